@@ -1,0 +1,151 @@
+"""Camera, Pose, `look_at`, rays and the Fibonacci sphere.
+
+OpenCV convention: in the camera's own frame x points right, y down and z forward, along the view.
+A pose is camera-to-scene. Angles are in radians, lengths in scene units.
+"""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxnbv.checks import AnyArray, is_traced, require
+
+
+class Pose(eqx.Module):
+    """A rigid camera-to-scene transform, or a batch of them along leading axes.
+
+    A point p of the camera's frame lies at `rotation @ p + position` in the scene. The columns of `rotation` are the
+    camera's right, down and forward axes in scene coordinates.
+
+    **Raises:** `ValueError` if the rotation is not orthonormal with determinant +1 (tolerance 1e-3) or if an entry is
+    not finite; under `jit` values are not known and are not checked.
+    """
+
+    rotation: Float[Array, "*batch 3 3"]
+    position: Float[Array, "*batch 3"]
+
+    def __init__(self, rotation: Float[AnyArray, "*batch 3 3"], position: Float[AnyArray, "*batch 3"]):
+        if not is_traced(rotation, position):
+            _check_rigid(np.asarray(rotation), np.asarray(position))
+        self.rotation = jnp.asarray(rotation)
+        self.position = jnp.asarray(position)
+
+    @property
+    def forward(self) -> Float[Array, "*batch 3"]:
+        """Unit viewing direction in the scene."""
+        return self.rotation[..., :, 2]
+
+    def to_scene(self, points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
+        """Points of the camera's frame in scene coordinates (a single pose)."""
+        return points @ self.rotation.T + self.position
+
+    def __getitem__(self, index) -> "Pose":
+        """The pose, or poses, at an index of the leading axes."""
+        return jax.tree.map(lambda leaf: leaf[index], self)
+
+
+def _check_rigid(rotation: np.ndarray, position: np.ndarray) -> None:
+    finite = np.isfinite(rotation).all() and np.isfinite(position).all()
+    require(finite, f"the pose has entries that are not finite: rotation {rotation}, position {position}")
+    error = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max(initial=0.0)
+    determinant = np.linalg.det(rotation)
+    require(
+        error < 1e-3 and bool((determinant > 0).all()),
+        f"the pose's 3 x 3 matrix is not a rotation: |R R^T - I| is {error:.3g} and det R is {determinant}; "
+        "build it with look_at, or orthonormalise it first",
+    )
+
+
+def look_at(
+    position,
+    target=(0.0, 0.0, 0.0),
+    up=(0.0, 1.0, 0.0),
+) -> Pose:
+    """The pose at `position` whose forward axis points to `target`.
+
+    **Arguments** (scene coordinates, anything `jnp.asarray` takes): `position` (*batch, 3); `target` (3,), by default
+    the origin; `up` (3,), the direction that is up in the image. Looking along `up`, the image is turned so that the
+    axis on which `up` is smallest takes its place.
+
+    **Raises:** `ValueError` if `position` equals `target`, or `up` is zero.
+    """
+    position, target, up = (jnp.asarray(a, dtype=jnp.result_type(float)) for a in (position, target, up))
+    offset = target - position
+    if not is_traced(position, target, up):
+        require(bool(jnp.all(jnp.isfinite(offset))), f"look_at needs finite coordinates, got position {position}")
+        require(
+            bool(jnp.all(jnp.linalg.norm(offset, axis=-1) > 0)),
+            f"look_at needs a position apart from its target; both are {target}",
+        )
+        require(bool(jnp.linalg.norm(up) > 0), "look_at needs an up direction that is not zero, such as (0, 1, 0)")
+    forward = offset / jnp.linalg.norm(offset, axis=-1, keepdims=True)
+    spare = jnp.eye(3, dtype=up.dtype)[jnp.argmin(jnp.abs(up))]
+    parallel = jnp.linalg.norm(jnp.cross(forward, up), axis=-1, keepdims=True) < 1e-4 * jnp.linalg.norm(up)
+    right = jnp.cross(forward, jnp.where(parallel, spare, up))
+    right = right / jnp.linalg.norm(right, axis=-1, keepdims=True)
+    down = jnp.cross(forward, right)
+    return Pose(jnp.stack([right, down, forward], axis=-1), position)
+
+
+class Camera(eqx.Module):
+    """A pinhole depth camera with square pixels and its principal point at the image's centre.
+
+    - `fov`: vertical field of view in radians, within (0, pi).
+    - `height`, `width`: pixels; one ray through the centre of each.
+
+    The defaults are the paper's: 30 degrees, 50 x 50.
+    """
+
+    fov: float = eqx.field(static=True, default=math.radians(30.0))
+    height: int = eqx.field(static=True, default=50)
+    width: int = eqx.field(static=True, default=50)
+
+    def __check_init__(self):
+        require(0 < self.fov < math.pi, f"the field of view is {self.fov} rad; it must lie within (0, pi)")
+        require(
+            self.height >= 1 and self.width >= 1,
+            f"the camera has {self.height} x {self.width} pixels; it needs at least one",
+        )
+
+    @property
+    def num_rays(self) -> int:
+        return self.height * self.width
+
+    @property
+    def focal_length(self) -> float:
+        """Focal length in pixels."""
+        return 0.5 * self.height / math.tan(0.5 * self.fov)
+
+    def pixel_directions(self) -> Float[Array, "rays 3"]:
+        """Directions through the pixel centres in the camera's frame, scaled so that z = 1; row by row."""
+        column, row = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+        x = (column - 0.5 * self.width) / self.focal_length
+        y = (row - 0.5 * self.height) / self.focal_length
+        directions = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+        return jnp.asarray(directions, dtype=jnp.result_type(float))
+
+    def rays(self, pose: Pose) -> tuple[Float[Array, "*batch rays 3"], Float[Array, "*batch rays 3"]]:
+        """Origins and unit directions of all rays in the scene, for one pose or a batch."""
+        directions = self.pixel_directions()
+        directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
+        directions = jnp.einsum("...ij,rj->...ri", pose.rotation, directions)
+        return jnp.broadcast_to(pose.position[..., None, :], directions.shape), directions
+
+
+def fibonacci_sphere(count: int, radius: float = 1.0) -> Float[Array, "count 3"]:
+    """`count` almost evenly spaced points on a sphere about the origin (spherical Fibonacci lattice; Gonzalez 2010).
+
+    **Raises:** `ValueError` if `count` < 1 or `radius` <= 0.
+    """
+    require(count >= 1, f"a Fibonacci sphere needs at least one point, got {count}")
+    require(radius > 0, f"the radius of the sphere must be positive, got {radius}")
+    index = np.arange(count)
+    y = 1.0 - (2.0 * index + 1.0) / count
+    azimuth = index * math.pi * (3.0 - math.sqrt(5.0))
+    ring = np.sqrt(1.0 - y**2)
+    points = np.stack([ring * np.cos(azimuth), y, ring * np.sin(azimuth)], axis=-1)
+    return jnp.asarray(radius * points, dtype=jnp.result_type(float))

@@ -1,0 +1,246 @@
+"""Oriented point clouds of fixed capacity, and the frame that carries the user's world into the scene."""
+
+import warnings
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnbv.camera import Camera, Pose
+from jaxnbv.checks import AnyArray, is_traced, require
+
+
+class PointCloud(eqx.Module):
+    """Oriented points (x, n): the paper's D. Rows whose mask is False hold nothing; their values are zero.
+
+    The number of rows is the cloud's capacity, a shape and so fixed under `jit`; `mask` says which rows are filled.
+    Leading axes make a batch of clouds.
+
+    - `points`: positions, in scene units unless said otherwise.
+    - `normals`: unit outward normals.
+    """
+
+    points: Float[Array, "*batch n 3"]
+    normals: Float[Array, "*batch n 3"]
+    mask: Bool[Array, "*batch n"]
+
+    @classmethod
+    def from_arrays(
+        cls,
+        points: Float[AnyArray, "n 3"] | list,
+        normals: Float[AnyArray, "n 3"] | list,
+        capacity: int | None = None,
+    ) -> "PointCloud":
+        """A cloud of the given points and outward normals, padded to `capacity` rows (default: as many as there are).
+
+        Normals are scaled to unit length, with a `UserWarning` where that changes one by more than 1 %.
+
+        **Raises:** `ValueError` for shapes other than (n, 3), no points at all, an entry that is not finite, a normal
+        of length zero, or more points than the capacity.
+        """
+        points, normals = (np.asarray(a, dtype=jnp.result_type(float)) for a in (points, normals))
+        require(
+            points.ndim == 2 and points.shape[1] == 3 and points.shape == normals.shape,
+            f"points and normals must both be (n, 3), got {points.shape} and {normals.shape}",
+        )
+        count = len(points)
+        capacity = count if capacity is None else capacity
+        require(count > 0, "the cloud is empty: give at least one point and its normal")
+        require(
+            count <= capacity,
+            f"{count} points do not fit a capacity of {capacity}: raise the capacity, or thin them first with "
+            f"farthest_point_subsample(cloud, {capacity})",
+        )
+        for name, array in (("points", points), ("normals", normals)):
+            bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+            require(
+                bad.size == 0,
+                f"{bad.size} of the {name} are not finite, the first at row {bad[:1]}: drop these rows",
+            )
+        lengths = np.linalg.norm(normals, axis=1)
+        zero = np.flatnonzero(lengths < 1e-12)
+        require(
+            zero.size == 0,
+            f"{zero.size} normals have length zero, the first at row {zero[:1]}: drop these points or estimate normals",
+        )
+        if np.abs(lengths - 1.0).max() > 0.01:
+            worst = int(np.abs(lengths - 1.0).argmax())
+            warnings.warn(
+                f"normals are not of unit length (row {worst}: {lengths[worst]:.4g}); they were normalised",
+                stacklevel=2,
+            )
+        pad = ((0, capacity - count), (0, 0))
+        return cls(
+            jnp.asarray(np.pad(points, pad)),
+            jnp.asarray(np.pad(normals / lengths[:, None], pad)),
+            jnp.arange(capacity) < count,
+        )
+
+    @classmethod
+    def from_depth(cls, depth: Float[AnyArray, "height width"], camera: Camera, pose: Pose) -> "PointCloud":
+        """The cloud, in scene coordinates, that a depth image shows: one row a pixel, row by row.
+
+        `depth` is the distance along the camera's forward axis, in scene units; pixels that are zero, negative or not
+        finite are masked. Normals come from the differences between neighbouring pixels, on the side where the depth
+        changes less, so they do not mix the two sides of an edge, and are turned to the camera. A pixel with no
+        valid neighbour along an image axis has no normal and is masked.
+
+        **Raises:** `ValueError` if the image's shape is not the camera's.
+        """
+        shape = (camera.height, camera.width)
+        require(
+            jnp.shape(depth) == shape,
+            f"the depth image is {jnp.shape(depth)} but the camera has {shape} pixels: "
+            "give Camera(height=..., width=...) of the image",
+        )
+        depth = jnp.asarray(depth, dtype=jnp.result_type(float))
+        valid = jnp.isfinite(depth) & (depth > 0)
+        local = jnp.where(valid, depth, 0.0)[..., None] * camera.pixel_directions().reshape(*shape, 3)
+        down, has_down = _one_sided_difference(local, valid, axis=0)
+        right, has_right = _one_sided_difference(local, valid, axis=1)
+        normals = jnp.cross(down, right)
+        normals = normals * -jnp.sign(jnp.sum(normals * local, axis=-1, keepdims=True))
+        length = jnp.linalg.norm(normals, axis=-1, keepdims=True)
+        mask = (valid & has_down & has_right & (length[..., 0] > 0)).reshape(-1)
+        normals = (normals / jnp.where(length > 0, length, 1.0)).reshape(-1, 3)
+        points = pose.to_scene(local.reshape(-1, 3))
+        normals = normals @ pose.rotation.T
+        return cls(jnp.where(mask[:, None], points, 0.0), jnp.where(mask[:, None], normals, 0.0), mask)
+
+    @property
+    def capacity(self) -> int:
+        return self.points.shape[-2]
+
+    @property
+    def count(self) -> Int[Array, "*batch"]:
+        """The number of filled rows."""
+        return jnp.sum(self.mask, axis=-1)
+
+    def to_numpy(self) -> tuple[Float[np.ndarray, "count 3"], Float[np.ndarray, "count 3"]]:
+        """Points and normals of the filled rows of a single cloud."""
+        mask = np.asarray(self.mask)
+        return np.asarray(self.points)[mask], np.asarray(self.normals)[mask]
+
+    def __getitem__(self, index) -> "PointCloud":
+        """The cloud, or clouds, at an index of the leading axes."""
+        return jax.tree.map(lambda leaf: leaf[index], self)
+
+
+def _one_sided_difference(points: Float[Array, "h w 3"], valid: Bool[Array, "h w"], axis: int):
+    """Differences between neighbours along an image axis, on the side of the smaller step, and whether there is one."""
+    step = jnp.diff(points, axis=axis)
+    index = [slice(None), slice(None)]
+    later, earlier = list(index), list(index)
+    later[axis], earlier[axis] = slice(1, None), slice(None, -1)
+    size = jnp.where(valid[tuple(later)] & valid[tuple(earlier)], jnp.linalg.norm(step, axis=-1), jnp.inf)
+
+    def shifted(array, before, fill):
+        pad = [(0, 0)] * array.ndim
+        pad[axis] = (1, 0) if before else (0, 1)
+        return jnp.pad(array, pad, constant_values=fill)
+
+    size_back, size_ahead = shifted(size, True, jnp.inf), shifted(size, False, jnp.inf)
+    back, ahead = shifted(step, True, 0.0), shifted(step, False, 0.0)
+    difference = jnp.where((size_back < size_ahead)[..., None], back, ahead)
+    return difference, jnp.isfinite(jnp.minimum(size_back, size_ahead))
+
+
+def concatenate(first: PointCloud, second: PointCloud) -> PointCloud:
+    """The union D u D' of the paper, with the capacities added; rows keep their places."""
+    join = lambda a, b: jnp.concatenate([a, b], axis=0)
+    return jax.tree.map(join, first, second)
+
+
+def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
+    """`count` points, each as far as can be from those chosen before it, in order of choice (Eldar et al. 1997).
+
+    Starts at the first filled row. Where the cloud has fewer points than `count`, all of them come first and the rest
+    of the rows are masked.
+
+    **Raises:** `ValueError` if `count` < 1.
+    """
+    require(count >= 1, f"cannot subsample to {count} points; ask for at least one")
+    points = jax.lax.stop_gradient(cloud.points)
+
+    def choose(i, carry):
+        chosen, distance, latest = carry
+        distance = jnp.minimum(distance, jnp.sum((points - points[latest]) ** 2, axis=-1)).at[latest].set(-1.0)
+        return chosen.at[i].set(latest), distance, jnp.argmax(distance).astype(jnp.int32)
+
+    # Rows that are not filled, and those already chosen, stand at -1: behind every other, duplicates included.
+    start = (
+        jnp.zeros(count, dtype=jnp.int32),
+        jnp.where(cloud.mask, jnp.inf, -1.0),
+        jnp.argmax(cloud.mask).astype(jnp.int32),
+    )
+    chosen, _, _ = jax.lax.fori_loop(0, count, choose, start)
+    kept = jnp.arange(count) < cloud.count
+    return _take(cloud, chosen, kept)
+
+
+def limit_capacity(cloud: PointCloud, capacity: int) -> PointCloud:
+    """The cloud in `capacity` rows, the filled ones first: all its points where they fit, else farthest point samples.
+
+    **Raises:** `ValueError` if `capacity` < 1.
+    """
+    require(capacity >= 1, f"a cloud cannot have a capacity of {capacity}; ask for at least one")
+
+    def compact(cloud):
+        order = jnp.argsort(~cloud.mask, stable=True)[:capacity]
+        order = jnp.pad(order, (0, max(0, capacity - cloud.capacity)))
+        return _take(cloud, order, jnp.arange(capacity) < cloud.count)
+
+    if cloud.capacity <= capacity:
+        return compact(cloud)
+    return jax.lax.cond(
+        cloud.count <= capacity, compact, lambda cloud: farthest_point_subsample(cloud, capacity), cloud
+    )
+
+
+def _take(cloud: PointCloud, index: Int[Array, " m"], kept: Bool[Array, " m"]) -> PointCloud:
+    points = jnp.where(kept[:, None], cloud.points[index], 0.0)
+    return PointCloud(points, jnp.where(kept[:, None], cloud.normals[index], 0.0), kept)
+
+
+class Frame(eqx.Module):
+    """The similarity between the user's world and the scene: scene = scale (world - center).
+
+    - `scale`: scene units per world unit.
+    - `center`: the world point that becomes the scene's origin.
+    """
+
+    scale: float = 1.0
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def fit(cls, points: Float[AnyArray, "n 3"], longest_side: float = 2.5) -> "Frame":
+        """The frame in which the points' bounding box is centred and its longest side is `longest_side`.
+
+        **Raises:** `ValueError` if there are no points, or they all coincide, or one is not finite.
+        """
+        points = np.asarray(points, dtype=np.float64)
+        require(len(points) > 0, "cannot fit a frame to no points")
+        require(bool(np.isfinite(points).all()), "cannot fit a frame to points that are not finite: drop them first")
+        low, high = points.min(axis=0), points.max(axis=0)
+        extent = float((high - low).max())
+        require(extent > 0, f"cannot fit a frame: all {len(points)} points lie at {low}")
+        x, y, z = (0.5 * (low + high)).tolist()
+        return cls(longest_side / extent, (x, y, z))
+
+    def to_scene(self, thing):
+        """World to scene, for an array of points (..., 3), a `PointCloud` or a `Pose`. Directions stay as they are."""
+        return self._apply(thing, lambda points: (points - np.asarray(self.center)) * self.scale)
+
+    def to_world(self, thing):
+        """Scene to world, for an array of points (..., 3), a `PointCloud` or a `Pose`."""
+        return self._apply(thing, lambda points: points / self.scale + np.asarray(self.center))
+
+    def _apply(self, thing, transform):
+        if isinstance(thing, PointCloud):
+            points = jnp.where(thing.mask[..., None], transform(thing.points), 0.0)
+            return PointCloud(points.astype(thing.points.dtype), thing.normals, thing.mask)
+        if isinstance(thing, Pose):
+            return Pose(thing.rotation, transform(thing.position).astype(thing.position.dtype))
+        return transform(thing if isinstance(thing, Array) and is_traced(thing) else np.asarray(thing))

@@ -1,0 +1,51 @@
+"""The paper's scan(theta; f): the oriented points that a depth camera sees of a surface."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
+
+from jaxnbv.camera import Camera, Pose
+from jaxnbv.checks import require
+from jaxnbv.cloud import PointCloud
+from jaxnbv.scanning.surface import Surface
+
+
+class SensorNoise(eqx.Module):
+    """Gaussian sensor noise: x + eps with eps ~ N(0, points^2 I), and normals n + eps, normalised again.
+
+    - `points`: standard deviation of each coordinate, in scene units.
+    - `normals`: standard deviation of each component of the unit normals.
+
+    The defaults are the authors'.
+    """
+
+    points: float = eqx.field(static=True, default=0.01)
+    normals: float = eqx.field(static=True, default=0.01)
+
+    def __check_init__(self):
+        require(
+            self.points >= 0 and self.normals >= 0,
+            f"the noise's standard deviations are {self.points} and {self.normals}; they must not be negative",
+        )
+
+    def __call__(self, cloud: PointCloud, key: PRNGKeyArray) -> PointCloud:
+        """The cloud with noise on its filled rows."""
+        point_key, normal_key = jax.random.split(key)
+        points = cloud.points + self.points * jax.random.normal(point_key, cloud.points.shape, cloud.points.dtype)
+        normals = cloud.normals + self.normals * jax.random.normal(normal_key, cloud.normals.shape, cloud.points.dtype)
+        normals = normals / jnp.linalg.norm(normals, axis=-1, keepdims=True)
+        mask = cloud.mask[..., None]
+        return PointCloud(jnp.where(mask, points, 0.0), jnp.where(mask, normals, 0.0), cloud.mask)
+
+
+def scan(surface: Surface, camera: Camera, pose: Pose) -> PointCloud:
+    """What the camera sees of the surface from a pose: one row a pixel, masked where its ray hits nothing.
+
+    Poses with leading axes give clouds with the same leading axes. Points are in scene coordinates; normals are unit
+    and turned to the sensor. No noise: apply a `SensorNoise` to the result. Runs under `jit` where `surface.in_jit`.
+    """
+    origins, directions = camera.rays(pose)
+    hits = surface.trace(origins.reshape(-1, 3), directions.reshape(-1, 3))
+    shape = origins.shape[:-1]
+    return PointCloud(hits.points.reshape(*shape, 3), hits.normals.reshape(*shape, 3), hits.mask.reshape(shape))

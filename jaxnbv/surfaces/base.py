@@ -1,0 +1,60 @@
+"""What the rest of the library asks of a distribution over implicit surfaces: condition it, and sample."""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from jaxnbv.checks import AnyArray
+from jaxnbv.cloud import PointCloud
+
+
+class Fields(eqx.Module):
+    """Sampled implicit functions f_1, ..., f_S, each to be evaluated anywhere in the scene."""
+
+    @abstractmethod
+    def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
+        """All samples at the points x (scene coordinates)."""
+
+    def on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "s g g g"]:
+        """All samples on the tensor grid axis x axis x axis (scene coordinates), slab by slab."""
+        axis = jnp.asarray(axis)
+        y, z = jnp.meshgrid(axis, axis, indexing="ij")
+
+        def slab(x):
+            return self(jnp.stack([jnp.full_like(y, x), y, z], axis=-1).reshape(-1, 3))
+
+        values = jax.lax.map(slab, axis)
+        return jnp.moveaxis(values, 0, 1).reshape(-1, axis.size, axis.size, axis.size)
+
+
+class SurfacePosterior(eqx.Module):
+    """p(f | D): the surface is where f equals `level`, and f is greater outside.
+
+    An implementation gives `level` and `sample`. One that has closed forms also overrides `mean` and `variance`, which
+    are Monte Carlo estimates here.
+    """
+
+    level: eqx.AbstractVar[Float[Array, ""]]
+
+    @abstractmethod
+    def sample(self, key: PRNGKeyArray, num_samples: int) -> Fields:
+        """`num_samples` independent samples of the whole function f."""
+
+    def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
+        """E f(x), here from 64 samples under a fixed key."""
+        return jnp.mean(self.sample(jax.random.key(0), 64)(x), axis=0)
+
+    def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
+        """Var f(x), here from 64 samples under a fixed key."""
+        return jnp.var(self.sample(jax.random.key(0), 64)(x), axis=0, ddof=1)
+
+
+class SurfaceModel(eqx.Module):
+    """p(f): a prior over implicit surfaces that can be conditioned on oriented points."""
+
+    @abstractmethod
+    def condition(self, cloud: PointCloud) -> SurfacePosterior:
+        """p(f | D) for the filled rows of a cloud in scene coordinates."""
