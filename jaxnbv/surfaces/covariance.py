@@ -1,0 +1,80 @@
+"""Covariances of the implicit function f and the normal field v under the prior, between pairs of points.
+
+    cov(v_d(x), v_d(y)) = sum_n s(n) cos(n.(x - y))
+    cov(f(x), v_d(y))   = sum_n s(n) n_d / |n|^2 sin(n.(x - y))
+    cov(f(x), f(y))     = sum_n s(n) / |n|^2 cos(n.(x - y)),   n != 0
+
+The first is a product over the axes. The other two become a short sum of such products by the trapezoidal rule for
+1 / r = int exp(-r e^u) e^u du (Beylkin and Monzon 2010), so no array over the (2 L + 1)^3 frequencies is ever made.
+"""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxnbv.surfaces.trigonometric import basis_variance, circle_basis
+
+Spectrum = Float[Array, "l_plus_1"]
+
+
+def normal_covariance(x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectrum) -> Float[Array, "n m"]:
+    """cov(v_d(x), v_d(y)), the same for each component d; different components are independent."""
+    even = [_even(x[:, axis], y[:, axis], spectrum) for axis in range(3)]
+    return even[0] * even[1] * even[2]
+
+
+def function_normal_covariance(
+    x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectrum
+) -> Float[Array, "3 n m"]:
+    """cov(f(x), v_d(y)) for d = 1, 2, 3."""
+    frequency = jnp.arange(spectrum.shape[0], dtype=spectrum.dtype)
+    total = jnp.zeros((3, x.shape[0], y.shape[0]), dtype=spectrum.dtype)
+    for rate, weight in zip(*_inverse_quadrature(spectrum), strict=True):
+        damped = spectrum * jnp.exp(-rate * frequency**2)
+        even = [_even(x[:, axis], y[:, axis], damped) for axis in range(3)]
+        odd = [_odd(x[:, axis], y[:, axis], damped * frequency) for axis in range(3)]
+        total += weight * jnp.stack([odd[0] * even[1] * even[2], even[0] * odd[1] * even[2], even[0] * even[1] * odd[2]])
+    return total
+
+
+def function_covariance(x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectrum) -> Float[Array, "n m"]:
+    """cov(f(x), f(y))."""
+    frequency = jnp.arange(spectrum.shape[0], dtype=spectrum.dtype)
+    total = jnp.zeros((x.shape[0], y.shape[0]), dtype=spectrum.dtype)
+    for rate, weight in zip(*_inverse_quadrature(spectrum), strict=True):
+        product = normal_covariance(x, y, spectrum * jnp.exp(-rate * frequency**2))
+        total += weight * (product - spectrum[0] ** 3)
+    return total
+
+
+def function_variance(spectrum: Spectrum) -> Float[Array, ""]:
+    """Var f(x) = sum_n s(n) / |n|^2, the same everywhere."""
+    origin = jnp.zeros((1, 3), dtype=spectrum.dtype)
+    return function_covariance(origin, origin, spectrum)[0, 0]
+
+
+def _even(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> Float[Array, "n m"]:
+    """sum_{n in Z} s1(n) cos(n (x - y))."""
+    truncation = spectrum.shape[0] - 1
+    return (circle_basis(x, truncation) * basis_variance(spectrum)) @ circle_basis(y, truncation).T
+
+
+def _odd(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> Float[Array, "n m"]:
+    """sum_{n in Z} s1(|n|) sign(n) sin(n (x - y)); sin(n (x - y)) = sin(n x) cos(n y) - cos(n x) sin(n y)."""
+    truncation = spectrum.shape[0] - 1
+    sign = np.sign(np.arange(-truncation, truncation + 1))
+    # Reversing the basis swaps the sine and the cosine of each frequency.
+    swapped = sign * circle_basis(x, truncation)[:, ::-1]
+    return (swapped * basis_variance(spectrum)) @ circle_basis(y, truncation).T
+
+
+def _inverse_quadrature(spectrum: Spectrum) -> tuple[np.ndarray, np.ndarray]:
+    """Rates t_q and weights w_q with 1 / r = sum_q w_q exp(-t_q r) for 1 <= r <= 3 L^2, to the dtype's precision."""
+    tolerance = 10 * float(jnp.finfo(spectrum.dtype).eps)
+    largest = 3.0 * (spectrum.shape[0] - 1) ** 2
+    step = math.pi**2 / math.log(10.0 / tolerance)
+    low, high = math.log(tolerance / largest), math.log(math.log(1.0 / tolerance))
+    rate = np.exp(np.arange(low, high + step, step))
+    return rate, step * rate

@@ -1,0 +1,229 @@
+"""Geometric stochastic Poisson surface reconstruction (Holalkere et al. 2025), consistent for the truncated model.
+
+    prior    v_1, v_2, v_3 independent Gaussian processes on the torus of period 2 pi,
+             cov(v_d(x), v_d(y)) = sum_{|n|_inf <= L} s(n) cos(n.(x - y)),   s(n) = s1(n_1) s1(n_2) s1(n_3)
+    Poisson  f_hat(n) = -i n . v_hat(n) / |n|^2,   f_hat(0) = 0
+    data     n_j = v(x_j) + eps_j,   eps_j ~ N(0, noise^2 I),   A = k(X, X) + noise^2 I
+    sample   v_post = v + k(., X) A^-1 (n - v(X) - eps), v and eps from the prior;   f = Poisson(v_post)
+
+A sample is one function, band-limited, to be evaluated anywhere: its prior part, its residual at the data and its update
+come from the same draw (Matheron's rule; Wilson et al. 2020), so samples have exactly the posterior's distribution.
+"""
+
+import warnings
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import cho_solve, solve_triangular
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.cloud import PointCloud
+from jaxnbv.surfaces.base import SurfaceModel, SurfacePosterior
+from jaxnbv.surfaces.covariance import (
+    function_covariance,
+    function_normal_covariance,
+    function_variance,
+    normal_covariance,
+)
+from jaxnbv.surfaces.matern import circle_spectrum
+from jaxnbv.surfaces.nonuniform import HALF_WIDTH, NonuniformTransform
+from jaxnbv.surfaces.trigonometric import TrigonometricFields, basis_variance, solve_poisson
+
+_CHUNK_VALUES = 2**24
+
+
+def _to_float(value) -> Float[Array, ""]:
+    return jnp.asarray(value, dtype=jnp.result_type(float))
+
+
+class GeometricSPSR(SurfaceModel):
+    """Matern prior on the normal field over the torus, and f as its Poisson reconstruction.
+
+    - `lengthscale`: ell, in units of the circumference 2 pi: 0.005 is 0.031 in scene units.
+    - `variance`: per axis, so that without truncation Var v_d = variance^3.
+    - `noise`: standard deviation of each component of the observed normals.
+    - `nu`: smoothness, 1/2, 3/2 or 5/2.
+    - `truncation`: L; frequencies up to L along each axis are kept. They hold `kept_variance` of the prior's variance:
+      49 % at the default values, which are the paper's.
+
+    `lengthscale`, `variance` and `noise` are array leaves: the posterior is differentiable in them.
+
+    **Raises:** `ValueError` for values that are not positive or a `nu` that is not offered; warns where less than a
+    third of the variance is kept.
+    """
+
+    lengthscale: Float[Array, ""] = eqx.field(converter=_to_float, default=0.005)
+    variance: Float[Array, ""] = eqx.field(converter=_to_float, default=0.2)
+    truncation: int = eqx.field(static=True, default=50)
+    noise: Float[Array, ""] = eqx.field(converter=_to_float, default=0.01)
+    nu: float = eqx.field(static=True, default=1.5)
+
+    def __check_init__(self):
+        require(self.nu in (0.5, 1.5, 2.5), f"nu is {self.nu}; it must be 0.5, 1.5 or 2.5")
+        require(self.truncation >= 1, f"the truncation is {self.truncation}; it must be at least 1")
+        if is_traced(self.lengthscale, self.variance, self.noise):
+            return
+        for name in ("lengthscale", "variance", "noise"):
+            value = float(getattr(self, name))
+            require(value > 0, f"{name} is {value}; it must be positive")
+        kept = float(self.kept_variance)
+        if kept < 1 / 3:
+            warnings.warn(
+                f"truncation={self.truncation} keeps {kept:.0%} of the prior's variance at lengthscale={float(self.lengthscale):.3g}: "
+                "raise the truncation or the lengthscale",
+                stacklevel=3,
+            )
+
+    @property
+    def spectrum(self) -> Float[Array, "l_plus_1"]:
+        """s1(0), ..., s1(L)."""
+        return circle_spectrum(self.nu, self.lengthscale, self.variance, self.truncation)
+
+    @property
+    def kept_variance(self) -> Float[Array, ""]:
+        """Share of the prior's variance within the truncation, in three dimensions."""
+        return (jnp.sum(basis_variance(self.spectrum)[self.truncation :]) / self.variance) ** 3
+
+    def condition(self, cloud: PointCloud) -> "GeometricSPSRPosterior":
+        """p(f | D). The cost is that of a Cholesky factorisation of the cloud's capacity.
+
+        **Raises:** `ValueError` if the cloud is empty, has entries that are not finite, or leaves
+        [-pi/2, pi/2]^3 (scene coordinates); under `jit` values are not known and are not checked.
+        """
+        if not is_traced(cloud):
+            _check_in_scene(cloud)
+        return _condition(self, cloud)
+
+
+def _check_in_scene(cloud: PointCloud) -> None:
+    points, normals = cloud.to_numpy()
+    require(len(points) > 0, "cannot condition on an empty cloud: scan the object at least once")
+    finite = np.isfinite(points).all() and np.isfinite(normals).all()
+    require(finite, "the cloud has points or normals that are not finite: build it with PointCloud.from_arrays")
+    furthest = float(np.abs(points).max())
+    require(
+        furthest <= HALF_WIDTH,
+        f"a point has a coordinate of {furthest:.4g}, outside the scene [-pi/2, pi/2]^3: "
+        "bring the points to the scene with Frame.fit(points).to_scene(points)",
+    )
+
+
+@eqx.filter_jit
+def _condition(model: GeometricSPSR, cloud: PointCloud) -> "GeometricSPSRPosterior":
+    spectrum = model.spectrum
+    both = cloud.mask[:, None] & cloud.mask[None, :]
+    kernel = jnp.where(both, normal_covariance(cloud.points, cloud.points, spectrum), 0.0)
+    # A row that is not filled becomes a row of the identity: it changes neither the solves nor the determinant.
+    diagonal = jnp.where(cloud.mask, model.noise**2, 1.0)
+    cholesky = jnp.linalg.cholesky(kernel + jnp.diag(diagonal), symmetrize_input=False)
+    normals = jnp.where(cloud.mask[:, None], cloud.normals, 0.0)
+    weights = cho_solve((cholesky, True), normals)
+    transform = NonuniformTransform(cloud.points, model.truncation)
+    mean = _reconstruct(transform, weights, spectrum)
+    at_data = transform.evaluate(mean[None])[:, 0]
+    level = jnp.sum(jnp.where(cloud.mask, at_data, 0.0)) / jnp.sum(cloud.mask)
+    return GeometricSPSRPosterior(level, model, cloud, cholesky, weights, mean)
+
+
+def _prior_variance(spectrum: Float[Array, "l_plus_1"]) -> Float[Array, "a a a"]:
+    variance = basis_variance(spectrum)
+    return variance[:, None, None] * variance[:, None] * variance
+
+
+def _reconstruct(
+    transform: NonuniformTransform, weights: Float[Array, "n 3"], spectrum: Float[Array, "l_plus_1"]
+) -> Float[Array, "a a a"]:
+    """Coefficients of the f that k(., X) weights reconstructs."""
+    return solve_poisson(_prior_variance(spectrum) * transform.adjoint(weights))
+
+
+class GeometricSPSRPosterior(SurfacePosterior):
+    """p(f | D) under `GeometricSPSR`, in closed form and as pathwise samples.
+
+    - `level`: mean over the data of E f(x_j); the surface is where f equals it.
+    - `cholesky`: lower factor of A.
+    - `weights`: A^-1 n.
+    - `mean_coefficients`: of E f, see `surfaces/trigonometric.py`.
+    """
+
+    level: Float[Array, ""]
+    model: GeometricSPSR
+    cloud: PointCloud
+    cholesky: Float[Array, "n n"]
+    weights: Float[Array, "n 3"]
+    mean_coefficients: Float[Array, "a a a"]
+
+    @property
+    def mean_field(self) -> TrigonometricFields:
+        """E f as a single field: evaluate it at points or on a grid."""
+        return TrigonometricFields(self.mean_coefficients[None])
+
+    @eqx.filter_jit
+    def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
+        """E f(x) at points in scene coordinates."""
+        return self.mean_field(x)[0]
+
+    @eqx.filter_jit
+    def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
+        """Var f(x) at points in scene coordinates. The cost grows with (number of points) x (capacity)^2."""
+        x = jnp.asarray(x, dtype=self.weights.dtype)
+        prior = function_variance(self.model.spectrum)
+
+        def at_points(x):
+            return prior - jnp.sum(self._whitened(x) ** 2, axis=(0, 1))
+
+        chunk = max(1, min(x.shape[0], _CHUNK_VALUES // self.cloud.capacity))
+        return jax.lax.map(lambda point: at_points(point[None])[0], x, batch_size=chunk)
+
+    @eqx.filter_jit
+    def covariance(self, x: Float[AnyArray, "n 3"], y: Float[AnyArray, "m 3"]) -> Float[Array, "n m"]:
+        """Cov(f(x), f(y)) between points in scene coordinates, all at once."""
+        x, y = (jnp.asarray(points, dtype=self.weights.dtype) for points in (x, y))
+        explained = jnp.einsum("djn,djm->nm", self._whitened(x), self._whitened(y))
+        return function_covariance(x, y, self.model.spectrum) - explained
+
+    def log_marginal_likelihood(self) -> Float[Array, ""]:
+        """log p(n_1, ..., n_N | x_1, ..., x_N), summed over the three components."""
+        count = self.cloud.count
+        fit = jnp.sum(jnp.where(self.cloud.mask[:, None], self.cloud.normals, 0.0) * self.weights)
+        log_determinant = 2.0 * jnp.sum(jnp.log(jnp.diag(self.cholesky)))
+        return -0.5 * (fit + 3.0 * log_determinant + 3.0 * count * jnp.log(2.0 * jnp.pi))
+
+    @eqx.filter_jit
+    def sample(self, key: PRNGKeyArray, num_samples: int) -> TrigonometricFields:
+        """`num_samples` joint samples of f by pathwise conditioning: functions, to be evaluated anywhere.
+
+        **Raises:** `ValueError` if `num_samples` < 1.
+        """
+        require(num_samples >= 1, f"asked for {num_samples} samples; ask for at least one")
+        spectrum, dtype = self.model.spectrum, self.weights.dtype
+        scale = jnp.sqrt(_prior_variance(spectrum))
+        modes = scale.shape[0]
+        transform = NonuniformTransform(self.cloud.points, self.model.truncation)
+        field_keys, noise_keys = jax.random.split(key, (2, num_samples))
+
+        def prior(keys):
+            field_key, noise_key = keys
+            coefficients = scale * jax.random.normal(field_key, (3, modes, modes, modes), dtype)
+            noise = self.model.noise * jax.random.normal(noise_key, self.cloud.points.shape, dtype)
+            return coefficients, transform.evaluate(coefficients) + noise
+
+        coefficients, at_data = jax.lax.map(prior, (field_keys, noise_keys))
+        residual = jnp.where(self.cloud.mask[:, None], self.cloud.normals - at_data, 0.0)
+        columns = jnp.moveaxis(residual, 0, 1).reshape(self.cloud.capacity, -1)
+        weights = cho_solve((self.cholesky, True), columns).reshape(self.cloud.capacity, num_samples, 3)
+
+        def update(sample):
+            coefficients, weights = sample
+            return solve_poisson(coefficients) + _reconstruct(transform, weights, spectrum)
+
+        return TrigonometricFields(jax.lax.map(update, (coefficients, jnp.moveaxis(weights, 1, 0))))
+
+    def _whitened(self, x: Float[Array, "n 3"]) -> Float[Array, "3 capacity n"]:
+        """C^-1 cov(v_d(X), f(x)) with A = C C^T: the sum of its squares is the variance that the data explain."""
+        cross = function_normal_covariance(x, self.cloud.points, self.model.spectrum)
+        cross = jnp.where(self.cloud.mask, cross, 0.0)
+        return jax.vmap(lambda c: solve_triangular(self.cholesky, c.T, lower=True))(cross)

@@ -1,0 +1,84 @@
+"""Band-limited functions on the torus of period 2 pi, in a real tensor basis.
+
+The basis on the circle is phi_a(x) = cos(a x) for a = 0, ..., L and phi_a(x) = sin(-a x) for a = -L, ..., -1. The
+products phi_a(x1) phi_b(x2) phi_c(x3) are as many real functions as the Hermitian half of the paper's exponentials has
+real and imaginary parts, and they span the same space; but evaluation is a chain of real matrix products, and the
+derivative of a function with coefficients C_a has the coefficients a C_{-a}.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxnbv.checks import AnyArray
+from jaxnbv.surfaces.base import Fields
+
+_CHUNK_VALUES = 2**24
+
+
+def circle_basis(x: Float[Array, "*n"], truncation: int) -> Float[Array, "*n a"]:
+    """phi_a(x) for a = -L, ..., L, along a new last axis of length 2 L + 1."""
+    angle = x[..., None] * jnp.arange(1, truncation + 1)
+    return jnp.concatenate([jnp.sin(angle)[..., ::-1], jnp.ones_like(x)[..., None], jnp.cos(angle)], axis=-1)
+
+
+def basis_variance(spectrum: Float[Array, "l_plus_1"]) -> Float[Array, " a"]:
+    """Variances of the coefficients of phi_a under which the kernel on the circle is sum_n s1(n) cos(n t), n in Z."""
+    positive = 2.0 * spectrum[1:]
+    return jnp.concatenate([positive[::-1], spectrum[:1], positive])
+
+
+def differentiate(coefficients: Float[Array, "*s a a a"], axis: int) -> Float[Array, "*s a a a"]:
+    """Coefficients of the partial derivative along an axis (0, 1 or 2)."""
+    return _frequency(coefficients, axis) * jnp.flip(coefficients, axis - 3)
+
+
+def solve_poisson(vector_field: Float[Array, "*s 3 a a a"]) -> Float[Array, "*s a a a"]:
+    """Coefficients of the f of mean zero with Laplacian f = div v: f_hat(n) = -i n . v_hat(n) / |n|^2."""
+    divergence = sum(differentiate(vector_field[..., axis, :, :, :], axis) for axis in range(3))
+    squared = sum(_frequency(divergence, axis) ** 2 for axis in range(3))
+    return -divergence / jnp.where(squared == 0, jnp.inf, squared)
+
+
+def _frequency(coefficients: Float[Array, "*s a a a"], axis: int) -> Float[Array, "_ _ _"]:
+    truncation = coefficients.shape[-1] // 2
+    shape = [1, 1, 1]
+    shape[axis] = -1
+    return jnp.arange(-truncation, truncation + 1, dtype=coefficients.dtype).reshape(shape)
+
+
+def evaluate_on_grid(
+    coefficients: Float[Array, "*s a a a"], basis: Float[Array, "g a"] | Float[np.ndarray, "g a"]
+) -> Float[Array, "*s g g g"]:
+    """Values on a tensor grid, given the basis at the nodes of its axis: three matrix products a function."""
+    values = jnp.einsum("...abc,kc->...abk", coefficients, basis)
+    values = jnp.einsum("...abk,jb->...ajk", values, basis)
+    return jnp.einsum("...ajk,ia->...ijk", values, basis)
+
+
+class TrigonometricFields(Fields):
+    """Band-limited functions, exact everywhere on the torus.
+
+    - `coefficients`: of phi_a(x1) phi_b(x2) phi_c(x3), one block a function.
+    """
+
+    coefficients: Float[Array, "s a a a"]
+
+    def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
+        """All functions at the points x (scene coordinates): one matrix product over the first axis of frequencies."""
+        x = jnp.asarray(x, dtype=self.coefficients.dtype)
+        samples, modes = self.coefficients.shape[0], self.coefficients.shape[-1]
+
+        def evaluate(point):
+            first, second, third = circle_basis(point, modes // 2)
+            values = jnp.einsum("sabc,a->sbc", self.coefficients, first)
+            return jnp.einsum("sbc,b,c->s", values, second, third)
+
+        chunk = max(1, min(x.shape[0], _CHUNK_VALUES // (samples * modes**2)))
+        return jax.lax.map(evaluate, x, batch_size=chunk).T
+
+    def on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "s g g g"]:
+        """All functions on the tensor grid axis x axis x axis, one after the other to bound the memory."""
+        basis = circle_basis(jnp.asarray(axis, dtype=self.coefficients.dtype), self.coefficients.shape[-1] // 2)
+        return jax.lax.map(lambda block: evaluate_on_grid(block, basis), self.coefficients)
