@@ -1,0 +1,13 @@
+"""Surfaces that rays can hit, and the scanner."""
+
+from jaxnbv.scanning.grid import Grid as Grid
+from jaxnbv.scanning.grid import GridSurface as GridSurface
+from jaxnbv.scanning.grid import scan_samples as scan_samples
+from jaxnbv.scanning.mesh import TriangleMesh as TriangleMesh
+from jaxnbv.scanning.mesh import load_mesh as load_mesh
+from jaxnbv.scanning.mesh import mesh_from_sdf as mesh_from_sdf
+from jaxnbv.scanning.scanner import SensorNoise as SensorNoise
+from jaxnbv.scanning.scanner import scan as scan
+from jaxnbv.scanning.sphere_tracing import SDFSurface as SDFSurface
+from jaxnbv.scanning.surface import Hits as Hits
+from jaxnbv.scanning.surface import Surface as Surface

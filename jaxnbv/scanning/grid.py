@@ -1,10 +1,20 @@
 """GridSurface: the level set of a function sampled on the regular grid that posterior samples are traced on."""
 
-import equinox as eqx
-import numpy as np
-from jaxtyping import Array, Float, UInt8
+from typing import ClassVar
 
-from jaxnbv.checks import require
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int8
+
+from jaxnbv.camera import Camera, Pose
+from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.cloud import PointCloud
+from jaxnbv.scanning import tracing
+from jaxnbv.scanning.scanner import scan
+from jaxnbv.scanning.surface import Hits, Surface
+
 
 
 class Grid(eqx.Module):
@@ -29,3 +39,80 @@ class Grid(eqx.Module):
     def axis(self) -> Float[np.ndarray, " g"]:
         """Coordinates of the nodes along one axis."""
         return np.linspace(-self.half_extent, self.half_extent, self.resolution)
+
+
+class GridSurface(Surface):
+    """The zero set of the trilinear interpolant of node values, traced exactly. Leading axes make a batch of surfaces.
+
+    - `values`: f minus its level at the nodes; positive outside.
+    - `distance`: how far each cell is from one with a change of sign (`tracing.free_distance`).
+
+    Nothing is hit outside the grid's box, which a ray enters where it meets it.
+    """
+
+    in_jit: ClassVar[bool] = True
+
+    values: Float[Array, "*s g g g"]
+    distance: Int8[Array, "*s m m m"]
+    grid: Grid
+
+    @classmethod
+    def from_values(
+        cls, values: Float[AnyArray, "*s g g g"], level: Float[AnyArray, ""] | float, grid: Grid
+    ) -> "GridSurface":
+        """The surface, or batch of surfaces, where a function with these values at the grid's nodes equals `level`.
+
+        **Raises:** `ValueError` if the values are not the grid's, or one of them or the level is not finite.
+        """
+        g = grid.resolution
+        require(
+            values.shape[-3:] == (g, g, g),
+            f"values of shape {values.shape} do not fit a grid of {g}^3 nodes: evaluate on grid.axis, three times",
+        )
+        values = jnp.asarray(values) - level
+        if not is_traced(values):
+            require(bool(jnp.isfinite(values).all()), "the values on the grid, or the level, are not finite")
+        return cls(values, _free_distances(values), grid)
+
+    @eqx.filter_jit
+    def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
+        """First zeros along the rays inside the box; see `Surface.trace`.
+
+        A hit is where the interpolant first differs in sign from its sign at the ray's start (its origin, or where it
+        enters the box). So a ray that touches the surface without crossing it, a double root, goes on.
+
+        Points and normals are differentiable in origins, directions and values: at a hit x = o + t d the implicit
+        function theorem gives dt = -(df + grad f . (do + t dd)) / (grad f . d). Grazing rays, with an angle
+        below about 3 degrees to the surface, get the derivative of that angle, so it stays bounded.
+        """
+        require(
+            self.values.ndim == 3,
+            f"rays are traced through one surface, not a batch of shape {self.values.shape[:-3]}: use scan_samples",
+        )
+        h, half = self.grid.spacing, self.grid.half_extent
+        field = tracing.Field(self.values.reshape(-1), self.distance.reshape(-1), self.grid.resolution)
+        o, d = list(jnp.asarray(origins).T), list(jnp.asarray(directions).T)
+        t, mask = tracing.first_zero(field, [(x + half) / h for x in o], [x / h for x in d])
+        hits = [jnp.where(mask, x + t * dx, 0.0) for x, dx in zip(o, d, strict=True)]
+
+        normals = tracing.smooth_gradient(field, [(x + half) / h for x in hits])
+        facing = -jnp.sign(sum(n * dx for n, dx in zip(normals, d, strict=True)))
+        square = sum(n * n for n in normals)
+        valid = mask & (square > 0)
+        scale = jnp.where(valid, jnp.where(facing == 0, 1.0, facing) / jnp.sqrt(jnp.where(valid, square, 1.0)), 0.0)
+        return Hits(jnp.stack(hits, axis=-1), jnp.stack([n * scale for n in normals], axis=-1), mask)
+
+
+@eqx.filter_jit
+def scan_samples(surfaces: GridSurface, camera: Camera, poses: Pose) -> PointCloud:
+    """What the camera sees of each of a batch of surfaces from each of a batch of poses.
+
+    For s surfaces and p poses, clouds with leading axes (s, p); rows as `scan` gives them.
+    """
+    return jax.lax.map(lambda surface: scan(surface, camera, poses), surfaces)
+
+
+@jax.jit
+def _free_distances(values: Float[Array, "*s g g g"]) -> Int8[Array, "*s m m m"]:
+    distances = jax.lax.map(tracing.free_distance, values.reshape(-1, *values.shape[-3:]))
+    return distances.reshape(*values.shape[:-3], *distances.shape[1:])

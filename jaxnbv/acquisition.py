@@ -1,0 +1,74 @@
+"""From imagined scans to the value of a pose: the paper's acquisition functions.
+
+    acquisition(theta) = E score(D, scan(theta; f | D)),   estimated by the mean over the step's samples f_1, ..., f_S,
+
+the same samples for all poses (common random numbers). A score sees the context that was computed once from D, and one
+imagined scan.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxnbv.camera import Camera, Pose
+from jaxnbv.cloud import PointCloud, concatenate
+from jaxnbv.scanning import GridSurface, scan
+
+
+class Score(eqx.Module):
+    """What one imagined scan is worth, given what has been seen.
+
+    `differentiable` says whether the value has a derivative with respect to the scan's points and normals that is worth
+    following; a search by gradient asks for it.
+    """
+
+    differentiable: eqx.AbstractVar[bool]
+
+    @abstractmethod
+    def context(self, cloud: PointCloud) -> Any:
+        """Whatever depends on D alone; computed once a step."""
+
+    @abstractmethod
+    def __call__(self, context: Any, scan: PointCloud) -> Float[Array, ""]:
+        """The score of one scan (rows, masked). Finite for a scan that sees nothing."""
+
+
+class ExpectedUtilityImprovement(Score):
+    """max(0, u(D u scan) - u(D)) for any utility u(cloud): the paper's alpha^(u), once averaged over samples.
+
+    - `utility`: a function from a `PointCloud` (rows, masked) to a scalar, made of JAX operations.
+    - `differentiable`: whether its gradient is worth following.
+    """
+
+    utility: Callable[[PointCloud], Float[Array, ""]]
+    differentiable: bool = eqx.field(static=True, default=True)
+
+    def context(self, cloud: PointCloud) -> tuple[PointCloud, Float[Array, ""]]:
+        """D and u(D)."""
+        return cloud, self.utility(cloud)
+
+    def __call__(self, context: tuple[PointCloud, Float[Array, ""]], scan: PointCloud) -> Float[Array, ""]:
+        """max(0, u(D u scan) - u(D))."""
+        cloud, utility = context
+        return jnp.maximum(0.0, self.utility(concatenate(cloud, scan)) - utility)
+
+
+def expected_score(
+    score: Score, cloud: PointCloud, surfaces: GridSurface, camera: Camera, poses: Pose
+) -> Float[Array, " poses"]:
+    """The acquisition at each of a batch of poses: mean over the sampled surfaces of the score of what they would show.
+
+    `surfaces` carries the samples along its leading axis; they are taken one after the other, all poses at once, so
+    memory is that of one sample's scans.
+    """
+    context = score.context(cloud)
+
+    def of_sample(surface: GridSurface) -> Float[Array, " poses"]:
+        return jax.vmap(lambda imagined: score(context, imagined))(scan(surface, camera, poses))
+
+    return jnp.mean(jax.lax.map(of_sample, surfaces), axis=0)

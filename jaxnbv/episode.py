@@ -1,0 +1,138 @@
+"""The simulated episode: scan, ask for the next view, scan again."""
+
+from pathlib import Path
+
+import equinox as eqx
+import jax
+from jaxtyping import PRNGKeyArray
+from tqdm.auto import tqdm
+
+from jaxnbv.camera import Camera, Pose
+from jaxnbv.checks import require
+from jaxnbv.cloud import PointCloud
+from jaxnbv.planner import Planner
+from jaxnbv.scanning import SensorNoise, Surface, scan
+from jaxnbv.search import Proposal
+from jaxnbv.storage import EpisodeFolder, describe
+
+
+class View(eqx.Module):
+    """One view of an episode.
+
+    - `pose`: where the sensor was.
+    - `scan`: what it saw, noise included; one row a pixel.
+    - `cloud`: D after this view.
+    - `proposal`: what the search looked at; None for the first view, which was given.
+    """
+
+    pose: Pose
+    scan: PointCloud
+    cloud: PointCloud
+    proposal: Proposal | None
+
+
+class Episode(eqx.Module):
+    """Views that a planner chose of a scene, and what they depend on."""
+
+    planner: Planner
+    scene: Surface
+    noise: SensorNoise
+    first: Pose
+    key: PRNGKeyArray
+    views: tuple[View, ...]
+
+    @property
+    def cloud(self) -> PointCloud:
+        """D after the last view, in scene coordinates."""
+        return self.views[-1].cloud
+
+    def save(self, path: str | Path) -> None:
+        """Write the episode to a folder (see `jaxnbv.storage` for its files); `simulate` can continue from it.
+
+        **Raises:** `ValueError` if the folder holds an episode of another configuration, or other files.
+        """
+        folder = EpisodeFolder(path, _config(self.planner, self.scene, self.noise, self.first, self.key))
+        for index, view in enumerate(self.views):
+            folder.write_view(index, view.pose, view.scan, view.proposal)
+        folder.write_cloud(self.cloud)
+
+
+def _config(planner: Planner, scene: Surface, noise: SensorNoise, first: Pose, key: PRNGKeyArray) -> dict:
+    return describe({"planner": planner, "scene": scene, "noise": noise, "first": first, "key": key})
+
+
+def simulate(
+    planner: Planner,
+    scene: Surface,
+    first: Pose,
+    views: int,
+    key: PRNGKeyArray,
+    noise: SensorNoise = SensorNoise(),
+    folder: str | Path | None = None,
+    progress: bool = True,
+) -> Episode:
+    """Scan a known surface from `first`, then from the views that the planner asks for, `views` in all.
+
+    View i depends on the key and i alone, not on how many follow. With `folder`, every finished view is written there;
+    a run that was interrupted goes on after the last of them and ends with the same bits as one that was not.
+
+    **Raises:** `ValueError` if `views` < 1 or more than the planner has room for, if the first view sees nothing, or
+    if the folder belongs to another configuration.
+    """
+    require(views >= 1, f"asked for {views} views; ask for at least one")
+    require(
+        views <= planner.max_views,
+        f"asked for {views} views but the planner has room for {planner.max_views}: raise Planner(max_views=...)",
+    )
+    store = None if folder is None else EpisodeFolder(folder, _config(planner, scene, noise, first, key))
+    finished: list[View] = []
+    state = None
+
+    def finish(pose: Pose, seen: PointCloud, proposal: Proposal | None) -> None:
+        nonlocal state
+        state = planner.init(seen, pose) if state is None else planner.observe(state, pose, seen)
+        finished.append(View(pose, seen, state.cloud, proposal))
+
+    for pose, seen, proposal in (store.read_views() if store else [])[:views]:
+        finish(pose, seen, proposal)
+
+    stages = ("sampling surfaces", "searching", "scanning")
+    with tqdm(total=views * len(stages), initial=len(finished) * len(stages), disable=not progress) as bar:
+
+        def begin(index: int, stage: str) -> None:
+            bar.set_description(f"view {index + 1}/{views}, {stage}")
+
+        for index in range(len(finished), views):
+            step_key, noise_key = jax.random.split(jax.random.fold_in(key, index))
+            pose, proposal = first, None
+            if state is not None:
+                sample_key, search_key = jax.random.split(step_key)
+                begin(index, stages[0])
+                surfaces = None
+                if planner.search.uses_samples:
+                    surfaces = jax.block_until_ready(planner.sample_surfaces(state, sample_key))
+                bar.update()
+                begin(index, stages[1])
+                proposal = jax.block_until_ready(planner.choose(state, surfaces, search_key))
+                pose = proposal.pose
+                bar.update()
+            begin(index, stages[2])
+            seen = observe_scene(scene, planner.camera, pose, noise, noise_key)
+            finish(pose, seen, proposal)
+            if store:
+                store.write_view(index, pose, seen, proposal)
+            bar.update(1 if proposal is not None else len(stages))
+    episode = Episode(planner, scene, noise, first, key, tuple(finished))
+    if store:
+        store.write_cloud(episode.cloud)
+    return episode
+
+
+def observe_scene(scene: Surface, camera: Camera, pose: Pose, noise: SensorNoise, key: PRNGKeyArray) -> PointCloud:
+    """A noisy scan of the true surface, compiled where the surface allows it."""
+    return _noisy_scan(scene, camera, pose, noise, key) if scene.in_jit else noise(scan(scene, camera, pose), key)
+
+
+@eqx.filter_jit
+def _noisy_scan(scene: Surface, camera: Camera, pose: Pose, noise: SensorNoise, key: PRNGKeyArray) -> PointCloud:
+    return noise(scan(scene, camera, pose), key)

@@ -1,0 +1,216 @@
+"""TriangleMesh: real objects as they come, soups and open sheets included, met by rays through Embree on the host."""
+
+import warnings
+from pathlib import Path
+from typing import ClassVar
+
+import equinox as eqx
+import igl
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from embreex.mesh_construction import TriangleMesh as EmbreeTriangles
+from embreex.rtcore_scene import EmbreeScene
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+from skimage.measure import marching_cubes
+
+from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.cloud import Frame
+from jaxnbv.scanning.grid import Grid, GridSurface
+from jaxnbv.scanning.sdf import SignedDistance
+from jaxnbv.scanning.surface import Hits, Surface
+
+
+class _Tree:
+    """Embree's tree of the triangles it was last asked for: it is no array, so it stays out of the pytree's leaves."""
+
+    def __init__(self):
+        self._vertices = self._faces = self._scene = None
+
+    def of(self, vertices: np.ndarray, faces: np.ndarray) -> EmbreeScene:
+        if self._vertices is not vertices or self._faces is not faces:
+            self._scene = EmbreeScene(robust=True)
+            EmbreeTriangles(self._scene, vertices.astype(np.float32), faces.astype(np.int32))
+            self._vertices, self._faces = vertices, faces
+        return self._scene
+
+
+class TriangleMesh(Surface):
+    """Triangles of any quality: closed or open, consistently wound or not, connected or a soup.
+
+    Build it with `load_mesh` or `from_arrays`, which check the triangles and fit the frame.
+
+    - `vertices`: corners in scene coordinates, float64 on the host.
+    - `faces`: three rows of `vertices` for each triangle.
+    - `frame`: from the world that the mesh was given in to the scene.
+
+    Rays are traced by host code: `trace` cannot run under JAX transformations.
+    """
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    frame: Frame
+    _tree: _Tree = eqx.field(static=True)
+    in_jit: ClassVar[bool] = False
+
+    def __init__(self, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], frame: Frame):
+        self.vertices = np.asarray(vertices, dtype=np.float64)
+        self.faces = np.asarray(faces, dtype=np.int64)
+        self.frame = frame
+        self._tree = _Tree()
+
+    @classmethod
+    def from_arrays(cls, vertices: Float[AnyArray, "v 3"] | list, faces: Int[AnyArray, "f 3"] | list) -> "TriangleMesh":
+        """The mesh of world coordinates and corner indices, in the frame that makes its longest side 2.5.
+
+        Vertices that no face uses are dropped. So are faces of zero area, with a `UserWarning`.
+
+        **Raises:** `ValueError` for other shapes, no faces, indices that are not integers or out of range, vertices
+        that are not finite, or no face of positive area.
+        """
+        vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
+        require(
+            faces.size > 0,
+            "the mesh has no faces: a point cloud or an empty file cannot be scanned; give a triangle mesh",
+        )
+        for name, array in (("vertices", vertices), ("faces", faces)):
+            require(array.ndim == 2 and array.shape[1] == 3, f"the mesh's {name} must be (n, 3), got {array.shape}")
+        require(faces.dtype.kind in "iu", f"faces are rows of vertex indices and must be integers, got {faces.dtype}")
+        low, high = int(faces.min()), int(faces.max())
+        require(
+            low >= 0 and high < len(vertices),
+            f"faces refer to vertices {low} to {high}, but there are {len(vertices)}, counted from 0: "
+            "renumber or drop these faces",
+        )
+        bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+        require(
+            bad.size == 0,
+            f"{bad.size} vertices of the mesh are not finite, the first at row {bad[:1]}: "
+            "drop them and the faces that use them",
+        )
+        # Half of the cross product, compared with the size of the mesh so that the unit of length does not matter.
+        corners = vertices[faces]
+        area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        solid = area > 1e-14 * np.ptp(corners.reshape(-1, 3), axis=0).max() ** 2
+        require(bool(solid.any()), f"all {len(faces)} faces of the mesh have zero area: nothing can be scanned")
+        if not solid.all():
+            warnings.warn(f"dropped {(~solid).sum()} of {len(faces)} faces: they have zero area", stacklevel=2)
+        used, faces = np.unique(faces[solid], return_inverse=True)
+        vertices = vertices[used]
+        frame = Frame.fit(vertices)
+        return cls(frame.to_scene(vertices), faces.reshape(-1, 3), frame)
+
+    def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
+        """First hits, exact on the triangles' planes.
+
+        **Raises:** `ValueError` under `jit`, `vmap` or `grad`.
+        """
+        require(
+            not is_traced(self, origins, directions),
+            "a TriangleMesh is scanned by host code and cannot be traced by JAX: scan it outside jit, vmap and grad, "
+            "or trace mesh.to_grid_surface() instead, which runs inside",
+        )
+        origins, directions = (np.asarray(a, dtype=np.float64) for a in (origins, directions))
+        scene = self._tree.of(self.vertices, self.faces)
+        found = scene.run(origins.astype(np.float32), directions.astype(np.float32), output=1)
+        (hit,) = np.nonzero(found["primID"] >= 0)
+        origins, directions, near = origins[hit], directions[hit], found["tfar"][hit]
+        a, b, c = np.moveaxis(self.vertices[self.faces[found["primID"][hit]]], 1, 0)
+        normals = np.cross(b - a, c - a)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        cosine = np.sum(normals * directions, axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = np.sum(normals * (a - origins), axis=1) / cosine
+        # A triangle seen edge-on has no well-defined place on its plane; Embree's float32 depth stays in the triangle.
+        depth = np.where(np.abs(depth - near) < 1e-3, depth, near)
+        mask = np.zeros(len(found["primID"]), dtype=bool)
+        mask[hit] = True
+        points, outward = np.zeros((2, len(mask), 3))
+        points[hit] = origins + depth[:, None] * directions
+        outward[hit] = normals * np.where(cosine > 0, -1.0, 1.0)[:, None]
+        dtype = jnp.result_type(float)
+        return Hits(jnp.asarray(points, dtype), jnp.asarray(outward, dtype), jnp.asarray(mask))
+
+    def sample_points(self, key: PRNGKeyArray, count: int) -> Float[np.ndarray, "count 3"]:
+        """`count` random points of the surface, uniform by area, in scene coordinates.
+
+        **Raises:** `ValueError` if `count` < 1.
+        """
+        require(count >= 1, f"cannot sample {count} points; ask for at least one")
+        seed = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        points, _ = trimesh.sample.sample_surface(self.to_trimesh(), count, seed=seed)
+        return np.asarray(points)
+
+    def to_signed_distance(self, grid: Grid = Grid()) -> Float[Array, "g g g"]:
+        """Distance to the mesh at the grid's nodes, negative inside.
+
+        Inside is where the winding number is above 1/2 (Barill et al. 2018), which forgives small holes. An open
+        sheet encloses nothing, and a mesh wound inside out has its inside nowhere: their distances are all positive.
+        """
+        axis = grid.axis
+        nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+        sign = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
+        distance = igl.signed_distance(nodes, self.vertices, self.faces, sign)[0]
+        return jnp.asarray(distance.reshape((grid.resolution,) * 3), jnp.result_type(float))
+
+    def to_grid_surface(self, grid: Grid = Grid()) -> GridSurface:
+        """The mesh as the zero set of its signed distance on a grid: it rounds off what is finer than the grid, and
+        can be traced inside `jit`.
+
+        **Raises:** `ValueError` if the mesh encloses no node of the grid, such as an open sheet.
+        """
+        distance = self.to_signed_distance(grid)
+        require(
+            bool((distance < 0).any()),
+            "the mesh encloses nothing that the grid can hold: close it, orient its faces outward, refine the grid, "
+            "or scan the mesh itself",
+        )
+        return GridSurface.from_values(distance, 0.0, grid)
+
+    def to_trimesh(self) -> trimesh.Trimesh:
+        """The mesh in scene coordinates as trimesh's own, to show, measure or export."""
+        return trimesh.Trimesh(self.vertices, self.faces, process=False)
+
+
+def load_mesh(path: str | Path) -> TriangleMesh:
+    """The mesh in a file of any format that trimesh reads; a scene's geometries are joined where it places them.
+
+    **Raises:** `ValueError` if the file is missing or cannot be read, and as `TriangleMesh.from_arrays` does.
+    """
+    path = Path(path)
+    require(path.is_file(), f"no mesh file at {path}: check the path")
+    try:
+        parts = trimesh.load_scene(path, process=False).dump()
+    except Exception as error:  # Each of trimesh's readers fails in its own way.
+        formats = ", ".join(sorted(trimesh.available_formats()))
+        message = f"cannot read {path} as a mesh ({type(error).__name__}: {error}): it must be one of {formats}"
+        raise ValueError(message) from error
+    parts = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    require(len(parts) > 0, f"{path} has no faces: a point cloud or an empty file cannot be scanned")
+    offsets = np.cumsum([0] + [len(part.vertices) for part in parts])
+    vertices = np.concatenate([part.vertices for part in parts])
+    faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets[:-1], strict=True)])
+    try:
+        return TriangleMesh.from_arrays(vertices, faces)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def mesh_from_sdf(sdf: SignedDistance, grid: Grid = Grid()) -> TriangleMesh:
+    """The surface of a solid as triangles in scene coordinates (the frame is the identity), by marching cubes.
+
+    **Raises:** `ValueError` if no surface lies within the grid.
+    """
+    axis = jnp.asarray(grid.axis, jnp.result_type(float))
+    y, z = jnp.meshgrid(axis, axis, indexing="ij")
+    slab = lambda x: sdf(jnp.stack([jnp.full_like(y, x), y, z], axis=-1))
+    values = np.array(jax.lax.map(slab, axis))
+    low, high = values.min(), values.max()
+    require(
+        low < 0 < high,
+        f"the solid's distances on the grid run from {low:.4g} to {high:.4g}: no surface lies within "
+        f"[-{grid.half_extent}, {grid.half_extent}]^3; move the solid, or give Grid(half_extent=...) that holds it",
+    )
+    vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(grid.spacing,) * 3, gradient_direction="descent")
+    return TriangleMesh(vertices - grid.half_extent, faces, Frame())

@@ -1,0 +1,302 @@
+"""Analytic signed distance functions and constructive solid geometry of them.
+
+A signed distance function is negative inside the solid. All functions here have slopes of at most one, so their
+magnitude never exceeds the distance to the surface and a ray may stride by it (Hart 1996). Each class says whether it
+is *exact* or a *bound*, for exact parts. Parameters are arrays: build a batch of scenes with `jax.vmap` and scan them
+in one jitted function.
+"""
+
+import functools
+from abc import abstractmethod
+from dataclasses import fields
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxnbv.camera import Pose
+from jaxnbv.checks import AnyArray, is_traced, require
+
+
+def _as_float(value):
+    return jnp.asarray(value, dtype=jnp.result_type(float))
+
+
+def _parameter(**kwargs):
+    return eqx.field(converter=_as_float, **kwargs)
+
+
+def _length(**kwargs):
+    """A parameter that must not be negative."""
+    return _parameter(metadata={"length": True}, **kwargs)
+
+
+@jax.custom_jvp
+def _norm(*components):
+    """Euclidean length of the vectors with these components, with derivative zero at zero."""
+    return jnp.sqrt(sum(c * c for c in components))
+
+
+@_norm.defjvp
+def _norm_jvp(components, tangents):
+    length = _norm(*components)
+    inverse = 1.0 / jnp.where(length > 0, length, 1.0)
+    return length, sum(inverse * c * dc for c, dc in zip(components, tangents, strict=True))
+
+
+def _split(x):
+    return x[..., 0], x[..., 1], x[..., 2]
+
+
+# Selections rather than jnp.minimum and jnp.maximum, whose derivatives share out ties at many times the cost.
+def _least(a, b):
+    return jnp.where(a <= b, a, b)
+
+
+def _greatest(a, b):
+    return jnp.where(a >= b, a, b)
+
+
+def _corner(*q):
+    """Signed distance to the corner, edge or face where all q <= 0, given the signed distances q to its faces."""
+    outside = _norm(*(_greatest(c, 0.0) for c in q))
+    return outside + _least(functools.reduce(_greatest, q), 0.0)
+
+
+class SignedDistance(eqx.Module):
+    """A solid by its signed distance function, in scene units: negative inside.
+
+    A subclass gives `__call__`, which treats every point on its own, has slopes of at most one and changes sign at the
+    surface. Solids combine as sets: `a | b`, `a & b`, `a - b`.
+
+    **Raises:** `ValueError` if a parameter is not finite, has the wrong shape, or is a negative length.
+    """
+
+    @abstractmethod
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        """The signed distance at the points x."""
+
+    def __check_init__(self):
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not eqx.is_array(value):
+                continue
+            name = f"{type(self).__name__}.{field.name}"
+            shape = tuple(int(size) for size in field.type.dim_str.split())
+            require(
+                value.shape == shape,
+                f"{name} has shape {value.shape}, not {shape}: for a batch of solids build it inside jax.vmap",
+            )
+            if not is_traced(value):
+                require(bool(jnp.isfinite(value).all()), f"{name} is {value}: give finite numbers")
+                if "length" in field.metadata:
+                    require(bool((value >= 0).all()), f"{name} is {value}: a length must not be negative")
+
+    def translate(self, offset) -> "Translated":
+        """The solid moved by `offset` (3,)."""
+        return Translated(self, offset)
+
+    def rotate(self, axis, angle) -> "Rotated":
+        """The solid turned about the direction `axis` (3,) through the origin, by `angle` radians, right-handed.
+
+        **Raises:** `ValueError` if the axis is zero.
+        """
+        axis, angle = _as_float(axis), _as_float(angle)
+        if not is_traced(axis):
+            require(bool(_norm(*axis) > 0), f"the axis of rotation is {axis}: give a direction that is not zero")
+        x, y, z = axis / _norm(*axis)
+        zero = jnp.zeros_like(x)
+        cross = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+        return Rotated(self, jnp.eye(3) + jnp.sin(angle) * cross + (1.0 - jnp.cos(angle)) * cross @ cross)
+
+    def transform(self, pose: Pose) -> "Translated":
+        """The solid moved rigidly: a point p of it goes to `pose.rotation @ p + pose.position`."""
+        return Rotated(self, pose.rotation).translate(pose.position)
+
+    def scale(self, factor) -> "Scaled":
+        """The solid scaled about the origin by a positive factor."""
+        return Scaled(self, factor)
+
+    def __or__(self, other: "SignedDistance") -> "Union":
+        return Union(self, other)
+
+    def __and__(self, other: "SignedDistance") -> "Intersection":
+        return Intersection(self, other)
+
+    def __sub__(self, other: "SignedDistance") -> "Difference":
+        return Difference(self, other)
+
+
+class Sphere(SignedDistance):
+    """The ball of `radius` about the origin. Exact."""
+
+    radius: Float[Array, ""] = _length()
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        return _norm(*_split(x)) - self.radius
+
+
+class Box(SignedDistance):
+    """The box [-half_size, half_size] with edges rounded by `rounding`, which leaves its outer size as it is. Exact.
+
+    **Raises:** `ValueError` also if the rounding is greater than half of a side.
+    """
+
+    half_size: Float[Array, "3"] = _length()
+    rounding: Float[Array, ""] = _length(default=0.0)
+
+    def __check_init__(self):
+        if not is_traced(self):
+            require(
+                bool((self.rounding <= self.half_size).all()),
+                f"a box of half sizes {self.half_size} cannot be rounded by {self.rounding}: round it by less",
+            )
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        return _corner(*_split(jnp.abs(x) - (self.half_size - self.rounding))) - self.rounding
+
+
+class Cylinder(SignedDistance):
+    """The solid cylinder about the y axis with flat caps at y = -half_height and half_height. Exact."""
+
+    radius: Float[Array, ""] = _length()
+    half_height: Float[Array, ""] = _length()
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        x, y, z = _split(x)
+        return _corner(_norm(x, z) - self.radius, jnp.abs(y) - self.half_height)
+
+
+class Cone(SignedDistance):
+    """The solid cone about the y axis, capped flat: radii at y = -half_height and y = half_height. Exact."""
+
+    bottom_radius: Float[Array, ""] = _length()
+    top_radius: Float[Array, ""] = _length()
+    half_height: Float[Array, ""] = _length()
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        # The profile in the half plane (r, y): two caps, a slanted edge from the bottom's corner to the top's.
+        x, y, z = _split(x)
+        r = _norm(x, z)
+        widening, rise = self.top_radius - self.bottom_radius, 2.0 * self.half_height
+        slant = _norm(widening, rise)
+        out, up = r - self.bottom_radius, y + self.half_height
+        side = (rise * out - widening * up) / slant
+        along = (widening * out + rise * up) / slant
+        cap = jnp.abs(y) - self.half_height
+        inside = _greatest(side, cap)
+        bottom, top = _norm(out, up), _norm(r - self.top_radius, y - self.half_height)
+        outside = jnp.where(along < 0, bottom, jnp.where(along > slant, top, inside))
+        over_cap = (cap > 0) & (r < jnp.where(y > 0, self.top_radius, self.bottom_radius))
+        return jnp.where(over_cap, cap, jnp.where(inside > 0, outside, inside))
+
+
+class Torus(SignedDistance):
+    """The torus about the y axis: a tube of `minor_radius` around the circle of `major_radius`. Exact."""
+
+    major_radius: Float[Array, ""] = _length()
+    minor_radius: Float[Array, ""] = _length()
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        x, y, z = _split(x)
+        return _norm(_norm(x, z) - self.major_radius, y) - self.minor_radius
+
+
+class Capsule(SignedDistance):
+    """All points within `radius` of the segment from `start` to `end`. Exact."""
+
+    start: Float[Array, "3"] = _parameter()
+    end: Float[Array, "3"] = _parameter()
+    radius: Float[Array, ""] = _length()
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        segment = self.end - self.start
+        squared = jnp.sum(segment**2)
+        offset = _split(x - self.start)
+        along = sum(c * d for c, d in zip(offset, segment, strict=True)) / jnp.where(squared > 0, squared, 1.0)
+        nearest = jnp.clip(along, 0.0, 1.0)
+        return _norm(*(c - nearest * d for c, d in zip(offset, segment, strict=True))) - self.radius
+
+
+class Union(SignedDistance):
+    """The union, min(a, b). Exact outside, a bound inside."""
+
+    first: SignedDistance
+    second: SignedDistance
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        return _least(self.first(x), self.second(x))
+
+
+class SmoothUnion(SignedDistance):
+    """The union with a fillet where the two surfaces come within `width` of each other. A bound.
+
+    min(a, b) - h^2 / (4 width), h = max(width - |a - b|, 0): slopes are averages of those of a and b.
+    """
+
+    first: SignedDistance
+    second: SignedDistance
+    width: Float[Array, ""] = _length()
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        a, b = self.first(x), self.second(x)
+        overlap = _greatest(self.width - jnp.abs(a - b), 0.0)
+        return _least(a, b) - overlap**2 / jnp.where(self.width > 0, 4.0 * self.width, 1.0)
+
+
+class Intersection(SignedDistance):
+    """The intersection, max(a, b). A bound outside, exact inside."""
+
+    first: SignedDistance
+    second: SignedDistance
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        return _greatest(self.first(x), self.second(x))
+
+
+class Difference(SignedDistance):
+    """The first solid without the second, max(a, -b). A bound outside, exact inside."""
+
+    first: SignedDistance
+    second: SignedDistance
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        return _greatest(self.first(x), -self.second(x))
+
+
+class Translated(SignedDistance):
+    """A solid moved by `offset`. As exact as the solid."""
+
+    solid: SignedDistance
+    offset: Float[Array, "3"] = _parameter()
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        return self.solid(x - self.offset)
+
+
+class Rotated(SignedDistance):
+    """A solid turned by a rotation matrix about the origin. As exact as the solid.
+
+    **Raises:** `ValueError` also if the matrix is not a rotation.
+    """
+
+    solid: SignedDistance
+    rotation: Float[Array, "3 3"] = _parameter()
+
+    def __check_init__(self):
+        Pose(self.rotation, jnp.zeros(3))
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        # R^T x written as a sum, which XLA fuses with its neighbours where it would not a matrix product.
+        return self.solid(sum(x[..., i, None] * self.rotation[i] for i in range(3)))
+
+
+class Scaled(SignedDistance):
+    """A solid scaled about the origin by `factor` > 0. As exact as the solid."""
+
+    solid: SignedDistance
+    factor: Float[Array, ""] = _length()
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        return self.factor * self.solid(x / self.factor)

@@ -1,0 +1,311 @@
+"""First zeros along rays of a trilinear interpolant: marching to the cell that holds one, then the root of a cubic.
+
+Coordinates are the grid's: nodes at the integers 0, ..., g - 1 along every axis, cells between them; vectors are lists of
+their components (n,). Values and distances are flat, in C order. A zero is where f first differs in sign from its sign
+at the start of the ray, so a ray that only touches the surface goes on.
+"""
+
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Int8
+
+# A march goes on with a quarter of its rays once no more are under way; batches smaller than this stay together.
+_SHRINK = 4
+_SMALLEST = 8192
+_ROOT_ITERATIONS = 8
+
+# Where the slope of f along a ray is less than this fraction of the spread of f over the cell's corners, the ray grazes.
+_GRAZING = 0.03
+
+CORNERS = tuple((i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1))
+
+
+# The x, y and z components of n vectors, apart: XLA fuses these better than one array of them.
+Triple = list[Float[Array, " n"]]
+
+
+class March(NamedTuple):
+    """Rays u + t du, and how far each has come.
+
+    - `t`: where the ray stands.
+    - `end`: where it leaves the box or, once it has found a zero, the cell of the zero. So t < end after the march
+      says that there is a zero between the two.
+    - `sign`: sign of f at the start, zero while unknown.
+    - `alive`: whether the ray is under way.
+    """
+
+    u: Triple
+    du: Triple
+    t: Float[Array, " n"]
+    end: Float[Array, " n"]
+    sign: Int8[Array, " n"]
+    alive: Bool[Array, " n"]
+
+
+class Field(eqx.Module):
+    """A function on g^3 nodes and the `free_distance` of its (g - 1)^3 cells, both flat."""
+
+    values: Float[Array, " nodes"]
+    distance: Int8[Array, " cells"]
+    g: int = eqx.field(static=True)
+
+    @property
+    def ahead(self) -> float:
+        """Positions are moved ahead by this much (cells, along every axis) before they are turned into a cell.
+
+        It exceeds the rounding of coordinates, so a ray on a border is always in the cell that it enters: it cannot
+        stall, and steps over no more than a sliver of this width. The sign at the start tells a zero in a sliver.
+        """
+        return 16 * float(jnp.finfo(self.values.dtype).eps) * self.g
+
+
+def free_distance(values: Float[Array, "g g g"]) -> Int8[Array, "m m m"]:
+    """How far each of the m^3 = (g - 1)^3 cells is from a change of sign: 0 where its own corners differ in sign.
+
+    Elsewhere the magnitude is a lower bound on the Chebyshev distance (in cells) to the nearest cell with a change of
+    sign, one of 1, 2, 3, 5, 9 and 17, and the sign is that of f in the cell. Zero counts as negative.
+    """
+    maximum = functools.partial(
+        jax.lax.reduce_window, init_value=jnp.int8(-1), computation=jax.lax.max, window_strides=(1, 1, 1)
+    )
+    positive = (values > 0).astype(jnp.int8)
+    high = maximum(positive, window_dimensions=(2, 2, 2), padding="VALID")
+    low = -maximum(-positive, window_dimensions=(2, 2, 2), padding="VALID")
+    near = high - low
+    distance = 1 - near
+    for step in (1, 1, 2, 4, 8):
+        # `near` has grown by step - 1 cells or more, so that its maximum over {-step, 0, step} leaves no hole.
+        for axis in range(3):
+            window, dilation, padding = [1, 1, 1], [1, 1, 1], [(0, 0)] * 3
+            window[axis], dilation[axis], padding[axis] = 3, step, (step, step)
+            near = maximum(near, window_dimensions=window, window_dilation=dilation, padding=padding)
+        distance = distance + jnp.int8(step) * (1 - near)
+    return jnp.where(low > 0, distance, -distance)
+
+
+@jax.custom_jvp
+def first_zero(field: Field, u: Triple, du: Triple) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
+    """t of the first zero along each ray, from its origin or where it enters the box; and whether there is one.
+
+    t is differentiable in values and rays by the implicit function theorem, dt = -(df + grad f . (du_0 + t ddu)) /
+    (grad f . du), with a denominator bounded from below where the ray grazes; t is zero without a zero.
+    """
+    t, mask, _ = _first_zero(field, u, du)
+    return t, mask
+
+
+@first_zero.defjvp
+def _first_zero_jvp(primals, tangents):
+    field, u, du = primals
+    t, mask, cell = _first_zero(field, u, du)
+
+    def value_and_slope(values, u, du):
+        corners = corner_values(cell, Field(values, field.distance, field.g))
+        local = [x + t * d - c for x, d, c in zip(u, du, cell, strict=True)]
+        value, slope, *_ = cubic(corners, local, du)
+        spread = functools.reduce(jnp.maximum, corners) - functools.reduce(jnp.minimum, corners)
+        return value, (slope, _GRAZING * spread * jnp.sqrt(sum(d * d for d in du)))
+
+    _, change, (slope, least) = jax.jvp(
+        value_and_slope, (field.values, u, du), (tangents[0].values, *tangents[1:]), has_aux=True
+    )
+    slope = jnp.where(jnp.abs(slope) < least, jnp.copysign(least, slope), slope)
+    dt = jnp.where(mask, -change / jnp.where(slope == 0, 1.0, slope), 0.0)
+    return (t, mask), (dt, np.zeros(mask.shape, jax.dtypes.float0))
+
+
+def _first_zero(field: Field, u: Triple, du: Triple):
+    """t of the first zeros, whether there is one, and its cell."""
+    rays, start = enter(u, du, field)
+    rays = march(rays, field)
+    mask = rays.t < rays.end
+    rays = rays._replace(t=jnp.where(mask, rays.t, 0.0), end=jnp.where(mask, rays.end, 0.0))
+    local, cell = cell_at(rays, field)
+    width = rays.end - rays.t
+    coefficients = cubic(corner_values(cell, field), local, [d * width for d in rays.du])
+    root = first_root([c * rays.sign for c in coefficients])
+    return jnp.where(mask, start + rays.t + root * width, 0.0), mask, cell
+
+
+def smooth_gradient(field: Field, x: Triple) -> Triple:
+    """Gradient, per cell, of the function at x within the grid: central differences at the nodes (one-sided on the
+    border), interpolated linearly, so that it is continuous where the interpolant's own gradient jumps."""
+    last = field.g - 1
+    cell = [jnp.clip(jnp.floor(jax.lax.stop_gradient(p)).astype(jnp.int32), 0, last - 1) for p in x]
+    local = [p - c for p, c in zip(x, cell, strict=True)]
+    index = [{offset: jnp.clip(c + offset, 0, last) for offset in (-1, 0, 1, 2)} for c in cell]
+
+    @functools.cache
+    def value(i, j, k):
+        return _take(field.values, _flat([index[0][i], index[1][j], index[2][k]], field.g))
+
+    gradient = []
+    for axis in range(3):
+        total = jnp.zeros_like(x[axis])
+        for node in CORNERS:
+            ahead, behind = ([n + step * (a == axis) for a, n in enumerate(node)] for step in (1, -1))
+            width = index[axis][ahead[axis]] - index[axis][behind[axis]]
+            weight = functools.reduce(jnp.multiply, [p if n else 1.0 - p for p, n in zip(local, node, strict=True)])
+            total += weight * (value(*ahead) - value(*behind)) / width
+        gradient.append(total)
+    return gradient
+
+
+def enter(u: Triple, du: Triple, field: Field) -> tuple[March, Float[Array, " n"]]:
+    """Rays set on the box, from where they enter it, and the t of that place, from which the march counts."""
+    # The box is smaller by a sliver so that no position, rounded and moved ahead, lies out of the grid.
+    low, high = 2 * field.ahead, field.g - 1 - 2 * field.ahead
+    du = [jnp.where(jnp.abs(d) < 1e-9, 1e-9, d) for d in du]
+    sides = [((low - x) / d, (high - x) / d) for x, d in zip(u, du, strict=True)]
+    start = functools.reduce(jnp.maximum, [jnp.minimum(p, q) for p, q in sides], 0.0)
+    end = functools.reduce(jnp.minimum, [jnp.maximum(p, q) for p, q in sides])
+    u = [jnp.clip(x + start * d, low, high) for x, d in zip(u, du, strict=True)]
+    unknown = jnp.zeros(start.shape, jnp.int8)
+    return March(u, du, jnp.zeros_like(start), end - start, unknown, start < end), start
+
+
+def march(rays: March, field: Field) -> March:
+    """Every ray at its first zero or out of the box (see `March.end`); none is left under way."""
+    count = rays.t.size
+    remainder = count // _SHRINK if count > _SMALLEST else 0
+    rays = jax.lax.while_loop(
+        lambda rays: jnp.sum(rays.alive) > remainder,
+        lambda rays: _search_cell(_stride(rays, field), field),
+        rays,
+    )
+    if remainder == 0:
+        return rays
+    index = jnp.nonzero(rays.alive, size=remainder, fill_value=count)[0]
+    rest = jax.tree.map(lambda leaf: jnp.take(leaf, index, mode="clip"), rays)
+    rest = march(rest._replace(alive=index < count), field)
+    put = lambda leaf, part: leaf.at[index].set(part, mode="drop", unique_indices=True)
+    return rays._replace(t=put(rays.t, rest.t), end=put(rays.end, rest.end), sign=put(rays.sign, rest.sign))
+
+
+def _stride(rays: March, field: Field) -> March:
+    """Rays moved through cells without a change of sign, until most are at a cell with one or out of the box."""
+
+    def step(state):
+        rays, _ = state
+        _, cell = cell_at(rays, field)
+        distance = _take(field.distance, _flat(cell, field.g - 1))
+        sign = jnp.where(rays.sign == 0, jnp.sign(distance), rays.sign)
+        free = rays.alive & (distance * sign > 0)
+        leave = _leave(rays, cell, jnp.abs(distance).astype(jnp.int32) - 1)
+        t = jnp.where(free, leave, rays.t)
+        alive = rays.alive & (t < rays.end)
+        return rays._replace(t=t, sign=sign, alive=alive), free & alive
+
+    few = rays.t.size // 8
+    return jax.lax.while_loop(lambda state: jnp.sum(state[1]) > few, step, step((rays, rays.alive)))[0]
+
+
+def _search_cell(rays: March, field: Field) -> March:
+    """Rays that stand at a cell with a change of sign: stopped where it holds a zero of theirs, else moved past it."""
+    local, cell = cell_at(rays, field)
+    distance = _take(field.distance, _flat(cell, field.g - 1))
+    here = rays.alive & (distance * rays.sign <= 0)
+    leave = jnp.minimum(_leave(rays, cell, 0), rays.end)
+    coefficients = cubic(corner_values(cell, field), local, [d * (leave - rays.t) for d in rays.du])
+    sign = jnp.where(rays.sign == 0, jnp.where(coefficients[0] > 0, 1, -1).astype(jnp.int8), rays.sign)
+    _, found = first_bracket([c * sign for c in coefficients])
+    found = found & here
+    end = jnp.where(found, leave, rays.end)
+    t = jnp.where(here & ~found, leave, rays.t)
+    return rays._replace(t=t, end=end, sign=jnp.where(here, sign, rays.sign), alive=rays.alive & ~found & (t < end))
+
+
+def cell_at(rays: March, field: Field) -> tuple[Triple, list[Int[Array, " n"]]]:
+    """The cell that rays are in or about to enter, and where they stand in its coordinates, within [0, 1]."""
+    position = [x + rays.t * d for x, d in zip(rays.u, rays.du, strict=True)]
+    cell = [
+        jnp.floor(x + jnp.where(d > 0, field.ahead, -field.ahead)).astype(jnp.int32)
+        for x, d in zip(position, rays.du, strict=True)
+    ]
+    return [x - c for x, c in zip(position, cell, strict=True)], cell
+
+
+def _leave(rays: March, cell: list[Int[Array, " n"]], reach) -> Float[Array, " n"]:
+    """t at which rays leave the cube of cells within a Chebyshev distance `reach` of the cell."""
+    borders = [
+        (c + jnp.where(d > 0, reach + 1, -reach) - x) / d for c, x, d in zip(cell, rays.u, rays.du, strict=True)
+    ]
+    return functools.reduce(jnp.minimum, borders)
+
+
+def _flat(index: list[Int[Array, " n"]], side: int) -> Int[Array, " n"]:
+    return (index[0] * side + index[1]) * side + index[2]
+
+
+def corner_values(cell: list[Int[Array, " n"]], field: Field) -> list[Float[Array, " n"]]:
+    """Values at the corners of cells, in the order of `CORNERS`."""
+    base = _flat(cell, field.g)
+    return [_take(field.values, base + (i * field.g + j) * field.g + k) for i, j, k in CORNERS]
+
+
+def cubic(corners: list, a: Triple, b: Triple) -> list[Float[Array, " n"]]:
+    """Coefficients c_0, ..., c_3 in s of the trilinear function along a + s b, in coordinates local to the cell.
+
+    Linear interpolation along z, y and x in turn, each time with polynomials one degree higher.
+    """
+    polynomials = [[corner] for corner in corners]
+    for x, dx in ((a[2], b[2]), (a[1], b[1]), (a[0], b[0])):
+        merged = []
+        for p, q in zip(polynomials[0::2], polynomials[1::2], strict=True):
+            difference = [qi - pi for pi, qi in zip(p, q, strict=True)]
+            constant = [pi + di * x for pi, di in zip(p, difference, strict=True)]
+            linear = [di * dx for di in difference]
+            merged.append([constant[0], *(c + d for c, d in zip(constant[1:], linear[:-1], strict=True)), linear[-1]])
+        polynomials = merged
+    return polynomials[0]
+
+
+def first_bracket(c: list) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
+    """For cubics positive at 0: an s such that the first root in [0, 1] is the only one in [0, s]; whether there is one.
+
+    A cubic positive at 0 that is not positive at its local minimum has one root before that. Else it has at most one
+    in [0, 1], and only if it is not positive at 1. One not positive at 0 has its root there.
+    """
+    discriminant = c[2] * c[2] - 3.0 * c[3] * c[1]
+    root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
+    # Both are the larger root of the derivative over c_3; each avoids cancellation for one sign of c_2.
+    numerator = jnp.where(c[2] > 0, -c[1], root - c[2])
+    denominator = jnp.where(c[2] > 0, c[2] + root, 3.0 * c[3])
+    minimum = numerator / jnp.where(denominator == 0, 1.0, denominator)
+    exists = (discriminant > 0) & (denominator != 0) & (minimum > 0) & (minimum < 1)
+    dips = exists & (_polynomial(c, minimum) <= 0)
+    return jnp.where(dips, minimum, 1.0), dips | (c[0] <= 0) | (_polynomial(c, 1.0) <= 0)
+
+
+def first_root(c: list) -> Float[Array, " n"]:
+    """The first root in [0, 1] of cubics that have one and are positive at 0; 0 where they are not.
+
+    Newton's method, and bisection where it leaves the bracket.
+    """
+    high, _ = first_bracket(c)
+    drop = c[0] - _polynomial(c, high)
+    secant = high * jnp.clip(c[0] / jnp.where(drop > 0, drop, 1.0), 0.0, 1.0)
+
+    def refine(_, state):
+        low, high, s = state
+        value = _polynomial(c, s)
+        slope = c[1] + s * (2.0 * c[2] + s * 3.0 * c[3])
+        low, high = jnp.where(value > 0, s, low), jnp.where(value > 0, high, s)
+        newton = s - value / jnp.where(slope == 0, 1.0, slope)
+        return low, high, jnp.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
+
+    _, _, s = jax.lax.fori_loop(0, _ROOT_ITERATIONS, refine, (jnp.zeros_like(high), high, secant))
+    return jnp.where(c[0] <= 0, 0.0, s)
+
+
+def _polynomial(c: list, s) -> Float[Array, " n"]:
+    return c[0] + s * (c[1] + s * (c[2] + s * c[3]))
+
+
+def _take(array: Array, index: Int[Array, " n"]) -> Array:
+    return array.at[index].get(mode="promise_in_bounds")

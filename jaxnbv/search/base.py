@@ -1,0 +1,91 @@
+"""What a search is asked, and what it answers."""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from jaxnbv.acquisition import Score, expected_score
+from jaxnbv.camera import Camera, Pose, fibonacci_sphere, look_at
+from jaxnbv.checks import require
+from jaxnbv.cloud import PointCloud
+from jaxnbv.scanning import GridSurface
+
+
+class Problem(eqx.Module):
+    """One step's question: where to look next.
+
+    - `cloud`: D, what has been seen.
+    - `visited`: the poses taken so far in the first `num_visited` rows; the others hold nothing.
+    - `surfaces`: the step's posterior samples along a leading axis; None for a search that does not ask for them.
+    """
+
+    cloud: PointCloud
+    visited: Pose
+    num_visited: Int[Array, ""]
+    camera: Camera
+    score: Score
+    surfaces: GridSurface | None
+
+    def acquisition(self, poses: Pose) -> Float[Array, " poses"]:
+        """The acquisition at a batch of poses."""
+        if self.surfaces is None:
+            raise ValueError("the acquisition needs posterior samples: set uses_samples = True on the search")
+        return expected_score(self.score, self.cloud, self.surfaces, self.camera, poses)
+
+    def is_visited(self, poses: Pose) -> Bool[Array, " poses"]:
+        """Whether each of a batch of poses equals one taken before, to 1e-3 in position and viewing direction."""
+        near = jnp.linalg.norm(poses.position[:, None] - self.visited.position[None], axis=-1) < 1e-3
+        aligned = jnp.linalg.norm(poses.forward[:, None] - self.visited.forward[None], axis=-1) < 1e-3
+        return jnp.any(near & aligned & self._is_filled, axis=1)
+
+    def distance_to_visited(self, poses: Pose) -> Float[Array, " poses"]:
+        """Distance from each of a batch of positions to the nearest one taken before; infinite if there is none."""
+        distance = jnp.linalg.norm(poses.position[:, None] - self.visited.position[None], axis=-1)
+        return jnp.min(jnp.where(self._is_filled, distance, jnp.inf), axis=1)
+
+    @property
+    def _is_filled(self) -> Bool[Array, " views"]:
+        return jnp.arange(self.visited.position.shape[0]) < self.num_visited
+
+
+class Proposal(eqx.Module):
+    """A search's answer: the pose to take next, and what it looked at.
+
+    - `value`: the chosen pose's value, in the units of what the search maximises.
+    - `candidates`, `values`: every pose looked at and its value; -inf where it was excluded as visited.
+    """
+
+    pose: Pose
+    value: Float[Array, ""]
+    candidates: Pose
+    values: Float[Array, " candidates"]
+
+
+class Search(eqx.Module):
+    """How a pose is found. `uses_samples` says whether posterior samples must be drawn for it."""
+
+    uses_samples: eqx.AbstractClassVar[bool]
+
+    @abstractmethod
+    def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
+        """The pose to take next; a pure function of its arguments, which runs under `jit`."""
+
+
+def sphere_candidates(count: int, radius: float) -> Pose:
+    """The paper's candidate pool: a Fibonacci sphere of cameras that look at the origin."""
+    return look_at(fibonacci_sphere(count, radius))
+
+
+def best_unvisited(problem: Problem, candidates: Pose, values: Float[Array, " candidates"]) -> Proposal:
+    """The candidate of the highest value among those not visited yet; the first of them where values tie."""
+    values = jnp.where(problem.is_visited(candidates), -jnp.inf, values)
+    index = jnp.argmax(values)
+    return Proposal(candidates[index], values[index], candidates, values)
+
+
+def check_candidates(count: int, radius: float) -> None:
+    """Raise `ValueError` unless there are candidates and the sphere has a radius."""
+    require(count >= 1, f"the search has {count} candidates; it needs at least one")
+    require(radius > 0, f"the candidates' sphere has radius {radius}; it must be positive")

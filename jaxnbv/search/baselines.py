@@ -1,0 +1,91 @@
+"""The paper's three baselines, over the same candidate pool as the discrete search."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from jaxnbv.camera import Pose
+from jaxnbv.search.base import Problem, Proposal, Search, best_unvisited, check_candidates, sphere_candidates
+
+
+class FarthestView(Search):
+    """Farthest point sampling of views: the candidate whose nearest visited camera is farthest away."""
+
+    num_candidates: int = eqx.field(static=True, default=120)
+    radius: float = eqx.field(static=True, default=2.5)
+    uses_samples: ClassVar[bool] = False
+
+    def __check_init__(self):
+        check_candidates(self.num_candidates, self.radius)
+
+    def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
+        """Values are distances in scene units; the key is not used."""
+        candidates = sphere_candidates(self.num_candidates, self.radius)
+        return best_unvisited(problem, candidates, problem.distance_to_visited(candidates))
+
+
+class RandomView(Search):
+    """A candidate drawn uniformly from those not visited yet."""
+
+    num_candidates: int = eqx.field(static=True, default=120)
+    radius: float = eqx.field(static=True, default=2.5)
+    uses_samples: ClassVar[bool] = False
+
+    def __check_init__(self):
+        check_candidates(self.num_candidates, self.radius)
+
+    def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
+        """Values are the lots that were drawn, uniform on [0, 1)."""
+        candidates = sphere_candidates(self.num_candidates, self.radius)
+        return best_unvisited(problem, candidates, jax.random.uniform(key, (self.num_candidates,)))
+
+
+class UncertaintyView(Search):
+    """The candidate whose principal ray is the most uncertain of where it ends (Holalkere et al. 2025).
+
+    With the transmittance T(t), the share of the samples whose surface the ray has not entered before t, the value is
+    the length of the ray between the first t with T(t) < 1 and the last t with T(t) > 0.05.
+    """
+
+    num_candidates: int = eqx.field(static=True, default=120)
+    radius: float = eqx.field(static=True, default=2.5)
+    uses_samples: ClassVar[bool] = True
+
+    def __check_init__(self):
+        check_candidates(self.num_candidates, self.radius)
+
+    def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
+        """Values are lengths in scene units; the key is not used."""
+        candidates = sphere_candidates(self.num_candidates, self.radius)
+        return best_unvisited(problem, candidates, uncertain_length(problem, candidates))
+
+
+def uncertain_length(problem: Problem, poses: Pose) -> Float[Array, " poses"]:
+    """Length between the first T < 1 and the last T > 0.05 along the principal rays, within the samples' grid.
+
+    Rays are looked at every half cell of the grid; a ray that all samples leave open, or that misses the grid, has
+    length zero.
+    """
+    surfaces = problem.surfaces
+    if surfaces is None:
+        raise ValueError("the transmittance needs posterior samples: set uses_samples = True on the search")
+    grid = surfaces.grid
+    step = 0.5 * grid.spacing
+    # Long enough to cross the grid from any camera outside it that looks at it, and from any inside.
+    reach = jnp.linalg.norm(poses.position, axis=-1, keepdims=True) - 3**0.5 * grid.half_extent
+    depth = jnp.maximum(reach, 0.0) + step * jnp.arange(int(2 * 3**0.5 * grid.half_extent / step) + 2)
+    points = poses.position[:, None] + depth[..., None] * poses.forward[:, None]
+    inside_grid = jnp.all(jnp.abs(points) <= grid.half_extent, axis=-1)
+    coordinates = jnp.moveaxis((points + grid.half_extent) / grid.spacing, -1, 0)
+
+    def is_open(values):
+        field = jax.scipy.ndimage.map_coordinates(values, list(coordinates), order=1, mode="constant", cval=jnp.inf)
+        return jax.lax.cumprod(jnp.where(inside_grid, field > 0, True).astype(points.dtype), axis=1)
+
+    transmittance = jnp.mean(jax.lax.map(is_open, surfaces.values), axis=0)
+    first = jnp.min(jnp.where(inside_grid & (transmittance < 1.0), depth, jnp.inf), axis=1)
+    last = jnp.max(jnp.where(inside_grid & (transmittance > 0.05), depth, -jnp.inf), axis=1)
+    return jnp.maximum(last - first, 0.0)

@@ -1,0 +1,154 @@
+"""Episodes on disk: a folder of plain JSON, NumPy and PLY files, written view by view and never half a file.
+
+    episode.json    the configuration (planner, scene, noise, first pose, seed) and the versions that made it
+    view_00.npz     pose and scan of the first view; view_01.npz and on also hold the candidates and their values
+    cloud.ply       the points that were kept, once the episode is complete
+"""
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from plyfile import PlyData, PlyElement
+
+from jaxnbv.camera import Pose
+from jaxnbv.checks import require
+from jaxnbv.cloud import PointCloud
+from jaxnbv.search import Proposal
+
+_LARGEST_LISTED = 16
+
+
+def describe(thing: Any) -> Any:
+    """A JSON description by which two configurations can be told apart.
+
+    Modules and dataclasses become their fields, small arrays their values, large ones a hash of their bytes, functions
+    and other objects their names.
+    """
+    if dataclasses.is_dataclass(thing) and not isinstance(thing, type):
+        fields = {field.name: describe(getattr(thing, field.name, None)) for field in dataclasses.fields(thing)}
+        return {"type": type(thing).__qualname__, **fields}
+    if isinstance(thing, jax.Array) and jnp.issubdtype(thing.dtype, jax.dtypes.prng_key):
+        return {"type": str(jax.random.key_impl(thing)), "data": jax.random.key_data(thing).tolist()}
+    if isinstance(thing, jax.Array | np.ndarray | np.generic):
+        array = np.asarray(thing)
+        if array.size <= _LARGEST_LISTED:
+            return array.tolist()
+        digest = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
+        return {"shape": list(array.shape), "dtype": str(array.dtype), "sha256": digest}
+    if isinstance(thing, dict):
+        return {str(key): describe(value) for key, value in thing.items()}
+    if isinstance(thing, list | tuple):
+        return [describe(value) for value in thing]
+    if thing is None or isinstance(thing, bool | int | float | str):
+        return thing
+    return getattr(thing, "__qualname__", type(thing).__qualname__)
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the numbers depend on, and the kind of device."""
+    names = ("jaxnbv", "jax", "jaxlib", "equinox", "numpy", "trimesh", "embreex")
+    return {**{name: importlib.metadata.version(name) for name in names}, "device": jax.devices()[0].device_kind}
+
+
+class EpisodeFolder:
+    """An episode's folder, open for one configuration.
+
+    **Raises:** `ValueError` if the folder holds an episode of another configuration, or files that are not an
+    episode's.
+    """
+
+    def __init__(self, path: str | Path, config: dict[str, Any]):
+        self.path = Path(path)
+        record = self.path / "episode.json"
+        if not record.exists():
+            foreign = sorted(entry.name for entry in self.path.iterdir()) if self.path.exists() else []
+            require(
+                not [name for name in foreign if not name.endswith(".partial")],
+                f"the output folder {self.path} holds other files ({', '.join(foreign[:3])}): choose an empty folder",
+            )
+            self.path.mkdir(parents=True, exist_ok=True)
+            text = json.dumps({"config": config, "versions": versions()}, indent=2)
+            _write_whole(record, lambda file: file.write(text.encode()))
+            return
+        try:
+            found = json.loads(record.read_text())["config"]
+        except (json.JSONDecodeError, KeyError, UnicodeDecodeError) as error:
+            raise ValueError(f"{record} is not an episode's record ({error}): choose another output folder") from error
+        changed = _differences(found, json.loads(json.dumps(config)))
+        require(
+            not changed,
+            f"the output folder {self.path} belongs to another configuration; it differs in {'; '.join(changed[:3])}. "
+            "Choose another folder, or the settings it was made with",
+        )
+
+    def read_views(self) -> list[tuple[Pose, PointCloud, Proposal | None]]:
+        """Pose, scan and proposal of every finished view, up to the first that is missing."""
+        views = []
+        while (file := self._view_file(len(views))).exists():
+            with np.load(file, allow_pickle=False) as saved:
+                data = {name: jnp.asarray(saved[name]) for name in saved.files}
+            pose = Pose(data["rotation"], data["position"])
+            scan = PointCloud(data["points"], data["normals"], data["mask"])
+            proposal = None
+            if "values" in data:
+                candidates = Pose(data["candidate_rotations"], data["candidate_positions"])
+                proposal = Proposal(pose, data["value"], candidates, data["values"])
+            views.append((pose, scan, proposal))
+        return views
+
+    def write_view(self, index: int, pose: Pose, scan: PointCloud, proposal: Proposal | None) -> None:
+        """Write one finished view, all or nothing."""
+        data = {
+            "rotation": pose.rotation,
+            "position": pose.position,
+            "points": scan.points,
+            "normals": scan.normals,
+            "mask": scan.mask,
+        }
+        if proposal is not None:
+            data |= {
+                "value": proposal.value,
+                "values": proposal.values,
+                "candidate_rotations": proposal.candidates.rotation,
+                "candidate_positions": proposal.candidates.position,
+            }
+        arrays = {name: np.asarray(value) for name, value in data.items()}
+        _write_whole(self._view_file(index), lambda file: np.savez_compressed(file, **arrays))
+
+    def write_cloud(self, cloud: PointCloud) -> None:
+        """Write the kept points and normals as a binary PLY file, in scene coordinates."""
+        points, normals = cloud.to_numpy()
+        rows = np.concatenate([points, normals], axis=1).astype("<f4")
+        vertices = np.rec.fromarrays(rows.T, names="x,y,z,nx,ny,nz")
+        ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=["scene coordinates"])
+        _write_whole(self.path / "cloud.ply", ply.write)
+
+    def _view_file(self, index: int) -> Path:
+        return self.path / f"view_{index:02d}.npz"
+
+
+def _write_whole(path: Path, write: Callable[[Any], Any]) -> None:
+    """Write beside the file and rename, so that a reader finds the old file or the whole new one, never a part."""
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("wb") as file:
+        write(file)
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
+
+
+def _differences(found: Any, asked: Any, name: str = "") -> list[str]:
+    if isinstance(found, dict) and isinstance(asked, dict):
+        keys = list(dict.fromkeys([*found, *asked]))
+        nested = (_differences(found.get(key), asked.get(key), f"{name}.{key}".lstrip(".")) for key in keys)
+        return [difference for group in nested for difference in group]
+    return [] if found == asked else [f"{name}: {found} there, {asked} now"]

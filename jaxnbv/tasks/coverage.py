@@ -1,0 +1,24 @@
+"""Geometric exploration: scan what is far from everything scanned so far."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxnbv.acquisition import Score
+from jaxnbv.cloud import PointCloud
+from jaxnbv.neighbours import nearest_squared_distance
+
+
+class Coverage(Score):
+    """The paper's alpha^(CD): sum over the points x of the scan of min_{y in D} |x - y|^2, in squared scene units."""
+
+    differentiable: ClassVar[bool] = True
+
+    def context(self, cloud: PointCloud) -> PointCloud:
+        """D itself."""
+        return cloud
+
+    def __call__(self, context: PointCloud, scan: PointCloud) -> Float[Array, ""]:
+        """Unidirectional Chamfer distance from the scan to D; zero for a scan that sees nothing."""
+        return jnp.sum(jnp.where(scan.mask, nearest_squared_distance(scan.points, context), 0.0))

@@ -1,0 +1,26 @@
+"""Shapes and types of every public signature are checked while the tests run."""
+
+from pathlib import Path
+
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+install_import_hook("jaxnbv", "beartype.beartype")
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+@pytest.fixture
+def x64():
+    """Double precision for one test, for comparison with float64 oracles."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="session")
+def shared():
+    """The maintainers' folder of reference numbers and meshes, which users do not have."""
+    if not SHARED.is_dir():
+        pytest.skip("the maintainers' reference data is not beside this checkout")
+    return SHARED

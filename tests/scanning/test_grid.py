@@ -1,0 +1,386 @@
+"""Traced hits on sampled fields: closed forms, a float64 brute-force march, Embree on marching cubes, properties."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.ndimage
+import trimesh
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from skimage.measure import marching_cubes
+
+from jaxnbv.camera import Camera, fibonacci_sphere, look_at
+from jaxnbv.scanning import tracing
+from jaxnbv.scanning.grid import Grid, GridSurface, scan_samples
+from jaxnbv.scanning.scanner import scan
+
+GRID = Grid(60, 1.75)
+CAMERA = Camera(height=40, width=40)
+
+
+def nodes(grid=GRID):
+    return np.stack(np.meshgrid(grid.axis, grid.axis, grid.axis, indexing="ij"), axis=-1)
+
+
+def sphere(grid=GRID, radius=1.0):
+    return GridSurface.from_values(np.linalg.norm(nodes(grid), axis=-1), radius, grid)
+
+
+def rough_values(grid, seed, amplitude):
+    """A sphere with smoothed noise, of several cells' wavelength."""
+    noise = np.random.default_rng(seed).standard_normal((grid.resolution,) * 3)
+    noise = scipy.ndimage.gaussian_filter(noise, 1.2)
+    return np.linalg.norm(nodes(grid), axis=-1) - 0.9 + amplitude * noise / noise.std()
+
+
+def interpolate(values, points, grid):
+    """The trilinear interpolant in float64."""
+    position = (np.asarray(points, np.float64) + grid.half_extent) / grid.spacing
+    return scipy.ndimage.map_coordinates(np.asarray(values, np.float64), position.T, order=1, mode="nearest")
+
+
+def random_rays(seed, count, radius=2.5, spread=1.0):
+    rng = np.random.default_rng(seed)
+    origins = rng.standard_normal((count, 3))
+    origins *= radius / np.linalg.norm(origins, axis=1, keepdims=True)
+    directions = rng.uniform(-spread, spread, (count, 3)) - origins
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return origins.astype(np.float32), directions.astype(np.float32)
+
+
+def camera_rays(poses):
+    origins, directions = CAMERA.rays(poses)
+    return np.asarray(origins).reshape(-1, 3), np.asarray(directions).reshape(-1, 3)
+
+
+# Linear interpolation of f errs by at most h^2 / 8 (|f_xx| + |f_yy| + |f_zz|); 2e-6 is the rounding of coordinates.
+def interpolation_error(curvatures):
+    return GRID.spacing**2 / 8 * curvatures + 2e-6
+
+
+def test_sphere_closed_form():
+    origins, directions = random_rays(0, 4000, spread=1.5)
+    hits = sphere().trace(origins, directions)
+    points, mask = np.asarray(hits.points, np.float64), np.asarray(hits.mask)
+    # f = |x| has the second derivatives of a sphere, 2 / |x| in all, at nodes no further in than a cell's diagonal.
+    error = interpolation_error(2 / (1 - 2 * GRID.spacing))
+    o, d = origins.astype(np.float64), directions.astype(np.float64)
+    along = -np.sum(o * d, axis=1)
+    squared = np.sum(o**2, axis=1) - along**2
+    clear = np.abs(np.sqrt(squared) - 1) > error
+    assert clear.mean() > 0.99
+    np.testing.assert_array_equal(mask[clear], (squared < 1)[clear])
+    assert np.abs(np.linalg.norm(points[mask], axis=1) - 1).max() < error
+    steep = mask & (squared < 0.5)
+    t = along - np.sqrt(np.maximum(1 - squared, 0))
+    # Where the ray meets the sphere at 45 degrees or more, an error of f moves the hit by at most sqrt(2) of it.
+    assert np.abs(points - (o + t[:, None] * d))[steep].max() < 1.6 * error
+    assert np.all(points[~mask] == 0)
+    assert np.all(np.asarray(hits.normals)[~mask] == 0)
+    # Central differences of |x| err by h^2 / 6 |f_xxx| < h^2 / 2, interpolation by no more.
+    assert np.abs(np.asarray(hits.normals)[mask] - points[mask]).max() < 2 * GRID.spacing**2
+
+
+def test_box_closed_form():
+    half = np.array([0.7, 0.83, 0.9])
+    q = np.abs(nodes()) - half
+    outside = np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0)
+    origins, directions = random_rays(1, 3000, spread=0.6)
+    hits = GridSurface.from_values(outside, 0.0, GRID).trace(origins, directions)
+    o, d = origins.astype(np.float64), directions.astype(np.float64)
+    near = np.minimum((-half - o) / d, (half - o) / d)
+    t, axis = near.max(axis=1), near.argmax(axis=1)
+    expected = o + t[:, None] * d
+    assert np.asarray(hits.mask).all()
+    error = np.linalg.norm(np.asarray(hits.points) - expected, axis=1)
+    # The distance is linear around a face, so interpolation is exact two voxels away from the edges.
+    margin = np.sort(half - np.abs(expected), axis=1)[:, 1]
+    face = margin > 2 * GRID.spacing
+    assert face.sum() > 1000
+    assert error[face].max() < 1e-5 / 0.2
+    normal = -np.sign(d[np.arange(len(d)), axis])[:, None] * np.eye(3)[axis]
+    np.testing.assert_allclose(np.asarray(hits.normals)[face], normal[face], atol=1e-4)
+    # Nearer to an edge the interpolant rounds it off, by less than a voxel.
+    assert np.abs(interpolate(outside, hits.points, GRID)).max() < 1e-4 * GRID.spacing / 0.01
+
+
+def test_torus_closed_form():
+    x = nodes()
+    ring = np.hypot(x[..., 0], x[..., 1]) - 0.85
+    values = np.hypot(ring, x[..., 2])
+    origins, directions = random_rays(2, 3000)
+    hits = GridSurface.from_values(values, 0.4, GRID).trace(origins, directions)
+    points = np.asarray(hits.points, np.float64)[np.asarray(hits.mask)]
+    assert 1000 < len(points) < 3000
+    distance = np.hypot(np.hypot(points[:, 0], points[:, 1]) - 0.85, points[:, 2]) - 0.4
+    # Second derivatives of a distance: the two curvatures of the level sets, here within a cell of the surface.
+    tube, hole = 0.4 - np.sqrt(3) * GRID.spacing, 0.45 - np.sqrt(3) * GRID.spacing
+    assert np.abs(distance).max() < interpolation_error(1 / tube + 1 / hole)
+    # First hits: the torus' quartic, by dense sampling of its distance along the ray.
+    t = np.linspace(0, 5, 5001)
+    o, d = origins[:200].astype(np.float64), directions[:200].astype(np.float64)
+    p = o[:, None] + t[:, None] * d[:, None]
+    inside = np.hypot(np.hypot(p[..., 0], p[..., 1]) - 0.85, p[..., 2]) < 0.4
+    first = np.where(inside.any(axis=1), t[inside.argmax(axis=1)], np.inf)
+    traced = np.where(hits.mask[:200], np.linalg.norm(np.asarray(hits.points[:200]) - o, axis=1), np.inf)
+    close = (first == traced) | (np.abs(np.where(np.isinf(first), 0, first) - traced) < 0.2 * GRID.spacing)
+    assert close.mean() > 0.97  # the others graze
+
+
+def brute_force(values, origins, directions, grid, step):
+    """t of the first change of sign of the interpolant in the box, by dense sampling in float64; inf where none."""
+    o, d = origins.astype(np.float64), directions.astype(np.float64)
+    result = np.full(len(o), np.inf)
+    for i in range(len(o)):
+        with np.errstate(divide="ignore"):
+            sides = np.sort([(-grid.half_extent - o[i]) / d[i], (grid.half_extent - o[i]) / d[i]], axis=0)
+        start, end = max(sides[0].max(), 0.0), sides[1].min()
+        if start < end:
+            t = np.arange(start, end, step)
+            positive = interpolate(values, o[i] + t[:, None] * d[i], grid) > 0
+            changed = np.flatnonzero(positive != positive[0])
+            result[i] = t[changed[0]] if changed.size else np.inf
+    return result
+
+
+@pytest.mark.parametrize("amplitude", [0.05, 0.5])
+def test_brute_force_march(amplitude):
+    grid = Grid(32, 1.5)
+    values = rough_values(grid, 3, amplitude).astype(np.float32)
+    surface = GridSurface.from_values(values, 0.0, grid)
+    outside, inside = random_rays(4, 200), random_rays(5, 100, radius=0.6)
+    origins, directions = (np.concatenate(pair) for pair in zip(outside, inside, strict=True))
+    hits = surface.trace(origins, directions)
+    step = 0.004 * grid.spacing
+    expected = brute_force(values, origins, directions, grid, step)
+    traced = np.where(hits.mask, np.linalg.norm(np.asarray(hits.points) - origins, axis=1), np.inf)
+    assert 100 < np.isfinite(expected).sum() <= 300
+    late = np.where(np.isinf(traced) & np.isinf(expected), 0.0, traced - expected)
+    # A march never ends later than the brute force; it may end earlier, where two zeros lie within one of its steps.
+    assert late.max() < 0.01 * grid.spacing
+    early = late < -0.01 * grid.spacing
+    assert early.mean() < 0.02
+    scale = np.abs(np.diff(values, axis=0)).max()
+    assert np.abs(interpolate(values, hits.points[hits.mask], grid)).max() < 1e-4 * scale
+
+
+@pytest.mark.parametrize(("seed", "amplitude"), [(0, 0.02), (1, 0.1), (2, 0.3)])
+def test_agrees_with_embree_on_marching_cubes(seed, amplitude):
+    values = rough_values(GRID, seed, amplitude).astype(np.float32)
+    origins, directions = camera_rays(look_at(fibonacci_sphere(4, 2.5)))
+    hits = GridSurface.from_values(values, 0.0, GRID).trace(origins, directions)
+    vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(GRID.spacing,) * 3)
+    mesh = trimesh.Trimesh(vertices - GRID.half_extent, faces, process=False)
+    points, rays, _ = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
+    mask = np.zeros(len(origins), bool)
+    mask[rays] = True
+    # Silhouette pixels may differ: flat triangles and the interpolant part by a fraction of a voxel.
+    assert (mask != np.asarray(hits.mask)).mean() < 0.005
+    both = np.asarray(hits.mask)[rays]
+    error = np.linalg.norm(np.asarray(hits.points)[rays] - points, axis=1)[both] / GRID.spacing
+    assert both.sum() > 3000
+    assert np.median(error) < 0.05
+    assert (error > 0.5).mean() < 0.02
+
+
+unit = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(unit, unit, st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
+def test_no_tunnelling_through_a_two_voxel_sheet(normal, direction, shift, slide):
+    grid = Grid(40, 1.75)
+    h = grid.spacing
+    n, d = (np.array(v) / np.linalg.norm(v) for v in (normal, direction))
+    side = -np.sign(d @ n)
+    # A flatter ray enters the box within the sheet.
+    assume(abs(d @ n) > 0.15)
+    surface = GridSurface.from_values(np.abs(nodes(grid) @ n - shift) - h, 0.0, grid)
+    across = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
+    targets = shift * n + np.linspace(-0.5, 0.5, 64)[:, None] * across + slide * np.cross(n, across)
+    hits = surface.trace((targets - 4 * d).astype(np.float32), np.broadcast_to(d, (64, 3)).astype(np.float32))
+    assert np.asarray(hits.mask).all()
+    # By Jensen's inequality the interpolant of |n.x - c| lies between |n.x - c| and sqrt((n.x - c)^2 + h^2 / 4).
+    depth = side * (np.asarray(hits.points, np.float64) @ n - shift) / h
+    assert depth.min() > np.sqrt(0.75) - 1e-4
+    assert depth.max() < 1 + 1e-4
+
+
+def test_sensor_inside_the_surface():
+    _, directions = random_rays(6, 500)
+    hits = sphere().trace(np.zeros_like(directions), directions)
+    assert np.asarray(hits.mask).all()
+    assert np.abs(np.asarray(hits.points) - directions).max() < interpolation_error(2 / (1 - 2 * GRID.spacing))
+    assert np.abs(np.asarray(hits.normals) + directions).max() < 2 * GRID.spacing**2
+
+
+def test_grazing_rays():
+    error = interpolation_error(2 / (1 - 2 * GRID.spacing))
+    height = 1 + error * np.linspace(-2, 2, 401)
+    origins = np.stack([height, np.full_like(height, 0.01), np.full_like(height, -2.5)], axis=1).astype(np.float32)
+    directions = np.tile(np.array([0, 0, 1], np.float32), (len(height), 1))
+    surface = sphere()
+    hits = surface.trace(origins, directions)
+    radius = np.hypot(height, 0.01)
+    assert not np.asarray(hits.mask)[radius > 1 + error].any()
+    assert np.asarray(hits.mask)[radius < 1 - error].all()
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(hits))
+
+    def depth(x, origin, direction):
+        origin = origin.at[0].set(x)
+        return surface.trace(origin[None], direction[None]).points[0, 2]
+
+    slope = jax.vmap(jax.grad(depth))(jnp.asarray(origins[:, 0]), jnp.asarray(origins), jnp.asarray(directions))
+    # |grad f| is at most the spread of f over a cell, so that the bounded ratio is at most 1 / 0.03.
+    assert np.abs(slope).max() < 34
+    assert np.abs(slope).max() > 5
+
+
+def test_filled_and_empty_images():
+    full = scan(sphere(), CAMERA, look_at((0.0, 0.0, 2.5)))
+    assert np.asarray(full.mask).all()
+    aside = scan(sphere(), CAMERA, look_at((0.0, 0.0, 2.5), target=(0.0, 0.0, 5.0)))
+    past = scan(sphere(radius=0.5), CAMERA, look_at((2.5, 0.0, 0.0), target=(0.0, 0.0, 3.0)))
+    nothing = scan(GridSurface.from_values(np.ones((60,) * 3), 0.0, GRID), CAMERA, look_at((0.0, 0.0, 2.5)))
+    for cloud in (aside, past, nothing):
+        assert not np.asarray(cloud.mask).any()
+        assert all((np.asarray(leaf) == 0).all() for leaf in jax.tree.leaves(cloud))
+
+
+def test_axis_parallel_rays_through_nodes_and_edges():
+    grid = Grid(33, 1.6)
+    values = rough_values(grid, 7, 0.1).astype(np.float32)
+    surface = GridSurface.from_values(values, 0.0, grid)
+    a, b = np.meshgrid(grid.axis[1:-1], grid.axis[1:-1] + 0.25 * grid.spacing * (np.arange(31) % 3))
+    a, b = a.ravel(), b.ravel()
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            origins = np.insert(np.stack([a, b], axis=1), axis, -3.0 * sign, axis=1).astype(np.float32)
+            directions = np.tile(sign * np.eye(3, dtype=np.float32)[axis], (len(a), 1))
+            hits = surface.trace(origins, directions)
+            expected = brute_force(values, origins[::37], directions[::37], grid, 0.004 * grid.spacing)
+            traced = np.where(hits.mask, np.abs(np.asarray(hits.points)[:, axis] + 3.0 * sign), np.inf)[::37]
+            assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(hits))
+            assert np.isfinite(expected).sum() > 5
+            np.testing.assert_array_equal(np.isinf(traced), np.isinf(expected))
+            hit = np.isfinite(expected)
+            assert np.abs(traced[hit] - expected[hit]).max() < 0.02 * grid.spacing
+
+
+def test_far_origins_and_rays_on_the_border_of_the_box():
+    surface = sphere()
+    far = surface.trace(np.array([[0.0, 0.0, -500.0]], np.float32), np.array([[0.0, 0.0, 1.0]], np.float32))
+    np.testing.assert_allclose(far.points[0], [0, 0, -1], atol=500 * 1e-6)
+    edges = np.array([[1.75, 1.75, -3], [1.75, 0, -3], [-1.75, -1.75, -3], [0, 0, 1.75]], np.float32)
+    hits = surface.trace(edges, np.tile(np.array([0, 0, 1], np.float32), (4, 1)))
+    assert not np.asarray(hits.mask).any()
+
+
+def test_samples_in_a_batch_equal_single_ones():
+    values = np.stack([rough_values(GRID, seed, 0.1) for seed in range(3)]).astype(np.float32)
+    surfaces = GridSurface.from_values(values, 0.05, GRID)
+    poses = look_at(fibonacci_sphere(5, 2.5))
+    clouds = scan_samples(surfaces, CAMERA, poses)
+    assert clouds.points.shape == (3, 5, 1600, 3)
+    assert clouds.mask.shape == (3, 5, 1600)
+    origins, directions = camera_rays(poses)
+    vmapped = jax.vmap(lambda surface: surface.trace(origins, directions))(surfaces)
+    for i in range(3):
+        single = GridSurface.from_values(values[i], 0.05, GRID)
+        np.testing.assert_array_equal(single.distance, surfaces.distance[i])
+        for j in range(5):
+            expected = scan(single, CAMERA, poses[j])
+            np.testing.assert_array_equal(clouds.mask[i, j], expected.mask)
+            np.testing.assert_allclose(clouds.points[i, j], expected.points, atol=1e-5)
+        np.testing.assert_array_equal(vmapped.mask[i], clouds.mask[i].reshape(-1))
+        np.testing.assert_allclose(vmapped.points[i], clouds.points[i].reshape(-1, 3), atol=1e-5)
+        # Rounding of a point turns the normal by as much as the gradient changes there.
+        np.testing.assert_allclose(vmapped.normals[i], clouds.normals[i].reshape(-1, 3), atol=1e-2)
+
+
+def test_derivatives_of_hits_against_finite_differences():
+    values = rough_values(GRID, 8, 0.02).astype(np.float32)
+    surface = GridSurface.from_values(values, 0.0, GRID)
+    origins, directions = (jnp.asarray(a) for a in random_rays(9, 60, spread=0.5))
+    shift = jnp.asarray(np.random.default_rng(10).standard_normal((60, 3)), jnp.float32)
+    bend = jnp.asarray(np.random.default_rng(11).standard_normal((60, 3)), jnp.float32)
+
+    def distances(step, values):
+        moved = GridSurface(values, surface.distance, GRID)
+        o, d = origins + step * shift, directions + step * bend
+        return jnp.sum((moved.trace(o, d).points - o) * d, axis=-1) / jnp.sum(d * d, axis=-1)
+
+    _, forward = jax.jvp(lambda step: distances(step, surface.values), (0.0,), (1.0,))
+    reverse = jax.jacrev(lambda step: distances(step, surface.values))(0.0)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-3, atol=1e-3)
+    eps = 1e-3
+    central = (distances(eps, surface.values) - distances(-eps, surface.values)) / (2 * eps)
+    # The interpolant has kinks at the cells' borders; rays that cross one within the difference's step are few.
+    error = np.abs(forward - central) / (1 + np.abs(central))
+    assert np.mean(error < 0.02) > 0.85
+    assert np.median(error) < 3e-3
+    # A higher f everywhere is a smaller object: along the normal, a hit recedes by df / |grad f|.
+    _, away = jax.jvp(lambda c: distances(0.0, surface.values + c), (0.0,), (1.0,))
+    raised = (distances(0.0, surface.values + eps) - distances(0.0, surface.values - eps)) / (2 * eps)
+    assert np.median(np.abs(away - raised) / (1 + np.abs(raised))) < 3e-3
+
+
+def test_roots_of_cubics():
+    rng = np.random.default_rng(12)
+    c = rng.standard_normal((4, 5000))
+    c[3, :500], c[2:, 500:1000] = 0.0, 0.0
+    c = np.where(c[0] < 0, -c, c)
+    expected = np.full(5000, np.inf)
+    for i in range(5000):
+        roots = np.roots(np.trim_zeros(c[::-1, i], "f"))
+        real = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real >= 0) & (roots.real <= 1)]
+        expected[i] = real.min(initial=np.inf)
+    _, found = tracing.first_bracket([jnp.asarray(row, jnp.float32) for row in c])
+    root = tracing.first_root([jnp.asarray(row, jnp.float32) for row in c])
+    near = np.minimum(expected % 1, 1 - expected % 1) < 1e-5  # a root at an end of the interval may fall either way
+    close = np.asarray(found) == np.isfinite(expected)
+    assert (close | near).mean() > 0.999  # double roots may fall either way in float32
+    hit = np.isfinite(expected) & np.asarray(found)
+    error = np.abs(np.asarray(root) - expected)[hit]
+    value = np.abs(np.polynomial.polynomial.polyval(np.asarray(root, np.float64), c, tensor=False))[hit]
+    assert value.max() < 1e-4
+    assert np.mean(error < 1e-4) > 0.99
+
+
+def test_free_distance_against_a_distance_transform():
+    values = rough_values(GRID, 13, 0.1)
+    distance = np.asarray(tracing.free_distance(jnp.asarray(values, jnp.float32)))
+    positive = values > 0
+    corners = [positive[i : i + 59, j : j + 59, k : k + 59] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    crossed = np.any(corners, axis=0) & ~np.all(corners, axis=0)
+    exact = scipy.ndimage.distance_transform_cdt(~crossed, metric="chessboard")
+    levels = np.array([0, 1, 2, 3, 5, 9, 17])
+    np.testing.assert_array_equal(np.abs(distance), levels[np.searchsorted(levels, exact, side="right") - 1])
+    np.testing.assert_array_equal(np.sign(distance), np.where(crossed, 0, np.where(corners[0], 1, -1)))
+
+
+def test_normals_are_interpolated_central_differences():
+    values = rough_values(GRID, 14, 0.1).astype(np.float32)
+    hits = GridSurface.from_values(values, 0.0, GRID).trace(*random_rays(15, 500))
+    points = np.asarray(hits.points, np.float64)[np.asarray(hits.mask)]
+    gradient = np.stack([interpolate(g, points, GRID) for g in np.gradient(values.astype(np.float64))], axis=1)
+    gradient /= np.linalg.norm(gradient, axis=1, keepdims=True)
+    normals = np.asarray(hits.normals)[np.asarray(hits.mask)]
+    np.testing.assert_allclose(np.abs(np.sum(normals * gradient, axis=1)), 1.0, atol=1e-4)
+    directions = random_rays(15, 500)[1][np.asarray(hits.mask)]
+    assert (np.sum(normals * directions, axis=1) <= 1e-6).all()
+
+
+def test_refused_input():
+    with pytest.raises(ValueError, match="do not fit a grid of 60"):
+        GridSurface.from_values(np.zeros((50, 50, 50)), 0.0, GRID)
+    with pytest.raises(ValueError, match="not finite"):
+        GridSurface.from_values(np.full((60, 60, 60), np.nan), 0.0, GRID)
+    batch = GridSurface.from_values(np.ones((2, 60, 60, 60)), 0.0, GRID)
+    with pytest.raises(ValueError, match="scan_samples"):
+        batch.trace(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+    with pytest.raises(ValueError, match="3\\^3 nodes is too small"):
+        Grid(3)
+    with pytest.raises(ValueError, match="half extent is -1"):
+        Grid(half_extent=-1.0)

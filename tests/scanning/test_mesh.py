@@ -1,0 +1,230 @@
+"""Mesh rays against closed forms and a slow Moller-Trumbore in NumPy; meshes that are broken."""
+
+from pathlib import Path
+
+import igl
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+from jaxnbv.camera import Camera, fibonacci_sphere, look_at
+from jaxnbv.scanning.grid import Grid
+from jaxnbv.scanning.mesh import TriangleMesh, load_mesh, mesh_from_sdf
+from jaxnbv.scanning.scanner import scan
+from jaxnbv.scanning.sdf import Box, Sphere, Torus
+
+SHARED = Path(__file__).parents[3] / "shared" / "meshes"
+RNG = np.random.default_rng(1)
+
+
+def some_rays(count):
+    origins = RNG.normal(size=(count, 3))
+    origins *= 2.5 / np.linalg.norm(origins, axis=1, keepdims=True)
+    directions = RNG.uniform(-0.8, 0.8, (count, 3)) - origins
+    return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def moller_trumbore(vertices, faces, o, d):
+    """Least positive ray parameter over all triangles, in float64; infinite where a ray misses."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    e1, e2 = b - a, c - a
+    p = np.cross(d[:, None], e2)
+    det = np.sum(p * e1, axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s = o[:, None] - a
+        u = np.sum(s * p, axis=-1) / det
+        q = np.cross(s, e1)
+        v = np.sum(d[:, None] * q, axis=-1) / det
+        t = np.sum(e2 * q, axis=-1) / det
+        return np.where((u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0), t, np.inf).min(axis=1)
+
+
+SHAPES = {
+    "icosphere": trimesh.creation.icosphere(2, 3.0),
+    "box": trimesh.creation.box((2.0, 5.0, 3.0)),
+    "torus": trimesh.creation.torus(2.0, 0.7, 40, 20),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_hits_equal_moller_trumbore(name):
+    mesh = TriangleMesh.from_arrays(SHAPES[name].vertices + 7.0, SHAPES[name].faces)
+    o, d = some_rays(500)
+    hits = mesh.trace(o, d)
+    t = moller_trumbore(mesh.vertices, mesh.faces, o, d)
+    mask = np.asarray(hits.mask)
+    assert (mask != np.isfinite(t)).sum() <= 1
+    use = mask & np.isfinite(t)
+    assert use.sum() > 150
+    np.testing.assert_allclose(np.asarray(hits.points)[use], (o + t[:, None] * d)[use], atol=2e-5)
+    assert (np.sum(np.asarray(hits.normals)[use] * d[use], axis=1) < 0).all()
+    assert not np.asarray(hits.points)[~mask].any()
+
+
+def test_hits_of_a_box_equal_the_closed_form():
+    mesh = TriangleMesh.from_arrays(SHAPES["box"].vertices, SHAPES["box"].faces)
+    half = np.array([0.5, 1.25, 0.75])
+    np.testing.assert_allclose(np.abs(mesh.vertices), np.broadcast_to(half, (8, 3)))
+    o, d = some_rays(2000)
+    hits = mesh.trace(o, d)
+    low, high = (-half - o) / d, (half - o) / d
+    enter, leave = np.minimum(low, high), np.maximum(low, high)
+    t = enter.max(axis=1)
+    expected = t < leave.min(axis=1)
+    mask = np.asarray(hits.mask)
+    assert (mask != expected).mean() < 0.002
+    use = mask & expected
+    np.testing.assert_allclose(np.asarray(hits.points)[use], (o + t[:, None] * d)[use], atol=1e-6)
+    normal = -np.sign(d) * (np.arange(3) == enter.argmax(axis=1)[:, None])
+    assert (np.linalg.norm(np.asarray(hits.normals) - normal, axis=1)[use] < 1e-6).mean() > 0.998
+
+
+def test_normals_face_the_sensor_for_any_winding_and_open_sheets():
+    sphere = SHAPES["icosphere"]
+    flip = RNG.random(len(sphere.faces)) < 0.5
+    faces = np.where(flip[:, None], sphere.faces[:, ::-1], sphere.faces)
+    straight = TriangleMesh.from_arrays(sphere.vertices, sphere.faces)
+    o, d = some_rays(500)
+    expected, hits = straight.trace(o, d), TriangleMesh.from_arrays(sphere.vertices, faces).trace(o, d)
+    np.testing.assert_allclose(hits.points, expected.points, atol=1e-6)
+    np.testing.assert_allclose(hits.normals, expected.normals, atol=1e-6)
+    sheet = TriangleMesh.from_arrays([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [2, 0, 3]])
+    for side in (1.0, -1.0):
+        hits = sheet.trace(np.array([[0.1, 0.2, side]]), np.array([[0.0, 0.0, -side]]))
+        np.testing.assert_allclose(hits.points, [[0.1, 0.2, 0.0]], atol=1e-6)
+        np.testing.assert_allclose(hits.normals, [[0.0, 0.0, side]], atol=1e-6)
+    inside = straight.trace(np.zeros((1, 3)), np.array([[0.0, 0.6, 0.8]]))
+    assert float(jnp.sum(inside.normals * jnp.asarray([0.0, 0.6, 0.8]))) < -0.9
+
+
+def test_frame_and_unused_vertices():
+    vertices = np.array([[0, 0, 0], [10, 0, 0], [0, 4, 0], [0, 0, 2], [999, 999, 999]], dtype=float)
+    mesh = TriangleMesh.from_arrays(vertices, [[0, 1, 2], [0, 2, 3], [0, 1, 3]])
+    assert np.ptp(mesh.vertices, axis=0).max() == pytest.approx(2.5)
+    np.testing.assert_allclose(mesh.frame.to_world(mesh.vertices), vertices[:4], atol=1e-9)
+
+
+def test_tracing_under_jit_names_the_remedy():
+    mesh = TriangleMesh.from_arrays(SHAPES["box"].vertices, SHAPES["box"].faces)
+    o, d = (jnp.asarray(a, dtype=jnp.result_type(float)) for a in some_rays(3))
+    for call in (lambda: jax.jit(lambda o, d: mesh.trace(o, d))(o, d), lambda: jax.jit(lambda m: m.trace(o, d))(mesh)):
+        with pytest.raises(ValueError, match="to_grid_surface"):
+            call()
+
+
+TRIANGLE = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "message"),
+    [
+        (TRIANGLE, np.zeros((0, 3), dtype=int), "no faces"),
+        ([*TRIANGLE[:2], [0.0, np.nan, 0.0]], [[0, 1, 2]], "not finite"),
+        (TRIANGLE, [[0, 1, 3]], "but there are 3"),
+        (TRIANGLE, [[0, 1, -1]], "faces refer to vertices -1"),
+        (TRIANGLE, [[0, 1, 1]], "zero area"),
+        (TRIANGLE, np.array([[0.0, 1.0, 2.0]]), "integers"),
+        (TRIANGLE, [[0, 1, 2, 2]], r"must be \(n, 3\)"),
+    ],
+)
+def test_broken_arrays_are_refused(vertices, faces, message):
+    # The function below the run-time check of shapes, which refuses some of these first.
+    build = getattr(TriangleMesh.from_arrays, "__func__", TriangleMesh.from_arrays)
+    with pytest.raises((ValueError, TypeError), match=f"{message}|[Tt]ype-check"):
+        build(TriangleMesh, vertices, faces)
+
+
+def test_zero_area_faces_are_dropped_and_counted():
+    with pytest.warns(UserWarning, match="dropped 2 of 3 faces"):
+        mesh = TriangleMesh.from_arrays(TRIANGLE, [[0, 1, 2], [0, 0, 1], [2, 2, 2]])
+    assert len(mesh.faces) == 1
+
+
+def test_broken_files_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="no mesh file"):
+        load_mesh(tmp_path / "absent.obj")
+    for name, content in (("garbage.ply", b"\x00\x01garbage"), ("garbage.glb", b"nonsense"), ("mesh.xyzw", b"1")):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match="cannot read"):
+            load_mesh(tmp_path / name)
+    for name, content in (("empty.obj", ""), ("points.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n")):
+        (tmp_path / name).write_text(content)
+        with pytest.raises(ValueError, match=r"no faces|cannot read"):
+            load_mesh(tmp_path / name)
+    (tmp_path / "nan.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n")
+    with pytest.raises(ValueError, match=r"nan\.obj.*not finite"):
+        load_mesh(tmp_path / "nan.obj")
+
+
+def test_a_scene_is_joined_where_it_places_its_parts(tmp_path):
+    scene = trimesh.Scene()
+    box = trimesh.creation.box((1.0, 1.0, 1.0))
+    scene.add_geometry(box)
+    scene.add_geometry(box.copy(), transform=trimesh.transformations.translation_matrix([4.0, 0.0, 0.0]))
+    scene.export(tmp_path / "two.glb")
+    mesh = load_mesh(tmp_path / "two.glb")
+    assert len(mesh.faces) == 24
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [2.5, 0.5, 0.5], atol=1e-6)
+
+
+def test_samples_lie_on_the_surface_and_are_even_by_area():
+    mesh = TriangleMesh.from_arrays(SHAPES["box"].vertices, SHAPES["box"].faces)
+    points = mesh.sample_points(jax.random.key(0), 20_000)
+    half = np.array([0.5, 1.25, 0.75])
+    on = np.isclose(np.abs(points), half, atol=1e-6)
+    assert on.any(axis=1).all()
+    area = 8 * np.prod(half) / half
+    share = area / area.sum()
+    # Five standard errors of a proportion of 20,000.
+    assert (np.abs(on.mean(axis=0) - share) < 5 * np.sqrt(share * (1 - share) / 20_000)).all()
+    np.testing.assert_array_equal(points, mesh.sample_points(jax.random.key(0), 20_000))
+    assert (points != mesh.sample_points(jax.random.key(1), 20_000)).any()
+
+
+def test_signed_distance_of_a_sphere_mesh():
+    sphere = trimesh.creation.icosphere(4)
+    grid = Grid(24, 1.75)
+    mesh = TriangleMesh.from_arrays(sphere.vertices, sphere.faces)
+    nodes = np.stack(np.meshgrid(grid.axis, grid.axis, grid.axis, indexing="ij"), axis=-1)
+    # An icosphere of 5,120 faces lies within 0.25 % of its sphere.
+    expected = np.linalg.norm(nodes, axis=-1) - 1.25
+    np.testing.assert_allclose(mesh.to_signed_distance(grid), expected, atol=4e-3)
+    cloud = scan(mesh.to_grid_surface(Grid(60)), Camera(), look_at([0.0, 1.0, 2.3]))
+    np.testing.assert_allclose(np.linalg.norm(cloud.points[cloud.mask], axis=1), 1.25, atol=5e-3)
+
+
+def test_an_open_sheet_has_no_grid_surface():
+    sheet = TriangleMesh.from_arrays(TRIANGLE, [[0, 1, 2]])
+    with pytest.raises(ValueError, match="encloses nothing"):
+        sheet.to_grid_surface(Grid(12))
+
+
+def test_mesh_of_a_solid():
+    mesh = mesh_from_sdf(Torus(0.8, 0.3), Grid(80))
+    assert mesh.to_trimesh().is_watertight
+    # Marching cubes inscribes: a deficit of order spacing^2 / radius^2, and outward faces give a positive volume.
+    assert mesh.to_trimesh().volume == pytest.approx(2 * np.pi**2 * 0.8 * 0.3**2, rel=0.02)
+    ring = np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 2]) - 0.8
+    np.testing.assert_allclose(np.hypot(ring, mesh.vertices[:, 1]), 0.3, atol=3e-3)
+    assert mesh.frame.scale == 1.0
+    with pytest.raises(ValueError, match="no surface lies within"):
+        mesh_from_sdf(Sphere(5.0) | Box([4.0, 4.0, 4.0]), Grid(8))
+
+
+@pytest.mark.parametrize("name", ["fandisk", "homer", "pickup", "spot", "suzanne", "teapot"])
+@pytest.mark.filterwarnings("ignore:dropped")
+def test_common_models_load_and_scan(name):
+    path = SHARED / f"{name}.obj"
+    if not path.exists():
+        pytest.skip(f"{path.name} is not here: the common models are not part of the project")
+    mesh = load_mesh(path)
+    assert np.ptp(mesh.vertices, axis=0).max() == pytest.approx(2.5)
+    cloud = scan(mesh, Camera(), look_at(fibonacci_sphere(12, 2.5)))
+    filled = np.asarray(cloud.mask)
+    assert filled.mean() > 0.2
+    points, normals = np.asarray(cloud.points)[filled], np.asarray(cloud.normals)[filled]
+    squared, _, _ = igl.point_mesh_squared_distance(points.astype(float), mesh.vertices, mesh.faces)
+    assert np.sqrt(squared.max()) < 1e-5
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)

@@ -1,0 +1,94 @@
+"""The scanner: rows, batches of poses, sensor noise, and the round trip through a depth image."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+from jaxnbv.camera import Camera, fibonacci_sphere, look_at
+from jaxnbv.cloud import PointCloud
+from jaxnbv.scanning.mesh import TriangleMesh
+from jaxnbv.scanning.scanner import SensorNoise, scan
+from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.scanning.sphere_tracing import SDFSurface
+
+ICOSPHERE = trimesh.creation.icosphere(4)
+SURFACES = {
+    "sdf": SDFSurface(Sphere(0.6).translate([0.2, 0.1, 0.0])),
+    "mesh": TriangleMesh.from_arrays(ICOSPHERE.vertices, ICOSPHERE.faces),
+}
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_batched_poses_equal_single_ones(name):
+    camera, poses = Camera(height=12, width=17), look_at(fibonacci_sphere(6, 2.5))
+    batch = scan(SURFACES[name], camera, poses)
+    assert batch.points.shape == (6, 12 * 17, 3)
+    for i in range(6):
+        alone = scan(SURFACES[name], camera, poses[i])
+        assert bool((alone.mask == batch.mask[i]).all())
+        np.testing.assert_allclose(alone.points, batch.points[i], atol=1e-5)
+        np.testing.assert_allclose(alone.normals, batch.normals[i], atol=1e-4)
+
+
+def test_rows_are_pixels_row_by_row_and_misses_are_masked():
+    """A small sphere low and right in the image fills exactly the pixels whose rays pass within its radius."""
+    camera, pose = Camera(height=20, width=30, fov=0.6), look_at([0.0, 0.0, 2.5])
+    centre, radius = np.array([0.4, -0.3, 0.2]), 0.2
+    cloud = scan(SDFSurface(Sphere(radius).translate(centre)), camera, pose)
+    focal = 10 / np.tan(0.3)
+    row, column = np.mgrid[:20, :30]
+    x, y = (column + 0.5 - 15) / focal, (row + 0.5 - 10) / focal
+    d = np.stack([x, -y, -np.ones_like(x)], axis=-1).reshape(-1, 3)
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    away = centre - [0.0, 0.0, 2.5]
+    reach = np.linalg.norm(away - (d @ away)[:, None] * d, axis=1)
+    np.testing.assert_array_equal(cloud.mask, reach < radius)
+    assert 10 < int(cloud.count) < 300
+    assert not np.asarray(cloud.points)[reach >= radius].any()
+
+
+def test_noise_has_the_stated_statistics():
+    n = 40_000
+    normals = np.tile([0.0, 0.6, 0.8], (n, 1))
+    clean = PointCloud.from_arrays(np.tile([0.3, -0.2, 0.5], (n, 1)), normals, capacity=n + 10)
+    noisy = SensorNoise(points=0.02, normals=0.05)(clean, jax.random.key(0))
+    points, turned = noisy.to_numpy()
+    error = points - [0.3, -0.2, 0.5]
+    # Five standard errors: sigma / sqrt(n) of a mean, sigma / sqrt(2 n) of a standard deviation.
+    assert (np.abs(error.mean(axis=0)) < 5 * 0.02 / np.sqrt(n)).all()
+    assert (np.abs(error.std(axis=0) - 0.02) < 5 * 0.02 / np.sqrt(2 * n)).all()
+    assert (np.abs(np.corrcoef(error.T) - np.eye(3)) < 5 / np.sqrt(n)).all()
+    np.testing.assert_allclose(np.linalg.norm(turned, axis=1), 1.0, atol=1e-5)
+    # Across the normal, n + eps over its length keeps the deviation but for a factor 1 - O(sigma^2).
+    across = turned @ np.array([[1.0, 0.0, 0.0], [0.0, 0.8, -0.6]]).T
+    assert (np.abs(across.std(axis=0) / 0.05 - 1) < 5 / np.sqrt(2 * n) + 2 * 0.05**2).all()
+    assert not np.asarray(noisy.points)[n:].any()
+    assert not np.asarray(noisy.normals)[n:].any()
+    np.testing.assert_array_equal(noisy.mask, clean.mask)
+
+
+def test_negative_noise_is_refused():
+    with pytest.raises(ValueError, match="must not be negative"):
+        SensorNoise(points=-0.1)
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_depth_image_round_trip(name):
+    camera, pose = Camera(height=80, width=80), look_at([0.8, 0.9, 2.2])
+    cloud = scan(SURFACES[name], camera, pose)
+    depth = jnp.where(cloud.mask, (cloud.points - pose.position) @ pose.forward, jnp.nan).reshape(80, 80)
+    depth = depth.at[40, 40].set(0.0).at[41, 40].set(-1.0).at[42, 40].set(jnp.inf)
+    back = PointCloud.from_depth(depth, camera, pose)
+    invalid = np.array(~cloud.mask).reshape(80, 80)
+    invalid[[40, 41, 42], 40] = True
+    assert not np.asarray(back.mask)[invalid.ravel()].any()
+    both = np.asarray(back.mask)
+    assert both.sum() > 0.9 * (~invalid).sum()
+    np.testing.assert_allclose(np.asarray(back.points)[both], np.asarray(cloud.points)[both], atol=1e-5)
+    cosine = np.sum(np.asarray(back.normals) * np.asarray(cloud.normals), axis=1)
+    steep = np.sum(np.asarray(cloud.normals) * np.asarray(pose.forward), axis=1) > -0.3
+    # One-sided differences over a pixel, 0.01 to 0.04 on the surface, tilt the normal of a curved surface by about
+    # half the angle between neighbours; a mesh adds the angle between its faces.
+    assert np.degrees(np.arccos(np.clip(cosine[both & ~steep], -1, 1))).max() < 6.0
