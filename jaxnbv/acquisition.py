@@ -21,13 +21,12 @@ from jaxnbv.scanning import GridSurface, scan
 
 
 class Score(eqx.Module):
-    """What one imagined scan is worth, given what has been seen.
+    """What one imagined scan is worth, given what has been seen."""
 
-    `differentiable` says whether the value has a derivative with respect to the scan's points and normals that is worth
-    following; a search by gradient asks for it.
-    """
-
-    differentiable: eqx.AbstractVar[bool]
+    @property
+    @abstractmethod
+    def differentiable(self) -> bool:
+        """Whether the value has a derivative in the scan's points and normals that is worth following."""
 
     @abstractmethod
     def context(self, cloud: PointCloud) -> Any:

@@ -7,10 +7,14 @@ from jax import Array
 AnyArray = Array | np.ndarray
 
 
-def require(condition: bool, message: str) -> None:
-    """Raise `ValueError(message)` unless the condition holds."""
+class InputError(ValueError):
+    """Something that the user gave cannot be used; the message says what, and what to do."""
+
+
+def require(condition: bool | np.bool_, message: str) -> None:
+    """Raise `InputError(message)` unless the condition holds."""
     if not condition:
-        raise ValueError(message)
+        raise InputError(message)
 
 
 def is_traced(*trees) -> bool:

@@ -149,8 +149,7 @@ def _one_sided_difference(points: Float[Array, "h w 3"], valid: Bool[Array, "h w
 
 def concatenate(first: PointCloud, second: PointCloud) -> PointCloud:
     """The union D u D' of the paper, with the capacities added; rows keep their places."""
-    join = lambda a, b: jnp.concatenate([a, b], axis=0)
-    return jax.tree.map(join, first, second)
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=0), first, second)
 
 
 def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:

@@ -1,8 +1,8 @@
 """Episodes on disk: a folder of plain JSON, NumPy and PLY files, written view by view and never half a file.
 
-    episode.json    the configuration (planner, scene, noise, first pose, seed) and the versions that made it
-    view_00.npz     pose and scan of the first view; view_01.npz and on also hold the candidates and their values
-    cloud.ply       the points that were kept, once the episode is complete
+episode.json    the configuration (planner, scene, noise, first pose, seed) and the versions that made it
+view_00.npz     pose and scan of the first view; view_01.npz and on also hold the candidates and their values
+cloud.ply       the points that were kept, once the episode is complete
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from jaxnbv.camera import Pose
-from jaxnbv.checks import require
+from jaxnbv.checks import InputError, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.search import Proposal
 
@@ -82,7 +82,7 @@ class EpisodeFolder:
         try:
             found = json.loads(record.read_text())["config"]
         except (json.JSONDecodeError, KeyError, UnicodeDecodeError) as error:
-            raise ValueError(f"{record} is not an episode's record ({error}): choose another output folder") from error
+            raise InputError(f"{record} is not an episode's record ({error}): choose another output folder") from error
         changed = _differences(found, json.loads(json.dumps(config)))
         require(
             not changed,
@@ -92,7 +92,7 @@ class EpisodeFolder:
 
     def read_views(self) -> list[tuple[Pose, PointCloud, Proposal | None]]:
         """Pose, scan and proposal of every finished view, up to the first that is missing."""
-        views = []
+        views: list[tuple[Pose, PointCloud, Proposal | None]] = []
         while (file := self._view_file(len(views))).exists():
             with np.load(file, allow_pickle=False) as saved:
                 data = {name: jnp.asarray(saved[name]) for name in saved.files}
@@ -121,14 +121,14 @@ class EpisodeFolder:
                 "candidate_rotations": proposal.candidates.rotation,
                 "candidate_positions": proposal.candidates.position,
             }
-        arrays = {name: np.asarray(value) for name, value in data.items()}
+        arrays: dict[str, Any] = {name: np.asarray(value) for name, value in data.items()}
         _write_whole(self._view_file(index), lambda file: np.savez_compressed(file, **arrays))
 
     def write_cloud(self, cloud: PointCloud) -> None:
         """Write the kept points and normals as a binary PLY file, in scene coordinates."""
         points, normals = cloud.to_numpy()
-        rows = np.concatenate([points, normals], axis=1).astype("<f4")
-        vertices = np.rec.fromarrays(rows.T, names="x,y,z,nx,ny,nz")
+        rows = np.concatenate([points, normals], axis=1)
+        vertices = np.rec.fromarrays(list(rows.T), dtype=[(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")])
         ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=["scene coordinates"])
         _write_whole(self.path / "cloud.ply", ply.write)
 

@@ -1,0 +1,3 @@
+"""Procedural scenes, shipped as code."""
+
+from jaxnbv.datasets.demo import demo_object as demo_object

@@ -10,7 +10,8 @@ def demo_object() -> SDFSurface:
     """An empty mug on a saucer, with a spoon in it and two lumps of sugar beside it: the scene's y axis is up.
 
     The longest side, across the saucer, is 2.5. The mug's inside, the spoon's bowl at its bottom, the saucer's
-    underside and what stands behind the mug show from few directions; no part is thinner than 0.06.
+    underside and what stands behind the mug show from few directions. No part is thinner than 0.06, but for the lip of
+    the spoon's bowl.
     """
     return SDFSurface((_saucer() | _mug() | _spoon() | _sugar()).translate([0.0, -0.87, 0.0]))
 
@@ -33,9 +34,9 @@ def _mug() -> SignedDistance:
 
 
 def _spoon() -> SignedDistance:
-    low, high = [0.2, 0.32, 0.1], [-0.62, 1.7, -0.3]
+    low, high = [0.24, 0.3, 0.11], [-0.62, 1.7, -0.3]
     stem = Capsule(low, high, 0.04)
-    bowl = (Sphere(0.18) - Sphere(0.12).translate([-0.02, 0.09, 0.0])).translate([0.16, 0.36, 0.08])
+    bowl = (Sphere(0.18) - Sphere(0.11).translate([-0.03, 0.11, 0.0])).translate([0.16, 0.36, 0.08])
     return SmoothUnion(stem, Sphere(0.07).translate(high), 0.1) | bowl
 
 

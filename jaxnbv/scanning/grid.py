@@ -16,7 +16,6 @@ from jaxnbv.scanning.scanner import scan
 from jaxnbv.scanning.surface import Hits, Surface
 
 
-
 class Grid(eqx.Module):
     """The regular grid of `resolution`^3 nodes that spans [-half_extent, half_extent]^3 of the scene.
 
@@ -79,11 +78,14 @@ class GridSurface(Surface):
         """First zeros along the rays inside the box; see `Surface.trace`.
 
         A hit is where the interpolant first differs in sign from its sign at the ray's start (its origin, or where it
-        enters the box). So a ray that touches the surface without crossing it, a double root, goes on.
+        enters the box), zero counted as negative. A ray that only touches the surface, a double root, may fall either
+        way by rounding. Normals are central differences interpolated linearly, so they are continuous.
 
-        Points and normals are differentiable in origins, directions and values: at a hit x = o + t d the implicit
-        function theorem gives dt = -(df + grad f . (do + t dd)) / (grad f . d). Grazing rays, with an angle
-        below about 3 degrees to the surface, get the derivative of that angle, so it stays bounded.
+        Differentiable in origins, directions and values: at a hit x = o + t d the implicit function theorem gives
+        dt = -(df + grad f . (do + t dd)) / (grad f . d), its denominator kept from zero where the ray grazes, so that
+        |dt| is at most about 34 |dx|.
+
+        **Raises:** `ValueError` for a batch of surfaces.
         """
         require(
             self.values.ndim == 3,

@@ -97,9 +97,8 @@ class TriangleMesh(Surface):
         if not solid.all():
             warnings.warn(f"dropped {(~solid).sum()} of {len(faces)} faces: they have zero area", stacklevel=2)
         used, faces = np.unique(faces[solid], return_inverse=True)
-        vertices = vertices[used]
-        frame = Frame.fit(vertices)
-        return cls(frame.to_scene(vertices), faces.reshape(-1, 3), frame)
+        frame = Frame.fit(np.asarray(vertices[used]))
+        return cls(frame.to_scene(vertices[used]), faces.reshape(-1, 3), frame)
 
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
         """First hits, exact on the triangles' planes.
@@ -109,7 +108,7 @@ class TriangleMesh(Surface):
         require(
             not is_traced(self, origins, directions),
             "a TriangleMesh is scanned by host code and cannot be traced by JAX: scan it outside jit, vmap and grad, "
-            "or trace mesh.to_grid_surface() instead, which runs inside",
+            "or trace mesh.to_grid_surface(Grid()) instead, which runs inside",
         )
         origins, directions = (np.asarray(a, dtype=np.float64) for a in (origins, directions))
         scene = self._tree.of(self.vertices, self.faces)
@@ -142,7 +141,7 @@ class TriangleMesh(Surface):
         points, _ = trimesh.sample.sample_surface(self.to_trimesh(), count, seed=seed)
         return np.asarray(points)
 
-    def to_signed_distance(self, grid: Grid = Grid()) -> Float[Array, "g g g"]:
+    def to_signed_distance(self, grid: Grid) -> Float[Array, "g g g"]:
         """Distance to the mesh at the grid's nodes, negative inside.
 
         Inside is where the winding number is above 1/2 (Barill et al. 2018), which forgives small holes. An open
@@ -154,7 +153,7 @@ class TriangleMesh(Surface):
         distance = igl.signed_distance(nodes, self.vertices, self.faces, sign)[0]
         return jnp.asarray(distance.reshape((grid.resolution,) * 3), jnp.result_type(float))
 
-    def to_grid_surface(self, grid: Grid = Grid()) -> GridSurface:
+    def to_grid_surface(self, grid: Grid) -> GridSurface:
         """The mesh as the zero set of its signed distance on a grid: it rounds off what is finer than the grid, and
         can be traced inside `jit`.
 
@@ -186,27 +185,30 @@ def load_mesh(path: str | Path) -> TriangleMesh:
         formats = ", ".join(sorted(trimesh.available_formats()))
         message = f"cannot read {path} as a mesh ({type(error).__name__}: {error}): it must be one of {formats}"
         raise ValueError(message) from error
-    parts = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-    require(len(parts) > 0, f"{path} has no faces: a point cloud or an empty file cannot be scanned")
-    offsets = np.cumsum([0] + [len(part.vertices) for part in parts])
-    vertices = np.concatenate([part.vertices for part in parts])
-    faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets[:-1], strict=True)])
+    meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    require(len(meshes) > 0, f"{path} has no faces: a point cloud or an empty file cannot be scanned")
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    vertices = np.concatenate([mesh.vertices for mesh in meshes])
+    faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)])
     try:
         return TriangleMesh.from_arrays(vertices, faces)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
 
-def mesh_from_sdf(sdf: SignedDistance, grid: Grid = Grid()) -> TriangleMesh:
+def mesh_from_sdf(sdf: SignedDistance, grid: Grid) -> TriangleMesh:
     """The surface of a solid as triangles in scene coordinates (the frame is the identity), by marching cubes.
 
     **Raises:** `ValueError` if no surface lies within the grid.
     """
     axis = jnp.asarray(grid.axis, jnp.result_type(float))
     y, z = jnp.meshgrid(axis, axis, indexing="ij")
-    slab = lambda x: sdf(jnp.stack([jnp.full_like(y, x), y, z], axis=-1))
+
+    def slab(x):
+        return sdf(jnp.stack([jnp.full_like(y, x), y, z], axis=-1))
+
     values = np.array(jax.lax.map(slab, axis))
-    low, high = values.min(), values.max()
+    low, high = float(values.min()), float(values.max())
     require(
         low < 0 < high,
         f"the solid's distances on the grid run from {low:.4g} to {high:.4g}: no surface lies within "

@@ -9,6 +9,7 @@ in one jitted function.
 import functools
 from abc import abstractmethod
 from dataclasses import fields
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import equinox as eqx
 import jax
@@ -17,6 +18,14 @@ from jaxtyping import Array, Float
 
 from jaxnbv.camera import Pose
 from jaxnbv.checks import AnyArray, is_traced, require
+
+# Numbers and lists are converted on the way in, which mypy cannot see.
+if TYPE_CHECKING:
+    Scalar: TypeAlias = Any
+    Vector: TypeAlias = Any
+    Matrix: TypeAlias = Any
+else:
+    Scalar, Vector, Matrix = Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]
 
 
 def _as_float(value):
@@ -83,7 +92,7 @@ class SignedDistance(eqx.Module):
             if not eqx.is_array(value):
                 continue
             name = f"{type(self).__name__}.{field.name}"
-            shape = tuple(int(size) for size in field.type.dim_str.split())
+            shape = tuple(int(size) for size in cast(Any, field.type).dim_str.split())
             require(
                 value.shape == shape,
                 f"{name} has shape {value.shape}, not {shape}: for a batch of solids build it inside jax.vmap",
@@ -131,7 +140,7 @@ class SignedDistance(eqx.Module):
 class Sphere(SignedDistance):
     """The ball of `radius` about the origin. Exact."""
 
-    radius: Float[Array, ""] = _length()
+    radius: Scalar = _length()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         return _norm(*_split(x)) - self.radius
@@ -143,8 +152,8 @@ class Box(SignedDistance):
     **Raises:** `ValueError` also if the rounding is greater than half of a side.
     """
 
-    half_size: Float[Array, "3"] = _length()
-    rounding: Float[Array, ""] = _length(default=0.0)
+    half_size: Vector = _length()
+    rounding: Scalar = _length(default=0.0)
 
     def __check_init__(self):
         if not is_traced(self):
@@ -160,8 +169,8 @@ class Box(SignedDistance):
 class Cylinder(SignedDistance):
     """The solid cylinder about the y axis with flat caps at y = -half_height and half_height. Exact."""
 
-    radius: Float[Array, ""] = _length()
-    half_height: Float[Array, ""] = _length()
+    radius: Scalar = _length()
+    half_height: Scalar = _length()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         x, y, z = _split(x)
@@ -171,9 +180,9 @@ class Cylinder(SignedDistance):
 class Cone(SignedDistance):
     """The solid cone about the y axis, capped flat: radii at y = -half_height and y = half_height. Exact."""
 
-    bottom_radius: Float[Array, ""] = _length()
-    top_radius: Float[Array, ""] = _length()
-    half_height: Float[Array, ""] = _length()
+    bottom_radius: Scalar = _length()
+    top_radius: Scalar = _length()
+    half_height: Scalar = _length()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         # The profile in the half plane (r, y): two caps, a slanted edge from the bottom's corner to the top's.
@@ -195,8 +204,8 @@ class Cone(SignedDistance):
 class Torus(SignedDistance):
     """The torus about the y axis: a tube of `minor_radius` around the circle of `major_radius`. Exact."""
 
-    major_radius: Float[Array, ""] = _length()
-    minor_radius: Float[Array, ""] = _length()
+    major_radius: Scalar = _length()
+    minor_radius: Scalar = _length()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         x, y, z = _split(x)
@@ -206,9 +215,9 @@ class Torus(SignedDistance):
 class Capsule(SignedDistance):
     """All points within `radius` of the segment from `start` to `end`. Exact."""
 
-    start: Float[Array, "3"] = _parameter()
-    end: Float[Array, "3"] = _parameter()
-    radius: Float[Array, ""] = _length()
+    start: Vector = _parameter()
+    end: Vector = _parameter()
+    radius: Scalar = _length()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         segment = self.end - self.start
@@ -237,7 +246,7 @@ class SmoothUnion(SignedDistance):
 
     first: SignedDistance
     second: SignedDistance
-    width: Float[Array, ""] = _length()
+    width: Scalar = _length()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         a, b = self.first(x), self.second(x)
@@ -269,7 +278,7 @@ class Translated(SignedDistance):
     """A solid moved by `offset`. As exact as the solid."""
 
     solid: SignedDistance
-    offset: Float[Array, "3"] = _parameter()
+    offset: Vector = _parameter()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         return self.solid(x - self.offset)
@@ -282,21 +291,22 @@ class Rotated(SignedDistance):
     """
 
     solid: SignedDistance
-    rotation: Float[Array, "3 3"] = _parameter()
+    rotation: Matrix = _parameter()
 
     def __check_init__(self):
         Pose(self.rotation, jnp.zeros(3))
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         # R^T x written as a sum, which XLA fuses with its neighbours where it would not a matrix product.
-        return self.solid(sum(x[..., i, None] * self.rotation[i] for i in range(3)))
+        a, b, c = (x[..., i, None] * self.rotation[i] for i in range(3))
+        return self.solid(a + b + c)
 
 
 class Scaled(SignedDistance):
     """A solid scaled about the origin by `factor` > 0. As exact as the solid."""
 
     solid: SignedDistance
-    factor: Float[Array, ""] = _length()
+    factor: Scalar = _length()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         return self.factor * self.solid(x / self.factor)

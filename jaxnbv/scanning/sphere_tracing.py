@@ -49,16 +49,16 @@ class SDFSurface(Surface):
 
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
         origins, directions = jnp.asarray(origins), jnp.asarray(directions)
-        fixed, static = eqx.partition((self.sdf, origins, directions), eqx.is_array)
-        fixed = eqx.combine(jax.lax.stop_gradient(fixed), static)
-        depth, mask = _first_root(*fixed, self.bounding_radius)
+        parameters, structure = eqx.partition(self.sdf, eqx.is_array)
+        fixed = jax.lax.stop_gradient((parameters, origins, directions))
+        depth, mask = _first_root(eqx.combine(fixed[0], structure), fixed[1], fixed[2], self.bounding_radius)
         value, cosine = jax.jvp(self.sdf, (origins + depth[:, None] * directions,), (directions,))
         cosine = jax.lax.stop_gradient(cosine)
         bounded = jnp.where(cosine < 0, -1.0, 1.0) * jnp.maximum(jnp.abs(cosine), _GRAZING)
         points = origins + (depth - value / bounded)[:, None] * directions
         # Forward mode: the slopes fuse into one pass over the points, which the scatters of reverse mode break up.
-        along = lambda axis: jax.jvp(self.sdf, (points,), (jnp.broadcast_to(axis, points.shape),))[1]
-        gradient = jnp.stack([along(axis) for axis in jnp.eye(3, dtype=points.dtype)], axis=-1)
+        axes = (jnp.broadcast_to(axis, points.shape) for axis in jnp.eye(3, dtype=points.dtype))
+        gradient = jnp.stack([jax.jvp(self.sdf, (points,), (axis,))[1] for axis in axes], axis=-1)
         length = jnp.linalg.norm(jnp.where(mask[:, None], gradient, 1.0), axis=-1, keepdims=True)
         facing = -jnp.sign(jnp.sum(gradient * directions, axis=-1, keepdims=True))
         normals = jnp.where(facing == 0, 1.0, facing) * gradient / length

@@ -1,8 +1,8 @@
 """First zeros along rays of a trilinear interpolant: marching to the cell that holds one, then the root of a cubic.
 
-Coordinates are the grid's: nodes at the integers 0, ..., g - 1 along every axis, cells between them; vectors are lists of
-their components (n,). Values and distances are flat, in C order. A zero is where f first differs in sign from its sign
-at the start of the ray, so a ray that only touches the surface goes on.
+Coordinates are the grid's: nodes at the integers 0, ..., g - 1 along every axis, cells between them. Vectors are lists
+of their components (n,). A zero is where f first differs in sign from its sign at the start of the ray, with zero
+counted as negative.
 """
 
 import functools
@@ -19,11 +19,10 @@ _SHRINK = 4
 _SMALLEST = 8192
 _ROOT_ITERATIONS = 8
 
-# Where the slope of f along a ray is less than this fraction of the spread of f over the cell's corners, the ray grazes.
+# A ray grazes where the slope of f along it is below this fraction of the spread of f over the cell's corners.
 _GRAZING = 0.03
 
 CORNERS = tuple((i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1))
-
 
 # The x, y and z components of n vectors, apart: XLA fuses these better than one array of them.
 Triple = list[Float[Array, " n"]]
@@ -59,7 +58,7 @@ class Field(eqx.Module):
         """Positions are moved ahead by this much (cells, along every axis) before they are turned into a cell.
 
         It exceeds the rounding of coordinates, so a ray on a border is always in the cell that it enters: it cannot
-        stall, and steps over no more than a sliver of this width. The sign at the start tells a zero in a sliver.
+        stall, and steps over no more than a sliver of this width. The sign at the start tells of a zero in a sliver.
         """
         return 16 * float(jnp.finfo(self.values.dtype).eps) * self.g
 
@@ -108,7 +107,7 @@ def _first_zero_jvp(primals, tangents):
         corners = corner_values(cell, Field(values, field.distance, field.g))
         local = [x + t * d - c for x, d, c in zip(u, du, cell, strict=True)]
         value, slope, *_ = cubic(corners, local, du)
-        spread = functools.reduce(jnp.maximum, corners) - functools.reduce(jnp.minimum, corners)
+        spread = _largest(corners) - _smallest(corners)
         return value, (slope, _GRAZING * spread * jnp.sqrt(sum(d * d for d in du)))
 
     _, change, (slope, least) = jax.jvp(
@@ -162,8 +161,8 @@ def enter(u: Triple, du: Triple, field: Field) -> tuple[March, Float[Array, " n"
     low, high = 2 * field.ahead, field.g - 1 - 2 * field.ahead
     du = [jnp.where(jnp.abs(d) < 1e-9, 1e-9, d) for d in du]
     sides = [((low - x) / d, (high - x) / d) for x, d in zip(u, du, strict=True)]
-    start = functools.reduce(jnp.maximum, [jnp.minimum(p, q) for p, q in sides], 0.0)
-    end = functools.reduce(jnp.minimum, [jnp.maximum(p, q) for p, q in sides])
+    start = jnp.maximum(_largest([jnp.minimum(p, q) for p, q in sides]), 0.0)
+    end = _smallest([jnp.maximum(p, q) for p, q in sides])
     u = [jnp.clip(x + start * d, low, high) for x, d in zip(u, du, strict=True)]
     unknown = jnp.zeros(start.shape, jnp.int8)
     return March(u, du, jnp.zeros_like(start), end - start, unknown, start < end), start
@@ -183,7 +182,7 @@ def march(rays: March, field: Field) -> March:
     index = jnp.nonzero(rays.alive, size=remainder, fill_value=count)[0]
     rest = jax.tree.map(lambda leaf: jnp.take(leaf, index, mode="clip"), rays)
     rest = march(rest._replace(alive=index < count), field)
-    put = lambda leaf, part: leaf.at[index].set(part, mode="drop", unique_indices=True)
+    put = functools.partial(_put, index)
     return rays._replace(t=put(rays.t, rest.t), end=put(rays.end, rest.end), sign=put(rays.sign, rest.sign))
 
 
@@ -232,10 +231,8 @@ def cell_at(rays: March, field: Field) -> tuple[Triple, list[Int[Array, " n"]]]:
 
 def _leave(rays: March, cell: list[Int[Array, " n"]], reach) -> Float[Array, " n"]:
     """t at which rays leave the cube of cells within a Chebyshev distance `reach` of the cell."""
-    borders = [
-        (c + jnp.where(d > 0, reach + 1, -reach) - x) / d for c, x, d in zip(cell, rays.u, rays.du, strict=True)
-    ]
-    return functools.reduce(jnp.minimum, borders)
+    sides = [c + jnp.where(d > 0, reach + 1, -reach) for c, d in zip(cell, rays.du, strict=True)]
+    return _smallest([(side - x) / d for side, x, d in zip(sides, rays.u, rays.du, strict=True)])
 
 
 def _flat(index: list[Int[Array, " n"]], side: int) -> Int[Array, " n"]:
@@ -266,7 +263,7 @@ def cubic(corners: list, a: Triple, b: Triple) -> list[Float[Array, " n"]]:
 
 
 def first_bracket(c: list) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """For cubics positive at 0: an s such that the first root in [0, 1] is the only one in [0, s]; whether there is one.
+    """For cubics positive at 0: whether they have a root in [0, 1], and an s so that [0, s] holds the first one alone.
 
     A cubic positive at 0 that is not positive at its local minimum has one root before that. Else it has at most one
     in [0, 1], and only if it is not positive at 1. One not positive at 0 has its root there.
@@ -309,3 +306,15 @@ def _polynomial(c: list, s) -> Float[Array, " n"]:
 
 def _take(array: Array, index: Int[Array, " n"]) -> Array:
     return array.at[index].get(mode="promise_in_bounds")
+
+
+def _put(index: Int[Array, " m"], array: Array, part: Array) -> Array:
+    return array.at[index].set(part, mode="drop", unique_indices=True)
+
+
+def _smallest(arrays: list[Float[Array, " n"]]) -> Float[Array, " n"]:
+    return functools.reduce(jnp.minimum, arrays)
+
+
+def _largest(arrays: list[Float[Array, " n"]]) -> Float[Array, " n"]:
+    return functools.reduce(jnp.maximum, arrays)

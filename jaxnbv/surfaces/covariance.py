@@ -10,6 +10,7 @@ The first is a product over the axes. The other two become a short sum of such p
 
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -29,24 +30,19 @@ def function_normal_covariance(
     x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectrum
 ) -> Float[Array, "3 n m"]:
     """cov(f(x), v_d(y)) for d = 1, 2, 3."""
-    frequency = jnp.arange(spectrum.shape[0], dtype=spectrum.dtype)
-    total = jnp.zeros((3, x.shape[0], y.shape[0]), dtype=spectrum.dtype)
-    for rate, weight in zip(*_inverse_quadrature(spectrum), strict=True):
-        damped = spectrum * jnp.exp(-rate * frequency**2)
+
+    def products(damped):
+        odd_spectrum = damped * jnp.arange(damped.size, dtype=damped.dtype)
         even = [_even(x[:, axis], y[:, axis], damped) for axis in range(3)]
-        odd = [_odd(x[:, axis], y[:, axis], damped * frequency) for axis in range(3)]
-        total += weight * jnp.stack([odd[0] * even[1] * even[2], even[0] * odd[1] * even[2], even[0] * even[1] * odd[2]])
-    return total
+        odd = [_odd(x[:, axis], y[:, axis], odd_spectrum) for axis in range(3)]
+        return jnp.stack([odd[0] * even[1] * even[2], even[0] * odd[1] * even[2], even[0] * even[1] * odd[2]])
+
+    return _over_squared_frequency(products, spectrum)
 
 
 def function_covariance(x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectrum) -> Float[Array, "n m"]:
     """cov(f(x), f(y))."""
-    frequency = jnp.arange(spectrum.shape[0], dtype=spectrum.dtype)
-    total = jnp.zeros((x.shape[0], y.shape[0]), dtype=spectrum.dtype)
-    for rate, weight in zip(*_inverse_quadrature(spectrum), strict=True):
-        product = normal_covariance(x, y, spectrum * jnp.exp(-rate * frequency**2))
-        total += weight * (product - spectrum[0] ** 3)
-    return total
+    return _over_squared_frequency(lambda damped: normal_covariance(x, y, damped) - spectrum[0] ** 3, spectrum)
 
 
 def function_variance(spectrum: Spectrum) -> Float[Array, ""]:
@@ -64,10 +60,24 @@ def _even(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> F
 def _odd(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> Float[Array, "n m"]:
     """sum_{n in Z} s1(|n|) sign(n) sin(n (x - y)); sin(n (x - y)) = sin(n x) cos(n y) - cos(n x) sin(n y)."""
     truncation = spectrum.shape[0] - 1
-    sign = np.sign(np.arange(-truncation, truncation + 1))
+    sign = jnp.sign(jnp.arange(-truncation, truncation + 1))
     # Reversing the basis swaps the sine and the cosine of each frequency.
     swapped = sign * circle_basis(x, truncation)[:, ::-1]
     return (swapped * basis_variance(spectrum)) @ circle_basis(y, truncation).T
+
+
+def _over_squared_frequency(products, spectrum: Spectrum):
+    """A sum over frequencies n, given as products over the axes, with each term divided by |n|^2."""
+    frequency = jnp.arange(spectrum.shape[0], dtype=spectrum.dtype)
+
+    def add(total, node):
+        rate, weight = node
+        return total + weight * products(spectrum * jnp.exp(-rate * frequency**2)), None
+
+    # A loop and not unrolled terms, which XLA would hold in memory all at once.
+    nodes = tuple(jnp.asarray(a, dtype=spectrum.dtype) for a in _inverse_quadrature(spectrum))
+    shape = jax.eval_shape(products, spectrum)
+    return jax.lax.scan(add, jnp.zeros(shape.shape, shape.dtype), nodes)[0]
 
 
 def _inverse_quadrature(spectrum: Spectrum) -> tuple[np.ndarray, np.ndarray]:

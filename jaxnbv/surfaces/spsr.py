@@ -6,10 +6,12 @@
     data     n_j = v(x_j) + eps_j,   eps_j ~ N(0, noise^2 I),   A = k(X, X) + noise^2 I
     sample   v_post = v + k(., X) A^-1 (n - v(X) - eps), v and eps from the prior;   f = Poisson(v_post)
 
-A sample is one function, band-limited, to be evaluated anywhere: its prior part, its residual at the data and its update
-come from the same draw (Matheron's rule; Wilson et al. 2020), so samples have exactly the posterior's distribution.
+A sample is one function, band-limited, to be evaluated anywhere. Its prior part, its residual at the data and its
+update come from the same draw (Matheron's rule; Wilson et al. 2020), so samples have exactly the posterior's
+distribution.
 """
 
+import functools
 import warnings
 
 import equinox as eqx
@@ -28,7 +30,7 @@ from jaxnbv.surfaces.covariance import (
     function_variance,
     normal_covariance,
 )
-from jaxnbv.surfaces.matern import circle_spectrum
+from jaxnbv.surfaces.matern import Scalar, circle_spectrum
 from jaxnbv.surfaces.nonuniform import HALF_WIDTH, NonuniformTransform
 from jaxnbv.surfaces.trigonometric import TrigonometricFields, basis_variance, solve_poisson
 
@@ -55,10 +57,10 @@ class GeometricSPSR(SurfaceModel):
     third of the variance is kept.
     """
 
-    lengthscale: Float[Array, ""] = eqx.field(converter=_to_float, default=0.005)
-    variance: Float[Array, ""] = eqx.field(converter=_to_float, default=0.2)
+    lengthscale: Scalar = eqx.field(converter=_to_float, default=0.005)
+    variance: Scalar = eqx.field(converter=_to_float, default=0.2)
     truncation: int = eqx.field(static=True, default=50)
-    noise: Float[Array, ""] = eqx.field(converter=_to_float, default=0.01)
+    noise: Scalar = eqx.field(converter=_to_float, default=0.01)
     nu: float = eqx.field(static=True, default=1.5)
 
     def __check_init__(self):
@@ -72,8 +74,8 @@ class GeometricSPSR(SurfaceModel):
         kept = float(self.kept_variance)
         if kept < 1 / 3:
             warnings.warn(
-                f"truncation={self.truncation} keeps {kept:.0%} of the prior's variance at lengthscale={float(self.lengthscale):.3g}: "
-                "raise the truncation or the lengthscale",
+                f"truncation={self.truncation} keeps {kept:.0%} of the prior's variance at "
+                f"lengthscale={float(self.lengthscale):.3g}: raise the truncation or the lengthscale",
                 stacklevel=3,
             )
 
@@ -114,11 +116,7 @@ def _check_in_scene(cloud: PointCloud) -> None:
 @eqx.filter_jit
 def _condition(model: GeometricSPSR, cloud: PointCloud) -> "GeometricSPSRPosterior":
     spectrum = model.spectrum
-    both = cloud.mask[:, None] & cloud.mask[None, :]
-    kernel = jnp.where(both, normal_covariance(cloud.points, cloud.points, spectrum), 0.0)
-    # A row that is not filled becomes a row of the identity: it changes neither the solves nor the determinant.
-    diagonal = jnp.where(cloud.mask, model.noise**2, 1.0)
-    cholesky = jnp.linalg.cholesky(kernel + jnp.diag(diagonal), symmetrize_input=False)
+    cholesky = _factorise(cloud, spectrum, model.noise)
     normals = jnp.where(cloud.mask[:, None], cloud.normals, 0.0)
     weights = cho_solve((cholesky, True), normals)
     transform = NonuniformTransform(cloud.points, model.truncation)
@@ -126,6 +124,28 @@ def _condition(model: GeometricSPSR, cloud: PointCloud) -> "GeometricSPSRPosteri
     at_data = transform.evaluate(mean[None])[:, 0]
     level = jnp.sum(jnp.where(cloud.mask, at_data, 0.0)) / jnp.sum(cloud.mask)
     return GeometricSPSRPosterior(level, model, cloud, cholesky, weights, mean)
+
+
+def _factorise(cloud: PointCloud, spectrum: Float[Array, "l_plus_1"], noise: Scalar) -> Float[Array, "n n"]:
+    """Lower Cholesky factor of A, where a row that is not filled is a row of the identity.
+
+    Such a row changes neither the solves nor the determinant. The factorisation is of the leading quarter, half or
+    whole of A, whichever holds the filled rows, so that its time follows them while the shapes stay fixed.
+    """
+    capacity = cloud.capacity
+    sizes = [-(-capacity // 4), -(-capacity // 2), capacity]
+
+    def leading(size: int):
+        points, mask = cloud.points[:size], cloud.mask[:size]
+        kernel = jnp.where(mask[:, None] & mask, normal_covariance(points, points, spectrum), 0.0)
+        block = kernel + jnp.diag(jnp.where(mask, noise**2, 1.0))
+        factor = jnp.linalg.cholesky(block, symmetrize_input=False)
+        return jnp.eye(capacity, dtype=factor.dtype).at[:size, :size].set(factor)
+
+    filled = jnp.max(jnp.where(cloud.mask, jnp.arange(capacity) + 1, 0))
+    return jax.lax.switch(
+        jnp.searchsorted(jnp.asarray(sizes), filled), [functools.partial(leading, size) for size in sizes]
+    )
 
 
 def _prior_variance(spectrum: Float[Array, "l_plus_1"]) -> Float[Array, "a a a"]:

@@ -36,8 +36,10 @@ def differentiate(coefficients: Float[Array, "*s a a a"], axis: int) -> Float[Ar
 
 def solve_poisson(vector_field: Float[Array, "*s 3 a a a"]) -> Float[Array, "*s a a a"]:
     """Coefficients of the f of mean zero with Laplacian f = div v: f_hat(n) = -i n . v_hat(n) / |n|^2."""
-    divergence = sum(differentiate(vector_field[..., axis, :, :, :], axis) for axis in range(3))
-    squared = sum(_frequency(divergence, axis) ** 2 for axis in range(3))
+    x, y, z = (differentiate(vector_field[..., axis, :, :, :], axis) for axis in range(3))
+    divergence = x + y + z
+    a, b, c = (_frequency(divergence, axis) for axis in range(3))
+    squared = a**2 + b**2 + c**2
     return -divergence / jnp.where(squared == 0, jnp.inf, squared)
 
 

@@ -1,7 +1,5 @@
 """Geometric exploration: scan what is far from everything scanned so far."""
 
-from typing import ClassVar
-
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -13,7 +11,10 @@ from jaxnbv.neighbours import nearest_squared_distance
 class Coverage(Score):
     """The paper's alpha^(CD): sum over the points x of the scan of min_{y in D} |x - y|^2, in squared scene units."""
 
-    differentiable: ClassVar[bool] = True
+    @property
+    def differentiable(self) -> bool:
+        """True."""
+        return True
 
     def context(self, cloud: PointCloud) -> PointCloud:
         """D itself."""

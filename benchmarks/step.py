@@ -1,0 +1,136 @@
+"""Time the stages of one planning step at the paper's settings, on this machine, against a yardstick and a rival.
+
+    python benchmarks/step.py [--mesh FILE] [--out results.json]
+
+The settings: S = 16 samples, 120 candidates, 50 x 50 rays, L = 50, grid 100^3, capacity 8,192. Every stage is timed
+after compilation as the least of several runs; the first whole step is also timed with compilation. The yardstick is a
+2,000^3 float32 matrix product; the rival of the scan is marching cubes (scikit-image) and Embree (through trimesh) on
+the same samples, meshes and trees included.
+"""
+
+import argparse
+import json
+import resource
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from skimage.measure import marching_cubes
+
+import jaxnbv as nbv
+from jaxnbv.datasets import demo_object
+from jaxnbv.episode import observe_scene
+from jaxnbv.search.base import Problem, sphere_candidates
+
+FIGURES = {
+    "samples": ("prior and posterior samples of f on the grid", 6.0),
+    "samples, full": ("the same at 8,192 points", 15.0),
+    "scan": ("scan of 16 samples from 120 candidates", 1.5),
+    "coverage": ("coverage values of the 1,920 scans", 2.5),
+    "step": ("one whole step", 10.0),
+    "first step": ("first step, compilation included", 60.0),
+}
+
+
+def least_time(function, repeats: int = 3) -> float:
+    """Least wall time in seconds of a few runs after one that compiles."""
+    jax.block_until_ready(function())
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        jax.block_until_ready(function())
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def rival_scan(surfaces: nbv.GridSurface, origins: np.ndarray, directions: np.ndarray) -> float:
+    """Seconds that marching cubes and Embree take for the same scans."""
+    values, spacing = np.asarray(surfaces.values), surfaces.grid.spacing
+    start = time.perf_counter()
+    for field in values:
+        vertices, faces, _, _ = marching_cubes(field, 0.0, spacing=(spacing,) * 3)
+        mesh = trimesh.Trimesh(vertices - surfaces.grid.half_extent, faces, process=False)
+        mesh.ray.intersects_id(origins, directions, multiple_hits=False, return_locations=True)
+    return time.perf_counter() - start
+
+
+def full_cloud(planner: nbv.Planner, scene: nbv.Surface) -> nbv.State:
+    """A state whose cloud is full: as many views from around the object as that takes."""
+    state = None
+    for index, position in enumerate(nbv.fibonacci_sphere(planner.max_views, 2.5)):
+        pose = nbv.look_at(position)
+        seen = observe_scene(scene, planner.camera, pose, nbv.SensorNoise(), jax.random.key(index))
+        state = planner.init(seen, pose) if state is None else planner.observe(state, pose, seen)
+        if int(state.cloud.count) == planner.capacity:
+            break
+    return state
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--mesh", help="a mesh file; the demo object if left out")
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/step.json"))
+    arguments = parser.parse_args()
+
+    scene = nbv.load_mesh(arguments.mesh) if arguments.mesh else demo_object()
+    planner = nbv.Planner(nbv.GeometricSPSR(), nbv.Camera(), nbv.Coverage(), nbv.DiscreteSearch())
+    first, key = nbv.look_at((0.8, 0.9, 2.2)), jax.random.key(0)
+    seen = observe_scene(scene, planner.camera, first, nbv.SensorNoise(), key)
+    state = planner.init(seen, first)
+
+    start = time.perf_counter()
+    jax.block_until_ready(planner.propose(state, key))
+    seconds = {"first step": time.perf_counter() - start}
+
+    seconds["samples"] = least_time(lambda: planner.sample_surfaces(state, key))
+    surfaces = planner.sample_surfaces(state, key)
+    poses = sphere_candidates(120, 2.5)
+
+    def seen_points(surfaces):
+        scans = nbv.scan_samples(surfaces, planner.camera, poses)
+        return scans.points, scans.mask
+
+    seconds["scan"] = least_time(lambda: jax.jit(seen_points)(surfaces))
+    scans = nbv.scan_samples(surfaces, planner.camera, poses)
+
+    @jax.jit
+    def values(cloud, scans):
+        context = planner.acquisition.context(cloud)
+        score = jax.vmap(lambda imagined: planner.acquisition(context, imagined))
+        return jnp.mean(jax.lax.map(score, scans), axis=0)
+
+    seconds["coverage"] = least_time(lambda: values(state.cloud, scans))
+    seconds["step"] = least_time(lambda: planner.propose(state, key))
+    full = full_cloud(planner, scene)
+    seconds["samples, full"] = least_time(lambda: planner.sample_surfaces(full, key))
+    seconds["coverage, full"] = least_time(lambda: values(full.cloud, scans))
+    matrix = jax.random.normal(key, (2000, 2000))
+    product = jax.jit(lambda a: a @ a)
+    seconds["yardstick"] = least_time(lambda: product(matrix), repeats=10)
+    origins, directions = (np.asarray(rays).reshape(-1, 3) for rays in planner.camera.rays(poses))
+    seconds["rival"] = min(rival_scan(surfaces, origins, directions) for _ in range(2))
+    # Linux gives kilobytes, macOS bytes.
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e9 if sys.platform == "darwin" else 1e6)
+
+    problem = Problem(state.cloud, state.poses, state.num_views, planner.camera, planner.acquisition, surfaces)
+    assert bool(jnp.allclose(values(state.cloud, scans), jax.jit(problem.acquisition)(poses), rtol=1e-3))
+
+    print(f"{jax.devices()[0].device_kind}; {int(state.cloud.count)} points, then {int(full.cloud.count)}")
+    print(f"{'stage':48s} {'seconds':>8s} {'at most':>8s} {'of step':>8s} {'yardsticks':>10s}")
+    for name, (text, limit) in FIGURES.items():
+        share, yardsticks = seconds[name] / seconds["step"], seconds[name] / seconds["yardstick"]
+        print(f"{text:48s} {seconds[name]:8.2f} {limit:8.1f} {share:8.0%} {yardsticks:10.0f}")
+    print(f"{'coverage values at 8,192 points':48s} {seconds['coverage, full']:8.2f}")
+    print(f"{'marching cubes and Embree, the same scans':48s} {seconds['rival']:8.2f}")
+    print(f"{'yardstick: 2,000^3 float32 product':48s} {seconds['yardstick']:8.3f}")
+    print(f"{'peak memory, GB':48s} {peak:8.2f} {6.0:8.1f}")
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    arguments.out.write_text(json.dumps({"seconds": seconds, "peak_memory_gb": peak}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,214 @@
+"""What the pictures of an episode show, as plain arrays: computed once a view, drawn by `report` and `figures`."""
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from skimage.measure import marching_cubes
+from tqdm.auto import tqdm
+
+from jaxnbv.camera import Pose
+from jaxnbv.checks import AnyArray
+from jaxnbv.cloud import PointCloud
+from jaxnbv.episode import Episode
+from jaxnbv.experiments.metrics import coverage, truth_points
+from jaxnbv.planner import Planner
+from jaxnbv.scanning import Grid
+from jaxnbv.search import Proposal
+from jaxnbv.surfaces import SurfacePosterior
+from jaxnbv.viz.words import Quantity, describe_choice, describe_first, quantity
+
+COVERAGE_RADIUS = 0.05
+# The variance of one point costs a triangular solve with the whole cloud, the slope two evaluations of the mean.
+_DEVIATION_ANCHORS = 256
+_SLOPE_ANCHORS = 1024
+_SLOPE_STEP = 0.005
+_MEAN_RESOLUTION = 100
+_SLOW_MEAN_RESOLUTION = 40
+_CHUNK = 16_000
+
+
+class MeanSurface(eqx.Module):
+    """Triangles of the surface where the posterior mean equals its level, in scene coordinates.
+
+    - `normals`: unit, outward.
+    - `deviation`: standard deviation of the surface's position along its normal, to first order:
+      sd f(x) / |grad E f(x)|, in scene units.
+    """
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    normals: Float[np.ndarray, "v 3"]
+    deviation: Float[np.ndarray, " v"]
+
+
+class Choice(eqx.Module):
+    """What the search looked at when it chose a view.
+
+    - `directions`: unit vectors from the origin to the candidates; `values`: theirs, NaN where excluded as visited.
+    - `chosen`, `value`: direction and value of the pose that was taken.
+    - `rank`: 1 for the best.
+    """
+
+    directions: Float[np.ndarray, "c 3"]
+    values: Float[np.ndarray, " c"]
+    chosen: Float[np.ndarray, "3"]
+    value: float
+    rank: int
+
+    @property
+    def visited(self) -> Bool[np.ndarray, " c"]:
+        return np.isnan(self.values)
+
+    @property
+    def open_values(self) -> Float[np.ndarray, " o"]:
+        """Values of the candidates that were open, best first."""
+        return np.sort(self.values[~self.visited])[::-1]
+
+
+class ViewData(eqx.Module):
+    """One view, ready to be drawn.
+
+    - `number`: from 1.
+    - `before`: points kept before this view; `new`: points it added. Scene coordinates.
+    - `surface`: None where the posterior mean has no surface within the grid.
+    - `choice`: None for a view that was given.
+    - `coverage`: share of the true surface within `COVERAGE_RADIUS` of the cloud; None where the truth is not known.
+    - `count`: points of the cloud after this view.
+    - `sentence`: what happened, in words.
+    """
+
+    number: int
+    pose: Pose
+    before: Float[np.ndarray, "n 3"]
+    new: Float[np.ndarray, "m 3"]
+    surface: MeanSurface | None
+    choice: Choice | None
+    coverage: float | None
+    count: int
+    sentence: str
+
+
+class ReportData(eqx.Module):
+    """All views of an episode, and what the values of its search mean."""
+
+    views: tuple[ViewData, ...]
+    quantity: Quantity
+
+
+def report_data(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, progress: bool = True) -> ReportData:
+    """Everything that the pictures of an episode show. Conditions the model once a view; nothing recompiles after the
+    first.
+
+    `truth`: points of the true surface (scene coordinates); by default sampled from the scene, where it can be.
+    """
+    planner = episode.planner
+    truth = truth_points(episode.scene, jax.random.key(0)) if truth is None else truth
+    values = quantity(planner.search, planner.acquisition)
+    drawn: list[ViewData] = []
+    for index, view in enumerate(tqdm(episode.views, desc="drawing views", disable=not progress)):
+        covered = None if truth is None else coverage(view.cloud, truth, COVERAGE_RADIUS)
+        before = drawn[-1] if drawn else None
+        choice = None if view.proposal is None else choice_of(view.proposal)
+        new, _ = view.scan.to_numpy()
+        count = int(view.cloud.count)
+        if choice is None or before is None:
+            words = describe_first(view.pose, len(new), covered)
+        else:
+            earlier = [other.pose for other in episode.views[:index]]
+            change = None if covered is None or before.coverage is None else (before.coverage, covered)
+            others = tuple(choice.open_values.tolist())
+            words = describe_choice(
+                values, choice.value, choice.rank, others, view.pose, earlier, len(new), count, change
+            )
+        drawn.append(
+            ViewData(
+                number=index + 1,
+                pose=view.pose,
+                before=episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), new.dtype),
+                new=new,
+                surface=mean_surface(planner, view.cloud),
+                choice=choice,
+                coverage=covered,
+                count=count,
+                sentence=f"View {index + 1} {words}",
+            )
+        )
+    return ReportData(tuple(drawn), values)
+
+
+def choice_of(proposal: Proposal) -> Choice:
+    """A proposal's candidates as directions, and where the chosen one stands among them."""
+    values = np.asarray(proposal.values, dtype=np.float64)
+    values = np.where(np.isfinite(values), values, np.nan)
+    positions = np.asarray(proposal.candidates.position, dtype=np.float64)
+    value = float(proposal.value)
+    return Choice(
+        directions=_unit(positions),
+        values=values,
+        chosen=_unit(np.asarray(proposal.pose.position, dtype=np.float64)),
+        value=value,
+        rank=1 + int(np.sum(values > value)),
+    )
+
+
+def mean_surface(planner: Planner, cloud: PointCloud) -> MeanSurface | None:
+    """The surface of the posterior mean given a cloud, with its standard deviation; None if the grid holds none."""
+    posterior = planner.model.condition(cloud)
+    grid, values = _mean_on_grid(posterior, planner.grid)
+    if not values.min() < 0 < values.max():
+        return None
+    found = marching_cubes(values, 0.0, spacing=(grid.spacing,) * 3, gradient_direction="descent")
+    vertices, faces, normals = found[0] - grid.half_extent, found[1], _unit(found[2])
+    # Along the normals too, so that the two sides of a thin sheet are told apart.
+    features = np.concatenate([vertices, 0.1 * normals], axis=1)
+    anchors = _spread(features, _SLOPE_ANCHORS)
+    few = anchors[:_DEVIATION_ANCHORS]
+    dtype = cloud.points.dtype
+    variance = np.asarray(posterior.variance(vertices[few].astype(dtype)))
+    step = _SLOPE_STEP * normals[anchors]
+    ahead, behind = (np.asarray(posterior.mean((vertices[anchors] + s).astype(dtype))) for s in (step, -step))
+    slope = np.abs(ahead - behind) / (2.0 * _SLOPE_STEP)
+    spread = _interpolate(features, few, np.sqrt(np.maximum(variance, 1e-30)))
+    deviation = spread / _interpolate(features, anchors, np.maximum(slope, 1e-6))
+    return MeanSurface(vertices, faces, normals, deviation)
+
+
+def _mean_on_grid(posterior: SurfacePosterior, grid: Grid) -> tuple[Grid, np.ndarray]:
+    """E f minus the level at the nodes of a grid of the given extent: fine where a field can be evaluated on one."""
+    field = getattr(posterior, "mean_field", None)
+    limit = _MEAN_RESOLUTION if field is not None else _SLOW_MEAN_RESOLUTION
+    grid = Grid(min(grid.resolution, limit), grid.half_extent)
+    if field is not None:
+        values = np.asarray(field.on_grid(grid.axis))[0]
+    else:
+        nodes = np.stack(np.meshgrid(*[grid.axis] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        nodes = nodes.astype(posterior.level.dtype)
+        parts = np.split(nodes, range(_CHUNK, len(nodes), _CHUNK))
+        values = np.concatenate([np.asarray(posterior.mean(part)) for part in parts])
+        values = values.reshape((grid.resolution,) * 3)
+    return grid, values - float(posterior.level)
+
+
+def _spread(features: np.ndarray, count: int) -> np.ndarray:
+    """`count` rows far from each other, in order of choice; repeated from the start where there are fewer rows."""
+    chosen = np.zeros(min(count, len(features)), dtype=np.int64)
+    distance = np.full(len(features), np.inf)
+    for i in range(1, len(chosen)):
+        distance = np.minimum(distance, np.sum((features - features[chosen[i - 1]]) ** 2, axis=1))
+        chosen[i] = distance.argmax()
+    return np.resize(chosen, count)
+
+
+def _interpolate(features: np.ndarray, anchors: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values at all rows from those at the anchors, positive throughout: a Gaussian mean of the nearest logarithms."""
+    distance, near = cKDTree(features[anchors]).query(features, k=min(8, len(anchors)))
+    width = 0.5 * distance[:, -1:] + 1e-12
+    weight = np.exp(-0.5 * (distance / width) ** 2) + 1e-12
+    return np.exp(np.sum(weight * np.log(values)[near], axis=1) / np.sum(weight, axis=1))
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.where(length > 0, length, 1.0)

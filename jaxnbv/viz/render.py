@@ -1,0 +1,137 @@
+"""A still picture of one view's scene: the mean surface ray-traced, points and cameras drawn in front of and behind it."""
+
+import math
+
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Bool, Float
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LogNorm
+from scipy.spatial import cKDTree
+
+from jaxnbv.camera import Camera, Pose, look_at
+from jaxnbv.cloud import Frame
+from jaxnbv.scanning import TriangleMesh
+from jaxnbv.viz.data import MeanSurface, ViewData
+from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW
+
+FRUSTUM_DEPTH = 0.45
+_DISTANCE = 11.0
+_SLACK = 0.04  # Noise and the mean's own error must not hide a point behind the surface that it lies on.
+
+
+def beside(pose: Pose, radius: float = 1.0) -> Float[np.ndarray, "3"]:
+    """Where to look from so as to see what a camera sees, and the camera itself from the side: 40 degrees around."""
+    away = np.asarray(pose.position, dtype=np.float64)
+    away = away / max(float(np.linalg.norm(away)), 1e-12)
+    across = np.cross([0.0, 1.0, 0.0], away)
+    if np.linalg.norm(across) < 1e-3:
+        across = np.array([1.0, 0.0, 0.0])
+    across = across / np.linalg.norm(across)
+    return radius * (math.cos(math.radians(40)) * away + math.sin(math.radians(40)) * across)
+
+
+def frustum(pose: Pose, camera: Camera, depth: float = FRUSTUM_DEPTH) -> Float[np.ndarray, "lines 2 3"]:
+    """Edges of a camera's field of view up to a depth, as segments in scene coordinates; the last marks its up side."""
+    tall = depth * math.tan(0.5 * camera.fov)
+    wide = tall * camera.width / camera.height
+    corners = np.array([[-wide, -tall, depth], [wide, -tall, depth], [wide, tall, depth], [-wide, tall, depth]])
+    corners = corners @ np.asarray(pose.rotation, dtype=np.float64).T + np.asarray(pose.position)
+    apex = np.broadcast_to(np.asarray(pose.position), corners.shape)
+    return np.concatenate([np.stack([apex, corners], axis=1), np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)])
+
+
+class Still:
+    """A perspective picture from one place, `size` pixels a side, in which all cameras of the scene have room."""
+
+    def __init__(self, eye: Float[np.ndarray, "3"], surface: MeanSurface | None, size: int, reach: float):
+        self.size = size
+        self.camera = Camera(2.0 * math.atan(1.08 * reach / _DISTANCE), size, size)
+        self.pose = look_at(_DISTANCE * eye / np.linalg.norm(eye))
+        self.image = np.zeros((size, size, 4))
+        self.depth = np.full((size, size), np.inf)
+        self.norm: LogNorm | None = None
+        self._surface = surface
+
+    def paint(self, deviation: LogNorm) -> None:
+        """Trace the surface, coloured by its standard deviation and lit from beside the eye; four rays a pixel."""
+        surface = self._surface
+        if surface is None:
+            return
+        fine = Camera(self.camera.fov, 2 * self.size, 2 * self.size)
+        mesh = TriangleMesh(surface.vertices.astype(np.float64), surface.faces.astype(np.int64), Frame())
+        origins, directions = fine.rays(self.pose)
+        hits = mesh.trace(origins, directions)
+        mask = np.asarray(hits.mask)
+        points = np.asarray(hits.points)[mask]
+        distance, near = cKDTree(surface.vertices).query(points, k=3)
+        weight = 1.0 / (distance + 1e-4)
+        weight /= weight.sum(axis=1, keepdims=True)
+        normals = np.sum(weight[..., None] * surface.normals[near], axis=1)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12
+        right, down, forward = np.asarray(self.pose.rotation).T
+        light = -forward - 0.5 * right - 0.7 * down
+        lit = 0.62 + 0.42 * np.clip(normals @ (light / np.linalg.norm(light)), -0.4, 1.0)
+        colours = DEVIATION(deviation(np.exp(np.sum(weight * np.log(surface.deviation)[near], axis=1))))
+        colours[:, :3] = np.clip(colours[:, :3] * lit[:, None], 0.0, 1.0)
+        image = np.zeros((len(mask), 4))
+        image[mask] = colours
+        image[:, :3] *= image[:, 3:]
+        image = image.reshape(self.size, 2, self.size, 2, 4).mean(axis=(1, 3))
+        image[..., :3] /= np.maximum(image[..., 3:], 1e-9)
+        self.image = np.clip(image, 0.0, 1.0)
+        depth = np.full(len(mask), np.inf)
+        depth[mask] = (points - np.asarray(self.pose.position)) @ forward
+        self.depth = depth.reshape(self.size, 2, self.size, 2).min(axis=(1, 3))
+
+    def project(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
+        """Pixel coordinates of points of the scene, and whether they lie in front of the surface."""
+        local = (points - np.asarray(self.pose.position)) @ np.asarray(self.pose.rotation)
+        pixels = self.camera.focal_length * local[:, :2] / local[:, 2:] + 0.5 * self.size
+        column, row = np.clip(pixels.astype(int), 0, self.size - 1).T
+        return pixels - 0.5, local[:, 2] < self.depth[row, column] + _SLACK
+
+
+def draw_scene(
+    axes: Axes, view: ViewData, poses: list[Pose], camera: Camera, deviation: LogNorm, size: int, weight: float = 1.0
+) -> None:
+    """Draw one view's scene into an empty axes: surface, points, and the frusta of `poses`, the last of which is new.
+
+    `weight` scales lines, dots and letters.
+    """
+    reach = max(1.8, *(float(np.linalg.norm(pose.position)) for pose in poses))
+    still = Still(beside(view.pose), view.surface, size, reach)
+    still.paint(deviation)
+    axes.imshow(still.image, interpolation="bilinear", zorder=1)
+    for points, colour, dot in ((view.before, BEFORE, 0.7), (view.new, NEW, 1.1)):
+        pixels, in_front = still.project(points)
+        axes.scatter(*pixels[in_front].T, s=dot * weight, c=colour, linewidths=0, zorder=2)
+    for number, pose in enumerate(poses, start=1):
+        is_new = number == len(poses)
+        colour = NEW if is_new else GREY
+        # Cut fine, so that what stands behind the surface can be drawn faint.
+        ends = frustum(pose, camera)
+        steps = np.linspace(0.0, 1.0, 25)[:, None, None]
+        fine = ends[:, 0] + steps * (ends[:, 1] - ends[:, 0])
+        pixels, in_front = still.project(fine.reshape(-1, 3))
+        pixels, in_front = pixels.reshape(25, -1, 2), in_front.reshape(25, -1)
+        segments = np.stack([pixels[:-1], pixels[1:]], axis=2).reshape(-1, 2, 2)
+        shown = (in_front[:-1] & in_front[1:]).reshape(-1)
+        width = (1.5 if is_new else 0.9) * weight
+        colours = mpl.colors.to_rgba_array([colour] * len(segments), np.where(shown, 1.0, 0.18))
+        axes.add_collection(LineCollection(list(segments), colors=colours, linewidths=width, zorder=3))
+        apex, apex_in_front = still.project(np.asarray(pose.position, dtype=np.float64)[None] * 1.09)
+        axes.text(
+            *apex[0],
+            str(number),
+            color=colour,
+            alpha=1.0 if apex_in_front[0] else 0.4,
+            fontsize=9 * weight,
+            fontweight="bold" if is_new else "normal",
+            ha="center",
+            va="center",
+            zorder=4,
+        )
+    axes.set(xlim=(-0.5, size - 0.5), ylim=(size - 0.5, -0.5), aspect="equal")
+    axes.axis("off")

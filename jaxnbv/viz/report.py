@@ -1,0 +1,149 @@
+"""The report of an episode: one HTML page that opens offline, and the same pictures as PNG files."""
+
+import base64
+import html
+import io
+import json
+import math
+from datetime import datetime, timezone
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Float
+from PIL import Image
+from plotly.offline import get_plotlyjs
+
+from jaxnbv.camera import Camera, Pose
+from jaxnbv.checks import AnyArray
+from jaxnbv.episode import Episode
+from jaxnbv.storage import describe, versions
+from jaxnbv.viz import sphere
+from jaxnbv.viz.data import COVERAGE_RADIUS, Choice, MeanSurface, ReportData, ViewData, report_data
+from jaxnbv.viz.figures import coverage_series, deviation_range, value_range, write_figures
+from jaxnbv.viz.render import beside, frustum
+from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, colour_scale, log_ticks
+
+_MAX_BEFORE, _MAX_NEW = 4000, 2500
+_QUANTA = 32_000  # Coordinates travel as 16-bit integers: of a scene 3.5 wide, steps of 1e-4.
+
+
+def write_report(
+    episode: Episode,
+    folder: str | Path,
+    truth: Float[AnyArray, "n 3"] | None = None,
+    title: str = "object",
+    progress: bool = True,
+) -> Path:
+    """Write `report.html` and `figures/*.png` into a folder, which is made where it is missing, and return the page's
+    path. Files of an earlier report are replaced.
+
+    - `truth`: points of the true surface in scene coordinates, for the chart of coverage; by default sampled from the
+      scene, where it can be. Without truth the chart counts points.
+    - `title`: what the object is called.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    data = report_data(episode, truth, progress)
+    write_figures(data, episode.planner.camera, folder / "figures", progress)
+    path = folder / "report.html"
+    path.write_text(report_html(episode, data, title), encoding="utf-8")
+    return path
+
+
+def report_html(episode: Episode, data: ReportData, title: str) -> str:
+    """The page as text: a template with the data, the header and plotly's own code put in."""
+    # "</" would end the script element that holds the data.
+    payload = json.dumps(_payload(episode, data), allow_nan=False).replace("</", "<\\/")
+    parts = {
+        "TITLE": html.escape(title),
+        "HEADER": _header(episode, title),
+        "QUANTITY": html.escape(data.quantity.label),
+        "MEANING": html.escape(data.quantity.meaning),
+        "COVERAGE": html.escape(_coverage_caption(data)),
+        "COUNT": str(len(data.views)),
+        "PLOTLY": get_plotlyjs(),
+        "DATA": payload,
+    }
+    text = Path(__file__).with_name("template.html").read_text(encoding="utf-8")
+    pieces = text.split("@@")
+    return "".join(piece if i % 2 == 0 else parts[piece] for i, piece in enumerate(pieces))
+
+
+def _coverage_caption(data: ReportData) -> str:
+    if data.views[0].coverage is None:
+        return "Points kept by view; the true surface is not known."
+    return f"Share of the true surface within {COVERAGE_RADIUS:g} scene units of the cloud, by view."
+
+
+def _header(episode: Episode, title: str) -> str:
+    planner = episode.planner
+    search, model = (describe(module) for module in (planner.search, planner.model))
+    settings = {
+        "Object": title,
+        "Search": _call(search),
+        "Acquisition": _call(describe(planner.acquisition)),
+        "Surface model": _call(model),
+        "Posterior samples": f"{planner.num_samples} on a {planner.grid.resolution}³ grid",
+        "Camera": f"{math.degrees(planner.camera.fov):.0f}°, {planner.camera.width} × {planner.camera.height} pixels",
+        "Sensor noise": _call(describe(episode.noise)),
+        "Capacity": f"{planner.capacity:,} points",
+        "Seed": ", ".join(str(word) for word in describe(episode.key)["data"]),
+        "Versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
+        "Written": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+    }
+    rows = (f"<div><dt>{name}</dt><dd>{html.escape(str(value))}</dd></div>" for name, value in settings.items())
+    return "".join(rows)
+
+
+def _call(description: dict) -> str:
+    """A module's description as the call that made it."""
+    arguments = {name: value for name, value in description.items() if name != "type"}
+    inside = ", ".join(f"{name}={_short(value)}" for name, value in arguments.items())
+    return f"{description['type']}({inside})" if inside else str(description["type"])
+
+
+def _short(value) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return value.get("type", "...") if isinstance(value, dict) else str(value)
+
+
+def _payload(episode: Episode, data: ReportData) -> dict:
+    low, high = deviation_range(data)
+    ticks = log_ticks(low, high)
+    label, series = coverage_series(data)
+    camera = episode.planner.camera
+    return {
+        "views": [_view(view, camera, data.quantity.smooth) for view in data.views],
+        "extent": episode.planner.grid.half_extent / _QUANTA,
+        "reach": max(1.8, *(float(np.linalg.norm(view.pose.position)) for view in data.views)) * 1.12,
+        "deviation": {
+            "range": [math.log10(low), math.log10(high)],
+            "ticks": np.log10(ticks).tolist(),
+            "labels": [f"{tick:g}" for tick in ticks.tolist()],
+            "colours": colour_scale(DEVIATION),
+        },
+        "value": {"colours": colour_scale(VALUE), "label": data.quantity.label},
+        "progress": {"label": label, "values": series.tolist()},
+        "map": {
+            "graticule": [line.round(4).tolist() for line in sphere.graticule()],
+            "rim": sphere.rim().round(4).tolist(),
+            "width": sphere.WIDTH,
+            "height": sphere.HEIGHT,
+        },
+        "style": {"ink": INK, "grey": GREY, "line": LINE, "before": BEFORE, "new": NEW},
+    }
+
+
+def _view(view: ViewData, camera: Camera, smooth: bool) -> dict:
+    return {
+        "sentence": view.sentence,
+        "before": _thinned(view.before, _MAX_BEFORE),
+        "new": _thinned(view.new, _MAX_NEW),
+        "eye": beside(view.pose).round(4).tolist(),
+        "frustum": frustum(view.pose, camera).round(4).tolist(),
+        "label": (1.09 * np.asarray(view.pose.position, dtype=np.float64)).round(4).tolist(),
+        "surface": None if view.surface is None else _surface(view.surface),
+        "choice": None if view.choice is None else _choice(view.choice, smooth),
+    }

@@ -1,0 +1,72 @@
+"""The sphere of candidates as a map: Mollweide's equal-area projection, front (the scene's +z) at its centre, y up."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.interpolate import RBFInterpolator
+
+WIDTH, HEIGHT = 2.0 * np.sqrt(2.0), np.sqrt(2.0)  # Half axes of the map's ellipse.
+
+
+def mollweide(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    """Places on the map of unit vectors: longitude atan2(x, z) to the right, latitude asin(y) upwards."""
+    longitude = np.arctan2(directions[:, 0], directions[:, 2])
+    sine = np.clip(directions[:, 1], -1.0, 1.0)
+    # 2 t + sin 2 t = pi sin(latitude), by bisection: Newton's steps stall at the poles, where the slope is zero.
+    low, high = np.full_like(sine, -0.5 * np.pi), np.full_like(sine, 0.5 * np.pi)
+    for _ in range(50):
+        t = 0.5 * (low + high)
+        above = 2.0 * t + np.sin(2.0 * t) > np.pi * sine
+        low, high = np.where(above, low, t), np.where(above, t, high)
+    t = 0.5 * (low + high)
+    return np.stack([WIDTH * longitude / np.pi * np.cos(t), HEIGHT * np.sin(t)], axis=1)
+
+
+def from_mollweide(places: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """Unit vectors of places on the map, and whether a place is on the map at all."""
+    x, y = places.T
+    t = np.arcsin(np.clip(y / HEIGHT, -1.0, 1.0))
+    longitude = np.pi * x / (WIDTH * np.maximum(np.cos(t), 1e-9))
+    sine = np.clip((2.0 * t + np.sin(2.0 * t)) / np.pi, -1.0, 1.0)
+    ring = np.sqrt(1.0 - sine**2)
+    inside = (x / WIDTH) ** 2 + (y / HEIGHT) ** 2 <= 1.0
+    return np.stack([ring * np.sin(longitude), sine, ring * np.cos(longitude)], axis=1), inside
+
+
+def smooth_map(
+    directions: Float[np.ndarray, "c 3"], values: Float[np.ndarray, " c"], height: int
+) -> Float[np.ndarray, "h w"]:
+    """The values of candidates carried over the map, `height` by 2 `height` pixels from its top; NaN outside it.
+
+    A spline over the chords of the sphere, which goes through the values (NaN ones are left out) and stays within
+    their range.
+    """
+    x = WIDTH * ((np.arange(2 * height) + 0.5) / height - 1.0)
+    y = HEIGHT * (1.0 - 2.0 * (np.arange(height) + 0.5) / height)
+    places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    at, inside = from_mollweide(places)
+    known = ~np.isnan(values)
+    spline = RBFInterpolator(directions[known], values[known], kernel="thin_plate_spline", degree=0)
+    smooth = np.clip(spline(at), values[known].min(), values[known].max())
+    return np.where(inside, smooth, np.nan).reshape(height, 2 * height)
+
+
+def graticule() -> list[Float[np.ndarray, "n 2"]]:
+    """Lines on the map: parallels every 30 degrees, meridians every 60."""
+    lines = []
+    fine = np.linspace(-1.0, 1.0, 121)
+    for latitude in np.radians([-60.0, -30.0, 0.0, 30.0, 60.0]):
+        lines.append((np.pi * 0.9999 * fine, np.full_like(fine, latitude)))
+    for longitude in np.radians([-120.0, -60.0, 0.0, 60.0, 120.0]):
+        lines.append((np.full_like(fine, longitude), 0.5 * np.pi * fine))
+    return [mollweide(_directions(longitude, latitude)) for longitude, latitude in lines]
+
+
+def rim() -> Float[np.ndarray, "n 2"]:
+    """The map's outline."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 181)
+    return np.stack([WIDTH * np.cos(angle), HEIGHT * np.sin(angle)], axis=1)
+
+
+def _directions(longitude: np.ndarray, latitude: np.ndarray) -> np.ndarray:
+    ring = np.cos(latitude)
+    return np.stack([ring * np.sin(longitude), np.sin(latitude), ring * np.cos(longitude)], axis=1)

@@ -1,0 +1,30 @@
+"""Colours and ranges that the page and the figures share; all can be told apart by colour-blind readers."""
+
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Float
+from matplotlib.colors import Colormap, LinearSegmentedColormap
+
+INK, GREY, LINE = "#1f2733", "#7a8494", "#d9dee6"
+BEFORE, NEW = "#26344d", "#d55e00"
+# Pale where the surface is known, dark where it is not: the scanned points stand out on what is known.
+DEVIATION = LinearSegmentedColormap.from_list("deviation", mpl.colormaps["YlGnBu"](np.linspace(0.04, 0.92, 256)))
+VALUE = mpl.colormaps["cividis"]
+
+
+def colour_scale(colours: Colormap, steps: int = 32) -> list[list]:
+    """A colour map as plotly writes one."""
+    return [[t, mpl.colors.to_hex(colours(t))] for t in np.linspace(0.0, 1.0, steps).tolist()]
+
+
+def round_range(low: float, high: float) -> tuple[float, float]:
+    """The range in steps of 1, 2, 5 that holds [low, high], for an axis of logarithms."""
+    ticks = log_ticks(low / 10.0, high * 10.0)
+    return float(ticks[ticks <= low * 1.0001].max()), float(ticks[ticks >= high * 0.9999].min())
+
+
+def log_ticks(low: float, high: float) -> Float[np.ndarray, " n"]:
+    """1, 2, 5, 10, ... within [low, high]."""
+    decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
+    ticks = np.outer(decades, [1.0, 2.0, 5.0]).ravel()
+    return ticks[(ticks >= low * 0.9999) & (ticks <= high * 1.0001)]

@@ -1,0 +1,129 @@
+"""What happened at every view, in words, and what the values of a search are called."""
+
+import equinox as eqx
+import numpy as np
+
+from jaxnbv.acquisition import ExpectedUtilityImprovement, Score
+from jaxnbv.camera import Pose
+from jaxnbv.search import FarthestView, RandomView, Search, UncertaintyView
+from jaxnbv.tasks import Coverage
+
+
+class Quantity(eqx.Module):
+    """What a search maximises.
+
+    - `name`, `unit`: in words; the unit is empty where there is none.
+    - `meaning`: a sentence for a caption.
+    - `smooth`: whether values between two candidates mean anything.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    smooth: bool = True
+
+    @property
+    def label(self) -> str:
+        return f"{self.name} ({self.unit})" if self.unit else self.name
+
+    def show(self, value: float) -> str:
+        """A value with its unit, where the unit is a length or an area."""
+        return f"{number(value)} {self.unit}" if self.unit.startswith("scene units") else number(value)
+
+
+def quantity(search: Search, score: Score) -> Quantity:
+    """What the values of a search are, from the kinds of search and score."""
+    if isinstance(search, FarthestView):
+        meaning = "Distance from a candidate to the nearest camera so far; the surface is not looked at."
+        return Quantity("distance to the nearest camera", "scene units", meaning)
+    if isinstance(search, RandomView):
+        meaning = "Every open candidate drew a lot; the surface is not looked at."
+        return Quantity("lot drawn", "uniform on [0, 1)", meaning, smooth=False)
+    if isinstance(search, UncertaintyView):
+        meaning = "Length of the principal ray along which the posterior samples disagree whether it has hit."
+        return Quantity("uncertain length of the principal ray", "scene units", meaning)
+    if isinstance(score, Coverage):
+        meaning = "Squared distances from an imagined scan to the cloud, summed over the scan, mean over posterior samples."
+        return Quantity("expected coverage gain", "scene units²", meaning)
+    if isinstance(score, ExpectedUtilityImprovement):
+        meaning = "How much an imagined scan raises the utility of the cloud, mean over posterior samples."
+        return Quantity("expected utility improvement", "", meaning)
+    meaning = "Score of an imagined scan, mean over posterior samples."
+    return Quantity(f"acquisition, {type(score).__name__}", "", meaning)
+
+
+def describe_first(pose: Pose, points: int, covered: float | None) -> str:
+    """What a view that was given saw, to follow "View 1"."""
+    share = "" if covered is None else f", {covered:.0%} of the true surface"
+    return f"was given. It looks from {place(pose)}, and found {points:,} points{share}."
+
+
+def describe_choice(
+    values: Quantity,
+    value: float,
+    rank: int,
+    others: tuple[float, ...],
+    pose: Pose,
+    earlier: list[Pose],
+    points: int,
+    count: int,
+    change: tuple[float, float] | None,
+) -> str:
+    """Where a view looks from, why it was chosen and what it added, to follow "View 2".
+
+    `others`: values of the open candidates, best first; `change`: coverage before and after, where it is known.
+    """
+    turned = f"{nearest_angle(pose, earlier):.0f}° from the nearest earlier view"
+    parts = [f"looks from {place(pose)}, {turned}.", _reason(values, value, rank, others)]
+    added = f"It added {points:,} points" if points else "It saw nothing"
+    kept = f" ({count:,} are kept)" if points else ""
+    grown = ""
+    if change is not None:
+        before, after = (f"{share:.0%}" for share in change)
+        grown = f"; coverage stayed at {after}" if before == after else f"; coverage went from {before} to {after}"
+    return " ".join([*parts, f"{added}{kept}{grown}."])
+
+
+def _reason(values: Quantity, value: float, rank: int, others: tuple[float, ...]) -> str:
+    if not values.smooth:
+        return f"It was drawn at random from {len(others)} open candidates."
+    best = rank == 1
+    stands = "the highest" if best else f"rank {rank}"
+    text = f"Its {values.name}, {values.show(value)}, was {stands} of {len(others)} open candidates"
+    median = float(np.median(others))
+    compared = f"the median candidate had {number(median)}"
+    if median > 0 and value / median < 1000:
+        compared = f"{number(value / median)} times the median ({number(median)})"
+    if not best or len(others) < 2:
+        return f"{text}: {compared}."
+    runner_up = others[1]
+    if runner_up > 0:
+        ahead = value / runner_up - 1.0
+        margin = "level with the runner-up" if ahead < 5e-4 else f"{100 * ahead:.2g} % above the runner-up"
+        if ahead >= 1:
+            margin = f"{number(ahead + 1)} times the runner-up"
+    else:
+        margin = "the runner-up had"
+    return f"{text}: {compared}, {margin} ({number(runner_up)})."
+
+
+def place(pose: Pose) -> str:
+    """A camera's position and its elevation over the scene's horizon (y is up)."""
+    position = np.asarray(pose.position, dtype=np.float64)
+    elevation = np.degrees(np.arcsin(position[1] / max(float(np.linalg.norm(position)), 1e-12)))
+    side = "above" if elevation >= 0 else "below"
+    x, y, z = (f"{coordinate:.2f}".replace("-", "−") for coordinate in position)
+    return f"({x}, {y}, {z}), {abs(elevation):.0f}° {side} the horizon"
+
+
+def nearest_angle(pose: Pose, earlier: list[Pose]) -> float:
+    """Angle at the origin, in degrees, between a camera and the nearest of the others."""
+    here, *others = (np.asarray(p.position, dtype=np.float64) for p in (pose, *earlier))
+    cosines = [here @ there / (np.linalg.norm(here) * np.linalg.norm(there) + 1e-12) for there in others]
+    return float(np.degrees(np.arccos(np.clip(max(cosines), -1.0, 1.0))))
+
+
+def number(value: float) -> str:
+    """Three significant digits, without an exponent where none is needed."""
+    text = f"{value:,.0f}" if 999.5 <= abs(value) < 1e7 else f"{value:.3g}"
+    return text.replace("-", "−")

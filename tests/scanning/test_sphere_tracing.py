@@ -1,0 +1,221 @@
+"""Sphere tracing against closed forms in float64 NumPy, and its derivatives against finite differences."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnbv.camera import Camera, fibonacci_sphere, look_at
+from jaxnbv.scanning.scanner import scan
+from jaxnbv.scanning.sdf import Box, Cylinder, Sphere, Torus
+from jaxnbv.scanning.sphere_tracing import SDFSurface
+
+RNG = np.random.default_rng(0)
+MUG = (Cylinder(0.8, 0.8) - Cylinder(0.7, 0.8).translate([0, 0.1, 0])) | Torus(0.4, 0.1).rotate(
+    [1, 0, 0], np.pi / 2
+).translate([0.8, 0, 0])
+
+
+def sphere_hit(o, d, radius):
+    b = np.sum(o * d, axis=1)
+    squared = b**2 - np.sum(o**2, axis=1) + radius**2
+    root = np.sqrt(np.maximum(squared, 0))
+    t = np.where(-b - root > 0, -b - root, -b + root)
+    return np.where((squared > 0) & (t > 0), t, np.inf)
+
+
+def box_hit(o, d, half):
+    a, b = (-half - o) / d, (half - o) / d
+    enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+    t = np.where(enter > 0, enter, leave)
+    return np.where((enter < leave) & (t > 0), t, np.inf)
+
+
+def cylinder_hit(o, d, radius, half_height):
+    a, b = d[:, 0] ** 2 + d[:, 2] ** 2, o[:, 0] * d[:, 0] + o[:, 2] * d[:, 2]
+    squared = b**2 - a * (o[:, 0] ** 2 + o[:, 2] ** 2 - radius**2)
+    root = np.sqrt(np.maximum(squared, 0))
+    low, high = (-half_height - o[:, 1]) / d[:, 1], (half_height - o[:, 1]) / d[:, 1]
+    enter = np.maximum(np.minimum(low, high), (-b - root) / a)
+    leave = np.minimum(np.maximum(low, high), (-b + root) / a)
+    t = np.where(enter > 0, enter, leave)
+    return np.where((squared > 0) & (enter < leave) & (t > 0), t, np.inf)
+
+
+def torus_hit(o, d, major, minor):
+    """Least positive root of the quartic (|x|^2 + R^2 - r^2)^2 = 4 R^2 (x^2 + z^2)."""
+    t = np.full(len(o), np.inf)
+    for i, (p, q) in enumerate(zip(o, d, strict=True)):
+        square = np.array([1.0, 2 * p @ q, p @ p + major**2 - minor**2])
+        ring = np.array([q[0] ** 2 + q[2] ** 2, 2 * (p[0] * q[0] + p[2] * q[2]), p[0] ** 2 + p[2] ** 2])
+        quartic = np.polymul(square, square)
+        quartic[2:] -= 4 * major**2 * ring
+        roots = np.roots(quartic)
+        real = roots.real[(np.abs(roots.imag) < 1e-7) & (roots.real > 0)]
+        t[i] = real.min(initial=np.inf)
+    return t
+
+
+SOLIDS = {
+    "sphere": (Sphere(0.9), lambda o, d: sphere_hit(o, d, 0.9)),
+    "box": (Box([0.7, 0.5, 0.9]), lambda o, d: box_hit(o, d, np.array([0.7, 0.5, 0.9]))),
+    "cylinder": (Cylinder(0.6, 0.8), lambda o, d: cylinder_hit(o, d, 0.6, 0.8)),
+    "torus": (Torus(0.7, 0.3), lambda o, d: torus_hit(o, d, 0.7, 0.3)),
+}
+
+
+def some_rays(count, radius=2.5):
+    origins = RNG.normal(size=(count, 3))
+    origins *= radius / np.linalg.norm(origins, axis=1, keepdims=True)
+    directions = RNG.uniform(-1, 1, (count, 3)) - origins
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return origins.astype(np.float32), directions.astype(np.float32)
+
+
+@pytest.mark.parametrize("inside", [False, True])
+@pytest.mark.parametrize("name", SOLIDS)
+def test_hits_equal_closed_forms(name, inside):
+    sdf, expected = SOLIDS[name]
+    o, d = some_rays(2000)
+    if inside:
+        o = np.zeros_like(o) + np.float32([0.65 if name == "torus" else 0.1, 0.05, 0.02])
+    hits = SDFSurface(sdf).trace(o, d)
+    t = expected(o.astype(float), d.astype(float))
+    mask = np.asarray(hits.mask)
+    # Only rays that skim the silhouette may differ: 0.2 % of them.
+    assert (mask != np.isfinite(t)).mean() <= 0.002
+    both = mask & np.isfinite(t)
+    assert both.sum() > 500
+    error = np.linalg.norm(np.asarray(hits.points) - (o + t[:, None] * d), axis=1)[both]
+    facing = -np.sum(np.asarray(hits.normals) * d, axis=1)[both]
+    # Rounding of the distance, 4e-7, over the sine of the angle between ray and surface.
+    error = (error * facing)[facing > 0.02]
+    assert np.quantile(error, 0.995) < 2e-6
+    assert error.max() < 1e-4  # The last chord may end on the wrong side of a sharp edge.
+    assert (facing >= 0).all()
+    np.testing.assert_allclose(np.linalg.norm(np.asarray(hits.normals)[mask], axis=1), 1.0, atol=1e-5)
+    assert not np.asarray(hits.points)[~mask].any()
+    assert not np.asarray(hits.normals)[~mask].any()
+
+
+def test_normals_of_the_sphere_are_radial_and_turned_to_the_sensor():
+    o, d = some_rays(1000)
+    outer = SDFSurface(Sphere(0.9)).trace(o, d)
+    mask = np.asarray(outer.mask)
+    np.testing.assert_allclose(outer.normals[mask], outer.points[mask] / 0.9, atol=1e-5)
+    inner = SDFSurface(Sphere(0.9)).trace(np.zeros_like(o), d)
+    assert bool(inner.mask.all())
+    np.testing.assert_allclose(inner.normals, -inner.points / 0.9, atol=1e-5)
+
+
+def test_image_that_misses_and_image_that_is_filled():
+    miss = scan(SDFSurface(Sphere(0.5)), Camera(), look_at([0.0, 0.0, 2.5], target=[0.0, 0.0, 5.0]))
+    assert not bool(miss.mask.any())
+    assert not np.asarray(miss.points).any()
+    full = scan(SDFSurface(Sphere(1.25)), Camera(), look_at([0.0, 0.0, 2.5]))
+    assert bool(full.mask.all())
+    np.testing.assert_allclose(np.linalg.norm(full.points, axis=-1), 1.25, atol=2e-6)
+
+
+def test_grazing_ray_is_defined_and_its_derivative_bounded():
+    offset = np.array([0.9 - 1e-5, 0.9 - 1e-3, 0.9 + 1e-3, 0.9])
+    o = jnp.asarray(np.stack([offset, 0 * offset, 0 * offset + 2.5], -1), dtype=jnp.result_type(float))
+    d = jnp.broadcast_to(jnp.asarray([0.0, 0.0, -1.0]), o.shape)
+    surface = SDFSurface(Sphere(0.9))
+    hits = surface.trace(o, d)
+    assert np.asarray(hits.mask)[:3].tolist() == [True, True, False]
+    jacobian = np.asarray(jax.jacrev(lambda o: surface.trace(o, d).points)(o))
+    assert np.isfinite(jacobian).all()
+    # |dx| <= 1 + 1 / least sine.
+    assert np.abs(jacobian).max() <= 1 + 1 / 0.05
+    assert not jacobian[2].any()
+
+
+@pytest.mark.parametrize("name", [*SOLIDS, "mug"])
+def test_derivatives_of_hits_equal_central_differences(name):
+    with jax.enable_x64(True):
+        sdf = MUG if name == "mug" else SOLIDS[name][0]
+        sdf = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), dtype=jnp.float64), sdf)
+        o, d = (jnp.asarray(a, dtype=jnp.float64) for a in some_rays(150))
+
+        @jax.jit
+        def trace(sdf, o, d):
+            hits = SDFSurface(sdf).trace(o, d)
+            return hits.points, hits.normals, hits.mask
+
+        do, dd = jnp.asarray(RNG.normal(size=(2, *o.shape)))
+        ds = jax.tree.map(lambda leaf: jnp.asarray(RNG.normal(size=leaf.shape)), sdf)
+        if name == "mug":  # A random matrix would not keep its rotations.
+            ds = jax.tree.map(jnp.zeros_like, ds)
+
+        def move(h):
+            return jax.tree.map(lambda a, b: a + h * b, (sdf, o, d), (ds, do, dd))
+
+        _, normals, mask = trace(sdf, o, d)
+        _, (dx, dn) = jax.jvp(lambda *at: trace(*at)[:2], (sdf, o, d), (ds, do, dd))
+        h = 1e-5
+        ahead, behind = trace(*move(h)), trace(*move(-h))
+        same = np.asarray(mask & ahead[2] & behind[2])
+        facing = -np.sum(np.asarray(normals) * np.asarray(d), axis=1)
+        # Where a ray changes the face it meets there is no derivative: the differences jump.
+        smooth = np.linalg.norm(np.asarray(ahead[1] - behind[1]), axis=1) < 1e-2
+        use = same & smooth & (facing > 0.15)
+        assert use.sum() > 40
+        np.testing.assert_allclose(dx[use], (ahead[0] - behind[0])[use] / (2 * h), rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(dn[use], (ahead[1] - behind[1])[use] / (2 * h), rtol=1e-3, atol=1e-3)
+        assert not np.asarray(dx)[~np.asarray(mask)].any()
+        assert bool(jnp.isfinite(dx).all() & jnp.isfinite(dn).all())
+
+
+def test_reverse_mode_has_no_nan_where_rays_miss():
+    o, d = some_rays(300)
+    surface = SDFSurface(MUG)
+
+    def total(surface, o):
+        hits = surface.trace(o, d)
+        return jnp.sum(hits.points**2) + jnp.sum(hits.normals[:, 0])
+
+    gradient, rays = jax.jit(jax.grad(total, argnums=(0, 1)))(surface, jnp.asarray(o))
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves((gradient, rays)))
+    missed = ~np.asarray(surface.trace(o, d).mask)
+    assert missed.any()
+    assert not np.asarray(rays)[missed].any()
+
+
+def test_vmapped_scenes_equal_single_scenes():
+    sizes = jnp.asarray(RNG.uniform(0.3, 0.9, (5, 2)), dtype=jnp.result_type(float))
+
+    def build(size):
+        box = Box(jnp.stack([size[0], 0.4 * jnp.ones(()), size[1]]), 0.05)
+        return box | Sphere(size[1]).translate(jnp.stack([size[0], size[0], 0.0 * size[0]]))
+
+    camera, poses = Camera(height=20, width=20, fov=0.7), look_at(fibonacci_sphere(5, 2.5))
+    together = jax.jit(jax.vmap(lambda size, pose: scan(SDFSurface(build(size)), camera, pose)))(sizes, poses)
+    batch = jax.vmap(lambda size: SDFSurface(build(size)))(sizes)
+    again = jax.jit(jax.vmap(lambda surface, pose: scan(surface, camera, pose)))(batch, poses)
+    for i in (0, 3):
+        alone = jax.jit(scan)(SDFSurface(build(sizes[i])), camera, poses[i])
+        for cloud in (together[i], again[i]):
+            assert bool((cloud.mask == alone.mask).all())
+            np.testing.assert_allclose(cloud.points, alone.points, atol=1e-5)
+            np.testing.assert_allclose(cloud.normals, alone.normals, atol=1e-4)
+
+
+def test_no_recompilation_for_other_solids_of_the_same_make():
+    traces = []
+
+    @jax.jit
+    def run(surface, pose):
+        traces.append(None)
+        return scan(surface, Camera(height=8, width=8), pose).mask
+
+    for radius in (0.5, 0.7):
+        run(SDFSurface(Sphere(radius) | Box([radius, 0.2, 0.3])), look_at([0.0, math.sqrt(2.0), 2.0 * radius]))
+    assert len(traces) == 1
+
+
+def test_a_ball_of_no_size_is_refused():
+    with pytest.raises(ValueError, match="must be positive"):
+        SDFSurface(Sphere(1.0), 0.0)

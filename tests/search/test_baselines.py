@@ -1,0 +1,160 @@
+"""The three baselines against slow versions written from their definitions."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from jaxnbv.camera import Camera, fibonacci_sphere, look_at
+from jaxnbv.cloud import PointCloud
+from jaxnbv.scanning import Grid, GridSurface
+from jaxnbv.search import FarthestView, Problem, RandomView, UncertaintyView
+from jaxnbv.search.baselines import uncertain_length
+from jaxnbv.tasks import Coverage
+
+GRID = Grid(24)
+CANDIDATES = np.asarray(fibonacci_sphere(12, 2.5), dtype=np.float64)
+
+
+def problem(visited, surfaces=None):
+    """Five rows for views, the first of them filled; the rest hold poses that must not count."""
+    positions = np.concatenate([visited, np.tile(CANDIDATES[5], (5, 1))])[:5]
+    cloud = PointCloud.from_arrays([[0.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    taken = jnp.asarray(len(visited))
+    return Problem(cloud, look_at(positions), taken, Camera(height=4, width=4), Coverage(), surfaces)
+
+
+def balls(radii, centres=None):
+    x = np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1)
+    centres = np.zeros((len(radii), 3)) if centres is None else centres
+    values = np.stack([np.linalg.norm(x - c, axis=-1) - r for c, r in zip(centres, radii, strict=True)])
+    return GridSurface.from_values(values.astype(np.float32), 0.0, GRID)
+
+
+def index_of(proposal):
+    return int(np.linalg.norm(CANDIDATES - np.asarray(proposal.pose.position), axis=1).argmin())
+
+
+def test_farthest_view_against_its_definition():
+    search, visited = FarthestView(num_candidates=12), [np.array([0.8, 0.9, 2.2])]
+    for _ in range(4):
+        proposal = search.propose(problem(np.array(visited)), jax.random.key(0))
+        nearest = np.array([min(np.linalg.norm(c - v) for v in visited) for c in CANDIDATES])
+        new = np.array([min(np.linalg.norm(c - v) for v in visited) > 1e-3 for c in CANDIDATES])
+        np.testing.assert_allclose(np.asarray(proposal.values)[new], nearest[new], rtol=1e-5)
+        assert np.isneginf(np.asarray(proposal.values)[~new]).all()
+        assert index_of(proposal) == nearest.argmax()
+        assert float(proposal.value) == pytest.approx(nearest.max(), rel=1e-5)
+        visited.append(CANDIDATES[nearest.argmax()])
+
+
+def test_random_view_is_uniform_over_what_is_unvisited():
+    """2,000 draws over ten candidates; the chi-square test has size 1e-4."""
+    search, asked = RandomView(num_candidates=12), problem(CANDIDATES[[3, 8]])
+    draw = eqx.filter_jit(jax.vmap(lambda key: search.propose(asked, key).pose.position))
+    chosen = np.asarray(draw(jax.random.split(jax.random.key(0), 2000)))
+    index = np.linalg.norm(CANDIDATES - chosen[:, None], axis=-1).argmin(axis=1)
+    counts = np.bincount(index, minlength=12)
+    assert counts[3] == counts[8] == 0
+    counts = np.delete(counts, [3, 8])
+    assert np.sum((counts - 200.0) ** 2 / 200.0) < chi2.ppf(1 - 1e-4, df=9)
+
+
+def test_random_view_is_reproducible_and_excludes():
+    search, asked = RandomView(num_candidates=12), problem(CANDIDATES[[3, 8]])
+    a, b = search.propose(asked, jax.random.key(4)), search.propose(asked, jax.random.key(4))
+    np.testing.assert_array_equal(a.values, b.values)
+    assert index_of(a) == index_of(b) == np.asarray(a.values).argmax()
+    np.testing.assert_array_equal(np.flatnonzero(np.isneginf(a.values)), [3, 8])
+
+
+def slow_uncertain_length(values, position, step):
+    """Walk the ray through the box and count, step by step, the samples that it has not entered yet."""
+    axis, h, g = GRID.axis, GRID.spacing, GRID.resolution
+    forward = -position / np.linalg.norm(position)
+    still_open, first, last = np.ones(len(values), bool), None, None
+    for t in np.arange(0.0, 6.0, step):
+        x = position + t * forward
+        if np.abs(x).max() > GRID.half_extent:
+            continue
+        cell = np.minimum(((x - axis[0]) / h).astype(int), g - 2)
+        w = (x - axis[cell]) / h
+        for s in range(len(values)):
+            f = 0.0
+            for corner in np.ndindex(2, 2, 2):
+                weight = np.prod([w[d] if corner[d] else 1 - w[d] for d in range(3)])
+                f += weight * values[s][tuple(cell + corner)]
+            still_open[s] &= f > 0
+        transmittance = still_open.mean()
+        if first is None and transmittance < 1:
+            first = t
+        if transmittance > 0.05:
+            last = t
+    return 0.0 if first is None else max(last - first, 0.0)
+
+
+def test_uncertainty_against_its_definition():
+    """The slow version walks at an eighth of the library's step, so each end may differ by one of the latter's steps."""
+    rng = np.random.default_rng(0)
+    surfaces = balls([0.9, 0.6, 0.7, 0.3], rng.uniform(-0.5, 0.5, (4, 3)))
+    search, values = UncertaintyView(num_candidates=12), np.asarray(surfaces.values, dtype=np.float64)
+    asked = problem(CANDIDATES[:1], surfaces)
+    step = 0.5 * GRID.spacing
+    expected = np.array([slow_uncertain_length(values, c, step / 8) for c in CANDIDATES])
+    proposal = search.propose(asked, jax.random.key(0))
+    np.testing.assert_allclose(uncertain_length(asked, proposal.candidates), expected, atol=1.2 * step)
+    assert expected.std() > 3 * step
+    np.testing.assert_array_equal(np.isneginf(proposal.values), np.arange(12) == 0)
+    best = np.asarray(proposal.values).argmax()
+    assert index_of(proposal) == best
+    assert expected[best] > expected[1:].max() - 2.4 * step
+
+
+def test_uncertainty_between_the_quantiles_of_many_samples():
+    """Forty balls of radii 0.3 ... 1.08: T > 0.05 until the ray enters the third smallest, of radius 0.34."""
+    radii = 0.3 + 0.02 * np.arange(40)
+    value = uncertain_length(problem(np.zeros((0, 3)), balls(radii)), look_at(CANDIDATES))
+    third = radii[2]
+    np.testing.assert_allclose(value, radii[-1] - third, atol=1.1 * GRID.spacing)
+    # Fewer than twenty samples never let T come to rest between 0 and 0.05: all of them count.
+    few = uncertain_length(problem(np.zeros((0, 3)), balls([1.0, 0.2])), look_at(CANDIDATES))
+    np.testing.assert_allclose(few, 0.8, atol=1.1 * GRID.spacing)
+
+
+def test_the_threshold_of_the_transmittance_by_thin_rings_of_samples():
+    """Of forty samples one lies far behind the rest: the ray stops counting when two are left, not none."""
+    radii = np.array([1.0] * 38 + [0.3] * 2)
+    value = uncertain_length(problem(np.zeros((0, 3)), balls(radii)), look_at(CANDIDATES))
+    np.testing.assert_allclose(value, 0.0, atol=1.1 * GRID.spacing)
+    radii = np.array([1.0] * 37 + [0.3] * 3)
+    value = uncertain_length(problem(np.zeros((0, 3)), balls(radii)), look_at(CANDIDATES))
+    np.testing.assert_allclose(value, 0.7, atol=1.1 * GRID.spacing)
+
+
+def test_rays_that_stay_open_are_certain_and_rays_of_some_end_where_the_box_does():
+    asked = problem(np.zeros((0, 3)), balls([0.5, 0.5], np.array([[0.0, 0.0, 0.0], [1.1, 0.0, 0.0]])))
+    poses = look_at(jnp.array([[0.0, 0.0, 2.5], [0.0, 2.5, 1.7], [1.1, 0.0, 2.5]]), target=(0.0, 0.0, 0.0))
+    past = eqx.tree_at(lambda p: p.rotation, poses, jnp.broadcast_to(look_at((0.0, 0.0, 1.0)).rotation, (3, 3, 3)))
+    # Down the z axis one of two samples is hit at z = 0.5, the other stays open to the box's end at z = -1.75.
+    expected = [0.5 + GRID.half_extent, 0.0, 0.5 + GRID.half_extent]
+    np.testing.assert_allclose(uncertain_length(asked, past), expected, atol=1.1 * GRID.spacing)
+
+
+def test_a_ray_that_meets_a_look_on_the_boxes_face_is_still_open():
+    """The first look lies exactly on the face at z = 1, where interpolation has a neighbour only on one side."""
+    grid = Grid(5, 1.0)
+    values = np.broadcast_to(grid.axis + 0.5, (2, 5, 5, 5)).astype(np.float32)
+    values = np.stack([values[0], values[1] - 0.75])
+    surfaces = GridSurface.from_values(values, 0.0, grid)
+    # Surfaces at z = -0.5 and z = 0.25, seen from z = 1.5; looks every quarter, at 1.5, 1.25, 1.0, ...
+    value = uncertain_length(problem(np.zeros((0, 3)), surfaces), look_at(jnp.array([[0.0, 0.0, 1.5]])))
+    np.testing.assert_allclose(value, 0.75, atol=0.26)
+
+
+@pytest.mark.parametrize("search", [FarthestView, RandomView, UncertaintyView])
+@pytest.mark.parametrize(("arguments", "message"), [((0, 2.5), "0 candidates"), ((12, 0.0), "radius 0.0")])
+def test_no_candidates_or_no_sphere_is_refused(search, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        search(*arguments)

@@ -1,0 +1,96 @@
+"""The discrete search: the argmax of values recomputed pose by pose, without the views taken before."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnbv.acquisition import expected_score
+from jaxnbv.camera import Camera, Pose, fibonacci_sphere, look_at
+from jaxnbv.cloud import PointCloud
+from jaxnbv.scanning import Grid, GridSurface
+from jaxnbv.search import DiscreteSearch, Problem
+from jaxnbv.tasks import Coverage
+
+CAMERA, GRID = Camera(height=8, width=8), Grid(20)
+SEARCH = DiscreteSearch(num_candidates=12)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    rng = np.random.default_rng(0)
+    x = np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1)
+    values = np.stack([np.linalg.norm(x - rng.uniform(-0.5, 0.5, 3), axis=-1) - r for r in (0.8, 0.6, 0.9)])
+    surfaces = GridSurface.from_values(values.astype(np.float32), 0.0, GRID)
+    cloud = PointCloud.from_arrays(rng.uniform(-1, 1, (30, 3)), np.tile([0.0, 1.0, 0.0], (30, 1)), 32)
+    visited = Pose(np.tile(np.eye(3, dtype=np.float32), (4, 1, 1)), np.zeros((4, 3), np.float32))
+    return Problem(cloud, visited, jnp.asarray(0), CAMERA, Coverage(), surfaces)
+
+
+def visit(problem, *poses):
+    rows = jax.tree.map(lambda *leaves: jnp.stack(leaves), *poses)
+    visited = jax.tree.map(lambda all_rows, new: all_rows.at[: len(poses)].set(new), problem.visited, rows)
+    return eqx.tree_at(lambda p: (p.visited, p.num_visited), problem, (visited, jnp.asarray(len(poses))))
+
+
+search = eqx.filter_jit(lambda problem, key=jax.random.key(0): SEARCH.propose(problem, key))
+
+
+def test_the_argmax_of_values_recomputed_one_by_one(problem):
+    proposal = search(problem)
+    value, values = eqx.filter_jit(expected_score), []
+    for position in np.asarray(fibonacci_sphere(12, 2.5)):
+        pose = look_at(position[None])
+        values.append(value(Coverage(), problem.cloud, problem.surfaces, CAMERA, pose)[0])
+    np.testing.assert_allclose(proposal.values, values, rtol=1e-5)
+    best = int(np.argmax(values))
+    assert np.sort(values)[-1] > 1.01 * np.sort(values)[-2]
+    np.testing.assert_allclose(proposal.pose.position, fibonacci_sphere(12, 2.5)[best], atol=1e-6)
+    np.testing.assert_allclose(proposal.pose.rotation, look_at(proposal.pose.position).rotation, atol=1e-6)
+    assert float(proposal.value) == pytest.approx(float(values[best]), rel=1e-5)
+    np.testing.assert_allclose(proposal.candidates.position, fibonacci_sphere(12, 2.5), atol=1e-6)
+
+
+def test_visited_views_are_excluded_one_after_the_other(problem):
+    values = np.asarray(search(problem).values)
+    order, taken = np.argsort(-values), []
+    for rank in range(4):
+        proposal = search(visit(problem, *taken) if taken else problem)
+        np.testing.assert_array_equal(proposal.pose.position, proposal.candidates.position[order[rank]])
+        np.testing.assert_array_equal(np.isneginf(proposal.values), np.isin(np.arange(12), order[:rank]))
+        taken.append(proposal.pose)
+
+
+def test_only_the_same_place_and_direction_counts_as_visited(problem):
+    best = search(problem).pose
+    elsewhere = look_at(best.position, target=(0.0, 0.3, 0.1))
+    aside = look_at(best.position + jnp.array([0.01, 0.0, 0.0]))
+    turned = look_at(best.position, up=(0.0, 0.0, 1.0))
+    for pose, is_visited in [(best, True), (turned, True), (elsewhere, False), (aside, False)]:
+        again = search(visit(problem, pose))
+        assert bool((again.pose.position != best.position).any()) == is_visited
+
+
+def test_rows_beyond_the_views_taken_hold_nothing(problem):
+    best = search(problem).pose
+    stale = eqx.tree_at(lambda p: p.num_visited, visit(problem, best), jnp.asarray(0))
+    np.testing.assert_array_equal(search(stale).pose.position, best.position)
+
+
+def test_it_is_deterministic(problem):
+    a, b = search(problem), search(problem, jax.random.key(7))
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_without_samples_it_says_so(problem):
+    bare = eqx.tree_at(lambda p: p.surfaces, problem, None, is_leaf=lambda leaf: isinstance(leaf, GridSurface))
+    with pytest.raises(ValueError, match="uses_samples"):
+        SEARCH.propose(bare, jax.random.key(0))
+
+
+@pytest.mark.parametrize(("arguments", "message"), [((0, 2.5), "0 candidates"), ((12, -1.0), "radius -1.0")])
+def test_no_candidates_or_no_sphere_is_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        DiscreteSearch(*arguments)

@@ -1,0 +1,110 @@
+"""A surface model of the user's own, with any sampler, drives the planner and the simulated episode."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Float
+
+import jaxnbv as nbv
+from jaxnbv.scanning.sdf import Box, Sphere
+
+
+class SphereFields(nbv.Fields):
+    centres: Float[Array, "s 3"]
+    radii: Float[Array, " s"]
+
+    def __call__(self, x):
+        return jnp.linalg.norm(x[None] - self.centres[:, None], axis=-1) - self.radii[:, None]
+
+
+class SpherePosterior(nbv.SurfacePosterior):
+    level: Float[Array, ""]
+    cloud: nbv.PointCloud
+
+    def sample(self, key, num_samples):
+        radii = jax.random.uniform(key, (num_samples,), minval=0.5, maxval=0.9)
+        centres = self.cloud.points - radii[:, None, None] * self.cloud.normals
+        return SphereFields(jnp.mean(centres, axis=1, where=self.cloud.mask[:, None]), radii)
+
+
+class RandomSpheres(nbv.SurfaceModel):
+    def condition(self, cloud):
+        return SpherePosterior(jnp.asarray(0.0), cloud)
+
+
+CAMERA = nbv.Camera(height=16, width=16)
+SCENES = {"sphere": nbv.SDFSurface(Sphere(0.7)), "box": nbv.SDFSurface(Box([0.5, 0.6, 0.4]))}
+
+
+def planner(**changes):
+    settings = {"num_samples": 3, "grid": nbv.Grid(40), "capacity": 512, "max_views": 4} | changes
+    return nbv.Planner(RandomSpheres(), CAMERA, nbv.Coverage(), nbv.DiscreteSearch(12), **settings)
+
+
+@pytest.fixture(scope="module")
+def posterior():
+    cloud = nbv.scan(SCENES["sphere"], CAMERA, nbv.look_at((0.8, 0.9, 2.2)))
+    return RandomSpheres().condition(cloud)
+
+
+def test_proposed_view_is_the_best_by_chamfer_distance_to_exact_scans_of_the_samples():
+    """Each sample is a sphere: its scan in closed form, then the mean over samples of the sum of squared distances."""
+    plan, key = planner(), jax.random.key(1)
+    first = nbv.look_at((0.8, 0.9, 2.2))
+    cloud = nbv.scan(SCENES["sphere"], CAMERA, first)
+    state = plan.init(cloud, first)
+    proposal = plan.propose(state, key)
+    sample_key, _ = jax.random.split(key)
+    fields = RandomSpheres().condition(state.cloud).sample(sample_key, 3)
+    known, _ = cloud.to_numpy()
+    values = np.zeros(12)
+    for i, pose in enumerate(nbv.look_at(nbv.fibonacci_sphere(12, 2.5))[j] for j in range(12)):
+        origins, directions = (np.asarray(a, np.float64) for a in CAMERA.rays(pose))
+        for centre, radius in zip(np.asarray(fields.centres), np.asarray(fields.radii), strict=True):
+            along = np.sum(directions * (centre - origins), axis=1)
+            inside = along**2 - np.sum((centre - origins) ** 2, axis=1) + radius**2
+            t = along - np.sqrt(np.maximum(inside, 0))
+            hits = (origins + t[:, None] * directions)[inside > 0]
+            values[i] += np.min(np.sum((hits[:, None] - known) ** 2, axis=-1), axis=1).sum() / 3
+    np.testing.assert_allclose(proposal.values, values, rtol=0.03, atol=0.03 * values.max())
+    assert int(np.argmax(proposal.values)) == int(np.argmax(values))
+    np.testing.assert_allclose(proposal.pose.position, nbv.fibonacci_sphere(12, 2.5)[np.argmax(values)], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_simulated_episode_sees_the_surface(name):
+    first = nbv.look_at((0.8, 0.9, 2.2))
+    noise = nbv.SensorNoise(0.0, 0.0)
+    episode = nbv.simulate(planner(), SCENES[name], first, 3, jax.random.key(0), noise, progress=False)
+    assert len(episode.views) == 3
+    points, _ = episode.cloud.to_numpy()
+    distance = np.asarray(SCENES[name].solid(jnp.asarray(points)))
+    assert len(points) > len(episode.views[0].scan.to_numpy()[0])
+    assert np.abs(distance).max() < 1e-3
+    positions = np.array([view.pose.position for view in episode.views])
+    assert np.linalg.norm(positions[:, None] - positions, axis=-1)[np.triu_indices(3, 1)].min() > 0.5
+
+
+def test_default_grid_evaluation_is_evaluation_at_the_nodes(posterior):
+    fields = posterior.sample(jax.random.key(2), 3)
+    axis = np.linspace(-1.2, 1.4, 6, dtype=np.float32)
+    values = np.asarray(fields.on_grid(axis))
+    for i, j, k in np.ndindex(6, 6, 6):
+        node = np.array([axis[i], axis[j], axis[k]])
+        expected = np.linalg.norm(node - np.asarray(fields.centres), axis=1) - np.asarray(fields.radii)
+        np.testing.assert_allclose(values[:, i, j, k], expected, atol=1e-5)
+
+
+def test_default_moments_are_within_monte_carlo_error(posterior):
+    """64 samples; exact moments by a fine sum over the uniform radius. Means to 4.5 standard errors; variances to 60 %,
+    more than 4.5 (2 / 63)^1/2 = 80 % of a Gaussian's would need for these bounded variables."""
+    x = np.random.default_rng(0).uniform(-1.5, 1.5, (8, 3)).astype(np.float32)
+    radii = 0.5 + 0.4 * (np.arange(4000) + 0.5) / 4000
+    points, normals = posterior.cloud.to_numpy()
+    centres = points.mean(axis=0) - radii[:, None] * normals.mean(axis=0)
+    f = np.linalg.norm(x[:, None] - centres, axis=-1) - radii
+    np.testing.assert_array_less(np.abs(posterior.mean(x) - f.mean(axis=1)), 4.5 * np.sqrt(f.var(axis=1) / 64))
+    np.testing.assert_allclose(posterior.variance(x), f.var(axis=1), rtol=0.6)
+    np.testing.assert_allclose(posterior.variance(x), eqx.filter_jit(posterior.variance)(x), rtol=1e-5)

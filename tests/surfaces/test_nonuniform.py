@@ -1,0 +1,76 @@
+"""The non-uniform transform against direct evaluation, its transpose, direct sums and finite differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnbv.surfaces.nonuniform import NonuniformTransform
+from jaxnbv.surfaces.trigonometric import TrigonometricFields, circle_basis
+
+RNG = np.random.default_rng(0)
+
+
+def points_with_borders(count):
+    points = RNG.uniform(-np.pi / 2, np.pi / 2, (count, 3))
+    points[:8] = np.pi / 2 * np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+    points[8] = [np.pi / 2, 0.0, -np.pi / 2]
+    return points
+
+
+def relative(actual, expected):
+    expected = np.asarray(expected, np.float64)
+    return np.linalg.norm(np.asarray(actual) - expected) / np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("truncation", [1, 7, 20])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float32, 1e-5), (np.float64, 1e-10)])
+def test_transform_and_adjoint_equal_direct_sums(x64, truncation, dtype, tolerance):
+    """White coefficients, so that the highest frequencies count as much as the lowest; corners of the scene included.
+    Relative errors, in the norm and, ten times as large, at the worst point."""
+    modes = 2 * truncation + 1
+    points = points_with_borders(60)
+    coefficients, values = RNG.standard_normal((2, modes, modes, modes)), RNG.standard_normal((60, 2))
+    transform = NonuniformTransform(jnp.asarray(points, dtype), truncation)
+    at_dtype = np.asarray(points.astype(dtype), np.float64)
+    expected = np.asarray(TrigonometricFields(jnp.asarray(coefficients))(at_dtype)).T
+    actual = transform.evaluate(jnp.asarray(coefficients, dtype))
+    assert actual.dtype == dtype
+    assert relative(actual, expected) < tolerance
+    assert np.abs(actual - expected).max() < 10 * tolerance * expected.std()
+    basis = np.asarray(circle_basis(jnp.asarray(at_dtype), truncation))
+    spread = np.einsum("nk,na,nb,nc->kabc", values, basis[:, 0], basis[:, 1], basis[:, 2], optimize=True)
+    adjoint = transform.adjoint(jnp.asarray(values, dtype))
+    assert relative(adjoint, spread) < tolerance
+    left, right = np.vdot(actual, values), np.vdot(coefficients, adjoint)
+    scale = np.linalg.norm(actual) * np.linalg.norm(values)
+    assert abs(left - right) < (1e-13 if dtype == np.float64 else 1e-6) * scale
+
+
+def test_gradients_through_the_window_equal_finite_differences_of_the_function(x64):
+    """d/dx of `evaluate`, and of `adjoint` paired with coefficients, against differences of the direct evaluation."""
+    truncation, h = 6, 1e-5
+    modes = 2 * truncation + 1
+    points = RNG.uniform(-1.5, 1.5, (12, 3))
+    coefficients = jnp.asarray(RNG.standard_normal((1, modes, modes, modes)))
+    values = RNG.standard_normal((12, 1))
+    field = TrigonometricFields(coefficients)
+    forward = lambda x: jnp.vdot(NonuniformTransform(x, truncation).evaluate(coefficients), values)
+    backward = lambda x: jnp.vdot(NonuniformTransform(x, truncation).adjoint(jnp.asarray(values)), coefficients)
+    expected = np.zeros((12, 3))
+    for axis in range(3):
+        step = h * np.eye(3)[axis]
+        expected[:, axis] = values[:, 0] * np.asarray(field(points + step) - field(points - step))[0] / (2 * h)
+    for function in (forward, backward):
+        gradient = jax.jit(jax.grad(function))(jnp.asarray(points))
+        np.testing.assert_allclose(gradient, expected, atol=1e-6 * np.abs(expected).max())
+
+
+def test_gradients_are_finite_on_nodes_and_borders():
+    """A point on a node has a window that ends exactly on its last node, where the square root starts."""
+    nodes = -np.pi / 2 + np.pi / 12 * np.arange(13)
+    points = jnp.asarray(np.stack([nodes, nodes[::-1], nodes], axis=1), jnp.float32)
+    coefficients = jnp.asarray(RNG.standard_normal((1, 13, 13, 13)), jnp.float32)
+    gradient = jax.jit(jax.grad(lambda x: jnp.sum(NonuniformTransform(x, 6).evaluate(coefficients))))(points)
+    exact = jax.jit(jax.grad(lambda x: jnp.sum(TrigonometricFields(coefficients)(x))))(points)
+    np.testing.assert_allclose(gradient, exact, atol=1e-4 * float(jnp.abs(exact).max()))

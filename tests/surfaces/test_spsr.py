@@ -1,0 +1,252 @@
+"""The posterior against Bayesian linear regression in weight space, the reference, and finite differences."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from weight_space import WeightSpace
+
+from jaxnbv.cloud import PointCloud
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.surfaces.covariance import function_normal_covariance, function_variance, normal_covariance
+
+RNG = np.random.default_rng(0)
+POINTS, NORMALS = RNG.uniform(-1.3, 1.3, (30, 3)), RNG.standard_normal((30, 3))
+QUERIES = np.concatenate([POINTS[:4], RNG.uniform(-1.5, 1.5, (12, 3))])
+SETTINGS = {"lengthscale": 0.1, "variance": 0.8, "noise": 0.2, "nu": 1.5, "truncation": 4}
+
+
+def cloud(points, normals, capacity=None, dtype=None):
+    """Normals as they are: `from_arrays` would scale them to unit length."""
+    pad = ((0, (capacity or len(points)) - len(points)), (0, 0))
+    arrays = (jnp.asarray(np.pad(a, pad), dtype) for a in (points, normals))
+    return PointCloud(*arrays, jnp.arange(capacity or len(points)) < len(points))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"nu": 0.5, "truncation": 5}, {"nu": 2.5, "lengthscale": 0.3}, {"noise": 0.01, "truncation": 6}],
+    ids=str,
+)
+def test_posterior_equals_regression_in_weight_space(x64, changes):
+    settings = SETTINGS | changes
+    oracle, posterior = WeightSpace(**settings), GeometricSPSR(**settings).condition(cloud(POINTS, NORMALS, 37))
+    mean, covariance = oracle.posterior(POINTS, NORMALS, QUERIES)
+    np.testing.assert_allclose(posterior.mean(QUERIES), mean, atol=1e-9 * np.abs(mean).max())
+    np.testing.assert_allclose(posterior.covariance(QUERIES, QUERIES), covariance, atol=1e-9 * covariance.max())
+    np.testing.assert_allclose(posterior.covariance(QUERIES[:5], QUERIES), covariance[:5], atol=1e-9 * covariance.max())
+    np.testing.assert_allclose(posterior.variance(QUERIES), np.diag(covariance), atol=1e-9 * covariance.max())
+    at_data, _ = oracle.posterior(POINTS, NORMALS, POINTS)
+    np.testing.assert_allclose(posterior.level, at_data.mean(), atol=1e-9 * np.abs(mean).max())
+    likelihood = oracle.log_marginal_likelihood(POINTS, NORMALS)
+    np.testing.assert_allclose(posterior.log_marginal_likelihood(), likelihood, rtol=1e-9)
+
+
+def test_order_padding_and_the_values_of_masked_rows_change_nothing(x64):
+    model = GeometricSPSR(**SETTINGS)
+    rows = RNG.permutation(45)[:30]
+    points, normals = 100.0 * RNG.standard_normal((2, 45, 3))
+    points[rows], normals[rows] = POINTS, NORMALS
+    scattered = PointCloud(jnp.asarray(points), jnp.asarray(normals), jnp.zeros(45, bool).at[rows].set(True))
+    results = []
+    for data in (cloud(POINTS, NORMALS), cloud(POINTS, NORMALS, 64), scattered):
+        posterior = model.condition(data)
+        likelihood, level = posterior.log_marginal_likelihood(), posterior.level
+        results.append((posterior.mean(QUERIES), posterior.covariance(QUERIES, QUERIES), likelihood, level))
+    for other in results[1:]:
+        for first, second in zip(results[0], other, strict=True):
+            np.testing.assert_allclose(first, second, rtol=1e-9, atol=1e-11)
+
+
+def test_float32_posterior_is_near_that_of_float64():
+    """At the scale of a close-up with the default noise, 300 points and L = 12."""
+    points = RNG.standard_normal((300, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    model = lambda: GeometricSPSR(lengthscale=0.02, truncation=12, noise=0.05)
+    single = model().condition(cloud(points, points, 320))
+    results = [single.mean(QUERIES), single.variance(QUERIES), single.log_marginal_likelihood()]
+    with jax.enable_x64(True):
+        double = model().condition(cloud(points, points, 320))
+        expected = [double.mean(QUERIES), double.variance(QUERIES), double.log_marginal_likelihood()]
+    for actual, value in zip(results, expected, strict=True):
+        np.testing.assert_allclose(actual, value, atol=3e-4 * float(np.abs(value).max()))
+
+
+def test_posterior_mean_is_the_poisson_reconstruction_of_the_mean_normals(x64):
+    """Laplacian E f = div E v, with E v in weight space, by central differences (error h^2 L^2 / 12 = 1.3e-6)."""
+    oracle = WeightSpace(**SETTINGS)
+    posterior = GeometricSPSR(**SETTINGS).condition(cloud(POINTS, NORMALS))
+    weights, _ = oracle.condition(POINTS, NORMALS)
+    h, x = 1e-3, QUERIES
+    divergence, laplacian = 0.0, -6 * np.asarray(posterior.mean(x)) / h**2
+    for d, step in enumerate(h * np.eye(3)):
+        difference = oracle.normal_features(x + step) - oracle.normal_features(x - step)
+        divergence += difference @ weights[d] / (2 * h)
+        laplacian += np.asarray(posterior.mean(x + step) + posterior.mean(x - step)) / h**2
+    np.testing.assert_allclose(laplacian, divergence, atol=1e-5 * np.abs(divergence).max())
+
+
+def reference_problem(shared, truncation):
+    data = np.load(shared / "reference" / "geospsr_spot.npz")
+    noise = float(data["noise_variance"]) ** 0.5
+    model = GeometricSPSR(float(data["lengthscale"]), float(data["variance_1d"]), truncation, noise)
+    return data, model, jnp.asarray(data["points"]), jnp.asarray(data["queries"])
+
+
+def relative(actual, expected):
+    return np.linalg.norm(np.asarray(actual) - expected) / np.linalg.norm(expected)
+
+
+def test_reference_formula_from_these_covariances(x64, shared):
+    """The reference's mean and variance, assembled as it does: k(X, X) of all frequencies (here up to 400) in A, the
+    cross-covariance and the prior variance of f truncated at L = 20. Equal to 1e-4."""
+    data, model, x, queries = reference_problem(shared, 20)
+    untruncated = GeometricSPSR(model.lengthscale, model.variance, 400, model.noise)
+    kernel = np.asarray(normal_covariance(x, x, untruncated.spectrum))
+    np.testing.assert_allclose(kernel[:16, :16], data["kernel_16x16"], atol=1e-4 * kernel.max())
+    kernel = kernel + float(data["noise_variance"]) * np.eye(len(kernel))
+    cross = np.asarray(function_normal_covariance(queries, x, model.spectrum))
+    mean = np.einsum("dqn,nd->q", cross, np.linalg.solve(kernel, data["normals"]))
+    np.testing.assert_allclose(mean, data["mean"], atol=1e-4 * np.abs(data["mean"]).max())
+    cross = cross[:, : len(data["variance"])]
+    explained = sum(np.einsum("qn,nq->q", c, np.linalg.solve(kernel, c.T)) for c in cross)
+    variance = float(function_variance(model.spectrum)) - explained
+    np.testing.assert_allclose(variance, data["variance"], rtol=1e-4)
+
+
+def test_posterior_equals_the_reference_to_one_percent(x64, shared):
+    """What differs at the reference's own L = 20: it leaves the frequencies above L in A but not in the cross-covariance,
+    which is not the posterior of any one model; ours truncates both. The kernels differ by 0.09 % of k(0), but the noise
+    is 0.3 % of k(0), so the mean differs by 1.7 % (relative L2 norm) and the variance by 0.4 %: there the mean is asserted
+    to 2 % and the variance to 1 %. The gap is the truncation's: at L = 30 the mean is within 1 %.
+    """
+    for truncation, tolerance in ((20, 0.02), (30, 0.01)):
+        data, model, x, queries = reference_problem(shared, truncation)
+        posterior = model.condition(cloud(x, data["normals"]))
+        assert relative(posterior.mean(queries), data["mean"]) < tolerance
+        if truncation == 20:
+            assert relative(posterior.variance(queries[: len(data["variance"])]), data["variance"]) < 0.01
+
+
+def central_difference(function, value, direction, step=1e-5):
+    return (function(value + step * direction) - function(value - step * direction)) / (2 * step)
+
+
+PARAMETERS = ("points", "normals", "queries", "lengthscale", "variance", "noise")
+
+
+def test_posterior_is_differentiable_in_data_queries_and_hyperparameters(x64):
+    """A scalar of mean, variance and level, and the log marginal likelihood, against differences of weight space."""
+    keep = {key: SETTINGS[key] for key in ("nu", "truncation")}
+    values = dict(zip(PARAMETERS, (POINTS, NORMALS, QUERIES, 0.1, 0.8, 0.2), strict=True))
+    functional = np.random.default_rng(1).standard_normal((2, len(QUERIES)))
+
+    def package(parameters):
+        p = parameters
+        model = GeometricSPSR(p["lengthscale"], p["variance"], noise=p["noise"], **keep)
+        posterior = model.condition(PointCloud(p["points"], p["normals"], jnp.ones(30, bool)))
+        x = p["queries"]
+        return jnp.stack(
+            [
+                functional[0] @ posterior.mean(x),
+                functional[1] @ posterior.variance(x),
+                posterior.level,
+                posterior.log_marginal_likelihood(),
+            ]
+        )
+
+    def oracle(p):
+        regression = WeightSpace(p["lengthscale"], p["variance"], p["noise"], **keep)
+        mean, covariance = regression.posterior(p["points"], p["normals"], p["queries"])
+        level = regression.posterior(p["points"], p["normals"], p["points"])[0].mean()
+        likelihood = regression.log_marginal_likelihood(p["points"], p["normals"])
+        return np.array([functional[0] @ mean, functional[1] @ np.diag(covariance), level, likelihood])
+
+    gradient = jax.jit(jax.jacrev(package))({name: jnp.asarray(value) for name, value in values.items()})
+    rng = np.random.default_rng(2)
+    for name in PARAMETERS:
+        direction = rng.standard_normal(np.shape(values[name])) if np.ndim(values[name]) else 1.0
+        expected = central_difference(lambda value: oracle(values | {name: value}), values[name], direction)  # noqa: B023
+        actual = np.sum(np.asarray(gradient[name]) * direction, axis=tuple(range(1, 1 + np.ndim(direction))))
+        np.testing.assert_allclose(actual, expected, rtol=1e-5, atol=1e-8, err_msg=name)
+        assert np.abs(expected).max() > 1e-3
+
+
+def test_variance_does_not_depend_on_the_size_of_its_chunks(x64, monkeypatch):
+    posterior = GeometricSPSR(**SETTINGS).condition(cloud(POINTS, NORMALS))
+    whole = posterior.variance(QUERIES)
+    monkeypatch.setattr("jaxnbv.surfaces.spsr._CHUNK_VALUES", 5 * len(POINTS))
+    jax.clear_caches()
+    np.testing.assert_allclose(posterior.variance(QUERIES), whole, rtol=1e-10)
+
+
+def test_nothing_recompiles_for_clouds_of_one_capacity():
+    traces = 0
+
+    @eqx.filter_jit
+    def step(model, data, key):
+        nonlocal traces
+        traces += 1
+        return model.condition(data).sample(key, 2)(jnp.zeros((1, 3)))
+
+    for count in (5, 12, 30):
+        step(GeometricSPSR(0.1 + 0.01 * count, truncation=3), cloud(POINTS[:count], NORMALS[:count], 30), jax.random.key(count))
+    assert traces == 1
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"nu": 1.0}, "nu is 1.0"),
+        ({"lengthscale": -0.1}, "lengthscale is -0.1"),
+        ({"lengthscale": np.nan}, "lengthscale is nan"),
+        ({"variance": 0.0}, "variance is 0.0"),
+        ({"noise": -1.0}, "noise is -1.0"),
+        ({"truncation": 0}, "truncation is 0"),
+    ],
+)
+def test_bad_hyperparameters_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        GeometricSPSR(**settings)
+
+
+def test_a_truncation_that_keeps_little_variance_is_reported():
+    with pytest.warns(UserWarning, match=r"truncation=10 keeps \d+% of the prior's variance"):
+        GeometricSPSR(truncation=10)
+
+
+@pytest.mark.parametrize("nu", [0.5, 1.5, 2.5])
+def test_kept_variance_is_the_prior_variance_of_weight_space(nu):
+    kept = GeometricSPSR(lengthscale=0.1, variance=0.8, truncation=4, nu=nu).kept_variance
+    oracle = WeightSpace(lengthscale=0.1, variance=0.8, truncation=4, nu=nu)
+    np.testing.assert_allclose(kept, (oracle.amplitude**2).sum() / 0.8**3 + oracle.constant**2 / 0.8**3, rtol=1e-5)
+
+
+def test_bad_clouds_are_refused():
+    model = GeometricSPSR(lengthscale=0.1, truncation=3)
+    good = cloud(POINTS, NORMALS)
+    with pytest.raises(ValueError, match="empty cloud: scan"):
+        model.condition(PointCloud(good.points, good.normals, jnp.zeros(30, bool)))
+    with pytest.raises(ValueError, match="not finite"):
+        model.condition(PointCloud(good.points.at[3, 1].set(jnp.nan), good.normals, good.mask))
+    with pytest.raises(ValueError, match="not finite"):
+        model.condition(PointCloud(good.points, good.normals.at[0, 0].set(jnp.inf), good.mask))
+    with pytest.raises(ValueError, match=r"coordinate of 1\.6, outside the scene"):
+        model.condition(PointCloud(good.points.at[5, 2].set(-1.6), good.normals, good.mask))
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_points_on_the_border_of_the_scene_are_accepted(double):
+    with jax.enable_x64(double):
+        points = np.concatenate([POINTS, np.pi / 2 * np.array([[1, -1, 1], [-1, 0, 0]])])
+        normals = np.concatenate([NORMALS, [[1.0, 0, 0], [0, 1, 0]]])
+        posterior = GeometricSPSR(**SETTINGS).condition(cloud(points, normals))
+        mean, _ = WeightSpace(**SETTINGS).posterior(points, normals, QUERIES)
+        np.testing.assert_allclose(posterior.mean(QUERIES), mean, atol=1e-3)
+
+
+def test_fewer_than_one_sample_is_refused():
+    posterior = GeometricSPSR(lengthscale=0.1, truncation=3).condition(cloud(POINTS, NORMALS))
+    with pytest.raises(ValueError, match="asked for 0 samples"):
+        posterior.sample(jax.random.key(0), 0)

@@ -1,0 +1,124 @@
+"""Expected scores against an explicit double loop over samples and poses."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnbv.acquisition import ExpectedUtilityImprovement, Score, expected_score
+from jaxnbv.camera import Camera, fibonacci_sphere, look_at
+from jaxnbv.cloud import PointCloud, concatenate
+from jaxnbv.scanning import Grid, GridSurface, scan
+
+CAMERA = Camera(height=6, width=7)
+GRID = Grid(20)
+# The last looks away from the object and sees nothing.
+POSES = look_at(jnp.concatenate([fibonacci_sphere(6, 2.5), jnp.array([[0.0, 3.0, 0.0]])]))
+POSES = eqx.tree_at(lambda pose: pose.rotation, POSES, POSES.rotation.at[-1].set(jnp.eye(3)))
+
+
+@pytest.fixture(scope="module")
+def surfaces():
+    """Three balls apart from the origin, as samples of a surface."""
+    x = np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1)
+    centres, radii = np.array([[0.2, 0.0, 0.1], [-0.3, 0.3, 0.0], [0.0, -0.2, 0.4]]), [0.9, 0.7, 0.5]
+    values = np.stack([np.linalg.norm(x - c, axis=-1) - r for c, r in zip(centres, radii, strict=True)])
+    return GridSurface.from_values(values.astype(np.float32), 0.0, GRID)
+
+
+@pytest.fixture(scope="module")
+def cloud():
+    rng = np.random.default_rng(0)
+    return PointCloud.from_arrays(0.4 * rng.normal(size=(9, 3)), np.tile([0.0, 1.0, 0.0], (9, 1)), capacity=12)
+
+
+def height(cloud):
+    """A utility with both signs: how high the points lie, less what each costs."""
+    return jnp.sum(jnp.where(cloud.mask, jnp.tanh(2 * cloud.points[:, 1] + cloud.normals[:, 2]) - 0.1, 0.0))
+
+
+def height_in_numpy(points, normals):
+    return np.sum(np.tanh(2 * points[:, 1].astype(np.float64) + normals[:, 2]) - 0.1)
+
+
+class Toy(Score):
+    """Counts the rows and weighs them by the context, the highest point of D."""
+
+    differentiable: bool = eqx.field(static=True, default=True)
+
+    def context(self, cloud):
+        return jnp.max(jnp.where(cloud.mask, cloud.points[:, 1], -jnp.inf))
+
+    def __call__(self, context, scan):
+        return jnp.sum(jnp.where(scan.mask, jnp.abs(scan.points[:, 1] - context), 0.0))
+
+
+def double_loop(surfaces, score):
+    values = np.zeros((3, 7))
+    for s in range(3):
+        surface = jax.tree.map(lambda leaf, s=s: leaf[s], surfaces)
+        for p in range(7):
+            values[s, p] = score(*scan(surface, CAMERA, POSES[p]).to_numpy())
+    return values
+
+
+def test_a_score_against_the_double_loop(surfaces, cloud):
+    highest = cloud.to_numpy()[0][:, 1].max()
+    values = double_loop(surfaces, lambda points, _: np.abs(points[:, 1] - highest).sum())
+    found = expected_score(Toy(), cloud, surfaces, CAMERA, POSES)
+    np.testing.assert_allclose(found, values.mean(axis=0), rtol=1e-4)
+    assert values[:, :6].std(axis=0).min() > 0
+    assert float(found[6]) == 0
+
+
+def test_utility_improvement_against_its_formula(surfaces, cloud):
+    points, normals = cloud.to_numpy()
+    before = height_in_numpy(points, normals)
+
+    def improvement(new_points, new_normals):
+        after = height_in_numpy(np.concatenate([points, new_points]), np.concatenate([normals, new_normals]))
+        return after - before
+
+    change = double_loop(surfaces, improvement)
+    assert (change < -0.5).any()
+    assert (change > 0.5).any()
+    found = expected_score(ExpectedUtilityImprovement(height), cloud, surfaces, CAMERA, POSES)
+    np.testing.assert_allclose(found, np.maximum(change, 0).mean(axis=0), rtol=1e-3, atol=1e-3)
+    # Each sample is cut at zero, not their mean.
+    assert np.abs(np.maximum(change, 0).mean(axis=0) - np.maximum(change.mean(axis=0), 0)).max() > 0.1
+    assert bool((found >= 0).all())
+    assert float(found[6]) == 0
+
+
+def test_the_context_is_computed_once_a_step(surfaces, cloud):
+    ran = []
+
+    def utility(cloud):
+        if cloud.capacity == 12:
+            jax.debug.callback(lambda _: ran.append(1), cloud.points[0, 0])
+        return height(cloud)
+
+    expected_score(ExpectedUtilityImprovement(utility), cloud, surfaces, CAMERA, POSES).block_until_ready()
+    jax.effects_barrier()
+    assert len(ran) == 1
+
+
+def test_common_random_numbers(surfaces, cloud):
+    """A pose's value does not depend on which others are asked for, nor on their order."""
+    score = ExpectedUtilityImprovement(height)
+    together = expected_score(score, cloud, surfaces, CAMERA, POSES)
+    order = np.array([4, 1, 5])
+    some = expected_score(score, cloud, surfaces, CAMERA, POSES[order])
+    np.testing.assert_allclose(some, together[order], rtol=1e-5, atol=1e-5)
+    assert float(jnp.std(together)) > 0.1
+
+
+def test_utility_sees_the_union_of_both_clouds(cloud):
+    seen = []
+    score = ExpectedUtilityImprovement(lambda c: seen.append(c) or jnp.sum(c.mask) * 1.0)
+    other = PointCloud.from_arrays([[1.0, 2.0, 3.0]], [[0.0, 0.0, 1.0]], capacity=4)
+    assert float(score(score.context(cloud), other)) == 1.0
+    expected = concatenate(cloud, other)
+    for a, b in zip(jax.tree.leaves(seen[-1]), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_array_equal(a, b)

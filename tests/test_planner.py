@@ -1,0 +1,182 @@
+"""The planner: ask and tell, compilation, overflow, bad input."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnbv.camera import Camera, Pose, look_at
+from jaxnbv.cloud import PointCloud, concatenate, farthest_point_subsample
+from jaxnbv.episode import simulate
+from jaxnbv.planner import Planner
+from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, scan
+from jaxnbv.scanning.sdf import Capsule, Sphere
+from jaxnbv.search import DiscreteSearch, FarthestView, RandomView, UncertaintyView
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Coverage
+
+SCENE = SDFSurface(Sphere(0.7) | Capsule([0.2, 0.3, -0.4], [0.5, 0.6, 0.9], 0.3))
+FIRST = look_at((0.8, 0.9, 2.2))
+SEARCHES = {kind.__name__: kind(num_candidates=12) for kind in (DiscreteSearch, FarthestView, RandomView, UncertaintyView)}
+
+
+def planner_of(search, **changes):
+    settings = {"num_samples": 3, "grid": Grid(24), "capacity": 128, **changes}
+    model, camera = GeometricSPSR(truncation=8, lengthscale=0.05), Camera(height=8, width=8)
+    return Planner(model, camera, Coverage(), search, **settings)
+
+
+@pytest.fixture(scope="module")
+def planner():
+    return planner_of(SEARCHES["DiscreteSearch"], max_views=8)
+
+
+@pytest.fixture(scope="module")
+def state(planner):
+    return planner.init(scan(SCENE, planner.camera, FIRST), FIRST)
+
+
+@pytest.fixture
+def compilations():
+    """Names of events by which JAX tells of a compilation, eager operations included, in the order they came."""
+    seen = []
+
+    def listen(event, duration, **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            seen.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield seen
+    jax.monitoring.unregister_event_duration_listener(listen)
+
+
+@pytest.mark.parametrize("name", SEARCHES)
+def test_nothing_recompiles_after_the_second_view(name, compilations):
+    planner, noise, key = planner_of(SEARCHES[name]), SensorNoise(), jax.random.key(3)
+    after, state, pose = [], None, FIRST
+    observe_scene = eqx.filter_jit(lambda pose, key: noise(scan(SCENE, planner.camera, pose), key))
+    for view in range(5):
+        if state is not None:
+            pose = planner.propose(state, jax.random.fold_in(key, view)).pose
+        seen = observe_scene(pose, jax.random.fold_in(key, view))
+        state = planner.init(seen, pose) if state is None else planner.observe(state, pose, seen)
+        after.append(len(compilations))
+    assert after[0] > 0, "the counter counts nothing"
+    assert after[1:] == [after[1]] * 4, f"compilations after each view: {after}"
+    jax.lax.neg(jnp.ones(1237))
+    assert len(compilations) > after[-1], "the counter does not see eager operations"
+
+
+def test_simulated_episodes_do_not_recompile_either(planner, compilations):
+    """A whole second episode, of another seed, first view and noise draw, compiles nothing."""
+    simulate(planner, SCENE, FIRST, 3, jax.random.key(0), progress=False)
+    before = len(compilations)
+    simulate(planner, SCENE, look_at((-0.8, 0.9, 2.2)), 4, jax.random.key(1), progress=False)
+    assert len(compilations) == before
+
+
+def test_asking_and_telling_leave_the_state_as_it_was(planner, state):
+    before = jax.tree.map(np.array, state)
+    proposal = planner.propose(state, jax.random.key(1))
+    seen = scan(SCENE, planner.camera, proposal.pose)
+    after = planner.observe(state, proposal.pose, seen)
+    jax.tree.map(np.testing.assert_array_equal, before, jax.tree.map(np.array, state))
+    assert int(state.num_views) == 1
+    assert int(after.num_views) == 2
+    np.testing.assert_array_equal(after.poses.position[:2], jnp.stack([FIRST.position, proposal.pose.position]))
+    assert int(after.cloud.count) == int(state.cloud.count + seen.count) <= 128
+    with pytest.raises(AttributeError):
+        state.num_views = 3
+    again = planner.propose(state, jax.random.key(1))
+    jax.tree.map(np.testing.assert_array_equal, jax.tree.map(np.array, proposal), jax.tree.map(np.array, again))
+
+
+def test_a_first_scan_from_an_unknown_pose_excludes_nothing():
+    planner = planner_of(SEARCHES["FarthestView"])
+    state = planner.init(scan(SCENE, planner.camera, FIRST))
+    assert int(state.num_views) == 0
+    assert not np.isneginf(planner.propose(state, jax.random.key(0)).values).any()
+
+
+def test_beyond_its_capacity_the_cloud_is_thinned_by_farthest_points(planner, state):
+    proposal_pose = look_at((-0.8, 0.9, 2.2))
+    seen = scan(SCENE, planner.camera, proposal_pose)
+    small = planner_of(SEARCHES["DiscreteSearch"], capacity=40)
+    first = scan(SCENE, small.camera, FIRST)
+    assert int(first.count) > 40
+    start = small.init(first, FIRST)
+    expected = farthest_point_subsample(first, 40)
+    np.testing.assert_array_equal(start.cloud.points, expected.points)
+    after = small.observe(start, proposal_pose, seen)
+    expected = farthest_point_subsample(concatenate(expected, seen), 40)
+    np.testing.assert_array_equal(after.cloud.points, expected.points)
+    np.testing.assert_array_equal(after.cloud.normals, expected.normals)
+    assert bool(after.cloud.mask.all())
+
+
+def test_a_scan_that_saw_nothing_only_records_its_pose(planner, state):
+    away = Pose(np.eye(3, dtype=np.float32), np.array([0.0, 0.0, 2.5], np.float32))
+    seen = scan(SCENE, planner.camera, away)
+    assert int(seen.count) == 0
+    after = planner.observe(state, away, seen)
+    np.testing.assert_array_equal(after.cloud.points, state.cloud.points)
+    assert int(after.num_views) == 2
+
+
+def cloud_at(*points):
+    return PointCloud.from_arrays(list(points), [[0.0, 1.0, 0.0]] * len(points), capacity=4)
+
+
+def test_an_empty_first_scan_is_refused(planner):
+    empty = PointCloud(jnp.zeros((4, 3)), jnp.zeros((4, 3)), jnp.zeros(4, bool))
+    with pytest.raises(ValueError, match=r"first scan is empty.*[Pp]oint the camera"):
+        planner.init(empty, FIRST)
+
+
+@pytest.mark.parametrize("field", ["points", "normals"])
+def test_a_scan_with_nan_is_refused(planner, state, field):
+    bad = eqx.tree_at(lambda c: getattr(c, field), cloud_at([0.0, 0.0, 0.1]), jnp.full((4, 3), jnp.nan))
+    for tell in (lambda: planner.init(bad, FIRST), lambda: planner.observe(state, FIRST, bad)):
+        with pytest.raises(ValueError, match=r"not finite.*mask these rows"):
+            tell()
+
+
+def test_nan_in_a_masked_row_does_no_harm(planner, state):
+    cloud = cloud_at([0.0, 0.0, 0.1])
+    bad = eqx.tree_at(lambda c: c.points, cloud, cloud.points.at[2].set(jnp.nan))
+    after = planner.observe(state, FIRST, bad)
+    assert np.isfinite(after.cloud.points).all()
+    assert int(after.cloud.count) == int(state.cloud.count) + 1
+
+
+def test_a_scan_outside_the_scene_is_refused(planner, state):
+    outside = cloud_at([0.0, 0.1, 0.0], [0.0, -40.0, 0.0])
+    for tell in (lambda: planner.init(outside, FIRST), lambda: planner.observe(state, FIRST, outside)):
+        with pytest.raises(ValueError, match=r"coordinate of 40.*Frame\.to_scene"):
+            tell()
+
+
+def test_no_room_for_another_view_is_refused():
+    planner = planner_of(SEARCHES["FarthestView"], max_views=1)
+    first = scan(SCENE, planner.camera, FIRST)
+    with pytest.raises(ValueError, match=r"holds 1 views.*max_views"):
+        planner.observe(planner.init(first, FIRST), FIRST, first)
+
+
+@pytest.mark.parametrize("kind", [FarthestView, RandomView])
+def test_all_candidates_visited_is_refused(kind):
+    planner = planner_of(kind(num_candidates=2))
+    first = scan(SCENE, planner.camera, FIRST)
+    state = planner.init(first, FIRST)
+    for _ in range(2):
+        state = planner.observe(state, planner.propose(state, jax.random.key(0)).pose, first)
+    with pytest.raises(ValueError, match=r"all 2 candidates have been visited.*more candidates"):
+        planner.propose(state, jax.random.key(0))
+
+
+@pytest.mark.parametrize("name", ["num_samples", "capacity", "max_views"])
+@pytest.mark.parametrize("value", [0, -3])
+def test_numbers_below_one_are_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name} is {value}"):
+        planner_of(SEARCHES["FarthestView"], **{name: value})
