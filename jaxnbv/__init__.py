@@ -25,6 +25,7 @@ from jaxnbv.scanning import TriangleMesh as TriangleMesh
 from jaxnbv.scanning import load_mesh as load_mesh
 from jaxnbv.scanning import mesh_from_sdf as mesh_from_sdf
 from jaxnbv.scanning import scan as scan
+from jaxnbv.scanning import scan_samples as scan_samples
 from jaxnbv.search import DiscreteSearch as DiscreteSearch
 from jaxnbv.search import FarthestView as FarthestView
 from jaxnbv.search import Proposal as Proposal

@@ -181,7 +181,7 @@ def _run(
     )
     _summarise(episode)
     if report:
-        typer.echo(f"report   {write_report(episode, folder)}")
+        typer.echo(f"report   {write_report(episode, folder, title=name)}")
     typer.echo(f"episode  {folder}   ({time.perf_counter() - start:.0f} s)")
 
 

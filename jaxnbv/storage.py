@@ -81,7 +81,7 @@ class EpisodeFolder:
             return
         try:
             found = json.loads(record.read_text())["config"]
-        except (json.JSONDecodeError, KeyError, UnicodeDecodeError) as error:
+        except (json.JSONDecodeError, KeyError, TypeError, UnicodeDecodeError) as error:
             raise InputError(f"{record} is not an episode's record ({error}): choose another output folder") from error
         changed = _differences(found, json.loads(json.dumps(config)))
         require(

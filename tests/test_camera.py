@@ -182,5 +182,5 @@ def test_fibonacci_sphere_is_even(count):
 
 @pytest.mark.parametrize(("count", "radius"), [(0, 1.0), (-3, 1.0), (5, 0.0), (5, -1.0)])
 def test_fibonacci_sphere_refuses_nothing(count, radius):
-    with pytest.raises(ValueError, match="Fibonacci|radius"):
+    with pytest.raises(ValueError, match=r"Fibonacci|radius"):
         fibonacci_sphere(count, radius)

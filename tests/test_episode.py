@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxnbv.camera import Camera, Pose, look_at
-from jaxnbv.episode import simulate
+from jaxnbv.episode import observe_scene, simulate
 from jaxnbv.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, mesh_from_sdf, scan
 from jaxnbv.scanning.sdf import Capsule, Sphere
@@ -43,7 +43,6 @@ def episode():
 
 def test_simulate_is_the_loop_of_ask_and_tell(episode):
     """View i draws from fold_in(key, i): one half to choose it, one for the sensor's noise."""
-    look = eqx.filter_jit(lambda pose, key: SensorNoise()(scan(SCENE, PLANNER.camera, pose), key))
     pose, state = FIRST, None
     for index in range(4):
         choose_key, noise_key = jax.random.split(jax.random.fold_in(KEY, index))
@@ -51,7 +50,7 @@ def test_simulate_is_the_loop_of_ask_and_tell(episode):
         if state is not None:
             proposal = PLANNER.propose(state, choose_key)
             pose = proposal.pose
-        seen = look(pose, noise_key)
+        seen = observe_scene(SCENE, PLANNER.camera, pose, SensorNoise(), noise_key)
         state = PLANNER.init(seen, pose) if state is None else PLANNER.observe(state, pose, seen)
         view = episode.views[index]
         assert_same_bits((view.pose, view.scan, view.cloud), (pose, seen, state.cloud))
@@ -113,9 +112,11 @@ def test_a_whole_episode_as_one_jitted_function(episode):
 
 
 def test_an_episode_over_a_mesh_runs_outside_jit():
-    mesh = mesh_from_sdf(SOLID, resolution=24)
+    mesh = mesh_from_sdf(SOLID, Grid(24))
     assert not mesh.in_jit
-    planner = eqx.tree_at(lambda p: p.search, PLANNER, RandomView(num_candidates=12), is_leaf=lambda x: x is PLANNER.search)
+    planner = eqx.tree_at(
+        lambda p: p.search, PLANNER, RandomView(num_candidates=12), is_leaf=lambda x: x is PLANNER.search
+    )
     episode = simulate(planner, mesh, FIRST, 2, KEY, progress=False)
     clean = scan(mesh, planner.camera, episode.views[1].pose)
     assert int(clean.count) > 5

@@ -85,7 +85,10 @@ def test_forward_and_reverse_mode_agree(x64):
     x, points, mask = problem()
     rng = np.random.default_rng(4)
     tangents = jnp.asarray(rng.normal(size=x.shape)), jnp.asarray(rng.normal(size=points.shape))
-    f = lambda x, points: nearest_squared_distance(x, cloud_of(points, mask))
+
+    def f(x, points):
+        return nearest_squared_distance(x, cloud_of(points, mask))
+
     value, along = jax.jvp(f, (x, points), tangents)
     np.testing.assert_allclose(value, f(x, points), atol=1e-13)
     cotangent = jnp.asarray(rng.normal(size=len(x)))
@@ -97,7 +100,10 @@ def test_forward_and_reverse_mode_agree(x64):
 def test_second_derivatives(x64):
     """|x - y|^2 has the Hessian 2 I in x."""
     x, points, mask = problem()
-    f = lambda x: nearest_squared_distance(x[None], cloud_of(points, mask))[0]
+
+    def f(x):
+        return nearest_squared_distance(x[None], cloud_of(points, mask))[0]
+
     for hessian in (jax.hessian(f), jax.jacrev(jax.jacrev(f))):
         np.testing.assert_allclose(hessian(x[0]), 2 * np.eye(3), atol=1e-12)
 

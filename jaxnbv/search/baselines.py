@@ -82,7 +82,7 @@ def uncertain_length(problem: Problem, poses: Pose) -> Float[Array, " poses"]:
     coordinates = jnp.moveaxis((points + grid.half_extent) / grid.spacing, -1, 0)
 
     def is_open(values):
-        field = jax.scipy.ndimage.map_coordinates(values, list(coordinates), order=1, mode="constant", cval=jnp.inf)
+        field = jax.scipy.ndimage.map_coordinates(values, list(coordinates), order=1, mode="nearest")
         return jax.lax.cumprod(jnp.where(inside_grid, field > 0, True).astype(points.dtype), axis=1)
 
     transmittance = jnp.mean(jax.lax.map(is_open, surfaces.values), axis=0)

@@ -34,8 +34,10 @@ class NonuniformTransform(eqx.Module):
 
     def __init__(self, points: Float[Array, "n 3"], truncation: int):
         window, beta, step = _window(truncation, points.dtype)
-        position = (points + HALF_WIDTH) / step
-        first = jnp.ceil(position - 0.5 * window)
+        # XLA may compute `first` once for `start` and again for `weights`. A multiplication followed by a subtraction
+        # may be rounded differently there, and the two would be a node apart: only ceil follows the multiplication.
+        position = (points + HALF_WIDTH) * (1.0 / step)
+        first = jnp.ceil(position) - window // 2
         offset = position[..., None] - first[..., None] - jnp.arange(window)
         radicand = jnp.maximum(1.0 - (2.0 * offset / window) ** 2, jnp.finfo(points.dtype).eps ** 2)
         self.start = (first + window // 2).astype(jnp.int32)

@@ -107,7 +107,7 @@ def _check_in_scene(cloud: PointCloud) -> None:
     require(finite, "the cloud has points or normals that are not finite: build it with PointCloud.from_arrays")
     furthest = float(np.abs(points).max())
     require(
-        furthest <= HALF_WIDTH,
+        furthest <= float(points.dtype.type(HALF_WIDTH)),
         f"a point has a coordinate of {furthest:.4g}, outside the scene [-pi/2, pi/2]^3: "
         "bring the points to the scene with Frame.fit(points).to_scene(points)",
     )

@@ -160,7 +160,7 @@ def mean_surface(planner: Planner, cloud: PointCloud) -> MeanSurface | None:
     if not values.min() < 0 < values.max():
         return None
     found = marching_cubes(values, 0.0, spacing=(grid.spacing,) * 3, gradient_direction="descent")
-    vertices, faces, normals = found[0] - grid.half_extent, found[1], _unit(found[2])
+    vertices, faces, normals = found[0] - grid.half_extent, found[1], -_unit(found[2])
     # Along the normals too, so that the two sides of a thin sheet are told apart.
     features = np.concatenate([vertices, 0.1 * normals], axis=1)
     anchors = _spread(features, _SLOPE_ANCHORS)

@@ -1,6 +1,7 @@
 """The pictures of an episode as PNG files, for papers and READMEs."""
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -19,9 +20,9 @@ from jaxnbv.viz import sphere
 from jaxnbv.viz.data import COVERAGE_RADIUS, Choice, ReportData, ViewData
 from jaxnbv.viz.render import draw_scene
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, log_ticks, round_range
-from jaxnbv.viz.words import Quantity, number
+from jaxnbv.viz.words import Quantity, number, percent
 
-STYLE = {
+STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.size": 9,
     "text.color": INK,
@@ -38,6 +39,7 @@ STYLE = {
     "axes.titlelocation": "left",
     "figure.facecolor": "white",
 }
+_ROW = 5.1
 DEVIATION_LABEL = "standard deviation of the surface (scene units)"
 
 
@@ -63,7 +65,7 @@ def write_figures(data: ReportData, camera: Camera, folder: str | Path, progress
     with mpl.rc_context(STYLE):
         for path in tqdm(paths, desc="drawing figures", disable=not progress):
             if path.name == "overview.png":
-                _save(_overview(data, camera, norm), path, dpi=120)
+                _save(_overview(data, camera, norm), path, dpi=120, few_colours=True)
             elif path.name == "coverage.png":
                 _save(_charts(data), path, dpi=200)
             else:
@@ -71,13 +73,19 @@ def write_figures(data: ReportData, camera: Camera, folder: str | Path, progress
     return paths
 
 
-def _save(figure: Figure, path: Path, dpi: int) -> None:
+def _save(figure: Figure, path: Path, dpi: int, few_colours: bool = False) -> None:
     canvas = FigureCanvasAgg(figure)
     figure.set_dpi(dpi)
     canvas.draw()
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    # A palette of 256 colours is a third of the size and not to be told apart.
-    image.quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(path, optimize=True, dpi=(dpi, dpi))
+    if few_colours:
+        # A third of the size; dithered, so that the colour bars stay smooth.
+        image = image.quantize(palette=image.quantize(256), dither=Image.Dither.FLOYDSTEINBERG)
+        colours = np.asarray(image.getpalette()).reshape(-1, 3)
+        # The background is the commonest colour; the mean of it and its neighbours is not quite white.
+        colours[np.bincount(np.asarray(image).ravel()).argmax()] = 255
+        image.putpalette(colours.ravel().tolist())
+    image.save(path, optimize=True, dpi=(dpi, dpi))
 
 
 def _view(data: ReportData, index: int, camera: Camera, norm: LogNorm) -> Figure:
@@ -105,7 +113,7 @@ def _map_title(view: ViewData, quantity: Quantity) -> str:
 def _deviation_bar(figure: Figure, place: tuple[float, float, float, float], norm: LogNorm) -> None:
     bar = figure.colorbar(ScalarMappable(norm, DEVIATION), cax=figure.add_axes(place), orientation="horizontal")
     bar.outline.set_visible(False)
-    bar.set_ticks(log_ticks(norm.vmin, norm.vmax).tolist())
+    bar.set_ticks(log_ticks(*bar.ax.get_xlim()).tolist())
     bar.ax.xaxis.set_minor_locator(NullLocator())
     bar.ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     bar.set_label(DEVIATION_LABEL)
@@ -116,39 +124,46 @@ def _legend(figure: Figure, x: float, y: float) -> None:
     figure.text(x + 0.125, y, "● new points and camera", color=NEW, fontsize=8)
 
 
-def draw_acquisition(axes: Axes, choice: Choice | None, quantity: Quantity, weight: float = 1.0) -> ScalarMappable | None:
-    """Draw the values of the candidates as a map of the sphere; returns what a colour bar needs, None for a given view."""
+def draw_acquisition(
+    axes: Axes, choice: Choice | None, quantity: Quantity, weight: float = 1.0
+) -> ScalarMappable | None:
+    """Draw the candidates' values as a map of the sphere; returns what a colour bar needs, None for a given view."""
     axes.set(xlim=(-2.95, 2.95), ylim=(-1.6, 1.6), aspect="equal")
     axes.axis("off")
-    colours = None
-    if choice is not None:
-        colours = ScalarMappable(Normalize(*value_range(choice)), VALUE)
-        if quantity.smooth:
-            extent = (-sphere.WIDTH, sphere.WIDTH, -sphere.HEIGHT, sphere.HEIGHT)
-            smooth = sphere.smooth_map(choice.directions, choice.values, 240)
-            image = axes.imshow(colours.to_rgba(smooth), extent=extent, interpolation="bilinear", zorder=1)
-            axes.fill(*sphere.rim().T, facecolor="none")
-            image.set_clip_path(axes.patches[-1])
     for line in sphere.graticule():
-        axes.plot(*line.T, color="white" if choice is not None and quantity.smooth else LINE, lw=0.5 * weight, alpha=0.5)
+        axes.plot(*line.T, color=LINE, lw=0.5 * weight, alpha=0.6)
     axes.plot(*sphere.rim().T, color=GREY, lw=0.8 * weight)
     if choice is None:
         axes.text(0.0, 0.0, "given", ha="center", va="center", color=GREY, fontsize=11 * weight)
         return None
+    colours = ScalarMappable(Normalize(*value_range(choice)), VALUE)
+    if is_smooth(choice, quantity):
+        extent = (-sphere.WIDTH, sphere.WIDTH, -sphere.HEIGHT, sphere.HEIGHT)
+        smooth = sphere.smooth_map(choice.directions, choice.values, 240)
+        image = axes.imshow(colours.to_rgba(smooth), extent=extent, interpolation="bilinear", zorder=1)
+        image.set_clip_path(axes.fill(*sphere.rim().T, facecolor="none")[0])
     places = sphere.mollweide(choice.directions)
     shown = ~choice.visited
     axes.scatter(
-        *places[shown].T,
-        c=colours.to_rgba(choice.values[shown]) if colours else None,
+        places[shown, 0],
+        places[shown, 1],
+        c=colours.to_rgba(choice.values[shown]),
         s=14 * weight,
-        edgecolors="white",
-        linewidths=0.5 * weight,
+        edgecolors=GREY,
+        linewidths=0.6 * weight,
         zorder=3,
     )
-    axes.scatter(*places[~shown].T, marker="x", c=INK, s=26 * weight, linewidths=1.2 * weight, zorder=4)
-    star = {"marker": "*", "s": 190 * weight, "c": NEW, "edgecolors": "white", "linewidths": 0.9 * weight}
-    axes.scatter(*sphere.mollweide(choice.chosen[None]).T, **star, zorder=5)
+    axes.scatter(
+        places[~shown, 0], places[~shown, 1], marker="x", c=INK, s=26 * weight, linewidths=1.2 * weight, zorder=4
+    )
+    star: dict[str, Any] = {"marker": "*", "ms": 14 * weight**0.5, "color": NEW, "markeredgecolor": "white", "mew": 1.0}
+    axes.plot(*sphere.mollweide(choice.chosen[None]).T, **star, zorder=5)
     return colours
+
+
+def is_smooth(choice: Choice, quantity: Quantity) -> bool:
+    """Whether a map between the candidates says something: they must be many, and their values no lots."""
+    return quantity.smooth and choice.open_values.size >= 12
 
 
 def value_range(choice: Choice) -> tuple[float, float]:
@@ -165,7 +180,8 @@ def coverage_series(data: ReportData) -> tuple[str, Float[np.ndarray, " v"]]:
     shares = [view.coverage for view in data.views]
     if any(share is None for share in shares):
         return "points kept", np.array([float(view.count) for view in data.views])
-    return f"coverage (% within {COVERAGE_RADIUS:g})", np.array([100.0 * share for share in shares if share is not None])
+    values = np.array([100.0 * share for share in shares if share is not None])
+    return f"coverage (% within {COVERAGE_RADIUS:g})", values
 
 
 def draw_coverage(axes: Axes, data: ReportData) -> None:
@@ -184,7 +200,8 @@ def draw_values(axes: Axes, data: ReportData) -> None:
     """Draw the value of each chosen view over that of the median candidate."""
     for view in data.views:
         if view.choice is None:
-            axes.annotate("given", (view.number, 0), (0, 4), textcoords="offset points", ha="center", color=GREY, fontsize=8)
+            below: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "color": GREY, "fontsize": 8}
+            axes.annotate("given", (view.number, 0), (0, 4), **below)
             continue
         axes.vlines(view.number, 0.0, view.choice.value, color=LINE, lw=1.5, zorder=1)
         axes.plot(view.number, view.choice.value, "*", color=NEW, ms=11, markeredgecolor="white", zorder=3)
@@ -211,26 +228,37 @@ def _overview(data: ReportData, camera: Camera, norm: LogNorm) -> Figure:
     """Scenes over acquisition maps, at most five to a row, with the charts' story in the titles."""
     columns = min(len(data.views), 5)
     rows = -(-len(data.views) // columns)
-    width, tall = 3.0 * columns, 4.75 * rows + 0.75
+    width, tall = 3.0 * columns, _ROW * rows + 0.85
     figure = Figure(figsize=(max(width, 6.0), tall))
     left = (max(width, 6.0) - width) / 2.0
     poses = [view.pose for view in data.views]
 
-    def place(x, y, w, h):
+    def place(x: float, y: float, w: float = 0.0, h: float = 0.0) -> tuple[float, float, float, float]:
         return (left + x) / figure.get_figwidth(), y / tall, w / figure.get_figwidth(), h / tall
 
     for index, view in enumerate(data.views):
         row, column = divmod(index, columns)
-        x, y = 3.0 * column, tall - 4.75 * (row + 1)
+        x, y = 3.0 * column, tall - _ROW * (row + 1)
         scene = figure.add_axes(place(x, y + 1.55, 3.0, 3.0))
         draw_scene(scene, view, poses[: index + 1], camera, norm, 420, weight=1.3)
-        share = f"{view.count:,} points" if view.coverage is None else f"{view.coverage:.0%} covered"
-        title = place(x + 0.12, y + 4.5, 0, 0)
+        share = f"{view.count:,} points" if view.coverage is None else f"{percent(view.coverage)} covered"
+        title = place(x + 0.12, y + 4.85)
         figure.text(*title[:2], f"View {view.number}", fontsize=15, fontweight="bold", va="center")
-        edge = place(x + 2.88, y + 4.5, 0, 0)
+        edge = place(x + 2.88, y + 4.85)
         figure.text(*edge[:2], share, fontsize=14, ha="right", va="center")
         draw_acquisition(figure.add_axes(place(x + 0.1, y, 2.8, 1.5)), view.choice, data.quantity, weight=1.2)
+    half = max(width, 6.0) / 2.0
     with mpl.rc_context({"font.size": 12}):
-        half = 0.5 * max(width, 6.0)
-        _deviation_bar(figure, (0.04, 0.55 / tall, 0.4 * half / half * 0.9, 0.12 / tall), norm)
+        _deviation_bar(figure, place(0.6, 0.55, half - 1.6, 0.13), norm)
+    marks = (
+        ("●", BEFORE, "points before"),
+        ("●", NEW, "new points, camera"),
+        ("★", NEW, "chosen view"),
+        ("×", INK, "visited views"),
+    )
+    x, y, *_ = place(half + 0.1, 0.76)
+    figure.text(x, y, f"Maps: {data.quantity.name}, pale (low) to dark (high)", fontsize=13, va="center")
+    for i, (mark, colour, text) in enumerate(marks):
+        x, y, *_ = place(half + 0.1 + 2.2 * (i % 2), 0.44 - 0.32 * (i // 2))
+        figure.text(x, y, f"{mark} {text}", color=colour, fontsize=13, va="center")
     return figure

@@ -1,4 +1,4 @@
-"""A still picture of one view's scene: the mean surface ray-traced, points and cameras drawn in front of and behind it."""
+"""A still picture of one view's scene: the mean surface, ray-traced, with points and cameras before and behind it."""
 
 import math
 
@@ -33,13 +33,14 @@ def beside(pose: Pose, radius: float = 1.0) -> Float[np.ndarray, "3"]:
 
 
 def frustum(pose: Pose, camera: Camera, depth: float = FRUSTUM_DEPTH) -> Float[np.ndarray, "lines 2 3"]:
-    """Edges of a camera's field of view up to a depth, as segments in scene coordinates; the last marks its up side."""
+    """Edges of a camera's field of view up to a depth, as segments in scene coordinates."""
     tall = depth * math.tan(0.5 * camera.fov)
     wide = tall * camera.width / camera.height
     corners = np.array([[-wide, -tall, depth], [wide, -tall, depth], [wide, tall, depth], [-wide, tall, depth]])
     corners = corners @ np.asarray(pose.rotation, dtype=np.float64).T + np.asarray(pose.position)
     apex = np.broadcast_to(np.asarray(pose.position), corners.shape)
-    return np.concatenate([np.stack([apex, corners], axis=1), np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)])
+    sides = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+    return np.concatenate([np.stack([apex, corners], axis=1), sides])
 
 
 class Still:
@@ -51,7 +52,6 @@ class Still:
         self.pose = look_at(_DISTANCE * eye / np.linalg.norm(eye))
         self.image = np.zeros((size, size, 4))
         self.depth = np.full((size, size), np.inf)
-        self.norm: LogNorm | None = None
         self._surface = surface
 
     def paint(self, deviation: LogNorm) -> None:
@@ -72,7 +72,7 @@ class Still:
         normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12
         right, down, forward = np.asarray(self.pose.rotation).T
         light = -forward - 0.5 * right - 0.7 * down
-        lit = 0.62 + 0.42 * np.clip(normals @ (light / np.linalg.norm(light)), -0.4, 1.0)
+        lit = 0.72 + 0.34 * np.clip(normals @ (light / np.linalg.norm(light)), -0.4, 1.0)
         colours = DEVIATION(deviation(np.exp(np.sum(weight * np.log(surface.deviation)[near], axis=1))))
         colours[:, :3] = np.clip(colours[:, :3] * lit[:, None], 0.0, 1.0)
         image = np.zeros((len(mask), 4))
@@ -106,7 +106,10 @@ def draw_scene(
     axes.imshow(still.image, interpolation="bilinear", zorder=1)
     for points, colour, dot in ((view.before, BEFORE, 0.7), (view.new, NEW, 1.1)):
         pixels, in_front = still.project(points)
-        axes.scatter(*pixels[in_front].T, s=dot * weight, c=colour, linewidths=0, zorder=2)
+        axes.scatter(pixels[in_front, 0], pixels[in_front, 1], s=dot * weight, c=colour, linewidths=0, zorder=2)
+    shown_places = [still.project(view.new)[0]]
+    if view.surface is not None:
+        shown_places.append(still.project(view.surface.vertices)[0])
     for number, pose in enumerate(poses, start=1):
         is_new = number == len(poses)
         colour = NEW if is_new else GREY
@@ -120,10 +123,13 @@ def draw_scene(
         shown = (in_front[:-1] & in_front[1:]).reshape(-1)
         width = (1.5 if is_new else 0.9) * weight
         colours = mpl.colors.to_rgba_array([colour] * len(segments), np.where(shown, 1.0, 0.18))
-        axes.add_collection(LineCollection(list(segments), colors=colours, linewidths=width, zorder=3))
+        lines = LineCollection(list(segments), colors=colours, linewidths=width, capstyle="round", zorder=3)
+        axes.add_collection(lines)
         apex, apex_in_front = still.project(np.asarray(pose.position, dtype=np.float64)[None] * 1.09)
+        shown_places += [apex, pixels.reshape(-1, 2)]
         axes.text(
-            *apex[0],
+            apex[0, 0],
+            apex[0, 1],
             str(number),
             color=colour,
             alpha=1.0 if apex_in_front[0] else 0.4,
@@ -133,5 +139,10 @@ def draw_scene(
             va="center",
             zorder=4,
         )
-    axes.set(xlim=(-0.5, size - 0.5), ylim=(size - 0.5, -0.5), aspect="equal")
+    # A square about what there is to see.
+    seen = np.concatenate(shown_places)
+    (left, top), (right, bottom) = seen.min(axis=0), seen.max(axis=0)
+    half = 0.53 * max(right - left, bottom - top) + 0.03 * size
+    x, y = 0.5 * (left + right), 0.5 * (top + bottom)
+    axes.set(xlim=(x - half, x + half), ylim=(y + half, y - half), aspect="equal")
     axes.axis("off")

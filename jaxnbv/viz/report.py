@@ -5,7 +5,7 @@ import html
 import io
 import json
 import math
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 
 import matplotlib as mpl
@@ -14,18 +14,18 @@ from jaxtyping import Float
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera
 from jaxnbv.checks import AnyArray
 from jaxnbv.episode import Episode
 from jaxnbv.storage import describe, versions
 from jaxnbv.viz import sphere
 from jaxnbv.viz.data import COVERAGE_RADIUS, Choice, MeanSurface, ReportData, ViewData, report_data
-from jaxnbv.viz.figures import coverage_series, deviation_range, value_range, write_figures
+from jaxnbv.viz.figures import coverage_series, deviation_range, is_smooth, value_range, write_figures
 from jaxnbv.viz.render import beside, frustum
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, colour_scale, log_ticks
+from jaxnbv.viz.words import Quantity
 
 _MAX_BEFORE, _MAX_NEW = 4000, 2500
-_QUANTA = 32_000  # Coordinates travel as 16-bit integers: of a scene 3.5 wide, steps of 1e-4.
 
 
 def write_report(
@@ -58,10 +58,11 @@ def report_html(episode: Episode, data: ReportData, title: str) -> str:
     parts = {
         "TITLE": html.escape(title),
         "HEADER": _header(episode, title),
-        "QUANTITY": html.escape(data.quantity.label),
+        "QUANTITY": html.escape(data.quantity.label[:1].upper() + data.quantity.label[1:]),
         "MEANING": html.escape(data.quantity.meaning),
         "COVERAGE": html.escape(_coverage_caption(data)),
         "COUNT": str(len(data.views)),
+        "SENTENCES": "".join(f"<li>{html.escape(view.sentence)}</li>" for view in data.views),
         "PLOTLY": get_plotlyjs(),
         "DATA": payload,
     }
@@ -90,7 +91,7 @@ def _header(episode: Episode, title: str) -> str:
         "Capacity": f"{planner.capacity:,} points",
         "Seed": ", ".join(str(word) for word in describe(episode.key)["data"]),
         "Versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
-        "Written": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+        "Written": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
     }
     rows = (f"<div><dt>{name}</dt><dd>{html.escape(str(value))}</dd></div>" for name, value in settings.items())
     return "".join(rows)
@@ -115,8 +116,7 @@ def _payload(episode: Episode, data: ReportData) -> dict:
     label, series = coverage_series(data)
     camera = episode.planner.camera
     return {
-        "views": [_view(view, camera, data.quantity.smooth) for view in data.views],
-        "extent": episode.planner.grid.half_extent / _QUANTA,
+        "views": [_view(view, camera, data.quantity) for view in data.views],
         "reach": max(1.8, *(float(np.linalg.norm(view.pose.position)) for view in data.views)) * 1.12,
         "deviation": {
             "range": [math.log10(low), math.log10(high)],
@@ -136,7 +136,7 @@ def _payload(episode: Episode, data: ReportData) -> dict:
     }
 
 
-def _view(view: ViewData, camera: Camera, smooth: bool) -> dict:
+def _view(view: ViewData, camera: Camera, quantity: Quantity) -> dict:
     return {
         "sentence": view.sentence,
         "before": _thinned(view.before, _MAX_BEFORE),
@@ -145,5 +145,52 @@ def _view(view: ViewData, camera: Camera, smooth: bool) -> dict:
         "frustum": frustum(view.pose, camera).round(4).tolist(),
         "label": (1.09 * np.asarray(view.pose.position, dtype=np.float64)).round(4).tolist(),
         "surface": None if view.surface is None else _surface(view.surface),
-        "choice": None if view.choice is None else _choice(view.choice, smooth),
+        "choice": None if view.choice is None else _choice(view.choice, quantity),
     }
+
+
+def _thinned(points: Float[np.ndarray, "n 3"], limit: int) -> list[list[float]]:
+    """At most `limit` rows, evenly taken, rounded to what a screen can show."""
+    rows = np.linspace(0, len(points) - 1, min(limit, len(points))).astype(int)
+    return np.round(points[rows].astype(np.float64), 3).tolist()
+
+
+def _surface(surface: MeanSurface) -> dict:
+    return {
+        "vertices": _packed(surface.vertices, np.float32),
+        "faces": _packed(surface.faces, np.uint32),
+        "deviation": _packed(np.log10(surface.deviation), np.float32),
+    }
+
+
+def _packed(array: np.ndarray, dtype: type) -> str:
+    """The bytes of an array, little-endian, as base64."""
+    return base64.b64encode(np.ascontiguousarray(array, np.dtype(dtype).newbyteorder("<")).tobytes()).decode()
+
+
+def _choice(choice: Choice, quantity: Quantity) -> dict:
+    low, high = value_range(choice)
+    order = np.argsort(-np.where(choice.visited, -np.inf, choice.values), kind="stable")
+    ranks = np.empty(len(order), dtype=int)
+    ranks[order] = np.arange(1, len(order) + 1)
+    return {
+        "places": sphere.mollweide(choice.directions).round(4).tolist(),
+        "directions": choice.directions.round(3).tolist(),
+        "values": [None if math.isnan(value) else value for value in choice.values.tolist()],
+        "ranks": ranks.tolist(),
+        "chosen": sphere.mollweide(choice.chosen[None]).round(4)[0].tolist(),
+        "value": choice.value,
+        "median": float(np.median(choice.open_values)) if choice.open_values.size else None,
+        "range": [low, high],
+        "image": _map_image(choice, low, high) if is_smooth(choice, quantity) else None,
+    }
+
+
+def _map_image(choice: Choice, low: float, high: float) -> str:
+    """The smooth map as a PNG in a data address, coloured as the candidates are; clear outside the rim."""
+    values = sphere.smooth_map(choice.directions, choice.values, 300)
+    colours = VALUE(mpl.colors.Normalize(low, high)(np.nan_to_num(values)), bytes=True)
+    colours[..., 3] = np.where(np.isnan(values), 0, 255)
+    file = io.BytesIO()
+    Image.fromarray(colours).save(file, format="PNG", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()

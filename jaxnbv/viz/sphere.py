@@ -45,7 +45,7 @@ def smooth_map(
     places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     at, inside = from_mollweide(places)
     known = ~np.isnan(values)
-    spline = RBFInterpolator(directions[known], values[known], kernel="thin_plate_spline", degree=0)
+    spline = RBFInterpolator(directions[known], values[known], kernel="thin_plate_spline")
     smooth = np.clip(spline(at), values[known].min(), values[known].max())
     return np.where(inside, smooth, np.nan).reshape(height, 2 * height)
 

@@ -9,7 +9,8 @@ INK, GREY, LINE = "#1f2733", "#7a8494", "#d9dee6"
 BEFORE, NEW = "#26344d", "#d55e00"
 # Pale where the surface is known, dark where it is not: the scanned points stand out on what is known.
 DEVIATION = LinearSegmentedColormap.from_list("deviation", mpl.colormaps["YlGnBu"](np.linspace(0.04, 0.92, 256)))
-VALUE = mpl.colormaps["cividis"]
+# Another hue for the other scale, and no colour of the marks that lie on it.
+VALUE = LinearSegmentedColormap.from_list("value", mpl.colormaps["BuPu"](np.linspace(0.03, 0.95, 256)))
 
 
 def colour_scale(colours: Colormap, steps: int = 32) -> list[list]:

@@ -13,7 +13,7 @@ class Quantity(eqx.Module):
     """What a search maximises.
 
     - `name`, `unit`: in words; the unit is empty where there is none.
-    - `meaning`: a sentence for a caption.
+    - `meaning`: the rest of a caption that begins with "Value:".
     - `smooth`: whether values between two candidates mean anything.
     """
 
@@ -34,27 +34,27 @@ class Quantity(eqx.Module):
 def quantity(search: Search, score: Score) -> Quantity:
     """What the values of a search are, from the kinds of search and score."""
     if isinstance(search, FarthestView):
-        meaning = "Distance from a candidate to the nearest camera so far; the surface is not looked at."
+        meaning = "distance from a candidate to the nearest camera so far; the surface is not looked at."
         return Quantity("distance to the nearest camera", "scene units", meaning)
     if isinstance(search, RandomView):
-        meaning = "Every open candidate drew a lot; the surface is not looked at."
+        meaning = "every open candidate drew a lot; the surface is not looked at."
         return Quantity("lot drawn", "uniform on [0, 1)", meaning, smooth=False)
     if isinstance(search, UncertaintyView):
-        meaning = "Length of the principal ray along which the posterior samples disagree whether it has hit."
+        meaning = "length of the principal ray along which the posterior samples disagree whether it has hit."
         return Quantity("uncertain length of the principal ray", "scene units", meaning)
     if isinstance(score, Coverage):
-        meaning = "Squared distances from an imagined scan to the cloud, summed over the scan, mean over posterior samples."
+        meaning = "squared distances to the cloud, summed over an imagined scan, mean over posterior samples."
         return Quantity("expected coverage gain", "scene units²", meaning)
     if isinstance(score, ExpectedUtilityImprovement):
-        meaning = "How much an imagined scan raises the utility of the cloud, mean over posterior samples."
+        meaning = "how much an imagined scan raises the utility of the cloud, mean over posterior samples."
         return Quantity("expected utility improvement", "", meaning)
-    meaning = "Score of an imagined scan, mean over posterior samples."
+    meaning = "score of an imagined scan, mean over posterior samples."
     return Quantity(f"acquisition, {type(score).__name__}", "", meaning)
 
 
 def describe_first(pose: Pose, points: int, covered: float | None) -> str:
     """What a view that was given saw, to follow "View 1"."""
-    share = "" if covered is None else f", {covered:.0%} of the true surface"
+    share = "" if covered is None else f", {percent(covered)} of the true surface"
     return f"was given. It looks from {place(pose)}, and found {points:,} points{share}."
 
 
@@ -79,7 +79,7 @@ def describe_choice(
     kept = f" ({count:,} are kept)" if points else ""
     grown = ""
     if change is not None:
-        before, after = (f"{share:.0%}" for share in change)
+        before, after = (percent(share) for share in change)
         grown = f"; coverage stayed at {after}" if before == after else f"; coverage went from {before} to {after}"
     return " ".join([*parts, f"{added}{kept}{grown}."])
 
@@ -103,7 +103,7 @@ def _reason(values: Quantity, value: float, rank: int, others: tuple[float, ...]
         if ahead >= 1:
             margin = f"{number(ahead + 1)} times the runner-up"
     else:
-        margin = "the runner-up had"
+        margin = "ahead of the runner-up"
     return f"{text}: {compared}, {margin} ({number(runner_up)})."
 
 
@@ -121,6 +121,11 @@ def nearest_angle(pose: Pose, earlier: list[Pose]) -> float:
     here, *others = (np.asarray(p.position, dtype=np.float64) for p in (pose, *earlier))
     cosines = [here @ there / (np.linalg.norm(here) * np.linalg.norm(there) + 1e-12) for there in others]
     return float(np.degrees(np.arccos(np.clip(max(cosines), -1.0, 1.0))))
+
+
+def percent(share: float) -> str:
+    """A share in whole percent."""
+    return f"{100 * share:.0f} %"
 
 
 def number(value: float) -> str:

@@ -96,7 +96,7 @@ def slow_uncertain_length(values, position, step):
 
 
 def test_uncertainty_against_its_definition():
-    """The slow version walks at an eighth of the library's step, so each end may differ by one of the latter's steps."""
+    """The slow version walks at an eighth of the library's step, which finds the first end late and the last early."""
     rng = np.random.default_rng(0)
     surfaces = balls([0.9, 0.6, 0.7, 0.3], rng.uniform(-0.5, 0.5, (4, 3)))
     search, values = UncertaintyView(num_candidates=12), np.asarray(surfaces.values, dtype=np.float64)
@@ -104,12 +104,14 @@ def test_uncertainty_against_its_definition():
     step = 0.5 * GRID.spacing
     expected = np.array([slow_uncertain_length(values, c, step / 8) for c in CANDIDATES])
     proposal = search.propose(asked, jax.random.key(0))
-    np.testing.assert_allclose(uncertain_length(asked, proposal.candidates), expected, atol=1.2 * step)
+    short = expected - np.asarray(uncertain_length(asked, proposal.candidates))
+    assert short.min() > -step / 4
+    assert short.max() < 2 * step
     assert expected.std() > 3 * step
     np.testing.assert_array_equal(np.isneginf(proposal.values), np.arange(12) == 0)
     best = np.asarray(proposal.values).argmax()
     assert index_of(proposal) == best
-    assert expected[best] > expected[1:].max() - 2.4 * step
+    assert expected[best] > expected[1:].max() - 2.25 * step
 
 
 def test_uncertainty_between_the_quantiles_of_many_samples():

@@ -27,15 +27,15 @@ def padded(points, normals, rows, capacity):
 
 @pytest.mark.parametrize("noise", [0.3, 0.05])
 def test_sample_mean_and_joint_covariance_equal_weight_space(noise):
-    """24,000 samples at four data points and six others. Whitened by the exact moments, the 10 means have standard error
-    N^-1/2, the 10 variances (2 / N)^1/2 and the 45 correlations N^-1/2; the sums of squares are chi-square with 10 and
-    55 degrees of freedom."""
+    """24,000 samples at four data points and six others. Whitened by the exact moments, the 10 means and the 45
+    correlations have standard error N^-1/2 and the 10 variances (2 / N)^1/2; the sums of squares are chi-square with
+    10 and 55 degrees of freedom."""
     settings = SETTINGS | {"noise": noise}
     rng = np.random.default_rng(0)
     points, normals = rng.uniform(-0.6, 0.6, (12, 3)), rng.standard_normal((12, 3))
     x = np.concatenate([points[:4], rng.uniform(-1.5, 1.5, (6, 3))])
     mean, covariance = WeightSpace(**settings).posterior(points, normals, x)
-    posterior = GeometricSPSR(**settings).condition(padded(points, normals, np.arange(16)[1::1][:12], 16))
+    posterior = GeometricSPSR(**settings).condition(padded(points, normals, np.arange(2, 14), 16))
     draws = [np.asarray(posterior.sample(jax.random.key(seed), 8000)(x), np.float64) for seed in range(3)]
     white = np.linalg.solve(np.linalg.cholesky(covariance), (np.concatenate(draws) - mean).T)
     count = white.shape[1]
@@ -59,15 +59,15 @@ def test_samples_are_reproducible_and_distinct():
 
 
 def test_posterior_is_calibrated():
-    """Simulation-based calibration (Talts et al. 2018). 1,600 problems drawn from the prior in weight space: normals of
-    f with noise at 10 random points, conditioned on in float32, 31 samples. The rank of the true f among the samples is
-    uniform on 0, ..., 31: chi-square over 8 bins of 200 expected, for f at two data points and at three unseen ones, two
-    differences, and the minimum over all five points, which depend on the joint distribution."""
-    problems, count, samples, bins = 1600, 10, 31, 8
+    """Simulation-based calibration (Talts et al. 2018). 1,200 problems drawn from the prior in weight space: normals of
+    f with noise at 10 random points, conditioned on in float32, 31 samples. The rank of the true f among the samples
+    is uniform on 0, ..., 31: chi-square over 8 bins of 150 expected, for f at two data points and at three unseen
+    ones, two differences, and the minimum over all five points, which depend on the joint distribution."""
+    problems, count, samples, bins = 1200, 10, 31, 8
     oracle, rng = WeightSpace(**SETTINGS), np.random.default_rng(3)
     points = rng.uniform(-0.8, 0.8, (problems, count, 3))
-    unseen = np.stack([points[:, 2] + 0.2, rng.uniform(-0.8, 0.8, (problems, 3)), rng.uniform(-1.57, 1.57, (problems, 3))], 1)
-    x = np.concatenate([points[:, :2], unseen], axis=1)
+    inner, outer = (rng.uniform(-extent, extent, (problems, 3)) for extent in (0.8, 1.57))
+    x = np.stack([points[:, 0], points[:, 1], points[:, 2] + 0.2, inner, outer], axis=1)
     truth, normals = np.zeros((problems, 5)), np.zeros((problems, count, 3))
     for i in range(problems):
         weights = rng.standard_normal((3, oracle.num_weights))
@@ -82,7 +82,8 @@ def test_posterior_is_calibrated():
 
     clouds = padded(points, normals, np.array([0, 1, 2, 3, 5, 6, 8, 9, 10, 11]), 12)
     keys = jax.random.split(jax.random.key(0), problems)
-    draws = jax.jit(lambda inputs: jax.lax.map(sample, inputs, batch_size=16))((clouds, jnp.asarray(x, jnp.float32), keys))
+    inputs = (clouds, jnp.asarray(x, jnp.float32), keys)
+    draws = jax.jit(lambda inputs: jax.lax.map(sample, inputs, batch_size=16))(inputs)
 
     def quantities(f):
         differences = [f[..., 0] - f[..., 1], f[..., 0] - f[..., 2]]

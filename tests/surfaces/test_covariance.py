@@ -29,7 +29,9 @@ def brute_force(x, y, spectrum):
     return np.cos(angle) @ s, cross, np.cos(angle) @ (s * inverse)
 
 
-@pytest.mark.parametrize(("nu", "lengthscale", "truncation"), [(0.5, 0.05, 12), (1.5, 0.2, 6), (2.5, 0.005, 12), (1.5, 0.1, 1)])
+@pytest.mark.parametrize(
+    ("nu", "lengthscale", "truncation"), [(0.5, 0.05, 12), (1.5, 0.2, 6), (2.5, 0.005, 12), (1.5, 0.1, 1)]
+)
 def test_covariances_equal_lattice_sums(x64, nu, lengthscale, truncation):
     spectrum = lattice_spectrum(nu, lengthscale, 0.4, truncation)
     expected = brute_force(X, Y, spectrum)
@@ -61,8 +63,13 @@ def test_covariances_obey_the_poisson_equation(x64):
     spectrum, h = circle_spectrum(1.5, 0.1, 0.5, 5), 1e-3
     steps = np.concatenate([np.zeros((1, 3)), h * np.eye(3), -h * np.eye(3)])
     at_x, at_y = jnp.asarray(X[1] + steps), jnp.asarray(Y[1] + steps)
-    gradient = lambda values: (values[1:4] - values[4:]) / (2 * h)
-    laplacian = lambda values: (values[1:].sum() - 6 * values[0]) / h**2
+
+    def gradient(values):
+        return (values[1:4] - values[4:]) / (2 * h)
+
+    def laplacian(values):
+        return (values[1:].sum() - 6 * values[0]) / h**2
+
     k_vv = np.asarray(normal_covariance(at_x, at_y, spectrum))
     k_fv = np.asarray(function_normal_covariance(at_x, at_y, spectrum))
     k_vf = np.asarray(function_normal_covariance(at_y, at_x, spectrum)).transpose(0, 2, 1)

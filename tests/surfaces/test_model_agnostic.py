@@ -1,6 +1,5 @@
 """A surface model of the user's own, with any sampler, drives the planner and the simulated episode."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -80,7 +79,7 @@ def test_a_simulated_episode_sees_the_surface(name):
     episode = nbv.simulate(planner(), SCENES[name], first, 3, jax.random.key(0), noise, progress=False)
     assert len(episode.views) == 3
     points, _ = episode.cloud.to_numpy()
-    distance = np.asarray(SCENES[name].solid(jnp.asarray(points)))
+    distance = np.asarray(SCENES[name].sdf(jnp.asarray(points)))
     assert len(points) > len(episode.views[0].scan.to_numpy()[0])
     assert np.abs(distance).max() < 1e-3
     positions = np.array([view.pose.position for view in episode.views])
@@ -98,13 +97,12 @@ def test_default_grid_evaluation_is_evaluation_at_the_nodes(posterior):
 
 
 def test_default_moments_are_within_monte_carlo_error(posterior):
-    """64 samples; exact moments by a fine sum over the uniform radius. Means to 4.5 standard errors; variances to 60 %,
-    more than 4.5 (2 / 63)^1/2 = 80 % of a Gaussian's would need for these bounded variables."""
+    """64 samples; exact moments by a fine sum over the uniform radius. Means to 4.5 standard errors; variances to 4.5
+    standard errors of those of uniform variables, (0.8 / 64)^1/2 = 11 % each (kurtosis 1.8)."""
     x = np.random.default_rng(0).uniform(-1.5, 1.5, (8, 3)).astype(np.float32)
     radii = 0.5 + 0.4 * (np.arange(4000) + 0.5) / 4000
     points, normals = posterior.cloud.to_numpy()
     centres = points.mean(axis=0) - radii[:, None] * normals.mean(axis=0)
     f = np.linalg.norm(x[:, None] - centres, axis=-1) - radii
     np.testing.assert_array_less(np.abs(posterior.mean(x) - f.mean(axis=1)), 4.5 * np.sqrt(f.var(axis=1) / 64))
-    np.testing.assert_allclose(posterior.variance(x), f.var(axis=1), rtol=0.6)
-    np.testing.assert_allclose(posterior.variance(x), eqx.filter_jit(posterior.variance)(x), rtol=1e-5)
+    np.testing.assert_allclose(posterior.variance(x), f.var(axis=1), rtol=0.5)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxnbv.surfaces.nonuniform import NonuniformTransform
-from jaxnbv.surfaces.trigonometric import TrigonometricFields, circle_basis
+from jaxnbv.surfaces.trigonometric import TrigonometricFields
 
 RNG = np.random.default_rng(0)
 
@@ -23,24 +23,34 @@ def relative(actual, expected):
     return np.linalg.norm(np.asarray(actual) - expected) / np.linalg.norm(expected)
 
 
-@pytest.mark.parametrize("truncation", [1, 7, 20])
-@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float32, 1e-5), (np.float64, 1e-10)])
-def test_transform_and_adjoint_equal_direct_sums(x64, truncation, dtype, tolerance):
-    """White coefficients, so that the highest frequencies count as much as the lowest; corners of the scene included.
-    Relative errors, in the norm and, ten times as large, at the worst point."""
+@pytest.mark.parametrize("truncation", [1, 4, 20])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float32, 1e-4), (np.float64, 1e-10)])
+def test_transform_and_adjoint_equal_direct_sums(truncation, dtype, tolerance):
+    """White coefficients, so that the highest frequencies count as much as the lowest; corners of the scene and points
+    on the transform's own nodes included. Relative errors, in the norm and, ten times as large, at the worst point."""
     modes = 2 * truncation + 1
-    points = points_with_borders(60)
+    points = points_with_borders(60).astype(dtype)
+    points[10:20] = -np.pi / 2 + np.pi / (2 * truncation) * RNG.integers(0, modes, (10, 3))
+    points = np.clip(points, -dtype(np.pi / 2), dtype(np.pi / 2))
     coefficients, values = RNG.standard_normal((2, modes, modes, modes)), RNG.standard_normal((60, 2))
-    transform = NonuniformTransform(jnp.asarray(points, dtype), truncation)
-    at_dtype = np.asarray(points.astype(dtype), np.float64)
-    expected = np.asarray(TrigonometricFields(jnp.asarray(coefficients))(at_dtype)).T
-    actual = transform.evaluate(jnp.asarray(coefficients, dtype))
-    assert actual.dtype == dtype
+    factors = []
+    for x in points.T.astype(np.float64):
+        angle = x[:, None] * np.arange(-truncation, truncation + 1)
+        factors.append(np.where(np.arange(modes) >= truncation, np.cos(angle), np.sin(-angle)))
+    expected = np.einsum("kabc,na,nb,nc->nk", coefficients, *factors, optimize=True)
+    spread = np.einsum("nk,na,nb,nc->kabc", values, *factors, optimize=True)
+    with jax.enable_x64(dtype is np.float64):
+
+        @jax.jit
+        def both(points, coefficients, values):
+            transform = NonuniformTransform(points, truncation)
+            return transform.evaluate(coefficients), transform.adjoint(values)
+
+        results = both(*(jnp.asarray(a, dtype) for a in (points, coefficients, values)))
+    actual, adjoint = (np.asarray(result) for result in results)
+    assert actual.dtype == adjoint.dtype == dtype
     assert relative(actual, expected) < tolerance
     assert np.abs(actual - expected).max() < 10 * tolerance * expected.std()
-    basis = np.asarray(circle_basis(jnp.asarray(at_dtype), truncation))
-    spread = np.einsum("nk,na,nb,nc->kabc", values, basis[:, 0], basis[:, 1], basis[:, 2], optimize=True)
-    adjoint = transform.adjoint(jnp.asarray(values, dtype))
     assert relative(adjoint, spread) < tolerance
     left, right = np.vdot(actual, values), np.vdot(coefficients, adjoint)
     scale = np.linalg.norm(actual) * np.linalg.norm(values)
@@ -55,8 +65,13 @@ def test_gradients_through_the_window_equal_finite_differences_of_the_function(x
     coefficients = jnp.asarray(RNG.standard_normal((1, modes, modes, modes)))
     values = RNG.standard_normal((12, 1))
     field = TrigonometricFields(coefficients)
-    forward = lambda x: jnp.vdot(NonuniformTransform(x, truncation).evaluate(coefficients), values)
-    backward = lambda x: jnp.vdot(NonuniformTransform(x, truncation).adjoint(jnp.asarray(values)), coefficients)
+
+    def forward(x):
+        return jnp.vdot(NonuniformTransform(x, truncation).evaluate(coefficients), values)
+
+    def backward(x):
+        return jnp.vdot(NonuniformTransform(x, truncation).adjoint(jnp.asarray(values)), coefficients)
+
     expected = np.zeros((12, 3))
     for axis in range(3):
         step = h * np.eye(3)[axis]
@@ -66,11 +81,11 @@ def test_gradients_through_the_window_equal_finite_differences_of_the_function(x
         np.testing.assert_allclose(gradient, expected, atol=1e-6 * np.abs(expected).max())
 
 
-def test_gradients_are_finite_on_nodes_and_borders():
+def test_gradients_on_nodes_and_borders_are_those_of_the_function():
     """A point on a node has a window that ends exactly on its last node, where the square root starts."""
     nodes = -np.pi / 2 + np.pi / 12 * np.arange(13)
     points = jnp.asarray(np.stack([nodes, nodes[::-1], nodes], axis=1), jnp.float32)
     coefficients = jnp.asarray(RNG.standard_normal((1, 13, 13, 13)), jnp.float32)
     gradient = jax.jit(jax.grad(lambda x: jnp.sum(NonuniformTransform(x, 6).evaluate(coefficients))))(points)
     exact = jax.jit(jax.grad(lambda x: jnp.sum(TrigonometricFields(coefficients)(x))))(points)
-    np.testing.assert_allclose(gradient, exact, atol=1e-4 * float(jnp.abs(exact).max()))
+    np.testing.assert_allclose(gradient, exact, atol=1e-3 * float(jnp.abs(exact).max()))

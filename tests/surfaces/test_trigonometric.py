@@ -52,7 +52,9 @@ def test_jit_grad_and_vmap_go_through_fields():
     x = jnp.asarray(POINTS, jnp.float32)
     values = fields(x)
     np.testing.assert_allclose(jax.jit(lambda fields, x: fields(x))(fields, x), values, atol=1e-4)
-    np.testing.assert_allclose(jax.vmap(fields)(x.reshape(4, 5, 3)).transpose(1, 0, 2).reshape(3, 20), values, atol=1e-4)
+    np.testing.assert_allclose(
+        jax.vmap(fields)(x.reshape(4, 5, 3)).transpose(1, 0, 2).reshape(3, 20), values, atol=1e-4
+    )
     gradient = jax.jit(jax.grad(lambda x: jnp.sum(fields(x)[1])))(x)
     expected = [direct(np.asarray(differentiate(fields.coefficients, d)), POINTS)[1] for d in range(3)]
     np.testing.assert_allclose(gradient.T, expected, atol=1e-3)
@@ -63,7 +65,10 @@ def test_poisson_solution_has_the_divergence_as_laplacian_and_mean_zero(x64):
     v = COEFFICIENTS[:1]
     f = np.asarray(solve_poisson(jnp.asarray(v)))
     h, points = 1e-3, POINTS[:6]
-    shifted = lambda field, axis, sign: direct(field, points + sign * h * np.eye(3)[axis])
+
+    def shifted(field, axis, sign):
+        return direct(field, points + sign * h * np.eye(3)[axis])
+
     second = sum(shifted(f, d, 1) + shifted(f, d, -1) - 2 * direct(f, points) for d in range(3)) / h**2
     divergence = sum((shifted(v[:, d], d, 1) - shifted(v[:, d], d, -1)) / (2 * h) for d in range(3))
     np.testing.assert_allclose(second, divergence, atol=1e-5 * np.abs(divergence).max())

@@ -1,0 +1,105 @@
+"""The command line, as a user meets it: every call is a process of its own."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+
+
+def run_command(*arguments: str, cwd, cache) -> subprocess.CompletedProcess:
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cache), "COLUMNS": "200", "NO_COLOR": "1"}
+    command = [sys.executable, "-m", "jaxnbv.cli", *arguments]
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=600)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("xla")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, cache):
+    """A folder in which `jaxnbv demo --quick` has run, and what it printed."""
+    folder = tmp_path_factory.mktemp("demo")
+    result = run_command("demo", "--quick", "--views", "2", cwd=folder, cache=cache)
+    assert result.returncode == 0, result.stderr
+    return folder, result
+
+
+def test_demo_leaves_an_episode_a_report_and_figures(finished):
+    folder, result = finished
+    out = folder / "runs" / "demo-discrete"
+    names = {path.name for path in out.iterdir()}
+    assert {"episode.json", "view_00.npz", "view_01.npz", "cloud.ply", "report.html"} <= names
+    assert list(out.rglob("*.png"))
+    assert "view 2" in result.stdout
+    assert str(out.relative_to(folder) / "report.html") in result.stdout
+    config = json.loads((out / "episode.json").read_text())["config"]
+    assert config["planner"]["search"]["type"] == "DiscreteSearch"
+
+
+def test_the_same_command_continues_with_more_views(finished, cache):
+    folder, _ = finished
+    out = folder / "runs" / "demo-discrete"
+    before = {path.name: path.read_bytes() for path in out.glob("view_*.npz")}
+    result = run_command("demo", "--quick", "--views", "3", "--no-report", cwd=folder, cache=cache)
+    assert result.returncode == 0, result.stderr
+    assert (out / "view_02.npz").exists()
+    assert all((out / name).read_bytes() == content for name, content in before.items())
+
+
+@pytest.mark.parametrize("search", ["farthest", "random", "uncertainty"])
+def test_run_takes_a_mesh_and_each_baseline(search, tmp_path, cache):
+    trimesh.creation.torus(1.0, 0.4).export(tmp_path / "ring.ply")
+    arguments = ("run", "ring.ply", "--quick", "--views", "2", "--search", search, "--out", "mine", "--no-report")
+    result = run_command(*arguments, cwd=tmp_path, cache=cache)
+    assert result.returncode == 0, result.stderr
+    with np.load(tmp_path / "mine" / "view_01.npz") as view:
+        chosen = np.flatnonzero((view["candidate_positions"] == view["position"]).all(axis=1))
+        assert view["values"][chosen[0]] == view["values"].max() == view["value"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("run", "absent.obj"), ("absent.obj",)),
+        (("demo", "--views", "0"), ("0 views", "at least one")),
+        (("demo", "--first", "1,2"), ("'1,2'", "three numbers")),
+        (("demo", "--first", "0,0,0"), ("target",)),
+        (("demo", "--first", "0,0,9", "--noise", "-1"), ("-1", "negative")),
+        (("demo", "--first", "0,9,0,1"), ("three numbers",)),
+        (("demo", "--vews", "3"), ("--vews", "--views")),
+        (("demo", "--search", "best"), ("best", "discrete")),
+        (("demo", "--out", "occupied"), ("occupied", "other files")),
+        (("demo", "--device", "gpu"), ("gpu", "--device")),
+    ],
+)
+def test_bad_input_is_one_line_that_names_the_value_and_the_remedy(arguments, words, tmp_path, cache):
+    (tmp_path / "occupied").mkdir()
+    (tmp_path / "occupied" / "thesis.tex").write_text("mine")
+    result = run_command(*arguments, cwd=tmp_path, cache=cache)
+    if "gpu" in arguments and result.returncode == 0:
+        pytest.skip("this machine has a GPU")
+    assert result.returncode == 2
+    assert "Traceback" not in result.stderr
+    assert all(word in result.stderr for word in words), result.stderr
+
+
+def test_a_folder_of_another_configuration_is_refused(finished, cache):
+    folder, _ = finished
+    result = run_command("demo", "--quick", "--views", "2", "--seed", "1", cwd=folder, cache=cache)
+    assert result.returncode == 2
+    assert "another configuration" in result.stderr
+    assert "key" in result.stderr
+
+
+@pytest.mark.parametrize("command", [(), ("demo",), ("run",)])
+def test_help_names_every_option(command, tmp_path, cache):
+    result = run_command(*command, "--help", cwd=tmp_path, cache=cache)
+    assert result.returncode == 0
+    expected = ["demo", "run"] if not command else ["--task", "--search", "--views", "--first", "--seed", "--out"]
+    assert all(word in result.stdout for word in expected)

@@ -1,0 +1,31 @@
+"""The notebooks run from top to bottom, at small settings: their cell tagged `parameters` is replaced."""
+
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
+
+SMALL = {
+    "01_quickstart.ipynb": """
+num_samples, truncation, lengthscale = 4, 20, 0.015
+resolution, pixels, num_candidates, views = 40, 20, 24, 2
+""",
+}
+
+
+def test_every_notebook_is_run():
+    assert {path.name for path in NOTEBOOKS.glob("*.ipynb")} == set(SMALL)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_notebook_runs(name, tmp_path):
+    notebook = nbformat.read(NOTEBOOKS / name, as_version=4)
+    (cell,) = (cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", []))
+    cell.source = SMALL[name]
+    resources = {"metadata": {"path": str(tmp_path)}}
+    NotebookClient(notebook, timeout=600, kernel_name="python3", resources=resources).execute()
+    printed = [output["text"] for cell in notebook.cells for output in cell.get("outputs", []) if "text" in output]
+    assert any("next view from" in text for text in printed)

@@ -1,0 +1,257 @@
+"""Episodes on disk: descriptions, exact round trips, PLY by two readers, kill and resume."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from plyfile import PlyData
+
+from jaxnbv.camera import Camera, look_at
+from jaxnbv.episode import simulate
+from jaxnbv.planner import Planner
+from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
+from jaxnbv.scanning.sdf import Capsule, Sphere
+from jaxnbv.search import DiscreteSearch, FarthestView
+from jaxnbv.storage import EpisodeFolder, describe
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Coverage
+
+ROOT = Path(__file__).resolve().parents[1]
+SCENE = SDFSurface(Sphere(0.7) | Capsule([0.2, 0.3, -0.4], [0.5, 0.6, 0.9], 0.3))
+FIRST = look_at((0.8, 0.9, 2.2))
+KEY = jax.random.key(0)
+
+
+def planner_of(search=None, lengthscale=0.05, **changes):
+    search = DiscreteSearch(num_candidates=12) if search is None else search
+    settings = {"num_samples": 3, "grid": Grid(24), "capacity": 128, "max_views": 6, **changes}
+    model, camera = GeometricSPSR(truncation=8, lengthscale=lengthscale), Camera(height=8, width=8)
+    return Planner(model, camera, Coverage(), search, **settings)
+
+
+BASE = {"planner": planner_of(), "scene": SCENE, "noise": SensorNoise(), "first": FIRST, "key": KEY}
+
+
+def run(folder, views=3, **changes):
+    return simulate(**(BASE | changes), views=views, folder=folder, progress=False)
+
+
+def contents(folder):
+    return {file.name: file.read_bytes() for file in sorted(Path(folder).iterdir())}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "five"
+    return run(folder, views=5), folder
+
+
+CHANGES = {
+    "model": {"planner": planner_of(lengthscale=0.051)},
+    "search": {"planner": planner_of(FarthestView(num_candidates=12))},
+    "candidates": {"planner": planner_of(DiscreteSearch(num_candidates=13))},
+    "radius": {"planner": planner_of(DiscreteSearch(num_candidates=12, radius=2.6))},
+    "samples": {"planner": planner_of(num_samples=4)},
+    "grid": {"planner": planner_of(grid=Grid(25))},
+    "capacity": {"planner": planner_of(capacity=129)},
+    "scene": {"scene": SDFSurface(Sphere(0.7))},
+    "one number of the scene": {"scene": SDFSurface(Sphere(0.7) | Capsule([0.2, 0.3, -0.4], [0.5, 0.6, 0.9], 0.31))},
+    "noise": {"noise": SensorNoise(points=0.02)},
+    "first": {"first": look_at((0.8, 0.9, 2.3))},
+    "key": {"key": jax.random.key(1)},
+    "kind of key": {"key": jax.random.key(0, impl="rbg")},
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_description_tells_every_setting_apart(name):
+    assert json.dumps(describe(BASE)) == json.dumps(describe(dict(BASE)))
+    assert json.dumps(describe(BASE | CHANGES[name])) != json.dumps(describe(BASE))
+
+
+def test_a_description_tells_large_arrays_and_functions_apart():
+    large = np.zeros((40, 3))
+    other = large.copy()
+    other[17, 1] = 1e-300
+    assert describe(large) == describe(large.copy())
+    assert describe(large) != describe(other)
+    assert describe(large) != describe(large.reshape(3, 40))
+    assert describe(jnp.sin) != describe(jnp.cos)
+    assert json.loads(json.dumps(describe({"a": (1, 2.5, None, "x", large)})))["a"][:4] == [1, 2.5, None, "x"]
+
+
+def test_views_come_back_with_the_same_bits(finished):
+    episode, folder = finished
+    config = describe({"planner": episode.planner, "scene": SCENE, "noise": SensorNoise(), "first": FIRST, "key": KEY})
+    views = EpisodeFolder(folder, config).read_views()
+    assert len(views) == 5
+    assert views[0][2] is None
+    for read, view in zip(views, episode.views, strict=True):
+        written = (view.pose, view.scan, view.proposal)
+        assert jax.tree.structure(read) == jax.tree.structure(written)
+        for a, b in zip(jax.tree.leaves(read), jax.tree.leaves(written), strict=True):
+            assert a.dtype == b.dtype
+            np.testing.assert_array_equal(a, b)
+
+
+def test_the_record_says_what_made_it(finished):
+    record = json.loads((finished[1] / "episode.json").read_text())
+    assert set(record["config"]) == {"planner", "scene", "noise", "first", "key"}
+    assert record["config"]["planner"]["num_samples"] == 3
+    assert record["versions"]["jax"] == jax.__version__
+    np.testing.assert_allclose(record["config"]["first"]["position"], [0.8, 0.9, 2.2], atol=1e-6)
+
+
+def test_the_cloud_reads_back_in_other_programs(finished):
+    episode, folder = finished
+    points, normals = episode.cloud.to_numpy()
+    vertices = PlyData.read(folder / "cloud.ply")["vertex"]
+    np.testing.assert_array_equal(np.stack([vertices[name] for name in ("x", "y", "z")], axis=1), points)
+    np.testing.assert_array_equal(np.stack([vertices[name] for name in ("nx", "ny", "nz")], axis=1), normals)
+    np.testing.assert_array_equal(np.asarray(trimesh.load(folder / "cloud.ply").vertices, np.float32), points)
+    assert len(points) == int(episode.cloud.count) > 64
+
+
+def test_saving_afterwards_writes_what_a_run_into_the_folder_writes(finished, tmp_path):
+    episode, folder = finished
+    episode.save(tmp_path / "saved")
+    assert contents(tmp_path / "saved") == contents(folder)
+    assert set(contents(folder)) == {"episode.json", "cloud.ply", *(f"view_0{i}.npz" for i in range(5))}
+
+
+def test_three_views_continued_to_five_equal_five(finished, tmp_path):
+    _, folder = finished
+    run(tmp_path / "run", views=3)
+    assert len(contents(tmp_path / "run")) == 5
+    episode = run(tmp_path / "run", views=5)
+    assert contents(tmp_path / "run") == contents(folder)
+    for a, b in zip(jax.tree.leaves(episode.views), jax.tree.leaves(finished[0].views), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_finished_run_is_read_not_computed(finished, monkeypatch):
+    before = contents(finished[1])
+    monkeypatch.setattr(Planner, "choose", lambda *_: pytest.fail("a finished view was chosen again"))
+    monkeypatch.setattr("jaxnbv.episode.observe_scene", lambda *_: pytest.fail("a finished view was scanned again"))
+    run(finished[1], views=5)
+    assert contents(finished[1]) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"planner": planner_of(num_samples=4)}, r"planner\.num_samples: 3 there, 4 now"),
+        ({"planner": planner_of(FarthestView(num_candidates=12))}, r"planner\.search\.type: DiscreteSearch there"),
+        ({"noise": SensorNoise(0.03)}, r"noise\.points: 0\.01 there, 0\.03 now"),
+        ({"key": jax.random.key(9)}, r"key\.data: \[0, 0\] there, \[0, 9\] now"),
+        ({"first": look_at((0.8, 0.9, 2.3))}, r"first\.position"),
+    ],
+)
+def test_a_folder_of_another_configuration_is_refused(finished, change, named):
+    before = contents(finished[1])
+    with pytest.raises(ValueError, match=r"another configuration.*" + named + r".*Choose another folder"):
+        run(finished[1], **change)
+    assert contents(finished[1]) == before
+
+
+def test_a_folder_with_other_files_is_refused(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(ValueError, match=r"holds other files \(thesis\.tex\): choose an empty folder"):
+        run(tmp_path)
+    assert contents(tmp_path) == {"thesis.tex": b"years of work"}
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "7", '{"versions": {}}', "\x80\xff"])
+def test_a_corrupt_record_is_refused(tmp_path, text):
+    (tmp_path / "episode.json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(ValueError, match=r"episode\.json is not an episode's record.*choose another output folder"):
+        run(tmp_path)
+
+
+def test_leftover_parts_do_not_matter(finished, tmp_path):
+    for name in ("episode.json.partial", "view_00.npz.partial", "view_01.npz.partial"):
+        (tmp_path / name).write_bytes(b"half a fi")
+    run(tmp_path, views=5)
+    assert contents(tmp_path) == contents(finished[1])
+
+
+SCRIPT = """
+import os, sys, time
+from pathlib import Path
+import jaxnbv.episode, jaxnbv.storage
+from test_storage import run
+
+folder, stage, view = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
+
+def stall_at(module, name, moment):
+    original, calls = getattr(module, name), [0]
+    def replacement(*arguments):
+        calls[0] += 1
+        if moment(calls[0]):
+            folder.with_suffix(".stalled").touch()
+            time.sleep(600)
+        return original(*arguments)
+    setattr(module, name, replacement)
+
+done = len(list(folder.glob("view_*.npz")))
+if stage == "scan":
+    stall_at(jaxnbv.episode, "observe_scene", lambda call: done + call == view + 1)
+if stage == "write":
+    record = 0 if (folder / "episode.json").exists() else 1
+    stall_at(jaxnbv.storage.os, "fsync", lambda call: done + call == view + 1 + record)
+run(folder, views=5)
+"""
+
+
+def start(folder, stage="none", view=0):
+    command = [sys.executable, "-c", SCRIPT, str(folder), stage, str(view)]
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")]),
+        "JAX_COMPILATION_CACHE_DIR": str(folder.with_suffix(".cache")),
+        "JAX_PERSISTENT_COMPILATION_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE)
+
+
+def kill_once(process, reached):
+    """SIGKILL as soon as `reached()`; the process must still have been running."""
+    deadline = time.monotonic() + 300
+    while not reached():
+        if process.poll() is not None:
+            pytest.fail(f"it ended before it could be killed: {process.stderr.read().decode()}")
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    process.kill()
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+
+
+def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_files(finished, tmp_path):
+    """Once when the first view appears, once half way through writing the second, once while the third is scanned."""
+    folder, stalled = tmp_path / "killed", tmp_path / "killed.stalled"
+    kill_once(start(folder), (folder / "view_00.npz").exists)
+    assert "cloud.ply" not in contents(folder)
+
+    kill_once(start(folder, "write", 1), stalled.exists)
+    assert (folder / "view_01.npz.partial").exists()
+    assert not (folder / "view_01.npz").exists()
+    stalled.unlink()
+
+    kill_once(start(folder, "scan", 2), stalled.exists)
+    assert (folder / "view_01.npz").exists()
+    assert not (folder / "view_02.npz").exists()
+
+    process = start(folder)
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors.decode()
+    assert contents(folder) == contents(finished[1])

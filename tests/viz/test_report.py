@@ -1,0 +1,279 @@
+"""The report: self-contained, complete, true to the episode; and what its pictures are made of."""
+
+import json
+import re
+from html.parser import HTMLParser
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+import jaxnbv as nbv
+from jaxnbv.datasets.demo import demo_object
+from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.search import Search
+from jaxnbv.viz import report_data, write_figures, write_report
+from jaxnbv.viz.data import choice_of, mean_surface
+from jaxnbv.viz.render import frustum
+from jaxnbv.viz.sphere import from_mollweide, mollweide, smooth_map
+from jaxnbv.viz.style import log_ticks, round_range
+from jaxnbv.viz.words import number, quantity
+
+CAMERA = nbv.Camera(height=24, width=24)
+
+
+def small_planner(search: Search, **changes) -> nbv.Planner:
+    options = {
+        "model": nbv.GeometricSPSR(truncation=16, lengthscale=0.02),
+        "camera": CAMERA,
+        "acquisition": nbv.Coverage(),
+        "num_samples": 4,
+        "capacity": 2048,
+        "grid": nbv.Grid(40),
+    }
+    return nbv.Planner(search=search, **(options | changes))
+
+
+def run(search, views=3, scene=None, **changes):
+    scene = demo_object() if scene is None else scene
+    first = nbv.look_at((0.8, 0.9, 2.2))
+    return nbv.simulate(small_planner(search, **changes), scene, first, views, jax.random.key(0), progress=False)
+
+
+@pytest.fixture(scope="module")
+def episode():
+    return run(nbv.DiscreteSearch(30))
+
+
+@pytest.fixture(scope="module")
+def report(episode, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    return write_report(episode, folder, title="a <mug> & saucer", progress=False)
+
+
+@pytest.fixture(scope="module")
+def data(episode):
+    return report_data(episode, progress=False)
+
+
+class Page(HTMLParser):
+    def __init__(self, text):
+        super().__init__()
+        self.loads, self.tags, self.scripts, self._script = [], [], [], False
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        self._script = tag == "script"
+        self.loads += [value for name, value in attributes if name in ("src", "href", "srcset", "action", "data")]
+
+    def handle_data(self, text):
+        if self._script:
+            self.scripts.append(text)
+            self._script = False
+
+
+def page_data(path):
+    scripts = Page(path.read_text(encoding="utf-8")).scripts
+    return json.loads(next(text for text in scripts if text.startswith('{"views"')))
+
+
+def test_the_page_loads_nothing_from_elsewhere(report):
+    text = report.read_text(encoding="utf-8")
+    page = Page(text)
+    assert all(load.startswith("data:") for load in page.loads)
+    assert "link" in page.tags
+    assert page.tags.count("script") == 3
+    style = text[text.index("<style>") : text.index("</style>")]
+    assert "@import" not in style
+    assert "url(" not in style
+    assert "mathjax" not in " ".join(page.loads).lower()
+    assert report.stat().st_size < 12e6
+
+
+def test_the_page_holds_every_view_and_escapes_its_title(report, episode):
+    text = report.read_text(encoding="utf-8")
+    assert "a &lt;mug&gt; &amp; saucer" in text
+    assert "<mug>" not in text
+    assert not re.search(r"@@[A-Z]+@@", text)
+    data = page_data(report)
+    assert len(data["views"]) == len(episode.views) == 3
+    for i, (shown, view) in enumerate(zip(data["views"], episode.views, strict=True), start=1):
+        assert shown["sentence"].startswith(f"View {i} ")
+        assert shown["sentence"] in text.replace("&#x27;", "'")
+        new = view.scan.to_numpy()[0]
+        assert 0 < len(shown["new"]) <= len(new)
+        nearest = np.linalg.norm(np.array(shown["new"])[:, None] - new[None], axis=-1).min(axis=1)
+        assert nearest.max() < 1e-3
+        np.testing.assert_allclose(shown["frustum"][0][0], view.pose.position, atol=1e-4)
+    assert data["views"][0]["choice"] is None
+    for shown, view in zip(data["views"][1:], episode.views[1:], strict=True):
+        values = np.array([np.nan if v is None else v for v in shown["choice"]["values"]])
+        assert shown["choice"]["value"] == pytest.approx(float(view.proposal.value))
+        assert np.nanmax(values) == pytest.approx(float(view.proposal.value))
+        assert np.isnan(values).sum() == np.isneginf(np.asarray(view.proposal.values)).sum()
+        assert shown["choice"]["image"].startswith("data:image/png;base64,")
+
+
+def test_figures_are_pictures_of_the_stated_size(report):
+    sizes = {"view_01": (1680, 860), "view_02": (1680, 860), "view_03": (1680, 860), "coverage": (1440, 580)}
+    folder = report.parent / "figures"
+    assert sorted(file.name for file in folder.iterdir()) == sorted([*(f"{n}.png" for n in sizes), "overview.png"])
+    for name, size in sizes.items():
+        with Image.open(folder / f"{name}.png") as image:
+            assert image.size == size
+            assert np.asarray(image.convert("L")).std() > 5
+    with Image.open(folder / "overview.png") as image:
+        assert image.width == 3 * 360
+        assert image.convert("RGB").getpixel((2, 2)) == (255, 255, 255)
+    assert (folder / "overview.png").stat().st_size < 300_000
+
+
+@pytest.mark.parametrize(
+    ("search", "label", "words"),
+    [
+        (nbv.FarthestView(30), "distance to the nearest camera (scene units)", "scene units, was the highest of 30"),
+        (nbv.RandomView(30), "lot drawn (uniform on [0, 1))", "drawn at random from 30 open candidates"),
+        (
+            nbv.UncertaintyView(30),
+            "uncertain length of the principal ray (scene units)",
+            "scene units, was the highest",
+        ),
+    ],
+)
+def test_baselines_are_labelled_in_their_own_units(search, label, words):
+    data = report_data(run(search, views=2), progress=False)
+    assert data.quantity.label == label
+    assert words in data.views[1].sentence
+    assert "coverage gain" not in data.views[1].sentence
+
+
+def test_other_scores_keep_their_name():
+    utility = nbv.ExpectedUtilityImprovement(lambda cloud: jnp.sum(cloud.mask) * 1.0)
+    assert quantity(nbv.DiscreteSearch(), utility).label == "expected utility improvement"
+
+
+def test_the_sentence_tells_the_numbers_of_the_step(episode, data):
+    view, shown = episode.views[1], data.views[1]
+    values = np.sort(np.asarray(view.proposal.values, np.float64))[::-1]
+    values = values[np.isfinite(values)]
+    assert f"the highest of {len(values)} open candidates" in shown.sentence
+    assert f"{number(values[0] / np.median(values))} times the median" in shown.sentence
+    assert f"added {int(view.scan.count):,} points" in shown.sentence
+    before, after = (100 * data.views[i].coverage for i in (0, 1))
+    assert f"coverage went from {before:.0f} % to {after:.0f} %" in shown.sentence
+    assert shown.choice.rank == 1
+
+
+def test_a_scene_without_truth_counts_points(tmp_path):
+    grid = nbv.Grid(40)
+    distance = np.linalg.norm(np.stack(np.meshgrid(*[grid.axis] * 3, indexing="ij")), axis=0) - 1.0
+    scene = nbv.GridSurface.from_values(distance, 0.0, grid)
+    lone = run(nbv.RandomView(30), views=1, scene=scene)
+    path = write_report(lone, tmp_path, progress=False)
+    assert page_data(path)["progress"] == {"label": "points kept", "values": [float(lone.cloud.count)]}
+    truth = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    assert report_data(lone, truth, progress=False).views[0].coverage in (0.0, 0.5, 1.0)
+
+
+class NoisySphere(nbv.Fields):
+    radii: jax.Array
+
+    def __call__(self, x):
+        return (jnp.linalg.norm(x, axis=-1) - self.radii[:, None]).astype(x.dtype)
+
+
+class SpherePosterior(nbv.SurfacePosterior):
+    level: jax.Array
+
+    def sample(self, key, num_samples):
+        return NoisySphere(0.9 + 0.03 * jax.random.normal(key, (num_samples,)))
+
+
+class SphereModel(nbv.SurfaceModel):
+    def condition(self, cloud):
+        return SpherePosterior(jnp.asarray(0.0))
+
+
+def test_any_posterior_has_a_surface_with_a_standard_deviation():
+    # f = |x| - r with r ~ N(0.9, 0.03^2): the surface is a sphere known to 0.03 all over, estimated from 64 samples.
+    planner = eqx.tree_at(lambda p: p.model, small_planner(nbv.RandomView()), SphereModel())
+    cloud = nbv.PointCloud.from_arrays([[0.9, 0.0, 0.0]], [[1.0, 0.0, 0.0]])
+    surface = mean_surface(planner, cloud)
+    radius = np.linalg.norm(surface.vertices, axis=1)
+    np.testing.assert_allclose(radius, 0.9, atol=4 * 0.03 / 8 + 0.005)
+    np.testing.assert_allclose(surface.deviation, 0.03, rtol=4 / np.sqrt(2 * 64))
+    np.testing.assert_allclose(np.sum(surface.normals * surface.vertices, axis=1) / radius, 1.0, atol=1e-2)
+
+
+def test_a_mean_without_a_surface_is_drawn_without_one(tmp_path, episode, data):
+    planner = eqx.tree_at(lambda p: p.model, episode.planner, SphereModel())
+    far = eqx.tree_at(lambda p: p.grid, planner, nbv.Grid(40, 0.2))
+    assert mean_surface(far, episode.cloud) is None
+    bare = eqx.tree_at(lambda d: [v.surface for v in d.views], data, [None] * 3, is_leaf=lambda x: x is None)
+    assert all(path.stat().st_size > 5000 for path in write_figures(bare, CAMERA, tmp_path, progress=False))
+
+
+def test_what_was_seen_is_known_better_than_what_was_not():
+    scene = nbv.SDFSurface(Sphere(0.9))
+    view = run(nbv.RandomView(30), views=1, scene=scene)
+    surface = mean_surface(view.planner, view.cloud)
+    distance = np.linalg.norm(surface.vertices[:, None] - view.cloud.to_numpy()[0][None, ::4], axis=-1).min(axis=1)
+    assert np.median(surface.deviation[distance < 0.1]) < 0.3 * np.median(surface.deviation[distance > 0.6])
+
+
+def test_excluded_candidates_have_no_value():
+    poses = nbv.look_at(nbv.fibonacci_sphere(5, 2.5))
+    values = jnp.array([3.0, -jnp.inf, 5.0, 1.0, 4.0])
+    choice = choice_of(nbv.Proposal(poses[0], values[0], poses, values))
+    np.testing.assert_array_equal(choice.visited, [False, True, False, False, False])
+    np.testing.assert_array_equal(choice.open_values, [5.0, 4.0, 3.0, 1.0])
+    assert choice.rank == 3
+    np.testing.assert_allclose(choice.directions, np.asarray(poses.position) / 2.5, atol=1e-6)
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.lists(st.tuples(*[st.floats(-1, 1)] * 3), min_size=1, max_size=5))
+def test_the_map_of_the_sphere_can_be_read_back(vectors):
+    vectors = np.array(vectors) + np.array([0.0, 0.0, 1e-3])
+    vectors = vectors[np.linalg.norm(vectors, axis=1) > 1e-6]
+    unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    back, inside = from_mollweide(mollweide(unit) * (1 - 1e-9))
+    assert inside.all()
+    np.testing.assert_allclose(back, unit, atol=2e-4)
+
+
+def test_the_map_keeps_areas_and_values():
+    # Equal areas: of points uniform on the sphere, the share in a band of the map is the band's share of the ellipse.
+    points = np.asarray(nbv.fibonacci_sphere(4000), dtype=np.float64)
+    x, y = mollweide(points).T
+    assert np.mean((x / 2 / np.sqrt(2)) ** 2 + (y / np.sqrt(2)) ** 2 <= 0.25) == pytest.approx(0.25, abs=0.01)
+    some = points[::40]
+    values = some[:, 1] + some[:, 0] * some[:, 2]
+    values[3] = np.nan
+    smooth = smooth_map(some, values, 100)
+    assert smooth.shape == (100, 200)
+    column, row = ((mollweide(some) * [1, -1] / [2 * np.sqrt(2), np.sqrt(2)] + 1) / 2 * [200, 100]).astype(int).T
+    known = ~np.isnan(values) & ~np.isnan(smooth[np.minimum(row, 99), np.minimum(column, 199)])
+    assert known.sum() > 90
+    np.testing.assert_allclose(smooth[row[known], column[known]], values[known], atol=0.1)
+
+
+def test_a_frustum_is_what_the_camera_sees():
+    pose = nbv.look_at((1.0, 0.5, 2.0))
+    edges = frustum(pose, CAMERA, 1.0)
+    assert edges.shape == (8, 2, 3)
+    local = (edges[:4, 1] - np.asarray(pose.position)) @ np.asarray(pose.rotation)
+    np.testing.assert_allclose(local[:, 2], 1.0, atol=1e-6)
+    np.testing.assert_allclose(np.abs(local[:, :2]), np.tan(CAMERA.fov / 2), atol=1e-6)
+
+
+def test_ranges_and_ticks_are_round():
+    assert round_range(0.0013, 0.088) == pytest.approx((0.001, 0.1))
+    np.testing.assert_allclose(log_ticks(0.001, 0.1), [0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1])
+    assert [number(value) for value in (0.001234, 186.59, 1234.5, -2.0)] == ["0.00123", "187", "1,234", "−2"]
