@@ -77,7 +77,7 @@ def simulate(
     a run that was interrupted goes on after the last of them and ends with the same bits as one that was not.
 
     **Raises:** `ValueError` if `views` < 1 or more than the planner has room for, if the first view sees nothing, or
-    if the folder belongs to another configuration.
+    if the folder belongs to another configuration or holds more views already.
     """
     require(views >= 1, f"asked for {views} views; ask for at least one")
     require(
@@ -93,7 +93,12 @@ def simulate(
         state = planner.init(seen, pose) if state is None else planner.observe(state, pose, seen)
         finished.append(View(pose, seen, state.cloud, proposal))
 
-    for pose, seen, proposal in (store.read_views() if store else [])[:views]:
+    done = store.read_views() if store else []
+    require(
+        len(done) <= views,
+        f"asked for {views} views but {folder} already holds {len(done)}: ask for more, or choose another folder",
+    )
+    for pose, seen, proposal in done:
         finish(pose, seen, proposal)
 
     stages = ("sampling surfaces", "searching", "scanning")

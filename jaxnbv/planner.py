@@ -83,10 +83,15 @@ class Planner(eqx.Module):
     def choose(self, state: State, surfaces: GridSurface | None, key: PRNGKeyArray) -> Proposal:
         """The second half of `propose`: the search, given the step's samples (any that a model of your own drew).
 
-        **Raises:** `ValueError` if every candidate has been visited.
+        **Raises:** `ValueError` if every candidate has been visited, or a score is NaN.
         """
         proposal = _choose(self, state, surfaces, key)
         if not is_traced(proposal):
+            require(
+                not bool(jnp.isnan(proposal.value)),
+                "the acquisition is not a number (NaN) for a candidate: the score must be finite for every scan, "
+                "one that sees nothing included",
+            )
             require(
                 bool(proposal.value > -jnp.inf),
                 f"all {proposal.values.shape[0]} candidates have been visited: give the search more candidates",

@@ -10,8 +10,10 @@ import hashlib
 import importlib.metadata
 import json
 import os
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from types import CodeType, FunctionType
 from typing import Any
 
 import jax
@@ -31,7 +33,7 @@ def describe(thing: Any) -> Any:
     """A JSON description by which two configurations can be told apart.
 
     Modules and dataclasses become their fields, small arrays their values, large ones a hash of their bytes, functions
-    and other objects their names.
+    their names and a hash of their code, other objects their types' names.
     """
     if dataclasses.is_dataclass(thing) and not isinstance(thing, type):
         fields = {field.name: describe(getattr(thing, field.name, None)) for field in dataclasses.fields(thing)}
@@ -50,6 +52,11 @@ def describe(thing: Any) -> Any:
         return [describe(value) for value in thing]
     if thing is None or isinstance(thing, bool | int | float | str):
         return thing
+    if isinstance(thing, FunctionType):
+        code = thing.__code__
+        constants = [value for value in code.co_consts if not isinstance(value, CodeType)]
+        digest = hashlib.sha256(repr((code.co_code, code.co_names, constants)).encode()).hexdigest()
+        return {"function": thing.__qualname__, "sha256": digest}
     return getattr(thing, "__qualname__", type(thing).__qualname__)
 
 
@@ -94,8 +101,11 @@ class EpisodeFolder:
         """Pose, scan and proposal of every finished view, up to the first that is missing."""
         views: list[tuple[Pose, PointCloud, Proposal | None]] = []
         while (file := self._view_file(len(views))).exists():
-            with np.load(file, allow_pickle=False) as saved:
-                data = {name: jnp.asarray(saved[name]) for name in saved.files}
+            try:
+                with np.load(file, allow_pickle=False) as saved:
+                    data = {name: jnp.asarray(saved[name]) for name in saved.files}
+            except (ValueError, OSError, zipfile.BadZipFile) as error:
+                raise InputError(f"{file} is damaged ({error}): delete it, and its view is scanned again") from error
             pose = Pose(data["rotation"], data["position"])
             scan = PointCloud(data["points"], data["normals"], data["mask"])
             proposal = None

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.camera import Camera, Pose, look_at
 from jaxnbv.cloud import PointCloud, concatenate, farthest_point_subsample
 from jaxnbv.episode import simulate
@@ -182,3 +183,11 @@ def test_all_candidates_visited_is_refused(kind):
 def test_numbers_below_one_are_refused(name, value):
     with pytest.raises(ValueError, match=f"{name} is {value}"):
         planner_of(SEARCHES["FarthestView"], **{name: value})
+
+
+def test_a_score_that_is_not_a_number_is_named(state):
+    utility = ExpectedUtilityImprovement(lambda cloud: jnp.sum(cloud.points) * jnp.nan)
+    planner = planner_of(DiscreteSearch(num_candidates=12))
+    planner = Planner(planner.model, planner.camera, utility, planner.search, 3, planner.grid, 128)
+    with pytest.raises(ValueError, match="NaN"):
+        planner.propose(state, jax.random.key(0))

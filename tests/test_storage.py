@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -86,6 +87,7 @@ def test_a_description_tells_large_arrays_and_functions_apart():
     assert describe(large) != describe(other)
     assert describe(large) != describe(large.reshape(3, 40))
     assert describe(jnp.sin) != describe(jnp.cos)
+    assert describe(lambda x: x + 1) != describe(lambda x: x + 2)
     assert json.loads(json.dumps(describe({"a": (1, 2.5, None, "x", large)})))["a"][:4] == [1, 2.5, None, "x"]
 
 
@@ -255,3 +257,15 @@ def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_files(fini
     _, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors.decode()
     assert contents(folder) == contents(finished[1])
+
+
+def test_fewer_views_than_the_folder_holds_are_refused(finished):
+    with pytest.raises(ValueError, match=r"asked for 1 views but .* already holds 5"):
+        run(finished[1], views=1)
+
+
+def test_a_damaged_view_is_refused_by_name(finished, tmp_path):
+    folder = shutil.copytree(finished[1], tmp_path / "copy")
+    (folder / "view_01.npz").write_bytes((folder / "view_01.npz").read_bytes()[:100])
+    with pytest.raises(ValueError, match=r"view_01.npz is damaged .* delete it"):
+        run(folder, views=5)

@@ -18,6 +18,8 @@ _MAX_STRIDES = 512
 # Rays that are still under way go on by themselves once they are at most this fraction of all.
 _FEW = 1 / 8
 _CHORDS = 2
+# How far before a hit, along the ray, its normal is taken: above rounding, below any detail.
+_FRONT = 1e-5
 # Least sine of the angle between a ray and the surface for which the exact derivative of the hit is given.
 _GRAZING = 0.05
 
@@ -56,12 +58,15 @@ class SDFSurface(Surface):
         cosine = jax.lax.stop_gradient(cosine)
         bounded = jnp.where(cosine < 0, -1.0, 1.0) * jnp.maximum(jnp.abs(cosine), _GRAZING)
         points = origins + (depth - value / bounded)[:, None] * directions
+        # Just in front of the surface: on it a solid's formula may stand at the zero between two of its cases, and
+        # rounding may take the slope of neither.
+        front = points - _FRONT * directions
         # Forward mode: the slopes fuse into one pass over the points, which the scatters of reverse mode break up.
         axes = (jnp.broadcast_to(axis, points.shape) for axis in jnp.eye(3, dtype=points.dtype))
-        gradient = jnp.stack([jax.jvp(self.sdf, (points,), (axis,))[1] for axis in axes], axis=-1)
-        length = jnp.linalg.norm(jnp.where(mask[:, None], gradient, 1.0), axis=-1, keepdims=True)
+        gradient = jnp.stack([jax.jvp(self.sdf, (front,), (axis,))[1] for axis in axes], axis=-1)
+        gradient = jnp.where(jnp.any(gradient != 0, axis=-1, keepdims=True), gradient, -directions)
         facing = -jnp.sign(jnp.sum(gradient * directions, axis=-1, keepdims=True))
-        normals = jnp.where(facing == 0, 1.0, facing) * gradient / length
+        normals = jnp.where(facing == 0, 1.0, facing) * gradient / jnp.linalg.norm(gradient, axis=-1, keepdims=True)
         return Hits(jnp.where(mask[:, None], points, 0.0), jnp.where(mask[:, None], normals, 0.0), mask)
 
 

@@ -104,10 +104,11 @@ def test_normals_of_the_sphere_are_radial_and_turned_to_the_sensor():
     o, d = some_rays(1000)
     outer = SDFSurface(Sphere(0.9)).trace(o, d)
     mask = np.asarray(outer.mask)
-    np.testing.assert_allclose(outer.normals[mask], outer.points[mask] / 0.9, atol=1e-5)
+    # A normal is taken 1e-5 before its hit, which turns a grazing ray's by as much.
+    np.testing.assert_allclose(outer.normals[mask], outer.points[mask] / 0.9, atol=2e-5)
     inner = SDFSurface(Sphere(0.9)).trace(np.zeros_like(o), d)
     assert bool(inner.mask.all())
-    np.testing.assert_allclose(inner.normals, -inner.points / 0.9, atol=1e-5)
+    np.testing.assert_allclose(inner.normals, -inner.points / 0.9, atol=2e-5)
 
 
 def test_image_that_misses_and_image_that_is_filled():
@@ -219,3 +220,12 @@ def test_no_recompilation_for_other_solids_of_the_same_make():
 def test_a_ball_of_no_size_is_refused():
     with pytest.raises(ValueError, match="must be positive"):
         SDFSurface(Sphere(1.0), 0.0)
+
+
+def test_normals_on_flat_faces_survive_compilation():
+    """On a face the slopes of a box come from one of two cases; rounding must not lose both (nor the unit length)."""
+    surface = SDFSurface(Sphere(0.7) | Box([0.4, 0.3, 0.8]).translate([0.3, 0.2, 0.0]))
+    seen = jax.jit(lambda pose: scan(surface, Camera(height=16, width=16), pose))(look_at(fibonacci_sphere(12, 2.5)))
+    assert int(seen.count.sum()) > 2000
+    lengths = np.linalg.norm(np.asarray(seen.normals)[np.asarray(seen.mask)], axis=1)
+    np.testing.assert_allclose(lengths, 1.0, atol=1e-5)

@@ -63,10 +63,11 @@ def test_posterior_is_calibrated():
     f with noise at 10 random points, conditioned on in float32, 31 samples. The rank of the true f among the samples
     is uniform on 0, ..., 31: chi-square over 8 bins of 150 expected, for f at two data points and at three unseen
     ones, two differences, and the minimum over all five points, which depend on the joint distribution."""
+    settings = SETTINGS | {"noise": 1.0}
     problems, count, samples, bins = 1200, 10, 31, 8
-    oracle, rng = WeightSpace(**SETTINGS), np.random.default_rng(3)
-    points = rng.uniform(-0.8, 0.8, (problems, count, 3))
-    inner, outer = (rng.uniform(-extent, extent, (problems, 3)) for extent in (0.8, 1.57))
+    oracle, rng = WeightSpace(**settings), np.random.default_rng(3)
+    points = rng.uniform(-0.5, 0.5, (problems, count, 3))
+    inner, outer = (rng.uniform(-extent, extent, (problems, 3)) for extent in (0.5, 1.57))
     x = np.stack([points[:, 0], points[:, 1], points[:, 2] + 0.2, inner, outer], axis=1)
     truth, normals = np.zeros((problems, 5)), np.zeros((problems, count, 3))
     for i in range(problems):
@@ -74,7 +75,7 @@ def test_posterior_is_calibrated():
         truth[i] = np.einsum("dnk,dk->n", oracle.function_features(x[i]), weights)
         normals[i] = oracle.normal_features(points[i]) @ weights.T
     normals += oracle.noise * rng.standard_normal(normals.shape)
-    model = GeometricSPSR(**SETTINGS)
+    model = GeometricSPSR(**settings)
 
     def sample(problem):
         cloud, x, key = problem
