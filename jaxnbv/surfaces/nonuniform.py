@@ -2,7 +2,7 @@
 
 A band-limited function is evaluated on a tensor grid that covers the scene, twice as fine as its highest frequency
 asks for, and interpolated from there with a Kaiser-Bessel window whose effect on each frequency is divided out first.
-The error is of the order of the rounding (1e-6 in float32, 1e-12 in float64). The adjoint is the transpose.
+The error is of the order of the rounding (some 1e-6 in float32, 1e-12 in float64). The adjoint is the transpose.
 (Dutt and Rokhlin 1993; Barnett, Magland and af Klinteberg 2019 on windows.)
 """
 
@@ -41,7 +41,7 @@ class NonuniformTransform(eqx.Module):
         offset = position[..., None] - first[..., None] - jnp.arange(window)
         radicand = jnp.maximum(1.0 - (2.0 * offset / window) ** 2, jnp.finfo(points.dtype).eps ** 2)
         self.start = (first + window // 2).astype(jnp.int32)
-        self.weights = jnp.i0(beta * jnp.sqrt(radicand)) / i0(beta)
+        self.weights = jnp.i0(beta * jnp.sqrt(radicand)) / float(i0(beta))
         self.truncation = truncation
 
     def evaluate(self, coefficients: Float[Array, "k a a a"]) -> Float[Array, "n k"]:
@@ -78,5 +78,5 @@ class NonuniformTransform(eqx.Module):
 
 def _window(truncation: int, dtype) -> tuple[int, float, float]:
     """Nodes under the window, its shape parameter, and the grid's spacing: two nodes for each that L asks for."""
-    nodes = 6 if dtype == jnp.float32 else 14
+    nodes = 8 if dtype == jnp.float32 else 14
     return nodes, 0.75 * math.pi * nodes, HALF_WIDTH / truncation

@@ -12,6 +12,7 @@ distribution.
 """
 
 import functools
+import math
 import warnings
 
 import equinox as eqx
@@ -70,7 +71,7 @@ class GeometricSPSR(SurfaceModel):
             return
         for name in ("lengthscale", "variance", "noise"):
             value = float(getattr(self, name))
-            require(value > 0, f"{name} is {value}; it must be positive")
+            require(0 < value < math.inf, f"{name} is {value}; it must be positive and finite")
         kept = float(self.kept_variance)
         if kept < 1 / 3:
             warnings.warn(
@@ -116,8 +117,10 @@ def _check_in_scene(cloud: PointCloud) -> None:
 @eqx.filter_jit
 def _condition(model: GeometricSPSR, cloud: PointCloud) -> "GeometricSPSRPosterior":
     spectrum = model.spectrum
+    # Whatever stands in rows that are not filled, NaN included, must not reach the products.
+    points, normals = (jnp.where(cloud.mask[:, None], rows, 0.0) for rows in (cloud.points, cloud.normals))
+    cloud = PointCloud(points, normals, cloud.mask)
     cholesky = _factorise(cloud, spectrum, model.noise)
-    normals = jnp.where(cloud.mask[:, None], cloud.normals, 0.0)
     weights = cho_solve((cholesky, True), normals)
     transform = NonuniformTransform(cloud.points, model.truncation)
     mean = _reconstruct(transform, weights, spectrum)
@@ -164,6 +167,7 @@ class GeometricSPSRPosterior(SurfacePosterior):
     """p(f | D) under `GeometricSPSR`, in closed form and as pathwise samples.
 
     - `level`: mean over the data of E f(x_j); the surface is where f equals it.
+    - `cloud`: D, with zeros in the rows that are not filled.
     - `cholesky`: lower factor of A.
     - `weights`: A^-1 n.
     - `mean_coefficients`: of E f, see `surfaces/trigonometric.py`.
@@ -208,7 +212,7 @@ class GeometricSPSRPosterior(SurfacePosterior):
     def log_marginal_likelihood(self) -> Float[Array, ""]:
         """log p(n_1, ..., n_N | x_1, ..., x_N), summed over the three components."""
         count = self.cloud.count
-        fit = jnp.sum(jnp.where(self.cloud.mask[:, None], self.cloud.normals, 0.0) * self.weights)
+        fit = jnp.sum(self.cloud.normals * self.weights)
         log_determinant = 2.0 * jnp.sum(jnp.log(jnp.diag(self.cholesky)))
         return -0.5 * (fit + 3.0 * log_determinant + 3.0 * count * jnp.log(2.0 * jnp.pi))
 
