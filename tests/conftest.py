@@ -11,6 +11,13 @@ install_import_hook("jaxnbv", "beartype.beartype")
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
+@pytest.fixture(scope="module", autouse=True)
+def compiled_programs_are_let_go():
+    """A whole run would hold gigabytes of them."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture
 def x64():
     """Double precision for one test, for comparison with float64 oracles."""
