@@ -7,6 +7,7 @@ from jaxnbv.camera import Camera as Camera
 from jaxnbv.camera import Pose as Pose
 from jaxnbv.camera import fibonacci_sphere as fibonacci_sphere
 from jaxnbv.camera import look_at as look_at
+from jaxnbv.checks import InputError as InputError
 from jaxnbv.cloud import Frame as Frame
 from jaxnbv.cloud import PointCloud as PointCloud
 from jaxnbv.cloud import concatenate as concatenate
@@ -18,6 +19,7 @@ from jaxnbv.planner import Planner as Planner
 from jaxnbv.planner import State as State
 from jaxnbv.scanning import Grid as Grid
 from jaxnbv.scanning import GridSurface as GridSurface
+from jaxnbv.scanning import Hits as Hits
 from jaxnbv.scanning import SDFSurface as SDFSurface
 from jaxnbv.scanning import SensorNoise as SensorNoise
 from jaxnbv.scanning import Surface as Surface
@@ -28,6 +30,7 @@ from jaxnbv.scanning import scan as scan
 from jaxnbv.scanning import scan_samples as scan_samples
 from jaxnbv.search import DiscreteSearch as DiscreteSearch
 from jaxnbv.search import FarthestView as FarthestView
+from jaxnbv.search import Problem as Problem
 from jaxnbv.search import Proposal as Proposal
 from jaxnbv.search import RandomView as RandomView
 from jaxnbv.search import Search as Search

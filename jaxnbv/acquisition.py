@@ -23,11 +23,6 @@ from jaxnbv.scanning import GridSurface, scan
 class Score(eqx.Module):
     """What one imagined scan is worth, given what has been seen."""
 
-    @property
-    @abstractmethod
-    def differentiable(self) -> bool:
-        """Whether the value has a derivative in the scan's points and normals that is worth following."""
-
     @abstractmethod
     def context(self, cloud: PointCloud) -> Any:
         """Whatever depends on D alone; computed once a step."""
@@ -41,11 +36,9 @@ class ExpectedUtilityImprovement(Score):
     """max(0, u(D u scan) - u(D)) for any utility u(cloud): the paper's alpha^(u), once averaged over samples.
 
     - `utility`: a function from a `PointCloud` (rows, masked) to a scalar, made of JAX operations.
-    - `differentiable`: whether its gradient is worth following.
     """
 
     utility: Callable[[PointCloud], Float[Array, ""]]
-    differentiable: bool = eqx.field(static=True, default=True)
 
     def context(self, cloud: PointCloud) -> tuple[PointCloud, Float[Array, ""]]:
         """D and u(D)."""

@@ -21,14 +21,19 @@ class Pose(eqx.Module):
     A point p of the camera's frame lies at `rotation @ p + position` in the scene. The columns of `rotation` are the
     camera's right, down and forward axes in scene coordinates.
 
-    **Raises:** `ValueError` if the rotation is not orthonormal with determinant +1 (tolerance 1e-3) or if an entry is
-    not finite; under `jit` values are not known and are not checked.
+    **Raises:** `ValueError` for other shapes, if the rotation is not orthonormal with determinant +1 (tolerance 1e-3),
+    or if an entry is not finite; under `jit` values are not known and only shapes are checked.
     """
 
     rotation: Float[Array, "*batch 3 3"]
     position: Float[Array, "*batch 3"]
 
     def __init__(self, rotation: Float[AnyArray, "*batch 3 3"], position: Float[AnyArray, "*batch 3"]):
+        shapes = jnp.shape(rotation), jnp.shape(position)
+        require(
+            shapes[0][-2:] == (3, 3) and shapes[1][-1:] == (3,) and shapes[0][:-2] == shapes[1][:-1],
+            f"a pose needs a rotation (..., 3, 3) and a position (..., 3), got {shapes[0]} and {shapes[1]}",
+        )
         if not is_traced(rotation, position):
             _check_rigid(np.asarray(rotation), np.asarray(position))
         self.rotation = jnp.asarray(rotation)
@@ -41,7 +46,7 @@ class Pose(eqx.Module):
 
     def to_scene(self, points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
         """Points of the camera's frame in scene coordinates (a single pose)."""
-        return points @ self.rotation.T + self.position
+        return jnp.matmul(points, self.rotation.T, precision="highest") + self.position
 
     def __getitem__(self, index) -> "Pose":
         """The pose, or poses, at an index of the leading axes."""
@@ -50,7 +55,7 @@ class Pose(eqx.Module):
 
 def _check_rigid(rotation: np.ndarray, position: np.ndarray) -> None:
     finite = np.isfinite(rotation).all() and np.isfinite(position).all()
-    require(finite, f"the pose has entries that are not finite: rotation {rotation}, position {position}")
+    require(finite, f"the pose has entries that are not finite: rotation {rotation}, position {position}; give numbers")
     error = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max(initial=0.0)
     determinant = np.linalg.det(rotation)
     require(
@@ -71,9 +76,14 @@ def look_at(
     the origin; `up` (3,), the direction that is up in the image. Looking along `up`, the image is turned so that the
     axis on which `up` is smallest takes its place.
 
-    **Raises:** `ValueError` if `position` equals `target`, or `up` is zero.
+    **Raises:** `ValueError` for other shapes, if `position` equals `target`, or `up` is zero.
     """
     position, target, up = (jnp.asarray(a, dtype=jnp.result_type(float)) for a in (position, target, up))
+    require(
+        position.shape[-1:] == target.shape == up.shape == (3,),
+        f"look_at needs a position (..., 3), a target (3,) and an up (3,), got {position.shape}, {target.shape}, "
+        f"{up.shape}",
+    )
     offset = target - position
     if not is_traced(position, target, up):
         require(bool(jnp.all(jnp.isfinite(offset))), f"look_at needs finite coordinates, got position {position}")
@@ -106,10 +116,11 @@ class Camera(eqx.Module):
 
     def __check_init__(self):
         require(0 < self.fov < math.pi, f"the field of view is {self.fov} rad; it must lie within (0, pi)")
-        require(
-            self.height >= 1 and self.width >= 1,
-            f"the camera has {self.height} x {self.width} pixels; it needs at least one",
-        )
+        for side in (self.height, self.width):
+            require(
+                isinstance(side, int) and side >= 1,
+                f"the camera has {self.height} x {self.width} pixels; it needs whole numbers, at least one",
+            )
 
     @property
     def num_rays(self) -> int:
@@ -132,7 +143,7 @@ class Camera(eqx.Module):
         """Origins and unit directions of all rays in the scene, for one pose or a batch."""
         directions = self.pixel_directions()
         directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
-        directions = jnp.einsum("...ij,rj->...ri", pose.rotation, directions)
+        directions = jnp.einsum("...ij,rj->...ri", pose.rotation, directions, precision="highest")
         return jnp.broadcast_to(pose.position[..., None, :], directions.shape), directions
 
 

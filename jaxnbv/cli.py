@@ -87,7 +87,9 @@ ViewsOption = Annotated[int, typer.Option(help="Views in all, the first one incl
 FirstOption = Annotated[
     str, typer.Option(help="Position of the first camera, x,y,z in scene units; it looks at the origin.")
 ]
-SeedOption = Annotated[int, typer.Option(help="Seed of the sensor's noise and of the posterior samples.")]
+SeedOption = Annotated[
+    int, typer.Option(min=0, max=2**63 - 1, help="Seed of the sensor's noise and of the posterior samples.")
+]
 OutOption = Annotated[Path | None, typer.Option(help="Output folder.  [default: runs/NAME-SEARCH]")]
 NoiseOption = Annotated[float, typer.Option(help="Standard deviation of the sensor's noise on points and normals.")]
 QuickOption = Annotated[
@@ -145,7 +147,7 @@ def _prepare(device: Device) -> None:
             jax.config.update("jax_default_device", jax.devices(device.value)[0])
         except RuntimeError as error:
             raise InputError(
-                f"no {device.value} that JAX can use ({error}): leave --device out, or install jaxnbv[cuda]"
+                f"no {device.value} that JAX can use ({error}): leave --device out, or install the extra named cuda"
             ) from error
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         jax.config.update("jax_compilation_cache_dir", str(platformdirs.user_cache_path("jaxnbv") / "xla"))

@@ -1,5 +1,6 @@
 """Oriented point clouds of fixed capacity, and the frame that carries the user's world into the scene."""
 
+import functools
 import warnings
 
 import equinox as eqx
@@ -106,7 +107,7 @@ class PointCloud(eqx.Module):
         mask = (valid & has_down & has_right & (length[..., 0] > 0)).reshape(-1)
         normals = (normals / jnp.where(length > 0, length, 1.0)).reshape(-1, 3)
         points = pose.to_scene(local.reshape(-1, 3))
-        normals = normals @ pose.rotation.T
+        normals = jnp.matmul(normals, pose.rotation.T, precision="highest")
         return cls(jnp.where(mask[:, None], points, 0.0), jnp.where(mask[:, None], normals, 0.0), mask)
 
     @property
@@ -152,6 +153,7 @@ def concatenate(first: PointCloud, second: PointCloud) -> PointCloud:
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=0), first, second)
 
 
+@functools.partial(jax.jit, static_argnames="count")
 def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
     """`count` points, each as far as can be from those chosen before it, in order of choice (Eldar et al. 1997).
 
@@ -161,7 +163,7 @@ def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
     **Raises:** `ValueError` if `count` < 1.
     """
     require(count >= 1, f"cannot subsample to {count} points; ask for at least one")
-    points = jax.lax.stop_gradient(cloud.points)
+    points = jax.lax.stop_gradient(jnp.where(cloud.mask[:, None], cloud.points, 0.0))
 
     def choose(i, carry):
         chosen, distance, latest = carry
@@ -213,6 +215,9 @@ class Frame(eqx.Module):
     scale: float = 1.0
     center: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
+    def __check_init__(self):
+        require(self.scale > 0, f"the frame's scale is {self.scale}; it must be positive")
+
     @classmethod
     def fit(cls, points: Float[AnyArray, "n 3"], longest_side: float = 2.5) -> "Frame":
         """The frame in which the points' bounding box is centred and its longest side is `longest_side`.
@@ -220,11 +225,11 @@ class Frame(eqx.Module):
         **Raises:** `ValueError` if there are no points, or they all coincide, or one is not finite.
         """
         points = np.asarray(points, dtype=np.float64)
-        require(len(points) > 0, "cannot fit a frame to no points")
+        require(len(points) > 0, "cannot fit a frame to no points: give the points of the object")
         require(bool(np.isfinite(points).all()), "cannot fit a frame to points that are not finite: drop them first")
         low, high = points.min(axis=0), points.max(axis=0)
         extent = float((high - low).max())
-        require(extent > 0, f"cannot fit a frame: all {len(points)} points lie at {low}")
+        require(extent > 0, f"cannot fit a frame: all {len(points)} points lie at {low}; give points that differ")
         x, y, z = (0.5 * (low + high)).tolist()
         return cls(longest_side / extent, (x, y, z))
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 from tqdm.auto import tqdm
 
@@ -49,9 +50,15 @@ class Episode(eqx.Module):
     def save(self, path: str | Path) -> None:
         """Write the episode to a folder (see `jaxnbv.storage` for its files); `simulate` can continue from it.
 
-        **Raises:** `ValueError` if the folder holds an episode of another configuration, or other files.
+        **Raises:** `ValueError` if the folder holds an episode of another configuration or a longer one, or other
+        files.
         """
         folder = EpisodeFolder(path, _config(self.planner, self.scene, self.noise, self.first, self.key))
+        held = len(folder.read_views())
+        require(
+            held <= len(self.views),
+            f"{path} already holds {held} views of this episode, which has {len(self.views)}: choose another folder",
+        )
         for index, view in enumerate(self.views):
             folder.write_view(index, view.pose, view.scan, view.proposal)
         folder.write_cloud(self.cloud)
@@ -83,6 +90,10 @@ def simulate(
     require(
         views <= planner.max_views,
         f"asked for {views} views but the planner has room for {planner.max_views}: raise Planner(max_views=...)",
+    )
+    require(
+        jnp.issubdtype(key.dtype, jax.dtypes.prng_key),
+        f"the key is a raw array of {key.dtype}: make it with jax.random.key(seed)",
     )
     store = None if folder is None else EpisodeFolder(folder, _config(planner, scene, noise, first, key))
     finished: list[View] = []

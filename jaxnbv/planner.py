@@ -54,12 +54,13 @@ class Planner(eqx.Module):
     def __check_init__(self):
         for name in ("num_samples", "capacity", "max_views"):
             value = getattr(self, name)
-            require(value >= 1, f"{name} is {value}; it must be at least 1")
+            require(isinstance(value, int) and value >= 1, f"{name} is {value}; it must be a whole number, at least 1")
 
     def init(self, cloud: PointCloud, pose: Pose | None = None) -> State:
         """The state after a first scan, in scene coordinates, taken from `pose` (None where it is not known).
 
-        **Raises:** `ValueError` if the cloud is empty, or a point is not finite or outside the scene's grid.
+        **Raises:** `ValueError` if the cloud is empty, if a point is not finite or outside the scene's grid, or a
+        normal not of unit length (to 1 %).
         """
         self._check_scan(cloud, first=True)
         poses = Pose(np.tile(np.eye(3), (self.max_views, 1, 1)), np.zeros((self.max_views, 3)))
@@ -68,8 +69,18 @@ class Planner(eqx.Module):
         return state if pose is None else _record(state, pose)
 
     def sample_surfaces(self, state: State, key: PRNGKeyArray) -> GridSurface:
-        """S samples of the surface given D, on the grid, along a leading axis."""
-        return _sample_surfaces(self, state.cloud, key)
+        """S samples of the surface given D, on the grid, along a leading axis.
+
+        **Raises:** `ValueError` if the model gives values that are not finite.
+        """
+        surfaces = _sample_surfaces(self, state.cloud, key)
+        if not is_traced(surfaces):
+            require(
+                bool(jnp.isfinite(surfaces.values).all()),
+                f"the samples of the surface given {int(state.cloud.count)} points are not finite: raise the model's "
+                "noise, or enable jax_enable_x64",
+            )
+        return surfaces
 
     def propose(self, state: State, key: PRNGKeyArray) -> Proposal:
         """Ask: the pose to take next, and what the search looked at.
@@ -103,8 +114,8 @@ class Planner(eqx.Module):
 
         Scans of one capacity share one compilation.
 
-        **Raises:** `ValueError` if a point is not finite or outside the scene's grid, or if the state has no room for
-        another view.
+        **Raises:** `ValueError` if a point is not finite or outside the scene's grid, a normal not of unit length (to
+        1 %), or if the state has no room for another view.
         """
         self._check_scan(scan, first=False)
         if not is_traced(state.num_views):
@@ -124,12 +135,19 @@ class Planner(eqx.Module):
         )
         finite = np.isfinite(points).all() and np.isfinite(normals).all()
         require(bool(finite), "the scan has points or normals that are not finite: drop or mask these rows")
+        lengths = np.linalg.norm(normals, axis=1)
+        wrong = lengths[np.abs(lengths - 1.0) > 0.01]
+        require(
+            wrong.size == 0,
+            f"the scan has {wrong.size} normals that are not of unit length, such as {wrong[:1]}: "
+            "build it with PointCloud.from_arrays, which normalises",
+        )
         furthest = float(np.abs(points).max(initial=0.0))
         limit = min(self.grid.half_extent, 0.5 * np.pi)
         require(
             furthest <= limit,
             f"a scanned point has a coordinate of {furthest:.4g}, outside the scene's cube of half side {limit:.4g}: "
-            "bring the scan to scene coordinates with Frame.to_scene",
+            "bring the scan to scene coordinates with Frame.to_scene (or simulate less noise)",
         )
 
 

@@ -6,11 +6,14 @@ cloud.ply       the points that were kept, once the episode is complete
 """
 
 import dataclasses
+import functools
 import hashlib
 import importlib.metadata
 import json
 import os
+import warnings
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from types import CodeType, FunctionType
@@ -33,7 +36,7 @@ def describe(thing: Any) -> Any:
     """A JSON description by which two configurations can be told apart.
 
     Modules and dataclasses become their fields, small arrays their values, large ones a hash of their bytes, functions
-    their names and a hash of their code, other objects their types' names.
+    their names and a hash of their code, defaults and closures, other objects their types' names.
     """
     if dataclasses.is_dataclass(thing) and not isinstance(thing, type):
         fields = {field.name: describe(getattr(thing, field.name, None)) for field in dataclasses.fields(thing)}
@@ -52,11 +55,26 @@ def describe(thing: Any) -> Any:
         return [describe(value) for value in thing]
     if thing is None or isinstance(thing, bool | int | float | str):
         return thing
+    if isinstance(thing, functools.partial):
+        return {"partial": describe(thing.func), "arguments": describe([thing.args, thing.keywords])}
     if isinstance(thing, FunctionType):
-        code = thing.__code__
-        constants = [value for value in code.co_consts if not isinstance(value, CodeType)]
-        digest = hashlib.sha256(repr((code.co_code, code.co_names, constants)).encode()).hexdigest()
+        cells = [cell.cell_contents for cell in thing.__closure__ or ()]
+        parts = [
+            thing.__code__,
+            thing.__defaults__,
+            thing.__kwdefaults__,
+            [cell for cell in cells if cell is not thing],
+        ]
+        digest = hashlib.sha256(json.dumps(describe(parts)).encode()).hexdigest()
         return {"function": thing.__qualname__, "sha256": digest}
+    if isinstance(thing, CodeType):
+        return describe([thing.co_code, thing.co_names, thing.co_consts])
+    if isinstance(thing, set | frozenset):
+        return sorted(map(repr, thing))
+    if isinstance(thing, bytes | complex):
+        return repr(thing)
+    if hasattr(thing, "__wrapped__"):
+        return describe(thing.__wrapped__)
     return getattr(thing, "__qualname__", type(thing).__qualname__)
 
 
@@ -75,6 +93,10 @@ class EpisodeFolder:
 
     def __init__(self, path: str | Path, config: dict[str, Any]):
         self.path = Path(path)
+        require(
+            not self.path.exists() or self.path.is_dir(),
+            f"the output folder {self.path} is a file: choose another place",
+        )
         record = self.path / "episode.json"
         if not record.exists():
             foreign = sorted(entry.name for entry in self.path.iterdir()) if self.path.exists() else []
@@ -82,12 +104,18 @@ class EpisodeFolder:
                 not [name for name in foreign if not name.endswith(".partial")],
                 f"the output folder {self.path} holds other files ({', '.join(foreign[:3])}): choose an empty folder",
             )
-            self.path.mkdir(parents=True, exist_ok=True)
+            try:
+                self.path.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise InputError(
+                    f"cannot make the output folder {self.path} ({error}): choose another place"
+                ) from error
             text = json.dumps({"config": config, "versions": versions()}, indent=2)
             _write_whole(record, lambda file: file.write(text.encode()))
             return
         try:
-            found = json.loads(record.read_text())["config"]
+            written = json.loads(record.read_text())
+            found, made_by = written["config"], written.get("versions")
         except (json.JSONDecodeError, KeyError, TypeError, UnicodeDecodeError) as error:
             raise InputError(f"{record} is not an episode's record ({error}): choose another output folder") from error
         changed = _differences(found, json.loads(json.dumps(config)))
@@ -96,6 +124,12 @@ class EpisodeFolder:
             f"the output folder {self.path} belongs to another configuration; it differs in {'; '.join(changed[:3])}. "
             "Choose another folder, or the settings it was made with",
         )
+        if made_by != versions():
+            warnings.warn(
+                f"{self.path} was begun with other versions ({'; '.join(_differences(made_by, versions()))}): "
+                "new views may differ in their last bits from those of an uninterrupted run",
+                stacklevel=3,
+            )
 
     def read_views(self) -> list[tuple[Pose, PointCloud, Proposal | None]]:
         """Pose, scan and proposal of every finished view, up to the first that is missing."""
@@ -103,16 +137,9 @@ class EpisodeFolder:
         while (file := self._view_file(len(views))).exists():
             try:
                 with np.load(file, allow_pickle=False) as saved:
-                    data = {name: jnp.asarray(saved[name]) for name in saved.files}
-            except (ValueError, OSError, zipfile.BadZipFile) as error:
+                    views.append(_view({name: jnp.asarray(saved[name]) for name in saved.files}))
+            except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
                 raise InputError(f"{file} is damaged ({error}): delete it, and its view is scanned again") from error
-            pose = Pose(data["rotation"], data["position"])
-            scan = PointCloud(data["points"], data["normals"], data["mask"])
-            proposal = None
-            if "values" in data:
-                candidates = Pose(data["candidate_rotations"], data["candidate_positions"])
-                proposal = Proposal(pose, data["value"], candidates, data["values"])
-            views.append((pose, scan, proposal))
         return views
 
     def write_view(self, index: int, pose: Pose, scan: PointCloud, proposal: Proposal | None) -> None:
@@ -144,6 +171,15 @@ class EpisodeFolder:
 
     def _view_file(self, index: int) -> Path:
         return self.path / f"view_{index:02d}.npz"
+
+
+def _view(data: dict[str, jax.Array]) -> tuple[Pose, PointCloud, Proposal | None]:
+    pose = Pose(data["rotation"], data["position"])
+    scan = PointCloud(data["points"], data["normals"], data["mask"])
+    if "values" not in data:
+        return pose, scan, None
+    candidates = Pose(data["candidate_rotations"], data["candidate_positions"])
+    return pose, scan, Proposal(pose, data["value"], candidates, data["values"])
 
 
 def _write_whole(path: Path, write: Callable[[Any], Any]) -> None:

@@ -45,8 +45,6 @@ def height_in_numpy(points, normals):
 class Toy(Score):
     """Counts the rows and weighs them by the context, the highest point of D."""
 
-    differentiable: bool = eqx.field(static=True, default=True)
-
     def context(self, cloud):
         return jnp.max(jnp.where(cloud.mask, cloud.points[:, 1], -jnp.inf))
 

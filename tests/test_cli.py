@@ -72,6 +72,9 @@ def test_run_takes_a_mesh_and_each_baseline(search, tmp_path, cache):
         (("demo", "--first", "0,0,0"), ("target",)),
         (("demo", "--first", "0,0,9", "--noise", "-1"), ("-1", "negative")),
         (("demo", "--first", "0,9,0,1"), ("three numbers",)),
+        (("run", "flat.obj"), ("flat.obj", "area")),
+        (("run", "broken.glb"), ("broken.glb", "cannot read")),
+        (("demo", "--out", "flat.obj"), ("flat.obj", "is a file")),
         (("demo", "--vews", "3"), ("--vews", "--views")),
         (("demo", "--search", "best"), ("best", "discrete")),
         (("demo", "--out", "occupied"), ("occupied", "other files")),
@@ -79,6 +82,8 @@ def test_run_takes_a_mesh_and_each_baseline(search, tmp_path, cache):
     ],
 )
 def test_bad_input_is_one_line_that_names_the_value_and_the_remedy(arguments, words, tmp_path, cache):
+    (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
+    (tmp_path / "broken.glb").write_bytes(b"glTF and no more")
     (tmp_path / "occupied").mkdir()
     (tmp_path / "occupied" / "thesis.tex").write_text("mine")
     result = run_command(*arguments, cwd=tmp_path, cache=cache)

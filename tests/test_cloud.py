@@ -257,3 +257,13 @@ def test_frame_moves_clouds_and_poses_but_not_directions():
 def test_frame_of_no_extent_is_refused(points, message):
     with pytest.raises(ValueError, match=message):
         Frame.fit(points)
+
+
+def test_nan_in_masked_rows_never_enters_farthest_point_samples():
+    points = np.full((60, 3), np.nan, np.float32)
+    points[:50] = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    cloud = PointCloud(jnp.asarray(points), jnp.asarray(points), jnp.arange(60) < 50)
+    chosen = limit_capacity(cloud, 20)
+    assert bool(chosen.mask.all())
+    assert len(np.unique(np.asarray(chosen.points), axis=0)) == 20
+    assert bool(jnp.isfinite(chosen.points).all())

@@ -73,9 +73,10 @@ def test_nothing_recompiles_after_the_second_view(name, compilations):
 
 def test_simulated_episodes_do_not_recompile_either(planner, compilations):
     """A whole second episode, of another seed, first view and noise draw, compiles nothing."""
+    other = look_at((-0.8, 0.9, 2.2))
     simulate(planner, SCENE, FIRST, 3, jax.random.key(0), progress=False)
     before = len(compilations)
-    simulate(planner, SCENE, look_at((-0.8, 0.9, 2.2)), 4, jax.random.key(1), progress=False)
+    simulate(planner, SCENE, other, 4, jax.random.key(1), progress=False)
     assert len(compilations) == before
 
 
@@ -191,3 +192,20 @@ def test_a_score_that_is_not_a_number_is_named(state):
     planner = Planner(planner.model, planner.camera, utility, planner.search, 3, planner.grid, 128)
     with pytest.raises(ValueError, match="NaN"):
         planner.propose(state, jax.random.key(0))
+
+
+def test_normals_that_are_not_of_unit_length_are_refused(planner):
+    cloud = cloud_at([0.1, 0.2, 0.3], [0.3, 0.2, 0.1])
+    with pytest.raises(ValueError, match=r"1 normals .*from_arrays"):
+        planner.init(PointCloud(cloud.points, cloud.normals.at[1].set(0.0), cloud.mask))
+
+
+def test_a_singular_covariance_is_named():
+    model = GeometricSPSR(noise=1e-5, lengthscale=0.05, truncation=8)
+    points = np.linspace(0, 1e-3, 64)[:, None] * np.ones(3)
+    cloud = PointCloud.from_arrays(points, np.tile([0.0, 0.0, 1.0], (64, 1)))
+    with pytest.raises(ValueError, match=r"64 normals with noise=1e-05 is singular .* raise the noise"):
+        model.condition(cloud)
+    planner = Planner(model, Camera(), Coverage(), DiscreteSearch(num_candidates=4), 2, Grid(12), 64)
+    with pytest.raises(ValueError, match="raise the model's noise"):
+        planner.propose(planner.init(cloud), jax.random.key(0))

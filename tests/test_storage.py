@@ -1,5 +1,6 @@
 """Episodes on disk: descriptions, exact round trips, PLY by two readers, kill and resume."""
 
+import functools
 import json
 import os
 import shutil
@@ -9,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -88,7 +90,27 @@ def test_a_description_tells_large_arrays_and_functions_apart():
     assert describe(large) != describe(large.reshape(3, 40))
     assert describe(jnp.sin) != describe(jnp.cos)
     assert describe(lambda x: x + 1) != describe(lambda x: x + 2)
+
+    def plus(amount, default=0):
+        return lambda x, y=default: (lambda z: z + x + y)(amount)
+
+    assert describe(plus(1.0)) == describe(plus(1.0))
+    assert describe(plus(1.0)) != describe(plus(2.0))
+    assert describe(plus(1.0, 1)) != describe(plus(1.0, 2))
+    assert describe(functools.partial(plus, 1)) != describe(functools.partial(plus, 2))
+    assert describe(jax.jit(plus(1.0))) != describe(jax.jit(plus(2.0)))
     assert json.loads(json.dumps(describe({"a": (1, 2.5, None, "x", large)})))["a"][:4] == [1, 2.5, None, "x"]
+
+
+def test_a_description_of_a_function_is_the_same_in_every_process():
+    code = "from jaxnbv.storage import describe; print(describe(lambda x: x in {'a', 'b', 'c'} and (lambda: 1)))"
+    outputs = set()
+    for seed in ("1", "2", "3"):
+        environment = {**os.environ, "PYTHONHASHSEED": seed}
+        outputs.add(
+            subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=True).stdout
+        )
+    assert len(outputs) == 1
 
 
 def test_views_come_back_with_the_same_bits(finished):
@@ -264,8 +286,32 @@ def test_fewer_views_than_the_folder_holds_are_refused(finished):
         run(finished[1], views=1)
 
 
-def test_a_damaged_view_is_refused_by_name(finished, tmp_path):
+@pytest.mark.parametrize("size", [0, 100, 3000])
+def test_a_damaged_view_is_refused_by_name(finished, tmp_path, size):
     folder = shutil.copytree(finished[1], tmp_path / "copy")
-    (folder / "view_01.npz").write_bytes((folder / "view_01.npz").read_bytes()[:100])
+    (folder / "view_01.npz").write_bytes((folder / "view_01.npz").read_bytes()[:size])
     with pytest.raises(ValueError, match=r"view_01.npz is damaged .* delete it"):
+        run(folder, views=5)
+
+
+def test_a_shorter_episode_is_not_saved_over_a_longer_one(finished, tmp_path):
+    folder = shutil.copytree(finished[1], tmp_path / "copy")
+    episode = finished[0]
+    shorter = eqx.tree_at(lambda e: e.views, episode, episode.views[:2])
+    with pytest.raises(ValueError, match="already holds 5 views"):
+        shorter.save(folder)
+
+
+def test_an_output_folder_that_is_a_file_is_refused(tmp_path):
+    (tmp_path / "notes").write_text("mine")
+    with pytest.raises(ValueError, match="is a file"):
+        run(tmp_path / "notes")
+
+
+def test_other_versions_are_told_of(finished, tmp_path):
+    folder = shutil.copytree(finished[1], tmp_path / "copy")
+    record = json.loads((folder / "episode.json").read_text())
+    record["versions"]["jax"] = "0.0.1"
+    (folder / "episode.json").write_text(json.dumps(record))
+    with pytest.warns(UserWarning, match=r"other versions \(jax: 0.0.1 there"):
         run(folder, views=5)

@@ -15,7 +15,7 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 from skimage.measure import marching_cubes
 
-from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.checks import AnyArray, InputError, is_traced, require
 from jaxnbv.cloud import Frame
 from jaxnbv.scanning.grid import Grid, GridSurface
 from jaxnbv.scanning.sdf import SignedDistance
@@ -184,7 +184,7 @@ def load_mesh(path: str | Path) -> TriangleMesh:
     except Exception as error:  # Each of trimesh's readers fails in its own way.
         formats = ", ".join(sorted(trimesh.available_formats()))
         message = f"cannot read {path} as a mesh ({type(error).__name__}: {error}): it must be one of {formats}"
-        raise ValueError(message) from error
+        raise InputError(message) from error
     meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     require(len(meshes) > 0, f"{path} has no faces: a point cloud or an empty file cannot be scanned")
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
@@ -192,8 +192,8 @@ def load_mesh(path: str | Path) -> TriangleMesh:
     faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)])
     try:
         return TriangleMesh.from_arrays(vertices, faces)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def mesh_from_sdf(sdf: SignedDistance, grid: Grid) -> TriangleMesh:

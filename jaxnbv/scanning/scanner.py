@@ -1,5 +1,7 @@
 """The paper's scan(theta; f): the oriented points that a depth camera sees of a surface."""
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -25,8 +27,8 @@ class SensorNoise(eqx.Module):
 
     def __check_init__(self):
         require(
-            self.points >= 0 and self.normals >= 0,
-            f"the noise's standard deviations are {self.points} and {self.normals}; they must not be negative",
+            0 <= self.points < math.inf and 0 <= self.normals < math.inf,
+            f"the noise's standard deviations are {self.points} and {self.normals}; they must be finite, not negative",
         )
 
     def __call__(self, cloud: PointCloud, key: PRNGKeyArray) -> PointCloud:

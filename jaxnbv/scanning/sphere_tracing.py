@@ -49,6 +49,7 @@ class SDFSurface(Surface):
     def __check_init__(self):
         require(self.bounding_radius > 0, f"the bounding radius is {self.bounding_radius}; it must be positive")
 
+    @eqx.filter_jit
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
         origins, directions = jnp.asarray(origins), jnp.asarray(directions)
         parameters, structure = eqx.partition(self.sdf, eqx.is_array)

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxnbv.acquisition import Score, expected_score
 from jaxnbv.camera import Camera, Pose, fibonacci_sphere, look_at
-from jaxnbv.checks import require
+from jaxnbv.checks import InputError, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.scanning import GridSurface
 
@@ -31,7 +31,7 @@ class Problem(eqx.Module):
     def acquisition(self, poses: Pose) -> Float[Array, " poses"]:
         """The acquisition at a batch of poses."""
         if self.surfaces is None:
-            raise ValueError("the acquisition needs posterior samples: set uses_samples = True on the search")
+            raise InputError("the acquisition needs posterior samples: set uses_samples = True on the search")
         return expected_score(self.score, self.cloud, self.surfaces, self.camera, poses)
 
     def is_visited(self, poses: Pose) -> Bool[Array, " poses"]:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.camera import Pose
+from jaxnbv.checks import InputError
 from jaxnbv.search.base import Problem, Proposal, Search, best_unvisited, check_candidates, sphere_candidates
 
 
@@ -71,7 +72,7 @@ def uncertain_length(problem: Problem, poses: Pose) -> Float[Array, " poses"]:
     """
     surfaces = problem.surfaces
     if surfaces is None:
-        raise ValueError("the transmittance needs posterior samples: set uses_samples = True on the search")
+        raise InputError("the transmittance needs posterior samples: set uses_samples = True on the search")
     grid = surfaces.grid
     step = 0.5 * grid.spacing
     # Long enough to cross the grid from any camera outside it that looks at it, and from any inside.

@@ -54,7 +54,8 @@ def function_variance(spectrum: Spectrum) -> Float[Array, ""]:
 def _even(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> Float[Array, "n m"]:
     """sum_{n in Z} s1(n) cos(n (x - y))."""
     truncation = spectrum.shape[0] - 1
-    return (circle_basis(x, truncation) * basis_variance(spectrum)) @ circle_basis(y, truncation).T
+    weighted = circle_basis(x, truncation) * basis_variance(spectrum)
+    return jnp.matmul(weighted, circle_basis(y, truncation).T, precision="highest")
 
 
 def _odd(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> Float[Array, "n m"]:
@@ -63,7 +64,7 @@ def _odd(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> Fl
     sign = jnp.sign(jnp.arange(-truncation, truncation + 1))
     # Reversing the basis swaps the sine and the cosine of each frequency.
     swapped = sign * circle_basis(x, truncation)[:, ::-1]
-    return (swapped * basis_variance(spectrum)) @ circle_basis(y, truncation).T
+    return jnp.matmul(swapped * basis_variance(spectrum), circle_basis(y, truncation).T, precision="highest")
 
 
 def _over_squared_frequency(products, spectrum: Spectrum):

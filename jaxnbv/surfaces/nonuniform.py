@@ -62,7 +62,7 @@ class NonuniformTransform(eqx.Module):
 
         def at_point(start, weights):
             block = jax.lax.dynamic_slice(grid, (*start, jnp.int32(0)), (window, window, window, k))
-            return jnp.einsum("uvwk,u,v,w->k", block, *weights)
+            return jnp.einsum("uvwk,u,v,w->k", block, *weights, precision="highest")
 
         return jax.vmap(at_point)(self.start, self.weights)
 

@@ -66,7 +66,8 @@ class GeometricSPSR(SurfaceModel):
 
     def __check_init__(self):
         require(self.nu in (0.5, 1.5, 2.5), f"nu is {self.nu}; it must be 0.5, 1.5 or 2.5")
-        require(self.truncation >= 1, f"the truncation is {self.truncation}; it must be at least 1")
+        whole = isinstance(self.truncation, int) and self.truncation >= 1
+        require(whole, f"the truncation is {self.truncation}; it must be a whole number, at least 1")
         if is_traced(self.lengthscale, self.variance, self.noise):
             return
         for name in ("lengthscale", "variance", "noise"):
@@ -93,12 +94,20 @@ class GeometricSPSR(SurfaceModel):
     def condition(self, cloud: PointCloud) -> "GeometricSPSRPosterior":
         """p(f | D). The cost is that of a Cholesky factorisation of the cloud's capacity.
 
-        **Raises:** `ValueError` if the cloud is empty, has entries that are not finite, or leaves
-        [-pi/2, pi/2]^3 (scene coordinates); under `jit` values are not known and are not checked.
+        **Raises:** `ValueError` if the cloud is empty, has entries that are not finite or leaves [-pi/2, pi/2]^3
+        (scene coordinates), or if A is singular in the precision at hand; under `jit` values are not known and are not
+        checked.
         """
         if not is_traced(cloud):
             _check_in_scene(cloud)
-        return _condition(self, cloud)
+        posterior = _condition(self, cloud)
+        if not is_traced(posterior.level):
+            require(
+                bool(jnp.isfinite(posterior.level)),
+                f"the covariance of {int(cloud.count)} normals with noise={float(self.noise):.3g} is singular in "
+                f"{posterior.level.dtype}: raise the noise, or enable jax_enable_x64",
+            )
+        return posterior
 
 
 def _check_in_scene(cloud: PointCloud) -> None:
@@ -197,7 +206,7 @@ class GeometricSPSRPosterior(SurfacePosterior):
         prior = function_variance(self.model.spectrum)
 
         def at_points(x):
-            return prior - jnp.sum(self._whitened(x) ** 2, axis=(0, 1))
+            return jnp.maximum(prior - jnp.sum(self._whitened(x) ** 2, axis=(0, 1)), 0.0)
 
         chunk = max(1, min(x.shape[0], _CHUNK_VALUES // self.cloud.capacity))
         return jax.lax.map(lambda point: at_points(point[None])[0], x, batch_size=chunk)
@@ -206,7 +215,7 @@ class GeometricSPSRPosterior(SurfacePosterior):
     def covariance(self, x: Float[AnyArray, "n 3"], y: Float[AnyArray, "m 3"]) -> Float[Array, "n m"]:
         """Cov(f(x), f(y)) between points in scene coordinates, all at once."""
         x, y = (jnp.asarray(points, dtype=self.weights.dtype) for points in (x, y))
-        explained = jnp.einsum("djn,djm->nm", self._whitened(x), self._whitened(y))
+        explained = jnp.einsum("djn,djm->nm", self._whitened(x), self._whitened(y), precision="highest")
         return function_covariance(x, y, self.model.spectrum) - explained
 
     def log_marginal_likelihood(self) -> Float[Array, ""]:

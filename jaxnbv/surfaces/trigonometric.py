@@ -4,6 +4,8 @@ The basis on the circle is phi_a(x) = cos(a x) for a = 0, ..., L and phi_a(x) = 
 products phi_a(x1) phi_b(x2) phi_c(x3) are as many real functions as the Hermitian half of the paper's exponentials has
 real and imaginary parts, and they span the same space; but evaluation is a chain of real matrix products, and the
 derivative of a function with coefficients C_a has the coefficients a C_{-a}.
+
+All products ask for full float32 precision, which some GPUs would otherwise trade for speed.
 """
 
 import jax
@@ -54,9 +56,9 @@ def evaluate_on_grid(
     coefficients: Float[Array, "*s a a a"], basis: Float[Array, "g a"] | Float[np.ndarray, "g a"]
 ) -> Float[Array, "*s g g g"]:
     """Values on a tensor grid, given the basis at the nodes of its axis: three matrix products a function."""
-    values = jnp.einsum("...abc,kc->...abk", coefficients, basis)
-    values = jnp.einsum("...abk,jb->...ajk", values, basis)
-    return jnp.einsum("...ajk,ia->...ijk", values, basis)
+    values = jnp.einsum("...abc,kc->...abk", coefficients, basis, precision="highest")
+    values = jnp.einsum("...abk,jb->...ajk", values, basis, precision="highest")
+    return jnp.einsum("...ajk,ia->...ijk", values, basis, precision="highest")
 
 
 class TrigonometricFields(Fields):
@@ -74,8 +76,8 @@ class TrigonometricFields(Fields):
 
         def evaluate(point):
             first, second, third = circle_basis(point, modes // 2)
-            values = jnp.einsum("sabc,a->sbc", self.coefficients, first)
-            return jnp.einsum("sbc,b,c->s", values, second, third)
+            values = jnp.einsum("sabc,a->sbc", self.coefficients, first, precision="highest")
+            return jnp.einsum("sbc,b,c->s", values, second, third, precision="highest")
 
         chunk = max(1, min(x.shape[0], _CHUNK_VALUES // (samples * modes**2)))
         return jax.lax.map(evaluate, x, batch_size=chunk).T

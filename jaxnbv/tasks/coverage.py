@@ -11,11 +11,6 @@ from jaxnbv.neighbours import nearest_squared_distance
 class Coverage(Score):
     """The paper's alpha^(CD): sum over the points x of the scan of min_{y in D} |x - y|^2, in squared scene units."""
 
-    @property
-    def differentiable(self) -> bool:
-        """True."""
-        return True
-
     def context(self, cloud: PointCloud) -> PointCloud:
         """D itself."""
         return cloud
