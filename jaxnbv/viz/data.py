@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from jaxnbv.camera import Pose
 from jaxnbv.checks import AnyArray

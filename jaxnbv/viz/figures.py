@@ -13,7 +13,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 from PIL import Image
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from jaxnbv.camera import Camera
 from jaxnbv.viz import sphere
