@@ -65,12 +65,11 @@ app = typer.Typer(
     episode (poses, scans, the values of all candidates), its point cloud as PLY, figures, and a report.html that opens
     offline.
 
-    Try: jaxnbv demo
-
-    Then: jaxnbv run MESH --views 5 --out runs/mine
+    Try `jaxnbv demo`, then `jaxnbv run MESH --views 5 --out runs/mine`.
     """,
     epilog="A run that was interrupted continues with the same command after its last finished view.",
     no_args_is_help=True,
+    rich_markup_mode="markdown",
     add_completion=False,
     pretty_exceptions_enable=False,
 )
@@ -90,7 +89,7 @@ FirstOption = Annotated[
 SeedOption = Annotated[
     int, typer.Option(min=0, max=2**63 - 1, help="Seed of the sensor's noise and of the posterior samples.")
 ]
-OutOption = Annotated[Path | None, typer.Option(help="Output folder.  [default: runs/NAME-SEARCH]")]
+OutOption = Annotated[Path | None, typer.Option(help="Output folder.", show_default="runs/NAME-SEARCH")]
 NoiseOption = Annotated[float, typer.Option(help="Standard deviation of the sensor's noise on points and normals.")]
 QuickOption = Annotated[
     bool, typer.Option("--quick", help="Small settings, for a first look in under a minute; not the paper's.")
@@ -119,7 +118,9 @@ def demo(
 
 @app.command()
 def run(
-    mesh: Annotated[Path, typer.Argument(help="Any mesh that trimesh reads: OBJ, PLY, STL, OFF, glTF, ...")],
+    mesh: Annotated[
+        Path, typer.Argument(metavar="MESH", help="Any mesh that trimesh reads: OBJ, PLY, STL, OFF, glTF, ...")
+    ],
     task: TaskOption = Task.COVERAGE,
     search: SearchOption = SearchName.DISCRETE,
     views: ViewsOption = 5,

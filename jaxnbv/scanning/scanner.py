@@ -28,7 +28,8 @@ class SensorNoise(eqx.Module):
     def __check_init__(self):
         require(
             0 <= self.points < math.inf and 0 <= self.normals < math.inf,
-            f"the noise's standard deviations are {self.points} and {self.normals}; they must be finite, not negative",
+            f"the noise's standard deviations are {self.points} and {self.normals}; "
+            "they must not be negative, nor infinite",
         )
 
     def __call__(self, cloud: PointCloud, key: PRNGKeyArray) -> PointCloud:
