@@ -66,4 +66,3 @@ def test_gradient_in_the_scan(x64):
     nearest = known[((points[:, None] - known[None]) ** 2).sum(-1).argmin(axis=1)]
     np.testing.assert_allclose(gradient[:6], 2 * (points - nearest), atol=1e-12)
     assert not np.asarray(gradient)[6:].any()
-    assert score.differentiable
