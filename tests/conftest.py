@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 from jaxtyping import install_import_hook
 
@@ -16,6 +17,13 @@ def compiled_programs_are_let_go():
     """A whole run would hold gigabytes of them."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture(autouse=True)
+def random_numbers_of_its_own(request):
+    """A test draws the same numbers from its module's generator whichever tests ran before it."""
+    if hasattr(request.module, "RNG"):
+        request.module.RNG = np.random.default_rng(0)
 
 
 @pytest.fixture

@@ -54,11 +54,11 @@ class SDFSurface(Surface):
         origins, directions = jnp.asarray(origins), jnp.asarray(directions)
         parameters, structure = eqx.partition(self.sdf, eqx.is_array)
         fixed = jax.lax.stop_gradient((parameters, origins, directions))
-        depth, mask = _first_root(eqx.combine(fixed[0], structure), fixed[1], fixed[2], self.bounding_radius)
-        value, cosine = jax.jvp(self.sdf, (origins + depth[:, None] * directions,), (directions,))
-        cosine = jax.lax.stop_gradient(cosine)
-        bounded = jnp.where(cosine < 0, -1.0, 1.0) * jnp.maximum(jnp.abs(cosine), _GRAZING)
-        points = origins + (depth - value / bounded)[:, None] * directions
+        solid = eqx.combine(fixed[0], structure)
+        depth, mask = _first_root(solid, fixed[1], fixed[2], self.bounding_radius)
+        # The first step makes the root exact, the second, taken there, its derivative.
+        depth = jax.lax.stop_gradient(_newton(solid, fixed[1], fixed[2], depth))
+        points = origins + _newton(self.sdf, origins, directions, depth)[:, None] * directions
         # Just in front of the surface: on it a solid's formula may stand at the zero between two of its cases, and
         # rounding may take the slope of neither.
         front = points - _FRONT * directions
@@ -69,6 +69,15 @@ class SDFSurface(Surface):
         facing = -jnp.sign(jnp.sum(gradient * directions, axis=-1, keepdims=True))
         normals = jnp.where(facing == 0, 1.0, facing) * gradient / jnp.linalg.norm(gradient, axis=-1, keepdims=True)
         return Hits(jnp.where(mask[:, None], points, 0.0), jnp.where(mask[:, None], normals, 0.0), mask)
+
+
+def _newton(
+    sdf: SignedDistance, origins: Float[Array, "n 3"], directions: Float[Array, "n 3"], depth: Float[Array, " n"]
+) -> Float[Array, " n"]:
+    """One Newton step towards the root along each ray; its derivative is that of the root, by the implicit function."""
+    value, cosine = jax.jvp(sdf, (origins + depth[:, None] * directions,), (directions,))
+    cosine = jax.lax.stop_gradient(cosine)
+    return depth - value / (jnp.where(cosine < 0, -1.0, 1.0) * jnp.maximum(jnp.abs(cosine), _GRAZING))
 
 
 def _first_root(
