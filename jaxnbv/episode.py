@@ -81,7 +81,8 @@ def simulate(
     """Scan a known surface from `first`, then from the views that the planner asks for, `views` in all.
 
     View i depends on the key and i alone, not on how many follow. With `folder`, every finished view is written there;
-    a run that was interrupted goes on after the last of them and ends with the same bits as one that was not.
+    a run that was interrupted goes on after the last of them and, on a CPU with the same versions, ends with the same
+    bits as one that was not. (A GPU may add in another order from run to run.)
 
     **Raises:** `ValueError` if `views` < 1 or more than the planner has room for, if the first view sees nothing, or
     if the folder belongs to another configuration or holds more views already.
