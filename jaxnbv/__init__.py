@@ -40,3 +40,7 @@ from jaxnbv.surfaces import GeometricSPSR as GeometricSPSR
 from jaxnbv.surfaces import SurfaceModel as SurfaceModel
 from jaxnbv.surfaces import SurfacePosterior as SurfacePosterior
 from jaxnbv.tasks import Coverage as Coverage
+from jaxnbv.tasks import CrossEntropy as CrossEntropy
+from jaxnbv.tasks import HostClassifier as HostClassifier
+from jaxnbv.tasks import MixedEntropy as MixedEntropy
+from jaxnbv.tasks import NegativeEntropy as NegativeEntropy

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxnbv.camera import Camera, Pose
-from jaxnbv.cloud import PointCloud, concatenate
+from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.scanning import GridSurface, scan
 
 
@@ -31,17 +31,26 @@ class Score(eqx.Module):
     def __call__(self, context: Any, scan: PointCloud) -> Float[Array, ""]:
         """The score of one scan (rows, masked). Finite for a scan that sees nothing."""
 
+    @property
+    def batch_size(self) -> int:
+        """How many scans are scored together. A CPU takes them one by one, lest a network's layers leave its cache."""
+        return 1 if jax.default_backend() == "cpu" else 128
+
 
 class ExpectedUtilityImprovement(Score):
     """max(0, u(D u scan) - u(D)) for any utility u(cloud): the paper's alpha^(u), once averaged over samples.
 
     - `utility`: a function from a `PointCloud` (rows, masked) to a scalar, made of JAX operations.
+    - `num_points`: where given, D is thinned to so many by farthest point sampling, once a step, before scans are
+      added to it: for a utility that looks at so many points anyway, and would sample D again for every scan.
     """
 
     utility: Callable[[PointCloud], Float[Array, ""]]
+    num_points: int | None = eqx.field(static=True, default=None)
 
     def context(self, cloud: PointCloud) -> tuple[PointCloud, Float[Array, ""]]:
-        """D and u(D)."""
+        """D, thinned, and u(D)."""
+        cloud = cloud if self.num_points is None else limit_capacity(cloud, self.num_points)
         return cloud, self.utility(cloud)
 
     def __call__(self, context: tuple[PointCloud, Float[Array, ""]], scan: PointCloud) -> Float[Array, ""]:
@@ -55,12 +64,13 @@ def expected_score(
 ) -> Float[Array, " poses"]:
     """The acquisition at each of a batch of poses: mean over the sampled surfaces of the score of what they would show.
 
-    `surfaces` carries the samples along its leading axis; they are taken one after the other, all poses at once, so
-    memory is that of one sample's scans.
+    `surfaces` carries the samples along its leading axis; they are taken one after the other, with all poses scanned at
+    once and scored `score.batch_size` at a time, so memory is that of one sample's scans.
     """
     context = score.context(cloud)
 
     def of_sample(surface: GridSurface) -> Float[Array, " poses"]:
-        return jax.vmap(lambda imagined: score(context, imagined))(scan(surface, camera, poses))
+        scans = scan(surface, camera, poses)
+        return jax.lax.map(lambda imagined: score(context, imagined), scans, batch_size=score.batch_size)
 
     return jnp.mean(jax.lax.map(of_sample, surfaces), axis=0)

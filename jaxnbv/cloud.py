@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.farthest import farthest_point_indices
 
 
 class PointCloud(eqx.Module):
@@ -162,21 +163,7 @@ def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
 
     **Raises:** `ValueError` if `count` < 1.
     """
-    require(count >= 1, f"cannot subsample to {count} points; ask for at least one")
-    points = jax.lax.stop_gradient(jnp.where(cloud.mask[:, None], cloud.points, 0.0))
-
-    def choose(i, carry):
-        chosen, distance, latest = carry
-        distance = jnp.minimum(distance, jnp.sum((points - points[latest]) ** 2, axis=-1)).at[latest].set(-1.0)
-        return chosen.at[i].set(latest), distance, jnp.argmax(distance).astype(jnp.int32)
-
-    # Rows that are not filled, and those already chosen, stand at -1: behind every other, duplicates included.
-    start = (
-        jnp.zeros(count, dtype=jnp.int32),
-        jnp.where(cloud.mask, jnp.inf, -1.0),
-        jnp.argmax(cloud.mask).astype(jnp.int32),
-    )
-    chosen, _, _ = jax.lax.fori_loop(0, count, choose, start)
+    chosen = farthest_point_indices(cloud.points, cloud.mask, count)
     kept = jnp.arange(count) < cloud.count
     return _take(cloud, chosen, kept)
 

@@ -111,14 +111,14 @@ class EpisodeFolder:
                     f"cannot make the output folder {self.path} ({error}): choose another place"
                 ) from error
             text = json.dumps({"config": config, "versions": versions()}, indent=2)
-            _write_whole(record, lambda file: file.write(text.encode()))
+            write_whole(record, lambda file: file.write(text.encode()))
             return
         try:
             written = json.loads(record.read_text())
             found, made_by = written["config"], written.get("versions")
         except (json.JSONDecodeError, KeyError, TypeError, UnicodeDecodeError) as error:
             raise InputError(f"{record} is not an episode's record ({error}): choose another output folder") from error
-        changed = _differences(found, json.loads(json.dumps(config)))
+        changed = differences(found, json.loads(json.dumps(config)))
         require(
             not changed,
             f"the output folder {self.path} belongs to another configuration; it differs in {'; '.join(changed[:3])}. "
@@ -126,7 +126,7 @@ class EpisodeFolder:
         )
         if made_by != versions():
             warnings.warn(
-                f"{self.path} was begun with other versions ({'; '.join(_differences(made_by, versions()))}): "
+                f"{self.path} was begun with other versions ({'; '.join(differences(made_by, versions()))}): "
                 "new views may differ in their last bits from those of an uninterrupted run",
                 stacklevel=3,
             )
@@ -159,7 +159,7 @@ class EpisodeFolder:
                 "candidate_positions": proposal.candidates.position,
             }
         arrays: dict[str, Any] = {name: np.asarray(value) for name, value in data.items()}
-        _write_whole(self._view_file(index), lambda file: np.savez_compressed(file, **arrays))
+        write_whole(self._view_file(index), lambda file: np.savez_compressed(file, **arrays))
 
     def write_cloud(self, cloud: PointCloud) -> None:
         """Write the kept points and normals as a binary PLY file, in scene coordinates."""
@@ -167,7 +167,7 @@ class EpisodeFolder:
         rows = np.concatenate([points, normals], axis=1)
         vertices = np.rec.fromarrays(list(rows.T), dtype=[(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")])
         ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=["scene coordinates"])
-        _write_whole(self.path / "cloud.ply", ply.write)
+        write_whole(self.path / "cloud.ply", ply.write)
 
     def _view_file(self, index: int) -> Path:
         return self.path / f"view_{index:02d}.npz"
@@ -182,7 +182,7 @@ def _view(data: dict[str, jax.Array]) -> tuple[Pose, PointCloud, Proposal | None
     return pose, scan, Proposal(pose, data["value"], candidates, data["values"])
 
 
-def _write_whole(path: Path, write: Callable[[Any], Any]) -> None:
+def write_whole(path: Path, write: Callable[[Any], Any]) -> None:
     """Write beside the file and rename, so that a reader finds the old file or the whole new one, never a part."""
     partial = path.with_name(path.name + ".partial")
     with partial.open("wb") as file:
@@ -192,9 +192,9 @@ def _write_whole(path: Path, write: Callable[[Any], Any]) -> None:
     partial.replace(path)
 
 
-def _differences(found: Any, asked: Any, name: str = "") -> list[str]:
+def differences(found: Any, asked: Any, name: str = "") -> list[str]:
     if isinstance(found, dict) and isinstance(asked, dict):
         keys = list(dict.fromkeys([*found, *asked]))
-        nested = (_differences(found.get(key), asked.get(key), f"{name}.{key}".lstrip(".")) for key in keys)
+        nested = (differences(found.get(key), asked.get(key), f"{name}.{key}".lstrip(".")) for key in keys)
         return [difference for group in nested for difference in group]
     return [] if found == asked else [f"{name}: {found} there, {asked} now"]

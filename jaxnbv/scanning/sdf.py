@@ -32,13 +32,13 @@ def _as_float(value):
     return jnp.asarray(value, dtype=jnp.result_type(float))
 
 
-def _parameter(**kwargs):
+def parameter(**kwargs):
     return eqx.field(converter=_as_float, **kwargs)
 
 
-def _length(**kwargs):
+def length(**kwargs):
     """A parameter that must not be negative."""
-    return _parameter(metadata={"length": True}, **kwargs)
+    return parameter(metadata={"length": True}, **kwargs)
 
 
 @jax.custom_jvp
@@ -140,7 +140,7 @@ class SignedDistance(eqx.Module):
 class Sphere(SignedDistance):
     """The ball of `radius` about the origin. Exact."""
 
-    radius: Scalar = _length()
+    radius: Scalar = length()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         return _norm(*_split(x)) - self.radius
@@ -152,8 +152,8 @@ class Box(SignedDistance):
     **Raises:** `ValueError` also if the rounding is greater than half of a side.
     """
 
-    half_size: Vector = _length()
-    rounding: Scalar = _length(default=0.0)
+    half_size: Vector = length()
+    rounding: Scalar = length(default=0.0)
 
     def __check_init__(self):
         if not is_traced(self):
@@ -169,8 +169,8 @@ class Box(SignedDistance):
 class Cylinder(SignedDistance):
     """The solid cylinder about the y axis with flat caps at y = -half_height and half_height. Exact."""
 
-    radius: Scalar = _length()
-    half_height: Scalar = _length()
+    radius: Scalar = length()
+    half_height: Scalar = length()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         x, y, z = _split(x)
@@ -180,9 +180,9 @@ class Cylinder(SignedDistance):
 class Cone(SignedDistance):
     """The solid cone about the y axis, capped flat: radii at y = -half_height and y = half_height. Exact."""
 
-    bottom_radius: Scalar = _length()
-    top_radius: Scalar = _length()
-    half_height: Scalar = _length()
+    bottom_radius: Scalar = length()
+    top_radius: Scalar = length()
+    half_height: Scalar = length()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         # The profile in the half plane (r, y): two caps, a slanted edge from the bottom's corner to the top's.
@@ -204,8 +204,8 @@ class Cone(SignedDistance):
 class Torus(SignedDistance):
     """The torus about the y axis: a tube of `minor_radius` around the circle of `major_radius`. Exact."""
 
-    major_radius: Scalar = _length()
-    minor_radius: Scalar = _length()
+    major_radius: Scalar = length()
+    minor_radius: Scalar = length()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         x, y, z = _split(x)
@@ -215,9 +215,9 @@ class Torus(SignedDistance):
 class Capsule(SignedDistance):
     """All points within `radius` of the segment from `start` to `end`. Exact."""
 
-    start: Vector = _parameter()
-    end: Vector = _parameter()
-    radius: Scalar = _length()
+    start: Vector = parameter()
+    end: Vector = parameter()
+    radius: Scalar = length()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         segment = self.end - self.start
@@ -246,7 +246,7 @@ class SmoothUnion(SignedDistance):
 
     first: SignedDistance
     second: SignedDistance
-    width: Scalar = _length()
+    width: Scalar = length()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         a, b = self.first(x), self.second(x)
@@ -278,7 +278,7 @@ class Translated(SignedDistance):
     """A solid moved by `offset`. As exact as the solid."""
 
     solid: SignedDistance
-    offset: Vector = _parameter()
+    offset: Vector = parameter()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         return self.solid(x - self.offset)
@@ -291,7 +291,7 @@ class Rotated(SignedDistance):
     """
 
     solid: SignedDistance
-    rotation: Matrix = _parameter()
+    rotation: Matrix = parameter()
 
     def __check_init__(self):
         Pose(self.rotation, jnp.zeros(3))
@@ -306,7 +306,7 @@ class Scaled(SignedDistance):
     """A solid scaled about the origin by `factor` > 0. As exact as the solid."""
 
     solid: SignedDistance
-    factor: Scalar = _length()
+    factor: Scalar = length()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         return self.factor * self.solid(x / self.factor)

@@ -18,3 +18,8 @@ class Coverage(Score):
     def __call__(self, context: PointCloud, scan: PointCloud) -> Float[Array, ""]:
         """Unidirectional Chamfer distance from the scan to D; zero for a scan that sees nothing."""
         return jnp.sum(jnp.where(scan.mask, nearest_squared_distance(scan.points, context), 0.0))
+
+    @property
+    def batch_size(self) -> int:
+        """Many scans at once: the loop over D runs once for all of them."""
+        return 128

@@ -1,12 +1,17 @@
 """What happened at every view, in words, and what the values of a search are called."""
 
+from typing import TypeAlias
+
 import equinox as eqx
 import numpy as np
+from jaxtyping import Float
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement, Score
 from jaxnbv.camera import Pose
 from jaxnbv.search import FarthestView, RandomView, Search, UncertaintyView
-from jaxnbv.tasks import Coverage
+from jaxnbv.tasks import Coverage, CrossEntropy, MixedEntropy, NegativeEntropy
+
+Probabilities: TypeAlias = Float[np.ndarray, " classes"]
 
 
 class Quantity(eqx.Module):
@@ -45,6 +50,15 @@ def quantity(search: Search, score: Score) -> Quantity:
     if isinstance(score, Coverage):
         meaning = "squared distances to the cloud, summed over an imagined scan, mean over posterior samples."
         return Quantity("expected coverage gain", "scene units²", meaning)
+    if isinstance(score, CrossEntropy):
+        meaning = "cross-entropy of the classes before and after an imagined scan, mean over posterior samples."
+        return Quantity("expected cross-entropy", "nats", meaning)
+    if isinstance(score, MixedEntropy):
+        meaning = "expected cross-entropy, or expected reduction of entropy once the class is nearly settled."
+        return Quantity("expected cross-entropy or reduction of entropy", "nats", meaning)
+    if isinstance(score, ExpectedUtilityImprovement) and isinstance(score.utility, NegativeEntropy):
+        meaning = "how much an imagined scan lowers the entropy of the classes, mean over posterior samples."
+        return Quantity("expected reduction of entropy", "nats", meaning)
     if isinstance(score, ExpectedUtilityImprovement):
         meaning = "how much an imagined scan raises the utility of the cloud, mean over posterior samples."
         return Quantity("expected utility improvement", "", meaning)
@@ -82,6 +96,19 @@ def describe_choice(
         before, after = (percent(share) for share in change)
         grown = f"; coverage stayed at {after}" if before == after else f"; coverage went from {before} to {after}"
     return " ".join([*parts, f"{added}{kept}{grown}."])
+
+
+def describe_classes(before: Probabilities | None, after: Probabilities, names: tuple[str, ...] | None) -> str:
+    """What the classifier makes of the object, after a view and before it: a sentence."""
+    names = tuple(f"class {index}" for index in range(len(after))) if names is None else names
+    best = int(np.argmax(after))
+    known = f"The classifier says {names[best]} with probability {after[best]:.2f}"
+    if before is None:
+        return f"{known}."
+    if int(np.argmax(before)) == best:
+        return f"{known}, up from {before[best]:.2f}." if after[best] > before[best] else f"{known} (was {before[best]:.2f})."
+    previous = int(np.argmax(before))
+    return f"{known} (was {before[best]:.2f}, behind {names[previous]} with {before[previous]:.2f})."
 
 
 def _reason(values: Quantity, value: float, rank: int, others: tuple[float, ...]) -> str:

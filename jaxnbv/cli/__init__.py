@@ -1,0 +1,40 @@
+"""The command line: `jaxnbv demo`, `jaxnbv run MESH`, `jaxnbv study pyramid` and `jaxnbv convert`."""
+
+import sys
+
+import typer
+
+from jaxnbv.checks import InputError
+from jaxnbv.cli.study import study
+from jaxnbv.cli.tools import convert
+from jaxnbv.cli.views import demo, run
+
+app = typer.Typer(
+    help="""Where should the sensor look next, for what you want to know?
+
+    jaxnbv scans an object from a first view, imagines what it may look like where it was not seen, and picks the view
+    that is expected to tell the most; then it scans from there and asks again. Each run leaves a folder with the
+    episode (poses, scans, the values of all candidates), its point cloud as PLY, figures, and a report.html that opens
+    offline.
+
+    Try `jaxnbv demo`, then `jaxnbv run MESH --views 5 --out runs/mine`.
+    """,
+    epilog="A run that was interrupted continues with the same command after its last finished view or scene.",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+app.command()(demo)
+app.command()(run)
+app.command()(convert)
+app.add_typer(study, name="study")
+
+
+def main() -> None:
+    """Entry point: errors that the user can mend are one line, without a traceback."""
+    try:
+        app()
+    except InputError as error:
+        typer.echo(f"error: {error}", err=True)
+        sys.exit(2)

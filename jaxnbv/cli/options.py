@@ -1,0 +1,84 @@
+"""What the commands' options mean, and what they do before they begin."""
+
+import os
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import platformdirs
+import typer
+
+from jaxnbv.checks import InputError
+from jaxnbv.datasets import Framing
+
+
+class Task(StrEnum):
+    """What the views are for."""
+
+    CROSS_ENTROPY = "cross-entropy"
+    ENTROPY = "entropy"
+    MIXED = "mixed"
+    COVERAGE = "coverage"
+
+
+class SearchName(StrEnum):
+    """How the next view is found."""
+
+    DISCRETE = "discrete"
+    FARTHEST = "farthest"
+    RANDOM = "random"
+    UNCERTAINTY = "uncertainty"
+
+
+class Device(StrEnum):
+    """Where the computation runs."""
+
+    AUTO = "auto"
+    CPU = "cpu"
+    GPU = "gpu"
+
+
+TaskOption = Annotated[
+    Task,
+    typer.Option(
+        help="What the views are for: coverage is the object's shape; the others its class, by expected cross-entropy, "
+        "by expected reduction of entropy, or by cross-entropy until the entropy falls to 0.75."
+    ),
+]
+SearchOption = Annotated[
+    SearchName,
+    typer.Option(
+        help="How the next view is found: discrete is the expected value of the task over 120 candidates; "
+        "farthest, random and uncertainty are the paper's baselines over the same candidates."
+    ),
+]
+ViewsOption = Annotated[int, typer.Option(help="Views in all, the first one included.")]
+SeedOption = Annotated[
+    int, typer.Option(min=0, max=2**63 - 1, help="Seed of the sensor's noise and of the posterior samples.")
+]
+OutOption = Annotated[Path | None, typer.Option(help="Output folder.", show_default="runs/NAME-SEARCH")]
+NoiseOption = Annotated[float, typer.Option(help="Standard deviation of the sensor's noise on points and normals.")]
+QuickOption = Annotated[
+    bool, typer.Option("--quick", help="Small settings, for a first look in under a minute; not the paper's.")
+]
+ReportOption = Annotated[bool, typer.Option("--report/--no-report", help="Write report.html and the figures.")]
+DeviceOption = Annotated[Device, typer.Option(help="Where to compute; auto takes a GPU if JAX sees one.")]
+FramingOption = Annotated[
+    Framing,
+    typer.Option(help="How large the object stands: its longest side 2.5, a view shows a patch; or 1.25, and it fits."),
+]
+
+
+def prepare(device: Device) -> None:
+    """Choose the device and keep compiled programs for later runs."""
+    if device is not Device.AUTO:
+        try:
+            jax.config.update("jax_default_device", jax.devices(device.value)[0])
+        except RuntimeError as error:
+            raise InputError(
+                f"no {device.value} that JAX can use ({error}): leave --device out, or install the extra named cuda"
+            ) from error
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        jax.config.update("jax_compilation_cache_dir", str(platformdirs.user_cache_path("jaxnbv") / "xla"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)

@@ -1,0 +1,186 @@
+"""`jaxnbv demo` and `jaxnbv run MESH`: one episode."""
+
+import re
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import numpy as np
+import typer
+
+from jaxnbv.acquisition import ExpectedUtilityImprovement, Score
+from jaxnbv.camera import Camera, Pose, look_at
+from jaxnbv.checks import InputError, require
+from jaxnbv.cli.options import (
+    DeviceOption,
+    Device,
+    FramingOption,
+    NoiseOption,
+    OutOption,
+    QuickOption,
+    ReportOption,
+    SearchName,
+    SearchOption,
+    SeedOption,
+    Task,
+    TaskOption,
+    ViewsOption,
+    prepare,
+)
+from jaxnbv.datasets import PATTERNS, Framing, Split, demo_object, hidden_view, pyramid_scene
+from jaxnbv.episode import Episode, simulate
+from jaxnbv.networks import CloudClassifier, load_checkpoint, pyramid_classifier
+from jaxnbv.planner import Planner
+from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, Surface, load_mesh
+from jaxnbv.search import DiscreteSearch, FarthestView, RandomView, Search, UncertaintyView
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Classifier, Coverage, CrossEntropy, MixedEntropy, NegativeEntropy
+from jaxnbv.tasks.classification import class_names, predict
+from jaxnbv.viz import write_report
+
+SEARCHES: dict[SearchName, Callable[..., Search]] = {
+    SearchName.DISCRETE: DiscreteSearch,
+    SearchName.FARTHEST: FarthestView,
+    SearchName.RANDOM: RandomView,
+    SearchName.UNCERTAINTY: UncertaintyView,
+}
+
+FirstOption = Annotated[
+    str, typer.Option(help="Position of the first camera, x,y,z in scene units; it looks at the origin.")
+]
+
+
+def demo(
+    task: TaskOption = Task.CROSS_ENTROPY,
+    search: SearchOption = SearchName.DISCRETE,
+    views: ViewsOption = 5,
+    scene: Annotated[int, typer.Option(min=0, help="Which pyramid of the test split.")] = 0,
+    framing: FramingOption = Framing.WHOLE,
+    seed: SeedOption = 0,
+    out: OutOption = None,
+    noise: NoiseOption = 0.01,
+    quick: QuickOption = False,
+    report: ReportOption = True,
+    device: DeviceOption = Device.AUTO,
+) -> None:
+    """Find out which pattern is pressed into the base of a pyramid: no file, no network.
+
+    The first view does not show the pattern. With --task coverage the object is a laid tea mug, to be seen all round.
+    """
+    prepare(device)
+    if task is Task.COVERAGE:
+        planner = _planner(Coverage(), search, quick)
+        _run("mug", demo_object(), planner, look_at([0.8, 0.9, 2.2]), views, seed, out, noise, quick, report)
+        return
+    pyramid = pyramid_scene(Split.TEST, scene, framing)
+    planner = _planner(_score(task, pyramid_classifier(framing.longest_side)), search, quick, framing)
+    typer.echo(f"the pattern is a {PATTERNS[int(pyramid.label)]}; the first view does not show it")
+    first = hidden_view(pyramid, jax.random.key(seed))
+    _run("pyramid", SDFSurface(pyramid), planner, first, views, seed, out, noise, quick, report)
+
+
+def run(
+    mesh: Annotated[
+        Path, typer.Argument(metavar="MESH", help="Any mesh that trimesh reads: OBJ, PLY, STL, OFF, glTF, ...")
+    ],
+    task: TaskOption = Task.COVERAGE,
+    network: Annotated[
+        Path | None,
+        typer.Option(help="A PointNet++ classifier, .pth or .safetensors, for the tasks that are about the class."),
+    ] = None,
+    search: SearchOption = SearchName.DISCRETE,
+    views: ViewsOption = 5,
+    first: FirstOption = "0.8,0.9,2.2",
+    seed: SeedOption = 0,
+    out: OutOption = None,
+    noise: NoiseOption = 0.01,
+    quick: QuickOption = False,
+    report: ReportOption = True,
+    device: DeviceOption = Device.AUTO,
+) -> None:
+    """Choose views of a mesh, scanned by a simulated depth camera.
+
+    The mesh may be open, a soup of triangles or inconsistently wound. It is scaled and centred so that its longest side
+    is 2.5 scene units; cameras stand 2.5 from its centre.
+    """
+    prepare(device)
+    require(
+        (network is None) == (task is Task.COVERAGE),
+        f"--task {task} with --network {network}: the tasks about the class need a network, coverage takes none",
+    )
+    score = Coverage() if network is None else _score(task, CloudClassifier(load_checkpoint(network), scale=0.8))
+    scene = load_mesh(mesh)
+    planner = _planner(score, search, quick)
+    _run(mesh.stem, scene, planner, look_at(_position(first)), views, seed, out, noise, quick, report)
+
+
+def _score(task: Task, classifier: Classifier) -> Score:
+    if task is Task.ENTROPY:
+        return ExpectedUtilityImprovement(NegativeEntropy(classifier), num_points=1024)
+    return CrossEntropy(classifier) if task is Task.CROSS_ENTROPY else MixedEntropy(classifier)
+
+
+def _planner(score: Score, search: SearchName, quick: bool, framing: Framing = Framing.CLOSE_UP) -> Planner:
+    half_extent = 0.7 * framing.longest_side
+    if not quick:
+        return Planner(GeometricSPSR(), Camera(), score, SEARCHES[search](), grid=Grid(100, half_extent))
+    model = GeometricSPSR(lengthscale=0.012, truncation=24)
+    camera = Camera(height=24, width=24)
+    return Planner(model, camera, score, SEARCHES[search](num_candidates=40), 4, Grid(56, half_extent), capacity=2048)
+
+
+def _run(
+    name: str,
+    scene: Surface,
+    planner: Planner,
+    first: Pose,
+    views: int,
+    seed: int,
+    out: Path | None,
+    noise: float,
+    quick: bool,
+    report: bool,
+) -> None:
+    start = time.perf_counter()
+    search = next(name for name, kind in SEARCHES.items() if isinstance(planner.search, kind))
+    folder = out or Path("runs") / f"{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}-{search}"
+    if quick:
+        typer.echo("--quick: small settings; leave it out for the paper's.")
+    episode = simulate(planner, scene, first, views, jax.random.key(seed), SensorNoise(noise, noise), folder)
+    _summarise(episode)
+    if report:
+        typer.echo(f"report   {write_report(episode, folder, title=name)}")
+    typer.echo(f"episode  {folder}   ({time.perf_counter() - start:.0f} s)")
+
+
+def _position(text: str) -> tuple[float, float, float]:
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise InputError(f"--first is {text!r}; give three numbers such as 0.8,0.9,2.2") from error
+    require(bool(np.isfinite([x, y, z]).all()), f"--first is {text!r}; its numbers must be finite")
+    return x, y, z
+
+
+def _summarise(episode: Episode) -> None:
+    """Lines for each view: where from, why, and what it told."""
+    score = episode.planner.acquisition
+    before = None
+    for index, view in enumerate(episode.views, start=1):
+        position = ", ".join(f"{value:+.2f}" for value in np.asarray(view.pose.position))
+        line = f"view {index}   from ({position})   {int(view.scan.count):5d} points, {int(view.cloud.count):5d} kept"
+        if view.proposal is not None:
+            values = np.asarray(view.proposal.values)
+            values = values[np.isfinite(values)]
+            line += f"   value {float(view.proposal.value):.4g}, best of {len(values)} (median {np.median(values):.4g})"
+        typer.echo(line)
+        log_p = predict(score, view.cloud)
+        if log_p is not None:
+            after = np.exp(np.asarray(log_p))
+            names = class_names(score) or tuple(str(number) for number in range(len(after)))
+            shown = sorted(np.argsort(-after)[:5])
+            changes = (f"{names[c]} {'' if before is None else f'{before[c]:.2f} -> '}{after[c]:.2f}" for c in shown)
+            typer.echo(f"         {'   '.join(changes)}")
+            before = after

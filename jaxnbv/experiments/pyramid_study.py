@@ -1,0 +1,292 @@
+"""The study of the synthetic pyramid: same scenes, first cameras, candidates and noise for all methods."""
+
+import time
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy.stats import spearmanr
+
+from jaxnbv.acquisition import expected_score
+from jaxnbv.camera import Camera, Pose
+from jaxnbv.checks import require
+from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
+from jaxnbv.datasets import Framing, Split, pyramid_scene
+from jaxnbv.planner import Planner, State
+from jaxnbv.scanning import Grid, GridSurface, SDFSurface, SensorNoise, scan
+from jaxnbv.search import DiscreteSearch, Problem
+from jaxnbv.search.base import sphere_candidates
+from jaxnbv.search.baselines import uncertain_length
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Coverage
+from jaxnbv.tasks.classification import Classifier, cross_entropy, entropy
+
+METHODS = ("cross-entropy", "entropy", "mixed", "coverage", "farthest", "uncertainty", "random", "oracle")
+_CLASSIFYING = ("cross-entropy", "entropy", "mixed")
+_RANDOM_RUNS = 4
+_MIXED_THRESHOLD = 0.75
+# A hit nearer to the sensor than this, of the 2.5 to the origin, lies in front of the object's box.
+_NEAR = 1.0
+
+
+class PyramidStudy(eqx.Module):
+    """What all scenes of a study share.
+
+    - `classifier`: of clouds in scene coordinates.
+    - `framing`: how large the object stands before the sensor.
+    - `split`: which scenes; tune on those of the validation split.
+    - `views`: in all, the first included.
+    - `num_candidates`: on the sphere of radius 2.5.
+    - `num_samples`, `model`, `grid_resolution`, `capacity`: of the planner.
+    - `num_points`: D is thinned to so many, once a step, for the classifier.
+    """
+
+    classifier: Classifier
+    framing: Framing = eqx.field(static=True)
+    split: Split = eqx.field(static=True, default=Split.TEST)
+    views: int = eqx.field(static=True, default=5)
+    num_candidates: int = eqx.field(static=True, default=120)
+    num_samples: int = eqx.field(static=True, default=16)
+    model: GeometricSPSR = GeometricSPSR(lengthscale=0.01, truncation=32)
+    grid_resolution: int = eqx.field(static=True, default=64)
+    capacity: int = eqx.field(static=True, default=4096)
+    num_points: int = eqx.field(static=True, default=1024)
+
+    def __check_init__(self):
+        require(
+            2 <= self.views <= self.num_candidates,
+            f"the study has {self.views} views of {self.num_candidates} candidates; ask for at least two views, and "
+            "for as many candidates",
+        )
+
+    @property
+    def planner(self) -> Planner:
+        """The grid keeps its proportion to the object in both framings."""
+        grid = Grid(self.grid_resolution, 0.7 * self.framing.longest_side)
+        return Planner(self.model, Camera(), Coverage(), DiscreteSearch(), self.num_samples, grid, self.capacity)
+
+
+def run_scene(study: PyramidStudy, index: int, methods: Sequence[str] = METHODS) -> dict:
+    """One scene with every method: the record that the tables and figures are made of."""
+    return _Scene(study, index).record(methods)
+
+
+class _Truth(eqx.Module):
+    """What each candidate would truly show: scans with noise, and how many rays hit the pattern."""
+
+    scans: PointCloud
+    pattern_pixels: Int[Array, " candidates"]
+    angles: Float[Array, " candidates"]
+    label: Int[Array, ""]
+
+
+class _Scene:
+    """One scene under study; what methods have in common is computed once."""
+
+    def __init__(self, study: PyramidStudy, index: int):
+        self.study, self.index, self.planner = study, index, study.planner
+        self.poses = sphere_candidates(study.num_candidates, 2.5)
+        self.truth = _truth(self.poses, jnp.asarray(index), study.split, study.framing)
+        self.pattern_pixels = np.asarray(self.truth.pattern_pixels)
+        self.key = jax.random.fold_in(jax.random.key(2), index)
+        self.first = self._first_view()
+        self.states: dict[tuple[int, ...], State] = {}
+        self.answers: dict[tuple[int, ...], np.ndarray] = {}
+        self.values: dict[tuple[int, ...], dict[str, np.ndarray]] = {}
+        self.diagnostics: list[dict] = []
+
+    def record(self, methods: Sequence[str]) -> dict:
+        start = time.perf_counter()
+        first = (self.first,)
+        runs: dict[str, list[tuple[int, ...]]] = {method: [first] for method in methods}
+        if "random" in runs:
+            runs["random"] = [self._random_run(run) for run in range(_RANDOM_RUNS)]
+        for view in range(2, self.study.views + 1):
+            together: dict[tuple[int, ...], list[str]] = {}
+            for method in methods:
+                if method != "random":
+                    together.setdefault(runs[method][0], []).append(method)
+            for visited, group in together.items():
+                values = self._acquisitions(visited, group, view)
+                for method in group:
+                    runs[method] = [(*visited, int(np.argmax(_without(values[method], visited))))]
+        correct = self._answers_to_truth(first).argmax(axis=1) == int(self.truth.label)
+        unvisited = np.arange(len(correct)) != self.first
+        return {
+            "scene": self.index,
+            "framing": self.study.framing.value,
+            "label": int(self.truth.label),
+            "first": self.first,
+            "angle": float(self.truth.angles[self.first]),
+            "pattern_pixels": self.pattern_pixels.tolist(),
+            "random_hit": float(np.mean(correct[unvisited])),
+            "methods": {name: {"runs": [self._run(visited) for visited in of]} for name, of in runs.items()},
+            "diagnostics": self.diagnostics,
+            "seconds": time.perf_counter() - start,
+        }
+
+    def _run(self, visited: tuple[int, ...]) -> dict:
+        log_p = [self._classify(visited[:count]).tolist() for count in range(1, len(visited) + 1)]
+        pixels = self.pattern_pixels[list(visited)].tolist()
+        return {"candidates": list(visited), "pattern_pixels": pixels, "log_p": log_p}
+
+    def _first_view(self) -> int:
+        hidden = np.flatnonzero((self.pattern_pixels == 0) & (np.asarray(self.truth.scans.count) > 0))
+        require(len(hidden) > 0, f"the pattern of scene {self.index} shows from all candidates: ask for more of them")
+        return int(jax.random.choice(jax.random.fold_in(self.key, 0), hidden))
+
+    def _random_run(self, run: int) -> tuple[int, ...]:
+        others = np.delete(np.arange(self.study.num_candidates), self.first)
+        key = jax.random.fold_in(jax.random.fold_in(self.key, 1), run)
+        chosen = jax.random.choice(key, others, (self.study.views - 1,), replace=False)
+        return (self.first, *(int(index) for index in chosen))
+
+    def _state(self, visited: tuple[int, ...]) -> State:
+        if visited not in self.states:
+            *before, last = visited
+            pose, seen = self.poses[last], self.truth.scans[last]
+            self.states[visited] = (
+                self.planner.observe(self._state(tuple(before)), pose, seen) if before else self.planner.init(seen, pose)
+            )
+        return self.states[visited]
+
+    def _classify(self, visited: tuple[int, ...]) -> np.ndarray:
+        if visited not in self.answers:
+            thinned = _thin(self._state(visited).cloud, self.study.num_points)
+            self.answers[visited] = np.asarray(_classify(self.study.classifier, thinned))
+        return self.answers[visited]
+
+    def _answers_to_truth(self, visited: tuple[int, ...]) -> np.ndarray:
+        """log p given D and each candidate's true scan."""
+        thinned = _thin(self._state(visited).cloud, self.study.num_points)
+        return np.asarray(_answers(self.study.classifier, thinned, self.truth.scans))
+
+    def _acquisitions(self, visited: tuple[int, ...], methods: Sequence[str], view: int) -> dict[str, np.ndarray]:
+        """Every method's values of all candidates, from one set of posterior samples."""
+        state, camera = self._state(visited), self.planner.camera
+        log_p = self._classify(visited)
+        values: dict[str, np.ndarray] = {}
+        if "farthest" in methods:
+            values["farthest"] = np.asarray(self._problem(state, None).distance_to_visited(self.poses))
+        if "oracle" in methods:
+            values["oracle"] = np.asarray(cross_entropy(jnp.asarray(log_p), self._answers_to_truth(visited)))
+        if not {*_CLASSIFYING, "coverage", "uncertainty"} & {*methods}:
+            return values
+        surfaces = self.planner.sample_surfaces(state, jax.random.fold_in(jax.random.fold_in(self.key, 2), view))
+        near = None
+        if {*_CLASSIFYING} & {*methods}:
+            thinned = _thin(state.cloud, self.study.num_points)
+            log_q, near = _imagined_answers(self.study.classifier, thinned, surfaces, camera, self.poses)
+            values |= _classification_values(jnp.asarray(log_p), log_q)
+        if "coverage" in methods:
+            values["coverage"] = np.asarray(_coverage(state.cloud, surfaces, camera, self.poses))
+        if "uncertainty" in methods:
+            values["uncertainty"] = np.asarray(_uncertainty(self._problem(state, surfaces), self.poses))
+        self.diagnostics.append(
+            {
+                "view": view,
+                "methods": list(methods),
+                "roughness": self._roughness(state, surfaces),
+                "near_sensor": None if near is None else float(near),
+                "rank_correlation": {name: self._rank_correlation(values[name], visited) for name in values},
+            }
+        )
+        return values
+
+    def _problem(self, state: State, surfaces: GridSurface | None) -> Problem:
+        return Problem(state.cloud, state.poses, state.num_views, self.planner.camera, Coverage(), surfaces)
+
+    def _roughness(self, state: State, surfaces: GridSurface) -> float:
+        mean = _mean_values(self.planner, state.cloud)
+        crossed = [_crossed_cells(values) for values in np.asarray(surfaces.values)]
+        return float(np.mean(crossed)) / max(_crossed_cells(np.asarray(mean)), 1)
+
+    def _rank_correlation(self, values: np.ndarray, visited: tuple[int, ...]) -> float | None:
+        """Spearman's, over the candidates not visited; None where either does not vary."""
+        rest = np.delete(np.arange(len(values)), visited)
+        a, b = values[rest], self.pattern_pixels[rest]
+        return None if np.ptp(a) == 0 or np.ptp(b) == 0 else float(spearmanr(a, b).statistic)
+
+
+def _without(values: np.ndarray, visited: tuple[int, ...]) -> np.ndarray:
+    values = np.array(values, dtype=np.float64)
+    values[list(visited)] = -np.inf
+    return values
+
+
+def _crossed_cells(values: np.ndarray) -> int:
+    inside = values < 0
+    size = inside.shape[0] - 1
+    corners = [inside[i : i + size, j : j + size, k : k + size] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    return int(np.sum(np.any(corners, axis=0) & ~np.all(corners, axis=0)))
+
+
+@eqx.filter_jit
+def _truth(poses: Pose, index: Int[Array, ""], split: Split, framing: Framing) -> _Truth:
+    pyramid = pyramid_scene(split, index, framing)
+    scans = scan(SDFSurface(pyramid), Camera(), poses)
+    pixels = jnp.sum(pyramid.on_pattern(scans.points) & scans.mask, axis=-1)
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(3), index), len(pixels))
+    direction = poses.position / jnp.linalg.norm(poses.position, axis=-1, keepdims=True)
+    # The base looks along -z of the pyramid's own frame.
+    angles = jnp.degrees(jnp.arccos(jnp.clip(-direction @ pyramid.rotation[:, 2], -1.0, 1.0)))
+    return _Truth(jax.vmap(SensorNoise())(scans, keys), pixels, angles, pyramid.label)
+
+
+@eqx.filter_jit
+def _thin(cloud: PointCloud, count: int) -> PointCloud:
+    return limit_capacity(cloud, count)
+
+
+@eqx.filter_jit
+def _classify(classifier: Classifier, cloud: PointCloud) -> Float[Array, " classes"]:
+    return classifier(cloud)
+
+
+@eqx.filter_jit
+def _answers(classifier: Classifier, cloud: PointCloud, scans: PointCloud) -> Float[Array, "scans classes"]:
+    return jax.lax.map(lambda one: classifier(concatenate(cloud, one)), scans)
+
+
+@eqx.filter_jit
+def _imagined_answers(
+    classifier: Classifier, cloud: PointCloud, surfaces: GridSurface, camera: Camera, poses: Pose
+) -> tuple[Float[Array, "samples poses classes"], Float[Array, ""]]:
+    """log p given D and each imagined scan, and the share of imagined hits near the sensor."""
+
+    def of_sample(surface):
+        scans = scan(surface, camera, poses)
+        depth = jnp.linalg.norm(scans.points - poses.position[:, None], axis=-1)
+        near = jnp.sum(scans.mask & (depth < _NEAR)) / jnp.maximum(jnp.sum(scans.mask), 1)
+        return _answers(classifier, cloud, scans), near
+
+    log_q, near = jax.lax.map(of_sample, surfaces)
+    return log_q, jnp.mean(near)
+
+
+def _classification_values(log_p: Float[Array, " classes"], log_q: Float[Array, "s c classes"]) -> dict[str, np.ndarray]:
+    """`CrossEntropy`, `ExpectedUtilityImprovement(NegativeEntropy)` and `MixedEntropy` of the same answers."""
+    cross = jnp.mean(cross_entropy(jnp.broadcast_to(log_p, log_q.shape), log_q), axis=0)
+    reduction = jnp.mean(jnp.maximum(0.0, entropy(log_p) - entropy(log_q)), axis=0)
+    mixed = cross if float(entropy(log_p)) > _MIXED_THRESHOLD else reduction
+    return {"cross-entropy": np.asarray(cross), "entropy": np.asarray(reduction), "mixed": np.asarray(mixed)}
+
+
+@eqx.filter_jit
+def _coverage(cloud: PointCloud, surfaces: GridSurface, camera: Camera, poses: Pose) -> Float[Array, " poses"]:
+    return expected_score(Coverage(), cloud, surfaces, camera, poses)
+
+
+@eqx.filter_jit
+def _uncertainty(problem: Problem, poses: Pose) -> Float[Array, " poses"]:
+    return uncertain_length(problem, poses)
+
+
+@eqx.filter_jit
+def _mean_values(planner: Planner, cloud: PointCloud) -> Float[Array, "g g g"]:
+    """E f minus its level on the planner's grid."""
+    posterior = planner.model.condition(cloud)
+    return posterior.mean_field.on_grid(planner.grid.axis)[0] - posterior.level

@@ -1,0 +1,53 @@
+"""Results of a study on disk: one JSON record a scene, so that a study that was interrupted goes on with the next."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from jaxnbv.checks import InputError, require
+from jaxnbv.storage import differences, write_whole
+
+
+class RecordFolder:
+    """A folder of records that belong to one configuration, kept beside them in study.json.
+
+    **Raises:** `ValueError` if the folder cannot be made or holds records of another configuration.
+    """
+
+    def __init__(self, path: str | Path, config: dict[str, Any]):
+        self.path = Path(path)
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"cannot make the output folder {self.path} ({error}): choose another place") from error
+        file = self.path / "study.json"
+        if not file.exists():
+            write_whole(file, lambda out: out.write(json.dumps(config, indent=2).encode()))
+            return
+        changed = differences(_read(file), json.loads(json.dumps(config)))
+        require(
+            not changed,
+            f"the output folder {self.path} belongs to another study; it differs in {'; '.join(changed[:3])}. "
+            "Choose another folder, or the settings it was made with",
+        )
+
+    def collect(self, count: int, run: Callable[[int], dict[str, Any]], progress: bool = True) -> list[dict[str, Any]]:
+        """Records 0 to `count` - 1: those on disk as they are, the others from `run`, each written once it is done."""
+        records = []
+        for index in tqdm(range(count), desc=self.path.name, unit="scene", disable=not progress):
+            file = self.path / f"scene_{index:04d}.json"
+            if not file.exists():
+                text = json.dumps(run(index)).encode()
+                write_whole(file, lambda out, text=text: out.write(text))
+            records.append(_read(file))
+        return records
+
+
+def _read(file: Path) -> Any:
+    try:
+        return json.loads(file.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{file} is damaged ({error}): delete it, and it is made again") from error

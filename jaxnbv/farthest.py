@@ -1,0 +1,47 @@
+"""Farthest point sampling of the rows of a point set (Eldar et al. 1997)."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnbv.checks import require
+
+
+@functools.partial(jax.jit, static_argnames="count")
+def farthest_point_indices(points: Float[Array, "n 3"], mask: Bool[Array, " n"], count: int) -> Int[Array, " count"]:
+    """`count` rows, each as far as can be from those before it, in order of choice; of equals, the first.
+
+    Starts at the first filled row. No row is chosen twice while another that is filled is left, duplicates included;
+    a cloud of fewer points than `count` gives each of them, then its first filled row again and again. The indices
+    carry no derivative; points get theirs through `points[indices]`.
+
+    **Raises:** `ValueError` if `count` < 1.
+    """
+    require(count >= 1, f"cannot choose {count} points; ask for at least one")
+    x, y, z = jax.lax.stop_gradient(jnp.where(mask[:, None], points, 0.0)).T
+    rows = jnp.arange(len(x), dtype=jnp.int32)
+
+    def choose(carry, _):
+        distance, latest = carry
+        nearer = jnp.minimum(distance, (x - x[latest]) ** 2 + (y - y[latest]) ** 2 + (z - z[latest]) ** 2)
+        distance = jnp.where(rows == latest, _CHOSEN, nearer)
+        return (distance, _first_of_largest(distance, rows)), latest
+
+    start = jnp.where(mask, jnp.inf, jnp.full_like(x, _EMPTY)), jnp.argmax(mask).astype(jnp.int32)
+    return jax.lax.scan(choose, start, length=count)[1]
+
+
+# In place of a distance. The bits of -2.0, as an integer, are greater than those of -1.0, and less than any distance's.
+_CHOSEN, _EMPTY = -2.0, -1.0
+
+
+def _first_of_largest(distance: Float[Array, " n"], rows: Int[Array, " n"]) -> Int[Array, ""]:
+    """argmax in the order of the numbers' bits.
+
+    That is the order of floats that are not negative; and a maximum of integers, then a minimum of rows, runs several
+    times as fast on a CPU as `jnp.argmax`.
+    """
+    bits = jax.lax.bitcast_convert_type(distance, jnp.dtype(f"int{8 * distance.dtype.itemsize}"))
+    return jnp.min(jnp.where(bits == jnp.max(bits), rows, len(rows)))

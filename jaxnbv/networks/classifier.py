@@ -1,0 +1,35 @@
+"""From a network on arrays to the classifier of clouds that the acquisitions take."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxnbv.checks import require
+from jaxnbv.cloud import PointCloud, farthest_point_subsample
+
+
+class CloudClassifier(eqx.Module):
+    """A network as a function from a `PointCloud` to log-probabilities.
+
+    - `network`: called as `network(points, normals, mask)`.
+    - `num_points`: what it is fed, by farthest point sampling; a smaller cloud is fed as it is, masked.
+    - `scale`: network units per scene unit.
+    - `classes`: their names, where known.
+    """
+
+    network: Callable[..., Float[Array, " classes"]]
+    num_points: int = eqx.field(static=True, default=1024)
+    scale: float = eqx.field(static=True, default=1.0)
+    classes: tuple[str, ...] | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        require(self.num_points >= 1, f"num_points is {self.num_points}; the network needs at least one")
+        require(self.scale > 0, f"the scale is {self.scale}; it must be positive")
+
+    def __call__(self, cloud: PointCloud) -> Float[Array, " classes"]:
+        """Log-probabilities of the classes of one cloud in scene coordinates."""
+        fed = farthest_point_subsample(cloud, self.num_points)
+        return self.network(self.scale * fed.points, fed.normals, fed.mask)

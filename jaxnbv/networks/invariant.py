@@ -1,0 +1,81 @@
+"""A small classifier that does not depend on how the object is turned."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from jaxnbv.networks.grouping import ball_query, farthest_point_indices
+
+_POOLED = 160
+
+
+class InvariantClassifier(eqx.Module):
+    """PointNet++ on point-pair features, which rotations and translations leave as they are.
+
+    A pair of oriented points enters as (|d|^2, n_i . d, n_j . d, n_i . n_j) with d = (x_j - x_i) / radius: the
+    point-pair features of Drost et al. (2010) without their square root and arc cosines, so that derivatives are
+    defined everywhere. Two levels of grouping, at the scale of an edge and at that of a pattern, and a maximum over all
+    groups; about 45,000 parameters.
+
+    - `radii`: of the two levels, in the units of the points.
+    - `temperature`: divides the logits; above 1 it makes an over-confident network more careful (Guo et al. 2017).
+    """
+
+    edge: "_Level"
+    pattern: "_Level"
+    head: tuple[eqx.nn.Linear, ...]
+    temperature: Float[Array, ""]
+
+    def __init__(self, num_classes: int, key: PRNGKeyArray, radii: tuple[float, float] = (0.25, 0.8)):
+        edge_key, pattern_key, first_key, last_key = jax.random.split(key, 4)
+        self.edge = _Level(0, 32, 64, radii[0], 256, 24, edge_key)
+        self.pattern = _Level(64, 96, _POOLED, radii[1], 64, 48, pattern_key)
+        self.head = (eqx.nn.Linear(_POOLED, 128, key=first_key), eqx.nn.Linear(128, num_classes, key=last_key))
+        self.temperature = jnp.asarray(1.0)
+
+    def __call__(
+        self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None = None
+    ) -> Float[Array, " classes"]:
+        """Log-probabilities of the classes; the normals are unit. Masked rows do not matter."""
+        mask = jnp.ones(len(points), bool) if mask is None else mask
+        # In farthest point order the first rows are themselves farthest point samples of all.
+        order = farthest_point_indices(points, mask, self.edge.groups)
+        centers = points[order], normals[order]
+        edges = self.edge(centers, (points, normals, None), mask)
+        coarse = tuple(array[: self.pattern.groups] for array in centers)
+        patterns = self.pattern(coarse, (*centers, edges), jnp.ones(len(order), bool))
+        pooled = jnp.where(jnp.any(mask), jnp.max(patterns, axis=0), 0.0)
+        hidden, output = self.head
+        return jax.nn.log_softmax(output(jax.nn.relu(hidden(pooled))) / self.temperature)
+
+
+class _Level(eqx.Module):
+    """One level of grouping: pair features and the neighbours' features through a perceptron, then the maximum."""
+
+    pair: eqx.nn.Linear
+    feature: eqx.nn.Linear | None
+    output: eqx.nn.Linear
+    radius: float = eqx.field(static=True)
+    groups: int = eqx.field(static=True)
+    neighbours: int = eqx.field(static=True)
+
+    def __init__(self, inputs, width, outputs, radius, groups, neighbours, key):
+        pair_key, feature_key, output_key = jax.random.split(key, 3)
+        self.pair = eqx.nn.Linear(4, width, key=pair_key)
+        self.feature = eqx.nn.Linear(inputs, width, use_bias=False, key=feature_key) if inputs else None
+        self.output = eqx.nn.Linear(width, outputs, key=output_key)
+        self.radius, self.groups, self.neighbours = radius, groups, neighbours
+
+    def __call__(self, centers, neighbourhood, mask):
+        points, normals, features = neighbourhood
+        index = ball_query(centers[0], points, mask, self.radius, self.neighbours)
+        d = (points[index] - centers[0][:, None]) / self.radius
+        here, there = centers[1][:, None], normals[index]
+        pairs = jnp.stack([jnp.sum(a * b, axis=-1) for a, b in ((d, d), (here, d), (there, d), (here, there))], axis=-1)
+        hidden = pairs.reshape(-1, 4) @ self.pair.weight.T + self.pair.bias
+        if self.feature is not None:
+            # Linear, so the features meet their weights once a point rather than once a pair.
+            hidden = hidden + (features @ self.feature.weight.T)[index].reshape(hidden.shape)
+        output = jax.nn.relu(hidden) @ self.output.weight.T + self.output.bias
+        return jax.nn.relu(jnp.max(output.reshape(*index.shape, -1), axis=1))

@@ -1,0 +1,62 @@
+"""The classifier that ships with jaxnbv; `scripts/train_pyramid.py` makes its weights."""
+
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from jaxnbv.checks import InputError, require
+from jaxnbv.networks.classifier import CloudClassifier
+from jaxnbv.networks.invariant import InvariantClassifier
+
+# Longest side of the box of a training object, in the network's units.
+TRAINED_SIDE = 2.5
+
+
+def pyramid_classifier(longest_side: float = TRAINED_SIDE) -> CloudClassifier:
+    """The shipped classifier of synthetic pyramids whose box has this longest side, in scene units.
+
+    **Raises:** `ValueError` if `longest_side` is not positive.
+    """
+    require(longest_side > 0, f"the longest side is {longest_side}; it must be positive")
+    with resources.as_file(resources.files("jaxnbv.networks") / "weights" / "pyramid.safetensors") as path:
+        network, classes = load_invariant(path)
+    return CloudClassifier(network, scale=TRAINED_SIDE / longest_side, classes=classes)
+
+
+def save_invariant(network: InvariantClassifier, classes: tuple[str, ...], path: str | Path) -> None:
+    """Write the network's arrays and the names of its classes as a safetensors file."""
+    tensors = {name: np.asarray(leaf) for name, leaf in _named(network)}
+    Path(path).write_bytes(safetensors.numpy.save(tensors, {"classes": ",".join(classes)}))
+
+
+def load_invariant(path: str | Path) -> tuple[InvariantClassifier, tuple[str, ...]]:
+    """The network that `save_invariant` wrote, and the names of its classes.
+
+    **Raises:** `ValueError` for a file that is missing, damaged or of another network.
+    """
+    require(Path(path).is_file(), f"there is no file {path}: give the path of a safetensors file")
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            classes = tuple((file.metadata() or {})["classes"].split(","))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (safetensors.SafetensorError, OSError, KeyError) as error:
+        raise InputError(f"{path} is damaged or holds another network ({error}): write it again") from error
+    blank = eqx.filter_eval_shape(InvariantClassifier, len(classes), jax.random.key(0))
+    names = [name for name, _ in _named(blank)]
+    expected = {name: leaf.shape for name, leaf in _named(blank)}
+    found = {name: array.shape for name, array in tensors.items()}
+    require(expected == found, f"{path} holds another network: its arrays are {found}, expected {expected}")
+    leaves = [jnp.asarray(tensors[name], jnp.result_type(float)) for name in names]
+    return jax.tree.unflatten(jax.tree.structure(blank), leaves), classes
+
+
+def _named(network) -> list[tuple[str, Any]]:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(network)
+    return [(jax.tree_util.keystr(path, simple=True, separator="."), leaf) for path, leaf in leaves]

@@ -1,0 +1,235 @@
+"""The tensors of a PyTorch file, read without PyTorch and without running anything that the file asks for.
+
+A `.pth` file is a pickle, that is, a program, beside the raw bytes of its arrays. Here the program may build
+dictionaries, numbers, strings and tensors; every other name in it is refused. Two layouts are read: the zip archive
+written since PyTorch 1.6 (`data.pkl`, `data/0`, `data/1`, ...), and the older stream of pickles followed by the arrays.
+"""
+
+import io
+import math
+import pickle
+import struct
+import zipfile
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnbv.checks import InputError, require
+
+_STORAGES = {
+    "DoubleStorage": np.dtype("f8"),
+    "FloatStorage": np.dtype("f4"),
+    "HalfStorage": np.dtype("f2"),
+    "BFloat16Storage": np.dtype(jnp.bfloat16),
+    "LongStorage": np.dtype("i8"),
+    "IntStorage": np.dtype("i4"),
+    "ShortStorage": np.dtype("i2"),
+    "CharStorage": np.dtype("i1"),
+    "ByteStorage": np.dtype("u1"),
+    "BoolStorage": np.dtype("?"),
+}
+_STREAM_MAGIC = 0x1950A86A20F9469CFC6C
+_STREAM_PROTOCOL = 1001
+_STATE_NAMES = ("model_state_dict", "state_dict")
+
+
+def read_torch_tensors(path: str | Path) -> dict[str, np.ndarray]:
+    """The model's tensors by name, read-only, from a file made by `torch.save`.
+
+    The file holds a state dictionary, or a training checkpoint with one under `model_state_dict` or `state_dict`. The
+    prefix `module.` of models trained on several devices is dropped.
+
+    **Raises:** `ValueError` for a file that is missing, damaged, not PyTorch's, without a state dictionary, or that
+    asks for anything but tensors and plain values.
+    """
+    path = Path(path)
+    require(path.is_file(), f"there is no file {path}: give the path of a PyTorch checkpoint")
+    try:
+        with path.open("rb") as file:
+            content = _read_archive(file) if file.read(2) == b"PK" else _read_stream(file)
+        tensors = _state_dictionary(content)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except Exception as error:  # a damaged pickle can raise nearly anything
+        raise InputError(
+            f"{path} is damaged or no PyTorch checkpoint ({type(error).__name__}: {error}): fetch or save it again"
+        ) from error
+    return tensors
+
+
+def _state_dictionary(content: Any) -> dict[str, np.ndarray]:
+    if isinstance(content, dict):
+        content = next((content[name] for name in _STATE_NAMES if name in content), content)
+    require(
+        isinstance(content, dict) and len(content) > 0 and all(isinstance(name, str) for name in content),
+        "holds no state dictionary; save model.state_dict(), or a dictionary with it under 'model_state_dict'",
+    )
+    odd = [name for name, tensor in content.items() if not isinstance(tensor, np.ndarray)]
+    require(not odd, f"entry {odd[:1]} is not a tensor; save model.state_dict() alone, or under 'model_state_dict'")
+    shared = "module." if all(name.startswith("module.") for name in content) else ""
+    return {name.removeprefix(shared): tensor for name, tensor in content.items()}
+
+
+def _read_archive(file: io.BufferedIOBase) -> Any:
+    """The zip archive: one folder that holds data.pkl, the arrays as data/<key>, and the byte order."""
+    file.seek(0)
+    with zipfile.ZipFile(file) as archive:
+        names = set(archive.namelist())
+        roots = [name.removesuffix("data.pkl") for name in names if name.endswith("/data.pkl") and name.count("/") == 1]
+        require(len(roots) == 1, "is a zip file, but not one made by torch.save: it has no data.pkl")
+        root = roots[0]
+        order = archive.read(f"{root}byteorder").decode().strip() if f"{root}byteorder" in names else "little"
+        require(order in ("little", "big"), f"the byte order is '{order}', neither little nor big: the file is damaged")
+
+        def load(key: str, dtype: np.dtype, count: int) -> np.ndarray:
+            name = f"{root}data/{key}"
+            require(name in names, f"the storage {name} is missing: fetch or save the file again")
+            size = archive.getinfo(name).file_size
+            require(
+                size == count * dtype.itemsize,
+                f"the storage {name} has {size} bytes instead of {count} x {dtype.itemsize}: fetch the file again",
+            )
+            bits = np.frombuffer(archive.read(name), f"{'>' if order == 'big' else '<'}u{dtype.itemsize}")
+            return bits.astype(bits.dtype.newbyteorder("="), copy=False).view(dtype)
+
+        return _TensorUnpickler(io.BytesIO(archive.read(f"{root}data.pkl")), load).load()
+
+
+def _read_stream(file: io.BufferedIOBase) -> Any:
+    """The layout before PyTorch 1.6: magic number, protocol, system, content, keys; then each array's count and bytes.
+
+    The arrays come last, so the tensors are made as views of arrays that are filled afterwards.
+    """
+    length = file.seek(0, io.SEEK_END)
+    file.seek(0)
+
+    def load_none(key: str, dtype: np.dtype, count: int) -> np.ndarray:
+        raise InputError("tensors stand before the content: the file is damaged")
+
+    def plain() -> Any:
+        return _TensorUnpickler(file, load_none).load()
+
+    try:
+        magic = plain()
+    except InputError:
+        raise
+    except Exception:  # whatever a file that is not a pickle at all may raise
+        magic = None
+    require(
+        type(magic) is int and magic == _STREAM_MAGIC,
+        "is neither a zip archive nor an older PyTorch file: fetch it again, or torch.save the model anew",
+    )
+    protocol, system = plain(), plain()
+    require(
+        protocol == _STREAM_PROTOCOL and isinstance(system, dict) and system.get("little_endian") is True,
+        "is an older PyTorch file of an unknown kind: load it with PyTorch and torch.save it again",
+    )
+    storages: dict[str, np.ndarray] = {}
+
+    def load(key: str, dtype: np.dtype, count: int) -> np.ndarray:
+        require(0 <= count * dtype.itemsize <= length, f"the storage {key} is larger than the file: fetch it again")
+        if key not in storages:
+            storages[key] = np.zeros(count, dtype)
+        require(storages[key].shape == (count,), f"the storage {key} has two sizes: the file is damaged")
+        return storages[key]
+
+    content = _TensorUnpickler(file, load).load()
+    for key in plain():
+        require(key in storages, f"the storage {key} belongs to no tensor: the file is damaged")
+        storage = storages[key]
+        (count,) = struct.unpack("<q", file.read(8))
+        data = file.read(storage.nbytes)
+        require(
+            count == len(storage) and len(data) == storage.nbytes,
+            f"the storage {key} is cut short or of another size: fetch the file again",
+        )
+        storage.view("u1")[:] = np.frombuffer(data, "u1")
+    return content
+
+
+class _NumpyType:
+    """A `numpy.dtype` of plain numbers as a pickle describes it: a name, then its byte order."""
+
+    def __init__(self, name: str):
+        require(isinstance(name, str), "describes a NumPy type by something other than its name: the file is damaged")
+        self.dtype = np.dtype(name)
+        require(self.dtype.kind in "fiub", f"refused: the file holds NumPy objects of type {name}")
+
+    def __setstate__(self, state: tuple) -> None:
+        self.dtype = self.dtype.newbyteorder(state[1])
+
+
+class _Storage(NamedTuple):
+    dtype: np.dtype
+
+
+class _TensorUnpickler(pickle.Unpickler):
+    """An unpickler whose only names are those below; they are methods, so a pickle cannot alter them either."""
+
+    def __init__(self, file: io.BufferedIOBase, load: Callable[[str, np.dtype, int], np.ndarray]):
+        super().__init__(file)
+        self._load = load
+
+    def find_class(self, module: str, name: str) -> Any:
+        """What a pickle may name; everything else is refused, unimported."""
+        known: dict[tuple[str, str], Any] = {
+            ("collections", "OrderedDict"): OrderedDict,
+            ("torch._utils", "_rebuild_tensor_v2"): self._tensor,
+            ("torch._utils", "_rebuild_parameter"): self._parameter,
+            ("_codecs", "encode"): self._bytes,
+            ("numpy", "dtype"): self._numpy_type,
+            ("numpy.core.multiarray", "scalar"): self._numpy_scalar,
+            ("numpy._core.multiarray", "scalar"): self._numpy_scalar,
+        }
+        if module in ("torch", "torch.cuda") and name in _STORAGES:
+            return _Storage(_STORAGES[name])
+        require(
+            (module, name) in known,
+            f"refused: the file asks to run {module}.{name}, and only tensors and plain values are read. Load it with "
+            "PyTorch where you trust it, and torch.save the model's state_dict() again",
+        )
+        return known[module, name]
+
+    def persistent_load(self, identifier: Any) -> np.ndarray:
+        """The storage that ('storage', type, key, device, count) names; older files add a view, always None here."""
+        kind, storage, key, _, count, *view = identifier
+        require(
+            kind == "storage" and isinstance(storage, _Storage) and type(count) is int and view in ([], [None]),
+            f"refers to something other than a storage ({kind!r}): the file is damaged",
+        )
+        return self._load(str(key), storage.dtype, count)
+
+    def _tensor(self, storage: np.ndarray, offset: int, shape: tuple, strides: tuple, *_: Any) -> np.ndarray:
+        require(
+            isinstance(storage, np.ndarray)
+            and all(type(number) is int and number >= 0 for number in (offset, *shape, *strides))
+            and len(shape) == len(strides),
+            "a tensor has no proper storage, shape or strides: the file is damaged",
+        )
+        size = math.prod(shape)
+        end = offset + 1 + sum((length - 1) * stride for length, stride in zip(shape, strides, strict=True))
+        require(
+            size == 0 or (end <= storage.size and size <= storage.size),
+            f"a tensor of shape {shape}, strides {strides}, offset {offset} does not fit its storage of {storage.size}",
+        )
+        if size == 0:
+            return np.zeros(shape, storage.dtype)
+        steps = tuple(stride * storage.itemsize for stride in strides)
+        return np.lib.stride_tricks.as_strided(storage[offset:], shape, steps, writeable=False)
+
+    def _parameter(self, tensor: np.ndarray, *_: Any) -> np.ndarray:
+        return tensor
+
+    def _bytes(self, text: str, encoding: str) -> bytes:
+        require(encoding == "latin1", f"refused: the file asks to encode text as {encoding!r}")
+        return text.encode("latin1")
+
+    def _numpy_type(self, name: str, *_: Any) -> _NumpyType:
+        return _NumpyType(name)
+
+    def _numpy_scalar(self, kind: _NumpyType, raw: bytes) -> Any:
+        return np.frombuffer(raw, kind.dtype, count=1)[0]

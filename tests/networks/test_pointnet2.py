@@ -1,0 +1,235 @@
+"""PointNet++ against published-layout reference outputs, a plain NumPy network, and finite differences."""
+
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnbv.checks import InputError
+from jaxnbv.networks import PointNet2Classifier, load_checkpoint, load_safetensors, save_safetensors
+from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
+
+RNG = np.random.default_rng(0)
+SAMPLING = {
+    "ssg": ((512, (0.2,), (32,)), (128, (0.4,), (64,))),
+    "msg": ((512, (0.1, 0.2, 0.4), (16, 32, 128)), (128, (0.2, 0.4, 0.8), (32, 64, 128))),
+}
+
+
+def layers(*widths):
+    return tuple(
+        Linear(jnp.asarray(RNG.normal(size=(a, b)) * (2 / a) ** 0.5), jnp.asarray(0.2 * RNG.normal(size=b)))
+        for a, b in itertools.pairwise(widths)
+    )
+
+
+def small_network(inputs=6, members=(8, 16), centers=10):
+    """Two radii, then one; few centres; groups as large as asked for."""
+    first = tuple(PooledMLP(layers(inputs, 8, 9)) for _ in members)
+    second = (PooledMLP(layers(3 + 18, 10, 10, 12)),)
+    return PointNet2Classifier(
+        (
+            SetAbstraction(first, (0.4, 0.8), members, centers),
+            SetAbstraction(second, (0.9,), members[1:], 6),
+        ),
+        PooledMLP(layers(3 + 12, 14, 16)),
+        layers(16, 12),
+        layers(12, 5)[0],
+    )
+
+
+def cloud(n):
+    points = RNG.normal(size=(n, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    normals = points + 0.3 * RNG.normal(size=(n, 3))
+    return jnp.asarray(points), jnp.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+
+
+def random_state(kind, inputs):
+    """A narrow network's tensors in the published names."""
+    state = {}
+
+    def put(linear, norm, a, b, kernel=(1, 1)):
+        state[f"{linear}.weight"] = RNG.normal(size=(b, a, *kernel)) * (2 / a) ** 0.5
+        state[f"{linear}.bias"] = 0.1 * RNG.normal(size=b)
+        if norm:
+            state[f"{norm}.weight"], state[f"{norm}.running_var"] = RNG.uniform(0.5, 1.5, (2, b))
+            state[f"{norm}.bias"], state[f"{norm}.running_mean"] = 0.1 * RNG.normal(size=(2, b))
+            state[f"{norm}.num_batches_tracked"] = np.array(7)
+
+    width = inputs
+    for level, (_, radii, _) in enumerate(SAMPLING[kind], start=1):
+        for branch in range(len(radii)):
+            names = ("mlp_convs", "mlp_bns") if kind == "ssg" else (f"conv_blocks.{branch}", f"bn_blocks.{branch}")
+            for i, (a, b) in enumerate(itertools.pairwise((width, 5, 6 + branch))):
+                put(f"sa{level}.{names[0]}.{i}", f"sa{level}.{names[1]}.{i}", a, b)
+        width = 3 + sum(6 + branch for branch in range(len(radii)))
+    put("sa3.mlp_convs.0", "sa3.mlp_bns.0", width, 8)
+    put("sa3.mlp_convs.1", "sa3.mlp_bns.1", 8, 12)
+    put("fc1", "bn1", 12, 8, ())
+    put("fc2", "bn2", 8, 7, ())
+    put("fc3", None, 7, 4, ())
+    return state
+
+
+def plain_network(state, kind, points, features):
+    """The published network, layer for layer with its concatenations and batch normalisations, in NumPy."""
+
+    def layer(x, linear, norm=None):
+        weight = state[f"{linear}.weight"]
+        x = x @ weight.reshape(weight.shape[:2]).T + state[f"{linear}.bias"]
+        if norm is None:
+            return x
+        x = (x - state[f"{norm}.running_mean"]) / np.sqrt(state[f"{norm}.running_var"] + 1e-5)
+        return np.maximum(x * state[f"{norm}.weight"] + state[f"{norm}.bias"], 0.0)
+
+    def pooled(x, linear, norm):
+        for i in range(2):
+            x = layer(x, f"{linear}.{i}", f"{norm}.{i}")
+        return x.max(axis=0)
+
+    for level, (count, radii, members) in enumerate(SAMPLING[kind], start=1):
+        chosen, distance = [0], np.full(len(points), np.inf)
+        while len(chosen) < count:
+            distance = np.minimum(distance, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
+            chosen.append(int(np.argmax(distance)))
+        found = []
+        for i in chosen:
+            squared = ((points - points[i]) ** 2).sum(axis=1)
+            row = []
+            for branch, (radius, size) in enumerate(zip(radii, members, strict=True)):
+                group = np.flatnonzero(squared <= radius**2)[:size]
+                offsets = points[group] - points[i]
+                extra = features[group] if features is not None else np.zeros((len(group), 0))
+                if kind == "ssg":
+                    x = np.concatenate([offsets, extra], axis=1)
+                    row.append(pooled(x, f"sa{level}.mlp_convs", f"sa{level}.mlp_bns"))
+                else:
+                    x = np.concatenate([extra, offsets], axis=1)
+                    row.append(pooled(x, f"sa{level}.conv_blocks.{branch}", f"sa{level}.bn_blocks.{branch}"))
+            found.append(np.concatenate(row))
+        points, features = points[chosen], np.array(found)
+    x = pooled(np.concatenate([points, features], axis=1), "sa3.mlp_convs", "sa3.mlp_bns")
+    x = layer(layer(layer(x, "fc1", "bn1"), "fc2", "bn2"), "fc3")
+    return x - np.log(np.exp(x).sum())
+
+
+@pytest.mark.parametrize("kind", ["ssg", "msg"])
+def test_log_probabilities_are_those_of_the_reference(shared, kind):
+    network = load_checkpoint(shared / "reference" / f"pointnet2_cls_{kind}.pth")
+    with np.load(shared / "reference" / f"pointnet2_cls_{kind}_io.npz") as saved:
+        points, expected = jnp.asarray(saved["points"]), saved["log_probs"]
+    assert network.uses_normals
+    assert network.classes == expected.shape[1]
+    assert np.ptp(expected) > 1
+    found = eqx.filter_jit(lambda net, x: jax.lax.map(lambda row: net(row[:, :3], row[:, 3:]), x))(network, points)
+    np.testing.assert_allclose(found, expected, atol=3e-5)
+
+
+@pytest.mark.parametrize("kind", ["ssg", "msg"])
+@pytest.mark.parametrize("inputs", [3, 6])
+@pytest.mark.parametrize(("n", "repeated"), [(700, 0), (60, 0), (540, 100)])
+def test_against_a_plain_network(x64, tmp_path, kind, inputs, n, repeated):
+    """Both layouts, with normals and without, and fewer points than centres, or only when duplicates are not counted.
+
+    The reference then returns to the first centre where farthest point sampling here goes through the duplicates; the
+    maximum over a group is the same.
+    """
+    state = random_state(kind, inputs)
+    save_safetensors(state, tmp_path / "net.safetensors")
+    network = load_safetensors(tmp_path / "net.safetensors")
+    rows = np.concatenate([np.arange(n - repeated), RNG.integers(0, n - repeated, repeated)])
+    points, normals = (array[rows] for array in cloud(n))
+    expected = plain_network(state, kind, np.asarray(points), np.asarray(normals) if inputs == 6 else None)
+    np.testing.assert_allclose(eqx.filter_jit(network)(points, normals), expected, atol=1e-11)
+
+
+def test_log_probabilities_sum_to_one(x64):
+    found = eqx.filter_jit(small_network())(*cloud(50))
+    assert found.shape == (5,)
+    assert float(jnp.sum(jnp.exp(found))) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_masked_rows_and_capacity_do_not_matter(x64):
+    network = eqx.filter_jit(small_network())
+    points, normals = cloud(50)
+    expected = network(points, normals)
+    rows = np.sort(RNG.permutation(130)[:50])
+    mask = np.zeros(130, bool)
+    mask[rows] = True
+    for filling in (0.0, 0.3, np.nan):
+        wide = [np.full((130, 3), filling) for _ in range(2)]
+        wide[0][rows], wide[1][rows] = points, normals
+        found = network(jnp.asarray(wide[0]), jnp.asarray(wide[1]), jnp.asarray(mask))
+        np.testing.assert_allclose(found, expected, atol=1e-13)
+        gradient = jax.grad(lambda x, rest: network(x, rest, jnp.asarray(mask))[0])(*map(jnp.asarray, wide))
+        assert np.isfinite(gradient).all()
+        assert not np.asarray(gradient)[~mask].any()
+
+
+def test_the_order_of_points_after_the_first_does_not_matter_in_balls_that_are_not_crowded(x64):
+    network = eqx.filter_jit(small_network(members=(64, 64)))
+    points, normals = cloud(60)
+    order = np.concatenate([[0], 1 + RNG.permutation(59)])
+    np.testing.assert_allclose(network(points[order], normals[order]), network(points, normals), atol=1e-13)
+
+
+def test_a_network_without_normals_ignores_them(x64):
+    network = small_network(inputs=3)
+    points, normals = cloud(40)
+    assert not network.uses_normals
+    np.testing.assert_array_equal(network(points, normals), network(points, jnp.full_like(normals, jnp.nan)))
+    assert np.abs(network(points, normals) - network(1.1 * points, normals)).max() > 1e-3
+
+
+def test_gradients_against_central_differences(x64):
+    network = small_network()
+    points, normals = cloud(30)
+    mask = jnp.arange(30) % 7 != 3
+
+    @jax.jit
+    def value(arguments):
+        return jnp.sum(jnp.arange(1.0, 6.0) * network(*arguments, mask))
+
+    gradients = jax.jit(jax.grad(value))((points, normals))
+    for which in (0, 1):
+        expected = np.zeros((30, 3))
+        for i in np.ndindex(30, 3):
+            ends = []
+            for sign in (1, -1):
+                moved = [points, normals]
+                moved[which] = moved[which].at[i].add(sign * 1e-6)
+                ends.append(float(value(tuple(moved))))
+            expected[i] = (ends[0] - ends[1]) / 2e-6
+        assert np.abs(expected).max() > 0.05
+        np.testing.assert_allclose(gradients[which], expected, atol=1e-7)
+
+
+def test_a_batch_is_the_clouds_one_by_one(x64):
+    network = eqx.filter_jit(small_network())
+    points, normals = (jnp.stack(rows) for rows in zip(*(cloud(45) for _ in range(3)), strict=True))
+    mask = jnp.asarray(RNG.random((3, 45)) < 0.7)
+    expected = np.stack([network(points[i], normals[i], mask[i]) for i in range(3)])
+    assert np.ptp(expected, axis=0).max() > 1e-3
+    np.testing.assert_allclose(jax.vmap(network)(points, normals, mask), expected, atol=1e-12)
+    mapped = jax.lax.map(lambda one: network(*one), (points, normals, mask), batch_size=2)
+    np.testing.assert_allclose(mapped, expected, atol=1e-12)
+
+
+def test_a_cloud_with_no_filled_row_gives_finite_numbers(x64):
+    points, normals = cloud(20)
+    network = small_network()
+    found = network(points, normals, jnp.zeros(20, bool))
+    np.testing.assert_allclose(found, network(jnp.zeros((1, 3)), jnp.zeros((1, 3))), atol=1e-13)
+
+
+def test_shapes_that_are_not_one_cloud_are_refused():
+    network = small_network()
+    for points, normals in (((2, 9, 3), (2, 9, 3)), ((9, 3), (8, 3)), ((0, 3), (0, 3))):
+        with pytest.raises((InputError, TypeError)):
+            network(jnp.zeros(points), jnp.zeros(normals))
+    with pytest.raises(InputError, match="n > 0"):
+        network(jnp.zeros((0, 3)), jnp.zeros((0, 3)))
