@@ -17,7 +17,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jaxnbv.networks import PointNet2Classifier, ball_query, farthest_point_indices
+from jaxnbv.farthest import farthest_point_indices
+from jaxnbv.networks import PointNet2Classifier, ball_query
 from jaxnbv.networks.pointnet2 import MULTI_SCALE, SINGLE_SCALE
 from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
 from jaxnbv.storage import versions

@@ -17,7 +17,9 @@ from jaxnbv.networks import pyramid_classifier
 from jaxnbv.storage import describe
 from jaxnbv.surfaces import GeometricSPSR
 
-study = typer.Typer(help="Measure the paper's claims on many scenes.", no_args_is_help=True, rich_markup_mode="markdown")
+study = typer.Typer(
+    help="Measure the paper's claims on many scenes.", no_args_is_help=True, rich_markup_mode="markdown"
+)
 
 
 @study.callback()

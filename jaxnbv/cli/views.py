@@ -2,9 +2,8 @@
 
 import re
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import numpy as np
@@ -14,8 +13,8 @@ from jaxnbv.acquisition import ExpectedUtilityImprovement, Score
 from jaxnbv.camera import Camera, Pose, look_at
 from jaxnbv.checks import InputError, require
 from jaxnbv.cli.options import (
-    DeviceOption,
     Device,
+    DeviceOption,
     FramingOption,
     NoiseOption,
     OutOption,
@@ -34,13 +33,13 @@ from jaxnbv.episode import Episode, simulate
 from jaxnbv.networks import CloudClassifier, load_checkpoint, pyramid_classifier
 from jaxnbv.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, Surface, load_mesh
-from jaxnbv.search import DiscreteSearch, FarthestView, RandomView, Search, UncertaintyView
+from jaxnbv.search import DiscreteSearch, FarthestView, RandomView, UncertaintyView
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Classifier, Coverage, CrossEntropy, MixedEntropy, NegativeEntropy
 from jaxnbv.tasks.classification import class_names, predict
 from jaxnbv.viz import write_report
 
-SEARCHES: dict[SearchName, Callable[..., Search]] = {
+SEARCHES: dict[SearchName, Any] = {
     SearchName.DISCRETE: DiscreteSearch,
     SearchName.FARTHEST: FarthestView,
     SearchName.RANDOM: RandomView,

@@ -18,16 +18,16 @@ def pattern_distance(label: Int[Array, ""], x: Float[Array, "*n"], y: Float[Arra
     return jnp.select([label == index for index in range(len(PATTERNS))], [shape(x, y) for shape in shapes])
 
 
-def _cross(x, y, reach=0.95, half_width=0.28):
+def _cross(x, y, reach=0.95, half_width=0.3):
     x, y = jnp.abs(x), jnp.abs(y)
     return jnp.minimum(jnp.maximum(x - reach, y - half_width), jnp.maximum(x - half_width, y - reach))
 
 
-def _ring(x, y, middle=0.74, half_width=0.23):
+def _ring(x, y, middle=0.74, half_width=0.24):
     return jnp.abs(jnp.sqrt(jnp.maximum(x**2 + y**2, 1e-12)) - middle) - half_width
 
 
-def _star(x, y, inner=0.42):
+def _star(x, y, inner=0.48):
     """Five tips at radius 1; the wedge between a tip and the notch beside it stands for all ten."""
     x = jnp.abs(x)
     half_turn = math.pi / 5

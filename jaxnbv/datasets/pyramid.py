@@ -90,7 +90,7 @@ class Pyramid(SignedDistance):
 
 
 # Least distance of a pattern from the base's edge: with the ranges below no pattern breaks through a side.
-_MARGIN = 0.15
+_MARGIN = 0.1
 
 
 def sample_pyramid(key: PRNGKeyArray, label: int | Int[AnyArray, ""], longest_side: float = 2.5) -> Pyramid:
@@ -102,11 +102,11 @@ def sample_pyramid(key: PRNGKeyArray, label: int | Int[AnyArray, ""], longest_si
     """
     require(longest_side > 0, f"the longest side is {longest_side}; it must be positive")
     height_key, size_key, place_key, turn_key, depth_key, rotation_key = jax.random.split(key, 6)
-    height = jax.random.uniform(height_key, minval=1.1, maxval=1.6)
-    size = jax.random.uniform(size_key, minval=0.6, maxval=0.8)
+    height = jax.random.uniform(height_key, minval=1.2, maxval=1.6)
+    size = jax.random.uniform(size_key, minval=0.7, maxval=0.85)
     place = (1.0 - _MARGIN - size) * jax.random.uniform(place_key, (2,), minval=-1.0, maxval=1.0)
     turn = jax.random.uniform(turn_key, maxval=2.0 * jnp.pi)
-    depth = jax.random.uniform(depth_key, minval=0.1, maxval=0.15)
+    depth = jax.random.uniform(depth_key, minval=0.07, maxval=0.1)
     rotation = jax.random.orthogonal(rotation_key, 3)
     rotation = rotation * jnp.linalg.det(rotation)
     corners = jnp.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0]])

@@ -9,7 +9,7 @@ from jaxnbv.camera import Camera, Pose, look_at
 from jaxnbv.cloud import PointCloud, concatenate, farthest_point_subsample, limit_capacity
 from jaxnbv.datasets import Framing, Split, pyramid_scene
 from jaxnbv.scanning import Grid, GridSurface, SDFSurface, SensorNoise, scan
-from jaxnbv.surfaces import GeometricSPSR, SurfaceModel
+from jaxnbv.surfaces import SurfaceModel
 
 MAX_VIEWS = 5
 SENSOR_RADIUS = 2.5

@@ -60,19 +60,19 @@ def _picture(record: Record, methods: Sequence[str]) -> Figure:
     images = dict(zip(wanted, _images(record, wanted), strict=True))
 
     # Inches: all methods share the first view, so it stands once, at the middle of the rows.
-    tile, gap, below, left, top, margin = 1.25, 0.1, 0.36, 0.12, 0.72, 1.0
+    tile, gap, below, left, top, margin = 1.25, 0.1, 0.36, 0.12, 0.8, 1.0
     wide, tall = left + views * (tile + gap) + margin + 0.1, top + len(methods) * (tile + below)
     figure = Figure(figsize=(wide, tall))
 
-    def place(column: int, row: float) -> Axes:
+    def place(column: int, row: int | float) -> Axes:
         x = left + column * (tile + gap) + (margin if column else 0.0)
         y = tall - top - row * (tile + below) - tile
         return figure.add_axes((x / wide, y / tall, tile / wide, tile / tall))
 
     title = f"Scene {record['scene']}, {record['framing']}: {PATTERNS[record['label']]}"
     figure.text(left / wide, 1.0 - 0.19 / tall, title, fontsize=10, fontweight="bold", va="center")
-    key = f"Framed: at least {PATTERN_PIXELS} pixels of the pattern. Beneath: the class after this view."
-    figure.text(1.0 - 0.1 / wide, 1.0 - 0.19 / tall, key, fontsize=8, color=GREY, ha="right", va="center")
+    key = f"Framed: at least {PATTERN_PIXELS} pattern pixels. Beneath: prediction so far."
+    figure.text(left / wide, 1.0 - 0.38 / tall, key, fontsize=8, color=GREY, va="center")
     for row, (method, run) in enumerate(zip(methods, runs, strict=True)):
         for column in range(1, views):
             axes = place(column, row)

@@ -149,7 +149,9 @@ class _Scene:
             *before, last = visited
             pose, seen = self.poses[last], self.truth.scans[last]
             self.states[visited] = (
-                self.planner.observe(self._state(tuple(before)), pose, seen) if before else self.planner.init(seen, pose)
+                self.planner.observe(self._state(tuple(before)), pose, seen)
+                if before
+                else self.planner.init(seen, pose)
             )
         return self.states[visited]
 
@@ -172,7 +174,7 @@ class _Scene:
         if "farthest" in methods:
             values["farthest"] = np.asarray(self._problem(state, None).distance_to_visited(self.poses))
         if "oracle" in methods:
-            values["oracle"] = np.asarray(cross_entropy(jnp.asarray(log_p), self._answers_to_truth(visited)))
+            values["oracle"] = np.asarray(_cross_entropies(log_p, self._answers_to_truth(visited)))
         if not {*_CLASSIFYING, "coverage", "uncertainty"} & {*methods}:
             return values
         surfaces = self.planner.sample_surfaces(state, jax.random.fold_in(jax.random.fold_in(self.key, 2), view))
@@ -200,7 +202,7 @@ class _Scene:
         return Problem(state.cloud, state.poses, state.num_views, self.planner.camera, Coverage(), surfaces)
 
     def _roughness(self, state: State, surfaces: GridSurface) -> float:
-        mean = _mean_values(self.planner, state.cloud)
+        mean = _mean_values(self.study.model, self.planner.grid, state.cloud)
         crossed = [_crossed_cells(values) for values in np.asarray(surfaces.values)]
         return float(np.mean(crossed)) / max(_crossed_cells(np.asarray(mean)), 1)
 
@@ -267,9 +269,15 @@ def _imagined_answers(
     return log_q, jnp.mean(near)
 
 
-def _classification_values(log_p: Float[Array, " classes"], log_q: Float[Array, "s c classes"]) -> dict[str, np.ndarray]:
+def _cross_entropies(log_p, log_q) -> Float[Array, "..."]:
+    return cross_entropy(jnp.broadcast_to(log_p, log_q.shape), jnp.asarray(log_q))
+
+
+def _classification_values(
+    log_p: Float[Array, " classes"], log_q: Float[Array, "s c classes"]
+) -> dict[str, np.ndarray]:
     """`CrossEntropy`, `ExpectedUtilityImprovement(NegativeEntropy)` and `MixedEntropy` of the same answers."""
-    cross = jnp.mean(cross_entropy(jnp.broadcast_to(log_p, log_q.shape), log_q), axis=0)
+    cross = jnp.mean(_cross_entropies(log_p, log_q), axis=0)
     reduction = jnp.mean(jnp.maximum(0.0, entropy(log_p) - entropy(log_q)), axis=0)
     mixed = cross if float(entropy(log_p)) > _MIXED_THRESHOLD else reduction
     return {"cross-entropy": np.asarray(cross), "entropy": np.asarray(reduction), "mixed": np.asarray(mixed)}
@@ -286,7 +294,7 @@ def _uncertainty(problem: Problem, poses: Pose) -> Float[Array, " poses"]:
 
 
 @eqx.filter_jit
-def _mean_values(planner: Planner, cloud: PointCloud) -> Float[Array, "g g g"]:
-    """E f minus its level on the planner's grid."""
-    posterior = planner.model.condition(cloud)
-    return posterior.mean_field.on_grid(planner.grid.axis)[0] - posterior.level
+def _mean_values(model: GeometricSPSR, grid: Grid, cloud: PointCloud) -> Float[Array, "g g g"]:
+    """E f minus its level on the grid."""
+    posterior = model.condition(cloud)
+    return posterior.mean_field.on_grid(grid.axis)[0] - posterior.level

@@ -25,7 +25,7 @@ class RecordFolder:
             raise InputError(f"cannot make the output folder {self.path} ({error}): choose another place") from error
         file = self.path / "study.json"
         if not file.exists():
-            write_whole(file, lambda out: out.write(json.dumps(config, indent=2).encode()))
+            _write(file, config)
             return
         changed = differences(_read(file), json.loads(json.dumps(config)))
         require(
@@ -40,10 +40,13 @@ class RecordFolder:
         for index in tqdm(range(count), desc=self.path.name, unit="scene", disable=not progress):
             file = self.path / f"scene_{index:04d}.json"
             if not file.exists():
-                text = json.dumps(run(index)).encode()
-                write_whole(file, lambda out, text=text: out.write(text))
+                _write(file, run(index))
             records.append(_read(file))
         return records
+
+
+def _write(file: Path, content: dict[str, Any]) -> None:
+    write_whole(file, lambda out: out.write(json.dumps(content).encode()))
 
 
 def _read(file: Path) -> Any:

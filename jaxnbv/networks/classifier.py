@@ -3,8 +3,6 @@
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxnbv.checks import require

@@ -1,4 +1,4 @@
-"""Which rows a set abstraction looks at: centres by farthest point sampling, and balls around them (Qi et al. 2017)."""
+"""Which rows a set abstraction looks at around each of its centres (Qi et al. 2017)."""
 
 import functools
 
@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.checks import require
-from jaxnbv.farthest import farthest_point_indices as farthest_point_indices
 
 _WORD = 32
 

@@ -1,11 +1,14 @@
 """A small classifier that does not depend on how the object is turned."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from jaxnbv.networks.grouping import ball_query, farthest_point_indices
+from jaxnbv.farthest import farthest_point_indices
+from jaxnbv.networks.grouping import ball_query
 
 _POOLED = 160
 
@@ -73,9 +76,20 @@ class _Level(eqx.Module):
         d = (points[index] - centers[0][:, None]) / self.radius
         here, there = centers[1][:, None], normals[index]
         pairs = jnp.stack([jnp.sum(a * b, axis=-1) for a, b in ((d, d), (here, d), (there, d), (here, there))], axis=-1)
-        hidden = pairs.reshape(-1, 4) @ self.pair.weight.T + self.pair.bias
+        hidden = _affine(self.pair, pairs.reshape(-1, 4))
         if self.feature is not None:
             # Linear, so the features meet their weights once a point rather than once a pair.
-            hidden = hidden + (features @ self.feature.weight.T)[index].reshape(hidden.shape)
-        output = jax.nn.relu(hidden) @ self.output.weight.T + self.output.bias
+            hidden = hidden + jnp.matmul(features, self.feature.weight.T, precision="highest")[index].reshape(
+                hidden.shape
+            )
+        output = _affine(self.output, jax.nn.relu(hidden))
         return jax.nn.relu(jnp.max(output.reshape(*index.shape, -1), axis=1))
+
+
+def _affine(layer: Any, rows):
+    return _product(layer, rows) + layer.bias
+
+
+def _product(layer: Any, rows):
+    """A layer without its bias on the rows of a matrix, as one product."""
+    return jnp.matmul(rows, layer.weight.T, precision="highest")

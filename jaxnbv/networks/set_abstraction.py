@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxnbv.networks.grouping import ball_query, farthest_point_indices
+from jaxnbv.farthest import farthest_point_indices
+from jaxnbv.networks.grouping import ball_query
 
 
 class Linear(eqx.Module):

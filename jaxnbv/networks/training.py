@@ -71,7 +71,8 @@ def train(
         batch = jax.tree.map(lambda leaf: leaf[rows].reshape(-1, _TOGETHER, *leaf.shape[1:]), data)
 
         def loss(parameters, clouds, labels):
-            log_p = jax.vmap(eqx.combine(parameters, fixed))(clouds.points, clouds.normals, clouds.mask)
+            network: Any = eqx.combine(parameters, fixed)
+            log_p = jax.vmap(network)(clouds.points, clouds.normals, clouds.mask)
             return -jnp.mean(jnp.take_along_axis(log_p, labels[:, None], axis=1))
 
         values, slopes = jax.lax.map(lambda part: jax.value_and_grad(loss)(parameters, *part), batch)
@@ -162,8 +163,11 @@ class _Checkpoint:
         return step, jax.tree.unflatten(structure, [jnp.asarray(leaf) for leaf in found])
 
     def write(self, step: int, carry) -> None:
-        leaves = {f"leaf_{index}": np.asarray(leaf) for index, leaf in enumerate(jax.tree.leaves(carry))}
+        leaves: dict[str, Any] = {
+            f"leaf_{index}": np.asarray(leaf) for index, leaf in enumerate(jax.tree.leaves(carry))
+        }
+        leaves |= {"settings": self.settings, "step": step}
         partial = self.path.with_suffix(".partial")
         with partial.open("wb") as file:
-            np.savez(file, settings=self.settings, step=step, **leaves)
+            np.savez(file, **leaves)
         partial.replace(self.path)

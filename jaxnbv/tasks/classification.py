@@ -26,7 +26,9 @@ def entropy(log_p: Float[Array, "*batch classes"]) -> Float[Array, "*batch"]:
     return cross_entropy(log_p, log_p)
 
 
-def cross_entropy(log_p: Float[Array, "*batch classes"], log_q: Float[Array, "*batch classes"]) -> Float[Array, "*batch"]:
+def cross_entropy(
+    log_p: Float[Array, "*batch classes"], log_q: Float[Array, "*batch classes"]
+) -> Float[Array, "*batch"]:
     """-sum_c p_c log q_c in nats, of log-probabilities. Finite: log 0 counts as the logarithm of the least float."""
     least = jnp.log(jnp.finfo(log_p.dtype).tiny)
     return -jnp.sum(jnp.exp(log_p) * jnp.maximum(log_q, least), axis=-1)

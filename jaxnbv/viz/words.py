@@ -106,7 +106,7 @@ def describe_classes(before: Probabilities | None, after: Probabilities, names: 
     if before is None:
         return f"{known}."
     if int(np.argmax(before)) == best:
-        return f"{known}, up from {before[best]:.2f}." if after[best] > before[best] else f"{known} (was {before[best]:.2f})."
+        return f"{known} (was {before[best]:.2f})."
     previous = int(np.argmax(before))
     return f"{known} (was {before[best]:.2f}, behind {names[previous]} with {before[previous]:.2f})."
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from jaxnbv.checks import InputError
-from jaxnbv.networks import ball_query, farthest_point_indices
+from jaxnbv.farthest import farthest_point_indices
+from jaxnbv.networks import ball_query
 
 RNG = np.random.default_rng(0)
 
