@@ -1,5 +1,6 @@
 """`jaxnbv study ...`: the runs behind the paper's tables and figures."""
 
+import functools
 from pathlib import Path
 from typing import Annotated
 
@@ -59,7 +60,7 @@ def pyramid(
         folder = out / one.value
         config = {"study": describe(settings), "methods": list(names)}
         records = RecordFolder(folder, config).collect(
-            min(scenes, 6) if quick else scenes, lambda index: run_scene(settings, index, names)
+            min(scenes, 6) if quick else scenes, functools.partial(run_scene, settings, methods=names)
         )
         write_tables(records, folder)
         write_figures(records, folder)

@@ -64,7 +64,7 @@ class Pyramid(SignedDistance):
 
     def on_base(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
         """Which points of the surface belong to the base, the pattern included; the tolerance is in scene units."""
-        u, v, w = self._own(x)
+        w = self._own(x)[2]
         return (self.scale * w <= tolerance) | self.on_pattern(x, tolerance)
 
     def on_pattern(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:

@@ -34,7 +34,7 @@ class LabelledClouds(eqx.Module):
 def scanned_clouds(
     split: Split, framing: Framing, first: Int[Array, ""], count: int, num_points: int = 1024
 ) -> LabelledClouds:
-    """Clouds of one to five random views, with the sensor's noise, of `count` scenes of a split from scene `first` on."""
+    """Clouds of one to five random views, with the sensor's noise, of `count` scenes from scene `first` on."""
 
     def cloud_of(index):
         pyramid, key = pyramid_scene(split, index, framing), _key(split, index)
@@ -62,7 +62,7 @@ class Imagination(eqx.Module):
 def imagined_clouds(
     split: Split, framing: Framing, index: Int[Array, ""], imagination: Imagination, num_points: int = 1024
 ) -> LabelledClouds:
-    """D u scan(theta; f_s) of one scene: D of one to four random views, every sample f_s seen from its own random poses.
+    """D u scan(theta; f_s) of one scene: D of one to four random views, every f_s seen from its own random poses.
 
     The class is the true one, whatever the sample shows.
     """
