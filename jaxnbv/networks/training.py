@@ -94,7 +94,7 @@ def train(
 
 
 @eqx.filter_jit
-def log_probabilities(network: eqx.Module, clouds: PointCloud) -> Float[Array, "b classes"]:
+def log_probabilities(network: Any, clouds: PointCloud) -> Float[Array, "b classes"]:
     """The network's answers to a batch of clouds, one after the other."""
     return jax.lax.map(lambda cloud: network(cloud.points, cloud.normals, cloud.mask), clouds)
 

@@ -1,0 +1,129 @@
+"""Train, calibrate and test the pyramid classifier that ships with jaxnbv: `python scripts/train_pyramid.py`.
+
+Two stages: clouds of true scans, then the same beside clouds whose last view is of a posterior sample, since those are
+what an acquisition feeds the network. Clouds and checkpoints stay in the output folder, so that a run that was
+interrupted continues. Half an hour on two CPU cores.
+"""
+
+import argparse
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from jaxnbv import Grid, PointCloud
+from jaxnbv.datasets import PATTERNS, Framing, Split
+from jaxnbv.experiments.pyramid_clouds import Imagination, LabelledClouds, imagined_clouds, scanned_clouds
+from jaxnbv.networks import (
+    InvariantClassifier,
+    calibrate,
+    expected_calibration_error,
+    log_probabilities,
+    save_invariant,
+    train,
+)
+from jaxnbv.networks.pretrained import TRAINED_SIDE
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks.classification import entropy
+
+WEIGHTS = Path(__file__).parents[1] / "jaxnbv" / "networks" / "weights" / "pyramid.safetensors"
+# Scenes whose posterior is sampled come from numbers that no scanned cloud uses.
+FIRST_IMAGINED = 100_000
+SCANNED_AT_ONCE = 100
+
+
+def scanned(folder: Path, split: Split, framing: Framing, count: int) -> LabelledClouds:
+    """Clouds of true scans."""
+
+    def make(first):
+        return scanned_clouds(split, framing, jnp.asarray(first), SCANNED_AT_ONCE)
+
+    return cached(folder / f"scanned-{split}-{framing}-{count}.npz", range(0, count, SCANNED_AT_ONCE), make)
+
+
+def imagined(folder: Path, split: Split, framing: Framing, count: int) -> LabelledClouds:
+    """Clouds that end in a scan of a posterior sample, 16 from each of `count` scenes."""
+    model = GeometricSPSR(lengthscale=0.01, truncation=32)
+    imagination = Imagination(model, Grid(64, 0.7 * framing.longest_side))
+
+    def make(index):
+        return imagined_clouds(split, framing, jnp.asarray(index), imagination)
+
+    scenes = range(FIRST_IMAGINED, FIRST_IMAGINED + count)
+    return cached(folder / f"imagined-{split}-{framing}-{count}.npz", scenes, make)
+
+
+def cached(path: Path, steps: range, make) -> LabelledClouds:
+    """The clouds of all steps, from the file where it exists."""
+    if not path.exists():
+        parts = [jax.tree.map(np.asarray, make(step)) for step in tqdm(steps, desc=path.stem)]
+        whole = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+        partial = path.with_suffix(".partial")
+        with partial.open("wb") as file:
+            np.savez(file, *jax.tree.leaves(whole))
+        partial.replace(path)
+    with np.load(path) as saved:
+        points, normals, mask, labels, pixels, is_imagined = (saved[name] for name in saved.files)
+    return LabelledClouds(PointCloud(points, normals, mask), labels, pixels, is_imagined)
+
+
+def joined(folder: Path, make, split: Split, count: int) -> LabelledClouds:
+    """Clouds of both framings, in the network's units."""
+
+    def scaled(framing):
+        data = make(folder, split, framing, count)
+        points = data.clouds.points * (TRAINED_SIDE / framing.longest_side)
+        clouds = PointCloud(points, data.clouds.normals, data.clouds.mask)
+        return LabelledClouds(clouds, data.labels, data.pattern_pixels, data.imagined)
+
+    return concatenated(*(scaled(framing) for framing in Framing))
+
+
+def concatenated(*parts: LabelledClouds) -> LabelledClouds:
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+def report(name: str, network: InvariantClassifier, data: LabelledClouds) -> None:
+    """Accuracy and entropy by visible pattern pixels, and calibration."""
+    log_p = log_probabilities(network, jax.tree.map(jnp.asarray, data.clouds))
+    right = np.asarray(log_p).argmax(axis=1) == data.labels
+    uncertain = np.asarray(entropy(log_p))
+    print(f"{name}: calibration error {expected_calibration_error(log_p, data.labels):.3f}")
+    for low, high in ((0, 1), (1, 150), (150, 500), (500, np.inf)):
+        rows = (data.pattern_pixels >= low) & (data.pattern_pixels < high)
+        if rows.any():
+            text = f"  {low:>4} to {high - 1:<4g} pixels of pattern: {rows.sum():5d} clouds"
+            print(f"{text}, {right[rows].mean():6.1%} right, entropy {uncertain[rows].mean():.2f} nats")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("runs/pyramid-network"))
+    parser.add_argument("--weights", type=Path, default=WEIGHTS)
+    arguments = parser.parse_args()
+    folder: Path = arguments.out
+    folder.mkdir(parents=True, exist_ok=True)
+
+    scans = joined(folder, scanned, Split.TRAIN, 5000)
+    network = InvariantClassifier(len(PATTERNS), jax.random.key(0))
+    network = train(network, scans.clouds, scans.labels, jax.random.key(1), 2000, folder=folder / "scanned")
+    both = concatenated(scans, joined(folder, imagined, Split.TRAIN, 350))
+    options = {"learning_rate": 1e-3, "folder": folder / "imagined"}
+    network = train(network, both.clouds, both.labels, jax.random.key(2), 1200, **options)
+
+    held_out = joined(folder, scanned, Split.VALIDATION, 1000)
+    network = calibrate(network, jax.tree.map(jnp.asarray, held_out.clouds), held_out.labels)
+    print(f"temperature {float(network.temperature):.3f}")
+    test = joined(folder, scanned, Split.TEST, 500)
+    report("true scans, test split", network, test)
+    report("imagined scans, validation split", network, joined(folder, imagined, Split.VALIDATION, 40))
+
+    arguments.weights.parent.mkdir(parents=True, exist_ok=True)
+    save_invariant(network, PATTERNS, arguments.weights)
+    print(f"{arguments.weights}   {arguments.weights.stat().st_size / 1e6:.2f} MB")
+
+
+if __name__ == "__main__":
+    main()
