@@ -109,7 +109,7 @@ def main() -> None:
     scans = joined(folder, scanned, Split.TRAIN, 5000)
     network = InvariantClassifier(len(PATTERNS), jax.random.key(0))
     network = train(network, scans.clouds, scans.labels, jax.random.key(1), 2000, folder=folder / "scanned")
-    both = concatenated(scans, joined(folder, imagined, Split.TRAIN, 350))
+    both = concatenated(scans, joined(folder, imagined, Split.TRAIN, 160))
     options = {"learning_rate": 1e-3, "folder": folder / "imagined"}
     network = train(network, both.clouds, both.labels, jax.random.key(2), 1200, **options)
 
@@ -118,7 +118,7 @@ def main() -> None:
     print(f"temperature {float(network.temperature):.3f}")
     test = joined(folder, scanned, Split.TEST, 500)
     report("true scans, test split", network, test)
-    report("imagined scans, validation split", network, joined(folder, imagined, Split.VALIDATION, 40))
+    report("imagined scans, validation split", network, joined(folder, imagined, Split.VALIDATION, 20))
 
     arguments.weights.parent.mkdir(parents=True, exist_ok=True)
     save_invariant(network, PATTERNS, arguments.weights)

@@ -49,6 +49,7 @@ SEARCHES: dict[SearchName, Any] = {
 FirstOption = Annotated[
     str, typer.Option(help="Position of the first camera, x,y,z in scene units; it looks at the origin.")
 ]
+DEFAULT_FIRST = "0.8,0.9,2.2"
 
 
 def demo(
@@ -57,6 +58,10 @@ def demo(
     views: ViewsOption = 5,
     scene: Annotated[int, typer.Option(min=0, help="Which pyramid of the test split.")] = 0,
     framing: FramingOption = Framing.WHOLE,
+    first: Annotated[
+        str | None,
+        typer.Option(help="Position of the first camera, x,y,z.", show_default="one that does not show the pattern"),
+    ] = None,
     seed: SeedOption = 0,
     out: OutOption = None,
     noise: NoiseOption = 0.01,
@@ -70,14 +75,14 @@ def demo(
     """
     prepare(device)
     if task is Task.COVERAGE:
-        planner = _planner(Coverage(), search, quick)
-        _run("mug", demo_object(), planner, look_at([0.8, 0.9, 2.2]), views, seed, out, noise, quick, report)
+        planner, start = _planner(Coverage(), search, quick), look_at(_position(first or DEFAULT_FIRST))
+        _run("mug", demo_object(), planner, start, views, seed, out, noise, quick, report)
         return
     pyramid = pyramid_scene(Split.TEST, scene, framing)
     planner = _planner(_score(task, pyramid_classifier(framing.longest_side)), search, quick, framing)
-    typer.echo(f"the pattern is a {PATTERNS[int(pyramid.label)]}; the first view does not show it")
-    first = hidden_view(pyramid, jax.random.key(seed))
-    _run("pyramid", SDFSurface(pyramid), planner, first, views, seed, out, noise, quick, report)
+    typer.echo(f"the pattern is a {PATTERNS[int(pyramid.label)]}")
+    start = hidden_view(pyramid, jax.random.key(seed)) if first is None else look_at(_position(first))
+    _run("pyramid", SDFSurface(pyramid), planner, start, views, seed, out, noise, quick, report)
 
 
 def run(
@@ -91,7 +96,7 @@ def run(
     ] = None,
     search: SearchOption = SearchName.DISCRETE,
     views: ViewsOption = 5,
-    first: FirstOption = "0.8,0.9,2.2",
+    first: FirstOption = DEFAULT_FIRST,
     seed: SeedOption = 0,
     out: OutOption = None,
     noise: NoiseOption = 0.01,

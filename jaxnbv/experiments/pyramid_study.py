@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.stats import spearmanr
 
 from jaxnbv.acquisition import expected_score
 from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import require
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.datasets import Framing, Split, pyramid_scene
+from jaxnbv.experiments.diagnostics import rank_correlation, roughness
+from jaxnbv.experiments.pyramid_report import METHODS
 from jaxnbv.planner import Planner, State
 from jaxnbv.scanning import Grid, GridSurface, SDFSurface, SensorNoise, scan
 from jaxnbv.search import DiscreteSearch, Problem
@@ -24,7 +25,6 @@ from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
 from jaxnbv.tasks.classification import Classifier, cross_entropy, entropy
 
-METHODS = ("cross-entropy", "entropy", "mixed", "coverage", "farthest", "uncertainty", "random", "oracle")
 _CLASSIFYING = ("cross-entropy", "entropy", "mixed")
 _RANDOM_RUNS = 4
 _MIXED_THRESHOLD = 0.75
@@ -187,13 +187,16 @@ class _Scene:
             values["coverage"] = np.asarray(_coverage(state.cloud, surfaces, camera, self.poses))
         if "uncertainty" in methods:
             values["uncertainty"] = np.asarray(_uncertainty(self._problem(state, surfaces), self.poses))
+        unvisited = ~np.isin(np.arange(len(self.pattern_pixels)), visited)
         self.diagnostics.append(
             {
                 "view": view,
                 "methods": list(methods),
-                "roughness": self._roughness(state, surfaces),
+                "roughness": roughness(self.study.model, state.cloud, surfaces),
                 "near_sensor": None if near is None else float(near),
-                "rank_correlation": {name: self._rank_correlation(values[name], visited) for name in values},
+                "rank_correlation": {
+                    name: rank_correlation(of, self.pattern_pixels, unvisited) for name, of in values.items()
+                },
             }
         )
         return values
@@ -201,29 +204,11 @@ class _Scene:
     def _problem(self, state: State, surfaces: GridSurface | None) -> Problem:
         return Problem(state.cloud, state.poses, state.num_views, self.planner.camera, Coverage(), surfaces)
 
-    def _roughness(self, state: State, surfaces: GridSurface) -> float:
-        mean = _mean_values(self.study.model, self.planner.grid, state.cloud)
-        crossed = [_crossed_cells(values) for values in np.asarray(surfaces.values)]
-        return float(np.mean(crossed)) / max(_crossed_cells(np.asarray(mean)), 1)
-
-    def _rank_correlation(self, values: np.ndarray, visited: tuple[int, ...]) -> float | None:
-        """Spearman's, over the candidates not visited; None where either does not vary."""
-        rest = np.delete(np.arange(len(values)), visited)
-        a, b = values[rest], self.pattern_pixels[rest]
-        return None if np.ptp(a) == 0 or np.ptp(b) == 0 else float(spearmanr(a, b).statistic)
-
 
 def _without(values: np.ndarray, visited: tuple[int, ...]) -> np.ndarray:
     values = np.array(values, dtype=np.float64)
     values[list(visited)] = -np.inf
     return values
-
-
-def _crossed_cells(values: np.ndarray) -> int:
-    inside = values < 0
-    size = inside.shape[0] - 1
-    corners = [inside[i : i + size, j : j + size, k : k + size] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-    return int(np.sum(np.any(corners, axis=0) & ~np.all(corners, axis=0)))
 
 
 @eqx.filter_jit
@@ -291,10 +276,3 @@ def _coverage(cloud: PointCloud, surfaces: GridSurface, camera: Camera, poses: P
 @eqx.filter_jit
 def _uncertainty(problem: Problem, poses: Pose) -> Float[Array, " poses"]:
     return uncertain_length(problem, poses)
-
-
-@eqx.filter_jit
-def _mean_values(model: GeometricSPSR, grid: Grid, cloud: PointCloud) -> Float[Array, "g g g"]:
-    """E f minus its level on the grid."""
-    posterior = model.condition(cloud)
-    return posterior.mean_field.on_grid(grid.axis)[0] - posterior.level

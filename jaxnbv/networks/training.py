@@ -102,9 +102,12 @@ def log_probabilities(network: Any, clouds: PointCloud) -> Float[Array, "b class
 def calibrate(network: Network, clouds: PointCloud, labels: Int[AnyArray, " b"]) -> Network:
     """The network with the temperature that makes held-out labels most likely (Guo et al. 2017).
 
-    **Raises:** `ValueError` if the network has no leaf `temperature`.
+    **Raises:** `ValueError` if the network has no leaf `temperature`, there are no clouds, or numbers of clouds and
+    labels differ.
     """
     require(hasattr(network, "temperature"), f"{type(network).__name__} has no temperature to calibrate")
+    count = clouds.mask.shape[0]
+    require(count > 0 and count == len(labels), f"{count} clouds and {len(labels)} labels: give one label a cloud")
     log_p = np.asarray(log_probabilities(network, clouds), np.float64)
     labels = np.asarray(labels)
 

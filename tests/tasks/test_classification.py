@@ -1,0 +1,339 @@
+"""Classification scores against their formulas in float64 NumPy, and classifiers on the host."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnbv.acquisition import ExpectedUtilityImprovement, expected_score
+from jaxnbv.camera import Camera, fibonacci_sphere, look_at
+from jaxnbv.checks import InputError
+from jaxnbv.cloud import PointCloud, concatenate, farthest_point_subsample
+from jaxnbv.planner import Planner
+from jaxnbv.scanning import Grid, GridSurface, scan
+from jaxnbv.search import DiscreteSearch
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Coverage
+from jaxnbv.tasks.classification import (
+    CrossEntropy,
+    HostClassifier,
+    MixedEntropy,
+    NegativeEntropy,
+    class_names,
+    cross_entropy,
+    entropy,
+    predict,
+)
+
+RNG = np.random.default_rng(0)
+WEIGHTS = np.random.default_rng(7).normal(size=(4, 6)) * 3.0
+CAMERA, GRID = Camera(height=6, width=7), Grid(20)
+
+
+def linear(cloud):
+    """Log-probabilities of four classes, from the means of the points and of the normals."""
+    rows = jnp.concatenate([cloud.points, cloud.normals], axis=-1)
+    mean = jnp.sum(jnp.where(cloud.mask[:, None], rows, 0.0), axis=0) / jnp.maximum(cloud.count, 1)
+    return jax.nn.log_softmax(jnp.asarray(WEIGHTS, mean.dtype) @ mean)
+
+
+def linear_in_numpy(points, normals):
+    mean = np.concatenate([points, normals], axis=-1).astype(np.float64).mean(axis=0)
+    p = np.exp(WEIGHTS @ mean)
+    return p / p.sum()
+
+
+def first_point(cloud):
+    """Three probabilities that are the coordinates of D's first point; a union's are those of its last."""
+    return jnp.log(jnp.where(cloud.mask[-1], cloud.points[-1], cloud.points[0]))
+
+
+def random_cloud(count, capacity, center=(0.0, 0.0, 0.0)):
+    normals = RNG.normal(size=(count, 3))
+    points = np.asarray(center) + 0.5 * RNG.normal(size=(count, 3))
+    return PointCloud.from_arrays(points, normals / np.linalg.norm(normals, axis=1, keepdims=True), capacity)
+
+
+def one_point(p):
+    """A cloud that `first_point` takes for the probabilities p."""
+    return PointCloud.from_arrays(np.array([p]), np.array([[0.0, 0.0, 1.0]]))
+
+
+def nothing(capacity):
+    return PointCloud(jnp.zeros((capacity, 3)), jnp.zeros((capacity, 3)), jnp.zeros(capacity, bool))
+
+
+def entropy_in_numpy(p, q=None):
+    q = p if q is None else q
+    return -sum(a * np.log(b) for a, b in zip(p, q, strict=True) if a > 0)
+
+
+def balls(radii):
+    x = np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1)
+    centres = 0.4 * np.eye(3)[: len(radii)]
+    values = np.stack([np.linalg.norm(x - c, axis=-1) - r for c, r in zip(centres, radii, strict=True)])
+    return GridSurface.from_values(values, 0.0, GRID)
+
+
+def test_entropies_of_batches_against_their_formulas(x64):
+    p, q = RNG.dirichlet(np.ones(5), size=(2, 7, 3))
+    np.testing.assert_allclose(entropy(jnp.log(p)), -(p * np.log(p)).sum(axis=-1), rtol=1e-12)
+    np.testing.assert_allclose(cross_entropy(jnp.log(p), jnp.log(q)), -(p * np.log(q)).sum(axis=-1), rtol=1e-12)
+    assert float(entropy(jnp.log(jnp.full(5, 0.2)))) == pytest.approx(np.log(5), rel=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_probability_zero_adds_nothing_where_expected_and_a_finite_price_where_not(x64, dtype):
+    with np.errstate(divide="ignore"):
+        sure = jnp.asarray(np.log([0.0, 1.0, 0.0]), dtype)
+        half = jnp.asarray(np.log([0.5, 0.5, 0.0]), dtype)
+    assert float(entropy(sure)) == 0
+    assert float(entropy(half)) == pytest.approx(np.log(2), rel=1e-6)
+    assert float(cross_entropy(half, half)) == pytest.approx(np.log(2), rel=1e-6)
+    assert float(cross_entropy(half, sure)) == pytest.approx(-0.5 * np.log(np.finfo(dtype).tiny), rel=1e-5)
+    for function in (entropy, lambda log_p: cross_entropy(log_p, half), lambda log_p: cross_entropy(half, log_p)):
+        for at in (sure, half):
+            assert np.isfinite(jax.grad(function)(at)).all()
+
+
+@pytest.mark.parametrize(
+    ("p", "q"),
+    [
+        ([0.2, 0.3, 0.5], [0.7, 0.2, 0.1]),
+        ([0.3, 0.3, 0.4], [0.1, 0.1, 0.8]),
+        ([0.02, 0.03, 0.95], [0.01, 0.01, 0.98]),
+        ([0.02, 0.03, 0.95], [0.4, 0.3, 0.3]),
+        ([1.0, 0.0, 0.0], [0.5, 0.25, 0.25]),
+        ([0.5, 0.5, 0.0], [0.75, 0.25, 0.0]),
+    ],
+)
+def test_scores_of_chosen_probabilities(x64, p, q):
+    before, after = entropy_in_numpy(p), entropy_in_numpy(q)
+    reduction, crossed = max(0.0, before - after), entropy_in_numpy(p, q)
+    seen, scanned = one_point(p), one_point(q)
+    scores = {
+        CrossEntropy(first_point): crossed,
+        MixedEntropy(first_point): crossed if before > 0.75 else reduction,
+        MixedEntropy(first_point, threshold=2.0): reduction,
+        MixedEntropy(first_point, threshold=0.0): crossed if before > 0 else reduction,
+        ExpectedUtilityImprovement(NegativeEntropy(first_point)): reduction,
+    }
+    assert float(NegativeEntropy(first_point)(seen)) == pytest.approx(-before, rel=1e-12)
+    for score, expected in scores.items():
+        assert float(score(score.context(seen), scanned)) == pytest.approx(expected, rel=1e-12, abs=1e-15)
+
+
+def test_the_switch_is_at_the_threshold_and_not_above_it(x64):
+    p, q = [0.2, 0.3, 0.5], [0.1, 0.1, 0.8]
+    exactly = float(entropy(first_point(one_point(p))))
+    for threshold, expected in ((exactly, exactly - entropy_in_numpy(q)), (exactly - 1e-9, entropy_in_numpy(p, q))):
+        score = MixedEntropy(first_point, threshold=threshold)
+        assert float(score(score.context(one_point(p)), one_point(q))) == pytest.approx(expected, rel=1e-12)
+    with pytest.raises(InputError, match=r"threshold is -0\.1"):
+        MixedEntropy(first_point, threshold=-0.1)
+
+
+def test_a_scan_that_sees_nothing(x64):
+    data = random_cloud(20, 25)
+    p = linear_in_numpy(*data.to_numpy())
+    before = entropy_in_numpy(p)
+    expected = {
+        CrossEntropy(linear): before,
+        MixedEntropy(linear, threshold=0.0): before,
+        MixedEntropy(linear, threshold=2.0): 0.0,
+        ExpectedUtilityImprovement(NegativeEntropy(linear)): 0.0,
+    }
+    for score, value in expected.items():
+        assert float(score(score.context(data), nothing(6))) == pytest.approx(value, abs=1e-12)
+        gradient = jax.grad(_of_points(score, data, nothing(6)))(nothing(6).points)
+        assert not np.asarray(gradient).any()
+
+
+def _of_points(score, data, scanned):
+    return lambda points: score(score.context(data), PointCloud(points, scanned.normals, scanned.mask))
+
+
+def test_thinning_is_that_by_hand_and_happens_once_before_scans_are_added(x64):
+    data, scanned = random_cloud(60, 80), random_cloud(15, 18, (0.3, 0.0, 0.0))
+    by_hand = farthest_point_subsample(data, 16)
+    p = linear_in_numpy(*by_hand.to_numpy())
+    q = linear_in_numpy(*concatenate(by_hand, scanned).to_numpy())
+    reduction = max(0.0, entropy_in_numpy(p) - entropy_in_numpy(q))
+    scores = {
+        CrossEntropy(linear, num_points=16): entropy_in_numpy(p, q),
+        MixedEntropy(linear, threshold=0.0, num_points=16): entropy_in_numpy(p, q),
+        MixedEntropy(linear, threshold=2.0, num_points=16): reduction,
+        ExpectedUtilityImprovement(NegativeEntropy(linear), num_points=16): reduction,
+    }
+    for score, expected in scores.items():
+        context = score.context(data)
+        for found, wanted in zip(jax.tree.leaves(context[0]), jax.tree.leaves(by_hand), strict=True):
+            np.testing.assert_array_equal(found, wanted)
+        assert float(score(context, scanned)) == pytest.approx(expected, rel=1e-10, abs=1e-14)
+    assert not np.allclose(p, linear_in_numpy(*data.to_numpy()), atol=1e-3)
+
+
+def test_thinning_to_what_the_utility_looks_at_leaves_its_value(x64):
+    """Farthest point samples of farthest point samples are the same points in the same order."""
+    data = random_cloud(60, 80)
+
+    def utility(cloud):
+        fed = farthest_point_subsample(cloud, 16)
+        return jnp.sum(jnp.where(fed.mask, fed.points[:, 0] * jnp.arange(16), 0.0))
+
+    whole, thinned = ExpectedUtilityImprovement(utility), ExpectedUtilityImprovement(utility, num_points=16)
+    assert float(thinned.context(data)[1]) == float(whole.context(data)[1]) == float(utility(data))
+    assert whole.context(data)[0] is data
+
+
+@pytest.mark.parametrize(
+    "score",
+    [
+        CrossEntropy(linear, num_points=20),
+        MixedEntropy(linear, threshold=0.0, num_points=20),
+        MixedEntropy(linear, threshold=2.0, num_points=20),
+        ExpectedUtilityImprovement(NegativeEntropy(linear)),
+    ],
+)
+def test_gradient_in_the_scan_against_central_differences(x64, score):
+    data = PointCloud.from_arrays(0.01 * RNG.normal(size=(8, 3)), np.tile([0.0, 0.0, 0.01], (8, 1)) / 0.01, 12)
+    scanned = random_cloud(9, 11, (0.8, 0.4, -0.5))
+    for name in ("points", "normals"):
+
+        def value(rows, name=name):
+            return score(score.context(data), eqx.tree_at(lambda c: getattr(c, name), scanned, rows))
+
+        rows = getattr(scanned, name)
+        gradient = np.asarray(jax.grad(value)(rows))
+        assert not gradient[9:].any()
+        assert np.abs(gradient[:9]).min(axis=0).max() > 1e-6
+        for _ in range(4):
+            along = RNG.normal(size=rows.shape)
+            step = 1e-6
+            difference = (value(rows + step * along) - value(rows - step * along)) / (2 * step)
+            assert float(np.sum(gradient * along)) == pytest.approx(float(difference), rel=1e-6)
+
+
+def test_expected_scores_against_a_loop(x64):
+    surfaces, poses = balls([0.9, 0.7]), look_at(fibonacci_sphere(5, 2.5))
+    data = random_cloud(30, 40)
+    p = linear_in_numpy(*data.to_numpy())
+    crossed, reduced = np.zeros((2, 5)), np.zeros((2, 5))
+    for s, i in np.ndindex(2, 5):
+        surface = jax.tree.map(lambda leaf, s=s: leaf[s], surfaces)
+        q = linear_in_numpy(*concatenate(data, scan(surface, CAMERA, poses[i])).to_numpy())
+        crossed[s, i] = entropy_in_numpy(p, q)
+        reduced[s, i] = max(0.0, entropy_in_numpy(p) - entropy_in_numpy(q))
+    assert reduced.max() > 0
+    for score, expected in (
+        (CrossEntropy(linear), crossed),
+        (ExpectedUtilityImprovement(NegativeEntropy(linear)), reduced),
+    ):
+        found = expected_score(score, data, surfaces, CAMERA, poses)
+        np.testing.assert_allclose(found, expected.mean(axis=0), rtol=1e-8, atol=1e-12)
+
+
+class Host:
+    """`linear` in NumPy, on batches; it counts its calls."""
+
+    def __init__(self):
+        self.shapes = []
+
+    def __call__(self, points, normals, mask):
+        assert all(isinstance(array, np.ndarray) for array in (points, normals, mask))
+        self.shapes.append(mask.shape)
+        return np.log([linear_in_numpy(p[m], n[m]) for p, n, m in zip(points, normals, mask, strict=True)])
+
+
+def test_a_host_classifier_equals_the_one_in_jax_in_one_call_a_batch():
+    clouds = [random_cloud(10 + i, 20) for i in range(6)]
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *clouds)
+    expected = np.stack([linear(cloud) for cloud in clouds])
+    calls = {
+        "one": (lambda f: f(clouds[0]), [(1, 20)], expected[0]),
+        "jit": (lambda f: jax.jit(f)(clouds[0]), [(1, 20)], expected[0]),
+        "vmap": (lambda f: jax.vmap(f)(batch), [(6, 20)], expected),
+        "jit of vmap": (lambda f: jax.jit(jax.vmap(f))(batch), [(6, 20)], expected),
+        "vmap of some": (
+            lambda f: jax.vmap(lambda p: f(PointCloud(p, clouds[0].normals, clouds[0].mask)))(batch.points[:, :20]),
+            [(6, 20)],
+            np.stack([linear(PointCloud(c.points, clouds[0].normals, clouds[0].mask)) for c in clouds]),
+        ),
+        "map": (lambda f: jax.lax.map(f, batch), [(1, 20)] * 6, expected),
+        "map in batches": (lambda f: jax.lax.map(f, batch, batch_size=4), [(4, 20), (2, 20)], expected),
+        "vmap of vmap": (
+            lambda f: jax.vmap(jax.vmap(f))(jax.tree.map(lambda a: a.reshape(2, 3, *a.shape[1:]), batch)),
+            [(6, 20)],
+            expected.reshape(2, 3, 4),
+        ),
+    }
+    for name, (call, shapes, wanted) in calls.items():
+        host = Host()
+        found = np.asarray(call(HostClassifier(host, 4)))
+        assert host.shapes == shapes, name
+        np.testing.assert_allclose(found, wanted, atol=2e-5, err_msg=name)
+
+
+def test_a_host_classifier_of_a_large_batch_comes_back():
+    """Callbacks of JAX have been known to wait for ever for their own arguments on few cores."""
+    cloud = PointCloud(jnp.ones((120, 3500, 3)), jnp.ones((120, 3500, 3)), jnp.ones((120, 3500), bool))
+    host = HostClassifier(lambda points, normals, mask: points[:, :2, 0] + mask[:, :2], 2)
+    np.testing.assert_array_equal(jax.jit(jax.vmap(host))(cloud), np.full((120, 2), 2.0))
+
+
+@pytest.mark.parametrize("wrap", [lambda f: f, jax.jit])
+def test_a_host_classifier_that_returns_another_shape_says_so(wrap):
+    host = HostClassifier(lambda points, normals, mask: np.zeros(4), 4)
+    with pytest.raises((RuntimeError, InputError), match=r"returned shape \(4,\), not \(1, 4\): log-prob"):
+        jax.block_until_ready(wrap(host)(random_cloud(5, 5)))
+
+
+def test_a_host_classifier_has_no_gradient():
+    score, data, scanned = CrossEntropy(HostClassifier(Host(), 4)), random_cloud(5, 5), random_cloud(4, 6)
+    with pytest.raises(InputError, match="use DiscreteSearch"):
+        jax.grad(_of_points(score, data, scanned))(scanned.points)
+    with pytest.raises(InputError, match="num_classes is 1"):
+        HostClassifier(Host(), 1)
+
+
+def test_a_host_classifier_in_a_planners_search():
+    """The same poses and values as the JAX classifier's, through `Planner.propose`."""
+    data = random_cloud(40, 40)
+    model, search = GeometricSPSR(lengthscale=0.05, truncation=8), DiscreteSearch(num_candidates=7)
+    proposals = []
+    for classifier in (linear, HostClassifier(Host(), 4)):
+        planner = Planner(model, CAMERA, CrossEntropy(classifier), search, 2, Grid(16, 3.0), 64)
+        proposals.append(planner.propose(planner.init(data), jax.random.key(3)))
+    np.testing.assert_allclose(proposals[0].values, proposals[1].values, atol=1e-4)
+    assert np.ptp(np.asarray(proposals[0].values)) > 1e-2
+    np.testing.assert_array_equal(proposals[0].pose.position, proposals[1].pose.position)
+
+
+def test_predictions_are_those_of_d_as_the_score_sees_it():
+    data = random_cloud(50, 60)
+    thinned = linear_in_numpy(*farthest_point_subsample(data, 12).to_numpy())
+    whole = linear_in_numpy(*data.to_numpy())
+    for score, expected in (
+        (CrossEntropy(linear, num_points=12), thinned),
+        (MixedEntropy(linear, num_points=12), thinned),
+        (ExpectedUtilityImprovement(NegativeEntropy(linear), num_points=12), thinned),
+        (ExpectedUtilityImprovement(NegativeEntropy(linear)), whole),
+    ):
+        np.testing.assert_allclose(np.exp(predict(score, data)), expected, atol=1e-5)
+    assert np.abs(thinned - whole).max() > 1e-3
+    assert predict(Coverage(), data) is None
+    assert predict(ExpectedUtilityImprovement(lambda cloud: jnp.sum(cloud.points)), data) is None
+
+
+def test_class_names_where_the_classifier_says_them():
+    class Named(eqx.Module):
+        classes: tuple[str, ...] = eqx.field(static=True, default=("cup", "bowl"))
+
+        def __call__(self, cloud):
+            return jnp.log(jnp.array([0.5, 0.5]))
+
+    assert class_names(CrossEntropy(Named())) == ("cup", "bowl")
+    assert class_names(ExpectedUtilityImprovement(NegativeEntropy(Named()))) == ("cup", "bowl")
+    assert class_names(CrossEntropy(linear)) is None
+    assert class_names(Coverage()) is None
