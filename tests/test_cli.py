@@ -32,11 +32,15 @@ def finished(tmp_path_factory, cache):
 
 def test_demo_leaves_an_episode_a_report_and_figures(finished):
     folder, result = finished
-    out = folder / "runs" / "demo-discrete"
+    out = folder / "runs" / "pyramid-discrete"
     names = {path.name for path in out.iterdir()}
     assert {"episode.json", "view_00.npz", "view_01.npz", "cloud.ply", "report.html"} <= names
     assert list(out.rglob("*.png"))
     assert "view 2" in result.stdout
+    # Probabilities before and after: five classes in a line after each view.
+    lines = [line for line in result.stdout.splitlines() if "ring" in line and "square" in line]
+    assert len(lines) == 2
+    assert lines[1].count("->") == 5
     assert str(out.relative_to(folder) / "report.html") in result.stdout
     config = json.loads((out / "episode.json").read_text())["config"]
     assert config["planner"]["search"]["type"] == "DiscreteSearch"
@@ -44,7 +48,7 @@ def test_demo_leaves_an_episode_a_report_and_figures(finished):
 
 def test_the_same_command_continues_with_more_views(finished, cache):
     folder, _ = finished
-    out = folder / "runs" / "demo-discrete"
+    out = folder / "runs" / "pyramid-discrete"
     before = {path.name: path.read_bytes() for path in out.glob("view_*.npz")}
     result = run_command("demo", "--quick", "--views", "3", "--no-report", cwd=folder, cache=cache)
     assert result.returncode == 0, result.stderr
@@ -102,9 +106,46 @@ def test_a_folder_of_another_configuration_is_refused(finished, cache):
     assert "key" in result.stderr
 
 
+def test_a_task_about_the_class_needs_a_network(tmp_path, cache):
+    trimesh.creation.torus(1.0, 0.4).export(tmp_path / "ring.ply")
+    result = run_command("run", "ring.ply", "--task", "cross-entropy", cwd=tmp_path, cache=cache)
+    assert result.returncode == 2
+    assert "need a network" in result.stderr
+
+
+def test_a_published_checkpoint_converts_and_classifies_a_mesh(tmp_path, cache, shared):
+    source = shared / "reference" / "pointnet2_cls_ssg.pth"
+    result = run_command("convert", str(source), "net.safetensors", cwd=tmp_path, cache=cache)
+    assert result.returncode == 0, result.stderr
+    assert "classes" in result.stdout
+    trimesh.creation.torus(1.0, 0.4).export(tmp_path / "ring.ply")
+    arguments = ("--task", "mixed", "--network", "net.safetensors", "--quick", "--views", "2", "--no-report")
+    result = run_command("run", "ring.ply", *arguments, cwd=tmp_path, cache=cache)
+    assert result.returncode == 0, result.stderr
+    assert "->" in result.stdout
+
+
+def test_the_study_writes_tables_and_figures_and_continues(tmp_path, cache):
+    arguments = ("study", "pyramid", "--quick", "--views", "2", "--framing", "whole", "--out", "mine")
+    result = run_command(*arguments, "--scenes", "1", cwd=tmp_path, cache=cache)
+    assert result.returncode == 0, result.stderr
+    assert "not the full study" in result.stdout
+    folder = tmp_path / "mine" / "whole"
+    first = (folder / "scene_0000.json").read_bytes()
+    assert {"results.txt", "results.csv"} <= {path.name for path in folder.iterdir()}
+    assert list(folder.rglob("*.png"))
+    result = run_command(*arguments, "--scenes", "2", cwd=tmp_path, cache=cache)
+    assert result.returncode == 0, result.stderr
+    assert (folder / "scene_0000.json").read_bytes() == first
+    assert (folder / "scene_0001.json").exists()
+    result = run_command(*arguments, "--methods", "farthest,best", cwd=tmp_path, cache=cache)
+    assert result.returncode == 2
+    assert "best" in result.stderr
+
+
 @pytest.mark.parametrize("command", [(), ("demo",), ("run",)])
 def test_help_names_every_option(command, tmp_path, cache):
     result = run_command(*command, "--help", cwd=tmp_path, cache=cache)
     assert result.returncode == 0
-    expected = ["demo", "run"] if not command else ["--task", "--search", "--views", "--first", "--seed", "--out"]
+    expected = ["demo", "run", "study", "convert"] if not command else ["--task", "--search", "--views", "--first", "--seed", "--out"]
     assert all(word in result.stdout for word in expected)

@@ -25,9 +25,9 @@ class LabelledClouds(eqx.Module):
     """
 
     clouds: PointCloud
-    labels: Int[Array, " b"]
-    pattern_pixels: Int[Array, " b"]
-    imagined: Bool[Array, " b"]
+    labels: Int[Array, "*batch"]
+    pattern_pixels: Int[Array, "*batch"]
+    imagined: Bool[Array, "*batch"]
 
 
 @eqx.filter_jit

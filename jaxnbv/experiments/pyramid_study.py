@@ -188,15 +188,14 @@ class _Scene:
         if "uncertainty" in methods:
             values["uncertainty"] = np.asarray(_uncertainty(self._problem(state, surfaces), self.poses))
         unvisited = ~np.isin(np.arange(len(self.pattern_pixels)), visited)
+        worth = self.pattern_pixels.astype(np.float64)
         self.diagnostics.append(
             {
                 "view": view,
                 "methods": list(methods),
                 "roughness": roughness(self.study.model, state.cloud, surfaces),
                 "near_sensor": None if near is None else float(near),
-                "rank_correlation": {
-                    name: rank_correlation(of, self.pattern_pixels, unvisited) for name, of in values.items()
-                },
+                "rank_correlation": {name: rank_correlation(of, worth, unvisited) for name, of in values.items()},
             }
         )
         return values

@@ -39,7 +39,7 @@ def save_invariant(network: InvariantClassifier, classes: tuple[str, ...], path:
 def load_invariant(path: str | Path) -> tuple[InvariantClassifier, tuple[str, ...]]:
     """The network that `save_invariant` wrote, and the names of its classes.
 
-    **Raises:** `ValueError` for a file that is missing, damaged or of another network.
+    **Raises:** `ValueError` for a file that is missing, damaged, of another network or not finite.
     """
     require(Path(path).is_file(), f"there is no file {path}: give the path of a safetensors file")
     try:
@@ -53,6 +53,8 @@ def load_invariant(path: str | Path) -> tuple[InvariantClassifier, tuple[str, ..
     expected = {name: leaf.shape for name, leaf in _named(blank)}
     found = {name: array.shape for name, array in tensors.items()}
     require(expected == found, f"{path} holds another network: its arrays are {found}, expected {expected}")
+    finite = all(np.isfinite(array).all() for array in tensors.values())
+    require(finite, f"{path} has entries that are not finite: write it again")
     leaves = [jnp.asarray(tensors[name], jnp.result_type(float)) for name in names]
     return jax.tree.unflatten(jax.tree.structure(blank), leaves), classes
 

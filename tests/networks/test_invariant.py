@@ -1,0 +1,245 @@
+"""The invariant network: what does not matter to it, its derivatives, its files."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import safetensors.numpy
+from scipy.spatial.transform import Rotation
+
+from jaxnbv.checks import InputError
+from jaxnbv.cloud import PointCloud, farthest_point_subsample
+from jaxnbv.networks import CloudClassifier, InvariantClassifier, load_invariant, pyramid_classifier, save_invariant
+
+RNG = np.random.default_rng(0)
+
+
+def network(classes=5, seed=0):
+    """An untrained network whose answers differ from cloud to cloud by some tenths."""
+    net = InvariantClassifier(classes, jax.random.key(seed))
+    return eqx.tree_at(lambda n: n.temperature, net, net.temperature * 0.02)
+
+
+def oriented(count, extent=1.0):
+    points, normals = extent * RNG.uniform(-1, 1, (count, 3)), RNG.normal(size=(count, 3))
+    return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+@eqx.filter_jit
+def call(net, *arguments):
+    return net(*arguments)
+
+
+def answer(net, points, normals, mask=None):
+    mask = None if mask is None else jnp.asarray(mask)
+    return np.asarray(call(net, jnp.asarray(points), jnp.asarray(normals), mask))
+
+
+def test_answers_are_log_probabilities_that_depend_on_the_cloud():
+    net = network()
+    answers = [answer(net, *(a.astype(np.float32) for a in oriented(300, extent))) for extent in (0.5, 1.0, 1.0)]
+    for log_p in answers:
+        assert np.exp(log_p).sum() == pytest.approx(1.0, abs=1e-5)
+    assert np.abs(answers[0] - answers[1]).max() > 0.1
+    assert np.abs(answers[1] - answers[2]).max() > 1e-3
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-9), (np.float32, 2e-2)])
+def test_rotations_and_translations_do_not_matter(x64, dtype, tolerance):
+    """Nor to the choices of rows, which compare distances: random points have no ties that rounding could break."""
+    net = jax.tree.map(lambda leaf: leaf.astype(dtype), network())
+    points, normals = oriented(400)
+    still = answer(net, points.astype(dtype), normals.astype(dtype))
+    assert still.dtype == dtype
+    for seed in range(5):
+        turn = Rotation.random(random_state=seed).as_matrix()
+        moved = points @ turn.T + RNG.uniform(-1, 1, 3)
+        np.testing.assert_allclose(answer(net, moved.astype(dtype), (normals @ turn.T).astype(dtype)), still, atol=tolerance)
+    mirror = np.diag([1.0, 1.0, -1.0])
+    np.testing.assert_allclose(
+        answer(net, (points @ mirror).astype(dtype), (normals @ mirror).astype(dtype)), still, atol=tolerance
+    )
+    assert np.abs(answer(net, 0.8 * points.astype(dtype), normals.astype(dtype)) - still).max() > 5 * tolerance
+
+
+def test_turning_normals_alone_matters(x64):
+    net = network()
+    points, normals = oriented(400)
+    turn = Rotation.from_rotvec([0.0, 0.5, 0.0]).as_matrix()
+    assert np.abs(answer(net, points, normals @ turn.T) - answer(net, points, normals)).max() > 1e-3
+
+
+@pytest.mark.parametrize("count", [40, 300])
+def test_masked_rows_and_the_capacity_do_not_matter(x64, count):
+    """Wherever the masked rows stand and whatever they hold, as long as the filled ones keep their order."""
+    net = network()
+    points, normals = oriented(count)
+    still = answer(net, points, normals)
+    np.testing.assert_allclose(answer(net, points, normals, np.ones(count, bool)), still, atol=1e-12)
+    for capacity in (count + 1, count + 250):
+        rows = np.sort(RNG.choice(capacity, count, replace=False))
+        for junk in (0.0, 1e6, np.nan):
+            padded = [np.full((capacity, 3), junk) for _ in range(2)]
+            padded[0][rows], padded[1][rows] = points, normals
+            np.testing.assert_allclose(answer(net, *padded, np.isin(np.arange(capacity), rows)), still, atol=1e-12)
+
+
+def test_the_order_of_rows_after_the_first_does_not_matter_where_no_ball_is_overfull(x64):
+    """The sampling starts at the first row, and a ball that is overfull takes the first 24 rows in it.
+
+    Balls of centres are filled in the order of sampling, which is that of the points and not of the rows.
+    """
+    net = network()
+    points, normals = oriented(400)
+    distance = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    assert (distance <= 0.25).sum(axis=1).max() <= 24
+    assert (distance <= 0.8).sum(axis=1).max() > 48
+    still = answer(net, points, normals)
+    for _ in range(3):
+        order = np.concatenate([[0], 1 + RNG.permutation(399)])
+        np.testing.assert_allclose(answer(net, points[order], normals[order]), still, atol=1e-12)
+    points = 0.3 * points
+    assert (0.3 * distance <= 0.25).sum(axis=1).max() > 24
+    assert np.abs(answer(net, points[order], normals[order]) - answer(net, points, normals)).max() > 1e-6
+
+
+def test_of_a_sampled_cloud_the_order_after_the_first_never_matters(x64):
+    """Farthest point sampling puts the rows of a cloud in one order, so overfull balls take the same rows."""
+    classifier = CloudClassifier(network(), num_points=300)
+    points, normals = oriented(350, 0.3)
+    still = np.asarray(call(classifier, PointCloud.from_arrays(points, normals)))
+    for _ in range(3):
+        order = np.concatenate([[0], 1 + RNG.permutation(349)])
+        found = call(classifier, PointCloud.from_arrays(points[order], normals[order], 400))
+        np.testing.assert_allclose(found, still, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [30, 300])
+def test_gradients_against_central_differences(x64, count):
+    """Normals are turned, not stretched: all points alone in their balls tie, with equal slopes for unit normals."""
+    net = network()
+    points, normals = (jnp.asarray(a) for a in oriented(count))
+
+    @jax.jit
+    def first(points, normals):
+        return net(points, normals)[1]
+
+    gradients = jax.grad(first, argnums=(0, 1))(points, normals)
+    for argument, gradient in enumerate(gradients):
+        assert np.abs(gradient).max() > 1e-3
+        for _ in range(4):
+            along = jnp.asarray(RNG.normal(size=(count, 3)))
+            if argument == 1:
+                along = along - jnp.sum(along * normals, axis=1, keepdims=True) * normals
+            step = [jnp.zeros_like(along)] * 2
+            step[argument] = 1e-7 * along
+            difference = first(points + step[0], normals + step[1]) - first(points - step[0], normals - step[1])
+            assert float(jnp.sum(gradient * along)) == pytest.approx(float(difference) / 2e-7, rel=1e-5, abs=1e-7)
+
+
+def test_gradients_of_duplicates_and_masked_rows_are_finite():
+    net = network()
+    points = jnp.asarray(np.repeat(oriented(20)[0], 3, axis=0), jnp.float32)
+    normals = jnp.asarray(oriented(60)[1], jnp.float32)
+    mask = jnp.arange(60) < 45
+    gradients = jax.jit(jax.grad(lambda p, n: net(p, n, mask)[0], argnums=(0, 1)))(points, normals)
+    for gradient in gradients:
+        assert np.isfinite(gradient).all()
+        assert not np.asarray(gradient)[45:].any()
+
+
+def test_no_points_at_all_give_finite_answers_and_derivatives():
+    net = network()
+    empty = jnp.zeros((50, 3)), jnp.zeros((50, 3)), jnp.zeros(50, bool)
+    log_p = answer(net, *empty)
+    assert np.exp(log_p).sum() == pytest.approx(1.0, abs=1e-5)
+    np.testing.assert_array_equal(answer(net, empty[0] + 7.0, empty[1] + 2.0, empty[2]), log_p)
+    assert not np.asarray(jax.jit(jax.grad(lambda points: net(points, *empty[1:])[0]))(empty[0])).any()
+
+
+def test_clouds_under_vmap_and_map_as_one_by_one():
+    net = network()
+    points, normals = (np.stack(a).astype(np.float32) for a in zip(*(oriented(100) for _ in range(3)), strict=True))
+    mask = RNG.random((3, 100)) < 0.8
+    one_by_one = [answer(net, points[i], normals[i], mask[i]) for i in range(3)]
+    mapped = jax.jit(lambda *arrays: jax.lax.map(lambda a: net(*a), arrays))
+    for together in (jax.jit(jax.vmap(net))(points, normals, mask), mapped(points, normals, mask)):
+        np.testing.assert_allclose(together, one_by_one, atol=1e-3)
+
+
+def test_the_temperature_divides_the_logits(x64):
+    net = network()
+    cloud = oriented(100)
+    warmer = eqx.tree_at(lambda n: n.temperature, net, 3.0 * net.temperature)
+    expected = answer(net, *cloud) / 3.0
+    expected -= np.log(np.exp(expected).sum())
+    np.testing.assert_allclose(answer(warmer, *cloud), expected, atol=1e-12)
+
+
+def test_a_cloud_classifier_is_sampling_and_the_network_in_its_units(x64):
+    net = network()
+    points, normals = oriented(200, 2.0)
+    cloud = PointCloud.from_arrays(points, normals, 230)
+    for num_points, scale in ((64, 0.5), (300, 1.0)):
+        fed = farthest_point_subsample(cloud, num_points)
+        expected = answer(net, scale * np.asarray(fed.points), fed.normals, fed.mask)
+        np.testing.assert_allclose(CloudClassifier(net, num_points, scale)(cloud), expected, atol=1e-12)
+    halved = PointCloud.from_arrays(0.5 * points, normals, 230)
+    np.testing.assert_allclose(
+        CloudClassifier(net, 64, 2.0)(halved), CloudClassifier(net, 64, 1.0)(cloud), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"), [({"num_points": 0}, "num_points is 0"), ({"scale": 0.0}, r"scale is 0\.0")]
+)
+def test_a_cloud_classifier_without_points_or_scale_is_refused(arguments, message):
+    with pytest.raises(InputError, match=message):
+        CloudClassifier(network(), **arguments)
+
+
+def test_a_saved_network_comes_back(tmp_path):
+    net, cloud = network(3, seed=4), [a.astype(np.float32) for a in oriented(80)]
+    save_invariant(net, ("cup", "bowl", "wide plate"), tmp_path / "net.safetensors")
+    loaded, classes = load_invariant(tmp_path / "net.safetensors")
+    assert classes == ("cup", "bowl", "wide plate")
+    assert jax.tree.structure(loaded) == jax.tree.structure(net)
+    for a, b in zip(jax.tree.leaves(loaded), jax.tree.leaves(net), strict=True):
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(answer(loaded, *cloud), answer(net, *cloud))
+
+
+def test_files_that_hold_no_such_network_are_refused(tmp_path):
+    path = tmp_path / "net.safetensors"
+    with pytest.raises(InputError, match="there is no file"):
+        load_invariant(path)
+    save_invariant(network(3), ("a", "b", "c"), path)
+    whole, tensors = path.read_bytes(), safetensors.numpy.load_file(path)
+    for damaged in (whole[: len(whole) // 2], whole[:5], b"", b"not a network at all", b"\xff" * 100):
+        path.write_bytes(damaged)
+        with pytest.raises(InputError, match="damaged"):
+            load_invariant(path)
+    path.write_bytes(safetensors.numpy.save(tensors))
+    with pytest.raises(InputError, match="damaged or holds another network"):
+        load_invariant(path)
+    name = next(iter(tensors))
+    for other in (
+        {**tensors, name: tensors[name][..., :-1].copy()},
+        {**tensors, "more": np.zeros(3, np.float32)},
+        {key: array for key, array in tensors.items() if key != name},
+    ):
+        path.write_bytes(safetensors.numpy.save(other, {"classes": "a,b,c"}))
+        with pytest.raises(InputError, match="holds another network"):
+            load_invariant(path)
+    path.write_bytes(safetensors.numpy.save(tensors, {"classes": "a,b"}))
+    with pytest.raises(InputError, match="holds another network"):
+        load_invariant(path)
+    path.write_bytes(safetensors.numpy.save({**tensors, name: tensors[name] * np.nan}, {"classes": "a,b,c"}))
+    with pytest.raises(InputError, match="finite"):
+        load_invariant(path)
+
+
+def test_the_longest_side_of_the_shipped_classifiers_objects_must_be_positive():
+    with pytest.raises(InputError, match=r"longest side is 0\.0"):
+        pyramid_classifier(0.0)
