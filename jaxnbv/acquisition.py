@@ -33,8 +33,16 @@ class Score(eqx.Module):
 
     @property
     def batch_size(self) -> int:
-        """How many scans are scored together. A CPU takes them one by one, lest a network's layers leave its cache."""
-        return 1 if jax.default_backend() == "cpu" else 128
+        """How many scans are scored together."""
+        return preferred_batch_size(None)
+
+
+def preferred_batch_size(function: Any) -> int:
+    """How many calls of a function to batch: its attribute `batch_size`, where it has one.
+
+    Otherwise a CPU takes them one by one, lest a network's layers leave its cache, and a GPU many at once.
+    """
+    return getattr(function, "batch_size", 1 if jax.default_backend() == "cpu" else 128)
 
 
 class ExpectedUtilityImprovement(Score):
@@ -57,6 +65,11 @@ class ExpectedUtilityImprovement(Score):
         """max(0, u(D u scan) - u(D))."""
         cloud, utility = context
         return jnp.maximum(0.0, self.utility(concatenate(cloud, scan)) - utility)
+
+    @property
+    def batch_size(self) -> int:
+        """As the utility prefers."""
+        return preferred_batch_size(self.utility)
 
 
 def expected_score(

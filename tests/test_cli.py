@@ -147,5 +147,9 @@ def test_the_study_writes_tables_and_figures_and_continues(tmp_path, cache):
 def test_help_names_every_option(command, tmp_path, cache):
     result = run_command(*command, "--help", cwd=tmp_path, cache=cache)
     assert result.returncode == 0
-    expected = ["demo", "run", "study", "convert"] if not command else ["--task", "--search", "--views", "--first", "--seed", "--out"]
+    expected = (
+        ["demo", "run", "study", "convert"]
+        if not command
+        else ["--task", "--search", "--views", "--first", "--seed", "--out"]
+    )
     assert all(word in result.stdout for word in expected)

@@ -13,6 +13,10 @@ SMALL = {
 num_samples, truncation, lengthscale = 4, 20, 0.015
 resolution, pixels, num_candidates, views = 40, 20, 24, 2
 """,
+    "02_your_own_utility.ipynb": """
+num_samples, truncation, lengthscale = 2, 16, 0.02
+resolution, pixels, num_candidates, views = 40, 24, 12, 2
+""",
 }
 
 

@@ -70,8 +70,9 @@ def pyramid(
 
 def _settings(framing: Framing, views: int, quick: bool) -> PyramidStudy:
     classifier = pyramid_classifier(framing.longest_side)
+    imagining = pyramid_classifier(framing.longest_side, num_points=512)
     if not quick:
-        return PyramidStudy(classifier, framing, views=views)
+        return PyramidStudy(classifier, framing, views=views, imagining=imagining)
     model = GeometricSPSR(lengthscale=0.02, truncation=16)
     return PyramidStudy(
         classifier, framing, views=views, num_candidates=40, num_samples=4, model=model, grid_resolution=48

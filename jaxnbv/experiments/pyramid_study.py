@@ -35,25 +35,28 @@ _NEAR = 1.0
 class PyramidStudy(eqx.Module):
     """What all scenes of a study share.
 
-    - `classifier`: of clouds in scene coordinates.
+    - `classifier`: of clouds in scene coordinates; it says what is known after each view.
+    - `imagining`: the classifier of D u scan for imagined scans, by default the same; one that is fed fewer points
+      saves time.
     - `framing`: how large the object stands before the sensor.
     - `split`: which scenes; tune on those of the validation split.
     - `views`: in all, the first included.
     - `num_candidates`: on the sphere of radius 2.5.
     - `num_samples`, `model`, `grid_resolution`, `capacity`: of the planner.
-    - `num_points`: D is thinned to so many, once a step, for the classifier.
+    - `num_points`: D is thinned to so many, once a step, before imagined scans are added to it.
     """
 
     classifier: Classifier
     framing: Framing = eqx.field(static=True)
     split: Split = eqx.field(static=True, default=Split.TEST)
     views: int = eqx.field(static=True, default=5)
-    num_candidates: int = eqx.field(static=True, default=120)
-    num_samples: int = eqx.field(static=True, default=16)
+    num_candidates: int = eqx.field(static=True, default=48)
+    num_samples: int = eqx.field(static=True, default=32)
     model: GeometricSPSR = GeometricSPSR(lengthscale=0.01, truncation=32)
     grid_resolution: int = eqx.field(static=True, default=64)
     capacity: int = eqx.field(static=True, default=4096)
-    num_points: int = eqx.field(static=True, default=1024)
+    num_points: int = eqx.field(static=True, default=512)
+    imagining: Classifier | None = None
 
     def __check_init__(self):
         require(
@@ -88,6 +91,7 @@ class _Scene:
 
     def __init__(self, study: PyramidStudy, index: int):
         self.study, self.index, self.planner = study, index, study.planner
+        self.imagining = study.classifier if study.imagining is None else study.imagining
         self.poses = sphere_candidates(study.num_candidates, 2.5)
         self.truth = _truth(self.poses, jnp.asarray(index), study.split, study.framing)
         self.pattern_pixels = np.asarray(self.truth.pattern_pixels)
@@ -95,7 +99,6 @@ class _Scene:
         self.first = self._first_view()
         self.states: dict[tuple[int, ...], State] = {}
         self.answers: dict[tuple[int, ...], np.ndarray] = {}
-        self.values: dict[tuple[int, ...], dict[str, np.ndarray]] = {}
         self.diagnostics: list[dict] = []
 
     def record(self, methods: Sequence[str]) -> dict:
@@ -157,32 +160,29 @@ class _Scene:
 
     def _classify(self, visited: tuple[int, ...]) -> np.ndarray:
         if visited not in self.answers:
-            thinned = _thin(self._state(visited).cloud, self.study.num_points)
-            self.answers[visited] = np.asarray(_classify(self.study.classifier, thinned))
+            self.answers[visited] = np.asarray(_classify(self.study.classifier, self._state(visited).cloud))
         return self.answers[visited]
 
     def _answers_to_truth(self, visited: tuple[int, ...]) -> np.ndarray:
         """log p given D and each candidate's true scan."""
-        thinned = _thin(self._state(visited).cloud, self.study.num_points)
-        return np.asarray(_answers(self.study.classifier, thinned, self.truth.scans))
+        return np.asarray(_answers(self.study.classifier, self._state(visited).cloud, self.truth.scans))
 
     def _acquisitions(self, visited: tuple[int, ...], methods: Sequence[str], view: int) -> dict[str, np.ndarray]:
         """Every method's values of all candidates, from one set of posterior samples."""
         state, camera = self._state(visited), self.planner.camera
-        log_p = self._classify(visited)
         values: dict[str, np.ndarray] = {}
         if "farthest" in methods:
             values["farthest"] = np.asarray(self._problem(state, None).distance_to_visited(self.poses))
         if "oracle" in methods:
-            values["oracle"] = np.asarray(_cross_entropies(log_p, self._answers_to_truth(visited)))
+            values["oracle"] = np.asarray(_cross_entropies(self._classify(visited), self._answers_to_truth(visited)))
         if not {*_CLASSIFYING, "coverage", "uncertainty"} & {*methods}:
             return values
         surfaces = self.planner.sample_surfaces(state, jax.random.fold_in(jax.random.fold_in(self.key, 2), view))
         near = None
         if {*_CLASSIFYING} & {*methods}:
             thinned = _thin(state.cloud, self.study.num_points)
-            log_q, near = _imagined_answers(self.study.classifier, thinned, surfaces, camera, self.poses)
-            values |= _classification_values(jnp.asarray(log_p), log_q)
+            log_q, near = _imagined_answers(self.imagining, thinned, surfaces, camera, self.poses)
+            values |= _classification_values(_classify(self.imagining, thinned), log_q)
         if "coverage" in methods:
             values["coverage"] = np.asarray(_coverage(state.cloud, surfaces, camera, self.poses))
         if "uncertainty" in methods:

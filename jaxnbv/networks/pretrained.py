@@ -19,15 +19,17 @@ from jaxnbv.networks.invariant import InvariantClassifier
 TRAINED_SIDE = 2.5
 
 
-def pyramid_classifier(longest_side: float = TRAINED_SIDE) -> CloudClassifier:
+def pyramid_classifier(longest_side: float = TRAINED_SIDE, num_points: int = 1024) -> CloudClassifier:
     """The shipped classifier of synthetic pyramids whose box has this longest side, in scene units.
 
-    **Raises:** `ValueError` if `longest_side` is not positive.
+    It was trained on 1,024 points a cloud; fed 512 it is a little less often right, and twice as fast.
+
+    **Raises:** `ValueError` if `longest_side` or `num_points` is not positive.
     """
     require(longest_side > 0, f"the longest side is {longest_side}; it must be positive")
     with resources.as_file(resources.files("jaxnbv.networks") / "weights" / "pyramid.safetensors") as path:
         network, classes = load_invariant(path)
-    return CloudClassifier(network, scale=TRAINED_SIDE / longest_side, classes=classes)
+    return CloudClassifier(network, num_points, scale=TRAINED_SIDE / longest_side, classes=classes)
 
 
 def save_invariant(network: InvariantClassifier, classes: tuple[str, ...], path: str | Path) -> None:

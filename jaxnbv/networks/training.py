@@ -1,5 +1,6 @@
 """Training and calibration of classifiers on labelled clouds."""
 
+import hashlib
 import json
 import zipfile
 from pathlib import Path
@@ -58,7 +59,9 @@ def train(
     start, carry = 0, (parameters, optimiser.init(parameters))
     checkpoint = None
     if folder is not None:
+        identity = hashlib.sha256(np.asarray(labels).tobytes() + np.asarray(jax.random.key_data(key)).tobytes())
         settings = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "clouds": count}
+        settings["labels_and_key"] = identity.hexdigest()
         checkpoint = _Checkpoint(Path(folder), {**settings, "weight_decay": weight_decay})
         start, carry = checkpoint.read(carry)
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.acquisition import ExpectedUtilityImprovement, Score
+from jaxnbv.acquisition import ExpectedUtilityImprovement, Score, preferred_batch_size
 from jaxnbv.checks import InputError, require
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
 
@@ -43,6 +43,11 @@ class NegativeEntropy(eqx.Module):
         """u_E in nats: 0 where the class is certain, -log(classes) where nothing is known."""
         return -entropy(self.classifier(cloud))
 
+    @property
+    def batch_size(self) -> int:
+        """As the classifier prefers."""
+        return preferred_batch_size(self.classifier)
+
 
 class CrossEntropy(Score):
     """The paper's alpha^(CE): -sum_c p_c^(t) log p_c^(t+1), of the classes' probabilities given D and given D u scan.
@@ -62,6 +67,11 @@ class CrossEntropy(Score):
         """In nats; the entropy of p^(t) for a scan that sees nothing."""
         cloud, log_p = context
         return cross_entropy(log_p, self.classifier(concatenate(cloud, scan)))
+
+    @property
+    def batch_size(self) -> int:
+        """As the classifier prefers."""
+        return preferred_batch_size(self.classifier)
 
 
 class MixedEntropy(Score):
@@ -90,6 +100,11 @@ class MixedEntropy(Score):
         before = entropy(log_p)
         reduction = jnp.maximum(0.0, before - entropy(log_q))
         return jnp.where(before > self.threshold, cross_entropy(log_p, log_q), reduction)
+
+    @property
+    def batch_size(self) -> int:
+        """As the classifier prefers."""
+        return preferred_batch_size(self.classifier)
 
 
 def _context(score: CrossEntropy | MixedEntropy, cloud: PointCloud) -> Context:

@@ -52,7 +52,7 @@ def test_pattern_pixels_vary_and_are_at_most_those_of_all_views(scanned):
 
 
 def test_a_cloud_whose_views_miss_the_pattern_has_no_point_in_it():
-    """And one with many pixels does: the floor of the pattern is more than six deviations of the noise from the base."""
+    """And one with many pixels does; half the depth of the pattern is more than three deviations of the noise."""
     found = scanned_clouds(Split.VALIDATION, Framing.CLOSE_UP, jnp.asarray(0), 24, 1000)
     shares = {False: [], True: []}
     for row, pixels in enumerate(np.asarray(found.pattern_pixels)):
@@ -82,7 +82,9 @@ def test_splits_and_framings_differ(scanned):
     assert not np.array_equal(other.pattern_pixels, scanned.pattern_pixels)
     whole = scanned_clouds(Split.TRAIN, Framing.WHOLE, jnp.asarray(5), COUNT, POINTS)
     np.testing.assert_array_equal(whole.labels, scanned.labels)
-    assert np.abs(np.asarray(whole.clouds.points)).max() < 0.625 + 0.06 < np.abs(np.asarray(scanned.clouds.points)).max()
+    assert (
+        np.abs(np.asarray(whole.clouds.points)).max() < 0.625 + 0.06 < np.abs(np.asarray(scanned.clouds.points)).max()
+    )
 
 
 def test_imagined_clouds_begin_with_what_was_truly_seen(imagined):

@@ -189,7 +189,10 @@ def test_the_choice_is_the_best_candidate_not_visited(scene):
     np.testing.assert_array_equal(values, [5.0, 9.0, 7.0, 9.0])
     first = scene.first
     value = np.delete(scene._acquisitions((first,), ["farthest"], 2)["farthest"], first)
-    assert whole_record()["methods"]["farthest"]["runs"][0]["candidates"][1] == np.delete(np.arange(CANDIDATES), first)[value.argmax()]
+    assert (
+        whole_record()["methods"]["farthest"]["runs"][0]["candidates"][1]
+        == np.delete(np.arange(CANDIDATES), first)[value.argmax()]
+    )
 
 
 def test_answers_are_the_classifiers_of_all_that_was_seen(scene):

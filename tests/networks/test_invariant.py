@@ -55,7 +55,9 @@ def test_rotations_and_translations_do_not_matter(x64, dtype, tolerance):
     for seed in range(5):
         turn = Rotation.random(random_state=seed).as_matrix()
         moved = points @ turn.T + RNG.uniform(-1, 1, 3)
-        np.testing.assert_allclose(answer(net, moved.astype(dtype), (normals @ turn.T).astype(dtype)), still, atol=tolerance)
+        np.testing.assert_allclose(
+            answer(net, moved.astype(dtype), (normals @ turn.T).astype(dtype)), still, atol=tolerance
+        )
     mirror = np.diag([1.0, 1.0, -1.0])
     np.testing.assert_allclose(
         answer(net, (points @ mirror).astype(dtype), (normals @ mirror).astype(dtype)), still, atol=tolerance
@@ -186,9 +188,7 @@ def test_a_cloud_classifier_is_sampling_and_the_network_in_its_units(x64):
         expected = answer(net, scale * np.asarray(fed.points), fed.normals, fed.mask)
         np.testing.assert_allclose(CloudClassifier(net, num_points, scale)(cloud), expected, atol=1e-12)
     halved = PointCloud.from_arrays(0.5 * points, normals, 230)
-    np.testing.assert_allclose(
-        CloudClassifier(net, 64, 2.0)(halved), CloudClassifier(net, 64, 1.0)(cloud), atol=1e-12
-    )
+    np.testing.assert_allclose(CloudClassifier(net, 64, 2.0)(halved), CloudClassifier(net, 64, 1.0)(cloud), atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -30,11 +30,7 @@ def test_the_weights_are_small():
 
 @pytest.mark.parametrize("framing", list(Framing))
 def test_right_where_the_pattern_is_seen_and_undecided_where_it_is_not(framing):
-    """A hundred test clouds with 500 pixels of the pattern or more, and those met meanwhile that have none.
-
-    A classifier that is right in 85 % of all clouds falls below 78 of 100 with probability 4 %, one that is right in
-    90 % below 85 with 4 %; the numbers here are fixed, so this is no lottery.
-    """
+    """A hundred test clouds with 500 pixels of the pattern or more, and those met meanwhile that have none."""
     classifier = pyramid_classifier(framing.longest_side)
     right, undecided, first = [], [], 0
     while len(right) < 100:
