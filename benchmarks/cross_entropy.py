@@ -2,8 +2,8 @@
 
     python benchmarks/cross_entropy.py [--out results.json]
 
-16 samples, 120 candidates, 50 x 50 rays, L = 50, grid 100^3: 1,920 imagined clouds of 1,024 points. Every stage is timed
-after compilation, as the least of several runs.
+16 samples, 120 candidates, 50 x 50 rays, L = 50, grid 100^3: 1,920 imagined clouds of 1,024 points. Every stage is
+timed after compilation, as the least of several runs.
 """
 
 import argparse

@@ -60,9 +60,9 @@ def train(
     checkpoint = None
     if folder is not None:
         identity = hashlib.sha256(np.asarray(labels).tobytes() + np.asarray(jax.random.key_data(key)).tobytes())
-        settings = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "clouds": count}
-        settings["labels_and_key"] = identity.hexdigest()
-        checkpoint = _Checkpoint(Path(folder), {**settings, "weight_decay": weight_decay})
+        settings = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate}
+        settings |= {"weight_decay": weight_decay, "clouds": count}
+        checkpoint = _Checkpoint(Path(folder), {**settings, "labels_and_key": identity.hexdigest()})
         start, carry = checkpoint.read(carry)
 
     data = jax.tree.map(jnp.asarray, (clouds, labels))
