@@ -110,8 +110,7 @@ def main() -> None:
     network = InvariantClassifier(len(PATTERNS), jax.random.key(0))
     network = train(network, scans.clouds, scans.labels, jax.random.key(1), 2000, folder=folder / "scanned")
     both = concatenated(scans, joined(folder, imagined, Split.TRAIN, 160))
-    options = {"learning_rate": 1e-3, "folder": folder / "imagined"}
-    network = train(network, both.clouds, both.labels, jax.random.key(2), 1200, **options)
+    network = train(network, both.clouds, both.labels, jax.random.key(2), 4000, folder=folder / "imagined")
 
     held_out = joined(folder, scanned, Split.VALIDATION, 1000)
     network = calibrate(network, jax.tree.map(jnp.asarray, held_out.clouds), held_out.labels)

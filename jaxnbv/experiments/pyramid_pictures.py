@@ -112,8 +112,8 @@ def _tile(axes: Axes, image: Float[np.ndarray, "h w 3"], label: int, run: dict, 
 
 def _images(record: Record, candidates: Sequence[int]) -> list[Float[np.ndarray, "h w 3"]]:
     poses = sphere_candidates(len(record["pattern_pixels"]), _RADIUS)
-    scene, framing = jnp.asarray(record["scene"]), Framing(record["framing"])
-    return [_shade(*map(np.asarray, _render(scene, framing, poses[candidate]))) for candidate in candidates]
+    scene, framing, split = jnp.asarray(record["scene"]), Framing(record["framing"]), Split(record["split"])
+    return [_shade(*map(np.asarray, _render(split, scene, framing, poses[candidate]))) for candidate in candidates]
 
 
 def _shade(
@@ -127,10 +127,10 @@ def _shade(
 
 @eqx.filter_jit
 def _render(
-    scene: Int[Array, ""], framing: Framing, pose: Pose
+    split: Split, scene: Int[Array, ""], framing: Framing, pose: Pose
 ) -> tuple[Bool[Array, " rays"], Bool[Array, " rays"], Float[Array, " rays"]]:
     """Which rays hit, which hit the pattern, and the cosine between each ray and its normal."""
-    pyramid = pyramid_scene(Split.TEST, scene, framing)
+    pyramid = pyramid_scene(split, scene, framing)
     seen = scan(SDFSurface(pyramid), Camera(height=2 * _PIXELS, width=2 * _PIXELS), pose)
     rays = pose.position - seen.points
     facing = jnp.sum(rays * seen.normals, axis=-1) / jnp.linalg.norm(rays, axis=-1)

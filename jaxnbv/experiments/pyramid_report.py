@@ -223,16 +223,18 @@ def _tables(records: Sequence[Record]) -> tuple[list[Row], list[Row], list[Row]]
     return share_rows(records), difference_rows(records), diagnostic_rows(records)
 
 
-def summary_table(records: Sequence[Record]) -> str:
+def summary_table(records: Sequence[Record], by_angle: bool = True) -> str:
     """The study as text: shares by view in percent, differences in percentage points, diagnostics; each for all scenes
-    of a framing, then by the angle of the first view.
+    of a framing, then, if `by_angle`, by the angle of the first view.
 
     **Raises:** `ValueError` if there are no records, or their numbers of views differ.
     """
-    return _summary(records, *_tables(records))
+    return _summary(records, *_tables(records), by_angle)
 
 
-def _summary(records: Sequence[Record], shares: list[Row], differences: list[Row], diagnostics: list[Row]) -> str:
+def _summary(
+    records: Sequence[Record], shares: list[Row], differences: list[Row], diagnostics: list[Row], by_angle: bool = True
+) -> str:
     intro = (
         f"Share of scenes, in percent, in [ ] its {LEVEL:.0%} bootstrap band over scenes.\n"
         "First hit: a right prediction so far. Stable hit: right from then to the end.\n"
@@ -242,6 +244,8 @@ def _summary(records: Sequence[Record], shares: list[Row], differences: list[Row
     )
     sections = [intro]
     for framing, angle, members in _groups(records):
+        if angle != "all" and not by_angle:
+            continue
         scenes = f"{len(members)} scene{'s' if len(members) != 1 else ''}"
         title = f"{framing}, {'all angles' if angle == 'all' else f'angle {angle}'}: {scenes}"
         sections.append(f"{title}\n{'=' * len(title)}\n")

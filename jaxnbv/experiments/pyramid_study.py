@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxnbv.acquisition import expected_score
 from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import require
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
@@ -26,10 +25,10 @@ from jaxnbv.tasks import Coverage
 from jaxnbv.tasks.classification import Classifier, cross_entropy, entropy
 
 _CLASSIFYING = ("cross-entropy", "entropy", "mixed")
-_RANDOM_RUNS = 4
+_SAMPLING = (*_CLASSIFYING, "coverage", "uncertainty")
+_RANDOM_RUNS = 16
 _MIXED_THRESHOLD = 0.75
-# A hit nearer to the sensor than this, of the 2.5 to the origin, lies in front of the object's box.
-_NEAR = 1.0
+_RADIUS = 2.5
 
 
 class PyramidStudy(eqx.Module):
@@ -92,7 +91,9 @@ class _Scene:
     def __init__(self, study: PyramidStudy, index: int):
         self.study, self.index, self.planner = study, index, study.planner
         self.imagining = study.classifier if study.imagining is None else study.imagining
-        self.poses = sphere_candidates(study.num_candidates, 2.5)
+        self.poses = sphere_candidates(study.num_candidates, _RADIUS)
+        # A hit this near lies outside the ball of radius 0.6 longest sides about the origin, towards the sensor.
+        self.near = _RADIUS - 0.6 * study.framing.longest_side
         self.truth = _truth(self.poses, jnp.asarray(index), study.split, study.framing)
         self.pattern_pixels = np.asarray(self.truth.pattern_pixels)
         self.key = jax.random.fold_in(jax.random.key(2), index)
@@ -116,11 +117,13 @@ class _Scene:
                 values = self._acquisitions(visited, group, view)
                 for method in group:
                     runs[method] = [(*visited, int(np.argmax(_without(values[method], visited))))]
-        correct = self._answers_to_truth(first).argmax(axis=1) == int(self.truth.label)
+        answers = np.asarray(_answers(self.study.classifier, self._state(first).cloud, self.truth.scans))
+        correct = answers.argmax(axis=1) == int(self.truth.label)
         unvisited = np.arange(len(correct)) != self.first
         return {
             "scene": self.index,
             "framing": self.study.framing.value,
+            "split": self.study.split.value,
             "label": int(self.truth.label),
             "first": self.first,
             "angle": float(self.truth.angles[self.first]),
@@ -163,42 +166,40 @@ class _Scene:
             self.answers[visited] = np.asarray(_classify(self.study.classifier, self._state(visited).cloud))
         return self.answers[visited]
 
-    def _answers_to_truth(self, visited: tuple[int, ...]) -> np.ndarray:
-        """log p given D and each candidate's true scan."""
-        return np.asarray(_answers(self.study.classifier, self._state(visited).cloud, self.truth.scans))
-
     def _acquisitions(self, visited: tuple[int, ...], methods: Sequence[str], view: int) -> dict[str, np.ndarray]:
-        """Every method's values of all candidates, from one set of posterior samples."""
-        state, camera = self._state(visited), self.planner.camera
+        """Values of all candidates for the methods that stand here, from one set of posterior samples."""
+        state = self._state(visited)
+        thinned = _thin(state.cloud, self.study.num_points)
+        log_p = _classify(self.imagining, thinned)
         values: dict[str, np.ndarray] = {}
         if "farthest" in methods:
             values["farthest"] = np.asarray(self._problem(state, None).distance_to_visited(self.poses))
         if "oracle" in methods:
-            values["oracle"] = np.asarray(_cross_entropies(self._classify(visited), self._answers_to_truth(visited)))
-        if not {*_CLASSIFYING, "coverage", "uncertainty"} & {*methods}:
-            return values
-        surfaces = self.planner.sample_surfaces(state, jax.random.fold_in(jax.random.fold_in(self.key, 2), view))
-        near = None
-        if {*_CLASSIFYING} & {*methods}:
-            thinned = _thin(state.cloud, self.study.num_points)
-            log_q, near = _imagined_answers(self.imagining, thinned, surfaces, camera, self.poses)
-            values |= _classification_values(_classify(self.imagining, thinned), log_q)
-        if "coverage" in methods:
-            values["coverage"] = np.asarray(_coverage(state.cloud, surfaces, camera, self.poses))
-        if "uncertainty" in methods:
-            values["uncertainty"] = np.asarray(_uncertainty(self._problem(state, surfaces), self.poses))
+            true_answers = _answers(self.imagining, thinned, self.truth.scans)
+            values["oracle"] = np.asarray(_cross_entropies(log_p, true_answers))
+        self._diagnose(view, visited, values, None, None)
+        sampling = [method for method in methods if method in _SAMPLING]
+        if sampling:
+            surfaces = self.planner.sample_surfaces(state, jax.random.fold_in(jax.random.fold_in(self.key, 2), view))
+            classifier = self.imagining if {*_CLASSIFYING} & {*sampling} else None
+            log_q, covered, near = _imagine(classifier, thinned, state.cloud, surfaces, self.near, self.poses)
+            found = {"coverage": np.asarray(covered)}
+            if log_q is not None:
+                found |= _classification_values(log_p, log_q)
+            if "uncertainty" in methods:
+                found["uncertainty"] = np.asarray(_uncertainty(self._problem(state, surfaces), self.poses))
+            found = {method: found[method] for method in sampling}
+            self._diagnose(view, visited, found, roughness(self.study.model, state.cloud, surfaces), float(near))
+            values |= found
+        return values
+
+    def _diagnose(self, view, visited, values: dict[str, np.ndarray], rough: float | None, near: float | None) -> None:
         unvisited = ~np.isin(np.arange(len(self.pattern_pixels)), visited)
         worth = self.pattern_pixels.astype(np.float64)
-        self.diagnostics.append(
-            {
-                "view": view,
-                "methods": list(methods),
-                "roughness": roughness(self.study.model, state.cloud, surfaces),
-                "near_sensor": None if near is None else float(near),
-                "rank_correlation": {name: rank_correlation(of, worth, unvisited) for name, of in values.items()},
-            }
-        )
-        return values
+        correlations = {name: rank_correlation(of, worth, unvisited) for name, of in values.items()}
+        found = {"roughness": rough, "near_sensor": near, "rank_correlation": correlations}
+        if values:
+            self.diagnostics.append({"view": view, "methods": list(values), **found})
 
     def _problem(self, state: State, surfaces: GridSurface | None) -> Problem:
         return Problem(state.cloud, state.poses, state.num_views, self.planner.camera, Coverage(), surfaces)
@@ -238,19 +239,27 @@ def _answers(classifier: Classifier, cloud: PointCloud, scans: PointCloud) -> Fl
 
 
 @eqx.filter_jit
-def _imagined_answers(
-    classifier: Classifier, cloud: PointCloud, surfaces: GridSurface, camera: Camera, poses: Pose
-) -> tuple[Float[Array, "samples poses classes"], Float[Array, ""]]:
-    """log p given D and each imagined scan, and the share of imagined hits near the sensor."""
+def _imagine(
+    classifier: Classifier | None,
+    thinned: PointCloud,
+    cloud: PointCloud,
+    surfaces: GridSurface,
+    near: float,
+    poses: Pose,
+) -> tuple[Float[Array, "samples poses classes"] | None, Float[Array, " poses"], Float[Array, ""]]:
+    """What each sample would show: log p given D and each scan, coverage, and the share of hits near the sensor."""
+    coverage = Coverage()
+    context = coverage.context(cloud)
 
     def of_sample(surface):
-        scans = scan(surface, camera, poses)
+        scans = scan(surface, Camera(), poses)
         depth = jnp.linalg.norm(scans.points - poses.position[:, None], axis=-1)
-        near = jnp.sum(scans.mask & (depth < _NEAR)) / jnp.maximum(jnp.sum(scans.mask), 1)
-        return _answers(classifier, cloud, scans), near
+        share = jnp.sum(scans.mask & (depth < near)) / jnp.maximum(jnp.sum(scans.mask), 1)
+        answers = None if classifier is None else _answers(classifier, thinned, scans)
+        return answers, jax.vmap(lambda one: coverage(context, one))(scans), share
 
-    log_q, near = jax.lax.map(of_sample, surfaces)
-    return log_q, jnp.mean(near)
+    log_q, covered, share = jax.lax.map(of_sample, surfaces)
+    return log_q, jnp.mean(covered, axis=0), jnp.mean(share)
 
 
 def _cross_entropies(log_p, log_q) -> Float[Array, "..."]:
@@ -265,11 +274,6 @@ def _classification_values(
     reduction = jnp.mean(jnp.maximum(0.0, entropy(log_p) - entropy(log_q)), axis=0)
     mixed = cross if float(entropy(log_p)) > _MIXED_THRESHOLD else reduction
     return {"cross-entropy": np.asarray(cross), "entropy": np.asarray(reduction), "mixed": np.asarray(mixed)}
-
-
-@eqx.filter_jit
-def _coverage(cloud: PointCloud, surfaces: GridSurface, camera: Camera, poses: Pose) -> Float[Array, " poses"]:
-    return expected_score(Coverage(), cloud, surfaces, camera, poses)
 
 
 @eqx.filter_jit

@@ -1,6 +1,7 @@
 """Results of a study on disk: one JSON record a scene, so that a study that was interrupted goes on with the next."""
 
 import json
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 from tqdm import tqdm
 
 from jaxnbv.checks import InputError, require
-from jaxnbv.storage import differences, write_whole
+from jaxnbv.storage import differences, versions, write_whole
 
 
 class RecordFolder:
@@ -25,14 +26,22 @@ class RecordFolder:
             raise InputError(f"cannot make the output folder {self.path} ({error}): choose another place") from error
         file = self.path / "study.json"
         if not file.exists():
-            _write(file, config)
+            _write(file, {**config, "versions": versions()})
             return
-        changed = differences(_read(file), json.loads(json.dumps(config)))
+        written = _read(file)
+        made_by = written.pop("versions", None)
+        changed = differences(written, json.loads(json.dumps(config)))
         require(
             not changed,
             f"the output folder {self.path} belongs to another study; it differs in {'; '.join(changed[:3])}. "
             "Choose another folder, or the settings it was made with",
         )
+        if made_by != versions():
+            warnings.warn(
+                f"{self.path} was begun with other versions ({'; '.join(differences(made_by, versions()))}): "
+                "new records may differ from those of an uninterrupted study",
+                stacklevel=2,
+            )
 
     def collect(self, count: int, run: Callable[[int], dict[str, Any]], progress: bool = True) -> list[dict[str, Any]]:
         """Records 0 to `count` - 1: those on disk as they are, the others from `run`, each written once it is done."""

@@ -28,6 +28,7 @@ def record(scene, methods, label=1, angle=100.0, framing="close-up", random_hit=
     return {
         "scene": scene,
         "framing": framing,
+        "split": "test",
         "label": label,
         "first": 0,
         "angle": angle,
