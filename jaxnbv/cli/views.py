@@ -38,6 +38,7 @@ from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Classifier, Coverage, CrossEntropy, MixedEntropy, NegativeEntropy
 from jaxnbv.tasks.classification import class_names, predict
 from jaxnbv.viz import write_report
+from jaxnbv.viz.words import quantity
 
 SEARCHES: dict[SearchName, Any] = {
     SearchName.DISCRETE: DiscreteSearch,
@@ -71,7 +72,9 @@ def demo(
 ) -> None:
     """Find out which pattern is pressed into the base of a pyramid: no file, no network.
 
-    The first view does not show the pattern. With --task coverage the object is a laid tea mug, to be seen all round.
+    The first view does not show the pattern. The pyramid is small enough for a view to see all of its near side; with
+    --framing close-up a view shows a patch of it. With --task coverage the object is a laid tea mug, to be seen all
+    round; --scene and --framing do not matter then.
     """
     prepare(device)
     if task is Task.COVERAGE:
@@ -79,7 +82,8 @@ def demo(
         _run("mug", demo_object(), planner, start, views, seed, out, noise, quick, report)
         return
     pyramid = pyramid_scene(Split.TEST, scene, framing)
-    planner = _planner(_score(task, pyramid_classifier(framing.longest_side)), search, quick, framing)
+    score = _score(task, pyramid_classifier(framing.longest_side))
+    planner = _planner(score, search, quick) if quick else _pyramid_planner(score, search, framing)
     typer.echo(f"the pattern is a {PATTERNS[int(pyramid.label)]}")
     start = hidden_view(pyramid, jax.random.key(seed)) if first is None else look_at(_position(first))
     _run("pyramid", SDFSurface(pyramid), planner, start, views, seed, out, noise, quick, report)
@@ -114,7 +118,8 @@ def run(
         (network is None) == (task is Task.COVERAGE),
         f"--task {task} with --network {network}: the tasks about the class need a network, coverage takes none",
     )
-    score = Coverage() if network is None else _score(task, CloudClassifier(load_checkpoint(network), scale=0.8))
+    # Published networks saw objects scaled into the unit sphere; in the scene half the longest side is 1.25.
+    score = Coverage() if network is None else _score(task, CloudClassifier(load_checkpoint(network), scale=1 / 1.25))
     scene = load_mesh(mesh)
     planner = _planner(score, search, quick)
     _run(mesh.stem, scene, planner, look_at(_position(first)), views, seed, out, noise, quick, report)
@@ -126,13 +131,18 @@ def _score(task: Task, classifier: Classifier) -> Score:
     return CrossEntropy(classifier) if task is Task.CROSS_ENTROPY else MixedEntropy(classifier)
 
 
-def _planner(score: Score, search: SearchName, quick: bool, framing: Framing = Framing.CLOSE_UP) -> Planner:
-    half_extent = 0.7 * framing.longest_side
+def _pyramid_planner(score: Score, search: SearchName, framing: Framing) -> Planner:
+    """The surfaces are imagined as those were that the classifier was trained on."""
+    model, grid = GeometricSPSR(lengthscale=0.01, truncation=32), Grid(64, 0.7 * framing.longest_side)
+    return Planner(model, Camera(), score, SEARCHES[search](), grid=grid)
+
+
+def _planner(score: Score, search: SearchName, quick: bool) -> Planner:
     if not quick:
-        return Planner(GeometricSPSR(), Camera(), score, SEARCHES[search](), grid=Grid(100, half_extent))
+        return Planner(GeometricSPSR(), Camera(), score, SEARCHES[search]())
     model = GeometricSPSR(lengthscale=0.012, truncation=24)
     camera = Camera(height=24, width=24)
-    return Planner(model, camera, score, SEARCHES[search](num_candidates=40), 4, Grid(56, half_extent), capacity=2048)
+    return Planner(model, camera, score, SEARCHES[search](num_candidates=40), 4, Grid(56), capacity=2048)
 
 
 def _run(
@@ -171,6 +181,7 @@ def _position(text: str) -> tuple[float, float, float]:
 def _summarise(episode: Episode) -> None:
     """Lines for each view: where from, why, and what it told."""
     score = episode.planner.acquisition
+    sought = quantity(episode.planner.search, score)
     before = None
     for index, view in enumerate(episode.views, start=1):
         position = ", ".join(f"{value:+.2f}" for value in np.asarray(view.pose.position))
@@ -178,7 +189,8 @@ def _summarise(episode: Episode) -> None:
         if view.proposal is not None:
             values = np.asarray(view.proposal.values)
             values = values[np.isfinite(values)]
-            line += f"   value {float(view.proposal.value):.4g}, best of {len(values)} (median {np.median(values):.4g})"
+            line += f"   {sought.name} {float(view.proposal.value):.4g}, the highest of {len(values)} candidates"
+            line += f" (median {np.median(values):.4g})" if sought.smooth else ""
         typer.echo(line)
         log_p = predict(score, view.cloud)
         if log_p is not None:

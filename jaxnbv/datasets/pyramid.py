@@ -12,7 +12,7 @@ from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import AnyArray, require
 from jaxnbv.datasets.patterns import PATTERNS, pattern_distance
 from jaxnbv.scanning import SDFSurface, scan
-from jaxnbv.scanning.sdf import Matrix, Scalar, SignedDistance, Vector, length, parameter
+from jaxnbv.scanning.sdf import Matrix, Scalar, SignedDistance, Vector, nonnegative, parameter
 from jaxnbv.search.base import sphere_candidates
 
 
@@ -47,13 +47,13 @@ class Pyramid(SignedDistance):
     """
 
     label: Int[Array, ""]
-    height: Scalar = length()
-    size: Scalar = length()
+    height: Scalar = nonnegative()
+    size: Scalar = nonnegative()
     place: Float[Array, "2"] = parameter()
     turn: Scalar = parameter()
-    depth: Scalar = length()
+    depth: Scalar = nonnegative()
     rotation: Matrix = parameter()
-    scale: Scalar = length()
+    scale: Scalar = nonnegative()
     offset: Vector = parameter()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:

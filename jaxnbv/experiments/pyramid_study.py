@@ -26,7 +26,7 @@ from jaxnbv.tasks.classification import Classifier, cross_entropy, entropy
 
 _CLASSIFYING = ("cross-entropy", "entropy", "mixed")
 _SAMPLING = (*_CLASSIFYING, "coverage", "uncertainty")
-_RANDOM_RUNS = 16
+_RANDOM_RUNS = 8
 _MIXED_THRESHOLD = 0.75
 _RADIUS = 2.5
 
@@ -50,7 +50,7 @@ class PyramidStudy(eqx.Module):
     split: Split = eqx.field(static=True, default=Split.TEST)
     views: int = eqx.field(static=True, default=5)
     num_candidates: int = eqx.field(static=True, default=48)
-    num_samples: int = eqx.field(static=True, default=32)
+    num_samples: int = eqx.field(static=True, default=16)
     model: GeometricSPSR = GeometricSPSR(lengthscale=0.01, truncation=32)
     grid_resolution: int = eqx.field(static=True, default=64)
     capacity: int = eqx.field(static=True, default=4096)

@@ -59,10 +59,12 @@ def train(
     start, carry = 0, (parameters, optimiser.init(parameters))
     checkpoint = None
     if folder is not None:
-        identity = hashlib.sha256(np.asarray(labels).tobytes() + np.asarray(jax.random.key_data(key)).tobytes())
+        identity = hashlib.sha256()
+        for array in (jax.random.key_data(key), labels, clouds.points, *jax.tree.leaves(parameters)):
+            identity.update(np.ascontiguousarray(array).tobytes())
         settings = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate}
         settings |= {"weight_decay": weight_decay, "clouds": count}
-        checkpoint = _Checkpoint(Path(folder), {**settings, "labels_and_key": identity.hexdigest()})
+        checkpoint = _Checkpoint(Path(folder), {**settings, "identity": identity.hexdigest()})
         start, carry = checkpoint.read(carry)
 
     data = jax.tree.map(jnp.asarray, (clouds, labels))

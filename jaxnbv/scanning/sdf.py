@@ -36,7 +36,7 @@ def parameter(**kwargs):
     return eqx.field(converter=_as_float, **kwargs)
 
 
-def length(**kwargs):
+def nonnegative(**kwargs):
     """A parameter that must not be negative."""
     return parameter(metadata={"length": True}, **kwargs)
 
@@ -140,7 +140,7 @@ class SignedDistance(eqx.Module):
 class Sphere(SignedDistance):
     """The ball of `radius` about the origin. Exact."""
 
-    radius: Scalar = length()
+    radius: Scalar = nonnegative()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         return _norm(*_split(x)) - self.radius
@@ -152,8 +152,8 @@ class Box(SignedDistance):
     **Raises:** `ValueError` also if the rounding is greater than half of a side.
     """
 
-    half_size: Vector = length()
-    rounding: Scalar = length(default=0.0)
+    half_size: Vector = nonnegative()
+    rounding: Scalar = nonnegative(default=0.0)
 
     def __check_init__(self):
         if not is_traced(self):
@@ -169,8 +169,8 @@ class Box(SignedDistance):
 class Cylinder(SignedDistance):
     """The solid cylinder about the y axis with flat caps at y = -half_height and half_height. Exact."""
 
-    radius: Scalar = length()
-    half_height: Scalar = length()
+    radius: Scalar = nonnegative()
+    half_height: Scalar = nonnegative()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         x, y, z = _split(x)
@@ -180,9 +180,9 @@ class Cylinder(SignedDistance):
 class Cone(SignedDistance):
     """The solid cone about the y axis, capped flat: radii at y = -half_height and y = half_height. Exact."""
 
-    bottom_radius: Scalar = length()
-    top_radius: Scalar = length()
-    half_height: Scalar = length()
+    bottom_radius: Scalar = nonnegative()
+    top_radius: Scalar = nonnegative()
+    half_height: Scalar = nonnegative()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         # The profile in the half plane (r, y): two caps, a slanted edge from the bottom's corner to the top's.
@@ -204,8 +204,8 @@ class Cone(SignedDistance):
 class Torus(SignedDistance):
     """The torus about the y axis: a tube of `minor_radius` around the circle of `major_radius`. Exact."""
 
-    major_radius: Scalar = length()
-    minor_radius: Scalar = length()
+    major_radius: Scalar = nonnegative()
+    minor_radius: Scalar = nonnegative()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         x, y, z = _split(x)
@@ -217,7 +217,7 @@ class Capsule(SignedDistance):
 
     start: Vector = parameter()
     end: Vector = parameter()
-    radius: Scalar = length()
+    radius: Scalar = nonnegative()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         segment = self.end - self.start
@@ -246,7 +246,7 @@ class SmoothUnion(SignedDistance):
 
     first: SignedDistance
     second: SignedDistance
-    width: Scalar = length()
+    width: Scalar = nonnegative()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         a, b = self.first(x), self.second(x)
@@ -306,7 +306,7 @@ class Scaled(SignedDistance):
     """A solid scaled about the origin by `factor` > 0. As exact as the solid."""
 
     solid: SignedDistance
-    factor: Scalar = length()
+    factor: Scalar = nonnegative()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         return self.factor * self.solid(x / self.factor)

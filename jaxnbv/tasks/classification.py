@@ -5,7 +5,7 @@ network of `jaxnbv.networks`, one of your own, or a `HostClassifier`.
 """
 
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import equinox as eqx
 import jax
@@ -141,6 +141,7 @@ class HostClassifier(eqx.Module):
 
     function: Callable = eqx.field(static=True)
     num_classes: int = eqx.field(static=True)
+    batch_size: ClassVar[int] = 128
 
     def __check_init__(self):
         require(self.num_classes >= 2, f"num_classes is {self.num_classes}; a classifier tells at least two apart")
@@ -160,6 +161,12 @@ def _call_host(cloud: PointCloud, host: HostClassifier) -> Float[Array, " classe
         require(
             log_p.shape == expected,
             f"the classifier returned shape {log_p.shape}, not {expected}: log-probabilities, a row a cloud",
+        )
+        total = np.exp(log_p).sum(axis=-1)
+        require(
+            bool((np.abs(total - 1.0) < 1e-3).all()),
+            f"the classifier's answers are not log-probabilities: their exponentials sum to {total.flat[0]:.4g}; "
+            "apply log_softmax to its logits",
         )
         return log_p.reshape(*batch, host.num_classes)
 
