@@ -1,6 +1,10 @@
 """Shapes and types of every public signature are checked while the tests run."""
 
+import os
 from pathlib import Path
+
+# Before NumPy and SciPy load it: workers whose linear algebra takes all cores each wait for one another.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
 import numpy as np

@@ -54,8 +54,8 @@ def pyramid(
     Writes a record a scene, tables as text and CSV, and figures. Interrupted, it continues with the next scene.
 
     48 candidates, 16 samples of a Gaussian process that fits the spacing of the data (lengthscale 0.01, L = 32) on a
-    64^3 grid, and 512 points for the classifier of imagined scans: fewer candidates and a smoother prior
-    than the paper's.
+    64^3 grid, and 512 points for the classifier of imagined scans: fewer candidates and a smoother prior than the
+    paper's.
     """
     prepare(device)
     asked = {name.strip() for name in methods.split(",")}

@@ -14,4 +14,4 @@ def convert(
 ) -> None:
     """Rewrite a PyTorch checkpoint as safetensors. Nothing in it is run, and PyTorch is not needed."""
     network = convert_checkpoint(source, target)
-    typer.echo(f"{target}   PointNet++ for {network.classes} classes")
+    typer.echo(f"{target}   PointNet++ for {network.num_classes} classes")

@@ -43,7 +43,7 @@ class PointNet2Classifier(eqx.Module):
     last: Linear
 
     @property
-    def classes(self) -> int:
+    def num_classes(self) -> int:
         """The number of classes."""
         return self.last.bias.shape[0]
 

@@ -156,7 +156,7 @@ def test_a_network_survives_safetensors_and_the_archive(tmp_path, sampling, inpu
     read = load_torch_checkpoint(checkpoint(tmp_path / "net.pth", arrays))
     assert_same(read, network)
     assert read.uses_normals == (inputs == 6)
-    assert read.classes == 4
+    assert read.num_classes == 4
     assert [level.radii for level in read.levels] == [level.radii for level in sampling]
 
 

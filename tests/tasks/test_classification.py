@@ -278,8 +278,17 @@ def test_a_host_classifier_equals_the_one_in_jax_in_one_call_a_batch():
 def test_a_host_classifier_of_a_large_batch_comes_back():
     """Callbacks of JAX have been known to wait for ever for their own arguments on few cores."""
     cloud = PointCloud(jnp.ones((120, 3500, 3)), jnp.ones((120, 3500, 3)), jnp.ones((120, 3500), bool))
-    host = HostClassifier(lambda points, normals, mask: points[:, :2, 0] + mask[:, :2], 2)
-    np.testing.assert_array_equal(jax.jit(jax.vmap(host))(cloud), np.full((120, 2), 2.0))
+    host = HostClassifier(lambda points, normals, mask: np.log([0.25, 0.75]) * points[:, :2, 0] * mask[:, :2], 2)
+    expected = np.tile(np.log([0.25, 0.75]), (120, 1))
+    np.testing.assert_allclose(jax.jit(jax.vmap(host))(cloud), expected, rtol=1e-6)
+
+
+def test_a_host_classifier_that_gives_logits_or_nan_is_refused():
+    cloud = PointCloud(jnp.ones((3, 3)), jnp.ones((3, 3)), jnp.ones(3, bool))
+    for answer in ([2.0, -1.0], [0.5, 0.5], [np.nan, np.nan]):
+        host = HostClassifier(lambda points, normals, mask, answer=answer: np.array([answer]), 2)
+        with pytest.raises(Exception, match="not log-probabilities"):
+            jax.block_until_ready(host(cloud))
 
 
 @pytest.mark.parametrize("wrap", [lambda f: f, jax.jit])
