@@ -82,7 +82,7 @@ def test_a_record_is_json_and_holds_every_method():
     assert record["label"] == int(pyramid.label)
     assert 0 <= record["random_hit"] <= 1
     for name, method in record["methods"].items():
-        assert len(method["runs"]) == (4 if name == "random" else 1)
+        assert len(method["runs"]) == (8 if name == "random" else 1)
         for run in method["runs"]:
             assert len(run["candidates"]) == len(set(run["candidates"])) == 3
             assert set(run["candidates"]) <= set(range(CANDIDATES))
@@ -117,20 +117,25 @@ def test_some_methods_alone_choose_as_among_all():
         assert list(record["methods"]) == list(some)
         for name in some:
             assert record["methods"][name] == whole_record()["methods"][name]
-    assert not run_scene(small_study(), SCENE, ("farthest", "oracle"))["diagnostics"]
+    found = run_scene(small_study(), SCENE, ("farthest", "oracle"))["diagnostics"]
+    assert {name for entry in found for name in entry["methods"]} == {"farthest", "oracle"}
+    assert all(entry["roughness"] is None and entry["near_sensor"] is None for entry in found)
 
 
-def test_diagnostics_of_every_step_that_draws_samples():
+def test_diagnostics_of_every_method_at_every_view():
     found = whole_record()["diagnostics"]
-    assert {entry["view"] for entry in found} == {2, 3}
-    assert set(found[0]["methods"]) == set(METHODS) - {"random"}
+    for view in (2, 3):
+        names = [name for entry in found if entry["view"] == view for name in entry["methods"]]
+        assert sorted(names) == sorted(set(METHODS) - {"random"})
     for entry in found:
-        assert entry["roughness"] > 0
-        assert entry["near_sensor"] is None or 0 <= entry["near_sensor"] <= 1
+        assert list(entry["rank_correlation"]) == entry["methods"]
+        draws_samples = not {*entry["methods"]} & {"farthest", "oracle"}
+        assert (entry["roughness"] is not None) == (entry["near_sensor"] is not None) == draws_samples
+        if draws_samples:
+            assert entry["roughness"] > 0
+            assert 0 <= entry["near_sensor"] <= 1
         for correlation in entry["rank_correlation"].values():
             assert correlation is None or -1 <= correlation <= 1
-    later = [name for entry in found if entry["view"] == 3 for name in entry["methods"]]
-    assert len(later) == len(set(later))
 
 
 @eqx.filter_jit
