@@ -66,7 +66,9 @@ ReportOption = Annotated[bool, typer.Option("--report/--no-report", help="Write 
 DeviceOption = Annotated[Device, typer.Option(help="Where to compute; auto takes a GPU if JAX sees one.")]
 FramingOption = Annotated[
     Framing,
-    typer.Option(help="How large the object stands: its longest side 2.5, a view shows a patch; or 1.25, and it fits."),
+    typer.Option(
+        help="How large the object stands: its longest side 2.5, a view shows a patch; or 1.25, and it nearly fits."
+    ),
 ]
 
 

@@ -35,7 +35,9 @@ def pyramid(
     views: Annotated[int, typer.Option(min=2, help="Views in all, the first one included.")] = 5,
     framing: Annotated[
         Framing | None,
-        typer.Option(help="How large the object stands: a view shows a patch of it, or all.", show_default="both"),
+        typer.Option(
+            help="How large the object stands: a view shows a patch of it, or nearly all.", show_default="both"
+        ),
     ] = None,
     methods: Annotated[str, typer.Option(help="Which methods, separated by commas.")] = ",".join(METHODS),
     out: Annotated[

@@ -72,9 +72,9 @@ def demo(
 ) -> None:
     """Find out which pattern is pressed into the base of a pyramid: no file, no network.
 
-    The first view does not show the pattern. The pyramid is small enough for a view to see all of its near side; with
-    --framing close-up a view shows a patch of it. With --task coverage the object is a laid tea mug, to be seen all
-    round; --scene and --framing do not matter then.
+    The first view does not show the pattern. The pyramid is small enough for a view to see nearly all of its near side;
+    with --framing close-up a view shows a patch of it. With --task coverage the object is a laid tea mug, to be seen
+    all round; --scene and --framing do not matter then.
     """
     prepare(device)
     if task is Task.COVERAGE:

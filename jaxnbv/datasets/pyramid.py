@@ -25,7 +25,7 @@ class Split(StrEnum):
 
 
 class Framing(StrEnum):
-    """How large the object stands before the sensor: a view shows a patch of it, or all of its near side."""
+    """How large the object stands before the sensor: a view shows a patch, or nearly all of its near side."""
 
     CLOSE_UP = "close-up"
     WHOLE = "whole"
