@@ -8,12 +8,12 @@ timed after compilation, as the least of several runs.
 
 import argparse
 import json
-import time
 from pathlib import Path
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from timing import least_time
 
 import jaxnbv as nbv
 from jaxnbv.datasets import Framing, Split, hidden_view, pyramid_scene
@@ -23,17 +23,6 @@ from jaxnbv.search.base import sphere_candidates
 from jaxnbv.storage import versions
 
 LIMIT = 30.0
-
-
-def least_time(function, repeats: int = 2) -> float:
-    """Least wall time in seconds of a few runs after one that compiles."""
-    jax.block_until_ready(function())
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(function())
-        times.append(time.perf_counter() - start)
-    return min(times)
 
 
 def main() -> None:

@@ -9,13 +9,13 @@ of several runs.
 
 import argparse
 import json
-import time
 from itertools import pairwise
 from pathlib import Path
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from timing import least_time
 
 from jaxnbv.farthest import farthest_point_indices
 from jaxnbv.networks import PointNet2Classifier, ball_query
@@ -31,17 +31,6 @@ NETWORKS = {
     ),
 }
 LIMIT = 2.5
-
-
-def least_time(function, repeats: int = 5) -> float:
-    """Least wall time in seconds of a few runs after one that compiles."""
-    jax.block_until_ready(function())
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(function())
-        times.append(time.perf_counter() - start)
-    return min(times)
 
 
 def random_layers(key: jax.Array, *widths: int) -> tuple[Linear, ...]:

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 from skimage.measure import marching_cubes
+from timing import least_time
 
 import jaxnbv as nbv
 from jaxnbv.datasets import demo_object
@@ -36,17 +37,6 @@ FIGURES = {
     "first step": ("first step, compilation included", 60.0),
 }
 PEAK_MEMORY = 6.0
-
-
-def least_time(function, repeats: int = 3) -> float:
-    """Least wall time in seconds of a few runs after one that compiles."""
-    jax.block_until_ready(function())
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(function())
-        times.append(time.perf_counter() - start)
-    return min(times)
 
 
 def rival_scan(surfaces: nbv.GridSurface, origins: np.ndarray, directions: np.ndarray) -> float:

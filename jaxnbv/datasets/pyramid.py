@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import AnyArray, require
+from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets.patterns import PATTERNS, pattern_distance
 from jaxnbv.scanning import SDFSurface, scan
 from jaxnbv.scanning.sdf import Matrix, Scalar, SignedDistance, Vector, nonnegative, parameter
@@ -128,17 +129,27 @@ def pyramid_scene(split: Split, index: int | Int[Array, ""], framing: Framing = 
 
 
 def hidden_view(pyramid: Pyramid, key: PRNGKeyArray, camera: Camera = Camera(), num_candidates: int = 120) -> Pose:
-    """A candidate from which the pattern does not show, drawn uniformly from them.
+    """A candidate from which the object shows but not the pattern, drawn uniformly from them.
 
-    **Raises:** `ValueError` if it shows from all candidates.
+    **Raises:** `ValueError` if there is none.
     """
-    poses = sphere_candidates(num_candidates, 2.5)
-    hidden = np.flatnonzero(np.asarray(_pattern_pixels(pyramid, camera, poses)) == 0)
-    require(len(hidden) > 0, f"the pattern shows from all {num_candidates} candidates: ask for more of them")
-    return poses[jax.random.choice(key, hidden)]
+    poses = sphere_candidates(num_candidates)
+    pixels, scans = scan_pattern(pyramid, camera, poses)
+    return poses[choose_hidden(pixels, scans, key)]
+
+
+def choose_hidden(pattern_pixels: Int[AnyArray, " poses"], scans: PointCloud, key: PRNGKeyArray) -> int:
+    """Index of a pose whose scan hits the object but not the pattern, drawn uniformly from them.
+
+    **Raises:** `ValueError` if there is none.
+    """
+    hidden = np.flatnonzero((np.asarray(pattern_pixels) == 0) & (np.asarray(scans.count) > 0))
+    require(len(hidden) > 0, f"the pattern shows from all {len(pattern_pixels)} candidates: ask for more of them")
+    return int(jax.random.choice(key, hidden))
 
 
 @eqx.filter_jit
-def _pattern_pixels(pyramid: Pyramid, camera: Camera, poses: Pose) -> Int[Array, " poses"]:
+def scan_pattern(pyramid: Pyramid, camera: Camera, poses: Pose) -> tuple[Int[Array, " poses"], PointCloud]:
+    """How many rays of each pose hit the pattern, and the scans, without noise."""
     scans = scan(SDFSurface(pyramid), camera, poses)
-    return jnp.sum(pyramid.on_pattern(scans.points) & scans.mask, axis=-1)
+    return jnp.sum(pyramid.on_pattern(scans.points) & scans.mask, axis=-1), scans

@@ -7,12 +7,13 @@ from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
 from jaxnbv.camera import Camera, Pose, look_at
 from jaxnbv.cloud import PointCloud, concatenate, farthest_point_subsample, limit_capacity
-from jaxnbv.datasets import Framing, Split, pyramid_scene
-from jaxnbv.scanning import Grid, GridSurface, SDFSurface, SensorNoise, scan
+from jaxnbv.datasets import Framing, Pyramid, Split, pyramid_scene
+from jaxnbv.datasets.pyramid import scan_pattern
+from jaxnbv.scanning import Grid, GridSurface, SensorNoise, scan
+from jaxnbv.search.base import SENSOR_RADIUS
 from jaxnbv.surfaces import SurfaceModel
 
 MAX_VIEWS = 5
-SENSOR_RADIUS = 2.5
 
 
 class LabelledClouds(eqx.Module):
@@ -38,11 +39,7 @@ def scanned_clouds(
 
     def cloud_of(index):
         pyramid, key = pyramid_scene(split, index, framing), _key(split, index)
-        views, pattern = _random_views(pyramid, key, MAX_VIEWS)
-        number = jax.random.randint(jax.random.fold_in(key, 1), (), 1, MAX_VIEWS + 1)
-        used = jnp.arange(MAX_VIEWS) < number
-        cloud = _flatten(PointCloud(views.points, views.normals, views.mask & used[:, None]))
-        pixels = jnp.sum(jnp.where(used, pattern, 0))
+        cloud, pixels = _partial_cloud(pyramid, key, MAX_VIEWS)
         return LabelledClouds(farthest_point_subsample(cloud, num_points), pyramid.label, pixels, jnp.asarray(False))
 
     return jax.lax.map(cloud_of, first + jnp.arange(count))
@@ -67,11 +64,7 @@ def imagined_clouds(
     The class is the true one, whatever the sample shows.
     """
     pyramid, key = pyramid_scene(split, index, framing), _key(split, index)
-    views, pattern = _random_views(pyramid, key, MAX_VIEWS - 1)
-    number = jax.random.randint(jax.random.fold_in(key, 1), (), 1, MAX_VIEWS)
-    used = jnp.arange(MAX_VIEWS - 1) < number
-    cloud = _flatten(PointCloud(views.points, views.normals, views.mask & used[:, None]))
-    pixels = jnp.sum(jnp.where(used, pattern, 0))
+    cloud, pixels = _partial_cloud(pyramid, key, MAX_VIEWS - 1)
 
     posterior = imagination.model.condition(limit_capacity(cloud, imagination.capacity))
     fields = posterior.sample(jax.random.fold_in(key, 2), imagination.num_samples)
@@ -99,12 +92,11 @@ def _random_poses(key: PRNGKeyArray, count: int) -> Pose:
     return look_at(SENSOR_RADIUS * direction / jnp.linalg.norm(direction, axis=-1, keepdims=True))
 
 
-def _random_views(pyramid, key: PRNGKeyArray, count: int) -> tuple[PointCloud, Int[Array, " views"]]:
+def _partial_cloud(pyramid: Pyramid, key: PRNGKeyArray, most: int) -> tuple[PointCloud, Int[Array, ""]]:
+    """What one to `most` random views show, and how many of their rays hit the pattern."""
     pose_key, noise_key = jax.random.split(key)
-    views = scan(SDFSurface(pyramid), Camera(), _random_poses(pose_key, count))
-    pattern = jnp.sum(pyramid.on_pattern(views.points) & views.mask, axis=-1)
-    return SensorNoise()(views, noise_key), pattern
-
-
-def _flatten(views: PointCloud) -> PointCloud:
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), views)
+    pattern, scans = scan_pattern(pyramid, Camera(), _random_poses(pose_key, most))
+    views = SensorNoise()(scans, noise_key)
+    used = jnp.arange(most) < jax.random.randint(jax.random.fold_in(key, 1), (), 1, most + 1)
+    views = PointCloud(views.points, views.normals, views.mask & used[:, None])
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), views), jnp.sum(jnp.where(used, pattern, 0))

@@ -23,7 +23,6 @@ from jaxnbv.viz.style import GREY, LINE, NEW
 
 _SHOWN = ("cross-entropy", "farthest", "uncertainty")
 _RIGHT = "#00734f"
-_RADIUS = 2.5
 # Of the picture: the sensor's own field of view, with finer pixels.
 _PIXELS = 250
 _BACKGROUND = np.array(mpl.colors.to_rgb("#f3f5f8"))
@@ -111,7 +110,7 @@ def _tile(axes: Axes, image: Float[np.ndarray, "h w 3"], label: int, run: dict, 
 
 
 def _images(record: Record, candidates: Sequence[int]) -> list[Float[np.ndarray, "h w 3"]]:
-    poses = sphere_candidates(len(record["pattern_pixels"]), _RADIUS)
+    poses = sphere_candidates(len(record["pattern_pixels"]))
     scene, framing, split = jnp.asarray(record["scene"]), Framing(record["framing"]), Split(record["split"])
     return [_shade(*map(np.asarray, _render(split, scene, framing, poses[candidate]))) for candidate in candidates]
 

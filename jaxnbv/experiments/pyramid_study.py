@@ -13,22 +13,21 @@ from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import require
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.datasets import Framing, Split, pyramid_scene
+from jaxnbv.datasets.pyramid import choose_hidden, scan_pattern
 from jaxnbv.experiments.diagnostics import rank_correlation, roughness
 from jaxnbv.experiments.pyramid_report import METHODS
 from jaxnbv.planner import Planner, State
-from jaxnbv.scanning import Grid, GridSurface, SDFSurface, SensorNoise, scan
+from jaxnbv.scanning import Grid, GridSurface, SensorNoise, scan
 from jaxnbv.search import DiscreteSearch, Problem
-from jaxnbv.search.base import sphere_candidates
+from jaxnbv.search.base import SENSOR_RADIUS, sphere_candidates
 from jaxnbv.search.baselines import uncertain_length
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
-from jaxnbv.tasks.classification import Classifier, cross_entropy, entropy
+from jaxnbv.tasks.classification import Classifier, MixedEntropy, cross_entropy, entropy
 
 _CLASSIFYING = ("cross-entropy", "entropy", "mixed")
 _SAMPLING = (*_CLASSIFYING, "coverage", "uncertainty")
 _RANDOM_RUNS = 8
-_MIXED_THRESHOLD = 0.75
-_RADIUS = 2.5
 
 
 class PyramidStudy(eqx.Module):
@@ -91,9 +90,9 @@ class _Scene:
     def __init__(self, study: PyramidStudy, index: int):
         self.study, self.index, self.planner = study, index, study.planner
         self.imagining = study.classifier if study.imagining is None else study.imagining
-        self.poses = sphere_candidates(study.num_candidates, _RADIUS)
+        self.poses = sphere_candidates(study.num_candidates)
         # A hit this near lies outside the ball of radius 0.6 longest sides about the origin, towards the sensor.
-        self.near = _RADIUS - 0.6 * study.framing.longest_side
+        self.near = SENSOR_RADIUS - 0.6 * study.framing.longest_side
         self.truth = _truth(self.poses, jnp.asarray(index), study.split, study.framing)
         self.pattern_pixels = np.asarray(self.truth.pattern_pixels)
         self.key = jax.random.fold_in(jax.random.key(2), index)
@@ -140,9 +139,7 @@ class _Scene:
         return {"candidates": list(visited), "pattern_pixels": pixels, "log_p": log_p}
 
     def _first_view(self) -> int:
-        hidden = np.flatnonzero((self.pattern_pixels == 0) & (np.asarray(self.truth.scans.count) > 0))
-        require(len(hidden) > 0, f"the pattern of scene {self.index} shows from all candidates: ask for more of them")
-        return int(jax.random.choice(jax.random.fold_in(self.key, 0), hidden))
+        return choose_hidden(self.pattern_pixels, self.truth.scans, jax.random.fold_in(self.key, 0))
 
     def _random_run(self, run: int) -> tuple[int, ...]:
         others = np.delete(np.arange(self.study.num_candidates), self.first)
@@ -214,8 +211,7 @@ def _without(values: np.ndarray, visited: tuple[int, ...]) -> np.ndarray:
 @eqx.filter_jit
 def _truth(poses: Pose, index: Int[Array, ""], split: Split, framing: Framing) -> _Truth:
     pyramid = pyramid_scene(split, index, framing)
-    scans = scan(SDFSurface(pyramid), Camera(), poses)
-    pixels = jnp.sum(pyramid.on_pattern(scans.points) & scans.mask, axis=-1)
+    pixels, scans = scan_pattern(pyramid, Camera(), poses)
     keys = jax.random.split(jax.random.fold_in(jax.random.key(3), index), len(pixels))
     direction = poses.position / jnp.linalg.norm(poses.position, axis=-1, keepdims=True)
     # The base looks along -z of the pyramid's own frame.
@@ -272,7 +268,7 @@ def _classification_values(
     """`CrossEntropy`, `ExpectedUtilityImprovement(NegativeEntropy)` and `MixedEntropy` of the same answers."""
     cross = jnp.mean(_cross_entropies(log_p, log_q), axis=0)
     reduction = jnp.mean(jnp.maximum(0.0, entropy(log_p) - entropy(log_q)), axis=0)
-    mixed = cross if float(entropy(log_p)) > _MIXED_THRESHOLD else reduction
+    mixed = cross if float(entropy(log_p)) > MixedEntropy.threshold else reduction
     return {"cross-entropy": np.asarray(cross), "entropy": np.asarray(reduction), "mixed": np.asarray(mixed)}
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxnbv.farthest import farthest_point_indices
 from jaxnbv.networks.grouping import ball_query
+from jaxnbv.networks.set_abstraction import product
 
 _POOLED = 160
 
@@ -50,7 +51,7 @@ class InvariantClassifier(eqx.Module):
         patterns = self.pattern(coarse, (*centers, edges), jnp.ones(len(order), bool))
         pooled = jnp.where(jnp.any(mask), jnp.max(patterns, axis=0), 0.0)
         hidden, output = self.head
-        return jax.nn.log_softmax(output(jax.nn.relu(hidden(pooled))) / self.temperature)
+        return jax.nn.log_softmax(_affine(output, jax.nn.relu(_affine(hidden, pooled))) / self.temperature)
 
 
 class _Level(eqx.Module):
@@ -79,17 +80,10 @@ class _Level(eqx.Module):
         hidden = _affine(self.pair, pairs.reshape(-1, 4))
         if self.feature is not None:
             # Linear, so the features meet their weights once a point rather than once a pair.
-            hidden = hidden + jnp.matmul(features, self.feature.weight.T, precision="highest")[index].reshape(
-                hidden.shape
-            )
+            hidden = hidden + product(features, self.feature.weight.T)[index].reshape(hidden.shape)
         output = _affine(self.output, jax.nn.relu(hidden))
         return jax.nn.relu(jnp.max(output.reshape(*index.shape, -1), axis=1))
 
 
 def _affine(layer: Any, rows):
-    return _product(layer, rows) + layer.bias
-
-
-def _product(layer: Any, rows):
-    """A layer without its bias on the rows of a matrix, as one product."""
-    return jnp.matmul(rows, layer.weight.T, precision="highest")
+    return product(rows, layer.weight.T) + layer.bias

@@ -12,6 +12,9 @@ from jaxnbv.checks import InputError, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.scanning import GridSurface
 
+# Of the paper: cameras stand on a sphere of this radius about the origin, in scene units.
+SENSOR_RADIUS = 2.5
+
 
 class Problem(eqx.Module):
     """One step's question: where to look next.
@@ -73,7 +76,7 @@ class Search(eqx.Module):
         """The pose to take next; a pure function of its arguments, which runs under `jit`."""
 
 
-def sphere_candidates(count: int, radius: float) -> Pose:
+def sphere_candidates(count: int, radius: float = SENSOR_RADIUS) -> Pose:
     """The paper's candidate pool: a Fibonacci sphere of cameras that look at the origin."""
     return look_at(fibonacci_sphere(count, radius))
 

@@ -9,14 +9,22 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.camera import Pose
 from jaxnbv.checks import InputError
-from jaxnbv.search.base import Problem, Proposal, Search, best_unvisited, check_candidates, sphere_candidates
+from jaxnbv.search.base import (
+    SENSOR_RADIUS,
+    Problem,
+    Proposal,
+    Search,
+    best_unvisited,
+    check_candidates,
+    sphere_candidates,
+)
 
 
 class FarthestView(Search):
     """Farthest point sampling of views: the candidate whose nearest visited camera is farthest away."""
 
     num_candidates: int = eqx.field(static=True, default=120)
-    radius: float = eqx.field(static=True, default=2.5)
+    radius: float = eqx.field(static=True, default=SENSOR_RADIUS)
     uses_samples: ClassVar[bool] = False
 
     def __check_init__(self):
@@ -32,7 +40,7 @@ class RandomView(Search):
     """A candidate drawn uniformly from those not visited yet."""
 
     num_candidates: int = eqx.field(static=True, default=120)
-    radius: float = eqx.field(static=True, default=2.5)
+    radius: float = eqx.field(static=True, default=SENSOR_RADIUS)
     uses_samples: ClassVar[bool] = False
 
     def __check_init__(self):
@@ -52,7 +60,7 @@ class UncertaintyView(Search):
     """
 
     num_candidates: int = eqx.field(static=True, default=120)
-    radius: float = eqx.field(static=True, default=2.5)
+    radius: float = eqx.field(static=True, default=SENSOR_RADIUS)
     uses_samples: ClassVar[bool] = True
 
     def __check_init__(self):

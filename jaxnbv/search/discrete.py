@@ -5,14 +5,22 @@ from typing import ClassVar
 import equinox as eqx
 from jaxtyping import PRNGKeyArray
 
-from jaxnbv.search.base import Problem, Proposal, Search, best_unvisited, check_candidates, sphere_candidates
+from jaxnbv.search.base import (
+    SENSOR_RADIUS,
+    Problem,
+    Proposal,
+    Search,
+    best_unvisited,
+    check_candidates,
+    sphere_candidates,
+)
 
 
 class DiscreteSearch(Search):
     """The candidate of the highest acquisition, among `num_candidates` on a Fibonacci sphere of the given radius."""
 
     num_candidates: int = eqx.field(static=True, default=120)
-    radius: float = eqx.field(static=True, default=2.5)
+    radius: float = eqx.field(static=True, default=SENSOR_RADIUS)
     uses_samples: ClassVar[bool] = True
 
     def __check_init__(self):

@@ -132,7 +132,7 @@ class HostClassifier(eqx.Module):
     """A classifier that runs outside JAX, a PyTorch model say: for search over candidates only.
 
     - `function`: from points (b, n, 3), unit normals (b, n, 3) and mask (b, n), as NumPy arrays, to log-probabilities
-      (b, num_classes). It is called with as many clouds at once as the score takes, one by one on a CPU.
+      (b, num_classes). It is called with up to 128 candidates of one posterior sample at once.
     - `num_classes`: how many classes it tells apart.
 
     **Raises:** `ValueError` when a gradient is asked for. A function that returns another shape, or fails, fails within

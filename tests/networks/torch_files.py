@@ -1,0 +1,130 @@
+"""PyTorch files written by hand, opcode by opcode, and a small network to put in them."""
+
+import itertools
+import pickle
+import struct
+import zipfile
+
+import jax.numpy as jnp
+import numpy as np
+import safetensors.numpy
+
+from jaxnbv.networks import (
+    PointNet2Classifier,
+    save_safetensors,
+)
+from jaxnbv.networks.pointnet2 import SINGLE_SCALE
+from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
+
+STORAGES = {
+    "f8": "DoubleStorage",
+    "f4": "FloatStorage",
+    "f2": "HalfStorage",
+    "i8": "LongStorage",
+    "i4": "IntStorage",
+    "u1": "ByteStorage",
+    "b1": "BoolStorage",
+}
+
+
+class Op:
+    """A piece of pickle program: its parts, and what is done with them."""
+
+    def __init__(self, code, *parts):
+        self.code, self.parts = code, parts
+
+
+def call(name, *arguments):
+    return Op(b"R", name, arguments)
+
+
+def named(module, name):
+    return Op(f"c{module}\n{name}\n".encode())
+
+
+def program(thing):
+    if isinstance(thing, Op):
+        return b"".join(map(program, thing.parts)) + thing.code
+    if isinstance(thing, tuple):
+        return b"(" + b"".join(map(program, thing)) + b"t"
+    if isinstance(thing, list):
+        return b"](" + b"".join(map(program, thing)) + b"e"
+    if isinstance(thing, dict):
+        return b"}(" + b"".join(program(part) for item in thing.items() for part in item) + b"u"
+    if isinstance(thing, str):
+        return b"X" + struct.pack("<I", len(thing.encode())) + thing.encode()
+    return pickle.dumps(thing, protocol=2)[2:-1]
+
+
+def dumps(thing):
+    return b"\x80\x02" + program(thing) + b"."
+
+
+def storage(key, kind, count, *view):
+    return Op(b"Q", ("storage", named("torch", kind), key, "cuda:0", count, *view))
+
+
+def view(stored, offset, shape, strides):
+    hooks = call(named("collections", "OrderedDict"))
+    return call(named("torch._utils", "_rebuild_tensor_v2"), stored, offset, shape, strides, False, hooks)
+
+
+def contiguous(shape):
+    return tuple(int(np.prod(shape[i + 1 :])) for i in range(len(shape)))
+
+
+def tensors_and_bytes(arrays, *view_metadata):
+    """The pickle's tensors, and the bytes of their storages, big-endian where the array is."""
+    tensors, data = {}, {}
+    for index, (name, array) in enumerate(arrays.items()):
+        kind = STORAGES[array.dtype.newbyteorder("<").str[1:]]
+        stored = storage(str(index), kind, array.size, *view_metadata)
+        tensors[name], data[str(index)] = view(stored, 0, array.shape, contiguous(array.shape)), array.tobytes()
+    return tensors, data
+
+
+def write_archive(path, content, data, order="little"):
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("net/data.pkl", dumps(content))
+        if order:
+            archive.writestr("net/byteorder", order)
+        for key, value in data.items():
+            archive.writestr(f"net/data/{key}", value)
+        archive.writestr("net/version", "3\n")
+    return path
+
+
+def write_stream(path, content, data, counts):
+    head = [0x1950A86A20F9469CFC6C, 1001, {"protocol_version": 1001, "little_endian": True}]
+    body = b"".join(struct.pack("<q", count) + data[key] for key, count in zip(data, counts, strict=True))
+    path.write_bytes(b"".join(map(dumps, [*head, content, list(data)])) + body)
+    return path
+
+
+def checkpoint(path, arrays, **others):
+    tensors, data = tensors_and_bytes(arrays)
+    return write_archive(path, {"epoch": 3, **others, "model_state_dict": tensors}, data)
+
+
+def layers(rng, *widths):
+    return tuple(
+        Linear(jnp.asarray(rng.normal(size=pair), jnp.float32), jnp.asarray(rng.normal(size=pair[1]), jnp.float32))
+        for pair in itertools.pairwise(widths)
+    )
+
+
+def narrow_network(sampling=SINGLE_SCALE, inputs=6):
+    rng = np.random.default_rng(0)
+    levels, width = [], inputs
+    for level in sampling:
+        branches = tuple(PooledMLP(layers(rng, width, 4, 5 + branch)) for branch in range(len(level.radii)))
+        levels.append(SetAbstraction(branches, level.radii, level.members, level.centers))
+        width = 3 + sum(5 + branch for branch in range(len(level.radii)))
+    return PointNet2Classifier(
+        tuple(levels), PooledMLP(layers(rng, width, 6, 8)), layers(rng, 8, 7, 6), layers(rng, 6, 4)[0]
+    )
+
+
+def state_of(network, folder):
+    save_safetensors(network, folder / "state.safetensors")
+    return safetensors.numpy.load_file(folder / "state.safetensors")
