@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxnbv.camera import Camera, Pose
+from jaxnbv.checks import InputError
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.scanning import GridSurface, scan
 
@@ -29,7 +30,7 @@ class Score(eqx.Module):
 
     @abstractmethod
     def __call__(self, context: Any, scan: PointCloud) -> Float[Array, ""]:
-        """The score of one scan (rows, masked). Finite for a scan that sees nothing."""
+        """The score of one scan (rows, masked). Finite; for a scan that sees nothing, no more than for any other."""
 
     @property
     def batch_size(self) -> int:
@@ -64,12 +65,37 @@ class ExpectedUtilityImprovement(Score):
     def __call__(self, context: tuple[PointCloud, Float[Array, ""]], scan: PointCloud) -> Float[Array, ""]:
         """max(0, u(D u scan) - u(D))."""
         cloud, utility = context
-        return jnp.maximum(0.0, self.utility(concatenate(cloud, scan)) - utility)
+        gain = jnp.maximum(0.0, self.utility(concatenate(cloud, scan)) - utility)
+        return jnp.where(jnp.any(scan.mask), gain, 0.0)
 
     @property
     def batch_size(self) -> int:
         """As the utility prefers."""
         return preferred_batch_size(self.utility)
+
+
+def check_differentiable(score: Score, capacity: int, num_rays: int) -> None:
+    """Try whether JAX can differentiate a score in the points of a scan, without computing anything.
+
+    - `capacity`: rows of the cloud; `num_rays`: rows of a scan.
+
+    **Raises:** `ValueError` if it cannot, as for anything that calls back to host code.
+    """
+
+    def cloud(rows: int) -> PointCloud:
+        return PointCloud(jnp.zeros((rows, 3)), jnp.ones((rows, 3)), jnp.ones(rows, bool))
+
+    def gradient():
+        context, seen = score.context(cloud(capacity)), cloud(num_rays)
+        return jax.grad(lambda points: score(context, PointCloud(points, seen.normals, seen.mask)))(seen.points)
+
+    try:
+        jax.eval_shape(gradient)
+    except ValueError as error:
+        raise InputError(
+            f"{type(score).__name__} cannot be differentiated, so no gradient search can use it ({error}). "
+            "Use DiscreteSearch, which asks for values only"
+        ) from error
 
 
 def expected_score(

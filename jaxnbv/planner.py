@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PRNGKeyArray
 
-from jaxnbv.acquisition import Score
+from jaxnbv.acquisition import Score, check_differentiable
 from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import is_traced, require
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
@@ -40,6 +40,8 @@ class Planner(eqx.Module):
     - `max_views`: views that a state has room for.
 
     All methods are pure and run under `jit`. They compile once a planner: at the first view, nothing after the second.
+
+    **Raises:** `ValueError` for numbers below one, or if the search needs the acquisition's gradient and JAX has none.
     """
 
     model: SurfaceModel
@@ -55,6 +57,8 @@ class Planner(eqx.Module):
         for name in ("num_samples", "capacity", "max_views"):
             value = getattr(self, name)
             require(isinstance(value, int) and value >= 1, f"{name} is {value}; it must be a whole number, at least 1")
+        if self.search.uses_gradients:
+            check_differentiable(self.acquisition, self.capacity, self.camera.num_rays)
 
     def init(self, cloud: PointCloud, pose: Pose | None = None) -> State:
         """The state after a first scan, in scene coordinates, taken from `pose` (None where it is not known).
@@ -101,7 +105,7 @@ class Planner(eqx.Module):
             require(
                 not bool(jnp.isnan(proposal.value)),
                 "the acquisition is not a number (NaN) for a candidate: the score must be finite for every scan, "
-                "one that sees nothing included",
+                "one that sees nothing included, and for a gradient search so must its derivatives",
             )
             require(
                 bool(proposal.value > -jnp.inf),

@@ -1,7 +1,8 @@
 """Episodes on disk: a folder of plain JSON, NumPy and PLY files, written view by view and never half a file.
 
 episode.json    the configuration (planner, scene, noise, first pose, seed) and the versions that made it
-view_00.npz     pose and scan of the first view; view_01.npz and on also hold the candidates and their values
+view_00.npz     pose and scan of the first view; view_01.npz and on also hold the candidates and their values, and
+                the trajectories of a gradient search
 cloud.ply       the points that were kept, once the episode is complete
 """
 
@@ -27,7 +28,7 @@ from plyfile import PlyData, PlyElement
 from jaxnbv.camera import Pose
 from jaxnbv.checks import InputError, require
 from jaxnbv.cloud import PointCloud
-from jaxnbv.search import Proposal
+from jaxnbv.search import Proposal, Trajectories
 
 _LARGEST_LISTED = 16
 
@@ -80,7 +81,7 @@ def describe(thing: Any) -> Any:
 
 def versions() -> dict[str, str]:
     """Versions of what the numbers depend on, and the kind of device."""
-    names = ("jaxnbv", "jax", "jaxlib", "equinox", "numpy", "trimesh", "embreex")
+    names = ("jaxnbv", "jax", "jaxlib", "equinox", "optax", "optimistix", "numpy", "trimesh", "embreex")
     return {**{name: importlib.metadata.version(name) for name in names}, "device": jax.devices()[0].device_kind}
 
 
@@ -158,6 +159,12 @@ class EpisodeFolder:
                 "candidate_rotations": proposal.candidates.rotation,
                 "candidate_positions": proposal.candidates.position,
             }
+        if proposal is not None and (ways := proposal.trajectories) is not None:
+            data |= {
+                "trajectory_rotations": ways.poses.rotation,
+                "trajectory_positions": ways.poses.position,
+                "trajectory_values": ways.values,
+            }
         arrays: dict[str, Any] = {name: np.asarray(value) for name, value in data.items()}
         write_whole(self._view_file(index), lambda file: np.savez_compressed(file, **arrays))
 
@@ -179,7 +186,11 @@ def _view(data: dict[str, jax.Array]) -> tuple[Pose, PointCloud, Proposal | None
     if "values" not in data:
         return pose, scan, None
     candidates = Pose(data["candidate_rotations"], data["candidate_positions"])
-    return pose, scan, Proposal(pose, data["value"], candidates, data["values"])
+    trajectories = None
+    if "trajectory_values" in data:
+        poses = Pose(data["trajectory_rotations"], data["trajectory_positions"])
+        trajectories = Trajectories(poses, data["trajectory_values"])
+    return pose, scan, Proposal(pose, data["value"], candidates, data["values"], trajectories)
 
 
 def write_whole(path: Path, write: Callable[[Any], Any]) -> None:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxnbv.checks import AnyArray, require
+from jaxnbv.scanning.implicit import implicit_depth
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.scanning.surface import Hits, Surface
 
@@ -52,13 +53,11 @@ class SDFSurface(Surface):
     @eqx.filter_jit
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
         origins, directions = jnp.asarray(origins), jnp.asarray(directions)
-        parameters, structure = eqx.partition(self.sdf, eqx.is_array)
-        fixed = jax.lax.stop_gradient((parameters, origins, directions))
-        solid = eqx.combine(fixed[0], structure)
-        depth, mask = _first_root(solid, fixed[1], fixed[2], self.bounding_radius)
-        # The first step makes the root exact, the second, taken there, its derivative.
-        depth = jax.lax.stop_gradient(_newton(solid, fixed[1], fixed[2], depth))
-        points = origins + _newton(self.sdf, origins, directions, depth)[:, None] * directions
+        along = _Along(self.sdf, origins, directions)
+        fixed = jax.lax.stop_gradient(along)
+        depth, mask = _first_root(fixed.sdf, fixed.origins, fixed.directions, self.bounding_radius)
+        depth = implicit_depth(along, fixed.newton(depth), mask, jnp.full_like(depth, _GRAZING))
+        points = along.points(depth)
         # Just in front of the surface: on it a solid's formula may stand at the zero between two of its cases, and
         # rounding may take the slope of neither.
         front = points - _FRONT * directions
@@ -71,13 +70,23 @@ class SDFSurface(Surface):
         return Hits(jnp.where(mask[:, None], points, 0.0), jnp.where(mask[:, None], normals, 0.0), mask)
 
 
-def _newton(
-    sdf: SignedDistance, origins: Float[Array, "n 3"], directions: Float[Array, "n 3"], depth: Float[Array, " n"]
-) -> Float[Array, " n"]:
-    """One Newton step towards the root along each ray; its derivative is that of the root, by the implicit function."""
-    value, cosine = jax.jvp(sdf, (origins + depth[:, None] * directions,), (directions,))
-    cosine = jax.lax.stop_gradient(cosine)
-    return depth - value / (jnp.where(cosine < 0, -1.0, 1.0) * jnp.maximum(jnp.abs(cosine), _GRAZING))
+class _Along(eqx.Module):
+    """A solid's distance along rays."""
+
+    sdf: SignedDistance
+    origins: Float[Array, "n 3"]
+    directions: Float[Array, "n 3"]
+
+    def points(self, depth: Float[Array, " n"]) -> Float[Array, "n 3"]:
+        return self.origins + depth[:, None] * self.directions
+
+    def __call__(self, depth: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self.sdf(self.points(depth))
+
+    def newton(self, depth: Float[Array, " n"]) -> Float[Array, " n"]:
+        """One Newton step towards the root along each ray, which makes it exact."""
+        value, slope = jax.jvp(self, (depth,), (jnp.ones_like(depth),))
+        return depth - value / (jnp.where(slope < 0, -1.0, 1.0) * jnp.maximum(jnp.abs(slope), _GRAZING))
 
 
 def _first_root(

@@ -11,8 +11,9 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Int8
+
+from jaxnbv.scanning.implicit import implicit_depth
 
 # A march goes on with a quarter of its rays once no more are under way; batches smaller than this stay together.
 _SHRINK = 4
@@ -87,37 +88,36 @@ def free_distance(values: Float[Array, "g g g"]) -> Int8[Array, "m m m"]:
     return jnp.where(low > 0, distance, -distance)
 
 
-@jax.custom_jvp
+class _InCell(eqx.Module):
+    """The trilinear function of a cell along rays u + t du, the cell held fixed."""
+
+    field: Field
+    u: Triple
+    du: Triple
+    cell: list[Int[Array, " n"]]
+
+    def __call__(self, t: Float[Array, " n"]) -> Float[Array, " n"]:
+        local = [x + t * d - c for x, d, c in zip(self.u, self.du, self.cell, strict=True)]
+        return cubic(corner_values(self.cell, self.field), local, self.du)[0]
+
+    @property
+    def grazing(self) -> Float[Array, " n"]:
+        corners = corner_values(self.cell, self.field)
+        return _GRAZING * (_largest(corners) - _smallest(corners)) * jnp.sqrt(sum(d * d for d in self.du))
+
+
 def first_zero(field: Field, u: Triple, du: Triple) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
     """t of the first zero along each ray, from its origin or where it enters the box; and whether there is one.
 
-    t is differentiable in values and rays by the implicit function theorem, dt = -(df + grad f . (du_0 + t ddu)) /
-    (grad f . du), with a denominator bounded from below where the ray grazes; t is zero without a zero.
+    t is differentiable in values and rays, with slopes held away from zero where the ray grazes (`implicit_depth`); it
+    is zero, derivatives included, without a zero.
     """
-    t, mask, _ = _first_zero(field, u, du)
-    return t, mask
+    t, mask, cell = _first_zero(*jax.lax.stop_gradient((field, u, du)))
+    along = _InCell(field, u, du, cell)
+    return implicit_depth(along, t, mask, jax.lax.stop_gradient(along.grazing)), mask
 
 
-@first_zero.defjvp
-def _first_zero_jvp(primals, tangents):
-    field, u, du = primals
-    t, mask, cell = _first_zero(field, u, du)
-
-    def value_and_slope(values, u, du):
-        corners = corner_values(cell, Field(values, field.distance, field.g))
-        local = [x + t * d - c for x, d, c in zip(u, du, cell, strict=True)]
-        value, slope, *_ = cubic(corners, local, du)
-        spread = _largest(corners) - _smallest(corners)
-        return value, (slope, _GRAZING * spread * jnp.sqrt(sum(d * d for d in du)))
-
-    _, change, (slope, least) = jax.jvp(
-        value_and_slope, (field.values, u, du), (tangents[0].values, *tangents[1:]), has_aux=True
-    )
-    slope = jnp.where(jnp.abs(slope) < least, jnp.copysign(least, slope), slope)
-    dt = jnp.where(mask, -change / jnp.where(slope == 0, 1.0, slope), 0.0)
-    return (t, mask), (dt, np.zeros(mask.shape, jax.dtypes.float0))
-
-
+@jax.custom_batching.custom_vmap
 def _first_zero(field: Field, u: Triple, du: Triple):
     """t of the first zeros, whether there is one, and its cell."""
     rays, start = enter(u, du, field)
@@ -129,6 +129,21 @@ def _first_zero(field: Field, u: Triple, du: Triple):
     coefficients = cubic(corner_values(cell, field), local, [d * width for d in rays.du])
     root = first_root([c * rays.sign for c in coefficients])
     return jnp.where(mask, start + rays.t + root * width, 0.0), mask, cell
+
+
+@_first_zero.def_vmap
+def _first_zero_batched(size: int, batched, field: Field, u: Triple, du: Triple):
+    """Batches of rays through one field are one batch of rays, which marches faster than a batch of marches."""
+    u, du = jax.tree.map(
+        lambda x, has: x if has else jnp.broadcast_to(x, (size, *x.shape)), (u, du), tuple(batched[1:])
+    )
+    if any(jax.tree.leaves(batched[0])):
+        axes = jax.tree.map(lambda has: 0 if has else None, batched[0])
+        found = jax.vmap(_first_zero.fun, in_axes=(axes, 0, 0))(field, u, du)
+    else:
+        flat = jax.tree.map(lambda x: x.reshape(-1), (u, du))
+        found = jax.tree.map(lambda x: x.reshape(size, -1), _first_zero(field, *flat))
+    return found, jax.tree.map(lambda _: True, found)
 
 
 def smooth_gradient(field: Field, x: Triple) -> Triple:

@@ -1,9 +1,16 @@
-"""How the next pose is found: the discrete search and the paper's baselines."""
+"""How the next pose is found: among candidates, by gradient, by both, and by the paper's baselines."""
 
 from jaxnbv.search.base import Problem as Problem
 from jaxnbv.search.base import Proposal as Proposal
 from jaxnbv.search.base import Search as Search
+from jaxnbv.search.base import Trajectories as Trajectories
 from jaxnbv.search.baselines import FarthestView as FarthestView
 from jaxnbv.search.baselines import RandomView as RandomView
 from jaxnbv.search.baselines import UncertaintyView as UncertaintyView
 from jaxnbv.search.discrete import DiscreteSearch as DiscreteSearch
+from jaxnbv.search.gradient import GradientSearch as GradientSearch
+from jaxnbv.search.gradient import HybridSearch as HybridSearch
+from jaxnbv.search.pose_space import ConstrainedPoses as ConstrainedPoses
+from jaxnbv.search.pose_space import FreePoses as FreePoses
+from jaxnbv.search.pose_space import PoseSpace as PoseSpace
+from jaxnbv.search.pose_space import SpherePoses as SpherePoses

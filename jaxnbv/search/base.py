@@ -1,8 +1,10 @@
 """What a search is asked, and what it answers."""
 
 from abc import abstractmethod
+from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
@@ -53,23 +55,43 @@ class Problem(eqx.Module):
         return jnp.arange(self.visited.position.shape[0]) < self.num_visited
 
 
+class Trajectories(eqx.Module):
+    """The ways of a gradient search, from each of its starts to where it ended, and the values along them."""
+
+    poses: Pose
+    values: Float[Array, "starts steps"]
+
+    @property
+    def flat(self) -> tuple[Pose, Float[Array, " looks"]]:
+        """All poses and values, every start's first ones first, then their second ones and so on."""
+        poses, values = jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), (self.poses, self.values))
+        return jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), (poses, values))
+
+
 class Proposal(eqx.Module):
     """A search's answer: the pose to take next, and what it looked at.
 
     - `value`: the chosen pose's value, in the units of what the search maximises.
     - `candidates`, `values`: every pose looked at and its value; -inf where it was excluded as visited.
+    - `trajectories`: those of them that a gradient search passed through, the last rows of `candidates`; else None.
     """
 
     pose: Pose
     value: Float[Array, ""]
     candidates: Pose
     values: Float[Array, " candidates"]
+    trajectories: Trajectories | None = None
 
 
 class Search(eqx.Module):
-    """How a pose is found. `uses_samples` says whether posterior samples must be drawn for it."""
+    """How a pose is found.
+
+    - `uses_samples`: whether posterior samples must be drawn for it.
+    - `uses_gradients`: whether it differentiates the score in the imagined scans.
+    """
 
     uses_samples: eqx.AbstractClassVar[bool]
+    uses_gradients: ClassVar[bool] = False
 
     @abstractmethod
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:

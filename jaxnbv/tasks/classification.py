@@ -64,9 +64,10 @@ class CrossEntropy(Score):
         return _context(self, cloud)
 
     def __call__(self, context: Context, scan: PointCloud) -> Float[Array, ""]:
-        """In nats; the entropy of p^(t) for a scan that sees nothing."""
+        """In nats; the least there is, zero, for a scan that sees nothing."""
         cloud, log_p = context
-        return cross_entropy(log_p, self.classifier(concatenate(cloud, scan)))
+        value = cross_entropy(log_p, self.classifier(concatenate(cloud, scan)))
+        return jnp.where(jnp.any(scan.mask), value, 0.0)
 
     @property
     def batch_size(self) -> int:
@@ -94,12 +95,13 @@ class MixedEntropy(Score):
         return _context(self, cloud)
 
     def __call__(self, context: Context, scan: PointCloud) -> Float[Array, ""]:
-        """In nats."""
+        """In nats; zero for a scan that sees nothing."""
         cloud, log_p = context
         log_q = self.classifier(concatenate(cloud, scan))
         before = entropy(log_p)
         reduction = jnp.maximum(0.0, before - entropy(log_q))
-        return jnp.where(before > self.threshold, cross_entropy(log_p, log_q), reduction)
+        value = jnp.where(before > self.threshold, cross_entropy(log_p, log_q), reduction)
+        return jnp.where(jnp.any(scan.mask), value, 0.0)
 
     @property
     def batch_size(self) -> int:

@@ -1,0 +1,59 @@
+"""Rotations as parameters of an optimiser: smooth, without angles."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxnbv.checks import AnyArray
+
+
+def rotation_to_6d(rotation: Float[AnyArray, "*batch 3 3"]) -> Float[Array, "*batch 6"]:
+    """The first two columns of a rotation, one after the other: the continuous representation of Zhou et al. (2019)."""
+    rotation = jnp.asarray(rotation)
+    return jnp.concatenate([rotation[..., :, 0], rotation[..., :, 1]], axis=-1)
+
+
+def rotation_from_6d(columns: Float[AnyArray, "*batch 6"]) -> Float[Array, "*batch 3 3"]:
+    """The rotation whose first two columns are a pair (a, b) of vectors made orthonormal (Zhou et al. 2019).
+
+    b_1 = a / |a|;  b_2 = b - (b_1 . b) b_1, normalised;  b_3 = b_1 x b_2. Every pair gives a rotation: where a is zero,
+    or b is zero or parallel to a, a coordinate axis takes its place.
+    """
+    columns = jnp.asarray(columns, dtype=jnp.result_type(float))
+    first = normalise(columns[..., :3], jnp.asarray([1.0, 0.0, 0.0], columns.dtype))
+    spare = _any_orthogonal(first)
+    second = normalise(_reject(normalise(columns[..., 3:], spare), first), spare)
+    # The difference of nearly parallel vectors has lost digits and is not orthogonal; the second time it is.
+    second = normalise(_reject(second, first), spare)
+    return jnp.stack([first, second, jnp.cross(first, second)], axis=-1)
+
+
+def rotation_between(
+    start: Float[AnyArray, "*batch 3"], end: Float[AnyArray, "*batch 3"]
+) -> Float[Array, "*batch 3 3"]:
+    """The least rotation that takes one unit vector to another; one of the many, where they are opposite."""
+    start, end = jnp.asarray(start), jnp.asarray(end)
+    halfway = normalise(start + end, _any_orthogonal(start))
+    return jnp.matmul(_reflection(halfway), _reflection(start), precision="highest")
+
+
+def _reflection(unit: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
+    """I - 2 u u^T."""
+    return jnp.eye(3, dtype=unit.dtype) - 2.0 * unit[..., :, None] * unit[..., None, :]
+
+
+def normalise(vector: Float[Array, "*batch 3"], spare: Float[Array, "*#batch 3"]) -> Float[Array, "*batch 3"]:
+    """The unit vector along a vector, or `spare` where its square underflows."""
+    square = jnp.sum(vector**2, axis=-1, keepdims=True)
+    usable = square > jnp.finfo(vector.dtype).tiny
+    return jnp.where(usable, vector / jnp.sqrt(jnp.where(usable, square, 1.0)), spare)
+
+
+def _reject(vector: Float[Array, "*batch 3"], unit: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
+    """The part of a vector that is orthogonal to a unit vector."""
+    return vector - jnp.sum(vector * unit, axis=-1, keepdims=True) * unit
+
+
+def _any_orthogonal(unit: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
+    """A unit vector orthogonal to a unit vector."""
+    axis = jnp.eye(3, dtype=unit.dtype)[jnp.argmin(jnp.abs(unit), axis=-1)]
+    return normalise(_reject(axis, unit), axis)

@@ -1,0 +1,95 @@
+"""Multi-start gradient ascent of the acquisition, through Optimistix."""
+
+import math
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from jaxnbv.camera import Pose
+from jaxnbv.checks import require
+from jaxnbv.search.base import Problem, Proposal, Trajectories, best_unvisited
+from jaxnbv.search.pose_space import PoseSpace
+
+
+class Ascent(eqx.Module):
+    """Gradient ascent of the acquisition from the best of some candidates, all starts at once.
+
+    - `space`: where poses may go.
+    - `num_starts`: how many of the candidates are started from.
+    - `iterations`: steps of the solver from each.
+    - `learning_rate`: Adam's, in the units of the space's parameters: radians or scene units, about.
+    - `solver`: a minimiser of Optimistix in place of Adam, such as `optimistix.BFGS(rtol=1e-4, atol=1e-4)`; the
+      objective that it is given is of order 1.
+
+    **Raises:** `ValueError` for a number of starts or iterations below one, or a learning rate that is not positive.
+    """
+
+    space: PoseSpace
+    num_starts: int = eqx.field(static=True)
+    iterations: int = eqx.field(static=True)
+    learning_rate: float = eqx.field(static=True)
+    solver: optx.AbstractMinimiser | None = None
+
+    def __check_init__(self):
+        for name in ("num_starts", "iterations"):
+            value = getattr(self, name)
+            require(isinstance(value, int) and value >= 1, f"{name} is {value}; it must be a whole number, at least 1")
+        require(
+            0 < self.learning_rate < math.inf,
+            f"the learning rate is {self.learning_rate}; it must be positive and finite, such as 0.01",
+        )
+
+    @property
+    def minimiser(self) -> optx.AbstractMinimiser:
+        if self.solver is not None:
+            return self.solver
+        # No tolerance is ever met: as many steps as were asked for.
+        return optx.OptaxMinimiser(optax.adam(self.learning_rate), rtol=0.0, atol=0.0)
+
+    def climb(self, problem: Problem, candidates: Pose, values: Float[Array, " candidates"]) -> Proposal:
+        """The best pose on the ways up from the best of the candidates, which is never worse than any of these."""
+        self.space.check_camera(problem.camera)
+        order = jnp.argsort(jnp.where(problem.is_visited(candidates), -jnp.inf, values), descending=True)
+        # Solvers that search along a line expect values and slopes of order one.
+        scale = jnp.max(jnp.abs(values))
+        scale = jnp.where(scale > 0, scale, 1.0)
+        walk = jax.vmap(partial(self._walk, problem, scale))
+        poses, visited_values, last = walk(candidates[order[: self.num_starts]])
+        poses = jax.tree.map(lambda way, end: jnp.concatenate([way, end[:, None]], axis=1), poses, last)
+        visited_values = jnp.concatenate([visited_values, problem.acquisition(last)[:, None]], axis=1)
+        trajectories = Trajectories(poses, visited_values)
+
+        poses, seen = trajectories.flat
+        everything = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), (candidates, values), (poses, seen))
+        proposal = best_unvisited(problem, *everything)
+        return Proposal(proposal.pose, proposal.value, proposal.candidates, proposal.values, trajectories)
+
+    def _walk(self, problem: Problem, scale: Float[Array, ""], start: Pose):
+        """The poses at which the solver asked for a gradient, their values, and the pose that it ended at."""
+        solver = self.minimiser
+
+        def loss(parameters, _):
+            pose = self.space.retract(start, parameters)
+            value = problem.acquisition(pose[None])[0]
+            return -value / scale, (pose, value)
+
+        parameters = jnp.zeros(self.space.num_parameters, start.position.dtype)
+        struct, aux_struct = jax.eval_shape(loss, parameters, None)
+        state = solver.init(loss, parameters, None, {}, struct, aux_struct, frozenset())
+        state, rest = eqx.partition(state, eqx.is_array)
+
+        def step(carry, _):
+            parameters, state = carry
+            whole = eqx.combine(state, rest)
+            done, _ = solver.terminate(loss, parameters, None, {}, whole, frozenset())
+            moved, whole, seen = solver.step(loss, parameters, None, {}, whole, frozenset())
+            after = moved, eqx.filter(whole, eqx.is_array)
+            return jax.tree.map(partial(jnp.where, done), carry, after), seen
+
+        (parameters, _), (poses, values) = jax.lax.scan(step, (parameters, state), length=self.iterations)
+        return poses, values, self.space.retract(start, parameters)

@@ -1,0 +1,108 @@
+"""Search by gradient: the acquisition is a differentiable function of the pose."""
+
+from typing import ClassVar, Literal
+
+import equinox as eqx
+import jax
+import optimistix as optx
+from jaxtyping import PRNGKeyArray
+
+from jaxnbv.camera import fibonacci_sphere, look_at
+from jaxnbv.checks import require
+from jaxnbv.rotations import rotation_from_6d
+from jaxnbv.search.ascent import Ascent
+from jaxnbv.search.base import Problem, Proposal, Search
+from jaxnbv.search.discrete import DiscreteSearch
+from jaxnbv.search.pose_space import FreePoses, PoseSpace, SpherePoses
+
+
+class GradientSearch(Search):
+    """Multi-start gradient ascent over 2-DOF or 6-DOF poses.
+
+    - `dof`: 2 for `SpherePoses()`, 6 for `FreePoses()`; or give a `space` of your own, `ConstrainedPoses()` say.
+    - `num_candidates`: views, evenly spread over the space's sphere and turned at random, that are valued first; the
+      ascent starts from the best `num_starts` of them. Of as many candidates as starts, all are starts.
+    - `num_starts`, `iterations`, `learning_rate`, `solver`: see `Ascent`.
+
+    The defaults are the paper's, except that it starts from six views without looking round first, as with
+    `num_candidates=6`.
+
+    **Raises:** `ValueError` for another `dof`, both `dof` and `space`, fewer candidates than starts, no starts or
+    iterations, or a learning rate that is not positive.
+    """
+
+    ascent: Ascent
+    num_candidates: int = eqx.field(static=True)
+    uses_samples: ClassVar[bool] = True
+    uses_gradients: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        dof: Literal[2, 6] | None = None,
+        space: PoseSpace | None = None,
+        num_starts: int = 6,
+        iterations: int = 20,
+        learning_rate: float = 0.01,
+        num_candidates: int = 60,
+        solver: optx.AbstractMinimiser | None = None,
+    ):
+        self.ascent = Ascent(_pose_space(dof, space), num_starts, iterations, learning_rate, solver)
+        self.num_candidates = num_candidates
+        _check_candidates(num_candidates, num_starts)
+
+    def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
+        """The best pose that was seen, candidates included; the key turns the candidates."""
+        rotation = rotation_from_6d(jax.random.normal(key, (6,)))
+        positions = fibonacci_sphere(self.num_candidates, self.ascent.space.start_radius) @ rotation.T
+        candidates = look_at(positions)
+        return self.ascent.climb(problem, candidates, problem.acquisition(candidates))
+
+
+class HybridSearch(Search):
+    """The discrete search, then gradient ascent from its best few candidates.
+
+    Arguments as of `GradientSearch`; `num_candidates` are those of `DiscreteSearch`. The value found is never below
+    that of the discrete search.
+
+    **Raises:** `ValueError` as `GradientSearch` does.
+    """
+
+    discrete: DiscreteSearch
+    ascent: Ascent
+    uses_samples: ClassVar[bool] = True
+    uses_gradients: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        dof: Literal[2, 6] | None = None,
+        space: PoseSpace | None = None,
+        num_starts: int = 3,
+        iterations: int = 10,
+        learning_rate: float = 0.01,
+        num_candidates: int = 120,
+        solver: optx.AbstractMinimiser | None = None,
+    ):
+        self.ascent = Ascent(_pose_space(dof, space), num_starts, iterations, learning_rate, solver)
+        self.discrete = DiscreteSearch(num_candidates, self.ascent.space.start_radius)
+        _check_candidates(num_candidates, num_starts)
+
+    def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
+        """The best pose that was seen, candidates included."""
+        found = self.discrete.propose(problem, key)
+        return self.ascent.climb(problem, found.candidates, found.values)
+
+
+def _check_candidates(num_candidates: int, num_starts: int) -> None:
+    require(
+        isinstance(num_candidates, int) and num_candidates >= num_starts,
+        f"the search has {num_candidates} candidates for {num_starts} starts: give it as many at least",
+    )
+
+
+def _pose_space(dof: int | None, space: PoseSpace | None) -> PoseSpace:
+    """The space that is meant by the number of degrees of freedom, by default 2, or that was given."""
+    if space is not None:
+        require(dof is None, f"both dof={dof} and space={space} were given: give one of them")
+        return space
+    require(dof in (None, 2, 6), f"dof is {dof}; it must be 2 or 6 (or give a space)")
+    return FreePoses() if dof == 6 else SpherePoses()
