@@ -120,10 +120,9 @@ def simulate(
             bar.set_description(f"view {index + 1}/{views}, {stage}")
 
         for index in range(len(finished), views):
-            step_key, noise_key = jax.random.split(jax.random.fold_in(key, index))
+            sample_key, search_key, noise_key = view_keys(key, index)
             pose, proposal = first, None
             if state is not None:
-                sample_key, search_key = jax.random.split(step_key)
                 begin(index, stages[0])
                 surfaces = None
                 if planner.search.uses_samples:
@@ -143,6 +142,13 @@ def simulate(
     if store:
         store.write_cloud(episode.cloud)
     return episode
+
+
+def view_keys(key: PRNGKeyArray, index: int) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:
+    """Keys of view `index` (from 0) of an episode: of its posterior samples, its search and its sensor's noise."""
+    step_key, noise_key = jax.random.split(jax.random.fold_in(key, index))
+    sample_key, search_key = jax.random.split(step_key)
+    return sample_key, search_key, noise_key
 
 
 def observe_scene(scene: Surface, camera: Camera, pose: Pose, noise: SensorNoise, key: PRNGKeyArray) -> PointCloud:

@@ -26,6 +26,9 @@ class SearchName(StrEnum):
     """How the next view is found."""
 
     DISCRETE = "discrete"
+    GRADIENT_2DOF = "gradient-2dof"
+    GRADIENT_6DOF = "gradient-6dof"
+    HYBRID = "hybrid"
     FARTHEST = "farthest"
     RANDOM = "random"
     UNCERTAINTY = "uncertainty"
@@ -50,7 +53,9 @@ SearchOption = Annotated[
     SearchName,
     typer.Option(
         help="How the next view is found: discrete is the expected value of the task over 120 candidates; "
-        "farthest, random and uncertainty are the paper's baselines over the same candidates."
+        "gradient-2dof climbs it by gradient over the sphere, gradient-6dof over positions and rotations (2 to 3 from "
+        "the object's centre, which stays in view), hybrid over the sphere from the best candidates; farthest, random "
+        "and uncertainty are the paper's baselines over the candidates."
     ),
 ]
 ViewsOption = Annotated[int, typer.Option(help="Views in all, the first one included.")]

@@ -2,6 +2,7 @@
 
 import re
 import time
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,15 +34,27 @@ from jaxnbv.episode import Episode, simulate
 from jaxnbv.networks import CloudClassifier, load_checkpoint, pyramid_classifier
 from jaxnbv.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, Surface, load_mesh
-from jaxnbv.search import DiscreteSearch, FarthestView, RandomView, UncertaintyView
+from jaxnbv.search import (
+    ConstrainedPoses,
+    DiscreteSearch,
+    FarthestView,
+    GradientSearch,
+    HybridSearch,
+    RandomView,
+    UncertaintyView,
+)
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Classifier, Coverage, CrossEntropy, MixedEntropy, NegativeEntropy
 from jaxnbv.tasks.classification import class_names, predict
 from jaxnbv.viz import write_report
+from jaxnbv.viz.trajectories import proper_candidates
 from jaxnbv.viz.words import quantity
 
 SEARCHES: dict[SearchName, Any] = {
     SearchName.DISCRETE: DiscreteSearch,
+    SearchName.GRADIENT_2DOF: partial(GradientSearch, dof=2),
+    SearchName.GRADIENT_6DOF: partial(GradientSearch, space=ConstrainedPoses()),
+    SearchName.HYBRID: HybridSearch,
     SearchName.FARTHEST: FarthestView,
     SearchName.RANDOM: RandomView,
     SearchName.UNCERTAINTY: UncertaintyView,
@@ -79,14 +92,14 @@ def demo(
     prepare(device)
     if task is Task.COVERAGE:
         planner, start = _planner(Coverage(), search, quick), look_at(_position(first or DEFAULT_FIRST))
-        _run("mug", demo_object(), planner, start, views, seed, out, noise, quick, report)
+        _run("mug", search, demo_object(), planner, start, views, seed, out, noise, quick, report)
         return
     pyramid = pyramid_scene(Split.TEST, scene, framing)
     score = _score(task, pyramid_classifier(framing.longest_side))
     planner = _planner(score, search, quick) if quick else _pyramid_planner(score, search, framing)
     typer.echo(f"the pattern is a {PATTERNS[int(pyramid.label)]}")
     start = hidden_view(pyramid, jax.random.key(seed)) if first is None else look_at(_position(first))
-    _run("pyramid", SDFSurface(pyramid), planner, start, views, seed, out, noise, quick, report)
+    _run("pyramid", search, SDFSurface(pyramid), planner, start, views, seed, out, noise, quick, report)
 
 
 def run(
@@ -122,7 +135,7 @@ def run(
     score = Coverage() if network is None else _score(task, CloudClassifier(load_checkpoint(network), scale=1 / 1.25))
     scene = load_mesh(mesh)
     planner = _planner(score, search, quick)
-    _run(mesh.stem, scene, planner, look_at(_position(first)), views, seed, out, noise, quick, report)
+    _run(mesh.stem, search, scene, planner, look_at(_position(first)), views, seed, out, noise, quick, report)
 
 
 def _score(task: Task, classifier: Classifier) -> Score:
@@ -147,6 +160,7 @@ def _planner(score: Score, search: SearchName, quick: bool) -> Planner:
 
 def _run(
     name: str,
+    search: SearchName,
     scene: Surface,
     planner: Planner,
     first: Pose,
@@ -158,7 +172,6 @@ def _run(
     report: bool,
 ) -> None:
     start = time.perf_counter()
-    search = next(name for name, kind in SEARCHES.items() if isinstance(planner.search, kind))
     folder = out or Path("runs") / f"{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}-{search}"
     if quick:
         typer.echo("--quick: small settings; leave it out for the paper's.")
@@ -187,10 +200,15 @@ def _summarise(episode: Episode) -> None:
         position = ", ".join(f"{value:+.2f}" for value in np.asarray(view.pose.position))
         line = f"view {index}   from ({position})   {int(view.scan.count):5d} points, {int(view.cloud.count):5d} kept"
         if view.proposal is not None:
-            values = np.asarray(view.proposal.values)
+            _, values = proper_candidates(view.proposal)
             values = values[np.isfinite(values)]
-            line += f"   {sought.name} {float(view.proposal.value):.4g}, the highest of {len(values)} candidates"
-            line += f" (median {np.median(values):.4g})" if sought.smooth else ""
+            line += f"   {sought.name} {float(view.proposal.value):.4g}, "
+            if (ways := view.proposal.trajectories) is None:
+                line += f"the highest of {len(values)} candidates"
+                line += f" (median {np.median(values):.4g})" if sought.smooth else ""
+            else:
+                line += f"by gradient ascent from {len(ways.values)} start{'s' if len(ways.values) > 1 else ''}; "
+                line += f"best of {len(values)} candidates {values.max(initial=-np.inf):.4g}"
         typer.echo(line)
         log_p = predict(score, view.cloud)
         if log_p is not None:

@@ -13,17 +13,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Int8
 
+from jaxnbv.scanning.cubic import CORNERS, cubic, first_bracket, first_root
 from jaxnbv.scanning.implicit import implicit_depth
 
 # A march goes on with a quarter of its rays once no more are under way; batches smaller than this stay together.
 _SHRINK = 4
 _SMALLEST = 8192
-_ROOT_ITERATIONS = 8
 
 # A ray grazes where the slope of f along it is below this fraction of the spread of f over the cell's corners.
 _GRAZING = 0.03
-
-CORNERS = tuple((i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1))
 
 # The x, y and z components of n vectors, apart: XLA fuses these better than one array of them.
 Triple = list[Float[Array, " n"]]
@@ -112,12 +110,11 @@ def first_zero(field: Field, u: Triple, du: Triple) -> tuple[Float[Array, " n"],
     t is differentiable in values and rays, with slopes held away from zero where the ray grazes (`implicit_depth`); it
     is zero, derivatives included, without a zero.
     """
-    t, mask, cell = _first_zero(*jax.lax.stop_gradient((field, u, du)))
+    t, mask, cell = _found_zero(*jax.lax.stop_gradient((field, u, du)))
     along = _InCell(field, u, du, cell)
     return implicit_depth(along, t, mask, jax.lax.stop_gradient(along.grazing)), mask
 
 
-@jax.custom_batching.custom_vmap
 def _first_zero(field: Field, u: Triple, du: Triple):
     """t of the first zeros, whether there is one, and its cell."""
     rays, start = enter(u, du, field)
@@ -131,18 +128,21 @@ def _first_zero(field: Field, u: Triple, du: Triple):
     return jnp.where(mask, start + rays.t + root * width, 0.0), mask, cell
 
 
-@_first_zero.def_vmap
-def _first_zero_batched(size: int, batched, field: Field, u: Triple, du: Triple):
+_found_zero = jax.custom_batching.custom_vmap(_first_zero)
+
+
+@_found_zero.def_vmap
+def _found_zero_batched(size: int, batched, field: Field, u: list[Array], du: list[Array]):
     """Batches of rays through one field are one batch of rays, which marches faster than a batch of marches."""
     u, du = jax.tree.map(
         lambda x, has: x if has else jnp.broadcast_to(x, (size, *x.shape)), (u, du), tuple(batched[1:])
     )
     if any(jax.tree.leaves(batched[0])):
         axes = jax.tree.map(lambda has: 0 if has else None, batched[0])
-        found = jax.vmap(_first_zero.fun, in_axes=(axes, 0, 0))(field, u, du)
+        found = jax.vmap(_first_zero, in_axes=(axes, 0, 0))(field, u, du)
     else:
         flat = jax.tree.map(lambda x: x.reshape(-1), (u, du))
-        found = jax.tree.map(lambda x: x.reshape(size, -1), _first_zero(field, *flat))
+        found = jax.tree.map(lambda x: x.reshape(size, -1), _found_zero(field, *flat))
     return found, jax.tree.map(lambda _: True, found)
 
 
@@ -258,65 +258,6 @@ def corner_values(cell: list[Int[Array, " n"]], field: Field) -> list[Float[Arra
     """Values at the corners of cells, in the order of `CORNERS`."""
     base = _flat(cell, field.g)
     return [_take(field.values, base + (i * field.g + j) * field.g + k) for i, j, k in CORNERS]
-
-
-def cubic(corners: list, a: Triple, b: Triple) -> list[Float[Array, " n"]]:
-    """Coefficients c_0, ..., c_3 in s of the trilinear function along a + s b, in coordinates local to the cell.
-
-    Linear interpolation along z, y and x in turn, each time with polynomials one degree higher.
-    """
-    polynomials = [[corner] for corner in corners]
-    for x, dx in ((a[2], b[2]), (a[1], b[1]), (a[0], b[0])):
-        merged = []
-        for p, q in zip(polynomials[0::2], polynomials[1::2], strict=True):
-            difference = [qi - pi for pi, qi in zip(p, q, strict=True)]
-            constant = [pi + di * x for pi, di in zip(p, difference, strict=True)]
-            linear = [di * dx for di in difference]
-            merged.append([constant[0], *(c + d for c, d in zip(constant[1:], linear[:-1], strict=True)), linear[-1]])
-        polynomials = merged
-    return polynomials[0]
-
-
-def first_bracket(c: list) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """For cubics positive at 0: whether they have a root in [0, 1], and an s so that [0, s] holds the first one alone.
-
-    A cubic positive at 0 that is not positive at its local minimum has one root before that. Else it has at most one
-    in [0, 1], and only if it is not positive at 1. One not positive at 0 has its root there.
-    """
-    discriminant = c[2] * c[2] - 3.0 * c[3] * c[1]
-    root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
-    # Both are the larger root of the derivative over c_3; each avoids cancellation for one sign of c_2.
-    numerator = jnp.where(c[2] > 0, -c[1], root - c[2])
-    denominator = jnp.where(c[2] > 0, c[2] + root, 3.0 * c[3])
-    minimum = numerator / jnp.where(denominator == 0, 1.0, denominator)
-    exists = (discriminant > 0) & (denominator != 0) & (minimum > 0) & (minimum < 1)
-    dips = exists & (_polynomial(c, minimum) <= 0)
-    return jnp.where(dips, minimum, 1.0), dips | (c[0] <= 0) | (_polynomial(c, 1.0) <= 0)
-
-
-def first_root(c: list) -> Float[Array, " n"]:
-    """The first root in [0, 1] of cubics that have one and are positive at 0; 0 where they are not.
-
-    Newton's method, and bisection where it leaves the bracket.
-    """
-    high, _ = first_bracket(c)
-    drop = c[0] - _polynomial(c, high)
-    secant = high * jnp.clip(c[0] / jnp.where(drop > 0, drop, 1.0), 0.0, 1.0)
-
-    def refine(_, state):
-        low, high, s = state
-        value = _polynomial(c, s)
-        slope = c[1] + s * (2.0 * c[2] + s * 3.0 * c[3])
-        low, high = jnp.where(value > 0, s, low), jnp.where(value > 0, high, s)
-        newton = s - value / jnp.where(slope == 0, 1.0, slope)
-        return low, high, jnp.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
-
-    _, _, s = jax.lax.fori_loop(0, _ROOT_ITERATIONS, refine, (jnp.zeros_like(high), high, secant))
-    return jnp.where(c[0] <= 0, 0.0, s)
-
-
-def _polynomial(c: list, s) -> Float[Array, " n"]:
-    return c[0] + s * (c[1] + s * (c[2] + s * c[3]))
 
 
 def _take(array: Array, index: Int[Array, " n"]) -> Array:

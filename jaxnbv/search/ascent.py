@@ -51,9 +51,10 @@ class Ascent(eqx.Module):
         # No tolerance is ever met: as many steps as were asked for.
         return optx.OptaxMinimiser(optax.adam(self.learning_rate), rtol=0.0, atol=0.0)
 
-    def climb(self, problem: Problem, candidates: Pose, values: Float[Array, " candidates"]) -> Proposal:
-        """The best pose on the ways up from the best of the candidates, which is never worse than any of these."""
+    def climb(self, problem: Problem, candidates: Pose) -> Proposal:
+        """The best pose on the ways up from the best of the candidates, or one of these if it is better."""
         self.space.check_camera(problem.camera)
+        values = problem.acquisition(candidates)
         order = jnp.argsort(jnp.where(problem.is_visited(candidates), -jnp.inf, values), descending=True)
         # Solvers that search along a line expect values and slopes of order one.
         scale = jnp.max(jnp.abs(values))

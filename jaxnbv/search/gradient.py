@@ -3,16 +3,12 @@
 from typing import ClassVar, Literal
 
 import equinox as eqx
-import jax
 import optimistix as optx
 from jaxtyping import PRNGKeyArray
 
-from jaxnbv.camera import fibonacci_sphere, look_at
 from jaxnbv.checks import require
-from jaxnbv.rotations import rotation_from_6d
 from jaxnbv.search.ascent import Ascent
 from jaxnbv.search.base import Problem, Proposal, Search
-from jaxnbv.search.discrete import DiscreteSearch
 from jaxnbv.search.pose_space import FreePoses, PoseSpace, SpherePoses
 
 
@@ -23,6 +19,9 @@ class GradientSearch(Search):
     - `num_candidates`: views, evenly spread over the space's sphere and turned at random, that are valued first; the
       ascent starts from the best `num_starts` of them. Of as many candidates as starts, all are starts.
     - `num_starts`, `iterations`, `learning_rate`, `solver`: see `Ascent`.
+
+    Differentiation keeps what the score computed for all starts and samples, with PointNet++ for six starts and 16
+    samples 2.4 GB (SSG) or 9.6 GB (MSG). Fewer starts need less.
 
     The defaults are the paper's, except that it starts from six views without looking round first, as with
     `num_candidates=6`.
@@ -52,23 +51,20 @@ class GradientSearch(Search):
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """The best pose that was seen, candidates included; the key turns the candidates."""
-        rotation = rotation_from_6d(jax.random.normal(key, (6,)))
-        positions = fibonacci_sphere(self.num_candidates, self.ascent.space.start_radius) @ rotation.T
-        candidates = look_at(positions)
-        return self.ascent.climb(problem, candidates, problem.acquisition(candidates))
+        return self.ascent.climb(problem, self.ascent.space.candidates(self.num_candidates, key))
 
 
 class HybridSearch(Search):
     """The discrete search, then gradient ascent from its best few candidates.
 
-    Arguments as of `GradientSearch`; `num_candidates` are those of `DiscreteSearch`. The value found is never below
-    that of the discrete search.
+    Arguments as of `GradientSearch`. On the sphere the candidates are those of `DiscreteSearch`, so the value found is
+    never below its.
 
     **Raises:** `ValueError` as `GradientSearch` does.
     """
 
-    discrete: DiscreteSearch
     ascent: Ascent
+    num_candidates: int = eqx.field(static=True)
     uses_samples: ClassVar[bool] = True
     uses_gradients: ClassVar[bool] = True
 
@@ -83,13 +79,12 @@ class HybridSearch(Search):
         solver: optx.AbstractMinimiser | None = None,
     ):
         self.ascent = Ascent(_pose_space(dof, space), num_starts, iterations, learning_rate, solver)
-        self.discrete = DiscreteSearch(num_candidates, self.ascent.space.start_radius)
+        self.num_candidates = num_candidates
         _check_candidates(num_candidates, num_starts)
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
-        """The best pose that was seen, candidates included."""
-        found = self.discrete.propose(problem, key)
-        return self.ascent.climb(problem, found.candidates, found.values)
+        """The best pose that was seen, candidates included; the key is not used."""
+        return self.ascent.climb(problem, self.ascent.space.candidates(self.num_candidates, None))
 
 
 def _check_candidates(num_candidates: int, num_starts: int) -> None:

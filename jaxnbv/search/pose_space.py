@@ -9,13 +9,14 @@ from abc import abstractmethod
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera, Pose, fibonacci_sphere, look_at
 from jaxnbv.checks import require
 from jaxnbv.rotations import normalise, rotation_between, rotation_from_6d, rotation_to_6d
-from jaxnbv.search.base import SENSOR_RADIUS
+from jaxnbv.search.base import SENSOR_RADIUS, sphere_candidates
 
 
 class PoseSpace(eqx.Module):
@@ -26,10 +27,9 @@ class PoseSpace(eqx.Module):
 
     num_parameters: eqx.AbstractClassVar[int]
 
-    @property
     @abstractmethod
-    def start_radius(self) -> float:
-        """How far from the origin candidates for a start stand, in scene units; they look at it."""
+    def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
+        """Poses of the space, spread evenly over it: always the same ones, or turned at random by a key."""
 
     @abstractmethod
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
@@ -54,10 +54,9 @@ class SpherePoses(PoseSpace):
     def __check_init__(self):
         require(0 < self.radius < math.inf, f"the sphere's radius is {self.radius}; it must be positive and finite")
 
-    @property
-    def start_radius(self) -> float:
-        """The sphere's."""
-        return self.radius
+    def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
+        """A Fibonacci sphere of cameras that look at the origin."""
+        return _sphere_views(count, self.radius, key)
 
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
         _, after = _directions(start, parameters)
@@ -82,10 +81,9 @@ class FreePoses(PoseSpace):
     def __check_init__(self):
         require(0 < self.radius < math.inf, f"the radius is {self.radius}; it must be positive and finite")
 
-    @property
-    def start_radius(self) -> float:
-        """The sphere's."""
-        return self.radius
+    def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
+        """A Fibonacci sphere of cameras that look at the origin."""
+        return _sphere_views(count, self.radius, key)
 
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
         rotation = rotation_from_6d(rotation_to_6d(start.rotation) + parameters[:6])
@@ -126,16 +124,20 @@ class ConstrainedPoses(PoseSpace):
         )
 
     @property
-    def start_radius(self) -> float:
+    def middle(self) -> float:
         """Half way between nearest and farthest."""
         return 0.5 * (self.nearest + self.farthest)
+
+    def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
+        """A Fibonacci sphere of cameras in the middle of the shell that look at the origin."""
+        return _sphere_views(count, self.middle, key)
 
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
         direction, distance, gaze, roll = jnp.split(parameters, (3, 4, 6))
         before, after = _directions(start, direction)
         half = 0.5 * (self.farthest - self.nearest)
-        offset = jnp.linalg.norm(start.position, keepdims=True) - self.start_radius
-        position = (self.start_radius + half * _move(offset / half, distance)) * after
+        offset = jnp.linalg.norm(start.position, keepdims=True) - self.middle
+        position = (self.middle + half * _move(offset / half, distance)) * after
 
         # Directions to the origin in the camera's frame: as the start sees it, and as it is to be seen.
         x, y, z = seen = -jnp.matmul(start.rotation.T, before, precision="highest")
@@ -157,6 +159,13 @@ class ConstrainedPoses(PoseSpace):
             f"off_axis is {self.off_axis:.3g} rad but the image ends {half:.3g} rad from its centre: the object would "
             "leave it; lower off_axis, or widen the camera's field of view",
         )
+
+
+def _sphere_views(count: int, radius: float, key: PRNGKeyArray | None) -> Pose:
+    if key is None:
+        return sphere_candidates(count, radius)
+    turn = rotation_from_6d(jax.random.normal(key, (6,)))
+    return look_at(jnp.matmul(fibonacci_sphere(count, radius), turn.T, precision="highest"))
 
 
 def _directions(start: Pose, parameters: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:

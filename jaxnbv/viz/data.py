@@ -18,6 +18,8 @@ from jaxnbv.scanning import Grid
 from jaxnbv.search import Proposal
 from jaxnbv.surfaces import SurfacePosterior
 from jaxnbv.tasks.classification import class_names, predict
+from jaxnbv.viz.sphere import unit
+from jaxnbv.viz.trajectories import Ascents, SphereMap, ascents_of, proper_candidates, wider_map
 from jaxnbv.viz.words import Quantity, describe_choice, describe_classes, describe_first, quantity
 
 COVERAGE_RADIUS = 0.05
@@ -50,6 +52,8 @@ class Choice(eqx.Module):
     - `directions`: unit vectors from the origin to the candidates; `values`: theirs, NaN where excluded as visited.
     - `chosen`, `value`: direction and value of the pose that was taken.
     - `rank`: 1 for the best.
+    - `map`: the values that the map is drawn from: the candidates', where they are enough.
+    - `ascents`: the trajectories of a gradient search, none of which is among the candidates here; else None.
     """
 
     directions: Float[np.ndarray, "c 3"]
@@ -57,6 +61,8 @@ class Choice(eqx.Module):
     chosen: Float[np.ndarray, "3"]
     value: float
     rank: int
+    map: SphereMap
+    ascents: Ascents | None
 
     @property
     def visited(self) -> Bool[np.ndarray, " c"]:
@@ -92,6 +98,19 @@ class ViewData(eqx.Module):
     sentence: str
     probabilities: Float[np.ndarray, " classes"] | None
 
+    @property
+    def spatial_ascents(self) -> Ascents | None:
+        """The trajectories that led to this view, where they left the sphere."""
+        ascents = None if self.choice is None else self.choice.ascents
+        return None if ascents is None or not ascents.is_spatial else ascents
+
+    @property
+    def reach(self) -> float:
+        """Distance from the origin to the farthest camera of this view and its ascents."""
+        ascents = self.spatial_ascents
+        positions = [self.pose.position] if ascents is None else [self.pose.position, ascents.poses.position]
+        return max(float(np.linalg.norm(position, axis=-1).max()) for position in positions)
+
 
 class ReportData(eqx.Module):
     """All views of an episode, and what the values of its search mean."""
@@ -113,7 +132,7 @@ def report_data(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, p
     for index, view in enumerate(tqdm(episode.views, desc="drawing views", disable=not progress)):
         covered = None if truth is None else coverage(view.cloud, truth, COVERAGE_RADIUS)
         before = drawn[-1] if drawn else None
-        choice = None if view.proposal is None else choice_of(view.proposal)
+        choice = None if view.proposal is None else choice_of(view.proposal, wider_map(episode, index))
         new, _ = view.scan.to_numpy()
         count = int(view.cloud.count)
         if choice is None or before is None:
@@ -122,8 +141,9 @@ def report_data(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, p
             earlier = [other.pose for other in episode.views[:index]]
             change = None if covered is None or before.coverage is None else (before.coverage, covered)
             others = tuple(choice.open_values.tolist())
+            starts = 0 if choice.ascents is None else len(choice.ascents.values)
             words = describe_choice(
-                values, choice.value, choice.rank, others, view.pose, earlier, len(new), count, change
+                values, choice.value, choice.rank, others, starts, view.pose, earlier, len(new), count, change
             )
         log_p = predict(planner.acquisition, view.cloud)
         probabilities = None if log_p is None else np.exp(np.asarray(log_p, np.float64))
@@ -147,18 +167,22 @@ def report_data(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, p
     return ReportData(tuple(drawn), values)
 
 
-def choice_of(proposal: Proposal) -> Choice:
-    """A proposal's candidates as directions, and where the chosen one stands among them."""
-    values = np.asarray(proposal.values, dtype=np.float64)
-    values = np.where(np.isfinite(values), values, np.nan)
-    positions = np.asarray(proposal.candidates.position, dtype=np.float64)
+def choice_of(proposal: Proposal, wider: SphereMap | None = None) -> Choice:
+    """A proposal's candidates as directions, where the chosen one stands among them, and its trajectories.
+
+    `wider`: what the map is to be drawn from in place of the candidates.
+    """
+    candidates, values = proper_candidates(proposal)
+    directions = unit(np.asarray(candidates.position, dtype=np.float64))
     value = float(proposal.value)
     return Choice(
-        directions=_unit(positions),
+        directions=directions,
         values=values,
-        chosen=_unit(np.asarray(proposal.pose.position, dtype=np.float64)),
+        chosen=unit(np.asarray(proposal.pose.position, dtype=np.float64)),
         value=value,
         rank=1 + int(np.sum(values > value)),
+        map=wider or SphereMap(directions, values),
+        ascents=None if proposal.trajectories is None else ascents_of(proposal.trajectories),
     )
 
 
@@ -169,7 +193,7 @@ def mean_surface(planner: Planner, cloud: PointCloud) -> MeanSurface | None:
     if not values.min() < 0 < values.max():
         return None
     found = marching_cubes(values, 0.0, spacing=(grid.spacing,) * 3, gradient_direction="descent")
-    vertices, faces, normals = found[0] - grid.half_extent, found[1], -_unit(found[2])
+    vertices, faces, normals = found[0] - grid.half_extent, found[1], -unit(found[2])
     # Along the normals too, so that the two sides of a thin sheet are told apart.
     features = np.concatenate([vertices, 0.1 * normals], axis=1)
     anchors = _spread(features, _SLOPE_ANCHORS)
@@ -216,8 +240,3 @@ def _interpolate(features: np.ndarray, anchors: np.ndarray, values: np.ndarray) 
     width = 0.5 * distance[:, -1:] + 1e-12
     weight = np.exp(-0.5 * (distance / width) ** 2) + 1e-12
     return np.exp(np.sum(weight * np.log(values)[near], axis=1) / np.sum(weight, axis=1))
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return vectors / np.where(length > 0, length, 1.0)

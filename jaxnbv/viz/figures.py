@@ -1,5 +1,7 @@
 """The pictures of an episode as PNG files, for papers and READMEs."""
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from jaxnbv.viz import sphere
 from jaxnbv.viz.data import COVERAGE_RADIUS, Choice, ReportData, ViewData
 from jaxnbv.viz.render import draw_scene
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, log_ticks, round_range
+from jaxnbv.viz.trajectory_figures import draw_ascents, trajectory_figure
 from jaxnbv.viz.words import Quantity, number, percent
 
 STYLE: dict[Any, Any] = {
@@ -54,23 +57,25 @@ def deviation_range(data: ReportData) -> tuple[float, float]:
 def write_figures(data: ReportData, camera: Camera, folder: str | Path, progress: bool = True) -> list[Path]:
     """Write the figures of an episode as PNG files into a folder, and return their paths:
 
-    `view_01.png`, ...: scene and acquisition of each view; `coverage.png`: the charts; `overview.png`: all views in a
-    strip.
+    `view_01.png`, ...: scene and acquisition of each view; `view_02_trajectories.png`, ...: the ascents of a gradient
+    search in space, of views that were found among 6-DOF poses; `coverage.png`: the charts; `overview.png`: all views
+    in a strip.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    names = [*(f"view_{view.number:02d}.png" for view in data.views), "coverage.png", "overview.png"]
-    paths = [folder / name for name in names]
     norm = LogNorm(*deviation_range(data))
+    drawings: dict[str, Callable[[], Figure]] = {}
+    for index, view in enumerate(data.views):
+        drawings[f"view_{view.number:02d}.png"] = partial(_view, data, index, camera, norm)
+        if view.spatial_ascents is not None:
+            drawings[f"view_{view.number:02d}_trajectories.png"] = partial(trajectory_figure, data, index, camera)
+    drawings["coverage.png"] = partial(_charts, data)
+    drawings["overview.png"] = partial(_overview, data, camera, norm)
     with mpl.rc_context(STYLE):
-        for path in tqdm(paths, desc="drawing figures", disable=not progress):
-            if path.name == "overview.png":
-                _save(_overview(data, camera, norm), path, dpi=120, few_colours=True)
-            elif path.name == "coverage.png":
-                _save(_charts(data), path, dpi=200)
-            else:
-                _save(_view(data, paths.index(path), camera, norm), path, dpi=200)
-    return paths
+        for name, draw in tqdm(drawings.items(), desc="drawing figures", disable=not progress):
+            small = name == "overview.png"
+            _save(draw(), folder / name, dpi=120 if small else 200, few_colours=small)
+    return [folder / name for name in drawings]
 
 
 def _save(figure: Figure, path: Path, dpi: int, few_colours: bool = False) -> None:
@@ -97,6 +102,8 @@ def _view(data: ReportData, index: int, camera: Camera, norm: LogNorm) -> Figure
     _deviation_bar(figure, (0.08, 0.115, 0.34, 0.022), norm)
     _legend(figure, 0.125, 0.955)
     figure.text(0.52, 0.95, _map_title(view, data.quantity), fontsize=10)
+    if view.choice is not None and view.choice.ascents is not None:
+        figure.text(0.52, 0.925, _ascent_key(view.choice), fontsize=8, va="top", linespacing=1.5)
     axes = figure.add_axes((0.52, 0.22, 0.46, 0.66))
     colours = draw_acquisition(axes, view.choice, data.quantity)
     if colours is not None:
@@ -108,6 +115,13 @@ def _view(data: ReportData, index: int, camera: Camera, norm: LogNorm) -> Figure
 
 def _map_title(view: ViewData, quantity: Quantity) -> str:
     return "This view was given" if view.choice is None else f"Why view {view.number}: {quantity.name}"
+
+
+def _ascent_key(choice: Choice) -> str:
+    key = "○ start   ● end of a gradient ascent   ★ chosen view"
+    if choice.ascents is not None and choice.ascents.is_spatial:
+        key += "\nascents: camera directions; map: cameras that look at the centre"
+    return key
 
 
 def _deviation_bar(figure: Figure, place: tuple[float, float, float, float], norm: LogNorm) -> None:
@@ -139,7 +153,7 @@ def draw_acquisition(
     colours = ScalarMappable(Normalize(*value_range(choice)), VALUE)
     if is_smooth(choice, quantity):
         extent = (-sphere.WIDTH, sphere.WIDTH, -sphere.HEIGHT, sphere.HEIGHT)
-        smooth = sphere.smooth_map(choice.directions, choice.values, 240)
+        smooth = sphere.smooth_map(choice.map.directions, choice.map.values, 240)
         image = axes.imshow(colours.to_rgba(smooth), extent=extent, interpolation="bilinear", zorder=1)
         image.set_clip_path(axes.fill(*sphere.rim().T, facecolor="none")[0])
     places = sphere.mollweide(choice.directions)
@@ -156,22 +170,31 @@ def draw_acquisition(
     axes.scatter(
         places[~shown, 0], places[~shown, 1], marker="x", c=INK, s=26 * weight, linewidths=1.2 * weight, zorder=4
     )
-    star: dict[str, Any] = {"marker": "*", "ms": 14 * weight**0.5, "color": NEW, "markeredgecolor": "white", "mew": 1.0}
-    axes.plot(*sphere.mollweide(choice.chosen[None]).T, **star, zorder=5)
+    if choice.ascents is not None:
+        draw_ascents(axes, choice.ascents, weight)
+    size = 14 if choice.ascents is None else 11
+    star: dict[str, Any] = {
+        "marker": "*",
+        "ms": size * weight**0.5,
+        "color": NEW,
+        "markeredgecolor": "white",
+        "mew": 1.0,
+    }
+    axes.plot(*sphere.mollweide(choice.chosen[None]).T, **star, zorder=10)
     return colours
 
 
 def is_smooth(choice: Choice, quantity: Quantity) -> bool:
     """Whether a map between the candidates says something: they must be many, and their values no lots."""
-    return quantity.smooth and choice.open_values.size >= 12
+    return quantity.smooth and int(np.sum(~np.isnan(choice.map.values))) >= 12
 
 
 def value_range(choice: Choice) -> tuple[float, float]:
-    """Range of the colours of a step's values; not empty."""
-    values = choice.open_values
+    """Range of the colours of a step's map and candidates; not empty."""
+    values = np.concatenate([choice.open_values, choice.map.values[~np.isnan(choice.map.values)]])
     if not values.size:
         return 0.0, 1.0
-    low, high = float(values[-1]), float(values[0])
+    low, high = float(values.min()), float(values.max())
     return (low, high) if high > low else (low - 0.5, low + 0.5)
 
 
@@ -228,7 +251,16 @@ def _overview(data: ReportData, camera: Camera, norm: LogNorm) -> Figure:
     """Scenes over acquisition maps, at most five to a row, with the charts' story in the titles."""
     columns = min(len(data.views), 5)
     rows = -(-len(data.views) // columns)
-    width, tall = 3.0 * columns, _ROW * rows + 0.85
+    marks = [
+        ("●", BEFORE, "points before"),
+        ("●", NEW, "new points, camera"),
+        ("★", NEW, "chosen view"),
+        ("×", INK, "visited views"),
+    ]
+    if any(view.choice is not None and view.choice.ascents is not None for view in data.views):
+        marks += [("○", INK, "start of an ascent"), ("●", INK, "end of an ascent")]
+    base = 0.16 * len(marks) - 0.2
+    width, tall = 3.0 * columns, _ROW * rows + base + 0.41
     figure = Figure(figsize=(max(width, 6.0), tall))
     left = (max(width, 6.0) - width) / 2.0
     poses = [view.pose for view in data.views]
@@ -249,16 +281,12 @@ def _overview(data: ReportData, camera: Camera, norm: LogNorm) -> Figure:
         draw_acquisition(figure.add_axes(place(x + 0.1, y, 2.8, 1.5)), view.choice, data.quantity, weight=1.2)
     half = max(width, 6.0) / 2.0
     with mpl.rc_context({"font.size": 12}):
-        _deviation_bar(figure, place(0.6, 0.55, half - 1.6, 0.13), norm)
-    marks = (
-        ("●", BEFORE, "points before"),
-        ("●", NEW, "new points, camera"),
-        ("★", NEW, "chosen view"),
-        ("×", INK, "visited views"),
-    )
-    x, y, *_ = place(half + 0.1, 0.76)
-    figure.text(x, y, f"Maps: {data.quantity.name}, pale (low) to dark (high)", fontsize=13, va="center")
+        _deviation_bar(figure, place(0.6, base + 0.11, half - 1.6, 0.13), norm)
+    x, y, *_ = place(half + 0.1, base + 0.32)
+    text = f"Maps: {data.quantity.name}, pale (low) to dark (high)"
+    # At 13 points a letter takes a tenth of an inch.
+    figure.text(x, y, text, fontsize=min(13.0, 130.0 * (half - 0.2) / len(text)), va="center")
     for i, (mark, colour, text) in enumerate(marks):
-        x, y, *_ = place(half + 0.1 + 2.2 * (i % 2), 0.44 - 0.32 * (i // 2))
+        x, y, *_ = place(half + 0.1 + 2.2 * (i % 2), base - 0.32 * (i // 2))
         figure.text(x, y, f"{mark} {text}", color=colour, fontsize=13, va="center")
     return figure

@@ -14,11 +14,12 @@ from jaxnbv.camera import Camera, Pose, look_at
 from jaxnbv.cloud import Frame
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.viz.data import MeanSurface, ViewData
-from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW
+from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, LINE, NEW
 
 FRUSTUM_DEPTH = 0.45
 _DISTANCE = 11.0
 _SLACK = 0.04  # Noise and the mean's own error must not hide a point behind the surface that it lies on.
+_HIDDEN = 0.18
 
 
 def beside(pose: Pose, radius: float = 1.0) -> Float[np.ndarray, "3"]:
@@ -54,8 +55,11 @@ class Still:
         self.depth = np.full((size, size), np.inf)
         self._surface = surface
 
-    def paint(self, deviation: LogNorm) -> None:
-        """Trace the surface, coloured by its standard deviation and lit from beside the eye; four rays a pixel."""
+    def paint(self, deviation: LogNorm | None) -> None:
+        """Trace the surface, coloured by its standard deviation and lit from beside the eye; four rays a pixel.
+
+        Without a range of deviations it is plain.
+        """
         surface = self._surface
         if surface is None:
             return
@@ -73,7 +77,9 @@ class Still:
         right, down, forward = np.asarray(self.pose.rotation).T
         light = -forward - 0.5 * right - 0.7 * down
         lit = 0.72 + 0.34 * np.clip(normals @ (light / np.linalg.norm(light)), -0.4, 1.0)
-        colours = DEVIATION(deviation(np.exp(np.sum(weight * np.log(surface.deviation)[near], axis=1))))
+        colours = np.tile(mpl.colors.to_rgba(LINE), (len(points), 1))
+        if deviation is not None:
+            colours = DEVIATION(deviation(np.exp(np.sum(weight * np.log(surface.deviation)[near], axis=1))))
         colours[:, :3] = np.clip(colours[:, :3] * lit[:, None], 0.0, 1.0)
         image = np.zeros((len(mask), 4))
         image[mask] = colours
@@ -84,6 +90,11 @@ class Still:
         depth = np.full(len(mask), np.inf)
         depth[mask] = (points - np.asarray(self.pose.position)) @ forward
         self.depth = depth.reshape(self.size, 2, self.size, 2).min(axis=(1, 3))
+
+    @property
+    def surface_pixels(self) -> Float[np.ndarray, "n 2"]:
+        """Where the surface's vertices are; none where there is no surface."""
+        return np.zeros((0, 2)) if self._surface is None else self.project(self._surface.vertices)[0]
 
     def project(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
         """Pixel coordinates of points of the scene, and whether they lie in front of the surface."""
@@ -104,29 +115,56 @@ def draw_scene(
     still = Still(beside(view.pose), view.surface, size, reach)
     still.paint(deviation)
     axes.imshow(still.image, interpolation="bilinear", zorder=1)
-    for points, colour, dot in ((view.before, BEFORE, 0.7), (view.new, NEW, 1.1)):
-        pixels, in_front = still.project(points)
-        axes.scatter(pixels[in_front, 0], pixels[in_front, 1], s=dot * weight, c=colour, linewidths=0, zorder=2)
-    shown_places = [still.project(view.new)[0]]
-    if view.surface is not None:
-        shown_places.append(still.project(view.surface.vertices)[0])
+    draw_points(axes, still, view.before, BEFORE, 0.7 * weight)
+    shown = [draw_points(axes, still, view.new, NEW, 1.1 * weight), still.surface_pixels]
+    shown += draw_cameras(axes, still, poses, camera, weight)
+    frame(axes, still, shown)
+
+
+def draw_points(
+    axes: Axes, still: Still, points: Float[np.ndarray, "n 3"], colour: str, size: float
+) -> Float[np.ndarray, "n 2"]:
+    """Draw the points that the surface does not hide; returns the pixels of all."""
+    pixels, in_front = still.project(points)
+    axes.scatter(pixels[in_front, 0], pixels[in_front, 1], s=size, c=colour, linewidths=0, zorder=2)
+    return pixels
+
+
+def draw_segments(
+    axes: Axes, still: Still, ends: Float[np.ndarray, "n 2 3"], colours: Float[np.ndarray, "n 4"], width: float
+) -> Float[np.ndarray, "m 2"]:
+    """Draw segments of the scene, faint where they stand behind the surface; returns pixels along them."""
+    # Cut fine, so that a part can be hidden.
+    steps = np.linspace(0.0, 1.0, 25)[:, None, None]
+    fine = ends[:, 0] + steps * (ends[:, 1] - ends[:, 0])
+    pixels, in_front = still.project(fine.reshape(-1, 3))
+    pixels, in_front = pixels.reshape(25, -1, 2), in_front.reshape(25, -1)
+    segments = np.stack([pixels[:-1], pixels[1:]], axis=2).reshape(-1, 2, 2)
+    shown = (in_front[:-1] & in_front[1:]).reshape(-1)
+    rows = np.tile(colours, (24, 1))
+    rows[:, 3] *= np.where(shown, 1.0, _HIDDEN)
+    axes.add_collection(LineCollection(list(segments), colors=rows, linewidths=width, capstyle="round", zorder=3))
+    return pixels.reshape(-1, 2)
+
+
+def draw_cameras(
+    axes: Axes, still: Still, poses: list[Pose], camera: Camera, weight: float, beyond: float = 0.0
+) -> list[Float[np.ndarray, "_ 2"]]:
+    """Draw numbered frusta, of which the last is new; returns the pixels that they take.
+
+    `beyond`: distance from the origin within which the new number would be in the way.
+    """
+    taken = []
     for number, pose in enumerate(poses, start=1):
         is_new = number == len(poses)
         colour = NEW if is_new else GREY
-        # Cut fine, so that what stands behind the surface can be drawn faint.
         ends = frustum(pose, camera)
-        steps = np.linspace(0.0, 1.0, 25)[:, None, None]
-        fine = ends[:, 0] + steps * (ends[:, 1] - ends[:, 0])
-        pixels, in_front = still.project(fine.reshape(-1, 3))
-        pixels, in_front = pixels.reshape(25, -1, 2), in_front.reshape(25, -1)
-        segments = np.stack([pixels[:-1], pixels[1:]], axis=2).reshape(-1, 2, 2)
-        shown = (in_front[:-1] & in_front[1:]).reshape(-1)
         width = (1.5 if is_new else 0.9) * weight
-        colours = mpl.colors.to_rgba_array([colour] * len(segments), np.where(shown, 1.0, 0.18))
-        lines = LineCollection(list(segments), colors=colours, linewidths=width, capstyle="round", zorder=3)
-        axes.add_collection(lines)
-        apex, apex_in_front = still.project(np.asarray(pose.position, dtype=np.float64)[None] * 1.09)
-        shown_places += [apex, pixels.reshape(-1, 2)]
+        taken.append(draw_segments(axes, still, ends, mpl.colors.to_rgba_array([colour] * len(ends)), width))
+        position = np.asarray(pose.position, dtype=np.float64)
+        away = max(1.0, beyond / max(float(np.linalg.norm(position)), 1e-12)) if is_new else 1.0
+        apex, apex_in_front = still.project(position[None] * 1.09 * away)
+        taken.append(apex)
         axes.text(
             apex[0, 0],
             apex[0, 1],
@@ -139,10 +177,14 @@ def draw_scene(
             va="center",
             zorder=4,
         )
-    # A square about what there is to see.
-    seen = np.concatenate(shown_places)
+    return taken
+
+
+def frame(axes: Axes, still: Still, shown: list[Float[np.ndarray, "_ 2"]]) -> None:
+    """Crop the picture to a square about the pixels that are to be seen."""
+    seen = np.concatenate(shown)
     (left, top), (right, bottom) = seen.min(axis=0), seen.max(axis=0)
-    half = 0.53 * max(right - left, bottom - top) + 0.03 * size
+    half = 0.53 * max(right - left, bottom - top) + 0.03 * still.size
     x, y = 0.5 * (left + right), 0.5 * (top + bottom)
     axes.set(xlim=(x - half, x + half), ylim=(y + half, y - half), aspect="equal")
     axes.axis("off")

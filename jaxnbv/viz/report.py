@@ -22,10 +22,14 @@ from jaxnbv.viz import sphere
 from jaxnbv.viz.data import COVERAGE_RADIUS, Choice, MeanSurface, ReportData, ViewData, report_data
 from jaxnbv.viz.figures import coverage_series, deviation_range, is_smooth, value_range, write_figures
 from jaxnbv.viz.render import beside, frustum
-from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, colour_scale, log_ticks
+from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, VALUE_LINES, colour_scale, log_ticks
+from jaxnbv.viz.trajectories import Ascents
+from jaxnbv.viz.trajectory_figures import frusta_steps, small_frusta, spatial_range
 from jaxnbv.viz.words import Quantity
 
 _MAX_BEFORE, _MAX_NEW = 4000, 2500
+_ASCENT_CAPTION = """
+      Small cameras stand along the gradient ascents, pale to dark with their acquisition, thicker towards the end."""
 
 
 def write_report(
@@ -61,6 +65,7 @@ def report_html(episode: Episode, data: ReportData, title: str) -> str:
         "QUANTITY": html.escape(data.quantity.label[:1].upper() + data.quantity.label[1:]),
         "MEANING": html.escape(data.quantity.meaning),
         "COVERAGE": html.escape(_coverage_caption(data)),
+        "ASCENTS": _ASCENT_CAPTION if any(view.spatial_ascents is not None for view in data.views) else "",
         "COUNT": str(len(data.views)),
         "SENTENCES": "".join(f"<li>{html.escape(view.sentence)}</li>" for view in data.views),
         "PLOTLY": get_plotlyjs(),
@@ -117,14 +122,14 @@ def _payload(episode: Episode, data: ReportData) -> dict:
     camera = episode.planner.camera
     return {
         "views": [_view(view, camera, data.quantity) for view in data.views],
-        "reach": max(1.8, *(float(np.linalg.norm(view.pose.position)) for view in data.views)) * 1.12,
+        "reach": 1.12 * max(1.8, *(view.reach for view in data.views)),
         "deviation": {
             "range": [math.log10(low), math.log10(high)],
             "ticks": np.log10(ticks).tolist(),
             "labels": [f"{tick:g}" for tick in ticks.tolist()],
             "colours": colour_scale(DEVIATION),
         },
-        "value": {"colours": colour_scale(VALUE), "label": data.quantity.label},
+        "value": {"colours": colour_scale(VALUE), "lines": colour_scale(VALUE_LINES), "label": data.quantity.label},
         "progress": {"label": label, "values": series.tolist()},
         "map": {
             "graticule": [line.round(4).tolist() for line in sphere.graticule()],
@@ -146,6 +151,7 @@ def _view(view: ViewData, camera: Camera, quantity: Quantity) -> dict:
         "label": (1.09 * np.asarray(view.pose.position, dtype=np.float64)).round(4).tolist(),
         "surface": None if view.surface is None else _surface(view.surface),
         "choice": None if view.choice is None else _choice(view.choice, quantity),
+        "ascents": None if view.spatial_ascents is None else _spatial(view.spatial_ascents, camera),
     }
 
 
@@ -183,12 +189,52 @@ def _choice(choice: Choice, quantity: Quantity) -> dict:
         "median": float(np.median(choice.open_values)) if choice.open_values.size else None,
         "range": [low, high],
         "image": _map_image(choice, low, high) if is_smooth(choice, quantity) else None,
+        "ascents": None if choice.ascents is None else _on_map(choice.ascents),
+        "caption": _map_caption(choice),
+    }
+
+
+def _map_caption(choice: Choice) -> str:
+    """What the marks of a gradient search on the map are; nothing for other searches."""
+    parts = []
+    if choice.ascents is not None:
+        parts.append("Lines: gradient ascents, from a ring where they start to a dot where they end.")
+        if choice.ascents.is_spatial:
+            parts.append(
+                "They change position and rotation; drawn is the direction of the position, over a map of cameras that "
+                "look at the centre from the sphere where the ascents start."
+            )
+    if not np.array_equal(choice.map.directions, choice.directions):
+        parts.append(
+            f"The candidates do not make a map: it is drawn from {len(choice.map.values)} more views, valued "
+            "with the same posterior samples."
+        )
+    return " ".join(parts)
+
+
+def _on_map(ascents: Ascents) -> dict:
+    starts, ends = (sphere.mollweide(ascents.directions[:, step]).round(4).tolist() for step in (0, -1))
+    return {
+        "ways": [piece.round(4).tolist() for directions in ascents.directions for piece in sphere.path(directions)],
+        "starts": starts,
+        "ends": ends,
+        "values": ascents.values[:, [0, -1]].tolist(),
+    }
+
+
+def _spatial(ascents: Ascents, camera: Camera) -> dict:
+    return {
+        "positions": np.asarray(ascents.poses.position, dtype=np.float64).round(3).tolist(),
+        "values": ascents.values.tolist(),
+        "range": list(spatial_range(ascents)),
+        "steps": frusta_steps(ascents).tolist(),
+        "frusta": [small_frusta(ascents, i, camera).round(3).tolist() for i in range(len(ascents.values))],
     }
 
 
 def _map_image(choice: Choice, low: float, high: float) -> str:
     """The smooth map as a PNG in a data address, coloured as the candidates are; clear outside the rim."""
-    values = sphere.smooth_map(choice.directions, choice.values, 300)
+    values = sphere.smooth_map(choice.map.directions, choice.map.values, 300)
     colours = VALUE(mpl.colors.Normalize(low, high)(np.nan_to_num(values)), bytes=True)
     colours[..., 3] = np.where(np.isnan(values), 0, 255)
     file = io.BytesIO()

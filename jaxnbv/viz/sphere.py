@@ -1,10 +1,19 @@
 """The sphere of candidates as a map: Mollweide's equal-area projection, front (the scene's +z) at its centre, y up."""
 
+import math
+from itertools import pairwise
+
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.interpolate import RBFInterpolator
 
 WIDTH, HEIGHT = 2.0 * np.sqrt(2.0), np.sqrt(2.0)  # Half axes of the map's ellipse.
+
+
+def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Vectors at length 1; zero ones stay."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.where(length > 0, length, 1.0)
 
 
 def mollweide(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
@@ -48,6 +57,28 @@ def smooth_map(
     spline = RBFInterpolator(directions[known], values[known], kernel="thin_plate_spline")
     smooth = np.clip(spline(at), values[known].min(), values[known].max())
     return np.where(inside, smooth, np.nan).reshape(height, 2 * height)
+
+
+def path(directions: Float[np.ndarray, "n 3"]) -> list[Float[np.ndarray, "_ 2"]]:
+    """Lines on the map that join directions by great circles: cut in two where a circle leaves the map at its rim."""
+    pieces = [[directions[0]]]
+    for a, b in pairwise(directions):
+        # Where the chord meets the plane of the meridians 0 and 180, which is where the rim is.
+        crossing = unit(np.sign(a[0]) * (a[0] * b - b[0] * a))
+        if a[0] * b[0] < 0 and crossing[2] < 0:
+            leaving, entering = (crossing + 1e-6 * np.sign(end[0]) * np.eye(3)[0] for end in (a, b))
+            pieces[-1] += _arc(a, leaving)
+            pieces.append([entering, *_arc(entering, b)])
+        else:
+            pieces[-1] += _arc(a, b)
+    return [mollweide(unit(np.stack(piece))) for piece in pieces]
+
+
+def _arc(a: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
+    """Directions from `a`, which is left out, to `b`: fine enough to be joined by straight lines on the map."""
+    a, b = unit(a), unit(b)
+    count = max(1, math.ceil(float(np.linalg.norm(b - a)) / 0.05))
+    return [unit(a + t * (b - a)) for t in np.arange(1, count + 1) / count]
 
 
 def graticule() -> list[Float[np.ndarray, "n 2"]]:

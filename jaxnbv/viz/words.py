@@ -77,6 +77,7 @@ def describe_choice(
     value: float,
     rank: int,
     others: tuple[float, ...],
+    starts: int,
     pose: Pose,
     earlier: list[Pose],
     points: int,
@@ -85,10 +86,11 @@ def describe_choice(
 ) -> str:
     """Where a view looks from, why it was chosen and what it added, to follow "View 2".
 
-    `others`: values of the open candidates, best first; `change`: coverage before and after, where it is known.
+    `others`: values of the open candidates, best first; `starts`: of a gradient search's ascents, else 0; `change`:
+    coverage before and after, where it is known.
     """
     turned = f"{nearest_angle(pose, earlier):.0f}° from the nearest earlier view"
-    parts = [f"looks from {place(pose)}, {turned}.", _reason(values, value, rank, others)]
+    parts = [f"looks from {place(pose)}{_aim(pose)}, {turned}.", _reason(values, value, rank, others, starts)]
     added = f"It added {points:,} points" if points else "It saw nothing"
     kept = f" ({count:,} are kept)" if points else ""
     grown = ""
@@ -111,27 +113,39 @@ def describe_classes(before: Probabilities | None, after: Probabilities, names: 
     return f"{known} (was {before[best]:.2f}, behind {names[previous]} with {before[previous]:.2f})."
 
 
-def _reason(values: Quantity, value: float, rank: int, others: tuple[float, ...]) -> str:
+def _reason(values: Quantity, value: float, rank: int, others: tuple[float, ...], starts: int) -> str:
     if not values.smooth:
         return f"It was drawn at random from {len(others)} open candidates."
+    ascent = f"gradient ascent from {starts} start{'s' if starts > 1 else ''}"
+    if starts and (not others or value > others[0]):
+        text = f"Its {values.name}, {values.show(value)}, was found by {ascent}"
+        if not others:
+            return f"{text}."
+        if len(others) == 1:
+            return f"{text}: {_margin(value, others[0], 'the one open candidate')} ({number(others[0])})."
+        margin = _margin(value, others[0], f"the best of {len(others)} open candidates")
+        return f"{text}: {margin} ({number(others[0])}; median {number(float(np.median(others)))})."
     best = rank == 1
     stands = "the highest" if best else f"rank {rank}"
     text = f"Its {values.name}, {values.show(value)}, was {stands} of {len(others)} open candidates"
+    after = f" The {ascent} found nothing better." if starts else ""
     median = float(np.median(others))
     compared = f"the median candidate had {number(median)}"
     if median > 0 and value / median < 1000:
         compared = f"{number(value / median)} times the median ({number(median)})"
     if not best or len(others) < 2:
-        return f"{text}: {compared}."
-    runner_up = others[1]
-    if runner_up > 0:
-        ahead = value / runner_up - 1.0
-        margin = "level with the runner-up" if ahead < 5e-4 else f"{100 * ahead:.2g} % above the runner-up"
-        if ahead >= 1:
-            margin = f"{number(ahead + 1)} times the runner-up"
-    else:
-        margin = "ahead of the runner-up"
-    return f"{text}: {compared}, {margin} ({number(runner_up)})."
+        return f"{text}: {compared}.{after}"
+    return f"{text}: {compared}, {_margin(value, others[1], 'the runner-up')} ({number(others[1])}).{after}"
+
+
+def _margin(value: float, other: float, name: str) -> str:
+    """How far a value is ahead of another, which has a name."""
+    if other <= 0:
+        return f"ahead of {name}"
+    ahead = value / other - 1.0
+    if ahead >= 1:
+        return f"{number(ahead + 1)} times {name}"
+    return f"level with {name}" if ahead < 5e-4 else f"{float(f'{100 * ahead:.2g}'):g} % above {name}"
 
 
 def place(pose: Pose) -> str:
@@ -141,6 +155,14 @@ def place(pose: Pose) -> str:
     side = "above" if elevation >= 0 else "below"
     x, y, z = (f"{coordinate:.2f}".replace("-", "−") for coordinate in position)
     return f"({x}, {y}, {z}), {abs(elevation):.0f}° {side} the horizon"
+
+
+def _aim(pose: Pose) -> str:
+    """By how much a camera looks past the origin, where it does."""
+    position, forward = (np.asarray(vector, dtype=np.float64) for vector in (pose.position, pose.forward))
+    distance = float(np.linalg.norm(position))
+    off = np.degrees(np.arccos(np.clip(-position @ forward / max(distance, 1e-12), -1.0, 1.0)))
+    return "" if off < 0.5 else f", {distance:.2f} from the centre and aimed {off:.0f}° beside it"
 
 
 def nearest_angle(pose: Pose, earlier: list[Pose]) -> float:

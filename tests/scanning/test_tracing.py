@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.ndimage
 
-from jaxnbv.scanning import tracing
+from jaxnbv.scanning import cubic, tracing
 
 
 def test_roots_of_cubics():
@@ -17,8 +17,8 @@ def test_roots_of_cubics():
         roots = np.roots(np.trim_zeros(c[::-1, i], "f"))
         real = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real >= 0) & (roots.real <= 1)]
         expected[i] = real.min(initial=np.inf)
-    _, found = tracing.first_bracket([jnp.asarray(row, jnp.float32) for row in c])
-    root = tracing.first_root([jnp.asarray(row, jnp.float32) for row in c])
+    _, found = cubic.first_bracket([jnp.asarray(row, jnp.float32) for row in c])
+    root = cubic.first_root([jnp.asarray(row, jnp.float32) for row in c])
     # Double roots, and roots at an end of the interval, may fall either way in float32.
     assert (np.asarray(found) == np.isfinite(expected)).mean() > 0.999
     hit = np.isfinite(expected) & np.asarray(found)

@@ -1,0 +1,143 @@
+"""What gradient searches find, and how long they take, as ratios to the discrete search of 120 candidates.
+
+    python benchmarks/gradient.py [--task coverage|cross-entropy] [--mesh FILE] [--seeds 10] [--out FILE]
+
+One step after one random view, at the paper's settings: S = 16, 50 x 50 rays, L = 50, grid 100^3. The object is the
+demo's: a mug for coverage, or a mesh; a pyramid in close-up for cross-entropy. All searches of a seed see the same
+samples. Times are those of the second of two runs, with what compiles left out; "step" adds the drawing of the samples,
+which all searches need. Also the time of one gradient of the acquisition at six poses, in times of its value.
+Continues after the last seed in the file, where this has the same settings.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from timing import least_time
+from tqdm import tqdm
+
+import jaxnbv as nbv
+from jaxnbv.datasets import Framing, Split, demo_object, hidden_view, pyramid_scene
+from jaxnbv.episode import observe_scene
+from jaxnbv.networks import pyramid_classifier
+from jaxnbv.search.base import sphere_candidates
+from jaxnbv.storage import describe, versions
+
+SEARCHES = {
+    "discrete": nbv.DiscreteSearch(),
+    "2-DOF": nbv.GradientSearch(dof=2),
+    "2-DOF, the paper's six starts": nbv.GradientSearch(dof=2, num_candidates=6),
+    "6-DOF": nbv.GradientSearch(dof=6),
+    "6-DOF, constrained": nbv.GradientSearch(space=nbv.ConstrainedPoses()),
+    "hybrid": nbv.HybridSearch(),
+}
+# Not for cross-entropy, which is greatest where nothing is seen but a few rays.
+COVERAGE_ONLY = ("6-DOF",)
+
+
+def scene_and_first(task: str, mesh: str | None, seed: int, key: jax.Array) -> tuple[nbv.Surface, nbv.Pose]:
+    """The object, and a random first view of it; of a pyramid one that does not show the pattern."""
+    if task == "cross-entropy":
+        pyramid = pyramid_scene(Split.TEST, seed, Framing.CLOSE_UP)
+        return nbv.SDFSurface(pyramid), hidden_view(pyramid, key)
+    direction = jax.random.normal(key, (3,))
+    first = nbv.look_at(2.5 * direction / jnp.linalg.norm(direction))
+    return nbv.load_mesh(mesh) if mesh else demo_object(), first
+
+
+@eqx.filter_jit
+def value(planner: nbv.Planner, state: nbv.State, surfaces: nbv.GridSurface, parameters):
+    """The acquisition at six poses of the sphere, moved by parameters."""
+    starts = sphere_candidates(6)
+    poses = jax.vmap(nbv.SpherePoses().retract)(starts, parameters)
+    return nbv.expected_score(planner.acquisition, state.cloud, surfaces, planner.camera, poses)
+
+
+@eqx.filter_jit
+def gradient(planner: nbv.Planner, state: nbv.State, surfaces: nbv.GridSurface, parameters):
+    """Its gradient, and its value with it."""
+    return jax.value_and_grad(lambda moved: value(planner, state, surfaces, moved).sum())(parameters)
+
+
+def run_seed(planners: dict[str, nbv.Planner], task: str, mesh: str | None, seed: int) -> dict:
+    """Values and seconds of every search on one step."""
+    first_key, noise_key, sample_key, search_key = jax.random.split(jax.random.key(seed), 4)
+    scene, first = scene_and_first(task, mesh, seed, first_key)
+    planner = planners["discrete"]
+    seen = observe_scene(scene, planner.camera, first, nbv.SensorNoise(), noise_key)
+    state = planner.init(seen, first)
+    surfaces = planner.sample_surfaces(state, sample_key)
+    parameters = jnp.zeros((6, 3))
+    row = {
+        "samples": least_time(lambda: planner.sample_surfaces(state, sample_key), 1),
+        "six values": least_time(lambda: value(planner, state, surfaces, parameters)),
+        "six gradients": least_time(lambda: gradient(planner, state, surfaces, parameters)),
+    }
+    for name, asked in planners.items():
+        jax.block_until_ready(asked.choose(state, surfaces, search_key))
+        start = time.perf_counter()
+        proposal = jax.block_until_ready(asked.choose(state, surfaces, search_key))
+        row[name] = {"value": float(proposal.value), "seconds": time.perf_counter() - start}
+    return row
+
+
+def show(rows: list[dict], names: list[str]) -> None:
+    """The table: medians over the seeds, and how often the discrete value is reached."""
+
+    def column(name: str, what: str) -> np.ndarray:
+        return np.array([row[name][what] for row in rows])
+
+    samples = np.array([row["samples"] for row in rows])
+    discrete, seconds = column("discrete", "value"), column("discrete", "seconds")
+    print(f"{'of the discrete search':32s} {'value':>7s} {'least':>7s} {'reached':>8s} {'search':>7s} {'step':>7s}")
+    for name in names:
+        ratio, took = column(name, "value") / discrete, column(name, "seconds")
+        reached = f"{int((ratio >= 1.0).sum())}/{len(rows)}"
+        step = (samples + took) / (samples + seconds)
+        print(
+            f"{name:32s} {np.median(ratio):7.3f} {ratio.min():7.3f} {reached:>8s} "
+            f"{np.median(took / seconds):7.2f} {np.median(step):7.2f}"
+        )
+    cost = np.median([row["six gradients"] / row["six values"] for row in rows])
+    print(f"the discrete search takes {np.median(seconds):.2f} s, the samples {np.median(samples):.2f} s")
+    print(f"one gradient at six poses takes {cost:.2f} times its value (at most 6)")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--task", choices=["coverage", "cross-entropy"], default="coverage")
+    parser.add_argument("--mesh", help="a mesh file, for coverage; the demo object if left out")
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--out", type=Path)
+    arguments = parser.parse_args()
+    if arguments.task == "cross-entropy" and arguments.mesh:
+        parser.error("cross-entropy has a classifier for pyramids only: leave --mesh out")
+
+    score = nbv.Coverage()
+    if arguments.task == "cross-entropy":
+        score = nbv.CrossEntropy(pyramid_classifier(Framing.CLOSE_UP.longest_side))
+    names = [name for name in SEARCHES if arguments.task == "coverage" or name not in COVERAGE_ONLY]
+    planners = {name: nbv.Planner(nbv.GeometricSPSR(), nbv.Camera(), score, SEARCHES[name]) for name in names}
+    label = Path(arguments.mesh).stem if arguments.mesh else arguments.task
+    out = arguments.out or Path("benchmarks/results") / f"gradient_{label}.json"
+    settings = {"object": arguments.mesh or arguments.task, "planners": describe(planners), "versions": versions()}
+    settings = json.loads(json.dumps(settings))
+    rows = []
+    if out.exists():
+        earlier = json.loads(out.read_text())
+        rows = earlier["rows"] if earlier["settings"] == settings else []
+    for seed in tqdm(range(len(rows), arguments.seeds), desc=label):
+        rows.append(run_seed(planners, arguments.task, arguments.mesh, seed))
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(json.dumps({"settings": settings, "rows": rows}, indent=2) + "\n")
+    print(f"{label}, {len(rows)} seeds, {jax.devices()[0].device_kind}")
+    show(rows, names)
+
+
+if __name__ == "__main__":
+    main()

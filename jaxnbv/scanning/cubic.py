@@ -1,0 +1,71 @@
+"""The trilinear function of a grid's cell along a ray: a cubic, and its first root.
+
+Vectors are lists of their components (n,), in coordinates local to the cell.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+CORNERS = tuple((i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1))
+
+_ROOT_ITERATIONS = 8
+
+
+def cubic(corners: list, a: list, b: list) -> list[Float[Array, " n"]]:
+    """Coefficients c_0, ..., c_3 in s of the trilinear function along a + s b, in coordinates local to the cell.
+
+    Linear interpolation along z, y and x in turn, each time with polynomials one degree higher.
+    """
+    polynomials = [[corner] for corner in corners]
+    for x, dx in ((a[2], b[2]), (a[1], b[1]), (a[0], b[0])):
+        merged = []
+        for p, q in zip(polynomials[0::2], polynomials[1::2], strict=True):
+            difference = [qi - pi for pi, qi in zip(p, q, strict=True)]
+            constant = [pi + di * x for pi, di in zip(p, difference, strict=True)]
+            linear = [di * dx for di in difference]
+            merged.append([constant[0], *(c + d for c, d in zip(constant[1:], linear[:-1], strict=True)), linear[-1]])
+        polynomials = merged
+    return polynomials[0]
+
+
+def first_bracket(c: list) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
+    """For cubics positive at 0: whether they have a root in [0, 1], and an s so that [0, s] holds the first one alone.
+
+    A cubic positive at 0 that is not positive at its local minimum has one root before that. Else it has at most one
+    in [0, 1], and only if it is not positive at 1. One not positive at 0 has its root there.
+    """
+    discriminant = c[2] * c[2] - 3.0 * c[3] * c[1]
+    root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
+    # Both are the larger root of the derivative over c_3; each avoids cancellation for one sign of c_2.
+    numerator = jnp.where(c[2] > 0, -c[1], root - c[2])
+    denominator = jnp.where(c[2] > 0, c[2] + root, 3.0 * c[3])
+    minimum = numerator / jnp.where(denominator == 0, 1.0, denominator)
+    exists = (discriminant > 0) & (denominator != 0) & (minimum > 0) & (minimum < 1)
+    dips = exists & (_polynomial(c, minimum) <= 0)
+    return jnp.where(dips, minimum, 1.0), dips | (c[0] <= 0) | (_polynomial(c, 1.0) <= 0)
+
+
+def first_root(c: list) -> Float[Array, " n"]:
+    """The first root in [0, 1] of cubics that have one and are positive at 0; 0 where they are not.
+
+    Newton's method, and bisection where it leaves the bracket.
+    """
+    high, _ = first_bracket(c)
+    drop = c[0] - _polynomial(c, high)
+    secant = high * jnp.clip(c[0] / jnp.where(drop > 0, drop, 1.0), 0.0, 1.0)
+
+    def refine(_, state):
+        low, high, s = state
+        value = _polynomial(c, s)
+        slope = c[1] + s * (2.0 * c[2] + s * 3.0 * c[3])
+        low, high = jnp.where(value > 0, s, low), jnp.where(value > 0, high, s)
+        newton = s - value / jnp.where(slope == 0, 1.0, slope)
+        return low, high, jnp.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
+
+    _, _, s = jax.lax.fori_loop(0, _ROOT_ITERATIONS, refine, (jnp.zeros_like(high), high, secant))
+    return jnp.where(c[0] <= 0, 0.0, s)
+
+
+def _polynomial(c: list, s) -> Float[Array, " n"]:
+    return c[0] + s * (c[1] + s * (c[2] + s * c[3]))

@@ -1,0 +1,94 @@
+"""What a gradient search passed through, as plain arrays, and the acquisition all over the sphere beside it."""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from jaxnbv.acquisition import expected_score
+from jaxnbv.camera import Pose
+from jaxnbv.episode import Episode, view_keys
+from jaxnbv.search import Proposal, Trajectories
+from jaxnbv.search.base import sphere_candidates
+from jaxnbv.viz.sphere import unit
+
+# Fewer candidates than this say little about what lies between them: the map is then made of so many views of its own.
+_FEWEST = 40
+MAP_VIEWS = 120
+
+
+class SphereMap(eqx.Module):
+    """Values of cameras that look at the origin, from which the map over the sphere is interpolated.
+
+    - `directions`: unit vectors from the origin to them; `values`: theirs, NaN where excluded as visited.
+    """
+
+    directions: Float[np.ndarray, "c 3"]
+    values: Float[np.ndarray, " c"]
+
+
+class Ascents(eqx.Module):
+    """The trajectories of a gradient search, from each of its starts to where it ended.
+
+    - `poses`: with leading axes (starts, steps).
+    - `directions`: unit vectors from the origin to their positions; `values`: theirs.
+    """
+
+    poses: Pose
+    directions: Float[np.ndarray, "starts steps 3"]
+    values: Float[np.ndarray, "starts steps"]
+
+    @property
+    def is_spatial(self) -> bool:
+        """Whether cameras left the sphere that they started from, or looked past its centre."""
+        return not _on_sphere(self.poses)
+
+
+def _on_sphere(poses: Pose) -> bool:
+    """Whether all cameras stand at one distance from the origin and look at it."""
+    positions = np.asarray(poses.position, dtype=np.float64)
+    past = np.asarray(poses.forward, dtype=np.float64) + unit(positions)
+    return bool(np.ptp(np.linalg.norm(positions, axis=-1)) < 1e-3 and np.linalg.norm(past, axis=-1).max() < 1e-3)
+
+
+def ascents_of(trajectories: Trajectories) -> Ascents:
+    """The trajectories of a proposal as directions and values."""
+    positions = np.asarray(trajectories.poses.position, dtype=np.float64)
+    return Ascents(trajectories.poses, unit(positions), np.asarray(trajectories.values, dtype=np.float64))
+
+
+def proper_candidates(proposal: Proposal) -> tuple[Pose, Float[np.ndarray, " c"]]:
+    """A proposal's candidates without the poses of its trajectories, and their values, NaN where excluded."""
+    passed = 0 if proposal.trajectories is None else proposal.trajectories.values.size
+    values = np.asarray(proposal.values, dtype=np.float64)
+    values = np.where(np.isfinite(values), values, np.nan)
+    count = len(values) - passed
+    return proposal.candidates[:count], values[:count]
+
+
+def wider_map(episode: Episode, index: int) -> SphereMap | None:
+    """What the map of view `index` (from 0) is to be drawn from in place of candidates that are too few, or not cameras
+    on one sphere that look at its centre; None for other candidates, and for searches without gradients.
+
+    The posterior samples are those of the step, so that values can be compared with the search's own.
+    """
+    proposal, planner = episode.views[index].proposal, episode.planner
+    if proposal is None or proposal.trajectories is None or not planner.search.uses_samples:
+        return None
+    candidates, values = proper_candidates(proposal)
+    if np.sum(~np.isnan(values)) >= _FEWEST and _on_sphere(candidates):
+        return None
+    radius = float(np.median(np.linalg.norm(np.asarray(candidates.position), axis=-1)))
+    poses = sphere_candidates(MAP_VIEWS, radius)
+    values = step_values(episode, index, poses)
+    return SphereMap(unit(np.asarray(poses.position, dtype=np.float64)), values)
+
+
+def step_values(episode: Episode, index: int, poses: Pose) -> Float[np.ndarray, " poses"]:
+    """The acquisition at a batch of poses, at the step that chose view `index` (from 1) and with its samples."""
+    planner, cloud = episode.planner, episode.views[index - 1].cloud
+    sample_key, *_ = view_keys(episode.key, index)
+    surfaces = planner.sample_surfaces(planner.init(cloud), sample_key)
+    return np.asarray(_expected(planner.acquisition, cloud, surfaces, planner.camera, poses), dtype=np.float64)
+
+
+_expected = eqx.filter_jit(expected_score)
