@@ -4,9 +4,9 @@
 
 One step after one random view, at the paper's settings: S = 16, 50 x 50 rays, L = 50, grid 100^3. The object is the
 demo's: a mug for coverage, or a mesh; a pyramid in close-up for cross-entropy. All searches of a seed see the same
-samples. Times are those of the second of two runs, with what compiles left out; "step" adds the drawing of the samples,
-which all searches need. Also the time of one gradient of the acquisition at six poses, in times of its value.
-Continues after the last seed in the file, where this has the same settings.
+samples. Times are without compilation; "step" adds the drawing of the samples, which all searches need. Also the time
+of one gradient of the acquisition at six poses, in times of its value. Continues after the last seed in the file, where
+this has the same settings.
 """
 
 import argparse
@@ -64,8 +64,8 @@ def gradient(planner: nbv.Planner, state: nbv.State, surfaces: nbv.GridSurface, 
     return jax.value_and_grad(lambda moved: value(planner, state, surfaces, moved).sum())(parameters)
 
 
-def run_seed(planners: dict[str, nbv.Planner], task: str, mesh: str | None, seed: int) -> dict:
-    """Values and seconds of every search on one step."""
+def run_seed(planners: dict[str, nbv.Planner], task: str, mesh: str | None, seed: int, compiled: bool) -> dict:
+    """Values and seconds of every search on one step; where nothing is compiled yet, of the second time."""
     first_key, noise_key, sample_key, search_key = jax.random.split(jax.random.key(seed), 4)
     scene, first = scene_and_first(task, mesh, seed, first_key)
     planner = planners["discrete"]
@@ -79,7 +79,8 @@ def run_seed(planners: dict[str, nbv.Planner], task: str, mesh: str | None, seed
         "six gradients": least_time(lambda: gradient(planner, state, surfaces, parameters)),
     }
     for name, asked in planners.items():
-        jax.block_until_ready(asked.choose(state, surfaces, search_key))
+        if not compiled:
+            jax.block_until_ready(asked.choose(state, surfaces, search_key))
         start = time.perf_counter()
         proposal = jax.block_until_ready(asked.choose(state, surfaces, search_key))
         row[name] = {"value": float(proposal.value), "seconds": time.perf_counter() - start}
@@ -131,8 +132,9 @@ def main() -> None:
     if out.exists():
         earlier = json.loads(out.read_text())
         rows = earlier["rows"] if earlier["settings"] == settings else []
-    for seed in tqdm(range(len(rows), arguments.seeds), desc=label):
-        rows.append(run_seed(planners, arguments.task, arguments.mesh, seed))
+    first = len(rows)
+    for seed in tqdm(range(first, arguments.seeds), desc=label):
+        rows.append(run_seed(planners, arguments.task, arguments.mesh, seed, compiled=seed > first))
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(json.dumps({"settings": settings, "rows": rows}, indent=2) + "\n")
     print(f"{label}, {len(rows)} seeds, {jax.devices()[0].device_kind}")

@@ -21,7 +21,7 @@ def rotation_from_6d(columns: Float[AnyArray, "*batch 6"]) -> Float[Array, "*bat
     columns = jnp.asarray(columns, dtype=jnp.result_type(float))
     first = normalise(columns[..., :3], jnp.asarray([1.0, 0.0, 0.0], columns.dtype))
     spare = _any_orthogonal(first)
-    second = normalise(_reject(normalise(columns[..., 3:], spare), first), spare)
+    second = normalise(_reject(normalise(columns[..., 3:], spare), first), spare, _rounding(columns))
     # The difference of nearly parallel vectors has lost digits and is not orthogonal; the second time it is.
     second = normalise(_reject(second, first), spare)
     return jnp.stack([first, second, jnp.cross(first, second)], axis=-1)
@@ -32,7 +32,11 @@ def rotation_between(
 ) -> Float[Array, "*batch 3 3"]:
     """The least rotation that takes one unit vector to another; one of the many, where they are opposite."""
     start, end = jnp.asarray(start), jnp.asarray(end)
-    halfway = normalise(start + end, _any_orthogonal(start))
+    halfway = normalise(start + end, _any_orthogonal(start), _rounding(start))
+    # The sum of nearly opposite vectors has lost digits; it is orthogonal to their difference, which has not.
+    opposed = jnp.sum(start * end, axis=-1, keepdims=True) < 0
+    apart = normalise(jnp.where(opposed, start - end, 0.0), jnp.zeros_like(start))
+    halfway = normalise(_reject(halfway, apart), halfway)
     return jnp.matmul(_reflection(halfway), _reflection(start), precision="highest")
 
 
@@ -41,11 +45,18 @@ def _reflection(unit: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
     return jnp.eye(3, dtype=unit.dtype) - 2.0 * unit[..., :, None] * unit[..., None, :]
 
 
-def normalise(vector: Float[Array, "*batch 3"], spare: Float[Array, "*#batch 3"]) -> Float[Array, "*batch 3"]:
-    """The unit vector along a vector, or `spare` where its square underflows."""
+def normalise(
+    vector: Float[Array, "*batch n"], spare: Float[Array, "*#batch n"], least: float = 0.0
+) -> Float[Array, "*batch n"]:
+    """The unit vector along a vector, or `spare` where it is no longer than `least` or its square underflows."""
     square = jnp.sum(vector**2, axis=-1, keepdims=True)
-    usable = square > jnp.finfo(vector.dtype).tiny
+    usable = square > max(least**2, float(jnp.finfo(vector.dtype).tiny))
     return jnp.where(usable, vector / jnp.sqrt(jnp.where(usable, square, 1.0)), spare)
+
+
+def _rounding(unit: Float[Array, "*batch n"]) -> float:
+    """Well above the rounding of sums of unit vectors: the direction of a shorter sum is not known."""
+    return 16.0 * float(jnp.finfo(unit.dtype).eps)
 
 
 def _reject(vector: Float[Array, "*batch 3"], unit: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:

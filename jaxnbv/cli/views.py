@@ -47,7 +47,6 @@ from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Classifier, Coverage, CrossEntropy, MixedEntropy, NegativeEntropy
 from jaxnbv.tasks.classification import class_names, predict
 from jaxnbv.viz import write_report
-from jaxnbv.viz.trajectories import proper_candidates
 from jaxnbv.viz.words import quantity
 
 SEARCHES: dict[SearchName, Any] = {
@@ -200,7 +199,7 @@ def _summarise(episode: Episode) -> None:
         position = ", ".join(f"{value:+.2f}" for value in np.asarray(view.pose.position))
         line = f"view {index}   from ({position})   {int(view.scan.count):5d} points, {int(view.cloud.count):5d} kept"
         if view.proposal is not None:
-            _, values = proper_candidates(view.proposal)
+            values = np.asarray(view.proposal.values)
             values = values[np.isfinite(values)]
             line += f"   {sought.name} {float(view.proposal.value):.4g}, "
             if (ways := view.proposal.trajectories) is None:

@@ -59,19 +59,16 @@ class Ascent(eqx.Module):
         # Solvers that search along a line expect values and slopes of order one.
         scale = jnp.max(jnp.abs(values))
         scale = jnp.where(scale > 0, scale, 1.0)
-        walk = jax.vmap(partial(self._walk, problem, scale))
-        poses, visited_values, last = walk(candidates[order[: self.num_starts]])
-        poses = jax.tree.map(lambda way, end: jnp.concatenate([way, end[:, None]], axis=1), poses, last)
-        visited_values = jnp.concatenate([visited_values, problem.acquisition(last)[:, None]], axis=1)
-        trajectories = Trajectories(poses, visited_values)
+        trajectories = jax.vmap(partial(self._walk, problem, scale))(candidates[order[: self.num_starts]])
+        found = best_unvisited(problem, candidates, values)
+        on_the_way = best_unvisited(problem, *trajectories.flat)
+        # Whatever is not a number comes through, so that the planner can say so.
+        better = ~(on_the_way.value <= found.value)
+        pose, value = jax.tree.map(partial(jnp.where, better), *[(p.pose, p.value) for p in (on_the_way, found)])
+        return Proposal(pose, value, candidates, found.values, trajectories)
 
-        poses, seen = trajectories.flat
-        everything = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), (candidates, values), (poses, seen))
-        proposal = best_unvisited(problem, *everything)
-        return Proposal(proposal.pose, proposal.value, proposal.candidates, proposal.values, trajectories)
-
-    def _walk(self, problem: Problem, scale: Float[Array, ""], start: Pose):
-        """The poses at which the solver asked for a gradient, their values, and the pose that it ended at."""
+    def _walk(self, problem: Problem, scale: Float[Array, ""], start: Pose) -> Trajectories:
+        """The poses at which the solver asked for a gradient, and their values."""
         solver = self.minimiser
 
         def loss(parameters, _):
@@ -92,5 +89,6 @@ class Ascent(eqx.Module):
             after = moved, eqx.filter(whole, eqx.is_array)
             return jax.tree.map(partial(jnp.where, done), carry, after), seen
 
-        (parameters, _), (poses, values) = jax.lax.scan(step, (parameters, state), length=self.iterations)
-        return poses, values, self.space.retract(start, parameters)
+        # One step more, for the value of the pose that the last one led to.
+        _, (poses, values) = jax.lax.scan(step, (parameters, state), length=self.iterations + 1)
+        return Trajectories(poses, values)

@@ -56,14 +56,17 @@ class Problem(eqx.Module):
 
 
 class Trajectories(eqx.Module):
-    """The ways of a gradient search, from each of its starts to where it ended, and the values along them."""
+    """The ways of a gradient search, from each of its starts to where it ended, and the values along them.
+
+    - `poses`: with the leading axes of `values`; `iterations` + 1 steps.
+    """
 
     poses: Pose
-    values: Float[Array, "starts steps"]
+    values: Float[Array, "*starts steps"]
 
     @property
     def flat(self) -> tuple[Pose, Float[Array, " looks"]]:
-        """All poses and values, every start's first ones first, then their second ones and so on."""
+        """All poses and values: the starts, then where each went with its first step, and so on."""
         poses, values = jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), (self.poses, self.values))
         return jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), (poses, values))
 
@@ -72,8 +75,8 @@ class Proposal(eqx.Module):
     """A search's answer: the pose to take next, and what it looked at.
 
     - `value`: the chosen pose's value, in the units of what the search maximises.
-    - `candidates`, `values`: every pose looked at and its value; -inf where it was excluded as visited.
-    - `trajectories`: those of them that a gradient search passed through, the last rows of `candidates`; else None.
+    - `candidates`, `values`: the pool of poses and their values; -inf where one was excluded as visited.
+    - `trajectories`: the poses that a gradient search passed through from the best of them; None for other searches.
     """
 
     pose: Pose

@@ -1,6 +1,6 @@
 """Search by gradient: the acquisition is a differentiable function of the pose."""
 
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import equinox as eqx
 import optimistix as optx
@@ -37,7 +37,7 @@ class GradientSearch(Search):
 
     def __init__(
         self,
-        dof: Literal[2, 6] | None = None,
+        dof: int | None = None,
         space: PoseSpace | None = None,
         num_starts: int = 6,
         iterations: int = 20,
@@ -70,7 +70,7 @@ class HybridSearch(Search):
 
     def __init__(
         self,
-        dof: Literal[2, 6] | None = None,
+        dof: int | None = None,
         space: PoseSpace | None = None,
         num_starts: int = 3,
         iterations: int = 10,

@@ -19,7 +19,7 @@ from jaxnbv.search import Proposal
 from jaxnbv.surfaces import SurfacePosterior
 from jaxnbv.tasks.classification import class_names, predict
 from jaxnbv.viz.sphere import unit
-from jaxnbv.viz.trajectories import Ascents, SphereMap, ascents_of, proper_candidates, wider_map
+from jaxnbv.viz.trajectories import Ascents, SphereMap, ascents_of, open_values, wider_map
 from jaxnbv.viz.words import Quantity, describe_choice, describe_classes, describe_first, quantity
 
 COVERAGE_RADIUS = 0.05
@@ -172,8 +172,8 @@ def choice_of(proposal: Proposal, wider: SphereMap | None = None) -> Choice:
 
     `wider`: what the map is to be drawn from in place of the candidates.
     """
-    candidates, values = proper_candidates(proposal)
-    directions = unit(np.asarray(candidates.position, dtype=np.float64))
+    values = open_values(proposal)
+    directions = unit(np.asarray(proposal.candidates.position, dtype=np.float64))
     value = float(proposal.value)
     return Choice(
         directions=directions,

@@ -103,7 +103,7 @@ def _view(data: ReportData, index: int, camera: Camera, norm: LogNorm) -> Figure
     _legend(figure, 0.125, 0.955)
     figure.text(0.52, 0.95, _map_title(view, data.quantity), fontsize=10)
     if view.choice is not None and view.choice.ascents is not None:
-        figure.text(0.52, 0.925, _ascent_key(view.choice), fontsize=8, va="top", linespacing=1.5)
+        _ascent_key(figure, view.spatial_ascents is not None)
     axes = figure.add_axes((0.52, 0.22, 0.46, 0.66))
     colours = draw_acquisition(axes, view.choice, data.quantity)
     if colours is not None:
@@ -117,11 +117,11 @@ def _map_title(view: ViewData, quantity: Quantity) -> str:
     return "This view was given" if view.choice is None else f"Why view {view.number}: {quantity.name}"
 
 
-def _ascent_key(choice: Choice) -> str:
-    key = "○ start   ● end of a gradient ascent   ★ chosen view"
-    if choice.ascents is not None and choice.ascents.is_spatial:
-        key += "\nascents: camera directions; map: cameras that look at the centre"
-    return key
+def _ascent_key(figure: Figure, is_spatial: bool) -> None:
+    figure.text(0.52, 0.905, "○ start   ● end of a gradient ascent", fontsize=8)
+    figure.text(0.775, 0.905, "★ chosen view", color=NEW, fontsize=8)
+    if is_spatial:
+        figure.text(0.52, 0.865, "ascents: camera directions; map: cameras that look at the centre", fontsize=8)
 
 
 def _deviation_bar(figure: Figure, place: tuple[float, float, float, float], norm: LogNorm) -> None:

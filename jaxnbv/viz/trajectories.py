@@ -56,13 +56,10 @@ def ascents_of(trajectories: Trajectories) -> Ascents:
     return Ascents(trajectories.poses, unit(positions), np.asarray(trajectories.values, dtype=np.float64))
 
 
-def proper_candidates(proposal: Proposal) -> tuple[Pose, Float[np.ndarray, " c"]]:
-    """A proposal's candidates without the poses of its trajectories, and their values, NaN where excluded."""
-    passed = 0 if proposal.trajectories is None else proposal.trajectories.values.size
+def open_values(proposal: Proposal) -> Float[np.ndarray, " c"]:
+    """The values of a proposal's candidates, NaN where one was excluded as visited."""
     values = np.asarray(proposal.values, dtype=np.float64)
-    values = np.where(np.isfinite(values), values, np.nan)
-    count = len(values) - passed
-    return proposal.candidates[:count], values[:count]
+    return np.where(np.isfinite(values), values, np.nan)
 
 
 def wider_map(episode: Episode, index: int) -> SphereMap | None:
@@ -74,13 +71,11 @@ def wider_map(episode: Episode, index: int) -> SphereMap | None:
     proposal, planner = episode.views[index].proposal, episode.planner
     if proposal is None or proposal.trajectories is None or not planner.search.uses_samples:
         return None
-    candidates, values = proper_candidates(proposal)
-    if np.sum(~np.isnan(values)) >= _FEWEST and _on_sphere(candidates):
+    if np.sum(~np.isnan(open_values(proposal))) >= _FEWEST and _on_sphere(proposal.candidates):
         return None
-    radius = float(np.median(np.linalg.norm(np.asarray(candidates.position), axis=-1)))
+    radius = float(np.median(np.linalg.norm(np.asarray(proposal.candidates.position), axis=-1)))
     poses = sphere_candidates(MAP_VIEWS, radius)
-    values = step_values(episode, index, poses)
-    return SphereMap(unit(np.asarray(poses.position, dtype=np.float64)), values)
+    return SphereMap(unit(np.asarray(poses.position, dtype=np.float64)), step_values(episode, index, poses))
 
 
 def step_values(episode: Episode, index: int, poses: Pose) -> Float[np.ndarray, " poses"]:

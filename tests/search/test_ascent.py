@@ -1,0 +1,131 @@
+"""The ascent on acquisitions in closed form: known maxima, Adam by hand, ties, degenerate starts, bad settings."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+import pytest
+
+from jaxnbv.camera import Camera, Pose, look_at
+from jaxnbv.cloud import PointCloud
+from jaxnbv.search import ConstrainedPoses, FreePoses, GradientSearch, HybridSearch, Problem, SpherePoses
+from jaxnbv.search.ascent import Ascent
+from jaxnbv.search.gradient import _pose_space
+from jaxnbv.tasks import Coverage
+
+
+@eqx.filter_jit
+def propose(search, problem, key):
+    return search.propose(problem, key)
+
+
+class Known(Problem):
+    """5 - |position - place|^2 - |forward - gaze|^2: an acquisition in closed form, without surfaces."""
+
+    place: jax.Array
+    gaze: jax.Array
+
+    def acquisition(self, poses):
+        return 5.0 - jnp.sum((poses.position - self.place) ** 2 + (poses.forward - self.gaze) ** 2, axis=-1)
+
+
+def known(kind=Known, pose=None, place=(0.9, -1.1, 1.4), gaze=(-0.6, 0.0, -0.8)):
+    """The problem, with a pose that has been visited, if one is given."""
+    cloud = PointCloud(jnp.zeros((1, 3)), jnp.zeros((1, 3)), jnp.zeros(1, bool))
+    visited = Pose(np.eye(3)[None], np.zeros((1, 3)))
+    problem = kind(cloud, visited, jnp.asarray(0), Camera(), Coverage(), None, jnp.asarray(place), jnp.asarray(gaze))
+    return (
+        problem
+        if pose is None
+        else eqx.tree_at(
+            lambda p: (p.visited, p.num_visited), problem, (jax.tree.map(lambda leaf: leaf[None], pose), jnp.asarray(1))
+        )
+    )
+
+
+SOLVERS = {"Adam": None, "BFGS": optx.BFGS(rtol=1e-4, atol=1e-4), "NonlinearCG": optx.NonlinearCG(rtol=1e-4, atol=1e-4)}
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("kind", [GradientSearch, HybridSearch])
+def test_a_pose_in_space_is_found(kind, solver):
+    search = kind(dof=6, num_starts=2, iterations=80, learning_rate=0.05, num_candidates=12, solver=SOLVERS[solver])
+    found = propose(search, known(), jax.random.key(1))
+    assert float(found.value) == pytest.approx(5.0, abs=1e-3)
+    assert float(found.values.max()) < 4.9
+    np.testing.assert_allclose(found.pose.position, [0.9, -1.1, 1.4], atol=0.03)
+    np.testing.assert_allclose(found.pose.forward, [-0.6, 0.0, -0.8], atol=0.03)
+
+
+class Constant(Known):
+    """Every pose is as good."""
+
+    def acquisition(self, poses):
+        return jnp.full(poses.position.shape[0], 7.0)
+
+
+@pytest.mark.parametrize("kind", [GradientSearch, HybridSearch])
+def test_where_values_tie_the_first_candidate_wins(kind):
+    search, key = kind(num_starts=2, iterations=4, num_candidates=9), jax.random.key(0)
+    found = propose(search, known(Constant), key)
+    jax.tree.map(np.testing.assert_array_equal, found.pose, found.candidates[0])
+    np.testing.assert_array_equal(found.values, 7.0)
+    again = propose(search, known(Constant, found.pose), key)
+    jax.tree.map(np.testing.assert_array_equal, again.pose, found.candidates[1])
+
+
+@pytest.mark.parametrize("space", [SpherePoses(), FreePoses(), ConstrainedPoses()])
+def test_adam_is_optax_in_a_plain_loop(space, x64):
+    problem, start = known(), look_at(jnp.asarray([[1.2, 1.0, 1.9]]))
+    ways = eqx.filter_jit(lambda problem: Ascent(space, 1, 30, 0.02).climb(problem, start).trajectories)(problem)
+    move = jax.jit(lambda parameters: space.retract(start[0], parameters))
+    gradient = jax.jit(jax.grad(lambda parameters: -problem.acquisition(move(parameters)[None])[0]))
+
+    optimiser, parameters = optax.adam(0.02), jnp.zeros(space.num_parameters)
+    state = optimiser.init(parameters)
+    for step in range(31):
+        expected = move(parameters)
+        np.testing.assert_allclose(ways.poses.position[0, step], expected.position, atol=1e-6)
+        np.testing.assert_allclose(ways.poses.rotation[0, step], expected.rotation, atol=1e-6)
+        updates, state = optimiser.update(gradient(parameters), state)
+        parameters = parameters + updates
+    assert float(jnp.abs(ways.poses.position[0, -1] - start.position[0]).max()) > 0.1
+
+
+@pytest.mark.parametrize("space", [SpherePoses(), ConstrainedPoses(), FreePoses()])
+def test_a_start_at_the_origin_gives_numbers(space):
+    start = Pose(np.eye(3, dtype=np.float32), np.zeros(3, np.float32))
+    parameters = jnp.zeros(space.num_parameters)
+    move = jax.jit(lambda p: space.retract(start, p))
+    for tree in (move(parameters), jax.jit(jax.jacrev(move))(parameters)):
+        assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(tree))
+
+
+@pytest.mark.parametrize("kind", [GradientSearch, HybridSearch])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"dof": 2, "space": FreePoses()}, "both dof=2 and space"),
+        *(({"learning_rate": rate}, f"learning rate is {rate}") for rate in (0.0, -1.0, np.nan, np.inf)),
+        ({"num_starts": 0}, "num_starts is 0"),
+        ({"iterations": 0}, "iterations is 0"),
+        ({"num_starts": 7, "num_candidates": 6}, "6 candidates for 7 starts"),
+    ],
+)
+def test_bad_settings_are_refused(kind, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        kind(**arguments)
+
+
+def test_other_degrees_of_freedom_are_refused():
+    """By the message, too, where the types of arguments are not checked as here."""
+    with pytest.raises(ValueError, match="dof is 3; it must be 2 or 6"):
+        _pose_space(3, None)
+
+
+def test_constraints_wider_than_the_image_are_refused():
+    search = GradientSearch(space=ConstrainedPoses(off_axis=0.3))
+    with pytest.raises(ValueError, match=r"off_axis is 0\.3 rad but the image ends 0\.262 rad"):
+        search.propose(known(), jax.random.key(0))

@@ -1,0 +1,136 @@
+"""Gradient searches within a planner: compilation, episodes on disk, scores that have no gradient."""
+
+import jax
+import numpy as np
+import optax
+import optimistix as optx
+import pytest
+
+from jaxnbv.acquisition import ExpectedUtilityImprovement
+from jaxnbv.camera import Camera, look_at
+from jaxnbv.episode import simulate
+from jaxnbv.planner import Planner
+from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
+from jaxnbv.scanning.sdf import Capsule, Sphere
+from jaxnbv.search import ConstrainedPoses, DiscreteSearch, FreePoses, GradientSearch, HybridSearch
+from jaxnbv.storage import EpisodeFolder, describe
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Coverage
+from jaxnbv.tasks.classification import CrossEntropy, HostClassifier, MixedEntropy, NegativeEntropy
+
+SCENE = SDFSurface(Sphere(0.7) | Capsule([0.2, 0.3, -0.4], [0.5, 0.6, 0.9], 0.3))
+FIRST, ELSEWHERE, KEY = look_at((0.8, 0.9, 2.2)), look_at((-0.8, 0.9, 2.2)), jax.random.key(0)
+OTHER_KEY = jax.random.key(1)
+SMALL = {"num_starts": 2, "iterations": 3, "num_candidates": 4}
+
+
+def planner_of(search, score=None):
+    score = Coverage() if score is None else score
+    model, camera = GeometricSPSR(truncation=6, lengthscale=0.05), Camera(height=6, width=6)
+    return Planner(model, camera, score, search, num_samples=2, grid=Grid(20), capacity=64, max_views=6)
+
+
+PLANNER = planner_of(GradientSearch(dof=2, **SMALL))
+
+
+@pytest.fixture
+def compilations():
+    """Names of events by which JAX tells of a compilation, in the order they came."""
+    seen = []
+
+    def listen(event, duration, **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            seen.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield seen
+    jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def test_a_planner_compiles_the_search_once(compilations):
+    """The whole search is one compiled function: a second episode of another seed and first view compiles nothing."""
+    episode = simulate(PLANNER, SCENE, FIRST, 3, KEY, progress=False)
+    before = len(compilations)
+    assert before > 0
+    other = simulate(PLANNER, SCENE, ELSEWHERE, 4, OTHER_KEY, progress=False)
+    assert len(compilations) == before
+    assert not np.array_equal(episode.views[1].pose.position, other.views[1].pose.position)
+
+
+def contents(folder):
+    return {file.name: file.read_bytes() for file in sorted(folder.iterdir())}
+
+
+def test_trajectories_come_back_from_disk_with_the_same_bits(tmp_path):
+    episode = simulate(PLANNER, SCENE, FIRST, 4, KEY, folder=tmp_path / "whole", progress=False)
+    config = describe({"planner": PLANNER, "scene": SCENE, "noise": SensorNoise(), "first": FIRST, "key": KEY})
+    views = EpisodeFolder(tmp_path / "whole", config).read_views()
+    assert views[0][2] is None
+    for (_, _, read), view in zip(views[1:], episode.views[1:], strict=True):
+        assert read.trajectories.values.shape == (2, 4)
+        assert jax.tree.structure(read) == jax.tree.structure(view.proposal)
+        for a, b in zip(jax.tree.leaves(read), jax.tree.leaves(view.proposal), strict=True):
+            assert a.dtype == b.dtype
+            np.testing.assert_array_equal(a, b)
+
+    simulate(PLANNER, SCENE, FIRST, 2, KEY, folder=tmp_path / "parts", progress=False)
+    resumed = simulate(PLANNER, SCENE, FIRST, 4, KEY, folder=tmp_path / "parts", progress=False)
+    assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
+    for a, b in zip(jax.tree.leaves(resumed.views), jax.tree.leaves(episode.views), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def sgd(rate):
+    return optx.OptaxMinimiser(optax.sgd(rate), rtol=0.0, atol=0.0)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (GradientSearch(dof=2), GradientSearch(dof=6)),
+        (GradientSearch(dof=2), HybridSearch(dof=2)),
+        (GradientSearch(dof=6), GradientSearch(space=FreePoses(radius=2.4))),
+        (GradientSearch(space=ConstrainedPoses()), GradientSearch(space=ConstrainedPoses(nearest=2.1))),
+        (GradientSearch(), GradientSearch(learning_rate=0.02)),
+        (GradientSearch(), GradientSearch(iterations=21)),
+        (GradientSearch(), GradientSearch(num_candidates=61)),
+        (GradientSearch(), GradientSearch(solver=optx.BFGS(rtol=1e-4, atol=1e-4))),
+        (
+            GradientSearch(solver=optx.BFGS(rtol=1e-3, atol=1e-4)),
+            GradientSearch(solver=optx.BFGS(rtol=1e-4, atol=1e-4)),
+        ),
+        (GradientSearch(solver=sgd(0.1)), GradientSearch(solver=sgd(0.2))),
+    ],
+)
+def test_a_record_tells_settings_apart(one, other):
+    assert describe(one) != describe(other)
+    assert describe(one) == describe(jax.tree.map(lambda leaf: leaf, one))
+
+
+def on_host(points, normals, mask):
+    return np.full((len(points), 2), np.log(0.5))
+
+
+def called_back(cloud):
+    result = jax.ShapeDtypeStruct((), cloud.points.dtype)
+    return jax.pure_callback(lambda points: np.asarray(points).sum(), result, cloud.points, vmap_method="sequential")
+
+
+HOST = HostClassifier(on_host, 2)
+
+
+@pytest.mark.parametrize("kind", [GradientSearch, HybridSearch])
+@pytest.mark.parametrize(
+    "score",
+    [
+        CrossEntropy(HOST),
+        MixedEntropy(HOST),
+        ExpectedUtilityImprovement(NegativeEntropy(HOST)),
+        ExpectedUtilityImprovement(called_back),
+    ],
+    ids=["cross-entropy", "mixed", "entropy", "utility"],
+)
+def test_a_score_without_gradient_is_refused_at_once(kind, score):
+    with pytest.raises(ValueError, match=rf"{type(score).__name__} cannot be differentiated.*DiscreteSearch"):
+        planner_of(kind(), score)
+    planner_of(DiscreteSearch(), score)
