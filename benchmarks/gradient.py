@@ -1,6 +1,6 @@
 """What gradient searches find, and how long they take, as ratios to the discrete search of 120 candidates.
 
-    python benchmarks/gradient.py [--task coverage|cross-entropy] [--mesh FILE] [--seeds 10] [--out FILE]
+    python benchmarks/gradient.py [--task coverage|cross-entropy] [--mesh FILE] [--seeds 10] [--only NAME] [--out FILE]
 
 One step after one random view, at the paper's settings: S = 16, 50 x 50 rays, L = 50, grid 100^3. The object is the
 demo's: a mug for coverage, or a mesh; a pyramid in close-up for cross-entropy. All searches of a seed see the same
@@ -114,6 +114,7 @@ def main() -> None:
     parser.add_argument("--task", choices=["coverage", "cross-entropy"], default="coverage")
     parser.add_argument("--mesh", help="a mesh file, for coverage; the demo object if left out")
     parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--only", choices=[name for name in SEARCHES if name != "discrete"], help="one search alone")
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
     if arguments.task == "cross-entropy" and arguments.mesh:
@@ -123,9 +124,10 @@ def main() -> None:
     if arguments.task == "cross-entropy":
         score = nbv.CrossEntropy(pyramid_classifier(Framing.CLOSE_UP.longest_side))
     names = [name for name in SEARCHES if arguments.task == "coverage" or name not in COVERAGE_ONLY]
+    names = ["discrete", arguments.only] if arguments.only else names
     planners = {name: nbv.Planner(nbv.GeometricSPSR(), nbv.Camera(), score, SEARCHES[name]) for name in names}
     label = Path(arguments.mesh).stem if arguments.mesh else arguments.task
-    out = arguments.out or Path("benchmarks/results") / f"gradient_{label}.json"
+    out = arguments.out or Path("benchmarks/results") / f"gradient_{label}{'_only' if arguments.only else ''}.json"
     settings = {"object": arguments.mesh or arguments.task, "planners": describe(planners), "versions": versions()}
     settings = json.loads(json.dumps(settings))
     rows = []

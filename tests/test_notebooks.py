@@ -17,6 +17,10 @@ resolution, pixels, num_candidates, views = 40, 20, 24, 2
 num_samples, truncation, lengthscale = 2, 16, 0.02
 resolution, pixels, num_candidates, views = 40, 24, 12, 2
 """,
+    "03_gradient_search.ipynb": """
+num_samples, truncation, lengthscale = 2, 16, 0.02
+resolution, pixels, num_candidates, iterations = 40, 16, 12, 3
+""",
 }
 
 

@@ -57,8 +57,8 @@ class GradientSearch(Search):
 class HybridSearch(Search):
     """The discrete search, then gradient ascent from its best few candidates.
 
-    Arguments as of `GradientSearch`. On the sphere the candidates are those of `DiscreteSearch`, so the value found is
-    never below its.
+    Arguments as of `GradientSearch`, with fewer and longer steps by default, since the starts are good. On the sphere the
+    candidates are those of `DiscreteSearch`, so the value found is never below its.
 
     **Raises:** `ValueError` as `GradientSearch` does.
     """
@@ -73,8 +73,8 @@ class HybridSearch(Search):
         dof: int | None = None,
         space: PoseSpace | None = None,
         num_starts: int = 3,
-        iterations: int = 10,
-        learning_rate: float = 0.01,
+        iterations: int = 6,
+        learning_rate: float = 0.02,
         num_candidates: int = 120,
         solver: optx.AbstractMinimiser | None = None,
     ):

@@ -1,0 +1,56 @@
+"""Surfaces and rays to differentiate scans on."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnbv.camera import Camera
+from jaxnbv.scanning.grid import Grid, GridSurface
+from jaxnbv.scanning.sdf import Box, Cylinder, Torus
+
+GRID, SMALL = Grid(60, 1.75), Grid(20, 1.75)
+FEW = Camera(height=6, width=6)
+# Nearly all the time goes into compilation: this halves it.
+quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+
+
+def solid():
+    bored = Box([0.7, 0.5, 0.6], 0.1) - Cylinder(0.3, 2.0)
+    return bored | Torus(0.5, 0.15).rotate([1.0, 1.0, 0.0], 0.8).translate([0.3, 0.5, 0.2])
+
+
+def nodes(grid):
+    return np.stack(np.meshgrid(grid.axis, grid.axis, grid.axis, indexing="ij"), axis=-1)
+
+
+class Bumps(eqx.Module):
+    """|x| - 0.9 and a dozen random waves: smooth and band-limited but for the ball's centre."""
+
+    waves: jax.Array
+    phases: jax.Array
+
+    def __call__(self, x):
+        return jnp.sqrt(jnp.sum(x**2, axis=-1)) - 0.9 + 0.03 * jnp.sum(jnp.cos(x @ self.waves + self.phases), axis=-1)
+
+
+def some_bumps(rng):
+    return Bumps(jnp.asarray(rng.integers(-3, 4, (3, 12)) * 1.0), jnp.asarray(rng.uniform(0, 2 * np.pi, 12)))
+
+
+def grid_surface(field, grid):
+    return GridSurface.from_values(field(jnp.asarray(nodes(grid))), 0.0, grid)
+
+
+def small_surfaces(rng, count):
+    values = np.stack([some_bumps(rng)(nodes(SMALL)) for _ in range(count)])
+    return GridSurface.from_values(values, 0.0, SMALL)
+
+
+def some_rays(rng, count, spread=0.7):
+    origins = rng.normal(size=(count, 3))
+    origins *= 2.5 / np.linalg.norm(origins, axis=1, keepdims=True)
+    directions = rng.uniform(-spread, spread, (count, 3)) - origins
+    return jnp.asarray(origins), jnp.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))

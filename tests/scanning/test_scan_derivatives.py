@@ -1,0 +1,186 @@
+"""Derivatives of hits and normals in the camera's pose: against differences and loops, one by one and in batches.
+
+A scan is smooth in its pose as long as every ray meets the same piece of the surface. It jumps where a ray crosses a
+silhouette or an edge where two parts of a solid meet; on a grid its derivative jumps where a hit crosses from one cell
+into the next; and where a ray grazes the surface the derivative is bounded on purpose. There no derivative equals a
+difference: such rays are left out, and they must be few.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from bumps import FEW, GRID, SMALL, grid_surface, quick_jit, small_surfaces, solid, some_bumps, some_rays
+
+from jaxnbv.camera import Camera, fibonacci_sphere, look_at
+from jaxnbv.scanning.grid import GridSurface
+from jaxnbv.scanning.scanner import scan
+from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.scanning.sphere_tracing import SDFSurface
+from jaxnbv.search.pose_space import FreePoses, SpherePoses
+
+RNG = np.random.default_rng(0)
+CAMERA = Camera(height=24, width=24)
+SPACES = {"sphere": SpherePoses(), "free": FreePoses()}
+
+
+def is_grazing(surface, points, normals, directions):
+    """Whether the slope along a ray is, but for a little, below what it is held at.
+
+    On a solid a sine of 0.05; on a grid 0.03 of the spread of f over the corners of the hit's cell.
+    """
+    if isinstance(surface, SDFSurface):
+        return -np.sum(normals * directions, axis=-1) < 0.055
+    position = (points + GRID.half_extent) / GRID.spacing
+    cell = np.floor(position).astype(int)
+    offsets = np.array(list(np.ndindex(2, 2, 2)))
+    corners = np.asarray(surface.values)[tuple(np.moveaxis(cell[..., None, :] + offsets, -1, 0))]
+
+    def f(at):
+        return np.sum(corners * np.prod(np.where(offsets, at[..., None, :], 1 - at[..., None, :]), axis=-1), axis=-1)
+
+    slope = (f(position - cell + 1e-4 * directions) - f(position - cell - 1e-4 * directions)) / 2e-4
+    return np.abs(slope) < 0.033 * np.ptp(corners, axis=-1)
+
+
+@functools.cache
+def looks(space):
+    """Points, normals, mask and rays at parameters + h step; and the derivatives in h, forwards, of the first two."""
+
+    def look(surface, start, parameters, step, h):
+        pose = SPACES[space].retract(start, parameters + h * step)
+        cloud = scan(surface, CAMERA, pose)
+        return (cloud.points, cloud.normals), (cloud.mask, CAMERA.rays(pose)[1])
+
+    def both(surface, start, parameters, step, h):
+        return jax.jvp(lambda h: look(surface, start, parameters, step, h), (h,), (1.0,), has_aux=True)
+
+    return quick_jit(jax.vmap(jax.vmap(both, (None, 0, 0, 0, None)), (None, None, None, None, 0)))
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("name", ["field", "distances on a grid", "solid"])
+def test_scans_as_functions_of_a_pose_against_central_differences(name, space, x64):
+    if name == "solid":
+        surface = SDFSurface(solid())
+    else:
+        surface = grid_surface(some_bumps(RNG) if name == "field" else solid(), GRID)
+    starts, count, h = look_at(fibonacci_sphere(6, 2.5)), SPACES[space].num_parameters, 1e-6
+    at, step = 0.1 * RNG.normal(size=(6, count)), RNG.normal(size=(6, count))
+    values, slopes, (masks, rays) = looks(space)(surface, starts, at, step, jnp.asarray([0.0, h, -h]))
+    points, normals = (np.asarray(value) for value in values)
+    masks, hit = np.asarray(masks), np.asarray(masks[0])
+    grazing = hit & is_grazing(surface, points[0], normals[0], np.asarray(rays[0]))
+    # Edges turn a normal at once; curvature, by no more than some hundred times the step.
+    kept = (masks == hit).all(axis=0) & (np.abs(normals - normals[0]).max(axis=(0, -1)) < 1e-3)
+    if name != "solid":
+        cells = np.floor((points + GRID.half_extent) / GRID.spacing)
+        kept &= (cells == cells[0]).all(axis=(0, -1))
+    assert 0.6 < hit.mean() < 1
+    assert (~kept).sum() < 0.005 * hit.sum()
+    assert grazing.sum() < 0.02 * hit.sum()
+    kept &= hit & ~grazing
+    for value, slope in ((points, slopes[0][0]), (normals, slopes[1][0])):
+        central = (value[1] - value[2]) / (2 * h)
+        error = np.abs(slope - central)[kept] / (1 + np.abs(central[kept]).max(axis=-1, keepdims=True))
+        assert error.max() < 1e-5
+        assert np.isfinite(slope).all()
+        assert not np.asarray(slope)[~hit].any()
+
+
+@pytest.mark.parametrize("name", ["solid", "grid"])
+def test_grazing_and_missed_rays(name):
+    """A ball of 0.9: slopes as great as the rays graze but bounded, and zero, to the last bit, beside it."""
+    surface = SDFSurface(Sphere(0.9)) if name == "solid" else grid_surface(Sphere(0.9), GRID)
+    # The ball on the grid is smaller by up to 1.2e-3.
+    miss = 0.9 + np.linspace(-4e-3, 1e-3, 200)
+    turn = RNG.uniform(0, 2 * np.pi, 200)
+    origins = jnp.asarray(np.stack([miss * np.cos(turn), miss * np.sin(turn), 0 * miss - 2.5], axis=1), jnp.float32)
+    directions = jnp.broadcast_to(jnp.asarray([0.0, 0.0, 1.0]), (200, 3))
+    mask = np.asarray(surface.trace(origins, directions).mask)
+    assert 0.5 < mask.mean() < 0.9
+
+    def trace(origin, direction):
+        hits = surface.trace(origin[None], direction[None])
+        return hits.points[0], hits.normals[0]
+
+    forward = quick_jit(jax.vmap(jax.jacfwd(trace, argnums=(0, 1))))(origins, directions)
+    reverse = quick_jit(jax.vmap(jax.jacrev(trace, argnums=(0, 1))))(origins, directions)
+    # |dt| is at most 1 / 0.05 or 1 / 0.03 of what moves: the origin, or the hit, which is 4 away from it at most.
+    bound = 1 + (20 if name == "solid" else 34)
+    for jacobian in (forward, reverse):
+        for (by_origin, by_direction), curvature in zip(jacobian, (1.0, 2 / 0.9), strict=True):
+            assert np.isfinite(by_origin).all()
+            assert np.isfinite(by_direction).all()
+            lengths = np.linalg.norm(by_origin, ord=2, axis=(1, 2))
+            assert 5 < lengths.max() < bound * curvature
+            assert np.linalg.norm(by_direction, ord=2, axis=(1, 2)).max() < 4 * bound * curvature
+            assert not np.asarray(by_origin)[~mask].any()
+            assert not np.asarray(by_direction)[~mask].any()
+    for a, b in zip(jax.tree.leaves(forward), jax.tree.leaves(reverse), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
+
+
+def test_batches_of_surfaces_and_starts_equal_loops_forwards_and_backwards(x64):
+    """Starts within surfaces, and surfaces within starts."""
+    surfaces, starts, space = small_surfaces(RNG, 16), look_at(fibonacci_sphere(3, 2.5)), FreePoses()
+    parameters, weights = (
+        jnp.asarray(0.05 * RNG.normal(size=(3, 9))),
+        jnp.asarray(RNG.normal(size=(2, FEW.num_rays, 3))),
+    )
+
+    def seen(values, distance, start, parameters):
+        cloud = scan(GridSurface(values, distance, SMALL), FEW, space.retract(start, parameters))
+        return jnp.sum(weights[0] * cloud.points) + jnp.sum(weights[1] * cloud.normals)
+
+    def reverse(surface, *pose):
+        return jax.value_and_grad(seen, argnums=(0, 3))(surface.values, surface.distance, *pose)
+
+    def forward(surface, *pose):
+        return jax.jacfwd(seen, argnums=3)(surface.values, surface.distance, *pose)
+
+    of_surface, of_start = (0, None, None), (None, 0, 0)
+    arguments = surfaces, starts, parameters
+    outer = quick_jit(jax.vmap(jax.vmap(reverse, of_start), of_surface))(*arguments)
+    inner = quick_jit(jax.vmap(jax.vmap(reverse, of_surface), of_start))(*arguments)
+    ahead = quick_jit(jax.vmap(jax.vmap(forward, of_start), of_surface))(*arguments)
+    assert (np.abs(ahead).max(axis=-1) > 0.1).all()
+    alone = quick_jit(reverse)
+    for i, j in np.ndindex(16, 3):
+        one = jax.tree.map(lambda leaf, i=i: leaf[i], surfaces), starts[j], parameters[j]
+        single = alone(*one)
+        for a, b, c in zip(*map(jax.tree.leaves, (outer, inner, single)), strict=True):
+            np.testing.assert_allclose(a[i, j], c, rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(b[j, i], c, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(ahead[i, j], single[1][1], rtol=1e-9, atol=1e-9)
+
+
+def traced(weights, surface, origins, directions):
+    def total(values, origins, directions):
+        hits = GridSurface(values, surface.distance, SMALL).trace(origins, directions)
+        return jnp.sum(weights[0] * hits.points) + jnp.sum(weights[1] * hits.normals), hits.mask
+
+    return jax.value_and_grad(total, argnums=(0, 1, 2), has_aux=True)(surface.values, origins, directions)
+
+
+@pytest.mark.parametrize("axes", [(0, 0, 0), (0, None, None), (None, 0, None)])
+def test_every_way_to_batch_fields_and_rays_equals_a_loop(axes, x64):
+    origins, directions = (rays + 0.05 * RNG.normal(size=(4, 30, 3)) for rays in some_rays(RNG, 30))
+    run = functools.partial(traced, jnp.asarray(RNG.normal(size=(2, 30, 3))))
+    # What is not batched is the first of the batch.
+    given = [
+        batch if axis == 0 else jax.tree.map(lambda leaf: leaf[0], batch)
+        for batch, axis in zip((small_surfaces(RNG, 4), origins, directions), axes, strict=True)
+    ]
+    together, loop = quick_jit(jax.vmap(run, axes))(*given), quick_jit(run)
+    for i in range(4):
+        turn = [
+            jax.tree.map(lambda leaf, i=i: leaf[i], each) if axis == 0 else each
+            for each, axis in zip(given, axes, strict=True)
+        ]
+        alone = loop(*turn)
+        assert bool(alone[0][1].any())
+        for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
+            np.testing.assert_allclose(a[i], b, rtol=1e-9, atol=1e-9)
