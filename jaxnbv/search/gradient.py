@@ -57,8 +57,8 @@ class GradientSearch(Search):
 class HybridSearch(Search):
     """The discrete search, then gradient ascent from its best few candidates.
 
-    Arguments as of `GradientSearch`, with fewer and longer steps by default, since the starts are good. On the sphere the
-    candidates are those of `DiscreteSearch`, so the value found is never below its.
+    Arguments as of `GradientSearch`, with fewer and longer steps by default. On the sphere the candidates are those of
+    `DiscreteSearch`, so the value found is never below its.
 
     **Raises:** `ValueError` as `GradientSearch` does.
     """
