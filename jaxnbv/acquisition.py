@@ -65,8 +65,7 @@ class ExpectedUtilityImprovement(Score):
     def __call__(self, context: tuple[PointCloud, Float[Array, ""]], scan: PointCloud) -> Float[Array, ""]:
         """max(0, u(D u scan) - u(D))."""
         cloud, utility = context
-        gain = jnp.maximum(0.0, self.utility(concatenate(cloud, scan)) - utility)
-        return jnp.where(jnp.any(scan.mask), gain, 0.0)
+        return zero_if_empty(scan, jnp.maximum(0.0, self.utility(concatenate(cloud, scan)) - utility))
 
     @property
     def batch_size(self) -> int:
@@ -74,8 +73,13 @@ class ExpectedUtilityImprovement(Score):
         return preferred_batch_size(self.utility)
 
 
+def zero_if_empty(scan: PointCloud, value: Float[Array, ""]) -> Float[Array, ""]:
+    """The value, or zero for a scan that sees nothing."""
+    return jnp.where(jnp.any(scan.mask), value, 0.0)
+
+
 def check_differentiable(score: Score, capacity: int, num_rays: int) -> None:
-    """Try whether JAX can differentiate a score in the points of a scan, without computing anything.
+    """Check that JAX can differentiate a score in the points and normals of a scan, without computing anything.
 
     - `capacity`: rows of the cloud; `num_rays`: rows of a scan.
 
@@ -85,12 +89,15 @@ def check_differentiable(score: Score, capacity: int, num_rays: int) -> None:
     def cloud(rows: int) -> PointCloud:
         return PointCloud(jnp.zeros((rows, 3)), jnp.ones((rows, 3)), jnp.ones(rows, bool))
 
-    def gradient():
-        context, seen = score.context(cloud(capacity)), cloud(num_rays)
-        return jax.grad(lambda points: score(context, PointCloud(points, seen.normals, seen.mask)))(seen.points)
+    def value(rows):
+        points, normals = rows
+        return score(score.context(cloud(capacity)), PointCloud(points, normals, cloud(num_rays).mask))
 
+    rows = cloud(num_rays).points, cloud(num_rays).normals
+    # A score that fails by itself says so itself.
+    jax.eval_shape(value, rows)
     try:
-        jax.eval_shape(gradient)
+        jax.eval_shape(jax.grad(value), rows)
     except ValueError as error:
         raise InputError(
             f"{type(score).__name__} cannot be differentiated, so no gradient search can use it ({error}). "

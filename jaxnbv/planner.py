@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PRNGKeyArray
 
-from jaxnbv.acquisition import Score, check_differentiable
+from jaxnbv.acquisition import Score
 from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import is_traced, require
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
@@ -41,7 +41,8 @@ class Planner(eqx.Module):
 
     All methods are pure and run under `jit`. They compile once a planner: at the first view, nothing after the second.
 
-    **Raises:** `ValueError` for numbers below one, or if the search needs the acquisition's gradient and JAX has none.
+    **Raises:** `ValueError` for numbers below one, and if the search cannot work with the acquisition or the camera: a
+    gradient search with a score that JAX cannot differentiate, say.
     """
 
     model: SurfaceModel
@@ -57,8 +58,7 @@ class Planner(eqx.Module):
         for name in ("num_samples", "capacity", "max_views"):
             value = getattr(self, name)
             require(isinstance(value, int) and value >= 1, f"{name} is {value}; it must be a whole number, at least 1")
-        if self.search.uses_gradients:
-            check_differentiable(self.acquisition, self.capacity, self.camera.num_rays)
+        self.search.check(self.acquisition, self.camera, self.capacity)
 
     def init(self, cloud: PointCloud, pose: Pose | None = None) -> State:
         """The state after a first scan, in scene coordinates, taken from `pose` (None where it is not known).

@@ -1,5 +1,6 @@
 """Rotations as parameters of an optimiser: smooth, without angles."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -48,10 +49,13 @@ def _reflection(unit: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
 def normalise(
     vector: Float[Array, "*batch n"], spare: Float[Array, "*#batch n"], least: float = 0.0
 ) -> Float[Array, "*batch n"]:
-    """The unit vector along a vector, or `spare` where it is no longer than `least` or its square underflows."""
-    square = jnp.sum(vector**2, axis=-1, keepdims=True)
-    usable = square > max(least**2, float(jnp.finfo(vector.dtype).tiny))
-    return jnp.where(usable, vector / jnp.sqrt(jnp.where(usable, square, 1.0)), spare)
+    """The unit vector along a vector, or `spare` where no entry of it is above `least`, or normal as a float."""
+    # In units of the largest entry no square overflows.
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(vector), axis=-1, keepdims=True))
+    usable = largest > max(least, float(jnp.finfo(vector.dtype).tiny))
+    vector = vector / jnp.where(usable, largest, 1.0)
+    square = jnp.where(usable, jnp.sum(vector**2, axis=-1, keepdims=True), 1.0)
+    return jnp.where(usable, vector / jnp.sqrt(square), spare)
 
 
 def _rounding(unit: Float[Array, "*batch n"]) -> float:

@@ -53,9 +53,9 @@ SearchOption = Annotated[
     SearchName,
     typer.Option(
         help="How the next view is found: discrete is the expected value of the task over 120 candidates; "
-        "gradient-2dof climbs it by gradient over the sphere, gradient-6dof over positions and rotations (2 to 3 from "
-        "the object's centre, which stays in view), hybrid over the sphere from the best candidates; farthest, random "
-        "and uncertainty are the paper's baselines over the candidates."
+        "gradient-2dof climbs it by gradient over the sphere, gradient-6dof over positions and rotations (2.2 to "
+        "2.8 from the object's centre, which stays in view), hybrid over the sphere from the best candidates; "
+        "farthest, random and uncertainty are the paper's baselines over the candidates."
     ),
 ]
 ViewsOption = Annotated[int, typer.Option(help="Views in all, the first one included.")]

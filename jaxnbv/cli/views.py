@@ -206,8 +206,9 @@ def _summarise(episode: Episode) -> None:
                 line += f"the highest of {len(values)} candidates"
                 line += f" (median {np.median(values):.4g})" if sought.smooth else ""
             else:
-                line += f"by gradient ascent from {len(ways.values)} start{'s' if len(ways.values) > 1 else ''}; "
-                line += f"best of {len(values)} candidates {values.max(initial=-np.inf):.4g}"
+                best = values.max(initial=-np.inf)
+                better = "found nothing better" if float(view.proposal.value) <= best else f"improved on {best:.4g}"
+                line += f"where ascent from {len(ways.values)} of {len(values)} candidates {better}"
         typer.echo(line)
         log_p = predict(score, view.cloud)
         if log_p is not None:

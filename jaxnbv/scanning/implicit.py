@@ -20,8 +20,8 @@ def implicit_depth(
     - `along`: a module that gives f at a depth along every ray; its arrays are what hits are differentiated in.
     - `depth`: the roots, f = 0, however they were found; they come back as they are.
     - `mask`: which rays hit; the others have derivative zero.
-    - `grazing`: the least slope |df/dt| that is believed. Where a ray runs along the surface the derivative of its hit
-      is unbounded; with the slope held at this value, its sign kept, it is not.
+    - `grazing`: smaller slopes |df/dt| are held at this value, their sign kept: where a ray runs along the surface the
+      derivative of its hit is unbounded.
 
     From f(theta, t(theta)) = 0 follows dt = -(df/dtheta dtheta) / (df/dt). The rule is applied to itself for
     derivatives of higher order.

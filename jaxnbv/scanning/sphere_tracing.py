@@ -84,7 +84,7 @@ class _Along(eqx.Module):
         return self.sdf(self.points(depth))
 
     def newton(self, depth: Float[Array, " n"]) -> Float[Array, " n"]:
-        """One Newton step towards the root along each ray, which makes it exact."""
+        """One Newton step towards the root along each ray, which makes it exact to rounding unless the ray grazes."""
         value, slope = jax.jvp(self, (depth,), (jnp.ones_like(depth),))
         return depth - value / (jnp.where(slope < 0, -1.0, 1.0) * jnp.maximum(jnp.abs(slope), _GRAZING))
 

@@ -10,7 +10,8 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from jaxnbv.camera import Pose
+from jaxnbv.acquisition import Score, check_differentiable
+from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import require
 from jaxnbv.search.base import Problem, Proposal, Trajectories, best_unvisited
 from jaxnbv.search.pose_space import PoseSpace
@@ -21,8 +22,9 @@ class Ascent(eqx.Module):
 
     - `space`: where poses may go.
     - `num_starts`: how many of the candidates are started from.
-    - `iterations`: steps of the solver from each.
-    - `learning_rate`: Adam's, in the units of the space's parameters: radians or scene units, about.
+    - `iterations`: steps of the solver from each; each evaluates the acquisition and its gradient once.
+    - `learning_rate`: Adam's, in the units of the space's parameters: radians or scene units, about. Another solver
+      does not use it.
     - `solver`: a minimiser of Optimistix in place of Adam, such as `optimistix.BFGS(rtol=1e-4, atol=1e-4)`; the
       objective that it is given is of order 1.
 
@@ -51,29 +53,35 @@ class Ascent(eqx.Module):
         # No tolerance is ever met: as many steps as were asked for.
         return optx.OptaxMinimiser(optax.adam(self.learning_rate), rtol=0.0, atol=0.0)
 
+    def check(self, score: Score, camera: Camera, capacity: int) -> None:
+        """Raise `ValueError` if the score has no gradient, or the space makes no sense for the camera."""
+        self.space.check_camera(camera)
+        check_differentiable(score, capacity, camera.num_rays)
+
     def climb(self, problem: Problem, candidates: Pose) -> Proposal:
-        """The best pose on the ways up from the best of the candidates, or one of these if it is better."""
-        self.space.check_camera(problem.camera)
+        """The best pose on the trajectories from the best candidates, or the best candidate if none is better."""
         values = problem.acquisition(candidates)
         order = jnp.argsort(jnp.where(problem.is_visited(candidates), -jnp.inf, values), descending=True)
-        # Solvers that search along a line expect values and slopes of order one.
-        scale = jnp.max(jnp.abs(values))
+        # Solvers that search along a line expect differences of order one.
+        scale = jnp.max(values) - jnp.min(values)
         scale = jnp.where(scale > 0, scale, 1.0)
         trajectories = jax.vmap(partial(self._walk, problem, scale))(candidates[order[: self.num_starts]])
         found = best_unvisited(problem, candidates, values)
-        on_the_way = best_unvisited(problem, *trajectories.flat)
+        passed = best_unvisited(problem, *trajectories.flat)
         # Whatever is not a number comes through, so that the planner can say so.
-        better = ~(on_the_way.value <= found.value)
-        pose, value = jax.tree.map(partial(jnp.where, better), *[(p.pose, p.value) for p in (on_the_way, found)])
+        better = ~(passed.value <= found.value)
+        pose, value = jax.tree.map(partial(jnp.where, better), *[(p.pose, p.value) for p in (passed, found)])
         return Proposal(pose, value, candidates, found.values, trajectories)
 
     def _walk(self, problem: Problem, scale: Float[Array, ""], start: Pose) -> Trajectories:
-        """The poses at which the solver asked for a gradient, and their values."""
+        """Where the solver stood: every pose it evaluated or, of one that searches along a line, those it accepted."""
         solver = self.minimiser
 
         def loss(parameters, _):
             pose = self.space.retract(start, parameters)
             value = problem.acquisition(pose[None])[0]
+            # A pose may hide that the gradient which led to it was not a number.
+            value = jnp.where(jnp.isfinite(parameters).all(), value, jnp.nan)
             return -value / scale, (pose, value)
 
         parameters = jnp.zeros(self.space.num_parameters, start.position.dtype)

@@ -1,7 +1,6 @@
 """What a search is asked, and what it answers."""
 
 from abc import abstractmethod
-from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -56,7 +55,7 @@ class Problem(eqx.Module):
 
 
 class Trajectories(eqx.Module):
-    """The ways of a gradient search, from each of its starts to where it ended, and the values along them.
+    """Where a gradient search stood, step by step, from each of its starts to the end, and the values there.
 
     - `poses`: with the leading axes of `values`; `iterations` + 1 steps.
     """
@@ -76,7 +75,7 @@ class Proposal(eqx.Module):
 
     - `value`: the chosen pose's value, in the units of what the search maximises.
     - `candidates`, `values`: the pool of poses and their values; -inf where one was excluded as visited.
-    - `trajectories`: the poses that a gradient search passed through from the best of them; None for other searches.
+    - `trajectories`: those of a gradient search, starting from the best candidates; None for other searches.
     """
 
     pose: Pose
@@ -87,14 +86,13 @@ class Proposal(eqx.Module):
 
 
 class Search(eqx.Module):
-    """How a pose is found.
-
-    - `uses_samples`: whether posterior samples must be drawn for it.
-    - `uses_gradients`: whether it differentiates the score in the imagined scans.
-    """
+    """How a pose is found. `uses_samples` says whether posterior samples must be drawn for it."""
 
     uses_samples: eqx.AbstractClassVar[bool]
-    uses_gradients: ClassVar[bool] = False
+
+    def check(self, score: Score, camera: Camera, capacity: int) -> None:
+        """Raise `ValueError` if the search cannot work with a score, a camera and a cloud of so many rows."""
+        return
 
     @abstractmethod
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:

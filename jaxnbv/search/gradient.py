@@ -6,6 +6,8 @@ import equinox as eqx
 import optimistix as optx
 from jaxtyping import PRNGKeyArray
 
+from jaxnbv.acquisition import Score
+from jaxnbv.camera import Camera
 from jaxnbv.checks import require
 from jaxnbv.search.ascent import Ascent
 from jaxnbv.search.base import Problem, Proposal, Search
@@ -16,24 +18,24 @@ class GradientSearch(Search):
     """Multi-start gradient ascent over 2-DOF or 6-DOF poses.
 
     - `dof`: 2 for `SpherePoses()`, 6 for `FreePoses()`; or give a `space` of your own, `ConstrainedPoses()` say.
-    - `num_candidates`: views, evenly spread over the space's sphere and turned at random, that are valued first; the
-      ascent starts from the best `num_starts` of them. Of as many candidates as starts, all are starts.
+    - `num_candidates`: poses, spread evenly over the space and turned at random, that are evaluated first; the ascent
+      starts from the best `num_starts` of them. With as many candidates as starts, every candidate is a start.
     - `num_starts`, `iterations`, `learning_rate`, `solver`: see `Ascent`.
 
-    Differentiation keeps what the score computed for all starts and samples, with PointNet++ for six starts and 16
-    samples 2.4 GB (SSG) or 9.6 GB (MSG). Fewer starts need less.
+    Differentiation keeps what the score computed for all starts and samples, with PointNet++ several gigabytes; fewer
+    starts need less.
 
-    The defaults are the paper's, except that it starts from six views without looking round first, as with
-    `num_candidates=6`.
+    Starts, steps and rate are the paper's. It starts from six views drawn at random, evaluates no others first, and
+    returns the best final value; `num_candidates=6` comes nearest to that.
 
     **Raises:** `ValueError` for another `dof`, both `dof` and `space`, fewer candidates than starts, no starts or
-    iterations, or a learning rate that is not positive.
+    iterations, or a learning rate that is not positive; within a `Planner`, also for a score that JAX cannot
+    differentiate, and a camera that the space is not for.
     """
 
     ascent: Ascent
     num_candidates: int = eqx.field(static=True)
     uses_samples: ClassVar[bool] = True
-    uses_gradients: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -42,12 +44,16 @@ class GradientSearch(Search):
         num_starts: int = 6,
         iterations: int = 20,
         learning_rate: float = 0.01,
-        num_candidates: int = 60,
+        num_candidates: int = 100,
         solver: optx.AbstractMinimiser | None = None,
     ):
         self.ascent = Ascent(_pose_space(dof, space), num_starts, iterations, learning_rate, solver)
         self.num_candidates = num_candidates
-        _check_candidates(num_candidates, num_starts)
+        _check_enough(num_candidates, num_starts)
+
+    def check(self, score: Score, camera: Camera, capacity: int) -> None:
+        """See `Ascent.check`."""
+        self.ascent.check(score, camera, capacity)
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """The best pose that was seen, candidates included; the key turns the candidates."""
@@ -58,7 +64,7 @@ class HybridSearch(Search):
     """The discrete search, then gradient ascent from its best few candidates.
 
     Arguments as of `GradientSearch`, with fewer and longer steps by default. On the sphere the candidates are those of
-    `DiscreteSearch`, so the value found is never below its.
+    a `DiscreteSearch` with as many, so the value found is never below its.
 
     **Raises:** `ValueError` as `GradientSearch` does.
     """
@@ -66,7 +72,6 @@ class HybridSearch(Search):
     ascent: Ascent
     num_candidates: int = eqx.field(static=True)
     uses_samples: ClassVar[bool] = True
-    uses_gradients: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -80,14 +85,18 @@ class HybridSearch(Search):
     ):
         self.ascent = Ascent(_pose_space(dof, space), num_starts, iterations, learning_rate, solver)
         self.num_candidates = num_candidates
-        _check_candidates(num_candidates, num_starts)
+        _check_enough(num_candidates, num_starts)
+
+    def check(self, score: Score, camera: Camera, capacity: int) -> None:
+        """See `Ascent.check`."""
+        self.ascent.check(score, camera, capacity)
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """The best pose that was seen, candidates included; the key is not used."""
         return self.ascent.climb(problem, self.ascent.space.candidates(self.num_candidates, None))
 
 
-def _check_candidates(num_candidates: int, num_starts: int) -> None:
+def _check_enough(num_candidates: int, num_starts: int) -> None:
     require(
         isinstance(num_candidates, int) and num_candidates >= num_starts,
         f"the search has {num_candidates} candidates for {num_starts} starts: give it as many at least",

@@ -1,7 +1,7 @@
 """Where a gradient search may move the camera: on the sphere, freely, or within constraints.
 
 A space moves a pose by a vector of parameters (a *retraction*, in the terms of optimisation on manifolds), so that
-every start is the origin of its own chart: none has a pole, an angle or a place where the image turns over.
+every start is the origin of its own chart: no poles, no angles, no flip of the image.
 """
 
 import math
@@ -33,19 +33,24 @@ class PoseSpace(eqx.Module):
 
     @abstractmethod
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
-        """The pose that the parameters lead to from `start`, differentiable in them; zeros lead to `start`."""
+        """The pose that the parameters lead to from `start`, differentiable in them.
 
-    @abstractmethod
+        Zeros lead to `start`, if it is in the space.
+        """
+
     def check_camera(self, camera: Camera) -> None:
         """Raise `ValueError` if the space makes no sense for the camera."""
+        return
 
 
 class SpherePoses(PoseSpace):
     """2-DOF: on the sphere of a radius about the origin, looking at it.
 
-    The parameters (3,) are added to the unit vector from the origin to the start, and the sum is normalised: they may
-    lead everywhere. The camera does not roll on its way, so that nothing singular happens at the poles; how its
+    The parameters (3,) are added to the unit vector from the origin to the start, and the sum is normalised:
+    every direction can be reached. The camera does not roll, so that nothing singular happens at the poles; how its
     image stands depends on where it started. A start at another radius is moved to this one.
+
+    **Raises:** `ValueError` unless the radius is positive and finite.
     """
 
     radius: float = eqx.field(static=True, default=SENSOR_RADIUS)
@@ -62,9 +67,6 @@ class SpherePoses(PoseSpace):
         _, after = _directions(start, parameters)
         return Pose(_product(rotation_between(start.forward, -after), start.rotation), self.radius * after)
 
-    def check_camera(self, camera: Camera) -> None:
-        """Every camera will do."""
-
 
 class FreePoses(PoseSpace):
     """6-DOF: any position and rotation.
@@ -73,6 +75,8 @@ class FreePoses(PoseSpace):
     position. Nothing keeps the camera from turning away from the object, or from flying into it.
 
     - `radius`: of the sphere on which candidates for a start stand, in scene units.
+
+    **Raises:** `ValueError` unless the radius is positive and finite.
     """
 
     radius: float = eqx.field(static=True, default=SENSOR_RADIUS)
@@ -89,26 +93,24 @@ class FreePoses(PoseSpace):
         rotation = rotation_from_6d(rotation_to_6d(start.rotation) + parameters[:6])
         return Pose(rotation, start.position + parameters[6:])
 
-    def check_camera(self, camera: Camera) -> None:
-        """Every camera will do."""
-
 
 class ConstrainedPoses(PoseSpace):
     """6-DOF within constraints: in a shell of distances, with the object's centre in view.
 
-    - `nearest`, `farthest`: the camera's distance from the origin, in scene units.
+    - `nearest`, `farthest`: the camera's distance from the origin, in scene units. By default about the paper's sphere,
+      and outside any object: corners of the scene's cube are 2.17 away.
     - `off_axis`: greatest angle between the optical axis and the direction to the origin, in radians.
 
     All parameters lead to poses that obey, so that no step of an optimiser has to be taken back. The parameters (8,):
     of the direction from the origin, as in `SpherePoses` (3); of the distance (1) and of where the origin stands in
-    the image (2), each pressed into its range by s / sqrt(1 + s^2); and of the roll, added to (cos, sin) = (1, 0) and
+    the image (2), each mapped into its range by s / sqrt(1 + s^2); and of the roll, added to (cos, sin) = (1, 0) and
     normalised (2). A start that does not obey, or stands on the limit, is moved just inside.
 
     **Raises:** `ValueError` unless 0 < nearest < farthest and 0 < off_axis < pi / 2.
     """
 
-    nearest: float = eqx.field(static=True, default=2.0)
-    farthest: float = eqx.field(static=True, default=3.0)
+    nearest: float = eqx.field(static=True, default=2.2)
+    farthest: float = eqx.field(static=True, default=2.8)
     off_axis: float = eqx.field(static=True, default=math.radians(10.0))
     num_parameters: ClassVar[int] = 8
 
@@ -124,20 +126,19 @@ class ConstrainedPoses(PoseSpace):
         )
 
     @property
-    def middle(self) -> float:
-        """Half way between nearest and farthest."""
+    def _middle(self) -> float:
         return 0.5 * (self.nearest + self.farthest)
 
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
         """A Fibonacci sphere of cameras in the middle of the shell that look at the origin."""
-        return _sphere_views(count, self.middle, key)
+        return _sphere_views(count, self._middle, key)
 
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
         direction, distance, gaze, roll = jnp.split(parameters, (3, 4, 6))
         before, after = _directions(start, direction)
         half = 0.5 * (self.farthest - self.nearest)
-        offset = jnp.linalg.norm(start.position, keepdims=True) - self.middle
-        position = (self.middle + half * _move(offset / half, distance)) * after
+        offset = jnp.linalg.norm(start.position, keepdims=True) - self._middle
+        position = (self._middle + half * _move(offset / half, distance)) * after
 
         # Directions to the origin in the camera's frame: as the start sees it, and as it is to be seen.
         x, y, z = seen = -jnp.matmul(start.rotation.T, before, precision="highest")
@@ -156,8 +157,8 @@ class ConstrainedPoses(PoseSpace):
         half = math.atan(0.5 * min(camera.height, camera.width) / camera.focal_length)
         require(
             self.off_axis <= half,
-            f"off_axis is {self.off_axis:.3g} rad but the image ends {half:.3g} rad from its centre: the object would "
-            "leave it; lower off_axis, or widen the camera's field of view",
+            f"off_axis is {self.off_axis:.3g} rad but the image ends {half:.3g} rad from its centre: the object's "
+            "centre would leave it; lower off_axis, or widen the camera's field of view",
         )
 
 
@@ -179,7 +180,7 @@ def _product(a: Float[Array, "3 3"], b: Float[Array, "3 3"]) -> Float[Array, "3 
 
 
 def _move(place: Float[Array, " n"], step: Float[Array, " n"]) -> Float[Array, " n"]:
-    """A place in the open unit ball moved by a step that is taken where the ball is pressed out to all of space."""
+    """A point of the open unit ball, moved in coordinates in which the ball is all of space."""
     length = jnp.linalg.norm(place)
     place = place * jnp.where(length > 0.99, 0.99 / jnp.maximum(length, 0.99), 1.0)
     far = place / jnp.sqrt(1.0 - jnp.sum(place**2)) + step

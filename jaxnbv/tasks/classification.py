@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.acquisition import ExpectedUtilityImprovement, Score, preferred_batch_size
+from jaxnbv.acquisition import ExpectedUtilityImprovement, Score, preferred_batch_size, zero_if_empty
 from jaxnbv.checks import InputError, require
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
 
@@ -66,8 +66,7 @@ class CrossEntropy(Score):
     def __call__(self, context: Context, scan: PointCloud) -> Float[Array, ""]:
         """In nats; the least there is, zero, for a scan that sees nothing."""
         cloud, log_p = context
-        value = cross_entropy(log_p, self.classifier(concatenate(cloud, scan)))
-        return jnp.where(jnp.any(scan.mask), value, 0.0)
+        return zero_if_empty(scan, cross_entropy(log_p, self.classifier(concatenate(cloud, scan))))
 
     @property
     def batch_size(self) -> int:
@@ -100,8 +99,7 @@ class MixedEntropy(Score):
         log_q = self.classifier(concatenate(cloud, scan))
         before = entropy(log_p)
         reduction = jnp.maximum(0.0, before - entropy(log_q))
-        value = jnp.where(before > self.threshold, cross_entropy(log_p, log_q), reduction)
-        return jnp.where(jnp.any(scan.mask), value, 0.0)
+        return zero_if_empty(scan, jnp.where(before > self.threshold, cross_entropy(log_p, log_q), reduction))
 
     @property
     def batch_size(self) -> int:

@@ -12,7 +12,7 @@ from jaxnbv.search.base import sphere_candidates
 from jaxnbv.viz.sphere import unit
 
 # Fewer candidates than this say little about what lies between them: the map is then made of so many views of its own.
-_FEWEST = 40
+_FEWEST = 30
 MAP_VIEWS = 120
 
 
@@ -63,8 +63,9 @@ def open_values(proposal: Proposal) -> Float[np.ndarray, " c"]:
 
 
 def wider_map(episode: Episode, index: int) -> SphereMap | None:
-    """What the map of view `index` (from 0) is to be drawn from in place of candidates that are too few, or not cameras
-    on one sphere that look at its centre; None for other candidates, and for searches without gradients.
+    """What to draw the map of view `index` (from 0) from, where the candidates of a gradient search do not make one.
+
+    They are too few, or not cameras on one sphere that look at its centre. None where they will do.
 
     The posterior samples are those of the step, so that values can be compared with the search's own.
     """
@@ -79,7 +80,7 @@ def wider_map(episode: Episode, index: int) -> SphereMap | None:
 
 
 def step_values(episode: Episode, index: int, poses: Pose) -> Float[np.ndarray, " poses"]:
-    """The acquisition at a batch of poses, at the step that chose view `index` (from 1) and with its samples."""
+    """The acquisition at a batch of poses, with the samples of the step that chose view `index` (from 0)."""
     planner, cloud = episode.planner, episode.views[index - 1].cloud
     sample_key, *_ = view_keys(episode.key, index)
     surfaces = planner.sample_surfaces(planner.init(cloud), sample_key)

@@ -10,9 +10,11 @@ import pytest
 
 from jaxnbv.camera import Camera, Pose, look_at
 from jaxnbv.cloud import PointCloud
+from jaxnbv.planner import Planner
 from jaxnbv.search import ConstrainedPoses, FreePoses, GradientSearch, HybridSearch, Problem, SpherePoses
 from jaxnbv.search.ascent import Ascent
 from jaxnbv.search.gradient import _pose_space
+from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
 
 
@@ -128,4 +130,4 @@ def test_other_degrees_of_freedom_are_refused():
 def test_constraints_wider_than_the_image_are_refused():
     search = GradientSearch(space=ConstrainedPoses(off_axis=0.3))
     with pytest.raises(ValueError, match=r"off_axis is 0\.3 rad but the image ends 0\.262 rad"):
-        search.propose(known(), jax.random.key(0))
+        Planner(GeometricSPSR(), Camera(), Coverage(), search)

@@ -121,7 +121,7 @@ SEARCHES = {
     "BFGS": GradientSearch(dof=2, **FEW, solver=optx.BFGS(**LINE)),
     "hybrid": HybridSearch(dof=2, **COMMON, num_candidates=20),
     "6-DOF": GradientSearch(dof=6, **FEW),
-    "constrained": GradientSearch(space=ConstrainedPoses(), **{**FEW, "learning_rate": 0.1}),
+    "constrained": GradientSearch(space=ConstrainedPoses(2.0, 3.0), **{**FEW, "learning_rate": 0.1}),
 }
 
 
@@ -235,10 +235,14 @@ def test_visited_poses_are_neither_started_from_nor_answered():
     assert float(kept.value) < float(first.value)
 
 
-def test_the_key_alone_decides():
+@pytest.mark.parametrize("name", SEARCHES)
+def test_the_key_alone_decides(name):
     problem = uneven(2)
-    first, again, other = run("2-DOF", problem, 1), run("2-DOF", problem, 1), run("2-DOF", problem, 2)
+    first, again, other = run(name, problem, 1), run(name, problem, 1), run(name, problem, 2)
     assert_equal(first, again)
+    if name == "hybrid":
+        assert_equal(first, other)
+        return
     assert float(jnp.abs(first.candidates.position - other.candidates.position).min(axis=1).max()) > 0.1
 
 

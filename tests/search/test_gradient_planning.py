@@ -1,6 +1,8 @@
 """Gradient searches within a planner: compilation, episodes on disk, scores that have no gradient."""
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
 import optimistix as optx
@@ -8,11 +10,12 @@ import pytest
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.camera import Camera, look_at
+from jaxnbv.cloud import PointCloud
 from jaxnbv.episode import simulate
 from jaxnbv.planner import Planner
-from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
+from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, scan
 from jaxnbv.scanning.sdf import Capsule, Sphere
-from jaxnbv.search import ConstrainedPoses, DiscreteSearch, FreePoses, GradientSearch, HybridSearch
+from jaxnbv.search import ConstrainedPoses, DiscreteSearch, FreePoses, GradientSearch, HybridSearch, SpherePoses
 from jaxnbv.storage import EpisodeFolder, describe
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
@@ -116,6 +119,10 @@ def called_back(cloud):
     return jax.pure_callback(lambda points: np.asarray(points).sum(), result, cloud.points, vmap_method="sequential")
 
 
+def called_back_with_normals(cloud):
+    return called_back(PointCloud(cloud.normals, cloud.normals, cloud.mask))
+
+
 HOST = HostClassifier(on_host, 2)
 
 
@@ -127,10 +134,48 @@ HOST = HostClassifier(on_host, 2)
         MixedEntropy(HOST),
         ExpectedUtilityImprovement(NegativeEntropy(HOST)),
         ExpectedUtilityImprovement(called_back),
+        ExpectedUtilityImprovement(called_back_with_normals),
     ],
-    ids=["cross-entropy", "mixed", "entropy", "utility"],
+    ids=["cross-entropy", "mixed", "entropy", "of points", "of normals"],
 )
 def test_a_score_without_gradient_is_refused_at_once(kind, score):
     with pytest.raises(ValueError, match=rf"{type(score).__name__} cannot be differentiated.*DiscreteSearch"):
         planner_of(kind(), score)
     planner_of(DiscreteSearch(), score)
+
+
+def test_a_score_that_fails_by_itself_says_so():
+    def wrong(cloud):
+        raise ValueError("no such thing")
+
+    with pytest.raises(ValueError, match=r"^no such thing"):
+        planner_of(GradientSearch(), ExpectedUtilityImprovement(wrong))
+
+
+@pytest.mark.parametrize("space", [SpherePoses(), FreePoses(), ConstrainedPoses()])
+def test_a_derivative_that_is_not_a_number_is_reported(space):
+    """The square root's value at zero is finite, its slope is not."""
+    score = ExpectedUtilityImprovement(lambda cloud: jnp.sqrt(0.0 * jnp.sum(cloud.points**2)) + 1.0 * cloud.count)
+    planner = planner_of(GradientSearch(space=space, **SMALL), score)
+    state = planner.init(scan(SCENE, planner.camera, FIRST), FIRST)
+    with pytest.raises(ValueError, match=r"not a number.*derivatives"):
+        planner.propose(state, KEY)
+
+
+class Side(eqx.Module):
+    """Says on which side of x = 0 the points are, the more surely the farther they are on average."""
+
+    def __call__(self, cloud):
+        mean = jnp.sum(jnp.where(cloud.mask, cloud.points[:, 0], 0.0)) / jnp.maximum(cloud.count, 1)
+        return jax.nn.log_softmax(jnp.stack([3.0 * mean, jnp.zeros(())]))
+
+
+def test_cross_entropy_within_constraints_ends_on_the_object():
+    search = GradientSearch(space=ConstrainedPoses(), num_starts=3, iterations=10, num_candidates=8, learning_rate=0.05)
+    planner = planner_of(search, CrossEntropy(Side(), num_points=64))
+    state = planner.init(scan(SCENE, planner.camera, FIRST), FIRST)
+    proposal = planner.propose(state, KEY)
+    ways = proposal.trajectories
+    assert float(proposal.value) == max(float(ways.values.max()), float(proposal.values.max()))
+    assert float(ways.values.max()) > float(ways.values[:, 0].max())
+    assert int(scan(SCENE, planner.camera, proposal.pose).count) > 0

@@ -19,7 +19,7 @@ from jaxnbv.search.pose_space import ConstrainedPoses, FreePoses, SpherePoses
 
 RNG = np.random.default_rng(0)
 LOOK_AT = jax.jit(look_at)
-SPHERE, FREE, CONSTRAINED = SpherePoses(), FreePoses(), ConstrainedPoses()
+SPHERE, FREE, CONSTRAINED = SpherePoses(), FreePoses(), ConstrainedPoses(2.0, 3.0)
 SPACES = {"sphere": SPHERE, "free": FREE, "constrained": CONSTRAINED}
 RETRACT = {name: jax.jit(space.retract) for name, space in SPACES.items()}
 RETRACT_MANY = {name: jax.jit(jax.vmap(space.retract)) for name, space in SPACES.items()}
@@ -263,7 +263,7 @@ def test_refused_cameras():
     CONSTRAINED.check_camera(Camera())
     with pytest.raises(ValueError, match=r"off_axis is 0.175 rad but the image ends 0.133 rad"):
         CONSTRAINED.check_camera(Camera(width=25))
-    with pytest.raises(ValueError, match="the object would leave it"):
+    with pytest.raises(ValueError, match="centre would leave it"):
         ConstrainedPoses(off_axis=math.radians(15.1)).check_camera(Camera())
     ConstrainedPoses(off_axis=math.radians(14.9)).check_camera(Camera(width=80))
     for space in (SPHERE, FREE):
