@@ -87,7 +87,7 @@ def _header(episode: Episode, title: str) -> str:
     search, model = (describe(module) for module in (planner.search, planner.model))
     settings = {
         "Object": title,
-        "Search": _call(search),
+        "Search": _call(search, depth=2),
         "Acquisition": _call(describe(planner.acquisition)),
         "Surface model": _call(model),
         "Posterior samples": f"{planner.num_samples} on a {planner.grid.resolution}³ grid",
@@ -102,17 +102,17 @@ def _header(episode: Episode, title: str) -> str:
     return "".join(rows)
 
 
-def _call(description: dict) -> str:
-    """A module's description as the call that made it."""
-    arguments = {name: value for name, value in description.items() if name != "type"}
-    inside = ", ".join(f"{name}={_short(value)}" for name, value in arguments.items())
+def _call(description: dict, depth: int = 0) -> str:
+    """A module's description as the call that made it; of the modules within, down to a depth, too."""
+    arguments = {name: value for name, value in description.items() if name != "type" and value is not None}
+    inside = ", ".join(f"{name}={_short(value, depth)}" for name, value in arguments.items())
     return f"{description['type']}({inside})" if inside else str(description["type"])
 
 
-def _short(value) -> str:
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    return value.get("type", "...") if isinstance(value, dict) else str(value)
+def _short(value, depth: int) -> str:
+    if isinstance(value, dict):
+        return _call(value, depth - 1) if depth > 0 and "type" in value else value.get("type", "...")
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _payload(episode: Episode, data: ReportData) -> dict:
@@ -206,8 +206,8 @@ def _map_caption(choice: Choice) -> str:
             )
     if not np.array_equal(choice.map.directions, choice.directions):
         parts.append(
-            f"The candidates do not make a map: it is drawn from {len(choice.map.values)} more views, valued "
-            "with the same posterior samples."
+            "The candidates are too few for a map, or off the sphere: it is drawn from "
+            f"{len(choice.map.values)} more views, valued with the same posterior samples."
         )
     return " ".join(parts)
 

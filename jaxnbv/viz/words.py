@@ -162,7 +162,7 @@ def _aim(pose: Pose) -> str:
     position, forward = (np.asarray(vector, dtype=np.float64) for vector in (pose.position, pose.forward))
     distance = float(np.linalg.norm(position))
     off = np.degrees(np.arccos(np.clip(-position @ forward / max(distance, 1e-12), -1.0, 1.0)))
-    return "" if off < 0.5 else f", {distance:.2f} from the centre and aimed {off:.0f}° beside it"
+    return "" if off < 0.5 else f", {distance:.2f} from the centre and aimed {off:.0f}° off it"
 
 
 def nearest_angle(pose: Pose, earlier: list[Pose]) -> float:

@@ -194,7 +194,7 @@ def test_words_say_what_the_ascent_gained(value, others, starts, words):
 def test_words_say_where_a_camera_looks_past_the_centre():
     pose = look_at((0.0, 0.0, 2.0), target=(2.0 * np.tan(np.radians(7.0)), 0.0, 0.0))
     said = describe_choice(COVERAGE, 2.0, 1, (1.0,), 1, pose, [look_at((2.5, 0.0, 0.0))], 5, 10, None)
-    assert "the horizon, 2.00 from the centre and aimed 7° beside it, 90° from" in said
+    assert "the horizon, 2.00 from the centre and aimed 7° off it, 90° from" in said
 
 
 def test_the_sentence_and_the_summary_tell_the_numbers_of_the_step(few, few_data, capsys):
