@@ -31,6 +31,14 @@ def random_numbers_of_its_own(request):
 
 
 @pytest.fixture
+def quick_compilation():
+    """For tests of which compilation takes nearly all the time; what is compiled runs slower."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture
 def x64():
     """Double precision for one test, for comparison with float64 oracles."""
     with jax.enable_x64(True):

@@ -63,8 +63,12 @@ def test_run_takes_a_mesh_and_each_search(search, tmp_path, cache):
     result = run_command(*arguments, cwd=tmp_path, cache=cache)
     assert result.returncode == 0, result.stderr
     with np.load(tmp_path / "mine" / "view_01.npz") as view:
-        chosen = np.flatnonzero((view["candidate_positions"] == view["position"]).all(axis=1))
-        assert view["values"][chosen[0]] == view["values"].max() == view["value"]
+        positions, values = view["candidate_positions"], view["values"]
+        if "trajectory_values" in view:
+            positions = np.concatenate([positions, view["trajectory_positions"].reshape(-1, 3)])
+            values = np.concatenate([values, view["trajectory_values"].ravel()])
+        chosen = np.flatnonzero((positions == view["position"]).all(axis=1))
+        assert values[chosen].max() == values.max() == view["value"]
 
 
 @pytest.mark.parametrize(

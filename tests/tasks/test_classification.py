@@ -136,16 +136,14 @@ def test_the_switch_is_at_the_threshold_and_not_above_it(x64):
 
 def test_a_scan_that_sees_nothing(x64):
     data = random_cloud(20, 25)
-    p = linear_in_numpy(*data.to_numpy())
-    before = entropy_in_numpy(p)
-    expected = {
-        CrossEntropy(linear): before,
-        MixedEntropy(linear, threshold=0.0): before,
-        MixedEntropy(linear, threshold=2.0): 0.0,
-        ExpectedUtilityImprovement(NegativeEntropy(linear)): 0.0,
-    }
-    for score, value in expected.items():
-        assert float(score(score.context(data), nothing(6))) == pytest.approx(value, abs=1e-12)
+    scores = [
+        CrossEntropy(linear),
+        MixedEntropy(linear, threshold=0.0),
+        MixedEntropy(linear, threshold=2.0),
+        ExpectedUtilityImprovement(NegativeEntropy(linear)),
+    ]
+    for score in scores:
+        assert float(score(score.context(data), nothing(6))) == 0.0
         gradient = jax.grad(_of_points(score, data, nothing(6)))(nothing(6).points)
         assert not np.asarray(gradient).any()
 
