@@ -56,7 +56,7 @@ def test_the_same_command_continues_with_more_views(finished, cache):
     assert all((out / name).read_bytes() == content for name, content in before.items())
 
 
-@pytest.mark.parametrize("search", ["farthest", "random", "uncertainty", "gradient-2dof", "gradient-6dof", "hybrid"])
+@pytest.mark.parametrize("search", ["farthest", "random", "uncertainty", "gradient-6dof"])
 def test_run_takes_a_mesh_and_each_search(search, tmp_path, cache):
     trimesh.creation.torus(1.0, 0.4).export(tmp_path / "ring.ply")
     arguments = ("run", "ring.ply", "--quick", "--views", "2", "--search", search, "--out", "mine", "--no-report")

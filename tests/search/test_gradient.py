@@ -24,6 +24,7 @@ from jaxnbv.search.ascent import Ascent
 from jaxnbv.tasks import Coverage
 from jaxnbv.tasks.classification import CrossEntropy, MixedEntropy, NegativeEntropy
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
 CAMERA, GRID = Camera(height=8, width=8), Grid(32)
 NODES = np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1)
 
@@ -235,7 +236,7 @@ def test_visited_poses_are_neither_started_from_nor_answered():
     assert float(kept.value) < float(first.value)
 
 
-@pytest.mark.parametrize("name", SEARCHES)
+@pytest.mark.parametrize("name", ["2-DOF", "hybrid"])
 def test_the_key_alone_decides(name):
     problem = uneven(2)
     first, again, other = run(name, problem, 1), run(name, problem, 1), run(name, problem, 2)

@@ -205,7 +205,7 @@ def test_the_sentence_and_the_summary_tell_the_numbers_of_the_step(few, few_data
     assert f"the best of 4 open candidates ({number(best)}; median" in view.sentence
     _summarise(few)
     line = capsys.readouterr().out.splitlines()[1]
-    assert line.endswith(f"{float(seen.value):.4g}, by gradient ascent from 4 starts; best of 4 candidates {best:.4g}")
+    assert line.endswith(f"{float(seen.value):.4g}, where ascent from 4 of 4 candidates improved on {best:.4g}")
 
 
 def test_frusta_stand_along_a_trajectory(spatial):
