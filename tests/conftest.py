@@ -31,6 +31,20 @@ def random_numbers_of_its_own(request):
 
 
 @pytest.fixture
+def compilations():
+    """Names of events by which JAX tells of a compilation, eager operations included, in the order they came."""
+    seen = []
+
+    def listen(event, duration, **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            seen.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield seen
+    jax.monitoring.unregister_event_duration_listener(listen)
+
+
+@pytest.fixture
 def quick_compilation():
     """For tests of which compilation takes nearly all the time; what is compiled runs slower."""
     jax.config.update("jax_disable_most_optimizations", True)

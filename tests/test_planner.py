@@ -40,20 +40,6 @@ def state(planner):
     return planner.init(scan(SCENE, planner.camera, FIRST), FIRST)
 
 
-@pytest.fixture
-def compilations():
-    """Names of events by which JAX tells of a compilation, eager operations included, in the order they came."""
-    seen = []
-
-    def listen(event, duration, **_):
-        if event == "/jax/core/compile/backend_compile_duration":
-            seen.append(event)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    yield seen
-    jax.monitoring.unregister_event_duration_listener(listen)
-
-
 @pytest.mark.parametrize("name", SEARCHES)
 def test_nothing_recompiles_after_the_second_view(name, compilations):
     planner, noise, key = planner_of(SEARCHES[name]), SensorNoise(), jax.random.key(3)

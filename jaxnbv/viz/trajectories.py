@@ -69,8 +69,8 @@ def wider_map(episode: Episode, index: int) -> SphereMap | None:
 
     The posterior samples are those of the step, so that values can be compared with the search's own.
     """
-    proposal, planner = episode.views[index].proposal, episode.planner
-    if proposal is None or proposal.trajectories is None or not planner.search.uses_samples:
+    proposal = episode.views[index].proposal
+    if proposal is None or proposal.trajectories is None:
         return None
     if np.sum(~np.isnan(open_values(proposal))) >= _FEWEST and _on_sphere(proposal.candidates):
         return None

@@ -36,20 +36,6 @@ def planner_of(search, score=None):
 PLANNER = planner_of(GradientSearch(dof=2, **SMALL))
 
 
-@pytest.fixture
-def compilations():
-    """Names of events by which JAX tells of a compilation, in the order they came."""
-    seen = []
-
-    def listen(event, duration, **_):
-        if event == "/jax/core/compile/backend_compile_duration":
-            seen.append(event)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    yield seen
-    jax.monitoring.unregister_event_duration_listener(listen)
-
-
 def test_a_planner_compiles_the_search_once(compilations):
     """The whole search is one compiled function: a second episode of another seed and first view compiles nothing."""
     episode = simulate(PLANNER, SCENE, FIRST, 3, KEY, progress=False)
