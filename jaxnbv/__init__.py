@@ -12,6 +12,7 @@ from jaxnbv.cloud import Frame as Frame
 from jaxnbv.cloud import PointCloud as PointCloud
 from jaxnbv.cloud import concatenate as concatenate
 from jaxnbv.cloud import farthest_point_subsample as farthest_point_subsample
+from jaxnbv.diffusion import HeatProblem as HeatProblem
 from jaxnbv.episode import Episode as Episode
 from jaxnbv.episode import View as View
 from jaxnbv.episode import simulate as simulate
@@ -33,6 +34,7 @@ from jaxnbv.search import DiscreteSearch as DiscreteSearch
 from jaxnbv.search import FarthestView as FarthestView
 from jaxnbv.search import FreePoses as FreePoses
 from jaxnbv.search import GradientSearch as GradientSearch
+from jaxnbv.search import HalvingSearch as HalvingSearch
 from jaxnbv.search import HybridSearch as HybridSearch
 from jaxnbv.search import PoseSpace as PoseSpace
 from jaxnbv.search import Problem as Problem
@@ -46,8 +48,11 @@ from jaxnbv.surfaces import Fields as Fields
 from jaxnbv.surfaces import GeometricSPSR as GeometricSPSR
 from jaxnbv.surfaces import SurfaceModel as SurfaceModel
 from jaxnbv.surfaces import SurfacePosterior as SurfacePosterior
+from jaxnbv.tasks import ColdestPoint as ColdestPoint
 from jaxnbv.tasks import Coverage as Coverage
 from jaxnbv.tasks import CrossEntropy as CrossEntropy
 from jaxnbv.tasks import HostClassifier as HostClassifier
 from jaxnbv.tasks import MixedEntropy as MixedEntropy
 from jaxnbv.tasks import NegativeEntropy as NegativeEntropy
+from jaxnbv.tasks import SoftPartCount as SoftPartCount
+from jaxnbv.tasks import coldest_point as coldest_point

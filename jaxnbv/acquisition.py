@@ -110,10 +110,19 @@ def expected_score(
 ) -> Float[Array, " poses"]:
     """The acquisition at each of a batch of poses: mean over the sampled surfaces of the score of what they would show.
 
-    `surfaces` carries the samples along its leading axis; they are taken one after the other, with all poses scanned at
-    once and scored `score.batch_size` at a time, so memory is that of one sample's scans.
+    `surfaces` carries the samples along its leading axis.
     """
-    context = score.context(cloud)
+    return mean_score(score, score.context(cloud), surfaces, camera, poses)
+
+
+def mean_score(
+    score: Score, context: Any, surfaces: GridSurface, camera: Camera, poses: Pose
+) -> Float[Array, " poses"]:
+    """`expected_score`, given what the score's `context` made of D.
+
+    Samples are taken one after the other, with all poses scanned at once and scored `score.batch_size` at a time, so
+    memory is that of one sample's scans.
+    """
 
     def of_sample(surface: GridSurface) -> Float[Array, " poses"]:
         scans = scan(surface, camera, poses)

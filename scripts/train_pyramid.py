@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from tqdm import tqdm
+from cached import cached
 
 from jaxnbv import Grid, PointCloud
 from jaxnbv.datasets import PATTERNS, Framing, Split
@@ -40,7 +40,7 @@ def scanned(folder: Path, split: Split, framing: Framing, count: int) -> Labelle
     def make(first):
         return scanned_clouds(split, framing, jnp.asarray(first), SCANNED_AT_ONCE)
 
-    return cached(folder / f"scanned-{split}-{framing}-{count}.npz", range(0, count, SCANNED_AT_ONCE), make)
+    return _clouds(cached(folder / f"scanned-{split}-{framing}-{count}.npz", range(0, count, SCANNED_AT_ONCE), make))
 
 
 def imagined(folder: Path, split: Split, framing: Framing, count: int) -> LabelledClouds:
@@ -52,20 +52,11 @@ def imagined(folder: Path, split: Split, framing: Framing, count: int) -> Labell
         return imagined_clouds(split, framing, jnp.asarray(index), imagination)
 
     scenes = range(FIRST_IMAGINED, FIRST_IMAGINED + count)
-    return cached(folder / f"imagined-{split}-{framing}-{count}.npz", scenes, make)
+    return _clouds(cached(folder / f"imagined-{split}-{framing}-{count}.npz", scenes, make))
 
 
-def cached(path: Path, steps: range, make) -> LabelledClouds:
-    """The clouds of all steps, from the file where it exists."""
-    if not path.exists():
-        parts = [jax.tree.map(np.asarray, make(step)) for step in tqdm(steps, desc=path.stem)]
-        whole = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-        partial = path.with_suffix(".partial")
-        with partial.open("wb") as file:
-            np.savez(file, *jax.tree.leaves(whole))
-        partial.replace(path)
-    with np.load(path) as saved:
-        points, normals, mask, labels, pixels, is_imagined = (saved[name] for name in saved.files)
+def _clouds(leaves: list[np.ndarray]) -> LabelledClouds:
+    points, normals, mask, labels, pixels, is_imagined = leaves
     return LabelledClouds(PointCloud(points, normals, mask), labels, pixels, is_imagined)
 
 

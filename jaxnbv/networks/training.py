@@ -1,8 +1,9 @@
-"""Training and calibration of classifiers on labelled clouds."""
+"""Training of networks on labelled clouds, and calibration of classifiers."""
 
 import hashlib
 import json
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -31,23 +32,49 @@ def train(
     labels: Int[AnyArray, " b"],
     key: PRNGKeyArray,
     steps: int,
+    **settings: Any,
+) -> Network:
+    """The classifier after `steps` of `fit` to the mean of -log p(label).
+
+    It is called as `network(points, normals, mask)` and gives log-probabilities. Further settings as of `fit`.
+
+    **Raises:** `ValueError` as `fit` does.
+    """
+
+    def loss(network: Any, example: tuple[PointCloud, Array]) -> Float[Array, ""]:
+        cloud, label = example
+        return -network(cloud.points, cloud.normals, cloud.mask)[label]
+
+    return fit(network, loss, (clouds, labels), key, steps, **settings)
+
+
+def fit(
+    network: Network,
+    loss: Callable[[Any, Any], Float[Array, ""]],
+    data: Any,
+    key: PRNGKeyArray,
+    steps: int,
     batch_size: int = 32,
     learning_rate: float = 2e-3,
     weight_decay: float = 1e-4,
     folder: str | Path | None = None,
     progress: bool = True,
 ) -> Network:
-    """The network after `steps` of AdamW on the mean of -log p(label), with a one-cycle schedule of the learning rate.
+    """The network after `steps` of AdamW on the mean loss, with a one-cycle schedule of the learning rate.
 
-    A network is called as `network(points, normals, mask)` and gives log-probabilities; its leaf `temperature`, if it
-    has one, is left to `calibrate`. Batches are drawn with replacement by the key and the step's number, so that with
-    `folder`, where a checkpoint is written every 500 steps, a run that was interrupted continues as if it had not been.
+    - `loss`: a function of the network and one example.
+    - `data`: the examples, arrays of any structure with a leading axis.
 
-    **Raises:** `ValueError` if there are no clouds, numbers of clouds and labels differ, a number is not positive, the
+    A leaf `temperature` of the network is left to `calibrate`. Batches are drawn with replacement by the key and the
+    step's number, so that with `folder`, where a checkpoint is written every 500 steps, a run that was interrupted
+    continues as if it had not been.
+
+    **Raises:** `ValueError` if there are no examples or arrays of different lengths, a number is not positive, the
     batch size is odd, or the folder holds the checkpoint of another training.
     """
-    count = clouds.mask.shape[0]
-    require(count > 0 and count == len(labels), f"{count} clouds and {len(labels)} labels: give one label a cloud")
+    counts = {len(leaf) for leaf in jax.tree.leaves(data)}
+    require(len(counts) == 1 and counts != {0}, f"the examples' arrays have lengths {sorted(counts)}: give one a row")
+    (count,) = counts
     require(
         steps >= 1 and learning_rate > 0 and batch_size >= 1 and batch_size % _TOGETHER == 0,
         f"steps={steps}, batch_size={batch_size}, learning_rate={learning_rate}: all must be positive, "
@@ -60,34 +87,33 @@ def train(
     checkpoint = None
     if folder is not None:
         identity = hashlib.sha256()
-        for array in (jax.random.key_data(key), labels, clouds.points, *jax.tree.leaves(parameters)):
+        for array in (jax.random.key_data(key), *jax.tree.leaves(data), *jax.tree.leaves(parameters)):
             identity.update(np.ascontiguousarray(array).tobytes())
         settings = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate}
-        settings |= {"weight_decay": weight_decay, "clouds": count}
+        settings |= {"weight_decay": weight_decay, "examples": count}
         checkpoint = _Checkpoint(Path(folder), {**settings, "identity": identity.hexdigest()})
         start, carry = checkpoint.read(carry)
 
-    data = jax.tree.map(jnp.asarray, (clouds, labels))
+    examples = jax.tree.map(jnp.asarray, data)
 
     @eqx.filter_jit
-    def step(carry, data, index):
+    def step(carry, examples, index):
         parameters, state = carry
         rows = jax.random.randint(jax.random.fold_in(key, index), (batch_size,), 0, count)
-        batch = jax.tree.map(lambda leaf: leaf[rows].reshape(-1, _TOGETHER, *leaf.shape[1:]), data)
+        batch = jax.tree.map(lambda leaf: leaf[rows].reshape(-1, _TOGETHER, *leaf.shape[1:]), examples)
 
-        def loss(parameters, clouds, labels):
-            network: Any = eqx.combine(parameters, fixed)
-            log_p = jax.vmap(network)(clouds.points, clouds.normals, clouds.mask)
-            return -jnp.mean(jnp.take_along_axis(log_p, labels[:, None], axis=1))
+        def mean_loss(parameters, some):
+            network = eqx.combine(parameters, fixed)
+            return jnp.mean(jax.vmap(lambda example: loss(network, example))(some))
 
-        values, slopes = jax.lax.map(lambda part: jax.value_and_grad(loss)(parameters, *part), batch)
+        values, slopes = jax.lax.map(lambda some: jax.value_and_grad(mean_loss)(parameters, some), batch)
         updates, state = optimiser.update(jax.tree.map(lambda s: jnp.mean(s, axis=0), slopes), state, parameters)
         return (optax.apply_updates(parameters, updates), state), jnp.mean(values)
 
     losses: list[Array] = []
     with tqdm(total=steps, initial=start, desc="training", disable=not progress) as bar:
         for index in range(start, steps):
-            carry, value = step(carry, data, jnp.asarray(index))
+            carry, value = step(carry, examples, jnp.asarray(index))
             losses.append(value)
             bar.update()
             if len(losses) == 50:

@@ -10,6 +10,7 @@ from jaxnbv.search.baselines import UncertaintyView as UncertaintyView
 from jaxnbv.search.discrete import DiscreteSearch as DiscreteSearch
 from jaxnbv.search.gradient import GradientSearch as GradientSearch
 from jaxnbv.search.gradient import HybridSearch as HybridSearch
+from jaxnbv.search.halving import HalvingSearch as HalvingSearch
 from jaxnbv.search.pose_space import ConstrainedPoses as ConstrainedPoses
 from jaxnbv.search.pose_space import FreePoses as FreePoses
 from jaxnbv.search.pose_space import PoseSpace as PoseSpace

@@ -1,13 +1,14 @@
 """What a search is asked, and what it answers."""
 
 from abc import abstractmethod
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from jaxnbv.acquisition import Score, expected_score
+from jaxnbv.acquisition import Score, mean_score
 from jaxnbv.camera import Camera, Pose, fibonacci_sphere, look_at
 from jaxnbv.checks import InputError, require
 from jaxnbv.cloud import PointCloud
@@ -23,6 +24,7 @@ class Problem(eqx.Module):
     - `cloud`: D, what has been seen.
     - `visited`: the poses taken so far in the first `num_visited` rows; the others hold nothing.
     - `surfaces`: the step's posterior samples along a leading axis; None for a search that does not ask for them.
+    - `context`: what the score makes of D, once; None without samples.
     """
 
     cloud: PointCloud
@@ -31,12 +33,32 @@ class Problem(eqx.Module):
     camera: Camera
     score: Score
     surfaces: GridSurface | None
+    context: Any
 
-    def acquisition(self, poses: Pose) -> Float[Array, " poses"]:
-        """The acquisition at a batch of poses."""
+    def __init__(
+        self,
+        cloud: PointCloud,
+        visited: Pose,
+        num_visited: Int[Array, ""],
+        camera: Camera,
+        score: Score,
+        surfaces: GridSurface | None,
+    ):
+        self.cloud, self.visited, self.num_visited = cloud, visited, num_visited
+        self.camera, self.score, self.surfaces = camera, score, surfaces
+        self.context = None if surfaces is None else score.context(cloud)
+
+    def acquisition(self, poses: Pose, samples: slice = slice(None)) -> Float[Array, " poses"]:
+        """The acquisition at a batch of poses, estimated from all posterior samples or from a part of them."""
         if self.surfaces is None:
             raise InputError("the acquisition needs posterior samples: set uses_samples = True on the search")
-        return expected_score(self.score, self.cloud, self.surfaces, self.camera, poses)
+        surfaces = jax.tree.map(lambda leaf: leaf[samples], self.surfaces)
+        return mean_score(self.score, self.context, surfaces, self.camera, poses)
+
+    @property
+    def num_samples(self) -> int:
+        """How many posterior samples there are."""
+        return 0 if self.surfaces is None else self.surfaces.values.shape[0]
 
     def is_visited(self, poses: Pose) -> Bool[Array, " poses"]:
         """Whether each of a batch of poses equals one taken before, to 1e-3 in position and viewing direction."""

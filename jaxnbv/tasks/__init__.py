@@ -7,3 +7,10 @@ from jaxnbv.tasks.classification import MixedEntropy as MixedEntropy
 from jaxnbv.tasks.classification import NegativeEntropy as NegativeEntropy
 from jaxnbv.tasks.classification import predict as predict
 from jaxnbv.tasks.coverage import Coverage as Coverage
+from jaxnbv.tasks.heat import Coldest as Coldest
+from jaxnbv.tasks.heat import ColdestPoint as ColdestPoint
+from jaxnbv.tasks.heat import body_temperature as body_temperature
+from jaxnbv.tasks.heat import coldest_point as coldest_point
+from jaxnbv.tasks.segmentation import Segmenter as Segmenter
+from jaxnbv.tasks.segmentation import SoftPartCount as SoftPartCount
+from jaxnbv.tasks.segmentation import part_counts as part_counts

@@ -1,0 +1,221 @@
+"""A solid whose surface carries labels, one type for all objects: one compiled program scans any of them.
+
+An object is a list of primitives, which `assemble` joins into a `LabelledSolid`. A primitive is a rounded box or a
+rounded rectangle that is turned about an axis: a ring, a wheel, a rod, a cone, a ball.
+"""
+
+import dataclasses
+import itertools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.scanning.sdf import SignedDistance, _corner, _norm, nonnegative, parameter
+
+# How many primitives a solid can have.
+CAPACITY = 24
+
+_LONGEST_SIDE = 2.5
+_EMPTY = -1
+
+
+class LabelledSolid(SignedDistance):
+    """The union of up to 24 labelled primitives; a bound.
+
+    A point x has the coordinates u = rotation^T (x - centre) in a primitive's own frame. With h = half_size and
+    t = rounding, its distance is that of the box [-h, h] rounded by t,
+
+        d(u) = |max(q, 0)| + min(max(q1, q2, q3), 0) - t,    q = |u| - (h - t),
+
+    or, where `revolved`, the same in two dimensions of (r - radius - slant * u2, u2), r the distance from the axis u2,
+    divided by the largest singular value (|slant| + sqrt(slant^2 + 4)) / 2 of this shear.
+
+    - `centre`, `rotation`, `half_size`, `rounding`: as above, in scene units; a revolved one's half width is the first
+      half size and its half height the second, and also the third.
+    - `revolved`: which primitives are revolved; `radius` is then that of the ring, 0 for a solid, and `slant` its
+      growth with height.
+    - `labels`: the label of each primitive; -1 marks a slot that is not used.
+
+    **Raises:** `ValueError` also if a rounding is greater than a half size, or no slot is used.
+    """
+
+    labels: Int[Array, f"{CAPACITY}"]
+    revolved: Bool[Array, f"{CAPACITY}"]
+    centre: Float[Array, f"{CAPACITY} 3"] = parameter()
+    rotation: Float[Array, f"{CAPACITY} 3 3"] = parameter()
+    half_size: Float[Array, f"{CAPACITY} 3"] = nonnegative()
+    rounding: Float[Array, f"{CAPACITY}"] = nonnegative()
+    radius: Float[Array, f"{CAPACITY}"] = nonnegative()
+    slant: Float[Array, f"{CAPACITY}"] = parameter()
+
+    def __check_init__(self):
+        if not is_traced(self):
+            over = np.flatnonzero(np.asarray(self.rounding) > np.asarray(self.half_size).min(axis=1))
+            require(len(over) == 0, f"primitives {over} are rounded by more than a half size: round them by less")
+            require(bool((np.asarray(self.labels) > _EMPTY).any()), "the solid has no primitive: give at least one")
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        return jnp.min(self.distances(x), axis=-1)
+
+    def distances(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, f"*n {CAPACITY}"]:
+        """Signed distance to each primitive; infinite for slots that are not used."""
+        a, b, c = (x[..., i, None] - self.centre[:, i] for i in range(3))
+        # R^T x written as sums, which XLA fuses with what follows where it would not a matrix product.
+        u, v, w = (
+            a * self.rotation[:, 0, i] + b * self.rotation[:, 1, i] + c * self.rotation[:, 2, i] for i in range(3)
+        )
+        u = jnp.where(self.revolved, _norm(u, w) - self.radius - self.slant * v, u)
+        w = jnp.where(self.revolved, 0.0, w)
+        half = self.half_size - self.rounding[:, None]
+        distance = _corner(jnp.abs(u) - half[:, 0], jnp.abs(v) - half[:, 1], jnp.abs(w) - half[:, 2]) - self.rounding
+        steepest = 0.5 * (jnp.abs(self.slant) + jnp.sqrt(self.slant**2 + 4.0))
+        return jnp.where(self.labels > _EMPTY, distance / steepest, jnp.inf)
+
+    def label(self, x: Float[AnyArray, "*n 3"]) -> Int[Array, "*n"]:
+        """The label of the primitive whose surface is nearest: exact for points of the solid's surface."""
+        return self.labels[jnp.argmin(jnp.abs(self.distances(x)), axis=-1)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Primitive:
+    """One slot of a `LabelledSolid`, of NumPy numbers; the fields are those of the solid."""
+
+    label: int
+    centre: np.ndarray
+    rotation: np.ndarray
+    half_size: np.ndarray
+    rounding: float
+    radius: float = 0.0
+    slant: float = 0.0
+    revolved: bool = False
+
+    def bounds(self) -> Float[np.ndarray, "2 3"]:
+        """The lowest and highest coordinates, exactly: how far the primitive reaches down and up each axis."""
+        inner = self.half_size - self.rounding
+        if not self.revolved:
+            reach = np.abs(self.rotation) @ inner + self.rounding
+            return self.centre + np.stack([-reach, reach])
+        # The direction of an axis, or its opposite, in the profile's plane, and what the shear makes of it.
+        up = np.stack([-self.rotation[:, 1], self.rotation[:, 1]])
+        out = np.sqrt(np.maximum(1.0 - up**2, 0.0))
+        up = up + self.slant * out
+        reach = out * (self.radius + inner[0]) + np.abs(up) * inner[1] + self.rounding * np.hypot(out, up)
+        return self.centre + np.array([[-1.0], [1.0]]) * reach
+
+
+def box(label: int, centre, half_size, rounding: float = 0.02, turn: tuple | None = None) -> Primitive:
+    """A box with rounded edges; `turn` = (axis, angle) turns it about its centre, right-handed."""
+    half_size = np.asarray(half_size, dtype=float)
+    rotation = np.eye(3) if turn is None else rotation_about(*turn)
+    return Primitive(label, np.asarray(centre, dtype=float), rotation, half_size, min(rounding, half_size.min()))
+
+
+def bar(label: int, start, end, half_width: float, half_depth: float, rounding: float = 0.02) -> Primitive:
+    """A box from `start` to `end`: its width lies across the y axis, or along z if the bar is upright."""
+    start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
+    half_size = np.array([half_depth, 0.5 * np.linalg.norm(end - start), half_width])
+    rotation = _upright(end - start)
+    return Primitive(label, 0.5 * (start + end), rotation, half_size, min(rounding, half_size.min()))
+
+
+def ring(
+    label: int,
+    centre,
+    axis,
+    radius: float,
+    half_width: float,
+    half_height: float,
+    rounding: float = 0.02,
+    slant: float = 0.0,
+) -> Primitive:
+    """A rounded rectangle turned about the direction `axis` at a mean distance `radius`, which grows by `slant`."""
+    half_size = np.array([half_width, half_height, half_height])
+    rounding = min(rounding, half_width, half_height)
+    return Primitive(label, np.asarray(centre, dtype=float), _upright(axis), half_size, rounding, radius, slant, True)
+
+
+def rod(label: int, start, end, radius: float, end_radius: float | None = None, rounding: float = 0.02) -> Primitive:
+    """A solid of circular section with flat ends, from one radius to another."""
+    start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
+    length = float(np.linalg.norm(end - start))
+    end_radius = radius if end_radius is None else end_radius
+    slant = (end_radius - radius) / length
+    mean = 0.5 * (radius + end_radius)
+    return ring(label, 0.5 * (start + end), end - start, 0.0, mean, 0.5 * length, rounding, slant)
+
+
+def path(label: int, points, radius: float) -> list[Primitive]:
+    """Rods with round ends along the polyline through the points."""
+    points = np.asarray(points, dtype=float)
+    rods = []
+    for start, end in itertools.pairwise(points):
+        over = radius * (end - start) / np.linalg.norm(end - start)
+        rods.append(rod(label, start - over, end + over, radius, rounding=radius))
+    return rods
+
+
+def ball(label: int, centre, radius: float) -> Primitive:
+    """A ball."""
+    return ring(label, centre, (0.0, 1.0, 0.0), 0.0, radius, radius, radius)
+
+
+def shifted(point, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Float[np.ndarray, "3"]:
+    """A point moved along the axes."""
+    return np.asarray(point, dtype=float) + np.array([x, y, z])
+
+
+def rotation_about(axis, angle: float) -> Float[np.ndarray, "3 3"]:
+    """The right-handed rotation about an axis by an angle in radians."""
+    x, y, z = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
+
+
+def _upright(axis):
+    """A rotation whose second column is the direction `axis` and whose third lies as level as it can."""
+    axis = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+    level = np.cross(axis, [0.0, 1.0, 0.0])
+    if np.linalg.norm(level) < 1e-6:
+        level = np.array([0.0, 0.0, 1.0])
+    level /= np.linalg.norm(level)
+    return np.stack([np.cross(axis, level), axis, level], axis=1)
+
+
+def assemble(primitives: list[Primitive], turn: float = 0.0) -> LabelledSolid:
+    """The union of primitives, turned about the y axis by an angle in radians, then moved and scaled: its bounding box
+    is centred in the scene and has the longest side 2.5.
+
+    **Raises:** `ValueError` if there are no primitives or more than a solid can have.
+    """
+    count = len(primitives)
+    require(1 <= count <= CAPACITY, f"the object has {count} primitives; a solid holds 1 to {CAPACITY}")
+    turned = rotation_about((0.0, 1.0, 0.0), turn)
+    primitives = [dataclasses.replace(p, centre=turned @ p.centre, rotation=turned @ p.rotation) for p in primitives]
+    lows, highs = zip(*(p.bounds() for p in primitives), strict=True)
+    low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+    scale = _LONGEST_SIDE / (high - low).max()
+
+    def padded(rows, filling=0.0):
+        rows = np.asarray(rows)
+        spare = np.broadcast_to(filling, (CAPACITY - count, *rows.shape[1:]))
+        return np.concatenate([rows, spare.astype(rows.dtype)])
+
+    return LabelledSolid(
+        labels=jnp.asarray(padded([p.label for p in primitives], _EMPTY), jnp.int32),
+        revolved=jnp.asarray(padded([p.revolved for p in primitives], False)),
+        centre=padded([scale * (p.centre - 0.5 * (low + high)) for p in primitives]),
+        rotation=padded([p.rotation for p in primitives], np.eye(3)),
+        half_size=padded([scale * p.half_size for p in primitives]),
+        rounding=padded([scale * p.rounding for p in primitives]),
+        radius=padded([scale * p.radius for p in primitives]),
+        slant=padded([p.slant for p in primitives]),
+    )
+
+
+def generator(key) -> np.random.Generator:
+    """NumPy's generator seeded by a JAX key: objects are built on the host, once."""
+    return np.random.default_rng(np.asarray(jax.random.key_data(key)))

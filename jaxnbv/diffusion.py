@@ -1,0 +1,260 @@
+"""Heat diffusion over scanned points and triangle meshes, by sparse linear algebra on the host.
+
+    du/dt = Delta u + f,     (M + h L) u_{k+1} = M (u_k + h f)
+
+with the Laplacian of Sharp and Crane (2020, "A Laplacian for Nonmanifold Triangle Meshes"): that of the tufted cover of
+the triangles, or for points of a triangulation of each one's neighbours. Open edges let no heat through.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import robust_laplacian
+from jax import Array
+from jaxtyping import Bool, Float, Int
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
+
+from jaxnbv.checks import AnyArray, is_traced, require
+
+# A point's neighbours in its local triangulation: what Sharp and Crane use.
+_NEIGHBOURS = 30
+
+
+def _array(source) -> AnyArray:
+    # Stays off JAX's devices, which worker processes have no use for.
+    return source if isinstance(source, Array) else np.asarray(source, jnp.result_type(float))
+
+
+class HeatProblem(eqx.Module):
+    """A body at one temperature that is heated near a point for a while: the paper's du/dt = Delta u + f, u(0) = u0.
+
+    - `source`: where; f is `power` within `radius` of it, and zero elsewhere. A body with no point there is not heated.
+    - `radius`: in scene units.
+    - `power`: f in degrees per unit of time; the unit of time is that in which Delta, in scene units, has factor one.
+    - `duration`: T, how long it is heated.
+    - `steps`: of implicit Euler, h = T / steps.
+    - `initial`: u0, in degrees.
+
+    **Raises:** `ValueError` for a source that is not one finite point, a radius or duration that is not positive, less
+    than one step, or a power or initial temperature that is not finite.
+    """
+
+    source: Float[AnyArray, "3"] = eqx.field(converter=_array)
+    radius: float = eqx.field(static=True, default=0.1)
+    power: float = eqx.field(static=True, default=10.0)
+    duration: float = eqx.field(static=True, default=5.0)
+    steps: int = eqx.field(static=True, default=20)
+    initial: float = eqx.field(static=True, default=0.0)
+
+    def __check_init__(self):
+        if not is_traced(self.source):
+            require(
+                self.source.shape == (3,) and bool(np.isfinite(self.source).all()),
+                f"the heat source is {self.source}; it must be one point, three finite scene coordinates",
+            )
+        for name in ("radius", "duration"):
+            value = getattr(self, name)
+            require(0 < value < np.inf, f"the heat problem's {name} is {value}; it must be positive and finite")
+        for name in ("power", "initial"):
+            value = getattr(self, name)
+            require(bool(np.isfinite(value)), f"the heat problem's {name} is {value}; it must be finite")
+        require(
+            isinstance(self.steps, int) and self.steps >= 1,
+            f"the number of time steps is {self.steps}; it must be a whole number, at least 1",
+        )
+
+    @property
+    def highest(self) -> float:
+        """No point gets warmer: u0 + T max(0, power), by the maximum principle."""
+        return self.initial + self.duration * max(0.0, self.power)
+
+    def heating(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """f at the points."""
+        near = np.linalg.norm(points - np.asarray(self.source, np.float64), axis=1) <= self.radius
+        return np.where(near, self.power, 0.0)
+
+
+class Laplacian(NamedTuple):
+    """The weak Laplacian of n points: Delta u = -u @ weak / mass.
+
+    - `weak`: L, (n, n), symmetric and positive semidefinite; its rows sum to zero, so that heat is conserved.
+    - `mass`: the diagonal of M, the area that each point stands for; positive.
+    """
+
+    weak: sparse.csc_matrix
+    mass: Float[np.ndarray, " n"]
+
+    @property
+    def pieces(self) -> Int[np.ndarray, " n"]:
+        """To which connected piece each point belongs, counted from 0: no heat flows between pieces."""
+        return connected_components(self.weak, directed=False)[1]
+
+
+class Temperature(NamedTuple):
+    """The solution of a `HeatProblem` at time T.
+
+    - `values`: u in degrees.
+    - `reached`: which points the source warms, as they are connected to a point that it heats. The others keep the
+      initial temperature for ever.
+    """
+
+    values: Float[np.ndarray, " n"]
+    reached: Bool[np.ndarray, " n"]
+
+    def coldest(self, reached_only: bool) -> int | None:
+        """Index of the coldest point, the first of equals; None if there is none, or none was reached."""
+        candidates = np.flatnonzero(self.reached) if reached_only else np.arange(len(self.values))
+        return int(candidates[np.argmin(self.values[candidates])]) if len(candidates) else None
+
+
+def cloud_laplacian(points: Float[np.ndarray, "n 3"]) -> Laplacian:
+    """The Laplacian of a point cloud in which no two points coincide.
+
+    A point is tied to some of its 30 nearest (to all others, if they are fewer), however far they are: pieces of more
+    points are separate once they are far from one another. Points without a triangle, such as those of a lone line,
+    conduct no heat.
+
+    **Raises:** `ValueError` for points that are not finite.
+    """
+    points = _finite(points)
+    neighbours = min(_NEIGHBOURS, len(points) - 1)
+    return _assemble(lambda: robust_laplacian.point_cloud_laplacian(points, n_neighbors=neighbours), len(points))
+
+
+def mesh_laplacian(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Laplacian:
+    """The Laplacian of triangles, manifold or not: heat flows where they share vertices.
+
+    **Raises:** `ValueError` for vertices that are not finite.
+    """
+    vertices, faces = _finite(vertices), np.asarray(faces)
+    return _assemble(lambda: robust_laplacian.mesh_laplacian(vertices, faces), len(vertices))
+
+
+def _finite(points: np.ndarray) -> np.ndarray:
+    points = np.asarray(points, np.float64)
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    require(bad.size == 0, f"{bad.size} points are not finite, the first at row {bad[:1]}: drop these rows")
+    return points
+
+
+def _assemble(build: Callable, count: int) -> Laplacian:
+    empty = sparse.csc_matrix((count, count)), np.ones(count)
+    if count < 3:
+        return Laplacian(*empty)
+    try:
+        weak, mass = build()
+    except RuntimeError as error:
+        # The library's way to say that there is not one triangle.
+        if "unreferenced vertex" not in str(error):
+            raise
+        return Laplacian(*empty)
+    # The library ties a point without triangles to zero degrees; rows that sum to zero leave it alone.
+    flow = weak - sparse.diags(weak.diagonal())
+    flow.eliminate_zeros()
+    return Laplacian((flow - sparse.diags(np.asarray(flow.sum(axis=1)).ravel())).tocsc(), mass.diagonal())
+
+
+def diffuse(
+    laplacian: Laplacian,
+    initial: Float[np.ndarray, " n"],
+    heating: Float[np.ndarray, " n"],
+    duration: float,
+    steps: int,
+) -> Float[np.ndarray, " n"]:
+    """u after `duration`, by implicit Euler: (M + h L) u_{k+1} = M (u_k + h f), factorised once.
+
+    Stable for any h, with an error of order h. The heat, mass @ u, grows by h mass @ f each step.
+    """
+    step = duration / steps
+    # Symmetric and positive definite, so pivots may stay on the diagonal and the order keep the factors sparse.
+    system = sparse.diags(laplacian.mass) + step * laplacian.weak
+    factors = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    u = initial
+    for _ in range(steps):
+        u = factors.solve(laplacian.mass * (u + step * heating))
+    return u
+
+
+def cloud_temperature(points: Float[np.ndarray, "n 3"], heat: HeatProblem) -> Temperature:
+    """Temperature of a point cloud, in scene coordinates. Points that coincide count as one.
+
+    **Raises:** `ValueError` for points that are not finite.
+    """
+    points, place = _merge(points)
+    return _solve(cloud_laplacian(points), points, place, heat)
+
+
+def mesh_temperature(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], heat: HeatProblem
+) -> Temperature:
+    """Temperature at the vertices of a mesh, in scene coordinates, linear between them: see `refine`.
+
+    Vertices that coincide count as one, so that heat crosses the seams of a triangle soup.
+
+    **Raises:** `ValueError` for vertices that are not finite.
+    """
+    vertices, place = _merge(vertices)
+    faces = place[faces]
+    solid = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    return _solve(mesh_laplacian(vertices, faces[solid]), vertices, place, heat)
+
+
+def _merge(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The distinct points, sorted, and the row of each point among them."""
+    distinct, place = np.unique(np.asarray(points, np.float64), axis=0, return_inverse=True)
+    return distinct, place.reshape(-1)
+
+
+def _solve(laplacian: Laplacian, points: np.ndarray, place: np.ndarray, heat: HeatProblem) -> Temperature:
+    heating = heat.heating(points)
+    pieces = laplacian.pieces
+    reached = np.isin(pieces, pieces[heating != 0.0])
+    values = np.full(len(points), float(heat.initial))
+    if reached.any():
+        values = diffuse(laplacian, values, heating, heat.duration, heat.steps)
+        # Exactly: solving would round it.
+        values[~reached] = heat.initial
+    return Temperature(values[place], reached[place])
+
+
+def refine(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], longest: float
+) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
+    """The same surface in triangles whose edges are at most `longest`, by halving edges in all their triangles at once.
+
+    The vertices that were there stay first. Triangles may become slivers, which this Laplacian forgives.
+
+    **Raises:** `ValueError` if `longest` is not positive.
+    """
+    require(longest > 0, f"the longest edge is {longest}; it must be positive")
+    while True:
+        edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=-1)
+        lengths = np.linalg.norm(vertices[edges[..., 0]] - vertices[edges[..., 1]], axis=-1)
+        if not (lengths > longest).any():
+            return vertices, faces
+        split, midpoint = np.unique(edges[lengths > longest], axis=0, return_inverse=True)
+        halves = np.full(lengths.shape, -1)
+        halves[lengths > longest] = len(vertices) + midpoint.reshape(-1)
+        vertices = np.concatenate([vertices, vertices[split].mean(axis=1)])
+        faces = _split_faces(faces, halves)
+
+
+def _split_faces(faces: np.ndarray, halves: np.ndarray) -> np.ndarray:
+    """Triangles cut at the midpoints of their edges (i, i + 1), a vertex each, or -1 for an edge that stays."""
+    count = (halves >= 0).sum(axis=1)
+    # Rotated so that one midpoint lies on the first edge, and two on the first and second.
+    first = np.where(count == 2, np.argmin(halves, axis=1) + 1, np.argmax(halves, axis=1))
+    turn = (first[:, None] + np.arange(3)) % 3
+    (a, b, c), (x, y, z) = (np.take_along_axis(rows, turn, axis=1).T for rows in (faces, halves))
+    patterns = {
+        0: [(a, b, c)],
+        1: [(a, x, c), (x, b, c)],
+        2: [(x, b, y), (a, x, y), (a, y, c)],
+        3: [(a, x, z), (x, b, y), (z, y, c), (x, y, z)],
+    }
+    return np.concatenate([np.stack(t, axis=1)[count == n] for n, triples in patterns.items() for t in triples])

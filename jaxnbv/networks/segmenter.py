@@ -1,0 +1,71 @@
+"""From a network on arrays to the segmenter of clouds that the segmentation task takes."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.cloud import PointCloud, farthest_point_subsample
+from jaxnbv.networks.shapenet import CATEGORIES, category_index, part_mask
+
+
+class CloudSegmenter(eqx.Module):
+    """A network as a function from a `PointCloud` to the probabilities of the parts of a known category, row by row.
+
+    Category and scale are arrays, so objects that differ in them share one compilation.
+
+    - `network`: called as `network(points, normals, category, mask)`; gives log-probabilities of the fifty parts of
+      ShapeNet-part.
+    - `category`: what the object is, by its name in `shapenet.CATEGORIES` or its index there.
+    - `num_points`: what the network is fed, by farthest point sampling; a smaller cloud is fed as it is, masked.
+    - `scale`: network units per scene unit.
+    """
+
+    network: Callable[..., Float[Array, "n parts"]]
+    category: Int[Array, ""]
+    scale: Float[Array, ""]
+    num_points: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        network: Callable[..., Float[Array, "n parts"]],
+        category: str | int | Int[AnyArray, ""],
+        num_points: int = 2048,
+        scale: float | Float[AnyArray, ""] = 1.0,
+    ):
+        index = category_index(category) if isinstance(category, str) else category
+        require(
+            is_traced(index) or 0 <= int(index) < len(CATEGORIES),
+            f"the category is {index}; choose 0 to {len(CATEGORIES) - 1}, or a name such as 'chair'",
+        )
+        require(num_points >= 1, f"num_points is {num_points}; the network needs at least one")
+        require(is_traced(scale) or float(scale) > 0, f"the scale is {scale}; it must be positive")
+        self.network, self.num_points = network, num_points
+        self.category, self.scale = jnp.asarray(index, jnp.int32), jnp.asarray(scale, jnp.result_type(float))
+
+    def __call__(self, cloud: PointCloud) -> Float[Array, "num_points parts"]:
+        """p(part) at the points that are fed; exactly zero for parts of other categories, and in rows without a point.
+
+        The network's probabilities, given that the part is one of the category's.
+        """
+        return self._probabilities(farthest_point_subsample(cloud, self.num_points))
+
+    def predict(self, cloud: PointCloud) -> tuple[PointCloud, Int[Array, " num_points"]]:
+        """The points that are fed, in scene coordinates, and the likeliest part of each; -1 in rows without a point."""
+        fed = farthest_point_subsample(cloud, self.num_points)
+        labels = jnp.argmax(self._probabilities(fed), axis=-1).astype(jnp.int32)
+        return fed, jnp.where(fed.mask, labels, -1)
+
+    def _probabilities(self, fed: PointCloud) -> Float[Array, "num_points parts"]:
+        log_p = self.network(self.scale * fed.points, fed.normals, self.category, fed.mask)
+        parts = part_mask().shape[1]
+        require(
+            log_p.shape[-1] == parts,
+            f"the network knows {log_p.shape[-1]} parts; give one that knows the {parts} of ShapeNet-part",
+        )
+        allowed = jnp.asarray(part_mask())[self.category]
+        p = jax.nn.softmax(jnp.where(allowed, log_p, -jnp.inf), axis=-1)
+        return jnp.where(fed.mask[:, None], p, 0.0)

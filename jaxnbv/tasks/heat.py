@@ -1,0 +1,149 @@
+"""Heat diffusion: where does a body that is heated at one place stay coldest?"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from loky import cpu_count, get_reusable_executor
+
+from jaxnbv.checks import AnyArray, InputError, require
+from jaxnbv.cloud import PointCloud
+from jaxnbv.diffusion import HeatProblem, Temperature, cloud_temperature, mesh_temperature, refine
+from jaxnbv.scanning import TriangleMesh
+
+# Longest edge, in scene units, of the triangles on which the true temperature is computed: within 2 % of that on ever
+# finer ones at the default radius, in seconds.
+_LONGEST_EDGE = 0.025
+# Workers wait for the next candidates while the rest of a step is computed.
+_IDLE_SECONDS = 120
+# They import jaxnbv, and with it JAX, but leave the accelerator and each other's cores alone.
+_WORKER_ENVIRONMENT = {"JAX_PLATFORMS": "cpu", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+
+
+class ColdestPoint(eqx.Module):
+    """The paper's u_H(D) = -min u^(T), a utility for `ExpectedUtilityImprovement`.
+
+    Its Laplacian runs on the host, so search over candidates only, as in the paper. Equal to the last bit whatever the
+    order of the points and the number of workers.
+
+    - `source`: (3,), where the body is heated, in scene coordinates: within `radius` of it, with `power`. Scenes that
+      differ in the source alone share one compilation.
+    - `T`, `steps`: how long, and in how many steps of implicit Euler.
+    - `u0`: the temperature at the beginning. All of these are explained in `HeatProblem`, which `heat` holds; the
+      defaults are the authors'.
+    - `reached_only`: take the minimum over the points that the source can warm. The paper takes it over all, where it
+      stays at u0, the least there can be, from the moment that D or an imagined scan has one piece that is not
+      connected to the source: no view improves on that.
+    - `workers`: processes that share the candidates, by default one a core; with 1, this process does the work.
+
+    **Raises:** `ValueError` for less than one worker, as `HeatProblem` does, and when a gradient is asked for.
+    """
+
+    heat: HeatProblem
+    reached_only: bool = eqx.field(static=True)
+    workers: int = eqx.field(static=True)
+    batch_size: ClassVar[int] = 128
+
+    def __init__(
+        self,
+        source: Float[AnyArray, "3"] | Sequence[float],
+        power: float = 10.0,
+        T: float = 5.0,
+        steps: int = 20,
+        u0: float = 0.0,
+        radius: float = 0.1,
+        reached_only: bool = False,
+        workers: int | None = None,
+    ):
+        workers = cpu_count() if workers is None else workers
+        require(workers >= 1, f"the number of workers is {workers}; it must be at least 1")
+        self.heat = HeatProblem(source, radius, power, T, steps, u0)
+        self.reached_only, self.workers = reached_only, workers
+
+    def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
+        """u_H in degrees, of one cloud; under `vmap`, of all of them in one call.
+
+        With no point to take the minimum over it is the least there can be, -(u0 + T power): any point improves on it.
+        """
+        return _call_host(cloud, self)
+
+
+@eqx.filter_custom_jvp
+def _call_host(cloud: PointCloud, utility: ColdestPoint) -> Float[Array, ""]:
+    origin = replace(utility.heat, source=np.zeros(3))
+
+    def call(points, mask, source):
+        batch = mask.shape[:-1]
+        points, mask, source = (np.asarray(a).reshape(-1, *a.shape[len(batch) :]) for a in (points, mask, source))
+        clouds = [rows[filled] for rows, filled in zip(points, mask, strict=True)]
+        problems = [replace(origin, source=own) for own in source]
+        values = _map(partial(_value, reached_only=utility.reached_only), clouds, problems, utility.workers)
+        return np.asarray(values, points.dtype).reshape(batch)
+
+    result = jax.ShapeDtypeStruct((), cloud.points.dtype)
+    source = jnp.asarray(utility.heat.source, cloud.points.dtype)
+    return jax.pure_callback(call, result, cloud.points, cloud.mask, source, vmap_method="broadcast_all")
+
+
+@_call_host.def_jvp
+def _call_host_jvp(primals, tangents):
+    raise InputError("ColdestPoint has no derivative, as its Laplacian runs outside JAX: use DiscreteSearch")
+
+
+def _value(points: np.ndarray, heat: HeatProblem, reached_only: bool) -> float:
+    temperature = cloud_temperature(points, heat)
+    coldest = temperature.coldest(reached_only)
+    return -(heat.highest if coldest is None else float(temperature.values[coldest]))
+
+
+def _map(function: Callable, clouds: list, problems: list, workers: int) -> list[float]:
+    if workers == 1 or len(clouds) == 1:
+        return list(map(function, clouds, problems))
+    executor = get_reusable_executor(workers, timeout=_IDLE_SECONDS, env=_WORKER_ENVIRONMENT)
+    return list(executor.map(function, clouds, problems, chunksize=math.ceil(len(clouds) / (4 * workers))))
+
+
+def body_temperature(
+    body: PointCloud | TriangleMesh, heat: HeatProblem
+) -> tuple[Float[np.ndarray, "n 3"], Temperature]:
+    """Points of a body, in scene coordinates, and their temperature: of a cloud its points; of a mesh its vertices,
+    and as many more as it takes to resolve the heat.
+
+    Of a mesh in separate parts, which may meet but share no vertices, only those with the source get warm; give a dense
+    cloud of points of it where heat shall pass between parts that touch.
+    """
+    if isinstance(body, PointCloud):
+        points = np.asarray(body.to_numpy()[0], np.float64)
+        return points, cloud_temperature(points, heat)
+    vertices, faces = refine(body.vertices, body.faces, _LONGEST_EDGE)
+    return vertices, mesh_temperature(vertices, faces, heat)
+
+
+class Coldest(NamedTuple):
+    """The coldest point (scene coordinates) and its temperature in degrees."""
+
+    point: Float[np.ndarray, "3"]
+    temperature: float
+
+
+def coldest_point(body: PointCloud | TriangleMesh, heat: HeatProblem, reached_only: bool = False) -> Coldest:
+    """The coldest point of a cloud, which is the estimate, or of a mesh, which is the truth; the first of equals.
+
+    - `reached_only`: as in `ColdestPoint`. Without it, where some points are not connected to the source, the answer is
+      any one of them.
+
+    **Raises:** `ValueError` if there is no point, or none that the source can warm.
+    """
+    points, temperature = body_temperature(body, heat)
+    coldest = temperature.coldest(reached_only)
+    if coldest is None:
+        reason = f"none of its {len(points)} points is connected to the source" if len(points) else "it is empty"
+        raise InputError(f"the body has no coldest point, as {reason}: scan the heat source first")
+    return Coldest(points[coldest], float(temperature.values[coldest]))

@@ -1,0 +1,346 @@
+"""Part segmentation against published-layout reference outputs and a plain NumPy network; checkpoints; clouds."""
+
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from jaxnbv.checks import InputError
+from jaxnbv.cloud import PointCloud
+from jaxnbv.networks import (
+    CATEGORIES,
+    CloudSegmenter,
+    FeaturePropagation,
+    PointNet2PartSegmenter,
+    category_index,
+    convert_checkpoint,
+    load_checkpoint,
+    load_part_segmenter,
+    part_mask,
+    save_safetensors,
+)
+from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
+
+RNG = np.random.default_rng(0)
+SAMPLING = {
+    "ssg": ((512, (0.2,), (32,)), (128, (0.4,), (64,))),
+    "msg": ((512, (0.1, 0.2, 0.4), (32, 64, 128)), (128, (0.4, 0.8), (64, 128))),
+}
+segment = eqx.filter_jit(lambda network, *arguments: network(*arguments))
+
+
+def layers(*widths):
+    return tuple(
+        Linear(jnp.asarray(RNG.normal(size=(a, b)) * (2 / a) ** 0.5), jnp.asarray(0.2 * RNG.normal(size=b)))
+        for a, b in itertools.pairwise(widths)
+    )
+
+
+def small_network():
+    """Few centres and narrow layers; sixteen categories and fifty parts."""
+    return PointNet2PartSegmenter(
+        (
+            SetAbstraction((PooledMLP(layers(9, 8, 9)),), (0.6,), (8,), 12),
+            SetAbstraction((PooledMLP(layers(12, 10, 11)),), (1.0,), (8,), 5),
+        ),
+        PooledMLP(layers(14, 12, 13)),
+        (
+            FeaturePropagation(layers(11 + 13, 12)),
+            FeaturePropagation(layers(9 + 12, 10)),
+            FeaturePropagation(layers(25 + 10, 14)),
+        ),
+        layers(14, 12)[0],
+        layers(12, 50)[0],
+    )
+
+
+def rows(n):
+    points = RNG.normal(size=(n, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    normals = points + 0.3 * RNG.normal(size=(n, 3))
+    return jnp.asarray(points), jnp.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+
+
+def random_state(kind, inputs, categories=16, parts=50):
+    """A narrow network's tensors in the published names; `inputs` counts coordinates twice, as the first level does."""
+    state = {}
+
+    def put(linear, norm, a, b, kernel):
+        state[f"{linear}.weight"] = RNG.normal(size=(b, a, *kernel)) * (2 / a) ** 0.5
+        state[f"{linear}.bias"] = 0.1 * RNG.normal(size=b)
+        if norm:
+            state[f"{norm}.weight"], state[f"{norm}.running_var"] = RNG.uniform(0.5, 1.5, (2, b))
+            state[f"{norm}.bias"], state[f"{norm}.running_mean"] = 0.1 * RNG.normal(size=(2, b))
+            state[f"{norm}.num_batches_tracked"] = np.array(7)
+
+    widths = [inputs - 3]
+    for level, (_, radii, _) in enumerate(SAMPLING[kind], start=1):
+        for branch in range(len(radii)):
+            names = ("mlp_convs", "mlp_bns") if kind == "ssg" else (f"conv_blocks.{branch}", f"bn_blocks.{branch}")
+            for i, pair in enumerate(itertools.pairwise((3 + widths[-1], 5, 6 + branch))):
+                put(f"sa{level}.{names[0]}.{i}", f"sa{level}.{names[1]}.{i}", *pair, (1, 1))
+        widths.append(sum(6 + branch for branch in range(len(radii))))
+    put("sa3.mlp_convs.0", "sa3.mlp_bns.0", 3 + widths[-1], 8, (1, 1))
+    put("sa3.mlp_convs.1", "sa3.mlp_bns.1", 8, 12, (1, 1))
+    below = 12
+    for number, own in ((3, widths[2]), (2, widths[1]), (1, categories + 3 + widths[0])):
+        for i, pair in enumerate(itertools.pairwise((own + below, 9, 7 + number))):
+            put(f"fp{number}.mlp_convs.{i}", f"fp{number}.mlp_bns.{i}", *pair, (1,))
+        below = 7 + number
+    put("conv1", "bn1", below, 9, (1,))
+    put("conv2", None, 9, parts, (1,))
+    return state
+
+
+def plain_network(state, kind, points, normals, category, categories=16):
+    """The published network, layer for layer with its concatenations and batch normalisations, in NumPy."""
+
+    def layer(x, linear, norm=None):
+        weight = state[f"{linear}.weight"]
+        x = x @ weight.reshape(weight.shape[:2]).T + state[f"{linear}.bias"]
+        if norm is None:
+            return x
+        x = (x - state[f"{norm}.running_mean"]) / np.sqrt(state[f"{norm}.running_var"] + 1e-5)
+        return np.maximum(x * state[f"{norm}.weight"] + state[f"{norm}.bias"], 0.0)
+
+    def perceptron(x, linear, norm):
+        for i in range(2):
+            x = layer(x, f"{linear}.{i}", f"{norm}.{i}")
+        return x
+
+    features = points if normals is None else np.concatenate([points, normals], axis=1)
+    one_hot = np.tile(np.eye(categories)[category], (len(points), 1))
+    stages = [(points, np.concatenate([one_hot, points, features], axis=1))]
+    for level, (count, radii, members) in enumerate(SAMPLING[kind], start=1):
+        chosen, distance = [0], np.full(len(points), np.inf)
+        while len(chosen) < count:
+            distance = np.minimum(distance, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
+            chosen.append(int(np.argmax(distance)))
+        found = []
+        for i in chosen:
+            squared = ((points - points[i]) ** 2).sum(axis=1)
+            row = []
+            for branch, (radius, size) in enumerate(zip(radii, members, strict=True)):
+                group = np.flatnonzero(squared <= radius**2)[:size]
+                offsets = points[group] - points[i]
+                if kind == "ssg":
+                    names, parts = ("mlp_convs", "mlp_bns"), [offsets, features[group]]
+                else:
+                    names, parts = (f"conv_blocks.{branch}", f"bn_blocks.{branch}"), [features[group], offsets]
+                x = np.concatenate(parts, axis=1)
+                row.append(perceptron(x, f"sa{level}.{names[0]}", f"sa{level}.{names[1]}").max(axis=0))
+            found.append(np.concatenate(row))
+        points, features = points[chosen], np.array(found)
+        stages.append((points, features))
+    x = perceptron(np.concatenate([points, features], axis=1), "sa3.mlp_convs", "sa3.mlp_bns").max(axis=0)
+    x = np.tile(x, (len(points), 1))
+    coarse = None
+    for number, (points, own) in zip((3, 2, 1), reversed(stages), strict=True):
+        if coarse is not None:
+            squared = ((points[:, None] - coarse) ** 2).sum(axis=-1)
+            nearest = np.argsort(squared, axis=1, kind="stable")[:, :3]
+            weights = 1 / (np.take_along_axis(squared, nearest, axis=1) + 1e-8)
+            x = np.einsum("nk,nkf->nf", weights / weights.sum(axis=1, keepdims=True), x[nearest])
+        x = perceptron(np.concatenate([own, x], axis=1), f"fp{number}.mlp_convs", f"fp{number}.mlp_bns")
+        coarse = points
+    x = layer(layer(x, "conv1", "bn1"), "conv2")
+    return x - np.log(np.exp(x).sum(axis=1, keepdims=True))
+
+
+def test_log_probabilities_are_those_of_the_reference(shared, quick_compilation):
+    network = load_part_segmenter(shared / "reference" / "pointnet2_partseg_msg.pth")
+    with np.load(shared / "reference" / "pointnet2_partseg_msg_io.npz") as saved:
+        points, categories, expected = (saved[name] for name in ("points", "category", "log_probs"))
+    assert network.uses_normals
+    assert (network.num_parts, network.num_categories) == (50, 16)
+    assert np.ptp(expected) > 1
+    for cloud, category, log_p in zip(jnp.asarray(points), categories, expected, strict=True):
+        found = segment(network, cloud[:, :3], cloud[:, 3:], jnp.asarray(category))
+        np.testing.assert_allclose(found, log_p, atol=3e-5)
+
+
+@pytest.mark.parametrize(("kind", "inputs", "n"), [("ssg", 6, 60), ("msg", 9, 560)])
+def test_against_a_plain_network(x64, quick_compilation, tmp_path, kind, inputs, n):
+    """Both layouts, with normals and without, and fewer points than centres, which are then repeated."""
+    state = random_state(kind, inputs)
+    save_safetensors(state, tmp_path / "net.safetensors")
+    network = load_part_segmenter(tmp_path / "net.safetensors")
+    assert network.uses_normals == (inputs == 9)
+    points, normals = rows(n)
+    answers = []
+    for category in (4, 15):
+        plain = [np.asarray(a) for a in (points, normals)]
+        answers.append(plain_network(state, kind, plain[0], plain[1] if inputs == 9 else None, category))
+        found = segment(network, points, normals, jnp.asarray(category))
+        np.testing.assert_allclose(found, answers[-1], atol=1e-10)
+    assert np.abs(answers[0] - answers[1]).max() > 0.01
+
+
+def test_masked_rows_and_capacity_do_not_matter_and_a_category_may_be_one_hot(quick_compilation):
+    network, (points, normals) = small_network(), rows(30)
+    expected = segment(network, points, normals, jnp.asarray(3))
+    assert np.ptp(expected, axis=0).max() > 0.01
+    np.testing.assert_allclose(np.exp(expected).sum(axis=1), 1.0, atol=1e-5)
+    place = np.sort(RNG.permutation(40)[:30])
+    mask = np.zeros(40, bool)
+    mask[place] = True
+    for filling in (0.3, np.nan):
+        wide = [np.full((40, 3), filling, np.float32) for _ in range(2)]
+        wide[0][place], wide[1][place] = points, normals
+        found = segment(network, *map(jnp.asarray, wide), jnp.eye(16)[3], jnp.asarray(mask))
+        np.testing.assert_allclose(found[place], expected, atol=1e-5)
+
+
+def test_all_categories_share_one_program(quick_compilation, compilations):
+    network, (points, normals) = small_network(), rows(30)
+    categories = [jnp.asarray(category) for category in range(16)]
+    first = segment(network, points, normals, categories[0])
+    compilations.clear()
+    answers = np.stack([segment(network, points, normals, category) for category in categories])
+    assert not compilations
+    np.testing.assert_array_equal(answers[0], first)
+    assert all(np.abs(a - b).max() > 1e-3 for a, b in itertools.pairwise(answers))
+
+
+def test_calls_that_cannot_be_answered_are_refused():
+    network, (points, normals) = small_network(), rows(30)
+    for category in (-1, 16, np.asarray(50)):
+        with pytest.raises(InputError, match="the network knows 0 to 15"):
+            network(points, normals, category)
+    with pytest.raises(InputError, match="has 12 entries; expected 16"):
+        network(points, normals, jnp.zeros(12))
+    with pytest.raises(InputError, match="n > 0"):
+        network(points[:0], normals[:0], 3)
+
+
+@pytest.mark.parametrize(("kind", "inputs"), [("ssg", 9), ("msg", 6)])
+def test_a_network_survives_safetensors(tmp_path, kind, inputs):
+    save_safetensors(random_state(kind, inputs, categories=3, parts=8), tmp_path / "published.safetensors")
+    network = load_part_segmenter(tmp_path / "published.safetensors")
+    assert (network.num_categories, network.num_parts) == (3, 8)
+    save_safetensors(network, tmp_path / "ours.safetensors")
+    again = load_part_segmenter(tmp_path / "ours.safetensors")
+    assert jax.tree.structure(again) == jax.tree.structure(network)
+    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(network), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
+    shapes = [
+        {name: array.shape for name, array in safetensors.numpy.load_file(file).items() if "num_batches" not in name}
+        for file in (tmp_path / "published.safetensors", tmp_path / "ours.safetensors")
+    ]
+    assert shapes[0] == shapes[1]
+
+
+def test_a_network_with_other_radii_is_not_saved(tmp_path):
+    with pytest.raises(InputError, match="published"):
+        save_safetensors(small_network(), tmp_path / "net.safetensors")
+
+
+def test_tensors_that_make_no_segmenter_are_named(tmp_path):
+    state = random_state("msg", 9)
+
+    def problem(changes, without=(), load=load_part_segmenter):
+        arrays = {name: array for name, array in {**state, **changes}.items() if name not in without}
+        save_safetensors(arrays, tmp_path / "net.safetensors")
+        with pytest.raises(InputError, match=r"net\.safetensors does not hold") as error:
+            load(tmp_path / "net.safetensors")
+        return str(error.value)
+
+    ones = np.ones((4, 5, 1))
+    assert "fp2.mlp_bns.1.running_mean is missing" in problem({}, ["fp2.mlp_bns.1.running_mean"])
+    assert "fp3.mlp_convs.0.weight has shape (4, 5, 1); expected (any, 25)" in problem({"fp3.mlp_convs.0.weight": ones})
+    assert "fp1.mlp_convs.0.weight takes 5 inputs; expected 19 or more" in problem({"fp1.mlp_convs.0.weight": ones})
+    assert "takes 5 inputs; expected 6 (points) or 9" in problem({"sa1.conv_blocks.0.0.weight": ones})
+    assert "conv2.bias has entries that are not finite" in problem({"conv2.bias": np.full(50, np.inf)})
+    assert "no place in it, such as ['conv1.extra']" in problem({"conv1.extra": ones})
+    assert "load_checkpoint reads classifiers" in problem({"fc3.weight": ones})
+    assert "load_part_segmenter reads" in problem({}, load=load_checkpoint)
+
+
+def test_conversion_tells_the_kinds_of_network_apart(tmp_path):
+    save_safetensors(random_state("msg", 9), tmp_path / "net.safetensors")
+    network = convert_checkpoint(tmp_path / "net.safetensors", tmp_path / "copy.safetensors")
+    assert isinstance(network, PointNet2PartSegmenter)
+    assert (tmp_path / "copy.safetensors").read_bytes() == (tmp_path / "net.safetensors").read_bytes()
+
+
+def test_the_parts_of_all_categories_make_up_the_fifty():
+    mask = part_mask()
+    assert mask.shape == (16, 50)
+    assert mask.sum(axis=0).tolist() == [1] * 50
+    assert mask.sum(axis=1).tolist() == [4, 2, 2, 4, 4, 3, 3, 2, 4, 2, 6, 2, 3, 3, 3, 3]
+    assert np.flatnonzero(mask[category_index("chair")]).tolist() == [12, 13, 14, 15]
+    assert [category_index(category.name) for category in CATEGORIES] == list(range(16))
+    assert len({category.synset for category in CATEGORIES}) == 16
+    with pytest.raises(InputError, match=r"no category 'sofa'.*chair"):
+        category_index("sofa")
+
+
+answers_of = eqx.filter_jit(lambda segmenter, cloud: (segmenter(cloud), *segmenter.predict(cloud)))
+
+
+def cloud_of(points, normals, capacity):
+    return PointCloud.from_arrays(np.asarray(points), np.asarray(normals), capacity)
+
+
+def test_a_cloud_segmenter_gives_probabilities_of_the_categorys_parts(quick_compilation):
+    network, (points, normals) = small_network(), rows(30)
+    segmenter = CloudSegmenter(network, "Table", num_points=40, scale=0.5)
+    cloud = cloud_of(2 * points, normals, 50)
+    p, fed, labels = answers_of(segmenter, cloud)
+    p = np.asarray(p)
+    assert p.shape == (40, 50)
+    np.testing.assert_array_equal(np.asarray(fed.mask), np.arange(40) < 30)
+    assert not p[30:].any()
+    assert not p[:, :47].any()
+    np.testing.assert_allclose(p[:30].sum(axis=1), 1.0, atol=1e-6)
+    # The network's own answer, to the points in the order they are fed in, at its scale, given the category.
+    log_p = segment(network, 0.5 * fed.points, fed.normals, jnp.eye(16)[15], fed.mask)
+    given = np.exp(np.asarray(log_p, np.float64))[:30, 47:]
+    np.testing.assert_allclose(p[:30, 47:], given / given.sum(axis=1, keepdims=True), atol=1e-5)
+    np.testing.assert_array_equal(labels, np.where(np.arange(40) < 30, p.argmax(axis=1), -1))
+    assert set(np.asarray(labels[:30]).tolist()) <= {47, 48, 49}
+    p, _, labels = answers_of(segmenter, PointCloud(cloud.points, cloud.normals, jnp.zeros(50, bool)))
+    assert not np.asarray(p).any()
+    assert (np.asarray(labels) == -1).all()
+
+
+def test_scenes_of_all_categories_and_scales_share_one_program(quick_compilation, compilations):
+    network, cloud = small_network(), cloud_of(*rows(30), 50)
+    segmenters = [CloudSegmenter(network, index, 40, 1.0 + 0.1 * index) for index in range(16)]
+    answers_of(segmenters[0], cloud)
+    compilations.clear()
+    answers = [answers_of(segmenter, cloud)[0] for segmenter in segmenters]
+    assert not compilations
+    for answer, allowed in zip(answers, part_mask(), strict=True):
+        np.testing.assert_array_equal(np.asarray(answer).any(axis=0), allowed)
+
+
+def test_gradients_reach_filled_rows_only_whatever_stands_in_the_others(quick_compilation):
+    segmenter, cloud = CloudSegmenter(small_network(), "chair", 40), cloud_of(*rows(30), 50)
+
+    def total(points, normals):
+        return jnp.sum(segmenter(PointCloud(points, normals, cloud.mask))[:, 13])
+
+    filled = [jnp.where(cloud.mask[:, None], array, jnp.nan) for array in (cloud.points, cloud.normals)]
+    for gradient in jax.jit(jax.grad(total, argnums=(0, 1)))(*filled):
+        assert np.isfinite(gradient).all()
+        assert np.abs(gradient).max() > 1e-4
+        assert not np.asarray(gradient)[30:].any()
+
+
+def test_settings_that_cannot_be_used_are_refused():
+    network, cloud = small_network(), cloud_of(*rows(30), 30)
+    with pytest.raises(InputError, match="no category 'sofa'"):
+        CloudSegmenter(network, "sofa")
+    with pytest.raises(InputError, match="the category is 16"):
+        CloudSegmenter(network, 16)
+    with pytest.raises(InputError, match="num_points is 0"):
+        CloudSegmenter(network, 3, num_points=0)
+    with pytest.raises(InputError, match=r"the scale is 0\.0"):
+        CloudSegmenter(network, 3, scale=0.0)
+    with pytest.raises(InputError, match="knows 7 parts"):
+        CloudSegmenter(lambda *_: jnp.zeros((30, 7)), 3)(cloud)

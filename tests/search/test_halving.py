@@ -1,0 +1,87 @@
+"""Successive halving: against rounds recomputed in NumPy from the full table of scores."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnbv.acquisition import Score, expected_score
+from jaxnbv.camera import Camera, fibonacci_sphere, look_at
+from jaxnbv.cloud import PointCloud
+from jaxnbv.scanning import Grid, GridSurface
+from jaxnbv.search import DiscreteSearch, HalvingSearch, Problem
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+GRID, CANDIDATES, SAMPLES = Grid(16), 11, 4
+
+
+class MeanHeight(Score):
+    """Mean of y over the scan."""
+
+    def context(self, cloud):
+        return ()
+
+    def __call__(self, context, scan):
+        return jnp.sum(scan.points[:, 1] * scan.mask) / jnp.maximum(scan.count, 1)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    rng = np.random.default_rng(1)
+    x = np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1)
+    values = [np.linalg.norm(x - rng.uniform(-0.5, 0.5, 3), axis=-1) - rng.uniform(0.5, 1.0) for _ in range(SAMPLES)]
+    surfaces = GridSurface.from_values(np.stack(values).astype(np.float32), 0.0, GRID)
+    cloud = PointCloud.from_arrays(rng.uniform(-1, 1, (3, 3)), np.tile([0.0, 1.0, 0.0], (3, 1)))
+    visited = look_at(fibonacci_sphere(CANDIDATES, 2.5)[:1])
+    return Problem(cloud, visited, jnp.asarray(0), Camera(height=8, width=8), MeanHeight(), surfaces)
+
+
+@pytest.fixture(scope="module")
+def table(problem):
+    """Scores by sample and candidate."""
+    poses = look_at(fibonacci_sphere(CANDIDATES, 2.5))
+    each = eqx.filter_jit(expected_score)
+
+    def of_sample(sample):
+        surface = jax.tree.map(lambda leaf: leaf[sample : sample + 1], problem.surfaces)
+        return each(problem.score, problem.cloud, surface, problem.camera, poses)
+
+    return np.stack([of_sample(sample) for sample in range(SAMPLES)]).astype(np.float64)
+
+
+@eqx.filter_jit
+def propose(search, problem):
+    return search.propose(problem, jax.random.key(0))
+
+
+@pytest.mark.parametrize("num_visited", [0, 1])
+def test_rounds_recomputed(problem, table, num_visited):
+    problem = eqx.tree_at(lambda p: p.num_visited, problem, jnp.asarray(num_visited))
+    left, values, scored = np.arange(CANDIDATES), np.zeros(CANDIDATES), 0
+    while scored < SAMPLES:
+        if scored:
+            left = left[np.argsort(-values[left], kind="stable")[: len(left) // 2]]
+        scored = min(max(2 * scored, 1), SAMPLES)
+        values[left] = table[:scored, left].mean(axis=0)
+        values[:num_visited] = -np.inf
+    proposal = propose(HalvingSearch(CANDIDATES, first_samples=1), problem)
+    best = left[np.argmax(values[left])]
+    np.testing.assert_allclose(proposal.values, values, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(proposal.pose.position, fibonacci_sphere(CANDIDATES, 2.5)[best], atol=1e-6)
+    assert float(proposal.value) == pytest.approx(values[best], rel=1e-4)
+
+
+def test_one_round_is_the_discrete_search(problem):
+    whole, halving = (
+        propose(search, problem)
+        for search in (DiscreteSearch(CANDIDATES), HalvingSearch(CANDIDATES, first_samples=SAMPLES))
+    )
+    np.testing.assert_array_equal(whole.pose.position, halving.pose.position)
+    np.testing.assert_allclose(whole.values, halving.values, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("arguments", "message"), [((0, 2.5, 2), "0 candidates"), ((9, 2.5, 0), "first_samples is 0")])
+def test_bad_numbers_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        HalvingSearch(*arguments)

@@ -1,0 +1,199 @@
+"""The heat utility against a dense solve in NumPy, across processes, in the acquisition, and where no heat gets."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import robust_laplacian
+import trimesh
+
+from jaxnbv.acquisition import ExpectedUtilityImprovement, expected_score
+from jaxnbv.camera import Camera, fibonacci_sphere, look_at
+from jaxnbv.checks import InputError
+from jaxnbv.cloud import PointCloud
+from jaxnbv.diffusion import HeatProblem
+from jaxnbv.planner import Planner
+from jaxnbv.scanning import Grid, GridSurface, TriangleMesh, scan
+from jaxnbv.search import GradientSearch
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks.heat import ColdestPoint, body_temperature, coldest_point
+
+RNG = np.random.default_rng(0)
+CAMERA, GRID = Camera(height=8, width=8), Grid(24)
+POLE = np.array([0.0, 0.0, 1.0])
+HEAT = HeatProblem(POLE, radius=0.4, power=8.0, duration=1.0, steps=6, initial=0.5)
+
+
+def sphere(count):
+    directions = RNG.normal(size=(count, 3))
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def cloud_of(points, capacity=None):
+    return PointCloud.from_arrays(points, np.tile(POLE, (len(points), 1)), capacity)
+
+
+def utility_of(heat, reached_only=False, workers=None):
+    return ColdestPoint(
+        heat.source, heat.power, heat.duration, heat.steps, heat.initial, heat.radius, reached_only, workers
+    )
+
+
+def nothing(capacity):
+    return PointCloud(jnp.zeros((capacity, 3)), jnp.zeros((capacity, 3)), jnp.zeros(capacity, bool))
+
+
+def least_in_numpy(points, heat):
+    """Coldest of a connected cloud by dense solves of the paper's (I - h Delta) u_{k+1} = u_k + h f."""
+    # The library's Laplacian depends a little on the order of the points; ours are sorted.
+    points = points[np.lexsort(points.T[::-1])]
+    weak, mass = robust_laplacian.point_cloud_laplacian(points, n_neighbors=30)
+    delta = -np.linalg.inv(mass.toarray()) @ weak.toarray()
+    step = heat.duration / heat.steps
+    u = np.full(len(points), heat.initial)
+    for _ in range(heat.steps):
+        f = heat.power * (np.linalg.norm(points - heat.source, axis=1) <= heat.radius)
+        u = np.linalg.solve(np.eye(len(u)) - step * delta, u + step * f)
+    return u.min()
+
+
+def test_the_utility_against_a_dense_solve(x64):
+    points = sphere(150)
+    utility = utility_of(HEAT, workers=1)
+    found = utility(cloud_of(points, 170))
+    assert float(found) == pytest.approx(-least_in_numpy(points, HEAT), rel=1e-9)
+    assert float(found) < -0.55
+    for change in ({"power": 4.0}, {"duration": 2.0}, {"steps": 2}, {"initial": -1.0}, {"radius": 0.8}):
+        other = dataclasses.replace(HEAT, **change)
+        value = float(utility_of(other, workers=1)(cloud_of(points)))
+        assert value == pytest.approx(-least_in_numpy(points, other), rel=1e-9)
+        assert abs(value - float(found)) > 1e-3
+
+
+def test_neither_workers_nor_the_order_of_the_points_change_a_bit():
+    points = np.stack([sphere(90) for _ in range(11)])
+    clouds = PointCloud(jnp.asarray(points), jnp.asarray(points), jnp.asarray(RNG.uniform(size=(11, 90)) < 0.7))
+    turned = jax.tree.map(lambda rows: rows[:, ::-1], clouds)
+    # Of the shared pool of processes, which a second call finds as it was.
+    values = [np.asarray(jax.vmap(utility_of(HEAT, workers=w))(c)) for w, c in ((1, clouds), (2, clouds), (2, turned))]
+    np.testing.assert_array_equal(values[1], values[0])
+    np.testing.assert_array_equal(values[2], values[0])
+    one_by_one = [float(utility_of(HEAT, workers=1)(clouds[i])) for i in range(11)]
+    np.testing.assert_array_equal(values[0], np.asarray(one_by_one, values[0].dtype))
+    assert len(set(one_by_one)) == 11
+
+
+def test_scenes_that_differ_in_the_source_share_a_compilation(compilations):
+    cloud, call = cloud_of(sphere(80)), eqx.filter_jit(lambda utility, cloud: utility(cloud))
+    first = call(utility_of(HEAT, workers=1), cloud)
+    before = len(compilations)
+    second = call(utility_of(dataclasses.replace(HEAT, source=-POLE), workers=1), cloud)
+    assert len(compilations) == before
+    assert float(first) != float(second)
+
+
+def test_many_sources_at_once(x64):
+    points, sources = sphere(80), sphere(3)
+    utilities = eqx.filter_vmap(lambda source: utility_of(dataclasses.replace(HEAT, source=source), workers=1))(
+        jnp.asarray(sources)
+    )
+    values = eqx.filter_vmap(lambda utility: utility(cloud_of(points)))(utilities)
+    for value, source in zip(values, sources, strict=True):
+        assert float(value) == pytest.approx(
+            -least_in_numpy(points, dataclasses.replace(HEAT, source=source)), rel=1e-9
+        )
+
+
+def test_what_the_source_does_not_reach(x64):
+    near, far = sphere(60), sphere(60) + np.array([9.0, 0.0, 0.0])
+    everything, reached = (utility_of(HEAT, only, workers=1) for only in (False, True))
+    alone = float(everything(cloud_of(near)))
+    assert alone == float(reached(cloud_of(near))) == pytest.approx(-least_in_numpy(near, HEAT), rel=1e-9)
+    both = cloud_of(np.concatenate([near, far]))
+    assert float(everything(both)) == -0.5
+    assert float(reached(both)) == pytest.approx(alone, rel=1e-9)
+    # The least there can be, u0 + T power, where there is nothing to take the minimum over.
+    assert float(everything(cloud_of(far))) == -0.5
+    assert float(reached(cloud_of(far))) == -8.5
+    assert float(everything(nothing(5))) == float(reached(nothing(5))) == -8.5
+    single = cloud_of(POLE[None])
+    assert float(everything(single)) == pytest.approx(-8.5)
+
+
+def test_gradients_are_refused():
+    utility = utility_of(HEAT, workers=1)
+    cloud = cloud_of(sphere(20))
+    with pytest.raises(InputError, match="ColdestPoint has no derivative"):
+        jax.grad(lambda points: utility(eqx.tree_at(lambda c: c.points, cloud, points)))(cloud.points)
+    with pytest.raises(InputError, match="use DiscreteSearch"):
+        Planner(
+            GeometricSPSR(truncation=4, lengthscale=0.2),
+            CAMERA,
+            ExpectedUtilityImprovement(utility),
+            GradientSearch(dof=2),
+        )
+
+
+@pytest.mark.usefixtures("quick_compilation")
+def test_expected_improvements_by_hand():
+    """A cap is known; views of two balls are worth what they add to it."""
+    nodes = np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1)
+    values = np.stack([np.linalg.norm(nodes, axis=-1) - r for r in (0.95, 1.0)])
+    surfaces = GridSurface.from_values(jnp.asarray(values, jnp.float32), 0.0, GRID)
+    poses = look_at(jnp.asarray(fibonacci_sphere(5, 2.5)))
+    points = sphere(400)
+    data = cloud_of(points[points[:, 2] > 0.8], capacity=100)
+    utility = utility_of(HEAT, workers=2)
+    found = eqx.filter_jit(expected_score)(ExpectedUtilityImprovement(utility), data, surfaces, CAMERA, poses)
+    scans = eqx.filter_jit(eqx.filter_vmap(scan, in_axes=(0, None, None)))(surfaces, CAMERA, poses)
+    known, seen = data.to_numpy()[0], [[scans[s, i].to_numpy()[0] for i in range(5)] for s in range(2)]
+    unions = [[np.concatenate([known, view]).astype(np.float64) for view in views] for views in seen]
+    least = np.array([[least_in_numpy(union, HEAT) for union in views] for views in unions])
+    expected = np.maximum(0.0, least_in_numpy(known.astype(np.float64), HEAT) - least).mean(axis=0)
+    # Triangulations hang on the last bits of the scans, which compilation changes.
+    np.testing.assert_allclose(found, expected, rtol=5e-3)
+    assert np.ptp(expected) > 0.1
+
+
+def test_the_coldest_point_of_a_mesh_and_of_a_scan_of_it():
+    """A bar that is heated at one end is coldest at the other."""
+    bar = trimesh.creation.box((2.5, 0.15, 0.15))
+    mesh = TriangleMesh.from_arrays(np.asarray(bar.vertices), np.asarray(bar.faces))
+    heat = HeatProblem([-1.25, 0.0, 0.0], radius=0.2)
+    points, temperature = body_temperature(mesh, heat)
+    truth = coldest_point(mesh, heat)
+    assert truth.point[0] == pytest.approx(1.25)
+    assert truth.temperature == temperature.values.min() > 0
+    assert len(points) > 100 * len(mesh.vertices)
+    cloud = cloud_of(mesh.sample_points(jax.random.key(0), 2000), 2100)
+    estimate = coldest_point(cloud, heat)
+    assert estimate.point[0] > 1.2
+    assert estimate.temperature == pytest.approx(truth.temperature, rel=0.2)
+    assert float(utility_of(heat, workers=1)(cloud)) == pytest.approx(-estimate.temperature, rel=1e-5)
+
+
+def test_the_coldest_point_that_heat_reaches():
+    near, far = sphere(60), sphere(60) + np.array([9.0, 0.0, 0.0])
+    both = cloud_of(np.concatenate([near, far]))
+    assert coldest_point(both, HEAT).temperature == 0.5
+    reached = coldest_point(both, HEAT, reached_only=True)
+    assert np.abs(reached.point).max() < 1.1
+    assert reached.temperature > 0.55
+    for body, why in ((cloud_of(far), "none of its 60 points"), (nothing(4), "it is empty")):
+        with pytest.raises(InputError, match=why):
+            coldest_point(body, HEAT, reached_only=True)
+
+
+def test_points_that_are_not_finite_and_wrong_numbers_of_workers_are_told():
+    cloud = cloud_of(sphere(20))
+    broken = eqx.tree_at(lambda c: c.points, cloud, cloud.points.at[3].set(jnp.nan))
+    with pytest.raises(jax.errors.JaxRuntimeError, match="1 points are not finite"):
+        jax.block_until_ready(utility_of(HEAT, workers=1)(broken))
+    masked = eqx.tree_at(lambda c: c.mask, broken, cloud.mask.at[3].set(False))
+    assert np.isfinite(float(utility_of(HEAT, workers=1)(masked)))
+    with pytest.raises(InputError, match="workers is 0"):
+        utility_of(HEAT, workers=0)
+    assert utility_of(HEAT).workers >= 1

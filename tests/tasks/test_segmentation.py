@@ -1,0 +1,126 @@
+"""The soft part count: against its formula in NumPy, central differences, and its limits."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnbv.acquisition import ExpectedUtilityImprovement
+from jaxnbv.cloud import PointCloud, concatenate
+from jaxnbv.tasks import SoftPartCount, part_counts
+
+RNG = np.random.default_rng(0)
+PARTS = 5
+
+
+class Linear(eqx.Module):
+    """Probabilities that follow from where a point is and how it faces."""
+
+    weight: jax.Array
+
+    def __call__(self, cloud):
+        features = jnp.concatenate([cloud.points, cloud.normals], axis=-1)
+        return jnp.where(cloud.mask[:, None], jax.nn.softmax(features @ self.weight, axis=-1), 0.0)
+
+
+def make_cloud(filled, capacity):
+    normals = RNG.standard_normal((filled, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return PointCloud.from_arrays(RNG.uniform(-1, 1, (filled, 3)), normals, capacity)
+
+
+def by_hand(cloud, weight, target):
+    """Point by point, part by part."""
+    total = np.zeros(weight.shape[1])
+    for point, normal in zip(*cloud.to_numpy(), strict=True):
+        e = np.exp(np.concatenate([point, normal]).astype(np.float64) @ weight)
+        total += e / e.sum()
+    return sum(np.tanh(soft / target) for soft in total)
+
+
+@pytest.mark.parametrize("target", [0.5, 4.0, 60.0])
+def test_the_formula_with_masked_rows(x64, target):
+    weight = 2.0 * RNG.standard_normal((6, PARTS))
+    cloud = make_cloud(17, 25)
+    utility = SoftPartCount(Linear(jnp.asarray(weight)), target)
+    assert float(utility(cloud)) == pytest.approx(by_hand(cloud, weight, target), rel=1e-12)
+    # What stands in empty rows must not count.
+    dirty = eqx.tree_at(lambda c: c.points, cloud, jnp.where(cloud.mask[:, None], cloud.points, 9.0))
+    assert float(utility(dirty)) == float(utility(cloud))
+
+
+def test_its_gradient_against_central_differences(x64):
+    utility = SoftPartCount(Linear(jnp.asarray(2.0 * RNG.standard_normal((6, PARTS)))), 3.0)
+    cloud = make_cloud(9, 12)
+
+    def value(points, normals):
+        return utility(PointCloud(points, normals, cloud.mask))
+
+    slopes = jax.grad(value, argnums=(0, 1))(cloud.points, cloud.normals)
+    for argument, slope in enumerate(slopes):
+        for row, axis in [(0, 0), (4, 2), (8, 1), (11, 0)]:
+            ends = []
+            for step in (-1e-6, 1e-6):
+                rows = [cloud.points, cloud.normals]
+                rows[argument] = rows[argument].at[row, axis].add(step)
+                ends.append(float(value(*rows)))
+            assert float(slope[row, axis]) == pytest.approx((ends[1] - ends[0]) / 2e-6, rel=1e-6, abs=1e-9)
+    # The last row is masked: nothing there may pull.
+    assert not np.asarray(slopes[0])[9:].any()
+    assert np.asarray(slopes[0])[:9].any()
+
+
+def certain(part):
+    """A segmenter that is sure of everything."""
+    return lambda cloud: jnp.where(cloud.mask[:, None], jax.nn.one_hot(jnp.full(cloud.capacity, part), PARTS), 0.0)
+
+
+def test_it_saturates_for_a_part_that_is_found():
+    def gain(seen):
+        score = ExpectedUtilityImprovement(SoftPartCount(certain(2), 60.0))
+        return float(score(score.context(make_cloud(seen, 1000)), make_cloud(30, 30)))
+
+    gains = [gain(seen) for seen in (1, 60, 200, 600)]
+    assert gains[0] > gains[1] > gains[2] > gains[3]
+    # tanh(31 / 60) - tanh(1 / 60), and within one in a million of 1 - 1.
+    assert gains[0] == pytest.approx(np.tanh(31 / 60) - np.tanh(1 / 60), rel=1e-5)
+    assert gains[3] < 1e-6
+
+
+def test_a_new_part_is_worth_more_than_more_of_the_same():
+    seen = make_cloud(200, 200)
+
+    def segmenter(cloud):
+        parts = jnp.where(jnp.arange(cloud.capacity) < 200, 0, jnp.where(cloud.points[:, 0] > 5.0, 1, 0))
+        return jnp.where(cloud.mask[:, None], jax.nn.one_hot(parts, PARTS), 0.0)
+
+    utility = SoftPartCount(segmenter)
+    more = make_cloud(30, 30)
+    other = PointCloud(more.points + 10.0, more.normals, more.mask)
+    assert float(utility(concatenate(seen, other))) > float(utility(concatenate(seen, more))) + 0.4
+
+
+def test_it_is_at_most_the_number_of_parts_and_zero_of_nothing():
+    utility = SoftPartCount(Linear(jnp.zeros((6, PARTS))), 1.0)
+    assert float(utility(make_cloud(400, 400))) == pytest.approx(PARTS)
+    assert float(utility(PointCloud(jnp.zeros((4, 3)), jnp.zeros((4, 3)), jnp.zeros(4, bool)))) == 0.0
+
+
+def test_a_scan_that_sees_nothing_is_worth_nothing():
+    score = ExpectedUtilityImprovement(SoftPartCount(certain(1)))
+    nothing = PointCloud(jnp.zeros((4, 3)), jnp.zeros((4, 3)), jnp.zeros(4, bool))
+    assert float(score(score.context(make_cloud(5, 8)), nothing)) == 0.0
+
+
+def test_counts_of_predicted_points():
+    p = RNG.dirichlet(np.ones(PARTS), size=40)
+    p[33:] = 0.0
+    expected = np.bincount(p[:33].argmax(axis=1), minlength=PARTS)
+    np.testing.assert_array_equal(part_counts(jnp.asarray(p, jnp.float32)), expected)
+
+
+@pytest.mark.parametrize("target", [0.0, -3.0])
+def test_a_target_that_is_not_positive_is_refused(target):
+    with pytest.raises(ValueError, match="N_target is"):
+        SoftPartCount(certain(0), target)
