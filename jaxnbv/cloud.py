@@ -168,6 +168,7 @@ def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
     return _take(cloud, chosen, kept)
 
 
+@functools.partial(jax.jit, static_argnames="capacity")
 def limit_capacity(cloud: PointCloud, capacity: int) -> PointCloud:
     """The cloud in `capacity` rows, the filled ones first: all its points where they fit, else farthest point samples.
 

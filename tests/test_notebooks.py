@@ -21,6 +21,11 @@ resolution, pixels, num_candidates, views = 40, 24, 12, 2
 num_samples, truncation, lengthscale = 2, 16, 0.02
 resolution, pixels, num_candidates, iterations = 40, 16, 12, 3
 """,
+    "04_heat_on_your_mesh.ipynb": """
+mesh_file = None
+num_samples, truncation, lengthscale = 2, 16, 0.02
+resolution, pixels, num_candidates, num_points, views = 40, 20, 6, 300, 2
+""",
 }
 
 

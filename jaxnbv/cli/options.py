@@ -20,12 +20,15 @@ class Task(StrEnum):
     ENTROPY = "entropy"
     MIXED = "mixed"
     COVERAGE = "coverage"
+    PARTS = "parts"
+    HEAT = "heat"
 
 
 class SearchName(StrEnum):
     """How the next view is found."""
 
     DISCRETE = "discrete"
+    HALVING = "halving"
     GRADIENT_2DOF = "gradient-2dof"
     GRADIENT_6DOF = "gradient-6dof"
     HYBRID = "hybrid"
@@ -45,16 +48,18 @@ class Device(StrEnum):
 TaskOption = Annotated[
     Task,
     typer.Option(
-        help="What the views are for: coverage is the object's shape; the others its class, by expected cross-entropy, "
-        "by expected reduction of entropy, or by cross-entropy until the entropy falls to 0.75."
+        help="What the views are for: the object's class, by expected cross-entropy, by expected reduction of "
+        "entropy, or by cross-entropy until the entropy falls to 0.75; its shape (coverage); its parts; or the coldest "
+        "point while it is heated at one place."
     ),
 ]
 SearchOption = Annotated[
     SearchName,
     typer.Option(
-        help="How the next view is found: discrete is the expected value of the task over 120 candidates; "
-        "gradient-2dof climbs it by gradient over the sphere, gradient-6dof over positions and rotations (2.2 to "
-        "2.8 from the object's centre, which stays in view), hybrid over the sphere from the best candidates; "
+        help="How the next view is found: discrete is the expected value of the task over 120 candidates (heat: 100); "
+        "halving drops the worse half again and again while samples are added; "
+        "gradient-2dof climbs it by gradient over the sphere, gradient-6dof over positions and rotations (up to 0.3 "
+        "nearer or farther, the object's centre in view), hybrid over the sphere from the best candidates; "
         "farthest, random and uncertainty are the paper's baselines over the candidates."
     ),
 ]
@@ -63,6 +68,20 @@ SeedOption = Annotated[
     int, typer.Option(min=0, max=2**63 - 1, help="Seed of the sensor's noise and of the posterior samples.")
 ]
 OutOption = Annotated[Path | None, typer.Option(help="Output folder.", show_default="runs/NAME-SEARCH")]
+CategoryOption = Annotated[
+    str | None,
+    typer.Option(
+        help="What the object is, for parts: one of ShapeNet-part's categories, such as chair. Upright along y, "
+        "facing x."
+    ),
+]
+SourceOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Where the object is heated, for heat: x,y,z of a point on it, in scene units.",
+        show_default="the middle of the first view",
+    ),
+]
 NoiseOption = Annotated[float, typer.Option(help="Standard deviation of the sensor's noise on points and normals.")]
 QuickOption = Annotated[
     bool, typer.Option("--quick", help="Small settings, for a first look in under a minute; not the paper's.")

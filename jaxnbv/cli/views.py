@@ -2,18 +2,18 @@
 
 import re
 import time
-from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import jax
 import numpy as np
 import typer
 
-from jaxnbv.acquisition import ExpectedUtilityImprovement, Score
+from jaxnbv.acquisition import Score
 from jaxnbv.camera import Camera, Pose, look_at
 from jaxnbv.checks import InputError, require
 from jaxnbv.cli.options import (
+    CategoryOption,
     Device,
     DeviceOption,
     FramingOption,
@@ -24,40 +24,41 @@ from jaxnbv.cli.options import (
     SearchName,
     SearchOption,
     SeedOption,
+    SourceOption,
     Task,
     TaskOption,
     ViewsOption,
     prepare,
 )
-from jaxnbv.datasets import PATTERNS, Framing, Split, demo_object, hidden_view, pyramid_scene
-from jaxnbv.episode import Episode, simulate
-from jaxnbv.networks import CloudClassifier, load_checkpoint, pyramid_classifier
-from jaxnbv.planner import Planner
-from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, Surface, load_mesh
-from jaxnbv.search import (
-    ConstrainedPoses,
-    DiscreteSearch,
-    FarthestView,
-    GradientSearch,
-    HybridSearch,
-    RandomView,
-    UncertaintyView,
+from jaxnbv.cli.planners import (
+    CLASS_TASKS,
+    class_score,
+    heat_score,
+    mesh_score,
+    part_score,
+    pyramid_planner,
+    task_planner,
 )
-from jaxnbv.surfaces import GeometricSPSR
-from jaxnbv.tasks import Classifier, Coverage, CrossEntropy, MixedEntropy, NegativeEntropy
-from jaxnbv.tasks.classification import class_names, predict
+from jaxnbv.datasets import (
+    PATTERNS,
+    Framing,
+    Split,
+    demo_object,
+    heat_scene,
+    hidden_view,
+    part_scene,
+    pyramid_scene,
+    source_view,
+)
+from jaxnbv.diffusion import HeatProblem
+from jaxnbv.episode import Episode, simulate
+from jaxnbv.networks import CATEGORIES, pyramid_classifier
+from jaxnbv.planner import Planner
+from jaxnbv.scanning import SDFSurface, SensorNoise, Surface, TriangleMesh, load_mesh, scan
+from jaxnbv.tasks import Coverage
 from jaxnbv.viz import write_report
+from jaxnbv.viz.findings import Finding, finding
 from jaxnbv.viz.words import quantity
-
-SEARCHES: dict[SearchName, Any] = {
-    SearchName.DISCRETE: DiscreteSearch,
-    SearchName.GRADIENT_2DOF: partial(GradientSearch, dof=2),
-    SearchName.GRADIENT_6DOF: partial(GradientSearch, space=ConstrainedPoses()),
-    SearchName.HYBRID: HybridSearch,
-    SearchName.FARTHEST: FarthestView,
-    SearchName.RANDOM: RandomView,
-    SearchName.UNCERTAINTY: UncertaintyView,
-}
 
 FirstOption = Annotated[
     str, typer.Option(help="Position of the first camera, x,y,z in scene units; it looks at the origin.")
@@ -69,11 +70,11 @@ def demo(
     task: TaskOption = Task.CROSS_ENTROPY,
     search: SearchOption = SearchName.DISCRETE,
     views: ViewsOption = 5,
-    scene: Annotated[int, typer.Option(min=0, help="Which pyramid of the test split.")] = 0,
+    scene: Annotated[int, typer.Option(min=0, help="Which object: the number of a scene.")] = 0,
     framing: FramingOption = Framing.WHOLE,
     first: Annotated[
         str | None,
-        typer.Option(help="Position of the first camera, x,y,z.", show_default="one that does not show the pattern"),
+        typer.Option(help="Position of the first camera, x,y,z.", show_default="one that hides the pattern"),
     ] = None,
     seed: SeedOption = 0,
     out: OutOption = None,
@@ -85,20 +86,38 @@ def demo(
     """Find out which pattern is pressed into the base of a pyramid: no file, no network.
 
     The first view does not show the pattern. The pyramid is small enough for a view to see nearly all of its near side;
-    with --framing close-up a view shows a patch of it. With --task coverage the object is a laid tea mug, to be seen
-    all round; --scene and --framing do not matter then.
+    with --framing close-up a view shows a patch of it. With --task parts the object is a procedural one of thirteen
+    categories, with --task heat one of four kinds that is heated at one place, and with --task coverage a laid tea mug,
+    to be seen all round.
     """
     prepare(device)
+    name, surface, score, start = _demo_scene(task, scene, framing, seed)
+    if task in CLASS_TASKS and not quick:
+        planner = pyramid_planner(score, search, framing)
+    else:
+        planner = task_planner(task, score, search, quick)
+    if first is not None:
+        start = look_at(_position("--first", first))
+    _run(name, search, surface, planner, start, views, seed, out, noise, quick, report)
+
+
+def _demo_scene(task: Task, scene: int, framing: Framing, seed: int) -> tuple[str, Surface, Score, Pose]:
+    """An object to show a task on: its name, its surface, the score, and a first view."""
+    start = look_at(_position("--first", DEFAULT_FIRST))
     if task is Task.COVERAGE:
-        planner, start = _planner(Coverage(), search, quick), look_at(_position(first or DEFAULT_FIRST))
-        _run("mug", search, demo_object(), planner, start, views, seed, out, noise, quick, report)
-        return
+        return "mug", demo_object(), Coverage(), start
+    if task is Task.PARTS:
+        thing = part_scene(Split.TEST, scene)
+        category = CATEGORIES[int(thing.category)].name
+        return f"{category}-parts", SDFSurface(thing.solid), part_score(category), start
+    if task is Task.HEAT:
+        heated = heat_scene(scene)
+        start = source_view(heated, jax.random.key(seed))
+        return f"{heated.name}-heat", SDFSurface(heated.solid), heat_score(np.asarray(heated.source)), start
     pyramid = pyramid_scene(Split.TEST, scene, framing)
-    score = _score(task, pyramid_classifier(framing.longest_side))
-    planner = _planner(score, search, quick) if quick else _pyramid_planner(score, search, framing)
     typer.echo(f"the pattern is a {PATTERNS[int(pyramid.label)]}")
-    start = hidden_view(pyramid, jax.random.key(seed)) if first is None else look_at(_position(first))
-    _run("pyramid", search, SDFSurface(pyramid), planner, start, views, seed, out, noise, quick, report)
+    score = class_score(task, pyramid_classifier(framing.longest_side))
+    return "pyramid", SDFSurface(pyramid), score, hidden_view(pyramid, jax.random.key(seed))
 
 
 def run(
@@ -108,8 +127,13 @@ def run(
     task: TaskOption = Task.COVERAGE,
     network: Annotated[
         Path | None,
-        typer.Option(help="A PointNet++ classifier, .pth or .safetensors, for the tasks that are about the class."),
+        typer.Option(
+            help="A PointNet++ network, .pth or .safetensors: a classifier for the tasks that are about the class, "
+            "which need one; for parts a part segmenter, in place of the one that ships."
+        ),
     ] = None,
+    category: CategoryOption = None,
+    source: SourceOption = None,
     search: SearchOption = SearchName.DISCRETE,
     views: ViewsOption = 5,
     first: FirstOption = DEFAULT_FIRST,
@@ -126,35 +150,31 @@ def run(
     is 2.5 scene units; cameras stand 2.5 from its centre.
     """
     prepare(device)
-    require(
-        (network is None) == (task is Task.COVERAGE),
-        f"--task {task} with --network {network}: the tasks about the class need a network, coverage takes none",
-    )
-    # Published networks saw objects scaled into the unit sphere; in the scene half the longest side is 1.25.
-    score = Coverage() if network is None else _score(task, CloudClassifier(load_checkpoint(network), scale=1 / 1.25))
-    scene = load_mesh(mesh)
-    planner = _planner(score, search, quick)
-    _run(mesh.stem, search, scene, planner, look_at(_position(first)), views, seed, out, noise, quick, report)
+    surface, start = load_mesh(mesh), look_at(_position("--first", first))
+    require(source is None or task is Task.HEAT, f"--task {task} takes no --source: it is for heat")
+    heated = _heat_source(surface, start, source) if task is Task.HEAT else None
+    planner = task_planner(task, mesh_score(task, network, category, heated), search, quick)
+    _run(mesh.stem, search, surface, planner, start, views, seed, out, noise, quick, report)
 
 
-def _score(task: Task, classifier: Classifier) -> Score:
-    if task is Task.ENTROPY:
-        return ExpectedUtilityImprovement(NegativeEntropy(classifier), num_points=1024)
-    return CrossEntropy(classifier) if task is Task.CROSS_ENTROPY else MixedEntropy(classifier)
-
-
-def _pyramid_planner(score: Score, search: SearchName, framing: Framing) -> Planner:
-    """The surfaces are imagined as those were that the classifier was trained on."""
-    model, grid = GeometricSPSR(lengthscale=0.01, truncation=32), Grid(64, 0.7 * framing.longest_side)
-    return Planner(model, Camera(), score, SEARCHES[search](), grid=grid)
-
-
-def _planner(score: Score, search: SearchName, quick: bool) -> Planner:
-    if not quick:
-        return Planner(GeometricSPSR(), Camera(), score, SEARCHES[search]())
-    model = GeometricSPSR(lengthscale=0.012, truncation=24)
-    camera = Camera(height=24, width=24)
-    return Planner(model, camera, score, SEARCHES[search](num_candidates=40), 4, Grid(56), capacity=2048)
+def _heat_source(surface: TriangleMesh, first: Pose, source: str | None) -> np.ndarray:
+    """The point that was asked for, or the one in the middle of the first view."""
+    if source is not None:
+        place = np.asarray(_position("--source", source))
+        points = surface.sample_points(jax.random.key(0), 20_000)
+        nearest = points[np.linalg.norm(points - place, axis=1).argmin()]
+        distance = float(np.linalg.norm(nearest - place))
+        require(
+            distance <= HeatProblem.radius,
+            f"--source is {source}, {distance:.2f} away from the object, but heat goes in within {HeatProblem.radius} "
+            f"only. The nearest point is {','.join(f'{x:.2f}' for x in nearest)}",
+        )
+        return place
+    points, _ = scan(surface, Camera(), first).to_numpy()
+    require(len(points) > 0, "the first view does not see the object: give another --first, or a --source")
+    along = (points - np.asarray(first.position)) @ np.asarray(first.forward)
+    beside = np.linalg.norm(points - np.asarray(first.position) - along[:, None] * np.asarray(first.forward), axis=1)
+    return points[beside.argmin()]
 
 
 def _run(
@@ -181,12 +201,12 @@ def _run(
     typer.echo(f"episode  {folder}   ({time.perf_counter() - start:.0f} s)")
 
 
-def _position(text: str) -> tuple[float, float, float]:
+def _position(option: str, text: str) -> tuple[float, float, float]:
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError as error:
-        raise InputError(f"--first is {text!r}; give three numbers such as 0.8,0.9,2.2") from error
-    require(bool(np.isfinite([x, y, z]).all()), f"--first is {text!r}; its numbers must be finite")
+        raise InputError(f"{option} is {text!r}; give three numbers such as 0.8,0.9,2.2") from error
+    require(bool(np.isfinite([x, y, z]).all()), f"{option} is {text!r}; its numbers must be finite")
     return x, y, z
 
 
@@ -194,7 +214,7 @@ def _summarise(episode: Episode) -> None:
     """Lines for each view: where from, why, and what it told."""
     score = episode.planner.acquisition
     sought = quantity(episode.planner.search, score)
-    before = None
+    known: Finding | None = None
     for index, view in enumerate(episode.views, start=1):
         position = ", ".join(f"{value:+.2f}" for value in np.asarray(view.pose.position))
         line = f"view {index}   from ({position})   {int(view.scan.count):5d} points, {int(view.cloud.count):5d} kept"
@@ -210,11 +230,6 @@ def _summarise(episode: Episode) -> None:
                 better = "found nothing better" if float(view.proposal.value) <= best else f"improved on {best:.4g}"
                 line += f"where ascent from {len(ways.values)} of {len(values)} candidates {better}"
         typer.echo(line)
-        log_p = predict(score, view.cloud)
-        if log_p is not None:
-            after = np.exp(np.asarray(log_p))
-            names = class_names(score) or tuple(str(number) for number in range(len(after)))
-            shown = sorted(np.argsort(-after)[:5])
-            changes = (f"{names[c]} {'' if before is None else f'{before[c]:.2f} -> '}{after[c]:.2f}" for c in shown)
-            typer.echo(f"         {'   '.join(changes)}")
-            before = after
+        known = finding(score, view.cloud, known)
+        if known is not None:
+            typer.echo(f"         {known.line}")

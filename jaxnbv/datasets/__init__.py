@@ -4,6 +4,7 @@ from jaxnbv.datasets.demo import demo_object as demo_object
 from jaxnbv.datasets.heat_objects import HEAT_OBJECTS as HEAT_OBJECTS
 from jaxnbv.datasets.heat_objects import HeatScene as HeatScene
 from jaxnbv.datasets.heat_objects import heat_scene as heat_scene
+from jaxnbv.datasets.heat_objects import source_view as source_view
 from jaxnbv.datasets.labelled import LabelledSolid as LabelledSolid
 from jaxnbv.datasets.parts import PART_CATEGORIES as PART_CATEGORIES
 from jaxnbv.datasets.parts import PartScene as PartScene

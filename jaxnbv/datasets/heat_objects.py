@@ -4,10 +4,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
+from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import require
 from jaxnbv.datasets.labelled import LabelledSolid, assemble, bar, box, generator, path, ring, rod
+from jaxnbv.scanning import SDFSurface, scan
+from jaxnbv.search.base import sphere_candidates
 
 _LABEL = 0
 
@@ -39,6 +42,19 @@ def heat_scene(index: int) -> HeatScene:
         solid.rotation[0], solid.half_size[0] * jnp.asarray(place), precision="highest"
     )
     return HeatScene(solid, name, source)
+
+
+def source_view(scene: HeatScene, key: PRNGKeyArray, num_candidates: int = 100, radius: float = 3.0) -> Pose:
+    """A candidate of the sphere from which the heat source shows, drawn uniformly from them.
+
+    **Raises:** `ValueError` if there is none.
+    """
+    poses = sphere_candidates(num_candidates, radius)
+    scans = scan(SDFSurface(scene.solid), Camera(), poses)
+    near = jnp.linalg.norm(scans.points - scene.source, axis=-1) < 0.05
+    (shown,) = np.nonzero(jnp.any(near & scans.mask, axis=-1))
+    require(len(shown) > 0, f"none of {num_candidates} candidates sees the heat source: ask for more of them")
+    return poses[int(jax.random.choice(key, shown))]
 
 
 # Each gives the primitives, the heated one first, and the source in that one's own frame, in units of its half sizes.

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import Array, Int, Key, PRNGKeyArray
 
 from jaxnbv.camera import Camera, Pose, look_at
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
@@ -59,14 +59,14 @@ def _stacked(scenes: Sequence[PartScene]) -> tuple[LabelledSolid, Int[Array, " s
     return solids, jnp.asarray([scene.category for scene in scenes])
 
 
-def _keys(split: Split, indices: Sequence[int]) -> PRNGKeyArray:
+def _keys(split: Split, indices: Sequence[int]) -> Key[Array, " scenes"]:
     of_split = jax.random.fold_in(jax.random.key(5), list(Split).index(split))
     return jax.vmap(lambda index: jax.random.fold_in(of_split, index))(jnp.asarray(indices))
 
 
 @eqx.filter_jit
 def _scanned(
-    solids: LabelledSolid, categories: Int[Array, " scenes"], keys: PRNGKeyArray, num_points: int
+    solids: LabelledSolid, categories: Int[Array, " scenes"], keys: Key[Array, " scenes"], num_points: int
 ) -> LabelledPartClouds:
     def of_scene(scene):
         solid, category, key = scene
@@ -83,7 +83,7 @@ def _scanned(
 def _imagined(
     solids: LabelledSolid,
     categories: Int[Array, " scenes"],
-    keys: PRNGKeyArray,
+    keys: Key[Array, " scenes"],
     imagination: Imagination,
     num_points: int,
 ) -> LabelledPartClouds:

@@ -129,10 +129,13 @@ def write_tables(records: Sequence[Record], folder: str | Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     summary = folder / "results.txt"
     summary.write_text(summary_table(records), encoding="utf-8")
-    columns = ("method", "target", "mean", "standard_error", "found", "rank", "scenes")
-    paths = [summary, write_csv(folder / "results.csv", time_rows(records), columns)]
-    columns = ("method", "baseline", "target", "mean", "low", "high", "excludes_zero", "scenes")
-    return [*paths, write_csv(folder / "differences.csv", difference_rows(records), columns)]
+    times = ("method", "target", "mean", "standard_error", "found", "rank", "scenes")
+    differences = ("method", "baseline", "target", "mean", "low", "high", "excludes_zero", "scenes")
+    return [
+        summary,
+        write_csv(folder / "results.csv", time_rows(records), times),
+        write_csv(folder / "differences.csv", difference_rows(records), differences),
+    ]
 
 
 def _time(row: Row) -> str:

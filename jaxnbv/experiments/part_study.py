@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -38,6 +39,11 @@ METHODS = ("discrete", "gradient-2dof", "gradient-6dof", "farthest", "uncertaint
 TARGETS = (20, 40, 60, 80, 100)
 # The utility's N_target, the authors' value, in points of the 2,048 that the network is fed.
 _UTILITY_TARGET, _NETWORK_POINTS = 60, 2048
+_OVER_CANDIDATES: dict[str, Any] = {
+    "farthest": FarthestView,
+    "uncertainty": UncertaintyView,
+    "random": RandomView,
+}
 
 
 class PartStudy(eqx.Module):
@@ -96,8 +102,7 @@ class PartStudy(eqx.Module):
             space = SpherePoses(PART_RADIUS) if method == "gradient-2dof" else FreePoses(PART_RADIUS)
             candidates = max(self.num_candidates // 2, self.num_starts)
             return GradientSearch(None, space, self.num_starts, self.iterations, self.learning_rate, candidates)
-        over_candidates = {"farthest": FarthestView, "uncertainty": UncertaintyView, "random": RandomView}
-        return over_candidates.get(method, DiscreteSearch)(self.num_candidates, PART_RADIUS)
+        return _OVER_CANDIDATES.get(method, DiscreteSearch)(self.num_candidates, PART_RADIUS)
 
 
 def run_scene(study: PartStudy, index: int, methods: Sequence[str] = METHODS) -> dict:

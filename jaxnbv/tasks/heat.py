@@ -64,7 +64,8 @@ class ColdestPoint(eqx.Module):
     ):
         workers = cpu_count() if workers is None else workers
         require(workers >= 1, f"the number of workers is {workers}; it must be at least 1")
-        self.heat = HeatProblem(source, radius, power, T, steps, u0)
+        place = np.asarray(source) if isinstance(source, Sequence) else source
+        self.heat = HeatProblem(place, radius, power, T, steps, u0)
         self.reached_only, self.workers = reached_only, workers
 
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:

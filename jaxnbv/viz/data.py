@@ -17,10 +17,10 @@ from jaxnbv.planner import Planner
 from jaxnbv.scanning import Grid
 from jaxnbv.search import Proposal
 from jaxnbv.surfaces import SurfacePosterior
-from jaxnbv.tasks.classification import class_names, predict
+from jaxnbv.viz.findings import Finding, finding
 from jaxnbv.viz.sphere import unit
 from jaxnbv.viz.trajectories import Ascents, SphereMap, ascents_of, open_values, wider_map
-from jaxnbv.viz.words import Quantity, describe_choice, describe_classes, describe_first, quantity
+from jaxnbv.viz.words import Quantity, describe_choice, describe_first, quantity
 
 COVERAGE_RADIUS = 0.05
 # The variance of one point costs a triangular solve with the whole cloud, the slope two evaluations of the mean.
@@ -84,7 +84,7 @@ class ViewData(eqx.Module):
     - `coverage`: share of the true surface within `COVERAGE_RADIUS` of the cloud; None where the truth is not known.
     - `count`: points of the cloud after this view.
     - `sentence`: what happened, in words.
-    - `probabilities`: of the classes after this view; None where the task is another.
+    - `finding`: what is known of the object after this view; None for a task that has no answer but the cloud.
     """
 
     number: int
@@ -96,7 +96,7 @@ class ViewData(eqx.Module):
     coverage: float | None
     count: int
     sentence: str
-    probabilities: Float[np.ndarray, " classes"] | None
+    finding: Finding | None
 
     @property
     def spatial_ascents(self) -> Ascents | None:
@@ -145,11 +145,9 @@ def report_data(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, p
             words = describe_choice(
                 values, choice.value, choice.rank, others, starts, view.pose, earlier, len(new), count, change
             )
-        log_p = predict(planner.acquisition, view.cloud)
-        probabilities = None if log_p is None else np.exp(np.asarray(log_p, np.float64))
-        if probabilities is not None:
-            earlier_p = None if before is None else before.probabilities
-            words += " " + describe_classes(earlier_p, probabilities, class_names(planner.acquisition))
+        known = finding(planner.acquisition, view.cloud, None if before is None else before.finding)
+        if known is not None:
+            words += f" {known.sentence}"
         drawn.append(
             ViewData(
                 number=index + 1,
@@ -161,7 +159,7 @@ def report_data(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, p
                 coverage=covered,
                 count=count,
                 sentence=f"View {index + 1} {words}",
-                probabilities=probabilities,
+                finding=known,
             )
         )
     return ReportData(tuple(drawn), values)

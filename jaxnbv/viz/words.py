@@ -1,7 +1,5 @@
 """What happened at every view, in words, and what the values of a search are called."""
 
-from typing import TypeAlias
-
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
@@ -9,9 +7,7 @@ from jaxtyping import Float
 from jaxnbv.acquisition import ExpectedUtilityImprovement, Score
 from jaxnbv.camera import Pose
 from jaxnbv.search import FarthestView, RandomView, Search, UncertaintyView
-from jaxnbv.tasks import Coverage, CrossEntropy, MixedEntropy, NegativeEntropy
-
-Probabilities: TypeAlias = Float[np.ndarray, " classes"]
+from jaxnbv.tasks import ColdestPoint, Coverage, CrossEntropy, MixedEntropy, NegativeEntropy, SoftPartCount
 
 
 class Quantity(eqx.Module):
@@ -59,6 +55,12 @@ def quantity(search: Search, score: Score) -> Quantity:
     if isinstance(score, ExpectedUtilityImprovement) and isinstance(score.utility, NegativeEntropy):
         meaning = "how much an imagined scan lowers the entropy of the classes, mean over posterior samples."
         return Quantity("expected reduction of entropy", "nats", meaning)
+    if isinstance(score, ExpectedUtilityImprovement) and isinstance(score.utility, SoftPartCount):
+        meaning = "how much an imagined scan raises the soft count of the parts, mean over posterior samples."
+        return Quantity("expected gain in parts", "parts", meaning)
+    if isinstance(score, ExpectedUtilityImprovement) and isinstance(score.utility, ColdestPoint):
+        meaning = "how much colder than now the coldest point is with an imagined scan, mean over posterior samples."
+        return Quantity("expected fall of the least temperature", "degrees", meaning)
     if isinstance(score, ExpectedUtilityImprovement):
         meaning = "how much an imagined scan raises the utility of the cloud, mean over posterior samples."
         return Quantity("expected utility improvement", "", meaning)
@@ -98,19 +100,6 @@ def describe_choice(
         before, after = (percent(share) for share in change)
         grown = f"; coverage stayed at {after}" if before == after else f"; coverage went from {before} to {after}"
     return " ".join([*parts, f"{added}{kept}{grown}."])
-
-
-def describe_classes(before: Probabilities | None, after: Probabilities, names: tuple[str, ...] | None) -> str:
-    """What the classifier makes of the object, after a view and before it: a sentence."""
-    names = tuple(f"class {index}" for index in range(len(after))) if names is None else names
-    best = int(np.argmax(after))
-    known = f"The classifier says {names[best]} with probability {after[best]:.2f}"
-    if before is None:
-        return f"{known}."
-    if int(np.argmax(before)) == best:
-        return f"{known} (was {before[best]:.2f})."
-    previous = int(np.argmax(before))
-    return f"{known} (was {before[best]:.2f}, behind {names[previous]} with {before[previous]:.2f})."
 
 
 def _reason(values: Quantity, value: float, rank: int, others: tuple[float, ...], starts: int) -> str:
@@ -153,8 +142,13 @@ def place(pose: Pose) -> str:
     position = np.asarray(pose.position, dtype=np.float64)
     elevation = np.degrees(np.arcsin(position[1] / max(float(np.linalg.norm(position)), 1e-12)))
     side = "above" if elevation >= 0 else "below"
-    x, y, z = (f"{coordinate:.2f}".replace("-", "−") for coordinate in position)
-    return f"({x}, {y}, {z}), {abs(elevation):.0f}° {side} the horizon"
+    return f"{coordinates(position)}, {abs(elevation):.0f}° {side} the horizon"
+
+
+def coordinates(point: Float[np.ndarray, "3"]) -> str:
+    """A point in scene units."""
+    x, y, z = (f"{coordinate:.2f}".replace("-", "−") for coordinate in point)
+    return f"({x}, {y}, {z})"
 
 
 def _aim(pose: Pose) -> str:

@@ -1,0 +1,184 @@
+"""The small part segmenter: what it depends on, its gradients, its file; the shipped weights on new objects."""
+
+from importlib import resources
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from jaxnbv.checks import InputError
+from jaxnbv.datasets import Split
+from jaxnbv.experiments.part_clouds import LabelledPartClouds, scanned_part_clouds
+from jaxnbv.networks import (
+    CATEGORIES,
+    CompactPartSegmenter,
+    load_compact_segmenter,
+    part_segmenter,
+    save_compact_segmenter,
+)
+
+RNG = np.random.default_rng(0)
+COUNT = 300
+CHAIR, MUG = 4, 11
+segment = eqx.filter_jit(lambda network, *arguments: network(*arguments))
+
+
+@pytest.fixture(scope="module")
+def network():
+    return CompactPartSegmenter(jax.random.key(0))
+
+
+def cloud(count=COUNT):
+    """Points of a box's faces with the outward normals."""
+    axis, sign = RNG.integers(0, 3, count), RNG.choice([-1.0, 1.0], count)
+    points, normals = RNG.uniform(-0.8, 0.8, (count, 3)), np.zeros((count, 3))
+    points[np.arange(count), axis] = 0.8 * sign
+    normals[np.arange(count), axis] = sign
+    return points.astype(jnp.result_type(float)), normals.astype(jnp.result_type(float))
+
+
+def test_it_gives_log_probabilities_and_is_small(network):
+    log_p = segment(network, *cloud(), CHAIR, np.ones(COUNT, bool))
+    assert log_p.shape == (COUNT, 50)
+    np.testing.assert_allclose(np.exp(log_p).sum(axis=1), 1.0, atol=1e-5)
+    # Nothing of a random network is constant over the object.
+    assert np.ptp(log_p, axis=0).min() > 1e-3
+    assert 80_000 < sum(leaf.size for leaf in jax.tree.leaves(network)) < 130_000
+
+
+def test_masked_rows_do_not_matter_whatever_they_hold_and_wherever_they_stand(network):
+    points, normals = cloud()
+    mask = np.arange(COUNT) < 220
+    found = segment(network, points, normals, CHAIR, mask)
+    worse = points.copy(), normals.copy()
+    for rows in worse:
+        rows[~mask] = np.nan
+    np.testing.assert_array_equal(segment(network, *worse, CHAIR, mask)[mask], found[mask])
+    # The first row stays, since farthest point sampling starts there; the others change places with the padding.
+    order = np.concatenate([[0], 1 + RNG.permutation(COUNT - 1)])
+    moved = segment(network, points[order], normals[order], CHAIR, mask[order])
+    np.testing.assert_allclose(moved[mask[order]], found[order][mask[order]], atol=2e-4)
+
+
+def test_the_category_matters_and_may_be_an_array(network, quick_compilation):
+    points, normals = cloud()
+    mask = np.ones(COUNT, bool)
+    chair, mug = (np.asarray(segment(network, points, normals, jnp.asarray(c), mask)) for c in (CHAIR, MUG))
+    assert np.abs(chair - mug).max() > 1e-2
+    np.testing.assert_allclose(segment(network, points, normals, CHAIR, mask), chair, atol=1e-5)
+
+
+def test_coordinates_matter_not_only_differences(network):
+    """Upright objects that face one way: the same shape elsewhere or turned over is another thing."""
+    points, normals = cloud()
+    mask = np.ones(COUNT, bool)
+    found = segment(network, points, normals, CHAIR, mask)
+    moved = segment(network, points + np.float32(0.3), normals, CHAIR, mask)
+    assert np.abs(moved - found).max() > 1e-2
+
+
+@eqx.filter_jit
+def value_and_gradient(network, points, normals, mask, weights):
+    def value(rows):
+        log_p = network(*rows, CHAIR, mask)
+        return jnp.sum(jnp.where(mask[:, None], weights * log_p, 0.0))
+
+    return jax.value_and_grad(value)((points, normals))
+
+
+def test_gradients_are_finite_and_those_of_finite_differences(network, x64, quick_compilation):
+    double = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), network)
+    points, normals = cloud()
+    mask, weights = np.arange(COUNT) < 280, RNG.normal(size=(COUNT, 50))
+    slopes = value_and_gradient(double, points, normals, mask, weights)[1]
+    for slope in slopes:
+        assert np.isfinite(slope).all()
+        assert (np.asarray(slope)[~mask] == 0).all()
+        assert np.abs(np.asarray(slope)[mask]).max() > 1e-2
+    along, step = [RNG.normal(size=(COUNT, 3)) for _ in range(2)], 1e-7
+    expected = sum(np.sum(np.asarray(slope) * d) for slope, d in zip(slopes, along, strict=True))
+    high, low = (
+        value_and_gradient(double, points + h * along[0], normals + h * along[1], mask, weights)[0]
+        for h in (step, -step)
+    )
+    assert float(high - low) / (2 * step) == pytest.approx(expected, rel=1e-4)
+    # Rows that are repeated, and a cloud of a single point.
+    points[100:] = points[:1]
+    for mask in (np.ones(COUNT, bool), np.arange(COUNT) < 1):
+        for slope in value_and_gradient(double, points, normals, mask, weights)[1]:
+            assert np.isfinite(slope).all()
+
+
+def test_a_network_is_read_as_it_was_written(network, tmp_path):
+    save_compact_segmenter(network, tmp_path / "a.safetensors")
+    read = load_compact_segmenter(tmp_path / "a.safetensors")
+    assert jax.tree.structure(read) == jax.tree.structure(network)
+    for found, expected in zip(jax.tree.leaves(read), jax.tree.leaves(network), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    assert any(
+        (a != b).any()
+        for a, b in zip(jax.tree.leaves(network), jax.tree.leaves(CompactPartSegmenter(jax.random.key(1))), strict=True)
+    )
+
+
+def test_bad_files_are_refused(network, tmp_path):
+    path = tmp_path / "a.safetensors"
+    with pytest.raises(InputError, match="no file"):
+        load_compact_segmenter(path)
+    save_compact_segmenter(network, path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="damaged"):
+        load_compact_segmenter(path)
+    tensors = safetensors.numpy.load(whole)
+    name = next(iter(tensors))
+    for changed in (
+        {key: value for key, value in tensors.items() if key != name},
+        tensors | {name: tensors[name][:1]},
+        tensors | {"more": np.zeros(3, np.float32)},
+    ):
+        safetensors.numpy.save_file(changed, path)
+        with pytest.raises(InputError, match="another network"):
+            load_compact_segmenter(path)
+    safetensors.numpy.save_file(tensors | {name: np.full_like(tensors[name], np.inf)}, path)
+    with pytest.raises(InputError, match="not finite"):
+        load_compact_segmenter(path)
+    pyramid = resources.files("jaxnbv.networks") / "weights" / "pyramid.safetensors"
+    path.write_bytes(pyramid.read_bytes())
+    with pytest.raises(InputError, match="another network"):
+        load_compact_segmenter(path)
+
+
+@eqx.filter_jit
+def predicted(segmenter, found):
+    def of_cloud(example):
+        own = eqx.tree_at(lambda s: s.category, segmenter, example.categories)
+        return own.predict(example.clouds)
+
+    return jax.lax.map(of_cloud, found)
+
+
+def test_the_shipped_weights_know_the_parts_of_objects_that_they_were_not_trained_on():
+    """Three clouds of an object of each procedural category, numbers of the test split that the training never saw."""
+    found = scanned_part_clouds(Split.TEST, range(5000, 5013))
+    assert isinstance(found, LabelledPartClouds)
+    fed, said = jax.tree.map(np.asarray, predicted(part_segmenter("chair", num_points=1024), found))
+    # Farthest point samples of farthest point samples are themselves, in their order.
+    np.testing.assert_array_equal(fed.points, found.clouds.points)
+    mask, labels = np.asarray(found.clouds.mask), np.asarray(found.labels)
+    for category, rows, there in zip(np.asarray(found.categories), said, mask, strict=True):
+        assert set(rows[there].tolist()) <= set(CATEGORIES[category].labels)
+        assert (rows[~there] == -1).all()
+    assert np.mean(said[mask] == labels[mask]) >= 0.85
+
+
+def test_the_shipped_weights_are_small_and_bad_arguments_refused():
+    file = resources.files("jaxnbv.networks") / "weights" / "parts.safetensors"
+    assert len(file.read_bytes()) < 2**20
+    with pytest.raises(InputError, match="longest side"):
+        part_segmenter("mug", longest_side=0.0)
+    with pytest.raises(InputError, match="category 'spoon'"):
+        part_segmenter("spoon")
