@@ -37,7 +37,8 @@ def stages(count: int) -> dict[str, float]:
     """Seconds for one cloud."""
     points = torus(count)
     heat = HeatProblem(points[0])
-    laplacian, heating, start = cloud_laplacian(points), heat.heating(points), np.zeros(count)
+    laplacian, start = cloud_laplacian(points), np.zeros(count)
+    heating = heat.heating(points, laplacian.mass)
     solve = lambda steps: diffuse(laplacian, start, heating, heat.duration, steps)  # noqa: E731
     one = least_time(lambda: solve(1))
     every = least_time(lambda: solve(heat.steps))

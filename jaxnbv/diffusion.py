@@ -73,10 +73,17 @@ class HeatProblem(eqx.Module):
         """No point gets warmer: u0 + T max(0, power), by the maximum principle."""
         return self.initial + self.duration * max(0.0, self.power)
 
-    def heating(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """f at the points."""
-        near = np.linalg.norm(points - np.asarray(self.source, np.float64), axis=1) <= self.radius
-        return np.where(near, self.power, 0.0)
+    def heating(self, points: Float[np.ndarray, "n 3"], areas: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """f at points that stand for the given areas: `power` times the share of a point's disc, of radius rho, that
+        lies within `radius` of the source, as far as that follows from its distance d: 1/2 + (radius - d) / (2 rho)
+        within [0, 1].
+
+        To the authors a point is within or not, which is the same for dense points. The share keeps the heat that goes
+        in from depending on which few points happen to be near: with 1,024 points on an object, the least temperature
+        of one sampling and another differed by a third of its value, and by a tenth with shares.
+        """
+        distance = np.linalg.norm(points - np.asarray(self.source, np.float64), axis=1)
+        return self.power * np.clip(0.5 + 0.5 * (self.radius - distance) / np.sqrt(areas / np.pi), 0.0, 1.0)
 
 
 class Laplacian(NamedTuple):
@@ -211,7 +218,7 @@ def _merge(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _solve(laplacian: Laplacian, points: np.ndarray, place: np.ndarray, heat: HeatProblem) -> Temperature:
-    heating = heat.heating(points)
+    heating = heat.heating(points, laplacian.mass)
     pieces = laplacian.pieces
     reached = np.isin(pieces, pieces[heating != 0.0])
     values = np.full(len(points), float(heat.initial))

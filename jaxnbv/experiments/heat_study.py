@@ -58,7 +58,7 @@ class HeatStudy(eqx.Module):
     """
 
     views: int = eqx.field(static=True, default=6)
-    num_candidates: int = eqx.field(static=True, default=48)
+    num_candidates: int = eqx.field(static=True, default=32)
     num_samples: int = eqx.field(static=True, default=8)
     model: GeometricSPSR = GeometricSPSR(lengthscale=0.01, truncation=32)
     grid_resolution: int = eqx.field(static=True, default=64)
@@ -253,7 +253,7 @@ def _scan(study: HeatStudy, scene: HeatScene, index: int, candidate: int, view: 
 def _first_view(study: HeatStudy, scene: HeatScene, index: int) -> int:
     for candidate in jax.random.permutation(_key(index, "first"), study.num_candidates).tolist():
         points, _ = _scan(study, scene, index, candidate, 0).to_numpy()
-        if heat_problem(scene).heating(points).any():
+        if (np.linalg.norm(points - np.asarray(scene.source), axis=1) <= HeatProblem.radius).any():
             return candidate
     raise InputError(f"none of {study.num_candidates} candidates sees the heat source of scene {index}: give more")
 
