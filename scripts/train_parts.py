@@ -16,8 +16,8 @@ from cached import cached
 
 from jaxnbv import Grid, PointCloud
 from jaxnbv.datasets import Split
-from jaxnbv.experiments.part_clouds import LabelledPartClouds, imagined_part_clouds, scanned_part_clouds
-from jaxnbv.experiments.pyramid_clouds import Imagination
+from jaxnbv.experiments.parts.clouds import LabelledPartClouds, imagined_part_clouds, scanned_part_clouds
+from jaxnbv.experiments.pyramid.clouds import Imagination
 from jaxnbv.networks import CATEGORIES, CompactPartSegmenter, fit, part_mask, save_compact_segmenter
 from jaxnbv.networks.pretrained import TRAINED_SIDE
 from jaxnbv.surfaces import GeometricSPSR

@@ -15,7 +15,7 @@ from cached import cached
 
 from jaxnbv import Grid, PointCloud
 from jaxnbv.datasets import PATTERNS, Framing, Split
-from jaxnbv.experiments.pyramid_clouds import Imagination, LabelledClouds, imagined_clouds, scanned_clouds
+from jaxnbv.experiments.pyramid.clouds import Imagination, LabelledClouds, imagined_clouds, scanned_clouds
 from jaxnbv.networks import (
     InvariantClassifier,
     calibrate,

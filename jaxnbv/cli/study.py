@@ -11,23 +11,22 @@ import typer
 from jaxnbv.checks import require
 from jaxnbv.cli.options import Device, DeviceOption, prepare
 from jaxnbv.datasets import Framing
-from jaxnbv.experiments import (
-    heat_figures,
-    heat_pictures,
-    heat_report,
-    heat_study,
-    part_figures,
-    part_pictures,
-    part_report,
-    part_study,
-    pyramid_figures,
-    pyramid_pictures,
-    pyramid_report,
-    pyramid_study,
-    reconstruction_pictures,
-    reconstruction_report,
-    reconstruction_study,
-)
+from jaxnbv.experiments.heat import figures as heat_figures
+from jaxnbv.experiments.heat import pictures as heat_pictures
+from jaxnbv.experiments.heat import report as heat_report
+from jaxnbv.experiments.heat import study as heat_study
+from jaxnbv.experiments.parts import figures as part_figures
+from jaxnbv.experiments.parts import pictures as part_pictures
+from jaxnbv.experiments.parts import report as part_report
+from jaxnbv.experiments.parts import study as part_study
+from jaxnbv.experiments.pyramid import figures as pyramid_figures
+from jaxnbv.experiments.pyramid import pictures as pyramid_pictures
+from jaxnbv.experiments.pyramid import report as pyramid_report
+from jaxnbv.experiments.pyramid import study as pyramid_study
+from jaxnbv.experiments.reconstruction import figures as reconstruction_figures
+from jaxnbv.experiments.reconstruction import pictures as reconstruction_pictures
+from jaxnbv.experiments.reconstruction import report as reconstruction_report
+from jaxnbv.experiments.reconstruction import study as reconstruction_study
 from jaxnbv.experiments.records import RecordFolder
 from jaxnbv.networks import part_segmenter, pyramid_classifier
 from jaxnbv.storage import describe
@@ -190,7 +189,7 @@ def reconstruction(
     names = _methods(methods, reconstruction_study.METHODS)
     run = reconstruction_study.run_scene
     records = _collect(run, settings, names, min(scenes, 4) if quick else scenes, folder, quick)
-    _write(records, settings, folder, reconstruction_report, reconstruction_pictures, reconstruction_pictures)
+    _write(records, settings, folder, reconstruction_report, reconstruction_figures, reconstruction_pictures)
 
 
 def _methods(asked: str | None, known: Sequence[str]) -> tuple[str, ...]:

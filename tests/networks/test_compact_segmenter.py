@@ -11,7 +11,7 @@ import safetensors.numpy
 
 from jaxnbv.checks import InputError
 from jaxnbv.datasets import Split
-from jaxnbv.experiments.part_clouds import LabelledPartClouds, scanned_part_clouds
+from jaxnbv.experiments.parts.clouds import LabelledPartClouds, scanned_part_clouds
 from jaxnbv.networks import (
     CATEGORIES,
     CompactPartSegmenter,

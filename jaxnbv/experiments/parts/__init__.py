@@ -1,0 +1,1 @@
+"""The discovery of semantic parts: the paper's Table 1."""

@@ -1,0 +1,301 @@
+"""The part study's qualitative figure: the parts that have been found, view by view and method by method."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from scipy.spatial import cKDTree
+
+from jaxnbv.camera import Camera, Pose, fibonacci_sphere, look_at
+from jaxnbv.cloud import PointCloud
+from jaxnbv.datasets import PartScene, Split, part_scene
+from jaxnbv.datasets.labelled import LabelledSolid
+from jaxnbv.experiments.parts.clouds import PART_CAMERA
+from jaxnbv.experiments.parts.report import Record, methods_of
+from jaxnbv.experiments.parts.study import TARGETS, PartStudy, discovery_time, seen_views
+from jaxnbv.networks import CATEGORIES
+from jaxnbv.scanning import SDFSurface, scan
+from jaxnbv.viz.figures import STYLE
+from jaxnbv.viz.render import frustum
+from jaxnbv.viz.style import GREY, INK, LINE
+
+_SHOWN = ("discrete", "gradient-2dof", "farthest", "uncertainty")
+_TARGET = 60
+_FOUND = "#00734f"
+# Okabe and Ito's: a category has at most six parts.
+_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#56b4e9", "#cc79a7")
+# Where pictures are taken from, half of what they span, pixels a side; the same of the tries for a good place.
+_DISTANCE, _REACH, _PIXELS = 11.0, 1.75, 420
+_TRIES, _TRY_PIXELS = 40, 40
+# Noise must not hide a point behind the surface that it lies on.
+_SLACK = 0.05
+_HIDDEN, _PALE = 0.12, 0.5
+# Cameras are drawn nearer than they stand, small, so that the object can be large.
+_NEARER, _FRUSTUM_DEPTH = 0.76, 0.24
+
+
+class _Stage(NamedTuple):
+    """One place from which all pictures of a scene are taken, and what stands there: the true object.
+
+    `image` is coloured by part, `ghost` a pale picture of the shape; `depth` is along the camera's forward axis.
+    """
+
+    pose: Pose
+    camera: Camera
+    image: Float[np.ndarray, "h w 4"]
+    ghost: Float[np.ndarray, "h w 4"]
+    depth: Float[np.ndarray, "h w"]
+
+    def project(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
+        """Pixels of points of the scene, and how far each lies in front of the object's surface."""
+        local = (points - np.asarray(self.pose.position)) @ np.asarray(self.pose.rotation)
+        pixels = self.camera.focal_length * local[:, :2] / local[:, 2:] + 0.5 * _PIXELS
+        column, row = np.clip(pixels.astype(int), 0, _PIXELS - 1).T
+        return pixels - 0.5, self.depth[row, column] - local[:, 2]
+
+
+def write_pictures(records: Sequence[Record], settings: PartStudy, folder: str | Path, scenes: int = 3) -> list[Path]:
+    """Write `parts_<scene>.png` for the scenes whose smallest part is the smallest share of the object's surface that
+    shows, one to a category; return the paths.
+
+    At the left the true object, coloured by part; a row a method, a column a view: the cloud so far, coloured by the
+    part that the segmenter says, the points of this view strong and those before pale, over the true shape. Cameras
+    are drawn nearer than they stood. Bars are the points of each part, full at N_target = 60. Methods are the discrete
+    and the 2-DOF gradient search, farthest view and uncertainty, those of them that the records hold, else all that
+    they do.
+
+    **Raises:** `ValueError` if there are no records, or no method that all of them hold.
+    """
+    present, folder = methods_of(records), Path(folder)
+    methods = [method for method in _SHOWN if method in present] or present
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    with mpl.rc_context(STYLE):
+        for record in _with_small_parts(records, scenes):
+            paths.append(folder / f"parts_{record['scene']:03d}.png")
+            _picture(record, settings, methods).savefig(paths[-1], dpi=200)
+    return paths
+
+
+def _with_small_parts(records: Sequence[Record], count: int) -> list[Record]:
+    smallest = []
+    for record in records:
+        scene = part_scene(Split(record["split"]), record["scene"])
+        pixels = np.asarray(_part_pixels(scene.solid, _places()))[:, np.asarray(scene.parts)].sum(axis=0)
+        smallest.append(float(pixels.min() / pixels.sum()))
+    chosen: dict[str, Record] = {}
+    for index in np.argsort(smallest, kind="stable"):
+        chosen.setdefault(records[index]["category"], records[index])
+    return list(chosen.values())[:count]
+
+
+def _picture(record: Record, settings: PartStudy, methods: Sequence[str]) -> Figure:
+    scene = part_scene(Split(record["split"]), record["scene"])
+    colours = _part_colours(scene)
+    stage = _stage(scene, colours)
+    runs = [record["methods"][method] for method in methods]
+    seen = [seen_views(settings, record, method) for method in methods]
+    segmenter = eqx.tree_at(lambda s: s.category, settings.segmenter, scene.category)
+
+    # Inches: all methods share the first view, so it stands once, at the middle of the rows.
+    tile, gap, below, left, top, margin, line = 1.5, 0.1, 0.36, 0.12, 0.74, 1.05, 0.2
+    corner, size = _extent(stage)
+    true_wide, true_tall = 2.1 * size / size.max()
+    block = true_tall + 0.35 + line * len(record["parts"])
+    columns = max(len(run["views"]) for run in runs)
+    given = left + 2.1 + 2 * gap
+    wide = given + columns * (tile + gap) + margin
+    tall = top + max(len(methods) * (tile + below), block)
+    figure = Figure(figsize=(wide, tall))
+    middle = top + 0.5 * (tall - top - below)
+
+    def place(x: float, down: float, w: float = tile, h: float = tile) -> Axes:
+        return figure.add_axes((x / wide, 1.0 - (down + h) / tall, w / wide, h / tall))
+
+    def column_at(column: int) -> float:
+        return given + column * (tile + gap) + (margin if column else 0.0)
+
+    def write(x: float, down: float, text: str, **style: Any) -> None:
+        figure.text(x / wide, 1.0 - down / tall, text, va="center", **style)
+
+    write(left, 0.18, f"Scene {record['scene']}: {record['category']}", fontsize=10, fontweight="bold")
+    key = (
+        "Points: the part that the segmenter says; strong are those of this view. "
+        f"Bars: points of each part, full at {_TARGET}. Framed: all parts have been found."
+    )
+    write(left, 0.38, key, fontsize=8, color=GREY)
+    axes = place(left + 0.5 * (2.1 - true_wide), middle - 0.5 * block + 0.2, true_wide, true_tall)
+    axes.imshow(stage.image, interpolation="antialiased")
+    axes.set(xlim=corner[0] + [0, size[0]], ylim=corner[1] + [size[1], 0])
+    axes.axis("off")
+    write(left + 1.05, middle - 0.5 * block + 0.08, "true parts", fontsize=9, ha="center")
+    for index, (name, colour) in enumerate(zip(record["parts"], _of_parts(scene, colours), strict=True)):
+        down = middle + 0.5 * block + line * (index + 0.5 - len(record["parts"]))
+        write(left + 0.6, down, "●", color=colour, fontsize=11)
+        write(left + 0.8, down, name, fontsize=9)
+
+    def draw(axes: Axes, row: int, column: int) -> None:
+        shown, cloud = seen[row][column]
+        _draw_view(axes, stage, segmenter.predict(cloud), shown, colours)
+        _finish(axes, stage, runs[row], column, _of_parts(scene, colours))
+
+    for row, (method, run) in enumerate(zip(methods, runs, strict=True)):
+        down, held = top + row * (tile + below), len(run["views"])
+        write(column_at(1) - gap, down + 0.5 * tile, method, fontsize=9, fontweight="bold", ha="right")
+        for column in range(1, held):
+            draw(place(column_at(column), down), row, column)
+        if held < columns:
+            text = f"every part has\n{max(TARGETS)} points"
+            write(column_at(max(held, 1)) + 0.5 * tile, down + 0.5 * tile, text, fontsize=8, color=GREY, ha="center")
+    for column in range(1, columns):
+        write(column_at(column) + 0.5 * tile, top - 0.12, f"view {column + 1}", fontsize=9, ha="center")
+    draw(place(given, middle - 0.5 * tile), 0, 0)
+    write(given + 0.5 * tile, middle - 0.5 * tile - 0.12, "view 1, given", fontsize=9, ha="center")
+    return figure
+
+
+def _part_colours(scene: PartScene) -> Float[np.ndarray, "labels 3"]:
+    """A colour for each of the fifty labels: grey for parts that the object does not have."""
+    colours = np.tile(mpl.colors.to_rgb(GREY), (len(scene.parts), 1))
+    for label in CATEGORIES[int(scene.category)].labels:
+        if scene.parts[label]:
+            colours[label] = mpl.colors.to_rgb(_COLOURS[label - CATEGORIES[int(scene.category)].first_label])
+    return colours
+
+
+def _of_parts(scene: PartScene, colours: Float[np.ndarray, "labels 3"]) -> Float[np.ndarray, "parts 3"]:
+    return colours[np.flatnonzero(np.asarray(scene.parts))]
+
+
+def _stage(scene: PartScene, colours: Float[np.ndarray, "labels 3"]) -> _Stage:
+    """Seen from where each part shows nearly as much as from where it shows best."""
+    places = _places()
+    pixels = np.asarray(_part_pixels(scene.solid, places), np.float64)[:, np.asarray(scene.parts)]
+    pose = places[int(np.argmax((pixels / pixels.max(axis=0)).min(axis=1)))]
+    fov = 2.0 * math.atan(_REACH / _DISTANCE)
+    mask, labels, facing, depth = map(np.asarray, _render(scene.solid, Camera(fov, 2 * _PIXELS, 2 * _PIXELS), pose))
+    lit = 0.62 + 0.42 * facing[:, None]
+    image = _smoothed(mask, np.clip(colours[labels] * lit, 0.0, 1.0))
+    ghost = _smoothed(mask, np.clip(mpl.colors.to_rgb(LINE) * (0.84 + 0.2 * facing[:, None]), 0.0, 1.0))
+    depth = depth.reshape(_PIXELS, 2, _PIXELS, 2).min(axis=(1, 3))
+    return _Stage(pose, Camera(fov, _PIXELS, _PIXELS), image, ghost, depth)
+
+
+def _smoothed(mask: Bool[np.ndarray, " rays"], colours: Float[np.ndarray, "rays 3"]) -> Float[np.ndarray, "h w 4"]:
+    """Four rays a pixel; clear where they miss."""
+    image = np.concatenate([colours, np.ones((len(mask), 1))], axis=1) * mask[:, None]
+    image = image.reshape(_PIXELS, 2, _PIXELS, 2, 4).mean(axis=(1, 3))
+    image[..., :3] /= np.maximum(image[..., 3:], 1e-9)
+    return np.clip(image, 0.0, 1.0)
+
+
+def _extent(stage: _Stage) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """The first corner and the size of the object's box in the picture."""
+    rows, columns = np.nonzero(stage.image[..., 3])
+    pixels = np.stack([columns, rows])
+    low, high = pixels.min(axis=1) - 2.0, pixels.max(axis=1) + 2.0
+    return low, high - low
+
+
+def _draw_view(
+    axes: Axes,
+    stage: _Stage,
+    predicted: tuple[PointCloud, Int[Array, " n"]],
+    latest: PointCloud,
+    colours: Float[np.ndarray, "labels 3"],
+) -> None:
+    """The cloud so far over the ghost of the true object, which hides nothing but dims what it would hide."""
+    fed, labels = predicted
+    mask = np.asarray(fed.mask)
+    points, own = np.asarray(fed.points)[mask], colours[np.asarray(labels)[mask]]
+    # Rows of D are those of the scans, bit by bit.
+    is_new = cKDTree(latest.to_numpy()[0]).query(points)[0] == 0.0
+    pixels, front = stage.project(points)
+    axes.imshow(stage.ghost, interpolation="antialiased", zorder=1)
+    tinted = np.where(is_new[:, None], own, 1.0 - (1.0 - _PALE) * (1.0 - own))
+    rgba = np.concatenate([tinted, np.where(front > -_SLACK, 1.0, _HIDDEN)[:, None]], axis=1)
+    for new, size in ((False, 2.2), (True, 3.6)):
+        # The nearest last.
+        order = np.flatnonzero(is_new == new)
+        order = order[np.argsort((points[order] - np.asarray(stage.pose.position)) @ np.asarray(stage.pose.forward))]
+        order = order[::-1]
+        axes.scatter(pixels[order, 0], pixels[order, 1], s=size, c=rgba[order], linewidths=0, zorder=2 + new)
+
+
+def _finish(axes: Axes, stage: _Stage, run: dict, view: int, colours: Float[np.ndarray, "parts 3"]) -> None:
+    """Cameras, frame and bars of one tile."""
+    for index in range(view + 1):
+        pose = Pose(*(np.asarray(run["views"][index][name], np.float32) for name in ("rotation", "position")))
+        _draw_camera(axes, stage, pose, is_new=index == view)
+    axes.set(xlim=(0, _PIXELS), ylim=(_PIXELS, 0), xticks=[], yticks=[])
+    found = discovery_time(np.asarray(run["counts"]), _TARGET)
+    is_found = found is not None and found <= view + 1
+    for spine in axes.spines.values():
+        spine.set(visible=True, color=_FOUND if is_found else LINE, linewidth=1.6 if is_found else 0.8)
+    if found == view + 1:
+        inside: dict[str, Any] = {"transform": axes.transAxes, "ha": "left", "va": "top"}
+        axes.text(0.03, 0.975, "✓ all found", color=_FOUND, fontsize=8, fontweight="bold", **inside, zorder=5)
+    counts = run["counts"][view]
+    width = 1.0 / len(counts)
+    for index, (count, colour) in enumerate(zip(counts, colours, strict=True)):
+        full, x = min(count / _TARGET, 1.0), (index + 0.08) * width
+        for share, fill in ((1.0, LINE), (full, colour)):
+            bar = Rectangle((x, -0.085), 0.84 * width * share, 0.04, transform=axes.transAxes, clip_on=False)
+            bar.set(facecolor=fill, edgecolor="none")
+            axes.add_patch(bar)
+        text: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": 7, "transform": axes.transAxes}
+        axes.text((index + 0.5) * width, -0.1, str(count), color=INK if count >= _TARGET else GREY, **text)
+
+
+def _draw_camera(axes: Axes, stage: _Stage, pose: Pose, is_new: bool) -> None:
+    """A frustum; faint where the object hides it."""
+    ends = frustum(Pose(pose.rotation, _NEARER * pose.position), PART_CAMERA, _FRUSTUM_DEPTH)
+    fine = ends[:, 0] + np.linspace(0.0, 1.0, 13)[:, None, None] * (ends[:, 1] - ends[:, 0])
+    pixels, front = stage.project(fine.reshape(-1, 3))
+    pixels, front = pixels.reshape(13, -1, 2), front.reshape(13, -1)
+    segments = np.stack([pixels[:-1], pixels[1:]], axis=2).reshape(-1, 2, 2)
+    colours = np.tile(mpl.colors.to_rgba(INK if is_new else GREY), (len(segments), 1))
+    colours[:, 3] = np.where((front[:-1] > 0).ravel() & (front[1:] > 0).ravel(), 1.0 if is_new else 0.6, _HIDDEN)
+    axes.add_collection(LineCollection(list(segments), colors=colours, linewidths=1.1 if is_new else 0.6, zorder=4))
+
+
+def _places() -> Pose:
+    """Level places to look from, and some a little above and below."""
+    places = fibonacci_sphere(_TRIES, _DISTANCE)
+    height = np.asarray(places[:, 1]) / _DISTANCE
+    return look_at(places[(height > -0.2) & (height < 0.7)])
+
+
+@eqx.filter_jit
+def _part_pixels(solid: LabelledSolid, places: Pose) -> Int[Array, "places labels"]:
+    """How many pixels of each of the fifty parts show from each place."""
+    camera = Camera(2.0 * math.atan(1.5 / _DISTANCE), _TRY_PIXELS, _TRY_PIXELS)
+
+    def of_place(place: Pose) -> Int[Array, " labels"]:
+        seen = scan(SDFSurface(solid), camera, place)
+        return jnp.zeros(50, jnp.int32).at[solid.label(seen.points)].add(seen.mask)
+
+    return jax.lax.map(of_place, places)
+
+
+@eqx.filter_jit
+def _render(
+    solid: LabelledSolid, camera: Camera, place: Pose
+) -> tuple[Bool[Array, " rays"], Int[Array, " rays"], Float[Array, " rays"], Float[Array, " rays"]]:
+    """Which rays hit, the part, the cosine between ray and normal, and the depth; infinite where they miss."""
+    seen = scan(SDFSurface(solid), camera, place)
+    rays = place.position - seen.points
+    facing = jnp.sum(rays * seen.normals, axis=-1) / jnp.linalg.norm(rays, axis=-1)
+    depth = -jnp.sum(rays * place.forward, axis=-1)
+    return seen.mask, solid.label(seen.points), jnp.abs(facing), jnp.where(seen.mask, depth, jnp.inf)

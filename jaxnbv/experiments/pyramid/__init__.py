@@ -1,0 +1,1 @@
+"""The classification of pyramids whose class shows on the base alone: the paper's synthetic data set."""

@@ -1,0 +1,136 @@
+"""The pyramid study's qualitative figure: what the sensor saw, view by view and method by method."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxnbv.camera import Camera, Pose
+from jaxnbv.checks import require
+from jaxnbv.datasets import PATTERNS, Framing, Split, pyramid_scene
+from jaxnbv.experiments.pyramid.hits import PATTERN_PIXELS
+from jaxnbv.experiments.pyramid.report import Record, by_framing, methods_of
+from jaxnbv.scanning import SDFSurface, scan
+from jaxnbv.search.base import sphere_candidates
+from jaxnbv.viz.figures import STYLE
+from jaxnbv.viz.style import GREY, LINE, NEW
+
+_SHOWN = ("cross-entropy", "farthest", "uncertainty")
+_RIGHT = "#00734f"
+# Of the picture: the sensor's own field of view, with finer pixels.
+_PIXELS = 250
+_BACKGROUND = np.array(mpl.colors.to_rgb("#f3f5f8"))
+_PLAIN, _TINTED = np.array([0.68, 0.72, 0.78]), np.array(mpl.colors.to_rgb(NEW))
+
+
+def write_pictures(records: Sequence[Record], framing: str, folder: str | Path, scenes: int = 3) -> list[Path]:
+    """Write `views_<framing>_<scene>.png` for the first test scenes of a framing, not picked ones; return the paths.
+
+    A row a method, a column a view: the true surface in the sensor's field of view, the pattern's pixels tinted, and
+    beneath it the predicted class with its probability once this view is known. Rows are cross-entropy, farthest view
+    and uncertainty, those of them that the records hold, else all that they do.
+
+    **Raises:** `ValueError` if there is no record of the framing.
+    """
+    chosen = by_framing(records).get(framing, [])[:scenes]
+    require(len(chosen) > 0, f"there is no record of the framing {framing!r}: run the study for it")
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    present = methods_of(chosen)
+    methods = [method for method in _SHOWN if method in present] or present
+    paths = []
+    with mpl.rc_context(STYLE):
+        for record in chosen:
+            paths.append(folder / f"views_{framing}_{record['scene']:03d}.png")
+            _picture(record, methods).savefig(paths[-1], dpi=200)
+    return paths
+
+
+def _picture(record: Record, methods: Sequence[str]) -> Figure:
+    runs = [record["methods"][method]["runs"][0] for method in methods]
+    views = len(runs[0]["candidates"])
+    wanted = sorted({candidate for run in runs for candidate in run["candidates"]})
+    images = dict(zip(wanted, _images(record, wanted), strict=True))
+
+    # Inches: all methods share the first view, so it stands once, at the middle of the rows.
+    tile, gap, below, left, top, margin = 1.25, 0.1, 0.36, 0.12, 0.8, 1.0
+    wide, tall = left + views * (tile + gap) + margin + 0.1, top + len(methods) * (tile + below)
+    figure = Figure(figsize=(wide, tall))
+
+    def place(column: int, row: int | float) -> Axes:
+        x = left + column * (tile + gap) + (margin if column else 0.0)
+        y = tall - top - row * (tile + below) - tile
+        return figure.add_axes((x / wide, y / tall, tile / wide, tile / tall))
+
+    title = f"Scene {record['scene']}, {record['framing']}: {PATTERNS[record['label']]}"
+    figure.text(left / wide, 1.0 - 0.19 / tall, title, fontsize=10, fontweight="bold", va="center")
+    key = f"Framed: at least {PATTERN_PIXELS} pattern pixels. Beneath: prediction so far."
+    figure.text(left / wide, 1.0 - 0.38 / tall, key, fontsize=8, color=GREY, va="center")
+    for row, (method, run) in enumerate(zip(methods, runs, strict=True)):
+        for column in range(1, views):
+            axes = place(column, row)
+            _tile(axes, images[run["candidates"][column]], record["label"], run, column)
+            if row == 0:
+                axes.set_title(f"view {column + 1}", fontsize=9, loc="center", pad=4)
+        x = left + tile + margin
+        y = tall - top - row * (tile + below) - 0.5 * tile
+        figure.text((x - 0.02) / wide, y / tall, method, fontsize=9, fontweight="bold", ha="right", va="center")
+    axes = place(0, 0.5 * (len(methods) - 1))
+    _tile(axes, images[record["first"]], record["label"], runs[0], 0)
+    axes.set_title("view 1, given", fontsize=9, loc="center", pad=4)
+    return figure
+
+
+def _tile(axes: Axes, image: Float[np.ndarray, "h w 3"], label: int, run: dict, view: int) -> None:
+    axes.imshow(image, interpolation="antialiased")
+    axes.set(xticks=[], yticks=[])
+    shows = run["pattern_pixels"][view] >= PATTERN_PIXELS
+    for spine in axes.spines.values():
+        spine.set(visible=True, color=NEW if shows else LINE, linewidth=1.6 if shows else 0.8)
+    guess = int(np.argmax(run["log_p"][view]))
+    right = guess == label
+    text = f"{PATTERNS[guess]} {np.exp(run['log_p'][view][guess]):.0%}"
+    axes.text(
+        0.5,
+        -0.06,
+        f"✓ {text}" if right else text,
+        transform=axes.transAxes,
+        ha="center",
+        va="top",
+        fontsize=9,
+        color=_RIGHT if right else GREY,
+        fontweight="bold" if right else "normal",
+    )
+
+
+def _images(record: Record, candidates: Sequence[int]) -> list[Float[np.ndarray, "h w 3"]]:
+    poses = sphere_candidates(len(record["pattern_pixels"]))
+    scene, framing, split = jnp.asarray(record["scene"]), Framing(record["framing"]), Split(record["split"])
+    return [_shade(*map(np.asarray, _render(split, scene, framing, poses[candidate]))) for candidate in candidates]
+
+
+def _shade(
+    hit: Bool[np.ndarray, " rays"], pattern: Bool[np.ndarray, " rays"], facing: Float[np.ndarray, " rays"]
+) -> Float[np.ndarray, "h w 3"]:
+    """Lit from the sensor; four rays a pixel."""
+    colours = np.where(pattern[:, None], _TINTED, _PLAIN) * (0.4 + 0.65 * facing)[:, None]
+    image = np.where(hit[:, None], np.clip(colours, 0.0, 1.0), _BACKGROUND)
+    return image.reshape(_PIXELS, 2, _PIXELS, 2, 3).mean(axis=(1, 3))
+
+
+@eqx.filter_jit
+def _render(
+    split: Split, scene: Int[Array, ""], framing: Framing, pose: Pose
+) -> tuple[Bool[Array, " rays"], Bool[Array, " rays"], Float[Array, " rays"]]:
+    """Which rays hit, which hit the pattern, and the cosine between each ray and its normal."""
+    pyramid = pyramid_scene(split, scene, framing)
+    seen = scan(SDFSurface(pyramid), Camera(height=2 * _PIXELS, width=2 * _PIXELS), pose)
+    rays = pose.position - seen.points
+    facing = jnp.sum(rays * seen.normals, axis=-1) / jnp.linalg.norm(rays, axis=-1)
+    return seen.mask, pyramid.on_pattern(seen.points) & seen.mask, jnp.where(seen.mask, facing, 0.0)

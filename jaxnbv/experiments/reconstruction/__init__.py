@@ -1,0 +1,1 @@
+"""Reconstruction of the surface: the table of the paper's supplement."""

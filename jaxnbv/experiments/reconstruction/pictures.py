@@ -1,0 +1,140 @@
+"""The reconstruction study's pictures: what each method's views give, beside the true surface."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import cast
+
+import jax
+import matplotlib as mpl
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from scipy.spatial import cKDTree
+
+from jaxnbv.checks import InputError
+from jaxnbv.experiments.reconstruction.report import (
+    Record,
+    methods_of,
+)
+from jaxnbv.experiments.reconstruction.study import RECONSTRUCTIONS, ReconstructionStudy, reconstruct, seen_cloud
+from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, mesh_from_sdf
+from jaxnbv.search.base import sphere_candidates
+from jaxnbv.viz.data import MeanSurface
+from jaxnbv.viz.figures import STYLE
+from jaxnbv.viz.render import Still
+from jaxnbv.viz.style import DEVIATION, GREY, log_ticks
+
+# Distances to the truth that the pictures tell apart: from the sensor's noise to a fifth of the object.
+_ERRORS = LogNorm(0.01, 0.5)
+_PIXELS = 420
+# Shading and colours are those of the vertices, so no triangle may be larger than what they vary over.
+_EDGE = 0.05
+# Half of what a picture spans, and points of the true surface that errors are measured to.
+_REACH, _DENSE = 1.55, 200_000
+
+
+def write_pictures(
+    records: Sequence[Record], study: ReconstructionStudy, folder: str | Path, scenes: int = 3
+) -> list[Path]:
+    """Write `surfaces_<scene>.png` for the first scenes, not picked ones; return the paths.
+
+    A row a reconstruction, a column a method, beside the true surface: seen from the side away from the first view,
+    which all methods share, and coloured by the distance to the true surface. Views are scanned again as they were.
+
+    **Raises:** `ValueError` as `methods_of` does, or for a scene that the study does not have.
+    """
+    methods, folder = methods_of(records), Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    with mpl.rc_context(STYLE):
+        for record in sorted(records, key=lambda record: record["scene"])[:scenes]:
+            paths.append(folder / f"surfaces_{record['scene']:03d}.png")
+            _picture(record, study, methods).savefig(paths[-1], dpi=200)
+    return paths
+
+
+def _picture(record: Record, study: ReconstructionStudy, methods: Sequence[str]) -> Figure:
+    index = record["scene"]
+    truth = _true_mesh(study.scene(index))
+    tree = cKDTree(truth.sample_points(jax.random.key(0), _DENSE))
+    eye = _eye(np.asarray(sphere_candidates(study.num_candidates).position[record["first"]], np.float64))
+    held = [record["methods"][method]["reconstructions"] for method in methods]
+    names = [name for name in RECONSTRUCTIONS if all(found[name] is not None for found in held)]
+    clouds = [seen_cloud(study, index, record["methods"][method]["candidates"]) for method in methods]
+
+    images = {"truth": _image(truth, None, eye)}
+    for method, cloud in zip(methods, clouds, strict=True):
+        for name in names:
+            mesh = reconstruct(study, cloud, name)
+            if mesh is None:
+                raise InputError(f'the records hold {name}: pip install "jaxnbv[poisson]" to draw it again')
+            images[f"{name}, {method}"] = _image(mesh, tree, eye)
+    seen = np.any([image[..., 3] > 0 for image in images.values()], axis=0)
+    rows, columns = (np.flatnonzero(seen.any(axis=axis)) for axis in (1, 0))
+    crop = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+
+    # Inches.
+    tile, gap, below, left, top, bottom = 1.6, 0.15, 0.32, 0.3, 0.62, 0.5
+    high = tile * (crop[0].stop - crop[0].start) / (crop[1].stop - crop[1].start)
+    wide, tall = left + (len(methods) + 1) * (tile + gap), top + len(names) * (high + below) + bottom
+    figure = Figure(figsize=(wide, tall))
+
+    def show(image: str, column: int, row: int | float, title: str = "") -> Axes:
+        x, y = left + column * (tile + gap) - gap, tall - top - row * (high + below) - high
+        axes = figure.add_axes((x / wide, y / tall, tile / wide, high / tall))
+        axes.imshow(images[image][crop], interpolation="antialiased", aspect="auto")
+        axes.set_title(title, fontsize=9, loc="center", pad=4)
+        axes.axis("off")
+        return axes
+
+    figure.text(0.1 / wide, 1.0 - 0.19 / tall, record["name"], fontsize=10, fontweight="bold", va="center")
+    show("truth", 0, 0.5 * (len(names) - 1), "true surface")
+    for row, name in enumerate(names):
+        x, y = left + tile + 0.5 * gap, tall - top - row * (high + below) - 0.5 * high
+        text = name.replace(" ", "\n")
+        figure.text(x / wide, y / tall, text, fontsize=8, color=GREY, rotation=90, ha="center", va="center")
+        for column, (method, found) in enumerate(zip(methods, held, strict=True), start=1):
+            axes = show(f"{name}, {method}", column, row, method if row == 0 else "")
+            text = f"CD {found[name]['chamfer']:.3f}   HD {found[name]['hausdorff']:.3f}"
+            axes.text(0.5, -0.04, text, transform=axes.transAxes, ha="center", va="top", fontsize=8)
+    scale = figure.add_axes(((wide - 3.4) / wide, 0.36 / tall, 3.2 / wide, 0.08 / tall))
+    bar = figure.colorbar(ScalarMappable(_ERRORS, DEVIATION), cax=scale, orientation="horizontal", extend="both")
+    ticks = log_ticks(float(_ERRORS.vmin or 0), float(_ERRORS.vmax or 1)).tolist()
+    bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
+    bar.ax.minorticks_off()
+    bar.outline.set_visible(False)
+    bar.ax.tick_params(labelsize=7, length=2)
+    label = "distance to the true surface\n(scene units)"
+    figure.text((wide - 3.5) / wide, 0.33 / tall, label, fontsize=8, ha="right", va="center")
+    return figure
+
+
+def _true_mesh(scene: Surface) -> TriangleMesh:
+    """Of the surfaces that a study has: a mesh as it is, a solid by marching cubes."""
+    return mesh_from_sdf(scene.sdf, Grid()) if isinstance(scene, SDFSurface) else cast(TriangleMesh, scene)
+
+
+def _eye(first: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """Where to look from: across the object from the first camera, and from above."""
+    across = -first[[0, 2]]
+    length = np.linalg.norm(across)
+    across = across / length if length > 1e-3 else np.array([0.6, 0.8])
+    return np.array([across[0], 0.55, across[1]])
+
+
+def _image(mesh: TriangleMesh, truth: cKDTree | None, eye: Float[np.ndarray, "3"]) -> Float[np.ndarray, "h w 4"]:
+    """Trace a mesh, plain or coloured by the distance to points of the true surface."""
+    vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _EDGE, max_iter=12)
+    fine = trimesh.Trimesh(vertices, faces)
+    error = np.ones(len(fine.vertices)) if truth is None else truth.query(fine.vertices)[0]
+    # A still colours whatever positive number stands at its vertices.
+    surface = MeanSurface(
+        np.asarray(fine.vertices), np.asarray(fine.faces), np.asarray(fine.vertex_normals), np.maximum(error, 1e-6)
+    )
+    still = Still(eye, surface, _PIXELS, _REACH)
+    still.paint(None if truth is None else _ERRORS)
+    return still.image

@@ -1,0 +1,111 @@
+"""Training clouds: what they hold, that they can be made again, and that splits differ."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnbv.datasets import PATTERNS, Framing, Split, pyramid_scene
+from jaxnbv.experiments.pyramid.clouds import MAX_VIEWS, Imagination, imagined_clouds, scanned_clouds
+from jaxnbv.scanning import Grid
+from jaxnbv.surfaces import GeometricSPSR
+
+COUNT, POINTS = 16, 200
+IMAGINATION = Imagination(GeometricSPSR(lengthscale=0.05, truncation=8), Grid(20), 2, 3, 150)
+
+
+@pytest.fixture(scope="module")
+def scanned():
+    return scanned_clouds(Split.TRAIN, Framing.CLOSE_UP, jnp.asarray(5), COUNT, POINTS)
+
+
+@pytest.fixture(scope="module")
+def imagined():
+    return [imagined_clouds(Split.TRAIN, Framing.CLOSE_UP, jnp.asarray(i), IMAGINATION, POINTS) for i in (5, 6)]
+
+
+def assert_same(a, b):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_scanned_clouds_are_samples_of_their_scenes_with_noise(scanned):
+    np.testing.assert_array_equal(scanned.labels, np.arange(5, 5 + COUNT) % len(PATTERNS))
+    assert not np.asarray(scanned.imagined).any()
+    assert scanned.clouds.points.shape == (COUNT, POINTS, 3)
+    assert np.asarray(scanned.clouds.count > 50).all()
+    for row in range(COUNT):
+        points, normals = scanned.clouds[row].to_numpy()
+        off = np.asarray(pyramid_scene(Split.TRAIN, 5 + row)(points))
+        # Farthest point samples favour what noise moves out: its standard deviation is 0.01 along each axis.
+        assert np.abs(off).max() < 0.06
+        assert 0.004 < off.std() < 0.025
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
+
+
+def test_pattern_pixels_vary_and_are_at_most_those_of_all_views(scanned):
+    pixels = np.asarray(scanned.pattern_pixels)
+    assert pixels.min() >= 0
+    assert pixels.max() <= MAX_VIEWS * 2500
+    assert (pixels >= 500).sum() >= 3
+    assert len(np.unique(pixels)) > COUNT // 2
+
+
+def test_a_cloud_whose_views_miss_the_pattern_has_no_point_in_it():
+    """And one with many pixels does; half the depth of the pattern is more than three deviations of the noise."""
+    found = scanned_clouds(Split.VALIDATION, Framing.CLOSE_UP, jnp.asarray(0), 24, 1000)
+    shares = {False: [], True: []}
+    for row, pixels in enumerate(np.asarray(found.pattern_pixels)):
+        pyramid = pyramid_scene(Split.VALIDATION, row)
+        points, _ = found.clouds[row].to_numpy()
+        own = (points - pyramid.offset) @ pyramid.rotation / pyramid.scale
+        side = (np.abs(own[:, :2]).max(axis=1) - 1) * float(pyramid.height) + own[:, 2]
+        inner = (own[:, 2] > 0.5 * float(pyramid.depth)) & (side < -0.12)
+        if pixels == 0 or pixels > 500:
+            shares[bool(pixels)].append(inner.mean())
+    assert len(shares[False]) >= 2
+    assert len(shares[True]) >= 5
+    assert max(shares[False]) < 0.01
+    assert min(shares[True]) > 0.02
+
+
+def test_clouds_can_be_made_again_in_other_portions(scanned):
+    again = scanned_clouds(Split.TRAIN, Framing.CLOSE_UP, jnp.asarray(5), COUNT, POINTS)
+    assert_same(scanned, again)
+    part = scanned_clouds(Split.TRAIN, Framing.CLOSE_UP, jnp.asarray(9), 3, POINTS)
+    np.testing.assert_array_equal(part.pattern_pixels, scanned.pattern_pixels[4:7])
+    np.testing.assert_allclose(part.clouds.points, scanned.clouds.points[4:7], atol=1e-5)
+
+
+def test_splits_and_framings_differ(scanned):
+    other = scanned_clouds(Split.TEST, Framing.CLOSE_UP, jnp.asarray(5), COUNT, POINTS)
+    assert not np.array_equal(other.pattern_pixels, scanned.pattern_pixels)
+    whole = scanned_clouds(Split.TRAIN, Framing.WHOLE, jnp.asarray(5), COUNT, POINTS)
+    np.testing.assert_array_equal(whole.labels, scanned.labels)
+    assert (
+        np.abs(np.asarray(whole.clouds.points)).max() < 0.625 + 0.06 < np.abs(np.asarray(scanned.clouds.points)).max()
+    )
+
+
+def test_imagined_clouds_begin_with_what_was_truly_seen(imagined):
+    for index, found in zip((5, 6), imagined, strict=True):
+        assert found.clouds.points.shape == (6, POINTS, 3)
+        assert np.asarray(found.imagined).all()
+        np.testing.assert_array_equal(found.labels, index % len(PATTERNS))
+        assert len(np.unique(found.pattern_pixels)) == 1
+        pyramid = pyramid_scene(Split.TRAIN, index)
+        clouds = [found.clouds[row].to_numpy() for row in range(6)]
+        for points, normals in clouds:
+            assert np.isfinite(points).all()
+            np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-4)
+            # Some of the points are D's, on the true surface; the sample's are not all.
+            assert 20 < (np.abs(np.asarray(pyramid(points))) < 0.04).sum() <= len(points)
+        shared = {tuple(p) for p in clouds[0][0]} & {tuple(p) for p in clouds[1][0]}
+        assert 5 < len(shared) < len(clouds[0][0])
+        assert len({points.tobytes() for points, _ in clouds}) == 6
+
+
+def test_imagined_clouds_can_be_made_again(imagined):
+    again = imagined_clouds(Split.TRAIN, Framing.CLOSE_UP, jnp.asarray(6), IMAGINATION, POINTS)
+    assert_same(imagined[1], again)
+    assert not np.array_equal(imagined[0].clouds.points, imagined[1].clouds.points)
