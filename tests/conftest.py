@@ -3,8 +3,14 @@
 import os
 from pathlib import Path
 
-# Before NumPy and SciPy load it: workers whose linear algebra takes all cores each wait for one another.
+# Before NumPy, SciPy and JAX are loaded, and for the processes that tests start. Workers whose linear algebra takes all
+# cores each wait for one another; and what one worker has compiled the others find.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "xla"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(2**31))
 
 import jax
 import numpy as np
@@ -42,14 +48,6 @@ def compilations():
     jax.monitoring.register_event_duration_secs_listener(listen)
     yield seen
     jax.monitoring.unregister_event_duration_listener(listen)
-
-
-@pytest.fixture
-def quick_compilation():
-    """For tests of which compilation takes nearly all the time; what is compiled runs slower."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture

@@ -34,7 +34,7 @@ def assert_same(a, b):
 
 
 @pytest.mark.parametrize("search", [DiscreteSearch(CANDIDATES), FarthestView(CANDIDATES), RandomView(CANDIDATES)])
-def test_views_are_those_of_a_simulated_episode(search, quick_compilation):
+def test_views_are_those_of_a_simulated_episode(search):
     own = planner(search)
     noise = SensorNoise(0.02)
     views = list(planned_views(own, SCENE, FIRST, KEY, noise))
@@ -47,7 +47,7 @@ def test_views_are_those_of_a_simulated_episode(search, quick_compilation):
     assert (other[0].scan.points != views[0].scan.points).any()
 
 
-def test_a_finer_sensor_sees_more_from_the_same_poses(quick_compilation):
+def test_a_finer_sensor_sees_more_from_the_same_poses():
     """And nothing is computed of views that nobody asks for."""
     own = planner(FarthestView(CANDIDATES))
     fine = planned_views(own, SCENE, FIRST, KEY, sensor=Camera(height=20, width=20))
@@ -59,7 +59,7 @@ def test_a_finer_sensor_sees_more_from_the_same_poses(quick_compilation):
         assert_same(view.pose, coarse.pose)
 
 
-def test_it_ends_where_the_planner_has_no_room_and_fails_where_no_candidate_is_left(quick_compilation):
+def test_it_ends_where_the_planner_has_no_room_and_fails_where_no_candidate_is_left():
     assert len(list(planned_views(planner(FarthestView(CANDIDATES), 1), SCENE, FIRST, KEY))) == 1
     few = planned_views(planner(FarthestView(2), 4), SCENE, sphere_candidates(2)[0], KEY)
     assert len(list(itertools.islice(few, 2))) == 2

@@ -63,7 +63,7 @@ def test_masked_rows_do_not_matter_whatever_they_hold_and_wherever_they_stand(ne
     np.testing.assert_allclose(moved[mask[order]], found[order][mask[order]], atol=2e-4)
 
 
-def test_the_category_matters_and_may_be_an_array(network, quick_compilation):
+def test_the_category_matters_and_may_be_an_array(network):
     points, normals = cloud()
     mask = np.ones(COUNT, bool)
     chair, mug = (np.asarray(segment(network, points, normals, jnp.asarray(c), mask)) for c in (CHAIR, MUG))
@@ -89,7 +89,7 @@ def value_and_gradient(network, points, normals, mask, weights):
     return jax.value_and_grad(value)((points, normals))
 
 
-def test_gradients_are_finite_and_those_of_finite_differences(network, x64, quick_compilation):
+def test_gradients_are_finite_and_those_of_finite_differences(network, x64):
     double = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), network)
     points, normals = cloud()
     mask, weights = np.arange(COUNT) < 280, RNG.normal(size=(COUNT, 50))

@@ -151,7 +151,7 @@ def plain_network(state, kind, points, normals, category, categories=16):
     return x - np.log(np.exp(x).sum(axis=1, keepdims=True))
 
 
-def test_log_probabilities_are_those_of_the_reference(shared, quick_compilation):
+def test_log_probabilities_are_those_of_the_reference(shared):
     network = load_part_segmenter(shared / "reference" / "pointnet2_partseg_msg.pth")
     with np.load(shared / "reference" / "pointnet2_partseg_msg_io.npz") as saved:
         points, categories, expected = (saved[name] for name in ("points", "category", "log_probs"))
@@ -164,7 +164,7 @@ def test_log_probabilities_are_those_of_the_reference(shared, quick_compilation)
 
 
 @pytest.mark.parametrize(("kind", "inputs", "n"), [("ssg", 6, 60), ("msg", 9, 560)])
-def test_against_a_plain_network(x64, quick_compilation, tmp_path, kind, inputs, n):
+def test_against_a_plain_network(x64, tmp_path, kind, inputs, n):
     """Both layouts, with normals and without, and fewer points than centres, which are then repeated."""
     state = random_state(kind, inputs)
     save_safetensors(state, tmp_path / "net.safetensors")
@@ -180,7 +180,7 @@ def test_against_a_plain_network(x64, quick_compilation, tmp_path, kind, inputs,
     assert np.abs(answers[0] - answers[1]).max() > 0.01
 
 
-def test_masked_rows_and_capacity_do_not_matter_and_a_category_may_be_one_hot(quick_compilation):
+def test_masked_rows_and_capacity_do_not_matter_and_a_category_may_be_one_hot():
     network, (points, normals) = small_network(), rows(30)
     expected = segment(network, points, normals, jnp.asarray(3))
     assert np.ptp(expected, axis=0).max() > 0.01
@@ -195,7 +195,7 @@ def test_masked_rows_and_capacity_do_not_matter_and_a_category_may_be_one_hot(qu
         np.testing.assert_allclose(found[place], expected, atol=1e-5)
 
 
-def test_all_categories_share_one_program(quick_compilation, compilations):
+def test_all_categories_share_one_program(compilations):
     network, (points, normals) = small_network(), rows(30)
     categories = [jnp.asarray(category) for category in range(16)]
     first = segment(network, points, normals, categories[0])
@@ -286,7 +286,7 @@ def cloud_of(points, normals, capacity):
     return PointCloud.from_arrays(np.asarray(points), np.asarray(normals), capacity)
 
 
-def test_a_cloud_segmenter_gives_probabilities_of_the_categorys_parts(quick_compilation):
+def test_a_cloud_segmenter_gives_probabilities_of_the_categorys_parts():
     network, (points, normals) = small_network(), rows(30)
     segmenter = CloudSegmenter(network, "Table", num_points=40, scale=0.5)
     cloud = cloud_of(2 * points, normals, 50)
@@ -308,7 +308,7 @@ def test_a_cloud_segmenter_gives_probabilities_of_the_categorys_parts(quick_comp
     assert (np.asarray(labels) == -1).all()
 
 
-def test_scenes_of_all_categories_and_scales_share_one_program(quick_compilation, compilations):
+def test_scenes_of_all_categories_and_scales_share_one_program(compilations):
     network, cloud = small_network(), cloud_of(*rows(30), 50)
     segmenters = [CloudSegmenter(network, index, 40, 1.0 + 0.1 * index) for index in range(16)]
     answers_of(segmenters[0], cloud)
@@ -319,7 +319,7 @@ def test_scenes_of_all_categories_and_scales_share_one_program(quick_compilation
         np.testing.assert_array_equal(np.asarray(answer).any(axis=0), allowed)
 
 
-def test_gradients_reach_filled_rows_only_whatever_stands_in_the_others(quick_compilation):
+def test_gradients_reach_filled_rows_only_whatever_stands_in_the_others():
     segmenter, cloud = CloudSegmenter(small_network(), "chair", 40), cloud_of(*rows(30), 50)
 
     def total(points, normals):

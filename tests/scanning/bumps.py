@@ -1,7 +1,5 @@
 """Surfaces and rays to differentiate scans on."""
 
-import functools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,8 +11,6 @@ from jaxnbv.scanning.sdf import Box, Cylinder, Torus
 
 GRID, SMALL = Grid(60, 1.75), Grid(20, 1.75)
 FEW = Camera(height=6, width=6)
-# Nearly all the time goes into compilation: this halves it.
-quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def solid():

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from bumps import FEW, GRID, grid_surface, nodes, quick_jit, solid, some_bumps, some_rays
+from bumps import FEW, GRID, grid_surface, nodes, solid, some_bumps, some_rays
 from jax.scipy.ndimage import map_coordinates
 
 from jaxnbv.camera import look_at
@@ -119,7 +119,7 @@ def hessian_and_gradient(run):
         slope = jax.jacrev(run)(parameters)
         return slope, slope
 
-    return quick_jit(jax.jacfwd(gradient, has_aux=True))
+    return jax.jit(jax.jacfwd(gradient, has_aux=True))
 
 
 def test_second_derivatives_of_depths_of_a_ball_in_closed_form(x64):
@@ -136,11 +136,11 @@ def test_second_derivatives_of_depths_of_a_ball_in_closed_form(x64):
 
     run = functools.partial(depths, SDFSurface(Sphere(0.6)), space, start)
     hessian, gradient = hessian_and_gradient(run)(parameters)
-    expected = quick_jit(jax.hessian(closed))(parameters)
+    expected = jax.jit(jax.hessian(closed))(parameters)
     misses = ~np.asarray(expected).any(axis=(1, 2))
     assert 2 < misses.sum() < 16
     np.testing.assert_allclose(hessian, expected, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(gradient, quick_jit(jax.jacfwd(closed))(parameters), rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(gradient, jax.jit(jax.jacfwd(closed))(parameters), rtol=1e-8, atol=1e-8)
 
 
 def test_second_derivatives_of_depths_on_a_grid_against_differences_of_the_gradient(x64):

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bumps import FEW, GRID, SMALL, grid_surface, quick_jit, small_surfaces, solid, some_bumps, some_rays
+from bumps import FEW, GRID, SMALL, grid_surface, small_surfaces, solid, some_bumps, some_rays
 
 from jaxnbv.camera import Camera, fibonacci_sphere, look_at
 from jaxnbv.scanning.grid import GridSurface
@@ -57,7 +57,7 @@ def looks(space):
     def both(surface, start, parameters, step, h):
         return jax.jvp(lambda h: look(surface, start, parameters, step, h), (h,), (1.0,), has_aux=True)
 
-    return quick_jit(jax.vmap(jax.vmap(both, (None, 0, 0, 0, None)), (None, None, None, None, 0)))
+    return jax.jit(jax.vmap(jax.vmap(both, (None, 0, 0, 0, None)), (None, None, None, None, 0)))
 
 
 @pytest.mark.parametrize("space", SPACES)
@@ -106,8 +106,8 @@ def test_grazing_and_missed_rays(name):
         hits = surface.trace(origin[None], direction[None])
         return hits.points[0], hits.normals[0]
 
-    forward = quick_jit(jax.vmap(jax.jacfwd(trace, argnums=(0, 1))))(origins, directions)
-    reverse = quick_jit(jax.vmap(jax.jacrev(trace, argnums=(0, 1))))(origins, directions)
+    forward = jax.jit(jax.vmap(jax.jacfwd(trace, argnums=(0, 1))))(origins, directions)
+    reverse = jax.jit(jax.vmap(jax.jacrev(trace, argnums=(0, 1))))(origins, directions)
     # |dt| is at most 1 / 0.05 or 1 / 0.03 of what moves: the origin, or the hit, which is 4 away from it at most.
     bound = 1 + (20 if name == "solid" else 34)
     for jacobian in (forward, reverse):
@@ -143,11 +143,11 @@ def test_batches_of_surfaces_and_starts_equal_loops_forwards_and_backwards(x64):
 
     of_surface, of_start = (0, None, None), (None, 0, 0)
     arguments = surfaces, starts, parameters
-    outer = quick_jit(jax.vmap(jax.vmap(reverse, of_start), of_surface))(*arguments)
-    inner = quick_jit(jax.vmap(jax.vmap(reverse, of_surface), of_start))(*arguments)
-    ahead = quick_jit(jax.vmap(jax.vmap(forward, of_start), of_surface))(*arguments)
+    outer = jax.jit(jax.vmap(jax.vmap(reverse, of_start), of_surface))(*arguments)
+    inner = jax.jit(jax.vmap(jax.vmap(reverse, of_surface), of_start))(*arguments)
+    ahead = jax.jit(jax.vmap(jax.vmap(forward, of_start), of_surface))(*arguments)
     assert (np.abs(ahead).max(axis=-1) > 0.1).all()
-    alone = quick_jit(reverse)
+    alone = jax.jit(reverse)
     for i, j in np.ndindex(16, 3):
         one = jax.tree.map(lambda leaf, i=i: leaf[i], surfaces), starts[j], parameters[j]
         single = alone(*one)
@@ -174,7 +174,7 @@ def test_every_way_to_batch_fields_and_rays_equals_a_loop(axes, x64):
         batch if axis == 0 else jax.tree.map(lambda leaf: leaf[0], batch)
         for batch, axis in zip((small_surfaces(RNG, 4), origins, directions), axes, strict=True)
     ]
-    together, loop = quick_jit(jax.vmap(run, axes))(*given), quick_jit(run)
+    together, loop = jax.jit(jax.vmap(run, axes))(*given), jax.jit(run)
     for i in range(4):
         turn = [
             jax.tree.map(lambda leaf, i=i: leaf[i], each) if axis == 0 else each

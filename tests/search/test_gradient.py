@@ -24,7 +24,6 @@ from jaxnbv.search.ascent import Ascent
 from jaxnbv.tasks import Coverage
 from jaxnbv.tasks.classification import CrossEntropy, MixedEntropy, NegativeEntropy
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 CAMERA, GRID = Camera(height=8, width=8), Grid(32)
 NODES = np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1)
 

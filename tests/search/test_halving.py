@@ -12,7 +12,6 @@ from jaxnbv.cloud import PointCloud
 from jaxnbv.scanning import Grid, GridSurface
 from jaxnbv.search import DiscreteSearch, HalvingSearch, Problem
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 GRID, CANDIDATES, SAMPLES = Grid(16), 11, 4
 
 

@@ -139,7 +139,6 @@ def test_gradients_are_refused():
         )
 
 
-@pytest.mark.usefixtures("quick_compilation")
 def test_expected_improvements_by_hand():
     """A cap is known; views of two balls are worth what they add to it."""
     nodes = np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1)

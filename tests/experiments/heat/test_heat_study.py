@@ -33,7 +33,6 @@ from jaxnbv.tasks import heat as heat_task
 # The other planners are put together in the same way, and compile as long again.
 RUN = ("heat", "heat-halving", "farthest")
 CANDIDATES, VIEWS = 12, 3
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 def small_study(**settings):

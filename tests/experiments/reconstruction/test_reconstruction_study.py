@@ -43,7 +43,6 @@ from jaxnbv.storage import describe
 # Those that draw no samples compile in a fraction of the time; all planners are of the same make.
 RUN = ("farthest", "random")
 CANDIDATES = 10
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 HAS_POISSON = has_poisson()
 
 
