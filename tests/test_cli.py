@@ -87,11 +87,20 @@ def test_run_takes_a_mesh_and_each_search(search, tmp_path, cache):
         (("demo", "--search", "best"), ("best", "discrete")),
         (("demo", "--out", "occupied"), ("occupied", "other files")),
         (("demo", "--device", "gpu"), ("gpu", "--device")),
+        (("run", "ball.obj", "--task", "parts"), ("--category",)),
+        (("run", "ball.obj", "--task", "parts", "--category", "teapot"), ("teapot", "mug")),
+        (("run", "ball.obj", "--task", "heat", "--source", "9,0,0"), ("9,0,0", "away", "nearest")),
+        (("run", "ball.obj", "--task", "heat", "--search", "gradient-2dof"), ("ColdestPoint", "DiscreteSearch")),
+        (("run", "ball.obj", "--source", "1,0,0"), ("--source", "heat")),
+        (("run", "ball.obj", "--task", "cross-entropy"), ("cross-entropy", "--network")),
+        (("study", "parts", "--methods", "best"), ("best", "gradient-2dof")),
+        (("study", "reconstruction", "--meshes", "occupied"), ("occupied", "no mesh")),
     ],
 )
 def test_bad_input_is_one_line_that_names_the_value_and_the_remedy(arguments, words, tmp_path, cache):
     (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
     (tmp_path / "broken.glb").write_bytes(b"glTF and no more")
+    trimesh.creation.icosphere(2).export(tmp_path / "ball.obj")
     (tmp_path / "occupied").mkdir()
     (tmp_path / "occupied" / "thesis.tex").write_text("mine")
     result = run_command(*arguments, cwd=tmp_path, cache=cache)
@@ -108,13 +117,6 @@ def test_a_folder_of_another_configuration_is_refused(finished, cache):
     assert result.returncode == 2
     assert "another configuration" in result.stderr
     assert "key" in result.stderr
-
-
-def test_a_task_about_the_class_needs_a_network(tmp_path, cache):
-    trimesh.creation.torus(1.0, 0.4).export(tmp_path / "ring.ply")
-    result = run_command("run", "ring.ply", "--task", "cross-entropy", cwd=tmp_path, cache=cache)
-    assert result.returncode == 2
-    assert "need a network" in result.stderr
 
 
 def test_a_published_checkpoint_converts_and_classifies_a_mesh(tmp_path, cache, shared):
@@ -145,6 +147,47 @@ def test_the_study_writes_tables_and_figures_and_continues(tmp_path, cache):
     result = run_command(*arguments, "--methods", "farthest,best", cwd=tmp_path, cache=cache)
     assert result.returncode == 2
     assert "best" in result.stderr
+
+
+@pytest.mark.parametrize("name", ["parts", "heat", "reconstruction"])
+def test_each_study_writes_tables_figures_and_pictures(name, tmp_path, cache):
+    arguments = (
+        "study",
+        name,
+        "--quick",
+        "--scenes",
+        "1",
+        "--views",
+        "2",
+        "--methods",
+        "farthest,random",
+        "--out",
+        "it",
+    )
+    result = run_command(*arguments, cwd=tmp_path, cache=cache)
+    assert result.returncode == 0, result.stderr
+    assert "not the full study" in result.stdout
+    written = {path.name for path in (tmp_path / "it").iterdir()}
+    assert {"study.json", "scene_0000.json", "results.txt", "results.csv"} <= written
+    assert (tmp_path / "it" / "results.txt").read_text() in result.stdout
+    assert sum(name.endswith(".png") for name in written) >= 2
+
+
+@pytest.mark.parametrize(("task", "told"), [("parts", "wheel"), ("heat", "coldest at")])
+def test_the_demo_of_each_task_tells_what_was_found(task, told, tmp_path, cache):
+    arguments = ("demo", "--task", task, "--scene", "7", "--quick", "--views", "2", "--search", "farthest")
+    result = run_command(*arguments, cwd=tmp_path, cache=cache)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.count(told) == 2
+    (report,) = tmp_path.rglob("report.html")
+    assert ("Points predicted of each part" if task == "parts" else "coldest at") in report.read_text()
+
+
+def test_a_published_part_segmenter_converts(tmp_path, cache, shared):
+    source = shared / "reference" / "pointnet2_partseg_msg.pth"
+    result = run_command("convert", str(source), "net.safetensors", cwd=tmp_path, cache=cache)
+    assert result.returncode == 0, result.stderr
+    assert "50 parts of 16 categories" in result.stdout
 
 
 @pytest.mark.parametrize("command", [(), ("demo",), ("run",)])

@@ -49,7 +49,7 @@ def test_the_script_runs_as_written(tmp_path, monkeypatch):
 
 def test_the_other_blocks_run():
     for block in python_blocks()[1:]:
-        exec(block, {"nbv": nbv, "jax": jax})
+        exec(block, {"nbv": nbv, "jax": jax, "source": np.array([0.0, 1.25, 0.0])})
 
 
 @pytest.mark.parametrize("name", ["main", "test"])
