@@ -15,6 +15,7 @@ from jaxnbv.experiments.heat import figures as heat_figures
 from jaxnbv.experiments.heat import pictures as heat_pictures
 from jaxnbv.experiments.heat import report as heat_report
 from jaxnbv.experiments.heat import study as heat_study
+from jaxnbv.experiments.meshes import mesh_files
 from jaxnbv.experiments.parts import figures as part_figures
 from jaxnbv.experiments.parts import pictures as part_pictures
 from jaxnbv.experiments.parts import report as part_report
@@ -51,6 +52,9 @@ FolderOption = Annotated[
         help="Output folder; the scenes already in it are not run again.",
         show_default="runs/study-NAME[-quick]",
     ),
+]
+MeshesOption = Annotated[
+    Path | None, typer.Option(help="A folder of meshes to scan.", show_default="procedural objects")
 ]
 # What every study's quick settings have in common, and the most scenes that it runs of each.
 _QUICK: dict[str, Any] = {
@@ -140,17 +144,24 @@ def heat(
     scenes: ScenesOption = 24,
     views: ViewsOption = 6,
     methods: MethodsOption = None,
+    meshes: MeshesOption = None,
     out: FolderOption = None,
     quick: QuickOption = False,
     device: DeviceOption = Device.AUTO,
 ) -> None:
     """How near does the coldest point of the scanned cloud come to the object's?
 
-    On procedural objects whose coldest point hides, heated at one place. Writes a record a scene, tables as text and
-    CSV, figures and pictures. Interrupted, it continues with the next scene.
+    On procedural objects whose coldest point hides, or on your meshes, heated at one place. Writes a record a scene,
+    tables as text and CSV, figures and pictures. Interrupted, it continues with the next scene.
+
+    32 candidates at radius 3, 50 x 50 rays. Views are imagined with 24 x 24 rays, 8 samples of a Gaussian process that
+    fits the spacing of the data (lengthscale 0.01, L = 32) on a 64^3 grid, and added to 1,024 points of the cloud: less
+    of everything than the paper.
     """
     prepare(device)
-    settings = heat_study.HeatStudy(views=views)
+    files = () if meshes is None else mesh_files(meshes)
+    settings = heat_study.HeatStudy(files, views=views)
+    scenes = min(scenes, len(files)) if files else scenes
     if quick:
         settings = dataclasses.replace(settings, **_QUICK, num_candidates=24, num_points=512)
     folder = _folder(out, "heat", quick)
@@ -164,10 +175,7 @@ def reconstruction(
     scenes: ScenesOption = 32,
     views: ViewsOption = 5,
     methods: MethodsOption = None,
-    meshes: Annotated[
-        Path | None,
-        typer.Option(help="A folder of meshes to reconstruct.", show_default="procedural objects"),
-    ] = None,
+    meshes: MeshesOption = None,
     out: FolderOption = None,
     quick: QuickOption = False,
     device: DeviceOption = Device.AUTO,
@@ -181,7 +189,7 @@ def reconstruction(
     64^3 grid: fewer candidates and a smoother prior than the paper's.
     """
     prepare(device)
-    files = () if meshes is None else reconstruction_study.mesh_files(meshes)
+    files = () if meshes is None else mesh_files(meshes)
     settings = reconstruction_study.ReconstructionStudy(files, views=views)
     settings = dataclasses.replace(settings, **_QUICK, num_candidates=40) if quick else settings
     scenes = min(scenes, len(files)) if files else scenes

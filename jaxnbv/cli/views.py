@@ -113,7 +113,7 @@ def _demo_scene(task: Task, scene: int, framing: Framing, seed: int) -> tuple[st
     if task is Task.HEAT:
         heated = heat_scene(scene)
         start = source_view(heated, jax.random.key(seed))
-        return f"{heated.name}-heat", SDFSurface(heated.solid), heat_score(np.asarray(heated.source)), start
+        return f"{heated.name}-heat", heated.surface, heat_score(np.asarray(heated.source)), start
     pyramid = pyramid_scene(Split.TEST, scene, framing)
     typer.echo(f"the pattern is a {PATTERNS[int(pyramid.label)]}")
     score = class_score(task, pyramid_classifier(framing.longest_side))

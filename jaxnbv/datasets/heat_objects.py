@@ -8,8 +8,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import require
-from jaxnbv.datasets.labelled import LabelledSolid, assemble, bar, box, generator, path, ring, rod
-from jaxnbv.scanning import SDFSurface, scan
+from jaxnbv.datasets.labelled import assemble, bar, box, generator, path, ring, rod
+from jaxnbv.scanning import SDFSurface, Surface, scan
 from jaxnbv.search.base import sphere_candidates
 
 _LABEL = 0
@@ -18,12 +18,12 @@ _LABEL = 0
 class HeatScene(eqx.Module):
     """An object in one piece and where it is heated.
 
-    - `solid`: the object, upright along y, centred, its longest side 2.5.
-    - `name`: one of `HEAT_OBJECTS`.
+    - `surface`: the object, centred, its longest side 2.5; a procedural one stands upright along y.
+    - `name`: what it is, such as one of `HEAT_OBJECTS`.
     - `source`: a point of its surface, in scene units; power goes in nearby.
     """
 
-    solid: LabelledSolid
+    surface: Surface
     name: str = eqx.field(static=True)
     source: Float[Array, "3"]
 
@@ -41,7 +41,7 @@ def heat_scene(index: int) -> HeatScene:
     source = solid.centre[0] + jnp.matmul(
         solid.rotation[0], solid.half_size[0] * jnp.asarray(place), precision="highest"
     )
-    return HeatScene(solid, name, source)
+    return HeatScene(SDFSurface(solid), name, source)
 
 
 def source_view(scene: HeatScene, key: PRNGKeyArray, num_candidates: int = 100, radius: float = 3.0) -> Pose:
@@ -50,7 +50,7 @@ def source_view(scene: HeatScene, key: PRNGKeyArray, num_candidates: int = 100, 
     **Raises:** `ValueError` if there is none.
     """
     poses = sphere_candidates(num_candidates, radius)
-    scans = scan(SDFSurface(scene.solid), Camera(), poses)
+    scans = scan(scene.surface, Camera(), poses)
     near = jnp.linalg.norm(scans.points - scene.source, axis=-1) < 0.05
     (shown,) = np.nonzero(jnp.any(near & scans.mask, axis=-1))
     require(len(shown) > 0, f"none of {num_candidates} candidates sees the heat source: ask for more of them")

@@ -31,7 +31,7 @@ def test_objects_are_in_one_piece_of_longest_side_two_and_a_half():
         scene = heat_scene(index)
         assert scene.name == HEAT_OBJECTS[index % len(HEAT_OBJECTS)]
         spacing = 2 * REACH / (NODES - 1)
-        vertices, faces, _, _ = marching_cubes(np.array(on_grid(scene.solid)), 0.0, spacing=(spacing,) * 3)
+        vertices, faces, _, _ = marching_cubes(np.array(on_grid(scene.surface.sdf)), 0.0, spacing=(spacing,) * 3)
         assert trimesh.Trimesh(vertices, faces, process=False).body_count == 1
         low, high = vertices.min(axis=0) - REACH, vertices.max(axis=0) - REACH
         np.testing.assert_allclose(low + high, 0.0, atol=0.025)
@@ -45,7 +45,7 @@ def test_the_source_lies_on_a_level_face_in_the_open():
         angle = np.linspace(0, 2 * np.pi, 12)
         rim = 0.05 * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=-1)
         above = [[0.0, 0.05 * up[scene.name], 0.0]]
-        distance = distances(scene.solid, np.asarray(scene.source) + np.concatenate([0 * rim[:1], rim, above]))
+        distance = distances(scene.surface.sdf, np.asarray(scene.source) + np.concatenate([0 * rim[:1], rim, above]))
         np.testing.assert_allclose(distance[:-1], 0.0, atol=1e-5)
         np.testing.assert_allclose(distance[-1], 0.05, atol=1e-5)
 
@@ -53,7 +53,7 @@ def test_the_source_lies_on_a_level_face_in_the_open():
 def test_scenes_differ_and_are_the_same_each_time():
     scenes = [heat_scene(index) for index in range(12)]
     assert len({tuple(np.asarray(scene.source).round(5)) for scene in scenes}) == 12
-    assert len({tuple(np.ravel(scene.solid.half_size).round(5)) for scene in scenes}) == 12
+    assert len({tuple(np.ravel(scene.surface.sdf.half_size).round(5)) for scene in scenes}) == 12
     again = heat_scene(7)
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(scenes[7]), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 
 from jaxnbv.camera import Camera, Pose, fibonacci_sphere
 from jaxnbv.cloud import PointCloud
-from jaxnbv.datasets import heat_scene
+from jaxnbv.datasets import HeatScene
 from jaxnbv.diffusion import HeatProblem
 from jaxnbv.experiments.heat.report import Record, methods_of
 from jaxnbv.experiments.heat.study import HeatStudy, Truth, heat_problem, seen_clouds, true_temperature
@@ -70,7 +70,7 @@ def write_pictures(records: Sequence[Record], settings: HeatStudy, folder: str |
 
 
 def _picture(record: Record, study: HeatStudy, methods: Sequence[str]) -> Figure:
-    stage = _stage(record["scene"])
+    stage = _stage(study.scene(record["scene"]))
     runs = [record["methods"][method] for method in methods]
     views = len(runs[0]["candidates"])
     columns = sorted({math.ceil(views / 3), math.ceil(2 * views / 3), views})
@@ -111,8 +111,8 @@ def _picture(record: Record, study: HeatStudy, methods: Sequence[str]) -> Figure
     return figure
 
 
-def _stage(scene: int) -> _Stage:
-    truth, heat = true_temperature(heat_scene(scene)), heat_problem(heat_scene(scene))
+def _stage(scene: HeatScene) -> _Stage:
+    truth, heat = true_temperature(scene), heat_problem(scene)
     mesh = truth.mesh
     normals = np.asarray(_vertex_normals(mesh.vertices, mesh.faces))
     surface = MeanSurface(mesh.vertices, mesh.faces, normals, np.ones(len(mesh.vertices)))

@@ -2,10 +2,12 @@
 
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 from scipy.spatial import cKDTree
@@ -17,6 +19,7 @@ from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets import HeatScene, heat_scene
 from jaxnbv.diffusion import HeatProblem
 from jaxnbv.episode import observe_scene, view_keys
+from jaxnbv.experiments.meshes import numbered_mesh
 from jaxnbv.planner import Planner, State
 from jaxnbv.scanning import Grid, GridSurface, SDFSurface, SensorNoise, TriangleMesh, mesh_from_sdf
 from jaxnbv.search import DiscreteSearch, FarthestView, HalvingSearch, Proposal, RandomView, UncertaintyView
@@ -50,6 +53,8 @@ _TRUE_GRID = Grid(160)
 class HeatStudy(eqx.Module):
     """What all scenes of a study share.
 
+    - `meshes`: files of the objects, one a scene (`mesh_files`), each heated at a random point; without any, scenes are
+      those of `heat_scene`.
     - `views`: in all, the first included.
     - `num_candidates`: on the sphere of radius 3.
     - `num_samples`, `model`, `grid_resolution`, `capacity`: of the planner.
@@ -57,6 +62,7 @@ class HeatStudy(eqx.Module):
     - `imagined_rays`: rays along a side of an imagined scan; true scans have 50 x 50.
     """
 
+    meshes: tuple[str, ...] = eqx.field(static=True, default=())
     views: int = eqx.field(static=True, default=6)
     num_candidates: int = eqx.field(static=True, default=32)
     num_samples: int = eqx.field(static=True, default=8)
@@ -88,6 +94,17 @@ class HeatStudy(eqx.Module):
         grid = Grid(self.grid_resolution)
         return Planner(self.model, camera, score, search, self.num_samples, grid, self.capacity, self.views)
 
+    def scene(self, index: int) -> HeatScene:
+        """An object and where it is heated.
+
+        **Raises:** `ValueError` if there is no mesh of this index, or it cannot be read.
+        """
+        if not self.meshes:
+            return heat_scene(index)
+        mesh = numbered_mesh(self.meshes, index)
+        (source,) = mesh.sample_points(_key(index, "source"), 1)
+        return HeatScene(mesh, Path(self.meshes[index]).name, jnp.asarray(source, jnp.result_type(float)))
+
     def poses(self) -> Pose:
         """The candidates."""
         return sphere_candidates(self.num_candidates, HEAT_RADIUS)
@@ -118,7 +135,11 @@ class Truth(NamedTuple):
 
 def true_temperature(scene: HeatScene) -> Truth:
     """The temperature of an object's whole surface."""
-    mesh = mesh_from_sdf(scene.solid, _TRUE_GRID)
+    mesh = scene.surface
+    if isinstance(mesh, SDFSurface):
+        mesh = mesh_from_sdf(mesh.sdf, _TRUE_GRID)
+    if not isinstance(mesh, TriangleMesh):
+        raise InputError(f"the temperature of a {type(mesh).__name__} is not known: give a mesh or a signed distance")
     points, temperature = body_temperature(mesh, heat_problem(scene))
     return Truth(mesh, points, temperature.values)
 
@@ -147,7 +168,7 @@ def run_scene(study: HeatStudy, index: int, methods: Sequence[str] = METHODS) ->
     unknown = sorted({*methods} - {*METHODS})
     require(not unknown, f"unknown methods: {', '.join(unknown)}; choose from {', '.join(METHODS)}")
     start = time.perf_counter()
-    scene = heat_scene(index)
+    scene = study.scene(index)
     first, truth = _first_view(study, scene, index), true_temperature(scene)
     runs = {}
     for method in methods:
@@ -236,7 +257,7 @@ def _estimates(clouds: Sequence[PointCloud], heat: HeatProblem, truth: Truth) ->
 
 def seen_clouds(study: HeatStudy, index: int, candidates: Sequence[int]) -> list[PointCloud]:
     """D after each of the given views of a scene, noise included: those of a record's method."""
-    scene, state, clouds = heat_scene(index), None, []
+    scene, state, clouds = study.scene(index), None, []
     planner = study.planner("farthest", scene.source)
     for view, candidate in enumerate(candidates):
         scan, pose = _scan(study, scene, index, candidate, view), study.poses()[candidate]
@@ -247,7 +268,7 @@ def seen_clouds(study: HeatStudy, index: int, candidates: Sequence[int]) -> list
 
 def _scan(study: HeatStudy, scene: HeatScene, index: int, candidate: int, view: int) -> PointCloud:
     _, _, noise_key = view_keys(_key(index, "episode"), view)
-    return observe_scene(SDFSurface(scene.solid), Camera(), study.poses()[candidate], SensorNoise(), noise_key)
+    return observe_scene(scene.surface, Camera(), study.poses()[candidate], SensorNoise(), noise_key)
 
 
 def _first_view(study: HeatStudy, scene: HeatScene, index: int) -> int:
@@ -263,5 +284,5 @@ def _candidate(study: HeatStudy, pose: Pose) -> int:
 
 
 def _key(index: int, purpose: str) -> PRNGKeyArray:
-    purposes = ("first", "episode")
+    purposes = ("first", "episode", "source")
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(8), index), purposes.index(purpose))

@@ -8,7 +8,6 @@ from pathlib import Path
 import equinox as eqx
 import jax
 import numpy as np
-import trimesh
 from jaxtyping import Float, PRNGKeyArray
 
 from jaxnbv.camera import Camera
@@ -18,12 +17,13 @@ from jaxnbv.datasets import Split
 from jaxnbv.datasets.parts import part_scene
 from jaxnbv.episode import observe_scene, view_keys
 from jaxnbv.experiments.episodes import planned_views
+from jaxnbv.experiments.meshes import numbered_mesh
 from jaxnbv.experiments.metrics import coverage, truth_points
 from jaxnbv.experiments.reconstruction.distances import SURFACE_POINTS, surface_distance
 from jaxnbv.networks.shapenet import CATEGORIES
 from jaxnbv.planner import Planner
 from jaxnbv.reconstruction import has_poisson, mean_mesh, screened_poisson
-from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, Surface, TriangleMesh, load_mesh
+from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, Surface, TriangleMesh
 from jaxnbv.search import DiscreteSearch, FarthestView, RandomView, Search, UncertaintyView
 from jaxnbv.search.base import sphere_candidates
 from jaxnbv.surfaces import GeometricSPSR
@@ -80,30 +80,13 @@ class ReconstructionStudy(eqx.Module):
         """
         if not self.meshes:
             return SDFSurface(part_scene(Split.TEST, index).solid)
-        require(
-            0 <= index < len(self.meshes),
-            f"there is no scene {index}: the study has {len(self.meshes)} meshes, counted from 0; run as many scenes",
-        )
-        return load_mesh(self.meshes[index])
+        return numbered_mesh(self.meshes, index)
 
     def name(self, index: int) -> str:
         """What a scene is called: its mesh file, or its category and number."""
         if self.meshes:
             return Path(self.meshes[index]).name
         return f"{CATEGORIES[int(part_scene(Split.TEST, index).category)].name} {index}"
-
-
-def mesh_files(folder: str | Path) -> tuple[str, ...]:
-    """The mesh files in a folder, sorted: those whose name ends as a format that trimesh reads.
-
-    **Raises:** `ValueError` if there is no such folder, or no mesh in it.
-    """
-    folder = Path(folder)
-    require(folder.is_dir(), f"there is no folder {folder}: give one that holds mesh files")
-    formats = trimesh.available_formats()
-    found = tuple(str(file) for file in sorted(folder.iterdir()) if file.suffix[1:].lower() in formats)
-    require(len(found) > 0, f"the folder {folder} holds no mesh: its files must end in {', '.join(sorted(formats))}")
-    return found
 
 
 def run_scene(study: ReconstructionStudy, index: int, methods: Sequence[str] = METHODS) -> dict:

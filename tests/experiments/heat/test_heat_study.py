@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 import jaxnbv as nbv
@@ -24,6 +25,7 @@ from jaxnbv.experiments.heat.study import (
     seen_clouds,
     true_temperature,
 )
+from jaxnbv.experiments.meshes import mesh_files
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.search import HalvingSearch
 from jaxnbv.search.base import Problem, sphere_candidates
@@ -178,3 +180,20 @@ def test_the_picture_shows_every_cloud_beside_the_truth(record, tmp_path, monkey
     # The green star of the true coldest point, in the truth and in all three views of both methods that are shown.
     green = np.abs(image - [0x00, 0x9E, 0x73]).sum(axis=-1) < 30
     assert green.sum() > 7 * 20
+
+
+def test_a_folder_of_meshes_gives_the_scenes(tmp_path):
+    for radius, name in ((1.0, "a.obj"), (0.5, "b.ply")):
+        trimesh.creation.icosphere(3, radius).export(tmp_path / name)
+    study = HeatStudy(mesh_files(tmp_path))
+    scenes = [study.scene(index) for index in range(2)]
+    assert [scene.name for scene in scenes] == ["a.obj", "b.ply"]
+    for scene in scenes:
+        assert 1.22 < np.linalg.norm(scene.source) < 1.26
+    assert not np.allclose(scenes[0].source, scenes[1].source)
+    truth = true_temperature(scenes[0])
+    # Of a ball heated at one place the other end is coldest.
+    opposite = -np.asarray(scenes[0].source)
+    assert np.linalg.norm(truth.coldest - opposite) < 0.3
+    with pytest.raises(InputError, match="no scene 2"):
+        study.scene(2)

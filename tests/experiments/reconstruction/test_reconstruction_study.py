@@ -11,6 +11,7 @@ from PIL import Image
 
 import jaxnbv as nbv
 from jaxnbv.checks import InputError
+from jaxnbv.experiments.meshes import mesh_files
 from jaxnbv.experiments.metrics import coverage, truth_points
 from jaxnbv.experiments.reconstruction import pictures as reconstruction_pictures
 from jaxnbv.experiments.reconstruction import study as reconstruction_study
@@ -29,7 +30,6 @@ from jaxnbv.experiments.reconstruction.study import (
     METHODS,
     POISSON,
     ReconstructionStudy,
-    mesh_files,
     reconstruct,
     run_scene,
     seen_cloud,
