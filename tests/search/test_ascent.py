@@ -29,6 +29,10 @@ class Known(Problem):
     place: jax.Array
     gaze: jax.Array
 
+    def __init__(self, *problem_place_and_gaze):
+        *problem, self.place, self.gaze = problem_place_and_gaze
+        super().__init__(*problem)
+
     def acquisition(self, poses):
         return 5.0 - jnp.sum((poses.position - self.place) ** 2 + (poses.forward - self.gaze) ** 2, axis=-1)
 
