@@ -47,7 +47,7 @@ def load_invariant(path: str | Path) -> tuple[InvariantClassifier, tuple[str, ..
     **Raises:** `ValueError` for a file that is missing, damaged, of another network or not finite.
     """
     tensors, metadata = _read(path)
-    require("classes" in metadata, f"{path} does not name its classes: it holds another network")
+    require("classes" in metadata, f"{path} is damaged or holds another network: it does not name its classes")
     classes = tuple(metadata["classes"].split(","))
     blank = eqx.filter_eval_shape(InvariantClassifier, len(classes), jax.random.key(0))
     return _filled(blank, tensors, path), classes

@@ -32,20 +32,27 @@ def train(
     labels: Int[AnyArray, " b"],
     key: PRNGKeyArray,
     steps: int,
-    **settings: Any,
+    batch_size: int = 32,
+    learning_rate: float = 2e-3,
+    weight_decay: float = 1e-4,
+    folder: str | Path | None = None,
+    progress: bool = True,
 ) -> Network:
     """The classifier after `steps` of `fit` to the mean of -log p(label).
 
-    It is called as `network(points, normals, mask)` and gives log-probabilities. Further settings as of `fit`.
+    It is called as `network(points, normals, mask)` and gives log-probabilities. Settings as of `fit`.
 
-    **Raises:** `ValueError` as `fit` does.
+    **Raises:** `ValueError` if there are no clouds, or numbers of clouds and labels differ, and as `fit` does.
     """
+    count = clouds.mask.shape[0]
+    require(count > 0 and count == len(labels), f"{count} clouds and {len(labels)} labels: give one label a cloud")
 
     def loss(network: Any, example: tuple[PointCloud, Array]) -> Float[Array, ""]:
         cloud, label = example
         return -network(cloud.points, cloud.normals, cloud.mask)[label]
 
-    return fit(network, loss, (clouds, labels), key, steps, **settings)
+    data = clouds, np.asarray(labels)
+    return fit(network, loss, data, key, steps, batch_size, learning_rate, weight_decay, folder, progress)
 
 
 def fit(
