@@ -149,7 +149,7 @@ def test_the_study_writes_tables_and_figures_and_continues(tmp_path, cache):
     assert "best" in result.stderr
 
 
-@pytest.mark.parametrize("name", ["parts", "heat", "reconstruction"])
+@pytest.mark.parametrize("name", ["heat", "reconstruction"])
 def test_each_study_writes_tables_figures_and_pictures(name, tmp_path, cache):
     arguments = (
         "study",
@@ -173,14 +173,13 @@ def test_each_study_writes_tables_figures_and_pictures(name, tmp_path, cache):
     assert sum(name.endswith(".png") for name in written) >= 2
 
 
-@pytest.mark.parametrize(("task", "told"), [("parts", "wheel"), ("heat", "coldest at")])
-def test_the_demo_of_each_task_tells_what_was_found(task, told, tmp_path, cache):
-    arguments = ("demo", "--task", task, "--scene", "7", "--quick", "--views", "2", "--search", "farthest")
+def test_the_demo_of_a_task_tells_what_was_found(tmp_path, cache):
+    arguments = ("demo", "--task", "parts", "--scene", "7", "--quick", "--views", "2", "--search", "farthest")
     result = run_command(*arguments, cwd=tmp_path, cache=cache)
     assert result.returncode == 0, result.stderr
-    assert result.stdout.count(told) == 2
+    assert result.stdout.count("wheel") == 2
     (report,) = tmp_path.rglob("report.html")
-    assert ("Points predicted of each part" if task == "parts" else "coldest at") in report.read_text()
+    assert "Points predicted of each part" in report.read_text()
 
 
 def test_a_published_part_segmenter_converts(tmp_path, cache, shared):
