@@ -33,7 +33,8 @@ def _array(source) -> AnyArray:
 class HeatProblem(eqx.Module):
     """A body at one temperature that is heated near a point for a while: the paper's du/dt = Delta u + f, u(0) = u0.
 
-    - `source`: where; f is `power` within `radius` of it, and zero elsewhere. A body with no point there is not heated.
+    - `source`: where, in scene coordinates; f is `power` within `radius` of it and zero elsewhere, smoothed at the rim
+      by what area a point stands for (`heating`). A body with no point there is not heated.
     - `radius`: in scene units.
     - `power`: f in degrees per unit of time; the unit of time is that in which Delta, in scene units, has factor one.
     - `duration`: T, how long it is heated.

@@ -68,7 +68,7 @@ class BallsPosterior(SurfacePosterior):
         self.level = jnp.asarray(0.25)
 
     def sample(self, key, num_samples):
-        raise NotImplementedError
+        pytest.fail("the mesh of the mean needs no samples")
 
     def mean(self, x):
         away = jnp.linalg.norm(x - jnp.array([-0.6, 0.0, 0.0]), axis=-1) - 0.5

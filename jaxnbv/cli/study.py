@@ -56,7 +56,7 @@ FolderOption = Annotated[
 MeshesOption = Annotated[
     Path | None, typer.Option(help="A folder of meshes to scan.", show_default="procedural objects")
 ]
-# What every study's quick settings have in common, and the most scenes that it runs of each.
+# What the quick settings of all studies have in common.
 _QUICK: dict[str, Any] = {
     "model": GeometricSPSR(lengthscale=0.02, truncation=16),
     "num_samples": 4,

@@ -50,15 +50,19 @@ class Problem(eqx.Module):
 
     def acquisition(self, poses: Pose, samples: slice = slice(None)) -> Float[Array, " poses"]:
         """The acquisition at a batch of poses, estimated from all posterior samples or from a part of them."""
-        if self.surfaces is None:
-            raise InputError("the acquisition needs posterior samples: set uses_samples = True on the search")
-        surfaces = jax.tree.map(lambda leaf: leaf[samples], self.surfaces)
+        surfaces = jax.tree.map(lambda leaf: leaf[samples], self._sampled)
         return mean_score(self.score, self.context, surfaces, self.camera, poses)
 
     @property
     def num_samples(self) -> int:
         """How many posterior samples there are."""
-        return 0 if self.surfaces is None else self.surfaces.values.shape[0]
+        return self._sampled.values.shape[0]
+
+    @property
+    def _sampled(self) -> GridSurface:
+        if self.surfaces is None:
+            raise InputError("the acquisition needs posterior samples: set uses_samples = True on the search")
+        return self.surfaces
 
     def is_visited(self, poses: Pose) -> Bool[Array, " poses"]:
         """Whether each of a batch of poses equals one taken before, to 1e-3 in position and viewing direction."""

@@ -80,6 +80,12 @@ def test_one_round_is_the_discrete_search(problem):
     np.testing.assert_allclose(whole.values, halving.values, rtol=1e-5)
 
 
+def test_without_samples_it_says_so(problem):
+    bare = eqx.tree_at(lambda p: p.surfaces, problem, None, is_leaf=lambda leaf: isinstance(leaf, GridSurface))
+    with pytest.raises(ValueError, match="uses_samples"):
+        HalvingSearch(CANDIDATES).propose(bare, jax.random.key(0))
+
+
 @pytest.mark.parametrize(("arguments", "message"), [((0, 2.5, 2), "0 candidates"), ((9, 2.5, 0), "first_samples is 0")])
 def test_bad_numbers_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
