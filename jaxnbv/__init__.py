@@ -18,6 +18,9 @@ from jaxnbv.episode import View as View
 from jaxnbv.episode import simulate as simulate
 from jaxnbv.planner import Planner as Planner
 from jaxnbv.planner import State as State
+from jaxnbv.presets import Imagination as Imagination
+from jaxnbv.presets import imagination as imagination
+from jaxnbv.scanning import Carving as Carving
 from jaxnbv.scanning import Grid as Grid
 from jaxnbv.scanning import GridSurface as GridSurface
 from jaxnbv.scanning import Hits as Hits
@@ -46,8 +49,15 @@ from jaxnbv.search import Trajectories as Trajectories
 from jaxnbv.search import UncertaintyView as UncertaintyView
 from jaxnbv.surfaces import Fields as Fields
 from jaxnbv.surfaces import GeometricSPSR as GeometricSPSR
+from jaxnbv.surfaces import OnSurface as OnSurface
+from jaxnbv.surfaces import OutsideBoundary as OutsideBoundary
+from jaxnbv.surfaces import ScreenedSPSR as ScreenedSPSR
+from jaxnbv.surfaces import SeenEmpty as SeenEmpty
 from jaxnbv.surfaces import SurfaceModel as SurfaceModel
 from jaxnbv.surfaces import SurfacePosterior as SurfacePosterior
+from jaxnbv.surfaces import Thickness as Thickness
+from jaxnbv.surfaces import ValueSource as ValueSource
+from jaxnbv.surfaces import fit_hyperparameters as fit_hyperparameters
 from jaxnbv.tasks import ColdestPoint as ColdestPoint
 from jaxnbv.tasks import Coverage as Coverage
 from jaxnbv.tasks import CrossEntropy as CrossEntropy
@@ -56,3 +66,4 @@ from jaxnbv.tasks import MixedEntropy as MixedEntropy
 from jaxnbv.tasks import NegativeEntropy as NegativeEntropy
 from jaxnbv.tasks import SoftPartCount as SoftPartCount
 from jaxnbv.tasks import coldest_point as coldest_point
+from jaxnbv.volume import Box as Box

@@ -22,11 +22,14 @@ class PointCloud(eqx.Module):
 
     - `points`: positions, in scene units unless said otherwise.
     - `normals`: unit outward normals.
+    - `missed`: of a sensor's scan, whose rows are its pixels: where the ray met nothing, so that all of it is empty. A
+      row that is neither filled nor missed is invalid and says nothing. None for a cloud that is no sensor's image.
     """
 
     points: Float[Array, "*batch n 3"]
     normals: Float[Array, "*batch n 3"]
     mask: Bool[Array, "*batch n"]
+    missed: Bool[Array, "*batch n"] | None = None
 
     @classmethod
     def from_arrays(
@@ -84,10 +87,11 @@ class PointCloud(eqx.Module):
     def from_depth(cls, depth: Float[AnyArray, "height width"], camera: Camera, pose: Pose) -> "PointCloud":
         """The cloud, in scene coordinates, that a depth image shows: one row a pixel, row by row.
 
-        `depth` is the distance along the camera's forward axis, in scene units; pixels that are zero, negative or not
-        finite are masked. Normals come from the differences between neighbouring pixels, on the side where the depth
-        changes less, so they do not mix the two sides of an edge, and are turned to the camera. A pixel with no
-        valid neighbour along an image axis has no normal and is masked.
+        `depth` is the distance along the camera's forward axis, in scene units. A pixel of +infinity met nothing within
+        the sensor's reach, which is taken to be the whole scene; one that is zero, negative or NaN is invalid and says
+        nothing. Normals come from the differences between neighbouring pixels, on the side where the depth changes
+        less, so they do not mix the two sides of an edge, and are turned to the camera. A pixel with no valid neighbour
+        along an image axis has no normal and is invalid.
 
         **Raises:** `ValueError` if the image's shape is not the camera's.
         """
@@ -109,7 +113,8 @@ class PointCloud(eqx.Module):
         normals = (normals / jnp.where(length > 0, length, 1.0)).reshape(-1, 3)
         points = pose.to_scene(local.reshape(-1, 3))
         normals = jnp.matmul(normals, pose.rotation.T, precision="highest")
-        return cls(jnp.where(mask[:, None], points, 0.0), jnp.where(mask[:, None], normals, 0.0), mask)
+        missed = (depth == jnp.inf).reshape(-1)
+        return cls(jnp.where(mask[:, None], points, 0.0), jnp.where(mask[:, None], normals, 0.0), mask, missed)
 
     @property
     def capacity(self) -> int:
@@ -150,8 +155,12 @@ def _one_sided_difference(points: Float[Array, "h w 3"], valid: Bool[Array, "h w
 
 
 def concatenate(first: PointCloud, second: PointCloud) -> PointCloud:
-    """The union D u D' of the paper, with the capacities added; rows keep their places."""
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=0), first, second)
+    """The union D u D' of the paper, with the capacities added; rows keep their places. It is no sensor's image."""
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=0), _without_rays(first), _without_rays(second))
+
+
+def _without_rays(cloud: PointCloud) -> PointCloud:
+    return PointCloud(cloud.points, cloud.normals, cloud.mask)
 
 
 @functools.partial(jax.jit, static_argnames="count")
@@ -232,7 +241,7 @@ class Frame(eqx.Module):
     def _apply(self, thing, transform):
         if isinstance(thing, PointCloud):
             points = jnp.where(thing.mask[..., None], transform(thing.points), 0.0)
-            return PointCloud(points.astype(thing.points.dtype), thing.normals, thing.mask)
+            return PointCloud(points.astype(thing.points.dtype), thing.normals, thing.mask, thing.missed)
         if isinstance(thing, Pose):
             return Pose(thing.rotation, transform(thing.position).astype(thing.position.dtype))
         return transform(thing if isinstance(thing, Array) and is_traced(thing) else np.asarray(thing))

@@ -1,5 +1,7 @@
 """The simulated episode: scan, ask for the next view, scan again."""
 
+import itertools
+from collections.abc import Iterator
 from pathlib import Path
 
 import equinox as eqx
@@ -11,7 +13,7 @@ from tqdm import tqdm
 from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import require
 from jaxnbv.cloud import PointCloud
-from jaxnbv.planner import Planner
+from jaxnbv.planner import Planner, State
 from jaxnbv.scanning import SensorNoise, Surface, scan
 from jaxnbv.search import Proposal
 from jaxnbv.storage import EpisodeFolder, describe
@@ -46,6 +48,18 @@ class Episode(eqx.Module):
     def cloud(self) -> PointCloud:
         """D after the last view, in scene coordinates."""
         return self.views[-1].cloud
+
+    def states(self) -> Iterator[State]:
+        """The planner's state after each view, made again from the scans."""
+        return self.planner.replay((view.pose, view.scan) for view in self.views)
+
+    def state_after(self, views: int) -> State:
+        """The planner's state after so many of the views.
+
+        **Raises:** `ValueError` unless there are so many, and at least one.
+        """
+        require(1 <= views <= len(self.views), f"asked for {views} of {len(self.views)} views; ask for one at least")
+        return next(itertools.islice(self.states(), views - 1, None))
 
     def save(self, path: str | Path) -> None:
         """Write the episode to a folder (see `jaxnbv.storage` for its files); `simulate` can continue from it.

@@ -1,18 +1,20 @@
 """The planner: ask for the next view, tell what it showed. A simulated episode and a real scanner call the same two."""
 
+from collections.abc import Iterable, Iterator
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxnbv.acquisition import Score
 from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import is_traced, require
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
-from jaxnbv.scanning import Grid, GridSurface
+from jaxnbv.scanning import Carving, Grid, GridSurface, carve, check_image
 from jaxnbv.search import Problem, Proposal, Search
-from jaxnbv.surfaces import SurfaceModel
+from jaxnbv.surfaces import SurfaceModel, SurfacePosterior
 
 
 class State(eqx.Module):
@@ -20,11 +22,13 @@ class State(eqx.Module):
 
     - `cloud`: the points that are kept, in scene coordinates.
     - `poses`: the views taken in the first `num_views` rows; the others hold the identity.
+    - `seen_empty`: the nodes of the planner's grid that a scan has shown to be empty; None without carving.
     """
 
     cloud: PointCloud
     poses: Pose
     num_views: Int[Array, ""]
+    seen_empty: Bool[Array, "g g g"] | None = None
 
 
 class Planner(eqx.Module):
@@ -38,6 +42,8 @@ class Planner(eqx.Module):
     - `grid`: where the samples are evaluated and scanned.
     - `capacity`: points of D that are kept, by farthest point sampling beyond it.
     - `max_views`: views that a state has room for.
+    - `carving`: what samples are cut by: space seen empty, on which the model is conditioned too where it can be, and
+      the outside of a volume. None leaves samples as the model draws them from D, which is the paper's own behaviour.
 
     All methods are pure and run under `jit`. They compile once a planner: at the first view, nothing after the second.
 
@@ -53,6 +59,7 @@ class Planner(eqx.Module):
     grid: Grid = Grid()
     capacity: int = eqx.field(static=True, default=8192)
     max_views: int = eqx.field(static=True, default=32)
+    carving: Carving | None = Carving()
 
     def __check_init__(self):
         for name in ("num_samples", "capacity", "max_views"):
@@ -60,24 +67,47 @@ class Planner(eqx.Module):
             require(isinstance(value, int) and value >= 1, f"{name} is {value}; it must be a whole number, at least 1")
         self.search.check(self.acquisition, self.camera, self.capacity)
 
-    def init(self, cloud: PointCloud, pose: Pose | None = None) -> State:
+    def init(self, cloud: PointCloud, pose: Pose | None = None, camera: Camera | None = None) -> State:
         """The state after a first scan, in scene coordinates, taken from `pose` (None where it is not known).
 
-        **Raises:** `ValueError` if the cloud is empty, if a point is not finite or outside the scene's grid, or a
-        normal not of unit length (to 1 %).
+        `camera`: the one that took the scan, by default the planner's.
+
+        **Raises:** `ValueError` if the cloud is empty, if a point is not finite or outside the scene's grid, or more
+        than stray ones outside the carving's volume, a normal not of unit length (to 1 %), or the scan an image of
+        another camera or from another pose.
         """
-        self._check_scan(cloud, first=True)
+        camera = camera or self.camera
+        self._check_scan(cloud, pose, camera, first=True)
         poses = Pose(np.tile(np.eye(3), (self.max_views, 1, 1)), np.zeros((self.max_views, 3)))
         poses = jax.tree.map(lambda leaf: leaf.astype(jnp.result_type(float)), poses)
-        state = State(limit_capacity(cloud, self.capacity), poses, jnp.asarray(0, jnp.int32))
-        return state if pose is None else _record(state, pose)
+        empty = None if self.carving is None else jnp.zeros((self.grid.resolution,) * 3, bool)
+        state = State(limit_capacity(cloud, self.capacity), poses, jnp.asarray(0, jnp.int32), empty)
+        return state if pose is None else _record(self.carving, self.grid, state, pose, cloud, camera)
+
+    def posterior(self, state: State) -> SurfacePosterior:
+        """p(f | D, what was seen empty), of which `sample_surfaces` draws its samples before it carves them.
+
+        **Raises:** `ValueError` as the model's `condition` does, and if the state was made by a planner of another grid
+        or without carving.
+        """
+        empty = self._seen_empty(state)
+        if self.carving is None or empty is None:
+            return self.model.condition(state.cloud)
+        return self.model.condition_on_space(state.cloud, self.carving.empty_points(self.grid, empty))
+
+    def carve(self, state: State, values: Float[Array, "*s g g g"]) -> Float[Array, "*s g g g"]:
+        """Values of f minus its level at the grid's nodes, carved by what the state knows to be empty."""
+        empty = self._seen_empty(state)
+        if self.carving is None or empty is None:
+            return values
+        return carve(values, empty | self.carving.outside(self.grid))
 
     def sample_surfaces(self, state: State, key: PRNGKeyArray) -> GridSurface:
-        """S samples of the surface given D, on the grid, along a leading axis.
+        """S samples of the surface given D, carved, on the grid, along a leading axis.
 
-        **Raises:** `ValueError` if the model gives values that are not finite.
+        **Raises:** `ValueError` as `posterior` does, and if the model gives values that are not finite.
         """
-        surfaces = _sample_surfaces(self, state.cloud, key)
+        surfaces = _sample_surfaces(self, state, key)
         if not is_traced(surfaces):
             require(
                 bool(jnp.isfinite(surfaces.values).all()),
@@ -113,24 +143,49 @@ class Planner(eqx.Module):
             )
         return proposal
 
-    def observe(self, state: State, pose: Pose, scan: PointCloud) -> State:
-        """Tell: the state after a scan (scene coordinates) from a pose. A scan that saw nothing only records the pose.
+    def observe(self, state: State, pose: Pose, scan: PointCloud, camera: Camera | None = None) -> State:
+        """Tell: the state after a scan (scene coordinates) from a pose. A scan that saw nothing adds no points.
 
-        Scans of one capacity share one compilation.
+        `camera`: the one that took the scan, by default the planner's. Scans of one capacity and camera share one
+        compilation.
 
-        **Raises:** `ValueError` if a point is not finite or outside the scene's grid, a normal not of unit length (to
-        1 %), or if the state has no room for another view.
+        **Raises:** `ValueError` for a scan as `init` does, if the state was made by a planner of another grid or
+        without carving, or if it has no room for another view.
         """
-        self._check_scan(scan, first=False)
+        camera = camera or self.camera
+        self._check_scan(scan, pose, camera, first=False)
+        self._seen_empty(state)
         if not is_traced(state.num_views):
             require(
                 int(state.num_views) < self.max_views,
                 f"the state holds {int(state.num_views)} views and has room for no more: raise Planner(max_views=...)",
             )
-        return _observe(state, pose, scan)
+        return _observe(self.carving, self.grid, state, pose, scan, camera)
 
-    def _check_scan(self, scan: PointCloud, first: bool) -> None:
-        if is_traced(scan):
+    def replay(self, views: Iterable[tuple[Pose, PointCloud]], camera: Camera | None = None) -> Iterator[State]:
+        """The state after each of some views, poses and scans: `init` with the first, then `observe`.
+
+        **Raises:** `ValueError` as these do.
+        """
+        state = None
+        for pose, scan in views:
+            state = self.init(scan, pose, camera) if state is None else self.observe(state, pose, scan, camera)
+            yield state
+
+    def _seen_empty(self, state: State) -> Bool[Array, "g g g"] | None:
+        if self.carving is None:
+            return None
+        found = None if state.seen_empty is None else state.seen_empty.shape
+        expected = (self.grid.resolution,) * 3
+        require(
+            found == expected,
+            f"the state knows empty space on {found} nodes, but the planner carves {expected}: make the state with "
+            "this planner's init",
+        )
+        return state.seen_empty
+
+    def _check_scan(self, scan: PointCloud, pose: Pose | None, camera: Camera, first: bool) -> None:
+        if is_traced(scan, pose):
             return
         points, normals = scan.to_numpy()
         require(
@@ -153,13 +208,17 @@ class Planner(eqx.Module):
             f"a scanned point has a coordinate of {furthest:.4g}, outside the scene's cube of half side {limit:.4g}: "
             "bring the scan to scene coordinates with Frame.to_scene (or simulate less noise)",
         )
+        if pose is not None:
+            check_image(scan, camera, pose)
+        if self.carving is not None:
+            self.carving.check_inside(scan, self.grid)
 
 
 @eqx.filter_jit
-def _sample_surfaces(planner: Planner, cloud: PointCloud, key: PRNGKeyArray) -> GridSurface:
-    posterior = planner.model.condition(cloud)
-    fields = posterior.sample(key, planner.num_samples)
-    return GridSurface.from_values(fields.on_grid(planner.grid.axis), posterior.level, planner.grid)
+def _sample_surfaces(planner: Planner, state: State, key: PRNGKeyArray) -> GridSurface:
+    posterior = planner.posterior(state)
+    values = posterior.sample(key, planner.num_samples).on_grid(planner.grid.axis) - posterior.level
+    return GridSurface.from_values(planner.carve(state, values), 0.0, planner.grid)
 
 
 @eqx.filter_jit
@@ -169,12 +228,15 @@ def _choose(planner: Planner, state: State, surfaces: GridSurface | None, key: P
 
 
 @eqx.filter_jit
-def _observe(state: State, pose: Pose, scan: PointCloud) -> State:
+def _observe(carving: Carving | None, grid: Grid, state: State, pose: Pose, scan: PointCloud, camera: Camera) -> State:
     cloud = limit_capacity(concatenate(state.cloud, scan), state.cloud.capacity)
-    return _record(State(cloud, state.poses, state.num_views), pose)
+    return _record(carving, grid, eqx.tree_at(lambda s: s.cloud, state, cloud), pose, scan, camera)
 
 
 @eqx.filter_jit
-def _record(state: State, pose: Pose) -> State:
+def _record(carving: Carving | None, grid: Grid, state: State, pose: Pose, scan: PointCloud, camera: Camera) -> State:
     poses = jax.tree.map(lambda rows, row: rows.at[state.num_views].set(row), state.poses, pose)
-    return State(state.cloud, poses, state.num_views + 1)
+    empty = state.seen_empty
+    if carving is not None and empty is not None:
+        empty = empty | carving.seen_empty(grid, scan, camera, pose)
+    return State(state.cloud, poses, state.num_views + 1, empty)

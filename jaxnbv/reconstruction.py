@@ -26,7 +26,7 @@ def mean_mesh(model: SurfaceModel, cloud: PointCloud, grid: Grid = Grid()) -> Tr
     **Raises:** `ValueError` if the mean does not cross its level within the grid, and as the model's `condition` does.
     """
     posterior = model.condition(cloud)
-    values = np.array(_mean_on_grid(posterior, grid))
+    values = np.array(mean_on_grid(posterior, grid))
     low, high = float(values.min()), float(values.max())
     require(
         low < 0 < high,
@@ -38,7 +38,7 @@ def mean_mesh(model: SurfaceModel, cloud: PointCloud, grid: Grid = Grid()) -> Tr
 
 
 @eqx.filter_jit
-def _mean_on_grid(posterior: SurfacePosterior, grid: Grid) -> Float[Array, "g g g"]:
+def mean_on_grid(posterior: SurfacePosterior, grid: Grid) -> Float[Array, "g g g"]:
     """E f minus the level at the grid's nodes, slab by slab; in one go where the mean is a field of its own."""
     axis = jnp.asarray(grid.axis, posterior.level.dtype)
     field = getattr(posterior, "mean_field", None)

@@ -152,6 +152,8 @@ class EpisodeFolder:
             "normals": scan.normals,
             "mask": scan.mask,
         }
+        if scan.missed is not None:
+            data["missed"] = scan.missed
         if proposal is not None:
             data |= {
                 "value": proposal.value,
@@ -182,7 +184,8 @@ class EpisodeFolder:
 
 def _view(data: dict[str, jax.Array]) -> tuple[Pose, PointCloud, Proposal | None]:
     pose = Pose(data["rotation"], data["position"])
-    scan = PointCloud(data["points"], data["normals"], data["mask"])
+    # Folders of earlier versions do not say which rays met nothing.
+    scan = PointCloud(data["points"], data["normals"], data["mask"], data.get("missed"))
     if "values" not in data:
         return pose, scan, None
     candidates = Pose(data["candidate_rotations"], data["candidate_positions"])

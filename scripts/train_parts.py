@@ -14,13 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 from cached import cached
 
-from jaxnbv import Grid, PointCloud
+from jaxnbv import Coverage, DiscreteSearch, Grid, Planner, PointCloud
 from jaxnbv.datasets import Split
-from jaxnbv.experiments.parts.clouds import LabelledPartClouds, imagined_part_clouds, scanned_part_clouds
-from jaxnbv.experiments.pyramid.clouds import Imagination
+from jaxnbv.experiments.parts.clouds import (
+    PART_CAMERA,
+    LabelledPartClouds,
+    imagined_part_clouds,
+    scanned_part_clouds,
+)
 from jaxnbv.networks import CATEGORIES, CompactPartSegmenter, fit, part_mask, save_compact_segmenter
 from jaxnbv.networks.pretrained import TRAINED_SIDE
-from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.presets import ModelName, imagination
 
 WEIGHTS = Path(__file__).parents[1] / "jaxnbv" / "networks" / "weights" / "parts.safetensors"
 # Scenes whose posterior is sampled come from numbers that no scanned cloud uses.
@@ -39,10 +43,11 @@ def scanned(folder: Path, split: Split, count: int) -> LabelledPartClouds:
 
 def imagined(folder: Path, split: Split, count: int) -> LabelledPartClouds:
     """Clouds that end in a scan of a posterior sample, 16 from each of `count` scenes."""
-    imagination = Imagination(GeometricSPSR(lengthscale=0.01, truncation=32), Grid(64))
+    model, carving = imagination(ModelName.SCREENED)
+    planner = Planner(model, PART_CAMERA, Coverage(), DiscreteSearch(), 4, Grid(64), 2500, carving=carving)
 
     def make(index):
-        return imagined_part_clouds(split, [index], imagination)
+        return imagined_part_clouds(split, [index], planner)
 
     scenes = range(FIRST_IMAGINED, FIRST_IMAGINED + count)
     return _clouds(cached(folder / f"imagined-{split}-{count}.npz", scenes, make))

@@ -56,12 +56,19 @@ def test_the_same_command_continues_with_more_views(finished, cache):
     assert all((out / name).read_bytes() == content for name, content in before.items())
 
 
-@pytest.mark.parametrize("search", ["farthest", "random", "uncertainty", "gradient-6dof"])
-def test_run_takes_a_mesh_and_each_search(search, tmp_path, cache):
+@pytest.mark.parametrize(
+    ("search", "model"),
+    [("farthest", "screened"), ("random", "paper"), ("uncertainty", "paper"), ("gradient-6dof", "screened")],
+)
+def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path, cache):
     trimesh.creation.torus(1.0, 0.4).export(tmp_path / "ring.ply")
+    named = () if model == "screened" else ("--model", model)
     arguments = ("run", "ring.ply", "--quick", "--views", "2", "--search", search, "--out", "mine", "--no-report")
-    result = run_command(*arguments, cwd=tmp_path, cache=cache)
+    result = run_command(*arguments, *named, cwd=tmp_path, cache=cache)
     assert result.returncode == 0, result.stderr
+    planner = json.loads((tmp_path / "mine" / "episode.json").read_text())["config"]["planner"]
+    assert planner["model"]["type"] == {"screened": "ScreenedSPSR", "paper": "GeometricSPSR"}[model]
+    assert (planner["carving"] is None) == (model == "paper")
     with np.load(tmp_path / "mine" / "view_01.npz") as view:
         positions, values = view["candidate_positions"], view["values"]
         if "trajectory_values" in view:

@@ -55,8 +55,12 @@ def test_simulate_is_the_loop_of_ask_and_tell(episode):
         view = episode.views[index]
         assert_same_bits((view.pose, view.scan, view.cloud), (pose, seen, state.cloud))
         assert_same_bits(view.proposal, proposal)
+        assert_same_bits(episode.state_after(index + 1), state)
     assert_same_bits(episode.cloud, state.cloud)
     assert len(episode.views) == 4
+    for wrong in (0, 5):
+        with pytest.raises(ValueError, match=f"asked for {wrong} of 4 views"):
+            episode.state_after(wrong)
 
 
 def test_views_differ_and_scans_carry_the_sensors_noise(episode):

@@ -33,7 +33,8 @@ def test_the_script_runs_as_written(tmp_path, monkeypatch):
         "normals": directions,
         "x": directions[:5],
         "key": jax.random.key(2),
-        "scan": seen,
+        # Its points alone, which may be told with any pose.
+        "scan": nbv.PointCloud(seen.points, seen.normals, seen.mask),
         "camera": camera,
         "pose": pose,
         "depth": np.where(np.asarray(seen.mask), local[:, 2], 0.0).reshape(50, 50),

@@ -127,6 +127,29 @@ def test_views_come_back_with_the_same_bits(finished):
             np.testing.assert_array_equal(a, b)
 
 
+def test_a_view_keeps_which_rays_missed_and_one_of_an_earlier_version_reads_without(finished, tmp_path):
+    episode, folder = finished
+    config = json.loads((folder / "episode.json").read_text())["config"]
+    folder = shutil.copytree(folder, tmp_path / "copy")
+    for read, view in zip(EpisodeFolder(folder, config).read_views(), episode.views, strict=True):
+        assert 0 < np.asarray(read[1].missed).sum() < 64
+        np.testing.assert_array_equal(read[1].missed, ~np.asarray(view.scan.mask))
+    with np.load(folder / "view_01.npz") as saved:
+        older = {name: saved[name] for name in saved.files if name != "missed"}
+    np.savez_compressed(folder / "view_01.npz", **older)
+    views = EpisodeFolder(folder, config).read_views()
+    assert [pair[1].missed is None for pair in views] == [False, True, False, False, False]
+    np.testing.assert_array_equal(views[1][1].points, episode.views[1].scan.points)
+
+
+def state_after(episode):
+    first, *others = episode.views
+    state = episode.planner.init(first.scan, first.pose)
+    for view in others:
+        state = episode.planner.observe(state, view.pose, view.scan)
+    return state
+
+
 def test_the_record_says_what_made_it(finished):
     record = json.loads((finished[1] / "episode.json").read_text())
     assert set(record["config"]) == {"planner", "scene", "noise", "first", "key"}
@@ -158,8 +181,10 @@ def test_three_views_continued_to_five_equal_five(finished, tmp_path):
     assert len(contents(tmp_path / "run")) == 5
     episode = run(tmp_path / "run", views=5)
     assert contents(tmp_path / "run") == contents(folder)
-    for a, b in zip(jax.tree.leaves(episode.views), jax.tree.leaves(finished[0].views), strict=True):
+    ends = [(each.views, state_after(each)) for each in (episode, finished[0])]
+    for a, b in zip(*map(jax.tree.leaves, ends), strict=True):
         np.testing.assert_array_equal(a, b)
+    assert ends[0][1].seen_empty.shape == (24, 24, 24)
 
 
 def test_a_finished_run_is_read_not_computed(finished, monkeypatch):

@@ -11,6 +11,7 @@ import typer
 
 from jaxnbv.checks import InputError
 from jaxnbv.datasets import Framing
+from jaxnbv.presets import ModelName
 
 
 class Task(StrEnum):
@@ -67,7 +68,7 @@ ViewsOption = Annotated[int, typer.Option(help="Views in all, the first one incl
 SeedOption = Annotated[
     int, typer.Option(min=0, max=2**63 - 1, help="Seed of the sensor's noise and of the posterior samples.")
 ]
-OutOption = Annotated[Path | None, typer.Option(help="Output folder.", show_default="runs/NAME-SEARCH")]
+OutOption = Annotated[Path | None, typer.Option(help="Output folder.", show_default="runs/NAME-SEARCH[-paper]")]
 CategoryOption = Annotated[
     str | None,
     typer.Option(
@@ -83,6 +84,13 @@ SourceOption = Annotated[
     ),
 ]
 NoiseOption = Annotated[float, typer.Option(help="Standard deviation of the sensor's noise on points and normals.")]
+ModelOption = Annotated[
+    ModelName,
+    typer.Option(
+        help="By what surfaces are imagined: screened knows that the object lies in its box and that space which was "
+        "seen through is empty; paper is the published model, which knows the scanned normals alone."
+    ),
+]
 QuickOption = Annotated[
     bool, typer.Option("--quick", help="Small settings, for a first look in under a minute; not the paper's.")
 ]

@@ -13,6 +13,7 @@ from jaxnbv.cli.options import SearchName, Task
 from jaxnbv.datasets import Framing
 from jaxnbv.networks import CloudClassifier, CloudSegmenter, load_checkpoint, load_part_segmenter, part_segmenter
 from jaxnbv.planner import Planner
+from jaxnbv.presets import ModelName, imagination
 from jaxnbv.scanning import Grid
 from jaxnbv.search import (
     ConstrainedPoses,
@@ -27,7 +28,6 @@ from jaxnbv.search import (
     SpherePoses,
     UncertaintyView,
 )
-from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Classifier, ColdestPoint, Coverage, CrossEntropy, MixedEntropy, NegativeEntropy, SoftPartCount
 
 CLASS_TASKS = (Task.CROSS_ENTROPY, Task.ENTROPY, Task.MIXED)
@@ -112,18 +112,22 @@ def search_of(name: SearchName, radius: float, num_candidates: int | None) -> Se
     return over_candidates[name](radius=radius, **count)
 
 
-def task_planner(task: Task, score: Score, search: SearchName, quick: bool) -> Planner:
-    """The planner of a task at the authors' settings, or at small ones."""
+def task_planner(
+    task: Task, score: Score, search: SearchName, model: ModelName, quick: bool, longest_side: float = 2.5
+) -> Planner:
+    """The planner of a task at the authors' settings, or at small ones, for an object of this longest side."""
     camera, radius, candidates = setting_of(task)
+    surfaces, carving = imagination(model, longest_side, quick)
     if not quick:
         count = None if search in (SearchName.GRADIENT_2DOF, SearchName.GRADIENT_6DOF) else candidates
-        return Planner(GeometricSPSR(), camera, score, search_of(search, radius, count))
-    model, small = GeometricSPSR(lengthscale=0.012, truncation=24), Camera(height=24, width=24)
-    return Planner(model, small, score, search_of(search, radius, 40), 4, Grid(56), capacity=2048)
+        return Planner(surfaces, camera, score, search_of(search, radius, count), carving=carving)
+    small = Camera(height=24, width=24)
+    return Planner(surfaces, small, score, search_of(search, radius, 40), 4, Grid(56), capacity=2048, carving=carving)
 
 
-def pyramid_planner(score: Score, search: SearchName, framing: Framing) -> Planner:
-    """The surfaces are imagined as those were that the classifier was trained on."""
-    model, grid = GeometricSPSR(lengthscale=0.01, truncation=32), Grid(64, 0.7 * framing.longest_side)
+def pyramid_planner(score: Score, search: SearchName, model: ModelName, framing: Framing) -> Planner:
+    """The grid is that of the surfaces that the classifier was trained on; so are the surfaces, but for the paper's."""
+    surfaces, carving = imagination(model, framing.longest_side)
     _, radius, _ = setting_of(Task.CROSS_ENTROPY)
-    return Planner(model, Camera(), score, search_of(search, radius, None), grid=grid)
+    grid = Grid(64, 0.7 * framing.longest_side)
+    return Planner(surfaces, Camera(), score, search_of(search, radius, None), grid=grid, carving=carving)

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from jaxnbv.checks import require
-from jaxnbv.cli.options import Device, DeviceOption, prepare
+from jaxnbv.cli.options import Device, DeviceOption, ModelOption, prepare
 from jaxnbv.datasets import Framing
 from jaxnbv.experiments.heat import figures as heat_figures
 from jaxnbv.experiments.heat import pictures as heat_pictures
@@ -30,8 +30,8 @@ from jaxnbv.experiments.reconstruction import report as reconstruction_report
 from jaxnbv.experiments.reconstruction import study as reconstruction_study
 from jaxnbv.experiments.records import RecordFolder
 from jaxnbv.networks import part_segmenter, pyramid_classifier
+from jaxnbv.presets import ModelName, imagination
 from jaxnbv.storage import describe
-from jaxnbv.surfaces import GeometricSPSR
 
 study = typer.Typer(
     help="Measure the paper's claims on many scenes.", no_args_is_help=True, rich_markup_mode="markdown"
@@ -50,7 +50,7 @@ FolderOption = Annotated[
     typer.Option(
         "--out",
         help="Output folder; the scenes already in it are not run again.",
-        show_default="runs/study-NAME[-quick]",
+        show_default="runs/study-NAME[-paper][-quick]",
     ),
 ]
 MeshesOption = Annotated[
@@ -58,7 +58,6 @@ MeshesOption = Annotated[
 ]
 # What the quick settings of all studies have in common.
 _QUICK: dict[str, Any] = {
-    "model": GeometricSPSR(lengthscale=0.02, truncation=16),
     "num_samples": 4,
     "grid_resolution": 48,
 }
@@ -80,6 +79,7 @@ def pyramid(
         ),
     ] = None,
     methods: MethodsOption = None,
+    model: ModelOption = ModelName.SCREENED,
     out: FolderOption = None,
     quick: QuickOption = False,
     device: DeviceOption = Device.AUTO,
@@ -88,18 +88,19 @@ def pyramid(
 
     Writes a record a scene, tables as text and CSV, and figures. Interrupted, it continues with the next scene.
 
-    48 candidates, 16 samples of a Gaussian process that fits the spacing of the data (lengthscale 0.01, L = 32) on a
-    64^3 grid, and 512 points for the classifier of imagined scans: fewer candidates and a smoother prior than the
-    paper's.
+    48 candidates, 16 samples on a 64^3 grid, and 512 points for the classifier of imagined scans: fewer
+    candidates and a coarser grid than the paper's.
     """
     prepare(device)
     names = _methods(methods, pyramid_study.METHODS)
     for one in Framing if framing is None else (framing,):
         classifier = pyramid_classifier(one.longest_side)
         imagining = pyramid_classifier(one.longest_side, num_points=512)
-        settings = pyramid_study.PyramidStudy(classifier, one, views=views, imagining=imagining)
+        settings = pyramid_study.PyramidStudy(
+            classifier, one, *imagination(model, one.longest_side, quick), views=views, imagining=imagining
+        )
         settings = dataclasses.replace(settings, **_QUICK, num_candidates=40) if quick else settings
-        folder = _folder(out, "pyramid", quick) / one.value
+        folder = _folder(out, "pyramid", model, quick) / one.value
         records = _collect(pyramid_study.run_scene, settings, names, min(scenes, 6) if quick else scenes, folder, quick)
         pyramid_report.write_tables(records, folder)
         pyramid_figures.write_figures(records, folder)
@@ -113,6 +114,7 @@ def parts(
     scenes: ScenesOption = 80,
     views: ViewsOption = 6,
     methods: MethodsOption = None,
+    model: ModelOption = ModelName.SCREENED,
     out: FolderOption = None,
     quick: QuickOption = False,
     device: DeviceOption = Device.AUTO,
@@ -122,18 +124,17 @@ def parts(
     Writes a record a scene, tables as text and CSV, figures and pictures. Interrupted, it continues with the next
     scene.
 
-    48 candidates at radius 2, 64 x 64 rays. Views are imagined with 32 x 32 rays, 8 samples of a Gaussian process that
-    fits the spacing of the data (lengthscale 0.01, L = 32) on a 64^3 grid, and 1,024 points for the segmenter, 2,048
-    for what it says of the cloud; gradient search climbs from the best 4 of 24 views, 8 steps of 0.03: less of
-    everything than the paper.
+    48 candidates at radius 2, 64 x 64 rays. Views are imagined with 32 x 32 rays, 8 samples on a 64^3 grid, and 1,024
+    points for the segmenter, 2,048 for what it says of the cloud; gradient search climbs from the best 4 of 24 views, 8
+    steps of 0.03: less of everything than the paper.
     """
     prepare(device)
-    settings = part_study.PartStudy(part_segmenter(category=0), views=views)
+    settings = part_study.PartStudy(part_segmenter(category=0), views=views, **_surfaces(model, quick))
     if quick:
         settings = dataclasses.replace(
             settings, **_QUICK, num_candidates=24, num_points=512, num_starts=2, iterations=4
         )
-    folder = _folder(out, "parts", quick)
+    folder = _folder(out, "parts", model, quick)
     names = _methods(methods, part_study.METHODS)
     records = _collect(part_study.run_scene, settings, names, min(scenes, 4) if quick else scenes, folder, quick)
     _write(records, settings, folder, part_report, part_figures, part_pictures)
@@ -144,6 +145,7 @@ def heat(
     scenes: ScenesOption = 24,
     views: ViewsOption = 6,
     methods: MethodsOption = None,
+    model: ModelOption = ModelName.SCREENED,
     meshes: MeshesOption = None,
     out: FolderOption = None,
     quick: QuickOption = False,
@@ -154,17 +156,16 @@ def heat(
     On procedural objects whose coldest point hides, or on your meshes, heated at one place. Writes a record a scene,
     tables as text and CSV, figures and pictures. Interrupted, it continues with the next scene.
 
-    32 candidates at radius 3, 50 x 50 rays. Views are imagined with 24 x 24 rays, 8 samples of a Gaussian process that
-    fits the spacing of the data (lengthscale 0.01, L = 32) on a 64^3 grid, and added to 1,024 points of the cloud: less
-    of everything than the paper.
+    32 candidates at radius 3, 50 x 50 rays. Views are imagined with 24 x 24 rays, 8 samples on a 64^3 grid, and added
+    to 1,024 points of the cloud: less of everything than the paper.
     """
     prepare(device)
     files = () if meshes is None else mesh_files(meshes)
-    settings = heat_study.HeatStudy(files, views=views)
+    settings = heat_study.HeatStudy(files, views=views, **_surfaces(model, quick))
     scenes = min(scenes, len(files)) if files else scenes
     if quick:
         settings = dataclasses.replace(settings, **_QUICK, num_candidates=24, num_points=512)
-    folder = _folder(out, "heat", quick)
+    folder = _folder(out, "heat", model, quick)
     names = _methods(methods, heat_study.METHODS)
     records = _collect(heat_study.run_scene, settings, names, min(scenes, 3) if quick else scenes, folder, quick)
     _write(records, settings, folder, heat_report, heat_figures, heat_pictures)
@@ -175,6 +176,7 @@ def reconstruction(
     scenes: ScenesOption = 32,
     views: ViewsOption = 5,
     methods: MethodsOption = None,
+    model: ModelOption = ModelName.SCREENED,
     meshes: MeshesOption = None,
     out: FolderOption = None,
     quick: QuickOption = False,
@@ -185,19 +187,22 @@ def reconstruction(
     Writes a record a scene, tables as text and CSV, figures and pictures. Interrupted, it continues with the next
     scene.
 
-    48 candidates, 16 samples of a Gaussian process that fits the spacing of the data (lengthscale 0.01, L = 32) on a
-    64^3 grid: fewer candidates and a smoother prior than the paper's.
+    48 candidates, 16 samples on a 64^3 grid: fewer and coarser than the paper's.
     """
     prepare(device)
     files = () if meshes is None else mesh_files(meshes)
-    settings = reconstruction_study.ReconstructionStudy(files, views=views)
+    settings = reconstruction_study.ReconstructionStudy(files, views=views, **_surfaces(model, quick))
     settings = dataclasses.replace(settings, **_QUICK, num_candidates=40) if quick else settings
     scenes = min(scenes, len(files)) if files else scenes
-    folder = _folder(out, "reconstruction", quick)
+    folder = _folder(out, "reconstruction", model, quick)
     names = _methods(methods, reconstruction_study.METHODS)
     run = reconstruction_study.run_scene
     records = _collect(run, settings, names, min(scenes, 4) if quick else scenes, folder, quick)
     _write(records, settings, folder, reconstruction_report, reconstruction_figures, reconstruction_pictures)
+
+
+def _surfaces(model: ModelName, quick: bool) -> dict[str, Any]:
+    return imagination(model, quick=quick)._asdict()
 
 
 def _methods(asked: str | None, known: Sequence[str]) -> tuple[str, ...]:
@@ -209,8 +214,9 @@ def _methods(asked: str | None, known: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in known if name in names)
 
 
-def _folder(out: Path | None, name: str, quick: bool) -> Path:
-    return out or Path("runs") / f"study-{name}{'-quick' if quick else ''}"
+def _folder(out: Path | None, name: str, model: ModelName, quick: bool) -> Path:
+    of_model = "" if model is ModelName.SCREENED else f"-{model}"
+    return out or Path("runs") / f"study-{name}{of_model}{'-quick' if quick else ''}"
 
 
 def _collect(

@@ -17,6 +17,7 @@ from jaxnbv.cli.options import (
     Device,
     DeviceOption,
     FramingOption,
+    ModelOption,
     NoiseOption,
     OutOption,
     QuickOption,
@@ -54,6 +55,7 @@ from jaxnbv.diffusion import HeatProblem
 from jaxnbv.episode import Episode, simulate
 from jaxnbv.networks import CATEGORIES, pyramid_classifier
 from jaxnbv.planner import Planner
+from jaxnbv.presets import ModelName
 from jaxnbv.scanning import SDFSurface, SensorNoise, Surface, TriangleMesh, load_mesh, scan
 from jaxnbv.tasks import Coverage
 from jaxnbv.viz import write_report
@@ -69,6 +71,7 @@ DEFAULT_FIRST = "0.8,0.9,2.2"
 def demo(
     task: TaskOption = Task.CROSS_ENTROPY,
     search: SearchOption = SearchName.DISCRETE,
+    model: ModelOption = ModelName.SCREENED,
     views: ViewsOption = 5,
     scene: Annotated[int, typer.Option(min=0, help="Which object: the number of a scene.")] = 0,
     framing: FramingOption = Framing.WHOLE,
@@ -93,12 +96,13 @@ def demo(
     prepare(device)
     name, surface, score, start = _demo_scene(task, scene, framing, seed)
     if task in CLASS_TASKS and not quick:
-        planner = pyramid_planner(score, search, framing)
+        planner = pyramid_planner(score, search, model, framing)
     else:
-        planner = task_planner(task, score, search, quick)
+        side = framing.longest_side if task in CLASS_TASKS else Framing.CLOSE_UP.longest_side
+        planner = task_planner(task, score, search, model, quick, side)
     if first is not None:
         start = look_at(_position("--first", first))
-    _run(name, search, surface, planner, start, views, seed, out, noise, quick, report)
+    _run(name, search, model, surface, planner, start, views, seed, out, noise, quick, report)
 
 
 def _demo_scene(task: Task, scene: int, framing: Framing, seed: int) -> tuple[str, Surface, Score, Pose]:
@@ -135,6 +139,7 @@ def run(
     category: CategoryOption = None,
     source: SourceOption = None,
     search: SearchOption = SearchName.DISCRETE,
+    model: ModelOption = ModelName.SCREENED,
     views: ViewsOption = 5,
     first: FirstOption = DEFAULT_FIRST,
     seed: SeedOption = 0,
@@ -153,8 +158,8 @@ def run(
     surface, start = load_mesh(mesh), look_at(_position("--first", first))
     require(source is None or task is Task.HEAT, f"--task {task} takes no --source: it is for heat")
     heated = _heat_source(surface, start, source) if task is Task.HEAT else None
-    planner = task_planner(task, mesh_score(task, network, category, heated), search, quick)
-    _run(mesh.stem, search, surface, planner, start, views, seed, out, noise, quick, report)
+    planner = task_planner(task, mesh_score(task, network, category, heated), search, model, quick)
+    _run(mesh.stem, search, model, surface, planner, start, views, seed, out, noise, quick, report)
 
 
 def _heat_source(surface: TriangleMesh, first: Pose, source: str | None) -> np.ndarray:
@@ -180,6 +185,7 @@ def _heat_source(surface: TriangleMesh, first: Pose, source: str | None) -> np.n
 def _run(
     name: str,
     search: SearchName,
+    model: ModelName,
     scene: Surface,
     planner: Planner,
     first: Pose,
@@ -191,7 +197,8 @@ def _run(
     report: bool,
 ) -> None:
     start = time.perf_counter()
-    folder = out or Path("runs") / f"{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}-{search}"
+    of_model = "" if model is ModelName.SCREENED else f"-{model}"
+    folder = out or Path("runs") / f"{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}-{search}{of_model}"
     if quick:
         typer.echo("--quick: small settings; leave it out for the paper's.")
     episode = simulate(planner, scene, first, views, jax.random.key(seed), SensorNoise(noise, noise), folder)

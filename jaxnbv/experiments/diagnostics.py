@@ -1,23 +1,23 @@
 """Whether a step's imagined surfaces carry a signal."""
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.stats import spearmanr
 
 from jaxnbv.checks import AnyArray
-from jaxnbv.cloud import PointCloud
-from jaxnbv.scanning import Grid, GridSurface
-from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.planner import Planner, State
+from jaxnbv.reconstruction import mean_on_grid
+from jaxnbv.scanning import GridSurface
 
 
-def roughness(model: GeometricSPSR, cloud: PointCloud, surfaces: GridSurface) -> float:
-    """Cells of the grid that a sample's surface crosses, mean over samples, per cell that the mean's surface crosses.
+def roughness(planner: Planner, state: State, surfaces: GridSurface) -> float:
+    """Cells of the grid that a sample's surface crosses, mean over samples, per cell that the mean's surface crosses,
+    carved as the samples are.
 
     About 1 for samples as smooth as the mean. It rises when the spacing of the data exceeds the kernel's width; near 5
     an acquisition says little about what a view is worth.
     """
-    mean = crossed_cells(np.asarray(_mean_values(model, surfaces.grid, cloud)))
+    mean = crossed_cells(np.asarray(planner.carve(state, mean_on_grid(planner.posterior(state), surfaces.grid))))
     samples = [crossed_cells(values) for values in np.asarray(surfaces.values)]
     return float(np.mean(samples)) / max(mean, 1)
 
@@ -36,9 +36,3 @@ def rank_correlation(
     """Spearman's, between the values and the worth of the candidates compared; None where either does not vary."""
     a, b = np.asarray(values)[compared], np.asarray(worth)[compared]
     return None if np.ptp(a) == 0 or np.ptp(b) == 0 else float(spearmanr(a, b).statistic)
-
-
-@eqx.filter_jit
-def _mean_values(model: GeometricSPSR, grid: Grid, cloud: PointCloud):
-    posterior = model.condition(cloud)
-    return posterior.mean_field.on_grid(grid.axis)[0] - posterior.level

@@ -31,12 +31,12 @@ def planned_views(
     sensor = planner.camera if sensor is None else sensor
     _, _, noise_key = view_keys(key, 0)
     seen = observe_scene(scene, sensor, first, noise, noise_key)
-    state = planner.init(seen, first)
+    state = planner.init(seen, first, sensor)
     yield View(first, seen, state.cloud, None)
     for index in range(1, planner.max_views):
         sample_key, search_key, noise_key = view_keys(key, index)
         surfaces = planner.sample_surfaces(state, sample_key) if planner.search.uses_samples else None
         proposal = jax.block_until_ready(planner.choose(state, surfaces, search_key))
         seen = observe_scene(scene, sensor, proposal.pose, noise, noise_key)
-        state = planner.observe(state, proposal.pose, seen)
+        state = planner.observe(state, proposal.pose, seen, sensor)
         yield View(proposal.pose, seen, state.cloud, proposal)

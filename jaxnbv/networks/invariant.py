@@ -11,7 +11,7 @@ from jaxnbv.farthest import farthest_point_indices
 from jaxnbv.networks.grouping import ball_query
 from jaxnbv.networks.set_abstraction import product
 
-_POOLED = 160
+_POOLED = 192
 
 
 class InvariantClassifier(eqx.Module):
@@ -20,7 +20,7 @@ class InvariantClassifier(eqx.Module):
     A pair of oriented points enters as (|d|^2, n_i . d, n_j . d, n_i . n_j) with d = (x_j - x_i) / radius: the
     point-pair features of Drost et al. (2010) without their square root and arc cosines, so that derivatives are
     defined everywhere. Two levels of grouping, at the scale of an edge and at that of a pattern, and a maximum over all
-    groups; about 45,000 parameters.
+    groups; about 75,000 parameters.
 
     - `radii`: of the two levels, in the units of the points.
     - `temperature`: divides the logits; above 1 it makes an over-confident network more careful (Guo et al. 2017).
@@ -34,8 +34,8 @@ class InvariantClassifier(eqx.Module):
     def __init__(self, num_classes: int, key: PRNGKeyArray, radii: tuple[float, float] = (0.25, 0.8)):
         edge_key, pattern_key, first_key, last_key = jax.random.split(key, 4)
         self.edge = _Level(0, 32, 64, radii[0], 256, 24, edge_key)
-        self.pattern = _Level(64, 96, _POOLED, radii[1], 64, 48, pattern_key)
-        self.head = (eqx.nn.Linear(_POOLED, 128, key=first_key), eqx.nn.Linear(128, num_classes, key=last_key))
+        self.pattern = _Level(64, 112, _POOLED, radii[1], 64, 48, pattern_key)
+        self.head = (eqx.nn.Linear(_POOLED, _POOLED, key=first_key), eqx.nn.Linear(_POOLED, num_classes, key=last_key))
         self.temperature = jnp.asarray(1.0)
 
     def __call__(

@@ -1,5 +1,8 @@
 """Surfaces that rays can hit, and the scanner."""
 
+from jaxnbv.scanning.free_space import Carving as Carving
+from jaxnbv.scanning.free_space import carve as carve
+from jaxnbv.scanning.free_space import check_image as check_image
 from jaxnbv.scanning.grid import Grid as Grid
 from jaxnbv.scanning.grid import GridSurface as GridSurface
 from jaxnbv.scanning.grid import scan_samples as scan_samples

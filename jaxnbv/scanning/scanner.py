@@ -39,11 +39,11 @@ class SensorNoise(eqx.Module):
         normals = cloud.normals + self.normals * jax.random.normal(normal_key, cloud.normals.shape, cloud.points.dtype)
         normals = normals / jnp.linalg.norm(normals, axis=-1, keepdims=True)
         mask = cloud.mask[..., None]
-        return PointCloud(jnp.where(mask, points, 0.0), jnp.where(mask, normals, 0.0), cloud.mask)
+        return PointCloud(jnp.where(mask, points, 0.0), jnp.where(mask, normals, 0.0), cloud.mask, cloud.missed)
 
 
 def scan(surface: Surface, camera: Camera, pose: Pose) -> PointCloud:
-    """What the camera sees of the surface from a pose: one row a pixel, masked where its ray hits nothing.
+    """What the camera sees of the surface from a pose: one row a pixel, missed where its ray hits nothing.
 
     Poses with leading axes give clouds with the same leading axes. Points are in scene coordinates; normals are unit
     and turned to the sensor. No noise: apply a `SensorNoise` to the result. Runs under `jit` where `surface.in_jit`.
@@ -51,4 +51,5 @@ def scan(surface: Surface, camera: Camera, pose: Pose) -> PointCloud:
     origins, directions = camera.rays(pose)
     hits = surface.trace(origins.reshape(-1, 3), directions.reshape(-1, 3))
     shape = origins.shape[:-1]
-    return PointCloud(hits.points.reshape(*shape, 3), hits.normals.reshape(*shape, 3), hits.mask.reshape(shape))
+    mask = hits.mask.reshape(shape)
+    return PointCloud(hits.points.reshape(*shape, 3), hits.normals.reshape(*shape, 3), mask, ~mask)

@@ -5,7 +5,7 @@ from abc import abstractmethod
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray
 from jaxnbv.cloud import PointCloud
@@ -52,9 +52,20 @@ class SurfacePosterior(eqx.Module):
         return jnp.var(self.sample(jax.random.key(0), 64)(x), axis=0, ddof=1)
 
 
+class EmptyPoints(eqx.Module):
+    """Points (scene coordinates) that were seen to be empty. Rows whose mask is False hold nothing."""
+
+    points: Float[Array, "m 3"]
+    mask: Bool[Array, " m"]
+
+
 class SurfaceModel(eqx.Module):
     """p(f): a prior over implicit surfaces that can be conditioned on oriented points."""
 
     @abstractmethod
     def condition(self, cloud: PointCloud) -> SurfacePosterior:
         """p(f | D) for the filled rows of a cloud in scene coordinates."""
+
+    def condition_on_space(self, cloud: PointCloud, empty: EmptyPoints) -> SurfacePosterior:
+        """p(f | D, what was seen empty). A model that makes nothing of emptiness gives p(f | D), as here."""
+        return self.condition(cloud)

@@ -4,10 +4,14 @@
     cov(f(x), v_d(y))   = sum_n s(n) n_d / |n|^2 sin(n.(x - y))
     cov(f(x), f(y))     = sum_n s(n) / |n|^2 cos(n.(x - y)),   n != 0
 
-The first is a product over the axes. The other two become a short sum of such products by the trapezoidal rule for
-1 / r = int exp(-r e^u) e^u du (Beylkin and Monzon 2010), so no array over the (2 L + 1)^3 frequencies is ever made.
+The prior may be a sum of several spectra, one a scale; so is then each covariance.
+
+With one spectrum the first is a product over the axes. The other two become a short sum of such products by the
+trapezoidal rule for 1 / r = int exp(-r e^u) e^u du (Beylkin and Monzon 2010), so no array over the (2 L + 1)^3
+frequencies is ever made.
 """
 
+import functools
 import math
 
 import jax
@@ -18,16 +22,25 @@ from jaxtyping import Array, Float
 from jaxnbv.surfaces.trigonometric import basis_variance, circle_basis
 
 Spectrum = Float[Array, "l_plus_1"]
+Spectra = Float[Array, "*scales l_plus_1"]
 
 
-def normal_covariance(x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectrum) -> Float[Array, "n m"]:
+def normal_covariance(x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectra) -> Float[Array, "n m"]:
     """cov(v_d(x), v_d(y)), the same for each component d; different components are independent."""
+    return _over_scales(lambda of_scale: _normal_covariance(x, y, of_scale), spectrum)
+
+
+def _over_scales(covariance, spectra: Spectra):
+    return functools.reduce(jnp.add, [covariance(of_scale) for of_scale in jnp.atleast_2d(spectra)])
+
+
+def _normal_covariance(x, y, spectrum: Spectrum):
     even = [_even(x[:, axis], y[:, axis], spectrum) for axis in range(3)]
     return even[0] * even[1] * even[2]
 
 
 def function_normal_covariance(
-    x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectrum
+    x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectra
 ) -> Float[Array, "3 n m"]:
     """cov(f(x), v_d(y)) for d = 1, 2, 3."""
 
@@ -37,15 +50,19 @@ def function_normal_covariance(
         odd = [_odd(x[:, axis], y[:, axis], odd_spectrum) for axis in range(3)]
         return jnp.stack([odd[0] * even[1] * even[2], even[0] * odd[1] * even[2], even[0] * even[1] * odd[2]])
 
-    return _over_squared_frequency(products, spectrum)
+    return _over_scales(lambda of_scale: _over_squared_frequency(products, of_scale), spectrum)
 
 
-def function_covariance(x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectrum) -> Float[Array, "n m"]:
+def function_covariance(x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectra) -> Float[Array, "n m"]:
     """cov(f(x), f(y))."""
-    return _over_squared_frequency(lambda damped: normal_covariance(x, y, damped) - spectrum[0] ** 3, spectrum)
+
+    def of_one(spectrum):
+        return _over_squared_frequency(lambda damped: _normal_covariance(x, y, damped) - spectrum[0] ** 3, spectrum)
+
+    return _over_scales(of_one, spectrum)
 
 
-def function_variance(spectrum: Spectrum) -> Float[Array, ""]:
+def function_variance(spectrum: Spectra) -> Float[Array, ""]:
     """Var f(x) = sum_n s(n) / |n|^2, the same everywhere."""
     origin = jnp.zeros((1, 3), dtype=spectrum.dtype)
     return function_covariance(origin, origin, spectrum)[0, 0]
@@ -88,4 +105,9 @@ def _inverse_quadrature(spectrum: Spectrum) -> tuple[np.ndarray, np.ndarray]:
     step = math.pi**2 / math.log(10.0 / tolerance)
     low, high = math.log(tolerance / largest), math.log(math.log(1.0 / tolerance))
     rate = np.exp(np.arange(low, high + step, step))
-    return rate, step * rate
+    weight = step * rate
+    # Rates this slow are one exponential of their common mean, up to its third order.
+    slow = rate < tolerance ** (1 / 3) / largest
+    together = weight[slow].sum()
+    mean = (weight * rate)[slow].sum() / together
+    return np.append(mean, rate[~slow]), np.append(together, weight[~slow])

@@ -1,7 +1,8 @@
 """Geometric stochastic Poisson surface reconstruction (Holalkere et al. 2025), consistent for the truncated model.
 
     prior    v_1, v_2, v_3 independent Gaussian processes on the torus of period 2 pi,
-             cov(v_d(x), v_d(y)) = sum_{|n|_inf <= L} s(n) cos(n.(x - y)),   s(n) = s1(n_1) s1(n_2) s1(n_3)
+             cov(v_d(x), v_d(y)) = sum_{|n|_inf <= L} s(n) cos(n.(x - y)),   s(n) = s1(n_1) s1(n_2) s1(n_3),
+             or a sum of such s, one for each lengthscale
     Poisson  f_hat(n) = -i n . v_hat(n) / |n|^2,   f_hat(0) = 0
     data     n_j = v(x_j) + eps_j,   eps_j ~ N(0, noise^2 I),   A = k(X, X) + noise^2 I
     sample   v_post = v + k(., X) A^-1 (n - v(X) - eps), v and eps from the prior;   f = Poisson(v_post)
@@ -14,6 +15,7 @@ distribution.
 import functools
 import math
 import warnings
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -26,6 +28,7 @@ from jaxnbv.checks import AnyArray, is_traced, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.surfaces.base import SurfaceModel, SurfacePosterior
 from jaxnbv.surfaces.covariance import (
+    Spectra,
     function_covariance,
     function_normal_covariance,
     function_variance,
@@ -37,16 +40,23 @@ from jaxnbv.surfaces.trigonometric import TrigonometricFields, basis_variance, s
 
 _CHUNK_VALUES = 2**24
 
+# Numbers and tuples are converted on the way in, which mypy cannot see.
+if TYPE_CHECKING:
+    Scales: TypeAlias = Any
+else:
+    Scales = Float[Array, "*scales"]
 
-def _to_float(value) -> Float[Array, ""]:
+
+def _to_float(value) -> Float[Array, "*scales"]:
     return jnp.asarray(value, dtype=jnp.result_type(float))
 
 
 class GeometricSPSR(SurfaceModel):
     """Matern prior on the normal field over the torus, and f as its Poisson reconstruction.
 
-    - `lengthscale`: ell, in units of the circumference 2 pi: 0.005 is 0.031 in scene units.
-    - `variance`: per axis, so that without truncation Var v_d = variance^3.
+    - `lengthscale`: ell, in units of the circumference 2 pi: 0.005 is 0.031 in scene units. Several make a sum of
+      independent priors, short ones for detail and long ones for the body.
+    - `variance`: per axis, so that without truncation Var v_d = variance^3; one for each lengthscale.
     - `noise`: standard deviation of each component of the observed normals.
     - `nu`: smoothness, 1/2, 3/2 or 5/2.
     - `truncation`: L; frequencies up to L along each axis are kept. They hold `kept_variance` of the prior's variance:
@@ -58,8 +68,8 @@ class GeometricSPSR(SurfaceModel):
     third of the variance is kept.
     """
 
-    lengthscale: Scalar = eqx.field(converter=_to_float, default=0.005)
-    variance: Scalar = eqx.field(converter=_to_float, default=0.2)
+    lengthscale: Scales = eqx.field(converter=_to_float, default=0.005)
+    variance: Scales = eqx.field(converter=_to_float, default=0.2)
     truncation: int = eqx.field(static=True, default=50)
     noise: Scalar = eqx.field(converter=_to_float, default=0.01)
     nu: float = eqx.field(static=True, default=1.5)
@@ -68,28 +78,39 @@ class GeometricSPSR(SurfaceModel):
         require(self.nu in (0.5, 1.5, 2.5), f"nu is {self.nu}; it must be 0.5, 1.5 or 2.5")
         whole = isinstance(self.truncation, int) and self.truncation >= 1
         require(whole, f"the truncation is {self.truncation}; it must be a whole number, at least 1")
+        shapes = jnp.shape(self.lengthscale), jnp.shape(self.variance)
+        require(
+            shapes[0] == shapes[1] and len(shapes[0]) <= 1 and jnp.size(self.lengthscale) >= 1,
+            f"lengthscale and variance have shapes {shapes[0]} and {shapes[1]}: give one number each, or as many "
+            "variances as lengthscales",
+        )
         if is_traced(self.lengthscale, self.variance, self.noise):
             return
         for name in ("lengthscale", "variance", "noise"):
-            value = float(getattr(self, name))
-            require(0 < value < math.inf, f"{name} is {value}; it must be positive and finite")
+            value = np.asarray(getattr(self, name))
+            positive = bool(np.all((value > 0) & (value < math.inf)))
+            require(positive, f"{name} is {value}; it must be positive and finite")
         kept = float(self.kept_variance)
         if kept < 1 / 3:
             warnings.warn(
                 f"truncation={self.truncation} keeps {kept:.0%} of the prior's variance at "
-                f"lengthscale={float(self.lengthscale):.3g}: raise the truncation or the lengthscale",
+                f"lengthscale={np.asarray(self.lengthscale)}: raise the truncation or the lengthscale",
                 stacklevel=3,
             )
 
     @property
-    def spectrum(self) -> Float[Array, "l_plus_1"]:
-        """s1(0), ..., s1(L)."""
-        return circle_spectrum(self.nu, self.lengthscale, self.variance, self.truncation)
+    def spectrum(self) -> Spectra:
+        """s1(0), ..., s1(L), with a leading axis where there are several lengthscales."""
+        of_one = functools.partial(circle_spectrum, self.nu, truncation=self.truncation)
+        if jnp.ndim(self.lengthscale) == 0:
+            return of_one(self.lengthscale, self.variance)
+        return jax.vmap(of_one)(self.lengthscale, self.variance)
 
     @property
     def kept_variance(self) -> Float[Array, ""]:
         """Share of the prior's variance within the truncation, in three dimensions."""
-        return (jnp.sum(basis_variance(self.spectrum)[self.truncation :]) / self.variance) ** 3
+        kept = jnp.sum(jax.vmap(basis_variance)(jnp.atleast_2d(self.spectrum))[:, self.truncation :], axis=1)
+        return jnp.sum(kept**3) / jnp.sum(self.variance**3)
 
     def condition(self, cloud: PointCloud) -> "GeometricSPSRPosterior":
         """p(f | D). The cost is that of a Cholesky factorisation of the cloud's capacity.
@@ -132,20 +153,18 @@ def _condition(model: GeometricSPSR, cloud: PointCloud) -> "GeometricSPSRPosteri
     cholesky = _factorise(cloud, spectrum, model.noise)
     weights = cho_solve((cholesky, True), normals)
     transform = NonuniformTransform(cloud.points, model.truncation)
-    mean = _reconstruct(transform, weights, spectrum)
+    mean = reconstruct(transform, weights, spectrum)
     at_data = transform.evaluate(mean[None])[:, 0]
     level = jnp.sum(jnp.where(cloud.mask, at_data, 0.0)) / jnp.sum(cloud.mask)
     return GeometricSPSRPosterior(level, model, cloud, cholesky, weights, mean)
 
 
-def _factorise(cloud: PointCloud, spectrum: Float[Array, "l_plus_1"], noise: Scalar) -> Float[Array, "n n"]:
+def _factorise(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Float[Array, "n n"]:
     """Lower Cholesky factor of A, where a row that is not filled is a row of the identity.
 
-    Such a row changes neither the solves nor the determinant. The factorisation is of the leading quarter, half or
-    whole of A, whichever holds the filled rows, so that its time follows them while the shapes stay fixed.
+    Such a row changes neither the solves nor the determinant.
     """
     capacity = cloud.capacity
-    sizes = [-(-capacity // 4), -(-capacity // 2), capacity]
 
     def leading(size: int):
         points, mask = cloud.points[:size], cloud.mask[:size]
@@ -154,22 +173,35 @@ def _factorise(cloud: PointCloud, spectrum: Float[Array, "l_plus_1"], noise: Sca
         factor = jnp.linalg.cholesky(block, symmetrize_input=False)
         return jnp.eye(capacity, dtype=factor.dtype).at[:size, :size].set(factor)
 
+    return _on_filled_rows(cloud, leading)
+
+
+def _on_filled_rows(cloud: PointCloud, leading):
+    """`leading(size)` for the leading quarter, half or whole of the rows, whichever holds all that are filled: so the
+    time follows them while the shapes stay fixed."""
+    capacity = cloud.capacity
+    sizes = [-(-capacity // 4), -(-capacity // 2), capacity]
     filled = jnp.max(jnp.where(cloud.mask, jnp.arange(capacity) + 1, 0))
     return jax.lax.switch(
         jnp.searchsorted(jnp.asarray(sizes), filled), [functools.partial(leading, size) for size in sizes]
     )
 
 
-def _prior_variance(spectrum: Float[Array, "l_plus_1"]) -> Float[Array, "a a a"]:
-    variance = basis_variance(spectrum)
-    return variance[:, None, None] * variance[:, None] * variance
+def mode_variance(spectrum: Spectra) -> Float[Array, "a a a"]:
+    """Prior variances of the coefficients of a component of v."""
+
+    def of_one(spectrum):
+        variance = basis_variance(spectrum)
+        return variance[:, None, None] * variance[:, None] * variance
+
+    return jnp.sum(jax.vmap(of_one)(jnp.atleast_2d(spectrum)), axis=0)
 
 
-def _reconstruct(
-    transform: NonuniformTransform, weights: Float[Array, "n 3"], spectrum: Float[Array, "l_plus_1"]
+def reconstruct(
+    transform: NonuniformTransform, weights: Float[Array, "n 3"], spectrum: Spectra
 ) -> Float[Array, "a a a"]:
     """Coefficients of the f that k(., X) weights reconstructs."""
-    return solve_poisson(_prior_variance(spectrum) * transform.adjoint(weights))
+    return solve_poisson(mode_variance(spectrum) * transform.adjoint(weights))
 
 
 class GeometricSPSRPosterior(SurfacePosterior):
@@ -206,7 +238,7 @@ class GeometricSPSRPosterior(SurfacePosterior):
         prior = function_variance(self.model.spectrum)
 
         def at_points(x):
-            return jnp.maximum(prior - jnp.sum(self._whitened(x) ** 2, axis=(0, 1)), 0.0)
+            return jnp.maximum(prior - jnp.sum(self.whitened(x) ** 2, axis=(0, 1)), 0.0)
 
         chunk = max(1, min(x.shape[0], _CHUNK_VALUES // self.cloud.capacity))
         return jax.lax.map(lambda point: at_points(point[None])[0], x, batch_size=chunk)
@@ -215,7 +247,7 @@ class GeometricSPSRPosterior(SurfacePosterior):
     def covariance(self, x: Float[AnyArray, "n 3"], y: Float[AnyArray, "m 3"]) -> Float[Array, "n m"]:
         """Cov(f(x), f(y)) between points in scene coordinates, all at once."""
         x, y = (jnp.asarray(points, dtype=self.weights.dtype) for points in (x, y))
-        explained = jnp.einsum("djn,djm->nm", self._whitened(x), self._whitened(y), precision="highest")
+        explained = jnp.einsum("djn,djm->nm", self.whitened(x), self.whitened(y), precision="highest")
         return function_covariance(x, y, self.model.spectrum) - explained
 
     def log_marginal_likelihood(self) -> Float[Array, ""]:
@@ -231,9 +263,18 @@ class GeometricSPSRPosterior(SurfacePosterior):
 
         **Raises:** `ValueError` if `num_samples` < 1.
         """
+        return TrigonometricFields(self.conditioned(*self.prior_draws(key, num_samples)))
+
+    def prior_draws(
+        self, key: PRNGKeyArray, num_samples: int
+    ) -> tuple[Float[Array, "s 3 a a a"], Float[Array, "s n 3"]]:
+        """Coefficients of v drawn from the prior, and their residuals at the data, whitened: C^-1 (n - v(X) - eps).
+
+        **Raises:** `ValueError` if `num_samples` < 1.
+        """
         require(num_samples >= 1, f"asked for {num_samples} samples; ask for at least one")
         spectrum, dtype = self.model.spectrum, self.weights.dtype
-        scale = jnp.sqrt(_prior_variance(spectrum))
+        scale = jnp.sqrt(mode_variance(spectrum))
         modes = scale.shape[0]
         transform = NonuniformTransform(self.cloud.points, self.model.truncation)
         field_keys, noise_keys = jax.random.split(key, (2, num_samples))
@@ -246,17 +287,35 @@ class GeometricSPSRPosterior(SurfacePosterior):
 
         coefficients, at_data = jax.lax.map(prior, (field_keys, noise_keys))
         residual = jnp.where(self.cloud.mask[:, None], self.cloud.normals - at_data, 0.0)
-        columns = jnp.moveaxis(residual, 0, 1).reshape(self.cloud.capacity, -1)
-        weights = cho_solve((self.cholesky, True), columns).reshape(self.cloud.capacity, num_samples, 3)
+        return coefficients, self._solve_triangular(residual, transpose=False)
+
+    def conditioned(
+        self, coefficients: Float[Array, "s 3 a a a"], whitened: Float[Array, "s n 3"]
+    ) -> Float[Array, "s a a a"]:
+        """Coefficients of Poisson(v + k(., X) C^-T z) for each v and z: samples, where z is the whitened residual."""
+        transform = NonuniformTransform(self.cloud.points, self.model.truncation)
+        weights = self._solve_triangular(whitened, transpose=True)
 
         def update(sample):
             coefficients, weights = sample
-            return solve_poisson(coefficients) + _reconstruct(transform, weights, spectrum)
+            return solve_poisson(coefficients) + reconstruct(transform, weights, self.model.spectrum)
 
-        return TrigonometricFields(jax.lax.map(update, (coefficients, jnp.moveaxis(weights, 1, 0))))
+        return jax.lax.map(update, (coefficients, weights))
 
-    def _whitened(self, x: Float[Array, "n 3"]) -> Float[Array, "3 capacity n"]:
+    def _solve_triangular(self, rows: Float[Array, "s n 3"], transpose: bool) -> Float[Array, "s n 3"]:
+        columns = jnp.moveaxis(rows, 0, 1)
+        solved = solve_triangular(self.cholesky, columns.reshape(len(columns), -1), lower=True, trans=int(transpose))
+        return jnp.moveaxis(solved.reshape(columns.shape), 1, 0)
+
+    def whitened(self, x: Float[Array, "n 3"]) -> Float[Array, "3 capacity n"]:
         """C^-1 cov(v_d(X), f(x)) with A = C C^T: the sum of its squares is the variance that the data explain."""
-        cross = function_normal_covariance(x, self.cloud.points, self.model.spectrum)
-        cross = jnp.where(self.cloud.mask, cross, 0.0)
-        return jax.vmap(lambda c: solve_triangular(self.cholesky, c.T, lower=True))(cross)
+        capacity = self.cloud.capacity
+
+        def leading(size: int):
+            cross = function_normal_covariance(x, self.cloud.points[:size], self.model.spectrum)
+            cross = jnp.where(self.cloud.mask[:size], cross, 0.0)
+            factor = self.cholesky[:size, :size]
+            solved = jax.vmap(lambda c: solve_triangular(factor, c.T, lower=True))(cross)
+            return jnp.pad(solved, ((0, 0), (0, capacity - size), (0, 0)))
+
+        return _on_filled_rows(self.cloud, leading)

@@ -39,10 +39,14 @@ def differentiate(coefficients: Float[Array, "*s a a a"], axis: int) -> Float[Ar
 def solve_poisson(vector_field: Float[Array, "*s 3 a a a"]) -> Float[Array, "*s a a a"]:
     """Coefficients of the f of mean zero with Laplacian f = div v: f_hat(n) = -i n . v_hat(n) / |n|^2."""
     x, y, z = (differentiate(vector_field[..., axis, :, :, :], axis) for axis in range(3))
-    divergence = x + y + z
-    a, b, c = (_frequency(divergence, axis) for axis in range(3))
+    return inverse_laplacian(x + y + z)
+
+
+def inverse_laplacian(function: Float[Array, "*s a a a"]) -> Float[Array, "*s a a a"]:
+    """Coefficients of the f of mean zero whose Laplacian is the function less its mean: -g_hat(n) / |n|^2."""
+    a, b, c = (_frequency(function, axis) for axis in range(3))
     squared = a**2 + b**2 + c**2
-    return -divergence / jnp.where(squared == 0, jnp.inf, squared)
+    return -function / jnp.where(squared == 0, jnp.inf, squared)
 
 
 def _frequency(coefficients: Float[Array, "*s a a a"], axis: int) -> Float[Array, "_ _ _"]:

@@ -10,10 +10,9 @@ from tqdm import tqdm
 
 from jaxnbv.camera import Pose
 from jaxnbv.checks import AnyArray
-from jaxnbv.cloud import PointCloud
 from jaxnbv.episode import Episode
 from jaxnbv.experiments.metrics import coverage, truth_points
-from jaxnbv.planner import Planner
+from jaxnbv.planner import Planner, State
 from jaxnbv.scanning import Grid
 from jaxnbv.search import Proposal
 from jaxnbv.surfaces import SurfacePosterior
@@ -129,6 +128,7 @@ def report_data(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, p
     truth = truth_points(episode.scene, jax.random.key(0)) if truth is None else truth
     values = quantity(planner.search, planner.acquisition)
     drawn: list[ViewData] = []
+    states = episode.states()
     for index, view in enumerate(tqdm(episode.views, desc="drawing views", disable=not progress)):
         covered = None if truth is None else coverage(view.cloud, truth, COVERAGE_RADIUS)
         before = drawn[-1] if drawn else None
@@ -154,7 +154,7 @@ def report_data(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, p
                 pose=view.pose,
                 before=episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), new.dtype),
                 new=new,
-                surface=mean_surface(planner, view.cloud),
+                surface=mean_surface(planner, next(states)),
                 choice=choice,
                 coverage=covered,
                 count=count,
@@ -184,9 +184,9 @@ def choice_of(proposal: Proposal, wider: SphereMap | None = None) -> Choice:
     )
 
 
-def mean_surface(planner: Planner, cloud: PointCloud) -> MeanSurface | None:
-    """The surface of the posterior mean given a cloud, with its standard deviation; None if the grid holds none."""
-    posterior = planner.model.condition(cloud)
+def mean_surface(planner: Planner, state: State) -> MeanSurface | None:
+    """The surface of the posterior mean given a state, with its standard deviation; None if the grid holds none."""
+    posterior = planner.posterior(state)
     grid, values = _mean_on_grid(posterior, planner.grid)
     if not values.min() < 0 < values.max():
         return None
@@ -196,7 +196,7 @@ def mean_surface(planner: Planner, cloud: PointCloud) -> MeanSurface | None:
     features = np.concatenate([vertices, 0.1 * normals], axis=1)
     anchors = _spread(features, _SLOPE_ANCHORS)
     few = anchors[:_DEVIATION_ANCHORS]
-    dtype = cloud.points.dtype
+    dtype = state.cloud.points.dtype
     variance = np.asarray(posterior.variance(vertices[few].astype(dtype)))
     step = _SLOPE_STEP * normals[anchors]
     ahead, behind = (np.asarray(posterior.mean((vertices[anchors] + s).astype(dtype))) for s in (step, -step))

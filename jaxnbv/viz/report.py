@@ -89,7 +89,8 @@ def _header(episode: Episode, title: str) -> str:
         "Object": title,
         "Search": _call(search, depth=2),
         "Acquisition": _call(describe(planner.acquisition)),
-        "Surface model": _call(model),
+        "Surface model": _call(model, depth=2),
+        "Carved by": _call(describe(planner.carving), depth=1) if planner.carving else "nothing, as in the paper",
         "Posterior samples": f"{planner.num_samples} on a {planner.grid.resolution}³ grid",
         "Camera": f"{math.degrees(planner.camera.fov):.0f}°, {planner.camera.width} × {planner.camera.height} pixels",
         "Sensor noise": _call(describe(episode.noise)),
@@ -110,6 +111,8 @@ def _call(description: dict, depth: int = 0) -> str:
 
 
 def _short(value, depth: int) -> str:
+    if isinstance(value, list) and any(isinstance(one, dict) for one in value):
+        return f"({', '.join(_short(one, depth) for one in value)})"
     if isinstance(value, dict):
         return _call(value, depth - 1) if depth > 0 and "type" in value else value.get("type", "...")
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -81,10 +81,10 @@ def wider_map(episode: Episode, index: int) -> SphereMap | None:
 
 def step_values(episode: Episode, index: int, poses: Pose) -> Float[np.ndarray, " poses"]:
     """The acquisition at a batch of poses, with the samples of the step that chose view `index` (from 0)."""
-    planner, cloud = episode.planner, episode.views[index - 1].cloud
+    planner, state = episode.planner, episode.state_after(index)
     sample_key, *_ = view_keys(episode.key, index)
-    surfaces = planner.sample_surfaces(planner.init(cloud), sample_key)
-    return np.asarray(_expected(planner.acquisition, cloud, surfaces, planner.camera, poses), dtype=np.float64)
+    surfaces = planner.sample_surfaces(state, sample_key)
+    return np.asarray(_expected(planner.acquisition, state.cloud, surfaces, planner.camera, poses), dtype=np.float64)
 
 
 _expected = eqx.filter_jit(expected_score)

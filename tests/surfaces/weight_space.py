@@ -72,3 +72,41 @@ class WeightSpace:
         covariance = features @ features.T + self.noise**2 * np.eye(len(points))
         fit = np.sum(normals * np.linalg.solve(covariance, normals))
         return -0.5 * fit - 1.5 * np.linalg.slogdet(2 * np.pi * covariance)[1]
+
+
+class JointWeightSpace:
+    """Normals and values in one regression: weights of all three components and of the level c, coupled by the values.
+
+    `scales` are `WeightSpace`s of independent priors that are added up; g = f - c, c ~ N(0, level_deviation^2).
+    """
+
+    def __init__(self, scales, level_deviation):
+        self.scales, self.level_deviation = scales, level_deviation
+
+    def function_features(self, x):
+        """(n, k): g = features @ w."""
+        parts = [np.concatenate(list(scale.function_features(x)), axis=1) for scale in self.scales]
+        return np.concatenate([*parts, np.full((len(x), 1), -self.level_deviation)], axis=1)
+
+    def normal_features(self, x):
+        """(3 n, k): the components of v one behind the other."""
+        parts = [np.kron(np.eye(3), scale.normal_features(x)) for scale in self.scales]
+        return np.concatenate([*parts, np.zeros((3 * len(x), 1))], axis=1)
+
+    def posterior(self, data, x):
+        """Mean (n,) and covariance (n, n) of g(x), and log p(data), by the joint covariance of all observations.
+
+        `data`: points, normals, their noise, and points, values and noise (m,) of the values.
+        """
+        points, normals, noise, at, values, value_noise = data
+        features = np.concatenate([self.normal_features(points), self.function_features(at)])
+        observed = np.concatenate([normals.T.reshape(-1), values])
+        covariance = features @ features.T
+        covariance += np.diag(np.concatenate([np.full(normals.size, noise**2), value_noise**2]))
+        queries = self.function_features(x)
+        cross = queries @ features.T
+        mean = cross @ np.linalg.solve(covariance, observed)
+        explained = cross @ np.linalg.solve(covariance, cross.T)
+        fit = observed @ np.linalg.solve(covariance, observed)
+        likelihood = -0.5 * (fit + np.linalg.slogdet(2 * np.pi * covariance)[1])
+        return mean, queries @ queries.T - explained, likelihood

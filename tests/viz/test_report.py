@@ -204,7 +204,7 @@ def test_any_posterior_has_a_surface_with_a_standard_deviation():
     # f = |x| - r with r ~ N(0.9, 0.03^2): the surface is a sphere known to 0.03 all over, estimated from 64 samples.
     planner = eqx.tree_at(lambda p: p.model, small_planner(nbv.RandomView()), SphereModel())
     cloud = nbv.PointCloud.from_arrays([[0.9, 0.0, 0.0]], [[1.0, 0.0, 0.0]])
-    surface = mean_surface(planner, cloud)
+    surface = mean_surface(planner, planner.init(cloud))
     radius = np.linalg.norm(surface.vertices, axis=1)
     np.testing.assert_allclose(radius, 0.9, atol=4 * 0.03 / 8 + 0.005)
     np.testing.assert_allclose(surface.deviation, 0.03, rtol=4 / np.sqrt(2 * 64))
@@ -213,8 +213,9 @@ def test_any_posterior_has_a_surface_with_a_standard_deviation():
 
 def test_a_mean_without_a_surface_is_drawn_without_one(tmp_path, episode, data):
     planner = eqx.tree_at(lambda p: p.model, episode.planner, SphereModel())
-    far = eqx.tree_at(lambda p: p.grid, planner, nbv.Grid(40, 0.2))
-    assert mean_surface(far, episode.cloud) is None
+    far = eqx.tree_at(lambda p: (p.grid, p.carving), planner, (nbv.Grid(40, 0.2), None))
+    state = eqx.tree_at(lambda s: s.seen_empty, episode.state_after(1), None)
+    assert mean_surface(far, state) is None
     bare = eqx.tree_at(lambda d: [v.surface for v in d.views], data, [None] * 3, is_leaf=lambda x: x is None)
     assert all(path.stat().st_size > 5000 for path in write_figures(bare, CAMERA, tmp_path, progress=False))
 
@@ -222,7 +223,7 @@ def test_a_mean_without_a_surface_is_drawn_without_one(tmp_path, episode, data):
 def test_what_was_seen_is_known_better_than_what_was_not():
     scene = nbv.SDFSurface(Sphere(0.9))
     view = run(nbv.RandomView(30), views=1, scene=scene)
-    surface = mean_surface(view.planner, view.cloud)
+    surface = mean_surface(view.planner, view.state_after(1))
     distance = np.linalg.norm(surface.vertices[:, None] - view.cloud.to_numpy()[0][None, ::4], axis=-1).min(axis=1)
     assert np.median(surface.deviation[distance < 0.1]) < 0.3 * np.median(surface.deviation[distance > 0.6])
 

@@ -70,7 +70,10 @@ def spatial(few):
     poses = look_at(candidates.position[:2, None] * inwards)
     ways = Trajectories(poses, 3.0 + jnp.arange(14.0).reshape(2, 7))
     seen = nbv.Proposal(poses[1, 6], ways.values[1, 6], candidates, 2.0 - candidates.position[:, 2], ways)
-    return eqx.tree_at(lambda e: (e.views[1].proposal, e.views[1].pose), few, (seen, seen.pose))
+    # Its points alone, which are no image from the made-up pose.
+    scan = nbv.PointCloud(few.views[1].scan.points, few.views[1].scan.normals, few.views[1].scan.mask)
+    changed = lambda e: (e.views[1].proposal, e.views[1].pose, e.views[1].scan)  # noqa: E731
+    return eqx.tree_at(changed, few, (seen, seen.pose, scan))
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +142,8 @@ def test_a_map_of_too_few_candidates_is_made_anew_with_the_same_samples(few, few
     assert choice.values.shape == (4,)
     assert choice.map.values.shape == (MAP_VIEWS,)
     np.testing.assert_allclose(choice.map.directions, nbv.fibonacci_sphere(MAP_VIEWS, 1.0), atol=1e-6)
-    seen, planner, cloud = few.views[1].proposal, few.planner, few.views[0].cloud
+    seen, planner = few.views[1].proposal, few.planner
+    state = planner.init(few.views[0].scan, few.views[0].pose)
     # The same samples: at the candidates and on the ways they give what the search saw ...
     poses, values = joined((seen.candidates, seen.values), seen.trajectories.flat)
     np.testing.assert_allclose(step_values(few, 1, poses), values, rtol=1e-3)
@@ -148,7 +152,7 @@ def test_a_map_of_too_few_candidates_is_made_anew_with_the_same_samples(few, few
     poses = joined(poses, sphere_candidates(MAP_VIEWS))
     score = eqx.filter_jit(nbv.expected_score)
     same, other = (
-        np.asarray(score(planner.acquisition, cloud, planner.sample_surfaces(planner.init(cloud), k), CAMERA, poses))
+        np.asarray(score(planner.acquisition, state.cloud, planner.sample_surfaces(state, k), CAMERA, poses))
         for k in (key, view_keys(few.key, 0)[0])
     )
     together = np.concatenate([values, choice.map.values])

@@ -21,10 +21,10 @@ from jaxnbv.diffusion import HeatProblem
 from jaxnbv.episode import observe_scene, view_keys
 from jaxnbv.experiments.meshes import numbered_mesh
 from jaxnbv.planner import Planner, State
-from jaxnbv.scanning import Grid, GridSurface, SDFSurface, SensorNoise, TriangleMesh, mesh_from_sdf
+from jaxnbv.scanning import Carving, Grid, GridSurface, SDFSurface, SensorNoise, TriangleMesh, mesh_from_sdf
 from jaxnbv.search import DiscreteSearch, FarthestView, HalvingSearch, Proposal, RandomView, UncertaintyView
 from jaxnbv.search.base import sphere_candidates
-from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.surfaces import ScreenedSPSR, SurfaceModel
 from jaxnbv.tasks import ColdestPoint, Coverage, body_temperature
 
 _SEARCHES = {
@@ -57,7 +57,7 @@ class HeatStudy(eqx.Module):
       those of `heat_scene`.
     - `views`: in all, the first included.
     - `num_candidates`: on the sphere of radius 3.
-    - `num_samples`, `model`, `grid_resolution`, `capacity`: of the planner.
+    - `num_samples`, `model`, `carving`, `grid_resolution`, `capacity`: of the planner.
     - `num_points`: points of D to which imagined scans are added, where the temperature is simulated.
     - `imagined_rays`: rays along a side of an imagined scan; true scans have 50 x 50.
     """
@@ -66,7 +66,8 @@ class HeatStudy(eqx.Module):
     views: int = eqx.field(static=True, default=6)
     num_candidates: int = eqx.field(static=True, default=32)
     num_samples: int = eqx.field(static=True, default=8)
-    model: GeometricSPSR = GeometricSPSR(lengthscale=0.01, truncation=32)
+    model: SurfaceModel = eqx.field(default_factory=ScreenedSPSR)
+    carving: Carving | None = Carving()
     grid_resolution: int = eqx.field(static=True, default=64)
     capacity: int = eqx.field(static=True, default=4096)
     num_points: int = eqx.field(static=True, default=1024)
@@ -92,7 +93,9 @@ class HeatStudy(eqx.Module):
         camera = Camera(height=self.imagined_rays, width=self.imagined_rays)
         search = _SEARCHES[method](self.num_candidates, HEAT_RADIUS)
         grid = Grid(self.grid_resolution)
-        return Planner(self.model, camera, score, search, self.num_samples, grid, self.capacity, self.views)
+        return Planner(
+            self.model, camera, score, search, self.num_samples, grid, self.capacity, self.views, self.carving
+        )
 
     def scene(self, index: int) -> HeatScene:
         """An object and where it is heated.
@@ -194,7 +197,7 @@ def _run(study: HeatStudy, scene: HeatScene, index: int, method: str, first: int
     """The episode, as `planned_views` has it; but here the other search is asked with the same state and samples."""
     planner, key = study.planner(method, scene.source), _key(index, "episode")
     halving = study.planner("heat-halving", scene.source) if compare else None
-    state = planner.init(_scan(study, scene, index, first, 0), study.poses()[first])
+    state = planner.init(_scan(study, scene, index, first, 0), study.poses()[first], Camera())
     candidates, clouds, steps, compared = [first], [state.cloud], [], []
     for view in range(1, study.views):
         sample_key, search_key, _ = view_keys(key, view)
@@ -205,7 +208,7 @@ def _run(study: HeatStudy, scene: HeatScene, index: int, method: str, first: int
             compared.append(_compare(study, proposal, *_choose(halving, state, surfaces, search_key)))
         candidates.append(_candidate(study, proposal.pose))
         scan = _scan(study, scene, index, candidates[-1], view)
-        state = planner.observe(state, proposal.pose, scan)
+        state = planner.observe(state, proposal.pose, scan, Camera())
         clouds.append(state.cloud)
     run = {"candidates": candidates, "steps": steps, "clouds": clouds}
     return run | {"halving": compared} if compare else run
@@ -257,13 +260,10 @@ def _estimates(clouds: Sequence[PointCloud], heat: HeatProblem, truth: Truth) ->
 
 def seen_clouds(study: HeatStudy, index: int, candidates: Sequence[int]) -> list[PointCloud]:
     """D after each of the given views of a scene, noise included: those of a record's method."""
-    scene, state, clouds = study.scene(index), None, []
+    scene = study.scene(index)
     planner = study.planner("farthest", scene.source)
-    for view, candidate in enumerate(candidates):
-        scan, pose = _scan(study, scene, index, candidate, view), study.poses()[candidate]
-        state = planner.init(scan, pose) if state is None else planner.observe(state, pose, scan)
-        clouds.append(state.cloud)
-    return clouds
+    views = ((study.poses()[one], _scan(study, scene, index, one, view)) for view, one in enumerate(candidates))
+    return [state.cloud for state in planner.replay(views, Camera())]
 
 
 def _scan(study: HeatStudy, scene: HeatScene, index: int, candidate: int, view: int) -> PointCloud:

@@ -8,12 +8,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int, Key, PRNGKeyArray
 
 from jaxnbv.camera import Camera, Pose, look_at
-from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
+from jaxnbv.cloud import PointCloud, concatenate
 from jaxnbv.datasets import PartScene, Split, part_scene
 from jaxnbv.datasets.labelled import LabelledSolid
-from jaxnbv.experiments.pyramid.clouds import Imagination
+from jaxnbv.experiments.training_views import joined_views, only, state_after
 from jaxnbv.farthest import farthest_point_indices
-from jaxnbv.scanning import GridSurface, SDFSurface, SensorNoise, scan
+from jaxnbv.planner import Planner
+from jaxnbv.scanning import SDFSurface, SensorNoise, scan
 
 # The authors' cameras for parts: 64 x 64 rays, on a sphere of radius 2 about the object.
 PART_CAMERA = Camera(height=64, width=64)
@@ -43,14 +44,15 @@ def scanned_part_clouds(split: Split, indices: Sequence[int], num_points: int = 
 
 
 def imagined_part_clouds(
-    split: Split, indices: Sequence[int], imagination: Imagination, num_points: int = 1024
+    split: Split, indices: Sequence[int], planner: Planner, num_poses: int = 4, num_points: int = 1024
 ) -> LabelledPartClouds:
     """D u scan(theta; f_s) of each scene: D of one to five views, every sample f_s seen from random poses of its own.
 
-    A point that was imagined has the label of the part that is nearest to it in truth.
+    The samples are those of a planner that has seen D. A point that was imagined has the label of the part that is
+    nearest to it in truth.
     """
     solids, categories = _stacked([part_scene(split, index) for index in indices])
-    found = _imagined(solids, categories, _keys(split, indices), imagination, num_points)
+    found = _imagined(solids, categories, _keys(split, indices), planner, num_poses, num_points)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found)
 
 
@@ -71,8 +73,8 @@ def _scanned(
     def of_scene(scene):
         solid, category, key = scene
         view_key, *keys = jax.random.split(key, 1 + _CLOUDS_A_SCENE)
-        views, labels = _views(solid, view_key)
-        clouds = [_thin(_some(views, key, MAX_VIEWS), labels.reshape(-1), num_points) for key in keys]
+        views, _, labels = _views(solid, view_key)
+        clouds = [_thin(joined_views(_some(views, key, MAX_VIEWS)), labels.reshape(-1), num_points) for key in keys]
         cloud, labels = jax.tree.map(lambda *leaves: jnp.stack(leaves), *clouds)
         return LabelledPartClouds(cloud, labels, jnp.full(_CLOUDS_A_SCENE, category))
 
@@ -84,31 +86,30 @@ def _imagined(
     solids: LabelledSolid,
     categories: Int[Array, " scenes"],
     keys: Key[Array, " scenes"],
-    imagination: Imagination,
+    planner: Planner,
+    num_poses: int,
     num_points: int,
 ) -> LabelledPartClouds:
     def of_scene(scene):
         solid, category, key = scene
         view_key, some_key, sample_key, pose_key = jax.random.split(key, 4)
-        views, labels = _views(solid, view_key)
-        cloud, labels = _some(views, some_key, MAX_VIEWS - 1), labels.reshape(-1)
-        posterior = imagination.model.condition(limit_capacity(cloud, imagination.capacity))
-        fields = posterior.sample(sample_key, imagination.num_samples)
-        surfaces = GridSurface.from_values(fields.on_grid(imagination.grid.axis), posterior.level, imagination.grid)
-        cloud, labels = _thin(cloud, labels, num_points)
+        views, poses, labels = _views(solid, view_key)
+        views = _some(views, some_key, MAX_VIEWS - 1)
+        surfaces = planner.sample_surfaces(state_after(planner, views, poses, PART_CAMERA), sample_key)
+        cloud, labels = _thin(joined_views(views), labels.reshape(-1), num_points)
 
         def of_sample(surface_and_key):
             surface, key = surface_and_key
-            scans = scan(surface, PART_CAMERA, _random_poses(key, imagination.num_poses))
+            scans = scan(surface, PART_CAMERA, _random_poses(key, num_poses))
 
             def joined(seen):
                 both = concatenate(cloud, seen)
                 return _thin(both, jnp.concatenate([labels, solid.label(seen.points)]), num_points)
 
             clouds, points_labels = jax.lax.map(joined, scans)
-            return LabelledPartClouds(clouds, points_labels, jnp.full(imagination.num_poses, category))
+            return LabelledPartClouds(clouds, points_labels, jnp.full(num_poses, category))
 
-        found = jax.lax.map(of_sample, (surfaces, jax.random.split(pose_key, imagination.num_samples)))
+        found = jax.lax.map(of_sample, (surfaces, jax.random.split(pose_key, planner.num_samples)))
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found)
 
     return jax.lax.map(of_scene, (solids, categories, keys))
@@ -127,16 +128,16 @@ def _random_poses(key: PRNGKeyArray, count: int) -> Pose:
     return look_at(PART_RADIUS * direction / jnp.linalg.norm(direction, axis=-1, keepdims=True))
 
 
-def _views(solid: LabelledSolid, key: PRNGKeyArray) -> tuple[PointCloud, Int[Array, "views rays"]]:
-    """What random views show, with noise, and the true part of every point."""
+def _views(solid: LabelledSolid, key: PRNGKeyArray) -> tuple[PointCloud, Pose, Int[Array, "views rays"]]:
+    """What random views show, with noise, their poses, and the true part of every point."""
     pose_key, noise_key = jax.random.split(key)
-    scans = scan(SDFSurface(solid), PART_CAMERA, _random_poses(pose_key, MAX_VIEWS))
-    return SensorNoise()(scans, noise_key), solid.label(scans.points)
+    poses = _random_poses(pose_key, MAX_VIEWS)
+    scans = scan(SDFSurface(solid), PART_CAMERA, poses)
+    return SensorNoise()(scans, noise_key), poses, solid.label(scans.points)
 
 
 def _some(views: PointCloud, key: PRNGKeyArray, most: int) -> PointCloud:
-    """One to `most` of the views, drawn at random, as one cloud; the rows of the others are masked."""
+    """One to `most` of the views, drawn at random; the rows of the others are masked."""
     count_key, order_key = jax.random.split(key)
     used = jax.random.permutation(order_key, MAX_VIEWS) < jax.random.randint(count_key, (), 1, most + 1)
-    views = PointCloud(views.points, views.normals, views.mask & used[:, None])
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), views)
+    return only(views, used)

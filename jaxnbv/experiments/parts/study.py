@@ -19,7 +19,7 @@ from jaxnbv.experiments.episodes import planned_views
 from jaxnbv.experiments.parts.clouds import MAX_VIEWS, PART_CAMERA, PART_RADIUS
 from jaxnbv.networks import CATEGORIES, CloudSegmenter
 from jaxnbv.planner import Planner
-from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
+from jaxnbv.scanning import Carving, Grid, SDFSurface, SensorNoise
 from jaxnbv.search import (
     DiscreteSearch,
     FarthestView,
@@ -31,7 +31,7 @@ from jaxnbv.search import (
     UncertaintyView,
 )
 from jaxnbv.search.base import sphere_candidates
-from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.surfaces import ScreenedSPSR, SurfaceModel
 from jaxnbv.tasks import Coverage, SoftPartCount, part_counts
 
 METHODS = ("discrete", "gradient-2dof", "gradient-6dof", "farthest", "uncertainty", "random", "coverage")
@@ -53,7 +53,7 @@ class PartStudy(eqx.Module):
     - `split`: which scenes; tune on those of the validation split.
     - `views`: in all, the first included.
     - `num_candidates`: on the sphere of radius 2.
-    - `num_samples`, `model`, `grid_resolution`, `capacity`: of the planner.
+    - `num_samples`, `model`, `carving`, `grid_resolution`, `capacity`: of the planner.
     - `imagined_rays`: rays along a side of an imagined scan; true scans have 64 x 64.
     - `num_points`: points that the segmenter is fed of D and an imagined scan; N_target is taken in proportion.
     - `num_starts`, `iterations`, `learning_rate`: of the gradient searches, which look at half the candidates first.
@@ -64,7 +64,8 @@ class PartStudy(eqx.Module):
     views: int = eqx.field(static=True, default=MAX_VIEWS)
     num_candidates: int = eqx.field(static=True, default=48)
     num_samples: int = eqx.field(static=True, default=8)
-    model: GeometricSPSR = GeometricSPSR(lengthscale=0.01, truncation=32)
+    model: SurfaceModel = eqx.field(default_factory=ScreenedSPSR)
+    carving: Carving | None = Carving()
     grid_resolution: int = eqx.field(static=True, default=64)
     capacity: int = eqx.field(static=True, default=4096)
     imagined_rays: int = eqx.field(static=True, default=32)
@@ -90,7 +91,9 @@ class PartStudy(eqx.Module):
         grid = Grid(self.grid_resolution)
         score = self._soft_count(category) if method in METHODS[:3] else Coverage()
         search = self._search(method)
-        return Planner(self.model, camera, score, search, self.num_samples, grid, self.capacity, self.views)
+        return Planner(
+            self.model, camera, score, search, self.num_samples, grid, self.capacity, self.views, self.carving
+        )
 
     def _soft_count(self, category: Int[Array, ""]) -> ExpectedUtilityImprovement:
         segmenter = CloudSegmenter(self.segmenter.network, category, self.num_points, self.segmenter.scale)
@@ -138,15 +141,14 @@ def seen_views(study: PartStudy, record: dict, method: str) -> list[tuple[PointC
     **Raises:** `ValueError` as `Planner.init` and `observe` do.
     """
     scene, key = part_scene(Split(record["split"]), record["scene"]), _key(record["scene"])
-    # D depends on the planner through its capacity alone.
-    planner, state, seen = study.planner("farthest", scene.category), None, []
+    views = []
     for index, view in enumerate(record["methods"][method]["views"]):
         pose = Pose(np.asarray(view["rotation"], np.float32), np.asarray(view["position"], np.float32))
         *_, noise_key = view_keys(key, index)
-        shown = observe_scene(SDFSurface(scene.solid), PART_CAMERA, pose, SensorNoise(), noise_key)
-        state = planner.init(shown, pose) if state is None else planner.observe(state, pose, shown)
-        seen.append((shown, state.cloud))
-    return seen
+        views.append((pose, observe_scene(SDFSurface(scene.solid), PART_CAMERA, pose, SensorNoise(), noise_key)))
+    # D depends on the planner through its capacity alone.
+    states = study.planner("farthest", scene.category).replay(views, PART_CAMERA)
+    return [(shown, state.cloud) for (_, shown), state in zip(views, states, strict=True)]
 
 
 def _run(study: PartStudy, scene: PartScene, first: Pose, index: int, method: str, parts: Sequence[int]) -> dict:

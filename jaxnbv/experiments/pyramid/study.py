@@ -17,11 +17,11 @@ from jaxnbv.datasets.pyramid import choose_hidden, scan_pattern
 from jaxnbv.experiments.diagnostics import rank_correlation, roughness
 from jaxnbv.experiments.pyramid.report import METHODS
 from jaxnbv.planner import Planner, State
-from jaxnbv.scanning import Grid, GridSurface, SensorNoise, scan
+from jaxnbv.scanning import Carving, Grid, GridSurface, SensorNoise, scan
 from jaxnbv.search import DiscreteSearch, Problem
 from jaxnbv.search.base import SENSOR_RADIUS, sphere_candidates
 from jaxnbv.search.baselines import uncertain_length
-from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.surfaces import SurfaceModel
 from jaxnbv.tasks import Coverage
 from jaxnbv.tasks.classification import Classifier, MixedEntropy, cross_entropy, entropy
 
@@ -40,17 +40,18 @@ class PyramidStudy(eqx.Module):
     - `split`: which scenes; tune on those of the validation split.
     - `views`: in all, the first included.
     - `num_candidates`: on the sphere of radius 2.5.
-    - `num_samples`, `model`, `grid_resolution`, `capacity`: of the planner.
+    - `model`, `carving`, `num_samples`, `grid_resolution`, `capacity`: of the planner.
     - `num_points`: D is thinned to so many, once a step, before imagined scans are added to it.
     """
 
     classifier: Classifier
     framing: Framing = eqx.field(static=True)
+    model: SurfaceModel
+    carving: Carving | None
     split: Split = eqx.field(static=True, default=Split.TEST)
     views: int = eqx.field(static=True, default=5)
     num_candidates: int = eqx.field(static=True, default=48)
     num_samples: int = eqx.field(static=True, default=16)
-    model: GeometricSPSR = GeometricSPSR(lengthscale=0.01, truncation=32)
     grid_resolution: int = eqx.field(static=True, default=64)
     capacity: int = eqx.field(static=True, default=4096)
     num_points: int = eqx.field(static=True, default=512)
@@ -67,7 +68,8 @@ class PyramidStudy(eqx.Module):
     def planner(self) -> Planner:
         """The grid keeps its proportion to the object in both framings."""
         grid = Grid(self.grid_resolution, 0.7 * self.framing.longest_side)
-        return Planner(self.model, Camera(), Coverage(), DiscreteSearch(), self.num_samples, grid, self.capacity)
+        search, samples = DiscreteSearch(), self.num_samples
+        return Planner(self.model, Camera(), Coverage(), search, samples, grid, self.capacity, carving=self.carving)
 
 
 def run_scene(study: PyramidStudy, index: int, methods: Sequence[str] = METHODS) -> dict:
@@ -186,7 +188,7 @@ class _Scene:
             if "uncertainty" in methods:
                 found["uncertainty"] = np.asarray(_uncertainty(self._problem(state, surfaces), self.poses))
             found = {method: found[method] for method in sampling}
-            self._diagnose(view, visited, found, roughness(self.study.model, state.cloud, surfaces), float(near))
+            self._diagnose(view, visited, found, roughness(self.planner, state, surfaces), float(near))
             values |= found
         return values
 

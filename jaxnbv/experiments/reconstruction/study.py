@@ -23,10 +23,10 @@ from jaxnbv.experiments.reconstruction.distances import SURFACE_POINTS, surface_
 from jaxnbv.networks.shapenet import CATEGORIES
 from jaxnbv.planner import Planner
 from jaxnbv.reconstruction import has_poisson, mean_mesh, screened_poisson
-from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, Surface, TriangleMesh
+from jaxnbv.scanning import Carving, Grid, SDFSurface, SensorNoise, Surface, TriangleMesh
 from jaxnbv.search import DiscreteSearch, FarthestView, RandomView, Search, UncertaintyView
 from jaxnbv.search.base import sphere_candidates
-from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.surfaces import ScreenedSPSR, SurfaceModel
 from jaxnbv.tasks import Coverage
 
 _SEARCHES: dict[str, Callable[[int], Search]] = {
@@ -47,15 +47,16 @@ class ReconstructionStudy(eqx.Module):
       of `part_scene`.
     - `views`: in all, the first included.
     - `num_candidates`: on the sphere of radius 2.5.
-    - `num_samples`, `model`, `grid_resolution`, `capacity`: of the planner. The model's mean is also meshed, on the
-      paper's grid of 100^3.
+    - `num_samples`, `model`, `carving`, `grid_resolution`, `capacity`: of the planner. The model's mean is also
+      meshed, on the paper's grid of 100^3.
     """
 
     meshes: tuple[str, ...] = eqx.field(static=True, default=())
     views: int = eqx.field(static=True, default=5)
     num_candidates: int = eqx.field(static=True, default=48)
     num_samples: int = eqx.field(static=True, default=16)
-    model: GeometricSPSR = GeometricSPSR(lengthscale=0.01, truncation=32)
+    model: SurfaceModel = eqx.field(default_factory=ScreenedSPSR)
+    carving: Carving | None = Carving()
     grid_resolution: int = eqx.field(static=True, default=64)
     capacity: int = eqx.field(static=True, default=4096)
 
@@ -70,7 +71,7 @@ class ReconstructionStudy(eqx.Module):
         """The planner of a method; planners differ in their search alone."""
         search, grid = _SEARCHES[method](self.num_candidates), Grid(self.grid_resolution)
         return Planner(
-            self.model, Camera(), Coverage(), search, self.num_samples, grid, self.capacity, max_views=self.views
+            self.model, Camera(), Coverage(), search, self.num_samples, grid, self.capacity, self.views, self.carving
         )
 
     def scene(self, index: int) -> Surface:

@@ -12,13 +12,16 @@ from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets import Split, part_scene
 from jaxnbv.experiments.parts import clouds as part_clouds
 from jaxnbv.experiments.parts.clouds import imagined_part_clouds, scanned_part_clouds
-from jaxnbv.experiments.pyramid.clouds import Imagination
+from jaxnbv.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, scan
+from jaxnbv.search import DiscreteSearch
 from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Coverage
 
 # A motorbike and a skateboard.
 SCENES, POINTS = (7, 11), 150
-IMAGINATION = Imagination(GeometricSPSR(lengthscale=0.05, truncation=8), Grid(20), 2, 3, 150)
+MODEL = GeometricSPSR(lengthscale=0.05, truncation=8)
+PLANNER = Planner(MODEL, Camera(), Coverage(), DiscreteSearch(), 2, Grid(20), 150)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -26,9 +29,7 @@ def few_rays():
     """Compilation takes nearly all the time of the rest."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(part_clouds, "PART_CAMERA", Camera(height=24, width=24))
-        jax.config.update("jax_disable_most_optimizations", True)
         yield
-        jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +44,7 @@ def scanned():
 
 @pytest.fixture(scope="module")
 def imagined():
-    return imagined_part_clouds(Split.TRAIN, SCENES, IMAGINATION, POINTS)
+    return imagined_part_clouds(Split.TRAIN, SCENES, PLANNER, 3, POINTS)
 
 
 @eqx.filter_jit

@@ -45,9 +45,7 @@ def few_rays():
     with pytest.MonkeyPatch.context() as patch:
         for module in (part_study, part_pictures):
             patch.setattr(module, "PART_CAMERA", CAMERA)
-        jax.config.update("jax_disable_most_optimizations", True)
         yield
-        jax.config.update("jax_disable_most_optimizations", False)
 
 
 class Pointwise(eqx.Module):

@@ -5,13 +5,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnbv.camera import Camera
 from jaxnbv.datasets import PATTERNS, Framing, Split, pyramid_scene
-from jaxnbv.experiments.pyramid.clouds import MAX_VIEWS, Imagination, imagined_clouds, scanned_clouds
+from jaxnbv.experiments.pyramid.clouds import MAX_VIEWS, imagined_clouds, scanned_clouds
+from jaxnbv.planner import Planner
 from jaxnbv.scanning import Grid
+from jaxnbv.search import DiscreteSearch
 from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Coverage
 
 COUNT, POINTS = 16, 200
-IMAGINATION = Imagination(GeometricSPSR(lengthscale=0.05, truncation=8), Grid(20), 2, 3, 150)
+MODEL = GeometricSPSR(lengthscale=0.05, truncation=8)
+PLANNER = Planner(MODEL, Camera(), Coverage(), DiscreteSearch(), 2, Grid(20), 150)
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +26,7 @@ def scanned():
 
 @pytest.fixture(scope="module")
 def imagined():
-    return [imagined_clouds(Split.TRAIN, Framing.CLOSE_UP, jnp.asarray(i), IMAGINATION, POINTS) for i in (5, 6)]
+    return [imagined_clouds(Split.TRAIN, Framing.CLOSE_UP, jnp.asarray(i), PLANNER, 3, POINTS) for i in (5, 6)]
 
 
 def assert_same(a, b):
@@ -106,6 +111,6 @@ def test_imagined_clouds_begin_with_what_was_truly_seen(imagined):
 
 
 def test_imagined_clouds_can_be_made_again(imagined):
-    again = imagined_clouds(Split.TRAIN, Framing.CLOSE_UP, jnp.asarray(6), IMAGINATION, POINTS)
+    again = imagined_clouds(Split.TRAIN, Framing.CLOSE_UP, jnp.asarray(6), PLANNER, 3, POINTS)
     assert_same(imagined[1], again)
     assert not np.array_equal(imagined[0].clouds.points, imagined[1].clouds.points)

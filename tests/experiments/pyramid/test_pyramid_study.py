@@ -17,7 +17,7 @@ from jaxnbv.datasets import Framing, Pyramid, Split, pyramid_scene
 from jaxnbv.experiments.pyramid import study as pyramid_study
 from jaxnbv.experiments.pyramid.study import METHODS, PyramidStudy, run_scene
 from jaxnbv.experiments.records import RecordFolder
-from jaxnbv.scanning import SDFSurface, scan
+from jaxnbv.scanning import Carving, SDFSurface, scan
 from jaxnbv.search import FarthestView, Problem, UncertaintyView
 from jaxnbv.search.base import sphere_candidates
 from jaxnbv.surfaces import GeometricSPSR
@@ -53,9 +53,10 @@ class Knowing(eqx.Module):
 
 def small_study(classifier=None, views=3, **settings):
     model = GeometricSPSR(lengthscale=0.05, truncation=8)
-    small = {"num_candidates": CANDIDATES, "num_samples": 2, "model": model, "grid_resolution": 20}
+    small = {"num_candidates": CANDIDATES, "num_samples": 2, "grid_resolution": 20}
     limits = {"capacity": 250, "num_points": 100}
-    return PyramidStudy(classifier or Linear(), Framing.CLOSE_UP, views=views, **(small | limits | settings))
+    surfaces = model, Carving()
+    return PyramidStudy(classifier or Linear(), Framing.CLOSE_UP, *surfaces, views=views, **(small | limits | settings))
 
 
 @functools.cache

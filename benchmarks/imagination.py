@@ -1,0 +1,301 @@
+"""How good imagined surfaces are: samples of several models against the true surface, after one view and after two.
+
+    python benchmarks/imagination.py [--scenes N] [--parts NAME ...] [--mesh FILE ...] [--candidates 24] [--seeds 0 1]
+        [--models NAME ...] [--variant "NAME=EXPRESSION" ...] [--figure PATH] [--better NAME] [--out FILE]
+
+Objects are N validation pyramids in close-up, one validation object of each part category named, and the demo object;
+with meshes, these alone and what else is asked for. All models see the same scans of 50 x 50 rays with the default
+noise, from the same two random views. Samples are 8 on a grid of 64^3 nodes; depths are along 32 x 32 rays from each
+candidate. See `jaxnbv.experiments.imagination` for the numbers. Continues with what the file does not hold yet.
+
+A variant is a model of your own, carved: --variant "smooth=nbv.GeometricSPSR(lengthscale=0.03, truncation=32)". All of
+jaxnbv, jaxnbv.surfaces and the grid are in scope. A change of a model's code is not noticed: take another file then.
+"""
+
+import argparse
+import functools
+import hashlib
+import json
+import math
+import time
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+from tqdm import tqdm
+
+import jaxnbv as nbv
+from jaxnbv import surfaces as models
+from jaxnbv.datasets import PART_CATEGORIES, Split, demo_object, part_scene, pyramid_scene
+from jaxnbv.episode import observe_scene
+from jaxnbv.experiments.imagination import Truth, judge
+from jaxnbv.neighbours import nearest_squared_distance
+from jaxnbv.search.base import sphere_candidates
+from jaxnbv.storage import describe, versions, write_whole
+from jaxnbv.viz.figures import STYLE
+from jaxnbv.viz.style import INK, LINE
+
+GRID = nbv.Grid(64, 0.7 * 2.5)
+RAYS = nbv.Camera(height=32, width=32)
+VOLUME = nbv.Box()
+VIEWS, LEAST_HITS = 2, 100
+TINT = "#f0a45c"
+
+Variant = Callable[[nbv.Grid], tuple[nbv.SurfaceModel, nbv.Carving | None]]
+TWO_SCALES = nbv.ScreenedSPSR().base
+VARIANTS: dict[str, Variant] = {
+    "paper": lambda grid: (nbv.GeometricSPSR(), None),
+    "+ carving": lambda grid: (nbv.GeometricSPSR(), nbv.Carving()),
+    "+ volume": lambda grid: (nbv.ScreenedSPSR(nbv.GeometricSPSR(), (nbv.OutsideBoundary(),)), nbv.Carving()),
+    "+ two scales": lambda grid: (nbv.ScreenedSPSR(TWO_SCALES, (nbv.OutsideBoundary(),)), nbv.Carving()),
+    "+ values": lambda grid: (
+        nbv.ScreenedSPSR(TWO_SCALES, (nbv.OutsideBoundary(), nbv.OnSurface(), nbv.Thickness())),
+        nbv.Carving(),
+    ),
+    "all": lambda grid: (nbv.ScreenedSPSR(), nbv.Carving()),
+}
+# What the table shows: heading, key of the record, digits.
+COLUMNS = (
+    ("CRPS", "crps", 4),
+    ("Brier", "brier", 4),
+    ("fair", "fair_brier", 4),
+    ("P(in)", "mean_inside", 3),
+    ("true", "true_inside", 3),
+    ("in empty", "in_empty", 3),
+    ("rank", "rank", 2),
+    ("of best", "share_of_best", 2),
+)
+
+
+def planner_of(variant: Variant) -> nbv.Planner:
+    """The planner whose samples are judged; its search is never asked."""
+    model, carving = variant(GRID)
+    settings = {"num_samples": 8, "grid": GRID, "capacity": 4096, "max_views": VIEWS, "carving": carving}
+    return nbv.Planner(model, nbv.Camera(), nbv.Coverage(), nbv.DiscreteSearch(), **settings)
+
+
+def objects_of(arguments: argparse.Namespace) -> dict[str, Callable[[], nbv.Surface]]:
+    """How to make each object, by the name "class/object"."""
+    alone = not arguments.mesh
+    scenes = (2 if alone else 0) if arguments.scenes is None else arguments.scenes
+    parts = (["chair", "mug", "motorbike"] if alone else []) if arguments.parts is None else arguments.parts
+    found: dict[str, Callable[[], nbv.Surface]] = {}
+    for index in range(scenes):
+        found[f"pyramid/{index}"] = lambda i=index: nbv.SDFSurface(pyramid_scene(Split.VALIDATION, i))
+    for name in parts:
+        index = PART_CATEGORIES.index(name)
+        found[f"parts/{name}"] = lambda i=index: nbv.SDFSurface(part_scene(Split.VALIDATION, i).solid)
+    if alone:
+        found["demo/mug"] = demo_object
+    for file in map(Path, arguments.mesh):
+        found[f"{file.resolve().parent.name}/{file.stem}"] = functools.partial(nbv.load_mesh, file)
+    return found
+
+
+def random_views(scene: nbv.Surface, key: jax.Array) -> list[tuple[nbv.Pose, nbv.PointCloud]]:
+    """Views from random directions, each of which sees something of the object."""
+    views = []
+    for index in range(100):
+        direction_key, noise_key = jax.random.split(jax.random.fold_in(key, index))
+        direction = jax.random.normal(direction_key, (3,))
+        pose = nbv.look_at(2.5 * direction / jnp.linalg.norm(direction))
+        seen = observe_scene(scene, nbv.Camera(), pose, nbv.SensorNoise(), noise_key)
+        views += [(pose, seen)] if int(seen.count) >= LEAST_HITS else []
+        if len(views) == VIEWS:
+            return views
+    raise SystemExit(f"the object shows from fewer than {VIEWS} of 100 random directions: give a larger one")
+
+
+@eqx.filter_jit
+def seen_space(scan: nbv.PointCloud, pose: nbv.Pose) -> jax.Array:
+    """What one scan shows to be empty, by the default carving, for all models alike."""
+    return nbv.Carving().seen_empty(GRID, scan, nbv.Camera(), pose)
+
+
+def run(planner: nbv.Planner, views: list, truth: Truth, key: jax.Array, compiled: bool) -> list[dict]:
+    """One record for each number of views; seconds are of a run that compiles nothing."""
+    records, state, empty = [], None, jnp.zeros((GRID.resolution,) * 3, bool)
+    for index, (pose, scan) in enumerate(views):
+        state = planner.init(scan, pose) if state is None else planner.observe(state, pose, scan)
+        empty = empty | seen_space(scan, pose)
+        sample = functools.partial(planner.sample_surfaces, state, jax.random.fold_in(key, index))
+        if index == 0 and not compiled:
+            jax.block_until_ready(sample())
+        start = time.perf_counter()
+        surfaces = jax.block_until_ready(sample())
+        seconds = time.perf_counter() - start
+        record = judge(planner, state, surfaces, truth, empty)._asdict()
+        record["reliability"] = record["reliability"] and record["reliability"]._asdict()
+        records.append(record | {"views": index + 1, "points": int(state.cloud.count), "seconds": seconds})
+    return records
+
+
+def show(rows: dict[tuple[str, int, str], list[dict]], names: list[str]) -> None:
+    """Means over objects and seeds, and the change of each object against the first model's."""
+    pairs = list(dict.fromkeys((name, seed) for name, seed, _ in rows))
+    objects = list(dict.fromkeys(name for name, _ in pairs))
+    wide = max(map(len, [*names, "model"])) + 2
+
+    def values(model: str, views: int, what: str, within: str | None = None) -> np.ndarray:
+        cells = [rows[name, seed, model][views][what] for name, seed in pairs if within in (None, name)]
+        return np.array([cell for cell in cells if cell is not None], float)
+
+    for views in range(VIEWS):
+        print(f"\nafter {views + 1} view{'s' if views else ''}: means of {len(objects)} objects, {len(pairs)} runs")
+        print(f"{'model':{wide}}" + "".join(f"{head:>10}" for head, _, _ in COLUMNS) + f"{'seconds':>10}")
+        for model in names:
+            cells = [(values(model, views, key), digits) for _, key, digits in COLUMNS]
+            text = "".join(f"{c.mean():10.{digits}f}" if len(c) else f"{'-':>10}" for c, digits in cells)
+            print(f"{model:{wide}}{text}{np.median(values(model, views, 'seconds')):10.2f}")
+        for what in ("crps", "fair_brier"):
+            print(f"change of {what} against {names[0]}, %: mean of the objects, and by class the mean (worst object)")
+            for model in names[1:]:
+                change: dict[str, list[float]] = {}
+                for name in objects:
+                    base = values(names[0], views, what, name)
+                    if len(base):
+                        ratio = values(model, views, what, name).mean() / base.mean()
+                        change.setdefault(name.split("/")[0], []).append(100.0 * (ratio - 1.0))
+                if change:
+                    mean = np.mean([one for group in change.values() for one in group])
+                    text = "  ".join(f"{kind} {np.mean(c):+.0f} ({max(c):+.0f})" for kind, c in change.items())
+                    print(f"{model:{wide}}{mean:+7.0f}   {text}")
+
+
+def picture(surface: nbv.Surface, eye: nbv.Pose, seen: nbv.PointCloud, pixels: int = 440) -> np.ndarray:
+    """The surface lit from beside the eye, tinted where it lies at scanned points; four rays a pixel, RGBA."""
+    camera = nbv.Camera(2.0 * math.atan(1.9 / 11.0), 2 * pixels, 2 * pixels)
+    view = nbv.scan(surface, camera, eye)
+    normals = np.asarray(view.normals)
+    near = np.asarray(nearest_squared_distance(view.points, seen)) < 0.05**2
+    right, down, forward = np.asarray(eye.rotation).T
+    light = -forward - 0.6 * right - 0.8 * down
+    lit = 0.62 + 0.44 * np.clip(normals @ (light / np.linalg.norm(light)), -0.5, 1.0)
+    colours = np.where(near[:, None], mpl.colors.to_rgb(TINT), mpl.colors.to_rgb(LINE)) * lit[:, None]
+    colours[~np.asarray(view.mask)] = 1.0
+    image = np.concatenate([np.clip(colours, 0.0, 1.0), np.asarray(view.mask, float)[:, None]], axis=1)
+    return image.reshape(pixels, 2, pixels, 2, 4).mean(axis=(1, 3))
+
+
+def crop(images: list[np.ndarray]) -> tuple[slice, slice]:
+    """The rows and columns that any of the pictures needs, but for stray specks."""
+    shown = np.mean([image[..., 3] for image in images], axis=0)
+    spans = []
+    for axis in (1, 0):
+        (used,) = np.nonzero(shown.sum(axis=axis) > 0.5)
+        spans.append(slice(max(used[0] - 6, 0), used[-1] + 7))
+    return spans[0], spans[1]
+
+
+def draw(path: Path, scene: nbv.Surface, view: tuple, named: dict[str, nbv.Planner], key: jax.Array) -> None:
+    """The true surface, and four surfaces that each of two models imagines after one view, seen from its side."""
+    pose, scan = view
+    away, up = np.asarray(pose.position) / 2.5, np.array([0.0, 1.0, 0.0])
+    across = np.cross(up, away) / max(float(np.linalg.norm(np.cross(up, away))), 1e-6)
+    eye = nbv.look_at(11.0 * (math.cos(1.15) * away + math.sin(1.15) * across + 0.25 * up))
+    images = [picture(scene, eye, scan)]
+    for planner in named.values():
+        surfaces = planner.sample_surfaces(planner.init(scan, pose), key)
+        images += [picture(jax.tree.map(lambda leaf, i=i: leaf[i], surfaces), eye, scan) for i in range(4)]
+    rows, columns = crop(images)
+    # Inches: a small picture, the gap below a heading, and the true surface at both rows' height.
+    tall, head = 1.75, 0.3
+    wide = tall * (columns.stop - columns.start) / (rows.stop - rows.start)
+    large = 2 * tall + head
+    width, height = large * wide / tall + 0.2 + 4 * (wide + 0.1), large + head
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(width, height))
+
+        def place(image: np.ndarray, left: float, bottom: float, scale: float) -> None:
+            axes = figure.add_axes((left / width, bottom / height, scale * wide / width, scale * tall / height))
+            axes.imshow(image[rows, columns, :3], interpolation="bilinear", aspect="auto")
+            axes.axis("off")
+
+        def write(left: float, bottom: float, text: str) -> None:
+            figure.text(left / width, bottom / height, text, va="bottom", fontsize=9, color=INK)
+
+        place(images[0], 0.0, 0.0, large / tall)
+        write(0.06, large + 0.06, "the object, and what one view saw of it")
+        for row, name in enumerate(named):
+            left, bottom = large * wide / tall + 0.2, (1 - row) * (tall + head)
+            write(left, bottom + tall + 0.06, f"imagined from this view: {name}")
+            for column in range(4):
+                place(images[1 + 4 * row + column], left + column * (wide + 0.1), bottom, 1.0)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.set_dpi(150)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        # Few colours are enough for two hues, and make the file small.
+        Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB").quantize(96, dither=Image.Dither.NONE).save(
+            path, optimize=True
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--mesh", nargs="+", default=[], help="mesh files")
+    parser.add_argument("--scenes", type=int, help="pyramids; 2 if left out, none with meshes")
+    parser.add_argument("--parts", nargs="*", choices=PART_CATEGORIES, help="categories; three if left out")
+    parser.add_argument("--candidates", type=int, default=24)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--models", nargs="+", help="names of variants, all if left out; the first is compared with")
+    parser.add_argument("--variant", action="append", default=[], metavar="NAME=EXPRESSION", help="a model to add")
+    parser.add_argument("--figure", type=Path, help="a picture of the first object, by the first model and --better")
+    parser.add_argument("--better", help="the second model of the picture; the last if left out")
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/imagination.json"))
+    arguments = parser.parse_args()
+
+    variants = dict(VARIANTS)
+    for text in arguments.variant:
+        name, _, expression = text.partition("=")
+        scope = {**vars(models), **vars(nbv), "nbv": nbv, "grid": GRID}
+        model = eval(expression, scope)
+        variants[name] = lambda grid, model=model: (model, nbv.Carving())
+    names = arguments.models or list(variants)
+    if unknown := {*names, arguments.better or names[0]} - set(variants):
+        parser.error(f"there is no model {', '.join(sorted(unknown))}: choose from {', '.join(variants)}")
+    planners = {name: planner_of(variants[name]) for name in names}
+    candidates = sphere_candidates(arguments.candidates, 2.5)
+    held = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
+    rows, warm = {}, set[str]()
+    objects = objects_of(arguments)
+    with tqdm(total=len(objects) * len(arguments.seeds) * len(names), unit="run") as bar:
+        for name, make in objects.items():
+            scene, truth = make(), None
+            for seed in arguments.seeds:
+                base, views = jax.random.fold_in(jax.random.key(seed), zlib.crc32(name.encode())), None
+                for model, planner in planners.items():
+                    asked = describe([scene, planner, arguments.candidates, RAYS, VOLUME, LEAST_HITS])
+                    label = f"{name}, seed {seed}, {model}"
+                    bar.set_description(label)
+                    made_of = hashlib.sha256(json.dumps(asked).encode()).hexdigest()
+                    if held.get(label, {}).get("made_of") != made_of:
+                        truth = truth or Truth.of(scene, planner, candidates, VOLUME, RAYS)
+                        views = views or random_views(scene, jax.random.fold_in(base, 0))
+                        records = run(planner, views, truth, jax.random.fold_in(base, 1), model in warm)
+                        warm.add(model)
+                        held[label] = {"made_of": made_of, "versions": versions(), "records": records}
+                        arguments.out.parent.mkdir(parents=True, exist_ok=True)
+                        write_whole(arguments.out, lambda out: out.write((json.dumps(held, indent=1) + "\n").encode()))
+                    rows[name, seed, model] = held[label]["records"]
+                    bar.update()
+    show(rows, names)
+    if arguments.figure:
+        name, make = next(iter(objects.items()))
+        base = jax.random.fold_in(jax.random.key(arguments.seeds[0]), zlib.crc32(name.encode()))
+        shown = {model: planner_of(variants[model]) for model in (names[0], arguments.better or names[-1])}
+        scene = make()
+        first = random_views(scene, jax.random.fold_in(base, 0))[0]
+        draw(arguments.figure, scene, first, shown, jax.random.fold_in(base, 1))
+
+
+if __name__ == "__main__":
+    main()

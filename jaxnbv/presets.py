@@ -1,0 +1,62 @@
+"""Which surfaces are held possible: the paper's, and those that the command line and the studies use by default."""
+
+from enum import StrEnum
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from jaxnbv.checks import require
+from jaxnbv.scanning import Carving
+from jaxnbv.surfaces import (
+    GeometricSPSR,
+    OnSurface,
+    OutsideBoundary,
+    ScreenedSPSR,
+    SeenEmpty,
+    SurfaceModel,
+    Thickness,
+)
+from jaxnbv.volume import Box, Volume
+
+
+class ModelName(StrEnum):
+    """By what surfaces are imagined."""
+
+    SCREENED = "screened"
+    PAPER = "paper"
+
+
+class Imagination(NamedTuple):
+    """A distribution over surfaces, and what its samples are carved by; both as `Planner` takes them."""
+
+    model: SurfaceModel
+    carving: Carving | None
+
+
+def imagination(
+    name: ModelName | str, longest_side: float = 2.5, quick: bool = False, volume: Volume | None = None
+) -> Imagination:
+    """The surfaces of a name, for an object whose box has this longest side, in scene units.
+
+    - `screened`: the default `ScreenedSPSR`, whose lengths are taken in proportion to the longest side and for which
+      the boundary of the volume is outside; carved, so that nothing is inside where the sensor saw empty space, nor
+      outside the volume.
+    - `paper`: the published model at its published values, which conditions on normals alone; not carved.
+    - `quick`: with fewer frequencies.
+    - `volume`: by default the cube of the longest side about the origin.
+
+    **Raises:** `ValueError` for another name, or a longest side that is not positive.
+    """
+    require(longest_side > 0, f"the longest side is {longest_side}; it must be positive")
+    known = ", ".join(ModelName)
+    require(name in [*ModelName], f"there is no model {name!r}: choose from {known}")
+    if name == ModelName.PAPER:
+        return Imagination(GeometricSPSR(0.015, truncation=20) if quick else GeometricSPSR(), None)
+    volume = Box.cube(longest_side) if volume is None else volume
+    scale, usual = longest_side / 2.5, ScreenedSPSR()
+    lengthscales = scale * (usual.base.lengthscale + (jnp.array([0.005, 0.0]) if quick else 0.0))
+    # Shorter scales need more frequencies, but time and memory grow with their cube.
+    truncation = min(round((20 if quick else usual.base.truncation) / scale), 30 if quick else 48)
+    base = GeometricSPSR(lengthscales, usual.base.variance, truncation)
+    values = OutsideBoundary(volume), OnSurface(), Thickness(scale * Thickness.depth), SeenEmpty()
+    return Imagination(ScreenedSPSR(base, values, reach=scale * usual.reach), Carving(volume))

@@ -1,0 +1,195 @@
+"""Space that a sensor has seen to be empty, and surfaces carved by it.
+
+A ray says three things: it hit, and was empty up to the hit; it met nothing, and was empty all the way; or it is
+invalid and says nothing. A node of the grid is *seen empty* once all rays near it went past it.
+"""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnbv.camera import Camera, Pose
+from jaxnbv.checks import require
+from jaxnbv.cloud import PointCloud
+from jaxnbv.scanning.grid import Grid
+from jaxnbv.surfaces import EmptyPoints
+from jaxnbv.volume import Box, Volume
+
+# A model takes a hundred or two of the empty points, and the time to choose them grows with how many there are.
+_POINTS_ALONG_AXIS = 20
+# Noise takes fewer of the points on a face of the volume two voxels out of it.
+_STRAY = 0.01
+
+
+class Carving(eqx.Module):
+    """No imagined surface is inside where the sensor saw empty space, nor outside the volume that holds the object.
+
+    - `volume`: where the object can be, see `jaxnbv.volume`; by default the box that scenes are scaled to.
+    - `margin`: in spacings of the grid. A node is seen empty if every ray that passes within the margin of it, and its
+      neighbours in the image, went on for the margin beyond it; it is outside if the volume is farther than two.
+
+    So a sheet thinner than a voxel keeps its surface, though both its sides were seen; noise on a hit does not carve
+    while its standard deviation is below a third of the margin; and nothing is concluded beside a silhouette, where a
+    ray that hit is among the neighbours.
+
+    **Raises:** `ValueError` if the margin is below half a voxel or not finite.
+    """
+
+    volume: Volume = Box()
+    margin: float = eqx.field(static=True, default=1.0)
+
+    def __check_init__(self):
+        require(
+            0.5 <= self.margin < math.inf,
+            f"the margin of the carving is {self.margin} voxels; it must be finite and at least 0.5",
+        )
+
+    def seen_empty(self, grid: Grid, scan: PointCloud, camera: Camera, pose: Pose) -> Bool[Array, "g g g"]:
+        """The nodes that one scan shows to be empty; none for a cloud that is no sensor's image."""
+        depth = _free_depth(scan, camera, pose)
+        if depth is None:
+            return jnp.zeros((grid.resolution,) * 3, bool)
+        return _crossed(grid, depth, camera, pose, self.margin * grid.spacing)
+
+    def outside(self, grid: Grid) -> Bool[Array, "g g g"]:
+        """The nodes outside the volume, by two margins."""
+        axis = jnp.asarray(grid.axis, jnp.result_type(float))
+        y, z = jnp.meshgrid(axis, axis, indexing="ij")
+
+        def slab(x):
+            return self.volume(jnp.stack([jnp.full_like(y, x), y, z], axis=-1).reshape(-1, 3)).reshape(y.shape)
+
+        return jax.lax.map(slab, axis) > self._beyond_volume(grid)
+
+    def _beyond_volume(self, grid: Grid) -> float:
+        return 2.0 * self.margin * grid.spacing
+
+    def empty_points(self, grid: Grid, seen: Bool[Array, "g g g"]) -> EmptyPoints:
+        """The nodes seen empty within the volume, of every few along each axis, for a model to condition on."""
+        stride = -(-grid.resolution // _POINTS_ALONG_AXIS)
+        axis = jnp.asarray(grid.axis, jnp.result_type(float))[::stride]
+        nodes = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+        return EmptyPoints(nodes, seen[::stride, ::stride, ::stride].reshape(-1) & (self.volume(nodes) < 0))
+
+    def check_inside(self, cloud: PointCloud, grid: Grid) -> None:
+        """Check that the volume, widened by two margins, holds the cloud but for one point in a hundred, which noise
+        may have moved: an object is never cut without a word.
+
+        **Raises:** `ValueError` if it does not.
+        """
+        limit = self._beyond_volume(grid)
+        outside, farthest = _beyond(self.volume, cloud, limit)
+        require(
+            int(outside) <= _STRAY * int(cloud.count),
+            f"{int(outside)} of {int(cloud.count)} scanned points lie up to {float(farthest):.4g} outside the volume "
+            f"that is to hold the object ({self.volume}), more than {limit:.4g}: declare a larger one, "
+            "Carving(Box(low, high)), drop what is not of the object, or bring the scan to scene coordinates with "
+            "Frame.to_scene",
+        )
+
+
+def carve(values: Float[Array, "*s g g g"], empty: Bool[Array, "g g g"]) -> Float[Array, "*s g g g"]:
+    """Values of f minus its level, made positive (outside) at the nodes that are empty.
+
+    There the value is twice the largest magnitude among the node and its neighbours, so that what surface remains
+    crosses the edges of the grid near the node that may be inside, at a third of them at most.
+    """
+    magnitude = jnp.maximum(jnp.abs(values), jnp.finfo(values.dtype).tiny)
+    for axis in (-3, -2, -1):
+        window = [1] * values.ndim
+        window[axis] = 3
+        magnitude = jax.lax.reduce_window(magnitude, -jnp.inf, jax.lax.max, window, [1] * values.ndim, "SAME")
+    return jnp.where(empty, 2.0 * magnitude, values)
+
+
+@eqx.filter_jit
+def _beyond(volume: Volume, cloud: PointCloud, limit: float) -> tuple[Int[Array, ""], Float[Array, ""]]:
+    """How many points lie farther than the limit outside the volume, and how far the farthest does."""
+    # All rows, so that clouds of other counts share a compilation.
+    distance = jnp.where(cloud.mask, volume(cloud.points), -jnp.inf)
+    return jnp.sum(distance > limit), jnp.max(distance, initial=-jnp.inf)
+
+
+def check_image(scan: PointCloud, camera: Camera, pose: Pose) -> None:
+    """Check that a scan that says which rays missed is an image of the camera from the pose.
+
+    **Raises:** `ValueError` if it has another number of rays, or its points are seen elsewhere in the image than their
+    rows say: half of them by more than a tenth of its longer side, which is beyond any noise.
+    """
+    if scan.missed is None:
+        return
+    remedy = "give the camera that took it, as observe(state, pose, scan, camera), and the pose that it was taken from"
+    require(
+        scan.capacity == camera.num_rays,
+        f"the scan has {scan.capacity} rays but the camera {camera.height} x {camera.width}: {remedy}",
+    )
+    off = float(_pixels_off(scan, camera, pose))
+    require(
+        off <= 0.1 * max(camera.height, camera.width),
+        f"the scan's points are seen {off:.3g} pixels (median) from where its rows say, in an image of "
+        f"{camera.height} x {camera.width}: {remedy}",
+    )
+
+
+@eqx.filter_jit
+def _pixels_off(scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, ""]:
+    """Median distance, in pixels along a side, of the filled rows from their own pixels; zero where none is filled."""
+    local = jnp.matmul(scan.points - pose.position, pose.rotation, precision="highest")
+    seen = scan.mask & (local[:, 2] > 0)
+    image = local[:, :2] / jnp.where(seen, local[:, 2], 1.0)[:, None]
+    off = camera.focal_length * jnp.max(jnp.abs(image - camera.pixel_directions()[:, :2]), axis=1)
+    off = jnp.where(scan.mask, jnp.where(seen, off, jnp.inf), jnp.nan)
+    return jnp.where(jnp.any(scan.mask), jnp.nanmedian(off), 0.0)
+
+
+def _free_depth(scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, "h w"] | None:
+    """Depth along the camera's axis up to which each pixel's ray was empty; None for a cloud that is no image."""
+    if scan.missed is None:
+        return None
+    along = jnp.matmul(scan.points - pose.position, pose.forward, precision="highest")
+    return jnp.where(scan.mask, along, jnp.where(scan.missed, jnp.inf, 0.0)).reshape(camera.height, camera.width)
+
+
+def _crossed(grid: Grid, depth: Float[Array, "h w"], camera: Camera, pose: Pose, margin: float) -> Bool[Array, "g g g"]:
+    """The nodes that the rays about them have crossed, by `margin` (scene units) to all sides."""
+    # nearest[k] is the least depth within 2^k pixels; zero beside the border, beyond which nothing is known.
+    nearest = [_least_within(depth, 1)]
+    while 2 ** len(nearest) < max(depth.shape):
+        nearest.append(_least_within(nearest[-1], 2 ** (len(nearest) - 1)))
+    pyramid = jnp.stack(nearest)
+
+    axis = jnp.asarray(grid.axis, depth.dtype)
+    y, z = (plane.reshape(-1) for plane in jnp.meshgrid(axis, axis, indexing="ij"))
+
+    def slab(x):
+        nodes = jnp.stack([jnp.full_like(y, x), y, z], axis=-1)
+        right, down, ahead = jnp.matmul(nodes - pose.position, pose.rotation, precision="highest").T
+        in_front = ahead > 2.0 * margin
+        safe = jnp.where(in_front, ahead, 1.0)
+        a, b = right / safe, down / safe
+        column = jnp.floor(camera.focal_length * a + 0.5 * camera.width).astype(jnp.int32)
+        row = jnp.floor(camera.focal_length * b + 0.5 * camera.height).astype(jnp.int32)
+        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        # A ball's image is stretched off the axis, at most by this; one pixel more takes in the rays on both sides.
+        radius = camera.focal_length * margin / (safe - margin) * (1.0 + a**2 + b**2) + 1.0
+        level = jnp.maximum(jnp.ceil(jnp.log2(radius)), 0).astype(jnp.int32)
+        known = in_front & inside & (level < len(nearest))
+        index = [jnp.where(known, i, 0) for i in (level, row, column)]
+        return (known & (pyramid[tuple(index)] >= ahead + margin)).reshape(grid.resolution, -1)
+
+    return jax.lax.map(slab, axis)
+
+
+def _least_within(image: Float[Array, "h w"], reach: int) -> Float[Array, "h w"]:
+    """The least of each pixel and those `reach` rows and columns away, zero beyond the border."""
+    for axis in (0, 1):
+        pad = [(0, 0), (0, 0)]
+        pad[axis] = (reach, reach)
+        padded = jnp.pad(image, pad)
+        size = image.shape[axis]
+        shifted = [jax.lax.slice_in_dim(padded, start, start + size, axis=axis) for start in (0, reach, 2 * reach)]
+        image = jnp.minimum(jnp.minimum(shifted[0], shifted[1]), shifted[2])
+    return image

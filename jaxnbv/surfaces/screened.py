@@ -1,0 +1,229 @@
+"""Poisson surfaces that know values too: screened and enveloped stochastic Poisson surface reconstruction.
+
+A second step of Bayes' rule after `GeometricSPSR`, whose posterior given the normals has mean m and covariance k:
+
+    level    c ~ N(0, tau^2), broad and independent of f;   g = f - c, and the surface is where g = 0
+    data     g(y_k) = h value_k + e_k,   e_k ~ N(0, h^2 noise_k^2),   k = 1, ..., M
+    factor   S = k(Y, Y) + tau^2 11^T + Sigma,   k(Y, Y) = K_ff - sum_d K_fd A^-1 K_df
+    mean     E g(x) = m(x) + (k(x, Y) + tau^2 1^T) w,   w = S^-1 (h value - m(Y))
+    sample   f a sample given the normals, c and e of the prior;   w = S^-1 (h value - f(Y) + c - e)
+
+so that f moves by k(., Y) w: the weights of the normals change by u_d = -A^-1 K_df w, the coefficients of f by
+s(n) / |n|^2 sum_k w_k e^{-i n.y_k} besides, and c by -tau^2 1^T w. A stays shared by the components.
+"""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import cho_solve, solve_triangular
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.cloud import PointCloud
+from jaxnbv.surfaces.base import EmptyPoints, SurfaceModel, SurfacePosterior
+from jaxnbv.surfaces.covariance import function_covariance, function_variance
+from jaxnbv.surfaces.nonuniform import NonuniformTransform
+from jaxnbv.surfaces.spsr import GeometricSPSR, GeometricSPSRPosterior, mode_variance
+from jaxnbv.surfaces.trigonometric import TrigonometricFields, inverse_laplacian, solve_poisson
+from jaxnbv.surfaces.values import OnSurface, OutsideBoundary, SeenEmpty, Thickness, ValueRows, ValueSource, joined
+
+_CHUNK_VALUES = 2**24
+_JUMP_POINTS = 256
+
+
+class ScreenedSPSR(SurfaceModel):
+    """`GeometricSPSR` conditioned on values of f as well as on normals.
+
+    The defaults are what `benchmarks/imagination.py` found best over validation objects.
+
+    - `base`: the prior, and the noise of the normals. The default has a short scale for detail and a long one for the
+      body, of which values can make use.
+    - `values`: what is known of values, see `jaxnbv.surfaces.values`.
+    - `level_deviation`: tau, the prior standard deviation of the level; broad beside the values of f.
+    - `reach`: scene units; h is half the median of E f(x_j + reach n_j) - E f(x_j - reach n_j) over the data, given the
+      normals alone, but at least half the prior standard deviation of f: the two sides of a thin sheet cancel.
+
+    The cost beyond that of `base` is 3 N^2 M + M^3 for N normals and M values.
+
+    **Raises:** `ValueError` without values, or if tau or the reach is not positive.
+    """
+
+    base: GeometricSPSR = eqx.field(default_factory=lambda: GeometricSPSR((0.01, 0.06), (0.2, 0.25), truncation=32))
+    values: tuple[ValueSource, ...] = eqx.field(
+        default_factory=lambda: (OutsideBoundary(), OnSurface(), Thickness(), SeenEmpty())
+    )
+    level_deviation: float = eqx.field(static=True, default=0.5)
+    reach: float = eqx.field(static=True, default=0.1)
+
+    def __check_init__(self):
+        require(len(self.values) > 0, "no values are given: name some, such as OutsideBoundary(), or use GeometricSPSR")
+        for name in ("level_deviation", "reach"):
+            value = getattr(self, name)
+            require(0 < value < math.inf, f"{name} is {value}; it must be positive and finite")
+
+    def condition(self, cloud: PointCloud) -> "ScreenedSPSRPosterior":
+        """p(g | D). The cost is that of the base, and of M triangular solves with its factor.
+
+        **Raises:** `ValueError` as `GeometricSPSR.condition` does, and if S is singular in the precision at hand.
+        """
+        nowhere = EmptyPoints(jnp.zeros((1, 3), cloud.points.dtype), jnp.zeros(1, bool))
+        return self.condition_on_space(cloud, nowhere)
+
+    def condition_on_space(self, cloud: PointCloud, empty: EmptyPoints) -> "ScreenedSPSRPosterior":
+        """p(g | D, what was seen empty). **Raises:** as `condition` does."""
+        posterior = _condition(self, self.base.condition(cloud), empty)
+        if not is_traced(posterior.weights):
+            require(
+                bool(jnp.isfinite(posterior.weights).all()),
+                f"the covariance of {posterior.rows.points.shape[0]} values is singular in {posterior.weights.dtype}: "
+                "raise their noise, or enable jax_enable_x64",
+            )
+        return posterior
+
+
+@eqx.filter_jit
+def _condition(model: ScreenedSPSR, base: GeometricSPSRPosterior, empty: EmptyPoints) -> "ScreenedSPSRPosterior":
+    spectrum, rows = model.base.spectrum, joined(model.values, base.cloud, empty)
+    half_jump = _half_jump(base, model.reach)
+    whitened = jnp.where(rows.mask, base.whitened(rows.points), 0.0)
+    explained = jnp.einsum("dnk,dnl->kl", whitened, whitened, precision="highest")
+    level_variance = model.level_deviation**2
+    covariance = function_covariance(rows.points, rows.points, spectrum) - explained + level_variance
+    block = jnp.where(rows.mask[:, None] & rows.mask, covariance, 0.0)
+    # A row that is not filled is one of the identity, and its weight is zero.
+    factor = jnp.linalg.cholesky(block + jnp.diag(jnp.where(rows.mask, (half_jump * rows.noise) ** 2, 1.0)))
+
+    posterior = ScreenedSPSRPosterior(
+        jnp.zeros_like(base.level), model, base, rows, half_jump, whitened, factor, rows.values, base.mean_coefficients
+    )
+    transform = NonuniformTransform(rows.points, model.base.truncation)
+    at_rows = transform.evaluate(base.mean_coefficients[None])[:, 0]
+    weights = posterior.solve(half_jump * rows.values - at_rows)
+    nothing = jnp.zeros((1, 3, *base.mean_coefficients.shape), at_rows.dtype)
+    normals = solve_triangular(base.cholesky, base.cloud.normals, lower=True)
+    mean = posterior._conditioned(nothing, normals[None], jnp.zeros(1, at_rows.dtype), weights[None])[0]
+    return eqx.tree_at(lambda p: (p.weights, p.mean_coefficients), posterior, (weights, mean))
+
+
+def _half_jump(base: GeometricSPSRPosterior, reach: float) -> Float[Array, ""]:
+    """h: half the median rise of E f given the normals across the data, from `reach` behind to `reach` before."""
+    count = jnp.sum(base.cloud.mask)
+    order = jnp.argsort(~base.cloud.mask, stable=True)
+    chosen = order[(jnp.arange(_JUMP_POINTS) * count) // _JUMP_POINTS]
+    points, step = base.cloud.points[chosen], reach * base.cloud.normals[chosen]
+    mean = base.mean_field
+    least = 0.5 * jnp.sqrt(function_variance(base.model.spectrum))
+    return jnp.maximum(0.5 * jnp.median(mean(points + step)[0] - mean(points - step)[0]), least)
+
+
+class ScreenedSPSRPosterior(SurfacePosterior):
+    """p(g | D) under `ScreenedSPSR`, g = f - c, in closed form and as pathwise samples.
+
+    - `level`: zero; g is relative to the level.
+    - `base`: p(f | normals).
+    - `rows`: the values; `half_jump`: their unit h.
+    - `whitened`: C^-1 K_df with A = C C^T.
+    - `factor`: lower Cholesky factor of S.
+    - `weights`: w of the mean.
+    - `mean_coefficients`: of E g, see `surfaces/trigonometric.py`.
+    """
+
+    level: Float[Array, ""]
+    model: ScreenedSPSR
+    base: GeometricSPSRPosterior
+    rows: ValueRows
+    half_jump: Float[Array, ""]
+    whitened: Float[Array, "3 n m"]
+    factor: Float[Array, "m m"]
+    weights: Float[Array, " m"]
+    mean_coefficients: Float[Array, "a a a"]
+
+    @property
+    def mean_field(self) -> TrigonometricFields:
+        """E g as a single field: evaluate it at points or on a grid."""
+        return TrigonometricFields(self.mean_coefficients[None])
+
+    @eqx.filter_jit
+    def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
+        """E g(x) at points in scene coordinates."""
+        return self.mean_field(x)[0]
+
+    @eqx.filter_jit
+    def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
+        """Var g(x) at points in scene coordinates."""
+        x = jnp.asarray(x, dtype=self.weights.dtype)
+        prior = function_variance(self.model.base.spectrum) + self.model.level_deviation**2
+
+        def at_point(point):
+            normals, values = self._explained(point[None])
+            return jnp.maximum(prior - jnp.sum(normals**2) - jnp.sum(values**2), 0.0)
+
+        chunk = max(1, min(x.shape[0], _CHUNK_VALUES // self.base.cloud.capacity))
+        return jax.lax.map(at_point, x, batch_size=chunk)
+
+    @eqx.filter_jit
+    def covariance(self, x: Float[AnyArray, "n 3"], y: Float[AnyArray, "m 3"]) -> Float[Array, "n m"]:
+        """Cov(g(x), g(y)) between points in scene coordinates, all at once."""
+        x, y = (jnp.asarray(points, dtype=self.weights.dtype) for points in (x, y))
+        (normals_x, values_x), (normals_y, values_y) = self._explained(x), self._explained(y)
+        by_normals = jnp.einsum("djn,djm->nm", normals_x, normals_y, precision="highest")
+        by_values = jnp.matmul(values_x.T, values_y, precision="highest")
+        prior = function_covariance(x, y, self.model.base.spectrum) + self.model.level_deviation**2
+        return prior - by_normals - by_values
+
+    def log_marginal_likelihood(self) -> Float[Array, ""]:
+        """log p(normals) + log p(values | normals)."""
+        mask, count = self.rows.mask, jnp.sum(self.rows.mask)
+        residual = jnp.matmul(self.factor.T, self.weights, precision="highest")
+        log_determinant = 2.0 * jnp.sum(jnp.where(mask, jnp.log(jnp.diag(self.factor)), 0.0))
+        of_values = -0.5 * (jnp.sum(residual**2) + log_determinant + count * jnp.log(2.0 * jnp.pi))
+        return self.base.log_marginal_likelihood() + of_values
+
+    @eqx.filter_jit
+    def sample(self, key: PRNGKeyArray, num_samples: int) -> TrigonometricFields:
+        """`num_samples` joint samples of g by pathwise conditioning: functions, to be evaluated anywhere.
+
+        **Raises:** `ValueError` if `num_samples` < 1.
+        """
+        base_key, level_key, noise_key = jax.random.split(key, 3)
+        coefficients, residual = self.base.prior_draws(base_key, num_samples)
+        dtype, shape = residual.dtype, self.rows.noise.shape
+        level = self.model.level_deviation * jax.random.normal(level_key, (num_samples,), dtype)
+        noise = self.half_jump * self.rows.noise * jax.random.normal(noise_key, (num_samples, *shape), dtype)
+        transform = NonuniformTransform(self.rows.points, self.model.base.truncation)
+        at_rows = jax.lax.map(lambda v: transform.evaluate(solve_poisson(v)[None])[:, 0], coefficients)
+        # f at the values given the normals: k(Y, X) A^-1 r = B^T C^-1 r, with B the whitened covariance.
+        at_rows = at_rows + jnp.einsum("dnm,snd->sm", self.whitened, residual, precision="highest")
+        weights = jax.vmap(self.solve)(self.half_jump * self.rows.values - at_rows + level[:, None] - noise)
+        return TrigonometricFields(self._conditioned(coefficients, residual, -level, weights))
+
+    def solve(self, residual: Float[Array, " m"]) -> Float[Array, " m"]:
+        """w = S^-1 r; zero in rows that are not filled."""
+        return cho_solve((self.factor, True), jnp.where(self.rows.mask, residual, 0.0))
+
+    def _conditioned(
+        self,
+        coefficients: Float[Array, "s 3 a a a"],
+        residual: Float[Array, "s n 3"],
+        constant: Float[Array, " s"],
+        weights: Float[Array, "s m"],
+    ) -> Float[Array, "s a a a"]:
+        """Coefficients of g for each v, its whitened residual at the normals, minus its level, and its w."""
+        moved = residual - jnp.einsum("dnm,sm->snd", self.whitened, weights, precision="highest")
+        fields = self.base.conditioned(coefficients, moved)
+        transform = NonuniformTransform(self.rows.points, self.model.base.truncation)
+        variance = mode_variance(self.model.base.spectrum)
+        direct = jax.lax.map(lambda w: inverse_laplacian(variance * transform.adjoint(w[:, None])[0]), weights)
+        middle = fields.shape[-1] // 2
+        constant = constant + self.model.level_deviation**2 * jnp.sum(weights, axis=1)
+        return (fields - direct).at[:, middle, middle, middle].add(constant)
+
+    def _explained(self, x: Float[Array, "n 3"]) -> tuple[Float[Array, "3 capacity n"], Float[Array, "m n"]]:
+        """Whitened covariances of g(x) with the normals, and with what the values say beyond them."""
+        normals = self.base.whitened(x)
+        cross = function_covariance(self.rows.points, x, self.model.base.spectrum) + self.model.level_deviation**2
+        cross = cross - jnp.einsum("dnm,dnx->mx", self.whitened, normals, precision="highest")
+        cross = jnp.where(self.rows.mask[:, None], cross, 0.0)
+        return normals, solve_triangular(self.factor, cross, lower=True)

@@ -1,0 +1,170 @@
+"""What is known of the function itself, beside its gradient: values of f relative to the level, at points.
+
+Values are in units of h, half of how much the mean of f given the normals rises across the scanned sheet: the scale of
+f is the prior's, and h is what it makes of the data.
+"""
+
+import math
+from abc import abstractmethod
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxnbv.checks import is_traced, require
+from jaxnbv.cloud import PointCloud, farthest_point_subsample
+from jaxnbv.farthest import farthest_point_indices
+from jaxnbv.surfaces.base import EmptyPoints
+from jaxnbv.surfaces.nonuniform import HALF_WIDTH
+from jaxnbv.volume import Box, Volume, boundary_points
+
+
+class ValueRows(eqx.Module):
+    """f(y_k) - c = value_k + e_k with e_k ~ N(0, noise_k^2), in units of h. Rows whose mask is False hold nothing.
+
+    - `points`: in scene coordinates.
+    """
+
+    points: Float[Array, "m 3"]
+    values: Float[Array, " m"]
+    noise: Float[Array, " m"]
+    mask: Bool[Array, " m"]
+
+
+class ValueSource(eqx.Module):
+    """A kind of knowledge about values of f."""
+
+    @abstractmethod
+    def rows(self, cloud: PointCloud, empty: EmptyPoints) -> ValueRows:
+        """The rows that it adds given D and what was seen empty, as many for all of one capacity; run under `jit`."""
+
+
+class OutsideBoundary(ValueSource):
+    """f(b) - c ~ N(h, s_b^2) at points b on the boundary of the volume that holds the object (the "envelope" of Poisson
+    reconstruction, Kazhdan et al. 2020, as an observation).
+
+    - `volume`: see `jaxnbv.volume`; by default the box that scenes are scaled to.
+    - `count`: points, spread evenly as seen from the origin.
+    - `value`, `noise`: mean and standard deviation, in units of h.
+
+    **Raises:** `ValueError` for a count below one, noise that is not positive, or a boundary that leaves the scene,
+    [-pi/2, pi/2]^3, or does not enclose the origin.
+    """
+
+    volume: Volume = Box()
+    count: int = eqx.field(static=True, default=150)
+    value: float = eqx.field(static=True, default=1.0)
+    noise: float = eqx.field(static=True, default=0.5)
+
+    def __check_init__(self):
+        _check(self.count, self.noise)
+        if is_traced(self.volume):
+            return
+        with jax.ensure_compile_time_eval():
+            farthest = float(jnp.abs(boundary_points(self.volume, self.count)).max())
+            middle = float(self.volume(jnp.zeros((1, 3)))[0])
+        require(middle < 0, f"the volume {self.volume} must enclose the origin, whose distance is {middle:.4g}")
+        require(
+            farthest <= HALF_WIDTH,
+            f"the boundary of {self.volume} has a coordinate of {farthest:.4g}: it must lie within the scene, "
+            "[-pi/2, pi/2]^3",
+        )
+
+    def rows(self, cloud: PointCloud, empty: EmptyPoints) -> ValueRows:
+        """One row a point of the boundary."""
+        points = boundary_points(self.volume, self.count).astype(cloud.points.dtype)
+        return _rows(points, self.value, self.noise, jnp.ones(self.count, bool))
+
+
+class OnSurface(ValueSource):
+    """f(x_j) - c ~ N(0, s_f^2) at some of the data, farthest points (the "screening" of Kazhdan and Hoppe 2013).
+
+    - `count`: how many, or all where there are fewer.
+    - `noise`: standard deviation s_f, in units of h.
+
+    **Raises:** `ValueError` for a count below one or noise that is not positive.
+    """
+
+    count: int = eqx.field(static=True, default=100)
+    noise: float = eqx.field(static=True, default=0.1)
+
+    def __check_init__(self):
+        _check(self.count, self.noise)
+
+    def rows(self, cloud: PointCloud, empty: EmptyPoints) -> ValueRows:
+        """One row a point."""
+        chosen = farthest_point_subsample(cloud, self.count)
+        return _rows(chosen.points, 0.0, self.noise, chosen.mask)
+
+
+class Thickness(ValueSource):
+    """f(x_j - depth n_j) - c ~ N(value, s^2) with a negative value, behind some of the data: most things that are
+    scanned are thicker than a sheet.
+
+    - `depth`: behind the point, in scene units.
+    - `count`: how many, or all where there are fewer; farthest points.
+    - `value`, `noise`: mean and standard deviation, in units of h.
+
+    **Raises:** `ValueError` for a count below one, or a noise or depth that is not positive.
+    """
+
+    depth: float = eqx.field(static=True, default=0.15)
+    count: int = eqx.field(static=True, default=100)
+    value: float = eqx.field(static=True, default=-1.0)
+    noise: float = eqx.field(static=True, default=1.0)
+
+    def __check_init__(self):
+        _check(self.count, self.noise)
+        require(self.depth > 0, f"the depth of the thickness is {self.depth}; it must be positive")
+
+    def rows(self, cloud: PointCloud, empty: EmptyPoints) -> ValueRows:
+        """One row a point."""
+        chosen = farthest_point_subsample(cloud, self.count)
+        behind = chosen.points - self.depth * chosen.normals
+        mask = chosen.mask & jnp.all(jnp.abs(behind) <= HALF_WIDTH, axis=1)
+        return _rows(jnp.where(mask[:, None], behind, 0.0), self.value, self.noise, mask)
+
+
+class SeenEmpty(ValueSource):
+    """f(z) - c ~ N(value, s^2) with a positive value, at points z that were seen empty: what was not seen beside them
+    is likely to be empty too. Of use with a long lengthscale, and with a boundary that holds the far field up.
+
+    - `count`: how many, or all where there are fewer; farthest points.
+    - `value`, `noise`: mean and standard deviation, in units of h.
+
+    **Raises:** `ValueError` for a count below one or noise that is not positive.
+    """
+
+    count: int = eqx.field(static=True, default=150)
+    value: float = eqx.field(static=True, default=2.0)
+    noise: float = eqx.field(static=True, default=1.0)
+
+    def __check_init__(self):
+        _check(self.count, self.noise)
+
+    def rows(self, cloud: PointCloud, empty: EmptyPoints) -> ValueRows:
+        """One row a point."""
+        mask = empty.mask & jnp.all(jnp.abs(empty.points) <= HALF_WIDTH, axis=1)
+        index = farthest_point_indices(empty.points, mask, self.count)
+        kept = jnp.arange(self.count) < jnp.sum(mask)
+        points = jnp.where(kept[:, None], empty.points[index], 0.0).astype(cloud.points.dtype)
+        return _rows(points, self.value, self.noise, kept)
+
+
+def joined(sources: tuple[ValueSource, ...], cloud: PointCloud, empty: EmptyPoints) -> ValueRows:
+    """The rows of all sources, one behind the other."""
+    parts = [source.rows(cloud, empty) for source in sources]
+    return ValueRows(
+        *(jnp.concatenate([getattr(part, name) for part in parts]) for name in ("points", "values", "noise", "mask"))
+    )
+
+
+def _rows(points, value: float, noise: float, mask) -> ValueRows:
+    one = jnp.ones(len(points), points.dtype)
+    return ValueRows(points, value * one, noise * one, mask)
+
+
+def _check(count: int, noise: float) -> None:
+    require(isinstance(count, int) and count >= 1, f"the number of values is {count}; it must be at least 1")
+    require(0 < noise < math.inf, f"the noise of the values is {noise}; it must be positive and finite")

@@ -1,0 +1,41 @@
+"""Solids, a camera and projections that the tests of free space and of carving share."""
+
+import math
+
+import equinox as eqx
+import numpy as np
+
+from jaxnbv.camera import Camera, look_at
+from jaxnbv.scanning import (
+    Carving,
+    Grid,
+    SDFSurface,
+)
+from jaxnbv.scanning.sdf import Box as BoxSolid
+from jaxnbv.scanning.sdf import Sphere
+
+# Rays 0.02 apart on the object, nodes 0.07.
+CAMERA, GRID, POSE = Camera(height=56, width=70, fov=0.5), Grid(50), look_at((0.8, 0.9, 2.2), target=(0.2, 0.0, 0.0))
+CENTRE, RADIUS, HALF = np.array([0.1, -0.2, 0.15]), 0.5, np.array([0.5, 0.3, 0.4])
+SOLIDS = {
+    "ball": SDFSurface(Sphere(RADIUS).translate(CENTRE)),
+    "box": SDFSurface(BoxSolid(HALF).translate(CENTRE)),
+}
+SEE = eqx.filter_jit(Carving.seen_empty)
+
+
+def nodes_of(grid):
+    axis = np.linspace(-grid.half_extent, grid.half_extent, grid.resolution)
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+
+
+def in_camera(x, pose):
+    return (x - np.asarray(pose.position, np.float64)) @ np.asarray(pose.rotation, np.float64)
+
+
+def image(x, camera, pose):
+    """Column and row, in pixels from the image's corner, and depth."""
+    right, down, ahead = np.moveaxis(in_camera(x, pose), -1, 0)
+    focal = 0.5 * camera.height / math.tan(0.5 * camera.fov)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return focal * right / ahead + 0.5 * camera.width, focal * down / ahead + 0.5 * camera.height, ahead

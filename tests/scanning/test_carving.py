@@ -1,0 +1,256 @@
+"""The planner and what was seen to be empty: carved samples, what the model is told, refused scans and states."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from free_scenes import SEE, SOLIDS, image, nodes_of
+from jaxtyping import Array, Float
+
+from jaxnbv.camera import Camera, look_at
+from jaxnbv.cloud import PointCloud
+from jaxnbv.planner import Planner
+from jaxnbv.scanning import (
+    Carving,
+    Grid,
+    GridSurface,
+    SDFSurface,
+    SensorNoise,
+    carve,
+    scan,
+    scan_samples,
+)
+from jaxnbv.scanning.sdf import Box as BoxSolid
+from jaxnbv.search import FarthestView
+from jaxnbv.surfaces import Fields, GeometricSPSR, SurfaceModel, SurfacePosterior
+from jaxnbv.tasks import Coverage
+from jaxnbv.volume import Box
+
+RNG = np.random.default_rng(0)
+SMALL_GRID = Grid(30, 1.6)
+POSES = [look_at((0.0, 0.3, 2.5)), look_at((0.0, 0.3, -2.5))]
+
+
+class Waves(Fields):
+    """A ball under random waves, whatever was scanned: dents and islands all over the scene."""
+
+    phases: Float[Array, "s 3"]
+
+    def __call__(self, x):
+        waves = jnp.sin(6.0 * x[None] + self.phases[:, None]).sum(axis=-1)
+        return jnp.linalg.norm(x, axis=-1) - 0.6 + waves
+
+
+class WavesPosterior(SurfacePosterior):
+    level: Float[Array, ""]
+
+    def sample(self, key, num_samples):
+        return Waves(jax.random.uniform(key, (num_samples, 3), maxval=6.28))
+
+    def mean(self, x):
+        return jnp.linalg.norm(x, axis=-1) - 0.6
+
+    def variance(self, x):
+        return jnp.full(x.shape[0], 1.5)
+
+
+class WavesModel(SurfaceModel):
+    def condition(self, cloud):
+        return WavesPosterior(level=jnp.asarray(0.1))
+
+
+CARVING, WAVES = Carving(), WavesModel()
+
+
+def planner_of(carving=CARVING, model=WAVES):
+    camera, search = Camera(height=40, width=40), FarthestView(12)
+    return Planner(model, camera, Coverage(), search, 3, SMALL_GRID, capacity=400, max_views=4, carving=carving)
+
+
+def after_both_sides(planner, surface, poses=POSES):
+    state = planner.init(scan(surface, planner.camera, poses[0]), poses[0])
+    return planner.observe(state, poses[1], scan(surface, planner.camera, poses[1]))
+
+
+def test_no_sample_is_inside_what_was_seen_empty_nor_outside_the_volume():
+    planner, raw = planner_of(), planner_of(carving=None)
+    state, raw_state = (after_both_sides(one, SOLIDS["ball"]) for one in (planner, raw))
+    assert raw_state.seen_empty is None
+    expected = np.zeros((30,) * 3, bool)
+    for pose in POSES:
+        seen = SEE(CARVING, SMALL_GRID, scan(SOLIDS["ball"], planner.camera, pose), planner.camera, pose)
+        assert seen.sum() > 200
+        expected |= np.asarray(seen)
+    np.testing.assert_array_equal(state.seen_empty, expected)
+
+    carved = np.asarray(planner.sample_surfaces(state, jax.random.key(1)).values)
+    values = np.asarray(raw.sample_surfaces(raw_state, jax.random.key(1)).values)
+    outside = (np.linalg.norm(np.maximum(np.abs(nodes_of(SMALL_GRID)) - 1.25, 0.0), axis=-1)) > 2 * SMALL_GRID.spacing
+    nowhere = expected | outside
+    assert (outside & ~expected).any()
+    assert (values[:, expected] < 0).any(), "there was nothing to carve"
+    assert (values[:, outside] < 0).any(), "there was nothing to carve"
+    assert (carved[:, nowhere] > 0).all()
+    np.testing.assert_allclose(carved[:, ~nowhere], values[:, ~nowhere], atol=1e-5 * np.abs(values).max())
+    # What is inside somewhere was so before.
+    assert ((carved < 0).mean(axis=0) <= (values < 0).mean(axis=0))[np.abs(values).min(axis=0) > 1e-4].all()
+
+
+class Told(WavesModel):
+    """Is told of space seen empty: its level says of how many points, and how far the farthest is out of the volume."""
+
+    def condition_on_space(self, cloud, empty):
+        outermost = jnp.max(jnp.where(empty.mask, jnp.max(jnp.abs(empty.points), axis=1), 0.0))
+        return WavesPosterior(level=1000.0 * jnp.sum(empty.mask) + outermost)
+
+
+def test_the_model_is_told_of_what_was_seen_empty_within_the_volume():
+    told, waves = planner_of(model=Told()), planner_of(carving=None)
+    state = after_both_sides(told, SOLIDS["ball"])
+    empty = CARVING.empty_points(SMALL_GRID, state.seen_empty)
+    points = np.asarray(empty.points)[np.asarray(empty.mask)]
+    assert 50 < len(points) <= 20**3
+    index = np.rint((points + SMALL_GRID.half_extent) / SMALL_GRID.spacing).astype(int)
+    assert np.asarray(state.seen_empty)[tuple(index.T)].all()
+    assert np.abs(points).max() < 1.25
+    key = jax.random.key(0)
+    raw = waves.model.condition(state.cloud).sample(key, 3).on_grid(SMALL_GRID.axis)
+    untouched = ~np.asarray(state.seen_empty | CARVING.outside(SMALL_GRID))
+    level = float((np.asarray(raw) - np.asarray(told.sample_surfaces(state, key).values))[:, untouched].mean())
+    np.testing.assert_allclose(level, 1000.0 * len(points) + np.abs(points).max(), rtol=1e-4)
+
+
+def test_without_carving_samples_are_the_models_own():
+    raw = planner_of(carving=None)
+    state = after_both_sides(raw, SOLIDS["ball"])
+    posterior = raw.model.condition(state.cloud)
+    own = posterior.sample(jax.random.key(2), 3).on_grid(SMALL_GRID.axis) - posterior.level
+    np.testing.assert_allclose(raw.sample_surfaces(state, jax.random.key(2)).values, own, atol=1e-4 * np.abs(own).max())
+
+
+def test_a_state_of_another_kind_of_planner_is_refused():
+    planner, raw = planner_of(), planner_of(carving=None)
+    finer = eqx.tree_at(lambda p: p.grid, planner, Grid(31), is_leaf=lambda x: isinstance(x, Grid))
+    scans = scan(SOLIDS["ball"], raw.camera, POSES[0])
+    for made_by, used_by in ((raw, planner), (planner, finer)):
+        state = made_by.init(scans, POSES[0])
+        for use in (
+            lambda p, s: p.observe(s, POSES[0], scans),
+            lambda p, s: p.sample_surfaces(s, jax.random.key(0)),
+            lambda p, s: p.posterior(s),
+        ):
+            with pytest.raises(ValueError, match="make the state with this planner"):
+                use(used_by, state)
+
+
+def test_what_was_seen_empty_stays_so():
+    planner = planner_of()
+    state = planner.init(scan(SOLIDS["ball"], planner.camera, POSES[0]), POSES[0])
+    blind = scan(SOLIDS["ball"], planner.camera, POSES[1])
+    blind = PointCloud(blind.points, blind.normals, blind.mask & False, blind.missed & False)
+    np.testing.assert_array_equal(planner.observe(state, POSES[1], blind).seen_empty, state.seen_empty)
+    both = np.asarray(after_both_sides(planner, SOLIDS["ball"]).seen_empty)
+    assert both[np.asarray(state.seen_empty)].all()
+    assert both.sum() > state.seen_empty.sum()
+
+
+SHEET = SDFSurface(BoxSolid([0.6, 0.6, 0.01]))
+ABOVE_AND_BELOW = [look_at((0.0, 0.0, 2.5)), look_at((0.0, 0.0, -2.5))]
+
+
+def test_the_nodes_beside_a_thin_sheet_seen_from_both_sides_are_not_carved():
+    planner = planner_of()
+    empty = np.asarray(after_both_sides(planner, SHEET, ABOVE_AND_BELOW).seen_empty)
+    x, y, z = np.abs(np.moveaxis(nodes_of(SMALL_GRID), -1, 0))
+    over = (x < 0.5) & (y < 0.5)
+    beside = over & (z < SMALL_GRID.spacing)
+    assert set(np.unique(nodes_of(SMALL_GRID)[beside][:, 2]).round(3)) == {-0.055, 0.055}
+    assert not empty[beside].any()
+    apart = (x < 0.25) & (y < 0.25) & (z > 0.01 + 1.01 * SMALL_GRID.spacing) & (z < 0.5)
+    assert apart.sum() > 50
+    assert empty[apart].all()
+
+
+def test_carved_samples_keep_a_thin_sheet_that_was_seen_from_both_sides():
+    """Rays straight at the sheet from both sides meet every sample there, as they do where nothing is carved."""
+    model = GeometricSPSR(truncation=12, lengthscale=0.1)
+    planner, raw = (planner_of(carving, model=model) for carving in (Carving(), None))
+    sheet = SDFSurface(BoxSolid([0.6, 0.6, 0.04]))
+    state = after_both_sides(planner, sheet, ABOVE_AND_BELOW)
+    values = raw.sample_surfaces(state, jax.random.key(0)).values
+    carved = carve(values, state.seen_empty | planner.carving.outside(SMALL_GRID))
+    narrow, poses = Camera(height=10, width=10, fov=0.35), look_at(jnp.asarray([[0.0, 0.0, 2.5], [0.0, 0.0, -2.5]]))
+    surfaces = GridSurface.from_values(jnp.concatenate([values, carved]), 0.0, SMALL_GRID)
+    clouds = scan_samples(surfaces, narrow, poses)
+    on_sheet = np.asarray(clouds.mask) & (np.abs(np.asarray(clouds.points)[..., 2]) < 2.0 * SMALL_GRID.spacing)
+    before, after = on_sheet.reshape(2, 3, 2, -1).mean(axis=-1)
+    assert (before > 0.5).all(), "the model does not see the sheet"
+    assert (after >= before).all(), (before, after)
+
+
+def test_a_scan_of_another_camera_needs_that_camera():
+    planner, other, pose = planner_of(), Camera(height=20, width=36, fov=0.6), POSES[1]
+    seen = scan(SOLIDS["ball"], other, pose)
+    expected = np.asarray(SEE(CARVING, SMALL_GRID, seen, other, pose))
+    column, row, _ = image(nodes_of(SMALL_GRID)[expected], other, pose)
+    # Wider than the planner's own image.
+    assert np.ptp(column) > 25
+    assert np.ptp(row) > 10
+    np.testing.assert_array_equal(planner.init(seen, pose, camera=other).seen_empty, expected)
+    state = planner.init(scan(SOLIDS["ball"], planner.camera, POSES[0]), POSES[0])
+    after = planner.observe(state, pose, seen, camera=other)
+    np.testing.assert_array_equal(after.seen_empty, expected | np.asarray(state.seen_empty))
+    for tell in (lambda: planner.init(seen, pose), lambda: planner.observe(state, pose, seen)):
+        with pytest.raises(ValueError, match=r"scan has 720 rays but the camera 40 x 40: give the camera that took it"):
+            tell()
+
+
+def test_an_image_of_another_view_is_refused():
+    """As many rays, but another field of view; or from another place; or with its rows in another order."""
+    planner = planner_of()
+    seen = scan(SOLIDS["ball"], planner.camera, POSES[0])
+    noisy = SensorNoise(0.03, 0.03)(seen, jax.random.key(0))
+    assert planner.init(noisy, POSES[0]).num_views == 1
+    wide = scan(SOLIDS["ball"], Camera(height=40, width=40, fov=1.2), POSES[0])
+    turned = jax.tree.map(lambda leaf: leaf[::-1], seen)
+    for wrong, pose in ((wide, POSES[0]), (seen, POSES[1]), (turned, POSES[0])):
+        with pytest.raises(ValueError, match=r"seen [\d.inf]+ pixels \(median\) from where its rows say"):
+            planner.init(wrong, pose)
+
+
+def test_a_cloud_that_is_no_image_carves_nothing():
+    planner = planner_of()
+    points = scan(SOLIDS["ball"], Camera(height=9, width=9), POSES[0])
+    cloud = PointCloud.from_arrays(*points.to_numpy())
+    assert cloud.missed is None
+    state = planner.init(cloud, POSES[0])
+    assert not state.seen_empty.any()
+    assert not planner.observe(state, POSES[1], cloud).seen_empty.any()
+    unknown = planner.init(scan(SOLIDS["ball"], planner.camera, POSES[0]))
+    assert not unknown.seen_empty.any(), "nothing is known of a scan from an unknown pose"
+
+
+def test_an_object_larger_than_its_volume_is_refused_and_one_that_fits_is_not():
+    """The ball's near side reaches 0.65 along z; two margins are 0.22."""
+    noisy = SensorNoise()(scan(SOLIDS["ball"], Camera(height=40, width=40), POSES[0]), jax.random.key(0))
+
+    def boxed(half):
+        return planner_of(Carving(Box((-half,) * 3, (half,) * 3)))
+
+    small, fits = boxed(0.3), boxed(0.6)
+    far = planner_of()
+    assert int(fits.observe(fits.init(noisy, POSES[0]), POSES[0], noisy).num_views) == 2
+    speck = PointCloud.from_arrays([[0.0, 0.0, 0.1]], [[0.0, 0.0, 1.0]])
+    for tell in (lambda: small.init(noisy, POSES[0]), lambda: small.observe(small.init(speck), POSES[0], noisy)):
+        with pytest.raises(
+            ValueError, match=r"\d+ of \d+ .* up to 0\.\d+ outside the volume.*declare a larger one, Carving\(Box"
+        ):
+            tell()
+    edge = PointCloud.from_arrays([[0.0, 0.0, 1.25 + 2.1 * SMALL_GRID.spacing]], [[0.0, 0.0, 1.0]])
+    with pytest.raises(ValueError, match=r"outside the volume"):
+        far.init(edge)
+    np.testing.assert_array_equal(planner_of(carving=None).init(edge).cloud.count, 1)
+    points = np.concatenate([0.1 * RNG.normal(size=(299, 3)), np.asarray(edge.points)])
+    stray = PointCloud.from_arrays(points, np.tile([0.0, 0.0, 1.0], (300, 1)))
+    np.testing.assert_array_equal(far.init(stray).cloud.count, 300)

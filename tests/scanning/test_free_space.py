@@ -1,0 +1,240 @@
+"""Free space: against exact rays in float64, true distances, thin sheets, sensor noise; and the planner's use of it."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from free_scenes import CAMERA, CENTRE, GRID, HALF, POSE, RADIUS, SEE, SOLIDS, image, in_camera, nodes_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import maximum_filter
+from scipy.spatial import cKDTree
+
+from jaxnbv.camera import Camera, fibonacci_sphere, look_at
+from jaxnbv.cloud import Frame, PointCloud
+from jaxnbv.datasets.demo import demo_object
+from jaxnbv.scanning import (
+    Carving,
+    Grid,
+    SDFSurface,
+    SensorNoise,
+    carve,
+    mesh_from_sdf,
+    scan,
+)
+from jaxnbv.scanning.sdf import Box as BoxSolid
+from jaxnbv.scanning.sdf import Capsule, Sphere
+from jaxnbv.volume import Box
+
+RNG = np.random.default_rng(0)
+
+
+def segment_meets(name, x, pose):
+    """Whether the straight way from the camera to x meets the solid, in closed form."""
+    start = np.asarray(pose.position, np.float64) - CENTRE
+    way = x - CENTRE - start
+    if name == "ball":
+        nearest = np.clip(-(way @ start) / (way**2).sum(-1), 0.0, 1.0)
+        return np.linalg.norm(start + nearest[..., None] * way, axis=-1) < RADIUS
+    enter, leave = np.sort(np.stack([(-HALF - start) / way, (HALF - start) / way]), axis=0)
+    return np.maximum(enter.max(axis=-1), 0.0) < np.minimum(leave.min(axis=-1), 1.0)
+
+
+def wholly_free(name, node, radius, camera, pose):
+    """Whether the whole ball about each node is in the image, in front of the camera and before the solid."""
+    shell = np.asarray(fibonacci_sphere(80), np.float64)
+    ball = node[:, None] + radius[:, None, None] * np.concatenate([np.zeros((1, 3)), shell])
+    column, row, ahead = image(ball, camera, pose)
+    seen = (ahead > 0) & (column > 0) & (column < camera.width) & (row > 0) & (row < camera.height)
+    return (seen & ~segment_meets(name, ball, pose)).all(axis=1)
+
+
+def pixel(node, camera, pose):
+    """What a pixel measures at the depth of a node."""
+    return np.maximum(in_camera(node, pose)[..., 2], 0.0) * 2.0 * math.tan(0.5 * camera.fov) / camera.height
+
+
+@pytest.mark.parametrize("margin", [0.5, 1.0])
+@pytest.mark.parametrize(("name", "slack"), [("ball", 0.15), ("box", 1.5)])
+def test_a_marked_node_has_a_free_ball_about_it_and_well_inside_free_space_nodes_are_marked(name, slack, margin):
+    """But for what is smaller than a pixel: the solid's outline between pixel centres, where only a box has corners."""
+    marked = np.asarray(SEE(Carving(margin=margin), GRID, scan(SOLIDS[name], CAMERA, POSE), CAMERA, POSE))
+    nodes = nodes_of(GRID)
+    some = RNG.choice(np.flatnonzero(marked), 1000)
+    node = nodes.reshape(-1, 3)[some]
+    free = wholly_free(name, node, margin * GRID.spacing - slack * pixel(node, CAMERA, POSE), CAMERA, POSE)
+    assert free.all(), f"{(~free).sum()} of 1000 marked nodes are not free"
+
+    column, row, ahead = image(nodes, CAMERA, POSE)
+    in_image = (ahead > 0) & (column > 0) & (column < CAMERA.width) & (row > 0) & (row < CAMERA.height)
+    node = nodes[in_image]
+    radius = 2.0 * GRID.spacing + margin * GRID.spacing + 3.0 * pixel(node, CAMERA, POSE)
+    well_inside = np.concatenate(
+        [wholly_free(name, node[i : i + 2000], radius[i : i + 2000], CAMERA, POSE) for i in range(0, len(node), 2000)]
+    )
+    assert well_inside.sum() > 200
+    assert marked[in_image][well_inside].mean() > 0.95
+
+
+def test_a_node_is_marked_only_if_all_rays_near_it_and_their_neighbours_went_on_beyond_it():
+    """The definition, ray by ray in float64, on an image of random depths with holes and misses."""
+    grid, camera, margin = Grid(16, 0.6), Camera(height=30, width=24, fov=0.5), 0.08
+    shape = (camera.height, camera.width)
+    depth = np.where(RNG.random(shape) < 0.03, RNG.uniform(1.8, 3.0, shape), np.inf)
+    depth[RNG.random(shape) < 0.005] = 0.0
+    depth[:, :12] = np.inf
+    rays = np.asarray(camera.pixel_directions(), np.float64)
+    pose = look_at((0.3, -0.4, 2.2))
+    hit = np.isfinite(depth.ravel()) & (depth.ravel() > 0)
+    points = np.asarray(pose.to_scene(jnp.asarray(np.where(hit, depth.ravel(), 0.0)[:, None] * rays, jnp.float32)))
+    points = jnp.where(hit[:, None], points, 0.0)
+    cloud = PointCloud(points, jnp.zeros_like(points), jnp.asarray(hit), jnp.asarray(np.isinf(depth.ravel())))
+    marked = np.asarray(Carving(margin=margin / grid.spacing).seen_empty(grid, cloud, camera, pose)).ravel()
+
+    local = in_camera(nodes_of(grid).reshape(-1, 3), pose)
+    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    near = np.linalg.norm(np.cross(local[:, None], unit), axis=-1).reshape(-1, *shape) <= margin
+    padded = np.pad(near, ((0, 0), (1, 1), (1, 1)))
+    near = np.any([padded[:, i : i + shape[0], j : j + shape[1]] for i in range(3) for j in range(3)], axis=0)
+    seen = near.any(axis=(1, 2))
+    stopped = depth < local[:, 2, None, None] + margin - 1e-5
+    allowed = seen & ~(near & stopped).any(axis=(1, 2))
+    assert marked.sum() > 50
+    assert (seen & ~allowed).sum() > 200
+    assert not (marked & ~allowed).any()
+
+
+def test_marked_nodes_are_in_view_outside_the_object_and_a_margin_from_it():
+    """The demo object: thin, hollow and full of edges. Distances are to the dense mesh that was scanned."""
+    camera, poses, nodes = Camera(height=48, width=48), look_at(fibonacci_sphere(6, 2.8)), nodes_of(GRID)
+    mesh = mesh_from_sdf(demo_object().sdf, Grid(60, 1.4))
+    empty = np.stack([SEE(Carving(), GRID, scan(mesh, camera, poses[i]), camera, poses[i]) for i in range(6)])
+    for i in range(6):
+        column, row, ahead = image(nodes[empty[i]], camera, poses[i])
+        assert (ahead > 2.0 * GRID.spacing).all()
+        assert ((column > 0) & (column < camera.width) & (row > 0) & (row < camera.height)).all()
+    marked = nodes[empty.any(axis=0)]
+    assert len(marked) > 1000
+    solid = trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    assert solid.is_watertight
+    assert not solid.contains(marked).any()
+    distance, _ = cKDTree(solid.sample(100_000, seed=0)).query(marked)
+    # A pixel and a half at the far side of the object.
+    assert distance.min() > GRID.spacing - 1.5 * camera.fov / camera.height * 4.0
+    assert distance.min() < 3.0 * GRID.spacing
+
+
+FINE, PLAIN = Grid(40, 0.7), Camera()
+FINE_NODES = jnp.asarray(nodes_of(FINE), jnp.float32)
+
+
+@jax.jit
+def marked_and_inside(centre, radius, half, axis, angle, start, end, direction, target, distance, key):
+    """How many nodes are marked, how many are inside the solid, and how many are both."""
+    solid = BoxSolid(half).rotate(axis, angle).translate(centre) | Capsule(start, end, radius)
+    pose = look_at(target + distance * direction, target)
+    seen = SensorNoise()(scan(SDFSurface(solid), PLAIN, pose), key)
+    empty, inside = Carving().seen_empty(FINE, seen, PLAIN, pose), solid(FINE_NODES) < 0
+    return jnp.sum(empty), jnp.sum(inside), jnp.sum(empty & inside)
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(st.integers(0, 2**31))
+def test_noise_on_any_solid_from_anywhere_carves_nothing_of_it(seed):
+    """Nodes 0.036 apart: the margin is 3.6 standard deviations."""
+    rng = np.random.default_rng(seed)
+    ends, target = rng.uniform(-0.5, 0.5, (2, 3)), rng.uniform(-0.2, 0.2, 3)
+    axis, direction = rng.normal(size=(2, 3))
+    direction /= np.linalg.norm(direction)
+    half, centre = rng.uniform(0.08, 0.4, 3), rng.uniform(-0.2, 0.2, 3)
+    radius, angle, distance = rng.uniform(0.08, 0.2), rng.uniform(0.0, 3.0), rng.uniform(1.3, 2.6)
+    floats = (centre, radius, half, axis, angle, *ends, direction, target, distance)
+    counts = marked_and_inside(*(jnp.asarray(x, jnp.float32) for x in floats), jax.random.key(seed % 1000))
+    marked, inside, both = map(int, counts)
+    assert inside > 200
+    assert marked > 100
+    assert both == 0
+
+
+BALL_SCAN = scan(SOLIDS["ball"], CAMERA, POSE)
+
+
+def with_invalid(cloud, invalid):
+    """The scan with some pixels invalid."""
+    keep = jnp.asarray(~invalid)
+    points, normals = (jnp.where(keep[:, None], a, 0.0) for a in (cloud.points, cloud.normals))
+    return PointCloud(points, normals, cloud.mask & keep, cloud.missed & keep)
+
+
+def test_invalid_pixels_carve_nothing():
+    whole = np.asarray(SEE(Carving(), GRID, BALL_SCAN, CAMERA, POSE))
+    none = SEE(Carving(), GRID, with_invalid(BALL_SCAN, np.ones(CAMERA.num_rays, bool)), CAMERA, POSE)
+    assert not none.any()
+    counts = [whole.sum()]
+    # A few specks, then the left half of the image.
+    left = np.tile(np.arange(CAMERA.width) < 35, CAMERA.height)
+    for invalid in (RNG.random(CAMERA.num_rays) < 0.002, left):
+        less = np.asarray(SEE(Carving(), GRID, with_invalid(BALL_SCAN, invalid), CAMERA, POSE))
+        assert not (less & ~whole).any()
+        counts.append(less.sum())
+    assert 0 < counts[1] < 0.98 * counts[0]
+    assert 0 < counts[2] < 0.6 * counts[0]
+    column, _, _ = image(nodes_of(GRID)[less], CAMERA, POSE)
+    assert column.min() > 35
+
+
+def test_a_depth_image_carves_what_the_scan_carves_and_says_which_rays_missed():
+    """Pixels of infinity met nothing; zero, negative and not a number are invalid, as is a lone pixel's depth."""
+    hit = np.asarray(BALL_SCAN.mask)
+    depth = np.where(hit, in_camera(np.asarray(BALL_SCAN.points, np.float64), POSE)[:, 2], np.inf)
+    bad = np.zeros(depth.shape, bool)
+    bad[[5, 300, 2000]] = True
+    depth[[5, 300, 2000]] = 0.0, np.nan, -1.0
+    depth[69] = 1.5
+    cloud = PointCloud.from_depth(depth.reshape(CAMERA.height, CAMERA.width), CAMERA, POSE)
+    expected = ~hit & ~bad
+    expected[69] = False
+    np.testing.assert_array_equal(cloud.missed, expected)
+    assert not (np.asarray(cloud.mask) & expected).any()
+    assert not cloud.mask[69]
+    from_depth = np.asarray(SEE(Carving(), GRID, cloud, CAMERA, POSE))
+    from_scan = SEE(Carving(), GRID, with_invalid(BALL_SCAN, ~np.asarray(cloud.mask | cloud.missed)), CAMERA, POSE)
+    assert from_depth.sum() > 1000
+    # Depths are rounded, so a node exactly a margin before a hit may fall either way.
+    assert (from_depth != np.asarray(from_scan)).sum() <= 3
+
+
+def test_noise_and_frames_keep_the_rays_that_missed():
+    frame = Frame(0.5, (1.0, 2.0, 3.0))
+    for cloud in (SensorNoise()(BALL_SCAN, jax.random.key(0)), frame.to_scene(frame.to_world(BALL_SCAN))):
+        np.testing.assert_array_equal(cloud.missed, ~np.asarray(BALL_SCAN.mask))
+
+
+def test_the_outside_is_what_lies_a_margin_beyond_the_volume():
+    grid, half = Grid(30), np.array([0.6, 0.9, 1.1])
+    carving = Carving(Box(tuple((-half).tolist()), tuple(half.tolist())), margin=0.7)
+    beyond = np.maximum(np.abs(nodes_of(grid)) - half, 0.0)
+    np.testing.assert_array_equal(carving.outside(grid), np.linalg.norm(beyond, axis=-1) > 2 * 0.7 * grid.spacing)
+    in_ball = np.linalg.norm(nodes_of(grid), axis=-1) - 1.0
+    np.testing.assert_array_equal(Carving(Sphere(1.0)).outside(grid), in_ball > 2 * grid.spacing)
+
+
+def test_carved_values_are_positive_where_empty_and_twice_the_largest_about():
+    """So, along every edge of the grid, what remains crosses it at a third, near the node that was not carved."""
+    values = jnp.asarray(RNG.normal(size=(2, 4, 4, 4)), jnp.float32).at[0, 1, 1, 1].set(0.0)
+    empty = jnp.asarray(RNG.random((4, 4, 4)) < 0.5).at[1, 1, 1].set(True)
+    carved = np.asarray(carve(values, empty))
+    assert (carved[:, empty] > 0).all()
+    np.testing.assert_array_equal(carved[:, ~empty], values[:, ~empty])
+    largest = maximum_filter(np.abs(values), size=(1, 3, 3, 3), mode="nearest")
+    np.testing.assert_array_equal(carved[:, empty], 2 * largest[:, empty])
+    assert (np.asarray(carve(jnp.zeros((4, 4, 4)), jnp.ones((4, 4, 4), bool))) > 0).all()
+
+
+@pytest.mark.parametrize("margin", [0.49, 0.0, -1.0, math.nan, math.inf])
+def test_a_margin_below_half_a_voxel_or_not_finite_is_refused(margin):
+    with pytest.raises(ValueError, match=rf"margin of the carving is {margin} voxels.*at least 0\.5"):
+        Carving(margin=margin)

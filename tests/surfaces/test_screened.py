@@ -1,0 +1,194 @@
+"""Values beside normals: against one regression of both in weight space, and what each kind of value says."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from weight_space import JointWeightSpace, WeightSpace
+
+from jaxnbv import (
+    Box,
+    GeometricSPSR,
+    InputError,
+    OnSurface,
+    OutsideBoundary,
+    PointCloud,
+    ScreenedSPSR,
+    SeenEmpty,
+    Thickness,
+)
+from jaxnbv.surfaces import EmptyPoints, ValueRows, ValueSource
+
+RNG = np.random.default_rng(0)
+POINTS, NORMALS = RNG.uniform(-1.0, 1.0, (20, 3)), RNG.standard_normal((20, 3))
+QUERIES = np.concatenate([POINTS[:3], RNG.uniform(-1.4, 1.4, (9, 3))])
+SCALES = {"lengthscale": (0.1, 0.3), "variance": (0.8, 0.6)}
+ONE = {"lengthscale": 0.1, "variance": 0.8}
+
+NOWHERE = EmptyPoints(jnp.zeros((1, 3)), jnp.zeros(1, bool))
+
+
+class Given(ValueSource):
+    """Values at points of the test's choice; the last row is not filled."""
+
+    points: jax.Array
+    values: jax.Array
+    noise: jax.Array
+
+    def rows(self, cloud, empty):
+        return ValueRows(self.points, self.values, self.noise, jnp.arange(len(self.values)) < len(self.values) - 1)
+
+
+def cloud(points, normals, capacity):
+    pad = ((0, capacity - len(points)), (0, 0))
+    arrays = (jnp.asarray(np.pad(a, pad)) for a in (points, normals))
+    return PointCloud(*arrays, jnp.arange(capacity) < len(points))
+
+
+def problem(hyperparameters, capacity=27):
+    at = RNG.uniform(-1.2, 1.2, (13, 3))
+    values, noise = RNG.standard_normal(13), RNG.uniform(0.1, 1.0, 13)
+    source = Given(*(jnp.asarray(a) for a in (at, values, noise)))
+    base = GeometricSPSR(truncation=3, noise=0.2, **hyperparameters)
+    posterior = ScreenedSPSR(base, (source,), level_deviation=0.7).condition(cloud(POINTS, NORMALS, capacity))
+    ells, variances = (np.atleast_1d(hyperparameters[name]) for name in ("lengthscale", "variance"))
+    scales = [WeightSpace(ell, variance, 0.2, 1.5, 3) for ell, variance in zip(ells, variances, strict=True)]
+    h = float(posterior.half_jump)
+    data = POINTS, NORMALS, 0.2, at[:-1], h * values[:-1], abs(h) * noise[:-1]
+    return posterior, JointWeightSpace(scales, 0.7).posterior(data, QUERIES)
+
+
+@pytest.mark.parametrize("hyperparameters", [ONE, SCALES], ids=("one scale", "two scales"))
+def test_posterior_equals_one_regression_of_normals_and_values(x64, hyperparameters):
+    posterior, (mean, covariance, likelihood) = problem(hyperparameters)
+    np.testing.assert_allclose(posterior.mean(QUERIES), mean, atol=1e-9 * np.abs(mean).max())
+    np.testing.assert_allclose(posterior.covariance(QUERIES, QUERIES), covariance, atol=1e-9 * covariance.max())
+    np.testing.assert_allclose(posterior.variance(QUERIES), np.diag(covariance), atol=1e-9 * covariance.max())
+    np.testing.assert_allclose(posterior.log_marginal_likelihood(), likelihood, rtol=1e-9)
+
+
+def test_samples_are_calibrated_jointly(x64):
+    """512 samples at twelve points: z' C^-1 z of the sample mean, and the chi-squared of every sample, within 4
+    standard errors."""
+    posterior, (mean, covariance, _) = problem(SCALES)
+    values = np.asarray(posterior.sample(jax.random.key(1), 512)(QUERIES))
+    factor = np.linalg.cholesky(covariance)
+    z = np.linalg.solve(factor, (values - mean).T)
+    of_mean = 512 * np.sum(z.mean(axis=1) ** 2)
+    assert of_mean < chi2.ppf(0.9999, 12)
+    np.testing.assert_allclose(z @ z.T / 512, np.eye(12), atol=4 * np.sqrt(2 / 512))
+    assert abs(np.sum(z**2) / 512 - 12) < 4 * np.sqrt(2 * 12 / 512)
+
+
+def sphere(count):
+    points = RNG.standard_normal((count, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return PointCloud.from_arrays(0.7 * points, points, capacity=count + 16)
+
+
+def test_the_unit_of_values_is_half_the_rise_of_the_mean_across_the_data():
+    data, base = sphere(60), GeometricSPSR(0.03, truncation=8)
+    posterior = ScreenedSPSR(base, reach=0.2).condition(data)
+    mean, (points, normals) = base.condition(data).mean, data.to_numpy()
+    rise = np.asarray(mean(points + 0.2 * normals) - mean(points - 0.2 * normals))
+    # 256 rows are taken of 60, so some four and some five times.
+    assert 0.5 * np.quantile(rise, 0.4) < float(posterior.half_jump) < 0.5 * np.quantile(rise, 0.6)
+
+
+def test_values_are_reached_where_they_are_said_to_be():
+    data = sphere(80)
+    posterior = ScreenedSPSR(
+        GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8),
+        (OutsideBoundary(count=60, noise=0.02), OnSurface(30, noise=0.02), Thickness(0.2, 30, -1.0, noise=0.02)),
+    ).condition(data)
+    h, rows = float(posterior.half_jump), posterior.rows
+    assert h > 0
+    np.testing.assert_allclose(np.asarray(posterior.mean(rows.points)), h * np.asarray(rows.values), atol=0.1 * h)
+    radius = np.linalg.norm(rows.points, axis=1)
+    np.testing.assert_allclose(radius[60:90], 0.7, rtol=1e-5)
+    np.testing.assert_allclose(radius[90:], 0.5, rtol=1e-5)
+    np.testing.assert_allclose(np.abs(rows.points[:60]).max(axis=1), 1.25, rtol=1e-5)
+
+
+def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
+    """Points half a unit to the side of a scanned ball; a tenth of a unit further than any of them, and far away."""
+    data = sphere(80)
+    beside = np.array([0.0, 1.2, 0.0]) + 0.1 * RNG.standard_normal((40, 3))
+    empty = EmptyPoints(jnp.asarray(np.concatenate([beside, np.full((5, 3), 9.0)])), jnp.arange(45) < 40)
+    model = ScreenedSPSR(
+        GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8), (OutsideBoundary(count=60), SeenEmpty(30))
+    )
+    without, knowing = model.condition(data), model.condition_on_space(data, empty)
+    near, far = beside + np.array([0.0, 0.0, 0.1]), beside * np.array([1.0, -1.0, 1.0])
+
+    def inside(posterior, x):
+        return float((posterior.sample(jax.random.key(0), 64)(x) < 0).mean())
+
+    assert inside(knowing, beside) < 0.3 * inside(without, beside)
+    assert inside(knowing, near) < 0.5 * inside(without, near)
+    assert abs(inside(knowing, far) - inside(without, far)) < 0.1
+    rows = SeenEmpty(30).rows(data, empty)
+    assert np.asarray(rows.mask).all()
+    assert {tuple(p) for p in np.asarray(rows.points)} <= {tuple(p) for p in np.asarray(empty.points)[:40]}
+    assert not np.asarray(SeenEmpty(30).rows(data, NOWHERE).mask).any()
+
+
+def test_rows_beyond_the_data_are_not_filled():
+    data = sphere(20)
+    rows = OnSurface(30).rows(data, NOWHERE)
+    assert np.asarray(rows.mask).sum() == 20
+    assert len(np.unique(np.asarray(rows.points)[:20], axis=0)) == 20
+    deep = Thickness(3.0, 10).rows(data, NOWHERE)
+    assert not np.asarray(deep.mask).any()
+
+
+def test_a_flat_patch_fills_less_of_the_volume_once_its_boundary_is_outside():
+    """From a flat patch alone the far field stands at the level, so that about half of it is inside."""
+    side = np.linspace(-0.5, 0.5, 12)
+    u, v = (a.reshape(-1) for a in np.meshgrid(side, side))
+    points = np.stack([u, v, np.zeros_like(u)], axis=1)
+    data = PointCloud.from_arrays(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)))
+    base = GeometricSPSR(0.02, truncation=16)
+    corner = Box.cube(2.0)
+    far = RNG.uniform(-1.25, 1.25, (400, 3))
+    far = far[np.abs(far).max(axis=1) > 1.0]
+
+    def inside(model):
+        posterior = model.condition(data)
+        return float((posterior.sample(jax.random.key(0), 32)(far) < posterior.level).mean())
+
+    assert inside(base) > 0.3
+    assert inside(ScreenedSPSR(base, (OutsideBoundary(corner, 100),))) < 0.15
+
+
+def test_the_posterior_is_differentiable_in_the_data(x64):
+    data, model = sphere(20), ScreenedSPSR(GeometricSPSR(0.1, truncation=3), (OutsideBoundary(count=20),))
+
+    def mean(shift):
+        moved = eqx.tree_at(lambda c: c.points, data, data.points + shift)
+        return jnp.sum(model.condition(moved).mean(QUERIES))
+
+    slope = jax.grad(mean)(0.0)
+    np.testing.assert_allclose(slope, (mean(1e-5) - mean(-1e-5)) / 2e-5, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ScreenedSPSR(values=()), "no values"),
+        (lambda: ScreenedSPSR(level_deviation=0.0), "level_deviation is 0.0"),
+        (lambda: ScreenedSPSR(reach=-1.0), "reach is -1.0"),
+        (lambda: OnSurface(0), "number of values is 0"),
+        (lambda: OnSurface(noise=0.0), "noise of the values is 0.0"),
+        (lambda: SeenEmpty(noise=-1.0), "noise of the values is -1.0"),
+        (lambda: Thickness(depth=-0.1), "depth of the thickness is -0.1"),
+        (lambda: OutsideBoundary(Box.cube(4.0)), "coordinate of 2"),
+        (lambda: OutsideBoundary(Box((1.0, 1.0, 1.0), (1.2, 1.2, 1.2))), "must enclose the origin"),
+        (lambda: GeometricSPSR((0.1, 0.2), 0.3), "as many variances as lengthscales"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(make, message):
+    with pytest.raises(InputError, match=message):
+        make()

@@ -1,0 +1,74 @@
+"""The surfaces of a name."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import pytest
+
+from jaxnbv import (
+    Box,
+    Camera,
+    Carving,
+    Coverage,
+    GeometricSPSR,
+    InputError,
+    Planner,
+    RandomView,
+    ScreenedSPSR,
+    Thickness,
+)
+from jaxnbv.presets import ModelName, imagination
+
+
+def test_the_papers_model_has_its_published_values_and_is_not_carved():
+    model, carving = imagination("paper")
+    assert isinstance(model, GeometricSPSR)
+    assert carving is None
+    published = {"lengthscale": 0.005, "variance": 0.2, "noise": 0.01, "nu": 1.5, "truncation": 50}
+    for name, value in published.items():
+        assert jnp.allclose(getattr(model, name), value), name
+
+
+@pytest.mark.parametrize("side", [2.5, 1.25])
+def test_the_default_model_knows_the_box_and_carves_by_it(side):
+    model, carving = imagination(ModelName.SCREENED, side)
+    assert isinstance(model, ScreenedSPSR)
+    assert carving == Carving(Box.cube(side))
+    (volume,) = (source.volume for source in model.values if hasattr(source, "volume"))
+    assert volume == Box.cube(side)
+
+
+def test_lengths_are_in_proportion_to_the_object():
+    large, small = (imagination("screened", side).model for side in (2.5, 1.25))
+    assert eqx.tree_equal(large, ScreenedSPSR())
+    assert jnp.allclose(small.base.lengthscale, 0.5 * large.base.lengthscale)
+    assert jnp.array_equal(small.base.variance, large.base.variance)
+    assert small.reach == 0.5 * large.reach
+    depths = [[one.depth for one in model.values if isinstance(one, Thickness)] for model in (large, small)]
+    assert depths == [[0.15], [0.075]]
+    assert small.base.truncation > large.base.truncation
+
+
+def test_a_volume_of_ones_own_is_that_of_both():
+    model, carving = imagination("screened", volume=Box.cube(1.0))
+    assert carving.volume == model.values[0].volume == Box.cube(1.0)
+    assert jnp.array_equal(model.base.lengthscale, ScreenedSPSR().base.lengthscale)
+
+
+def test_quick_surfaces_have_fewer_frequencies():
+    for name in ModelName:
+        full, quick = (imagination(name, quick=quick).model for quick in (False, True))
+        truncations = [getattr(model, "base", model).truncation for model in (full, quick)]
+        assert truncations[1] < truncations[0]
+
+
+def test_a_planner_takes_what_it_gives():
+    model, carving = imagination("paper")
+    planner = Planner(model, Camera(), Coverage(), RandomView(), carving=carving)
+    assert planner.carving is None
+
+
+def test_another_name_is_refused():
+    with pytest.raises(InputError, match=r"no model 'mine': choose from screened, paper"):
+        imagination("mine")
+    with pytest.raises(InputError, match=r"longest side is -1\.0"):
+        imagination("screened", -1.0)
