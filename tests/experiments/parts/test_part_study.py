@@ -177,7 +177,7 @@ def test_the_discrete_search_takes_the_candidate_whose_imagined_scans_find_most(
     planner = study.planner("discrete", scene.category)
     views = [pose_of(view) for view in record["methods"]["discrete"]["views"]]
     segmenter = CloudSegmenter(study.segmenter.network, scene.category, 100, scale=0.8)
-    state = planner.init(next(scans(record, "discrete")), views[0])
+    state = planner.init(next(scans(record, "discrete")), views[0], CAMERA)
     key = jax.random.fold_in(jax.random.key(6), SCENE)
     step_key, _ = jax.random.split(jax.random.fold_in(key, 1))
     surfaces = planner.sample_surfaces(state, jax.random.split(step_key)[0])
@@ -220,7 +220,7 @@ def test_a_run_stops_once_every_part_has_the_largest_target():
 
 def test_planners_of_all_categories_share_their_compilations(compilations):
     study, first = small_study(), pose_of(whole_record()["methods"]["discrete"]["views"][0])
-    state = study.planner("discrete", jnp.asarray(0)).init(next(scans(whole_record(), "discrete")), first)
+    state = study.planner("discrete", jnp.asarray(0)).init(next(scans(whole_record(), "discrete")), first, CAMERA)
     values = []
     for category in (13, 4):
         planner = study.planner("discrete", jnp.asarray(category))
