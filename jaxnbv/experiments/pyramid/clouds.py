@@ -22,12 +22,14 @@ class LabelledClouds(eqx.Module):
 
     - `clouds`: in scene units, thinned by farthest point sampling.
     - `labels`: indices of `PATTERNS`.
-    - `pattern_pixels`: how many of the rays that were truly scanned hit the pattern.
-    - `imagined`: whether the last view of the cloud is one of a posterior sample.
+    - `views`: how many true views the cloud is of.
+    - `pattern_pixels`: the most rays of one of these views that hit the pattern.
+    - `imagined`: whether a view of a posterior sample was added to them.
     """
 
     clouds: PointCloud
     labels: Int[Array, "*batch"]
+    views: Int[Array, "*batch"]
     pattern_pixels: Int[Array, "*batch"]
     imagined: Bool[Array, "*batch"]
 
@@ -40,9 +42,9 @@ def scanned_clouds(
 
     def cloud_of(index):
         pyramid, key = pyramid_scene(split, index, framing), _key(split, index)
-        views, _, pixels = _partial_views(pyramid, key, MAX_VIEWS)
+        views, _, count, pixels = _partial_views(pyramid, key, MAX_VIEWS)
         cloud = farthest_point_subsample(joined_views(views), num_points)
-        return LabelledClouds(cloud, pyramid.label, pixels, jnp.asarray(False))
+        return LabelledClouds(cloud, pyramid.label, count, pixels, jnp.asarray(False))
 
     return jax.lax.map(cloud_of, first + jnp.arange(count))
 
@@ -57,7 +59,7 @@ def imagined_clouds(
     """
     pyramid = pyramid_scene(split, index, framing)
     key, sample_key, pose_key = jax.random.split(_key(split, index), 3)
-    views, poses, pixels = _partial_views(pyramid, key, MAX_VIEWS - 1)
+    views, poses, count, pixels = _partial_views(pyramid, key, MAX_VIEWS - 1)
     surfaces = planner.sample_surfaces(state_after(planner, views, poses, Camera()), sample_key)
     seen = limit_capacity(joined_views(views), num_points)
 
@@ -70,7 +72,7 @@ def imagined_clouds(
     clouds = jax.lax.map(of_sample, (surfaces, keys))
     clouds = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), clouds)
     total = planner.num_samples * num_poses
-    return LabelledClouds(clouds, *(jnp.full(total, value) for value in (pyramid.label, pixels, True)))
+    return LabelledClouds(clouds, *(jnp.full(total, value) for value in (pyramid.label, count, pixels, True)))
 
 
 def _key(split: Split, index: Int[Array, ""]) -> PRNGKeyArray:
@@ -82,10 +84,13 @@ def _random_poses(key: PRNGKeyArray, count: int) -> Pose:
     return look_at(SENSOR_RADIUS * direction / jnp.linalg.norm(direction, axis=-1, keepdims=True))
 
 
-def _partial_views(pyramid: Pyramid, key: PRNGKeyArray, most: int) -> tuple[PointCloud, Pose, Int[Array, ""]]:
-    """What one to `most` random views show, their poses, and how many of their rays hit the pattern."""
+def _partial_views(
+    pyramid: Pyramid, key: PRNGKeyArray, most: int
+) -> tuple[PointCloud, Pose, Int[Array, ""], Int[Array, ""]]:
+    """What one to `most` random views show, their poses, how many they are, and the most pattern pixels of one."""
     pose_key, noise_key, count_key = jax.random.split(key, 3)
     poses = _random_poses(pose_key, most)
     pattern, scans = scan_pattern(pyramid, Camera(), poses)
-    used = jnp.arange(most) < jax.random.randint(count_key, (), 1, most + 1)
-    return only(SensorNoise()(scans, noise_key), used), poses, jnp.sum(jnp.where(used, pattern, 0))
+    count = jax.random.randint(count_key, (), 1, most + 1)
+    used = jnp.arange(most) < count
+    return only(SensorNoise()(scans, noise_key), used), poses, count, jnp.max(jnp.where(used, pattern, 0))
