@@ -102,12 +102,16 @@ class Planner(eqx.Module):
             return values
         return carve(values, empty | self.carving.outside(self.grid))
 
-    def sample_surfaces(self, state: State, key: PRNGKeyArray) -> GridSurface:
+    def sample_surfaces(
+        self, state: State, key: PRNGKeyArray, posterior: SurfacePosterior | None = None
+    ) -> GridSurface:
         """S samples of the surface given D, carved, on the grid, along a leading axis.
+
+        `posterior`: that of the state, where it is at hand already.
 
         **Raises:** `ValueError` as `posterior` does, and if the model gives values that are not finite.
         """
-        surfaces = _sample_surfaces(self, state, key)
+        surfaces = _sample_surfaces(self, state, key, posterior)
         if not is_traced(surfaces):
             require(
                 bool(jnp.isfinite(surfaces.values).all()),
@@ -215,8 +219,10 @@ class Planner(eqx.Module):
 
 
 @eqx.filter_jit
-def _sample_surfaces(planner: Planner, state: State, key: PRNGKeyArray) -> GridSurface:
-    posterior = planner.posterior(state)
+def _sample_surfaces(
+    planner: Planner, state: State, key: PRNGKeyArray, posterior: SurfacePosterior | None
+) -> GridSurface:
+    posterior = planner.posterior(state) if posterior is None else posterior
     values = posterior.sample(key, planner.num_samples).on_grid(planner.grid.axis) - posterior.level
     return GridSurface.from_values(planner.carve(state, values), 0.0, planner.grid)
 

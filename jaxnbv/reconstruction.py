@@ -1,16 +1,12 @@
 """From a cloud to a surface: triangles of the posterior mean, and screened Poisson surface reconstruction."""
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from skimage.measure import marching_cubes
 
 from jaxnbv.checks import InputError, require
 from jaxnbv.cloud import Frame, PointCloud
 from jaxnbv.scanning import Grid, TriangleMesh
-from jaxnbv.surfaces import SurfaceModel, SurfacePosterior
+from jaxnbv.surfaces import SurfaceModel
 
 # Fewer cannot enclose anything, and Poisson reconstruction answers them with an empty mesh.
 _FEWEST_POINTS = 4
@@ -26,7 +22,7 @@ def mean_mesh(model: SurfaceModel, cloud: PointCloud, grid: Grid = Grid()) -> Tr
     **Raises:** `ValueError` if the mean does not cross its level within the grid, and as the model's `condition` does.
     """
     posterior = model.condition(cloud)
-    values = np.array(mean_on_grid(posterior, grid))
+    values = np.array(posterior.mean_on_grid(grid.axis.astype(posterior.level.dtype)) - posterior.level)
     low, high = float(values.min()), float(values.max())
     require(
         low < 0 < high,
@@ -35,21 +31,6 @@ def mean_mesh(model: SurfaceModel, cloud: PointCloud, grid: Grid = Grid()) -> Tr
     )
     vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(grid.spacing,) * 3, gradient_direction="descent")
     return TriangleMesh(vertices - grid.half_extent, faces, Frame())
-
-
-@eqx.filter_jit
-def mean_on_grid(posterior: SurfacePosterior, grid: Grid) -> Float[Array, "g g g"]:
-    """E f minus the level at the grid's nodes, slab by slab; in one go where the mean is a field of its own."""
-    axis = jnp.asarray(grid.axis, posterior.level.dtype)
-    field = getattr(posterior, "mean_field", None)
-    if field is not None:
-        return field.on_grid(axis)[0] - posterior.level
-    y, z = jnp.meshgrid(axis, axis, indexing="ij")
-
-    def slab(x):
-        return posterior.mean(jnp.stack([jnp.full_like(y, x), y, z], axis=-1).reshape(-1, 3))
-
-    return jax.lax.map(slab, axis).reshape((grid.resolution,) * 3) - posterior.level
 
 
 def has_poisson() -> bool:

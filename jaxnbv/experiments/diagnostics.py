@@ -6,18 +6,19 @@ from scipy.stats import spearmanr
 
 from jaxnbv.checks import AnyArray
 from jaxnbv.planner import Planner, State
-from jaxnbv.reconstruction import mean_on_grid
 from jaxnbv.scanning import GridSurface
+from jaxnbv.surfaces import SurfacePosterior
 
 
-def roughness(planner: Planner, state: State, surfaces: GridSurface) -> float:
+def roughness(planner: Planner, state: State, posterior: SurfacePosterior, surfaces: GridSurface) -> float:
     """Cells of the grid that a sample's surface crosses, mean over samples, per cell that the mean's surface crosses,
     carved as the samples are.
 
     About 1 for samples as smooth as the mean. It rises when the spacing of the data exceeds the kernel's width; near 5
     an acquisition says little about what a view is worth.
     """
-    mean = crossed_cells(np.asarray(planner.carve(state, mean_on_grid(planner.posterior(state), surfaces.grid))))
+    values = posterior.mean_on_grid(surfaces.grid.axis.astype(surfaces.values.dtype)) - posterior.level
+    mean = crossed_cells(np.asarray(planner.carve(state, values)))
     samples = [crossed_cells(values) for values in np.asarray(surfaces.values)]
     return float(np.mean(samples)) / max(mean, 1)
 

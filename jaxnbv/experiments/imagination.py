@@ -20,6 +20,7 @@ from jaxnbv.cloud import PointCloud
 from jaxnbv.experiments.diagnostics import rank_correlation
 from jaxnbv.planner import Planner, State
 from jaxnbv.scanning import Grid, GridSurface, SDFSurface, Surface, TriangleMesh, scan
+from jaxnbv.tensor_grid import on_tensor_grid
 from jaxnbv.volume import Box
 
 BINS = 10
@@ -256,6 +257,4 @@ def _unseen(volume: Box, grid: Grid, seen_empty: Bool[Array, "g g g"]) -> Bool[A
 
 @eqx.filter_jit
 def _over_nodes(distance, grid: Grid) -> Float[Array, "g g g"]:
-    axis = jnp.asarray(grid.axis, jnp.result_type(float))
-    y, z = jnp.meshgrid(axis, axis, indexing="ij")
-    return jax.lax.map(lambda x: distance(jnp.stack([jnp.full_like(y, x), y, z], axis=-1)), axis)
+    return on_tensor_grid(distance, jnp.asarray(grid.axis, jnp.result_type(float)))

@@ -16,6 +16,7 @@ from jaxnbv.checks import require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.surfaces import EmptyPoints
+from jaxnbv.tensor_grid import on_tensor_grid
 from jaxnbv.volume import Box, Volume
 
 # A model takes a hundred or two of the empty points, and the time to choose them grows with how many there are.
@@ -57,12 +58,7 @@ class Carving(eqx.Module):
     def outside(self, grid: Grid) -> Bool[Array, "g g g"]:
         """The nodes outside the volume, by two margins."""
         axis = jnp.asarray(grid.axis, jnp.result_type(float))
-        y, z = jnp.meshgrid(axis, axis, indexing="ij")
-
-        def slab(x):
-            return self.volume(jnp.stack([jnp.full_like(y, x), y, z], axis=-1).reshape(-1, 3)).reshape(y.shape)
-
-        return jax.lax.map(slab, axis) > self._beyond_volume(grid)
+        return on_tensor_grid(self.volume, axis) > self._beyond_volume(grid)
 
     def _beyond_volume(self, grid: Grid) -> float:
         return 2.0 * self.margin * grid.spacing

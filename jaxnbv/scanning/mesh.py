@@ -20,6 +20,7 @@ from jaxnbv.cloud import Frame
 from jaxnbv.scanning.grid import Grid, GridSurface
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.scanning.surface import Hits, Surface
+from jaxnbv.tensor_grid import on_tensor_grid
 
 
 class _Tree:
@@ -201,13 +202,7 @@ def mesh_from_sdf(sdf: SignedDistance, grid: Grid) -> TriangleMesh:
 
     **Raises:** `ValueError` if no surface lies within the grid.
     """
-    axis = jnp.asarray(grid.axis, jnp.result_type(float))
-    y, z = jnp.meshgrid(axis, axis, indexing="ij")
-
-    def slab(x):
-        return sdf(jnp.stack([jnp.full_like(y, x), y, z], axis=-1))
-
-    values = np.array(jax.lax.map(slab, axis))
+    values = np.array(on_tensor_grid(sdf, jnp.asarray(grid.axis, jnp.result_type(float))))
     low, high = float(values.min()), float(values.max())
     require(
         low < 0 < high,

@@ -8,6 +8,7 @@ from jaxnbv.surfaces.fitting import fit_hyperparameters as fit_hyperparameters
 from jaxnbv.surfaces.screened import ScreenedSPSR as ScreenedSPSR
 from jaxnbv.surfaces.spsr import GeometricSPSR as GeometricSPSR
 from jaxnbv.surfaces.trigonometric import TrigonometricFields as TrigonometricFields
+from jaxnbv.surfaces.trigonometric import TrigonometricPosterior as TrigonometricPosterior
 from jaxnbv.surfaces.values import OnSurface as OnSurface
 from jaxnbv.surfaces.values import OutsideBoundary as OutsideBoundary
 from jaxnbv.surfaces.values import SeenEmpty as SeenEmpty

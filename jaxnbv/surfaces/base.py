@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray
 from jaxnbv.cloud import PointCloud
+from jaxnbv.tensor_grid import on_tensor_grid
 
 
 class Fields(eqx.Module):
@@ -19,15 +20,8 @@ class Fields(eqx.Module):
         """All samples at the points x (scene coordinates)."""
 
     def on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "s g g g"]:
-        """All samples on the tensor grid axis x axis x axis (scene coordinates), slab by slab."""
-        axis = jnp.asarray(axis)
-        y, z = jnp.meshgrid(axis, axis, indexing="ij")
-
-        def slab(x):
-            return self(jnp.stack([jnp.full_like(y, x), y, z], axis=-1).reshape(-1, 3))
-
-        values = jax.lax.map(slab, axis)
-        return jnp.moveaxis(values, 0, 1).reshape(-1, axis.size, axis.size, axis.size)
+        """All samples on the tensor grid axis x axis x axis (scene coordinates)."""
+        return on_tensor_grid(self, axis)
 
 
 class SurfacePosterior(eqx.Module):
@@ -46,6 +40,10 @@ class SurfacePosterior(eqx.Module):
     def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
         """E f(x), here from 64 samples under a fixed key."""
         return jnp.mean(self.sample(jax.random.key(0), 64)(x), axis=0)
+
+    def mean_on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "g g g"]:
+        """E f on the tensor grid axis x axis x axis (scene coordinates)."""
+        return on_tensor_grid(self.mean, axis)
 
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
         """Var f(x), here from 64 samples under a fixed key."""

@@ -22,11 +22,16 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, is_traced, require
 from jaxnbv.cloud import PointCloud
-from jaxnbv.surfaces.base import EmptyPoints, SurfaceModel, SurfacePosterior
+from jaxnbv.surfaces.base import EmptyPoints, SurfaceModel
 from jaxnbv.surfaces.covariance import function_covariance, function_variance
 from jaxnbv.surfaces.nonuniform import NonuniformTransform
 from jaxnbv.surfaces.spsr import GeometricSPSR, GeometricSPSRPosterior, mode_variance
-from jaxnbv.surfaces.trigonometric import TrigonometricFields, inverse_laplacian, solve_poisson
+from jaxnbv.surfaces.trigonometric import (
+    TrigonometricFields,
+    TrigonometricPosterior,
+    inverse_laplacian,
+    solve_poisson,
+)
 from jaxnbv.surfaces.values import OnSurface, OutsideBoundary, SeenEmpty, Thickness, ValueRows, ValueSource, joined
 
 _CHUNK_VALUES = 2**24
@@ -95,15 +100,17 @@ def _condition(model: ScreenedSPSR, base: GeometricSPSRPosterior, empty: EmptyPo
     # A row that is not filled is one of the identity, and its weight is zero.
     factor = jnp.linalg.cholesky(block + jnp.diag(jnp.where(rows.mask, (half_jump * rows.noise) ** 2, 1.0)))
 
+    # Given the normals alone, until the weights of the values are known.
+    level, nothing = jnp.zeros_like(base.level), jnp.zeros_like(rows.values)
     posterior = ScreenedSPSRPosterior(
-        jnp.zeros_like(base.level), model, base, rows, half_jump, whitened, factor, rows.values, base.mean_coefficients
+        level, base.mean_coefficients, model, base, rows, half_jump, whitened, factor, nothing
     )
     transform = NonuniformTransform(rows.points, model.base.truncation)
     at_rows = transform.evaluate(base.mean_coefficients[None])[:, 0]
     weights = posterior.solve(half_jump * rows.values - at_rows)
-    nothing = jnp.zeros((1, 3, *base.mean_coefficients.shape), at_rows.dtype)
+    no_draw = jnp.zeros((1, 3, *base.mean_coefficients.shape), at_rows.dtype)
     normals = solve_triangular(base.cholesky, base.cloud.normals, lower=True)
-    mean = posterior._conditioned(nothing, normals[None], jnp.zeros(1, at_rows.dtype), weights[None])[0]
+    mean = posterior._conditioned(no_draw, normals[None], jnp.zeros(1, at_rows.dtype), weights[None])[0]
     return eqx.tree_at(lambda p: (p.weights, p.mean_coefficients), posterior, (weights, mean))
 
 
@@ -118,19 +125,20 @@ def _half_jump(base: GeometricSPSRPosterior, reach: float) -> Float[Array, ""]:
     return jnp.maximum(0.5 * jnp.median(mean(points + step)[0] - mean(points - step)[0]), least)
 
 
-class ScreenedSPSRPosterior(SurfacePosterior):
+class ScreenedSPSRPosterior(TrigonometricPosterior):
     """p(g | D) under `ScreenedSPSR`, g = f - c, in closed form and as pathwise samples.
 
     - `level`: zero; g is relative to the level.
+    - `mean_coefficients`: of E g, see `surfaces/trigonometric.py`.
     - `base`: p(f | normals).
     - `rows`: the values; `half_jump`: their unit h.
     - `whitened`: C^-1 K_df with A = C C^T.
     - `factor`: lower Cholesky factor of S.
     - `weights`: w of the mean.
-    - `mean_coefficients`: of E g, see `surfaces/trigonometric.py`.
     """
 
     level: Float[Array, ""]
+    mean_coefficients: Float[Array, "a a a"]
     model: ScreenedSPSR
     base: GeometricSPSRPosterior
     rows: ValueRows
@@ -138,17 +146,6 @@ class ScreenedSPSRPosterior(SurfacePosterior):
     whitened: Float[Array, "3 n m"]
     factor: Float[Array, "m m"]
     weights: Float[Array, " m"]
-    mean_coefficients: Float[Array, "a a a"]
-
-    @property
-    def mean_field(self) -> TrigonometricFields:
-        """E g as a single field: evaluate it at points or on a grid."""
-        return TrigonometricFields(self.mean_coefficients[None])
-
-    @eqx.filter_jit
-    def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """E g(x) at points in scene coordinates."""
-        return self.mean_field(x)[0]
 
     @eqx.filter_jit
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, is_traced, require
 from jaxnbv.cloud import PointCloud
-from jaxnbv.surfaces.base import SurfaceModel, SurfacePosterior
+from jaxnbv.surfaces.base import SurfaceModel
 from jaxnbv.surfaces.covariance import (
     Spectra,
     function_covariance,
@@ -36,9 +36,10 @@ from jaxnbv.surfaces.covariance import (
 )
 from jaxnbv.surfaces.matern import Scalar, circle_spectrum
 from jaxnbv.surfaces.nonuniform import HALF_WIDTH, NonuniformTransform
-from jaxnbv.surfaces.trigonometric import TrigonometricFields, basis_variance, solve_poisson
+from jaxnbv.surfaces.trigonometric import TrigonometricFields, TrigonometricPosterior, basis_variance, solve_poisson
 
 _CHUNK_VALUES = 2**24
+_ALWAYS_WHOLE = 1024
 
 # Numbers and tuples are converted on the way in, which mypy cannot see.
 if TYPE_CHECKING:
@@ -156,7 +157,7 @@ def _condition(model: GeometricSPSR, cloud: PointCloud) -> "GeometricSPSRPosteri
     mean = reconstruct(transform, weights, spectrum)
     at_data = transform.evaluate(mean[None])[:, 0]
     level = jnp.sum(jnp.where(cloud.mask, at_data, 0.0)) / jnp.sum(cloud.mask)
-    return GeometricSPSRPosterior(level, model, cloud, cholesky, weights, mean)
+    return GeometricSPSRPosterior(level, mean, model, cloud, cholesky, weights)
 
 
 def _factorise(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Float[Array, "n n"]:
@@ -177,10 +178,12 @@ def _factorise(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Float[Arr
 
 
 def _on_filled_rows(cloud: PointCloud, leading):
-    """`leading(size)` for the leading quarter, half or whole of the rows, whichever holds all that are filled: so the
-    time follows them while the shapes stay fixed."""
+    """`leading(size)` for a share of the rows, the leading ones, that holds all that are filled: so the time follows
+    them while the shapes stay fixed. Each share is compiled, which few rows are not worth."""
     capacity = cloud.capacity
-    sizes = [-(-capacity // 4), -(-capacity // 2), capacity]
+    if capacity <= _ALWAYS_WHOLE:
+        return leading(capacity)
+    sizes = [-(-capacity * eighths // 8) for eighths in (2, 3, 4, 5, 6, 8)]
     filled = jnp.max(jnp.where(cloud.mask, jnp.arange(capacity) + 1, 0))
     return jax.lax.switch(
         jnp.searchsorted(jnp.asarray(sizes), filled), [functools.partial(leading, size) for size in sizes]
@@ -204,32 +207,22 @@ def reconstruct(
     return solve_poisson(mode_variance(spectrum) * transform.adjoint(weights))
 
 
-class GeometricSPSRPosterior(SurfacePosterior):
+class GeometricSPSRPosterior(TrigonometricPosterior):
     """p(f | D) under `GeometricSPSR`, in closed form and as pathwise samples.
 
     - `level`: mean over the data of E f(x_j); the surface is where f equals it.
+    - `mean_coefficients`: of E f, see `surfaces/trigonometric.py`.
     - `cloud`: D, with zeros in the rows that are not filled.
     - `cholesky`: lower factor of A.
     - `weights`: A^-1 n.
-    - `mean_coefficients`: of E f, see `surfaces/trigonometric.py`.
     """
 
     level: Float[Array, ""]
+    mean_coefficients: Float[Array, "a a a"]
     model: GeometricSPSR
     cloud: PointCloud
     cholesky: Float[Array, "n n"]
     weights: Float[Array, "n 3"]
-    mean_coefficients: Float[Array, "a a a"]
-
-    @property
-    def mean_field(self) -> TrigonometricFields:
-        """E f as a single field: evaluate it at points or on a grid."""
-        return TrigonometricFields(self.mean_coefficients[None])
-
-    @eqx.filter_jit
-    def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """E f(x) at points in scene coordinates."""
-        return self.mean_field(x)[0]
 
     @eqx.filter_jit
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:

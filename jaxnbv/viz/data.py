@@ -15,7 +15,7 @@ from jaxnbv.experiments.metrics import coverage, truth_points
 from jaxnbv.planner import Planner, State
 from jaxnbv.scanning import Grid
 from jaxnbv.search import Proposal
-from jaxnbv.surfaces import SurfacePosterior
+from jaxnbv.surfaces import TrigonometricPosterior
 from jaxnbv.viz.findings import Finding, finding
 from jaxnbv.viz.sphere import unit
 from jaxnbv.viz.trajectories import Ascents, SphereMap, ascents_of, open_values, wider_map
@@ -28,7 +28,6 @@ _SLOPE_ANCHORS = 1024
 _SLOPE_STEP = 0.005
 _MEAN_RESOLUTION = 100
 _SLOW_MEAN_RESOLUTION = 40
-_CHUNK = 16_000
 
 
 class MeanSurface(eqx.Module):
@@ -187,7 +186,9 @@ def choice_of(proposal: Proposal, wider: SphereMap | None = None) -> Choice:
 def mean_surface(planner: Planner, state: State) -> MeanSurface | None:
     """The surface of the posterior mean given a state, with its standard deviation; None if the grid holds none."""
     posterior = planner.posterior(state)
-    grid, values = _mean_on_grid(posterior, planner.grid)
+    limit = _MEAN_RESOLUTION if isinstance(posterior, TrigonometricPosterior) else _SLOW_MEAN_RESOLUTION
+    grid = Grid(min(planner.grid.resolution, limit), planner.grid.half_extent)
+    values = np.array(posterior.mean_on_grid(grid.axis.astype(posterior.level.dtype)) - posterior.level)
     if not values.min() < 0 < values.max():
         return None
     found = marching_cubes(values, 0.0, spacing=(grid.spacing,) * 3, gradient_direction="descent")
@@ -204,22 +205,6 @@ def mean_surface(planner: Planner, state: State) -> MeanSurface | None:
     spread = _interpolate(features, few, np.sqrt(np.maximum(variance, 1e-30)))
     deviation = spread / _interpolate(features, anchors, np.maximum(slope, 1e-6))
     return MeanSurface(vertices, faces, normals, deviation)
-
-
-def _mean_on_grid(posterior: SurfacePosterior, grid: Grid) -> tuple[Grid, np.ndarray]:
-    """E f minus the level at the nodes of a grid of the given extent: fine where a field can be evaluated on one."""
-    field = getattr(posterior, "mean_field", None)
-    limit = _MEAN_RESOLUTION if field is not None else _SLOW_MEAN_RESOLUTION
-    grid = Grid(min(grid.resolution, limit), grid.half_extent)
-    if field is not None:
-        values = np.asarray(field.on_grid(grid.axis))[0]
-    else:
-        nodes = np.stack(np.meshgrid(*[grid.axis] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-        nodes = nodes.astype(posterior.level.dtype)
-        parts = np.split(nodes, range(_CHUNK, len(nodes), _CHUNK))
-        values = np.concatenate([np.asarray(posterior.mean(part)) for part in parts])
-        values = values.reshape((grid.resolution,) * 3)
-    return grid, values - float(posterior.level)
 
 
 def _spread(features: np.ndarray, count: int) -> np.ndarray:

@@ -28,15 +28,15 @@ def test_roughness_counts_the_samples_cells_per_cell_of_the_mean():
     posterior = model.condition(cloud)
     mean = np.asarray(posterior.mean_field.on_grid(grid.axis))
     once = GridSurface.from_values(jnp.asarray(mean), posterior.level, grid)
-    assert roughness(planner, state, once) == pytest.approx(1.0)
+    assert roughness(planner, state, posterior, once) == pytest.approx(1.0)
     # A second sample, far inside, that crosses as many cells as one node has around it.
     speck = np.full_like(mean[0], 1.0)
     speck[5, 5, 5] = -1.0
     both = GridSurface.from_values(jnp.stack([mean[0] - posterior.level, jnp.asarray(speck)]), 0.0, grid)
     cells = crossed_cells(mean[0] - float(posterior.level))
-    assert roughness(planner, state, both) == pytest.approx(0.5 * (1.0 + 8.0 / cells))
+    assert roughness(planner, state, posterior, both) == pytest.approx(0.5 * (1.0 + 8.0 / cells))
     samples = posterior.sample(jax.random.key(0), 2).on_grid(grid.axis)
-    assert roughness(planner, state, GridSurface.from_values(samples, posterior.level, grid)) > 0.8
+    assert roughness(planner, state, posterior, GridSurface.from_values(samples, posterior.level, grid)) > 0.8
 
 
 def test_rank_correlation_is_of_the_candidates_compared():

@@ -255,3 +255,14 @@ def test_fewer_than_one_sample_is_refused():
     posterior = GeometricSPSR(lengthscale=0.1, truncation=3).condition(cloud(POINTS, NORMALS))
     with pytest.raises(ValueError, match="asked for 0 samples"):
         posterior.sample(jax.random.key(0), 0)
+
+
+@pytest.mark.parametrize("count", [1, 260, 261, 500, 1040])
+def test_a_large_capacity_gives_what_its_filled_rows_give(x64, count):
+    """Beyond a thousand rows the leading ones alone are worked on: a quarter of 1,040 are 260."""
+    rng = np.random.default_rng(count)
+    points, normals = rng.uniform(-1.3, 1.3, (count, 3)), rng.standard_normal((count, 3))
+    oracle, posterior = WeightSpace(**SETTINGS), GeometricSPSR(**SETTINGS).condition(cloud(points, normals, 1040))
+    mean, covariance = oracle.posterior(points, normals, QUERIES)
+    np.testing.assert_allclose(posterior.mean(QUERIES), mean, atol=1e-9 * np.abs(mean).max())
+    np.testing.assert_allclose(posterior.covariance(QUERIES, QUERIES), covariance, atol=1e-9 * covariance.max())

@@ -179,7 +179,9 @@ class _Scene:
         self._diagnose(view, visited, values, None, None)
         sampling = [method for method in methods if method in _SAMPLING]
         if sampling:
-            surfaces = self.planner.sample_surfaces(state, jax.random.fold_in(jax.random.fold_in(self.key, 2), view))
+            posterior = self.planner.posterior(state)
+            key = jax.random.fold_in(jax.random.fold_in(self.key, 2), view)
+            surfaces = self.planner.sample_surfaces(state, key, posterior)
             classifier = self.imagining if {*_CLASSIFYING} & {*sampling} else None
             log_q, covered, near = _imagine(classifier, thinned, state.cloud, surfaces, self.near, self.poses)
             found = {"coverage": np.asarray(covered)}
@@ -188,7 +190,7 @@ class _Scene:
             if "uncertainty" in methods:
                 found["uncertainty"] = np.asarray(_uncertainty(self._problem(state, surfaces), self.poses))
             found = {method: found[method] for method in sampling}
-            self._diagnose(view, visited, found, roughness(self.planner, state, surfaces), float(near))
+            self._diagnose(view, visited, found, roughness(self.planner, state, posterior, surfaces), float(near))
             values |= found
         return values
 

@@ -1,0 +1,23 @@
+"""Functions at the nodes of a tensor grid."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Shaped
+
+from jaxnbv.checks import AnyArray
+
+
+def on_tensor_grid(
+    function: Callable[[Float[Array, "n 3"]], Shaped[Array, "*s n"]], axis: Float[AnyArray, " g"]
+) -> Shaped[Array, "*s g g g"]:
+    """Values of a function of points at the nodes of axis x axis x axis, slab by slab to bound the memory."""
+    axis = jnp.asarray(axis)
+    y, z = jnp.meshgrid(axis, axis, indexing="ij")
+
+    def slab(x):
+        return function(jnp.stack([jnp.full_like(y, x), y, z], axis=-1).reshape(-1, 3))
+
+    values = jnp.moveaxis(jax.lax.map(slab, axis), 0, -2)
+    return values.reshape(*values.shape[:-1], *y.shape)
