@@ -1,7 +1,8 @@
 """How good imagined surfaces are: samples of several models against the true surface, after one view and after two.
 
     python benchmarks/imagination.py [--scenes N] [--parts NAME ...] [--mesh FILE ...] [--candidates 24] [--seeds 0 1]
-        [--models NAME ...] [--variant "NAME=EXPRESSION" ...] [--figure PATH] [--better NAME] [--out FILE]
+        [--models NAME ...] [--variant "NAME=EXPRESSION" ...] [--figure PATH] [--reliability PATH]
+        [--better NAME] [--out FILE]
 
 Objects are N validation pyramids in close-up, one validation object of each part category named, and the demo object;
 with meshes, these alone and what else is asked for. All models see the same scans of 50 x 50 rays with the default
@@ -16,7 +17,6 @@ import argparse
 import functools
 import hashlib
 import json
-import math
 import time
 import zlib
 from collections.abc import Callable
@@ -25,11 +25,8 @@ from pathlib import Path
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import matplotlib as mpl
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from PIL import Image
+from imagination_figures import draw_reliability, draw_samples
 from tqdm import tqdm
 
 import jaxnbv as nbv
@@ -37,17 +34,13 @@ from jaxnbv import surfaces as models
 from jaxnbv.datasets import PART_CATEGORIES, Split, demo_object, part_scene, pyramid_scene
 from jaxnbv.episode import observe_scene
 from jaxnbv.experiments.imagination import Truth, judge
-from jaxnbv.neighbours import nearest_squared_distance
 from jaxnbv.search.base import sphere_candidates
 from jaxnbv.storage import describe, versions, write_whole
-from jaxnbv.viz.figures import STYLE
-from jaxnbv.viz.style import INK, LINE
 
 GRID = nbv.Grid(64, 0.7 * 2.5)
 RAYS = nbv.Camera(height=32, width=32)
 VOLUME = nbv.Box()
 VIEWS, LEAST_HITS = 2, 100
-TINT = "#f0a45c"
 
 Variant = Callable[[nbv.Grid], tuple[nbv.SurfaceModel, nbv.Carving | None]]
 TWO_SCALES = nbv.ScreenedSPSR().base
@@ -170,75 +163,6 @@ def show(rows: dict[tuple[str, int, str], list[dict]], names: list[str]) -> None
                     print(f"{model:{wide}}{mean:+7.0f}   {text}")
 
 
-def picture(surface: nbv.Surface, eye: nbv.Pose, seen: nbv.PointCloud, pixels: int = 440) -> np.ndarray:
-    """The surface lit from beside the eye, tinted where it lies at scanned points; four rays a pixel, RGBA."""
-    camera = nbv.Camera(2.0 * math.atan(1.9 / 11.0), 2 * pixels, 2 * pixels)
-    view = nbv.scan(surface, camera, eye)
-    normals = np.asarray(view.normals)
-    near = np.asarray(nearest_squared_distance(view.points, seen)) < 0.05**2
-    right, down, forward = np.asarray(eye.rotation).T
-    light = -forward - 0.6 * right - 0.8 * down
-    lit = 0.62 + 0.44 * np.clip(normals @ (light / np.linalg.norm(light)), -0.5, 1.0)
-    colours = np.where(near[:, None], mpl.colors.to_rgb(TINT), mpl.colors.to_rgb(LINE)) * lit[:, None]
-    colours[~np.asarray(view.mask)] = 1.0
-    image = np.concatenate([np.clip(colours, 0.0, 1.0), np.asarray(view.mask, float)[:, None]], axis=1)
-    return image.reshape(pixels, 2, pixels, 2, 4).mean(axis=(1, 3))
-
-
-def crop(images: list[np.ndarray]) -> tuple[slice, slice]:
-    """The rows and columns that any of the pictures needs, but for stray specks."""
-    shown = np.mean([image[..., 3] for image in images], axis=0)
-    spans = []
-    for axis in (1, 0):
-        (used,) = np.nonzero(shown.sum(axis=axis) > 0.5)
-        spans.append(slice(max(used[0] - 6, 0), used[-1] + 7))
-    return spans[0], spans[1]
-
-
-def draw(path: Path, scene: nbv.Surface, view: tuple, named: dict[str, nbv.Planner], key: jax.Array) -> None:
-    """The true surface, and four surfaces that each of two models imagines after one view, seen from its side."""
-    pose, scan = view
-    away, up = np.asarray(pose.position) / 2.5, np.array([0.0, 1.0, 0.0])
-    across = np.cross(up, away) / max(float(np.linalg.norm(np.cross(up, away))), 1e-6)
-    eye = nbv.look_at(11.0 * (math.cos(1.15) * away + math.sin(1.15) * across + 0.25 * up))
-    images = [picture(scene, eye, scan)]
-    for planner in named.values():
-        surfaces = planner.sample_surfaces(planner.init(scan, pose), key)
-        images += [picture(jax.tree.map(lambda leaf, i=i: leaf[i], surfaces), eye, scan) for i in range(4)]
-    rows, columns = crop(images)
-    # Inches: a small picture, the gap below a heading, and the true surface at both rows' height.
-    tall, head = 1.75, 0.3
-    wide = tall * (columns.stop - columns.start) / (rows.stop - rows.start)
-    large = 2 * tall + head
-    width, height = large * wide / tall + 0.2 + 4 * (wide + 0.1), large + head
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(width, height))
-
-        def place(image: np.ndarray, left: float, bottom: float, scale: float) -> None:
-            axes = figure.add_axes((left / width, bottom / height, scale * wide / width, scale * tall / height))
-            axes.imshow(image[rows, columns, :3], interpolation="bilinear", aspect="auto")
-            axes.axis("off")
-
-        def write(left: float, bottom: float, text: str) -> None:
-            figure.text(left / width, bottom / height, text, va="bottom", fontsize=9, color=INK)
-
-        place(images[0], 0.0, 0.0, large / tall)
-        write(0.06, large + 0.06, "the object, and what one view saw of it")
-        for row, name in enumerate(named):
-            left, bottom = large * wide / tall + 0.2, (1 - row) * (tall + head)
-            write(left, bottom + tall + 0.06, f"imagined from this view: {name}")
-            for column in range(4):
-                place(images[1 + 4 * row + column], left + column * (wide + 0.1), bottom, 1.0)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.set_dpi(150)
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
-        # Few colours are enough for two hues, and make the file small.
-        Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB").quantize(96, dither=Image.Dither.NONE).save(
-            path, optimize=True
-        )
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--mesh", nargs="+", default=[], help="mesh files")
@@ -249,7 +173,8 @@ def main() -> None:
     parser.add_argument("--models", nargs="+", help="names of variants, all if left out; the first is compared with")
     parser.add_argument("--variant", action="append", default=[], metavar="NAME=EXPRESSION", help="a model to add")
     parser.add_argument("--figure", type=Path, help="a picture of the first object, by the first model and --better")
-    parser.add_argument("--better", help="the second model of the picture; the last if left out")
+    parser.add_argument("--reliability", type=Path, help="a picture of the first model's reliability and --better's")
+    parser.add_argument("--better", help="the second model of the pictures; the last if left out")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/imagination.json"))
     arguments = parser.parse_args()
 
@@ -260,8 +185,11 @@ def main() -> None:
         model = eval(expression, scope)
         variants[name] = lambda grid, model=model: (model, nbv.Carving())
     names = arguments.models or list(variants)
-    if unknown := {*names, arguments.better or names[0]} - set(variants):
+    if unknown := set(names) - set(variants):
         parser.error(f"there is no model {', '.join(sorted(unknown))}: choose from {', '.join(variants)}")
+    compared = names[0], arguments.better or names[-1]
+    if compared[1] not in names:
+        parser.error(f"--better {compared[1]} is none of the models that are compared: {', '.join(names)}")
     planners = {name: planner_of(variants[name]) for name in names}
     candidates = sphere_candidates(arguments.candidates, 2.5)
     held = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
@@ -288,13 +216,15 @@ def main() -> None:
                     rows[name, seed, model] = held[label]["records"]
                     bar.update()
     show(rows, names)
+    if arguments.reliability:
+        draw_reliability(arguments.reliability, rows, compared)
     if arguments.figure:
         name, make = next(iter(objects.items()))
         base = jax.random.fold_in(jax.random.key(arguments.seeds[0]), zlib.crc32(name.encode()))
-        shown = {model: planner_of(variants[model]) for model in (names[0], arguments.better or names[-1])}
+        shown = {model: planners[model] for model in compared}
         scene = make()
         first = random_views(scene, jax.random.fold_in(base, 0))[0]
-        draw(arguments.figure, scene, first, shown, jax.random.fold_in(base, 1))
+        draw_samples(arguments.figure, scene, first, shown, jax.random.fold_in(base, 1))
 
 
 if __name__ == "__main__":

@@ -52,7 +52,10 @@ def test_pattern_pixels_vary_and_are_at_most_those_of_one_view(scanned):
     pixels = np.asarray(scanned.pattern_pixels)
     assert pixels.min() >= 0
     assert pixels.max() <= 2500
-    assert set(np.asarray(scanned.views)) == set(range(1, MAX_VIEWS + 1))
+    views = np.asarray(scanned.views)
+    assert views.min() >= 1
+    assert views.max() == MAX_VIEWS
+    assert len(np.unique(views)) >= 3
     assert (pixels >= 500).sum() >= 3
     assert len(np.unique(pixels)) > COUNT // 2
 
