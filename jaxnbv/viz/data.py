@@ -26,7 +26,6 @@ COVERAGE_RADIUS = 0.05
 _DEVIATION_ANCHORS = 256
 _SLOPE_ANCHORS = 1024
 _SLOPE_STEP = 0.005
-_MEAN_RESOLUTION = 100
 _SLOW_MEAN_RESOLUTION = 40
 
 
@@ -184,11 +183,15 @@ def choice_of(proposal: Proposal, wider: SphereMap | None = None) -> Choice:
 
 
 def mean_surface(planner: Planner, state: State) -> MeanSurface | None:
-    """The surface of the posterior mean given a state, with its standard deviation; None if the grid holds none."""
+    """The surface of the posterior mean given a state, carved as the samples are where its mean is
+    quickly evaluated, with its standard deviation; None if the grid holds none."""
     posterior = planner.posterior(state)
-    limit = _MEAN_RESOLUTION if isinstance(posterior, TrigonometricPosterior) else _SLOW_MEAN_RESOLUTION
-    grid = Grid(min(planner.grid.resolution, limit), planner.grid.half_extent)
-    values = np.array(posterior.mean_on_grid(grid.axis.astype(posterior.level.dtype)) - posterior.level)
+    grid = planner.grid
+    if not isinstance(posterior, TrigonometricPosterior):
+        grid = Grid(min(grid.resolution, _SLOW_MEAN_RESOLUTION), grid.half_extent)
+    mean = posterior.mean_on_grid(grid.axis.astype(posterior.level.dtype)) - posterior.level
+    # What was seen empty is known at the nodes of the planner's own grid.
+    values = np.array(planner.carve(state, mean) if grid == planner.grid else mean)
     if not values.min() < 0 < values.max():
         return None
     found = marching_cubes(values, 0.0, spacing=(grid.spacing,) * 3, gradient_direction="descent")
