@@ -211,6 +211,17 @@ def test_any_posterior_has_a_surface_with_a_standard_deviation():
     np.testing.assert_allclose(np.sum(surface.normals * surface.vertices, axis=1) / radius, 1.0, atol=1e-2)
 
 
+def test_the_surface_of_the_mean_is_carved():
+    planner = eqx.tree_at(lambda p: p.model, small_planner(nbv.RandomView()), SphereModel())
+    state = planner.init(nbv.PointCloud.from_arrays([[0.9, 0.0, 0.0]], [[1.0, 0.0, 0.0]]))
+    empty = jnp.broadcast_to((planner.grid.axis > 0.3)[:, None, None], state.seen_empty.shape)
+    vertices = mean_surface(planner, eqx.tree_at(lambda s: s.seen_empty, state, empty)).vertices
+    assert vertices[:, 0].max() < 0.3 + planner.grid.spacing
+    # The other side is as it was.
+    left = vertices[vertices[:, 0] < 0.3 - planner.grid.spacing]
+    np.testing.assert_allclose(np.linalg.norm(left, axis=1).max(), 0.9, atol=0.02)
+
+
 def test_a_mean_without_a_surface_is_drawn_without_one(tmp_path, episode, data):
     planner = eqx.tree_at(lambda p: p.model, episode.planner, SphereModel())
     far = eqx.tree_at(lambda p: (p.grid, p.carving), planner, (nbv.Grid(40, 0.2), None))
