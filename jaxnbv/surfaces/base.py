@@ -41,6 +41,7 @@ class SurfacePosterior(eqx.Module):
         """E f(x), here from 64 samples under a fixed key."""
         return jnp.mean(self.sample(jax.random.key(0), 64)(x), axis=0)
 
+    @eqx.filter_jit
     def mean_on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "g g g"]:
         """E f on the tensor grid axis x axis x axis (scene coordinates)."""
         return on_tensor_grid(self.mean, axis)
