@@ -1,31 +1,50 @@
-"""The command line, as a user meets it: every call is a process of its own."""
+"""The command line: one call of each kind as a user makes it, in a process of its own, the others in this process."""
 
+import contextlib
+import io
 import json
 import os
 import subprocess
 import sys
+from unittest import mock
 
 import numpy as np
 import pytest
 import trimesh
 
+from jaxnbv.cli import main
 
-def run_command(*arguments: str, cwd, cache) -> subprocess.CompletedProcess:
-    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cache), "COLUMNS": "200", "NO_COLOR": "1"}
+TERMINAL = {"COLUMNS": "200", "NO_COLOR": "1"}
+
+
+def run_process(*arguments: str, cwd) -> subprocess.CompletedProcess:
     command = [sys.executable, "-m", "jaxnbv.cli", *arguments]
+    environment = {**os.environ, **TERMINAL}
     return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=600)
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    return tmp_path_factory.mktemp("xla")
+def run_command(*arguments: str, cwd) -> subprocess.CompletedProcess:
+    """As `run_process`, without the seconds that a process takes to start; what is not caught there raises here."""
+    stdout, stderr, code = io.StringIO(), io.StringIO(), 0
+    with (
+        contextlib.chdir(cwd),
+        contextlib.redirect_stdout(stdout),
+        contextlib.redirect_stderr(stderr),
+        mock.patch.dict(os.environ, TERMINAL),
+        mock.patch.object(sys, "argv", ["jaxnbv", *arguments]),
+    ):
+        try:
+            main()
+        except SystemExit as leaving:
+            code = leaving.code or 0
+    return subprocess.CompletedProcess(arguments, code, stdout.getvalue(), stderr.getvalue())
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory, cache):
+def finished(tmp_path_factory):
     """A folder in which `jaxnbv demo --quick` has run, and what it printed."""
     folder = tmp_path_factory.mktemp("demo")
-    result = run_command("demo", "--quick", "--views", "2", cwd=folder, cache=cache)
+    result = run_process("demo", "--quick", "--views", "2", cwd=folder)
     assert result.returncode == 0, result.stderr
     return folder, result
 
@@ -46,11 +65,11 @@ def test_demo_leaves_an_episode_a_report_and_figures(finished):
     assert config["planner"]["search"]["type"] == "DiscreteSearch"
 
 
-def test_the_same_command_continues_with_more_views(finished, cache):
+def test_the_same_command_continues_with_more_views(finished):
     folder, _ = finished
     out = folder / "runs" / "pyramid-discrete"
     before = {path.name: path.read_bytes() for path in out.glob("view_*.npz")}
-    result = run_command("demo", "--quick", "--views", "3", "--no-report", cwd=folder, cache=cache)
+    result = run_command("demo", "--quick", "--views", "3", "--no-report", cwd=folder)
     assert result.returncode == 0, result.stderr
     assert (out / "view_02.npz").exists()
     assert all((out / name).read_bytes() == content for name, content in before.items())
@@ -60,11 +79,11 @@ def test_the_same_command_continues_with_more_views(finished, cache):
     ("search", "model"),
     [("farthest", "screened"), ("random", "paper"), ("uncertainty", "paper"), ("gradient-6dof", "screened")],
 )
-def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path, cache):
+def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
     trimesh.creation.torus(1.0, 0.4).export(tmp_path / "ring.ply")
     named = () if model == "screened" else ("--model", model)
     arguments = ("run", "ring.ply", "--quick", "--views", "2", "--search", search, "--out", "mine", "--no-report")
-    result = run_command(*arguments, *named, cwd=tmp_path, cache=cache)
+    result = run_command(*arguments, *named, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     planner = json.loads((tmp_path / "mine" / "episode.json").read_text())["config"]["planner"]
     assert planner["model"]["type"] == {"screened": "ScreenedSPSR", "paper": "GeometricSPSR"}[model]
@@ -104,13 +123,13 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path, ca
         (("study", "reconstruction", "--meshes", "occupied"), ("occupied", "no mesh")),
     ],
 )
-def test_bad_input_is_one_line_that_names_the_value_and_the_remedy(arguments, words, tmp_path, cache):
+def test_bad_input_is_one_line_that_names_the_value_and_the_remedy(arguments, words, tmp_path):
     (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
     (tmp_path / "broken.glb").write_bytes(b"glTF and no more")
     trimesh.creation.icosphere(2).export(tmp_path / "ball.obj")
     (tmp_path / "occupied").mkdir()
     (tmp_path / "occupied" / "thesis.tex").write_text("mine")
-    result = run_command(*arguments, cwd=tmp_path, cache=cache)
+    result = run_command(*arguments, cwd=tmp_path)
     if "gpu" in arguments and result.returncode == 0:
         pytest.skip("this machine has a GPU")
     assert result.returncode == 2
@@ -118,46 +137,46 @@ def test_bad_input_is_one_line_that_names_the_value_and_the_remedy(arguments, wo
     assert all(word in result.stderr for word in words), result.stderr
 
 
-def test_a_folder_of_another_configuration_is_refused(finished, cache):
+def test_a_folder_of_another_configuration_is_refused(finished):
     folder, _ = finished
-    result = run_command("demo", "--quick", "--views", "2", "--seed", "1", cwd=folder, cache=cache)
+    result = run_command("demo", "--quick", "--views", "2", "--seed", "1", cwd=folder)
     assert result.returncode == 2
     assert "another configuration" in result.stderr
     assert "key" in result.stderr
 
 
-def test_a_published_checkpoint_converts_and_classifies_a_mesh(tmp_path, cache, shared):
+def test_a_published_checkpoint_converts_and_classifies_a_mesh(tmp_path, shared):
     source = shared / "reference" / "pointnet2_cls_ssg.pth"
-    result = run_command("convert", str(source), "net.safetensors", cwd=tmp_path, cache=cache)
+    result = run_command("convert", str(source), "net.safetensors", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "classes" in result.stdout
     trimesh.creation.torus(1.0, 0.4).export(tmp_path / "ring.ply")
     arguments = ("--task", "mixed", "--network", "net.safetensors", "--quick", "--views", "2", "--no-report")
-    result = run_command("run", "ring.ply", *arguments, cwd=tmp_path, cache=cache)
+    result = run_command("run", "ring.ply", *arguments, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "->" in result.stdout
 
 
-def test_the_study_writes_tables_and_figures_and_continues(tmp_path, cache):
+def test_the_study_writes_tables_and_figures_and_continues(tmp_path):
     arguments = ("study", "pyramid", "--quick", "--views", "2", "--framing", "whole", "--out", "mine")
-    result = run_command(*arguments, "--scenes", "1", cwd=tmp_path, cache=cache)
+    result = run_command(*arguments, "--scenes", "1", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "not the full study" in result.stdout
     folder = tmp_path / "mine" / "whole"
     first = (folder / "scene_0000.json").read_bytes()
     assert {"results.txt", "results.csv"} <= {path.name for path in folder.iterdir()}
     assert list(folder.rglob("*.png"))
-    result = run_command(*arguments, "--scenes", "2", cwd=tmp_path, cache=cache)
+    result = run_command(*arguments, "--scenes", "2", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert (folder / "scene_0000.json").read_bytes() == first
     assert (folder / "scene_0001.json").exists()
-    result = run_command(*arguments, "--methods", "farthest,best", cwd=tmp_path, cache=cache)
+    result = run_command(*arguments, "--methods", "farthest,best", cwd=tmp_path)
     assert result.returncode == 2
     assert "best" in result.stderr
 
 
 @pytest.mark.parametrize("name", ["heat", "reconstruction"])
-def test_each_study_writes_tables_figures_and_pictures(name, tmp_path, cache):
+def test_each_study_writes_tables_figures_and_pictures(name, tmp_path):
     arguments = (
         "study",
         name,
@@ -171,7 +190,7 @@ def test_each_study_writes_tables_figures_and_pictures(name, tmp_path, cache):
         "--out",
         "it",
     )
-    result = run_command(*arguments, cwd=tmp_path, cache=cache)
+    result = run_command(*arguments, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "not the full study" in result.stdout
     written = {path.name for path in (tmp_path / "it").iterdir()}
@@ -180,25 +199,25 @@ def test_each_study_writes_tables_figures_and_pictures(name, tmp_path, cache):
     assert sum(name.endswith(".png") for name in written) >= 2
 
 
-def test_the_demo_of_a_task_tells_what_was_found(tmp_path, cache):
+def test_the_demo_of_a_task_tells_what_was_found(tmp_path):
     arguments = ("demo", "--task", "parts", "--scene", "7", "--quick", "--views", "2", "--search", "farthest")
-    result = run_command(*arguments, cwd=tmp_path, cache=cache)
+    result = run_command(*arguments, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert result.stdout.count("wheel") == 2
     (report,) = tmp_path.rglob("report.html")
     assert "Points predicted of each part" in report.read_text()
 
 
-def test_a_published_part_segmenter_converts(tmp_path, cache, shared):
+def test_a_published_part_segmenter_converts(tmp_path, shared):
     source = shared / "reference" / "pointnet2_partseg_msg.pth"
-    result = run_command("convert", str(source), "net.safetensors", cwd=tmp_path, cache=cache)
+    result = run_command("convert", str(source), "net.safetensors", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "50 parts of 16 categories" in result.stdout
 
 
 @pytest.mark.parametrize("command", [(), ("demo",), ("run",)])
-def test_help_names_every_option(command, tmp_path, cache):
-    result = run_command(*command, "--help", cwd=tmp_path, cache=cache)
+def test_help_names_every_option(command, tmp_path):
+    result = run_command(*command, "--help", cwd=tmp_path)
     assert result.returncode == 0
     expected = (
         ["demo", "run", "study", "convert"]

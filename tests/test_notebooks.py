@@ -8,23 +8,23 @@ from nbclient import NotebookClient
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
 
+MODEL = "model = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=16))"
 SMALL = {
-    "01_quickstart.ipynb": """
-num_samples, truncation, lengthscale = 4, 20, 0.015
-resolution, pixels, num_candidates, views = 40, 20, 24, 2
+    "01_quickstart.ipynb": f"""
+{MODEL}
+num_samples, resolution, pixels, num_candidates, capacity, views = 4, 40, 20, 24, 1024, 2
 """,
     "02_your_own_utility.ipynb": """
-num_samples, truncation, lengthscale = 2, 16, 0.02
-resolution, pixels, num_candidates, views = 40, 24, 12, 2
+num_samples, resolution, pixels, num_candidates, quick, capacity, views = 2, 40, 24, 12, True, 1024, 2
 """,
-    "03_gradient_search.ipynb": """
-num_samples, truncation, lengthscale = 2, 16, 0.02
-resolution, pixels, num_candidates, iterations = 40, 16, 12, 3
+    "03_gradient_search.ipynb": f"""
+{MODEL}
+num_samples, resolution, pixels, num_candidates, capacity, iterations = 2, 40, 16, 12, 1024, 3
 """,
-    "04_heat_on_your_mesh.ipynb": """
+    "04_heat_on_your_mesh.ipynb": f"""
+{MODEL}
 mesh_file = None
-num_samples, truncation, lengthscale = 2, 16, 0.02
-resolution, pixels, num_candidates, num_points, views = 40, 20, 6, 300, 2
+num_samples, resolution, pixels, num_candidates, num_points, capacity, views = 2, 40, 20, 6, 300, 1024, 2
 """,
 }
 

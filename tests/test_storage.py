@@ -268,7 +268,7 @@ def start(folder, stage="none", view=0):
         "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")]),
         "JAX_COMPILATION_CACHE_DIR": str(folder.with_suffix(".cache")),
         # The promise is about programs as users run them.
-        "JAX_DISABLE_MOST_OPTIMIZATIONS": "0",
+        "XLA_FLAGS": "",
     }
     return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE)
 

@@ -122,7 +122,7 @@ def task_planner(
         count = None if search in (SearchName.GRADIENT_2DOF, SearchName.GRADIENT_6DOF) else candidates
         return Planner(surfaces, camera, score, search_of(search, radius, count), carving=carving)
     small = Camera(height=24, width=24)
-    return Planner(surfaces, small, score, search_of(search, radius, 40), 4, Grid(56), capacity=2048, carving=carving)
+    return Planner(surfaces, small, score, search_of(search, radius, 40), 4, Grid(56), capacity=1024, carving=carving)
 
 
 def pyramid_planner(score: Score, search: SearchName, model: ModelName, framing: Framing) -> Planner:

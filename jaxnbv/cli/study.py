@@ -60,6 +60,7 @@ MeshesOption = Annotated[
 _QUICK: dict[str, Any] = {
     "num_samples": 4,
     "grid_resolution": 48,
+    "capacity": 1024,
 }
 
 
