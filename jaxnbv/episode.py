@@ -1,8 +1,10 @@
 """The simulated episode: scan, ask for the next view, scan again."""
 
 import itertools
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -14,7 +16,7 @@ from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.planner import Planner, State
-from jaxnbv.scanning import SensorNoise, Surface, scan
+from jaxnbv.scanning import GridSurface, SensorNoise, Surface, scan
 from jaxnbv.search import Proposal
 from jaxnbv.storage import EpisodeFolder, describe
 
@@ -111,51 +113,94 @@ def simulate(
         f"the key is a raw array of {key.dtype}: make it with jax.random.key(seed)",
     )
     store = None if folder is None else EpisodeFolder(folder, _config(planner, scene, noise, first, key))
-    finished: list[View] = []
-    state = None
-
-    def finish(pose: Pose, seen: PointCloud, proposal: Proposal | None) -> None:
-        nonlocal state
-        state = planner.init(seen, pose) if state is None else planner.observe(state, pose, seen)
-        finished.append(View(pose, seen, state.cloud, proposal))
-
     done = store.read_views() if store else []
     require(
         len(done) <= views,
         f"asked for {views} views but {folder} already holds {len(done)}: ask for more, or choose another folder",
     )
-    for pose, seen, proposal in done:
-        finish(pose, seen, proposal)
-
-    stages = ("sampling surfaces", "searching", "scanning")
-    with tqdm(total=views * len(stages), initial=len(finished) * len(stages), disable=not progress) as bar:
+    finished: list[View] = []
+    with tqdm(total=views * len(STAGES), disable=not progress) as bar:
 
         def begin(index: int, stage: str) -> None:
             bar.set_description(f"view {index + 1}/{views}, {stage}")
+            bar.update(index * len(STAGES) + STAGES.index(stage) - bar.n)
 
-        for index in range(len(finished), views):
-            sample_key, search_key, noise_key = view_keys(key, index)
+        sensor = scene_sensor(scene, planner.camera, noise)
+        episode = steps(planner, sensor, first, key, done=done, begin=begin)
+        for index, (view, *_) in enumerate(itertools.islice(episode, views)):
+            finished.append(view)
+            if store and index >= len(done):
+                store.write_view(index, view.pose, view.scan, view.proposal)
+        bar.update(bar.total - bar.n)
+    if store:
+        store.write_cloud(finished[-1].cloud)
+    return Episode(planner, scene, noise, first, key, tuple(finished))
+
+
+# What a sensor sees from a pose; the key is of its noise, for which a real sensor has no use.
+Sensor: TypeAlias = Callable[[Pose, PRNGKeyArray], PointCloud]
+STAGES = ("sampling surfaces", "searching", "scanning")
+
+
+class Step(NamedTuple):
+    """How an episode came to a view, and what the planner knows after it.
+
+    - `surfaces`: the samples that the view was chosen by; None where there were none.
+    - `seconds`: of the search; zero for a view that was given.
+    """
+
+    view: View
+    state: State
+    surfaces: GridSurface | None
+    seconds: float
+
+
+def steps(
+    planner: Planner,
+    sensor: Sensor,
+    first: Pose,
+    key: PRNGKeyArray,
+    camera: Camera | None = None,
+    done: Iterable[tuple[Pose, PointCloud, Proposal | None]] = (),
+    begin: Callable[[int, str], None] = lambda index, stage: None,
+) -> Iterator[Step]:
+    """Views from `first` on, each where the planner asks for it, for as long as more are wanted and it has room.
+
+    View i depends on the key and i alone: planners that differ in their search or their acquisition are compared under
+    the same sensor noise, and under the same prior samples at the same view.
+
+    - `camera`: of the sensor, by default the planner's; one of more rays than are imagined saves time.
+    - `done`: views that are known already, in their order; they are told, not asked for.
+    - `begin`: is told the index of a view and which of `STAGES` of it begins.
+
+    **Raises:** `ValueError` as `Planner.init`, `propose` and `observe` do; among others when every candidate has been
+    visited.
+    """
+    known, state = iter(done), None
+    for index in range(planner.max_views):
+        sample_key, search_key, noise_key = view_keys(key, index)
+        surfaces, seconds = None, 0.0
+        if (told := next(known, None)) is not None:
+            pose, seen, proposal = told
+        else:
             pose, proposal = first, None
             if state is not None:
-                begin(index, stages[0])
-                surfaces = None
                 if planner.search.uses_samples:
+                    begin(index, STAGES[0])
                     surfaces = jax.block_until_ready(planner.sample_surfaces(state, sample_key))
-                bar.update()
-                begin(index, stages[1])
+                begin(index, STAGES[1])
+                start = time.perf_counter()
                 proposal = jax.block_until_ready(planner.choose(state, surfaces, search_key))
-                pose = proposal.pose
-                bar.update()
-            begin(index, stages[2])
-            seen = observe_scene(scene, planner.camera, pose, noise, noise_key)
-            finish(pose, seen, proposal)
-            if store:
-                store.write_view(index, pose, seen, proposal)
-            bar.update(1 if proposal is not None else len(stages))
-    episode = Episode(planner, scene, noise, first, key, tuple(finished))
-    if store:
-        store.write_cloud(episode.cloud)
-    return episode
+                pose, seconds = proposal.pose, time.perf_counter() - start
+            begin(index, STAGES[2])
+            seen = sensor(pose, noise_key)
+        state = planner.init(seen, pose, camera) if state is None else planner.observe(state, pose, seen, camera)
+        yield Step(View(pose, seen, state.cloud, proposal), state, surfaces, seconds)
+
+
+def scene_sensor(scene: Surface, camera: Camera, noise: SensorNoise = SensorNoise()) -> Sensor:
+    """A camera that scans a known surface, with noise."""
+    return lambda pose, key: observe_scene(scene, camera, pose, noise, key)
 
 
 def view_keys(key: PRNGKeyArray, index: int) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:

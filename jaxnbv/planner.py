@@ -90,17 +90,11 @@ class Planner(eqx.Module):
         **Raises:** `ValueError` as the model's `condition` does, and if the state was made by a planner of another grid
         or without carving.
         """
-        empty = self._seen_empty(state)
-        if self.carving is None or empty is None:
-            return self.model.condition(state.cloud)
-        return self.model.condition_on_space(state.cloud, self.carving.empty_points(self.grid, empty))
+        return _posterior(self.model, self.carving, self.grid, state.cloud, self._seen_empty(state))
 
     def carve(self, state: State, values: Float[Array, "*s g g g"]) -> Float[Array, "*s g g g"]:
         """Values of f minus its level at the grid's nodes, carved by what the state knows to be empty."""
-        empty = self._seen_empty(state)
-        if self.carving is None or empty is None:
-            return values
-        return carve(values, empty | self.carving.outside(self.grid))
+        return _carve(self.carving, self.grid, self._seen_empty(state), values)
 
     def sample_surfaces(
         self, state: State, key: PRNGKeyArray, posterior: SurfacePosterior | None = None
@@ -111,7 +105,10 @@ class Planner(eqx.Module):
 
         **Raises:** `ValueError` as `posterior` does, and if the model gives values that are not finite.
         """
-        surfaces = _sample_surfaces(self, state, key, posterior)
+        empty = self._seen_empty(state)
+        surfaces = _sample_surfaces(
+            self.model, self.carving, self.grid, self.num_samples, state.cloud, empty, key, posterior
+        )
         if not is_traced(surfaces):
             require(
                 bool(jnp.isfinite(surfaces.values).all()),
@@ -134,7 +131,9 @@ class Planner(eqx.Module):
 
         **Raises:** `ValueError` if every candidate has been visited, or a score is NaN.
         """
-        proposal = _choose(self, state, surfaces, key)
+        proposal = _choose(
+            self.search, self.acquisition, self.camera, state.cloud, state.poses, state.num_views, surfaces, key
+        )
         if not is_traced(proposal):
             require(
                 not bool(jnp.isnan(proposal.value)),
@@ -218,19 +217,51 @@ class Planner(eqx.Module):
             self.carving.check_inside(scan, self.grid)
 
 
+# What is compiled takes what it uses, not the planner: another score or search does not compile the sampler again.
+
+
+def _posterior(
+    model: SurfaceModel, carving: Carving | None, grid: Grid, cloud: PointCloud, empty: Bool[Array, "g g g"] | None
+) -> SurfacePosterior:
+    if carving is None or empty is None:
+        return model.condition(cloud)
+    return model.condition_on_space(cloud, carving.empty_points(grid, empty))
+
+
+def _carve(
+    carving: Carving | None, grid: Grid, empty: Bool[Array, "g g g"] | None, values: Float[Array, "*s g g g"]
+) -> Float[Array, "*s g g g"]:
+    return values if carving is None or empty is None else carve(values, empty | carving.outside(grid))
+
+
 @eqx.filter_jit
 def _sample_surfaces(
-    planner: Planner, state: State, key: PRNGKeyArray, posterior: SurfacePosterior | None
+    model: SurfaceModel,
+    carving: Carving | None,
+    grid: Grid,
+    num_samples: int,
+    cloud: PointCloud,
+    empty: Bool[Array, "g g g"] | None,
+    key: PRNGKeyArray,
+    posterior: SurfacePosterior | None,
 ) -> GridSurface:
-    posterior = planner.posterior(state) if posterior is None else posterior
-    values = posterior.sample(key, planner.num_samples).on_grid(planner.grid.axis) - posterior.level
-    return GridSurface.from_values(planner.carve(state, values), 0.0, planner.grid)
+    posterior = _posterior(model, carving, grid, cloud, empty) if posterior is None else posterior
+    values = posterior.sample(key, num_samples).on_grid(grid.axis) - posterior.level
+    return GridSurface.from_values(_carve(carving, grid, empty, values), 0.0, grid)
 
 
 @eqx.filter_jit
-def _choose(planner: Planner, state: State, surfaces: GridSurface | None, key: PRNGKeyArray) -> Proposal:
-    problem = Problem(state.cloud, state.poses, state.num_views, planner.camera, planner.acquisition, surfaces)
-    return planner.search.propose(problem, key)
+def _choose(
+    search: Search,
+    acquisition: Score,
+    camera: Camera,
+    cloud: PointCloud,
+    visited: Pose,
+    num_visited: Int[Array, ""],
+    surfaces: GridSurface | None,
+    key: PRNGKeyArray,
+) -> Proposal:
+    return search.propose(Problem(cloud, visited, num_visited, camera, acquisition, surfaces), key)
 
 
 @eqx.filter_jit

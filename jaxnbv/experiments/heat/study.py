@@ -18,10 +18,10 @@ from jaxnbv.checks import AnyArray, InputError, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets import HeatScene, heat_scene
 from jaxnbv.diffusion import HeatProblem
-from jaxnbv.episode import observe_scene, view_keys
+from jaxnbv.episode import observe_scene, scene_sensor, steps, view_keys
 from jaxnbv.experiments.meshes import numbered_mesh
-from jaxnbv.planner import Planner, State
-from jaxnbv.scanning import Carving, Grid, GridSurface, SDFSurface, SensorNoise, TriangleMesh, mesh_from_sdf
+from jaxnbv.planner import Planner
+from jaxnbv.scanning import Carving, Grid, SDFSurface, SensorNoise, TriangleMesh, mesh_from_sdf
 from jaxnbv.search import DiscreteSearch, FarthestView, HalvingSearch, Proposal, RandomView, UncertaintyView
 from jaxnbv.search.base import sphere_candidates
 from jaxnbv.surfaces import ScreenedSPSR, SurfaceModel
@@ -194,30 +194,23 @@ def run_scene(study: HeatStudy, index: int, methods: Sequence[str] = METHODS) ->
 
 
 def _run(study: HeatStudy, scene: HeatScene, index: int, method: str, first: int, compare: bool) -> dict:
-    """The episode, as `planned_views` has it; but here the other search is asked with the same state and samples."""
-    planner, key = study.planner(method, scene.source), _key(index, "episode")
+    """The episode; the other search is asked at each step with the same state and samples."""
+    planner, key, poses = study.planner(method, scene.source), _key(index, "episode"), study.poses()
     halving = study.planner("heat-halving", scene.source) if compare else None
-    state = planner.init(_scan(study, scene, index, first, 0), study.poses()[first], Camera())
-    candidates, clouds, steps, compared = [first], [state.cloud], [], []
-    for view in range(1, study.views):
-        sample_key, search_key, _ = view_keys(key, view)
-        surfaces = planner.sample_surfaces(state, sample_key) if planner.search.uses_samples else None
-        proposal, seconds = _choose(planner, state, surfaces, search_key)
-        steps.append({"value": float(proposal.value), "seconds": seconds})
-        if halving is not None:
-            compared.append(_compare(study, proposal, *_choose(halving, state, surfaces, search_key)))
-        candidates.append(_candidate(study, proposal.pose))
-        scan = _scan(study, scene, index, candidates[-1], view)
-        state = planner.observe(state, proposal.pose, scan, Camera())
-        clouds.append(state.cloud)
-    run = {"candidates": candidates, "steps": steps, "clouds": clouds}
+    candidates, clouds, taken, compared = [first], [], [], []
+    before = None
+    for view, step in enumerate(steps(planner, scene_sensor(scene.surface, Camera()), poses[first], key, Camera())):
+        clouds.append(step.state.cloud)
+        if before is not None and (proposal := step.view.proposal) is not None:
+            candidates.append(_candidate(study, proposal.pose))
+            taken.append({"value": float(proposal.value), "seconds": step.seconds})
+            if halving is not None:
+                start = time.perf_counter()
+                halved = jax.block_until_ready(halving.choose(before, step.surfaces, view_keys(key, view)[1]))
+                compared.append(_compare(study, proposal, halved, time.perf_counter() - start))
+        before = step.state
+    run = {"candidates": candidates, "steps": taken, "clouds": clouds}
     return run | {"halving": compared} if compare else run
-
-
-def _choose(planner: Planner, state: State, surfaces: GridSurface | None, key: PRNGKeyArray) -> tuple[Proposal, float]:
-    start = time.perf_counter()
-    proposal = jax.block_until_ready(planner.choose(state, surfaces, key))
-    return proposal, time.perf_counter() - start
 
 
 def _compare(study: HeatStudy, full: Proposal, halved: Proposal, seconds: float) -> dict:

@@ -14,8 +14,7 @@ from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import InputError, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets import PartScene, Split, part_scene
-from jaxnbv.episode import observe_scene, view_keys
-from jaxnbv.experiments.episodes import planned_views
+from jaxnbv.episode import observe_scene, scene_sensor, steps, view_keys
 from jaxnbv.experiments.parts.clouds import MAX_VIEWS, PART_CAMERA, PART_RADIUS
 from jaxnbv.networks import CATEGORIES, CloudSegmenter
 from jaxnbv.planner import Planner
@@ -155,7 +154,8 @@ def _run(study: PartStudy, scene: PartScene, first: Pose, index: int, method: st
     planner = study.planner(method, scene.category)
     segmenter = eqx.tree_at(lambda s: s.category, study.segmenter, scene.category)
     views, counts = [], []
-    for view in planned_views(planner, SDFSurface(scene.solid), first, _key(index), sensor=PART_CAMERA):
+    sensor = scene_sensor(SDFSurface(scene.solid), PART_CAMERA)
+    for view, *_ in steps(planner, sensor, first, _key(index), PART_CAMERA):
         views.append({"position": view.pose.position.tolist(), "rotation": view.pose.rotation.tolist()})
         counts.append(np.asarray(_count(segmenter, view.cloud))[list(parts)].tolist())
         if min(counts[-1]) >= max(TARGETS):

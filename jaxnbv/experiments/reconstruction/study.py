@@ -15,8 +15,7 @@ from jaxnbv.checks import InputError, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets import Split
 from jaxnbv.datasets.parts import part_scene
-from jaxnbv.episode import observe_scene, view_keys
-from jaxnbv.experiments.episodes import planned_views
+from jaxnbv.episode import observe_scene, scene_sensor, steps, view_keys
 from jaxnbv.experiments.meshes import numbered_mesh
 from jaxnbv.experiments.metrics import coverage, truth_points
 from jaxnbv.experiments.reconstruction.distances import SURFACE_POINTS, surface_distance
@@ -123,9 +122,9 @@ def _run(
     study: ReconstructionStudy, scene: Surface, index: int, method: str, first: int, truth: Float[np.ndarray, "n 3"]
 ) -> dict:
     poses = sphere_candidates(study.num_candidates)
-    episode = planned_views(study.planner(method), scene, poses[first], _key(index, "episode"))
+    episode = steps(study.planner(method), scene_sensor(scene, Camera()), poses[first], _key(index, "episode"))
     candidates, covered = [], []
-    for view in itertools.islice(episode, study.views):
+    for view, *_ in itertools.islice(episode, study.views):
         candidates.append(first if view.proposal is None else int(np.argmax(view.proposal.values)))
         covered.append(coverage(view.cloud, truth))
         cloud = view.cloud
@@ -148,14 +147,11 @@ def reconstruct(study: ReconstructionStudy, cloud: PointCloud, name: str) -> Tri
 def seen_cloud(study: ReconstructionStudy, index: int, candidates: Sequence[int]) -> PointCloud:
     """D after the given views of a scene, noise included: that which a record's reconstructions were made from."""
     scene, poses, key = study.scene(index), sphere_candidates(study.num_candidates), _key(index, "episode")
-    planner, state = study.planner("farthest"), None
-    for view, candidate in enumerate(candidates):
-        pose = poses[candidate]
-        seen = observe_scene(scene, planner.camera, pose, SensorNoise(), view_keys(key, view)[2])
-        state = planner.init(seen, pose) if state is None else planner.observe(state, pose, seen)
-    if state is None:
-        raise InputError("there are no views to scan again: give at least one candidate")
-    return state.cloud
+    require(len(candidates) > 0, "there are no views to scan again: give at least one candidate")
+    planner, sensor = study.planner("farthest"), scene_sensor(scene, Camera())
+    seen = ((poses[one], sensor(poses[one], view_keys(key, view)[2])) for view, one in enumerate(candidates))
+    *_, last = planner.replay(seen)
+    return last.cloud
 
 
 def _distances(mesh: TriangleMesh | None, truth: Float[np.ndarray, "n 3"], index: int) -> dict | None:
