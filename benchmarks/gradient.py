@@ -25,7 +25,7 @@ import jaxnbv as nbv
 from jaxnbv.datasets import Framing, Split, demo_object, hidden_view, pyramid_scene
 from jaxnbv.episode import observe_scene
 from jaxnbv.networks import pyramid_classifier
-from jaxnbv.search.base import sphere_candidates
+from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.storage import describe, versions
 
 SEARCHES = {

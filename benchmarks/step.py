@@ -27,7 +27,7 @@ import jaxnbv as nbv
 from jaxnbv.datasets import demo_object
 from jaxnbv.episode import observe_scene
 from jaxnbv.presets import ModelName
-from jaxnbv.search.base import sphere_candidates
+from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.storage import describe, versions
 
 FIGURES = {

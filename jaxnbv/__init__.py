@@ -32,10 +32,12 @@ from jaxnbv.scanning import load_mesh as load_mesh
 from jaxnbv.scanning import mesh_from_sdf as mesh_from_sdf
 from jaxnbv.scanning import scan as scan
 from jaxnbv.scanning import scan_samples as scan_samples
+from jaxnbv.search import Candidates as Candidates
 from jaxnbv.search import ConstrainedPoses as ConstrainedPoses
 from jaxnbv.search import DiscreteSearch as DiscreteSearch
 from jaxnbv.search import FarthestView as FarthestView
 from jaxnbv.search import FreePoses as FreePoses
+from jaxnbv.search import GivenPoses as GivenPoses
 from jaxnbv.search import GradientSearch as GradientSearch
 from jaxnbv.search import HalvingSearch as HalvingSearch
 from jaxnbv.search import HybridSearch as HybridSearch
@@ -44,6 +46,7 @@ from jaxnbv.search import Problem as Problem
 from jaxnbv.search import Proposal as Proposal
 from jaxnbv.search import RandomView as RandomView
 from jaxnbv.search import Search as Search
+from jaxnbv.search import SphereCandidates as SphereCandidates
 from jaxnbv.search import SpherePoses as SpherePoses
 from jaxnbv.search import Trajectories as Trajectories
 from jaxnbv.search import UncertaintyView as UncertaintyView

@@ -147,15 +147,21 @@ class Camera(eqx.Module):
         return jnp.broadcast_to(pose.position[..., None, :], directions.shape), directions
 
 
-def fibonacci_sphere(count: int, radius: float = 1.0) -> Float[Array, "count 3"]:
+def fibonacci_sphere(count: int, radius: float = 1.0, min_elevation: float = -0.5 * math.pi) -> Float[Array, "count 3"]:
     """`count` almost evenly spaced points on a sphere about the origin (spherical Fibonacci lattice; Gonzalez 2010).
 
-    **Raises:** `ValueError` if `count` < 1 or `radius` <= 0.
+    `min_elevation`: radians above the plane y = 0; from there to the pole, the whole sphere by default.
+
+    **Raises:** `ValueError` if `count` < 1, `radius` <= 0 or the elevation is not within [-pi/2, pi/2).
     """
     require(count >= 1, f"a Fibonacci sphere needs at least one point, got {count}")
     require(radius > 0, f"the radius of the sphere must be positive, got {radius}")
+    require(
+        -0.5 * math.pi <= min_elevation < 0.5 * math.pi,
+        f"the least elevation is {min_elevation} rad; it must lie within [-pi/2, pi/2)",
+    )
     index = np.arange(count)
-    y = 1.0 - (2.0 * index + 1.0) / count
+    y = 1.0 - (1.0 - math.sin(min_elevation)) * (index + 0.5) / count
     azimuth = index * math.pi * (3.0 - math.sqrt(5.0))
     ring = np.sqrt(1.0 - y**2)
     points = np.stack([ring * np.cos(azimuth), y, ring * np.sin(azimuth)], axis=-1)

@@ -4,11 +4,14 @@ import os
 from pathlib import Path
 
 # Before NumPy, SciPy and JAX are loaded, and for the processes that tests start. Workers whose linear algebra takes all
-# cores each wait for one another. Most programs of the tests run for less time than they take to compile, so LLVM's
-# expensive passes do not pay; without any (level 0) programs run several times slower. What one worker has compiled the
-# others find.
+# cores each wait for one another. Most programs of the tests run for less time than they take to compile: LLVM's
+# expensive passes and XLA's newer emitters of fused loops do not pay. Without any optimisation (level 0) they would run
+# several times longer. What one worker has compiled the others find.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true")
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true --xla_cpu_use_fusion_emitters=false",
+)
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "xla"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")

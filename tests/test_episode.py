@@ -22,7 +22,7 @@ PLANNER = Planner(
     GeometricSPSR(truncation=8, lengthscale=0.05),
     Camera(height=8, width=8),
     Coverage(),
-    DiscreteSearch(num_candidates=12),
+    DiscreteSearch(12),
     num_samples=3,
     grid=Grid(24),
     capacity=128,
@@ -118,9 +118,7 @@ def test_a_whole_episode_as_one_jitted_function(episode):
 def test_an_episode_over_a_mesh_runs_outside_jit():
     mesh = mesh_from_sdf(SOLID, Grid(24))
     assert not mesh.in_jit
-    planner = eqx.tree_at(
-        lambda p: p.search, PLANNER, RandomView(num_candidates=12), is_leaf=lambda x: x is PLANNER.search
-    )
+    planner = eqx.tree_at(lambda p: p.search, PLANNER, RandomView(12), is_leaf=lambda x: x is PLANNER.search)
     episode = simulate(planner, mesh, FIRST, 2, KEY, progress=False)
     clean = scan(mesh, planner.camera, episode.views[1].pose)
     assert int(clean.count) > 5

@@ -19,9 +19,7 @@ from jaxnbv.tasks import Coverage
 
 SCENE = SDFSurface(Sphere(0.7) | Capsule([0.2, 0.3, -0.4], [0.5, 0.6, 0.9], 0.3))
 FIRST = look_at((0.8, 0.9, 2.2))
-SEARCHES = {
-    kind.__name__: kind(num_candidates=12) for kind in (DiscreteSearch, FarthestView, RandomView, UncertaintyView)
-}
+SEARCHES = {kind.__name__: kind(12) for kind in (DiscreteSearch, FarthestView, RandomView, UncertaintyView)}
 
 
 def planner_of(search, **changes):
@@ -156,7 +154,7 @@ def test_no_room_for_another_view_is_refused():
 
 @pytest.mark.parametrize("kind", [FarthestView, RandomView])
 def test_all_candidates_visited_is_refused(kind):
-    planner = planner_of(kind(num_candidates=2))
+    planner = planner_of(kind(2))
     first = scan(SCENE, planner.camera, FIRST)
     # Its points alone, which may be told with any pose.
     first = PointCloud(first.points, first.normals, first.mask)
@@ -176,7 +174,7 @@ def test_numbers_below_one_are_refused(name, value):
 
 def test_a_score_that_is_not_a_number_is_named(state):
     utility = ExpectedUtilityImprovement(lambda cloud: jnp.sum(cloud.points) * jnp.nan)
-    planner = planner_of(DiscreteSearch(num_candidates=12))
+    planner = planner_of(DiscreteSearch(12))
     planner = Planner(planner.model, planner.camera, utility, planner.search, 3, planner.grid, 128)
     with pytest.raises(ValueError, match="NaN"):
         planner.propose(state, jax.random.key(0))
@@ -194,6 +192,6 @@ def test_a_singular_covariance_is_named():
     cloud = PointCloud.from_arrays(points, np.tile([0.0, 0.0, 1.0], (64, 1)))
     with pytest.raises(ValueError, match=r"64 normals with noise=1e-05 is singular .* raise the noise"):
         model.condition(cloud)
-    planner = Planner(model, Camera(), Coverage(), DiscreteSearch(num_candidates=4), 2, Grid(12), 64)
+    planner = Planner(model, Camera(), Coverage(), DiscreteSearch(4), 2, Grid(12), 64)
     with pytest.raises(ValueError, match="raise the model's noise"):
         planner.propose(planner.init(cloud), jax.random.key(0))

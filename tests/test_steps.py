@@ -16,7 +16,7 @@ from jaxnbv.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.search import DiscreteSearch, FarthestView, RandomView, UncertaintyView
-from jaxnbv.search.base import sphere_candidates
+from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
 
@@ -111,6 +111,6 @@ def test_another_score_or_search_does_not_compile_the_sampler_again(compilations
     surfaces = own.sample_surfaces(state, KEY)
     jax.block_until_ready(surfaces.values)
     del compilations[:]
-    other = eqx.tree_at(lambda p: p.acquisition, planner(UncertaintyView(CANDIDATES, 3.0)), FirstRow())
+    other = eqx.tree_at(lambda p: p.acquisition, planner(UncertaintyView(CANDIDATES)), FirstRow())
     assert_same(other.sample_surfaces(state, KEY), surfaces)
     assert not compilations

@@ -23,7 +23,7 @@ from jaxnbv.episode import simulate
 from jaxnbv.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
 from jaxnbv.scanning.sdf import Capsule, Sphere
-from jaxnbv.search import DiscreteSearch, FarthestView
+from jaxnbv.search import DiscreteSearch, FarthestView, SphereCandidates
 from jaxnbv.storage import EpisodeFolder, describe
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
@@ -35,7 +35,7 @@ KEY = jax.random.key(0)
 
 
 def planner_of(search=None, lengthscale=0.05, **changes):
-    search = DiscreteSearch(num_candidates=12) if search is None else search
+    search = DiscreteSearch(12) if search is None else search
     settings = {"num_samples": 3, "grid": Grid(24), "capacity": 128, "max_views": 6, **changes}
     model, camera = GeometricSPSR(truncation=8, lengthscale=lengthscale), Camera(height=8, width=8)
     return Planner(model, camera, Coverage(), search, **settings)
@@ -60,9 +60,9 @@ def finished(tmp_path_factory):
 
 CHANGES = {
     "model": {"planner": planner_of(lengthscale=0.051)},
-    "search": {"planner": planner_of(FarthestView(num_candidates=12))},
-    "candidates": {"planner": planner_of(DiscreteSearch(num_candidates=13))},
-    "radius": {"planner": planner_of(DiscreteSearch(num_candidates=12, radius=2.6))},
+    "search": {"planner": planner_of(FarthestView(12))},
+    "candidates": {"planner": planner_of(DiscreteSearch(13))},
+    "radius": {"planner": planner_of(DiscreteSearch(SphereCandidates(12, 2.6)))},
     "samples": {"planner": planner_of(num_samples=4)},
     "grid": {"planner": planner_of(grid=Grid(25))},
     "capacity": {"planner": planner_of(capacity=129)},
@@ -199,7 +199,7 @@ def test_a_finished_run_is_read_not_computed(finished, monkeypatch):
     ("change", "named"),
     [
         ({"planner": planner_of(num_samples=4)}, r"planner\.num_samples: 3 there, 4 now"),
-        ({"planner": planner_of(FarthestView(num_candidates=12))}, r"planner\.search\.type: DiscreteSearch there"),
+        ({"planner": planner_of(FarthestView(12))}, r"planner\.search\.type: DiscreteSearch there"),
         ({"noise": SensorNoise(0.03)}, r"noise\.points: 0\.01 there, 0\.03 now"),
         ({"key": jax.random.key(9)}, r"key\.data: \[0, 0\] there, \[0, 9\] now"),
         ({"first": look_at((0.8, 0.9, 2.3))}, r"first\.position"),

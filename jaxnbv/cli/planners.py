@@ -25,6 +25,7 @@ from jaxnbv.search import (
     PoseSpace,
     RandomView,
     Search,
+    SphereCandidates,
     SpherePoses,
     UncertaintyView,
 )
@@ -109,7 +110,8 @@ def search_of(name: SearchName, radius: float, num_candidates: int | None) -> Se
         SearchName.RANDOM: RandomView,
         SearchName.UNCERTAINTY: UncertaintyView,
     }
-    return over_candidates[name](radius=radius, **count)
+    everywhere = SphereCandidates(radius=radius)
+    return over_candidates[name](everywhere if num_candidates is None else SphereCandidates(num_candidates, radius))
 
 
 def task_planner(

@@ -10,7 +10,7 @@ from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import require
 from jaxnbv.datasets.labelled import assemble, bar, box, generator, path, ring, rod
 from jaxnbv.scanning import SDFSurface, Surface, scan
-from jaxnbv.search.base import sphere_candidates
+from jaxnbv.search.candidates import sphere_candidates
 
 _LABEL = 0
 

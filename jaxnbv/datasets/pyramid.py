@@ -14,7 +14,7 @@ from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets.patterns import PATTERNS, pattern_distance
 from jaxnbv.scanning import SDFSurface, scan
 from jaxnbv.scanning.sdf import Matrix, Scalar, SignedDistance, Vector, nonnegative, parameter
-from jaxnbv.search.base import sphere_candidates
+from jaxnbv.search.candidates import sphere_candidates
 
 
 class Split(StrEnum):

@@ -1,5 +1,6 @@
 """How the next pose is found: among candidates, by gradient, by both, and by the paper's baselines."""
 
+from jaxnbv.search.base import CandidateSearch as CandidateSearch
 from jaxnbv.search.base import Problem as Problem
 from jaxnbv.search.base import Proposal as Proposal
 from jaxnbv.search.base import Search as Search
@@ -7,6 +8,9 @@ from jaxnbv.search.base import Trajectories as Trajectories
 from jaxnbv.search.baselines import FarthestView as FarthestView
 from jaxnbv.search.baselines import RandomView as RandomView
 from jaxnbv.search.baselines import UncertaintyView as UncertaintyView
+from jaxnbv.search.candidates import Candidates as Candidates
+from jaxnbv.search.candidates import GivenPoses as GivenPoses
+from jaxnbv.search.candidates import SphereCandidates as SphereCandidates
 from jaxnbv.search.discrete import DiscreteSearch as DiscreteSearch
 from jaxnbv.search.gradient import GradientSearch as GradientSearch
 from jaxnbv.search.gradient import HybridSearch as HybridSearch

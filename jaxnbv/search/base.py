@@ -1,7 +1,7 @@
 """What a search is asked, and what it answers."""
 
 from abc import abstractmethod
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -9,13 +9,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxnbv.acquisition import Score, mean_score
-from jaxnbv.camera import Camera, Pose, fibonacci_sphere, look_at
-from jaxnbv.checks import InputError, require
+from jaxnbv.camera import Camera, Pose
+from jaxnbv.checks import InputError
 from jaxnbv.cloud import PointCloud
 from jaxnbv.scanning import GridSurface
+from jaxnbv.search.candidates import Candidates, SphereCandidates, as_candidates
 
-# Of the paper: cameras stand on a sphere of this radius about the origin, in scene units.
-SENSOR_RADIUS = 2.5
+# Numbers and poses are converted on the way in, which mypy cannot see.
+if TYPE_CHECKING:
+    AnyCandidates: TypeAlias = Any
+else:
+    AnyCandidates = Candidates
 
 
 class Problem(eqx.Module):
@@ -125,9 +129,14 @@ class Search(eqx.Module):
         """The pose to take next; a pure function of its arguments, which runs under `jit`."""
 
 
-def sphere_candidates(count: int, radius: float = SENSOR_RADIUS) -> Pose:
-    """The paper's candidate pool: a Fibonacci sphere of cameras that look at the origin."""
-    return look_at(fibonacci_sphere(count, radius))
+class CandidateSearch(Search):
+    """A search that chooses one of its candidates.
+
+    - `candidates`: `SphereCandidates`, `GivenPoses` or others; a number stands for so many on the paper's sphere, and a
+      batch of poses for these.
+    """
+
+    candidates: AnyCandidates = eqx.field(converter=as_candidates, default=SphereCandidates())
 
 
 def best_unvisited(problem: Problem, candidates: Pose, values: Float[Array, " candidates"]) -> Proposal:
@@ -135,9 +144,3 @@ def best_unvisited(problem: Problem, candidates: Pose, values: Float[Array, " ca
     values = jnp.where(problem.is_visited(candidates), -jnp.inf, values)
     index = jnp.argmax(values)
     return Proposal(candidates[index], values[index], candidates, values)
-
-
-def check_candidates(count: int, radius: float) -> None:
-    """Raise `ValueError` unless there are candidates and the sphere has a radius."""
-    require(count >= 1, f"the search has {count} candidates; it needs at least one")
-    require(radius > 0, f"the candidates' sphere has radius {radius}; it must be positive")

@@ -2,73 +2,49 @@
 
 from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.camera import Pose
 from jaxnbv.checks import InputError
-from jaxnbv.search.base import (
-    SENSOR_RADIUS,
-    Problem,
-    Proposal,
-    Search,
-    best_unvisited,
-    check_candidates,
-    sphere_candidates,
-)
+from jaxnbv.search.base import CandidateSearch, Problem, Proposal, best_unvisited
 
 
-class FarthestView(Search):
+class FarthestView(CandidateSearch):
     """Farthest point sampling of views: the candidate whose nearest visited camera is farthest away."""
 
-    num_candidates: int = eqx.field(static=True, default=120)
-    radius: float = eqx.field(static=True, default=SENSOR_RADIUS)
     uses_samples: ClassVar[bool] = False
-
-    def __check_init__(self):
-        check_candidates(self.num_candidates, self.radius)
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """Values are distances in scene units; the key is not used."""
-        candidates = sphere_candidates(self.num_candidates, self.radius)
+        candidates = self.candidates.poses()
         return best_unvisited(problem, candidates, problem.distance_to_visited(candidates))
 
 
-class RandomView(Search):
+class RandomView(CandidateSearch):
     """A candidate drawn uniformly from those not visited yet."""
 
-    num_candidates: int = eqx.field(static=True, default=120)
-    radius: float = eqx.field(static=True, default=SENSOR_RADIUS)
     uses_samples: ClassVar[bool] = False
-
-    def __check_init__(self):
-        check_candidates(self.num_candidates, self.radius)
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """Values are the lots that were drawn, uniform on [0, 1)."""
-        candidates = sphere_candidates(self.num_candidates, self.radius)
-        return best_unvisited(problem, candidates, jax.random.uniform(key, (self.num_candidates,)))
+        candidates = self.candidates.poses()
+        return best_unvisited(problem, candidates, jax.random.uniform(key, (self.candidates.count,)))
 
 
-class UncertaintyView(Search):
+class UncertaintyView(CandidateSearch):
     """The candidate whose principal ray is the most uncertain of where it ends (Holalkere et al. 2025).
 
     With the transmittance T(t), the share of the samples whose surface the ray has not entered before t, the value is
     the length of the ray between the first t with T(t) < 1 and the last t with T(t) > 0.05.
     """
 
-    num_candidates: int = eqx.field(static=True, default=120)
-    radius: float = eqx.field(static=True, default=SENSOR_RADIUS)
     uses_samples: ClassVar[bool] = True
-
-    def __check_init__(self):
-        check_candidates(self.num_candidates, self.radius)
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """Values are lengths in scene units; the key is not used."""
-        candidates = sphere_candidates(self.num_candidates, self.radius)
+        candidates = self.candidates.poses()
         return best_unvisited(problem, candidates, uncertain_length(problem, candidates))
 
 

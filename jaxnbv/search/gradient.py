@@ -7,10 +7,11 @@ import optimistix as optx
 from jaxtyping import PRNGKeyArray
 
 from jaxnbv.acquisition import Score
-from jaxnbv.camera import Camera
+from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import require
 from jaxnbv.search.ascent import Ascent
 from jaxnbv.search.base import Problem, Proposal, Search
+from jaxnbv.search.candidates import Candidates, as_candidates
 from jaxnbv.search.pose_space import FreePoses, PoseSpace, SpherePoses
 
 
@@ -20,6 +21,7 @@ class GradientSearch(Search):
     - `dof`: 2 for `SpherePoses()`, 6 for `FreePoses()`; or give a `space` of your own, `ConstrainedPoses()` say.
     - `num_candidates`: poses, spread evenly over the space and turned at random, that are evaluated first; the ascent
       starts from the best `num_starts` of them. With as many candidates as starts, every candidate is a start.
+    - `candidates`: in their place, poses of your own; `turned`: whether the key turns them, if they can be turned.
     - `num_starts`, `iterations`, `learning_rate`, `solver`: see `Ascent`.
 
     Differentiation keeps what the score computed for all starts and samples, with PointNet++ several gigabytes; fewer
@@ -34,7 +36,8 @@ class GradientSearch(Search):
     """
 
     ascent: Ascent
-    num_candidates: int = eqx.field(static=True)
+    candidates: Candidates
+    turned: bool = eqx.field(static=True)
     uses_samples: ClassVar[bool] = True
 
     def __init__(
@@ -46,32 +49,35 @@ class GradientSearch(Search):
         learning_rate: float = 0.01,
         num_candidates: int = 100,
         solver: optx.AbstractMinimiser | None = None,
+        candidates: Candidates | Pose | None = None,
+        turned: bool = True,
     ):
         self.ascent = Ascent(_pose_space(dof, space), num_starts, iterations, learning_rate, solver)
-        self.num_candidates = num_candidates
-        _check_enough(num_candidates, num_starts)
+        of_space = SpaceCandidates(self.ascent.space, num_candidates)
+        self.candidates = of_space if candidates is None else as_candidates(candidates)
+        self.turned = turned
+        require(
+            self.candidates.count >= num_starts,
+            f"the search has {self.candidates.count} candidates for {num_starts} starts: give it as many at least",
+        )
 
     def check(self, score: Score, camera: Camera, capacity: int) -> None:
         """See `Ascent.check`."""
         self.ascent.check(score, camera, capacity)
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
-        """The best pose that was seen, candidates included; the key turns the candidates."""
-        return self.ascent.climb(problem, self.ascent.space.candidates(self.num_candidates, key))
+        """The best pose that was seen, candidates included; the key turns the candidates, if they are to be turned."""
+        return self.ascent.climb(problem, self.candidates.poses(key if self.turned else None))
 
 
-class HybridSearch(Search):
-    """The discrete search, then gradient ascent from its best few candidates.
+class HybridSearch(GradientSearch):
+    """The discrete search, then gradient ascent from its best few candidates: a `GradientSearch` with other defaults.
 
-    Arguments as of `GradientSearch`, with fewer and longer steps by default. On the sphere the candidates are those of
-    a `DiscreteSearch` with as many, so the value found is never below its.
+    Steps are fewer and longer. On the sphere the candidates are those of a `DiscreteSearch` with as many, so the value
+    found is never below its.
 
     **Raises:** `ValueError` as `GradientSearch` does.
     """
-
-    ascent: Ascent
-    num_candidates: int = eqx.field(static=True)
-    uses_samples: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -82,25 +88,31 @@ class HybridSearch(Search):
         learning_rate: float = 0.02,
         num_candidates: int = 120,
         solver: optx.AbstractMinimiser | None = None,
+        candidates: Candidates | Pose | None = None,
+        turned: bool = False,
     ):
-        self.ascent = Ascent(_pose_space(dof, space), num_starts, iterations, learning_rate, solver)
-        self.num_candidates = num_candidates
-        _check_enough(num_candidates, num_starts)
-
-    def check(self, score: Score, camera: Camera, capacity: int) -> None:
-        """See `Ascent.check`."""
-        self.ascent.check(score, camera, capacity)
-
-    def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
-        """The best pose that was seen, candidates included; the key is not used."""
-        return self.ascent.climb(problem, self.ascent.space.candidates(self.num_candidates, None))
+        super().__init__(dof, space, num_starts, iterations, learning_rate, num_candidates, solver, candidates, turned)
 
 
-def _check_enough(num_candidates: int, num_starts: int) -> None:
-    require(
-        isinstance(num_candidates, int) and num_candidates >= num_starts,
-        f"the search has {num_candidates} candidates for {num_starts} starts: give it as many at least",
-    )
+class SpaceCandidates(Candidates):
+    """Poses of a pose space, spread evenly over it.
+
+    **Raises:** `ValueError` for a number below one.
+    """
+
+    space: PoseSpace
+    number: int = eqx.field(static=True)
+
+    def __check_init__(self):
+        whole = isinstance(self.number, int) and self.number >= 1
+        require(whole, f"the search has {self.number} candidates; it needs a whole number, at least one")
+
+    @property
+    def count(self) -> int:
+        return self.number
+
+    def poses(self, key: PRNGKeyArray | None = None) -> Pose:
+        return self.space.candidates(self.number, key)
 
 
 def _pose_space(dof: int | None, space: PoseSpace | None) -> PoseSpace:

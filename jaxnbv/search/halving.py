@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
 from jaxnbv.checks import require
-from jaxnbv.search.base import SENSOR_RADIUS, Problem, Proposal, Search, check_candidates, sphere_candidates
+from jaxnbv.search.base import CandidateSearch, Problem, Proposal
 
 
-class HalvingSearch(Search):
+class HalvingSearch(CandidateSearch):
     """Successive halving over the candidates of a `DiscreteSearch` (Karnin et al. 2013), for scores that are slow.
 
     All candidates are scored on the first few posterior samples; the better half on as many again, the better half of
@@ -19,25 +19,21 @@ class HalvingSearch(Search):
     16. Samples are the same for all candidates (common random numbers), so what is compared are differences between
     poses on the same surfaces. The view is not always that of the full search.
 
-    - `num_candidates`, `radius`: as of `DiscreteSearch`.
     - `first_samples`: posterior samples on which every candidate is scored.
     """
 
-    num_candidates: int = eqx.field(static=True, default=120)
-    radius: float = eqx.field(static=True, default=SENSOR_RADIUS)
     first_samples: int = eqx.field(static=True, default=2)
     uses_samples: ClassVar[bool] = True
 
     def __check_init__(self):
-        check_candidates(self.num_candidates, self.radius)
         require(self.first_samples >= 1, f"first_samples is {self.first_samples}; candidates need at least one")
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """The best of the last round; the value of a candidate that left earlier is its mean until then."""
-        candidates = sphere_candidates(self.num_candidates, self.radius)
+        candidates = self.candidates.poses()
         is_visited = problem.is_visited(candidates)
-        left = jnp.arange(self.num_candidates)
-        totals = jnp.zeros(self.num_candidates, candidates.position.dtype)
+        left = jnp.arange(self.candidates.count)
+        totals = jnp.zeros(self.candidates.count, candidates.position.dtype)
         values, scored = totals, 0
         while scored < problem.num_samples:
             if scored:

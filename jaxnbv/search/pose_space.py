@@ -9,14 +9,13 @@ from abc import abstractmethod
 from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.camera import Camera, Pose, fibonacci_sphere, look_at
+from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import require
 from jaxnbv.rotations import normalise, rotation_between, rotation_from_6d, rotation_to_6d
-from jaxnbv.search.base import SENSOR_RADIUS, sphere_candidates
+from jaxnbv.search.candidates import SENSOR_RADIUS, SphereCandidates
 
 
 class PoseSpace(eqx.Module):
@@ -61,7 +60,7 @@ class SpherePoses(PoseSpace):
 
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
         """A Fibonacci sphere of cameras that look at the origin."""
-        return _sphere_views(count, self.radius, key)
+        return SphereCandidates(count, self.radius).poses(key)
 
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
         _, after = _directions(start, parameters)
@@ -87,7 +86,7 @@ class FreePoses(PoseSpace):
 
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
         """A Fibonacci sphere of cameras that look at the origin."""
-        return _sphere_views(count, self.radius, key)
+        return SphereCandidates(count, self.radius).poses(key)
 
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
         rotation = rotation_from_6d(rotation_to_6d(start.rotation) + parameters[:6])
@@ -131,7 +130,7 @@ class ConstrainedPoses(PoseSpace):
 
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
         """A Fibonacci sphere of cameras in the middle of the shell that look at the origin."""
-        return _sphere_views(count, self._middle, key)
+        return SphereCandidates(count, self._middle).poses(key)
 
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
         direction, distance, gaze, roll = jnp.split(parameters, (3, 4, 6))
@@ -160,13 +159,6 @@ class ConstrainedPoses(PoseSpace):
             f"off_axis is {self.off_axis:.3g} rad but the image ends {half:.3g} rad from its centre: the object's "
             "centre would leave it; lower off_axis, or widen the camera's field of view",
         )
-
-
-def _sphere_views(count: int, radius: float, key: PRNGKeyArray | None) -> Pose:
-    if key is None:
-        return sphere_candidates(count, radius)
-    turn = rotation_from_6d(jax.random.normal(key, (6,)))
-    return look_at(jnp.matmul(fibonacci_sphere(count, radius), turn.T, precision="highest"))
 
 
 def _directions(start: Pose, parameters: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:

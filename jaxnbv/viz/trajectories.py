@@ -8,7 +8,7 @@ from jaxnbv.acquisition import expected_score
 from jaxnbv.camera import Pose
 from jaxnbv.episode import Episode, view_keys
 from jaxnbv.search import Proposal, Trajectories
-from jaxnbv.search.base import sphere_candidates
+from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.viz.sphere import unit
 
 # Fewer candidates than this say little about what lies between them: the map is then made of so many views of its own.

@@ -13,7 +13,7 @@ from jaxnbv.datasets import PATTERNS, Framing, Pyramid, Split, hidden_view, pyra
 from jaxnbv.datasets.patterns import pattern_distance
 from jaxnbv.scanning import Grid, SDFSurface, mesh_from_sdf, scan
 from jaxnbv.scanning.mesh import load_mesh
-from jaxnbv.search.base import sphere_candidates
+from jaxnbv.search.candidates import sphere_candidates
 
 RNG = np.random.default_rng(0)
 

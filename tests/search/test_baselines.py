@@ -38,7 +38,7 @@ def index_of(proposal):
 
 
 def test_farthest_view_against_its_definition():
-    search, visited = FarthestView(num_candidates=12), [np.array([0.8, 0.9, 2.2])]
+    search, visited = FarthestView(12), [np.array([0.8, 0.9, 2.2])]
     for _ in range(4):
         proposal = search.propose(problem(np.array(visited)), jax.random.key(0))
         nearest = np.array([min(np.linalg.norm(c - v) for v in visited) for c in CANDIDATES])
@@ -52,7 +52,7 @@ def test_farthest_view_against_its_definition():
 
 def test_random_view_is_uniform_over_what_is_unvisited():
     """2,000 draws over ten candidates; the chi-square test has size 1e-4."""
-    search, asked = RandomView(num_candidates=12), problem(CANDIDATES[[3, 8]])
+    search, asked = RandomView(12), problem(CANDIDATES[[3, 8]])
     draw = eqx.filter_jit(jax.vmap(lambda key: search.propose(asked, key).pose.position))
     chosen = np.asarray(draw(jax.random.split(jax.random.key(0), 2000)))
     index = np.linalg.norm(CANDIDATES - chosen[:, None], axis=-1).argmin(axis=1)
@@ -63,7 +63,7 @@ def test_random_view_is_uniform_over_what_is_unvisited():
 
 
 def test_random_view_is_reproducible_and_excludes():
-    search, asked = RandomView(num_candidates=12), problem(CANDIDATES[[3, 8]])
+    search, asked = RandomView(12), problem(CANDIDATES[[3, 8]])
     a, b = search.propose(asked, jax.random.key(4)), search.propose(asked, jax.random.key(4))
     np.testing.assert_array_equal(a.values, b.values)
     assert index_of(a) == index_of(b) == np.asarray(a.values).argmax()
@@ -99,7 +99,7 @@ def test_uncertainty_against_its_definition():
     """The slow version walks at an eighth of the library's step, which finds the first end late and the last early."""
     rng = np.random.default_rng(0)
     surfaces = balls([0.9, 0.6, 0.7, 0.3], rng.uniform(-0.5, 0.5, (4, 3)))
-    search, values = UncertaintyView(num_candidates=12), np.asarray(surfaces.values, dtype=np.float64)
+    search, values = UncertaintyView(12), np.asarray(surfaces.values, dtype=np.float64)
     asked = problem(CANDIDATES[:1], surfaces)
     step = 0.5 * GRID.spacing
     expected = np.array([slow_uncertain_length(values, c, step / 8) for c in CANDIDATES])
@@ -156,7 +156,6 @@ def test_a_ray_that_meets_a_look_on_the_boxes_face_is_still_open():
 
 
 @pytest.mark.parametrize("search", [FarthestView, RandomView, UncertaintyView])
-@pytest.mark.parametrize(("arguments", "message"), [((0, 2.5), "0 candidates"), ((12, 0.0), "radius 0.0")])
-def test_no_candidates_or_no_sphere_is_refused(search, arguments, message):
-    with pytest.raises(ValueError, match=message):
-        search(*arguments)
+def test_no_candidates_are_refused(search):
+    with pytest.raises(ValueError, match="0 candidates"):
+        search(0)

@@ -179,7 +179,7 @@ def test_the_best_that_was_seen_is_returned(name):
         assert_equal(found.pose, poses[int(jnp.argmax(values))])
         downhill += int((ways.values[:, -1] < ways.values.max(axis=1)).sum())
         if name == "hybrid":
-            discrete = propose(DiscreteSearch(num_candidates=20), problem, jax.random.key(0))
+            discrete = propose(DiscreteSearch(20), problem, jax.random.key(0))
             assert_close(found.candidates, discrete.candidates)
             np.testing.assert_allclose(found.values, discrete.values, rtol=1e-4)
             assert float(found.value) >= float(discrete.value) - 1e-4
@@ -193,7 +193,7 @@ def test_trajectories_hold_every_look(name):
     ways, count = found.trajectories, len(found.values)
     assert ways.values.shape == (2, 41)
     assert ways.poses.position.shape == (2, 41, 3)
-    assert count == (20 if name == "hybrid" else search.num_candidates)
+    assert count == (20 if name == "hybrid" else search.candidates.count)
     poses, values = ways.flat
     np.testing.assert_allclose(values_at(problem, poses), values, rtol=1e-4)
     # All starts of a step together.

@@ -86,7 +86,7 @@ def test_without_samples_it_says_so(problem):
         HalvingSearch(CANDIDATES).propose(bare, jax.random.key(0))
 
 
-@pytest.mark.parametrize(("arguments", "message"), [((0, 2.5, 2), "0 candidates"), ((9, 2.5, 0), "first_samples is 0")])
+@pytest.mark.parametrize(("arguments", "message"), [((0, 2), "0 candidates"), ((9, 0), "first_samples is 0")])
 def test_bad_numbers_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         HalvingSearch(*arguments)

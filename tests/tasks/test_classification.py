@@ -307,7 +307,7 @@ def test_a_host_classifier_has_no_gradient():
 def test_a_host_classifier_in_a_planners_search():
     """The same poses and values as the JAX classifier's, through `Planner.propose`."""
     data = random_cloud(40, 40)
-    model, search = GeometricSPSR(lengthscale=0.05, truncation=8), DiscreteSearch(num_candidates=7)
+    model, search = GeometricSPSR(lengthscale=0.05, truncation=8), DiscreteSearch(7)
     proposals = []
     for classifier in (linear, HostClassifier(Host(), 4)):
         planner = Planner(model, CAMERA, CrossEntropy(classifier), search, 2, Grid(16, 3.0), 64)

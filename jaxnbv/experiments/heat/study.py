@@ -22,8 +22,16 @@ from jaxnbv.episode import observe_scene, scene_sensor, steps, view_keys
 from jaxnbv.experiments.meshes import numbered_mesh
 from jaxnbv.planner import Planner
 from jaxnbv.scanning import Carving, Grid, SDFSurface, SensorNoise, TriangleMesh, mesh_from_sdf
-from jaxnbv.search import DiscreteSearch, FarthestView, HalvingSearch, Proposal, RandomView, UncertaintyView
-from jaxnbv.search.base import sphere_candidates
+from jaxnbv.search import (
+    DiscreteSearch,
+    FarthestView,
+    HalvingSearch,
+    Proposal,
+    RandomView,
+    SphereCandidates,
+    UncertaintyView,
+)
+from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.surfaces import ScreenedSPSR, SurfaceModel
 from jaxnbv.tasks import ColdestPoint, Coverage, body_temperature
 
@@ -91,7 +99,7 @@ class HeatStudy(eqx.Module):
             coldest = ColdestPoint(source, reached_only=method == "heat-reached")
             score = ExpectedUtilityImprovement(coldest, self.num_points)
         camera = Camera(height=self.imagined_rays, width=self.imagined_rays)
-        search = _SEARCHES[method](self.num_candidates, HEAT_RADIUS)
+        search = _SEARCHES[method](SphereCandidates(self.num_candidates, HEAT_RADIUS))
         grid = Grid(self.grid_resolution)
         return Planner(
             self.model, camera, score, search, self.num_samples, grid, self.capacity, self.views, self.carving

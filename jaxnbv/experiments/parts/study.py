@@ -26,10 +26,11 @@ from jaxnbv.search import (
     GradientSearch,
     RandomView,
     Search,
+    SphereCandidates,
     SpherePoses,
     UncertaintyView,
 )
-from jaxnbv.search.base import sphere_candidates
+from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.surfaces import ScreenedSPSR, SurfaceModel
 from jaxnbv.tasks import Coverage, SoftPartCount, part_counts
 
@@ -104,7 +105,7 @@ class PartStudy(eqx.Module):
             space = SpherePoses(PART_RADIUS) if method == "gradient-2dof" else FreePoses(PART_RADIUS)
             candidates = max(self.num_candidates // 2, self.num_starts)
             return GradientSearch(None, space, self.num_starts, self.iterations, self.learning_rate, candidates)
-        return _OVER_CANDIDATES.get(method, DiscreteSearch)(self.num_candidates, PART_RADIUS)
+        return _OVER_CANDIDATES.get(method, DiscreteSearch)(SphereCandidates(self.num_candidates, PART_RADIUS))
 
 
 def run_scene(study: PartStudy, index: int, methods: Sequence[str] = METHODS) -> dict:

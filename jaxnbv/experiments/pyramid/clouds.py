@@ -12,7 +12,7 @@ from jaxnbv.datasets.pyramid import scan_pattern
 from jaxnbv.experiments.training_views import joined_views, only, state_after
 from jaxnbv.planner import Planner
 from jaxnbv.scanning import SensorNoise, scan
-from jaxnbv.search.base import SENSOR_RADIUS
+from jaxnbv.search.candidates import SENSOR_RADIUS
 
 MAX_VIEWS = 5
 

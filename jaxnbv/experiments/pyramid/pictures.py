@@ -17,7 +17,7 @@ from jaxnbv.datasets import PATTERNS, Framing, Split, pyramid_scene
 from jaxnbv.experiments.pyramid.hits import PATTERN_PIXELS
 from jaxnbv.experiments.pyramid.report import Record, by_framing, methods_of
 from jaxnbv.scanning import SDFSurface, scan
-from jaxnbv.search.base import sphere_candidates
+from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.style import GREY, LINE, NEW
 

@@ -19,8 +19,8 @@ from jaxnbv.experiments.pyramid.report import METHODS
 from jaxnbv.planner import Planner, State
 from jaxnbv.scanning import Carving, Grid, GridSurface, SensorNoise, scan
 from jaxnbv.search import DiscreteSearch, Problem
-from jaxnbv.search.base import SENSOR_RADIUS, sphere_candidates
 from jaxnbv.search.baselines import uncertain_length
+from jaxnbv.search.candidates import SENSOR_RADIUS, sphere_candidates
 from jaxnbv.surfaces import SurfaceModel
 from jaxnbv.tasks import Coverage
 from jaxnbv.tasks.classification import Classifier, MixedEntropy, cross_entropy, entropy

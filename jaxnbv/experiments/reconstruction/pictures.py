@@ -22,7 +22,7 @@ from jaxnbv.experiments.reconstruction.report import (
 )
 from jaxnbv.experiments.reconstruction.study import RECONSTRUCTIONS, ReconstructionStudy, reconstruct, seen_cloud
 from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, mesh_from_sdf
-from jaxnbv.search.base import sphere_candidates
+from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.viz.data import MeanSurface
 from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.render import Still

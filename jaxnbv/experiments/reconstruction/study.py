@@ -2,7 +2,7 @@
 
 import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import equinox as eqx
@@ -23,12 +23,12 @@ from jaxnbv.networks.shapenet import CATEGORIES
 from jaxnbv.planner import Planner
 from jaxnbv.reconstruction import has_poisson, mean_mesh, screened_poisson
 from jaxnbv.scanning import Carving, Grid, SDFSurface, SensorNoise, Surface, TriangleMesh
-from jaxnbv.search import DiscreteSearch, FarthestView, RandomView, Search, UncertaintyView
-from jaxnbv.search.base import sphere_candidates
+from jaxnbv.search import CandidateSearch, DiscreteSearch, FarthestView, RandomView, UncertaintyView
+from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.surfaces import ScreenedSPSR, SurfaceModel
 from jaxnbv.tasks import Coverage
 
-_SEARCHES: dict[str, Callable[[int], Search]] = {
+_SEARCHES: dict[str, type[CandidateSearch]] = {
     "coverage": DiscreteSearch,
     "farthest": FarthestView,
     "uncertainty": UncertaintyView,

@@ -28,7 +28,8 @@ from jaxnbv.experiments.heat.study import (
 from jaxnbv.experiments.meshes import mesh_files
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.search import HalvingSearch
-from jaxnbv.search.base import Problem, sphere_candidates
+from jaxnbv.search.base import Problem
+from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.tasks import coldest_point
 from jaxnbv.tasks import heat as heat_task
 

@@ -28,7 +28,7 @@ from jaxnbv.search import (
     SpherePoses,
     UncertaintyView,
 )
-from jaxnbv.search.base import sphere_candidates
+from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
 

@@ -19,7 +19,7 @@ from jaxnbv.experiments.pyramid.study import METHODS, PyramidStudy, run_scene
 from jaxnbv.experiments.records import RecordFolder
 from jaxnbv.scanning import Carving, SDFSurface, scan
 from jaxnbv.search import FarthestView, Problem, UncertaintyView
-from jaxnbv.search.base import sphere_candidates
+from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
 from jaxnbv.tasks.classification import CrossEntropy, MixedEntropy, NegativeEntropy

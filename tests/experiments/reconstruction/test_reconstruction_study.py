@@ -37,7 +37,7 @@ from jaxnbv.experiments.reconstruction.study import (
 from jaxnbv.experiments.records import RecordFolder
 from jaxnbv.reconstruction import has_poisson
 from jaxnbv.scanning import scan
-from jaxnbv.search.base import sphere_candidates
+from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.storage import describe
 
 # Those that draw no samples compile in a fraction of the time; all planners are of the same make.
