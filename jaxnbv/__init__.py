@@ -1,72 +1,8 @@
-"""jaxnbv: task-specific next-best-view selection with uncertain geometry, in differentiable JAX."""
+"""jaxnbv: task-specific next-best-view selection with uncertain geometry, in differentiable JAX.
 
-from jaxnbv.acquisition import ExpectedUtilityImprovement as ExpectedUtilityImprovement
-from jaxnbv.acquisition import Score as Score
-from jaxnbv.acquisition import expected_score as expected_score
-from jaxnbv.camera import Camera as Camera
-from jaxnbv.camera import Pose as Pose
-from jaxnbv.camera import fibonacci_sphere as fibonacci_sphere
-from jaxnbv.camera import look_at as look_at
-from jaxnbv.checks import InputError as InputError
-from jaxnbv.cloud import Frame as Frame
-from jaxnbv.cloud import PointCloud as PointCloud
-from jaxnbv.cloud import concatenate as concatenate
-from jaxnbv.cloud import farthest_point_subsample as farthest_point_subsample
-from jaxnbv.diffusion import HeatProblem as HeatProblem
-from jaxnbv.episode import Episode as Episode
-from jaxnbv.episode import View as View
-from jaxnbv.episode import simulate as simulate
-from jaxnbv.planner import Planner as Planner
-from jaxnbv.planner import State as State
-from jaxnbv.presets import Imagination as Imagination
-from jaxnbv.presets import imagination as imagination
-from jaxnbv.scanning import Carving as Carving
-from jaxnbv.scanning import Grid as Grid
-from jaxnbv.scanning import GridSurface as GridSurface
-from jaxnbv.scanning import Hits as Hits
-from jaxnbv.scanning import SDFSurface as SDFSurface
-from jaxnbv.scanning import SensorNoise as SensorNoise
-from jaxnbv.scanning import Surface as Surface
-from jaxnbv.scanning import TriangleMesh as TriangleMesh
-from jaxnbv.scanning import load_mesh as load_mesh
-from jaxnbv.scanning import mesh_from_sdf as mesh_from_sdf
-from jaxnbv.scanning import scan as scan
-from jaxnbv.scanning import scan_samples as scan_samples
-from jaxnbv.search import Candidates as Candidates
-from jaxnbv.search import ConstrainedPoses as ConstrainedPoses
-from jaxnbv.search import DiscreteSearch as DiscreteSearch
-from jaxnbv.search import FarthestView as FarthestView
-from jaxnbv.search import FreePoses as FreePoses
-from jaxnbv.search import GivenPoses as GivenPoses
-from jaxnbv.search import GradientSearch as GradientSearch
-from jaxnbv.search import HalvingSearch as HalvingSearch
-from jaxnbv.search import HybridSearch as HybridSearch
-from jaxnbv.search import PoseSpace as PoseSpace
-from jaxnbv.search import Problem as Problem
-from jaxnbv.search import Proposal as Proposal
-from jaxnbv.search import RandomView as RandomView
-from jaxnbv.search import Search as Search
-from jaxnbv.search import SphereCandidates as SphereCandidates
-from jaxnbv.search import SpherePoses as SpherePoses
-from jaxnbv.search import Trajectories as Trajectories
-from jaxnbv.search import UncertaintyView as UncertaintyView
-from jaxnbv.surfaces import Fields as Fields
-from jaxnbv.surfaces import GeometricSPSR as GeometricSPSR
-from jaxnbv.surfaces import OnSurface as OnSurface
-from jaxnbv.surfaces import OutsideBoundary as OutsideBoundary
-from jaxnbv.surfaces import ScreenedSPSR as ScreenedSPSR
-from jaxnbv.surfaces import SeenEmpty as SeenEmpty
-from jaxnbv.surfaces import SurfaceModel as SurfaceModel
-from jaxnbv.surfaces import SurfacePosterior as SurfacePosterior
-from jaxnbv.surfaces import Thickness as Thickness
-from jaxnbv.surfaces import ValueSource as ValueSource
-from jaxnbv.surfaces import fit_hyperparameters as fit_hyperparameters
-from jaxnbv.tasks import ColdestPoint as ColdestPoint
-from jaxnbv.tasks import Coverage as Coverage
-from jaxnbv.tasks import CrossEntropy as CrossEntropy
-from jaxnbv.tasks import HostClassifier as HostClassifier
-from jaxnbv.tasks import MixedEntropy as MixedEntropy
-from jaxnbv.tasks import NegativeEntropy as NegativeEntropy
-from jaxnbv.tasks import SoftPartCount as SoftPartCount
-from jaxnbv.tasks import coldest_point as coldest_point
-from jaxnbv.volume import Box as Box
+The public names are those of `__init__.pyi`. Each is imported when it is first used, for JAX takes seconds to import.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

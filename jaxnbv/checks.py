@@ -4,11 +4,9 @@ import jax
 import numpy as np
 from jax import Array
 
+from jaxnbv.errors import InputError as InputError
+
 AnyArray = Array | np.ndarray
-
-
-class InputError(ValueError):
-    """Something that the user gave cannot be used; the message says what, and what to do."""
 
 
 def require(condition: bool | np.bool_, message: str) -> None:

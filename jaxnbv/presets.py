@@ -1,11 +1,11 @@
 """Which surfaces are held possible: the paper's, and those that the command line and the studies use by default."""
 
-from enum import StrEnum
 from typing import NamedTuple
 
 import jax.numpy as jnp
 
 from jaxnbv.checks import require
+from jaxnbv.model_name import ModelName as ModelName
 from jaxnbv.scanning import Carving
 from jaxnbv.surfaces import (
     GeometricSPSR,
@@ -17,13 +17,6 @@ from jaxnbv.surfaces import (
     Thickness,
 )
 from jaxnbv.volume import Box, Volume
-
-
-class ModelName(StrEnum):
-    """By what surfaces are imagined."""
-
-    SCREENED = "screened"
-    PAPER = "paper"
 
 
 class Imagination(NamedTuple):

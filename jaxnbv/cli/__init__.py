@@ -1,13 +1,15 @@
 """The command line: `jaxnbv demo`, `jaxnbv run MESH`, `jaxnbv study pyramid` and `jaxnbv convert`."""
 
 import sys
+from typing import Annotated
 
 import typer
 
-from jaxnbv.checks import InputError
+import jaxnbv
 from jaxnbv.cli.study import study
 from jaxnbv.cli.tools import convert
 from jaxnbv.cli.views import demo, run
+from jaxnbv.errors import InputError
 
 app = typer.Typer(
     help="""Where should the sensor look next, for what you want to know?
@@ -25,6 +27,24 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+
+
+def _show_version(asked: bool) -> bool:
+    if asked:
+        typer.echo(f"jaxnbv {jaxnbv.__version__}")
+        raise typer.Exit
+    return asked
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """What is asked of `jaxnbv` itself."""
+
+
 app.command()(demo)
 app.command()(run)
 app.command()(convert)

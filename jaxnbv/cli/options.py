@@ -1,17 +1,13 @@
-"""What the commands' options mean, and what they do before they begin."""
+"""What the commands' options mean."""
 
-import os
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
-import jax
-import platformdirs
 import typer
 
-from jaxnbv.checks import InputError
 from jaxnbv.datasets import Framing
-from jaxnbv.presets import ModelName
+from jaxnbv.model_name import ModelName
 
 
 class Task(StrEnum):
@@ -69,6 +65,10 @@ SeedOption = Annotated[
     int, typer.Option(min=0, max=2**63 - 1, help="Seed of the sensor's noise and of the posterior samples.")
 ]
 OutOption = Annotated[Path | None, typer.Option(help="Output folder.", show_default="runs/NAME-SEARCH[-paper]")]
+FirstOption = Annotated[
+    str, typer.Option(help="Position of the first camera, x,y,z in scene units; it looks at the origin.")
+]
+DEFAULT_FIRST = "0.8,0.9,2.2"
 CategoryOption = Annotated[
     str | None,
     typer.Option(
@@ -104,15 +104,14 @@ FramingOption = Annotated[
 ]
 
 
-def prepare(device: Device) -> None:
-    """Choose the device and keep compiled programs for later runs."""
-    if device is not Device.AUTO:
-        try:
-            jax.config.update("jax_default_device", jax.devices(device.value)[0])
-        except RuntimeError as error:
-            raise InputError(
-                f"no {device.value} that JAX can use ({error}): leave --device out, or install the extra named cuda"
-            ) from error
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        jax.config.update("jax_compilation_cache_dir", str(platformdirs.user_cache_path("jaxnbv") / "xla"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+class EpisodeOptions(NamedTuple):
+    """What every command that runs one episode takes."""
+
+    search: SearchName
+    model: ModelName
+    views: int
+    seed: int
+    out: Path | None
+    noise: float
+    quick: bool
+    report: bool

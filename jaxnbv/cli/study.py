@@ -8,30 +8,11 @@ from typing import Annotated, Any
 
 import typer
 
-from jaxnbv.checks import require
-from jaxnbv.cli.options import Device, DeviceOption, ModelOption, prepare
+from jaxnbv.cli import actions
+from jaxnbv.cli.options import Device, DeviceOption, ModelOption
 from jaxnbv.datasets import Framing
-from jaxnbv.experiments.heat import figures as heat_figures
-from jaxnbv.experiments.heat import pictures as heat_pictures
-from jaxnbv.experiments.heat import report as heat_report
-from jaxnbv.experiments.heat import study as heat_study
-from jaxnbv.experiments.meshes import mesh_files
-from jaxnbv.experiments.parts import figures as part_figures
-from jaxnbv.experiments.parts import pictures as part_pictures
-from jaxnbv.experiments.parts import report as part_report
-from jaxnbv.experiments.parts import study as part_study
-from jaxnbv.experiments.pyramid import figures as pyramid_figures
-from jaxnbv.experiments.pyramid import pictures as pyramid_pictures
-from jaxnbv.experiments.pyramid import report as pyramid_report
-from jaxnbv.experiments.pyramid import study as pyramid_study
-from jaxnbv.experiments.reconstruction import figures as reconstruction_figures
-from jaxnbv.experiments.reconstruction import pictures as reconstruction_pictures
-from jaxnbv.experiments.reconstruction import report as reconstruction_report
-from jaxnbv.experiments.reconstruction import study as reconstruction_study
-from jaxnbv.experiments.records import RecordFolder
-from jaxnbv.networks import part_segmenter, pyramid_classifier
-from jaxnbv.presets import ModelName, imagination
-from jaxnbv.storage import describe
+from jaxnbv.errors import InputError
+from jaxnbv.model_name import ModelName
 
 study = typer.Typer(
     help="Measure the paper's claims on many scenes.", no_args_is_help=True, rich_markup_mode="markdown"
@@ -92,21 +73,24 @@ def pyramid(
     48 candidates, 16 samples on a 64^3 grid, and 512 points for the classifier of imagined scans: fewer
     candidates and a coarser grid than the paper's.
     """
-    prepare(device)
-    names = _methods(methods, pyramid_study.METHODS)
+    actions.prepare(device)
+    studies = actions.studies
+    names = _methods(methods, studies.pyramid_study.METHODS)
     for one in Framing if framing is None else (framing,):
-        classifier = pyramid_classifier(one.longest_side)
-        imagining = pyramid_classifier(one.longest_side, num_points=512)
-        settings = pyramid_study.PyramidStudy(
-            classifier, one, *imagination(model, one.longest_side, quick), views=views, imagining=imagining
+        classifier = studies.pyramid_classifier(one.longest_side)
+        imagining = studies.pyramid_classifier(one.longest_side, num_points=512)
+        settings = studies.pyramid_study.PyramidStudy(
+            classifier, one, *studies.imagination(model, one.longest_side, quick), views=views, imagining=imagining
         )
         settings = dataclasses.replace(settings, **_QUICK, num_candidates=40) if quick else settings
         folder = _folder(out, "pyramid", model, quick) / one.value
-        records = _collect(pyramid_study.run_scene, settings, names, min(scenes, 6) if quick else scenes, folder, quick)
-        pyramid_report.write_tables(records, folder)
-        pyramid_figures.write_figures(records, folder)
-        pyramid_pictures.write_pictures(records, one, folder)
-        typer.echo(f"\n{pyramid_report.summary_table(records, by_angle=False)}")
+        records = _collect(
+            studies.pyramid_study.run_scene, settings, names, min(scenes, 6) if quick else scenes, folder, quick
+        )
+        studies.pyramid_report.write_tables(records, folder)
+        studies.pyramid_figures.write_figures(records, folder)
+        studies.pyramid_pictures.write_pictures(records, one, folder)
+        typer.echo(f"\n{studies.pyramid_report.summary_table(records, by_angle=False)}")
         typer.echo(f"by the angle of the first view, CSV files and figures: {folder}\n")
 
 
@@ -129,16 +113,19 @@ def parts(
     points for the segmenter, 2,048 for what it says of the cloud; gradient search climbs from the best 4 of 24 views, 8
     steps of 0.03: less of everything than the paper.
     """
-    prepare(device)
-    settings = part_study.PartStudy(part_segmenter(category=0), views=views, **_surfaces(model, quick))
+    actions.prepare(device)
+    studies = actions.studies
+    settings = studies.part_study.PartStudy(studies.part_segmenter(category=0), views=views, **_surfaces(model, quick))
     if quick:
         settings = dataclasses.replace(
             settings, **_QUICK, num_candidates=24, num_points=512, num_starts=2, iterations=4
         )
     folder = _folder(out, "parts", model, quick)
-    names = _methods(methods, part_study.METHODS)
-    records = _collect(part_study.run_scene, settings, names, min(scenes, 4) if quick else scenes, folder, quick)
-    _write(records, settings, folder, part_report, part_figures, part_pictures)
+    names = _methods(methods, studies.part_study.METHODS)
+    records = _collect(
+        studies.part_study.run_scene, settings, names, min(scenes, 4) if quick else scenes, folder, quick
+    )
+    _write(records, settings, folder, studies.part_report, studies.part_figures, studies.part_pictures)
 
 
 @study.command()
@@ -160,16 +147,19 @@ def heat(
     32 candidates at radius 3, 50 x 50 rays. Views are imagined with 24 x 24 rays, 8 samples on a 64^3 grid, and added
     to 1,024 points of the cloud: less of everything than the paper.
     """
-    prepare(device)
-    files = () if meshes is None else mesh_files(meshes)
-    settings = heat_study.HeatStudy(files, views=views, **_surfaces(model, quick))
+    actions.prepare(device)
+    studies = actions.studies
+    files = () if meshes is None else studies.mesh_files(meshes)
+    settings = studies.heat_study.HeatStudy(files, views=views, **_surfaces(model, quick))
     scenes = min(scenes, len(files)) if files else scenes
     if quick:
         settings = dataclasses.replace(settings, **_QUICK, num_candidates=24, num_points=512)
     folder = _folder(out, "heat", model, quick)
-    names = _methods(methods, heat_study.METHODS)
-    records = _collect(heat_study.run_scene, settings, names, min(scenes, 3) if quick else scenes, folder, quick)
-    _write(records, settings, folder, heat_report, heat_figures, heat_pictures)
+    names = _methods(methods, studies.heat_study.METHODS)
+    records = _collect(
+        studies.heat_study.run_scene, settings, names, min(scenes, 3) if quick else scenes, folder, quick
+    )
+    _write(records, settings, folder, studies.heat_report, studies.heat_figures, studies.heat_pictures)
 
 
 @study.command()
@@ -190,20 +180,28 @@ def reconstruction(
 
     48 candidates, 16 samples on a 64^3 grid: fewer and coarser than the paper's.
     """
-    prepare(device)
-    files = () if meshes is None else mesh_files(meshes)
-    settings = reconstruction_study.ReconstructionStudy(files, views=views, **_surfaces(model, quick))
+    actions.prepare(device)
+    studies = actions.studies
+    files = () if meshes is None else studies.mesh_files(meshes)
+    settings = studies.reconstruction_study.ReconstructionStudy(files, views=views, **_surfaces(model, quick))
     settings = dataclasses.replace(settings, **_QUICK, num_candidates=40) if quick else settings
     scenes = min(scenes, len(files)) if files else scenes
     folder = _folder(out, "reconstruction", model, quick)
-    names = _methods(methods, reconstruction_study.METHODS)
-    run = reconstruction_study.run_scene
+    names = _methods(methods, studies.reconstruction_study.METHODS)
+    run = studies.reconstruction_study.run_scene
     records = _collect(run, settings, names, min(scenes, 4) if quick else scenes, folder, quick)
-    _write(records, settings, folder, reconstruction_report, reconstruction_figures, reconstruction_pictures)
+    _write(
+        records,
+        settings,
+        folder,
+        studies.reconstruction_report,
+        studies.reconstruction_figures,
+        studies.reconstruction_pictures,
+    )
 
 
 def _surfaces(model: ModelName, quick: bool) -> dict[str, Any]:
-    return imagination(model, quick=quick)._asdict()
+    return actions.studies.imagination(model, quick=quick)._asdict()
 
 
 def _methods(asked: str | None, known: Sequence[str]) -> tuple[str, ...]:
@@ -211,7 +209,8 @@ def _methods(asked: str | None, known: Sequence[str]) -> tuple[str, ...]:
         return tuple(known)
     names = {name.strip() for name in asked.split(",")}
     unknown = sorted(names - {*known})
-    require(not unknown, f"unknown methods: {', '.join(unknown)}; choose from {', '.join(known)}")
+    if unknown:
+        raise InputError(f"unknown methods: {', '.join(unknown)}; choose from {', '.join(known)}")
     return tuple(name for name in known if name in names)
 
 
@@ -226,8 +225,10 @@ def _collect(
     """The records of the scenes: those in the folder as they are, the others as they are run."""
     if quick:
         typer.echo("--quick: small settings and few scenes. This is not the full study; leave it out for that.")
-    config = {"study": describe(settings), "methods": sorted(methods)}
-    return RecordFolder(folder, config).collect(scenes, functools.partial(run_scene, settings, methods=methods))
+    config = {"study": actions.studies.describe(settings), "methods": sorted(methods)}
+    return actions.studies.RecordFolder(folder, config).collect(
+        scenes, functools.partial(run_scene, settings, methods=methods)
+    )
 
 
 def _write(records: list[dict], settings: Any, folder: Path, report: Any, figures: Any, pictures: Any) -> None:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from jaxnbv.networks import PointNet2Classifier, convert_checkpoint
+from jaxnbv.cli import actions
 
 
 def convert(
@@ -13,9 +13,4 @@ def convert(
     target: Annotated[Path, typer.Argument(help="The .safetensors file to write.")],
 ) -> None:
     """Rewrite a PyTorch checkpoint as safetensors. Nothing in it is run, and PyTorch is not needed."""
-    network = convert_checkpoint(source, target)
-    if isinstance(network, PointNet2Classifier):
-        what = f"{network.num_classes} classes"
-    else:
-        what = f"{network.num_parts} parts of {network.num_categories} categories"
-    typer.echo(f"{target}   PointNet++ for {what}")
+    actions.convert(source, target)

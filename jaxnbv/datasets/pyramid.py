@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import AnyArray, require
 from jaxnbv.cloud import PointCloud
+from jaxnbv.datasets.framing import Framing
 from jaxnbv.datasets.patterns import PATTERNS, pattern_distance
 from jaxnbv.scanning import SDFSurface, scan
 from jaxnbv.scanning.sdf import Matrix, Scalar, SignedDistance, Vector, nonnegative, parameter
@@ -23,18 +24,6 @@ class Split(StrEnum):
     TRAIN = "train"
     VALIDATION = "validation"
     TEST = "test"
-
-
-class Framing(StrEnum):
-    """How large the object stands before the sensor: a view shows a patch, or nearly all of its near side."""
-
-    CLOSE_UP = "close-up"
-    WHOLE = "whole"
-
-    @property
-    def longest_side(self) -> float:
-        """Longest side of the object's box in scene units."""
-        return 2.5 if self is Framing.CLOSE_UP else 1.25
 
 
 class Pyramid(SignedDistance):

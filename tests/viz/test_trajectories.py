@@ -12,7 +12,7 @@ from PIL import Image
 
 import jaxnbv as nbv
 from jaxnbv.camera import look_at
-from jaxnbv.cli.views import _summarise
+from jaxnbv.cli.actions.episodes import _summarise
 from jaxnbv.datasets.demo import demo_object
 from jaxnbv.episode import view_keys
 from jaxnbv.rotations import rotation_from_6d

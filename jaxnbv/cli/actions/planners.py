@@ -11,9 +11,10 @@ from jaxnbv.camera import Camera
 from jaxnbv.checks import require
 from jaxnbv.cli.options import SearchName, Task
 from jaxnbv.datasets import Framing
+from jaxnbv.model_name import ModelName
 from jaxnbv.networks import CloudClassifier, CloudSegmenter, load_checkpoint, load_part_segmenter, part_segmenter
 from jaxnbv.planner import Planner
-from jaxnbv.presets import ModelName, imagination
+from jaxnbv.presets import imagination
 from jaxnbv.scanning import Grid
 from jaxnbv.search import (
     ConstrainedPoses,

@@ -1,0 +1,104 @@
+"""What starting costs: `jaxnbv` answers what it can without JAX, whose import takes seconds, and has all its names."""
+
+import ast
+import importlib.metadata
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+
+import jaxtyping
+import numpy as np
+import pytest
+
+import jaxnbv
+from jaxnbv import cli, datasets
+
+HEAVY = {"jax", "equinox", "scipy", "matplotlib", "trimesh"}
+LAZY = pytest.mark.parametrize("package", [jaxnbv, datasets, cli.actions], ids=lambda package: package.__name__)
+
+
+def public_imports(package) -> list[ast.stmt]:
+    return ast.parse(Path(inspect.getfile(package)).with_suffix(".pyi").read_text()).body
+
+
+def run_fresh(*arguments: str) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=600)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        ((), 2),
+        (("--help",), 0),
+        (("--version",), 0),
+        (("demo", "--help"), 0),
+        (("run", "--help"), 0),
+        (("convert", "--help"), 0),
+        (("study", "--help"), 0),
+        (("study", "pyramid", "--help"), 0),
+        (("dmeo",), 2),
+        (("demo", "--vews", "3"), 2),
+        (("demo", "--search", "best"), 2),
+    ],
+)
+def test_help_and_typos_are_answered_without_jax(arguments, code):
+    result = run_fresh("-X", "importtime", "-m", "jaxnbv.cli", *arguments)
+    assert result.returncode == code
+    lines = [line for line in result.stderr.splitlines() if line.startswith("import time:")]
+    imported = {line.split("|")[-1].strip() for line in lines}
+    assert "typer" in imported
+    assert imported & HEAVY == set()
+
+
+def test_importing_the_package_imports_no_jax_until_a_name_is_used():
+    script = "import jaxnbv, sys; assert 'jax' not in sys.modules; jaxnbv.Camera; assert 'jax' in sys.modules"
+    result = run_fresh("-c", script)
+    assert result.returncode == 0, result.stderr
+
+
+def test_version_is_that_of_the_distribution():
+    version = importlib.metadata.version("jaxnbv")
+    assert jaxnbv.__version__ == version
+    assert run_fresh("-m", "jaxnbv.cli", "--version").stdout == f"jaxnbv {version}\n"
+
+
+@LAZY
+def test_every_public_name_resolves(package):
+    assert dir(package) == package.__all__
+    for name in package.__all__:
+        assert getattr(package, name) is not None
+    with pytest.raises(AttributeError, match="Plannr"):
+        _ = package.Plannr
+
+
+@LAZY
+def test_type_checkers_see_every_public_name(package):
+    """In a stub `import x` is private; it is public as `import x as x`, which the lazy package does not ask for."""
+    imports = public_imports(package)
+    assert all(isinstance(statement, ast.ImportFrom) for statement in imports)
+    aliases = [alias for statement in imports for alias in statement.names]
+    assert [alias.asname for alias in aliases] == [alias.name for alias in aliases]
+    assert sorted(alias.name for alias in aliases) == package.__all__
+    assert (Path(inspect.getfile(jaxnbv)).parent / "py.typed").exists()
+
+
+def test_every_public_module_can_be_the_first_that_is_used():
+    """Modules that import each other in a circle would work after some first names, not after others."""
+    imports = public_imports(jaxnbv)
+    first_names = {statement.module or statement.names[0].name: statement.names[0].name for statement in imports}
+    script = f"""
+import sys
+for name in {[*first_names.values()]}:
+    for module in [module for module in sys.modules if module.split(".")[0] == "jaxnbv"]:
+        del sys.modules[module]
+    import jaxnbv
+    getattr(jaxnbv, name)
+"""
+    result = run_fresh("-c", script)
+    assert result.returncode == 0, result.stderr
+
+
+def test_shapes_are_checked_in_modules_that_are_imported_late():
+    with pytest.raises(jaxtyping.TypeCheckError):
+        datasets.unit_sphere(np.arange(3.0))
