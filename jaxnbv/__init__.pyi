@@ -8,6 +8,8 @@ from . import viz as viz
 from .acquisition import ExpectedUtilityImprovement as ExpectedUtilityImprovement
 from .acquisition import Score as Score
 from .acquisition import expected_score as expected_score
+from .answers import Answer as Answer
+from .answers import Quantity as Quantity
 from .camera import Camera as Camera
 from .camera import Pose as Pose
 from .camera import fibonacci_sphere as fibonacci_sphere
@@ -70,6 +72,7 @@ from .tasks import ColdestPoint as ColdestPoint
 from .tasks import Coverage as Coverage
 from .tasks import CrossEntropy as CrossEntropy
 from .tasks import HostClassifier as HostClassifier
+from .tasks import HostSegmenter as HostSegmenter
 from .tasks import MixedEntropy as MixedEntropy
 from .tasks import NegativeEntropy as NegativeEntropy
 from .tasks import SoftPartCount as SoftPartCount

@@ -13,10 +13,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from jaxnbv.answers import Answer, Quantity
 from jaxnbv.camera import Camera, Pose
-from jaxnbv.checks import InputError
+from jaxnbv.checks import InputError, require
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.scanning import GridSurface, scan
 
@@ -37,6 +39,20 @@ class Score(eqx.Module):
         """How many scans are scored together."""
         return preferred_batch_size(None)
 
+    @property
+    def quantity(self) -> Quantity:
+        """What its expected value is, for tables and captions."""
+        meaning = "score of an imagined scan, mean over posterior samples."
+        return Quantity(f"acquisition, {type(self).__name__}", "", meaning)
+
+    def answer(self, cloud: PointCloud) -> Answer | None:
+        """What D tells of what the score asks, for the report and the terminal; None where there is nothing to tell."""
+        return None
+
+    def check(self, cloud: PointCloud) -> None:
+        """Raise `ValueError` if what the score is made of gives something impossible on a first D."""
+        return
+
 
 def preferred_batch_size(function: Any) -> int:
     """How many calls of a function to batch: its attribute `batch_size`, where it has one.
@@ -52,12 +68,15 @@ class ExpectedUtilityImprovement(Score):
     - `utility`: a function from a `PointCloud` (rows, masked) to a scalar, made of JAX operations.
     - `num_points`: where given, D is thinned to so many by farthest point sampling, once a step, before scans are
       added to it: for a utility that looks at so many points anyway, and would sample D again for every scan.
+
+    A utility may say more of itself by attributes: `improvement`, the `Quantity` of what is expected; `answer(cloud)`,
+    and `check(cloud)`, as of a `Score`; `batch_size`. A plain function has its name.
     """
 
     utility: Callable[[PointCloud], Float[Array, ""]]
     num_points: int | None = eqx.field(static=True, default=None)
 
-    def context(self, cloud: PointCloud) -> tuple[PointCloud, Float[Array, ""]]:
+    def context(self, cloud: PointCloud) -> tuple[PointCloud, Array]:
         """D, thinned, and u(D)."""
         cloud = cloud if self.num_points is None else limit_capacity(cloud, self.num_points)
         return cloud, self.utility(cloud)
@@ -71,6 +90,41 @@ class ExpectedUtilityImprovement(Score):
     def batch_size(self) -> int:
         """As the utility prefers."""
         return preferred_batch_size(self.utility)
+
+    @property
+    def quantity(self) -> Quantity:
+        """The utility's `improvement`, or one that is made of its name."""
+        meaning = "how much an imagined scan raises the utility of the cloud, mean over posterior samples."
+        name = "utility improvement" if self._name == "utility" else f"improvement of {self._name}"
+        return getattr(self.utility, "improvement", Quantity(f"expected {name}", "", meaning))
+
+    def answer(self, cloud: PointCloud) -> Answer | None:
+        """The utility's own answer, or its value."""
+        own = getattr(self.utility, "answer", None)
+        return Answer((self._name,), np.array([float(context_of(self, cloud)[1])])) if own is None else own(cloud)
+
+    def check(self, cloud: PointCloud) -> None:
+        """**Raises:** `ValueError` as the utility's own `check` does, or if u(D) is not a finite number."""
+        if (own := getattr(self.utility, "check", None)) is not None:
+            own(cloud)
+        _, value = context_of(self, cloud)
+        require(
+            jnp.shape(value) == (),
+            f"the {self._name} of the cloud has shape {jnp.shape(value)}: a utility is one number",
+        )
+        require(bool(jnp.isfinite(value)), f"the {self._name} of the first cloud is {value}: it must be finite")
+
+    @property
+    def _name(self) -> str:
+        """In words; functions without a name of their own are "utility"."""
+        name = getattr(self.utility, "__name__", "").strip("_").replace("_", " ")
+        return name if name and name != "<lambda>" else "utility"
+
+
+@eqx.filter_jit
+def context_of(score: Score, cloud: PointCloud) -> Any:
+    """What a score makes of D, compiled."""
+    return score.context(cloud)
 
 
 def zero_if_empty(scan: PointCloud, value: Float[Array, ""]) -> Float[Array, ""]:

@@ -72,16 +72,22 @@ class Planner(eqx.Module):
 
         `camera`: the one that took the scan, by default the planner's.
 
+        The score is asked once about the cloud, so that a classifier or utility which gives something impossible says
+        so at once.
+
         **Raises:** `ValueError` if the cloud is empty, if a point is not finite or outside the scene's grid, or more
         than stray ones outside the carving's volume, a normal not of unit length (to 1 %), or the scan an image of
-        another camera or from another pose.
+        another camera or from another pose; and as the acquisition's `check` does.
         """
         camera = camera or self.camera
         self._check_scan(cloud, pose, camera, first=True)
         poses = Pose(np.tile(np.eye(3), (self.max_views, 1, 1)), np.zeros((self.max_views, 3)))
         poses = jax.tree.map(lambda leaf: leaf.astype(jnp.result_type(float)), poses)
         empty = None if self.carving is None else jnp.zeros((self.grid.resolution,) * 3, bool)
-        state = State(limit_capacity(cloud, self.capacity), poses, jnp.asarray(0, jnp.int32), empty)
+        kept = limit_capacity(cloud, self.capacity)
+        if self.search.uses_samples and not is_traced(kept):
+            self.acquisition.check(kept)
+        state = State(kept, poses, jnp.asarray(0, jnp.int32), empty)
         return state if pose is None else _record(self.carving, self.grid, state, pose, cloud, camera)
 
     def posterior(self, state: State) -> SurfacePosterior:

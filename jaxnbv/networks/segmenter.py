@@ -46,6 +46,12 @@ class CloudSegmenter(eqx.Module):
         self.network, self.num_points = network, num_points
         self.category, self.scale = jnp.asarray(index, jnp.int32), jnp.asarray(scale, jnp.result_type(float))
 
+    @property
+    def part_names(self) -> dict[int, str]:
+        """The parts of the category, by their index among the fifty."""
+        category = CATEGORIES[int(self.category)]
+        return dict(zip(category.labels, category.parts, strict=True))
+
     def __call__(self, cloud: PointCloud) -> Float[Array, "num_points parts"]:
         """p(part) at the points that are fed; exactly zero for parts of other categories, and in rows without a point.
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxnbv.acquisition import Score, mean_score
+from jaxnbv.answers import Quantity
 from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import InputError
 from jaxnbv.cloud import PointCloud
@@ -123,6 +124,10 @@ class Search(eqx.Module):
     def check(self, score: Score, camera: Camera, capacity: int) -> None:
         """Raise `ValueError` if the search cannot work with a score, a camera and a cloud of so many rows."""
         return
+
+    def quantity(self, score: Score) -> Quantity:
+        """What the values of its proposals are: by default the score's."""
+        return score.quantity
 
     @abstractmethod
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from jaxnbv.acquisition import Score
+from jaxnbv.answers import Quantity
 from jaxnbv.camera import Pose
 from jaxnbv.checks import InputError
 from jaxnbv.search.base import CandidateSearch, Problem, Proposal, best_unvisited
@@ -15,6 +17,10 @@ class FarthestView(CandidateSearch):
     """Farthest point sampling of views: the candidate whose nearest visited camera is farthest away."""
 
     uses_samples: ClassVar[bool] = False
+
+    def quantity(self, score: Score) -> Quantity:
+        meaning = "distance from a candidate to the nearest camera so far; the surface is not looked at."
+        return Quantity("distance to the nearest camera", "scene units", meaning)
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """Values are distances in scene units; the key is not used."""
@@ -26,6 +32,10 @@ class RandomView(CandidateSearch):
     """A candidate drawn uniformly from those not visited yet."""
 
     uses_samples: ClassVar[bool] = False
+
+    def quantity(self, score: Score) -> Quantity:
+        meaning = "every open candidate drew a lot; the surface is not looked at."
+        return Quantity("lot drawn", "uniform on [0, 1)", meaning, smooth=False)
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """Values are the lots that were drawn, uniform on [0, 1)."""
@@ -41,6 +51,10 @@ class UncertaintyView(CandidateSearch):
     """
 
     uses_samples: ClassVar[bool] = True
+
+    def quantity(self, score: Score) -> Quantity:
+        meaning = "length of the principal ray along which the posterior samples disagree whether it has hit."
+        return Quantity("uncertain length of the principal ray", "scene units", meaning)
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """Values are lengths in scene units; the key is not used."""

@@ -2,7 +2,6 @@
 
 from jaxnbv.tasks.classification import Classifier as Classifier
 from jaxnbv.tasks.classification import CrossEntropy as CrossEntropy
-from jaxnbv.tasks.classification import HostClassifier as HostClassifier
 from jaxnbv.tasks.classification import MixedEntropy as MixedEntropy
 from jaxnbv.tasks.classification import NegativeEntropy as NegativeEntropy
 from jaxnbv.tasks.classification import predict as predict
@@ -11,6 +10,8 @@ from jaxnbv.tasks.heat import Coldest as Coldest
 from jaxnbv.tasks.heat import ColdestPoint as ColdestPoint
 from jaxnbv.tasks.heat import body_temperature as body_temperature
 from jaxnbv.tasks.heat import coldest_point as coldest_point
+from jaxnbv.tasks.host import HostClassifier as HostClassifier
+from jaxnbv.tasks.host import HostSegmenter as HostSegmenter
 from jaxnbv.tasks.segmentation import Segmenter as Segmenter
 from jaxnbv.tasks.segmentation import SoftPartCount as SoftPartCount
 from jaxnbv.tasks.segmentation import part_counts as part_counts

@@ -1,24 +1,25 @@
 """Classification: which class is the object of?
 
 A classifier is any function from a `PointCloud` (rows, masked) to log-probabilities, log p = classifier(cloud): a
-network of `jaxnbv.networks`, one of your own, or a `HostClassifier`.
+network of `jaxnbv.networks`, one of your own, or a `HostClassifier`. In an attribute `classes` it may say their names.
 """
 
 from collections.abc import Callable
-from typing import ClassVar, TypeAlias
+from typing import TypeAlias
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.acquisition import ExpectedUtilityImprovement, Score, preferred_batch_size, zero_if_empty
-from jaxnbv.checks import InputError, require
+from jaxnbv.acquisition import Score, context_of, preferred_batch_size, zero_if_empty
+from jaxnbv.answers import Answer, Quantity
+from jaxnbv.checks import require
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
 
 Classifier: TypeAlias = Callable[[PointCloud], Float[Array, " classes"]]
-Context: TypeAlias = tuple[PointCloud, Float[Array, " classes"]]
+# Their shape is checked by `Score.check`.
+Context: TypeAlias = tuple[PointCloud, Array]
 
 
 def entropy(log_p: Float[Array, "*batch classes"]) -> Float[Array, "*batch"]:
@@ -48,20 +49,58 @@ class NegativeEntropy(eqx.Module):
         """As the classifier prefers."""
         return preferred_batch_size(self.classifier)
 
+    @property
+    def improvement(self) -> Quantity:
+        """What its expected improvement is."""
+        meaning = "how much an imagined scan lowers the entropy of the classes, mean over posterior samples."
+        return Quantity("expected reduction of entropy", "nats", meaning)
 
-class CrossEntropy(Score):
-    """The paper's alpha^(CE): -sum_c p_c^(t) log p_c^(t+1), of the classes' probabilities given D and given D u scan.
+    def answer(self, cloud: PointCloud) -> "ClassAnswer":
+        """The probabilities of the classes."""
+        return _answer(self.classifier, _log_p(self.classifier, cloud))
+
+    def check(self, cloud: PointCloud) -> None:
+        """**Raises:** `ValueError` if the classifier's answer on D is not a vector of log-probabilities."""
+        check_log_p(_log_p(self.classifier, cloud))
+
+
+class ClassScore(Score):
+    """A score that compares what a classifier says of D and of D u scan.
 
     - `classifier`: a function from a cloud to log-probabilities.
     - `num_points`: D is thinned to so many by farthest point sampling, once a step, before scans are added to it.
     """
 
-    classifier: Classifier
-    num_points: int = eqx.field(static=True, default=1024)
+    classifier: eqx.AbstractVar[Classifier]
+    num_points: eqx.AbstractVar[int]
 
     def context(self, cloud: PointCloud) -> Context:
         """D, thinned, and log p^(t)."""
-        return _context(self, cloud)
+        thinned = limit_capacity(cloud, self.num_points)
+        return thinned, self.classifier(thinned)
+
+    @property
+    def batch_size(self) -> int:
+        """As the classifier prefers."""
+        return preferred_batch_size(self.classifier)
+
+    def answer(self, cloud: PointCloud) -> "ClassAnswer":
+        """The probabilities of the classes given D."""
+        return _answer(self.classifier, context_of(self, cloud)[1])
+
+    def check(self, cloud: PointCloud) -> None:
+        """**Raises:** `ValueError` if the classifier's answer on D is not a vector of log-probabilities."""
+        check_log_p(context_of(self, cloud)[1])
+
+
+class CrossEntropy(ClassScore):
+    """The paper's alpha^(CE): -sum_c p_c^(t) log p_c^(t+1), of the classes' probabilities given D and given D u scan.
+
+    - `classifier`, `num_points`: see `ClassScore`.
+    """
+
+    classifier: Classifier
+    num_points: int = eqx.field(static=True, default=1024)
 
     def __call__(self, context: Context, scan: PointCloud) -> Float[Array, ""]:
         """In nats; the least there is, zero, for a scan that sees nothing."""
@@ -69,17 +108,17 @@ class CrossEntropy(Score):
         return zero_if_empty(scan, cross_entropy(log_p, self.classifier(concatenate(cloud, scan))))
 
     @property
-    def batch_size(self) -> int:
-        """As the classifier prefers."""
-        return preferred_batch_size(self.classifier)
+    def quantity(self) -> Quantity:
+        meaning = "cross-entropy of the classes before and after an imagined scan, mean over posterior samples."
+        return Quantity("expected cross-entropy", "nats", meaning)
 
 
-class MixedEntropy(Score):
+class MixedEntropy(ClassScore):
     """Cross-entropy while the class is open, entropy reduction once it is nearly settled (the authors' code).
 
     `CrossEntropy` where the entropy of p^(t) is above `threshold` (nats), else max(0, H(p^(t)) - H(p^(t+1))).
 
-    - `classifier`, `num_points`: as in `CrossEntropy`.
+    - `classifier`, `num_points`: see `ClassScore`.
     """
 
     classifier: Classifier
@@ -88,10 +127,6 @@ class MixedEntropy(Score):
 
     def __check_init__(self):
         require(self.threshold >= 0, f"the entropy's threshold is {self.threshold}; it must not be negative")
-
-    def context(self, cloud: PointCloud) -> Context:
-        """D, thinned, and log p^(t)."""
-        return _context(self, cloud)
 
     def __call__(self, context: Context, scan: PointCloud) -> Float[Array, ""]:
         """In nats; zero for a scan that sees nothing."""
@@ -102,78 +137,59 @@ class MixedEntropy(Score):
         return zero_if_empty(scan, jnp.where(before > self.threshold, cross_entropy(log_p, log_q), reduction))
 
     @property
-    def batch_size(self) -> int:
-        """As the classifier prefers."""
-        return preferred_batch_size(self.classifier)
+    def quantity(self) -> Quantity:
+        meaning = "expected cross-entropy, or expected reduction of entropy once the class is nearly settled."
+        return Quantity("expected cross-entropy or reduction of entropy", "nats", meaning)
 
 
-def _context(score: CrossEntropy | MixedEntropy, cloud: PointCloud) -> Context:
-    thinned = limit_capacity(cloud, score.num_points)
-    return thinned, score.classifier(thinned)
+class ClassAnswer(Answer):
+    """The probabilities of the classes; the likeliest five are told."""
+
+    form: str = "{:.2f}"
+
+    @property
+    def shown(self) -> tuple[int, ...]:
+        return tuple(sorted(np.argsort(-self.values)[:5].tolist()))
+
+    def sentence(self, before: Answer | None = None) -> str:
+        best = int(np.argmax(self.values))
+        text = f"The classifier says {self.names[best]} with probability {self.values[best]:.2f}"
+        if before is not None:
+            previous = int(np.argmax(before.values))
+            behind = "" if best == previous else f", behind {self.names[previous]} with {before.values[previous]:.2f}"
+            text += f" (was {before.values[best]:.2f}{behind})"
+        return f"{text}."
+
+
+def _answer(classifier: Classifier, log_p: Float[Array, " classes"]) -> ClassAnswer:
+    p = np.exp(np.asarray(log_p, np.float64))
+    names = getattr(classifier, "classes", None) or tuple(f"class {index}" for index in range(len(p)))
+    return ClassAnswer(tuple(names), p)
+
+
+def check_log_p(log_p: Array) -> None:
+    """Raise `ValueError` unless these are log-probabilities of classes."""
+    require(
+        jnp.ndim(log_p) == 1 and jnp.size(log_p) >= 2,
+        f"the classifier's answer has shape {jnp.shape(log_p)}: give log-probabilities, one for each of two classes or "
+        "more",
+    )
+    total = float(jnp.sum(jnp.exp(log_p)))
+    require(
+        abs(total - 1.0) < 1e-3,
+        f"the classifier's answers are not log-probabilities: their exponentials sum to {total:.4g}; apply log_softmax "
+        "to its logits",
+    )
+
+
+def predict(score: Score, cloud: PointCloud) -> Float[Array, " classes"] | None:
+    """log p of the classes given D, as the score sees them; None for a score that does not classify."""
+    if isinstance(score, ClassScore):
+        return context_of(score, cloud)[1]
+    classifier = getattr(getattr(score, "utility", None), "classifier", None)
+    return None if classifier is None else _log_p(classifier, context_of(score, cloud)[0])
 
 
 @eqx.filter_jit
-def predict(score: Score, cloud: PointCloud) -> Float[Array, " classes"] | None:
-    """log p of the classes given D, as the score sees them; None for a score that does not classify."""
-    if isinstance(score, CrossEntropy | MixedEntropy):
-        return score.context(cloud)[1]
-    if isinstance(score, ExpectedUtilityImprovement) and isinstance(score.utility, NegativeEntropy):
-        return score.utility.classifier(score.context(cloud)[0])
-    return None
-
-
-def class_names(score: Score) -> tuple[str, ...] | None:
-    """What the classes are called, where the score's classifier says so in an attribute `classes`."""
-    classifier = getattr(score, "classifier", None) or getattr(getattr(score, "utility", None), "classifier", None)
-    return getattr(classifier, "classes", None)
-
-
-class HostClassifier(eqx.Module):
-    """A classifier that runs outside JAX, a PyTorch model say: for search over candidates only.
-
-    - `function`: from points (b, n, 3), unit normals (b, n, 3) and mask (b, n), as NumPy arrays, to log-probabilities
-      (b, num_classes). It is called with up to 128 candidates of one posterior sample at once.
-    - `num_classes`: how many classes it tells apart.
-
-    **Raises:** `ValueError` when a gradient is asked for. A function that returns another shape, or fails, fails within
-    JAX, which raises its own `RuntimeError` with the message in its text.
-    """
-
-    function: Callable = eqx.field(static=True)
-    num_classes: int = eqx.field(static=True)
-    batch_size: ClassVar[int] = 128
-
-    def __check_init__(self):
-        require(self.num_classes >= 2, f"num_classes is {self.num_classes}; a classifier tells at least two apart")
-
-    def __call__(self, cloud: PointCloud) -> Float[Array, " classes"]:
-        """Log-probabilities of one cloud; under `vmap`, of all of them in one call."""
-        return _call_host(cloud, self)
-
-
-@eqx.filter_custom_jvp
-def _call_host(cloud: PointCloud, host: HostClassifier) -> Float[Array, " classes"]:
-    def call(points, normals, mask):
-        batch = mask.shape[:-1]
-        flat = (np.asarray(a).reshape(-1, *a.shape[len(batch) :]) for a in (points, normals, mask))
-        log_p = np.asarray(host.function(*flat), dtype=points.dtype)
-        expected = (int(np.prod(batch)), host.num_classes)
-        require(
-            log_p.shape == expected,
-            f"the classifier returned shape {log_p.shape}, not {expected}: log-probabilities, a row a cloud",
-        )
-        total = np.exp(log_p).sum(axis=-1)
-        require(
-            bool((np.abs(total - 1.0) < 1e-3).all()),
-            f"the classifier's answers are not log-probabilities: their exponentials sum to {total.flat[0]:.4g}; "
-            "apply log_softmax to its logits",
-        )
-        return log_p.reshape(*batch, host.num_classes)
-
-    result = jax.ShapeDtypeStruct((host.num_classes,), cloud.points.dtype)
-    return jax.pure_callback(call, result, cloud.points, cloud.normals, cloud.mask, vmap_method="broadcast_all")
-
-
-@_call_host.def_jvp
-def _call_host_jvp(primals, tangents):
-    raise InputError("a HostClassifier has no derivative: use DiscreteSearch, or write the classifier in JAX")
+def _log_p(classifier: Classifier, cloud: PointCloud) -> Array:
+    return classifier(cloud)

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxnbv.acquisition import Score
+from jaxnbv.answers import Quantity
 from jaxnbv.cloud import PointCloud
 from jaxnbv.neighbours import nearest_squared_distance
 
@@ -18,6 +19,11 @@ class Coverage(Score):
     def __call__(self, context: PointCloud, scan: PointCloud) -> Float[Array, ""]:
         """Unidirectional Chamfer distance from the scan to D; zero for a scan that sees nothing."""
         return jnp.sum(jnp.where(scan.mask, nearest_squared_distance(scan.points, context), 0.0))
+
+    @property
+    def quantity(self) -> Quantity:
+        meaning = "squared distances to the cloud, summed over an imagined scan, mean over posterior samples."
+        return Quantity("expected coverage gain", "scene units²", meaning)
 
     @property
     def batch_size(self) -> int:

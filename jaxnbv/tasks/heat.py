@@ -7,16 +7,17 @@ from functools import partial
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from loky import cpu_count, get_reusable_executor
 
+from jaxnbv.answers import Answer, Quantity, coordinates, number
 from jaxnbv.checks import AnyArray, InputError, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.diffusion import HeatProblem, Temperature, cloud_temperature, mesh_temperature, refine
 from jaxnbv.scanning import TriangleMesh
+from jaxnbv.tasks.host import call_on_host
 
 # Longest edge, in scene units, of the triangles on which the true temperature is computed: within 2 % of that on ever
 # finer ones at the default radius, in seconds.
@@ -73,29 +74,43 @@ class ColdestPoint(eqx.Module):
 
         With no point to take the minimum over it is the least there can be, -(u0 + T power): any point improves on it.
         """
-        return _call_host(cloud, self)
+        source = jnp.asarray(self.heat.source, cloud.points.dtype)
+        # The source is told with each cloud: here it may be a value that JAX does not know yet.
+        heat = replace(self.heat, source=np.zeros(3))
+        values = partial(_values, heat=heat, reached_only=self.reached_only, workers=self.workers)
+        return call_on_host(values, (), "ColdestPoint", cloud.points, cloud.mask, source)
+
+    @property
+    def improvement(self) -> Quantity:
+        """What its expected improvement is."""
+        meaning = "how much colder than now the coldest point is with an imagined scan, mean over posterior samples."
+        return Quantity("expected fall of the least temperature", "degrees", meaning)
+
+    def answer(self, cloud: PointCloud) -> "ColdestAnswer":
+        """Where the cloud is coldest, and its temperature there."""
+        point, temperature = coldest_point(cloud, self.heat, self.reached_only)
+        return ColdestAnswer(("coldest",), np.array([temperature]), point=point)
 
 
-@eqx.filter_custom_jvp
-def _call_host(cloud: PointCloud, utility: ColdestPoint) -> Float[Array, ""]:
-    origin = replace(utility.heat, source=np.zeros(3))
+class ColdestAnswer(Answer):
+    """The temperature of the coldest point, and where it is (scene coordinates)."""
 
-    def call(points, mask, source):
-        batch = mask.shape[:-1]
-        points, mask, source = (np.asarray(a).reshape(-1, *a.shape[len(batch) :]) for a in (points, mask, source))
-        clouds = [rows[filled] for rows, filled in zip(points, mask, strict=True)]
-        problems = [replace(origin, source=own) for own in source]
-        values = _map(partial(_value, reached_only=utility.reached_only), clouds, problems, utility.workers)
-        return np.asarray(values, points.dtype).reshape(batch)
+    point: Float[np.ndarray, "3"] = eqx.field(default_factory=lambda: np.zeros(3))
 
-    result = jax.ShapeDtypeStruct((), cloud.points.dtype)
-    source = jnp.asarray(utility.heat.source, cloud.points.dtype)
-    return jax.pure_callback(call, result, cloud.points, cloud.mask, source, vmap_method="broadcast_all")
+    def line(self, before: Answer | None = None) -> str:
+        change = "" if before is None else f" (was {number(float(before.values[0]))})"
+        return f"coldest at {coordinates(self.point)}, {number(float(self.values[0]))} degrees{change}"
+
+    def sentence(self, before: Answer | None = None) -> str:
+        return f"The cloud is {self.line(before)}."
 
 
-@_call_host.def_jvp
-def _call_host_jvp(primals, tangents):
-    raise InputError("ColdestPoint has no derivative, as its Laplacian runs outside JAX: use DiscreteSearch")
+def _values(
+    points: np.ndarray, mask: np.ndarray, source: np.ndarray, heat: HeatProblem, reached_only: bool, workers: int
+) -> list[float]:
+    clouds = [rows[filled] for rows, filled in zip(points, mask, strict=True)]
+    problems = [replace(heat, source=own) for own in source]
+    return _map(partial(_value, reached_only=reached_only), clouds, problems, workers)
 
 
 def _value(points: np.ndarray, heat: HeatProblem, reached_only: bool) -> float:

@@ -2,18 +2,21 @@
 
 A segmenter is any function from a `PointCloud` (rows, masked) to the probabilities p_ic that point i belongs to part c,
 with rows of zeros for points that are not there: p = segmenter(cloud), (points, parts). The points may be fewer than
-the cloud's, where the segmenter thins it; `jaxnbv.networks.CloudSegmenter` makes one of a network.
+the cloud's, where the segmenter thins it; `jaxnbv.networks.CloudSegmenter` makes one of a network, `HostSegmenter` of a
+function outside JAX. In an attribute `part_names`, by their index, it may say which parts it is asked for.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxnbv.acquisition import preferred_batch_size
+from jaxnbv.answers import Answer, Quantity
 from jaxnbv.checks import require
 from jaxnbv.cloud import PointCloud
 
@@ -44,6 +47,39 @@ class SoftPartCount(eqx.Module):
     def batch_size(self) -> int:
         """As the segmenter prefers."""
         return preferred_batch_size(self.segmenter)
+
+    @property
+    def improvement(self) -> Quantity:
+        """What its expected improvement is."""
+        meaning = "how much an imagined scan raises the soft count of the parts, mean over posterior samples."
+        return Quantity("expected gain in parts", "parts", meaning)
+
+    def answer(self, cloud: PointCloud) -> "PartAnswer":
+        """How many points are predicted of each part: of those that the segmenter names, or of those that it finds."""
+        counts = np.asarray(_counts(self.segmenter, cloud), np.float64)
+        known: Mapping[int, str] | None = getattr(self.segmenter, "part_names", None)
+        names = tuple((known or {}).get(index, f"part {index}") for index in range(len(counts)))
+        return PartAnswer(names, counts, asked=tuple(np.flatnonzero(counts > 0).tolist() if known is None else known))
+
+
+class PartAnswer(Answer):
+    """How many points are predicted of each part; `asked`: of which it is told."""
+
+    form: str = "{:.0f}"
+    asked: tuple[int, ...] = ()
+
+    @property
+    def shown(self) -> tuple[int, ...]:
+        return self.asked
+
+    def sentence(self, before: Answer | None = None) -> str:
+        listed = ", ".join(f"{self.names[index]} {self.values[index]:.0f}" for index in self.shown) or "none"
+        return f"Points predicted of each part: {listed}."
+
+
+@eqx.filter_jit
+def _counts(segmenter: Segmenter, cloud: PointCloud) -> Int[Array, " parts"]:
+    return part_counts(segmenter(cloud))
 
 
 def part_counts(p: Float[Array, "points parts"]) -> Int[Array, " parts"]:

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 from tqdm import tqdm
 
+from jaxnbv.answers import Answer, Quantity
 from jaxnbv.camera import Pose
 from jaxnbv.checks import AnyArray
 from jaxnbv.episode import Episode
@@ -16,10 +17,9 @@ from jaxnbv.planner import Planner, State
 from jaxnbv.scanning import Grid
 from jaxnbv.search import Proposal
 from jaxnbv.surfaces import TrigonometricPosterior
-from jaxnbv.viz.findings import Finding, finding
 from jaxnbv.viz.sphere import unit
 from jaxnbv.viz.trajectories import Ascents, SphereMap, ascents_of, open_values, wider_map
-from jaxnbv.viz.words import Quantity, describe_choice, describe_first, quantity
+from jaxnbv.viz.words import describe_choice, describe_first
 
 COVERAGE_RADIUS = 0.05
 # The variance of one point costs a triangular solve with the whole cloud, the slope two evaluations of the mean.
@@ -81,7 +81,7 @@ class ViewData(eqx.Module):
     - `coverage`: share of the true surface within `COVERAGE_RADIUS` of the cloud; None where the truth is not known.
     - `count`: points of the cloud after this view.
     - `sentence`: what happened, in words.
-    - `finding`: what is known of the object after this view; None for a task that has no answer but the cloud.
+    - `answer`: what is known of the object after this view; None for a task that has no answer but the cloud.
     """
 
     number: int
@@ -93,7 +93,7 @@ class ViewData(eqx.Module):
     coverage: float | None
     count: int
     sentence: str
-    finding: Finding | None
+    answer: Answer | None
 
     @property
     def spatial_ascents(self) -> Ascents | None:
@@ -124,7 +124,7 @@ def report_data(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, p
     """
     planner = episode.planner
     truth = truth_points(episode.scene, jax.random.key(0)) if truth is None else truth
-    values = quantity(planner.search, planner.acquisition)
+    values = planner.search.quantity(planner.acquisition)
     drawn: list[ViewData] = []
     states = episode.states()
     for index, view in enumerate(tqdm(episode.views, desc="drawing views", disable=not progress)):
@@ -143,9 +143,9 @@ def report_data(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, p
             words = describe_choice(
                 values, choice.value, choice.rank, others, starts, view.pose, earlier, len(new), count, change
             )
-        known = finding(planner.acquisition, view.cloud, None if before is None else before.finding)
-        if known is not None:
-            words += f" {known.sentence}"
+        answer = planner.acquisition.answer(view.cloud)
+        if answer is not None:
+            words += f" {answer.sentence(None if before is None else before.answer)}"
         drawn.append(
             ViewData(
                 number=index + 1,
@@ -157,7 +157,7 @@ def report_data(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, p
                 coverage=covered,
                 count=count,
                 sentence=f"View {index + 1} {words}",
-                finding=known,
+                answer=answer,
             )
         )
     return ReportData(tuple(drawn), values)

@@ -17,13 +17,14 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 from PIL import Image
 from tqdm import tqdm
 
+from jaxnbv.answers import Quantity, number
 from jaxnbv.camera import Camera
 from jaxnbv.viz import sphere
 from jaxnbv.viz.data import COVERAGE_RADIUS, Choice, ReportData, ViewData
 from jaxnbv.viz.render import draw_scene
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, log_ticks, round_range
 from jaxnbv.viz.trajectory_figures import draw_ascents, trajectory_figure
-from jaxnbv.viz.words import Quantity, number, percent
+from jaxnbv.viz.words import percent
 
 STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
+from jaxnbv.answers import Quantity
 from jaxnbv.camera import Camera
 from jaxnbv.checks import AnyArray
 from jaxnbv.episode import Episode
@@ -25,7 +26,6 @@ from jaxnbv.viz.render import beside, frustum
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, VALUE_LINES, colour_scale, log_ticks
 from jaxnbv.viz.trajectories import Ascents
 from jaxnbv.viz.trajectory_figures import frusta_steps, small_frusta, spatial_range
-from jaxnbv.viz.words import Quantity
 
 _MAX_BEFORE, _MAX_NEW = 4000, 2500
 _ASCENT_CAPTION = """

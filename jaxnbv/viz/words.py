@@ -1,71 +1,9 @@
-"""What happened at every view, in words, and what the values of a search are called."""
+"""What happened at every view, in words."""
 
-import equinox as eqx
 import numpy as np
-from jaxtyping import Float
 
-from jaxnbv.acquisition import ExpectedUtilityImprovement, Score
+from jaxnbv.answers import Quantity, coordinates, number
 from jaxnbv.camera import Pose
-from jaxnbv.search import FarthestView, RandomView, Search, UncertaintyView
-from jaxnbv.tasks import ColdestPoint, Coverage, CrossEntropy, MixedEntropy, NegativeEntropy, SoftPartCount
-
-
-class Quantity(eqx.Module):
-    """What a search maximises.
-
-    - `name`, `unit`: in words; the unit is empty where there is none.
-    - `meaning`: the rest of a caption that begins with "Value:".
-    - `smooth`: whether values between two candidates mean anything.
-    """
-
-    name: str
-    unit: str
-    meaning: str
-    smooth: bool = True
-
-    @property
-    def label(self) -> str:
-        return f"{self.name} ({self.unit})" if self.unit else self.name
-
-    def show(self, value: float) -> str:
-        """A value with its unit, where the unit is a length or an area."""
-        return f"{number(value)} {self.unit}" if self.unit.startswith("scene units") else number(value)
-
-
-def quantity(search: Search, score: Score) -> Quantity:
-    """What the values of a search are, from the kinds of search and score."""
-    if isinstance(search, FarthestView):
-        meaning = "distance from a candidate to the nearest camera so far; the surface is not looked at."
-        return Quantity("distance to the nearest camera", "scene units", meaning)
-    if isinstance(search, RandomView):
-        meaning = "every open candidate drew a lot; the surface is not looked at."
-        return Quantity("lot drawn", "uniform on [0, 1)", meaning, smooth=False)
-    if isinstance(search, UncertaintyView):
-        meaning = "length of the principal ray along which the posterior samples disagree whether it has hit."
-        return Quantity("uncertain length of the principal ray", "scene units", meaning)
-    if isinstance(score, Coverage):
-        meaning = "squared distances to the cloud, summed over an imagined scan, mean over posterior samples."
-        return Quantity("expected coverage gain", "scene units²", meaning)
-    if isinstance(score, CrossEntropy):
-        meaning = "cross-entropy of the classes before and after an imagined scan, mean over posterior samples."
-        return Quantity("expected cross-entropy", "nats", meaning)
-    if isinstance(score, MixedEntropy):
-        meaning = "expected cross-entropy, or expected reduction of entropy once the class is nearly settled."
-        return Quantity("expected cross-entropy or reduction of entropy", "nats", meaning)
-    if isinstance(score, ExpectedUtilityImprovement) and isinstance(score.utility, NegativeEntropy):
-        meaning = "how much an imagined scan lowers the entropy of the classes, mean over posterior samples."
-        return Quantity("expected reduction of entropy", "nats", meaning)
-    if isinstance(score, ExpectedUtilityImprovement) and isinstance(score.utility, SoftPartCount):
-        meaning = "how much an imagined scan raises the soft count of the parts, mean over posterior samples."
-        return Quantity("expected gain in parts", "parts", meaning)
-    if isinstance(score, ExpectedUtilityImprovement) and isinstance(score.utility, ColdestPoint):
-        meaning = "how much colder than now the coldest point is with an imagined scan, mean over posterior samples."
-        return Quantity("expected fall of the least temperature", "degrees", meaning)
-    if isinstance(score, ExpectedUtilityImprovement):
-        meaning = "how much an imagined scan raises the utility of the cloud, mean over posterior samples."
-        return Quantity("expected utility improvement", "", meaning)
-    meaning = "score of an imagined scan, mean over posterior samples."
-    return Quantity(f"acquisition, {type(score).__name__}", "", meaning)
 
 
 def describe_first(pose: Pose, points: int, covered: float | None) -> str:
@@ -145,12 +83,6 @@ def place(pose: Pose) -> str:
     return f"{coordinates(position)}, {abs(elevation):.0f}° {side} the horizon"
 
 
-def coordinates(point: Float[np.ndarray, "3"]) -> str:
-    """A point in scene units."""
-    x, y, z = (f"{coordinate:.2f}".replace("-", "−") for coordinate in point)
-    return f"({x}, {y}, {z})"
-
-
 def _aim(pose: Pose) -> str:
     """By how much a camera looks past the origin, where it does."""
     position, forward = (np.asarray(vector, dtype=np.float64) for vector in (pose.position, pose.forward))
@@ -169,9 +101,3 @@ def nearest_angle(pose: Pose, earlier: list[Pose]) -> float:
 def percent(share: float) -> str:
     """A share in whole percent."""
     return f"{100 * share:.0f} %"
-
-
-def number(value: float) -> str:
-    """Three significant digits, without an exponent where none is needed."""
-    text = f"{value:,.0f}" if 999.5 <= abs(value) < 1e7 else f"{value:.3g}"
-    return text.replace("-", "−")

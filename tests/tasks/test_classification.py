@@ -12,15 +12,13 @@ from jaxnbv.checks import InputError
 from jaxnbv.cloud import PointCloud, concatenate, farthest_point_subsample
 from jaxnbv.planner import Planner
 from jaxnbv.scanning import Grid, GridSurface, scan
-from jaxnbv.search import DiscreteSearch
+from jaxnbv.search import DiscreteSearch, FarthestView
 from jaxnbv.surfaces import GeometricSPSR
-from jaxnbv.tasks import Coverage
+from jaxnbv.tasks import Coverage, HostClassifier
 from jaxnbv.tasks.classification import (
     CrossEntropy,
-    HostClassifier,
     MixedEntropy,
     NegativeEntropy,
-    class_names,
     cross_entropy,
     entropy,
     predict,
@@ -333,14 +331,46 @@ def test_predictions_are_those_of_d_as_the_score_sees_it():
     assert predict(ExpectedUtilityImprovement(lambda cloud: jnp.sum(cloud.points)), data) is None
 
 
-def test_class_names_where_the_classifier_says_them():
-    class Named(eqx.Module):
-        classes: tuple[str, ...] = eqx.field(static=True, default=("cup", "bowl"))
+class Named(eqx.Module):
+    classes: tuple[str, ...] = eqx.field(static=True, default=("cup", "bowl"))
 
-        def __call__(self, cloud):
-            return jnp.log(jnp.array([0.5, 0.5]))
+    def __call__(self, cloud):
+        return jnp.log(jnp.array([0.3, 0.7]))
 
-    assert class_names(CrossEntropy(Named())) == ("cup", "bowl")
-    assert class_names(ExpectedUtilityImprovement(NegativeEntropy(Named()))) == ("cup", "bowl")
-    assert class_names(CrossEntropy(linear)) is None
-    assert class_names(Coverage()) is None
+
+def test_answers_name_the_classes_where_the_classifier_does():
+    data = random_cloud(50, 60)
+    for score in (CrossEntropy(Named()), MixedEntropy(Named()), ExpectedUtilityImprovement(NegativeEntropy(Named()))):
+        answer = score.answer(data)
+        assert answer.names == ("cup", "bowl")
+        np.testing.assert_allclose(answer.values, [0.3, 0.7], atol=1e-6)
+        assert answer.line() == "cup 0.30   bowl 0.70"
+    before = eqx.tree_at(lambda a: a.values, answer, np.array([0.9, 0.1]))
+    assert answer.line(before) == "cup 0.90 -> 0.30   bowl 0.10 -> 0.70"
+    assert answer.sentence(before) == (
+        "The classifier says bowl with probability 0.70 (was 0.10, behind cup with 0.90)."
+    )
+    assert CrossEntropy(linear).answer(data).names[:2] == ("class 0", "class 1")
+
+
+@pytest.mark.parametrize(
+    ("classifier", "message"),
+    [
+        (lambda cloud: jnp.array([3.0, 1.0, 0.2]), "apply log_softmax"),
+        (lambda cloud: jnp.array([jnp.nan, 0.0]), "sum to nan"),
+        (lambda cloud: jnp.zeros((1, 2)), r"shape \(1, 2\)"),
+        (lambda cloud: jnp.zeros(1), r"shape \(1,\)"),
+    ],
+)
+def test_what_is_no_log_probability_is_named_at_the_first_scan(classifier, message):
+    data = random_cloud(50, 60)
+    model, camera = GeometricSPSR(lengthscale=0.05, truncation=8), Camera(height=8, width=8)
+    for score in (
+        CrossEntropy(classifier),
+        MixedEntropy(classifier),
+        ExpectedUtilityImprovement(NegativeEntropy(classifier)),
+    ):
+        with pytest.raises(InputError, match=message):
+            Planner(model, camera, score, DiscreteSearch(7), carving=None).init(data)
+    # Asked for nothing, it says nothing.
+    Planner(model, camera, CrossEntropy(classifier), FarthestView(7), carving=None).init(data)

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 import jaxnbv as nbv
+from jaxnbv.answers import number
 from jaxnbv.datasets.demo import demo_object
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.search import Search
@@ -22,7 +23,6 @@ from jaxnbv.viz.data import choice_of, mean_surface
 from jaxnbv.viz.render import frustum
 from jaxnbv.viz.sphere import from_mollweide, mollweide, smooth_map
 from jaxnbv.viz.style import log_ticks, round_range
-from jaxnbv.viz.words import number, quantity
 
 CAMERA = nbv.Camera(height=24, width=24)
 
@@ -155,7 +155,7 @@ def test_baselines_are_labelled_in_their_own_units(search, label, words):
 
 def test_other_scores_keep_their_name():
     utility = nbv.ExpectedUtilityImprovement(lambda cloud: jnp.sum(cloud.mask) * 1.0)
-    assert quantity(nbv.DiscreteSearch(), utility).label == "expected utility improvement"
+    assert nbv.DiscreteSearch().quantity(utility).label == "expected utility improvement"
 
 
 def test_the_sentence_tells_the_numbers_of_the_step(episode, data):

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 import jaxnbv as nbv
+from jaxnbv.answers import number
 from jaxnbv.camera import look_at
 from jaxnbv.cli.actions.episodes import _summarise
 from jaxnbv.datasets.demo import demo_object
@@ -24,10 +25,10 @@ from jaxnbv.viz.data import choice_of
 from jaxnbv.viz.report import report_html
 from jaxnbv.viz.trajectories import MAP_VIEWS, step_values
 from jaxnbv.viz.trajectory_figures import frusta_steps, small_frusta
-from jaxnbv.viz.words import describe_choice, number, quantity
+from jaxnbv.viz.words import describe_choice
 
 CAMERA = nbv.Camera(height=16, width=16)
-COVERAGE = quantity(nbv.DiscreteSearch(), nbv.Coverage())
+COVERAGE = nbv.DiscreteSearch().quantity(nbv.Coverage())
 
 
 def joined(first, second):

@@ -9,6 +9,7 @@ import numpy as np
 import typer
 
 from jaxnbv.acquisition import Score
+from jaxnbv.answers import Answer
 from jaxnbv.camera import Camera, Pose, look_at
 from jaxnbv.checks import InputError, require
 from jaxnbv.cli.actions.planners import (
@@ -40,8 +41,6 @@ from jaxnbv.planner import Planner
 from jaxnbv.scanning import SDFSurface, SensorNoise, Surface, TriangleMesh, load_mesh, scan
 from jaxnbv.tasks import Coverage
 from jaxnbv.viz import write_report
-from jaxnbv.viz.findings import Finding, finding
-from jaxnbv.viz.words import quantity
 
 
 def demo(task: Task, scene: int, framing: Framing, first: str | None, options: EpisodeOptions) -> None:
@@ -141,8 +140,8 @@ def _position(option: str, text: str) -> tuple[float, float, float]:
 def _summarise(episode: Episode) -> None:
     """Lines for each view: where from, why, and what it told."""
     score = episode.planner.acquisition
-    sought = quantity(episode.planner.search, score)
-    known: Finding | None = None
+    sought = episode.planner.search.quantity(score)
+    before: Answer | None = None
     for index, view in enumerate(episode.views, start=1):
         position = ", ".join(f"{value:+.2f}" for value in np.asarray(view.pose.position))
         line = f"view {index}   from ({position})   {int(view.scan.count):5d} points, {int(view.cloud.count):5d} kept"
@@ -158,6 +157,7 @@ def _summarise(episode: Episode) -> None:
                 better = "found nothing better" if float(view.proposal.value) <= best else f"improved on {best:.4g}"
                 line += f"where ascent from {len(ways.values)} of {len(values)} candidates {better}"
         typer.echo(line)
-        known = finding(score, view.cloud, known)
-        if known is not None:
-            typer.echo(f"         {known.line}")
+        answer = score.answer(view.cloud)
+        if answer is not None:
+            typer.echo(f"         {answer.line(before)}")
+        before = answer

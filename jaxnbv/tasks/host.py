@@ -1,0 +1,125 @@
+"""Functions that run outside JAX, on the host: a PyTorch model, a solver. They have no derivative, so a search over
+candidates alone can use them."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Shaped
+
+from jaxnbv.checks import InputError, require
+from jaxnbv.cloud import PointCloud
+
+
+class HostClassifier(eqx.Module):
+    """A classifier that runs outside JAX, a PyTorch model say: for search over candidates only.
+
+    - `function`: from points (b, n, 3), unit normals (b, n, 3) and mask (b, n), as NumPy arrays, to log-probabilities
+      (b, num_classes). It is called with up to 128 candidates of one posterior sample at once.
+    - `num_classes`: how many classes it tells apart.
+
+    **Raises:** `ValueError` when a gradient is asked for. A function that returns another shape, or fails, fails within
+    JAX, which raises its own `RuntimeError` with the message in its text.
+    """
+
+    function: Callable = eqx.field(static=True)
+    num_classes: int = eqx.field(static=True)
+    batch_size: ClassVar[int] = 128
+
+    def __check_init__(self):
+        require(self.num_classes >= 2, f"num_classes is {self.num_classes}; a classifier tells at least two apart")
+
+    def __call__(self, cloud: PointCloud) -> Float[Array, " classes"]:
+        """Log-probabilities of one cloud; under `vmap`, of all of them in one call."""
+        return call_on_host(self._log_p, (self.num_classes,), "a HostClassifier", *_rows(cloud))
+
+    def _log_p(self, points: np.ndarray, normals: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        log_p = np.asarray(self.function(points, normals, mask))
+        expected = (len(mask), self.num_classes)
+        require(
+            log_p.shape == expected,
+            f"the classifier returned shape {log_p.shape}, not {expected}: log-probabilities, a row a cloud",
+        )
+        total = np.exp(log_p).sum(axis=-1)
+        require(
+            bool((np.abs(total - 1.0) < 1e-3).all()),
+            f"the classifier's answers are not log-probabilities: their exponentials sum to {total.flat[0]:.4g}; "
+            "apply log_softmax to its logits",
+        )
+        return log_p
+
+
+class HostSegmenter(eqx.Module):
+    """A segmenter that runs outside JAX, a PyTorch model say: for search over candidates only.
+
+    - `function`: from points (b, n, 3), unit normals (b, n, 3) and mask (b, n), as NumPy arrays, to probabilities of
+      the parts (b, n, num_parts). It is called with up to 128 candidates of one posterior sample at once; rows that the
+      mask leaves out count for nothing, whatever it says of them.
+    - `num_parts`: how many parts it tells apart.
+
+    **Raises:** as `HostClassifier`.
+    """
+
+    function: Callable = eqx.field(static=True)
+    num_parts: int = eqx.field(static=True)
+    batch_size: ClassVar[int] = 128
+
+    def __check_init__(self):
+        require(self.num_parts >= 1, f"num_parts is {self.num_parts}; a segmenter knows one part at least")
+
+    def __call__(self, cloud: PointCloud) -> Float[Array, "points parts"]:
+        """Probabilities of the parts of one cloud's points; under `vmap`, of all clouds in one call."""
+        return call_on_host(self._p, (cloud.capacity, self.num_parts), "a HostSegmenter", *_rows(cloud))
+
+    def _p(self, points: np.ndarray, normals: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        p = np.asarray(self.function(points, normals, mask))
+        expected = (*mask.shape, self.num_parts)
+        require(
+            p.shape == expected,
+            f"the segmenter returned shape {p.shape}, not {expected}: probabilities, a row a point",
+        )
+        p = np.where(mask[..., None], p, 0.0)
+        odd = p[mask].size and float(np.abs(p[mask].sum(axis=-1) - 1.0).max())
+        require(
+            bool((p >= 0).all()) and odd < 1e-3,
+            f"the segmenter's answers are not probabilities: their sum is off one by up to {odd:.4g}; apply softmax to "
+            "its logits",
+        )
+        return p
+
+
+def _rows(cloud: PointCloud) -> tuple[Array, Array, Array]:
+    return cloud.points, cloud.normals, cloud.mask
+
+
+def call_on_host(
+    function: Callable, shape: tuple[int, ...], name: str, *arrays: Shaped[Array, "..."]
+) -> Float[Array, "..."]:
+    """A function of NumPy arrays with a leading axis more than here: of one entry or, under `vmap`, of all of them.
+
+    - `shape`: of the result of one entry; it has the type of the first array.
+    - `name`: of what is called, for the error where its derivative is asked for.
+
+    **Raises:** `ValueError` when it is differentiated.
+    """
+    return _call(arrays, function, shape, name)
+
+
+@eqx.filter_custom_jvp
+def _call(arrays: tuple[Any, ...], function: Callable, shape: tuple[int, ...], name: str) -> Float[Array, "..."]:
+    own_axes, dtype = arrays[0].ndim, arrays[0].dtype
+
+    def call(*given):
+        batch = given[0].shape[: given[0].ndim - own_axes]
+        flat = (np.asarray(a).reshape(-1, *a.shape[len(batch) :]) for a in given)
+        return np.asarray(function(*flat), dtype).reshape((*batch, *shape))
+
+    return jax.pure_callback(call, jax.ShapeDtypeStruct(shape, dtype), *arrays, vmap_method="broadcast_all")
+
+
+@_call.def_jvp
+def _call_jvp(primals, tangents):
+    *_, name = primals
+    raise InputError(f"{name} has no derivative, as it runs outside JAX: use DiscreteSearch, or write it in JAX")

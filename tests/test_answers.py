@@ -1,0 +1,94 @@
+"""What is sought and what is known, for scores and utilities of one's own as for those that ship."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxnbv as nbv
+
+POINTS = np.array([[0.0, 0.3, 0.0], [0.1, 0.8, 0.0], [0.0, -0.2, 0.4]])
+CLOUD = nbv.PointCloud.from_arrays(POINTS, np.eye(3), 5)
+
+
+def greatest_height(cloud):
+    return jnp.max(jnp.where(cloud.mask, cloud.points[:, 1], -jnp.inf))
+
+
+class Metres:
+    """A utility that says more of itself."""
+
+    improvement = nbv.Quantity("expected growth", "metres", "how much higher.")
+
+    def __call__(self, cloud):
+        return 2.0 * greatest_height(cloud)
+
+    def answer(self, cloud):
+        return nbv.Answer(("height", "points"), np.array([float(self(cloud)), float(cloud.count)]), "{:.1f}")
+
+
+class Unnamed(nbv.Score):
+    def context(self, cloud):
+        return None
+
+    def __call__(self, context, scan):
+        return jnp.sum(scan.mask)
+
+
+def test_a_function_has_its_name_and_value():
+    score = nbv.ExpectedUtilityImprovement(greatest_height)
+    assert score.quantity.label == "expected improvement of greatest height"
+    answer, before = score.answer(CLOUD), score.answer(_first())
+    assert answer.line(before) == "greatest height 0.3 -> 0.8"
+    assert answer.sentence(before) == "Greatest height 0.8 (was 0.3)."
+    assert answer.sentence() == "Greatest height 0.8."
+    assert nbv.ExpectedUtilityImprovement(lambda cloud: 1.0).quantity.name == "expected utility improvement"
+
+
+def _first():
+    return nbv.PointCloud.from_arrays(POINTS[:1], np.eye(3)[:1], 5)
+
+
+def test_a_utility_says_what_it_likes():
+    score = nbv.ExpectedUtilityImprovement(Metres(), num_points=1)
+    assert score.quantity.label == "expected growth (metres)"
+    # Of all of D, however few points the score looks at.
+    assert score.answer(CLOUD).line() == "height 1.6   points 3.0"
+    assert nbv.DiscreteSearch().quantity(score) == score.quantity
+
+
+def test_a_score_without_words_has_its_type():
+    assert Unnamed().quantity.name == "acquisition, Unnamed"
+    assert Unnamed().answer(CLOUD) is None
+    assert nbv.Coverage().answer(CLOUD) is None
+    assert nbv.Coverage().quantity.unit == "scene units²"
+
+
+def test_a_search_that_does_not_ask_the_score_says_so():
+    units = {nbv.FarthestView: "scene units", nbv.RandomView: "uniform on [0, 1)", nbv.UncertaintyView: "scene units"}
+    for kind, unit in units.items():
+        assert kind().quantity(nbv.Coverage()).unit == unit
+        assert kind().quantity(Unnamed()) == kind().quantity(nbv.Coverage())
+    assert not nbv.RandomView().quantity(Unnamed()).smooth
+
+
+@pytest.mark.parametrize(
+    ("utility", "message"),
+    [
+        (lambda cloud: cloud.points[:, 1], r"shape \(5,\): a utility is one number"),
+        (lambda cloud: jnp.log(-1.0 - jnp.sum(cloud.mask)), "first cloud is nan: it must be finite"),
+        (lambda cloud: 1.0 / jnp.sum(~cloud.mask[:3]), "must be finite"),
+    ],
+)
+def test_an_impossible_utility_is_named_at_the_first_scan(utility, message):
+    score = nbv.ExpectedUtilityImprovement(utility)
+    planner = nbv.Planner(nbv.GeometricSPSR(0.05, truncation=8), nbv.Camera(), score, nbv.DiscreteSearch(4), capacity=5)
+    with pytest.raises(nbv.InputError, match=message):
+        planner.init(CLOUD)
+
+
+def test_under_jit_nothing_is_asked():
+    score = nbv.ExpectedUtilityImprovement(lambda cloud: jnp.nan * jnp.sum(cloud.mask))
+    model = nbv.GeometricSPSR(0.05, truncation=8)
+    planner = nbv.Planner(model, nbv.Camera(), score, nbv.DiscreteSearch(4), capacity=5, carving=None)
+    assert jax.eval_shape(planner.init, CLOUD).cloud.capacity == 5
