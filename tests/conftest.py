@@ -26,6 +26,26 @@ install_import_hook("jaxnbv", "beartype.beartype")
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
+# A worker takes files as a whole, so that what a module prepares is prepared once; the longest come first.
+LONGEST_FIRST = (
+    "test_cli.py",
+    "test_notebooks.py",
+    "test_readme.py",
+    "test_scan_derivatives.py",
+    "test_gradient.py",
+    "test_spsr.py",
+    "test_pose_gradients.py",
+    "test_trajectories.py",
+    "test_screened.py",
+    "test_storage.py",
+    "test_report.py",
+)
+
+
+def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: LONGEST_FIRST.index(item.path.name) if item.path.name in LONGEST_FIRST else 99)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def compiled_programs_are_let_go():
     """A whole run would hold gigabytes of them."""
