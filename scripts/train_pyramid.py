@@ -2,7 +2,7 @@
 
 Two stages: clouds of true scans, then the same beside clouds whose last view is of a posterior sample, since those are
 what an acquisition feeds the network. Clouds and checkpoints stay in the output folder, so that a run that was
-interrupted continues. An hour and a half on one CPU core.
+interrupted continues. An hour and a quarter on one CPU core.
 """
 
 import argparse
