@@ -18,8 +18,8 @@ from jaxnbv.scanning.sdf import Capsule, Sphere
 from jaxnbv.search import ConstrainedPoses, DiscreteSearch, FreePoses, GradientSearch, HybridSearch, SpherePoses
 from jaxnbv.storage import EpisodeFolder, describe
 from jaxnbv.surfaces import GeometricSPSR
-from jaxnbv.tasks import Coverage
-from jaxnbv.tasks.classification import CrossEntropy, HostClassifier, MixedEntropy, NegativeEntropy
+from jaxnbv.tasks import Coverage, HostClassifier
+from jaxnbv.tasks.classification import CrossEntropy, MixedEntropy, NegativeEntropy
 
 SCENE = SDFSurface(Sphere(0.7) | Capsule([0.2, 0.3, -0.4], [0.5, 0.6, 0.9], 0.3))
 FIRST, ELSEWHERE, KEY = look_at((0.8, 0.9, 2.2)), look_at((-0.8, 0.9, 2.2)), jax.random.key(0)
