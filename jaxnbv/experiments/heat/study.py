@@ -206,8 +206,13 @@ def _run(study: HeatStudy, scene: HeatScene, index: int, method: str, first: int
     planner, key, poses = study.planner(method, scene.source), _key(index, "episode"), study.poses()
     halving = study.planner("heat-halving", scene.source) if compare else None
     candidates, clouds, taken, compared = [first], [], [], []
-    before = None
-    for view, step in enumerate(steps(planner, scene_sensor(scene.surface, Camera()), poses[first], key, Camera())):
+    before, camera = None, scene_sensor(scene.surface, Camera())
+
+    def sensor(pose, noise_key):
+        # From the candidate itself: a compiled search may have rounded it otherwise than `seen_clouds` does.
+        return camera(poses[_candidate(study, pose)], noise_key)
+
+    for view, step in enumerate(steps(planner, sensor, poses[first], key, Camera())):
         clouds.append(step.state.cloud)
         if before is not None and (proposal := step.view.proposal) is not None:
             candidates.append(_candidate(study, proposal.pose))
