@@ -43,17 +43,15 @@ VOLUME = nbv.Box()
 VIEWS, LEAST_HITS = 2, 100
 
 Variant = Callable[[nbv.Grid], tuple[nbv.SurfaceModel, nbv.Carving | None]]
-TWO_SCALES = nbv.ScreenedSPSR().base
+TWO_SCALES, USUAL = nbv.ScreenedSPSR().base, nbv.ScreenedSPSR().values
 VARIANTS: dict[str, Variant] = {
     "paper": lambda grid: (nbv.GeometricSPSR(), None),
     "+ carving": lambda grid: (nbv.GeometricSPSR(), nbv.Carving()),
     "+ volume": lambda grid: (nbv.ScreenedSPSR(nbv.GeometricSPSR(), (nbv.OutsideBoundary(),)), nbv.Carving()),
     "+ two scales": lambda grid: (nbv.ScreenedSPSR(TWO_SCALES, (nbv.OutsideBoundary(),)), nbv.Carving()),
-    "+ values": lambda grid: (
-        nbv.ScreenedSPSR(TWO_SCALES, (nbv.OutsideBoundary(), nbv.OnSurface(), nbv.Thickness())),
-        nbv.Carving(),
-    ),
-    "all": lambda grid: (nbv.ScreenedSPSR(), nbv.Carving()),
+    "default": lambda grid: (nbv.ScreenedSPSR(), nbv.Carving()),
+    "+ thickness": lambda grid: (nbv.ScreenedSPSR(values=(*USUAL, nbv.Thickness())), nbv.Carving()),
+    "+ seen empty": lambda grid: (nbv.ScreenedSPSR(values=(*USUAL, nbv.Thickness(), nbv.SeenEmpty())), nbv.Carving()),
 }
 # What the table shows: heading, key of the record, digits.
 COLUMNS = (

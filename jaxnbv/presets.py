@@ -12,9 +12,7 @@ from jaxnbv.surfaces import (
     OnSurface,
     OutsideBoundary,
     ScreenedSPSR,
-    SeenEmpty,
     SurfaceModel,
-    Thickness,
 )
 from jaxnbv.volume import Box, Volume
 
@@ -51,5 +49,5 @@ def imagination(
     # Shorter scales need more frequencies, but time and memory grow with their cube.
     truncation = min(round((20 if quick else usual.base.truncation) / scale), 30 if quick else 48)
     base = GeometricSPSR(lengthscales, usual.base.variance, truncation)
-    values = OutsideBoundary(volume), OnSurface(), Thickness(scale * Thickness.depth), SeenEmpty()
+    values = OutsideBoundary(volume), OnSurface()
     return Imagination(ScreenedSPSR(base, values, reach=scale * usual.reach), Carving(volume))

@@ -14,7 +14,6 @@ from jaxnbv import (
     Planner,
     RandomView,
     ScreenedSPSR,
-    Thickness,
 )
 from jaxnbv.presets import ModelName, imagination
 
@@ -43,8 +42,6 @@ def test_lengths_are_in_proportion_to_the_object():
     assert jnp.allclose(small.base.lengthscale, 0.5 * large.base.lengthscale)
     assert jnp.array_equal(small.base.variance, large.base.variance)
     assert small.reach == 0.5 * large.reach
-    depths = [[one.depth for one in model.values if isinstance(one, Thickness)] for model in (large, small)]
-    assert depths == [[0.15], [0.075]]
     assert small.base.truncation > large.base.truncation
 
 
