@@ -121,6 +121,35 @@ class ExpectedUtilityImprovement(Score):
         return name if name and name != "<lambda>" else "utility"
 
 
+class Several(Score):
+    """Several scores of the same scans, so that they are compared on the same samples at the cost of one scan.
+
+    Its value is a vector, the scores' values in their order (a score whose value is a vector itself takes as many
+    places): for `expected_score`, not for a search.
+    """
+
+    scores: tuple[Score, ...]
+
+    def context(self, cloud: PointCloud) -> tuple[Any, ...]:
+        """That of each."""
+        return tuple(score.context(cloud) for score in self.scores)
+
+    def __call__(self, context: tuple[Any, ...], scan: PointCloud) -> Float[Array, " values"]:
+        """The scores of one scan."""
+        found = [score(own, scan) for score, own in zip(self.scores, context, strict=True)]
+        return jnp.concatenate([jnp.atleast_1d(value) for value in found])
+
+    @property
+    def batch_size(self) -> int:
+        """The least that one prefers."""
+        return min(score.batch_size for score in self.scores)
+
+    def check(self, cloud: PointCloud) -> None:
+        """**Raises:** `ValueError` as one of them does."""
+        for score in self.scores:
+            score.check(cloud)
+
+
 @eqx.filter_jit
 def context_of(score: Score, cloud: PointCloud) -> Any:
     """What a score makes of D, compiled."""
@@ -161,24 +190,24 @@ def check_differentiable(score: Score, capacity: int, num_rays: int) -> None:
 
 def expected_score(
     score: Score, cloud: PointCloud, surfaces: GridSurface, camera: Camera, poses: Pose
-) -> Float[Array, " poses"]:
+) -> Float[Array, "poses *scores"]:
     """The acquisition at each of a batch of poses: mean over the sampled surfaces of the score of what they would show.
 
-    `surfaces` carries the samples along its leading axis.
+    `surfaces` carries the samples along its leading axis. `Several` scores have an axis of their own.
     """
     return mean_score(score, score.context(cloud), surfaces, camera, poses)
 
 
 def mean_score(
     score: Score, context: Any, surfaces: GridSurface, camera: Camera, poses: Pose
-) -> Float[Array, " poses"]:
+) -> Float[Array, "poses *scores"]:
     """`expected_score`, given what the score's `context` made of D.
 
     Samples are taken one after the other, with all poses scanned at once and scored `score.batch_size` at a time, so
     memory is that of one sample's scans.
     """
 
-    def of_sample(surface: GridSurface) -> Float[Array, " poses"]:
+    def of_sample(surface: GridSurface) -> Float[Array, "poses *scores"]:
         scans = scan(surface, camera, poses)
         return jax.lax.map(lambda imagined: score(context, imagined), scans, batch_size=score.batch_size)
 

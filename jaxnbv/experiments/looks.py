@@ -1,5 +1,6 @@
 """What methods look like in the charts of all studies."""
 
+import zlib
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -35,12 +36,14 @@ LOOKS = {
     "random": Look(GREY, "--", "X"),
     "oracle": Look(INK, ":", "*"),
 }
+# Methods of one's own, in turn.
+_OTHERS = (Look("#8c564b", "-", "p"), Look("#7f3fbf", "-", "h"), Look("#b8860b", "--", "d"))
 _SIZES = {"*": 8.0, "o": 5.0, "P": 6.0, "X": 6.0}
 
 
 def line_of(method: str) -> dict[str, Any]:
     """A method's line and markers, as arguments of `Axes.plot`; that of a study's first method is thicker."""
-    look = LOOKS[method]
+    look = LOOKS.get(method) or _OTHERS[zlib.crc32(method.encode()) % len(_OTHERS)]
     ours = look == _FIRST
     line = {"color": look.colour, "ls": look.line, "lw": 2.0 if ours else 1.2}
     size = _SIZES.get(look.marker, 4.4) * (1.2 if ours else 1.0)

@@ -32,3 +32,8 @@ def numbered_mesh(files: Sequence[str], index: int) -> TriangleMesh:
         f"there is no scene {index}: the study has {len(files)} meshes, counted from 0; run as many scenes",
     )
     return load_mesh(files[index])
+
+
+def as_mesh_files(meshes: str | Path | Sequence[str] | None) -> tuple[str, ...]:
+    """A folder's `mesh_files`, files as they are, or none."""
+    return mesh_files(meshes) if isinstance(meshes, str | Path) else tuple(meshes or ())

@@ -1,29 +1,115 @@
-"""Tables of a study: aligned text, and CSV."""
+"""Tables of a study: aligned text, and CSV with one row a number."""
 
 import csv
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from jaxtyping import Float
+from jaxnbv.experiments.measures import Measure, Record, Row, difference_rows, methods_of, result_rows
+from jaxnbv.experiments.statistics import LEVEL
+from jaxnbv.experiments.study import Study
 
-Row = dict[str, Any]
+_RESULT = ("group", "quantity", "by", "at", "method", "mean", "standard_error", "low", "high", "rank", "scenes")
+_DIFFERENCE = ("group", "quantity", "by", "at", "method", "baseline", "mean", "low", "high", "excludes_zero", "scenes")
+_MARKS = {1: "**", 2: "* "}
 
 
-def standard_error(values: Float[np.ndarray, "scenes *rest"]) -> Float[np.ndarray, "*rest"]:
-    """Of the mean over scenes, element by element; NaN for a single scene."""
-    if len(values) < 2:
-        return np.full(values.shape[1:], np.nan)
-    return np.asarray(values.std(axis=0, ddof=1) / math.sqrt(len(values)))
+def write_tables(records: Sequence[Record], study: type[Study], folder: str | Path) -> list[Path]:
+    """Write the tables of a study into a folder, and return their paths: `results.txt`, the text of `summary`, and
+    with one row a number `results.csv`, `differences.csv` and what else the study has.
+
+    **Raises:** `ValueError` if there are no records, no method that all of them hold, or their numbers of views differ.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    text = folder / "results.txt"
+    text.write_text(summary(records, study), encoding="utf-8")
+    results, differences = all_rows(records, study)
+    paths = [
+        write_csv(folder / "results.csv", results, _RESULT),
+        write_csv(folder / "differences.csv", differences, _DIFFERENCE),
+    ]
+    own = [
+        write_csv(folder / f"{name}.csv", rows, list(rows[0])) for name, rows in study.own_rows(records).items() if rows
+    ]
+    return [text, *paths, *own]
+
+
+def all_rows(records: Sequence[Record], study: type[Study]) -> tuple[list[Row], list[Row]]:
+    """Results and differences, of each group of scenes."""
+    methods_of(records, study.methods)
+    results, differences = [], []
+    for group, members in study.groups(records).items():
+        methods, label = methods_of(members, study.methods), {"group": group}
+        results += [label | row for row in result_rows(members, methods, study.measures)]
+        compared = [measure for measure in study.measures if measure.listed or measure.better]
+        differences += [label | row for row in difference_rows(members, methods, compared, study.reference)]
+    return results, differences
+
+
+def summary(records: Sequence[Record], study: type[Study], groups: bool = True) -> str:
+    """A study as text: its measures by method, differences to its reference, and what else it tells.
+
+    - `groups`: of each group of its scenes; otherwise of all of them alone.
+
+    **Raises:** as `write_tables`.
+    """
+    results, differences = all_rows(records, study)
+    sections = [
+        underlined(f"{study.title}: {count_of(len(records), 'scene')}"),
+        f"{study.explanation}\n"
+        f"Mean over scenes +- its standard error, or in percent; in [ ] the {LEVEL:.0%} bootstrap interval over\n"
+        f"scenes. ** the best, * the second. Differences: {study.reference} minus another method over the same\n"
+        "scenes, * where the interval excludes zero.\n",
+    ]
+    for group, members in study.groups(records).items():
+        if not groups and group != "all":
+            continue
+        if group != "all":
+            sections.append(underlined(f"{group}: {count_of(len(members), 'scene')}"))
+        for measure in study.measures:
+            here = [row for row in results if (row["group"], row["quantity"]) == (group, measure.name)]
+            if measure.listed and here:
+                unit = f" ({measure.unit})" if measure.unit else ""
+                sections.append(f"{measure.title}{unit}, by {measure.by}\n{_grid(here, 'method', _result, measure)}")
+            here = [row for row in differences if (row["group"], row["quantity"]) == (group, measure.name)]
+            if measure.listed and here:
+                title = f"{measure.title}: {study.reference} minus another method"
+                sections.append(f"{title}\n{_grid(here, 'baseline', _difference, measure)}")
+    return "\n".join([*sections, *study.notes(records)])
+
+
+def _grid(rows: Sequence[Row], key: str, write, measure: Measure) -> str:
+    names, columns = (list(dict.fromkeys(row[what] for row in rows)) for what in (key, "at"))
+    cells = {(name, str(column)): "-" for name in names for column in columns}
+    cells |= {(row[key], str(row["at"])): write(row, measure) for row in rows}
+    return text_grid(measure.by, names, [str(column) for column in columns], cells)
+
+
+def _result(row: Row, measure: Measure) -> str:
+    mark = _MARKS.get(row["rank"], "  ") if measure.better else ""
+    if measure.percent and row["low"] is not None:
+        mean, low, high = (100.0 * row[key] for key in ("mean", "low", "high"))
+        return f"{mean:3.0f} [{low:3.0f},{high:4.0f}]{mark}"
+    if not measure.paired:
+        return f"{row['mean']:.{measure.digits}f} ({row['scenes']:3d})"
+    error = row["standard_error"]
+    error = "" if math.isnan(error) else f" +- {error:.{measure.digits}f}"
+    return f"{row['mean']:.{measure.digits}f}{error}{mark}"
+
+
+def _difference(row: Row, measure: Measure) -> str:
+    mean, low, high = ((100.0 if measure.percent else 1.0) * row[key] for key in ("mean", "low", "high"))
+    form = "+.0f" if measure.percent else f"+.{measure.digits}f"
+    return f"{mean:{form}} [{low:{form}}, {high:{form}}]{'*' if row['excludes_zero'] else ' '}"
 
 
 def text_grid(corner: str, rows: Sequence[str], columns: Sequence[str], cells: Mapping[tuple[str, str], str]) -> str:
     """One line for each row, aligned; cells by row and column."""
     width = max(map(len, (*cells.values(), *columns))) + 2
-    head = f"  {corner:15}" + "".join(f"{column:>{width}}" for column in columns)
-    lines = [f"  {row:15}" + "".join(f"{cells[row, column]:>{width}}" for column in columns) for row in rows]
+    left = max(map(len, ("." * 13, *rows))) + 2
+    head = f"  {corner:{left}}" + "".join(f"{column:>{width}}" for column in columns)
+    lines = [f"  {row:{left}}" + "".join(f"{cells[row, column]:>{width}}" for column in columns) for row in rows]
     return "\n".join(line.rstrip() for line in [head, *lines]) + "\n"
 
 

@@ -3,18 +3,9 @@
 import csv
 import math
 
-import numpy as np
 import pytest
 
-from jaxnbv.experiments.tables import count_of, standard_error, text_grid, underlined, write_csv
-
-
-def test_standard_error_is_that_of_the_mean():
-    values = np.array([[1.0, 5.0], [2.0, 5.0], [6.0, 5.0]])
-    # Deviations from the mean 3 are -2, -1, 3: variance 14 / 2.
-    np.testing.assert_allclose(standard_error(values), [math.sqrt(7.0 / 3.0), 0.0])
-    assert standard_error(np.arange(8.0).reshape(2, 2, 2)).shape == (2, 2)
-    assert np.isnan(standard_error(np.zeros((1, 2, 3)))).all()
+from jaxnbv.experiments.tables import count_of, text_grid, underlined, write_csv
 
 
 def test_text_is_aligned_to_the_right_under_its_columns():

@@ -1,25 +1,89 @@
-"""What the commands of `jaxnbv study` work with."""
+"""Run a study of the registry: its scenes, tables, charts and pictures."""
 
-# ruff: noqa: F401
+import functools
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
-from jaxnbv.experiments.heat import figures as heat_figures
-from jaxnbv.experiments.heat import pictures as heat_pictures
-from jaxnbv.experiments.heat import report as heat_report
-from jaxnbv.experiments.heat import study as heat_study
-from jaxnbv.experiments.meshes import mesh_files
-from jaxnbv.experiments.parts import figures as part_figures
-from jaxnbv.experiments.parts import pictures as part_pictures
-from jaxnbv.experiments.parts import report as part_report
-from jaxnbv.experiments.parts import study as part_study
-from jaxnbv.experiments.pyramid import figures as pyramid_figures
-from jaxnbv.experiments.pyramid import pictures as pyramid_pictures
-from jaxnbv.experiments.pyramid import report as pyramid_report
-from jaxnbv.experiments.pyramid import study as pyramid_study
-from jaxnbv.experiments.reconstruction import figures as reconstruction_figures
-from jaxnbv.experiments.reconstruction import pictures as reconstruction_pictures
-from jaxnbv.experiments.reconstruction import report as reconstruction_report
-from jaxnbv.experiments.reconstruction import study as reconstruction_study
+import typer
+
+from jaxnbv.checks import InputError
+from jaxnbv.experiments.charts import write_charts
 from jaxnbv.experiments.records import RecordFolder
-from jaxnbv.networks import part_segmenter, pyramid_classifier
-from jaxnbv.presets import imagination
+from jaxnbv.experiments.registry import Entry
+from jaxnbv.experiments.study import Factory, Study
+from jaxnbv.experiments.tables import summary, write_tables
+from jaxnbv.model_name import ModelName
 from jaxnbv.storage import describe
+
+
+def study(
+    name: str,
+    entry: Entry,
+    scenes: int,
+    views: int,
+    methods: str | None,
+    own: Sequence[str] | None,
+    model: ModelName,
+    out: Path | None,
+    quick: bool,
+    **options: Any,
+) -> None:
+    """Run a study, or each of those that it consists of, and write what it found.
+
+    **Raises:** `ValueError` for unknown methods, or a method of one's own that cannot be found.
+    """
+    kind: type[Study] = _found(entry.study)
+    chosen, added = _methods(methods, kind.methods), {text: _own(text) for text in own or ()}
+    given = {option: value for option, value in options.items() if value is not None}
+    of_model = "" if model is ModelName.SCREENED else f"-{model}"
+    folder = out or Path("runs") / f"study-{name}{of_model}{'-quick' if quick else ''}"
+    if quick:
+        typer.echo("--quick: small settings and few scenes. This is not the full study; leave it out for that.")
+        scenes = min(scenes, kind.quick_scenes)
+    for part, settings in kind.configured(model, views, quick, **given).items():
+        config = {"study": describe(settings), "methods": sorted(chosen)}
+        config |= {"own": {text: describe(make) for text, make in added.items()}} if added else {}
+        count = min(scenes, settings.num_scenes or scenes)
+        run = functools.partial(settings.run_scene, methods=chosen, own=added)
+        records = RecordFolder(folder / part, config).collect(count, run)
+        write_tables(records, kind, folder / part)
+        write_charts(records, kind, folder / part)
+        if entry.pictures:
+            _found(entry.pictures)(records, settings, folder / part)
+        typer.echo(f"\n{f'{part}. ' if part else ''}{summary(records, kind, groups=False)}")
+        typer.echo(f"All tables as CSV, figures and pictures: {folder / part}\n")
+
+
+def _methods(asked: str | None, known: Sequence[str]) -> tuple[str, ...]:
+    if asked is None:
+        return tuple(known)
+    names = {name.strip() for name in asked.split(",")}
+    unknown = sorted(names - {*known})
+    if unknown:
+        raise InputError(f"unknown methods: {', '.join(unknown)}; choose from {', '.join(known)}")
+    return tuple(name for name in known if name in names)
+
+
+def _own(text: str) -> Factory:
+    """A function of a module that may lie in the current folder."""
+    if (here := os.getcwd()) not in sys.path:
+        sys.path.insert(0, here)
+    module, _, function = text.partition(":")
+    if not module or not function:
+        raise InputError(f"--method {text} names no function: write module:function, such as mine:planner")
+    try:
+        found = _found(text)
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"--method {text} cannot be found ({error}): start where the module lies") from error
+    if not callable(found):
+        raise InputError(f"--method {text} is a {type(found).__name__}; give a function of a study and a scene")
+    return found
+
+
+def _found(text: str) -> Any:
+    module, _, name = text.partition(":")
+    return getattr(importlib.import_module(module), name)

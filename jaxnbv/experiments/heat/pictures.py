@@ -16,10 +16,10 @@ from matplotlib.lines import Line2D
 
 from jaxnbv.camera import Camera, Pose, fibonacci_sphere
 from jaxnbv.cloud import PointCloud
-from jaxnbv.datasets import HeatScene
 from jaxnbv.diffusion import HeatProblem
-from jaxnbv.experiments.heat.report import Record, methods_of
-from jaxnbv.experiments.heat.study import HeatStudy, Truth, heat_problem, seen_clouds, true_temperature
+from jaxnbv.experiments.heat.study import HeatStudy, Truth, heat_problem
+from jaxnbv.experiments.measures import Record, methods_of
+from jaxnbv.experiments.study import Scene, views_of
 from jaxnbv.tasks import body_temperature
 from jaxnbv.viz.data import MeanSurface
 from jaxnbv.viz.figures import STYLE
@@ -30,8 +30,8 @@ _SHOWN = ("heat", "heat-reached", "farthest", "uncertainty", "random")
 # Without its palest colours, which would not stand out against the grey of what was not scanned.
 _HEAT = LinearSegmentedColormap.from_list("heat", mpl.colormaps["inferno"](np.linspace(0.0, 0.9, 256)))
 _TRUE, _ESTIMATED, _REACHED, _SOURCE = "#009e73", "#0072b2", "#56b4e9", "#d55e00"
-# Half of what a picture spans, pixels a side, places to look from that are tried.
-_REACH, _PIXELS, _TRIES = 1.6, 420, 80
+# Half of what a picture spans, places to look from that are tried.
+_REACH, _TRIES = 1.6, 80
 # A target counts as visible from a place if what is hit in its direction lies this near.
 _VISIBLE = 0.05
 _ROD = 0.1
@@ -48,7 +48,9 @@ class _Stage(NamedTuple):
     norm: Normalize
 
 
-def write_pictures(records: Sequence[Record], settings: HeatStudy, folder: str | Path, scenes: int = 4) -> list[Path]:
+def write_pictures(
+    records: Sequence[Record], study: HeatStudy, folder: str | Path, scenes: int = 4, pixels: int = 420
+) -> list[Path]:
     """Write `heat_<scene>.png` for the first scenes, not picked ones; return the paths.
 
     At the left the object's own temperature; a row a method, a column a number of views: the points of the cloud that
@@ -56,23 +58,26 @@ def write_pictures(records: Sequence[Record], settings: HeatStudy, folder: str |
     are drawn nearer than they stood. Methods are the two that seek cold by full search and the baselines, those of
     them that the records hold, else all that they do. Views are scanned again as they were.
 
-    **Raises:** `ValueError` if there are no records, no method that all of them hold, or their numbers of views differ.
+    - `pixels`: along a side of a picture.
+
+    **Raises:** `ValueError` if there are no records, or no method that all of them hold.
     """
-    present, folder = methods_of(records), Path(folder)
+    present, folder = methods_of(records, study.methods), Path(folder)
     methods = [method for method in _SHOWN if method in present] or present
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     with mpl.rc_context(STYLE):
         for record in sorted(records, key=lambda record: record["scene"])[:scenes]:
             paths.append(folder / f"heat_{record['scene']:03d}.png")
-            _picture(record, settings, methods).savefig(paths[-1], dpi=200)
+            _picture(record, study, methods, pixels).savefig(paths[-1], dpi=200)
     return paths
 
 
-def _picture(record: Record, study: HeatStudy, methods: Sequence[str]) -> Figure:
-    stage = _stage(study.scene(record["scene"]))
+def _picture(record: Record, study: HeatStudy, methods: Sequence[str], pixels: int) -> Figure:
+    scene = study.scene(record["scene"])
+    stage = _stage(study, scene, pixels)
     runs = [record["methods"][method] for method in methods]
-    views = len(runs[0]["candidates"])
+    views = views_of(runs[0])
     columns = sorted({math.ceil(views / 3), math.ceil(2 * views / 3), views})
 
     # Inches.
@@ -98,11 +103,11 @@ def _picture(record: Record, study: HeatStudy, methods: Sequence[str]) -> Figure
     for row, (method, run) in enumerate(zip(methods, runs, strict=True)):
         down = top + row * (tile + below)
         write(given - gap, down + 0.5 * tile, method, fontsize=9, fontweight="bold", ha="right")
-        clouds = seen_clouds(study, record["scene"], run["candidates"])
+        clouds = [cloud for _, cloud in study.seen(scene, run)]
+        taken = study.poses_of(run)
         for column, count in enumerate(columns):
             axes = place(given + column * (tile + gap), down, tile, tile)
-            poses = [study.poses()[candidate] for candidate in run["candidates"][:count]]
-            _draw_cloud(axes, stage, clouds[count - 1], poses)
+            _draw_cloud(axes, stage, clouds[count - 1], taken[:count])
             estimates = {name: {key: of[key][count - 1] for key in of} for name, of in run["estimates"].items()}
             _draw_estimates(axes, stage, estimates)
             if row == 0:
@@ -111,12 +116,12 @@ def _picture(record: Record, study: HeatStudy, methods: Sequence[str]) -> Figure
     return figure
 
 
-def _stage(scene: HeatScene) -> _Stage:
-    truth, heat = true_temperature(scene), heat_problem(scene)
+def _stage(study: HeatStudy, scene: Scene, pixels: int) -> _Stage:
+    truth, heat = study.truth(scene), heat_problem(scene)
     mesh = truth.mesh
     normals = np.asarray(_vertex_normals(mesh.vertices, mesh.faces))
     surface = MeanSurface(mesh.vertices, mesh.faces, normals, np.ones(len(mesh.vertices)))
-    still = Still(_eye(truth, np.asarray(heat.source, np.float64)), surface, _PIXELS, _REACH)
+    still = Still(_eye(truth, np.asarray(heat.source, np.float64)), surface, pixels, _REACH)
     still.paint(None)
     return _Stage(still, truth, heat, Normalize(0.0, float(truth.temperatures.max())))
 
@@ -144,7 +149,7 @@ def _sees(truth: Truth, eyes: Float[np.ndarray, "n 3"], target: Float[np.ndarray
 def _draw_truth(axes: Axes, stage: _Stage) -> None:
     _draw_points(axes, stage, stage.truth.points, stage.truth.temperatures, 2.2)
     _mark(axes, stage, np.asarray(stage.heat.source, np.float64), _SOURCE, "X", 7.0)
-    _finish(axes)
+    _finish(axes, stage)
     _mark(axes, stage, stage.truth.coldest, _TRUE, "*", 12.0)
 
 
@@ -157,7 +162,7 @@ def _draw_cloud(axes: Axes, stage: _Stage, cloud: PointCloud, poses: Sequence[Po
         draw_segments(axes, stage.still, ends, mpl.colors.to_rgba_array([GREY] * len(ends)), 0.7)
         (place,), _ = stage.still.project(1.09 * np.asarray(near.position, np.float64)[None])
         axes.text(place[0], place[1], str(number), fontsize=6.5, color=GREY, ha="center", va="center", zorder=4)
-    _finish(axes)
+    _finish(axes, stage)
 
 
 def _draw_points(
@@ -193,8 +198,9 @@ def _mark(axes: Axes, stage: _Stage, point: Float[np.ndarray, "3"], colour: str,
     axes.plot(pixels[0, 0], pixels[0, 1], marker, ms=size, mew=0.9, mfc=fill, mec=edge, zorder=6)
 
 
-def _finish(axes: Axes) -> None:
-    axes.set(xlim=(0, _PIXELS), ylim=(_PIXELS, 0), xticks=[], yticks=[])
+def _finish(axes: Axes, stage: _Stage) -> None:
+    size = stage.still.size
+    axes.set(xlim=(0, size), ylim=(size, 0), xticks=[], yticks=[])
     for spine in axes.spines.values():
         spine.set(visible=True, color=LINE, linewidth=0.8)
 

@@ -21,9 +21,9 @@ from jaxnbv.camera import Camera, Pose, fibonacci_sphere, look_at
 from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets import PartScene, Split, part_scene
 from jaxnbv.datasets.labelled import LabelledSolid
-from jaxnbv.experiments.parts.clouds import PART_CAMERA
-from jaxnbv.experiments.parts.report import Record, methods_of
-from jaxnbv.experiments.parts.study import TARGETS, PartStudy, discovery_time, seen_views
+from jaxnbv.experiments.measures import Record, methods_of
+from jaxnbv.experiments.parts.study import TARGET, TARGETS, PartStudy, discovery_time
+from jaxnbv.experiments.study import Scene
 from jaxnbv.networks import CATEGORIES
 from jaxnbv.scanning import SDFSurface, scan
 from jaxnbv.viz.figures import STYLE
@@ -31,12 +31,11 @@ from jaxnbv.viz.render import frustum
 from jaxnbv.viz.style import GREY, INK, LINE
 
 _SHOWN = ("discrete", "gradient-2dof", "farthest", "uncertainty")
-_TARGET = 60
 _FOUND = "#00734f"
 # Okabe and Ito's: a category has at most six parts.
 _COLOURS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#56b4e9", "#cc79a7")
-# Where pictures are taken from, half of what they span, pixels a side; the same of the tries for a good place.
-_DISTANCE, _REACH, _PIXELS = 11.0, 1.75, 420
+# Where pictures are taken from, half of what they span; tries for a good place, and their pixels.
+_DISTANCE, _REACH = 11.0, 1.75
 _TRIES, _TRY_PIXELS = 40, 40
 # Noise must not hide a point behind the surface that it lies on.
 _SLACK = 0.05
@@ -60,12 +59,14 @@ class _Stage(NamedTuple):
     def project(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
         """Pixels of points of the scene, and how far each lies in front of the object's surface."""
         local = (points - np.asarray(self.pose.position)) @ np.asarray(self.pose.rotation)
-        pixels = self.camera.focal_length * local[:, :2] / local[:, 2:] + 0.5 * _PIXELS
-        column, row = np.clip(pixels.astype(int), 0, _PIXELS - 1).T
+        pixels = self.camera.focal_length * local[:, :2] / local[:, 2:] + 0.5 * self.camera.width
+        column, row = np.clip(pixels.astype(int), 0, self.camera.width - 1).T
         return pixels - 0.5, self.depth[row, column] - local[:, 2]
 
 
-def write_pictures(records: Sequence[Record], settings: PartStudy, folder: str | Path, scenes: int = 3) -> list[Path]:
+def write_pictures(
+    records: Sequence[Record], study: PartStudy, folder: str | Path, scenes: int = 3, pixels: int = 420
+) -> list[Path]:
     """Write `parts_<scene>.png` for the scenes whose smallest part is the smallest share of the object's surface that
     shows, one to a category; return the paths.
 
@@ -75,16 +76,18 @@ def write_pictures(records: Sequence[Record], settings: PartStudy, folder: str |
     and the 2-DOF gradient search, farthest view and uncertainty, those of them that the records hold, else all that
     they do.
 
+    - `pixels`: along a side of a picture.
+
     **Raises:** `ValueError` if there are no records, or no method that all of them hold.
     """
-    present, folder = methods_of(records), Path(folder)
+    present, folder = methods_of(records, study.methods), Path(folder)
     methods = [method for method in _SHOWN if method in present] or present
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     with mpl.rc_context(STYLE):
         for record in _with_small_parts(records, scenes):
             paths.append(folder / f"parts_{record['scene']:03d}.png")
-            _picture(record, settings, methods).savefig(paths[-1], dpi=200)
+            _picture(record, study, methods, pixels).savefig(paths[-1], dpi=200)
     return paths
 
 
@@ -100,13 +103,14 @@ def _with_small_parts(records: Sequence[Record], count: int) -> list[Record]:
     return list(chosen.values())[:count]
 
 
-def _picture(record: Record, settings: PartStudy, methods: Sequence[str]) -> Figure:
+def _picture(record: Record, study: PartStudy, methods: Sequence[str], pixels: int) -> Figure:
     scene = part_scene(Split(record["split"]), record["scene"])
     colours = _part_colours(scene)
-    stage = _stage(scene, colours)
+    stage = _stage(scene, colours, pixels)
     runs = [record["methods"][method] for method in methods]
-    seen = [seen_views(settings, record, method) for method in methods]
-    segmenter = eqx.tree_at(lambda s: s.category, settings.segmenter, scene.category)
+    of_study = Scene(record["scene"], record["category"], SDFSurface(scene.solid), scene)
+    seen = [study.seen(of_study, run) for run in runs]
+    segmenter = eqx.tree_at(lambda s: s.category, study.segmenter, scene.category)
 
     # Inches: all methods share the first view, so it stands once, at the middle of the rows.
     tile, gap, below, left, top, margin, line = 1.5, 0.1, 0.36, 0.12, 0.74, 1.05, 0.2
@@ -132,7 +136,7 @@ def _picture(record: Record, settings: PartStudy, methods: Sequence[str]) -> Fig
     write(left, 0.18, f"Scene {record['scene']}: {record['category']}", fontsize=10, fontweight="bold")
     key = (
         "Points: the part that the segmenter says; strong are those of this view. "
-        f"Bars: points of each part, full at {_TARGET}. Framed: all parts have been found."
+        f"Bars: points of each part, full at {TARGET}. Framed: all parts have been found."
     )
     write(left, 0.38, key, fontsize=8, color=GREY)
     axes = place(left + 0.5 * (2.1 - true_wide), middle - 0.5 * block + 0.2, true_wide, true_tall)
@@ -148,6 +152,9 @@ def _picture(record: Record, settings: PartStudy, methods: Sequence[str]) -> Fig
     def draw(axes: Axes, row: int, column: int) -> None:
         shown, cloud = seen[row][column]
         _draw_view(axes, stage, segmenter.predict(cloud), shown, colours)
+        taken = study.poses_of(runs[row])[: column + 1]
+        for index, pose in enumerate(taken):
+            _draw_camera(axes, stage, study.camera, pose, is_new=index == column)
         _finish(axes, stage, runs[row], column, _of_parts(scene, colours))
 
     for row, (method, run) in enumerate(zip(methods, runs, strict=True)):
@@ -178,24 +185,26 @@ def _of_parts(scene: PartScene, colours: Float[np.ndarray, "labels 3"]) -> Float
     return colours[np.flatnonzero(np.asarray(scene.parts))]
 
 
-def _stage(scene: PartScene, colours: Float[np.ndarray, "labels 3"]) -> _Stage:
+def _stage(scene: PartScene, colours: Float[np.ndarray, "labels 3"], size: int) -> _Stage:
     """Seen from where each part shows nearly as much as from where it shows best."""
     places = _places()
     pixels = np.asarray(_part_pixels(scene.solid, places), np.float64)[:, np.asarray(scene.parts)]
     pose = places[int(np.argmax((pixels / pixels.max(axis=0)).min(axis=1)))]
     fov = 2.0 * math.atan(_REACH / _DISTANCE)
-    mask, labels, facing, depth = map(np.asarray, _render(scene.solid, Camera(fov, 2 * _PIXELS, 2 * _PIXELS), pose))
+    mask, labels, facing, depth = map(np.asarray, _render(scene.solid, Camera(fov, 2 * size, 2 * size), pose))
     lit = 0.62 + 0.42 * facing[:, None]
-    image = _smoothed(mask, np.clip(colours[labels] * lit, 0.0, 1.0))
-    ghost = _smoothed(mask, np.clip(mpl.colors.to_rgb(LINE) * (0.84 + 0.2 * facing[:, None]), 0.0, 1.0))
-    depth = depth.reshape(_PIXELS, 2, _PIXELS, 2).min(axis=(1, 3))
-    return _Stage(pose, Camera(fov, _PIXELS, _PIXELS), image, ghost, depth)
+    image = _smoothed(size, mask, np.clip(colours[labels] * lit, 0.0, 1.0))
+    ghost = _smoothed(size, mask, np.clip(mpl.colors.to_rgb(LINE) * (0.84 + 0.2 * facing[:, None]), 0.0, 1.0))
+    depth = depth.reshape(size, 2, size, 2).min(axis=(1, 3))
+    return _Stage(pose, Camera(fov, size, size), image, ghost, depth)
 
 
-def _smoothed(mask: Bool[np.ndarray, " rays"], colours: Float[np.ndarray, "rays 3"]) -> Float[np.ndarray, "h w 4"]:
+def _smoothed(
+    size: int, mask: Bool[np.ndarray, " rays"], colours: Float[np.ndarray, "rays 3"]
+) -> Float[np.ndarray, "h w 4"]:
     """Four rays a pixel; clear where they miss."""
     image = np.concatenate([colours, np.ones((len(mask), 1))], axis=1) * mask[:, None]
-    image = image.reshape(_PIXELS, 2, _PIXELS, 2, 4).mean(axis=(1, 3))
+    image = image.reshape(size, 2, size, 2, 4).mean(axis=(1, 3))
     image[..., :3] /= np.maximum(image[..., 3:], 1e-9)
     return np.clip(image, 0.0, 1.0)
 
@@ -234,12 +243,10 @@ def _draw_view(
 
 
 def _finish(axes: Axes, stage: _Stage, run: dict, view: int, colours: Float[np.ndarray, "parts 3"]) -> None:
-    """Cameras, frame and bars of one tile."""
-    for index in range(view + 1):
-        pose = Pose(*(np.asarray(run["views"][index][name], np.float32) for name in ("rotation", "position")))
-        _draw_camera(axes, stage, pose, is_new=index == view)
-    axes.set(xlim=(0, _PIXELS), ylim=(_PIXELS, 0), xticks=[], yticks=[])
-    found = discovery_time(np.asarray(run["counts"]), _TARGET)
+    """Frame and bars of one tile."""
+    size = stage.camera.width
+    axes.set(xlim=(0, size), ylim=(size, 0), xticks=[], yticks=[])
+    found = discovery_time(np.asarray(run["counts"]), TARGET)
     is_found = found is not None and found <= view + 1
     for spine in axes.spines.values():
         spine.set(visible=True, color=_FOUND if is_found else LINE, linewidth=1.6 if is_found else 0.8)
@@ -249,18 +256,18 @@ def _finish(axes: Axes, stage: _Stage, run: dict, view: int, colours: Float[np.n
     counts = run["counts"][view]
     width = 1.0 / len(counts)
     for index, (count, colour) in enumerate(zip(counts, colours, strict=True)):
-        full, x = min(count / _TARGET, 1.0), (index + 0.08) * width
+        full, x = min(count / TARGET, 1.0), (index + 0.08) * width
         for share, fill in ((1.0, LINE), (full, colour)):
             bar = Rectangle((x, -0.085), 0.84 * width * share, 0.04, transform=axes.transAxes, clip_on=False)
             bar.set(facecolor=fill, edgecolor="none")
             axes.add_patch(bar)
         text: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": 7, "transform": axes.transAxes}
-        axes.text((index + 0.5) * width, -0.1, str(count), color=INK if count >= _TARGET else GREY, **text)
+        axes.text((index + 0.5) * width, -0.1, str(count), color=INK if count >= TARGET else GREY, **text)
 
 
-def _draw_camera(axes: Axes, stage: _Stage, pose: Pose, is_new: bool) -> None:
+def _draw_camera(axes: Axes, stage: _Stage, camera: Camera, pose: Pose, is_new: bool) -> None:
     """A frustum; faint where the object hides it."""
-    ends = frustum(Pose(pose.rotation, _NEARER * pose.position), PART_CAMERA, _FRUSTUM_DEPTH)
+    ends = frustum(Pose(pose.rotation, _NEARER * pose.position), camera, _FRUSTUM_DEPTH)
     fine = ends[:, 0] + np.linspace(0.0, 1.0, 13)[:, None, None] * (ends[:, 1] - ends[:, 0])
     pixels, front = stage.project(fine.reshape(-1, 3))
     pixels, front = pixels.reshape(13, -1, 2), front.reshape(13, -1)

@@ -4,20 +4,20 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxnbv.camera import Camera, Pose
-from jaxnbv.checks import require
-from jaxnbv.datasets import PATTERNS, Framing, Split, pyramid_scene
+from jaxnbv.datasets import PATTERNS, Framing, Pyramid, Split, pyramid_scene
+from jaxnbv.experiments.measures import Record, methods_of
 from jaxnbv.experiments.pyramid.hits import PATTERN_PIXELS
-from jaxnbv.experiments.pyramid.report import Record, by_framing, methods_of
+from jaxnbv.experiments.pyramid.study import PyramidStudy
 from jaxnbv.scanning import SDFSurface, scan
-from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.style import GREY, LINE, NEW
 
@@ -29,34 +29,33 @@ _BACKGROUND = np.array(mpl.colors.to_rgb("#f3f5f8"))
 _PLAIN, _TINTED = np.array([0.68, 0.72, 0.78]), np.array(mpl.colors.to_rgb(NEW))
 
 
-def write_pictures(records: Sequence[Record], framing: str, folder: str | Path, scenes: int = 3) -> list[Path]:
-    """Write `views_<framing>_<scene>.png` for the first test scenes of a framing, not picked ones; return the paths.
+def write_pictures(records: Sequence[Record], study: PyramidStudy, folder: str | Path, scenes: int = 3) -> list[Path]:
+    """Write `views_<scene>.png` for the first scenes, not picked ones; return the paths.
 
     A row a method, a column a view: the true surface in the sensor's field of view, the pattern's pixels tinted, and
     beneath it the predicted class with its probability once this view is known. Rows are cross-entropy, farthest view
     and uncertainty, those of them that the records hold, else all that they do.
 
-    **Raises:** `ValueError` if there is no record of the framing.
+    **Raises:** `ValueError` if there are no records, or no method that all of them hold.
     """
-    chosen = by_framing(records).get(framing, [])[:scenes]
-    require(len(chosen) > 0, f"there is no record of the framing {framing!r}: run the study for it")
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    present = methods_of(chosen)
+    present, folder = methods_of(records, study.methods), Path(folder)
     methods = [method for method in _SHOWN if method in present] or present
+    folder.mkdir(parents=True, exist_ok=True)
     paths = []
     with mpl.rc_context(STYLE):
-        for record in chosen:
-            paths.append(folder / f"views_{framing}_{record['scene']:03d}.png")
-            _picture(record, methods).savefig(paths[-1], dpi=200)
+        for record in sorted(records, key=lambda record: record["scene"])[:scenes]:
+            paths.append(folder / f"views_{record['scene']:03d}.png")
+            _picture(record, study, methods).savefig(paths[-1], dpi=200)
     return paths
 
 
-def _picture(record: Record, methods: Sequence[str]) -> Figure:
-    runs = [record["methods"][method]["runs"][0] for method in methods]
-    views = len(runs[0]["candidates"])
-    wanted = sorted({candidate for run in runs for candidate in run["candidates"]})
-    images = dict(zip(wanted, _images(record, wanted), strict=True))
+def _picture(record: Record, study: PyramidStudy, methods: Sequence[str]) -> Figure:
+    held = [record["methods"][method] for method in methods]
+    runs = [method["runs"][0] for method in held]
+    views = len(runs[0]["log_p"])
+    taken = [study.poses_of(method if "views" in method else method["runs"][0])[:views] for method in held]
+    pyramid = pyramid_scene(Split(record["split"]), jnp.asarray(record["scene"]), Framing(record["framing"]))
+    images = [[_shade(*map(np.asarray, _render(pyramid, _plain(pose)))) for pose in poses] for poses in taken]
 
     # Inches: all methods share the first view, so it stands once, at the middle of the rows.
     tile, gap, below, left, top, margin = 1.25, 0.1, 0.36, 0.12, 0.8, 1.0
@@ -75,14 +74,14 @@ def _picture(record: Record, methods: Sequence[str]) -> Figure:
     for row, (method, run) in enumerate(zip(methods, runs, strict=True)):
         for column in range(1, views):
             axes = place(column, row)
-            _tile(axes, images[run["candidates"][column]], record["label"], run, column)
+            _tile(axes, images[row][column], record["label"], run, column)
             if row == 0:
                 axes.set_title(f"view {column + 1}", fontsize=9, loc="center", pad=4)
         x = left + tile + margin
         y = tall - top - row * (tile + below) - 0.5 * tile
         figure.text((x - 0.02) / wide, y / tall, method, fontsize=9, fontweight="bold", ha="right", va="center")
     axes = place(0, 0.5 * (len(methods) - 1))
-    _tile(axes, images[record["first"]], record["label"], runs[0], 0)
+    _tile(axes, images[0][0], record["label"], runs[0], 0)
     axes.set_title("view 1, given", fontsize=9, loc="center", pad=4)
     return figure
 
@@ -109,10 +108,8 @@ def _tile(axes: Axes, image: Float[np.ndarray, "h w 3"], label: int, run: dict, 
     )
 
 
-def _images(record: Record, candidates: Sequence[int]) -> list[Float[np.ndarray, "h w 3"]]:
-    poses = sphere_candidates(len(record["pattern_pixels"]))
-    scene, framing, split = jnp.asarray(record["scene"]), Framing(record["framing"]), Split(record["split"])
-    return [_shade(*map(np.asarray, _render(split, scene, framing, poses[candidate]))) for candidate in candidates]
+def _plain(pose: Pose) -> Pose:
+    return jax.tree.map(jnp.asarray, pose)
 
 
 def _shade(
@@ -125,11 +122,8 @@ def _shade(
 
 
 @eqx.filter_jit
-def _render(
-    split: Split, scene: Int[Array, ""], framing: Framing, pose: Pose
-) -> tuple[Bool[Array, " rays"], Bool[Array, " rays"], Float[Array, " rays"]]:
+def _render(pyramid: Pyramid, pose: Pose) -> tuple[Bool[Array, " rays"], Bool[Array, " rays"], Float[Array, " rays"]]:
     """Which rays hit, which hit the pattern, and the cosine between each ray and its normal."""
-    pyramid = pyramid_scene(split, scene, framing)
     seen = scan(SDFSurface(pyramid), Camera(height=2 * _PIXELS, width=2 * _PIXELS), pose)
     rays = pose.position - seen.points
     facing = jnp.sum(rays * seen.normals, axis=-1) / jnp.linalg.norm(rays, axis=-1)

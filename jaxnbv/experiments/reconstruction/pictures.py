@@ -16,13 +16,9 @@ from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
 from jaxnbv.checks import InputError
-from jaxnbv.experiments.reconstruction.report import (
-    Record,
-    methods_of,
-)
-from jaxnbv.experiments.reconstruction.study import RECONSTRUCTIONS, ReconstructionStudy, reconstruct, seen_cloud
+from jaxnbv.experiments.measures import Record, methods_of
+from jaxnbv.experiments.reconstruction.study import RECONSTRUCTIONS, ReconstructionStudy, reconstruct
 from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, mesh_from_sdf
-from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.viz.data import MeanSurface
 from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.render import Still
@@ -30,49 +26,55 @@ from jaxnbv.viz.style import DEVIATION, GREY, log_ticks
 
 # Distances to the truth that the pictures tell apart: from the sensor's noise to a fifth of the object.
 _ERRORS = LogNorm(0.01, 0.5)
-_PIXELS = 420
 # Shading and colours are those of the vertices, so no triangle may be larger than what they vary over.
 _EDGE = 0.05
-# Half of what a picture spans, and points of the true surface that errors are measured to.
-_REACH, _DENSE = 1.55, 200_000
+# Half of what a picture spans.
+_REACH = 1.55
 
 
 def write_pictures(
-    records: Sequence[Record], study: ReconstructionStudy, folder: str | Path, scenes: int = 3
+    records: Sequence[Record],
+    study: ReconstructionStudy,
+    folder: str | Path,
+    scenes: int = 3,
+    pixels: int = 420,
+    dense: int = 200_000,
 ) -> list[Path]:
     """Write `surfaces_<scene>.png` for the first scenes, not picked ones; return the paths.
 
     A row a reconstruction, a column a method, beside the true surface: seen from the side away from the first view,
     which all methods share, and coloured by the distance to the true surface. Views are scanned again as they were.
 
+    - `pixels`: along a side of a picture; `dense`: points of the true surface that errors are measured to.
+
     **Raises:** `ValueError` as `methods_of` does, or for a scene that the study does not have.
     """
-    methods, folder = methods_of(records), Path(folder)
+    methods, folder = methods_of(records, study.methods), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     with mpl.rc_context(STYLE):
         for record in sorted(records, key=lambda record: record["scene"])[:scenes]:
             paths.append(folder / f"surfaces_{record['scene']:03d}.png")
-            _picture(record, study, methods).savefig(paths[-1], dpi=200)
+            _picture(record, study, methods, pixels, dense).savefig(paths[-1], dpi=200)
     return paths
 
 
-def _picture(record: Record, study: ReconstructionStudy, methods: Sequence[str]) -> Figure:
-    index = record["scene"]
-    truth = _true_mesh(study.scene(index))
-    tree = cKDTree(truth.sample_points(jax.random.key(0), _DENSE))
-    eye = _eye(np.asarray(sphere_candidates(study.num_candidates).position[record["first"]], np.float64))
+def _picture(record: Record, study: ReconstructionStudy, methods: Sequence[str], pixels: int, dense: int) -> Figure:
+    scene = study.scene(record["scene"])
+    truth = _true_mesh(scene.surface)
+    tree = cKDTree(truth.sample_points(jax.random.key(0), dense))
+    eye = _eye(np.asarray(study.candidates.poses().position[record["first"]], np.float64))
     held = [record["methods"][method]["reconstructions"] for method in methods]
     names = [name for name in RECONSTRUCTIONS if all(found[name] is not None for found in held)]
-    clouds = [seen_cloud(study, index, record["methods"][method]["candidates"]) for method in methods]
+    clouds = [study.seen(scene, record["methods"][method])[-1][1] for method in methods]
 
-    images = {"truth": _image(truth, None, eye)}
+    images = {"truth": _image(truth, None, eye, pixels)}
     for method, cloud in zip(methods, clouds, strict=True):
         for name in names:
             mesh = reconstruct(study, cloud, name)
             if mesh is None:
                 raise InputError(f'the records hold {name}: pip install "jaxnbv[poisson]" to draw it again')
-            images[f"{name}, {method}"] = _image(mesh, tree, eye)
+            images[f"{name}, {method}"] = _image(mesh, tree, eye, pixels)
     seen = np.any([image[..., 3] > 0 for image in images.values()], axis=0)
     rows, columns = (np.flatnonzero(seen.any(axis=axis)) for axis in (1, 0))
     crop = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
@@ -126,7 +128,9 @@ def _eye(first: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     return np.array([across[0], 0.55, across[1]])
 
 
-def _image(mesh: TriangleMesh, truth: cKDTree | None, eye: Float[np.ndarray, "3"]) -> Float[np.ndarray, "h w 4"]:
+def _image(
+    mesh: TriangleMesh, truth: cKDTree | None, eye: Float[np.ndarray, "3"], pixels: int
+) -> Float[np.ndarray, "h w 4"]:
     """Trace a mesh, plain or coloured by the distance to points of the true surface."""
     vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _EDGE, max_iter=12)
     fine = trimesh.Trimesh(vertices, faces)
@@ -135,6 +139,6 @@ def _image(mesh: TriangleMesh, truth: cKDTree | None, eye: Float[np.ndarray, "3"
     surface = MeanSurface(
         np.asarray(fine.vertices), np.asarray(fine.faces), np.asarray(fine.vertex_normals), np.maximum(error, 1e-6)
     )
-    still = Still(eye, surface, _PIXELS, _REACH)
+    still = Still(eye, surface, pixels, _REACH)
     still.paint(None if truth is None else _ERRORS)
     return still.image

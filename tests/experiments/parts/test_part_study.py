@@ -15,8 +15,7 @@ from jaxnbv.checks import InputError
 from jaxnbv.cloud import concatenate, limit_capacity
 from jaxnbv.datasets import Split, part_scene
 from jaxnbv.experiments.parts import pictures as part_pictures
-from jaxnbv.experiments.parts import study as part_study
-from jaxnbv.experiments.parts.study import METHODS, PartStudy, run_scene, seen_views
+from jaxnbv.experiments.parts.study import PartStudy
 from jaxnbv.networks import CATEGORIES, CloudSegmenter
 from jaxnbv.scanning import SDFSurface, SensorNoise, scan
 from jaxnbv.search import (
@@ -39,15 +38,6 @@ CAMERA = Camera(height=32, width=32)
 RUN = ("discrete", "farthest", "random")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def few_rays():
-    """Compilation takes nearly all the time of the rest."""
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (part_study, part_pictures):
-            patch.setattr(module, "PART_CAMERA", CAMERA)
-        yield
-
-
 class Pointwise(eqx.Module):
     """An opinion on each point by itself; once `enough` points are there, the parts take turns."""
 
@@ -66,12 +56,12 @@ def small_study(enough=10**6, **settings):
     small = {"views": VIEWS, "num_candidates": CANDIDATES, "num_samples": 2, "model": model, "grid_resolution": 20}
     limits = {"capacity": 600, "imagined_rays": 12, "num_points": 100, "num_starts": 1, "iterations": 2}
     segmenter = CloudSegmenter(Pointwise(jnp.asarray(enough)), 0, 500, scale=0.8)
-    return PartStudy(segmenter, **(small | limits | settings))
+    return PartStudy(segmenter=segmenter, camera=CAMERA, **(small | limits | settings))
 
 
 @functools.cache
 def whole_record():
-    return run_scene(small_study(), SCENE, RUN)
+    return small_study().run_scene(SCENE, RUN)
 
 
 def pose_of(view):
@@ -86,7 +76,7 @@ def noisy_scan(solid, pose, key):
 def scans(record, method):
     """What the sensor showed, from the recorded poses and the study's key."""
     solid = part_scene(Split.TEST, record["scene"]).solid
-    key = jax.random.fold_in(jax.random.key(6), record["scene"])
+    key = small_study().key(record["scene"], "episode")
     for index, view in enumerate(record["methods"][method]["views"]):
         _, noise_key = jax.random.split(jax.random.fold_in(key, index))
         yield noisy_scan(solid, pose_of(view), noise_key)
@@ -134,7 +124,8 @@ def test_poses_are_candidates():
 
 
 def test_each_method_has_its_search_and_score():
-    planners = {method: small_study().planner(method, jnp.asarray(4)) for method in METHODS}
+    study = small_study()
+    planners = {method: study.planner(method, study.scene(SCENE)) for method in study.methods}
     searches = {
         "discrete": DiscreteSearch,
         "gradient-2dof": GradientSearch,
@@ -157,7 +148,7 @@ def test_counts_are_those_of_the_segmenter_on_all_that_was_seen(method):
     record, study, scene = whole_record(), small_study(), part_scene(Split.TEST, SCENE)
     segmenter = CloudSegmenter(study.segmenter.network, scene.category, 500, scale=0.8)
     run = record["methods"][method]
-    again = seen_views(study, record, method)
+    again = study.seen(study.scene(SCENE), run)
     assert len(again) == len(run["counts"])
     labels = np.flatnonzero(np.asarray(scene.parts))
     for counts, cloud, (_, remade) in zip(run["counts"], clouds(record, method), again, strict=True):
@@ -174,11 +165,11 @@ def test_counts_are_those_of_the_segmenter_on_all_that_was_seen(method):
 
 def test_the_discrete_search_takes_the_candidate_whose_imagined_scans_find_most():
     record, study, scene = whole_record(), small_study(), part_scene(Split.TEST, SCENE)
-    planner = study.planner("discrete", scene.category)
+    planner = study.planner("discrete", study.scene(SCENE))
     views = [pose_of(view) for view in record["methods"]["discrete"]["views"]]
     segmenter = CloudSegmenter(study.segmenter.network, scene.category, 100, scale=0.8)
     state = planner.init(next(scans(record, "discrete")), views[0], CAMERA)
-    key = jax.random.fold_in(jax.random.key(6), SCENE)
+    key = study.key(SCENE, "episode")
     step_key, _ = jax.random.split(jax.random.fold_in(key, 1))
     surfaces = planner.sample_surfaces(state, jax.random.split(step_key)[0])
 
@@ -210,7 +201,7 @@ def test_a_run_stops_once_every_part_has_the_largest_target():
     first = int(next(scans(whole_record(), "farthest")).count)
     study = small_study(first + 1, capacity=4096)
     study = eqx.tree_at(lambda s: s.segmenter, study, CloudSegmenter(study.segmenter.network, 0, 2048, scale=0.8))
-    record = run_scene(study, SCENE, ("farthest",))
+    record = study.run_scene(SCENE, ("farthest",))
     run = record["methods"]["farthest"]
     assert min(run["counts"][0]) < 100 <= min(run["counts"][-1])
     assert [min(counts) >= 100 for counts in run["counts"]] == [False] * (len(run["counts"]) - 1) + [True]
@@ -220,19 +211,18 @@ def test_a_run_stops_once_every_part_has_the_largest_target():
 
 def test_planners_of_all_categories_share_their_compilations(compilations):
     study, first = small_study(), pose_of(whole_record()["methods"]["discrete"]["views"][0])
-    state = study.planner("discrete", jnp.asarray(0)).init(next(scans(whole_record(), "discrete")), first, CAMERA)
+    state = study.planner("discrete", study.scene(0)).init(next(scans(whole_record(), "discrete")), first, CAMERA)
     values = []
-    for category in (13, 4):
-        planner = study.planner("discrete", jnp.asarray(category))
+    for index in (1, 4):
+        planner = study.planner("discrete", study.scene(index))
         del compilations[:]
         values.append(np.asarray(planner.propose(state, jax.random.key(1)).values))
     assert not compilations
     assert (values[0] != values[1]).any()
 
 
-def test_pictures_are_of_the_scenes_and_methods_asked_for(tmp_path, monkeypatch):
-    monkeypatch.setattr(part_pictures, "_PIXELS", 60)
-    (path,) = part_pictures.write_pictures([whole_record()], small_study(), tmp_path / "a", scenes=2)
+def test_pictures_are_of_the_scenes_and_methods_asked_for(tmp_path):
+    (path,) = part_pictures.write_pictures([whole_record()], small_study(), tmp_path / "a", scenes=2, pixels=60)
     assert path == tmp_path / "a" / f"parts_{SCENE:03d}.png"
     assert path.read_bytes()[:4] == b"\x89PNG"
     with pytest.raises(InputError, match="no records"):
@@ -240,12 +230,10 @@ def test_pictures_are_of_the_scenes_and_methods_asked_for(tmp_path, monkeypatch)
 
 
 def test_unknown_methods_and_bad_numbers_are_refused():
-    with pytest.raises(InputError, match=r"no method nearest.*discrete"):
-        small_study().planner("nearest", jnp.asarray(3))
-    with pytest.raises(InputError, match="no method nearest"):
-        run_scene(small_study(), SCENE, ("nearest",))
+    with pytest.raises(InputError, match=r"unknown methods: nearest; choose from discrete"):
+        small_study().run_scene(SCENE, ("nearest",))
     for settings in ({"views": 1}, {"views": CANDIDATES + 1}):
         with pytest.raises(InputError, match="at least two views"):
             small_study(**settings)
     with pytest.raises(InputError, match="must not be negative"):
-        run_scene(small_study(), -1, ("farthest",))
+        small_study().run_scene(-1, ("farthest",))

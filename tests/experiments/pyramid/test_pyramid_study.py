@@ -8,16 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
 from jaxnbv.cloud import concatenate, limit_capacity
 from jaxnbv.datasets import Framing, Pyramid, Split, pyramid_scene
-from jaxnbv.experiments.pyramid import study as pyramid_study
-from jaxnbv.experiments.pyramid.study import METHODS, PyramidStudy, run_scene
-from jaxnbv.experiments.records import RecordFolder
-from jaxnbv.scanning import Carving, SDFSurface, scan
+from jaxnbv.experiments.pyramid.pictures import write_pictures
+from jaxnbv.experiments.pyramid.study import PyramidStudy
+from jaxnbv.scanning import SDFSurface, scan
 from jaxnbv.search import FarthestView, Problem, UncertaintyView
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.surfaces import GeometricSPSR
@@ -55,18 +55,22 @@ def small_study(classifier=None, views=3, **settings):
     model = GeometricSPSR(lengthscale=0.05, truncation=8)
     small = {"num_candidates": CANDIDATES, "num_samples": 2, "grid_resolution": 20}
     limits = {"capacity": 250, "num_points": 100}
-    surfaces = model, Carving()
-    return PyramidStudy(classifier or Linear(), Framing.CLOSE_UP, *surfaces, views=views, **(small | limits | settings))
+    fixed = {"classifier": classifier or Linear(), "framing": Framing.CLOSE_UP, "model": model, "views": views}
+    return PyramidStudy(**(fixed | small | limits | settings))
 
 
 @functools.cache
 def whole_record():
-    return run_scene(small_study(), SCENE)
+    return small_study().run_scene(SCENE)
 
 
 @pytest.fixture
-def scene():
-    return pyramid_study._Scene(small_study(), SCENE)
+def chooser():
+    return chooser_of(small_study())
+
+
+def chooser_of(study):
+    return study._chooser(study.scene(SCENE))
 
 
 def without_time(record):
@@ -76,12 +80,12 @@ def without_time(record):
 def test_a_record_is_json_and_holds_every_method():
     record = json.loads(json.dumps(whole_record(), allow_nan=False))
     assert record == whole_record()
-    assert list(record["methods"]) == list(METHODS)
+    assert list(record["methods"]) == list(PyramidStudy.methods)
     pyramid = pyramid_scene(Split.TEST, SCENE)
     assert record["scene"] == SCENE
     assert record["framing"] == "close-up"
     assert record["label"] == int(pyramid.label)
-    assert 0 <= record["random_hit"] <= 1
+    assert 0 <= record["methods"]["random"]["hit"] <= 1
     for name, method in record["methods"].items():
         assert len(method["runs"]) == (8 if name == "random" else 1)
         for run in method["runs"]:
@@ -94,7 +98,7 @@ def test_a_record_is_json_and_holds_every_method():
 
 
 def test_a_scene_can_be_run_again():
-    assert without_time(run_scene(small_study(), SCENE)) == without_time(whole_record())
+    assert without_time(small_study().run_scene(SCENE)) == without_time(whole_record())
 
 
 def test_the_first_view_is_that_of_all_methods_and_shows_no_pattern_but_something():
@@ -114,29 +118,21 @@ def test_the_first_view_is_that_of_all_methods_and_shows_no_pattern_but_somethin
 
 def test_some_methods_alone_choose_as_among_all():
     for some in (("farthest", "random"), ("mixed", "oracle")):
-        record = run_scene(small_study(), SCENE, some)
+        record = small_study().run_scene(SCENE, some)
         assert list(record["methods"]) == list(some)
         for name in some:
             assert record["methods"][name] == whole_record()["methods"][name]
-    found = run_scene(small_study(), SCENE, ("farthest", "oracle"))["diagnostics"]
-    assert {name for entry in found for name in entry["methods"]} == {"farthest", "oracle"}
-    assert all(entry["roughness"] is None and entry["near_sensor"] is None for entry in found)
 
 
 def test_diagnostics_of_every_method_at_every_view():
-    found = whole_record()["diagnostics"]
-    for view in (2, 3):
-        names = [name for entry in found if entry["view"] == view for name in entry["methods"]]
-        assert sorted(names) == sorted(set(METHODS) - {"random"})
-    for entry in found:
-        assert list(entry["rank_correlation"]) == entry["methods"]
-        draws_samples = not {*entry["methods"]} & {"farthest", "oracle"}
-        assert (entry["roughness"] is not None) == (entry["near_sensor"] is not None) == draws_samples
-        if draws_samples:
-            assert entry["roughness"] > 0
-            assert 0 <= entry["near_sensor"] <= 1
-        for correlation in entry["rank_correlation"].values():
-            assert correlation is None or -1 <= correlation <= 1
+    for name, method in whole_record()["methods"].items():
+        found = method["diagnostics"]
+        assert [entry["view"] for entry in found] == ([] if name == "random" else [2, 3])
+        for entry in found:
+            draws_samples = name not in ("farthest", "oracle")
+            assert (entry["roughness"] is not None) == draws_samples
+            assert entry["roughness"] is None or entry["roughness"] > 0
+            assert entry["rank_correlation"] is None or -1 <= entry["rank_correlation"] <= 1
 
 
 @eqx.filter_jit
@@ -158,19 +154,19 @@ def test_values_are_the_librarys_scores_of_the_same_samples(sharpness):
     """Undecided, above the threshold of the mixed score, and nearly decided, below it."""
     classifier = Linear(sharpness)
     study = small_study(classifier)
-    scene = pyramid_study._Scene(study, SCENE)
-    visited = (scene.first, (scene.first + 5) % CANDIDATES)
-    found = scene._acquisitions(visited, [name for name in METHODS if name != "random"], 3)
-    state, planner = scene._state(visited), study.planner
+    chooser = chooser_of(study)
+    visited = (2, 7)
+    found, _ = chooser.values(visited, [name for name in study.methods if name != "random"], 3)
+    state, planner = chooser.state(visited), chooser.planner
     assert int(state.num_views) == 2
-    surfaces = planner.sample_surfaces(state, jax.random.fold_in(jax.random.fold_in(scene.key, 2), 3))
+    surfaces = planner.sample_surfaces(state, jax.random.fold_in(study.key(SCENE, "scene"), 3))
     scores = {
         "cross-entropy": CrossEntropy(classifier, num_points=100),
         "mixed": MixedEntropy(classifier, num_points=100),
         "entropy": ExpectedUtilityImprovement(NegativeEntropy(classifier), num_points=100),
         "coverage": Coverage(),
     }
-    expected = scores_by_hand(tuple(scores.values()), state.cloud, surfaces, planner.camera, scene.poses)
+    expected = scores_by_hand(tuple(scores.values()), state.cloud, surfaces, planner.camera, chooser.poses)
     for name, value in zip(scores, expected, strict=True):
         np.testing.assert_allclose(found[name], value, rtol=1e-4, atol=1e-5, err_msg=name)
     is_open = float(-NegativeEntropy(classifier)(limit_capacity(state.cloud, 100))) > 0.75
@@ -185,37 +181,52 @@ def test_values_are_the_librarys_scores_of_the_same_samples(sharpness):
     thinned = limit_capacity(state.cloud, 100)
     p = np.exp(np.asarray(classifier(thinned), np.float64))
     for candidate in (0, 7):
-        q = np.asarray(classifier(concatenate(thinned, scene.truth.scans[candidate])), np.float64)
+        q = np.asarray(classifier(concatenate(thinned, chooser.scans[candidate])), np.float64)
         assert found["oracle"][candidate] == pytest.approx(-np.sum(p * q), rel=1e-4)
 
 
-def test_the_choice_is_the_best_candidate_not_visited(scene):
-    values = np.array([5.0, 9.0, 7.0, 9.0])
-    np.testing.assert_array_equal(pyramid_study._without(values, (1,)), [5.0, -np.inf, 7.0, 9.0])
-    np.testing.assert_array_equal(values, [5.0, 9.0, 7.0, 9.0])
-    first = scene.first
-    value = np.delete(scene._acquisitions((first,), ["farthest"], 2)["farthest"], first)
-    assert (
-        whole_record()["methods"]["farthest"]["runs"][0]["candidates"][1]
-        == np.delete(np.arange(CANDIDATES), first)[value.argmax()]
-    )
+def test_the_choice_is_the_best_candidate_not_visited(chooser):
+    first = whole_record()["first"]
+    values = chooser.values((first,), ["farthest"], 2)[0]["farthest"]
+    best = int(np.delete(np.arange(CANDIDATES), first)[np.delete(values, first).argmax()])
+    assert whole_record()["methods"]["farthest"]["runs"][0]["candidates"][1] == best
+    assert chooser.choose((first,), ["farthest"], 2)["farthest"].candidate == best
+    assert chooser.choose((first, best), ["farthest"], 3)["farthest"].candidate not in (first, best)
 
 
-def test_answers_are_the_classifiers_of_all_that_was_seen(scene):
+def test_answers_are_the_classifiers_of_all_that_was_seen(chooser):
     run = whole_record()["methods"]["coverage"]["runs"][0]
-    planner, study = scene.study.planner, scene.study
-    state = planner.init(scene.truth.scans[run["candidates"][0]], scene.poses[run["candidates"][0]])
+    planner = chooser.planner
+    state = planner.init(chooser.scans[run["candidates"][0]], chooser.poses[run["candidates"][0]])
     for count, index in enumerate(run["candidates"]):
         if count:
-            state = planner.observe(state, scene.poses[index], scene.truth.scans[index])
-        expected = study.classifier(state.cloud)
+            state = planner.observe(state, chooser.poses[index], chooser.scans[index])
+        expected = chooser.classifier(state.cloud)
         np.testing.assert_allclose(run["log_p"][count], expected, atol=1e-5)
+
+
+def test_a_method_of_ones_own_sees_what_others_see_from_a_candidate(tmp_path):
+    study = small_study()
+    farthest = study.run_scene(SCENE, ("farthest",))["methods"]["farthest"]["runs"][0]
+
+    def own(study, scene):
+        return study.planner_of(Coverage(), FarthestView(study.candidates))
+
+    record = study.run_scene(SCENE, ("random",), {"mine:own": own})
+    (run,) = record["methods"]["mine:own"]["runs"]
+    np.testing.assert_allclose(run["log_p"], farthest["log_p"], atol=1e-5)
+    assert np.abs(np.subtract(run["pattern_pixels"], farthest["pattern_pixels"])).max() <= 2
+    for shown in (record, whole_record()):
+        (path,) = write_pictures([shown], study, tmp_path)
+        assert path == tmp_path / f"views_{SCENE:03d}.png"
+        with Image.open(path) as image:
+            assert np.asarray(image.convert("L")).std() > 5
 
 
 def test_with_a_classifier_that_knows_the_pattern_the_oracle_looks_at_it():
     """And the share of single views that a random second view would be right with is the share that shows enough."""
     study = small_study(Knowing(pyramid_scene(Split.TEST, SCENE)))
-    record = run_scene(study, SCENE, ("oracle",))
+    record = study.run_scene(SCENE, ("oracle", "random"))
     run, pixels = record["methods"]["oracle"]["runs"][0], np.array(record["pattern_pixels"])
     assert run["pattern_pixels"][1] >= 0.25 * pixels.max() > 200
     assert np.ptp(run["log_p"][0]) == pytest.approx(0.0, abs=1e-5)
@@ -223,48 +234,10 @@ def test_with_a_classifier_that_knows_the_pattern_the_oracle_looks_at_it():
     assert np.ptp(run["log_p"][1]) > 1.0
     shown = np.delete(pixels, record["first"])
     # Scene 3 is of class 3: a tie of all classes is no right answer.
-    assert np.mean(shown > 1000) <= record["random_hit"] <= np.mean(shown > 0) < 1
+    assert np.mean(shown > 1000) <= record["methods"]["random"]["hit"] <= np.mean(shown > 0) < 1
 
 
 def test_too_few_views_or_candidates_are_refused():
     for settings in ({"views": 1}, {"views": 15}):
         with pytest.raises(InputError, match="at least two views"):
             small_study(**settings)
-
-
-def test_records_are_kept_and_the_missing_ones_made(tmp_path):
-    asked = []
-
-    def run(index):
-        asked.append(index)
-        if index == 2 and len(asked) == 3:
-            raise KeyboardInterrupt
-        return {"scene": index, "value": 0.1 * index}
-
-    config = {"views": 3, "radii": (1, 2)}
-    with pytest.raises(KeyboardInterrupt):
-        RecordFolder(tmp_path / "a" / "b", config).collect(4, run, progress=False)
-    found = RecordFolder(tmp_path / "a" / "b", config).collect(4, run, progress=False)
-    assert asked == [0, 1, 2, 2, 3]
-    assert found == [{"scene": index, "value": 0.1 * index} for index in range(4)]
-    assert RecordFolder(tmp_path / "a" / "b", config).collect(2, run, progress=False) == found[:2]
-    assert len(asked) == 5
-    (tmp_path / "a" / "b" / "scene_0001.json").unlink()
-    assert RecordFolder(tmp_path / "a" / "b", config).collect(4, run, progress=False) == found
-    assert asked[5:] == [1]
-
-
-def test_folders_of_another_study_and_damaged_records_are_refused(tmp_path):
-    RecordFolder(tmp_path, {"views": 3, "framing": "whole"}).collect(1, lambda index: {"scene": index}, progress=False)
-    with pytest.raises(InputError, match="another study; it differs in views: 3 there, 4 now"):
-        RecordFolder(tmp_path, {"views": 4, "framing": "whole"})
-    for damaged in (b'{"scene": ', b"", b"\xff\xfe\x00"):
-        (tmp_path / "scene_0000.json").write_bytes(damaged)
-        with pytest.raises(InputError, match=r"scene_0000\.json is damaged"):
-            RecordFolder(tmp_path, {"views": 3, "framing": "whole"}).collect(1, lambda index: {}, progress=False)
-    (tmp_path / "study.json").write_bytes(b"[")
-    with pytest.raises(InputError, match=r"study\.json is damaged"):
-        RecordFolder(tmp_path, {"views": 3, "framing": "whole"})
-    (tmp_path / "file").write_text("here")
-    with pytest.raises(InputError, match="cannot make the output folder"):
-        RecordFolder(tmp_path / "file", {"views": 3})

@@ -1,4 +1,4 @@
-"""Curves, tables and files of the pyramid study, from records made by hand."""
+"""What the pyramid study measures, from records made by hand; records as they were and as they are."""
 
 import csv
 import json
@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxnbv.checks import InputError
-from jaxnbv.experiments.pyramid.figures import write_figures
-from jaxnbv.experiments.pyramid.pictures import write_pictures
-from jaxnbv.experiments.pyramid.report import METHODS, curves, methods_of, summary_table, write_tables
+from jaxnbv.experiments.charts import write_charts
+from jaxnbv.experiments.measures import result_rows, values
+from jaxnbv.experiments.pyramid.study import PyramidStudy
+from jaxnbv.experiments.tables import summary, write_tables
 
 
 def log_p(guesses):
@@ -40,7 +40,7 @@ def record(scene, methods, label=1, angle=100.0, framing="close-up", random_hit=
     }
 
 
-def synthetic_records(scenes, views=5, methods=METHODS, framing="close-up", seed=0):
+def synthetic_records(scenes, views=5, methods=PyramidStudy.methods, framing="close-up", seed=0):
     """Random records which hold together: candidates differ, pixels are those of the candidates."""
     rng = np.random.default_rng(seed)
     records = []
@@ -89,6 +89,10 @@ def two_scenes():
     ]
 
 
+def curves(records, method, quantity):
+    return values(records, [method], PyramidStudy.measure(quantity))[:, 0]
+
+
 def test_curves_of_hand_made_sequences():
     records = two_scenes()
     np.testing.assert_array_equal(curves(records, "cross-entropy", "first"), [[0, 1, 1], [0, 1, 1]])
@@ -99,27 +103,56 @@ def test_curves_of_hand_made_sequences():
     np.testing.assert_array_equal(curves(records, "farthest", "pattern"), np.zeros((2, 3)))
 
 
-def test_random_search_is_exact_where_it_can_be():
-    records = two_scenes()
+def as_now(record):
+    """Diagnostics and the exact share of random search stand with their methods."""
+    new = json.loads(json.dumps(record))
+    for method, held in new["methods"].items():
+        held["diagnostics"] = [
+            {"view": entry["view"], "roughness": entry["roughness"], "rank_correlation": correlation}
+            for entry in new["diagnostics"]
+            if (correlation := entry["rank_correlation"].get(method)) is not None or method in entry["methods"]
+        ]
+        held |= {"hit": new["random_hit"]} if method == "random" else {}
+    del new["diagnostics"], new["random_hit"]
+    return new
+
+
+@pytest.mark.parametrize("made", [lambda record: record, as_now])
+def test_random_search_is_exact_where_it_can_be(made):
+    records = [made(record) for record in two_scenes()]
     # Two of eight candidates show the pattern.
     exact = [0.0, 2 / 8, 1 - (6 / 8) * (5 / 7)]
     np.testing.assert_allclose(curves(records, "random", "pattern"), [exact, exact])
     # By view 2 half of the runs hit, but the expectation over all candidates is 0.25.
     np.testing.assert_allclose(curves(records, "random", "first"), [[0, 0.25, 1], [0, 0.25, 1]])
     np.testing.assert_allclose(curves(records, "random", "stable"), [[0, 0, 0.5], [0, 0, 0.5]])
-    already = record(0, {"random": [run([1, 0, 0], [0, 0, 0])]}, random_hit=0.25)
+    already = made(record(0, {"random": [run([1, 0, 0], [0, 0, 0])]}, random_hit=0.25))
     np.testing.assert_allclose(curves([already], "random", "first"), [[1, 1, 1]])
 
 
 def test_curves_only_rise_and_stable_hits_follow_first_hits():
     records = synthetic_records(30)
-    for method in set(METHODS) - {"random"}:
+    for method in set(PyramidStudy.methods) - {"random"}:
         first, stable, pattern = (curves(records, method, quantity) for quantity in ("first", "stable", "pattern"))
-        for values in (first, stable, pattern):
-            assert (np.diff(values, axis=1) >= 0).all()
+        for shares in (first, stable, pattern):
+            assert (np.diff(shares, axis=1) >= 0).all()
         assert (stable <= first).all()
         right = [np.argmax(r["methods"][method]["runs"][0]["log_p"][-1]) == r["label"] for r in records]
         np.testing.assert_array_equal(stable[:, -1], right)
+
+
+@pytest.mark.parametrize("made", [lambda record: record, as_now])
+def test_diagnostics_are_of_the_methods_own_views(made):
+    records = [made(record) for record in two_scenes()]
+    found = result_rows(records, ["cross-entropy", "farthest"], PyramidStudy.measures)
+    rows = {(row["quantity"], row["method"], row["at"]): row for row in found}
+    row = rows["rank_correlation", "farthest", 2]
+    assert (row["mean"], row["scenes"]) == (-0.5, 1)
+    assert rows["roughness", "cross-entropy", 3]["mean"] == 3.0
+    assert ("rank_correlation", "cross-entropy", 3) not in rows
+    assert ("roughness", "farthest", 3) not in rows
+    # Older records alone hold it.
+    assert (("near_sensor", "cross-entropy", 3) in rows) == (made is not as_now)
 
 
 def read(path):
@@ -134,94 +167,42 @@ def only(rows, **wanted):
 
 def test_tables_hold_shares_computed_by_hand(tmp_path):
     records = two_scenes()
-    paths = write_tables(records, tmp_path / "new")
-    assert [path.name for path in paths] == ["results.txt", "results.csv", "differences.csv", "diagnostics.csv"]
-    results, differences, diagnostics = (read(path) for path in paths[1:])
-
-    row = only(results, angle="all", quantity="first", method="farthest", view="2")
-    assert (row["framing"], float(row["mean"]), row["scenes"]) == ("close-up", 0.5, "2")
-    assert (float(row["low"]), float(row["high"])) == (0.0, 1.0)
-    row = only(results, angle="140-180", quantity="first", method="farthest", view="2")
+    paths = write_tables(records, PyramidStudy, tmp_path / "new")
+    results, differences = (read(path) for path in paths[1:])
+    row = only(results, group="all", quantity="first", method="farthest", at="2")
+    assert (float(row["mean"]), row["scenes"], float(row["low"]), float(row["high"])) == (0.5, "2", 0.0, 1.0)
+    row = only(results, group="first view at 140-180°", quantity="first", method="farthest", at="2")
     assert (float(row["mean"]), float(row["high"]), row["scenes"]) == (0.0, 0.0, "1")
-    row = only(results, angle="all", quantity="pattern", method="random", view="3")
+    row = only(results, group="all", quantity="pattern", method="random", at="3")
     assert float(row["mean"]) == pytest.approx(1 - 30 / 56, abs=1e-6)
-    assert {row["angle"] for row in results} == {"all", "under 110", "140-180"}
-    assert len(results) == 3 * 3 * 3 * 3
-
-    row = only(differences, angle="all", quantity="first", baseline="farthest", view="2")
+    assert {row["group"] for row in results} == {"all", "first view at under 110°", "first view at 140-180°"}
+    row = only(differences, group="all", quantity="first", baseline="farthest", at="2")
     assert (float(row["mean"]), row["excludes_zero"]) == (0.5, "False")
-    row = only(differences, angle="all", quantity="stable", baseline="farthest", view="3")
+    row = only(differences, group="all", quantity="stable", baseline="farthest", at="3")
     assert (float(row["mean"]), float(row["low"]), row["excludes_zero"]) == (1.0, 1.0, "True")
-    assert {row["baseline"] for row in differences} == {"farthest", "random"}
-
-    row = only(diagnostics, angle="all", quantity="rank_correlation", method="farthest", view="2")
-    assert (float(row["mean"]), row["scenes"]) == (-0.5, "1")
-    row = only(diagnostics, angle="all", quantity="roughness", method="cross-entropy", view="3")
-    assert float(row["mean"]) == 3.0
-    missing = {("rank_correlation", "3"), ("near_sensor", "2")}
-    assert not missing & {(row["quantity"], row["view"]) for row in diagnostics}
-    assert not [row for row in diagnostics if row["method"] == "farthest" and row["view"] == "3"]
 
     text = paths[0].read_text(encoding="utf-8")
-    assert text == summary_table(records)
-    assert "close-up, all angles: 2 scenes" in text
-    assert "close-up, angle 140-180: 1 scene\n" in text
-    head, *lines = text.split("first hit\n")[1].splitlines()[:4]
-    assert head.split() == ["view", "1", "view", "2", "view", "3"]
+    assert text == summary(records, PyramidStudy)
+    head, *lines = text.split("First hit, by view\n")[1].splitlines()[:4]
+    assert head.split() == ["view", "1", "2", "3"]
     assert lines[1].split()[0] == "farthest"
     assert re.findall(r"\d+", lines[1]) == ["0", "0", "0", "50", "0", "100", "50", "0", "100"]
-    compared = text.split("stable hit: cross-entropy minus")[1].splitlines()[2]
+    compared = text.split("Stable hit: cross-entropy minus another method")[1].splitlines()[2]
     assert compared.split() == ["farthest", "+100", "[+100,", "+100]*", "+100", "[+100,", "+100]*"]
     assert max(map(len, text.splitlines())) <= 120
 
 
-def test_framings_are_told_apart(tmp_path):
-    hit, miss = run([1, 1], [0, 0]), run([0, 0], [0, 0])
-    records = [record(0, {"farthest": [hit]}), record(0, {"farthest": [miss]}, framing="whole")]
-    write_tables(records, tmp_path)
-    rows = read(tmp_path / "results.csv")
-    for framing, share in (("close-up", "1.0"), ("whole", "0.0")):
-        assert only(rows, framing=framing, angle="all", quantity="first", view="2", method="farthest")["mean"] == share
-    assert read(tmp_path / "differences.csv") == []
-
-
 @pytest.mark.parametrize(
-    ("scenes", "views", "methods"), [(1, 5, METHODS), (6, 3, ("farthest", "cross-entropy")), (4, 2, ("random",))]
+    ("scenes", "views", "methods"),
+    [(1, 5, PyramidStudy.methods), (6, 3, ("farthest", "cross-entropy")), (4, 2, ("random",))],
 )
 def test_few_scenes_views_and_methods_are_enough(tmp_path, scenes, views, methods):
     records = synthetic_records(scenes, views, methods)
-    assert methods_of(records) == [method for method in METHODS if method in methods]
-    assert all(path.stat().st_size > 0 for path in write_tables(records, tmp_path))
-    names = {path.name for path in write_figures(records, tmp_path)}
-    charts = {"hits_close-up.png", "angles_close-up.png"}
-    assert names == charts | ({"diagnostics_close-up.png"} if methods != ("random",) else set())
-    for name in names:
-        with Image.open(tmp_path / name) as image:
+    assert all(path.stat().st_size > 0 for path in write_tables(records, PyramidStudy, tmp_path))
+    paths = write_charts(records, PyramidStudy, tmp_path)
+    names = {path.name for path in paths}
+    assert names == {"hits.png", "angles.png"} | ({"diagnostics.png"} if methods != ("random",) else set())
+    for path in paths:
+        with Image.open(path) as image:
             assert image.width > 1000
             assert np.asarray(image.convert("L")).std() > 5
-
-
-def test_methods_that_some_scenes_lack_are_left_out():
-    records = [*synthetic_records(1), *synthetic_records(1, methods=("farthest",))]
-    assert methods_of(records) == ["farthest"]
-    with pytest.raises(InputError, match="in common"):
-        methods_of([*synthetic_records(1, methods=("random",)), *synthetic_records(1, methods=("farthest",))])
-
-
-def test_what_cannot_be_reported_is_refused(tmp_path):
-    with pytest.raises(InputError, match="no records"):
-        summary_table([])
-    with pytest.raises(InputError, match=r"\[3, 5\]"):
-        write_tables([*synthetic_records(1), *synthetic_records(1, views=3)], tmp_path)
-    with pytest.raises(InputError, match="'last'"):
-        curves(two_scenes(), "random", "last")
-    with pytest.raises(InputError, match="'whole'"):
-        write_pictures(two_scenes(), "whole", tmp_path)
-
-
-def test_pictures_show_the_first_scenes(tmp_path):
-    records = synthetic_records(2, views=2, methods=("uncertainty", "cross-entropy"))
-    (path,) = write_pictures(records[::-1], "close-up", tmp_path, scenes=1)
-    assert path == tmp_path / "views_close-up_000.png"
-    with Image.open(path) as image:
-        assert np.asarray(image.convert("L")).std() > 5

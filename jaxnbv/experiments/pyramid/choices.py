@@ -1,0 +1,162 @@
+"""Where each method of the pyramid study looks next, all asked about the same samples and the same scans of them."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from jaxnbv.acquisition import Score, Several, expected_score, zero_if_empty
+from jaxnbv.camera import Camera, Pose
+from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
+from jaxnbv.experiments.diagnostics import rank_correlation, roughness
+from jaxnbv.planner import Planner, State
+from jaxnbv.scanning import GridSurface
+from jaxnbv.search import CandidateSearch, Problem
+from jaxnbv.search.baselines import uncertain_length
+from jaxnbv.tasks import Coverage
+from jaxnbv.tasks.classification import Classifier, ClassScore, Context, MixedEntropy, cross_entropy, entropy
+
+CLASSIFYING = ("cross-entropy", "entropy", "mixed")
+_SAMPLING = (*CLASSIFYING, "coverage", "uncertainty")
+
+
+class Choice(NamedTuple):
+    """A candidate; and how well the method's values agreed with the pattern that the candidates would truly show, and
+    how rough the samples were, None without samples."""
+
+    candidate: int
+    diagnostics: dict[str, float | None]
+
+
+class Chooser:
+    """The choices of one scene; what methods have in common is computed once.
+
+    - `planner`: its states and samples; its search has the candidates.
+    - `classifier`: of all that was seen; `imagining`: of what was seen, thinned to `num_points`, and an imagined scan.
+    - `scans`, `pattern_pixels`: what each candidate would truly show.
+    """
+
+    def __init__(
+        self,
+        planner: Planner,
+        classifier: Classifier,
+        imagining: Classifier,
+        num_points: int,
+        scans: PointCloud,
+        pattern_pixels: Int[Array, " candidates"],
+        key: PRNGKeyArray,
+    ):
+        self.planner, self.classifier, self.imagining = planner, classifier, imagining
+        self.num_points, self.key = num_points, key
+        self.scans, self.pattern_pixels = scans, np.asarray(pattern_pixels, np.float64)
+        assert isinstance(planner.search, CandidateSearch)
+        self.poses: Pose = planner.search.candidates.poses()
+        self.states: dict[tuple[int, ...], State] = {}
+        self.answers: dict[tuple[int, ...], np.ndarray] = {}
+
+    def choose(self, visited: tuple[int, ...], methods: Sequence[str], view: int) -> dict[str, Choice]:
+        """The best candidate not visited yet, for each of the methods that stand here."""
+        values, rough = self.values(visited, methods, view)
+        new = ~np.isin(np.arange(len(self.pattern_pixels)), visited)
+        choices = {}
+        for method in methods:
+            rank = rank_correlation(values[method], self.pattern_pixels, new)
+            best = int(np.argmax(np.where(new, values[method], -np.inf)))
+            diagnostics = {"rank_correlation": rank, "roughness": rough if method in _SAMPLING else None}
+            choices[method] = Choice(best, diagnostics)
+        return choices
+
+    def values(
+        self, visited: tuple[int, ...], methods: Sequence[str], view: int
+    ) -> tuple[dict[str, np.ndarray], float | None]:
+        """The values of all candidates by method, and how rough the samples were."""
+        state = self.state(visited)
+        values: dict[str, Any] = {}
+        if "farthest" in methods:
+            values["farthest"] = self._problem(state, None).distance_to_visited(self.poses)
+        if "oracle" in methods:
+            thinned = _thinned(state.cloud, self.num_points)
+            answers = _answers(self.imagining, thinned, self.scans)
+            values["oracle"] = cross_entropy(*jnp.broadcast_arrays(classify(self.imagining, thinned), answers))
+        rough: float | None = None
+        if {*methods} & {*_SAMPLING}:
+            posterior = self.planner.posterior(state)
+            surfaces = self.planner.sample_surfaces(state, jax.random.fold_in(self.key, view), posterior)
+            rough = roughness(self.planner, state, posterior, surfaces)
+            classes = (_Entropies(self.imagining, self.num_points),) if {*methods} & {*CLASSIFYING} else ()
+            score = Several((Coverage(), *classes))
+            found = _expected(score, state.cloud, surfaces, self.planner.camera, self.poses).T
+            values["coverage"], *entropies = found
+            if entropies:
+                values["cross-entropy"], values["entropy"] = entropies
+                undecided = float(entropy(classify(self.imagining, _thinned(state.cloud, self.num_points))))
+                values["mixed"] = entropies[0 if undecided > MixedEntropy.threshold else 1]
+            if "uncertainty" in methods:
+                values["uncertainty"] = _uncertainty(self._problem(state, surfaces), self.poses)
+        return {name: np.asarray(of, np.float64) for name, of in values.items()}, rough
+
+    def state(self, visited: tuple[int, ...]) -> State:
+        """After the views of these candidates."""
+        if visited not in self.states:
+            *before, last = visited
+            pose, seen = self.poses[last], self.scans[last]
+            self.states[visited] = (
+                self.planner.observe(self.state(tuple(before)), pose, seen) if before else self.planner.init(seen, pose)
+            )
+        return self.states[visited]
+
+    def answer(self, visited: tuple[int, ...]) -> Float[np.ndarray, " classes"]:
+        """log p after the views of these candidates."""
+        if visited not in self.answers:
+            self.answers[visited] = np.asarray(classify(self.classifier, self.state(visited).cloud))
+        return self.answers[visited]
+
+    def true_answers(self, first: int) -> Float[np.ndarray, "candidates classes"]:
+        """log p after the first view and each of the candidates."""
+        return np.asarray(_answers(self.classifier, self.state((first,)).cloud, self.scans))
+
+    def _problem(self, state: State, surfaces: GridSurface | None) -> Problem:
+        return Problem(state.cloud, state.poses, state.num_views, self.planner.camera, Coverage(), surfaces)
+
+
+class _Entropies(ClassScore):
+    """The values of `CrossEntropy` and of the reduction of entropy, from one answer of the classifier."""
+
+    classifier: Classifier
+    num_points: int = eqx.field(static=True)
+
+    def __call__(self, context: Context, scan: PointCloud) -> Float[Array, "2"]:
+        cloud, log_p = context
+        log_q = self.classifier(concatenate(cloud, scan))
+        both = cross_entropy(log_p, log_q), jnp.maximum(0.0, entropy(log_p) - entropy(log_q))
+        return jnp.stack([zero_if_empty(scan, value) for value in both])
+
+
+@eqx.filter_jit
+def classify(classifier: Classifier, cloud: PointCloud) -> Float[Array, " classes"]:
+    """log p, compiled."""
+    return classifier(cloud)
+
+
+@eqx.filter_jit
+def _expected(score: Score, cloud: PointCloud, surfaces: GridSurface, camera: Camera, poses: Pose) -> Array:
+    return expected_score(score, cloud, surfaces, camera, poses)
+
+
+@eqx.filter_jit
+def _thinned(cloud: PointCloud, count: int) -> PointCloud:
+    return limit_capacity(cloud, count)
+
+
+@eqx.filter_jit
+def _answers(classifier: Classifier, cloud: PointCloud, scans: PointCloud) -> Float[Array, "scans classes"]:
+    return jax.lax.map(lambda one: classifier(concatenate(cloud, one)), scans)
+
+
+@eqx.filter_jit
+def _uncertainty(problem: Problem, poses: Pose) -> Float[Array, " poses"]:
+    return uncertain_length(problem, poses)

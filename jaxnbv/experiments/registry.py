@@ -1,0 +1,68 @@
+"""The studies of `jaxnbv study`, by name: what a command must know before anything heavy is imported.
+
+A new study is a module with a `Study` and an entry here.
+"""
+
+from typing import NamedTuple
+
+
+class Entry(NamedTuple):
+    """One study.
+
+    - `study`: module and class; `pictures`: module and function that draws its own pictures, if there are any.
+    - `question`, `settings`: for the help.
+    - `scenes`, `views`: by default.
+    - `options`: names of its fields that are options of the command.
+    """
+
+    study: str
+    question: str
+    settings: str
+    scenes: int
+    views: int
+    pictures: str = ""
+    options: tuple[str, ...] = ()
+
+
+STUDIES = {
+    "pyramid": Entry(
+        "jaxnbv.experiments.pyramid.study:PyramidStudy",
+        "Which methods find the pattern on a pyramid's base, and how soon is its class known?",
+        "48 candidates, 16 samples on a 64^3 grid, and 512 points for the classifier of imagined scans: fewer "
+        "candidates and a coarser grid than the paper's.",
+        scenes=100,
+        views=5,
+        pictures="jaxnbv.experiments.pyramid.pictures:write_pictures",
+        options=("framing",),
+    ),
+    "parts": Entry(
+        "jaxnbv.experiments.parts.study:PartStudy",
+        "How many views until all parts of an object are found? The paper's Table 1, on procedural objects.",
+        "48 candidates at radius 2, 64 x 64 rays. Views are imagined with 32 x 32 rays, 8 samples on a 64^3 grid, and "
+        "1,024 points for the segmenter, 2,048 for what it says of the cloud; gradient search climbs from the best 4 "
+        "of 24 views, 8 steps of 0.03: less of everything than the paper.",
+        scenes=80,
+        views=6,
+        pictures="jaxnbv.experiments.parts.pictures:write_pictures",
+    ),
+    "heat": Entry(
+        "jaxnbv.experiments.heat.study:HeatStudy",
+        "How near does the coldest point of the scanned cloud come to the object's? On procedural objects whose "
+        "coldest point hides, or on your meshes, heated at one place.",
+        "32 candidates at radius 3, 50 x 50 rays. Views are imagined with 24 x 24 rays, 8 samples on a 64^3 grid, and "
+        "added to 1,024 points of the cloud: less of everything than the paper.",
+        scenes=24,
+        views=6,
+        pictures="jaxnbv.experiments.heat.pictures:write_pictures",
+        options=("meshes",),
+    ),
+    "reconstruction": Entry(
+        "jaxnbv.experiments.reconstruction.study:ReconstructionStudy",
+        "How near is the surface that a method's views give to the true one? The table of the paper's supplement.",
+        "48 candidates, 16 samples on a 64^3 grid: fewer and coarser than the paper's.",
+        scenes=32,
+        views=5,
+        pictures="jaxnbv.experiments.reconstruction.pictures:write_pictures",
+        options=("meshes",),
+    ),
+}
