@@ -7,6 +7,7 @@ from . import tasks as tasks
 from . import viz as viz
 from .acquisition import ExpectedUtilityImprovement as ExpectedUtilityImprovement
 from .acquisition import Score as Score
+from .acquisition import Several as Several
 from .acquisition import expected_score as expected_score
 from .answers import Answer as Answer
 from .answers import Quantity as Quantity

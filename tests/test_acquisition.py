@@ -6,8 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv.acquisition import ExpectedUtilityImprovement, Score, expected_score
+from jaxnbv.acquisition import ExpectedUtilityImprovement, Score, Several, expected_score
 from jaxnbv.camera import Camera, fibonacci_sphere, look_at
+from jaxnbv.checks import InputError
 from jaxnbv.cloud import PointCloud, concatenate
 from jaxnbv.scanning import Grid, GridSurface, scan
 
@@ -120,3 +121,22 @@ def test_utility_sees_the_union_of_both_clouds(cloud):
     expected = concatenate(cloud, other)
     for a, b in zip(jax.tree.leaves(seen[-1]), jax.tree.leaves(expected), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+class Vector(Toy):
+    """A score that is a vector itself."""
+
+    def __call__(self, context, scan):
+        value = super().__call__(context, scan)
+        return jnp.stack([value, -value])
+
+
+def test_several_scores_of_the_same_scans_are_each_that_of_its_own(surfaces, cloud):
+    scores = (Toy(), Vector(), ExpectedUtilityImprovement(height))
+    found = expected_score(Several(scores), cloud, surfaces, CAMERA, POSES)
+    toy, improvement = (expected_score(score, cloud, surfaces, CAMERA, POSES) for score in (scores[0], scores[2]))
+    np.testing.assert_allclose(found, jnp.stack([toy, toy, -toy, improvement], axis=1), rtol=1e-6)
+    assert float(jnp.ptp(toy)) > 0 < float(jnp.ptp(improvement))
+    assert Several(scores).batch_size == min(score.batch_size for score in scores)
+    with pytest.raises(InputError, match="it must be finite"):
+        Several((Toy(), ExpectedUtilityImprovement(lambda cloud: jnp.nan * cloud.points.sum()))).check(cloud)
