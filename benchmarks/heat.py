@@ -19,8 +19,8 @@ from loky import cpu_count
 from timing import least_time
 
 import jaxnbv as nbv
-from jaxnbv.diffusion import HeatProblem, cloud_laplacian, cloud_temperature, diffuse
 from jaxnbv.storage import versions
+from jaxnbv.tasks.diffusion import HeatProblem, cloud_laplacian, cloud_temperature, diffuse
 from jaxnbv.tasks.heat import ColdestPoint
 
 SIZES = (2000, 4000, 6000)

@@ -34,8 +34,9 @@ from jaxnbv import surfaces as models
 from jaxnbv.datasets import PART_CATEGORIES, Split, demo_object, part_scene, pyramid_scene
 from jaxnbv.episode import observe_scene
 from jaxnbv.experiments.imagination import Truth, judge
+from jaxnbv.files import write_whole
 from jaxnbv.search.candidates import sphere_candidates
-from jaxnbv.storage import describe, versions, write_whole
+from jaxnbv.storage import describe, versions
 
 GRID = nbv.Grid(64, 0.7 * 2.5)
 RAYS = nbv.Camera(height=32, width=32)

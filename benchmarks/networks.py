@@ -18,7 +18,8 @@ import jax.numpy as jnp
 from timing import least_time
 
 from jaxnbv.farthest import farthest_point_indices
-from jaxnbv.networks import PointNet2Classifier, ball_query
+from jaxnbv.networks import PointNet2Classifier
+from jaxnbv.networks.grouping import ball_query
 from jaxnbv.networks.pointnet2 import MULTI_SCALE, SINGLE_SCALE
 from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
 from jaxnbv.storage import versions

@@ -19,7 +19,6 @@ from .cloud import Frame as Frame
 from .cloud import PointCloud as PointCloud
 from .cloud import concatenate as concatenate
 from .cloud import farthest_point_subsample as farthest_point_subsample
-from .diffusion import HeatProblem as HeatProblem
 from .episode import Episode as Episode
 from .episode import View as View
 from .episode import simulate as simulate
@@ -78,5 +77,6 @@ from .tasks import MixedEntropy as MixedEntropy
 from .tasks import NegativeEntropy as NegativeEntropy
 from .tasks import SoftPartCount as SoftPartCount
 from .tasks import coldest_point as coldest_point
+from .tasks.diffusion import HeatProblem as HeatProblem
 from .version import __version__ as __version__
 from .volume import Box as Box

@@ -1,11 +1,11 @@
 """From a cloud to a surface: triangles of the posterior mean, and screened Poisson surface reconstruction."""
 
 import numpy as np
-from skimage.measure import marching_cubes
 
 from jaxnbv.checks import InputError, require
 from jaxnbv.cloud import Frame, PointCloud
 from jaxnbv.scanning import Grid, TriangleMesh
+from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.surfaces import SurfaceModel
 
 # Fewer cannot enclose anything, and Poisson reconstruction answers them with an empty mesh.
@@ -23,14 +23,14 @@ def mean_mesh(model: SurfaceModel, cloud: PointCloud, grid: Grid = Grid()) -> Tr
     """
     posterior = model.condition(cloud)
     values = np.array(posterior.mean_on_grid(grid.axis.astype(posterior.level.dtype)) - posterior.level)
-    low, high = float(values.min()), float(values.max())
-    require(
-        low < 0 < high,
-        f"the posterior mean less its level runs from {low:.4g} to {high:.4g} on the grid, so no surface lies within "
-        f"[-{grid.half_extent}, {grid.half_extent}]^3: give a Grid whose half extent holds the cloud, or a finer one",
-    )
-    vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(grid.spacing,) * 3, gradient_direction="descent")
-    return TriangleMesh(vertices - grid.half_extent, faces, Frame())
+    found = level_triangles(values, grid)
+    if found is None:
+        raise InputError(
+            f"the posterior mean less its level runs from {values.min():.4g} to {values.max():.4g} on the grid, so no "
+            f"surface lies within [-{grid.half_extent}, {grid.half_extent}]^3: give a Grid whose half extent holds the "
+            "cloud, or a finer one"
+        )
+    return TriangleMesh(found[0], found[1], Frame())
 
 
 def has_poisson() -> bool:

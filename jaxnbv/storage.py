@@ -11,11 +11,9 @@ import functools
 import hashlib
 import importlib.metadata
 import json
-import os
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any
@@ -28,6 +26,7 @@ from plyfile import PlyData, PlyElement
 from jaxnbv.camera import Pose
 from jaxnbv.checks import InputError, require
 from jaxnbv.cloud import PointCloud
+from jaxnbv.files import write_whole
 from jaxnbv.search import Proposal, Trajectories
 
 _LARGEST_LISTED = 16
@@ -194,16 +193,6 @@ def _view(data: dict[str, jax.Array]) -> tuple[Pose, PointCloud, Proposal | None
         poses = Pose(data["trajectory_rotations"], data["trajectory_positions"])
         trajectories = Trajectories(poses, data["trajectory_values"])
     return pose, scan, Proposal(pose, data["value"], candidates, data["values"], trajectories)
-
-
-def write_whole(path: Path, write: Callable[[Any], Any]) -> None:
-    """Write beside the file and rename, so that a reader finds the old file or the whole new one, never a part."""
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("wb") as file:
-        write(file)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
 
 
 def differences(found: Any, asked: Any, name: str = "") -> list[str]:

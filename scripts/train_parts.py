@@ -16,15 +16,16 @@ from cached import cached
 
 from jaxnbv import Coverage, DiscreteSearch, Grid, Planner, PointCloud
 from jaxnbv.datasets import Split
-from jaxnbv.experiments.parts.clouds import (
-    PART_CAMERA,
+from jaxnbv.networks import CATEGORIES, CompactPartSegmenter, part_mask, save_compact_segmenter
+from jaxnbv.networks.pretrained import TRAINED_SIDE
+from jaxnbv.presets import ModelName, imagination
+from jaxnbv.sensors import PART_SETTING
+from jaxnbv.training import fit
+from jaxnbv.training.part_clouds import (
     LabelledPartClouds,
     imagined_part_clouds,
     scanned_part_clouds,
 )
-from jaxnbv.networks import CATEGORIES, CompactPartSegmenter, fit, part_mask, save_compact_segmenter
-from jaxnbv.networks.pretrained import TRAINED_SIDE
-from jaxnbv.presets import ModelName, imagination
 
 WEIGHTS = Path(__file__).parents[1] / "jaxnbv" / "networks" / "weights" / "parts.safetensors"
 # Scenes whose posterior is sampled come from numbers that no scanned cloud uses.
@@ -44,7 +45,7 @@ def scanned(folder: Path, split: Split, count: int) -> LabelledPartClouds:
 def imagined(folder: Path, split: Split, count: int) -> LabelledPartClouds:
     """Clouds that end in a scan of a posterior sample, 16 from each of `count` scenes."""
     model, carving = imagination(ModelName.SCREENED)
-    planner = Planner(model, PART_CAMERA, Coverage(), DiscreteSearch(), 4, Grid(64), 2500, carving=carving)
+    planner = Planner(model, PART_SETTING.camera, Coverage(), DiscreteSearch(), 4, Grid(64), 2500, carving=carving)
 
     def make(index):
         return imagined_part_clouds(split, [index], planner)

@@ -16,18 +16,12 @@ from cached import cached
 
 from jaxnbv import Camera, Coverage, DiscreteSearch, Grid, Planner, PointCloud
 from jaxnbv.datasets import PATTERNS, Framing, Split
-from jaxnbv.experiments.pyramid.clouds import LabelledClouds, imagined_clouds, scanned_clouds
-from jaxnbv.networks import (
-    InvariantClassifier,
-    calibrate,
-    expected_calibration_error,
-    log_probabilities,
-    save_invariant,
-    train,
-)
+from jaxnbv.networks import InvariantClassifier, save_invariant
 from jaxnbv.networks.pretrained import TRAINED_SIDE
 from jaxnbv.presets import ModelName, imagination
 from jaxnbv.tasks.classification import entropy
+from jaxnbv.training import calibrate, expected_calibration_error, log_probabilities, train
+from jaxnbv.training.pyramid_clouds import LabelledClouds, imagined_clouds, scanned_clouds
 
 WEIGHTS = Path(__file__).parents[1] / "jaxnbv" / "networks" / "weights" / "pyramid.safetensors"
 # Scenes whose posterior is sampled come from numbers that no scanned cloud uses.

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.checks import AnyArray, is_traced, require
-from jaxnbv.scanning.sdf import SignedDistance, _corner, _norm, nonnegative, parameter
+from jaxnbv.scanning.sdf import SignedDistance, corner_distance, nonnegative, norm, parameter
 
 # How many primitives a solid can have.
 CAPACITY = 24
@@ -68,10 +68,12 @@ class LabelledSolid(SignedDistance):
         u, v, w = (
             a * self.rotation[:, 0, i] + b * self.rotation[:, 1, i] + c * self.rotation[:, 2, i] for i in range(3)
         )
-        u = jnp.where(self.revolved, _norm(u, w) - self.radius - self.slant * v, u)
+        u = jnp.where(self.revolved, norm(u, w) - self.radius - self.slant * v, u)
         w = jnp.where(self.revolved, 0.0, w)
         half = self.half_size - self.rounding[:, None]
-        distance = _corner(jnp.abs(u) - half[:, 0], jnp.abs(v) - half[:, 1], jnp.abs(w) - half[:, 2]) - self.rounding
+        distance = (
+            corner_distance(jnp.abs(u) - half[:, 0], jnp.abs(v) - half[:, 1], jnp.abs(w) - half[:, 2]) - self.rounding
+        )
         steepest = 0.5 * (jnp.abs(self.slant) + jnp.sqrt(self.slant**2 + 4.0))
         return jnp.where(self.labels > _EMPTY, distance / steepest, jnp.inf)
 

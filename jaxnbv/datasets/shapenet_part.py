@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from jaxnbv.checks import InputError, require
 from jaxnbv.cloud import Frame, PointCloud
-from jaxnbv.networks.shapenet import CATEGORIES, category_index
+from jaxnbv.datasets.categories import CATEGORIES, category_index
 
 _SPLITS = {"train": "train", "validation": "val", "test": "test"}
 _CATEGORY_FILE = "synsetoffset2category.txt"

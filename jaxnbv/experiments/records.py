@@ -9,7 +9,8 @@ from typing import Any
 from tqdm import tqdm
 
 from jaxnbv.checks import InputError, require
-from jaxnbv.storage import differences, versions, write_whole
+from jaxnbv.files import write_whole
+from jaxnbv.storage import differences, versions
 
 
 class RecordFolder:

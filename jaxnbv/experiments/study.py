@@ -22,7 +22,7 @@ from jaxnbv.planner import Planner
 from jaxnbv.presets import imagination
 from jaxnbv.scanning import Carving, Grid, Surface
 from jaxnbv.search import Search, SphereCandidates
-from jaxnbv.search.candidates import SENSOR_RADIUS
+from jaxnbv.sensors import SENSOR_RADIUS
 from jaxnbv.surfaces import ScreenedSPSR, SurfaceModel
 
 _PURPOSES = ("first", "episode", "scene", "measure")

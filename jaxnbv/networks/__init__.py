@@ -1,5 +1,9 @@
 """Networks: PointNet++ and published checkpoints, a small rotation-invariant classifier, training and calibration."""
 
+from jaxnbv.datasets.categories import CATEGORIES as CATEGORIES
+from jaxnbv.datasets.categories import Category as Category
+from jaxnbv.datasets.categories import category_index as category_index
+from jaxnbv.datasets.categories import part_mask as part_mask
 from jaxnbv.networks.checkpoints import convert_checkpoint as convert_checkpoint
 from jaxnbv.networks.checkpoints import load_checkpoint as load_checkpoint
 from jaxnbv.networks.checkpoints import load_part_segmenter as load_part_segmenter
@@ -9,8 +13,6 @@ from jaxnbv.networks.checkpoints import save_safetensors as save_safetensors
 from jaxnbv.networks.classifier import CloudClassifier as CloudClassifier
 from jaxnbv.networks.compact_segmenter import CompactPartSegmenter as CompactPartSegmenter
 from jaxnbv.networks.feature_propagation import FeaturePropagation as FeaturePropagation
-from jaxnbv.networks.feature_propagation import interpolate as interpolate
-from jaxnbv.networks.grouping import ball_query as ball_query
 from jaxnbv.networks.invariant import InvariantClassifier as InvariantClassifier
 from jaxnbv.networks.part_segmentation import PointNet2PartSegmenter as PointNet2PartSegmenter
 from jaxnbv.networks.pointnet2 import PointNet2Classifier as PointNet2Classifier
@@ -21,13 +23,4 @@ from jaxnbv.networks.pretrained import pyramid_classifier as pyramid_classifier
 from jaxnbv.networks.pretrained import save_compact_segmenter as save_compact_segmenter
 from jaxnbv.networks.pretrained import save_invariant as save_invariant
 from jaxnbv.networks.segmenter import CloudSegmenter as CloudSegmenter
-from jaxnbv.networks.shapenet import CATEGORIES as CATEGORIES
-from jaxnbv.networks.shapenet import Category as Category
-from jaxnbv.networks.shapenet import category_index as category_index
-from jaxnbv.networks.shapenet import part_mask as part_mask
 from jaxnbv.networks.torch_format import read_torch_tensors as read_torch_tensors
-from jaxnbv.networks.training import calibrate as calibrate
-from jaxnbv.networks.training import expected_calibration_error as expected_calibration_error
-from jaxnbv.networks.training import fit as fit
-from jaxnbv.networks.training import log_probabilities as log_probabilities
-from jaxnbv.networks.training import train as train

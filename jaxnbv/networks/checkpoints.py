@@ -10,6 +10,7 @@ import safetensors.numpy
 from safetensors import SafetensorError
 
 from jaxnbv.checks import InputError, require
+from jaxnbv.files import write_whole
 from jaxnbv.networks.part_segmentation import PointNet2PartSegmenter
 from jaxnbv.networks.pointnet2 import PointNet2Classifier
 from jaxnbv.networks.state_dict import Tensors, build_classifier, build_part_segmenter, is_segmenter, tensors_of
@@ -70,10 +71,8 @@ def save_safetensors(
         for name, tensor in tensors.items()
     }
     path = Path(path)
-    partial = path.with_name(path.name + ".partial")
     try:
-        partial.write_bytes(safetensors.numpy.save(arrays))
-        partial.replace(path)
+        write_whole(path, lambda file: file.write(safetensors.numpy.save(arrays)))
     except OSError as error:
         raise InputError(f"cannot write {path} ({error}): choose another place") from error
 

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from jaxnbv.datasets.categories import CATEGORIES, NUM_PARTS
 from jaxnbv.networks.feature_propagation import FeaturePropagation
 from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
-from jaxnbv.networks.shapenet import CATEGORIES, NUM_PARTS
 
 
 class CompactPartSegmenter(eqx.Module):

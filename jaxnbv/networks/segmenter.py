@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxnbv.checks import AnyArray, is_traced, require
 from jaxnbv.cloud import PointCloud, farthest_point_subsample
-from jaxnbv.networks.shapenet import CATEGORIES, category_index, part_mask
+from jaxnbv.datasets.categories import CATEGORIES, category_index, part_mask
 
 
 class CloudSegmenter(eqx.Module):

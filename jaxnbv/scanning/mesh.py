@@ -197,17 +197,29 @@ def load_mesh(path: str | Path) -> TriangleMesh:
         raise InputError(f"{path}: {error}") from error
 
 
+def level_triangles(
+    values: Float[np.ndarray, "g g g"], grid: Grid
+) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Float[np.ndarray, "v 3"]] | None:
+    """Vertices, faces wound outward and outward unit normals where values at the grid's nodes, positive outside, cross
+    zero, by marching cubes; None if they do not."""
+    if not values.min() < 0 < values.max():
+        return None
+    vertices, faces, normals, _ = marching_cubes(values, 0.0, spacing=(grid.spacing,) * 3, gradient_direction="descent")
+    lengths = np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return vertices - grid.half_extent, faces, -normals / lengths
+
+
 def mesh_from_sdf(sdf: SignedDistance, grid: Grid) -> TriangleMesh:
     """The surface of a solid as triangles in scene coordinates (the frame is the identity), by marching cubes.
 
     **Raises:** `ValueError` if no surface lies within the grid.
     """
     values = np.array(on_tensor_grid(sdf, jnp.asarray(grid.axis, jnp.result_type(float))))
-    low, high = float(values.min()), float(values.max())
-    require(
-        low < 0 < high,
-        f"the solid's distances on the grid run from {low:.4g} to {high:.4g}: no surface lies within "
-        f"[-{grid.half_extent}, {grid.half_extent}]^3; move the solid, or give Grid(half_extent=...) that holds it",
-    )
-    vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(grid.spacing,) * 3, gradient_direction="descent")
-    return TriangleMesh(vertices - grid.half_extent, faces, Frame())
+    found = level_triangles(values, grid)
+    if found is None:
+        raise InputError(
+            f"the solid's distances on the grid run from {values.min():.4g} to {values.max():.4g}: no surface lies "
+            f"within [-{grid.half_extent}, {grid.half_extent}]^3; move the solid, or give Grid(half_extent=...) that "
+            "holds it"
+        )
+    return TriangleMesh(found[0], found[1], Frame())

@@ -42,14 +42,14 @@ def nonnegative(**kwargs):
 
 
 @jax.custom_jvp
-def _norm(*components):
+def norm(*components):
     """Euclidean length of the vectors with these components, with derivative zero at zero."""
     return jnp.sqrt(sum(c * c for c in components))
 
 
-@_norm.defjvp
+@norm.defjvp
 def _norm_jvp(components, tangents):
-    length = _norm(*components)
+    length = norm(*components)
     inverse = 1.0 / jnp.where(length > 0, length, 1.0)
     return length, sum(inverse * c * dc for c, dc in zip(components, tangents, strict=True))
 
@@ -67,9 +67,9 @@ def _greatest(a, b):
     return jnp.where(a >= b, a, b)
 
 
-def _corner(*q):
+def corner_distance(*q):
     """Signed distance to the corner, edge or face where all q <= 0, given the signed distances q to its faces."""
-    outside = _norm(*(_greatest(c, 0.0) for c in q))
+    outside = norm(*(_greatest(c, 0.0) for c in q))
     return outside + _least(functools.reduce(_greatest, q), 0.0)
 
 
@@ -113,8 +113,8 @@ class SignedDistance(eqx.Module):
         """
         axis, angle = _as_float(axis), _as_float(angle)
         if not is_traced(axis):
-            require(bool(_norm(*axis) > 0), f"the axis of rotation is {axis}: give a direction that is not zero")
-        x, y, z = axis / _norm(*axis)
+            require(bool(norm(*axis) > 0), f"the axis of rotation is {axis}: give a direction that is not zero")
+        x, y, z = axis / norm(*axis)
         zero = jnp.zeros_like(x)
         cross = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
         return Rotated(self, jnp.eye(3) + jnp.sin(angle) * cross + (1.0 - jnp.cos(angle)) * cross @ cross)
@@ -143,7 +143,7 @@ class Sphere(SignedDistance):
     radius: Scalar = nonnegative()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        return _norm(*_split(x)) - self.radius
+        return norm(*_split(x)) - self.radius
 
 
 class Box(SignedDistance):
@@ -163,7 +163,7 @@ class Box(SignedDistance):
             )
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        return _corner(*_split(jnp.abs(x) - (self.half_size - self.rounding))) - self.rounding
+        return corner_distance(*_split(jnp.abs(x) - (self.half_size - self.rounding))) - self.rounding
 
 
 class Cylinder(SignedDistance):
@@ -174,7 +174,7 @@ class Cylinder(SignedDistance):
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         x, y, z = _split(x)
-        return _corner(_norm(x, z) - self.radius, jnp.abs(y) - self.half_height)
+        return corner_distance(norm(x, z) - self.radius, jnp.abs(y) - self.half_height)
 
 
 class Cone(SignedDistance):
@@ -187,15 +187,15 @@ class Cone(SignedDistance):
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         # The profile in the half plane (r, y): two caps, a slanted edge from the bottom's corner to the top's.
         x, y, z = _split(x)
-        r = _norm(x, z)
+        r = norm(x, z)
         widening, rise = self.top_radius - self.bottom_radius, 2.0 * self.half_height
-        slant = _norm(widening, rise)
+        slant = norm(widening, rise)
         out, up = r - self.bottom_radius, y + self.half_height
         side = (rise * out - widening * up) / slant
         along = (widening * out + rise * up) / slant
         cap = jnp.abs(y) - self.half_height
         inside = _greatest(side, cap)
-        bottom, top = _norm(out, up), _norm(r - self.top_radius, y - self.half_height)
+        bottom, top = norm(out, up), norm(r - self.top_radius, y - self.half_height)
         outside = jnp.where(along < 0, bottom, jnp.where(along > slant, top, inside))
         over_cap = (cap > 0) & (r < jnp.where(y > 0, self.top_radius, self.bottom_radius))
         return jnp.where(over_cap, cap, jnp.where(inside > 0, outside, inside))
@@ -209,7 +209,7 @@ class Torus(SignedDistance):
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         x, y, z = _split(x)
-        return _norm(_norm(x, z) - self.major_radius, y) - self.minor_radius
+        return norm(norm(x, z) - self.major_radius, y) - self.minor_radius
 
 
 class Capsule(SignedDistance):
@@ -225,7 +225,7 @@ class Capsule(SignedDistance):
         offset = _split(x - self.start)
         along = sum(c * d for c, d in zip(offset, segment, strict=True)) / jnp.where(squared > 0, squared, 1.0)
         nearest = jnp.clip(along, 0.0, 1.0)
-        return _norm(*(c - nearest * d for c, d in zip(offset, segment, strict=True))) - self.radius
+        return norm(*(c - nearest * d for c, d in zip(offset, segment, strict=True))) - self.radius
 
 
 class Union(SignedDistance):

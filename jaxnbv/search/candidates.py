@@ -12,10 +12,8 @@ from jaxtyping import Array, Bool, PRNGKeyArray
 
 from jaxnbv.camera import Pose, fibonacci_sphere, look_at
 from jaxnbv.checks import AnyArray, InputError, require
-from jaxnbv.rotations import rotation_between, rotation_from_6d
-
-# Of the paper: cameras stand on a sphere of this radius about the origin, in scene units.
-SENSOR_RADIUS = 2.5
+from jaxnbv.search.rotations import rotation_between, rotation_from_6d
+from jaxnbv.sensors import SENSOR_RADIUS
 
 
 class Candidates(eqx.Module):

@@ -14,8 +14,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import require
-from jaxnbv.rotations import normalise, rotation_between, rotation_from_6d, rotation_to_6d
-from jaxnbv.search.candidates import SENSOR_RADIUS, SphereCandidates
+from jaxnbv.search.candidates import SphereCandidates
+from jaxnbv.search.rotations import normalise, rotation_between, rotation_from_6d, rotation_to_6d
+from jaxnbv.sensors import SENSOR_RADIUS
 
 
 class PoseSpace(eqx.Module):

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 from jaxnbv.acquisition import Score
 from jaxnbv.answers import Quantity
 from jaxnbv.cloud import PointCloud
-from jaxnbv.neighbours import nearest_squared_distance
+from jaxnbv.tasks.neighbours import nearest_squared_distance
 
 
 class Coverage(Score):

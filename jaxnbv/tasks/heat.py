@@ -15,8 +15,8 @@ from loky import cpu_count, get_reusable_executor
 from jaxnbv.answers import Answer, Quantity, coordinates, number
 from jaxnbv.checks import AnyArray, InputError, require
 from jaxnbv.cloud import PointCloud
-from jaxnbv.diffusion import HeatProblem, Temperature, cloud_temperature, mesh_temperature, refine
 from jaxnbv.scanning import TriangleMesh
+from jaxnbv.tasks.diffusion import HeatProblem, Temperature, cloud_temperature, mesh_temperature, refine
 from jaxnbv.tasks.host import call_on_host
 
 # Longest edge, in scene units, of the triangles on which the true temperature is computed: within 2 % of that on ever

@@ -5,16 +5,16 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
-from skimage.measure import marching_cubes
 from tqdm import tqdm
 
 from jaxnbv.answers import Answer, Quantity
 from jaxnbv.camera import Pose
 from jaxnbv.checks import AnyArray
 from jaxnbv.episode import Episode
-from jaxnbv.experiments.metrics import coverage, truth_points
+from jaxnbv.metrics import coverage, truth_points
 from jaxnbv.planner import Planner, State
 from jaxnbv.scanning import Grid
+from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.surfaces import TrigonometricPosterior
 from jaxnbv.viz.sphere import unit
@@ -192,10 +192,10 @@ def mean_surface(planner: Planner, state: State) -> MeanSurface | None:
     mean = posterior.mean_on_grid(grid.axis.astype(posterior.level.dtype)) - posterior.level
     # What was seen empty is known at the nodes of the planner's own grid.
     values = np.array(planner.carve(state, mean) if grid == planner.grid else mean)
-    if not values.min() < 0 < values.max():
+    found = level_triangles(values, grid)
+    if found is None:
         return None
-    found = marching_cubes(values, 0.0, spacing=(grid.spacing,) * 3, gradient_direction="descent")
-    vertices, faces, normals = found[0] - grid.half_extent, found[1], -unit(found[2])
+    vertices, faces, normals = found
     # Along the normals too, so that the two sides of a thin sheet are told apart.
     features = np.concatenate([vertices, 0.1 * normals], axis=1)
     anchors = _spread(features, _SLOPE_ANCHORS)

@@ -12,7 +12,7 @@ from skimage.measure import marching_cubes
 
 from jaxnbv.checks import InputError
 from jaxnbv.datasets import PART_CATEGORIES, Split, part_scene, sample_part_object
-from jaxnbv.networks.shapenet import CATEGORIES, category_index
+from jaxnbv.datasets.categories import CATEGORIES, category_index
 
 NODES, REACH = 90, 1.3
 

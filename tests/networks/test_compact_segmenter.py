@@ -11,7 +11,6 @@ import safetensors.numpy
 
 from jaxnbv.checks import InputError
 from jaxnbv.datasets import Split
-from jaxnbv.experiments.parts.clouds import LabelledPartClouds, scanned_part_clouds
 from jaxnbv.networks import (
     CATEGORIES,
     CompactPartSegmenter,
@@ -19,6 +18,7 @@ from jaxnbv.networks import (
     part_segmenter,
     save_compact_segmenter,
 )
+from jaxnbv.training.part_clouds import LabelledPartClouds, scanned_part_clouds
 
 RNG = np.random.default_rng(0)
 COUNT = 300

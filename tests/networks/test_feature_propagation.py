@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv.networks import FeaturePropagation, interpolate
+from jaxnbv.networks.feature_propagation import FeaturePropagation, interpolate
 from jaxnbv.networks.set_abstraction import Linear
 
 RNG = np.random.default_rng(0)

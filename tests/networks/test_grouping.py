@@ -7,7 +7,7 @@ import pytest
 
 from jaxnbv.checks import InputError
 from jaxnbv.farthest import farthest_point_indices
-from jaxnbv.networks import ball_query
+from jaxnbv.networks.grouping import ball_query
 
 RNG = np.random.default_rng(0)
 

@@ -10,9 +10,9 @@ import pytest
 
 from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets import PATTERNS, Framing, Split
-from jaxnbv.experiments.pyramid.clouds import LabelledClouds, scanned_clouds
 from jaxnbv.networks import pyramid_classifier
 from jaxnbv.tasks.classification import entropy
+from jaxnbv.training.pyramid_clouds import LabelledClouds, scanned_clouds
 
 _CHUNK = 40
 

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from jaxnbv.camera import Camera, Pose, look_at
-from jaxnbv.rotations import rotation_to_6d
 from jaxnbv.search.pose_space import ConstrainedPoses, FreePoses, SpherePoses
+from jaxnbv.search.rotations import rotation_to_6d
 
 RNG = np.random.default_rng(0)
 LOOK_AT = jax.jit(look_at)

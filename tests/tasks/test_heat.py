@@ -14,11 +14,11 @@ from jaxnbv.acquisition import ExpectedUtilityImprovement, expected_score
 from jaxnbv.camera import Camera, fibonacci_sphere, look_at
 from jaxnbv.checks import InputError
 from jaxnbv.cloud import PointCloud
-from jaxnbv.diffusion import HeatProblem
 from jaxnbv.planner import Planner
 from jaxnbv.scanning import Grid, GridSurface, TriangleMesh, scan
 from jaxnbv.search import GradientSearch
 from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks.diffusion import HeatProblem
 from jaxnbv.tasks.heat import ColdestPoint, body_temperature, coldest_point
 
 RNG = np.random.default_rng(0)

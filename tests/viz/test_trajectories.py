@@ -16,10 +16,10 @@ from jaxnbv.camera import look_at
 from jaxnbv.cli.actions.episodes import _summarise
 from jaxnbv.datasets.demo import demo_object
 from jaxnbv.episode import view_keys
-from jaxnbv.rotations import rotation_from_6d
 from jaxnbv.search import Search, Trajectories
 from jaxnbv.search.base import best_unvisited
 from jaxnbv.search.candidates import sphere_candidates
+from jaxnbv.search.rotations import rotation_from_6d
 from jaxnbv.viz import report_data, sphere, write_figures
 from jaxnbv.viz.data import choice_of
 from jaxnbv.viz.report import report_html

@@ -33,13 +33,13 @@ from jaxnbv.datasets import (
     pyramid_scene,
     source_view,
 )
-from jaxnbv.diffusion import HeatProblem
 from jaxnbv.episode import Episode, simulate
 from jaxnbv.model_name import ModelName
 from jaxnbv.networks import CATEGORIES, pyramid_classifier
 from jaxnbv.planner import Planner
 from jaxnbv.scanning import SDFSurface, SensorNoise, Surface, TriangleMesh, load_mesh, scan
 from jaxnbv.tasks import Coverage
+from jaxnbv.tasks.diffusion import HeatProblem
 from jaxnbv.viz import write_report
 
 

@@ -1,7 +1,7 @@
 """What a task and a search on the command line stand for: scores, searches and planners."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -30,6 +30,7 @@ from jaxnbv.search import (
     SpherePoses,
     UncertaintyView,
 )
+from jaxnbv.sensors import HEAT_SETTING, PART_SETTING, USUAL_SETTING, Setting
 from jaxnbv.tasks import Classifier, ColdestPoint, Coverage, CrossEntropy, MixedEntropy, NegativeEntropy, SoftPartCount
 
 CLASS_TASKS = (Task.CROSS_ENTROPY, Task.ENTROPY, Task.MIXED)
@@ -37,19 +38,9 @@ CLASS_TASKS = (Task.CROSS_ENTROPY, Task.ENTROPY, Task.MIXED)
 _NETWORK_SCALE = 1 / 1.25
 
 
-class Setting(NamedTuple):
-    """The authors' sensor for a task: camera, distance from the object's centre, and candidates on that sphere."""
-
-    camera: Camera
-    radius: float
-    num_candidates: int
-
-
 def setting_of(task: Task) -> Setting:
     """The sensor of a task."""
-    if task is Task.PARTS:
-        return Setting(Camera(height=64, width=64), 2.0, 120)
-    return Setting(Camera(), 3.0, 100) if task is Task.HEAT else Setting(Camera(), 2.5, 120)
+    return {Task.PARTS: PART_SETTING, Task.HEAT: HEAT_SETTING}.get(task, USUAL_SETTING)
 
 
 def class_score(task: Task, classifier: Classifier) -> Score:
@@ -131,6 +122,5 @@ def task_planner(
 def pyramid_planner(score: Score, search: SearchName, model: ModelName, framing: Framing) -> Planner:
     """The grid is that of the surfaces that the classifier was trained on; so are the surfaces, but for the paper's."""
     surfaces, carving = imagination(model, framing.longest_side)
-    _, radius, _ = setting_of(Task.CROSS_ENTROPY)
     grid = Grid(64, 0.7 * framing.longest_side)
-    return Planner(surfaces, Camera(), score, search_of(search, radius, None), grid=grid, carving=carving)
+    return Planner(surfaces, Camera(), score, search_of(search, USUAL_SETTING.radius, None), grid=grid, carving=carving)

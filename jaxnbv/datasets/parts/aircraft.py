@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from jaxnbv.datasets.categories import CATEGORIES, category_index
 from jaxnbv.datasets.labelled import Primitive, bar, box, rod, rotation_about
-from jaxnbv.networks.shapenet import CATEGORIES, category_index
 
 BODY, WING, TAIL, ENGINE = CATEGORIES[category_index("airplane")].labels
 HULL, FIN, NOSE = CATEGORIES[category_index("rocket")].labels

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from jaxnbv.datasets.categories import CATEGORIES, category_index
 from jaxnbv.datasets.labelled import Primitive, bar, box, path, rod
-from jaxnbv.networks.shapenet import CATEGORIES, category_index
 
 HANDLE, BAG_BODY = CATEGORIES[category_index("bag")].labels
 HEAD, NECK, BODY = CATEGORIES[category_index("guitar")].labels

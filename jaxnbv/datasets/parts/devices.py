@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from jaxnbv.datasets.categories import CATEGORIES, category_index
 from jaxnbv.datasets.labelled import Primitive, bar, box, path, ring, rod, shifted
-from jaxnbv.networks.shapenet import CATEGORIES, category_index
 
 CUP, BAND, WIRE = CATEGORIES[category_index("earphone")].labels
 KEYBOARD, SCREEN = CATEGORIES[category_index("laptop")].labels

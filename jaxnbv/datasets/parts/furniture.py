@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from jaxnbv.datasets.categories import CATEGORIES, category_index
 from jaxnbv.datasets.labelled import Primitive, bar, box, path, ring, rod
-from jaxnbv.networks.shapenet import CATEGORIES, category_index
 
 BACK, SEAT, LEG, ARM = CATEGORIES[category_index("chair")].labels
 TOP, TABLE_LEG, DRAWER = CATEGORIES[category_index("table")].labels

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from jaxnbv.datasets.categories import CATEGORIES, category_index
 from jaxnbv.datasets.labelled import Primitive, ball, bar, box, path, ring, rod, shifted
-from jaxnbv.networks.shapenet import CATEGORIES, category_index
 
 TANK, SEAT, WHEEL, HANDLE, LIGHT, FRAME = CATEGORIES[category_index("motorbike")].labels
 

@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
 from jaxnbv.checks import require
+from jaxnbv.datasets.categories import NUM_PARTS, category_index
 from jaxnbv.datasets.labelled import LabelledSolid, assemble, generator
 from jaxnbv.datasets.parts import aircraft, belongings, devices, furniture, motorbike, skateboard, vessels
 from jaxnbv.datasets.pyramid import Split
-from jaxnbv.networks.shapenet import NUM_PARTS, category_index
 
 # Each lists the primitives of a random object: x is forward, y up and z to the right.
 _BUILDERS = {

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from jaxnbv.datasets.categories import CATEGORIES, category_index
 from jaxnbv.datasets.labelled import Primitive, bar, box, rod
-from jaxnbv.networks.shapenet import CATEGORIES, category_index
 
 WHEEL, DECK, TRUCK = CATEGORIES[category_index("skateboard")].labels
 

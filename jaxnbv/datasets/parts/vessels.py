@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from jaxnbv.datasets.categories import CATEGORIES, category_index
 from jaxnbv.datasets.labelled import Primitive, path, ring, rod
-from jaxnbv.networks.shapenet import CATEGORIES, category_index
 
 HANDLE, BODY = CATEGORIES[category_index("mug")].labels
 

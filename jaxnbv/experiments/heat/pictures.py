@@ -16,11 +16,11 @@ from matplotlib.lines import Line2D
 
 from jaxnbv.camera import Camera, Pose, fibonacci_sphere
 from jaxnbv.cloud import PointCloud
-from jaxnbv.diffusion import HeatProblem
 from jaxnbv.experiments.heat.study import HeatStudy, Truth, heat_problem
 from jaxnbv.experiments.measures import Record, methods_of
 from jaxnbv.experiments.study import Scene, views_of
 from jaxnbv.tasks import body_temperature
+from jaxnbv.tasks.diffusion import HeatProblem
 from jaxnbv.viz.data import MeanSurface
 from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.render import Still, draw_segments, frustum

@@ -15,7 +15,6 @@ from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
 from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets import heat_scene
-from jaxnbv.diffusion import HeatProblem
 from jaxnbv.episode import Step, view_keys
 from jaxnbv.experiments.heat.halving import compare, halving_notes, halving_rows
 from jaxnbv.experiments.measures import Measure, Record, Row
@@ -24,7 +23,9 @@ from jaxnbv.experiments.study import Chart, Panel, Scene, Study
 from jaxnbv.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, mesh_from_sdf
 from jaxnbv.search import CandidateSearch, DiscreteSearch, FarthestView, HalvingSearch, RandomView, UncertaintyView
+from jaxnbv.sensors import HEAT_SETTING
 from jaxnbv.tasks import ColdestPoint, Coverage, body_temperature
+from jaxnbv.tasks.diffusion import HeatProblem
 
 _SEARCHES: dict[str, type[CandidateSearch]] = {
     "heat": DiscreteSearch,
@@ -130,7 +131,7 @@ class HeatStudy(Study):
         "coldest": Chart(tuple((Panel(f"distance, {e}"), Panel(f"error, {e}", log=True)) for e in ESTIMATES))
     }
     seed: ClassVar[int] = 8
-    radius: ClassVar[float] = 3.0
+    radius: ClassVar[float] = HEAT_SETTING.radius
     quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 24, "num_points": 512}
     quick_scenes: ClassVar[int] = 3
 

@@ -13,7 +13,6 @@ from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets import Split, part_scene
 from jaxnbv.episode import Step
 from jaxnbv.experiments.measures import Measure, Record
-from jaxnbv.experiments.parts.clouds import MAX_VIEWS, PART_CAMERA, PART_RADIUS
 from jaxnbv.experiments.study import Chart, Panel, Scene, Study
 from jaxnbv.model_name import ModelName
 from jaxnbv.networks import CATEGORIES, CloudSegmenter, part_segmenter
@@ -29,6 +28,7 @@ from jaxnbv.search import (
     SpherePoses,
     UncertaintyView,
 )
+from jaxnbv.sensors import PART_SETTING
 from jaxnbv.tasks import Coverage, SoftPartCount, part_counts
 
 # The paper's N_target of its Table 1, and the authors' value for the utility, in points of the 2,048 that the network
@@ -99,7 +99,7 @@ class PartStudy(Study):
         )
     }
     seed: ClassVar[int] = 6
-    radius: ClassVar[float] = PART_RADIUS
+    radius: ClassVar[float] = PART_SETTING.radius
     quick: ClassVar[Mapping[str, Any]] = {
         **Study.quick,
         "num_candidates": 24,
@@ -108,9 +108,9 @@ class PartStudy(Study):
         "iterations": 4,
     }
 
-    views: int = eqx.field(static=True, default=MAX_VIEWS)
+    views: int = eqx.field(static=True, default=6)
     num_samples: int = eqx.field(static=True, default=8)
-    camera: Camera = PART_CAMERA
+    camera: Camera = PART_SETTING.camera
     segmenter: CloudSegmenter = eqx.field(kw_only=True)
     split: Split = eqx.field(static=True, default=Split.TEST)
     imagined_rays: int = eqx.field(static=True, default=32)

@@ -11,14 +11,13 @@ from jaxtyping import Float
 from jaxnbv.checks import InputError
 from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets import Split
+from jaxnbv.datasets.categories import CATEGORIES
 from jaxnbv.datasets.parts import part_scene
 from jaxnbv.episode import Step
 from jaxnbv.experiments.measures import Measure, Record
 from jaxnbv.experiments.meshes import as_mesh_files, numbered_mesh
-from jaxnbv.experiments.metrics import coverage, truth_points
-from jaxnbv.experiments.reconstruction.distances import SURFACE_POINTS, surface_distance
 from jaxnbv.experiments.study import Chart, Panel, Scene, Study
-from jaxnbv.networks.shapenet import CATEGORIES
+from jaxnbv.metrics import SURFACE_POINTS, coverage, surface_distance, truth_points
 from jaxnbv.planner import Planner
 from jaxnbv.reconstruction import has_poisson, mean_mesh, screened_poisson
 from jaxnbv.scanning import SDFSurface, TriangleMesh

@@ -11,12 +11,11 @@ from PIL import Image
 import jaxnbv as nbv
 from jaxnbv.checks import InputError
 from jaxnbv.experiments.meshes import mesh_files
-from jaxnbv.experiments.metrics import coverage, truth_points
 from jaxnbv.experiments.reconstruction import study as reconstruction_study
-from jaxnbv.experiments.reconstruction.distances import surface_distance
 from jaxnbv.experiments.reconstruction.pictures import write_pictures
 from jaxnbv.experiments.reconstruction.study import MEAN, POISSON, ReconstructionStudy, reconstruct
 from jaxnbv.experiments.records import RecordFolder
+from jaxnbv.metrics import coverage, surface_distance, truth_points
 from jaxnbv.reconstruction import has_poisson
 from jaxnbv.scanning import scan
 from jaxnbv.search.candidates import sphere_candidates

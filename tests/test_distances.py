@@ -10,7 +10,7 @@ from scipy.spatial.distance import cdist, directed_hausdorff
 
 from jaxnbv.checks import InputError
 from jaxnbv.cloud import Frame
-from jaxnbv.experiments.reconstruction.distances import SURFACE_POINTS, surface_distance
+from jaxnbv.metrics import SURFACE_POINTS, surface_distance
 from jaxnbv.scanning import TriangleMesh
 
 

@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jaxnbv.rotations import rotation_between, rotation_from_6d, rotation_to_6d
+from jaxnbv.search.rotations import rotation_between, rotation_from_6d, rotation_to_6d
 
 RNG = np.random.default_rng(0)
 FROM_6D, BETWEEN = jax.jit(rotation_from_6d), jax.jit(rotation_between)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from jaxnbv.cloud import PointCloud
-from jaxnbv.neighbours import nearest_squared_distance
+from jaxnbv.tasks.neighbours import nearest_squared_distance
 
 
 def cloud_of(points, mask=None):

@@ -8,7 +8,7 @@ import pytest
 
 from jaxnbv.checks import InputError
 from jaxnbv.cloud import PointCloud
-from jaxnbv.networks import calibrate, expected_calibration_error, log_probabilities, train, training
+from jaxnbv.training import calibrate, expected_calibration_error, log_probabilities, loop, train
 
 RNG = np.random.default_rng(0)
 
@@ -90,8 +90,8 @@ def test_a_network_without_a_temperature_is_trained_too():
 def test_an_interrupted_training_continues_as_if_it_had_not_been(tmp_path, monkeypatch):
     clouds, labels = toy_clouds(40)
     whole = run(clouds, labels)
-    monkeypatch.setattr(training, "_STEPS_A_CHECKPOINT", 7)
-    write, written = training._Checkpoint.write, []
+    monkeypatch.setattr(loop, "_STEPS_A_CHECKPOINT", 7)
+    write, written = loop._Checkpoint.write, []
 
     def write_then_stop(self, step, carry):
         write(self, step, carry)
@@ -99,7 +99,7 @@ def test_an_interrupted_training_continues_as_if_it_had_not_been(tmp_path, monke
         if step in (14, 28):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(training._Checkpoint, "write", write_then_stop)
+    monkeypatch.setattr(loop._Checkpoint, "write", write_then_stop)
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
             run(clouds, labels, folder=tmp_path)

@@ -10,7 +10,7 @@ from scipy.special import eval_legendre
 
 from jaxnbv.camera import fibonacci_sphere
 from jaxnbv.checks import InputError
-from jaxnbv.diffusion import (
+from jaxnbv.tasks.diffusion import (
     HeatProblem,
     cloud_laplacian,
     cloud_temperature,

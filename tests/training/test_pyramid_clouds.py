@@ -7,12 +7,12 @@ import pytest
 
 from jaxnbv.camera import Camera
 from jaxnbv.datasets import PATTERNS, Framing, Split, pyramid_scene
-from jaxnbv.experiments.pyramid.clouds import MAX_VIEWS, imagined_clouds, scanned_clouds
 from jaxnbv.planner import Planner
 from jaxnbv.scanning import Grid
 from jaxnbv.search import DiscreteSearch
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
+from jaxnbv.training.pyramid_clouds import MAX_VIEWS, imagined_clouds, scanned_clouds
 
 COUNT, POINTS = 16, 200
 MODEL = GeometricSPSR(lengthscale=0.05, truncation=8)

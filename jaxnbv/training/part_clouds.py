@@ -11,14 +11,12 @@ from jaxnbv.camera import Camera, Pose, look_at
 from jaxnbv.cloud import PointCloud, concatenate
 from jaxnbv.datasets import PartScene, Split, part_scene
 from jaxnbv.datasets.labelled import LabelledSolid
-from jaxnbv.experiments.training_views import joined_views, only, state_after
 from jaxnbv.farthest import farthest_point_indices
 from jaxnbv.planner import Planner
 from jaxnbv.scanning import SDFSurface, SensorNoise, scan
+from jaxnbv.sensors import PART_SETTING
+from jaxnbv.training.views import joined_views, only, state_after
 
-# The authors' cameras for parts: 64 x 64 rays, on a sphere of radius 2 about the object.
-PART_CAMERA = Camera(height=64, width=64)
-PART_RADIUS = 2.0
 MAX_VIEWS = 6
 _CLOUDS_A_SCENE = 3
 
@@ -36,15 +34,22 @@ class LabelledPartClouds(eqx.Module):
     categories: Int[Array, "*batch"]
 
 
-def scanned_part_clouds(split: Split, indices: Sequence[int], num_points: int = 1024) -> LabelledPartClouds:
+def scanned_part_clouds(
+    split: Split, indices: Sequence[int], num_points: int = 1024, camera: Camera = PART_SETTING.camera
+) -> LabelledPartClouds:
     """Three clouds of each scene, of one to six of the same six random views, with the sensor's noise."""
     solids, categories = _stacked([part_scene(split, index) for index in indices])
-    found = _scanned(solids, categories, _keys(split, indices), num_points)
+    found = _scanned(solids, categories, _keys(split, indices), num_points, camera)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found)
 
 
 def imagined_part_clouds(
-    split: Split, indices: Sequence[int], planner: Planner, num_poses: int = 4, num_points: int = 1024
+    split: Split,
+    indices: Sequence[int],
+    planner: Planner,
+    num_poses: int = 4,
+    num_points: int = 1024,
+    camera: Camera = PART_SETTING.camera,
 ) -> LabelledPartClouds:
     """D u scan(theta; f_s) of each scene: D of one to five views, every sample f_s seen from random poses of its own.
 
@@ -52,7 +57,7 @@ def imagined_part_clouds(
     nearest to it in truth.
     """
     solids, categories = _stacked([part_scene(split, index) for index in indices])
-    found = _imagined(solids, categories, _keys(split, indices), planner, num_poses, num_points)
+    found = _imagined(solids, categories, _keys(split, indices), planner, num_poses, num_points, camera)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found)
 
 
@@ -68,12 +73,16 @@ def _keys(split: Split, indices: Sequence[int]) -> Key[Array, " scenes"]:
 
 @eqx.filter_jit
 def _scanned(
-    solids: LabelledSolid, categories: Int[Array, " scenes"], keys: Key[Array, " scenes"], num_points: int
+    solids: LabelledSolid,
+    categories: Int[Array, " scenes"],
+    keys: Key[Array, " scenes"],
+    num_points: int,
+    camera: Camera,
 ) -> LabelledPartClouds:
     def of_scene(scene):
         solid, category, key = scene
         view_key, *keys = jax.random.split(key, 1 + _CLOUDS_A_SCENE)
-        views, _, labels = _views(solid, view_key)
+        views, _, labels = _views(solid, view_key, camera)
         clouds = [_thin(joined_views(_some(views, key, MAX_VIEWS)), labels.reshape(-1), num_points) for key in keys]
         cloud, labels = jax.tree.map(lambda *leaves: jnp.stack(leaves), *clouds)
         return LabelledPartClouds(cloud, labels, jnp.full(_CLOUDS_A_SCENE, category))
@@ -89,18 +98,19 @@ def _imagined(
     planner: Planner,
     num_poses: int,
     num_points: int,
+    camera: Camera,
 ) -> LabelledPartClouds:
     def of_scene(scene):
         solid, category, key = scene
         view_key, some_key, sample_key, pose_key = jax.random.split(key, 4)
-        views, poses, labels = _views(solid, view_key)
+        views, poses, labels = _views(solid, view_key, camera)
         views = _some(views, some_key, MAX_VIEWS - 1)
-        surfaces = planner.sample_surfaces(state_after(planner, views, poses, PART_CAMERA), sample_key)
+        surfaces = planner.sample_surfaces(state_after(planner, views, poses, camera), sample_key)
         cloud, labels = _thin(joined_views(views), labels.reshape(-1), num_points)
 
         def of_sample(surface_and_key):
             surface, key = surface_and_key
-            scans = scan(surface, PART_CAMERA, _random_poses(key, num_poses))
+            scans = scan(surface, camera, _random_poses(key, num_poses))
 
             def joined(seen):
                 both = concatenate(cloud, seen)
@@ -125,14 +135,16 @@ def _thin(cloud: PointCloud, labels: Int[Array, " n"], count: int) -> tuple[Poin
 
 def _random_poses(key: PRNGKeyArray, count: int) -> Pose:
     direction = jax.random.normal(key, (count, 3))
-    return look_at(PART_RADIUS * direction / jnp.linalg.norm(direction, axis=-1, keepdims=True))
+    return look_at(PART_SETTING.radius * direction / jnp.linalg.norm(direction, axis=-1, keepdims=True))
 
 
-def _views(solid: LabelledSolid, key: PRNGKeyArray) -> tuple[PointCloud, Pose, Int[Array, "views rays"]]:
+def _views(
+    solid: LabelledSolid, key: PRNGKeyArray, camera: Camera
+) -> tuple[PointCloud, Pose, Int[Array, "views rays"]]:
     """What random views show, with noise, their poses, and the true part of every point."""
     pose_key, noise_key = jax.random.split(key)
     poses = _random_poses(pose_key, MAX_VIEWS)
-    scans = scan(SDFSurface(solid), PART_CAMERA, poses)
+    scans = scan(SDFSurface(solid), camera, poses)
     return SensorNoise()(scans, noise_key), poses, solid.label(scans.points)
 
 

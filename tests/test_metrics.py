@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 import jaxnbv as nbv
 from jaxnbv.datasets.demo import demo_object
-from jaxnbv.experiments.metrics import coverage, truth_points
+from jaxnbv.metrics import coverage, truth_points
 from jaxnbv.scanning.sdf import Sphere
 
 

@@ -10,26 +10,20 @@ from scipy.spatial import cKDTree
 from jaxnbv.camera import Camera, fibonacci_sphere, look_at
 from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets import Split, part_scene
-from jaxnbv.experiments.parts import clouds as part_clouds
-from jaxnbv.experiments.parts.clouds import imagined_part_clouds, scanned_part_clouds
 from jaxnbv.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, scan
 from jaxnbv.search import DiscreteSearch
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
+from jaxnbv.training import part_clouds
+from jaxnbv.training.part_clouds import imagined_part_clouds, scanned_part_clouds
 
 # A motorbike and a skateboard.
 SCENES, POINTS = (7, 11), 150
+# Compilation takes nearly all the time of the rest.
+CAMERA = Camera(height=24, width=24)
 MODEL = GeometricSPSR(lengthscale=0.05, truncation=8)
 PLANNER = Planner(MODEL, Camera(), Coverage(), DiscreteSearch(), 2, Grid(20), 150)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_rays():
-    """Compilation takes nearly all the time of the rest."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(part_clouds, "PART_CAMERA", Camera(height=24, width=24))
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -39,12 +33,12 @@ def scenes():
 
 @pytest.fixture(scope="module")
 def scanned():
-    return scanned_part_clouds(Split.TRAIN, SCENES, POINTS)
+    return scanned_part_clouds(Split.TRAIN, SCENES, POINTS, CAMERA)
 
 
 @pytest.fixture(scope="module")
 def imagined():
-    return imagined_part_clouds(Split.TRAIN, SCENES, PLANNER, 3, POINTS)
+    return imagined_part_clouds(Split.TRAIN, SCENES, PLANNER, 3, POINTS, CAMERA)
 
 
 @eqx.filter_jit
@@ -123,10 +117,10 @@ def test_imagined_points_have_the_label_of_the_part_nearest_in_truth(imagined, s
 
 
 def test_order_does_not_matter_and_splits_do(scanned):
-    turned = scanned_part_clouds(Split.TRAIN, SCENES[::-1], POINTS)
+    turned = scanned_part_clouds(Split.TRAIN, SCENES[::-1], POINTS, CAMERA)
     np.testing.assert_array_equal(turned.labels[:3], scanned.labels[3:])
     np.testing.assert_allclose(turned.clouds.points[:3], scanned.clouds.points[3:], atol=1e-5)
-    other = scanned_part_clouds(Split.TEST, SCENES, POINTS)
+    other = scanned_part_clouds(Split.TEST, SCENES, POINTS, CAMERA)
     np.testing.assert_array_equal(other.categories, scanned.categories)
     shared = np.isin(other.clouds.points[other.clouds.mask], scanned.clouds.points[scanned.clouds.mask])
     assert shared.mean() < 0.01

@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from jaxnbv.checks import AnyArray, InputError, require
 from jaxnbv.cloud import PointCloud
+from jaxnbv.files import write_whole
 
 Network = TypeVar("Network", bound=eqx.Module)
 
@@ -208,7 +209,4 @@ class _Checkpoint:
             f"leaf_{index}": np.asarray(leaf) for index, leaf in enumerate(jax.tree.leaves(carry))
         }
         leaves |= {"settings": self.settings, "step": step}
-        partial = self.path.with_suffix(".partial")
-        with partial.open("wb") as file:
-            np.savez(file, **leaves)
-        partial.replace(self.path)
+        write_whole(self.path, lambda file: np.savez(file, **leaves))

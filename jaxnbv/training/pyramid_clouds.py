@@ -9,10 +9,10 @@ from jaxnbv.camera import Camera, Pose, look_at
 from jaxnbv.cloud import PointCloud, concatenate, farthest_point_subsample, limit_capacity
 from jaxnbv.datasets import Framing, Pyramid, Split, pyramid_scene
 from jaxnbv.datasets.pyramid import scan_pattern
-from jaxnbv.experiments.training_views import joined_views, only, state_after
 from jaxnbv.planner import Planner
 from jaxnbv.scanning import SensorNoise, scan
-from jaxnbv.search.candidates import SENSOR_RADIUS
+from jaxnbv.sensors import SENSOR_RADIUS
+from jaxnbv.training.views import joined_views, only, state_after
 
 MAX_VIEWS = 5
 
