@@ -45,8 +45,8 @@ def _options(
     """What is asked of `jaxnbv` itself."""
 
 
-app.command()(demo)
-app.command()(run)
+app.command("demo")(demo)
+app.command("run")(run)
 app.command()(convert)
 app.add_typer(study, name="study")
 

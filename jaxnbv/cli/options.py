@@ -1,37 +1,23 @@
 """What the commands' options mean."""
 
+import inspect
+from collections.abc import Callable, Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
+from jaxnbv.cli.registry import SEARCHES, TASKS
 from jaxnbv.datasets import Framing
 from jaxnbv.model_name import ModelName
 
-
-class Task(StrEnum):
-    """What the views are for."""
-
-    CROSS_ENTROPY = "cross-entropy"
-    ENTROPY = "entropy"
-    MIXED = "mixed"
-    COVERAGE = "coverage"
-    PARTS = "parts"
-    HEAT = "heat"
+# The registries are the enumerations.
+Task = StrEnum("Task", {name.replace("-", "_").upper(): name for name in TASKS})  # type: ignore[misc]
+SearchName = StrEnum("SearchName", {name.replace("-", "_").upper(): name for name in SEARCHES})  # type: ignore[misc]
 
 
-class SearchName(StrEnum):
-    """How the next view is found."""
-
-    DISCRETE = "discrete"
-    HALVING = "halving"
-    GRADIENT_2DOF = "gradient-2dof"
-    GRADIENT_6DOF = "gradient-6dof"
-    HYBRID = "hybrid"
-    FARTHEST = "farthest"
-    RANDOM = "random"
-    UNCERTAINTY = "uncertainty"
+REQUIRED = inspect.Parameter.empty
 
 
 class Device(StrEnum):
@@ -43,22 +29,11 @@ class Device(StrEnum):
 
 
 TaskOption = Annotated[
-    Task,
-    typer.Option(
-        help="What the views are for: the object's class, by expected cross-entropy, by expected reduction of "
-        "entropy, or by cross-entropy until the entropy falls to 0.75; its shape (coverage); its parts; or the coldest "
-        "point while it is heated at one place."
-    ),
+    Task, typer.Option(help="What the views are for. " + "; ".join(f"{n}: {e.about}" for n, e in TASKS.items()) + ".")
 ]
 SearchOption = Annotated[
     SearchName,
-    typer.Option(
-        help="How the next view is found: discrete is the expected value of the task over 120 candidates (heat: 100); "
-        "halving drops the worse half again and again while samples are added; "
-        "gradient-2dof climbs it by gradient over the sphere, gradient-6dof over positions and rotations (up to 0.3 "
-        "nearer or farther, the object's centre in view), hybrid over the sphere from the best candidates; "
-        "farthest, random and uncertainty are the paper's baselines over the candidates."
-    ),
+    typer.Option(help="How the next view is found. " + "; ".join(f"{n}: {e.about}" for n, e in SEARCHES.items()) + "."),
 ]
 ViewsOption = Annotated[int, typer.Option(help="Views in all, the first one included.")]
 SeedOption = Annotated[
@@ -104,10 +79,29 @@ FramingOption = Annotated[
 ]
 
 
+def command(run: Callable[..., None], about: str, options: Mapping[str, tuple[Any, Any]]) -> Callable[..., None]:
+    """A function with these options, as Typer reads it, that hands them on to `run`.
+
+    - `options`: annotation and default by name; the default is `REQUIRED` for an argument without one.
+    """
+
+    def called(**given: Any) -> None:
+        run(**given)
+
+    called.__doc__ = about
+    called.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+            for name, (annotation, default) in options.items()
+        ]
+    )
+    return called
+
+
 class EpisodeOptions(NamedTuple):
     """What every command that runs one episode takes."""
 
-    search: SearchName
+    search: str
     model: ModelName
     views: int
     seed: int

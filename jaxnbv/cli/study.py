@@ -1,6 +1,5 @@
 """`jaxnbv study ...`: the runs behind the paper's tables and figures, a command for each study of the registry."""
 
-import inspect
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -8,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from jaxnbv.cli import actions
-from jaxnbv.cli.options import Device, DeviceOption, ModelOption
+from jaxnbv.cli.options import Device, DeviceOption, ModelOption, command
 from jaxnbv.datasets import Framing
 from jaxnbv.experiments.registry import STUDIES, Entry
 from jaxnbv.model_name import ModelName
@@ -64,8 +63,8 @@ def _studies() -> None:
 def _command(name: str, entry: Entry) -> Callable[..., None]:
     """The command of a study; its options are those of all studies and its own."""
 
-    def run(**given: Any) -> None:
-        actions.prepare(given.pop("device"))
+    def run(device: Device, **given: Any) -> None:
+        actions.prepare(device)
         actions.study(name, entry, **given)
 
     shared = {
@@ -79,17 +78,11 @@ def _command(name: str, entry: Entry) -> Callable[..., None]:
         "device": (DeviceOption, Device.AUTO),
     }
     options = shared | {option: (OPTIONS[option], None) for option in entry.options}
-    run.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [
-            inspect.Parameter(option, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-            for option, (annotation, default) in options.items()
-        ]
-    )
-    run.__doc__ = (
+    about = (
         f"{entry.question}\n\nWrites a record a scene, tables as text and CSV, figures and pictures. Interrupted, it "
         f"continues with the next scene.\n\n{entry.settings}"
     )
-    return run
+    return command(run, about, options)
 
 
 for _name, _entry in STUDIES.items():

@@ -1,7 +1,6 @@
 """Run a study of the registry: its scenes, tables, charts and pictures."""
 
 import functools
-import importlib
 import os
 import sys
 from collections.abc import Sequence
@@ -11,6 +10,7 @@ from typing import Any
 import typer
 
 from jaxnbv.checks import InputError
+from jaxnbv.cli.registry import resolve
 from jaxnbv.experiments.charts import write_charts
 from jaxnbv.experiments.records import RecordFolder
 from jaxnbv.experiments.registry import Entry
@@ -36,7 +36,7 @@ def study(
 
     **Raises:** `ValueError` for unknown methods, or a method of one's own that cannot be found.
     """
-    kind: type[Study] = _found(entry.study)
+    kind: type[Study] = resolve(entry.study)
     chosen, added = _methods(methods, kind.methods), {text: _own(text) for text in own or ()}
     given = {option: value for option, value in options.items() if value is not None}
     of_model = "" if model is ModelName.SCREENED else f"-{model}"
@@ -53,7 +53,7 @@ def study(
         write_tables(records, kind, folder / part)
         write_charts(records, kind, folder / part)
         if entry.pictures:
-            _found(entry.pictures)(records, settings, folder / part)
+            resolve(entry.pictures)(records, settings, folder / part)
         typer.echo(f"\n{f'{part}. ' if part else ''}{summary(records, kind, groups=False)}")
         typer.echo(f"All tables as CSV, figures and pictures: {folder / part}\n")
 
@@ -76,14 +76,9 @@ def _own(text: str) -> Factory:
     if not module or not function:
         raise InputError(f"--method {text} names no function: write module:function, such as mine:planner")
     try:
-        found = _found(text)
+        made = resolve(text)
     except (ImportError, AttributeError) as error:
         raise InputError(f"--method {text} cannot be found ({error}): start where the module lies") from error
-    if not callable(found):
-        raise InputError(f"--method {text} is a {type(found).__name__}; give a function of a study and a scene")
-    return found
-
-
-def _found(text: str) -> Any:
-    module, _, name = text.partition(":")
-    return getattr(importlib.import_module(module), name)
+    if not callable(made):
+        raise InputError(f"--method {text} is a {type(made).__name__}; give a function of a study and a scene")
+    return made

@@ -1,0 +1,196 @@
+"""What the tasks of the command line are: their sensor, their score, and an object to show them on."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxnbv.acquisition import ExpectedUtilityImprovement, Score
+from jaxnbv.camera import Pose, look_at
+from jaxnbv.checks import InputError, require
+from jaxnbv.cli.options import DEFAULT_FIRST
+from jaxnbv.datasets import (
+    PATTERNS,
+    Framing,
+    Split,
+    demo_object,
+    heat_scene,
+    hidden_view,
+    part_scene,
+    pyramid_scene,
+    source_view,
+)
+from jaxnbv.networks import (
+    CATEGORIES,
+    CloudClassifier,
+    CloudSegmenter,
+    load_checkpoint,
+    load_part_segmenter,
+    part_segmenter,
+    pyramid_classifier,
+)
+from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, scan
+from jaxnbv.sensors import HEAT_SETTING, PART_SETTING, USUAL_SETTING, Setting
+from jaxnbv.tasks import Classifier, ColdestPoint, Coverage, CrossEntropy, MixedEntropy, NegativeEntropy, SoftPartCount
+from jaxnbv.tasks.diffusion import HeatProblem
+
+# Networks saw objects scaled into the unit sphere or its box; in the scene half the longest side is 1.25.
+_NETWORK_SCALE = 1 / 1.25
+
+
+class Given(NamedTuple):
+    """What a user gives: a mesh, the first view, and options that some tasks take."""
+
+    surface: TriangleMesh
+    first: Pose
+    network: Path | None = None
+    category: str | None = None
+    source: str | None = None
+
+
+class Shown(NamedTuple):
+    """An object to show a task on.
+
+    - `longest_side`, `grid`: of the imagined surfaces; `told`: what is said of the object before.
+    """
+
+    name: str
+    surface: Surface
+    score: Score
+    first: Pose
+    longest_side: float = Framing.CLOSE_UP.longest_side
+    grid: Grid = Grid()
+    told: str = ""
+
+
+class CommandTask(ABC):
+    """A task of `jaxnbv run` and `jaxnbv demo`. `setting` is its sensor."""
+
+    setting: Setting = USUAL_SETTING
+
+    @abstractmethod
+    def score(self, given: Given) -> Score:
+        """The score on a mesh of the user's; options that the task requires are there."""
+
+    @abstractmethod
+    def demo(self, scene: int, framing: Framing, seed: int) -> Shown:
+        """One of the objects that ship."""
+
+
+class CoverageTask(CommandTask):
+    """To see all of an object."""
+
+    def score(self, given: Given) -> Score:
+        return Coverage()
+
+    def demo(self, scene: int, framing: Framing, seed: int) -> Shown:
+        """A laid tea mug, the only one."""
+        return Shown("mug", demo_object(), Coverage(), usual_first())
+
+
+class ClassTask(CommandTask):
+    """To know an object's class, by a score of a classifier."""
+
+    def __init__(self, of: Callable[[Classifier], Score]):
+        self.of = of
+
+    def score(self, given: Given) -> Score:
+        assert given.network is not None
+        return self.of(CloudClassifier(load_checkpoint(given.network), scale=_NETWORK_SCALE))
+
+    def demo(self, scene: int, framing: Framing, seed: int) -> Shown:
+        """A pyramid. The grid is that of the surfaces that the classifier was trained on."""
+        pyramid = pyramid_scene(Split.TEST, scene, framing)
+        side, first = framing.longest_side, hidden_view(pyramid, jax.random.key(seed))
+        told = f"the pattern is a {PATTERNS[int(pyramid.label)]}"
+        score = self.of(pyramid_classifier(side))
+        return Shown("pyramid", SDFSurface(pyramid), score, first, side, Grid(64, 0.7 * side), told)
+
+
+class PartTask(CommandTask):
+    """To find all parts of an object of a category."""
+
+    setting = PART_SETTING
+
+    def score(self, given: Given) -> Score:
+        assert given.category is not None
+        if given.network is None:
+            return self._score(part_segmenter(given.category))
+        return self._score(CloudSegmenter(load_part_segmenter(given.network), given.category, scale=_NETWORK_SCALE))
+
+    def demo(self, scene: int, framing: Framing, seed: int) -> Shown:
+        """A procedural object."""
+        thing = part_scene(Split.TEST, scene)
+        category = CATEGORIES[int(thing.category)].name
+        score = self._score(part_segmenter(category))
+        return Shown(f"{category}-parts", SDFSurface(thing.solid), score, usual_first())
+
+    def _score(self, segmenter: CloudSegmenter) -> Score:
+        return ExpectedUtilityImprovement(SoftPartCount(segmenter), segmenter.num_points)
+
+
+class HeatTask(CommandTask):
+    """To find the coldest point of a body that is heated at one place."""
+
+    setting = HEAT_SETTING
+
+    def score(self, given: Given) -> Score:
+        """Heated at the point that was asked for, or at the one in the middle of the first view."""
+        return self._score(_middle(given) if given.source is None else _asked(given.surface, given.source))
+
+    def demo(self, scene: int, framing: Framing, seed: int) -> Shown:
+        """A procedural object."""
+        heated = heat_scene(scene)
+        first = source_view(heated, jax.random.key(seed))
+        return Shown(f"{heated.name}-heat", heated.surface, self._score(np.asarray(heated.source)), first)
+
+    def _score(self, source: np.ndarray) -> Score:
+        return ExpectedUtilityImprovement(ColdestPoint(source), num_points=2048)
+
+
+COVERAGE, PARTS, HEAT = CoverageTask(), PartTask(), HeatTask()
+CROSS_ENTROPY, MIXED = ClassTask(CrossEntropy), ClassTask(MixedEntropy)
+ENTROPY = ClassTask(lambda classifier: ExpectedUtilityImprovement(NegativeEntropy(classifier), num_points=1024))
+
+
+def usual_first() -> Pose:
+    """Where a first view is taken if nothing else is said."""
+    return look_at(position("--first", DEFAULT_FIRST))
+
+
+def position(option: str, text: str) -> tuple[float, float, float]:
+    """Three numbers of an option.
+
+    **Raises:** `ValueError` unless these are three finite numbers.
+    """
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise InputError(f"{option} is {text!r}; give three numbers such as {DEFAULT_FIRST}") from error
+    require(bool(np.isfinite([x, y, z]).all()), f"{option} is {text!r}; its numbers must be finite")
+    return x, y, z
+
+
+def _asked(surface: TriangleMesh, source: str) -> np.ndarray:
+    place = np.asarray(position("--source", source))
+    points = surface.sample_points(jax.random.key(0), 20_000)
+    nearest = points[np.linalg.norm(points - place, axis=1).argmin()]
+    distance = float(np.linalg.norm(nearest - place))
+    require(
+        distance <= HeatProblem.radius,
+        f"--source is {source}, {distance:.2f} away from the object, but heat goes in within {HeatProblem.radius} "
+        f"only. The nearest point is {','.join(f'{x:.2f}' for x in nearest)}",
+    )
+    return place
+
+
+def _middle(given: Given) -> np.ndarray:
+    points, _ = scan(given.surface, USUAL_SETTING.camera, given.first).to_numpy()
+    require(len(points) > 0, "the first view does not see the object: give another --first, or a --source")
+    away, forward = points - np.asarray(given.first.position), np.asarray(given.first.forward)
+    along = away @ forward
+    beside = np.linalg.norm(away - along[:, None] * forward, axis=1)
+    return points[beside.argmin()]

@@ -1,0 +1,58 @@
+"""The registries of the command line: everything that they name is there, and is what it is taken for."""
+
+import inspect
+
+import jax
+import numpy as np
+import pytest
+
+from jaxnbv.cli.actions.tasks import CommandTask
+from jaxnbv.cli.registry import SEARCHES, TASKS, resolve
+from jaxnbv.experiments.registry import STUDIES
+from jaxnbv.experiments.study import Chart, Study
+from jaxnbv.search import GradientSearch, Search
+from jaxnbv.search.base import CandidateSearch
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_task_has_a_sensor_and_requires_what_it_takes(name):
+    entry = TASKS[name]
+    task = resolve(entry.task)
+    assert isinstance(task, CommandTask)
+    assert task.setting.radius > 1.5
+    assert {option for option, _ in entry.requires} <= {*entry.options} <= {"network", "category", "source"}
+
+
+@pytest.mark.parametrize("name", SEARCHES)
+def test_a_search_stands_at_the_sensors_distance_with_as_many_candidates(name):
+    make = resolve(SEARCHES[name].search)
+    search = make(2.2, 24)
+    assert isinstance(search, Search)
+    assert isinstance(make(2.2, None), Search)
+    if isinstance(search, CandidateSearch):
+        poses = search.candidates.poses()
+    else:
+        assert isinstance(search, GradientSearch)
+        poses = search.ascent.space.candidates(24, jax.random.key(0))
+    distance = np.linalg.norm(poses.position, axis=1)
+    assert len(distance) == 24
+    assert distance.mean() == pytest.approx(2.2, abs=0.1)
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_a_study_is_declared_in_full(name):
+    entry = STUDIES[name]
+    study = resolve(entry.study)
+    assert issubclass(study, Study)
+    assert study.reference in study.methods
+    names = [measure.name for measure in study.measures]
+    assert len({*names}) == len(names)
+    for chart in study.charts.values():
+        assert isinstance(chart, Chart)
+        for panel in (panel for row in chart.rows for panel in row):
+            assert panel.measure in names
+    assert {*entry.options} <= {*inspect.signature(study).parameters}
+    assert {*study.quick} <= {*inspect.signature(study).parameters}
+    assert callable(resolve(entry.pictures))
+    seeds = [resolve(other.study).seed for other in STUDIES.values()]
+    assert len({*seeds}) == len(seeds)
