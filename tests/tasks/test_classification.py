@@ -1,10 +1,11 @@
-"""Classification scores against their formulas in float64 NumPy, and classifiers on the host."""
+"""Classification scores against their formulas in float64 NumPy."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from opinions import drawn_cloud, linear, linear_in_numpy
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement, expected_score
 from jaxnbv.camera import Camera, fibonacci_sphere, look_at
@@ -14,7 +15,7 @@ from jaxnbv.planner import Planner
 from jaxnbv.scanning import Grid, GridSurface, scan
 from jaxnbv.search import DiscreteSearch, FarthestView
 from jaxnbv.surfaces import GeometricSPSR
-from jaxnbv.tasks import Coverage, HostClassifier
+from jaxnbv.tasks import Coverage
 from jaxnbv.tasks.classification import (
     CrossEntropy,
     MixedEntropy,
@@ -25,21 +26,7 @@ from jaxnbv.tasks.classification import (
 )
 
 RNG = np.random.default_rng(0)
-WEIGHTS = np.random.default_rng(7).normal(size=(4, 6)) * 3.0
 CAMERA, GRID = Camera(height=6, width=7), Grid(20)
-
-
-def linear(cloud):
-    """Log-probabilities of four classes, from the means of the points and of the normals."""
-    rows = jnp.concatenate([cloud.points, cloud.normals], axis=-1)
-    mean = jnp.sum(jnp.where(cloud.mask[:, None], rows, 0.0), axis=0) / jnp.maximum(cloud.count, 1)
-    return jax.nn.log_softmax(jnp.asarray(WEIGHTS, mean.dtype) @ mean)
-
-
-def linear_in_numpy(points, normals):
-    mean = np.concatenate([points, normals], axis=-1).astype(np.float64).mean(axis=0)
-    p = np.exp(WEIGHTS @ mean)
-    return p / p.sum()
 
 
 def first_point(cloud):
@@ -48,9 +35,7 @@ def first_point(cloud):
 
 
 def random_cloud(count, capacity, center=(0.0, 0.0, 0.0)):
-    normals = RNG.normal(size=(count, 3))
-    points = np.asarray(center) + 0.5 * RNG.normal(size=(count, 3))
-    return PointCloud.from_arrays(points, normals / np.linalg.norm(normals, axis=1, keepdims=True), capacity)
+    return drawn_cloud(RNG, count, capacity, center)
 
 
 def one_point(p):
@@ -228,91 +213,6 @@ def test_expected_scores_against_a_loop(x64):
     ):
         found = expected_score(score, data, surfaces, CAMERA, poses)
         np.testing.assert_allclose(found, expected.mean(axis=0), rtol=1e-8, atol=1e-12)
-
-
-class Host:
-    """`linear` in NumPy, on batches; it counts its calls."""
-
-    def __init__(self):
-        self.shapes = []
-
-    def __call__(self, points, normals, mask):
-        assert all(isinstance(array, np.ndarray) for array in (points, normals, mask))
-        self.shapes.append(mask.shape)
-        return np.log([linear_in_numpy(p[m], n[m]) for p, n, m in zip(points, normals, mask, strict=True)])
-
-
-def test_a_host_classifier_equals_the_one_in_jax_in_one_call_a_batch():
-    clouds = [random_cloud(10 + i, 20) for i in range(6)]
-    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *clouds)
-    expected = np.stack([linear(cloud) for cloud in clouds])
-    calls = {
-        "one": (lambda f: f(clouds[0]), [(1, 20)], expected[0]),
-        "jit": (lambda f: jax.jit(f)(clouds[0]), [(1, 20)], expected[0]),
-        "vmap": (lambda f: jax.vmap(f)(batch), [(6, 20)], expected),
-        "jit of vmap": (lambda f: jax.jit(jax.vmap(f))(batch), [(6, 20)], expected),
-        "vmap of some": (
-            lambda f: jax.vmap(lambda p: f(PointCloud(p, clouds[0].normals, clouds[0].mask)))(batch.points[:, :20]),
-            [(6, 20)],
-            np.stack([linear(PointCloud(c.points, clouds[0].normals, clouds[0].mask)) for c in clouds]),
-        ),
-        "map": (lambda f: jax.lax.map(f, batch), [(1, 20)] * 6, expected),
-        "map in batches": (lambda f: jax.lax.map(f, batch, batch_size=4), [(4, 20), (2, 20)], expected),
-        "vmap of vmap": (
-            lambda f: jax.vmap(jax.vmap(f))(jax.tree.map(lambda a: a.reshape(2, 3, *a.shape[1:]), batch)),
-            [(6, 20)],
-            expected.reshape(2, 3, 4),
-        ),
-    }
-    for name, (call, shapes, wanted) in calls.items():
-        host = Host()
-        found = np.asarray(call(HostClassifier(host, 4)))
-        assert host.shapes == shapes, name
-        np.testing.assert_allclose(found, wanted, atol=2e-5, err_msg=name)
-
-
-def test_a_host_classifier_of_a_large_batch_comes_back():
-    """Callbacks of JAX have been known to wait for ever for their own arguments on few cores."""
-    cloud = PointCloud(jnp.ones((120, 3500, 3)), jnp.ones((120, 3500, 3)), jnp.ones((120, 3500), bool))
-    host = HostClassifier(lambda points, normals, mask: np.log([0.25, 0.75]) * points[:, :2, 0] * mask[:, :2], 2)
-    expected = np.tile(np.log([0.25, 0.75]), (120, 1))
-    np.testing.assert_allclose(jax.jit(jax.vmap(host))(cloud), expected, rtol=1e-6)
-
-
-def test_a_host_classifier_that_gives_logits_or_nan_is_refused():
-    cloud = PointCloud(jnp.ones((3, 3)), jnp.ones((3, 3)), jnp.ones(3, bool))
-    for answer in ([2.0, -1.0], [0.5, 0.5], [np.nan, np.nan]):
-        host = HostClassifier(lambda points, normals, mask, answer=answer: np.array([answer]), 2)
-        with pytest.raises(Exception, match="not log-probabilities"):
-            jax.block_until_ready(host(cloud))
-
-
-@pytest.mark.parametrize("wrap", [lambda f: f, jax.jit])
-def test_a_host_classifier_that_returns_another_shape_says_so(wrap):
-    host = HostClassifier(lambda points, normals, mask: np.zeros(4), 4)
-    with pytest.raises((RuntimeError, InputError), match=r"returned shape \(4,\), not \(1, 4\): log-prob"):
-        jax.block_until_ready(wrap(host)(random_cloud(5, 5)))
-
-
-def test_a_host_classifier_has_no_gradient():
-    score, data, scanned = CrossEntropy(HostClassifier(Host(), 4)), random_cloud(5, 5), random_cloud(4, 6)
-    with pytest.raises(InputError, match="use DiscreteSearch"):
-        jax.grad(_of_points(score, data, scanned))(scanned.points)
-    with pytest.raises(InputError, match="num_classes is 1"):
-        HostClassifier(Host(), 1)
-
-
-def test_a_host_classifier_in_a_planners_search():
-    """The same poses and values as the JAX classifier's, through `Planner.propose`."""
-    data = random_cloud(40, 40)
-    model, search = GeometricSPSR(lengthscale=0.05, truncation=8), DiscreteSearch(7)
-    proposals = []
-    for classifier in (linear, HostClassifier(Host(), 4)):
-        planner = Planner(model, CAMERA, CrossEntropy(classifier), search, 2, Grid(16, 3.0), 64)
-        proposals.append(planner.propose(planner.init(data), jax.random.key(3)))
-    np.testing.assert_allclose(proposals[0].values, proposals[1].values, atol=1e-4)
-    assert np.ptp(np.asarray(proposals[0].values)) > 1e-2
-    np.testing.assert_array_equal(proposals[0].pose.position, proposals[1].pose.position)
 
 
 def test_predictions_are_those_of_d_as_the_score_sees_it():

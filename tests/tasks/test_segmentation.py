@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement
-from jaxnbv.checks import InputError
 from jaxnbv.cloud import PointCloud, concatenate
-from jaxnbv.tasks import HostSegmenter, SoftPartCount, part_counts
+from jaxnbv.tasks import SoftPartCount, part_counts
 
 RNG = np.random.default_rng(0)
 PARTS = 5
@@ -144,50 +143,3 @@ def test_the_answer_counts_the_points_of_each_part():
     assert named.line() == f"seat {counts[1]}   leg {counts[3]}"
     assert named.line(plain) == f"seat {counts[1]} -> {counts[1]}   leg {counts[3]} -> {counts[3]}"
     assert named.sentence(plain) == f"Points predicted of each part: seat {counts[1]}, leg {counts[3]}."
-
-
-def in_numpy(weight, calls):
-    """`Linear` on the host, which says something of masked rows too."""
-
-    def function(points, normals, mask):
-        calls.append(len(mask))
-        e = np.exp(np.concatenate([points, normals], axis=-1) @ weight)
-        return e / e.sum(axis=-1, keepdims=True)
-
-    return function
-
-
-def test_a_segmenter_on_the_host_is_one_in_jax():
-    weight, calls = 2.0 * RNG.standard_normal((6, PARTS)), []
-    own, host = Linear(jnp.asarray(weight, jnp.float32)), HostSegmenter(in_numpy(weight, calls), PARTS)
-    cloud = make_cloud(17, 25)
-    np.testing.assert_allclose(host(cloud), own(cloud), atol=1e-6)
-    scores = [ExpectedUtilityImprovement(SoftPartCount(segmenter, 3.0)) for segmenter in (own, host)]
-    scans = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[make_cloud(4, 6) for _ in range(5)])
-    contexts = [score.context(cloud) for score in scores]
-    del calls[:]
-    values = [jax.vmap(lambda seen, s=s, c=c: s(c, seen))(scans) for s, c in zip(scores, contexts, strict=True)]
-    np.testing.assert_allclose(values[1], values[0], atol=1e-5)
-    assert calls == [5], "all candidates in one call"
-    assert scores[1].batch_size == 128
-
-
-@pytest.mark.parametrize(
-    ("function", "message"),
-    [
-        (lambda points, normals, mask: np.ones((len(mask), PARTS)), "the segmenter returned shape"),
-        (lambda points, normals, mask: np.full((*mask.shape, PARTS), 1.0), "apply softmax"),
-        (lambda points, normals, mask: np.full((*mask.shape, PARTS), np.nan), "not probabilities"),
-    ],
-)
-def test_what_is_no_probability_is_named(function, message):
-    with pytest.raises(Exception, match=message):
-        jax.block_until_ready(HostSegmenter(function, PARTS)(make_cloud(4, 6)))
-
-
-def test_a_segmenter_on_the_host_has_no_derivative():
-    host, cloud = HostSegmenter(in_numpy(np.ones((6, PARTS)), []), PARTS), make_cloud(4, 6)
-    with pytest.raises(InputError, match="a HostSegmenter has no derivative"):
-        jax.grad(lambda points: jnp.sum(host(PointCloud(points, cloud.normals, cloud.mask))))(cloud.points)
-    with pytest.raises(InputError, match="num_parts is 0"):
-        HostSegmenter(in_numpy, 0)

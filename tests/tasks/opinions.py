@@ -1,0 +1,28 @@
+"""An opinion on four classes, in JAX and in NumPy, and clouds to have it of."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnbv.cloud import PointCloud
+
+WEIGHTS = np.random.default_rng(7).normal(size=(4, 6)) * 3.0
+
+
+def linear(cloud):
+    """Log-probabilities of four classes, from the means of the points and of the normals."""
+    rows = jnp.concatenate([cloud.points, cloud.normals], axis=-1)
+    mean = jnp.sum(jnp.where(cloud.mask[:, None], rows, 0.0), axis=0) / jnp.maximum(cloud.count, 1)
+    return jax.nn.log_softmax(jnp.asarray(WEIGHTS, mean.dtype) @ mean)
+
+
+def linear_in_numpy(points, normals):
+    mean = np.concatenate([points, normals], axis=-1).astype(np.float64).mean(axis=0)
+    p = np.exp(WEIGHTS @ mean)
+    return p / p.sum()
+
+
+def drawn_cloud(rng, count, capacity, center=(0.0, 0.0, 0.0)):
+    normals = rng.normal(size=(count, 3))
+    points = np.asarray(center) + 0.5 * rng.normal(size=(count, 3))
+    return PointCloud.from_arrays(points, normals / np.linalg.norm(normals, axis=1, keepdims=True), capacity)

@@ -1,0 +1,169 @@
+"""Classifiers and segmenters on the host against the same in JAX."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from opinions import drawn_cloud, linear, linear_in_numpy
+
+from jaxnbv.acquisition import ExpectedUtilityImprovement
+from jaxnbv.camera import Camera
+from jaxnbv.checks import InputError
+from jaxnbv.cloud import PointCloud
+from jaxnbv.planner import Planner
+from jaxnbv.scanning import Grid
+from jaxnbv.search import DiscreteSearch
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import CrossEntropy, HostClassifier, HostSegmenter, SoftPartCount
+
+RNG = np.random.default_rng(0)
+CAMERA, PARTS = Camera(height=6, width=7), 5
+
+
+def random_cloud(count, capacity):
+    return drawn_cloud(RNG, count, capacity)
+
+
+class Host:
+    """`linear` in NumPy, on batches; it counts its calls."""
+
+    def __init__(self):
+        self.shapes = []
+
+    def __call__(self, points, normals, mask):
+        assert all(isinstance(array, np.ndarray) for array in (points, normals, mask))
+        self.shapes.append(mask.shape)
+        return np.log([linear_in_numpy(p[m], n[m]) for p, n, m in zip(points, normals, mask, strict=True)])
+
+
+def test_a_host_classifier_equals_the_one_in_jax_in_one_call_a_batch():
+    clouds = [random_cloud(10 + i, 20) for i in range(6)]
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *clouds)
+    expected = np.stack([linear(cloud) for cloud in clouds])
+    calls = {
+        "one": (lambda f: f(clouds[0]), [(1, 20)], expected[0]),
+        "jit": (lambda f: jax.jit(f)(clouds[0]), [(1, 20)], expected[0]),
+        "vmap": (lambda f: jax.vmap(f)(batch), [(6, 20)], expected),
+        "jit of vmap": (lambda f: jax.jit(jax.vmap(f))(batch), [(6, 20)], expected),
+        "vmap of some": (
+            lambda f: jax.vmap(lambda p: f(PointCloud(p, clouds[0].normals, clouds[0].mask)))(batch.points[:, :20]),
+            [(6, 20)],
+            np.stack([linear(PointCloud(c.points, clouds[0].normals, clouds[0].mask)) for c in clouds]),
+        ),
+        "map": (lambda f: jax.lax.map(f, batch), [(1, 20)] * 6, expected),
+        "map in batches": (lambda f: jax.lax.map(f, batch, batch_size=4), [(4, 20), (2, 20)], expected),
+        "vmap of vmap": (
+            lambda f: jax.vmap(jax.vmap(f))(jax.tree.map(lambda a: a.reshape(2, 3, *a.shape[1:]), batch)),
+            [(6, 20)],
+            expected.reshape(2, 3, 4),
+        ),
+    }
+    for name, (call, shapes, wanted) in calls.items():
+        host = Host()
+        found = np.asarray(call(HostClassifier(host, 4)))
+        assert host.shapes == shapes, name
+        np.testing.assert_allclose(found, wanted, atol=2e-5, err_msg=name)
+
+
+def test_a_host_classifier_of_a_large_batch_comes_back():
+    """Callbacks of JAX have been known to wait for ever for their own arguments on few cores."""
+    cloud = PointCloud(jnp.ones((120, 3500, 3)), jnp.ones((120, 3500, 3)), jnp.ones((120, 3500), bool))
+    host = HostClassifier(lambda points, normals, mask: np.log([0.25, 0.75]) * points[:, :2, 0] * mask[:, :2], 2)
+    expected = np.tile(np.log([0.25, 0.75]), (120, 1))
+    np.testing.assert_allclose(jax.jit(jax.vmap(host))(cloud), expected, rtol=1e-6)
+
+
+def test_a_host_classifier_that_gives_logits_or_nan_is_refused():
+    cloud = PointCloud(jnp.ones((3, 3)), jnp.ones((3, 3)), jnp.ones(3, bool))
+    for answer in ([2.0, -1.0], [0.5, 0.5], [np.nan, np.nan]):
+        host = HostClassifier(lambda points, normals, mask, answer=answer: np.array([answer]), 2)
+        with pytest.raises(Exception, match="not log-probabilities"):
+            jax.block_until_ready(host(cloud))
+
+
+@pytest.mark.parametrize("wrap", [lambda f: f, jax.jit])
+def test_a_host_classifier_that_returns_another_shape_says_so(wrap):
+    host = HostClassifier(lambda points, normals, mask: np.zeros(4), 4)
+    with pytest.raises((RuntimeError, InputError), match=r"returned shape \(4,\), not \(1, 4\): log-prob"):
+        jax.block_until_ready(wrap(host)(random_cloud(5, 5)))
+
+
+def test_a_host_classifier_has_no_gradient():
+    score, data, scanned = CrossEntropy(HostClassifier(Host(), 4)), random_cloud(5, 5), random_cloud(4, 6)
+    with pytest.raises(InputError, match="use DiscreteSearch"):
+        jax.grad(lambda points: score(score.context(data), PointCloud(points, scanned.normals, scanned.mask)))(
+            scanned.points
+        )
+    with pytest.raises(InputError, match="num_classes is 1"):
+        HostClassifier(Host(), 1)
+
+
+def test_a_host_classifier_in_a_planners_search():
+    """The same poses and values as the JAX classifier's, through `Planner.propose`."""
+    data = random_cloud(40, 40)
+    model, search = GeometricSPSR(lengthscale=0.05, truncation=8), DiscreteSearch(7)
+    proposals = []
+    for classifier in (linear, HostClassifier(Host(), 4)):
+        planner = Planner(model, CAMERA, CrossEntropy(classifier), search, 2, Grid(16, 3.0), 64)
+        proposals.append(planner.propose(planner.init(data), jax.random.key(3)))
+    np.testing.assert_allclose(proposals[0].values, proposals[1].values, atol=1e-4)
+    assert np.ptp(np.asarray(proposals[0].values)) > 1e-2
+    np.testing.assert_array_equal(proposals[0].pose.position, proposals[1].pose.position)
+
+
+class Linear(eqx.Module):
+    """Probabilities of parts that follow from where a point is and how it faces."""
+
+    weight: jax.Array
+
+    def __call__(self, cloud):
+        features = jnp.concatenate([cloud.points, cloud.normals], axis=-1)
+        return jnp.where(cloud.mask[:, None], jax.nn.softmax(features @ self.weight, axis=-1), 0.0)
+
+
+def in_numpy(weight, calls):
+    """`Linear` on the host, which says something of masked rows too."""
+
+    def function(points, normals, mask):
+        calls.append(len(mask))
+        e = np.exp(np.concatenate([points, normals], axis=-1) @ weight)
+        return e / e.sum(axis=-1, keepdims=True)
+
+    return function
+
+
+def test_a_segmenter_on_the_host_is_one_in_jax():
+    weight, calls = 2.0 * RNG.standard_normal((6, PARTS)), []
+    own, host = Linear(jnp.asarray(weight, jnp.float32)), HostSegmenter(in_numpy(weight, calls), PARTS)
+    cloud = random_cloud(17, 25)
+    np.testing.assert_allclose(host(cloud), own(cloud), atol=1e-6)
+    scores = [ExpectedUtilityImprovement(SoftPartCount(segmenter, 3.0)) for segmenter in (own, host)]
+    scans = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[random_cloud(4, 6) for _ in range(5)])
+    contexts = [score.context(cloud) for score in scores]
+    del calls[:]
+    values = [jax.vmap(lambda seen, s=s, c=c: s(c, seen))(scans) for s, c in zip(scores, contexts, strict=True)]
+    np.testing.assert_allclose(values[1], values[0], atol=1e-5)
+    assert calls == [5], "all candidates in one call"
+    assert scores[1].batch_size == 128
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda points, normals, mask: np.ones((len(mask), PARTS)), "the segmenter returned shape"),
+        (lambda points, normals, mask: np.full((*mask.shape, PARTS), 1.0), "apply softmax"),
+        (lambda points, normals, mask: np.full((*mask.shape, PARTS), np.nan), "not probabilities"),
+    ],
+)
+def test_what_is_no_probability_is_named(function, message):
+    with pytest.raises(Exception, match=message):
+        jax.block_until_ready(HostSegmenter(function, PARTS)(random_cloud(4, 6)))
+
+
+def test_a_segmenter_on_the_host_has_no_derivative():
+    host, cloud = HostSegmenter(in_numpy(np.ones((6, PARTS)), []), PARTS), random_cloud(4, 6)
+    with pytest.raises(InputError, match="a HostSegmenter has no derivative"):
+        jax.grad(lambda points: jnp.sum(host(PointCloud(points, cloud.normals, cloud.mask))))(cloud.points)
+    with pytest.raises(InputError, match="num_parts is 0"):
+        HostSegmenter(in_numpy, 0)
