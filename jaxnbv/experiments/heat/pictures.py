@@ -19,12 +19,12 @@ from jaxnbv.cloud import PointCloud
 from jaxnbv.experiments.heat.study import HeatStudy, Truth, heat_problem
 from jaxnbv.experiments.measures import Record, methods_of
 from jaxnbv.experiments.study import Scene, views_of
+from jaxnbv.experiments.tiles import Tiles, first_scenes, frame, save_pictures
 from jaxnbv.tasks import body_temperature
 from jaxnbv.tasks.diffusion import HeatProblem
 from jaxnbv.viz.data import MeanSurface
-from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.render import Still, draw_segments, frustum
-from jaxnbv.viz.style import GREY, LINE
+from jaxnbv.viz.style import GREY
 
 _SHOWN = ("heat", "heat-reached", "farthest", "uncertainty", "random")
 # Without its palest colours, which would not stand out against the grey of what was not scanned.
@@ -62,15 +62,10 @@ def write_pictures(
 
     **Raises:** `ValueError` if there are no records, or no method that all of them hold.
     """
-    present, folder = methods_of(records, study.methods), Path(folder)
+    present = methods_of(records, study.methods)
     methods = [method for method in _SHOWN if method in present] or present
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    with mpl.rc_context(STYLE):
-        for record in sorted(records, key=lambda record: record["scene"])[:scenes]:
-            paths.append(folder / f"heat_{record['scene']:03d}.png")
-            _picture(record, study, methods, pixels).savefig(paths[-1], dpi=200)
-    return paths
+    chosen = first_scenes(records, scenes)
+    return save_pictures(chosen, folder, "heat", lambda record: _picture(record, study, methods, pixels))
 
 
 def _picture(record: Record, study: HeatStudy, methods: Sequence[str], pixels: int) -> Figure:
@@ -85,35 +80,27 @@ def _picture(record: Record, study: HeatStudy, methods: Sequence[str], pixels: i
     given = left + big + margin
     wide = given + len(columns) * (tile + gap)
     tall = top + max(len(methods) * (tile + below), big + key)
-    figure = Figure(figsize=(wide, tall))
-
-    def place(x: float, down: float, w: float, h: float) -> Axes:
-        return figure.add_axes((x / wide, 1.0 - (down + h) / tall, w / wide, h / tall))
-
-    def write(x: float, down: float, text: str, **style: Any) -> None:
-        figure.text(x / wide, 1.0 - down / tall, text, va="center", **style)
-
-    write(left, 0.18, f"Scene {record['scene']}: {record['name']}", fontsize=10, fontweight="bold")
     caption = "Scanned points, coloured by the temperature that they give; grey: not scanned.\n"
-    write(left, 0.43, f"{caption}Below each: distance of the estimate to the coldest points.", fontsize=8, color=GREY)
+    caption += "Below each: distance of the estimate to the coldest points."
+    tiles = Tiles(wide, tall, f"Scene {record['scene']}: {record['name']}", caption)
     start = top + 0.5 * (tall - top - big - key)
-    write(left + 0.5 * big, start - 0.1, "the object's temperature", fontsize=9, ha="center")
-    _draw_truth(place(left, start, big, big), stage)
-    _key(figure, place(left + 0.2, start + big + 0.05, big - 0.4, 0.09), stage)
+    tiles.write(left + 0.5 * big, start - 0.1, "the object's temperature", fontsize=9, ha="center")
+    _draw_truth(tiles.place(left, start, big, big), stage)
+    _key(tiles.figure, tiles.place(left + 0.2, start + big + 0.05, big - 0.4, 0.09), stage)
     for row, (method, run) in enumerate(zip(methods, runs, strict=True)):
         down = top + row * (tile + below)
-        write(given - gap, down + 0.5 * tile, method, fontsize=9, fontweight="bold", ha="right")
+        tiles.write(given - gap, down + 0.5 * tile, method, fontsize=9, fontweight="bold", ha="right")
         clouds = [cloud for _, cloud in study.seen(scene, run)]
         taken = study.poses_of(run)
         for column, count in enumerate(columns):
-            axes = place(given + column * (tile + gap), down, tile, tile)
+            axes = tiles.place(given + column * (tile + gap), down, tile, tile)
             _draw_cloud(axes, stage, clouds[count - 1], taken[:count])
             estimates = {name: {key: of[key][count - 1] for key in of} for name, of in run["estimates"].items()}
             _draw_estimates(axes, stage, estimates)
             if row == 0:
                 text = f"after {count} view{'s' if count > 1 else ''}"
                 axes.set_title(text, fontsize=9, loc="center", pad=4)
-    return figure
+    return tiles.figure
 
 
 def _stage(study: HeatStudy, scene: Scene, pixels: int) -> _Stage:
@@ -200,9 +187,8 @@ def _mark(axes: Axes, stage: _Stage, point: Float[np.ndarray, "3"], colour: str,
 
 def _finish(axes: Axes, stage: _Stage) -> None:
     size = stage.still.size
-    axes.set(xlim=(0, size), ylim=(size, 0), xticks=[], yticks=[])
-    for spine in axes.spines.values():
-        spine.set(visible=True, color=LINE, linewidth=0.8)
+    axes.set(xlim=(0, size), ylim=(size, 0))
+    frame(axes)
 
 
 def _key(figure: Figure, axes: Axes, stage: _Stage) -> None:

@@ -39,7 +39,7 @@ _SEARCHES: dict[str, type[CandidateSearch]] = {
 # Those that seek cold; the other methods know nothing of heat.
 HEAT_METHODS = tuple(_SEARCHES)[:3]
 # The points among which a cloud's coldest is sought.
-ESTIMATES = {"all": "coldest of all points", "reached": "coldest of the points that the source warms"}
+ESTIMATES = {"all": "coldest of all points", "reached": "coldest of the warmed points"}
 # Points colder than this share of the range of temperatures count as coldest: objects have symmetries, and the inner
 # floor of a mug is as cold all over.
 _NEARLY = 0.01

@@ -24,9 +24,9 @@ from jaxnbv.datasets.labelled import LabelledSolid
 from jaxnbv.experiments.measures import Record, methods_of
 from jaxnbv.experiments.parts.study import TARGET, TARGETS, PartStudy, discovery_time
 from jaxnbv.experiments.study import Scene
+from jaxnbv.experiments.tiles import Tiles, frame, save_pictures
 from jaxnbv.networks import CATEGORIES
 from jaxnbv.scanning import SDFSurface, scan
-from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.render import frustum
 from jaxnbv.viz.style import GREY, INK, LINE
 
@@ -80,15 +80,10 @@ def write_pictures(
 
     **Raises:** `ValueError` if there are no records, or no method that all of them hold.
     """
-    present, folder = methods_of(records, study.methods), Path(folder)
+    present = methods_of(records, study.methods)
     methods = [method for method in _SHOWN if method in present] or present
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    with mpl.rc_context(STYLE):
-        for record in _with_small_parts(records, scenes):
-            paths.append(folder / f"parts_{record['scene']:03d}.png")
-            _picture(record, study, methods, pixels).savefig(paths[-1], dpi=200)
-    return paths
+    chosen = _with_small_parts(records, scenes)
+    return save_pictures(chosen, folder, "parts", lambda record: _picture(record, study, methods, pixels))
 
 
 def _with_small_parts(records: Sequence[Record], count: int) -> list[Record]:
@@ -121,33 +116,25 @@ def _picture(record: Record, study: PartStudy, methods: Sequence[str], pixels: i
     given = left + 2.1 + 2 * gap
     wide = given + columns * (tile + gap) + margin
     tall = top + max(len(methods) * (tile + below), block)
-    figure = Figure(figsize=(wide, tall))
+    caption = (
+        "Points: the part that the segmenter says; strong are those of this view. "
+        f"Bars: points of each part, full at {TARGET}. Framed: all parts have been found."
+    )
+    tiles = Tiles(wide, tall, f"Scene {record['scene']}: {record['category']}", caption)
     middle = top + 0.5 * (tall - top - below)
-
-    def place(x: float, down: float, w: float = tile, h: float = tile) -> Axes:
-        return figure.add_axes((x / wide, 1.0 - (down + h) / tall, w / wide, h / tall))
 
     def column_at(column: int) -> float:
         return given + column * (tile + gap) + (margin if column else 0.0)
 
-    def write(x: float, down: float, text: str, **style: Any) -> None:
-        figure.text(x / wide, 1.0 - down / tall, text, va="center", **style)
-
-    write(left, 0.18, f"Scene {record['scene']}: {record['category']}", fontsize=10, fontweight="bold")
-    key = (
-        "Points: the part that the segmenter says; strong are those of this view. "
-        f"Bars: points of each part, full at {TARGET}. Framed: all parts have been found."
-    )
-    write(left, 0.38, key, fontsize=8, color=GREY)
-    axes = place(left + 0.5 * (2.1 - true_wide), middle - 0.5 * block + 0.2, true_wide, true_tall)
+    axes = tiles.place(left + 0.5 * (2.1 - true_wide), middle - 0.5 * block + 0.2, true_wide, true_tall)
     axes.imshow(stage.image, interpolation="antialiased")
     axes.set(xlim=corner[0] + [0, size[0]], ylim=corner[1] + [size[1], 0])
     axes.axis("off")
-    write(left + 1.05, middle - 0.5 * block + 0.08, "true parts", fontsize=9, ha="center")
+    tiles.write(left + 1.05, middle - 0.5 * block + 0.08, "true parts", fontsize=9, ha="center")
     for index, (name, colour) in enumerate(zip(record["parts"], _of_parts(scene, colours), strict=True)):
         down = middle + 0.5 * block + line * (index + 0.5 - len(record["parts"]))
-        write(left + 0.6, down, "●", color=colour, fontsize=11)
-        write(left + 0.8, down, name, fontsize=9)
+        tiles.write(left + 0.6, down, "●", color=colour, fontsize=11)
+        tiles.write(left + 0.8, down, name, fontsize=9)
 
     def draw(axes: Axes, row: int, column: int) -> None:
         shown, cloud = seen[row][column]
@@ -159,17 +146,19 @@ def _picture(record: Record, study: PartStudy, methods: Sequence[str], pixels: i
 
     for row, (method, run) in enumerate(zip(methods, runs, strict=True)):
         down, held = top + row * (tile + below), len(run["views"])
-        write(column_at(1) - gap, down + 0.5 * tile, method, fontsize=9, fontweight="bold", ha="right")
+        tiles.write(column_at(1) - gap, down + 0.5 * tile, method, fontsize=9, fontweight="bold", ha="right")
         for column in range(1, held):
-            draw(place(column_at(column), down), row, column)
+            draw(tiles.place(column_at(column), down, tile, tile), row, column)
         if held < columns:
             text = f"every part has\n{max(TARGETS)} points"
-            write(column_at(max(held, 1)) + 0.5 * tile, down + 0.5 * tile, text, fontsize=8, color=GREY, ha="center")
+            tiles.write(
+                column_at(max(held, 1)) + 0.5 * tile, down + 0.5 * tile, text, fontsize=8, color=GREY, ha="center"
+            )
     for column in range(1, columns):
-        write(column_at(column) + 0.5 * tile, top - 0.12, f"view {column + 1}", fontsize=9, ha="center")
-    draw(place(given, middle - 0.5 * tile), 0, 0)
-    write(given + 0.5 * tile, middle - 0.5 * tile - 0.12, "view 1, given", fontsize=9, ha="center")
-    return figure
+        tiles.write(column_at(column) + 0.5 * tile, top - 0.12, f"view {column + 1}", fontsize=9, ha="center")
+    draw(tiles.place(given, middle - 0.5 * tile, tile, tile), 0, 0)
+    tiles.write(given + 0.5 * tile, middle - 0.5 * tile - 0.12, "view 1, given", fontsize=9, ha="center")
+    return tiles.figure
 
 
 def _part_colours(scene: PartScene) -> Float[np.ndarray, "labels 3"]:
@@ -245,11 +234,10 @@ def _draw_view(
 def _finish(axes: Axes, stage: _Stage, run: dict, view: int, colours: Float[np.ndarray, "parts 3"]) -> None:
     """Frame and bars of one tile."""
     size = stage.camera.width
-    axes.set(xlim=(0, size), ylim=(size, 0), xticks=[], yticks=[])
+    axes.set(xlim=(0, size), ylim=(size, 0))
     found = discovery_time(np.asarray(run["counts"]), TARGET)
     is_found = found is not None and found <= view + 1
-    for spine in axes.spines.values():
-        spine.set(visible=True, color=_FOUND if is_found else LINE, linewidth=1.6 if is_found else 0.8)
+    frame(axes, _FOUND if is_found else LINE, 1.6 if is_found else 0.8)
     if found == view + 1:
         inside: dict[str, Any] = {"transform": axes.transAxes, "ha": "left", "va": "top"}
         axes.text(0.03, 0.975, "✓ all found", color=_FOUND, fontsize=8, fontweight="bold", **inside, zorder=5)

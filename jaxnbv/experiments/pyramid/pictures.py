@@ -17,8 +17,8 @@ from jaxnbv.datasets import PATTERNS, Framing, Pyramid, Split, pyramid_scene
 from jaxnbv.experiments.measures import Record, methods_of
 from jaxnbv.experiments.pyramid.hits import PATTERN_PIXELS
 from jaxnbv.experiments.pyramid.study import PyramidStudy
+from jaxnbv.experiments.tiles import Tiles, first_scenes, frame, save_pictures
 from jaxnbv.scanning import SDFSurface, scan
-from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.style import GREY, LINE, NEW
 
 _SHOWN = ("cross-entropy", "farthest", "uncertainty")
@@ -38,15 +38,9 @@ def write_pictures(records: Sequence[Record], study: PyramidStudy, folder: str |
 
     **Raises:** `ValueError` if there are no records, or no method that all of them hold.
     """
-    present, folder = methods_of(records, study.methods), Path(folder)
+    present = methods_of(records, study.methods)
     methods = [method for method in _SHOWN if method in present] or present
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    with mpl.rc_context(STYLE):
-        for record in sorted(records, key=lambda record: record["scene"])[:scenes]:
-            paths.append(folder / f"views_{record['scene']:03d}.png")
-            _picture(record, study, methods).savefig(paths[-1], dpi=200)
-    return paths
+    return save_pictures(first_scenes(records, scenes), folder, "views", lambda one: _picture(one, study, methods))
 
 
 def _picture(record: Record, study: PyramidStudy, methods: Sequence[str]) -> Figure:
@@ -60,38 +54,32 @@ def _picture(record: Record, study: PyramidStudy, methods: Sequence[str]) -> Fig
     # Inches: all methods share the first view, so it stands once, at the middle of the rows.
     tile, gap, below, left, top, margin = 1.25, 0.1, 0.36, 0.12, 0.8, 1.0
     wide, tall = left + views * (tile + gap) + margin + 0.1, top + len(methods) * (tile + below)
-    figure = Figure(figsize=(wide, tall))
+    title = f"Scene {record['scene']}, {record['framing']}: {PATTERNS[record['label']]}"
+    caption = f"Framed: at least {PATTERN_PIXELS} pattern pixels. Beneath: prediction so far."
+    tiles = Tiles(wide, tall, title, caption)
 
     def place(column: int, row: int | float) -> Axes:
         x = left + column * (tile + gap) + (margin if column else 0.0)
-        y = tall - top - row * (tile + below) - tile
-        return figure.add_axes((x / wide, y / tall, tile / wide, tile / tall))
+        return tiles.place(x, top + row * (tile + below), tile, tile)
 
-    title = f"Scene {record['scene']}, {record['framing']}: {PATTERNS[record['label']]}"
-    figure.text(left / wide, 1.0 - 0.19 / tall, title, fontsize=10, fontweight="bold", va="center")
-    key = f"Framed: at least {PATTERN_PIXELS} pattern pixels. Beneath: prediction so far."
-    figure.text(left / wide, 1.0 - 0.38 / tall, key, fontsize=8, color=GREY, va="center")
     for row, (method, run) in enumerate(zip(methods, runs, strict=True)):
         for column in range(1, views):
             axes = place(column, row)
             _tile(axes, images[row][column], record["label"], run, column)
             if row == 0:
                 axes.set_title(f"view {column + 1}", fontsize=9, loc="center", pad=4)
-        x = left + tile + margin
-        y = tall - top - row * (tile + below) - 0.5 * tile
-        figure.text((x - 0.02) / wide, y / tall, method, fontsize=9, fontweight="bold", ha="right", va="center")
+        x, down = left + tile + margin - 0.02, top + row * (tile + below) + 0.5 * tile
+        tiles.write(x, down, method, fontsize=9, fontweight="bold", ha="right")
     axes = place(0, 0.5 * (len(methods) - 1))
     _tile(axes, images[0][0], record["label"], runs[0], 0)
     axes.set_title("view 1, given", fontsize=9, loc="center", pad=4)
-    return figure
+    return tiles.figure
 
 
 def _tile(axes: Axes, image: Float[np.ndarray, "h w 3"], label: int, run: dict, view: int) -> None:
     axes.imshow(image, interpolation="antialiased")
-    axes.set(xticks=[], yticks=[])
     shows = run["pattern_pixels"][view] >= PATTERN_PIXELS
-    for spine in axes.spines.values():
-        spine.set(visible=True, color=NEW if shows else LINE, linewidth=1.6 if shows else 0.8)
+    frame(axes, NEW if shows else LINE, 1.6 if shows else 0.8)
     guess = int(np.argmax(run["log_p"][view]))
     right = guess == label
     text = f"{PATTERNS[guess]} {np.exp(run['log_p'][view][guess]):.0%}"

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import cast
 
 import jax
-import matplotlib as mpl
 import numpy as np
 import trimesh
 from jaxtyping import Float
@@ -18,9 +17,9 @@ from scipy.spatial import cKDTree
 from jaxnbv.checks import InputError
 from jaxnbv.experiments.measures import Record, methods_of
 from jaxnbv.experiments.reconstruction.study import RECONSTRUCTIONS, ReconstructionStudy, reconstruct
+from jaxnbv.experiments.tiles import Tiles, first_scenes, save_pictures
 from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, mesh_from_sdf
 from jaxnbv.viz.data import MeanSurface
-from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.render import Still
 from jaxnbv.viz.style import DEVIATION, GREY, log_ticks
 
@@ -49,14 +48,9 @@ def write_pictures(
 
     **Raises:** `ValueError` as `methods_of` does, or for a scene that the study does not have.
     """
-    methods, folder = methods_of(records, study.methods), Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    with mpl.rc_context(STYLE):
-        for record in sorted(records, key=lambda record: record["scene"])[:scenes]:
-            paths.append(folder / f"surfaces_{record['scene']:03d}.png")
-            _picture(record, study, methods, pixels, dense).savefig(paths[-1], dpi=200)
-    return paths
+    methods = methods_of(records, study.methods)
+    chosen = first_scenes(records, scenes)
+    return save_pictures(chosen, folder, "surfaces", lambda one: _picture(one, study, methods, pixels, dense))
 
 
 def _picture(record: Record, study: ReconstructionStudy, methods: Sequence[str], pixels: int, dense: int) -> Figure:
@@ -83,36 +77,33 @@ def _picture(record: Record, study: ReconstructionStudy, methods: Sequence[str],
     tile, gap, below, left, top, bottom = 1.6, 0.15, 0.32, 0.3, 0.62, 0.5
     high = tile * (crop[0].stop - crop[0].start) / (crop[1].stop - crop[1].start)
     wide, tall = left + (len(methods) + 1) * (tile + gap), top + len(names) * (high + below) + bottom
-    figure = Figure(figsize=(wide, tall))
+    tiles = Tiles(wide, tall, record["name"])
 
     def show(image: str, column: int, row: int | float, title: str = "") -> Axes:
-        x, y = left + column * (tile + gap) - gap, tall - top - row * (high + below) - high
-        axes = figure.add_axes((x / wide, y / tall, tile / wide, high / tall))
+        axes = tiles.place(left + column * (tile + gap) - gap, top + row * (high + below), tile, high)
         axes.imshow(images[image][crop], interpolation="antialiased", aspect="auto")
         axes.set_title(title, fontsize=9, loc="center", pad=4)
         axes.axis("off")
         return axes
 
-    figure.text(0.1 / wide, 1.0 - 0.19 / tall, record["name"], fontsize=10, fontweight="bold", va="center")
     show("truth", 0, 0.5 * (len(names) - 1), "true surface")
     for row, name in enumerate(names):
-        x, y = left + tile + 0.5 * gap, tall - top - row * (high + below) - 0.5 * high
-        text = name.replace(" ", "\n")
-        figure.text(x / wide, y / tall, text, fontsize=8, color=GREY, rotation=90, ha="center", va="center")
+        x, down = left + tile + 0.5 * gap, top + row * (high + below) + 0.5 * high
+        tiles.write(x, down, name.replace(" ", "\n"), fontsize=8, color=GREY, rotation=90, ha="center")
         for column, (method, found) in enumerate(zip(methods, held, strict=True), start=1):
             axes = show(f"{name}, {method}", column, row, method if row == 0 else "")
             text = f"CD {found[name]['chamfer']:.3f}   HD {found[name]['hausdorff']:.3f}"
             axes.text(0.5, -0.04, text, transform=axes.transAxes, ha="center", va="top", fontsize=8)
-    scale = figure.add_axes(((wide - 3.4) / wide, 0.36 / tall, 3.2 / wide, 0.08 / tall))
-    bar = figure.colorbar(ScalarMappable(_ERRORS, DEVIATION), cax=scale, orientation="horizontal", extend="both")
+    scale = tiles.place(wide - 3.4, tall - 0.44, 3.2, 0.08)
+    bar = tiles.figure.colorbar(ScalarMappable(_ERRORS, DEVIATION), cax=scale, orientation="horizontal", extend="both")
     ticks = log_ticks(float(_ERRORS.vmin or 0), float(_ERRORS.vmax or 1)).tolist()
     bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
     bar.ax.minorticks_off()
     bar.outline.set_visible(False)
     bar.ax.tick_params(labelsize=7, length=2)
     label = "distance to the true surface\n(scene units)"
-    figure.text((wide - 3.5) / wide, 0.33 / tall, label, fontsize=8, ha="right", va="center")
-    return figure
+    tiles.write(wide - 3.5, tall - 0.33, label, fontsize=8, ha="right")
+    return tiles.figure
 
 
 def _true_mesh(scene: Surface) -> TriangleMesh:
