@@ -1,4 +1,5 @@
 from . import datasets as datasets
+from . import metrics as metrics
 from . import networks as networks
 from . import scanning as scanning
 from . import search as search
@@ -27,6 +28,8 @@ from .planner import Planner as Planner
 from .planner import State as State
 from .presets import Imagination as Imagination
 from .presets import imagination as imagination
+from .reconstruction import mean_mesh as mean_mesh
+from .reconstruction import screened_poisson as screened_poisson
 from .scanning import Carving as Carving
 from .scanning import Grid as Grid
 from .scanning import GridSurface as GridSurface
@@ -39,6 +42,7 @@ from .scanning import load_mesh as load_mesh
 from .scanning import mesh_from_sdf as mesh_from_sdf
 from .scanning import scan as scan
 from .scanning import scan_samples as scan_samples
+from .scanning import sdf as sdf
 from .search import Candidates as Candidates
 from .search import ConstrainedPoses as ConstrainedPoses
 from .search import DiscreteSearch as DiscreteSearch
@@ -77,6 +81,8 @@ from .tasks import MixedEntropy as MixedEntropy
 from .tasks import NegativeEntropy as NegativeEntropy
 from .tasks import SoftPartCount as SoftPartCount
 from .tasks import coldest_point as coldest_point
+from .tasks import predict as predict
 from .tasks.diffusion import HeatProblem as HeatProblem
 from .version import __version__ as __version__
+from .viz import write_report as write_report
 from .volume import Box as Box

@@ -35,7 +35,7 @@ class ColdestPoint(eqx.Module):
     order of the points and the number of workers.
 
     - `source`: (3,), where the body is heated, in scene coordinates: within `radius` of it, with `power`. Scenes that
-      differ in the source alone share one compilation.
+      differ in the source alone share one compilation. Or a whole `HeatProblem`, in place of it and the next five.
     - `T`, `steps`: how long, and in how many steps of implicit Euler.
     - `u0`: the temperature at the beginning. All of these are explained in `HeatProblem`, which `heat` holds; the
       defaults are the authors'.
@@ -54,7 +54,7 @@ class ColdestPoint(eqx.Module):
 
     def __init__(
         self,
-        source: Float[AnyArray, "3"] | Sequence[float],
+        source: Float[AnyArray, "3"] | Sequence[float] | HeatProblem,
         power: float = 10.0,
         T: float = 5.0,
         steps: int = 20,
@@ -65,8 +65,13 @@ class ColdestPoint(eqx.Module):
     ):
         workers = cpu_count() if workers is None else workers
         require(workers >= 1, f"the number of workers is {workers}; it must be at least 1")
-        place = np.asarray(source) if isinstance(source, Sequence) else source
-        self.heat = HeatProblem(place, radius, power, T, steps, u0)
+        if isinstance(source, HeatProblem):
+            twice = (power, T, steps, u0, radius) != (10.0, 5.0, 20, 0.0, 0.1)
+            require(not twice, "the heat is told twice: power, T, steps, u0 and radius are those of the HeatProblem")
+            self.heat = source
+        else:
+            place = np.asarray(source) if isinstance(source, Sequence) else source
+            self.heat = HeatProblem(place, radius, power, T, steps, u0)
         self.reached_only, self.workers = reached_only, workers
 
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:

@@ -74,6 +74,14 @@ def test_the_utility_against_a_dense_solve(x64):
         assert abs(value - float(found)) > 1e-3
 
 
+def test_a_heat_problem_stands_for_its_numbers(x64):
+    cloud = cloud_of(sphere(60))
+    assert float(ColdestPoint(HEAT, workers=1)(cloud)) == float(utility_of(HEAT, workers=1)(cloud))
+    assert ColdestPoint(HEAT).heat is HEAT
+    with pytest.raises(InputError, match="told twice"):
+        ColdestPoint(HEAT, T=2.0)
+
+
 def test_neither_workers_nor_the_order_of_the_points_change_a_bit():
     points = np.stack([sphere(90) for _ in range(11)])
     clouds = PointCloud(jnp.asarray(points), jnp.asarray(points), jnp.asarray(RNG.uniform(size=(11, 90)) < 0.7))
