@@ -50,9 +50,9 @@ VARIANTS: dict[str, Variant] = {
     "+ carving": lambda grid: (nbv.GeometricSPSR(), nbv.Carving()),
     "+ volume": lambda grid: (nbv.ScreenedSPSR(nbv.GeometricSPSR(), (nbv.OutsideBoundary(),)), nbv.Carving()),
     "+ two scales": lambda grid: (nbv.ScreenedSPSR(TWO_SCALES, (nbv.OutsideBoundary(),)), nbv.Carving()),
+    "+ on surface": lambda grid: (nbv.ScreenedSPSR(values=(nbv.OutsideBoundary(), nbv.OnSurface())), nbv.Carving()),
     "default": lambda grid: (nbv.ScreenedSPSR(), nbv.Carving()),
     "+ thickness": lambda grid: (nbv.ScreenedSPSR(values=(*USUAL, nbv.Thickness())), nbv.Carving()),
-    "+ seen empty": lambda grid: (nbv.ScreenedSPSR(values=(*USUAL, nbv.Thickness(), nbv.SeenEmpty())), nbv.Carving()),
 }
 # What the table shows: heading, key of the record, digits.
 COLUMNS = (

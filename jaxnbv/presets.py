@@ -12,6 +12,7 @@ from jaxnbv.surfaces import (
     OnSurface,
     OutsideBoundary,
     ScreenedSPSR,
+    SeenEmpty,
     SurfaceModel,
 )
 from jaxnbv.volume import Box, Volume
@@ -25,7 +26,11 @@ class Imagination(NamedTuple):
 
 
 def imagination(
-    name: ModelName | str, longest_side: float = 2.5, quick: bool = False, volume: Volume | None = None
+    name: ModelName | str,
+    longest_side: float = 2.5,
+    quick: bool = False,
+    volume: Volume | None = None,
+    solid: bool = False,
 ) -> Imagination:
     """The surfaces of a name, for an object whose box has this longest side, in scene units.
 
@@ -35,6 +40,8 @@ def imagination(
     - `paper`: the published model at its published values, which conditions on normals alone; not carved.
     - `quick`: with fewer frequencies.
     - `volume`: by default the cube of the longest side about the origin.
+    - `solid`: for a body that is nowhere thin, such as the pyramid: its hidden side is as large as the one that was
+      seen, so that nothing follows for the space beside what was seen empty (`SeenEmpty`).
 
     **Raises:** `ValueError` for another name, or a longest side that is not positive.
     """
@@ -49,5 +56,5 @@ def imagination(
     # Shorter scales need more frequencies, but time and memory grow with their cube.
     truncation = min(round((20 if quick else usual.base.truncation) / scale), 30 if quick else 48)
     base = GeometricSPSR(lengthscales, usual.base.variance, truncation)
-    values = OutsideBoundary(volume), OnSurface()
+    values = (OutsideBoundary(volume), OnSurface(), *(() if solid else (SeenEmpty(),)))
     return Imagination(ScreenedSPSR(base, values, reach=scale * usual.reach), Carving(volume))

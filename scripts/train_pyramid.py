@@ -40,7 +40,7 @@ def scanned(folder: Path, split: Split, framing: Framing, count: int) -> Labelle
 
 def imagined(folder: Path, split: Split, framing: Framing, count: int) -> LabelledClouds:
     """Clouds that end in a scan of a posterior sample, 16 from each of `count` scenes."""
-    model, carving = imagination(ModelName.SCREENED, framing.longest_side)
+    model, carving = imagination(ModelName.SCREENED, framing.longest_side, solid=True)
     grid = Grid(64, 0.7 * framing.longest_side)
     planner = Planner(model, Camera(), Coverage(), DiscreteSearch(), 4, grid, 2500, carving=carving)
 

@@ -45,6 +45,13 @@ def test_lengths_are_in_proportion_to_the_object():
     assert small.base.truncation > large.base.truncation
 
 
+def test_of_a_solid_body_nothing_follows_from_what_was_seen_empty():
+    kinds = [
+        [type(one).__name__ for one in imagination("screened", solid=solid).model.values] for solid in (False, True)
+    ]
+    assert kinds == [["OutsideBoundary", "OnSurface", "SeenEmpty"], ["OutsideBoundary", "OnSurface"]]
+
+
 def test_a_volume_of_ones_own_is_that_of_both():
     model, carving = imagination("screened", volume=Box.cube(1.0))
     assert carving.volume == model.values[0].volume == Box.cube(1.0)

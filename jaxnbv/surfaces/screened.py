@@ -32,7 +32,7 @@ from jaxnbv.surfaces.trigonometric import (
     inverse_laplacian,
     solve_poisson,
 )
-from jaxnbv.surfaces.values import OnSurface, OutsideBoundary, ValueRows, ValueSource, joined
+from jaxnbv.surfaces.values import OnSurface, OutsideBoundary, SeenEmpty, ValueRows, ValueSource, joined
 
 _CHUNK_VALUES = 2**24
 _JUMP_POINTS = 256
@@ -41,8 +41,7 @@ _JUMP_POINTS = 256
 class ScreenedSPSR(SurfaceModel):
     """`GeometricSPSR` conditioned on values of f as well as on normals.
 
-    The defaults are what served best over validation objects: surfaces as near to the truth as with more kinds of
-    values (`benchmarks/imagination.py`), and views better chosen.
+    The defaults are what `benchmarks/imagination.py` found best over validation objects.
 
     - `base`: the prior, and the noise of the normals. The default has a short scale for detail and a long one for the
       body, of which values can make use.
@@ -57,7 +56,7 @@ class ScreenedSPSR(SurfaceModel):
     """
 
     base: GeometricSPSR = eqx.field(default_factory=lambda: GeometricSPSR((0.01, 0.06), (0.2, 0.25), truncation=32))
-    values: tuple[ValueSource, ...] = eqx.field(default_factory=lambda: (OutsideBoundary(), OnSurface()))
+    values: tuple[ValueSource, ...] = eqx.field(default_factory=lambda: (OutsideBoundary(), OnSurface(), SeenEmpty()))
     level_deviation: float = eqx.field(static=True, default=0.5)
     reach: float = eqx.field(static=True, default=0.1)
 

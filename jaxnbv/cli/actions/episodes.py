@@ -32,7 +32,7 @@ def demo(task: str, scene: int, framing: Framing, first: str | None, options: Ep
     if shown.told:
         typer.echo(shown.told)
     start = shown.first if first is None else look_at(position("--first", first))
-    planner = _planner(made.setting, shown.score, options, shown.longest_side, shown.grid)
+    planner = _planner(made.setting, shown.score, options, shown.longest_side, shown.solid, shown.grid)
     _run(shown.name, shown.surface, planner, start, options)
 
 
@@ -61,10 +61,15 @@ def run(
 
 
 def _planner(
-    setting: Setting, score: Score, options: EpisodeOptions, longest_side: float = 2.5, grid: Grid = Grid()
+    setting: Setting,
+    score: Score,
+    options: EpisodeOptions,
+    longest_side: float = 2.5,
+    solid: bool = False,
+    grid: Grid = Grid(),
 ) -> Planner:
     """At the authors' settings, or at small ones, for an object of this longest side."""
-    surfaces, carving = imagination(options.model, longest_side, options.quick)
+    surfaces, carving = imagination(options.model, longest_side, options.quick, solid=solid)
     search = resolve(SEARCHES[options.search].search)
     if options.quick:
         small = Camera(height=24, width=24)

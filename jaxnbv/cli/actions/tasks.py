@@ -54,7 +54,7 @@ class Given(NamedTuple):
 class Shown(NamedTuple):
     """An object to show a task on.
 
-    - `longest_side`, `grid`: of the imagined surfaces; `told`: what is said of the object before.
+    - `longest_side`, `solid`, `grid`: of the imagined surfaces; `told`: what is said of the object before.
     """
 
     name: str
@@ -62,6 +62,7 @@ class Shown(NamedTuple):
     score: Score
     first: Pose
     longest_side: float = Framing.CLOSE_UP.longest_side
+    solid: bool = False
     grid: Grid = Grid()
     told: str = ""
 
@@ -107,7 +108,7 @@ class ClassTask(CommandTask):
         side, first = framing.longest_side, hidden_view(pyramid, jax.random.key(seed))
         told = f"the pattern is a {PATTERNS[int(pyramid.label)]}"
         score = self.of(pyramid_classifier(side))
-        return Shown("pyramid", SDFSurface(pyramid), score, first, side, Grid(64, 0.7 * side), told)
+        return Shown("pyramid", SDFSurface(pyramid), score, first, side, True, Grid(64, 0.7 * side), told)
 
 
 class PartTask(CommandTask):

@@ -158,7 +158,7 @@ class PyramidStudy(Study):
         studies: dict[str, Study] = {}
         for one in Framing if framing is None else (framing,):
             classifier, imagining = (pyramid_classifier(one.longest_side, **s) for s in ({}, {"num_points": 512}))
-            surfaces = imagination(model, one.longest_side, quick)._asdict()
+            surfaces = imagination(model, one.longest_side, quick, solid=True)._asdict()
             settings = {"classifier": classifier, "imagining": imagining, "framing": one} | options
             studies[one.value] = cls(views=views, **surfaces | settings | (dict(cls.quick) if quick else {}))
         return studies
