@@ -94,7 +94,7 @@ def draw_reliability(path: Path, rows: dict[tuple[str, int, str], list[dict]], n
     """
     views = len(next(iter(rows.values())))
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(3.4 * views, 3.6), layout="constrained")
+        figure = Figure(figsize=(3.4 * views, 3.9), layout="constrained")
         panels = figure.subplots(1, views, sharey=True, squeeze=False)[0]
         for index, axes in enumerate(panels):
             axes.plot([0, 1], [0, 1], color=GREY, linewidth=0.8, linestyle=":")
@@ -108,7 +108,7 @@ def draw_reliability(path: Path, rows: dict[tuple[str, int, str], list[dict]], n
         panels[0].set_ylabel("share truly inside")
         panels[0].legend(frameon=False, fontsize=8)
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=150)
+        figure.savefig(path, dpi=150, bbox_inches="tight")
 
 
 def pooled(runs: list[dict]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
