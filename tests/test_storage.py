@@ -236,7 +236,7 @@ def test_leftover_parts_do_not_matter(finished, tmp_path):
 SCRIPT = """
 import os, sys, time
 from pathlib import Path
-import jaxnbv.episode, jaxnbv.storage
+import jaxnbv.episode, jaxnbv.files
 from test_storage import run
 
 folder, stage, view = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
@@ -256,7 +256,7 @@ if stage == "scan":
     stall_at(jaxnbv.episode, "observe_scene", lambda call: done + call == view + 1)
 if stage == "write":
     record = 0 if (folder / "episode.json").exists() else 1
-    stall_at(jaxnbv.storage.os, "fsync", lambda call: done + call == view + 1 + record)
+    stall_at(jaxnbv.files.os, "fsync", lambda call: done + call == view + 1 + record)
 run(folder, views=5)
 """
 
