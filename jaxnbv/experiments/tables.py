@@ -68,14 +68,15 @@ def summary(records: Sequence[Record], study: type[Study], groups: bool = True) 
         if group != "all":
             sections.append(underlined(f"{group}: {count_of(len(members), 'scene')}"))
         for measure in study.measures:
+            title = measure.title.replace("\n", " ")
             here = [row for row in results if (row["group"], row["quantity"]) == (group, measure.name)]
             if measure.listed and here:
                 unit = f" ({measure.unit})" if measure.unit else ""
-                sections.append(f"{measure.title}{unit}, by {measure.by}\n{_grid(here, 'method', _result, measure)}")
+                sections.append(f"{title}{unit}, by {measure.by}\n{_grid(here, 'method', _result, measure)}")
             here = [row for row in differences if (row["group"], row["quantity"]) == (group, measure.name)]
             if measure.listed and here:
-                title = f"{measure.title}: {study.reference} minus another method"
-                sections.append(f"{title}\n{_grid(here, 'baseline', _difference, measure)}")
+                compared = f"{title}: {study.reference} minus another method"
+                sections.append(f"{compared}\n{_grid(here, 'baseline', _difference, measure)}")
     return "\n".join([*sections, *study.notes(records)])
 
 
