@@ -22,9 +22,9 @@ def write_tables(records: Sequence[Record], study: type[Study], folder: str | Pa
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    text = folder / "results.txt"
-    text.write_text(summary(records, study), encoding="utf-8")
     results, differences = all_rows(records, study)
+    text = folder / "results.txt"
+    text.write_text(_text(records, study, results, differences), encoding="utf-8")
     paths = [
         write_csv(folder / "results.csv", results, _RESULT),
         write_csv(folder / "differences.csv", differences, _DIFFERENCE),
@@ -42,8 +42,7 @@ def all_rows(records: Sequence[Record], study: type[Study]) -> tuple[list[Row], 
     for group, members in study.groups(records).items():
         methods, label = methods_of(members, study.methods), {"group": group}
         results += [label | row for row in result_rows(members, methods, study.measures)]
-        compared = [measure for measure in study.measures if measure.listed or measure.better]
-        differences += [label | row for row in difference_rows(members, methods, compared, study.reference)]
+        differences += [label | row for row in difference_rows(members, methods, study.measures, study.reference)]
     return results, differences
 
 
@@ -54,7 +53,12 @@ def summary(records: Sequence[Record], study: type[Study], groups: bool = True) 
 
     **Raises:** as `write_tables`.
     """
-    results, differences = all_rows(records, study)
+    return _text(records, study, *all_rows(records, study), groups)
+
+
+def _text(
+    records: Sequence[Record], study: type[Study], results: list[Row], differences: list[Row], groups: bool = True
+) -> str:
     sections = [
         underlined(f"{study.title}: {count_of(len(records), 'scene')}"),
         f"{study.explanation}\n"

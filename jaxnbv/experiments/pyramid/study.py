@@ -127,18 +127,15 @@ class PyramidStudy(Study):
         Measure("first", "First hit", _hit(first_hit), percent=True),
         Measure("stable", "Stable hit", _hit(stable_hit), percent=True),
         Measure("pattern", "Pattern seen", _pattern, percent=True),
-        Measure(
-            "rank_correlation", "Rank correlation", _diagnostic("rank_correlation"), first=2, digits=2, paired=False
+        *(
+            Measure(name, title, _diagnostic(name), first=2, digits=2, paired=False)
+            for name, title in _DIAGNOSTICS.items()
         ),
-        Measure("roughness", "Roughness", _diagnostic("roughness"), first=2, digits=2, paired=False),
-        Measure("near_sensor", "Near-sensor share", _diagnostic("near_sensor"), first=2, digits=2, paired=False),
     )
     charts: ClassVar[Mapping[str, Chart]] = {
         "hits": Chart((tuple(map(Panel, ("first", "stable", "pattern"))),)),
         "angles": Chart((tuple(map(Panel, ("first", "stable", "pattern"))),), by_group=True),
-        "diagnostics": Chart(
-            (tuple(Panel(name, axis="view being chosen") for name in ("rank_correlation", "roughness")),)
-        ),
+        "diagnostics": Chart(((Panel("rank_correlation", axis=_CHOSEN), Panel("roughness", axis=_CHOSEN)),)),
     }
     seed: ClassVar[int] = 2
     quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 40}
