@@ -16,7 +16,7 @@ from cached import cached
 
 from jaxnbv import Coverage, DiscreteSearch, Grid, Planner, PointCloud
 from jaxnbv.datasets import Split
-from jaxnbv.networks import CATEGORIES, CompactPartSegmenter, part_mask, save_compact_segmenter
+from jaxnbv.networks import CATEGORIES, CompactPartSegmenter, part_mask, save_checkpoint
 from jaxnbv.networks.pretrained import TRAINED_SIDE
 from jaxnbv.presets import ModelName, imagination
 from jaxnbv.sensors import PART_SETTING
@@ -118,7 +118,7 @@ def main() -> None:
     report("true scans, test split", network, scanned(folder, Split.TEST, 300))
     report("imagined scans, validation split", network, imagined(folder, Split.VALIDATION, 13))
 
-    save_compact_segmenter(network, arguments.weights)
+    save_checkpoint(network, arguments.weights)
     print(f"{arguments.weights}   {arguments.weights.stat().st_size / 1e6:.2f} MB")
 
 

@@ -16,7 +16,7 @@ from cached import cached
 
 from jaxnbv import Camera, Coverage, DiscreteSearch, Grid, Planner, PointCloud
 from jaxnbv.datasets import PATTERNS, Framing, Split
-from jaxnbv.networks import InvariantClassifier, save_invariant
+from jaxnbv.networks import InvariantClassifier, save_checkpoint
 from jaxnbv.networks.pretrained import TRAINED_SIDE
 from jaxnbv.presets import ModelName, imagination
 from jaxnbv.tasks.classification import entropy
@@ -106,7 +106,7 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
 
     scans = thinned(informative(joined(folder, scanned, Split.TRAIN, 12_000)))
-    network = InvariantClassifier(len(PATTERNS), jax.random.key(0))
+    network = InvariantClassifier(len(PATTERNS), jax.random.key(0), classes=PATTERNS)
     network = train(network, scans.clouds, scans.labels, jax.random.key(1), 8000, folder=folder / "scanned")
     both = concatenated(scans, informative(joined(folder, imagined, Split.TRAIN, 100)))
     network = train(network, both.clouds, both.labels, jax.random.key(2), 4000, folder=folder / "imagined")
@@ -119,7 +119,7 @@ def main() -> None:
     report("imagined scans, validation split", network, joined(folder, imagined, Split.VALIDATION, 15))
 
     arguments.weights.parent.mkdir(parents=True, exist_ok=True)
-    save_invariant(network, PATTERNS, arguments.weights)
+    save_checkpoint(network, arguments.weights)
     print(f"{arguments.weights}   {arguments.weights.stat().st_size / 1e6:.2f} MB")
 
 

@@ -9,6 +9,7 @@ from jaxnbv.networks.checkpoints import load_checkpoint as load_checkpoint
 from jaxnbv.networks.checkpoints import load_part_segmenter as load_part_segmenter
 from jaxnbv.networks.checkpoints import load_safetensors as load_safetensors
 from jaxnbv.networks.checkpoints import load_torch_checkpoint as load_torch_checkpoint
+from jaxnbv.networks.checkpoints import save_checkpoint as save_checkpoint
 from jaxnbv.networks.checkpoints import save_safetensors as save_safetensors
 from jaxnbv.networks.classifier import CloudClassifier as CloudClassifier
 from jaxnbv.networks.compact_segmenter import CompactPartSegmenter as CompactPartSegmenter
@@ -16,11 +17,8 @@ from jaxnbv.networks.feature_propagation import FeaturePropagation as FeaturePro
 from jaxnbv.networks.invariant import InvariantClassifier as InvariantClassifier
 from jaxnbv.networks.part_segmentation import PointNet2PartSegmenter as PointNet2PartSegmenter
 from jaxnbv.networks.pointnet2 import PointNet2Classifier as PointNet2Classifier
-from jaxnbv.networks.pretrained import load_compact_segmenter as load_compact_segmenter
-from jaxnbv.networks.pretrained import load_invariant as load_invariant
+from jaxnbv.networks.pretrained import network_scale as network_scale
 from jaxnbv.networks.pretrained import part_segmenter as part_segmenter
 from jaxnbv.networks.pretrained import pyramid_classifier as pyramid_classifier
-from jaxnbv.networks.pretrained import save_compact_segmenter as save_compact_segmenter
-from jaxnbv.networks.pretrained import save_invariant as save_invariant
 from jaxnbv.networks.segmenter import CloudSegmenter as CloudSegmenter
 from jaxnbv.networks.torch_format import read_torch_tensors as read_torch_tensors

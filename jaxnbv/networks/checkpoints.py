@@ -1,8 +1,7 @@
-"""PointNet++ networks from published checkpoints, and back to safetensors; `state_dict` knows the tensors' names."""
+"""Networks from files and back: published PointNet++ checkpoints, safetensors, and the files of our own networks."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,60 +10,39 @@ from safetensors import SafetensorError
 
 from jaxnbv.checks import InputError, require
 from jaxnbv.files import write_whole
+from jaxnbv.networks.native import NativeNetwork, arrays_of, build_native, is_native
 from jaxnbv.networks.part_segmentation import PointNet2PartSegmenter
 from jaxnbv.networks.pointnet2 import PointNet2Classifier
-from jaxnbv.networks.state_dict import Tensors, build_classifier, build_part_segmenter, is_segmenter, tensors_of
+from jaxnbv.networks.state_dict import build_classifier, build_part_segmenter, is_segmenter, tensors_of
 from jaxnbv.networks.torch_format import read_torch_tensors
 
-_Network = TypeVar("_Network")
+Network = PointNet2Classifier | PointNet2PartSegmenter | NativeNetwork
+_Tensors = Mapping[str, np.ndarray]
 
-_READERS = "a checkpoint ends in .pth or .pt (PyTorch) or .safetensors"
 
+def load_checkpoint(path: str | Path) -> Network:
+    """The network in a PyTorch (.pth, .pt) or .safetensors file, recognised by the names of its tensors.
 
-def load_checkpoint(path: str | Path) -> PointNet2Classifier:
-    """The classifier in a PyTorch (.pth, .pt) or .safetensors file.
+    That is a classifier or a part segmenter: PointNet++ as published, or one of our own that `save_checkpoint` wrote.
+    Nothing in the file is run, and PyTorch is not needed. `CloudClassifier` and `CloudSegmenter` feed it clouds.
 
-    **Raises:** `ValueError` for another suffix, and as the two readers do.
+    **Raises:** `ValueError` for another suffix, a file that is missing or damaged, and for tensors that make none of
+    these networks.
     """
-    return _classifier(path, _read_tensors(path))
+    return _network(path, *_read(path))
 
 
-def load_part_segmenter(path: str | Path) -> PointNet2PartSegmenter:
-    """The network that segments parts in a PyTorch (.pth, .pt) or .safetensors file.
-
-    Nothing in the file is run, and PyTorch is not needed.
-
-    **Raises:** `ValueError` for another suffix, a file that is missing or damaged, and for tensors that do not make a
-    PointNet++ part segmenter.
-    """
-    return _part_segmenter(path, _read_tensors(path))
-
-
-def load_torch_checkpoint(path: str | Path) -> PointNet2Classifier:
-    """The classifier in a file made by `torch.save`; nothing in the file is run, and PyTorch is not needed.
-
-    **Raises:** `ValueError` as `read_torch_tensors` does, and for tensors that do not make a PointNet++ classifier.
-    """
-    return _classifier(path, read_torch_tensors(path))
-
-
-def load_safetensors(path: str | Path) -> PointNet2Classifier:
-    """The classifier in a safetensors file.
-
-    **Raises:** `ValueError` for a file that is missing or damaged, or whose tensors do not make a classifier.
-    """
-    return _classifier(path, _read_safetensors(path))
-
-
-def save_safetensors(
-    network: PointNet2Classifier | PointNet2PartSegmenter | Mapping[str, np.ndarray], path: str | Path
-) -> None:
+def save_checkpoint(network: Network | _Tensors, path: str | Path) -> None:
     """Write a network, or tensors in the published names, as a safetensors file; PyTorch can load either.
 
-    **Raises:** `ValueError` for a network whose sampling is not the published one, which the file could not tell, and
-    for a place that cannot be written.
+    **Raises:** `ValueError` for a PointNet++ whose sampling is not the published one, which the file could not tell,
+    and for a place that cannot be written.
     """
-    tensors = network if isinstance(network, Mapping) else tensors_of(network)
+    metadata: dict[str, str] = {}
+    if isinstance(network, NativeNetwork):
+        tensors, metadata = arrays_of(network)
+    else:
+        tensors = dict(network if isinstance(network, Mapping) else tensors_of(network))
     # bfloat16 is unknown to NumPy and so to most readers of safetensors; float32 holds it exactly.
     arrays = {
         name: np.array(tensor, np.float32 if tensor.dtype == jnp.bfloat16 else tensor.dtype, order="C")
@@ -72,48 +50,49 @@ def save_safetensors(
     }
     path = Path(path)
     try:
-        write_whole(path, lambda file: file.write(safetensors.numpy.save(arrays)))
+        write_whole(path, lambda file: file.write(safetensors.numpy.save(arrays, metadata)))
     except OSError as error:
         raise InputError(f"cannot write {path} ({error}): choose another place") from error
 
 
-def convert_checkpoint(source: str | Path, target: str | Path) -> PointNet2Classifier | PointNet2PartSegmenter:
+def convert_checkpoint(source: str | Path, target: str | Path) -> Network:
     """Rewrite the model's tensors of any checkpoint, unchanged, as a safetensors file; returns the network.
 
-    **Raises:** `ValueError` if the source is the checkpoint of neither kind of network, or the target does not end in
-    .safetensors.
+    **Raises:** `ValueError` as `load_checkpoint` does, or if the target does not end in .safetensors.
     """
     require(Path(target).suffix == ".safetensors", f"the target {target} must end in .safetensors")
-    tensors = _read_tensors(source)
-    network = _part_segmenter(source, tensors) if is_segmenter(tensors) else _classifier(source, tensors)
-    save_safetensors(tensors, target)
+    tensors, metadata = _read(source)
+    network = _network(source, tensors, metadata)
+    save_checkpoint(network if isinstance(network, NativeNetwork) else tensors, target)
     return network
 
 
-def _read_tensors(path: str | Path) -> dict[str, np.ndarray]:
+def _read(path: str | Path) -> tuple[_Tensors, Mapping[str, str]]:
+    """Tensors by name, and metadata."""
     suffix = Path(path).suffix
-    require(suffix in (".pth", ".pt", ".safetensors"), f"cannot tell what {path} is: {_READERS}")
-    return _read_safetensors(path) if suffix == ".safetensors" else read_torch_tensors(path)
-
-
-def _read_safetensors(path: str | Path) -> dict[str, np.ndarray]:
+    require(
+        suffix in (".pth", ".pt", ".safetensors"),
+        f"cannot tell what {path} is: a checkpoint ends in .pth or .pt (PyTorch) or .safetensors",
+    )
+    if suffix != ".safetensors":
+        return read_torch_tensors(path), {}
     require(Path(path).is_file(), f"there is no file {path}: give the path of a safetensors file")
     try:
-        return safetensors.numpy.load_file(path)
+        with safetensors.safe_open(path, framework="numpy") as file:
+            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is damaged or no safetensors file ({error}): fetch or write it again") from error
 
 
-def _classifier(path: str | Path, tensors: Tensors) -> PointNet2Classifier:
-    return _build(build_classifier, tensors, f"{path} does not hold a PointNet++ classifier")
-
-
-def _part_segmenter(path: str | Path, tensors: Tensors) -> PointNet2PartSegmenter:
-    return _build(build_part_segmenter, tensors, f"{path} does not hold a PointNet++ part segmenter")
-
-
-def _build(builder: Callable[[Tensors], _Network], tensors: Tensors, problem: str) -> _Network:
+def _network(path: str | Path, tensors: _Tensors, metadata: Mapping[str, str]) -> Network:
     try:
-        return builder(tensors)
+        if is_native(tensors):
+            return build_native(tensors, metadata)
+        return build_part_segmenter(tensors) if is_segmenter(tensors) else build_classifier(tensors)
     except InputError as error:
-        raise InputError(f"{problem}: {error}") from error
+        raise InputError(f"{path} does not hold a network that is known here: {error}") from error
+
+
+# Their former names, for one release.
+load_torch_checkpoint = load_safetensors = load_part_segmenter = load_checkpoint
+save_safetensors = save_checkpoint

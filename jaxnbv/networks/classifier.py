@@ -7,6 +7,8 @@ from jaxtyping import Array, Float
 
 from jaxnbv.checks import require
 from jaxnbv.cloud import PointCloud, farthest_point_subsample
+from jaxnbv.networks.compact_segmenter import CompactPartSegmenter
+from jaxnbv.networks.part_segmentation import PointNet2PartSegmenter
 
 
 class CloudClassifier(eqx.Module):
@@ -15,7 +17,9 @@ class CloudClassifier(eqx.Module):
     - `network`: called as `network(points, normals, mask)`.
     - `num_points`: what it is fed, by farthest point sampling; a smaller cloud is fed as it is, masked.
     - `scale`: network units per scene unit.
-    - `classes`: their names, where known.
+    - `classes`: their names, where known; by default the network's own.
+
+    **Raises:** `ValueError` if `num_points` or `scale` is not positive, or for a network that segments parts.
     """
 
     network: Callable[..., Float[Array, " classes"]]
@@ -23,7 +27,13 @@ class CloudClassifier(eqx.Module):
     scale: float = eqx.field(static=True, default=1.0)
     classes: tuple[str, ...] | None = eqx.field(static=True, default=None)
 
+    def __post_init__(self):
+        if self.classes is None:
+            self.classes = getattr(self.network, "classes", None)
+
     def __check_init__(self):
+        parts = isinstance(self.network, PointNet2PartSegmenter | CompactPartSegmenter)
+        require(not parts, "the network segments parts; a CloudSegmenter feeds it clouds")
         require(self.num_points >= 1, f"num_points is {self.num_points}; the network needs at least one")
         require(self.scale > 0, f"the scale is {self.scale}; it must be positive")
 

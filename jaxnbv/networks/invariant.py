@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from jaxnbv.checks import require
 from jaxnbv.farthest import farthest_point_indices
 from jaxnbv.networks.grouping import ball_query
 from jaxnbv.networks.set_abstraction import product
@@ -22,21 +23,33 @@ class InvariantClassifier(eqx.Module):
     defined everywhere. Two levels of grouping, at the scale of an edge and at that of a pattern, and a maximum over all
     groups; about 75,000 parameters.
 
+    - `num_classes`, and their names `classes`, where known.
     - `radii`: of the two levels, in the units of the points.
     - `temperature`: divides the logits; above 1 it makes an over-confident network more careful (Guo et al. 2017).
+
+    **Raises:** `ValueError` if the names are not as many as the classes.
     """
 
     edge: "_Level"
     pattern: "_Level"
     head: tuple[eqx.nn.Linear, ...]
     temperature: Float[Array, ""]
+    classes: tuple[str, ...] | None = eqx.field(static=True)
 
-    def __init__(self, num_classes: int, key: PRNGKeyArray, radii: tuple[float, float] = (0.25, 0.8)):
+    def __init__(
+        self,
+        num_classes: int,
+        key: PRNGKeyArray,
+        radii: tuple[float, float] = (0.25, 0.8),
+        classes: tuple[str, ...] | None = None,
+    ):
+        named = num_classes if classes is None else len(classes)
+        require(named == num_classes, f"{classes} names {named} classes; the network has {num_classes}")
         edge_key, pattern_key, first_key, last_key = jax.random.split(key, 4)
         self.edge = _Level(0, 32, 64, radii[0], 256, 24, edge_key)
         self.pattern = _Level(64, 112, _POOLED, radii[1], 64, 48, pattern_key)
         self.head = (eqx.nn.Linear(_POOLED, _POOLED, key=first_key), eqx.nn.Linear(_POOLED, num_classes, key=last_key))
-        self.temperature = jnp.asarray(1.0)
+        self.temperature, self.classes = jnp.asarray(1.0), classes
 
     def __call__(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None = None

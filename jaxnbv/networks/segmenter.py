@@ -10,6 +10,8 @@ from jaxtyping import Array, Float, Int
 from jaxnbv.checks import AnyArray, is_traced, require
 from jaxnbv.cloud import PointCloud, farthest_point_subsample
 from jaxnbv.datasets.categories import CATEGORIES, category_index, part_mask
+from jaxnbv.networks.invariant import InvariantClassifier
+from jaxnbv.networks.pointnet2 import PointNet2Classifier
 
 
 class CloudSegmenter(eqx.Module):
@@ -22,6 +24,9 @@ class CloudSegmenter(eqx.Module):
     - `category`: what the object is, by its name in `shapenet.CATEGORIES` or its index there.
     - `num_points`: what the network is fed, by farthest point sampling; a smaller cloud is fed as it is, masked.
     - `scale`: network units per scene unit.
+
+    **Raises:** `ValueError` for an unknown category, if `num_points` or `scale` is not positive, or for a network that
+    classifies.
     """
 
     network: Callable[..., Float[Array, "n parts"]]
@@ -41,6 +46,8 @@ class CloudSegmenter(eqx.Module):
             is_traced(index) or 0 <= int(index) < len(CATEGORIES),
             f"the category is {index}; choose 0 to {len(CATEGORIES) - 1}, or a name such as 'chair'",
         )
+        whole = isinstance(network, PointNet2Classifier | InvariantClassifier)
+        require(not whole, "the network classifies whole clouds; a CloudClassifier feeds it clouds")
         require(num_points >= 1, f"num_points is {num_points}; the network needs at least one")
         require(is_traced(scale) or float(scale) > 0, f"the scale is {scale}; it must be positive")
         self.network, self.num_points = network, num_points

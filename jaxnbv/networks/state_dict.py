@@ -42,7 +42,7 @@ def build_classifier(tensors: Tensors) -> PointNet2Classifier:
     **Raises:** `ValueError` that names the tensor which is missing, not of its shape, not finite or without a place.
     """
     state = _State(tensors)
-    state.check_parts(_CLASSIFIER, "load_part_segmenter reads networks that segment parts")
+    state.check_parts(_CLASSIFIER)
     levels, widths = _levels(state, SINGLE_SCALE, MULTI_SCALE, {3: "points", 6: "with normals"})
     whole = state.pooled("sa3.mlp_convs", "sa3.mlp_bns", 3 + widths[-1])
     hidden = []
@@ -61,7 +61,7 @@ def build_part_segmenter(tensors: Tensors) -> PointNet2PartSegmenter:
     **Raises:** `ValueError` as `build_classifier` does.
     """
     state = _State(tensors)
-    state.check_parts(_SEGMENTER, "load_checkpoint reads classifiers")
+    state.check_parts(_SEGMENTER)
     known = {6: "points", 9: "with normals"}
     levels, widths = _levels(state, PARTS_SINGLE_SCALE, PARTS_MULTI_SCALE, known)
     whole = state.pooled("sa3.mlp_convs", "sa3.mlp_bns", 3 + widths[-1])
@@ -138,9 +138,9 @@ class _State:
         self.tensors = {name: array for name, array in tensors.items() if not name.endswith("num_batches_tracked")}
         self.left = set(self.tensors)
 
-    def check_parts(self, parts: set[str], remedy: str) -> None:
+    def check_parts(self, parts: set[str]) -> None:
         foreign = {name.split(".")[0] for name in self.tensors} - parts
-        require(not foreign, f"{sorted(foreign)} belong to another kind of network; {remedy}")
+        require(not foreign, f"{sorted(foreign)} belong to another kind of network")
 
     def check_all_taken(self) -> None:
         require(not self.left, f"{len(self.left)} tensors have no place in it, such as {sorted(self.left)[:1]}")

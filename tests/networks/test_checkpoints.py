@@ -1,4 +1,4 @@
-"""Classifiers from checkpoints: read, refused, converted."""
+"""Networks from checkpoints: read, refused, converted."""
 
 import struct
 
@@ -8,14 +8,17 @@ import pytest
 import safetensors.numpy
 from torch_files import Op, call, checkpoint, named, narrow_network, state_of
 
+from jaxnbv import networks
 from jaxnbv.checks import InputError
 from jaxnbv.networks import (
+    CloudClassifier,
+    CloudSegmenter,
+    CompactPartSegmenter,
+    InvariantClassifier,
     convert_checkpoint,
     load_checkpoint,
-    load_safetensors,
-    load_torch_checkpoint,
     read_torch_tensors,
-    save_safetensors,
+    save_checkpoint,
 )
 from jaxnbv.networks.pointnet2 import MULTI_SCALE, SINGLE_SCALE
 
@@ -36,8 +39,8 @@ def assert_same(found, expected, rtol=1e-6):
 def test_a_network_survives_safetensors_and_the_archive(tmp_path, sampling, inputs):
     network = narrow_network(sampling, inputs)
     arrays = state_of(network, tmp_path)
-    assert_same(load_safetensors(tmp_path / "state.safetensors"), network)
-    read = load_torch_checkpoint(checkpoint(tmp_path / "net.pth", arrays))
+    assert_same(load_checkpoint(tmp_path / "state.safetensors"), network)
+    read = load_checkpoint(checkpoint(tmp_path / "net.pth", arrays))
     assert_same(read, network)
     assert read.uses_normals == (inputs == 6)
     assert read.num_classes == 4
@@ -51,14 +54,14 @@ def test_training_checkpoints_with_numpy_numbers_and_the_prefix_of_several_devic
     accuracy = call(named(core, "scalar"), kind, text)
     file = checkpoint(tmp_path / "net.pth", {f"module.{k}": v for k, v in state.items()}, class_acc=accuracy)
     assert set(read_torch_tensors(file)) == set(state)
-    assert_same(load_torch_checkpoint(file), load_safetensors(tmp_path / "state.safetensors"))
+    assert_same(load_checkpoint(file), load_checkpoint(tmp_path / "state.safetensors"))
 
 
 def test_tensors_that_make_no_classifier_are_named(tmp_path, state):
     def problem(changes, without=()):
         arrays = {name: array for name, array in {**state, **changes}.items() if name not in without}
         with pytest.raises(InputError, match=r"net\.pth does not hold") as error:
-            load_torch_checkpoint(checkpoint(tmp_path / "net.pth", arrays))
+            load_checkpoint(checkpoint(tmp_path / "net.pth", arrays))
         return str(error.value)
 
     ones = np.ones((4, 9), np.float32)
@@ -69,7 +72,8 @@ def test_tensors_that_make_no_classifier_are_named(tmp_path, state):
     assert "sa3.mlp_bns.0.bias has shape (4, 9)" in problem({"sa3.mlp_bns.0.bias": ones})
     assert "negative" in problem({"bn1.running_var": -state["bn1.running_var"]})
     assert "not finite" in problem({"bn1.bias": np.full_like(state["bn1.bias"], np.nan)})
-    assert "['fp3'] belong to another kind of network" in problem({"fp3.mlp_convs.0.weight": ones})
+    both = problem({"fp3.mlp_convs.0.weight": ones})
+    assert "['bn2', 'fc1', 'fc2', 'fc3'] belong to another kind of network" in both
     assert "no place in it, such as ['fc1.extra']" in problem({"fc1.extra": ones})
 
 
@@ -102,11 +106,11 @@ def test_safetensors_files_that_are_damaged_or_missing(tmp_path, state):
     for damaged in (b"", b"abc", whole[:50], whole[:-3]):
         file.write_bytes(damaged)
         with pytest.raises(InputError, match=r"state\.safetensors is damaged"):
-            load_safetensors(file)
+            load_checkpoint(file)
     with pytest.raises(InputError, match="no file"):
-        load_safetensors(tmp_path / "nowhere.safetensors")
+        load_checkpoint(tmp_path / "nowhere.safetensors")
     with pytest.raises(InputError, match="cannot write"):
-        save_safetensors(state, tmp_path / "nowhere" / "net.safetensors")
+        save_checkpoint(state, tmp_path / "nowhere" / "net.safetensors")
     with pytest.raises(InputError, match=r"\.pth or \.pt"):
         load_checkpoint(tmp_path / "net.onnx")
 
@@ -114,4 +118,67 @@ def test_safetensors_files_that_are_damaged_or_missing(tmp_path, state):
 def test_a_network_with_other_radii_is_not_saved(tmp_path):
     other = tuple(level._replace(radii=(0.3,)) for level in SINGLE_SCALE)
     with pytest.raises(InputError, match="published"):
-        save_safetensors(narrow_network(other), tmp_path / "net.safetensors")
+        save_checkpoint(narrow_network(other), tmp_path / "net.safetensors")
+
+
+@pytest.fixture(
+    params=[lambda key: InvariantClassifier(3, key, classes=("cup", "wide plate", "bowl")), CompactPartSegmenter]
+)
+def own(request):
+    return request.param(jax.random.key(4))
+
+
+def test_networks_of_our_own_come_back(own, tmp_path):
+    save_checkpoint(own, tmp_path / "net.safetensors")
+    found = load_checkpoint(tmp_path / "net.safetensors")
+    assert_same(found, own, rtol=0)
+    assert_same(convert_checkpoint(tmp_path / "net.safetensors", tmp_path / "copy.safetensors"), own, rtol=0)
+    assert_same(load_checkpoint(tmp_path / "copy.safetensors"), own, rtol=0)
+    if isinstance(own, InvariantClassifier):
+        assert CloudClassifier(found).classes == ("cup", "wide plate", "bowl")
+
+
+def test_a_network_that_does_not_name_its_classes_comes_back(tmp_path):
+    network = InvariantClassifier(2, jax.random.key(0))
+    save_checkpoint(network, tmp_path / "net.safetensors")
+    found = load_checkpoint(tmp_path / "net.safetensors")
+    assert_same(found, network, rtol=0)
+    assert CloudClassifier(found).classes is None
+
+
+def test_files_that_hold_no_whole_network_of_our_own_are_refused(own, tmp_path):
+    file = tmp_path / "net.safetensors"
+    save_checkpoint(own, file)
+    whole = safetensors.numpy.load_file(file)
+    name = next(name for name in whole if whole[name].ndim == 2)
+
+    def problem(changes, without=()):
+        arrays = {key: array for key, array in {**whole, **changes}.items() if key not in without}
+        save_checkpoint(arrays, file)
+        with pytest.raises(InputError, match=r"net\.safetensors does not hold") as error:
+            load_checkpoint(file)
+        return str(error.value)
+
+    assert f"{name} has shape" in problem({name: whole[name][:, :-1]})
+    assert f"{name} is missing" in problem({}, [name])
+    assert "more has no place" in problem({"more": np.zeros(3, np.float32)})
+    assert f"{name} has entries that are not finite" in problem({name: np.full_like(whole[name], np.inf)})
+    if isinstance(own, InvariantClassifier):
+        assert "head.1.bias" in problem({}, ["head.1.bias"])
+        file.write_bytes(safetensors.numpy.save(whole, {"classes": "a,b"}))
+        with pytest.raises(InputError, match="names 2 classes; the network has 3"):
+            load_checkpoint(file)
+
+
+def test_a_network_of_the_other_kind_is_refused_where_it_would_be_fed():
+    with pytest.raises(InputError, match="a CloudSegmenter feeds it"):
+        CloudClassifier(CompactPartSegmenter(jax.random.key(0)))
+    with pytest.raises(InputError, match="a CloudClassifier feeds it"):
+        CloudSegmenter(InvariantClassifier(3, jax.random.key(0)), "chair")
+
+
+def test_former_names():
+    assert (
+        networks.load_torch_checkpoint is networks.load_safetensors is networks.load_part_segmenter is load_checkpoint
+    )
+    assert networks.save_safetensors is save_checkpoint

@@ -7,16 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import safetensors.numpy
 
 from jaxnbv.checks import InputError
 from jaxnbv.datasets import Split
 from jaxnbv.networks import (
     CATEGORIES,
     CompactPartSegmenter,
-    load_compact_segmenter,
     part_segmenter,
-    save_compact_segmenter,
 )
 from jaxnbv.training.part_clouds import LabelledPartClouds, scanned_part_clouds
 
@@ -110,46 +107,6 @@ def test_gradients_are_finite_and_those_of_finite_differences(network, x64):
     for mask in (np.ones(COUNT, bool), np.arange(COUNT) < 1):
         for slope in value_and_gradient(double, points, normals, mask, weights)[1]:
             assert np.isfinite(slope).all()
-
-
-def test_a_network_is_read_as_it_was_written(network, tmp_path):
-    save_compact_segmenter(network, tmp_path / "a.safetensors")
-    read = load_compact_segmenter(tmp_path / "a.safetensors")
-    assert jax.tree.structure(read) == jax.tree.structure(network)
-    for found, expected in zip(jax.tree.leaves(read), jax.tree.leaves(network), strict=True):
-        np.testing.assert_array_equal(found, expected)
-    assert any(
-        (a != b).any()
-        for a, b in zip(jax.tree.leaves(network), jax.tree.leaves(CompactPartSegmenter(jax.random.key(1))), strict=True)
-    )
-
-
-def test_bad_files_are_refused(network, tmp_path):
-    path = tmp_path / "a.safetensors"
-    with pytest.raises(InputError, match="no file"):
-        load_compact_segmenter(path)
-    save_compact_segmenter(network, path)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match="damaged"):
-        load_compact_segmenter(path)
-    tensors = safetensors.numpy.load(whole)
-    name = next(iter(tensors))
-    for changed in (
-        {key: value for key, value in tensors.items() if key != name},
-        tensors | {name: tensors[name][:1]},
-        tensors | {"more": np.zeros(3, np.float32)},
-    ):
-        safetensors.numpy.save_file(changed, path)
-        with pytest.raises(InputError, match="another network"):
-            load_compact_segmenter(path)
-    safetensors.numpy.save_file(tensors | {name: np.full_like(tensors[name], np.inf)}, path)
-    with pytest.raises(InputError, match="not finite"):
-        load_compact_segmenter(path)
-    pyramid = resources.files("jaxnbv.networks") / "weights" / "pyramid.safetensors"
-    path.write_bytes(pyramid.read_bytes())
-    with pytest.raises(InputError, match="another network"):
-        load_compact_segmenter(path)
 
 
 @eqx.filter_jit

@@ -5,12 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import safetensors.numpy
 from scipy.spatial.transform import Rotation
 
 from jaxnbv.checks import InputError
 from jaxnbv.cloud import PointCloud, farthest_point_subsample
-from jaxnbv.networks import CloudClassifier, InvariantClassifier, load_invariant, pyramid_classifier, save_invariant
+from jaxnbv.networks import CloudClassifier, InvariantClassifier, pyramid_classifier
 
 RNG = np.random.default_rng(0)
 
@@ -197,47 +196,6 @@ def test_a_cloud_classifier_is_sampling_and_the_network_in_its_units(x64):
 def test_a_cloud_classifier_without_points_or_scale_is_refused(arguments, message):
     with pytest.raises(InputError, match=message):
         CloudClassifier(network(), **arguments)
-
-
-def test_a_saved_network_comes_back(tmp_path):
-    net, cloud = network(3, seed=4), [a.astype(np.float32) for a in oriented(80)]
-    save_invariant(net, ("cup", "bowl", "wide plate"), tmp_path / "net.safetensors")
-    loaded, classes = load_invariant(tmp_path / "net.safetensors")
-    assert classes == ("cup", "bowl", "wide plate")
-    assert jax.tree.structure(loaded) == jax.tree.structure(net)
-    for a, b in zip(jax.tree.leaves(loaded), jax.tree.leaves(net), strict=True):
-        np.testing.assert_array_equal(a, b)
-    np.testing.assert_array_equal(answer(loaded, *cloud), answer(net, *cloud))
-
-
-def test_files_that_hold_no_such_network_are_refused(tmp_path):
-    path = tmp_path / "net.safetensors"
-    with pytest.raises(InputError, match="there is no file"):
-        load_invariant(path)
-    save_invariant(network(3), ("a", "b", "c"), path)
-    whole, tensors = path.read_bytes(), safetensors.numpy.load_file(path)
-    for damaged in (whole[: len(whole) // 2], whole[:5], b"", b"not a network at all", b"\xff" * 100):
-        path.write_bytes(damaged)
-        with pytest.raises(InputError, match="damaged"):
-            load_invariant(path)
-    path.write_bytes(safetensors.numpy.save(tensors))
-    with pytest.raises(InputError, match="damaged or holds another network"):
-        load_invariant(path)
-    name = next(iter(tensors))
-    for other in (
-        {**tensors, name: tensors[name][..., :-1].copy()},
-        {**tensors, "more": np.zeros(3, np.float32)},
-        {key: array for key, array in tensors.items() if key != name},
-    ):
-        path.write_bytes(safetensors.numpy.save(other, {"classes": "a,b,c"}))
-        with pytest.raises(InputError, match="holds another network"):
-            load_invariant(path)
-    path.write_bytes(safetensors.numpy.save(tensors, {"classes": "a,b"}))
-    with pytest.raises(InputError, match="holds another network"):
-        load_invariant(path)
-    path.write_bytes(safetensors.numpy.save({**tensors, name: tensors[name] * np.nan}, {"classes": "a,b,c"}))
-    with pytest.raises(InputError, match="finite"):
-        load_invariant(path)
 
 
 def test_the_longest_side_of_the_shipped_classifiers_objects_must_be_positive():

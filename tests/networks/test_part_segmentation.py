@@ -19,9 +19,8 @@ from jaxnbv.networks import (
     category_index,
     convert_checkpoint,
     load_checkpoint,
-    load_part_segmenter,
     part_mask,
-    save_safetensors,
+    save_checkpoint,
 )
 from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
 
@@ -152,7 +151,7 @@ def plain_network(state, kind, points, normals, category, categories=16):
 
 
 def test_log_probabilities_are_those_of_the_reference(shared):
-    network = load_part_segmenter(shared / "reference" / "pointnet2_partseg_msg.pth")
+    network = load_checkpoint(shared / "reference" / "pointnet2_partseg_msg.pth")
     with np.load(shared / "reference" / "pointnet2_partseg_msg_io.npz") as saved:
         points, categories, expected = (saved[name] for name in ("points", "category", "log_probs"))
     assert network.uses_normals
@@ -167,8 +166,8 @@ def test_log_probabilities_are_those_of_the_reference(shared):
 def test_against_a_plain_network(x64, tmp_path, kind, inputs, n):
     """Both layouts, with normals and without, and fewer points than centres, which are then repeated."""
     state = random_state(kind, inputs)
-    save_safetensors(state, tmp_path / "net.safetensors")
-    network = load_part_segmenter(tmp_path / "net.safetensors")
+    save_checkpoint(state, tmp_path / "net.safetensors")
+    network = load_checkpoint(tmp_path / "net.safetensors")
     assert network.uses_normals == (inputs == 9)
     points, normals = rows(n)
     answers = []
@@ -219,11 +218,11 @@ def test_calls_that_cannot_be_answered_are_refused():
 
 @pytest.mark.parametrize(("kind", "inputs"), [("ssg", 9), ("msg", 6)])
 def test_a_network_survives_safetensors(tmp_path, kind, inputs):
-    save_safetensors(random_state(kind, inputs, categories=3, parts=8), tmp_path / "published.safetensors")
-    network = load_part_segmenter(tmp_path / "published.safetensors")
+    save_checkpoint(random_state(kind, inputs, categories=3, parts=8), tmp_path / "published.safetensors")
+    network = load_checkpoint(tmp_path / "published.safetensors")
     assert (network.num_categories, network.num_parts) == (3, 8)
-    save_safetensors(network, tmp_path / "ours.safetensors")
-    again = load_part_segmenter(tmp_path / "ours.safetensors")
+    save_checkpoint(network, tmp_path / "ours.safetensors")
+    again = load_checkpoint(tmp_path / "ours.safetensors")
     assert jax.tree.structure(again) == jax.tree.structure(network)
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(network), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
@@ -236,17 +235,17 @@ def test_a_network_survives_safetensors(tmp_path, kind, inputs):
 
 def test_a_network_with_other_radii_is_not_saved(tmp_path):
     with pytest.raises(InputError, match="published"):
-        save_safetensors(small_network(), tmp_path / "net.safetensors")
+        save_checkpoint(small_network(), tmp_path / "net.safetensors")
 
 
 def test_tensors_that_make_no_segmenter_are_named(tmp_path):
     state = random_state("msg", 9)
 
-    def problem(changes, without=(), load=load_part_segmenter):
+    def problem(changes, without=()):
         arrays = {name: array for name, array in {**state, **changes}.items() if name not in without}
-        save_safetensors(arrays, tmp_path / "net.safetensors")
+        save_checkpoint(arrays, tmp_path / "net.safetensors")
         with pytest.raises(InputError, match=r"net\.safetensors does not hold") as error:
-            load(tmp_path / "net.safetensors")
+            load_checkpoint(tmp_path / "net.safetensors")
         return str(error.value)
 
     ones = np.ones((4, 5, 1))
@@ -256,12 +255,11 @@ def test_tensors_that_make_no_segmenter_are_named(tmp_path):
     assert "takes 5 inputs; expected 6 (points) or 9" in problem({"sa1.conv_blocks.0.0.weight": ones})
     assert "conv2.bias has entries that are not finite" in problem({"conv2.bias": np.full(50, np.inf)})
     assert "no place in it, such as ['conv1.extra']" in problem({"conv1.extra": ones})
-    assert "load_checkpoint reads classifiers" in problem({"fc3.weight": ones})
-    assert "load_part_segmenter reads" in problem({}, load=load_checkpoint)
+    assert "['fc3'] belong to another kind of network" in problem({"fc3.weight": ones})
 
 
 def test_conversion_tells_the_kinds_of_network_apart(tmp_path):
-    save_safetensors(random_state("msg", 9), tmp_path / "net.safetensors")
+    save_checkpoint(random_state("msg", 9), tmp_path / "net.safetensors")
     network = convert_checkpoint(tmp_path / "net.safetensors", tmp_path / "copy.safetensors")
     assert isinstance(network, PointNet2PartSegmenter)
     assert (tmp_path / "copy.safetensors").read_bytes() == (tmp_path / "net.safetensors").read_bytes()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxnbv.checks import InputError
-from jaxnbv.networks import PointNet2Classifier, load_checkpoint, load_safetensors, save_safetensors
+from jaxnbv.networks import PointNet2Classifier, load_checkpoint, save_checkpoint
 from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
 
 RNG = np.random.default_rng(0)
@@ -139,8 +139,8 @@ def test_against_a_plain_network(x64, tmp_path, kind, inputs, n, repeated):
     maximum over a group is the same.
     """
     state = random_state(kind, inputs)
-    save_safetensors(state, tmp_path / "net.safetensors")
-    network = load_safetensors(tmp_path / "net.safetensors")
+    save_checkpoint(state, tmp_path / "net.safetensors")
+    network = load_checkpoint(tmp_path / "net.safetensors")
     rows = np.concatenate([np.arange(n - repeated), RNG.integers(0, n - repeated, repeated)])
     points, normals = (array[rows] for array in cloud(n))
     expected = plain_network(state, kind, np.asarray(points), np.asarray(normals) if inputs == 6 else None)

@@ -28,7 +28,7 @@ from jaxnbv.networks import (
     CloudClassifier,
     CloudSegmenter,
     load_checkpoint,
-    load_part_segmenter,
+    network_scale,
     part_segmenter,
     pyramid_classifier,
 )
@@ -36,9 +36,6 @@ from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, scan
 from jaxnbv.sensors import HEAT_SETTING, PART_SETTING, USUAL_SETTING, Setting
 from jaxnbv.tasks import Classifier, ColdestPoint, Coverage, CrossEntropy, MixedEntropy, NegativeEntropy, SoftPartCount
 from jaxnbv.tasks.diffusion import HeatProblem
-
-# Networks saw objects scaled into the unit sphere or its box; in the scene half the longest side is 1.25.
-_NETWORK_SCALE = 1 / 1.25
 
 
 class Given(NamedTuple):
@@ -100,7 +97,8 @@ class ClassTask(CommandTask):
 
     def score(self, given: Given) -> Score:
         assert given.network is not None
-        return self.of(CloudClassifier(load_checkpoint(given.network), scale=_NETWORK_SCALE))
+        network = load_checkpoint(given.network)
+        return self.of(CloudClassifier(network, scale=network_scale(network)))
 
     def demo(self, scene: int, framing: Framing, seed: int) -> Shown:
         """A pyramid. The grid is that of the surfaces that the classifier was trained on."""
@@ -120,7 +118,8 @@ class PartTask(CommandTask):
         assert given.category is not None
         if given.network is None:
             return self._score(part_segmenter(given.category))
-        return self._score(CloudSegmenter(load_part_segmenter(given.network), given.category, scale=_NETWORK_SCALE))
+        network = load_checkpoint(given.network)
+        return self._score(CloudSegmenter(network, given.category, scale=network_scale(network)))
 
     def demo(self, scene: int, framing: Framing, seed: int) -> Shown:
         """A procedural object."""

@@ -1,0 +1,62 @@
+"""The arrays of our own networks by name, for safetensors files, and the networks that they make.
+
+Names are attribute paths such as `pattern.pair.weight`; widths are those of the class. A file that names its classes
+does so in its metadata, separated by commas.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnbv.checks import require
+from jaxnbv.networks.compact_segmenter import CompactPartSegmenter
+from jaxnbv.networks.invariant import InvariantClassifier
+
+NativeNetwork = InvariantClassifier | CompactPartSegmenter
+
+
+def arrays_of(network: NativeNetwork) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """The network's arrays by name, and the file's metadata."""
+    classes = getattr(network, "classes", None)
+    return {name: np.asarray(leaf) for name, leaf in _named(network)}, {"classes": ",".join(classes)} if classes else {}
+
+
+def is_native(arrays: Mapping[str, np.ndarray]) -> bool:
+    """Whether the names are those of one of our own networks."""
+    return any(name.startswith(("edge.", "fine.")) for name in arrays)
+
+
+def build_native(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> NativeNetwork:
+    """The network that the arrays make.
+
+    **Raises:** `ValueError` for shapes that are not the network's, another number of names, or entries not finite.
+    """
+    if any(name.startswith("fine.") for name in arrays):
+        return _filled(eqx.filter_eval_shape(CompactPartSegmenter, jax.random.key(0)), arrays)
+    last = arrays.get("head.1.bias", np.zeros(0))
+    require(last.ndim == 1 and last.size > 0, "the array head.1.bias, of one entry a class, is missing")
+    classes = tuple(metadata["classes"].split(",")) if "classes" in metadata else None
+    return _filled(eqx.filter_eval_shape(InvariantClassifier, last.size, jax.random.key(0), classes=classes), arrays)
+
+
+def _filled(blank: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """The network of the shapes of `blank`, with these arrays."""
+    expected = {name: leaf.shape for name, leaf in _named(blank)}
+    found = {name: array.shape for name, array in arrays.items()}
+    for name in sorted(expected.keys() | found.keys()):
+        require(name in found, f"the array {name} is missing")
+        require(name in expected, f"the array {name} has no place in it")
+        same = found[name] == expected[name]
+        require(same, f"the array {name} has shape {found[name]}; expected {expected[name]}")
+        require(bool(np.isfinite(arrays[name]).all()), f"the array {name} has entries that are not finite")
+    leaves = [jnp.asarray(arrays[name], jnp.result_type(float)) for name in expected]
+    return jax.tree.unflatten(jax.tree.structure(blank), leaves)
+
+
+def _named(network: Any) -> list[tuple[str, Any]]:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(network)
+    return [(jax.tree_util.keystr(path, simple=True, separator="."), leaf) for path, leaf in leaves]
