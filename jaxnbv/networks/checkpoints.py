@@ -18,6 +18,7 @@ from jaxnbv.networks.torch_format import read_torch_tensors
 
 Network = PointNet2Classifier | PointNet2PartSegmenter | NativeNetwork
 _Tensors = Mapping[str, np.ndarray]
+_SAFETENSORS_TYPES = {"F64", "F32", "F16", "I64", "I32", "I16", "I8", "U64", "U32", "U16", "U8", "BOOL"}
 
 
 def load_checkpoint(path: str | Path) -> Network:
@@ -79,7 +80,13 @@ def _read(path: str | Path) -> tuple[_Tensors, Mapping[str, str]]:
     require(Path(path).is_file(), f"there is no file {path}: give the path of a safetensors file")
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
-            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+            types = {name: file.get_slice(name).get_dtype() for name in file.keys()}  # noqa: SIM118
+            for name, kind in types.items():
+                known = kind in _SAFETENSORS_TYPES
+                require(known, f"{path}: the array {name} is of type {kind}, which NumPy has not; write it as float32")
+            return {name: file.get_tensor(name) for name in types}, file.metadata() or {}
+    except InputError:
+        raise
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is damaged or no safetensors file ({error}): fetch or write it again") from error
 

@@ -5,20 +5,19 @@ dictionaries, numbers, strings and tensors; every other name in it is refused. T
 written since PyTorch 1.6 (`data.pkl`, `data/0`, `data/1`, ...), and the older stream of pickles followed by the arrays.
 """
 
-import io
 import math
-import pickle
+import mmap
 import struct
 import zipfile
-from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from jaxnbv.checks import InputError, require
+from jaxnbv.networks.pickled import Function, Mutable, dictionary, unpickle
 
 _STORAGES = {
     "DoubleStorage": np.dtype("f8"),
@@ -34,6 +33,9 @@ _STORAGES = {
 }
 _STREAM_MAGIC = 0x1950A86A20F9469CFC6C
 _STREAM_PROTOCOL = 1001
+_BYTE_ORDERS = ("<", ">", "=", "|")
+# NumPy's own limit.
+_MOST_DIMENSIONS = 64
 _STATE_NAMES = ("model_state_dict", "state_dict")
 
 
@@ -50,7 +52,8 @@ def read_torch_tensors(path: str | Path) -> dict[str, np.ndarray]:
     require(path.is_file(), f"there is no file {path}: give the path of a PyTorch checkpoint")
     try:
         with path.open("rb") as file:
-            content = _read_archive(file) if file.read(2) == b"PK" else _read_stream(file)
+            archive = file.read(2) == b"PK"
+            content = _read_archive(file, path.stat().st_size) if archive else _read_stream(file)
         tensors = _state_dictionary(content)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
@@ -74,44 +77,61 @@ def _state_dictionary(content: Any) -> dict[str, np.ndarray]:
     return {name.removeprefix(shared): tensor for name, tensor in content.items()}
 
 
-def _read_archive(file: io.BufferedIOBase) -> Any:
+def _read_archive(file: IO[bytes], length: int) -> Any:
     """The zip archive: one folder that holds data.pkl, the arrays as data/<key>, and the byte order."""
     file.seek(0)
     with zipfile.ZipFile(file) as archive:
         names = set(archive.namelist())
+        left = length
+
+        def read(name: str) -> bytes:
+            """A member as it lies in the file, so that all together are no longer than it."""
+            nonlocal left
+            require(name in names, f"the storage {name} is missing: fetch or save the file again")
+            member = archive.getinfo(name)
+            left -= member.file_size
+            require(
+                member.compress_type == zipfile.ZIP_STORED and left >= 0,
+                f"the member {name} is compressed or longer than the file, which torch.save never makes",
+            )
+            return archive.read(member)
+
         roots = [name.removesuffix("data.pkl") for name in names if name.endswith("/data.pkl") and name.count("/") == 1]
         require(len(roots) == 1, "is a zip file, but not one made by torch.save: it has no data.pkl")
         root = roots[0]
-        order = archive.read(f"{root}byteorder").decode().strip() if f"{root}byteorder" in names else "little"
-        require(order in ("little", "big"), f"the byte order is '{order}', neither little nor big: the file is damaged")
+        order = read(f"{root}byteorder").decode().strip() if f"{root}byteorder" in names else "little"
+        require(
+            order in ("little", "big"), f"the byte order is '{order[:20]}', neither little nor big: the file is damaged"
+        )
 
         def load(key: str, dtype: np.dtype, count: int) -> np.ndarray:
             name = f"{root}data/{key}"
-            require(name in names, f"the storage {name} is missing: fetch or save the file again")
-            size = archive.getinfo(name).file_size
+            data = read(name)
+            size = len(data)
             require(
                 size == count * dtype.itemsize,
                 f"the storage {name} has {size} bytes instead of {count} x {dtype.itemsize}: fetch the file again",
             )
-            bits = np.frombuffer(archive.read(name), f"{'>' if order == 'big' else '<'}u{dtype.itemsize}")
+            bits = np.frombuffer(data, f"{'>' if order == 'big' else '<'}u{dtype.itemsize}")
             return bits.astype(bits.dtype.newbyteorder("="), copy=False).view(dtype)
 
-        return _TensorUnpickler(io.BytesIO(archive.read(f"{root}data.pkl")), load).load()
+        return _unpickle(read(f"{root}data.pkl"), load)
 
 
-def _read_stream(file: io.BufferedIOBase) -> Any:
+def _read_stream(opened: IO[bytes]) -> Any:
     """The layout before PyTorch 1.6: magic number, protocol, system, content, keys; then each array's count and bytes.
 
     The arrays come last, so the tensors are made as views of arrays that are filled afterwards.
     """
-    length = file.seek(0, io.SEEK_END)
-    file.seek(0)
+    # Of a map a read is never longer than what is there.
+    file = mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ)
+    left = len(file)
 
     def load_none(key: str, dtype: np.dtype, count: int) -> np.ndarray:
         raise InputError("tensors stand before the content: the file is damaged")
 
     def plain() -> Any:
-        return _TensorUnpickler(file, load_none).load()
+        return _unpickle(file, load_none)
 
     try:
         magic = plain()
@@ -131,14 +151,17 @@ def _read_stream(file: io.BufferedIOBase) -> Any:
     storages: dict[str, np.ndarray] = {}
 
     def load(key: str, dtype: np.dtype, count: int) -> np.ndarray:
-        require(0 <= count * dtype.itemsize <= length, f"the storage {key} is larger than the file: fetch it again")
+        nonlocal left
         if key not in storages:
+            left -= count * dtype.itemsize
+            require(left >= 0, f"the storage {key} is larger than the file: fetch it again")
             storages[key] = np.zeros(count, dtype)
         require(storages[key].shape == (count,), f"the storage {key} has two sizes: the file is damaged")
         return storages[key]
 
-    content = _TensorUnpickler(file, load).load()
-    for key in plain():
+    content, keys = _unpickle(file, load), plain()
+    require(isinstance(keys, list) and all(isinstance(key, str) for key in keys), "the list of storages is damaged")
+    for key in keys:
         require(key in storages, f"the storage {key} belongs to no tensor: the file is damaged")
         storage = storages[key]
         (count,) = struct.unpack("<q", file.read(8))
@@ -151,85 +174,97 @@ def _read_stream(file: io.BufferedIOBase) -> Any:
     return content
 
 
-class _NumpyType:
+class _NumpyType(Mutable):
     """A `numpy.dtype` of plain numbers as a pickle describes it: a name, then its byte order."""
 
-    def __init__(self, name: str):
+    def __init__(self, name: Any, *_: Any):
         require(isinstance(name, str), "describes a NumPy type by something other than its name: the file is damaged")
         self.dtype = np.dtype(name)
         require(self.dtype.kind in "fiub", f"refused: the file holds NumPy objects of type {name}")
 
-    def __setstate__(self, state: tuple) -> None:
-        self.dtype = self.dtype.newbyteorder(state[1])
+    def set_state(self, state: Any) -> None:
+        order = state[1] if isinstance(state, tuple) and len(state) > 1 else None
+        require(order in _BYTE_ORDERS, "a NumPy type has no byte order: the file is damaged")
+        self.dtype = self.dtype.newbyteorder(order)
 
 
 class _Storage(NamedTuple):
     dtype: np.dtype
 
 
-class _TensorUnpickler(pickle.Unpickler):
-    """An unpickler whose only names are those below; they are methods, so a pickle cannot alter them either."""
+_Load = Callable[[str, np.dtype, int], np.ndarray]
 
-    def __init__(self, file: io.BufferedIOBase, load: Callable[[str, np.dtype, int], np.ndarray]):
-        super().__init__(file)
-        self._load = load
 
-    def find_class(self, module: str, name: str) -> Any:
-        """What a pickle may name; everything else is refused, unimported."""
-        known: dict[tuple[str, str], Any] = {
-            ("collections", "OrderedDict"): OrderedDict,
-            ("torch._utils", "_rebuild_tensor_v2"): self._tensor,
-            ("torch._utils", "_rebuild_parameter"): self._parameter,
-            ("_codecs", "encode"): self._bytes,
-            ("numpy", "dtype"): self._numpy_type,
-            ("numpy.core.multiarray", "scalar"): self._numpy_scalar,
-            ("numpy._core.multiarray", "scalar"): self._numpy_scalar,
-        }
-        if module in ("torch", "torch.cuda") and name in _STORAGES:
-            return _Storage(_STORAGES[name])
-        require(
-            (module, name) in known,
-            f"refused: the file asks to run {module}.{name}, and only tensors and plain values are read. Load it with "
-            "PyTorch where you trust it, and torch.save the model's state_dict() again",
-        )
-        return known[module, name]
+def _unpickle(file: Any, load: _Load) -> Any:
+    """The next pickle, whose storages `load` gives by key, type and count."""
 
-    def persistent_load(self, identifier: Any) -> np.ndarray:
+    def persistent(identifier: Any) -> np.ndarray:
         """The storage that ('storage', type, key, device, count) names; older files add a view, always None here."""
-        kind, storage, key, _, count, *view = identifier
+        parts = identifier if isinstance(identifier, tuple) and len(identifier) in (5, 6) else (None,) * 5
+        kind, storage, key, _, count, *view = parts
+        proper = kind == "storage" and isinstance(storage, _Storage) and isinstance(key, str | int)
         require(
-            kind == "storage" and isinstance(storage, _Storage) and type(count) is int and view in ([], [None]),
-            f"refers to something other than a storage ({kind!r}): the file is damaged",
+            proper and _is_size(count) and view in ([], [None]),
+            "refers to something other than a storage: the file is damaged",
         )
-        return self._load(str(key), storage.dtype, count)
+        return load(str(key), storage.dtype, count)
 
-    def _tensor(self, storage: np.ndarray, offset: int, shape: tuple, strides: tuple, *_: Any) -> np.ndarray:
-        require(
-            isinstance(storage, np.ndarray)
-            and all(type(number) is int and number >= 0 for number in (offset, *shape, *strides))
-            and len(shape) == len(strides),
-            "a tensor has no proper storage, shape or strides: the file is damaged",
-        )
-        size = math.prod(shape)
-        end = offset + 1 + sum((length - 1) * stride for length, stride in zip(shape, strides, strict=True))
-        require(
-            size == 0 or (end <= storage.size and size <= storage.size),
-            f"a tensor of shape {shape}, strides {strides}, offset {offset} does not fit its storage of {storage.size}",
-        )
-        if size == 0:
-            return np.zeros(shape, storage.dtype)
-        steps = tuple(stride * storage.itemsize for stride in strides)
-        return np.lib.stride_tricks.as_strided(storage[offset:], shape, steps, writeable=False)
+    return unpickle(file, _name, persistent)
 
-    def _parameter(self, tensor: np.ndarray, *_: Any) -> np.ndarray:
-        return tensor
 
-    def _bytes(self, text: str, encoding: str) -> bytes:
-        require(encoding == "latin1", f"refused: the file asks to encode text as {encoding!r}")
-        return text.encode("latin1")
+def _name(module: str, name: str) -> Any:
+    """What stands for a name; every other name is refused, unimported."""
+    if module in ("torch", "torch.cuda") and name in _STORAGES:
+        return _Storage(_STORAGES[name])
+    require(
+        (module, name) in _FUNCTIONS,
+        f"refused: the file asks to run {module}.{name}, and only tensors and plain values are read. Load it with "
+        "PyTorch where you trust it, and torch.save the model's state_dict() again",
+    )
+    return Function(_FUNCTIONS[module, name])
 
-    def _numpy_type(self, name: str, *_: Any) -> _NumpyType:
-        return _NumpyType(name)
 
-    def _numpy_scalar(self, kind: _NumpyType, raw: bytes) -> Any:
-        return np.frombuffer(raw, kind.dtype, count=1)[0]
+def _is_size(number: Any) -> bool:
+    return type(number) is int and 0 <= number < 2**63
+
+
+def _tensor(storage: Any, offset: Any, shape: Any, strides: Any, *_: Any) -> np.ndarray:
+    require(
+        isinstance(storage, np.ndarray)
+        and isinstance(shape, tuple)
+        and isinstance(strides, tuple)
+        and all(map(_is_size, (offset, *shape, *strides)))
+        and len(shape) == len(strides) <= _MOST_DIMENSIONS,
+        "a tensor has no proper storage, shape or strides: the file is damaged",
+    )
+    size = math.prod(shape)
+    end = offset + 1 + sum((length - 1) * stride for length, stride in zip(shape, strides, strict=True))
+    require(
+        size == 0 or (end <= storage.size and size <= storage.size),
+        f"a tensor of shape {shape}, strides {strides}, offset {offset} does not fit its storage of {storage.size}",
+    )
+    if size == 0:
+        return np.zeros(shape, storage.dtype)
+    steps = tuple(stride * storage.itemsize for stride in strides)
+    return np.lib.stride_tricks.as_strided(storage[offset:], shape, steps, writeable=False)
+
+
+def _bytes(text: Any, encoding: Any) -> bytes:
+    require(isinstance(text, str) and encoding == "latin1", "refused: the file asks for another encoding than latin1")
+    return text.encode("latin1")
+
+
+def _numpy_scalar(kind: Any, raw: Any) -> Any:
+    require(isinstance(kind, _NumpyType) and isinstance(raw, bytes), "a NumPy number has no type: the file is damaged")
+    return np.frombuffer(raw, kind.dtype, count=1)[0]
+
+
+_FUNCTIONS: dict[tuple[str, str], Callable[..., Any]] = {
+    ("collections", "OrderedDict"): dictionary,
+    ("torch._utils", "_rebuild_tensor_v2"): _tensor,
+    ("torch._utils", "_rebuild_parameter"): lambda tensor, *_: tensor,
+    ("_codecs", "encode"): _bytes,
+    ("numpy", "dtype"): _NumpyType,
+    ("numpy.core.multiarray", "scalar"): _numpy_scalar,
+    ("numpy._core.multiarray", "scalar"): _numpy_scalar,
+}

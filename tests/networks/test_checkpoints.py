@@ -1,5 +1,6 @@
 """Networks from checkpoints: read, refused, converted."""
 
+import json
 import struct
 
 import jax
@@ -113,6 +114,14 @@ def test_safetensors_files_that_are_damaged_or_missing(tmp_path, state):
         save_checkpoint(state, tmp_path / "nowhere" / "net.safetensors")
     with pytest.raises(InputError, match=r"\.pth or \.pt"):
         load_checkpoint(tmp_path / "net.onnx")
+
+
+def test_safetensors_of_types_that_numpy_has_not(tmp_path):
+    header = json.dumps({"a": {"dtype": "F8_E4M3", "shape": [2], "data_offsets": [0, 2]}}).encode()
+    file = tmp_path / "net.safetensors"
+    file.write_bytes(struct.pack("<Q", len(header)) + header + bytes(2))
+    with pytest.raises(InputError, match=r"net\.safetensors .*F8_E4M3.*float32"):
+        load_checkpoint(file)
 
 
 def test_a_network_with_other_radii_is_not_saved(tmp_path):

@@ -1,12 +1,17 @@
 """PyTorch files written by hand: read as they are meant, or refused."""
 
+import copy
 import pickle
+import subprocess
+import sys
+import zipfile
 
 import numpy as np
 import pytest
 import safetensors.numpy
 from torch_files import (
     STORAGES,
+    Op,
     call,
     checkpoint,
     dumps,
@@ -23,7 +28,7 @@ from torch_files import (
 from jaxnbv.checks import InputError
 from jaxnbv.networks import (
     read_torch_tensors,
-    save_safetensors,
+    save_checkpoint,
 )
 
 RNG = np.random.default_rng(0)
@@ -52,7 +57,7 @@ def test_bfloat16(tmp_path):
     content = {"a": view(storage("0", "BFloat16Storage", 3), 0, (3,), (1,))}
     tensors = read_torch_tensors(write_archive(tmp_path / "net.pth", content, {"0": bits.tobytes()}))
     np.testing.assert_array_equal(tensors["a"].astype(np.float32), values)
-    save_safetensors(tensors, tmp_path / "net.safetensors")
+    save_checkpoint(tensors, tmp_path / "net.safetensors")
     np.testing.assert_array_equal(safetensors.numpy.load_file(tmp_path / "net.safetensors")["a"], values)
 
 
@@ -164,3 +169,100 @@ def test_missing_and_mismatched_storages_are_named(tmp_path):
 def test_files_without_a_state_dictionary_are_refused(tmp_path, content):
     with pytest.raises(InputError, match=r"state_dict"):
         read_torch_tensors(write_archive(tmp_path / "net.pth", content, {}))
+
+
+def nested(depth):
+    """A tuple of two that is 2^depth long when it is written out, by a program of some four bytes a level."""
+    steps = b"".join(b"q" + bytes([index]) + b"h" + bytes([index]) + b"\x86" for index in range(depth))
+    return Op(b"K\x01K\x02\x86" + steps)
+
+
+def refusals(*files):
+    """Their messages, from a process that may take 300 MB and half a minute."""
+    script = """
+import resource, sys
+from jaxnbv.checks import InputError
+from jaxnbv.networks import read_torch_tensors
+held = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (held + 300 * 2**20,) * 2)
+resource.setrlimit(resource.RLIMIT_CPU, (30, 30))
+for file in sys.argv[1:]:
+    try:
+        read_torch_tensors(file)
+    except InputError as error:
+        print(str(error)[:1000])
+"""
+    run = subprocess.run([sys.executable, "-c", script, *files], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    messages = run.stdout.splitlines()
+    assert len(messages) == len(files)
+    return messages
+
+
+def test_short_programs_for_huge_values_are_refused_at_once(tmp_path):
+    huge, stored = nested(60), named("torch", "FloatStorage")
+    contents = (
+        {"a": Op(b"Q", ("storage", huge, "0", "cpu", 1))},
+        {"a": Op(b"Q", ("storage", stored, huge, "cpu", 1))},
+        {huge: 1},
+        {"a": call(named("collections", "OrderedDict"), [(huge, 1)])},
+        {"a": huge},
+    )
+    files = [write_archive(tmp_path / f"net{index}.pth", content, {}) for index, content in enumerate(contents)]
+    assert all("nested too deep" in message for message in refusals(*files))
+
+
+def test_keys_that_are_no_names_are_refused(tmp_path):
+    with pytest.raises(InputError, match="neither a string nor an integer"):
+        read_torch_tensors(write_archive(tmp_path / "net.pth", {(1, 2): 1}, {}))
+
+
+def test_declared_sizes_cost_nothing(tmp_path):
+    """An index of the memo, the lengths of a text, of a longer one and of an integer, in both layouts."""
+    files = []
+    for size in (b"r\xff\xff\xff\xff", b"X\xff\xff\xff\x7f", b"\x8d" + b"\xff" * 5 + bytes(3), b"\x8b\xff\xff\xff\x7f"):
+        files.append(write_archive(tmp_path / f"{len(files)}.pth", {"a": Op(b"K\x01" + size)}, {}))
+        files.append(tmp_path / f"{len(files)}.pth")
+        files[-1].write_bytes(b"\x80\x02K\x01" + size + b".")
+    refusals(*files)
+
+
+def test_members_that_are_compressed_or_shared_are_refused(tmp_path):
+    count = 2**26
+    content = {"a": view(storage("0", "FloatStorage", count), 0, (count,), (1,))}
+    file = tmp_path / "net.pth"
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("net/data.pkl", dumps(content), zipfile.ZIP_STORED)
+        with archive.open("net/data/0", "w") as member:
+            for _ in range(2**8):
+                member.write(bytes(2**20))
+    assert file.stat().st_size < 2**20
+    assert "compressed" in refusals(file)[0]
+    # One member's bytes under many names.
+    arrays = {f"a{index}": np.zeros(1000, np.float32) for index in range(4)}
+    tensors, data = tensors_and_bytes(arrays)
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("net/data.pkl", dumps(tensors))
+        archive.writestr("net/data/0", data["0"])
+        one = archive.getinfo("net/data/0")
+        for index in (1, 2, 3):
+            other = copy.copy(one)
+            other.filename = f"net/data/{index}"
+            archive.filelist.append(other)
+            archive.NameToInfo[other.filename] = other
+    with pytest.raises(InputError, match=r"longer than the file|damaged"):
+        read_torch_tensors(file)
+
+
+def test_storages_of_the_older_layout_are_no_longer_than_the_file_all_together(tmp_path):
+    arrays = {f"a{index}": np.zeros(1000, np.float32) for index in range(4)}
+    content, data = tensors_and_bytes(arrays, None)
+    file = write_stream(tmp_path / "net.pth", content, {"0": data["0"]}, [1000])
+    with pytest.raises(InputError, match="larger than the file"):
+        read_torch_tensors(file)
+
+
+def test_operations_that_no_tensor_needs_are_refused(tmp_path):
+    for body in (b"\x8f", b"c__builtin__\nset\n)\x81", b"(ios\nsystem\n"):
+        with pytest.raises(InputError, match=r"refused"):
+            read_torch_tensors(write_archive(tmp_path / "net.pth", {"a": Op(body)}, {}))

@@ -11,7 +11,7 @@ import safetensors.numpy
 
 from jaxnbv.networks import (
     PointNet2Classifier,
-    save_safetensors,
+    save_checkpoint,
 )
 from jaxnbv.networks.pointnet2 import SINGLE_SCALE
 from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
@@ -126,5 +126,5 @@ def narrow_network(sampling=SINGLE_SCALE, inputs=6):
 
 
 def state_of(network, folder):
-    save_safetensors(network, folder / "state.safetensors")
+    save_checkpoint(network, folder / "state.safetensors")
     return safetensors.numpy.load_file(folder / "state.safetensors")
