@@ -120,7 +120,7 @@ def test_safetensors_of_types_that_numpy_has_not(tmp_path):
     header = json.dumps({"a": {"dtype": "F8_E4M3", "shape": [2], "data_offsets": [0, 2]}}).encode()
     file = tmp_path / "net.safetensors"
     file.write_bytes(struct.pack("<Q", len(header)) + header + bytes(2))
-    with pytest.raises(InputError, match=r"net\.safetensors .*F8_E4M3.*float32"):
+    with pytest.raises(InputError, match=r"net\.safetensors: .*F8_E4M3.*float32"):
         load_checkpoint(file)
 
 
