@@ -18,9 +18,9 @@ from timing import least_time
 import jaxnbv as nbv
 from jaxnbv.datasets import Framing, Split, hidden_view, pyramid_scene
 from jaxnbv.episode import observe_scene
+from jaxnbv.folders import versions
 from jaxnbv.networks import pyramid_classifier
 from jaxnbv.search.candidates import sphere_candidates
-from jaxnbv.storage import versions
 
 LIMIT = 30.0
 

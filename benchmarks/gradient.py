@@ -24,9 +24,10 @@ from tqdm import tqdm
 import jaxnbv as nbv
 from jaxnbv.datasets import Framing, Split, demo_object, hidden_view, pyramid_scene
 from jaxnbv.episode import observe_scene
+from jaxnbv.folders import versions
 from jaxnbv.networks import pyramid_classifier
 from jaxnbv.search.candidates import sphere_candidates
-from jaxnbv.storage import describe, versions
+from jaxnbv.storage import describe
 
 SEARCHES = {
     "discrete": nbv.DiscreteSearch(),

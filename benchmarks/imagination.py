@@ -35,8 +35,9 @@ from jaxnbv.datasets import PART_CATEGORIES, Split, demo_object, part_scene, pyr
 from jaxnbv.episode import observe_scene
 from jaxnbv.experiments.imagination import Truth, judge
 from jaxnbv.files import write_whole
+from jaxnbv.folders import versions
 from jaxnbv.search.candidates import sphere_candidates
-from jaxnbv.storage import describe, versions
+from jaxnbv.storage import describe
 
 GRID = nbv.Grid(64, 0.7 * 2.5)
 RAYS = nbv.Camera(height=32, width=32)

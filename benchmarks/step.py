@@ -26,9 +26,10 @@ from timing import least_time
 import jaxnbv as nbv
 from jaxnbv.datasets import demo_object
 from jaxnbv.episode import observe_scene
+from jaxnbv.folders import versions
 from jaxnbv.presets import ModelName
 from jaxnbv.search.candidates import sphere_candidates
-from jaxnbv.storage import describe, versions
+from jaxnbv.storage import describe
 
 FIGURES = {
     "samples": ("prior and posterior samples of f on the grid", 6.0),

@@ -3,6 +3,7 @@
 import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -70,14 +71,16 @@ class Episode(eqx.Module):
         files.
         """
         folder = EpisodeFolder(path, _config(self.planner, self.scene, self.noise, self.first, self.key))
-        held = len(folder.read_views())
-        require(
-            held <= len(self.views),
-            f"{path} already holds {held} views of this episode, which has {len(self.views)}: choose another folder",
-        )
-        for index, view in enumerate(self.views):
-            folder.write_view(index, view.pose, view.scan, view.proposal)
-        folder.write_cloud(self.cloud)
+        with folder.writing():
+            held = len(folder.read_views())
+            require(
+                held <= len(self.views),
+                f"{path} already holds {held} views of this episode, which has {len(self.views)}: "
+                "choose another folder",
+            )
+            for index, view in enumerate(self.views):
+                folder.write_view(index, view.pose, view.scan, view.proposal)
+            folder.write_cloud(self.cloud)
 
 
 def _config(planner: Planner, scene: Surface, noise: SensorNoise, first: Pose, key: PRNGKeyArray) -> dict:
@@ -113,27 +116,28 @@ def simulate(
         f"the key is a raw array of {key.dtype}: make it with jax.random.key(seed)",
     )
     store = None if folder is None else EpisodeFolder(folder, _config(planner, scene, noise, first, key))
-    done = store.read_views() if store else []
-    require(
-        len(done) <= views,
-        f"asked for {views} views but {folder} already holds {len(done)}: ask for more, or choose another folder",
-    )
-    finished: list[View] = []
-    with tqdm(total=views * len(STAGES), disable=not progress) as bar:
+    with store.writing() if store else nullcontext():
+        done = store.read_views() if store else []
+        require(
+            len(done) <= views,
+            f"asked for {views} views but {folder} already holds {len(done)}: ask for more, or choose another folder",
+        )
+        finished: list[View] = []
+        with tqdm(total=views * len(STAGES), disable=not progress) as bar:
 
-        def begin(index: int, stage: str) -> None:
-            bar.set_description(f"view {index + 1}/{views}, {stage}")
-            bar.update(index * len(STAGES) + STAGES.index(stage) - bar.n)
+            def begin(index: int, stage: str) -> None:
+                bar.set_description(f"view {index + 1}/{views}, {stage}")
+                bar.update(index * len(STAGES) + STAGES.index(stage) - bar.n)
 
-        sensor = scene_sensor(scene, planner.camera, noise)
-        episode = steps(planner, sensor, first, key, done=done, begin=begin)
-        for index, (view, *_) in enumerate(itertools.islice(episode, views)):
-            finished.append(view)
-            if store and index >= len(done):
-                store.write_view(index, view.pose, view.scan, view.proposal)
-        bar.update(bar.total - bar.n)
-    if store:
-        store.write_cloud(finished[-1].cloud)
+            sensor = scene_sensor(scene, planner.camera, noise)
+            episode = steps(planner, sensor, first, key, done=done, begin=begin)
+            for index, (view, *_) in enumerate(itertools.islice(episode, views)):
+                finished.append(view)
+                if store and index >= len(done):
+                    store.write_view(index, view.pose, view.scan, view.proposal)
+            bar.update(bar.total - bar.n)
+        if store:
+            store.write_cloud(finished[-1].cloud)
     return Episode(planner, scene, noise, first, key, tuple(finished))
 
 

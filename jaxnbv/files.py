@@ -1,16 +1,53 @@
-"""Files that are whole or not there."""
+"""Files that are whole or not there, and folders that can be made; what the disk refuses is named."""
 
 import os
+import secrets
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from jaxnbv.errors import InputError
+
+PARTIAL = ".partial"
+
 
 def write_whole(path: Path, write: Callable[[Any], Any]) -> None:
-    """Write beside the file and rename, so that a reader finds the old file or the whole new one, never a part."""
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("wb") as file:
-        write(file)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+    """Write beside the file and rename, so that a reader finds the old file or the whole new one, never a part.
+
+    **Raises:** `ValueError` if the disk is full, the folder is missing or may not be written, or the name is too long.
+    """
+    # A name of its own: two processes that write one file do not meet in its parts.
+    partial = path.with_name(f".{secrets.token_hex(8)}{PARTIAL}")
+    try:
+        try:
+            with partial.open("xb") as file:
+                write(file)
+                file.flush()
+                os.fsync(file.fileno())
+            partial.replace(path)
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise InputError(
+            f"cannot write {path} ({error.strerror or error}): make room there or choose another place. "
+            "What was finished before is kept"
+        ) from error
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write UTF-8 text as `write_whole` does."""
+    write_whole(path, lambda file: file.write(text.encode()))
+
+
+def make_folder(path: str | Path) -> Path:
+    """The folder, made with its parents where it is missing.
+
+    **Raises:** `ValueError` if there is a file in its place, or it may not be made.
+    """
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"cannot make the output folder {path} ({reason}): choose another place") from error
+    return Path(path)

@@ -9,11 +9,7 @@ cloud.ply       the points that were kept, once the episode is complete
 import dataclasses
 import functools
 import hashlib
-import importlib.metadata
 import json
-import warnings
-import zipfile
-import zlib
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any
@@ -24,9 +20,10 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from jaxnbv.camera import Pose
-from jaxnbv.checks import InputError, require
+from jaxnbv.checks import InputError
 from jaxnbv.cloud import PointCloud
 from jaxnbv.files import write_whole
+from jaxnbv.folders import FORMAT, ResultFolder, check_format
 from jaxnbv.search import Proposal, Trajectories
 
 _LARGEST_LISTED = 16
@@ -78,13 +75,7 @@ def describe(thing: Any) -> Any:
     return getattr(thing, "__qualname__", type(thing).__qualname__)
 
 
-def versions() -> dict[str, str]:
-    """Versions of what the numbers depend on, and the kind of device."""
-    names = ("jaxnbv", "jax", "jaxlib", "equinox", "optax", "optimistix", "numpy", "trimesh", "embreex")
-    return {**{name: importlib.metadata.version(name) for name in names}, "device": jax.devices()[0].device_kind}
-
-
-class EpisodeFolder:
+class EpisodeFolder(ResultFolder):
     """An episode's folder, open for one configuration.
 
     **Raises:** `ValueError` if the folder holds an episode of another configuration, or files that are not an
@@ -92,44 +83,7 @@ class EpisodeFolder:
     """
 
     def __init__(self, path: str | Path, config: dict[str, Any]):
-        self.path = Path(path)
-        require(
-            not self.path.exists() or self.path.is_dir(),
-            f"the output folder {self.path} is a file: choose another place",
-        )
-        record = self.path / "episode.json"
-        if not record.exists():
-            foreign = sorted(entry.name for entry in self.path.iterdir()) if self.path.exists() else []
-            require(
-                not [name for name in foreign if not name.endswith(".partial")],
-                f"the output folder {self.path} holds other files ({', '.join(foreign[:3])}): choose an empty folder",
-            )
-            try:
-                self.path.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise InputError(
-                    f"cannot make the output folder {self.path} ({error}): choose another place"
-                ) from error
-            text = json.dumps({"config": config, "versions": versions()}, indent=2)
-            write_whole(record, lambda file: file.write(text.encode()))
-            return
-        try:
-            written = json.loads(record.read_text())
-            found, made_by = written["config"], written.get("versions")
-        except (json.JSONDecodeError, KeyError, TypeError, UnicodeDecodeError) as error:
-            raise InputError(f"{record} is not an episode's record ({error}): choose another output folder") from error
-        changed = differences(found, json.loads(json.dumps(config)))
-        require(
-            not changed,
-            f"the output folder {self.path} belongs to another configuration; it differs in {'; '.join(changed[:3])}. "
-            "Choose another folder, or the settings it was made with",
-        )
-        if made_by != versions():
-            warnings.warn(
-                f"{self.path} was begun with other versions ({'; '.join(differences(made_by, versions()))}): "
-                "new views may differ in their last bits from those of an uninterrupted run",
-                stacklevel=3,
-            )
+        super().__init__(path, "episode.json", "view_*.npz", config, "episode")
 
     def read_views(self) -> list[tuple[Pose, PointCloud, Proposal | None]]:
         """Pose, scan and proposal of every finished view, up to the first that is missing."""
@@ -137,13 +91,19 @@ class EpisodeFolder:
         while (file := self._view_file(len(views))).exists():
             try:
                 with np.load(file, allow_pickle=False) as saved:
-                    views.append(_view({name: jnp.asarray(saved[name]) for name in saved.files}))
-            except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+                    data = {name: saved[name] for name in saved.files}
+                _check_view(data, len(views), file)
+                views.append(_view({name: jnp.asarray(data[name]) for name in _ARRAYS if name in data}))
+            except InputError:
+                raise
+            # Whatever NumPy and zipfile raise on bits that were turned: some twenty kinds of error.
+            except Exception as error:
                 raise InputError(f"{file} is damaged ({error}): delete it, and its view is scanned again") from error
         return views
 
     def write_view(self, index: int, pose: Pose, scan: PointCloud, proposal: Proposal | None) -> None:
-        """Write one finished view, all or nothing."""
+        """Write one finished view, all or nothing; the first of them binds the folder to its configuration."""
+        self.bind()
         data = {
             "rotation": pose.rotation,
             "position": pose.position,
@@ -167,6 +127,8 @@ class EpisodeFolder:
                 "trajectory_values": ways.values,
             }
         arrays: dict[str, Any] = {name: np.asarray(value) for name, value in data.items()}
+        arrays |= {"format": np.asarray(FORMAT), "index": np.asarray(index)}
+        arrays["sha256"] = np.asarray(_checksum(arrays))
         write_whole(self._view_file(index), lambda file: np.savez_compressed(file, **arrays))
 
     def write_cloud(self, cloud: PointCloud) -> None:
@@ -181,6 +143,53 @@ class EpisodeFolder:
         return self.path / f"view_{index:02d}.npz"
 
 
+# What a view's arrays are: the kind of their type, and their shape; what one letter stands for is the same in all.
+_ARRAYS = {
+    "rotation": ("f", (3, 3)),
+    "position": ("f", (3,)),
+    "points": ("f", ("n", 3)),
+    "normals": ("f", ("n", 3)),
+    "mask": ("b", ("n",)),
+    "missed": ("b", ("n",)),
+    "value": ("f", ()),
+    "values": ("f", ("c",)),
+    "candidate_rotations": ("f", ("c", 3, 3)),
+    "candidate_positions": ("f", ("c", 3)),
+    "trajectory_rotations": ("f", ("s", "i", 3, 3)),
+    "trajectory_positions": ("f", ("s", "i", 3)),
+    "trajectory_values": ("f", ("s", "i")),
+}
+
+
+def _check_view(data: dict[str, np.ndarray], index: int, file: Path) -> None:
+    """**Raises:** `ValueError` that says what is damaged; `InputError` for a later format."""
+    lengths: dict[str, int] = {}
+    for name, (kind, shape) in _ARRAYS.items():
+        if name in data:
+            array = data[name]
+            fits = array.dtype.kind == kind and array.ndim == len(shape)
+            fits = fits and all(
+                length == (lengths.setdefault(axis, length) if isinstance(axis, str) else axis)
+                for axis, length in zip(shape, array.shape, strict=True)
+            )
+            if not fits:
+                raise ValueError(f"its {name} is {array.dtype}{list(array.shape)}")
+    # Folders of format 1 say none of these.
+    if "format" in data:
+        check_format(int(data["format"]), file)
+        if int(data["index"]) != index:
+            raise ValueError(f"it is view {int(data['index'])}")
+        if str(data["sha256"]) != _checksum({name: array for name, array in data.items() if name != "sha256"}):
+            raise ValueError("its checksum is not that of its arrays")
+
+
+def _checksum(arrays: dict[str, np.ndarray]) -> str:
+    digest = hashlib.sha256()
+    for name, array in sorted(arrays.items()):
+        digest.update(f"{name} {array.dtype.str} {array.shape} ".encode() + np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
 def _view(data: dict[str, jax.Array]) -> tuple[Pose, PointCloud, Proposal | None]:
     pose = Pose(data["rotation"], data["position"])
     # Folders of earlier versions do not say which rays met nothing.
@@ -193,11 +202,3 @@ def _view(data: dict[str, jax.Array]) -> tuple[Pose, PointCloud, Proposal | None
         poses = Pose(data["trajectory_rotations"], data["trajectory_positions"])
         trajectories = Trajectories(poses, data["trajectory_values"])
     return pose, scan, Proposal(pose, data["value"], candidates, data["values"], trajectories)
-
-
-def differences(found: Any, asked: Any, name: str = "") -> list[str]:
-    if isinstance(found, dict) and isinstance(asked, dict):
-        keys = list(dict.fromkeys([*found, *asked]))
-        nested = (differences(found.get(key), asked.get(key), f"{name}.{key}".lstrip(".")) for key in keys)
-        return [difference for group in nested for difference in group]
-    return [] if found == asked else [f"{name}: {found} there, {asked} now"]

@@ -19,6 +19,7 @@ import trimesh
 from plyfile import PlyData
 
 from jaxnbv.camera import Camera, look_at
+from jaxnbv.checks import InputError
 from jaxnbv.episode import simulate
 from jaxnbv.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
@@ -49,7 +50,8 @@ def run(folder, views=3, **changes):
 
 
 def contents(folder):
-    return {file.name: file.read_bytes() for file in sorted(Path(folder).iterdir())}
+    """Of all files but the lock."""
+    return {file.name: file.read_bytes() for file in sorted(Path(folder).iterdir()) if file.name != ".lock"}
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +137,8 @@ def test_a_view_keeps_which_rays_missed_and_one_of_an_earlier_version_reads_with
         assert 0 < np.asarray(read[1].missed).sum() < 64
         np.testing.assert_array_equal(read[1].missed, ~np.asarray(view.scan.mask))
     with np.load(folder / "view_01.npz") as saved:
-        older = {name: saved[name] for name in saved.files if name != "missed"}
+        later = {"missed", "format", "index", "sha256"}
+        older = {name: saved[name] for name in saved.files if name not in later}
     np.savez_compressed(folder / "view_01.npz", **older)
     views = EpisodeFolder(folder, config).read_views()
     assert [pair[1].missed is None for pair in views] == [False, True, False, False, False]
@@ -207,7 +210,7 @@ def test_a_finished_run_is_read_not_computed(finished, monkeypatch):
 )
 def test_a_folder_of_another_configuration_is_refused(finished, change, named):
     before = contents(finished[1])
-    with pytest.raises(ValueError, match=r"another configuration.*" + named + r".*Choose another folder"):
+    with pytest.raises(ValueError, match=r"another episode.*" + named + r".*Choose another folder"):
         run(finished[1], **change)
     assert contents(finished[1]) == before
 
@@ -294,7 +297,7 @@ def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_files(tmp_
     assert "cloud.ply" not in contents(folder)
 
     kill_once(start(folder, "write", 1), stalled.exists)
-    assert (folder / "view_01.npz.partial").exists()
+    assert list(folder.glob(".*.partial"))
     assert not (folder / "view_01.npz").exists()
     stalled.unlink()
 
@@ -332,7 +335,7 @@ def test_a_shorter_episode_is_not_saved_over_a_longer_one(finished, tmp_path):
 
 def test_an_output_folder_that_is_a_file_is_refused(tmp_path):
     (tmp_path / "notes").write_text("mine")
-    with pytest.raises(ValueError, match="is a file"):
+    with pytest.raises(ValueError, match="File exists"):
         run(tmp_path / "notes")
 
 
@@ -342,4 +345,126 @@ def test_other_versions_are_told_of(finished, tmp_path):
     record["versions"]["jax"] = "0.0.1"
     (folder / "episode.json").write_text(json.dumps(record))
     with pytest.warns(UserWarning, match=r"other versions \(jax: 0.0.1 there"):
+        run(folder, views=5)
+
+
+def config_of(episode):
+    return describe(BASE | {"planner": episode.planner})
+
+
+def test_a_first_view_that_fails_does_not_bind_its_folder(tmp_path, finished):
+    with pytest.raises(InputError, match="the first scan is empty"):
+        run(tmp_path, first=look_at((0.0, 0.0, 2.5), (0.0, 0.0, 9.0)))
+    assert contents(tmp_path) == {}
+    run(tmp_path, views=5)
+    assert contents(tmp_path) == contents(finished[1])
+
+
+def test_a_record_without_views_binds_nobody(tmp_path, finished):
+    """A run that was killed between the two files."""
+    run(tmp_path, views=1, key=jax.random.key(9))
+    (tmp_path / "view_00.npz").unlink()
+    (tmp_path / "cloud.ply").unlink()
+    run(tmp_path, views=5)
+    assert contents(tmp_path) == contents(finished[1])
+
+
+def rewritten(file, changes, without=()):
+    with np.load(file) as saved:
+        arrays = {name: saved[name] for name in saved.files if name not in without}
+    np.savez_compressed(file, **(arrays | changes))
+
+
+def test_a_view_that_is_not_what_it_was_is_refused(finished, tmp_path):
+    folder = shutil.copytree(finished[1], tmp_path / "copy")
+    file, whole = folder / "view_01.npz", (folder / "view_01.npz").read_bytes()
+
+    def problem():
+        with pytest.raises(InputError, match=r"view_01\.npz is damaged .* delete it") as error:
+            run(folder, views=5)
+        file.write_bytes(whole)
+        return str(error.value)
+
+    shutil.copy(folder / "view_02.npz", file)
+    assert "it is view 2" in problem()
+    rewritten(file, {"value": np.float32(1.0)})
+    assert "checksum" in problem()
+    rewritten(file, {}, ["missed"])
+    assert "checksum" in problem()
+    of_format_1 = ("format", "index", "sha256")
+    for name, array in (
+        ("mask", np.ones(63, bool)),
+        ("points", np.zeros((64, 2), np.float32)),
+        ("normals", np.zeros((64, 3), int)),
+        ("values", np.zeros(11, np.float32)),
+        ("rotation", np.zeros((3, 3, 1), np.float32)),
+        ("missed", np.array(["x"] * 64)),
+    ):
+        rewritten(file, {name: array}, of_format_1)
+        # Where two lengths should be one, the later array is named.
+        assert f"its {'candidate_rotations' if name == 'values' else name} is " in problem()
+
+
+def test_no_turned_bit_of_a_view_passes(finished, tmp_path):
+    """Any one bit: the file is refused by name, or its arrays are the same (bits that mean nothing)."""
+    episode, folder = finished
+    config = config_of(episode)
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    whole, expected = (folder / "view_01.npz").read_bytes(), EpisodeFolder(folder, config).read_views()[1]
+    ends = whole.index(b"PK\x01\x02")
+    # The first header, all of the directory, and a sample of the rest.
+    places = [*range(60), *range(ends, len(whole), 7), *np.random.default_rng(0).integers(0, len(whole), 150)]
+    refused = 0
+    for place in places:
+        turned = bytearray(whole)
+        turned[place] ^= 1 << (place % 8)
+        (copy / "view_01.npz").write_bytes(turned)
+        try:
+            views = EpisodeFolder(copy, config).read_views()
+        except InputError as error:
+            refused += "view_01.npz is damaged" in str(error)
+            continue
+        for a, b in zip(jax.tree.leaves(views[1]), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert refused > len(places) / 2
+
+
+def test_an_episode_of_a_later_format_is_refused(finished, tmp_path):
+    folder = shutil.copytree(finished[1], tmp_path / "copy")
+    record = json.loads((folder / "episode.json").read_text())
+    (folder / "episode.json").write_text(json.dumps(record | {"format": 3}))
+    with pytest.raises(InputError, match=r"episode\.json is of format 3; .* install a newer one"):
+        run(folder, views=5)
+    (folder / "episode.json").write_text(json.dumps(record))
+    rewritten(folder / "view_01.npz", {"format": np.asarray(3)})
+    with pytest.raises(InputError, match=r"view_01\.npz is of format 3; .* install a newer one"):
+        run(folder, views=5)
+
+
+def test_one_process_writes_at_a_time(finished, tmp_path):
+    folder = shutil.copytree(finished[1], tmp_path / "copy")
+    script = (
+        "import sys, time\nfrom pathlib import Path\nfrom jaxnbv.folders import ResultFolder\n"
+        "with ResultFolder(sys.argv[1], 'episode.json', 'nothing_*', {}, 'episode').writing():\n"
+        "    print('holding', flush=True)\n    sys.stdin.read()\n"
+    )
+    holder = subprocess.Popen([sys.executable, "-c", script, folder], stdin=-1, stdout=-1, text=True)
+    assert holder.stdout.readline() == "holding\n"
+    with pytest.raises(InputError, match=rf"is being written by process {holder.pid} on .*: wait until it ends"):
+        run(folder, views=5)
+    holder.kill()
+    holder.communicate()
+    run(folder, views=5)
+    assert contents(folder) == contents(finished[1])
+
+
+def test_a_name_that_is_too_long_is_told(tmp_path):
+    with pytest.raises(InputError, match=r"cannot make the output folder .*File name too long"):
+        run(tmp_path / ("n" * 300))
+
+
+def test_more_cores_than_before_are_told_of(finished, tmp_path, monkeypatch):
+    folder = shutil.copytree(finished[1], tmp_path / "copy")
+    monkeypatch.setattr("jaxnbv.folders.loky.cpu_count", lambda: 64)
+    with pytest.warns(UserWarning, match=r"cores: \d+ there, 64 now"):
         run(folder, views=5)

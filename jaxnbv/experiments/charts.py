@@ -12,8 +12,9 @@ from jaxnbv.experiments.looks import draw_legend, line_of
 from jaxnbv.experiments.measures import Measure, Record, Row, methods_of, result_rows
 from jaxnbv.experiments.study import Panel, Study
 from jaxnbv.experiments.tables import count_of
+from jaxnbv.files import make_folder
 from jaxnbv.viz.figures import STYLE
-from jaxnbv.viz.style import GREY, LINE, log_ticks
+from jaxnbv.viz.style import GREY, LINE, log_ticks, save_figure
 
 # Methods side by side, so that equal values do not hide one another: of the distance between two columns.
 _DODGE, _DODGE_NAMED = 0.06, 0.13
@@ -26,8 +27,7 @@ def write_charts(records: Sequence[Record], study: type[Study], folder: str | Pa
     **Raises:** `ValueError` if there are no records, no method that all of them hold, or their numbers of views differ.
     """
     methods_of(records, study.methods)
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = make_folder(folder)
     groups, paths = study.groups(records), []
     with mpl.rc_context(STYLE):
         for name, chart in study.charts.items():
@@ -36,7 +36,7 @@ def write_charts(records: Sequence[Record], study: type[Study], folder: str | Pa
             figure = _figure(rows, study) if rows else None
             if figure is not None:
                 paths.append(folder / f"{name}.png")
-                figure.savefig(paths[-1], dpi=200)
+                save_figure(figure, paths[-1])
     return paths
 
 

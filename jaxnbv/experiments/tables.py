@@ -1,6 +1,7 @@
 """Tables of a study: aligned text, and CSV with one row a number."""
 
 import csv
+import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 from jaxnbv.experiments.measures import Measure, Record, Row, difference_rows, methods_of, result_rows
 from jaxnbv.experiments.statistics import LEVEL
 from jaxnbv.experiments.study import Study
+from jaxnbv.files import make_folder, write_text
 
 _RESULT = ("group", "quantity", "by", "at", "method", "mean", "standard_error", "low", "high", "rank", "scenes")
 _DIFFERENCE = ("group", "quantity", "by", "at", "method", "baseline", "mean", "low", "high", "excludes_zero", "scenes")
@@ -20,11 +22,10 @@ def write_tables(records: Sequence[Record], study: type[Study], folder: str | Pa
 
     **Raises:** `ValueError` if there are no records, no method that all of them hold, or their numbers of views differ.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = make_folder(folder)
     results, differences = all_rows(records, study)
     text = folder / "results.txt"
-    text.write_text(_text(records, study, results, differences), encoding="utf-8")
+    write_text(text, _text(records, study, results, differences))
     paths = [
         write_csv(folder / "results.csv", results, _RESULT),
         write_csv(folder / "differences.csv", differences, _DIFFERENCE),
@@ -130,9 +131,10 @@ def count_of(count: int, thing: str) -> str:
 
 def write_csv(path: Path, rows: Sequence[Row], columns: Sequence[str]) -> Path:
     """Write rows under a header of the columns, floats to six digits."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns)
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({key: round(x, 6) if isinstance(x, float) else x for key, x in row.items()})
+    lines = io.StringIO(newline="")
+    writer = csv.DictWriter(lines, columns)
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({key: round(x, 6) if isinstance(x, float) else x for key, x in row.items()})
+    write_text(path, lines.getvalue())
     return path

@@ -9,8 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxnbv.experiments.measures import Record
+from jaxnbv.files import make_folder
 from jaxnbv.viz.figures import STYLE
-from jaxnbv.viz.style import GREY, LINE
+from jaxnbv.viz.style import GREY, LINE, save_figure
 
 
 class Tiles:
@@ -45,13 +46,12 @@ def save_pictures(
     records: Sequence[Record], folder: str | Path, name: str, draw: Callable[[Record], Figure]
 ) -> list[Path]:
     """Write `<name>_<scene>.png` for each record into a folder; return the paths."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = make_folder(folder)
     paths = []
     with mpl.rc_context(STYLE):
         for record in records:
             paths.append(folder / f"{name}_{record['scene']:03d}.png")
-            draw(record).savefig(paths[-1], dpi=200)
+            save_figure(draw(record), paths[-1])
     return paths
 
 

@@ -49,11 +49,7 @@ def save_checkpoint(network: Network | _Tensors, path: str | Path) -> None:
         name: np.array(tensor, np.float32 if tensor.dtype == jnp.bfloat16 else tensor.dtype, order="C")
         for name, tensor in tensors.items()
     }
-    path = Path(path)
-    try:
-        write_whole(path, lambda file: file.write(safetensors.numpy.save(arrays, metadata)))
-    except OSError as error:
-        raise InputError(f"cannot write {path} ({error}): choose another place") from error
+    write_whole(Path(path), lambda file: file.write(safetensors.numpy.save(arrays, metadata)))
 
 
 def convert_checkpoint(source: str | Path, target: str | Path) -> Network:

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,7 +19,7 @@ from tqdm import tqdm
 
 from jaxnbv.checks import AnyArray, InputError, require
 from jaxnbv.cloud import PointCloud
-from jaxnbv.files import write_whole
+from jaxnbv.files import make_folder, write_whole
 
 Network = TypeVar("Network", bound=eqx.Module)
 
@@ -187,8 +188,7 @@ class _Checkpoint:
     """Where a training run stands, in one file that is replaced as a whole."""
 
     def __init__(self, folder: Path, settings: dict[str, Any]):
-        folder.mkdir(parents=True, exist_ok=True)
-        self.path, self.settings = folder / "training.npz", json.dumps(settings, sort_keys=True)
+        self.path, self.settings = make_folder(folder) / "training.npz", json.dumps(settings, sort_keys=True)
 
     def read(self, carry):
         if not self.path.exists():
@@ -198,7 +198,7 @@ class _Checkpoint:
             with np.load(self.path, allow_pickle=False) as saved:
                 settings, step = str(saved["settings"]), int(saved["step"])
                 found = [saved[f"leaf_{index}"] for index in range(len(leaves))]
-        except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        except (ValueError, OSError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
             raise InputError(f"{self.path} is damaged or of another network ({error}): delete it") from error
         same = settings == self.settings and all(a.shape == b.shape for a, b in zip(found, leaves, strict=True))
         require(same, f"{self.path} belongs to another training ({settings}): choose another folder")

@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from jaxnbv.answers import Quantity, number
 from jaxnbv.camera import Camera
+from jaxnbv.files import make_folder, write_whole
 from jaxnbv.viz import sphere
 from jaxnbv.viz.data import COVERAGE_RADIUS, Choice, ReportData, ViewData
 from jaxnbv.viz.render import draw_scene
@@ -62,8 +63,7 @@ def write_figures(data: ReportData, camera: Camera, folder: str | Path, progress
     search in space, of views that were found among 6-DOF poses; `coverage.png`: the charts; `overview.png`: all views
     in a strip.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = make_folder(folder)
     norm = LogNorm(*deviation_range(data))
     drawings: dict[str, Callable[[], Figure]] = {}
     for index, view in enumerate(data.views):
@@ -91,7 +91,7 @@ def _save(figure: Figure, path: Path, dpi: int, few_colours: bool = False) -> No
         # The background is the commonest colour; the mean of it and its neighbours is not quite white.
         colours[np.bincount(np.asarray(image).ravel()).argmax()] = 255
         image.putpalette(colours.ravel().tolist())
-    image.save(path, optimize=True, dpi=(dpi, dpi))
+    write_whole(path, lambda file: image.save(file, "png", optimize=True, dpi=(dpi, dpi)))
 
 
 def _view(data: ReportData, index: int, camera: Camera, norm: LogNorm) -> Figure:

@@ -18,7 +18,9 @@ from jaxnbv.answers import Quantity
 from jaxnbv.camera import Camera
 from jaxnbv.checks import AnyArray
 from jaxnbv.episode import Episode
-from jaxnbv.storage import describe, versions
+from jaxnbv.files import make_folder, write_text
+from jaxnbv.folders import versions
+from jaxnbv.storage import describe
 from jaxnbv.viz import sphere
 from jaxnbv.viz.data import COVERAGE_RADIUS, Choice, MeanSurface, ReportData, ViewData, report_data
 from jaxnbv.viz.figures import coverage_series, deviation_range, is_smooth, value_range, write_figures
@@ -46,12 +48,11 @@ def write_report(
       scene, where it can be. Without truth the chart counts points.
     - `title`: what the object is called.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = make_folder(folder)
     data = report_data(episode, truth, progress)
     write_figures(data, episode.planner.camera, folder / "figures", progress)
     path = folder / "report.html"
-    path.write_text(report_html(episode, data, title), encoding="utf-8")
+    write_text(path, report_html(episode, data, title))
     return path
 
 

@@ -1,9 +1,14 @@
 """Colours and ranges that the page and the figures share; all can be told apart by colour-blind readers."""
 
+from pathlib import Path
+
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
 from matplotlib.colors import Colormap, LinearSegmentedColormap
+from matplotlib.figure import Figure
+
+from jaxnbv.files import write_whole
 
 INK, GREY, LINE = "#1f2733", "#7a8494", "#d9dee6"
 BEFORE, NEW = "#26344d", "#d55e00"
@@ -31,3 +36,8 @@ def log_ticks(low: float, high: float) -> Float[np.ndarray, " n"]:
     decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
     ticks = np.outer(decades, [1.0, 2.0, 5.0]).ravel()
     return ticks[(ticks >= low * 0.9999) & (ticks <= high * 1.0001)]
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """As a PNG file that is whole or not there."""
+    write_whole(path, lambda file: figure.savefig(file, format="png", dpi=200))

@@ -1,0 +1,158 @@
+"""A folder whose results belong to one configuration and are written by one process at a time."""
+
+import importlib.metadata
+import json
+import os
+import socket
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import filelock
+import jax
+import loky
+
+from jaxnbv.checks import InputError, require
+from jaxnbv.files import PARTIAL, make_folder, write_text
+
+# Of the files; those of format 1 do not say it, and hold neither index nor checksum.
+FORMAT = 2
+_LOCK = ".lock"
+
+
+def versions() -> dict[str, Any]:
+    """Versions of what the numbers depend on, the kind of device, and the cores that share a sum."""
+    names = ("jaxnbv", "jax", "jaxlib", "equinox", "optax", "optimistix", "numpy", "trimesh", "embreex")
+    made_by: dict[str, Any] = {name: importlib.metadata.version(name) for name in names}
+    return made_by | {"device": jax.devices()[0].device_kind, "cores": loky.cpu_count()}
+
+
+def differences(found: Any, asked: Any, name: str = "") -> list[str]:
+    """Where two descriptions differ, in words."""
+    if isinstance(found, dict) and isinstance(asked, dict):
+        keys = list(dict.fromkeys([*found, *asked]))
+        nested = (differences(found.get(key), asked.get(key), f"{name}.{key}".lstrip(".")) for key in keys)
+        return [difference for group in nested for difference in group]
+    return [] if found == asked else [f"{name}: {found} there, {asked} now"]
+
+
+def check_format(format: Any, file: Path) -> None:
+    """**Raises:** `ValueError` for a file of a format that is not known here."""
+    require(
+        format in range(1, FORMAT + 1),
+        f"{file} is of format {str(format)[:20]}; this version of jaxnbv reads up to {FORMAT}: install a newer one",
+    )
+
+
+def read_json(file: Path, problem: str, remedy: str) -> dict[str, Any]:
+    """What a JSON file holds.
+
+    **Raises:** `ValueError` that tells `problem` and `remedy`, unless that is an object.
+    """
+    try:
+        content = json.loads(file.read_bytes())
+    except (ValueError, OSError, RecursionError) as error:
+        raise InputError(f"{file} {problem} ({error}): {remedy}") from error
+    require(isinstance(content, dict), f"{file} {problem} (it holds a {type(content).__name__}): {remedy}")
+    return content
+
+
+class ResultFolder:
+    """A folder, and the configuration that its results have: a record, written with the first of them.
+
+    - `record`: the record's name; `results`: the pattern of the results' names.
+    - `config`: what JSON can say, see `jaxnbv.storage.describe`.
+    - `kind`: what the folder is for, such as "study".
+
+    **Raises:** `ValueError` if the folder cannot be made, or holds results of another configuration or other files.
+    """
+
+    def __init__(self, path: str | Path, record: str, results: str, config: dict[str, Any], kind: str):
+        self.path, self.config = make_folder(path), json.loads(json.dumps(config))
+        self.record, self.results, self.kind = self.path / record, results, kind
+        self.bound = False
+        self._check()
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """While this process writes results.
+
+        **Raises:** `ValueError` if another process does, or the folder cannot be written.
+        """
+        lock = filelock.FileLock(self.path / _LOCK, timeout=0)
+        try:
+            lock.acquire()
+        except filelock.Timeout as error:
+            raise InputError(
+                f"{self.path} is being written by {self._holder()}: wait until it ends, or choose another folder"
+            ) from error
+        except (OSError, NotImplementedError) as error:
+            raise InputError(f"cannot write in {self.path} ({error}): choose another place") from error
+        try:
+            # The same file: what another process reads when the lock is taken.
+            (self.path / _LOCK).write_text(f"process {os.getpid()} on {socket.gethostname()}")
+            for left in self.path.glob(f"*{PARTIAL}"):
+                if left.is_file():
+                    left.unlink()
+            # Another process may have written since this one looked.
+            self._check()
+            yield
+        finally:
+            lock.release()
+
+    def bind(self) -> None:
+        """Write the record, if it is not there, before the first result is."""
+        if not self.bound:
+            write_text(
+                self.record, json.dumps({"format": FORMAT, "config": self.config, "versions": versions()}, indent=2)
+            )
+            self.bound = True
+
+    def _holder(self) -> str:
+        try:
+            return (self.path / _LOCK).read_text() or "another process"
+        except OSError:
+            return "another process"
+
+    def _check(self) -> None:
+        has_results = any(self.path.glob(self.results))
+        if not self.record.exists():
+            names = sorted(entry.name for entry in self.path.iterdir() if not entry.name.endswith(PARTIAL))
+            foreign = [name for name in names if name != _LOCK]
+            require(
+                not foreign or self.kind == "study",
+                f"the output folder {self.path} holds other files ({', '.join(foreign[:3])}): choose an empty folder",
+            )
+            return
+        found, made_by = self._read_record()
+        # A record without results is of a run that did not come far; it binds nobody.
+        if not has_results:
+            return
+        changed = differences(found, self.config)
+        require(
+            not changed,
+            f"the output folder {self.path} belongs to another {self.kind}; it differs in {'; '.join(changed[:3])}. "
+            "Choose another folder, or the settings it was made with",
+        )
+        now = {key: value for key, value in versions().items() if key in made_by}
+        if made_by != now and not self.bound:
+            warnings.warn(
+                f"{self.path} was begun with other versions ({'; '.join(differences(made_by, now))}): "
+                "new results may differ in their last bits from those of an uninterrupted run",
+                stacklevel=3,
+            )
+        self.bound = True
+
+    def _read_record(self) -> tuple[Any, dict[str, Any]]:
+        """The configuration that was written, and the versions that wrote it."""
+        article = "an" if self.kind == "episode" else "a"
+        problem = f"is not {article} {self.kind}'s record"
+        written = read_json(self.record, problem, "choose another output folder")
+        check_format(written.pop("format", 1), self.record)
+        made_by = written.pop("versions", None)
+        # Studies of format 1 have no level of their own for it.
+        config = written.get("config", written if self.kind == "study" else None)
+        require(config is not None, f"{self.record} {problem} (it has no config): choose another output folder")
+        return config, made_by if isinstance(made_by, dict) else {}
