@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxnbv.answers import Answer, Quantity
 from jaxnbv.camera import Camera, Pose
-from jaxnbv.checks import InputError, require
+from jaxnbv.checks import InputError, check_fields, checked, require
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.scanning import GridSurface, scan
 
@@ -75,6 +75,10 @@ class ExpectedUtilityImprovement(Score):
 
     utility: Callable[[PointCloud], Float[Array, ""]]
     num_points: int | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        check_fields(self)
+        require(self.num_points is None or self.num_points >= 1, f"num_points is {self.num_points}; give at least 1")
 
     def context(self, cloud: PointCloud) -> tuple[PointCloud, Array]:
         """D, thinned, and u(D)."""
@@ -188,6 +192,7 @@ def check_differentiable(score: Score, capacity: int, num_rays: int) -> None:
         ) from error
 
 
+@checked
 def expected_score(
     score: Score, cloud: PointCloud, surfaces: GridSurface, camera: Camera, poses: Pose
 ) -> Float[Array, "poses *scores"]:

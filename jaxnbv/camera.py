@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.checks import AnyArray, as_floats, check_fields, checked, is_traced, require
 
 
 class Pose(eqx.Module):
@@ -29,15 +29,15 @@ class Pose(eqx.Module):
     position: Float[Array, "*batch 3"]
 
     def __init__(self, rotation: Float[AnyArray, "*batch 3 3"], position: Float[AnyArray, "*batch 3"]):
-        shapes = jnp.shape(rotation), jnp.shape(position)
+        rotation, position = as_floats(rotation, "the rotation"), as_floats(position, "the position")
+        shapes = rotation.shape, position.shape
         require(
             shapes[0][-2:] == (3, 3) and shapes[1][-1:] == (3,) and shapes[0][:-2] == shapes[1][:-1],
             f"a pose needs a rotation (..., 3, 3) and a position (..., 3), got {shapes[0]} and {shapes[1]}",
         )
         if not is_traced(rotation, position):
             _check_rigid(np.asarray(rotation), np.asarray(position))
-        self.rotation = jnp.asarray(rotation)
-        self.position = jnp.asarray(position)
+        self.rotation, self.position = rotation, position
 
     @property
     def forward(self) -> Float[Array, "*batch 3"]:
@@ -78,7 +78,10 @@ def look_at(
 
     **Raises:** `ValueError` for other shapes, if `position` equals `target`, or `up` is zero.
     """
-    position, target, up = (jnp.asarray(a, dtype=jnp.result_type(float)) for a in (position, target, up))
+    position, target, up = (
+        as_floats(value, f"look_at's {name}")
+        for value, name in ((position, "position"), (target, "target"), (up, "up"))
+    )
     require(
         position.shape[-1:] == target.shape == up.shape == (3,),
         f"look_at needs a position (..., 3), a target (3,) and an up (3,), got {position.shape}, {target.shape}, "
@@ -115,12 +118,10 @@ class Camera(eqx.Module):
     width: int = eqx.field(static=True, default=50)
 
     def __check_init__(self):
+        check_fields(self)
         require(0 < self.fov < math.pi, f"the field of view is {self.fov} rad; it must lie within (0, pi)")
         for side in (self.height, self.width):
-            require(
-                isinstance(side, int) and side >= 1,
-                f"the camera has {self.height} x {self.width} pixels; it needs whole numbers, at least one",
-            )
+            require(side >= 1, f"the camera has {self.height} x {self.width} pixels; it needs at least one")
 
     @property
     def num_rays(self) -> int:
@@ -147,6 +148,7 @@ class Camera(eqx.Module):
         return jnp.broadcast_to(pose.position[..., None, :], directions.shape), directions
 
 
+@checked
 def fibonacci_sphere(count: int, radius: float = 1.0, min_elevation: float = -0.5 * math.pi) -> Float[Array, "count 3"]:
     """`count` almost evenly spaced points on a sphere about the origin (spherical Fibonacci lattice; Gonzalez 2010).
 

@@ -1,12 +1,25 @@
 """Checks at the boundary: values are checked where they are known, and errors name the value and the remedy."""
 
+import dataclasses
+import functools
+import inspect
+import numbers
+import types
+from collections.abc import Callable
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxnbv.errors import InputError as InputError
 
 AnyArray = Array | np.ndarray
+_F = TypeVar("_F", bound=Callable[..., Any])
+_LONGEST_SHOWN = 60
+# Of 32 bits. What is larger is infinite there.
+_LARGEST = float(np.finfo(np.float32).max)
 
 
 def require(condition: bool | np.bool_, message: str) -> None:
@@ -18,3 +31,107 @@ def require(condition: bool | np.bool_, message: str) -> None:
 def is_traced(*trees) -> bool:
     """Whether any leaf is a tracer, that is, has no value yet because a JAX transformation is under way."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def check_fields(module: Any) -> None:
+    """Check what is annotated by a plain type: whole numbers, numbers, truths, text, and instances of classes.
+
+    To be called first in `__check_init__`, so that the checks after it compare numbers with numbers.
+
+    **Raises:** `ValueError` that names the field.
+    """
+    hints = get_type_hints(type(module))
+    for field in dataclasses.fields(module):
+        check_type(getattr(module, field.name, None), hints[field.name], f"{type(module).__name__}'s {field.name}")
+
+
+def checked(function: _F) -> _F:
+    """A function whose arguments are checked as the fields of a module are; nothing else is changed."""
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def call(*arguments: Any, **named: Any) -> Any:
+        bound = signature.bind(*arguments, **named)
+        hints = _hints(function)
+        for name, value in bound.arguments.items():
+            if name in hints:
+                owner = type(arguments[0]).__name__ if function.__name__ == "__init__" else function.__name__
+                check_type(value, hints[name], f"{owner}'s {name}")
+        return function(*arguments, **named)
+
+    return call  # type: ignore[return-value]
+
+
+@functools.cache
+def _hints(function: Callable[..., Any]) -> dict[str, Any]:
+    return get_type_hints(function)
+
+
+def check_type(value: Any, hint: Any, name: str) -> None:
+    """**Raises:** `ValueError` unless the value is what a plain type hint says; of other hints nothing is known."""
+    if hint is int:
+        whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+        require(whole, f"{name} is {shown(value)}; it must be a whole number")
+    elif hint is float:
+        require(_is_number(value), f"{name} is {shown(value)}; it must be a finite number")
+    elif hint is bool:
+        require(isinstance(value, bool | np.bool_), f"{name} is {shown(value)}; it must be True or False")
+    elif hint == tuple[float, float, float]:
+        three = isinstance(value, tuple | list) and len(value) == 3 and all(map(_is_number, value))
+        require(three, f"{name} is {shown(value)}; it must be three finite numbers")
+    elif isinstance(hint, types.UnionType) and type(None) in (kinds := get_args(hint)) and len(kinds) == 2:
+        if value is not None:
+            check_type(value, kinds[0] if kinds[1] is type(None) else kinds[1], name)
+    elif (kinds := _classes(hint)) and not isinstance(value, kinds):
+        wanted = " or ".join("None" if kind is type(None) else kind.__name__ for kind in kinds)
+        raise InputError(f"{name} is {shown(value)}; give {wanted}")
+    elif get_origin(hint) is Callable and not callable(value):
+        raise InputError(f"{name} is {shown(value)}; give a function")
+
+
+def as_floats(value: Any, name: str) -> Array:
+    """The numbers as an array of JAX's default floating-point type.
+
+    **Raises:** `ValueError` for what is not an array of numbers.
+    """
+    return jnp.asarray(value if is_traced(value) else as_numbers(value, name), dtype=jnp.result_type(float))
+
+
+def as_numbers(value: Any, name: str, dtype: Any = float) -> np.ndarray:
+    """The numbers as a NumPy array of this type: `float` is JAX's default one, None that which they have.
+
+    **Raises:** `ValueError` for what is not an array of numbers, and for a masked array of which something is masked.
+    """
+    masked = isinstance(value, np.ma.MaskedArray) and bool(np.ma.getmaskarray(value).any())
+    require(not masked, f"{name} is a masked array: give what is valid of it as a plain one")
+    try:
+        return np.asarray(value, dtype=jnp.result_type(float) if dtype is float else dtype)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{name} is {shown(value)}; give numbers") from error
+
+
+def shown(value: Any) -> str:
+    """A value in an error: short, and of an array its shape."""
+    if isinstance(value, AnyArray):
+        return f"an array of shape {value.shape} and type {value.dtype}" if value.ndim else str(value)
+    if isinstance(value, str | int | float | complex | tuple | list | dict | None):
+        text = repr(value)
+        return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
+    return f"a {type(value).__name__}" if not isinstance(value, type) else f"the class {value.__name__}"
+
+
+def _is_number(value: Any) -> bool:
+    if is_traced(value):
+        return np.ndim(value) == 0
+    if isinstance(value, AnyArray) and value.ndim == 0 and getattr(value.dtype, "kind", "") in ("i", "u", "f"):
+        value = float(value)
+    real = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    return real and abs(value) <= _LARGEST
+
+
+def _classes(hint: Any) -> tuple[type, ...]:
+    """The classes that a hint names, if it names classes alone."""
+    kinds = get_args(hint) if isinstance(hint, types.UnionType) or get_origin(hint) is Union else (hint,)
+    # A jaxtyping annotation is a class too; what it says of shapes is checked where it matters.
+    plain = all(isinstance(kind, type) and not hasattr(kind, "dim_str") and kind is not object for kind in kinds)
+    return kinds if plain else ()

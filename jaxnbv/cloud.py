@@ -10,7 +10,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.camera import Camera, Pose
-from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.checks import (
+    AnyArray,
+    as_floats,
+    as_numbers,
+    check_fields,
+    check_type,
+    checked,
+    is_traced,
+    require,
+)
 from jaxnbv.farthest import farthest_point_indices
 
 
@@ -45,12 +54,13 @@ class PointCloud(eqx.Module):
         **Raises:** `ValueError` for shapes other than (n, 3), no points at all, an entry that is not finite, a normal
         of length zero, or more points than the capacity.
         """
-        points, normals = (np.asarray(a, dtype=jnp.result_type(float)) for a in (points, normals))
+        points, normals = (as_numbers(rows, name) for rows, name in ((points, "points"), (normals, "normals")))
         require(
             points.ndim == 2 and points.shape[1] == 3 and points.shape == normals.shape,
             f"points and normals must both be (n, 3), got {points.shape} and {normals.shape}",
         )
         count = len(points)
+        check_type(capacity, int | None, "the capacity")
         capacity = count if capacity is None else capacity
         require(count > 0, "the cloud is empty: give at least one point and its normal")
         require(
@@ -64,7 +74,9 @@ class PointCloud(eqx.Module):
                 bad.size == 0,
                 f"{bad.size} of the {name} are not finite, the first at row {bad[:1]}: drop these rows",
             )
-        lengths = np.linalg.norm(normals, axis=1)
+        # Squares of numbers that are very large or small leave the range of float32.
+        largest = np.abs(normals).max(axis=1).astype(np.float64)
+        lengths = largest * np.linalg.norm(normals / np.where(largest > 0, largest, 1.0)[:, None], axis=1)
         zero = np.flatnonzero(lengths < 1e-12)
         require(
             zero.size == 0,
@@ -79,11 +91,12 @@ class PointCloud(eqx.Module):
         pad = ((0, capacity - count), (0, 0))
         return cls(
             jnp.asarray(np.pad(points, pad)),
-            jnp.asarray(np.pad(normals / lengths[:, None], pad)),
+            jnp.asarray(np.pad((normals / lengths[:, None]).astype(points.dtype), pad)),
             jnp.arange(capacity) < count,
         )
 
     @classmethod
+    @checked
     def from_depth(cls, depth: Float[AnyArray, "height width"], camera: Camera, pose: Pose) -> "PointCloud":
         """The cloud, in scene coordinates, that a depth image shows: one row a pixel, row by row.
 
@@ -101,7 +114,8 @@ class PointCloud(eqx.Module):
             f"the depth image is {jnp.shape(depth)} but the camera has {shape} pixels: "
             "give Camera(height=..., width=...) of the image",
         )
-        depth = jnp.asarray(depth, dtype=jnp.result_type(float))
+        require(pose.position.ndim == 1, f"the pose is a batch {pose.position.shape[:-1]}: give one, poses[0] say")
+        depth = as_floats(depth, "the depth image")
         valid = jnp.isfinite(depth) & (depth > 0)
         local = jnp.where(valid, depth, 0.0)[..., None] * camera.pixel_directions().reshape(*shape, 3)
         down, has_down = _one_sided_difference(local, valid, axis=0)
@@ -154,6 +168,7 @@ def _one_sided_difference(points: Float[Array, "h w 3"], valid: Bool[Array, "h w
     return difference, jnp.isfinite(jnp.minimum(size_back, size_ahead))
 
 
+@checked
 def concatenate(first: PointCloud, second: PointCloud) -> PointCloud:
     """The union D u D' of the paper, with the capacities added; rows keep their places. It is no sensor's image."""
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=0), _without_rays(first), _without_rays(second))
@@ -163,6 +178,7 @@ def _without_rays(cloud: PointCloud) -> PointCloud:
     return PointCloud(cloud.points, cloud.normals, cloud.mask)
 
 
+@checked
 @functools.partial(jax.jit, static_argnames="count")
 def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
     """`count` points, each as far as can be from those chosen before it, in order of choice (Eldar et al. 1997).
@@ -213,15 +229,18 @@ class Frame(eqx.Module):
     center: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __check_init__(self):
+        check_fields(self)
         require(self.scale > 0, f"the frame's scale is {self.scale}; it must be positive")
 
     @classmethod
+    @checked
     def fit(cls, points: Float[AnyArray, "n 3"], longest_side: float = 2.5) -> "Frame":
         """The frame in which the points' bounding box is centred and its longest side is `longest_side`.
 
         **Raises:** `ValueError` if there are no points, or they all coincide, or one is not finite.
         """
-        points = np.asarray(points, dtype=np.float64)
+        points = as_numbers(points, "points", np.float64)
+        require(points.ndim == 2 and points.shape[1] == 3, f"the points must be (n, 3), got {points.shape}")
         require(len(points) > 0, "cannot fit a frame to no points: give the points of the object")
         require(bool(np.isfinite(points).all()), "cannot fit a frame to points that are not finite: drop them first")
         low, high = points.min(axis=0), points.max(axis=0)

@@ -14,7 +14,7 @@ from jaxtyping import PRNGKeyArray
 from tqdm import tqdm
 
 from jaxnbv.camera import Camera, Pose
-from jaxnbv.checks import require
+from jaxnbv.checks import checked, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.planner import Planner, State
 from jaxnbv.scanning import GridSurface, SensorNoise, Surface, scan
@@ -87,6 +87,7 @@ def _config(planner: Planner, scene: Surface, noise: SensorNoise, first: Pose, k
     return describe({"planner": planner, "scene": scene, "noise": noise, "first": first, "key": key})
 
 
+@checked
 def simulate(
     planner: Planner,
     scene: Surface,

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxnbv.acquisition import Score
 from jaxnbv.camera import Camera, Pose
-from jaxnbv.checks import is_traced, require
+from jaxnbv.checks import check_fields, check_type, is_traced, require
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.scanning import Carving, Grid, GridSurface, carve, check_image
 from jaxnbv.search import Problem, Proposal, Search
@@ -62,9 +62,10 @@ class Planner(eqx.Module):
     carving: Carving | None = Carving()
 
     def __check_init__(self):
+        check_fields(self)
         for name in ("num_samples", "capacity", "max_views"):
             value = getattr(self, name)
-            require(isinstance(value, int) and value >= 1, f"{name} is {value}; it must be a whole number, at least 1")
+            require(value >= 1, f"{name} is {value}; it must be at least 1")
         self.search.check(self.acquisition, self.camera, self.capacity)
 
     def init(self, cloud: PointCloud, pose: Pose | None = None, camera: Camera | None = None) -> State:
@@ -194,6 +195,8 @@ class Planner(eqx.Module):
         return state.seen_empty
 
     def _check_scan(self, scan: PointCloud, pose: Pose | None, camera: Camera, first: bool) -> None:
+        for value, hint, name in ((scan, PointCloud, "scan"), (pose, Pose | None, "pose"), (camera, Camera, "camera")):
+            check_type(value, hint, f"the {name}")
         if is_traced(scan, pose):
             return
         points, normals = scan.to_numpy()

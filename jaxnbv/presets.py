@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from jaxnbv.checks import require
+from jaxnbv.checks import checked, require
 from jaxnbv.model_name import ModelName as ModelName
 from jaxnbv.scanning import Carving
 from jaxnbv.surfaces import (
@@ -25,6 +25,7 @@ class Imagination(NamedTuple):
     carving: Carving | None
 
 
+@checked
 def imagination(
     name: ModelName | str,
     longest_side: float = 2.5,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxnbv.checks import InputError, require
+from jaxnbv.checks import InputError, checked, require
 from jaxnbv.cloud import Frame, PointCloud
 from jaxnbv.scanning import Grid, TriangleMesh
 from jaxnbv.scanning.mesh import level_triangles
@@ -12,6 +12,7 @@ from jaxnbv.surfaces import SurfaceModel
 _FEWEST_POINTS = 4
 
 
+@checked
 def mean_mesh(model: SurfaceModel, cloud: PointCloud, grid: Grid = Grid()) -> TriangleMesh:
     """The surface where the posterior mean equals its level, {x : E f(x) = level}, by marching cubes on a grid.
 
@@ -42,6 +43,7 @@ def has_poisson() -> bool:
     return True
 
 
+@checked
 def screened_poisson(cloud: PointCloud, depth: int = 8) -> TriangleMesh:
     """Screened Poisson surface reconstruction (Kazhdan and Hoppe 2013) of an oriented cloud, as MeshLab has it.
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxnbv.camera import fibonacci_sphere
-from jaxnbv.checks import AnyArray, require
+from jaxnbv.checks import AnyArray, InputError, require, shown
 
 Volume = Callable[[Float[Array, "n 3"]], Float[Array, " n"]]
 """A function of points (scene coordinates): negative inside the volume, positive outside, at most the distance to its
@@ -21,7 +21,10 @@ _FAR = 3.0
 
 
 def _corner(values) -> tuple[float, ...]:
-    return tuple(float(value) for value in values)
+    try:
+        return tuple(float(value) for value in values)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"a corner of a box is {shown(values)}; give three numbers") from error
 
 
 class Box(eqx.Module):

@@ -48,6 +48,20 @@ def test_bad_input_is_refused_with_value_and_remedy(points, normals, capacity, v
     assert error.match(remedy)
 
 
+@pytest.mark.parametrize("length", [1e30, 3e38, 1e-11])
+def test_normals_of_extreme_lengths_keep_their_direction(length):
+    with pytest.warns(UserWarning, match="they were normalised"):
+        cloud = PointCloud.from_arrays(GOOD, length * np.array([[0.6, 0.8, 0.0], [0.0, 0.6, -0.8]]))
+    np.testing.assert_allclose(cloud.normals, [[0.6, 0.8, 0.0], [0.0, 0.6, -0.8]], rtol=1e-6)
+
+
+def test_masked_rows_are_not_taken_for_data():
+    points = np.ma.masked_array(GOOD, [[False] * 3, [True] * 3])
+    with pytest.raises(ValueError, match="points is a masked array: give what is valid"):
+        PointCloud.from_arrays(points, UP)
+    np.testing.assert_array_equal(PointCloud.from_arrays(np.ma.masked_array(GOOD), UP).points, np.float32(GOOD))
+
+
 def test_normals_of_other_lengths_are_normalised_with_a_warning():
     with pytest.warns(UserWarning, match=r"row 1: 5.*normalised"):
         cloud = PointCloud.from_arrays(GOOD, [[0.0, 1.0, 0.0], [3.0, 0.0, -4.0]])

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import require
+from jaxnbv.checks import check_fields, require
 from jaxnbv.cloud import PointCloud, farthest_point_subsample
 from jaxnbv.networks.compact_segmenter import CompactPartSegmenter
 from jaxnbv.networks.part_segmentation import PointNet2PartSegmenter
@@ -32,6 +32,7 @@ class CloudClassifier(eqx.Module):
             self.classes = getattr(self.network, "classes", None)
 
     def __check_init__(self):
+        check_fields(self)
         parts = isinstance(self.network, PointNet2PartSegmenter | CompactPartSegmenter)
         require(not parts, "the network segments parts; a CloudSegmenter feeds it clouds")
         require(self.num_points >= 1, f"num_points is {self.num_points}; the network needs at least one")

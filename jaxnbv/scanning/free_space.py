@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.camera import Camera, Pose
-from jaxnbv.checks import require
+from jaxnbv.checks import check_fields, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.surfaces import EmptyPoints
@@ -43,6 +43,7 @@ class Carving(eqx.Module):
     margin: float = eqx.field(static=True, default=1.0)
 
     def __check_init__(self):
+        check_fields(self)
         require(
             0.5 <= self.margin < math.inf,
             f"the margin of the carving is {self.margin} voxels; it must be finite and at least 0.5",

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int8
 
 from jaxnbv.camera import Camera, Pose
-from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.checks import AnyArray, check_fields, is_traced, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.scanning import tracing
 from jaxnbv.scanning.scanner import scan
@@ -26,6 +26,7 @@ class Grid(eqx.Module):
     half_extent: float = eqx.field(static=True, default=1.75)
 
     def __check_init__(self):
+        check_fields(self)
         require(self.resolution >= 4, f"a grid of {self.resolution}^3 nodes is too small; it needs at least 4^3")
         require(self.half_extent > 0, f"the grid's half extent is {self.half_extent}; it must be positive")
 

@@ -15,7 +15,7 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 from skimage.measure import marching_cubes
 
-from jaxnbv.checks import AnyArray, InputError, is_traced, require
+from jaxnbv.checks import AnyArray, InputError, as_numbers, checked, is_traced, require
 from jaxnbv.cloud import Frame
 from jaxnbv.scanning.grid import Grid, GridSurface
 from jaxnbv.scanning.sdf import SignedDistance
@@ -70,7 +70,8 @@ class TriangleMesh(Surface):
         **Raises:** `ValueError` for other shapes, no faces, indices that are not integers or out of range, vertices
         that are not finite, or no face of positive area.
         """
-        vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
+        vertices = as_numbers(vertices, "the mesh's vertices", np.float64)
+        faces = as_numbers(faces, "the mesh's faces", None)
         require(
             faces.size > 0,
             "the mesh has no faces: a point cloud or an empty file cannot be scanned; give a triangle mesh",
@@ -173,6 +174,7 @@ class TriangleMesh(Surface):
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
 
+@checked
 def load_mesh(path: str | Path) -> TriangleMesh:
     """The mesh in a file of any format that trimesh reads; a scene's geometries are joined where it places them.
 
@@ -209,6 +211,7 @@ def level_triangles(
     return vertices - grid.half_extent, faces, -normals / lengths
 
 
+@checked
 def mesh_from_sdf(sdf: SignedDistance, grid: Grid) -> TriangleMesh:
     """The surface of a solid as triangles in scene coordinates (the frame is the identity), by marching cubes.
 

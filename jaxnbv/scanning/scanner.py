@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
 from jaxnbv.camera import Camera, Pose
-from jaxnbv.checks import require
+from jaxnbv.checks import check_fields, checked, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.scanning.surface import Surface
 
@@ -26,6 +26,7 @@ class SensorNoise(eqx.Module):
     normals: float = eqx.field(static=True, default=0.01)
 
     def __check_init__(self):
+        check_fields(self)
         require(
             0 <= self.points < math.inf and 0 <= self.normals < math.inf,
             f"the noise's standard deviations are {self.points} and {self.normals}; "
@@ -42,6 +43,7 @@ class SensorNoise(eqx.Module):
         return PointCloud(jnp.where(mask, points, 0.0), jnp.where(mask, normals, 0.0), cloud.mask, cloud.missed)
 
 
+@checked
 def scan(surface: Surface, camera: Camera, pose: Pose) -> PointCloud:
     """What the camera sees of the surface from a pose: one row a pixel, missed where its ray hits nothing.
 

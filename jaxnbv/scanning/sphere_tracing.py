@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxnbv.checks import AnyArray, require
+from jaxnbv.checks import AnyArray, check_fields, require
 from jaxnbv.scanning.implicit import implicit_depth
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.scanning.surface import Hits, Surface
@@ -48,6 +48,7 @@ class SDFSurface(Surface):
     in_jit: ClassVar[bool] = True
 
     def __check_init__(self):
+        check_fields(self)
         require(self.bounding_radius > 0, f"the bounding radius is {self.bounding_radius}; it must be positive")
 
     @eqx.filter_jit

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxnbv.acquisition import Score, check_differentiable
 from jaxnbv.camera import Camera, Pose
-from jaxnbv.checks import require
+from jaxnbv.checks import check_fields, require
 from jaxnbv.search.base import Problem, Proposal, Trajectories, best_unvisited
 from jaxnbv.search.pose_space import PoseSpace
 
@@ -38,9 +38,10 @@ class Ascent(eqx.Module):
     solver: optx.AbstractMinimiser | None = None
 
     def __check_init__(self):
+        check_fields(self)
         for name in ("num_starts", "iterations"):
             value = getattr(self, name)
-            require(isinstance(value, int) and value >= 1, f"{name} is {value}; it must be a whole number, at least 1")
+            require(value >= 1, f"{name} is {value}; it must be at least 1")
         require(
             0 < self.learning_rate < math.inf,
             f"the learning rate is {self.learning_rate}; it must be positive and finite, such as 0.01",

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray
 
 from jaxnbv.camera import Pose, fibonacci_sphere, look_at
-from jaxnbv.checks import AnyArray, InputError, require
+from jaxnbv.checks import AnyArray, InputError, check_fields, require, shown
 from jaxnbv.search.rotations import rotation_between, rotation_from_6d
 from jaxnbv.sensors import SENSOR_RADIUS
 
@@ -57,8 +57,8 @@ class SphereCandidates(Candidates):
     up: tuple[float, float, float] = eqx.field(static=True, default=(0.0, 1.0, 0.0))
 
     def __check_init__(self):
-        whole = isinstance(self.number, int) and self.number >= 1
-        require(whole, f"the search has {self.number} candidates; it needs a whole number, at least one")
+        check_fields(self)
+        require(self.number >= 1, f"the search has {self.number} candidates; it needs at least one")
         require(0 < self.radius < math.inf, f"the candidates' sphere has radius {self.radius}; it must be positive")
         require(
             -0.5 * math.pi <= self.min_elevation < 0.5 * math.pi,
@@ -93,6 +93,7 @@ class GivenPoses(Candidates):
     given: Pose
 
     def __check_init__(self):
+        check_fields(self)
         shape = jnp.shape(self.given.position)
         require(len(shape) == 2 and shape[0] >= 1, f"the poses have shape {shape[:-1]}; give a batch (n,) of them")
 
@@ -113,9 +114,9 @@ def as_candidates(value: object) -> Candidates:
         return value
     if isinstance(value, Pose):
         return GivenPoses(value)
-    if isinstance(value, int):
+    if isinstance(value, int) and not isinstance(value, bool):
         return SphereCandidates(value)
-    raise InputError(f"the candidates are {value!r}: give how many, a batch of poses, or SphereCandidates(...)")
+    raise InputError(f"the candidates are {shown(value)}: give how many, a batch of poses, or SphereCandidates(...)")
 
 
 def sphere_candidates(count: int, radius: float = SENSOR_RADIUS) -> Pose:

@@ -8,7 +8,7 @@ from jaxtyping import PRNGKeyArray
 
 from jaxnbv.acquisition import Score
 from jaxnbv.camera import Camera, Pose
-from jaxnbv.checks import require
+from jaxnbv.checks import check_fields, checked, require
 from jaxnbv.search.ascent import Ascent
 from jaxnbv.search.base import Problem, Proposal, Search
 from jaxnbv.search.candidates import Candidates, as_candidates
@@ -40,6 +40,7 @@ class GradientSearch(Search):
     turned: bool = eqx.field(static=True)
     uses_samples: ClassVar[bool] = True
 
+    @checked
     def __init__(
         self,
         dof: int | None = None,
@@ -104,8 +105,8 @@ class SpaceCandidates(Candidates):
     number: int = eqx.field(static=True)
 
     def __check_init__(self):
-        whole = isinstance(self.number, int) and self.number >= 1
-        require(whole, f"the search has {self.number} candidates; it needs a whole number, at least one")
+        check_fields(self)
+        require(self.number >= 1, f"the search has {self.number} candidates; it needs at least one")
 
     @property
     def count(self) -> int:

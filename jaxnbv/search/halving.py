@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
-from jaxnbv.checks import require
+from jaxnbv.checks import check_fields, require
 from jaxnbv.search.base import CandidateSearch, Problem, Proposal
 
 
@@ -26,6 +26,7 @@ class HalvingSearch(CandidateSearch):
     uses_samples: ClassVar[bool] = True
 
     def __check_init__(self):
+        check_fields(self)
         require(self.first_samples >= 1, f"first_samples is {self.first_samples}; candidates need at least one")
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.camera import Camera, Pose
-from jaxnbv.checks import require
+from jaxnbv.checks import check_fields, require
 from jaxnbv.search.candidates import SphereCandidates
 from jaxnbv.search.rotations import normalise, rotation_between, rotation_from_6d, rotation_to_6d
 from jaxnbv.sensors import SENSOR_RADIUS
@@ -57,6 +57,7 @@ class SpherePoses(PoseSpace):
     num_parameters: ClassVar[int] = 3
 
     def __check_init__(self):
+        check_fields(self)
         require(0 < self.radius < math.inf, f"the sphere's radius is {self.radius}; it must be positive and finite")
 
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
@@ -83,6 +84,7 @@ class FreePoses(PoseSpace):
     num_parameters: ClassVar[int] = 9
 
     def __check_init__(self):
+        check_fields(self)
         require(0 < self.radius < math.inf, f"the radius is {self.radius}; it must be positive and finite")
 
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
@@ -115,6 +117,7 @@ class ConstrainedPoses(PoseSpace):
     num_parameters: ClassVar[int] = 8
 
     def __check_init__(self):
+        check_fields(self)
         require(
             0 < self.nearest < self.farthest < math.inf,
             f"the camera's distance must range from nearest > 0 to a finite farthest beyond it, not from "

@@ -1,15 +1,42 @@
 """What the rest of the library asks of a distribution over implicit surfaces: condition it, and sample."""
 
+import functools
+import math
 from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from jaxnbv.checks import AnyArray
+from jaxnbv.checks import AnyArray, is_traced, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.tensor_grid import on_tensor_grid
+
+HALF_WIDTH = 0.5 * math.pi
+"""Scattered points must lie in [-HALF_WIDTH, HALF_WIDTH]^3, the cube that the paper scales a scene into."""
+
+
+def on_torus(method: Callable[..., Any]) -> Callable[..., Any]:
+    """A method of points, which must lie on the torus, [-pi, pi]^3: beyond it functions only repeat. Its eighth in the
+    middle is the scene; outside that nothing is known but that the surface does not lie there."""
+
+    @functools.wraps(method)
+    def call(self: Any, *points: Any) -> Any:
+        for x in points:
+            if not is_traced(x, self) and np.size(x):
+                furthest = float(np.abs(np.asarray(x)).max())
+                require(
+                    furthest <= 2.0 * HALF_WIDTH + 1e-6,
+                    f"a point has a coordinate of {furthest:.4g}, outside [-pi, pi]^3, where surfaces only repeat; the "
+                    "scene is [-pi/2, pi/2]^3: bring the points there with Frame.to_scene",
+                )
+        return method(self, *points)
+
+    return call
 
 
 class Fields(eqx.Module):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import PRNGKeyArray
 
-from jaxnbv.checks import require
+from jaxnbv.checks import checked, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.surfaces.screened import ScreenedSPSR
 from jaxnbv.surfaces.spsr import GeometricSPSR
@@ -18,6 +18,7 @@ Model = TypeVar("Model", GeometricSPSR, ScreenedSPSR)
 _TOLERANCE = 3e-3
 
 
+@checked
 def fit_hyperparameters(
     model: Model, cloud: PointCloud, key: PRNGKeyArray, num_points: int = 400, max_steps: int = 60
 ) -> Model:

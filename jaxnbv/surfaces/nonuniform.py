@@ -15,10 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.special import i0
 
+from jaxnbv.surfaces.base import HALF_WIDTH
 from jaxnbv.surfaces.trigonometric import circle_basis, evaluate_on_grid
-
-HALF_WIDTH = 0.5 * math.pi
-"""Scattered points must lie in [-HALF_WIDTH, HALF_WIDTH]^3, the cube that the paper scales a scene into."""
 
 
 class NonuniformTransform(eqx.Module):

@@ -20,9 +20,9 @@ import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.checks import AnyArray, check_fields, is_traced, require, shown
 from jaxnbv.cloud import PointCloud
-from jaxnbv.surfaces.base import EmptyPoints, SurfaceModel
+from jaxnbv.surfaces.base import EmptyPoints, SurfaceModel, on_torus
 from jaxnbv.surfaces.covariance import function_covariance, function_variance
 from jaxnbv.surfaces.nonuniform import NonuniformTransform
 from jaxnbv.surfaces.spsr import GeometricSPSR, GeometricSPSRPosterior, mode_variance
@@ -61,6 +61,9 @@ class ScreenedSPSR(SurfaceModel):
     reach: float = eqx.field(static=True, default=0.1)
 
     def __check_init__(self):
+        check_fields(self)
+        known = isinstance(self.values, tuple) and all(isinstance(value, ValueSource) for value in self.values)
+        require(known, f"the values are {shown(self.values)}; give a tuple such as (OutsideBoundary(), OnSurface())")
         require(len(self.values) > 0, "no values are given: name some, such as OutsideBoundary(), or use GeometricSPSR")
         for name in ("level_deviation", "reach"):
             value = getattr(self, name)
@@ -145,6 +148,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
     factor: Float[Array, "m m"]
     weights: Float[Array, " m"]
 
+    @on_torus
     @eqx.filter_jit
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
         """Var g(x) at points in scene coordinates."""
@@ -158,6 +162,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         chunk = max(1, min(x.shape[0], _CHUNK_VALUES // self.base.cloud.capacity))
         return jax.lax.map(at_point, x, batch_size=chunk)
 
+    @on_torus
     @eqx.filter_jit
     def covariance(self, x: Float[AnyArray, "n 3"], y: Float[AnyArray, "m 3"]) -> Float[Array, "n m"]:
         """Cov(g(x), g(y)) between points in scene coordinates, all at once."""

@@ -24,9 +24,9 @@ import numpy as np
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.checks import AnyArray, as_floats, check_type, is_traced, require
 from jaxnbv.cloud import PointCloud
-from jaxnbv.surfaces.base import SurfaceModel
+from jaxnbv.surfaces.base import HALF_WIDTH, SurfaceModel, on_torus
 from jaxnbv.surfaces.covariance import (
     Spectra,
     function_covariance,
@@ -35,11 +35,13 @@ from jaxnbv.surfaces.covariance import (
     normal_covariance,
 )
 from jaxnbv.surfaces.matern import Scalar, circle_spectrum
-from jaxnbv.surfaces.nonuniform import HALF_WIDTH, NonuniformTransform
+from jaxnbv.surfaces.nonuniform import NonuniformTransform
 from jaxnbv.surfaces.trigonometric import TrigonometricFields, TrigonometricPosterior, basis_variance, solve_poisson
 
 _CHUNK_VALUES = 2**24
 _ALWAYS_WHOLE = 1024
+# Draws of the prior are not of unit length either, and a model may be conditioned on them.
+_LONGEST_NORMAL = 10.0
 
 # Numbers and tuples are converted on the way in, which mypy cannot see.
 if TYPE_CHECKING:
@@ -49,7 +51,7 @@ else:
 
 
 def _to_float(value) -> Float[Array, "*scales"]:
-    return jnp.asarray(value, dtype=jnp.result_type(float))
+    return as_floats(value, "a hyperparameter")
 
 
 class GeometricSPSR(SurfaceModel):
@@ -76,9 +78,10 @@ class GeometricSPSR(SurfaceModel):
     nu: float = eqx.field(static=True, default=1.5)
 
     def __check_init__(self):
+        check_type(self.nu, float, "nu")
         require(self.nu in (0.5, 1.5, 2.5), f"nu is {self.nu}; it must be 0.5, 1.5 or 2.5")
-        whole = isinstance(self.truncation, int) and self.truncation >= 1
-        require(whole, f"the truncation is {self.truncation}; it must be a whole number, at least 1")
+        check_type(self.truncation, int, "the truncation")
+        require(self.truncation >= 1, f"the truncation is {self.truncation}; it must be a whole number, at least 1")
         shapes = jnp.shape(self.lengthscale), jnp.shape(self.variance)
         require(
             shapes[0] == shapes[1] and len(shapes[0]) <= 1 and jnp.size(self.lengthscale) >= 1,
@@ -116,12 +119,13 @@ class GeometricSPSR(SurfaceModel):
     def condition(self, cloud: PointCloud) -> "GeometricSPSRPosterior":
         """p(f | D). The cost is that of a Cholesky factorisation of the cloud's capacity.
 
-        **Raises:** `ValueError` if the cloud is empty, has entries that are not finite or leaves [-pi/2, pi/2]^3
+        **Raises:** `ValueError` if the cloud is empty, has entries that are not finite, a normal longer than
+        10 or points outside [-pi/2, pi/2]^3
         (scene coordinates), or if A is singular in the precision at hand; under `jit` values are not known and are not
         checked.
         """
         if not is_traced(cloud):
-            _check_in_scene(cloud)
+            _check_on_torus(cloud)
         posterior = _condition(self, cloud)
         if not is_traced(posterior.level):
             require(
@@ -132,11 +136,18 @@ class GeometricSPSR(SurfaceModel):
         return posterior
 
 
-def _check_in_scene(cloud: PointCloud) -> None:
+def _check_on_torus(cloud: PointCloud) -> None:
+    check_type(cloud, PointCloud, "the cloud")
     points, normals = cloud.to_numpy()
     require(len(points) > 0, "cannot condition on an empty cloud: scan the object at least once")
     finite = np.isfinite(points).all() and np.isfinite(normals).all()
     require(finite, "the cloud has points or normals that are not finite: build it with PointCloud.from_arrays")
+    longest = float(np.linalg.norm(normals, axis=1).max())
+    require(
+        longest <= _LONGEST_NORMAL,
+        f"a normal has length {longest:.4g} and should be of unit length: build the cloud with PointCloud.from_arrays, "
+        "which normalises",
+    )
     furthest = float(np.abs(points).max())
     require(
         furthest <= float(points.dtype.type(HALF_WIDTH)),
@@ -224,6 +235,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
     cholesky: Float[Array, "n n"]
     weights: Float[Array, "n 3"]
 
+    @on_torus
     @eqx.filter_jit
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
         """Var f(x) at points in scene coordinates. The cost grows with (number of points) x (capacity)^2."""
@@ -236,6 +248,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         chunk = max(1, min(x.shape[0], _CHUNK_VALUES // self.cloud.capacity))
         return jax.lax.map(lambda point: at_points(point[None])[0], x, batch_size=chunk)
 
+    @on_torus
     @eqx.filter_jit
     def covariance(self, x: Float[AnyArray, "n 3"], y: Float[AnyArray, "m 3"]) -> Float[Array, "n m"]:
         """Cov(f(x), f(y)) between points in scene coordinates, all at once."""

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnbv.checks import AnyArray
-from jaxnbv.surfaces.base import Fields, SurfacePosterior
+from jaxnbv.surfaces.base import Fields, SurfacePosterior, on_torus
 
 _CHUNK_VALUES = 2**24
 
@@ -74,6 +74,7 @@ class TrigonometricFields(Fields):
 
     coefficients: Float[Array, "s a a a"]
 
+    @on_torus
     def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
         """All functions at the points x (scene coordinates): one matrix product over the first axis of frequencies."""
         x = jnp.asarray(x, dtype=self.coefficients.dtype)
@@ -106,6 +107,7 @@ class TrigonometricPosterior(SurfacePosterior):
         """E f as a single field."""
         return TrigonometricFields(self.mean_coefficients[None])
 
+    @on_torus
     @eqx.filter_jit
     def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
         """E f(x) at points in scene coordinates."""

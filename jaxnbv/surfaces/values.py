@@ -12,11 +12,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxnbv.checks import is_traced, require
+from jaxnbv.checks import InputError, check_fields, is_traced, require, shown
 from jaxnbv.cloud import PointCloud, farthest_point_subsample
 from jaxnbv.farthest import farthest_point_indices
-from jaxnbv.surfaces.base import EmptyPoints
-from jaxnbv.surfaces.nonuniform import HALF_WIDTH
+from jaxnbv.surfaces.base import HALF_WIDTH, EmptyPoints
 from jaxnbv.volume import Box, Volume, boundary_points
 
 
@@ -58,12 +57,19 @@ class OutsideBoundary(ValueSource):
     noise: float = eqx.field(static=True, default=0.5)
 
     def __check_init__(self):
+        check_fields(self)
         _check(self.count, self.noise)
         if is_traced(self.volume):
             return
         with jax.ensure_compile_time_eval():
-            farthest = float(jnp.abs(boundary_points(self.volume, self.count)).max())
-            middle = float(self.volume(jnp.zeros((1, 3)))[0])
+            try:
+                farthest = float(jnp.abs(boundary_points(self.volume, self.count)).max())
+                middle = float(self.volume(jnp.zeros((1, 3)))[0])
+            except Exception as error:
+                raise InputError(
+                    f"the volume {shown(self.volume)} gives no signed distances of points (n, 3) ({error}): "
+                    "give a Box or a solid of jaxnbv.sdf"
+                ) from error
         require(middle < 0, f"the volume {self.volume} must enclose the origin, whose distance is {middle:.4g}")
         require(
             farthest <= HALF_WIDTH,
@@ -90,6 +96,7 @@ class OnSurface(ValueSource):
     noise: float = eqx.field(static=True, default=0.1)
 
     def __check_init__(self):
+        check_fields(self)
         _check(self.count, self.noise)
 
     def rows(self, cloud: PointCloud, empty: EmptyPoints) -> ValueRows:
@@ -115,6 +122,7 @@ class Thickness(ValueSource):
     noise: float = eqx.field(static=True, default=1.0)
 
     def __check_init__(self):
+        check_fields(self)
         _check(self.count, self.noise)
         require(self.depth > 0, f"the depth of the thickness is {self.depth}; it must be positive")
 
@@ -142,6 +150,7 @@ class SeenEmpty(ValueSource):
     noise: float = eqx.field(static=True, default=1.0)
 
     def __check_init__(self):
+        check_fields(self)
         _check(self.count, self.noise)
 
     def rows(self, cloud: PointCloud, empty: EmptyPoints) -> ValueRows:
@@ -167,5 +176,5 @@ def _rows(points, value: float, noise: float, mask) -> ValueRows:
 
 
 def _check(count: int, noise: float) -> None:
-    require(isinstance(count, int) and count >= 1, f"the number of values is {count}; it must be at least 1")
+    require(count >= 1, f"the number of values is {count}; it must be at least 1")
     require(0 < noise < math.inf, f"the noise of the values is {noise}; it must be positive and finite")

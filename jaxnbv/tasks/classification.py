@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from jaxnbv.acquisition import Score, context_of, preferred_batch_size, zero_if_empty
 from jaxnbv.answers import Answer, Quantity
-from jaxnbv.checks import require
+from jaxnbv.checks import check_fields, require
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
 
 Classifier: TypeAlias = Callable[[PointCloud], Float[Array, " classes"]]
@@ -126,6 +126,7 @@ class MixedEntropy(ClassScore):
     num_points: int = eqx.field(static=True, default=1024)
 
     def __check_init__(self):
+        check_fields(self)
         require(self.threshold >= 0, f"the entropy's threshold is {self.threshold}; it must not be negative")
 
     def __call__(self, context: Context, scan: PointCloud) -> Float[Array, ""]:

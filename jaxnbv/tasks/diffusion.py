@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import robust_laplacian
 from jax import Array
@@ -19,7 +18,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
-from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.checks import AnyArray, as_numbers, check_fields, is_traced, require
 
 # A point's neighbours in its local triangulation: what Sharp and Crane use.
 _NEIGHBOURS = 30
@@ -27,7 +26,7 @@ _NEIGHBOURS = 30
 
 def _array(source) -> AnyArray:
     # Stays off JAX's devices, which worker processes have no use for.
-    return source if isinstance(source, Array) else np.asarray(source, jnp.result_type(float))
+    return source if isinstance(source, Array) else as_numbers(source, "the heat source")
 
 
 class HeatProblem(eqx.Module):
@@ -53,6 +52,7 @@ class HeatProblem(eqx.Module):
     initial: float = eqx.field(static=True, default=0.0)
 
     def __check_init__(self):
+        check_fields(self)
         if not is_traced(self.source):
             require(
                 self.source.shape == (3,) and bool(np.isfinite(self.source).all()),
@@ -65,8 +65,8 @@ class HeatProblem(eqx.Module):
             value = getattr(self, name)
             require(bool(np.isfinite(value)), f"the heat problem's {name} is {value}; it must be finite")
         require(
-            isinstance(self.steps, int) and self.steps >= 1,
-            f"the number of time steps is {self.steps}; it must be a whole number, at least 1",
+            self.steps >= 1,
+            f"the number of time steps is {self.steps}; it must be at least 1",
         )
 
     @property

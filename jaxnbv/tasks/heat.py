@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from loky import cpu_count, get_reusable_executor
 
 from jaxnbv.answers import Answer, Quantity, coordinates, number
-from jaxnbv.checks import AnyArray, InputError, require
+from jaxnbv.checks import AnyArray, InputError, as_numbers, checked, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.tasks.diffusion import HeatProblem, Temperature, cloud_temperature, mesh_temperature, refine
@@ -52,6 +52,7 @@ class ColdestPoint(eqx.Module):
     workers: int = eqx.field(static=True)
     batch_size: ClassVar[int] = 128
 
+    @checked
     def __init__(
         self,
         source: Float[AnyArray, "3"] | Sequence[float] | HeatProblem,
@@ -70,7 +71,7 @@ class ColdestPoint(eqx.Module):
             require(not twice, "the heat is told twice: power, T, steps, u0 and radius are those of the HeatProblem")
             self.heat = source
         else:
-            place = np.asarray(source) if isinstance(source, Sequence) else source
+            place = source if isinstance(source, Array) else as_numbers(source, "the heat source")
             self.heat = HeatProblem(place, radius, power, T, steps, u0)
         self.reached_only, self.workers = reached_only, workers
 
@@ -154,6 +155,7 @@ class Coldest(NamedTuple):
     temperature: float
 
 
+@checked
 def coldest_point(body: PointCloud | TriangleMesh, heat: HeatProblem, reached_only: bool = False) -> Coldest:
     """The coldest point of a cloud, which is the estimate, or of a mesh, which is the truth; the first of equals.
 

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Shaped
 
-from jaxnbv.checks import InputError, require
+from jaxnbv.checks import InputError, check_fields, require
 from jaxnbv.cloud import PointCloud
 
 
@@ -29,6 +29,7 @@ class HostClassifier(eqx.Module):
     batch_size: ClassVar[int] = 128
 
     def __check_init__(self):
+        check_fields(self)
         require(self.num_classes >= 2, f"num_classes is {self.num_classes}; a classifier tells at least two apart")
 
     def __call__(self, cloud: PointCloud) -> Float[Array, " classes"]:
@@ -67,6 +68,7 @@ class HostSegmenter(eqx.Module):
     batch_size: ClassVar[int] = 128
 
     def __check_init__(self):
+        check_fields(self)
         require(self.num_parts >= 1, f"num_parts is {self.num_parts}; a segmenter knows one part at least")
 
     def __call__(self, cloud: PointCloud) -> Float[Array, "points parts"]:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxnbv.acquisition import preferred_batch_size
 from jaxnbv.answers import Answer, Quantity
-from jaxnbv.checks import require
+from jaxnbv.checks import check_fields, require
 from jaxnbv.cloud import PointCloud
 
 Segmenter: TypeAlias = Callable[[PointCloud], Float[Array, "points parts"]]
@@ -37,6 +37,7 @@ class SoftPartCount(eqx.Module):
     target: float = eqx.field(static=True, default=60.0)
 
     def __check_init__(self):
+        check_fields(self)
         require(self.target > 0, f"N_target is {self.target}; it must be positive")
 
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:

@@ -16,7 +16,7 @@ from plotly.offline import get_plotlyjs
 
 from jaxnbv.answers import Quantity
 from jaxnbv.camera import Camera
-from jaxnbv.checks import AnyArray
+from jaxnbv.checks import AnyArray, checked
 from jaxnbv.episode import Episode
 from jaxnbv.files import make_folder, write_text
 from jaxnbv.folders import versions
@@ -34,6 +34,7 @@ _ASCENT_CAPTION = """
       Small cameras stand along the gradient ascents, pale to dark with their acquisition, thicker towards the end."""
 
 
+@checked
 def write_report(
     episode: Episode,
     folder: str | Path,

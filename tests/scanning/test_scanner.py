@@ -61,6 +61,9 @@ def test_noise_has_the_stated_statistics():
     assert (np.abs(error.std(axis=0) - 0.02) < 5 * 0.02 / np.sqrt(2 * n)).all()
     assert (np.abs(np.corrcoef(error.T) - np.eye(3)) < 5 / np.sqrt(n)).all()
     np.testing.assert_allclose(np.linalg.norm(turned, axis=1), 1.0, atol=1e-5)
+    # A point's error tells nothing of its normal's.
+    together = np.corrcoef(error.T, (turned - normals).T)[:3, 3:]
+    assert (np.abs(together) < 5 / np.sqrt(n)).all()
     # Across the normal, n + eps over its length keeps the deviation but for a factor 1 - O(sigma^2).
     across = turned @ np.array([[1.0, 0.0, 0.0], [0.0, 0.8, -0.6]]).T
     assert (np.abs(across.std(axis=0) / 0.05 - 1) < 5 / np.sqrt(2 * n) + 2 * 0.05**2).all()

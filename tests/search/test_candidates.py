@@ -86,7 +86,7 @@ def test_numbers_and_poses_stand_for_candidates():
     [
         ((0,), "0 candidates"),
         ((10, 0.0), "radius 0.0"),
-        ((10, math.inf), "radius inf"),
+        ((10, math.inf), "radius is inf; it must be a finite number"),
         ((10, 2.5, 2.0), "elevation is 2.0 rad"),
         ((10, 2.5, 0.0, (0.0, 0.0, 0.0)), "must be a direction"),
     ],

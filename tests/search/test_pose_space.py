@@ -248,7 +248,7 @@ def test_roll_turns_the_image_about_the_axis():
         (lambda: ConstrainedPoses(2.0, 2.0), "from 2.0 to 2.0"),
         (lambda: ConstrainedPoses(3.0, 2.0), "from 3.0 to 2.0"),
         (lambda: ConstrainedPoses(0.0, 2.0), "from 0.0 to 2.0"),
-        (lambda: ConstrainedPoses(2.0, math.inf), "from 2.0 to inf"),
+        (lambda: ConstrainedPoses(2.0, math.inf), "farthest is inf"),
         (lambda: ConstrainedPoses(off_axis=0.0), "off_axis is 0.0 rad"),
         (lambda: ConstrainedPoses(off_axis=0.5 * math.pi), "off_axis is 1.57"),
     ],

@@ -1,0 +1,150 @@
+"""Any argument of a public constructor or function either works or raises `InputError`: `python tests/hostile.py`.
+
+A program of its own: in the tests annotations are checked by beartype before anything else is.
+"""
+
+import contextlib
+import sys
+import traceback
+import warnings
+
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import HealthCheck, Phase, given, settings
+
+import jaxnbv as nbv
+
+RNG = np.random.default_rng(0)
+DIRECTIONS = RNG.normal(size=(20, 3))
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
+CLOUD = nbv.PointCloud.from_arrays(DIRECTIONS, DIRECTIONS)
+POSE = nbv.look_at((0.0, 0.0, 2.5))
+POSES = nbv.SphereCandidates(6).poses()
+SMALL = nbv.Camera(height=4, width=4)
+BALL = nbv.sdf.Sphere(1.0)
+MODEL = nbv.GeometricSPSR(0.05, 0.2, 6)
+
+
+def number_of_points(cloud):
+    return jnp.sum(cloud.mask).astype(float)
+
+
+# What is called, and arguments that work; each is replaced in turn.
+CALLS = {
+    nbv.Box: {"low": (-1.0, -1.0, -1.0), "high": (1.0, 1.0, 1.0)},
+    nbv.Camera: {"fov": 0.5, "height": 4, "width": 4},
+    nbv.Carving: {"volume": nbv.Box(), "margin": 1.0},
+    nbv.ColdestPoint: {"source": (0.0, 1.0, 0.0), "power": 10.0, "T": 5.0, "steps": 20, "u0": 0.0, "radius": 0.1}
+    | {"reached_only": False, "workers": 1},
+    nbv.ConstrainedPoses: {"nearest": 2.0, "farthest": 3.0, "off_axis": 0.1},
+    nbv.CrossEntropy: {"classifier": number_of_points, "num_points": 16},
+    nbv.DiscreteSearch: {"candidates": 6},
+    nbv.ExpectedUtilityImprovement: {"utility": number_of_points, "num_points": 16},
+    nbv.FarthestView: {"candidates": 6},
+    nbv.Frame: {"scale": 1.0, "center": (0.0, 0.0, 0.0)},
+    nbv.Frame.fit: {"points": DIRECTIONS, "longest_side": 2.5},
+    nbv.FreePoses: {"radius": 2.5},
+    nbv.GeometricSPSR: {"lengthscale": 0.05, "variance": 0.2, "truncation": 6, "noise": 0.01, "nu": 1.5},
+    nbv.GivenPoses: {"given": POSES},
+    nbv.GradientSearch: {"dof": 2, "space": None, "num_starts": 2, "iterations": 2, "learning_rate": 0.01}
+    | {"num_candidates": 6, "solver": None, "candidates": None, "turned": True},
+    nbv.Grid: {"resolution": 8, "half_extent": 1.5},
+    nbv.HalvingSearch: {"candidates": 6, "first_samples": 2},
+    nbv.HeatProblem: {"source": (0.0, 1.0, 0.0), "radius": 0.1, "power": 10.0, "duration": 5.0, "steps": 2}
+    | {"initial": 0.0},
+    nbv.HostClassifier: {"function": number_of_points, "num_classes": 3},
+    nbv.HostSegmenter: {"function": number_of_points, "num_parts": 3},
+    nbv.MixedEntropy: {"classifier": number_of_points, "threshold": 0.5, "num_points": 16},
+    nbv.NegativeEntropy: {"classifier": number_of_points},
+    nbv.OnSurface: {"count": 10, "noise": 0.1},
+    nbv.OutsideBoundary: {"volume": nbv.Box(), "count": 10, "value": 1.0, "noise": 0.5},
+    nbv.Planner: {"model": MODEL, "camera": SMALL, "acquisition": nbv.Coverage(), "search": nbv.DiscreteSearch(6)}
+    | {"num_samples": 2, "grid": nbv.Grid(8), "capacity": 32, "max_views": 3, "carving": nbv.Carving()},
+    nbv.PointCloud.from_arrays: {"points": DIRECTIONS, "normals": DIRECTIONS, "capacity": 32},
+    nbv.PointCloud.from_depth: {"depth": np.ones((4, 4)), "camera": SMALL, "pose": POSE},
+    nbv.Pose: {"rotation": np.eye(3), "position": np.zeros(3)},
+    nbv.RandomView: {"candidates": 6},
+    nbv.SDFSurface: {"sdf": BALL, "bounding_radius": 2.0},
+    nbv.ScreenedSPSR: {"base": MODEL, "values": (nbv.OnSurface(),), "level_deviation": 0.5, "reach": 0.1},
+    nbv.SeenEmpty: {"count": 10, "value": 2.0, "noise": 1.0},
+    nbv.SensorNoise: {"points": 0.01, "normals": 0.01},
+    nbv.Several: {"scores": (nbv.Coverage(),)},
+    nbv.SoftPartCount: {"segmenter": number_of_points, "target": 60.0},
+    nbv.SphereCandidates: {"number": 6, "radius": 2.5, "min_elevation": 0.0, "up": (0.0, 1.0, 0.0)},
+    nbv.SpherePoses: {"radius": 2.5},
+    nbv.Thickness: {"depth": 0.1, "count": 10, "value": -1.0, "noise": 1.0},
+    nbv.TriangleMesh.from_arrays: {"vertices": np.eye(3), "faces": [[0, 1, 2]]},
+    nbv.UncertaintyView: {"candidates": 6},
+    nbv.concatenate: {"first": CLOUD, "second": CLOUD},
+    nbv.farthest_point_subsample: {"cloud": CLOUD, "count": 3},
+    nbv.fibonacci_sphere: {"count": 6, "radius": 1.0, "min_elevation": 0.0},
+    nbv.imagination: {"name": "paper", "longest_side": 2.5, "quick": True, "volume": None, "solid": False},
+    nbv.load_mesh: {"path": "nowhere.obj"},
+    nbv.look_at: {"position": (0.0, 0.0, 2.5), "target": (0.0, 0.0, 0.0), "up": (0.0, 1.0, 0.0)},
+    nbv.mesh_from_sdf: {"sdf": BALL, "grid": nbv.Grid(8)},
+    nbv.scan: {"surface": nbv.SDFSurface(BALL), "camera": SMALL, "pose": POSE},
+}
+
+NUMBERS = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-3, 40),
+    st.floats(),
+    st.sampled_from([0.0, -1.0, 1e30, 1e-30, 2.5, 1j, 10**400, np.int64(3), np.float32(0.5), np.array(2.0)]),
+)
+ANYTHING = st.one_of(
+    NUMBERS,
+    st.text(max_size=5),
+    st.lists(NUMBERS, max_size=4),
+    st.tuples(NUMBERS, NUMBERS, NUMBERS),
+    st.sampled_from([{}, {"a": 1}, object(), int, len, b"x", jax.random.key(0)]),
+    st.sampled_from([np.zeros((2, 3)), np.full((4, 4), np.nan), np.array(["a"]), np.zeros((0, 3))]),
+    st.sampled_from([np.ma.masked_array(np.ones((20, 3)), np.arange(60).reshape(20, 3) == 7)]),
+    st.sampled_from([CLOUD, POSE, POSES, SMALL, BALL, MODEL, nbv.Coverage(), nbv.Grid(8), nbv.Coverage]),
+)
+
+
+def hold(function, arguments):
+    """What is called holds: it works, or says by an `InputError` what is wrong."""
+    with contextlib.suppress(nbv.InputError):
+        function(**arguments)
+
+
+def test_of(function, usual, name, examples):
+    @settings(
+        max_examples=examples,
+        derandomize=True,
+        deadline=None,
+        database=None,
+        phases=(Phase.explicit, Phase.generate),
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(ANYTHING)
+    def test(value):
+        hold(function, usual | {name: value})
+
+    return test
+
+
+def main() -> None:
+    warnings.simplefilter("ignore")
+    examples = int(sys.argv[1]) if len(sys.argv) > 1 else 40
+    failures = []
+    for function, usual in CALLS.items():
+        hold(function, usual)
+        for name in usual:
+            try:
+                test_of(function, usual, name, examples)()
+            except Exception as error:
+                where = traceback.extract_tb(error.__traceback__)[-1]
+                problem = f"{type(error).__name__}: {str(error)[:150]!r} ({where.filename}:{where.lineno})"
+                example = " ".join(getattr(error, "__notes__", ()))[-200:]
+                failures.append(f"{function.__qualname__}({name}=...): {problem} {example}")
+    print("\n".join(failures))
+    sys.exit(bool(failures))
+
+
+if __name__ == "__main__":
+    main()
