@@ -90,8 +90,13 @@ def look_at(
     offset = target - position
     if not is_traced(position, target, up):
         require(bool(jnp.all(jnp.isfinite(offset))), f"look_at needs finite coordinates, got position {position}")
+        distance = jnp.linalg.norm(offset, axis=-1)
         require(
-            bool(jnp.all(jnp.linalg.norm(offset, axis=-1) > 0)),
+            bool(jnp.all(jnp.isfinite(distance))),
+            f"look_at needs a position whose distance from its target is a finite number, got position {position}",
+        )
+        require(
+            bool(jnp.all(distance > 0)),
             f"look_at needs a position apart from its target; both are {target}",
         )
         require(bool(jnp.linalg.norm(up) > 0), "look_at needs an up direction that is not zero, such as (0, 1, 0)")

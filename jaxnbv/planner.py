@@ -88,6 +88,7 @@ class Planner(eqx.Module):
         kept = limit_capacity(cloud, self.capacity)
         if self.search.uses_samples and not is_traced(kept):
             self.acquisition.check(kept)
+            self.model.check(kept)
         state = State(kept, poses, jnp.asarray(0, jnp.int32), empty)
         return state if pose is None else _record(self.carving, self.grid, state, pose, cloud, camera)
 
@@ -170,7 +171,10 @@ class Planner(eqx.Module):
                 int(state.num_views) < self.max_views,
                 f"the state holds {int(state.num_views)} views and has room for no more: raise Planner(max_views=...)",
             )
-        return _observe(self.carving, self.grid, state, pose, scan, camera)
+        after = _observe(self.carving, self.grid, state, pose, scan, camera)
+        if self.search.uses_samples and not is_traced(after):
+            self.grid.check(after.cloud)
+        return after
 
     def replay(self, views: Iterable[tuple[Pose, PointCloud]], camera: Camera | None = None) -> Iterator[State]:
         """The state after each of some views, poses and scans: `init` with the first, then `observe`.

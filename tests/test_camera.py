@@ -144,6 +144,7 @@ def test_one_bad_pose_of_a_batch_is_refused():
     [
         (((1.0, 2.0, 3.0), (1.0, 2.0, 3.0)), "apart from its target"),
         (((np.nan, 0.0, 1.0),), "finite"),
+        (((0.0, 0.0, 1e30),), r"distance from its target is a finite number, got position \[0"),
         (((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "up direction"),
     ],
 )

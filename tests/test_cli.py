@@ -106,9 +106,11 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
         (("demo", "--first", "0,0,0"), ("target",)),
         (("demo", "--first", "0,0,9", "--noise", "-1"), ("-1", "negative")),
         (("demo", "--first", "0,9,0,1"), ("three numbers",)),
+        (("demo", "--first", "0,0,1e30"), ("position", "1.e+30")),
+        (("demo", "--scene", "99999999999999"), ("--scene", "99999999999999")),
         (("run", "flat.obj"), ("flat.obj", "area")),
         (("run", "broken.glb"), ("broken.glb", "cannot read")),
-        (("demo", "--out", "flat.obj"), ("flat.obj", "is a file")),
+        (("demo", "--out", "flat.obj"), ("flat.obj", "File exists")),
         (("demo", "--vews", "3"), ("--vews", "--views")),
         (("demo", "--search", "best"), ("best", "discrete")),
         (("demo", "--out", "occupied"), ("occupied", "other files")),
@@ -141,7 +143,7 @@ def test_a_folder_of_another_configuration_is_refused(finished):
     folder, _ = finished
     result = run_command("demo", "--quick", "--views", "2", "--seed", "1", cwd=folder)
     assert result.returncode == 2
-    assert "another configuration" in result.stderr
+    assert "another episode" in result.stderr
     assert "key" in result.stderr
 
 

@@ -1,5 +1,7 @@
 """The planner: ask and tell, compilation, overflow, bad input."""
 
+import warnings
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement
-from jaxnbv.camera import Camera, Pose, look_at
+from jaxnbv.camera import Camera, Pose, fibonacci_sphere, look_at
 from jaxnbv.cloud import PointCloud, concatenate, farthest_point_subsample
 from jaxnbv.episode import simulate
 from jaxnbv.planner import Planner
@@ -195,3 +197,39 @@ def test_a_singular_covariance_is_named():
     planner = Planner(model, Camera(), Coverage(), DiscreteSearch(4), 2, Grid(12), 64)
     with pytest.raises(ValueError, match="raise the model's noise"):
         planner.propose(planner.init(cloud), jax.random.key(0))
+
+
+def test_points_far_apart_are_told_of_with_the_remedy():
+    """Beyond 2.5 lengthscales; a long one of several is enough."""
+    points = np.asarray(fibonacci_sphere(60))
+    cloud = PointCloud.from_arrays(points, points)
+
+    def init(lengthscale, variance):
+        model = GeometricSPSR(lengthscale, variance, 10)
+        Planner(model, Camera(height=8, width=8), Coverage(), DiscreteSearch(6), 2, Grid(16)).init(cloud)
+
+    with pytest.warns(UserWarning, match=r"points are 0\.4\d apart, 2\.\d times .*Scan more densely, or raise"):
+        init(0.025, 0.2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        init((0.025, 0.06), (0.2, 0.2))
+
+
+def test_parts_thinner_than_a_cell_are_told_of_with_the_remedy():
+    """A slab whose two sides were seen, on a grid that is too coarse for it and on one that is not."""
+    axis = np.linspace(-0.5, 0.5, 12)
+    x, y = (side.ravel() for side in np.meshgrid(axis, axis))
+    above, below = (np.stack([x, y, np.full_like(x, z)], axis=1) for z in (0.04, -0.04))
+    up = np.tile([0.0, 0.0, 1.0], (len(x), 1))
+    first, second = PointCloud.from_arrays(above, up), PointCloud.from_arrays(below, -up)
+
+    def observe(resolution):
+        model, camera = GeometricSPSR(0.05, 0.2, 10), Camera(height=8, width=8)
+        planner = Planner(model, camera, Coverage(), DiscreteSearch(6), 2, Grid(resolution), 400)
+        planner.observe(planner.init(first), look_at((0.0, 0.0, -2.5)), second)
+
+    with pytest.warns(UserWarning, match=r"288 of 288 points lie on parts thinner than a cell .*0\.0972.*Raise Grid"):
+        observe(37)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        observe(60)

@@ -38,11 +38,11 @@ MeshArgument = Annotated[
 NetworkOption = Annotated[
     Path | None,
     typer.Option(
-        help="A PointNet++ network, .pth or .safetensors: a classifier for the tasks that are about the class, "
+        help="A network, .pth or .safetensors: a classifier for the tasks that are about the class, "
         "which need one; for parts a part segmenter, in place of the one that ships."
     ),
 ]
-SceneOption = Annotated[int, typer.Option(min=0, help="Which object: the number of a scene.")]
+SceneOption = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Which object: the number of a scene.")]
 HidingFirstOption = Annotated[
     str | None,
     typer.Option(help="Position of the first camera, x,y,z.", show_default="one that hides the pattern"),

@@ -1,5 +1,6 @@
 """TriangleMesh: real objects as they come, soups and open sheets included, met by rays through Embree on the host."""
 
+import struct
 import warnings
 from pathlib import Path
 from typing import ClassVar
@@ -189,7 +190,7 @@ def load_mesh(path: str | Path) -> TriangleMesh:
         message = f"cannot read {path} as a mesh ({type(error).__name__}: {error}): it must be one of {formats}"
         raise InputError(message) from error
     meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-    require(len(meshes) > 0, f"{path} has no faces: a point cloud or an empty file cannot be scanned")
+    require(len(meshes) > 0, f"{path} has no faces: {_why_empty(path)}")
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     vertices = np.concatenate([mesh.vertices for mesh in meshes])
     faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)])
@@ -197,6 +198,16 @@ def load_mesh(path: str | Path) -> TriangleMesh:
         return TriangleMesh.from_arrays(vertices, faces)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+
+
+def _why_empty(path: Path) -> str:
+    """A binary STL that is cut short reads as an empty one."""
+    if path.suffix.lower() == ".stl":
+        head, length = path.open("rb").read(84), path.stat().st_size
+        count = struct.unpack("<I", head[80:84])[0] if len(head) == 84 else 0
+        if not head.startswith(b"solid") and length != 84 + 50 * count:
+            return f"it has {length} bytes where a binary STL of {count} faces has {84 + 50 * count}; fetch it again"
+    return "a point cloud or an empty file cannot be scanned"
 
 
 def level_triangles(

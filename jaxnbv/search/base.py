@@ -23,6 +23,9 @@ else:
     AnyCandidates = Candidates
 
 
+_TIE = 1e-5
+
+
 class Problem(eqx.Module):
     """One step's question: where to look next.
 
@@ -145,7 +148,11 @@ class CandidateSearch(Search):
 
 
 def best_unvisited(problem: Problem, candidates: Pose, values: Float[Array, " candidates"]) -> Proposal:
-    """The candidate of the highest value among those not visited yet; the first of them where values tie."""
+    """The candidate of the highest value among those not visited yet; the first of them where values tie, that is,
+    differ by no more than sums do which are added in another order, on another number of cores."""
     values = jnp.where(problem.is_visited(candidates), -jnp.inf, values)
-    index = jnp.argmax(values)
+    best = jnp.max(values)
+    # Nothing ties with an infinite value, and NaN is told of by the planner.
+    tied = values >= best - jnp.where(jnp.isfinite(best), _TIE * jnp.abs(best), 0.0)
+    index = jnp.where(jnp.isfinite(best), jnp.argmax(tied), jnp.argmax(values))
     return Proposal(candidates[index], values[index], candidates, values)

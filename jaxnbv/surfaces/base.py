@@ -92,6 +92,10 @@ class SurfaceModel(eqx.Module):
     def condition(self, cloud: PointCloud) -> SurfacePosterior:
         """p(f | D) for the filled rows of a cloud in scene coordinates."""
 
+    def check(self, cloud: PointCloud) -> None:
+        """Warn where a cloud, whose values are known, is not one that the model makes much of."""
+        return
+
     def condition_on_space(self, cloud: PointCloud, empty: EmptyPoints) -> SurfacePosterior:
         """p(f | D, what was seen empty). A model that makes nothing of emptiness gives p(f | D), as here."""
         return self.condition(cloud)

@@ -69,6 +69,10 @@ class ScreenedSPSR(SurfaceModel):
             value = getattr(self, name)
             require(0 < value < math.inf, f"{name} is {value}; it must be positive and finite")
 
+    def check(self, cloud: PointCloud) -> None:
+        """As that of the base."""
+        self.base.check(cloud)
+
     def condition(self, cloud: PointCloud) -> "ScreenedSPSRPosterior":
         """p(g | D). The cost is that of the base, and of M triangular solves with its factor.
 

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float, PRNGKeyArray
+from scipy.spatial import cKDTree
 
 from jaxnbv.checks import AnyArray, as_floats, check_type, is_traced, require
 from jaxnbv.cloud import PointCloud
@@ -42,6 +43,7 @@ _CHUNK_VALUES = 2**24
 _ALWAYS_WHOLE = 1024
 # Draws of the prior are not of unit length either, and a model may be conditioned on them.
 _LONGEST_NORMAL = 10.0
+_SPARSE = 2.5
 
 # Numbers and tuples are converted on the way in, which mypy cannot see.
 if TYPE_CHECKING:
@@ -115,6 +117,22 @@ class GeometricSPSR(SurfaceModel):
         """Share of the prior's variance within the truncation, in three dimensions."""
         kept = jnp.sum(jax.vmap(basis_variance)(jnp.atleast_2d(self.spectrum))[:, self.truncation :], axis=1)
         return jnp.sum(kept**3) / jnp.sum(self.variance**3)
+
+    def check(self, cloud: PointCloud) -> None:
+        """Warn where points are so far apart that samples vary between them as if nothing had been seen: at 2.5
+        lengthscales the standard deviation of f less its level, at the data, is 0.9 of the prior's."""
+        points, _ = cloud.to_numpy()
+        if len(points) < 2 or is_traced(self):
+            return
+        spacing = float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))
+        lengthscale = 2.0 * math.pi * float(np.max(self.lengthscale))
+        if spacing > _SPARSE * lengthscale:
+            warnings.warn(
+                f"points are {spacing:.2g} apart, {spacing / lengthscale:.1f} times the model's longest lengthscale of "
+                f"{lengthscale:.2g} (scene units): samples hardly follow them. Scan more densely, or raise the "
+                "lengthscale",
+                stacklevel=2,
+            )
 
     def condition(self, cloud: PointCloud) -> "GeometricSPSRPosterior":
         """p(f | D). The cost is that of a Cholesky factorisation of the cloud's capacity.

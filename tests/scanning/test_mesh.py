@@ -142,6 +142,12 @@ def test_zero_area_faces_are_dropped_and_counted():
     assert len(mesh.faces) == 1
 
 
+def test_comments_in_another_encoding_do_not_matter(tmp_path):
+    text = "# gr\u00fcner K\u00f6rper\n" + SHAPES["box"].export(file_type="obj")
+    (tmp_path / "box.obj").write_bytes(text.encode("latin-1"))
+    assert len(load_mesh(tmp_path / "box.obj").faces) == len(SHAPES["box"].faces)
+
+
 def test_broken_files_are_refused(tmp_path):
     with pytest.raises(ValueError, match="no mesh file"):
         load_mesh(tmp_path / "absent.obj")
@@ -153,6 +159,11 @@ def test_broken_files_are_refused(tmp_path):
         (tmp_path / name).write_text(content)
         with pytest.raises(ValueError, match=r"no faces|cannot read"):
             load_mesh(tmp_path / name)
+    whole = SHAPES["box"].export(file_type="stl")
+    for length in (90, 400, len(whole) - 1):
+        (tmp_path / "cut.stl").write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=rf"it has {length} bytes where .* has {len(whole)}; fetch it again"):
+            load_mesh(tmp_path / "cut.stl")
     (tmp_path / "nan.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n")
     with pytest.raises(ValueError, match=r"nan\.obj.*not finite"):
         load_mesh(tmp_path / "nan.obj")

@@ -10,7 +10,8 @@ from jaxnbv.acquisition import expected_score
 from jaxnbv.camera import Camera, Pose, fibonacci_sphere, look_at
 from jaxnbv.cloud import PointCloud
 from jaxnbv.scanning import Grid, GridSurface
-from jaxnbv.search import DiscreteSearch, Problem
+from jaxnbv.search import DiscreteSearch, Problem, SphereCandidates
+from jaxnbv.search.base import best_unvisited
 from jaxnbv.tasks import Coverage
 
 CAMERA, GRID = Camera(height=8, width=8), Grid(20)
@@ -95,3 +96,21 @@ def test_without_samples_it_says_so(problem):
 def test_no_candidates_are_refused():
     with pytest.raises(ValueError, match="0 candidates"):
         DiscreteSearch(0)
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([0.5, 1.0, 1.000001, 0.9], 1),
+        ([0.5, 1.0, 1.001, 0.9], 2),
+        ([-3.0, -1.000001, -1.0, -2.0], 1),
+        ([0.0, 0.0, 1e-30, 0.0], 2),
+        ([1.0, -np.inf, np.inf, np.inf], 2),
+        ([-np.inf] * 4, 0),
+    ],
+)
+def test_values_that_rounding_may_turn_round_tie_and_the_first_is_taken(problem, values, expected):
+    poses = SphereCandidates(4).poses()
+    found = best_unvisited(problem, poses, jnp.asarray(values))
+    np.testing.assert_array_equal(found.pose.position, poses.position[expected])
+    assert float(found.value) == np.float32(values[expected])
