@@ -107,7 +107,7 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
         (("demo", "--first", "0,0,9", "--noise", "-1"), ("-1", "negative")),
         (("demo", "--first", "0,9,0,1"), ("three numbers",)),
         (("demo", "--first", "0,0,1e30"), ("position", "1.e+30")),
-        (("demo", "--scene", "99999999999999"), ("--scene", "99999999999999")),
+        (("demo", "--scene", "99999999999999"), ("--scene", "2147483647")),
         (("run", "flat.obj"), ("flat.obj", "area")),
         (("run", "broken.glb"), ("broken.glb", "cannot read")),
         (("demo", "--out", "flat.obj"), ("flat.obj", "File exists")),
