@@ -67,8 +67,8 @@ class Ascent(eqx.Module):
         scale = jnp.max(values) - jnp.min(values)
         scale = jnp.where(scale > 0, scale, 1.0)
         trajectories = jax.vmap(partial(self._walk, problem, scale))(candidates[order[: self.num_starts]])
-        found = best_unvisited(problem, candidates, values)
-        passed = best_unvisited(problem, *trajectories.flat)
+        found = best_unvisited(problem, candidates, values, tie=0.0)
+        passed = best_unvisited(problem, *trajectories.flat, tie=0.0)
         # Whatever is not a number comes through, so that the planner can say so.
         better = ~(passed.value <= found.value)
         pose, value = jax.tree.map(partial(jnp.where, better), *[(p.pose, p.value) for p in (passed, found)])

@@ -147,12 +147,17 @@ class CandidateSearch(Search):
     candidates: AnyCandidates = eqx.field(converter=as_candidates, default=SphereCandidates())
 
 
-def best_unvisited(problem: Problem, candidates: Pose, values: Float[Array, " candidates"]) -> Proposal:
-    """The candidate of the highest value among those not visited yet; the first of them where values tie, that is,
-    differ by no more than sums do which are added in another order, on another number of cores."""
+def best_unvisited(
+    problem: Problem, candidates: Pose, values: Float[Array, " candidates"], tie: float = _TIE
+) -> Proposal:
+    """The candidate of the highest value among those not visited yet; the first of them where values tie.
+
+    `tie`: the relative difference within which they do, by default what sums differ by that are added in another order,
+    on another number of cores.
+    """
     values = jnp.where(problem.is_visited(candidates), -jnp.inf, values)
     best = jnp.max(values)
     # Nothing ties with an infinite value, and NaN is told of by the planner.
-    tied = values >= best - jnp.where(jnp.isfinite(best), _TIE * jnp.abs(best), 0.0)
+    tied = values >= best - jnp.where(jnp.isfinite(best), tie * jnp.abs(best), 0.0)
     index = jnp.where(jnp.isfinite(best), jnp.argmax(tied), jnp.argmax(values))
     return Proposal(candidates[index], values[index], candidates, values)

@@ -114,7 +114,7 @@ def test_a_start_at_the_origin_gives_numbers(space):
     ("arguments", "message"),
     [
         ({"dof": 2, "space": FreePoses()}, "both dof=2 and space"),
-        *(({"learning_rate": rate}, f"learning rate is {rate}") for rate in (0.0, -1.0, np.nan, np.inf)),
+        *(({"learning_rate": rate}, f"learning.rate is {rate}") for rate in (0.0, -1.0, np.nan, np.inf)),
         ({"num_starts": 0}, "num_starts is 0"),
         ({"iterations": 0}, "iterations is 0"),
         ({"num_starts": 7, "num_candidates": 6}, "6 candidates for 7 starts"),
