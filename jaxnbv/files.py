@@ -8,7 +8,8 @@ from typing import Any
 
 from jaxnbv.errors import InputError
 
-PARTIAL = ".partial"
+# What a process that was killed leaves: the pattern of the names of parts.
+PARTS = "." + 16 * "[0-9a-f]" + ".partial"
 
 
 def write_whole(path: Path, write: Callable[[Any], Any]) -> None:
@@ -17,7 +18,7 @@ def write_whole(path: Path, write: Callable[[Any], Any]) -> None:
     **Raises:** `ValueError` if the disk is full, the folder is missing or may not be written, or the name is too long.
     """
     # A name of its own: two processes that write one file do not meet in its parts.
-    partial = path.with_name(f".{secrets.token_hex(8)}{PARTIAL}")
+    partial = path.with_name(f".{secrets.token_hex(8)}.partial")
     try:
         try:
             with partial.open("xb") as file:

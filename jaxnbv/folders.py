@@ -15,7 +15,7 @@ import jax
 import loky
 
 from jaxnbv.checks import InputError, require
-from jaxnbv.files import PARTIAL, make_folder, write_text
+from jaxnbv.files import PARTS, make_folder, write_text
 
 # Of the files; those of format 1 do not say it, and hold neither index nor checksum.
 FORMAT = 2
@@ -84,18 +84,18 @@ class ResultFolder:
         lock = filelock.FileLock(self.path / _LOCK, timeout=0)
         try:
             lock.acquire()
+            # The same file: what another process reads when the lock is taken.
+            (self.path / _LOCK).write_text(f"process {os.getpid()} on {socket.gethostname()}")
         except filelock.Timeout as error:
             raise InputError(
                 f"{self.path} is being written by {self._holder()}: wait until it ends, or choose another folder"
             ) from error
         except (OSError, NotImplementedError) as error:
-            raise InputError(f"cannot write in {self.path} ({error}): choose another place") from error
+            lock.release()
+            raise InputError(f"cannot write in {self.path} ({error}): make room or choose another place") from error
         try:
-            # The same file: what another process reads when the lock is taken.
-            (self.path / _LOCK).write_text(f"process {os.getpid()} on {socket.gethostname()}")
-            for left in self.path.glob(f"*{PARTIAL}"):
-                if left.is_file():
-                    left.unlink()
+            for left in self.path.glob(PARTS):
+                left.unlink()
             # Another process may have written since this one looked.
             self._check()
             yield
@@ -119,8 +119,8 @@ class ResultFolder:
     def _check(self) -> None:
         has_results = any(self.path.glob(self.results))
         if not self.record.exists():
-            names = sorted(entry.name for entry in self.path.iterdir() if not entry.name.endswith(PARTIAL))
-            foreign = [name for name in names if name != _LOCK]
+            names = sorted(entry.name for entry in self.path.iterdir())
+            foreign = [name for name in names if name != _LOCK and not name.endswith(".partial")]
             require(
                 not foreign or self.kind == "study",
                 f"the output folder {self.path} holds other files ({', '.join(foreign[:3])}): choose an empty folder",

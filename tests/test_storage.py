@@ -230,10 +230,12 @@ def test_a_corrupt_record_is_refused(tmp_path, text):
 
 
 def test_leftover_parts_do_not_matter(finished, tmp_path):
-    for name in ("episode.json.partial", "view_00.npz.partial", "view_01.npz.partial"):
+    for name in (".0123456789abcdef.partial", ".00000000000000ff.partial"):
         (tmp_path / name).write_bytes(b"half a fi")
+    # Not one of ours, and so not touched.
+    (tmp_path / "mine.partial").write_bytes(b"half a thesis")
     run(tmp_path, views=5)
-    assert contents(tmp_path) == contents(finished[1])
+    assert contents(tmp_path) == contents(finished[1]) | {"mine.partial": b"half a thesis"}
 
 
 SCRIPT = """
