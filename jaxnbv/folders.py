@@ -90,6 +90,7 @@ class ResultFolder:
             raise InputError(
                 f"{self.path} is being written by {self._holder()}: wait until it ends, or choose another folder"
             ) from error
+        # What filelock raises where the file system has no locks.
         except (OSError, NotImplementedError) as error:
             lock.release()
             raise InputError(f"cannot write in {self.path} ({error}): make room or choose another place") from error

@@ -32,7 +32,8 @@ class RecordFolder(ResultFolder):
             for index in tqdm(range(count), desc=self.path.name, unit="scene", disable=not progress):
                 file = self.path / f"scene_{index:04d}.json"
                 if not file.exists():
-                    record = run(index)
+                    # As it will be read: JSON turns keys that are numbers into text, and the checksum sorts them.
+                    record = json.loads(json.dumps(run(index)))
                     self.bind()
                     sealed = {"format": FORMAT, "index": index, "sha256": _checksum(index, record), "record": record}
                     write_text(file, json.dumps(sealed))

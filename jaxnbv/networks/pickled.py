@@ -6,6 +6,7 @@ most tuples without tuples, so that nothing is hashed, compared or shown that is
 """
 
 import pickletools
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -34,12 +35,12 @@ class Function(NamedTuple):
     call: Callable[..., Any]
 
 
-class Mutable:
+class Mutable(ABC):
     """What a pickle may give a state after it was made."""
 
+    @abstractmethod
     def set_state(self, state: Any) -> None:
         """Take the state."""
-        raise NotImplementedError
 
 
 class _OfTuples(tuple):

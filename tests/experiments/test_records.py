@@ -88,6 +88,11 @@ def test_records_of_the_first_format_are_read(tmp_path):
         RecordFolder(tmp_path, {"views": 4})
 
 
+def test_keys_that_are_numbers_are_read_as_text(tmp_path):
+    found = RecordFolder(tmp_path, {}).collect(1, lambda index: {"by view": {10: 1.5, 9: 0.5}}, progress=False)
+    assert found == [{"by view": {"10": 1.5, "9": 0.5}}]
+
+
 def test_a_study_that_fails_at_once_does_not_bind_its_folder(tmp_path):
     def fail(index):
         raise KeyboardInterrupt
