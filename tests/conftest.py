@@ -37,7 +37,7 @@ LONGEST_FIRST = (
     "test_pose_gradients.py",
     "test_trajectories.py",
     "test_screened.py",
-    "test_storage.py",
+    "test_processes.py",
     "test_report.py",
 )
 

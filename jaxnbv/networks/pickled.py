@@ -1,8 +1,9 @@
 """The plain values of a pickle, which is a program: it is interpreted here, not handed to Python's own machine.
 
 Numbers, strings, tuples, lists and dictionaries are built; a name stands for what a table of names says, and anything
-else is refused. What a hostile file may do is bounded by its length: keys are strings or integers, and tuples hold at
-most tuples without tuples, so that nothing is hashed, compared or shown that is longer than the file.
+else is refused. What a hostile file may do is bounded by its length: keys are strings or integers, tuples hold at most
+tuples without tuples, and what all calls together copy is no longer than the file, so that nothing is hashed, compared,
+shown or kept that is.
 """
 
 import pickletools
@@ -18,6 +19,8 @@ _PLAIN = {
     *("BINBYTES", "SHORT_BINBYTES", "BINBYTES8"),
 }
 _MARK = object()
+# A short text may be stored once and used by many calls, of eight bytes each.
+_COPIES = 2
 _MADE: Mapping[str, Callable[[], Any]] = {
     "NONE": lambda: None,
     "NEWTRUE": lambda: True,
@@ -47,15 +50,16 @@ class _OfTuples(tuple):
     """A tuple that holds tuples; none holds it."""
 
 
-def unpickle(file: Any, name: Callable[[str, str], Any], persistent: Callable[[Any], Any]) -> Any:
+def unpickle(file: Any, length: int, name: Callable[[str, str], Any], persistent: Callable[[Any], Any]) -> Any:
     """The next pickle of a binary file.
 
+    - `length`: of the file, in bytes.
     - `name`: says what stands for the name of a module; `persistent`: what stands for an identifier.
 
     **Raises:** `ValueError` for operations, keys and nested tuples that no PyTorch file has; nearly anything for a
     pickle that is damaged.
     """
-    return _Machine(name, persistent).run(file)
+    return _Machine(length, name, persistent).run(file)
 
 
 def dictionary(pairs: Any = ()) -> dict:
@@ -71,8 +75,9 @@ def dictionary(pairs: Any = ()) -> dict:
 
 
 class _Machine:
-    def __init__(self, name: Callable[[str, str], Any], persistent: Callable[[Any], Any]):
+    def __init__(self, length: int, name: Callable[[str, str], Any], persistent: Callable[[Any], Any]):
         self.name, self.persistent = name, persistent
+        self.copies_left = _COPIES * length
         self.stack: list[Any] = []
         self.memo: dict[int, Any] = {}
 
@@ -123,6 +128,8 @@ class _Machine:
                 function, arguments = self.last(2)
                 called = isinstance(function, Function) and isinstance(arguments, tuple)
                 require(called, "calls something other than a function: the file is damaged")
+                self.copies_left -= sum(map(_copied, arguments))
+                require(self.copies_left >= 0, "refused: calls copy more than the file holds")
                 stack.append(function.call(*arguments))
             case "BUILD":
                 state, target = stack.pop(), stack[-1]
@@ -149,6 +156,13 @@ class _Machine:
         while (value := self.stack.pop()) is not _MARK:
             taken.append(value)
         return taken[::-1]
+
+
+def _copied(argument: Any) -> int:
+    """What a call may copy of an argument, in bytes of a pickle; each entry of a list takes several."""
+    if isinstance(argument, str | bytes):
+        return len(argument)
+    return 4 * len(argument) if isinstance(argument, list | tuple | dict) else 0
 
 
 def _tuple(values: list) -> tuple:

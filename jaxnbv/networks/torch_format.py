@@ -36,6 +36,7 @@ _STREAM_PROTOCOL = 1001
 _BYTE_ORDERS = ("<", ">", "=", "|")
 # NumPy's own limit.
 _MOST_DIMENSIONS = 64
+_LONGEST_PROBLEM = 500
 _STATE_NAMES = ("model_state_dict", "state_dict")
 
 
@@ -56,11 +57,11 @@ def read_torch_tensors(path: str | Path) -> dict[str, np.ndarray]:
             content = _read_archive(file, path.stat().st_size) if archive else _read_stream(file)
         tensors = _state_dictionary(content)
     except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+        # Names in a file are as long as it pleases.
+        raise InputError(f"{path}: {str(error)[:_LONGEST_PROBLEM]}") from error
     except Exception as error:  # a damaged pickle can raise nearly anything
-        raise InputError(
-            f"{path} is damaged or no PyTorch checkpoint ({type(error).__name__}: {error}): fetch or save it again"
-        ) from error
+        problem = f"{type(error).__name__}: {error}"[:_LONGEST_PROBLEM]
+        raise InputError(f"{path} is damaged or no PyTorch checkpoint ({problem}): fetch or save it again") from error
     return tensors
 
 
@@ -115,7 +116,8 @@ def _read_archive(file: IO[bytes], length: int) -> Any:
             bits = np.frombuffer(data, f"{'>' if order == 'big' else '<'}u{dtype.itemsize}")
             return bits.astype(bits.dtype.newbyteorder("="), copy=False).view(dtype)
 
-        return _unpickle(read(f"{root}data.pkl"), load)
+        program = read(f"{root}data.pkl")
+        return _unpickle(program, len(program), load)
 
 
 def _read_stream(opened: IO[bytes]) -> Any:
@@ -131,7 +133,7 @@ def _read_stream(opened: IO[bytes]) -> Any:
         raise InputError("tensors stand before the content: the file is damaged")
 
     def plain() -> Any:
-        return _unpickle(file, load_none)
+        return _unpickle(file, len(file), load_none)
 
     try:
         magic = plain()
@@ -159,10 +161,11 @@ def _read_stream(opened: IO[bytes]) -> Any:
         require(storages[key].shape == (count,), f"the storage {key} has two sizes: the file is damaged")
         return storages[key]
 
-    content, keys = _unpickle(file, load), plain()
+    content, keys = _unpickle(file, len(file), load), plain()
     require(isinstance(keys, list) and all(isinstance(key, str) for key in keys), "the list of storages is damaged")
+    same = len(keys) == len(storages) and {*keys} == storages.keys()
+    require(same, f"lists {len(keys)} storages where its tensors need {len(storages)} others: the file is damaged")
     for key in keys:
-        require(key in storages, f"the storage {key} belongs to no tensor: the file is damaged")
         storage = storages[key]
         (count,) = struct.unpack("<q", file.read(8))
         data = file.read(storage.nbytes)
@@ -195,8 +198,8 @@ class _Storage(NamedTuple):
 _Load = Callable[[str, np.dtype, int], np.ndarray]
 
 
-def _unpickle(file: Any, load: _Load) -> Any:
-    """The next pickle, whose storages `load` gives by key, type and count."""
+def _unpickle(file: Any, length: int, load: _Load) -> Any:
+    """The next pickle of a file of so many bytes, whose storages `load` gives by key, type and count."""
 
     def persistent(identifier: Any) -> np.ndarray:
         """The storage that ('storage', type, key, device, count) names; older files add a view, always None here."""
@@ -209,7 +212,7 @@ def _unpickle(file: Any, load: _Load) -> Any:
         )
         return load(str(key), storage.dtype, count)
 
-    return unpickle(file, _name, persistent)
+    return unpickle(file, length, _name, persistent)
 
 
 def _name(module: str, name: str) -> Any:

@@ -12,12 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.checks import AnyArray, check_type, is_traced, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.tensor_grid import on_tensor_grid
 
 HALF_WIDTH = 0.5 * math.pi
 """Scattered points must lie in [-HALF_WIDTH, HALF_WIDTH]^3, the cube that the paper scales a scene into."""
+
+# Draws of the prior are not of unit length either, and a model may be conditioned on them.
+_LONGEST_NORMAL = 10.0
 
 
 def on_torus(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -37,6 +40,31 @@ def on_torus(method: Callable[..., Any]) -> Callable[..., Any]:
         return method(self, *points)
 
     return call
+
+
+def check_data(cloud: PointCloud) -> None:
+    """Whether a model can be conditioned on a cloud, whose values are known.
+
+    **Raises:** `ValueError` if it is empty, has entries that are not finite, a normal longer than 10, or points outside
+    [-pi/2, pi/2]^3 (scene coordinates).
+    """
+    check_type(cloud, PointCloud, "the cloud")
+    points, normals = cloud.to_numpy()
+    require(len(points) > 0, "cannot condition on an empty cloud: scan the object at least once")
+    finite = np.isfinite(points).all() and np.isfinite(normals).all()
+    require(finite, "the cloud has points or normals that are not finite: build it with PointCloud.from_arrays")
+    longest = float(np.linalg.norm(normals, axis=1).max())
+    require(
+        longest <= _LONGEST_NORMAL,
+        f"a normal has length {longest:.4g} and should be of unit length: build the cloud with PointCloud.from_arrays, "
+        "which normalises",
+    )
+    furthest = float(np.abs(points).max())
+    require(
+        furthest <= float(points.dtype.type(HALF_WIDTH)),
+        f"a point has a coordinate of {furthest:.4g}, outside the scene [-pi/2, pi/2]^3: "
+        "bring the points to the scene with Frame.fit(points).to_scene(points)",
+    )
 
 
 class Fields(eqx.Module):

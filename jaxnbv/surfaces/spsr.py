@@ -27,22 +27,19 @@ from scipy.spatial import cKDTree
 
 from jaxnbv.checks import AnyArray, as_floats, check_type, is_traced, require
 from jaxnbv.cloud import PointCloud
-from jaxnbv.surfaces.base import HALF_WIDTH, SurfaceModel, on_torus
+from jaxnbv.surfaces.base import SurfaceModel, check_data, on_torus
 from jaxnbv.surfaces.covariance import (
     Spectra,
     function_covariance,
     function_normal_covariance,
     function_variance,
-    normal_covariance,
 )
+from jaxnbv.surfaces.gram import factorise, on_filled_rows
 from jaxnbv.surfaces.matern import Scalar, circle_spectrum
 from jaxnbv.surfaces.nonuniform import NonuniformTransform
 from jaxnbv.surfaces.trigonometric import TrigonometricFields, TrigonometricPosterior, basis_variance, solve_poisson
 
 _CHUNK_VALUES = 2**24
-_ALWAYS_WHOLE = 1024
-# Draws of the prior are not of unit length either, and a model may be conditioned on them.
-_LONGEST_NORMAL = 10.0
 _SPARSE = 2.5
 
 # Numbers and tuples are converted on the way in, which mypy cannot see.
@@ -137,13 +134,12 @@ class GeometricSPSR(SurfaceModel):
     def condition(self, cloud: PointCloud) -> "GeometricSPSRPosterior":
         """p(f | D). The cost is that of a Cholesky factorisation of the cloud's capacity.
 
-        **Raises:** `ValueError` if the cloud is empty, has entries that are not finite, a normal longer than
-        10 or points outside [-pi/2, pi/2]^3
-        (scene coordinates), or if A is singular in the precision at hand; under `jit` values are not known and are not
-        checked.
+        **Raises:** `ValueError` if the cloud is empty, has entries that are not finite, a normal longer than 10 or
+        points outside [-pi/2, pi/2]^3 (scene coordinates), or if A is singular in the precision at hand; under `jit`
+        values are not known and are not checked.
         """
         if not is_traced(cloud):
-            _check_on_torus(cloud)
+            check_data(cloud)
         posterior = _condition(self, cloud)
         if not is_traced(posterior.level):
             require(
@@ -154,69 +150,19 @@ class GeometricSPSR(SurfaceModel):
         return posterior
 
 
-def _check_on_torus(cloud: PointCloud) -> None:
-    check_type(cloud, PointCloud, "the cloud")
-    points, normals = cloud.to_numpy()
-    require(len(points) > 0, "cannot condition on an empty cloud: scan the object at least once")
-    finite = np.isfinite(points).all() and np.isfinite(normals).all()
-    require(finite, "the cloud has points or normals that are not finite: build it with PointCloud.from_arrays")
-    longest = float(np.linalg.norm(normals, axis=1).max())
-    require(
-        longest <= _LONGEST_NORMAL,
-        f"a normal has length {longest:.4g} and should be of unit length: build the cloud with PointCloud.from_arrays, "
-        "which normalises",
-    )
-    furthest = float(np.abs(points).max())
-    require(
-        furthest <= float(points.dtype.type(HALF_WIDTH)),
-        f"a point has a coordinate of {furthest:.4g}, outside the scene [-pi/2, pi/2]^3: "
-        "bring the points to the scene with Frame.fit(points).to_scene(points)",
-    )
-
-
 @eqx.filter_jit
 def _condition(model: GeometricSPSR, cloud: PointCloud) -> "GeometricSPSRPosterior":
     spectrum = model.spectrum
     # Whatever stands in rows that are not filled, NaN included, must not reach the products.
     points, normals = (jnp.where(cloud.mask[:, None], rows, 0.0) for rows in (cloud.points, cloud.normals))
     cloud = PointCloud(points, normals, cloud.mask)
-    cholesky = _factorise(cloud, spectrum, model.noise)
+    cholesky = factorise(cloud, spectrum, model.noise)
     weights = cho_solve((cholesky, True), normals)
     transform = NonuniformTransform(cloud.points, model.truncation)
     mean = reconstruct(transform, weights, spectrum)
     at_data = transform.evaluate(mean[None])[:, 0]
     level = jnp.sum(jnp.where(cloud.mask, at_data, 0.0)) / jnp.sum(cloud.mask)
     return GeometricSPSRPosterior(level, mean, model, cloud, cholesky, weights)
-
-
-def _factorise(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Float[Array, "n n"]:
-    """Lower Cholesky factor of A, where a row that is not filled is a row of the identity.
-
-    Such a row changes neither the solves nor the determinant.
-    """
-    capacity = cloud.capacity
-
-    def leading(size: int):
-        points, mask = cloud.points[:size], cloud.mask[:size]
-        kernel = jnp.where(mask[:, None] & mask, normal_covariance(points, points, spectrum), 0.0)
-        block = kernel + jnp.diag(jnp.where(mask, noise**2, 1.0))
-        factor = jnp.linalg.cholesky(block, symmetrize_input=False)
-        return jnp.eye(capacity, dtype=factor.dtype).at[:size, :size].set(factor)
-
-    return _on_filled_rows(cloud, leading)
-
-
-def _on_filled_rows(cloud: PointCloud, leading):
-    """`leading(size)` for a share of the rows, the leading ones, that holds all that are filled: so the time follows
-    them while the shapes stay fixed. Each share is compiled, which few rows are not worth."""
-    capacity = cloud.capacity
-    if capacity <= _ALWAYS_WHOLE:
-        return leading(capacity)
-    sizes = [-(-capacity * eighths // 8) for eighths in (2, 3, 4, 5, 6, 8)]
-    filled = jnp.max(jnp.where(cloud.mask, jnp.arange(capacity) + 1, 0))
-    return jax.lax.switch(
-        jnp.searchsorted(jnp.asarray(sizes), filled), [functools.partial(leading, size) for size in sizes]
-    )
 
 
 def mode_variance(spectrum: Spectra) -> Float[Array, "a a a"]:
@@ -342,4 +288,4 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
             solved = jax.vmap(lambda c: solve_triangular(factor, c.T, lower=True))(cross)
             return jnp.pad(solved, ((0, 0), (0, capacity - size), (0, 0)))
 
-        return _on_filled_rows(self.cloud, leading)
+        return on_filled_rows(self.cloud, leading)

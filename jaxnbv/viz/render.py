@@ -63,9 +63,8 @@ class Still:
         surface = self._surface
         if surface is None:
             return
-        fine = Camera(self.camera.fov, 2 * self.size, 2 * self.size)
         mesh = TriangleMesh(surface.vertices.astype(np.float64), surface.faces.astype(np.int64), Frame())
-        origins, directions = fine.rays(self.pose)
+        origins, directions = self.fine_camera.rays(self.pose)
         hits = mesh.trace(origins, directions)
         mask = np.asarray(hits.mask)
         points = np.asarray(hits.points)[mask]
@@ -81,15 +80,26 @@ class Still:
         if deviation is not None:
             colours = DEVIATION(deviation(np.exp(np.sum(weight * np.log(surface.deviation)[near], axis=1))))
         colours[:, :3] = np.clip(colours[:, :3] * lit[:, None], 0.0, 1.0)
+        self.show(mask, colours, (points - np.asarray(self.pose.position)) @ forward)
+
+    @property
+    def fine_camera(self) -> Camera:
+        """Whose rays make the picture, four a pixel."""
+        return Camera(self.camera.fov, 2 * self.size, 2 * self.size)
+
+    def show(
+        self, mask: Bool[np.ndarray, " rays"], colours: Float[np.ndarray, "hits 4"], depth: Float[np.ndarray, " hits"]
+    ) -> None:
+        """Make the picture from what the rays of `fine_camera` hit, and how deep; clear where they miss."""
         image = np.zeros((len(mask), 4))
         image[mask] = colours
         image[:, :3] *= image[:, 3:]
         image = image.reshape(self.size, 2, self.size, 2, 4).mean(axis=(1, 3))
         image[..., :3] /= np.maximum(image[..., 3:], 1e-9)
         self.image = np.clip(image, 0.0, 1.0)
-        depth = np.full(len(mask), np.inf)
-        depth[mask] = (points - np.asarray(self.pose.position)) @ forward
-        self.depth = depth.reshape(self.size, 2, self.size, 2).min(axis=(1, 3))
+        deep = np.full(len(mask), np.inf)
+        deep[mask] = depth
+        self.depth = deep.reshape(self.size, 2, self.size, 2).min(axis=(1, 3))
 
     @property
     def surface_pixels(self) -> Float[np.ndarray, "n 2"]:

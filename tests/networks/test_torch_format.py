@@ -17,6 +17,7 @@ from torch_files import (
     dumps,
     named,
     narrow_network,
+    program,
     state_of,
     storage,
     tensors_and_bytes,
@@ -266,3 +267,30 @@ def test_operations_that_no_tensor_needs_are_refused(tmp_path):
     for body in (b"\x8f", b"c__builtin__\nset\n)\x81", b"(ios\nsystem\n"):
         with pytest.raises(InputError, match=r"refused"):
             read_torch_tensors(write_archive(tmp_path / "net.pth", {"a": Op(body)}, {}))
+
+
+def test_calls_that_copy_the_same_again_and_again_are_refused(tmp_path):
+    pairs = dumps([(str(index), None) for index in range(30_000)])[2:-1]
+    of_pairs = Op(pairs + b"q\x00ccollections\nOrderedDict\nq\x01" + 3000 * b"h\x01h\x00\x85R")
+    text = program("a" * 1_000_000) + b"q\x00" + program("latin1") + b"q\x01c_codecs\nencode\nq\x02"
+    of_text = Op(text + 3000 * b"h\x02h\x00h\x01\x86R")
+    files = [
+        write_archive(tmp_path / f"net{index}.pth", {"a": content}, {})
+        for index, content in enumerate((of_pairs, of_text))
+    ]
+    assert all("copy more than the file holds" in message for message in refusals(*files))
+
+
+def test_storages_that_an_older_file_does_not_fill_are_refused(tmp_path, state):
+    content, data = tensors_and_bytes(state, None)
+    first = dict(list(data.items())[:1])
+    file = write_stream(tmp_path / "net.pth", content, first, [next(iter(state.values())).size])
+    with pytest.raises(InputError, match=rf"lists 1 storages where its tensors need {len(state)}"):
+        read_torch_tensors(file)
+
+
+def test_a_long_name_does_not_make_a_long_message(tmp_path):
+    file = write_archive(tmp_path / "net.pth", {"n" * 1_000_000: 1}, {})
+    with pytest.raises(InputError, match=r"is not a tensor|nnn") as error:
+        read_torch_tensors(file)
+    assert len(str(error.value)) < 700

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,7 +12,6 @@ import matplotlib as mpl
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from scipy.spatial import cKDTree
@@ -27,7 +26,7 @@ from jaxnbv.experiments.study import Scene
 from jaxnbv.experiments.tiles import Tiles, frame, save_pictures
 from jaxnbv.networks import CATEGORIES
 from jaxnbv.scanning import SDFSurface, scan
-from jaxnbv.viz.render import frustum
+from jaxnbv.viz.render import Still, draw_segments, frustum
 from jaxnbv.viz.style import GREY, INK, LINE
 
 _SHOWN = ("discrete", "gradient-2dof", "farthest", "uncertainty")
@@ -35,33 +34,11 @@ _FOUND = "#00734f"
 # Okabe and Ito's: a category has at most six parts.
 _COLOURS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#56b4e9", "#cc79a7")
 # Where pictures are taken from, half of what they span; tries for a good place, and their pixels.
-_DISTANCE, _REACH = 11.0, 1.75
+_DISTANCE, _REACH = 11.0, 1.62
 _TRIES, _TRY_PIXELS = 40, 40
-# Noise must not hide a point behind the surface that it lies on.
-_SLACK = 0.05
 _HIDDEN, _PALE = 0.12, 0.5
 # Cameras are drawn nearer than they stand, small, so that the object can be large.
 _NEARER, _FRUSTUM_DEPTH = 0.76, 0.24
-
-
-class _Stage(NamedTuple):
-    """One place from which all pictures of a scene are taken, and what stands there: the true object.
-
-    `image` is coloured by part, `ghost` a pale picture of the shape; `depth` is along the camera's forward axis.
-    """
-
-    pose: Pose
-    camera: Camera
-    image: Float[np.ndarray, "h w 4"]
-    ghost: Float[np.ndarray, "h w 4"]
-    depth: Float[np.ndarray, "h w"]
-
-    def project(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-        """Pixels of points of the scene, and how far each lies in front of the object's surface."""
-        local = (points - np.asarray(self.pose.position)) @ np.asarray(self.pose.rotation)
-        pixels = self.camera.focal_length * local[:, :2] / local[:, 2:] + 0.5 * self.camera.width
-        column, row = np.clip(pixels.astype(int), 0, self.camera.width - 1).T
-        return pixels - 0.5, self.depth[row, column] - local[:, 2]
 
 
 def write_pictures(
@@ -101,7 +78,7 @@ def _with_small_parts(records: Sequence[Record], count: int) -> list[Record]:
 def _picture(record: Record, study: PartStudy, methods: Sequence[str], pixels: int) -> Figure:
     scene = part_scene(Split(record["split"]), record["scene"])
     colours = _part_colours(scene)
-    stage = _stage(scene, colours, pixels)
+    true, ghost = _stills(scene, colours, pixels)
     runs = [record["methods"][method] for method in methods]
     of_study = Scene(record["scene"], record["category"], SDFSurface(scene.solid), scene)
     seen = [study.seen(of_study, run) for run in runs]
@@ -109,7 +86,7 @@ def _picture(record: Record, study: PartStudy, methods: Sequence[str], pixels: i
 
     # Inches: all methods share the first view, so it stands once, at the middle of the rows.
     tile, gap, below, left, top, margin, line = 1.5, 0.1, 0.36, 0.12, 0.74, 1.05, 0.2
-    corner, size = _extent(stage)
+    corner, size = _extent(true)
     true_wide, true_tall = 2.1 * size / size.max()
     block = true_tall + 0.35 + line * len(record["parts"])
     columns = max(len(run["views"]) for run in runs)
@@ -127,7 +104,7 @@ def _picture(record: Record, study: PartStudy, methods: Sequence[str], pixels: i
         return given + column * (tile + gap) + (margin if column else 0.0)
 
     axes = tiles.place(left + 0.5 * (2.1 - true_wide), middle - 0.5 * block + 0.2, true_wide, true_tall)
-    axes.imshow(stage.image, interpolation="antialiased")
+    axes.imshow(true.image, interpolation="antialiased")
     axes.set(xlim=corner[0] + [0, size[0]], ylim=corner[1] + [size[1], 0])
     axes.axis("off")
     tiles.write(left + 1.05, middle - 0.5 * block + 0.08, "true parts", fontsize=9, ha="center")
@@ -138,11 +115,11 @@ def _picture(record: Record, study: PartStudy, methods: Sequence[str], pixels: i
 
     def draw(axes: Axes, row: int, column: int) -> None:
         shown, cloud = seen[row][column]
-        _draw_view(axes, stage, segmenter.predict(cloud), shown, colours)
+        _draw_view(axes, ghost, segmenter.predict(cloud), shown, colours)
         taken = study.poses_of(runs[row])[: column + 1]
         for index, pose in enumerate(taken):
-            _draw_camera(axes, stage, study.camera, pose, is_new=index == column)
-        _finish(axes, stage, runs[row], column, _of_parts(scene, colours))
+            _draw_camera(axes, ghost, study.camera, pose, is_new=index == column)
+        _finish(axes, ghost.size, runs[row], column, _of_parts(scene, colours))
 
     for row, (method, run) in enumerate(zip(methods, runs, strict=True)):
         down, held = top + row * (tile + below), len(run["views"])
@@ -174,33 +151,27 @@ def _of_parts(scene: PartScene, colours: Float[np.ndarray, "labels 3"]) -> Float
     return colours[np.flatnonzero(np.asarray(scene.parts))]
 
 
-def _stage(scene: PartScene, colours: Float[np.ndarray, "labels 3"], size: int) -> _Stage:
-    """Seen from where each part shows nearly as much as from where it shows best."""
+def _stills(scene: PartScene, colours: Float[np.ndarray, "labels 3"], size: int) -> tuple[Still, Still]:
+    """The true object coloured by part, and a pale ghost of it: seen from where each part shows nearly as much as from
+    where it shows best."""
     places = _places()
     pixels = np.asarray(_part_pixels(scene.solid, places), np.float64)[:, np.asarray(scene.parts)]
-    pose = places[int(np.argmax((pixels / pixels.max(axis=0)).min(axis=1)))]
-    fov = 2.0 * math.atan(_REACH / _DISTANCE)
-    mask, labels, facing, depth = map(np.asarray, _render(scene.solid, Camera(fov, 2 * size, 2 * size), pose))
-    lit = 0.62 + 0.42 * facing[:, None]
-    image = _smoothed(size, mask, np.clip(colours[labels] * lit, 0.0, 1.0))
-    ghost = _smoothed(size, mask, np.clip(mpl.colors.to_rgb(LINE) * (0.84 + 0.2 * facing[:, None]), 0.0, 1.0))
-    depth = depth.reshape(size, 2, size, 2).min(axis=(1, 3))
-    return _Stage(pose, Camera(fov, size, size), image, ghost, depth)
+    eye = np.asarray(places.position[int(np.argmax((pixels / pixels.max(axis=0)).min(axis=1)))], np.float64)
+    true, ghost = (Still(eye, None, size, _REACH) for _ in range(2))
+    mask, *found = map(np.asarray, _render(scene.solid, true.fine_camera, true.pose))
+    labels, facing, depth = (of[mask] for of in found)
+    for still, plain, lit in (
+        (true, colours[labels], 0.62 + 0.42 * facing),
+        (ghost, np.array(mpl.colors.to_rgb(LINE)), 0.84 + 0.2 * facing),
+    ):
+        shaded = np.clip(plain * lit[:, None], 0.0, 1.0)
+        still.show(mask, np.column_stack([shaded, np.ones(len(shaded))]), depth)
+    return true, ghost
 
 
-def _smoothed(
-    size: int, mask: Bool[np.ndarray, " rays"], colours: Float[np.ndarray, "rays 3"]
-) -> Float[np.ndarray, "h w 4"]:
-    """Four rays a pixel; clear where they miss."""
-    image = np.concatenate([colours, np.ones((len(mask), 1))], axis=1) * mask[:, None]
-    image = image.reshape(size, 2, size, 2, 4).mean(axis=(1, 3))
-    image[..., :3] /= np.maximum(image[..., 3:], 1e-9)
-    return np.clip(image, 0.0, 1.0)
-
-
-def _extent(stage: _Stage) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+def _extent(still: Still) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """The first corner and the size of the object's box in the picture."""
-    rows, columns = np.nonzero(stage.image[..., 3])
+    rows, columns = np.nonzero(still.image[..., 3])
     pixels = np.stack([columns, rows])
     low, high = pixels.min(axis=1) - 2.0, pixels.max(axis=1) + 2.0
     return low, high - low
@@ -208,7 +179,7 @@ def _extent(stage: _Stage) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2
 
 def _draw_view(
     axes: Axes,
-    stage: _Stage,
+    ghost: Still,
     predicted: tuple[PointCloud, Int[Array, " n"]],
     latest: PointCloud,
     colours: Float[np.ndarray, "labels 3"],
@@ -219,21 +190,20 @@ def _draw_view(
     points, own = np.asarray(fed.points)[mask], colours[np.asarray(labels)[mask]]
     # Rows of D are those of the scans, bit by bit.
     is_new = cKDTree(latest.to_numpy()[0]).query(points)[0] == 0.0
-    pixels, front = stage.project(points)
-    axes.imshow(stage.ghost, interpolation="antialiased", zorder=1)
+    pixels, in_front = ghost.project(points)
+    axes.imshow(ghost.image, interpolation="antialiased", zorder=1)
     tinted = np.where(is_new[:, None], own, 1.0 - (1.0 - _PALE) * (1.0 - own))
-    rgba = np.concatenate([tinted, np.where(front > -_SLACK, 1.0, _HIDDEN)[:, None]], axis=1)
+    rgba = np.concatenate([tinted, np.where(in_front, 1.0, _HIDDEN)[:, None]], axis=1)
     for new, size in ((False, 2.2), (True, 3.6)):
         # The nearest last.
         order = np.flatnonzero(is_new == new)
-        order = order[np.argsort((points[order] - np.asarray(stage.pose.position)) @ np.asarray(stage.pose.forward))]
+        order = order[np.argsort((points[order] - np.asarray(ghost.pose.position)) @ np.asarray(ghost.pose.forward))]
         order = order[::-1]
         axes.scatter(pixels[order, 0], pixels[order, 1], s=size, c=rgba[order], linewidths=0, zorder=2 + new)
 
 
-def _finish(axes: Axes, stage: _Stage, run: dict, view: int, colours: Float[np.ndarray, "parts 3"]) -> None:
+def _finish(axes: Axes, size: int, run: dict, view: int, colours: Float[np.ndarray, "parts 3"]) -> None:
     """Frame and bars of one tile."""
-    size = stage.camera.width
     axes.set(xlim=(0, size), ylim=(size, 0))
     found = discovery_time(np.asarray(run["counts"]), TARGET)
     is_found = found is not None and found <= view + 1
@@ -253,16 +223,11 @@ def _finish(axes: Axes, stage: _Stage, run: dict, view: int, colours: Float[np.n
         axes.text((index + 0.5) * width, -0.1, str(count), color=INK if count >= TARGET else GREY, **text)
 
 
-def _draw_camera(axes: Axes, stage: _Stage, camera: Camera, pose: Pose, is_new: bool) -> None:
+def _draw_camera(axes: Axes, still: Still, camera: Camera, pose: Pose, is_new: bool) -> None:
     """A frustum; faint where the object hides it."""
     ends = frustum(Pose(pose.rotation, _NEARER * pose.position), camera, _FRUSTUM_DEPTH)
-    fine = ends[:, 0] + np.linspace(0.0, 1.0, 13)[:, None, None] * (ends[:, 1] - ends[:, 0])
-    pixels, front = stage.project(fine.reshape(-1, 3))
-    pixels, front = pixels.reshape(13, -1, 2), front.reshape(13, -1)
-    segments = np.stack([pixels[:-1], pixels[1:]], axis=2).reshape(-1, 2, 2)
-    colours = np.tile(mpl.colors.to_rgba(INK if is_new else GREY), (len(segments), 1))
-    colours[:, 3] = np.where((front[:-1] > 0).ravel() & (front[1:] > 0).ravel(), 1.0 if is_new else 0.6, _HIDDEN)
-    axes.add_collection(LineCollection(list(segments), colors=colours, linewidths=1.1 if is_new else 0.6, zorder=4))
+    colour = mpl.colors.to_rgba(INK if is_new else GREY, 1.0 if is_new else 0.6)
+    draw_segments(axes, still, ends, np.tile(colour, (len(ends), 1)), 1.1 if is_new else 0.6)
 
 
 def _places() -> Pose:
