@@ -1,0 +1,10 @@
+"""Five views of the small episode in a folder, made once."""
+
+import pytest
+from small_episode import run
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "five"
+    return run(folder, views=5), folder

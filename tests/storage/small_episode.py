@@ -1,0 +1,37 @@
+"""A small episode, run into a folder."""
+
+from pathlib import Path
+
+import jax
+
+from jaxnbv.camera import Camera, look_at
+from jaxnbv.episode import simulate
+from jaxnbv.planner import Planner
+from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
+from jaxnbv.scanning.sdf import Capsule, Sphere
+from jaxnbv.search import DiscreteSearch
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Coverage
+
+SCENE = SDFSurface(Sphere(0.7) | Capsule([0.2, 0.3, -0.4], [0.5, 0.6, 0.9], 0.3))
+FIRST = look_at((0.8, 0.9, 2.2))
+KEY = jax.random.key(0)
+
+
+def planner_of(search=None, lengthscale=0.05, **changes):
+    search = DiscreteSearch(12) if search is None else search
+    settings = {"num_samples": 3, "grid": Grid(24), "capacity": 128, "max_views": 6, **changes}
+    model, camera = GeometricSPSR(truncation=8, lengthscale=lengthscale), Camera(height=8, width=8)
+    return Planner(model, camera, Coverage(), search, **settings)
+
+
+BASE = {"planner": planner_of(), "scene": SCENE, "noise": SensorNoise(), "first": FIRST, "key": KEY}
+
+
+def run(folder, views=3, **changes):
+    return simulate(**(BASE | changes), views=views, folder=folder, progress=False)
+
+
+def contents(folder):
+    """Of all files but the lock."""
+    return {file.name: file.read_bytes() for file in sorted(Path(folder).iterdir()) if file.name != ".lock"}

@@ -1,0 +1,192 @@
+"""What an episode's folder holds, that it reads back exactly, continues, and belongs to one configuration."""
+
+import json
+import shutil
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+import trimesh
+from plyfile import PlyData
+from small_episode import FIRST, KEY, SCENE, contents, planner_of, run
+
+from jaxnbv.camera import look_at
+from jaxnbv.checks import InputError
+from jaxnbv.planner import Planner
+from jaxnbv.scanning import SensorNoise
+from jaxnbv.search import FarthestView
+from jaxnbv.storage import EpisodeFolder, describe
+
+
+def test_views_come_back_with_the_same_bits(finished):
+    episode, folder = finished
+    config = describe({"planner": episode.planner, "scene": SCENE, "noise": SensorNoise(), "first": FIRST, "key": KEY})
+    views = EpisodeFolder(folder, config).read_views()
+    assert len(views) == 5
+    assert views[0][2] is None
+    for read, view in zip(views, episode.views, strict=True):
+        written = (view.pose, view.scan, view.proposal)
+        assert jax.tree.structure(read) == jax.tree.structure(written)
+        for a, b in zip(jax.tree.leaves(read), jax.tree.leaves(written), strict=True):
+            assert a.dtype == b.dtype
+            np.testing.assert_array_equal(a, b)
+
+
+def test_a_view_keeps_which_rays_missed_and_one_of_an_earlier_version_reads_without(finished, tmp_path):
+    episode, folder = finished
+    config = json.loads((folder / "episode.json").read_text())["config"]
+    folder = shutil.copytree(folder, tmp_path / "copy")
+    for read, view in zip(EpisodeFolder(folder, config).read_views(), episode.views, strict=True):
+        assert 0 < np.asarray(read[1].missed).sum() < 64
+        np.testing.assert_array_equal(read[1].missed, ~np.asarray(view.scan.mask))
+    with np.load(folder / "view_01.npz") as saved:
+        later = {"missed", "format", "index", "sha256"}
+        older = {name: saved[name] for name in saved.files if name not in later}
+    np.savez_compressed(folder / "view_01.npz", **older)
+    views = EpisodeFolder(folder, config).read_views()
+    assert [pair[1].missed is None for pair in views] == [False, True, False, False, False]
+    np.testing.assert_array_equal(views[1][1].points, episode.views[1].scan.points)
+
+
+def state_after(episode):
+    first, *others = episode.views
+    state = episode.planner.init(first.scan, first.pose)
+    for view in others:
+        state = episode.planner.observe(state, view.pose, view.scan)
+    return state
+
+
+def test_the_record_says_what_made_it(finished):
+    record = json.loads((finished[1] / "episode.json").read_text())
+    assert set(record["config"]) == {"planner", "scene", "noise", "first", "key"}
+    assert record["config"]["planner"]["num_samples"] == 3
+    assert record["versions"]["jax"] == jax.__version__
+    np.testing.assert_allclose(record["config"]["first"]["position"], [0.8, 0.9, 2.2], atol=1e-6)
+
+
+def test_the_cloud_reads_back_in_other_programs(finished):
+    episode, folder = finished
+    points, normals = episode.cloud.to_numpy()
+    vertices = PlyData.read(folder / "cloud.ply")["vertex"]
+    np.testing.assert_array_equal(np.stack([vertices[name] for name in ("x", "y", "z")], axis=1), points)
+    np.testing.assert_array_equal(np.stack([vertices[name] for name in ("nx", "ny", "nz")], axis=1), normals)
+    np.testing.assert_array_equal(np.asarray(trimesh.load(folder / "cloud.ply").vertices, np.float32), points)
+    assert len(points) == int(episode.cloud.count) > 64
+
+
+def test_saving_afterwards_writes_what_a_run_into_the_folder_writes(finished, tmp_path):
+    episode, folder = finished
+    episode.save(tmp_path / "saved")
+    assert contents(tmp_path / "saved") == contents(folder)
+    assert set(contents(folder)) == {"episode.json", "cloud.ply", *(f"view_0{i}.npz" for i in range(5))}
+
+
+def test_three_views_continued_to_five_equal_five(finished, tmp_path):
+    _, folder = finished
+    run(tmp_path / "run", views=3)
+    assert len(contents(tmp_path / "run")) == 5
+    episode = run(tmp_path / "run", views=5)
+    assert contents(tmp_path / "run") == contents(folder)
+    ends = [(each.views, state_after(each)) for each in (episode, finished[0])]
+    for a, b in zip(*map(jax.tree.leaves, ends), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert ends[0][1].seen_empty.shape == (24, 24, 24)
+
+
+def test_a_finished_run_is_read_not_computed(finished, monkeypatch):
+    before = contents(finished[1])
+    monkeypatch.setattr(Planner, "choose", lambda *_: pytest.fail("a finished view was chosen again"))
+    monkeypatch.setattr("jaxnbv.episode.observe_scene", lambda *_: pytest.fail("a finished view was scanned again"))
+    run(finished[1], views=5)
+    assert contents(finished[1]) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"planner": planner_of(num_samples=4)}, r"planner\.num_samples: 3 there, 4 now"),
+        ({"planner": planner_of(FarthestView(12))}, r"planner\.search\.type: DiscreteSearch there"),
+        ({"noise": SensorNoise(0.03)}, r"noise\.points: 0\.01 there, 0\.03 now"),
+        ({"key": jax.random.key(9)}, r"key\.data: \[0, 0\] there, \[0, 9\] now"),
+        ({"first": look_at((0.8, 0.9, 2.3))}, r"first\.position"),
+    ],
+)
+def test_a_folder_of_another_configuration_is_refused(finished, change, named):
+    before = contents(finished[1])
+    with pytest.raises(ValueError, match=r"another episode.*" + named + r".*Choose another folder"):
+        run(finished[1], **change)
+    assert contents(finished[1]) == before
+
+
+def test_a_folder_with_other_files_is_refused(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(ValueError, match=r"holds other files \(thesis\.tex\): choose an empty folder"):
+        run(tmp_path)
+    assert contents(tmp_path) == {"thesis.tex": b"years of work"}
+
+
+def test_leftover_parts_do_not_matter(finished, tmp_path):
+    for name in (".0123456789abcdef.partial", ".00000000000000ff.partial"):
+        (tmp_path / name).write_bytes(b"half a fi")
+    # Not one of ours, and so not touched.
+    (tmp_path / "mine.partial").write_bytes(b"half a thesis")
+    run(tmp_path, views=5)
+    assert contents(tmp_path) == contents(finished[1]) | {"mine.partial": b"half a thesis"}
+
+
+def test_fewer_views_than_the_folder_holds_are_refused(finished):
+    with pytest.raises(ValueError, match=r"asked for 1 views but .* already holds 5"):
+        run(finished[1], views=1)
+
+
+def test_a_shorter_episode_is_not_saved_over_a_longer_one(finished, tmp_path):
+    folder = shutil.copytree(finished[1], tmp_path / "copy")
+    episode = finished[0]
+    shorter = eqx.tree_at(lambda e: e.views, episode, episode.views[:2])
+    with pytest.raises(ValueError, match="already holds 5 views"):
+        shorter.save(folder)
+
+
+def test_an_output_folder_that_is_a_file_is_refused(tmp_path):
+    (tmp_path / "notes").write_text("mine")
+    with pytest.raises(ValueError, match="File exists"):
+        run(tmp_path / "notes")
+
+
+def test_other_versions_are_told_of(finished, tmp_path):
+    folder = shutil.copytree(finished[1], tmp_path / "copy")
+    record = json.loads((folder / "episode.json").read_text())
+    record["versions"]["jax"] = "0.0.1"
+    (folder / "episode.json").write_text(json.dumps(record))
+    with pytest.warns(UserWarning, match=r"other versions \(jax: 0.0.1 there"):
+        run(folder, views=5)
+
+
+def test_a_first_view_that_fails_does_not_bind_its_folder(tmp_path, finished):
+    with pytest.raises(InputError, match="the first scan is empty"):
+        run(tmp_path, first=look_at((0.0, 0.0, 2.5), (0.0, 0.0, 9.0)))
+    assert contents(tmp_path) == {}
+    run(tmp_path, views=5)
+    assert contents(tmp_path) == contents(finished[1])
+
+
+def test_a_record_without_views_binds_nobody(tmp_path, finished):
+    """A run that was killed between the two files."""
+    run(tmp_path, views=1, key=jax.random.key(9))
+    (tmp_path / "view_00.npz").unlink()
+    (tmp_path / "cloud.ply").unlink()
+    run(tmp_path, views=5)
+    assert contents(tmp_path) == contents(finished[1])
+
+
+def test_a_name_that_is_too_long_is_told(tmp_path):
+    with pytest.raises(InputError, match=r"cannot make the output folder .*File name too long"):
+        run(tmp_path / ("n" * 300))
+
+
+def test_more_cores_than_before_are_told_of(finished, tmp_path, monkeypatch):
+    folder = shutil.copytree(finished[1], tmp_path / "copy")
+    monkeypatch.setattr("jaxnbv.folders.loky.cpu_count", lambda: 64)
+    with pytest.warns(UserWarning, match=r"cores: \d+ there, 64 now"):
+        run(folder, views=5)

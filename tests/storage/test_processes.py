@@ -1,0 +1,108 @@
+"""Killed and started again; and two processes in one folder."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from small_episode import contents, run
+
+from jaxnbv.checks import InputError
+
+ROOT = Path(__file__).resolve().parents[2]
+
+SCRIPT = """
+import os, sys, time
+from pathlib import Path
+import jaxnbv.episode, jaxnbv.files
+from small_episode import run
+
+folder, stage, view = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
+
+def stall_at(module, name, moment):
+    original, calls = getattr(module, name), [0]
+    def replacement(*arguments):
+        calls[0] += 1
+        if moment(calls[0]):
+            folder.with_suffix(".stalled").touch()
+            time.sleep(600)
+        return original(*arguments)
+    setattr(module, name, replacement)
+
+done = len(list(folder.glob("view_*.npz")))
+if stage == "scan":
+    stall_at(jaxnbv.episode, "observe_scene", lambda call: done + call == view + 1)
+if stage == "write":
+    record = 0 if (folder / "episode.json").exists() else 1
+    stall_at(jaxnbv.files.os, "fsync", lambda call: done + call == view + 1 + record)
+run(folder, views=5)
+"""
+
+
+def start(folder, stage="none", view=0):
+    command = [sys.executable, "-c", SCRIPT, str(folder), stage, str(view)]
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(ROOT), str(Path(__file__).parent)]),
+        "JAX_COMPILATION_CACHE_DIR": str(folder.with_suffix(".cache")),
+        # The promise is about programs as users run them.
+        "XLA_FLAGS": "",
+    }
+    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE)
+
+
+def kill_once(process, reached):
+    """SIGKILL as soon as `reached()`; the process must still have been running."""
+    deadline = time.monotonic() + 300
+    while not reached():
+        if process.poll() is not None:
+            pytest.fail(f"it ended before it could be killed: {process.stderr.read().decode()}")
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    process.kill()
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+
+
+def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_files(tmp_path):
+    """Once when the first view appears, once half way through writing the second, once while the third is scanned."""
+    folder, stalled = tmp_path / "killed", tmp_path / "killed.stalled"
+    uninterrupted = start(tmp_path / "whole")
+    kill_once(start(folder), (folder / "view_00.npz").exists)
+    assert "cloud.ply" not in contents(folder)
+
+    kill_once(start(folder, "write", 1), stalled.exists)
+    assert list(folder.glob(".*.partial"))
+    assert not (folder / "view_01.npz").exists()
+    stalled.unlink()
+
+    kill_once(start(folder, "scan", 2), stalled.exists)
+    assert (folder / "view_01.npz").exists()
+    assert not (folder / "view_02.npz").exists()
+
+    process = start(folder)
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors.decode()
+    assert uninterrupted.wait(timeout=300) == 0
+    assert contents(folder) == contents(tmp_path / "whole")
+
+
+def test_one_process_writes_at_a_time(finished, tmp_path):
+    folder = shutil.copytree(finished[1], tmp_path / "copy")
+    script = (
+        "import sys, time\nfrom pathlib import Path\nfrom jaxnbv.folders import ResultFolder\n"
+        "with ResultFolder(sys.argv[1], 'episode.json', 'nothing_*', {}, 'episode').writing():\n"
+        "    print('holding', flush=True)\n    sys.stdin.read()\n"
+    )
+    holder = subprocess.Popen([sys.executable, "-c", script, folder], stdin=-1, stdout=-1, text=True)
+    assert holder.stdout.readline() == "holding\n"
+    with pytest.raises(InputError, match=rf"is being written by process {holder.pid} on .*: wait until it ends"):
+        run(folder, views=5)
+    holder.kill()
+    holder.communicate()
+    run(folder, views=5)
+    assert contents(folder) == contents(finished[1])
