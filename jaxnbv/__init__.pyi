@@ -16,7 +16,6 @@ from .camera import Camera as Camera
 from .camera import Pose as Pose
 from .camera import fibonacci_sphere as fibonacci_sphere
 from .camera import look_at as look_at
-from .cloud import Frame as Frame
 from .cloud import PointCloud as PointCloud
 from .cloud import concatenate as concatenate
 from .cloud import farthest_point_subsample as farthest_point_subsample
@@ -24,8 +23,8 @@ from .episode import Episode as Episode
 from .episode import View as View
 from .episode import simulate as simulate
 from .errors import InputError as InputError
+from .frame import Frame as Frame
 from .planner import Planner as Planner
-from .planner import State as State
 from .presets import Imagination as Imagination
 from .presets import imagination as imagination
 from .reconstruction import mean_mesh as mean_mesh
@@ -61,6 +60,7 @@ from .search import SphereCandidates as SphereCandidates
 from .search import SpherePoses as SpherePoses
 from .search import Trajectories as Trajectories
 from .search import UncertaintyView as UncertaintyView
+from .state import State as State
 from .surfaces import Fields as Fields
 from .surfaces import GeometricSPSR as GeometricSPSR
 from .surfaces import OnSurface as OnSurface

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxnbv.answers import Answer, Quantity
 from jaxnbv.camera import Camera, Pose
-from jaxnbv.checks import InputError, check_fields, checked, require
+from jaxnbv.checks import InputError, check_fields, checked, require, shown
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.scanning import GridSurface, scan
 
@@ -133,6 +133,10 @@ class Several(Score):
     """
 
     scores: tuple[Score, ...]
+
+    def __check_init__(self):
+        known = isinstance(self.scores, tuple) and all(isinstance(score, Score) for score in self.scores)
+        require(known and len(self.scores) > 0, f"the scores are {shown(self.scores)}; give a tuple of some")
 
     def context(self, cloud: PointCloud) -> tuple[Any, ...]:
         """That of each."""

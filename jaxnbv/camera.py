@@ -5,6 +5,7 @@ A pose is camera-to-scene. Angles are in radians, lengths in scene units.
 """
 
 import math
+from collections.abc import Iterator
 
 import equinox as eqx
 import jax
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import AnyArray, as_floats, check_fields, checked, is_traced, require
+from jaxnbv.checks import AnyArray, as_floats, check_fields, check_index, checked, is_traced, require
 
 
 class Pose(eqx.Module):
@@ -49,8 +50,17 @@ class Pose(eqx.Module):
         return jnp.matmul(points, self.rotation.T, precision="highest") + self.position
 
     def __getitem__(self, index) -> "Pose":
-        """The pose, or poses, at an index of the leading axes."""
+        """The pose, or poses, at an index of the leading axes.
+
+        **Raises:** `ValueError` of a single pose, or if there is no such index.
+        """
+        check_index(index, self.position.shape[:-1], "the pose")
         return jax.tree.map(lambda leaf: leaf[index], self)
+
+    def __iter__(self) -> Iterator["Pose"]:
+        """The poses along the first axis of a batch."""
+        check_index(slice(None), self.position.shape[:-1], "the pose")
+        return (self[index] for index in range(self.position.shape[0]))
 
 
 def _check_rigid(rotation: np.ndarray, position: np.ndarray) -> None:
@@ -89,7 +99,8 @@ def look_at(
     )
     offset = target - position
     if not is_traced(position, target, up):
-        require(bool(jnp.all(jnp.isfinite(offset))), f"look_at needs finite coordinates, got position {position}")
+        for value, name in ((position, "position"), (target, "target"), (up, "up")):
+            require(bool(jnp.all(jnp.isfinite(value))), f"look_at needs finite coordinates, got {name} {value}")
         distance = jnp.linalg.norm(offset, axis=-1)
         require(
             bool(jnp.all(jnp.isfinite(distance))),
@@ -99,7 +110,11 @@ def look_at(
             bool(jnp.all(distance > 0)),
             f"look_at needs a position apart from its target; both are {target}",
         )
-        require(bool(jnp.linalg.norm(up) > 0), "look_at needs an up direction that is not zero, such as (0, 1, 0)")
+        length = float(jnp.linalg.norm(up))
+        require(
+            0 < length < math.inf,
+            f"look_at needs an up direction whose length is not zero and finite, such as (0, 1, 0), got {up}",
+        )
     forward = offset / jnp.linalg.norm(offset, axis=-1, keepdims=True)
     spare = jnp.eye(3, dtype=up.dtype)[jnp.argmin(jnp.abs(up))]
     parallel = jnp.linalg.norm(jnp.cross(forward, up), axis=-1, keepdims=True) < 1e-4 * jnp.linalg.norm(up)

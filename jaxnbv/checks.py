@@ -89,6 +89,20 @@ def check_type(value: Any, hint: Any, name: str) -> None:
         raise InputError(f"{name} is {shown(value)}; give a function")
 
 
+def check_index(index: Any, batch: tuple[int, ...], name: str) -> None:
+    """**Raises:** `ValueError` for an index into what is no batch, or beyond its length, which JAX would clamp."""
+    require(len(batch) > 0, f"{name} is a single one, not a batch: it has no index {shown(index)}")
+    if isinstance(index, int | np.integer):
+        require(-batch[0] <= index < batch[0], f"{name} has {batch[0]} along its first axis: there is no index {index}")
+
+
+def check_key(key: Any) -> None:
+    """**Raises:** `ValueError` for what is not one key of JAX's random numbers."""
+    typed = isinstance(key, Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0
+    raw = isinstance(key, AnyArray) and key.dtype == np.uint32 and key.ndim == 1
+    require(typed or raw, f"the key is {shown(key)}: make one with jax.random.key(seed)")
+
+
 def as_floats(value: Any, name: str) -> Array:
     """The numbers as an array of JAX's default floating-point type.
 
@@ -105,7 +119,15 @@ def as_numbers(value: Any, name: str, dtype: Any = float) -> np.ndarray:
     masked = isinstance(value, np.ma.MaskedArray) and bool(np.ma.getmaskarray(value).any())
     require(not masked, f"{name} is a masked array: give what is valid of it as a plain one")
     try:
-        return np.asarray(value, dtype=jnp.result_type(float) if dtype is float else dtype)
+        found = np.asarray(value)
+        # Of text, dates, complex numbers and None NumPy would make numbers.
+        real = found.dtype.kind in "biuf" or jnp.issubdtype(found.dtype, jnp.floating)
+        real = real or (found.dtype.kind == "O" and all(isinstance(item, numbers.Real) for item in found.flat))
+        require(real, f"{name} is {shown(value)}; give real numbers")
+        with np.errstate(over="ignore"):
+            return found.astype(jnp.result_type(float) if dtype is float else dtype or found.dtype, copy=False)
+    except InputError:
+        raise
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{name} is {shown(value)}; give numbers") from error
 

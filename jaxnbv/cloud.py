@@ -1,7 +1,8 @@
-"""Oriented point clouds of fixed capacity, and the frame that carries the user's world into the scene."""
+"""Oriented point clouds of fixed capacity."""
 
 import functools
 import warnings
+from collections.abc import Iterator
 
 import equinox as eqx
 import jax
@@ -14,13 +15,17 @@ from jaxnbv.checks import (
     AnyArray,
     as_floats,
     as_numbers,
-    check_fields,
+    check_index,
     check_type,
     checked,
     is_traced,
     require,
+    shown,
 )
 from jaxnbv.farthest import farthest_point_indices
+
+# Of a cloud: what an index of 32 bits counts, and far beyond any memory that a planner has.
+_MOST_ROWS = 2**31 - 1
 
 
 class PointCloud(eqx.Module):
@@ -39,6 +44,17 @@ class PointCloud(eqx.Module):
     normals: Float[Array, "*batch n 3"]
     mask: Bool[Array, "*batch n"]
     missed: Bool[Array, "*batch n"] | None = None
+
+    def __check_init__(self):
+        shapes = [jnp.shape(leaf) for leaf in (self.points, self.normals, self.mask, self.missed) if leaf is not None]
+        rows = shapes[0][:-1]
+        require(
+            len(rows) > 0 and shapes[0] == shapes[1] == (*rows, 3) and all(shape == rows for shape in shapes[2:]),
+            f"a cloud needs points and normals (..., n, 3) and masks (..., n), got {shapes}: build it with "
+            "PointCloud.from_arrays",
+        )
+        for leaf, name in ((self.mask, "mask"), (self.missed, "missed")):
+            require(leaf is None or leaf.dtype == bool, f"a cloud's {name} is {shown(leaf)}: give an array of truths")
 
     @classmethod
     def from_arrays(
@@ -63,6 +79,7 @@ class PointCloud(eqx.Module):
         check_type(capacity, int | None, "the capacity")
         capacity = count if capacity is None else capacity
         require(count > 0, "the cloud is empty: give at least one point and its normal")
+        require(capacity <= _MOST_ROWS, f"the capacity is {capacity}; give at most {_MOST_ROWS}")
         require(
             count <= capacity,
             f"{count} points do not fit a capacity of {capacity}: raise the capacity, or thin them first with "
@@ -109,13 +126,15 @@ class PointCloud(eqx.Module):
         **Raises:** `ValueError` if the image's shape is not the camera's.
         """
         shape = (camera.height, camera.width)
+        # Before large numbers are rounded to infinity.
+        missed = (depth if is_traced(depth) else as_numbers(depth, "the depth image", None)) == np.inf
+        depth = as_floats(depth, "the depth image")
         require(
-            jnp.shape(depth) == shape,
-            f"the depth image is {jnp.shape(depth)} but the camera has {shape} pixels: "
+            depth.shape == shape,
+            f"the depth image is {depth.shape} but the camera has {shape} pixels: "
             "give Camera(height=..., width=...) of the image",
         )
         require(pose.position.ndim == 1, f"the pose is a batch {pose.position.shape[:-1]}: give one, poses[0] say")
-        depth = as_floats(depth, "the depth image")
         valid = jnp.isfinite(depth) & (depth > 0)
         local = jnp.where(valid, depth, 0.0)[..., None] * camera.pixel_directions().reshape(*shape, 3)
         down, has_down = _one_sided_difference(local, valid, axis=0)
@@ -123,12 +142,13 @@ class PointCloud(eqx.Module):
         normals = jnp.cross(down, right)
         normals = normals * -jnp.sign(jnp.sum(normals * local, axis=-1, keepdims=True))
         length = jnp.linalg.norm(normals, axis=-1, keepdims=True)
-        mask = (valid & has_down & has_right & (length[..., 0] > 0)).reshape(-1)
+        has_normal = (length[..., 0] > 0) & jnp.isfinite(length[..., 0])
+        mask = (valid & has_down & has_right & has_normal).reshape(-1)
         normals = (normals / jnp.where(length > 0, length, 1.0)).reshape(-1, 3)
         points = pose.to_scene(local.reshape(-1, 3))
         normals = jnp.matmul(normals, pose.rotation.T, precision="highest")
-        missed = (depth == jnp.inf).reshape(-1)
-        return cls(jnp.where(mask[:, None], points, 0.0), jnp.where(mask[:, None], normals, 0.0), mask, missed)
+        points, normals = (jnp.where(mask[:, None], rows, 0.0) for rows in (points, normals))
+        return cls(points, normals, mask, jnp.asarray(missed).reshape(-1))
 
     @property
     def capacity(self) -> int:
@@ -140,13 +160,26 @@ class PointCloud(eqx.Module):
         return jnp.sum(self.mask, axis=-1)
 
     def to_numpy(self) -> tuple[Float[np.ndarray, "count 3"], Float[np.ndarray, "count 3"]]:
-        """Points and normals of the filled rows of a single cloud."""
+        """Points and normals of the filled rows of a single cloud.
+
+        **Raises:** `ValueError` for a batch of clouds.
+        """
+        check_single(self)
         mask = np.asarray(self.mask)
         return np.asarray(self.points)[mask], np.asarray(self.normals)[mask]
 
     def __getitem__(self, index) -> "PointCloud":
-        """The cloud, or clouds, at an index of the leading axes."""
+        """The cloud, or clouds, at an index of the leading axes.
+
+        **Raises:** `ValueError` of a single cloud, or if there is no such index.
+        """
+        check_index(index, self.mask.shape[:-1], "the cloud")
         return jax.tree.map(lambda leaf: leaf[index], self)
+
+    def __iter__(self) -> Iterator["PointCloud"]:
+        """The clouds along the first axis of a batch."""
+        check_index(slice(None), self.mask.shape[:-1], "the cloud")
+        return (self[index] for index in range(self.mask.shape[0]))
 
 
 def _one_sided_difference(points: Float[Array, "h w 3"], valid: Bool[Array, "h w"], axis: int):
@@ -168,9 +201,17 @@ def _one_sided_difference(points: Float[Array, "h w 3"], valid: Bool[Array, "h w
     return difference, jnp.isfinite(jnp.minimum(size_back, size_ahead))
 
 
+def check_single(cloud: PointCloud, name: str = "the cloud") -> None:
+    """**Raises:** `ValueError` for a batch of clouds where one is needed."""
+    batch = cloud.mask.shape[:-1]
+    require(not batch, f"{name} is a batch {batch} of clouds: give one, or use jax.vmap")
+
+
 @checked
 def concatenate(first: PointCloud, second: PointCloud) -> PointCloud:
     """The union D u D' of the paper, with the capacities added; rows keep their places. It is no sensor's image."""
+    for cloud in (first, second):
+        check_single(cloud)
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=0), _without_rays(first), _without_rays(second))
 
 
@@ -188,6 +229,8 @@ def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
 
     **Raises:** `ValueError` if `count` < 1.
     """
+    check_single(cloud)
+    require(1 <= count <= _MOST_ROWS, f"asked for {count} points; ask for 1 to {_MOST_ROWS}")
     chosen = farthest_point_indices(cloud.points, cloud.mask, count)
     kept = jnp.arange(count) < cloud.count
     return _take(cloud, chosen, kept)
@@ -216,51 +259,3 @@ def limit_capacity(cloud: PointCloud, capacity: int) -> PointCloud:
 def _take(cloud: PointCloud, index: Int[Array, " m"], kept: Bool[Array, " m"]) -> PointCloud:
     points = jnp.where(kept[:, None], cloud.points[index], 0.0)
     return PointCloud(points, jnp.where(kept[:, None], cloud.normals[index], 0.0), kept)
-
-
-class Frame(eqx.Module):
-    """The similarity between the user's world and the scene: scene = scale (world - center).
-
-    - `scale`: scene units per world unit.
-    - `center`: the world point that becomes the scene's origin.
-    """
-
-    scale: float = 1.0
-    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def __check_init__(self):
-        check_fields(self)
-        require(self.scale > 0, f"the frame's scale is {self.scale}; it must be positive")
-
-    @classmethod
-    @checked
-    def fit(cls, points: Float[AnyArray, "n 3"], longest_side: float = 2.5) -> "Frame":
-        """The frame in which the points' bounding box is centred and its longest side is `longest_side`.
-
-        **Raises:** `ValueError` if there are no points, or they all coincide, or one is not finite.
-        """
-        points = as_numbers(points, "points", np.float64)
-        require(points.ndim == 2 and points.shape[1] == 3, f"the points must be (n, 3), got {points.shape}")
-        require(len(points) > 0, "cannot fit a frame to no points: give the points of the object")
-        require(bool(np.isfinite(points).all()), "cannot fit a frame to points that are not finite: drop them first")
-        low, high = points.min(axis=0), points.max(axis=0)
-        extent = float((high - low).max())
-        require(extent > 0, f"cannot fit a frame: all {len(points)} points lie at {low}; give points that differ")
-        x, y, z = (0.5 * (low + high)).tolist()
-        return cls(longest_side / extent, (x, y, z))
-
-    def to_scene(self, thing):
-        """World to scene, for an array of points (..., 3), a `PointCloud` or a `Pose`. Directions stay as they are."""
-        return self._apply(thing, lambda points: (points - np.asarray(self.center)) * self.scale)
-
-    def to_world(self, thing):
-        """Scene to world, for an array of points (..., 3), a `PointCloud` or a `Pose`."""
-        return self._apply(thing, lambda points: points / self.scale + np.asarray(self.center))
-
-    def _apply(self, thing, transform):
-        if isinstance(thing, PointCloud):
-            points = jnp.where(thing.mask[..., None], transform(thing.points), 0.0)
-            return PointCloud(points.astype(thing.points.dtype), thing.normals, thing.mask, thing.missed)
-        if isinstance(thing, Pose):
-            return Pose(thing.rotation, transform(thing.position).astype(thing.position.dtype))
-        return transform(thing if isinstance(thing, Array) and is_traced(thing) else np.asarray(thing))

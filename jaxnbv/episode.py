@@ -14,11 +14,12 @@ from jaxtyping import PRNGKeyArray
 from tqdm import tqdm
 
 from jaxnbv.camera import Camera, Pose
-from jaxnbv.checks import checked, require
+from jaxnbv.checks import check_key, check_type, checked, require
 from jaxnbv.cloud import PointCloud
-from jaxnbv.planner import Planner, State
+from jaxnbv.planner import Planner
 from jaxnbv.scanning import GridSurface, SensorNoise, Surface, scan
 from jaxnbv.search import Proposal
+from jaxnbv.state import State
 from jaxnbv.storage import EpisodeFolder, describe
 
 
@@ -61,6 +62,7 @@ class Episode(eqx.Module):
 
         **Raises:** `ValueError` unless there are so many, and at least one.
         """
+        check_type(views, int, "the number of views")
         require(1 <= views <= len(self.views), f"asked for {views} of {len(self.views)} views; ask for one at least")
         return next(itertools.islice(self.states(), views - 1, None))
 
@@ -112,10 +114,12 @@ def simulate(
         views <= planner.max_views,
         f"asked for {views} views but the planner has room for {planner.max_views}: raise Planner(max_views=...)",
     )
+    check_key(key)
     require(
         jnp.issubdtype(key.dtype, jax.dtypes.prng_key),
         f"the key is a raw array of {key.dtype}: make it with jax.random.key(seed)",
     )
+    require(first.position.ndim == 1, "the first pose is a batch of poses: give one, poses[0] say")
     store = None if folder is None else EpisodeFolder(folder, _config(planner, scene, noise, first, key))
     with store.writing() if store else nullcontext():
         done = store.read_views() if store else []

@@ -41,6 +41,14 @@ def write_text(path: Path, text: str) -> None:
     write_whole(path, lambda file: file.write(text.encode()))
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is a file; there is none of a name that no file can have."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
 def make_folder(path: str | Path) -> Path:
     """The folder, made with its parents where it is missing.
 
@@ -48,7 +56,7 @@ def make_folder(path: str | Path) -> Path:
     """
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        reason = error.strerror or error
-        raise InputError(f"cannot make the output folder {path} ({reason}): choose another place") from error
+    except (OSError, ValueError, TypeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"cannot make the output folder {path!r} ({reason}): choose another place") from error
     return Path(path)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 from scipy.spatial import cKDTree
 
-from jaxnbv.checks import AnyArray, require
+from jaxnbv.checks import AnyArray, as_numbers, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, mesh_from_sdf
 
@@ -24,9 +24,7 @@ def coverage(cloud: PointCloud, truth: Float[AnyArray, "n 3"], radius: float = 0
 
     **Raises:** `ValueError` if `truth` is empty or not finite, or `radius` <= 0.
     """
-    truth = np.asarray(truth, dtype=np.float64)
-    require(len(truth) > 0, "the true surface has no points: sample it with truth_points(scene, key)")
-    require(bool(np.isfinite(truth).all()), "the true surface has points that are not finite: drop them")
+    truth = _points(truth, "true surface")
     require(radius > 0, f"the radius is {radius}; it must be positive, in scene units")
     points, _ = cloud.to_numpy()
     if not len(points):
@@ -75,10 +73,15 @@ def surface_distance(reconstruction: Float[AnyArray, "n 3"], truth: Float[AnyArr
 
     **Raises:** `ValueError` if either has no points, or some that are not finite.
     """
-    found, true = (np.asarray(points, dtype=np.float64) for points in (reconstruction, truth))
-    for name, points in (("reconstruction", found), ("true surface", true)):
-        require(len(points) > 0, f"the {name} has no points: sample it with mesh.sample_points(key, count)")
-        require(bool(np.isfinite(points).all()), f"the {name} has points that are not finite: drop them")
+    found, true = _points(reconstruction, "reconstruction"), _points(truth, "true surface")
     from_found, from_true = cKDTree(true).query(found)[0], cKDTree(found).query(true)[0]
     hausdorff = max(float(from_found.max()), float(from_true.max()))
     return SurfaceDistance(float(from_found.mean()), float(from_true.mean()), hausdorff)
+
+
+def _points(points: Float[AnyArray, "n 3"], name: str) -> Float[np.ndarray, "n 3"]:
+    points = as_numbers(points, f"the {name}", np.float64)
+    require(points.ndim == 2 and points.shape[1] == 3, f"the {name} has shape {points.shape}: give points (n, 3)")
+    require(len(points) > 0, f"the {name} has no points: sample it with mesh.sample_points(key, count)")
+    require(bool(np.isfinite(points).all()), f"the {name} has points that are not finite: drop them")
+    return points

@@ -10,25 +10,12 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxnbv.acquisition import Score
 from jaxnbv.camera import Camera, Pose
-from jaxnbv.checks import check_fields, check_type, is_traced, require
-from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
-from jaxnbv.scanning import Carving, Grid, GridSurface, carve, check_image
+from jaxnbv.checks import check_fields, check_key, check_type, is_traced, require, shown
+from jaxnbv.cloud import PointCloud, limit_capacity
+from jaxnbv.scanning import Carving, Grid, GridSurface, carve
 from jaxnbv.search import Problem, Proposal, Search
+from jaxnbv.state import State, check_scan, observe, record, seen_empty
 from jaxnbv.surfaces import SurfaceModel, SurfacePosterior
-
-
-class State(eqx.Module):
-    """What the planner knows: D, and where it has been. Immutable, of fixed shapes.
-
-    - `cloud`: the points that are kept, in scene coordinates.
-    - `poses`: the views taken in the first `num_views` rows; the others hold the identity.
-    - `seen_empty`: the nodes of the planner's grid that a scan has shown to be empty; None without carving.
-    """
-
-    cloud: PointCloud
-    poses: Pose
-    num_views: Int[Array, ""]
-    seen_empty: Bool[Array, "g g g"] | None = None
 
 
 class Planner(eqx.Module):
@@ -66,6 +53,10 @@ class Planner(eqx.Module):
         for name in ("num_samples", "capacity", "max_views"):
             value = getattr(self, name)
             require(value >= 1, f"{name} is {value}; it must be at least 1")
+        require(
+            self.grid.half_extent <= np.pi,
+            f"the grid reaches to {self.grid.half_extent}, beyond the torus [-pi, pi]^3: give Grid(half_extent=...)",
+        )
         self.search.check(self.acquisition, self.camera, self.capacity)
 
     def init(self, cloud: PointCloud, pose: Pose | None = None, camera: Camera | None = None) -> State:
@@ -81,16 +72,13 @@ class Planner(eqx.Module):
         another camera or from another pose; and as the acquisition's `check` does.
         """
         camera = camera or self.camera
-        self._check_scan(cloud, pose, camera, first=True)
-        poses = Pose(np.tile(np.eye(3), (self.max_views, 1, 1)), np.zeros((self.max_views, 3)))
-        poses = jax.tree.map(lambda leaf: leaf.astype(jnp.result_type(float)), poses)
-        empty = None if self.carving is None else jnp.zeros((self.grid.resolution,) * 3, bool)
+        check_scan(cloud, pose, camera, self.grid, self.carving, first=True)
         kept = limit_capacity(cloud, self.capacity)
         if self.search.uses_samples and not is_traced(kept):
             self.acquisition.check(kept)
             self.model.check(kept)
-        state = State(kept, poses, jnp.asarray(0, jnp.int32), empty)
-        return state if pose is None else _record(self.carving, self.grid, state, pose, cloud, camera)
+        state = State.before_views(kept, self.max_views, None if self.carving is None else self.grid)
+        return state if pose is None else record(self.carving, self.grid, state, pose, cloud, camera)
 
     def posterior(self, state: State) -> SurfacePosterior:
         """p(f | D, what was seen empty), of which `sample_surfaces` draws its samples before it carves them.
@@ -98,11 +86,19 @@ class Planner(eqx.Module):
         **Raises:** `ValueError` as the model's `condition` does, and if the state was made by a planner of another grid
         or without carving.
         """
-        return _posterior(self.model, self.carving, self.grid, state.cloud, self._seen_empty(state))
+        empty = seen_empty(state, self.grid, self.carving)
+        return _posterior(self.model, self.carving, self.grid, state.cloud, empty)
 
     def carve(self, state: State, values: Float[Array, "*s g g g"]) -> Float[Array, "*s g g g"]:
-        """Values of f minus its level at the grid's nodes, carved by what the state knows to be empty."""
-        return _carve(self.carving, self.grid, self._seen_empty(state), values)
+        """Values of f minus its level at the grid's nodes, carved by what the state knows to be empty.
+
+        **Raises:** `ValueError` if the values or the state are of another grid.
+        """
+        empty, nodes = seen_empty(state, self.grid, self.carving), (self.grid.resolution,) * 3
+        require(
+            jnp.shape(values)[-3:] == nodes, f"the values are {shown(values)}, but the planner's grid has {nodes} nodes"
+        )
+        return _carve(self.carving, self.grid, empty, values)
 
     def sample_surfaces(
         self, state: State, key: PRNGKeyArray, posterior: SurfacePosterior | None = None
@@ -113,7 +109,9 @@ class Planner(eqx.Module):
 
         **Raises:** `ValueError` as `posterior` does, and if the model gives values that are not finite.
         """
-        empty = self._seen_empty(state)
+        check_key(key)
+        check_type(posterior, SurfacePosterior | None, "the posterior")
+        empty = seen_empty(state, self.grid, self.carving)
         surfaces = _sample_surfaces(
             self.model, self.carving, self.grid, self.num_samples, state.cloud, empty, key, posterior
         )
@@ -130,6 +128,7 @@ class Planner(eqx.Module):
 
         **Raises:** `ValueError` if every candidate has been visited.
         """
+        check_key(key)
         sample_key, search_key = jax.random.split(key)
         surfaces = self.sample_surfaces(state, sample_key) if self.search.uses_samples else None
         return self.choose(state, surfaces, search_key)
@@ -137,15 +136,18 @@ class Planner(eqx.Module):
     def choose(self, state: State, surfaces: GridSurface | None, key: PRNGKeyArray) -> Proposal:
         """The second half of `propose`: the search, given the step's samples (any that a model of your own drew).
 
-        **Raises:** `ValueError` if every candidate has been visited, or a score is NaN.
+        **Raises:** `ValueError` if every candidate has been visited, or a score is not finite.
         """
+        check_key(key)
+        check_type(state, State, "the state")
+        check_type(surfaces, GridSurface | None, "the surfaces")
         proposal = _choose(
             self.search, self.acquisition, self.camera, state.cloud, state.poses, state.num_views, surfaces, key
         )
         if not is_traced(proposal):
             require(
-                not bool(jnp.isnan(proposal.value)),
-                "the acquisition is not a number (NaN) for a candidate: the score must be finite for every scan, "
+                bool(proposal.value < jnp.inf),
+                f"the acquisition is {float(proposal.value)} for a candidate: the score must be finite for every scan, "
                 "one that sees nothing included, and for a gradient search so must its derivatives",
             )
             require(
@@ -164,14 +166,17 @@ class Planner(eqx.Module):
         without carving, or if it has no room for another view.
         """
         camera = camera or self.camera
-        self._check_scan(scan, pose, camera, first=False)
-        self._seen_empty(state)
+        check_type(pose, Pose, "the pose")
+        check_scan(scan, pose, camera, self.grid, self.carving, first=False)
+        seen_empty(state, self.grid, self.carving)
         if not is_traced(state.num_views):
+            views, room = int(state.num_views), state.poses.position.shape[0]
             require(
-                int(state.num_views) < self.max_views,
-                f"the state holds {int(state.num_views)} views and has room for no more: raise Planner(max_views=...)",
+                views < room,
+                f"the state holds {views} views and has room for no more: make it with a planner of "
+                f"Planner(max_views=...) greater than {room}",
             )
-        after = _observe(self.carving, self.grid, state, pose, scan, camera)
+        after = observe(self.carving, self.grid, state, pose, scan, camera)
         if self.search.uses_samples and not is_traced(after):
             self.grid.check(after.cloud)
         return after
@@ -182,52 +187,12 @@ class Planner(eqx.Module):
         **Raises:** `ValueError` as these do.
         """
         state = None
-        for pose, scan in views:
+        for view in views:
+            pair = isinstance(view, tuple | list) and len(view) == 2
+            require(pair, f"a view is {shown(view)}; give pairs of a pose and a scan")
+            pose, scan = view
             state = self.init(scan, pose, camera) if state is None else self.observe(state, pose, scan, camera)
             yield state
-
-    def _seen_empty(self, state: State) -> Bool[Array, "g g g"] | None:
-        if self.carving is None:
-            return None
-        found = None if state.seen_empty is None else state.seen_empty.shape
-        expected = (self.grid.resolution,) * 3
-        require(
-            found == expected,
-            f"the state knows empty space on {found} nodes, but the planner carves {expected}: make the state with "
-            "this planner's init",
-        )
-        return state.seen_empty
-
-    def _check_scan(self, scan: PointCloud, pose: Pose | None, camera: Camera, first: bool) -> None:
-        for value, hint, name in ((scan, PointCloud, "scan"), (pose, Pose | None, "pose"), (camera, Camera, "camera")):
-            check_type(value, hint, f"the {name}")
-        if is_traced(scan, pose):
-            return
-        points, normals = scan.to_numpy()
-        require(
-            len(points) > 0 or not first,
-            "the first scan is empty: no point to start from. Point the camera at the object, or check the depth image",
-        )
-        finite = np.isfinite(points).all() and np.isfinite(normals).all()
-        require(bool(finite), "the scan has points or normals that are not finite: drop or mask these rows")
-        lengths = np.linalg.norm(normals, axis=1)
-        wrong = lengths[np.abs(lengths - 1.0) > 0.01]
-        require(
-            wrong.size == 0,
-            f"the scan has {wrong.size} normals that are not of unit length, such as {wrong[:1]}: "
-            "build it with PointCloud.from_arrays, which normalises",
-        )
-        furthest = float(np.abs(points).max(initial=0.0))
-        limit = min(self.grid.half_extent, 0.5 * np.pi)
-        require(
-            furthest <= limit,
-            f"a scanned point has a coordinate of {furthest:.4g}, outside the scene's cube of half side {limit:.4g}: "
-            "bring the scan to scene coordinates with Frame.to_scene (or simulate less noise)",
-        )
-        if pose is not None:
-            check_image(scan, camera, pose)
-        if self.carving is not None:
-            self.carving.check_inside(scan, self.grid)
 
 
 # What is compiled takes what it uses, not the planner: another score or search does not compile the sampler again.
@@ -275,18 +240,3 @@ def _choose(
     key: PRNGKeyArray,
 ) -> Proposal:
     return search.propose(Problem(cloud, visited, num_visited, camera, acquisition, surfaces), key)
-
-
-@eqx.filter_jit
-def _observe(carving: Carving | None, grid: Grid, state: State, pose: Pose, scan: PointCloud, camera: Camera) -> State:
-    cloud = limit_capacity(concatenate(state.cloud, scan), state.cloud.capacity)
-    return _record(carving, grid, eqx.tree_at(lambda s: s.cloud, state, cloud), pose, scan, camera)
-
-
-@eqx.filter_jit
-def _record(carving: Carving | None, grid: Grid, state: State, pose: Pose, scan: PointCloud, camera: Camera) -> State:
-    poses = jax.tree.map(lambda rows, row: rows.at[state.num_views].set(row), state.poses, pose)
-    empty = state.seen_empty
-    if carving is not None and empty is not None:
-        empty = empty | carving.seen_empty(grid, scan, camera, pose)
-    return State(state.cloud, poses, state.num_views + 1, empty)

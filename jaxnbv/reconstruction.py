@@ -3,7 +3,8 @@
 import numpy as np
 
 from jaxnbv.checks import InputError, checked, require
-from jaxnbv.cloud import Frame, PointCloud
+from jaxnbv.cloud import PointCloud
+from jaxnbv.frame import Frame
 from jaxnbv.scanning import Grid, TriangleMesh
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.surfaces import SurfaceModel

@@ -20,13 +20,15 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from jaxnbv.camera import Pose
-from jaxnbv.checks import InputError
+from jaxnbv.checks import InputError, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.files import write_whole
 from jaxnbv.folders import FORMAT, ResultFolder, check_format
 from jaxnbv.search import Proposal, Trajectories
 
 _LARGEST_LISTED = 16
+# In bytes, unpacked: sixteen million rays, far more than a camera has.
+_LARGEST_VIEW = 2**29
 
 
 def describe(thing: Any) -> Any:
@@ -91,6 +93,8 @@ class EpisodeFolder(ResultFolder):
         while (file := self._view_file(len(views))).exists():
             try:
                 with np.load(file, allow_pickle=False) as saved:
+                    held = sum(member.file_size for member in saved.zip.infolist())
+                    require(held <= _LARGEST_VIEW, f"{file} is damaged (it unpacks to {held} bytes): delete it")
                     data = {name: saved[name] for name in saved.files}
                 _check_view(data, len(views), file)
                 views.append(_view({name: jnp.asarray(data[name]) for name in _ARRAYS if name in data}))

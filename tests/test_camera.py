@@ -185,3 +185,10 @@ def test_fibonacci_sphere_is_even(count):
 def test_fibonacci_sphere_refuses_nothing(count, radius):
     with pytest.raises(ValueError, match=r"Fibonacci|radius"):
         fibonacci_sphere(count, radius)
+
+
+def test_a_batch_of_poses_is_iterated_once():
+    poses = look_at(fibonacci_sphere(3, 2.5))
+    for pose, again in zip(poses, [poses[0], poses[1], poses[-1]], strict=True):
+        np.testing.assert_array_equal(pose.position, again.position)
+    assert [len(list(row)) for row in look_at(np.ones((2, 3, 3)))] == [3, 3]

@@ -122,10 +122,16 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
         (("run", "ball.obj", "--source", "1,0,0"), ("--source", "heat")),
         (("run", "ball.obj", "--task", "cross-entropy"), ("cross-entropy", "--network")),
         (("study", "parts", "--methods", "best"), ("best", "gradient-2dof")),
+        (("study", "parts", "--method", "broken_module:it"), ("broken_module:it", "ZeroDivisionError")),
+        (("study", "parts", "--method", "leaving:it"), ("leaving:it", "SystemExit")),
+        (("study", "parts", "--method", "halved:it"), ("halved:it", "SyntaxError")),
+        (("study", "parts", "--method", ".mine:it"), (".mine:it", "cannot be found")),
         (("study", "reconstruction", "--meshes", "occupied"), ("occupied", "no mesh")),
     ],
 )
 def test_bad_input_is_one_line_that_names_the_value_and_the_remedy(arguments, words, tmp_path):
+    for name, text in {"broken_module": "1 / 0", "leaving": "import sys\nsys.exit(5)", "halved": "def ("}.items():
+        (tmp_path / f"{name}.py").write_text(text)
     (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
     (tmp_path / "broken.glb").write_bytes(b"glTF and no more")
     trimesh.creation.icosphere(2).export(tmp_path / "ball.obj")

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxnbv.camera import Camera, Pose, look_at
-from jaxnbv.cloud import Frame, PointCloud, concatenate, farthest_point_subsample, limit_capacity
+from jaxnbv.cloud import PointCloud, concatenate, farthest_point_subsample, limit_capacity
+from jaxnbv.frame import Frame
 
 GOOD = [[0.0, 0.1, 0.2], [0.3, 0.4, 0.5]]
 UP = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -281,3 +282,18 @@ def test_nan_in_masked_rows_never_enters_farthest_point_samples():
     assert bool(chosen.mask.all())
     assert len(np.unique(np.asarray(chosen.points), axis=0)) == 20
     assert bool(jnp.isfinite(chosen.points).all())
+
+
+def test_a_batch_of_clouds_is_iterated_once():
+    points = np.random.default_rng(0).normal(size=(2, 5, 3))
+    clouds = PointCloud(jnp.asarray(points), jnp.asarray(points), jnp.ones((2, 5), bool))
+    for cloud, expected in zip(clouds, points, strict=True):
+        np.testing.assert_array_equal(cloud.points, np.float32(expected))
+
+
+def test_depths_beyond_the_type_say_nothing_and_only_infinity_says_nothing_is_there():
+    camera, pose = Camera(height=4, width=4), look_at((0.0, 0.0, 2.5))
+    for depth, missed in ((1e15, 0), (3.5e38, 0), (1e300, 0), (np.inf, 16)):
+        cloud = PointCloud.from_depth(np.full((4, 4), depth), camera, pose)
+        assert int(cloud.count) == 0
+        assert int(cloud.missed.sum()) == missed

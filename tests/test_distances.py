@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import cdist, directed_hausdorff
 
 from jaxnbv.checks import InputError
-from jaxnbv.cloud import Frame
+from jaxnbv.frame import Frame
 from jaxnbv.metrics import SURFACE_POINTS, surface_distance
 from jaxnbv.scanning import TriangleMesh
 

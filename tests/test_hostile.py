@@ -5,7 +5,15 @@ import sys
 from pathlib import Path
 
 
+def run(name, *arguments):
+    script = Path(__file__).with_name(name)
+    found = subprocess.run([sys.executable, script, *arguments], capture_output=True, text=True)
+    assert found.returncode == 0, found.stdout + found.stderr
+
+
 def test_any_argument_works_or_is_refused_by_name():
-    script = Path(__file__).with_name("hostile.py")
-    run = subprocess.run([sys.executable, script, "25"], capture_output=True, text=True)
-    assert run.returncode == 0, run.stdout + run.stderr
+    run("hostile.py", "25")
+
+
+def test_what_once_passed_or_failed_within_is_refused_by_name():
+    run("refused.py")

@@ -233,3 +233,22 @@ def test_parts_thinner_than_a_cell_are_told_of_with_the_remedy():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         observe(60)
+
+
+def test_what_is_constant_under_jit_is_checked_too(planner, state):
+    seen = scan(SCENE, planner.camera, FIRST)
+    begun = jax.jit(lambda: planner.init(seen, FIRST))()
+    np.testing.assert_array_equal(begun.cloud.points, state.cloud.points)
+    assert int(jax.jit(lambda state: planner.observe(state, FIRST, seen).num_views)(state)) == 2
+    with pytest.raises(ValueError, match="not of unit length"):
+        jax.jit(lambda: planner.init(eqx.tree_at(lambda c: c.normals, seen, 2 * seen.normals), FIRST))()
+
+
+def test_a_near_camera_s_own_scan_is_its_image():
+    """Noise of a hundredth is many pixels where the surface is a tenth away."""
+    planner, near = planner_of(SEARCHES["FarthestView"]), look_at((0.0, 0.0, 0.8))
+    ball = SDFSurface(Sphere(0.7))
+    seen = SensorNoise()(scan(ball, planner.camera, near), jax.random.key(0))
+    assert int(planner.init(seen, near).num_views) == 1
+    with pytest.raises(ValueError, match="pixels"):
+        planner.init(seen, look_at((0.0, 0.8, 0.0)))

@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxnbv.checks import InputError, require
-from jaxnbv.cloud import Frame, PointCloud
+from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets.categories import CATEGORIES, category_index
+from jaxnbv.frame import Frame
 
 _SPLITS = {"train": "train", "validation": "val", "test": "test"}
 _CATEGORY_FILE = "synsetoffset2category.txt"

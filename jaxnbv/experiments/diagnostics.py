@@ -5,8 +5,9 @@ from jaxtyping import Bool, Float
 from scipy.stats import spearmanr
 
 from jaxnbv.checks import AnyArray
-from jaxnbv.planner import Planner, State
+from jaxnbv.planner import Planner
 from jaxnbv.scanning import GridSurface
+from jaxnbv.state import State
 from jaxnbv.surfaces import SurfacePosterior
 
 

@@ -18,8 +18,9 @@ from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import AnyArray, InputError, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.experiments.diagnostics import rank_correlation
-from jaxnbv.planner import Planner, State
+from jaxnbv.planner import Planner
 from jaxnbv.scanning import Grid, GridSurface, SDFSurface, Surface, TriangleMesh, scan
+from jaxnbv.state import State
 from jaxnbv.tensor_grid import on_tensor_grid
 from jaxnbv.volume import Box
 

@@ -2,6 +2,7 @@
 
 import itertools
 import time
+import traceback
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, TypeAlias
@@ -13,7 +14,7 @@ from jaxtyping import PRNGKeyArray
 
 from jaxnbv.acquisition import Score
 from jaxnbv.camera import Camera, Pose
-from jaxnbv.checks import InputError, require
+from jaxnbv.checks import InputError, check_type, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.episode import Sensor, Step, scene_sensor, steps, view_keys
 from jaxnbv.experiments.measures import Measure, Record, Row
@@ -207,19 +208,37 @@ class Study(eqx.Module):
 
         - `methods`: some of the study's, by default all; `own`: further ones, and what makes their planners.
 
-        **Raises:** `ValueError` for an unknown method, as `scene` does, and if no candidate shows enough.
+        **Raises:** `ValueError` for an unknown method, as `scene` does, if no candidate shows enough, or if one
+        of `own` makes no planner of so many views.
         """
         methods = self.methods if methods is None else tuple(methods)
         unknown = sorted({*methods} - {*self.methods})
         require(not unknown, f"unknown methods: {', '.join(unknown)}; choose from {', '.join(self.methods)}")
         start = time.perf_counter()
         scene = self.scene(index)
+        planners = {name: self._made(name, make, scene) for name, make in (own or {}).items()}
         first, truth = self.first_view(scene), self.truth(scene)
         record = {"scene": index, **self.facts(scene, truth, first), "first": first, "study_views": self.views}
         record["methods"] = self.run_methods(scene, truth, first, methods) | {
-            name: self.run(scene, truth, first, name, methods, make(self, scene)) for name, make in (own or {}).items()
+            name: self.run(scene, truth, first, name, methods, planner) for name, planner in planners.items()
         }
         return record | {"seconds": time.perf_counter() - start}
+
+    def _made(self, name: str, make: "Factory", scene: Scene) -> Planner:
+        """The planner of a method of one's own."""
+        try:
+            planner = make(self, scene)
+        except Exception as error:
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            problem = f"{type(error).__name__}: {error}, {where.filename}:{where.lineno}"
+            raise InputError(f"the method {name} fails on scene {scene.index} ({problem})") from error
+        check_type(planner, Planner, f"what the method {name} makes")
+        require(
+            planner.max_views >= self.views,
+            f"the method {name} makes a planner of {planner.max_views} views, but the study has {self.views}: give "
+            f"Planner(max_views={self.views})",
+        )
+        return planner
 
     def run_methods(self, scene: Scene, truth: Any, first: int, methods: Sequence[str]) -> dict[str, Record]:
         """The records of the study's own methods."""

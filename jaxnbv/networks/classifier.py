@@ -5,7 +5,7 @@ from collections.abc import Callable
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import check_fields, require
+from jaxnbv.checks import check_fields, require, shown
 from jaxnbv.cloud import PointCloud, farthest_point_subsample
 from jaxnbv.networks.compact_segmenter import CompactPartSegmenter
 from jaxnbv.networks.part_segmentation import PointNet2PartSegmenter
@@ -34,6 +34,9 @@ class CloudClassifier(eqx.Module):
     def __check_init__(self):
         check_fields(self)
         parts = isinstance(self.network, PointNet2PartSegmenter | CompactPartSegmenter)
+        names = () if self.classes is None else self.classes
+        proper = isinstance(names, tuple) and all(isinstance(name, str) for name in names)
+        require(proper, f"the classes are {shown(self.classes)}; give a tuple of names")
         require(not parts, "the network segments parts; a CloudSegmenter feeds it clouds")
         require(self.num_points >= 1, f"num_points is {self.num_points}; the network needs at least one")
         require(self.scale > 0, f"the scale is {self.scale}; it must be positive")

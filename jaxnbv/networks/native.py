@@ -47,14 +47,19 @@ def _filled(blank: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     """The network of the shapes of `blank`, with these arrays."""
     expected = {name: leaf.shape for name, leaf in _named(blank)}
     found = {name: array.shape for name, array in arrays.items()}
+    leaves: dict[str, np.ndarray] = {}
     for name in sorted(expected.keys() | found.keys()):
         require(name in found, f"the array {name} is missing")
         require(name in expected, f"the array {name} has no place in it")
         same = found[name] == expected[name]
         require(same, f"the array {name} has shape {found[name]}; expected {expected[name]}")
-        require(bool(np.isfinite(arrays[name]).all()), f"the array {name} has entries that are not finite")
-    leaves = [jnp.asarray(arrays[name], jnp.result_type(float)) for name in expected]
-    return jax.tree.unflatten(jax.tree.structure(blank), leaves)
+        # Numbers of 64 bits may not be finite in the type that they are used in.
+        with np.errstate(over="ignore"):
+            leaves[name] = arrays[name].astype(jnp.result_type(float))
+        require(bool(np.isfinite(leaves[name]).all()), f"the array {name} has entries that are not finite")
+    temperature = leaves.get("temperature")
+    require(temperature is None or bool(temperature > 0), f"the temperature is {temperature}; it must be positive")
+    return jax.tree.unflatten(jax.tree.structure(blank), [jnp.asarray(leaves[name]) for name in expected])
 
 
 def _named(network: Any) -> list[tuple[str, Any]]:

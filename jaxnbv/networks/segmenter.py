@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.checks import AnyArray, check_type, is_traced, require
 from jaxnbv.cloud import PointCloud, farthest_point_subsample
 from jaxnbv.datasets.categories import CATEGORIES, category_index, part_mask
 from jaxnbv.networks.invariant import InvariantClassifier
@@ -42,10 +42,14 @@ class CloudSegmenter(eqx.Module):
         scale: float | Float[AnyArray, ""] = 1.0,
     ):
         index = category_index(category) if isinstance(category, str) else category
-        require(
-            is_traced(index) or 0 <= int(index) < len(CATEGORIES),
-            f"the category is {index}; choose 0 to {len(CATEGORIES) - 1}, or a name such as 'chair'",
-        )
+        check_type(network, Callable, "the network")
+        check_type(num_points, int, "num_points")
+        check_type(scale, float, "the scale")
+        if not is_traced(index):
+            index = index.item() if isinstance(index, AnyArray) and index.ndim == 0 else index
+            check_type(index, int, "the category")
+            known = bool(0 <= index < len(CATEGORIES))
+            require(known, f"the category is {index}; choose 0 to {len(CATEGORIES) - 1}, or a name such as 'chair'")
         whole = isinstance(network, PointNet2Classifier | InvariantClassifier)
         require(not whole, "the network classifies whole clouds; a CloudClassifier feeds it clouds")
         require(num_points >= 1, f"num_points is {num_points}; the network needs at least one")

@@ -216,7 +216,11 @@ def _branch_names(level: str, radii: int) -> list[tuple[str, str]]:
 
 def _linear(weight: np.ndarray, bias: np.ndarray) -> Linear:
     dtype = jnp.result_type(float)
-    return Linear(jnp.asarray(weight, dtype=dtype), jnp.asarray(bias, dtype=dtype))
+    with np.errstate(over="ignore"):
+        arrays = [array.astype(dtype) for array in (weight, bias)]
+    finite = all(np.isfinite(array).all() for array in arrays)
+    require(finite, f"a layer of shape {weight.shape} has entries that are not finite as {dtype}: train it again")
+    return Linear(*map(jnp.asarray, arrays))
 
 
 def _width(layers: tuple[Linear, ...] | list[Linear]) -> int:

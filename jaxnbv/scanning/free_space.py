@@ -23,6 +23,8 @@ from jaxnbv.volume import Box, Volume
 _POINTS_ALONG_AXIS = 20
 # Noise takes fewer of the points on a face of the volume two voxels out of it.
 _STRAY = 0.01
+# Off its ray, in scene units: five standard deviations of the sensor that is usual.
+_NOISE = 0.05
 
 
 class Carving(eqx.Module):
@@ -138,6 +140,8 @@ def _pixels_off(scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, ""
     seen = scan.mask & (local[:, 2] > 0)
     image = local[:, :2] / jnp.where(seen, local[:, 2], 1.0)[:, None]
     off = camera.focal_length * jnp.max(jnp.abs(image - camera.pixel_directions()[:, :2]), axis=1)
+    # Beside a near camera a little noise is many pixels.
+    off = jnp.where(off * local[:, 2] < _NOISE * camera.focal_length, 0.0, off)
     off = jnp.where(scan.mask, jnp.where(seen, off, jnp.inf), jnp.nan)
     return jnp.where(jnp.any(scan.mask), jnp.nanmedian(off), 0.0)
 

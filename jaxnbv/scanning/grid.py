@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int8
 from scipy.spatial import cKDTree
 
 from jaxnbv.camera import Camera, Pose
-from jaxnbv.checks import AnyArray, check_fields, is_traced, require
+from jaxnbv.checks import AnyArray, as_floats, check_fields, is_traced, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.scanning import tracing
 from jaxnbv.scanning.scanner import scan
@@ -85,11 +85,12 @@ class GridSurface(Surface):
         **Raises:** `ValueError` if the values are not the grid's, or one of them or the level is not finite.
         """
         g = grid.resolution
+        values, level = as_floats(values, "the values"), as_floats(level, "the level")
         require(
             values.shape[-3:] == (g, g, g),
             f"values of shape {values.shape} do not fit a grid of {g}^3 nodes: evaluate on grid.axis, three times",
         )
-        values = jnp.asarray(values) - level
+        values = values - level
         if not is_traced(values):
             require(bool(jnp.isfinite(values).all()), "the values on the grid, or the level, are not finite")
         return cls(values, _free_distances(values), grid)

@@ -16,8 +16,9 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 from skimage.measure import marching_cubes
 
-from jaxnbv.checks import AnyArray, InputError, as_numbers, checked, is_traced, require
-from jaxnbv.cloud import Frame
+from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, check_type, checked, is_traced, require, shown
+from jaxnbv.files import is_file
+from jaxnbv.frame import Frame
 from jaxnbv.scanning.grid import Grid, GridSurface
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.scanning.surface import Hits, Surface
@@ -139,6 +140,8 @@ class TriangleMesh(Surface):
 
         **Raises:** `ValueError` if `count` < 1.
         """
+        check_key(key)
+        check_type(count, int, "the number of points")
         require(count >= 1, f"cannot sample {count} points; ask for at least one")
         seed = np.random.default_rng(np.asarray(jax.random.key_data(key)))
         points, _ = trimesh.sample.sample_surface(self.to_trimesh(), count, seed=seed)
@@ -182,13 +185,12 @@ def load_mesh(path: str | Path) -> TriangleMesh:
     **Raises:** `ValueError` if the file is missing or cannot be read, and as `TriangleMesh.from_arrays` does.
     """
     path = Path(path)
-    require(path.is_file(), f"no mesh file at {path}: check the path")
+    require(is_file(path), f"no mesh file at {shown(str(path))}: check the path")
     try:
         parts = trimesh.load_scene(path, process=False).dump()
     except Exception as error:  # Each of trimesh's readers fails in its own way.
-        formats = ", ".join(sorted(trimesh.available_formats()))
-        message = f"cannot read {path} as a mesh ({type(error).__name__}: {error}): it must be one of {formats}"
-        raise InputError(message) from error
+        problem = f"cannot read {path} as a mesh ({type(error).__name__}: {error})"
+        raise InputError(f"{problem}: {_why_unread(path)}") from error
     meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     require(len(meshes) > 0, f"{path} has no faces: {_why_empty(path)}")
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
@@ -198,6 +200,15 @@ def load_mesh(path: str | Path) -> TriangleMesh:
         return TriangleMesh.from_arrays(vertices, faces)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+
+
+def _why_unread(path: Path) -> str:
+    if path.open("rb").read(3) == b"\xef\xbb\xbf":
+        return "it begins with a byte-order mark; save it as UTF-8 without one"
+    formats = sorted(trimesh.available_formats())
+    if path.suffix.lower().removeprefix(".") in formats:
+        return "it is damaged, or not what its name says; export it again"
+    return f"it must be one of {', '.join(formats)}, some of which need a package of their own"
 
 
 def _why_empty(path: Path) -> str:

@@ -1,7 +1,5 @@
 """The paper's scan(theta; f): the oriented points that a depth camera sees of a surface."""
 
-import math
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,6 +9,9 @@ from jaxnbv.camera import Camera, Pose
 from jaxnbv.checks import check_fields, checked, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.scanning.surface import Surface
+
+# Beyond any sensor; squares of much larger numbers are infinite.
+_LOUDEST = 1e6
 
 
 class SensorNoise(eqx.Module):
@@ -28,9 +29,9 @@ class SensorNoise(eqx.Module):
     def __check_init__(self):
         check_fields(self)
         require(
-            0 <= self.points < math.inf and 0 <= self.normals < math.inf,
+            all(0 <= deviation <= _LOUDEST for deviation in (self.points, self.normals)),
             f"the noise's standard deviations are {self.points} and {self.normals}; "
-            "they must not be negative, nor infinite",
+            f"they must not be negative, nor above {_LOUDEST:g}",
         )
 
     def __call__(self, cloud: PointCloud, key: PRNGKeyArray) -> PointCloud:

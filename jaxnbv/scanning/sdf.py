@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxnbv.camera import Pose
-from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.checks import AnyArray, as_floats, check_type, is_traced, require
 
 # Numbers and lists are converted on the way in, which mypy cannot see.
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ else:
 
 
 def _as_float(value):
-    return jnp.asarray(value, dtype=jnp.result_type(float))
+    return as_floats(value, "a parameter of a signed distance")
 
 
 def parameter(**kwargs):
@@ -88,10 +88,11 @@ class SignedDistance(eqx.Module):
 
     def __check_init__(self):
         for field in fields(self):
-            value = getattr(self, field.name)
+            value, name = getattr(self, field.name), f"{type(self).__name__}.{field.name}"
+            if field.type is SignedDistance:
+                check_type(value, SignedDistance, name)
             if not eqx.is_array(value):
                 continue
-            name = f"{type(self).__name__}.{field.name}"
             shape = tuple(int(size) for size in cast(Any, field.type).dim_str.split())
             require(
                 value.shape == shape,
@@ -112,6 +113,8 @@ class SignedDistance(eqx.Module):
         **Raises:** `ValueError` if the axis is zero.
         """
         axis, angle = _as_float(axis), _as_float(angle)
+        shapes = axis.shape, angle.shape
+        require(shapes == ((3,), ()), f"axis and angle have shapes {shapes[0]} and {shapes[1]}: give (3,) and ()")
         if not is_traced(axis):
             require(bool(norm(*axis) > 0), f"the axis of rotation is {axis}: give a direction that is not zero")
         x, y, z = axis / norm(*axis)
@@ -307,6 +310,10 @@ class Scaled(SignedDistance):
 
     solid: SignedDistance
     factor: Scalar = nonnegative()
+
+    def __check_init__(self):
+        if not is_traced(self.factor):
+            require(bool(self.factor > 0), f"a solid cannot be scaled by {self.factor}: give a positive factor")
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         return self.factor * self.solid(x / self.factor)

@@ -114,8 +114,8 @@ def as_candidates(value: object) -> Candidates:
         return value
     if isinstance(value, Pose):
         return GivenPoses(value)
-    if isinstance(value, int) and not isinstance(value, bool):
-        return SphereCandidates(value)
+    if isinstance(value, int | np.integer) and not isinstance(value, bool):
+        return SphereCandidates(int(value))
     raise InputError(f"the candidates are {shown(value)}: give how many, a batch of poses, or SphereCandidates(...)")
 
 

@@ -6,10 +6,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.checks import checked, require
+from jaxnbv.checks import check_key, check_type, checked, require
 from jaxnbv.cloud import PointCloud
+from jaxnbv.surfaces.base import check_data
 from jaxnbv.surfaces.screened import ScreenedSPSR
 from jaxnbv.surfaces.spsr import GeometricSPSR
 
@@ -31,14 +32,19 @@ def fit_hyperparameters(
     The maximum is a local one. It explains the scanned patch, and says little about what was not seen: prefer the fixed
     values where the patch is flat, and the fitted ones where the surface has detail of another size than they expect.
 
-    **Raises:** `ValueError` if the cloud is empty, `num_points` < 8, or no likelihood that is finite was found.
+    **Raises:** `ValueError` for a cloud as `condition` does, `num_points` < 8, `max_steps` < 1, or if no
+    likelihood that is finite was found.
     """
+    check_type(model, GeometricSPSR | ScreenedSPSR, "the model")
+    check_key(key)
     require(num_points >= 8, f"asked for {num_points} points to fit to; ask for at least 8")
+    require(max_steps >= 1, f"asked for {max_steps} steps; ask for at least one")
+    check_data(cloud)
     base = model.base if isinstance(model, ScreenedSPSR) else model
-    require(int(cloud.count) > 0, "cannot fit hyperparameters to an empty cloud: scan the object at least once")
-    found = _fit(base, _random_rows(cloud, key, num_points), max_steps)
+    found: GeometricSPSR
+    found, likelihood = _fit(base, _random_rows(cloud, key, num_points), max_steps)
     require(
-        all(bool(jnp.isfinite(value).all()) for value in (found.lengthscale, found.variance, found.noise)),
+        all(bool(jnp.isfinite(value).all()) for value in (likelihood, *_parameters(found))),
         "the likelihood of the normals is not finite: start from a model of more noise, or enable jax_enable_x64",
     )
     # Made anew, so that a truncation that no longer fits the lengthscale is warned of.
@@ -52,7 +58,9 @@ def _random_rows(cloud: PointCloud, key: PRNGKeyArray, count: int) -> PointCloud
 
 
 @eqx.filter_jit
-def _fit(model: GeometricSPSR, cloud: PointCloud, max_steps: int) -> GeometricSPSR:
+def _fit(model: GeometricSPSR, cloud: PointCloud, max_steps: int) -> tuple[GeometricSPSR, Float[Array, ""]]:
+    """The fitted model, and its likelihood."""
+
     def with_logarithms(logarithms) -> GeometricSPSR:
         return _with(model, jax.tree.map(jnp.exp, logarithms))
 
@@ -63,7 +71,8 @@ def _fit(model: GeometricSPSR, cloud: PointCloud, max_steps: int) -> GeometricSP
     start = jax.tree.map(jnp.log, _parameters(model))
     solver: Any = optx.BFGS(rtol=_TOLERANCE, atol=_TOLERANCE)
     solution: Any = optx.minimise(loss, solver, start, max_steps=max_steps, throw=False)
-    return with_logarithms(solution.value)
+    found = with_logarithms(solution.value)
+    return found, found.condition(cloud).log_marginal_likelihood()
 
 
 def _parameters(model: GeometricSPSR):

@@ -20,9 +20,9 @@ import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.checks import AnyArray, check_fields, is_traced, require, shown
+from jaxnbv.checks import AnyArray, check_fields, check_type, is_traced, require, shown
 from jaxnbv.cloud import PointCloud
-from jaxnbv.surfaces.base import EmptyPoints, SurfaceModel, on_torus
+from jaxnbv.surfaces.base import EmptyPoints, SurfaceModel, on_torus, sampler
 from jaxnbv.surfaces.covariance import function_covariance, function_variance
 from jaxnbv.surfaces.nonuniform import NonuniformTransform
 from jaxnbv.surfaces.spsr import GeometricSPSR, GeometricSPSRPosterior, mode_variance
@@ -78,6 +78,7 @@ class ScreenedSPSR(SurfaceModel):
 
         **Raises:** `ValueError` as `GeometricSPSR.condition` does, and if S is singular in the precision at hand.
         """
+        check_type(cloud, PointCloud, "the cloud")
         nowhere = EmptyPoints(jnp.zeros((1, 3), cloud.points.dtype), jnp.zeros(1, bool))
         return self.condition_on_space(cloud, nowhere)
 
@@ -185,6 +186,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         of_values = -0.5 * (jnp.sum(residual**2) + log_determinant + count * jnp.log(2.0 * jnp.pi))
         return self.base.log_marginal_likelihood() + of_values
 
+    @sampler
     @eqx.filter_jit
     def sample(self, key: PRNGKeyArray, num_samples: int) -> TrigonometricFields:
         """`num_samples` joint samples of g by pathwise conditioning: functions, to be evaluated anywhere.

@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 
 from jaxnbv.checks import AnyArray, as_floats, check_type, is_traced, require
 from jaxnbv.cloud import PointCloud
-from jaxnbv.surfaces.base import SurfaceModel, check_data, on_torus
+from jaxnbv.surfaces.base import SurfaceModel, check_data, on_torus, sampler
 from jaxnbv.surfaces.covariance import (
     Spectra,
     function_covariance,
@@ -227,6 +227,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         log_determinant = 2.0 * jnp.sum(jnp.log(jnp.diag(self.cholesky)))
         return -0.5 * (fit + 3.0 * log_determinant + 3.0 * count * jnp.log(2.0 * jnp.pi))
 
+    @sampler
     @eqx.filter_jit
     def sample(self, key: PRNGKeyArray, num_samples: int) -> TrigonometricFields:
         """`num_samples` joint samples of f by pathwise conditioning: functions, to be evaluated anywhere.
@@ -238,11 +239,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
     def prior_draws(
         self, key: PRNGKeyArray, num_samples: int
     ) -> tuple[Float[Array, "s 3 a a a"], Float[Array, "s n 3"]]:
-        """Coefficients of v drawn from the prior, and their residuals at the data, whitened: C^-1 (n - v(X) - eps).
-
-        **Raises:** `ValueError` if `num_samples` < 1.
-        """
-        require(num_samples >= 1, f"asked for {num_samples} samples; ask for at least one")
+        """Coefficients of v drawn from the prior, and their residuals at the data, whitened: C^-1 (n - v(X) - eps)."""
         spectrum, dtype = self.model.spectrum, self.weights.dtype
         scale = jnp.sqrt(mode_variance(spectrum))
         modes = scale.shape[0]

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnbv.checks import AnyArray
-from jaxnbv.surfaces.base import Fields, SurfacePosterior, on_torus
+from jaxnbv.surfaces.base import Fields, SurfacePosterior, on_grid_of_torus, on_torus
 
 _CHUNK_VALUES = 2**24
 
@@ -88,6 +88,7 @@ class TrigonometricFields(Fields):
         chunk = max(1, min(x.shape[0], _CHUNK_VALUES // (samples * modes**2)))
         return jax.lax.map(evaluate, x, batch_size=chunk).T
 
+    @on_grid_of_torus
     def on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "s g g g"]:
         """All functions on the tensor grid axis x axis x axis, one after the other to bound the memory."""
         basis = circle_basis(jnp.asarray(axis, dtype=self.coefficients.dtype), self.coefficients.shape[-1] // 2)
@@ -113,6 +114,7 @@ class TrigonometricPosterior(SurfacePosterior):
         """E f(x) at points in scene coordinates."""
         return self.mean_field(x)[0]
 
+    @on_grid_of_torus
     @eqx.filter_jit
     def mean_on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "g g g"]:
         """E f on the tensor grid axis x axis x axis (scene coordinates)."""

@@ -89,8 +89,15 @@ class ClassScore(Score):
         return _answer(self.classifier, context_of(self, cloud)[1])
 
     def check(self, cloud: PointCloud) -> None:
-        """**Raises:** `ValueError` if the classifier's answer on D is not a vector of log-probabilities."""
-        check_log_p(context_of(self, cloud)[1])
+        """**Raises:** `ValueError` if the classifier's answer on D is not a vector of log-probabilities, one for each
+        of the classes that it names."""
+        log_p = context_of(self, cloud)[1]
+        check_log_p(log_p)
+        names = getattr(self.classifier, "classes", None)
+        require(
+            names is None or len(names) == len(log_p),
+            f"the classifier names {len(names or ())} classes but tells {len(log_p)} apart: give as many names",
+        )
 
 
 class CrossEntropy(ClassScore):

@@ -17,8 +17,11 @@ from jaxtyping import Array, Float, Int
 
 from jaxnbv.acquisition import preferred_batch_size
 from jaxnbv.answers import Answer, Quantity
-from jaxnbv.checks import check_fields, require
+from jaxnbv.checks import check_fields, require, shown
 from jaxnbv.cloud import PointCloud
+
+# Of probabilities in 32 bits, or less.
+_SLACK = 1e-2
 
 Segmenter: TypeAlias = Callable[[PointCloud], Float[Array, "points parts"]]
 
@@ -43,6 +46,23 @@ class SoftPartCount(eqx.Module):
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
         """u_S, between zero and the number of parts."""
         return jnp.sum(jnp.tanh(jnp.sum(self.segmenter(cloud), axis=0) / self.target))
+
+    def check(self, cloud: PointCloud) -> None:
+        """**Raises:** `ValueError` if what the segmenter gives of the cloud are not probabilities, a row a point."""
+        p = _probabilities(self.segmenter, cloud)
+        require(
+            isinstance(p, Array) and p.ndim == 2,
+            f"the segmenter gives {shown(p)}; it should give probabilities (points, parts)",
+        )
+        total = jnp.sum(p, axis=1)
+        # Rows of points that are not there hold zeros.
+        proper = jnp.all(p >= -_SLACK) & jnp.all((jnp.abs(total - 1.0) < _SLACK) | (jnp.abs(total) < _SLACK))
+        require(
+            bool(proper),
+            f"the segmenter gives values from {float(jnp.min(p)):.4g} whose sums over the parts run from "
+            f"{float(jnp.min(total)):.4g} to {float(jnp.max(total)):.4g}: give probabilities, such as jax.nn.softmax "
+            "of logits, and zeros for points that are not there",
+        )
 
     @property
     def batch_size(self) -> int:
@@ -76,6 +96,11 @@ class PartAnswer(Answer):
     def sentence(self, before: Answer | None = None) -> str:
         listed = ", ".join(f"{self.names[index]} {self.values[index]:.0f}" for index in self.shown) or "none"
         return f"Points predicted of each part: {listed}."
+
+
+@eqx.filter_jit
+def _probabilities(segmenter: Segmenter, cloud: PointCloud):
+    return segmenter(cloud)
 
 
 @eqx.filter_jit

@@ -4,7 +4,8 @@ from jaxtyping import Array, Bool
 
 from jaxnbv.camera import Camera, Pose
 from jaxnbv.cloud import PointCloud
-from jaxnbv.planner import Planner, State
+from jaxnbv.planner import Planner
+from jaxnbv.state import State
 
 
 def only(views: PointCloud, used: Bool[Array, " v"]) -> PointCloud:

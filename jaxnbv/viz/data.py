@@ -12,10 +12,11 @@ from jaxnbv.camera import Pose
 from jaxnbv.checks import AnyArray
 from jaxnbv.episode import Episode
 from jaxnbv.metrics import coverage, truth_points
-from jaxnbv.planner import Planner, State
+from jaxnbv.planner import Planner
 from jaxnbv.scanning import Grid
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
+from jaxnbv.state import State
 from jaxnbv.surfaces import TrigonometricPosterior
 from jaxnbv.viz.sphere import unit
 from jaxnbv.viz.trajectories import Ascents, SphereMap, ascents_of, open_values, wider_map

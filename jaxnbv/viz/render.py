@@ -11,7 +11,7 @@ from matplotlib.colors import LogNorm
 from scipy.spatial import cKDTree
 
 from jaxnbv.camera import Camera, Pose, look_at
-from jaxnbv.cloud import Frame
+from jaxnbv.frame import Frame
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.viz.data import MeanSurface, ViewData
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, LINE, NEW

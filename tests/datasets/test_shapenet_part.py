@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from jaxnbv.checks import InputError
-from jaxnbv.cloud import Frame
 from jaxnbv.datasets import ShapeNetPart, unit_sphere
+from jaxnbv.frame import Frame
 
 RNG = np.random.default_rng(0)
 SYNSETS = {"Airplane": "02691156", "Chair": "03001627"}

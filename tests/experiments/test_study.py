@@ -80,6 +80,23 @@ def test_a_method_of_ones_own_stands_in_the_same_record():
     assert {abs(round(view["position"][1], 3)) for view in own["views"][1:]} == {2.5}
 
 
+def test_a_method_of_ones_own_that_makes_no_planner_is_refused_before_anything_is_run(monkeypatch):
+    study = small()
+    monkeypatch.setattr(ToyStudy, "run_methods", lambda *_: pytest.fail("a method was run"))
+
+    def few(study, scene):
+        return Planner(study.model, study.camera, Coverage(), RandomView(3), max_views=1)
+
+    for make, problem in (
+        (lambda study, scene: None, "what the method mine makes is None; give Planner"),
+        (lambda study, scene: 1 / 0, r"the method mine fails on scene 0 \(ZeroDivisionError: .*test_study\.py:\d+\)"),
+        (lambda: None, "the method mine fails on scene 0 .*takes 0 positional arguments"),
+        (few, rf"a planner of 1 views, but the study has {study.views}: give Planner\(max_views={study.views}\)"),
+    ):
+        with pytest.raises(InputError, match=problem):
+            study.run_scene(0, ["random"], {"mine": make})
+
+
 def test_the_first_view_shows_enough():
     class Picky(ToyStudy):
         def shows_enough(self, scene, seen):

@@ -14,8 +14,9 @@ from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
 from jaxnbv.camera import Camera, fibonacci_sphere, look_at
-from jaxnbv.cloud import Frame, PointCloud
+from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets.demo import demo_object
+from jaxnbv.frame import Frame
 from jaxnbv.scanning import (
     Carving,
     Grid,

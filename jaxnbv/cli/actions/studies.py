@@ -77,8 +77,10 @@ def _own(text: str) -> Factory:
         raise InputError(f"--method {text} names no function: write module:function, such as mine:planner")
     try:
         made = resolve(text)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, TypeError) as error:
         raise InputError(f"--method {text} cannot be found ({error}): start where the module lies") from error
+    except (Exception, SystemExit) as error:  # whatever a module of the user's does as it is imported
+        raise InputError(f"--method {text}: its module fails ({type(error).__name__}: {error})") from error
     if not callable(made):
         raise InputError(f"--method {text} is a {type(made).__name__}; give a function of a study and a scene")
     return made

@@ -10,9 +10,10 @@ from jaxtyping import PRNGKeyArray
 
 from jaxnbv.experiments.measures import Record, Row
 from jaxnbv.experiments.tables import count_of, underlined
-from jaxnbv.planner import Planner, State
+from jaxnbv.planner import Planner
 from jaxnbv.scanning import GridSurface
 from jaxnbv.search import HalvingSearch, Proposal
+from jaxnbv.state import State
 
 
 def compare(

@@ -13,10 +13,11 @@ from jaxnbv.acquisition import Score, Several, expected_score, zero_if_empty
 from jaxnbv.camera import Camera, Pose
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.experiments.diagnostics import rank_correlation, roughness
-from jaxnbv.planner import Planner, State
+from jaxnbv.planner import Planner
 from jaxnbv.scanning import GridSurface
 from jaxnbv.search import CandidateSearch, Problem
 from jaxnbv.search.baselines import uncertain_length
+from jaxnbv.state import State
 from jaxnbv.tasks import Coverage
 from jaxnbv.tasks.classification import Classifier, ClassScore, Context, MixedEntropy, cross_entropy, entropy
 

@@ -1,0 +1,201 @@
+"""What once failed by an internal error, or gave a wrong value without a word, is refused by name: `python refused.py`.
+
+A program of its own: in the tests annotations are checked by beartype before anything else is.
+"""
+
+import sys
+import tempfile
+import traceback
+import warnings
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from safetensors.numpy import load_file, save_file
+
+import jaxnbv as nbv
+from jaxnbv.networks import CloudClassifier, CloudSegmenter, load_checkpoint
+
+FOLDER = Path(tempfile.mkdtemp())
+WEIGHTS = Path(nbv.__file__).parent / "networks" / "weights"
+KEY = jax.random.key(0)
+BALL = nbv.SDFSurface(nbv.sdf.Sphere(1.0))
+POSE = nbv.look_at((0.0, 0.0, 2.5))
+POSES = nbv.SphereCandidates(6).poses()
+SMALL = nbv.Camera(height=6, width=6)
+SCAN = nbv.scan(BALL, SMALL, POSE)
+SCANS = nbv.scan(BALL, SMALL, POSES)
+D = np.random.default_rng(0).normal(size=(60, 3))
+D /= np.linalg.norm(D, axis=1, keepdims=True)
+CLOUD = nbv.PointCloud.from_arrays(D, D)
+NOT_FINITE = nbv.PointCloud(CLOUD.points.at[0].set(jnp.nan), CLOUD.normals, CLOUD.mask)
+MODEL = nbv.GeometricSPSR(0.05, 0.2, 6)
+POSTERIOR = MODEL.condition(CLOUD)
+MAP = D + np.array([5e6, 4e5, 100.0])
+SEGMENTER, CLASSIFIER = (load_checkpoint(WEIGHTS / f"{name}.safetensors") for name in ("parts", "pyramid"))
+
+
+def planner(**changes):
+    settings = {"model": MODEL, "camera": SMALL, "acquisition": nbv.Coverage(), "search": nbv.DiscreteSearch(6)}
+    settings |= {"num_samples": 2, "grid": nbv.Grid(12), "capacity": 64, "max_views": 4}
+    return nbv.Planner(**(settings | changes))
+
+
+P = planner()
+STATE = P.init(SCAN, POSE)
+FULL = planner(max_views=1).init(SCAN, POSE)
+
+
+def proposed(acquisition):
+    return planner(acquisition=acquisition).propose(planner(acquisition=acquisition).init(SCAN, POSE), KEY)
+
+
+def parts_of(answer):
+    return proposed(nbv.ExpectedUtilityImprovement(nbv.SoftPartCount(lambda cloud: answer), 16))
+
+
+def stored(name, changes):
+    arrays = load_file(WEIGHTS / "pyramid.safetensors")
+    save_file(changes(arrays), FOLDER / name)
+    return load_checkpoint(FOLDER / name)
+
+
+def large_view():
+    """A view whose arrays are zeros, of which a megabyte holds gigabytes."""
+    folder = FOLDER / "episode"
+    nbv.simulate(P, BALL, POSE, 1, KEY, folder=folder, progress=False)
+    np.savez_compressed(folder / "view_00.npz", points=np.zeros(2**26 + 2**10))
+    nbv.simulate(P, BALL, POSE, 1, KEY, folder=folder, progress=False)
+
+
+# What is done, and a word of what must be said.
+REFUSED = {
+    "index beyond a batch": (lambda: POSES[6], "no index 6"),
+    "index of a single pose": (lambda: POSE[0], "a single one"),
+    "iteration of a single pose": (lambda: list(POSE), "a single one"),
+    "index beyond a batch of clouds": (lambda: SCANS[-7], "no index -7"),
+    "a state without room": (lambda: P.observe(FULL, POSE, SCAN), "max_views"),
+    "a state of another grid's extent": (lambda: planner(grid=nbv.Grid(12, 1.5)).propose(STATE, KEY), "reaches to 1.5"),
+    "a map's coordinates": (lambda: nbv.Frame.fit(MAP).to_scene(nbv.PointCloud.from_arrays(MAP, D)), "rounded"),
+    "a map's pose": (lambda: nbv.Frame.fit(MAP).to_scene(nbv.look_at(MAP[0], MAP[1])), "rounded"),
+    "points of the plane": (lambda: POSTERIOR.variance(D[:, :2]), "(60, 2)"),
+    "points of the plane, mean": (lambda: POSTERIOR.mean(D[:, :2]), "(60, 2)"),
+    "no points": (lambda: POSTERIOR.mean(None), "None"),
+    "complex points": (lambda: POSTERIOR.mean(D + 1j), "real numbers"),
+    "a grid beyond the torus": (lambda: nbv.mean_mesh(MODEL, CLOUD, nbv.Grid(12, 9.4)), "9.4"),
+    "nodes beyond the torus": (lambda: POSTERIOR.mean_on_grid(np.array([0.0, 10.0])), "10"),
+    "nodes that are not finite": (lambda: POSTERIOR.sample(KEY, 2).on_grid(np.array([np.nan, 1.0])), "nan"),
+    "a planner's grid beyond the torus": (lambda: planner(grid=nbv.Grid(12, 100.0)), "100"),
+    "a fit to a cloud outside": (
+        lambda: nbv.fit_hyperparameters(MODEL, nbv.PointCloud.from_arrays(100.0 * D, D), KEY),
+        "outside the scene",
+    ),
+    "a fit to what is not finite": (lambda: nbv.fit_hyperparameters(MODEL, NOT_FINITE, KEY), "not finite"),
+    "a fit without steps": (lambda: nbv.fit_hyperparameters(MODEL, CLOUD, KEY, max_steps=0), "0 steps"),
+    "a fit of no model": (lambda: nbv.fit_hyperparameters("x", CLOUD, KEY), "the model is 'x'"),
+    "an infinite score": (
+        lambda: proposed(nbv.ExpectedUtilityImprovement(lambda c: jnp.where(c.points.shape[0] > 64, jnp.inf, 1.0))),
+        "inf",
+    ),
+    "parts without points": (lambda: parts_of(jnp.ones(16)), "(16,)"),
+    "negative parts": (lambda: parts_of(-jnp.ones((16, 3))), "probabilities"),
+    "logits of parts": (lambda: parts_of(jnp.full((16, 3), 4.0)), "softmax"),
+    "no parts": (lambda: parts_of(None), "None"),
+    "a ragged image": (lambda: nbv.PointCloud.from_depth([[2.0] * 6] * 5 + [[1]], SMALL, POSE), "numbers"),
+    "a batch of scans": (lambda: P.init(SCANS), "batch"),
+    "a batch of poses": (lambda: P.init(SCAN, POSES), "batch"),
+    "a batch of poses, observed": (lambda: P.observe(STATE, POSES, SCAN), "batch"),
+    "no pose": (lambda: P.observe(STATE, None, SCAN), "None"),
+    "no state": (lambda: P.propose(None, KEY), "the state is None"),
+    "a scan as a state": (lambda: P.propose(SCAN, KEY), "the state is a PointCloud"),
+    "a number as a key": (lambda: P.propose(STATE, 0), "jax.random.key"),
+    "several keys": (lambda: P.propose(STATE, jax.random.split(KEY, 2)), "jax.random.key"),
+    "text as surfaces": (lambda: P.choose(STATE, "x", KEY), "'x'"),
+    "text as a posterior": (lambda: P.sample_surfaces(STATE, KEY, "x"), "'x'"),
+    "numbers as views": (lambda: list(P.replay([1, 2])), "pairs"),
+    "values of another grid": (lambda: P.carve(STATE, jnp.zeros((3, 3, 3))), "(3, 3, 3)"),
+    "a number as an episode's key": (lambda: nbv.simulate(P, BALL, POSE, 1, 0), "jax.random.key"),
+    "a batch of first poses": (lambda: nbv.simulate(P, BALL, POSES, 1, KEY), "batch"),
+    "rows that differ in number": (
+        lambda: nbv.PointCloud(jnp.zeros((3, 3)), jnp.zeros((2, 3)), jnp.ones(3, bool)),
+        "(2, 3)",
+    ),
+    "rays that differ in number": (lambda: nbv.PointCloud(SCAN.points, SCAN.normals, SCAN.mask, SCAN.mask[:5]), "(5,)"),
+    "a mask of numbers": (lambda: nbv.PointCloud(CLOUD.points, CLOUD.normals, jnp.ones(60)), "truths"),
+    "a batch for a posterior": (lambda: MODEL.condition(SCANS), "batch"),
+    "a batch to thin": (lambda: nbv.farthest_point_subsample(SCANS, 3), "batch"),
+    "a batch to join": (lambda: nbv.concatenate(CLOUD, SCANS), "batch"),
+    "a batch to measure": (lambda: nbv.metrics.coverage(SCANS, D), "batch"),
+    "text as a cloud": (lambda: nbv.ScreenedSPSR(MODEL).condition("x"), "'x'"),
+    "complex coordinates": (lambda: nbv.PointCloud.from_arrays(D + 1j, D), "real numbers"),
+    "a complex rotation": (lambda: nbv.Pose(np.eye(3) + 0j, np.zeros(3)), "real numbers"),
+    "dates as a position": (lambda: nbv.Pose(np.eye(3), np.array(["2020-01-01"] * 3, "M8[D]")), "real numbers"),
+    "text as numbers": (lambda: nbv.look_at(["0", "0", "2"]), "real numbers"),
+    "text for a frame": (lambda: nbv.Frame().to_scene("x"), "real numbers"),
+    "the plane for a frame": (lambda: nbv.Frame().to_world(D[:, :2]), "(60, 2)"),
+    "a masked truth": (lambda: nbv.metrics.coverage(CLOUD, np.ma.masked_array(D, D > 0)), "masked"),
+    "a truth of the plane": (lambda: nbv.metrics.coverage(CLOUD, D[:, :2]), "(60, 2)"),
+    "text as a radius": (lambda: nbv.sdf.Sphere("x"), "'x'"),
+    "a turn about the plane": (lambda: nbv.sdf.Sphere(1.0).rotate([0.0, 1.0], 1.0), "(2,)"),
+    "less text": (lambda: nbv.sdf.Sphere(1.0) - "x", "'x'"),
+    "united with a number": (lambda: nbv.sdf.Union(nbv.sdf.Sphere(1.0), 3), "is 3"),
+    "scaled to nothing": (lambda: nbv.sdf.Sphere(1.0).scale(0), "positive"),
+    "complex values": (lambda: nbv.GridSurface.from_values(np.ones((8, 8, 8)) * 1j, 0, nbv.Grid(8)), "real numbers"),
+    "a list of values": (lambda: nbv.GridSurface.from_values([[[1]]], 0, nbv.Grid(8)), "(1, 1, 1)"),
+    "half a sample": (lambda: POSTERIOR.sample(KEY, 2.5), "2.5"),
+    "no samples": (lambda: POSTERIOR.sample(KEY, None), "None"),
+    "a key that is none": (lambda: POSTERIOR.sample(3, 2), "jax.random.key"),
+    "half a point": (
+        lambda: nbv.mesh_from_sdf(nbv.sdf.Sphere(1.0), nbv.Grid(12)).sample_points(KEY, 2.5),
+        "2.5",
+    ),
+    "a negative temperature": (
+        lambda: stored("t.safetensors", lambda a: a | {"temperature": np.full((), -1, np.float32)}),
+        "temperature",
+    ),
+    "weights beyond 32 bits": (
+        lambda: stored("h.safetensors", lambda a: {k: np.asarray(v.astype(np.float64) * 1e300) for k, v in a.items()}),
+        "not finite",
+    ),
+    "a view of gigabytes": (large_view, "unpacks to"),
+    "a long name": (lambda: nbv.load_mesh("a" * 5000 + ".obj"), "no mesh file"),
+    "a name that ends early": (lambda: nbv.simulate(P, BALL, POSE, 1, KEY, folder="/tmp/a\0b"), "cannot make"),
+    "too large a capacity": (lambda: nbv.PointCloud.from_arrays(D, D, 10**13), "capacity"),
+    "too many points": (lambda: nbv.farthest_point_subsample(CLOUD, 10**12), "1000000000000"),
+    "half a category": (lambda: CloudSegmenter(SEGMENTER, 2.5), "2.5"),
+    "a true category": (lambda: CloudSegmenter(SEGMENTER, True), "True"),
+    "no network": (lambda: CloudSegmenter(None, 4), "None"),
+    "an infinite scale": (lambda: CloudSegmenter(SEGMENTER, 4, scale=float("inf")), "inf"),
+    "text as classes": (lambda: CloudClassifier(CLASSIFIER, classes="abcde"), "'abcde'"),
+    "too few classes": (lambda: proposed(nbv.CrossEntropy(CloudClassifier(CLASSIFIER, classes=("a",)), 16)), "names 1"),
+    "one score as several": (lambda: nbv.Several(nbv.Coverage()), "a tuple"),
+    "no scores": (lambda: nbv.Several(()), "a tuple"),
+    "deafening noise": (lambda: nbv.SensorNoise(0.0, 1e20), "1e+20"),
+    "up is nowhere": (lambda: nbv.look_at((0, 0, 2), (0, 0, 0), (np.nan, 0, 0)), "got up"),
+    "a target nowhere": (lambda: nbv.look_at((0, 0, 2), (np.nan, 0, 0)), "got target"),
+    "up without measure": (lambda: nbv.look_at((0, 0, 2), (0, 0, 0), (0, 1e30, 0)), "up direction"),
+}
+
+
+def problem(action, word):
+    """What is wrong with how something is refused, or None."""
+    try:
+        action()
+    except nbv.InputError as error:
+        return None if word in str(error) else f"says {str(error)[:200]!r} without {word!r}"
+    except Exception as error:
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        return f"{type(error).__name__}: {str(error)[:150]!r} ({where.filename}:{where.lineno})"
+    return "is accepted"
+
+
+def main() -> None:
+    warnings.simplefilter("ignore")
+    problems = {name: problem(*case) for name, case in REFUSED.items()}
+    print("\n".join(f"{name}: {found}" for name, found in problems.items() if found))
+    sys.exit(any(problems.values()))
+
+
+if __name__ == "__main__":
+    main()
