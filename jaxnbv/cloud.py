@@ -230,7 +230,7 @@ def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
     **Raises:** `ValueError` if `count` < 1.
     """
     check_single(cloud)
-    require(1 <= count <= _MOST_ROWS, f"asked for {count} points; ask for 1 to {_MOST_ROWS}")
+    require(1 <= count <= _MOST_ROWS, f"asked for {count} points; ask for at least one and at most {_MOST_ROWS}")
     chosen = farthest_point_indices(cloud.points, cloud.mask, count)
     kept = jnp.arange(count) < cloud.count
     return _take(cloud, chosen, kept)

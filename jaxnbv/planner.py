@@ -146,7 +146,7 @@ class Planner(eqx.Module):
         )
         if not is_traced(proposal):
             require(
-                bool(proposal.value < jnp.inf),
+                not bool(jnp.isnan(proposal.value)) and (surfaces is None or bool(proposal.value < jnp.inf)),
                 f"the acquisition is {float(proposal.value)} for a candidate: the score must be finite for every scan, "
                 "one that sees nothing included, and for a gradient search so must its derivatives",
             )
