@@ -13,9 +13,6 @@ from .acquisition import expected_score as expected_score
 from .answers import Answer as Answer
 from .answers import Quantity as Quantity
 from .camera import Camera as Camera
-from .camera import Pose as Pose
-from .camera import fibonacci_sphere as fibonacci_sphere
-from .camera import look_at as look_at
 from .cloud import PointCloud as PointCloud
 from .cloud import concatenate as concatenate
 from .cloud import farthest_point_subsample as farthest_point_subsample
@@ -25,6 +22,9 @@ from .episode import simulate as simulate
 from .errors import InputError as InputError
 from .frame import Frame as Frame
 from .planner import Planner as Planner
+from .pose import Pose as Pose
+from .pose import fibonacci_sphere as fibonacci_sphere
+from .pose import look_at as look_at
 from .presets import Imagination as Imagination
 from .presets import imagination as imagination
 from .reconstruction import mean_mesh as mean_mesh

@@ -1,164 +1,173 @@
-"""Camera, Pose, `look_at`, rays and the Fibonacci sphere.
+"""The sensor: a pinhole depth camera, its rays, and what it measures.
 
 OpenCV convention: in the camera's own frame x points right, y down and z forward, along the view.
-A pose is camera-to-scene. Angles are in radians, lengths in scene units.
 """
 
+import dataclasses
 import math
-from collections.abc import Iterator
+from typing import TypeVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import AnyArray, as_floats, check_fields, check_index, checked, is_traced, require
+from jaxnbv.checks import AnyArray, as_numbers, check_fields, checked, require
+from jaxnbv.pose import Pose
 
-
-class Pose(eqx.Module):
-    """A rigid camera-to-scene transform, or a batch of them along leading axes.
-
-    A point p of the camera's frame lies at `rotation @ p + position` in the scene. The columns of `rotation` are the
-    camera's right, down and forward axes in scene coordinates.
-
-    **Raises:** `ValueError` for other shapes, if the rotation is not orthonormal with determinant +1 (tolerance 1e-3),
-    or if an entry is not finite; under `jit` values are not known and only shapes are checked.
-    """
-
-    rotation: Float[Array, "*batch 3 3"]
-    position: Float[Array, "*batch 3"]
-
-    def __init__(self, rotation: Float[AnyArray, "*batch 3 3"], position: Float[AnyArray, "*batch 3"]):
-        rotation, position = as_floats(rotation, "the rotation"), as_floats(position, "the position")
-        shapes = rotation.shape, position.shape
-        require(
-            shapes[0][-2:] == (3, 3) and shapes[1][-1:] == (3,) and shapes[0][:-2] == shapes[1][:-1],
-            f"a pose needs a rotation (..., 3, 3) and a position (..., 3), got {shapes[0]} and {shapes[1]}",
-        )
-        if not is_traced(rotation, position):
-            _check_rigid(np.asarray(rotation), np.asarray(position))
-        self.rotation, self.position = rotation, position
-
-    @property
-    def forward(self) -> Float[Array, "*batch 3"]:
-        """Unit viewing direction in the scene."""
-        return self.rotation[..., :, 2]
-
-    def to_scene(self, points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-        """Points of the camera's frame in scene coordinates (a single pose)."""
-        return jnp.matmul(points, self.rotation.T, precision="highest") + self.position
-
-    def __getitem__(self, index) -> "Pose":
-        """The pose, or poses, at an index of the leading axes.
-
-        **Raises:** `ValueError` of a single pose, or if there is no such index.
-        """
-        check_index(index, self.position.shape[:-1], "the pose")
-        return jax.tree.map(lambda leaf: leaf[index], self)
-
-    def __iter__(self) -> Iterator["Pose"]:
-        """The poses along the first axis of a batch."""
-        check_index(slice(None), self.position.shape[:-1], "the pose")
-        return (self[index] for index in range(self.position.shape[0]))
-
-
-def _check_rigid(rotation: np.ndarray, position: np.ndarray) -> None:
-    finite = np.isfinite(rotation).all() and np.isfinite(position).all()
-    require(finite, f"the pose has entries that are not finite: rotation {rotation}, position {position}; give numbers")
-    error = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max(initial=0.0)
-    determinant = np.linalg.det(rotation)
-    require(
-        error < 1e-3 and bool((determinant > 0).all()),
-        f"the pose's 3 x 3 matrix is not a rotation: |R R^T - I| is {error:.3g} and det R is {determinant}; "
-        "build it with look_at, or orthonormalise it first",
-    )
-
-
-def look_at(
-    position,
-    target=(0.0, 0.0, 0.0),
-    up=(0.0, 1.0, 0.0),
-) -> Pose:
-    """The pose at `position` whose forward axis points to `target`.
-
-    **Arguments** (scene coordinates, anything `jnp.asarray` takes): `position` (*batch, 3); `target` (3,), by default
-    the origin; `up` (3,), the direction that is up in the image. Looking along `up`, the image is turned so that the
-    axis on which `up` is smallest takes its place.
-
-    **Raises:** `ValueError` for other shapes, if `position` equals `target`, or `up` is zero.
-    """
-    position, target, up = (
-        as_floats(value, f"look_at's {name}")
-        for value, name in ((position, "position"), (target, "target"), (up, "up"))
-    )
-    require(
-        position.shape[-1:] == target.shape == up.shape == (3,),
-        f"look_at needs a position (..., 3), a target (3,) and an up (3,), got {position.shape}, {target.shape}, "
-        f"{up.shape}",
-    )
-    offset = target - position
-    if not is_traced(position, target, up):
-        for value, name in ((position, "position"), (target, "target"), (up, "up")):
-            require(bool(jnp.all(jnp.isfinite(value))), f"look_at needs finite coordinates, got {name} {value}")
-        distance = jnp.linalg.norm(offset, axis=-1)
-        require(
-            bool(jnp.all(jnp.isfinite(distance))),
-            f"look_at needs a position whose distance from its target is a finite number, got position {position}",
-        )
-        require(
-            bool(jnp.all(distance > 0)),
-            f"look_at needs a position apart from its target; both are {target}",
-        )
-        length = float(jnp.linalg.norm(up))
-        require(
-            0 < length < math.inf,
-            f"look_at needs an up direction whose length is not zero and finite, such as (0, 1, 0), got {up}",
-        )
-    forward = offset / jnp.linalg.norm(offset, axis=-1, keepdims=True)
-    spare = jnp.eye(3, dtype=up.dtype)[jnp.argmin(jnp.abs(up))]
-    parallel = jnp.linalg.norm(jnp.cross(forward, up), axis=-1, keepdims=True) < 1e-4 * jnp.linalg.norm(up)
-    right = jnp.cross(forward, jnp.where(parallel, spare, up))
-    right = right / jnp.linalg.norm(right, axis=-1, keepdims=True)
-    down = jnp.cross(forward, right)
-    return Pose(jnp.stack([right, down, forward], axis=-1), position)
+_Places = TypeVar("_Places", Float[Array, "*n 2"], Float[np.ndarray, "*n 2"])
+# Of the focal length: what a calibration without skew is written down to.
+_SKEW = 1e-6
 
 
 class Camera(eqx.Module):
-    """A pinhole depth camera with square pixels and its principal point at the image's centre.
+    """A pinhole depth camera. Its pixels are told from the image's top left corner: their centres are at 0.5, 1.5, ...
 
-    - `fov`: vertical field of view in radians, within (0, pi).
+    - `fov`: vertical field of view in radians, within (0, pi), as if the principal point were at the image's centre.
     - `height`, `width`: pixels; one ray through the centre of each.
+    - `aspect`: focal length across over focal length down, in pixels; 1 for square pixels.
+    - `center`: the principal point, as shares of the width and the height.
+    - `nearest`, `farthest`: depths along the viewing direction between which the sensor measures, in scene units; None
+      is no limit. A hit nearer than the first is invalid; where none is nearer than the second, nothing was met so far.
+    - `max_incidence`: largest angle in radians, within (0, pi/2], between a ray and the normal at which a hit returns.
 
-    The defaults are the paper's: 30 degrees, 50 x 50.
+    The defaults are the paper's: 30 degrees, 50 x 50, no limits.
+
+    **Raises:** `ValueError` for a value outside what is said here.
     """
 
     fov: float = eqx.field(static=True, default=math.radians(30.0))
     height: int = eqx.field(static=True, default=50)
     width: int = eqx.field(static=True, default=50)
+    aspect: float = eqx.field(static=True, default=1.0)
+    center: tuple[float, float] = eqx.field(static=True, default=(0.5, 0.5))
+    nearest: float = eqx.field(static=True, default=0.0)
+    farthest: float | None = eqx.field(static=True, default=None)
+    max_incidence: float = eqx.field(static=True, default=0.5 * math.pi)
 
     def __check_init__(self):
         check_fields(self)
         require(0 < self.fov < math.pi, f"the field of view is {self.fov} rad; it must lie within (0, pi)")
         for side in (self.height, self.width):
             require(side >= 1, f"the camera has {self.height} x {self.width} pixels; it needs at least one")
+        require(self.aspect > 0, f"the aspect of the pixels is {self.aspect}; it must be positive")
+        require(
+            0 <= self.nearest < (math.inf if self.farthest is None else self.farthest),
+            f"the camera measures from {self.nearest} to {self.farthest}: give depths of which the second is greater",
+        )
+        require(
+            0 < self.max_incidence <= 0.5 * math.pi,
+            f"the largest angle of incidence is {self.max_incidence} rad; it must lie within (0, pi/2]",
+        )
+
+    @classmethod
+    @checked
+    def from_intrinsics(
+        cls,
+        matrix: Float[AnyArray, "3 3"] | list,
+        width: int,
+        height: int,
+        nearest: float = 0.0,
+        farthest: float | None = None,
+        max_incidence: float = 0.5 * math.pi,
+    ) -> "Camera":
+        """The camera of an intrinsic matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, as OpenCV and the makers
+        of depth cameras give it: the centre of the first pixel is at (0, 0). The limits are those of the camera.
+
+        **Raises:** `ValueError` for another matrix, such as one with skew or of another image size.
+        """
+        found = as_numbers(matrix, "the intrinsic matrix", np.float64)
+        require(found.shape == (3, 3), f"the intrinsic matrix has shape {found.shape}: give one of (3, 3)")
+        (fx, skew, cx), (zero, fy, cy), last = found.tolist()
+        require(
+            0 < fx < math.inf and 0 < fy < math.inf and last == [0.0, 0.0, 1.0] and zero == 0.0,
+            f"the intrinsic matrix is {found.tolist()}; it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive "
+            "focal lengths, in pixels",
+        )
+        require(abs(skew) <= _SKEW * fx, f"the intrinsic matrix has a skew of {skew}: undistort the image first")
+        require(
+            -0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5,
+            f"the principal point ({cx}, {cy}) lies outside the image of {width} x {height}: give the matrix that is "
+            "of this image size",
+        )
+        fov = 2.0 * math.atan(0.5 * height / fy)
+        center = ((cx + 0.5) / width, (cy + 0.5) / height)
+        return cls(fov, height, width, fx / fy, center, nearest, farthest, max_incidence)
+
+    @classmethod
+    @checked
+    def from_focal_length(cls, focal_length: float, width: int, height: int) -> "Camera":
+        """The camera of square pixels, its principal point at the centre, of a focal length in pixels.
+
+        **Raises:** `ValueError` if the focal length is not positive.
+        """
+        matrix = np.diag([focal_length, focal_length, 1.0])
+        matrix[:2, 2] = 0.5 * (width - 1), 0.5 * (height - 1)
+        return cls.from_intrinsics(matrix, width, height)
+
+    @property
+    def intrinsics(self) -> Float[np.ndarray, "3 3"]:
+        """The intrinsic matrix of `from_intrinsics`, in pixels."""
+        (fx, fy), (x, y) = self.focal_lengths, self.center
+        return np.array([[fx, 0.0, x * self.width - 0.5], [0.0, fy, y * self.height - 0.5], [0.0, 0.0, 1.0]])
+
+    @checked
+    def resized(self, height: int, width: int) -> "Camera":
+        """The camera of the same field of view with another number of pixels, to imagine with fewer rays, say."""
+        aspect = self.aspect * (width / self.width) / (height / self.height)
+        return dataclasses.replace(self, height=height, width=width, aspect=aspect)
+
+    @checked
+    def strided(self, stride: int) -> "Camera":
+        """The camera of every so many-th row and column, the first ones half as far from the border.
+
+        **Raises:** `ValueError` for a stride below one, or one that leaves no pixel.
+        """
+        require(stride >= 1, f"the stride is {stride}; it must be at least 1")
+        first = stride // 2
+        height, width = (-(-(side - first) // stride) for side in (self.height, self.width))
+        require(height >= 1 and width >= 1, f"a stride of {stride} leaves none of {self.height} x {self.width} pixels")
+        matrix = self.intrinsics
+        matrix[:2] /= stride
+        matrix[:2, 2] -= first / stride
+        fov, center = 2.0 * math.atan(0.5 * height / matrix[1, 1]), matrix[:2, 2] + 0.5
+        share = float(center[0] / width), float(center[1] / height)
+        return dataclasses.replace(self, fov=fov, height=height, width=width, center=share)
 
     @property
     def num_rays(self) -> int:
         return self.height * self.width
 
     @property
-    def focal_length(self) -> float:
-        """Focal length in pixels."""
-        return 0.5 * self.height / math.tan(0.5 * self.fov)
+    def focal_lengths(self) -> tuple[float, float]:
+        """Focal lengths across and down, in pixels."""
+        down = 0.5 * self.height / math.tan(0.5 * self.fov)
+        return self.aspect * down, down
+
+    @property
+    def edges(self) -> tuple[float, float, float, float]:
+        """Where the image ends to the left, above, to the right and below, in the plane z = 1 of the camera's frame."""
+        (fx, fy), (cx, cy) = self.focal_lengths, self.center
+        return -cx * self.width / fx, -cy * self.height / fy, (1 - cx) * self.width / fx, (1 - cy) * self.height / fy
+
+    @property
+    def limited(self) -> bool:
+        """Whether the sensor has a range, or an angle beyond which hits do not return."""
+        return self.nearest > 0 or self.farthest is not None or self.max_incidence < 0.5 * math.pi
 
     def pixel_directions(self) -> Float[Array, "rays 3"]:
         """Directions through the pixel centres in the camera's frame, scaled so that z = 1; row by row."""
+        (fx, fy), (cx, cy) = self.focal_lengths, self.center
         column, row = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
-        x = (column - 0.5 * self.width) / self.focal_length
-        y = (row - 0.5 * self.height) / self.focal_length
+        x = (column - cx * self.width) / fx
+        y = (row - cy * self.height) / fy
         directions = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
         return jnp.asarray(directions, dtype=jnp.result_type(float))
+
+    def to_pixels(self, image: _Places) -> _Places:
+        """Columns and rows (the first pixel's centre at 0.5) of places (x / z, y / z) of the camera's frame."""
+        (fx, fy), (cx, cy) = self.focal_lengths, self.center
+        return image * np.array([fx, fy], image.dtype) + np.array([cx * self.width, cy * self.height], image.dtype)
 
     def rays(self, pose: Pose) -> tuple[Float[Array, "*batch rays 3"], Float[Array, "*batch rays 3"]]:
         """Origins and unit directions of all rays in the scene, for one pose or a batch."""
@@ -166,25 +175,3 @@ class Camera(eqx.Module):
         directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
         directions = jnp.einsum("...ij,rj->...ri", pose.rotation, directions, precision="highest")
         return jnp.broadcast_to(pose.position[..., None, :], directions.shape), directions
-
-
-@checked
-def fibonacci_sphere(count: int, radius: float = 1.0, min_elevation: float = -0.5 * math.pi) -> Float[Array, "count 3"]:
-    """`count` almost evenly spaced points on a sphere about the origin (spherical Fibonacci lattice; Gonzalez 2010).
-
-    `min_elevation`: radians above the plane y = 0; from there to the pole, the whole sphere by default.
-
-    **Raises:** `ValueError` if `count` < 1, `radius` <= 0 or the elevation is not within [-pi/2, pi/2).
-    """
-    require(count >= 1, f"a Fibonacci sphere needs at least one point, got {count}")
-    require(radius > 0, f"the radius of the sphere must be positive, got {radius}")
-    require(
-        -0.5 * math.pi <= min_elevation < 0.5 * math.pi,
-        f"the least elevation is {min_elevation} rad; it must lie within [-pi/2, pi/2)",
-    )
-    index = np.arange(count)
-    y = 1.0 - (1.0 - math.sin(min_elevation)) * (index + 0.5) / count
-    azimuth = index * math.pi * (3.0 - math.sqrt(5.0))
-    ring = np.sqrt(1.0 - y**2)
-    points = np.stack([ring * np.cos(azimuth), y, ring * np.sin(azimuth)], axis=-1)
-    return jnp.asarray(radius * points, dtype=jnp.result_type(float))

@@ -18,6 +18,7 @@ from jaxnbv.errors import InputError as InputError
 AnyArray = Array | np.ndarray
 _F = TypeVar("_F", bound=Callable[..., Any])
 _LONGEST_SHOWN = 60
+_NUMBERS = {tuple[float, float]: "two", tuple[float, float, float]: "three"}
 # Of 32 bits. What is larger is infinite there.
 _LARGEST = float(np.finfo(np.float32).max)
 
@@ -76,9 +77,10 @@ def check_type(value: Any, hint: Any, name: str) -> None:
         require(_is_number(value), f"{name} is {shown(value)}; it must be a finite number")
     elif hint is bool:
         require(isinstance(value, bool | np.bool_), f"{name} is {shown(value)}; it must be True or False")
-    elif hint == tuple[float, float, float]:
-        three = isinstance(value, tuple | list) and len(value) == 3 and all(map(_is_number, value))
-        require(three, f"{name} is {shown(value)}; it must be three finite numbers")
+    elif hint in _NUMBERS:
+        count = len(get_args(hint))
+        proper = isinstance(value, tuple | list) and len(value) == count and all(map(_is_number, value))
+        require(proper, f"{name} is {shown(value)}; it must be {_NUMBERS[hint]} finite numbers")
     elif isinstance(hint, types.UnionType) and type(None) in (kinds := get_args(hint)) and len(kinds) == 2:
         if value is not None:
             check_type(value, kinds[0] if kinds[1] is type(None) else kinds[1], name)
@@ -90,10 +92,15 @@ def check_type(value: Any, hint: Any, name: str) -> None:
 
 
 def check_index(index: Any, batch: tuple[int, ...], name: str) -> None:
-    """**Raises:** `ValueError` for an index into what is no batch, or beyond its length, which JAX would clamp."""
-    require(len(batch) > 0, f"{name} is a single one, not a batch: it has no index {shown(index)}")
+    """**Raises:** `ValueError` for a whole number into what is no batch, or beyond its length, which JAX would clamp."""
     if isinstance(index, int | np.integer):
+        check_batch(batch, name)
         require(-batch[0] <= index < batch[0], f"{name} has {batch[0]} along its first axis: there is no index {index}")
+
+
+def check_batch(batch: tuple[int, ...], name: str) -> None:
+    """**Raises:** `ValueError` for what has no axes of a batch."""
+    require(len(batch) > 0, f"{name} is a single one, not a batch: it can be neither indexed nor iterated")
 
 
 def check_key(key: Any) -> None:

@@ -10,19 +10,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera
 from jaxnbv.checks import (
     AnyArray,
-    as_floats,
     as_numbers,
+    check_batch,
     check_index,
     check_type,
     checked,
-    is_traced,
     require,
     shown,
 )
+from jaxnbv.depth_image import points_of_depth
 from jaxnbv.farthest import farthest_point_indices
+from jaxnbv.pose import Pose
+from jaxnbv.volume import Box
 
 # Of a cloud: what an index of 32 bits counts, and far beyond any memory that a planner has.
 _MOST_ROWS = 2**31 - 1
@@ -114,41 +116,33 @@ class PointCloud(eqx.Module):
 
     @classmethod
     @checked
-    def from_depth(cls, depth: Float[AnyArray, "height width"], camera: Camera, pose: Pose) -> "PointCloud":
-        """The cloud, in scene coordinates, that a depth image shows: one row a pixel, row by row.
+    def from_depth(
+        cls,
+        depth: Float[AnyArray, "height width"],
+        camera: Camera,
+        pose: Pose,
+        scale: float = 1.0,
+        stride: int = 1,
+        box: Box | None = None,
+    ) -> "PointCloud":
+        """The cloud that a depth image shows, in the coordinates of the pose: one row a pixel, row by row.
 
-        `depth` is the distance along the camera's forward axis, in scene units. A pixel of +infinity met nothing within
-        the sensor's reach, which is taken to be the whole scene; one that is zero, negative or NaN is invalid and says
-        nothing. Normals come from the differences between neighbouring pixels, on the side where the depth changes
-        less, so they do not mix the two sides of an edge, and are turned to the camera. A pixel with no valid neighbour
-        along an image axis has no normal and is invalid.
+        A pixel of +infinity met nothing within the sensor's reach, which is taken to be the whole scene; one that is
+        zero, negative or NaN is invalid and says nothing. Out of the camera's range a pixel is invalid where it is too
+        near, and met nothing so far where it is too far. Normals come from the differences between neighbouring pixels,
+        on the side where the depth changes less, so they do not mix the two sides of an edge, and are turned to the
+        camera. A pixel with no valid neighbour along an image axis has no normal and is invalid.
 
-        **Raises:** `ValueError` if the image's shape is not the camera's.
+        - `depth`: along the camera's forward axis; `scale` times it is in units of the pose: 0.001 where the image is
+          in millimetres and the pose in metres. The range of the camera, and the box, are in units of the pose.
+        - `stride`: take every so many-th row and column alone; the cloud is an image of `camera.strided(stride)`.
+        - `box`: keep points in it alone. A ray that hits behind the box has crossed it, and met nothing; one that hits
+          before it is invalid.
+
+        **Raises:** `ValueError` if the image's shape is not the camera's, or its values cannot be meant: all of them
+        out of the camera's range, a box behind the camera, or depths of another order than the box is away.
         """
-        shape = (camera.height, camera.width)
-        # Before large numbers are rounded to infinity.
-        missed = (depth if is_traced(depth) else as_numbers(depth, "the depth image", None)) == np.inf
-        depth = as_floats(depth, "the depth image")
-        require(
-            depth.shape == shape,
-            f"the depth image is {depth.shape} but the camera has {shape} pixels: "
-            "give Camera(height=..., width=...) of the image",
-        )
-        require(pose.position.ndim == 1, f"the pose is a batch {pose.position.shape[:-1]}: give one, poses[0] say")
-        valid = jnp.isfinite(depth) & (depth > 0)
-        local = jnp.where(valid, depth, 0.0)[..., None] * camera.pixel_directions().reshape(*shape, 3)
-        down, has_down = _one_sided_difference(local, valid, axis=0)
-        right, has_right = _one_sided_difference(local, valid, axis=1)
-        normals = jnp.cross(down, right)
-        normals = normals * -jnp.sign(jnp.sum(normals * local, axis=-1, keepdims=True))
-        length = jnp.linalg.norm(normals, axis=-1, keepdims=True)
-        has_normal = (length[..., 0] > 0) & jnp.isfinite(length[..., 0])
-        mask = (valid & has_down & has_right & has_normal).reshape(-1)
-        normals = (normals / jnp.where(length > 0, length, 1.0)).reshape(-1, 3)
-        points = pose.to_scene(local.reshape(-1, 3))
-        normals = jnp.matmul(normals, pose.rotation.T, precision="highest")
-        points, normals = (jnp.where(mask[:, None], rows, 0.0) for rows in (points, normals))
-        return cls(points, normals, mask, jnp.asarray(missed).reshape(-1))
+        return cls(*points_of_depth(depth, camera, pose, scale, stride, box))
 
     @property
     def capacity(self) -> int:
@@ -178,27 +172,8 @@ class PointCloud(eqx.Module):
 
     def __iter__(self) -> Iterator["PointCloud"]:
         """The clouds along the first axis of a batch."""
-        check_index(slice(None), self.mask.shape[:-1], "the cloud")
+        check_batch(self.mask.shape[:-1], "the cloud")
         return (self[index] for index in range(self.mask.shape[0]))
-
-
-def _one_sided_difference(points: Float[Array, "h w 3"], valid: Bool[Array, "h w"], axis: int):
-    """Differences between neighbours along an image axis, on the side of the smaller step, and whether there is one."""
-    step = jnp.diff(points, axis=axis)
-    index = [slice(None), slice(None)]
-    later, earlier = list(index), list(index)
-    later[axis], earlier[axis] = slice(1, None), slice(None, -1)
-    size = jnp.where(valid[tuple(later)] & valid[tuple(earlier)], jnp.linalg.norm(step, axis=-1), jnp.inf)
-
-    def shifted(array, before, fill):
-        pad = [(0, 0)] * array.ndim
-        pad[axis] = (1, 0) if before else (0, 1)
-        return jnp.pad(array, pad, constant_values=fill)
-
-    size_back, size_ahead = shifted(size, True, jnp.inf), shifted(size, False, jnp.inf)
-    back, ahead = shifted(step, True, 0.0), shifted(step, False, 0.0)
-    difference = jnp.where((size_back < size_ahead)[..., None], back, ahead)
-    return difference, jnp.isfinite(jnp.minimum(size_back, size_ahead))
 
 
 def check_single(cloud: PointCloud, name: str = "the cloud") -> None:

@@ -13,10 +13,11 @@ import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 from tqdm import tqdm
 
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera
 from jaxnbv.checks import check_key, check_type, checked, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.planner import Planner
+from jaxnbv.pose import Pose
 from jaxnbv.scanning import GridSurface, SensorNoise, Surface, scan
 from jaxnbv.search import Proposal
 from jaxnbv.state import State

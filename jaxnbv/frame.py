@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.camera import Pose
 from jaxnbv.checks import AnyArray, as_numbers, check_fields, checked, is_traced, require, shown
 from jaxnbv.cloud import PointCloud
+from jaxnbv.pose import Pose
 
 # Of the sensor's noise a hundredth.
 _ROUNDING = 1e-4

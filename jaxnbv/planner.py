@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxnbv.acquisition import Score
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera
 from jaxnbv.checks import check_fields, check_key, check_type, is_traced, require, shown
 from jaxnbv.cloud import PointCloud, limit_capacity
+from jaxnbv.pose import Pose
 from jaxnbv.scanning import Carving, Grid, GridSurface, carve
 from jaxnbv.search import Problem, Proposal, Search
 from jaxnbv.state import State, check_scan, observe, record, seen_empty

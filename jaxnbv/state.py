@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera
 from jaxnbv.checks import check_type, is_traced, require
 from jaxnbv.cloud import PointCloud, check_single, concatenate, limit_capacity
+from jaxnbv.pose import Pose
 from jaxnbv.scanning import Carving, Grid, check_image
 
 

@@ -19,11 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from jaxnbv.camera import Pose
 from jaxnbv.checks import InputError, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.files import write_whole
 from jaxnbv.folders import FORMAT, ResultFolder, check_format
+from jaxnbv.pose import Pose
 from jaxnbv.search import Proposal, Trajectories
 
 _LARGEST_LISTED = 16

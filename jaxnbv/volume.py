@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnbv.camera import fibonacci_sphere
 from jaxnbv.checks import AnyArray, InputError, require, shown
+from jaxnbv.pose import fibonacci_sphere
 
 Volume = Callable[[Float[Array, "n 3"]], Float[Array, " n"]]
 """A function of points (scene coordinates): negative inside the volume, positive outside, at most the distance to its

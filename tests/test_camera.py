@@ -9,7 +9,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from jaxnbv.camera import Camera, Pose, fibonacci_sphere, look_at
+from jaxnbv.camera import Camera
+from jaxnbv.pose import Pose, fibonacci_sphere, look_at
 
 coordinate = st.floats(-3.0, 3.0, width=32)
 vector = st.tuples(coordinate, coordinate, coordinate)

@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnbv.camera import Camera, Pose, look_at
+from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud, concatenate, farthest_point_subsample, limit_capacity
 from jaxnbv.frame import Frame
+from jaxnbv.pose import Pose, look_at
 
 GOOD = [[0.0, 0.1, 0.2], [0.3, 0.4, 0.5]]
 UP = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]

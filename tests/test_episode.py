@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv.camera import Camera, Pose, look_at
+from jaxnbv.camera import Camera
 from jaxnbv.episode import observe_scene, simulate
 from jaxnbv.planner import Planner
+from jaxnbv.pose import Pose, look_at
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, mesh_from_sdf, scan
 from jaxnbv.scanning.sdf import Capsule, Sphere
 from jaxnbv.search import DiscreteSearch, RandomView

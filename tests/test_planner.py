@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement
-from jaxnbv.camera import Camera, Pose, fibonacci_sphere, look_at
+from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud, concatenate, farthest_point_subsample
 from jaxnbv.episode import simulate
 from jaxnbv.planner import Planner
+from jaxnbv.pose import Pose, fibonacci_sphere, look_at
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, scan
 from jaxnbv.scanning.sdf import Capsule, Sphere
 from jaxnbv.search import DiscreteSearch, FarthestView, RandomView, UncertaintyView

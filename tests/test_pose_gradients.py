@@ -16,9 +16,10 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement, Score, expected_score
-from jaxnbv.camera import Camera, Pose, fibonacci_sphere, look_at
+from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud
 from jaxnbv.networks import CloudClassifier, InvariantClassifier
+from jaxnbv.pose import Pose, fibonacci_sphere, look_at
 from jaxnbv.scanning import Grid, GridSurface, scan_samples
 from jaxnbv.search import FreePoses, SpherePoses
 from jaxnbv.tasks import Coverage

@@ -9,8 +9,8 @@ import pytest
 from jaxtyping import Array, Float
 
 import jaxnbv as nbv
-from jaxnbv.camera import fibonacci_sphere
 from jaxnbv.checks import InputError
+from jaxnbv.pose import fibonacci_sphere
 from jaxnbv.reconstruction import has_poisson, mean_mesh, screened_poisson
 from jaxnbv.surfaces import SurfaceModel, SurfacePosterior
 

@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera
 from jaxnbv.checks import require
 from jaxnbv.datasets.labelled import assemble, bar, box, generator, path, ring, rod
+from jaxnbv.pose import Pose
 from jaxnbv.scanning import SDFSurface, Surface, scan
 from jaxnbv.search.candidates import sphere_candidates
 

@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera
 from jaxnbv.checks import AnyArray, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets.framing import Framing
 from jaxnbv.datasets.patterns import PATTERNS, pattern_distance
+from jaxnbv.pose import Pose
 from jaxnbv.scanning import SDFSurface, scan
 from jaxnbv.scanning.sdf import Matrix, Scalar, SignedDistance, Vector, nonnegative, parameter
 from jaxnbv.search.candidates import sphere_candidates

@@ -14,11 +14,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnbv.acquisition import Score, expected_score
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera
 from jaxnbv.checks import AnyArray, InputError, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.experiments.diagnostics import rank_correlation
 from jaxnbv.planner import Planner
+from jaxnbv.pose import Pose
 from jaxnbv.scanning import Grid, GridSurface, SDFSurface, Surface, TriangleMesh, scan
 from jaxnbv.state import State
 from jaxnbv.tensor_grid import on_tensor_grid

@@ -13,13 +13,14 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from jaxnbv.acquisition import Score
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError, check_type, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.episode import Sensor, Step, scene_sensor, steps, view_keys
 from jaxnbv.experiments.measures import Measure, Record, Row
 from jaxnbv.model_name import ModelName
 from jaxnbv.planner import Planner
+from jaxnbv.pose import Pose
 from jaxnbv.presets import imagination
 from jaxnbv.scanning import Carving, Grid, Surface
 from jaxnbv.search import Search, SphereCandidates

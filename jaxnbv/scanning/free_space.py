@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera
 from jaxnbv.checks import check_fields, require
 from jaxnbv.cloud import PointCloud
+from jaxnbv.pose import Pose
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.surfaces import EmptyPoints
 from jaxnbv.tensor_grid import on_tensor_grid
@@ -139,9 +140,10 @@ def _pixels_off(scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, ""
     local = jnp.matmul(scan.points - pose.position, pose.rotation, precision="highest")
     seen = scan.mask & (local[:, 2] > 0)
     image = local[:, :2] / jnp.where(seen, local[:, 2], 1.0)[:, None]
-    off = camera.focal_length * jnp.max(jnp.abs(image - camera.pixel_directions()[:, :2]), axis=1)
+    aside = jnp.abs(image - camera.pixel_directions()[:, :2])
+    off = jnp.max(aside * jnp.array(camera.focal_lengths), axis=1)
     # Beside a near camera a little noise is many pixels.
-    off = jnp.where(off * local[:, 2] < _NOISE * camera.focal_length, 0.0, off)
+    off = jnp.where(jnp.max(aside, axis=1) * local[:, 2] < _NOISE, 0.0, off)
     off = jnp.where(scan.mask, jnp.where(seen, off, jnp.inf), jnp.nan)
     return jnp.where(jnp.any(scan.mask), jnp.nanmedian(off), 0.0)
 
@@ -151,7 +153,8 @@ def _free_depth(scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, "h
     if scan.missed is None:
         return None
     along = jnp.matmul(scan.points - pose.position, pose.forward, precision="highest")
-    return jnp.where(scan.mask, along, jnp.where(scan.missed, jnp.inf, 0.0)).reshape(camera.height, camera.width)
+    reach = jnp.inf if camera.farthest is None else camera.farthest
+    return jnp.where(scan.mask, along, jnp.where(scan.missed, reach, 0.0)).reshape(camera.height, camera.width)
 
 
 def _crossed(grid: Grid, depth: Float[Array, "h w"], camera: Camera, pose: Pose, margin: float) -> Bool[Array, "g g g"]:
@@ -171,11 +174,10 @@ def _crossed(grid: Grid, depth: Float[Array, "h w"], camera: Camera, pose: Pose,
         in_front = ahead > 2.0 * margin
         safe = jnp.where(in_front, ahead, 1.0)
         a, b = right / safe, down / safe
-        column = jnp.floor(camera.focal_length * a + 0.5 * camera.width).astype(jnp.int32)
-        row = jnp.floor(camera.focal_length * b + 0.5 * camera.height).astype(jnp.int32)
+        column, row = jnp.floor(camera.to_pixels(jnp.stack([a, b], axis=-1))).astype(jnp.int32).T
         inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         # A ball's image is stretched off the axis, at most by this; one pixel more takes in the rays on both sides.
-        radius = camera.focal_length * margin / (safe - margin) * (1.0 + a**2 + b**2) + 1.0
+        radius = max(camera.focal_lengths) * margin / (safe - margin) * (1.0 + a**2 + b**2) + 1.0
         level = jnp.maximum(jnp.ceil(jnp.log2(radius)), 0).astype(jnp.int32)
         known = in_front & inside & (level < len(nearest))
         index = [jnp.where(known, i, 0) for i in (level, row, column)]

@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int8
 from scipy.spatial import cKDTree
 
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera
 from jaxnbv.checks import AnyArray, as_floats, check_fields, is_traced, require
 from jaxnbv.cloud import PointCloud
+from jaxnbv.pose import Pose
 from jaxnbv.scanning import tracing
 from jaxnbv.scanning.scanner import scan
 from jaxnbv.scanning.surface import Hits, Surface

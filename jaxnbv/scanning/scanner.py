@@ -1,13 +1,16 @@
 """The paper's scan(theta; f): the oriented points that a depth camera sees of a surface."""
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera
 from jaxnbv.checks import check_fields, checked, require
 from jaxnbv.cloud import PointCloud
+from jaxnbv.pose import Pose
 from jaxnbv.scanning.surface import Surface
 
 # Beyond any sensor; squares of much larger numbers are infinite.
@@ -46,7 +49,8 @@ class SensorNoise(eqx.Module):
 
 @checked
 def scan(surface: Surface, camera: Camera, pose: Pose) -> PointCloud:
-    """What the camera sees of the surface from a pose: one row a pixel, missed where its ray hits nothing.
+    """What the camera sees of the surface from a pose: one row a pixel, missed where its ray hits nothing in its range,
+    invalid where it hits what is too near, or too aslant.
 
     Poses with leading axes give clouds with the same leading axes. Points are in scene coordinates; normals are unit
     and turned to the sensor. No noise: apply a `SensorNoise` to the result. Runs under `jit` where `surface.in_jit`.
@@ -55,4 +59,12 @@ def scan(surface: Surface, camera: Camera, pose: Pose) -> PointCloud:
     hits = surface.trace(origins.reshape(-1, 3), directions.reshape(-1, 3))
     shape = origins.shape[:-1]
     mask = hits.mask.reshape(shape)
-    return PointCloud(hits.points.reshape(*shape, 3), hits.normals.reshape(*shape, 3), mask, ~mask)
+    points, normals = hits.points.reshape(*shape, 3), hits.normals.reshape(*shape, 3)
+    if not camera.limited:
+        return PointCloud(points, normals, mask, ~mask)
+    depth = jnp.einsum("...rd,...d->...r", points - origins, pose.forward, precision="highest")
+    beyond = jnp.zeros_like(mask) if camera.farthest is None else depth > camera.farthest
+    cosine = -jnp.sum(normals * directions, axis=-1)
+    returns = mask & ~beyond & (depth >= camera.nearest) & (cosine >= math.cos(camera.max_incidence))
+    points, normals = (jnp.where(returns[..., None], rows, 0.0) for rows in (points, normals))
+    return PointCloud(points, normals, returns, ~mask | beyond)

@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnbv.camera import Pose
 from jaxnbv.checks import AnyArray, as_floats, check_type, is_traced, require
+from jaxnbv.pose import Pose
 
 # Numbers and lists are converted on the way in, which mypy cannot see.
 if TYPE_CHECKING:

@@ -10,9 +10,10 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxnbv.acquisition import Score, mean_score
 from jaxnbv.answers import Quantity
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
 from jaxnbv.cloud import PointCloud
+from jaxnbv.pose import Pose
 from jaxnbv.scanning import GridSurface
 from jaxnbv.search.candidates import Candidates, SphereCandidates, as_candidates
 

@@ -8,8 +8,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.acquisition import Score
 from jaxnbv.answers import Quantity
-from jaxnbv.camera import Pose
 from jaxnbv.checks import InputError
+from jaxnbv.pose import Pose
 from jaxnbv.search.base import CandidateSearch, Problem, Proposal, best_unvisited
 
 

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray
 
-from jaxnbv.camera import Pose, fibonacci_sphere, look_at
 from jaxnbv.checks import AnyArray, InputError, check_fields, require, shown
+from jaxnbv.pose import Pose, fibonacci_sphere, look_at
 from jaxnbv.search.rotations import rotation_between, rotation_from_6d
 from jaxnbv.sensors import SENSOR_RADIUS
 

@@ -12,8 +12,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera
 from jaxnbv.checks import check_fields, require
+from jaxnbv.pose import Pose
 from jaxnbv.search.candidates import SphereCandidates
 from jaxnbv.search.rotations import normalise, rotation_between, rotation_from_6d, rotation_to_6d
 from jaxnbv.sensors import SENSOR_RADIUS
@@ -157,11 +158,12 @@ class ConstrainedPoses(PoseSpace):
 
     def check_camera(self, camera: Camera) -> None:
         """**Raises:** `ValueError` if the origin may leave the image."""
-        half = math.atan(0.5 * min(camera.height, camera.width) / camera.focal_length)
+        left, top, right, bottom = camera.edges
+        half = math.atan(min(-left, -top, right, bottom))
         require(
             self.off_axis <= half,
-            f"off_axis is {self.off_axis:.3g} rad but the image ends {half:.3g} rad from its centre: the object's "
-            "centre would leave it; lower off_axis, or widen the camera's field of view",
+            f"off_axis is {self.off_axis:.3g} rad but the image ends {half:.3g} rad from the camera's axis: the "
+            "object's centre would leave it; lower off_axis, or widen the camera's field of view",
         )
 
 

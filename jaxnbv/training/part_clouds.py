@@ -7,12 +7,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, Key, PRNGKeyArray
 
-from jaxnbv.camera import Camera, Pose, look_at
+from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud, concatenate
 from jaxnbv.datasets import PartScene, Split, part_scene
 from jaxnbv.datasets.labelled import LabelledSolid
 from jaxnbv.farthest import farthest_point_indices
 from jaxnbv.planner import Planner
+from jaxnbv.pose import Pose, look_at
 from jaxnbv.scanning import SDFSurface, SensorNoise, scan
 from jaxnbv.sensors import PART_SETTING
 from jaxnbv.training.views import joined_views, only, state_after

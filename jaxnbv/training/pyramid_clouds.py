@@ -5,11 +5,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
-from jaxnbv.camera import Camera, Pose, look_at
+from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud, concatenate, farthest_point_subsample, limit_capacity
 from jaxnbv.datasets import Framing, Pyramid, Split, pyramid_scene
 from jaxnbv.datasets.pyramid import scan_pattern
 from jaxnbv.planner import Planner
+from jaxnbv.pose import Pose, look_at
 from jaxnbv.scanning import SensorNoise, scan
 from jaxnbv.sensors import SENSOR_RADIUS
 from jaxnbv.training.views import joined_views, only, state_after

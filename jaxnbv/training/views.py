@@ -2,9 +2,10 @@
 
 from jaxtyping import Array, Bool
 
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud
 from jaxnbv.planner import Planner
+from jaxnbv.pose import Pose
 from jaxnbv.state import State
 
 

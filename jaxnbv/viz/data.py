@@ -8,11 +8,11 @@ from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from jaxnbv.answers import Answer, Quantity
-from jaxnbv.camera import Pose
 from jaxnbv.checks import AnyArray
 from jaxnbv.episode import Episode
 from jaxnbv.metrics import coverage, truth_points
 from jaxnbv.planner import Planner
+from jaxnbv.pose import Pose
 from jaxnbv.scanning import Grid
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal

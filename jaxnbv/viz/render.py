@@ -10,8 +10,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm
 from scipy.spatial import cKDTree
 
-from jaxnbv.camera import Camera, Pose, look_at
+from jaxnbv.camera import Camera
 from jaxnbv.frame import Frame
+from jaxnbv.pose import Pose, look_at
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.viz.data import MeanSurface, ViewData
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, LINE, NEW
@@ -35,9 +36,8 @@ def beside(pose: Pose, radius: float = 1.0) -> Float[np.ndarray, "3"]:
 
 def frustum(pose: Pose, camera: Camera, depth: float = FRUSTUM_DEPTH) -> Float[np.ndarray, "lines 2 3"]:
     """Edges of a camera's field of view up to a depth, as segments in scene coordinates."""
-    tall = depth * math.tan(0.5 * camera.fov)
-    wide = tall * camera.width / camera.height
-    corners = np.array([[-wide, -tall, depth], [wide, -tall, depth], [wide, tall, depth], [-wide, tall, depth]])
+    left, top, right, bottom = camera.edges
+    corners = depth * np.array([[left, top, 1.0], [right, top, 1.0], [right, bottom, 1.0], [left, bottom, 1.0]])
     corners = corners @ np.asarray(pose.rotation, dtype=np.float64).T + np.asarray(pose.position)
     apex = np.broadcast_to(np.asarray(pose.position), corners.shape)
     sides = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
@@ -109,7 +109,7 @@ class Still:
     def project(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
         """Pixel coordinates of points of the scene, and whether they lie in front of the surface."""
         local = (points - np.asarray(self.pose.position)) @ np.asarray(self.pose.rotation)
-        pixels = self.camera.focal_length * local[:, :2] / local[:, 2:] + 0.5 * self.size
+        pixels = self.camera.to_pixels(local[:, :2] / local[:, 2:])
         column, row = np.clip(pixels.astype(int), 0, self.size - 1).T
         return pixels - 0.5, local[:, 2] < self.depth[row, column] + _SLACK
 

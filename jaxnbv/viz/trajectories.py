@@ -5,8 +5,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnbv.acquisition import expected_score
-from jaxnbv.camera import Pose
 from jaxnbv.episode import Episode, view_keys
+from jaxnbv.pose import Pose
 from jaxnbv.search import Proposal, Trajectories
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.viz.sphere import unit

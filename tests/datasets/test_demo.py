@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from jaxnbv.camera import Camera, fibonacci_sphere, look_at
+from jaxnbv.camera import Camera
 from jaxnbv.datasets.demo import demo_object
+from jaxnbv.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.mesh import mesh_from_sdf
 from jaxnbv.scanning.scanner import scan

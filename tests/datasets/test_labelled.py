@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv.camera import Camera, fibonacci_sphere, look_at
+from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
 from jaxnbv.datasets.labelled import CAPACITY, LabelledSolid, assemble, ball, bar, box, path, ring, rod, rotation_about
+from jaxnbv.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning import SDFSurface, scan
 from jaxnbv.scanning.sdf import Box, Capsule, Cone, Cylinder, Sphere, Torus
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from toy import ToyStudy
 
-from jaxnbv.camera import look_at
 from jaxnbv.checks import InputError
 from jaxnbv.cloud import limit_capacity
 from jaxnbv.experiments.study import views_of
 from jaxnbv.model_name import ModelName
 from jaxnbv.planner import Planner
+from jaxnbv.pose import look_at
 from jaxnbv.scanning import SDFSurface
 from jaxnbv.search import GivenPoses, RandomView
 from jaxnbv.surfaces import GeometricSPSR

@@ -5,7 +5,8 @@ import math
 import equinox as eqx
 import numpy as np
 
-from jaxnbv.camera import Camera, look_at
+from jaxnbv.camera import Camera
+from jaxnbv.pose import look_at
 from jaxnbv.scanning import (
     Carving,
     Grid,

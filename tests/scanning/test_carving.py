@@ -8,9 +8,10 @@ import pytest
 from free_scenes import SEE, SOLIDS, image, nodes_of
 from jaxtyping import Array, Float
 
-from jaxnbv.camera import Camera, look_at
+from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud
 from jaxnbv.planner import Planner
+from jaxnbv.pose import look_at
 from jaxnbv.scanning import (
     Carving,
     Grid,

@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
-from jaxnbv.camera import Camera, fibonacci_sphere, look_at
+from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets.demo import demo_object
 from jaxnbv.frame import Frame
+from jaxnbv.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning import (
     Carving,
     Grid,

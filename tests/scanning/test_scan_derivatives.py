@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from bumps import FEW, GRID, SMALL, grid_surface, small_surfaces, solid, some_bumps, some_rays
 
-from jaxnbv.camera import Camera, fibonacci_sphere, look_at
+from jaxnbv.camera import Camera
+from jaxnbv.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning.grid import GridSurface
 from jaxnbv.scanning.scanner import scan
 from jaxnbv.scanning.sdf import Sphere

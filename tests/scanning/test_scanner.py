@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxnbv.camera import Camera, fibonacci_sphere, look_at
+from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud
+from jaxnbv.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning.mesh import TriangleMesh
 from jaxnbv.scanning.scanner import SensorNoise, scan
 from jaxnbv.scanning.sdf import Sphere

@@ -9,8 +9,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement, Score
-from jaxnbv.camera import Camera, Pose, look_at
+from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud
+from jaxnbv.pose import Pose, look_at
 from jaxnbv.scanning import Grid, GridSurface, scan
 from jaxnbv.search import (
     ConstrainedPoses,

@@ -9,10 +9,11 @@ import optimistix as optx
 import pytest
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement
-from jaxnbv.camera import Camera, look_at
+from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud
 from jaxnbv.episode import simulate
 from jaxnbv.planner import Planner
+from jaxnbv.pose import look_at
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, scan
 from jaxnbv.scanning.sdf import Capsule, Sphere
 from jaxnbv.search import ConstrainedPoses, DiscreteSearch, FreePoses, GradientSearch, HybridSearch, SpherePoses

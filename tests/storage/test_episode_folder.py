@@ -11,9 +11,9 @@ import trimesh
 from plyfile import PlyData
 from small_episode import FIRST, KEY, SCENE, contents, planner_of, run
 
-from jaxnbv.camera import look_at
 from jaxnbv.checks import InputError
 from jaxnbv.planner import Planner
+from jaxnbv.pose import look_at
 from jaxnbv.scanning import SensorNoise
 from jaxnbv.search import FarthestView
 from jaxnbv.storage import EpisodeFolder, describe

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from jaxnbv.acquisition import expected_score
-from jaxnbv.camera import Camera, fibonacci_sphere, look_at
+from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud
+from jaxnbv.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning import Grid, GridSurface, scan
 from jaxnbv.tasks import Coverage
 

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.special import eval_legendre
 
-from jaxnbv.camera import fibonacci_sphere
 from jaxnbv.checks import InputError
+from jaxnbv.pose import fibonacci_sphere
 from jaxnbv.tasks.diffusion import (
     HeatProblem,
     cloud_laplacian,

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from jaxnbv.camera import Camera, fibonacci_sphere, look_at
+from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets import Split, part_scene
 from jaxnbv.planner import Planner
+from jaxnbv.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning import Grid, SDFSurface, scan
 from jaxnbv.search import DiscreteSearch
 from jaxnbv.surfaces import GeometricSPSR

@@ -12,10 +12,10 @@ from PIL import Image
 
 import jaxnbv as nbv
 from jaxnbv.answers import number
-from jaxnbv.camera import look_at
 from jaxnbv.cli.actions.episodes import _summarise
 from jaxnbv.datasets.demo import demo_object
 from jaxnbv.episode import view_keys
+from jaxnbv.pose import look_at
 from jaxnbv.search import Search, Trajectories
 from jaxnbv.search.base import best_unvisited
 from jaxnbv.search.candidates import sphere_candidates

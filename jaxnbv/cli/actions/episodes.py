@@ -10,7 +10,7 @@ import typer
 
 from jaxnbv.acquisition import Score
 from jaxnbv.answers import Answer
-from jaxnbv.camera import Camera, Pose, look_at
+from jaxnbv.camera import Camera
 from jaxnbv.checks import require
 from jaxnbv.cli.actions.tasks import CommandTask, Given, position
 from jaxnbv.cli.options import EpisodeOptions
@@ -19,6 +19,7 @@ from jaxnbv.datasets import Framing
 from jaxnbv.episode import Episode, simulate
 from jaxnbv.model_name import ModelName
 from jaxnbv.planner import Planner
+from jaxnbv.pose import Pose, look_at
 from jaxnbv.presets import imagination
 from jaxnbv.scanning import Grid, SensorNoise, Surface, load_mesh
 from jaxnbv.sensors import Setting

@@ -9,7 +9,6 @@ import jax
 import numpy as np
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement, Score
-from jaxnbv.camera import Pose, look_at
 from jaxnbv.checks import InputError, require
 from jaxnbv.cli.options import DEFAULT_FIRST
 from jaxnbv.datasets import (
@@ -32,6 +31,7 @@ from jaxnbv.networks import (
     part_segmenter,
     pyramid_classifier,
 )
+from jaxnbv.pose import Pose, look_at
 from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, scan
 from jaxnbv.sensors import HEAT_SETTING, PART_SETTING, USUAL_SETTING, Setting
 from jaxnbv.tasks import Classifier, ColdestPoint, Coverage, CrossEntropy, MixedEntropy, NegativeEntropy, SoftPartCount

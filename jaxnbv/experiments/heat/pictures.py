@@ -14,12 +14,13 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jaxnbv.camera import Camera, Pose, fibonacci_sphere
+from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud
 from jaxnbv.experiments.heat.study import HeatStudy, Truth, heat_problem
 from jaxnbv.experiments.measures import Record, methods_of
 from jaxnbv.experiments.study import Scene, views_of
 from jaxnbv.experiments.tiles import Tiles, first_scenes, frame, save_pictures
+from jaxnbv.pose import Pose, fibonacci_sphere
 from jaxnbv.tasks import body_temperature
 from jaxnbv.tasks.diffusion import HeatProblem
 from jaxnbv.viz.data import MeanSurface

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from scipy.spatial import cKDTree
 
-from jaxnbv.camera import Camera, Pose, fibonacci_sphere, look_at
+from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets import PartScene, Split, part_scene
 from jaxnbv.datasets.labelled import LabelledSolid
@@ -25,6 +25,7 @@ from jaxnbv.experiments.parts.study import TARGET, TARGETS, PartStudy, discovery
 from jaxnbv.experiments.study import Scene
 from jaxnbv.experiments.tiles import Tiles, frame, save_pictures
 from jaxnbv.networks import CATEGORIES
+from jaxnbv.pose import Pose, fibonacci_sphere, look_at
 from jaxnbv.scanning import SDFSurface, scan
 from jaxnbv.viz.render import Still, draw_segments, frustum
 from jaxnbv.viz.style import GREY, INK, LINE

@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxnbv.acquisition import Score, Several, expected_score, zero_if_empty
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.experiments.diagnostics import rank_correlation, roughness
 from jaxnbv.planner import Planner
+from jaxnbv.pose import Pose
 from jaxnbv.scanning import GridSurface
 from jaxnbv.search import CandidateSearch, Problem
 from jaxnbv.search.baselines import uncertain_length

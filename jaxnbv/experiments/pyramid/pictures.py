@@ -12,12 +12,13 @@ from jaxtyping import Array, Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera
 from jaxnbv.datasets import PATTERNS, Framing, Pyramid, Split, pyramid_scene
 from jaxnbv.experiments.measures import Record, methods_of
 from jaxnbv.experiments.pyramid.hits import PATTERN_PIXELS
 from jaxnbv.experiments.pyramid.study import PyramidStudy
 from jaxnbv.experiments.tiles import Tiles, first_scenes, frame, save_pictures
+from jaxnbv.pose import Pose
 from jaxnbv.scanning import SDFSurface, scan
 from jaxnbv.viz.style import GREY, LINE, NEW
 

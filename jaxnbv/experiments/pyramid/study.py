@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets import Framing, Pyramid, Split, pyramid_scene
 from jaxnbv.datasets.pyramid import choose_hidden, scan_pattern
@@ -28,6 +28,7 @@ from jaxnbv.experiments.study import Chart, Panel, Scene, Study
 from jaxnbv.model_name import ModelName
 from jaxnbv.networks import pyramid_classifier
 from jaxnbv.planner import Planner
+from jaxnbv.pose import Pose
 from jaxnbv.presets import imagination
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
 from jaxnbv.search import DiscreteSearch

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement
-from jaxnbv.camera import Camera, Pose
+from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
 from jaxnbv.cloud import concatenate, limit_capacity
 from jaxnbv.datasets import Split, part_scene
 from jaxnbv.experiments.parts import pictures as part_pictures
 from jaxnbv.experiments.parts.study import PartStudy
 from jaxnbv.networks import CATEGORIES, CloudSegmenter
+from jaxnbv.pose import Pose
 from jaxnbv.scanning import SDFSurface, SensorNoise, scan
 from jaxnbv.search import (
     DiscreteSearch,

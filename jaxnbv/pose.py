@@ -1,0 +1,178 @@
+"""Poses, `look_at`, and places on a sphere.
+
+OpenCV convention: in the camera's own frame x points right, y down and z forward, along the view.
+A pose is camera-to-scene. Angles are in radians, lengths in scene units.
+"""
+
+import math
+from collections.abc import Iterator
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxnbv.checks import AnyArray, as_floats, check_batch, check_index, checked, is_traced, require
+
+# Signs of the camera's axes, given as right, down and forward.
+_CONVENTIONS = {"opencv": (1.0, 1.0, 1.0), "opengl": (1.0, -1.0, -1.0)}
+
+
+class Pose(eqx.Module):
+    """A rigid camera-to-scene transform, or a batch of them along leading axes.
+
+    A point p of the camera's frame lies at `rotation @ p + position` in the scene. The columns of `rotation` are the
+    camera's right, down and forward axes in scene coordinates.
+
+    **Raises:** `ValueError` for other shapes, if the rotation is not orthonormal with determinant +1 (tolerance 1e-3),
+    or if an entry is not finite; under `jit` values are not known and only shapes are checked.
+    """
+
+    rotation: Float[Array, "*batch 3 3"]
+    position: Float[Array, "*batch 3"]
+
+    def __init__(self, rotation: Float[AnyArray, "*batch 3 3"], position: Float[AnyArray, "*batch 3"]):
+        rotation, position = as_floats(rotation, "the rotation"), as_floats(position, "the position")
+        shapes = rotation.shape, position.shape
+        require(
+            shapes[0][-2:] == (3, 3) and shapes[1][-1:] == (3,) and shapes[0][:-2] == shapes[1][:-1],
+            f"a pose needs a rotation (..., 3, 3) and a position (..., 3), got {shapes[0]} and {shapes[1]}",
+        )
+        if not is_traced(rotation, position):
+            _check_rigid(np.asarray(rotation), np.asarray(position))
+        self.rotation, self.position = rotation, position
+
+    @classmethod
+    @checked
+    def from_matrix(cls, matrix: Float[AnyArray, "*batch 4 4"], convention: str = "opencv") -> "Pose":
+        """The pose of a camera-to-scene (or camera-to-world) matrix [[R, t], [0, 1]].
+
+        - `convention`: "opencv" for cameras that look along +z with y down, "opengl" (also Blender's and NeRF's) for
+          cameras that look along -z with y up.
+
+        **Raises:** `ValueError` for another convention, a last row other than (0, 0, 0, 1), or as `Pose` does.
+        """
+        require(convention in _CONVENTIONS, f"the convention is {convention!r}; give one of {', '.join(_CONVENTIONS)}")
+        found = as_floats(matrix, "the matrix of a pose")
+        require(found.shape[-2:] == (4, 4), f"the matrix of a pose has shape {found.shape}; give (..., 4, 4)")
+        if not is_traced(found):
+            last = np.asarray(found)[..., 3, :]
+            require(
+                bool(np.all(np.abs(last - [0.0, 0.0, 0.0, 1.0]) < 1e-6)),
+                f"the last row of a pose's matrix is {last}, not (0, 0, 0, 1): give camera-to-world, not its transpose "
+                "or a projection",
+            )
+        axes = jnp.asarray(_CONVENTIONS[convention], found.dtype)
+        return cls(found[..., :3, :3] * axes, found[..., :3, 3])
+
+    @property
+    def matrix(self) -> Float[Array, "*batch 4 4"]:
+        """The camera-to-scene matrix [[R, t], [0, 1]] in OpenCV's convention."""
+        last = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0], self.position.dtype), (*self.position.shape[:-1], 1, 4))
+        return jnp.concatenate([jnp.concatenate([self.rotation, self.position[..., None]], axis=-1), last], axis=-2)
+
+    @property
+    def forward(self) -> Float[Array, "*batch 3"]:
+        """Unit viewing direction in the scene."""
+        return self.rotation[..., :, 2]
+
+    def to_scene(self, points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
+        """Points of the camera's frame in scene coordinates (a single pose)."""
+        return jnp.matmul(points, self.rotation.T, precision="highest") + self.position
+
+    def __getitem__(self, index) -> "Pose":
+        """The pose, or poses, at an index of the leading axes.
+
+        **Raises:** `ValueError` of a single pose, or if there is no such index.
+        """
+        check_index(index, self.position.shape[:-1], "the pose")
+        return jax.tree.map(lambda leaf: leaf[index], self)
+
+    def __iter__(self) -> Iterator["Pose"]:
+        """The poses along the first axis of a batch."""
+        check_batch(self.position.shape[:-1], "the pose")
+        return (self[index] for index in range(self.position.shape[0]))
+
+
+def _check_rigid(rotation: np.ndarray, position: np.ndarray) -> None:
+    finite = np.isfinite(rotation).all() and np.isfinite(position).all()
+    require(finite, f"the pose has entries that are not finite: rotation {rotation}, position {position}; give numbers")
+    error = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max(initial=0.0)
+    determinant = np.linalg.det(rotation)
+    require(
+        error < 1e-3 and bool((determinant > 0).all()),
+        f"the pose's 3 x 3 matrix is not a rotation: |R R^T - I| is {error:.3g} and det R is {determinant}; "
+        "build it with look_at, or orthonormalise it first",
+    )
+
+
+def look_at(
+    position,
+    target=(0.0, 0.0, 0.0),
+    up=(0.0, 1.0, 0.0),
+) -> Pose:
+    """The pose at `position` whose forward axis points to `target`.
+
+    **Arguments** (scene coordinates, anything `jnp.asarray` takes): `position` (*batch, 3); `target` (3,), by default
+    the origin; `up` (3,), the direction that is up in the image. Looking along `up`, the image is turned so that the
+    axis on which `up` is smallest takes its place.
+
+    **Raises:** `ValueError` for other shapes, if `position` equals `target`, or `up` is zero.
+    """
+    position, target, up = (
+        as_floats(value, f"look_at's {name}")
+        for value, name in ((position, "position"), (target, "target"), (up, "up"))
+    )
+    require(
+        position.shape[-1:] == target.shape == up.shape == (3,),
+        f"look_at needs a position (..., 3), a target (3,) and an up (3,), got {position.shape}, {target.shape}, "
+        f"{up.shape}",
+    )
+    offset = target - position
+    if not is_traced(position, target, up):
+        for value, name in ((position, "position"), (target, "target"), (up, "up")):
+            require(bool(jnp.all(jnp.isfinite(value))), f"look_at needs finite coordinates, got {name} {value}")
+        distance = jnp.linalg.norm(offset, axis=-1)
+        require(
+            bool(jnp.all(jnp.isfinite(distance))),
+            f"look_at needs a position whose distance from its target is a finite number, got position {position}",
+        )
+        require(
+            bool(jnp.all(distance > 0)),
+            f"look_at needs a position apart from its target; both are {target}",
+        )
+        length = float(jnp.linalg.norm(up))
+        require(
+            0 < length < math.inf,
+            f"look_at needs an up direction whose length is not zero and finite, such as (0, 1, 0), got {up}",
+        )
+    forward = offset / jnp.linalg.norm(offset, axis=-1, keepdims=True)
+    spare = jnp.eye(3, dtype=up.dtype)[jnp.argmin(jnp.abs(up))]
+    parallel = jnp.linalg.norm(jnp.cross(forward, up), axis=-1, keepdims=True) < 1e-4 * jnp.linalg.norm(up)
+    right = jnp.cross(forward, jnp.where(parallel, spare, up))
+    right = right / jnp.linalg.norm(right, axis=-1, keepdims=True)
+    down = jnp.cross(forward, right)
+    return Pose(jnp.stack([right, down, forward], axis=-1), position)
+
+
+@checked
+def fibonacci_sphere(count: int, radius: float = 1.0, min_elevation: float = -0.5 * math.pi) -> Float[Array, "count 3"]:
+    """`count` almost evenly spaced points on a sphere about the origin (spherical Fibonacci lattice; Gonzalez 2010).
+
+    `min_elevation`: radians above the plane y = 0; from there to the pole, the whole sphere by default.
+
+    **Raises:** `ValueError` if `count` < 1, `radius` <= 0 or the elevation is not within [-pi/2, pi/2).
+    """
+    require(count >= 1, f"a Fibonacci sphere needs at least one point, got {count}")
+    require(radius > 0, f"the radius of the sphere must be positive, got {radius}")
+    require(
+        -0.5 * math.pi <= min_elevation < 0.5 * math.pi,
+        f"the least elevation is {min_elevation} rad; it must lie within [-pi/2, pi/2)",
+    )
+    index = np.arange(count)
+    y = 1.0 - (1.0 - math.sin(min_elevation)) * (index + 0.5) / count
+    azimuth = index * math.pi * (3.0 - math.sqrt(5.0))
+    ring = np.sqrt(1.0 - y**2)
+    points = np.stack([ring * np.cos(azimuth), y, ring * np.sin(azimuth)], axis=-1)
+    return jnp.asarray(radius * points, dtype=jnp.result_type(float))
