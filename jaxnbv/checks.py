@@ -92,7 +92,7 @@ def check_type(value: Any, hint: Any, name: str) -> None:
 
 
 def check_index(index: Any, batch: tuple[int, ...], name: str) -> None:
-    """**Raises:** `ValueError` for a whole number into what is no batch, or beyond its length, which JAX would clamp."""
+    """**Raises:** `ValueError` for a number into what is no batch, or beyond its length, which JAX would clamp."""
     if isinstance(index, int | np.integer):
         check_batch(batch, name)
         require(-batch[0] <= index < batch[0], f"{name} has {batch[0]} along its first axis: there is no index {index}")

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Real
 
 from jaxnbv.camera import Camera
 from jaxnbv.checks import (
@@ -118,7 +118,7 @@ class PointCloud(eqx.Module):
     @checked
     def from_depth(
         cls,
-        depth: Float[AnyArray, "height width"],
+        depth: Real[AnyArray, "height width"],
         camera: Camera,
         pose: Pose,
         scale: float = 1.0,

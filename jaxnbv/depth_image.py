@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Real
 
 from jaxnbv.camera import Camera
 from jaxnbv.checks import AnyArray, as_floats, as_numbers, is_traced, require
@@ -15,7 +15,7 @@ _OTHER_UNITS = 20.0
 
 
 def points_of_depth(
-    depth: Float[AnyArray, "height width"], camera: Camera, pose: Pose, scale: float, stride: int, box: Box | None
+    depth: Real[AnyArray, "height width"], camera: Camera, pose: Pose, scale: float, stride: int, box: Box | None
 ) -> Rows:
     """Points, normals, which rows are filled and which rays met nothing: `PointCloud.from_depth`."""
     shape = (camera.height, camera.width)

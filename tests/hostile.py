@@ -34,7 +34,13 @@ def number_of_points(cloud):
 # What is called, and arguments that work; each is replaced in turn.
 CALLS = {
     nbv.Box: {"low": (-1.0, -1.0, -1.0), "high": (1.0, 1.0, 1.0)},
-    nbv.Camera: {"fov": 0.5, "height": 4, "width": 4},
+    nbv.Camera: {"fov": 0.5, "height": 4, "width": 4, "aspect": 1.0, "center": (0.5, 0.5), "nearest": 0.1}
+    | {"farthest": 3.0, "max_incidence": 1.0},
+    nbv.Camera.from_intrinsics: {"matrix": np.eye(3), "width": 4, "height": 4, "nearest": 0.1, "farthest": 3.0}
+    | {"max_incidence": 1.0},
+    nbv.Camera.from_focal_length: {"focal_length": 5.0, "width": 4, "height": 4},
+    SMALL.resized: {"height": 2, "width": 3},
+    SMALL.strided: {"stride": 2},
     nbv.Carving: {"volume": nbv.Box(), "margin": 1.0},
     nbv.ColdestPoint: {"source": (0.0, 1.0, 0.0), "power": 10.0, "T": 5.0, "steps": 20, "u0": 0.0, "radius": 0.1}
     | {"reached_only": False, "workers": 1},
@@ -63,7 +69,9 @@ CALLS = {
     nbv.Planner: {"model": MODEL, "camera": SMALL, "acquisition": nbv.Coverage(), "search": nbv.DiscreteSearch(6)}
     | {"num_samples": 2, "grid": nbv.Grid(8), "capacity": 32, "max_views": 3, "carving": nbv.Carving()},
     nbv.PointCloud.from_arrays: {"points": DIRECTIONS, "normals": DIRECTIONS, "capacity": 32},
-    nbv.PointCloud.from_depth: {"depth": np.ones((4, 4)), "camera": SMALL, "pose": POSE},
+    nbv.PointCloud.from_depth: {"depth": np.ones((4, 4)), "camera": SMALL, "pose": POSE}
+    | {"scale": 1.0, "stride": 2, "box": nbv.Box()},
+    nbv.Pose.from_matrix: {"matrix": np.eye(4), "convention": "opengl"},
     nbv.Pose: {"rotation": np.eye(3), "position": np.zeros(3)},
     nbv.RandomView: {"candidates": 6},
     nbv.SDFSurface: {"sdf": BALL, "bounding_radius": 2.0},

@@ -1,4 +1,4 @@
-"""Point clouds: bad input, depth images, farthest point sampling against a slow greedy version, frames."""
+"""Point clouds: bad input, depth images, farthest point sampling against a slow greedy version."""
 
 import math
 
@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud, concatenate, farthest_point_subsample, limit_capacity
-from jaxnbv.frame import Frame
-from jaxnbv.pose import Pose, look_at
+from jaxnbv.pose import look_at
 
 GOOD = [[0.0, 0.1, 0.2], [0.3, 0.4, 0.5]]
 UP = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -232,49 +231,6 @@ def test_no_room_at_all_is_refused(function):
         function(PointCloud.from_arrays(GOOD, UP), 0)
 
 
-def test_frame_centres_the_box_and_scales_its_longest_side():
-    world = np.array([[10.0, 0.0, -3.0], [14.0, 1.0, -1.0], [12.0, 0.5, -2.9]])
-    frame = Frame.fit(world)
-    scene = frame.to_scene(world)
-    np.testing.assert_allclose(scene.min(axis=0), [-1.25, -0.3125, -0.625], atol=1e-12)
-    np.testing.assert_allclose(scene.max(axis=0), [1.25, 0.3125, 0.625], atol=1e-12)
-    np.testing.assert_allclose(frame.to_world(scene), world, atol=1e-12)
-    assert Frame.fit(world, longest_side=1.0).scale == pytest.approx(0.25)
-
-
-def test_frame_moves_clouds_and_poses_but_not_directions():
-    frame = Frame(0.5, (1.0, 2.0, 3.0))
-    cloud = PointCloud.from_arrays([[3.0, 2.0, 1.0]], [[0.0, 0.6, 0.8]], capacity=3)
-    scene = frame.to_scene(cloud)
-    np.testing.assert_allclose(scene.points, [[1.0, 0.0, -1.0], [0.0] * 3, [0.0] * 3], atol=1e-6)
-    np.testing.assert_array_equal(scene.normals, cloud.normals)
-    np.testing.assert_array_equal(scene.mask, cloud.mask)
-    pose = look_at((0.8, 0.9, 2.2))
-    moved = frame.to_world(pose)
-    assert isinstance(moved, Pose)
-    np.testing.assert_allclose(moved.position, [2.6, 3.8, 7.4], atol=1e-6)
-    np.testing.assert_array_equal(moved.rotation, pose.rotation)
-    for thing in (cloud, pose):
-        back = frame.to_world(frame.to_scene(thing))
-        for a, b in zip(jax.tree.leaves(back), jax.tree.leaves(thing), strict=True):
-            np.testing.assert_allclose(a, b, atol=1e-6)
-    points = jnp.asarray(GOOD)
-    np.testing.assert_allclose(jax.jit(frame.to_scene)(points), frame.to_scene(points), atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("points", "message"),
-    [
-        (np.zeros((0, 3)), "no points"),
-        (np.ones((4, 3)), "all 4 points lie at"),
-        (np.array([[0.0, 0.0, 0.0], [1.0, np.nan, 0.0]]), "not finite"),
-    ],
-)
-def test_frame_of_no_extent_is_refused(points, message):
-    with pytest.raises(ValueError, match=message):
-        Frame.fit(points)
-
-
 def test_nan_in_masked_rows_never_enters_farthest_point_samples():
     points = np.full((60, 3), np.nan, np.float32)
     points[:50] = np.random.default_rng(0).uniform(-1, 1, (50, 3))
@@ -290,11 +246,3 @@ def test_a_batch_of_clouds_is_iterated_once():
     clouds = PointCloud(jnp.asarray(points), jnp.asarray(points), jnp.ones((2, 5), bool))
     for cloud, expected in zip(clouds, points, strict=True):
         np.testing.assert_array_equal(cloud.points, np.float32(expected))
-
-
-def test_depths_beyond_the_type_say_nothing_and_only_infinity_says_nothing_is_there():
-    camera, pose = Camera(height=4, width=4), look_at((0.0, 0.0, 2.5))
-    for depth, missed in ((1e15, 0), (3.5e38, 0), (1e300, 0), (np.inf, 16)):
-        cloud = PointCloud.from_depth(np.full((4, 4), depth), camera, pose)
-        assert int(cloud.count) == 0
-        assert int(cloud.missed.sum()) == missed

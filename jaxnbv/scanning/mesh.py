@@ -64,8 +64,12 @@ class TriangleMesh(Surface):
         self._tree = _Tree()
 
     @classmethod
-    def from_arrays(cls, vertices: Float[AnyArray, "v 3"] | list, faces: Int[AnyArray, "f 3"] | list) -> "TriangleMesh":
+    def from_arrays(
+        cls, vertices: Float[AnyArray, "v 3"] | list, faces: Int[AnyArray, "f 3"] | list, up: str = "y"
+    ) -> "TriangleMesh":
         """The mesh of world coordinates and corner indices, in the frame that makes its longest side 2.5.
+
+        - `up`: the world's axis that is upward, see `Frame`.
 
         Vertices that no face uses are dropped. So are faces of zero area, with a `UserWarning`.
 
@@ -101,7 +105,7 @@ class TriangleMesh(Surface):
         if not solid.all():
             warnings.warn(f"dropped {(~solid).sum()} of {len(faces)} faces: they have zero area", stacklevel=2)
         used, faces = np.unique(faces[solid], return_inverse=True)
-        frame = Frame.fit(np.asarray(vertices[used]))
+        frame = Frame.fit(np.asarray(vertices[used]), up=up)
         return cls(frame.to_scene(vertices[used]), faces.reshape(-1, 3), frame)
 
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
@@ -179,8 +183,10 @@ class TriangleMesh(Surface):
 
 
 @checked
-def load_mesh(path: str | Path) -> TriangleMesh:
+def load_mesh(path: str | Path, up: str = "y") -> TriangleMesh:
     """The mesh in a file of any format that trimesh reads; a scene's geometries are joined where it places them.
+
+    - `up`: the file's axis that is upward, see `Frame`.
 
     **Raises:** `ValueError` if the file is missing or cannot be read, and as `TriangleMesh.from_arrays` does.
     """
@@ -197,7 +203,7 @@ def load_mesh(path: str | Path) -> TriangleMesh:
     vertices = np.concatenate([mesh.vertices for mesh in meshes])
     faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)])
     try:
-        return TriangleMesh.from_arrays(vertices, faces)
+        return TriangleMesh.from_arrays(vertices, faces, up)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
