@@ -54,9 +54,41 @@ def test_the_script_runs_as_written(tmp_path):
     assert (tmp_path / "runs" / "spot" / "cloud.ply").exists()
 
 
+def test_the_block_for_a_depth_camera_runs():
+    """A ball of 0.1 metres on a table, z up, seen from 0.9 metres."""
+    matrix = np.array([[600.0, 0.0, 325.0], [0.0, 605.0, 236.0], [0.0, 0.0, 1.0]])
+    camera = nbv.Camera.from_intrinsics(matrix, 640, 480)
+    pose = nbv.look_at((0.6, -0.6, 0.4), (0.0, 0.0, 0.1), up=(0.0, 0.0, 1.0))
+    solid = nbv.sdf.Sphere(0.1).translate([0.0, 0.0, 0.1]) | nbv.sdf.Box([1.0, 1.0, 0.05]).translate([0.0, 0.0, -0.05])
+    seen = nbv.scan(nbv.SDFSurface(solid), camera, pose)
+    depth = (np.asarray(seen.points) - np.asarray(pose.position)) @ np.asarray(pose.forward)
+    small = nbv.GeometricSPSR(0.05, 0.2, 8), nbv.Camera(height=12, width=12), nbv.Coverage(), nbv.DiscreteSearch(12)
+    given = {
+        "nbv": nbv,
+        "np": np,
+        "K": matrix,
+        "T": np.asarray(pose.matrix),
+        "low": (-0.15, -0.15, 0.005),
+        "high": (0.15, 0.15, 0.255),
+        "depth_mm": np.where(seen.mask, np.round(1000 * depth), 0).astype(np.uint16).reshape(480, 640),
+        "planner": nbv.Planner(*small, num_samples=2, grid=nbv.Grid(24)),
+        "key": jax.random.key(0),
+    }
+    (block,) = (block for block in python_blocks() if "depth_mm" in block)
+    exec(block, given)
+    points = given["cloud"].to_numpy()[0]
+    assert len(points) > 100
+    assert np.abs(np.linalg.norm(points - [0.0, 0.0, 0.1], axis=1) - 0.1).max() < 0.01
+    # Candidates stand on a sphere of 2.5 scene units about the box, whose longest side is 2.5, and look at its centre.
+    place, forward = given["matrix"][:3, 3] - np.array([0.0, 0.0, 0.13]), given["matrix"][:3, 2]
+    assert np.linalg.norm(place) == pytest.approx(0.3, abs=1e-4)
+    np.testing.assert_allclose(forward, -place / np.linalg.norm(place), atol=1e-4)
+
+
 def test_the_other_blocks_run():
     for block in python_blocks()[1:]:
-        exec(block, {"nbv": nbv, "jax": jax, "source": np.array([0.0, 1.25, 0.0])})
+        if "depth_mm" not in block:
+            exec(block, {"nbv": nbv, "jax": jax, "source": np.array([0.0, 1.25, 0.0])})
 
 
 @pytest.mark.parametrize("name", ["main", "test"])
