@@ -55,10 +55,12 @@ from .search import PoseSpace as PoseSpace
 from .search import Problem as Problem
 from .search import Proposal as Proposal
 from .search import RandomView as RandomView
+from .search import Reach as Reach
 from .search import Search as Search
 from .search import SphereCandidates as SphereCandidates
 from .search import SpherePoses as SpherePoses
 from .search import Trajectories as Trajectories
+from .search import Turntable as Turntable
 from .search import UncertaintyView as UncertaintyView
 from .state import State as State
 from .surfaces import Fields as Fields

@@ -211,7 +211,14 @@ def expected_score(
 def mean_score(
     score: Score, context: Any, surfaces: GridSurface, camera: Camera, poses: Pose
 ) -> Float[Array, "poses *scores"]:
-    """`expected_score`, given what the score's `context` made of D.
+    """`expected_score`, given what the score's `context` made of D."""
+    return jnp.mean(sample_scores(score, context, surfaces, camera, poses), axis=0)
+
+
+def sample_scores(
+    score: Score, context: Any, surfaces: GridSurface, camera: Camera, poses: Pose
+) -> Float[Array, "samples poses *scores"]:
+    """The score of what each of the sampled surfaces would show from each of a batch of poses.
 
     Samples are taken one after the other, with all poses scanned at once and scored `score.batch_size` at a time, so
     memory is that of one sample's scans.
@@ -221,4 +228,4 @@ def mean_score(
         scans = scan(surface, camera, poses)
         return jax.lax.map(lambda imagined: score(context, imagined), scans, batch_size=score.batch_size)
 
-    return jnp.mean(jax.lax.map(of_sample, surfaces), axis=0)
+    return jax.lax.map(of_sample, surfaces)

@@ -148,8 +148,8 @@ class Planner(eqx.Module):
         if not is_traced(proposal):
             require(
                 not bool(jnp.isnan(proposal.value)) and (surfaces is None or bool(proposal.value < jnp.inf)),
-                f"the acquisition is {float(proposal.value)} for a candidate: the score must be finite for every scan, "
-                "one that sees nothing included, and for a gradient search so must its derivatives",
+                f"the acquisition is {_in_words(proposal.value)} for a candidate: the score must be finite for every "
+                "scan, one that sees nothing included, and for a gradient search so must its derivatives",
             )
             require(
                 bool(proposal.value > -jnp.inf),
@@ -194,6 +194,10 @@ class Planner(eqx.Module):
             pose, scan = view
             state = self.init(scan, pose, camera) if state is None else self.observe(state, pose, scan, camera)
             yield state
+
+
+def _in_words(value: Float[Array, ""]) -> str:
+    return "not a number (NaN)" if jnp.isnan(value) else "infinite"
 
 
 # What is compiled takes what it uses, not the planner: another score or search does not compile the sampler again.

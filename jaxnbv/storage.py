@@ -124,6 +124,8 @@ class EpisodeFolder(ResultFolder):
                 "candidate_rotations": proposal.candidates.rotation,
                 "candidate_positions": proposal.candidates.position,
             }
+            errors = {name: getattr(proposal, name) for name in _ERRORS}
+            data |= {name: value for name, value in errors.items() if value is not None}
         if proposal is not None and (ways := proposal.trajectories) is not None:
             data |= {
                 "trajectory_rotations": ways.poses.rotation,
@@ -147,6 +149,7 @@ class EpisodeFolder(ResultFolder):
         return self.path / f"view_{index:02d}.npz"
 
 
+_ERRORS = ("standard_errors", "difference_errors")
 # What a view's arrays are: the kind of their type, and their shape; what one letter stands for is the same in all.
 _ARRAYS = {
     "rotation": ("f", (3, 3)),
@@ -159,6 +162,8 @@ _ARRAYS = {
     "values": ("f", ("c",)),
     "candidate_rotations": ("f", ("c", 3, 3)),
     "candidate_positions": ("f", ("c", 3)),
+    "standard_errors": ("f", ("c",)),
+    "difference_errors": ("f", ("c",)),
     "trajectory_rotations": ("f", ("s", "i", 3, 3)),
     "trajectory_positions": ("f", ("s", "i", 3)),
     "trajectory_values": ("f", ("s", "i")),
@@ -205,4 +210,5 @@ def _view(data: dict[str, jax.Array]) -> tuple[Pose, PointCloud, Proposal | None
     if "trajectory_values" in data:
         poses = Pose(data["trajectory_rotations"], data["trajectory_positions"])
         trajectories = Trajectories(poses, data["trajectory_values"])
-    return pose, scan, Proposal(pose, data["value"], candidates, data["values"], trajectories)
+    errors = (data.get(name) for name in _ERRORS)
+    return pose, scan, Proposal(pose, data["value"], candidates, data["values"], trajectories, *errors)

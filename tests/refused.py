@@ -96,7 +96,7 @@ REFUSED = {
     "a fit of no model": (lambda: nbv.fit_hyperparameters("x", CLOUD, KEY), "the model is 'x'"),
     "an infinite score": (
         lambda: proposed(nbv.ExpectedUtilityImprovement(lambda c: jnp.where(c.points.shape[0] > 64, jnp.inf, 1.0))),
-        "inf",
+        "infinite",
     ),
     "parts without points": (lambda: parts_of(jnp.ones(16)), "(16,)"),
     "negative parts": (lambda: parts_of(-jnp.ones((16, 3))), "probabilities"),

@@ -10,7 +10,9 @@ from jaxnbv.search.baselines import RandomView as RandomView
 from jaxnbv.search.baselines import UncertaintyView as UncertaintyView
 from jaxnbv.search.candidates import Candidates as Candidates
 from jaxnbv.search.candidates import GivenPoses as GivenPoses
+from jaxnbv.search.candidates import Reach as Reach
 from jaxnbv.search.candidates import SphereCandidates as SphereCandidates
+from jaxnbv.search.candidates import Turntable as Turntable
 from jaxnbv.search.discrete import DiscreteSearch as DiscreteSearch
 from jaxnbv.search.gradient import GradientSearch as GradientSearch
 from jaxnbv.search.gradient import HybridSearch as HybridSearch

@@ -1,5 +1,6 @@
 """Multi-start gradient ascent of the acquisition, through Optimistix."""
 
+import dataclasses
 import math
 from functools import partial
 
@@ -62,18 +63,19 @@ class Ascent(eqx.Module):
 
     def climb(self, problem: Problem, candidates: Pose) -> Proposal:
         """The best pose on the trajectories from the best candidates, or the best candidate if none is better."""
-        values = problem.acquisition(candidates)
+        scores = problem.scores(candidates)
+        values = jnp.mean(scores, axis=0)
         order = jnp.argsort(jnp.where(problem.is_visited(candidates), -jnp.inf, values), descending=True)
         # Solvers that search along a line expect differences of order one.
         scale = jnp.max(values) - jnp.min(values)
         scale = jnp.where(scale > 0, scale, 1.0)
         trajectories = jax.vmap(partial(self._walk, problem, scale))(candidates[order[: self.num_starts]])
-        found = best_unvisited(problem, candidates, values, tie=0.0)
+        found = best_unvisited(problem, candidates, values, tie=0.0, scores=scores)
         passed = best_unvisited(problem, *trajectories.flat, tie=0.0)
         # Whatever is not a number comes through, so that the planner can say so.
         better = ~(passed.value <= found.value)
         pose, value = jax.tree.map(partial(jnp.where, better), *[(p.pose, p.value) for p in (passed, found)])
-        return Proposal(pose, value, candidates, found.values, trajectories)
+        return dataclasses.replace(found, pose=pose, value=value, trajectories=trajectories)
 
     def _walk(self, problem: Problem, scale: Float[Array, ""], start: Pose) -> Trajectories:
         """Where the solver stood: every pose it evaluated or, of one that searches along a line, those it accepted."""

@@ -1,5 +1,6 @@
 """What a search is asked, and what it answers."""
 
+import dataclasses
 from abc import abstractmethod
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -8,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from jaxnbv.acquisition import Score, mean_score
+from jaxnbv.acquisition import Score, sample_scores
 from jaxnbv.answers import Quantity
 from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
@@ -59,8 +60,12 @@ class Problem(eqx.Module):
 
     def acquisition(self, poses: Pose, samples: slice = slice(None)) -> Float[Array, " poses"]:
         """The acquisition at a batch of poses, estimated from all posterior samples or from a part of them."""
+        return jnp.mean(self.scores(poses, samples), axis=0)
+
+    def scores(self, poses: Pose, samples: slice = slice(None)) -> Float[Array, "samples poses"]:
+        """The scores whose mean is the acquisition, sample by sample."""
         surfaces = jax.tree.map(lambda leaf: leaf[samples], self._sampled)
-        return mean_score(self.score, self.context, surfaces, self.camera, poses)
+        return sample_scores(self.score, self.context, surfaces, self.camera, poses)
 
     @property
     def num_samples(self) -> int:
@@ -110,6 +115,9 @@ class Proposal(eqx.Module):
 
     - `value`: the chosen pose's value, in the units of what the search maximises.
     - `candidates`, `values`: the pool of poses and their values; -inf where one was excluded as visited.
+    - `standard_errors`: of the values, as means over the posterior samples; `difference_errors`: of each value less
+      that of the best candidate, which is known better, since all poses are scored on the same samples. NaN for a
+      single sample; None for a search that does not score all candidates on all samples.
     - `trajectories`: those of a gradient search, starting from the best candidates; None for other searches.
     """
 
@@ -118,6 +126,25 @@ class Proposal(eqx.Module):
     candidates: Pose
     values: Float[Array, " candidates"]
     trajectories: Trajectories | None = None
+    standard_errors: Float[Array, " candidates"] | None = None
+    difference_errors: Float[Array, " candidates"] | None = None
+
+    def is_level(self, errors: float = 2.0) -> Bool[Array, " candidates"] | None:
+        """Which candidates the samples cannot tell from the best one, itself included: those whose value is within so
+        many standard errors of the difference. None where these are not known."""
+        if self.difference_errors is None:
+            return None
+        best = jnp.max(self.values)
+        return (self.values == best) | (best - self.values <= errors * self.difference_errors)
+
+    @property
+    def others_level(self) -> int | None:
+        """How many other candidates are level with the best one, within two standard errors; None where that is not
+        known, as for a single sample."""
+        level = self.is_level()
+        if level is None or bool(jnp.isnan(jnp.asarray(self.difference_errors)).any()):
+            return None
+        return int(jnp.sum(level)) - 1
 
 
 class Search(eqx.Module):
@@ -149,16 +176,31 @@ class CandidateSearch(Search):
 
 
 def best_unvisited(
-    problem: Problem, candidates: Pose, values: Float[Array, " candidates"], tie: float = _TIE
+    problem: Problem,
+    candidates: Pose,
+    values: Float[Array, " candidates"],
+    tie: float = _TIE,
+    scores: Float[Array, "samples candidates"] | None = None,
 ) -> Proposal:
     """The candidate of the highest value among those not visited yet; the first of them where values tie.
 
     `tie`: the relative difference within which they do, by default what sums differ by that are added in another order,
-    on another number of cores.
+    on another number of cores. `scores`: those whose means the values are, for their standard errors.
     """
     values = jnp.where(problem.is_visited(candidates), -jnp.inf, values)
     best = jnp.max(values)
     # Nothing ties with an infinite value, and NaN is told of by the planner.
     tied = values >= best - jnp.where(jnp.isfinite(best), tie * jnp.abs(best), 0.0)
     index = jnp.where(jnp.isfinite(best), jnp.argmax(tied), jnp.argmax(values))
-    return Proposal(candidates[index], values[index], candidates, values)
+    found = Proposal(candidates[index], values[index], candidates, values)
+    if scores is None:
+        return found
+    of_differences = standard_error(scores - scores[:, index][:, None])
+    return dataclasses.replace(found, standard_errors=standard_error(scores), difference_errors=of_differences)
+
+
+def standard_error(scores: Float[Array, "samples *poses"]) -> Float[Array, "*poses"]:
+    """Of the means over the samples; NaN for a single one."""
+    count = scores.shape[0]
+    squares = jnp.sum((scores - jnp.mean(scores, axis=0)) ** 2, axis=0)
+    return jnp.sqrt(squares / (count - 1) / count) if count > 1 else jnp.full(scores.shape[1:], jnp.nan)

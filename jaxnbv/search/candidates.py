@@ -8,12 +8,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, InputError, check_fields, require, shown
 from jaxnbv.pose import Pose, fibonacci_sphere, look_at
 from jaxnbv.search.rotations import rotation_between, rotation_from_6d
 from jaxnbv.sensors import SENSOR_RADIUS
+
+# The real root of x^3 = x + 1.
+_PLASTIC = 1.324717957244746
 
 
 class Candidates(eqx.Module):
@@ -58,13 +61,11 @@ class SphereCandidates(Candidates):
 
     def __check_init__(self):
         check_fields(self)
-        require(self.number >= 1, f"the search has {self.number} candidates; it needs at least one")
-        require(0 < self.radius < math.inf, f"the candidates' sphere has radius {self.radius}; it must be positive")
+        _check_places(self.number, self.radius, self.radius, self.up)
         require(
             -0.5 * math.pi <= self.min_elevation < 0.5 * math.pi,
             f"the least elevation is {self.min_elevation} rad; it must lie within [-pi/2, pi/2)",
         )
-        require(0 < math.hypot(*self.up) < math.inf, f"up is {self.up}; it must be a direction, such as (0, 1, 0)")
 
     @property
     def count(self) -> int:
@@ -74,14 +75,89 @@ class SphereCandidates(Candidates):
         """A dome is turned about its axis, so that the poses of every key are above the elevation."""
         whole = self.min_elevation == -0.5 * math.pi
         places = fibonacci_sphere(self.number, self.radius, self.min_elevation)
-        if key is not None:
-            turn = rotation_from_6d(jax.random.normal(key, (6,))) if whole else _about_y(key)
-            places = jnp.matmul(places, turn.T, precision="highest")
-        up = jnp.asarray(self.up, places.dtype)
-        if self.up[0] or self.up[2] or self.up[1] < 0:
-            turn = rotation_between(jnp.asarray([0.0, 1.0, 0.0], places.dtype), up / jnp.linalg.norm(up))
-            places = jnp.matmul(places, turn.T, precision="highest")
-        return look_at(places, up=up)
+        if key is not None and whole:
+            turn = rotation_from_6d(jax.random.normal(key, (6,)))
+            places, key = jnp.matmul(places, turn.T, precision="highest"), None
+        return _looking(places, self.up, key)
+
+
+class Turntable(Candidates):
+    """A camera that stands still before a turntable: as the object sees it, on a circle about the axis `up`.
+
+    - `number`: of positions of the table, evenly spaced.
+    - `radius`: the camera's distance from the centre of the scene, at which it looks; `elevation`: its angle above the
+      plane across `up`, in radians.
+
+    **Raises:** `ValueError` for no positions, a radius that is not positive, an elevation that is not within
+    (-pi/2, pi/2), or an `up` without direction.
+    """
+
+    number: int = eqx.field(static=True, default=36)
+    radius: float = eqx.field(static=True, default=SENSOR_RADIUS)
+    elevation: float = eqx.field(static=True, default=math.radians(30.0))
+    up: tuple[float, float, float] = eqx.field(static=True, default=(0.0, 1.0, 0.0))
+
+    def __check_init__(self):
+        check_fields(self)
+        _check_places(self.number, self.radius, self.radius, self.up)
+        require(
+            -0.5 * math.pi < self.elevation < 0.5 * math.pi,
+            f"the elevation is {self.elevation} rad; it must lie within (-pi/2, pi/2)",
+        )
+
+    @property
+    def count(self) -> int:
+        return self.number
+
+    def poses(self, key: PRNGKeyArray | None = None) -> Pose:
+        """With a key the table starts at a random angle."""
+        angle = 2.0 * np.pi * np.arange(self.number) / self.number
+        ring = np.cos(self.elevation)
+        places = np.stack([ring * np.cos(angle), np.full_like(angle, np.sin(self.elevation)), ring * np.sin(angle)], 1)
+        return _looking(self.radius * jnp.asarray(places, jnp.result_type(float)), self.up, key)
+
+
+class Reach(Candidates):
+    """Where an arm can hold a camera that looks at the centre: between two distances and two elevations about `up`.
+
+    - `number`: of places; directions as of a Fibonacci sphere, distances uniform in the volume between them.
+    - `nearest`, `farthest`: in scene units; `min_elevation`, `max_elevation`: in radians above the plane across `up`.
+
+    **Raises:** `ValueError` for no places, distances or elevations of which the second is not greater, or an `up`
+    without direction.
+    """
+
+    number: int = eqx.field(static=True, default=120)
+    nearest: float = eqx.field(static=True, default=2.0)
+    farthest: float = eqx.field(static=True, default=3.0)
+    min_elevation: float = eqx.field(static=True, default=0.0)
+    max_elevation: float = eqx.field(static=True, default=math.radians(80.0))
+    up: tuple[float, float, float] = eqx.field(static=True, default=(0.0, 1.0, 0.0))
+
+    def __check_init__(self):
+        check_fields(self)
+        _check_places(self.number, self.nearest, self.farthest, self.up)
+        require(
+            -0.5 * math.pi <= self.min_elevation < self.max_elevation <= 0.5 * math.pi,
+            f"the elevations are {self.min_elevation} and {self.max_elevation} rad; the second must be greater, and "
+            "both within [-pi/2, pi/2]",
+        )
+
+    @property
+    def count(self) -> int:
+        return self.number
+
+    def poses(self, key: PRNGKeyArray | None = None) -> Pose:
+        """With a key all places are turned about `up`."""
+        index = np.arange(self.number)
+        low, high = math.sin(self.min_elevation), math.sin(self.max_elevation)
+        y = high - (high - low) * (index + 0.5) / self.number
+        ring, angle = np.sqrt(1.0 - y**2), index * math.pi * (3.0 - math.sqrt(5.0))
+        # The plastic number's sequence, so that directions and distances are even together (Roberts 2018).
+        share = (0.5 + index / _PLASTIC**2) % 1.0
+        distance = np.cbrt(self.nearest**3 + share * (self.farthest**3 - self.nearest**3))
+        places = distance[:, None] * np.stack([ring * np.cos(angle), y, ring * np.sin(angle)], axis=1)
+        return _looking(jnp.asarray(places, jnp.result_type(float)), self.up, key)
 
 
 class GivenPoses(Candidates):
@@ -103,6 +179,27 @@ class GivenPoses(Candidates):
 
     def poses(self, key: PRNGKeyArray | None = None) -> Pose:
         return self.given
+
+
+def _check_places(number: int, nearest: float, farthest: float, up: tuple[float, float, float]) -> None:
+    require(number >= 1, f"the search has {number} candidates; it needs at least one")
+    sphere = f"the candidates have a radius of {nearest}; it must be positive"
+    shell = (
+        f"the candidates have distances of {nearest} to {farthest}; they must be positive, the second not the smaller"
+    )
+    require(0 < nearest <= farthest < math.inf, sphere if nearest == farthest else shell)
+    require(0 < math.hypot(*up) < math.inf, f"up is {up}; it must be a direction, such as (0, 1, 0)")
+
+
+def _looking(places: Float[Array, "n 3"], up: tuple[float, float, float], key: PRNGKeyArray | None) -> Pose:
+    """Poses at places about the y axis, turned about it at random by a key, and then so that it becomes `up`."""
+    if key is not None:
+        places = jnp.matmul(places, _about_y(key).T, precision="highest")
+    axis = jnp.asarray(up, places.dtype)
+    if up[0] or up[2] or up[1] < 0:
+        turn = rotation_between(jnp.asarray([0.0, 1.0, 0.0], places.dtype), axis / jnp.linalg.norm(axis))
+        places = jnp.matmul(places, turn.T, precision="highest")
+    return look_at(places, up=axis)
 
 
 def as_candidates(value: object) -> Candidates:

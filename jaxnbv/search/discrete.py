@@ -2,6 +2,7 @@
 
 from typing import ClassVar
 
+import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
 from jaxnbv.search.base import CandidateSearch, Problem, Proposal, best_unvisited
@@ -15,4 +16,5 @@ class DiscreteSearch(CandidateSearch):
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """The argmax of the acquisition over the candidates not visited yet; the key is not used."""
         candidates = self.candidates.poses()
-        return best_unvisited(problem, candidates, problem.acquisition(candidates))
+        scores = problem.scores(candidates)
+        return best_unvisited(problem, candidates, jnp.mean(scores, axis=0), scores=scores)

@@ -130,6 +130,10 @@ def cloud_laplacian(points: Float[np.ndarray, "n 3"]) -> Laplacian:
     **Raises:** `ValueError` for points that are not finite.
     """
     points = _finite(points)
+    if len(points) == 3:
+        # Of two neighbours the library makes what happens to lie in memory.
+        one = np.linalg.matrix_rank(points[1:] - points[0]) == 2
+        return mesh_laplacian(points, np.array([[0, 1, 2]])) if one else _nothing(3)
     neighbours = min(_NEIGHBOURS, len(points) - 1)
     return _assemble(lambda: robust_laplacian.point_cloud_laplacian(points, n_neighbors=neighbours), len(points))
 
@@ -150,17 +154,21 @@ def _finite(points: np.ndarray) -> np.ndarray:
     return points
 
 
+def _nothing(count: int) -> Laplacian:
+    """Of points that conduct no heat."""
+    return Laplacian(sparse.csc_matrix((count, count)), np.ones(count))
+
+
 def _assemble(build: Callable, count: int) -> Laplacian:
-    empty = sparse.csc_matrix((count, count)), np.ones(count)
     if count < 3:
-        return Laplacian(*empty)
+        return _nothing(count)
     try:
         weak, mass = build()
     except RuntimeError as error:
         # The library's way to say that there is not one triangle.
         if "unreferenced vertex" not in str(error):
             raise
-        return Laplacian(*empty)
+        return _nothing(count)
     # The library ties a point without triangles to zero degrees; rows that sum to zero leave it alone.
     flow = weak - sparse.diags(weak.diagonal())
     flow.eliminate_zeros()

@@ -52,6 +52,7 @@ class Choice(eqx.Module):
     - `rank`: 1 for the best.
     - `map`: the values that the map is drawn from: the candidates', where they are enough.
     - `ascents`: the trajectories of a gradient search, none of which is among the candidates here; else None.
+    - `level`: how many other candidates cannot be told from the best one by the samples; None where it is not known.
     """
 
     directions: Float[np.ndarray, "c 3"]
@@ -61,6 +62,7 @@ class Choice(eqx.Module):
     rank: int
     map: SphereMap
     ascents: Ascents | None
+    level: int | None = None
 
     @property
     def visited(self) -> Bool[np.ndarray, " c"]:
@@ -142,7 +144,17 @@ def report_data(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, p
             others = tuple(choice.open_values.tolist())
             starts = 0 if choice.ascents is None else len(choice.ascents.values)
             words = describe_choice(
-                values, choice.value, choice.rank, others, starts, view.pose, earlier, len(new), count, change
+                values,
+                choice.value,
+                choice.rank,
+                others,
+                starts,
+                view.pose,
+                earlier,
+                len(new),
+                count,
+                change,
+                choice.level,
             )
         answer = planner.acquisition.answer(view.cloud)
         if answer is not None:
@@ -180,6 +192,7 @@ def choice_of(proposal: Proposal, wider: SphereMap | None = None) -> Choice:
         rank=1 + int(np.sum(values > value)),
         map=wider or SphereMap(directions, values),
         ascents=None if proposal.trajectories is None else ascents_of(proposal.trajectories),
+        level=proposal.others_level,
     )
 
 

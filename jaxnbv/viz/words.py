@@ -23,14 +23,15 @@ def describe_choice(
     points: int,
     count: int,
     change: tuple[float, float] | None,
+    level: int | None = None,
 ) -> str:
     """Where a view looks from, why it was chosen and what it added, to follow "View 2".
 
     `others`: values of the open candidates, best first; `starts`: of a gradient search's ascents, else 0; `change`:
-    coverage before and after, where it is known.
+    coverage before and after, where it is known; `level`: how many others the samples cannot tell from the best.
     """
     turned = f"{nearest_angle(pose, earlier):.0f}° from the nearest earlier view"
-    parts = [f"looks from {place(pose)}{_aim(pose)}, {turned}.", _reason(values, value, rank, others, starts)]
+    parts = [f"looks from {place(pose)}{_aim(pose)}, {turned}.", _reason(values, value, rank, others, starts, level)]
     added = f"It added {points:,} points" if points else "It saw nothing"
     kept = f" ({count:,} are kept)" if points else ""
     grown = ""
@@ -40,7 +41,9 @@ def describe_choice(
     return " ".join([*parts, f"{added}{kept}{grown}."])
 
 
-def _reason(values: Quantity, value: float, rank: int, others: tuple[float, ...], starts: int) -> str:
+def _reason(
+    values: Quantity, value: float, rank: int, others: tuple[float, ...], starts: int, level: int | None
+) -> str:
     if not values.smooth:
         return f"It was drawn at random from {len(others)} open candidates."
     ascent = f"gradient ascent from {starts} start{'s' if starts > 1 else ''}"
@@ -62,7 +65,15 @@ def _reason(values: Quantity, value: float, rank: int, others: tuple[float, ...]
         compared = f"{number(value / median)} times the median ({number(median)})"
     if not best or len(others) < 2:
         return f"{text}: {compared}.{after}"
-    return f"{text}: {compared}, {_margin(value, others[1], 'the runner-up')} ({number(others[1])}).{after}"
+    told = "" if level is None else f" {told_apart(level)}"
+    return f"{text}: {compared}, {_margin(value, others[1], 'the runner-up')} ({number(others[1])}).{told}{after}"
+
+
+def told_apart(level: int) -> str:
+    """Whether the samples tell the best candidate from the others, of which so many are level with it."""
+    if not level:
+        return "It stands out: no other is within two standard errors of it."
+    return f"By the samples it cannot be told from {level} other{'s' if level > 1 else ''}, within two standard errors."
 
 
 def _margin(value: float, other: float, name: str) -> str:

@@ -85,7 +85,7 @@ def test_numbers_and_poses_stand_for_candidates():
     ("arguments", "message"),
     [
         ((0,), "0 candidates"),
-        ((10, 0.0), "radius 0.0"),
+        ((10, 0.0), "radius of 0.0"),
         ((10, math.inf), "radius is inf; it must be a finite number"),
         ((10, 2.5, 2.0), "elevation is 2.0 rad"),
         ((10, 2.5, 0.0, (0.0, 0.0, 0.0)), "must be a direction"),

@@ -115,3 +115,41 @@ def test_values_that_rounding_may_turn_round_tie_and_the_first_is_taken(problem,
     found = best_unvisited(problem, poses, jnp.asarray(values))
     np.testing.assert_array_equal(found.pose.position, poses.position[expected])
     assert float(found.value) == np.float32(values[expected])
+
+
+def test_standard_errors_are_those_of_the_scores_sample_by_sample(problem):
+    proposal = search(problem)
+    value, poses = eqx.filter_jit(expected_score), look_at(fibonacci_sphere(12, 2.5))
+    scores = np.array(
+        [
+            value(
+                Coverage(),
+                problem.cloud,
+                jax.tree.map(lambda leaf, s=s: leaf[s : s + 1], problem.surfaces),
+                CAMERA,
+                poses,
+            )
+            for s in range(3)
+        ],
+        np.float64,
+    )
+    best = scores.mean(axis=0).argmax()
+    expected = scores.std(axis=0, ddof=1) / np.sqrt(3)
+    np.testing.assert_allclose(proposal.standard_errors, expected, rtol=1e-4)
+    differences = scores - scores[:, [best]]
+    of_differences = differences.std(axis=0, ddof=1) / np.sqrt(3)
+    np.testing.assert_allclose(proposal.difference_errors, of_differences, rtol=1e-3, atol=1e-5)
+    for errors in (0.5, 2.0, 5.0):
+        level = -differences.mean(axis=0) <= errors * of_differences
+        np.testing.assert_array_equal(proposal.is_level(errors), level)
+    assert proposal.others_level == np.sum(-differences.mean(axis=0) <= 2.0 * of_differences) - 1
+    assert 0 < proposal.others_level < 11
+
+
+def test_a_visited_view_is_level_with_none_and_of_one_sample_nothing_is_known(problem):
+    first = search(problem)
+    again = search(visit(problem, first.pose))
+    assert not again.is_level()[np.argmax(first.values)]
+    alone = eqx.tree_at(lambda p: p.surfaces, problem, jax.tree.map(lambda leaf: leaf[:1], problem.surfaces))
+    assert search(alone).others_level is None
+    np.testing.assert_array_equal(np.isnan(search(alone).standard_errors), True)

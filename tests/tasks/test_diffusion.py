@@ -271,3 +271,19 @@ def test_bad_input_is_told():
     }.items():
         with pytest.raises(InputError, match=message):
             HeatProblem(**{"source": np.zeros(3), **wrong})
+
+
+def test_three_points_are_a_triangle():
+    """By the cotangent formula; a line of three conducts nothing."""
+    points = np.array([[0.0, 0.0, 0.3], [2.0, 0.0, 0.3], [0.5, 1.0, 0.3]])
+    found = cloud_laplacian(points)
+    a, b, c = points
+    expected = np.zeros((3, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        u, v = points[i] - points[k], points[j] - points[k]
+        expected[i, j] = expected[j, i] = 0.5 * (u @ v) / np.linalg.norm(np.cross(u, v))
+    expected -= np.diag(expected.sum(axis=1))
+    np.testing.assert_allclose(found.weak.toarray(), -expected, atol=1e-9)
+    np.testing.assert_allclose(found.mass, np.linalg.norm(np.cross(b - a, c - a)) / 6.0)
+    line = cloud_laplacian(np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0], [2.0, 4.0, 6.0]]))
+    assert line.weak.nnz == 0

@@ -168,6 +168,8 @@ def test_the_sentence_tells_the_numbers_of_the_step(episode, data):
     before, after = (100 * data.views[i].coverage for i in (0, 1))
     assert f"coverage went from {before:.0f} % to {after:.0f} %" in shown.sentence
     assert shown.choice.rank == 1
+    assert shown.choice.level == view.proposal.others_level
+    assert "two standard errors" in shown.sentence
 
 
 def test_a_scene_without_truth_counts_points(tmp_path):

@@ -197,6 +197,21 @@ def test_words_say_what_the_ascent_gained(value, others, starts, words):
     )
 
 
+@pytest.mark.parametrize(
+    ("level", "words"),
+    [
+        (None, "above the runner-up (2). It added"),
+        (0, "above the runner-up (2). It stands out: no other is within two standard errors of it. It added"),
+        (1, "cannot be told from 1 other, within two standard errors. It added"),
+        (3, "cannot be told from 3 others, within two standard errors. It added"),
+    ],
+)
+def test_words_say_whether_the_samples_tell_it_from_the_others(level, words):
+    pose = look_at((0.0, 0.0, 2.5))
+    said = describe_choice(COVERAGE, 3.0, 1, (3.0, 2.0, 1.0), 0, pose, [look_at((2.5, 0.0, 0.0))], 5, 10, None, level)
+    assert words in said
+
+
 def test_words_say_where_a_camera_looks_past_the_centre():
     pose = look_at((0.0, 0.0, 2.0), target=(2.0 * np.tan(np.radians(7.0)), 0.0, 0.0))
     said = describe_choice(COVERAGE, 2.0, 1, (1.0,), 1, pose, [look_at((2.5, 0.0, 0.0))], 5, 10, None)

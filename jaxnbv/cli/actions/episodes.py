@@ -110,6 +110,8 @@ def _summarise(episode: Episode) -> None:
             if (ways := view.proposal.trajectories) is None:
                 line += f"the highest of {len(values)} candidates"
                 line += f" (median {np.median(values):.4g})" if sought.smooth else ""
+                level = view.proposal.others_level
+                line += "" if level is None else f", {level} of them within two standard errors"
             else:
                 best = values.max(initial=-np.inf)
                 better = "found nothing better" if float(view.proposal.value) <= best else f"improved on {best:.4g}"
