@@ -34,8 +34,8 @@ class Known(Problem):
         *problem, self.place, self.gaze = problem_place_and_gaze
         super().__init__(*problem)
 
-    def acquisition(self, poses):
-        return 5.0 - jnp.sum((poses.position - self.place) ** 2 + (poses.forward - self.gaze) ** 2, axis=-1)
+    def scores(self, poses, samples=slice(None)):
+        return 5.0 - jnp.sum((poses.position - self.place) ** 2 + (poses.forward - self.gaze) ** 2, axis=-1)[None]
 
 
 def known(kind=Known, pose=None, place=(0.9, -1.1, 1.4), gaze=(-0.6, 0.0, -0.8)):
@@ -69,8 +69,8 @@ def test_a_pose_in_space_is_found(kind, solver):
 class Constant(Known):
     """Every pose is as good."""
 
-    def acquisition(self, poses):
-        return jnp.full(poses.position.shape[0], 7.0)
+    def scores(self, poses, samples=slice(None)):
+        return jnp.full((1, poses.position.shape[0]), 7.0)
 
 
 @pytest.mark.parametrize("kind", [GradientSearch, HybridSearch])

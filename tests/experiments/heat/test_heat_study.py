@@ -137,9 +137,10 @@ def test_halving_is_asked_at_each_step_of_the_full_search(record):
 class Counting(Problem):
     """Counts the imagined scans that a search asks for."""
 
-    def acquisition(self, poses, samples=slice(None)):
-        counted.append(poses.position.shape[0] * len(range(*samples.indices(self.num_samples))))
-        return jnp.zeros(poses.position.shape[0])
+    def scores(self, poses, samples=slice(None)):
+        count = len(range(*samples.indices(self.num_samples)))
+        counted.append(poses.position.shape[0] * count)
+        return jnp.zeros((count, poses.position.shape[0]))
 
 
 counted: list[int] = []
