@@ -19,6 +19,7 @@ AnyArray = Array | np.ndarray
 _F = TypeVar("_F", bound=Callable[..., Any])
 _LONGEST_SHOWN = 60
 _NUMBERS = {tuple[float, float]: "two", tuple[float, float, float]: "three"}
+_REAL = (jnp.bool_, jnp.integer, jnp.floating)
 # Of 32 bits. What is larger is infinite there.
 _LARGEST = float(np.finfo(np.float32).max)
 
@@ -115,7 +116,9 @@ def as_floats(value: Any, name: str) -> Array:
 
     **Raises:** `ValueError` for what is not an array of numbers.
     """
-    return jnp.asarray(value if is_traced(value) else as_numbers(value, name), dtype=jnp.result_type(float))
+    # An array of real numbers that lies on a device stays there.
+    known = isinstance(value, Array) and any(jnp.issubdtype(value.dtype, kind) for kind in _REAL)
+    return jnp.asarray(value if known or is_traced(value) else as_numbers(value, name), dtype=jnp.result_type(float))
 
 
 def as_numbers(value: Any, name: str, dtype: Any = float) -> np.ndarray:
