@@ -62,7 +62,15 @@ from .search import SpherePoses as SpherePoses
 from .search import Trajectories as Trajectories
 from .search import Turntable as Turntable
 from .search import UncertaintyView as UncertaintyView
+from .session import NextView as NextView
+from .session import Session as Session
 from .state import State as State
+from .stopping import Budget as Budget
+from .stopping import Covered as Covered
+from .stopping import Found as Found
+from .stopping import Stop as Stop
+from .stopping import Sure as Sure
+from .stopping import WorthLess as WorthLess
 from .surfaces import Fields as Fields
 from .surfaces import GeometricSPSR as GeometricSPSR
 from .surfaces import OnSurface as OnSurface

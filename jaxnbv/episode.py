@@ -21,6 +21,7 @@ from jaxnbv.pose import Pose
 from jaxnbv.scanning import GridSurface, SensorNoise, Surface, scan
 from jaxnbv.search import Proposal
 from jaxnbv.state import State
+from jaxnbv.stopping import Stop, Watch
 from jaxnbv.storage import EpisodeFolder, describe
 
 
@@ -40,14 +41,21 @@ class View(eqx.Module):
 
 
 class Episode(eqx.Module):
-    """Views that a planner chose of a scene, and what they depend on."""
+    """Views that a planner chose of a scene, and what they depend on.
+
+    - `scene`, `noise`: None where a real sensor took the views.
+    - `camera`: which did, in scene units; None for the planner's.
+    - `stopped`: why there are not as many views as were asked for; None where there are.
+    """
 
     planner: Planner
-    scene: Surface
-    noise: SensorNoise
+    scene: Surface | None
+    noise: SensorNoise | None
     first: Pose
     key: PRNGKeyArray
     views: tuple[View, ...]
+    camera: Camera | None = None
+    stopped: str | None = None
 
     @property
     def cloud(self) -> PointCloud:
@@ -56,7 +64,7 @@ class Episode(eqx.Module):
 
     def states(self) -> Iterator[State]:
         """The planner's state after each view, made again from the scans."""
-        return self.planner.replay((view.pose, view.scan) for view in self.views)
+        return self.planner.replay(((view.pose, view.scan) for view in self.views), self.camera)
 
     def state_after(self, views: int) -> State:
         """The planner's state after so many of the views.
@@ -86,7 +94,7 @@ class Episode(eqx.Module):
             folder.write_cloud(self.cloud)
 
 
-def _config(planner: Planner, scene: Surface, noise: SensorNoise, first: Pose, key: PRNGKeyArray) -> dict:
+def _config(planner: Planner, scene: Surface | None, noise: SensorNoise | None, first: Pose, key: PRNGKeyArray) -> dict:
     return describe({"planner": planner, "scene": scene, "noise": noise, "first": first, "key": key})
 
 
@@ -100,12 +108,15 @@ def simulate(
     noise: SensorNoise = SensorNoise(),
     folder: str | Path | None = None,
     progress: bool = True,
+    until: Stop | None = None,
 ) -> Episode:
-    """Scan a known surface from `first`, then from the views that the planner asks for, `views` in all.
+    """Scan a known surface from `first`, then from the views that the planner asks for, `views` in all, or as many as
+    it takes `until` a rule of `jaxnbv.stopping` ends it; `Sure(0.95) | Budget(seconds=60)`, say.
 
     View i depends on the key and i alone, not on how many follow. With `folder`, every finished view is written there;
     a run that was interrupted goes on after the last of them and, on a CPU with the same versions, ends with the same
-    bits as one that was not. (A GPU may add in another order from run to run.)
+    bits as one that was not. (A GPU may add in another order from run to run.) The rule is asked after the last view
+    that is there, so a folder can be continued with another one.
 
     **Raises:** `ValueError` if `views` < 1 or more than the planner has room for, if the first view sees nothing, or
     if the folder belongs to another configuration or holds more views already.
@@ -136,15 +147,17 @@ def simulate(
                 bar.update(index * len(STAGES) + STAGES.index(stage) - bar.n)
 
             sensor = scene_sensor(scene, planner.camera, noise)
-            episode = steps(planner, sensor, first, key, done=done, begin=begin)
+            watch = None if until is None else Watch(until, planner)
+            episode = steps(planner, sensor, first, key, done=done, begin=begin, watch=watch)
             for index, (view, *_) in enumerate(itertools.islice(episode, views)):
                 finished.append(view)
                 if store and index >= len(done):
                     store.write_view(index, view.pose, view.scan, view.proposal)
+            stopped = watch.reason if watch and len(finished) < views else None
             bar.update(bar.total - bar.n)
         if store:
             store.write_cloud(finished[-1].cloud)
-    return Episode(planner, scene, noise, first, key, tuple(finished))
+    return Episode(planner, scene, noise, first, key, tuple(finished), stopped=stopped)
 
 
 # What a sensor sees from a pose; the key is of its noise, for which a real sensor has no use.
@@ -173,6 +186,7 @@ def steps(
     camera: Camera | None = None,
     done: Iterable[tuple[Pose, PointCloud, Proposal | None]] = (),
     begin: Callable[[int, str], None] = lambda index, stage: None,
+    watch: Watch | None = None,
 ) -> Iterator[Step]:
     """Views from `first` on, each where the planner asks for it, for as long as more are wanted and it has room.
 
@@ -182,11 +196,13 @@ def steps(
     - `camera`: of the sensor, by default the planner's; one of more rays than are imagined saves time.
     - `done`: views that are known already, in their order; they are told, not asked for.
     - `begin`: is told the index of a view and which of `STAGES` of it begins.
+    - `watch`: ends them, by its rule.
 
     **Raises:** `ValueError` as `Planner.init`, `propose` and `observe` do; among others when every candidate has been
     visited.
     """
     known, state = iter(done), None
+    poses: list[Pose] = []
     for index in range(planner.max_views):
         sample_key, search_key, noise_key = view_keys(key, index)
         surfaces, seconds = None, 0.0
@@ -195,6 +211,8 @@ def steps(
         else:
             pose, proposal = first, None
             if state is not None:
+                if watch and watch.after(state, poses, sample_key):
+                    return
                 if planner.search.uses_samples:
                     begin(index, STAGES[0])
                     surfaces = jax.block_until_ready(planner.sample_surfaces(state, sample_key))
@@ -202,9 +220,12 @@ def steps(
                 start = time.perf_counter()
                 proposal = jax.block_until_ready(planner.choose(state, surfaces, search_key))
                 pose, seconds = proposal.pose, time.perf_counter() - start
+                if watch and watch.before(state, poses, sample_key, proposal):
+                    return
             begin(index, STAGES[2])
             seen = sensor(pose, noise_key)
         state = planner.init(seen, pose, camera) if state is None else planner.observe(state, pose, seen, camera)
+        poses.append(pose)
         yield Step(View(pose, seen, state.cloud, proposal), state, surfaces, seconds)
 
 

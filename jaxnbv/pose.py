@@ -53,7 +53,7 @@ class Pose(eqx.Module):
 
         **Raises:** `ValueError` for another convention, a last row other than (0, 0, 0, 1), or as `Pose` does.
         """
-        require(convention in _CONVENTIONS, f"the convention is {convention!r}; give one of {', '.join(_CONVENTIONS)}")
+        axes = _axes(convention)
         found = as_floats(matrix, "the matrix of a pose")
         require(found.shape[-2:] == (4, 4), f"the matrix of a pose has shape {found.shape}; give (..., 4, 4)")
         if not is_traced(found):
@@ -63,14 +63,21 @@ class Pose(eqx.Module):
                 f"the last row of a pose's matrix is {last}, not (0, 0, 0, 1): give camera-to-world, not its transpose "
                 "or a projection",
             )
-        axes = jnp.asarray(_CONVENTIONS[convention], found.dtype)
-        return cls(found[..., :3, :3] * axes, found[..., :3, 3])
+        return cls(found[..., :3, :3] * axes.astype(found.dtype), found[..., :3, 3])
 
     @property
     def matrix(self) -> Float[Array, "*batch 4 4"]:
         """The camera-to-scene matrix [[R, t], [0, 1]] in OpenCV's convention."""
+        return self.to_matrix()
+
+    def to_matrix(self, convention: str = "opencv") -> Float[Array, "*batch 4 4"]:
+        """The camera-to-scene matrix that `from_matrix` takes.
+
+        **Raises:** `ValueError` for another convention.
+        """
+        rotation = self.rotation * _axes(convention).astype(self.rotation.dtype)
         last = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0], self.position.dtype), (*self.position.shape[:-1], 1, 4))
-        return jnp.concatenate([jnp.concatenate([self.rotation, self.position[..., None]], axis=-1), last], axis=-2)
+        return jnp.concatenate([jnp.concatenate([rotation, self.position[..., None]], axis=-1), last], axis=-2)
 
     @property
     def forward(self) -> Float[Array, "*batch 3"]:
@@ -93,6 +100,11 @@ class Pose(eqx.Module):
         """The poses along the first axis of a batch."""
         check_batch(self.position.shape[:-1], "the pose")
         return (self[index] for index in range(self.position.shape[0]))
+
+
+def _axes(convention: str) -> np.ndarray:
+    require(convention in _CONVENTIONS, f"the convention is {convention!r}; give one of {', '.join(_CONVENTIONS)}")
+    return np.array(_CONVENTIONS[convention])
 
 
 def _check_rigid(rotation: np.ndarray, position: np.ndarray) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxnbv.acquisition import Score, sample_scores
@@ -136,6 +137,15 @@ class Proposal(eqx.Module):
             return None
         best = jnp.max(self.values)
         return (self.values == best) | (best - self.values <= errors * self.difference_errors)
+
+    @property
+    def standard_error(self) -> float | None:
+        """Of the chosen pose's value; None where it is not known, or the pose is none of the candidates."""
+        if self.standard_errors is None:
+            return None
+        same = jax.tree.map(lambda rows, row: rows == row, self.candidates, self.pose)
+        chosen = np.asarray(jnp.all(same.position, axis=1) & jnp.all(same.rotation, axis=(1, 2)))
+        return float(self.standard_errors[chosen.argmax()]) if chosen.any() else None
 
     @property
     def others_level(self) -> int | None:

@@ -126,7 +126,8 @@ def report_data(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, p
     `truth`: points of the true surface (scene coordinates); by default sampled from the scene, where it can be.
     """
     planner = episode.planner
-    truth = truth_points(episode.scene, jax.random.key(0)) if truth is None else truth
+    if truth is None and episode.scene is not None:
+        truth = truth_points(episode.scene, jax.random.key(0))
     values = planner.search.quantity(planner.acquisition)
     drawn: list[ViewData] = []
     states = episode.states()

@@ -95,7 +95,7 @@ def _header(episode: Episode, title: str) -> str:
         "Carved by": _call(describe(planner.carving), depth=1) if planner.carving else "nothing, as in the paper",
         "Posterior samples": f"{planner.num_samples} on a {planner.grid.resolution}³ grid",
         "Camera": f"{math.degrees(planner.camera.fov):.0f}°, {planner.camera.width} × {planner.camera.height} pixels",
-        "Sensor noise": _call(describe(episode.noise)),
+        "Sensor noise": "that of a real sensor" if episode.noise is None else _call(describe(episode.noise)),
         "Capacity": f"{planner.capacity:,} points",
         "Seed": ", ".join(str(word) for word in describe(episode.key)["data"]),
         "Versions": ", ".join(f"{name} {version}" for name, version in versions().items()),

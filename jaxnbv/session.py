@@ -1,0 +1,304 @@
+"""A live session: depth images of a real sensor in, where to take the next one out, in the user's own world."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray, Real
+
+from jaxnbv.camera import Camera
+from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, checked, require, shown
+from jaxnbv.cloud import PointCloud
+from jaxnbv.episode import Episode, View, view_keys
+from jaxnbv.frame import Frame
+from jaxnbv.planner import Planner
+from jaxnbv.pose import Pose
+from jaxnbv.scanning import GridSurface, scan_samples
+from jaxnbv.search import GivenPoses, Proposal
+from jaxnbv.search.base import CandidateSearch
+from jaxnbv.state import State
+from jaxnbv.stopping import Stop, Watch
+from jaxnbv.storage import DepthImage, SessionFolder, describe
+from jaxnbv.viz import write_report
+from jaxnbv.volume import Box
+
+# A cloud holds some thousands of points; more rays than these only take time.
+_MOST_RAYS = 20_000
+_NO_IMAGE = "the session has no image yet: add one first, session.add(depth, matrix)"
+
+
+class NextView(eqx.Module):
+    """Where to take the next image.
+
+    - `matrix`: camera to world, in the convention of the session.
+    - `value`: what the search maximises, as `Planner.propose` gives it; `standard_error`: of the value, as a mean over
+      the posterior samples; None where it is not known.
+    - `expected_depth`: what the sensor is expected to see there, in world units and at the planner's resolution: the
+      mean depth over the posterior samples, NaN where most of them are missed; None without samples.
+    - `proposal`: all that the search looked at, in scene coordinates.
+    """
+
+    matrix: Float[np.ndarray, "4 4"]
+    value: float
+    standard_error: float | None
+    expected_depth: Float[np.ndarray, "h w"] | None
+    proposal: Proposal
+
+
+class Session:
+    """A planner at a real sensor. Matrices are 4 x 4, camera to world, in world units; so is the box.
+
+    - `planner`: in scene coordinates, as for a simulation. The scene is the box, scaled; the planner's camera is
+      replaced by the sensor's with the planner's number of pixels, and what it holds for the default volume, `Box()`,
+      by the box.
+    - `camera`: the sensor, its range in world units.
+    - `box`: two corners of a box about the object, without the table.
+    - `up`: the world's axis that is upward, "y" or "z" say.
+    - `poses`: (n, 4, 4), where the sensor can be held; by default the candidates of the planner's search, in scene
+      units about the box's centre.
+    - `folder`: where images and proposals are kept before they are acted on; a session that was killed goes on from it.
+    - `convention`: of the matrices' axes, see `Pose.from_matrix`.
+    - `stride`: of the images, every so many-th row and column alone is used; by default such that 20,000 rays are left
+      or fewer. Whole images are kept.
+    - `key`: of the posterior samples.
+    - `until`: when it is done, such as `Sure(0.95) | Budget(seconds=600)`; see `jaxnbv.stopping`.
+
+    **Raises:** `ValueError` for a box without inside, poses that the search has no use for, or a folder of another
+    session.
+    """
+
+    @checked
+    def __init__(
+        self,
+        planner: Planner,
+        camera: Camera,
+        box: tuple | list | Box | AnyArray,
+        up: str = "y",
+        poses: Float[AnyArray, "n 4 4"] | None = None,
+        folder: str | Path | None = None,
+        convention: str = "opencv",
+        stride: int | None = None,
+        key: PRNGKeyArray | None = None,
+        until: Stop | None = None,
+    ):
+        self.camera, self.convention = camera, convention
+        self.box = box if isinstance(box, Box) else Box(*_corners(box))
+        self.frame = Frame.fit(np.array([self.box.low, self.box.high]), up=up)
+        self.stride = math.ceil(math.sqrt(camera.num_rays / _MOST_RAYS)) if stride is None else stride
+        self.key = jax.random.key(0) if key is None else key
+        check_key(self.key)
+        allowed = None if poses is None else self.frame.to_scene(Pose.from_matrix(poses, convention))
+        self.planner = planner_for(planner, self.frame.to_scene(camera), self.frame.to_scene(self.box), allowed)
+        self._rays = camera.strided(self.stride)
+        self._watch = None if until is None else Watch(until, self.planner)
+        self._images: list[tuple[Pose, PointCloud, PointCloud]] = []
+        self._proposals: dict[int, Proposal] = {}
+        self._next: NextView | None = None
+        self._state: State | None = None
+        self._folder = None if folder is None else SessionFolder(folder, self._config())
+        if self._folder is not None:
+            for index in range(self._folder.count_images()):
+                if (known := self._folder.read_proposal(index)) is not None:
+                    self._proposals[index] = known[0]
+                self._take(*self._seen(self._folder.read_image(index)))
+
+    @property
+    def views(self) -> int:
+        """How many images there are so far."""
+        return len(self._images)
+
+    @property
+    def state(self) -> State:
+        """What the planner knows, in scene coordinates.
+
+        **Raises:** `ValueError` before the first image.
+        """
+        if self._state is None:
+            raise InputError(_NO_IMAGE)
+        return self._state
+
+    @property
+    def cloud(self) -> PointCloud:
+        """The points that are kept, in world units.
+
+        **Raises:** `ValueError` before the first image.
+        """
+        return self.frame.to_world(self.state.cloud)
+
+    @property
+    def episode(self) -> Episode:
+        """The session so far, in scene coordinates, as of a simulation.
+
+        **Raises:** `ValueError` before the first image.
+        """
+        views = tuple(
+            View(pose, scan, cloud, self._proposals.get(index))
+            for index, (pose, scan, cloud) in enumerate(self._images)
+        )
+        if not views:
+            raise InputError(_NO_IMAGE)
+        camera = self.frame.to_scene(self._rays)
+        return Episode(self.planner, None, None, views[0].pose, self.key, views, camera)
+
+    @property
+    def done(self) -> str | None:
+        """Why no more images are needed, by the rule that was given; None while they are.
+
+        **Raises:** `ValueError` as `next` does, if the rule is about what the next view is worth.
+        """
+        if self._watch is None or not self._images:
+            return None
+        key, *_ = view_keys(self.key, self.views)
+        poses = [pose for pose, *_ in self._images]
+        enough = self._watch.after(self.state, poses, key)
+        return enough or self._watch.before(self.state, poses, key, self.next().proposal)
+
+    @checked
+    def add(
+        self, depth: Real[AnyArray, "height width"], matrix: Float[AnyArray, "4 4"] | list, depth_scale: float = 1.0
+    ) -> None:
+        """Take in an image, which is stored first.
+
+        - `depth`: see `PointCloud.from_depth`; `depth_scale` times it is in world units: 0.001 for millimetres where
+          the world is in metres.
+        - `matrix`: where the camera truly was, which need not be what was proposed.
+
+        **Raises:** `ValueError` as `PointCloud.from_depth`, `Pose.from_matrix`, `Planner.init` and `observe` do, or if
+        another process has added images to the folder. Nothing is changed then.
+        """
+        pixels = as_numbers(depth, "the depth image", None)
+        image = DepthImage(pixels, as_numbers(matrix, "the matrix of a pose", np.float64), depth_scale)
+        pose, scan = self._seen(image)
+        state = self._after(pose, scan)
+        if self._folder is not None:
+            with self._folder.writing():
+                self._check_alone(self._folder)
+                self._folder.write_image(self.views, image)
+        self._take(pose, scan, state)
+
+    def next(self) -> NextView:
+        """Where to take the next image. It is stored, and the same until an image is added; what was proposed once is
+        not proposed again, for where the sensor could not be held it need not be tried twice.
+
+        **Raises:** `ValueError` before the first image, or as `Planner.propose` does.
+        """
+        if self._next is None:
+            index = self.views
+            known = None if self._folder is None else self._folder.read_proposal(index)
+            proposal, expected = self._propose() if known is None else known
+            if self._folder is not None and known is None:
+                with self._folder.writing():
+                    self._check_alone(self._folder)
+                    self._folder.write_proposal(index, proposal, expected)
+            self._proposals[index] = proposal
+            matrix = np.asarray(self.frame.to_world(proposal.pose).to_matrix(self.convention), np.float64)
+            self._next = NextView(matrix, float(proposal.value), proposal.standard_error, expected, proposal)
+        return self._next
+
+    def report(self, folder: str | Path | None = None, title: str = "object", progress: bool = True) -> Path:
+        """Write `report.html` and its figures, by default into the session's folder, and return the page's path.
+
+        **Raises:** `ValueError` before the first image, or without a folder.
+        """
+        place = folder or (None if self._folder is None else self._folder.path)
+        if place is None:
+            raise InputError("the session keeps no folder: tell the report one, session.report(folder)")
+        return write_report(self.episode, place, title=title, progress=progress)
+
+    def _config(self) -> dict:
+        sensor = {"camera": self.camera, "box": self.box, "up": self.frame.up, "convention": self.convention}
+        return describe({"planner": self.planner, **sensor, "stride": self.stride, "key": self.key})
+
+    def _seen(self, image: DepthImage) -> tuple[Pose, PointCloud]:
+        """Pose and scan of an image, in scene coordinates."""
+        pose = Pose.from_matrix(image.matrix, self.convention)
+        cloud = PointCloud.from_depth(image.depth, self.camera, pose, image.depth_scale, self.stride, self.box)
+        return self.frame.to_scene(pose), self.frame.to_scene(cloud)
+
+    def _after(self, pose: Pose, scan: PointCloud) -> State:
+        camera = self.frame.to_scene(self._rays)
+        if self._state is None:
+            return self.planner.init(scan, pose, camera)
+        return self.planner.observe(self._state, pose, scan, camera)
+
+    def _take(self, pose: Pose, scan: PointCloud, state: State | None = None) -> None:
+        self._state = self._after(pose, scan) if state is None else state
+        self._images.append((pose, scan, self._state.cloud))
+        self._next = None
+
+    def _propose(self) -> tuple[Proposal, Float[np.ndarray, "h w"] | None]:
+        sample_key, search_key, _ = view_keys(self.key, self.views)
+        surfaces = self.planner.sample_surfaces(self.state, sample_key) if self.planner.search.uses_samples else None
+        proposed = [proposal.pose for index, proposal in sorted(self._proposals.items()) if index < self.views]
+        proposal = self.planner.choose(_with_visited(self.state, proposed), surfaces, search_key)
+        if surfaces is None:
+            return proposal, None
+        depth = np.asarray(_expected_depth(surfaces, self.planner.camera, proposal.pose))
+        return proposal, depth / self.frame.scale
+
+    def _check_alone(self, folder: SessionFolder) -> None:
+        found = folder.count_images()
+        require(
+            found == self.views,
+            f"{folder.path} holds {found} images, but this session knows {self.views}: another process has added some; "
+            "make the session again, which reads them",
+        )
+
+
+def planner_for(planner: Planner, camera: Camera, box: Box, poses: Pose | None) -> Planner:
+    """A planner at a sensor, all in scene coordinates: see `Session`.
+
+    - `poses`: where the search may look from, or None for its own candidates.
+
+    **Raises:** `ValueError` if the search does not choose among poses.
+    """
+    usual = Box()
+
+    def placed(leaf):
+        default = isinstance(leaf, Box) and (leaf.low, leaf.high) == (usual.low, usual.high)
+        return box if default else leaf
+
+    planner = jax.tree.map(placed, planner, is_leaf=lambda leaf: isinstance(leaf, Box))
+    imagined = camera.resized(planner.camera.height, planner.camera.width)
+    if poses is None:
+        return dataclasses.replace(planner, camera=imagined)
+    if not isinstance(planner.search, CandidateSearch):
+        raise InputError(
+            f"the session was given poses, but {type(planner.search).__name__} is no search over candidates: use "
+            "DiscreteSearch() or HalvingSearch()"
+        )
+    search = dataclasses.replace(planner.search, candidates=GivenPoses(poses))
+    return dataclasses.replace(planner, camera=imagined, search=search)
+
+
+def _with_visited(state: State, poses: list[Pose]) -> State:
+    """The state in which these are taken for visited too, of fixed shapes: with room for one more before each view."""
+    room, seen = state.poses.position.shape[0], int(state.num_views)
+
+    def rows(leaf: Array, *own: Array) -> Array:
+        spare = jnp.broadcast_to(leaf[-1:], (room - len(own), *leaf.shape[1:]))
+        return jnp.concatenate([leaf[:seen], *(row[None] for row in own), leaf[seen:], spare])
+
+    visited = jax.tree.map(rows, state.poses, *poses)
+    return dataclasses.replace(state, poses=visited, num_views=state.num_views + len(poses))
+
+
+@eqx.filter_jit
+def _expected_depth(surfaces: GridSurface, camera: Camera, pose: Pose) -> Float[Array, "h w"]:
+    """Mean depth along the camera's axis (scene units) over the samples that a ray hits; NaN where it misses most."""
+    scans = scan_samples(surfaces, camera, pose[None])
+    depth = jnp.einsum("spnd,d->sn", scans.points - pose.position, pose.forward, precision="highest")
+    hit = scans.mask[:, 0]
+    count = jnp.sum(hit, axis=0)
+    mean = jnp.sum(jnp.where(hit, depth, 0.0), axis=0) / jnp.maximum(count, 1)
+    mean = jnp.where(2 * count >= hit.shape[0], mean, jnp.nan)
+    return mean.reshape(camera.height, camera.width)
+
+
+def _corners(box) -> tuple:
+    require(np.shape(box) == (2, 3), f"the box is {shown(box)}; give two corners, (low, high), or a Box")
+    return tuple(as_numbers(corner, "a corner of the box", np.float64).tolist() for corner in box)

@@ -1,0 +1,82 @@
+"""A simulated episode on disk, written view by view.
+
+episode.json    the configuration (planner, scene, noise, first pose, seed) and the versions that made it
+view_00.npz     pose and scan of the first view; view_01.npz and on also hold the candidates and their values, and
+                the trajectories of a gradient search
+cloud.ply       the points that were kept, once the episode is complete
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from plyfile import PlyData, PlyElement
+
+from jaxnbv.cloud import PointCloud
+from jaxnbv.files import write_whole
+from jaxnbv.folders import ResultFolder
+from jaxnbv.pose import Pose
+from jaxnbv.search import Proposal
+from jaxnbv.storage.arrays import (
+    POSE,
+    PROPOSAL,
+    SCAN,
+    pose_arrays,
+    pose_of,
+    proposal_arrays,
+    proposal_of,
+    read_arrays,
+    scan_arrays,
+    scan_of,
+    write_arrays,
+)
+
+_VIEW = {**POSE, **SCAN, **PROPOSAL}
+
+
+class EpisodeFolder(ResultFolder):
+    """An episode's folder, open for one configuration.
+
+    **Raises:** `ValueError` if the folder holds an episode of another configuration, or files that are not an
+    episode's.
+    """
+
+    def __init__(self, path: str | Path, config: dict[str, Any]):
+        super().__init__(path, "episode.json", "view_*.npz", config, "episode")
+
+    def read_views(self) -> list[tuple[Pose, PointCloud, Proposal | None]]:
+        """Pose, scan and proposal of every finished view, up to the first that is missing.
+
+        **Raises:** `ValueError` if one is damaged.
+        """
+        views: list[tuple[Pose, PointCloud, Proposal | None]] = []
+        while (file := self._view_file(len(views))).exists():
+            remedy = "delete it, and its view is scanned again"
+            views.append(read_arrays(file, len(views), _VIEW, _view, "view", remedy))
+        return views
+
+    def write_view(self, index: int, pose: Pose, scan: PointCloud, proposal: Proposal | None) -> None:
+        """Write one finished view, all or nothing; the first of them binds the folder to its configuration."""
+        self.bind()
+        chosen = {} if proposal is None else proposal_arrays(proposal)
+        write_arrays(self._view_file(index), index, pose_arrays(pose) | scan_arrays(scan) | chosen)
+
+    def write_cloud(self, cloud: PointCloud) -> None:
+        """Write the kept points and normals as a binary PLY file, in scene coordinates."""
+        write_cloud(self.path / "cloud.ply", cloud, "scene coordinates")
+
+    def _view_file(self, index: int) -> Path:
+        return self.path / f"view_{index:02d}.npz"
+
+
+def _view(data: dict[str, np.ndarray]) -> tuple[Pose, PointCloud, Proposal | None]:
+    return pose_of(data), scan_of(data), proposal_of(data)
+
+
+def write_cloud(path: Path, cloud: PointCloud, coordinates: str) -> None:
+    """Write points and normals as a binary PLY file; a comment says in which coordinates."""
+    points, normals = cloud.to_numpy()
+    rows = np.concatenate([points, normals], axis=1)
+    vertices = np.rec.fromarrays(list(rows.T), dtype=[(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")])
+    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=[coordinates])
+    write_whole(path, ply.write)
