@@ -1,5 +1,7 @@
 """From a depth image to oriented points, and to what its rays have crossed."""
 
+import warnings
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Real
@@ -54,6 +56,8 @@ def points_of_depth(
     if box is not None:
         crossed = valid.reshape(-1) & (depth.reshape(-1) >= _depth_behind(box, camera, pose))
         inside = box(points) <= 0
+        if not is_traced(points):
+            _warn_of_nothing_inside(np.asarray(points)[np.asarray(mask)], np.asarray(inside & mask), box)
         mask, missed = mask & inside, missed | (crossed & ~inside)
     points, normals = (jnp.where(mask[:, None], vectors, 0.0) for vectors in (points, normals))
     return points, normals, mask, missed
@@ -94,6 +98,18 @@ def _check_meaning(depth: Float[np.ndarray, " valid"], camera: Camera, pose: Pos
         f"the depths have a median of {middle:.4g}, but the box is {nearest:.4g} to {float(ahead.max()):.4g} away: "
         "give the depth's scale, 0.001 for millimetres and a pose in metres",
     )
+
+
+def _warn_of_nothing_inside(points: Float[np.ndarray, "valid 3"], inside: Bool[np.ndarray, " n"], box: Box) -> None:
+    """An image may show none of the object; more often its pose is wrong."""
+    if len(points) and not inside.any():
+        low, high = points.min(axis=0), points.max(axis=0)
+        warnings.warn(
+            f"none of the {len(points)} points of the depth image lies in the box from {box.low} to {box.high}: they "
+            f"lie from {low} to {high}. Is the pose from camera to world, in the right convention, and the box in its "
+            "units?",
+            stacklevel=4,
+        )
 
 
 def _one_sided_difference(points: Float[Array, "h w 3"], valid: Bool[Array, "h w"], axis: int):

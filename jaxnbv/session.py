@@ -211,7 +211,7 @@ class Session:
 
     def _config(self) -> dict:
         sensor = {"camera": self.camera, "box": self.box, "up": self.frame.up, "convention": self.convention}
-        return describe({"planner": self.planner, **sensor, "stride": self.stride, "key": self.key})
+        return describe({**sensor, "stride": self.stride, "key": self.key, "planner": self.planner})
 
     def _seen(self, image: DepthImage) -> tuple[Pose, PointCloud]:
         """Pose and scan of an image, in scene coordinates."""
@@ -277,14 +277,15 @@ def planner_for(planner: Planner, camera: Camera, box: Box, poses: Pose | None) 
 
 def _with_visited(state: State, poses: list[Pose]) -> State:
     """The state in which these are taken for visited too, of fixed shapes: with room for one more before each view."""
-    room, seen = state.poses.position.shape[0], int(state.num_views)
+    seen = int(state.num_views)
 
     def rows(leaf: Array, *own: Array) -> Array:
-        spare = jnp.broadcast_to(leaf[-1:], (room - len(own), *leaf.shape[1:]))
-        return jnp.concatenate([leaf[:seen], *(row[None] for row in own), leaf[seen:], spare])
+        room = np.concatenate([np.asarray(leaf)] * 2)
+        room[seen : seen + len(own)] = np.asarray(own).reshape(-1, *leaf.shape[1:])
+        return jnp.asarray(room)
 
     visited = jax.tree.map(rows, state.poses, *poses)
-    return dataclasses.replace(state, poses=visited, num_views=state.num_views + len(poses))
+    return dataclasses.replace(state, poses=visited, num_views=jnp.asarray(seen + len(poses), jnp.int32))
 
 
 @eqx.filter_jit

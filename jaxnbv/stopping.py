@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.acquisition import Score, expected_score
 from jaxnbv.camera import Camera
-from jaxnbv.checks import InputError, check_fields, require
+from jaxnbv.checks import InputError, check_fields, require, shown
 from jaxnbv.cloud import PointCloud
 from jaxnbv.planner import Planner
 from jaxnbv.pose import Pose
@@ -141,6 +141,8 @@ class Found(Stop):
     def __check_init__(self):
         check_fields(self)
         require(self.points >= 1, f"a part is found by {self.points} points; give at least 1")
+        names = isinstance(self.parts, tuple) and all(isinstance(name, str) for name in self.parts)
+        require(self.parts is None or names, f"the parts are {shown(self.parts)}; give a tuple of their names")
 
     def check(self, planner: Planner) -> None:
         segmenter = getattr(getattr(planner.acquisition, "utility", None), "segmenter", None)

@@ -17,7 +17,9 @@ from safetensors.numpy import load_file, save_file
 import jaxnbv as nbv
 from jaxnbv.networks import CloudClassifier, CloudSegmenter, load_checkpoint
 
-FOLDER = Path(tempfile.mkdtemp())
+# Until the program ends.
+_HELD = tempfile.TemporaryDirectory()
+FOLDER = Path(_HELD.name)
 WEIGHTS = Path(nbv.__file__).parent / "networks" / "weights"
 KEY = jax.random.key(0)
 BALL = nbv.SDFSurface(nbv.sdf.Sphere(1.0))
@@ -53,6 +55,11 @@ def proposed(acquisition):
 
 def parts_of(answer):
     return proposed(nbv.ExpectedUtilityImprovement(nbv.SoftPartCount(lambda cloud: answer), 16))
+
+
+def session(**changes):
+    settings = {"planner": P, "camera": SMALL, "box": ((-1.2, -1.2, -1.2), (1.2, 1.2, 1.2))}
+    return nbv.Session(**(settings | changes))
 
 
 def stored(name, changes):
@@ -178,6 +185,20 @@ REFUSED = {
     "text as a convention": (lambda: nbv.Pose.from_matrix(np.eye(4), "ros"), "opengl"),
     "up is nowhere": (lambda: nbv.look_at((0, 0, 2), (0, 0, 0), (np.nan, 0, 0)), "got up"),
     "a target nowhere": (lambda: nbv.look_at((0, 0, 2), (np.nan, 0, 0)), "got target"),
+    "poses of a session that are one": (lambda: session(poses=np.eye(4)), "give a batch"),
+    "a session without a planner": (lambda: session(planner=None), "give Planner"),
+    "a session's box of text": (lambda: session(box="here"), "'here'"),
+    "a session's folder that is none": (lambda: session(folder=3), "3"),
+    "half a stride": (lambda: session(stride=2.5), "2.5"),
+    "a rule that is none": (lambda: session(until=0.95), "0.95"),
+    "a session's pose of three rows": (lambda: session().add(np.ones((6, 6)), np.eye(3)), "(3, 3)"),
+    "a depth image of text": (lambda: session().add("image", np.eye(4)), "'image'"),
+    "a rule of an episode that is none": (
+        lambda: nbv.simulate(P, BALL, POSE, 2, KEY, progress=False, until="sure"),
+        "'sure'",
+    ),
+    "a probability of text": (lambda: nbv.Sure("0.9"), "'0.9'"),
+    "parts that are no names": (lambda: nbv.Found(parts=3), "3"),
     "up without measure": (lambda: nbv.look_at((0, 0, 2), (0, 0, 0), (0, 1e30, 0)), "up direction"),
 }
 

@@ -1,0 +1,355 @@
+"""A live session: a simulated sensor of 64 x 48 pixels in millimetres, a world in metres with z up, a table in view."""
+
+import json
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import jax
+import numpy as np
+import pytest
+
+from jaxnbv.camera import Camera
+from jaxnbv.checks import InputError
+from jaxnbv.cloud import PointCloud
+from jaxnbv.episode import view_keys
+from jaxnbv.frame import Frame
+from jaxnbv.planner import Planner
+from jaxnbv.pose import Pose, look_at
+from jaxnbv.scanning import Carving, Grid, SDFSurface, scan
+from jaxnbv.scanning.sdf import Box as Block
+from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.search import DiscreteSearch, FarthestView, GradientSearch
+from jaxnbv.session import Session
+from jaxnbv.stopping import Budget, WorthLess
+from jaxnbv.surfaces import GeometricSPSR, OutsideBoundary, ScreenedSPSR
+from jaxnbv.tasks import Coverage
+from jaxnbv.volume import Box
+
+CENTER = np.array([0.3, 0.2, 0.12])
+WORLD = SDFSurface(Sphere(0.1).translate([0.3, 0.2, 0.101]) | Block([1.0, 1.0, 0.02]).translate([0.3, 0.2, -0.021]))
+CAMERA = Camera.from_intrinsics([[90.0, 0.0, 34.0], [0.0, 95.0, 21.5], [0.0, 0.0, 1.0]], width=64, height=48)
+BOX = ((0.18, 0.08, 0.002), (0.42, 0.32, 0.24))
+
+
+def around(angle, elevation, distance=0.6):
+    direction = [np.cos(angle) * np.cos(elevation), np.sin(angle) * np.cos(elevation), np.sin(elevation)]
+    return np.asarray(look_at(CENTER + distance * np.array(direction), CENTER, up=(0.0, 0.0, 1.0)).matrix, np.float64)
+
+
+POSES = np.array([around(angle, e) for e in (0.4, 0.9) for angle in np.arange(0.0, 6.2, np.pi / 3)])
+FIRST = around(0.2, 0.5)
+
+
+def shot(matrix, unit=1000.0):
+    """What the sensor gives: whole millimetres, zero where nothing is hit."""
+    pose = Pose.from_matrix(matrix)
+    seen = scan(WORLD, CAMERA, pose)
+    depth = (np.asarray(seen.points, np.float64) - np.asarray(pose.position)) @ np.asarray(pose.forward, np.float64)
+    image = np.where(seen.mask, unit * depth, 0.0).reshape(48, 64)
+    return np.round(image).astype(np.uint16) if unit > 1 else image
+
+
+def planner_of(search=None, **changes):
+    settings = {"num_samples": 3, "grid": Grid(28), "capacity": 400, "max_views": 8, **changes}
+    model = GeometricSPSR(0.2, truncation=8)
+    return Planner(model, Camera(height=12, width=16), Coverage(), search or DiscreteSearch(), **settings)
+
+
+def session_of(folder=None, **changes):
+    settings = {"camera": CAMERA, "box": BOX, "up": "z", "poses": POSES, "folder": folder, **changes}
+    return Session(settings.pop("planner", None) or planner_of(), **settings)
+
+
+@pytest.fixture(scope="module")
+def finished():
+    """A session of three views."""
+    session = session_of()
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    for _ in range(2):
+        matrix = session.next().matrix
+        session.add(shot(matrix), matrix, depth_scale=1e-3)
+    return session
+
+
+def test_it_asks_and_tells_as_a_planner_in_the_scene_does(finished):
+    """Every step by hand, with the frame."""
+    frame = Frame.fit(np.array(BOX), up="z")
+    box = Box(*BOX)
+    search = DiscreteSearch(frame.to_scene(Pose.from_matrix(POSES)))
+    imagined = frame.to_scene(CAMERA).resized(12, 16)
+    planner = Planner(
+        GeometricSPSR(0.2, truncation=8),
+        imagined,
+        Coverage(),
+        search,
+        3,
+        Grid(28),
+        400,
+        8,
+        Carving(frame.to_scene(box)),
+    )
+    state, matrix = None, FIRST
+    for index in range(3):
+        pose = Pose.from_matrix(matrix)
+        cloud = PointCloud.from_depth(shot(matrix), CAMERA, pose, scale=1e-3, box=box)
+        told = (frame.to_scene(pose), frame.to_scene(CAMERA))
+        scanned = frame.to_scene(cloud)
+        state = planner.init(scanned, *told) if state is None else planner.observe(state, told[0], scanned, told[1])
+        sample_key, search_key, _ = view_keys(jax.random.key(0), index + 1)
+        proposal = planner.choose(state, planner.sample_surfaces(state, sample_key), search_key)
+        matrix = np.asarray(frame.to_world(proposal.pose).matrix)
+        expected = finished.episode.views[index + 1].proposal if index < 2 else finished.next().proposal
+        np.testing.assert_allclose(proposal.values, expected.values, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(proposal.pose.position, expected.pose.position, atol=1e-5)
+    np.testing.assert_allclose(finished.state.cloud.points, state.cloud.points, atol=1e-5)
+
+
+def test_its_matrices_are_those_that_were_given(finished):
+    proposed = finished.next()
+    distance = np.abs(POSES - proposed.matrix).max(axis=(1, 2))
+    assert distance.min() < 1e-5
+    index = int(np.argmax(np.asarray(proposed.proposal.values)))
+    assert int(distance.argmin()) == index
+    assert proposed.value == pytest.approx(float(proposed.proposal.values[index]))
+    assert proposed.standard_error == pytest.approx(float(proposed.proposal.standard_errors[index]))
+    assert finished.next() is proposed
+    assert finished.views == 3
+
+
+def test_its_cloud_lies_on_the_object_in_the_world(finished):
+    points, normals = finished.cloud.to_numpy()
+    outward = points - np.array([0.3, 0.2, 0.101])
+    assert len(points) == 400
+    assert np.abs(np.linalg.norm(outward, axis=1) - 0.1).max() < 0.004
+    assert np.median(np.sum(outward * normals, axis=1)) / 0.1 > 0.95
+
+
+def test_the_expected_depth_is_near_what_is_then_seen(finished):
+    """In metres, at the planner's resolution: by the sensor's pixels at its rays, where both see the ball."""
+    proposed = finished.next()
+    assert proposed.expected_depth.shape == (12, 16)
+    camera = CAMERA.resized(12, 16)
+    seen = scan(WORLD, camera, Pose.from_matrix(proposed.matrix))
+    inside = np.asarray(Box(*BOX)(seen.points)) < 0
+    depth = (np.asarray(seen.points) - proposed.matrix[:3, 3]) @ proposed.matrix[:3, 2]
+    both = (np.asarray(seen.mask) & inside).reshape(12, 16) & np.isfinite(proposed.expected_depth)
+    assert both.sum() > 15
+    assert np.median(np.abs(proposed.expected_depth - depth.reshape(12, 16))[both]) < 0.02
+
+
+@pytest.mark.parametrize(("convention", "unit"), [("opencv", 1.0), ("opengl", 1000.0)])
+def test_metres_and_millimetres_and_both_conventions_tell_the_same(convention, unit, finished):
+    axes = np.diag([1.0, -1.0, -1.0, 1.0]) if convention == "opengl" else np.eye(4)
+    session = session_of(convention=convention, poses=POSES @ axes)
+    session.add(shot(FIRST, unit), FIRST @ axes, depth_scale=1.0 / unit)
+    first = finished.episode.views[1].proposal
+    np.testing.assert_allclose(session.next().matrix @ axes, finished.frame.to_world(first.pose).matrix, atol=1e-5)
+    # Points that are rounded to millimetres are other points.
+    assert session.next().value == pytest.approx(float(first.value), rel=1e-4 if unit > 1 else 0.2)
+
+
+def test_nothing_recompiles_after_the_second_image(compilations):
+    session, after = session_of(planner=planner_of(num_samples=2)), []
+    matrix = FIRST
+    for _ in range(5):
+        session.add(shot(matrix), matrix, depth_scale=1e-3)
+        matrix = session.next().matrix
+        after.append(len(compilations))
+    assert after[0] > 0
+    assert after[2:] == [after[2]] * 3
+
+
+def test_where_the_sensor_could_not_be_held_is_not_proposed_again():
+    """The user took the image from elsewhere; then all others are proposed once, and there is nothing left."""
+    session = session_of(planner=planner_of(FarthestView()), poses=POSES[:4])
+    proposed = []
+    for angle in (0.2, 1.2, 2.2, 3.2):
+        matrix = around(angle, 0.6)
+        session.add(shot(matrix), matrix, depth_scale=1e-3)
+        proposed.append(session.next().matrix)
+    assert len({tuple(np.round(matrix[:3, 3], 4)) for matrix in proposed}) == 4
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    with pytest.raises(InputError, match="all 4 candidates have been visited"):
+        session.next()
+
+
+def test_a_session_goes_on_from_its_folder(finished, tmp_path):
+    """After an image, and after a proposal, whose file is read and not made again."""
+    session = session_of(tmp_path)
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    session = session_of(tmp_path)
+    assert session.views == 1
+    matrix = session.next().matrix
+    again = session_of(tmp_path)
+    files = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.npz")}
+    np.testing.assert_array_equal(again.next().matrix, matrix)
+    np.testing.assert_array_equal(again.next().expected_depth, session.next().expected_depth)
+    assert files == {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.npz")}
+    again.add(shot(matrix), matrix, depth_scale=1e-3)
+    last = session_of(tmp_path)
+    np.testing.assert_array_equal(last.next().proposal.values, _third(finished).values)
+    np.testing.assert_array_equal(last.state.cloud.points, again.state.cloud.points)
+
+
+def _third(finished):
+    return finished.episode.views[2].proposal
+
+
+def test_images_keep_their_pixels(tmp_path):
+    session, image = session_of(tmp_path), shot(FIRST)
+    session.add(image, FIRST, depth_scale=1e-3)
+    with np.load(tmp_path / "image_00.npz") as saved:
+        np.testing.assert_array_equal(saved["depth"], image)
+        assert saved["depth"].dtype == np.uint16
+        np.testing.assert_array_equal(saved["matrix"], FIRST)
+    config = json.loads((tmp_path / "session.json").read_text())["config"]
+    assert config["box"]["low"] == list(BOX[0])
+    assert config["up"] == "z"
+
+
+def test_a_folder_of_another_session_is_refused(tmp_path):
+    session_of(tmp_path).add(shot(FIRST), FIRST, depth_scale=1e-3)
+    with pytest.raises(InputError, match=r"belongs to another session; it differs in up: z there, y now"):
+        session_of(tmp_path, up="y")
+
+
+def test_two_sessions_in_one_folder_do_not_overwrite_each_other(tmp_path):
+    first, second = session_of(tmp_path), session_of(tmp_path)
+    first.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    held = (tmp_path / "image_00.npz").read_bytes()
+    with pytest.raises(InputError, match=r"holds 1 images, but this session knows 0"):
+        second.add(shot(POSES[0]), POSES[0], depth_scale=1e-3)
+    assert (tmp_path / "image_00.npz").read_bytes() == held
+    assert second.views == 0
+
+
+def test_a_damaged_image_is_named(tmp_path):
+    session_of(tmp_path).add(shot(FIRST), FIRST, depth_scale=1e-3)
+    file = tmp_path / "image_00.npz"
+    file.write_bytes(file.read_bytes()[:-40])
+    with pytest.raises(InputError, match=r"image_00\.npz is damaged .*restore it, or delete it and those after it"):
+        session_of(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"depth_scale": 1.0}, "give the depth's scale, 0.001 for millimetres"),
+        ({"matrix": FIRST @ np.diag([-1.0, 1.0, -1.0, 1.0])}, "the box .* lies behind the camera"),
+        ({"depth": np.ones((5, 5))}, r"the depth image is \(5, 5\) but the camera has \(48, 64\)"),
+        ({"depth": np.zeros((48, 64))}, "the first scan is empty"),
+    ],
+)
+def test_a_wrong_image_is_named_and_changes_nothing(given, message, tmp_path):
+    session = session_of(tmp_path)
+    right = {"depth": shot(FIRST), "matrix": FIRST, "depth_scale": 1e-3}
+    with pytest.raises(InputError, match=message):
+        session.add(**right | given)
+    assert session.views == 0
+    assert not list(tmp_path.glob("*.npz"))
+    session.add(**right)
+    assert session.views == 1
+
+
+def test_an_image_beside_the_box_is_warned_of():
+    """It may be meant, but for the first one."""
+    session = session_of()
+    inverse = np.linalg.inv(FIRST)
+    with (
+        pytest.warns(
+            UserWarning, match=r"none of the \d+ points .* lies in the box .* Is the pose from camera to world"
+        ),
+        pytest.raises(InputError, match="the first scan is empty"),
+    ):
+        session.add(shot(FIRST), inverse, depth_scale=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: session_of().next(), "no image yet: add one first"),
+        (lambda: session_of().cloud, "no image yet: add one first"),
+        (lambda: session_of(box=((0.0, 0.0), (1.0, 1.0))), "give two corners"),
+        (lambda: session_of(box=((0.0, 0.0, 0.0), (1.0, 1.0, -1.0))), "has no inside"),
+        (lambda: session_of(planner=planner_of(GradientSearch())), "GradientSearch is no search over candidates"),
+        (lambda: session_of(convention="blender"), "the convention is 'blender'"),
+        (lambda: session_of(stride=0), "stride is 0"),
+    ],
+)
+def test_bad_input_is_named(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+def test_the_box_is_the_volume_of_the_model_and_of_the_carving():
+    """What was given another volume keeps it."""
+    own = Box.cube(2.0)
+    planner = planner_of()
+    planner = Planner(
+        ScreenedSPSR(values=(OutsideBoundary(), OutsideBoundary(own))), planner.camera, Coverage(), planner.search
+    )
+    fitted = session_of(planner=planner).planner
+    scene = Frame.fit(np.array(BOX), up="z").to_scene(Box(*BOX))
+    assert fitted.carving.volume == scene
+    assert fitted.model.values[0].volume == scene
+    assert fitted.model.values[1].volume == own
+    assert max(scene.high) == pytest.approx(1.25)
+    assert fitted.camera.fov == pytest.approx(CAMERA.fov)
+
+
+def test_it_is_done_by_its_rule(finished):
+    assert finished.done is None
+    session = session_of(until=WorthLess(1e9))
+    assert session.done is None
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    assert "less than" in session.done
+    session = session_of(until=Budget(seconds=1e9))
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    assert session.done is None
+
+
+def test_a_report_stands_upright_and_needs_no_truth(finished, tmp_path):
+    page = finished.report(tmp_path, progress=False).read_text()
+    assert "that of a real sensor" in page
+    assert page.count("<li>View") == 3
+    with pytest.raises(InputError, match="keeps no folder"):
+        finished.report()
+
+
+SCRIPT = """
+import sys
+sys.path[:0] = [{tests!r}]
+from test_session import FIRST, session_of, shot
+session = session_of(sys.argv[1])
+while session.views < 4:
+    matrix = FIRST if session.views == 0 else session.next().matrix
+    session.add(shot(matrix), matrix, depth_scale=1e-3)
+session.next()
+"""
+
+
+def test_a_session_that_was_killed_ends_as_one_that_was_not(tmp_path):
+    script = tmp_path / "live.py"
+    script.write_text(textwrap.dedent(SCRIPT.format(tests=str(__import__("pathlib").Path(__file__).parent))))
+
+    def start(folder):
+        return subprocess.Popen([sys.executable, str(script), str(folder)])
+
+    assert start(tmp_path / "whole").wait() == 0
+    for last in ("image_01.npz", "proposal_02.npz"):
+        process = start(tmp_path / "killed")
+        while process.poll() is None and not (tmp_path / "killed" / last).exists():
+            time.sleep(0.01)
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+    assert start(tmp_path / "killed").wait() == 0
+
+    def contents(folder):
+        return {path.name: path.read_bytes() for path in sorted(folder.glob("*.npz"))}
+
+    whole = contents(tmp_path / "whole")
+    assert len(whole) == 8
+    assert contents(tmp_path / "killed") == whole
