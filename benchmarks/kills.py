@@ -2,9 +2,9 @@
 
     python benchmarks/kills.py --kills 200 --out runs/kills
 
-Commands are a run, its figures, and a study, at small settings; each is killed (SIGKILL) at moments that are spread
-over the time that it takes, and started again until it has been killed so often. Then it is let through. Not part of
-the tests: about ten seconds a kill.
+Commands are a run, its figures, a study, and a session that is planned again, at small settings; each is killed
+(SIGKILL) at moments that are spread over the time that it takes, and started again until it has been killed so often.
+Then it is let through. Not part of the tests: about ten seconds a kill.
 """
 
 import argparse
@@ -18,13 +18,35 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+import jaxnbv as nbv
+
 COMMANDS = {
     "run": ("demo", "--quick", "--views", "4", "--no-report"),
     "figures": ("demo", "--quick", "--views", "2"),
     "study": ("study", "pyramid", "--quick", "--scenes", "3", "--views", "2", "--framing", "close-up"),
+    "session": ("session", "replay", "SESSION", "--quick", "--no-report"),
 }
 # What says when it was made, and by what means.
 UNLIKE = {"report.html", ".lock"}
+
+
+def record_session(folder: Path) -> None:
+    """Four images of a ball by a simulated sensor, from where its planner asked for them."""
+    camera, ball = nbv.Camera(height=48, width=64), nbv.SDFSurface(nbv.sdf.Sphere(0.1))
+    planner = nbv.Planner(
+        nbv.GeometricSPSR(0.05, truncation=12),
+        nbv.Camera(height=12, width=16),
+        nbv.Coverage(),
+        nbv.DiscreteSearch(20),
+        2,
+    )
+    session = nbv.Session(planner, camera, ((-0.12, -0.12, -0.12), (0.12, 0.12, 0.12)), folder=folder)
+    matrix = np.asarray(nbv.look_at((0.0, 0.1, 0.3)).matrix)
+    while session.views < 4:
+        seen, pose = nbv.scan(ball, camera, nbv.Pose.from_matrix(matrix)), nbv.Pose.from_matrix(matrix)
+        depth = np.asarray((seen.points - pose.position) @ pose.forward).reshape(48, 64)
+        session.add(np.where(np.asarray(seen.mask).reshape(48, 64), depth, np.inf), matrix)
+        matrix = session.next().matrix
 
 
 def start(arguments: tuple[str, ...], out: Path) -> subprocess.Popen:
@@ -58,12 +80,16 @@ def let_through(arguments: tuple[str, ...], out: Path) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--commands", nargs="+", choices=COMMANDS, default=list(COMMANDS))
     parser.add_argument("--out", type=Path, default=Path("runs/kills"))
     asked = parser.parse_args()
     shutil.rmtree(asked.out, ignore_errors=True)
     random, failures = np.random.default_rng(0), []
-    share = -(-asked.kills // len(COMMANDS))
-    for name, arguments in COMMANDS.items():
+    share = -(-asked.kills // len(asked.commands))
+    if "session" in asked.commands:
+        record_session(asked.out / "recorded")
+    for name in asked.commands:
+        arguments = tuple(str(asked.out / "recorded") if word == "SESSION" else word for word in COMMANDS[name])
         # The second time all programs are compiled, as they will be when it is killed.
         let_through(arguments, asked.out / f"{name}-first")
         seconds = let_through(arguments, asked.out / f"{name}-whole")

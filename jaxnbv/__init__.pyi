@@ -29,6 +29,7 @@ from .presets import Imagination as Imagination
 from .presets import imagination as imagination
 from .reconstruction import mean_mesh as mean_mesh
 from .reconstruction import screened_poisson as screened_poisson
+from .replay import StoredSession as StoredSession
 from .scanning import Carving as Carving
 from .scanning import Grid as Grid
 from .scanning import GridSurface as GridSurface

@@ -75,6 +75,20 @@ def test_the_same_command_continues_with_more_views(finished):
     assert all((out / name).read_bytes() == content for name, content in before.items())
 
 
+def test_a_rule_ends_it_and_says_what_is_saved(tmp_path):
+    """A way of a tenth leads to no other candidate."""
+    arguments = ("demo", "--task", "coverage", "--quick", "--views", "3", "--search", "farthest", "--no-report")
+    rules = ("--until", "travel=0.1", "--until", "seconds=1e6")
+    result = run_command(*arguments, *rules, "--out", "mine", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "enough   after view 1: the next view would cost" in result.stdout
+    assert "2 of 3 views are saved" in result.stdout
+    assert len(list((tmp_path / "mine").glob("view_*.npz"))) == 1
+    result = run_command(*arguments, "--until", "never", "--out", "mine", cwd=tmp_path)
+    assert len(list((tmp_path / "mine").glob("view_*.npz"))) == 3
+    assert "enough" not in result.stdout
+
+
 @pytest.mark.parametrize(
     ("search", "model"),
     [("farthest", "screened"), ("random", "paper"), ("uncertainty", "paper"), ("gradient-6dof", "screened")],
@@ -111,6 +125,9 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
         (("run", "flat.obj"), ("flat.obj", "area")),
         (("run", "broken.glb"), ("broken.glb", "cannot read")),
         (("demo", "--out", "flat.obj"), ("flat.obj", "File exists")),
+        (("demo", "--until", "surely=3"), ("'surely=3'", "sure", "never")),
+        (("demo", "--until", "sure"), ("'sure'", "a number")),
+        (("demo", "--task", "coverage", "--until", "sure=0.9"), ("Coverage", "classifier")),
         (("demo", "--vews", "3"), ("--vews", "--views")),
         (("demo", "--search", "best"), ("best", "discrete")),
         (("demo", "--out", "occupied"), ("occupied", "other files")),

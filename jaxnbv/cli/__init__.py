@@ -1,4 +1,5 @@
-"""The command line: `jaxnbv demo`, `jaxnbv run MESH`, `jaxnbv study pyramid` and `jaxnbv convert`."""
+"""The command line: `jaxnbv demo`, `jaxnbv run MESH`, `jaxnbv study pyramid`, `jaxnbv session replay DIR` and `jaxnbv
+convert`."""
 
 import sys
 from typing import Annotated
@@ -6,6 +7,7 @@ from typing import Annotated
 import typer
 
 import jaxnbv
+from jaxnbv.cli.session import session
 from jaxnbv.cli.study import study
 from jaxnbv.cli.tools import convert
 from jaxnbv.cli.views import demo, run
@@ -49,6 +51,7 @@ app.command("demo")(demo)
 app.command("run")(run)
 app.command()(convert)
 app.add_typer(study, name="study")
+app.add_typer(session, name="session")
 
 
 def main() -> None:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from jaxnbv.cli.registry import SEARCHES, TASKS
+from jaxnbv.cli.registry import SEARCHES, STOPS, TASKS
 from jaxnbv.datasets import Framing
 from jaxnbv.model_name import ModelName
 
@@ -39,11 +39,28 @@ ViewsOption = Annotated[int, typer.Option(help="Views in all, the first one incl
 SeedOption = Annotated[
     int, typer.Option(min=0, max=2**63 - 1, help="Seed of the sensor's noise and of the posterior samples.")
 ]
+UntilOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="RULE=N",
+        help="End earlier, by the first of some rules that holds. "
+        + "; ".join(f"{n}=N: {e.about}" for n, e in STOPS.items())
+        + "; never: not earlier.",
+        show_default="never; demo of a class: sure=0.95",
+    ),
+]
 OutOption = Annotated[Path | None, typer.Option(help="Output folder.", show_default="runs/NAME-SEARCH[-paper]")]
 FirstOption = Annotated[
     str, typer.Option(help="Position of the first camera, x,y,z in scene units; it looks at the origin.")
 ]
 DEFAULT_FIRST = "0.8,0.9,2.2"
+NetworkOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="A network, .pth or .safetensors: a classifier for the tasks that are about the class, "
+        "which need one; for parts a part segmenter, in place of the one that ships."
+    ),
+]
 CategoryOption = Annotated[
     str | None,
     typer.Option(
@@ -104,6 +121,7 @@ class EpisodeOptions(NamedTuple):
     search: str
     model: ModelName
     views: int
+    until: list[str] | None
     seed: int
     out: Path | None
     noise: float

@@ -1,6 +1,7 @@
-"""The tasks and searches of the command line, by name: what it must know before anything heavy is imported.
+"""The tasks, searches and stopping rules of the command line: what it must know before anything heavy is imported.
 
-A new task is a class like those of `actions/tasks.py` and an entry here; a new search is a function and an entry.
+A new task is a class like those of `actions/tasks.py` and an entry here; a new search or rule is a function and an
+entry.
 """
 
 import importlib
@@ -25,6 +26,13 @@ class SearchEntry(NamedTuple):
     """How the next view is found: module and name of a function of radius and number of candidates, and a clause."""
 
     search: str
+    about: str
+
+
+class StopEntry(NamedTuple):
+    """When views are enough: module and name of a function of one number, and a clause with N for it."""
+
+    stop: str
     about: str
 
 
@@ -66,6 +74,18 @@ SEARCHES = {
     "farthest": SearchEntry(f"{_SEARCHES}:farthest", "the paper's baseline, farthest from the views so far"),
     "random": SearchEntry(f"{_SEARCHES}:random", "a baseline"),
     "uncertainty": SearchEntry(f"{_SEARCHES}:uncertainty", "a baseline, where the surface is most uncertain"),
+}
+
+
+_STOPS = "jaxnbv.cli.actions.stops"
+
+STOPS = {
+    "sure": StopEntry(f"{_STOPS}:sure", "the class has this probability, and given every half of the points too"),
+    "found": StopEntry(f"{_STOPS}:found", "every part has so many points"),
+    "covered": StopEntry(f"{_STOPS}:covered", "this share of what can be seen is expected to have been seen"),
+    "worth-less": StopEntry(f"{_STOPS}:worth_less", "the best view is worth less than this"),
+    "seconds": StopEntry(f"{_STOPS}:seconds", "so many have passed"),
+    "travel": StopEntry(f"{_STOPS}:travel", "the way from view to view would be longer, in scene units"),
 }
 
 

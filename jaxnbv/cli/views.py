@@ -16,6 +16,7 @@ from jaxnbv.cli.options import (
     FirstOption,
     FramingOption,
     ModelOption,
+    NetworkOption,
     NoiseOption,
     OutOption,
     QuickOption,
@@ -26,6 +27,7 @@ from jaxnbv.cli.options import (
     SourceOption,
     Task,
     TaskOption,
+    UntilOption,
     ViewsOption,
     command,
 )
@@ -34,13 +36,6 @@ from jaxnbv.model_name import ModelName
 
 MeshArgument = Annotated[
     Path, typer.Argument(metavar="MESH", help="Any mesh that trimesh reads: OBJ, PLY, STL, OFF, glTF, ...")
-]
-NetworkOption = Annotated[
-    Path | None,
-    typer.Option(
-        help="A network, .pth or .safetensors: a classifier for the tasks that are about the class, "
-        "which need one; for parts a part segmenter, in place of the one that ships."
-    ),
 ]
 SceneOption = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Which object: the number of a scene.")]
 HidingFirstOption = Annotated[
@@ -51,6 +46,7 @@ _EPISODE: dict[str, tuple[Any, Any]] = {
     "search": (SearchOption, SearchName("discrete")),
     "model": (ModelOption, ModelName.SCREENED),
     "views": (ViewsOption, 5),
+    "until": (UntilOption, None),
     "seed": (SeedOption, 0),
     "out": (OutOption, None),
     "noise": (NoiseOption, 0.01),

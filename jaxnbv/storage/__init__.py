@@ -4,3 +4,4 @@ from jaxnbv.storage.description import describe as describe
 from jaxnbv.storage.episode_folder import EpisodeFolder as EpisodeFolder
 from jaxnbv.storage.session_folder import DepthImage as DepthImage
 from jaxnbv.storage.session_folder import SessionFolder as SessionFolder
+from jaxnbv.storage.session_folder import open_session as open_session

@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Real
 
-from jaxnbv.folders import ResultFolder
+from jaxnbv.checks import InputError
+from jaxnbv.folders import ResultFolder, read_json
 from jaxnbv.search import Proposal
 from jaxnbv.storage.arrays import (
     POSE,
@@ -24,6 +25,7 @@ from jaxnbv.storage.arrays import (
     write_arrays,
 )
 
+RECORD = "session.json"
 _IMAGE: Schema = {"depth": ("uif", ("h", "w")), "matrix": ("f", (4, 4)), "depth_scale": ("f", ())}
 _PROPOSAL: Schema = {**POSE, **PROPOSAL, "expected_depth": ("f", ("h", "w"))}
 
@@ -47,7 +49,7 @@ class SessionFolder(ResultFolder):
     """
 
     def __init__(self, path: str | Path, config: dict[str, Any]):
-        super().__init__(path, "session.json", "image_*.npz", config, "session")
+        super().__init__(path, RECORD, "image_*.npz", config, "session")
 
     def count_images(self) -> int:
         """How many there are, up to the first that is missing."""
@@ -87,6 +89,18 @@ class SessionFolder(ResultFolder):
 
     def _proposal_file(self, index: int) -> Path:
         return self.path / f"proposal_{index:02d}.npz"
+
+
+def open_session(path: str | Path) -> SessionFolder:
+    """The folder of a session, whatever its configuration, which is its `config`.
+
+    **Raises:** `ValueError` if it holds no session.
+    """
+    record = Path(path) / RECORD
+    config = read_json(record, "is not a session's record", "give the folder of a session").get("config")
+    if not isinstance(config, dict):
+        raise InputError(f"{record} is not a session's record: give the folder of a session")
+    return SessionFolder(path, config)
 
 
 def _image(data: dict[str, np.ndarray]) -> DepthImage:

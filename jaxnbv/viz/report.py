@@ -98,6 +98,7 @@ def _header(episode: Episode, title: str) -> str:
         "Sensor noise": "that of a real sensor" if episode.noise is None else _call(describe(episode.noise)),
         "Capacity": f"{planner.capacity:,} points",
         "Seed": ", ".join(str(word) for word in describe(episode.key)["data"]),
+        "Ended": episode.stopped or "after as many views as were asked for",
         "Versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
         "Written": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
     }

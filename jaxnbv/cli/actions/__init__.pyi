@@ -2,4 +2,5 @@ from .checkpoints import convert as convert
 from .device import prepare as prepare
 from .episodes import demo as demo
 from .episodes import run as run
+from .sessions import replay as replay
 from .studies import study as study

@@ -12,7 +12,8 @@ from jaxnbv.acquisition import Score
 from jaxnbv.answers import Answer
 from jaxnbv.camera import Camera
 from jaxnbv.checks import require
-from jaxnbv.cli.actions.tasks import CommandTask, Given, position
+from jaxnbv.cli.actions.stops import rule
+from jaxnbv.cli.actions.tasks import CommandTask, Given, OfMesh, position
 from jaxnbv.cli.options import EpisodeOptions
 from jaxnbv.cli.registry import SEARCHES, TASKS, resolve
 from jaxnbv.datasets import Framing
@@ -33,8 +34,9 @@ def demo(task: str, scene: int, framing: Framing, first: str | None, options: Ep
     if shown.told:
         typer.echo(shown.told)
     start = shown.first if first is None else look_at(position("--first", first))
-    planner = _planner(made.setting, shown.score, options, shown.longest_side, shown.solid, shown.grid)
-    _run(shown.name, shown.surface, planner, start, options)
+    own = shown.longest_side, shown.solid, shown.grid
+    planner = planner_of(made.setting, shown.score, options.search, options.model, options.quick, *own)
+    _run(shown.name, shown.surface, planner, start, options, shown.until)
 
 
 def run(
@@ -50,7 +52,18 @@ def run(
 
     **Raises:** `ValueError` for a task without what it needs, or with what it has no use for.
     """
-    given = Given(load_mesh(mesh), look_at(position("--first", first)), network, category, source)
+    surface, start = load_mesh(mesh), look_at(position("--first", first))
+    given = Given(OfMesh(surface, start), network, category, source)
+    made = task_for(task, given)
+    planner = planner_of(made.setting, made.score(given), options.search, options.model, options.quick)
+    _run(mesh.stem, surface, planner, start, options)
+
+
+def task_for(task: str, given: Given) -> CommandTask:
+    """The task of a name.
+
+    **Raises:** `ValueError` if it lacks what it needs, or was given what it has no use for.
+    """
     for option in ("network", "category", "source"):
         takers = ", ".join(name for name, entry in TASKS.items() if option in entry.options)
         useless = getattr(given, option) is not None and option not in TASKS[task].options
@@ -58,38 +71,48 @@ def run(
     for option, hint in TASKS[task].requires:
         require(getattr(given, option) is not None, f"--task {task} needs {hint}")
     made: CommandTask = resolve(TASKS[task].task)
-    _run(mesh.stem, given.surface, _planner(made.setting, made.score(given), options), given.first, options)
+    return made
 
 
-def _planner(
+def planner_of(
     setting: Setting,
     score: Score,
-    options: EpisodeOptions,
+    search: str,
+    model: ModelName,
+    quick: bool,
     longest_side: float = 2.5,
     solid: bool = False,
     grid: Grid = Grid(),
 ) -> Planner:
     """At the authors' settings, or at small ones, for an object of this longest side."""
-    surfaces, carving = imagination(options.model, longest_side, options.quick, solid=solid)
-    search = resolve(SEARCHES[options.search].search)
-    if options.quick:
+    surfaces, carving = imagination(model, longest_side, quick, solid=solid)
+    found = resolve(SEARCHES[search].search)
+    if quick:
         small = Camera(height=24, width=24)
-        return Planner(surfaces, small, score, search(setting.radius, 40), 4, Grid(56), 1024, carving=carving)
+        return Planner(surfaces, small, score, found(setting.radius, 40), 4, Grid(56), 1024, carving=carving)
     # A gradient search looks at its own number of candidates before it climbs.
-    count = None if options.search.startswith("gradient") else setting.num_candidates
-    return Planner(surfaces, setting.camera, score, search(setting.radius, count), grid=grid, carving=carving)
+    count = None if search.startswith("gradient") else setting.num_candidates
+    return Planner(surfaces, setting.camera, score, found(setting.radius, count), grid=grid, carving=carving)
 
 
-def _run(name: str, scene: Surface, planner: Planner, first: Pose, options: EpisodeOptions) -> None:
-    start = time.perf_counter()
+def _run(
+    name: str, scene: Surface, planner: Planner, first: Pose, options: EpisodeOptions, until: tuple[str, ...] = ()
+) -> None:
+    enough, start = rule(options.until or until), time.perf_counter()
     of_model = "" if options.model is ModelName.SCREENED else f"-{options.model}"
     usual = Path("runs") / f"{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}-{options.search}{of_model}"
     folder = options.out or usual
     if options.quick:
         typer.echo("--quick: small settings; leave it out for the paper's.")
     key, noise = jax.random.key(options.seed), SensorNoise(options.noise, options.noise)
-    episode = simulate(planner, scene, first, options.views, key, noise, folder)
+    episode = simulate(planner, scene, first, options.views, key, noise, folder, until=enough)
     _summarise(episode)
+    if episode.stopped is not None:
+        saved = options.views - len(episode.views)
+        views = "view is" if saved == 1 else "views are"
+        typer.echo(
+            f"enough   after view {len(episode.views)}: {episode.stopped}. {saved} of {options.views} {views} saved"
+        )
     if options.report:
         typer.echo(f"report   {write_report(episode, folder, title=name)}")
     typer.echo(f"episode  {folder}   ({time.perf_counter() - start:.0f} s)")

@@ -2,15 +2,18 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement, Score
 from jaxnbv.checks import InputError, require
 from jaxnbv.cli.options import DEFAULT_FIRST
+from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets import (
     PATTERNS,
     Framing,
@@ -38,11 +41,55 @@ from jaxnbv.tasks import Classifier, ColdestPoint, Coverage, CrossEntropy, Mixed
 from jaxnbv.tasks.diffusion import HeatProblem
 
 
-class Given(NamedTuple):
-    """What a user gives: a mesh, the first view, and options that some tasks take."""
+class Known(ABC):
+    """What is known of a user's object before a view of it is chosen, in scene coordinates.
+
+    - `first`: where the first view is taken.
+    """
+
+    first: Pose
+
+    @abstractmethod
+    def points(self) -> Float[np.ndarray, "n 3"]:
+        """Points of it."""
+
+    @abstractmethod
+    def first_points(self) -> Float[np.ndarray, "n 3"]:
+        """Those that the first view shows."""
+
+
+@dataclass(frozen=True)
+class OfMesh(Known):
+    """Of a mesh all is known."""
 
     surface: TriangleMesh
     first: Pose
+
+    def points(self) -> Float[np.ndarray, "n 3"]:
+        return self.surface.sample_points(jax.random.key(0), 20_000)
+
+    def first_points(self) -> Float[np.ndarray, "n 3"]:
+        return scan(self.surface, USUAL_SETTING.camera, self.first).to_numpy()[0]
+
+
+@dataclass(frozen=True)
+class OfScan(Known):
+    """Of what a sensor saw its first scan."""
+
+    first: Pose
+    seen: PointCloud
+
+    def points(self) -> Float[np.ndarray, "n 3"]:
+        return self.seen.to_numpy()[0]
+
+    def first_points(self) -> Float[np.ndarray, "n 3"]:
+        return self.points()
+
+
+class Given(NamedTuple):
+    """What a user gives: an object, and options that some tasks take."""
+
+    known: Known
     network: Path | None = None
     category: str | None = None
     source: str | None = None
@@ -52,6 +99,7 @@ class Shown(NamedTuple):
     """An object to show a task on.
 
     - `longest_side`, `solid`, `grid`: of the imagined surfaces; `told`: what is said of the object before.
+    - `until`: what is enough, as of `--until`.
     """
 
     name: str
@@ -62,6 +110,7 @@ class Shown(NamedTuple):
     solid: bool = False
     grid: Grid = Grid()
     told: str = ""
+    until: tuple[str, ...] = ()
 
 
 class CommandTask(ABC):
@@ -106,7 +155,8 @@ class ClassTask(CommandTask):
         side, first = framing.longest_side, hidden_view(pyramid, jax.random.key(seed))
         told = f"the pattern is a {PATTERNS[int(pyramid.label)]}"
         score = self.of(pyramid_classifier(side))
-        return Shown("pyramid", SDFSurface(pyramid), score, first, side, True, Grid(64, 0.7 * side), told)
+        grid = Grid(64, 0.7 * side)
+        return Shown("pyramid", SDFSurface(pyramid), score, first, side, True, grid, told, ("sure=0.95",))
 
 
 class PartTask(CommandTask):
@@ -139,7 +189,7 @@ class HeatTask(CommandTask):
 
     def score(self, given: Given) -> Score:
         """Heated at the point that was asked for, or at the one in the middle of the first view."""
-        return self._score(_middle(given) if given.source is None else _asked(given.surface, given.source))
+        return self._score(_middle(given.known) if given.source is None else _asked(given.known, given.source))
 
     def demo(self, scene: int, framing: Framing, seed: int) -> Shown:
         """A procedural object."""
@@ -174,9 +224,8 @@ def position(option: str, text: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _asked(surface: TriangleMesh, source: str) -> np.ndarray:
-    place = np.asarray(position("--source", source))
-    points = surface.sample_points(jax.random.key(0), 20_000)
+def _asked(known: Known, source: str) -> np.ndarray:
+    place, points = np.asarray(position("--source", source)), known.points()
     nearest = points[np.linalg.norm(points - place, axis=1).argmin()]
     distance = float(np.linalg.norm(nearest - place))
     require(
@@ -187,10 +236,10 @@ def _asked(surface: TriangleMesh, source: str) -> np.ndarray:
     return place
 
 
-def _middle(given: Given) -> np.ndarray:
-    points, _ = scan(given.surface, USUAL_SETTING.camera, given.first).to_numpy()
+def _middle(known: Known) -> np.ndarray:
+    points = known.first_points()
     require(len(points) > 0, "the first view does not see the object: give another --first, or a --source")
-    away, forward = points - np.asarray(given.first.position), np.asarray(given.first.forward)
+    away, forward = points - np.asarray(known.first.position), np.asarray(known.first.forward)
     along = away @ forward
     beside = np.linalg.norm(away - along[:, None] * forward, axis=1)
     return points[beside.argmin()]

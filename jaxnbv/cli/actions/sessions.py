@@ -1,0 +1,64 @@
+"""What `jaxnbv session replay DIR` does."""
+
+from pathlib import Path
+
+import numpy as np
+import typer
+
+from jaxnbv.cli.actions.episodes import planner_of, task_for
+from jaxnbv.cli.actions.tasks import Given, OfScan, position
+from jaxnbv.model_name import ModelName
+from jaxnbv.replay import StoredSession
+
+
+def replay(
+    folder: Path,
+    task: str,
+    network: Path | None,
+    category: str | None,
+    source: str | None,
+    search: str,
+    model: ModelName,
+    out: Path | None,
+    quick: bool,
+    report: bool,
+) -> None:
+    """Where another task would have looked next, after each image of a session.
+
+    **Raises:** `ValueError` for a task without what it needs, or with what it has no use for.
+    """
+    stored = StoredSession(folder)
+    if source is not None:
+        place = stored.frame.to_scene(np.array(position("--source", source)))
+        source = ",".join(str(float(x)) for x in place)
+    given = Given(OfScan(*stored.first_view()), network, category, source)
+    made = task_for(task, given)
+    planner = planner_of(made.setting, made.score(given), search, model, quick)
+    out = out or folder.with_name(f"{folder.name}-{task}-{search}")
+    sought = planner.search.quantity(planner.acquisition)
+    replayed = None
+    for replayed, proposed in stored.replay(planner, out):
+        points = int(replayed.state.cloud.count)
+        typer.echo(
+            f"image {replayed.views}   {points:5d} points kept; next from {_place(proposed.matrix)}, "
+            f"{sought.name} {proposed.value:.4g}{_taken(stored, replayed.views, proposed.matrix)}"
+        )
+        answer = planner.acquisition.answer(replayed.state.cloud)
+        if answer is not None:
+            typer.echo(f"          {answer.line()}")
+    if report and replayed is not None:
+        typer.echo(f"report    {replayed.report(title=folder.name)}")
+    typer.echo(f"session   {out}")
+
+
+def _taken(stored: StoredSession, index: int, proposed: np.ndarray) -> str:
+    """Where the next image was taken truly, and how far from there."""
+    if index >= stored.views:
+        return ""
+    taken = np.asarray(stored.image(index).matrix)
+    away = float(np.linalg.norm(taken[:3, 3] - proposed[:3, 3]))
+    return f"; taken from {_place(taken)}, {away:.3g} away"
+
+
+def _place(matrix: np.ndarray) -> str:
+    return "(" + ", ".join(f"{x:+.3f}" for x in matrix[:3, 3]) + ")"

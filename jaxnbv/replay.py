@@ -1,0 +1,90 @@
+"""A session that was stored, planned again: where would another utility have looked next?"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxnbv.camera import Camera
+from jaxnbv.checks import InputError, checked, require
+from jaxnbv.cloud import PointCloud
+from jaxnbv.frame import Frame
+from jaxnbv.planner import Planner
+from jaxnbv.pose import Pose
+from jaxnbv.search.base import CandidateSearch
+from jaxnbv.session import NextView, Session
+from jaxnbv.storage import DepthImage, open_session
+from jaxnbv.volume import Box
+
+
+class StoredSession:
+    """The images of a session's folder and what is known of its sensor; not what its planner was.
+
+    **Raises:** `ValueError` if the folder holds no session with an image.
+    """
+
+    @checked
+    def __init__(self, folder: str | Path):
+        self._folder = open_session(folder)
+        config = self._folder.config
+        try:
+            camera, box = _fields(config["camera"]), _fields(config["box"])
+            self.camera, self.box = Camera(**{**camera, "center": tuple(camera["center"])}), Box(**box)
+            self.up, self.convention, self.stride = (config[name] for name in ("up", "convention", "stride"))
+        except (KeyError, TypeError) as error:
+            raise InputError(f"{self._folder.record} does not say what the sensor was ({error!r})") from error
+        self.frame = Frame.fit(np.array([self.box.low, self.box.high]), up=self.up)
+        self.views = self._folder.count_images()
+        require(self.views > 0, f"{folder} holds no image yet: add one to the session first")
+
+    def image(self, index: int) -> DepthImage:
+        """The image of an index, from 0.
+
+        **Raises:** `ValueError` if it is damaged.
+        """
+        return self._folder.read_image(index)
+
+    def first_view(self) -> tuple[Pose, PointCloud]:
+        """Pose and scan of the first image, in scene coordinates."""
+        image = self.image(0)
+        pose = Pose.from_matrix(image.matrix, self.convention)
+        cloud = PointCloud.from_depth(image.depth, self.camera, pose, image.depth_scale, self.stride, self.box)
+        return self.frame.to_scene(pose), self.frame.to_scene(cloud)
+
+    def candidates(self) -> Float[np.ndarray, "n 4 4"] | None:
+        """The poses that the session's own planner chose among, in world units; None where it has proposed nothing."""
+        for index in range(self.views + 1):
+            if (known := self._folder.read_proposal(index)) is not None:
+                return np.asarray(self.frame.to_world(known[0].candidates).to_matrix(self.convention))
+        return None
+
+    def replay(self, planner: Planner, out: str | Path | None = None) -> Iterator[tuple[Session, NextView]]:
+        """After each image, the session so far and where this planner would have taken the next one.
+
+        - `planner`: see `Session`; a search over candidates is given those that the session's own planner had, where
+          they are known.
+        - `out`: a folder for the session that results; images are copied there. What was interrupted goes on after the
+          last of them.
+
+        **Raises:** `ValueError` as `Session` and its `add` and `next` do.
+        """
+        require(
+            out is None or Path(out).resolve() != self._folder.path.resolve(),
+            f"{out} holds the session that is to be replayed: choose another folder",
+        )
+        sensor = {"camera": self.camera, "box": self.box, "up": self.up, "convention": self.convention}
+        poses = self.candidates() if isinstance(planner.search, CandidateSearch) else None
+        settings: dict[str, Any] = {**sensor, "stride": self.stride, "poses": poses, "folder": out}
+        session = Session(planner, **settings)
+        # What was killed may lack the answer to its last image.
+        if session.views:
+            yield session, session.next()
+        for index in range(session.views, self.views):
+            session.add(*self.image(index))
+            yield session, session.next()
+
+
+def _fields(description: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in description.items() if name != "type"}
