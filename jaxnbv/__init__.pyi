@@ -43,6 +43,7 @@ from .scanning import mesh_from_sdf as mesh_from_sdf
 from .scanning import scan as scan
 from .scanning import scan_samples as scan_samples
 from .scanning import sdf as sdf
+from .search import Batch as Batch
 from .search import Candidates as Candidates
 from .search import ConstrainedPoses as ConstrainedPoses
 from .search import DiscreteSearch as DiscreteSearch
@@ -94,6 +95,11 @@ from .tasks import SoftPartCount as SoftPartCount
 from .tasks import coldest_point as coldest_point
 from .tasks import predict as predict
 from .tasks.diffusion import HeatProblem as HeatProblem
+from .travel import ValueMinusCost as ValueMinusCost
+from .travel import ValuePerCost as ValuePerCost
+from .travel import arc_length as arc_length
+from .travel import rotation_angle as rotation_angle
+from .travel import visiting_order as visiting_order
 from .version import __version__ as __version__
 from .viz import write_report as write_report
 from .volume import Box as Box

@@ -216,16 +216,20 @@ def mean_score(
 
 
 def sample_scores(
-    score: Score, context: Any, surfaces: GridSurface, camera: Camera, poses: Pose
+    score: Score, context: Any, surfaces: GridSurface, camera: Camera, poses: Pose, own_contexts: bool = False
 ) -> Float[Array, "samples poses *scores"]:
     """The score of what each of the sampled surfaces would show from each of a batch of poses.
 
     Samples are taken one after the other, with all poses scanned at once and scored `score.batch_size` at a time, so
     memory is that of one sample's scans.
+
+    - `own_contexts`: the context has a leading axis of samples, one each.
     """
 
-    def of_sample(surface: GridSurface) -> Float[Array, "poses *scores"]:
+    def of_sample(surface: GridSurface, context: Any) -> Float[Array, "poses *scores"]:
         scans = scan(surface, camera, poses)
         return jax.lax.map(lambda imagined: score(context, imagined), scans, batch_size=score.batch_size)
 
-    return jax.lax.map(of_sample, surfaces)
+    if own_contexts:
+        return jax.lax.map(lambda pair: of_sample(*pair), (surfaces, context))
+    return jax.lax.map(lambda surface: of_sample(surface, context), surfaces)

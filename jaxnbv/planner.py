@@ -9,14 +9,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxnbv.acquisition import Score
+from jaxnbv.answers import Quantity
 from jaxnbv.camera import Camera
 from jaxnbv.checks import check_fields, check_key, check_type, is_traced, require, shown
 from jaxnbv.cloud import PointCloud, limit_capacity
 from jaxnbv.pose import Pose
-from jaxnbv.scanning import Carving, Grid, GridSurface, carve
-from jaxnbv.search import Problem, Proposal, Search
-from jaxnbv.state import State, check_scan, observe, record, seen_empty
+from jaxnbv.scanning import Carving, Grid, GridSurface, carve, imagine, nothing_imagined
+from jaxnbv.search import Batch, Problem, Proposal, Search
+from jaxnbv.state import State, check_scan, observe, record, seen_empty, with_visited
 from jaxnbv.surfaces import SurfaceModel, SurfacePosterior
+from jaxnbv.travel import Cost, arc_length
 
 
 class Planner(eqx.Module):
@@ -30,6 +32,7 @@ class Planner(eqx.Module):
     - `grid`: where the samples are evaluated and scanned.
     - `capacity`: points of D that are kept, by farthest point sampling beyond it.
     - `max_views`: views that a state has room for.
+    - `cost`: `ValuePerCost` or `ValueMinusCost` of going from the last view to the next; None where it does not count.
     - `carving`: what samples are cut by: space seen empty, on which the model is conditioned too where it can be, and
       the outside of a volume. None leaves samples as the model draws them from D, which is the paper's own behaviour.
 
@@ -48,6 +51,7 @@ class Planner(eqx.Module):
     capacity: int = eqx.field(static=True, default=8192)
     max_views: int = eqx.field(static=True, default=32)
     carving: Carving | None = Carving()
+    cost: Cost | None = None
 
     def __check_init__(self):
         check_fields(self)
@@ -59,6 +63,17 @@ class Planner(eqx.Module):
             f"the grid reaches to {self.grid.half_extent}, beyond the torus [-pi, pi]^3: give Grid(half_extent=...)",
         )
         self.search.check(self.acquisition, self.camera, self.capacity)
+        require(
+            self.cost is None or self.search.weighs_cost,
+            f"{type(self.search).__name__} does not look at what a view is worth, so its cost cannot count: leave cost "
+            "out, or use another search",
+        )
+
+    @property
+    def quantity(self) -> Quantity:
+        """What the values of its proposals are."""
+        value = self.search.quantity(self.acquisition)
+        return value if self.cost is None else self.cost.quantity(value)
 
     def init(self, cloud: PointCloud, pose: Pose | None = None, camera: Camera | None = None) -> State:
         """The state after a first scan, in scene coordinates, taken from `pose` (None where it is not known).
@@ -134,17 +149,47 @@ class Planner(eqx.Module):
         surfaces = self.sample_surfaces(state, sample_key) if self.search.uses_samples else None
         return self.choose(state, surfaces, search_key)
 
-    def choose(self, state: State, surfaces: GridSurface | None, key: PRNGKeyArray) -> Proposal:
+    def propose_batch(self, state: State, key: PRNGKeyArray, count: int) -> Batch:
+        """Several poses to take before the next question, chosen greedily: each is worth what it adds, sample by
+        sample, to what the scans before it would show of the same posterior sample. The first is that of `propose`.
+
+        For searches that do not look at samples, each is chosen as if those before it had been visited.
+
+        **Raises:** `ValueError` for fewer than one, or more than the state has room for, or as `propose` does.
+        """
+        check_key(key)
+        check_type(count, int, "the number of views")
+        check_type(state, State, "the state")
+        room = state.poses.position.shape[0] - (0 if is_traced(state.num_views) else int(state.num_views))
+        require(1 <= count <= room, f"asked for {count} views at once; give 1 to {room}, for which there is room")
+        sample_key, search_key = jax.random.split(key)
+        surfaces = self.sample_surfaces(state, sample_key) if self.search.uses_samples else None
+        proposals = [self.choose(state, surfaces, search_key)]
+        imagined = None if surfaces is None else nothing_imagined(surfaces, self.camera, count - 1)
+        for index in range(count - 1):
+            if surfaces is not None and imagined is not None:
+                imagined = imagine(imagined, surfaces, self.camera, proposals[-1].pose, jnp.asarray(index))
+            after = with_visited(state, [proposal.pose for proposal in proposals])
+            proposals.append(self.choose(after, surfaces, jax.random.fold_in(search_key, index), imagined))
+        seen = is_traced(state.num_views) or int(state.num_views) > 0
+        start = jax.tree.map(lambda rows: rows[state.num_views - 1], state.poses) if seen else None
+        return Batch(tuple(proposals), start, arc_length if self.cost is None else self.cost.of)
+
+    def choose(
+        self, state: State, surfaces: GridSurface | None, key: PRNGKeyArray, imagined: PointCloud | None = None
+    ) -> Proposal:
         """The second half of `propose`: the search, given the step's samples (any that a model of your own drew).
+
+        - `imagined`: what would be known of each of the samples before this view, beside D; of leading axis S.
 
         **Raises:** `ValueError` if every candidate has been visited, or a score is not finite.
         """
         check_key(key)
         check_type(state, State, "the state")
         check_type(surfaces, GridSurface | None, "the surfaces")
-        proposal = _choose(
-            self.search, self.acquisition, self.camera, state.cloud, state.poses, state.num_views, surfaces, key
-        )
+        check_type(imagined, PointCloud | None, "what is imagined")
+        known = state.cloud, state.poses, state.num_views
+        proposal = _choose(self.search, self.acquisition, self.camera, *known, surfaces, key, self.cost, imagined)
         if not is_traced(proposal):
             require(
                 not bool(jnp.isnan(proposal.value)) and (surfaces is None or bool(proposal.value < jnp.inf)),
@@ -243,5 +288,8 @@ def _choose(
     num_visited: Int[Array, ""],
     surfaces: GridSurface | None,
     key: PRNGKeyArray,
+    cost: Cost | None,
+    imagined: PointCloud | None,
 ) -> Proposal:
-    return search.propose(Problem(cloud, visited, num_visited, camera, acquisition, surfaces), key)
+    problem = Problem(cloud, visited, num_visited, camera, acquisition, surfaces, cost, imagined)
+    return search.propose(problem, key)

@@ -20,7 +20,7 @@ from jaxnbv.pose import Pose
 from jaxnbv.scanning import GridSurface, scan_samples
 from jaxnbv.search import GivenPoses, Proposal
 from jaxnbv.search.base import CandidateSearch
-from jaxnbv.state import State
+from jaxnbv.state import State, with_visited
 from jaxnbv.stopping import Stop, Watch
 from jaxnbv.storage import DepthImage, SessionFolder, describe
 from jaxnbv.viz import write_report
@@ -234,7 +234,7 @@ class Session:
         sample_key, search_key, _ = view_keys(self.key, self.views)
         surfaces = self.planner.sample_surfaces(self.state, sample_key) if self.planner.search.uses_samples else None
         proposed = [proposal.pose for index, proposal in sorted(self._proposals.items()) if index < self.views]
-        proposal = self.planner.choose(_with_visited(self.state, proposed), surfaces, search_key)
+        proposal = self.planner.choose(with_visited(self.state, proposed), surfaces, search_key)
         if surfaces is None:
             return proposal, None
         depth = np.asarray(_expected_depth(surfaces, self.planner.camera, proposal.pose))
@@ -273,19 +273,6 @@ def planner_for(planner: Planner, camera: Camera, box: Box, poses: Pose | None) 
         )
     search = dataclasses.replace(planner.search, candidates=GivenPoses(poses))
     return dataclasses.replace(planner, camera=imagined, search=search)
-
-
-def _with_visited(state: State, poses: list[Pose]) -> State:
-    """The state in which these are taken for visited too, of fixed shapes: with room for one more before each view."""
-    seen = int(state.num_views)
-
-    def rows(leaf: Array, *own: Array) -> Array:
-        room = np.concatenate([np.asarray(leaf)] * 2)
-        room[seen : seen + len(own)] = np.asarray(own).reshape(-1, *leaf.shape[1:])
-        return jnp.asarray(room)
-
-    visited = jax.tree.map(rows, state.poses, *poses)
-    return dataclasses.replace(state, poses=visited, num_views=jnp.asarray(seen + len(poses), jnp.int32))
 
 
 @eqx.filter_jit

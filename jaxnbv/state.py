@@ -1,5 +1,8 @@
 """What a planner knows, what a scan adds to it, and what a scan must be."""
 
+import dataclasses
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -57,6 +60,15 @@ def record(carving: Carving | None, grid: Grid, state: State, pose: Pose, scan: 
     if carving is not None and empty is not None:
         empty = empty | carving.seen_empty(grid, scan, camera, pose)
     return State(state.cloud, poses, state.num_views + 1, empty, state.half_extent)
+
+
+def with_visited(state: State, poses: Sequence[Pose]) -> State:
+    """The state in which these poses are taken for visited too. It has room for twice as many, so that its shapes do
+    not depend on how many they are."""
+    room, count = jax.tree.map(lambda rows: jnp.concatenate([rows, rows]), state.poses), state.num_views
+    for pose in poses:
+        room, count = jax.tree.map(lambda rows, row, at=count: rows.at[at].set(row), room, pose), count + 1
+    return dataclasses.replace(state, poses=room, num_views=count)
 
 
 def seen_empty(state: State, grid: Grid, carving: Carving | None) -> Bool[Array, "g g g"] | None:

@@ -5,6 +5,8 @@ from jaxnbv.scanning.free_space import carve as carve
 from jaxnbv.scanning.free_space import check_image as check_image
 from jaxnbv.scanning.grid import Grid as Grid
 from jaxnbv.scanning.grid import GridSurface as GridSurface
+from jaxnbv.scanning.grid import imagine as imagine
+from jaxnbv.scanning.grid import nothing_imagined as nothing_imagined
 from jaxnbv.scanning.grid import scan_samples as scan_samples
 from jaxnbv.scanning.mesh import TriangleMesh as TriangleMesh
 from jaxnbv.scanning.mesh import load_mesh as load_mesh

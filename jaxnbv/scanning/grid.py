@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int8
+from jaxtyping import Array, Float, Int, Int8
 from scipy.spatial import cKDTree
 
 from jaxnbv.camera import Camera
@@ -135,6 +135,26 @@ def scan_samples(surfaces: GridSurface, camera: Camera, poses: Pose) -> PointClo
     For s surfaces and p poses, clouds with leading axes (s, p); rows as `scan` gives them.
     """
     return jax.lax.map(lambda surface: scan(surface, camera, poses), surfaces)
+
+
+def nothing_imagined(surfaces: GridSurface, camera: Camera, scans: int) -> PointCloud:
+    """Room for so many scans of each of a batch of surfaces, one after the other along the rows; none is taken yet."""
+    rows = surfaces.values.shape[0], scans * camera.num_rays
+    nowhere = jnp.zeros((*rows, 3), surfaces.values.dtype)
+    return PointCloud(nowhere, nowhere, jnp.zeros(rows, bool))
+
+
+@eqx.filter_jit
+def imagine(
+    imagined: PointCloud, surfaces: GridSurface, camera: Camera, pose: Pose, index: Int[Array, ""]
+) -> PointCloud:
+    """With the scan of an index, that of each surface from a pose."""
+    scans = scan_samples(surfaces, camera, pose[None])[:, 0]
+    scans = PointCloud(scans.points, scans.normals, scans.mask)
+    start = index * camera.num_rays
+    return jax.tree.map(
+        lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new, start, axis=1), imagined, scans
+    )
 
 
 @jax.jit

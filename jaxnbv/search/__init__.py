@@ -1,10 +1,7 @@
 """How the next pose is found: among candidates, by gradient, by both, and by the paper's baselines."""
 
 from jaxnbv.search.base import CandidateSearch as CandidateSearch
-from jaxnbv.search.base import Problem as Problem
-from jaxnbv.search.base import Proposal as Proposal
 from jaxnbv.search.base import Search as Search
-from jaxnbv.search.base import Trajectories as Trajectories
 from jaxnbv.search.baselines import FarthestView as FarthestView
 from jaxnbv.search.baselines import RandomView as RandomView
 from jaxnbv.search.baselines import UncertaintyView as UncertaintyView
@@ -21,3 +18,7 @@ from jaxnbv.search.pose_space import ConstrainedPoses as ConstrainedPoses
 from jaxnbv.search.pose_space import FreePoses as FreePoses
 from jaxnbv.search.pose_space import PoseSpace as PoseSpace
 from jaxnbv.search.pose_space import SpherePoses as SpherePoses
+from jaxnbv.search.problem import Problem as Problem
+from jaxnbv.search.proposal import Batch as Batch
+from jaxnbv.search.proposal import Proposal as Proposal
+from jaxnbv.search.proposal import Trajectories as Trajectories

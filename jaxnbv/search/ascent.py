@@ -15,8 +15,10 @@ from jaxnbv.acquisition import Score, check_differentiable
 from jaxnbv.camera import Camera
 from jaxnbv.checks import check_fields, require
 from jaxnbv.pose import Pose
-from jaxnbv.search.base import Problem, Proposal, Trajectories, best_unvisited
+from jaxnbv.search.base import best_unvisited
 from jaxnbv.search.pose_space import PoseSpace
+from jaxnbv.search.problem import Problem
+from jaxnbv.search.proposal import Proposal, Trajectories
 
 
 class Ascent(eqx.Module):

@@ -10,13 +10,16 @@ from jaxnbv.acquisition import Score
 from jaxnbv.answers import Quantity
 from jaxnbv.checks import InputError
 from jaxnbv.pose import Pose
-from jaxnbv.search.base import CandidateSearch, Problem, Proposal, best_unvisited
+from jaxnbv.search.base import CandidateSearch, best_unvisited
+from jaxnbv.search.problem import Problem
+from jaxnbv.search.proposal import Proposal
 
 
 class FarthestView(CandidateSearch):
     """Farthest point sampling of views: the candidate whose nearest visited camera is farthest away."""
 
     uses_samples: ClassVar[bool] = False
+    weighs_cost: ClassVar[bool] = False
 
     def quantity(self, score: Score) -> Quantity:
         meaning = "distance from a candidate to the nearest camera so far; the surface is not looked at."
@@ -32,6 +35,7 @@ class RandomView(CandidateSearch):
     """A candidate drawn uniformly from those not visited yet."""
 
     uses_samples: ClassVar[bool] = False
+    weighs_cost: ClassVar[bool] = False
 
     def quantity(self, score: Score) -> Quantity:
         meaning = "every open candidate drew a lot; the surface is not looked at."
@@ -59,7 +63,7 @@ class UncertaintyView(CandidateSearch):
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """Values are lengths in scene units; the key is not used."""
         candidates = self.candidates.poses()
-        return best_unvisited(problem, candidates, uncertain_length(problem, candidates))
+        return best_unvisited(problem, candidates, problem.worth(uncertain_length(problem, candidates), candidates))
 
 
 def uncertain_length(problem: Problem, poses: Pose) -> Float[Array, " poses"]:

@@ -5,7 +5,9 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
-from jaxnbv.search.base import CandidateSearch, Problem, Proposal, best_unvisited
+from jaxnbv.search.base import CandidateSearch, best_unvisited
+from jaxnbv.search.problem import Problem
+from jaxnbv.search.proposal import Proposal
 
 
 class DiscreteSearch(CandidateSearch):

@@ -11,9 +11,11 @@ from jaxnbv.camera import Camera
 from jaxnbv.checks import check_fields, checked, require
 from jaxnbv.pose import Pose
 from jaxnbv.search.ascent import Ascent
-from jaxnbv.search.base import Problem, Proposal, Search
+from jaxnbv.search.base import Search
 from jaxnbv.search.candidates import Candidates, as_candidates
 from jaxnbv.search.pose_space import FreePoses, PoseSpace, SpherePoses
+from jaxnbv.search.problem import Problem
+from jaxnbv.search.proposal import Proposal
 
 
 class GradientSearch(Search):

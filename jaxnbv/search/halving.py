@@ -8,7 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
 from jaxnbv.checks import check_fields, require
-from jaxnbv.search.base import CandidateSearch, Problem, Proposal
+from jaxnbv.search.base import CandidateSearch
+from jaxnbv.search.problem import Problem
+from jaxnbv.search.proposal import Proposal
 
 
 class HalvingSearch(CandidateSearch):

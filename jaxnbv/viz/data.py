@@ -128,7 +128,7 @@ def report_data(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, p
     planner = episode.planner
     if truth is None and episode.scene is not None:
         truth = truth_points(episode.scene, jax.random.key(0))
-    values = planner.search.quantity(planner.acquisition)
+    values = planner.quantity
     drawn: list[ViewData] = []
     states = episode.states()
     for index, view in enumerate(tqdm(episode.views, desc="drawing views", disable=not progress)):

@@ -121,7 +121,7 @@ def _run(
 def _summarise(episode: Episode) -> None:
     """Lines for each view: where from, why, and what it told."""
     score = episode.planner.acquisition
-    sought = episode.planner.search.quantity(score)
+    sought = episode.planner.quantity
     before: Answer | None = None
     for index, view in enumerate(episode.views, start=1):
         position = ", ".join(f"{value:+.2f}" for value in np.asarray(view.pose.position))

@@ -35,7 +35,7 @@ def replay(
     made = task_for(task, given)
     planner = planner_of(made.setting, made.score(given), search, model, quick)
     out = out or folder.with_name(f"{folder.name}-{task}-{search}")
-    sought = planner.search.quantity(planner.acquisition)
+    sought = planner.quantity
     replayed = None
     for replayed, proposed in stored.replay(planner, out):
         points = int(replayed.state.cloud.count)

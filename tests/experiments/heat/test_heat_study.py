@@ -18,8 +18,8 @@ from jaxnbv.experiments.heat.pictures import write_pictures
 from jaxnbv.experiments.heat.study import HeatStudy, Truth, heat_problem
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.search import HalvingSearch
-from jaxnbv.search.base import Problem
 from jaxnbv.search.candidates import sphere_candidates
+from jaxnbv.search.problem import Problem
 from jaxnbv.tasks import coldest_point
 from jaxnbv.tasks import heat as heat_task
 

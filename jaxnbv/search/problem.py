@@ -1,0 +1,105 @@
+"""What a search is asked."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnbv.acquisition import Score, sample_scores
+from jaxnbv.camera import Camera
+from jaxnbv.checks import InputError
+from jaxnbv.cloud import PointCloud, concatenate
+from jaxnbv.pose import Pose
+from jaxnbv.scanning import GridSurface
+from jaxnbv.travel import Cost
+
+
+class Problem(eqx.Module):
+    """One step's question: where to look next.
+
+    - `cloud`: D, what has been seen.
+    - `visited`: the poses taken so far in the first `num_visited` rows; the others hold nothing.
+    - `surfaces`: the step's posterior samples along a leading axis; None for a search that does not ask for them.
+    - `cost`: how the cost of going there counts against the value; None where it does not.
+    - `imagined`: what earlier views of a batch would show of each sample, along the same axis; None for a single view.
+    - `context`: what the score makes of D, once, or of D and what is imagined, once a sample; None without samples.
+    """
+
+    cloud: PointCloud
+    visited: Pose
+    num_visited: Int[Array, ""]
+    camera: Camera
+    score: Score
+    surfaces: GridSurface | None
+    cost: Cost | None
+    imagined: PointCloud | None
+    context: Any
+
+    def __init__(
+        self,
+        cloud: PointCloud,
+        visited: Pose,
+        num_visited: Int[Array, ""],
+        camera: Camera,
+        score: Score,
+        surfaces: GridSurface | None,
+        cost: Cost | None = None,
+        imagined: PointCloud | None = None,
+    ):
+        self.cloud, self.visited, self.num_visited = cloud, visited, num_visited
+        self.camera, self.score, self.surfaces = camera, score, surfaces
+        self.cost, self.imagined, self.context = cost, imagined, None
+        if imagined is not None:
+            self.context = jax.lax.map(lambda scan: score.context(concatenate(cloud, scan)), imagined)
+        elif surfaces is not None:
+            self.context = score.context(cloud)
+
+    def acquisition(self, poses: Pose, samples: slice = slice(None)) -> Float[Array, " poses"]:
+        """The acquisition at a batch of poses, estimated from all posterior samples or from a part of them."""
+        return jnp.mean(self.scores(poses, samples), axis=0)
+
+    def scores(self, poses: Pose, samples: slice = slice(None)) -> Float[Array, "samples poses"]:
+        """The scores whose mean is the acquisition, sample by sample; given the cost of going there, if that counts."""
+
+        def part(tree):
+            return jax.tree.map(lambda leaf: leaf[samples], tree)
+
+        own = self.imagined is not None
+        context = part(self.context) if own else self.context
+        return self.worth(sample_scores(self.score, context, part(self._sampled), self.camera, poses, own), poses)
+
+    def worth(self, values: Float[Array, "*samples poses"], poses: Pose) -> Float[Array, "*samples poses"]:
+        """Values of poses, given the cost of going there from the last view."""
+        if self.cost is None:
+            return values
+        here, of = jax.tree.map(lambda rows: rows[self.num_visited - 1], self.visited), self.cost.of
+        cost = jax.vmap(lambda pose: of(here, pose))(poses)
+        return self.cost(values, jnp.where(self.num_visited > 0, cost, 0.0))
+
+    @property
+    def num_samples(self) -> int:
+        """How many posterior samples there are."""
+        return self._sampled.values.shape[0]
+
+    @property
+    def _sampled(self) -> GridSurface:
+        if self.surfaces is None:
+            raise InputError("the acquisition needs posterior samples: set uses_samples = True on the search")
+        return self.surfaces
+
+    def is_visited(self, poses: Pose) -> Bool[Array, " poses"]:
+        """Whether each of a batch of poses equals one taken before, to 1e-3 in position and viewing direction."""
+        near = jnp.linalg.norm(poses.position[:, None] - self.visited.position[None], axis=-1) < 1e-3
+        aligned = jnp.linalg.norm(poses.forward[:, None] - self.visited.forward[None], axis=-1) < 1e-3
+        return jnp.any(near & aligned & self._is_filled, axis=1)
+
+    def distance_to_visited(self, poses: Pose) -> Float[Array, " poses"]:
+        """Distance from each of a batch of positions to the nearest one taken before; infinite if there is none."""
+        distance = jnp.linalg.norm(poses.position[:, None] - self.visited.position[None], axis=-1)
+        return jnp.min(jnp.where(self._is_filled, distance, jnp.inf), axis=1)
+
+    @property
+    def _is_filled(self) -> Bool[Array, " views"]:
+        return jnp.arange(self.visited.position.shape[0]) < self.num_visited
