@@ -84,6 +84,8 @@ from .surfaces import SurfacePosterior as SurfacePosterior
 from .surfaces import Thickness as Thickness
 from .surfaces import ValueSource as ValueSource
 from .surfaces import fit_hyperparameters as fit_hyperparameters
+from .surroundings import Surroundings as Surroundings
+from .surroundings import support_plane as support_plane
 from .tasks import ColdestPoint as ColdestPoint
 from .tasks import Coverage as Coverage
 from .tasks import CrossEntropy as CrossEntropy

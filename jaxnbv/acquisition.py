@@ -199,24 +199,29 @@ def check_differentiable(score: Score, capacity: int, num_rays: int) -> None:
 
 @checked
 def expected_score(
-    score: Score, cloud: PointCloud, surfaces: GridSurface, camera: Camera, poses: Pose
+    score: Score,
+    cloud: PointCloud,
+    surfaces: GridSurface,
+    camera: Camera,
+    poses: Pose,
+    barrier: Float[Array, "poses rays"] | None = None,
 ) -> Float[Array, "poses *scores"]:
     """The acquisition at each of a batch of poses: mean over the sampled surfaces of the score of what they would show.
 
-    `surfaces` carries the samples along its leading axis. `Several` scores have an axis of their own.
+    `surfaces` carries the samples along its leading axis; `barrier` is as of `scan`. `Several` scores have an axis of
+    their own.
     """
-    return mean_score(score, score.context(cloud), surfaces, camera, poses)
-
-
-def mean_score(
-    score: Score, context: Any, surfaces: GridSurface, camera: Camera, poses: Pose
-) -> Float[Array, "poses *scores"]:
-    """`expected_score`, given what the score's `context` made of D."""
-    return jnp.mean(sample_scores(score, context, surfaces, camera, poses), axis=0)
+    return jnp.mean(sample_scores(score, score.context(cloud), surfaces, camera, poses, barrier=barrier), axis=0)
 
 
 def sample_scores(
-    score: Score, context: Any, surfaces: GridSurface, camera: Camera, poses: Pose, own_contexts: bool = False
+    score: Score,
+    context: Any,
+    surfaces: GridSurface,
+    camera: Camera,
+    poses: Pose,
+    own_contexts: bool = False,
+    barrier: Float[Array, "poses rays"] | None = None,
 ) -> Float[Array, "samples poses *scores"]:
     """The score of what each of the sampled surfaces would show from each of a batch of poses.
 
@@ -224,10 +229,11 @@ def sample_scores(
     memory is that of one sample's scans.
 
     - `own_contexts`: the context has a leading axis of samples, one each.
+    - `barrier`: see `scan`.
     """
 
     def of_sample(surface: GridSurface, context: Any) -> Float[Array, "poses *scores"]:
-        scans = scan(surface, camera, poses)
+        scans = scan(surface, camera, poses, barrier)
         return jax.lax.map(lambda imagined: score(context, imagined), scans, batch_size=score.batch_size)
 
     if own_contexts:

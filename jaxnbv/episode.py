@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 from tqdm import tqdm
 
 from jaxnbv.camera import Camera
@@ -23,6 +23,7 @@ from jaxnbv.search import Proposal
 from jaxnbv.state import State
 from jaxnbv.stopping import Stop, Watch
 from jaxnbv.storage import EpisodeFolder, describe
+from jaxnbv.surroundings import Surroundings
 
 
 class View(eqx.Module):
@@ -146,7 +147,7 @@ def simulate(
                 bar.set_description(f"view {index + 1}/{views}, {stage}")
                 bar.update(index * len(STAGES) + STAGES.index(stage) - bar.n)
 
-            sensor = scene_sensor(scene, planner.camera, noise)
+            sensor = scene_sensor(scene, planner.camera, noise, planner.surroundings)
             watch = None if until is None else Watch(until, planner)
             episode = steps(planner, sensor, first, key, done=done, begin=begin, watch=watch)
             for index, (view, *_) in enumerate(itertools.islice(episode, views)):
@@ -229,9 +230,11 @@ def steps(
         yield Step(View(pose, seen, state.cloud, proposal), state, surfaces, seconds)
 
 
-def scene_sensor(scene: Surface, camera: Camera, noise: SensorNoise = SensorNoise()) -> Sensor:
-    """A camera that scans a known surface, with noise."""
-    return lambda pose, key: observe_scene(scene, camera, pose, noise, key)
+def scene_sensor(
+    scene: Surface, camera: Camera, noise: SensorNoise = SensorNoise(), surroundings: Surroundings | None = None
+) -> Sensor:
+    """A camera that scans a known surface, with noise, past what stands around it."""
+    return lambda pose, key: observe_scene(scene, camera, pose, noise, key, surroundings)
 
 
 def view_keys(key: PRNGKeyArray, index: int) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:
@@ -241,11 +244,33 @@ def view_keys(key: PRNGKeyArray, index: int) -> tuple[PRNGKeyArray, PRNGKeyArray
     return sample_key, search_key, noise_key
 
 
-def observe_scene(scene: Surface, camera: Camera, pose: Pose, noise: SensorNoise, key: PRNGKeyArray) -> PointCloud:
+def observe_scene(
+    scene: Surface,
+    camera: Camera,
+    pose: Pose,
+    noise: SensorNoise,
+    key: PRNGKeyArray,
+    surroundings: Surroundings | None = None,
+) -> PointCloud:
     """A noisy scan of the true surface, compiled where the surface allows it."""
-    return _noisy_scan(scene, camera, pose, noise, key) if scene.in_jit else noise(scan(scene, camera, pose), key)
+    barrier = None if surroundings is None else _barrier(surroundings, camera, pose)
+    if scene.in_jit:
+        return _noisy_scan(scene, camera, pose, barrier, noise, key)
+    return noise(scan(scene, camera, pose, barrier), key)
 
 
 @eqx.filter_jit
-def _noisy_scan(scene: Surface, camera: Camera, pose: Pose, noise: SensorNoise, key: PRNGKeyArray) -> PointCloud:
-    return noise(scan(scene, camera, pose), key)
+def _barrier(surroundings: Surroundings, camera: Camera, pose: Pose) -> Float[Array, " rays"] | None:
+    return surroundings.barrier(camera, pose)
+
+
+@eqx.filter_jit
+def _noisy_scan(
+    scene: Surface,
+    camera: Camera,
+    pose: Pose,
+    barrier: Float[Array, " rays"] | None,
+    noise: SensorNoise,
+    key: PRNGKeyArray,
+) -> PointCloud:
+    return noise(scan(scene, camera, pose, barrier), key)

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.acquisition import Score
 from jaxnbv.answers import Quantity
@@ -14,10 +14,12 @@ from jaxnbv.camera import Camera
 from jaxnbv.checks import check_fields, check_key, check_type, is_traced, require, shown
 from jaxnbv.cloud import PointCloud, limit_capacity
 from jaxnbv.pose import Pose
-from jaxnbv.scanning import Carving, Grid, GridSurface, carve, imagine, nothing_imagined
+from jaxnbv.sampling import carved, posterior_of, sample_surfaces
+from jaxnbv.scanning import Carving, Grid, GridSurface, imagine, nothing_imagined
 from jaxnbv.search import Batch, Problem, Proposal, Search
 from jaxnbv.state import State, check_scan, observe, record, seen_empty, with_visited
 from jaxnbv.surfaces import SurfaceModel, SurfacePosterior
+from jaxnbv.surroundings import Surroundings
 from jaxnbv.travel import Cost, arc_length
 
 
@@ -33,6 +35,7 @@ class Planner(eqx.Module):
     - `capacity`: points of D that are kept, by farthest point sampling beyond it.
     - `max_views`: views that a state has room for.
     - `cost`: `ValuePerCost` or `ValueMinusCost` of going from the last view to the next; None where it does not count.
+    - `surroundings`: what stands around the object, hides it, and keeps cameras out; None for nothing.
     - `carving`: what samples are cut by: space seen empty, on which the model is conditioned too where it can be, and
       the outside of a volume. None leaves samples as the model draws them from D, which is the paper's own behaviour.
 
@@ -52,6 +55,7 @@ class Planner(eqx.Module):
     max_views: int = eqx.field(static=True, default=32)
     carving: Carving | None = Carving()
     cost: Cost | None = None
+    surroundings: Surroundings | None = None
 
     def __check_init__(self):
         check_fields(self)
@@ -94,7 +98,7 @@ class Planner(eqx.Module):
             self.acquisition.check(kept)
             self.model.check(kept)
         state = State.before_views(kept, self.max_views, None if self.carving is None else self.grid)
-        return state if pose is None else record(self.carving, self.grid, state, pose, cloud, camera)
+        return state if pose is None else record(self.carving, self.grid, self.surroundings, state, pose, cloud, camera)
 
     def posterior(self, state: State) -> SurfacePosterior:
         """p(f | D, what was seen empty), of which `sample_surfaces` draws its samples before it carves them.
@@ -103,7 +107,7 @@ class Planner(eqx.Module):
         or without carving.
         """
         empty = seen_empty(state, self.grid, self.carving)
-        return _posterior(self.model, self.carving, self.grid, state.cloud, empty)
+        return posterior_of(self.model, self.carving, self.grid, state.cloud, empty)
 
     def carve(self, state: State, values: Float[Array, "*s g g g"]) -> Float[Array, "*s g g g"]:
         """Values of f minus its level at the grid's nodes, carved by what the state knows to be empty.
@@ -114,7 +118,7 @@ class Planner(eqx.Module):
         require(
             jnp.shape(values)[-3:] == nodes, f"the values are {shown(values)}, but the planner's grid has {nodes} nodes"
         )
-        return _carve(self.carving, self.grid, empty, values)
+        return carved(self.carving, self.grid, self.surroundings, empty, values)
 
     def sample_surfaces(
         self, state: State, key: PRNGKeyArray, posterior: SurfacePosterior | None = None
@@ -128,8 +132,8 @@ class Planner(eqx.Module):
         check_key(key)
         check_type(posterior, SurfacePosterior | None, "the posterior")
         empty = seen_empty(state, self.grid, self.carving)
-        surfaces = _sample_surfaces(
-            self.model, self.carving, self.grid, self.num_samples, state.cloud, empty, key, posterior
+        surfaces = sample_surfaces(
+            self.model, self.carving, self.grid, self.surroundings, self.num_samples, state.cloud, empty, key, posterior
         )
         if not is_traced(surfaces):
             require(
@@ -168,7 +172,9 @@ class Planner(eqx.Module):
         imagined = None if surfaces is None else nothing_imagined(surfaces, self.camera, count - 1)
         for index in range(count - 1):
             if surfaces is not None and imagined is not None:
-                imagined = imagine(imagined, surfaces, self.camera, proposals[-1].pose, jnp.asarray(index))
+                pose = proposals[-1].pose
+                barrier = self.barrier(pose[None])
+                imagined = imagine(imagined, surfaces, self.camera, pose, barrier, jnp.asarray(index))
             after = with_visited(state, [proposal.pose for proposal in proposals])
             proposals.append(self.choose(after, surfaces, jax.random.fold_in(search_key, index), imagined))
         seen = is_traced(state.num_views) or int(state.num_views) > 0
@@ -188,8 +194,10 @@ class Planner(eqx.Module):
         check_type(state, State, "the state")
         check_type(surfaces, GridSurface | None, "the surfaces")
         check_type(imagined, PointCloud | None, "what is imagined")
-        known = state.cloud, state.poses, state.num_views
-        proposal = _choose(self.search, self.acquisition, self.camera, *known, surfaces, key, self.cost, imagined)
+        half_extent = self.grid.half_extent
+        known = state.cloud, state.poses, state.num_views, surfaces, self.cost, imagined
+        around = self.surroundings, state.seen_empty, half_extent
+        proposal = _choose(self.search, self.acquisition, self.camera, known, around, key)
         if not is_traced(proposal):
             require(
                 not bool(jnp.isnan(proposal.value)) and (surfaces is None or bool(proposal.value < jnp.inf)),
@@ -198,9 +206,14 @@ class Planner(eqx.Module):
             )
             require(
                 bool(proposal.value > -jnp.inf),
-                f"all {proposal.values.shape[0]} candidates have been visited: give the search more candidates",
+                f"all {proposal.values.shape[0]} candidates have been visited, or no camera may stand there: give the "
+                "search more candidates",
             )
         return proposal
+
+    def barrier(self, poses: Pose) -> Float[Array, "poses rays"] | None:
+        """How far along the camera's rays from each of a batch of poses obstacles stand; None without any."""
+        return None if self.surroundings is None else self.surroundings.barrier(self.camera, poses)
 
     def observe(self, state: State, pose: Pose, scan: PointCloud, camera: Camera | None = None) -> State:
         """Tell: the state after a scan (scene coordinates) from a pose. A scan that saw nothing adds no points.
@@ -222,7 +235,7 @@ class Planner(eqx.Module):
                 f"the state holds {views} views and has room for no more: make it with a planner of "
                 f"Planner(max_views=...) greater than {room}",
             )
-        after = observe(self.carving, self.grid, state, pose, scan, camera)
+        after = observe(self.carving, self.grid, self.surroundings, state, pose, scan, camera)
         if self.search.uses_samples and not is_traced(after):
             self.grid.check(after.cloud)
         return after
@@ -245,51 +258,13 @@ def _in_words(value: Float[Array, ""]) -> str:
     return "not a number (NaN)" if jnp.isnan(value) else "infinite"
 
 
-# What is compiled takes what it uses, not the planner: another score or search does not compile the sampler again.
-
-
-def _posterior(
-    model: SurfaceModel, carving: Carving | None, grid: Grid, cloud: PointCloud, empty: Bool[Array, "g g g"] | None
-) -> SurfacePosterior:
-    if carving is None or empty is None:
-        return model.condition(cloud)
-    return model.condition_on_space(cloud, carving.empty_points(grid, empty))
-
-
-def _carve(
-    carving: Carving | None, grid: Grid, empty: Bool[Array, "g g g"] | None, values: Float[Array, "*s g g g"]
-) -> Float[Array, "*s g g g"]:
-    return values if carving is None or empty is None else carve(values, empty | carving.outside(grid))
-
-
-@eqx.filter_jit
-def _sample_surfaces(
-    model: SurfaceModel,
-    carving: Carving | None,
-    grid: Grid,
-    num_samples: int,
-    cloud: PointCloud,
-    empty: Bool[Array, "g g g"] | None,
-    key: PRNGKeyArray,
-    posterior: SurfacePosterior | None,
-) -> GridSurface:
-    posterior = _posterior(model, carving, grid, cloud, empty) if posterior is None else posterior
-    values = posterior.sample(key, num_samples).on_grid(grid.axis) - posterior.level
-    return GridSurface.from_values(_carve(carving, grid, empty, values), 0.0, grid)
+# As of `sampling`: another model does not compile the search again.
 
 
 @eqx.filter_jit
 def _choose(
-    search: Search,
-    acquisition: Score,
-    camera: Camera,
-    cloud: PointCloud,
-    visited: Pose,
-    num_visited: Int[Array, ""],
-    surfaces: GridSurface | None,
-    key: PRNGKeyArray,
-    cost: Cost | None,
-    imagined: PointCloud | None,
+    search: Search, acquisition: Score, camera: Camera, known: tuple, around: tuple, key: PRNGKeyArray
 ) -> Proposal:
-    problem = Problem(cloud, visited, num_visited, camera, acquisition, surfaces, cost, imagined)
+    cloud, visited, num_visited, surfaces, cost, imagined = known
+    problem = Problem(cloud, visited, num_visited, camera, acquisition, surfaces, cost, imagined, *around)
     return search.propose(problem, key)

@@ -23,6 +23,7 @@ from jaxnbv.search.base import CandidateSearch
 from jaxnbv.state import State, with_visited
 from jaxnbv.stopping import Stop, Watch
 from jaxnbv.storage import DepthImage, SessionFolder, describe
+from jaxnbv.surroundings import Surroundings
 from jaxnbv.viz import write_report
 from jaxnbv.volume import Box
 
@@ -58,6 +59,7 @@ class Session:
     - `camera`: the sensor, its range in world units.
     - `box`: two corners of a box about the object, without the table.
     - `up`: the world's axis that is upward, "y" or "z" say.
+    - `surroundings`: what stands around the object, in world units: `Surroundings((table,), margin=0.005)`, say.
     - `poses`: (n, 4, 4), where the sensor can be held; by default the candidates of the planner's search, in scene
       units about the box's centre.
     - `folder`: where images and proposals are kept before they are acted on; a session that was killed goes on from it.
@@ -84,6 +86,7 @@ class Session:
         stride: int | None = None,
         key: PRNGKeyArray | None = None,
         until: Stop | None = None,
+        surroundings: Surroundings | None = None,
     ):
         self.camera, self.convention = camera, convention
         self.box = box if isinstance(box, Box) else Box(*_corners(box))
@@ -93,6 +96,8 @@ class Session:
         check_key(self.key)
         allowed = None if poses is None else self.frame.to_scene(Pose.from_matrix(poses, convention))
         self.planner = planner_for(planner, self.frame.to_scene(camera), self.frame.to_scene(self.box), allowed)
+        if surroundings is not None:
+            self.planner = dataclasses.replace(self.planner, surroundings=surroundings.in_scene(self.frame))
         self._rays = camera.strided(self.stride)
         self._watch = None if until is None else Watch(until, self.planner)
         self._images: list[tuple[Pose, PointCloud, PointCloud]] = []
@@ -217,7 +222,8 @@ class Session:
         """Pose and scan of an image, in scene coordinates."""
         pose = Pose.from_matrix(image.matrix, self.convention)
         cloud = PointCloud.from_depth(image.depth, self.camera, pose, image.depth_scale, self.stride, self.box)
-        return self.frame.to_scene(pose), self.frame.to_scene(cloud)
+        scan, around = self.frame.to_scene(cloud), self.planner.surroundings
+        return self.frame.to_scene(pose), scan if around is None else around.without_obstacles(scan)
 
     def _after(self, pose: Pose, scan: PointCloud) -> State:
         camera = self.frame.to_scene(self._rays)
@@ -237,7 +243,7 @@ class Session:
         proposal = self.planner.choose(with_visited(self.state, proposed), surfaces, search_key)
         if surfaces is None:
             return proposal, None
-        depth = np.asarray(_expected_depth(surfaces, self.planner.camera, proposal.pose))
+        depth = np.asarray(_expected_depth(self.planner, surfaces, proposal.pose))
         return proposal, depth / self.frame.scale
 
     def _check_alone(self, folder: SessionFolder) -> None:
@@ -276,9 +282,10 @@ def planner_for(planner: Planner, camera: Camera, box: Box, poses: Pose | None) 
 
 
 @eqx.filter_jit
-def _expected_depth(surfaces: GridSurface, camera: Camera, pose: Pose) -> Float[Array, "h w"]:
+def _expected_depth(planner: Planner, surfaces: GridSurface, pose: Pose) -> Float[Array, "h w"]:
     """Mean depth along the camera's axis (scene units) over the samples that a ray hits; NaN where it misses most."""
-    scans = scan_samples(surfaces, camera, pose[None])
+    camera = planner.camera
+    scans = scan_samples(surfaces, camera, pose[None], planner.barrier(pose[None]))
     depth = jnp.einsum("spnd,d->sn", scans.points - pose.position, pose.forward, precision="highest")
     hit = scans.mask[:, 0]
     count = jnp.sum(hit, axis=0)

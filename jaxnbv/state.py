@@ -14,6 +14,7 @@ from jaxnbv.checks import check_type, is_traced, require
 from jaxnbv.cloud import PointCloud, check_single, concatenate, limit_capacity
 from jaxnbv.pose import Pose
 from jaxnbv.scanning import Carving, Grid, check_image
+from jaxnbv.surroundings import Surroundings
 
 
 class State(eqx.Module):
@@ -46,19 +47,37 @@ class State(eqx.Module):
 
 
 @eqx.filter_jit
-def observe(carving: Carving | None, grid: Grid, state: State, pose: Pose, scan: PointCloud, camera: Camera) -> State:
+def observe(
+    carving: Carving | None,
+    grid: Grid,
+    surroundings: Surroundings | None,
+    state: State,
+    pose: Pose,
+    scan: PointCloud,
+    camera: Camera,
+) -> State:
     """The state after a scan from a pose."""
     cloud = limit_capacity(concatenate(state.cloud, scan), state.cloud.capacity)
-    return record(carving, grid, eqx.tree_at(lambda s: s.cloud, state, cloud), pose, scan, camera)
+    state = eqx.tree_at(lambda s: s.cloud, state, cloud)
+    return record(carving, grid, surroundings, state, pose, scan, camera)
 
 
 @eqx.filter_jit
-def record(carving: Carving | None, grid: Grid, state: State, pose: Pose, scan: PointCloud, camera: Camera) -> State:
+def record(
+    carving: Carving | None,
+    grid: Grid,
+    surroundings: Surroundings | None,
+    state: State,
+    pose: Pose,
+    scan: PointCloud,
+    camera: Camera,
+) -> State:
     """The state after a view whose points it holds: where that was taken, and what it shows to be empty."""
     poses = jax.tree.map(lambda rows, row: rows.at[state.num_views].set(row), state.poses, pose)
     empty = state.seen_empty
     if carving is not None and empty is not None:
-        empty = empty | carving.seen_empty(grid, scan, camera, pose)
+        barrier = None if surroundings is None else surroundings.barrier(camera, pose)
+        empty = empty | carving.seen_empty(grid, scan, camera, pose, barrier)
     return State(state.cloud, poses, state.num_views + 1, empty, state.half_extent)
 
 

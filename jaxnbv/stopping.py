@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.acquisition import Score, expected_score
-from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError, check_fields, require, shown
 from jaxnbv.cloud import PointCloud
 from jaxnbv.planner import Planner
@@ -275,15 +274,17 @@ def expected_coverage(planner: Planner, state: State, key: PRNGKeyArray, radius:
     search = planner.search
     candidates = search.candidates if isinstance(search, CandidateSearch) else SphereCandidates()
     surfaces = planner.sample_surfaces(state, key)
-    near, seen = np.asarray(_seen_before(SeenBefore(radius), state.cloud, surfaces, planner.camera, candidates.poses()))
+    poses = candidates.poses()
+    near, seen = np.asarray(_seen_before(SeenBefore(radius), planner, state.cloud, surfaces, poses))
     return float(near / seen) if seen else 1.0
 
 
 @eqx.filter_jit
 def _seen_before(
-    score: SeenBefore, cloud: PointCloud, surfaces: GridSurface, camera: Camera, poses: Pose
+    score: SeenBefore, planner: Planner, cloud: PointCloud, surfaces: GridSurface, poses: Pose
 ) -> Float[Array, "2"]:
-    return jnp.sum(expected_score(score, cloud, surfaces, camera, poses), axis=0)
+    found = expected_score(score, cloud, surfaces, planner.camera, poses, planner.barrier(poses))
+    return jnp.sum(found, axis=0)
 
 
 @jax.jit

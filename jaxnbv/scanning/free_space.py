@@ -52,9 +52,19 @@ class Carving(eqx.Module):
             f"the margin of the carving is {self.margin} voxels; it must be finite and at least 0.5",
         )
 
-    def seen_empty(self, grid: Grid, scan: PointCloud, camera: Camera, pose: Pose) -> Bool[Array, "g g g"]:
-        """The nodes that one scan shows to be empty; none for a cloud that is no sensor's image."""
-        depth = _free_depth(scan, camera, pose)
+    def seen_empty(
+        self,
+        grid: Grid,
+        scan: PointCloud,
+        camera: Camera,
+        pose: Pose,
+        barrier: Float[Array, " rays"] | None = None,
+    ) -> Bool[Array, "g g g"]:
+        """The nodes that one scan shows to be empty; none for a cloud that is no sensor's image.
+
+        - `barrier`: how far along each ray something else than the object stands, beyond which nothing is known.
+        """
+        depth = _free_depth(scan, camera, pose, barrier)
         if depth is None:
             return jnp.zeros((grid.resolution,) * 3, bool)
         return _crossed(grid, depth, camera, pose, self.margin * grid.spacing)
@@ -148,12 +158,16 @@ def _pixels_off(scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, ""
     return jnp.where(jnp.any(scan.mask), jnp.nanmedian(off), 0.0)
 
 
-def _free_depth(scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, "h w"] | None:
+def _free_depth(
+    scan: PointCloud, camera: Camera, pose: Pose, barrier: Float[Array, " rays"] | None
+) -> Float[Array, "h w"] | None:
     """Depth along the camera's axis up to which each pixel's ray was empty; None for a cloud that is no image."""
     if scan.missed is None:
         return None
     along = jnp.matmul(scan.points - pose.position, pose.forward, precision="highest")
-    reach = jnp.inf if camera.farthest is None else camera.farthest
+    reach = jnp.asarray(jnp.inf if camera.farthest is None else camera.farthest)
+    if barrier is not None:
+        reach = jnp.minimum(reach, barrier / jnp.linalg.norm(camera.pixel_directions(), axis=-1))
     return jnp.where(scan.mask, along, jnp.where(scan.missed, reach, 0.0)).reshape(camera.height, camera.width)
 
 

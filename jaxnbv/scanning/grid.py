@@ -129,12 +129,14 @@ class GridSurface(Surface):
 
 
 @eqx.filter_jit
-def scan_samples(surfaces: GridSurface, camera: Camera, poses: Pose) -> PointCloud:
+def scan_samples(
+    surfaces: GridSurface, camera: Camera, poses: Pose, barrier: Float[Array, "poses rays"] | None = None
+) -> PointCloud:
     """What the camera sees of each of a batch of surfaces from each of a batch of poses.
 
-    For s surfaces and p poses, clouds with leading axes (s, p); rows as `scan` gives them.
+    For s surfaces and p poses, clouds with leading axes (s, p); rows as `scan` gives them, and `barrier` as it takes.
     """
-    return jax.lax.map(lambda surface: scan(surface, camera, poses), surfaces)
+    return jax.lax.map(lambda surface: scan(surface, camera, poses, barrier), surfaces)
 
 
 def nothing_imagined(surfaces: GridSurface, camera: Camera, scans: int) -> PointCloud:
@@ -146,10 +148,15 @@ def nothing_imagined(surfaces: GridSurface, camera: Camera, scans: int) -> Point
 
 @eqx.filter_jit
 def imagine(
-    imagined: PointCloud, surfaces: GridSurface, camera: Camera, pose: Pose, index: Int[Array, ""]
+    imagined: PointCloud,
+    surfaces: GridSurface,
+    camera: Camera,
+    pose: Pose,
+    barrier: Float[Array, "1 rays"] | None,
+    index: Int[Array, ""],
 ) -> PointCloud:
     """With the scan of an index, that of each surface from a pose."""
-    scans = scan_samples(surfaces, camera, pose[None])[:, 0]
+    scans = scan_samples(surfaces, camera, pose[None], barrier)[:, 0]
     scans = PointCloud(scans.points, scans.normals, scans.mask)
     start = index * camera.num_rays
     return jax.tree.map(

@@ -5,7 +5,7 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.camera import Camera
 from jaxnbv.checks import check_fields, checked, require
@@ -48,9 +48,13 @@ class SensorNoise(eqx.Module):
 
 
 @checked
-def scan(surface: Surface, camera: Camera, pose: Pose) -> PointCloud:
+def scan(
+    surface: Surface, camera: Camera, pose: Pose, barrier: Float[Array, "*batch rays"] | None = None
+) -> PointCloud:
     """What the camera sees of the surface from a pose: one row a pixel, missed where its ray hits nothing in its range,
     invalid where it hits what is too near, or too aslant.
+
+    - `barrier`: how far along each ray something else stands (`Surroundings.barrier`); what is behind is missed.
 
     Poses with leading axes give clouds with the same leading axes. Points are in scene coordinates; normals are unit
     and turned to the sensor. No noise: apply a `SensorNoise` to the result. Runs under `jit` where `surface.in_jit`.
@@ -60,6 +64,9 @@ def scan(surface: Surface, camera: Camera, pose: Pose) -> PointCloud:
     shape = origins.shape[:-1]
     mask = hits.mask.reshape(shape)
     points, normals = hits.points.reshape(*shape, 3), hits.normals.reshape(*shape, 3)
+    if barrier is not None:
+        mask = mask & (jnp.linalg.norm(points - origins, axis=-1) < barrier)
+        points, normals = (jnp.where(mask[..., None], rows, 0.0) for rows in (points, normals))
     if not camera.limited:
         return PointCloud(points, normals, mask, ~mask)
     depth = jnp.einsum("...rd,...d->...r", points - origins, pose.forward, precision="highest")

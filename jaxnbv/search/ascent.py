@@ -20,6 +20,9 @@ from jaxnbv.search.pose_space import PoseSpace
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal, Trajectories
 
+# In ranges of the candidates' values, for each scene unit.
+_PENALTY = 10.0
+
 
 class Ascent(eqx.Module):
     """Gradient ascent of the acquisition from the best of some candidates, all starts at once.
@@ -67,7 +70,7 @@ class Ascent(eqx.Module):
         """The best pose on the trajectories from the best candidates, or the best candidate if none is better."""
         scores = problem.scores(candidates)
         values = jnp.mean(scores, axis=0)
-        order = jnp.argsort(jnp.where(problem.is_visited(candidates), -jnp.inf, values), descending=True)
+        order = jnp.argsort(jnp.where(problem.is_closed(candidates), -jnp.inf, values), descending=True)
         # Solvers that search along a line expect differences of order one.
         scale = jnp.max(values) - jnp.min(values)
         scale = jnp.where(scale > 0, scale, 1.0)
@@ -88,7 +91,8 @@ class Ascent(eqx.Module):
             value = problem.acquisition(pose[None])[0]
             # A pose may hide that the gradient which led to it was not a number.
             value = jnp.where(jnp.isfinite(parameters).all(), value, jnp.nan)
-            return -value / scale, (pose, value)
+            # A pose where no camera may stand is never chosen; the penalty leads out of there.
+            return _PENALTY * problem.trespass(pose[None])[0] - value / scale, (pose, value)
 
         parameters = jnp.zeros(self.space.num_parameters, start.position.dtype)
         struct, aux_struct = jax.eval_shape(loss, parameters, None)

@@ -63,12 +63,12 @@ def best_unvisited(
     tie: float = _TIE,
     scores: Float[Array, "samples candidates"] | None = None,
 ) -> Proposal:
-    """The candidate of the highest value among those not visited yet; the first of them where values tie.
+    """The candidate of the highest value among those that are open; the first of them where values tie.
 
     `tie`: the relative difference within which they do, by default what sums differ by that are added in another order,
     on another number of cores. `scores`: those whose means the values are, for their standard errors.
     """
-    values = jnp.where(problem.is_visited(candidates), -jnp.inf, values)
+    values = jnp.where(problem.is_closed(candidates), -jnp.inf, values)
     best = jnp.max(values)
     # Nothing ties with an infinite value, and NaN is told of by the planner.
     tied = values >= best - jnp.where(jnp.isfinite(best), tie * jnp.abs(best), 0.0)

@@ -34,7 +34,7 @@ class HalvingSearch(CandidateSearch):
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """The best of the last round; the value of a candidate that left earlier is its mean until then."""
         candidates = self.candidates.poses()
-        is_visited = problem.is_visited(candidates)
+        is_closed = problem.is_closed(candidates)
         left = jnp.arange(self.candidates.count)
         totals = jnp.zeros(self.candidates.count, candidates.position.dtype)
         values, scored = totals, 0
@@ -44,6 +44,6 @@ class HalvingSearch(CandidateSearch):
             more = min(max(scored, self.first_samples), problem.num_samples - scored)
             means = problem.acquisition(candidates[left], slice(scored, scored + more))
             totals, scored = totals.at[left].add(more * means), scored + more
-            values = values.at[left].set(jnp.where(is_visited[left], -jnp.inf, totals[left] / scored))
+            values = values.at[left].set(jnp.where(is_closed[left], -jnp.inf, totals[left] / scored))
         best = left[jnp.argmax(values[left])]
         return Proposal(candidates[best], values[best], candidates, values)

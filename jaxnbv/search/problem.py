@@ -13,6 +13,7 @@ from jaxnbv.checks import InputError
 from jaxnbv.cloud import PointCloud, concatenate
 from jaxnbv.pose import Pose
 from jaxnbv.scanning import GridSurface
+from jaxnbv.surroundings import Surroundings
 from jaxnbv.travel import Cost
 
 
@@ -23,6 +24,8 @@ class Problem(eqx.Module):
     - `visited`: the poses taken so far in the first `num_visited` rows; the others hold nothing.
     - `surfaces`: the step's posterior samples along a leading axis; None for a search that does not ask for them.
     - `cost`: how the cost of going there counts against the value; None where it does not.
+    - `surroundings`: what stands around the object, and hides it; `empty`: the nodes of the grid that were seen empty,
+      and `half_extent` of that grid; None where they are not known.
     - `imagined`: what earlier views of a batch would show of each sample, along the same axis; None for a single view.
     - `context`: what the score makes of D, once, or of D and what is imagined, once a sample; None without samples.
     """
@@ -34,6 +37,9 @@ class Problem(eqx.Module):
     score: Score
     surfaces: GridSurface | None
     cost: Cost | None
+    surroundings: Surroundings | None
+    empty: Bool[Array, "g g g"] | None
+    half_extent: float | None = eqx.field(static=True)
     imagined: PointCloud | None
     context: Any
 
@@ -47,10 +53,14 @@ class Problem(eqx.Module):
         surfaces: GridSurface | None,
         cost: Cost | None = None,
         imagined: PointCloud | None = None,
+        surroundings: Surroundings | None = None,
+        empty: Bool[Array, "g g g"] | None = None,
+        half_extent: float | None = None,
     ):
         self.cloud, self.visited, self.num_visited = cloud, visited, num_visited
         self.camera, self.score, self.surfaces = camera, score, surfaces
         self.cost, self.imagined, self.context = cost, imagined, None
+        self.surroundings, self.empty, self.half_extent = surroundings, empty, half_extent
         if imagined is not None:
             self.context = jax.lax.map(lambda scan: score.context(concatenate(cloud, scan)), imagined)
         elif surfaces is not None:
@@ -68,7 +78,9 @@ class Problem(eqx.Module):
 
         own = self.imagined is not None
         context = part(self.context) if own else self.context
-        return self.worth(sample_scores(self.score, context, part(self._sampled), self.camera, poses, own), poses)
+        barrier = None if self.surroundings is None else self.surroundings.barrier(self.camera, poses)
+        values = sample_scores(self.score, context, part(self._sampled), self.camera, poses, own, barrier)
+        return self.worth(values, poses)
 
     def worth(self, values: Float[Array, "*samples poses"], poses: Pose) -> Float[Array, "*samples poses"]:
         """Values of poses, given the cost of going there from the last view."""
@@ -88,6 +100,19 @@ class Problem(eqx.Module):
         if self.surfaces is None:
             raise InputError("the acquisition needs posterior samples: set uses_samples = True on the search")
         return self.surfaces
+
+    def is_closed(self, poses: Pose) -> Bool[Array, " poses"]:
+        """Whether each of a batch of poses was taken before, or a camera may not stand there."""
+        visited = self.is_visited(poses)
+        if self.surroundings is None:
+            return visited
+        return visited | self.surroundings.is_closed(poses, self.cloud, self.empty, self.half_extent)
+
+    def trespass(self, poses: Pose) -> Float[Array, " poses"]:
+        """By how much each of a batch of cameras is too near to things, see `Surroundings.trespass`."""
+        if self.surroundings is None:
+            return jnp.zeros(poses.position.shape[:-1], poses.position.dtype)
+        return self.surroundings.trespass(poses, self.cloud)
 
     def is_visited(self, poses: Pose) -> Bool[Array, " poses"]:
         """Whether each of a batch of poses equals one taken before, to 1e-3 in position and viewing direction."""

@@ -84,7 +84,9 @@ def step_values(episode: Episode, index: int, poses: Pose) -> Float[np.ndarray, 
     planner, state = episode.planner, episode.state_after(index)
     sample_key, *_ = view_keys(episode.key, index)
     surfaces = planner.sample_surfaces(state, sample_key)
-    return np.asarray(_expected(planner.acquisition, state.cloud, surfaces, planner.camera, poses), dtype=np.float64)
+    barrier = planner.barrier(poses)
+    found = _expected(planner.acquisition, state.cloud, surfaces, planner.camera, poses, barrier)
+    return np.asarray(found, dtype=np.float64)
 
 
 _expected = eqx.filter_jit(expected_score)

@@ -1,4 +1,4 @@
-"""Analytic signed distance functions and constructive solid geometry of them.
+"""Signed distance functions, moved and combined (constructive solid geometry).
 
 A signed distance function is negative inside the solid. All functions here have slopes of at most one, so their
 magnitude never exceeds the distance to the surface and a ray may stride by it (Hart 1996). Each class says whether it
@@ -54,23 +54,23 @@ def _norm_jvp(components, tangents):
     return length, sum(inverse * c * dc for c, dc in zip(components, tangents, strict=True))
 
 
-def _split(x):
+def split(x):
     return x[..., 0], x[..., 1], x[..., 2]
 
 
 # Selections rather than jnp.minimum and jnp.maximum, whose derivatives share out ties at many times the cost.
-def _least(a, b):
+def least(a, b):
     return jnp.where(a <= b, a, b)
 
 
-def _greatest(a, b):
+def greatest(a, b):
     return jnp.where(a >= b, a, b)
 
 
 def corner_distance(*q):
     """Signed distance to the corner, edge or face where all q <= 0, given the signed distances q to its faces."""
-    outside = norm(*(_greatest(c, 0.0) for c in q))
-    return outside + _least(functools.reduce(_greatest, q), 0.0)
+    outside = norm(*(greatest(c, 0.0) for c in q))
+    return outside + least(functools.reduce(greatest, q), 0.0)
 
 
 class SignedDistance(eqx.Module):
@@ -93,9 +93,11 @@ class SignedDistance(eqx.Module):
                 check_type(value, SignedDistance, name)
             if not eqx.is_array(value):
                 continue
-            shape = tuple(int(size) for size in cast(Any, field.type).dim_str.split())
+            # A letter stands for any length.
+            shape = tuple(int(n) if n.isdigit() else n for n in cast(Any, field.type).dim_str.split())
             require(
-                value.shape == shape,
+                len(value.shape) == len(shape)
+                and all(isinstance(n, str) or n == size for n, size in zip(shape, value.shape, strict=True)),
                 f"{name} has shape {value.shape}, not {shape}: for a batch of solids build it inside jax.vmap",
             )
             if not is_traced(value):
@@ -140,97 +142,6 @@ class SignedDistance(eqx.Module):
         return Difference(self, other)
 
 
-class Sphere(SignedDistance):
-    """The ball of `radius` about the origin. Exact."""
-
-    radius: Scalar = nonnegative()
-
-    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        return norm(*_split(x)) - self.radius
-
-
-class Box(SignedDistance):
-    """The box [-half_size, half_size] with edges rounded by `rounding`, which leaves its outer size as it is. Exact.
-
-    **Raises:** `ValueError` also if the rounding is greater than half of a side.
-    """
-
-    half_size: Vector = nonnegative()
-    rounding: Scalar = nonnegative(default=0.0)
-
-    def __check_init__(self):
-        if not is_traced(self):
-            require(
-                bool((self.rounding <= self.half_size).all()),
-                f"a box of half sizes {self.half_size} cannot be rounded by {self.rounding}: round it by less",
-            )
-
-    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        return corner_distance(*_split(jnp.abs(x) - (self.half_size - self.rounding))) - self.rounding
-
-
-class Cylinder(SignedDistance):
-    """The solid cylinder about the y axis with flat caps at y = -half_height and half_height. Exact."""
-
-    radius: Scalar = nonnegative()
-    half_height: Scalar = nonnegative()
-
-    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        x, y, z = _split(x)
-        return corner_distance(norm(x, z) - self.radius, jnp.abs(y) - self.half_height)
-
-
-class Cone(SignedDistance):
-    """The solid cone about the y axis, capped flat: radii at y = -half_height and y = half_height. Exact."""
-
-    bottom_radius: Scalar = nonnegative()
-    top_radius: Scalar = nonnegative()
-    half_height: Scalar = nonnegative()
-
-    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        # The profile in the half plane (r, y): two caps, a slanted edge from the bottom's corner to the top's.
-        x, y, z = _split(x)
-        r = norm(x, z)
-        widening, rise = self.top_radius - self.bottom_radius, 2.0 * self.half_height
-        slant = norm(widening, rise)
-        out, up = r - self.bottom_radius, y + self.half_height
-        side = (rise * out - widening * up) / slant
-        along = (widening * out + rise * up) / slant
-        cap = jnp.abs(y) - self.half_height
-        inside = _greatest(side, cap)
-        bottom, top = norm(out, up), norm(r - self.top_radius, y - self.half_height)
-        outside = jnp.where(along < 0, bottom, jnp.where(along > slant, top, inside))
-        over_cap = (cap > 0) & (r < jnp.where(y > 0, self.top_radius, self.bottom_radius))
-        return jnp.where(over_cap, cap, jnp.where(inside > 0, outside, inside))
-
-
-class Torus(SignedDistance):
-    """The torus about the y axis: a tube of `minor_radius` around the circle of `major_radius`. Exact."""
-
-    major_radius: Scalar = nonnegative()
-    minor_radius: Scalar = nonnegative()
-
-    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        x, y, z = _split(x)
-        return norm(norm(x, z) - self.major_radius, y) - self.minor_radius
-
-
-class Capsule(SignedDistance):
-    """All points within `radius` of the segment from `start` to `end`. Exact."""
-
-    start: Vector = parameter()
-    end: Vector = parameter()
-    radius: Scalar = nonnegative()
-
-    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        segment = self.end - self.start
-        squared = jnp.sum(segment**2)
-        offset = _split(x - self.start)
-        along = sum(c * d for c, d in zip(offset, segment, strict=True)) / jnp.where(squared > 0, squared, 1.0)
-        nearest = jnp.clip(along, 0.0, 1.0)
-        return norm(*(c - nearest * d for c, d in zip(offset, segment, strict=True))) - self.radius
-
-
 class Union(SignedDistance):
     """The union, min(a, b). Exact outside, a bound inside."""
 
@@ -238,7 +149,7 @@ class Union(SignedDistance):
     second: SignedDistance
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        return _least(self.first(x), self.second(x))
+        return least(self.first(x), self.second(x))
 
 
 class SmoothUnion(SignedDistance):
@@ -253,8 +164,8 @@ class SmoothUnion(SignedDistance):
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         a, b = self.first(x), self.second(x)
-        overlap = _greatest(self.width - jnp.abs(a - b), 0.0)
-        return _least(a, b) - overlap**2 / jnp.where(self.width > 0, 4.0 * self.width, 1.0)
+        overlap = greatest(self.width - jnp.abs(a - b), 0.0)
+        return least(a, b) - overlap**2 / jnp.where(self.width > 0, 4.0 * self.width, 1.0)
 
 
 class Intersection(SignedDistance):
@@ -264,7 +175,7 @@ class Intersection(SignedDistance):
     second: SignedDistance
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        return _greatest(self.first(x), self.second(x))
+        return greatest(self.first(x), self.second(x))
 
 
 class Difference(SignedDistance):
@@ -274,7 +185,7 @@ class Difference(SignedDistance):
     second: SignedDistance
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        return _greatest(self.first(x), -self.second(x))
+        return greatest(self.first(x), -self.second(x))
 
 
 class Translated(SignedDistance):

@@ -1,0 +1,126 @@
+"""Solids by their signed distance functions."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.scanning.sdf.base import (
+    Scalar,
+    SignedDistance,
+    Vector,
+    corner_distance,
+    greatest,
+    nonnegative,
+    norm,
+    parameter,
+    split,
+)
+
+
+class Sphere(SignedDistance):
+    """The ball of `radius` about the origin. Exact."""
+
+    radius: Scalar = nonnegative()
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        return norm(*split(x)) - self.radius
+
+
+class Box(SignedDistance):
+    """The box [-half_size, half_size] with edges rounded by `rounding`, which leaves its outer size as it is. Exact.
+
+    **Raises:** `ValueError` also if the rounding is greater than half of a side.
+    """
+
+    half_size: Vector = nonnegative()
+    rounding: Scalar = nonnegative(default=0.0)
+
+    def __check_init__(self):
+        if not is_traced(self):
+            require(
+                bool((self.rounding <= self.half_size).all()),
+                f"a box of half sizes {self.half_size} cannot be rounded by {self.rounding}: round it by less",
+            )
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        return corner_distance(*split(jnp.abs(x) - (self.half_size - self.rounding))) - self.rounding
+
+
+class Cylinder(SignedDistance):
+    """The solid cylinder about the y axis with flat caps at y = -half_height and half_height. Exact."""
+
+    radius: Scalar = nonnegative()
+    half_height: Scalar = nonnegative()
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        x, y, z = split(x)
+        return corner_distance(norm(x, z) - self.radius, jnp.abs(y) - self.half_height)
+
+
+class Cone(SignedDistance):
+    """The solid cone about the y axis, capped flat: radii at y = -half_height and y = half_height. Exact."""
+
+    bottom_radius: Scalar = nonnegative()
+    top_radius: Scalar = nonnegative()
+    half_height: Scalar = nonnegative()
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        # The profile in the half plane (r, y): two caps, a slanted edge from the bottom's corner to the top's.
+        x, y, z = split(x)
+        r = norm(x, z)
+        widening, rise = self.top_radius - self.bottom_radius, 2.0 * self.half_height
+        slant = norm(widening, rise)
+        out, up = r - self.bottom_radius, y + self.half_height
+        side = (rise * out - widening * up) / slant
+        along = (widening * out + rise * up) / slant
+        cap = jnp.abs(y) - self.half_height
+        inside = greatest(side, cap)
+        bottom, top = norm(out, up), norm(r - self.top_radius, y - self.half_height)
+        outside = jnp.where(along < 0, bottom, jnp.where(along > slant, top, inside))
+        over_cap = (cap > 0) & (r < jnp.where(y > 0, self.top_radius, self.bottom_radius))
+        return jnp.where(over_cap, cap, jnp.where(inside > 0, outside, inside))
+
+
+class Torus(SignedDistance):
+    """The torus about the y axis: a tube of `minor_radius` around the circle of `major_radius`. Exact."""
+
+    major_radius: Scalar = nonnegative()
+    minor_radius: Scalar = nonnegative()
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        x, y, z = split(x)
+        return norm(norm(x, z) - self.major_radius, y) - self.minor_radius
+
+
+class Capsule(SignedDistance):
+    """All points within `radius` of the segment from `start` to `end`. Exact."""
+
+    start: Vector = parameter()
+    end: Vector = parameter()
+    radius: Scalar = nonnegative()
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        segment = self.end - self.start
+        squared = jnp.sum(segment**2)
+        offset = split(x - self.start)
+        along = sum(c * d for c, d in zip(offset, segment, strict=True)) / jnp.where(squared > 0, squared, 1.0)
+        nearest = jnp.clip(along, 0.0, 1.0)
+        return norm(*(c - nearest * d for c, d in zip(offset, segment, strict=True))) - self.radius
+
+
+class HalfSpace(SignedDistance):
+    """All that lies below a plane through `point`, whose `normal` points out of it: a table, a wall. Exact.
+
+    **Raises:** `ValueError` also if the normal is zero.
+    """
+
+    point: Vector = parameter()
+    normal: Vector = parameter()
+
+    def __check_init__(self):
+        if not is_traced(self.normal):
+            require(bool(norm(*self.normal) > 0), f"the plane's normal is {self.normal}: give a direction")
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        unit = self.normal / norm(*self.normal)
+        return sum(c * d for c, d in zip(split(x - self.point), unit, strict=True))
