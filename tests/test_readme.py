@@ -54,23 +54,61 @@ def test_the_script_runs_as_written(tmp_path):
     assert (tmp_path / "runs" / "spot" / "cloud.ply").exists()
 
 
-def test_the_block_for_a_depth_camera_runs():
-    """A ball of 0.1 metres on a table, z up, seen from 0.9 metres."""
-    matrix = np.array([[600.0, 0.0, 325.0], [0.0, 605.0, 236.0], [0.0, 0.0, 1.0]])
-    camera = nbv.Camera.from_intrinsics(matrix, 640, 480)
-    pose = nbv.look_at((0.6, -0.6, 0.4), (0.0, 0.0, 0.1), up=(0.0, 0.0, 1.0))
+INTRINSICS = np.array([[600.0, 0.0, 325.0], [0.0, 605.0, 236.0], [0.0, 0.0, 1.0]])
+CORNERS = {"low": (-0.15, -0.15, 0.005), "high": (0.15, 0.15, 0.255)}
+
+
+def image_of_a_ball(matrix):
+    """Of 0.1 metres on a table, z up; in millimetres."""
+    camera, pose = nbv.Camera.from_intrinsics(INTRINSICS, 640, 480), nbv.Pose.from_matrix(matrix)
     solid = nbv.sdf.Sphere(0.1).translate([0.0, 0.0, 0.1]) | nbv.sdf.Box([1.0, 1.0, 0.05]).translate([0.0, 0.0, -0.05])
     seen = nbv.scan(nbv.SDFSurface(solid), camera, pose)
     depth = (np.asarray(seen.points) - np.asarray(pose.position)) @ np.asarray(pose.forward)
+    return np.where(seen.mask, np.round(1000 * depth), 0).astype(np.uint16).reshape(480, 640)
+
+
+def poses_about_a_ball(count):
+    angle = 2.0 * np.pi * np.arange(count) / count
+    places = np.stack([0.8 * np.cos(angle), 0.8 * np.sin(angle), 0.3 + 0.2 * (np.arange(count) % 2)], axis=1)
+    return np.asarray(nbv.look_at(places, (0.0, 0.0, 0.1), up=(0.0, 0.0, 1.0)).matrix)
+
+
+def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
+    """Until the ball is expected to be covered, and on from the folder that it leaves."""
+    monkeypatch.chdir(tmp_path)
+    poses = poses_about_a_ball(10)
+    model, search = nbv.ScreenedSPSR(), nbv.DiscreteSearch()
+    given = {
+        "nbv": nbv,
+        "K": INTRINSICS,
+        **CORNERS,
+        "reachable": poses,
+        "first": poses[0],
+        "take_image": image_of_a_ball,
+        "planner": nbv.Planner(model, nbv.Camera(height=24, width=32), nbv.Coverage(), search, 3, nbv.Grid(40), 2048),
+    }
+    (block,) = (block for block in python_blocks() if "nbv.Session(" in block)
+    exec(block, given)
+    session = given["session"]
+    assert 3 <= session.views < 10
+    assert "expected to be covered" in session.done
+    assert (tmp_path / "live" / "report.html").exists()
+    points, _ = session.cloud.to_numpy()
+    assert np.abs(np.linalg.norm(points - [0.0, 0.0, 0.1], axis=1) - 0.1).max() < 0.01
+    assert points[:, 0].min() < -0.08
+    assert points[:, 0].max() > 0.08
+
+
+def test_the_block_for_a_depth_camera_runs():
+    pose = nbv.look_at((0.6, -0.6, 0.4), (0.0, 0.0, 0.1), up=(0.0, 0.0, 1.0))
     small = nbv.GeometricSPSR(0.05, 0.2, 8), nbv.Camera(height=12, width=12), nbv.Coverage(), nbv.DiscreteSearch(12)
     given = {
         "nbv": nbv,
         "np": np,
-        "K": matrix,
+        "camera": nbv.Camera.from_intrinsics(INTRINSICS, 640, 480),
         "T": np.asarray(pose.matrix),
-        "low": (-0.15, -0.15, 0.005),
-        "high": (0.15, 0.15, 0.255),
-        "depth_mm": np.where(seen.mask, np.round(1000 * depth), 0).astype(np.uint16).reshape(480, 640),
+        **CORNERS,
+        "depth_mm": image_of_a_ball(pose.matrix),
         "planner": nbv.Planner(*small, num_samples=2, grid=nbv.Grid(24)),
         "key": jax.random.key(0),
     }
@@ -87,7 +125,7 @@ def test_the_block_for_a_depth_camera_runs():
 
 def test_the_other_blocks_run():
     for block in python_blocks()[1:]:
-        if "depth_mm" not in block:
+        if "depth_mm" not in block and "nbv.Session(" not in block:
             exec(block, {"nbv": nbv, "jax": jax, "source": np.array([0.0, 1.25, 0.0])})
 
 
