@@ -33,19 +33,20 @@ class View(eqx.Module):
     - `scan`: what it saw, noise included; one row a pixel.
     - `cloud`: D after this view.
     - `proposal`: what the search looked at; None for the first view, which was given.
+    - `camera`: which took it, in scene units; None for the planner's.
     """
 
     pose: Pose
     scan: PointCloud
     cloud: PointCloud
     proposal: Proposal | None
+    camera: Camera | None = None
 
 
 class Episode(eqx.Module):
     """Views that a planner chose of a scene, and what they depend on.
 
     - `scene`, `noise`: None where a real sensor took the views.
-    - `camera`: which did, in scene units; None for the planner's.
     - `stopped`: why there are not as many views as were asked for; None where there are.
     """
 
@@ -55,7 +56,6 @@ class Episode(eqx.Module):
     first: Pose
     key: PRNGKeyArray
     views: tuple[View, ...]
-    camera: Camera | None = None
     stopped: str | None = None
 
     @property
@@ -65,7 +65,7 @@ class Episode(eqx.Module):
 
     def states(self) -> Iterator[State]:
         """The planner's state after each view, made again from the scans."""
-        return self.planner.replay(((view.pose, view.scan) for view in self.views), self.camera)
+        return self.planner.replay((view.pose, view.scan, view.camera) for view in self.views)
 
     def state_after(self, views: int) -> State:
         """The planner's state after so many of the views.

@@ -240,17 +240,20 @@ class Planner(eqx.Module):
             self.grid.check(after.cloud)
         return after
 
-    def replay(self, views: Iterable[tuple[Pose, PointCloud]], camera: Camera | None = None) -> Iterator[State]:
-        """The state after each of some views, poses and scans: `init` with the first, then `observe`.
+    def replay(
+        self, views: Iterable[tuple[Pose, PointCloud] | tuple[Pose, PointCloud, Camera | None]]
+    ) -> Iterator[State]:
+        """The state after each of some views, poses and scans: `init` with the first, then `observe`. A third says
+        which camera took a scan.
 
         **Raises:** `ValueError` as these do.
         """
         state = None
         for view in views:
-            pair = isinstance(view, tuple | list) and len(view) == 2
-            require(pair, f"a view is {shown(view)}; give pairs of a pose and a scan")
-            pose, scan = view
-            state = self.init(scan, pose, camera) if state is None else self.observe(state, pose, scan, camera)
+            known = isinstance(view, tuple | list) and len(view) in (2, 3)
+            require(known, f"a view is {shown(view)}; give pairs of a pose and a scan")
+            pose, scan, *camera = view
+            state = self.init(scan, pose, *camera) if state is None else self.observe(state, pose, scan, *camera)
             yield state
 
 

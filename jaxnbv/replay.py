@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxnbv.at_sensor import stride_of
 from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError, checked, require
 from jaxnbv.cloud import PointCloud
@@ -30,8 +31,8 @@ class StoredSession:
         self._folder = open_session(folder)
         config = self._folder.config
         try:
-            camera, box = _fields(config["camera"]), _fields(config["box"])
-            self.camera, self.box = Camera(**{**camera, "center": tuple(camera["center"])}), Box(**box)
+            self.cameras = tuple(_camera(camera) for camera in config["cameras"])
+            self.box = Box(**_fields(config["box"]))
             self.up, self.convention, self.stride = (config[name] for name in ("up", "convention", "stride"))
         except (KeyError, TypeError) as error:
             raise InputError(f"{self._folder.record} does not say what the sensor was ({error!r})") from error
@@ -50,7 +51,9 @@ class StoredSession:
         """Pose and scan of the first image, in scene coordinates."""
         image = self.image(0)
         pose = Pose.from_matrix(image.matrix, self.convention)
-        cloud = PointCloud.from_depth(image.depth, self.camera, pose, image.depth_scale, self.stride, self.box)
+        camera = self.cameras[image.camera]
+        stride = stride_of(camera) if self.stride is None else self.stride
+        cloud = PointCloud.from_depth(image.depth, camera, pose, image.depth_scale, stride, self.box)
         return self.frame.to_scene(pose), self.frame.to_scene(cloud)
 
     def candidates(self) -> Float[np.ndarray, "n 4 4"] | None:
@@ -74,7 +77,7 @@ class StoredSession:
             out is None or Path(out).resolve() != self._folder.path.resolve(),
             f"{out} holds the session that is to be replayed: choose another folder",
         )
-        sensor = {"camera": self.camera, "box": self.box, "up": self.up, "convention": self.convention}
+        sensor = {"camera": self.cameras, "box": self.box, "up": self.up, "convention": self.convention}
         poses = self.candidates() if isinstance(planner.search, CandidateSearch) else None
         settings: dict[str, Any] = {**sensor, "stride": self.stride, "poses": poses, "folder": out}
         session = Session(planner, **settings)
@@ -84,6 +87,11 @@ class StoredSession:
         for index in range(session.views, self.views):
             session.add(*self.image(index))
             yield session, session.next()
+
+
+def _camera(description: dict[str, Any]) -> Camera:
+    fields = _fields(description)
+    return Camera(**{**fields, "center": tuple(fields["center"])})
 
 
 def _fields(description: dict[str, Any]) -> dict[str, Any]:

@@ -1,25 +1,22 @@
 """A live session: depth images of a real sensor in, where to take the next one out, in the user's own world."""
 
 import dataclasses
-import math
 from pathlib import Path
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray, Real
+from jaxtyping import Float, PRNGKeyArray, Real
 
+from jaxnbv.at_sensor import expected_depth, planner_at, stride_of
 from jaxnbv.camera import Camera
-from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, checked, require, shown
+from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, check_type, checked, require, shown
 from jaxnbv.cloud import PointCloud
 from jaxnbv.episode import Episode, View, view_keys
 from jaxnbv.frame import Frame
 from jaxnbv.planner import Planner
 from jaxnbv.pose import Pose
-from jaxnbv.scanning import GridSurface, scan_samples
-from jaxnbv.search import GivenPoses, Proposal
-from jaxnbv.search.base import CandidateSearch
+from jaxnbv.search import Proposal
 from jaxnbv.state import State, with_visited
 from jaxnbv.stopping import Stop, Watch
 from jaxnbv.storage import DepthImage, SessionFolder, describe
@@ -27,8 +24,6 @@ from jaxnbv.surroundings import Surroundings
 from jaxnbv.viz import write_report
 from jaxnbv.volume import Box
 
-# A cloud holds some thousands of points; more rays than these only take time.
-_MOST_RAYS = 20_000
 _NO_IMAGE = "the session has no image yet: add one first, session.add(depth, matrix)"
 
 
@@ -56,7 +51,7 @@ class Session:
     - `planner`: in scene coordinates, as for a simulation. The scene is the box, scaled; the planner's camera is
       replaced by the sensor's with the planner's number of pixels, and what it holds for the default volume, `Box()`,
       by the box.
-    - `camera`: the sensor, its range in world units.
+    - `camera`: the sensor, its range in world units; or several, of a rig, of which the first is planned for.
     - `box`: two corners of a box about the object, without the table.
     - `up`: the world's axis that is upward, "y" or "z" say.
     - `surroundings`: what stands around the object, in world units: `Surroundings((table,), margin=0.005)`, say.
@@ -77,7 +72,7 @@ class Session:
     def __init__(
         self,
         planner: Planner,
-        camera: Camera,
+        camera: Camera | tuple | list,
         box: tuple | list | Box | AnyArray,
         up: str = "y",
         poses: Float[AnyArray, "n 4 4"] | None = None,
@@ -88,19 +83,25 @@ class Session:
         until: Stop | None = None,
         surroundings: Surroundings | None = None,
     ):
-        self.camera, self.convention = camera, convention
+        self.cameras = tuple(camera) if isinstance(camera, tuple | list) else (camera,)
+        require(len(self.cameras) > 0, "the session has no camera: give one")
+        for one in self.cameras:
+            check_type(one, Camera, "a camera of the session")
+        self.convention = convention
         self.box = box if isinstance(box, Box) else Box(*_corners(box))
         self.frame = Frame.fit(np.array([self.box.low, self.box.high]), up=up)
-        self.stride = math.ceil(math.sqrt(camera.num_rays / _MOST_RAYS)) if stride is None else stride
+        self.stride = stride
         self.key = jax.random.key(0) if key is None else key
         check_key(self.key)
         allowed = None if poses is None else self.frame.to_scene(Pose.from_matrix(poses, convention))
-        self.planner = planner_for(planner, self.frame.to_scene(camera), self.frame.to_scene(self.box), allowed)
+        sensor, volume = self.frame.to_scene(self.cameras[0]), self.frame.to_scene(self.box)
+        self.planner = planner_at(planner, sensor, volume, allowed)
         if surroundings is not None:
             self.planner = dataclasses.replace(self.planner, surroundings=surroundings.in_scene(self.frame))
-        self._rays = camera.strided(self.stride)
+        self._strides = tuple(stride_of(one) if stride is None else stride for one in self.cameras)
+        self._rays = tuple(one.strided(n) for one, n in zip(self.cameras, self._strides, strict=True))
         self._watch = None if until is None else Watch(until, self.planner)
-        self._images: list[tuple[Pose, PointCloud, PointCloud]] = []
+        self._views: list[View] = []
         self._proposals: dict[int, Proposal] = {}
         self._next: NextView | None = None
         self._state: State | None = None
@@ -109,12 +110,13 @@ class Session:
             for index in range(self._folder.count_images()):
                 if (known := self._folder.read_proposal(index)) is not None:
                     self._proposals[index] = known[0]
-                self._take(*self._seen(self._folder.read_image(index)))
+                image = self._folder.read_image(index)
+                self._take(*self._seen(image), image.camera)
 
     @property
     def views(self) -> int:
         """How many images there are so far."""
-        return len(self._images)
+        return len(self._views)
 
     @property
     def state(self) -> State:
@@ -140,14 +142,8 @@ class Session:
 
         **Raises:** `ValueError` before the first image.
         """
-        views = tuple(
-            View(pose, scan, cloud, self._proposals.get(index))
-            for index, (pose, scan, cloud) in enumerate(self._images)
-        )
-        if not views:
-            raise InputError(_NO_IMAGE)
-        camera = self.frame.to_scene(self._rays)
-        return Episode(self.planner, None, None, views[0].pose, self.key, views, camera)
+        require(self.views > 0, _NO_IMAGE)
+        return Episode(self.planner, None, None, self._views[0].pose, self.key, tuple(self._views))
 
     @property
     def done(self) -> str | None:
@@ -155,35 +151,42 @@ class Session:
 
         **Raises:** `ValueError` as `next` does, if the rule is about what the next view is worth.
         """
-        if self._watch is None or not self._images:
+        if self._watch is None or not self._views:
             return None
         key, *_ = view_keys(self.key, self.views)
-        poses = [pose for pose, *_ in self._images]
+        poses = [view.pose for view in self._views]
         enough = self._watch.after(self.state, poses, key)
         return enough or self._watch.before(self.state, poses, key, self.next().proposal)
 
     @checked
     def add(
-        self, depth: Real[AnyArray, "height width"], matrix: Float[AnyArray, "4 4"] | list, depth_scale: float = 1.0
+        self,
+        depth: Real[AnyArray, "height width"],
+        matrix: Float[AnyArray, "4 4"] | list,
+        depth_scale: float = 1.0,
+        camera: int = 0,
     ) -> None:
         """Take in an image, which is stored first.
 
         - `depth`: see `PointCloud.from_depth`; `depth_scale` times it is in world units: 0.001 for millimetres where
           the world is in metres.
         - `matrix`: where the camera truly was, which need not be what was proposed.
+        - `camera`: which of a rig's cameras it is of.
 
         **Raises:** `ValueError` as `PointCloud.from_depth`, `Pose.from_matrix`, `Planner.init` and `observe` do, or if
         another process has added images to the folder. Nothing is changed then.
         """
         pixels = as_numbers(depth, "the depth image", None)
-        image = DepthImage(pixels, as_numbers(matrix, "the matrix of a pose", np.float64), depth_scale)
+        count = len(self.cameras)
+        require(0 <= camera < count, f"the session has {count} cameras, counted from 0: there is no camera {camera}")
+        image = DepthImage(pixels, as_numbers(matrix, "the matrix of a pose", np.float64), depth_scale, camera)
         pose, scan = self._seen(image)
-        state = self._after(pose, scan)
+        state = self._after(pose, scan, camera)
         if self._folder is not None:
             with self._folder.writing():
                 self._check_alone(self._folder)
                 self._folder.write_image(self.views, image)
-        self._take(pose, scan, state)
+        self._take(pose, scan, camera, state)
 
     def next(self) -> NextView:
         """Where to take the next image. It is stored, and the same until an image is added; what was proposed once is
@@ -215,25 +218,27 @@ class Session:
         return write_report(self.episode, place, title=title, progress=progress)
 
     def _config(self) -> dict:
-        sensor = {"camera": self.camera, "box": self.box, "up": self.frame.up, "convention": self.convention}
+        sensor = {"cameras": self.cameras, "box": self.box, "up": self.frame.up, "convention": self.convention}
         return describe({**sensor, "stride": self.stride, "key": self.key, "planner": self.planner})
 
     def _seen(self, image: DepthImage) -> tuple[Pose, PointCloud]:
         """Pose and scan of an image, in scene coordinates."""
         pose = Pose.from_matrix(image.matrix, self.convention)
-        cloud = PointCloud.from_depth(image.depth, self.camera, pose, image.depth_scale, self.stride, self.box)
+        camera, stride = self.cameras[image.camera], self._strides[image.camera]
+        cloud = PointCloud.from_depth(image.depth, camera, pose, image.depth_scale, stride, self.box)
         scan, around = self.frame.to_scene(cloud), self.planner.surroundings
         return self.frame.to_scene(pose), scan if around is None else around.without_obstacles(scan)
 
-    def _after(self, pose: Pose, scan: PointCloud) -> State:
-        camera = self.frame.to_scene(self._rays)
+    def _after(self, pose: Pose, scan: PointCloud, camera: int) -> State:
+        rays = self.frame.to_scene(self._rays[camera])
         if self._state is None:
-            return self.planner.init(scan, pose, camera)
-        return self.planner.observe(self._state, pose, scan, camera)
+            return self.planner.init(scan, pose, rays)
+        return self.planner.observe(self._state, pose, scan, rays)
 
-    def _take(self, pose: Pose, scan: PointCloud, state: State | None = None) -> None:
-        self._state = self._after(pose, scan) if state is None else state
-        self._images.append((pose, scan, self._state.cloud))
+    def _take(self, pose: Pose, scan: PointCloud, camera: int, state: State | None = None) -> None:
+        self._state = self._after(pose, scan, camera) if state is None else state
+        rays, proposal = self.frame.to_scene(self._rays[camera]), self._proposals.get(self.views)
+        self._views.append(View(pose, scan, self._state.cloud, proposal, rays))
         self._next = None
 
     def _propose(self) -> tuple[Proposal, Float[np.ndarray, "h w"] | None]:
@@ -243,7 +248,7 @@ class Session:
         proposal = self.planner.choose(with_visited(self.state, proposed), surfaces, search_key)
         if surfaces is None:
             return proposal, None
-        depth = np.asarray(_expected_depth(self.planner, surfaces, proposal.pose))
+        depth = np.asarray(expected_depth(self.planner, surfaces, proposal.pose))
         return proposal, depth / self.frame.scale
 
     def _check_alone(self, folder: SessionFolder) -> None:
@@ -253,45 +258,6 @@ class Session:
             f"{folder.path} holds {found} images, but this session knows {self.views}: another process has added some; "
             "make the session again, which reads them",
         )
-
-
-def planner_for(planner: Planner, camera: Camera, box: Box, poses: Pose | None) -> Planner:
-    """A planner at a sensor, all in scene coordinates: see `Session`.
-
-    - `poses`: where the search may look from, or None for its own candidates.
-
-    **Raises:** `ValueError` if the search does not choose among poses.
-    """
-    usual = Box()
-
-    def placed(leaf):
-        default = isinstance(leaf, Box) and (leaf.low, leaf.high) == (usual.low, usual.high)
-        return box if default else leaf
-
-    planner = jax.tree.map(placed, planner, is_leaf=lambda leaf: isinstance(leaf, Box))
-    imagined = camera.resized(planner.camera.height, planner.camera.width)
-    if poses is None:
-        return dataclasses.replace(planner, camera=imagined)
-    if not isinstance(planner.search, CandidateSearch):
-        raise InputError(
-            f"the session was given poses, but {type(planner.search).__name__} is no search over candidates: use "
-            "DiscreteSearch() or HalvingSearch()"
-        )
-    search = dataclasses.replace(planner.search, candidates=GivenPoses(poses))
-    return dataclasses.replace(planner, camera=imagined, search=search)
-
-
-@eqx.filter_jit
-def _expected_depth(planner: Planner, surfaces: GridSurface, pose: Pose) -> Float[Array, "h w"]:
-    """Mean depth along the camera's axis (scene units) over the samples that a ray hits; NaN where it misses most."""
-    camera = planner.camera
-    scans = scan_samples(surfaces, camera, pose[None], planner.barrier(pose[None]))
-    depth = jnp.einsum("spnd,d->sn", scans.points - pose.position, pose.forward, precision="highest")
-    hit = scans.mask[:, 0]
-    count = jnp.sum(hit, axis=0)
-    mean = jnp.sum(jnp.where(hit, depth, 0.0), axis=0) / jnp.maximum(count, 1)
-    mean = jnp.where(2 * count >= hit.shape[0], mean, jnp.nan)
-    return mean.reshape(camera.height, camera.width)
 
 
 def _corners(box) -> tuple:

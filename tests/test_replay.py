@@ -26,7 +26,7 @@ def stored(tmp_path_factory):
 def test_what_is_stored_is_read_without_the_planner(stored):
     folder, session = stored
     found = StoredSession(folder)
-    assert found.camera == CAMERA
+    assert found.cameras == (CAMERA,)
     assert (found.box.low, found.box.high) == BOX
     assert found.up == "z"
     assert found.views == 3

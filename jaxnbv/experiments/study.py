@@ -274,10 +274,10 @@ class Study(eqx.Module):
         key, sensor = self.key(scene.index, "episode"), self.sensor(scene)
         poses = self.poses_of(run)
         require(len(poses) > 0, "there are no views to scan again")
-        views = [(pose, sensor(pose, view_keys(key, index)[2])) for index, pose in enumerate(poses)]
+        views = [(pose, sensor(pose, view_keys(key, index)[2]), self.camera) for index, pose in enumerate(poses)]
         # D depends on the planner through its capacity alone.
-        states = self.planner(self.methods[0], scene).replay(views, self.camera)
-        return [(scan, state.cloud) for (_, scan), state in zip(views, states, strict=True)]
+        states = self.planner(self.methods[0], scene).replay(views)
+        return [(scan, state.cloud) for (_, scan, _), state in zip(views, states, strict=True)]
 
     def poses_of(self, run: Record) -> list[Pose]:
         """Where a method's views were taken; older records hold the numbers of candidates."""

@@ -26,7 +26,12 @@ from jaxnbv.storage.arrays import (
 )
 
 RECORD = "session.json"
-_IMAGE: Schema = {"depth": ("uif", ("h", "w")), "matrix": ("f", (4, 4)), "depth_scale": ("f", ())}
+_IMAGE: Schema = {
+    "depth": ("uif", ("h", "w")),
+    "matrix": ("f", (4, 4)),
+    "depth_scale": ("f", ()),
+    "camera": ("i", ()),
+}
 _PROPOSAL: Schema = {**POSE, **PROPOSAL, "expected_depth": ("f", ("h", "w"))}
 
 
@@ -35,11 +40,13 @@ class DepthImage(NamedTuple):
 
     - `depth`: along the forward axis; `depth_scale` times it is in world units.
     - `matrix`: camera to world, in the convention of the session.
+    - `camera`: which of the session's cameras it is of.
     """
 
     depth: Real[np.ndarray, "h w"]
     matrix: Float[np.ndarray, "4 4"]
     depth_scale: float
+    camera: int = 0
 
 
 class SessionFolder(ResultFolder):
@@ -104,7 +111,7 @@ def open_session(path: str | Path) -> SessionFolder:
 
 
 def _image(data: dict[str, np.ndarray]) -> DepthImage:
-    return DepthImage(data["depth"], data["matrix"], float(data["depth_scale"]))
+    return DepthImage(data["depth"], data["matrix"], float(data["depth_scale"]), int(data["camera"]))
 
 
 def _proposal(data: dict[str, np.ndarray]) -> tuple[Proposal, Float[np.ndarray, "h w"] | None]:

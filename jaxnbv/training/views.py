@@ -24,6 +24,6 @@ def joined_views(views: PointCloud) -> PointCloud:
 
 def state_after(planner: Planner, views: PointCloud, poses: Pose, camera: Camera) -> State:
     """The planner's state after all views (v, rays), taken by a camera. Runs under `jit`."""
-    seen = ((poses[index], views[index]) for index in range(views.mask.shape[0]))
-    *_, last = planner.replay(seen, camera)
+    seen = ((poses[index], views[index], camera) for index in range(views.mask.shape[0]))
+    *_, last = planner.replay(seen)
     return last

@@ -1,0 +1,140 @@
+"""How many views a rule of stopping saves, and what it costs.
+
+    python benchmarks/stopping.py [--task class parts coverage] [--scenes 24] [--out FILE]
+
+Each object of the test split is scanned to the end once; every rule is then asked after each view, which is what it
+would have been asked had it been in force. `class`: pyramids, whole, by cross-entropy, 6 views; right is the class of
+the highest probability. `parts`: objects of thirteen categories by soft part count, 6 views; right is that every part
+that the object has is given 60 points. `coverage`: the same objects by coverage, 14 views; right is the share truly
+seen, of what the camera would see from all candidates. Intervals are of 90 %, by resampling the scenes. Continues after
+the last scene in the file.
+"""
+
+import argparse
+import functools
+import json
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+import jaxnbv as nbv
+from jaxnbv.datasets import CATEGORIES, Framing, Split, hidden_view, part_scene, pyramid_scene
+from jaxnbv.episode import view_keys
+from jaxnbv.experiments.statistics import bootstrap_mean
+from jaxnbv.files import write_text
+from jaxnbv.networks import part_segmenter, pyramid_classifier
+from jaxnbv.stopping import Covered, Found, SoFar, Sure
+from jaxnbv.tasks.coverage import SeenBefore
+
+SIDE = Framing.WHOLE.longest_side
+FIRST = nbv.look_at((0.8, 0.9, 2.2))
+RULES = {
+    "class": {
+        f"{'Sure' if again else 'D alone'} {p}": Sure(p, again) for again in (8, 0) for p in (0.8, 0.9, 0.95, 0.99)
+    },
+    "parts": {f"Found {points}": Found(points) for points in (20, 40, 60, 100)},
+    "coverage": {f"Covered {share}": Covered(share) for share in (0.6, 0.7, 0.8, 0.9)},
+}
+VIEWS = {"class": 6, "parts": 6, "coverage": 14}
+
+
+def planner_of(score: nbv.Score, radius: float, side: float = 2.5, solid: bool = False) -> nbv.Planner:
+    surfaces, carving = nbv.imagination("screened", side, solid=solid)
+    search, grid = nbv.DiscreteSearch(nbv.SphereCandidates(48, radius)), nbv.Grid(64, 0.7 * side)
+    return nbv.Planner(surfaces, nbv.Camera(), score, search, 8, grid, 4096, carving=carving)
+
+
+@functools.cache
+def planner_for(task: str, category: str) -> nbv.Planner:
+    """One for all objects of a category, so that nothing is compiled twice."""
+    if task == "class":
+        return planner_of(nbv.CrossEntropy(pyramid_classifier(SIDE)), 2.5, SIDE, solid=True)
+    if task == "coverage":
+        return planner_of(nbv.Coverage(), 2.5)
+    utility = nbv.SoftPartCount(part_segmenter(category))
+    return planner_of(nbv.ExpectedUtilityImprovement(utility, num_points=1024), 2.0)
+
+
+def measured(task: str, index: int) -> dict:
+    """After which view each rule ends it, and what is right after every view."""
+    key = jax.random.fold_in(jax.random.key(15), index)
+    if task == "class":
+        pyramid = pyramid_scene(Split.TEST, index, Framing.WHOLE)
+        surface, first, category = nbv.SDFSurface(pyramid), hidden_view(pyramid, key), ""
+    else:
+        thing = part_scene(Split.TEST, index)
+        surface, first, category = nbv.SDFSurface(thing.solid), FIRST, CATEGORIES[int(thing.category)].name
+    planner = planner_for(task, category)
+    episode = nbv.simulate(planner, surface, first, VIEWS[task], key, progress=False)
+    right, ends = [], {name: VIEWS[task] for name in RULES[task]}
+    for count, state in enumerate(episode.states(), start=1):
+        if task == "class":
+            right.append(float(int(jnp.argmax(nbv.predict(planner.acquisition, state.cloud))) == int(pyramid.label)))
+        elif task == "parts":
+            counts = planner.acquisition.answer(state.cloud).values
+            right.append(float((counts[np.asarray(thing.parts)] >= 60).all()))
+        else:
+            right.append(_seen(surface, planner.camera, planner.search.candidates.poses(), state.cloud))
+        poses = tuple(view.pose for view in episode.views[:count])
+        so_far = SoFar(planner, state, poses, 0.0, view_keys(key, count)[0])
+        for name, rule in RULES[task].items():
+            if ends[name] == VIEWS[task] and rule.after(so_far) is not None:
+                ends[name] = count
+    return {"right": right, "ends": ends}
+
+
+def _seen(surface: nbv.SDFSurface, camera: nbv.Camera, poses: nbv.Pose, cloud: nbv.PointCloud) -> float:
+    """Share of what the camera would truly see, from all candidates, that lies near D."""
+    near, seen = np.asarray(_counted(surface, camera, poses, cloud))
+    return float(near / seen)
+
+
+@eqx.filter_jit
+def _counted(surface: nbv.SDFSurface, camera: nbv.Camera, poses: nbv.Pose, cloud: nbv.PointCloud):
+    scans = nbv.scan(surface, camera, poses)
+    return jnp.sum(jax.lax.map(lambda one: SeenBefore()(cloud, one), scans), axis=0)
+
+
+def table(task: str, records: list[dict]) -> str:
+    views, generator = VIEWS[task], np.random.default_rng(0)
+
+    def shown(values) -> str:
+        mean, low, high = bootstrap_mean(np.asarray(values, float), generator)
+        return f"{float(mean):5.2f} [{float(low):5.2f}, {float(high):5.2f}]"
+
+    last = [record["right"][-1] for record in records]
+    lines = [
+        f"{task}: {len(records)} scenes, {views} views",
+        f"{'rule':<14} views                 right then          right then less in the end",
+    ]
+    lines.append(f"{'none':<14} {shown([views] * len(records))}  {shown(last)}")
+    for name in RULES[task]:
+        ends = [record["ends"][name] for record in records]
+        then = [record["right"][end - 1] for record, end in zip(records, ends, strict=True)]
+        lost = [a - b for a, b in zip(then, last, strict=True)]
+        lines.append(f"{name:<14} {shown(ends)}  {shown(then)}  {shown(lost)}")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", nargs="+", choices=RULES, default=list(RULES))
+    parser.add_argument("--scenes", type=int, default=24)
+    parser.add_argument("--out", type=Path, default=Path("runs/stopping.json"))
+    asked = parser.parse_args()
+    asked.out.parent.mkdir(parents=True, exist_ok=True)
+    held = json.loads(asked.out.read_text()) if asked.out.exists() else {}
+    for task in asked.task:
+        records = held.setdefault(task, [])
+        for index in tqdm(range(len(records), asked.scenes), desc=task):
+            records.append(measured(task, index))
+            write_text(asked.out, json.dumps(held))
+        print(table(task, records[: asked.scenes]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""Coverage by views and by the camera's way, with and without the cost of going there; three views at once.
+
+    python benchmarks/travel.py --mesh FILE ... [--views 8] [--out FILE]
+
+Each mesh is scanned from one random first view on, by coverage over 60 candidates on a sphere: for its value, for its
+value per cost (fixed + length of the way, in scene units), from the farthest view, and three views at a time
+(`propose_batch`, visited in the order of the shortest way). All see the same noise and the same samples at the same
+view. Coverage is the share of the true surface within 0.05 of the cloud. Continues after the last mesh in the file.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+import jaxnbv as nbv
+from jaxnbv.episode import observe_scene, view_keys
+from jaxnbv.experiments.statistics import bootstrap_mean
+from jaxnbv.files import write_text
+from jaxnbv.metrics import coverage, truth_points
+from jaxnbv.travel import arc_length, total_cost
+
+CANDIDATES = nbv.SphereCandidates(60)
+# Search, cost, and how many views are chosen at once.
+METHODS = {
+    "value": (nbv.DiscreteSearch(CANDIDATES), None, 1),
+    "value per cost, fixed 2": (nbv.DiscreteSearch(CANDIDATES), nbv.ValuePerCost(arc_length, fixed=2.0), 1),
+    "value per cost, fixed 0.5": (nbv.DiscreteSearch(CANDIDATES), nbv.ValuePerCost(arc_length, fixed=0.5), 1),
+    "farthest view": (nbv.FarthestView(CANDIDATES), None, 1),
+    "three at once": (nbv.DiscreteSearch(CANDIDATES), None, 3),
+}
+
+
+def episode(planner: nbv.Planner, mesh: nbv.TriangleMesh, truth: np.ndarray, views: int, at_once: int, key) -> dict:
+    """Coverage, and length of the way so far, after each view."""
+    direction = jax.random.normal(jax.random.fold_in(key, 99), (3,))
+    waiting = [nbv.look_at(2.5 * direction / jnp.linalg.norm(direction))]
+    state, taken, found = None, [], {"coverage": [], "way": []}
+    for index in range(views):
+        if not waiting:
+            batch = planner.propose_batch(state, view_keys(key, index)[0], at_once)
+            waiting = [batch.poses[number] for number in batch.order]
+        pose = waiting.pop(0)
+        seen = observe_scene(mesh, planner.camera, pose, nbv.SensorNoise(), view_keys(key, index)[2])
+        state = planner.init(seen, pose) if state is None else planner.observe(state, pose, seen)
+        taken.append(pose)
+        found["coverage"].append(coverage(state.cloud, truth))
+        found["way"].append(total_cost(taken))
+    return found
+
+
+def summary(records: dict, views: int) -> str:
+    generator, names = np.random.default_rng(0), list(METHODS)
+
+    def shown(values) -> str:
+        mean, low, high = bootstrap_mean(np.asarray(values, float), generator)
+        return f"{float(mean):6.3f} [{float(low):6.3f}, {float(high):6.3f}]"
+
+    lines = [f"{len(records)} meshes, means and 90 % intervals over them"]
+    for count in range(4, views + 1, 2):
+        lines.append(f"after {count} views: coverage, way (scene units); coverage by the value's way; less the value's")
+        ways = {m: [r["value"]["way"][count - 1] for r in records.values()] for m in ["value"]}["value"]
+        for name in names:
+            own = [record[name] for record in records.values()]
+            then = [one["coverage"][count - 1] for one in own]
+            by_way = [float(np.interp(way, one["way"], one["coverage"])) for way, one in zip(ways, own, strict=True)]
+            base = [record["value"]["coverage"][count - 1] for record in records.values()]
+            less = [a - b for a, b in zip(then, base, strict=True)]
+            way = [one["way"][count - 1] for one in own]
+            lines.append(f"  {name:<26} {shown(then)}  {shown(way)}  {shown(by_way)}  {shown(less)}")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--mesh", nargs="+", type=Path, required=True)
+    parser.add_argument("--views", type=int, default=8)
+    parser.add_argument("--out", type=Path, default=Path("runs/travel.json"))
+    asked = parser.parse_args()
+    asked.out.parent.mkdir(parents=True, exist_ok=True)
+    records = json.loads(asked.out.read_text()) if asked.out.exists() else {}
+    for file in tqdm(asked.mesh, desc="meshes"):
+        if file.stem in records:
+            continue
+        mesh = nbv.load_mesh(file)
+        truth = truth_points(mesh, jax.random.key(0))
+        found = {}
+        for name, (search, cost, at_once) in METHODS.items():
+            settings = {"num_samples": 8, "grid": nbv.Grid(64), "capacity": 4096, "cost": cost}
+            planner = nbv.Planner(nbv.ScreenedSPSR(), nbv.Camera(), nbv.Coverage(), search, **settings)
+            key = jax.random.fold_in(jax.random.key(4), sum(map(ord, file.stem)))
+            found[name] = episode(planner, mesh, truth, asked.views, at_once, key)
+        records[file.stem] = found
+        write_text(asked.out, json.dumps(records))
+    print(summary(records, asked.views))
+
+
+if __name__ == "__main__":
+    main()

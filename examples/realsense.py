@@ -1,0 +1,48 @@
+"""Where to hold a RealSense camera next: `python realsense.py`, with `pip install jaxnbv pyrealsense2`.
+
+The depth stream's intrinsics and unit are read from the camera. How your robot or your hand is told to go somewhere,
+and where it then truly is, you fill in: `go_to` takes and gives a 4 x 4 matrix, camera to world, in metres.
+"""
+
+import numpy as np
+import pyrealsense2 as rs
+
+import jaxnbv as nbv
+
+# In metres: two corners of a box about the object, without the table.
+BOX = ((-0.15, -0.15, 0.005), (0.15, 0.15, 0.30))
+
+
+def go_to(matrix: np.ndarray) -> np.ndarray:
+    """Hold the camera there, and say where it is."""
+    input(f"hold the camera at\n{np.round(matrix, 3)}\nand press enter ")
+    return matrix
+
+
+def depth_camera(profile) -> tuple[nbv.Camera, float]:
+    """The depth stream as a camera, and metres per unit of its images."""
+    intrinsics = profile.get_stream(rs.stream.depth).as_video_stream_profile().get_intrinsics()
+    matrix = [[intrinsics.fx, 0.0, intrinsics.ppx], [0.0, intrinsics.fy, intrinsics.ppy], [0.0, 0.0, 1.0]]
+    # Of a D435: nearer it measures nothing, farther nothing worth having.
+    camera = nbv.Camera.from_intrinsics(matrix, intrinsics.width, intrinsics.height, nearest=0.2, farthest=2.0)
+    return camera, profile.get_device().first_depth_sensor().get_depth_scale()
+
+
+def main(folder: str = "live", views: int = 10) -> None:
+    pipeline = rs.pipeline()
+    camera, scale = depth_camera(pipeline.start())
+    planner = nbv.Planner(nbv.ScreenedSPSR(), nbv.Camera(), nbv.Coverage(), nbv.DiscreteSearch(nbv.Reach()))
+    session = nbv.Session(planner, camera, BOX, up="z", folder=folder, until=nbv.Covered(0.9))
+    first = np.asarray(nbv.look_at((0.0, -0.4, 0.4), (0.0, 0.0, 0.15), up=(0.0, 0.0, 1.0)).matrix)
+    try:
+        while session.views < views and not session.done:
+            matrix = go_to(first if session.views == 0 else session.next().matrix)
+            depth = np.asanyarray(pipeline.wait_for_frames().get_depth_frame().get_data())
+            session.add(depth, matrix, depth_scale=scale)
+    finally:
+        pipeline.stop()
+    print(session.done or f"{views} images are taken", session.report())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,135 @@
+"""A thin ROS 2 node about a session: depth images in, the next pose of the camera out.
+
+Topics: `depth/image` (sensor_msgs/Image, 16UC1 in millimetres or 32FC1 in metres), `depth/camera_info`
+(sensor_msgs/CameraInfo), `next_view` (geometry_msgs/PoseStamped). The camera's pose is that of `camera_frame` in
+`world_frame`, by tf at the image's time; camera frames of ROS look along z with y down, which is OpenCV's convention.
+An image is taken in when the service `take` (std_srvs/Trigger) is called, since most of a stream shows nothing new.
+
+What does not need ROS is in `Bridge`, which is tested with stand-ins for the messages; the node itself is not.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+import jaxnbv as nbv
+
+_DTYPES = {"16UC1": (np.uint16, 1e-3), "32FC1": (np.float32, 1.0)}
+
+
+def image_of(message: Any) -> tuple[np.ndarray, float]:
+    """The depth image of a message, and metres per unit."""
+    dtype, scale = _DTYPES[message.encoding]
+    rows = np.frombuffer(bytes(message.data), np.dtype(dtype).newbyteorder(">" if message.is_bigendian else "<"))
+    image = rows.reshape(message.height, message.step // np.dtype(dtype).itemsize)[:, : message.width]
+    return image.astype(dtype), scale
+
+
+def camera_of(message: Any) -> nbv.Camera:
+    """The camera of an undistorted stream."""
+    return nbv.Camera.from_intrinsics(np.reshape(message.k, (3, 3)), message.width, message.height)
+
+
+def matrix_of(transform: Any) -> np.ndarray:
+    """The 4 x 4 matrix of a geometry_msgs/Transform."""
+    x, y, z, w = (getattr(transform.rotation, name) for name in "xyzw")
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, 3] = [getattr(transform.translation, name) for name in "xyz"]
+    return matrix
+
+
+class Bridge:
+    """Messages in, the next pose out.
+
+    - `start`: makes the session, once the camera is known.
+    - `lookup`: the transform of the camera in the world at a time stamp.
+    - `publish`: what is to be done with the next pose, a 4 x 4 matrix, camera to world.
+    """
+
+    def __init__(
+        self,
+        start: Callable[[nbv.Camera], nbv.Session],
+        lookup: Callable[[Any], Any],
+        publish: Callable[[np.ndarray], None],
+    ):
+        self.start, self.lookup, self.publish = start, lookup, publish
+        self.session: nbv.Session | None = None
+        self.latest: Any = None
+
+    def on_camera_info(self, message: Any) -> None:
+        if self.session is None:
+            self.session = self.start(camera_of(message))
+
+    def on_image(self, message: Any) -> None:
+        self.latest = message
+
+    def take(self) -> str:
+        """Take in the latest image and publish where to go next; says what was done."""
+        if self.session is None or self.latest is None:
+            return "there is no image yet"
+        depth, scale = image_of(self.latest)
+        self.session.add(depth, matrix_of(self.lookup(self.latest.header.stamp)), depth_scale=scale)
+        if self.session.done:
+            return f"done: {self.session.done}"
+        self.publish(self.session.next().matrix)
+        return f"{self.session.views} images"
+
+
+def main() -> None:
+    """Parameters of the node: world_frame, camera_frame, folder, and low and high, two corners of the object's box."""
+    import rclpy
+    import tf2_ros
+    from geometry_msgs.msg import PoseStamped
+    from rclpy.node import Node
+    from sensor_msgs.msg import CameraInfo, Image
+    from std_srvs.srv import Trigger
+
+    rclpy.init()
+    node = Node("next_view")
+    world, camera, folder = (
+        node.declare_parameter(name, value).value
+        for name, value in (("world_frame", "world"), ("camera_frame", "camera_optical_frame"), ("folder", "live"))
+    )
+    low, high = (
+        tuple(node.declare_parameter(name, value).value)
+        for name, value in (("low", [-0.15, -0.15, 0.005]), ("high", [0.15, 0.15, 0.30]))
+    )
+    buffer = tf2_ros.Buffer()
+    tf2_ros.TransformListener(buffer, node)
+    publisher = node.create_publisher(PoseStamped, "next_view", 1)
+
+    def publish(matrix: np.ndarray) -> None:
+        from scipy.spatial.transform import Rotation
+
+        message = PoseStamped()
+        message.header.frame_id = world
+        for name, value in zip("xyz", matrix[:3, 3], strict=True):
+            setattr(message.pose.position, name, float(value))
+        for name, value in zip("xyzw", Rotation.from_matrix(matrix[:3, :3]).as_quat(), strict=True):
+            setattr(message.pose.orientation, name, float(value))
+        publisher.publish(message)
+
+    def start(found: nbv.Camera) -> nbv.Session:
+        planner = nbv.Planner(nbv.ScreenedSPSR(), nbv.Camera(), nbv.Coverage(), nbv.DiscreteSearch(nbv.Reach()))
+        return nbv.Session(planner, found, (low, high), up="z", folder=folder, until=nbv.Covered(0.9))
+
+    bridge = Bridge(start, lambda stamp: buffer.lookup_transform(world, camera, stamp).transform, publish)
+
+    def take(request: Any, response: Any) -> Any:
+        response.message, response.success = bridge.take(), True
+        return response
+
+    node.create_subscription(CameraInfo, "depth/camera_info", bridge.on_camera_info, 1)
+    node.create_subscription(Image, "depth/image", bridge.on_image, 1)
+    node.create_service(Trigger, "take", take)
+    rclpy.spin(node)
+
+
+if __name__ == "__main__":
+    main()
