@@ -100,7 +100,7 @@ class Session:
             self.planner = dataclasses.replace(self.planner, surroundings=surroundings.in_scene(self.frame))
         self._strides = tuple(stride_of(one) if stride is None else stride for one in self.cameras)
         self._rays = tuple(one.strided(n) for one, n in zip(self.cameras, self._strides, strict=True))
-        self._watch = None if until is None else Watch(until, self.planner)
+        self._watch, self._asked_at = None if until is None else Watch(until, self.planner), 0
         self._views: list[View] = []
         self._proposals: dict[int, Proposal] = {}
         self._next: NextView | None = None
@@ -147,16 +147,20 @@ class Session:
 
     @property
     def done(self) -> str | None:
-        """Why no more images are needed, by the rule that was given; None while they are.
+        """Why no more images are needed, by the rule that was given; None while they are. Asked once an image.
 
-        **Raises:** `ValueError` as `next` does, if the rule is about what the next view is worth.
+        **Raises:** `ValueError` as `next` does, if the rule does not hold of what there is: then it is asked about what
+        comes next.
         """
         if self._watch is None or not self._views:
             return None
-        key, *_ = view_keys(self.key, self.views)
-        poses = [view.pose for view in self._views]
-        enough = self._watch.after(self.state, poses, key)
-        return enough or self._watch.before(self.state, poses, key, self.next().proposal)
+        if self._asked_at < self.views:
+            key, *_ = view_keys(self.key, self.views)
+            poses = [view.pose for view in self._views]
+            if self._watch.after(self.state, poses, key) is None:
+                self._watch.before(self.state, poses, key, self.next().proposal)
+            self._asked_at = self.views
+        return self._watch.reason
 
     @checked
     def add(

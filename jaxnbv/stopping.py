@@ -76,10 +76,8 @@ class AnyOf(Stop):
 
 
 class Sure(Stop):
-    """The class is known: with this probability given D, and given parts of D too.
-
-    A single answer may be sure by chance and change with the next view. So D is thinned at random, and the same class
-    must be as likely given every half of it.
+    """The class is known: with this probability given D and, as a single answer may be sure by chance and change with
+    the next view, given random halves of D too.
 
     - `probability`: within (0, 1).
     - `resamplings`: how many halves are drawn.

@@ -42,7 +42,17 @@ class Candidates(eqx.Module):
         return GivenPoses(poses[jnp.asarray(np.flatnonzero(rows))])
 
 
-class SphereCandidates(Candidates):
+class NumberedCandidates(Candidates):
+    """Of which there are as many as are asked for: `number`."""
+
+    number: eqx.AbstractVar[int]
+
+    @property
+    def count(self) -> int:
+        return self.number
+
+
+class SphereCandidates(NumberedCandidates):
     """The paper's pool: a Fibonacci sphere of cameras that look at the origin, or the part of it above an elevation.
 
     - `number`: of cameras, evenly spaced on what there is of the sphere.
@@ -67,10 +77,6 @@ class SphereCandidates(Candidates):
             f"the least elevation is {self.min_elevation} rad; it must lie within [-pi/2, pi/2)",
         )
 
-    @property
-    def count(self) -> int:
-        return self.number
-
     def poses(self, key: PRNGKeyArray | None = None) -> Pose:
         """A dome is turned about its axis, so that the poses of every key are above the elevation."""
         whole = self.min_elevation == -0.5 * math.pi
@@ -81,7 +87,7 @@ class SphereCandidates(Candidates):
         return _looking(places, self.up, key)
 
 
-class Turntable(Candidates):
+class Turntable(NumberedCandidates):
     """A camera that stands still before a turntable: as the object sees it, on a circle about the axis `up`.
 
     - `number`: of positions of the table, evenly spaced.
@@ -105,10 +111,6 @@ class Turntable(Candidates):
             f"the elevation is {self.elevation} rad; it must lie within (-pi/2, pi/2)",
         )
 
-    @property
-    def count(self) -> int:
-        return self.number
-
     def poses(self, key: PRNGKeyArray | None = None) -> Pose:
         """With a key the table starts at a random angle."""
         angle = 2.0 * np.pi * np.arange(self.number) / self.number
@@ -117,7 +119,7 @@ class Turntable(Candidates):
         return _looking(self.radius * jnp.asarray(places, jnp.result_type(float)), self.up, key)
 
 
-class Reach(Candidates):
+class Reach(NumberedCandidates):
     """Where an arm can hold a camera that looks at the centre: between two distances and two elevations about `up`.
 
     - `number`: of places; directions as of a Fibonacci sphere, distances uniform in the volume between them.
@@ -142,10 +144,6 @@ class Reach(Candidates):
             f"the elevations are {self.min_elevation} and {self.max_elevation} rad; the second must be greater, and "
             "both within [-pi/2, pi/2]",
         )
-
-    @property
-    def count(self) -> int:
-        return self.number
 
     def poses(self, key: PRNGKeyArray | None = None) -> Pose:
         """With a key all places are turned about `up`."""

@@ -12,7 +12,7 @@ from jaxnbv.checks import check_fields, checked, require
 from jaxnbv.pose import Pose
 from jaxnbv.search.ascent import Ascent
 from jaxnbv.search.base import Search
-from jaxnbv.search.candidates import Candidates, as_candidates
+from jaxnbv.search.candidates import Candidates, NumberedCandidates, as_candidates
 from jaxnbv.search.pose_space import FreePoses, PoseSpace, SpherePoses
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal
@@ -57,7 +57,7 @@ class GradientSearch(Search):
         turned: bool = True,
     ):
         self.ascent = Ascent(_pose_space(dof, space), num_starts, iterations, learning_rate, solver)
-        of_space = SpaceCandidates(self.ascent.space, num_candidates)
+        of_space = SpaceCandidates(space=self.ascent.space, number=num_candidates)
         self.candidates = of_space if candidates is None else as_candidates(candidates)
         self.turned = turned
         require(
@@ -98,7 +98,7 @@ class HybridSearch(GradientSearch):
         super().__init__(dof, space, num_starts, iterations, learning_rate, num_candidates, solver, candidates, turned)
 
 
-class SpaceCandidates(Candidates):
+class SpaceCandidates(NumberedCandidates):
     """Poses of a pose space, spread evenly over it.
 
     **Raises:** `ValueError` for a number below one.
@@ -110,10 +110,6 @@ class SpaceCandidates(Candidates):
     def __check_init__(self):
         check_fields(self)
         require(self.number >= 1, f"the search has {self.number} candidates; it needs at least one")
-
-    @property
-    def count(self) -> int:
-        return self.number
 
     def poses(self, key: PRNGKeyArray | None = None) -> Pose:
         return self.space.candidates(self.number, key)
