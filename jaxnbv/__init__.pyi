@@ -30,6 +30,7 @@ from .presets import imagination as imagination
 from .reconstruction import mean_mesh as mean_mesh
 from .reconstruction import screened_poisson as screened_poisson
 from .replay import StoredSession as StoredSession
+from .replay import stored_run as stored_run
 from .scanning import Carving as Carving
 from .scanning import Grid as Grid
 from .scanning import GridSurface as GridSurface

@@ -59,6 +59,17 @@ def read_json(file: Path, problem: str, remedy: str) -> dict[str, Any]:
     return content
 
 
+def read_config(file: Path, problem: str, remedy: str) -> dict[str, Any]:
+    """The configuration in a folder's record.
+
+    **Raises:** as `read_json`, and if there is none.
+    """
+    config = read_json(file, problem, remedy).get("config")
+    if not isinstance(config, dict):
+        raise InputError(f"{file} {problem} (it has no config): {remedy}")
+    return config
+
+
 class ResultFolder:
     """A folder, and the configuration that its results have: a record, written with the first of them.
 

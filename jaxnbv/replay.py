@@ -1,9 +1,11 @@
-"""A session that was stored, planned again: where would another utility have looked next?"""
+"""Runs that were stored, read without the planner that made them; sessions, planned again for another utility."""
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -11,12 +13,16 @@ from jaxnbv.at_sensor import stride_of
 from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError, checked, require
 from jaxnbv.cloud import PointCloud
+from jaxnbv.episode import Episode, View
 from jaxnbv.frame import Frame
 from jaxnbv.planner import Planner
 from jaxnbv.pose import Pose
+from jaxnbv.search import DiscreteSearch, Proposal
 from jaxnbv.search.base import CandidateSearch
 from jaxnbv.session import NextView, Session
-from jaxnbv.storage import DepthImage, open_session
+from jaxnbv.storage import SESSION_RECORD, DepthImage, open_episode, open_session
+from jaxnbv.surfaces import ScreenedSPSR
+from jaxnbv.tasks import Coverage
 from jaxnbv.volume import Box
 
 
@@ -56,10 +62,15 @@ class StoredSession:
         cloud = PointCloud.from_depth(image.depth, camera, pose, image.depth_scale, stride, self.box)
         return self.frame.to_scene(pose), self.frame.to_scene(cloud)
 
+    def proposal(self, index: int) -> tuple[Proposal, Float[np.ndarray, "h w"] | None] | None:
+        """The session's own proposal for the image of an index, and the depth that was expected of it; None where it
+        was not asked for."""
+        return self._folder.read_proposal(index)
+
     def candidates(self) -> Float[np.ndarray, "n 4 4"] | None:
         """The poses that the session's own planner chose among, in world units; None where it has proposed nothing."""
         for index in range(self.views + 1):
-            if (known := self._folder.read_proposal(index)) is not None:
+            if (known := self.proposal(index)) is not None:
                 return np.asarray(self.frame.to_world(known[0].candidates).to_matrix(self.convention))
         return None
 
@@ -87,6 +98,52 @@ class StoredSession:
         for index in range(session.views, self.views):
             session.add(*self.image(index))
             yield session, session.next()
+
+
+class StoredRun(NamedTuple):
+    """An episode or a session as it was stored.
+
+    - `episode`: with a planner that has the stored camera and the usual surfaces, for what is to be drawn.
+    - `proposal`, `expected`: for the view after its last; None where there is none.
+    """
+
+    episode: Episode
+    proposal: Proposal | None = None
+    expected: Float[np.ndarray, "h w"] | None = None
+
+
+def stored_run(folder: str | Path) -> StoredRun:
+    """The episode or session of a folder.
+
+    **Raises:** `ValueError` if it holds neither, or one without a view.
+    """
+    planner = Planner(ScreenedSPSR(), Camera(), Coverage(), DiscreteSearch())
+    return (_session_run if (Path(folder) / SESSION_RECORD).exists() else _episode_run)(folder, planner)
+
+
+def _session_run(folder: str | Path, planner: Planner) -> StoredRun:
+    stored = StoredSession(folder)
+    session = Session(
+        planner, stored.cameras, stored.box, stored.up, convention=stored.convention, stride=stored.stride
+    )
+    for index in range(stored.views):
+        session.add(*stored.image(index))
+    asked = [stored.proposal(index) for index in range(stored.views + 1)]
+    views = tuple(
+        dataclasses.replace(view, proposal=None if known is None else known[0])
+        for view, known in zip(session.episode.views, asked, strict=False)
+    )
+    return StoredRun(dataclasses.replace(session.episode, views=views), *(asked[-1] or ()))
+
+
+def _episode_run(folder: str | Path, planner: Planner) -> StoredRun:
+    held = open_episode(folder)
+    views = held.read_views()
+    require(len(views) > 0, f"{folder} holds no view yet")
+    planner = dataclasses.replace(planner, camera=_camera(held.config["planner"]["camera"]))
+    states = planner.replay((pose, scan) for pose, scan, _ in views)
+    shown = tuple(View(pose, scan, state.cloud, own) for (pose, scan, own), state in zip(views, states, strict=True))
+    return StoredRun(Episode(planner, None, None, views[0][0], jax.random.key(0), shown))
 
 
 def _camera(description: dict[str, Any]) -> Camera:

@@ -22,6 +22,7 @@ from jaxnbv.stopping import Stop, Watch
 from jaxnbv.storage import DepthImage, SessionFolder, describe
 from jaxnbv.surroundings import Surroundings
 from jaxnbv.viz import write_report
+from jaxnbv.viz.live import LiveView
 from jaxnbv.volume import Box
 
 _NO_IMAGE = "the session has no image yet: add one first, session.add(depth, matrix)"
@@ -104,6 +105,7 @@ class Session:
         self._views: list[View] = []
         self._proposals: dict[int, Proposal] = {}
         self._next: NextView | None = None
+        self._live: LiveView | None = None
         self._state: State | None = None
         self._folder = None if folder is None else SessionFolder(folder, self._config())
         if self._folder is not None:
@@ -209,6 +211,7 @@ class Session:
             self._proposals[index] = proposal
             matrix = np.asarray(self.frame.to_world(proposal.pose).to_matrix(self.convention), np.float64)
             self._next = NextView(matrix, float(proposal.value), proposal.standard_error, expected, proposal)
+            self._show()
         return self._next
 
     def report(self, folder: str | Path | None = None, title: str = "object", progress: bool = True) -> Path:
@@ -220,6 +223,21 @@ class Session:
         if place is None:
             raise InputError("the session keeps no folder: tell the report one, session.report(folder)")
         return write_report(self.episode, place, title=title, progress=progress)
+
+    def view(self, port: int = 8080, host: str = "127.0.0.1") -> LiveView:
+        """A page in the browser, which changes with every image and proposal from now on; needs viser.
+
+        **Raises:** `ValueError` if viser is not installed.
+        """
+        self._live = LiveView(port, host)
+        self._show()
+        return self._live
+
+    def _show(self) -> None:
+        if self._live is not None and self.views:
+            asked = self._next
+            about = () if asked is None else (asked.proposal, asked.expected_depth)
+            self._live.update(self.episode, *about)
 
     def _config(self) -> dict:
         sensor = {"cameras": self.cameras, "box": self.box, "up": self.frame.up, "convention": self.convention}
@@ -244,6 +262,7 @@ class Session:
         rays, proposal = self.frame.to_scene(self._rays[camera]), self._proposals.get(self.views)
         self._views.append(View(pose, scan, self._state.cloud, proposal, rays))
         self._next = None
+        self._show()
 
     def _propose(self) -> tuple[Proposal, Float[np.ndarray, "h w"] | None]:
         sample_key, search_key, _ = view_keys(self.key, self.views)

@@ -1,4 +1,4 @@
-"""`jaxnbv convert`: checkpoints."""
+"""`jaxnbv convert`: checkpoints. `jaxnbv view`: a run in the browser."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,3 +14,17 @@ def convert(
 ) -> None:
     """Rewrite a PyTorch checkpoint as safetensors. Nothing in it is run, and PyTorch is not needed."""
     actions.convert(source, target)
+
+
+def view(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run or of a session.")],
+    html: Annotated[
+        Path | None, typer.Option(help="Write the scene into one HTML file, which opens offline, and end.")
+    ] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Where the page is served.")] = 8080,
+) -> None:
+    """Look at a run in the browser: points, cameras, the surface, what is imagined, where to look next.
+
+    Needs viser: `pip install "jaxnbv[view]"`. Surfaces are those of the usual model, given what was seen.
+    """
+    actions.view(folder, html, port)

@@ -14,7 +14,7 @@ from plyfile import PlyData, PlyElement
 
 from jaxnbv.cloud import PointCloud
 from jaxnbv.files import write_whole
-from jaxnbv.folders import ResultFolder
+from jaxnbv.folders import ResultFolder, read_config
 from jaxnbv.pose import Pose
 from jaxnbv.search import Proposal
 from jaxnbv.storage.arrays import (
@@ -31,6 +31,7 @@ from jaxnbv.storage.arrays import (
     write_arrays,
 )
 
+_RECORD = "episode.json"
 _VIEW = {**POSE, **SCAN, **PROPOSAL}
 
 
@@ -42,7 +43,7 @@ class EpisodeFolder(ResultFolder):
     """
 
     def __init__(self, path: str | Path, config: dict[str, Any]):
-        super().__init__(path, "episode.json", "view_*.npz", config, "episode")
+        super().__init__(path, _RECORD, "view_*.npz", config, "episode")
 
     def read_views(self) -> list[tuple[Pose, PointCloud, Proposal | None]]:
         """Pose, scan and proposal of every finished view, up to the first that is missing.
@@ -67,6 +68,15 @@ class EpisodeFolder(ResultFolder):
 
     def _view_file(self, index: int) -> Path:
         return self.path / f"view_{index:02d}.npz"
+
+
+def open_episode(path: str | Path) -> EpisodeFolder:
+    """The folder of an episode, whatever its configuration, which is its `config`.
+
+    **Raises:** `ValueError` if it holds no episode.
+    """
+    record = Path(path) / _RECORD
+    return EpisodeFolder(path, read_config(record, "is not an episode's record", "give the folder of a run"))
 
 
 def _view(data: dict[str, np.ndarray]) -> tuple[Pose, PointCloud, Proposal | None]:

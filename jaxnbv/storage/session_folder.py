@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Real
 
-from jaxnbv.checks import InputError
-from jaxnbv.folders import ResultFolder, read_json
+from jaxnbv.folders import ResultFolder, read_config
 from jaxnbv.search import Proposal
 from jaxnbv.storage.arrays import (
     POSE,
@@ -25,7 +24,7 @@ from jaxnbv.storage.arrays import (
     write_arrays,
 )
 
-RECORD = "session.json"
+SESSION_RECORD = "session.json"
 _IMAGE: Schema = {
     "depth": ("uif", ("h", "w")),
     "matrix": ("f", (4, 4)),
@@ -56,7 +55,7 @@ class SessionFolder(ResultFolder):
     """
 
     def __init__(self, path: str | Path, config: dict[str, Any]):
-        super().__init__(path, RECORD, "image_*.npz", config, "session")
+        super().__init__(path, SESSION_RECORD, "image_*.npz", config, "session")
 
     def count_images(self) -> int:
         """How many there are, up to the first that is missing."""
@@ -103,11 +102,8 @@ def open_session(path: str | Path) -> SessionFolder:
 
     **Raises:** `ValueError` if it holds no session.
     """
-    record = Path(path) / RECORD
-    config = read_json(record, "is not a session's record", "give the folder of a session").get("config")
-    if not isinstance(config, dict):
-        raise InputError(f"{record} is not a session's record: give the folder of a session")
-    return SessionFolder(path, config)
+    record = Path(path) / SESSION_RECORD
+    return SessionFolder(path, read_config(record, "is not a session's record", "give the folder of a session"))
 
 
 def _image(data: dict[str, np.ndarray]) -> DepthImage:

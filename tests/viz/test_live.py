@@ -1,0 +1,95 @@
+"""The live view: what is in its scene, against the state; and one HTML file of it."""
+
+import re
+import sys
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from test_session import FIRST, session_of, shot
+
+from jaxnbv.checks import InputError
+from jaxnbv.replay import stored_run
+from jaxnbv.viz.live import LiveView
+
+viser = pytest.importorskip("viser", reason="viser is not installed")
+
+
+@pytest.fixture(scope="module")
+def watched(tmp_path_factory):
+    """A session that was watched from its first image on: of two images and the next question."""
+    folder = tmp_path_factory.mktemp("live") / "session"
+    session = session_of(folder)
+    page = session.view(port=0)
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    matrix = session.next().matrix
+    session.add(shot(matrix), matrix, depth_scale=1e-3)
+    session.next()
+    yield folder, session, page
+    page.stop()
+
+
+def handles(page):
+    return {handle.name: handle for handle in page._drawn}
+
+
+def test_all_that_is_known_is_in_the_scene(watched):
+    _, _, page = watched
+    shown = handles(page)
+    expected = {"/points/before", "/points/new", "/surface of the mean", "/candidates", "/next view", "/imagined/1"}
+    assert expected <= set(shown)
+    assert {"/cameras/view 1", "/cameras/view 2"} <= set(shown)
+    assert "/cameras/view 3" not in shown
+    assert not shown["/imagined/1"].visible
+    assert shown["/surface of the mean"].visible
+
+
+def test_cameras_stand_and_look_as_they_do(watched):
+    _, session, page = watched
+    for number, view in enumerate(session.episode.views, start=1):
+        handle = handles(page)[f"/cameras/view {number}"]
+        np.testing.assert_allclose(handle.position, view.pose.position, atol=1e-5)
+        turned = Rotation.from_quat(handle.wxyz, scalar_first=True).as_matrix()
+        np.testing.assert_allclose(turned, view.pose.rotation, atol=1e-5)
+        assert handle.aspect == pytest.approx((64 / 90.0) / (48 / 95.0), rel=0.05)
+    following = handles(page)["/next view"]
+    np.testing.assert_allclose(following.position, session.next().proposal.pose.position, atol=1e-5)
+
+
+def test_points_are_those_of_the_last_scan_and_those_before(watched):
+    _, session, page = watched
+    new, _ = session.episode.views[-1].scan.to_numpy()
+    before, _ = session.episode.views[0].cloud.to_numpy()
+    np.testing.assert_allclose(handles(page)["/points/new"].points, new, atol=2e-3)
+    np.testing.assert_allclose(handles(page)["/points/before"].points, before, atol=2e-3)
+
+
+def test_the_text_tells_what_is_asked(watched):
+    _, _, page = watched
+    text = page._text.content
+    assert "2 views" in text
+    assert "expected coverage gain" in text
+    assert page._image is not None
+
+
+def test_one_file_holds_the_scene(watched, tmp_path):
+    _, _, page = watched
+    path = page.save(tmp_path / "scene.html")
+    text = path.read_text()
+    assert "<html" in text
+    assert not re.findall(r'<(?:script|link|img)[^>]*(?:src|href)="https?:', text)
+
+
+def test_a_stored_session_is_shown_without_its_planner(watched):
+    folder, session, _ = watched
+    run = stored_run(folder)
+    assert len(run.episode.views) == 2
+    np.testing.assert_array_equal(run.episode.views[1].scan.points, session.episode.views[1].scan.points)
+    np.testing.assert_array_equal(run.proposal.values, session.next().proposal.values)
+    np.testing.assert_array_equal(run.expected, session.next().expected_depth)
+
+
+def test_without_viser_it_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(InputError, match=r'pip install "jaxnbv\[view\]"'):
+        LiveView(0)
