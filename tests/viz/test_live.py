@@ -17,12 +17,12 @@ viser = pytest.importorskip("viser", reason="viser is not installed")
 
 @pytest.fixture(scope="module")
 def watched(tmp_path_factory):
-    """A session that was watched from its first image on: of two images and the next question."""
+    """A session of two images and the next question, watched from its first question on."""
     folder = tmp_path_factory.mktemp("live") / "session"
     session = session_of(folder)
-    page = session.view(port=0)
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     matrix = session.next().matrix
+    page = session.view(port=0)
     session.add(shot(matrix), matrix, depth_scale=1e-3)
     session.next()
     yield folder, session, page
