@@ -70,6 +70,42 @@ def read_config(file: Path, problem: str, remedy: str) -> dict[str, Any]:
     return config
 
 
+@contextmanager
+def writing_in(path: Path, *inside: str) -> Iterator[None]:
+    """While this process writes in a folder; what a process that was killed has left of a file is removed first, there
+    and in folders inside.
+
+    **Raises:** `ValueError` if another process writes there, or it cannot be written.
+    """
+    lock = filelock.FileLock(path / _LOCK, timeout=0)
+    try:
+        lock.acquire()
+        # The same file: what another process reads when the lock is taken.
+        (path / _LOCK).write_text(f"process {os.getpid()} on {socket.gethostname()}")
+    except filelock.Timeout as error:
+        raise InputError(
+            f"{path} is being written by {_holder(path)}: wait until it ends, or choose another folder"
+        ) from error
+    # What filelock raises where the file system has no locks.
+    except (OSError, NotImplementedError) as error:
+        lock.release()
+        raise InputError(f"cannot write in {path} ({error}): make room or choose another place") from error
+    try:
+        for folder in (path, *(path / name for name in inside)):
+            for left in folder.glob(PARTS):
+                left.unlink()
+        yield
+    finally:
+        lock.release()
+
+
+def _holder(path: Path) -> str:
+    try:
+        return (path / _LOCK).read_text() or "another process"
+    except OSError:
+        return "another process"
+
+
 class ResultFolder:
     """A folder, and the configuration that its results have: a record, written with the first of them.
 
@@ -92,27 +128,10 @@ class ResultFolder:
 
         **Raises:** `ValueError` if another process does, or the folder cannot be written.
         """
-        lock = filelock.FileLock(self.path / _LOCK, timeout=0)
-        try:
-            lock.acquire()
-            # The same file: what another process reads when the lock is taken.
-            (self.path / _LOCK).write_text(f"process {os.getpid()} on {socket.gethostname()}")
-        except filelock.Timeout as error:
-            raise InputError(
-                f"{self.path} is being written by {self._holder()}: wait until it ends, or choose another folder"
-            ) from error
-        # What filelock raises where the file system has no locks.
-        except (OSError, NotImplementedError) as error:
-            lock.release()
-            raise InputError(f"cannot write in {self.path} ({error}): make room or choose another place") from error
-        try:
-            for left in self.path.glob(PARTS):
-                left.unlink()
+        with writing_in(self.path):
             # Another process may have written since this one looked.
             self._check()
             yield
-        finally:
-            lock.release()
 
     def bind(self) -> None:
         """Write the record, if it is not there, before the first result is."""
@@ -121,12 +140,6 @@ class ResultFolder:
                 self.record, json.dumps({"format": FORMAT, "config": self.config, "versions": versions()}, indent=2)
             )
             self.bound = True
-
-    def _holder(self) -> str:
-        try:
-            return (self.path / _LOCK).read_text() or "another process"
-        except OSError:
-            return "another process"
 
     def _check(self) -> None:
         has_results = any(self.path.glob(self.results))

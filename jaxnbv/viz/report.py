@@ -19,7 +19,7 @@ from jaxnbv.camera import Camera
 from jaxnbv.checks import AnyArray, checked
 from jaxnbv.episode import Episode
 from jaxnbv.files import make_folder, write_text
-from jaxnbv.folders import versions
+from jaxnbv.folders import versions, writing_in
 from jaxnbv.storage import describe
 from jaxnbv.viz import sphere
 from jaxnbv.viz.data import COVERAGE_RADIUS, Choice, MeanSurface, ReportData, ViewData, report_data
@@ -29,6 +29,7 @@ from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, VAL
 from jaxnbv.viz.trajectories import Ascents
 from jaxnbv.viz.trajectory_figures import frusta_steps, small_frusta, spatial_range
 
+_FIGURES = "figures"
 _MAX_BEFORE, _MAX_NEW = 4000, 2500
 _ASCENT_CAPTION = """
       Small cameras stand along the gradient ascents, pale to dark with their acquisition, thicker towards the end."""
@@ -48,12 +49,14 @@ def write_report(
     - `truth`: points of the true surface in scene coordinates, for the chart of coverage; by default sampled from the
       scene, where it can be. Without truth the chart counts points.
     - `title`: what the object is called.
+
+    **Raises:** `ValueError` if the folder cannot be written, or another process writes in it.
     """
-    folder = make_folder(folder)
+    path = make_folder(folder) / "report.html"
     data = report_data(episode, truth, progress)
-    write_figures(data, episode.planner.camera, folder / "figures", progress)
-    path = folder / "report.html"
-    write_text(path, report_html(episode, data, title))
+    with writing_in(path.parent, _FIGURES):
+        write_figures(data, episode.planner.camera, path.parent / _FIGURES, progress)
+        write_text(path, report_html(episode, data, title))
     return path
 
 

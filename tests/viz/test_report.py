@@ -52,7 +52,10 @@ def episode():
 
 @pytest.fixture(scope="module")
 def report(episode, tmp_path_factory):
+    """In a folder where a process that was killed has left a part of a picture."""
     folder = tmp_path_factory.mktemp("report")
+    (folder / "figures").mkdir()
+    (folder / "figures" / ".0123456789abcdef.partial").write_bytes(b"half a picture")
     return write_report(episode, folder, title="a <mug> & saucer", progress=False)
 
 
