@@ -171,7 +171,8 @@ class Found(Stop):
 class Covered(Stop):
     """So much has been seen of what can be seen, in expectation over the posterior.
 
-    Of all points that the sensor would see of the sampled surfaces from the candidates, the share that lies near D.
+    Of all points that the sensor would see of the sampled surfaces from the candidates, the share that lies near D. Of
+    three objects it was right to 0.02 on one, and up to 0.28 too low on two: it ends late rather than early.
 
     - `share`: within (0, 1].
     - `radius`: within which of D a point counts as seen, in scene units.
