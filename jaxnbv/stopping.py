@@ -272,8 +272,7 @@ def expected_coverage(planner: Planner, state: State, key: PRNGKeyArray, radius:
     """
     search = planner.search
     candidates = search.candidates if isinstance(search, CandidateSearch) else SphereCandidates()
-    surfaces = planner.sample_surfaces(state, key)
-    poses = candidates.poses()
+    surfaces, poses = planner.sample_surfaces(state, key), candidates.poses()
     near, seen = np.asarray(_seen_before(SeenBefore(radius), planner, state.cloud, surfaces, poses))
     return float(near / seen) if seen else 1.0
 
