@@ -194,10 +194,8 @@ class Planner(eqx.Module):
         check_type(state, State, "the state")
         check_type(surfaces, GridSurface | None, "the surfaces")
         check_type(imagined, PointCloud | None, "what is imagined")
-        half_extent = self.grid.half_extent
-        known = state.cloud, state.poses, state.num_views, surfaces, self.cost, imagined
-        around = self.surroundings, state.seen_empty, half_extent
-        proposal = _choose(self.search, self.acquisition, self.camera, known, around, key)
+        asked = surfaces, self.cost, imagined, self.surroundings
+        proposal = _choose(self.search, self.acquisition, self.camera, state, *asked, key)
         if not is_traced(proposal):
             require(
                 not bool(jnp.isnan(proposal.value)) and (surfaces is None or bool(proposal.value < jnp.inf)),
@@ -266,8 +264,16 @@ def _in_words(value: Float[Array, ""]) -> str:
 
 @eqx.filter_jit
 def _choose(
-    search: Search, acquisition: Score, camera: Camera, known: tuple, around: tuple, key: PRNGKeyArray
+    search: Search,
+    acquisition: Score,
+    camera: Camera,
+    state: State,
+    surfaces: GridSurface | None,
+    cost: Cost | None,
+    imagined: PointCloud | None,
+    surroundings: Surroundings | None,
+    key: PRNGKeyArray,
 ) -> Proposal:
-    cloud, visited, num_visited, surfaces, cost, imagined = known
-    problem = Problem(cloud, visited, num_visited, camera, acquisition, surfaces, cost, imagined, *around)
+    known, empty = (state.cloud, state.poses, state.num_views), (state.seen_empty, state.half_extent)
+    problem = Problem(*known, camera, acquisition, surfaces, cost, imagined, surroundings, *empty)
     return search.propose(problem, key)

@@ -236,8 +236,8 @@ class Session:
     def _show(self) -> None:
         if self._live is not None and self.views:
             asked = self._next
-            about = () if asked is None else (asked.proposal, asked.expected_depth)
-            self._live.update(self.episode, *about)
+            proposal, expected = (None, None) if asked is None else (asked.proposal, asked.expected_depth)
+            self._live.update(self.episode, proposal, expected, self.state)
 
     def _config(self) -> dict:
         sensor = {"cameras": self.cameras, "box": self.box, "up": self.frame.up, "convention": self.convention}

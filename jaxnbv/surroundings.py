@@ -141,14 +141,15 @@ def support_plane(
     - `points`: as scanned, table and all, in any units; `up`: a direction that is upward, to 30 degrees.
     - `tolerance`: how far from the plane its points may be, in the units of the points.
 
-    **Raises:** `ValueError` for fewer than three points, a tolerance that is not positive, or where the plane of most
-    points is not level.
+    **Raises:** `ValueError` for fewer than three points, one that is not finite, a tolerance that is not positive, or
+    where the plane of most points is not level.
     """
     points = as_numbers(points, "the points", np.float64)
     require(
         points.ndim == 2 and points.shape[1:] == (3,) and len(points) >= 3,
         f"the points are {shown(points)}; give (n, 3), three at least",
     )
+    require(bool(np.isfinite(points).all()), "the points are not all finite: drop those that are not")
     require(tolerance > 0, f"the tolerance is {tolerance}; it must be positive")
     upward = as_numbers(up, "up", np.float64)
     require(upward.shape == (3,) and bool(np.linalg.norm(upward) > 0), f"up is {shown(up)}; give a direction")

@@ -244,6 +244,7 @@ def test_the_table_is_found_under_an_object(seed):
         (lambda: solid_of_mesh(np.eye(3), np.array([[0, 1, 3]])), "faces refer to vertices 0 to 3"),
         (lambda: support_plane(np.zeros((2, 3)), (0.0, 0.0, 1.0), 0.01), "three at least"),
         (lambda: support_plane(np.eye(3), (0.0, 0.0, 0.0), 0.01), "give a direction"),
+        (lambda: support_plane(np.full((4, 3), np.nan), (0.0, 0.0, 1.0), 0.01), "not all finite"),
         (lambda: support_plane(np.eye(3) * [1, 1, 0.0], (1.0, 0.0, 0.0), 0.01), "degrees off level"),
     ],
 )

@@ -56,13 +56,18 @@ class LiveView:
         return f"http://{self._server.get_host()}:{self._server.get_port()}"
 
     def update(
-        self, episode: Episode, proposal: Proposal | None = None, expected: Float[np.ndarray, "h w"] | None = None
+        self,
+        episode: Episode,
+        proposal: Proposal | None = None,
+        expected: Float[np.ndarray, "h w"] | None = None,
+        state: State | None = None,
     ) -> None:
         """Show an episode as it is now.
 
         - `proposal`: for the view after its last; `expected`: the depth image expected there.
+        - `state`: the planner's after its last view, where that is at hand; made again from the scans otherwise.
         """
-        *_, state = episode.states()
+        state = episode.state_after(len(episode.views)) if state is None else state
         key, *_ = view_keys(episode.key, len(episode.views))
         scene = self._server.scene
         with self._server.atomic():
