@@ -4,25 +4,26 @@ import os
 from pathlib import Path
 
 # Before NumPy, SciPy and JAX are loaded, and for the processes that tests start. Workers whose linear algebra takes all
-# cores each wait for one another. Most programs of the tests run for less time than they take to compile: LLVM's
-# expensive passes and XLA's newer emitters of fused loops do not pay. Without any optimisation (level 0) they would run
-# several times longer. What one worker has compiled the others find.
+# cores each wait for one another. Most programs of the tests run for less time than they take to compile: neither
+# LLVM's passes nor XLA's newer emitters of fused loops pay. Modules that compute for long, some five times longer so,
+# say COMPUTES = True. What one worker has compiled the others find.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault(
-    "XLA_FLAGS",
-    "--xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true --xla_cpu_use_fusion_emitters=false",
-)
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+os.environ.setdefault("XLA_FLAGS", "--xla_llvm_disable_expensive_passes=true --xla_cpu_use_fusion_emitters=false")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "xla"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 import jax
 import numpy as np
+import psutil
 import pytest
 from jaxtyping import install_import_hook
 
 install_import_hook("jaxnbv", "beartype.beartype")
 
+# Bytes of a worker.
+MEMORY = 3 << 30
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
@@ -46,11 +47,25 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: LONGEST_FIRST.index(item.path.name) if item.path.name in LONGEST_FIRST else 99)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compiled_programs_are_let_go():
-    """A whole run would hold gigabytes of them."""
-    yield
+def compile_for_speed(wanted):
     jax.clear_caches()
+    jax.config.update("jax_disable_most_optimizations", not wanted)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_programs(request):
+    """As a module asks for them; let go before they fill the memory, which those of a whole run would."""
+    computes = getattr(request.module, "COMPUTES", False)
+    if computes == jax.config.values["jax_disable_most_optimizations"] or psutil.Process().memory_info().rss > MEMORY:
+        compile_for_speed(computes)
+
+
+@pytest.fixture
+def computes():
+    """For a single test that computes for long."""
+    compile_for_speed(True)
+    yield
+    compile_for_speed(False)
 
 
 @pytest.fixture(autouse=True)

@@ -65,4 +65,13 @@ STUDIES = {
         pictures="jaxnbv.experiments.reconstruction.pictures:write_pictures",
         options=("meshes",),
     ),
+    "searches": Entry(
+        "jaxnbv.experiments.searches:SearchStudy",
+        "Do searches by gradient find better views than one over candidates, and what do they cost? On pyramids.",
+        "Settings of the pyramid study; gradient searches climb from the best 4 of 24 views, 8 steps of 0.03.",
+        scenes=60,
+        views=5,
+        pictures="jaxnbv.experiments.pyramid.pictures:write_pictures",
+        options=("framing",),
+    ),
 }

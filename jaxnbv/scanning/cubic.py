@@ -49,22 +49,25 @@ def first_bracket(c: list) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
 def first_root(c: list) -> Float[Array, " n"]:
     """The first root in [0, 1] of cubics that have one and are positive at 0; 0 where they are not.
 
-    Newton's method, and bisection where it leaves the bracket.
+    Newton's method, and bisection where it leaves the bracket by more than rounding explains: a compiler may compute a
+    value twice, a little differently, and the bracket then ends beside the root.
     """
     high, _ = first_bracket(c)
     drop = c[0] - _polynomial(c, high)
     secant = high * jnp.clip(c[0] / jnp.where(drop > 0, drop, 1.0), 0.0, 1.0)
+    rounding = 4.0 * jnp.finfo(high.dtype).eps * sum(map(jnp.abs, c))
 
     def refine(_, state):
         low, high, s = state
         value = _polynomial(c, s)
         slope = c[1] + s * (2.0 * c[2] + s * 3.0 * c[3])
         low, high = jnp.where(value > 0, s, low), jnp.where(value > 0, high, s)
-        newton = s - value / jnp.where(slope == 0, 1.0, slope)
-        return low, high, jnp.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
+        safe = jnp.where(slope == 0, 1.0, slope)
+        newton, slack = s - value / safe, rounding / jnp.abs(safe)
+        return low, high, jnp.where((newton >= low - slack) & (newton <= high + slack), newton, 0.5 * (low + high))
 
     _, _, s = jax.lax.fori_loop(0, _ROOT_ITERATIONS, refine, (jnp.zeros_like(high), high, secant))
-    return jnp.where(c[0] <= 0, 0.0, s)
+    return jnp.where(c[0] <= 0, 0.0, jnp.clip(s, 0.0, 1.0))
 
 
 def _polynomial(c: list, s) -> Float[Array, " n"]:

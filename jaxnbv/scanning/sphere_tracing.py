@@ -19,8 +19,8 @@ _MAX_STRIDES = 512
 # Rays that are still under way go on by themselves once they are at most this fraction of all.
 _FEW = 1 / 8
 _CHORDS = 2
-# How far before a hit, along the ray, its normal is taken: above rounding, below any detail.
-_FRONT = 1e-5
+# How far before a hit, along the ray, slopes are taken, in units of rounding: above it, below any detail.
+_FRONT = 84
 # Least sine of the angle between a ray and the surface for which the exact derivative of the hit is given.
 _GRAZING = 0.05
 
@@ -57,11 +57,11 @@ class SDFSurface(Surface):
         along = _Along(self.sdf, origins, directions)
         fixed = jax.lax.stop_gradient(along)
         depth, mask = _first_root(fixed.sdf, fixed.origins, fixed.directions, self.bounding_radius)
-        depth = implicit_depth(along, fixed.newton(depth), mask, jnp.full_like(depth, _GRAZING))
-        points = along.points(depth)
-        # Just in front of the surface: on it a solid's formula may stand at the zero between two of its cases, and
-        # rounding may take the slope of neither.
-        front = points - _FRONT * directions
+        # Slopes are those just in front of the surface: on it a solid's formula may stand at the zero between two of
+        # its cases, and rounding may take the slope of neither.
+        before = _Along(self.sdf, origins - _FRONT * jnp.finfo(origins.dtype).eps * directions, directions)
+        depth = implicit_depth(before, fixed.newton(depth), mask, jnp.full_like(depth, _GRAZING))
+        points, front = along.points(depth), before.points(depth)
         # Forward mode: the slopes fuse into one pass over the points, which the scatters of reverse mode break up.
         axes = (jnp.broadcast_to(axis, points.shape) for axis in jnp.eye(3, dtype=points.dtype))
         gradient = jnp.stack([jax.jvp(self.sdf, (front,), (axis,))[1] for axis in axes], axis=-1)

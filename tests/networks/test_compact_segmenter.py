@@ -19,6 +19,7 @@ from jaxnbv.training.part_clouds import LabelledPartClouds, scanned_part_clouds
 
 RNG = np.random.default_rng(0)
 COUNT = 300
+COMPUTES = True
 CHAIR, MUG = 4, 11
 segment = eqx.filter_jit(lambda network, *arguments: network(*arguments))
 

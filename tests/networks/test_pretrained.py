@@ -14,6 +14,7 @@ from jaxnbv.networks import pyramid_classifier
 from jaxnbv.tasks.classification import entropy
 from jaxnbv.training.pyramid_clouds import LabelledClouds, scanned_clouds
 
+COMPUTES = True
 _CHUNK = 40
 
 

@@ -51,6 +51,7 @@ def start(folder, stage="none", view=0):
         "JAX_COMPILATION_CACHE_DIR": str(folder.with_suffix(".cache")),
         # The promise is about programs as users run them.
         "XLA_FLAGS": "",
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "0",
     }
     return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE)
 

@@ -13,6 +13,7 @@ from weight_space import WeightSpace
 from jaxnbv.cloud import PointCloud
 from jaxnbv.surfaces import GeometricSPSR
 
+COMPUTES = True
 SETTINGS = {"lengthscale": 0.15, "variance": 1.0, "noise": 0.3, "nu": 1.5, "truncation": 3}
 
 
