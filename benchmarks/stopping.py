@@ -22,7 +22,8 @@ import numpy as np
 from tqdm import tqdm
 
 import jaxnbv as nbv
-from jaxnbv.datasets import CATEGORIES, Framing, Split, hidden_view, part_scene, pyramid_scene
+from jaxnbv.datasets import Framing, Split, hidden_view, part_scene, pyramid_scene
+from jaxnbv.datasets.categories import CATEGORIES
 from jaxnbv.episode import view_keys
 from jaxnbv.experiments.statistics import bootstrap_mean
 from jaxnbv.files import write_text
