@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.ndimage
 
 from jaxnbv.camera import Camera
 from jaxnbv.scanning.grid import Grid, GridSurface
@@ -50,3 +51,19 @@ def some_rays(rng, count, spread=0.7):
     origins *= 2.5 / np.linalg.norm(origins, axis=1, keepdims=True)
     directions = rng.uniform(-spread, spread, (count, 3)) - origins
     return jnp.asarray(origins), jnp.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+
+
+def rough_values(grid, seed, amplitude):
+    """A sphere with smoothed noise, of several cells' wavelength."""
+    noise = np.random.default_rng(seed).standard_normal((grid.resolution,) * 3)
+    noise = scipy.ndimage.gaussian_filter(noise, 1.2)
+    return np.linalg.norm(nodes(grid), axis=-1) - 0.9 + amplitude * noise / noise.std()
+
+
+def random_rays(seed, count, radius=2.5, spread=1.0):
+    rng = np.random.default_rng(seed)
+    origins = rng.standard_normal((count, 3))
+    origins *= radius / np.linalg.norm(origins, axis=1, keepdims=True)
+    directions = rng.uniform(-spread, spread, (count, 3)) - origins
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return origins.astype(np.float32), directions.astype(np.float32)

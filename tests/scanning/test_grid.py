@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.ndimage
 import trimesh
+from bumps import GRID, nodes, random_rays, rough_values
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from skimage.measure import marching_cubes
@@ -15,38 +16,17 @@ from jaxnbv.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning.grid import Grid, GridSurface, scan_samples
 from jaxnbv.scanning.scanner import scan
 
-GRID = Grid(60, 1.75)
 CAMERA = Camera(height=40, width=40)
-
-
-def nodes(grid=GRID):
-    return np.stack(np.meshgrid(grid.axis, grid.axis, grid.axis, indexing="ij"), axis=-1)
 
 
 def sphere(grid=GRID, radius=1.0):
     return GridSurface.from_values(np.linalg.norm(nodes(grid), axis=-1), radius, grid)
 
 
-def rough_values(grid, seed, amplitude):
-    """A sphere with smoothed noise, of several cells' wavelength."""
-    noise = np.random.default_rng(seed).standard_normal((grid.resolution,) * 3)
-    noise = scipy.ndimage.gaussian_filter(noise, 1.2)
-    return np.linalg.norm(nodes(grid), axis=-1) - 0.9 + amplitude * noise / noise.std()
-
-
 def interpolate(values, points, grid):
     """The trilinear interpolant in float64."""
     position = (np.asarray(points, np.float64) + grid.half_extent) / grid.spacing
     return scipy.ndimage.map_coordinates(np.asarray(values, np.float64), position.T, order=1, mode="nearest")
-
-
-def random_rays(seed, count, radius=2.5, spread=1.0):
-    rng = np.random.default_rng(seed)
-    origins = rng.standard_normal((count, 3))
-    origins *= radius / np.linalg.norm(origins, axis=1, keepdims=True)
-    directions = rng.uniform(-spread, spread, (count, 3)) - origins
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return origins.astype(np.float32), directions.astype(np.float32)
 
 
 def camera_rays(poses):
@@ -84,7 +64,7 @@ def test_sphere_closed_form():
 
 def test_box_closed_form():
     half = np.array([0.7, 0.83, 0.9])
-    q = np.abs(nodes()) - half
+    q = np.abs(nodes(GRID)) - half
     outside = np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0)
     origins, directions = random_rays(1, 3000, spread=0.6)
     hits = GridSurface.from_values(outside, 0.0, GRID).trace(origins, directions)
@@ -108,7 +88,7 @@ def test_box_closed_form():
 
 
 def test_torus_closed_form():
-    x = nodes()
+    x = nodes(GRID)
     ring = np.hypot(x[..., 0], x[..., 1]) - 0.85
     values = np.hypot(ring, x[..., 2])
     origins, directions = random_rays(2, 3000)
@@ -297,35 +277,6 @@ def test_samples_in_a_batch_equal_single_ones():
             assert differs(clouds.points[i, j], expected.points).mean() <= 0.002
         assert (vmapped.mask[i] != clouds.mask[i].reshape(-1)).mean() <= 0.002
         assert differs(vmapped.points[i], clouds.points[i].reshape(-1, 3)).mean() <= 0.002
-
-
-def test_derivatives_of_hits_against_finite_differences():
-    values = rough_values(GRID, 8, 0.02).astype(np.float32)
-    surface = GridSurface.from_values(values, 0.0, GRID)
-    origins, directions = (jnp.asarray(a) for a in random_rays(9, 60, spread=0.5))
-    shift = jnp.asarray(np.random.default_rng(10).standard_normal((60, 3)), jnp.float32)
-    bend = jnp.asarray(np.random.default_rng(11).standard_normal((60, 3)), jnp.float32)
-
-    @jax.jit
-    def distances(step, values):
-        moved = GridSurface(values, surface.distance, GRID)
-        o, d = origins + step * shift, directions + step * bend
-        return jnp.sum((moved.trace(o, d).points - o) * d, axis=-1) / jnp.sum(d * d, axis=-1)
-
-    zeros, ones = jnp.zeros_like(surface.values), jnp.ones_like(surface.values)
-    derivative = jax.jit(lambda ds, dv: jax.jvp(distances, (0.0, surface.values), (ds, dv))[1])
-    forward, away = derivative(1.0, zeros), derivative(0.0, ones)
-    reverse = jax.jit(jax.grad(lambda step: distances(step, surface.values) @ jnp.arange(60.0)))(0.0)
-    np.testing.assert_allclose(forward @ jnp.arange(60.0), reverse, rtol=1e-4)
-    eps = 1e-3
-    central = (distances(eps, surface.values) - distances(-eps, surface.values)) / (2 * eps)
-    # The interpolant has kinks at the cells' borders; rays that cross one within the difference's step are few.
-    error = np.abs(forward - central) / (1 + np.abs(central))
-    assert np.mean(error < 0.02) > 0.85
-    assert np.median(error) < 3e-3
-    # A higher f everywhere is a smaller object: along the normal, a hit recedes by df / |grad f|.
-    raised = (distances(0.0, surface.values + eps) - distances(0.0, surface.values - eps)) / (2 * eps)
-    assert np.median(np.abs(away - raised) / (1 + np.abs(raised))) < 3e-3
 
 
 def test_normals_are_interpolated_central_differences():
