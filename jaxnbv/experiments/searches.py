@@ -63,7 +63,7 @@ class SearchStudy(PyramidStudy):
         Measure("seconds", "Time of a proposal", _seconds, ("median",), "step", unit="seconds", better="less"),
     )
     charts: ClassVar[Mapping[str, Chart]] = {
-        "searches": Chart((tuple(map(Panel, ("stable", "value", "seconds"))),)),
+        "searches": Chart(((Panel("stable"), Panel("value", "Expected cross-entropy"), Panel("seconds")),)),
     }
     seed: ClassVar[int] = 10
     quick: ClassVar[Mapping[str, Any]] = {**PyramidStudy.quick, "num_starts": 2, "iterations": 3}

@@ -53,7 +53,7 @@ def _picture(record: Record, study: PyramidStudy, methods: Sequence[str]) -> Fig
     images = [[_shade(*map(np.asarray, _render(pyramid, _plain(pose)))) for pose in poses] for poses in taken]
 
     # Inches: all methods share the first view, so it stands once, at the middle of the rows.
-    tile, gap, below, left, top, margin = 1.25, 0.1, 0.36, 0.12, 0.8, 1.0
+    tile, gap, below, left, top, margin = 1.25, 0.1, 0.36, 0.12, 0.8, 0.1 + 0.08 * max(map(len, methods))
     wide, tall = left + views * (tile + gap) + margin + 0.1, top + len(methods) * (tile + below)
     title = f"Scene {record['scene']}, {record['framing']}: {PATTERNS[record['label']]}"
     caption = f"Framed: at least {PATTERN_PIXELS} pattern pixels. Beneath: prediction so far."
