@@ -1,6 +1,7 @@
 """The study of searches: does a search by gradient find better views than one over candidates, and what does it cost?
 
-The paper's comparison of its two ways to maximise the acquisition, on pyramids, and of three that lie between them.
+The paper's comparison of its two ways to maximise the acquisition, over candidates and by gradient, on pyramids; and
+successive halving, constrained 6-DOF poses, and gradient ascent from the best candidates beside them.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -19,7 +19,8 @@ _MAX_STRIDES = 512
 # Rays that are still under way go on by themselves once they are at most this fraction of all.
 _FEW = 1 / 8
 _CHORDS = 2
-# How far before a hit, along the ray, slopes are taken, in units of rounding: above it, below any detail.
+# How far before a hit, along the ray, slopes are taken, in units of a number's rounding: 1e-5 in float32, above the
+# rounding of a hit and below any detail.
 _FRONT = 84
 # Least sine of the angle between a ray and the surface for which the exact derivative of the hit is given.
 _GRAZING = 0.05
