@@ -54,16 +54,16 @@ def first_root(c: list) -> Float[Array, " n"]:
     """
     high, _ = first_bracket(c)
     drop = c[0] - _polynomial(c, high)
-    secant = high * jnp.clip(c[0] / jnp.where(drop > 0, drop, 1.0), 0.0, 1.0)
-    rounding = 4.0 * jnp.finfo(high.dtype).eps * sum(map(jnp.abs, c))
+    run = high / jnp.where(drop > 0, drop, 1.0)
+    secant = jnp.clip(c[0] * run, 0.0, high)
+    slack = 32.0 * jnp.finfo(high.dtype).eps * sum(map(jnp.abs, c)) * run
 
     def refine(_, state):
         low, high, s = state
         value = _polynomial(c, s)
         slope = c[1] + s * (2.0 * c[2] + s * 3.0 * c[3])
         low, high = jnp.where(value > 0, s, low), jnp.where(value > 0, high, s)
-        safe = jnp.where(slope == 0, 1.0, slope)
-        newton, slack = s - value / safe, rounding / jnp.abs(safe)
+        newton = s - value / jnp.where(slope == 0, 1.0, slope)
         return low, high, jnp.where((newton >= low - slack) & (newton <= high + slack), newton, 0.5 * (low + high))
 
     _, _, s = jax.lax.fori_loop(0, _ROOT_ITERATIONS, refine, (jnp.zeros_like(high), high, secant))
