@@ -1,17 +1,19 @@
 """Shapes and types of every public signature are checked while the tests run."""
 
+import gc
 import os
 from pathlib import Path
 
 # Before NumPy, SciPy and JAX are loaded, and for the processes that tests start. Workers whose linear algebra takes all
 # cores each wait for one another. Most programs of the tests run for less time than they take to compile: neither
 # LLVM's passes nor XLA's newer emitters of fused loops pay. Modules that compute for long, some five times longer so,
-# say COMPUTES = True. What one worker has compiled the others find.
+# say COMPUTES = True. What one worker has compiled the others find, if it took longer than reading it back. Tracing
+# makes and drops many small objects: collecting them as often as Python does by default takes a tenth of the time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 os.environ.setdefault("XLA_FLAGS", "--xla_llvm_disable_expensive_passes=true --xla_cpu_use_fusion_emitters=false")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "xla"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 import jax
@@ -20,6 +22,7 @@ import psutil
 import pytest
 from jaxtyping import install_import_hook
 
+gc.set_threshold(100_000, 20, 100)
 install_import_hook("jaxnbv", "beartype.beartype")
 
 # Bytes of a worker.
