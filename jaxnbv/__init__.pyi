@@ -27,6 +27,7 @@ from .pose import fibonacci_sphere as fibonacci_sphere
 from .pose import look_at as look_at
 from .presets import Imagination as Imagination
 from .presets import imagination as imagination
+from .reconstruction import carved_mesh as carved_mesh
 from .reconstruction import mean_mesh as mean_mesh
 from .reconstruction import screened_poisson as screened_poisson
 from .replay import StoredSession as StoredSession

@@ -11,7 +11,8 @@ from jaxtyping import Array, Float
 import jaxnbv as nbv
 from jaxnbv.checks import InputError
 from jaxnbv.pose import fibonacci_sphere
-from jaxnbv.reconstruction import has_poisson, mean_mesh, screened_poisson
+from jaxnbv.reconstruction import carved_mesh, has_poisson, mean_mesh, screened_poisson
+from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.surfaces import SurfaceModel, SurfacePosterior
 
 RADIUS = 0.9
@@ -81,6 +82,22 @@ def test_other_models_are_meshed_too_and_pieces_without_data_are_kept():
     assert len(parts) == 2
     for part, centre, radius in zip(parts, ([0.6, 0.3, 0.0], [-0.6, 0.0, 0.0]), (0.3, 0.5), strict=True):
         np.testing.assert_allclose(np.linalg.norm(part.vertices - centre, axis=1), radius, atol=0.02)
+
+
+def test_what_was_seen_empty_is_not_meshed():
+    """One of the model's two balls is there, and the camera sees past it through the other."""
+    seen = nbv.SDFSurface(Sphere(0.5).translate((-0.6, 0.0, 0.0)))
+    camera, pose = nbv.Camera(fov=1.3, height=60, width=60), nbv.look_at((0.0, 0.0, 2.5))
+
+    def mesh(carving):
+        search = nbv.FarthestView(nbv.SphereCandidates(8))
+        planner = nbv.Planner(Balls(), camera, nbv.Coverage(), search, 1, nbv.Grid(30), 4000, carving=carving)
+        return carved_mesh(planner, planner.init(nbv.scan(seen, camera, pose), pose))
+
+    (ball,) = mesh(nbv.Carving()).to_trimesh().split()
+    np.testing.assert_allclose(np.linalg.norm(ball.vertices - [-0.6, 0.0, 0.0], axis=1), 0.5, atol=0.03)
+    whole, plain = mesh(None), mean_mesh(Balls(), sphere_cloud(), nbv.Grid(30))
+    np.testing.assert_array_equal(whole.vertices, plain.vertices)
 
 
 def test_a_grid_that_the_surface_does_not_cross_is_refused():

@@ -25,6 +25,7 @@ from jaxnbv.presets import imagination
 from jaxnbv.scanning import Carving, Grid, Surface
 from jaxnbv.search import Search, SphereCandidates
 from jaxnbv.sensors import SENSOR_RADIUS
+from jaxnbv.state import State
 from jaxnbv.surfaces import ScreenedSPSR, SurfaceModel
 
 _PURPOSES = ("first", "episode", "scene", "measure")
@@ -269,15 +270,15 @@ class Study(eqx.Module):
                 return candidate
         raise InputError(f"none of {self.num_candidates} candidates shows enough of {scene.name}: give more")
 
-    def seen(self, scene: Scene, run: Record) -> list[tuple[PointCloud, PointCloud]]:
-        """Each scan of a method, and D after it, made again from the poses of its record."""
+    def seen(self, scene: Scene, run: Record) -> list[tuple[PointCloud, State]]:
+        """Each scan of a method, and what is known after it, made again from the poses of its record."""
         key, sensor = self.key(scene.index, "episode"), self.sensor(scene)
         poses = self.poses_of(run)
         require(len(poses) > 0, "there are no views to scan again")
         views = [(pose, sensor(pose, view_keys(key, index)[2]), self.camera) for index, pose in enumerate(poses)]
-        # D depends on the planner through its capacity alone.
+        # A state depends on the planner through its capacity, its grid and what it carves alone.
         states = self.planner(self.methods[0], scene).replay(views)
-        return [(scan, state.cloud) for (_, scan, _), state in zip(views, states, strict=True)]
+        return [(scan, state) for (_, scan, _), state in zip(views, states, strict=True)]
 
     def poses_of(self, run: Record) -> list[Pose]:
         """Where a method's views were taken; older records hold the numbers of candidates."""

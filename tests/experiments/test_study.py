@@ -50,13 +50,13 @@ def test_the_same_views_are_scanned_again_from_a_record_and_from_an_older_one():
     study = small()
     scene, run = study.scene(0), study.run_scene(0)["methods"]["farthest"]
     seen = study.seen(scene, run)
-    assert [int(cloud.count) for _, cloud in seen] == run["points"]
+    assert [int(state.cloud.count) for _, state in seen] == run["points"]
     scans = [scan for scan, _ in seen]
     assert int(scans[0].count) + int(scans[1].count) == run["points"][1]
     positions = np.asarray(study.candidates.poses().position)
     numbers = [int(np.argmin(np.linalg.norm(positions - view["position"], axis=1))) for view in run["views"]]
     again = study.seen(scene, {"candidates": numbers})
-    np.testing.assert_allclose(again[-1][1].points, seen[-1][1].points, atol=1e-5)
+    np.testing.assert_allclose(again[-1][1].cloud.points, seen[-1][1].cloud.points, atol=1e-5)
     # The noise is there.
     distance = np.abs(np.linalg.norm(scans[0].to_numpy()[0], axis=1) - 1.0)
     assert 1e-4 < distance.mean() < 0.05

@@ -60,12 +60,12 @@ def _picture(record: Record, study: ReconstructionStudy, methods: Sequence[str],
     eye = _eye(np.asarray(study.candidates.poses().position[record["first"]], np.float64))
     held = [record["methods"][method]["reconstructions"] for method in methods]
     names = [name for name in RECONSTRUCTIONS if all(found[name] is not None for found in held)]
-    clouds = [study.seen(scene, record["methods"][method])[-1][1] for method in methods]
+    states = [study.seen(scene, record["methods"][method])[-1][1] for method in methods]
 
     images = {"truth": _image(truth, None, eye, pixels)}
-    for method, cloud in zip(methods, clouds, strict=True):
+    for method, state in zip(methods, states, strict=True):
         for name in names:
-            mesh = reconstruct(study, cloud, name)
+            mesh = reconstruct(study, state, name)
             if mesh is None:
                 raise InputError(f'the records hold {name}: pip install "jaxnbv[poisson]" to draw it again')
             images[f"{name}, {method}"] = _image(mesh, tree, eye, pixels)
@@ -74,24 +74,26 @@ def _picture(record: Record, study: ReconstructionStudy, methods: Sequence[str],
     crop = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
     # Inches.
-    tile, gap, below, left, top, bottom = 1.6, 0.15, 0.32, 0.3, 0.62, 0.5
+    tile, gap, named, below, left, top, bottom = 1.6, 0.15, 0.35, 0.32, 0.12, 0.62, 0.5
     high = tile * (crop[0].stop - crop[0].start) / (crop[1].stop - crop[1].start)
-    wide, tall = left + (len(methods) + 1) * (tile + gap), top + len(names) * (high + below) + bottom
+    start = left + tile + named
+    wide, tall = start + len(methods) * (tile + gap), top + len(names) * (high + below) + bottom
     tiles = Tiles(wide, tall, record["name"])
 
-    def show(image: str, column: int, row: int | float, title: str = "") -> Axes:
-        axes = tiles.place(left + column * (tile + gap) - gap, top + row * (high + below), tile, high)
+    def show(image: str, x: float, row: int | float, title: str = "") -> Axes:
+        axes = tiles.place(x, top + row * (high + below), tile, high)
         axes.imshow(images[image][crop], interpolation="antialiased", aspect="auto")
         axes.set_title(title, fontsize=9, loc="center", pad=4)
         axes.axis("off")
         return axes
 
-    show("truth", 0, 0.5 * (len(names) - 1), "true surface")
+    show("truth", left, 0.5 * (len(names) - 1), "true surface")
     for row, name in enumerate(names):
-        x, down = left + tile + 0.5 * gap, top + row * (high + below) + 0.5 * high
-        tiles.write(x, down, name.replace(" ", "\n"), fontsize=8, color=GREY, rotation=90, ha="center")
-        for column, (method, found) in enumerate(zip(methods, held, strict=True), start=1):
-            axes = show(f"{name}, {method}", column, row, method if row == 0 else "")
+        down = top + row * (high + below) + 0.5 * high
+        upright = name.replace(" ", "\n")
+        tiles.write(start - 0.5 * named, down, upright, fontsize=8, color=GREY, rotation=90, ha="center")
+        for column, (method, found) in enumerate(zip(methods, held, strict=True)):
+            axes = show(f"{name}, {method}", start + column * (tile + gap), row, method if row == 0 else "")
             text = f"CD {found[name]['chamfer']:.3f}   HD {found[name]['hausdorff']:.3f}"
             axes.text(0.5, -0.04, text, transform=axes.transAxes, ha="center", va="top", fontsize=8)
     scale = tiles.place(wide - 3.4, tall - 0.44, 3.2, 0.08)

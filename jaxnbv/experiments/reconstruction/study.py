@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnbv.checks import InputError
-from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets import Split
 from jaxnbv.datasets.categories import CATEGORIES
 from jaxnbv.datasets.parts import part_scene
@@ -19,9 +18,10 @@ from jaxnbv.experiments.meshes import as_mesh_files, numbered_mesh
 from jaxnbv.experiments.study import Chart, Panel, Scene, Study
 from jaxnbv.metrics import SURFACE_POINTS, coverage, surface_distance, truth_points
 from jaxnbv.planner import Planner
-from jaxnbv.reconstruction import has_poisson, mean_mesh, screened_poisson
+from jaxnbv.reconstruction import carved_mesh, has_poisson, screened_poisson
 from jaxnbv.scanning import SDFSurface, TriangleMesh
 from jaxnbv.search import CandidateSearch, DiscreteSearch, FarthestView, RandomView, UncertaintyView
+from jaxnbv.state import State
 from jaxnbv.tasks import Coverage
 
 _SEARCHES: dict[str, type[CandidateSearch]] = {
@@ -52,7 +52,7 @@ class ReconstructionStudy(Study):
     - `meshes`: a folder of them, or their files, one a scene; without any, scenes are those of the test split of
       `part_scene`.
 
-    The model's mean is also meshed, on the paper's grid of 100^3.
+    The posterior's mean is meshed on the grid of the samples, carved as they are.
     """
 
     title: ClassVar[str] = "Distances to the true surface after the last view"
@@ -96,6 +96,11 @@ class ReconstructionStudy(Study):
     def planner(self, method: str, scene: Scene) -> Planner:
         return self.planner_of(Coverage(), _SEARCHES[method](self.candidates))
 
+    @property
+    def mesher(self) -> Planner:
+        """Whose posterior all methods' views are meshed by, those of planners of one's own too."""
+        return self.planner_of(Coverage(), FarthestView(self.candidates))
+
     def truth(self, scene: Scene) -> Float[np.ndarray, "n 3"]:
         points = truth_points(scene.surface, self.key(scene.index, "scene"), SURFACE_POINTS)
         if points is None:
@@ -112,12 +117,11 @@ class ReconstructionStudy(Study):
     ) -> Record:
         """The share of the true surface that is covered after each view, and the distances to it of two
         reconstructions from the last cloud; that by Poisson reconstruction is None without `pymeshlab`."""
-        covered = []
-        for view, *_ in episode:
-            covered.append(coverage(view.cloud, truth))
-            cloud = view.cloud
-        found = {name: self._distances(reconstruct(self, cloud, name), truth, scene.index) for name in RECONSTRUCTIONS}
-        return {"coverage": covered, "points": int(cloud.count), "reconstructions": found}
+        views = [view for view, *_ in episode]
+        *_, state = self.mesher.replay((view.pose, view.scan, self.camera) for view in views)
+        found = {name: self._distances(reconstruct(self, state, name), truth, scene.index) for name in RECONSTRUCTIONS}
+        covered = [coverage(view.cloud, truth) for view in views]
+        return {"coverage": covered, "points": int(state.cloud.count), "reconstructions": found}
 
     def _distances(self, mesh: TriangleMesh | None, truth: Float[np.ndarray, "n 3"], index: int) -> Record | None:
         if mesh is None:
@@ -126,8 +130,9 @@ class ReconstructionStudy(Study):
         return {"chamfer": distance.chamfer, **distance._asdict()}
 
 
-def reconstruct(study: ReconstructionStudy, cloud: PointCloud, name: str) -> TriangleMesh | None:
-    """One of `RECONSTRUCTIONS` from a cloud; None for Poisson reconstruction where `pymeshlab` cannot be imported."""
+def reconstruct(study: ReconstructionStudy, state: State, name: str) -> TriangleMesh | None:
+    """One of `RECONSTRUCTIONS` from what is known; None for Poisson reconstruction where `pymeshlab` cannot be
+    imported."""
     if name == MEAN:
-        return mean_mesh(study.model, cloud)
-    return screened_poisson(cloud) if has_poisson() else None
+        return carved_mesh(study.mesher, state)
+    return screened_poisson(state.cloud) if has_poisson() else None

@@ -73,7 +73,7 @@ def test_a_record_is_json_and_holds_every_method(record):
 def test_the_first_view_sees_the_heat_source(record):
     study = small_study()
     for method in RUN:
-        points, _ = study.seen(study.scene(0), record["methods"][method])[0][1].to_numpy()
+        points, _ = study.seen(study.scene(0), record["methods"][method])[0][1].cloud.to_numpy()
         assert np.linalg.norm(points - np.asarray(heat_scene(0).source), axis=1).min() <= 0.1
 
 
@@ -100,9 +100,9 @@ def test_estimates_are_those_of_the_clouds(record):
     assert record["truth"] == {"point": truth.coldest.tolist(), "temperature": low, "hottest": high}
     assert coldest_point(truth.mesh, heat).temperature == low
     run = record["methods"]["heat"]
-    for view, (_, cloud) in enumerate(study.seen(scene, run)):
+    for view, (_, state) in enumerate(study.seen(scene, run)):
         for name, found in run["estimates"].items():
-            expected = coldest_point(cloud, heat, reached_only=name == "reached")
+            expected = coldest_point(state.cloud, heat, reached_only=name == "reached")
             assert found["points"][view] == expected.point.tolist()
             assert found["temperatures"][view] == expected.temperature
             distance = np.linalg.norm(near - expected.point, axis=1).min()

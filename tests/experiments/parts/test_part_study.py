@@ -152,8 +152,8 @@ def test_counts_are_those_of_the_segmenter_on_all_that_was_seen(method):
     again = study.seen(study.scene(SCENE), run)
     assert len(again) == len(run["counts"])
     labels = np.flatnonzero(np.asarray(scene.parts))
-    for counts, cloud, (_, remade) in zip(run["counts"], clouds(record, method), again, strict=True):
-        np.testing.assert_allclose(remade.points, cloud.points, atol=1e-5)
+    for counts, cloud, (_, state) in zip(run["counts"], clouds(record, method), again, strict=True):
+        np.testing.assert_allclose(state.cloud.points, cloud.points, atol=1e-5)
         fed, said = segmenter.predict(cloud)
         points, normals = np.asarray(fed.points, np.float64), np.asarray(fed.normals, np.float64)
         weight = np.random.default_rng(1).normal(size=(6, 50))

@@ -103,7 +103,7 @@ def test_views_are_those_of_an_episode_from_the_shared_first_view(record, meshes
         for view, taken, share in zip(episode.views, method["views"], method["coverage"], strict=True):
             np.testing.assert_array_equal(view.pose.position, np.float32(taken["position"]))
             assert share == coverage(view.cloud, truth)
-        cloud = study.seen(scene, method)[-1][1]
+        cloud = study.seen(scene, method)[-1][1].cloud
         np.testing.assert_array_equal(cloud.points, episode.cloud.points)
 
 
@@ -111,10 +111,10 @@ def test_distances_are_those_of_the_reconstruction_from_the_last_cloud(record, m
     study = small_study(meshes)
     truth = study.scene(1).surface.sample_points(jax.random.key(5), 20_000)
     method = record["methods"]["farthest"]
-    cloud = study.seen(study.scene(1), method)[-1][1]
+    state = study.seen(study.scene(1), method)[-1][1]
     for name, found in method["reconstructions"].items():
         if found is not None:
-            points = reconstruct(study, cloud, name).sample_points(jax.random.key(6), 20_000)
+            points = reconstruct(study, state, name).sample_points(jax.random.key(6), 20_000)
             expected = surface_distance(points, truth)
             assert found["chamfer"] == pytest.approx(expected.chamfer, rel=0.05)
             assert found["hausdorff"] == pytest.approx(expected.hausdorff, rel=0.1)
