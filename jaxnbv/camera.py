@@ -169,6 +169,7 @@ class Camera(eqx.Module):
         (fx, fy), (cx, cy) = self.focal_lengths, self.center
         return image * np.array([fx, fy], image.dtype) + np.array([cx * self.width, cy * self.height], image.dtype)
 
+    @eqx.filter_jit
     def rays(self, pose: Pose) -> tuple[Float[Array, "*batch rays 3"], Float[Array, "*batch rays 3"]]:
         """Origins and unit directions of all rays in the scene, for one pose or a batch."""
         directions = self.pixel_directions()

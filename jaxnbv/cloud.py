@@ -111,7 +111,7 @@ class PointCloud(eqx.Module):
         return cls(
             jnp.asarray(np.pad(points, pad)),
             jnp.asarray(np.pad((normals / lengths[:, None]).astype(points.dtype), pad)),
-            jnp.arange(capacity) < count,
+            jnp.asarray(np.arange(capacity) < count),
         )
 
     @classmethod

@@ -2,6 +2,7 @@
 
 import warnings
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Real
@@ -32,11 +33,24 @@ def points_of_depth(
     require(scale > 0, f"the depth's scale is {scale}; it must be positive")
     require(pose.position.ndim == 1, f"the pose is a batch {pose.position.shape[:-1]}: give one, poses[0] say")
     camera, rows = camera.strided(stride), slice(stride // 2, None, stride)
-    depth, missed = depth[rows, rows], jnp.asarray(missed)[rows, rows]
-
-    valid = jnp.isfinite(depth) & (depth > 0)
+    depth, missed = depth[rows, rows], missed[rows, rows]
     if not is_traced(depth, pose):
-        _check_meaning(np.asarray(depth)[np.asarray(valid)], camera, pose, box)
+        known = np.asarray(depth)
+        _check_meaning(known[np.isfinite(known) & (known > 0)], camera, pose, box)
+    points, normals, mask, missed, inside = _oriented(depth, jnp.asarray(missed), camera, pose, box)
+    if box is not None and not is_traced(points):
+        _warn_of_nothing_inside(np.asarray(points)[np.asarray(mask)], np.asarray(inside)[np.asarray(mask)], box)
+    mask = mask & inside
+    points, normals = (jnp.where(mask[:, None], vectors, 0.0) for vectors in (points, normals))
+    return points, normals, mask, missed
+
+
+@eqx.filter_jit
+def _oriented(
+    depth: Float[Array, "h w"], missed: Bool[Array, "h w"], camera: Camera, pose: Pose, box: Box | None
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"], Bool[Array, " n"]]:
+    """Points, normals, which of them are valid, which rays met nothing in the box, and which points lie in it."""
+    valid = jnp.isfinite(depth) & (depth > 0)
     if camera.farthest is not None:
         missed = missed | (valid & (depth > camera.farthest))
     valid = valid & ~missed & (depth >= camera.nearest)
@@ -52,15 +66,12 @@ def points_of_depth(
     points = pose.to_scene(local.reshape(-1, 3))
     normals = jnp.matmul(normals, pose.rotation.T, precision="highest")
 
-    missed = missed.reshape(-1)
+    missed, inside = missed.reshape(-1), jnp.ones_like(mask)
     if box is not None:
         crossed = valid.reshape(-1) & (depth.reshape(-1) >= _depth_behind(box, camera, pose))
         inside = box(points) <= 0
-        if not is_traced(points):
-            _warn_of_nothing_inside(np.asarray(points)[np.asarray(mask)], np.asarray(inside & mask), box)
-        mask, missed = mask & inside, missed | (crossed & ~inside)
-    points, normals = (jnp.where(mask[:, None], vectors, 0.0) for vectors in (points, normals))
-    return points, normals, mask, missed
+        missed = missed | (crossed & ~inside)
+    return points, normals, mask, missed, inside
 
 
 def _depth_behind(box: Box, camera: Camera, pose: Pose) -> Float[Array, " n"]:

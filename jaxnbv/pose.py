@@ -141,31 +141,38 @@ def look_at(
         f"look_at needs a position (..., 3), a target (3,) and an up (3,), got {position.shape}, {target.shape}, "
         f"{up.shape}",
     )
-    offset = target - position
+    rotation, distance, length = _facing(position, target, up)
     if not is_traced(position, target, up):
         for value, name in ((position, "position"), (target, "target"), (up, "up")):
-            require(bool(jnp.all(jnp.isfinite(value))), f"look_at needs finite coordinates, got {name} {value}")
-        distance = jnp.linalg.norm(offset, axis=-1)
+            require(bool(np.isfinite(value).all()), f"look_at needs finite coordinates, got {name} {value}")
         require(
-            bool(jnp.all(jnp.isfinite(distance))),
+            bool(np.isfinite(distance).all()),
             f"look_at needs a position whose distance from its target is a finite number, got position {position}",
         )
         require(
-            bool(jnp.all(distance > 0)),
+            bool((np.asarray(distance) > 0).all()),
             f"look_at needs a position apart from its target; both are {target}",
         )
-        length = float(jnp.linalg.norm(up))
         require(
-            0 < length < math.inf,
+            0 < float(length) < math.inf,
             f"look_at needs an up direction whose length is not zero and finite, such as (0, 1, 0), got {up}",
         )
-    forward = offset / jnp.linalg.norm(offset, axis=-1, keepdims=True)
+    return Pose(rotation, position)
+
+
+@jax.jit
+def _facing(
+    position: Float[Array, "*batch 3"], target: Float[Array, "3"], up: Float[Array, "3"]
+) -> tuple[Float[Array, "*batch 3 3"], Float[Array, "*batch 1"], Float[Array, ""]]:
+    """The rotation of `look_at`, the distance to the target and the length of the upward direction."""
+    offset, length = target - position, jnp.linalg.norm(up)
+    distance = jnp.linalg.norm(offset, axis=-1, keepdims=True)
+    forward = offset / distance
     spare = jnp.eye(3, dtype=up.dtype)[jnp.argmin(jnp.abs(up))]
-    parallel = jnp.linalg.norm(jnp.cross(forward, up), axis=-1, keepdims=True) < 1e-4 * jnp.linalg.norm(up)
+    parallel = jnp.linalg.norm(jnp.cross(forward, up), axis=-1, keepdims=True) < 1e-4 * length
     right = jnp.cross(forward, jnp.where(parallel, spare, up))
     right = right / jnp.linalg.norm(right, axis=-1, keepdims=True)
-    down = jnp.cross(forward, right)
-    return Pose(jnp.stack([right, down, forward], axis=-1), position)
+    return jnp.stack([right, jnp.cross(forward, right), forward], axis=-1), distance, length
 
 
 @checked

@@ -38,8 +38,8 @@ class State(eqx.Module):
 
         - `grid`: on which empty space is kept; None without carving.
         """
-        poses = Pose(np.tile(np.eye(3), (max_views, 1, 1)), np.zeros((max_views, 3)))
-        poses = jax.tree.map(lambda leaf: leaf.astype(jnp.result_type(float)), poses)
+        dtype = jnp.result_type(float)
+        poses = Pose(np.tile(np.eye(3, dtype=dtype), (max_views, 1, 1)), np.zeros((max_views, 3), dtype))
         none = jnp.asarray(0, jnp.int32)
         if grid is None:
             return cls(cloud, poses, none)

@@ -24,6 +24,7 @@ _MOST_PLACES = 12
 
 
 @checked
+@jax.jit
 def arc_length(start: Pose, end: Pose) -> Float[Array, ""]:
     """Length of the way from one camera's place to another's about the origin, in scene units: of the great circle
     where both are equally far from it, hypot(mean distance x angle, difference of distances) in general."""
@@ -34,6 +35,7 @@ def arc_length(start: Pose, end: Pose) -> Float[Array, ""]:
 
 
 @checked
+@jax.jit
 def rotation_angle(start: Pose, end: Pose) -> Float[Array, ""]:
     """Angle in radians, within [0, pi], by which a camera turns from one pose to another."""
     turn = jnp.matmul(start.rotation.T, end.rotation, precision="highest")

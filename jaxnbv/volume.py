@@ -48,6 +48,7 @@ class Box(eqx.Module):
         """The cube of this side about the origin."""
         return cls((-0.5 * side,) * 3, (0.5 * side,) * 3)
 
+    @eqx.filter_jit
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         """The signed distance at the points x; exact."""
         x = jnp.asarray(x)
@@ -58,12 +59,11 @@ class Box(eqx.Module):
         return outside + jnp.minimum(jnp.max(beyond, axis=-1), 0.0)
 
 
+@eqx.filter_jit
 def boundary_points(volume: Volume, count: int) -> Float[Array, "count 3"]:
     """Where `count` evenly spread rays from the origin cross the volume's boundary: found by bisection between the
     origin and a sphere beyond the scene. A ray of a volume that is not star-shaped about the origin has several
     crossings, of which this is any one.
-
-    Runs under `jit`.
     """
     directions = fibonacci_sphere(count)
 

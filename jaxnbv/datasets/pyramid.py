@@ -92,6 +92,11 @@ def sample_pyramid(key: PRNGKeyArray, label: int | Int[AnyArray, ""], longest_si
     **Raises:** `ValueError` if `longest_side` is not positive.
     """
     require(longest_side > 0, f"the longest side is {longest_side}; it must be positive")
+    return _sample(key, jnp.asarray(label), longest_side)
+
+
+@jax.jit
+def _sample(key: PRNGKeyArray, label: Int[Array, ""], longest_side: Float[Array, ""] | float) -> Pyramid:
     height_key, size_key, place_key, turn_key, depth_key, rotation_key = jax.random.split(key, 6)
     height = jax.random.uniform(height_key, minval=1.2, maxval=1.6)
     size = jax.random.uniform(size_key, minval=0.7, maxval=0.85)
@@ -105,7 +110,7 @@ def sample_pyramid(key: PRNGKeyArray, label: int | Int[AnyArray, ""], longest_si
     corners = jnp.matmul(corners, rotation.T, precision="highest")
     low, high = jnp.min(corners, axis=0), jnp.max(corners, axis=0)
     scale = longest_side / jnp.max(high - low)
-    return Pyramid(jnp.asarray(label), height, size, place, turn, depth, rotation, scale, -0.5 * scale * (low + high))
+    return Pyramid(label, height, size, place, turn, depth, rotation, scale, -0.5 * scale * (low + high))
 
 
 def pyramid_scene(split: Split, index: int | Int[Array, ""], framing: Framing = Framing.CLOSE_UP) -> Pyramid:

@@ -69,6 +69,7 @@ class Carving(eqx.Module):
             return jnp.zeros((grid.resolution,) * 3, bool)
         return _crossed(grid, depth, camera, pose, self.margin * grid.spacing)
 
+    @eqx.filter_jit
     def outside(self, grid: Grid) -> Bool[Array, "g g g"]:
         """The nodes outside the volume, by two margins."""
         axis = jnp.asarray(grid.axis, jnp.result_type(float))
@@ -77,6 +78,7 @@ class Carving(eqx.Module):
     def _beyond_volume(self, grid: Grid) -> float:
         return 2.0 * self.margin * grid.spacing
 
+    @eqx.filter_jit
     def empty_points(self, grid: Grid, seen: Bool[Array, "g g g"]) -> EmptyPoints:
         """The nodes seen empty within the volume, of every few along each axis, for a model to condition on."""
         stride = -(-grid.resolution // _POINTS_ALONG_AXIS)
@@ -101,6 +103,7 @@ class Carving(eqx.Module):
         )
 
 
+@jax.jit
 def carve(values: Float[Array, "*s g g g"], empty: Bool[Array, "g g g"]) -> Float[Array, "*s g g g"]:
     """Values of f minus its level, made positive (outside) at the nodes that are empty.
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Int8
+from jaxtyping import Array, Bool, Float, Int, Int8
 from scipy.spatial import cKDTree
 
 from jaxnbv.camera import Camera
@@ -91,10 +91,10 @@ class GridSurface(Surface):
             values.shape[-3:] == (g, g, g),
             f"values of shape {values.shape} do not fit a grid of {g}^3 nodes: evaluate on grid.axis, three times",
         )
-        values = values - level
-        if not is_traced(values):
-            require(bool(jnp.isfinite(values).all()), "the values on the grid, or the level, are not finite")
-        return cls(values, _free_distances(values), grid)
+        relative, finite, distances = _prepared(values, level)
+        if not is_traced(finite):
+            require(bool(finite), "the values on the grid, or the level, are not finite")
+        return cls(relative, distances, grid)
 
     @eqx.filter_jit
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
@@ -165,6 +165,10 @@ def imagine(
 
 
 @jax.jit
-def _free_distances(values: Float[Array, "*s g g g"]) -> Int8[Array, "*s m m m"]:
+def _prepared(
+    values: Float[Array, "*s g g g"], level: Float[Array, ""]
+) -> tuple[Float[Array, "*s g g g"], Bool[Array, ""], Int8[Array, "*s m m m"]]:
+    """Values less the level, whether they are finite, and how far each cell is from a change of sign."""
+    values = values - level
     distances = jax.lax.map(tracing.free_distance, values.reshape(-1, *values.shape[-3:]))
-    return distances.reshape(*values.shape[:-3], *distances.shape[1:])
+    return values, jnp.isfinite(values).all(), distances.reshape(*values.shape[:-3], *distances.shape[1:])

@@ -11,7 +11,7 @@ from jaxnbv.camera import Camera
 from jaxnbv.checks import check_fields, checked, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.pose import Pose
-from jaxnbv.scanning.surface import Surface
+from jaxnbv.scanning.surface import Hits, Surface
 
 # Beyond any sensor; squares of much larger numbers are infinite.
 _LOUDEST = 1e6
@@ -61,6 +61,19 @@ def scan(
     """
     origins, directions = camera.rays(pose)
     hits = surface.trace(origins.reshape(-1, 3), directions.reshape(-1, 3))
+    return _returns(hits, origins, directions, camera, pose, barrier)
+
+
+@eqx.filter_jit
+def _returns(
+    hits: Hits,
+    origins: Float[Array, "*batch rays 3"],
+    directions: Float[Array, "*batch rays 3"],
+    camera: Camera,
+    pose: Pose,
+    barrier: Float[Array, "*batch rays"] | None,
+) -> PointCloud:
+    """The hits that the sensor sees, as an image."""
     shape = origins.shape[:-1]
     mask = hits.mask.reshape(shape)
     points, normals = hits.points.reshape(*shape, 3), hits.normals.reshape(*shape, 3)

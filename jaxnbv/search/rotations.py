@@ -7,12 +7,14 @@ from jaxtyping import Array, Float
 from jaxnbv.checks import AnyArray
 
 
+@jax.jit
 def rotation_to_6d(rotation: Float[AnyArray, "*batch 3 3"]) -> Float[Array, "*batch 6"]:
     """The first two columns of a rotation, one after the other: the continuous representation of Zhou et al. (2019)."""
     rotation = jnp.asarray(rotation)
     return jnp.concatenate([rotation[..., :, 0], rotation[..., :, 1]], axis=-1)
 
 
+@jax.jit
 def rotation_from_6d(columns: Float[AnyArray, "*batch 6"]) -> Float[Array, "*batch 3 3"]:
     """The rotation whose first two columns are a pair (a, b) of vectors made orthonormal (Zhou et al. 2019).
 
@@ -28,6 +30,7 @@ def rotation_from_6d(columns: Float[AnyArray, "*batch 6"]) -> Float[Array, "*bat
     return jnp.stack([first, second, jnp.cross(first, second)], axis=-1)
 
 
+@jax.jit
 def rotation_between(
     start: Float[AnyArray, "*batch 3"], end: Float[AnyArray, "*batch 3"]
 ) -> Float[Array, "*batch 3 3"]:

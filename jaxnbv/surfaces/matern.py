@@ -1,13 +1,16 @@
 """The Matern spectrum on the circle of period 2 pi."""
 
+import functools
 import math
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 Scalar = float | Float[Array, ""]
 
 
+@functools.partial(jax.jit, static_argnames=("nu", "truncation"))
 def circle_spectrum(nu: float, lengthscale: Scalar, variance: Scalar, truncation: int) -> Float[Array, "l_plus_1"]:
     """s1(0), ..., s1(L) with s1(n) = variance w(n) / sum_{m in Z} w(m), w(n) = (2 nu / ell^2 + 4 pi^2 n^2)^-(nu + 1/2).
 

@@ -112,8 +112,7 @@ class GeometricSPSR(SurfaceModel):
     @property
     def kept_variance(self) -> Float[Array, ""]:
         """Share of the prior's variance within the truncation, in three dimensions."""
-        kept = jnp.sum(jax.vmap(basis_variance)(jnp.atleast_2d(self.spectrum))[:, self.truncation :], axis=1)
-        return jnp.sum(kept**3) / jnp.sum(self.variance**3)
+        return _kept_variance(self)
 
     def check(self, cloud: PointCloud) -> None:
         """Warn where points are so far apart that samples vary between them as if nothing had been seen: at 2.5
@@ -148,6 +147,12 @@ class GeometricSPSR(SurfaceModel):
                 f"{posterior.level.dtype}: raise the noise, or enable jax_enable_x64",
             )
         return posterior
+
+
+@eqx.filter_jit
+def _kept_variance(model: GeometricSPSR) -> Float[Array, ""]:
+    kept = jnp.sum(jax.vmap(basis_variance)(jnp.atleast_2d(model.spectrum))[:, model.truncation :], axis=1)
+    return jnp.sum(kept**3) / jnp.sum(model.variance**3)
 
 
 @eqx.filter_jit

@@ -9,6 +9,7 @@ from jaxnbv.cloud import PointCloud
 _UNROLL = 16
 
 
+@jax.jit
 def nearest_squared_distance(x: Float[Array, "n 3"], cloud: PointCloud) -> Float[Array, " n"]:
     """min_j |x - y_j|^2 over the filled rows of a cloud; infinite where the cloud is empty.
 

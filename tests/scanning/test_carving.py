@@ -186,7 +186,7 @@ def test_carved_samples_keep_a_thin_sheet_that_was_seen_from_both_sides():
     clouds = scan_samples(surfaces, narrow, poses)
     on_sheet = np.asarray(clouds.mask) & (np.abs(np.asarray(clouds.points)[..., 2]) < 2.0 * SMALL_GRID.spacing)
     before, after = on_sheet.reshape(2, 3, 2, -1).mean(axis=-1)
-    assert (before > 0.5).all(), "the model does not see the sheet"
+    assert (before > 0.3).all(), "the model does not see the sheet"
     assert (after >= before).all(), (before, after)
 
 

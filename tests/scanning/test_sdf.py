@@ -3,6 +3,7 @@
 import itertools
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +14,9 @@ from jaxnbv.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning.sdf import Box, Capsule, Cone, Cylinder, SmoothUnion, Sphere, Torus
 
 RNG = np.random.default_rng(0)
+
+values = eqx.filter_jit(lambda sdf, x: sdf(x))
+gradients = eqx.filter_jit(lambda sdf, x: jax.vmap(jax.grad(sdf))(x))
 
 
 def revolve(profile):
@@ -96,7 +100,7 @@ def test_exact_distance_equals_that_to_a_dense_sampling(name):
     sdf, surface = EXACT[name]
     x = RNG.uniform(-1.6, 1.6, (3000, 3))
     nearest, _ = cKDTree(surface).query(x)
-    value = np.asarray(sdf(x))
+    value = np.asarray(values(sdf, x))
     far = nearest > 0.05
     # A sampling of spacing s overestimates a distance d by at most s^2 / (2 d); s < 0.012 here.
     np.testing.assert_allclose(np.abs(value[far]), nearest[far], atol=2e-3)
@@ -106,21 +110,21 @@ def test_exact_distance_equals_that_to_a_dense_sampling(name):
 @pytest.mark.parametrize("name", EXACT)
 def test_exact_distance_is_negative_inside_only(name):
     sdf, surface = EXACT[name]
-    assert np.abs(np.asarray(sdf(surface))).max() < 2e-3
+    assert np.abs(np.asarray(values(sdf, surface))).max() < 2e-3
     outside = surface.mean(axis=0) + 4.0 * np.asarray(fibonacci_sphere(200))
-    assert (np.asarray(sdf(outside)) > 0).all()
-    gradient = np.asarray(jax.vmap(jax.grad(sdf))(jnp.asarray(surface[::37])))
+    assert (np.asarray(values(sdf, outside)) > 0).all()
+    gradient = np.asarray(gradients(sdf, jnp.asarray(surface[::37])))
     smooth = np.abs(np.linalg.norm(gradient, axis=1) - 1) < 1e-3
     inward = surface[::37][smooth] - 0.02 * gradient[smooth]
     # Samples on a sharp edge may step along a face, or out.
-    assert (np.asarray(sdf(inward)) < -0.01).mean() > 0.8
+    assert (np.asarray(values(sdf, inward)) < -0.01).mean() > 0.8
 
 
 @pytest.mark.parametrize("name", EXACT)
 def test_exact_distance_has_slope_one_almost_everywhere(name):
     sdf, _ = EXACT[name]
     x = jnp.asarray(RNG.uniform(-1.6, 1.6, (5000, 3)), dtype=jnp.result_type(float))
-    slope = np.linalg.norm(np.asarray(jax.vmap(jax.grad(sdf))(x)), axis=1)
+    slope = np.linalg.norm(np.asarray(gradients(sdf, x)), axis=1)
     assert (np.abs(slope - 1) < 1e-4).mean() > 0.999
 
 
@@ -130,7 +134,7 @@ def test_bounds_never_overestimate(name):
     sdf = BOUNDS[name]
     x = RNG.uniform(-1.6, 1.6, (20_000, 3))
     y = x + RNG.normal(size=x.shape) * 10.0 ** RNG.uniform(-2, 0.3, (len(x), 1))
-    change = np.abs(np.asarray(sdf(x)) - np.asarray(sdf(y)))
+    change = np.abs(np.asarray(values(sdf, x)) - np.asarray(values(sdf, y)))
     assert (change <= np.linalg.norm(x - y, axis=1) + 1e-5).all()
 
 
@@ -140,7 +144,7 @@ def test_set_operations_agree_with_membership():
     in_a = np.linalg.norm(x - [0.3, 0, 0], axis=1) < 0.7
     in_b = (np.abs(x) < [0.6, 0.5, 0.4]).all(axis=1)
     for sdf, expected in ((a | b, in_a | in_b), (a & b, in_a & in_b), (a - b, in_a & ~in_b)):
-        value = np.asarray(sdf(x))
+        value = np.asarray(values(sdf, x))
         decided = np.abs(value) > 1e-5
         assert ((value < 0) == expected)[decided].all()
     union = np.asarray((a | b)(x))

@@ -115,8 +115,8 @@ def _picture(record: Record, study: PartStudy, methods: Sequence[str], pixels: i
         tiles.write(left + 0.8, down, name, fontsize=9)
 
     def draw(axes: Axes, row: int, column: int) -> None:
-        shown, cloud = seen[row][column]
-        _draw_view(axes, ghost, segmenter.predict(cloud), shown, colours)
+        shown, state = seen[row][column]
+        _draw_view(axes, ghost, segmenter.predict(state.cloud), shown, colours)
         taken = study.poses_of(runs[row])[: column + 1]
         for index, pose in enumerate(taken):
             _draw_camera(axes, ghost, study.camera, pose, is_new=index == column)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnbv.checks import AnyArray, as_floats, check_type, is_traced, require
@@ -67,6 +68,15 @@ def greatest(a, b):
     return jnp.where(a >= b, a, b)
 
 
+@jax.jit
+def _rotation_about(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """Rodrigues' formula."""
+    x, y, z = axis / norm(*axis)
+    zero = jnp.zeros_like(x)
+    cross = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+    return jnp.eye(3) + jnp.sin(angle) * cross + (1.0 - jnp.cos(angle)) * cross @ cross
+
+
 def corner_distance(*q):
     """Signed distance to the corner, edge or face where all q <= 0, given the signed distances q to its faces."""
     outside = norm(*(greatest(c, 0.0) for c in q))
@@ -101,9 +111,10 @@ class SignedDistance(eqx.Module):
                 f"{name} has shape {value.shape}, not {shape}: for a batch of solids build it inside jax.vmap",
             )
             if not is_traced(value):
-                require(bool(jnp.isfinite(value).all()), f"{name} is {value}: give finite numbers")
+                known = np.asarray(value)
+                require(bool(np.isfinite(known).all()), f"{name} is {value}: give finite numbers")
                 if "length" in field.metadata:
-                    require(bool((value >= 0).all()), f"{name} is {value}: a length must not be negative")
+                    require(bool((known >= 0).all()), f"{name} is {value}: a length must not be negative")
 
     def translate(self, offset) -> "Translated":
         """The solid moved by `offset` (3,)."""
@@ -118,11 +129,11 @@ class SignedDistance(eqx.Module):
         shapes = axis.shape, angle.shape
         require(shapes == ((3,), ()), f"axis and angle have shapes {shapes[0]} and {shapes[1]}: give (3,) and ()")
         if not is_traced(axis):
-            require(bool(norm(*axis) > 0), f"the axis of rotation is {axis}: give a direction that is not zero")
-        x, y, z = axis / norm(*axis)
-        zero = jnp.zeros_like(x)
-        cross = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-        return Rotated(self, jnp.eye(3) + jnp.sin(angle) * cross + (1.0 - jnp.cos(angle)) * cross @ cross)
+            require(
+                bool(np.asarray(axis).any()),
+                f"the axis of rotation is {axis}: give a direction that is not zero",
+            )
+        return Rotated(self, _rotation_about(axis, angle))
 
     def transform(self, pose: Pose) -> "Translated":
         """The solid moved rigidly: a point p of it goes to `pose.rotation @ p + pose.position`."""
