@@ -1,5 +1,6 @@
 """The pyramid study's qualitative figure: what the sensor saw, view by view and method by method."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,33 +25,38 @@ from jaxnbv.viz.style import GREY, LINE, NEW
 
 _SHOWN = ("cross-entropy", "farthest", "uncertainty")
 _RIGHT = "#00734f"
-# Of the picture: the sensor's own field of view, with finer pixels.
-_PIXELS = 250
 _BACKGROUND = np.array(mpl.colors.to_rgb("#f3f5f8"))
 _PLAIN, _TINTED = np.array([0.68, 0.72, 0.78]), np.array(mpl.colors.to_rgb(NEW))
 
 
-def write_pictures(records: Sequence[Record], study: PyramidStudy, folder: str | Path, scenes: int = 3) -> list[Path]:
+def write_pictures(
+    records: Sequence[Record], study: PyramidStudy, folder: str | Path, scenes: int = 3, pixels: int = 250
+) -> list[Path]:
     """Write `views_<scene>.png` for the first scenes, not picked ones; return the paths.
 
     A row a method, a column a view: the true surface in the sensor's field of view, the pattern's pixels tinted, and
     beneath it the predicted class with its probability once this view is known. Rows are cross-entropy, farthest view
     and uncertainty, those of them that the records hold, else all that they do.
 
+    - `pixels`: along a side of a view.
+
     **Raises:** `ValueError` if there are no records, or no method that all of them hold.
     """
     present = methods_of(records, study.methods)
     methods = [method for method in _SHOWN if method in present] or present
-    return save_pictures(first_scenes(records, scenes), folder, "views", lambda one: _picture(one, study, methods))
+    chosen = first_scenes(records, scenes)
+    return save_pictures(chosen, folder, "views", lambda one: _picture(one, study, methods, pixels))
 
 
-def _picture(record: Record, study: PyramidStudy, methods: Sequence[str]) -> Figure:
+def _picture(record: Record, study: PyramidStudy, methods: Sequence[str], pixels: int) -> Figure:
     held = [record["methods"][method] for method in methods]
     runs = [method["runs"][0] for method in held]
     views = len(runs[0]["log_p"])
     taken = [study.poses_of(method if "views" in method else method["runs"][0])[:views] for method in held]
     pyramid = pyramid_scene(Split(record["split"]), jnp.asarray(record["scene"]), Framing(record["framing"]))
-    images = [[_shade(*map(np.asarray, _render(pyramid, _plain(pose)))) for pose in poses] for poses in taken]
+    # Four rays a pixel.
+    camera = Camera(height=2 * pixels, width=2 * pixels)
+    images = [[_shade(*map(np.asarray, _render(pyramid, camera, _plain(pose)))) for pose in poses] for poses in taken]
 
     # Inches: all methods share the first view, so it stands once, at the middle of the rows.
     tile, gap, below, left, top, margin = 1.25, 0.1, 0.36, 0.12, 0.8, 0.1 + 0.08 * max(map(len, methods))
@@ -104,16 +110,19 @@ def _plain(pose: Pose) -> Pose:
 def _shade(
     hit: Bool[np.ndarray, " rays"], pattern: Bool[np.ndarray, " rays"], facing: Float[np.ndarray, " rays"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """Lit from the sensor; four rays a pixel."""
+    """Lit from the sensor, four rays a pixel."""
     colours = np.where(pattern[:, None], _TINTED, _PLAIN) * (0.4 + 0.65 * facing)[:, None]
     image = np.where(hit[:, None], np.clip(colours, 0.0, 1.0), _BACKGROUND)
-    return image.reshape(_PIXELS, 2, _PIXELS, 2, 3).mean(axis=(1, 3))
+    side = math.isqrt(len(hit)) // 2
+    return image.reshape(side, 2, side, 2, 3).mean(axis=(1, 3))
 
 
 @eqx.filter_jit
-def _render(pyramid: Pyramid, pose: Pose) -> tuple[Bool[Array, " rays"], Bool[Array, " rays"], Float[Array, " rays"]]:
+def _render(
+    pyramid: Pyramid, camera: Camera, pose: Pose
+) -> tuple[Bool[Array, " rays"], Bool[Array, " rays"], Float[Array, " rays"]]:
     """Which rays hit, which hit the pattern, and the cosine between each ray and its normal."""
-    seen = scan(SDFSurface(pyramid), Camera(height=2 * _PIXELS, width=2 * _PIXELS), pose)
+    seen = scan(SDFSurface(pyramid), camera, pose)
     rays = pose.position - seen.points
     facing = jnp.sum(rays * seen.normals, axis=-1) / jnp.linalg.norm(rays, axis=-1)
     return seen.mask, pyramid.on_pattern(seen.points) & seen.mask, jnp.where(seen.mask, facing, 0.0)

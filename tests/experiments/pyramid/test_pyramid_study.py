@@ -217,7 +217,7 @@ def test_a_method_of_ones_own_sees_what_others_see_from_a_candidate(tmp_path):
     np.testing.assert_allclose(run["log_p"], farthest["log_p"], atol=1e-5)
     assert np.abs(np.subtract(run["pattern_pixels"], farthest["pattern_pixels"])).max() <= 2
     for shown in (record, whole_record()):
-        (path,) = write_pictures([shown], study, tmp_path)
+        (path,) = write_pictures([shown], study, tmp_path, pixels=50)
         assert path == tmp_path / f"views_{SCENE:03d}.png"
         with Image.open(path) as image:
             assert np.asarray(image.convert("L")).std() > 5
