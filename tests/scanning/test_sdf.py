@@ -167,6 +167,7 @@ def test_rigid_transform_moves_points_as_the_pose_does():
         (lambda: Sphere(np.nan), "finite"),
         (lambda: Box([0.1, 0.2, 0.3], 0.15), "round it by less"),
         (lambda: Sphere(1.0).rotate([0, 0, 0], 1.0), "not zero"),
+        (lambda: Sphere(1.0).rotate([0, 1e-30, 0], 1.0), "not zero"),
         (lambda: Sphere(1.0).scale(-2.0), "scaled by -2.0"),
     ],
 )

@@ -129,10 +129,9 @@ class SignedDistance(eqx.Module):
         shapes = axis.shape, angle.shape
         require(shapes == ((3,), ()), f"axis and angle have shapes {shapes[0]} and {shapes[1]}: give (3,) and ()")
         if not is_traced(axis):
-            require(
-                bool(np.asarray(axis).any()),
-                f"the axis of rotation is {axis}: give a direction that is not zero",
-            )
+            # As a float of JAX, which takes what is below the least normal number for zero.
+            longer = bool(np.sum(np.square(np.asarray(axis))) >= jnp.finfo(axis.dtype).tiny)
+            require(longer, f"the axis of rotation is {axis}: give a direction that is not zero")
         return Rotated(self, _rotation_about(axis, angle))
 
     def transform(self, pose: Pose) -> "Translated":
