@@ -179,14 +179,14 @@ def test_carved_samples_keep_a_thin_sheet_that_was_seen_from_both_sides():
     planner, raw = (planner_of(carving, model=model) for carving in (Carving(), None))
     sheet = SDFSurface(BoxSolid([0.6, 0.6, 0.04]))
     state = after_both_sides(planner, sheet, ABOVE_AND_BELOW)
-    values = raw.sample_surfaces(state, jax.random.key(0)).values
+    values = raw.sample_surfaces(state, jax.random.key(1)).values
     carved = carve(values, state.seen_empty | planner.carving.outside(SMALL_GRID))
     narrow, poses = Camera(height=10, width=10, fov=0.35), look_at(jnp.asarray([[0.0, 0.0, 2.5], [0.0, 0.0, -2.5]]))
     surfaces = GridSurface.from_values(jnp.concatenate([values, carved]), 0.0, SMALL_GRID)
     clouds = scan_samples(surfaces, narrow, poses)
     on_sheet = np.asarray(clouds.mask) & (np.abs(np.asarray(clouds.points)[..., 2]) < 2.0 * SMALL_GRID.spacing)
     before, after = on_sheet.reshape(2, 3, 2, -1).mean(axis=-1)
-    assert (before > 0.3).all(), "the model does not see the sheet"
+    assert (before > 0.5).all(), "the model does not see the sheet"
     assert (after >= before).all(), (before, after)
 
 

@@ -110,7 +110,7 @@ def _plain(pose: Pose) -> Pose:
 def _shade(
     hit: Bool[np.ndarray, " rays"], pattern: Bool[np.ndarray, " rays"], facing: Float[np.ndarray, " rays"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """Lit from the sensor, four rays a pixel."""
+    """Lit from the sensor; four rays a pixel."""
     colours = np.where(pattern[:, None], _TINTED, _PLAIN) * (0.4 + 0.65 * facing)[:, None]
     image = np.where(hit[:, None], np.clip(colours, 0.0, 1.0), _BACKGROUND)
     side = math.isqrt(len(hit)) // 2
