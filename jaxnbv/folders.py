@@ -22,11 +22,15 @@ FORMAT = 2
 _LOCK = ".lock"
 
 
-def versions() -> dict[str, Any]:
-    """Versions of what the numbers depend on, the kind of device, and the cores that share a sum."""
+def software() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
     names = ("jaxnbv", "jax", "jaxlib", "equinox", "optax", "optimistix", "numpy", "trimesh", "embreex")
-    made_by: dict[str, Any] = {name: importlib.metadata.version(name) for name in names}
-    return made_by | {"device": jax.devices()[0].device_kind, "cores": loky.cpu_count()}
+    return {name: importlib.metadata.version(name) for name in names}
+
+
+def versions(cores: int | None = None) -> dict[str, Any]:
+    """Versions of what the numbers depend on, the kind of device, and the cores that share a sum, by default all."""
+    return software() | {"device": jax.devices()[0].device_kind, "cores": cores or loky.cpu_count()}
 
 
 def differences(found: Any, asked: Any, name: str = "") -> list[str]:
@@ -112,13 +116,22 @@ class ResultFolder:
     - `record`: the record's name; `results`: the pattern of the results' names.
     - `config`: what JSON can say, see `jaxnbv.storage.describe`.
     - `kind`: what the folder is for, such as "study".
+    - `cores`: how many share a sum, by default all.
 
     **Raises:** `ValueError` if the folder cannot be made, or holds results of another configuration or other files.
     """
 
-    def __init__(self, path: str | Path, record: str, results: str, config: dict[str, Any], kind: str):
+    def __init__(
+        self,
+        path: str | Path,
+        record: str,
+        results: str,
+        config: dict[str, Any],
+        kind: str,
+        cores: int | None = None,
+    ):
         self.path, self.config = make_folder(path), json.loads(json.dumps(config))
-        self.record, self.results, self.kind = self.path / record, results, kind
+        self.record, self.results, self.kind, self.cores = self.path / record, results, kind, cores
         self.bound = False
         self._check()
 
@@ -136,8 +149,9 @@ class ResultFolder:
     def bind(self) -> None:
         """Write the record, if it is not there, before the first result is."""
         if not self.bound:
+            made_by = versions(self.cores)
             write_text(
-                self.record, json.dumps({"format": FORMAT, "config": self.config, "versions": versions()}, indent=2)
+                self.record, json.dumps({"format": FORMAT, "config": self.config, "versions": made_by}, indent=2)
             )
             self.bound = True
 
@@ -161,7 +175,7 @@ class ResultFolder:
             f"the output folder {self.path} belongs to another {self.kind}; it differs in {'; '.join(changed[:3])}. "
             "Choose another folder, or the settings it was made with",
         )
-        now = {key: value for key, value in versions().items() if key in made_by}
+        now = {key: value for key, value in versions(self.cores).items() if key in made_by}
         if made_by != now and not self.bound:
             warnings.warn(
                 f"{self.path} was begun with other versions ({'; '.join(differences(made_by, now))}): "

@@ -41,6 +41,18 @@ FolderOption = Annotated[
         show_default="runs/study-NAME[-paper][-quick]",
     ),
 ]
+WorkersOption = Annotated[
+    int, typer.Option(min=1, help="Scenes at a time, in as many processes, which share the cores.")
+]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Run the scenes on a Dask cluster: its scheduler, such as tcp://10.0.0.1:8786. "
+        'Needs `pip install "jaxnbv[cluster]"` here and on its workers.',
+        show_default=False,
+    ),
+]
 # Of single studies, by the names of their settings.
 OPTIONS = {
     "meshes": Annotated[
@@ -65,7 +77,7 @@ def _command(name: str, entry: Entry) -> Callable[..., None]:
 
     def run(device: Device, **given: Any) -> None:
         actions.prepare(device)
-        actions.study(name, entry, **given)
+        actions.study(name, entry, device=device, **given)
 
     shared = {
         "scenes": (ScenesOption, entry.scenes),
@@ -75,6 +87,8 @@ def _command(name: str, entry: Entry) -> Callable[..., None]:
         "model": (ModelOption, ModelName.SCREENED),
         "out": (FolderOption, None),
         "quick": (QuickOption, False),
+        "workers": (WorkersOption, 1),
+        "scheduler": (SchedulerOption, None),
         "device": (DeviceOption, Device.AUTO),
     }
     options = shared | {option: (OPTIONS[option], None) for option in entry.options}

@@ -2,43 +2,76 @@
 
 import hashlib
 import json
-from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 from jaxnbv.checks import InputError, require
+from jaxnbv.experiments.measures import Record
+from jaxnbv.experiments.trials import Failure, Here, Outcome, Runner, Trial
 from jaxnbv.files import write_text
 from jaxnbv.folders import FORMAT, ResultFolder, check_format, read_json
+
+_FAILED = ".failed"
 
 
 class RecordFolder(ResultFolder):
     """A folder of records that belong to one configuration, kept beside them in study.json.
 
+    - `runner`: where the missing ones are made.
+
     **Raises:** `ValueError` if the folder cannot be made or holds records of another configuration.
     """
 
-    def __init__(self, path: str | Path, config: dict[str, Any]):
-        super().__init__(path, "study.json", "scene_*.json", config, "study")
+    def __init__(self, path: str | Path, config: dict[str, Any], runner: Runner | None = None):
+        self.runner = runner or Here()
+        super().__init__(path, "study.json", "scene_*.json", config, "study", self.runner.cores)
 
-    def collect(self, count: int, run: Callable[[int], dict[str, Any]], progress: bool = True) -> list[dict[str, Any]]:
+    def collect(self, count: int, run: Trial, progress: bool = True) -> list[Record]:
         """Records 0 to `count` - 1: those on disk as they are, the others from `run`, each written once it is done.
+
+        Where `run` fails there is no record; `failures` tells of it, and the next call tries again.
 
         **Raises:** `ValueError` for a record that is damaged, and if another process writes in the folder.
         """
-        records = []
+        records = {}
         with self.writing():
-            for index in tqdm(range(count), desc=self.path.name, unit="scene", disable=not progress):
-                file = self.path / f"scene_{index:04d}.json"
-                if not file.exists():
-                    # As it will be read: JSON turns keys that are numbers into text, and the checksum sorts them.
-                    record = json.loads(json.dumps(run(index)))
-                    self.bind()
-                    sealed = {"format": FORMAT, "index": index, "sha256": _checksum(index, record), "record": record}
-                    write_text(file, json.dumps(sealed))
-                records.append(_read(file, index))
-        return records
+            missing = []
+            for index in range(count):
+                if self._file(index).exists():
+                    records[index] = _read(self._file(index), index)
+                else:
+                    missing.append(index)
+            bar = tqdm(total=count, initial=len(records), desc=self.path.name, unit="scene", disable=not progress)
+            with bar, closing(self.runner.outcomes(run, missing)) as outcomes:
+                for index, outcome in outcomes:
+                    self._write(index, outcome)
+                    if not isinstance(outcome, Failure):
+                        records[index] = _read(self._file(index), index)
+                    bar.update()
+        return [records[index] for index in sorted(records)]
+
+    def failures(self, count: int) -> dict[int, str]:
+        """The errors of scenes that failed, a line each; beside the records, scene_*.failed has their tracebacks."""
+        files = {index: self._file(index).with_suffix(_FAILED) for index in range(count)}
+        return {index: file.read_text().partition("\n")[0] for index, file in files.items() if file.exists()}
+
+    def _file(self, index: int) -> Path:
+        return self.path / f"scene_{index:04d}.json"
+
+    def _write(self, index: int, outcome: Outcome) -> None:
+        failed = self._file(index).with_suffix(_FAILED)
+        if isinstance(outcome, Failure):
+            write_text(failed, f"{outcome.error}\n\n{outcome.traceback}")
+            return
+        # As it will be read: JSON turns keys that are numbers into text, and the checksum sorts them.
+        record = json.loads(json.dumps(outcome))
+        self.bind()
+        sealed = {"format": FORMAT, "index": index, "sha256": _checksum(index, record), "record": record}
+        write_text(self._file(index), json.dumps(sealed))
+        failed.unlink(missing_ok=True)
 
 
 def _checksum(index: int, record: dict[str, Any]) -> str:

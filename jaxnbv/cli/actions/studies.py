@@ -3,19 +3,23 @@
 import functools
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import typer
 
 from jaxnbv.checks import InputError
+from jaxnbv.cli.actions.device import prepare
+from jaxnbv.cli.options import Device
 from jaxnbv.cli.registry import resolve
 from jaxnbv.experiments.charts import write_charts
+from jaxnbv.experiments.measures import Record
 from jaxnbv.experiments.records import RecordFolder
 from jaxnbv.experiments.registry import Entry
 from jaxnbv.experiments.study import Factory, Study
 from jaxnbv.experiments.tables import summary, write_tables
+from jaxnbv.experiments.trials import Cluster, Here, Processes, Runner, Trial
 from jaxnbv.model_name import ModelName
 from jaxnbv.storage import describe
 
@@ -30,14 +34,21 @@ def study(
     model: ModelName,
     out: Path | None,
     quick: bool,
+    workers: int,
+    scheduler: str | None,
+    device: Device = Device.AUTO,
     **options: Any,
 ) -> None:
     """Run a study, or each of those that it consists of, and write what it found.
 
-    **Raises:** `ValueError` for unknown methods, or a method of one's own that cannot be found.
+    **Raises:** `ValueError` for unknown methods, or a method of one's own that cannot be found; and, once all is
+    written, if scenes failed.
     """
     kind: type[Study] = resolve(entry.study)
     chosen, added = _methods(methods, kind.methods), {text: _own(text) for text in own or ()}
+    runner = _runner(workers, scheduler, added)
+    failed: dict[str, str] = {}
+    asked = 0
     given = {option: value for option, value in options.items() if value is not None}
     of_model = "" if model is ModelName.SCREENED else f"-{model}"
     folder = out or Path("runs") / f"study-{name}{of_model}{'-quick' if quick else ''}"
@@ -48,14 +59,39 @@ def study(
         config = {"study": describe(settings), "methods": sorted(chosen)}
         config |= {"own": {text: describe(make) for text, make in added.items()}} if added else {}
         count = min(scenes, settings.num_scenes or scenes)
-        run = functools.partial(settings.run_scene, methods=chosen, own=added)
-        records = RecordFolder(folder / part, config).collect(count, run)
+        run = functools.partial(_prepared, device, functools.partial(settings.run_scene, methods=chosen, own=added))
+        results = RecordFolder(folder / part, config, runner)
+        records, failures = results.collect(count, run), results.failures(count)
+        failed |= {f"{part} scene {index}".strip(): error for index, error in failures.items()}
+        asked += count
+        if not records:
+            continue
         write_tables(records, kind, folder / part)
         write_charts(records, kind, folder / part)
         if entry.pictures:
             resolve(entry.pictures)(records, settings, folder / part)
         typer.echo(f"\n{f'{part}. ' if part else ''}{summary(records, kind, groups=False)}")
         typer.echo(f"All tables as CSV, figures and pictures: {folder / part}\n")
+    if failed:
+        where, error = next(iter(failed.items()))
+        raise InputError(
+            f"{len(failed)} of {asked} scenes failed, the first {where} ({error}): {folder} has scene_*.failed that "
+            "tell how, and the same command tries them again"
+        )
+
+
+def _prepared(device: Device, run: Trial, index: int) -> Record:
+    """A trial in a process that has not prepared itself."""
+    prepare(device)
+    return run(index)
+
+
+def _runner(workers: int, scheduler: str | None, own: Mapping[str, Factory]) -> Runner:
+    if scheduler is None:
+        return Here() if workers == 1 else Processes(workers)
+    if workers != 1:
+        raise InputError(f"--workers {workers} and --scheduler {scheduler} exclude each other: give one of them")
+    return Cluster(scheduler, [sys.modules[factory.__module__] for factory in own.values()])
 
 
 def _methods(asked: str | None, known: Sequence[str]) -> tuple[str, ...]:
