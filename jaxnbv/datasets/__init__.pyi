@@ -4,6 +4,8 @@ from .heat_objects import HEAT_OBJECTS as HEAT_OBJECTS
 from .heat_objects import HeatScene as HeatScene
 from .heat_objects import heat_scene as heat_scene
 from .heat_objects import source_view as source_view
+from .household import HOUSEHOLD as HOUSEHOLD
+from .household import sample_household_object as sample_household_object
 from .labelled import LabelledSolid as LabelledSolid
 from .parts import PART_CATEGORIES as PART_CATEGORIES
 from .parts import PartScene as PartScene
@@ -18,3 +20,6 @@ from .pyramid import sample_pyramid as sample_pyramid
 from .shapenet_part import LabelledShape as LabelledShape
 from .shapenet_part import ShapeNetPart as ShapeNetPart
 from .shapenet_part import unit_sphere as unit_sphere
+from .truck import LoadedTruck as LoadedTruck
+from .truck import sample_truck as sample_truck
+from .truck import truck_scene as truck_scene

@@ -21,6 +21,7 @@ CAPACITY = 24
 
 _LONGEST_SIDE = 2.5
 _EMPTY = -1
+_UNTURNED, _UNMOVED = np.eye(3), np.zeros(3)
 
 
 class LabelledSolid(SignedDistance):
@@ -193,29 +194,63 @@ def assemble(primitives: list[Primitive], turn: float = 0.0) -> LabelledSolid:
 
     **Raises:** `ValueError` if there are no primitives or more than a solid can have.
     """
-    count = len(primitives)
-    require(1 <= count <= CAPACITY, f"the object has {count} primitives; a solid holds 1 to {CAPACITY}")
+    _check_count(primitives)
     turned = rotation_about((0.0, 1.0, 0.0), turn)
-    primitives = [dataclasses.replace(p, centre=turned @ p.centre, rotation=turned @ p.rotation) for p in primitives]
+    return united(fitted([moved(p, rotation=turned) for p in primitives], _LONGEST_SIDE))
+
+
+def moved(p: Primitive, scale: float = 1.0, rotation=_UNTURNED, offset=_UNMOVED) -> Primitive:
+    """A primitive whose points x are at `scale` rotation x + offset."""
+    return dataclasses.replace(
+        p,
+        centre=scale * rotation @ p.centre + offset,
+        rotation=rotation @ p.rotation,
+        half_size=scale * p.half_size,
+        rounding=scale * p.rounding,
+        radius=scale * p.radius,
+    )
+
+
+def bounds(primitives: list[Primitive]) -> Float[np.ndarray, "2 3"]:
+    """The lowest and highest coordinates of several primitives."""
     lows, highs = zip(*(p.bounds() for p in primitives), strict=True)
-    low, high = np.min(lows, axis=0), np.max(highs, axis=0)
-    scale = _LONGEST_SIDE / (high - low).max()
+    return np.stack([np.min(lows, axis=0), np.max(highs, axis=0)])
+
+
+def fitted(primitives: list[Primitive], longest_side: float) -> list[Primitive]:
+    """The primitives moved and scaled: their bounding box is centred and has this longest side."""
+    low, high = bounds(primitives)
+    scale = longest_side / (high - low).max()
+    return [moved(p, scale, offset=-0.5 * scale * (low + high)) for p in primitives]
+
+
+def united(primitives: list[Primitive]) -> LabelledSolid:
+    """The union of primitives, where they are.
+
+    **Raises:** `ValueError` if there are no primitives or more than a solid can have.
+    """
+    _check_count(primitives)
 
     def padded(rows, filling=0.0):
         rows = np.asarray(rows)
-        spare = np.broadcast_to(filling, (CAPACITY - count, *rows.shape[1:]))
+        spare = np.broadcast_to(filling, (CAPACITY - len(rows), *rows.shape[1:]))
         return np.concatenate([rows, spare.astype(rows.dtype)])
 
     return LabelledSolid(
         labels=jnp.asarray(padded([p.label for p in primitives], _EMPTY), jnp.int32),
         revolved=jnp.asarray(padded([p.revolved for p in primitives], False)),
-        centre=padded([scale * (p.centre - 0.5 * (low + high)) for p in primitives]),
+        centre=padded([p.centre for p in primitives]),
         rotation=padded([p.rotation for p in primitives], np.eye(3)),
-        half_size=padded([scale * p.half_size for p in primitives]),
-        rounding=padded([scale * p.rounding for p in primitives]),
-        radius=padded([scale * p.radius for p in primitives]),
+        half_size=padded([p.half_size for p in primitives]),
+        rounding=padded([p.rounding for p in primitives]),
+        radius=padded([p.radius for p in primitives]),
         slant=padded([p.slant for p in primitives]),
     )
+
+
+def _check_count(primitives: list[Primitive]) -> None:
+    count = len(primitives)
+    require(1 <= count <= CAPACITY, f"the object has {count} primitives; a solid holds 1 to {CAPACITY}")
 
 
 def generator(key) -> np.random.Generator:

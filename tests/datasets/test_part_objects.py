@@ -8,33 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from skimage.measure import marching_cubes
+from solids import check_fills_its_box, check_whole, mesh_of, thinnest
 
 from jaxnbv.checks import InputError
 from jaxnbv.datasets import PART_CATEGORIES, Split, part_scene, sample_part_object
 from jaxnbv.datasets.categories import CATEGORIES, category_index
 
-NODES, REACH = 90, 1.3
-
-
-@eqx.filter_jit
-def on_grid(solid):
-    axis = jnp.linspace(-REACH, REACH, NODES)
-    y, z = jnp.meshgrid(axis, axis, indexing="ij")
-    return jax.lax.map(lambda x: solid(jnp.stack([jnp.full_like(y, x), y, z], axis=-1)), axis)
-
 
 @eqx.filter_jit
 def labels_at(solid, x):
     return solid.label(x)
-
-
-def mesh_of(solid):
-    spacing = 2 * REACH / (NODES - 1)
-    vertices, faces, _, _ = marching_cubes(
-        np.array(on_grid(solid)), 0.0, spacing=(spacing,) * 3, gradient_direction="descent"
-    )
-    return trimesh.Trimesh(vertices - REACH, faces, process=False)
 
 
 @functools.cache
@@ -65,25 +48,15 @@ def test_every_part_shows_and_no_other(category):
 @pytest.mark.parametrize("category", PART_CATEGORIES)
 def test_objects_are_whole_and_fill_their_box(category):
     for _, mesh in objects(category):
-        # Of negative volume are small cavities between primitives, which nothing sees.
-        volumes = [piece.volume for piece in mesh.split(only_watertight=False)]
-        assert sum(volume > 0 for volume in volumes) == 1
-        assert sum(abs(volume) for volume in volumes if volume < 0) < 0.01 * max(volumes)
-        low, high = mesh.bounds
-        np.testing.assert_allclose(low + high, 0.0, atol=0.025)
-        assert np.max(high - low) == pytest.approx(2.5, rel=0.01)
+        check_whole(mesh)
+        check_fills_its_box(mesh)
 
 
 @pytest.mark.parametrize("category", PART_CATEGORIES)
 def test_no_part_is_thinner_than_a_twentieth(category):
     for seed in range(6):
         solid = sample_part_object(category, jax.random.key(seed))
-        for k in np.flatnonzero(np.asarray(solid.labels) >= 0):
-            half = np.asarray(solid.half_size[k])
-            if solid.revolved[k] and solid.radius[k] == 0:
-                # A cone's thinner end.
-                half = half[:2] - [abs(float(solid.slant[k])) * half[1], 0.0]
-            assert 2 * half.min() >= 0.05, (category, seed, k)
+        assert thinnest(solid) >= 0.05, (category, seed)
 
 
 # Part, axis, and the part that stands further along it.
