@@ -64,8 +64,8 @@ class SDFSurface(Surface):
         depth = implicit_depth(before, fixed.newton(depth), mask, jnp.full_like(depth, _GRAZING))
         points, front = along.points(depth), before.points(depth)
         # Forward mode: the slopes fuse into one pass over the points, which the scatters of reverse mode break up.
-        axes = (jnp.broadcast_to(axis, points.shape) for axis in jnp.eye(3, dtype=points.dtype))
-        gradient = jnp.stack([jax.jvp(self.sdf, (front,), (axis,))[1] for axis in axes], axis=-1)
+        axes = jnp.broadcast_to(jnp.eye(3, dtype=points.dtype)[:, None], (3, *points.shape))
+        gradient = jax.vmap(lambda axis: jax.jvp(self.sdf, (front,), (axis,))[1], out_axes=-1)(axes)
         gradient = jnp.where(jnp.any(gradient != 0, axis=-1, keepdims=True), gradient, -directions)
         facing = -jnp.sign(jnp.sum(gradient * directions, axis=-1, keepdims=True))
         normals = jnp.where(facing == 0, 1.0, facing) * gradient / jnp.linalg.norm(gradient, axis=-1, keepdims=True)
