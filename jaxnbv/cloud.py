@@ -4,7 +4,6 @@ import functools
 import warnings
 from collections.abc import Iterator
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +21,7 @@ from jaxnbv.checks import (
     shown,
 )
 from jaxnbv.depth_image import points_of_depth
+from jaxnbv.display import Displayed
 from jaxnbv.farthest import farthest_point_indices
 from jaxnbv.pose import Pose
 from jaxnbv.volume import Box
@@ -30,7 +30,7 @@ from jaxnbv.volume import Box
 _MOST_ROWS = 2**31 - 1
 
 
-class PointCloud(eqx.Module):
+class PointCloud(Displayed):
     """Oriented points (x, n): the paper's D. Rows whose mask is False hold nothing; their values are zero.
 
     The number of rows is the cloud's capacity, a shape and so fixed under `jit`; `mask` says which rows are filled.

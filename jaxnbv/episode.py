@@ -1,11 +1,12 @@
 """The simulated episode: scan, ask for the next view, scan again."""
 
+import importlib
 import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -16,6 +17,7 @@ from tqdm import tqdm
 from jaxnbv.camera import Camera
 from jaxnbv.checks import check_key, check_type, checked, require
 from jaxnbv.cloud import PointCloud
+from jaxnbv.display import Displayed
 from jaxnbv.planner import Planner
 from jaxnbv.pose import Pose
 from jaxnbv.scanning import GridSurface, SensorNoise, Surface, scan
@@ -43,7 +45,7 @@ class View(eqx.Module):
     camera: Camera | None = None
 
 
-class Episode(eqx.Module):
+class Episode(Displayed):
     """Views that a planner chose of a scene, and what they depend on.
 
     - `scene`, `noise`: None where a real sensor took the views.
@@ -75,6 +77,10 @@ class Episode(eqx.Module):
         check_type(views, int, "the number of views")
         require(1 <= views <= len(self.views), f"asked for {views} of {len(self.views)} views; ask for one at least")
         return next(itertools.islice(self.states(), views - 1, None))
+
+    def show(self, progress: bool = True) -> Any:
+        """A picture of all views, which a notebook shows: the surface as it became known, and what the search saw."""
+        return importlib.import_module("jaxnbv.viz.notebook").overview(self, progress)
 
     def save(self, path: str | Path) -> None:
         """Write the episode to a folder (see `jaxnbv.storage` for its files); `simulate` can continue from it.

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxnbv.display import Displayed
 from jaxnbv.pose import Pose
 from jaxnbv.travel import CostFunction, arc_length, visiting_order
 
@@ -26,7 +27,7 @@ class Trajectories(eqx.Module):
         return jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), (poses, values))
 
 
-class Proposal(eqx.Module):
+class Proposal(Displayed):
     """A search's answer: the pose to take next, and what it looked at.
 
     - `value`: the chosen pose's value, in the units of what the search maximises.

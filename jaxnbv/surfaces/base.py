@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, as_numbers, check_key, check_type, is_traced, require
 from jaxnbv.cloud import PointCloud
+from jaxnbv.display import Displayed
 from jaxnbv.tensor_grid import on_tensor_grid
 
 HALF_WIDTH = 0.5 * math.pi
@@ -114,7 +115,7 @@ class Fields(eqx.Module):
         return on_tensor_grid(self, axis)
 
 
-class SurfacePosterior(eqx.Module):
+class SurfacePosterior(Displayed):
     """p(f | D): the surface is where f equals `level`, and f is greater outside.
 
     An implementation gives `level` and `sample`. One that has closed forms also overrides `mean` and `variance`, which

@@ -71,7 +71,7 @@ def write_figures(data: ReportData, camera: Camera, folder: str | Path, progress
         if view.spatial_ascents is not None:
             drawings[f"view_{view.number:02d}_trajectories.png"] = partial(trajectory_figure, data, index, camera)
     drawings["coverage.png"] = partial(_charts, data)
-    drawings["overview.png"] = partial(_overview, data, camera, norm)
+    drawings["overview.png"] = partial(overview_figure, data, camera)
     with mpl.rc_context(STYLE):
         for name, draw in tqdm(drawings.items(), desc="drawing figures", disable=not progress):
             small = name == "overview.png"
@@ -248,8 +248,9 @@ def _charts(data: ReportData) -> Figure:
     return figure
 
 
-def _overview(data: ReportData, camera: Camera, norm: LogNorm) -> Figure:
+def overview_figure(data: ReportData, camera: Camera) -> Figure:
     """Scenes over acquisition maps, at most five to a row, with the charts' story in the titles."""
+    norm = LogNorm(*deviation_range(data))
     columns = min(len(data.views), 5)
     rows = -(-len(data.views) // columns)
     marks = [

@@ -1,0 +1,163 @@
+"""What a notebook shows of a cloud, a posterior, a proposal and an episode: a small picture and a line of facts."""
+
+import base64
+import functools
+import html
+import io
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from scipy.special import ndtr
+
+from jaxnbv.answers import Quantity
+from jaxnbv.cloud import PointCloud
+from jaxnbv.display import Displayed
+from jaxnbv.episode import Episode
+from jaxnbv.pose import look_at
+from jaxnbv.search import Proposal
+from jaxnbv.surfaces import SurfacePosterior
+from jaxnbv.viz.data import choice_of, report_data
+from jaxnbv.viz.figures import STYLE, draw_acquisition, overview_figure
+from jaxnbv.viz.render import Still, beside, draw_cameras, draw_points, frame
+from jaxnbv.viz.style import BEFORE, NEW, VALUE
+
+_INCHES, _DPI = 2.4, 110
+# Of clouds whose normals look everywhere.
+_USUAL_EYE = np.array([0.8, 0.9, 2.2])
+# Half the side of the slice of a posterior, in scene units, and its pixels along a side.
+_REACH, _PIXELS = 1.5, 48
+
+
+class Drawing(NamedTuple):
+    """A function that draws into an empty axes, or None; and what is said of it."""
+
+    draw: Callable[[Axes], Any] | None
+    facts: str
+
+
+class Picture:
+    """A PNG image that a notebook shows."""
+
+    def __init__(self, figure: Figure, dpi: int):
+        file = io.BytesIO()
+        figure.savefig(file, format="png", dpi=dpi)
+        self.png = file.getvalue()
+
+    def _repr_png_(self) -> bytes:
+        return self.png
+
+
+def html_of(shown: Displayed) -> str:
+    """A small picture and a line of facts, as HTML."""
+    drawing = drawing_of(shown)
+    caption = html.escape(drawing.facts)
+    if drawing.draw is None:
+        return f"<div>{caption}</div>"
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(_INCHES, _INCHES))
+        drawing.draw(figure.add_axes((0.02, 0.02, 0.96, 0.96)))
+        image = base64.b64encode(Picture(figure, _DPI).png).decode()
+    return (
+        f'<figure style="margin:0"><img alt="{caption}" width="{round(_INCHES * 100)}" '
+        f'src="data:image/png;base64,{image}"><figcaption>{caption}</figcaption></figure>'
+    )
+
+
+@functools.singledispatch
+def drawing_of(shown: Any) -> Drawing:
+    """What is drawn and said of an object."""
+    return Drawing(None, repr(shown))
+
+
+@drawing_of.register
+def _(cloud: PointCloud) -> Drawing:
+    if cloud.mask.ndim > 1:
+        return Drawing(None, f"a batch {cloud.mask.shape[:-1]} of clouds of up to {cloud.capacity:,} points")
+    points, normals = cloud.to_numpy()
+    facts = f"{len(points):,} points"
+    if cloud.missed is not None:
+        facts += f" of {cloud.capacity:,} rays, {int(cloud.missed.sum()):,} met nothing"
+    elif cloud.capacity > len(points):
+        facts += f" of at most {cloud.capacity:,}"
+    if not len(points):
+        return Drawing(None, facts)
+    size = " x ".join(f"{side:.3g}" for side in np.ptp(points, axis=0))
+    return Drawing(functools.partial(_draw_shaded, points, normals), f"{facts}; box {size}")
+
+
+def _draw_shaded(points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], axes: Axes) -> None:
+    """From where the normals look to, bright where they look at the eye; in any unit."""
+    eye = normals.mean(axis=0)
+    eye = eye if np.linalg.norm(eye) > 0.2 else _USUAL_EYE
+    rotation = np.asarray(look_at(eye).rotation)
+    x, y, depth = ((points - points.mean(axis=0)) @ rotation).T
+    facing = np.clip(-normals @ rotation[:, 2], 0.0, 1.0)
+    order = np.argsort(-depth)
+    shade = mpl.colors.LinearSegmentedColormap.from_list("shade", [BEFORE, "#cfd8e6"])(facing[order])
+    axes.scatter(x[order], y[order], s=np.clip(6000.0 / len(x), 1.0, 12.0), c=shade, linewidths=0)
+    axes.set(aspect="equal")
+    axes.invert_yaxis()
+    axes.axis("off")
+
+
+@drawing_of.register
+def _(posterior: SurfacePosterior) -> Drawing:
+    facts = f"{type(posterior).__name__}, level {float(posterior.level):.4g}: probability of being inside at z = 0"
+    return Drawing(functools.partial(_draw_slice, posterior), facts)
+
+
+def _draw_slice(posterior: SurfacePosterior, axes: Axes) -> None:
+    """P(f < level) on a plane through the scene, x to the right and y up."""
+    axis = jnp.linspace(-_REACH, _REACH, _PIXELS)
+    x, y = jnp.meshgrid(axis, axis)
+    places = jnp.stack([x.ravel(), y.ravel(), jnp.zeros(_PIXELS**2)], axis=-1)
+    deviation = np.sqrt(np.maximum(posterior.variance(places), 1e-12))
+    inside = ndtr((float(posterior.level) - np.asarray(posterior.mean(places))) / deviation)
+    extent = (-_REACH, _REACH, -_REACH, _REACH)
+    axes.imshow(inside.reshape(_PIXELS, _PIXELS), VALUE, vmin=0, vmax=1, origin="lower", extent=extent)
+    axes.axis("off")
+
+
+@drawing_of.register
+def _(proposal: Proposal) -> Drawing:
+    where = ", ".join(f"{x:+.2f}" for x in np.asarray(proposal.pose.position).tolist())
+    error = proposal.standard_error
+    facts = f"look from ({where}): value {float(proposal.value):.4g}{'' if error is None else f' ± {error:.2g}'}"
+    facts += f", {len(proposal.values)} candidates"
+    if proposal.others_level:
+        facts += f", {proposal.others_level} of them as good as the samples can tell"
+    choice = choice_of(proposal)
+    return Drawing(lambda axes: draw_acquisition(axes, choice, Quantity("value", "", "")), facts)
+
+
+@drawing_of.register
+def _(episode: Episode) -> Drawing:
+    count = len(episode.views)
+    facts = f"{count} view{'s' * (count != 1)} by {episode.planner.quantity.name}, {int(episode.cloud.count):,} points"
+    return Drawing(functools.partial(_draw_views, episode), facts + (f"; {episode.stopped}" if episode.stopped else ""))
+
+
+def _draw_views(episode: Episode, axes: Axes) -> None:
+    """The points, those of the last view told apart, and where the cameras stood."""
+    poses = [view.pose for view in episode.views]
+    reach = max(1.8, *(float(np.linalg.norm(pose.position)) for pose in poses))
+    still = Still(beside(poses[-1]), None, 400, reach)
+    shown = [
+        draw_points(axes, still, episode.cloud.to_numpy()[0], BEFORE, 1.0),
+        draw_points(axes, still, episode.views[-1].scan.to_numpy()[0], NEW, 1.0),
+        *draw_cameras(axes, still, poses, episode.planner.camera, 0.8),
+    ]
+    frame(axes, still, shown)
+
+
+def overview(episode: Episode, progress: bool = True) -> Picture:
+    """All views of an episode in a strip: the surface as it became known, and what the search looked at."""
+    data = report_data(episode, progress=progress)
+    with mpl.rc_context(STYLE):
+        return Picture(overview_figure(data, episode.planner.camera), 80)

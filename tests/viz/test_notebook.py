@@ -1,0 +1,104 @@
+"""What a notebook shows."""
+
+import base64
+import io
+import math
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+import jaxnbv as nbv
+from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.viz import sphere
+from jaxnbv.viz.notebook import drawing_of
+
+
+@pytest.fixture(scope="module")
+def episode():
+    """Of a ball of radius 1, seen from two sides."""
+    small = nbv.Camera(height=24, width=24), nbv.Coverage(), nbv.DiscreteSearch(12)
+    planner = nbv.Planner(nbv.GeometricSPSR(0.05, 0.2, 8), *small, 2, nbv.Grid(24), 2000)
+    scene, first = nbv.SDFSurface(Sphere(1.0)), nbv.look_at((0.0, 0.0, 2.5))
+    return nbv.simulate(planner, scene, first, 2, jax.random.key(0), nbv.SensorNoise(0.0, 0.0), progress=False)
+
+
+def parts(shown):
+    """The size of the picture, and the caption."""
+    text = shown._repr_html_()
+    image = Image.open(io.BytesIO(base64.b64decode(re.search('base64,([^"]+)"', text).group(1))))
+    return image.size, re.search("<figcaption>(.*)</figcaption>", text).group(1)
+
+
+def drawn(shown):
+    axes = Figure().add_axes((0, 0, 1, 1))
+    drawing_of(shown).draw(axes)
+    return axes
+
+
+def test_each_is_a_small_picture_and_a_line(episode):
+    count = int(episode.cloud.count)
+    scan, proposal = episode.views[0].scan, episode.views[1].proposal
+    facts = (
+        (episode.cloud, f"{count:,} points of at most 2,000; box "),
+        (scan, f"{int(scan.count)} points of 576 rays, {576 - int(scan.count)} met nothing; box "),
+        (proposal, f"value {float(proposal.value):.4g}"),
+        (episode, f"2 views by expected coverage gain, {count:,} points"),
+        (episode.planner.model.condition(episode.cloud), "level "),
+    )
+    for shown, expected in facts:
+        size, caption = parts(shown)
+        assert size == (264, 264)
+        assert expected in caption
+        assert len(shown._repr_html_()) < 100_000
+    assert "12 candidates" in parts(proposal)[1]
+
+
+def test_a_cloud_is_seen_from_where_its_normals_look(episode):
+    """A half of the ball: its middle is the brightest, its rim dark; the box is as wide as what was seen."""
+    scan = episode.views[0].scan
+    points = scan.to_numpy()[0]
+    (dots,) = drawn(scan).collections
+    away = np.linalg.norm(dots.get_offsets() - np.mean(dots.get_offsets(), axis=0), axis=1)
+    brightness = dots.get_facecolors()[:, :3].mean(axis=1)
+    assert brightness[away < 0.15].min() > brightness[away > 0.5].max()
+    assert away.max() == pytest.approx(np.linalg.norm(points[:, :2], axis=1).max(), rel=0.1)
+
+
+def test_the_slice_of_a_posterior_is_inside_the_ball(episode):
+    posterior = episode.planner.model.condition(episode.cloud)
+    (image,) = drawn(posterior).images
+    inside = np.asarray(image.get_array())
+    assert inside.shape == (48, 48)
+    axis = np.linspace(-1.5, 1.5, 48)
+    row, column = 30, 11
+    point = jnp.array([[axis[column], axis[row], 0.0]])
+    short = (float(posterior.level) - float(posterior.mean(point)[0])) / math.sqrt(float(posterior.variance(point)[0]))
+    assert inside[row, column] == pytest.approx(0.5 * (1.0 + math.erf(short / math.sqrt(2.0))), abs=1e-3)
+    assert inside.min() < inside[row, column] < inside.max()
+
+
+def test_a_proposal_has_its_star_and_an_episode_its_cameras(episode):
+    star = drawn(episode.views[1].proposal).lines[-1]
+    expected = sphere.mollweide(np.asarray(episode.views[1].pose.position)[None] / 2.5)[0]
+    np.testing.assert_allclose(np.ravel(star.get_data()), expected, atol=1e-3)
+    assert [text.get_text() for text in drawn(episode).texts] == ["1", "2"]
+
+
+def test_what_has_no_picture_has_its_facts():
+    none = nbv.PointCloud(jnp.zeros((7, 3)), jnp.zeros((7, 3)), jnp.zeros(7, bool))
+    assert none._repr_html_() == "<div>0 points of at most 7</div>"
+    several = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), none)
+    assert several._repr_html_() == "<div>a batch (3,) of clouds of up to 7 points</div>"
+
+
+def test_an_episode_is_shown_in_a_strip(episode, monkeypatch):
+    """Without surfaces, which take long; the figure is tested with the report's."""
+    monkeypatch.setattr("jaxnbv.viz.data.mean_surface", lambda planner, state: None)
+    image = Image.open(io.BytesIO(episode.show(progress=False)._repr_png_()))
+    assert image.width == 480
+    assert image.height > 300
