@@ -21,7 +21,6 @@ from jaxnbv.datasets.labelled import (
 )
 from jaxnbv.datasets.pyramid import Split
 from jaxnbv.scanning.sdf import SignedDistance
-from jaxnbv.scanning.sdf.base import least
 
 _TRUCK, _CARGO = 0, 1
 
@@ -38,7 +37,7 @@ class LoadedTruck(SignedDistance):
     label: Int[Array, ""]
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        return least(self.truck(x), self.cargo(x))
+        return (self.truck | self.cargo)(x)
 
     def on_cargo(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
         """Which points of the surface belong to the cargo; the tolerance is in scene units. Give hits without noise."""

@@ -1,5 +1,6 @@
 """Where the trials of a study are run: here, in processes of this machine, or on a Dask cluster."""
 
+import functools
 import pickle
 import sys
 import traceback
@@ -175,4 +176,10 @@ def _attempt_alike(trial: bytes, index: int, expected: dict[str, str]) -> Outcom
     if differ:
         error = f"the worker has other versions than the command: {'; '.join(differ)}"
         return Failure(error, error)
-    return _attempt(lambda index: pickle.loads(trial)(index), index)
+    return _attempt(lambda index: _unpickled(trial)(index), index)
+
+
+@functools.lru_cache(1)
+def _unpickled(trial: bytes) -> Trial:
+    """Once a process: functions of modules that were sent along would be others each time, and compiled again."""
+    return pickle.loads(trial)
