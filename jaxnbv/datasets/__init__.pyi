@@ -1,3 +1,6 @@
+from .class_object import ClassObject as ClassObject
+from .class_sets import CLASS_SETS as CLASS_SETS
+from .class_sets import ClassSet as ClassSet
 from .demo import demo_object as demo_object
 from .framing import Framing as Framing
 from .heat_objects import HEAT_OBJECTS as HEAT_OBJECTS
@@ -5,6 +8,8 @@ from .heat_objects import HeatScene as HeatScene
 from .heat_objects import heat_scene as heat_scene
 from .heat_objects import source_view as source_view
 from .household import HOUSEHOLD as HOUSEHOLD
+from .household import HouseholdObject as HouseholdObject
+from .household import household_scene as household_scene
 from .household import sample_household_object as sample_household_object
 from .labelled import LabelledSolid as LabelledSolid
 from .parts import PART_CATEGORIES as PART_CATEGORIES
@@ -13,13 +18,13 @@ from .parts import part_scene as part_scene
 from .parts import sample_part_object as sample_part_object
 from .patterns import PATTERNS as PATTERNS
 from .pyramid import Pyramid as Pyramid
-from .pyramid import Split as Split
 from .pyramid import hidden_view as hidden_view
 from .pyramid import pyramid_scene as pyramid_scene
 from .pyramid import sample_pyramid as sample_pyramid
 from .shapenet_part import LabelledShape as LabelledShape
 from .shapenet_part import ShapeNetPart as ShapeNetPart
 from .shapenet_part import unit_sphere as unit_sphere
+from .splits import Split as Split
 from .truck import LoadedTruck as LoadedTruck
 from .truck import sample_truck as sample_truck
 from .truck import truck_scene as truck_scene

@@ -1,25 +1,55 @@
 """Stand-ins for the ten classes of ModelNet10, which are told apart by their global shape."""
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxnbv.checks import require
+from jaxnbv.checks import AnyArray, require
+from jaxnbv.datasets.class_object import ClassObject
+from jaxnbv.datasets.framing import Framing
 from jaxnbv.datasets.labelled import LabelledSolid, Primitive, assemble, ball, bar, box, generator, path, ring, rod
 from jaxnbv.datasets.parts import furniture
+from jaxnbv.datasets.splits import Split, scene_key
 
 _LABEL = 0
 
 
-def sample_household_object(name: str, key: PRNGKeyArray) -> LabelledSolid:
+class HouseholdObject(ClassObject):
+    """An object of one of `HOUSEHOLD`; a bound.
+
+    - `solid`: where it stands in the scene.
+    - `label`: its class, an index of `HOUSEHOLD`.
+    """
+
+    solid: LabelledSolid
+    label: Int[Array, ""]
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        return self.solid(x)
+
+
+def household_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_UP) -> HouseholdObject:
+    """Scene number `index` of a split; the classes take turns.
+
+    **Raises:** `ValueError` if the index is negative.
+    """
+    key = scene_key(6, split, index)
+    return sample_household_object(HOUSEHOLD[index % len(HOUSEHOLD)], key, framing.longest_side)
+
+
+def sample_household_object(name: str, key: PRNGKeyArray, longest_side: float = 2.5) -> HouseholdObject:
     """A random object of one of `HOUSEHOLD`, upright along y, turned about it at random.
 
-    Its bounding box is centred and has the longest side 2.5; no primitive is thinner than 0.05. Built on the host: it
-    does not run under `jit`.
+    Its bounding box is centred; where it has the longest side 2.5, no primitive is thinner than 0.05. Built on the
+    host: it does not run under `jit`.
 
-    **Raises:** `ValueError` for another class.
+    **Raises:** `ValueError` for another class, or if `longest_side` is not positive.
     """
+    require(longest_side > 0, f"the longest side is {longest_side}; it must be positive")
     rng = generator(key)
-    return assemble(household_primitives(name, rng), rng.uniform(-np.pi, np.pi))
+    primitives = household_primitives(name, rng)
+    solid = assemble(primitives, rng.uniform(-np.pi, np.pi), longest_side)
+    return HouseholdObject(solid=solid, label=jnp.asarray(HOUSEHOLD.index(name)))
 
 
 def household_primitives(name: str, rng: np.random.Generator) -> list[Primitive]:

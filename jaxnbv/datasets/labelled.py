@@ -188,15 +188,15 @@ def _upright(axis):
     return np.stack([np.cross(axis, level), axis, level], axis=1)
 
 
-def assemble(primitives: list[Primitive], turn: float = 0.0) -> LabelledSolid:
+def assemble(primitives: list[Primitive], turn: float = 0.0, longest_side: float = _LONGEST_SIDE) -> LabelledSolid:
     """The union of primitives, turned about the y axis by an angle in radians, then moved and scaled: its bounding box
-    is centred in the scene and has the longest side 2.5.
+    is centred in the scene and has the given longest side.
 
     **Raises:** `ValueError` if there are no primitives or more than a solid can have.
     """
     _check_count(primitives)
     turned = rotation_about((0.0, 1.0, 0.0), turn)
-    return united(fitted([moved(p, rotation=turned) for p in primitives], _LONGEST_SIDE))
+    return united(fitted([moved(p, rotation=turned) for p in primitives], longest_side))
 
 
 def moved(p: Primitive, scale: float = 1.0, rotation=_UNTURNED, offset=_UNMOVED) -> Primitive:

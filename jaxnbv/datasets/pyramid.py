@@ -1,8 +1,5 @@
 """The synthetic pyramid: five classes that differ in a pattern imprinted on the base, and in nothing else."""
 
-from enum import StrEnum
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,23 +8,16 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from jaxnbv.camera import Camera
 from jaxnbv.checks import AnyArray, require
 from jaxnbv.cloud import PointCloud
+from jaxnbv.datasets.class_object import ClassObject, scan_telling
 from jaxnbv.datasets.framing import Framing
 from jaxnbv.datasets.patterns import PATTERNS, pattern_distance
+from jaxnbv.datasets.splits import Split, scene_key
 from jaxnbv.pose import Pose
-from jaxnbv.scanning import SDFSurface, scan
-from jaxnbv.scanning.sdf import Matrix, Scalar, SignedDistance, Vector, nonnegative, parameter
+from jaxnbv.scanning.sdf import Matrix, Scalar, Vector, nonnegative, parameter
 from jaxnbv.search.candidates import sphere_candidates
 
 
-class Split(StrEnum):
-    """Which scenes: no two splits share one."""
-
-    TRAIN = "train"
-    VALIDATION = "validation"
-    TEST = "test"
-
-
-class Pyramid(SignedDistance):
+class Pyramid(ClassObject):
     """A pyramid on a square base into which a pattern is pressed; a bound.
 
     In its own frame the base is [-1, 1]^2 at z = 0 and the apex stands at (0, 0, height); a point u of it lies at
@@ -65,6 +55,10 @@ class Pyramid(SignedDistance):
         """
         u, v, w = self._own(x)
         return (self.scale * self._imprint(u, v, w) <= tolerance) & (self.scale * w > tolerance)
+
+    def tells(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
+        """Those of the pattern."""
+        return self.on_pattern(x, tolerance)
 
     def _own(self, x):
         a, b, c = (x[..., i, None] - self.offset[i] for i in range(3))
@@ -118,9 +112,7 @@ def pyramid_scene(split: Split, index: int | Int[Array, ""], framing: Framing = 
 
     **Raises:** `ValueError` if the index is negative.
     """
-    require(isinstance(index, jax.Array) or index >= 0, f"the scene's number is {index}; it must not be negative")
-    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), list(Split).index(split)), index)
-    return sample_pyramid(key, index % len(PATTERNS), framing.longest_side)
+    return sample_pyramid(scene_key(0, split, index), index % len(PATTERNS), framing.longest_side)
 
 
 def hidden_view(pyramid: Pyramid, key: PRNGKeyArray, camera: Camera = Camera(), num_candidates: int = 120) -> Pose:
@@ -129,7 +121,7 @@ def hidden_view(pyramid: Pyramid, key: PRNGKeyArray, camera: Camera = Camera(), 
     **Raises:** `ValueError` if there is none.
     """
     poses = sphere_candidates(num_candidates)
-    pixels, scans = scan_pattern(pyramid, camera, poses)
+    pixels, scans = scan_telling(pyramid, camera, poses)
     return poses[choose_hidden(pixels, scans, key)]
 
 
@@ -141,10 +133,3 @@ def choose_hidden(pattern_pixels: Int[AnyArray, " poses"], scans: PointCloud, ke
     hidden = np.flatnonzero((np.asarray(pattern_pixels) == 0) & (np.asarray(scans.count) > 0))
     require(len(hidden) > 0, f"the pattern shows from all {len(pattern_pixels)} candidates: ask for more of them")
     return int(jax.random.choice(key, hidden))
-
-
-@eqx.filter_jit
-def scan_pattern(pyramid: Pyramid, camera: Camera, poses: Pose) -> tuple[Int[Array, " poses"], PointCloud]:
-    """How many rays of each pose hit the pattern, and the scans, without noise."""
-    scans = scan(SDFSurface(pyramid), camera, poses)
-    return jnp.sum(pyramid.on_pattern(scans.points) & scans.mask, axis=-1), scans

@@ -1,11 +1,12 @@
 """A truck with an open bed that carries an object of one of ten classes: only the cargo tells the class."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, require
+from jaxnbv.datasets.class_object import ClassObject
+from jaxnbv.datasets.framing import Framing
 from jaxnbv.datasets.household import HOUSEHOLD, household_primitives
 from jaxnbv.datasets.labelled import (
     LabelledSolid,
@@ -19,13 +20,12 @@ from jaxnbv.datasets.labelled import (
     rotation_about,
     united,
 )
-from jaxnbv.datasets.pyramid import Split
-from jaxnbv.scanning.sdf import SignedDistance
+from jaxnbv.datasets.splits import Split, scene_key
 
 _TRUCK, _CARGO = 0, 1
 
 
-class LoadedTruck(SignedDistance):
+class LoadedTruck(ClassObject):
     """A truck and its cargo; a bound.
 
     - `truck`, `cargo`: where they stand in the scene.
@@ -39,22 +39,20 @@ class LoadedTruck(SignedDistance):
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         return (self.truck | self.cargo)(x)
 
-    def on_cargo(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
-        """Which points of the surface belong to the cargo; the tolerance is in scene units. Give hits without noise."""
+    def tells(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
+        """Those of the cargo."""
         return self.cargo(x) <= tolerance
 
 
-def truck_scene(split: Split, index: int, longest_side: float = 2.5) -> LoadedTruck:
+def truck_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_UP) -> LoadedTruck:
     """Scene number `index` of a split; the classes of the cargo take turns.
 
     The cargo is turned at random about the vertical, as large as the bed has room for, and the loaded truck in any
     direction; its bounding box is centred in the scene. Built on the host: it does not run under `jit`.
 
-    **Raises:** `ValueError` if the index is negative, or `longest_side` is not positive.
+    **Raises:** `ValueError` if the index is negative.
     """
-    require(index >= 0, f"the scene's number is {index}; it must not be negative")
-    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(5), list(Split).index(split)), index)
-    return sample_truck(key, index % len(HOUSEHOLD), longest_side)
+    return sample_truck(scene_key(5, split, index), index % len(HOUSEHOLD), framing.longest_side)
 
 
 def sample_truck(key: PRNGKeyArray, label: int, longest_side: float = 2.5) -> LoadedTruck:
@@ -80,7 +78,8 @@ def sample_truck(key: PRNGKeyArray, label: int, longest_side: float = 2.5) -> Lo
     rotation = rotation * np.sign(np.diag(triangle))
     rotation[:, 0] *= np.linalg.det(rotation)
     both = fitted([moved(p, rotation=rotation) for p in truck + cargo], longest_side)
-    return LoadedTruck(united(both[: len(truck)]), united(both[len(truck) :]), jnp.asarray(label))
+    solids = {"truck": united(both[: len(truck)]), "cargo": united(both[len(truck) :])}
+    return LoadedTruck(**solids, label=jnp.asarray(label))
 
 
 def _truck(rng: np.random.Generator) -> tuple[list[Primitive], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:

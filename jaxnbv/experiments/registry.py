@@ -26,14 +26,33 @@ class Entry(NamedTuple):
 
 STUDIES = {
     "pyramid": Entry(
-        "jaxnbv.experiments.pyramid.study:PyramidStudy",
+        "jaxnbv.experiments.classification.pyramid:PyramidStudy",
         "Which methods find the pattern on a pyramid's base, and how soon is its class known?",
         "48 candidates, 16 samples on a 64^3 grid, and 512 points for the classifier of imagined scans: fewer "
         "candidates and a coarser grid than the paper's.",
         scenes=100,
         views=5,
-        pictures="jaxnbv.experiments.pyramid.pictures:write_pictures",
+        pictures="jaxnbv.experiments.classification.pictures:write_pictures",
         options=("framing",),
+    ),
+    "truck": Entry(
+        "jaxnbv.experiments.classification.truck:TruckStudy",
+        "How soon is the class of a truck's cargo known, which most views do not show? The paper's Truck-ModelNet10, "
+        "on procedural trucks and cargo.",
+        "48 candidates, 16 samples on a 64^3 grid, 1,024 points of what was seen beside an imagined scan and 2,048 of "
+        "what was seen alone: fewer candidates and a coarser grid than the paper's.",
+        scenes=100,
+        views=5,
+        pictures="jaxnbv.experiments.classification.pictures:write_pictures",
+    ),
+    "modelnet10": Entry(
+        "jaxnbv.experiments.classification.modelnet10:ModelNet10Study",
+        "Do all methods tell classes alike that differ in global shape? The paper's ModelNet10, on procedural objects.",
+        "48 candidates, 16 samples on a 64^3 grid, and 512 points for the classifier of imagined scans: fewer "
+        "candidates and a coarser grid than the paper's.",
+        scenes=100,
+        views=5,
+        pictures="jaxnbv.experiments.classification.pictures:write_pictures",
     ),
     "parts": Entry(
         "jaxnbv.experiments.parts.study:PartStudy",
@@ -66,12 +85,14 @@ STUDIES = {
         options=("meshes",),
     ),
     "searches": Entry(
-        "jaxnbv.experiments.searches:SearchStudy",
-        "Do searches by gradient find better views than one over candidates, and what do they cost? On pyramids.",
-        "Settings of the pyramid study; gradient searches climb from the best 4 of 24 views, 8 steps of 0.03.",
+        "jaxnbv.experiments.classification.searches:SearchStudy",
+        "Do searches by gradient find better views than one over candidates, and what do they cost? On pyramids and "
+        "trucks.",
+        "Settings of the studies of pyramids and trucks; gradient searches climb from the best 4 of 24 views, 8 steps "
+        "of 0.03.",
         scenes=60,
         views=5,
-        pictures="jaxnbv.experiments.pyramid.pictures:write_pictures",
+        pictures="jaxnbv.experiments.classification.pictures:write_pictures",
         options=("framing",),
     ),
 }

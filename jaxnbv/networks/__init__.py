@@ -19,6 +19,7 @@ from jaxnbv.networks.part_segmentation import PointNet2PartSegmenter as PointNet
 from jaxnbv.networks.pointnet2 import PointNet2Classifier as PointNet2Classifier
 from jaxnbv.networks.pretrained import network_scale as network_scale
 from jaxnbv.networks.pretrained import part_segmenter as part_segmenter
+from jaxnbv.networks.pretrained import pretrained_classifier as pretrained_classifier
 from jaxnbv.networks.pretrained import pyramid_classifier as pyramid_classifier
 from jaxnbv.networks.segmenter import CloudSegmenter as CloudSegmenter
 from jaxnbv.networks.torch_format import read_torch_tensors as read_torch_tensors

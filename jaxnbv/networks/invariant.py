@@ -25,9 +25,10 @@ class InvariantClassifier(eqx.Module):
 
     - `num_classes`, and their names `classes`, where known.
     - `radii`: of the two levels, in the units of the points.
+    - `groups`: how many each level has; more see more of what is small beside the rest.
     - `temperature`: divides the logits; above 1 it makes an over-confident network more careful (Guo et al. 2017).
 
-    **Raises:** `ValueError` if the names are not as many as the classes.
+    **Raises:** `ValueError` if the names are not as many as the classes, or the second level has more groups.
     """
 
     edge: "_Level"
@@ -42,12 +43,14 @@ class InvariantClassifier(eqx.Module):
         key: PRNGKeyArray,
         radii: tuple[float, float] = (0.25, 0.8),
         classes: tuple[str, ...] | None = None,
+        groups: tuple[int, int] = (256, 64),
     ):
         named = num_classes if classes is None else len(classes)
         require(named == num_classes, f"{classes} names {named} classes; the network has {num_classes}")
+        require(1 <= groups[1] <= groups[0], f"the levels have {groups} groups; give the second no more than the first")
         edge_key, pattern_key, first_key, last_key = jax.random.split(key, 4)
-        self.edge = _Level(0, 32, 64, radii[0], 256, 24, edge_key)
-        self.pattern = _Level(64, 112, _POOLED, radii[1], 64, 48, pattern_key)
+        self.edge = _Level(0, 32, 64, radii[0], groups[0], 24, edge_key)
+        self.pattern = _Level(64, 112, _POOLED, radii[1], groups[1], 48, pattern_key)
         self.head = (eqx.nn.Linear(_POOLED, _POOLED, key=first_key), eqx.nn.Linear(_POOLED, num_classes, key=last_key))
         self.temperature, self.classes = jnp.asarray(1.0), classes
 

@@ -1,7 +1,7 @@
 """The arrays of our own networks by name, for safetensors files, and the networks that they make.
 
-Names are attribute paths such as `pattern.pair.weight`; widths are those of the class. A file that names its classes
-does so in its metadata, separated by commas.
+Names are attribute paths such as `pattern.pair.weight`; widths are those of the class. Of a classifier the metadata
+hold the names of its classes, where it has some, and how many groups its levels have, separated by commas.
 """
 
 from collections.abc import Mapping
@@ -21,8 +21,11 @@ NativeNetwork = InvariantClassifier | CompactPartSegmenter
 
 def arrays_of(network: NativeNetwork) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """The network's arrays by name, and the file's metadata."""
-    classes = getattr(network, "classes", None)
-    return {name: np.asarray(leaf) for name, leaf in _named(network)}, {"classes": ",".join(classes)} if classes else {}
+    arrays = {name: np.asarray(leaf) for name, leaf in _named(network)}
+    if not isinstance(network, InvariantClassifier):
+        return arrays, {}
+    classes = {} if network.classes is None else {"classes": ",".join(network.classes)}
+    return arrays, classes | {"groups": f"{network.edge.groups},{network.pattern.groups}"}
 
 
 def is_native(arrays: Mapping[str, np.ndarray]) -> bool:
@@ -39,8 +42,19 @@ def build_native(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) 
         return _filled(eqx.filter_eval_shape(CompactPartSegmenter, jax.random.key(0)), arrays)
     last = arrays.get("head.1.bias", np.zeros(0))
     require(last.ndim == 1 and last.size > 0, "the array head.1.bias, of one entry a class, is missing")
-    classes = tuple(metadata["classes"].split(",")) if "classes" in metadata else None
-    return _filled(eqx.filter_eval_shape(InvariantClassifier, last.size, jax.random.key(0), classes=classes), arrays)
+    said: dict[str, Any] = {}
+    if "classes" in metadata:
+        said["classes"] = tuple(metadata["classes"].split(","))
+    if "groups" in metadata:
+        said["groups"] = _groups(metadata["groups"])
+    return _filled(eqx.filter_eval_shape(InvariantClassifier, last.size, jax.random.key(0), **said), arrays)
+
+
+def _groups(text: str) -> tuple[int, int]:
+    numbers = text.split(",")
+    proper = len(numbers) == 2 and all(number.isdecimal() for number in numbers)
+    require(proper, f"its metadata say groups={text!r}; expected two numbers, such as 256,64")
+    return int(numbers[0]), int(numbers[1])
 
 
 def _filled(blank: Any, arrays: Mapping[str, np.ndarray]) -> Any:

@@ -4,15 +4,14 @@ from importlib import resources
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxnbv.cloud import PointCloud
-from jaxnbv.datasets import PATTERNS, Framing, Split
+from jaxnbv.datasets import CLASS_SETS, PATTERNS, Framing, Split
 from jaxnbv.networks import pyramid_classifier
 from jaxnbv.tasks.classification import entropy
-from jaxnbv.training.pyramid_clouds import LabelledClouds, scanned_clouds
+from jaxnbv.training.class_clouds import LabelledClouds, scanned_clouds
 
 COMPUTES = True
 _CHUNK = 40
@@ -36,11 +35,11 @@ def test_right_where_the_pattern_is_seen_and_undecided_where_it_is_not(framing):
     classifier = pyramid_classifier(framing.longest_side)
     right, undecided, first = [], [], 0
     while len(right) < 100:
-        found = scanned_clouds(Split.TEST, framing, jnp.asarray(first), _CHUNK)
+        found = scanned_clouds(CLASS_SETS["pyramid"], Split.TEST, framing, range(first, first + _CHUNK))
         assert isinstance(found, LabelledClouds)
         assert isinstance(found.clouds, PointCloud)
         log_p = answers(classifier, found.clouds)
-        pixels = np.asarray(found.pattern_pixels)
+        pixels = np.asarray(found.telling_pixels)
         right += (np.argmax(log_p, axis=1) == np.asarray(found.labels))[pixels >= enough].tolist()
         undecided += np.asarray(entropy(log_p))[pixels == 0].tolist()
         first += _CHUNK

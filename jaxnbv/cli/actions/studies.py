@@ -66,11 +66,11 @@ def study(
         asked += count
         if not records:
             continue
-        write_tables(records, kind, folder / part)
-        write_charts(records, kind, folder / part)
+        write_tables(records, type(settings), folder / part)
+        write_charts(records, type(settings), folder / part)
         if entry.pictures:
             resolve(entry.pictures)(records, settings, folder / part)
-        typer.echo(f"\n{f'{part}. ' if part else ''}{summary(records, kind, groups=False)}")
+        typer.echo(f"\n{f'{part}. ' if part else ''}{summary(records, type(settings), groups=False)}")
         typer.echo(f"All tables as CSV, figures and pictures: {folder / part}\n")
     if failed:
         where, error = next(iter(failed.items()))

@@ -9,7 +9,7 @@ from jaxnbv.checks import require
 from jaxnbv.datasets.categories import NUM_PARTS, category_index
 from jaxnbv.datasets.labelled import LabelledSolid, assemble, generator
 from jaxnbv.datasets.parts import aircraft, belongings, devices, furniture, motorbike, skateboard, vessels
-from jaxnbv.datasets.pyramid import Split
+from jaxnbv.datasets.splits import Split, scene_key
 
 # Each lists the primitives of a random object: x is forward, y up and z to the right.
 _BUILDERS = {
@@ -69,8 +69,7 @@ def part_scene(split: Split, index: int) -> PartScene:
 
     **Raises:** `ValueError` if the index is negative.
     """
-    require(index >= 0, f"the scene's number is {index}; it must not be negative")
-    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), list(Split).index(split)), index)
+    key = scene_key(0, split, index)
     category = PART_CATEGORIES[index % len(PART_CATEGORIES)]
     solid = sample_part_object(category, key)
     parts = np.isin(np.arange(NUM_PARTS), np.asarray(solid.labels))

@@ -1,4 +1,4 @@
-"""When a sequence of views first gives the right class, gives it for good, or first shows the pattern.
+"""When a sequence of views first gives the right class, gives it for good, or first shows what tells it.
 
 Views count from 1. A sequence that never does has no such time: None.
 """
@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Integer
 
 from jaxnbv.checks import AnyArray, require
 
-# What the study calls having seen the pattern: rays of one scan that hit it.
-PATTERN_PIXELS = 150
+# What the studies call having seen it: rays of one scan that hit what tells the class.
+TELLING_PIXELS = 150
 
 
 def first_hit(correct: Bool[AnyArray, " views"]) -> int | None:
@@ -27,8 +27,8 @@ def stable_hit(correct: Bool[AnyArray, " views"]) -> int | None:
     return view if view <= len(correct) else None
 
 
-def pattern_view(pixels: Integer[AnyArray, " views"], threshold: int = PATTERN_PIXELS) -> int | None:
-    """The first view in which at least `threshold` rays hit the pattern; views do not add up."""
+def seen_view(pixels: Integer[AnyArray, " views"], threshold: int = TELLING_PIXELS) -> int | None:
+    """The first view in which at least `threshold` rays hit what tells the class; views do not add up."""
     return first_hit(np.asarray(pixels) >= threshold)
 
 
@@ -42,21 +42,21 @@ def cumulative_share(times: Sequence[int | None], views: int) -> Float[np.ndarra
     return np.mean(by_view[:, None] <= np.arange(1, views + 1), axis=0)
 
 
-def random_pattern_share(
-    pattern_pixels: Integer[AnyArray, " candidates"], first: int, views: int, threshold: int = PATTERN_PIXELS
+def random_seen_share(
+    pixels: Integer[AnyArray, " candidates"], first: int, views: int, threshold: int = TELLING_PIXELS
 ) -> Float[np.ndarray, " views"]:
-    """Exact probability that a random search has shown the pattern by view 1, 2, ..., `views`.
+    """Exact probability that a random search has shown what tells the class by view 1, 2, ..., `views`.
 
     After the first camera it takes the other N candidates in an order drawn uniformly without replacement. Of these M
-    show the pattern, so by view t it has missed them all with the hypergeometric probability
-    C(N - M, t - 1) / C(N, t - 1). If the first camera shows the pattern, the share is 1 throughout.
+    show it, so by view t it has missed them all with the hypergeometric probability
+    C(N - M, t - 1) / C(N, t - 1). If the first camera shows it, the share is 1 throughout.
 
-    - `pattern_pixels`: for each candidate the rays of its true scan that hit the pattern.
+    - `pixels`: for each candidate the rays of its true scan that hit what tells the class.
     - `first`: the first camera, an index of the candidates.
 
     **Raises:** `ValueError` if there is no such candidate, or there are more views than candidates.
     """
-    shows = np.asarray(pattern_pixels) >= threshold
+    shows = np.asarray(pixels) >= threshold
     require(0 <= first < len(shows), f"the first camera is candidate {first} of {len(shows)}; count from 0")
     require(1 <= views <= len(shows), f"{views} views of {len(shows)} candidates: each is taken at most once")
     if shows[first]:

@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from jaxnbv.experiments.charts import write_charts
+from jaxnbv.experiments.classification.pyramid import PyramidStudy
 from jaxnbv.experiments.measures import result_rows, values
-from jaxnbv.experiments.pyramid.study import PyramidStudy
 from jaxnbv.experiments.tables import summary, write_tables
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxnbv.checks import InputError
-from jaxnbv.experiments.pyramid.hits import cumulative_share, first_hit, pattern_view, random_pattern_share, stable_hit
+from jaxnbv.experiments.classification.hits import cumulative_share, first_hit, random_seen_share, seen_view, stable_hit
 
 
 @pytest.mark.parametrize(
@@ -29,9 +29,9 @@ def test_hit_times_of_hand_made_sequences(correct, first, stable):
 
 
 def test_the_pattern_is_seen_in_one_view_not_in_their_sum():
-    assert pattern_view(np.array([0, 100, 100, 150, 0])) == 4
-    assert pattern_view(np.array([0, 149, 149])) is None
-    assert pattern_view(np.array([0, 149, 149]), threshold=149) == 2
+    assert seen_view(np.array([0, 100, 100, 150, 0])) == 4
+    assert seen_view(np.array([0, 149, 149])) is None
+    assert seen_view(np.array([0, 149, 149]), threshold=149) == 2
 
 
 def test_sequences_that_never_hit_count_in_the_whole():
@@ -51,14 +51,14 @@ def test_random_search_agrees_with_all_orders(showing, first_shows):
     pixels[first] = 150 if first_shows else 0
     orders = [(first, *order) for order in itertools.permutations(others)]
     shown = np.array([np.maximum.accumulate(pixels[list(order)] >= 150) for order in orders])
-    np.testing.assert_allclose(random_pattern_share(pixels, first, views), shown.mean(axis=0), atol=1e-14)
+    np.testing.assert_allclose(random_seen_share(pixels, first, views), shown.mean(axis=0), atol=1e-14)
 
 
 def test_random_search_over_one_view_and_bad_input():
     pixels = np.array([0, 200, 0])
-    np.testing.assert_array_equal(random_pattern_share(pixels, 0, 1), [0.0])
-    np.testing.assert_array_equal(random_pattern_share(pixels, 0, 2, threshold=201), [0.0, 0.0])
+    np.testing.assert_array_equal(random_seen_share(pixels, 0, 1), [0.0])
+    np.testing.assert_array_equal(random_seen_share(pixels, 0, 2, threshold=201), [0.0, 0.0])
     with pytest.raises(InputError, match="4 views of 3 candidates"):
-        random_pattern_share(pixels, 0, 4)
+        random_seen_share(pixels, 0, 4)
     with pytest.raises(InputError, match="candidate 3 of 3"):
-        random_pattern_share(pixels, 3, 2)
+        random_seen_share(pixels, 3, 2)

@@ -1,7 +1,7 @@
 """The study of searches: does a search by gradient find better views than one over candidates, and what does it cost?
 
-The paper's comparison of its two ways to maximise the acquisition, over candidates and by gradient, on pyramids; and
-successive halving, constrained 6-DOF poses, and gradient ascent from the best candidates beside them.
+The paper's comparison of its two ways to maximise the acquisition, over candidates and by gradient, on pyramids and on
+trucks; and successive halving, constrained 6-DOF poses, and gradient ascent from the best candidates beside them.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,10 +10,14 @@ from typing import Any, ClassVar
 import equinox as eqx
 import numpy as np
 
+from jaxnbv.datasets import Framing
 from jaxnbv.episode import Step
+from jaxnbv.experiments.classification.pyramid import PyramidStudy
+from jaxnbv.experiments.classification.study import ClassificationStudy, Truth, hits, seen_explained
+from jaxnbv.experiments.classification.truck import TruckStudy
 from jaxnbv.experiments.measures import Measure, Record
-from jaxnbv.experiments.pyramid.study import PyramidStudy, Truth
 from jaxnbv.experiments.study import Chart, Panel, Scene, Study
+from jaxnbv.model_name import ModelName
 from jaxnbv.planner import Planner
 from jaxnbv.search import (
     ConstrainedPoses,
@@ -40,8 +44,9 @@ def _seconds(record: Record, method: str) -> list[float]:
     return [float(np.median(seconds[1:]))] if len(seconds) > 1 else [np.nan]
 
 
-class SearchStudy(PyramidStudy):
-    """The class of a pyramid by cross-entropy, whose view is sought in several ways. Settings as of `PyramidStudy`, and
+class _Searches(ClassificationStudy):
+    """The class of an object by cross-entropy, whose view is sought in several ways. Settings as of
+    `ClassificationStudy`, and
 
     - `num_starts`, `iterations`, `learning_rate`: of the gradient searches, which look at half the candidates first.
 
@@ -50,24 +55,21 @@ class SearchStudy(PyramidStudy):
     """
 
     title: ClassVar[str] = "Ways to maximise the expected cross-entropy"
-    explanation: ClassVar[str] = (
-        "First hit: a right prediction so far. Stable hit: right from then to the end. Pattern seen: one of the views\n"
-        "shows it. All searches start from the same view and see the same noise and, at view 2, the same samples, so\n"
-        "that there the values that they found can be compared. Seconds are of a proposal once it is compiled, the\n"
-        "median over the steps of a scene."
+    searches_explained: ClassVar[str] = (
+        "First hit: a right prediction so far. Stable hit: right from then to the end. All searches start from the\n"
+        "same view and see the same noise and, at view 2, the same samples, so that there the values that they found\n"
+        "can be compared. Seconds are of a proposal once it is compiled, the median over the steps of a scene.\n"
     )
     methods: ClassVar[tuple[str, ...]] = ("discrete", "halving", *_SPACES, "hybrid")
     reference: ClassVar[str] = "discrete"
-    measures: ClassVar[tuple[Measure, ...]] = (
-        *(PyramidStudy.measure(name) for name in ("first", "stable", "pattern")),
+    own_measures: ClassVar[tuple[Measure, ...]] = (
         Measure("value", "Expected cross-entropy of the view", _value, first=2, unit="nats", better="more"),
         Measure("seconds", "Time of a proposal", _seconds, ("median",), "step", unit="seconds", better="less"),
     )
     charts: ClassVar[Mapping[str, Chart]] = {
         "searches": Chart(((Panel("stable"), Panel("value", "Expected cross-entropy"), Panel("seconds")),)),
     }
-    seed: ClassVar[int] = 10
-    quick: ClassVar[Mapping[str, Any]] = {**PyramidStudy.quick, "num_starts": 2, "iterations": 3}
+    quick: ClassVar[Mapping[str, Any]] = {**ClassificationStudy.quick, "num_starts": 2, "iterations": 3}
 
     num_starts: int = eqx.field(static=True, default=4)
     iterations: int = eqx.field(static=True, default=8)
@@ -92,7 +94,7 @@ class SearchStudy(PyramidStudy):
     def follow(
         self, scene: Scene, truth: Truth, method: str, methods: Sequence[str], episode: Iterator[Step]
     ) -> Record:
-        """As of `PyramidStudy`, and of each view that was sought its value and the seconds that it took."""
+        """As of `ClassificationStudy`, and of each view that was sought its value and the seconds that it took."""
         values, seconds = [], []
 
         def noted() -> Iterator[Step]:
@@ -103,3 +105,30 @@ class SearchStudy(PyramidStudy):
                 yield step
 
         return super().follow(scene, truth, method, methods, noted()) | {"values": values, "seconds": seconds}
+
+
+class TruckSearchStudy(_Searches, TruckStudy):
+    """On trucks."""
+
+    explanation: ClassVar[str] = f"{_Searches.searches_explained}{seen_explained('cargo')}"
+    measures: ClassVar[tuple[Measure, ...]] = (*hits("cargo"), *_Searches.own_measures)
+    seed: ClassVar[int] = 13
+
+
+class SearchStudy(_Searches, PyramidStudy):
+    """On pyramids."""
+
+    explanation: ClassVar[str] = f"{_Searches.searches_explained}{seen_explained('pattern')}"
+    measures: ClassVar[tuple[Measure, ...]] = (*hits("pattern"), *_Searches.own_measures)
+    seed: ClassVar[int] = 10
+
+    @classmethod
+    def configured(
+        cls, model: ModelName, views: int, quick: bool, framing: Framing | None = None, **options: Any
+    ) -> dict[str, Study]:
+        """On pyramids of each framing, and on trucks, if none is given."""
+        pyramids = super().configured(model, views, quick, framing, **options)
+        if framing is not None:
+            return pyramids
+        (truck,) = TruckSearchStudy.configured(model, views, quick, **options).values()
+        return pyramids | {"truck": truck}

@@ -1,32 +1,39 @@
 """Training clouds: what they hold, that they can be made again, and that splits differ."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxnbv.camera import Camera
-from jaxnbv.datasets import PATTERNS, Framing, Split, pyramid_scene
+from jaxnbv.datasets import CLASS_SETS, PATTERNS, Framing, Split, pyramid_scene
 from jaxnbv.planner import Planner
 from jaxnbv.scanning import Grid
 from jaxnbv.search import DiscreteSearch
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
-from jaxnbv.training.pyramid_clouds import MAX_VIEWS, imagined_clouds, scanned_clouds
+from jaxnbv.training.class_clouds import MAX_VIEWS, imagined_clouds, scanned_clouds
 
 COUNT, POINTS = 16, 200
 MODEL = GeometricSPSR(lengthscale=0.05, truncation=8)
 PLANNER = Planner(MODEL, Camera(), Coverage(), DiscreteSearch(), 2, Grid(20), 150)
 
 
+def clouds_of(split, framing, first, count, points):
+    return scanned_clouds(CLASS_SETS["pyramid"], split, framing, range(first, first + count), points)
+
+
+def imagined_of(index):
+    return imagined_clouds(CLASS_SETS["pyramid"], Split.TRAIN, Framing.CLOSE_UP, index, PLANNER, 3, POINTS)
+
+
 @pytest.fixture(scope="module")
 def scanned():
-    return scanned_clouds(Split.TRAIN, Framing.CLOSE_UP, jnp.asarray(5), COUNT, POINTS)
+    return clouds_of(Split.TRAIN, Framing.CLOSE_UP, 5, COUNT, POINTS)
 
 
 @pytest.fixture(scope="module")
 def imagined():
-    return [imagined_clouds(Split.TRAIN, Framing.CLOSE_UP, jnp.asarray(i), PLANNER, 3, POINTS) for i in (5, 6)]
+    return [imagined_of(index) for index in (5, 6)]
 
 
 def assert_same(a, b):
@@ -48,8 +55,8 @@ def test_scanned_clouds_are_samples_of_their_scenes_with_noise(scanned):
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
 
 
-def test_pattern_pixels_vary_and_are_at_most_those_of_one_view(scanned):
-    pixels = np.asarray(scanned.pattern_pixels)
+def test_telling_pixels_vary_and_are_at_most_those_of_one_view(scanned):
+    pixels = np.asarray(scanned.telling_pixels)
     assert pixels.min() >= 0
     assert pixels.max() <= 2500
     views = np.asarray(scanned.views)
@@ -62,9 +69,9 @@ def test_pattern_pixels_vary_and_are_at_most_those_of_one_view(scanned):
 
 def test_a_cloud_whose_views_miss_the_pattern_has_no_point_in_it():
     """And one with many pixels does; half the depth of the pattern is more than three deviations of the noise."""
-    found = scanned_clouds(Split.VALIDATION, Framing.CLOSE_UP, jnp.asarray(0), 24, 1000)
+    found = clouds_of(Split.VALIDATION, Framing.CLOSE_UP, 0, 24, 1000)
     shares = {False: [], True: []}
-    for row, pixels in enumerate(np.asarray(found.pattern_pixels)):
+    for row, pixels in enumerate(np.asarray(found.telling_pixels)):
         pyramid = pyramid_scene(Split.VALIDATION, row)
         points, _ = found.clouds[row].to_numpy()
         own = (points - pyramid.offset) @ pyramid.rotation / pyramid.scale
@@ -79,17 +86,17 @@ def test_a_cloud_whose_views_miss_the_pattern_has_no_point_in_it():
 
 
 def test_clouds_can_be_made_again_in_other_portions(scanned):
-    again = scanned_clouds(Split.TRAIN, Framing.CLOSE_UP, jnp.asarray(5), COUNT, POINTS)
+    again = clouds_of(Split.TRAIN, Framing.CLOSE_UP, 5, COUNT, POINTS)
     assert_same(scanned, again)
-    part = scanned_clouds(Split.TRAIN, Framing.CLOSE_UP, jnp.asarray(9), 3, POINTS)
-    np.testing.assert_array_equal(part.pattern_pixels, scanned.pattern_pixels[4:7])
+    part = clouds_of(Split.TRAIN, Framing.CLOSE_UP, 9, 3, POINTS)
+    np.testing.assert_array_equal(part.telling_pixels, scanned.telling_pixels[4:7])
     np.testing.assert_allclose(part.clouds.points, scanned.clouds.points[4:7], atol=1e-5)
 
 
 def test_splits_and_framings_differ(scanned):
-    other = scanned_clouds(Split.TEST, Framing.CLOSE_UP, jnp.asarray(5), COUNT, POINTS)
-    assert not np.array_equal(other.pattern_pixels, scanned.pattern_pixels)
-    whole = scanned_clouds(Split.TRAIN, Framing.WHOLE, jnp.asarray(5), COUNT, POINTS)
+    other = clouds_of(Split.TEST, Framing.CLOSE_UP, 5, COUNT, POINTS)
+    assert not np.array_equal(other.telling_pixels, scanned.telling_pixels)
+    whole = clouds_of(Split.TRAIN, Framing.WHOLE, 5, COUNT, POINTS)
     np.testing.assert_array_equal(whole.labels, scanned.labels)
     assert (
         np.abs(np.asarray(whole.clouds.points)).max() < 0.625 + 0.06 < np.abs(np.asarray(scanned.clouds.points)).max()
@@ -101,7 +108,7 @@ def test_imagined_clouds_begin_with_what_was_truly_seen(imagined):
         assert found.clouds.points.shape == (6, POINTS, 3)
         assert np.asarray(found.imagined).all()
         np.testing.assert_array_equal(found.labels, index % len(PATTERNS))
-        assert len(np.unique(found.pattern_pixels)) == 1
+        assert len(np.unique(found.telling_pixels)) == 1
         pyramid = pyramid_scene(Split.TRAIN, index)
         clouds = [found.clouds[row].to_numpy() for row in range(6)]
         for points, normals in clouds:
@@ -115,6 +122,6 @@ def test_imagined_clouds_begin_with_what_was_truly_seen(imagined):
 
 
 def test_imagined_clouds_can_be_made_again(imagined):
-    again = imagined_clouds(Split.TRAIN, Framing.CLOSE_UP, jnp.asarray(6), PLANNER, 3, POINTS)
+    again = imagined_of(6)
     assert_same(imagined[1], again)
     assert not np.array_equal(imagined[0].clouds.points, imagined[1].clouds.points)

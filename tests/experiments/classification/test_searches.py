@@ -12,7 +12,7 @@ import pytest
 
 from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
-from jaxnbv.experiments.searches import SearchStudy
+from jaxnbv.experiments.classification.searches import SearchStudy
 from jaxnbv.experiments.tables import summary
 from jaxnbv.surfaces import GeometricSPSR
 

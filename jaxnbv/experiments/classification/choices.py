@@ -1,4 +1,4 @@
-"""Where each method of the pyramid study looks next, all asked about the same samples and the same scans of them."""
+"""Where each method of a study of classification looks next, all asked about the same scans of the same samples."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -27,8 +27,8 @@ _SAMPLING = (*CLASSIFYING, "coverage", "uncertainty")
 
 
 class Choice(NamedTuple):
-    """A candidate; and how well the method's values agreed with the pattern that the candidates would truly show, and
-    how rough the samples were, None without samples."""
+    """A candidate; and how well the method's values agreed with what the candidates would truly show, and how rough the
+    samples were, None without samples."""
 
     candidate: int
     diagnostics: dict[str, float | None]
@@ -39,7 +39,7 @@ class Chooser:
 
     - `planner`: its states and samples; its search has the candidates.
     - `classifier`: of all that was seen; `imagining`: of what was seen, thinned to `num_points`, and an imagined scan.
-    - `scans`, `pattern_pixels`: what each candidate would truly show.
+    - `scans`: what each candidate would truly show; `worth`: what that is worth, where it is known.
     """
 
     def __init__(
@@ -49,12 +49,12 @@ class Chooser:
         imagining: Classifier,
         num_points: int,
         scans: PointCloud,
-        pattern_pixels: Int[Array, " candidates"],
+        worth: Int[Array, " candidates"] | None,
         key: PRNGKeyArray,
     ):
         self.planner, self.classifier, self.imagining = planner, classifier, imagining
         self.num_points, self.key = num_points, key
-        self.scans, self.pattern_pixels = scans, np.asarray(pattern_pixels, np.float64)
+        self.scans, self.worth = scans, None if worth is None else np.asarray(worth, np.float64)
         assert isinstance(planner.search, CandidateSearch)
         self.poses: Pose = planner.search.candidates.poses()
         self.states: dict[tuple[int, ...], State] = {}
@@ -63,10 +63,10 @@ class Chooser:
     def choose(self, visited: tuple[int, ...], methods: Sequence[str], view: int) -> dict[str, Choice]:
         """The best candidate not visited yet, for each of the methods that stand here."""
         values, rough = self.values(visited, methods, view)
-        new = ~np.isin(np.arange(len(self.pattern_pixels)), visited)
+        new = ~np.isin(np.arange(self.scans.mask.shape[0]), visited)
         choices = {}
         for method in methods:
-            rank = rank_correlation(values[method], self.pattern_pixels, new)
+            rank = None if self.worth is None else rank_correlation(values[method], self.worth, new)
             best = int(np.argmax(np.where(new, values[method], -np.inf)))
             diagnostics = {"rank_correlation": rank, "roughness": rough if method in _SAMPLING else None}
             choices[method] = Choice(best, diagnostics)

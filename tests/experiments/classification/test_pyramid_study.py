@@ -15,8 +15,8 @@ from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
 from jaxnbv.cloud import concatenate, limit_capacity
 from jaxnbv.datasets import Framing, Pyramid, Split, pyramid_scene
-from jaxnbv.experiments.pyramid.pictures import write_pictures
-from jaxnbv.experiments.pyramid.study import PyramidStudy
+from jaxnbv.experiments.classification.pictures import write_pictures
+from jaxnbv.experiments.classification.pyramid import PyramidStudy
 from jaxnbv.scanning import SDFSurface, scan
 from jaxnbv.search import FarthestView, Problem, UncertaintyView
 from jaxnbv.search.candidates import sphere_candidates

@@ -1,4 +1,4 @@
-"""The study of the synthetic pyramid: which methods find the pattern on its base, and how soon is its class known?"""
+"""What the studies of classification have in common: which methods' views tell the class, and how soon?"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar
@@ -7,26 +7,25 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Key
 
-from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud
-from jaxnbv.datasets import Framing, Pyramid, Split, pyramid_scene
-from jaxnbv.datasets.pyramid import choose_hidden, scan_pattern
+from jaxnbv.datasets import ClassObject, ClassSet, Framing, Split
+from jaxnbv.datasets.class_object import scan_telling
 from jaxnbv.episode import Sensor, Step
-from jaxnbv.experiments.measures import Measure, Record
-from jaxnbv.experiments.pyramid.choices import CLASSIFYING, Chooser, classify
-from jaxnbv.experiments.pyramid.hits import (
-    PATTERN_PIXELS,
+from jaxnbv.experiments.classification.choices import CLASSIFYING, Chooser, classify
+from jaxnbv.experiments.classification.hits import (
+    TELLING_PIXELS,
     cumulative_share,
     first_hit,
-    pattern_view,
-    random_pattern_share,
+    random_seen_share,
+    seen_view,
     stable_hit,
 )
+from jaxnbv.experiments.measures import Measure, Record
 from jaxnbv.experiments.study import Chart, Panel, Scene, Study
 from jaxnbv.model_name import ModelName
-from jaxnbv.networks import pyramid_classifier
+from jaxnbv.networks import pretrained_classifier
 from jaxnbv.planner import Planner
 from jaxnbv.pose import Pose
 from jaxnbv.presets import imagination
@@ -37,26 +36,14 @@ from jaxnbv.tasks.classification import Classifier
 
 _RANDOM_RUNS = 8
 _CHOSEN = "view being chosen"
-# The last is held by older records alone: carved samples have nothing before the object.
-_DIAGNOSTICS = {
-    "rank_correlation": "Rank correlation",
-    "roughness": "Roughness",
-    "near_sensor": "Near-sensor share",
-}
-# Of the cameras from which the pattern cannot be seen two fifths lie in each of the first two, a fifth in the last.
-_ANGLES = {"under 110": (0.0, 110.0), "110-140": (110.0, 140.0), "140-180": (140.0, 180.1)}
 
 
 class Truth(eqx.Module):
-    """What each candidate would truly show: scans with noise, and how many rays hit the pattern.
+    """What each candidate would truly show: scans with noise, and how many rays hit what tells the class."""
 
-    - `angles`: of the candidates from the base's normal, in degrees; at 180 a camera looks from behind the apex.
-    """
-
-    pyramid: Pyramid
+    thing: ClassObject
     scans: PointCloud
-    pattern_pixels: Int[Array, " candidates"]
-    angles: Float[Array, " candidates"]
+    pixels: Int[Array, " candidates"]
 
 
 def _hit(time_of: Callable) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
@@ -74,13 +61,17 @@ def _hit(time_of: Callable) -> Callable[[Record, str], Float[np.ndarray, " views
     return of
 
 
-def _pattern(record: Record, method: str) -> Float[np.ndarray, " views"]:
-    """Whether a view has shown the pattern, by view; of random search the exact share over all orders."""
-    runs = record["methods"][method]["runs"]
-    views = len(runs[0]["log_p"])
-    if method == "random":
-        return random_pattern_share(np.array(record["pattern_pixels"]), record["first"], views)
-    return cumulative_share([pattern_view(np.array(run["pattern_pixels"])) for run in runs], views)
+def _seen(telling: str) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
+    """Whether a view has shown what tells the class, by view; of random search the exact share over all orders."""
+
+    def of(record: Record, method: str) -> Float[np.ndarray, " views"]:
+        runs, pixels = record["methods"][method]["runs"], f"{telling}_pixels"
+        views = len(runs[0]["log_p"])
+        if method == "random":
+            return random_seen_share(np.array(record[pixels]), record["first"], views)
+        return cumulative_share([seen_view(np.array(run[pixels])) for run in runs], views)
+
+    return of
 
 
 def _diagnostic(quantity: str) -> Callable[[Record, str], list[float | None]]:
@@ -104,8 +95,29 @@ def _of_view(record: Record, method: str, quantity: str, view: int) -> float | N
     return found[0] if found and found[0] is not None and np.isfinite(found[0]) else None
 
 
-class PyramidStudy(Study):
-    """The class of a pyramid whose pattern the first view does not show. Settings as of `Study`, and
+def diagnostic(name: str, title: str) -> Measure:
+    """A measure of the samples among which a view is chosen."""
+    return Measure(name, title, _diagnostic(name), first=2, digits=2, paired=False)
+
+
+def hits(telling: str = "") -> tuple[Measure, ...]:
+    """First and stable hit; and whether a view has shown what tells the class, where that is a part of the object."""
+    seen = Measure(telling, f"{telling.capitalize()} seen", _seen(telling), percent=True)
+    both = [Measure(f.__name__.partition("_")[0], _HIT_TITLES[f], _hit(f), percent=True) for f in _HIT_TITLES]
+    return (*both, seen) if telling else tuple(both)
+
+
+_HIT_TITLES = {first_hit: "First hit", stable_hit: "Stable hit"}
+ROUGHNESS = diagnostic("roughness", "Roughness")
+
+
+def diagnostics_chart(*measures: str) -> Chart:
+    """Measures by the view being chosen, beside each other."""
+    return Chart((tuple(Panel(measure, axis=_CHOSEN) for measure in measures),))
+
+
+class ClassificationStudy(Study):
+    """The class of an object. Settings as of `Study`, and
 
     - `classifier`: of clouds in scene coordinates; it says what is known after each view.
     - `imagining`: the classifier of D u scan for imagined scans, by default the same; one that is fed fewer points
@@ -113,34 +125,30 @@ class PyramidStudy(Study):
     - `framing`: how large the object stands before the sensor.
     - `split`: which scenes; tune on those of the validation split.
     - `num_points`: D is thinned to so many, once a step, before imagined scans are added to it.
+
+    What it is:
+
+    - `objects`: the scenes; `telling`: what of them tells the class, "" for all of the object.
+    - `network`: the name of the shipped classifier; `fed`: the points that it is fed of what was seen, and of that and
+      an imagined scan.
+    - `framings`: each a study of its own; `solid`: whether the objects are nowhere thin, see `imagination`.
     """
 
-    title: ClassVar[str] = "The class of a pyramid"
-    explanation: ClassVar[str] = (
-        "First hit: a right prediction so far. Stable hit: right from then to the end. Pattern seen: one of the views\n"
-        f"shows at least {PATTERN_PIXELS} pixels of it. Random search: exact expectation of pattern seen and of first\n"
-        "hit by view 2, else a mean over runs. Diagnostics are by the view being chosen, in ( ) their scenes.\n"
-        "Angles are of the first view from the base's normal."
+    hits_explained: ClassVar[str] = (
+        "First hit: a right prediction so far. Stable hit: right from then to the end. Random search: exact\n"
+        "expectation of first hit by view 2, and of what a view shows; else a mean over runs.\n"
     )
     methods: ClassVar[tuple[str, ...]] = (*CLASSIFYING, "coverage", "farthest", "uncertainty", "random", "oracle")
     reference: ClassVar[str] = "cross-entropy"
-    measures: ClassVar[tuple[Measure, ...]] = (
-        Measure("first", "First hit", _hit(first_hit), percent=True),
-        Measure("stable", "Stable hit", _hit(stable_hit), percent=True),
-        Measure("pattern", "Pattern seen", _pattern, percent=True),
-        *(
-            Measure(name, title, _diagnostic(name), first=2, digits=2, paired=False)
-            for name, title in _DIAGNOSTICS.items()
-        ),
-    )
-    charts: ClassVar[Mapping[str, Chart]] = {
-        "hits": Chart((tuple(map(Panel, ("first", "stable", "pattern"))),)),
-        "angles": Chart((tuple(map(Panel, ("first", "stable", "pattern"))),), by_group=True),
-        "diagnostics": Chart(((Panel("rank_correlation", axis=_CHOSEN), Panel("roughness", axis=_CHOSEN)),)),
-    }
-    seed: ClassVar[int] = 2
     quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 40}
     quick_scenes: ClassVar[int] = 6
+
+    objects: eqx.AbstractClassVar[ClassSet]
+    telling: eqx.AbstractClassVar[str]
+    network: eqx.AbstractClassVar[str]
+    fed: eqx.AbstractClassVar[tuple[int, int]]
+    framings: ClassVar[tuple[Framing, ...]] = (Framing.CLOSE_UP,)
+    solid: ClassVar[bool] = False
 
     classifier: Classifier = eqx.field(kw_only=True)
     imagining: Classifier | None = None
@@ -154,41 +162,39 @@ class PyramidStudy(Study):
     ) -> dict[str, Study]:
         """One for each framing, if none is given."""
         studies: dict[str, Study] = {}
-        for one in Framing if framing is None else (framing,):
-            classifier, imagining = (pyramid_classifier(one.longest_side, **s) for s in ({}, {"num_points": 512}))
-            surfaces = imagination(model, one.longest_side, quick, solid=True)._asdict()
+        for one in cls.framings if framing is None else (framing,):
+            classifier, imagining = (pretrained_classifier(cls.network, one.longest_side, fed) for fed in cls.fed)
+            surfaces = imagination(model, one.longest_side, quick, solid=cls.solid)._asdict()
             settings = {"classifier": classifier, "imagining": imagining, "framing": one} | options
-            studies[one.value] = cls(views=views, **surfaces | settings | (dict(cls.quick) if quick else {}))
+            name = one.value if len(cls.framings) > 1 else ""
+            studies[name] = cls(views=views, **surfaces | settings | (dict(cls.quick) if quick else {}))
         return studies
 
     @classmethod
     def groups(cls, records: Sequence[Record]) -> dict[str, list[Record]]:
-        """All, and those in each bin of the first view's angle; no bin is empty."""
-        bins = {name: [r for r in records if low <= r["angle"] < high] for name, (low, high) in _ANGLES.items()}
-        return {"all": list(records)} | {f"first view at {name}°": of for name, of in bins.items() if of}
+        """All, and those whose first view shows nothing of what tells the class, and something; no group is empty."""
+        parts: dict[str, list[Record]] = {"all": list(records)}
+        if cls.telling:
+            shown = [record[f"{cls.telling}_pixels"][record["first"]] > 0 for record in records]
+            for word, wanted in (("without", False), ("with", True)):
+                of = [record for record, shows in zip(records, shown, strict=True) if shows is wanted]
+                parts |= {f"first view {word} {cls.telling}": of} if of else {}
+        return parts
 
     def scene(self, index: int) -> Scene:
-        """A pyramid; its task is the `Truth`."""
-        truth = _truth(self.candidates.poses(), jnp.asarray(index), self.split, self.framing, self.camera)
-        return Scene(index, f"pyramid {index}", SDFSurface(truth.pyramid), truth)
+        """An object; its task is the `Truth`."""
+        thing = self.objects.scene(self.split, index, self.framing)
+        pixels, scans = scan_telling(thing, self.camera, self.candidates.poses())
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(3), index), len(pixels))
+        truth = Truth(thing, _noisy(scans, keys), pixels)
+        return Scene(index, f"{self.network} {index}", SDFSurface(thing), truth)
 
     def truth(self, scene: Scene) -> Truth:
         return scene.task
 
     def facts(self, scene: Scene, truth: Truth, first: int) -> Record:
-        return {
-            "name": scene.name,
-            "framing": self.framing.value,
-            "split": self.split.value,
-            "label": int(truth.pyramid.label),
-            "pattern_pixels": truth.pattern_pixels.tolist(),
-            "angle": float(truth.angles[first]),
-        }
-
-    def first_view(self, scene: Scene) -> int:
-        """A random one of the candidates that do not show the pattern, but something."""
-        pixels = np.asarray(scene.task.pattern_pixels)
-        return choose_hidden(pixels, scene.task.scans, self.key(scene.index, "first"))
+        known = {"name": scene.name, "framing": self.framing.value, "split": self.split.value}
+        return known | {"label": int(truth.thing.label)} | self._shown(truth.pixels)
 
     @property
     def grid(self) -> Grid:
@@ -230,7 +236,7 @@ class PyramidStudy(Study):
             for method, of in runs.items()
         }
         if "random" in found:
-            correct = chooser.true_answers(first).argmax(axis=1) == int(truth.pyramid.label)
+            correct = chooser.true_answers(first).argmax(axis=1) == int(truth.thing.label)
             found["random"]["hit"] = float(np.mean(np.delete(correct, first)))
         return found
 
@@ -238,12 +244,13 @@ class PyramidStudy(Study):
         """For the choices of a scene."""
         planner, imagining = self.planner("coverage", scene), self.imagining or self.classifier
         truth, classifiers = scene.task, (self.classifier, imagining, self.num_points)
-        return Chooser(planner, *classifiers, truth.scans, truth.pattern_pixels, self.key(scene.index, "scene"))
+        worth = truth.pixels if self.telling else None
+        return Chooser(planner, *classifiers, truth.scans, worth, self.key(scene.index, "scene"))
 
     def _run(self, chooser: Chooser, truth: Truth, visited: tuple[int, ...]) -> Record:
         log_p = [chooser.answer(visited[:count]).tolist() for count in range(1, len(visited) + 1)]
-        pixels = np.asarray(truth.pattern_pixels)[list(visited)].tolist()
-        return {"candidates": list(visited), "pattern_pixels": pixels, "log_p": log_p}
+        shown = self._shown(np.asarray(truth.pixels)[list(visited)])
+        return {"candidates": list(visited), **shown, "log_p": log_p}
 
     def _random_run(self, index: int, first: int, run: int) -> tuple[int, ...]:
         others = np.delete(np.arange(self.num_candidates), first)
@@ -254,13 +261,27 @@ class PyramidStudy(Study):
     def follow(
         self, scene: Scene, truth: Truth, method: str, methods: Sequence[str], episode: Iterator[Step]
     ) -> Record:
-        """Of a method of one's own: what the classifier says after each view, and how much of the pattern it shows."""
+        """Of a method of one's own: what the classifier says after each view, and how much of it tells the class."""
         log_p, pixels = [], []
         for view, *_ in episode:
             log_p.append(np.asarray(classify(self.classifier, view.cloud)).tolist())
             pose = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], view.pose)
-            pixels.append(int(scan_pattern(truth.pyramid, self.camera, pose)[0][0]))
-        return {"runs": [{"pattern_pixels": pixels, "log_p": log_p}], "diagnostics": []}
+            pixels.append(int(scan_telling(truth.thing, self.camera, pose)[0][0]))
+        return {"runs": [{**self._shown(pixels), "log_p": log_p}], "diagnostics": []}
+
+    def _shown(self, pixels: Any) -> Record:
+        """How many rays of each view hit what tells the class, where that is a part of the object."""
+        return {f"{self.telling}_pixels": np.asarray(pixels).tolist()} if self.telling else {}
+
+
+def seen_explained(telling: str) -> str:
+    """What having seen it means."""
+    return f"{telling.capitalize()} seen: one of the views shows at least {TELLING_PIXELS} pixels of it."
+
+
+@eqx.filter_jit
+def _noisy(scans: PointCloud, keys: Key[Array, " candidates"]) -> PointCloud:
+    return jax.vmap(SensorNoise())(scans, keys)
 
 
 def _nearest(poses: Pose, pose: Pose) -> int | None:
@@ -269,14 +290,3 @@ def _nearest(poses: Pose, pose: Pose) -> int | None:
     turned = np.linalg.norm(np.asarray(poses.forward) - np.asarray(pose.forward), axis=1)
     index = int(np.argmin(away))
     return index if away[index] + turned[index] < 1e-3 else None
-
-
-@eqx.filter_jit
-def _truth(poses: Pose, index: Int[Array, ""], split: Split, framing: Framing, camera: Camera) -> Truth:
-    pyramid = pyramid_scene(split, index, framing)
-    pixels, scans = scan_pattern(pyramid, camera, poses)
-    keys = jax.random.split(jax.random.fold_in(jax.random.key(3), index), len(pixels))
-    direction = poses.position / jnp.linalg.norm(poses.position, axis=-1, keepdims=True)
-    # The base looks along -z of the pyramid's own frame.
-    angles = jnp.degrees(jnp.arccos(jnp.clip(-direction @ pyramid.rotation[:, 2], -1.0, 1.0)))
-    return Truth(pyramid, jax.vmap(SensorNoise())(scans, keys), pixels, angles)

@@ -1,0 +1,28 @@
+"""The procedural scenes whose class is asked for, by name."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from jaxnbv.datasets.class_object import ClassObject
+from jaxnbv.datasets.household import HOUSEHOLD, household_scene
+from jaxnbv.datasets.patterns import PATTERNS
+from jaxnbv.datasets.pyramid import pyramid_scene
+from jaxnbv.datasets.truck import truck_scene
+
+
+class ClassSet(NamedTuple):
+    """Scenes of several classes.
+
+    - `classes`: their names.
+    - `scene`: of a split, an index and a framing.
+    """
+
+    classes: tuple[str, ...]
+    scene: Callable[..., ClassObject]
+
+
+CLASS_SETS = {
+    "pyramid": ClassSet(PATTERNS, pyramid_scene),
+    "truck": ClassSet(HOUSEHOLD, truck_scene),
+    "household": ClassSet(HOUSEHOLD, household_scene),
+}

@@ -1,0 +1,1 @@
+"""Which class is the object of? The paper's experiments on classification, one a module."""
