@@ -52,6 +52,7 @@ RECIPES = {
     "pyramid": Recipe(tuple(Framing), solid=True, scenes=12_000, imagined=100),
     "truck": Recipe(groups=(512, 128)),
     "household": Recipe(),
+    "fruit": Recipe(solid=True),
 }
 
 

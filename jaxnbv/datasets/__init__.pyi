@@ -3,6 +3,10 @@ from .class_sets import CLASS_SETS as CLASS_SETS
 from .class_sets import ClassSet as ClassSet
 from .demo import demo_object as demo_object
 from .framing import Framing as Framing
+from .fruit import FRUITS as FRUITS
+from .fruit import Fruit as Fruit
+from .fruit import fruit_scene as fruit_scene
+from .fruit import sample_fruit as sample_fruit
 from .heat_objects import HEAT_OBJECTS as HEAT_OBJECTS
 from .heat_objects import HeatScene as HeatScene
 from .heat_objects import heat_scene as heat_scene

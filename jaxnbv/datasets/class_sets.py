@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from jaxnbv.datasets.class_object import ClassObject
+from jaxnbv.datasets.fruit import FRUITS, fruit_scene
 from jaxnbv.datasets.household import HOUSEHOLD, household_scene
 from jaxnbv.datasets.patterns import PATTERNS
 from jaxnbv.datasets.pyramid import pyramid_scene
@@ -25,4 +26,5 @@ CLASS_SETS = {
     "pyramid": ClassSet(PATTERNS, pyramid_scene),
     "truck": ClassSet(HOUSEHOLD, truck_scene),
     "household": ClassSet(HOUSEHOLD, household_scene),
+    "fruit": ClassSet(FRUITS, fruit_scene),
 }

@@ -54,6 +54,15 @@ STUDIES = {
         views=5,
         pictures="jaxnbv.experiments.classification.pictures:write_pictures",
     ),
+    "omniobject3d": Entry(
+        "jaxnbv.experiments.classification.omniobject3d:OmniObject3DStudy",
+        "How soon are fruits told that differ in what is small? The paper's OmniObject3D, on procedural fruits.",
+        "48 candidates, 16 samples on a 64^3 grid, and 512 points for the classifier of imagined scans: fewer "
+        "candidates and a coarser grid than the paper's.",
+        scenes=100,
+        views=5,
+        pictures="jaxnbv.experiments.classification.pictures:write_pictures",
+    ),
     "parts": Entry(
         "jaxnbv.experiments.parts.study:PartStudy",
         "How many views until all parts of an object are found? The paper's Table 1, on procedural objects.",
