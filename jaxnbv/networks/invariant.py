@@ -20,19 +20,21 @@ class InvariantClassifier(eqx.Module):
 
     A pair of oriented points enters as (|d|^2, n_i . d, n_j . d, n_i . n_j) with d = (x_j - x_i) / radius: the
     point-pair features of Drost et al. (2010) without their square root and arc cosines, so that derivatives are
-    defined everywhere. Two levels of grouping, at the scale of an edge and at that of a pattern, and a maximum over all
-    groups; about 75,000 parameters.
+    defined everywhere. Two levels of grouping, at the scale of an edge and at that of a pattern, or a third for how
+    these lie to each other, and a maximum over all groups; about 75,000 parameters, 150,000 with the third level.
 
     - `num_classes`, and their names `classes`, where known.
-    - `radii`: of the two levels, in the units of the points.
+    - `radii`: of the levels, in the units of the points.
     - `groups`: how many each level has; more see more of what is small beside the rest.
     - `temperature`: divides the logits; above 1 it makes an over-confident network more careful (Guo et al. 2017).
 
-    **Raises:** `ValueError` if the names are not as many as the classes, or the second level has more groups.
+    **Raises:** `ValueError` if the names are not as many as the classes, or there are not two or three levels, each
+    with a radius and no more groups than the one before.
     """
 
     edge: "_Level"
     pattern: "_Level"
+    whole: "_Level | None"
     head: tuple[eqx.nn.Linear, ...]
     temperature: Float[Array, ""]
     classes: tuple[str, ...] | None = eqx.field(static=True)
@@ -41,16 +43,23 @@ class InvariantClassifier(eqx.Module):
         self,
         num_classes: int,
         key: PRNGKeyArray,
-        radii: tuple[float, float] = (0.25, 0.8),
+        radii: tuple[float, ...] = (0.25, 0.8),
         classes: tuple[str, ...] | None = None,
-        groups: tuple[int, int] = (256, 64),
+        groups: tuple[int, ...] = (256, 64),
     ):
         named = num_classes if classes is None else len(classes)
         require(named == num_classes, f"{classes} names {named} classes; the network has {num_classes}")
-        require(1 <= groups[1] <= groups[0], f"the levels have {groups} groups; give the second no more than the first")
+        proper = len(radii) == len(groups) in (2, 3) and groups[-1] >= 1 and sorted(groups, reverse=True) == [*groups]
+        require(
+            proper and min(radii) > 0,
+            f"the levels have radii {radii} and {groups} groups; give both for two levels or three, the radii positive "
+            "and no level more groups than the one before",
+        )
         edge_key, pattern_key, first_key, last_key = jax.random.split(key, 4)
         self.edge = _Level(0, 32, 64, radii[0], groups[0], 24, edge_key)
         self.pattern = _Level(64, 112, _POOLED, radii[1], groups[1], 48, pattern_key)
+        whole_key = jax.random.fold_in(key, 0)
+        self.whole = _Level(_POOLED, 160, _POOLED, radii[2], groups[2], 48, whole_key) if len(groups) == 3 else None
         self.head = (eqx.nn.Linear(_POOLED, _POOLED, key=first_key), eqx.nn.Linear(_POOLED, num_classes, key=last_key))
         self.temperature, self.classes = jnp.asarray(1.0), classes
 
@@ -62,12 +71,18 @@ class InvariantClassifier(eqx.Module):
         # In farthest point order the first rows are themselves farthest point samples of all.
         order = farthest_point_indices(points, mask, self.edge.groups)
         centers = points[order], normals[order]
-        edges = self.edge(centers, (points, normals, None), mask)
-        coarse = tuple(array[: self.pattern.groups] for array in centers)
-        patterns = self.pattern(coarse, (*centers, edges), jnp.ones(len(order), bool))
-        pooled = jnp.where(jnp.any(mask), jnp.max(patterns, axis=0), 0.0)
+        found = self.edge(centers, (points, normals, None), mask)
+        for level in self.levels[1:]:
+            finer, centers = centers, (centers[0][: level.groups], centers[1][: level.groups])
+            found = level(centers, (*finer, found), jnp.ones(len(found), bool))
+        pooled = jnp.where(jnp.any(mask), jnp.max(found, axis=0), 0.0)
         hidden, output = self.head
         return jax.nn.log_softmax(_affine(output, jax.nn.relu(_affine(hidden, pooled))) / self.temperature)
+
+    @property
+    def levels(self) -> tuple["_Level", ...]:
+        """From the finest on."""
+        return (self.edge, self.pattern) if self.whole is None else (self.edge, self.pattern, self.whole)
 
 
 class _Level(eqx.Module):

@@ -1,7 +1,8 @@
 """The arrays of our own networks by name, for safetensors files, and the networks that they make.
 
 Names are attribute paths such as `pattern.pair.weight`; widths are those of the class. Of a classifier the metadata
-hold the names of its classes, where it has some, and how many groups its levels have, separated by commas.
+hold the names of its classes, where it has some, and the radii and the numbers of groups of its levels, separated by
+commas.
 """
 
 from collections.abc import Mapping
@@ -12,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnbv.checks import require
+from jaxnbv.checks import InputError, require
 from jaxnbv.networks.compact_segmenter import CompactPartSegmenter
 from jaxnbv.networks.invariant import InvariantClassifier
 
@@ -25,7 +26,9 @@ def arrays_of(network: NativeNetwork) -> tuple[dict[str, np.ndarray], dict[str, 
     if not isinstance(network, InvariantClassifier):
         return arrays, {}
     classes = {} if network.classes is None else {"classes": ",".join(network.classes)}
-    return arrays, classes | {"groups": f"{network.edge.groups},{network.pattern.groups}"}
+    levels = network.levels
+    radii, groups = (",".join(str(getattr(level, name)) for level in levels) for name in ("radius", "groups"))
+    return arrays, classes | {"radii": radii, "groups": groups}
 
 
 def is_native(arrays: Mapping[str, np.ndarray]) -> bool:
@@ -45,16 +48,21 @@ def build_native(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) 
     said: dict[str, Any] = {}
     if "classes" in metadata:
         said["classes"] = tuple(metadata["classes"].split(","))
-    if "groups" in metadata:
-        said["groups"] = _groups(metadata["groups"])
+    said |= {name: _numbers(metadata, name, kind) for name, kind in _LEVELS.items() if name in metadata}
     return _filled(eqx.filter_eval_shape(InvariantClassifier, last.size, jax.random.key(0), **said), arrays)
 
 
-def _groups(text: str) -> tuple[int, int]:
-    numbers = text.split(",")
-    proper = len(numbers) == 2 and all(number.isdecimal() for number in numbers)
-    require(proper, f"its metadata say groups={text!r}; expected two numbers, such as 256,64")
-    return int(numbers[0]), int(numbers[1])
+# What the metadata say of levels.
+_LEVELS: dict[str, type[int] | type[float]] = {"radii": float, "groups": int}
+
+
+def _numbers(metadata: Mapping[str, str], name: str, kind: type[int] | type[float]) -> tuple[int | float, ...]:
+    try:
+        return tuple(map(kind, metadata[name].split(",")))
+    except ValueError as error:
+        raise InputError(
+            f"its metadata say {name}={metadata[name]!r}; expected numbers, separated by commas"
+        ) from error
 
 
 def _filled(blank: Any, arrays: Mapping[str, np.ndarray]) -> Any:

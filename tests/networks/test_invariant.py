@@ -5,18 +5,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import safetensors.numpy
 from scipy.spatial.transform import Rotation
 
 from jaxnbv.checks import InputError
 from jaxnbv.cloud import PointCloud, farthest_point_subsample
-from jaxnbv.networks import CloudClassifier, InvariantClassifier, pyramid_classifier
+from jaxnbv.networks import (
+    CloudClassifier,
+    InvariantClassifier,
+    load_checkpoint,
+    pretrained_classifier,
+    pyramid_classifier,
+    save_checkpoint,
+)
+from jaxnbv.networks.native import arrays_of
 
 RNG = np.random.default_rng(0)
 
 
-def network(classes=5, seed=0):
+TWO, THREE = {}, {"radii": (0.2, 0.6, 1.1), "groups": (200, 50, 12)}
+
+
+def network(classes=5, seed=0, **levels):
     """An untrained network whose answers differ from cloud to cloud by some tenths."""
-    net = InvariantClassifier(classes, jax.random.key(seed))
+    net = InvariantClassifier(classes, jax.random.key(seed), **levels)
     return eqx.tree_at(lambda n: n.temperature, net, net.temperature * 0.02)
 
 
@@ -44,10 +56,12 @@ def test_answers_are_log_probabilities_that_depend_on_the_cloud():
     assert np.abs(answers[1] - answers[2]).max() > 1e-3
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-9), (np.float32, 2e-2)])
-def test_rotations_and_translations_do_not_matter(x64, dtype, tolerance):
+@pytest.mark.parametrize(
+    ("levels", "dtype", "tolerance"), [(TWO, np.float64, 1e-9), (TWO, np.float32, 2e-2), (THREE, np.float64, 1e-9)]
+)
+def test_rotations_and_translations_do_not_matter(x64, levels, dtype, tolerance):
     """Nor to the choices of rows, which compare distances: random points have no ties that rounding could break."""
-    net = jax.tree.map(lambda leaf: leaf.astype(dtype), network())
+    net = jax.tree.map(lambda leaf: leaf.astype(dtype), network(**levels))
     points, normals = oriented(400)
     still = answer(net, points.astype(dtype), normals.astype(dtype))
     assert still.dtype == dtype
@@ -62,6 +76,53 @@ def test_rotations_and_translations_do_not_matter(x64, dtype, tolerance):
         answer(net, (points @ mirror).astype(dtype), (normals @ mirror).astype(dtype)), still, atol=tolerance
     )
     assert np.abs(answer(net, 0.8 * points.astype(dtype), normals.astype(dtype)) - still).max() > 5 * tolerance
+
+
+def test_a_third_level_sees_how_what_lies_apart_is_turned(x64):
+    """Two clusters that no ball of the second level joins: to two levels their places do not matter, to three they do.
+
+    Each cluster has more points than groups are asked for, and farthest point sampling starts in the first.
+    """
+    points, normals = (np.stack(arrays) for arrays in zip(*(oriented(100, 0.12) for _ in range(2)), strict=True))
+    levels = {"radii": (0.2, 0.6, 1.5), "groups": (200, 200, 200)}
+    two = network(radii=levels["radii"][:2], groups=levels["groups"][:2])
+    found = {}
+    for apart in (0.9, 1.2):
+        moved = np.concatenate([points[0], points[1] + [apart, 0.0, 0.0]])
+        for name, net in (("two", two), ("three", network(**levels))):
+            found[name, apart] = answer(net, moved, normals.reshape(-1, 3))
+    np.testing.assert_allclose(found["two", 0.9], found["two", 1.2], atol=1e-9)
+    assert np.abs(found["three", 0.9] - found["three", 1.2]).max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    "levels",
+    [{"groups": (64, 65)}, {"radii": (0.2,), "groups": (64,)}, {"radii": (0.2, 0.4, 0.8)}, {"radii": (0.2, 0.0)}],
+)
+def test_levels_that_do_not_fit_are_refused(levels):
+    with pytest.raises(InputError, match="two levels or three"):
+        InvariantClassifier(5, jax.random.key(0), **levels)
+
+
+@pytest.mark.parametrize("levels", [TWO, THREE])
+def test_a_file_tells_the_levels(levels, tmp_path):
+    net = network(classes=3, **levels)
+    save_checkpoint(net, tmp_path / "net.safetensors")
+    again = load_checkpoint(tmp_path / "net.safetensors")
+    assert [(level.radius, level.groups) for level in again.levels] == [
+        (level.radius, level.groups) for level in net.levels
+    ]
+    cloud = oriented(150)
+    np.testing.assert_allclose(answer(again, *cloud), answer(net, *cloud), atol=1e-6)
+
+
+def test_a_file_whose_levels_are_no_numbers_is_refused(tmp_path):
+    arrays, metadata = arrays_of(network())
+    for said in ("64,many", ""):
+        file = tmp_path / "net.safetensors"
+        safetensors.numpy.save_file(arrays, file, {**metadata, "groups": said})
+        with pytest.raises(InputError, match=f"groups='{said}'; expected numbers"):
+            load_checkpoint(file)
 
 
 def test_turning_normals_alone_matters(x64):
@@ -201,3 +262,8 @@ def test_a_cloud_classifier_without_points_or_scale_is_refused(arguments, messag
 def test_the_longest_side_of_the_shipped_classifiers_objects_must_be_positive():
     with pytest.raises(InputError, match=r"longest side is 0\.0"):
         pyramid_classifier(0.0)
+
+
+def test_a_network_that_was_not_trained_is_refused():
+    with pytest.raises(InputError, match=r"no trained classifier of 'teapot': choose from pyramid"):
+        pretrained_classifier("teapot")
