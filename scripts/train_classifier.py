@@ -1,8 +1,8 @@
 """Train, calibrate and test a classifier that ships with jaxnbv: `python scripts/train_classifier.py truck`.
 
-Two stages: clouds of true scans, then the same beside clouds whose last view is of a posterior sample, since those are
-what an acquisition feeds the network. Clouds and checkpoints stay in the output folder, so that a run that was
-interrupted continues. One to two hours on one CPU core.
+Stages: where little of a cloud tells the class, that part alone; clouds of true scans; the same beside clouds whose
+last view is of a posterior sample, since those are what an acquisition feeds the network. Clouds and checkpoints stay
+in the output folder, so that a run that was interrupted continues. One to two hours on one CPU core.
 """
 
 import argparse
@@ -36,15 +36,18 @@ class Recipe(NamedTuple):
     - `framings`: how large the objects stand.
     - `solid`: whether they are nowhere thin, see `imagination`.
     - `scenes`: of which there are true scans, in each framing; `imagined`: of which there are imagined ones, 16 each.
-    - `groups`: of the network.
-    - `steps`: of each stage.
+    - `radii`, `groups`: of the network.
+    - `alone`: steps on the points that tell the class alone.
+    - `steps`: on true scans, and on these beside imagined ones.
     """
 
     framings: tuple[Framing, ...] = (Framing.CLOSE_UP,)
     solid: bool = False
     scenes: int = 10_000
     imagined: int = 200
-    groups: tuple[int, int] = (256, 64)
+    radii: tuple[float, ...] = (0.25, 0.8)
+    groups: tuple[int, ...] = (256, 64)
+    alone: int = 0
     steps: tuple[int, int] = (8000, 4000)
 
 
@@ -111,6 +114,15 @@ def thinned(data: LabelledClouds) -> LabelledClouds:
     return eqx.tree_at(lambda d: d.clouds.mask, data, mask)
 
 
+def telling_alone(data: LabelledClouds, points: int = 320) -> LabelledClouds:
+    """The points that tell the class, of the clouds that have twenty of them or more."""
+    data = jax.tree.map(lambda leaf: leaf[data.tells.sum(axis=1) >= 20], data)
+    order = np.argsort(~data.tells, axis=1, kind="stable")[:, :points]
+    rows = np.arange(len(order))[:, None]
+    cloud = PointCloud(data.clouds.points[rows, order], data.clouds.normals[rows, order], data.tells[rows, order])
+    return eqx.tree_at(lambda d: (d.clouds, d.tells), data, (cloud, cloud.mask))
+
+
 def report(name: str, network: InvariantClassifier, data: LabelledClouds) -> None:
     """Accuracy and entropy by the telling pixels of the best view, on clouds of two or more views, and by the number of
     views; calibration."""
@@ -142,7 +154,14 @@ def main() -> None:
 
     scans = thinned(informative(clouds.joined(clouds.scanned, Split.TRAIN, recipe.scenes)))
     names = clouds.set.classes
-    network = InvariantClassifier(len(names), jax.random.key(0), classes=names, groups=recipe.groups)
+    network = InvariantClassifier(len(names), jax.random.key(0), recipe.radii, names, recipe.groups)
+    if recipe.alone:
+        alone = telling_alone(scans)
+        # Few points need few groups; the weights are the same.
+        few = tuple(3 * count // 8 for count in recipe.groups)
+        small = InvariantClassifier(len(names), jax.random.key(0), recipe.radii, names, few)
+        small = train(small, alone.clouds, alone.labels, jax.random.key(3), recipe.alone, folder=folder / "alone")
+        network = jax.tree.unflatten(jax.tree.structure(network), jax.tree.leaves(small))
     network = train(network, scans.clouds, scans.labels, jax.random.key(1), first, folder=folder / "scanned")
     both = concatenated(scans, informative(clouds.joined(clouds.imagined, Split.TRAIN, recipe.imagined)))
     network = train(network, both.clouds, both.labels, jax.random.key(2), second, folder=folder / "imagined")

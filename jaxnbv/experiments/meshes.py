@@ -1,5 +1,6 @@
 """A folder of meshes as the scenes of a study."""
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,6 +21,31 @@ def mesh_files(folder: str | Path) -> tuple[str, ...]:
     found = tuple(str(file) for file in sorted(folder.iterdir()) if file.suffix[1:].lower() in formats)
     require(len(found) > 0, f"the folder {folder} holds no mesh: its files must end in {', '.join(sorted(formats))}")
     return found
+
+
+def class_meshes(folder: str | Path, classes: Sequence[str]) -> tuple[tuple[int, str], ...]:
+    """The class and the file of each mesh in a folder `class/.../name` for some of the classes; these take turns.
+
+    Names of classes may be written with underscores. Where a class is split as ModelNet is, in `train` and `test`, the
+    meshes are those of `test`. Other folders are passed over.
+
+    **Raises:** `ValueError` if there is no such folder, none of a class, or one without a mesh.
+    """
+    folder = Path(folder)
+    require(folder.is_dir(), f"there is no folder {folder}: give one that holds a folder of meshes for each class")
+    found = {path.name.lower().replace("_", " "): path for path in sorted(folder.iterdir()) if path.is_dir()}
+    known = [(label, found[name]) for label, name in enumerate(classes) if name in found]
+    require(len(known) > 0, f"the folder {folder} has none of the folders {', '.join(classes)}: give one that has")
+    formats = {f".{name}" for name in trimesh.available_formats()}
+    meshes = []
+    for label, of_class in known:
+        split = of_class / "test"
+        inside = sorted((split if split.is_dir() else of_class).rglob("*"))
+        files = [str(file) for file in inside if file.suffix.lower() in formats and file.is_file()]
+        require(len(files) > 0, f"the folder {of_class} holds no mesh: unpack it again, or take it away")
+        meshes.append([(label, file) for file in files])
+    turns = itertools.chain.from_iterable(itertools.zip_longest(*meshes))
+    return tuple(mesh for mesh in turns if mesh is not None)
 
 
 def numbered_mesh(files: Sequence[str], index: int) -> TriangleMesh:

@@ -47,21 +47,25 @@ STUDIES = {
     ),
     "modelnet10": Entry(
         "jaxnbv.experiments.classification.modelnet10:ModelNet10Study",
-        "Do all methods tell classes alike that differ in global shape? The paper's ModelNet10, on procedural objects.",
+        "Do all methods tell classes alike that differ in global shape? The paper's ModelNet10, on procedural objects, "
+        "or on meshes in folders of the classes' names.",
         "48 candidates, 16 samples on a 64^3 grid, and 512 points for the classifier of imagined scans: fewer "
         "candidates and a coarser grid than the paper's.",
         scenes=100,
         views=5,
         pictures="jaxnbv.experiments.classification.pictures:write_pictures",
+        options=("meshes",),
     ),
     "omniobject3d": Entry(
         "jaxnbv.experiments.classification.omniobject3d:OmniObject3DStudy",
-        "How soon are fruits told that differ in what is small? The paper's OmniObject3D, on procedural fruits.",
+        "How soon are fruits told that differ in what is small? The paper's OmniObject3D, on procedural fruits, or on "
+        "meshes in folders of the classes' names.",
         "48 candidates, 16 samples on a 64^3 grid, and 512 points for the classifier of imagined scans: fewer "
         "candidates and a coarser grid than the paper's.",
         scenes=100,
         views=5,
         pictures="jaxnbv.experiments.classification.pictures:write_pictures",
+        options=("meshes",),
     ),
     "parts": Entry(
         "jaxnbv.experiments.parts.study:PartStudy",

@@ -1,5 +1,6 @@
 """TriangleMesh: real objects as they come, soups and open sheets included, met by rays through Embree on the host."""
 
+import io
 import struct
 import warnings
 from pathlib import Path
@@ -193,7 +194,7 @@ def load_mesh(path: str | Path, up: str = "y") -> TriangleMesh:
     path = Path(path)
     require(is_file(path), f"no mesh file at {shown(str(path))}: check the path")
     try:
-        parts = trimesh.load_scene(path, process=False).dump()
+        parts = trimesh.load_scene(_opened(path), path.suffix[1:].lower(), process=False).dump()
     except Exception as error:  # Each of trimesh's readers fails in its own way.
         problem = f"cannot read {path} as a mesh ({type(error).__name__}: {error})"
         raise InputError(f"{problem}: {_why_unread(path)}") from error
@@ -206,6 +207,16 @@ def load_mesh(path: str | Path, up: str = "y") -> TriangleMesh:
         return TriangleMesh.from_arrays(vertices, faces, up)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+
+
+def _opened(path: Path) -> Path | io.BytesIO:
+    """What trimesh is to read: many OFF files of ModelNet run their first two lines together."""
+    if path.suffix.lower() == ".off":
+        with path.open("rb") as file:
+            if file.read(3) == b"OFF" and file.read(1).isdigit():
+                file.seek(3)
+                return io.BytesIO(b"OFF\n" + file.read())
+    return path
 
 
 def _why_unread(path: Path) -> str:

@@ -19,6 +19,8 @@ from jaxnbv.sensors import SENSOR_RADIUS
 from jaxnbv.training.views import joined_views, only, state_after
 
 MAX_VIEWS = 5
+# Three standard deviations of the sensor's.
+_NOISE = 3 * SensorNoise().points
 
 
 class LabelledClouds(eqx.Module):
@@ -29,6 +31,7 @@ class LabelledClouds(eqx.Module):
     - `views`: how many true views the cloud is of.
     - `telling_pixels`: the most rays of one of these views that hit what tells the class.
     - `imagined`: whether a view of a posterior sample was added to them.
+    - `tells`: which points lie where the class is told, up to the sensor's noise.
     """
 
     clouds: PointCloud
@@ -36,6 +39,7 @@ class LabelledClouds(eqx.Module):
     views: Int[Array, "*batch"]
     telling_pixels: Int[Array, "*batch"]
     imagined: Bool[Array, "*batch"]
+    tells: Bool[Array, "*batch points"]
 
 
 def scanned_clouds(
@@ -70,7 +74,7 @@ def _scanned(objects: ClassObject, keys: Key[Array, " scenes"], num_points: int)
         thing, key = object_and_key
         views, _, count, pixels = _partial_views(thing, key, MAX_VIEWS)
         cloud = farthest_point_subsample(joined_views(views), num_points)
-        return LabelledClouds(cloud, thing.label, count, pixels, jnp.asarray(False))
+        return LabelledClouds(cloud, thing.label, count, pixels, jnp.asarray(False), _tells(thing, cloud))
 
     return jax.lax.map(cloud_of, (objects, keys))
 
@@ -92,8 +96,12 @@ def _imagined(
     keys = jax.random.split(pose_key, planner.num_samples)
     clouds = jax.lax.map(of_sample, (surfaces, keys))
     clouds = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), clouds)
-    total = planner.num_samples * num_poses
-    return LabelledClouds(clouds, *(jnp.full(total, value) for value in (thing.label, count, pixels, True)))
+    label, views, most, imagined = (jnp.full(len(clouds.mask), value) for value in (thing.label, count, pixels, True))
+    return LabelledClouds(clouds, label, views, most, imagined, _tells(thing, clouds))
+
+
+def _tells(thing: ClassObject, cloud: PointCloud) -> Bool[Array, "*batch points"]:
+    return thing.tells(cloud.points, _NOISE) & cloud.mask
 
 
 def _random_poses(key: PRNGKeyArray, count: int) -> Pose:

@@ -85,6 +85,19 @@ def test_a_cloud_whose_views_miss_the_pattern_has_no_point_in_it():
     assert min(shares[True]) > 0.02
 
 
+def test_points_that_tell_the_class_lie_on_what_tells_it(scanned):
+    """In a pyramid's own frame, up to three deviations of the noise: above the base and in the pattern."""
+    counted = np.asarray(scanned.tells).sum(axis=1)
+    assert not (np.asarray(scanned.tells) & ~np.asarray(scanned.clouds.mask)).any()
+    assert counted[np.asarray(scanned.telling_pixels) >= 500].min() > 10
+    for row in range(COUNT):
+        pyramid = pyramid_scene(Split.TRAIN, 5 + row)
+        tells = np.asarray(scanned.tells[row])
+        own = (np.asarray(scanned.clouds.points[row]) - pyramid.offset) @ pyramid.rotation / pyramid.scale
+        assert (own[tells, 2] * float(pyramid.scale) > 0.03 - 1e-4).all()
+        assert (own[tells, 2] < float(pyramid.depth) + 0.04).all()
+
+
 def test_clouds_can_be_made_again_in_other_portions(scanned):
     again = clouds_of(Split.TRAIN, Framing.CLOSE_UP, 5, COUNT, POINTS)
     assert_same(scanned, again)

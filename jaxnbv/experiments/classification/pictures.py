@@ -14,13 +14,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxnbv.camera import Camera
-from jaxnbv.datasets import ClassObject, Framing, Split
+from jaxnbv.datasets import ClassObject
 from jaxnbv.experiments.classification.hits import TELLING_PIXELS
 from jaxnbv.experiments.classification.study import ClassificationStudy
 from jaxnbv.experiments.measures import Record, methods_of
+from jaxnbv.experiments.study import Scene
 from jaxnbv.experiments.tiles import Tiles, first_scenes, frame, save_pictures
 from jaxnbv.pose import Pose
-from jaxnbv.scanning import SDFSurface, scan
+from jaxnbv.scanning import scan
 from jaxnbv.viz.style import GREY, LINE, NEW
 
 _SHOWN = ("cross-entropy", "farthest", "uncertainty")
@@ -53,10 +54,10 @@ def _picture(record: Record, study: ClassificationStudy, methods: Sequence[str],
     runs = [method["runs"][0] for method in held]
     views = len(runs[0]["log_p"])
     taken = [study.poses_of(method if "views" in method else method["runs"][0])[:views] for method in held]
-    thing = study.objects.scene(Split(record["split"]), record["scene"], Framing(record["framing"]))
+    scene = study.scene(record["scene"])
     # Four rays a pixel.
     camera = Camera(height=2 * pixels, width=2 * pixels)
-    images = [[_image(thing, camera, pose, bool(study.telling)) for pose in poses] for poses in taken]
+    images = [[_image(scene, camera, pose, bool(study.telling)) for pose in poses] for poses in taken]
 
     # Inches: all methods share the first view, so it stands once, at the middle of the rows.
     tile, gap, below, left, top, margin = 1.25, 0.1, 0.36, 0.12, 0.8, 0.1 + 0.08 * max(map(len, methods))
@@ -107,21 +108,19 @@ def _tile(
     )
 
 
-def _image(thing: ClassObject, camera: Camera, pose: Pose, tinted: bool) -> Float[np.ndarray, "h w 3"]:
-    """Lit from the sensor; four rays a pixel."""
-    hit, tells, facing = map(np.asarray, _render(thing, camera, jax.tree.map(jnp.asarray, pose)))
-    colours = np.where((tells & tinted)[:, None], _TINTED, _PLAIN) * (0.4 + 0.65 * facing)[:, None]
+def _image(scene: Scene, camera: Camera, pose: Pose, tinted: bool) -> Float[np.ndarray, "h w 3"]:
+    """Lit from the sensor; four rays a pixel. Tinted where it tells the class."""
+    seen = scan(scene.surface, camera, jax.tree.map(jnp.asarray, pose))
+    tells = np.asarray(_tells(scene.task.thing, seen.points)) if tinted else np.zeros(len(seen.mask), bool)
+    points, normals, hit = (np.asarray(array) for array in (seen.points, seen.normals, seen.mask))
+    rays = pose.position - points
+    facing = np.where(hit, np.sum(rays * normals, axis=-1) / np.linalg.norm(rays, axis=-1), 0.0)
+    colours = np.where(tells[:, None], _TINTED, _PLAIN) * (0.4 + 0.65 * facing)[:, None]
     image = np.where(hit[:, None], np.clip(colours, 0.0, 1.0), _BACKGROUND)
     side = math.isqrt(len(hit)) // 2
     return image.reshape(side, 2, side, 2, 3).mean(axis=(1, 3))
 
 
 @eqx.filter_jit
-def _render(
-    thing: ClassObject, camera: Camera, pose: Pose
-) -> tuple[Bool[Array, " rays"], Bool[Array, " rays"], Float[Array, " rays"]]:
-    """Which rays hit, which hit what tells the class, and the cosine between each ray and its normal."""
-    seen = scan(SDFSurface(thing), camera, pose)
-    rays = pose.position - seen.points
-    facing = jnp.sum(rays * seen.normals, axis=-1) / jnp.linalg.norm(rays, axis=-1)
-    return seen.mask, thing.tells(seen.points) & seen.mask, jnp.where(seen.mask, facing, 0.0)
+def _tells(thing: ClassObject, points: Float[Array, "rays 3"]) -> Bool[Array, " rays"]:
+    return thing.tells(points)

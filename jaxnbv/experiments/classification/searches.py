@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 import equinox as eqx
 import numpy as np
 
-from jaxnbv.datasets import Framing
 from jaxnbv.episode import Step
 from jaxnbv.experiments.classification.pyramid import PyramidStudy
 from jaxnbv.experiments.classification.study import ClassificationStudy, Truth, hits, seen_explained
@@ -123,12 +122,10 @@ class SearchStudy(_Searches, PyramidStudy):
     seed: ClassVar[int] = 10
 
     @classmethod
-    def configured(
-        cls, model: ModelName, views: int, quick: bool, framing: Framing | None = None, **options: Any
-    ) -> dict[str, Study]:
+    def configured(cls, model: ModelName, views: int, quick: bool, **options: Any) -> dict[str, Study]:
         """On pyramids of each framing, and on trucks, if none is given."""
-        pyramids = super().configured(model, views, quick, framing, **options)
-        if framing is not None:
+        pyramids = super().configured(model, views, quick, **options)
+        if "framing" in options:
             return pyramids
         (truck,) = TruckSearchStudy.configured(model, views, quick, **options).values()
         return pyramids | {"truck": truck}

@@ -1,6 +1,7 @@
 """What the studies of classification have in common: which methods' views tell the class, and how soon?"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
+from jaxnbv.checks import require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets import ClassObject, ClassSet, Framing, Split
 from jaxnbv.datasets.class_object import scan_telling
@@ -23,13 +25,14 @@ from jaxnbv.experiments.classification.hits import (
     stable_hit,
 )
 from jaxnbv.experiments.measures import Measure, Record
+from jaxnbv.experiments.meshes import class_meshes, numbered_mesh
 from jaxnbv.experiments.study import Chart, Panel, Scene, Study
 from jaxnbv.model_name import ModelName
 from jaxnbv.networks import pretrained_classifier
 from jaxnbv.planner import Planner
 from jaxnbv.pose import Pose
 from jaxnbv.presets import imagination
-from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
+from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, scan
 from jaxnbv.search import DiscreteSearch
 from jaxnbv.tasks import Coverage
 from jaxnbv.tasks.classification import Classifier
@@ -39,11 +42,13 @@ _CHOSEN = "view being chosen"
 
 
 class Truth(eqx.Module):
-    """What each candidate would truly show: scans with noise, and how many rays hit what tells the class."""
+    """The class, and what each candidate would truly show: scans with noise, and of procedural objects how many rays
+    hit what tells the class."""
 
-    thing: ClassObject
+    label: int
     scans: PointCloud
-    pixels: Int[Array, " candidates"]
+    thing: ClassObject | None
+    pixels: Int[Array, " candidates"] | None
 
 
 def _hit(time_of: Callable) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
@@ -125,6 +130,8 @@ class ClassificationStudy(Study):
     - `framing`: how large the object stands before the sensor.
     - `split`: which scenes; tune on those of the validation split.
     - `num_points`: D is thinned to so many, once a step, before imagined scans are added to it.
+    - `meshes`: classes and files in place of procedural objects, see `class_meshes`, where all of an object tells its
+      class.
 
     What it is:
 
@@ -155,14 +162,18 @@ class ClassificationStudy(Study):
     framing: Framing = eqx.field(static=True, default=Framing.CLOSE_UP)
     split: Split = eqx.field(static=True, default=Split.TEST)
     num_points: int = eqx.field(static=True, default=512)
+    meshes: tuple[tuple[int, str], ...] = eqx.field(static=True, default=())
+
+    def __check_init__(self):
+        require(not (self.telling and self.meshes), f"what tells the {self.telling} of a mesh is not known: give none")
 
     @classmethod
-    def configured(
-        cls, model: ModelName, views: int, quick: bool, framing: Framing | None = None, **options: Any
-    ) -> dict[str, Study]:
-        """One for each framing, if none is given."""
+    def configured(cls, model: ModelName, views: int, quick: bool, **options: Any) -> dict[str, Study]:
+        """One for each framing, if none is given; `meshes` is a folder, see `class_meshes`."""
+        if "meshes" in options:
+            options["meshes"] = class_meshes(options["meshes"], cls.objects.classes)
         studies: dict[str, Study] = {}
-        for one in cls.framings if framing is None else (framing,):
+        for one in (options["framing"],) if "framing" in options else cls.framings:
             classifier, imagining = (pretrained_classifier(cls.network, one.longest_side, fed) for fed in cls.fed)
             surfaces = imagination(model, one.longest_side, quick, solid=cls.solid)._asdict()
             settings = {"classifier": classifier, "imagining": imagining, "framing": one} | options
@@ -181,12 +192,25 @@ class ClassificationStudy(Study):
                 parts |= {f"first view {word} {cls.telling}": of} if of else {}
         return parts
 
+    @property
+    def num_scenes(self) -> int | None:
+        return len(self.meshes) or None
+
     def scene(self, index: int) -> Scene:
-        """An object; its task is the `Truth`."""
+        """An object; its task is the `Truth`.
+
+        **Raises:** `ValueError` if there is no mesh of this index, or it cannot be read.
+        """
+        poses = self.candidates.poses()
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(3), index), self.num_candidates)
+        if self.meshes:
+            mesh = numbered_mesh([file for _, file in self.meshes], index)
+            label, file = self.meshes[index]
+            truth = Truth(label, _noisy(scan(mesh, self.camera, poses), keys), None, None)
+            return Scene(index, f"{self.objects.classes[label]} {Path(file).stem}", mesh, truth)
         thing = self.objects.scene(self.split, index, self.framing)
-        pixels, scans = scan_telling(thing, self.camera, self.candidates.poses())
-        keys = jax.random.split(jax.random.fold_in(jax.random.key(3), index), len(pixels))
-        truth = Truth(thing, _noisy(scans, keys), pixels)
+        pixels, scans = scan_telling(thing, self.camera, poses)
+        truth = Truth(int(thing.label), _noisy(scans, keys), thing, pixels)
         return Scene(index, f"{self.network} {index}", SDFSurface(thing), truth)
 
     def truth(self, scene: Scene) -> Truth:
@@ -194,7 +218,7 @@ class ClassificationStudy(Study):
 
     def facts(self, scene: Scene, truth: Truth, first: int) -> Record:
         known = {"name": scene.name, "framing": self.framing.value, "split": self.split.value}
-        return known | {"label": int(truth.thing.label)} | self._shown(truth.pixels)
+        return known | {"label": truth.label} | self._shown(truth.pixels)
 
     @property
     def grid(self) -> Grid:
@@ -236,7 +260,7 @@ class ClassificationStudy(Study):
             for method, of in runs.items()
         }
         if "random" in found:
-            correct = chooser.true_answers(first).argmax(axis=1) == int(truth.thing.label)
+            correct = chooser.true_answers(first).argmax(axis=1) == truth.label
             found["random"]["hit"] = float(np.mean(np.delete(correct, first)))
         return found
 
@@ -249,8 +273,8 @@ class ClassificationStudy(Study):
 
     def _run(self, chooser: Chooser, truth: Truth, visited: tuple[int, ...]) -> Record:
         log_p = [chooser.answer(visited[:count]).tolist() for count in range(1, len(visited) + 1)]
-        shown = self._shown(np.asarray(truth.pixels)[list(visited)])
-        return {"candidates": list(visited), **shown, "log_p": log_p}
+        pixels = truth.pixels if truth.pixels is None else truth.pixels[np.array(visited)]
+        return {"candidates": list(visited), **self._shown(pixels), "log_p": log_p}
 
     def _random_run(self, index: int, first: int, run: int) -> tuple[int, ...]:
         others = np.delete(np.arange(self.num_candidates), first)
@@ -265,8 +289,9 @@ class ClassificationStudy(Study):
         log_p, pixels = [], []
         for view, *_ in episode:
             log_p.append(np.asarray(classify(self.classifier, view.cloud)).tolist())
-            pose = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], view.pose)
-            pixels.append(int(scan_telling(truth.thing, self.camera, pose)[0][0]))
+            if truth.thing is not None:
+                pose = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], view.pose)
+                pixels.append(int(scan_telling(truth.thing, self.camera, pose)[0][0]))
         return {"runs": [{**self._shown(pixels), "log_p": log_p}], "diagnostics": []}
 
     def _shown(self, pixels: Any) -> Record:
