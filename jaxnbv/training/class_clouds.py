@@ -96,8 +96,8 @@ def _imagined(
     keys = jax.random.split(pose_key, planner.num_samples)
     clouds = jax.lax.map(of_sample, (surfaces, keys))
     clouds = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), clouds)
-    label, views, most, imagined = (jnp.full(len(clouds.mask), value) for value in (thing.label, count, pixels, True))
-    return LabelledClouds(clouds, label, views, most, imagined, _tells(thing, clouds))
+    label, taken, most, imagined = (jnp.full(len(clouds.mask), value) for value in (thing.label, count, pixels, True))
+    return LabelledClouds(clouds, label, taken, most, imagined, _tells(thing, clouds))
 
 
 def _tells(thing: ClassObject, cloud: PointCloud) -> Bool[Array, "*batch points"]:

@@ -240,3 +240,15 @@ def test_common_models_load_and_scan(name):
     squared, _, _ = igl.point_mesh_squared_distance(points.astype(float), mesh.vertices, mesh.faces)
     assert np.sqrt(squared.max()) < 1e-5
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
+
+
+def test_an_off_file_whose_first_two_lines_run_together_is_read(tmp_path):
+    """As many of ModelNet are."""
+    text = trimesh.creation.box((1.0, 2.0, 4.0)).export(file_type="off")
+    assert text.startswith("OFF\n8 12 0")
+    for name, written in (("well", text), ("glued", "OFF" + text[4:])):
+        (tmp_path / f"{name}.off").write_text(written)
+    well, glued = (load_mesh(tmp_path / f"{name}.off") for name in ("well", "glued"))
+    np.testing.assert_array_equal(glued.vertices, well.vertices)
+    np.testing.assert_array_equal(glued.faces, well.faces)
+    np.testing.assert_allclose(np.ptp(glued.vertices, axis=0), [0.625, 1.25, 2.5], rtol=1e-6)

@@ -2,22 +2,26 @@
 
 import functools
 import json
+from pathlib import Path
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from jaxnbv.camera import Camera
-from jaxnbv.datasets import Split, truck_scene
+from jaxnbv.checks import InputError
+from jaxnbv.datasets import HOUSEHOLD, Split, truck_scene
 from jaxnbv.experiments.charts import write_charts
 from jaxnbv.experiments.classification.modelnet10 import ModelNet10Study
 from jaxnbv.experiments.classification.omniobject3d import OmniObject3DStudy
 from jaxnbv.experiments.classification.pictures import write_pictures
 from jaxnbv.experiments.classification.truck import TruckStudy
 from jaxnbv.experiments.measures import values
+from jaxnbv.experiments.meshes import class_meshes
 from jaxnbv.experiments.tables import summary, write_tables
 from jaxnbv.scanning import SDFSurface, scan
 from jaxnbv.search import FarthestView
@@ -106,6 +110,59 @@ def test_tables_charts_and_pictures(kind, tmp_path):
     (picture,) = write_pictures([record(kind)], small(kind), tmp_path, pixels=40)
     with Image.open(picture) as image:
         assert np.asarray(image.convert("L")).std() > 5
+
+
+def box_files(folder, *names):
+    for name in names:
+        file = folder / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        trimesh.creation.box((1.0, 0.5, 0.25)).export(file)
+
+
+def test_meshes_of_classes_take_turns_and_other_folders_are_passed_over(tmp_path):
+    """As ModelNet has them, in `test` and with underscores, and in any depth."""
+    box_files(
+        tmp_path, "bench/a.obj", "chair/b.obj", "chair/a.ply", "Night_Stand/train/a.off", "Night_Stand/test/c.off"
+    )
+    box_files(tmp_path, "chair/deep/er/c.stl")
+    (tmp_path / "chair" / "readme.txt").write_text("no mesh")
+    found = class_meshes(tmp_path, HOUSEHOLD)
+    assert [(HOUSEHOLD[label], Path(file).name) for label, file in found] == [
+        ("chair", "a.ply"),
+        ("night stand", "c.off"),
+        ("chair", "b.obj"),
+        ("chair", "c.stl"),
+    ]
+
+
+def test_folders_without_a_class_or_a_mesh_are_refused(tmp_path):
+    with pytest.raises(InputError, match="no folder"):
+        class_meshes(tmp_path / "none", HOUSEHOLD)
+    with pytest.raises(InputError, match="none of the folders bathtub, bed, chair"):
+        class_meshes(tmp_path, HOUSEHOLD)
+    (tmp_path / "sofa" / "test").mkdir(parents=True)
+    with pytest.raises(InputError, match="sofa holds no mesh"):
+        class_meshes(tmp_path, HOUSEHOLD)
+
+
+def test_meshes_in_place_of_procedural_objects(tmp_path):
+    box_files(tmp_path, "chair/a.off", "desk/b.obj")
+    study = small(ModelNet10Study, meshes=class_meshes(tmp_path, HOUSEHOLD))
+    assert study.num_scenes == 2
+    found = study.run_scene(1, ("farthest", "coverage"))
+    assert (found["label"], found["name"]) == (HOUSEHOLD.index("desk"), "desk b")
+    (run,) = found["methods"]["coverage"]["runs"]
+    assert len({*run["candidates"]}) == 3
+    seen = study.scene(1).task.scans[run["candidates"][0]].to_numpy()[0]
+    # A box of sides 2.5, 1.25 and 0.625; the noise is 0.01.
+    away = np.abs(np.abs(seen) - [1.25, 0.625, 0.3125]).min(axis=1)
+    assert away.max() < 0.06
+    (picture,) = write_pictures([found], study, tmp_path, pixels=40)
+    assert picture.exists()
+    with pytest.raises(InputError, match="no scene 2: the study has 2 meshes"):
+        study.run_scene(2)
+    with pytest.raises(InputError, match="what tells the cargo of a mesh is not known"):
+        small(TruckStudy, meshes=class_meshes(tmp_path, HOUSEHOLD))
 
 
 def test_a_method_of_ones_own_on_household_objects():
