@@ -1,11 +1,11 @@
 """The arrays of our own networks by name, for safetensors files, and the networks that they make.
 
 Names are attribute paths such as `pattern.pair.weight`; widths are those of the class. Of a classifier the metadata
-hold the names of its classes, where it has some, and the radii and the numbers of groups of its levels, separated by
-commas.
+hold the names of its classes, where it has some, the radii and the numbers of groups of its levels, and the points that
+a focused one is fed, separated by commas.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -13,27 +13,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnbv.checks import InputError, require
+from jaxnbv.checks import require
 from jaxnbv.networks.compact_segmenter import CompactPartSegmenter
+from jaxnbv.networks.focused import Focus, FocusedClassifier
 from jaxnbv.networks.invariant import InvariantClassifier
 
-NativeNetwork = InvariantClassifier | CompactPartSegmenter
+NativeNetwork = InvariantClassifier | FocusedClassifier | CompactPartSegmenter
 
 
 def arrays_of(network: NativeNetwork) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """The network's arrays by name, and the file's metadata."""
     arrays = {name: np.asarray(leaf) for name, leaf in _named(network)}
-    if not isinstance(network, InvariantClassifier):
-        return arrays, {}
-    classes = {} if network.classes is None else {"classes": ",".join(network.classes)}
-    levels = network.levels
-    radii, groups = (",".join(str(getattr(level, name)) for level in levels) for name in ("radius", "groups"))
-    return arrays, classes | {"radii": radii, "groups": groups}
+    said: dict[str, str] = {}
+    if isinstance(network, FocusedClassifier):
+        said, network = {"points": str(network.num_points)}, network.network
+    if isinstance(network, InvariantClassifier):
+        levels = network.edge, network.pattern
+        said |= {"radii": _listed(one.radius for one in levels), "groups": _listed(one.groups for one in levels)}
+        said |= {} if network.classes is None else {"classes": _listed(network.classes)}
+    return arrays, said
 
 
 def is_native(arrays: Mapping[str, np.ndarray]) -> bool:
     """Whether the names are those of one of our own networks."""
-    return any(name.startswith(("edge.", "fine.")) for name in arrays)
+    return any(name.startswith(("edge.", "fine.", "focus.")) for name in arrays)
 
 
 def build_native(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> NativeNetwork:
@@ -43,26 +46,37 @@ def build_native(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) 
     """
     if any(name.startswith("fine.") for name in arrays):
         return _filled(eqx.filter_eval_shape(CompactPartSegmenter, jax.random.key(0)), arrays)
-    last = arrays.get("head.1.bias", np.zeros(0))
-    require(last.ndim == 1 and last.size > 0, "the array head.1.bias, of one entry a class, is missing")
-    said: dict[str, Any] = {}
-    if "classes" in metadata:
-        said["classes"] = tuple(metadata["classes"].split(","))
-    said |= {name: _numbers(metadata, name, kind) for name, kind in _LEVELS.items() if name in metadata}
-    return _filled(eqx.filter_eval_shape(InvariantClassifier, last.size, jax.random.key(0), **said), arrays)
+    focused = any(name.startswith("focus.") for name in arrays)
+    last_name = f"{'network.' if focused else ''}head.1.bias"
+    last = arrays.get(last_name, np.zeros(0))
+    require(last.ndim == 1 and last.size > 0, f"the array {last_name}, of one entry a class, is missing")
+    said: dict[str, Any] = {"classes": tuple(metadata["classes"].split(","))} if "classes" in metadata else {}
+    said |= {name: _numbers(metadata, name, *kind) for name, kind in _LEVELS.items() if name in metadata}
+    points = _numbers(metadata, "points", int, 1) if "points" in metadata else ()
+
+    def blank():
+        network = InvariantClassifier(last.size, jax.random.key(0), **said)
+        return FocusedClassifier(Focus(jax.random.key(0)), network, *points) if focused else network
+
+    return _filled(eqx.filter_eval_shape(blank), arrays)
 
 
-# What the metadata say of levels.
-_LEVELS: dict[str, type[int] | type[float]] = {"radii": float, "groups": int}
+# What the metadata say of the two levels.
+_LEVELS = {"radii": (float, 2), "groups": (int, 2)}
 
 
-def _numbers(metadata: Mapping[str, str], name: str, kind: type[int] | type[float]) -> tuple[int | float, ...]:
+def _listed(values: Iterable[Any]) -> str:
+    return ",".join(map(str, values))
+
+
+def _numbers(metadata: Mapping[str, str], name: str, kind: Callable[[str], Any], count: int) -> tuple[Any, ...]:
+    words = metadata[name].split(",")
     try:
-        return tuple(map(kind, metadata[name].split(",")))
-    except ValueError as error:
-        raise InputError(
-            f"its metadata say {name}={metadata[name]!r}; expected numbers, separated by commas"
-        ) from error
+        numbers = tuple(map(kind, words))
+    except ValueError:
+        numbers = ()
+    require(len(numbers) == count, f"its metadata say {name}={metadata[name]!r}; expected numbers, {count} of them")
+    return numbers
 
 
 def _filled(blank: Any, arrays: Mapping[str, np.ndarray]) -> Any:
@@ -79,7 +93,7 @@ def _filled(blank: Any, arrays: Mapping[str, np.ndarray]) -> Any:
         with np.errstate(over="ignore"):
             leaves[name] = arrays[name].astype(jnp.result_type(float))
         require(bool(np.isfinite(leaves[name]).all()), f"the array {name} has entries that are not finite")
-    temperature = leaves.get("temperature")
+    temperature = leaves.get("temperature", leaves.get("network.temperature"))
     require(temperature is None or bool(temperature > 0), f"the temperature is {temperature}; it must be positive")
     return jax.tree.unflatten(jax.tree.structure(blank), [jnp.asarray(leaves[name]) for name in expected])
 
