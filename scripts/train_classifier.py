@@ -1,8 +1,8 @@
 """Train, calibrate and test a classifier that ships with jaxnbv: `python scripts/train_classifier.py truck`.
 
 Two stages: clouds of true scans, then the same beside clouds whose last view is of a posterior sample, since those are
-what an acquisition feeds the network; where little of a cloud tells the class, first which points do. Clouds and checkpoints stay
-in the output folder, so that a run that was interrupted continues. One to two hours on one CPU core.
+what an acquisition feeds the network; where little of a cloud tells the class, first which points do. Clouds and
+checkpoints stay in the output folder, so that a run that was interrupted continues. One to two hours on one CPU core.
 """
 
 import argparse
@@ -172,14 +172,11 @@ def main() -> None:
     scans = clouds.joined(clouds.scanned, Split.TRAIN, recipe.scenes)
     imagined = informative(clouds.joined(clouds.imagined, Split.TRAIN, recipe.imagined))
     if recipe.focus:
-        scans = thinned(scans)
         alone = telling_alone(scans)
         network = train(network, alone.clouds, alone.labels, jax.random.key(3), first, folder=folder / "alone")
-        both = informative(concatenated(scans, imagined))
-        data = both.clouds, both.tells
-        focus = fit(
-            Focus(jax.random.key(4)), focus_loss, data, jax.random.key(5), recipe.focus, folder=folder / "focus"
-        )
+        both = informative(concatenated(thinned(scans), imagined))
+        data, keys = (both.clouds, both.tells), jax.random.split(jax.random.key(4))
+        focus = fit(Focus(keys[0]), focus_loss, data, keys[1], recipe.focus, folder=folder / "focus")
         chosen = chosen_clouds(FocusedClassifier(focus, network), both.clouds)
         network = train(network, chosen, both.labels, jax.random.key(2), second, folder=folder / "imagined")
         network = FocusedClassifier(focus, network)
