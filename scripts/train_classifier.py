@@ -176,7 +176,8 @@ def main() -> None:
         network = train(network, alone.clouds, alone.labels, jax.random.key(3), first, folder=folder / "alone")
         both = informative(concatenated(thinned(scans), imagined))
         data, keys = (both.clouds, both.tells), jax.random.split(jax.random.key(4))
-        focus = fit(Focus(keys[0]), focus_loss, data, keys[1], recipe.focus, folder=folder / "focus")
+        # Every point is an example: few clouds make a batch.
+        focus = fit(Focus(keys[0]), focus_loss, data, keys[1], recipe.focus, 8, folder=folder / "focus")
         chosen = chosen_clouds(FocusedClassifier(focus, network), both.clouds)
         network = train(network, chosen, both.labels, jax.random.key(2), second, folder=folder / "imagined")
         network = FocusedClassifier(focus, network)

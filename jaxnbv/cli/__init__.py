@@ -1,5 +1,5 @@
-"""The command line: `jaxnbv demo`, `jaxnbv run MESH`, `jaxnbv study pyramid`, `jaxnbv session replay DIR`, `jaxnbv
-view RUN` and `jaxnbv convert`."""
+"""The command line: `jaxnbv demo`, `jaxnbv run MESH`, `jaxnbv study pyramid`, `jaxnbv report DIR`, `jaxnbv
+session replay DIR`, `jaxnbv view RUN` and `jaxnbv convert`."""
 
 import sys
 from typing import Annotated
@@ -9,7 +9,7 @@ import typer
 import jaxnbv
 from jaxnbv.cli.session import session
 from jaxnbv.cli.study import study
-from jaxnbv.cli.tools import convert, view
+from jaxnbv.cli.tools import convert, report, view
 from jaxnbv.cli.views import demo, run
 from jaxnbv.errors import InputError
 
@@ -51,6 +51,7 @@ app.command("demo")(demo)
 app.command("run")(run)
 app.command()(convert)
 app.command()(view)
+app.command()(report)
 app.add_typer(study, name="study")
 app.add_typer(session, name="session")
 

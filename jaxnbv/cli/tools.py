@@ -1,4 +1,4 @@
-"""`jaxnbv convert`: checkpoints. `jaxnbv view`: a run in the browser."""
+"""`jaxnbv convert`: checkpoints. `jaxnbv view`: a run in the browser. `jaxnbv report`: what studies have found."""
 
 from pathlib import Path
 from typing import Annotated
@@ -28,3 +28,16 @@ def view(
     Needs viser: `pip install "jaxnbv[view]"`. Surfaces are those of the usual model, given what was seen.
     """
     actions.view(folder, html, port)
+
+
+def report(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="A folder of studies, or one in which such folders lie.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="The page: .html, or .md with its images beside it.", show_default="DIR/report.html"),
+    ] = None,
+) -> None:
+    """Gather studies on one page: tables, figures, pictures, settings, versions and times. Nothing is run."""
+    actions.report(folder, out or folder / "report.html")

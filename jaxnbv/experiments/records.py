@@ -74,6 +74,14 @@ class RecordFolder(ResultFolder):
         failed.unlink(missing_ok=True)
 
 
+def read_records(folder: str | Path) -> list[Record]:
+    """The records that a folder holds, in order.
+
+    **Raises:** `ValueError` for a record that is damaged.
+    """
+    return [_read(file, int(file.stem.removeprefix("scene_"))) for file in sorted(Path(folder).glob("scene_*.json"))]
+
+
 def _checksum(index: int, record: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps([FORMAT, index, record], sort_keys=True).encode()).hexdigest()
 

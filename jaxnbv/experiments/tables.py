@@ -77,11 +77,11 @@ def _text(
             here = [row for row in results if (row["group"], row["quantity"]) == (group, measure.name)]
             if measure.listed and here:
                 unit = f" ({measure.unit})" if measure.unit else ""
-                sections.append(f"{title}{unit}, by {measure.by}\n{_grid(here, 'method', _result, measure)}")
+                sections.append(f"{title}{unit}, by {measure.by}\n{_grid(here, 'method', result_text, measure)}")
             here = [row for row in differences if (row["group"], row["quantity"]) == (group, measure.name)]
             if measure.listed and here:
                 compared = f"{title}: {study.reference} minus another method"
-                sections.append(f"{compared}\n{_grid(here, 'baseline', _difference, measure)}")
+                sections.append(f"{compared}\n{_grid(here, 'baseline', difference_text, measure)}")
     return "\n".join([*sections, *study.notes(records)])
 
 
@@ -92,7 +92,8 @@ def _grid(rows: Sequence[Row], key: str, write, measure: Measure) -> str:
     return text_grid(measure.by, names, [str(column) for column in columns], cells)
 
 
-def _result(row: Row, measure: Measure) -> str:
+def result_text(row: Row, measure: Measure) -> str:
+    """A mean over scenes with its error or interval; the best is marked, where one is better than another."""
     mark = _MARKS.get(row["rank"], "  ") if measure.better else ""
     if measure.percent and row["low"] is not None:
         mean, low, high = (100.0 * row[key] for key in ("mean", "low", "high"))
@@ -104,7 +105,8 @@ def _result(row: Row, measure: Measure) -> str:
     return f"{row['mean']:.{measure.digits}f}{error}{mark}"
 
 
-def _difference(row: Row, measure: Measure) -> str:
+def difference_text(row: Row, measure: Measure) -> str:
+    """A difference with its interval; marked where that excludes zero."""
     mean, low, high = ((100.0 if measure.percent else 1.0) * row[key] for key in ("mean", "low", "high"))
     form = "+.0f" if measure.percent else f"+.{measure.digits}f"
     return f"{mean:{form}} [{low:{form}}, {high:{form}}]{'*' if row['excludes_zero'] else ' '}"

@@ -15,6 +15,7 @@ from jaxnbv.cli.options import Device
 from jaxnbv.cli.registry import resolve
 from jaxnbv.experiments.charts import write_charts
 from jaxnbv.experiments.measures import Record
+from jaxnbv.experiments.page import write_page
 from jaxnbv.experiments.records import RecordFolder
 from jaxnbv.experiments.registry import Entry
 from jaxnbv.experiments.study import Factory, Study
@@ -78,6 +79,11 @@ def study(
             f"{len(failed)} of {asked} scenes failed, the first {where} ({error}): {folder} has scene_*.failed that "
             "tell how, and the same command tries them again"
         )
+
+
+def report(folder: Path, out: Path) -> None:
+    """Write the page of all studies in a folder."""
+    typer.echo(f"{write_page(folder, out)}")
 
 
 def _prepared(device: Device, run: Trial, index: int) -> Record:
