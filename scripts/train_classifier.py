@@ -65,7 +65,7 @@ class Clouds:
 
     def __init__(self, name: str, folder: Path):
         self.set, self.recipe, self.folder = CLASS_SETS[name], RECIPES[name], folder
-        self.points = TRAINED_POINTS[name]
+        self.points = TRAINED_POINTS.get(name, 1024)
 
     def scanned(self, split: Split, framing: Framing, count: int) -> LabelledClouds:
         """Clouds of true scans."""

@@ -58,6 +58,10 @@ OPTIONS = {
     "meshes": Annotated[
         Path | None, typer.Option(help="A folder of meshes to scan.", show_default="procedural objects")
     ],
+    "classifier": Annotated[
+        Path | None,
+        typer.Option(help="A network's checkpoint: .safetensors, .pth or .pt.", show_default="the one that ships"),
+    ],
     "framing": Annotated[
         Framing | None,
         typer.Option(

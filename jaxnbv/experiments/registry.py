@@ -33,7 +33,7 @@ STUDIES = {
         scenes=100,
         views=5,
         pictures="jaxnbv.experiments.classification.pictures:write_pictures",
-        options=("framing",),
+        options=("framing", "classifier"),
     ),
     "truck": Entry(
         "jaxnbv.experiments.classification.truck:TruckStudy",
@@ -44,6 +44,7 @@ STUDIES = {
         scenes=100,
         views=5,
         pictures="jaxnbv.experiments.classification.pictures:write_pictures",
+        options=("classifier",),
     ),
     "modelnet10": Entry(
         "jaxnbv.experiments.classification.modelnet10:ModelNet10Study",
@@ -54,7 +55,7 @@ STUDIES = {
         scenes=100,
         views=5,
         pictures="jaxnbv.experiments.classification.pictures:write_pictures",
-        options=("meshes",),
+        options=("meshes", "classifier"),
     ),
     "omniobject3d": Entry(
         "jaxnbv.experiments.classification.omniobject3d:OmniObject3DStudy",
@@ -65,7 +66,7 @@ STUDIES = {
         scenes=100,
         views=5,
         pictures="jaxnbv.experiments.classification.pictures:write_pictures",
-        options=("meshes",),
+        options=("meshes", "classifier"),
     ),
     "parts": Entry(
         "jaxnbv.experiments.parts.study:PartStudy",
@@ -106,6 +107,6 @@ STUDIES = {
         scenes=60,
         views=5,
         pictures="jaxnbv.experiments.classification.pictures:write_pictures",
-        options=("framing",),
+        options=("framing", "classifier"),
     ),
 }

@@ -12,7 +12,7 @@ from jaxnbv.networks.segmenter import CloudSegmenter
 # Longest side of the box of a training object, in scene units.
 TRAINED_SIDE = 2.5
 # Points of a cloud that each classifier was trained on.
-TRAINED_POINTS = {"pyramid": 1024, "truck": 2048, "household": 1024, "fruit": 1024}
+TRAINED_POINTS = {"pyramid": 1024, "truck": 2048}
 
 
 def pyramid_classifier(longest_side: float = TRAINED_SIDE, num_points: int = 1024) -> CloudClassifier:
@@ -37,7 +37,7 @@ def pretrained_classifier(
     **Raises:** `ValueError` for another name, or if `longest_side` or `num_points` is not positive.
     """
     known = ", ".join(TRAINED_POINTS)
-    require(name in TRAINED_POINTS, f"there is no trained classifier of {name!r}: choose from {known}")
+    require(name in TRAINED_POINTS, f"no classifier of {name!r} ships: give the file of one, or choose from {known}")
     network = _shipped(name)
     fed = TRAINED_POINTS[name] if num_points is None else num_points
     return CloudClassifier(network, fed, network_scale(network, longest_side))

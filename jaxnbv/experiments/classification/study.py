@@ -28,7 +28,7 @@ from jaxnbv.experiments.measures import Measure, Record
 from jaxnbv.experiments.meshes import class_meshes, numbered_mesh
 from jaxnbv.experiments.study import Chart, Panel, Scene, Study
 from jaxnbv.model_name import ModelName
-from jaxnbv.networks import pretrained_classifier
+from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale, pretrained_classifier
 from jaxnbv.planner import Planner
 from jaxnbv.pose import Pose
 from jaxnbv.presets import imagination
@@ -169,17 +169,37 @@ class ClassificationStudy(Study):
 
     @classmethod
     def configured(cls, model: ModelName, views: int, quick: bool, **options: Any) -> dict[str, Study]:
-        """One for each framing, if none is given; `meshes` is a folder, see `class_meshes`."""
+        """One for each framing, if none is given.
+
+        - `meshes`: a folder, see `class_meshes`; `classifier`: a file of `load_checkpoint`, in place of the shipped one.
+
+        **Raises:** `ValueError` as these do, or if the network does not tell as many classes.
+        """
         if "meshes" in options:
             options["meshes"] = class_meshes(options["meshes"], cls.objects.classes)
+        file = options.pop("classifier", None)
         studies: dict[str, Study] = {}
         for one in (options["framing"],) if "framing" in options else cls.framings:
-            classifier, imagining = (pretrained_classifier(cls.network, one.longest_side, fed) for fed in cls.fed)
+            classifier, imagining = (cls._classifier(file, one.longest_side, fed) for fed in cls.fed)
             surfaces = imagination(model, one.longest_side, quick, solid=cls.solid)._asdict()
             settings = {"classifier": classifier, "imagining": imagining, "framing": one} | options
             name = one.value if len(cls.framings) > 1 else ""
             studies[name] = cls(views=views, **surfaces | settings | (dict(cls.quick) if quick else {}))
         return studies
+
+    @classmethod
+    def _classifier(cls, file: str | Path | None, longest_side: float, fed: int) -> CloudClassifier:
+        if file is None:
+            return pretrained_classifier(cls.network, longest_side, fed)
+        network = load_checkpoint(file)
+        classifier = CloudClassifier(network, fed, network_scale(network, longest_side))
+        rows = jnp.zeros((fed, 3))
+        (told,) = jax.eval_shape(classifier, PointCloud(rows, rows, jnp.ones(fed, bool))).shape
+        wanted = len(cls.objects.classes)
+        require(
+            told == wanted, f"the network in {file} tells {told} classes apart; the study has {wanted}: {_named(cls)}"
+        )
+        return classifier
 
     @classmethod
     def groups(cls, records: Sequence[Record]) -> dict[str, list[Record]]:
@@ -297,6 +317,10 @@ class ClassificationStudy(Study):
     def _shown(self, pixels: Any) -> Record:
         """How many rays of each view hit what tells the class, where that is a part of the object."""
         return {f"{self.telling}_pixels": np.asarray(pixels).tolist()} if self.telling else {}
+
+
+def _named(study: type[ClassificationStudy]) -> str:
+    return ", ".join(study.objects.classes)
 
 
 def seen_explained(telling: str) -> str:

@@ -14,7 +14,7 @@ from PIL import Image
 
 from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
-from jaxnbv.datasets import HOUSEHOLD, Split, truck_scene
+from jaxnbv.datasets import FRUITS, HOUSEHOLD, Split, truck_scene
 from jaxnbv.experiments.charts import write_charts
 from jaxnbv.experiments.classification.modelnet10 import ModelNet10Study
 from jaxnbv.experiments.classification.omniobject3d import OmniObject3DStudy
@@ -23,6 +23,8 @@ from jaxnbv.experiments.classification.truck import TruckStudy
 from jaxnbv.experiments.measures import values
 from jaxnbv.experiments.meshes import class_meshes
 from jaxnbv.experiments.tables import summary, write_tables
+from jaxnbv.model_name import ModelName
+from jaxnbv.networks import InvariantClassifier, save_checkpoint
 from jaxnbv.scanning import SDFSurface, scan
 from jaxnbv.search import FarthestView
 from jaxnbv.search.candidates import sphere_candidates
@@ -163,6 +165,19 @@ def test_meshes_in_place_of_procedural_objects(tmp_path):
         study.run_scene(2)
     with pytest.raises(InputError, match="what tells the cargo of a mesh is not known"):
         small(TruckStudy, meshes=class_meshes(tmp_path, HOUSEHOLD))
+
+
+def test_a_network_of_ones_own_takes_the_place_of_the_shipped_one(tmp_path):
+    network = InvariantClassifier(len(FRUITS), jax.random.key(0), groups=(20, 8))
+    save_checkpoint(network, tmp_path / "mine.safetensors")
+    made = OmniObject3DStudy.configured(ModelName.SCREENED, 2, True, classifier=tmp_path / "mine.safetensors")
+    (study,) = made.values()
+    assert (study.classifier.num_points, study.imagining.num_points) == OmniObject3DStudy.fed
+    np.testing.assert_array_equal(study.classifier.network.head[1].bias, network.head[1].bias)
+    with pytest.raises(InputError, match=r"tells 5 classes apart; the study has 10: bathtub, bed"):
+        ModelNet10Study.configured(ModelName.SCREENED, 2, True, classifier=tmp_path / "mine.safetensors")
+    with pytest.raises(InputError, match="no classifier of 'fruit' ships: give the file of one"):
+        OmniObject3DStudy.configured(ModelName.SCREENED, 2, True)
 
 
 def test_a_method_of_ones_own_on_household_objects():
