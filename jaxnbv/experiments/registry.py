@@ -107,6 +107,6 @@ STUDIES = {
         scenes=60,
         views=5,
         pictures="jaxnbv.experiments.classification.pictures:write_pictures",
-        options=("framing", "classifier"),
+        options=("framing",),
     ),
 }

@@ -171,7 +171,8 @@ class ClassificationStudy(Study):
     def configured(cls, model: ModelName, views: int, quick: bool, **options: Any) -> dict[str, Study]:
         """One for each framing, if none is given.
 
-        - `meshes`: a folder, see `class_meshes`; `classifier`: a file of `load_checkpoint`, in place of the shipped one.
+        - `meshes`: a folder, see `class_meshes`.
+        - `classifier`: the file of a network, see `load_checkpoint`, in place of the one that ships.
 
         **Raises:** `ValueError` as these do, or if the network does not tell as many classes.
         """
@@ -195,9 +196,10 @@ class ClassificationStudy(Study):
         classifier = CloudClassifier(network, fed, network_scale(network, longest_side))
         rows = jnp.zeros((fed, 3))
         (told,) = jax.eval_shape(classifier, PointCloud(rows, rows, jnp.ones(fed, bool))).shape
-        wanted = len(cls.objects.classes)
+        names = cls.objects.classes
         require(
-            told == wanted, f"the network in {file} tells {told} classes apart; the study has {wanted}: {_named(cls)}"
+            told == len(names),
+            f"the network in {file} tells {told} classes apart; the study has {len(names)}: {', '.join(names)}",
         )
         return classifier
 
@@ -317,10 +319,6 @@ class ClassificationStudy(Study):
     def _shown(self, pixels: Any) -> Record:
         """How many rays of each view hit what tells the class, where that is a part of the object."""
         return {f"{self.telling}_pixels": np.asarray(pixels).tolist()} if self.telling else {}
-
-
-def _named(study: type[ClassificationStudy]) -> str:
-    return ", ".join(study.objects.classes)
 
 
 def seen_explained(telling: str) -> str:
