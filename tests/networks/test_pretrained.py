@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jaxnbv.cloud import PointCloud
-from jaxnbv.datasets import CLASS_SETS, PATTERNS, Framing, Split
-from jaxnbv.networks import pyramid_classifier
+from jaxnbv.datasets import CLASS_SETS, HOUSEHOLD, PATTERNS, Framing, Split
+from jaxnbv.networks import pretrained_classifier, pyramid_classifier
 from jaxnbv.tasks.classification import entropy
 from jaxnbv.training.class_clouds import LabelledClouds, scanned_clouds
 
@@ -46,3 +46,21 @@ def test_right_where_the_pattern_is_seen_and_undecided_where_it_is_not(framing):
     assert np.mean(right[:100]) >= 0.85
     assert len(undecided) >= 10
     assert np.mean(undecided) >= 1.5
+
+
+def test_the_class_of_a_cargo_by_what_is_seen_of_it():
+    """Of test trucks whose cargo a view shows well; where no point of it is seen the classifier is undecided."""
+    classifier = pretrained_classifier("truck")
+    assert classifier.classes == HOUSEHOLD
+    right, undecided, first = [], [], 0
+    while len(right) < 60:
+        found = scanned_clouds(CLASS_SETS["truck"], Split.TEST, Framing.CLOSE_UP, range(first, first + _CHUNK), 2048)
+        log_p = answers(classifier, found.clouds)
+        telling = np.asarray(found.tells).sum(axis=1)
+        right += (np.argmax(log_p, axis=1) == np.asarray(found.labels))[telling >= 150].tolist()
+        undecided += np.asarray(entropy(log_p))[telling == 0].tolist()
+        first += _CHUNK
+    # Guessing is right in a tenth. 541 such clouds are right in 83 %; 60 tell their share to 5 points.
+    assert np.mean(right[:60]) >= 0.65
+    assert len(undecided) >= 5
+    assert np.mean(undecided) >= 1.8
