@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from jaxnbv.checks import require
 from jaxnbv.farthest import farthest_point_indices
 from jaxnbv.networks.feature_propagation import interpolate
 from jaxnbv.networks.invariant import InvariantClassifier
@@ -48,11 +49,16 @@ class FocusedClassifier(eqx.Module):
     - `focus`: which these are; it is not sure of a point below even odds.
     - `network`: the classifier of these, or of no points at all where there are none.
     - `num_points`: how many it is fed, the first of them.
+
+    **Raises:** `ValueError` if `num_points` is not positive.
     """
 
     focus: Focus
     network: InvariantClassifier
     num_points: int = eqx.field(static=True, default=320)
+
+    def __check_init__(self):
+        require(self.num_points >= 1, f"num_points is {self.num_points}; the network needs at least one")
 
     @property
     def classes(self) -> tuple[str, ...] | None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxnbv.checks import InputError
 from jaxnbv.networks import Focus, FocusedClassifier, InvariantClassifier, load_checkpoint, save_checkpoint
 from jaxnbv.networks.pretrained import network_scale
 
@@ -79,3 +80,9 @@ def test_files_hold_both_networks(tmp_path):
     points, normals = (jnp.asarray(array, jnp.float32) for array in oriented(90))
     np.testing.assert_allclose(call(again, points, normals), call(net, points, normals), atol=1e-5)
     assert network_scale(again, 1.25) == 2.0
+
+
+def test_a_network_that_is_fed_nothing_is_refused():
+    net = network()
+    with pytest.raises(InputError, match="num_points is 0"):
+        FocusedClassifier(net.focus, net.network, 0)

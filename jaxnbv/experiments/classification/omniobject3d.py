@@ -4,7 +4,8 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from jaxnbv.datasets import CLASS_SETS, ClassSet
-from jaxnbv.experiments.classification.study import ROUGHNESS, ClassificationStudy, diagnostics_chart, hits
+from jaxnbv.experiments.classification.measures import HITS_EXPLAINED, ROUGHNESS, diagnostics_chart, hits
+from jaxnbv.experiments.classification.study import ClassificationStudy
 from jaxnbv.experiments.measures import Measure
 from jaxnbv.experiments.study import Chart, Panel
 
@@ -13,9 +14,7 @@ class OmniObject3DStudy(ClassificationStudy):
     """The class of a fruit, from a random first view. Settings as of `ClassificationStudy`."""
 
     title: ClassVar[str] = "The class of a fruit"
-    explanation: ClassVar[str] = (
-        f"{ClassificationStudy.hits_explained}Roughness is by the view being chosen, in ( ) its scenes."
-    )
+    explanation: ClassVar[str] = f"{HITS_EXPLAINED}Roughness is by the view being chosen, in ( ) its scenes."
     objects: ClassVar[ClassSet] = CLASS_SETS["fruit"]
     telling: ClassVar[str] = ""
     network: ClassVar[str] = "fruit"

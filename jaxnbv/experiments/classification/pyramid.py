@@ -7,15 +7,15 @@ import numpy as np
 
 from jaxnbv.datasets import CLASS_SETS, ClassSet, Framing, Pyramid
 from jaxnbv.datasets.pyramid import choose_hidden
-from jaxnbv.experiments.classification.study import (
+from jaxnbv.experiments.classification.measures import (
+    HITS_EXPLAINED,
     ROUGHNESS,
-    ClassificationStudy,
-    Truth,
     diagnostic,
     diagnostics_chart,
     hits,
     seen_explained,
 )
+from jaxnbv.experiments.classification.study import ClassificationStudy, Truth
 from jaxnbv.experiments.measures import Measure, Record
 from jaxnbv.experiments.study import Chart, Panel, Scene
 
@@ -28,7 +28,7 @@ class PyramidStudy(ClassificationStudy):
 
     title: ClassVar[str] = "The class of a pyramid"
     explanation: ClassVar[str] = (
-        f"{ClassificationStudy.hits_explained}{seen_explained('pattern')}\n"
+        f"{HITS_EXPLAINED}{seen_explained('pattern')}\n"
         "Diagnostics are by the view being chosen, in ( ) their scenes. Angles are of the first view from the base's "
         "normal."
     )

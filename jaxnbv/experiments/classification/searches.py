@@ -11,8 +11,9 @@ import equinox as eqx
 import numpy as np
 
 from jaxnbv.episode import Step
+from jaxnbv.experiments.classification.measures import hits, seen_explained
 from jaxnbv.experiments.classification.pyramid import PyramidStudy
-from jaxnbv.experiments.classification.study import ClassificationStudy, Truth, hits, seen_explained
+from jaxnbv.experiments.classification.study import ClassificationStudy, Truth
 from jaxnbv.experiments.classification.truck import TruckStudy
 from jaxnbv.experiments.measures import Measure, Record
 from jaxnbv.experiments.study import Chart, Panel, Scene, Study

@@ -1,6 +1,6 @@
 """What the studies of classification have in common: which methods' views tell the class, and how soon?"""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Int, Key
 
 from jaxnbv.checks import require
 from jaxnbv.cloud import PointCloud
@@ -16,17 +16,9 @@ from jaxnbv.datasets import ClassObject, ClassSet, Framing, Split
 from jaxnbv.datasets.class_object import scan_telling
 from jaxnbv.episode import Sensor, Step
 from jaxnbv.experiments.classification.choices import CLASSIFYING, Chooser, classify
-from jaxnbv.experiments.classification.hits import (
-    TELLING_PIXELS,
-    cumulative_share,
-    first_hit,
-    random_seen_share,
-    seen_view,
-    stable_hit,
-)
-from jaxnbv.experiments.measures import Measure, Record
+from jaxnbv.experiments.measures import Record
 from jaxnbv.experiments.meshes import class_meshes, numbered_mesh
-from jaxnbv.experiments.study import Chart, Panel, Scene, Study
+from jaxnbv.experiments.study import Scene, Study
 from jaxnbv.model_name import ModelName
 from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale, pretrained_classifier
 from jaxnbv.planner import Planner
@@ -38,7 +30,6 @@ from jaxnbv.tasks import Coverage
 from jaxnbv.tasks.classification import Classifier
 
 _RANDOM_RUNS = 8
-_CHOSEN = "view being chosen"
 
 
 class Truth(eqx.Module):
@@ -49,76 +40,6 @@ class Truth(eqx.Module):
     scans: PointCloud
     thing: ClassObject | None
     pixels: Int[Array, " candidates"] | None
-
-
-def _hit(time_of: Callable) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
-    """The share of a method's runs that have hit, by view: for all but random search that of one run, 0 or 1."""
-
-    def of(record: Record, method: str) -> Float[np.ndarray, " views"]:
-        held = record["methods"][method]
-        correct = [np.argmax(run["log_p"], axis=1) == record["label"] for run in held["runs"]]
-        share = cumulative_share([time_of(run) for run in correct], len(correct[0]))
-        if method == "random" and time_of is first_hit and len(share) >= 2:
-            # Exact by view 2; all runs have the first view in common.
-            share[1] = 1.0 if correct[0][0] else held.get("hit", record.get("random_hit"))
-        return share
-
-    return of
-
-
-def _seen(telling: str) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
-    """Whether a view has shown what tells the class, by view; of random search the exact share over all orders."""
-
-    def of(record: Record, method: str) -> Float[np.ndarray, " views"]:
-        runs, pixels = record["methods"][method]["runs"], f"{telling}_pixels"
-        views = len(runs[0]["log_p"])
-        if method == "random":
-            return random_seen_share(np.array(record[pixels]), record["first"], views)
-        return cumulative_share([seen_view(np.array(run[pixels])) for run in runs], views)
-
-    return of
-
-
-def _diagnostic(quantity: str) -> Callable[[Record, str], list[float | None]]:
-    """By the view being chosen; of the posterior that the method's own views made."""
-
-    def of(record: Record, method: str) -> list[float | None]:
-        views = len(record["methods"][method]["runs"][0]["log_p"])
-        return [_of_view(record, method, quantity, view) for view in range(2, views + 1)]
-
-    return of
-
-
-def _of_view(record: Record, method: str, quantity: str, view: int) -> float | None:
-    # Older records hold them beside the methods.
-    entries = record["methods"][method].get("diagnostics") or [
-        entry | {"rank_correlation": entry["rank_correlation"].get(method)}
-        for entry in record.get("diagnostics", ())
-        if method in entry["methods"]
-    ]
-    found = [entry.get(quantity) for entry in entries if entry["view"] == view]
-    return found[0] if found and found[0] is not None and np.isfinite(found[0]) else None
-
-
-def diagnostic(name: str, title: str) -> Measure:
-    """A measure of the samples among which a view is chosen."""
-    return Measure(name, title, _diagnostic(name), first=2, digits=2, paired=False)
-
-
-def hits(telling: str = "") -> tuple[Measure, ...]:
-    """First and stable hit; and whether a view has shown what tells the class, where that is a part of the object."""
-    seen = Measure(telling, f"{telling.capitalize()} seen", _seen(telling), percent=True)
-    both = [Measure(f.__name__.partition("_")[0], _HIT_TITLES[f], _hit(f), percent=True) for f in _HIT_TITLES]
-    return (*both, seen) if telling else tuple(both)
-
-
-_HIT_TITLES = {first_hit: "First hit", stable_hit: "Stable hit"}
-ROUGHNESS = diagnostic("roughness", "Roughness")
-
-
-def diagnostics_chart(*measures: str) -> Chart:
-    """Measures by the view being chosen, beside each other."""
-    return Chart((tuple(Panel(measure, axis=_CHOSEN) for measure in measures),))
 
 
 class ClassificationStudy(Study):
@@ -141,10 +62,6 @@ class ClassificationStudy(Study):
     - `framings`: each a study of its own; `solid`: whether the objects are nowhere thin, see `imagination`.
     """
 
-    hits_explained: ClassVar[str] = (
-        "First hit: a right prediction so far. Stable hit: right from then to the end. Random search: exact\n"
-        "expectation of first hit by view 2, and of what a view shows; else a mean over runs.\n"
-    )
     methods: ClassVar[tuple[str, ...]] = (*CLASSIFYING, "coverage", "farthest", "uncertainty", "random", "oracle")
     reference: ClassVar[str] = "cross-entropy"
     quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 40}
@@ -319,11 +236,6 @@ class ClassificationStudy(Study):
     def _shown(self, pixels: Any) -> Record:
         """How many rays of each view hit what tells the class, where that is a part of the object."""
         return {f"{self.telling}_pixels": np.asarray(pixels).tolist()} if self.telling else {}
-
-
-def seen_explained(telling: str) -> str:
-    """What having seen it means."""
-    return f"{telling.capitalize()} seen: one of the views shows at least {TELLING_PIXELS} pixels of it."
 
 
 @eqx.filter_jit

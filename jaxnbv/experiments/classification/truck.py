@@ -6,14 +6,15 @@ from typing import ClassVar
 import equinox as eqx
 
 from jaxnbv.datasets import CLASS_SETS, ClassSet
-from jaxnbv.experiments.classification.study import (
+from jaxnbv.experiments.classification.measures import (
+    HITS_EXPLAINED,
     ROUGHNESS,
-    ClassificationStudy,
     diagnostic,
     diagnostics_chart,
     hits,
     seen_explained,
 )
+from jaxnbv.experiments.classification.study import ClassificationStudy
 from jaxnbv.experiments.measures import Measure
 from jaxnbv.experiments.study import Chart, Panel
 
@@ -23,8 +24,7 @@ class TruckStudy(ClassificationStudy):
 
     title: ClassVar[str] = "The class of a truck's cargo"
     explanation: ClassVar[str] = (
-        f"{ClassificationStudy.hits_explained}{seen_explained('cargo')}\n"
-        "Diagnostics are by the view being chosen, in ( ) their scenes."
+        f"{HITS_EXPLAINED}{seen_explained('cargo')}\nDiagnostics are by the view being chosen, in ( ) their scenes."
     )
     objects: ClassVar[ClassSet] = CLASS_SETS["truck"]
     telling: ClassVar[str] = "cargo"
