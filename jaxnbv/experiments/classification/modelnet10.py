@@ -1,27 +1,15 @@
 """The paper's sanity check: ten classes that are told by their global shape, for which any views will do."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 from jaxnbv.datasets import CLASS_SETS, ClassSet
-from jaxnbv.experiments.classification.measures import HITS_EXPLAINED, ROUGHNESS, diagnostics_chart, hits
 from jaxnbv.experiments.classification.study import ClassificationStudy
-from jaxnbv.experiments.measures import Measure
-from jaxnbv.experiments.study import Chart, Panel
 
 
 class ModelNet10Study(ClassificationStudy):
     """The class of a household object, from a random first view. Settings as of `ClassificationStudy`."""
 
     title: ClassVar[str] = "The class of a household object"
-    explanation: ClassVar[str] = f"{HITS_EXPLAINED}Roughness is by the view being chosen, in ( ) its scenes."
     objects: ClassVar[ClassSet] = CLASS_SETS["household"]
-    telling: ClassVar[str] = ""
     network: ClassVar[str] = "household"
-    fed: ClassVar[tuple[int, int]] = (1024, 512)
-    measures: ClassVar[tuple[Measure, ...]] = (*hits(), ROUGHNESS)
-    charts: ClassVar[Mapping[str, Chart]] = {
-        "hits": Chart((tuple(map(Panel, ("first", "stable"))),)),
-        "diagnostics": diagnostics_chart("roughness"),
-    }
     seed: ClassVar[int] = 12

@@ -35,7 +35,6 @@ class PyramidStudy(ClassificationStudy):
     objects: ClassVar[ClassSet] = CLASS_SETS["pyramid"]
     telling: ClassVar[str] = "pattern"
     network: ClassVar[str] = "pyramid"
-    fed: ClassVar[tuple[int, int]] = (1024, 512)
     framings: ClassVar[tuple[Framing, ...]] = tuple(Framing)
     solid: ClassVar[bool] = True
     # The last is held by older records alone: carved samples have nothing before the object.

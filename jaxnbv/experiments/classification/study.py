@@ -16,9 +16,10 @@ from jaxnbv.datasets import ClassObject, ClassSet, Framing, Split
 from jaxnbv.datasets.class_object import scan_telling
 from jaxnbv.episode import Sensor, Step
 from jaxnbv.experiments.classification.choices import CLASSIFYING, Chooser, classify
-from jaxnbv.experiments.measures import Record
+from jaxnbv.experiments.classification.measures import HITS_EXPLAINED, ROUGHNESS, diagnostics_chart, hits
+from jaxnbv.experiments.measures import Measure, Record
 from jaxnbv.experiments.meshes import class_meshes, numbered_mesh
-from jaxnbv.experiments.study import Scene, Study
+from jaxnbv.experiments.study import Chart, Panel, Scene, Study
 from jaxnbv.model_name import ModelName
 from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale, pretrained_classifier
 from jaxnbv.planner import Planner
@@ -64,13 +65,19 @@ class ClassificationStudy(Study):
 
     methods: ClassVar[tuple[str, ...]] = (*CLASSIFYING, "coverage", "farthest", "uncertainty", "random", "oracle")
     reference: ClassVar[str] = "cross-entropy"
+    explanation: ClassVar[str] = f"{HITS_EXPLAINED}Roughness is by the view being chosen, in ( ) its scenes."
+    measures: ClassVar[tuple[Measure, ...]] = (*hits(), ROUGHNESS)
+    charts: ClassVar[Mapping[str, Chart]] = {
+        "hits": Chart((tuple(map(Panel, ("first", "stable"))),)),
+        "diagnostics": diagnostics_chart("roughness"),
+    }
     quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 40}
     quick_scenes: ClassVar[int] = 6
 
     objects: eqx.AbstractClassVar[ClassSet]
-    telling: eqx.AbstractClassVar[str]
+    telling: ClassVar[str] = ""
     network: eqx.AbstractClassVar[str]
-    fed: eqx.AbstractClassVar[tuple[int, int]]
+    fed: ClassVar[tuple[int, int]] = (1024, 512)
     framings: ClassVar[tuple[Framing, ...]] = (Framing.CLOSE_UP,)
     solid: ClassVar[bool] = False
 
