@@ -55,8 +55,8 @@ class Recipe(NamedTuple):
 RECIPES = {
     "pyramid": Recipe(tuple(Framing), solid=True, scenes=12_000, imagined=100),
     "truck": Recipe(scenes=8000, imagined=100, groups=(192, 48), focus=1200, steps=(2500, 2500)),
-    "household": Recipe(),
-    "fruit": Recipe(solid=True),
+    "household": Recipe(scenes=8000, imagined=100, groups=(192, 48), steps=(4000, 2000)),
+    "fruit": Recipe(solid=True, scenes=5000, imagined=80, groups=(192, 48), steps=(3000, 1500)),
 }
 
 

@@ -1,13 +1,16 @@
 """A folder of meshes as the scenes of a study."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import trimesh
 
 from jaxnbv.checks import require
 from jaxnbv.scanning import TriangleMesh, load_mesh
+
+_T = TypeVar("_T")
 
 
 def mesh_files(folder: str | Path) -> tuple[str, ...]:
@@ -17,10 +20,21 @@ def mesh_files(folder: str | Path) -> tuple[str, ...]:
     """
     folder = Path(folder)
     require(folder.is_dir(), f"there is no folder {folder}: give one that holds mesh files")
-    formats = trimesh.available_formats()
-    found = tuple(str(file) for file in sorted(folder.iterdir()) if file.suffix[1:].lower() in formats)
-    require(len(found) > 0, f"the folder {folder} holds no mesh: its files must end in {', '.join(sorted(formats))}")
+    found = tuple(str(file) for file in sorted(folder.iterdir()) if is_mesh_file(file))
+    formats = ", ".join(sorted(trimesh.available_formats()))
+    require(len(found) > 0, f"the folder {folder} holds no mesh: its files must end in {formats}")
     return found
+
+
+def is_mesh_file(path: Path) -> bool:
+    """Whether a file's name ends as a format that trimesh reads."""
+    return path.suffix[1:].lower() in trimesh.available_formats() and path.is_file()
+
+
+def taking_turns(groups: Iterable[Sequence[_T]]) -> list[_T]:
+    """The first of each group, then the second of each that has one, and so on."""
+    turns = itertools.chain.from_iterable(itertools.zip_longest(*groups))
+    return [one for one in turns if one is not None]
 
 
 def class_meshes(folder: str | Path, classes: Sequence[str]) -> tuple[tuple[int, str], ...]:
@@ -36,16 +50,14 @@ def class_meshes(folder: str | Path, classes: Sequence[str]) -> tuple[tuple[int,
     found = {path.name.lower().replace("_", " "): path for path in sorted(folder.iterdir()) if path.is_dir()}
     known = [(label, found[name]) for label, name in enumerate(classes) if name in found]
     require(len(known) > 0, f"the folder {folder} has none of the folders {', '.join(classes)}: give one that has")
-    formats = {f".{name}" for name in trimesh.available_formats()}
     meshes = []
     for label, of_class in known:
         split = of_class / "test"
         inside = sorted((split if split.is_dir() else of_class).rglob("*"))
-        files = [str(file) for file in inside if file.suffix.lower() in formats and file.is_file()]
+        files = [str(file) for file in inside if is_mesh_file(file)]
         require(len(files) > 0, f"the folder {of_class} holds no mesh: unpack it again, or take it away")
         meshes.append([(label, file) for file in files])
-    turns = itertools.chain.from_iterable(itertools.zip_longest(*meshes))
-    return tuple(mesh for mesh in turns if mesh is not None)
+    return tuple(taking_turns(meshes))
 
 
 def numbered_mesh(files: Sequence[str], index: int) -> TriangleMesh:

@@ -70,13 +70,15 @@ STUDIES = {
     ),
     "parts": Entry(
         "jaxnbv.experiments.parts.study:PartStudy",
-        "How many views until all parts of an object are found? The paper's Table 1, on procedural objects.",
+        "How many views until all parts of an object are found? The paper's Table 1, on procedural objects, or on "
+        "meshes whose nodes are their parts, in folders of the classes' names.",
         "48 candidates at radius 2, 64 x 64 rays. Views are imagined with 32 x 32 rays, 8 samples on a 64^3 grid, and "
         "1,024 points for the segmenter, 2,048 for what it says of the cloud; gradient search climbs from the best 4 "
         "of 24 views, 8 steps of 0.03: less of everything than the paper.",
         scenes=80,
         views=6,
         pictures="jaxnbv.experiments.parts.pictures:write_pictures",
+        options=("meshes",),
     ),
     "heat": Entry(
         "jaxnbv.experiments.heat.study:HeatStudy",

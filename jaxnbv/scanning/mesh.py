@@ -191,6 +191,21 @@ def load_mesh(path: str | Path, up: str = "y") -> TriangleMesh:
 
     **Raises:** `ValueError` if the file is missing or cannot be read, and as `TriangleMesh.from_arrays` does.
     """
+    meshes = [mesh for _, mesh in read_nodes(path)]
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    vertices = np.concatenate([mesh.vertices for mesh in meshes])
+    faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)])
+    try:
+        return TriangleMesh.from_arrays(vertices, faces, up)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def read_nodes(path: str | Path) -> list[tuple[str, trimesh.Trimesh]]:
+    """The nodes of a file that have faces, by name, where its scene places them, in the file's coordinates.
+
+    **Raises:** `ValueError` if the file is missing, cannot be read, or has no faces.
+    """
     path = Path(path)
     require(is_file(path), f"no mesh file at {shown(str(path))}: check the path")
     try:
@@ -200,13 +215,7 @@ def load_mesh(path: str | Path, up: str = "y") -> TriangleMesh:
         raise InputError(f"{problem}: {_why_unread(path)}") from error
     meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     require(len(meshes) > 0, f"{path} has no faces: {_why_empty(path)}")
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    vertices = np.concatenate([mesh.vertices for mesh in meshes])
-    faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)])
-    try:
-        return TriangleMesh.from_arrays(vertices, faces, up)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+    return [(str(mesh.metadata.get("node", index)), mesh) for index, mesh in enumerate(meshes)]
 
 
 def _opened(path: Path) -> Path | io.BytesIO:

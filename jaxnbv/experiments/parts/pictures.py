@@ -5,12 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -18,21 +17,19 @@ from scipy.spatial import cKDTree
 
 from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud
-from jaxnbv.datasets import PartScene, Split, part_scene
-from jaxnbv.datasets.labelled import LabelledSolid
+from jaxnbv.episode import observe_scene
 from jaxnbv.experiments.measures import Record, methods_of
-from jaxnbv.experiments.parts.study import TARGET, TARGETS, PartStudy, discovery_time
+from jaxnbv.experiments.parts.discovery import TARGET, TARGETS, PartDiscoveryStudy, discovery_time
 from jaxnbv.experiments.study import Scene
 from jaxnbv.experiments.tiles import Tiles, frame, save_pictures
-from jaxnbv.networks import CATEGORIES
 from jaxnbv.pose import Pose, fibonacci_sphere, look_at
-from jaxnbv.scanning import SDFSurface, scan
+from jaxnbv.scanning import SensorNoise
 from jaxnbv.viz.render import Still, draw_segments, frustum
 from jaxnbv.viz.style import GREY, INK, LINE
 
 _SHOWN = ("discrete", "gradient-2dof", "farthest", "uncertainty")
 _FOUND = "#00734f"
-# Okabe and Ito's: a category has at most six parts.
+# Okabe and Ito's: a category of ShapeNet-part has at most six parts.
 _COLOURS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#56b4e9", "#cc79a7")
 # Where pictures are taken from, half of what they span; tries for a good place, and their pixels.
 _DISTANCE, _REACH = 11.0, 1.62
@@ -43,10 +40,9 @@ _NEARER, _FRUSTUM_DEPTH = 0.76, 0.24
 
 
 def write_pictures(
-    records: Sequence[Record], study: PartStudy, folder: str | Path, scenes: int = 3, pixels: int = 420
+    records: Sequence[Record], study: PartDiscoveryStudy, folder: str | Path, scenes: int = 3, pixels: int = 420
 ) -> list[Path]:
-    """Write `parts_<scene>.png` for the scenes whose smallest part is the smallest share of the object's surface that
-    shows, one to a category; return the paths.
+    """Write `parts_<scene>.png` for the scenes with the most parts, one to a category; return the paths.
 
     At the left the true object, coloured by part; a row a method, a column a view: the cloud so far, coloured by the
     part that the segmenter says, the points of this view strong and those before pale, over the true shape. Cameras
@@ -60,30 +56,25 @@ def write_pictures(
     """
     present = methods_of(records, study.methods)
     methods = [method for method in _SHOWN if method in present] or present
-    chosen = _with_small_parts(records, scenes)
-    return save_pictures(chosen, folder, "parts", lambda record: _picture(record, study, methods, pixels))
-
-
-def _with_small_parts(records: Sequence[Record], count: int) -> list[Record]:
-    smallest = []
-    for record in records:
-        scene = part_scene(Split(record["split"]), record["scene"])
-        pixels = np.asarray(_part_pixels(scene.solid, _places()))[:, np.asarray(scene.parts)].sum(axis=0)
-        smallest.append(float(pixels.min() / pixels.sum()))
     chosen: dict[str, Record] = {}
-    for index in np.argsort(smallest, kind="stable"):
-        chosen.setdefault(records[index]["category"], records[index])
-    return list(chosen.values())[:count]
+    for record in sorted(records, key=lambda record: -len(record["parts"])):
+        chosen.setdefault(record["category"], record)
+    return save_pictures(
+        list(chosen.values())[:scenes], folder, "parts", lambda record: _picture(record, study, methods, pixels)
+    )
 
 
-def _picture(record: Record, study: PartStudy, methods: Sequence[str], pixels: int) -> Figure:
-    scene = part_scene(Split(record["split"]), record["scene"])
-    colours = _part_colours(scene)
-    true, ghost = _stills(scene, colours, pixels)
+def _picture(record: Record, study: PartDiscoveryStudy, methods: Sequence[str], pixels: int) -> Figure:
+    scene = study.scene(record["scene"])
+    asked = study.truth(scene)
+    segmenter = study.segmenter_of(scene)
+    own = _palette(len(asked))
+    told = segmenter(PointCloud(jnp.zeros((1, 3)), jnp.zeros((1, 3)), jnp.zeros(1, bool)))
+    colours = np.tile(mpl.colors.to_rgb(GREY), (told.shape[1], 1))
+    colours[asked] = own
+    true, ghost = _stills(study, scene, asked, colours, pixels)
     runs = [record["methods"][method] for method in methods]
-    of_study = Scene(record["scene"], record["category"], SDFSurface(scene.solid), scene)
-    seen = [study.seen(of_study, run) for run in runs]
-    segmenter = eqx.tree_at(lambda s: s.category, study.segmenter, scene.category)
+    seen = [study.seen(scene, run) for run in runs]
 
     # Inches: all methods share the first view, so it stands once, at the middle of the rows.
     tile, gap, below, left, top, margin, line = 1.5, 0.1, 0.36, 0.12, 0.74, 1.05, 0.2
@@ -98,7 +89,7 @@ def _picture(record: Record, study: PartStudy, methods: Sequence[str], pixels: i
         "Points: the part that the segmenter says; strong are those of this view. "
         f"Bars: points of each part, full at {TARGET}. Framed: all parts have been found."
     )
-    tiles = Tiles(wide, tall, f"Scene {record['scene']}: {record['category']}", caption)
+    tiles = Tiles(wide, tall, f"Scene {record['scene']}: {scene.name}", caption)
     middle = top + 0.5 * (tall - top - below)
 
     def column_at(column: int) -> float:
@@ -109,7 +100,7 @@ def _picture(record: Record, study: PartStudy, methods: Sequence[str], pixels: i
     axes.set(xlim=corner[0] + [0, size[0]], ylim=corner[1] + [size[1], 0])
     axes.axis("off")
     tiles.write(left + 1.05, middle - 0.5 * block + 0.08, "true parts", fontsize=9, ha="center")
-    for index, (name, colour) in enumerate(zip(record["parts"], _of_parts(scene, colours), strict=True)):
+    for index, (name, colour) in enumerate(zip(record["parts"], own, strict=True)):
         down = middle + 0.5 * block + line * (index + 0.5 - len(record["parts"]))
         tiles.write(left + 0.6, down, "●", color=colour, fontsize=11)
         tiles.write(left + 0.8, down, name, fontsize=9)
@@ -120,7 +111,7 @@ def _picture(record: Record, study: PartStudy, methods: Sequence[str], pixels: i
         taken = study.poses_of(runs[row])[: column + 1]
         for index, pose in enumerate(taken):
             _draw_camera(axes, ghost, study.camera, pose, is_new=index == column)
-        _finish(axes, ghost.size, runs[row], column, _of_parts(scene, colours))
+        _finish(axes, ghost.size, runs[row], column, own)
 
     for row, (method, run) in enumerate(zip(methods, runs, strict=True)):
         down, held = top + row * (tile + below), len(run["views"])
@@ -139,30 +130,33 @@ def _picture(record: Record, study: PartStudy, methods: Sequence[str], pixels: i
     return tiles.figure
 
 
-def _part_colours(scene: PartScene) -> Float[np.ndarray, "labels 3"]:
-    """A colour for each of the fifty labels: grey for parts that the object does not have."""
-    colours = np.tile(mpl.colors.to_rgb(GREY), (len(scene.parts), 1))
-    for label in CATEGORIES[int(scene.category)].labels:
-        if scene.parts[label]:
-            colours[label] = mpl.colors.to_rgb(_COLOURS[label - CATEGORIES[int(scene.category)].first_label])
-    return colours
+def _palette(count: int) -> Float[np.ndarray, "count 3"]:
+    """A colour for each part."""
+    if count <= len(_COLOURS):
+        return np.array([mpl.colors.to_rgb(colour) for colour in _COLOURS[:count]])
+    return mpl.colormaps["turbo"](np.linspace(0.05, 0.95, count))[:, :3]
 
 
-def _of_parts(scene: PartScene, colours: Float[np.ndarray, "labels 3"]) -> Float[np.ndarray, "parts 3"]:
-    return colours[np.flatnonzero(np.asarray(scene.parts))]
-
-
-def _stills(scene: PartScene, colours: Float[np.ndarray, "labels 3"], size: int) -> tuple[Still, Still]:
+def _stills(
+    study: PartDiscoveryStudy, scene: Scene, asked: Sequence[int], colours: Float[np.ndarray, "labels 3"], size: int
+) -> tuple[Still, Still]:
     """The true object coloured by part, and a pale ghost of it: seen from where each part shows nearly as much as from
     where it shows best."""
     places = _places()
-    pixels = np.asarray(_part_pixels(scene.solid, places), np.float64)[:, np.asarray(scene.parts)]
-    eye = np.asarray(places.position[int(np.argmax((pixels / pixels.max(axis=0)).min(axis=1)))], np.float64)
+    tried = _look(scene, Camera(2.0 * math.atan(1.5 / _DISTANCE), _TRY_PIXELS, _TRY_PIXELS), places)
+    labels = _true_parts(study, scene, tried)
+    pixels = np.stack([(labels == part).sum(axis=1) for part in asked], axis=1).astype(np.float64)
+    share = pixels / np.maximum(pixels.max(axis=0), 1.0)
+    # A part that none of these places shows has no say.
+    eye = np.asarray(places.position[int(np.argmax(share[:, share.any(axis=0)].min(axis=1)))], np.float64)
     true, ghost = (Still(eye, None, size, _REACH) for _ in range(2))
-    mask, *found = map(np.asarray, _render(scene.solid, true.fine_camera, true.pose))
-    labels, facing, depth = (of[mask] for of in found)
+    seen = _look(scene, true.fine_camera, true.pose)
+    mask, points, normals = (np.asarray(leaf) for leaf in (seen.mask, seen.points, seen.normals))
+    rays = np.asarray(true.pose.position) - points[mask]
+    facing = np.abs(np.sum(rays * normals[mask], axis=-1)) / np.linalg.norm(rays, axis=-1)
+    depth = -rays @ np.asarray(true.pose.forward)
     for still, plain, lit in (
-        (true, colours[labels], 0.62 + 0.42 * facing),
+        (true, colours[_true_parts(study, scene, seen)[mask]], 0.62 + 0.42 * facing),
         (ghost, np.array(mpl.colors.to_rgb(LINE)), 0.84 + 0.2 * facing),
     ):
         shaded = np.clip(plain * lit[:, None], 0.0, 1.0)
@@ -238,25 +232,12 @@ def _places() -> Pose:
     return look_at(places[(height > -0.2) & (height < 0.7)])
 
 
-@eqx.filter_jit
-def _part_pixels(solid: LabelledSolid, places: Pose) -> Int[Array, "places labels"]:
-    """How many pixels of each of the fifty parts show from each place."""
-    camera = Camera(2.0 * math.atan(1.5 / _DISTANCE), _TRY_PIXELS, _TRY_PIXELS)
-
-    def of_place(place: Pose) -> Int[Array, " labels"]:
-        seen = scan(SDFSurface(solid), camera, place)
-        return jnp.zeros(50, jnp.int32).at[solid.label(seen.points)].add(seen.mask)
-
-    return jax.lax.map(of_place, places)
+def _look(scene: Scene, camera: Camera, places: Pose) -> PointCloud:
+    """What a camera sees of the true object."""
+    return observe_scene(scene.surface, camera, places, SensorNoise(0.0, 0.0), jax.random.key(0))
 
 
-@eqx.filter_jit
-def _render(
-    solid: LabelledSolid, camera: Camera, place: Pose
-) -> tuple[Bool[Array, " rays"], Int[Array, " rays"], Float[Array, " rays"], Float[Array, " rays"]]:
-    """Which rays hit, the part, the cosine between ray and normal, and the depth; infinite where they miss."""
-    seen = scan(SDFSurface(solid), camera, place)
-    rays = place.position - seen.points
-    facing = jnp.sum(rays * seen.normals, axis=-1) / jnp.linalg.norm(rays, axis=-1)
-    depth = -jnp.sum(rays * place.forward, axis=-1)
-    return seen.mask, solid.label(seen.points), jnp.abs(facing), jnp.where(seen.mask, depth, jnp.inf)
+def _true_parts(study: PartDiscoveryStudy, scene: Scene, seen: PointCloud) -> Int[np.ndarray, "*batch rays"]:
+    """The part of each point, -1 where there is none."""
+    labels = study.true_parts(scene, seen.points.reshape(-1, 3)).reshape(seen.mask.shape)
+    return np.asarray(jnp.where(seen.mask, labels, -1))

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from jaxnbv.checks import InputError
 from jaxnbv.experiments.charts import write_charts
 from jaxnbv.experiments.measures import difference_rows, result_rows, values
-from jaxnbv.experiments.parts.study import TARGETS, PartStudy, discovery_time
+from jaxnbv.experiments.parts.discovery import TARGETS, discovery_time
+from jaxnbv.experiments.parts.study import PartStudy
 from jaxnbv.experiments.tables import summary
 
 TIME, FOUND, BY_VIEW = PartStudy.measures
