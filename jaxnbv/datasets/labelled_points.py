@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxnbv.checks import require
+from jaxnbv.checks import InputError, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.frame import Frame
 
@@ -32,7 +32,8 @@ class LabelledPoints(NamedTuple):
 
         **Raises:** `ValueError` if there are no normals, or as `PointCloud.from_arrays` does.
         """
-        require(self.normals is not None, f"{self.name} has points without normals: scan its mesh, or estimate them")
+        if self.normals is None:
+            raise InputError(f"{self.name} has points without normals: scan its mesh, or estimate them")
         return frame.to_scene(PointCloud.from_arrays(self.points, self.normals))
 
 

@@ -85,9 +85,10 @@ class OmniObject3DPoints(eqx.Module):
         label, path = self.files[index]
         check_file(Path(path))
         try:
-            points = np.asarray(trimesh.load(path, process=False).vertices, dtype=np.float64)
+            cloud = trimesh.load(path, process=False)
         except Exception as error:  # Its readers fail in their own ways.
             raise InputError(f"cannot read {path} ({type(error).__name__}: {error}): unpack it again") from error
+        points = np.array(cloud.vertices if isinstance(cloud, trimesh.PointCloud) else [], dtype=np.float64)
         require(
             points.shape == (self.num_points, 3) and bool(np.isfinite(points).all()),
             f"{path} is damaged: expected {self.num_points} points of finite coordinates; unpack it again",
