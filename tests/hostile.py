@@ -5,8 +5,10 @@ A program of its own: in the tests annotations are checked by beartype before an
 
 import contextlib
 import sys
+import tempfile
 import traceback
 import warnings
+from pathlib import Path
 
 import hypothesis.strategies as st
 import jax
@@ -15,6 +17,7 @@ import numpy as np
 from hypothesis import HealthCheck, Phase, given, settings
 
 import jaxnbv as nbv
+from jaxnbv import datasets
 
 RNG = np.random.default_rng(0)
 DIRECTIONS = RNG.normal(size=(20, 3))
@@ -25,6 +28,23 @@ POSES = nbv.SphereCandidates(6).poses()
 SMALL = nbv.Camera(height=4, width=4)
 BALL = nbv.sdf.Sphere(1.0)
 MODEL = nbv.GeometricSPSR(0.05, 0.2, 6)
+# Until the program ends.
+_HELD = tempfile.TemporaryDirectory()
+COPY = Path(_HELD.name)
+for name, content in {
+    "bed/test/bed_0516.off": "",
+    "bed/bed_0516.txt": "",
+    "modelnet10_shape_names.txt": "bed",
+    "modelnet10_test.txt": "bed_0516",
+    "02958343/a/model.obj": "",
+    "raw_scans/apple/apple_001/Scan/Scan.obj": "",
+    "point_clouds/ply_files/1024/apple/apple_001/pcd_1024.ply": "",
+    "synsetoffset2category.txt": "Car 02958343",
+    "train_test_split/shuffled_test_file_list.json": '["shape_data/02958343/a"]',
+    "02958343/a.txt": "",
+}.items():
+    (COPY / name).parent.mkdir(parents=True, exist_ok=True)
+    (COPY / name).write_text(content)
 
 
 def number_of_points(cloud):
@@ -85,6 +105,12 @@ CALLS = {
     nbv.Thickness: {"depth": 0.1, "count": 10, "value": -1.0, "noise": 1.0},
     nbv.TriangleMesh.from_arrays: {"vertices": np.eye(3), "faces": [[0, 1, 2]]},
     nbv.UncertaintyView: {"candidates": 6},
+    datasets.ModelNet: {"folder": COPY, "split": "test", "classes": ["bed"]},
+    datasets.ModelNetPoints: {"folder": COPY, "split": "test", "num_classes": 10},
+    datasets.OmniObject3D: {"folder": COPY, "classes": ["apple"]},
+    datasets.OmniObject3DPoints: {"folder": COPY, "num_points": 1024, "classes": ["apple"]},
+    datasets.ShapeNet: {"folder": COPY, "categories": ["car"], "models": ["a"]},
+    datasets.ShapeNetPart: {"folder": COPY, "split": "test", "categories": ["car"]},
     nbv.concatenate: {"first": CLOUD, "second": CLOUD},
     nbv.farthest_point_subsample: {"cloud": CLOUD, "count": 3},
     nbv.fibonacci_sphere: {"count": 6, "radius": 1.0, "min_elevation": 0.0},

@@ -9,9 +9,11 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxnbv.checks import InputError, require
+from jaxnbv.checks import InputError, checked, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets.categories import CATEGORIES, category_index
+from jaxnbv.datasets.labelled_points import unit_sphere
+from jaxnbv.datasets.local_copy import as_names, check_listed, checked_folder, read_rows, read_text
 from jaxnbv.frame import Frame
 
 _SPLITS = {"train": "train", "validation": "val", "test": "test"}
@@ -58,22 +60,25 @@ class ShapeNetPart(eqx.Module):
     folder: Path = eqx.field(static=True)
     entries: tuple[tuple[int, str], ...] = eqx.field(static=True)
 
-    def __init__(self, folder: str | Path, split: str, categories: Iterable[str] | None = None):
+    @checked
+    def __init__(self, folder: str | Path, split: str, categories: str | Iterable[str] | None = None):
         """The shapes of the split "train", "validation" or "test" that belong to the categories; default: to any.
 
         **Raises:** `ValueError` for a folder, a list or a table of categories that is missing or damaged, an unknown
-        split or category, or no shape at all.
+        split or category, no shape at all, and shapes that the list names and the folder has not: how many, and the
+        first.
         """
-        self.folder = Path(folder)
-        require(self.folder.is_dir(), f"there is no folder {folder}: give the place of the unpacked data set")
+        self.folder = checked_folder(folder)
         require(split in _SPLITS, f"there is no split '{split}': choose from {', '.join(_SPLITS)}")
         synsets = _read_synsets(self.folder / _CATEGORY_FILE)
-        wanted = set(synsets.values()) if categories is None else {category_index(name) for name in categories}
+        chosen = None if categories is None else as_names(categories, "category")
+        wanted = set(synsets.values()) if chosen is None else {category_index(name) for name in chosen}
         absent = [CATEGORIES[index].name for index in sorted(wanted - set(synsets.values()))]
         require(not absent, f"{self.folder / _CATEGORY_FILE} does not list {absent}: choose other categories")
         path = self.folder / "train_test_split" / f"shuffled_{_SPLITS[split]}_file_list.json"
         self.entries = tuple(entry for entry in _read_list(path, synsets) if entry[0] in wanted)
         require(len(self.entries) > 0, f"{path} lists no shape of these categories: choose others")
+        check_listed([self.folder / file for _, file in self.entries], path)
 
     def __len__(self) -> int:
         return len(self.entries)
@@ -88,30 +93,10 @@ class ShapeNetPart(eqx.Module):
         return _read_shape(self.folder / file, category)
 
 
-def unit_sphere(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """The points moved so that their mean is the origin, and scaled so that the farthest from it has distance 1.
-
-    **Raises:** `ValueError` if there are no points, or all coincide.
-    """
-    require(len(points) > 0, "there are no points to normalise: give at least two")
-    centred = points - points.mean(axis=0)
-    radius = np.linalg.norm(centred, axis=1).max()
-    require(radius > 0, f"all {len(points)} points lie at {points[0]}; give points that differ")
-    return centred / radius
-
-
-def _read_text(path: Path) -> str:
-    require(path.is_file(), f"there is no file {path}: the folder is incomplete, unpack the data set again")
-    try:
-        return path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read {path} ({error}): unpack the data set again") from error
-
-
 def _read_synsets(path: Path) -> dict[str, int]:
     """The category that each folder holds."""
     synsets = {}
-    for line in _read_text(path).splitlines():
+    for line in read_text(path).splitlines():
         if not line.strip():
             continue
         words = line.split()
@@ -124,7 +109,7 @@ def _read_synsets(path: Path) -> dict[str, int]:
 def _read_list(path: Path, synsets: dict[str, int]) -> list[tuple[int, str]]:
     """Category and file of each shape, of lines such as "shape_data/02691156/<identifier>"."""
     try:
-        lines = json.loads(_read_text(path))
+        lines = json.loads(read_text(path))
     except json.JSONDecodeError as error:
         raise InputError(f"{path} is damaged ({error}): unpack the data set again") from error
     require(isinstance(lines, list), f"{path} holds no list: unpack the data set again")
@@ -140,15 +125,7 @@ def _read_list(path: Path, synsets: dict[str, int]) -> list[tuple[int, str]]:
 
 
 def _read_shape(path: Path, category: int) -> LabelledShape:
-    lines = [line for line in _read_text(path).splitlines() if line.strip()]
-    require(len(lines) > 0, f"{path} is empty: unpack the data set again")
-    try:
-        rows = np.loadtxt(lines, ndmin=2)
-    except ValueError as error:
-        raise InputError(f"{path} is damaged ({error}): each row must be {_COLUMNS}") from error
-    require(rows.shape[1] == 7, f"{path} has {rows.shape[1]} columns; expected 7: {_COLUMNS}")
-    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-    require(bad.size == 0, f"{path} has numbers that are not finite, the first in row {bad[:1]}: unpack it again")
+    rows = read_rows(path, _COLUMNS)
     known = CATEGORIES[category]
     bad = np.flatnonzero(~np.isin(rows[:, 6], known.labels))
     require(

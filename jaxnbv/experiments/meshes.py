@@ -8,9 +8,13 @@ from typing import TypeVar
 import trimesh
 
 from jaxnbv.checks import require
+from jaxnbv.datasets import MeshFile, ModelNet, OmniObject3D
+from jaxnbv.datasets.local_copy import class_folders
+from jaxnbv.datasets.modelnet import is_modelnet
+from jaxnbv.datasets.omniobject3d import holds_scans, scans_folder
 from jaxnbv.scanning import TriangleMesh, load_mesh
 
-_T = TypeVar("_T")
+_File = TypeVar("_File")
 
 
 def mesh_files(folder: str | Path) -> tuple[str, ...]:
@@ -31,33 +35,52 @@ def is_mesh_file(path: Path) -> bool:
     return path.suffix[1:].lower() in trimesh.available_formats() and path.is_file()
 
 
-def taking_turns(groups: Iterable[Sequence[_T]]) -> list[_T]:
+def taking_turns(groups: Iterable[Sequence[_File]]) -> list[_File]:
     """The first of each group, then the second of each that has one, and so on."""
     turns = itertools.chain.from_iterable(itertools.zip_longest(*groups))
     return [one for one in turns if one is not None]
 
 
-def class_meshes(folder: str | Path, classes: Sequence[str]) -> tuple[tuple[int, str], ...]:
-    """The class and the file of each mesh in a folder `class/.../name` for some of the classes; these take turns.
+def class_meshes(folder: str | Path, classes: Sequence[str]) -> tuple[MeshFile, ...]:
+    """The meshes in a folder `class/.../name` for some of the classes, labelled by their place; these take turns.
 
-    Names of classes may be written with underscores. Where a class is split as ModelNet is, in `train` and `test`, the
-    meshes are those of `test`. Other folders are passed over.
+    Names of classes may be written with underscores. What is named as in `ModelNet` or `OmniObject3D` is read as these
+    are: of the former the meshes for tests. Of other classes that have a folder `test` the meshes are those in it.
+    Other folders are passed over.
 
     **Raises:** `ValueError` if there is no such folder, none of a class, or one without a mesh.
     """
     folder = Path(folder)
     require(folder.is_dir(), f"there is no folder {folder}: give one that holds a folder of meshes for each class")
-    found = {path.name.lower().replace("_", " "): path for path in sorted(folder.iterdir()) if path.is_dir()}
-    known = [(label, found[name]) for label, name in enumerate(classes) if name in found]
+    folder = scans_folder(folder)
+    found = class_folders(folder)
+    known = [(label, name) for label, name in enumerate(classes) if name in found]
     require(len(known) > 0, f"the folder {folder} has none of the folders {', '.join(classes)}: give one that has")
-    meshes = []
-    for label, of_class in known:
-        split = of_class / "test"
-        inside = sorted((split if split.is_dir() else of_class).rglob("*"))
-        files = [str(file) for file in inside if is_mesh_file(file)]
-        require(len(files) > 0, f"the folder {of_class} holds no mesh: unpack it again, or take it away")
-        meshes.append([(label, file) for file in files])
-    return tuple(taking_turns(meshes))
+    return tuple(taking_turns([file._replace(label=label) for file in _of_class(found[name])] for label, name in known))
+
+
+def _of_class(folder: Path) -> Sequence[MeshFile]:
+    if is_modelnet(folder):
+        return ModelNet(folder.parent, "test", [folder.name]).files
+    if holds_scans(folder):
+        return OmniObject3D(folder.parent, [folder.name]).files
+    split = folder / "test"
+    inside = sorted((split if split.is_dir() else folder).rglob("*"))
+    files = [file for file in inside if is_mesh_file(file)]
+    require(len(files) > 0, f"the folder {folder} holds no mesh: unpack it again, or take it away")
+    return [MeshFile(0, file.stem, str(file)) for file in files]
+
+
+def numbered(files: Sequence[_File], index: int) -> _File:
+    """The file of a scene.
+
+    **Raises:** `ValueError` if there is none of this index.
+    """
+    require(
+        0 <= index < len(files),
+        f"there is no scene {index}: the study has {len(files)} meshes, counted from 0; run as many scenes",
+    )
+    return files[index]
 
 
 def numbered_mesh(files: Sequence[str], index: int) -> TriangleMesh:
@@ -65,11 +88,7 @@ def numbered_mesh(files: Sequence[str], index: int) -> TriangleMesh:
 
     **Raises:** `ValueError` if there is no mesh of this index, or it cannot be read.
     """
-    require(
-        0 <= index < len(files),
-        f"there is no scene {index}: the study has {len(files)} meshes, counted from 0; run as many scenes",
-    )
-    return load_mesh(files[index])
+    return load_mesh(numbered(files, index))
 
 
 def as_mesh_files(meshes: str | Path | Sequence[str] | None) -> tuple[str, ...]:

@@ -123,6 +123,15 @@ def test_damaged_folders(folder, file, content, message):
         ShapeNetPart(folder, "train")
 
 
+def test_shapes_that_the_list_names_and_the_folder_lacks(folder):
+    (folder / "02691156" / "c.txt").unlink()
+    with pytest.raises(
+        InputError, match=r"1 of the 3 files that .*train_file_list.json names are not there: .*156/c.txt"
+    ):
+        ShapeNetPart(folder, "train")
+    assert len(ShapeNetPart(folder, "train", ["chair"])) == 1
+
+
 ROW = "0.1 0.2 0.3 1 0 0 "
 
 
@@ -143,12 +152,12 @@ ROW = "0.1 0.2 0.3 1 0 0 "
     ],
 )
 def test_damaged_shapes(folder, content, message):
+    shapes = ShapeNetPart(folder, "train")
     file = folder / "02691156" / "a.txt"
     if content is None:
         file.unlink()
     else:
         file.write_text(content)
-    shapes = ShapeNetPart(folder, "train")
     with pytest.raises(InputError, match=message):
         shapes[0]
     assert shapes[1].name == "b"

@@ -12,13 +12,13 @@ from jaxtyping import Array, Int, Key
 
 from jaxnbv.checks import require
 from jaxnbv.cloud import PointCloud
-from jaxnbv.datasets import ClassObject, ClassSet, Framing, Split
+from jaxnbv.datasets import ClassObject, ClassSet, Framing, MeshFile, Split
 from jaxnbv.datasets.class_object import scan_telling
 from jaxnbv.episode import Sensor, Step
 from jaxnbv.experiments.classification.choices import CLASSIFYING, Chooser, classify
 from jaxnbv.experiments.classification.measures import HITS_EXPLAINED, ROUGHNESS, diagnostics_chart, hits
 from jaxnbv.experiments.measures import Measure, Record
-from jaxnbv.experiments.meshes import class_meshes, numbered_mesh
+from jaxnbv.experiments.meshes import class_meshes, numbered
 from jaxnbv.experiments.study import Chart, Panel, Scene, Study
 from jaxnbv.model_name import ModelName
 from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale, pretrained_classifier
@@ -52,8 +52,7 @@ class ClassificationStudy(Study):
     - `framing`: how large the object stands before the sensor.
     - `split`: which scenes; tune on those of the validation split.
     - `num_points`: D is thinned to so many, once a step, before imagined scans are added to it.
-    - `meshes`: classes and files in place of procedural objects, see `class_meshes`, where all of an object tells its
-      class.
+    - `meshes`: files in place of procedural objects, see `class_meshes`, where all of an object tells its class.
 
     What it is:
 
@@ -86,7 +85,7 @@ class ClassificationStudy(Study):
     framing: Framing = eqx.field(static=True, default=Framing.CLOSE_UP)
     split: Split = eqx.field(static=True, default=Split.TEST)
     num_points: int = eqx.field(static=True, default=512)
-    meshes: tuple[tuple[int, str], ...] = eqx.field(static=True, default=())
+    meshes: tuple[MeshFile, ...] = eqx.field(static=True, default=())
 
     def __check_init__(self):
         require(not (self.telling and self.meshes), f"what tells the {self.telling} of a mesh is not known: give none")
@@ -150,10 +149,10 @@ class ClassificationStudy(Study):
         poses = self.candidates.poses()
         keys = jax.random.split(jax.random.fold_in(jax.random.key(3), index), self.num_candidates)
         if self.meshes:
-            mesh = numbered_mesh([file for _, file in self.meshes], index)
-            label, file = self.meshes[index]
-            truth = Truth(label, _noisy(scan(mesh, self.camera, poses), keys), None, None)
-            return Scene(index, f"{self.objects.classes[label]} {Path(file).stem}", mesh, truth)
+            file = numbered(self.meshes, index)
+            mesh = file.read()
+            truth = Truth(file.label, _noisy(scan(mesh, self.camera, poses), keys), None, None)
+            return Scene(index, f"{self.objects.classes[file.label]} {file.name}", mesh, truth)
         thing = self.objects.scene(self.split, index, self.framing)
         pixels, scans = scan_telling(thing, self.camera, poses)
         truth = Truth(int(thing.label), _noisy(scans, keys), thing, pixels)

@@ -11,7 +11,7 @@ from jaxnbv.camera import Camera
 from jaxnbv.checks import require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.experiments.measures import Record
-from jaxnbv.experiments.meshes import is_mesh_file, taking_turns
+from jaxnbv.experiments.meshes import is_mesh_file, numbered, taking_turns
 from jaxnbv.experiments.parts.discovery import NETWORK_POINTS, TARGETS, PartDiscoveryStudy
 from jaxnbv.experiments.parts.nearest import NearestPart
 from jaxnbv.experiments.study import Scene, Study
@@ -67,11 +67,7 @@ class MeshPartStudy(PartDiscoveryStudy):
 
         **Raises:** `ValueError` if there is no mesh of this index, or it cannot be read.
         """
-        require(
-            0 <= index < len(self.meshes),
-            f"there is no scene {index}: the study has {len(self.meshes)} meshes, counted from 0; run as many scenes",
-        )
-        file = Path(self.meshes[index][0])
+        file = Path(numbered(self.meshes, index)[0])
         parts = load_parts(file)
         room = max(count for _, count in self.meshes)
         oracle = NearestPart.of(parts, room, _GRID, NETWORK_POINTS)

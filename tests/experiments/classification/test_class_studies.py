@@ -129,12 +129,41 @@ def test_meshes_of_classes_take_turns_and_other_folders_are_passed_over(tmp_path
     box_files(tmp_path, "chair/deep/er/c.stl")
     (tmp_path / "chair" / "readme.txt").write_text("no mesh")
     found = class_meshes(tmp_path, HOUSEHOLD)
-    assert [(HOUSEHOLD[label], Path(file).name) for label, file in found] == [
+    assert [(HOUSEHOLD[mesh.label], Path(mesh.path).name) for mesh in found] == [
         ("chair", "a.ply"),
         ("night stand", "c.off"),
         ("chair", "b.obj"),
         ("chair", "c.stl"),
     ]
+
+
+def test_copies_of_modelnet_are_turned_upright(tmp_path):
+    numbers = {"bathtub": range(107, 157), "night_stand": range(201, 287)}
+    box_files(tmp_path, *(f"{name}/test/{name}_{number:04d}.off" for name in numbers for number in numbers[name]))
+    box_files(tmp_path, "bathtub/train/bathtub_0001.off", "chair/y_up.off")
+    found = class_meshes(tmp_path, HOUSEHOLD)
+    assert [(HOUSEHOLD[mesh.label], mesh.name, mesh.up) for mesh in found[:4]] == [
+        ("bathtub", "bathtub_0107", "z"),
+        ("chair", "y_up", "y"),
+        ("night stand", "night_stand_0201", "z"),
+        ("bathtub", "bathtub_0108", "z"),
+    ]
+    assert len(found) == 50 + 86 + 1
+    study = small(ModelNet10Study, meshes=found)
+    # The sides of the box in its file are 1, 0.5 and 0.25.
+    for index, sides in ((0, [2.5, 0.625, 1.25]), (1, [2.5, 1.25, 0.625])):
+        np.testing.assert_allclose(np.ptp(study.scene(index).surface.vertices, axis=0), sides)
+
+
+def test_copies_of_omniobject3d_name_their_scenes_by_object(tmp_path):
+    names = ("apple/apple_003", "apple/apple_001", "toy_car/toy_car_001", "orange/orange_010")
+    box_files(tmp_path / "raw_scans", *(f"{name}/Scan/Scan.obj" for name in names))
+    (tmp_path / "point_clouds").mkdir()
+    for folder in (tmp_path, tmp_path / "raw_scans"):
+        study = small(OmniObject3DStudy, meshes=class_meshes(folder, FRUITS))
+        scenes = [study.scene(index) for index in range(study.num_scenes)]
+        assert [scene.name for scene in scenes] == ["apple apple_001", "orange orange_010", "apple apple_003"]
+        assert [scene.task.label for scene in scenes] == [FRUITS.index(name) for name in ("apple", "orange", "apple")]
 
 
 def test_folders_without_a_class_or_a_mesh_are_refused(tmp_path):
