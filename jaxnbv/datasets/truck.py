@@ -73,13 +73,18 @@ def sample_truck(key: PRNGKeyArray, label: int, longest_side: float = 2.5) -> Lo
     slack = (high - low) - scale * (greatest_corner - least_corner)
     corner = low + slack * np.array([rng.random(), 0.0, rng.random()])
     cargo = [moved(p, scale, offset=corner - scale * least_corner) for p in cargo]
-    # Any rotation: a uniform one from the QR decomposition of a normal matrix.
-    rotation, triangle = np.linalg.qr(rng.normal(size=(3, 3)))
-    rotation = rotation * np.sign(np.diag(triangle))
-    rotation[:, 0] *= np.linalg.det(rotation)
+    rotation = random_rotation(rng)
     both = fitted([moved(p, rotation=rotation) for p in truck + cargo], longest_side)
     solids = {"truck": united(both[: len(truck)]), "cargo": united(both[len(truck) :])}
     return LoadedTruck(**solids, label=jnp.asarray(label))
+
+
+def random_rotation(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
+    """A uniform one, from the QR decomposition of a normal matrix."""
+    rotation, triangle = np.linalg.qr(rng.normal(size=(3, 3)))
+    rotation = rotation * np.sign(np.diag(triangle))
+    rotation[:, 0] *= np.linalg.det(rotation)
+    return rotation
 
 
 def _truck(rng: np.random.Generator) -> tuple[list[Primitive], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:

@@ -38,13 +38,13 @@ STUDIES = {
     "truck": Entry(
         "jaxnbv.experiments.classification.truck:TruckStudy",
         "How soon is the class of a truck's cargo known, which most views do not show? The paper's Truck-ModelNet10, "
-        "on procedural trucks and cargo.",
+        "on procedural trucks and cargo, or on meshes: a folder `trucks`, and folders of the classes' names.",
         "48 candidates, 16 samples on a 64^3 grid, 1,024 points of what was seen beside an imagined scan and 2,048 of "
         "what was seen alone: fewer candidates and a coarser grid than the paper's.",
         scenes=100,
         views=5,
         pictures="jaxnbv.experiments.classification.pictures:write_pictures",
-        options=("classifier",),
+        options=("meshes", "classifier"),
     ),
     "modelnet10": Entry(
         "jaxnbv.experiments.classification.modelnet10:ModelNet10Study",

@@ -4,17 +4,15 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxnbv.camera import Camera
-from jaxnbv.datasets import ClassObject
 from jaxnbv.experiments.classification.hits import TELLING_PIXELS
 from jaxnbv.experiments.classification.study import ClassificationStudy
 from jaxnbv.experiments.measures import Record, methods_of
@@ -111,7 +109,7 @@ def _tile(
 def _image(scene: Scene, camera: Camera, pose: Pose, tinted: bool) -> Float[np.ndarray, "h w 3"]:
     """Lit from the sensor; four rays a pixel. Tinted where it tells the class."""
     seen = scan(scene.surface, camera, jax.tree.map(jnp.asarray, pose))
-    tells = np.asarray(_tells(scene.task.thing, seen.points)) if tinted else np.zeros(len(seen.mask), bool)
+    tells = np.asarray(scene.task.thing.tells(seen.points)) if tinted else np.zeros(len(seen.mask), bool)
     points, normals, hit = (np.asarray(array) for array in (seen.points, seen.normals, seen.mask))
     rays = pose.position - points
     facing = np.where(hit, np.sum(rays * normals, axis=-1) / np.linalg.norm(rays, axis=-1), 0.0)
@@ -119,8 +117,3 @@ def _image(scene: Scene, camera: Camera, pose: Pose, tinted: bool) -> Float[np.n
     image = np.where(hit[:, None], np.clip(colours, 0.0, 1.0), _BACKGROUND)
     side = math.isqrt(len(hit)) // 2
     return image.reshape(side, 2, side, 2, 3).mean(axis=(1, 3))
-
-
-@eqx.filter_jit
-def _tells(thing: ClassObject, points: Float[Array, "rays 3"]) -> Bool[Array, " rays"]:
-    return thing.tells(points)

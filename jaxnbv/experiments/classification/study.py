@@ -13,7 +13,7 @@ from jaxtyping import Array, Int, Key
 from jaxnbv.checks import require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets import ClassObject, ClassSet, Framing, MeshFile, Split
-from jaxnbv.datasets.class_object import scan_telling
+from jaxnbv.datasets.class_object import ClassMesh, scan_telling, surface_of
 from jaxnbv.episode import Sensor, Step
 from jaxnbv.experiments.classification.choices import CLASSIFYING, Chooser, classify
 from jaxnbv.experiments.classification.measures import HITS_EXPLAINED, ROUGHNESS, diagnostics_chart, hits
@@ -25,7 +25,7 @@ from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale, pre
 from jaxnbv.planner import Planner
 from jaxnbv.pose import Pose
 from jaxnbv.presets import imagination
-from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, scan
+from jaxnbv.scanning import Grid, SensorNoise
 from jaxnbv.search import DiscreteSearch
 from jaxnbv.tasks import Coverage
 from jaxnbv.tasks.classification import Classifier
@@ -34,13 +34,12 @@ _RANDOM_RUNS = 8
 
 
 class Truth(eqx.Module):
-    """The class, and what each candidate would truly show: scans with noise, and of procedural objects how many rays
-    hit what tells the class."""
+    """The class, and what each candidate would truly show: scans with noise, and how many rays hit what tells it."""
 
     label: int
     scans: PointCloud
-    thing: ClassObject | None
-    pixels: Int[Array, " candidates"] | None
+    thing: ClassObject | ClassMesh
+    pixels: Int[Array, " candidates"]
 
 
 class ClassificationStudy(Study):
@@ -86,9 +85,6 @@ class ClassificationStudy(Study):
     split: Split = eqx.field(static=True, default=Split.TEST)
     num_points: int = eqx.field(static=True, default=512)
     meshes: tuple[MeshFile, ...] = eqx.field(static=True, default=())
-
-    def __check_init__(self):
-        require(not (self.telling and self.meshes), f"what tells the {self.telling} of a mesh is not known: give none")
 
     @classmethod
     def configured(cls, model: ModelName, views: int, quick: bool, **options: Any) -> dict[str, Study]:
@@ -148,15 +144,20 @@ class ClassificationStudy(Study):
         """
         poses = self.candidates.poses()
         keys = jax.random.split(jax.random.fold_in(jax.random.key(3), index), self.num_candidates)
-        if self.meshes:
-            file = numbered(self.meshes, index)
-            mesh = file.read()
-            truth = Truth(file.label, _noisy(scan(mesh, self.camera, poses), keys), None, None)
-            return Scene(index, f"{self.objects.classes[file.label]} {file.name}", mesh, truth)
-        thing = self.objects.scene(self.split, index, self.framing)
+        name, thing = self.thing(index)
         pixels, scans = scan_telling(thing, self.camera, poses)
-        truth = Truth(int(thing.label), _noisy(scans, keys), thing, pixels)
-        return Scene(index, f"{self.network} {index}", SDFSurface(thing), truth)
+        return Scene(index, name, surface_of(thing), Truth(int(thing.label), _noisy(scans, keys), thing, pixels))
+
+    def thing(self, index: int) -> tuple[str, ClassObject | ClassMesh]:
+        """The object of a scene and its name."""
+        if not self.meshes:
+            return f"{self.network} {index}", self.objects.scene(self.split, index, self.framing)
+        file = numbered(self.meshes, index)
+        return f"{self.objects.classes[file.label]} {file.name}", self.of_mesh(file, index)
+
+    def of_mesh(self, file: MeshFile, index: int) -> ClassMesh:
+        """What a file of `meshes` gives."""
+        return ClassMesh(file.read(), file.label)
 
     def truth(self, scene: Scene) -> Truth:
         return scene.task
@@ -218,8 +219,7 @@ class ClassificationStudy(Study):
 
     def _run(self, chooser: Chooser, truth: Truth, visited: tuple[int, ...]) -> Record:
         log_p = [chooser.answer(visited[:count]).tolist() for count in range(1, len(visited) + 1)]
-        pixels = truth.pixels if truth.pixels is None else truth.pixels[np.array(visited)]
-        return {"candidates": list(visited), **self._shown(pixels), "log_p": log_p}
+        return {"candidates": list(visited), **self._shown(truth.pixels[np.array(visited)]), "log_p": log_p}
 
     def _random_run(self, index: int, first: int, run: int) -> tuple[int, ...]:
         others = np.delete(np.arange(self.num_candidates), first)
@@ -234,9 +234,8 @@ class ClassificationStudy(Study):
         log_p, pixels = [], []
         for view, *_ in episode:
             log_p.append(np.asarray(classify(self.classifier, view.cloud)).tolist())
-            if truth.thing is not None:
-                pose = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], view.pose)
-                pixels.append(int(scan_telling(truth.thing, self.camera, pose)[0][0]))
+            pose = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], view.pose)
+            pixels.append(int(scan_telling(truth.thing, self.camera, pose)[0][0]))
         return {"runs": [{**self._shown(pixels), "log_p": log_p}], "diagnostics": []}
 
     def _shown(self, pixels: Any) -> Record:

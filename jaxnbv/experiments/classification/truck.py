@@ -1,11 +1,15 @@
 """The study of the loaded truck: its outside is most of what can be seen, and says nothing of the cargo's class."""
 
 from collections.abc import Mapping
-from typing import ClassVar
+from pathlib import Path
+from typing import Any, ClassVar
 
 import equinox as eqx
 
-from jaxnbv.datasets import CLASS_SETS, ClassSet
+from jaxnbv.datasets import CLASS_SETS, ClassSet, MeshFile
+from jaxnbv.datasets.class_object import ClassMesh
+from jaxnbv.datasets.splits import scene_key
+from jaxnbv.datasets.truck_meshes import loaded_truck
 from jaxnbv.experiments.classification.measures import (
     HITS_EXPLAINED,
     ROUGHNESS,
@@ -16,11 +20,17 @@ from jaxnbv.experiments.classification.measures import (
 )
 from jaxnbv.experiments.classification.study import ClassificationStudy
 from jaxnbv.experiments.measures import Measure
-from jaxnbv.experiments.study import Chart, Panel
+from jaxnbv.experiments.meshes import mesh_files
+from jaxnbv.experiments.study import Chart, Panel, Study
+from jaxnbv.model_name import ModelName
+from jaxnbv.scanning import load_mesh
 
 
 class TruckStudy(ClassificationStudy):
-    """The class of a truck's cargo, from a random first view. Settings as of `ClassificationStudy`."""
+    """The class of a truck's cargo, from a random first view. Settings as of `ClassificationStudy`, and
+
+    - `trucks`: files of trucks that carry what `meshes` names.
+    """
 
     title: ClassVar[str] = "The class of a truck's cargo"
     explanation: ClassVar[str] = (
@@ -43,3 +53,20 @@ class TruckStudy(ClassificationStudy):
     seed: ClassVar[int] = 11
 
     num_points: int = eqx.field(static=True, default=1024)
+    trucks: tuple[str, ...] = eqx.field(static=True, default=())
+
+    @classmethod
+    def configured(cls, model: ModelName, views: int, quick: bool, **options: Any) -> dict[str, Study]:
+        """
+        - `meshes`: a folder with a folder `trucks` of meshes, and those of the cargo's classes, see `class_meshes`.
+
+        **Raises:** `ValueError` as of a `ClassificationStudy`, or if there is no truck.
+        """
+        if "meshes" in options:
+            options["trucks"] = mesh_files(Path(options["meshes"]) / "trucks")
+        return super().configured(model, views, quick, **options)
+
+    def of_mesh(self, file: MeshFile, index: int) -> ClassMesh:
+        """The cargo on the bed of one of the trucks, which take turns."""
+        truck = load_mesh(self.trucks[index % len(self.trucks)])
+        return loaded_truck(truck, file.read(), file.label, scene_key(self.seed, self.split, index))
