@@ -55,8 +55,8 @@ class Recipe(NamedTuple):
 RECIPES = {
     "pyramid": Recipe(tuple(Framing), solid=True, scenes=12_000, imagined=100),
     "truck": Recipe(scenes=8000, imagined=100, groups=(192, 48), focus=1200, steps=(2500, 2500)),
-    "household": Recipe(scenes=8000, imagined=100, groups=(192, 48), steps=(4000, 2000)),
-    "fruit": Recipe(solid=True, scenes=5000, imagined=80, groups=(192, 48), steps=(3000, 1500)),
+    "household": Recipe(scenes=8000, imagined=100, groups=(192, 48), steps=(4000, 1000)),
+    "fruit": Recipe(solid=True, scenes=5000, imagined=80, groups=(192, 48), steps=(3000, 800)),
 }
 
 
@@ -65,7 +65,7 @@ class Clouds:
 
     def __init__(self, name: str, folder: Path):
         self.set, self.recipe, self.folder = CLASS_SETS[name], RECIPES[name], folder
-        self.points = TRAINED_POINTS.get(name, 1024)
+        self.points = TRAINED_POINTS[name]
 
     def scanned(self, split: Split, framing: Framing, count: int) -> LabelledClouds:
         """Clouds of true scans."""

@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 
+from jaxnbv.checks import require
 from jaxnbv.datasets import CLASS_SETS, ClassSet, MeshFile
 from jaxnbv.datasets.class_object import ClassMesh
 from jaxnbv.datasets.splits import scene_key
@@ -54,6 +55,12 @@ class TruckStudy(ClassificationStudy):
 
     num_points: int = eqx.field(static=True, default=1024)
     trucks: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def __check_init__(self):
+        require(
+            bool(self.trucks) == bool(self.meshes),
+            f"{len(self.meshes)} meshes of cargo and {len(self.trucks)} of trucks: give both, or none",
+        )
 
     @classmethod
     def configured(cls, model: ModelName, views: int, quick: bool, **options: Any) -> dict[str, Study]:

@@ -3,6 +3,7 @@
 import functools
 import json
 from pathlib import Path
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -44,6 +45,12 @@ class Linear(eqx.Module):
         mean = jnp.sum(jnp.where(cloud.mask[:, None], rows, 0.0), axis=0) / jnp.maximum(cloud.count, 1)
         weight = jnp.asarray(np.random.default_rng(1).normal(size=(self.classes, 6)), mean.dtype)
         return jax.nn.log_softmax(2.0 * weight @ mean)
+
+
+class Unshipped(OmniObject3DStudy):
+    """Without a network."""
+
+    network: ClassVar[str] = "teapot"
 
 
 def small(kind, **settings):
@@ -192,7 +199,7 @@ def test_meshes_in_place_of_procedural_objects(tmp_path):
     assert picture.exists()
     with pytest.raises(InputError, match="no scene 2: the study has 2 meshes"):
         study.run_scene(2)
-    with pytest.raises(InputError, match="what tells the cargo of a mesh is not known"):
+    with pytest.raises(InputError, match="2 meshes of cargo and 0 of trucks: give both, or none"):
         small(TruckStudy, meshes=class_meshes(tmp_path, HOUSEHOLD))
 
 
@@ -205,8 +212,8 @@ def test_a_network_of_ones_own_takes_the_place_of_the_shipped_one(tmp_path):
     np.testing.assert_array_equal(study.classifier.network.head[1].bias, network.head[1].bias)
     with pytest.raises(InputError, match=r"tells 5 classes apart; the study has 10: bathtub, bed"):
         ModelNet10Study.configured(ModelName.SCREENED, 2, True, classifier=tmp_path / "mine.safetensors")
-    with pytest.raises(InputError, match="no classifier of 'fruit' ships: give the file of one"):
-        OmniObject3DStudy.configured(ModelName.SCREENED, 2, True)
+    with pytest.raises(InputError, match="no classifier of 'teapot' ships: give the file of one"):
+        Unshipped.configured(ModelName.SCREENED, 2, True)
 
 
 def test_a_method_of_ones_own_on_household_objects():

@@ -1,0 +1,105 @@
+"""How often a shipped classifier is right on real objects, as it is and tuned on a few of them.
+
+    python benchmarks/real_classes.py household FOLDER [--few 2] [--steps 300] [--out results.json]
+
+FOLDER holds a folder of meshes for each class, as `jaxnbv study modelnet10 --meshes` takes it. The first objects of
+each class, `few` of them where the class has more, tune the network, together with stand-ins so that it does not
+forget; the others test it. A cloud is of five random views with the sensor's noise, ten clouds an object; objects count
+alike, and their standard error is that over objects.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnbv import Camera, PointCloud
+from jaxnbv.cloud import farthest_point_subsample
+from jaxnbv.datasets import CLASS_SETS, Framing, MeshFile, Split
+from jaxnbv.experiments.meshes import class_meshes
+from jaxnbv.folders import versions
+from jaxnbv.networks import pretrained_classifier
+from jaxnbv.networks.pretrained import TRAINED_POINTS
+from jaxnbv.pose import look_at
+from jaxnbv.scanning import SensorNoise, scan
+from jaxnbv.sensors import SENSOR_RADIUS
+from jaxnbv.training import log_probabilities, train
+from jaxnbv.training.class_clouds import scanned_clouds
+
+CLOUDS, VIEWS, STAND_INS = 10, 5, 200
+
+
+def clouds_of(file: MeshFile, number: int, points: int) -> PointCloud:
+    """Clouds of an object, each of its own random views."""
+    mesh = file.read()
+    made = []
+    for key in jax.random.split(jax.random.fold_in(jax.random.key(0), number), CLOUDS):
+        place_key, noise_key = jax.random.split(key)
+        direction = jax.random.normal(place_key, (VIEWS, 3))
+        poses = look_at(SENSOR_RADIUS * direction / jnp.linalg.norm(direction, axis=-1, keepdims=True))
+        seen = SensorNoise()(scan(mesh, Camera(), poses), noise_key)
+        joined = PointCloud(seen.points.reshape(-1, 3), seen.normals.reshape(-1, 3), seen.mask.reshape(-1))
+        made.append(farthest_point_subsample(joined, points))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *made)
+
+
+def told(network, objects: list[tuple[MeshFile, PointCloud]], names: tuple[str, ...]) -> dict:
+    """The share of an object's clouds that the network is right about: mean and standard error over objects."""
+    shares = {
+        f"{names[file.label]} {file.name}": float(np.mean(log_probabilities(network, clouds).argmax(1) == file.label))
+        for file, clouds in objects
+    }
+    each = np.array(list(shares.values()))
+    error = float(each.std(ddof=1) / np.sqrt(len(each))) if len(each) > 1 else None
+    return {"objects": len(each), "right": float(each.mean()), "error": error, "by_object": shares}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("set", choices=sorted({"household", "fruit"}))
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--few", type=int, default=2)
+    parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--out", type=Path)
+    arguments = parser.parse_args()
+
+    names, points = CLASS_SETS[arguments.set].classes, TRAINED_POINTS[arguments.set]
+    files = class_meshes(arguments.folder, names)
+    objects = [(file, clouds_of(file, number, points)) for number, file in enumerate(files)]
+    few: list[tuple[MeshFile, PointCloud]] = []
+    rest: list[tuple[MeshFile, PointCloud]] = []
+    for label in sorted({file.label for file in files}):
+        of_class = [one for one in objects if one[0].label == label]
+        count = min(arguments.few, len(of_class) - 1)
+        few, rest = few + of_class[:count], rest + of_class[count:]
+
+    network = pretrained_classifier(arguments.set).network
+    results = {"versions": versions(), "tuned_on": [f"{names[f.label]} {f.name}" for f, _ in few]}
+    results["as it is"] = told(network, rest, names)
+    if few:
+        made = scanned_clouds(CLASS_SETS[arguments.set], Split.TRAIN, Framing.CLOSE_UP, range(STAND_INS), points)
+        clouds = jax.tree.map(
+            lambda *leaves: np.concatenate(leaves),
+            PointCloud(made.clouds.points, made.clouds.normals, made.clouds.mask),
+            *(PointCloud(of.points, of.normals, of.mask) for _, of in few),
+        )
+        labels = np.concatenate([made.labels, *(np.full(CLOUDS, file.label) for file, _ in few)])
+        tuned = train(network, clouds, labels, jax.random.key(1), arguments.steps, learning_rate=3e-4)
+        results["tuned"] = told(tuned, rest, names)
+    print(f"tuned on: {', '.join(results['tuned_on']) or 'none'}")
+    for state in ("as it is", "tuned"):
+        if state in results:
+            found = results[state]
+            error = "" if found["error"] is None else f" ± {found['error']:.0%}"
+            print(f"{state}: {found['right']:.0%}{error} right of {found['objects']} objects")
+            for name, share in found["by_object"].items():
+                print(f"    {share:4.0%}  {name}")
+    if arguments.out:
+        arguments.out.write_text(json.dumps(results, indent=2))
+
+
+if __name__ == "__main__":
+    main()
