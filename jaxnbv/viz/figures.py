@@ -24,7 +24,7 @@ from jaxnbv.viz.data import Choice, ReportData, ViewData
 from jaxnbv.viz.imagined_figures import imagined_figure
 from jaxnbv.viz.layout import fitted, flow, width_of
 from jaxnbv.viz.render import Still, draw_scene, painted
-from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, few_ticks, round_range
+from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, round_range, spaced_ticks
 from jaxnbv.viz.task_figures import chart_figure, coverage_series, draw_coverage, draw_values, task_charts
 from jaxnbv.viz.trajectory_figures import draw_ascents, trajectory_figure
 from jaxnbv.viz.words import percent
@@ -131,9 +131,9 @@ def _view(data: ReportData, index: int, camera: Camera, stills: Stills) -> Figur
     figure = Figure(figsize=(8.4, 4.3))
     draw_scene(figure.add_axes((0.0, 0.16, 0.5, 0.78)), data, index, stills[index], camera)
     figure.text(0.015, 0.955, f"View {view.number}", fontsize=11, fontweight="bold", va="center")
-    flow(figure, _POINTS, 0.125, 0.955, 0.37, 0.045, 8)
+    flow(figure, _POINTS, 0.125, 0.955, 0.37, 0.045, 8.0)
     _deviation_bar(figure, (0.08, 0.115, 0.34, 0.022), norm)
-    fitted(figure, 0.52, 0.955, _map_title(view, data.quantity), 0.47, 10, va="center")
+    fitted(figure, 0.52, 0.955, _map_title(view, data.quantity), 0.47, 10.0, va="center")
     if view.choice is None:
         draw_acquisition(figure.add_axes((0.52, 0.22, 0.46, 0.66)), None, data.quantity)
         return figure
@@ -144,7 +144,7 @@ def _view(data: ReportData, index: int, camera: Camera, stills: Stills) -> Figur
         marks += [("○ start, ● end of an ascent", INK)]
     if view.spatial_ascents is not None:
         marks.append(("(directions of the cameras; map: cameras that look at the centre)", GREY))
-    flow(figure, marks, 0.52, 0.905, 0.47, 0.04, 8)
+    flow(figure, marks, 0.52, 0.905, 0.47, 0.04, 8.0)
     colours = draw_acquisition(figure.add_axes((0.54, 0.35, 0.42, 0.5)), view.choice, data.quantity)
     draw_candidates(figure.add_axes((0.58, 0.15, 0.34, 0.17)), view.choice)
     assert colours is not None
@@ -152,7 +152,7 @@ def _view(data: ReportData, index: int, camera: Camera, stills: Stills) -> Figur
     bar.outline.set_visible(False)
     bar.locator = MaxNLocator(5)
     bar.formatter = FuncFormatter(lambda value, _: number(value))
-    fitted(figure, 0.75, 0.02, _bar_label(view.choice, data.quantity), 0.46, 9, ha="center", va="center")
+    fitted(figure, 0.75, 0.02, _bar_label(view.choice, data.quantity), 0.46, 9.0, ha="center", va="center")
     return figure
 
 
@@ -167,7 +167,9 @@ def _map_title(view: ViewData, quantity: Quantity) -> str:
 def _deviation_bar(figure: Figure, place: tuple[float, float, float, float], norm: LogNorm, size: float = 9.0) -> None:
     bar = figure.colorbar(ScalarMappable(norm, DEVIATION), cax=figure.add_axes(place), orientation="horizontal")
     bar.outline.set_visible(False)
-    bar.set_ticks(few_ticks(*bar.ax.get_xlim(), most=5 if place[2] * figure.get_figwidth() < 2.4 else 7).tolist())
+    # The longest number has some six letters, which are less than two thirds as wide as high.
+    gap = 4.2 * size / 72.0 / (place[2] * figure.get_figwidth())
+    bar.set_ticks(spaced_ticks(*bar.ax.get_xlim(), gap).tolist())
     bar.ax.xaxis.set_minor_locator(NullLocator())
     bar.ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     bar.ax.tick_params(labelsize=size)
@@ -294,6 +296,6 @@ def overview_figure(data: ReportData, camera: Camera, stills: Stills | None = No
     _deviation_bar(figure, place(0.6, base - 0.35, long, 0.13), norm, 12.0)
     x, y, room = (0.5 * width + 0.1, base - 0.25, 0.5 * width - 0.3) if beside else (0.3, base - 1.1, width - 0.6)
     text = f"Maps: {data.quantity.name}, pale (low) to dark (high)"
-    fitted(figure, *place(x, y)[:2], text, room / width, 13, va="center")
-    flow(figure, marks, *place(x, y - 0.28)[:2], room / width, 0.26 / tall, 12)
+    fitted(figure, *place(x, y)[:2], text, room / width, 13.0, va="center")
+    flow(figure, marks, *place(x, y - 0.28)[:2], room / width, 0.26 / tall, 12.0)
     return figure

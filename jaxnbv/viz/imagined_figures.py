@@ -82,7 +82,7 @@ def imagined_figure(data: ReportData, index: int) -> Figure:
     heads = (f"What was imagined from the pose of view {index + 1} (grey: seen before)", f"Expected and seen. {scale}")
     for row, (head, tiles) in enumerate(zip(heads, (above, below), strict=True)):
         top = tall - 0.22 - row * (_TILE + _HEAD + 0.4)
-        fitted(figure, *share(_GAP, top), head, 1.0 - 2 * _GAP / width, 9, va="center")
+        fitted(figure, *share(_GAP, top), head, 1.0 - 2 * _GAP / width, 9.0, va="center")
         for column, tile in enumerate(tiles):
             x, y = _GAP + column * (_TILE + _GAP), top - 0.16 - _TILE
             axes = figure.add_axes((*share(x, y), *share(_TILE, _TILE)))
@@ -90,5 +90,5 @@ def imagined_figure(data: ReportData, index: int) -> Figure:
             axes.set(xticks=[], yticks=[])
             for side in axes.spines.values():
                 side.set(visible=True, color=GREY, linewidth=0.6)
-            fitted(figure, *share(x, y - 0.13), tile.name, _TILE / width, 8, va="center")
+            fitted(figure, *share(x, y - 0.13), tile.name, _TILE / width, 8.0, va="center")
     return figure

@@ -25,7 +25,7 @@ from jaxnbv.viz.style import (
     VALUE,
     VALUE_LINES,
     colour_scale,
-    few_ticks,
+    spaced_ticks,
 )
 from jaxnbv.viz.task_figures import coverage_series
 from jaxnbv.viz.trajectories import Ascents
@@ -36,12 +36,14 @@ _MAX_POINTS, _MAX_VERTICES = 9000, 48_000
 _FEWEST_POINTS, _MOST_POINTS = 400, 1500
 _FEWEST_VERTICES, _MOST_VERTICES = 1500, 9000
 _QUALITY = 82
+# Between numbers under the bar, of its width on a phone.
+_TICK_GAP = 0.14
 
 
 def payload(data: ReportData, camera: Camera) -> dict:
     """All of it."""
     low, high = deviation_range(data)
-    ticks = few_ticks(low, high)
+    ticks = spaced_ticks(low, high, _TICK_GAP)
     label, series = coverage_series(data)
     count = len(data.views)
     points = min(max(_MAX_POINTS // count, _FEWEST_POINTS), _MOST_POINTS)

@@ -40,14 +40,17 @@ def log_ticks(low: float, high: float) -> Float[np.ndarray, " n"]:
     return ticks[(ticks >= low * 0.9999) & (ticks <= high * 1.0001)]
 
 
-def few_ticks(low: float, high: float, most: int = 7) -> Float[np.ndarray, " n"]:
-    """As `log_ticks`, but without the twos, then without the fives, where there is no room for so many."""
+def spaced_ticks(low: float, high: float, gap: float) -> Float[np.ndarray, " n"]:
+    """Those of `log_ticks` that have room: no two nearer than a share `gap` of the axis, powers of ten before fives
+    before twos."""
     ticks = log_ticks(low, high)
-    for dropped in (2.0, 5.0):
-        if len(ticks) > most:
-            first = ticks / 10.0 ** np.floor(np.log10(ticks) + 1e-9)
-            ticks = ticks[np.abs(first - dropped) > 1e-6]
-    return ticks[:: max(1, -(-len(ticks) // most))]
+    at = np.log(ticks / low) / np.log(high / low)
+    first = np.round(ticks / 10.0 ** np.floor(np.log10(ticks) + 1e-9))
+    chosen: list[int] = []
+    for index in sorted(range(len(ticks)), key=lambda index: {1.0: 0, 5.0: 1}.get(first[index], 2)):
+        if all(abs(at[index] - at[other]) >= gap for other in chosen):
+            chosen.append(index)
+    return ticks[sorted(chosen)]
 
 
 def save_figure(figure: Figure, path: Path) -> None:

@@ -16,7 +16,7 @@ from jaxnbv.answers import Panel, number
 from jaxnbv.viz.data import COVERAGE_RADIUS, ReportData
 from jaxnbv.viz.style import BEFORE, GREY, INK, LINE, NEW, SERIES
 
-_MOST_NAMES = 8
+_MOST_NAMES, _LONGEST_NAME = 6, 22
 
 
 def shown_names(panels: tuple[Panel, ...]) -> list[int]:
@@ -34,7 +34,7 @@ def draw_panel(axes: Axes, panels: tuple[Panel, ...]) -> None:
     colours = _colours(last, chosen)
     handles: list[Any] = []
     for place, index in enumerate(chosen):
-        name, colour = last.names[index], colours[place]
+        name, colour = textwrap.shorten(last.names[index], _LONGEST_NAME, placeholder="…"), colours[place]
         if last.bars:
             width = 0.8 / len(chosen)
             at = views + width * (place - 0.5 * (len(chosen) - 1))
@@ -46,7 +46,8 @@ def draw_panel(axes: Axes, panels: tuple[Panel, ...]) -> None:
         handles.append(Line2D([], [], color=colour, marker="o", ms=5, label=name))
         if last.true is not None:
             axes.axhline(last.true[index], color=colour, lw=1.2, ls="--", zorder=1)
-            handles.append(Line2D([], [], color=colour, lw=1.2, ls="--", label=f"{name}, in truth"))
+    if last.true is not None and not last.bars:
+        handles.append(Line2D([], [], color=GREY, lw=1.2, ls="--", label="in truth"))
     if last.goal is not None:
         axes.axhline(last.goal, color=GREY, lw=1.0, ls=":", zorder=1)
     if len(handles) > 1:

@@ -81,8 +81,8 @@ def trajectory_figure(data: ReportData, index: int, camera: Camera) -> Figure:
         label.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
     figure.text(0.03, 0.95, f"Gradient ascents to view {view.number}", fontsize=10, fontweight="bold")
     marks = [("● points before", BEFORE), ("cameras of ascents: thin at the start, thick at the end", INK)]
-    flow(figure, marks, 0.03, 0.918, 0.94, 0.035, 8)
+    flow(figure, marks, 0.03, 0.918, 0.94, 0.035, 8.0)
     bar = figure.colorbar(colours, cax=figure.add_axes((0.14, 0.1, 0.72, 0.02)), orientation="horizontal")
     bar.outline.set_visible(False)
-    fitted(figure, 0.5, 0.02, f"{data.quantity.label} along the ascents", 0.94, 9, ha="center", va="center")
+    fitted(figure, 0.5, 0.02, f"{data.quantity.label} along the ascents", 0.94, 9.0, ha="center", va="center")
     return figure
