@@ -64,7 +64,7 @@ class NegativeEntropy(eqx.Module):
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> "ClassAnswer | None":
         """The object's own class, where it says one."""
-        return _label(scene, self.answer(cloud))
+        return _true_class(scene, cloud, self.answer)
 
     def check(self, cloud: PointCloud) -> None:
         """**Raises:** `ValueError` if the classifier's answer on D is not a vector of log-probabilities."""
@@ -97,7 +97,7 @@ class ClassScore(Score):
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> "ClassAnswer | None":
         """The object's own class, where it says one."""
-        return _label(scene, self.answer(cloud))
+        return _true_class(scene, cloud, self.answer)
 
     def check(self, cloud: PointCloud) -> None:
         """**Raises:** `ValueError` if the classifier's answer on D is not a vector of log-probabilities, one for each
@@ -208,12 +208,13 @@ class ClassAnswer(Answer):
         return (Panel("probability", self.names, self.values, true, bars=True, goal=_SURE),)
 
 
-def _label(scene: Surface, answer: ClassAnswer) -> ClassAnswer | None:
-    """The answer that a scene's own class would be, in the names of another."""
+def _true_class(scene: Surface, cloud: PointCloud, answer: Callable[[PointCloud], ClassAnswer]) -> ClassAnswer | None:
+    """The answer that a scene's own class would be, in the names of that on a cloud."""
     label = getattr(getattr(scene, "sdf", None), "label", None)
-    if not isinstance(label, Array) or label.ndim > 0 or not 0 <= int(label) < len(answer.names):
+    if not isinstance(label, Array) or label.ndim > 0:
         return None
-    return ClassAnswer(answer.names, np.eye(len(answer.names))[int(label)])
+    names = answer(cloud).names
+    return ClassAnswer(names, np.eye(len(names))[int(label)]) if 0 <= int(label) < len(names) else None
 
 
 def _answer(classifier: Classifier, log_p: Float[Array, " classes"]) -> ClassAnswer:

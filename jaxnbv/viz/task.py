@@ -14,7 +14,7 @@ from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, mesh_from_s
 _TRUE_POINTS = 8192
 
 
-class Coverage(Answer):
+class CoverageAnswer(Answer):
     """The share of the true surface that was seen, or where that is not known the number of points.
 
     - `radius`: within which of the cloud a place counts as seen, in scene units; None where points are counted.
@@ -60,7 +60,7 @@ class Task(eqx.Module):
     @property
     def is_coverage(self) -> bool:
         """Whether its answer is how much was seen."""
-        return isinstance(self.answers[-1], Coverage)
+        return isinstance(self.answers[-1], CoverageAnswer)
 
 
 def task_of(episode: Episode, covered: list[float | None], radius: float) -> Task:
@@ -100,10 +100,10 @@ def since(answers: list[Answer]) -> int | None:
     return None if not relied[-1] else len(relied) - int(np.argmin([*relied[::-1], False]) - 1)
 
 
-def _coverage(count: int, share: float | None, radius: float) -> Coverage:
+def _coverage(count: int, share: float | None, radius: float) -> CoverageAnswer:
     if share is None:
-        return Coverage(("points kept",), np.array([float(count)]), "{:,.0f}")
-    return Coverage(("of the surface seen",), np.array([share]), radius=radius)
+        return CoverageAnswer(("points kept",), np.array([float(count)]), "{:,.0f}")
+    return CoverageAnswer(("of the surface seen",), np.array([share]), radius=radius)
 
 
 def _asked(planner: Planner) -> str:
