@@ -21,7 +21,7 @@ from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError, check_fields, checked, require, shown
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.pose import Pose
-from jaxnbv.scanning import GridSurface, scan
+from jaxnbv.scanning import GridSurface, Surface, scan
 
 
 class Score(eqx.Module):
@@ -50,6 +50,13 @@ class Score(eqx.Module):
         """What D tells of what the score asks, for the report and the terminal; None where there is nothing to tell."""
         return None
 
+    def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
+        """What `answer` should come to in the end, for the report; None where that is not known.
+
+        - `scene`: the true surface; `cloud`: points all over it, uniform by area.
+        """
+        return self.answer(cloud)
+
     def check(self, cloud: PointCloud) -> None:
         """Raise `ValueError` if what the score is made of gives something impossible on a first D."""
         return
@@ -71,7 +78,7 @@ class ExpectedUtilityImprovement(Score):
       added to it: for a utility that looks at so many points anyway, and would sample D again for every scan.
 
     A utility may say more of itself by attributes: `improvement`, the `Quantity` of what is expected; `answer(cloud)`,
-    and `check(cloud)`, as of a `Score`; `batch_size`. A plain function has its name.
+    `true_answer(scene, cloud)` and `check(cloud)`, as of a `Score`; `batch_size`. A plain function has its name.
     """
 
     utility: Callable[[PointCloud], Float[Array, ""]]
@@ -107,6 +114,11 @@ class ExpectedUtilityImprovement(Score):
         """The utility's own answer, or its value."""
         own = getattr(self.utility, "answer", None)
         return Answer((self._name,), np.array([float(context_of(self, cloud)[1])])) if own is None else own(cloud)
+
+    def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
+        """The utility's own, or its answer on all of the surface."""
+        own = getattr(self.utility, "true_answer", None)
+        return self.answer(cloud) if own is None else own(scene, cloud)
 
     def check(self, cloud: PointCloud) -> None:
         """**Raises:** `ValueError` as the utility's own `check` does, or if u(D) is not a finite number."""

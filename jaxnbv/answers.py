@@ -1,8 +1,13 @@
 """What is sought and what is known, in words: what the values of a search mean, and what the cloud answers."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+
+# An answer that changes by less than this share from one view to the next has settled.
+_SETTLED = 0.05
 
 
 class Quantity(eqx.Module):
@@ -27,13 +32,32 @@ class Quantity(eqx.Module):
         return f"{number(value)} {self.unit}" if self.unit.startswith("scene units") else number(value)
 
 
+class Panel(NamedTuple):
+    """A chart's numbers at one view.
+
+    - `label`: of its axis, with the unit.
+    - `names`, `values`: one each.
+    - `true`: what the values would be if all of the surface had been seen; None where that is not known.
+    - `bars`: whether they are drawn beside each other, view by view, rather than as lines over the views.
+    - `goal`: a value to be reached; None without one.
+    """
+
+    label: str
+    names: tuple[str, ...]
+    values: Float[np.ndarray, " n"]
+    true: Float[np.ndarray, " n"] | None = None
+    bars: bool = False
+    goal: float | None = None
+
+
 class Answer(eqx.Module):
     """What D tells of the question that the views are for: numbers with names.
 
     - `names`, `values`: one each.
     - `form`: how a value is written, in the language of `str.format`.
 
-    A task whose answer reads otherwise overrides `sentence`, or both.
+    A task whose answer reads otherwise overrides `line` and `sentence`; one that is charted otherwise, `panels`; one
+    that is sure in another sense, `settled` and `settled_means`.
     """
 
     names: tuple[str, ...]
@@ -63,6 +87,36 @@ class Answer(eqx.Module):
 
         text = ", ".join(map(one, self.shown))
         return f"{text[:1].upper()}{text[1:]}."
+
+    @property
+    def question(self) -> str:
+        """What was asked, for the head of the report."""
+        names = " and ".join(self.names[index] for index in self.shown)
+        return f"{names[:1].upper()}{names[1:]}?"
+
+    @property
+    def found(self) -> str:
+        """The answer in short."""
+        return self.line()
+
+    @property
+    def settled_means(self) -> str:
+        """What `settled` asks, in words."""
+        return f"within {100 * _SETTLED:.0f} % of the view before"
+
+    def settled(self, before: "Answer | None") -> bool:
+        """Whether the answer can be relied on, given that of the view before."""
+        if before is None:
+            return False
+        return bool(np.allclose(self.values[list(self.shown)], before.values[list(self.shown)], rtol=_SETTLED))
+
+    def panels(self, truth: "Answer | None") -> tuple[Panel, ...]:
+        """Its charts at this view, the same ones at every view.
+
+        `truth`: the answer if all of the surface had been seen; None where that is not known.
+        """
+        names, shown = tuple(self.names[index] for index in self.shown), list(self.shown)
+        return (Panel(", ".join(names), names, self.values[shown], None if truth is None else truth.values[shown]),)
 
 
 def coordinates(point: Float[np.ndarray, "3"]) -> str:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
+from jaxnbv.cloud import PointCloud
 from jaxnbv.planner import Planner
 from jaxnbv.pose import Pose
 from jaxnbv.scanning import GridSurface, scan_samples
@@ -54,12 +55,19 @@ def planner_at(planner: Planner, camera: Camera, box: Box, poses: Pose | None) -
 
 @eqx.filter_jit
 def expected_depth(planner: Planner, surfaces: GridSurface, pose: Pose) -> Float[Array, "h w"]:
-    """Mean depth along the camera's axis (scene units) over the samples that a ray hits; NaN where it misses most."""
+    """What `mean_depth` is of the planner's camera and samples."""
     camera = planner.camera
     scans = scan_samples(surfaces, camera, pose[None], planner.barrier(pose[None]))
-    depth = jnp.einsum("spnd,d->sn", scans.points - pose.position, pose.forward, precision="highest")
-    hit = scans.mask[:, 0]
-    count = jnp.sum(hit, axis=0)
-    mean = jnp.sum(jnp.where(hit, depth, 0.0), axis=0) / jnp.maximum(count, 1)
-    mean = jnp.where(2 * count >= hit.shape[0], mean, jnp.nan)
-    return mean.reshape(camera.height, camera.width)
+    return mean_depth(jax.tree.map(lambda rows: rows[:, 0], scans), pose).reshape(camera.height, camera.width)
+
+
+@eqx.filter_jit
+def mean_depth(scans: PointCloud, pose: Pose) -> Float[Array, " rays"]:
+    """Mean depth along the camera's axis (scene units) over the samples that a ray hits; NaN where it misses most.
+
+    `scans`: of all samples from the pose, along a leading axis.
+    """
+    depth = jnp.einsum("snd,d->sn", scans.points - pose.position, pose.forward, precision="highest")
+    count = jnp.sum(scans.mask, axis=0)
+    mean = jnp.sum(jnp.where(scans.mask, depth, 0.0), axis=0) / jnp.maximum(count, 1)
+    return jnp.where(2 * count >= scans.mask.shape[0], mean, jnp.nan)

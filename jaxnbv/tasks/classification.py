@@ -13,13 +13,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnbv.acquisition import Score, context_of, preferred_batch_size, zero_if_empty
-from jaxnbv.answers import Answer, Quantity
+from jaxnbv.answers import Answer, Panel, Quantity
 from jaxnbv.checks import check_fields, require
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
+from jaxnbv.scanning import Surface
 
 Classifier: TypeAlias = Callable[[PointCloud], Float[Array, " classes"]]
 # Their shape is checked by `Score.check`.
 Context: TypeAlias = tuple[PointCloud, Array]
+# By when a reader may rely on a class.
+_SURE = 0.95
 
 
 def entropy(log_p: Float[Array, "*batch classes"]) -> Float[Array, "*batch"]:
@@ -59,6 +62,10 @@ class NegativeEntropy(eqx.Module):
         """The probabilities of the classes."""
         return _answer(self.classifier, _log_p(self.classifier, cloud))
 
+    def true_answer(self, scene: Surface, cloud: PointCloud) -> "ClassAnswer | None":
+        """The object's own class, where it says one."""
+        return _true_class(scene, cloud, self.answer)
+
     def check(self, cloud: PointCloud) -> None:
         """**Raises:** `ValueError` if the classifier's answer on D is not a vector of log-probabilities."""
         check_log_p(_log_p(self.classifier, cloud))
@@ -87,6 +94,10 @@ class ClassScore(Score):
     def answer(self, cloud: PointCloud) -> "ClassAnswer":
         """The probabilities of the classes given D."""
         return _answer(self.classifier, context_of(self, cloud)[1])
+
+    def true_answer(self, scene: Surface, cloud: PointCloud) -> "ClassAnswer | None":
+        """The object's own class, where it says one."""
+        return _true_class(scene, cloud, self.answer)
 
     def check(self, cloud: PointCloud) -> None:
         """**Raises:** `ValueError` if the classifier's answer on D is not a vector of log-probabilities, one for each
@@ -167,6 +178,43 @@ class ClassAnswer(Answer):
             behind = "" if best == previous else f", behind {self.names[previous]} with {before.values[previous]:.2f}"
             text += f" (was {before.values[best]:.2f}{behind})"
         return f"{text}."
+
+    @property
+    def question(self) -> str:
+        return "Which class is it?"
+
+    @property
+    def found(self) -> str:
+        best = int(np.argmax(self.values))
+        p = self.values[best]
+        return self.names[best] if p == 1.0 else f"{self.names[best]}, probability {p:.2f}"
+
+    @property
+    def settled_means(self) -> str:
+        return f"probability {_SURE} or more"
+
+    def settled(self, before: Answer | None) -> bool:
+        """Sure, and not of another class than the view before was sure of."""
+        contradicted = (
+            before is not None
+            and before.values.max() >= _SURE
+            and int(np.argmax(before.values)) != int(np.argmax(self.values))
+        )
+        return bool(self.values.max() >= _SURE) and not contradicted
+
+    def panels(self, truth: Answer | None) -> tuple[Panel, ...]:
+        """The probabilities of all classes; of the truth, 1 and 0."""
+        true = None if truth is None else truth.values
+        return (Panel("probability", self.names, self.values, true, bars=True, goal=_SURE),)
+
+
+def _true_class(scene: Surface, cloud: PointCloud, answer: Callable[[PointCloud], ClassAnswer]) -> ClassAnswer | None:
+    """The answer that a scene's own class would be, in the names of that on a cloud."""
+    label = getattr(getattr(scene, "sdf", None), "label", None)
+    if not isinstance(label, Array) or label.ndim > 0:
+        return None
+    names = answer(cloud).names
+    return ClassAnswer(names, np.eye(len(names))[int(label)]) if 0 <= int(label) < len(names) else None
 
 
 def _answer(classifier: Classifier, log_p: Float[Array, " classes"]) -> ClassAnswer:

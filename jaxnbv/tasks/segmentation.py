@@ -6,6 +6,7 @@ the cloud's, where the segmenter thins it; `jaxnbv.networks.CloudSegmenter` make
 function outside JAX. In an attribute `part_names`, by their index, it may say which parts it is asked for.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from typing import TypeAlias
 
@@ -16,9 +17,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxnbv.acquisition import preferred_batch_size
-from jaxnbv.answers import Answer, Quantity
+from jaxnbv.answers import Answer, Panel, Quantity
 from jaxnbv.checks import check_fields, require, shown
 from jaxnbv.cloud import PointCloud
+from jaxnbv.scanning import Surface
 
 # Of probabilities in 32 bits, or less.
 _SLACK = 1e-2
@@ -80,14 +82,24 @@ class SoftPartCount(eqx.Module):
         counts = np.asarray(_counts(self.segmenter, cloud), np.float64)
         known: Mapping[int, str] | None = getattr(self.segmenter, "part_names", None)
         names = tuple((known or {}).get(index, f"part {index}") for index in range(len(counts)))
-        return PartAnswer(names, counts, asked=tuple(np.flatnonzero(counts > 0).tolist() if known is None else known))
+        asked = tuple(np.flatnonzero(counts > 0).tolist() if known is None else known)
+        return PartAnswer(names, counts, asked=asked, target=self.target)
+
+    def true_answer(self, scene: Surface, cloud: PointCloud) -> "PartAnswer":
+        """Of a solid with labels, how many points of its surface belong to each; of others, the answer on all of it."""
+        answer, label = self.answer(cloud), getattr(getattr(scene, "sdf", None), "label", None)
+        if not callable(label):
+            return answer
+        counts = np.bincount(np.asarray(label(cloud.points))[np.asarray(cloud.mask)], minlength=len(answer.names))
+        return dataclasses.replace(answer, values=counts[: len(answer.names)].astype(np.float64))
 
 
 class PartAnswer(Answer):
-    """How many points are predicted of each part; `asked`: of which it is told."""
+    """How many points are predicted of each part; `asked`: of which it is told; `target`: N_target."""
 
     form: str = "{:.0f}"
     asked: tuple[int, ...] = ()
+    target: float = 60.0
 
     @property
     def shown(self) -> tuple[int, ...]:
@@ -96,6 +108,31 @@ class PartAnswer(Answer):
     def sentence(self, before: Answer | None = None) -> str:
         listed = ", ".join(f"{self.names[index]} {self.values[index]:.0f}" for index in self.shown) or "none"
         return f"Points predicted of each part: {listed}."
+
+    @property
+    def question(self) -> str:
+        return "Which parts does it have?"
+
+    @property
+    def found(self) -> str:
+        parts = [self.names[index] for index in self.shown if self.values[index] >= self.target]
+        return ", ".join(parts) or "no part yet"
+
+    @property
+    def settled_means(self) -> str:
+        return f"{self.target:g} points or more of every part"
+
+    def settled(self, before: Answer | None) -> bool:
+        return all(self.values[index] >= self.target for index in self.shown)
+
+    def panels(self, truth: Answer | None) -> tuple[Panel, ...]:
+        """The points of each part, and how many parts have N_target of them; of the truth, those that it has at all."""
+        shown = sorted({*self.shown, *(() if truth is None else truth.shown)})
+        names = tuple(self.names[index] for index in shown)
+        found = np.array([np.sum(self.values[shown] >= self.target)], np.float64)
+        there = None if truth is None else np.array([np.sum(truth.values[shown] > 0)], np.float64)
+        points = Panel("points predicted of each part", names, self.values[shown], bars=True, goal=self.target)
+        return Panel(f"parts found ({self.target:g} points or more)", ("parts",), found, there), points
 
 
 @eqx.filter_jit

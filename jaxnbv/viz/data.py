@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from jaxnbv.answers import Answer, Quantity
+from jaxnbv.answers import Quantity
 from jaxnbv.checks import AnyArray
 from jaxnbv.episode import Episode
 from jaxnbv.metrics import coverage, truth_points
@@ -18,7 +18,10 @@ from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.state import State
 from jaxnbv.surfaces import TrigonometricPosterior
+from jaxnbv.viz.imagined import Imagined, Look, imagined, look
 from jaxnbv.viz.sphere import unit
+from jaxnbv.viz.stage import Stage, stage_of
+from jaxnbv.viz.task import Task, task_of
 from jaxnbv.viz.trajectories import Ascents, SphereMap, ascents_of, open_values, wider_map
 from jaxnbv.viz.words import describe_choice, describe_first
 
@@ -53,6 +56,8 @@ class Choice(eqx.Module):
     - `map`: the values that the map is drawn from: the candidates', where they are enough.
     - `ascents`: the trajectories of a gradient search, none of which is among the candidates here; else None.
     - `level`: how many other candidates cannot be told from the best one by the samples; None where it is not known.
+    - `errors`: standard errors of the values, and `error` that of the chosen one; None where they are not known.
+    - `is_level`: which candidates the samples cannot tell from the best one, itself included; none where not known.
     """
 
     directions: Float[np.ndarray, "c 3"]
@@ -63,6 +68,9 @@ class Choice(eqx.Module):
     map: SphereMap
     ascents: Ascents | None
     level: int | None = None
+    errors: Float[np.ndarray, " c"] | None = None
+    error: float | None = None
+    is_level: Bool[np.ndarray, " c"] | None = None
 
     @property
     def visited(self) -> Bool[np.ndarray, " c"]:
@@ -84,7 +92,8 @@ class ViewData(eqx.Module):
     - `coverage`: share of the true surface within `COVERAGE_RADIUS` of the cloud; None where the truth is not known.
     - `count`: points of the cloud after this view.
     - `sentence`: what happened, in words.
-    - `answer`: what is known of the object after this view; None for a task that has no answer but the cloud.
+    - `imagined`: what was imagined before it was taken; None for a view that was given.
+    - `look`: the scan itself; None where it is no image.
     """
 
     number: int
@@ -96,7 +105,8 @@ class ViewData(eqx.Module):
     coverage: float | None
     count: int
     sentence: str
-    answer: Answer | None
+    imagined: Imagined | None = None
+    look: Look | None = None
 
     @property
     def spatial_ascents(self) -> Ascents | None:
@@ -113,68 +123,81 @@ class ViewData(eqx.Module):
 
 
 class ReportData(eqx.Module):
-    """All views of an episode, and what the values of its search mean."""
+    """All views of an episode, what the values of its search mean, what the views were for, whence they are drawn."""
 
     views: tuple[ViewData, ...]
     quantity: Quantity
+    task: Task
+    stage: Stage
 
 
-def report_data(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, progress: bool = True) -> ReportData:
-    """Everything that the pictures of an episode show. Conditions the model once a view; nothing recompiles after the
-    first.
+def report_data(
+    episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, progress: bool = True, imagine: bool = True
+) -> ReportData:
+    """Everything that the pictures of an episode show. Conditions the model once a view, and draws the samples of each
+    step again; nothing recompiles after the first.
 
-    `truth`: points of the true surface (scene coordinates); by default sampled from the scene, where it can be.
+    - `truth`: points of the true surface (scene coordinates); by default sampled from the scene, where it can be.
+    - `imagine`: whether what the steps imagined is shown.
     """
     planner = episode.planner
     if truth is None and episode.scene is not None:
         truth = truth_points(episode.scene, jax.random.key(0))
     values = planner.quantity
+    covered = [None if truth is None else coverage(view.cloud, truth, COVERAGE_RADIUS) for view in episode.views]
+    task = task_of(episode, covered, COVERAGE_RADIUS)
     drawn: list[ViewData] = []
-    states = episode.states()
-    for index, view in enumerate(tqdm(episode.views, desc="drawing views", disable=not progress)):
-        covered = None if truth is None else coverage(view.cloud, truth, COVERAGE_RADIUS)
-        before = drawn[-1] if drawn else None
+    known: State | None = None
+    bar = tqdm(
+        zip(episode.views, episode.states(), strict=True), "drawing views", len(episode.views), disable=not progress
+    )
+    for index, (view, state) in enumerate(bar):
         choice = None if view.proposal is None else choice_of(view.proposal, wider_map(episode, index))
         new, _ = view.scan.to_numpy()
-        count = int(view.cloud.count)
-        if choice is None or before is None:
-            words = describe_first(view.pose, len(new), covered)
-        else:
-            earlier = [other.pose for other in episode.views[:index]]
-            change = None if covered is None or before.coverage is None else (before.coverage, covered)
-            others = tuple(choice.open_values.tolist())
-            starts = 0 if choice.ascents is None else len(choice.ascents.values)
-            words = describe_choice(
-                values,
-                choice.value,
-                choice.rank,
-                others,
-                starts,
-                view.pose,
-                earlier,
-                len(new),
-                count,
-                change,
-                choice.level,
-            )
-        answer = planner.acquisition.answer(view.cloud)
-        if answer is not None:
-            words += f" {answer.sentence(None if before is None else before.answer)}"
+        before = episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), new.dtype)
+        camera = view.camera or planner.camera
         drawn.append(
             ViewData(
                 number=index + 1,
                 pose=view.pose,
-                before=episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), new.dtype),
+                before=before,
                 new=new,
-                surface=mean_surface(planner, next(states)),
+                surface=mean_surface(planner, state),
                 choice=choice,
-                coverage=covered,
-                count=count,
-                sentence=f"View {index + 1} {words}",
-                answer=answer,
+                coverage=covered[index],
+                count=int(view.cloud.count),
+                sentence=_sentence(episode, index, choice, covered, task),
+                imagined=imagined(episode, index, known) if imagine and known is not None else None,
+                look=look(view.scan, camera, view.pose, before) if view.scan.capacity == camera.num_rays else None,
             )
         )
-    return ReportData(tuple(drawn), values)
+        known = state
+    surfaces = [view.surface.vertices for view in drawn if view.surface is not None]
+    return ReportData(tuple(drawn), values, task, stage_of(episode, surfaces))
+
+
+def _sentence(episode: Episode, index: int, choice: Choice | None, covered: list[float | None], task: Task) -> str:
+    view, before = episode.views[index], covered[index - 1] if index else None
+    points, after = int(view.scan.count), covered[index]
+    if choice is None or not index:
+        words = describe_first(view.pose, points, after)
+    else:
+        words = describe_choice(
+            episode.planner.quantity,
+            choice.value,
+            choice.rank,
+            tuple(choice.open_values.tolist()),
+            0 if choice.ascents is None else len(choice.ascents.values),
+            view.pose,
+            [other.pose for other in episode.views[:index]],
+            points,
+            int(view.cloud.count),
+            None if before is None or after is None else (before, after),
+            choice.level,
+        )
+    if not task.is_coverage:
+        words += f" {task.answers[index].sentence(task.answers[index - 1] if index else None)}"
+    return f"View {index + 1} {words}"
 
 
 def choice_of(proposal: Proposal, wider: SphereMap | None = None) -> Choice:
@@ -194,6 +217,9 @@ def choice_of(proposal: Proposal, wider: SphereMap | None = None) -> Choice:
         map=wider or SphereMap(directions, values),
         ascents=None if proposal.trajectories is None else ascents_of(proposal.trajectories),
         level=proposal.others_level,
+        errors=None if proposal.standard_errors is None else np.asarray(proposal.standard_errors, np.float64),
+        error=proposal.standard_error,
+        is_level=None if proposal.others_level is None else np.asarray(proposal.is_level()),
     )
 
 

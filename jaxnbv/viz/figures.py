@@ -7,7 +7,6 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
@@ -21,9 +20,12 @@ from jaxnbv.answers import Quantity, number
 from jaxnbv.camera import Camera
 from jaxnbv.files import make_folder, write_whole
 from jaxnbv.viz import sphere
-from jaxnbv.viz.data import COVERAGE_RADIUS, Choice, ReportData, ViewData
-from jaxnbv.viz.render import draw_scene
-from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, log_ticks, round_range
+from jaxnbv.viz.data import Choice, ReportData, ViewData
+from jaxnbv.viz.imagined_figures import imagined_figure
+from jaxnbv.viz.layout import fitted, flow, width_of
+from jaxnbv.viz.render import Still, draw_scene, painted
+from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, round_range, spaced_ticks
+from jaxnbv.viz.task_figures import chart_figure, coverage_series, draw_coverage, draw_values, task_charts
 from jaxnbv.viz.trajectory_figures import draw_ascents, trajectory_figure
 from jaxnbv.viz.words import percent
 
@@ -45,6 +47,8 @@ STYLE: dict[Any, Any] = {
     "figure.facecolor": "white",
 }
 _ROW = 5.1
+_STILL = 640
+_POINTS = [("● points before", BEFORE), ("● new points and camera", NEW)]
 DEVIATION_LABEL = "standard deviation of the surface (scene units)"
 
 
@@ -56,27 +60,55 @@ def deviation_range(data: ReportData) -> tuple[float, float]:
     return round_range(*np.percentile(np.concatenate(all_views), [2.0, 98.0]).tolist())
 
 
-def write_figures(data: ReportData, camera: Camera, folder: str | Path, progress: bool = True) -> list[Path]:
-    """Write the figures of an episode as PNG files into a folder, and return their paths:
+class Stills:
+    """The painted surfaces, once they are asked for: the page, the figures and the strip share them."""
 
-    `view_01.png`, ...: scene and acquisition of each view; `view_02_trajectories.png`, ...: the ascents of a gradient
-    search in space, of views that were found among 6-DOF poses; `coverage.png`: the charts; `overview.png`: all views
-    in a strip.
-    """
-    folder = make_folder(folder)
-    norm = LogNorm(*deviation_range(data))
+    def __init__(self, data: ReportData):
+        self._data = data
+        self._stills: dict[int, Still] = {}
+
+    def __getitem__(self, index: int) -> Still:
+        if index not in self._stills:
+            self._stills[index] = painted(self._data, index, LogNorm(*deviation_range(self._data)), _STILL)
+        return self._stills[index]
+
+
+def figures_of(data: ReportData, camera: Camera, stills: Stills) -> dict[str, Callable[[], Figure]]:
+    """What draws each figure of an episode, by its name: `view_01`, ... scene and acquisition of each view;
+    `view_02_imagined`, ... what was imagined before it; `view_02_trajectories`, ... the ascents of a gradient search in
+    space, of views that were found among 6-DOF poses; `task` and `coverage`, the charts; `overview`, all views in a
+    strip."""
     drawings: dict[str, Callable[[], Figure]] = {}
     for index, view in enumerate(data.views):
-        drawings[f"view_{view.number:02d}.png"] = partial(_view, data, index, camera, norm)
+        drawings[f"view_{view.number:02d}"] = partial(_view, data, index, camera, stills)
+        if view.imagined is not None:
+            drawings[f"view_{view.number:02d}_imagined"] = partial(imagined_figure, data, index)
         if view.spatial_ascents is not None:
-            drawings[f"view_{view.number:02d}_trajectories.png"] = partial(trajectory_figure, data, index, camera)
-    drawings["coverage.png"] = partial(_charts, data)
-    drawings["overview.png"] = partial(overview_figure, data, camera)
+            drawings[f"view_{view.number:02d}_trajectories"] = partial(trajectory_figure, data, index, camera)
+    progress: list[tuple[str, Any]] = [
+        (coverage_series(data)[0], partial(draw_coverage, data=data)),
+        (data.quantity.label, partial(draw_values, data=data)),
+    ]
+    drawings["task"] = partial(chart_figure, task_charts(data))
+    drawings["coverage"] = partial(chart_figure, progress)
+    drawings["overview"] = partial(overview_figure, data, camera, stills)
+    return drawings
+
+
+def write_figures(
+    data: ReportData, camera: Camera, folder: str | Path, progress: bool = True, stills: Stills | None = None
+) -> list[Path]:
+    """Write the figures of an episode (see `figures_of`) as PNG files into a folder, and return their paths.
+
+    `stills`: painted surfaces, where they are at hand.
+    """
+    folder = make_folder(folder)
+    drawings = figures_of(data, camera, Stills(data) if stills is None else stills)
     with mpl.rc_context(STYLE):
         for name, draw in tqdm(drawings.items(), desc="drawing figures", disable=not progress):
-            small = name == "overview.png"
-            _save(draw(), folder / name, dpi=120 if small else 200, few_colours=small)
-    return [folder / name for name in drawings]
+            small = name == "overview"
+            _save(draw(), folder / f"{name}.png", dpi=120 if small else 200, few_colours=small)
+    return [folder / f"{name}.png" for name in drawings]
 
 
 def _save(figure: Figure, path: Path, dpi: int, few_colours: bool = False) -> None:
@@ -94,49 +126,72 @@ def _save(figure: Figure, path: Path, dpi: int, few_colours: bool = False) -> No
     write_whole(path, lambda file: image.save(file, "png", optimize=True, dpi=(dpi, dpi)))
 
 
-def _view(data: ReportData, index: int, camera: Camera, norm: LogNorm) -> Figure:
-    view = data.views[index]
+def _view(data: ReportData, index: int, camera: Camera, stills: Stills) -> Figure:
+    view, norm = data.views[index], LogNorm(*deviation_range(data))
     figure = Figure(figsize=(8.4, 4.3))
-    scene = figure.add_axes((0.0, 0.1, 0.5, 0.84))
-    draw_scene(scene, view, [other.pose for other in data.views[: index + 1]], camera, norm, 800)
-    figure.text(0.015, 0.95, f"View {view.number}", fontsize=11, fontweight="bold")
+    draw_scene(figure.add_axes((0.0, 0.16, 0.5, 0.78)), data, index, stills[index], camera)
+    figure.text(0.015, 0.955, f"View {view.number}", fontsize=11, fontweight="bold", va="center")
+    flow(figure, _POINTS, 0.125, 0.955, 0.37, 0.045, 8.0)
     _deviation_bar(figure, (0.08, 0.115, 0.34, 0.022), norm)
-    _legend(figure, 0.125, 0.955)
-    figure.text(0.52, 0.95, _map_title(view, data.quantity), fontsize=10)
-    if view.choice is not None and view.choice.ascents is not None:
-        _ascent_key(figure, view.spatial_ascents is not None)
-    axes = figure.add_axes((0.52, 0.22, 0.46, 0.66))
-    colours = draw_acquisition(axes, view.choice, data.quantity)
-    if colours is not None:
-        bar = figure.colorbar(colours, cax=figure.add_axes((0.58, 0.115, 0.34, 0.022)), orientation="horizontal")
-        bar.outline.set_visible(False)
-        bar.set_label(data.quantity.label)
+    fitted(figure, 0.52, 0.955, _map_title(view, data.quantity), 0.47, 10.0, va="center")
+    if view.choice is None:
+        draw_acquisition(figure.add_axes((0.52, 0.22, 0.46, 0.66)), None, data.quantity)
+        return figure
+    marks = [("★ chosen", NEW)]
+    if rings_level(view.choice):
+        marks.append(("◯ level with it", INK))
+    if view.choice.ascents is not None:
+        marks += [("○ start, ● end of an ascent", INK)]
+    if view.spatial_ascents is not None:
+        marks.append(("(directions of the cameras; map: cameras that look at the centre)", GREY))
+    flow(figure, marks, 0.52, 0.905, 0.47, 0.04, 8.0)
+    colours = draw_acquisition(figure.add_axes((0.54, 0.35, 0.42, 0.5)), view.choice, data.quantity)
+    draw_candidates(figure.add_axes((0.58, 0.15, 0.34, 0.17)), view.choice)
+    assert colours is not None
+    bar = figure.colorbar(colours, cax=figure.add_axes((0.58, 0.115, 0.34, 0.022)), orientation="horizontal")
+    bar.outline.set_visible(False)
+    bar.locator = MaxNLocator(5)
+    bar.formatter = FuncFormatter(lambda value, _: number(value))
+    fitted(figure, 0.75, 0.02, _bar_label(view.choice, data.quantity), 0.46, 9.0, ha="center", va="center")
     return figure
+
+
+def _bar_label(choice: Choice, quantity: Quantity) -> str:
+    return quantity.label if choice.errors is None else f"{quantity.label}; lines: standard errors"
 
 
 def _map_title(view: ViewData, quantity: Quantity) -> str:
     return "This view was given" if view.choice is None else f"Why view {view.number}: {quantity.name}"
 
 
-def _ascent_key(figure: Figure, is_spatial: bool) -> None:
-    figure.text(0.52, 0.905, "○ start   ● end of a gradient ascent", fontsize=8)
-    figure.text(0.775, 0.905, "★ chosen view", color=NEW, fontsize=8)
-    if is_spatial:
-        figure.text(0.52, 0.865, "ascents: camera directions; map: cameras that look at the centre", fontsize=8)
-
-
-def _deviation_bar(figure: Figure, place: tuple[float, float, float, float], norm: LogNorm) -> None:
+def _deviation_bar(figure: Figure, place: tuple[float, float, float, float], norm: LogNorm, size: float = 9.0) -> None:
     bar = figure.colorbar(ScalarMappable(norm, DEVIATION), cax=figure.add_axes(place), orientation="horizontal")
     bar.outline.set_visible(False)
-    bar.set_ticks(log_ticks(*bar.ax.get_xlim()).tolist())
+    # The longest number has some six letters, which are less than two thirds as wide as high.
+    gap = 4.2 * size / 72.0 / (place[2] * figure.get_figwidth())
+    bar.set_ticks(spaced_ticks(*bar.ax.get_xlim(), gap).tolist())
     bar.ax.xaxis.set_minor_locator(NullLocator())
     bar.ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    bar.set_label(DEVIATION_LABEL)
+    bar.ax.tick_params(labelsize=size)
+    # Under the numbers, which are as high as their letters and stand off the bar by half as much.
+    below = place[1] - 2.6 * size / 72.0 / figure.get_figheight()
+    label = fitted(figure, 0.5, below, DEVIATION_LABEL, min(1.9 * place[2], 0.96), size, ha="center", va="center")
+    half, middle = 0.5 * width_of(label, figure), place[0] + 0.5 * place[2]
+    label.set_position((max(middle, half + 0.01), below))
 
 
-def _legend(figure: Figure, x: float, y: float) -> None:
-    figure.text(x, y, "● points before", color=BEFORE, fontsize=8)
-    figure.text(x + 0.125, y, "● new points and camera", color=NEW, fontsize=8)
+def draw_candidates(axes: Axes, choice: Choice) -> None:
+    """Draw the values of the open candidates, the best on top, with their standard errors, over a colour bar of the
+    same range."""
+    low, high = value_range(choice)
+    order = np.argsort(-np.where(choice.visited, -np.inf, choice.values))[: len(choice.open_values)]
+    values, rows = choice.values[order], -np.arange(len(order))
+    if choice.errors is not None:
+        axes.hlines(rows, values - choice.errors[order], values + choice.errors[order], color=GREY, lw=0.6, zorder=1)
+    axes.scatter(values, rows, s=4, color=INK, linewidths=0, zorder=2)
+    axes.plot(choice.value, 1.0, "*", color=NEW, ms=8, markeredgecolor="white", zorder=3, clip_on=False)
+    axes.set(xlim=(low, high), ylim=(-len(order), 3.0 + 0.05 * len(order)))
+    axes.axis("off")
 
 
 def draw_acquisition(
@@ -168,6 +223,9 @@ def draw_acquisition(
         linewidths=0.6 * weight,
         zorder=3,
     )
+    if choice.is_level is not None and rings_level(choice):
+        x, y = places[choice.is_level & shown].T
+        axes.scatter(x, y, s=52 * weight, facecolors="none", edgecolors=INK, linewidths=1.0 * weight, zorder=4)
     axes.scatter(
         places[~shown, 0], places[~shown, 1], marker="x", c=INK, s=26 * weight, linewidths=1.2 * weight, zorder=4
     )
@@ -185,6 +243,11 @@ def draw_acquisition(
     return colours
 
 
+def rings_level(choice: Choice) -> bool:
+    """Whether the candidates that are level with the best are marked: they must be known, and not most of all."""
+    return choice.is_level is not None and 0 < (choice.level or 0) <= len(choice.values) // 3
+
+
 def is_smooth(choice: Choice, quantity: Quantity) -> bool:
     """Whether a map between the candidates says something: they must be many, and their values no lots."""
     return quantity.smooth and int(np.sum(~np.isnan(choice.map.values))) >= 12
@@ -199,96 +262,40 @@ def value_range(choice: Choice) -> tuple[float, float]:
     return (low, high) if high > low else (low - 0.5, low + 0.5)
 
 
-def coverage_series(data: ReportData) -> tuple[str, Float[np.ndarray, " v"]]:
-    """The chart of progress: coverage in percent, or where the truth is not known the points that are kept."""
-    shares = [view.coverage for view in data.views]
-    if any(share is None for share in shares):
-        return "points kept", np.array([float(view.count) for view in data.views])
-    values = np.array([100.0 * share for share in shares if share is not None])
-    return f"coverage (% within {COVERAGE_RADIUS:g})", values
-
-
-def draw_coverage(axes: Axes, data: ReportData) -> None:
-    """Draw progress by view."""
-    label, values = coverage_series(data)
-    views = np.arange(1, len(values) + 1)
-    axes.plot(views, values, color=BEFORE, lw=1.4, marker="o", ms=5, markeredgecolor="white")
-    for view, value in zip(views, values, strict=True):
-        text = number(value) if label == "points kept" else f"{value:.0f}"
-        axes.annotate(text, (view, value), (0, 6), textcoords="offset points", ha="center", fontsize=8)
-    axes.set(xlabel="view", ylabel=label, ylim=(0, 1.15 * max(float(values.max()), 1.0)), xlim=(0.6, len(values) + 0.4))
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-
-
-def draw_values(axes: Axes, data: ReportData) -> None:
-    """Draw the value of each chosen view over that of the median candidate."""
-    for view in data.views:
-        if view.choice is None:
-            below: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "color": GREY, "fontsize": 8}
-            axes.annotate("given", (view.number, 0), (0, 4), **below)
-            continue
-        axes.vlines(view.number, 0.0, view.choice.value, color=LINE, lw=1.5, zorder=1)
-        axes.plot(view.number, view.choice.value, "*", color=NEW, ms=11, markeredgecolor="white", zorder=3)
-        if view.choice.open_values.size:
-            axes.plot(view.number, np.median(view.choice.open_values), "_", color=INK, ms=11, mew=1.4, zorder=2)
-    axes.plot([], [], "*", color=NEW, ms=9, label="chosen view")
-    axes.plot([], [], "_", color=INK, ms=9, mew=1.4, label="median candidate")
-    axes.legend(frameon=False, fontsize=8, loc="upper right")
-    axes.set(xlabel="view", ylabel=data.quantity.label, xlim=(0.6, len(data.views) + 0.4))
-    low, high = axes.get_ylim()
-    axes.set_ylim(min(low, 0.0), high * 1.12)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-
-
-def _charts(data: ReportData) -> Figure:
-    figure = Figure(figsize=(7.2, 2.9), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    draw_coverage(left, data)
-    draw_values(right, data)
-    return figure
-
-
-def overview_figure(data: ReportData, camera: Camera) -> Figure:
+def overview_figure(data: ReportData, camera: Camera, stills: Stills | None = None) -> Figure:
     """Scenes over acquisition maps, at most five to a row, with the charts' story in the titles."""
+    stills = Stills(data) if stills is None else stills
     norm = LogNorm(*deviation_range(data))
     columns = min(len(data.views), 5)
     rows = -(-len(data.views) // columns)
-    marks = [
-        ("●", BEFORE, "points before"),
-        ("●", NEW, "new points, camera"),
-        ("★", NEW, "chosen view"),
-        ("×", INK, "visited views"),
-    ]
+    marks = [*_POINTS, ("★ chosen view", NEW), ("× visited views", INK)]
+    if any(view.choice is not None and rings_level(view.choice) for view in data.views):
+        marks.append(("◯ level with the best", INK))
     if any(view.choice is not None and view.choice.ascents is not None for view in data.views):
-        marks += [("○", INK, "start of an ascent"), ("●", INK, "end of an ascent")]
-    base = 0.16 * len(marks) - 0.2
-    width, tall = 3.0 * columns, _ROW * rows + base + 0.41
-    figure = Figure(figsize=(max(width, 6.0), tall))
-    left = (max(width, 6.0) - width) / 2.0
-    poses = [view.pose for view in data.views]
+        marks += [("○ start of an ascent", INK), ("● end of an ascent", INK)]
+    width = max(3.0 * columns, 6.0)
+    # Beside the bar there is room for the words only in a wide strip.
+    beside = width > 8.0
+    rows_of_marks = -(-len(marks) // 2)
+    base = max(1.0, 0.5 + 0.26 * rows_of_marks) if beside else 1.35 + 0.26 * rows_of_marks
+    tall = _ROW * rows + base
+    figure, left = Figure(figsize=(width, tall)), (width - 3.0 * columns) / 2.0
 
     def place(x: float, y: float, w: float = 0.0, h: float = 0.0) -> tuple[float, float, float, float]:
-        return (left + x) / figure.get_figwidth(), y / tall, w / figure.get_figwidth(), h / tall
+        return x / width, y / tall, w / width, h / tall
 
     for index, view in enumerate(data.views):
         row, column = divmod(index, columns)
-        x, y = 3.0 * column, tall - _ROW * (row + 1)
-        scene = figure.add_axes(place(x, y + 1.55, 3.0, 3.0))
-        draw_scene(scene, view, poses[: index + 1], camera, norm, 420, weight=1.3)
+        x, y = left + 3.0 * column, tall - _ROW * (row + 1)
+        draw_scene(figure.add_axes(place(x, y + 1.55, 3.0, 3.0)), data, index, stills[index], camera, weight=1.3)
         share = f"{view.count:,} points" if view.coverage is None else f"{percent(view.coverage)} covered"
-        title = place(x + 0.12, y + 4.85)
-        figure.text(*title[:2], f"View {view.number}", fontsize=15, fontweight="bold", va="center")
-        edge = place(x + 2.88, y + 4.85)
-        figure.text(*edge[:2], share, fontsize=14, ha="right", va="center")
+        figure.text(*place(x + 0.12, y + 4.85)[:2], f"View {view.number}", fontsize=15, fontweight="bold", va="center")
+        figure.text(*place(x + 2.88, y + 4.85)[:2], share, fontsize=14, ha="right", va="center")
         draw_acquisition(figure.add_axes(place(x + 0.1, y, 2.8, 1.5)), view.choice, data.quantity, weight=1.2)
-    half = max(width, 6.0) / 2.0
-    with mpl.rc_context({"font.size": 12}):
-        _deviation_bar(figure, place(0.6, base + 0.11, half - 1.6, 0.13), norm)
-    x, y, *_ = place(half + 0.1, base + 0.32)
+    long = 0.5 * width - 1.2 if beside else width - 1.6
+    _deviation_bar(figure, place(0.6, base - 0.35, long, 0.13), norm, 12.0)
+    x, y, room = (0.5 * width + 0.1, base - 0.25, 0.5 * width - 0.3) if beside else (0.3, base - 1.1, width - 0.6)
     text = f"Maps: {data.quantity.name}, pale (low) to dark (high)"
-    # At 13 points a letter takes a tenth of an inch.
-    figure.text(x, y, text, fontsize=min(13.0, 130.0 * (half - 0.2) / len(text)), va="center")
-    for i, (mark, colour, text) in enumerate(marks):
-        x, y, *_ = place(half + 0.1 + 2.2 * (i % 2), base - 0.32 * (i // 2))
-        figure.text(x, y, f"{mark} {text}", color=colour, fontsize=13, va="center")
+    fitted(figure, *place(x, y)[:2], text, room / width, 13.0, va="center")
+    flow(figure, marks, *place(x, y - 0.28)[:2], room / width, 0.26 / tall, 12.0)
     return figure

@@ -21,6 +21,7 @@ from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.state import State
 from jaxnbv.viz.data import mean_surface
+from jaxnbv.viz.render import depth_picture, depth_range
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, VALUE, round_range
 
 _SAMPLES = 4
@@ -184,13 +185,7 @@ def _frustum(
 
 def _depth_picture(depth: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
     """Near is bright; white where nothing is expected."""
-    seen = np.isfinite(depth)
-    if not seen.any():
-        return np.full((*depth.shape, 3), 255, np.uint8)
-    low, high = float(depth[seen].min()), float(depth[seen].max())
-    share = (depth - low) / max(high - low, 1e-12)
-    picture = _colours(mpl.colormaps["viridis_r"], np.nan_to_num(share))[..., :3]
-    return np.where(seen[..., None], picture, 255).astype(np.uint8)
+    return depth_picture(depth, *depth_range([depth]))
 
 
 def _colours(scale: Colormap, share: np.ndarray) -> UInt8[np.ndarray, "*n 4"]:

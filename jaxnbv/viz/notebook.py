@@ -158,6 +158,6 @@ def _draw_views(episode: Episode, axes: Axes) -> None:
 
 def overview(episode: Episode, progress: bool = True) -> Picture:
     """All views of an episode in a strip: the surface as it became known, and what the search looked at."""
-    data = report_data(episode, progress=progress)
+    data = report_data(episode, progress=progress, imagine=False)
     with mpl.rc_context(STYLE):
         return Picture(overview_figure(data, episode.planner.camera), 80)

@@ -1,10 +1,11 @@
 """A still picture of one view's scene: the mean surface, ray-traced, with points and cameras before and behind it."""
 
 import math
+from collections.abc import Iterable
 
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm
@@ -14,13 +15,17 @@ from jaxnbv.camera import Camera
 from jaxnbv.frame import Frame
 from jaxnbv.pose import Pose, look_at
 from jaxnbv.scanning import TriangleMesh
-from jaxnbv.viz.data import MeanSurface, ViewData
+from jaxnbv.viz.data import MeanSurface, ReportData
+from jaxnbv.viz.imagined import Look
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, LINE, NEW
 
 FRUSTUM_DEPTH = 0.45
 _DISTANCE = 11.0
 _SLACK = 0.04  # Noise and the mean's own error must not hide a point behind the surface that it lies on.
 _HIDDEN = 0.18
+INSET = 0.24
+# What had been seen before, in images of what was imagined.
+_KNOWN = "#c3c9d2"
 
 
 def beside(pose: Pose, radius: float = 1.0) -> Float[np.ndarray, "3"]:
@@ -114,21 +119,92 @@ class Still:
         return pixels - 0.5, local[:, 2] < self.depth[row, column] + _SLACK
 
 
-def draw_scene(
-    axes: Axes, view: ViewData, poses: list[Pose], camera: Camera, deviation: LogNorm, size: int, weight: float = 1.0
-) -> None:
-    """Draw one view's scene into an empty axes: surface, points, and the frusta of `poses`, the last of which is new.
-
-    `weight` scales lines, dots and letters.
-    """
-    reach = max(1.8, *(float(np.linalg.norm(pose.position)) for pose in poses))
-    still = Still(beside(view.pose), view.surface, size, reach)
+def painted(data: ReportData, index: int, deviation: LogNorm, size: int) -> Still:
+    """A picture of the surface after view `index` (from 0), from where all are seen."""
+    still = Still(data.stage.eye, data.views[index].surface, size, data.stage.reach)
     still.paint(deviation)
+    return still
+
+
+def draw_scene(
+    axes: Axes,
+    data: ReportData,
+    index: int,
+    still: Still,
+    camera: Camera,
+    weight: float = 1.0,
+    inset: bool = True,
+    aspect: float = 1.0,
+) -> tuple[int, int]:
+    """Draw the scene after view `index` (from 0) into an empty axes: surface, points, the cameras so far, of which the
+    last is new, and in a corner what that one saw.
+
+    `weight` scales lines, dots and letters; `aspect` is width over height. Returns that corner, where the least stands
+    in any view: 0 or 1 from the left, and from below.
+    """
+    view, stage = data.views[index], data.stage
     axes.imshow(still.image, interpolation="bilinear", zorder=1)
     draw_points(axes, still, view.before, BEFORE, 0.7 * weight)
-    shown = [draw_points(axes, still, view.new, NEW, 1.1 * weight), still.surface_pixels]
-    shown += draw_cameras(axes, still, poses, camera, weight)
-    frame(axes, still, shown)
+    draw_points(axes, still, view.new, NEW, 1.1 * weight)
+    poses = [stage.pulled(other.pose) for other in data.views[: index + 1]]
+    draw_cameras(axes, still, poses, camera, weight, depth=stage.depth)
+    extent = _extent(data, still, camera)
+    frame(axes, still, extent, aspect)
+    across, up = corner = _free_corner(axes, extent)
+    if inset and view.look is not None:
+        place = axes.inset_axes((across * (1 - INSET), up * (1 - INSET), INSET, INSET))
+        place.imshow(look_picture(view.look, plain=True), interpolation="nearest")
+        place.set(xticks=[], yticks=[])
+        for side in place.spines.values():
+            side.set(visible=True, color=NEW, linewidth=1.2 * weight)
+    return corner
+
+
+def _free_corner(axes: Axes, extent: list[Float[np.ndarray, "_ 2"]]) -> tuple[int, int]:
+    """The corner of a framed axes in which the least share of each of some groups of pixels lies."""
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+
+    def taken(corner: tuple[int, int]) -> float:
+        total = 0.0
+        for pixels in extent:
+            places = (pixels - [left, bottom]) / [right - left, top - bottom]
+            away = np.abs(places - corner)
+            total += float(np.mean((away < 1.25 * INSET).all(axis=1)))
+        return total
+
+    return min(((0, 0), (0, 1), (1, 0), (1, 1)), key=taken)
+
+
+def _extent(data: ReportData, still: Still, camera: Camera) -> list[Float[np.ndarray, "_ 2"]]:
+    """The pixels that anything takes in any view, so that all views are cropped alike."""
+    surfaces = [view.surface.vertices for view in data.views if view.surface is not None]
+    shown = [still.project(rows)[0] for rows in (*surfaces, *(view.new for view in data.views)) if len(rows)]
+    for view in data.views:
+        pose = data.stage.pulled(view.pose)
+        shown.append(still.project(frustum(pose, camera, data.stage.depth).reshape(-1, 3))[0])
+        shown.append(still.project(1.1 * np.asarray(pose.position, np.float64)[None])[0])
+    return [np.clip(pixels, 0, still.size) for pixels in shown]
+
+
+def look_picture(look: Look, hidden: str = BEFORE, plain: bool = False) -> UInt8[np.ndarray, "h w 3"]:
+    """A lit image of a look: grey where it had been seen before, in a colour of `hidden` elsewhere; white where a ray
+    met nothing. `plain`: all in grey."""
+    tints = np.array([mpl.colors.to_rgb(colour) for colour in (hidden, _KNOWN)])
+    colours = tints[(look.known | plain).astype(int)] * (0.25 + 0.75 * look.lit[..., None])
+    return np.round(255.0 * np.where(look.mask[..., None], colours, 1.0)).astype(np.uint8)
+
+
+def depth_picture(depth: Float[np.ndarray, "h w"], low: float, high: float) -> UInt8[np.ndarray, "h w 3"]:
+    """Near (`low`) is bright, far dark; white where there is none."""
+    share = np.clip((np.nan_to_num(depth, nan=low) - low) / max(high - low, 1e-12), 0.0, 1.0)
+    colours = np.asarray(mpl.colormaps["viridis_r"](share))[..., :3]
+    return np.round(255.0 * np.where(np.isfinite(depth)[..., None], colours, 1.0)).astype(np.uint8)
+
+
+def depth_range(images: Iterable[Float[np.ndarray, "_ _"]]) -> tuple[float, float]:
+    """The least and the greatest depth in some images; not empty."""
+    found = np.concatenate([image[np.isfinite(image)] for image in images])
+    return (float(found.min()), float(found.max())) if found.size else (0.0, 1.0)
 
 
 def draw_points(
@@ -158,17 +234,24 @@ def draw_segments(
 
 
 def draw_cameras(
-    axes: Axes, still: Still, poses: list[Pose], camera: Camera, weight: float, beyond: float = 0.0
+    axes: Axes,
+    still: Still,
+    poses: list[Pose],
+    camera: Camera,
+    weight: float,
+    beyond: float = 0.0,
+    depth: float = FRUSTUM_DEPTH,
 ) -> list[Float[np.ndarray, "_ 2"]]:
     """Draw numbered frusta, of which the last is new; returns the pixels that they take.
 
-    `beyond`: distance from the origin within which the new number would be in the way.
+    - `beyond`: distance from the origin within which the new number would be in the way.
+    - `depth`: of the fields of view.
     """
     taken = []
     for number, pose in enumerate(poses, start=1):
         is_new = number == len(poses)
         colour = NEW if is_new else GREY
-        ends = frustum(pose, camera)
+        ends = frustum(pose, camera, depth)
         width = (1.5 if is_new else 0.9) * weight
         taken.append(draw_segments(axes, still, ends, mpl.colors.to_rgba_array([colour] * len(ends)), width))
         position = np.asarray(pose.position, dtype=np.float64)
@@ -190,11 +273,11 @@ def draw_cameras(
     return taken
 
 
-def frame(axes: Axes, still: Still, shown: list[Float[np.ndarray, "_ 2"]]) -> None:
-    """Crop the picture to a square about the pixels that are to be seen."""
+def frame(axes: Axes, still: Still, shown: list[Float[np.ndarray, "_ 2"]], aspect: float = 1.0) -> None:
+    """Crop the picture about the pixels that are to be seen, to a width of `aspect` heights."""
     seen = np.concatenate(shown)
     (left, top), (right, bottom) = seen.min(axis=0), seen.max(axis=0)
-    half = 0.53 * max(right - left, bottom - top) + 0.03 * still.size
+    half = 0.53 * max((right - left) / aspect, bottom - top) + 0.03 * still.size
     x, y = 0.5 * (left + right), 0.5 * (top + bottom)
-    axes.set(xlim=(x - half, x + half), ylim=(y + half, y - half), aspect="equal")
+    axes.set(xlim=(x - aspect * half, x + aspect * half), ylim=(y + half, y - half), aspect="equal")
     axes.axis("off")

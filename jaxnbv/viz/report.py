@@ -1,6 +1,7 @@
 """The report of an episode: one HTML page that opens offline, and the same pictures as PNG files."""
 
 import base64
+import gzip
 import html
 import io
 import json
@@ -11,26 +12,27 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
-from PIL import Image
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from plotly.offline import get_plotlyjs
 
-from jaxnbv.answers import Quantity
+from jaxnbv.answers import Panel, number
 from jaxnbv.camera import Camera
 from jaxnbv.checks import AnyArray, checked
 from jaxnbv.episode import Episode
 from jaxnbv.files import make_folder, write_text
 from jaxnbv.folders import versions, writing_in
 from jaxnbv.storage import describe
-from jaxnbv.viz import sphere
-from jaxnbv.viz.data import COVERAGE_RADIUS, Choice, MeanSurface, ReportData, ViewData, report_data
-from jaxnbv.viz.figures import coverage_series, deviation_range, is_smooth, value_range, write_figures
-from jaxnbv.viz.render import beside, frustum
-from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, VALUE_LINES, colour_scale, log_ticks
-from jaxnbv.viz.trajectories import Ascents
-from jaxnbv.viz.trajectory_figures import frusta_steps, small_frusta, spatial_range
+from jaxnbv.viz.data import ReportData, report_data
+from jaxnbv.viz.figures import STYLE, Stills, write_figures
+from jaxnbv.viz.imagined_figures import Tile, depths, looks
+from jaxnbv.viz.page_data import payload, picture_address
+from jaxnbv.viz.render import draw_scene, look_picture
+from jaxnbv.viz.task_figures import chart_figure, other_charts, task_charts
 
 _FIGURES = "figures"
-_MAX_BEFORE, _MAX_NEW = 4000, 2500
+_SCENE, _SCENE_DPI = (6.8, 5.9), 100
+_CHART, _SMALL_CHART = (4.4, 2.6), (3.1, 2.6)
 _ASCENT_CAPTION = """
       Small cameras stand along the gradient ascents, pale to dark with their acquisition, thicker towards the end."""
 
@@ -54,40 +56,128 @@ def write_report(
     """
     path = make_folder(folder) / "report.html"
     data = report_data(episode, truth, progress)
+    stills = Stills(data)
     with writing_in(path.parent, _FIGURES):
-        write_figures(data, episode.planner.camera, path.parent / _FIGURES, progress)
-        write_text(path, report_html(episode, data, title))
+        write_figures(data, episode.planner.camera, path.parent / _FIGURES, progress, stills)
+        write_text(path, report_html(episode, data, title, stills))
     return path
 
 
-def report_html(episode: Episode, data: ReportData, title: str) -> str:
-    """The page as text: a template with the data, the header and plotly's own code put in."""
+def report_html(episode: Episode, data: ReportData, title: str, stills: Stills | None = None) -> str:
+    """The page as text: a template with the data, the pictures and plotly's own code put in.
+
+    `stills`: painted surfaces, where they are at hand.
+    """
+    stills, camera = Stills(data) if stills is None else stills, episode.planner.camera
     # "</" would end the script element that holds the data.
-    payload = json.dumps(_payload(episode, data), allow_nan=False).replace("</", "<\\/")
+    numbers = json.dumps(payload(data, camera), allow_nan=False).replace("</", "<\\/")
+    with mpl.rc_context(STYLE):
+        scenes = [_scene(data, index, stills, camera) for index in range(len(data.views))]
+        own = task_charts(data)
+        size = _CHART if len(own) == 1 else _SMALL_CHART
+        task = "".join(_chart(chart, size) for chart in own)
+        charts = "".join(_chart(chart, _CHART) for chart in other_charts(data))
     parts = {
         "TITLE": html.escape(title),
-        "HEADER": _header(episode, title),
+        "QUESTION": html.escape(data.task.question),
+        "ASKED": html.escape(data.task.asked),
+        "FOUND": html.escape(data.task.found),
+        "SURE": html.escape(data.task.sure),
+        "SETTINGS": _settings(episode, title),
         "QUANTITY": html.escape(data.quantity.label[:1].upper() + data.quantity.label[1:]),
         "MEANING": html.escape(data.quantity.meaning),
-        "COVERAGE": html.escape(_coverage_caption(data)),
         "ASCENTS": _ASCENT_CAPTION if any(view.spatial_ascents is not None for view in data.views) else "",
         "COUNT": str(len(data.views)),
+        "SCENES": "".join(scenes),
+        "TASK": task,
+        "CHARTS": charts,
+        "TABLES": "".join(_table(panels, title) for title, panels in _panels(data)),
+        "IMAGINED": "".join(_imagined(data, index) for index in range(len(data.views))),
         "SENTENCES": "".join(f"<li>{html.escape(view.sentence)}</li>" for view in data.views),
-        "PLOTLY": get_plotlyjs(),
-        "DATA": payload,
+        "PLOTLY": base64.b64encode(gzip.compress(get_plotlyjs().encode(), mtime=0)).decode(),
+        "DATA": numbers,
     }
     text = Path(__file__).with_name("template.html").read_text(encoding="utf-8")
     pieces = text.split("@@")
     return "".join(piece if i % 2 == 0 else parts[piece] for i, piece in enumerate(pieces))
 
 
-def _coverage_caption(data: ReportData) -> str:
-    if data.views[0].coverage is None:
-        return "Points kept by view; the true surface is not known."
-    return f"Share of the true surface within {COVERAGE_RADIUS:g} scene units of the cloud, by view."
+def _scene(data: ReportData, index: int, stills: Stills, camera: Camera) -> str:
+    """The picture of one view's scene, and in its corner what the new view saw."""
+    figure = Figure(figsize=_SCENE)
+    axes, aspect = figure.add_axes((0, 0, 1, 1)), _SCENE[0] / _SCENE[1]
+    across, up = draw_scene(axes, data, index, stills[index], camera, weight=1.2, inset=False, aspect=aspect)
+    canvas = FigureCanvasAgg(figure)
+    figure.set_dpi(_SCENE_DPI)
+    canvas.draw()
+    view = data.views[index]
+    alt = f"The scene after view {view.number}: the mean surface by its uncertainty, points and cameras."
+    shown = f'<img src="{picture_address(np.asarray(canvas.buffer_rgba())[..., :3])}" alt="{alt}">'
+    if view.look is not None:
+        inset = picture_address(look_picture(view.look, plain=True), lossless=True)
+        corner = f"{'right' if across else 'left'}:0;{'top' if up else 'bottom'}:0"
+        shown += f'<img class="inset" style="{corner}" src="{inset}" alt="What view {view.number} saw.">'
+    return f'<div class="of" hidden>{shown}</div>'
 
 
-def _header(episode: Episode, title: str) -> str:
+def _chart(chart: tuple, size: tuple[float, float]) -> str:
+    """A chart as a drawing, and where its views are, so that the page can mark one."""
+    title, _ = chart
+    figure, file = chart_figure([chart], *size, titled=False), io.BytesIO()
+    with mpl.rc_context({"svg.hashsalt": "jaxnbv"}):
+        figure.savefig(file, format="svg", metadata={"Date": None})
+    place = figure.axes[0].get_position()
+    address = "data:image/svg+xml;base64," + base64.b64encode(file.getvalue()).decode()
+    name = html.escape(title[:1].upper() + title[1:])
+    box = ",".join(f"{share:.4f}" for share in (place.x0, place.width, 1.0 - place.y1, place.height))
+    return (
+        f'<figure class="card"><h2>{name}</h2><div class="chart" data-axes="{box}"><img src="{address}" '
+        f'alt="{name}, by view; its numbers are in a table below."><i></i></div></figure>'
+    )
+
+
+def _panels(data: ReportData) -> list[tuple[str, tuple[Panel, ...]]]:
+    return [(panels[-1].label, panels) for panels in zip(*data.task.panels, strict=True)]
+
+
+def _table(panels: tuple[Panel, ...], title: str) -> str:
+    """The numbers of a chart of the task."""
+    last = panels[-1]
+    rows = [(f"view {view}", panel.values) for view, panel in enumerate(panels, start=1)]
+    if last.true is not None:
+        rows.append(("in truth", last.true))
+    head = "".join(f'<th scope="col">{html.escape(name)}</th>' for name in last.names)
+    body = "".join(
+        f'<tr><th scope="row">{name}</th>{"".join(f"<td>{number(value)}</td>" for value in values.tolist())}</tr>'
+        for name, values in rows
+    )
+    caption = html.escape(title[:1].upper() + title[1:])
+    head = f"<caption>{caption}</caption><thead><tr><td></td>{head}</tr></thead>"
+    return f"<div><table>{head}<tbody>{body}</tbody></table></div>"
+
+
+def _imagined(data: ReportData, index: int) -> str:
+    """What was imagined before a view: its pictures."""
+    seen = data.views[index].imagined
+    if seen is None:
+        why = "View 1 was given" if index == 0 else f"What was imagined before view {index + 1} is not known"
+        return f'<div class="of" hidden><p>{why}: nothing was imagined before it.</p></div>'
+    tiles, scale = depths(seen)
+    return (
+        f'<div class="of" hidden><div class="tiles">{_tiles(looks(seen))}</div><h3>Expected | seen</h3>'
+        f'<div class="tiles">{_tiles(tiles)}</div><p>{html.escape(scale)}</p></div>'
+    )
+
+
+def _tiles(tiles: list[Tile]) -> str:
+    return "".join(
+        f'<figure><img src="{picture_address(tile.picture, lossless=min(tile.picture.shape[:2]) < 64)}" '
+        f'alt="{html.escape(tile.name)}"><figcaption>{html.escape(tile.name)}</figcaption></figure>'
+        for tile in tiles
+    )
+
+
+def _settings(episode: Episode, title: str) -> str:
     planner = episode.planner
     search, model = (describe(module) for module in (planner.search, planner.model))
     settings = {
@@ -122,130 +212,3 @@ def _short(value, depth: int) -> str:
     if isinstance(value, dict):
         return _call(value, depth - 1) if depth > 0 and "type" in value else value.get("type", "...")
     return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _payload(episode: Episode, data: ReportData) -> dict:
-    low, high = deviation_range(data)
-    ticks = log_ticks(low, high)
-    label, series = coverage_series(data)
-    camera = episode.planner.camera
-    return {
-        "views": [_view(view, camera, data.quantity) for view in data.views],
-        "reach": 1.12 * max(1.8, *(view.reach for view in data.views)),
-        "deviation": {
-            "range": [math.log10(low), math.log10(high)],
-            "ticks": np.log10(ticks).tolist(),
-            "labels": [f"{tick:g}" for tick in ticks.tolist()],
-            "colours": colour_scale(DEVIATION),
-        },
-        "value": {"colours": colour_scale(VALUE), "lines": colour_scale(VALUE_LINES), "label": data.quantity.label},
-        "progress": {"label": label, "values": series.tolist()},
-        "map": {
-            "graticule": [line.round(4).tolist() for line in sphere.graticule()],
-            "rim": sphere.rim().round(4).tolist(),
-            "width": sphere.WIDTH,
-            "height": sphere.HEIGHT,
-        },
-        "style": {"ink": INK, "grey": GREY, "line": LINE, "before": BEFORE, "new": NEW},
-    }
-
-
-def _view(view: ViewData, camera: Camera, quantity: Quantity) -> dict:
-    return {
-        "sentence": view.sentence,
-        "before": _thinned(view.before, _MAX_BEFORE),
-        "new": _thinned(view.new, _MAX_NEW),
-        "eye": beside(view.pose).round(4).tolist(),
-        "frustum": frustum(view.pose, camera).round(4).tolist(),
-        "label": (1.09 * np.asarray(view.pose.position, dtype=np.float64)).round(4).tolist(),
-        "surface": None if view.surface is None else _surface(view.surface),
-        "choice": None if view.choice is None else _choice(view.choice, quantity),
-        "ascents": None if view.spatial_ascents is None else _spatial(view.spatial_ascents, camera),
-    }
-
-
-def _thinned(points: Float[np.ndarray, "n 3"], limit: int) -> list[list[float]]:
-    """At most `limit` rows, evenly taken, rounded to what a screen can show."""
-    rows = np.linspace(0, len(points) - 1, min(limit, len(points))).astype(int)
-    return np.round(points[rows].astype(np.float64), 3).tolist()
-
-
-def _surface(surface: MeanSurface) -> dict:
-    return {
-        "vertices": _packed(surface.vertices, np.float32),
-        "faces": _packed(surface.faces, np.uint32),
-        "deviation": _packed(np.log10(surface.deviation), np.float32),
-    }
-
-
-def _packed(array: np.ndarray, dtype: type) -> str:
-    """The bytes of an array, little-endian, as base64."""
-    return base64.b64encode(np.ascontiguousarray(array, np.dtype(dtype).newbyteorder("<")).tobytes()).decode()
-
-
-def _choice(choice: Choice, quantity: Quantity) -> dict:
-    low, high = value_range(choice)
-    order = np.argsort(-np.where(choice.visited, -np.inf, choice.values), kind="stable")
-    ranks = np.empty(len(order), dtype=int)
-    ranks[order] = np.arange(1, len(order) + 1)
-    return {
-        "places": sphere.mollweide(choice.directions).round(4).tolist(),
-        "directions": choice.directions.round(3).tolist(),
-        "values": [None if math.isnan(value) else value for value in choice.values.tolist()],
-        "ranks": ranks.tolist(),
-        "chosen": sphere.mollweide(choice.chosen[None]).round(4)[0].tolist(),
-        "value": choice.value,
-        "median": float(np.median(choice.open_values)) if choice.open_values.size else None,
-        "range": [low, high],
-        "image": _map_image(choice, low, high) if is_smooth(choice, quantity) else None,
-        "ascents": None if choice.ascents is None else _on_map(choice.ascents),
-        "caption": _map_caption(choice),
-    }
-
-
-def _map_caption(choice: Choice) -> str:
-    """What the marks of a gradient search on the map are; nothing for other searches."""
-    parts = []
-    if choice.ascents is not None:
-        parts.append("Lines: gradient ascents, from a ring where they start to a dot where they end.")
-        if choice.ascents.is_spatial:
-            parts.append(
-                "They change position and rotation; drawn is the direction of the position, over a map of cameras that "
-                "look at the centre from the sphere where the ascents start."
-            )
-    if not np.array_equal(choice.map.directions, choice.directions):
-        parts.append(
-            "The candidates are too few for a map, or off the sphere: it is drawn from "
-            f"{len(choice.map.values)} more views, valued with the same posterior samples."
-        )
-    return " ".join(parts)
-
-
-def _on_map(ascents: Ascents) -> dict:
-    starts, ends = (sphere.mollweide(ascents.directions[:, step]).round(4).tolist() for step in (0, -1))
-    return {
-        "ways": [piece.round(4).tolist() for directions in ascents.directions for piece in sphere.path(directions)],
-        "starts": starts,
-        "ends": ends,
-        "values": ascents.values[:, [0, -1]].tolist(),
-    }
-
-
-def _spatial(ascents: Ascents, camera: Camera) -> dict:
-    return {
-        "positions": np.asarray(ascents.poses.position, dtype=np.float64).round(3).tolist(),
-        "values": ascents.values.tolist(),
-        "range": list(spatial_range(ascents)),
-        "steps": frusta_steps(ascents).tolist(),
-        "frusta": [small_frusta(ascents, i, camera).round(3).tolist() for i in range(len(ascents.values))],
-    }
-
-
-def _map_image(choice: Choice, low: float, high: float) -> str:
-    """The smooth map as a PNG in a data address, coloured as the candidates are; clear outside the rim."""
-    values = sphere.smooth_map(choice.map.directions, choice.map.values, 300)
-    colours = VALUE(mpl.colors.Normalize(low, high)(np.nan_to_num(values)), bytes=True)
-    colours[..., 3] = np.where(np.isnan(values), 0, 255)
-    file = io.BytesIO()
-    Image.fromarray(colours).save(file, format="PNG", optimize=True)
-    return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()

@@ -12,6 +12,8 @@ from jaxnbv.files import write_whole
 
 INK, GREY, LINE = "#1f2733", "#7a8494", "#d9dee6"
 BEFORE, NEW = "#26344d", "#d55e00"
+# For several numbers in one chart (Okabe and Ito), apart from NEW, which marks the true one.
+SERIES = ["#0072b2", "#56b4e9", "#009e73", "#e69f00", "#cc79a7", "#7a8494", "#26344d", "#b8b04a"]
 # Pale where the surface is known, dark where it is not: the scanned points stand out on what is known.
 DEVIATION = LinearSegmentedColormap.from_list("deviation", mpl.colormaps["YlGnBu"](np.linspace(0.04, 0.92, 256)))
 # Another hue for the other scale, and no colour of the marks that lie on it.
@@ -36,6 +38,19 @@ def log_ticks(low: float, high: float) -> Float[np.ndarray, " n"]:
     decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
     ticks = np.outer(decades, [1.0, 2.0, 5.0]).ravel()
     return ticks[(ticks >= low * 0.9999) & (ticks <= high * 1.0001)]
+
+
+def spaced_ticks(low: float, high: float, gap: float) -> Float[np.ndarray, " n"]:
+    """Those of `log_ticks` that have room: no two nearer than a share `gap` of the axis, powers of ten before fives
+    before twos."""
+    ticks = log_ticks(low, high)
+    at = np.log(ticks / low) / np.log(high / low)
+    first = np.round(ticks / 10.0 ** np.floor(np.log10(ticks) + 1e-9))
+    chosen: list[int] = []
+    for index in sorted(range(len(ticks)), key=lambda index: {1.0: 0, 5.0: 1}.get(first[index], 2)):
+        if all(abs(at[index] - at[other]) >= gap for other in chosen):
+            chosen.append(index)
+    return ticks[sorted(chosen)]
 
 
 def save_figure(figure: Figure, path: Path) -> None:

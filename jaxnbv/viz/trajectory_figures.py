@@ -13,7 +13,8 @@ from matplotlib.patheffects import withStroke
 from jaxnbv.camera import Camera
 from jaxnbv.viz import sphere
 from jaxnbv.viz.data import ReportData
-from jaxnbv.viz.render import Still, beside, draw_cameras, draw_points, draw_segments, frame, frustum
+from jaxnbv.viz.layout import fitted, flow
+from jaxnbv.viz.render import Still, draw_cameras, draw_points, draw_segments, frame, frustum
 from jaxnbv.viz.style import BEFORE, INK, VALUE_LINES
 from jaxnbv.viz.trajectories import Ascents
 
@@ -61,7 +62,7 @@ def trajectory_figure(data: ReportData, index: int, camera: Camera) -> Figure:
     positions = np.asarray(ascents.poses.position, dtype=np.float64)
     poses = [other.pose for other in data.views[: index + 1]]
     reach = max(1.8, *(other.reach for other in data.views[: index + 1]))
-    still = Still(beside(view.pose), known.surface, 900, reach)
+    still = Still(data.stage.eye, known.surface, 900, reach)
     still.paint(None)
     axes.imshow(still.image, interpolation="bilinear", zorder=1)
     shown = [draw_points(axes, still, view.before, BEFORE, 0.7), still.surface_pixels]
@@ -79,9 +80,9 @@ def trajectory_figure(data: ReportData, index: int, camera: Camera) -> Figure:
     for label in axes.texts:
         label.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
     figure.text(0.03, 0.95, f"Gradient ascents to view {view.number}", fontsize=10, fontweight="bold")
-    figure.text(0.03, 0.912, "● points before", color=BEFORE, fontsize=8)
-    figure.text(0.27, 0.912, "cameras of ascents: thin at the start, thick at the end", fontsize=8)
+    marks = [("● points before", BEFORE), ("cameras of ascents: thin at the start, thick at the end", INK)]
+    flow(figure, marks, 0.03, 0.918, 0.94, 0.035, 8.0)
     bar = figure.colorbar(colours, cax=figure.add_axes((0.14, 0.1, 0.72, 0.02)), orientation="horizontal")
     bar.outline.set_visible(False)
-    bar.set_label(f"{data.quantity.label} along the ascents")
+    fitted(figure, 0.5, 0.02, f"{data.quantity.label} along the ascents", 0.94, 9.0, ha="center", va="center")
     return figure

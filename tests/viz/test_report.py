@@ -96,7 +96,7 @@ def test_the_page_loads_nothing_from_elsewhere(report):
     assert "@import" not in style
     assert "url(" not in style
     assert "mathjax" not in " ".join(page.loads).lower()
-    assert report.stat().st_size < 12e6
+    assert report.stat().st_size < 4e6
 
 
 def test_the_page_holds_every_view_and_escapes_its_title(report, episode):
@@ -120,13 +120,14 @@ def test_the_page_holds_every_view_and_escapes_its_title(report, episode):
         assert shown["choice"]["value"] == pytest.approx(float(view.proposal.value))
         assert np.nanmax(values) == pytest.approx(float(view.proposal.value))
         assert np.isnan(values).sum() == np.isneginf(np.asarray(view.proposal.values)).sum()
-        assert shown["choice"]["image"].startswith("data:image/png;base64,")
+        assert shown["choice"]["image"].startswith("data:image/webp;base64,")
 
 
 def test_figures_are_pictures_of_the_stated_size(report):
     sizes = {"view_01": (1680, 860), "view_02": (1680, 860), "view_03": (1680, 860), "coverage": (1440, 580)}
-    folder = report.parent / "figures"
-    assert sorted(file.name for file in folder.iterdir()) == sorted([*(f"{n}.png" for n in sizes), "overview.png"])
+    sizes |= {"task": (720, 580)}
+    folder, others = report.parent / "figures", ["overview", "view_02_imagined", "view_03_imagined"]
+    assert sorted(file.name for file in folder.iterdir()) == sorted(f"{name}.png" for name in [*sizes, *others])
     for name, size in sizes.items():
         with Image.open(folder / f"{name}.png") as image:
             assert image.size == size

@@ -239,7 +239,8 @@ def test_frusta_stand_along_a_trajectory(spatial):
 
 def test_pictures_of_a_search_in_space(spatial, spatial_data, tmp_path):
     paths = write_figures(spatial_data, CAMERA, tmp_path, progress=False)
-    names = ["coverage.png", "overview.png", "view_01.png", "view_02.png", "view_02_trajectories.png"]
+    names = ["coverage.png", "overview.png", "task.png", "view_01.png", "view_02.png", "view_02_imagined.png"]
+    names += ["view_02_trajectories.png"]
     assert sorted(path.name for path in paths) == sorted(path.name for path in tmp_path.iterdir()) == names
     with Image.open(tmp_path / "view_02_trajectories.png") as image:
         assert image.size == (860, 980)
@@ -255,18 +256,25 @@ def test_pictures_of_a_search_in_space(spatial, spatial_data, tmp_path):
     assert "the direction of the position" in second["choice"]["caption"]
     assert "Small cameras stand along the gradient ascents" in text
     farthest = np.linalg.norm(ways.poses.position, axis=-1).max()
-    assert page_data(text)["reach"] >= 1.1 * farthest
+    # Cameras are drawn nearer than they stood, and so all of them are in the picture.
+    stage = page_data(text)["stage"]
+    assert stage["reach"] >= 1.09 * stage["pull"] * farthest
+    assert all(
+        stage["reach"] >= 1.09 * view["pull"] * np.linalg.norm(view["frustum"][0][0])
+        for view in page_data(text)["views"]
+    )
 
 
 def test_pictures_of_a_search_on_the_sphere(few, few_data, tmp_path):
     paths = write_figures(few_data, CAMERA, tmp_path, progress=False)
-    assert [path.name for path in paths] == ["view_01.png", "view_02.png", "coverage.png", "overview.png"]
+    names = ["view_01.png", "view_02.png", "view_02_imagined.png", "task.png", "coverage.png", "overview.png"]
+    assert [path.name for path in paths] == names
     text = report_html(few, few_data, "mug")
     assert "Small cameras" not in text
     shown = page_data(text)["views"][1]
     assert shown["ascents"] is None
     assert "drawn from 120 more views" in shown["choice"]["caption"]
-    assert shown["choice"]["image"].startswith("data:image/png;base64,")
+    assert shown["choice"]["image"].startswith("data:image/webp;base64,")
     marks, ways = shown["choice"]["ascents"], few.views[1].proposal.trajectories
     for name, step in (("starts", 0), ("ends", -1)):
         places = sphere.mollweide(np.asarray(ways.poses.position[:, step], np.float64) / 2.5)

@@ -1,0 +1,142 @@
+"""What a step imagined: sampled surfaces as the chosen camera would see them, and the depth that was expected there."""
+
+import math
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+
+from jaxnbv.at_sensor import mean_depth
+from jaxnbv.camera import Camera
+from jaxnbv.cloud import PointCloud
+from jaxnbv.episode import Episode, observe_scene, view_keys
+from jaxnbv.pose import Pose
+from jaxnbv.scanning import SensorNoise, scan_samples
+from jaxnbv.search import Proposal
+from jaxnbv.state import State
+
+SHOWN = 4
+_PIXELS = 96
+# Nearer to the cloud than this, or than so many of its own spacings, a surface was seen before.
+_SEEN, _SPACINGS = 0.05, 3.0
+
+
+class Look(eqx.Module):
+    """An image of a surface from a camera.
+
+    - `mask`: which rays hit it; `depth`: along the camera's axis, in scene units, NaN where they do not.
+    - `lit`: brightness by a lamp beside the camera, in [0, 1]; `known`: whether that place had been seen before.
+    """
+
+    mask: Bool[np.ndarray, "h w"]
+    depth: Float[np.ndarray, "h w"]
+    lit: Float[np.ndarray, "h w"]
+    known: Bool[np.ndarray, "h w"]
+
+
+class Expected(eqx.Module):
+    """The depth that a camera was expected to measure, and what it measured or, not taken, would have.
+
+    - `expected`: mean over the samples that a ray hits, NaN where it misses most.
+    - `seen`: NaN where the ray met nothing; None where that is not known. It may have other pixels.
+    """
+
+    expected: Float[np.ndarray, "h w"]
+    seen: Float[np.ndarray, "i j"] | None
+
+
+class Imagined(eqx.Module):
+    """What a step knew of its view before it was taken.
+
+    - `samples`: some of its sampled surfaces, from the chosen pose.
+    - `seen`: the true surface from there, or where it is not known the scan; None where that is no image.
+    - `is_true`: which of both.
+    - `chosen`, `runner_up`: of the chosen camera and of the best of the other candidates; None without one.
+    """
+
+    samples: tuple[Look, ...]
+    seen: Look | None
+    is_true: bool
+    chosen: Expected
+    runner_up: Expected | None
+
+
+def imagined(episode: Episode, index: int, state: State) -> Imagined | None:
+    """What was imagined before view `index` (from 0) was taken; None for one that was not chosen.
+
+    `state`: the planner's before it. The samples are drawn again with the key of the step, so they are the same.
+    """
+    planner, view = episode.planner, episode.views[index]
+    if view.proposal is None:
+        return None
+    sample_key, *_ = view_keys(episode.key, index)
+    surfaces = planner.sample_surfaces(state, sample_key)
+    other = runner_up(view.proposal) if planner.quantity.smooth else None
+    # Two in any case, lest a second program be compiled.
+    poses = jax.tree.map(lambda *rows: np.stack(rows), view.pose, view.pose if other is None else other)
+    camera, around = _finer(planner.camera), planner.surroundings
+    scans = scan_samples(surfaces, camera, poses, None if around is None else around.barrier(camera, poses))
+    cloud = state.cloud.to_numpy()[0]
+    samples = tuple(
+        look(_rows(scans, (sample, 0)), camera, view.pose, cloud) for sample in range(min(SHOWN, planner.num_samples))
+    )
+    expected = [
+        np.asarray(mean_depth(_rows(scans, (slice(None), i)), pose), np.float64).reshape(camera.height, camera.width)
+        for i, pose in enumerate((view.pose, other or view.pose))
+    ]
+    true = [_true_scan(episode, camera, pose) for pose in (view.pose, other or view.pose)]
+    own = view.camera or planner.camera
+    taken = look(view.scan, own, view.pose, cloud) if view.scan.capacity == own.num_rays else None
+    seen = taken if true[0] is None else look(true[0], camera, view.pose, cloud)
+    beside = None
+    if other is not None:
+        beside = Expected(expected[1], None if true[1] is None else look(true[1], camera, other, cloud).depth)
+    chosen = Expected(expected[0], None if taken is None else taken.depth)
+    return Imagined(samples, seen, true[0] is not None, chosen, beside)
+
+
+def runner_up(proposal: Proposal) -> Pose | None:
+    """The best open candidate but the chosen one; None if there is no other."""
+    values = np.asarray(proposal.values, np.float64)
+    same = np.linalg.norm(np.asarray(proposal.candidates.position) - np.asarray(proposal.pose.position), axis=1) < 1e-6
+    values = np.where(np.isfinite(values) & ~same, values, -np.inf)
+    best = int(values.argmax())
+    return None if values[best] == -np.inf else proposal.candidates[best]
+
+
+def look(scan: PointCloud, camera: Camera, pose: Pose, cloud: Float[np.ndarray, "n 3"]) -> Look:
+    """The image that a scan is, row by row; `cloud`: what had been seen before it."""
+    right, down, forward = np.asarray(pose.rotation, np.float64).T
+    points, normals = (np.asarray(rows, np.float64) for rows in (scan.points, scan.normals))
+    mask = np.asarray(scan.mask)
+    depth = np.where(mask, (points - np.asarray(pose.position, np.float64)) @ forward, np.nan)
+    lamp = -forward - 0.5 * right - 0.7 * down
+    lit = np.clip(0.35 + 0.65 * normals @ (lamp / np.linalg.norm(lamp)), 0.0, 1.0)
+    known = mask & (cKDTree(cloud).query(points)[0] < _spacing(cloud)) if len(cloud) else np.zeros_like(mask)
+    shape = camera.height, camera.width
+    return Look(mask.reshape(shape), depth.reshape(shape), lit.reshape(shape), known.reshape(shape))
+
+
+def _spacing(cloud: Float[np.ndarray, "n 3"]) -> float:
+    """Within which of a cloud a place counts as seen."""
+    nearest = cKDTree(cloud).query(cloud, k=2)[0][:, 1] if len(cloud) > 1 else np.zeros(1)
+    return max(_SEEN, _SPACINGS * float(np.median(nearest)))
+
+
+def _finer(camera: Camera) -> Camera:
+    """The camera with about as many pixels along its longer side as are shown."""
+    factor = math.ceil(_PIXELS / max(camera.height, camera.width))
+    return camera if factor == 1 else camera.resized(factor * camera.height, factor * camera.width)
+
+
+def _true_scan(episode: Episode, camera: Camera, pose: Pose) -> PointCloud | None:
+    if episode.scene is None:
+        return None
+    around, still = episode.planner.surroundings, SensorNoise(0.0, 0.0)
+    return observe_scene(episode.scene, camera, pose, still, episode.key, around)
+
+
+def _rows(scans: PointCloud, at: tuple) -> PointCloud:
+    return jax.tree.map(lambda rows: rows[at], scans)

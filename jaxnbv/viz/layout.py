@@ -1,0 +1,43 @@
+"""Letters that neither collide nor leave the picture: they are measured before they are placed."""
+
+from collections.abc import Iterable
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+_SMALLEST = 5.0
+
+
+def width_of(text: Text, figure: Figure) -> float:
+    """Of a text, as a share of the figure's width."""
+    canvas = FigureCanvasAgg(figure)
+    return float(text.get_window_extent(canvas.get_renderer()).width / figure.bbox.width)
+
+
+def fitted(figure: Figure, x: float, y: float, text: str, width: float, fontsize: float, **style) -> Text:
+    """A text at a place of the figure, its letters as small as it takes for `width`; cut where they would be too
+    small."""
+    placed = figure.text(x, y, text, fontsize=fontsize, **style)
+    if (share := width / max(width_of(placed, figure), 1e-9)) < 1.0:
+        placed.set_fontsize(max(_SMALLEST, 0.99 * share * fontsize))
+        while width_of(placed, figure) > width and len(text) > 1:
+            text = text[:-1]
+            placed.set_text(f"{text}…")
+    return placed
+
+
+def flow(
+    figure: Figure, items: Iterable[tuple[str, str]], x: float, y: float, width: float, step: float, fontsize: float
+) -> float:
+    """Texts with their colours from left to right within a width, in as many rows as they need, `step` apart; returns
+    the height of the last one."""
+    at, gap = x, 0.14 / figure.get_figwidth()
+    for text, colour in items:
+        placed = figure.text(at, y, text, color=colour, fontsize=fontsize, va="center")
+        wide = width_of(placed, figure)
+        if at > x and at + wide > x + width:
+            at, y = x, y - step
+            placed.set_position((at, y))
+        at += wide + gap
+    return y

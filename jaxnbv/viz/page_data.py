@@ -1,0 +1,214 @@
+"""What the page draws itself, as JSON: the map of each view and, once a reader turns it, the scene in space."""
+
+import base64
+import io
+import math
+
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from PIL import Image
+
+from jaxnbv.answers import Quantity
+from jaxnbv.camera import Camera
+from jaxnbv.viz import sphere
+from jaxnbv.viz.data import Choice, MeanSurface, ReportData, ViewData
+from jaxnbv.viz.figures import deviation_range, is_smooth, rings_level, value_range
+from jaxnbv.viz.render import FRUSTUM_DEPTH, frustum
+from jaxnbv.viz.style import (
+    BEFORE,
+    DEVIATION,
+    GREY,
+    INK,
+    LINE,
+    NEW,
+    VALUE,
+    VALUE_LINES,
+    colour_scale,
+    spaced_ticks,
+)
+from jaxnbv.viz.task_figures import coverage_series
+from jaxnbv.viz.trajectories import Ascents
+from jaxnbv.viz.trajectory_figures import frusta_steps, small_frusta, spatial_range
+
+# Of all views together, so that a long episode stays a small page.
+_MAX_POINTS, _MAX_VERTICES = 9000, 48_000
+_FEWEST_POINTS, _MOST_POINTS = 400, 1500
+_FEWEST_VERTICES, _MOST_VERTICES = 1500, 9000
+_QUALITY = 82
+# Between numbers under the bar, of its width on a phone.
+_TICK_GAP = 0.14
+
+
+def payload(data: ReportData, camera: Camera) -> dict:
+    """All of it."""
+    low, high = deviation_range(data)
+    ticks = spaced_ticks(low, high, _TICK_GAP)
+    label, series = coverage_series(data)
+    count = len(data.views)
+    points = min(max(_MAX_POINTS // count, _FEWEST_POINTS), _MOST_POINTS)
+    vertices = min(max(_MAX_VERTICES // count, _FEWEST_VERTICES), _MOST_VERTICES)
+    return {
+        "views": [_view(view, camera, data, points, vertices) for view in data.views],
+        "stage": {
+            "eye": data.stage.eye.round(4).tolist(),
+            "reach": data.stage.reach,
+            "pull": data.stage.pull,
+            "shrink": data.stage.depth / FRUSTUM_DEPTH,
+        },
+        "deviation": {
+            "range": [math.log10(low), math.log10(high)],
+            "ticks": np.log10(ticks).tolist(),
+            "labels": [f"{tick:g}" for tick in ticks.tolist()],
+            "colours": colour_scale(DEVIATION),
+        },
+        "value": {"colours": colour_scale(VALUE), "lines": colour_scale(VALUE_LINES), "label": data.quantity.label},
+        "progress": {"label": label, "values": series.tolist()},
+        "map": {
+            "graticule": [line.round(3).tolist() for line in sphere.graticule()],
+            "width": sphere.WIDTH,
+            "height": sphere.HEIGHT,
+        },
+        "style": {"ink": INK, "grey": GREY, "line": LINE, "before": BEFORE, "new": NEW},
+    }
+
+
+def picture_address(picture: UInt8[np.ndarray, "h w _"], lossless: bool = False) -> str:
+    """An image as a data address."""
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, format="WEBP", quality=_QUALITY, lossless=lossless, method=6)
+    return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
+
+
+def _view(view: ViewData, camera: Camera, data: ReportData, points: int, vertices: int) -> dict:
+    return {
+        "sentence": view.sentence,
+        "new": _thinned(view.new, points),
+        "pull": data.stage.pull_of(view.pose),
+        "frustum": frustum(view.pose, camera).round(4).tolist(),
+        "surface": None if view.surface is None else _surface(view.surface, vertices),
+        "choice": None if view.choice is None else _choice(view.choice, data.quantity),
+        "ascents": None if view.spatial_ascents is None else _spatial(view.spatial_ascents, camera),
+    }
+
+
+def _thinned(points: Float[np.ndarray, "n 3"], limit: int) -> list[list[float]]:
+    """At most `limit` rows, evenly taken, rounded to what a screen can show."""
+    rows = np.linspace(0, len(points) - 1, min(limit, len(points))).astype(int)
+    return np.round(points[rows].astype(np.float64), 3).tolist()
+
+
+def clustered(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], limit: int
+) -> tuple[Int[np.ndarray, " v"], Int[np.ndarray, "g 3"]]:
+    """A coarser mesh of at most `limit` vertices: the cluster of each vertex, those within one cell of a lattice, and
+    the faces between clusters (Rossignac and Borrel 1993)."""
+    own = np.arange(len(vertices))
+    cell = 0.01
+    while own.max(initial=-1) + 1 > limit:
+        _, own = np.unique(np.floor(vertices / cell).astype(np.int64), axis=0, return_inverse=True)
+        own, cell = own.reshape(-1), 1.2 * cell
+    joined = own[faces]
+    a, b, c = joined.T
+    return own, joined[(a != b) & (b != c) & (c != a)]
+
+
+def _surface(surface: MeanSurface, limit: int) -> dict:
+    """Vertices and logarithms of deviations in whole steps of their ranges."""
+    own, faces = clustered(surface.vertices, surface.faces, limit)
+    count = np.bincount(own)
+    vertices = np.stack([np.bincount(own, column) / count for column in surface.vertices.T], axis=1)
+    deviation = np.bincount(own, np.log10(surface.deviation)) / count
+    low, high = float(vertices.min()), float(vertices.max())
+    least, most = float(deviation.min()), float(deviation.max())
+    return {
+        "low": low,
+        "step": (high - low) / 65535.0,
+        "vertices": _packed(np.round((vertices - low) / max(high - low, 1e-12) * 65535.0), "<u2"),
+        "faces": _packed(faces, "<u2" if len(vertices) < 65536 else "<u4"),
+        "least": least,
+        "grade": (most - least) / 255.0,
+        "deviation": _packed(np.round((deviation - least) / max(most - least, 1e-12) * 255.0), "u1"),
+    }
+
+
+def _packed(array: np.ndarray, dtype: str) -> str:
+    """The bytes of an array as base64."""
+    return base64.b64encode(np.ascontiguousarray(array, dtype).tobytes()).decode()
+
+
+def _choice(choice: Choice, quantity: Quantity) -> dict:
+    low, high = value_range(choice)
+    order = np.argsort(-np.where(choice.visited, -np.inf, choice.values), kind="stable")
+    ranks = np.empty(len(order), dtype=int)
+    ranks[order] = np.arange(1, len(order) + 1)
+    return {
+        "places": sphere.mollweide(choice.directions).round(3).tolist(),
+        "directions": choice.directions.round(2).tolist(),
+        "values": [None if math.isnan(value) else value for value in choice.values.tolist()],
+        "errors": None if choice.errors is None else _numbers(choice.errors),
+        "level": [] if choice.is_level is None or not rings_level(choice) else np.flatnonzero(choice.is_level).tolist(),
+        "ranks": ranks.tolist(),
+        "chosen": sphere.mollweide(choice.chosen[None]).round(4)[0].tolist(),
+        "value": choice.value,
+        "error": None if choice.error is None or math.isnan(choice.error) else choice.error,
+        "median": float(np.median(choice.open_values)) if choice.open_values.size else None,
+        "range": [low, high],
+        "image": _map_image(choice, low, high) if is_smooth(choice, quantity) else None,
+        "ascents": None if choice.ascents is None else _on_map(choice.ascents),
+        "caption": _map_caption(choice),
+    }
+
+
+def _numbers(values: Float[np.ndarray, " n"]) -> list[float | None]:
+    return [None if not math.isfinite(value) else float(f"{value:.4g}") for value in values.tolist()]
+
+
+def _map_caption(choice: Choice) -> str:
+    """What the marks on the map are that not every map has."""
+    parts = []
+    if rings_level(choice):
+        parts.append("Rings: level with the best, within two standard errors of the difference.")
+    elif choice.level:
+        parts.append(f"The samples cannot tell the best from {choice.level} of the others: no rings are drawn.")
+    if choice.ascents is not None:
+        parts.append("Lines: gradient ascents, from a ring where they start to a dot where they end.")
+        if choice.ascents.is_spatial:
+            parts.append(
+                "They change position and rotation; drawn is the direction of the position, over a map of cameras that "
+                "look at the centre from the sphere where the ascents start."
+            )
+    if not np.array_equal(choice.map.directions, choice.directions):
+        parts.append(
+            "The candidates are too few for a map, or off the sphere: it is drawn from "
+            f"{len(choice.map.values)} more views, valued with the same posterior samples."
+        )
+    return " ".join(parts)
+
+
+def _on_map(ascents: Ascents) -> dict:
+    starts, ends = (sphere.mollweide(ascents.directions[:, step]).round(4).tolist() for step in (0, -1))
+    return {
+        "ways": [piece.round(3).tolist() for directions in ascents.directions for piece in sphere.path(directions)],
+        "starts": starts,
+        "ends": ends,
+        "values": ascents.values[:, [0, -1]].tolist(),
+    }
+
+
+def _spatial(ascents: Ascents, camera: Camera) -> dict:
+    return {
+        "positions": np.asarray(ascents.poses.position, dtype=np.float64).round(3).tolist(),
+        "values": ascents.values.tolist(),
+        "range": list(spatial_range(ascents)),
+        "steps": frusta_steps(ascents).tolist(),
+        "frusta": [small_frusta(ascents, i, camera).round(3).tolist() for i in range(len(ascents.values))],
+    }
+
+
+def _map_image(choice: Choice, low: float, high: float) -> str:
+    """The smooth map, coloured as the candidates are; clear outside the rim."""
+    values = sphere.smooth_map(choice.map.directions, choice.map.values, 160)
+    colours = VALUE(mpl.colors.Normalize(low, high)(np.nan_to_num(values)), bytes=True)
+    colours[..., 3] = np.where(np.isnan(values), 0, 255)
+    return picture_address(colours)

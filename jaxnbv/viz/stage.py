@@ -1,0 +1,76 @@
+"""From where all views of an episode are drawn, and how its cameras are brought into the picture."""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from jaxnbv.episode import Episode
+from jaxnbv.pose import Pose, fibonacci_sphere
+
+# Fields of view are drawn so deep, in radii of the object, and end at so many of its extents in their direction, which
+# counts as so many radii at least.
+_DEPTH, _STAND, _CLOSEST = 0.2, 1.06, 0.35
+_SPREAD, _OUTLINE = 99.0, 1000
+_DIRECTIONS, _HIGHEST = 80, 0.7
+# A camera nearer to the line of sight than this (cosine) would stand in front of the object.
+_IN_FRONT = 0.9
+
+
+class Stage(eqx.Module):
+    """One viewpoint for all pictures, near enough for the object to fill them.
+
+    - `eye`: unit vector from the origin to the reader.
+    - `radius`: of the object about the origin, in scene units; `outline`: points of it.
+    - `pull`: what the positions along ascents are multiplied by, so that they stand near the object.
+    - `depth`: of the fields of view that are drawn, in scene units.
+    """
+
+    eye: Float[np.ndarray, "3"]
+    radius: float
+    outline: Float[np.ndarray, "n 3"]
+    pull: float
+    depth: float
+
+    @property
+    def reach(self) -> float:
+        """Radius of what is drawn, numbers of cameras included."""
+        return 1.1 * (_STAND * self.radius + self.depth)
+
+    def pull_of(self, pose: Pose) -> float:
+        """What a camera's position is multiplied by: it stands just beyond the object's extent in its direction."""
+        position = np.asarray(pose.position, np.float64)
+        distance = max(float(np.linalg.norm(position)), 1e-9)
+        extent = max(float((self.outline @ position).max()) / distance, _CLOSEST * self.radius)
+        return min(1.0, (_STAND * extent + self.depth) / distance)
+
+    def pulled(self, pose: Pose) -> Pose:
+        """Where a camera is drawn."""
+        return Pose(pose.rotation, self.pull_of(pose) * pose.position)
+
+
+def stage_of(episode: Episode, surfaces: list[Float[np.ndarray, "_ 3"]]) -> Stage:
+    """The stage of an episode, whose surfaces of the mean have these vertices."""
+    points, normals = episode.cloud.to_numpy()
+    known = [np.asarray(rows, np.float64)[:: max(1, len(rows) // _OUTLINE)] for rows in (points, *surfaces)]
+    distances = [np.linalg.norm(rows, axis=1) for rows in known]
+    radius = max(float(np.percentile(far, _SPREAD)) for far in distances)
+    outline = np.concatenate([rows[far <= radius] for rows, far in zip(known, distances, strict=True)])
+    positions = [np.asarray(view.pose.position, np.float64) for view in episode.views]
+    for view in episode.views:
+        if view.proposal is not None and view.proposal.trajectories is not None:
+            positions += list(np.asarray(view.proposal.trajectories.poses.position, np.float64).reshape(-1, 3))
+    farthest = max(float(np.linalg.norm(position)) for position in positions)
+    depth = _DEPTH * radius
+    pull = min(1.0, (_STAND * radius + depth) / max(farthest, 1e-9))
+    return Stage(_eye(normals, [view.pose for view in episode.views]), radius, outline, pull, depth)
+
+
+def _eye(normals: Float[np.ndarray, "n 3"], poses: list[Pose]) -> Float[np.ndarray, "3"]:
+    """The direction that most of what was seen faces, but few cameras stand in."""
+    eyes = np.asarray(fibonacci_sphere(_DIRECTIONS), np.float64)
+    eyes = eyes[np.abs(eyes[:, 1]) < _HIGHEST]
+    away = np.stack([np.asarray(pose.position, np.float64) for pose in poses])
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+    facing = np.mean(normals @ eyes.T > 0.2, axis=0)
+    in_front = np.mean(away @ eyes.T > _IN_FRONT, axis=0)
+    return eyes[int(np.argmax(facing - in_front))]

@@ -1,0 +1,124 @@
+"""The task by view: what was asked, what was found, when it was sure, and the numbers for its charts."""
+
+import equinox as eqx
+import numpy as np
+import trimesh
+
+from jaxnbv.answers import Answer, Panel
+from jaxnbv.cloud import PointCloud
+from jaxnbv.episode import Episode
+from jaxnbv.planner import Planner
+from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, mesh_from_sdf
+
+# Points of the true surface that a score is asked about: the planner's own usual capacity.
+_TRUE_POINTS = 8192
+
+
+class CoverageAnswer(Answer):
+    """The share of the true surface that was seen, or where that is not known the number of points.
+
+    - `radius`: within which of the cloud a place counts as seen, in scene units; None where points are counted.
+    """
+
+    form: str = "{:.0%}"
+    radius: float | None = None
+
+    @property
+    def question(self) -> str:
+        return "What does it look like all round?"
+
+    @property
+    def found(self) -> str:
+        return f"{self.form.format(self.values[0])} {self.names[0]}"
+
+    def panels(self, truth: Answer | None) -> tuple[Panel, ...]:
+        if self.radius is None:
+            return (Panel(self.names[0], self.names, self.values),)
+        return (Panel(f"coverage (% within {self.radius:g})", self.names, 100.0 * self.values, goal=100.0),)
+
+
+class Task(eqx.Module):
+    """What the views were for.
+
+    - `answers`: after each view; `truth`: what they should come to, None where that is not known.
+    - `panels`: view by view the charts of the answer.
+    - `asked`, `found`, `sure`: how it was asked, what was found and since when, for the head of the report.
+    """
+
+    answers: tuple[Answer, ...]
+    truth: Answer | None
+    panels: tuple[tuple[Panel, ...], ...]
+    asked: str
+    found: str
+    sure: str
+
+    @property
+    def question(self) -> str:
+        """What was asked."""
+        return self.answers[-1].question
+
+    @property
+    def is_coverage(self) -> bool:
+        """Whether its answer is how much was seen."""
+        return isinstance(self.answers[-1], CoverageAnswer)
+
+
+def task_of(episode: Episode, covered: list[float | None], radius: float) -> Task:
+    """The task of an episode's score; that of seeing all of the surface, where the score answers nothing.
+
+    - `covered`: the share of the true surface that was seen after each view, within `radius`; None where not known.
+    """
+    score = episode.planner.acquisition
+    answers = [score.answer(view.cloud) for view in episode.views]
+    told = [answer for answer in answers if answer is not None]
+    truth = None
+    if len(told) == len(answers) and episode.scene is not None:
+        cloud = true_cloud(episode.scene)
+        truth = None if cloud is None else score.true_answer(episode.scene, cloud)
+    if len(told) < len(answers):
+        told = [
+            _coverage(int(view.cloud.count), share, radius) for view, share in zip(episode.views, covered, strict=True)
+        ]
+    panels = tuple(answer.panels(truth) for answer in told)
+    return Task(tuple(told), truth, panels, _asked(episode.planner), _found(told, truth), _sure(told, episode))
+
+
+def true_cloud(scene: Surface, count: int = _TRUE_POINTS) -> PointCloud | None:
+    """Points all over a known surface with their normals, uniform by area; None for a kind that cannot be sampled."""
+    mesh = mesh_from_sdf(scene.sdf, Grid()) if isinstance(scene, SDFSurface) else scene
+    if not isinstance(mesh, TriangleMesh):
+        return None
+    own = mesh.to_trimesh()
+    points, faces = trimesh.sample.sample_surface(own, count, seed=0)
+    return PointCloud.from_arrays(np.asarray(points, np.float32), np.asarray(own.face_normals[faces], np.float32))
+
+
+def since(answers: list[Answer]) -> int | None:
+    """The first view (from 1) from which on all answers can be relied on; None if not even the last can."""
+    befores = [None, *answers[:-1]]
+    relied = [answer.settled(before) for answer, before in zip(answers, befores, strict=True)]
+    return None if not relied[-1] else len(relied) - int(np.argmin([*relied[::-1], False]) - 1)
+
+
+def _coverage(count: int, share: float | None, radius: float) -> CoverageAnswer:
+    if share is None:
+        return CoverageAnswer(("points kept",), np.array([float(count)]), "{:,.0f}")
+    return CoverageAnswer(("of the surface seen",), np.array([share]), radius=radius)
+
+
+def _asked(planner: Planner) -> str:
+    samples = f" over {planner.num_samples} imagined surfaces a step" if planner.search.uses_samples else ""
+    return f"Each view is where the {planner.quantity.name} is highest, by {type(planner.search).__name__}{samples}."
+
+
+def _found(answers: list[Answer], truth: Answer | None) -> str:
+    last = answers[-1].found
+    text = f"{last[:1].upper()}{last[1:]}"
+    return text if truth is None else f"{text}. In truth: {truth.found}"
+
+
+def _sure(answers: list[Answer], episode: Episode) -> str:
+    first, count = since(answers), len(answers)
+    text = f"From view {first} on" if first else f"Not yet after {count} view{'s' * (count > 1)}"
+    text = f"{text}; sure means {answers[-1].settled_means}."
+    return f"{text} Ended: {episode.stopped}." if episode.stopped else text

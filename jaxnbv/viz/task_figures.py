@@ -1,0 +1,165 @@
+"""The charts of an episode: its task by view, how much was seen, what the chosen views were worth."""
+
+import textwrap
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+from jaxnbv.answers import Panel, number
+from jaxnbv.viz.data import COVERAGE_RADIUS, ReportData
+from jaxnbv.viz.style import BEFORE, GREY, INK, LINE, NEW, SERIES
+
+_MOST_NAMES, _LONGEST_NAME = 6, 22
+
+
+def shown_names(panels: tuple[Panel, ...]) -> list[int]:
+    """Which numbers of a chart are drawn: all if they are few, else those that are ever the largest, or true."""
+    values = np.stack([panel.values for panel in panels])
+    true = panels[-1].true
+    reached = values.max(axis=0) if true is None else np.maximum(values.max(axis=0), true)
+    return sorted(np.argsort(-reached, kind="stable")[:_MOST_NAMES].tolist())
+
+
+def draw_panel(axes: Axes, panels: tuple[Panel, ...]) -> None:
+    """Draw a chart of the task, of which each view has a panel: bars side by side, or lines, with what is true."""
+    last, chosen = panels[-1], shown_names(panels)
+    values, views = np.stack([panel.values for panel in panels]), np.arange(1, len(panels) + 1)
+    colours = _colours(last, chosen)
+    handles: list[Any] = []
+    for place, index in enumerate(chosen):
+        name, colour = textwrap.shorten(last.names[index], _LONGEST_NAME, placeholder="…"), colours[place]
+        if last.bars:
+            width = 0.8 / len(chosen)
+            at = views + width * (place - 0.5 * (len(chosen) - 1))
+            axes.bar(at, values[:, index], 0.9 * width, color=colour, zorder=2)
+            is_true = last.true is not None and last.true[index] > 0
+            handles.append(Patch(color=colour, label=f"{name} (true)" if is_true else name))
+            continue
+        axes.plot(views, values[:, index], color=colour, lw=1.6, marker="o", ms=5, markeredgecolor="white", zorder=3)
+        handles.append(Line2D([], [], color=colour, marker="o", ms=5, label=name))
+        if last.true is not None:
+            axes.axhline(last.true[index], color=colour, lw=1.2, ls="--", zorder=1)
+    if last.true is not None and not last.bars:
+        handles.append(Line2D([], [], color=GREY, lw=1.2, ls="--", label="in truth"))
+    if last.goal is not None:
+        axes.axhline(last.goal, color=GREY, lw=1.0, ls=":", zorder=1)
+    if len(handles) > 1:
+        legend_below(axes, handles)
+    low, high = axes.get_ylim()
+    axes.set_ylim(min(low, 0.0) if values.min() >= 0 else low, high + 0.05 * (high - low))
+    over_views(axes, len(panels))
+
+
+def _colours(last: Panel, chosen: list[int]) -> list[str]:
+    """Of the numbers that are drawn; one that is the only true one stands out."""
+    marked = [] if last.true is None or not last.bars else [index for index in chosen if last.true[index] > 0]
+    others = iter(SERIES * 2)
+    return [NEW if marked == [index] else next(others) for index in chosen]
+
+
+def legend_below(axes: Axes, handles: list[Any]) -> None:
+    """A legend that stands under the axes, where nothing is drawn."""
+    # In inches: the figure's, shared by its columns.
+    width = float(axes.figure.bbox.width / axes.figure.dpi)
+    spec = axes.get_subplotspec()
+    room = width if spec is None else width / spec.get_gridspec().ncols
+    # Thirteen letters of this size take an inch, and so do a mark and the gap by it six of them.
+    longest = max(len(handle.get_label()) for handle in handles) + 6
+    columns = max(1, min(len(handles), int(13 * room) // longest))
+    axes.legend(
+        handles=handles,
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.24),
+        ncols=columns,
+        frameon=False,
+        fontsize=8,
+        handlelength=1.4,
+        columnspacing=1.2,
+    )
+
+
+def over_views(axes: Axes, count: int) -> None:
+    """An axis of views, from half a view before the first to half a view behind the last."""
+    axes.set(xlabel="view", xlim=(0.5, count + 0.5))
+    axes.xaxis.set_major_locator(MaxNLocator(min(count, 10), integer=True, min_n_ticks=1))
+    axes.yaxis.set_major_locator(MaxNLocator(5))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
+
+
+def coverage_series(data: ReportData) -> tuple[str, Float[np.ndarray, " v"]]:
+    """The chart of progress: coverage in percent, or where the truth is not known the points that are kept."""
+    shares = [view.coverage for view in data.views]
+    if any(share is None for share in shares):
+        return "points kept", np.array([float(view.count) for view in data.views])
+    values = np.array([100.0 * share for share in shares if share is not None])
+    return f"coverage (% within {COVERAGE_RADIUS:g})", values
+
+
+def draw_coverage(axes: Axes, data: ReportData) -> None:
+    """Draw progress by view."""
+    label, values = coverage_series(data)
+    views = np.arange(1, len(values) + 1)
+    axes.plot(views, values, color=BEFORE, lw=1.4, marker="o", ms=5, markeredgecolor="white")
+    if len(views) <= 10:
+        for view, value in zip(views, values, strict=True):
+            text = number(value) if label == "points kept" else f"{value:.0f}"
+            axes.annotate(text, (view, value), (0, 6), textcoords="offset points", ha="center", fontsize=8)
+    axes.set(ylim=(0, 1.18 * max(float(values.max()), 1.0)))
+    over_views(axes, len(values))
+
+
+def draw_values(axes: Axes, data: ReportData) -> None:
+    """Draw the value of each chosen view, with its standard error, over that of the median candidate."""
+    has_error = False
+    for view in data.views:
+        if view.choice is None:
+            below: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "color": GREY, "fontsize": 8}
+            axes.annotate("given", (view.number, 0), (0, 4), **below)
+            continue
+        axes.vlines(view.number, 0.0, view.choice.value, color=LINE, lw=1.5, zorder=1)
+        error = view.choice.error
+        if error is not None and np.isfinite(error):
+            has_error = True
+            axes.errorbar(view.number, view.choice.value, error, color=INK, lw=1.2, capsize=3, zorder=2)
+        axes.plot(view.number, view.choice.value, "*", color=NEW, ms=11, markeredgecolor="white", zorder=3)
+        if view.choice.open_values.size:
+            axes.plot(view.number, np.median(view.choice.open_values), "_", color=INK, ms=11, mew=1.4, zorder=2)
+    star = Line2D([], [], ls="none", marker="*", color=NEW, ms=9, label="chosen view" + " ± standard error" * has_error)
+    median = Line2D([], [], ls="none", marker="_", color=INK, ms=9, mew=1.4, label="median candidate")
+    legend_below(axes, [star, median])
+    low, high = axes.get_ylim()
+    axes.set_ylim(min(low, 0.0), high * 1.12)
+    over_views(axes, len(data.views))
+
+
+def task_charts(data: ReportData) -> list[tuple[str, Any]]:
+    """The title of each chart of the task, and what draws it."""
+    by_chart = zip(*data.task.panels, strict=True)
+    return [(panels[-1].label, partial(draw_panel, panels=panels)) for panels in by_chart]
+
+
+def other_charts(data: ReportData) -> list[tuple[str, Any]]:
+    """The other charts: of progress, where that is not the task, and of the chosen views."""
+    charts: list[tuple[str, Any]] = []
+    if not data.task.is_coverage:
+        charts.append((coverage_series(data)[0], partial(draw_coverage, data=data)))
+    if any(view.choice is not None for view in data.views):
+        charts.append((data.quantity.label, partial(draw_values, data=data)))
+    return charts
+
+
+def chart_figure(charts: list[tuple[str, Any]], width: float = 3.6, height: float = 2.9, titled: bool = True) -> Figure:
+    """Charts side by side."""
+    figure = Figure(figsize=(width * len(charts), height), layout="constrained")
+    for axes, (title, draw) in zip(np.atleast_1d(figure.subplots(1, len(charts))), charts, strict=True):
+        draw(axes)
+        if titled:
+            axes.set_title("\n".join(textwrap.wrap(title[:1].upper() + title[1:], int(12 * width))[:3]), fontsize=9)
+    return figure

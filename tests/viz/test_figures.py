@@ -1,0 +1,223 @@
+"""Pictures that can be read: letters that do not collide and are not cut; a page that stays small."""
+
+import base64
+import dataclasses
+import itertools
+import json
+
+import jax
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Text
+
+import jaxnbv as nbv
+from jaxnbv.answers import Answer, Panel, Quantity
+from jaxnbv.datasets.demo import demo_object
+from jaxnbv.pose import look_at
+from jaxnbv.viz import report_data
+from jaxnbv.viz.data import MeanSurface
+from jaxnbv.viz.figures import STYLE, Stills, figures_of
+from jaxnbv.viz.page_data import clustered, payload
+from jaxnbv.viz.stage import stage_of
+from jaxnbv.viz.style import spaced_ticks
+from jaxnbv.viz.task import Task
+
+CAMERA = nbv.Camera(height=16, width=16)
+
+
+@pytest.fixture(scope="module")
+def episode():
+    model = nbv.GeometricSPSR(truncation=12, lengthscale=0.03)
+    planner = nbv.Planner(model, CAMERA, nbv.Coverage(), nbv.DiscreteSearch(12), 3, nbv.Grid(24), capacity=512)
+    return nbv.simulate(planner, demo_object(), look_at((0.8, 0.9, 2.2)), 3, jax.random.key(0), progress=False)
+
+
+@pytest.fixture(scope="module")
+def data(episode):
+    """Without surfaces, which take long to paint and have no letters."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("jaxnbv.viz.data.mean_surface", lambda planner, state: None)
+        return report_data(episode, progress=False)
+
+
+def of_views(data, count):
+    """The data of an episode of so many views, the same ones again and again."""
+    views = [
+        dataclasses.replace(view, number=number)
+        for number, view in zip(range(1, count + 1), itertools.cycle(data.views), strict=False)
+    ]
+    panels = tuple(itertools.islice(itertools.cycle(data.task.panels), count))
+    return dataclasses.replace(data, views=tuple(views), task=dataclasses.replace(data.task, panels=panels))
+
+
+def texts(figure):
+    """What is written in a figure and where, but for the numbers of cameras, which stand where these do."""
+    scenes = [axes for axes in figure.axes if axes.images and not axes.axison]
+    numbers = {id(text) for axes in scenes for text in axes.texts}
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    FigureCanvasAgg(figure).draw()
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            low, high = sorted(axis.get_view_interval())
+            beyond = [not low - 1e-9 <= at <= high + 1e-9 for at in axis.get_majorticklocs()]
+            # Ticks beyond the axis are not drawn, though they say that they are visible.
+            numbers |= {id(tick.label1) for tick, is_off in zip(axis.get_major_ticks(), beyond, strict=True) if is_off}
+    shown = [
+        text
+        for text in figure.findobj(Text)
+        if text.get_visible() and text.get_text().strip() and id(text) not in numbers
+    ]
+    drawn = []
+    for text in shown:
+        axis_off = text.axes is not None and not text.axes.axison
+        if not axis_off or text in text.axes.texts:
+            drawn.append((text.get_text(), text.get_window_extent(renderer)))
+    return drawn
+
+
+def check_letters(figure):
+    found = texts(figure)
+    assert found
+    for text, box in found:
+        inside = box.x0 >= -1 and box.y0 >= -1 and box.x1 <= figure.bbox.width + 1 and box.y1 <= figure.bbox.height + 1
+        assert inside, f"{text!r} is cut: {box.extents} of {figure.bbox.size}"
+    for (one, here), (other, there) in itertools.combinations(found, 2):
+        width = min(here.x1, there.x1) - max(here.x0, there.x0)
+        height = min(here.y1, there.y1) - max(here.y0, there.y0)
+        assert width < 1 or height < 1, f"{one!r} and {other!r} collide: {here.extents}, {there.extents}"
+
+
+LONG = Quantity(
+    "expected improvement of the greatest height over the table at the back", "hundredths of scene units", ""
+)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7])
+@pytest.mark.parametrize("quantity", [None, LONG])
+def test_letters_neither_collide_nor_are_cut(data, count, quantity):
+    shown = of_views(data, count)
+    shown = shown if quantity is None else dataclasses.replace(shown, quantity=quantity)
+    with mpl.rc_context(STYLE):
+        for draw in figures_of(shown, CAMERA, Stills(shown)).values():
+            check_letters(draw())
+
+
+@pytest.mark.parametrize("low", [1e-4, 2e-3, 0.04])
+def test_the_ticks_of_any_range_have_room(data, low, monkeypatch):
+    monkeypatch.setattr("jaxnbv.viz.figures.deviation_range", lambda data: (low, 1.0))
+    for count in (2, 3):
+        shown = of_views(data, count)
+        with mpl.rc_context(STYLE):
+            drawings = figures_of(shown, CAMERA, Stills(shown))
+            for name in ("view_02", "overview"):
+                check_letters(drawings[name]())
+
+
+@pytest.mark.parametrize("names", [("one",), tuple("abcde"), tuple(f"a part of a name of {k}" for k in range(12))])
+@pytest.mark.parametrize("bars", [True, False])
+def test_legends_of_the_task_have_room(data, names, bars):
+    values = np.linspace(0.0, 1.0, len(names))
+    panels = Panel("a quantity with a rather long name, and its unit (units)", names, values, values[::-1], bars, 0.9)
+    answer = Answer(names, values)
+    task = Task((answer,) * 3, None, ((panels, panels),) * 3, "", "", "")
+    shown = dataclasses.replace(data, task=task)
+    with mpl.rc_context(STYLE):
+        check_letters(figures_of(shown, CAMERA, Stills(shown))["task"]())
+
+
+def test_ticks_are_round_and_have_room():
+    np.testing.assert_allclose(spaced_ticks(0.001, 0.1, 0.1), [0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1])
+    np.testing.assert_allclose(spaced_ticks(0.001, 0.1, 0.2), [0.001, 0.01, 0.1])
+    np.testing.assert_allclose(spaced_ticks(0.001, 1.0, 0.12), [0.001, 0.01, 0.1, 1.0])
+    for low, high, gap in ((1e-12, 1.0, 0.15), (0.0005, 0.05, 0.2), (0.02, 0.05, 0.3)):
+        ticks = spaced_ticks(low, high, gap)
+        assert len(ticks) >= 2
+        assert np.diff(np.log(ticks)).min() >= gap * np.log(high / low)
+
+
+def ball(count=40_000):
+    """A fine mesh of the unit sphere, which is known to 0.01 above and 0.1 below."""
+    rows = int(np.sqrt(count / 2))
+    theta, phi = np.meshgrid(np.linspace(0, np.pi, rows), np.linspace(0, 2 * np.pi, 2 * rows), indexing="ij")
+    vertices = np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], -1).reshape(-1, 3)
+    a = (np.arange(rows - 1)[:, None] * 2 * rows + np.arange(2 * rows - 1)).ravel()
+    faces = np.concatenate(
+        [np.stack([a, a + 1, a + 2 * rows], 1), np.stack([a + 1, a + 2 * rows + 1, a + 2 * rows], 1)]
+    )
+    return MeanSurface(vertices, faces, vertices, np.where(vertices[:, 1] > 0, 0.01, 0.1))
+
+
+def test_a_clustered_mesh_keeps_its_shape():
+    surface = ball()
+    own, faces = clustered(surface.vertices, surface.faces, 3000)
+    assert own.max() < 3000
+    assert own.max() > 800
+    centres = np.stack([np.bincount(own, column) / np.bincount(own) for column in surface.vertices.T], axis=1)
+    assert np.linalg.norm(surface.vertices - centres[own], axis=1).max() < 0.2
+    a, b, c = np.moveaxis(centres[faces], 1, 0)
+    volume = abs(np.sum(np.einsum("ij,ij->i", a, np.cross(b, c)))) / 6.0
+    assert volume == pytest.approx(4 * np.pi / 3, rel=0.03)
+    assert len(np.unique(faces)) <= own.max() + 1
+    same, kept = clustered(surface.vertices, surface.faces, 10**6)
+    np.testing.assert_array_equal(same, np.arange(len(surface.vertices)))
+    np.testing.assert_array_equal(kept, surface.faces)
+
+
+def test_ten_views_of_fine_surfaces_make_a_small_page(data):
+    """Plotly takes 2 MB, packed, and the pictures of a view less than 0.1 MB."""
+    shown = of_views(data, 10)
+    views = tuple(dataclasses.replace(view, surface=ball()) for view in shown.views)
+    found = payload(dataclasses.replace(shown, views=views), CAMERA)
+    assert len(json.dumps(found)) < 1.2e6
+    packed = found["views"][9]["surface"]
+    steps = np.frombuffer(base64.b64decode(packed["vertices"]), "<u2").reshape(-1, 3)
+    vertices = packed["low"] + packed["step"] * steps
+    deviation = packed["least"] + packed["grade"] * np.frombuffer(base64.b64decode(packed["deviation"]), "u1")
+    faces = np.frombuffer(base64.b64decode(packed["faces"]), "<u2").reshape(-1, 3)
+    assert faces.max() < len(vertices) == len(deviation)
+    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1.0, atol=0.02)
+    np.testing.assert_allclose(deviation[vertices[:, 1] > 0.1], -2.0, atol=0.01)
+    np.testing.assert_allclose(deviation[vertices[:, 1] < -0.1], -1.0, atol=0.01)
+
+
+def test_all_cameras_stand_beside_the_object_in_one_picture(episode):
+    stage = stage_of(episode, [ball().vertices])
+    assert np.linalg.norm(stage.eye) == pytest.approx(1.0)
+    for view in episode.views:
+        position = np.asarray(stage.pulled(view.pose).position, np.float64)
+        distance = np.linalg.norm(position)
+        assert stage.radius < distance < np.linalg.norm(view.pose.position)
+        assert 1.09 * distance <= stage.reach
+        np.testing.assert_allclose(position / distance, np.asarray(view.pose.position) / 2.5, atol=0.05)
+
+
+def test_standard_errors_are_on_the_page(episode, data):
+    shown = payload(data, CAMERA)["views"][1]["choice"]
+    proposal = episode.views[1].proposal
+    np.testing.assert_allclose(shown["errors"], np.asarray(proposal.standard_errors), rtol=1e-3)
+    chosen = int(np.argmax(np.asarray(proposal.values)))
+    assert shown["error"] == pytest.approx(float(proposal.standard_errors[chosen]))
+
+
+def test_a_record_without_standard_errors_gives_a_page_too(episode):
+    """As of a folder of an earlier version."""
+    views = tuple(
+        view
+        if view.proposal is None
+        else dataclasses.replace(
+            view, proposal=dataclasses.replace(view.proposal, standard_errors=None, difference_errors=None)
+        )
+        for view in episode.views
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("jaxnbv.viz.data.mean_surface", lambda planner, state: None)
+        old = report_data(dataclasses.replace(episode, views=views), progress=False, imagine=False)
+    shown = payload(old, CAMERA)["views"][1]["choice"]
+    assert shown["errors"] is None
+    assert shown["error"] is None
+    assert shown["level"] == []
+    with mpl.rc_context(STYLE):
+        for draw in figures_of(old, CAMERA, Stills(old)).values():
+            check_letters(draw())

@@ -1,0 +1,242 @@
+"""The task by view: its numbers, what is true, since when it is sure; in the answers and on the page."""
+
+import html
+import re
+from html.parser import HTMLParser
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxnbv as nbv
+from jaxnbv.answers import Answer, number
+from jaxnbv.datasets import Split, pyramid_scene
+from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.tasks.classification import ClassAnswer
+from jaxnbv.tasks.heat import ColdestAnswer
+from jaxnbv.tasks.segmentation import PartAnswer
+from jaxnbv.viz.data import report_data
+from jaxnbv.viz.report import report_html
+from jaxnbv.viz.task import since, true_cloud
+
+CAMERA = nbv.Camera(height=16, width=16)
+NAMES = ("left", "right", "up")
+
+
+class Leaning(eqx.Module):
+    """A classifier that looks at where the points are."""
+
+    classes: tuple[str, ...] = NAMES
+
+    def __call__(self, cloud):
+        mean = jnp.sum(jnp.where(cloud.mask[:, None], cloud.points, 0.0), axis=0) / jnp.maximum(cloud.count, 1)
+        return jax.nn.log_softmax(6.0 * jnp.array([-mean[0], mean[0], mean[1]]))
+
+
+def greatest_height(cloud):
+    return jnp.max(jnp.where(cloud.mask, cloud.points[:, 1], -2.0))
+
+
+def run(score, scene, views=3):
+    model = nbv.GeometricSPSR(truncation=12, lengthscale=0.03)
+    planner = nbv.Planner(model, CAMERA, score, nbv.RandomView(8), 2, nbv.Grid(24), capacity=512)
+    first, none = nbv.look_at((0.8, 0.9, 2.2)), nbv.SensorNoise(0.0, 0.0)
+    return nbv.simulate(planner, scene, first, views, jax.random.key(3), none, progress=False)
+
+
+@pytest.fixture(scope="module")
+def plain(request):
+    """Pictures of surfaces take long, and have nothing to do with the numbers."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr("jaxnbv.viz.data.mean_surface", lambda planner, state: None)
+    yield
+    patch.undo()
+
+
+class Tables(HTMLParser):
+    """The tables of a page: by their captions, a row's cells by its name."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.found, self._tag, self._row = {}, None, None
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self._tag = tag
+        if tag == "tr":
+            self._row = []
+
+    def handle_endtag(self, tag):
+        self._tag = None
+        if tag == "tr" and self._row is not None:
+            self._table.append(self._row)
+
+    def handle_data(self, text):
+        if self._tag == "caption":
+            self._table = self.found[text] = []
+        elif self._tag in ("th", "td") and self._row is not None:
+            self._row.append(text)
+
+
+def page_of(episode):
+    data = report_data(episode, progress=False, imagine=False)
+    return data, report_html(episode, data, "thing")
+
+
+def head(text):
+    """The rows at the head of the page."""
+    return {name: html.unescape(value) for name, value in re.findall(r"<dt>(\w+)</dt><dd[^>]*>([^<]*)</dd>", text)}
+
+
+def test_probabilities_by_view_are_those_of_the_classifier(plain):
+    scene = pyramid_scene(Split.TEST, 1)
+    episode = run(nbv.CrossEntropy(Leaning(), 512), nbv.SDFSurface(scene))
+    _, text = page_of(episode)
+    header, *rows, true = Tables(text).found["Probability"]
+    assert header == list(NAMES)
+    expected = []
+    for view in episode.views:
+        mean = np.asarray(view.cloud.to_numpy()[0], np.float64).mean(axis=0)
+        odds = np.exp(6.0 * np.array([-mean[0], mean[0], mean[1]]))
+        expected.append(odds / odds.sum())
+    assert [row[0] for row in rows] == ["view 1", "view 2", "view 3"]
+    np.testing.assert_allclose([[float(cell) for cell in row[1:]] for row in rows], expected, rtol=6e-3)
+    # The scene is of class 1.
+    assert int(scene.label) == 1
+    assert true == ["in truth", "0", "1", "0"]
+    best = int(np.argmax(expected[-1]))
+    assert head(text)["Found"].startswith(f"{NAMES[best].capitalize()}, probability {expected[-1][best]:.2f}")
+    assert head(text)["Found"].endswith("In truth: right")
+    assert "Which class is it?" in text
+
+
+def test_a_utility_of_ones_own_has_its_chart_and_its_truth(plain):
+    """The true height of a ball is its radius."""
+    episode = run(nbv.ExpectedUtilityImprovement(greatest_height), nbv.SDFSurface(Sphere(0.9)))
+    data, text = page_of(episode)
+    header, *rows, true = Tables(text).found["Greatest height"]
+    assert header == ["greatest height"]
+    heights = [float(view.cloud.to_numpy()[0][:, 1].max()) for view in episode.views]
+    assert [row[1] for row in rows] == [number(height) for height in heights]
+    assert float(true[1]) == pytest.approx(0.9, abs=0.01)
+    assert data.task.truth.values[0] == pytest.approx(0.9, abs=0.01)
+    assert "<h1>Greatest height?" in text
+    settled = abs(heights[-1] / heights[-2] - 1.0) < 0.05
+    assert head(text)["Sure"].startswith("From view" if settled else "Not yet after 3 views")
+
+
+def test_coverage_by_view_is_the_share_of_the_truth_near_the_cloud(plain):
+    episode = run(nbv.Coverage(), nbv.SDFSurface(Sphere(0.9)))
+    truth = 0.9 * np.asarray(nbv.fibonacci_sphere(500), np.float64)
+    data = report_data(episode, truth, progress=False, imagine=False)
+    _, *rows = Tables(report_html(episode, data, "ball")).found["Coverage (% within 0.05)"]
+    for row, view in zip(rows, episode.views, strict=True):
+        away = np.linalg.norm(truth[:, None] - view.cloud.to_numpy()[0][None], axis=-1).min(axis=1)
+        assert row[1] == number(100.0 * float(np.mean(away <= 0.05)))
+
+
+def test_truth_of_a_scene_is_all_over_it():
+    cloud = true_cloud(nbv.SDFSurface(Sphere(0.9)))
+    points, normals = cloud.to_numpy()
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 0.9, atol=0.01)
+    assert np.sum(points * normals, axis=1).min() > 0.85
+    assert np.abs(points.mean(axis=0)).max() < 5 * 0.9 / np.sqrt(3 * len(points))
+    assert (
+        true_cloud(nbv.GridSurface.from_values(jnp.ones((24, 24, 24)).at[12, 12, 12].set(-1.0), 0.0, nbv.Grid(24)))
+        is None
+    )
+
+
+def test_a_class_is_not_known_of_a_scene_without_one():
+    ball, cloud = nbv.SDFSurface(Sphere(0.9)), nbv.PointCloud.from_arrays([[0.0, 0.9, 0.0]], [[0.0, 1.0, 0.0]])
+    for score in (nbv.CrossEntropy(Leaning()), nbv.ExpectedUtilityImprovement(nbv.NegativeEntropy(Leaning()))):
+        assert score.true_answer(ball, cloud) is None
+        known = score.true_answer(nbv.SDFSurface(pyramid_scene(Split.TEST, 2)), cloud)
+        np.testing.assert_array_equal(known.values, [0.0, 0.0, 1.0])
+        # The classifier tells three classes apart: a fourth is none of its.
+        assert score.true_answer(nbv.SDFSurface(pyramid_scene(Split.TEST, 3)), cloud) is None
+
+
+def test_heat_is_charted_by_temperature_and_distance():
+    found = ColdestAnswer(("coldest",), np.array([0.4]), point=np.array([1.0, 0.0, 2.0]))
+    truth = ColdestAnswer(("coldest",), np.array([0.1]), point=np.array([1.0, 3.0, -2.0]))
+    temperature, distance = found.panels(truth)
+    assert (temperature.values[0], temperature.true[0]) == (0.4, 0.1)
+    assert distance.values[0] == 5.0
+    (alone,) = found.panels(None)
+    assert alone.true is None
+
+
+def test_parts_are_found_by_their_points():
+    found = PartAnswer(("a", "b", "c", "d"), np.array([70.0, 59.0, 60.0, 500.0]), asked=(0, 1, 2))
+    truth = PartAnswer(("a", "b", "c", "d"), np.array([4.0, 9.0, 0.0, 0.0]), asked=(0, 1, 2))
+    count, points = found.panels(truth)
+    assert (count.values[0], count.true[0]) == (2.0, 2.0)
+    np.testing.assert_array_equal(points.values, [70.0, 59.0, 60.0])
+    assert found.found == "a, c"
+    assert not found.settled(None)
+    assert PartAnswer(("a",), np.array([60.0]), asked=(0,)).settled(None)
+
+
+def classes(*rows):
+    return [ClassAnswer(("a", "b"), np.array([p, 1.0 - p])) for p in rows]
+
+
+@pytest.mark.parametrize(
+    ("answers", "view"),
+    [
+        (classes(0.5, 0.96, 0.97), 2),
+        (classes(0.96, 0.9, 0.97), 3),
+        (classes(0.96, 0.97), 1),
+        (classes(0.96, 0.94), None),
+        # Sure of one class, then of the other: not to be relied on before it says so twice.
+        (classes(0.96, 0.03), None),
+        (classes(0.96, 0.03, 0.02), 3),
+        ([Answer(("x",), np.array([value])) for value in (1.0, 2.0, 2.05, 2.06)], 3),
+        ([Answer(("x",), np.array([value])) for value in (1.0, 2.0)], None),
+        ([Answer(("x",), np.array([1.0]))], None),
+    ],
+)
+def test_since_when_an_answer_can_be_relied_on(answers, view):
+    assert since(answers) == view
+
+
+def test_the_page_opens_with_the_answer_and_folds_the_settings_away(plain):
+    episode = run(nbv.ExpectedUtilityImprovement(greatest_height), nbv.SDFSurface(Sphere(0.9)), views=2)
+    _, text = page_of(episode)
+    body = text[text.index("<body>") :]
+    asked, slider = body.index("<h1>"), body.index('id="slider"')
+    folded = body.index("<summary>Settings and versions")
+    assert asked < body.index("<dt>Found</dt>") < body.index("<dt>Sure</dt>") < slider < folded
+    for setting in ("GeometricSPSR(", "RandomView(", "equinox "):
+        assert setting in body[folded:]
+        assert setting not in body[:folded]
+
+
+class Attributes(HTMLParser):
+    def __init__(self, text):
+        super().__init__()
+        self.elements = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+
+
+def test_the_page_can_be_read_and_used_without_a_mouse_or_eyes(plain):
+    episode = run(nbv.ExpectedUtilityImprovement(greatest_height), nbv.SDFSurface(Sphere(0.9)), views=2)
+    elements = Attributes(page_of(episode)[1]).elements
+    ids = [attributes["id"] for _, attributes in elements if "id" in attributes]
+    assert len(ids) == len(set(ids))
+    (slider,) = (attributes for tag, attributes in elements if tag == "input")
+    assert (slider["type"], slider["min"], slider["max"], slider["aria-label"]) == ("range", "1", "2", "View")
+    assert slider["aria-describedby"] in ids
+    (spoken,) = (attributes for _, attributes in elements if attributes.get("aria-live") == "polite")
+    assert spoken["id"] == slider["aria-describedby"]
+    images = [attributes for tag, attributes in elements if tag == "img"]
+    assert len(images) >= 4
+    assert all(len(attributes["alt"]) > 5 for attributes in images)
+    buttons = [attributes for tag, attributes in elements if tag == "button"]
+    assert {"Previous view", "Next view"} <= {attributes.get("aria-label") for attributes in buttons}
