@@ -1,4 +1,4 @@
-"""The site: `pip install ".[docs]" && sphinx-build -W -b html docs site`. Nothing is fetched, to build it or to read it."""
+"""The site: `pip install ".[docs]" && sphinx-build -W -b html docs site`. It is built and read without a network."""
 
 import re
 import shutil
@@ -50,7 +50,7 @@ def _restructured(app: Sphinx, what: str, name: str, obj: Any, options: Any, lin
     markup."""
     parts = re.split(r"(`[^`]+`)", "\n".join(lines))
     prose = [re.sub(r"(?<!\*)\*(?!\*)|\||_(?=\W|$)", r"\\\g<0>", part) for part in parts[::2]]
-    code = [f"`{part}`" for part in parts[1::2]]
+    code = [rf"\ `{part}`\ " for part in parts[1::2]]
     text = "".join(a + b for a, b in zip(prose, [*code, ""], strict=True))
     lines[:] = re.sub(r"(?m)^(?! *- )(.*\S.*)\n(?=- )", r"\1\n\n", text).split("\n")
 
@@ -60,7 +60,7 @@ def _short(app: Sphinx, what: str, name: str, obj: Any, options: Any, given: str
 
     def renamed(text: str | None) -> str | None:
         text = text and text.replace("jaxlib._jax.Array", "Array")
-        return text and re.sub(r"Key\[Array, ''\] \| UInt32\[Array, '2'\] \| UInt32\[Array, '4'\]", "PRNGKeyArray", text)
+        return text and text.replace("Key[Array, ''] | UInt32[Array, '2'] | UInt32[Array, '4']", "PRNGKeyArray")
 
     return renamed(given), renamed(returned)
 
