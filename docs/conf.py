@@ -14,7 +14,6 @@ import jaxnbv
 ROOT = Path(__file__).resolve().parents[1]
 
 project = "jaxnbv"
-author = "The jaxnbv authors"
 release = jaxnbv.__version__
 extensions = ["myst_nb", "sphinx.ext.autodoc"]
 
@@ -33,6 +32,7 @@ add_module_names = False
 
 html_theme = "furo"
 html_title = "jaxnbv"
+html_show_copyright = False
 html_math_renderer = "mathml"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]

@@ -212,9 +212,12 @@ def commands(text: str) -> list[list[str]]:
     return found
 
 
+COMMAND = typer.main.get_command(cli.app)
+
+
 def parse(arguments: list[str], whole: bool = True) -> None:
     """As the command line takes them. Runs nothing. What is named in a sentence need not be whole."""
-    command = typer.main.get_command(cli.app)
+    command = COMMAND
     while arguments and arguments[0] in getattr(command, "commands", {}):
         command, arguments = command.commands[arguments[0]], arguments[1:]
     known = getattr(command, "commands", {})
@@ -274,6 +277,13 @@ def test_commands_that_are_not_there_are_refused():
         check_script(found[1][1:])
     with pytest.raises(AssertionError):
         check_extras(["install", ".[cuba]"])
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_formulas_in_tables_are_whole(page):
+    """A bar ends a cell of a table, within a formula too."""
+    rows = [line for line in (DOCS / page).read_text().splitlines() if line.startswith("|")]
+    assert not [cell for row in rows for cell in row.split("|") if cell.count("$") % 2]
 
 
 def documented() -> dict[str, list[str]]:
