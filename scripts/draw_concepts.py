@@ -130,11 +130,13 @@ def main() -> None:
     state = planner.init(noise(nbv.scan(scene, planner.camera, first), scan_key), first)
     surfaces = planner.sample_surfaces(state, sample_key)
     proposal = planner.choose(state, surfaces, search_key)
-    climbing = dataclasses.replace(planner, search=nbv.GradientSearch(dof=2))
-    found = {"over candidates": proposal, "by gradient": climbing.choose(state, surfaces, search_key)}
     with mpl.rc_context(STYLE):
         save(draw_posterior(planner, state, surfaces, scene), folder / "concepts_posterior.png")
         save(draw_utility(planner, state, surfaces, proposal), folder / "concepts_utility.png")
+        # Fewer and longer steps than by default, so that the ascents can be seen on a map.
+        search = nbv.GradientSearch(dof=2, num_starts=4, iterations=12, learning_rate=0.04, num_candidates=60)
+        climbed = dataclasses.replace(planner, search=search).choose(state, surfaces, search_key)
+        found = {"over candidates": proposal, "by gradient": climbed}
         save(draw_search(found, planner.quantity), folder / "concepts_search.png")
 
 
