@@ -1,4 +1,4 @@
-"""The pictures of docs/concepts.md, of one step of the demo object: `python scripts/draw_concepts.py`, minutes."""
+"""The pictures of docs/concepts.md, one step of the demo object, small: `python scripts/draw_concepts.py`."""
 
 import argparse
 import dataclasses
@@ -38,7 +38,8 @@ def draw_posterior(planner: nbv.Planner, state: nbv.State, surfaces: nbv.GridSur
     """What one view saw; outlines of samples on the plane x = 0, and the probability of being inside there."""
     axis = np.asarray(planner.grid.axis)
     middle = len(axis) // 2
-    y, z = np.meshgrid(axis, axis, indexing="ij")
+    # Variances take long: every second node.
+    y, z = np.meshgrid(axis[::2], axis[::2], indexing="ij")
     plane = jnp.asarray(np.stack([np.full(y.size, axis[middle]), y.ravel(), z.ravel()], axis=1))
     posterior = planner.posterior(state)
     deviation = np.sqrt(np.maximum(np.asarray(posterior.variance(plane)), 1e-12))
@@ -56,12 +57,12 @@ def draw_posterior(planner: nbv.Planner, state: nbv.State, surfaces: nbv.GridSur
     for sample in np.asarray(surfaces.values[:SHOWN, middle]):
         second.contour(axis, axis, sample, levels=[0.0], colors=[BEFORE], linewidths=0.9, alpha=0.75)
     second.set_title(f"cross-section of {SHOWN} samples")
-    extent = (axis[0], axis[-1]) * 2
+    extent = (axis[0], axis[-2]) * 2
     third.imshow(inside, VALUE, vmin=0, vmax=1, origin="lower", extent=extent, interpolation="bilinear")
     third.set_title("probability of being inside")
     near = np.abs(points[:, 0] - axis[middle]) < 0.03
     for panel in (second, third):
-        panel.contour(axis, axis, truth, levels=[0.0], colors=[GREY], linewidths=1.0, linestyles=":")
+        panel.contour(axis[::2], axis[::2], truth, levels=[0.0], colors=[GREY], linewidths=1.0, linestyles=":")
         panel.scatter(points[near, 2], points[near, 1], s=5.0, color=NEW, linewidths=0, zorder=5)
         panel.set(xlim=(-1.5, 1.5), ylim=(-1.35, 1.35), aspect="equal")
         panel.axis("off")
@@ -85,7 +86,13 @@ def draw_utility(planner: nbv.Planner, state: nbv.State, surfaces: nbv.GridSurfa
             highest = max(highest, float(np.quantile(squares[row, column][np.asarray(fine.mask[column, row])], 0.98)))
     for row, name in enumerate(("the chosen view", "a poor view")):
         expected = float(proposal.values[chosen[row]])
-        figure.text(0.012, 0.93 - 0.46 * row, f"{name}: {expected:.0f} expected, of 16 samples", color=INK, fontsize=10)
+        figure.text(
+            0.012,
+            0.93 - 0.46 * row,
+            f"{name}: {expected:.0f} expected, of {planner.num_samples} samples",
+            color=INK,
+            fontsize=10,
+        )
         for column in range(SHOWN):
             axes = figure.add_axes((0.01 + 0.222 * column, 0.5 - 0.46 * row, 0.21, 0.39))
             mask = np.asarray(fine.mask[column, row])
@@ -124,7 +131,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("docs"))
     folder = parser.parse_args().out
     scene = demo_object()
-    planner = nbv.Planner(nbv.ScreenedSPSR(), nbv.Camera(), nbv.Coverage(), nbv.DiscreteSearch())
+    model = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=16))
+    camera = nbv.Camera(height=32, width=32)
+    planner = nbv.Planner(model, camera, nbv.Coverage(), nbv.DiscreteSearch(), 8, nbv.Grid(72), 1024)
     first, noise = nbv.look_at((0.8, 0.9, 2.2)), nbv.SensorNoise()
     scan_key, sample_key, search_key = jax.random.split(jax.random.key(0), 3)
     state = planner.init(noise(nbv.scan(scene, planner.camera, first), scan_key), first)
