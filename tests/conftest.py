@@ -40,6 +40,7 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 LONGEST_FIRST = (
     "test_cli.py",
     "test_notebooks.py",
+    "test_pages.py",
     "test_readme.py",
     "test_scan_derivatives.py",
     "test_gradient.py",

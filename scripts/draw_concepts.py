@@ -1,0 +1,153 @@
+"""The pictures of docs/concepts.md, one step of the demo object, small: `python scripts/draw_concepts.py`."""
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+from scipy.special import ndtr
+
+import jaxnbv as nbv
+from jaxnbv.datasets import demo_object
+from jaxnbv.tasks.neighbours import nearest_squared_distance
+from jaxnbv.viz.data import choice_of
+from jaxnbv.viz.figures import STYLE, draw_acquisition
+from jaxnbv.viz.render import Still, beside, draw_cameras, draw_points, frame
+from jaxnbv.viz.style import BEFORE, GREY, INK, NEW, VALUE
+
+SHOWN = 4
+PIXELS = 160
+
+
+def save(figure: Figure, path: Path) -> None:
+    """With few colours, which makes the file small."""
+    figure.set_dpi(170)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    image.quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+def draw_posterior(planner: nbv.Planner, state: nbv.State, surfaces: nbv.GridSurface, scene: nbv.SDFSurface) -> Figure:
+    """What one view saw; outlines of samples on the plane x = 0, and the probability of being inside there."""
+    axis = np.asarray(planner.grid.axis)
+    middle = len(axis) // 2
+    # Variances take long: every second node.
+    y, z = np.meshgrid(axis[::2], axis[::2], indexing="ij")
+    plane = jnp.asarray(np.stack([np.full(y.size, axis[middle]), y.ravel(), z.ravel()], axis=1))
+    posterior = planner.posterior(state)
+    deviation = np.sqrt(np.maximum(np.asarray(posterior.variance(plane)), 1e-12))
+    inside = ndtr((float(posterior.level) - np.asarray(posterior.mean(plane))) / deviation).reshape(y.shape)
+    truth = np.asarray(scene.sdf(plane)).reshape(y.shape)
+    figure = Figure(figsize=(9.6, 3.5))
+    first, second, third = (figure.add_axes((left, 0.02, 0.32, 0.86)) for left in (0.0, 0.34, 0.67))
+    pose = state.poses[0]
+    still = Still(beside(pose), None, 500, 2.5)
+    points, _ = state.cloud.to_numpy()
+    shown = draw_points(first, still, points, NEW, 1.2)
+    frame(first, still, [shown, *draw_cameras(first, still, [pose], planner.camera, 1.0)])
+    first.axis("off")
+    first.set_title("D, what one view saw")
+    for sample in np.asarray(surfaces.values[:SHOWN, middle]):
+        second.contour(axis, axis, sample, levels=[0.0], colors=[BEFORE], linewidths=0.9, alpha=0.75)
+    second.set_title(f"cross-section of {SHOWN} samples")
+    extent = (axis[0], axis[-2]) * 2
+    third.imshow(inside, VALUE, vmin=0, vmax=1, origin="lower", extent=extent, interpolation="bilinear")
+    third.set_title("probability of being inside")
+    near = np.abs(points[:, 0] - axis[middle]) < 0.03
+    for panel in (second, third):
+        panel.contour(axis[::2], axis[::2], truth, levels=[0.0], colors=[GREY], linewidths=1.0, linestyles=":")
+        panel.scatter(points[near, 2], points[near, 1], s=5.0, color=NEW, linewidths=0, zorder=5)
+        panel.set(xlim=(-1.5, 1.5), ylim=(-1.35, 1.35), aspect="equal")
+        panel.axis("off")
+    return figure
+
+
+def draw_utility(planner: nbv.Planner, state: nbv.State, surfaces: nbv.GridSurface, proposal: nbv.Proposal) -> Figure:
+    """Imagined scans of the best candidate and of one of the worst tenth, coloured by what each point is worth."""
+    order = np.argsort(np.asarray(proposal.values))
+    chosen = np.array([order[-1], order[len(order) // 10]])
+    poses = proposal.candidates[jnp.asarray(chosen)]
+    camera = dataclasses.replace(planner.camera, height=PIXELS, width=PIXELS)
+    few = jax.tree.map(lambda rows: rows[:SHOWN], surfaces)
+    fine, coarse = (nbv.scan_samples(few, one, poses) for one in (camera, planner.camera))
+    figure = Figure(figsize=(9.6, 5.2))
+    highest = 0.0
+    squares = np.zeros((2, SHOWN, PIXELS**2))
+    for row in range(2):
+        for column in range(SHOWN):
+            squares[row, column] = nearest_squared_distance(fine.points[column, row], state.cloud)
+            highest = max(highest, float(np.quantile(squares[row, column][np.asarray(fine.mask[column, row])], 0.98)))
+    for row, name in enumerate(("the chosen view", "a poor view")):
+        expected = float(proposal.values[chosen[row]])
+        figure.text(
+            0.012,
+            0.93 - 0.46 * row,
+            f"{name}: {expected:.0f} expected, of {planner.num_samples} samples",
+            color=INK,
+            fontsize=10,
+        )
+        for column in range(SHOWN):
+            axes = figure.add_axes((0.01 + 0.222 * column, 0.5 - 0.46 * row, 0.21, 0.39))
+            mask = np.asarray(fine.mask[column, row])
+            normals = np.asarray(fine.normals[column, row])
+            right, down, forward = np.asarray(poses.rotation[row]).T
+            light = -forward - 0.5 * right - 0.7 * down
+            lit = 0.75 + 0.3 * np.clip(normals @ (light / np.linalg.norm(light)), -0.4, 1.0)
+            colours = np.ones((PIXELS**2, 3))
+            colours[mask] = (VALUE(np.clip(squares[row, column] / highest, 0, 1))[:, :3] * lit[:, None])[mask]
+            axes.imshow(np.clip(colours, 0, 1).reshape(PIXELS, PIXELS, 3), interpolation="bilinear")
+            axes.set(xticks=[], yticks=[])
+            own = jax.tree.map(lambda rows, i=(column, row): rows[i], coarse)
+            worth = float(planner.acquisition(planner.acquisition.context(state.cloud), own))
+            axes.set_xlabel(f"worth {worth:.0f}", labelpad=2)
+    bar = figure.add_axes((0.91, 0.2, 0.014, 0.55))
+    scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(0.0, highest), VALUE)
+    figure.colorbar(scale, cax=bar).set_label("squared distance to D")
+    return figure
+
+
+def draw_search(found: dict[str, nbv.Proposal], quantity: nbv.Quantity) -> Figure:
+    """Maps of the sphere of directions, by one search each."""
+    figure = Figure(figsize=(9.6, 3.3))
+    for index, (name, proposal) in enumerate(found.items()):
+        axes = figure.add_axes((0.01 + 0.46 * index, 0.03, 0.44, 0.84))
+        colours = draw_acquisition(axes, choice_of(proposal), quantity)
+        axes.set_title(f"{name}: {float(proposal.value):.0f}", loc="center")
+    bar = figure.colorbar(colours, cax=figure.add_axes((0.935, 0.2, 0.012, 0.55)))
+    bar.outline.set_visible(False)
+    bar.set_label(quantity.name)
+    return figure
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("docs"))
+    folder = parser.parse_args().out
+    scene = demo_object()
+    model = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=16))
+    camera = nbv.Camera(height=32, width=32)
+    planner = nbv.Planner(model, camera, nbv.Coverage(), nbv.DiscreteSearch(), 8, nbv.Grid(72), 1024)
+    first, noise = nbv.look_at((0.8, 0.9, 2.2)), nbv.SensorNoise()
+    scan_key, sample_key, search_key = jax.random.split(jax.random.key(0), 3)
+    state = planner.init(noise(nbv.scan(scene, planner.camera, first), scan_key), first)
+    surfaces = planner.sample_surfaces(state, sample_key)
+    proposal = planner.choose(state, surfaces, search_key)
+    with mpl.rc_context(STYLE):
+        save(draw_posterior(planner, state, surfaces, scene), folder / "concepts_posterior.png")
+        save(draw_utility(planner, state, surfaces, proposal), folder / "concepts_utility.png")
+        # Fewer and longer steps than by default, so that the ascents can be seen on a map.
+        search = nbv.GradientSearch(dof=2, num_starts=4, iterations=12, learning_rate=0.04, num_candidates=60)
+        climbed = dataclasses.replace(planner, search=search).choose(state, surfaces, search_key)
+        found = {"over candidates": proposal, "by gradient": climbed}
+        save(draw_search(found, planner.quantity), folder / "concepts_search.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,319 @@
+"""The site's pages say what is so: their programs run, one a page, and the commands they name are there."""
+
+import dataclasses
+import importlib
+import inspect
+import re
+import shlex
+import sys
+import tomllib
+from contextlib import nullcontext
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+import typer
+
+import jaxnbv as nbv
+from jaxnbv import cli
+from jaxnbv.datasets import demo_object
+from jaxnbv.networks import pyramid_classifier, save_checkpoint
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted(str(path.relative_to(DOCS)) for path in DOCS.rglob("*.md"))
+SMALL = nbv.GeometricSPSR(0.05, 0.2, 8)
+INTRINSICS = np.array([[600.0, 0.0, 325.0], [0.0, 605.0, 236.0], [0.0, 0.0, 1.0]])
+CORNERS = {"low": (-0.15, -0.15, 0.005), "high": (0.15, 0.15, 0.255)}
+
+
+def blocks(page: str, language: str = "python") -> list[str]:
+    return re.findall(rf"(?ms)^```{language}\n(.*?)^```$", (DOCS / page).read_text())
+
+
+PROGRAMS = [page for page in PAGES if blocks(page) and page != "how_to/depth_camera.md"]
+
+
+def smaller(planner_of=nbv.Planner):
+    """A planner as it is asked for, with less of what takes long alone. Models of a page's own are left as they are."""
+
+    def make(*given, **named):
+        planner = planner_of(*given, **named)
+        model = planner.model
+        if isinstance(model, nbv.ScreenedSPSR):
+            model = dataclasses.replace(model, base=SMALL)
+        elif isinstance(model, nbv.GeometricSPSR):
+            model = SMALL
+        less = {"num_samples": 2, "grid": nbv.Grid(24), "capacity": 512, "camera": nbv.Camera(height=12, width=12)}
+        return dataclasses.replace(planner, model=model, **less)
+
+    return make
+
+
+class Tensor(np.ndarray):
+    def numpy(self):
+        return np.asarray(self)
+
+
+def stand_in(monkeypatch, name: str, **members) -> None:
+    module = ModuleType(name)
+    vars(module).update(members)
+    monkeypatch.setitem(sys.modules, name, module)
+
+
+def before_mesh(monkeypatch):
+    nbv.mesh_from_sdf(demo_object().sdf, nbv.Grid(32)).to_trimesh().export("spot.obj")
+
+
+def before_pytorch(monkeypatch):
+    """A model that tells classes by the height of the points, in place of PyTorch."""
+
+    def log_softmax(logits, dim):
+        return (logits - np.log(np.exp(logits).sum(axis=dim, keepdims=True))).view(Tensor)
+
+    def load(path):
+        return SimpleNamespace(eval=lambda: lambda points: points[..., 1].mean(axis=1)[:, None] * np.arange(5.0))
+
+    functions = {"Tensor": Tensor, "from_numpy": np.asarray, "no_grad": nullcontext, "log_softmax": log_softmax}
+    stand_in(monkeypatch, "torch", jit=SimpleNamespace(load=load), **functions)
+    save_checkpoint(pyramid_classifier(num_points=64).network, "net.safetensors")
+
+
+def before_cluster(monkeypatch):
+    """Clusters that take what they are told."""
+
+    def cluster(**given):
+        assert given["n_workers" if "image" in given else "cores"] >= 1
+        return SimpleNamespace(scale=lambda jobs: None, scheduler_address="tcp://10.0.0.1:8786")
+
+    stand_in(monkeypatch, "dask_jobqueue", SLURMCluster=cluster)
+    stand_in(monkeypatch, "dask_kubernetes")
+    stand_in(monkeypatch, "dask_kubernetes.operator", KubeCluster=cluster)
+
+
+# What a page leaves to its reader.
+BEFORE = {
+    "how_to/mesh.md": before_mesh,
+    "how_to/pytorch_classifier.md": before_pytorch,
+    "how_to/cluster.md": before_cluster,
+}
+NAMES = {"how_to/utility.md": {"source": np.array([0.0, 1.25, 0.0])}}
+
+
+@pytest.fixture
+def as_before():
+    """The device that a page chooses is not kept."""
+    yield
+    jax.config.update("jax_default_device", None)
+
+
+@pytest.mark.usefixtures("as_before")
+@pytest.mark.parametrize("page", PROGRAMS)
+def test_the_program_of_a_page_runs(page, tmp_path, monkeypatch):
+    """As it is written, but for sizes; reports are tested on their own."""
+    monkeypatch.chdir(tmp_path)
+    BEFORE.get(page, lambda _: None)(monkeypatch)
+    reported = []
+    monkeypatch.setattr(nbv, "Planner", smaller())
+    monkeypatch.setattr(nbv, "write_report", lambda episode, folder: reported.append(episode))
+    program = "\n".join(blocks(page))
+    names = {"__name__": "page", **NAMES.get(page, {})}
+    exec(compile(program, page, "exec"), names)
+    assert len(reported) == program.count("nbv.write_report(")
+    for name in re.findall(r"(?m)^(\w+) = planner\.propose\(", program):
+        assert np.isfinite(float(names[name].value))
+
+
+def image_of_a_ball(matrix):
+    """Of 0.1 metres, on the table z = 0; in millimetres along the camera's axis."""
+    matrix = np.asarray(matrix, np.float64)
+    row, column = np.indices((480, 640))
+    rays = np.stack([column, row, np.ones_like(row)], axis=-1) @ np.linalg.inv(INTRINSICS).T @ matrix[:3, :3].T
+    away = matrix[:3, 3] - [0.0, 0.0, 0.1]
+    a, b, c = np.sum(rays**2, axis=-1), rays @ away, away @ away - 0.1**2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ball, table = (-b - np.sqrt(b**2 - a * c)) / a, -matrix[2, 3] / rays[..., 2]
+    depth = np.fmin(ball, np.where(table > 0, table, np.nan))
+    return np.round(1000 * np.nan_to_num(depth, posinf=0.0)).clip(0, 65535).astype(np.uint16)
+
+
+def poses_about_a_ball(count):
+    angle = 2.0 * np.pi * np.arange(count) / count
+    places = np.stack([0.8 * np.cos(angle), 0.8 * np.sin(angle), 0.3 + 0.2 * (np.arange(count) % 2)], axis=1)
+    return np.asarray(nbv.look_at(places, (0.0, 0.0, 0.1), up=(0.0, 0.0, 1.0)).matrix)
+
+
+def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
+    """Until the ball is expected to be covered. Reports of sessions are tested on their own."""
+    monkeypatch.chdir(tmp_path)
+    reported = []
+    monkeypatch.setattr("jaxnbv.session.write_report", lambda episode, folder, **_: reported.append(episode) or folder)
+    poses = poses_about_a_ball(10)
+    model, search = nbv.GeometricSPSR(0.02, 0.2, 16), nbv.DiscreteSearch()
+    planner = nbv.Planner(model, nbv.Camera(height=18, width=24), nbv.Coverage(), search, 2, nbv.Grid(40), 2048)
+    monkeypatch.setattr(nbv, "Planner", lambda *_: planner)
+    given = {"K": INTRINSICS, **CORNERS, "reachable": poses, "first": poses[0], "take_image": image_of_a_ball}
+    (block,) = (block for block in blocks("how_to/depth_camera.md") if "nbv.Session(" in block)
+    exec(block, given)
+    session = given["session"]
+    assert 3 <= session.views < 10
+    assert "expected to be covered" in session.done
+    assert len(reported[0].views) == session.views
+    points, _ = session.cloud.to_numpy()
+    assert np.abs(np.linalg.norm(points - [0.0, 0.0, 0.1], axis=1) - 0.1).max() < 0.01
+    assert points[:, 0].min() < -0.08
+    assert points[:, 0].max() > 0.08
+
+
+def test_the_block_for_a_depth_camera_runs():
+    pose = nbv.look_at((0.6, -0.6, 0.4), (0.0, 0.0, 0.1), up=(0.0, 0.0, 1.0))
+    small = nbv.GeometricSPSR(0.05, 0.2, 8), nbv.Camera(height=12, width=12), nbv.Coverage(), nbv.DiscreteSearch(12)
+    given = {
+        "nbv": nbv,
+        "camera": nbv.Camera.from_intrinsics(INTRINSICS, 640, 480),
+        "T": np.asarray(pose.matrix),
+        **CORNERS,
+        "depth_mm": image_of_a_ball(pose.matrix),
+        "planner": nbv.Planner(*small, num_samples=2, grid=nbv.Grid(24)),
+        "key": jax.random.key(0),
+    }
+    (block,) = (block for block in blocks("how_to/depth_camera.md") if "depth_mm" in block)
+    exec(block, given)
+    points = given["cloud"].to_numpy()[0]
+    assert len(points) > 100
+    assert np.abs(np.linalg.norm(points - [0.0, 0.0, 0.1], axis=1) - 0.1).max() < 0.01
+    # Candidates stand on a sphere of 2.5 scene units about the box, whose longest side is 2.5, and look at its centre.
+    place, forward = given["matrix"][:3, 3] - np.array([0.0, 0.0, 0.13]), given["matrix"][:3, 2]
+    assert np.linalg.norm(place) == pytest.approx(0.3, abs=1e-4)
+    np.testing.assert_allclose(forward, -place / np.linalg.norm(place), atol=1e-4)
+
+
+def test_no_block_of_the_depth_camera_is_left_out():
+    assert [("nbv.Session(" in block, "depth_mm" in block) for block in blocks("how_to/depth_camera.md")] == [
+        (True, False),
+        (False, True),
+    ]
+
+
+def commands(text: str) -> list[list[str]]:
+    """Those of blocks of shell, without the variables that are set before them."""
+    found = []
+    for block in re.findall(r"(?ms)^```bash\n(.*?)^```$", text):
+        for line in block.replace("\\\n", " ").splitlines():
+            words = shlex.split(line, comments=True)
+            while words and re.match(r"[A-Z_]+=", words[0]):
+                words.pop(0)
+            while words:
+                end = words.index("&&") if "&&" in words else len(words)
+                found.append(words[:end])
+                words = words[end + 1 :]
+    return found
+
+
+COMMAND = typer.main.get_command(cli.app)
+
+
+def parse(arguments: list[str], whole: bool = True) -> None:
+    """As the command line takes them. Runs nothing. What is named in a sentence need not be whole."""
+    command = COMMAND
+    while arguments and arguments[0] in getattr(command, "commands", {}):
+        command, arguments = command.commands[arguments[0]], arguments[1:]
+    known = getattr(command, "commands", {})
+    if known and not arguments and not whole:
+        return
+    assert not known or arguments[0].startswith("-"), f"{arguments[0]} is none of {', '.join(known)}"
+    try:
+        command.make_context("jaxnbv", list(arguments))
+    except typer.Exit:
+        pass  # After its help or its version.
+    except Exception as error:
+        # Typer carries its own click, or does not.
+        if whole or type(error).__name__ != "MissingParameter":
+            raise
+
+
+def check_script(arguments: list[str]) -> None:
+    """A script of the repository, whose parser names the options."""
+    if arguments[0] == "-m":
+        assert arguments[1] == "venv"
+        return
+    source = (ROOT / arguments[0]).read_text()
+    missing = [word for word in arguments if word.startswith("--") and f'"{word}"' not in source]
+    assert not missing
+
+
+def check_extras(arguments: list[str]) -> None:
+    """Extras that are installed are those of the package."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    named = [name for word in arguments for group in re.findall(r"\[(.*)\]", word) for name in group.split(",")]
+    assert set(named) <= set(extras)
+
+
+CHECKS = {"jaxnbv": parse, "python": check_script, "python3": check_script, "pip": check_extras}
+# Programs of others, whose options are not looked at.
+OTHERS = {"dask", "ruff", "mypy", "pytest", "sphinx-build"}
+
+
+@pytest.mark.parametrize("page", ["../README.md", "../CONTRIBUTING.md", *PAGES])
+def test_the_commands_of_a_page_are_there(page, capsys):
+    text = (DOCS / page).read_text()
+    for program, *arguments in commands(text):
+        name = Path(program).name
+        assert name in CHECKS or name in OTHERS, f"{program} is no program that is known here"
+        CHECKS.get(name, lambda _: None)(arguments)
+    for command in re.findall(r"`jaxnbv ([^`]+)`", text):
+        parse(shlex.split(command), whole=False)
+
+
+def test_commands_that_are_not_there_are_refused():
+    """Or the test above would say nothing."""
+    found = commands("```bash\nX=1 jaxnbv run a --vews 3 && python benchmarks/step.py --mash b  # more\n```\n")
+    assert found == [["jaxnbv", "run", "a", "--vews", "3"], ["python", "benchmarks/step.py", "--mash", "b"]]
+    with pytest.raises(Exception, match="No such option"):
+        parse(found[0][1:])
+    with pytest.raises(AssertionError):
+        check_script(found[1][1:])
+    with pytest.raises(AssertionError):
+        check_extras(["install", ".[cuba]"])
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_formulas_in_tables_are_whole(page):
+    """A bar ends a cell of a table, within a formula too."""
+    rows = [line for line in (DOCS / page).read_text().splitlines() if line.startswith("|")]
+    assert not [cell for row in rows for cell in row.split("|") if cell.count("$") % 2]
+
+
+def documented() -> dict[str, list[str]]:
+    names: dict[str, list[str]] = {}
+    for page in sorted((DOCS / "reference").glob("*.md")):
+        module = ""
+        for directive, argument in re.findall(r"(?m)^\.\. (\w+):: (\S+)$", page.read_text()):
+            if directive == "currentmodule":
+                module = argument
+            else:
+                names.setdefault(module, []).append(argument)
+    return names
+
+
+PACKAGES = ("datasets", "networks", "scanning", "search", "surfaces", "tasks", "training", "viz")
+
+
+@pytest.mark.parametrize("package", ["jaxnbv", *(f"jaxnbv.{name}" for name in PACKAGES)])
+def test_every_public_class_and_function_has_its_place_in_the_reference(package):
+    names = documented()
+    module = importlib.import_module(package)
+    public = getattr(module, "__all__", None) or [name for name in vars(module) if not name.startswith("_")]
+    of = {name: getattr(module, name) for name in public}
+    wanted = {name for name, thing in of.items() if inspect.isclass(thing) or inspect.isfunction(inspect.unwrap(thing))}
+    known = {*names.get(package, []), *names["jaxnbv"]}
+    assert wanted <= known
+    assert len(names[package]) == len(set(names[package]))
+
+
+def test_the_example_of_style_is_the_code():
+    """CONTRIBUTING.md shows a class as it is."""
+    (shown,) = re.findall(r"(?ms)^```python\n(.*?)^```$", (ROOT / "CONTRIBUTING.md").read_text())
+    assert shown.strip() in (ROOT / "jaxnbv" / "tasks" / "coverage.py").read_text()
