@@ -255,7 +255,7 @@ def test_what_is_asked_for_is_taken(ring):
         "radius": candidates["radius"],
         "rays": camera["height"],
         "samples": planner["num_samples"],
-        "candidates": candidates["count"],
+        "candidates": candidates["number"],
         "lengthscale": planner["model"]["base"]["lengthscale"][0],
     }
     assert camera["width"] == 33

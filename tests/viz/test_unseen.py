@@ -8,8 +8,6 @@ from jaxnbv.scanning.sdf import Capsule
 from jaxnbv.viz import report_data
 from jaxnbv.viz.data import MeanSurface, allowing_for_unseen
 
-COMPUTES = True
-
 
 def test_the_deviation_allows_for_a_quarter_of_the_distance_to_the_nearest_point():
     """On a unit sphere of which one point was seen, and is held to be known to 0.03 all over."""
