@@ -116,6 +116,7 @@ def simulate(
     folder: str | Path | None = None,
     progress: bool = True,
     until: Stop | None = None,
+    each: Callable[[View], None] | None = None,
 ) -> Episode:
     """Scan a known surface from `first`, then from the views that the planner asks for, `views` in all, or as many as
     it takes `until` a rule of `jaxnbv.stopping` ends it; `Sure(0.95) | Budget(seconds=60)`, say.
@@ -124,6 +125,8 @@ def simulate(
     a run that was interrupted goes on after the last of them and, on a CPU with the same versions, ends with the same
     bits as one that was not. (A GPU may add in another order from run to run.) The rule is asked after the last view
     that is there, so a folder can be continued with another one.
+
+    - `each`: is told every view once it is done, those that the folder holds included.
 
     **Raises:** `ValueError` if `views` < 1 or more than the planner has room for, if the first view sees nothing, or
     if the folder belongs to another configuration or holds more views already.
@@ -160,6 +163,8 @@ def simulate(
                 finished.append(view)
                 if store and index >= len(done):
                     store.write_view(index, view.pose, view.scan, view.proposal)
+                if each is not None:
+                    each(view)
             stopped = watch.reason if watch and len(finished) < views else None
             bar.update(bar.total - bar.n)
         if store:

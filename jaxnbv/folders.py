@@ -22,6 +22,10 @@ FORMAT = 2
 _LOCK = ".lock"
 
 
+class AnotherConfigurationError(InputError):
+    """A folder's results are of another configuration than the one that is asked for."""
+
+
 def software() -> dict[str, str]:
     """Versions of what the numbers depend on."""
     names = ("jaxnbv", "jax", "jaxlib", "equinox", "optax", "optimistix", "numpy", "trimesh", "embreex")
@@ -170,11 +174,11 @@ class ResultFolder:
         if not has_results:
             return
         changed = differences(found, self.config)
-        require(
-            not changed,
-            f"the output folder {self.path} belongs to another {self.kind}; it differs in {'; '.join(changed[:3])}. "
-            "Choose another folder, or the settings it was made with",
-        )
+        if changed:
+            raise AnotherConfigurationError(
+                f"the output folder {self.path} belongs to another {self.kind}; it differs in "
+                f"{'; '.join(changed[:3])}. Choose another folder, or the settings it was made with"
+            )
         now = {key: value for key, value in versions(self.cores).items() if key in made_by}
         if made_by != now and not self.bound:
             warnings.warn(

@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from jaxnbv.checks import InputError
 from jaxnbv.cli import main
+from jaxnbv.planner import Planner
 
 COMPUTES = True
 TERMINAL = {"COLUMNS": "200", "NO_COLOR": "1"}
@@ -52,7 +54,7 @@ def finished(tmp_path_factory):
 
 def test_demo_leaves_an_episode_a_report_and_figures(finished):
     folder, result = finished
-    out = folder / "runs" / "pyramid-discrete"
+    out = folder / "runs" / "pyramid-cross-entropy-discrete-seed0"
     names = {path.name for path in out.iterdir()}
     assert {"episode.json", "view_00.npz", "view_01.npz", "cloud.ply", "report.html"} <= names
     assert list(out.rglob("*.png"))
@@ -68,7 +70,7 @@ def test_demo_leaves_an_episode_a_report_and_figures(finished):
 
 def test_the_same_command_continues_with_more_views(finished):
     folder, _ = finished
-    out = folder / "runs" / "pyramid-discrete"
+    out = folder / "runs" / "pyramid-cross-entropy-discrete-seed0"
     before = {path.name: path.read_bytes() for path in out.glob("view_*.npz")}
     result = run_command("demo", "--quick", "--views", "3", "--no-report", cwd=folder)
     assert result.returncode == 0, result.stderr
@@ -120,6 +122,10 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
         (("demo", "--first", "1,2"), ("'1,2'", "three numbers")),
         (("demo", "--first", "0,0,0"), ("target",)),
         (("demo", "--first", "0,0,9", "--noise", "-1"), ("-1", "negative")),
+        (("demo", "--first", "0.05,0,0"), ("0.05,0,0", "inside the object", "outside")),
+        (("run", "ball.obj", "--first", "0.3,-1,0.2"), ("0.3,-1,0.2", "inside the object", "outside")),
+        (("run", "ball.obj", "--radius", "1"), ("cameras 1 from", "1.25", "give more")),
+        (("run", "ball.obj", "--lengthscale", "0"), ("lengthscale is 0", "positive")),
         (("demo", "--first", "0,9,0,1"), ("three numbers",)),
         (("demo", "--first", "0,0,1e30"), ("position", "1.e+30")),
         (("demo", "--scene", "99999999999999"), ("--scene", "2147483647")),
@@ -164,11 +170,119 @@ def test_bad_input_is_one_line_that_names_the_value_and_the_remedy(arguments, wo
 
 
 def test_a_folder_of_another_configuration_is_refused(finished):
+    """In the user's words; in those of the record where they are not known."""
     folder, _ = finished
-    result = run_command("demo", "--quick", "--views", "2", "--seed", "1", cwd=folder)
+    out = "runs/pyramid-cross-entropy-discrete-seed0"
+    asked = ("demo", "--views", "2", "--seed", "1", "--scene", "3", "--out", out)
+    result = run_command(*asked, cwd=folder)
+    assert result.returncode == 2
+    assert "another episode" in result.stderr
+    for words in ("--seed 0 there, 1 now", "--scene 0 there, 3 now", "--quick there, not now", "--overwrite"):
+        assert words in result.stderr
+    assert "--views" not in result.stderr
+    (folder / out / "options.json").rename(folder / "elsewhere")
+    result = run_command("demo", "--quick", "--views", "2", "--seed", "1", "--out", out, cwd=folder)
+    (folder / "elsewhere").rename(folder / out / "options.json")
     assert result.returncode == 2
     assert "another episode" in result.stderr
     assert "key" in result.stderr
+
+
+@pytest.fixture
+def ring(tmp_path):
+    """A folder with a mesh whose surface is 1.25 from the centre at most."""
+    trimesh.creation.torus(1.0, 0.4).export(tmp_path / "ring.ply")
+    return tmp_path
+
+
+# Without samples of surfaces, in seconds.
+FARTHEST = ("run", "ring.ply", "--search", "farthest", "--views", "2", "--no-report")
+
+
+def test_an_episode_is_replaced_when_asked(ring):
+    for seed in ("0", "1"):
+        result = run_command(*FARTHEST, "--out", "mine", "--seed", seed, *(("--overwrite",) * int(seed)), cwd=ring)
+        assert result.returncode == 0, result.stderr
+        config = json.loads((ring / "mine" / "episode.json").read_text())["config"]
+        assert config["key"]["data"] == [0, int(seed)]
+    result = run_command(*FARTHEST, "--out", "mine", "--views", "3", "--seed", "1", cwd=ring)
+    assert result.returncode == 0, result.stderr
+    (ring / "thesis").mkdir()
+    (ring / "thesis" / "thesis.tex").write_text("mine")
+    result = run_command(*FARTHEST, "--out", "thesis", "--overwrite", cwd=ring)
+    assert result.returncode == 2
+    assert [path.name for path in (ring / "thesis").glob("thesis*")] == ["thesis.tex"]
+
+
+def border_hits(file):
+    """How many of the rays along the image's border met the object, and how many of all."""
+    with np.load(file) as view:
+        side = round(len(view["mask"]) ** 0.5)
+        image = view["mask"].reshape(side, side)
+    return int(image.sum() - image[1:-1, 1:-1].sum()), int(image.sum())
+
+
+@pytest.mark.parametrize("asked", [(), ("--fov", "70"), ("--radius", "2"), ("--task", "heat", "--rays", "30")])
+def test_an_object_fits_the_view(asked, ring):
+    result = run_command(*FARTHEST, *asked, "--out", "mine", cwd=ring)
+    assert result.returncode == 0, result.stderr
+    for file in sorted((ring / "mine").glob("view_*.npz")):
+        hits, seen = border_hits(file)
+        assert hits == 0
+        assert seen > 100
+
+
+def test_the_papers_close_up_is_there_when_asked(ring):
+    result = run_command(*FARTHEST, "--paper", cwd=ring)
+    assert result.returncode == 0, result.stderr
+    out = ring / "runs" / "ring-coverage-farthest-seed0"
+    assert border_hits(out / "view_00.npz")[0] > 20
+    config = json.loads((out / "episode.json").read_text())["config"]
+    assert config["planner"]["camera"]["fov"] == pytest.approx(np.radians(30))
+    assert config["planner"]["search"]["candidates"]["radius"] == 2.5
+    np.testing.assert_allclose(config["first"]["position"], [0.8, 0.9, 2.2])
+
+
+def test_what_is_asked_for_is_taken(ring):
+    asked = {"fov": 40, "radius": 7.5, "rays": 33, "samples": 3, "candidates": 21, "lengthscale": 0.02}
+    options = [text for name, value in asked.items() for text in (f"--{name}", str(value))]
+    result = run_command(*FARTHEST, *options, "--out", "mine", cwd=ring)
+    assert result.returncode == 0, result.stderr
+    planner = json.loads((ring / "mine" / "episode.json").read_text())["config"]["planner"]
+    camera, candidates = planner["camera"], planner["search"]["candidates"]
+    found = {
+        "fov": np.degrees(camera["fov"]),
+        "radius": candidates["radius"],
+        "rays": camera["height"],
+        "samples": planner["num_samples"],
+        "candidates": candidates["number"],
+        "lengthscale": planner["model"]["base"]["lengthscale"][0],
+    }
+    assert camera["width"] == 33
+    assert found == pytest.approx(asked)
+
+
+def test_a_flat_and_open_mesh_is_named_as_such(ring):
+    turned = trimesh.transformations.rotation_matrix(0.5, (1.0, 0.3, 0.2))
+    (ring / "sheet.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 2 0\nv 0 2 0\nf 1 2 3\nf 1 3 4\n")
+    sheet = trimesh.load_mesh(ring / "sheet.obj")
+    sheet.apply_transform(turned).export(ring / "sheet.obj")
+    result = run_command("run", "sheet.obj", *FARTHEST[2:], cwd=ring)
+    assert result.returncode == 0, result.stderr
+    assert "sheet.obj is flat" in result.stdout
+    assert "4 of its 5 edges" in result.stdout
+    result = run_command(*FARTHEST, cwd=ring)
+    assert "flat" not in result.stdout
+    assert "open" not in result.stdout
+
+
+def test_a_view_is_told_when_it_is_done(ring):
+    """Before the next is looked for, which fails here."""
+    with mock.patch.object(Planner, "choose", side_effect=InputError("stopped here")):
+        result = run_command(*FARTHEST, cwd=ring)
+    assert "stopped here" in result.stderr
+    assert "view 1   from (" in result.stdout
+    assert "view 2" not in result.stdout
 
 
 def test_a_published_checkpoint_converts_and_classifies_a_mesh(tmp_path, shared):
@@ -249,6 +363,8 @@ def test_help_names_every_option(command, tmp_path):
     expected = (
         ["demo", "run", "study", "convert"]
         if not command
-        else ["--task", "--search", "--views", "--first", "--seed", "--out"]
+        else ["--task", "--search", "--views", "--first", "--seed", "--out", "--overwrite"]
     )
+    if "run" in command:
+        expected += ["--paper", "--fov", "--radius", "--rays", "--samples", "--candidates", "--lengthscale", "--model"]
     assert all(word in result.stdout for word in expected)

@@ -1,12 +1,16 @@
-"""The notebooks run from top to bottom, at small settings: their cell tagged `parameters` is replaced."""
+"""The notebooks run from top to bottom, at small settings (their cell tagged `parameters` is replaced), and what they
+have stored is of their code."""
 
+import re
+import runpy
 from pathlib import Path
 
 import nbformat
 import pytest
 from nbclient import NotebookClient
 
-NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
+ROOT = Path(__file__).resolve().parents[1]
+NOTEBOOKS = ROOT / "notebooks"
 
 MODEL = "model = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=16))"
 SMALL = {
@@ -26,7 +30,51 @@ num_samples, resolution, pixels, num_candidates, capacity, iterations = 2, 40, 1
 mesh_file = None
 num_samples, resolution, pixels, num_candidates, num_points, capacity, views = 2, 40, 20, 6, 300, 1024, 2
 """,
+    "05_your_own_surface_model.ipynb": """
+num_features, num_samples, resolution, pixels, num_candidates, capacity, views = 60, 2, 32, 16, 8, 400, 2
+""",
+    "06_a_depth_camera.ipynb": f"""
+{MODEL.replace("truncation=16", "truncation=12")}
+num_samples, resolution, pixels, capacity, most = 2, 32, 16, 400, 2
+""",
+    "07_a_study_of_your_own.ipynb": """
+scenes = 2
+settings = {
+    "views": 2,
+    "model": nbv.GeometricSPSR(0.05, truncation=8),
+    "num_samples": 2,
+    "num_candidates": 8,
+    "grid_resolution": 28,
+    "capacity": 300,
+    "camera": nbv.Camera(height=16, width=16),
 }
+""",
+}
+
+
+def stored(name):
+    return nbformat.read(NOTEBOOKS / name, as_version=4)
+
+
+def code_cells(notebook):
+    return [cell for cell in notebook.cells if cell.cell_type == "code"]
+
+
+def kinds(cell):
+    """What a cell shows: text, pictures, pages."""
+    found = set()
+    for output in cell.outputs:
+        found |= (
+            {output.name} if output.output_type == "stream" else {kind for kind in output.data if kind != "text/plain"}
+        )
+    return found
+
+
+def wording(cell):
+    """The lines that a cell prints, numbers and blanks aside."""
+    text = "".join(output.text for output in cell.outputs if output.get("name") == "stdout")
+    lines = (re.sub(r"\s", "", re.sub(r"[-+]?\d+(\.\d*)?(e[-+]?\d+)?", "#", line)) for line in text.splitlines())
+    return {line for line in lines if line}
 
 
 def test_every_notebook_is_run():
@@ -34,11 +82,46 @@ def test_every_notebook_is_run():
 
 
 @pytest.mark.parametrize("name", SMALL)
+def test_what_is_stored_is_of_this_code(name):
+    """Otherwise: python scripts/run_notebooks.py NAME."""
+    script, notebook = runpy.run_path(str(ROOT / "scripts" / "run_notebooks.py")), stored(name)
+    assert notebook.metadata["jaxnbv"]["code"] == script["code_hash"](notebook)
+    cells = code_cells(notebook)
+    assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
+    outputs = [output for cell in cells for output in cell.outputs]
+    assert all(output.output_type != "error" and output.get("name") != "stderr" for output in outputs)
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    assert (NOTEBOOKS / name).stat().st_size <= script["LARGEST"] <= 2**20
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_notebook_opens_with_what_the_reader_will_be_able_to_do(name):
+    first = stored(name).cells[0]
+    assert first.cell_type == "markdown"
+    assert "After this notebook you can" in first.source
+
+
+def test_other_code_has_another_hash():
+    code_hash = runpy.run_path(str(ROOT / "scripts" / "run_notebooks.py"))["code_hash"]
+    notebook = stored("01_quickstart.ipynb")
+    before = code_hash(notebook)
+    notebook.cells[0].source += " More words."
+    assert code_hash(notebook) == before
+    code_cells(notebook)[-1].source += "\nprint(1)"
+    assert code_hash(notebook) != before
+
+
+@pytest.mark.parametrize("name", SMALL)
 def test_notebook_runs(name, tmp_path):
-    notebook = nbformat.read(NOTEBOOKS / name, as_version=4)
+    """And every cell shows the same kinds of things as it has stored, in the same words."""
+    notebook = stored(name)
     (cell,) = (cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", []))
     cell.source = SMALL[name]
     resources = {"metadata": {"path": str(tmp_path)}}
     NotebookClient(notebook, timeout=600, kernel_name="python3", resources=resources).execute()
     printed = [output["text"] for cell in notebook.cells for output in cell.get("outputs", []) if "text" in output]
     assert any("next view from" in text for text in printed)
+    for now, before in zip(code_cells(notebook), code_cells(stored(name)), strict=True):
+        assert kinds(now) - {"stderr"} == kinds(before), before.source
+        # Which of several lines are printed may depend on the settings.
+        assert wording(now) & wording(before) or wording(now) == wording(before) == set(), before.source

@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from jaxnbv import (
@@ -76,3 +77,12 @@ def test_another_name_is_refused():
         imagination("mine")
     with pytest.raises(InputError, match=r"longest side is -1\.0"):
         imagination("screened", -1.0)
+
+
+@pytest.mark.parametrize("quick", [False, True])
+def test_a_lengthscale_takes_the_place_of_the_short_one(quick):
+    plain, given = (imagination("screened", quick=quick, lengthscale=scale).model.base for scale in (None, 0.03))
+    np.testing.assert_allclose(given.lengthscale, [0.03, plain.lengthscale[1]])
+    assert float(imagination("paper", quick=quick, lengthscale=0.03).model.lengthscale) == pytest.approx(0.03)
+    with pytest.raises(InputError, match=r"lengthscale is -1\.0"):
+        imagination("paper", lengthscale=-1.0)

@@ -49,11 +49,20 @@ UntilOption = Annotated[
         show_default="never; demo of a class: sure=0.95",
     ),
 ]
-OutOption = Annotated[Path | None, typer.Option(help="Output folder.", show_default="runs/NAME-SEARCH[-paper]")]
-FirstOption = Annotated[
-    str, typer.Option(help="Position of the first camera, x,y,z in scene units; it looks at the origin.")
+OutOption = Annotated[
+    Path | None, typer.Option(help="Output folder.", show_default="runs/NAME-TASK-SEARCH[-MODEL]-seedN")
+]
+OverwriteOption = Annotated[
+    bool, typer.Option("--overwrite", help="Begin anew: an episode that the output folder holds is removed.")
 ]
 DEFAULT_FIRST = "0.8,0.9,2.2"
+FirstOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Position of the first camera, x,y,z in scene units; it looks at the origin.",
+        show_default=f"from {DEFAULT_FIRST}, as far as the others",
+    ),
+]
 NetworkOption = Annotated[
     Path | None,
     typer.Option(
@@ -81,6 +90,44 @@ ModelOption = Annotated[
     typer.Option(
         help="By what surfaces are imagined: screened knows that the object lies in its box and that space which was "
         "seen through is empty; paper is the published model, which knows the scanned normals alone."
+    ),
+]
+PaperOption = Annotated[
+    bool,
+    typer.Option(
+        "--paper",
+        help="The paper's close-up: 30 degrees from 2.5 (parts: 2, heat: 3); a view shows a patch of the object.",
+    ),
+]
+FovOption = Annotated[
+    float | None,
+    typer.Option(
+        min=1.0, max=170.0, help="Field of view in degrees.", show_default="30, or what fits the object from --radius"
+    ),
+]
+RadiusOption = Annotated[
+    float | None,
+    typer.Option(
+        help="Distance of the cameras from the object's centre, in scene units.",
+        show_default="the object fits the view",
+    ),
+]
+RaysOption = Annotated[
+    int | None,
+    typer.Option(min=4, max=1024, help="Rays along a side of the image.", show_default="50; parts: 64; --quick: 24"),
+]
+SamplesOption = Annotated[
+    int | None, typer.Option(min=1, help="Surfaces that are imagined for each view.", show_default="16; --quick: 4")
+]
+CandidatesOption = Annotated[
+    int | None,
+    typer.Option(min=1, help="Poses among which a view is chosen.", show_default="120; heat: 100; --quick: 40"),
+]
+LengthscaleOption = Annotated[
+    float | None,
+    typer.Option(
+        help="Lengthscale of the imagined surfaces' detail, a share of 2 pi scene units; longer is smoother.",
+        show_default="0.01; --model paper: 0.005",
     ),
 ]
 QuickOption = Annotated[
@@ -116,7 +163,10 @@ def command(run: Callable[..., None], about: str, options: Mapping[str, tuple[An
 
 
 class EpisodeOptions(NamedTuple):
-    """What every command that runs one episode takes."""
+    """What every command that runs one episode takes.
+
+    - `asked`: all of its options that a view depends on, by name.
+    """
 
     search: str
     model: ModelName
@@ -124,6 +174,31 @@ class EpisodeOptions(NamedTuple):
     until: list[str] | None
     seed: int
     out: Path | None
+    overwrite: bool
     noise: float
     quick: bool
     report: bool
+    asked: dict[str, Any]
+
+
+class SensorOptions(NamedTuple):
+    """The sensor of `jaxnbv run`; None leaves what fits the object.
+
+    - `fov`: degrees; `radius`: scene units; `rays`: along a side.
+    """
+
+    paper: bool = False
+    fov: float | None = None
+    radius: float | None = None
+    rays: int | None = None
+
+
+class SizeOptions(NamedTuple):
+    """How much is imagined; None leaves the usual number."""
+
+    samples: int | None = None
+    candidates: int | None = None
+    lengthscale: float | None = None
+
+
+USUAL_SIZE = SizeOptions()

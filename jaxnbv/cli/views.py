@@ -1,29 +1,39 @@
 """`jaxnbv demo` and `jaxnbv run MESH`: one episode."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import typer
 
 from jaxnbv.cli import actions
 from jaxnbv.cli.options import (
-    DEFAULT_FIRST,
     REQUIRED,
+    CandidatesOption,
     CategoryOption,
     Device,
     DeviceOption,
     EpisodeOptions,
     FirstOption,
+    FovOption,
     FramingOption,
+    LengthscaleOption,
     ModelOption,
     NetworkOption,
     NoiseOption,
     OutOption,
+    OverwriteOption,
+    PaperOption,
     QuickOption,
+    RadiusOption,
+    RaysOption,
     ReportOption,
+    SamplesOption,
     SearchName,
     SearchOption,
     SeedOption,
+    SensorOptions,
+    SizeOptions,
     SourceOption,
     Task,
     TaskOption,
@@ -33,6 +43,8 @@ from jaxnbv.cli.options import (
 )
 from jaxnbv.datasets import Framing
 from jaxnbv.model_name import ModelName
+
+_T = TypeVar("_T")
 
 MeshArgument = Annotated[
     Path, typer.Argument(metavar="MESH", help="Any mesh that trimesh reads: OBJ, PLY, STL, OFF, glTF, ...")
@@ -49,6 +61,7 @@ _EPISODE: dict[str, tuple[Any, Any]] = {
     "until": (UntilOption, None),
     "seed": (SeedOption, 0),
     "out": (OutOption, None),
+    "overwrite": (OverwriteOption, False),
     "noise": (NoiseOption, 0.01),
     "quick": (QuickOption, False),
     "report": (ReportOption, True),
@@ -56,10 +69,21 @@ _EPISODE: dict[str, tuple[Any, Any]] = {
 }
 
 
+# No view depends on these.
+_FREE = {"views", "until", "out", "overwrite", "report"}
+
+
 def _options(device: Device, given: dict[str, Any]) -> tuple[EpisodeOptions, dict[str, Any]]:
     """What every episode takes, and what is left."""
     actions.prepare(device)
-    return EpisodeOptions(*(given.pop(name) for name in EpisodeOptions._fields)), given
+    asked = {name: str(value) if isinstance(value, Path) else value for name, value in given.items()}
+    given["asked"] = {name: value for name, value in asked.items() if name not in _FREE}
+    return _taken(EpisodeOptions, given), given
+
+
+def _taken(kind: Callable[..., _T], given: dict[str, Any]) -> _T:
+    """A named tuple of options, taken out of those that are given."""
+    return kind(*(given.pop(name) for name in kind._fields))  # type: ignore[attr-defined]
 
 
 def _demo(device: Device, **given: Any) -> None:
@@ -69,7 +93,8 @@ def _demo(device: Device, **given: Any) -> None:
 
 def _run(device: Device, **given: Any) -> None:
     options, own = _options(device, given)
-    actions.run(**own, options=options)
+    sensor, sizes = _taken(SensorOptions, own), _taken(SizeOptions, own)
+    actions.run(**own, sensor=sensor, sizes=sizes, options=options)
 
 
 demo = command(
@@ -94,7 +119,7 @@ run = command(
     """Choose views of a mesh, scanned by a simulated depth camera.
 
     The mesh may be open, a soup of triangles or inconsistently wound. It is scaled and centred so that its longest side
-    is 2.5 scene units; cameras stand 2.5 from its centre.
+    is 2.5 scene units; cameras stand as far from its centre as it takes to see all of it.
     """,
     {
         "mesh": (MeshArgument, REQUIRED),
@@ -102,7 +127,14 @@ run = command(
         "network": (NetworkOption, None),
         "category": (CategoryOption, None),
         "source": (SourceOption, None),
-        "first": (FirstOption, DEFAULT_FIRST),
+        "first": (FirstOption, None),
+        "paper": (PaperOption, False),
+        "fov": (FovOption, None),
+        "radius": (RadiusOption, None),
+        "rays": (RaysOption, None),
+        "samples": (SamplesOption, None),
+        "candidates": (CandidatesOption, None),
+        "lengthscale": (LengthscaleOption, None),
     }
     | _EPISODE,
 )

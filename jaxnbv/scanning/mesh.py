@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 from embreex.mesh_construction import TriangleMesh as EmbreeTriangles
 from embreex.rtcore_scene import EmbreeScene
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from skimage.measure import marching_cubes
 
 from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, check_type, checked, is_traced, require, shown
@@ -151,6 +151,33 @@ class TriangleMesh(Surface):
         seed = np.random.default_rng(np.asarray(jax.random.key_data(key)))
         points, _ = trimesh.sample.sample_surface(self.to_trimesh(), count, seed=seed)
         return np.asarray(points)
+
+    @property
+    def reach(self) -> float:
+        """Distance from the scene's origin to the farthest corner."""
+        return float(np.linalg.norm(self.vertices, axis=1).max())
+
+    @property
+    def thickness(self) -> float:
+        """Extent along the direction in which the corners vary least, in scene units; zero for a plane sheet."""
+        centred = self.vertices - self.vertices.mean(axis=0)
+        _, directions = np.linalg.eigh(centred.T @ centred)
+        return float(np.ptp(centred @ directions[:, 0]))
+
+    @property
+    def open_edges(self) -> tuple[int, int]:
+        """How many edges belong to one face only, and how many there are; corners at one place are taken for one."""
+        _, places = np.unique(self.vertices.round(6), axis=0, return_inverse=True)
+        sides = np.sort(places.reshape(-1)[self.faces][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        _, counts = np.unique(sides, axis=0, return_counts=True)
+        return int(np.sum(counts == 1)), len(counts)
+
+    @checked
+    def contains(self, points: Float[AnyArray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Which points (scene coordinates) lie inside: where the winding number is above 1/2 in magnitude, so that a
+        mesh that is wound inside out has an inside too. An open sheet encloses nothing."""
+        points = np.asarray(points, dtype=np.float64)
+        return np.asarray(np.abs(igl.fast_winding_number(self.vertices, self.faces, points)) > 0.5)
 
     def to_signed_distance(self, grid: Grid) -> Float[Array, "g g g"]:
         """Distance to the mesh at the grid's nodes, negative inside.

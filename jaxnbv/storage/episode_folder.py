@@ -14,7 +14,7 @@ from plyfile import PlyData, PlyElement
 
 from jaxnbv.cloud import PointCloud
 from jaxnbv.files import write_whole
-from jaxnbv.folders import ResultFolder, read_config
+from jaxnbv.folders import ResultFolder, read_config, writing_in
 from jaxnbv.pose import Pose
 from jaxnbv.search import Proposal
 from jaxnbv.storage.arrays import (
@@ -31,7 +31,7 @@ from jaxnbv.storage.arrays import (
     write_arrays,
 )
 
-_RECORD = "episode.json"
+_RECORD, _VIEWS = "episode.json", "view_*.npz"
 _VIEW = {**POSE, **SCAN, **PROPOSAL}
 
 
@@ -43,7 +43,7 @@ class EpisodeFolder(ResultFolder):
     """
 
     def __init__(self, path: str | Path, config: dict[str, Any]):
-        super().__init__(path, _RECORD, "view_*.npz", config, "episode")
+        super().__init__(path, _RECORD, _VIEWS, config, "episode")
 
     def read_views(self) -> list[tuple[Pose, PointCloud, Proposal | None]]:
         """Pose, scan and proposal of every finished view, up to the first that is missing.
@@ -77,6 +77,21 @@ def open_episode(path: str | Path) -> EpisodeFolder:
     """
     record = Path(path) / _RECORD
     return EpisodeFolder(path, read_config(record, "is not an episode's record", "give the folder of a run"))
+
+
+def remove_episode(path: str | Path) -> bool:
+    """Remove the files of an episode from its folder, whatever its configuration; whether there were any.
+
+    **Raises:** `ValueError` if another process writes there.
+    """
+    path = Path(path)
+    if not (path / _RECORD).exists():
+        return False
+    with writing_in(path):
+        # The record last, so that what is left of views is never foreign.
+        for file in (*path.glob(_VIEWS), path / "cloud.ply", path / _RECORD):
+            file.unlink(missing_ok=True)
+    return True
 
 
 def _view(data: dict[str, np.ndarray]) -> tuple[Pose, PointCloud, Proposal | None]:

@@ -20,7 +20,7 @@ from jaxnbv.pose import Pose
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.state import State
-from jaxnbv.viz.data import mean_surface
+from jaxnbv.viz.data import allowing_for_unseen, mean_surface
 from jaxnbv.viz.render import depth_picture, depth_range
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, VALUE, round_range
 
@@ -132,7 +132,7 @@ def _cameras(scene: Any, episode: Episode) -> list[Any]:
 
 
 def _mean(scene: Any, planner: Planner, state: State) -> list[Any]:
-    surface = mean_surface(planner, state)
+    surface = allowing_for_unseen(mean_surface(planner, state), state.cloud)
     if surface is None:
         return []
     low, high = round_range(*np.percentile(surface.deviation, [2.0, 98.0]).tolist())

@@ -252,3 +252,43 @@ def test_an_off_file_whose_first_two_lines_run_together_is_read(tmp_path):
     np.testing.assert_array_equal(glued.vertices, well.vertices)
     np.testing.assert_array_equal(glued.faces, well.faces)
     np.testing.assert_allclose(np.ptp(glued.vertices, axis=0), [0.625, 1.25, 2.5], rtol=1e-6)
+
+
+TURN = trimesh.transformations.rotation_matrix(0.7, (1.0, 2.0, -0.5))
+
+
+@pytest.mark.parametrize("sides", [(1.0, 1.0, 1.0), (4.0, 2.0, 0.3), (4.0, 2.0, 1e-4)])
+def test_the_reach_and_thickness_of_a_turned_box_are_its_diagonal_and_least_side(sides):
+    shape = trimesh.creation.box(sides, transform=TURN)
+    mesh = TriangleMesh.from_arrays(shape.vertices, shape.faces)
+    assert mesh.reach == pytest.approx(0.5 * np.linalg.norm(sides) * mesh.frame.scale)
+    # All directions of a cube are alike: its least extent is between its side and its diagonal.
+    if len({*sides}) == 3:
+        assert mesh.thickness == pytest.approx(min(sides) * mesh.frame.scale, rel=1e-6)
+
+
+def test_a_turned_sheet_has_no_thickness():
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 3, 0], [0, 3, 0]]) @ TURN[:3, :3].T
+    assert TriangleMesh.from_arrays(vertices, [[0, 1, 2], [0, 2, 3]]).thickness < 1e-6
+
+
+@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("apart", [False, True], ids=["joined", "soup"])
+def test_open_edges_are_those_of_one_face(name, apart):
+    """Taking a face away opens its three edges; faces whose corners lie at one place are joined."""
+    shape = SHAPES[name]
+    vertices, faces = shape.vertices, shape.faces
+    if apart:
+        vertices, faces = vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
+    assert TriangleMesh.from_arrays(vertices, faces).open_edges == (0, len(shape.edges_unique))
+    assert TriangleMesh.from_arrays(vertices, faces[1:]).open_edges == (3, len(shape.edges_unique))
+
+
+@pytest.mark.parametrize("outward", [True, False])
+def test_a_ball_contains_what_is_nearer_than_its_radius_however_it_is_wound(outward):
+    shape = trimesh.creation.icosphere(4)
+    mesh = TriangleMesh.from_arrays(shape.vertices, shape.faces[:, :: 1 if outward else -1])
+    points = RNG.uniform(-1.7, 1.7, (400, 3))
+    distance = np.linalg.norm(points, axis=1)
+    clear = np.abs(distance - 1.25) > 0.02
+    np.testing.assert_array_equal(mesh.contains(points)[clear], distance[clear] < 1.25)

@@ -1,26 +1,26 @@
 """What `jaxnbv demo` and `jaxnbv run MESH` do: one episode."""
 
-import re
 import time
 from pathlib import Path
 
 import jax
-import numpy as np
 import typer
 
 from jaxnbv.acquisition import Score
-from jaxnbv.answers import Answer
-from jaxnbv.camera import Camera
-from jaxnbv.checks import require
+from jaxnbv.checks import InputError, require
+from jaxnbv.cli.actions.lines import Lines
+from jaxnbv.cli.actions.run_folder import clear, explained, note, usual_folder
+from jaxnbv.cli.actions.sensors import first_pose, peculiarities, quick_rays, sensor_for
 from jaxnbv.cli.actions.stops import rule
-from jaxnbv.cli.actions.tasks import CommandTask, Given, OfMesh, position
-from jaxnbv.cli.options import EpisodeOptions
+from jaxnbv.cli.actions.tasks import CommandTask, Given, OfMesh
+from jaxnbv.cli.options import USUAL_SIZE, EpisodeOptions, SensorOptions, SizeOptions
 from jaxnbv.cli.registry import SEARCHES, TASKS, resolve
 from jaxnbv.datasets import Framing
-from jaxnbv.episode import Episode, simulate
+from jaxnbv.episode import View, simulate
+from jaxnbv.folders import AnotherConfigurationError
 from jaxnbv.model_name import ModelName
 from jaxnbv.planner import Planner
-from jaxnbv.pose import Pose, look_at
+from jaxnbv.pose import Pose
 from jaxnbv.presets import imagination
 from jaxnbv.scanning import Grid, SensorNoise, Surface, load_mesh
 from jaxnbv.sensors import Setting
@@ -28,15 +28,19 @@ from jaxnbv.viz import write_report
 
 
 def demo(task: str, scene: int, framing: Framing, first: str | None, options: EpisodeOptions) -> None:
-    """One episode of a shipped object."""
+    """One episode of a shipped object.
+
+    **Raises:** `ValueError` for a first view from inside the object.
+    """
     made: CommandTask = resolve(TASKS[task].task)
     shown = made.demo(scene, framing, options.seed)
     if shown.told:
         typer.echo(shown.told)
-    start = shown.first if first is None else look_at(position("--first", first))
+    start = shown.first if first is None else first_pose(first, shown.surface)
     own = shown.longest_side, shown.solid, shown.grid
-    planner = planner_of(made.setting, shown.score, options.search, options.model, options.quick, *own)
-    _run(shown.name, shown.surface, planner, start, options, shown.until)
+    setting = quick_rays(made.setting) if options.quick else made.setting
+    planner = planner_of(setting, shown.score, options.search, options.model, options.quick, *own)
+    _run(shown.name, task, shown.surface, planner, start, options, shown.until)
 
 
 def run(
@@ -45,31 +49,38 @@ def run(
     network: Path | None,
     category: str | None,
     source: str | None,
-    first: str,
+    first: str | None,
+    sensor: SensorOptions,
+    sizes: SizeOptions,
     options: EpisodeOptions,
 ) -> None:
     """One episode of a mesh of the user's.
 
-    **Raises:** `ValueError` for a task without what it needs, or with what it has no use for.
+    **Raises:** `ValueError` for a task without what it needs, or with what it has no use for, a sensor that cannot see
+    the object, and a first view from inside it.
     """
-    surface, start = load_mesh(mesh), look_at(position("--first", first))
-    given = Given(OfMesh(surface, start), network, category, source)
-    made = task_for(task, given)
-    planner = planner_of(made.setting, made.score(given), options.search, options.model, options.quick)
-    _run(mesh.stem, surface, planner, start, options)
+    surface, made = load_mesh(mesh), task_for(task, network, category, source)
+    setting = sensor_for(surface, made.setting, sensor, options.quick)
+    start = first_pose(first, surface, None if sensor.paper else setting.radius)
+    score = made.score(Given(OfMesh(surface, start, setting.camera), network, category, source))
+    planner = planner_of(setting, score, options.search, options.model, options.quick, sizes=sizes)
+    for words in peculiarities(mesh, surface, planner.grid.spacing):
+        typer.echo(f"note     {words}")
+    _run(mesh.stem, task, surface, planner, start, options)
 
 
-def task_for(task: str, given: Given) -> CommandTask:
+def task_for(task: str, network: Path | None, category: str | None, source: str | None) -> CommandTask:
     """The task of a name.
 
     **Raises:** `ValueError` if it lacks what it needs, or was given what it has no use for.
     """
-    for option in ("network", "category", "source"):
+    given = {"network": network, "category": category, "source": source}
+    for option, value in given.items():
         takers = ", ".join(name for name, entry in TASKS.items() if option in entry.options)
-        useless = getattr(given, option) is not None and option not in TASKS[task].options
+        useless = value is not None and option not in TASKS[task].options
         require(not useless, f"--task {task} takes no --{option}: it is for {takers}")
     for option, hint in TASKS[task].requires:
-        require(getattr(given, option) is not None, f"--task {task} needs {hint}")
+        require(given[option] is not None, f"--task {task} needs {hint}")
     made: CommandTask = resolve(TASKS[task].task)
     return made
 
@@ -83,30 +94,47 @@ def planner_of(
     longest_side: float = 2.5,
     solid: bool = False,
     grid: Grid = Grid(),
+    sizes: SizeOptions = USUAL_SIZE,
 ) -> Planner:
     """At the authors' settings, or at small ones, for an object of this longest side."""
-    surfaces, carving = imagination(model, longest_side, quick, solid=solid)
+    surfaces, carving = imagination(model, longest_side, quick, solid=solid, lengthscale=sizes.lengthscale)
     found = resolve(SEARCHES[search].search)
     if quick:
-        small = Camera(height=24, width=24)
-        return Planner(surfaces, small, score, found(setting.radius, 40), 4, Grid(56), 1024, carving=carving)
+        many, grid, capacity = found(setting.radius, sizes.candidates or 40), Grid(56), 1024
+        return Planner(surfaces, setting.camera, score, many, sizes.samples or 4, grid, capacity, carving=carving)
     # A gradient search looks at its own number of candidates before it climbs.
-    count = None if search.startswith("gradient") else setting.num_candidates
-    return Planner(surfaces, setting.camera, score, found(setting.radius, count), grid=grid, carving=carving)
+    usual = None if search.startswith("gradient") else setting.num_candidates
+    many = found(setting.radius, sizes.candidates or usual)
+    return Planner(surfaces, setting.camera, score, many, sizes.samples or 16, grid=grid, carving=carving)
 
 
 def _run(
-    name: str, scene: Surface, planner: Planner, first: Pose, options: EpisodeOptions, until: tuple[str, ...] = ()
+    name: str,
+    task: str,
+    scene: Surface,
+    planner: Planner,
+    first: Pose,
+    options: EpisodeOptions,
+    until: tuple[str, ...] = (),
 ) -> None:
     enough, start = rule(options.until or until), time.perf_counter()
-    of_model = "" if options.model is ModelName.SCREENED else f"-{options.model}"
-    usual = Path("runs") / f"{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}-{options.search}{of_model}"
-    folder = options.out or usual
+    folder = options.out or usual_folder(name, task, options.search, options.model, options.seed)
     if options.quick:
         typer.echo("--quick: small settings; leave it out for the paper's.")
+    if options.overwrite:
+        clear(folder)
+    lines = Lines(planner)
+
+    def tell(view: View) -> None:
+        if lines.count == 0:
+            note(folder, options.asked)
+        lines(view)
+
     key, noise = jax.random.key(options.seed), SensorNoise(options.noise, options.noise)
-    episode = simulate(planner, scene, first, options.views, key, noise, folder, until=enough)
-    _summarise(episode)
+    try:
+        episode = simulate(planner, scene, first, options.views, key, noise, folder, until=enough, each=tell)
+    except AnotherConfigurationError as error:
+        raise InputError(explained(folder, options.asked, error)) from error
     if episode.stopped is not None:
         saved = options.views - len(episode.views)
         views = "view is" if saved == 1 else "views are"
@@ -116,31 +144,3 @@ def _run(
     if options.report:
         typer.echo(f"report   {write_report(episode, folder, title=name)}")
     typer.echo(f"episode  {folder}   ({time.perf_counter() - start:.0f} s)")
-
-
-def _summarise(episode: Episode) -> None:
-    """Lines for each view: where from, why, and what it told."""
-    score = episode.planner.acquisition
-    sought = episode.planner.quantity
-    before: Answer | None = None
-    for index, view in enumerate(episode.views, start=1):
-        position = ", ".join(f"{value:+.2f}" for value in np.asarray(view.pose.position))
-        line = f"view {index}   from ({position})   {int(view.scan.count):5d} points, {int(view.cloud.count):5d} kept"
-        if view.proposal is not None:
-            values = np.asarray(view.proposal.values)
-            values = values[np.isfinite(values)]
-            line += f"   {sought.name} {float(view.proposal.value):.4g}, "
-            if (ways := view.proposal.trajectories) is None:
-                line += f"the highest of {len(values)} candidates"
-                line += f" (median {np.median(values):.4g})" if sought.smooth else ""
-                level = view.proposal.others_level
-                line += "" if level is None else f", {level} of them within two standard errors"
-            else:
-                best = values.max(initial=-np.inf)
-                better = "found nothing better" if float(view.proposal.value) <= best else f"improved on {best:.4g}"
-                line += f"where ascent from {len(ways.values)} of {len(values)} candidates {better}"
-        typer.echo(line)
-        answer = score.answer(view.cloud)
-        if answer is not None:
-            typer.echo(f"         {answer.line(before)}")
-        before = answer

@@ -6,6 +6,7 @@ import numpy as np
 import typer
 
 from jaxnbv.cli.actions.episodes import planner_of, task_for
+from jaxnbv.cli.actions.sensors import quick_rays
 from jaxnbv.cli.actions.tasks import Given, OfScan, position
 from jaxnbv.model_name import ModelName
 from jaxnbv.replay import StoredSession
@@ -31,9 +32,10 @@ def replay(
     if source is not None:
         place = stored.frame.to_scene(np.array(position("--source", source)))
         source = ",".join(str(float(x)) for x in place)
+    made = task_for(task, network, category, source)
     given = Given(OfScan(*stored.first_view()), network, category, source)
-    made = task_for(task, given)
-    planner = planner_of(made.setting, made.score(given), search, model, quick)
+    setting = quick_rays(made.setting) if quick else made.setting
+    planner = planner_of(setting, made.score(given), search, model, quick)
     out = out or folder.with_name(f"{folder.name}-{task}-{search}")
     sought = planner.quantity
     replayed = None

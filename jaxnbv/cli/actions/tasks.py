@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement, Score
+from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError, require
 from jaxnbv.cli.options import DEFAULT_FIRST
 from jaxnbv.cloud import PointCloud
@@ -60,16 +61,17 @@ class Known(ABC):
 
 @dataclass(frozen=True)
 class OfMesh(Known):
-    """Of a mesh all is known."""
+    """Of a mesh all is known. `camera`: which takes the first view."""
 
     surface: TriangleMesh
     first: Pose
+    camera: Camera
 
     def points(self) -> Float[np.ndarray, "n 3"]:
         return self.surface.sample_points(jax.random.key(0), 20_000)
 
     def first_points(self) -> Float[np.ndarray, "n 3"]:
-        return scan(self.surface, USUAL_SETTING.camera, self.first).to_numpy()[0]
+        return scan(self.surface, self.camera, self.first).to_numpy()[0]
 
 
 @dataclass(frozen=True)
@@ -176,7 +178,7 @@ class PartTask(CommandTask):
         thing = part_scene(Split.TEST, scene)
         category = CATEGORIES[int(thing.category)].name
         score = self._score(part_segmenter(category))
-        return Shown(f"{category}-parts", SDFSurface(thing.solid), score, usual_first())
+        return Shown(category, SDFSurface(thing.solid), score, usual_first())
 
     def _score(self, segmenter: CloudSegmenter) -> Score:
         return ExpectedUtilityImprovement(SoftPartCount(segmenter), segmenter.num_points)
@@ -195,7 +197,7 @@ class HeatTask(CommandTask):
         """A procedural object."""
         heated = heat_scene(scene)
         first = source_view(heated, jax.random.key(seed))
-        return Shown(f"{heated.name}-heat", heated.surface, self._score(np.asarray(heated.source)), first)
+        return Shown(heated.name, heated.surface, self._score(np.asarray(heated.source)), first)
 
     def _score(self, source: np.ndarray) -> Score:
         return ExpectedUtilityImprovement(ColdestPoint(source), num_points=2048)

@@ -1,0 +1,66 @@
+"""The folder of a run: its usual name, what was asked for in it, and how it is begun anew."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from jaxnbv.files import write_text
+from jaxnbv.folders import AnotherConfigurationError, read_json, writing_in
+from jaxnbv.model_name import ModelName
+from jaxnbv.storage import remove_episode
+
+_OPTIONS, _REPORT = "options.json", ("report.html", "figures/*.png")
+
+
+def usual_folder(name: str, task: str, search: str, model: ModelName, seed: int) -> Path:
+    """runs/NAME-TASK-SEARCH[-MODEL]-seedN."""
+    parts = name, task, search, *(() if model is ModelName.SCREENED else (model,)), f"seed{seed}"
+    return Path("runs") / re.sub(r"[^A-Za-z0-9_.-]", "_", "-".join(parts))
+
+
+def clear(folder: Path) -> None:
+    """Remove an episode, its report, and what was asked for; a folder of something else is left as it is.
+
+    **Raises:** `ValueError` if another process writes there.
+    """
+    if remove_episode(folder):
+        with writing_in(folder):
+            for pattern in (_OPTIONS, *_REPORT):
+                for file in folder.glob(pattern):
+                    file.unlink()
+
+
+def note(folder: Path, asked: dict[str, Any]) -> None:
+    """Write down what was asked for, in the user's own words."""
+    write_text(folder / _OPTIONS, json.dumps(asked, indent=2))
+
+
+def explained(folder: Path, asked: dict[str, Any], error: AnotherConfigurationError) -> str:
+    """Why a folder belongs to another episode: the options that differ, if they are known, else what the error says."""
+    changed: list[str] = []
+    if (folder / _OPTIONS).exists():
+        held = read_json(folder / _OPTIONS, "does not hold options", "give another --out, or --overwrite")
+        names = list(dict.fromkeys([*held, *asked]))
+        changed = [
+            _difference(name, held.get(name), asked.get(name)) for name in names if held.get(name) != asked.get(name)
+        ]
+    if not changed:
+        return f"{error}; or replace it by --overwrite"
+    return (
+        f"the output folder {folder} belongs to another episode: {'; '.join(changed)}. Give the options it was made "
+        "with, another --out, or --overwrite to replace it"
+    )
+
+
+def _difference(name: str, there: Any, now: Any) -> str:
+    if name == "mesh":
+        return f"the mesh {there} there, {now} now"
+    option = f"--{name}"
+    if isinstance(there, bool) or isinstance(now, bool):
+        return f"{option} there, not now" if there else f"{option} now, not there"
+    return f"{option} {_said(there)} there, {_said(now)} now"
+
+
+def _said(value: Any) -> str:
+    return "not given" if value is None else str(value)

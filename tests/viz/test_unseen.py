@@ -1,0 +1,43 @@
+"""What no ray has met is shown as uncertain, whatever the posterior says of it."""
+
+import jax
+import numpy as np
+
+import jaxnbv as nbv
+from jaxnbv.scanning.sdf import Capsule
+from jaxnbv.viz import report_data
+from jaxnbv.viz.data import MeanSurface, allowing_for_unseen
+
+
+def test_the_deviation_allows_for_a_quarter_of_the_distance_to_the_nearest_point():
+    """On a unit sphere of which one point was seen, and is held to be known to 0.03 all over."""
+    vertices = np.asarray(nbv.fibonacci_sphere(200), np.float64)
+    faces = np.zeros((1, 3), np.int64)
+    surface = MeanSurface(vertices, faces, vertices, np.full(200, 0.03))
+    # Rows that hold nothing lie at the origin, and are no points.
+    cloud = nbv.PointCloud.from_arrays([[1.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]], capacity=4)
+    shown = allowing_for_unseen(surface, cloud)
+    chord = 2 * np.sin(0.5 * np.arccos(np.clip(vertices[:, 0], -1, 1)))
+    np.testing.assert_allclose(shown.deviation, np.sqrt(0.03**2 + (chord / 4) ** 2), rtol=1e-5)
+    np.testing.assert_array_equal(shown.vertices, vertices)
+    assert allowing_for_unseen(None, cloud) is None
+
+
+def test_an_end_beyond_the_images_border_is_never_shown_as_certain():
+    scene = nbv.SDFSurface(Capsule([-0.8, 0.0, 0.0], [0.8, 0.0, 0.0], 0.3))
+    model = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=16))
+    camera = nbv.Camera(height=24, width=24)
+    planner = nbv.Planner(model, camera, nbv.Coverage(), nbv.RandomView(30), 2, nbv.Grid(40), 1024)
+    first = nbv.look_at((-0.6, 0.0, 1.8), (-0.6, 0.0, 0.0))
+    (view,) = report_data(
+        nbv.simulate(planner, scene, first, 1, jax.random.key(0), progress=False), progress=False
+    ).views
+    surface = view.surface
+    local = (surface.vertices - np.asarray(first.position)) @ np.asarray(first.rotation)
+    column, row = camera.to_pixels(local[:, :2] / local[:, 2:]).T
+    beside = np.max([-column, column - camera.width, -row, row - camera.height], axis=0)
+    outside = beside > 0.3 * camera.width
+    met = np.linalg.norm(surface.vertices[:, None] - view.new[None], axis=-1).min(axis=1) < 0.05
+    assert outside.sum() > 20
+    assert met.sum() > 20
+    assert surface.deviation[outside].min() > 2 * np.percentile(surface.deviation[met], 90)
