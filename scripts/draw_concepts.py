@@ -88,13 +88,13 @@ def draw_utility(planner: nbv.Planner, state: nbv.State, surfaces: nbv.GridSurfa
         expected = float(proposal.values[chosen[row]])
         figure.text(
             0.012,
-            0.93 - 0.46 * row,
+            0.955 - 0.49 * row,
             f"{name}: {expected:.0f} expected, of {planner.num_samples} samples",
             color=INK,
             fontsize=10,
         )
         for column in range(SHOWN):
-            axes = figure.add_axes((0.01 + 0.222 * column, 0.5 - 0.46 * row, 0.21, 0.39))
+            axes = figure.add_axes((0.01 + 0.222 * column, 0.55 - 0.49 * row, 0.21, 0.385))
             mask = np.asarray(fine.mask[column, row])
             normals = np.asarray(fine.normals[column, row])
             right, down, forward = np.asarray(poses.rotation[row]).T
@@ -113,16 +113,13 @@ def draw_utility(planner: nbv.Planner, state: nbv.State, surfaces: nbv.GridSurfa
     return figure
 
 
-def draw_search(found: dict[str, nbv.Proposal], quantity: nbv.Quantity) -> Figure:
+def draw_search(found: dict[str, nbv.Proposal], quantities: dict[str, nbv.Quantity]) -> Figure:
     """Maps of the sphere of directions, by one search each."""
-    figure = Figure(figsize=(9.6, 3.3))
+    figure = Figure(figsize=(9.6, 2.3))
     for index, (name, proposal) in enumerate(found.items()):
-        axes = figure.add_axes((0.01 + 0.46 * index, 0.03, 0.44, 0.84))
-        colours = draw_acquisition(axes, choice_of(proposal), quantity)
-        axes.set_title(f"{name}: {float(proposal.value):.0f}", loc="center")
-    bar = figure.colorbar(colours, cax=figure.add_axes((0.935, 0.2, 0.012, 0.55)))
-    bar.outline.set_visible(False)
-    bar.set_label(quantity.name)
+        axes = figure.add_axes((0.005 + 0.333 * index, 0.02, 0.323, 0.76))
+        draw_acquisition(axes, choice_of(proposal), quantities[name])
+        axes.set_title(f"{name}: {quantities[name].name}", loc="center", fontsize=8)
     return figure
 
 
@@ -142,11 +139,11 @@ def main() -> None:
     with mpl.rc_context(STYLE):
         save(draw_posterior(planner, state, surfaces, scene), folder / "concepts_posterior.png")
         save(draw_utility(planner, state, surfaces, proposal), folder / "concepts_utility.png")
-        # Fewer and longer steps than by default, so that the ascents can be seen on a map.
-        search = nbv.GradientSearch(dof=2, num_starts=4, iterations=12, learning_rate=0.04, num_candidates=60)
-        climbed = dataclasses.replace(planner, search=search).choose(state, surfaces, search_key)
-        found = {"over candidates": proposal, "by gradient": climbed}
-        save(draw_search(found, planner.quantity), folder / "concepts_search.png")
+        searches = (nbv.DiscreteSearch(), nbv.UncertaintyView(), nbv.FarthestView())
+        planners = {type(search).__name__: dataclasses.replace(planner, search=search) for search in searches}
+        found = {name: one.choose(state, surfaces, search_key) for name, one in planners.items()}
+        quantities = {name: one.quantity for name, one in planners.items()}
+        save(draw_search(found, quantities), folder / "concepts_search.png")
 
 
 if __name__ == "__main__":
