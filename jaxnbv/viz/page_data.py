@@ -106,8 +106,10 @@ def clustered(
     own = np.arange(len(vertices))
     cell = 0.01
     while own.max(initial=-1) + 1 > limit:
-        _, own = np.unique(np.floor(vertices / cell).astype(np.int64), axis=0, return_inverse=True)
-        own, cell = own.reshape(-1), 1.2 * cell
+        steps = np.floor(vertices / cell).astype(np.int64)
+        steps -= steps.min(axis=0)
+        _, own = np.unique(np.ravel_multi_index(steps.T, steps.max(axis=0) + 1), return_inverse=True)
+        cell *= 1.2
     joined = own[faces]
     a, b, c = joined.T
     return own, joined[(a != b) & (b != c) & (c != a)]
@@ -125,7 +127,7 @@ def _surface(surface: MeanSurface, limit: int) -> dict:
         "low": low,
         "step": (high - low) / 65535.0,
         "vertices": _packed(np.round((vertices - low) / max(high - low, 1e-12) * 65535.0), "<u2"),
-        "faces": _packed(faces, "<u2" if len(vertices) < 65536 else "<u4"),
+        "faces": _packed(faces, "<u2"),
         "least": least,
         "grade": (most - least) / 255.0,
         "deviation": _packed(np.round((deviation - least) / max(most - least, 1e-12) * 255.0), "u1"),

@@ -11,12 +11,15 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.transforms import ScaledTranslation
 
 from jaxnbv.answers import Panel, number
 from jaxnbv.viz.data import COVERAGE_RADIUS, ReportData
 from jaxnbv.viz.style import BEFORE, GREY, INK, LINE, NEW, SERIES
 
 _MOST_NAMES, _LONGEST_NAME = 6, 22
+# In inches, from the axis to its legend.
+_BELOW = 0.42
 
 
 def shown_names(panels: tuple[Panel, ...]) -> list[int]:
@@ -76,7 +79,9 @@ def legend_below(axes: Axes, handles: list[Any]) -> None:
     axes.legend(
         handles=handles,
         loc="upper center",
-        bbox_to_anchor=(0.5, -0.24),
+        bbox_to_anchor=(0.5, 0.0),
+        # Under the axis's numbers and name, however low the axes are.
+        bbox_transform=axes.transAxes + ScaledTranslation(0.0, -_BELOW, axes.figure.dpi_scale_trans),
         ncols=columns,
         frameon=False,
         fontsize=8,
