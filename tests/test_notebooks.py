@@ -38,7 +38,7 @@ num_features, num_samples, resolution, pixels, num_candidates, capacity, views =
 num_samples, resolution, pixels, capacity, most = 2, 32, 16, 400, 2
 """,
     "07_a_study_of_your_own.ipynb": """
-scenes = 2
+scenes = 3
 settings = {
     "views": 2,
     "model": nbv.GeometricSPSR(0.05, truncation=8),
