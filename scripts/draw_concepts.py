@@ -53,13 +53,13 @@ def draw_posterior(planner: nbv.Planner, state: nbv.State, surfaces: nbv.GridSur
     shown = draw_points(first, still, points, NEW, 1.2)
     frame(first, still, [shown, *draw_cameras(first, still, [pose], planner.camera, 1.0)])
     first.axis("off")
-    first.set_title("D, what one view saw")
     for sample in np.asarray(surfaces.values[:SHOWN, middle]):
         second.contour(axis, axis, sample, levels=[0.0], colors=[BEFORE], linewidths=0.9, alpha=0.75)
-    second.set_title(f"cross-section of {SHOWN} samples")
     extent = (axis[0], axis[-2]) * 2
     third.imshow(inside, VALUE, vmin=0, vmax=1, origin="lower", extent=extent, interpolation="bilinear")
-    third.set_title("probability of being inside")
+    heads = "D, what one view saw", f"cross-section of {SHOWN} samples", "probability of being inside"
+    for panel, head in zip((first, second, third), heads, strict=True):
+        figure.text(panel.get_position().x0 + 0.01, 0.94, head, fontsize=10)
     near = np.abs(points[:, 0] - axis[middle]) < 0.03
     for panel in (second, third):
         panel.contour(axis[::2], axis[::2], truth, levels=[0.0], colors=[GREY], linewidths=1.0, linestyles=":")

@@ -1,0 +1,151 @@
+"""The pictures docs/gallery.png, eight objects that ship as they are known after four views, and docs/hero.png, one
+step of one of them: `python scripts/draw_gallery.py`. About fifteen minutes on two cores."""
+
+import argparse
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import matplotlib as mpl
+import numpy as np
+from draw_concepts import save
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+import jaxnbv as nbv
+from jaxnbv.acquisition import Score
+from jaxnbv.cli.actions.tasks import PARTS
+from jaxnbv.datasets import Framing, Split, demo_object, fruit_scene, household_scene, part_scene, truck_scene
+from jaxnbv.metrics import truth_points
+from jaxnbv.scanning import SDFSurface, Surface
+from jaxnbv.search import SphereCandidates
+from jaxnbv.sensors import PART_SETTING, USUAL_SETTING, Setting, fitted
+from jaxnbv.viz.data import ReportData, report_data
+from jaxnbv.viz.figures import STYLE, Stills, draw_acquisition
+from jaxnbv.viz.imagined_figures import looks
+from jaxnbv.viz.layout import fitted as words
+from jaxnbv.viz.render import draw_scene
+from jaxnbv.viz.style import GREY
+from jaxnbv.viz.words import percent
+
+VIEWS, RAYS, CANDIDATES = 4, 48, 60
+FIRST = nbv.look_at((0.8, 0.9, 2.2))
+
+
+class Shown(NamedTuple):
+    """An object with a name, what is asked of it, and the usual sensor."""
+
+    name: str
+    surface: Surface
+    score: Score
+    setting: Setting = USUAL_SETTING
+
+
+def part_object(index: int) -> Shown:
+    """Number `index` of the procedural objects, whose parts are asked for."""
+    made = PARTS.demo(index, Framing.CLOSE_UP, 0)
+    return Shown(made.name, made.surface, made.score, PART_SETTING)
+
+
+def objects() -> list[Shown]:
+    """Those of the gallery."""
+    scenes = {
+        "mug": demo_object(),
+        "truck with a chair": SDFSurface(truck_scene(Split.TEST, 2)),
+        "sofa": SDFSurface(household_scene(Split.TEST, 7)),
+        "toilet": SDFSurface(household_scene(Split.TEST, 9)),
+        "mushroom": SDFSurface(fruit_scene(Split.TEST, 3)),
+        "guitar": SDFSurface(part_scene(Split.TEST, 4).solid),
+        "lamp": SDFSurface(part_scene(Split.TEST, 5).solid),
+        "motorbike": SDFSurface(part_scene(Split.TEST, 7).solid),
+    }
+    return [Shown(name, surface, nbv.Coverage()) for name, surface in scenes.items()]
+
+
+def episode_of(shown: Shown, views: int) -> nbv.Episode:
+    """Views of an object that fits the image."""
+    points = truth_points(shown.surface, jax.random.key(0))
+    setting = fitted(shown.setting, float(np.linalg.norm(points, axis=1).max()))
+    camera = setting.camera.resized(RAYS, RAYS)
+    search = nbv.DiscreteSearch(SphereCandidates(CANDIDATES, setting.radius))
+    planner = nbv.Planner(nbv.ScreenedSPSR(), camera, shown.score, search, 8, nbv.Grid(72), 4096)
+    first = nbv.look_at(setting.radius * FIRST.position / np.linalg.norm(FIRST.position))
+    return nbv.simulate(planner, shown.surface, first, views=views, key=jax.random.key(0))
+
+
+def draw_gallery(figure: Figure, columns: int = 4) -> None:
+    """All objects, each as it is known in the end."""
+    shown = objects()
+    rows = -(-len(shown) // columns)
+    for index, one in enumerate(tqdm(shown, "objects")):
+        episode = episode_of(one, VIEWS)
+        data = report_data(episode, progress=False, imagine=False)
+        row, column = divmod(index, columns)
+        bottom = 1.0 - (row + 1) / rows
+        axes = figure.add_axes((column / columns, bottom + 0.08 / rows, 1.0 / columns, 0.92 / rows))
+        draw_scene(axes, data, VIEWS - 1, Stills(data)[VIEWS - 1], episode.planner.camera, weight=0.8, inset=False)
+        covered = data.views[-1].coverage
+        assert covered is not None
+        text = f"{one.name}, {percent(covered)} covered"
+        figure.text((column + 0.5) / columns, bottom + 0.04 / rows, text, ha="center", va="center", fontsize=9)
+
+
+def draw_hero(figure: Figure) -> None:
+    """One step: what is known, what is imagined, which view is worth most, what it shows, and the answer."""
+    one = part_object(7)
+    episode = episode_of(one, 2)
+    data: ReportData = report_data(episode, progress=False)
+    stills, camera = Stills(data), episode.planner.camera
+    seen = data.views[1].imagined
+    choice = data.views[1].choice
+    assert seen is not None
+    assert choice is not None
+    heads = (
+        (f"one view of a {one.name}", "pale is known, dark is guessed"),
+        ("what may be there", "four samples from the next pose, blue where nothing was seen"),
+        ("what each view is worth", data.quantity.name),
+        ("the next view, and the answer", data.task.found),
+    )
+    widths = (3.0, 2.6, 2.6, 3.0)
+    total, left = sum(widths), 0.0
+    for place, ((head, below), width) in enumerate(zip(heads, widths, strict=True)):
+        x, w = left / total, width / total
+        figure.text(x + 0.5 * w, 0.96, head, ha="center", va="center", fontsize=9.5)
+        words(figure, x + 0.5 * w, 0.885, below, 0.94 * w, 8.0, ha="center", va="center", color=GREY)
+        if place in (0, 3):
+            index = 0 if place == 0 else 1
+            draw_scene(figure.add_axes((x, 0.0, w, 0.86)), data, index, stills[index], camera, inset=False)
+        elif place == 1:
+            for number, tile in enumerate(looks(seen)[:4]):
+                down, across = divmod(number, 2)
+                box = (x + (0.04 + 0.48 * across) * w, 0.43 - 0.42 * down, 0.44 * w, 0.4)
+                _tile(figure.add_axes(box), tile.picture)
+        else:
+            draw_acquisition(figure.add_axes((x + 0.02 * w, 0.2, 0.96 * w, 0.55)), choice, data.quantity)
+        left += width
+
+
+def _tile(axes: Axes, picture: np.ndarray) -> None:
+    axes.imshow(picture, interpolation="bilinear")
+    axes.set(xticks=[], yticks=[])
+    for side in axes.spines.values():
+        side.set(visible=True, color=GREY, linewidth=0.6)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", default=["hero", "gallery"], help="which; default: both")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "docs", help="folder of the pictures")
+    arguments = parser.parse_args()
+    out: Path = arguments.out
+    with mpl.rc_context(STYLE):
+        for name, size, draw in (("hero", (11.2, 3.2), draw_hero), ("gallery", (10.4, 5.6), draw_gallery)):
+            if name in arguments.names:
+                figure = Figure(figsize=size)
+                draw(figure)
+                save(figure, out / f"{name}.png")
+
+
+if __name__ == "__main__":
+    main()
