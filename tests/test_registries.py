@@ -51,7 +51,9 @@ def test_a_study_is_declared_in_full(name):
         assert isinstance(chart, Chart)
         for panel in (panel for row in chart.rows for panel in row):
             assert panel.measure in names
-    assert {*entry.options} <= {*inspect.signature(study).parameters}
+    # Settings, or what else it is configured by.
+    taken = {*inspect.signature(study).parameters, *inspect.signature(study.configured).parameters}
+    assert {*entry.options} <= taken - {"model", "views", "quick", "options"}
     assert {*study.quick} <= {*inspect.signature(study).parameters}
     assert callable(resolve(entry.pictures))
     seeds = [resolve(other.study).seed for other in STUDIES.values()]

@@ -12,7 +12,7 @@ from PIL import Image
 
 import jaxnbv as nbv
 from jaxnbv.answers import number
-from jaxnbv.cli.actions.episodes import _summarise
+from jaxnbv.cli.actions.lines import Lines
 from jaxnbv.datasets.demo import demo_object
 from jaxnbv.episode import view_keys
 from jaxnbv.pose import look_at
@@ -224,7 +224,9 @@ def test_the_sentence_and_the_summary_tell_the_numbers_of_the_step(few, few_data
     best = float(np.max(seen.values))
     assert f"was found by gradient ascent from 4 starts: {100 * (float(seen.value) / best - 1):.2g} %" in view.sentence
     assert f"the best of 4 open candidates ({number(best)}; median" in view.sentence
-    _summarise(few)
+    lines = Lines(few.planner)
+    for one in few.views:
+        lines(one)
     line = capsys.readouterr().out.splitlines()[1]
     assert line.endswith(f"{float(seen.value):.4g}, where ascent from 4 of 4 candidates improved on {best:.4g}")
 
