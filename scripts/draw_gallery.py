@@ -16,7 +16,7 @@ from tqdm import tqdm
 import jaxnbv as nbv
 from jaxnbv.acquisition import Score
 from jaxnbv.cli.actions.tasks import PARTS
-from jaxnbv.datasets import Framing, Split, demo_object, household_scene, part_scene, truck_scene
+from jaxnbv.datasets import Framing, Split, demo_object, fruit_scene, household_scene, part_scene, truck_scene
 from jaxnbv.metrics import truth_points
 from jaxnbv.scanning import SDFSurface, Surface
 from jaxnbv.search import SphereCandidates
@@ -55,7 +55,7 @@ def objects() -> list[Shown]:
         "truck with a chair": SDFSurface(truck_scene(Split.TEST, 2)),
         "sofa": SDFSurface(household_scene(Split.TEST, 7)),
         "toilet": SDFSurface(household_scene(Split.TEST, 9)),
-        "airplane": SDFSurface(part_scene(Split.TEST, 0).solid),
+        "mushroom": SDFSurface(fruit_scene(Split.TEST, 3)),
         "guitar": SDFSurface(part_scene(Split.TEST, 4).solid),
         "lamp": SDFSurface(part_scene(Split.TEST, 5).solid),
         "motorbike": SDFSurface(part_scene(Split.TEST, 7).solid),
