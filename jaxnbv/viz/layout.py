@@ -20,7 +20,7 @@ def fitted(figure: Figure, x: float, y: float, text: str, width: float, fontsize
     small."""
     placed = figure.text(x, y, text, fontsize=fontsize, **style)
     if (share := width / max(width_of(placed, figure), 1e-9)) < 1.0:
-        placed.set_fontsize(max(_SMALLEST, 0.99 * share * fontsize))
+        placed.set_fontsize(max(_SMALLEST, 0.97 * share * fontsize))
         while width_of(placed, figure) > width and len(text) > 1:
             text = text[:-1]
             placed.set_text(f"{text}…")
