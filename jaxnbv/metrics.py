@@ -39,9 +39,16 @@ def truth_points(scene: Surface, key: PRNGKeyArray, count: int = SURFACE_POINTS)
 
     Meshes are sampled as they are, a signed distance on its marching-cubes mesh over the scene's grid.
     """
+    mesh = true_mesh(scene)
+    return None if mesh is None else mesh.sample_points(key, count)
+
+
+def true_mesh(scene: Surface) -> TriangleMesh | None:
+    """A known surface as triangles in scene coordinates: a mesh as it is, a signed distance by marching cubes over the
+    scene's grid; None for another kind."""
     if isinstance(scene, SDFSurface):
-        scene = mesh_from_sdf(scene.sdf, Grid())
-    return scene.sample_points(key, count) if isinstance(scene, TriangleMesh) else None
+        return mesh_from_sdf(scene.sdf, Grid())
+    return scene if isinstance(scene, TriangleMesh) else None
 
 
 class SurfaceDistance(NamedTuple):

@@ -218,7 +218,14 @@ def load_mesh(path: str | Path, up: str = "y") -> TriangleMesh:
 
     **Raises:** `ValueError` if the file is missing or cannot be read, and as `TriangleMesh.from_arrays` does.
     """
-    meshes = [mesh for _, mesh in read_nodes(path)]
+    return joined_nodes(path, [mesh for _, mesh in read_nodes(path)], up)
+
+
+def joined_nodes(path: str | Path, meshes: list[trimesh.Trimesh], up: str) -> TriangleMesh:
+    """The mesh that the nodes of a file make together.
+
+    **Raises:** `ValueError` as `TriangleMesh.from_arrays` does, for the file.
+    """
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     vertices = np.concatenate([mesh.vertices for mesh in meshes])
     faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)])

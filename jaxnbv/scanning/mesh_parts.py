@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxnbv.checks import require
 from jaxnbv.scanning.grid import Grid
-from jaxnbv.scanning.mesh import TriangleMesh, load_mesh, read_nodes
+from jaxnbv.scanning.mesh import TriangleMesh, joined_nodes, read_nodes
 
 
 class MeshParts(eqx.Module):
@@ -39,10 +39,9 @@ def load_parts(path: str | Path, up: str = "y") -> MeshParts:
 
     **Raises:** `ValueError` as `load_mesh` does, or if there is one part alone.
     """
-    mesh = load_mesh(path, up)
-    solid = [
-        (name, node, node.faces[node.area_faces > 0]) for name, node in sorted(read_nodes(path), key=lambda n: n[0])
-    ]
+    nodes = read_nodes(path)
+    mesh = joined_nodes(path, [node for _, node in nodes], up)
+    solid = [(name, node, node.faces[node.area_faces > 0]) for name, node in sorted(nodes, key=lambda node: node[0])]
     whole = [(name, node, faces) for name, node, faces in solid if len(faces)]
     require(len(whole) > 1, f"{path} has one node: a file has parts if each of them is a node")
     parts = tuple(TriangleMesh(mesh.frame.to_scene(node.vertices), faces, mesh.frame) for _, node, faces in whole)

@@ -7,8 +7,9 @@ import trimesh
 from jaxnbv.answers import Answer, Panel
 from jaxnbv.cloud import PointCloud
 from jaxnbv.episode import Episode
+from jaxnbv.metrics import true_mesh
 from jaxnbv.planner import Planner
-from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, mesh_from_sdf
+from jaxnbv.scanning import Surface
 
 # Points of the true surface that a score is asked about: the planner's own usual capacity.
 _TRUE_POINTS = 8192
@@ -85,8 +86,8 @@ def task_of(episode: Episode, covered: list[float | None], radius: float) -> Tas
 
 def true_cloud(scene: Surface, count: int = _TRUE_POINTS) -> PointCloud | None:
     """Points all over a known surface with their normals, uniform by area; None for a kind that cannot be sampled."""
-    mesh = mesh_from_sdf(scene.sdf, Grid()) if isinstance(scene, SDFSurface) else scene
-    if not isinstance(mesh, TriangleMesh):
+    mesh = true_mesh(scene)
+    if mesh is None:
         return None
     own = mesh.to_trimesh()
     points, faces = trimesh.sample.sample_surface(own, count, seed=0)

@@ -69,8 +69,9 @@ def _picture(record: Record, study: PartDiscoveryStudy, methods: Sequence[str], 
     asked = study.truth(scene)
     segmenter = study.segmenter_of(scene)
     own = _palette(len(asked))
-    told = segmenter(PointCloud(jnp.zeros((1, 3)), jnp.zeros((1, 3)), jnp.zeros(1, bool)))
-    colours = np.tile(mpl.colors.to_rgb(GREY), (told.shape[1], 1))
+    row = jnp.zeros((1, 3))
+    _, labels = jax.eval_shape(segmenter, PointCloud(row, row, jnp.zeros(1, bool))).shape
+    colours = np.tile(mpl.colors.to_rgb(GREY), (labels, 1))
     colours[asked] = own
     true, ghost = _stills(study, scene, asked, colours, pixels)
     runs = [record["methods"][method] for method in methods]
