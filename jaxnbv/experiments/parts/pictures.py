@@ -70,7 +70,7 @@ def _picture(record: Record, study: PartDiscoveryStudy, methods: Sequence[str], 
     segmenter = study.segmenter_of(scene)
     own = _palette(len(asked))
     row = jnp.zeros((1, 3))
-    _, labels = jax.eval_shape(segmenter, PointCloud(row, row, jnp.zeros(1, bool))).shape
+    labels = jax.eval_shape(segmenter, PointCloud(row, row, jnp.zeros(1, bool))).shape[1]
     colours = np.tile(mpl.colors.to_rgb(GREY), (labels, 1))
     colours[asked] = own
     true, ghost = _stills(study, scene, asked, colours, pixels)
