@@ -69,8 +69,8 @@ def _picture(record: Record, study: PartDiscoveryStudy, methods: Sequence[str], 
     asked = study.truth(scene)
     segmenter = study.segmenter_of(scene)
     own = _palette(len(asked))
-    row = jnp.zeros((1, 3))
-    labels = jax.eval_shape(segmenter, PointCloud(row, row, jnp.zeros(1, bool))).shape[1]
+    point = jnp.zeros((1, 3))
+    labels = jax.eval_shape(segmenter, PointCloud(point, point, jnp.zeros(1, bool))).shape[1]
     colours = np.tile(mpl.colors.to_rgb(GREY), (labels, 1))
     colours[asked] = own
     true, ghost = _stills(study, scene, asked, colours, pixels)
