@@ -16,13 +16,12 @@ from jaxnbv.checks import InputError
 from jaxnbv.cli import main
 from jaxnbv.planner import Planner
 
-COMPUTES = True
 TERMINAL = {"COLUMNS": "200", "NO_COLOR": "1"}
 
 
 def run_process(*arguments: str, cwd) -> subprocess.CompletedProcess:
     command = [sys.executable, "-m", "jaxnbv.cli", *arguments]
-    environment = {**os.environ, **TERMINAL, "JAX_DISABLE_MOST_OPTIMIZATIONS": "0"}
+    environment = {**os.environ, **TERMINAL}
     return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=600)
 
 

@@ -12,31 +12,16 @@ from nbclient import NotebookClient
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = ROOT / "notebooks"
 
-MODEL = "model = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=16))"
+MODEL = "model = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.05, 0.1), (0.2, 0.25), truncation=8))"
+# The same everywhere, so that what one notebook has compiled the next one reads.
+SIZES = "num_samples, resolution, pixels, num_candidates, capacity, views = 2, 24, 12, 12, 512, 2"
 SMALL = {
-    "01_quickstart.ipynb": f"""
-{MODEL}
-num_samples, resolution, pixels, num_candidates, capacity, views = 4, 40, 20, 24, 1024, 2
-""",
-    "02_your_own_utility.ipynb": """
-num_samples, resolution, pixels, num_candidates, quick, capacity, views = 2, 40, 24, 12, True, 1024, 2
-""",
-    "03_gradient_search.ipynb": f"""
-{MODEL}
-num_samples, resolution, pixels, num_candidates, capacity, iterations = 2, 40, 16, 12, 1024, 3
-""",
-    "04_heat_on_your_mesh.ipynb": f"""
-{MODEL}
-mesh_file = None
-num_samples, resolution, pixels, num_candidates, num_points, capacity, views = 2, 40, 20, 6, 300, 1024, 2
-""",
-    "05_your_own_surface_model.ipynb": """
-num_features, num_samples, resolution, pixels, num_candidates, capacity, views = 60, 2, 32, 16, 8, 400, 2
-""",
-    "06_a_depth_camera.ipynb": f"""
-{MODEL.replace("truncation=16", "truncation=12")}
-num_samples, resolution, pixels, capacity, most = 2, 32, 16, 400, 2
-""",
+    "01_quickstart.ipynb": f"{MODEL}\n{SIZES}",
+    "02_your_own_utility.ipynb": f"quick = True\n{SIZES}",
+    "03_gradient_search.ipynb": f"{MODEL}\n{SIZES}\niterations = 3",
+    "04_heat_on_your_mesh.ipynb": f"{MODEL}\n{SIZES}\nmesh_file, num_points = None, 300",
+    "05_your_own_surface_model.ipynb": f"{SIZES}\nnum_features = 60",
+    "06_a_depth_camera.ipynb": f"{MODEL}\n{SIZES}\nmost = 2",
     "07_a_study_of_your_own.ipynb": """
 scenes = 3
 settings = {
@@ -44,9 +29,9 @@ settings = {
     "model": nbv.GeometricSPSR(0.05, truncation=8),
     "num_samples": 2,
     "num_candidates": 8,
-    "grid_resolution": 28,
+    "grid_resolution": 24,
     "capacity": 300,
-    "camera": nbv.Camera(height=16, width=16),
+    "camera": nbv.Camera(height=12, width=12),
 }
 """,
 }

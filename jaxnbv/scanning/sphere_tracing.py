@@ -151,12 +151,17 @@ def _advance(sdf: SignedDistance, march: _March, count, enough: int):
 
 def _refine(sdf: SignedDistance, march: _March) -> Float[Array, " n"]:
     """The root within the last stride, by regula falsi; the bracket is short, so a few chords reach rounding error."""
-    low, f_low, high, f_high = march.before, march.f_before, march.depth, march.f
-    for _ in range(_CHORDS):
+
+    def chord(_, bracket):
+        low, f_low, high, f_high = bracket
         drop = f_low - f_high
         root = low + (high - low) * f_low / jnp.where(drop == 0, 1.0, drop)
         f = march.distance(sdf, root)
         ahead = march.side * f > 0
         low, f_low = jnp.where(ahead, root, low), jnp.where(ahead, f, f_low)
         high, f_high = jnp.where(ahead, high, root), jnp.where(ahead, f_high, f)
+        return low, f_low, high, f_high
+
+    bracket = march.before, march.f_before, march.depth, march.f
+    low, f_low, high, f_high = jax.lax.fori_loop(0, _CHORDS, chord, bracket)
     return jnp.where(jnp.abs(f_low) < jnp.abs(f_high), low, high)

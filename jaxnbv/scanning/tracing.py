@@ -257,11 +257,11 @@ def _flat(index: list[Int[Array, " n"]], side: int) -> Int[Array, " n"]:
 def corner_values(cell: list[Int[Array, " n"]], field: Field) -> list[Float[Array, " n"]]:
     """Values at the corners of cells, in the order of `CORNERS`."""
     base = _flat(cell, field.g)
-    return [_take(field.values, base + (i * field.g + j) * field.g + k) for i, j, k in CORNERS]
+    return [_take(field.values, base + ((i * field.g + j) * field.g + k)) for i, j, k in CORNERS]
 
 
 def _take(array: Array, index: Int[Array, " n"]) -> Array:
-    return array.at[index].get(mode="promise_in_bounds")
+    return array.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def _put(index: Int[Array, " m"], array: Array, part: Array) -> Array:

@@ -6,7 +6,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.cloud import PointCloud
 
-_UNROLL = 16
+_UNROLL = 8
 
 
 @jax.jit
@@ -57,8 +57,9 @@ def _loop(x, points, mask, best, closer):
     filled = jnp.max(jnp.where(mask, jnp.arange(points.shape[0]) + 1, 0), initial=0)
 
     def body(turn, best):
+        rows = planes[turn]
         for step in range(_UNROLL):
-            a, b, c, offset = planes[turn, step]
+            a, b, c, offset = rows[step]
             best = closer(best, turn * _UNROLL + step, x[:, 0] * a + (x[:, 1] * b + (x[:, 2] * c + offset)))
         return best
 
