@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxnbv.checks import require
+from jaxnbv.experiments.claims import Verdict, verdicts
 from jaxnbv.experiments.measures import Measure, Record, Row
 from jaxnbv.experiments.records import read_records
 from jaxnbv.experiments.registry import STUDIES
@@ -19,24 +20,31 @@ _REMEDY = "give a folder that `jaxnbv study` has written"
 
 
 class Table(NamedTuple):
-    """Cells of text under a header; a row begins with its name."""
+    """Cells of text under a header; a row begins with its name.
+
+    - `group`: of the scenes; "" for all of them.
+    """
 
     caption: str
     header: list[str]
     rows: list[list[str]]
+    group: str = ""
 
 
 class Chapter(NamedTuple):
     """One study.
 
     - `facts`: what was run, in words; `explanation`: what its measures mean.
+    - `scenes`: how many; `claims`: what the paper says, and what was found.
     - `images`: figures and pictures, by their captions.
     - `settings`: of the study, as JSON.
     """
 
     title: str
+    scenes: int
     facts: list[str]
     explanation: str
+    claims: list[Verdict]
     tables: list[Table]
     images: list[tuple[str, Path]]
     settings: str
@@ -81,14 +89,15 @@ def _chapter(path: Path, inside: Path, config: dict[str, Any], kind: type[Study]
     results, differences = all_rows(records, kind)
     tables = []
     for group, members in kind.groups(records).items():
-        part = "" if group == "all" else f" ({group}: {count_of(len(members), 'scene')})"
+        part = "" if group == "all" else f"{group}: {count_of(len(members), 'scene')}"
         for measure in kind.measures:
             if measure.listed:
                 tables += _tables(measure, group, part, results, differences, kind.reference)
     images = [(_caption(file), file) for file in _in_order(path, kind)]
     settings = json.dumps(config.get("config", {}), indent=1)
     where = "" if inside == Path(".") else f": {inside}"
-    return Chapter(f"{kind.title}{where}", _facts(records, config), kind.explanation, tables, images, settings)
+    facts, found = _facts(records, config), verdicts(kind, differences)
+    return Chapter(f"{kind.title}{where}", len(records), facts, kind.explanation, found, tables, images, settings)
 
 
 def _tables(
@@ -98,15 +107,15 @@ def _tables(
     unit = f" in {measure.unit}" if measure.unit else unit
     made = []
     for rows, key, text, caption in (
-        (results, "method", result_text, f"{title}{unit}, by {measure.by}{part}"),
-        (differences, "baseline", difference_text, f"{title}{unit}: {reference} minus another method{part}"),
+        (results, "method", result_text, f"{title}{unit}, by {measure.by}"),
+        (differences, "baseline", difference_text, f"{title}{unit}: {reference} minus another method"),
     ):
         here = [row for row in rows if (row["group"], row["quantity"]) == (group, measure.name)]
         if here:
             names, columns = (list(dict.fromkeys(row[what] for row in here)) for what in (key, "at"))
             cells = {(row[key], row["at"]): _tight(text(row, measure)) for row in here}
             lines = [[name, *(cells.get((name, column), "") for column in columns)] for name in names]
-            made.append(Table(caption, [measure.by, *map(str, columns)], lines))
+            made.append(Table(caption, [measure.by, *map(str, columns)], lines, part))
     return made
 
 

@@ -44,6 +44,22 @@ class Measure(NamedTuple):
         return list(range(self.first, self.first + count)) if self.columns is None else list(self.columns)
 
 
+class Claim(NamedTuple):
+    """What the paper says of a study: that its reference does better than other methods, or no worse.
+
+    - `text`: in words.
+    - `measure`, `at`: the number that tells, by its name and its column.
+    - `than`: the other methods.
+    - `ahead`: whether it is to be better; otherwise it is not to be worse.
+    """
+
+    text: str
+    measure: str
+    at: Any
+    than: tuple[str, ...]
+    ahead: bool = True
+
+
 def methods_of(records: Sequence[Record], known: Sequence[str]) -> list[str]:
     """The methods that all records hold: those of the study in its order, then others.
 

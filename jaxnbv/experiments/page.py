@@ -2,8 +2,9 @@
 
 import base64
 import html
+import itertools
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -29,7 +30,8 @@ _STYLE = """
   tbody th { font-weight: 500; } .best { font-weight: 700; } .second { text-decoration: underline; }
   img { max-width: 100%; height: auto; background: #fff; border: 1px solid var(--line); border-radius: 8px; }
   figure { margin: 14px 0; } figcaption, .facts, pre { font-size: 13px; color: var(--soft); }
-  pre { overflow-x: auto; } details { font-size: 13px; }
+  pre { overflow-x: auto; } details { font-size: 13px; margin: 8px 0; } summary { cursor: pointer; }
+  .claims td, .claims th { white-space: normal; text-align: left; }
 """
 
 
@@ -53,38 +55,65 @@ def as_html(found: Sequence[Chapter]) -> str:
     """One file that opens offline."""
     links = " ".join(f'<a href="#study{i}">{html.escape(c.title)}</a>' for i, c in enumerate(found))
     body = "".join(_html_chapter(index, chapter) for index, chapter in enumerate(found))
+    overview = _overview(found)
+    claims = _html_table(overview, "claims") if overview.rows else ""
     return (
         f'<!doctype html>\n<html lang="en">\n<head><meta charset="utf-8"><title>{_TITLE}</title>\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{_STYLE}</style></head>\n'
         f'<body><main><h1>{_TITLE}</h1>\n<p class="facts">jaxnbv {__version__}, {datetime.now(UTC):%Y-%m-%d}. '
-        f"Bold: the best. Underlined: the second, or an interval that excludes zero.</p>\n<nav>{links}</nav>\n{body}"
-        "</main></body></html>\n"
+        f"Bold: the best. Underlined: the second, or an interval that excludes zero.</p>\n<nav>{links}</nav>\n"
+        f"{claims}{body}</main></body></html>\n"
     )
 
 
 def _html_chapter(index: int, chapter: Chapter) -> str:
     facts = "<br>".join(map(html.escape, chapter.facts))
     explanation = html.escape(chapter.explanation).replace("\n", " ")
+    claims = "".join(
+        f"<p><strong>{html.escape(v.claim.text)}</strong> {html.escape(v.sentence)}</p>\n" for v in chapter.claims
+    )
     images = "".join(
         f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,'
         f'{base64.b64encode(file.read_bytes()).decode()}"><figcaption>{html.escape(caption)}</figcaption></figure>\n'
         for caption, file in chapter.images
     )
     return (
-        f'<section id="study{index}"><h2>{html.escape(chapter.title)}</h2>\n<p>{explanation}</p>\n'
-        f'<p class="facts">{facts}</p>\n{images}{"".join(map(_html_table, chapter.tables))}'
+        f'<section id="study{index}"><h2>{html.escape(chapter.title)}</h2>\n{claims}<p>{explanation}</p>\n'
+        f'<p class="facts">{facts}</p>\n{images}{_folded(chapter.tables, _html_table)}'
         f"<details><summary>Settings</summary><pre>{html.escape(chapter.settings)}</pre></details></section>\n"
     )
 
 
-def _html_table(table: Table) -> str:
+def _overview(found: Sequence[Chapter]) -> Table:
+    """All claims of the paper, and whether they hold."""
+    rows = [
+        [chapter.title, str(chapter.scenes), verdict.claim.text, f"{verdict.held} of {len(verdict.against)}"]
+        for chapter in found
+        for verdict in chapter.claims
+    ]
+    return Table(
+        "What the paper says, and whether it holds here", ["study", "scenes", "claim", "holds against methods"], rows
+    )
+
+
+def _folded(tables: Sequence[Table], write: Callable[[Table], str]) -> str:
+    """Those of all scenes, and those of each group of scenes to be opened."""
+    parts = []
+    for group, members in itertools.groupby(tables, key=lambda table: table.group):
+        text = "\n\n".join(map(write, members))
+        parts.append(f"<details><summary>{html.escape(group)}</summary>\n\n{text}\n\n</details>" if group else text)
+    return "\n\n".join(parts)
+
+
+def _html_table(table: Table, kind: str = "") -> str:
     head = "".join(f'<th scope="col">{html.escape(name)}</th>' for name in table.header)
     rows = "".join(
         f'<tr><th scope="row">{html.escape(name)}</th>{"".join(map(_html_cell, cells))}</tr>'
         for name, *cells in table.rows
     )
     caption = f"<caption>{html.escape(table.caption)}</caption>"
-    return f'<div class="scroll"><table>{caption}<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>\n'
+    body = f"{caption}<thead><tr>{head}</tr></thead><tbody>{rows}</tbody>"
+    return f'<div class="scroll"><table class="{kind}">{body}</table></div>\n'
 
 
 def _html_cell(cell: str) -> str:
@@ -94,22 +123,24 @@ def _html_cell(cell: str) -> str:
 
 def _markdown_with_images(found: Sequence[Chapter], out: Path) -> str:
     """The text; its images are copied beside it."""
-    images = out.with_suffix("")
+    images, overview = out.with_suffix(""), _overview(found)
     marks = "Bold: the best. Italic: the second, or an interval that excludes zero."
     sections = [f"# {_TITLE}", f"Written by `jaxnbv report`, jaxnbv {__version__}. {marks}"]
+    sections += [_markdown_table(overview, "---")] if overview.rows else []
     for index, chapter in enumerate(found):
-        sections += [f"## {chapter.title}", chapter.explanation.replace("\n", " "), "\n".join(chapter.facts)]
+        sections += [f"## {chapter.title}", *(f"**{v.claim.text}** {v.sentence}" for v in chapter.claims)]
+        sections += [chapter.explanation.replace("\n", " "), "\n".join(chapter.facts)]
         for caption, file in chapter.images:
             copy = make_folder(images) / f"{index}-{file.name}"
             shutil.copyfile(file, copy)
             sections.append(f"![{caption}]({images.name}/{copy.name})")
-        sections += map(_markdown_table, chapter.tables)
+        sections.append(_folded(chapter.tables, _markdown_table))
         sections.append(f"<details><summary>Settings</summary>\n\n```json\n{chapter.settings}\n```\n\n</details>")
     return "\n\n".join(sections) + "\n"
 
 
-def _markdown_table(table: Table) -> str:
-    rows = [table.header, ["---", *("---:" for _ in table.header[1:])]]
+def _markdown_table(table: Table, rule: str = "---:") -> str:
+    rows = [table.header, ["---", *(rule for _ in table.header[1:])]]
     rows += [[name, *map(_markdown_cell, cells)] for name, *cells in table.rows]
     lines = "\n".join(f"| {' | '.join(row)} |" for row in rows)
     return f"**{table.caption}**\n\n{lines}"

@@ -17,7 +17,7 @@ from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError, check_type, require
 from jaxnbv.cloud import PointCloud
 from jaxnbv.episode import Sensor, Step, scene_sensor, steps, view_keys
-from jaxnbv.experiments.measures import Measure, Record, Row
+from jaxnbv.experiments.measures import Claim, Measure, Record, Row
 from jaxnbv.model_name import ModelName
 from jaxnbv.planner import Planner
 from jaxnbv.pose import Pose
@@ -75,6 +75,7 @@ class Study(eqx.Module):
     - `title`, `explanation`: for tables.
     - `methods`: by name, in order; `reference`: the one that the others are compared with.
     - `measures`, `charts`: what tables and figures show; charts by the names of their files.
+    - `claims`: what the paper says of it.
     - `quick`: settings for a first look, on `quick_scenes` scenes.
     - `seed`: of its first views, noise and samples.
 
@@ -88,6 +89,7 @@ class Study(eqx.Module):
     measures: eqx.AbstractClassVar[tuple[Measure, ...]]
     charts: eqx.AbstractClassVar[Mapping[str, Chart]]
     seed: eqx.AbstractClassVar[int]
+    claims: ClassVar[tuple[Claim, ...]] = ()
     radius: ClassVar[float] = SENSOR_RADIUS
     quick: ClassVar[Mapping[str, Any]] = {"num_samples": 4, "grid_resolution": 48, "capacity": 1024}
     quick_scenes: ClassVar[int] = 4

@@ -34,7 +34,7 @@ def test_a_chapter_tells_means_differences_times_and_versions(tmp_path):
     (chapter,) = chapters(written(tmp_path))
     assert chapter.title == ToyStudy.title
     assert [caption for caption, _ in chapter.images] == ["points", "picture 0"]
-    tables = {table.caption: table for table in chapter.tables}
+    tables = {table.caption: table for table in chapter.tables if not table.group}
     points = tables["Points, by view"]
     assert points.header == ["view", "1", "2"]
     means = {row[0]: float(re.match(r"[\d.]+", row[2])[0]) for row in points.rows}
@@ -43,7 +43,11 @@ def test_a_chapter_tells_means_differences_times_and_versions(tmp_path):
     (difference,) = tables["Points: farthest minus another method"].rows
     assert difference[0] == "random"
     assert difference[1].startswith("+1000.0 [")
-    assert "Many points in %, by view (odd: 1 scene)" in tables
+    groups = {(table.caption, table.group) for table in chapter.tables}
+    assert ("Many points in %, by view", "odd: 1 scene") in groups
+    assert ("Many points in %, by view", "") in groups
+    (verdict,) = chapter.claims
+    assert verdict.against == {"random": ("level with", difference[1])}
     facts = " ".join(chapter.facts)
     assert "3 scenes" in facts
     assert "3 seconds a scene" in facts
@@ -61,6 +65,8 @@ def test_html_holds_its_images_and_nothing_of_the_settings_is_code(tmp_path):
     assert "<b>" not in page
     assert "&lt;b&gt;|" in page
     assert '<td class="best">' in page
+    assert "Far apart | more is seen.</strong> Holds against 0 of 1: level with random" in page
+    assert page.count("<summary>even: 2 scenes</summary>") == 1
     assert "http" not in page
 
 
@@ -71,6 +77,7 @@ def test_markdown_has_its_images_beside_it(tmp_path):
     assert linked == ["studies/0-points.png", "studies/0-picture_0.png"]
     assert all((tmp_path / name).is_file() for name in linked)
     lines = page.splitlines()
+    assert f"| {ToyStudy.title} | 3 | Far apart \\| more is seen. | 0 of 1 |" in lines
     start = lines.index("**Points, by view**")
     head, rule, first, second = lines[start + 2 : start + 6]
     assert head == "| view | 1 | 2 |"

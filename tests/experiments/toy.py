@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import ClassVar
 
-from jaxnbv.experiments.measures import Measure
+from jaxnbv.experiments.measures import Claim, Measure
 from jaxnbv.experiments.study import Chart, Panel, Scene, Study
 from jaxnbv.scanning import SDFSurface
 from jaxnbv.scanning.sdf import Sphere
@@ -27,6 +27,7 @@ class ToyStudy(Study):
         "points": Chart(((Panel("points", log=True), Panel("many")), (Panel("odd"), Panel("points")))),
         "halves": Chart(((Panel("many"), Panel("points")),), by_group=True),
     }
+    claims: ClassVar[tuple[Claim, ...]] = (Claim("Far apart | more is seen.", "points", 2, ("random", "absent")),)
     seed: ClassVar[int] = 11
 
     @classmethod

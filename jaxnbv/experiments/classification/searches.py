@@ -15,7 +15,7 @@ from jaxnbv.experiments.classification.measures import hits, seen_explained
 from jaxnbv.experiments.classification.pyramid import PyramidStudy
 from jaxnbv.experiments.classification.study import ClassificationStudy, Truth
 from jaxnbv.experiments.classification.truck import TruckStudy
-from jaxnbv.experiments.measures import Measure, Record
+from jaxnbv.experiments.measures import Claim, Measure, Record
 from jaxnbv.experiments.study import Chart, Panel, Scene, Study
 from jaxnbv.model_name import ModelName
 from jaxnbv.planner import Planner
@@ -62,6 +62,15 @@ class _Searches(ClassificationStudy):
     )
     methods: ClassVar[tuple[str, ...]] = ("discrete", "halving", *_SPACES, "hybrid")
     reference: ClassVar[str] = "discrete"
+    claims: ClassVar[tuple[Claim, ...]] = (
+        Claim(
+            "Search over candidates tells the class as soon as search by gradient, or almost.",
+            "stable",
+            2,
+            tuple(_SPACES),
+            ahead=False,
+        ),
+    )
     own_measures: ClassVar[tuple[Measure, ...]] = (
         Measure("value", "Expected cross-entropy of the view", _value, first=2, unit="nats", better="more"),
         Measure("seconds", "Time of a proposal", _seconds, ("median",), "step", unit="seconds", better="less"),

@@ -17,7 +17,7 @@ from jaxnbv.cloud import PointCloud
 from jaxnbv.datasets import heat_scene
 from jaxnbv.episode import Step, view_keys
 from jaxnbv.experiments.heat.halving import compare, halving_notes, halving_rows
-from jaxnbv.experiments.measures import Measure, Record, Row
+from jaxnbv.experiments.measures import Claim, Measure, Record, Row
 from jaxnbv.experiments.meshes import as_mesh_files, numbered_mesh
 from jaxnbv.experiments.study import Chart, Panel, Scene, Study
 from jaxnbv.planner import Planner
@@ -126,6 +126,14 @@ class HeatStudy(Study):
         *_measures("all"),
         *_measures("reached"),
         Measure("saturated", "Saturated steps", _saturated, first=2, digits=2, paired=False),
+    )
+    claims: ClassVar[tuple[Claim, ...]] = (
+        Claim(
+            "The utility comes nearer to the coldest point within few views.",
+            "distance, all",
+            4,
+            ("coverage", "farthest", "uncertainty", "random"),
+        ),
     )
     charts: ClassVar[Mapping[str, Chart]] = {
         "coldest": Chart(tuple((Panel(f"distance, {e}"), Panel(f"error, {e}", log=True)) for e in ESTIMATES))

@@ -13,7 +13,7 @@ from jaxnbv.datasets import Split
 from jaxnbv.datasets.categories import CATEGORIES
 from jaxnbv.datasets.parts import part_scene
 from jaxnbv.episode import Step
-from jaxnbv.experiments.measures import Measure, Record
+from jaxnbv.experiments.measures import Claim, Measure, Record
 from jaxnbv.experiments.meshes import as_mesh_files, numbered_mesh
 from jaxnbv.experiments.study import Chart, Panel, Scene, Study
 from jaxnbv.metrics import SURFACE_POINTS, coverage, surface_distance, truth_points
@@ -69,6 +69,15 @@ class ReconstructionStudy(Study):
         _distances("accuracy", "Accuracy"),
         _distances("completeness", "Completeness"),
         Measure("covered", "Surface covered", lambda r, m: r["methods"][m]["coverage"], percent=True, better="more"),
+    )
+    claims: ClassVar[tuple[Claim, ...]] = (
+        Claim(
+            "Surfaces made of coverage's views are as near to the truth as those of baselines made for coverage.",
+            "chamfer",
+            POISSON,
+            ("farthest", "uncertainty"),
+            ahead=False,
+        ),
     )
     charts: ClassVar[Mapping[str, Chart]] = {
         "reconstruction": Chart(((Panel("chamfer"), Panel("hausdorff"), Panel("covered")),))
