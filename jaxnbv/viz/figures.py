@@ -295,7 +295,7 @@ def overview_figure(data: ReportData, camera: Camera, stills: Stills | None = No
     long = 0.5 * width - 1.2 if beside else width - 1.6
     _deviation_bar(figure, place(0.6, base - 0.35, long, 0.13), norm, 12.0)
     x, y, room = (0.5 * width + 0.1, base - 0.25, 0.5 * width - 0.3) if beside else (0.3, base - 1.1, width - 0.6)
-    text = f"Maps: {data.quantity.name}, pale (low) to dark (high)"
+    text = f"Maps: {data.quantity.name}; dark is high"
     fitted(figure, *place(x, y)[:2], text, room / width, 13.0, va="center")
     flow(figure, marks, *place(x, y - 0.28)[:2], room / width, 0.26 / tall, 12.0)
     return figure
