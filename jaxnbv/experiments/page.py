@@ -3,14 +3,15 @@
 import base64
 import html
 import itertools
-import shutil
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
+from PIL import Image
+
 from jaxnbv.checks import require
 from jaxnbv.experiments.chapters import Chapter, Table, chapters
-from jaxnbv.files import make_folder, write_text
+from jaxnbv.files import make_folder, write_text, write_whole
 from jaxnbv.version import __version__
 
 _TITLE = "Results of studies"
@@ -132,7 +133,9 @@ def _markdown_with_images(found: Sequence[Chapter], out: Path) -> str:
         sections += [chapter.explanation.replace("\n", " "), "\n".join(chapter.facts)]
         for caption, file in chapter.images:
             copy = make_folder(images) / f"{index}-{file.name}"
-            shutil.copyfile(file, copy)
+            # A third of the size, for a repository.
+            image = Image.open(file).convert("RGB").quantize(256)
+            write_whole(copy, lambda whole, image=image: image.save(whole, "png", optimize=True))
             sections.append(f"![{caption}]({images.name}/{copy.name})")
         sections.append(_folded(chapter.tables, _markdown_table))
         sections.append(f"<details><summary>Settings</summary>\n\n```json\n{chapter.settings}\n```\n\n</details>")
