@@ -14,12 +14,18 @@ from jaxnbv.tasks import Coverage
 from jaxnbv.training.class_clouds import MAX_VIEWS, imagined_clouds, scanned_clouds
 
 COUNT, POINTS = 16, 200
+# The scenes of these rows again, in a portion of their own.
+FEW = slice(4, 7)
 MODEL = GeometricSPSR(lengthscale=0.05, truncation=8)
 PLANNER = Planner(MODEL, Camera(), Coverage(), DiscreteSearch(), 2, Grid(20), 150)
 
 
 def clouds_of(split, framing, first, count, points):
     return scanned_clouds(CLASS_SETS["pyramid"], split, framing, range(first, first + count), points)
+
+
+def few_clouds_of(split, framing):
+    return clouds_of(split, framing, 5 + FEW.start, FEW.stop - FEW.start, POINTS)
 
 
 def imagined_of(index):
@@ -29,6 +35,11 @@ def imagined_of(index):
 @pytest.fixture(scope="module")
 def scanned():
     return clouds_of(Split.TRAIN, Framing.CLOSE_UP, 5, COUNT, POINTS)
+
+
+@pytest.fixture(scope="module")
+def portion():
+    return few_clouds_of(Split.TRAIN, Framing.CLOSE_UP)
 
 
 @pytest.fixture(scope="module")
@@ -98,21 +109,19 @@ def test_points_that_tell_the_class_lie_on_what_tells_it(scanned):
         assert (own[tells, 2] < float(pyramid.depth) + 0.04).all()
 
 
-def test_clouds_can_be_made_again_in_other_portions(scanned):
-    again = clouds_of(Split.TRAIN, Framing.CLOSE_UP, 5, COUNT, POINTS)
-    assert_same(scanned, again)
-    part = clouds_of(Split.TRAIN, Framing.CLOSE_UP, 9, 3, POINTS)
-    np.testing.assert_array_equal(part.telling_pixels, scanned.telling_pixels[4:7])
-    np.testing.assert_allclose(part.clouds.points, scanned.clouds.points[4:7], atol=1e-5)
+def test_clouds_can_be_made_again_in_other_portions(scanned, portion):
+    assert_same(portion, few_clouds_of(Split.TRAIN, Framing.CLOSE_UP))
+    np.testing.assert_array_equal(portion.telling_pixels, scanned.telling_pixels[FEW])
+    np.testing.assert_allclose(portion.clouds.points, scanned.clouds.points[FEW], atol=1e-5)
 
 
-def test_splits_and_framings_differ(scanned):
-    other = clouds_of(Split.TEST, Framing.CLOSE_UP, 5, COUNT, POINTS)
-    assert not np.array_equal(other.telling_pixels, scanned.telling_pixels)
-    whole = clouds_of(Split.TRAIN, Framing.WHOLE, 5, COUNT, POINTS)
-    np.testing.assert_array_equal(whole.labels, scanned.labels)
+def test_splits_and_framings_differ(portion):
+    other = few_clouds_of(Split.TEST, Framing.CLOSE_UP)
+    assert not np.array_equal(other.telling_pixels, portion.telling_pixels)
+    whole = few_clouds_of(Split.TRAIN, Framing.WHOLE)
+    np.testing.assert_array_equal(whole.labels, portion.labels)
     assert (
-        np.abs(np.asarray(whole.clouds.points)).max() < 0.625 + 0.06 < np.abs(np.asarray(scanned.clouds.points)).max()
+        np.abs(np.asarray(whole.clouds.points)).max() < 0.625 + 0.06 < np.abs(np.asarray(portion.clouds.points)).max()
     )
 
 

@@ -24,7 +24,7 @@ SCENES, POINTS = (7, 11), 150
 # Compilation takes nearly all the time of the rest.
 CAMERA = Camera(height=24, width=24)
 MODEL = GeometricSPSR(lengthscale=0.05, truncation=8)
-PLANNER = Planner(MODEL, Camera(), Coverage(), DiscreteSearch(), 2, Grid(20), 150)
+PLANNER = Planner(MODEL, CAMERA, Coverage(), DiscreteSearch(), 2, Grid(20), 150)
 
 
 @pytest.fixture(scope="module")
@@ -53,10 +53,11 @@ def surface_points(solid):
 def test_labels_are_those_of_the_surface_nearby(scanned, scenes):
     assert scanned.clouds.points.shape == (6, POINTS, 3)
     assert scanned.labels.shape == (6, POINTS)
+    surfaces = [tuple(map(np.asarray, surface_points(scene.solid))) for scene in scenes]
     for row in range(6):
         scene = scenes[row // 3]
         assert int(scanned.categories[row]) == int(scene.category)
-        points, labels, mask = map(np.asarray, surface_points(scene.solid))
+        points, labels, mask = surfaces[row // 3]
         points, labels = points[mask], labels[mask]
         there = np.asarray(scanned.clouds.mask[row])
         noisy, own = np.asarray(scanned.clouds.points[row])[there], np.asarray(scanned.labels[row])[there]
