@@ -12,6 +12,8 @@ from solids import check_fills_its_box, check_whole, mesh_of
 from jaxnbv.checks import InputError
 from jaxnbv.datasets import FRUITS, Split, fruit_scene, sample_fruit
 
+COMPUTES = True
+
 
 @eqx.filter_jit
 def slopes(fruit, x):

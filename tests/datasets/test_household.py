@@ -10,6 +10,8 @@ from solids import check_fills_its_box, check_whole, mesh_of, thinnest
 from jaxnbv.checks import InputError
 from jaxnbv.datasets import HOUSEHOLD, sample_household_object
 
+COMPUTES = True
+
 
 def test_the_classes_are_those_of_modelnet10():
     names = ("bathtub", "bed", "chair", "desk", "dresser", "monitor", "night stand", "sofa", "table", "toilet")

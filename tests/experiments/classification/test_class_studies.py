@@ -16,6 +16,7 @@ from PIL import Image
 from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
 from jaxnbv.datasets import FRUITS, HOUSEHOLD, Split, truck_scene
+from jaxnbv.datasets.class_object import scan_telling
 from jaxnbv.experiments.charts import write_charts
 from jaxnbv.experiments.classification.modelnet10 import ModelNet10Study
 from jaxnbv.experiments.classification.omniobject3d import OmniObject3DStudy
@@ -26,7 +27,6 @@ from jaxnbv.experiments.meshes import class_meshes
 from jaxnbv.experiments.tables import summary, write_tables
 from jaxnbv.model_name import ModelName
 from jaxnbv.networks import InvariantClassifier, save_checkpoint
-from jaxnbv.scanning import SDFSurface, scan
 from jaxnbv.search import FarthestView
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.surfaces import GeometricSPSR
@@ -71,7 +71,7 @@ def test_of_a_truck_the_pixels_of_its_cargo_are_recorded():
     assert list(found["methods"]) == list(TruckStudy.methods)
     assert found["label"] == int(truck.label) == SCENE
     poses = sphere_candidates(CANDIDATES, 2.5)
-    seen = scan(SDFSurface(truck), CAMERA, poses)
+    _, seen = scan_telling(truck, CAMERA, poses)
     cargo = np.asarray(jnp.sum((jnp.abs(truck.cargo(seen.points)) < 2e-3) & seen.mask, axis=-1))
     np.testing.assert_allclose(found["cargo_pixels"], cargo, atol=2)
     assert cargo.max() > 150 > cargo.min() == 0

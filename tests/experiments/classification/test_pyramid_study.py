@@ -15,9 +15,10 @@ from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
 from jaxnbv.cloud import concatenate, limit_capacity
 from jaxnbv.datasets import Framing, Pyramid, Split, pyramid_scene
+from jaxnbv.datasets.class_object import scan_telling
 from jaxnbv.experiments.classification.pictures import write_pictures
 from jaxnbv.experiments.classification.pyramid import PyramidStudy
-from jaxnbv.scanning import SDFSurface, scan
+from jaxnbv.scanning import scan
 from jaxnbv.search import FarthestView, Problem, UncertaintyView
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.surfaces import GeometricSPSR
@@ -108,7 +109,7 @@ def test_the_first_view_is_that_of_all_methods_and_shows_no_pattern_but_somethin
     firsts = {run["candidates"][0] for method in record["methods"].values() for run in method["runs"]}
     assert firsts == {record["first"]}
     pyramid, poses = pyramid_scene(Split.TEST, SCENE), sphere_candidates(CANDIDATES, 2.5)
-    seen = scan(SDFSurface(pyramid), CAMERA, poses)
+    _, seen = scan_telling(pyramid, CAMERA, poses)
     pixels = np.asarray(jnp.sum(pyramid.on_pattern(seen.points) & seen.mask, axis=-1))
     assert pixels[record["first"]] == 0 < int(seen.count[record["first"]])
     np.testing.assert_allclose(record["pattern_pixels"], pixels, atol=1)
