@@ -11,6 +11,7 @@ import jaxnbv as nbv
 from jaxnbv.checks import InputError
 from jaxnbv.datasets import HOUSEHOLD, Split, sample_truck, truck_scene
 
+COMPUTES = True
 CAMERA = nbv.Camera(height=40, width=40)
 
 
