@@ -1,5 +1,7 @@
 """Fruits: whole, bounded, in their box, and what each class shows."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,17 +12,24 @@ from solids import check_fills_its_box, check_whole, mesh_of
 from jaxnbv.checks import InputError
 from jaxnbv.datasets import FRUITS, Split, fruit_scene, sample_fruit
 
+COMPUTES = True
+
 
 @eqx.filter_jit
 def slopes(fruit, x):
     return jnp.linalg.norm(jax.vmap(jax.grad(fruit))(x), axis=-1)
 
 
+@functools.cache
+def fruit_and_mesh(seed, label):
+    fruit = sample_fruit(jax.random.key(seed), label)
+    return fruit, mesh_of(fruit)
+
+
 @pytest.mark.parametrize("label", range(len(FRUITS)))
 def test_fruits_are_whole_fill_their_box_and_have_slopes_of_at_most_one(label):
     for seed in range(3):
-        fruit = sample_fruit(jax.random.key(seed), label)
-        mesh = mesh_of(fruit)
+        fruit, mesh = fruit_and_mesh(seed, label)
         check_whole(mesh)
         check_fills_its_box(mesh)
         anywhere = np.random.default_rng(seed).uniform(-1.6, 1.6, (20_000, 3))
@@ -37,9 +46,7 @@ def own(fruit, mesh):
 def test_each_class_has_its_marks():
     """In the fruit's own frame, of sections and of how far the surface reaches along the axis."""
     for seed in range(4):
-        apple, lemon, mango, mushroom, orange = (
-            own(fruit, mesh_of(fruit)) for fruit in (sample_fruit(jax.random.key(seed), label) for label in range(5))
-        )
+        apple, lemon, mango, mushroom, orange = (own(*fruit_and_mesh(seed, label)) for label in range(5))
 
         def rim(points, low, high):
             away = np.linalg.norm(points[:, [0, 2]], axis=1)

@@ -1,5 +1,7 @@
 """The ten classes of household objects."""
 
+import functools
+
 import jax
 import numpy as np
 import pytest
@@ -7,6 +9,8 @@ from solids import check_fills_its_box, check_whole, mesh_of, thinnest
 
 from jaxnbv.checks import InputError
 from jaxnbv.datasets import HOUSEHOLD, sample_household_object
+
+COMPUTES = True
 
 
 def test_the_classes_are_those_of_modelnet10():
@@ -24,11 +28,15 @@ def test_objects_are_whole_fill_their_box_and_have_no_thin_part(name):
     assert min(thinnest(sample_household_object(name, jax.random.key(seed)).solid) for seed in range(40)) >= 0.05
 
 
+@functools.cache
+def solid_and_bounds(name):
+    solid = sample_household_object(name, jax.random.key(5))
+    return solid, mesh_of(solid).bounds
+
+
 def level_share(name, height):
     """The share of an object's horizontal box that its section at a height is inside, and the box."""
-    solid = sample_household_object(name, jax.random.key(5))
-    mesh = mesh_of(solid)
-    low, high = mesh.bounds
+    solid, (low, high) = solid_and_bounds(name)
     at = low[1] + height * (high[1] - low[1])
     axis = np.linspace(-1.25, 1.25, 101)
     x, z = np.meshgrid(axis, axis, indexing="ij")

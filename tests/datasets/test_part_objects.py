@@ -14,6 +14,8 @@ from jaxnbv.checks import InputError
 from jaxnbv.datasets import PART_CATEGORIES, Split, part_scene, sample_part_object
 from jaxnbv.datasets.categories import CATEGORIES, category_index
 
+COMPUTES = True
+
 
 @eqx.filter_jit
 def labels_at(solid, x):

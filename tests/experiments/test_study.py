@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from toy import ToyStudy
 
+from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
 from jaxnbv.cloud import limit_capacity
 from jaxnbv.experiments.study import views_of
@@ -20,9 +21,10 @@ from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
 
 
-def small(**settings):
+def small(kind=ToyStudy, **settings):
     few = {"views": 3, "num_candidates": 8, "num_samples": 2, "model": GeometricSPSR(0.05, truncation=4)}
-    return ToyStudy(**(few | {"grid_resolution": 16, "capacity": 5000} | settings))
+    fine = {"grid_resolution": 16, "camera": Camera(height=12, width=12), "capacity": 500}
+    return kind(**(few | fine | settings))
 
 
 def without_time(record):
@@ -103,11 +105,11 @@ def test_the_first_view_shows_enough():
         def shows_enough(self, scene, seen):
             return float(seen.points[seen.mask].mean(axis=0)[1]) > 0.3
 
-    study = Picky(**{field: getattr(small(), field) for field in ("views", "num_candidates", "model")})
+    study = small(Picky)
     for index in range(4):
         assert float(study.candidates.poses().position[study.run_scene(index, ["random"])["first"]][1]) > 0.5
     with pytest.raises(InputError, match="none of 3 candidates shows enough of ball 0"):
-        Never(views=2, num_candidates=3).run_scene(0)
+        small(Never, views=2, num_candidates=3).run_scene(0)
 
 
 class Never(ToyStudy):
@@ -135,7 +137,7 @@ def test_a_command_configures_it():
 
 def test_planners_have_the_studys_settings():
     planner = small(carving=None).planner("random", None)
-    assert (planner.num_samples, planner.grid.resolution, planner.capacity, planner.max_views) == (2, 16, 5000, 3)
+    assert (planner.num_samples, planner.grid.resolution, planner.capacity, planner.max_views) == (2, 16, 500, 3)
     assert planner.carving is None
     assert isinstance(small().scene(0).surface, SDFSurface)
     keys = [small().key(*of) for of in ((0, "first"), (1, "first"), (0, "episode"))]
@@ -143,8 +145,8 @@ def test_planners_have_the_studys_settings():
 
 
 def test_clouds_are_thinned_to_the_capacity():
-    study = small(capacity=300)
+    study = small(capacity=100)
     run = study.run_scene(0, ["random"])["methods"]["random"]
-    assert run["points"] == [300, 300, 300]
+    assert run["points"] == [100, 100, 100]
     scan, state = study.seen(study.scene(0), run)[0]
-    np.testing.assert_array_equal(state.cloud.points, limit_capacity(scan, 300).points)
+    np.testing.assert_array_equal(state.cloud.points, limit_capacity(scan, 100).points)

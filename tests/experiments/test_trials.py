@@ -1,12 +1,10 @@
 """Where trials are run."""
 
-import os
-import signal
-
 import dask
 import distributed
 import loky
 import pytest
+from deadly import Trial
 from test_study import small, without_time
 from toy import ToyStudy
 
@@ -19,29 +17,16 @@ from jaxnbv.folders import software
 from jaxnbv.model_name import ModelName
 
 
-class Trial:
-    """Trials that note their beginnings: number 2 kills its process the first time, 3 raises, 4 kills its process."""
-
-    def __init__(self, folder):
-        self.folder = folder
-
-    def __call__(self, index):
-        first = not self.beginnings(index)
-        (self.folder / f"{index}-{os.getpid()}").touch()
-        if index == 4 or (index == 2 and first):
-            os.kill(os.getpid(), signal.SIGKILL)
-        if index == 3:
-            raise RuntimeError("the third never works")
-        return {"square": index * index}
-
-    def beginnings(self, index):
-        return [*self.folder.glob(f"{index}-*")]
-
-
-@pytest.fixture
+@pytest.fixture(scope="module")
 def cluster():
-    """A scheduler and two worker processes, which their nannies replace when they die."""
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as started:
+    """A scheduler and two worker processes, which their nannies replace when they die.
+
+    A worker holds one trial at a time, which is given up when it has killed a second one.
+    """
+    with (
+        dask.config.set({f"distributed.scheduler.{name}": 1 for name in ("allowed-failures", "worker-saturation")}),
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as started,
+    ):
         yield started
 
 

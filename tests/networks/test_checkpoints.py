@@ -3,6 +3,7 @@
 import json
 import struct
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -131,10 +132,11 @@ def test_a_network_with_other_radii_is_not_saved(tmp_path):
 
 
 @pytest.fixture(
-    params=[lambda key: InvariantClassifier(3, key, classes=("cup", "wide plate", "bowl")), CompactPartSegmenter]
+    scope="module",
+    params=[lambda key: InvariantClassifier(3, key, classes=("cup", "wide plate", "bowl")), CompactPartSegmenter],
 )
 def own(request):
-    return request.param(jax.random.key(4))
+    return eqx.filter_jit(request.param)(jax.random.key(4))
 
 
 def test_networks_of_our_own_come_back(own, tmp_path):

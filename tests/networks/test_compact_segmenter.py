@@ -19,14 +19,13 @@ from jaxnbv.training.part_clouds import LabelledPartClouds, scanned_part_clouds
 
 RNG = np.random.default_rng(0)
 COUNT = 300
-COMPUTES = True
 CHAIR, MUG = 4, 11
 segment = eqx.filter_jit(lambda network, *arguments: network(*arguments))
 
 
 @pytest.fixture(scope="module")
 def network():
-    return CompactPartSegmenter(jax.random.key(0))
+    return eqx.filter_jit(CompactPartSegmenter)(jax.random.key(0))
 
 
 def cloud(count=COUNT):
@@ -119,7 +118,7 @@ def predicted(segmenter, found):
     return jax.lax.map(of_cloud, found)
 
 
-def test_the_shipped_weights_know_the_parts_of_objects_that_they_were_not_trained_on():
+def test_the_shipped_weights_know_the_parts_of_objects_that_they_were_not_trained_on(computes):
     """Three clouds of an object of each procedural category, numbers of the test split that the training never saw."""
     found = scanned_part_clouds(Split.TEST, range(5000, 5013))
     assert isinstance(found, LabelledPartClouds)

@@ -34,6 +34,11 @@ def call(net, *arguments):
     return net(*arguments)
 
 
+@eqx.filter_jit
+def slopes_of(net, points, normals):
+    return jax.grad(lambda points: net(points, normals)[0])(points)
+
+
 def test_what_tells_the_class_does_not_depend_on_how_the_object_is_turned(x64):
     focus = jax.tree.map(lambda leaf: leaf.astype(np.float64), network().focus)
     points, normals = oriented(300)
@@ -65,7 +70,7 @@ def test_fewer_points_or_none_are_padded(bias, fed):
     points, normals = (jnp.asarray(array, jnp.float32) for array in oriented(25))
     expected = call(net.network, points, normals, jnp.arange(25) < fed)
     np.testing.assert_allclose(call(net, points, normals), expected, atol=1e-4)
-    slopes = jax.jit(jax.grad(lambda points: net(points, normals)[0]))(points)
+    slopes = slopes_of(net, points, normals)
     assert np.isfinite(slopes).all()
     assert bool(np.abs(slopes).max() > 0) == (fed > 0)
 

@@ -19,6 +19,11 @@ SAMPLING = {
 }
 
 
+@eqx.filter_jit
+def call(network, *arguments):
+    return network(*arguments)
+
+
 def layers(*widths):
     return tuple(
         Linear(jnp.asarray(RNG.normal(size=(a, b)) * (2 / a) ** 0.5), jnp.asarray(0.2 * RNG.normal(size=b)))
@@ -131,7 +136,7 @@ def test_log_probabilities_are_those_of_the_reference(shared, kind):
 
 @pytest.mark.parametrize("kind", ["ssg", "msg"])
 @pytest.mark.parametrize("inputs", [3, 6])
-@pytest.mark.parametrize(("n", "repeated"), [(700, 0), (60, 0), (540, 100)])
+@pytest.mark.parametrize(("n", "repeated"), [(540, 0), (60, 0), (540, 100)])
 def test_against_a_plain_network(x64, tmp_path, kind, inputs, n, repeated):
     """Both layouts, with normals and without, and fewer points than centres, or only when duplicates are not counted.
 
@@ -144,7 +149,7 @@ def test_against_a_plain_network(x64, tmp_path, kind, inputs, n, repeated):
     rows = np.concatenate([np.arange(n - repeated), RNG.integers(0, n - repeated, repeated)])
     points, normals = (array[rows] for array in cloud(n))
     expected = plain_network(state, kind, np.asarray(points), np.asarray(normals) if inputs == 6 else None)
-    np.testing.assert_allclose(eqx.filter_jit(network)(points, normals), expected, atol=1e-11)
+    np.testing.assert_allclose(call(network, points, normals), expected, atol=1e-11)
 
 
 def test_log_probabilities_sum_to_one(x64):
@@ -154,18 +159,19 @@ def test_log_probabilities_sum_to_one(x64):
 
 
 def test_masked_rows_and_capacity_do_not_matter(x64):
-    network = eqx.filter_jit(small_network())
+    network = small_network()
+    slopes = jax.jit(jax.grad(lambda points, *rest: network(points, *rest)[0]))
     points, normals = cloud(50)
-    expected = network(points, normals)
+    expected = call(network, points, normals)
     rows = np.sort(RNG.permutation(130)[:50])
     mask = np.zeros(130, bool)
     mask[rows] = True
     for filling in (0.0, 0.3, np.nan):
         wide = [np.full((130, 3), filling) for _ in range(2)]
         wide[0][rows], wide[1][rows] = points, normals
-        found = network(jnp.asarray(wide[0]), jnp.asarray(wide[1]), jnp.asarray(mask))
-        np.testing.assert_allclose(found, expected, atol=1e-13)
-        gradient = jax.grad(lambda x, rest: network(x, rest, jnp.asarray(mask))[0])(*map(jnp.asarray, wide))
+        padded = tuple(map(jnp.asarray, (*wide, mask)))
+        np.testing.assert_allclose(call(network, *padded), expected, atol=1e-13)
+        gradient = slopes(*padded)
         assert np.isfinite(gradient).all()
         assert not np.asarray(gradient)[~mask].any()
 
@@ -178,9 +184,10 @@ def test_the_order_of_points_after_the_first_does_not_matter_in_balls_that_are_n
 
 
 def test_a_network_without_normals_ignores_them(x64):
-    network = small_network(inputs=3)
+    plain = small_network(inputs=3)
     points, normals = cloud(40)
-    assert not network.uses_normals
+    assert not plain.uses_normals
+    network = eqx.filter_jit(plain)
     np.testing.assert_array_equal(network(points, normals), network(points, jnp.full_like(normals, jnp.nan)))
     assert np.abs(network(points, normals) - network(1.1 * points, normals)).max() > 1e-3
 
@@ -200,8 +207,8 @@ def test_gradients_against_central_differences(x64):
         for i in np.ndindex(30, 3):
             ends = []
             for sign in (1, -1):
-                moved = [points, normals]
-                moved[which] = moved[which].at[i].add(sign * 1e-6)
+                moved = [np.array(points), np.array(normals)]
+                moved[which][i] += sign * 1e-6
                 ends.append(float(value(tuple(moved))))
             expected[i] = (ends[0] - ends[1]) / 2e-6
         assert np.abs(expected).max() > 0.05
@@ -209,19 +216,19 @@ def test_gradients_against_central_differences(x64):
 
 
 def test_a_batch_is_the_clouds_one_by_one(x64):
-    network = eqx.filter_jit(small_network())
+    network = small_network()
     points, normals = (jnp.stack(rows) for rows in zip(*(cloud(45) for _ in range(3)), strict=True))
     mask = jnp.asarray(RNG.random((3, 45)) < 0.7)
-    expected = np.stack([network(points[i], normals[i], mask[i]) for i in range(3)])
+    expected = np.stack([call(network, points[i], normals[i], mask[i]) for i in range(3)])
     assert np.ptp(expected, axis=0).max() > 1e-3
-    np.testing.assert_allclose(jax.vmap(network)(points, normals, mask), expected, atol=1e-12)
-    mapped = jax.lax.map(lambda one: network(*one), (points, normals, mask), batch_size=2)
+    np.testing.assert_allclose(jax.jit(jax.vmap(network))(points, normals, mask), expected, atol=1e-12)
+    mapped = jax.jit(lambda *of: jax.lax.map(lambda one: network(*one), of, batch_size=2))(points, normals, mask)
     np.testing.assert_allclose(mapped, expected, atol=1e-12)
 
 
 def test_a_cloud_with_no_filled_row_gives_finite_numbers(x64):
     points, normals = cloud(20)
-    network = small_network()
+    network = eqx.filter_jit(small_network())
     found = network(points, normals, jnp.zeros(20, bool))
     np.testing.assert_allclose(found, network(jnp.zeros((1, 3)), jnp.zeros((1, 3))), atol=1e-13)
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import AnyArray, as_floats, check_type, is_traced, require
+from jaxnbv.checks import AnyArray, InputError, as_floats, check_type, is_traced, require
 from jaxnbv.pose import Pose
 
 # Numbers and lists are converted on the way in, which mypy cannot see.
@@ -112,9 +112,11 @@ class SignedDistance(eqx.Module):
             )
             if not is_traced(value):
                 known = np.asarray(value)
-                require(bool(np.isfinite(known).all()), f"{name} is {value}: give finite numbers")
-                if "length" in field.metadata:
-                    require(bool((known >= 0).all()), f"{name} is {value}: a length must not be negative")
+                # To print an array takes far longer than to look at it.
+                if not np.isfinite(known).all():
+                    raise InputError(f"{name} is {value}: give finite numbers")
+                if "length" in field.metadata and (known < 0).any():
+                    raise InputError(f"{name} is {value}: a length must not be negative")
 
     def translate(self, offset) -> "Translated":
         """The solid moved by `offset` (3,)."""

@@ -16,6 +16,7 @@ from PIL import Image
 from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
 from jaxnbv.datasets import FRUITS, HOUSEHOLD, Split, truck_scene
+from jaxnbv.datasets.class_object import scan_telling
 from jaxnbv.experiments.charts import write_charts
 from jaxnbv.experiments.classification.modelnet10 import ModelNet10Study
 from jaxnbv.experiments.classification.omniobject3d import OmniObject3DStudy
@@ -26,13 +27,13 @@ from jaxnbv.experiments.meshes import class_meshes
 from jaxnbv.experiments.tables import summary, write_tables
 from jaxnbv.model_name import ModelName
 from jaxnbv.networks import InvariantClassifier, save_checkpoint
-from jaxnbv.scanning import SDFSurface, scan
 from jaxnbv.search import FarthestView
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
 
 SCENE, CANDIDATES = 4, 12
+CAMERA = Camera(height=24, width=24)
 
 
 class Linear(eqx.Module):
@@ -56,7 +57,8 @@ class Unshipped(OmniObject3DStudy):
 def small(kind, **settings):
     few = {"num_candidates": CANDIDATES, "num_samples": 2, "grid_resolution": 20, "capacity": 250, "num_points": 100}
     model = GeometricSPSR(lengthscale=0.05, truncation=8)
-    return kind(classifier=Linear(len(kind.objects.classes)), model=model, views=3, **few, **settings)
+    classifier = Linear(len(kind.objects.classes))
+    return kind(classifier=classifier, model=model, views=3, camera=CAMERA, **few, **settings)
 
 
 @functools.cache
@@ -69,7 +71,7 @@ def test_of_a_truck_the_pixels_of_its_cargo_are_recorded():
     assert list(found["methods"]) == list(TruckStudy.methods)
     assert found["label"] == int(truck.label) == SCENE
     poses = sphere_candidates(CANDIDATES, 2.5)
-    seen = scan(SDFSurface(truck), Camera(), poses)
+    _, seen = scan_telling(truck, CAMERA, poses)
     cargo = np.asarray(jnp.sum((jnp.abs(truck.cargo(seen.points)) < 2e-3) & seen.mask, axis=-1))
     np.testing.assert_allclose(found["cargo_pixels"], cargo, atol=2)
     assert cargo.max() > 150 > cargo.min() == 0
@@ -116,7 +118,7 @@ def test_tables_charts_and_pictures(kind, tmp_path):
     assert "Stable hit" in text
     paths = [*write_tables([record(kind)], kind, tmp_path), *write_charts([record(kind)], kind, tmp_path)]
     assert all(path.stat().st_size > 0 for path in paths)
-    (picture,) = write_pictures([record(kind)], small(kind), tmp_path, pixels=40)
+    (picture,) = write_pictures([record(kind)], small(kind), tmp_path, pixels=24)
     with Image.open(picture) as image:
         assert np.asarray(image.convert("L")).std() > 5
 
@@ -195,7 +197,7 @@ def test_meshes_in_place_of_procedural_objects(tmp_path):
     # A box of sides 2.5, 1.25 and 0.625; the noise is 0.01.
     away = np.abs(np.abs(seen) - [1.25, 0.625, 0.3125]).min(axis=1)
     assert away.max() < 0.06
-    (picture,) = write_pictures([found], study, tmp_path, pixels=40)
+    (picture,) = write_pictures([found], study, tmp_path, pixels=24)
     assert picture.exists()
     with pytest.raises(InputError, match="no scene 2: the study has 2 meshes"):
         study.run_scene(2)

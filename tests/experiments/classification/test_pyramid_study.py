@@ -15,9 +15,10 @@ from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
 from jaxnbv.cloud import concatenate, limit_capacity
 from jaxnbv.datasets import Framing, Pyramid, Split, pyramid_scene
+from jaxnbv.datasets.class_object import scan_telling
 from jaxnbv.experiments.classification.pictures import write_pictures
 from jaxnbv.experiments.classification.pyramid import PyramidStudy
-from jaxnbv.scanning import SDFSurface, scan
+from jaxnbv.scanning import scan
 from jaxnbv.search import FarthestView, Problem, UncertaintyView
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.surfaces import GeometricSPSR
@@ -25,6 +26,8 @@ from jaxnbv.tasks import Coverage
 from jaxnbv.tasks.classification import CrossEntropy, MixedEntropy, NegativeEntropy
 
 SCENE, CANDIDATES = 3, 14
+CAMERA = Camera(height=24, width=24)
+RAYS = CAMERA.height * CAMERA.width
 
 
 class Linear(eqx.Module):
@@ -56,7 +59,7 @@ def small_study(classifier=None, views=3, **settings):
     small = {"num_candidates": CANDIDATES, "num_samples": 2, "grid_resolution": 20}
     limits = {"capacity": 250, "num_points": 100}
     fixed = {"classifier": classifier or Linear(), "framing": Framing.CLOSE_UP, "model": model, "views": views}
-    return PyramidStudy(**(fixed | small | limits | settings))
+    return PyramidStudy(camera=CAMERA, **(fixed | small | limits | settings))
 
 
 @functools.cache
@@ -106,11 +109,11 @@ def test_the_first_view_is_that_of_all_methods_and_shows_no_pattern_but_somethin
     firsts = {run["candidates"][0] for method in record["methods"].values() for run in method["runs"]}
     assert firsts == {record["first"]}
     pyramid, poses = pyramid_scene(Split.TEST, SCENE), sphere_candidates(CANDIDATES, 2.5)
-    seen = scan(SDFSurface(pyramid), Camera(), poses)
+    _, seen = scan_telling(pyramid, CAMERA, poses)
     pixels = np.asarray(jnp.sum(pyramid.on_pattern(seen.points) & seen.mask, axis=-1))
     assert pixels[record["first"]] == 0 < int(seen.count[record["first"]])
-    np.testing.assert_allclose(record["pattern_pixels"], pixels, atol=2)
-    assert pixels.max() > 500
+    np.testing.assert_allclose(record["pattern_pixels"], pixels, atol=1)
+    assert pixels.max() > 0.2 * RAYS
     outward = -np.asarray(pyramid.rotation)[:, 2]
     angle = np.degrees(np.arccos(np.asarray(poses.position[record["first"]]) @ outward / 2.5))
     assert record["angle"] == pytest.approx(angle, abs=0.05)
@@ -159,7 +162,8 @@ def test_values_are_the_librarys_scores_of_the_same_samples(sharpness):
     found, _ = chooser.values(visited, [name for name in study.methods if name != "random"], 3)
     state, planner = chooser.state(visited), chooser.planner
     assert int(state.num_views) == 2
-    surfaces = planner.sample_surfaces(state, jax.random.fold_in(study.key(SCENE, "scene"), 3))
+    key = jax.random.fold_in(study.key(SCENE, "scene"), 3)
+    surfaces = planner.sample_surfaces(state, key, planner.posterior(state))
     scores = {
         "cross-entropy": CrossEntropy(classifier, num_points=100),
         "mixed": MixedEntropy(classifier, num_points=100),
@@ -215,9 +219,9 @@ def test_a_method_of_ones_own_sees_what_others_see_from_a_candidate(tmp_path):
     record = study.run_scene(SCENE, ("random",), {"mine:own": own})
     (run,) = record["methods"]["mine:own"]["runs"]
     np.testing.assert_allclose(run["log_p"], farthest["log_p"], atol=1e-5)
-    assert np.abs(np.subtract(run["pattern_pixels"], farthest["pattern_pixels"])).max() <= 2
+    assert np.abs(np.subtract(run["pattern_pixels"], farthest["pattern_pixels"])).max() <= 1
     for shown in (record, whole_record()):
-        (path,) = write_pictures([shown], study, tmp_path, pixels=50)
+        (path,) = write_pictures([shown], study, tmp_path, pixels=24)
         assert path == tmp_path / f"views_{SCENE:03d}.png"
         with Image.open(path) as image:
             assert np.asarray(image.convert("L")).std() > 5
@@ -228,13 +232,13 @@ def test_with_a_classifier_that_knows_the_pattern_the_oracle_looks_at_it():
     study = small_study(Knowing(pyramid_scene(Split.TEST, SCENE)))
     record = study.run_scene(SCENE, ("oracle", "random"))
     run, pixels = record["methods"]["oracle"]["runs"][0], np.array(record["pattern_pixels"])
-    assert run["pattern_pixels"][1] >= 0.25 * pixels.max() > 200
+    assert run["pattern_pixels"][1] >= 0.25 * pixels.max() > 0.08 * RAYS
     assert np.ptp(run["log_p"][0]) == pytest.approx(0.0, abs=1e-5)
     assert int(np.argmax(run["log_p"][1])) == record["label"]
     assert np.ptp(run["log_p"][1]) > 1.0
     shown = np.delete(pixels, record["first"])
     # Scene 3 is of class 3: a tie of all classes is no right answer.
-    assert np.mean(shown > 1000) <= record["methods"]["random"]["hit"] <= np.mean(shown > 0) < 1
+    assert np.mean(shown > 0.4 * RAYS) <= record["methods"]["random"]["hit"] <= np.mean(shown > 0) < 1
 
 
 def test_too_few_views_or_candidates_are_refused():
