@@ -14,7 +14,7 @@ from jaxnbv.tasks.classification import entropy
 from jaxnbv.training.class_clouds import LabelledClouds, scanned_clouds
 
 COMPUTES = True
-_CHUNK = 20
+_CHUNK = 40
 
 
 @eqx.filter_jit
@@ -71,11 +71,9 @@ def test_the_class_of_objects_seen_from_several_sides(name, classes):
     """Of test objects that were not trained on, from three views and more."""
     classifier = pretrained_classifier(name)
     assert classifier.classes == classes
-    right, first = [], 0
-    while len(right) < 40:
-        found = scanned_clouds(CLASS_SETS[name], Split.TEST, Framing.CLOSE_UP, range(first, first + _CHUNK))
-        rows = np.asarray(found.views) >= 3
-        right += (np.argmax(answers(classifier, found.clouds), axis=1) == np.asarray(found.labels))[rows].tolist()
-        first += _CHUNK
+    found = scanned_clouds(CLASS_SETS[name], Split.TEST, Framing.CLOSE_UP, range(100))
+    rows = np.asarray(found.views) >= 3
+    right = np.argmax(answers(classifier, found.clouds), axis=1) == np.asarray(found.labels)
+    assert rows.sum() >= 40
     # Forty clouds that are right in 95 % tell their share to 3.5 points.
-    assert np.mean(right[:40]) >= 0.85
+    assert np.mean(right[rows]) >= 0.85
