@@ -5,17 +5,15 @@ import dataclasses
 import itertools
 import json
 
-import jax
 import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
+from small_run import CAMERA, small_run
 
 import jaxnbv as nbv
 from jaxnbv.answers import Answer, Panel, Quantity
-from jaxnbv.datasets.demo import demo_object
-from jaxnbv.pose import look_at
 from jaxnbv.viz import report_data
 from jaxnbv.viz.data import MeanSurface
 from jaxnbv.viz.figures import STYLE, Stills, figures_of
@@ -24,14 +22,10 @@ from jaxnbv.viz.stage import stage_of
 from jaxnbv.viz.style import spaced_ticks
 from jaxnbv.viz.task import Task
 
-CAMERA = nbv.Camera(height=16, width=16)
-
 
 @pytest.fixture(scope="module")
 def episode():
-    model = nbv.GeometricSPSR(truncation=12, lengthscale=0.03)
-    planner = nbv.Planner(model, CAMERA, nbv.Coverage(), nbv.DiscreteSearch(12), 3, nbv.Grid(24), capacity=512)
-    return nbv.simulate(planner, demo_object(), look_at((0.8, 0.9, 2.2)), 3, jax.random.key(0), progress=False)
+    return small_run(nbv.DiscreteSearch(12))
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +51,7 @@ def texts(figure):
     scenes = [axes for axes in figure.axes if axes.images and not axes.axison]
     numbers = {id(text) for axes in scenes for text in axes.texts}
     renderer = FigureCanvasAgg(figure).get_renderer()
-    FigureCanvasAgg(figure).draw()
+    figure.draw_without_rendering()
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):
             low, high = sorted(axis.get_view_interval())
