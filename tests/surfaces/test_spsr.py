@@ -257,7 +257,7 @@ def test_points_where_functions_only_repeat_are_refused():
 def test_samples_at_the_data_have_the_posteriors_moments(x64):
     """Of 4,000 samples: a standard deviation is known to 1.1 %. Noise as large as the field, so that draws without it
     would vary less."""
-    settings = SETTINGS | {"noise": 0.7}
+    settings = SETTINGS | {"noise": 0.7, "lengthscale": 0.15, "truncation": 2}
     values = GeometricSPSR(**settings).condition(cloud(POINTS, NORMALS)).sample(jax.random.key(3), 4000)(POINTS)
     mean, covariance = WeightSpace(**settings).posterior(POINTS, NORMALS, POINTS)
     deviation = np.sqrt(np.diag(covariance))
