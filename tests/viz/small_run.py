@@ -22,7 +22,7 @@ def small_planner(search, acquisition=None, **changes) -> nbv.Planner:
     return nbv.Planner(search=search, acquisition=acquisition, **(options | changes))
 
 
-def small_run(search, views=3, scene=SCENE, acquisition=None, noise=None, **changes) -> nbv.Episode:
+def small_run(search, views=3, scene=SCENE, acquisition=None, noise=None, first=FIRST, **changes) -> nbv.Episode:
     planner = small_planner(search, acquisition, **changes)
     noise = nbv.SensorNoise() if noise is None else noise
-    return nbv.simulate(planner, scene, FIRST, views, jax.random.key(0), noise, progress=False)
+    return nbv.simulate(planner, scene, first, views, jax.random.key(0), noise, progress=False)

@@ -93,19 +93,22 @@ LONG = Quantity(
 def test_letters_neither_collide_nor_are_cut(data, count, quantity):
     shown = of_views(data, count)
     shown = shown if quantity is None else dataclasses.replace(shown, quantity=quantity)
+    # A view's own figures do not depend on later ones: those of all but the last are drawn with three views.
+    last = f"view_{count:02d}"
     with mpl.rc_context(STYLE):
-        for draw in figures_of(shown, CAMERA, Stills(shown)).values():
-            check_letters(draw())
+        for name, draw in figures_of(shown, CAMERA, Stills(shown)).items():
+            if count == 3 or name.startswith(last) or not name.startswith("view"):
+                check_letters(draw())
 
 
 @pytest.mark.parametrize("low", [1e-4, 2e-3, 0.04])
 def test_the_ticks_of_any_range_have_room(data, low, monkeypatch):
     monkeypatch.setattr("jaxnbv.viz.figures.deviation_range", lambda data: (low, 1.0))
-    for count in (2, 3):
+    for count, names in ((2, ("view_02", "overview")), (3, ("overview",))):
         shown = of_views(data, count)
         with mpl.rc_context(STYLE):
             drawings = figures_of(shown, CAMERA, Stills(shown))
-            for name in ("view_02", "overview"):
+            for name in names:
                 check_letters(drawings[name]())
 
 

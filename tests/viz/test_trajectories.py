@@ -51,6 +51,14 @@ class Walks(Search):
         return nbv.Proposal(found.pose, found.value, candidates, found.values[:4], ways)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def coarse():
+    """Surfaces are traced at a quarter of their pixels a side, which is most of what a picture takes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("jaxnbv.viz.figures._STILL", 160)
+        yield
+
+
 @pytest.fixture(scope="module")
 def few():
     """On the sphere, from as many candidates as starts, which are too few for a map."""
