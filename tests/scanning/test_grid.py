@@ -66,7 +66,7 @@ def test_box_closed_form():
     half = np.array([0.7, 0.83, 0.9])
     q = np.abs(nodes(GRID)) - half
     outside = np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0)
-    origins, directions = random_rays(1, 3000, spread=0.6)
+    origins, directions = random_rays(1, 4000, spread=0.6)
     hits = GridSurface.from_values(outside, 0.0, GRID).trace(origins, directions)
     o, d = origins.astype(np.float64), directions.astype(np.float64)
     near = np.minimum((-half - o) / d, (half - o) / d)
@@ -91,10 +91,10 @@ def test_torus_closed_form():
     x = nodes(GRID)
     ring = np.hypot(x[..., 0], x[..., 1]) - 0.85
     values = np.hypot(ring, x[..., 2])
-    origins, directions = random_rays(2, 3000)
+    origins, directions = random_rays(2, 4000)
     hits = GridSurface.from_values(values, 0.4, GRID).trace(origins, directions)
     points = np.asarray(hits.points, np.float64)[np.asarray(hits.mask)]
-    assert 1000 < len(points) < 3000
+    assert 1000 < len(points) < 4000
     distance = np.hypot(np.hypot(points[:, 0], points[:, 1]) - 0.85, points[:, 2]) - 0.4
     # Second derivatives of a distance: the two curvatures of the level sets, here within a cell of the surface.
     tube, hole = 0.4 - np.sqrt(3) * GRID.spacing, 0.45 - np.sqrt(3) * GRID.spacing
@@ -181,7 +181,7 @@ def test_no_tunnelling_through_a_two_voxel_sheet(normal, direction, shift, slide
 
 
 def test_sensor_inside_the_surface():
-    _, directions = random_rays(6, 500)
+    _, directions = random_rays(6, 4000)
     hits = sphere().trace(np.zeros_like(directions), directions)
     assert np.asarray(hits.mask).all()
     assert np.abs(np.asarray(hits.points) - directions).max() < interpolation_error(2 / (1 - 2 * GRID.spacing))
@@ -190,7 +190,7 @@ def test_sensor_inside_the_surface():
 
 def test_grazing_rays():
     error = interpolation_error(2 / (1 - 2 * GRID.spacing))
-    height = 1 + error * np.linspace(-2, 2, 401)
+    height = 1 + error * np.linspace(-2, 2, 4000)
     origins = np.stack([height, np.full_like(height, 0.01), np.full_like(height, -2.5)], axis=1).astype(np.float32)
     directions = np.tile(np.array([0, 0, 1], np.float32), (len(height), 1))
     surface = sphere()
@@ -205,7 +205,7 @@ def test_grazing_rays():
         return surface.trace(origin[None], direction[None]).points[0, 2]
 
     slope = jax.jit(jax.vmap(jax.grad(depth)))(
-        jnp.asarray(origins[:, 0]), jnp.asarray(origins), jnp.asarray(directions)
+        jnp.asarray(origins[::10, 0]), jnp.asarray(origins[::10]), jnp.asarray(directions[::10])
     )
     # |grad f| is at most the spread of f over a cell, so that the bounded ratio is at most 1 / 0.03.
     assert np.abs(slope).max() < 34
@@ -246,12 +246,11 @@ def test_axis_parallel_rays_through_nodes_and_edges():
 
 
 def test_far_origins_and_rays_on_the_border_of_the_box():
-    surface = sphere()
-    far = surface.trace(np.array([[0.0, 0.0, -500.0]], np.float32), np.array([[0.0, 0.0, 1.0]], np.float32))
-    np.testing.assert_allclose(far.points[0], [0, 0, -1], atol=interpolation_error(2.2) + 500 * 1e-6)
-    edges = np.array([[1.75, 1.75, -3], [1.75, 0, -3], [-1.75, -1.75, -3], [0, 0, 1.75]], np.float32)
-    hits = surface.trace(edges, np.tile(np.array([0, 0, 1], np.float32), (4, 1)))
-    assert not np.asarray(hits.mask).any()
+    far, edges = [[0, 0, -500]], [[1.75, 1.75, -3], [1.75, 0, -3], [-1.75, -1.75, -3], [0, 0, 1.75]]
+    origins = np.resize(np.array(far + edges, np.float32), (4000, 3))
+    hits = sphere().trace(origins, np.tile(np.array([0, 0, 1], np.float32), (4000, 1)))
+    np.testing.assert_allclose(hits.points[0], [0, 0, -1], atol=interpolation_error(2.2) + 500 * 1e-6)
+    assert not np.asarray(hits.mask)[1:5].any()
 
 
 def test_samples_in_a_batch_equal_single_ones():
@@ -281,13 +280,13 @@ def test_samples_in_a_batch_equal_single_ones():
 
 def test_normals_are_interpolated_central_differences():
     values = rough_values(GRID, 14, 0.1).astype(np.float32)
-    hits = GridSurface.from_values(values, 0.0, GRID).trace(*random_rays(15, 500))
+    hits = GridSurface.from_values(values, 0.0, GRID).trace(*random_rays(15, 4000))
     points = np.asarray(hits.points, np.float64)[np.asarray(hits.mask)]
     gradient = np.stack([interpolate(g, points, GRID) for g in np.gradient(values.astype(np.float64))], axis=1)
     gradient /= np.linalg.norm(gradient, axis=1, keepdims=True)
     normals = np.asarray(hits.normals)[np.asarray(hits.mask)]
     np.testing.assert_allclose(np.abs(np.sum(normals * gradient, axis=1)), 1.0, atol=1e-4)
-    directions = random_rays(15, 500)[1][np.asarray(hits.mask)]
+    directions = random_rays(15, 4000)[1][np.asarray(hits.mask)]
     assert (np.sum(normals * directions, axis=1) <= 1e-6).all()
 
 

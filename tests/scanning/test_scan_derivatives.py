@@ -57,19 +57,25 @@ def is_grazing(surface, points, normals, directions):
     return np.abs(slope) < 0.033 * np.ptp(corners, axis=-1)
 
 
-@functools.cache
-def looks(space):
-    """Points, normals, mask and rays at parameters + h step; and the derivatives in h, forwards, of the first two."""
+@functools.partial(jax.jit, static_argnums=0)
+@functools.partial(jax.vmap, in_axes=(None, None, None, None, 0))
+@functools.partial(jax.vmap, in_axes=(None, 0, 0, 0, None))
+def moves(space, start, parameters, step, h):
+    """Poses at parameters + h step, and their derivatives in h."""
+    return jax.jvp(lambda h: SPACES[space].retract(start, parameters + h * step), (h,), (1.0,))
 
-    def look(surface, start, parameters, step, h):
-        pose = SPACES[space].retract(start, parameters + h * step)
+
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(None, 0, 0))
+@functools.partial(jax.vmap, in_axes=(None, 0, 0))
+def looks(surface, pose, moved):
+    """Points, normals, mask and rays; and the derivatives, forwards, of the first two for a pose that is moved."""
+
+    def look(pose):
         cloud = scan(surface, CAMERA, pose)
         return (cloud.points, cloud.normals), (cloud.mask, CAMERA.rays(pose)[1])
 
-    def both(surface, start, parameters, step, h):
-        return jax.jvp(lambda h: look(surface, start, parameters, step, h), (h,), (1.0,), has_aux=True)
-
-    return jax.jit(jax.vmap(jax.vmap(both, (None, 0, 0, 0, None)), (None, None, None, None, 0)))
+    return jax.jvp(look, (pose,), (moved,), has_aux=True)
 
 
 @pytest.mark.parametrize("space", SPACES)
@@ -81,7 +87,7 @@ def test_scans_as_functions_of_a_pose_against_central_differences(name, space, x
         surface = grid_surface(some_bumps(RNG) if name == "field" else solid(), GRID)
     starts, count, h = look_at(fibonacci_sphere(6, 2.5)), SPACES[space].num_parameters, 1e-6
     at, step = 0.1 * RNG.normal(size=(6, count)), RNG.normal(size=(6, count))
-    values, slopes, (masks, rays) = looks(space)(surface, starts, at, step, jnp.asarray([0.0, h, -h]))
+    values, slopes, (masks, rays) = looks(surface, *moves(space, starts, at, step, jnp.asarray([0.0, h, -h])))
     points, normals = (np.asarray(value) for value in values)
     masks, hit = np.asarray(masks), np.asarray(masks[0])
     grazing = hit & is_grazing(surface, points[0], normals[0], np.asarray(rays[0]))
@@ -111,15 +117,16 @@ def test_grazing_and_missed_rays(name):
     turn = RNG.uniform(0, 2 * np.pi, 200)
     origins = jnp.asarray(np.stack([miss * np.cos(turn), miss * np.sin(turn), 0 * miss - 2.5], axis=1), jnp.float32)
     directions = jnp.broadcast_to(jnp.asarray([0.0, 0.0, 1.0]), (200, 3))
-    mask = np.asarray(surface.trace(origins, directions).mask)
-    assert 0.5 < mask.mean() < 0.9
 
+    @jax.jit
     def trace(origin, direction):
         hits = surface.trace(origin[None], direction[None])
-        return hits.points[0], hits.normals[0]
+        return (hits.points[0], hits.normals[0]), hits.mask[0]
 
-    forward = jax.jit(jax.vmap(jax.jacfwd(trace, argnums=(0, 1))))(origins, directions)
-    reverse = jax.jit(jax.vmap(jax.jacrev(trace, argnums=(0, 1))))(origins, directions)
+    forward, mask = jax.jit(jax.vmap(jax.jacfwd(trace, (0, 1), has_aux=True)))(origins, directions)
+    reverse, _ = jax.jit(jax.vmap(jax.jacrev(trace, (0, 1), has_aux=True)))(origins, directions)
+    mask = np.asarray(mask)
+    assert 0.5 < mask.mean() < 0.9
     # |dt| is at most 1 / 0.05 or 1 / 0.03 of what moves: the origin, or the hit, which is 4 away from it at most.
     bound = 1 + (20 if name == "solid" else 34)
     for jacobian in (forward, reverse):
@@ -147,6 +154,7 @@ def test_batches_of_surfaces_and_starts_equal_loops_forwards_and_backwards(x64):
         cloud = scan(GridSurface(values, distance, SMALL), FEW, space.retract(start, parameters))
         return jnp.sum(weights[0] * cloud.points) + jnp.sum(weights[1] * cloud.normals)
 
+    @jax.jit
     def reverse(surface, *pose):
         return jax.value_and_grad(seen, argnums=(0, 3))(surface.values, surface.distance, *pose)
 
@@ -159,16 +167,16 @@ def test_batches_of_surfaces_and_starts_equal_loops_forwards_and_backwards(x64):
     inner = jax.jit(jax.vmap(jax.vmap(reverse, of_surface), of_start))(*arguments)
     ahead = jax.jit(jax.vmap(jax.vmap(forward, of_start), of_surface))(*arguments)
     assert (np.abs(ahead).max(axis=-1) > 0.1).all()
-    alone = jax.jit(reverse)
     for i, j in np.ndindex(16, 3):
         one = jax.tree.map(lambda leaf, i=i: leaf[i], surfaces), starts[j], parameters[j]
-        single = alone(*one)
+        single = reverse(*one)
         for a, b, c in zip(*map(jax.tree.leaves, (outer, inner, single)), strict=True):
             np.testing.assert_allclose(a[i, j], c, rtol=1e-9, atol=1e-9)
             np.testing.assert_allclose(b[j, i], c, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(ahead[i, j], single[1][1], rtol=1e-9, atol=1e-9)
 
 
+@jax.jit
 def traced(weights, surface, origins, directions):
     def total(values, origins, directions):
         hits = GridSurface(values, surface.distance, SMALL).trace(origins, directions)
@@ -180,19 +188,19 @@ def traced(weights, surface, origins, directions):
 @pytest.mark.parametrize("axes", [(0, 0, 0), (0, None, None), (None, 0, None)])
 def test_every_way_to_batch_fields_and_rays_equals_a_loop(axes, x64):
     origins, directions = (rays + 0.05 * RNG.normal(size=(4, 30, 3)) for rays in some_rays(RNG, 30))
-    run = functools.partial(traced, jnp.asarray(RNG.normal(size=(2, 30, 3))))
+    weights = jnp.asarray(RNG.normal(size=(2, 30, 3)))
     # What is not batched is the first of the batch.
     given = [
         batch if axis == 0 else jax.tree.map(lambda leaf: leaf[0], batch)
         for batch, axis in zip((small_surfaces(RNG, 4), origins, directions), axes, strict=True)
     ]
-    together, loop = jax.jit(jax.vmap(run, axes))(*given), jax.jit(run)
+    together = jax.jit(jax.vmap(traced, (None, *axes)))(weights, *given)
     for i in range(4):
         turn = [
             jax.tree.map(lambda leaf, i=i: leaf[i], each) if axis == 0 else each
             for each, axis in zip(given, axes, strict=True)
         ]
-        alone = loop(*turn)
+        alone = traced(weights, *turn)
         assert bool(alone[0][1].any())
         for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
             np.testing.assert_allclose(a[i], b, rtol=1e-9, atol=1e-9)

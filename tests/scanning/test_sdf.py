@@ -30,7 +30,7 @@ def revolve(profile):
 
 
 def arc(cx, cy, r, start, stop):
-    t = np.linspace(start, stop, 400)
+    t = np.linspace(start, stop, math.ceil(r * (stop - start) / 0.005) + 1)
     return np.stack([cx + r * np.cos(t), cy + r * np.sin(t)], axis=-1)
 
 

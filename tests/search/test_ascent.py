@@ -87,17 +87,23 @@ def test_where_values_tie_the_first_candidate_wins(kind):
 def test_adam_is_optax_in_a_plain_loop(space, x64):
     problem, start = known(), look_at(jnp.asarray([[1.2, 1.0, 1.9]]))
     ways = eqx.filter_jit(lambda problem: Ascent(space, 1, 30, 0.02).climb(problem, start).trajectories)(problem)
-    move = jax.jit(lambda parameters: space.retract(start[0], parameters))
-    gradient = jax.jit(jax.grad(lambda parameters: -problem.acquisition(move(parameters)[None])[0]))
-
     optimiser, parameters = optax.adam(0.02), jnp.zeros(space.num_parameters)
     state = optimiser.init(parameters)
+
+    def loss(parameters):
+        pose = space.retract(start[0], parameters)
+        return -problem.acquisition(pose[None])[0], pose
+
+    @jax.jit
+    def turn(parameters, state):
+        gradient, pose = jax.grad(loss, has_aux=True)(parameters)
+        updates, state = optimiser.update(gradient, state)
+        return pose, parameters + updates, state
+
     for step in range(31):
-        expected = move(parameters)
+        expected, parameters, state = turn(parameters, state)
         np.testing.assert_allclose(ways.poses.position[0, step], expected.position, atol=1e-6)
         np.testing.assert_allclose(ways.poses.rotation[0, step], expected.rotation, atol=1e-6)
-        updates, state = optimiser.update(gradient(parameters), state)
-        parameters = parameters + updates
     assert float(jnp.abs(ways.poses.position[0, -1] - start.position[0]).max()) > 0.1
 
 

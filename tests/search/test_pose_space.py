@@ -25,6 +25,11 @@ SPACES = {"sphere": SPHERE, "free": FREE, "constrained": CONSTRAINED}
 RETRACT = {name: jax.jit(space.retract) for name, space in SPACES.items()}
 RETRACT_MANY = {name: jax.jit(jax.vmap(space.retract)) for name, space in SPACES.items()}
 JACOBIAN = {name: jax.jit(jax.jacfwd(space.retract, argnums=1)) for name, space in SPACES.items()}
+# One pose as rows of numbers, and many from the same start.
+FLAT = jax.jit(lambda start, parameters: flat(SPHERE.retract(start, parameters)))
+WAY = jax.jit(jax.vmap(FLAT, in_axes=(None, 0)))
+# Of all batches alike, so that they share what was compiled.
+MANY = 3000
 FREEDOMS = {"sphere": 2, "free": 6, "constrained": 6}
 
 
@@ -83,8 +88,8 @@ def assert_obeys(pose, space=CONSTRAINED):
 
 @pytest.mark.parametrize("name", SPACES)
 def test_zeros_lead_to_the_start(name):
-    start = starts_of(name, 200)
-    end = RETRACT_MANY[name](start, jnp.zeros((200, SPACES[name].num_parameters)))
+    start = starts_of(name, MANY)
+    end = RETRACT_MANY[name](start, jnp.zeros((MANY, SPACES[name].num_parameters)))
     np.testing.assert_allclose(end.rotation, start.rotation, atol=3e-6)
     np.testing.assert_allclose(end.position, start.position, atol=3e-6)
 
@@ -122,16 +127,16 @@ def test_forward_and_reverse_mode_agree(name):
 
 
 def test_sphere_keeps_its_radius_and_looks_at_the_origin():
-    start = LOOK_AT(real(RNG.uniform(0.5, 4.0, (500, 1)) * units(500)))
+    start = LOOK_AT(real(RNG.uniform(0.5, 4.0, (MANY, 1)) * units(MANY)))
     for size in (0.1, 1.0, 1e6):
-        end = RETRACT_MANY["sphere"](start, real(size * RNG.normal(size=(500, 3))))
+        end = RETRACT_MANY["sphere"](start, real(size * RNG.normal(size=(MANY, 3))))
         np.testing.assert_allclose(np.linalg.norm(end.position, axis=1), 2.5, rtol=1e-6)
         assert_rotation(end.rotation)
         assert angle_to_origin(end).max() < 1e-5
 
 
 def test_sphere_reaches_every_direction_and_does_not_roll():
-    start, wanted = starts_inside(300, 2.5), units(300)
+    start, wanted = starts_inside(MANY, 2.5), units(MANY)
     before = np.asarray(start.position, np.float64) / 2.5
     end = RETRACT_MANY["sphere"](start, real(wanted - before))
     np.testing.assert_allclose(end.position, 2.5 * wanted, atol=2e-6)
@@ -145,11 +150,11 @@ def test_sphere_reaches_every_direction_and_does_not_roll():
 @pytest.mark.parametrize("name", ["sphere", "constrained"])
 def test_steps_to_the_far_side(name):
     """To the antipode, or as near to it as rounding allows, the turn is one of many; it must still be one."""
-    start = starts_inside(2000, 2.5)
+    start = starts_inside(MANY, 2.5)
     before = np.asarray(start.position / 2.5)
     for miss in (0.0, 1e-7, 1e-5, 1e-3):
-        parameters = np.zeros((2000, SPACES[name].num_parameters))
-        parameters[:, :3] = -2 * before + miss * RNG.normal(size=(2000, 3))
+        parameters = np.zeros((MANY, SPACES[name].num_parameters))
+        parameters[:, :3] = -2 * before + miss * RNG.normal(size=(MANY, 3))
         end = RETRACT_MANY[name](start, real(parameters))
         np.testing.assert_allclose(end.position, -start.position, atol=3e-6 + 20 * miss)
         assert_rotation(end.rotation)
@@ -163,22 +168,21 @@ def test_nothing_happens_at_the_poles(pole, offset, x64):
     """The derivative of the rotation is as at any other place: a turn of the camera by as much as it moves."""
     start = look_at(jnp.asarray([offset, pole * 2.5, 0.5 * offset]))
     move = np.cross(np.asarray(start.position) / 2.5, units(1)[0])
-    run = jax.jit(lambda at: flat(SPHERE.retract(start, at)))
     slope = jacobian("sphere", start, np.zeros(3)) @ move
-    central = (run(jnp.asarray(1e-5 * move)) - run(jnp.asarray(-1e-5 * move))) / 2e-5
+    central = (FLAT(start, jnp.asarray(1e-5 * move)) - FLAT(start, jnp.asarray(-1e-5 * move))) / 2e-5
     np.testing.assert_allclose(slope, central, atol=1e-8)
     # A turn by the angle v has |dR| = sqrt(2) v in the norm of Frobenius.
     speed = np.linalg.norm(move)
     np.testing.assert_allclose(np.linalg.norm(slope[:9]), math.sqrt(2) * speed, rtol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(slope[9:]), 2.5 * speed, rtol=1e-5)
     # And a way over the pole is one motion: no pose on it is far from the last.
-    way = jax.jit(jax.vmap(run))(jnp.linspace(-1.0, 1.0, 201)[:, None] * jnp.asarray(move))
+    way = WAY(start, jnp.linspace(-1.0, 1.0, 201)[:, None] * jnp.asarray(move))
     assert np.linalg.norm(np.diff(way, axis=0), axis=1).max() < 1.05 * 0.01 * np.linalg.norm(slope)
 
 
 def test_free_poses_reach_any_pose():
-    start, wanted = starts_inside(300, 2.5), Rotation.random(300, random_state=3).as_matrix().astype(np.float32)
-    position = real(3 * RNG.normal(size=(300, 3)))
+    start, wanted = starts_inside(MANY, 2.5), Rotation.random(MANY, random_state=3).as_matrix().astype(np.float32)
+    position = real(3 * RNG.normal(size=(MANY, 3)))
     turn = rotation_to_6d(wanted) - rotation_to_6d(start.rotation)
     end = RETRACT_MANY["free"](start, jnp.concatenate([turn, position - start.position], axis=1))
     np.testing.assert_allclose(end.rotation, wanted, atol=2e-6)
@@ -187,7 +191,7 @@ def test_free_poses_reach_any_pose():
 
 @pytest.mark.parametrize("size", [1.0, 1e3, 1e6])
 def test_free_poses_are_poses(size):
-    end = RETRACT_MANY["free"](starts_inside(500, 2.5), real(size * RNG.normal(size=(500, 9))))
+    end = RETRACT_MANY["free"](starts_inside(MANY, 2.5), real(size * RNG.normal(size=(MANY, 9))))
     assert_rotation(end.rotation)
 
 
@@ -210,9 +214,9 @@ def test_every_start_and_all_parameters_obey(position, quaternion, parameters):
 
 def test_starts_that_look_straight_away_are_turned_to_the_origin():
     """The origin is behind them, but for rounding: which way they are turned is open."""
-    at_centre = LOOK_AT(real(RNG.uniform(0.5, 4.0, (3000, 1)) * units(3000)))
+    at_centre = LOOK_AT(real(RNG.uniform(0.5, 4.0, (MANY, 1)) * units(MANY)))
     away = Pose(at_centre.rotation * real([1.0, -1.0, -1.0]), at_centre.position)
-    for parameters in (np.zeros((3000, 8)), RNG.normal(size=(3000, 8))):
+    for parameters in (np.zeros((MANY, 8)), RNG.normal(size=(MANY, 8))):
         assert_obeys(RETRACT_MANY["constrained"](away, real(parameters)))
 
 

@@ -14,7 +14,7 @@ from jaxnbv.cloud import PointCloud
 from jaxnbv.surfaces import GeometricSPSR
 
 COMPUTES = True
-SETTINGS = {"lengthscale": 0.15, "variance": 1.0, "noise": 0.3, "nu": 1.5, "truncation": 3}
+SETTINGS = {"lengthscale": 0.15, "variance": 1.0, "noise": 0.3, "nu": 1.5, "truncation": 2}
 
 
 def padded(points, normals, rows, capacity):

@@ -120,7 +120,8 @@ def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
     model = ScreenedSPSR(
         GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8), (OutsideBoundary(count=60), SeenEmpty(30))
     )
-    without, knowing = model.condition(data), model.condition_on_space(data, empty)
+    nothing = EmptyPoints(empty.points, jnp.zeros(45, bool))
+    without, knowing = (model.condition_on_space(data, seen) for seen in (nothing, empty))
     near, far = beside + np.array([0.0, 0.0, 0.1]), beside * np.array([1.0, -1.0, 1.0])
 
     def inside(posterior, x):

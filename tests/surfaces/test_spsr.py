@@ -45,12 +45,12 @@ def test_posterior_equals_regression_in_weight_space(x64, changes):
 
 def test_order_padding_and_the_values_of_masked_rows_change_nothing(x64):
     model = GeometricSPSR(**SETTINGS)
-    rows = RNG.permutation(45)[:30]
-    points, normals = 100.0 * RNG.standard_normal((2, 45, 3))
+    rows = RNG.permutation(37)[:30]
+    points, normals = 100.0 * RNG.standard_normal((2, 37, 3))
     points[rows], normals[rows] = POINTS, NORMALS
-    scattered = PointCloud(jnp.asarray(points), jnp.asarray(normals), jnp.zeros(45, bool).at[rows].set(True))
+    scattered = PointCloud(jnp.asarray(points), jnp.asarray(normals), jnp.zeros(37, bool).at[rows].set(True))
     results = []
-    for data in (cloud(POINTS, NORMALS), cloud(POINTS, NORMALS, 64), scattered):
+    for data in (cloud(POINTS, NORMALS), cloud(POINTS, NORMALS, 37), scattered):
         posterior = model.condition(data)
         likelihood, level = posterior.log_marginal_likelihood(), posterior.level
         results.append((posterior.mean(QUERIES), posterior.covariance(QUERIES, QUERIES), likelihood, level))
@@ -178,8 +178,8 @@ def test_variance_does_not_depend_on_the_size_of_its_chunks(x64, monkeypatch):
     posterior = GeometricSPSR(**SETTINGS).condition(cloud(POINTS, NORMALS))
     whole = posterior.variance(QUERIES)
     monkeypatch.setattr("jaxnbv.surfaces.spsr._CHUNK_VALUES", 5 * len(POINTS))
-    jax.clear_caches()
-    np.testing.assert_allclose(posterior.variance(QUERIES), whole, rtol=1e-10)
+    # Two more than before, so that it is compiled anew.
+    np.testing.assert_allclose(posterior.variance(np.concatenate([QUERIES, QUERIES[:2]]))[:-2], whole, rtol=1e-10)
 
 
 def test_nothing_recompiles_for_clouds_of_one_capacity():
@@ -254,11 +254,15 @@ def test_points_where_functions_only_repeat_are_refused():
         assert np.isfinite(ask(near)).all()
 
 
-def test_samples_at_the_data_have_the_posteriors_moments(computes, x64):
+def test_samples_at_the_data_have_the_posteriors_moments():
     """Of 4,000 samples: a standard deviation is known to 1.1 %. Noise as large as the field, so that draws without it
     would vary less."""
     settings = SETTINGS | {"noise": 0.7}
-    values = GeometricSPSR(**settings).condition(cloud(POINTS, NORMALS)).sample(jax.random.key(3), 4000)(POINTS)
+    values = (
+        GeometricSPSR(**settings)
+        .condition(cloud(POINTS, NORMALS))
+        .sample(jax.random.key(3), 4000)(POINTS.astype(np.float32))
+    )
     mean, covariance = WeightSpace(**settings).posterior(POINTS, NORMALS, POINTS)
     deviation = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(np.mean(values, axis=0), mean, atol=5 * deviation.max() / np.sqrt(4000))
@@ -268,15 +272,15 @@ def test_samples_at_the_data_have_the_posteriors_moments(computes, x64):
 @pytest.mark.parametrize("double", [False, True])
 def test_points_on_the_border_of_the_scene_are_accepted(double):
     with jax.enable_x64(double):
-        points = np.concatenate([POINTS, np.pi / 2 * np.array([[1, -1, 1], [-1, 0, 0]])])
-        normals = np.concatenate([NORMALS, [[1.0, 0, 0], [0, 1, 0]]])
+        points = np.concatenate([POINTS[2:], np.pi / 2 * np.array([[1, -1, 1], [-1, 0, 0]])])
+        normals = np.concatenate([NORMALS[2:], [[1.0, 0, 0], [0, 1, 0]]])
         posterior = GeometricSPSR(**SETTINGS).condition(cloud(points, normals))
         mean, _ = WeightSpace(**SETTINGS).posterior(points, normals, QUERIES)
         np.testing.assert_allclose(posterior.mean(QUERIES), mean, atol=1e-3)
 
 
 def test_fewer_than_one_sample_is_refused():
-    posterior = GeometricSPSR(lengthscale=0.1, truncation=3).condition(cloud(POINTS, NORMALS))
+    posterior = GeometricSPSR(**SETTINGS).condition(cloud(POINTS, NORMALS))
     with pytest.raises(ValueError, match="asked for 0 samples"):
         posterior.sample(jax.random.key(0), 0)
 

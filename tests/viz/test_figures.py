@@ -5,17 +5,15 @@ import dataclasses
 import itertools
 import json
 
-import jax
 import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
+from small_run import CAMERA, small_run
 
 import jaxnbv as nbv
 from jaxnbv.answers import Answer, Panel, Quantity
-from jaxnbv.datasets.demo import demo_object
-from jaxnbv.pose import look_at
 from jaxnbv.viz import report_data
 from jaxnbv.viz.data import MeanSurface
 from jaxnbv.viz.figures import STYLE, Stills, figures_of
@@ -24,14 +22,11 @@ from jaxnbv.viz.stage import stage_of
 from jaxnbv.viz.style import spaced_ticks
 from jaxnbv.viz.task import Task
 
-CAMERA = nbv.Camera(height=16, width=16)
-
 
 @pytest.fixture(scope="module")
 def episode():
-    model = nbv.GeometricSPSR(truncation=12, lengthscale=0.03)
-    planner = nbv.Planner(model, CAMERA, nbv.Coverage(), nbv.DiscreteSearch(12), 3, nbv.Grid(24), capacity=512)
-    return nbv.simulate(planner, demo_object(), look_at((0.8, 0.9, 2.2)), 3, jax.random.key(0), progress=False)
+    """Of 13 candidates: the second view stands out; the third is level with another, which its picture marks."""
+    return small_run(nbv.DiscreteSearch(13))
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +52,7 @@ def texts(figure):
     scenes = [axes for axes in figure.axes if axes.images and not axes.axison]
     numbers = {id(text) for axes in scenes for text in axes.texts}
     renderer = FigureCanvasAgg(figure).get_renderer()
-    FigureCanvasAgg(figure).draw()
+    figure.draw_without_rendering()
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):
             low, high = sorted(axis.get_view_interval())
@@ -99,19 +94,22 @@ LONG = Quantity(
 def test_letters_neither_collide_nor_are_cut(data, count, quantity):
     shown = of_views(data, count)
     shown = shown if quantity is None else dataclasses.replace(shown, quantity=quantity)
+    # A view's own figures do not depend on later ones: those of all but the last are drawn with three views.
+    last = f"view_{count:02d}"
     with mpl.rc_context(STYLE):
-        for draw in figures_of(shown, CAMERA, Stills(shown)).values():
-            check_letters(draw())
+        for name, draw in figures_of(shown, CAMERA, Stills(shown)).items():
+            if count == 3 or name.startswith(last) or not name.startswith("view"):
+                check_letters(draw())
 
 
 @pytest.mark.parametrize("low", [1e-4, 2e-3, 0.04])
 def test_the_ticks_of_any_range_have_room(data, low, monkeypatch):
     monkeypatch.setattr("jaxnbv.viz.figures.deviation_range", lambda data: (low, 1.0))
-    for count in (2, 3):
+    for count, names in ((2, ("view_02", "overview")), (3, ("overview",))):
         shown = of_views(data, count)
         with mpl.rc_context(STYLE):
             drawings = figures_of(shown, CAMERA, Stills(shown))
-            for name in ("view_02", "overview"):
+            for name in names:
                 check_letters(drawings[name]())
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
+from small_run import small_run
 
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
@@ -21,10 +22,8 @@ from jaxnbv.viz.notebook import drawing_of
 @pytest.fixture(scope="module")
 def episode():
     """Of a ball of radius 1, seen from two sides."""
-    small = nbv.Camera(height=24, width=24), nbv.Coverage(), nbv.DiscreteSearch(12)
-    planner = nbv.Planner(nbv.GeometricSPSR(0.05, 0.2, 8), *small, 2, nbv.Grid(24), 2000)
     scene, first = nbv.SDFSurface(Sphere(1.0)), nbv.look_at((0.0, 0.0, 2.5))
-    return nbv.simulate(planner, scene, first, 2, jax.random.key(0), nbv.SensorNoise(0.0, 0.0), progress=False)
+    return small_run(nbv.DiscreteSearch(12), 2, scene, noise=nbv.SensorNoise(0.0, 0.0), first=first)
 
 
 def parts(shown):
@@ -44,8 +43,8 @@ def test_each_is_a_small_picture_and_a_line(episode):
     count = int(episode.cloud.count)
     scan, proposal = episode.views[0].scan, episode.views[1].proposal
     facts = (
-        (episode.cloud, f"{count:,} points of at most 2,000; box "),
-        (scan, f"{int(scan.count)} points of 576 rays, {576 - int(scan.count)} met nothing; box "),
+        (episode.cloud, f"{count:,} points of at most 512; box "),
+        (scan, f"{int(scan.count)} points of 144 rays, {144 - int(scan.count)} met nothing; box "),
         (proposal, f"value {float(proposal.value):.4g}"),
         (episode, f"2 views by expected coverage gain, {count:,} points"),
         (episode.planner.model.condition(episode.cloud), "level "),

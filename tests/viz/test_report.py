@@ -1,5 +1,6 @@
 """The report: self-contained, complete, true to the episode; and what its pictures are made of."""
 
+import dataclasses
 import json
 import re
 from html.parser import HTMLParser
@@ -12,42 +13,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from small_run import CAMERA, small_planner, small_run
 
 import jaxnbv as nbv
 from jaxnbv.answers import number
-from jaxnbv.datasets.demo import demo_object
 from jaxnbv.scanning.sdf import Sphere
-from jaxnbv.search import Search
 from jaxnbv.viz import report_data, write_figures, write_report
 from jaxnbv.viz.data import choice_of, mean_surface
 from jaxnbv.viz.render import frustum
 from jaxnbv.viz.sphere import from_mollweide, mollweide, smooth_map
 from jaxnbv.viz.style import log_ticks, round_range
 
-CAMERA = nbv.Camera(height=24, width=24)
-
-
-def small_planner(search: Search, **changes) -> nbv.Planner:
-    options = {
-        "model": nbv.GeometricSPSR(truncation=16, lengthscale=0.02),
-        "camera": CAMERA,
-        "acquisition": nbv.Coverage(),
-        "num_samples": 4,
-        "capacity": 2048,
-        "grid": nbv.Grid(40),
-    }
-    return nbv.Planner(search=search, **(options | changes))
-
-
-def run(search, views=3, scene=None, **changes):
-    scene = demo_object() if scene is None else scene
-    first = nbv.look_at((0.8, 0.9, 2.2))
-    return nbv.simulate(small_planner(search, **changes), scene, first, views, jax.random.key(0), progress=False)
-
 
 @pytest.fixture(scope="module")
 def episode():
-    return run(nbv.DiscreteSearch(30))
+    return small_run(nbv.DiscreteSearch(30))
 
 
 @pytest.fixture(scope="module")
@@ -141,17 +121,17 @@ def test_figures_are_pictures_of_the_stated_size(report):
 @pytest.mark.parametrize(
     ("search", "label", "words"),
     [
-        (nbv.FarthestView(30), "distance to the nearest camera (scene units)", "scene units, was the highest of 30"),
-        (nbv.RandomView(30), "lot drawn (uniform on [0, 1))", "drawn at random from 30 open candidates"),
+        (nbv.FarthestView(12), "distance to the nearest camera (scene units)", "scene units, was the highest of 12"),
+        (nbv.RandomView(12), "lot drawn (uniform on [0, 1))", "drawn at random from 12 open candidates"),
         (
-            nbv.UncertaintyView(30),
+            nbv.UncertaintyView(12),
             "uncertain length of the principal ray (scene units)",
             "scene units, was the highest",
         ),
     ],
 )
 def test_baselines_are_labelled_in_their_own_units(search, label, words):
-    data = report_data(run(search, views=2), progress=False)
+    data = report_data(small_run(search, views=2), progress=False)
     assert data.quantity.label == label
     assert words in data.views[1].sentence
     assert "coverage gain" not in data.views[1].sentence
@@ -176,11 +156,11 @@ def test_the_sentence_tells_the_numbers_of_the_step(episode, data):
     assert "two standard errors" in shown.sentence
 
 
-def test_a_scene_without_truth_counts_points(tmp_path):
-    grid = nbv.Grid(40)
+def test_a_scene_without_truth_counts_points(tmp_path, episode):
+    grid = nbv.Grid(24)
     distance = np.linalg.norm(np.stack(np.meshgrid(*[grid.axis] * 3, indexing="ij")), axis=0) - 1.0
     scene = nbv.GridSurface.from_values(distance, 0.0, grid)
-    lone = run(nbv.RandomView(30), views=1, scene=scene)
+    lone = dataclasses.replace(episode, scene=scene, views=episode.views[:1])
     path = write_report(lone, tmp_path, progress=False)
     assert page_data(path)["progress"] == {"label": "points kept", "values": [float(lone.cloud.count)]}
     truth = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
@@ -208,7 +188,7 @@ class SphereModel(nbv.SurfaceModel):
 
 def test_any_posterior_has_a_surface_with_a_standard_deviation():
     # f = |x| - r with r ~ N(0.9, 0.03^2): the surface is a sphere known to 0.03 all over, estimated from 64 samples.
-    planner = eqx.tree_at(lambda p: p.model, small_planner(nbv.RandomView()), SphereModel())
+    planner = small_planner(nbv.RandomView(), model=SphereModel(), grid=nbv.Grid(40))
     cloud = nbv.PointCloud.from_arrays([[0.9, 0.0, 0.0]], [[1.0, 0.0, 0.0]])
     surface = mean_surface(planner, planner.init(cloud))
     radius = np.linalg.norm(surface.vertices, axis=1)
@@ -218,7 +198,7 @@ def test_any_posterior_has_a_surface_with_a_standard_deviation():
 
 
 def test_the_surface_of_the_mean_is_carved():
-    planner = eqx.tree_at(lambda p: p.model, small_planner(nbv.RandomView()), SphereModel())
+    planner = small_planner(nbv.RandomView(), model=SphereModel(), grid=nbv.Grid(40))
     state = planner.init(nbv.PointCloud.from_arrays([[0.9, 0.0, 0.0]], [[1.0, 0.0, 0.0]]))
     empty = jnp.broadcast_to((planner.grid.axis > 0.3)[:, None, None], state.seen_empty.shape)
     vertices = mean_surface(planner, eqx.tree_at(lambda s: s.seen_empty, state, empty)).vertices
@@ -239,7 +219,8 @@ def test_a_mean_without_a_surface_is_drawn_without_one(tmp_path, episode, data):
 
 def test_what_was_seen_is_known_better_than_what_was_not():
     scene = nbv.SDFSurface(Sphere(0.9))
-    view = run(nbv.RandomView(30), views=1, scene=scene)
+    model, camera = nbv.GeometricSPSR(truncation=16, lengthscale=0.02), nbv.Camera(height=24, width=24)
+    view = small_run(nbv.RandomView(12), views=1, scene=scene, model=model, camera=camera)
     surface = mean_surface(view.planner, view.state_after(1))
     distance = np.linalg.norm(surface.vertices[:, None] - view.cloud.to_numpy()[0][None, ::4], axis=-1).min(axis=1)
     assert np.median(surface.deviation[distance < 0.1]) < 0.3 * np.median(surface.deviation[distance > 0.6])

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_run import small_run
 
 import jaxnbv as nbv
 from jaxnbv.answers import Answer, number
@@ -21,7 +22,6 @@ from jaxnbv.viz.data import report_data
 from jaxnbv.viz.report import report_html
 from jaxnbv.viz.task import since, true_cloud
 
-CAMERA = nbv.Camera(height=16, width=16)
 NAMES = ("left", "right", "up")
 
 
@@ -40,10 +40,7 @@ def greatest_height(cloud):
 
 
 def run(score, scene, views=3):
-    model = nbv.GeometricSPSR(truncation=12, lengthscale=0.03)
-    planner = nbv.Planner(model, CAMERA, score, nbv.RandomView(8), 2, nbv.Grid(24), capacity=512)
-    first, none = nbv.look_at((0.8, 0.9, 2.2)), nbv.SensorNoise(0.0, 0.0)
-    return nbv.simulate(planner, scene, first, views, jax.random.key(3), none, progress=False)
+    return small_run(nbv.RandomView(8), views, scene, score, nbv.SensorNoise(0.0, 0.0))
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
+from small_run import CAMERA, small_run
 
 import jaxnbv as nbv
 from jaxnbv.answers import number
 from jaxnbv.cli.actions.lines import Lines
-from jaxnbv.datasets.demo import demo_object
 from jaxnbv.episode import view_keys
 from jaxnbv.pose import look_at
 from jaxnbv.search import Search, Trajectories
@@ -27,7 +27,6 @@ from jaxnbv.viz.trajectories import MAP_VIEWS, step_values
 from jaxnbv.viz.trajectory_figures import frusta_steps, small_frusta
 from jaxnbv.viz.words import describe_choice
 
-CAMERA = nbv.Camera(height=16, width=16)
 COVERAGE = nbv.DiscreteSearch().quantity(nbv.Coverage())
 
 
@@ -52,12 +51,18 @@ class Walks(Search):
         return nbv.Proposal(found.pose, found.value, candidates, found.values[:4], ways)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def coarse():
+    """Surfaces are traced at a quarter of their pixels a side, which is most of what a picture takes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("jaxnbv.viz.figures._STILL", 160)
+        yield
+
+
 @pytest.fixture(scope="module")
 def few():
     """On the sphere, from as many candidates as starts, which are too few for a map."""
-    model = nbv.GeometricSPSR(truncation=12, lengthscale=0.03)
-    planner = nbv.Planner(model, CAMERA, nbv.Coverage(), Walks(), 2, nbv.Grid(32), capacity=512)
-    return nbv.simulate(planner, demo_object(), look_at((0.8, 0.9, 2.2)), 2, jax.random.key(0), progress=False)
+    return small_run(Walks(), views=2)
 
 
 @pytest.fixture(scope="module")

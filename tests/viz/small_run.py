@@ -1,0 +1,28 @@
+"""A small planner and a small scene, which the tests of pictures share: what is compiled for one serves all."""
+
+import jax
+
+import jaxnbv as nbv
+from jaxnbv.scanning.sdf import Sphere
+
+CAMERA = nbv.Camera(height=12, width=12)
+FIRST = nbv.look_at((0.8, 0.9, 2.2))
+SCENE = nbv.SDFSurface(Sphere(0.7) | Sphere(0.35).translate([0.8, 0.3, 0.0]))
+
+
+def small_planner(search, acquisition=None, **changes) -> nbv.Planner:
+    options = {
+        "model": nbv.GeometricSPSR(0.05, 0.2, 8),
+        "camera": CAMERA,
+        "num_samples": 2,
+        "capacity": 512,
+        "grid": nbv.Grid(24),
+    }
+    acquisition = nbv.Coverage() if acquisition is None else acquisition
+    return nbv.Planner(search=search, acquisition=acquisition, **(options | changes))
+
+
+def small_run(search, views=3, scene=SCENE, acquisition=None, noise=None, first=FIRST, **changes) -> nbv.Episode:
+    planner = small_planner(search, acquisition, **changes)
+    noise = nbv.SensorNoise() if noise is None else noise
+    return nbv.simulate(planner, scene, first, views, jax.random.key(0), noise, progress=False)
