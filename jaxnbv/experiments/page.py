@@ -5,6 +5,7 @@ import html
 import itertools
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 from PIL import Image
@@ -135,7 +136,7 @@ def _markdown_with_images(found: Sequence[Chapter], out: Path) -> str:
             copy = make_folder(images) / f"{index}-{file.name}"
             # A third of the size, for a repository.
             image = Image.open(file).convert("RGB").quantize(256)
-            write_whole(copy, lambda whole, image=image: image.save(whole, "png", optimize=True))
+            write_whole(copy, partial(image.save, format="png", optimize=True))
             sections.append(f"![{caption}]({images.name}/{copy.name})")
         sections.append(_folded(chapter.tables, _markdown_table))
         sections.append(f"<details><summary>Settings</summary>\n\n```json\n{chapter.settings}\n```\n\n</details>")

@@ -69,8 +69,10 @@ class Still:
         if surface is None:
             return
         mesh = TriangleMesh(surface.vertices.astype(np.float64), surface.faces.astype(np.int64), Frame())
-        origins, directions = self.fine_camera.rays(self.pose)
-        hits = mesh.trace(origins, directions)
+        # Not by the camera's compiled rays: of millions of pixels, XLA takes seconds over the constants.
+        directions = np.asarray(self.fine_camera.pixel_directions()) @ np.asarray(self.pose.rotation).T
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        hits = mesh.trace(np.broadcast_to(np.asarray(self.pose.position), directions.shape), directions)
         mask = np.asarray(hits.mask)
         points = np.asarray(hits.points)[mask]
         distance, near = cKDTree(surface.vertices).query(points, k=3)
