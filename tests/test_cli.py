@@ -199,11 +199,16 @@ FARTHEST = ("run", "ring.ply", "--search", "farthest", "--views", "2", "--no-rep
 
 
 def test_an_episode_is_replaced_when_asked(ring):
+    """With its report."""
     for seed in ("0", "1"):
         result = run_command(*FARTHEST, "--out", "mine", "--seed", seed, *(("--overwrite",) * int(seed)), cwd=ring)
         assert result.returncode == 0, result.stderr
         config = json.loads((ring / "mine" / "episode.json").read_text())["config"]
         assert config["key"]["data"] == [0, int(seed)]
+        assert not (ring / "mine" / "report.html").exists()
+        (ring / "mine" / "figures").mkdir()
+        for name in ("report.html", "figures/view_01.png"):
+            (ring / "mine" / name).write_text("drawn")
     result = run_command(*FARTHEST, "--out", "mine", "--views", "3", "--seed", "1", cwd=ring)
     assert result.returncode == 0, result.stderr
     (ring / "thesis").mkdir()

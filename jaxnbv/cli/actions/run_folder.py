@@ -10,7 +10,8 @@ from jaxnbv.folders import AnotherConfigurationError, read_json, writing_in
 from jaxnbv.model_name import ModelName
 from jaxnbv.storage import remove_episode
 
-_OPTIONS, _REPORT = "options.json", ("report.html", "figures/*.png")
+_OPTIONS, _FIGURES = "options.json", "figures"
+_REPORT = "report.html", f"{_FIGURES}/*.png"
 
 
 def usual_folder(name: str, task: str, search: str, model: ModelName, seed: int) -> Path:
@@ -29,6 +30,9 @@ def clear(folder: Path) -> None:
             for pattern in (_OPTIONS, *_REPORT):
                 for file in folder.glob(pattern):
                     file.unlink()
+            figures = folder / _FIGURES
+            if figures.is_dir() and not any(figures.iterdir()):
+                figures.rmdir()
 
 
 def note(folder: Path, asked: dict[str, Any]) -> None:
