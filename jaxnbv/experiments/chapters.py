@@ -13,7 +13,7 @@ from jaxnbv.experiments.records import read_records
 from jaxnbv.experiments.registry import STUDIES
 from jaxnbv.experiments.statistics import LEVEL
 from jaxnbv.experiments.study import Study
-from jaxnbv.experiments.tables import all_rows, count_of, difference_text, result_text
+from jaxnbv.experiments.tables import all_rows, count_of, difference_text, result_text, tight
 from jaxnbv.folders import read_json
 
 _REMEDY = "give a folder that `jaxnbv study` has written"
@@ -113,15 +113,10 @@ def _tables(
         here = [row for row in rows if (row["group"], row["quantity"]) == (group, measure.name)]
         if here:
             names, columns = (list(dict.fromkeys(row[what] for row in here)) for what in (key, "at"))
-            cells = {(row[key], row["at"]): _tight(text(row, measure)) for row in here}
+            cells = {(row[key], row["at"]): tight(text(row, measure)) for row in here}
             lines = [[name, *(cells.get((name, column), "") for column in columns)] for name in names]
             made.append(Table(caption, [measure.by, *map(str, columns)], lines, part))
     return made
-
-
-def _tight(text: str) -> str:
-    """Without the spaces that align it."""
-    return " ".join(text.split()).replace("[ ", "[")
 
 
 def _facts(records: Sequence[Record], config: dict[str, Any]) -> list[str]:

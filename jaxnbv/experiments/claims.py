@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from jaxnbv.experiments.measures import Claim, Row
 from jaxnbv.experiments.study import Study
-from jaxnbv.experiments.tables import difference_text
+from jaxnbv.experiments.tables import difference_text, tight
 
 
 class Verdict(NamedTuple):
@@ -46,7 +46,7 @@ def verdicts(study: type[Study], differences: Sequence[Row]) -> list[Verdict]:
             where = "level with"
             if row["excludes_zero"]:
                 where = "ahead of" if (row["mean"] < 0) == (measure.better == "less") else "behind"
-            against[method] = where, " ".join(difference_text(row, measure).rstrip("* ").split()).replace("[ ", "[")
+            against[method] = where, tight(difference_text(row, measure).rstrip("* "))
         if against:
             found.append(Verdict(claim, against))
     return found

@@ -112,6 +112,11 @@ def difference_text(row: Row, measure: Measure) -> str:
     return f"{mean:{form}} [{low:{form}}, {high:{form}}]{'*' if row['excludes_zero'] else ' '}"
 
 
+def tight(text: str) -> str:
+    """Without the spaces that align it."""
+    return " ".join(text.split()).replace("[ ", "[")
+
+
 def text_grid(corner: str, rows: Sequence[str], columns: Sequence[str], cells: Mapping[tuple[str, str], str]) -> str:
     """One line for each row, aligned; cells by row and column."""
     width = max(map(len, (*cells.values(), *columns))) + 2

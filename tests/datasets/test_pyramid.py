@@ -172,12 +172,12 @@ def test_no_pattern_breaks_through_a_side_and_none_reaches_the_apex():
 def faces(pyramid, count=400):
     """Points in the pyramid's own frame on floor, wall, base and sides, none of them within 0.01 of an edge."""
     name, height, depth = name_of(pyramid), float(pyramid.height), float(pyramid.depth)
-    flat = RNG.uniform(-1, 1, (5 * count, 2))
+    flat = RNG.uniform(-1, 1, (20 * count, 2))
     floor = flat[is_inside(name, flat) & (distance_to_outline(name, flat) > 0.03)][:count]
     floor = np.insert(of_pattern(pyramid, floor), 2, depth, axis=1)
     wall = of_pattern(pyramid, on_outline(name, count))
     wall = np.insert(wall, 2, RNG.uniform(0.012, depth, count), axis=1)
-    base = RNG.uniform(-0.99, 0.99, (5 * count, 2))
+    base = RNG.uniform(-0.99, 0.99, (20 * count, 2))
     turn, size = float(pyramid.turn), float(pyramid.size)
     c, s = np.cos(turn), np.sin(turn)
     local = (base - np.asarray(pyramid.place, np.float64)) @ np.array([[c, -s], [s, c]]) / size

@@ -28,13 +28,9 @@ def portion_of(split, framing, first, count):
     return scanned_clouds(CLASS_SETS["pyramid"], split, framing, range(first, first + count), POINTS)
 
 
-def clouds_of(split, first, count):
-    portions = [portion_of(split, Framing.CLOSE_UP, first + i, PORTION) for i in range(0, count, PORTION)]
+def clouds_of(split, first, count, framing=Framing.CLOSE_UP):
+    portions = [portion_of(split, framing, first + i, PORTION) for i in range(0, count, PORTION)]
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *portions)
-
-
-def few_clouds_of(split, framing):
-    return portion_of(split, framing, 5 + FEW.start, FEW.stop - FEW.start)
 
 
 def imagined_of(index):
@@ -44,11 +40,6 @@ def imagined_of(index):
 @pytest.fixture(scope="module")
 def scanned():
     return clouds_of(Split.TRAIN, 5, COUNT)
-
-
-@pytest.fixture(scope="module")
-def portion():
-    return few_clouds_of(Split.TRAIN, Framing.CLOSE_UP)
 
 
 @pytest.fixture(scope="module")
@@ -130,19 +121,20 @@ def test_points_that_tell_the_class_lie_on_what_tells_it(scanned):
         assert (own[tells, 2] < float(pyramid.depth) + 0.04).all()
 
 
-def test_clouds_can_be_made_again_in_other_portions(scanned, portion):
-    assert_same(portion, few_clouds_of(Split.TRAIN, Framing.CLOSE_UP))
-    np.testing.assert_array_equal(portion.telling_pixels, scanned.telling_pixels[FEW])
-    np.testing.assert_allclose(portion.clouds.points, scanned.clouds.points[FEW], atol=1e-5)
+def test_clouds_can_be_made_again_in_other_portions(scanned):
+    assert_same(scanned, clouds_of(Split.TRAIN, 5, COUNT))
+    part = portion_of(Split.TRAIN, Framing.CLOSE_UP, 5 + FEW.start, FEW.stop - FEW.start)
+    np.testing.assert_array_equal(part.telling_pixels, scanned.telling_pixels[FEW])
+    np.testing.assert_allclose(part.clouds.points, scanned.clouds.points[FEW], atol=1e-5)
 
 
-def test_splits_and_framings_differ(portion):
-    other = few_clouds_of(Split.TEST, Framing.CLOSE_UP)
-    assert not np.array_equal(other.telling_pixels, portion.telling_pixels)
-    whole = few_clouds_of(Split.TRAIN, Framing.WHOLE)
-    np.testing.assert_array_equal(whole.labels, portion.labels)
+def test_splits_and_framings_differ(scanned):
+    other = clouds_of(Split.TEST, 5, COUNT)
+    assert not np.array_equal(other.telling_pixels, scanned.telling_pixels)
+    whole = clouds_of(Split.TRAIN, 5, COUNT, Framing.WHOLE)
+    np.testing.assert_array_equal(whole.labels, scanned.labels)
     assert (
-        np.abs(np.asarray(whole.clouds.points)).max() < 0.625 + 0.06 < np.abs(np.asarray(portion.clouds.points)).max()
+        np.abs(np.asarray(whole.clouds.points)).max() < 0.625 + 0.06 < np.abs(np.asarray(scanned.clouds.points)).max()
     )
 
 
