@@ -118,25 +118,25 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
     [
         (("run", "absent.obj"), ("absent.obj",)),
         (("demo", "--views", "0"), ("0 views", "at least one")),
-        (("demo", "--first", "1,2"), ("'1,2'", "three numbers")),
-        (("demo", "--first", "0,0,0"), ("target",)),
-        (("demo", "--first", "0,0,9", "--noise", "-1"), ("-1", "negative")),
+        (("demo", "--task", "coverage", "--first", "1,2"), ("'1,2'", "three numbers")),
+        (("demo", "--task", "coverage", "--first", "0,0,0"), ("target",)),
+        (("demo", "--task", "coverage", "--first", "0,0,9", "--noise", "-1"), ("-1", "negative")),
         (("demo", "--first", "0.05,0,0"), ("0.05,0,0", "inside the object", "outside")),
         (("run", "ball.obj", "--first", "0.3,-1,0.2"), ("0.3,-1,0.2", "inside the object", "outside")),
         (("run", "ball.obj", "--radius", "1"), ("cameras 1 from", "1.25", "give more")),
         (("run", "ball.obj", "--lengthscale", "0"), ("lengthscale is 0", "positive")),
-        (("demo", "--first", "0,9,0,1"), ("three numbers",)),
-        (("demo", "--first", "0,0,1e30"), ("position", "1.e+30")),
+        (("demo", "--task", "coverage", "--first", "0,9,0,1"), ("three numbers",)),
+        (("demo", "--task", "coverage", "--first", "0,0,1e30"), ("position", "1.e+30")),
         (("demo", "--scene", "99999999999999"), ("--scene", "2147483647")),
         (("run", "flat.obj"), ("flat.obj", "area")),
         (("run", "broken.glb"), ("broken.glb", "cannot read")),
-        (("demo", "--out", "flat.obj"), ("flat.obj", "File exists")),
-        (("demo", "--until", "surely=3"), ("'surely=3'", "sure", "never")),
-        (("demo", "--until", "sure"), ("'sure'", "a number")),
+        (("demo", "--task", "coverage", "--out", "flat.obj"), ("flat.obj", "File exists")),
+        (("demo", "--task", "coverage", "--until", "surely=3"), ("'surely=3'", "sure", "never")),
+        (("demo", "--task", "coverage", "--until", "sure"), ("'sure'", "a number")),
         (("demo", "--task", "coverage", "--until", "sure=0.9"), ("Coverage", "classifier")),
         (("demo", "--vews", "3"), ("--vews", "--views")),
         (("demo", "--search", "best"), ("best", "discrete")),
-        (("demo", "--out", "occupied"), ("occupied", "other files")),
+        (("demo", "--task", "coverage", "--out", "occupied"), ("occupied", "other files")),
         (("demo", "--device", "gpu"), ("gpu", "--device")),
         (("run", "ball.obj", "--task", "parts"), ("--category",)),
         (("run", "ball.obj", "--task", "parts", "--category", "teapot"), ("teapot", "mug")),
@@ -211,6 +211,12 @@ def test_an_episode_is_replaced_when_asked(ring):
             (ring / "mine" / name).write_text("drawn")
     result = run_command(*FARTHEST, "--out", "mine", "--views", "3", "--seed", "1", cwd=ring)
     assert result.returncode == 0, result.stderr
+    (ring / "mine" / "figures" / "thesis.tex").write_text("mine")
+    held = {path: path.read_bytes() for path in (ring / "mine").rglob("*") if path.is_file()}
+    result = run_command(*FARTHEST, "--out", "mine", "--overwrite", cwd=ring)
+    assert result.returncode == 2
+    assert "thesis.tex" in result.stderr
+    assert all(path.read_bytes() == content for path, content in held.items())
     (ring / "thesis").mkdir()
     (ring / "thesis" / "thesis.tex").write_text("mine")
     result = run_command(*FARTHEST, "--out", "thesis", "--overwrite", cwd=ring)
@@ -295,7 +301,8 @@ def test_a_published_checkpoint_converts_and_classifies_a_mesh(tmp_path, shared)
     assert result.returncode == 0, result.stderr
     assert "classes" in result.stdout
     trimesh.creation.torus(1.0, 0.4).export(tmp_path / "ring.ply")
-    arguments = ("--task", "mixed", "--network", "net.safetensors", "--quick", "--views", "2", "--no-report")
+    sizes = ("--candidates", "6", "--samples", "2", "--quick", "--views", "2")
+    arguments = ("--task", "mixed", "--network", "net.safetensors", *sizes, "--no-report")
     result = run_command("run", "ring.ply", *arguments, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "->" in result.stdout

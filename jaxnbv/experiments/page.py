@@ -124,8 +124,9 @@ def _html_cell(cell: str) -> str:
 
 
 def _markdown_with_images(found: Sequence[Chapter], out: Path) -> str:
-    """The text; its images are copied beside it."""
+    """The text; its images are copied beside it, and those of a page that was there before are removed."""
     images, overview = out.with_suffix(""), _overview(found)
+    before = set(images.glob("[0-9]*-*.png"))
     marks = "Bold: the best. Italic: the second, or an interval that excludes zero."
     sections = [f"# {_TITLE}", f"Written by `jaxnbv report`, jaxnbv {__version__}. {marks}"]
     sections += [_markdown_table(overview, "---")] if overview.rows else []
@@ -137,9 +138,12 @@ def _markdown_with_images(found: Sequence[Chapter], out: Path) -> str:
             # A third of the size, for a repository.
             image = Image.open(file).convert("RGB").quantize(256)
             write_whole(copy, partial(image.save, format="png", optimize=True))
+            before.discard(copy)
             sections.append(f"![{caption}]({images.name}/{copy.name})")
         sections.append(_folded(chapter.tables, _markdown_table))
         sections.append(f"<details><summary>Settings</summary>\n\n```json\n{chapter.settings}\n```\n\n</details>")
+    for file in before:
+        file.unlink()
     return "\n\n".join(sections) + "\n"
 
 

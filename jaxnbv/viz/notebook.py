@@ -49,6 +49,9 @@ class Picture:
         figure.savefig(file, format="png", dpi=dpi)
         self.png = file.getvalue()
 
+    def __repr__(self) -> str:
+        return f"Picture({len(self.png)} bytes of PNG)"
+
     def _repr_png_(self) -> bytes:
         return self.png
 

@@ -71,8 +71,14 @@ def test_html_holds_its_images_and_nothing_of_the_settings_is_code(tmp_path):
 
 
 def test_markdown_has_its_images_beside_it(tmp_path):
+    """And none of an earlier page."""
     written(tmp_path / "runs")
+    (tmp_path / "studies").mkdir()
+    for name in ("3-of_a_study_that_is_gone.png", "mine.png"):
+        (tmp_path / "studies" / name).write_bytes(b"PNG")
     page = write_page(tmp_path / "runs", tmp_path / "studies.md").read_text()
+    kept = {path.name for path in (tmp_path / "studies").iterdir()}
+    assert kept == {"0-points.png", "0-picture_0.png", "mine.png"}
     linked = re.findall(r"!\[[^]]+\]\(([^)]+)\)", page)
     assert linked == ["studies/0-points.png", "studies/0-picture_0.png"]
     assert all((tmp_path / name).is_file() for name in linked)

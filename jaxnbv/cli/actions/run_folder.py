@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from jaxnbv.checks import require
 from jaxnbv.files import write_text
 from jaxnbv.folders import AnotherConfigurationError, read_json, writing_in
 from jaxnbv.model_name import ModelName
@@ -23,14 +24,17 @@ def usual_folder(name: str, task: str, search: str, model: ModelName, seed: int)
 def clear(folder: Path) -> None:
     """Remove an episode, its report, and what was asked for; a folder of something else is left as it is.
 
-    **Raises:** `ValueError` if another process writes there.
+    **Raises:** `ValueError` if another process writes there, or if something else lies among the report's figures;
+    nothing is removed then.
     """
+    figures = folder / _FIGURES
+    others = sorted(file.name for file in figures.glob("*") if file.suffix != ".png")
+    require(not others, f"{figures} holds {', '.join(others)}, which is of no report: move it, or give another --out")
     if remove_episode(folder):
         with writing_in(folder):
             for pattern in (_OPTIONS, *_REPORT):
                 for file in folder.glob(pattern):
                     file.unlink()
-            figures = folder / _FIGURES
             if figures.is_dir() and not any(figures.iterdir()):
                 figures.rmdir()
 

@@ -18,7 +18,8 @@ from jaxnbv.checks import InputError
 from jaxnbv.experiments.measures import Record, methods_of
 from jaxnbv.experiments.reconstruction.study import RECONSTRUCTIONS, ReconstructionStudy, reconstruct
 from jaxnbv.experiments.tiles import Tiles, first_scenes, save_pictures
-from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, mesh_from_sdf
+from jaxnbv.metrics import true_mesh
+from jaxnbv.scanning import TriangleMesh
 from jaxnbv.viz.data import MeanSurface
 from jaxnbv.viz.render import Still
 from jaxnbv.viz.style import DEVIATION, GREY, log_ticks
@@ -55,7 +56,7 @@ def write_pictures(
 
 def _picture(record: Record, study: ReconstructionStudy, methods: Sequence[str], pixels: int, dense: int) -> Figure:
     scene = study.scene(record["scene"])
-    truth = _true_mesh(scene.surface)
+    truth = cast(TriangleMesh, true_mesh(scene.surface))
     tree = cKDTree(truth.sample_points(jax.random.key(0), dense))
     eye = _eye(np.asarray(study.candidates.poses().position[record["first"]], np.float64))
     held = [record["methods"][method]["reconstructions"] for method in methods]
@@ -106,11 +107,6 @@ def _picture(record: Record, study: ReconstructionStudy, methods: Sequence[str],
     label = "distance to the true surface\n(scene units)"
     tiles.write(wide - 3.5, tall - 0.33, label, fontsize=8, ha="right")
     return tiles.figure
-
-
-def _true_mesh(scene: Surface) -> TriangleMesh:
-    """Of the surfaces that a study has: a mesh as it is, a solid by marching cubes."""
-    return mesh_from_sdf(scene.sdf, Grid()) if isinstance(scene, SDFSurface) else cast(TriangleMesh, scene)
 
 
 def _eye(first: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
