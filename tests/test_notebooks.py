@@ -7,6 +7,7 @@ from pathlib import Path
 
 import nbformat
 import pytest
+from jupyter_client.manager import KernelManager
 from nbclient import NotebookClient
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -96,14 +97,24 @@ def test_other_code_has_another_hash():
     assert code_hash(notebook) != before
 
 
+@pytest.fixture(scope="module")
+def kernel():
+    """One for all, so that what a notebook has compiled the next one has; they share no names."""
+    manager = KernelManager(kernel_name="python3")
+    manager.start_kernel()
+    yield manager
+    manager.shutdown_kernel(now=True)
+
+
 @pytest.mark.parametrize("name", SMALL)
-def test_notebook_runs(name, tmp_path):
+def test_notebook_runs(name, kernel, tmp_path):
     """And every cell shows the same kinds of things as it has stored, in the same words."""
     notebook = stored(name)
     (cell,) = (cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", []))
     cell.source = SMALL[name]
-    resources = {"metadata": {"path": str(tmp_path)}}
-    NotebookClient(notebook, timeout=600, kernel_name="python3", resources=resources).execute()
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(f"%reset -f\n%cd -q {tmp_path}"))
+    NotebookClient(notebook, km=kernel, timeout=600).execute()
+    notebook.cells.pop(0)
     printed = [output["text"] for cell in notebook.cells for output in cell.get("outputs", []) if "text" in output]
     assert any("next view from" in text for text in printed)
     for now, before in zip(code_cells(notebook), code_cells(stored(name)), strict=True):
