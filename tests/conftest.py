@@ -6,16 +6,18 @@ import os
 from pathlib import Path
 
 # Before NumPy, SciPy and JAX are loaded, and for the processes that tests start. Workers whose linear algebra takes all
-# cores each wait for one another. Most programs of the tests run for less time than they take to compile: neither
-# LLVM's passes nor XLA's newer emitters of fused loops pay. Modules that compute for long, some five times longer so,
-# say COMPUTES = True. What one worker has compiled the others find, if it took longer than reading it back. Tracing
-# makes and drops many small objects: collecting them as often as Python does by default takes a tenth of the time.
+# cores each wait for one another, and so do those that compile in several threads. Most programs of the tests run for
+# less time than they take to compile: neither LLVM's passes nor wide registers nor XLA's newer emitters of fused loops
+# pay. Modules that compute for long, some five times longer so, say COMPUTES = True. What one worker has compiled the
+# others find, if it took longer than reading it back. Tracing makes and drops many small objects: collecting them as
+# often as Python does by default takes a tenth of the time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 # Versions of XLA after 0.10 have no older emitters, and end a process that asks for them.
 os.environ.setdefault(
     "XLA_FLAGS",
-    "--xla_llvm_disable_expensive_passes=true"
+    "--xla_llvm_disable_expensive_passes=true --xla_cpu_prefer_vector_width=128 "
+    "--xla_cpu_parallel_codegen_split_count=1"
     + (" --xla_cpu_use_fusion_emitters=false" if importlib.metadata.version("jaxlib").startswith("0.10.") else ""),
 )
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "xla"))
