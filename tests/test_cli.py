@@ -1,45 +1,11 @@
 """The command line: one call of each kind as a user makes it, in a process of its own, the others in this process."""
 
-import contextlib
-import io
 import json
-import os
-import subprocess
-import sys
-from unittest import mock
 
 import numpy as np
 import pytest
 import trimesh
-
-from jaxnbv.checks import InputError
-from jaxnbv.cli import main
-from jaxnbv.planner import Planner
-
-TERMINAL = {"COLUMNS": "200", "NO_COLOR": "1"}
-
-
-def run_process(*arguments: str, cwd) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "jaxnbv.cli", *arguments]
-    environment = {**os.environ, **TERMINAL}
-    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=600)
-
-
-def run_command(*arguments: str, cwd) -> subprocess.CompletedProcess:
-    """As `run_process`, without the seconds that a process takes to start; what is not caught there raises here."""
-    stdout, stderr, code = io.StringIO(), io.StringIO(), 0
-    with (
-        contextlib.chdir(cwd),
-        contextlib.redirect_stdout(stdout),
-        contextlib.redirect_stderr(stderr),
-        mock.patch.dict(os.environ, TERMINAL),
-        mock.patch.object(sys, "argv", ["jaxnbv", *arguments]),
-    ):
-        try:
-            main()
-        except SystemExit as leaving:
-            code = leaving.code or 0
-    return subprocess.CompletedProcess(arguments, code, stdout.getvalue(), stderr.getvalue())
+from commands import run_command, run_process
 
 
 @pytest.fixture(scope="module")
@@ -185,114 +151,6 @@ def test_a_folder_of_another_configuration_is_refused(finished):
     assert result.returncode == 2
     assert "another episode" in result.stderr
     assert "key" in result.stderr
-
-
-@pytest.fixture
-def ring(tmp_path):
-    """A folder with a mesh whose surface is 1.25 from the centre at most."""
-    trimesh.creation.torus(1.0, 0.4).export(tmp_path / "ring.ply")
-    return tmp_path
-
-
-# Without samples of surfaces, in seconds.
-FARTHEST = ("run", "ring.ply", "--search", "farthest", "--views", "2", "--no-report")
-
-
-def test_an_episode_is_replaced_when_asked(ring):
-    """With its report."""
-    for seed in ("0", "1"):
-        result = run_command(*FARTHEST, "--out", "mine", "--seed", seed, *(("--overwrite",) * int(seed)), cwd=ring)
-        assert result.returncode == 0, result.stderr
-        config = json.loads((ring / "mine" / "episode.json").read_text())["config"]
-        assert config["key"]["data"] == [0, int(seed)]
-        assert not (ring / "mine" / "report.html").exists()
-        (ring / "mine" / "figures").mkdir()
-        for name in ("report.html", "figures/view_01.png"):
-            (ring / "mine" / name).write_text("drawn")
-    result = run_command(*FARTHEST, "--out", "mine", "--views", "3", "--seed", "1", cwd=ring)
-    assert result.returncode == 0, result.stderr
-    (ring / "mine" / "figures" / "thesis.tex").write_text("mine")
-    held = {path: path.read_bytes() for path in (ring / "mine").rglob("*") if path.is_file()}
-    result = run_command(*FARTHEST, "--out", "mine", "--overwrite", cwd=ring)
-    assert result.returncode == 2
-    assert "thesis.tex" in result.stderr
-    assert all(path.read_bytes() == content for path, content in held.items())
-    (ring / "thesis").mkdir()
-    (ring / "thesis" / "thesis.tex").write_text("mine")
-    result = run_command(*FARTHEST, "--out", "thesis", "--overwrite", cwd=ring)
-    assert result.returncode == 2
-    assert [path.name for path in (ring / "thesis").glob("thesis*")] == ["thesis.tex"]
-
-
-def border_hits(file):
-    """How many of the rays along the image's border met the object, and how many of all."""
-    with np.load(file) as view:
-        side = round(len(view["mask"]) ** 0.5)
-        image = view["mask"].reshape(side, side)
-    return int(image.sum() - image[1:-1, 1:-1].sum()), int(image.sum())
-
-
-@pytest.mark.parametrize("asked", [(), ("--fov", "70"), ("--radius", "2"), ("--task", "heat", "--rays", "30")])
-def test_an_object_fits_the_view(asked, ring):
-    result = run_command(*FARTHEST, *asked, "--out", "mine", cwd=ring)
-    assert result.returncode == 0, result.stderr
-    for file in sorted((ring / "mine").glob("view_*.npz")):
-        hits, seen = border_hits(file)
-        assert hits == 0
-        assert seen > 100
-
-
-def test_the_papers_close_up_is_there_when_asked(ring):
-    result = run_command(*FARTHEST, "--paper", cwd=ring)
-    assert result.returncode == 0, result.stderr
-    out = ring / "runs" / "ring-coverage-farthest-seed0"
-    assert border_hits(out / "view_00.npz")[0] > 20
-    config = json.loads((out / "episode.json").read_text())["config"]
-    assert config["planner"]["camera"]["fov"] == pytest.approx(np.radians(30))
-    assert config["planner"]["search"]["candidates"]["radius"] == 2.5
-    np.testing.assert_allclose(config["first"]["position"], [0.8, 0.9, 2.2])
-
-
-def test_what_is_asked_for_is_taken(ring):
-    asked = {"fov": 40, "radius": 7.5, "rays": 33, "samples": 3, "candidates": 21, "lengthscale": 0.02}
-    options = [text for name, value in asked.items() for text in (f"--{name}", str(value))]
-    result = run_command(*FARTHEST, *options, "--out", "mine", cwd=ring)
-    assert result.returncode == 0, result.stderr
-    planner = json.loads((ring / "mine" / "episode.json").read_text())["config"]["planner"]
-    camera, candidates = planner["camera"], planner["search"]["candidates"]
-    found = {
-        "fov": np.degrees(camera["fov"]),
-        "radius": candidates["radius"],
-        "rays": camera["height"],
-        "samples": planner["num_samples"],
-        "candidates": candidates["number"],
-        "lengthscale": planner["model"]["base"]["lengthscale"][0],
-    }
-    assert camera["width"] == 33
-    assert found == pytest.approx(asked)
-
-
-def test_a_flat_and_open_mesh_is_named_as_such(ring):
-    turned = trimesh.transformations.rotation_matrix(0.5, (1.0, 0.3, 0.2))
-    (ring / "sheet.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 2 0\nv 0 2 0\nf 1 2 3\nf 1 3 4\n")
-    sheet = trimesh.load_mesh(ring / "sheet.obj")
-    sheet.apply_transform(turned).export(ring / "sheet.obj")
-    result = run_command("run", "sheet.obj", *FARTHEST[2:], cwd=ring)
-    assert result.returncode == 0, result.stderr
-    assert "sheet.obj is flat" in result.stdout
-    assert "4 of its 5 edges" in result.stdout
-    result = run_command(*FARTHEST, cwd=ring)
-    assert "flat" not in result.stdout
-    assert "open" not in result.stdout
-
-
-def test_a_view_is_told_when_it_is_done(ring):
-    """Before the next is looked for, which fails here."""
-    with mock.patch.object(Planner, "choose", side_effect=InputError("stopped here")):
-        result = run_command(*FARTHEST, cwd=ring)
-    assert "stopped here" in result.stderr
-    assert "view 1   from (" in result.stdout
-    assert "view 2" not in result.stdout
 
 
 def test_a_published_checkpoint_converts_and_classifies_a_mesh(tmp_path, shared):

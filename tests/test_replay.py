@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_cli import run_command
+from commands import run_command
 from test_session import BOX, CAMERA, FIRST, planner_of, session_of, shot
 
 from jaxnbv.checks import InputError

@@ -1,0 +1,35 @@
+"""The command line, called as a user calls it."""
+
+import contextlib
+import io
+import os
+import subprocess
+import sys
+from unittest import mock
+
+from jaxnbv.cli import main
+
+TERMINAL = {"COLUMNS": "200", "NO_COLOR": "1"}
+
+
+def run_process(*arguments: str, cwd) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "jaxnbv.cli", *arguments]
+    environment = {**os.environ, **TERMINAL}
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=600)
+
+
+def run_command(*arguments: str, cwd) -> subprocess.CompletedProcess:
+    """As `run_process`, without the seconds that a process takes to start; what is not caught there raises here."""
+    stdout, stderr, code = io.StringIO(), io.StringIO(), 0
+    with (
+        contextlib.chdir(cwd),
+        contextlib.redirect_stdout(stdout),
+        contextlib.redirect_stderr(stderr),
+        mock.patch.dict(os.environ, TERMINAL),
+        mock.patch.object(sys, "argv", ["jaxnbv", *arguments]),
+    ):
+        try:
+            main()
+        except SystemExit as leaving:
+            code = leaving.code or 0
+    return subprocess.CompletedProcess(arguments, code, stdout.getvalue(), stderr.getvalue())
