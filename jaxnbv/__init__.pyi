@@ -63,6 +63,7 @@ from .search import Reach as Reach
 from .search import Search as Search
 from .search import SphereCandidates as SphereCandidates
 from .search import SpherePoses as SpherePoses
+from .search import TieBreakSearch as TieBreakSearch
 from .search import Trajectories as Trajectories
 from .search import Turntable as Turntable
 from .search import UncertaintyView as UncertaintyView

@@ -142,7 +142,7 @@ class Several(Score):
     """Several scores of the same scans, so that they are compared on the same samples at the cost of one scan.
 
     Its value is a vector, the scores' values in their order (a score whose value is a vector itself takes as many
-    places): for `expected_score`, not for a search.
+    places): for `expected_score`, not for a planner.
     """
 
     scores: tuple[Score, ...]

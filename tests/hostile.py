@@ -100,6 +100,7 @@ CALLS = {
     nbv.SensorNoise: {"points": 0.01, "normals": 0.01},
     nbv.Several: {"scores": (nbv.Coverage(),)},
     nbv.SoftPartCount: {"segmenter": number_of_points, "target": 60.0},
+    nbv.TieBreakSearch: {"candidates": 6, "second": nbv.Coverage()},
     nbv.SphereCandidates: {"number": 6, "radius": 2.5, "min_elevation": 0.0, "up": (0.0, 1.0, 0.0)},
     nbv.SpherePoses: {"radius": 2.5},
     nbv.Thickness: {"depth": 0.1, "count": 10, "value": -1.0, "noise": 1.0},

@@ -65,6 +65,9 @@ TASKS = {
 SEARCHES = {
     "discrete": SearchEntry(f"{_SEARCHES}:discrete", "the expected value of the task over 120 candidates (heat: 100)"),
     "halving": SearchEntry(f"{_SEARCHES}:halving", "drops the worse half again and again while samples are added"),
+    "tie-break": SearchEntry(
+        f"{_SEARCHES}:tie_break", "coverage, among the candidates that samples cannot tell from the best"
+    ),
     "gradient-2dof": SearchEntry(f"{_SEARCHES}:gradient_2dof", "climbs it by gradient over the sphere"),
     "gradient-6dof": SearchEntry(
         f"{_SEARCHES}:gradient_6dof",

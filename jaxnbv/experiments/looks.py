@@ -24,6 +24,7 @@ LOOKS = {
     "cross-entropy": _FIRST,
     "entropy": _SECOND,
     "mixed": _THIRD,
+    "tie-break": Look("#a33b00", "--", "h"),
     "discrete": _FIRST,
     "gradient-2dof": _THIRD,
     "gradient-6dof": _SECOND,

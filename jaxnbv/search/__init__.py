@@ -22,3 +22,4 @@ from jaxnbv.search.problem import Problem as Problem
 from jaxnbv.search.proposal import Batch as Batch
 from jaxnbv.search.proposal import Proposal as Proposal
 from jaxnbv.search.proposal import Trajectories as Trajectories
+from jaxnbv.search.tie_break import TieBreakSearch as TieBreakSearch

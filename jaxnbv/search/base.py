@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxnbv.acquisition import Score
 from jaxnbv.answers import Quantity
@@ -69,15 +69,20 @@ def best_unvisited(
     on another number of cores. `scores`: those whose means the values are, for their standard errors.
     """
     values = jnp.where(problem.is_closed(candidates), -jnp.inf, values)
-    best = jnp.max(values)
-    # Nothing ties with an infinite value, and NaN is told of by the planner.
-    tied = values >= best - jnp.where(jnp.isfinite(best), tie * jnp.abs(best), 0.0)
-    index = jnp.where(jnp.isfinite(best), jnp.argmax(tied), jnp.argmax(values))
+    index = first_best(values, tie)
     found = Proposal(candidates[index], values[index], candidates, values)
     if scores is None:
         return found
     of_differences = standard_error(scores - scores[:, index][:, None])
     return dataclasses.replace(found, standard_errors=standard_error(scores), difference_errors=of_differences)
+
+
+def first_best(values: Float[Array, " candidates"], tie: float = _TIE) -> Int[Array, ""]:
+    """Index of the highest value, the first of them where values tie, as of `best_unvisited`."""
+    best = jnp.max(values)
+    # Nothing ties with an infinite value, and NaN is told of by the planner.
+    tied = values >= best - jnp.where(jnp.isfinite(best), tie * jnp.abs(best), 0.0)
+    return jnp.where(jnp.isfinite(best), jnp.argmax(tied), jnp.argmax(values))
 
 
 def standard_error(scores: Float[Array, "samples *poses"]) -> Float[Array, "*poses"]:

@@ -70,8 +70,16 @@ class Problem(eqx.Module):
         """The acquisition at a batch of poses, estimated from all posterior samples or from a part of them."""
         return jnp.mean(self.scores(poses, samples), axis=0)
 
-    def scores(self, poses: Pose, samples: slice = slice(None)) -> Float[Array, "samples poses"]:
-        """The scores whose mean is the acquisition, sample by sample; given the cost of going there, if that counts."""
+    def about(self, score: Score) -> "Problem":
+        """The same step, asked about another score."""
+        known, scene = (self.cloud, self.visited, self.num_visited), (self.surroundings, self.empty, self.half_extent)
+        return Problem(*known, self.camera, score, self.surfaces, self.cost, self.imagined, *scene)
+
+    def scores(self, poses: Pose, samples: slice = slice(None)) -> Float[Array, "*scores samples poses"]:
+        """The scores whose mean is the acquisition, sample by sample; given the cost of going there, if that counts.
+
+        Those of a `Several` come along a leading axis.
+        """
 
         def part(tree):
             return jax.tree.map(lambda leaf: leaf[samples], tree)
@@ -80,7 +88,7 @@ class Problem(eqx.Module):
         context = part(self.context) if own else self.context
         barrier = None if self.surroundings is None else self.surroundings.barrier(self.camera, poses)
         values = sample_scores(self.score, context, part(self._sampled), self.camera, poses, own, barrier)
-        return self.worth(values, poses)
+        return self.worth(jnp.moveaxis(values, (0, 1), (-2, -1)), poses)
 
     def worth(self, values: Float[Array, "*samples poses"], poses: Pose) -> Float[Array, "*samples poses"]:
         """Values of poses, given the cost of going there from the last view."""

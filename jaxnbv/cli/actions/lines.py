@@ -40,7 +40,8 @@ def _line(planner: Planner, view: View) -> str:
     values = values[np.isfinite(values)]
     line += f"   {sought.name} {float(view.proposal.value):.4g}, "
     if (ways := view.proposal.trajectories) is None:
-        line += f"the highest of {len(values)} candidates"
+        rank = 1 + int(np.sum(values > float(view.proposal.value)))
+        line += f"{'the highest' if rank == 1 else f'rank {rank}'} of {len(values)} candidates"
         line += f" (median {np.median(values):.4g})" if sought.smooth else ""
         level = view.proposal.others_level
         return line if level is None else f"{line}, {level} of them within two standard errors"

@@ -16,8 +16,10 @@ from jaxnbv.search import (
     Search,
     SphereCandidates,
     SpherePoses,
+    TieBreakSearch,
     UncertaintyView,
 )
+from jaxnbv.tasks import Coverage
 
 
 def discrete(radius: float, count: int | None) -> Search:
@@ -28,6 +30,11 @@ def discrete(radius: float, count: int | None) -> Search:
 def halving(radius: float, count: int | None) -> Search:
     """Over candidates, by successive halving."""
     return HalvingSearch(_candidates(radius, count))
+
+
+def tie_break(radius: float, count: int | None) -> Search:
+    """Over all candidates, by coverage where the task does not tell."""
+    return TieBreakSearch(_candidates(radius, count), second=Coverage())
 
 
 def farthest(radius: float, count: int | None) -> Search:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxnbv.acquisition import Score, Several, expected_score, zero_if_empty
+from jaxnbv.acquisition import Score, Several, sample_scores, zero_if_empty
 from jaxnbv.camera import Camera
 from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.experiments.diagnostics import rank_correlation, roughness
@@ -17,12 +17,13 @@ from jaxnbv.planner import Planner
 from jaxnbv.pose import Pose
 from jaxnbv.scanning import GridSurface
 from jaxnbv.search import CandidateSearch, Problem
+from jaxnbv.search.base import best_unvisited
 from jaxnbv.search.baselines import uncertain_length
 from jaxnbv.state import State
 from jaxnbv.tasks import Coverage
 from jaxnbv.tasks.classification import Classifier, ClassScore, Context, MixedEntropy, cross_entropy, entropy
 
-CLASSIFYING = ("cross-entropy", "entropy", "mixed")
+CLASSIFYING = ("cross-entropy", "entropy", "mixed", "tie-break")
 _SAMPLING = (*CLASSIFYING, "coverage", "uncertainty")
 
 
@@ -91,15 +92,28 @@ class Chooser:
             rough = roughness(self.planner, state, posterior, surfaces)
             classes = (_Entropies(self.imagining, self.num_points),) if {*methods} & {*CLASSIFYING} else ()
             score = Several((Coverage(), *classes))
-            found = _expected(score, state.cloud, surfaces, self.planner.camera, self.poses).T
-            values["coverage"], *entropies = found
+            found, samples = _expected(score, state.cloud, surfaces, self.planner.camera, self.poses)
+            values["coverage"], *entropies = found.T
             if entropies:
                 values["cross-entropy"], values["entropy"] = entropies
+                values["tie-break"] = self._tie_break(state, *found.T[:2], samples[..., 1])
                 undecided = float(entropy(classify(self.imagining, _thinned(state.cloud, self.num_points))))
                 values["mixed"] = entropies[0 if undecided > MixedEntropy.threshold else 1]
             if "uncertainty" in methods:
                 values["uncertainty"] = _uncertainty(self._problem(state, surfaces), self.poses)
         return {name: np.asarray(of, np.float64) for name, of in values.items()}, rough
+
+    def _tie_break(
+        self,
+        state: State,
+        coverage: Float[Array, " candidates"],
+        mean: Float[Array, " candidates"],
+        samples: Float[Array, "samples candidates"],
+    ) -> Float[Array, " candidates"]:
+        """Cross-entropy's values, those of level candidates raised above all others by coverage: the highest is what
+        `TieBreakSearch` takes."""
+        found = best_unvisited(self._problem(state, None), self.poses, mean, scores=samples)
+        return jnp.where(found.is_level(), found.value + coverage - jnp.min(coverage), mean)
 
     def state(self, visited: tuple[int, ...]) -> State:
         """After the views of these candidates."""
@@ -145,8 +159,12 @@ def classify(classifier: Classifier, cloud: PointCloud) -> Float[Array, " classe
 
 
 @eqx.filter_jit
-def _expected(score: Score, cloud: PointCloud, surfaces: GridSurface, camera: Camera, poses: Pose) -> Array:
-    return expected_score(score, cloud, surfaces, camera, poses)
+def _expected(
+    score: Score, cloud: PointCloud, surfaces: GridSurface, camera: Camera, poses: Pose
+) -> tuple[Float[Array, "poses scores"], Float[Array, "samples poses scores"]]:
+    """The scores' means, and they themselves."""
+    samples = sample_scores(score, score.context(cloud), surfaces, camera, poses)
+    return jnp.mean(samples, axis=0), samples
 
 
 @eqx.filter_jit

@@ -19,7 +19,7 @@ from jaxnbv.datasets.class_object import scan_telling
 from jaxnbv.experiments.classification.pictures import write_pictures
 from jaxnbv.experiments.classification.pyramid import PyramidStudy
 from jaxnbv.scanning import scan
-from jaxnbv.search import FarthestView, Problem, UncertaintyView
+from jaxnbv.search import FarthestView, Problem, TieBreakSearch, UncertaintyView
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
@@ -177,6 +177,10 @@ def test_values_are_the_librarys_scores_of_the_same_samples(sharpness):
     assert is_open == (sharpness < 1)
     np.testing.assert_array_equal(found["mixed"], found["cross-entropy" if is_open else "entropy"])
     problem = Problem(state.cloud, state.poses, state.num_views, planner.camera, Coverage(), surfaces)
+    told = problem.about(scores["cross-entropy"])
+    view = TieBreakSearch(CANDIDATES, second=scores["coverage"]).propose(told, jax.random.key(0)).pose
+    open_values = np.where(np.isin(np.arange(CANDIDATES), visited), -np.inf, found["tie-break"])
+    np.testing.assert_array_equal(view.position, chooser.poses.position[open_values.argmax()])
     for name, search in (("farthest", FarthestView(CANDIDATES)), ("uncertainty", UncertaintyView(CANDIDATES))):
         expected = np.asarray(search.propose(problem, jax.random.key(0)).values)
         new = np.setdiff1d(np.arange(CANDIDATES), visited)
