@@ -39,8 +39,9 @@ class TieBreakSearch(CandidateSearch):
         candidates = self.candidates.poses()
         first, second = problem.about(Several((problem.score, self.second))).scores(candidates)
         found = best_unvisited(problem, candidates, jnp.mean(first, axis=0), scores=first)
-        level = found.is_level() & (found.values > -jnp.inf)
-        seconds = jnp.where(level, jnp.mean(second, axis=0), -jnp.inf)
+        level = found.is_level()
+        assert level is not None
+        seconds = jnp.where(level & (found.values > -jnp.inf), jnp.mean(second, axis=0), -jnp.inf)
         index = first_best(seconds)
         # What is not a number is told of by the planner, whichever score gave it.
         value = jnp.where(jnp.isnan(seconds[index]), jnp.nan, found.values[index])

@@ -93,10 +93,11 @@ class Chooser:
             classes = (_Entropies(self.imagining, self.num_points),) if {*methods} & {*CLASSIFYING} else ()
             score = Several((Coverage(), *classes))
             found, samples = _expected(score, state.cloud, surfaces, self.planner.camera, self.poses)
-            values["coverage"], *entropies = found.T
+            covered, *entropies = found.T
+            values["coverage"] = covered
             if entropies:
                 values["cross-entropy"], values["entropy"] = entropies
-                values["tie-break"] = self._tie_break(state, *found.T[:2], samples[..., 1])
+                values["tie-break"] = self._tie_break(state, covered, entropies[0], samples[..., 1])
                 undecided = float(entropy(classify(self.imagining, _thinned(state.cloud, self.num_points))))
                 values["mixed"] = entropies[0 if undecided > MixedEntropy.threshold else 1]
             if "uncertainty" in methods:
@@ -113,7 +114,9 @@ class Chooser:
         """Cross-entropy's values, those of level candidates raised above all others by coverage: the highest is what
         `TieBreakSearch` takes."""
         found = best_unvisited(self._problem(state, None), self.poses, mean, scores=samples)
-        return jnp.where(found.is_level(), found.value + coverage - jnp.min(coverage), mean)
+        level = found.is_level()
+        assert level is not None
+        return jnp.where(level, found.value + coverage - jnp.min(coverage), mean)
 
     def state(self, visited: tuple[int, ...]) -> State:
         """After the views of these candidates."""
