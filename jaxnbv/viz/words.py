@@ -63,17 +63,22 @@ def _reason(
     compared = f"the median candidate had {number(median)}"
     if median > 0 and value / median < 1000:
         compared = f"{number(value / median)} times the median ({number(median)})"
-    if not best or len(others) < 2:
+    told = "" if level is None or len(others) < 2 else f" {told_apart(level, best)}"
+    if not best:
+        return f"{text}: {compared}, the best {number(others[0])}.{told}{after}"
+    if len(others) < 2:
         return f"{text}: {compared}.{after}"
-    told = "" if level is None else f" {told_apart(level)}"
     return f"{text}: {compared}, {_margin(value, others[1], 'the runner-up')} ({number(others[1])}).{told}{after}"
 
 
-def told_apart(level: int) -> str:
-    """Whether the samples tell the best candidate from the others, of which so many are level with it."""
+def told_apart(level: int, chosen: bool = True) -> str:
+    """Whether the samples tell the best candidate, be it the chosen one or not, from the others, of which so many are
+    level with it."""
+    best = "it" if chosen else "the best"
     if not level:
-        return "It stands out: no other is within two standard errors of it."
-    return f"By the samples it cannot be told from {level} other{'s' if level > 1 else ''}, within two standard errors."
+        return f"{best.capitalize()} stands out: no other is within two standard errors of it."
+    others = f"{level} other{'s' if level > 1 else ''}"
+    return f"By the samples {best} cannot be told from {others}, within two standard errors."
 
 
 def _margin(value: float, other: float, name: str) -> str:

@@ -169,11 +169,17 @@ def test_no_pattern_breaks_through_a_side_and_none_reaches_the_apex():
         assert 0 < 3 * pyramid.depth < pyramid.height
 
 
+def clear_of_outline(name, local, count, points=None):
+    """The first of the points, given in the pattern's frame too, that are not near its outline."""
+    some = slice(5 * count)
+    return (local if points is None else points)[some][distance_to_outline(name, local[some]) > 0.03][:count]
+
+
 def faces(pyramid, count=400):
     """Points in the pyramid's own frame on floor, wall, base and sides, none of them within 0.01 of an edge."""
     name, height, depth = name_of(pyramid), float(pyramid.height), float(pyramid.depth)
     flat = RNG.uniform(-1, 1, (20 * count, 2))
-    floor = flat[is_inside(name, flat) & (distance_to_outline(name, flat) > 0.03)][:count]
+    floor = clear_of_outline(name, flat[is_inside(name, flat)], count)
     floor = np.insert(of_pattern(pyramid, floor), 2, depth, axis=1)
     wall = of_pattern(pyramid, on_outline(name, count))
     wall = np.insert(wall, 2, RNG.uniform(0.012, depth, count), axis=1)
@@ -181,8 +187,8 @@ def faces(pyramid, count=400):
     turn, size = float(pyramid.turn), float(pyramid.size)
     c, s = np.cos(turn), np.sin(turn)
     local = (base - np.asarray(pyramid.place, np.float64)) @ np.array([[c, -s], [s, c]]) / size
-    base = base[~is_inside(name, local) & (distance_to_outline(name, local) > 0.03)][:count]
-    base = np.insert(base, 2, 0.0, axis=1)
+    outside = ~is_inside(name, local)
+    base = np.insert(clear_of_outline(name, local[outside], count, base[outside]), 2, 0.0, axis=1)
     w = RNG.uniform(0.012, height, count)
     reach = 1.0 - w / height
     side = np.stack([reach, reach * RNG.uniform(-1, 1, count), w], axis=-1)

@@ -71,7 +71,7 @@ def test_no_turned_bit_of_a_view_passes(finished, tmp_path):
     """Any one bit: the file is refused by name, or its arrays are the same (bits that mean nothing)."""
     episode, folder = finished
     config = config_of(episode)
-    copy = shutil.copytree(folder, tmp_path / "copy")
+    copy = shutil.copytree(folder, tmp_path / "copy", ignore=shutil.ignore_patterns("view_0[2-9].npz"))
     whole, expected = (folder / "view_01.npz").read_bytes(), EpisodeFolder(folder, config).read_views()[1]
     ends = whole.index(b"PK\x01\x02")
     # The first header, all of the directory, and a sample of the rest.

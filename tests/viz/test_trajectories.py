@@ -305,3 +305,13 @@ def test_a_path_over_the_rim_is_cut_there():
     front = np.array([[0.1, 0.0, 1.0], [-0.1, 0.0, 1.0], [-0.3, 0.5, 1.0]])
     (whole,) = sphere.path(front / np.linalg.norm(front, axis=1, keepdims=True))
     assert np.linalg.norm(np.diff(whole, axis=0), axis=1).max() < 0.1
+
+
+def test_of_a_candidate_that_is_not_the_best_it_says_how_the_best_stands():
+    pose = look_at((0.0, 0.0, 2.5))
+    said = describe_choice(COVERAGE, 2.0, 2, (3.0, 2.0, 1.0), 0, pose, [look_at((2.5, 0.0, 0.0))], 5, 10, None, 1)
+    assert (
+        "was rank 2 of 3 open candidates: 1 times the median (2), the best 3. By the samples the best cannot be told"
+        in said
+    )
+    assert "from 1 other, within two standard errors. It added" in said
