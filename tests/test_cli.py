@@ -159,7 +159,7 @@ def test_a_published_checkpoint_converts_and_classifies_a_mesh(tmp_path, shared)
     assert result.returncode == 0, result.stderr
     assert "classes" in result.stdout
     trimesh.creation.torus(1.0, 0.4).export(tmp_path / "ring.ply")
-    sizes = ("--candidates", "6", "--samples", "2", "--quick", "--views", "2")
+    sizes = ("--candidates", "2", "--samples", "2", "--quick", "--views", "2")
     arguments = ("--task", "mixed", "--network", "net.safetensors", *sizes, "--no-report")
     result = run_command("run", "ring.ply", *arguments, cwd=tmp_path)
     assert result.returncode == 0, result.stderr

@@ -251,7 +251,7 @@ def check_extras(arguments: list[str]) -> None:
     assert set(named) <= set(extras)
 
 
-CHECKS = {"jaxnbv": parse, "python": check_script, "python3": check_script, "pip": check_extras}
+CHECKS = {"jaxnbv": parse, "python": check_script, "python3": check_script, "pip": check_extras, "uv": check_extras}
 # Programs of others, whose options are not looked at.
 OTHERS = {"dask", "ruff", "mypy", "pytest", "sphinx-build"}
 
