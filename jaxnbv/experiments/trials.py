@@ -1,8 +1,11 @@
 """Where the trials of a study are run: here, in processes of this machine, or on a Dask cluster."""
 
 import functools
+import os
 import pickle
 import sys
+import threading
+import time
 import traceback
 from abc import ABC, abstractmethod
 from collections import deque
@@ -104,7 +107,8 @@ class Processes(Runner):
     def _pool(self) -> loky.ProcessPoolExecutor:
         # What XLA, the libraries of linear algebra and our own pools of processes ask for how many threads to start.
         names = ("NPROC", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "LOKY_MAX_CPU_COUNT")
-        return loky.ProcessPoolExecutor(1, env=dict.fromkeys(names, str(self.cores)))
+        environment = dict.fromkeys(names, str(self.cores))
+        return loky.ProcessPoolExecutor(1, env=environment, initializer=_end_with, initargs=(os.getpid(),))
 
 
 class Cluster(Runner):
@@ -161,6 +165,17 @@ class Cluster(Runner):
                 yield running.pop(future), outcome
         finally:
             self.client.cancel(list(running))
+
+
+def _end_with(parent: int) -> None:
+    """Ends this process when its parent is gone: one that is killed cannot end its processes."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _attempt(trial: Trial, index: int) -> Outcome:

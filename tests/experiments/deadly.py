@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 
 
 class Trial:
@@ -21,3 +22,15 @@ class Trial:
 
     def beginnings(self, index):
         return [*self.folder.glob(f"{index}-*")]
+
+
+class Endless:
+    """A trial that notes its process and does not end."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def __call__(self, index):
+        (self.folder / f"{os.getpid()}").touch()
+        while True:
+            time.sleep(1)

@@ -1,8 +1,16 @@
 """Where trials are run."""
 
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
 import dask
 import distributed
 import loky
+import psutil
 import pytest
 from deadly import Trial
 from test_study import small, without_time
@@ -56,6 +64,35 @@ def check_every_trial_is_in_the_result_once(folder, runner, killed):
 def test_in_processes_no_trial_is_lost_though_some_die(tmp_path):
     trial = check_every_trial_is_in_the_result_once(tmp_path, Processes(2), "died 2 times")
     assert [len(trial.beginnings(index)) for index in range(6)] == [1, 1, 2, 1, 2, 1]
+
+
+def test_processes_end_when_the_command_is_killed(tmp_path):
+    program = (
+        "from pathlib import Path; from deadly import Endless; from jaxnbv.experiments.trials import Processes;"
+        f"list(Processes(1).outcomes(Endless(Path({str(tmp_path)!r})), [0]))"
+    )
+    folder = str(Path(__file__).parent)
+    command = subprocess.Popen([sys.executable, "-c", program], env=os.environ | {"PYTHONPATH": folder})
+    wait_until(lambda: any(tmp_path.iterdir()) or command.poll() is not None)
+    (begun,) = tmp_path.iterdir()
+    assert is_running(int(begun.name))
+    command.send_signal(signal.SIGKILL)
+    command.wait()
+    wait_until(lambda: not is_running(int(begun.name)))
+
+
+def wait_until(happened, seconds=60):
+    end = time.monotonic() + seconds
+    while not happened():
+        assert time.monotonic() < end, f"it did not happen in {seconds} s"
+        time.sleep(0.1)
+
+
+def is_running(process):
+    try:
+        return psutil.Process(process).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
 
 
 def test_on_a_cluster_no_trial_is_lost_though_workers_die(tmp_path, cluster):
