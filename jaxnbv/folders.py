@@ -94,7 +94,7 @@ def writing_in(path: Path, *inside: str) -> Iterator[None]:
         raise InputError(
             f"{path} is being written by {_holder(path)}: wait until it ends, or choose another folder"
         ) from error
-    # What filelock raises where the file system has no locks.
+    # Of filelock, down to the least version that we allow (3.16): there are no locks on this file system.
     except (OSError, NotImplementedError) as error:
         lock.release()
         raise InputError(f"cannot write in {path} ({error}): make room or choose another place") from error
