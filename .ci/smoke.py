@@ -11,8 +11,8 @@ import jax
 import optimistix
 
 import jaxnbv as nbv
-from jaxnbv.datasets import demo_object
 from jaxnbv.networks import load_checkpoint, pyramid_classifier, save_checkpoint
+from jaxnbv.studies.scenes import demo_object
 from jaxnbv.viz import write_report
 
 

@@ -16,11 +16,11 @@ import jax.numpy as jnp
 from timing import least_time
 
 import jaxnbv as nbv
-from jaxnbv.datasets import Framing, Split, hidden_view, pyramid_scene
-from jaxnbv.episode import observe_scene
-from jaxnbv.folders import versions
 from jaxnbv.networks import pyramid_classifier
+from jaxnbv.planning.episode import observe_scene
 from jaxnbv.search.candidates import sphere_candidates
+from jaxnbv.storage.folders import versions
+from jaxnbv.studies.scenes import Framing, Split, hidden_view, pyramid_scene
 
 LIMIT = 30.0
 

@@ -22,12 +22,12 @@ from timing import least_time
 from tqdm import tqdm
 
 import jaxnbv as nbv
-from jaxnbv.datasets import Framing, Split, demo_object, hidden_view, pyramid_scene
-from jaxnbv.episode import observe_scene
-from jaxnbv.folders import versions
 from jaxnbv.networks import pyramid_classifier
+from jaxnbv.planning.episode import observe_scene
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.storage import describe
+from jaxnbv.storage.folders import versions
+from jaxnbv.studies.scenes import Framing, Split, demo_object, hidden_view, pyramid_scene
 
 SEARCHES = {
     "discrete": nbv.DiscreteSearch(),

@@ -19,7 +19,7 @@ from loky import cpu_count
 from timing import least_time
 
 import jaxnbv as nbv
-from jaxnbv.folders import versions
+from jaxnbv.storage.folders import versions
 from jaxnbv.tasks.diffusion import HeatProblem, cloud_laplacian, cloud_temperature, diffuse
 from jaxnbv.tasks.heat import ColdestPoint
 

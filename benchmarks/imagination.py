@@ -7,7 +7,7 @@
 Objects are N validation pyramids in close-up, one validation object of each part category named, and the demo object;
 with meshes, these alone and what else is asked for. All models see the same scans of 50 x 50 rays with the default
 noise, from the same two random views. Samples are 8 on a grid of 64^3 nodes; depths are along 32 x 32 rays from each
-candidate. See `jaxnbv.experiments.imagination` for the numbers. Continues with what the file does not hold yet.
+candidate. See `jaxnbv.studies.forecasts` for the numbers. Continues with what the file does not hold yet.
 
 A variant is a model of your own, carved: --variant "smooth=nbv.GeometricSPSR(lengthscale=0.03, truncation=32)". All of
 jaxnbv, jaxnbv.surfaces and the grid are in scope. A change of a model's code is not noticed: take another file then.
@@ -31,13 +31,13 @@ from tqdm import tqdm
 
 import jaxnbv as nbv
 from jaxnbv import surfaces as models
-from jaxnbv.datasets import PART_CATEGORIES, Split, demo_object, part_scene, pyramid_scene
-from jaxnbv.episode import observe_scene
-from jaxnbv.experiments.imagination import Truth, judge
-from jaxnbv.files import write_whole
-from jaxnbv.folders import versions
+from jaxnbv.planning.episode import observe_scene
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.storage import describe
+from jaxnbv.storage.files import write_whole
+from jaxnbv.storage.folders import versions
+from jaxnbv.studies.forecasts import Truth, judge
+from jaxnbv.studies.scenes import PART_CATEGORIES, Split, demo_object, part_scene, pyramid_scene
 
 GRID = nbv.Grid(64, 0.7 * 2.5)
 RAYS = nbv.Camera(height=32, width=32)

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import jaxnbv as nbv
-from jaxnbv.tasks.neighbours import nearest_squared_distance
+from jaxnbv.geometry.neighbours import nearest_squared_distance
 from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.style import BEFORE, GREY, INK, LINE, NEW
 

@@ -17,12 +17,12 @@ import jax
 import jax.numpy as jnp
 from timing import least_time
 
-from jaxnbv.farthest import farthest_point_indices
-from jaxnbv.folders import versions
+from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.networks import PointNet2Classifier
 from jaxnbv.networks.grouping import ball_query
 from jaxnbv.networks.pointnet2 import MULTI_SCALE, SINGLE_SCALE
 from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
+from jaxnbv.storage.folders import versions
 
 NETWORKS = {
     "one radius": (SINGLE_SCALE, (((64, 64, 128),), ((128, 128, 256),))),

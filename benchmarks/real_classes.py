@@ -17,17 +17,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnbv import Camera, PointCloud
-from jaxnbv.cloud import farthest_point_subsample
-from jaxnbv.datasets import CLASS_SETS, Framing, MeshFile, Split
-from jaxnbv.experiments.meshes import class_meshes
-from jaxnbv.folders import versions
+from jaxnbv.geometry.cloud import farthest_point_subsample
+from jaxnbv.geometry.pose import look_at
 from jaxnbv.networks import pretrained_classifier
 from jaxnbv.networks.pretrained import TRAINED_POINTS
-from jaxnbv.pose import look_at
 from jaxnbv.scanning import SensorNoise, scan
-from jaxnbv.sensors import SENSOR_RADIUS
-from jaxnbv.training import log_probabilities, train
-from jaxnbv.training.class_clouds import scanned_clouds
+from jaxnbv.scanning.sensors import SENSOR_RADIUS
+from jaxnbv.storage.folders import versions
+from jaxnbv.studies.engine.meshes import class_meshes
+from jaxnbv.studies.readers import MeshFile
+from jaxnbv.studies.scenes import CLASS_SETS, Framing, Split
+from jaxnbv.studies.training import log_probabilities, train
+from jaxnbv.studies.training.class_clouds import scanned_clouds
 
 CLOUDS, VIEWS, STAND_INS = 10, 5, 200
 

@@ -24,12 +24,12 @@ from skimage.measure import marching_cubes
 from timing import least_time
 
 import jaxnbv as nbv
-from jaxnbv.datasets import demo_object
-from jaxnbv.episode import observe_scene
-from jaxnbv.folders import versions
-from jaxnbv.presets import ModelName
+from jaxnbv.imagination import ModelName
+from jaxnbv.planning.episode import observe_scene
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.storage import describe
+from jaxnbv.storage.folders import versions
+from jaxnbv.studies.scenes import demo_object
 
 FIGURES = {
     "samples": ("prior and posterior samples of f on the grid", 6.0),

@@ -22,13 +22,13 @@ import numpy as np
 from tqdm import tqdm
 
 import jaxnbv as nbv
-from jaxnbv.datasets import Framing, Split, hidden_view, part_scene, pyramid_scene
-from jaxnbv.datasets.categories import CATEGORIES
-from jaxnbv.episode import view_keys
-from jaxnbv.experiments.statistics import bootstrap_mean
-from jaxnbv.files import write_text
 from jaxnbv.networks import part_segmenter, pyramid_classifier
-from jaxnbv.stopping import Covered, Found, SoFar, Sure
+from jaxnbv.networks.categories import CATEGORIES
+from jaxnbv.planning.episode import view_keys
+from jaxnbv.planning.stopping import Covered, Found, SoFar, Sure
+from jaxnbv.storage.files import write_text
+from jaxnbv.studies.engine.statistics import bootstrap_mean
+from jaxnbv.studies.scenes import Framing, Split, hidden_view, part_scene, pyramid_scene
 from jaxnbv.tasks.coverage import SeenBefore
 
 SIDE = Framing.WHOLE.longest_side

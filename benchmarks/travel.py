@@ -18,11 +18,11 @@ import numpy as np
 from tqdm import tqdm
 
 import jaxnbv as nbv
-from jaxnbv.episode import observe_scene, view_keys
-from jaxnbv.experiments.statistics import bootstrap_mean
-from jaxnbv.files import write_text
-from jaxnbv.metrics import coverage, truth_points
-from jaxnbv.travel import arc_length, total_cost
+from jaxnbv.planning.episode import observe_scene, view_keys
+from jaxnbv.planning.travel import arc_length, total_cost
+from jaxnbv.scanning.metrics import coverage, truth_points
+from jaxnbv.storage.files import write_text
+from jaxnbv.studies.engine.statistics import bootstrap_mean
 
 CANDIDATES = nbv.SphereCandidates(60)
 # Search, cost, and how many views are chosen at once.

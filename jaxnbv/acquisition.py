@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnbv.answers import Answer, Quantity
-from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError, check_fields, checked, require, shown
-from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
-from jaxnbv.pose import Pose
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import GridSurface, Surface, scan
 
 

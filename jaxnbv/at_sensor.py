@@ -8,15 +8,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
-from jaxnbv.cloud import PointCloud
-from jaxnbv.planner import Planner
-from jaxnbv.pose import Pose
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.volume import Box
+from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import GridSurface, scan_samples
 from jaxnbv.search import GivenPoses
 from jaxnbv.search.base import CandidateSearch
-from jaxnbv.volume import Box
 
 # A cloud holds some thousands of points; more rays than these only take time.
 _MOST_RAYS = 20_000

@@ -6,10 +6,10 @@ What is compiled takes what it uses, not the planner: another score or search do
 import equinox as eqx
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from jaxnbv.cloud import PointCloud
+from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.scanning import Carving, Grid, GridSurface, carve
+from jaxnbv.scanning.surroundings import Surroundings
 from jaxnbv.surfaces import SurfaceModel, SurfacePosterior
-from jaxnbv.surroundings import Surroundings
 
 
 def posterior_of(

@@ -14,8 +14,8 @@ from PIL import Image
 from scipy.special import ndtr
 
 import jaxnbv as nbv
-from jaxnbv.datasets import demo_object
-from jaxnbv.tasks.neighbours import nearest_squared_distance
+from jaxnbv.geometry.neighbours import nearest_squared_distance
+from jaxnbv.studies.scenes import demo_object
 from jaxnbv.viz.data import choice_of
 from jaxnbv.viz.figures import STYLE, draw_acquisition
 from jaxnbv.viz.render import Still, beside, draw_cameras, draw_points, frame

@@ -16,11 +16,11 @@ from tqdm import tqdm
 import jaxnbv as nbv
 from jaxnbv.acquisition import Score
 from jaxnbv.cli.actions.tasks import PARTS
-from jaxnbv.datasets import Framing, Split, demo_object, fruit_scene, household_scene, part_scene, truck_scene
-from jaxnbv.metrics import truth_points
 from jaxnbv.scanning import SDFSurface, Surface
+from jaxnbv.scanning.metrics import truth_points
+from jaxnbv.scanning.sensors import PART_SETTING, USUAL_SETTING, Setting, fitted
 from jaxnbv.search import SphereCandidates
-from jaxnbv.sensors import PART_SETTING, USUAL_SETTING, Setting, fitted
+from jaxnbv.studies.scenes import Framing, Split, demo_object, fruit_scene, household_scene, part_scene, truck_scene
 from jaxnbv.viz.data import ReportData, report_data
 from jaxnbv.viz.figures import STYLE, Stills, draw_acquisition
 from jaxnbv.viz.imagined_figures import looks

@@ -17,13 +17,13 @@ import optax
 from cached import cached
 
 from jaxnbv import Camera, Coverage, DiscreteSearch, Grid, Planner, PointCloud
-from jaxnbv.datasets import CLASS_SETS, Framing, Split
+from jaxnbv.imagination import ModelName, imagination
 from jaxnbv.networks import Focus, FocusedClassifier, InvariantClassifier, save_checkpoint
 from jaxnbv.networks.pretrained import TRAINED_POINTS, TRAINED_SIDE
-from jaxnbv.presets import ModelName, imagination
+from jaxnbv.studies.scenes import CLASS_SETS, Framing, Split
+from jaxnbv.studies.training import calibrate, expected_calibration_error, fit, log_probabilities, train
+from jaxnbv.studies.training.class_clouds import LabelledClouds, imagined_clouds, scanned_clouds
 from jaxnbv.tasks.classification import entropy
-from jaxnbv.training import calibrate, expected_calibration_error, fit, log_probabilities, train
-from jaxnbv.training.class_clouds import LabelledClouds, imagined_clouds, scanned_clouds
 
 WEIGHTS = Path(__file__).parents[1] / "jaxnbv" / "networks" / "weights"
 # Scenes whose posterior is sampled come from numbers that no scanned cloud uses.

@@ -15,13 +15,13 @@ import numpy as np
 from cached import cached
 
 from jaxnbv import Coverage, DiscreteSearch, Grid, Planner, PointCloud
-from jaxnbv.datasets import Split
+from jaxnbv.imagination import ModelName, imagination
 from jaxnbv.networks import CATEGORIES, CompactPartSegmenter, part_mask, save_checkpoint
 from jaxnbv.networks.pretrained import TRAINED_SIDE
-from jaxnbv.presets import ModelName, imagination
-from jaxnbv.sensors import PART_SETTING
-from jaxnbv.training import fit
-from jaxnbv.training.part_clouds import (
+from jaxnbv.scanning.sensors import PART_SETTING
+from jaxnbv.studies.scenes import Split
+from jaxnbv.studies.training import fit
+from jaxnbv.studies.training.part_clouds import (
     LabelledPartClouds,
     imagined_part_clouds,
     scanned_part_clouds,

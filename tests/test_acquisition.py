@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement, Score, Several, expected_score
-from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
-from jaxnbv.cloud import PointCloud, concatenate
-from jaxnbv.pose import fibonacci_sphere, look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud, concatenate
+from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning import Grid, GridSurface, scan
 
 CAMERA = Camera(height=6, width=7)

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import cdist, directed_hausdorff
 
 from jaxnbv.checks import InputError
-from jaxnbv.frame import Frame
-from jaxnbv.metrics import SURFACE_POINTS, surface_distance
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.scanning import TriangleMesh
+from jaxnbv.scanning.metrics import SURFACE_POINTS, surface_distance
 
 
 def points_of(mesh, seed, count=SURFACE_POINTS):

@@ -18,8 +18,8 @@ import typer
 
 import jaxnbv as nbv
 from jaxnbv import cli
-from jaxnbv.datasets import demo_object
 from jaxnbv.networks import pyramid_classifier, save_checkpoint
+from jaxnbv.studies.scenes import demo_object
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -149,7 +149,9 @@ def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
     """Until the ball is expected to be covered. Reports of sessions are tested on their own."""
     monkeypatch.chdir(tmp_path)
     reported = []
-    monkeypatch.setattr("jaxnbv.session.write_report", lambda episode, folder, **_: reported.append(episode) or folder)
+    monkeypatch.setattr(
+        "jaxnbv.planning.session.write_report", lambda episode, folder, **_: reported.append(episode) or folder
+    )
     poses = poses_about_a_ball(10)
     model, search = nbv.GeometricSPSR(0.02, 0.2, 16), nbv.DiscreteSearch()
     planner = nbv.Planner(model, nbv.Camera(height=18, width=24), nbv.Coverage(), search, 2, nbv.Grid(40), 2048)

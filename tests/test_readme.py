@@ -19,7 +19,7 @@ BEFORE = """
 import jax
 import numpy as np
 import jaxnbv
-from jaxnbv.datasets import demo_object
+from jaxnbv.studies.scenes import demo_object
 from jaxnbv.scanning.sdf import Sphere
 
 jaxnbv.mesh_from_sdf(demo_object().sdf, jaxnbv.Grid(64)).to_trimesh().export("spot.obj")

@@ -8,10 +8,10 @@ import pytest
 
 from jaxnbv.cli.actions.tasks import CommandTask
 from jaxnbv.cli.registry import SEARCHES, TASKS, resolve
-from jaxnbv.experiments.registry import STUDIES
-from jaxnbv.experiments.study import Chart, Study
 from jaxnbv.search import GradientSearch, Search
 from jaxnbv.search.base import CandidateSearch
+from jaxnbv.studies.engine.study import Chart, Study
+from jaxnbv.studies.registry import STUDIES
 
 
 @pytest.mark.parametrize("name", TASKS)

@@ -9,7 +9,7 @@ import trimesh
 from commands import run_command
 
 from jaxnbv.checks import InputError
-from jaxnbv.planner import Planner
+from jaxnbv.planning.planner import Planner
 
 
 @pytest.fixture

@@ -8,9 +8,9 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
+from jaxnbv.cli.model_name import ModelName
 from jaxnbv.cli.registry import SEARCHES, STOPS, TASKS
-from jaxnbv.datasets import Framing
-from jaxnbv.model_name import ModelName
+from jaxnbv.studies.scenes import Framing
 
 # The registries are the enumerations.
 Task = StrEnum("Task", {name.replace("-", "_").upper(): name for name in TASKS})  # type: ignore[misc]

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from jaxnbv.cli import actions
+from jaxnbv.cli.model_name import ModelName
 from jaxnbv.cli.options import (
     REQUIRED,
     CategoryOption,
@@ -21,7 +22,6 @@ from jaxnbv.cli.options import (
     TaskOption,
     command,
 )
-from jaxnbv.model_name import ModelName
 
 session = typer.Typer(
     help="What a real sensor saw, as `jaxnbv.Session` keeps it.", no_args_is_help=True, rich_markup_mode="markdown"

@@ -7,10 +7,10 @@ from typing import Annotated, Any
 import typer
 
 from jaxnbv.cli import actions
+from jaxnbv.cli.model_name import ModelName
 from jaxnbv.cli.options import Device, DeviceOption, ModelOption, command
-from jaxnbv.datasets import Framing
-from jaxnbv.experiments.registry import STUDIES, Entry
-from jaxnbv.model_name import ModelName
+from jaxnbv.studies.registry import STUDIES, Entry
+from jaxnbv.studies.scenes import Framing
 
 study = typer.Typer(
     help="Measure the paper's claims on many scenes.", no_args_is_help=True, rich_markup_mode="markdown"

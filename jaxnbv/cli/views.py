@@ -7,6 +7,7 @@ from typing import Annotated, Any, TypeVar
 import typer
 
 from jaxnbv.cli import actions
+from jaxnbv.cli.model_name import ModelName
 from jaxnbv.cli.options import (
     REQUIRED,
     CandidatesOption,
@@ -41,8 +42,7 @@ from jaxnbv.cli.options import (
     ViewsOption,
     command,
 )
-from jaxnbv.datasets import Framing
-from jaxnbv.model_name import ModelName
+from jaxnbv.studies.scenes import Framing
 
 _T = TypeVar("_T")
 

@@ -1,9 +1,9 @@
 """Networks: PointNet++ and published checkpoints, a small rotation-invariant classifier, training and calibration."""
 
-from jaxnbv.datasets.categories import CATEGORIES as CATEGORIES
-from jaxnbv.datasets.categories import Category as Category
-from jaxnbv.datasets.categories import category_index as category_index
-from jaxnbv.datasets.categories import part_mask as part_mask
+from jaxnbv.networks.categories import CATEGORIES as CATEGORIES
+from jaxnbv.networks.categories import Category as Category
+from jaxnbv.networks.categories import category_index as category_index
+from jaxnbv.networks.categories import part_mask as part_mask
 from jaxnbv.networks.checkpoints import convert_checkpoint as convert_checkpoint
 from jaxnbv.networks.checkpoints import load_checkpoint as load_checkpoint
 from jaxnbv.networks.checkpoints import load_part_segmenter as load_part_segmenter

@@ -6,7 +6,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from jaxnbv.checks import check_fields, require, shown
-from jaxnbv.cloud import PointCloud, farthest_point_subsample
+from jaxnbv.geometry.cloud import PointCloud, farthest_point_subsample
 from jaxnbv.networks.compact_segmenter import CompactPartSegmenter
 from jaxnbv.networks.part_segmentation import PointNet2PartSegmenter
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from jaxnbv.datasets.categories import CATEGORIES, NUM_PARTS
+from jaxnbv.networks.categories import CATEGORIES, NUM_PARTS
 from jaxnbv.networks.feature_propagation import FeaturePropagation
 from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
 

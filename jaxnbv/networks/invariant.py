@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxnbv.checks import require
-from jaxnbv.farthest import farthest_point_indices
+from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.networks.pair_level import PairLevel, affine
 
 _POOLED = 192

@@ -30,7 +30,7 @@ def pretrained_classifier(
 ) -> CloudClassifier:
     """The shipped classifier of the procedural scenes of a name, whose boxes have this longest side, in scene units.
 
-    - `name`: of `jaxnbv.datasets.CLASS_SETS`.
+    - `name`: of `jaxnbv.studies.scenes.CLASS_SETS`.
     - `num_points`: what it is fed, by default as many as it was trained on; with half as many it is a little less often
       right, and twice as fast.
 
@@ -44,7 +44,7 @@ def pretrained_classifier(
 
 
 def part_segmenter(category: str | int, num_points: int = 2048, longest_side: float = TRAINED_SIDE) -> CloudSegmenter:
-    """The shipped segmenter of the procedural objects of `jaxnbv.datasets.part_scene`, for one of their categories.
+    """The shipped segmenter of the objects of `jaxnbv.studies.scenes.part_scene`, for one of their categories.
 
     It was trained on objects whose box has the longest side 2.5, upright and facing one way, seen by parts.
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxnbv.checks import AnyArray, check_type, is_traced, require
-from jaxnbv.cloud import PointCloud, farthest_point_subsample
-from jaxnbv.datasets.categories import CATEGORIES, category_index, part_mask
+from jaxnbv.geometry.cloud import PointCloud, farthest_point_subsample
+from jaxnbv.networks.categories import CATEGORIES, category_index, part_mask
 from jaxnbv.networks.invariant import InvariantClassifier
 from jaxnbv.networks.pointnet2 import PointNet2Classifier
 

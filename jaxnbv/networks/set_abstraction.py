@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxnbv.farthest import farthest_point_indices
+from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.networks.grouping import ball_query
 
 

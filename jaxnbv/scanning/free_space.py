@@ -11,14 +11,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnbv.camera import Camera
 from jaxnbv.checks import check_fields, require
-from jaxnbv.cloud import PointCloud
-from jaxnbv.pose import Pose
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.tensor_grid import on_tensor_grid
+from jaxnbv.geometry.volume import Box, Volume
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.surfaces import EmptyPoints
-from jaxnbv.tensor_grid import on_tensor_grid
-from jaxnbv.volume import Box, Volume
 
 # A model takes a hundred or two of the empty points, and the time to choose them grows with how many there are.
 _POINTS_ALONG_AXIS = 20
@@ -31,7 +31,7 @@ _NOISE = 0.05
 class Carving(eqx.Module):
     """No imagined surface is inside where the sensor saw empty space, nor outside the volume that holds the object.
 
-    - `volume`: where the object can be, see `jaxnbv.volume`; by default the box that scenes are scaled to.
+    - `volume`: where the object can be, see `jaxnbv.geometry.volume`; by default the box that scenes are scaled to.
     - `margin`: in spacings of the grid. A node is seen empty if every ray that passes within the margin of it, and its
       neighbours in the image, went on for the margin beyond it; it is outside if the volume is farther than two.
 

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Int8
 from scipy.spatial import cKDTree
 
-from jaxnbv.camera import Camera
 from jaxnbv.checks import AnyArray, as_floats, check_fields, is_traced, require
-from jaxnbv.cloud import PointCloud
-from jaxnbv.pose import Pose
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import tracing
 from jaxnbv.scanning.scanner import scan
 from jaxnbv.scanning.surface import Hits, Surface

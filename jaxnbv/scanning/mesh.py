@@ -18,12 +18,12 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from skimage.measure import marching_cubes
 
 from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, check_type, checked, is_traced, require, shown
-from jaxnbv.files import is_file
-from jaxnbv.frame import Frame
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.geometry.tensor_grid import on_tensor_grid
 from jaxnbv.scanning.grid import Grid, GridSurface
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.scanning.surface import Hits, Surface
-from jaxnbv.tensor_grid import on_tensor_grid
+from jaxnbv.storage.files import is_file
 
 
 class _Tree:

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.camera import Camera
 from jaxnbv.checks import check_fields, checked, require
-from jaxnbv.cloud import PointCloud
-from jaxnbv.pose import Pose
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning.surface import Hits, Surface
 
 # Beyond any sensor; squares of much larger numbers are infinite.

@@ -12,9 +12,9 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from jaxnbv.acquisition import Score, check_differentiable
-from jaxnbv.camera import Camera
 from jaxnbv.checks import check_fields, require
-from jaxnbv.pose import Pose
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.search.base import best_unvisited
 from jaxnbv.search.pose_space import PoseSpace
 from jaxnbv.search.problem import Problem

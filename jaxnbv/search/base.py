@@ -10,8 +10,8 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxnbv.acquisition import Score
 from jaxnbv.answers import Quantity
-from jaxnbv.camera import Camera
-from jaxnbv.pose import Pose
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.search.candidates import Candidates, SphereCandidates, as_candidates
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxnbv.acquisition import Score
 from jaxnbv.answers import Quantity
 from jaxnbv.checks import InputError
-from jaxnbv.pose import Pose
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.search.base import CandidateSearch, best_unvisited
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, InputError, check_fields, require, shown
-from jaxnbv.pose import Pose, fibonacci_sphere, look_at
+from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
+from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.search.rotations import rotation_between, rotation_from_6d
-from jaxnbv.sensors import SENSOR_RADIUS
 
 # The real root of x^3 = x + 1.
 _PLASTIC = 1.324717957244746

@@ -7,9 +7,9 @@ import optimistix as optx
 from jaxtyping import PRNGKeyArray
 
 from jaxnbv.acquisition import Score
-from jaxnbv.camera import Camera
 from jaxnbv.checks import check_fields, checked, require
-from jaxnbv.pose import Pose
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.search.ascent import Ascent
 from jaxnbv.search.base import Search
 from jaxnbv.search.candidates import Candidates, NumberedCandidates, as_candidates

@@ -12,12 +12,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.camera import Camera
 from jaxnbv.checks import check_fields, require
-from jaxnbv.pose import Pose
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.search.candidates import SphereCandidates
 from jaxnbv.search.rotations import normalise, rotation_between, rotation_from_6d, rotation_to_6d
-from jaxnbv.sensors import SENSOR_RADIUS
 
 
 class PoseSpace(eqx.Module):

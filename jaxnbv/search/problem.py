@@ -8,13 +8,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.acquisition import Score, sample_scores
-from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
-from jaxnbv.cloud import PointCloud, concatenate
-from jaxnbv.pose import Pose
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud, concatenate
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.planning.travel import Cost
 from jaxnbv.scanning import GridSurface
-from jaxnbv.surroundings import Surroundings
-from jaxnbv.travel import Cost
+from jaxnbv.scanning.surroundings import Surroundings
 
 
 class Problem(eqx.Module):

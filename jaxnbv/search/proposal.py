@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnbv.display import Displayed
-from jaxnbv.pose import Pose
-from jaxnbv.travel import CostFunction, arc_length, visiting_order
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.planning.travel import CostFunction, arc_length, visiting_order
 
 
 class Trajectories(eqx.Module):

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnbv.checks import InputError, require
-from jaxnbv.cloud import PointCloud
-from jaxnbv.files import write_whole
-from jaxnbv.folders import FORMAT, check_format
-from jaxnbv.pose import Pose
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.search import Proposal, Trajectories
+from jaxnbv.storage.files import write_whole
+from jaxnbv.storage.folders import FORMAT, check_format
 
 T = TypeVar("T")
 Schema: TypeAlias = Mapping[str, tuple[str, tuple[int | str, ...]]]

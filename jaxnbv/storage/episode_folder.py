@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from jaxnbv.cloud import PointCloud
-from jaxnbv.files import write_whole
-from jaxnbv.folders import ResultFolder, read_config, writing_in
-from jaxnbv.pose import Pose
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.search import Proposal
 from jaxnbv.storage.arrays import (
     POSE,
@@ -30,6 +28,8 @@ from jaxnbv.storage.arrays import (
     scan_of,
     write_arrays,
 )
+from jaxnbv.storage.files import write_whole
+from jaxnbv.storage.folders import ResultFolder, read_config, writing_in
 
 _RECORD, _VIEWS = "episode.json", "view_*.npz"
 _VIEW = {**POSE, **SCAN, **PROPOSAL}

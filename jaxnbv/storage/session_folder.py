@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Real
 
-from jaxnbv.folders import ResultFolder, read_config
 from jaxnbv.search import Proposal
 from jaxnbv.storage.arrays import (
     POSE,
@@ -23,6 +22,7 @@ from jaxnbv.storage.arrays import (
     read_arrays,
     write_arrays,
 )
+from jaxnbv.storage.folders import ResultFolder, read_config
 
 SESSION_RECORD = "session.json"
 _IMAGE: Schema = {

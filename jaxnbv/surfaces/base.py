@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, as_numbers, check_key, check_type, is_traced, require
-from jaxnbv.cloud import PointCloud
 from jaxnbv.display import Displayed
-from jaxnbv.tensor_grid import on_tensor_grid
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.tensor_grid import on_tensor_grid
 
 HALF_WIDTH = 0.5 * math.pi
 """Scattered points must lie in [-HALF_WIDTH, HALF_WIDTH]^3, the cube that the paper scales a scene into."""

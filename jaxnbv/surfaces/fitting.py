@@ -9,7 +9,7 @@ import optimistix as optx
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.checks import check_key, check_type, checked, require
-from jaxnbv.cloud import PointCloud
+from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.surfaces.base import check_data
 from jaxnbv.surfaces.screened import ScreenedSPSR
 from jaxnbv.surfaces.spsr import GeometricSPSR

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnbv.cloud import PointCloud
+from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.surfaces.covariance import Spectra, normal_covariance
 from jaxnbv.surfaces.matern import Scalar
 

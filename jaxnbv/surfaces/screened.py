@@ -21,7 +21,7 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, check_fields, check_type, is_traced, require, shown
-from jaxnbv.cloud import PointCloud
+from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.surfaces.base import EmptyPoints, SurfaceModel, on_torus, sampler
 from jaxnbv.surfaces.covariance import function_covariance, function_variance
 from jaxnbv.surfaces.nonuniform import NonuniformTransform

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from scipy.spatial import cKDTree
 
 from jaxnbv.checks import AnyArray, as_floats, check_type, is_traced, require
-from jaxnbv.cloud import PointCloud
+from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.surfaces.base import SurfaceModel, check_data, on_torus, sampler
 from jaxnbv.surfaces.covariance import (
     Spectra,

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxnbv.checks import InputError, check_fields, is_traced, require, shown
-from jaxnbv.cloud import PointCloud, farthest_point_subsample
-from jaxnbv.farthest import farthest_point_indices
+from jaxnbv.geometry.cloud import PointCloud, farthest_point_subsample
+from jaxnbv.geometry.farthest_points import farthest_point_indices
+from jaxnbv.geometry.volume import Box, Volume, boundary_points
 from jaxnbv.surfaces.base import HALF_WIDTH, EmptyPoints
-from jaxnbv.volume import Box, Volume, boundary_points
 
 
 class ValueRows(eqx.Module):
@@ -43,7 +43,7 @@ class OutsideBoundary(ValueSource):
     """f(b) - c ~ N(h, s_b^2) at points b on the boundary of the volume that holds the object (the "envelope" of Poisson
     reconstruction, Kazhdan et al. 2020, as an observation).
 
-    - `volume`: see `jaxnbv.volume`; by default the box that scenes are scaled to.
+    - `volume`: see `jaxnbv.geometry.volume`; by default the box that scenes are scaled to.
     - `count`: points, spread evenly as seen from the origin.
     - `value`, `noise`: mean and standard deviation, in units of h.
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from jaxnbv.acquisition import Score, context_of, preferred_batch_size, zero_if_empty
 from jaxnbv.answers import Answer, Panel, Quantity
 from jaxnbv.checks import check_fields, require
-from jaxnbv.cloud import PointCloud, concatenate, limit_capacity
+from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.scanning import Surface
 
 Classifier: TypeAlias = Callable[[PointCloud], Float[Array, " classes"]]

@@ -7,8 +7,8 @@ from jaxtyping import Array, Float
 from jaxnbv.acquisition import Score
 from jaxnbv.answers import Quantity
 from jaxnbv.checks import check_fields, require
-from jaxnbv.cloud import PointCloud
-from jaxnbv.tasks.neighbours import nearest_squared_distance
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.neighbours import nearest_squared_distance
 
 
 class Coverage(Score):

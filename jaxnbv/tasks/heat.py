@@ -14,7 +14,7 @@ from loky import cpu_count, get_reusable_executor
 
 from jaxnbv.answers import Answer, Panel, Quantity, coordinates, number
 from jaxnbv.checks import AnyArray, InputError, as_numbers, checked, require
-from jaxnbv.cloud import PointCloud
+from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.tasks.diffusion import HeatProblem, Temperature, cloud_temperature, mesh_temperature, refine
 from jaxnbv.tasks.host import call_on_host

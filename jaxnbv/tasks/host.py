@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Shaped
 
 from jaxnbv.checks import InputError, check_fields, require
-from jaxnbv.cloud import PointCloud
+from jaxnbv.geometry.cloud import PointCloud
 
 
 class HostClassifier(eqx.Module):

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 from jaxnbv.acquisition import preferred_batch_size
 from jaxnbv.answers import Answer, Panel, Quantity
 from jaxnbv.checks import check_fields, require, shown
-from jaxnbv.cloud import PointCloud
+from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.scanning import Surface
 
 # Of probabilities in 32 bits, or less.

@@ -11,15 +11,15 @@ from tqdm import tqdm
 
 from jaxnbv.answers import Quantity
 from jaxnbv.checks import AnyArray
-from jaxnbv.cloud import PointCloud
-from jaxnbv.episode import Episode
-from jaxnbv.metrics import coverage, truth_points
-from jaxnbv.planner import Planner
-from jaxnbv.pose import Pose
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.planning.episode import Episode
+from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.state import State
 from jaxnbv.scanning import Grid
 from jaxnbv.scanning.mesh import level_triangles
+from jaxnbv.scanning.metrics import coverage, truth_points
 from jaxnbv.search import Proposal
-from jaxnbv.state import State
 from jaxnbv.surfaces import TrigonometricPosterior
 from jaxnbv.viz.imagined import Imagined, Look, imagined, look
 from jaxnbv.viz.sphere import unit

@@ -17,8 +17,8 @@ from PIL import Image
 from tqdm import tqdm
 
 from jaxnbv.answers import Quantity, number
-from jaxnbv.camera import Camera
-from jaxnbv.files import make_folder, write_whole
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.storage.files import make_folder, write_whole
 from jaxnbv.viz import sphere
 from jaxnbv.viz.data import Choice, ReportData, ViewData
 from jaxnbv.viz.imagined_figures import imagined_figure

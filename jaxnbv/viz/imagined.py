@@ -9,13 +9,13 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from jaxnbv.at_sensor import mean_depth
-from jaxnbv.camera import Camera
-from jaxnbv.cloud import PointCloud
-from jaxnbv.episode import Episode, observe_scene, view_keys
-from jaxnbv.pose import Pose
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.planning.episode import Episode, observe_scene, view_keys
+from jaxnbv.planning.state import State
 from jaxnbv.scanning import SensorNoise, scan_samples
 from jaxnbv.search import Proposal
-from jaxnbv.state import State
 
 SHOWN = 4
 _PIXELS = 96

@@ -11,15 +11,15 @@ from jaxtyping import Float, UInt8
 from matplotlib.colors import Colormap, to_rgb
 from scipy.spatial.transform import Rotation
 
-from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError, checked
-from jaxnbv.episode import Episode, view_keys
-from jaxnbv.files import write_text
-from jaxnbv.planner import Planner
-from jaxnbv.pose import Pose
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.planning.episode import Episode, view_keys
+from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.state import State
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
-from jaxnbv.state import State
+from jaxnbv.storage.files import write_text
 from jaxnbv.viz.data import allowing_for_unseen, mean_surface
 from jaxnbv.viz.render import depth_picture, depth_range
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, VALUE, round_range

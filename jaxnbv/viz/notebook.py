@@ -16,10 +16,10 @@ from matplotlib.figure import Figure
 from scipy.special import ndtr
 
 from jaxnbv.answers import Quantity
-from jaxnbv.cloud import PointCloud
 from jaxnbv.display import Displayed
-from jaxnbv.episode import Episode
-from jaxnbv.pose import look_at
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import look_at
+from jaxnbv.planning.episode import Episode
 from jaxnbv.search import Proposal
 from jaxnbv.surfaces import SurfacePosterior
 from jaxnbv.viz.data import choice_of, report_data

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
 from jaxnbv.answers import Quantity
-from jaxnbv.camera import Camera
+from jaxnbv.geometry.camera import Camera
 from jaxnbv.viz import sphere
 from jaxnbv.viz.data import Choice, MeanSurface, ReportData, ViewData
 from jaxnbv.viz.figures import deviation_range, is_smooth, rings_level, value_range

@@ -11,9 +11,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm
 from scipy.spatial import cKDTree
 
-from jaxnbv.camera import Camera
-from jaxnbv.frame import Frame
-from jaxnbv.pose import Pose, look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.viz.data import MeanSurface, ReportData
 from jaxnbv.viz.imagined import Look

@@ -17,12 +17,12 @@ from matplotlib.figure import Figure
 from plotly.offline import get_plotlyjs
 
 from jaxnbv.answers import Panel, number
-from jaxnbv.camera import Camera
 from jaxnbv.checks import AnyArray, checked
-from jaxnbv.episode import Episode
-from jaxnbv.files import make_folder, write_text
-from jaxnbv.folders import versions, writing_in
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.planning.episode import Episode
 from jaxnbv.storage import describe
+from jaxnbv.storage.files import make_folder, write_text
+from jaxnbv.storage.folders import versions, writing_in
 from jaxnbv.viz.data import ReportData, report_data
 from jaxnbv.viz.figures import STYLE, Stills, write_figures
 from jaxnbv.viz.imagined_figures import Tile, depths, looks

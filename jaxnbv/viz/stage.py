@@ -4,8 +4,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxnbv.episode import Episode
-from jaxnbv.pose import Pose, fibonacci_sphere
+from jaxnbv.geometry.pose import Pose, fibonacci_sphere
+from jaxnbv.planning.episode import Episode
 
 # Fields of view are drawn so deep, in radii of the object, and end at so many of its extents in their direction, which
 # counts as so many radii at least.

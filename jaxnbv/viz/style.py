@@ -8,7 +8,7 @@ from jaxtyping import Float
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
 
-from jaxnbv.files import write_whole
+from jaxnbv.storage.files import write_whole
 
 INK, GREY, LINE = "#1f2733", "#7a8494", "#d9dee6"
 BEFORE, NEW = "#26344d", "#d55e00"

@@ -5,11 +5,11 @@ import numpy as np
 import trimesh
 
 from jaxnbv.answers import Answer, Panel
-from jaxnbv.cloud import PointCloud
-from jaxnbv.episode import Episode
-from jaxnbv.metrics import true_mesh
-from jaxnbv.planner import Planner
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.planning.episode import Episode
+from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Surface
+from jaxnbv.scanning.metrics import true_mesh
 
 # Points of the true surface that a score is asked about: the planner's own usual capacity.
 _TRUE_POINTS = 8192

@@ -5,8 +5,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnbv.acquisition import expected_score
-from jaxnbv.episode import Episode, view_keys
-from jaxnbv.pose import Pose
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.planning.episode import Episode, view_keys
 from jaxnbv.search import Proposal, Trajectories
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.viz.sphere import unit

@@ -10,7 +10,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-from jaxnbv.camera import Camera
+from jaxnbv.geometry.camera import Camera
 from jaxnbv.viz import sphere
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.layout import fitted, flow

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxnbv.answers import Quantity, coordinates, number
-from jaxnbv.pose import Pose
+from jaxnbv.geometry.pose import Pose
 
 
 def describe_first(pose: Pose, points: int, covered: float | None) -> str:

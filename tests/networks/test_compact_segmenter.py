@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from jaxnbv.checks import InputError
-from jaxnbv.datasets import Split
 from jaxnbv.networks import (
     CATEGORIES,
     CompactPartSegmenter,
     part_segmenter,
 )
-from jaxnbv.training.part_clouds import LabelledPartClouds, scanned_part_clouds
+from jaxnbv.studies.scenes import Split
+from jaxnbv.studies.training.part_clouds import LabelledPartClouds, scanned_part_clouds
 
 RNG = np.random.default_rng(0)
 COUNT = 300

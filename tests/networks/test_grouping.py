@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxnbv.checks import InputError
-from jaxnbv.farthest import farthest_point_indices
+from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.networks.grouping import ball_query
 
 RNG = np.random.default_rng(0)

@@ -9,7 +9,7 @@ import safetensors.numpy
 from scipy.spatial.transform import Rotation
 
 from jaxnbv.checks import InputError
-from jaxnbv.cloud import PointCloud, farthest_point_subsample
+from jaxnbv.geometry.cloud import PointCloud, farthest_point_subsample
 from jaxnbv.networks import (
     CloudClassifier,
     InvariantClassifier,

@@ -10,7 +10,7 @@ import pytest
 import safetensors.numpy
 
 from jaxnbv.checks import InputError
-from jaxnbv.cloud import PointCloud
+from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.networks import (
     CATEGORIES,
     CloudSegmenter,

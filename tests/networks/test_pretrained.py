@@ -7,11 +7,11 @@ import jax
 import numpy as np
 import pytest
 
-from jaxnbv.cloud import PointCloud
-from jaxnbv.datasets import CLASS_SETS, FRUITS, HOUSEHOLD, PATTERNS, Framing, Split
+from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.networks import pretrained_classifier, pyramid_classifier
+from jaxnbv.studies.scenes import CLASS_SETS, FRUITS, HOUSEHOLD, PATTERNS, Framing, Split
+from jaxnbv.studies.training.class_clouds import LabelledClouds, scanned_clouds
 from jaxnbv.tasks.classification import entropy
-from jaxnbv.training.class_clouds import LabelledClouds, scanned_clouds
 
 COMPUTES = True
 _CHUNK = 40

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.ndimage
 
-from jaxnbv.camera import Camera
+from jaxnbv.geometry.camera import Camera
 from jaxnbv.scanning.grid import Grid, GridSurface
 from jaxnbv.scanning.sdf import Box, Cylinder, Torus
 

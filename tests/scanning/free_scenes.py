@@ -5,8 +5,8 @@ import math
 import equinox as eqx
 import numpy as np
 
-from jaxnbv.camera import Camera
-from jaxnbv.pose import look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import look_at
 from jaxnbv.scanning import (
     Carving,
     Grid,

@@ -8,10 +8,11 @@ import pytest
 from free_scenes import SEE, SOLIDS, image, nodes_of
 from jaxtyping import Array, Float
 
-from jaxnbv.camera import Camera
-from jaxnbv.cloud import PointCloud
-from jaxnbv.planner import Planner
-from jaxnbv.pose import look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import look_at
+from jaxnbv.geometry.volume import Box
+from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import (
     Carving,
     Grid,
@@ -26,7 +27,6 @@ from jaxnbv.scanning.sdf import Box as BoxSolid
 from jaxnbv.search import FarthestView
 from jaxnbv.surfaces import Fields, GeometricSPSR, SurfaceModel, SurfacePosterior
 from jaxnbv.tasks import Coverage
-from jaxnbv.volume import Box
 
 RNG = np.random.default_rng(0)
 SMALL_GRID = Grid(30, 1.6)

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
-from jaxnbv.camera import Camera
-from jaxnbv.cloud import PointCloud
-from jaxnbv.datasets.demo import demo_object
-from jaxnbv.frame import Frame
-from jaxnbv.pose import fibonacci_sphere, look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.geometry.pose import fibonacci_sphere, look_at
+from jaxnbv.geometry.volume import Box
 from jaxnbv.scanning import (
     Carving,
     Grid,
@@ -29,7 +29,7 @@ from jaxnbv.scanning import (
 )
 from jaxnbv.scanning.sdf import Box as BoxSolid
 from jaxnbv.scanning.sdf import Capsule, Sphere
-from jaxnbv.volume import Box
+from jaxnbv.studies.scenes.demo import demo_object
 
 RNG = np.random.default_rng(0)
 

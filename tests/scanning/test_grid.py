@@ -11,8 +11,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from skimage.measure import marching_cubes
 
-from jaxnbv.camera import Camera
-from jaxnbv.pose import fibonacci_sphere, look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning.grid import Grid, GridSurface, scan_samples
 from jaxnbv.scanning.scanner import scan
 

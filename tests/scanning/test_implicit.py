@@ -11,7 +11,7 @@ import pytest
 from bumps import FEW, GRID, grid_surface, nodes, solid, some_bumps, some_rays
 from jax.scipy.ndimage import map_coordinates
 
-from jaxnbv.pose import look_at
+from jaxnbv.geometry.pose import look_at
 from jaxnbv.scanning.grid import GridSurface
 from jaxnbv.scanning.implicit import implicit_depth
 from jaxnbv.scanning.scanner import scan

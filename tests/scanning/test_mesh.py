@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxnbv.camera import Camera
-from jaxnbv.pose import fibonacci_sphere, look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.mesh import TriangleMesh, load_mesh, mesh_from_sdf
 from jaxnbv.scanning.scanner import scan

@@ -25,8 +25,8 @@ from bumps import (
     some_rays,
 )
 
-from jaxnbv.camera import Camera
-from jaxnbv.pose import fibonacci_sphere, look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning.grid import GridSurface
 from jaxnbv.scanning.scanner import scan
 from jaxnbv.scanning.sdf import Sphere

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxnbv.camera import Camera
-from jaxnbv.cloud import PointCloud
-from jaxnbv.pose import fibonacci_sphere, look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning.mesh import TriangleMesh
 from jaxnbv.scanning.scanner import SensorNoise, scan
 from jaxnbv.scanning.sdf import Sphere

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from jaxnbv.pose import fibonacci_sphere, look_at
+from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning.sdf import Box, Capsule, Cone, Cylinder, SmoothUnion, Sphere, Torus
 
 RNG = np.random.default_rng(0)

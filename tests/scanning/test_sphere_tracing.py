@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv.camera import Camera
-from jaxnbv.pose import fibonacci_sphere, look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning.scanner import scan
 from jaxnbv.scanning.sdf import Box, Cylinder, Sphere, Torus
 from jaxnbv.scanning.sphere_tracing import SDFSurface

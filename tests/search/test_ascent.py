@@ -8,10 +8,10 @@ import optax
 import optimistix as optx
 import pytest
 
-from jaxnbv.camera import Camera
-from jaxnbv.cloud import PointCloud
-from jaxnbv.planner import Planner
-from jaxnbv.pose import Pose, look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose, look_at
+from jaxnbv.planning.planner import Planner
 from jaxnbv.search import ConstrainedPoses, FreePoses, GradientSearch, HybridSearch, Problem, SpherePoses
 from jaxnbv.search.ascent import Ascent
 from jaxnbv.search.gradient import _pose_space

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from jaxnbv.camera import Camera
-from jaxnbv.cloud import PointCloud
-from jaxnbv.pose import fibonacci_sphere, look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning import Grid, GridSurface
 from jaxnbv.search import FarthestView, Problem, RandomView, UncertaintyView
 from jaxnbv.search.baselines import uncertain_length

@@ -9,9 +9,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement, Score
-from jaxnbv.camera import Camera
-from jaxnbv.cloud import PointCloud
-from jaxnbv.pose import Pose, look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.scanning import Grid, GridSurface, scan
 from jaxnbv.search import (
     ConstrainedPoses,

@@ -9,11 +9,11 @@ import optimistix as optx
 import pytest
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement
-from jaxnbv.camera import Camera
-from jaxnbv.cloud import PointCloud
-from jaxnbv.episode import simulate
-from jaxnbv.planner import Planner
-from jaxnbv.pose import look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import look_at
+from jaxnbv.planning.episode import simulate
+from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, scan
 from jaxnbv.scanning.sdf import Capsule, Sphere
 from jaxnbv.search import ConstrainedPoses, DiscreteSearch, FreePoses, GradientSearch, HybridSearch, SpherePoses

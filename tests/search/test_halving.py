@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from jaxnbv.acquisition import Score, expected_score
-from jaxnbv.camera import Camera
-from jaxnbv.cloud import PointCloud
-from jaxnbv.pose import fibonacci_sphere, look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning import Grid, GridSurface
 from jaxnbv.search import DiscreteSearch, HalvingSearch, Problem
 

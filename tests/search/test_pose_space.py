@@ -13,8 +13,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jaxnbv.camera import Camera
-from jaxnbv.pose import Pose, look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.search.pose_space import ConstrainedPoses, FreePoses, SpherePoses
 from jaxnbv.search.rotations import rotation_to_6d
 

@@ -9,10 +9,10 @@ from test_discrete import CAMERA, problem, visit
 
 from jaxnbv.acquisition import Score, Several, expected_score
 from jaxnbv.checks import InputError
-from jaxnbv.pose import fibonacci_sphere, look_at
+from jaxnbv.geometry.pose import fibonacci_sphere, look_at
+from jaxnbv.planning.travel import ValueMinusCost, arc_length
 from jaxnbv.search import DiscreteSearch, TieBreakSearch
 from jaxnbv.tasks import Coverage
-from jaxnbv.travel import ValueMinusCost, arc_length
 
 __all__ = ["problem"]
 

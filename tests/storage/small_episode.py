@@ -4,10 +4,10 @@ from pathlib import Path
 
 import jax
 
-from jaxnbv.camera import Camera
-from jaxnbv.episode import simulate
-from jaxnbv.planner import Planner
-from jaxnbv.pose import look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import look_at
+from jaxnbv.planning.episode import simulate
+from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
 from jaxnbv.scanning.sdf import Capsule, Sphere
 from jaxnbv.search import DiscreteSearch

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from small_episode import BASE, planner_of
 
-from jaxnbv.pose import look_at
+from jaxnbv.geometry.pose import look_at
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
 from jaxnbv.scanning.sdf import Capsule, Sphere
 from jaxnbv.search import DiscreteSearch, FarthestView, SphereCandidates

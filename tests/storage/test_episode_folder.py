@@ -12,8 +12,8 @@ from plyfile import PlyData
 from small_episode import FIRST, KEY, SCENE, contents, planner_of, run
 
 from jaxnbv.checks import InputError
-from jaxnbv.planner import Planner
-from jaxnbv.pose import look_at
+from jaxnbv.geometry.pose import look_at
+from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import SensorNoise
 from jaxnbv.search import FarthestView
 from jaxnbv.storage import EpisodeFolder, describe, remove_episode
@@ -97,7 +97,9 @@ def test_three_views_continued_to_five_equal_five(finished, tmp_path):
 def test_a_finished_run_is_read_not_computed(finished, monkeypatch):
     before = contents(finished[1])
     monkeypatch.setattr(Planner, "choose", lambda *_: pytest.fail("a finished view was chosen again"))
-    monkeypatch.setattr("jaxnbv.episode.observe_scene", lambda *_: pytest.fail("a finished view was scanned again"))
+    monkeypatch.setattr(
+        "jaxnbv.planning.episode.observe_scene", lambda *_: pytest.fail("a finished view was scanned again")
+    )
     run(finished[1], views=5)
     assert contents(finished[1]) == before
 
@@ -187,7 +189,7 @@ def test_a_name_that_is_too_long_is_told(tmp_path):
 
 def test_more_cores_than_before_are_told_of(finished, tmp_path, monkeypatch):
     folder = shutil.copytree(finished[1], tmp_path / "copy")
-    monkeypatch.setattr("jaxnbv.folders.loky.cpu_count", lambda: 64)
+    monkeypatch.setattr("jaxnbv.storage.folders.loky.cpu_count", lambda: 64)
     with pytest.warns(UserWarning, match=r"cores: \d+ there, 64 now"):
         run(folder, views=5)
 

@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = """
 import os, sys, time
 from pathlib import Path
-import jaxnbv.episode, jaxnbv.files
+import jaxnbv.planning.episode, jaxnbv.storage.files
 from small_episode import run
 
 folder, stage, view = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
@@ -35,10 +35,10 @@ def stall_at(module, name, moment):
 
 done = len(list(folder.glob("view_*.npz")))
 if stage == "scan":
-    stall_at(jaxnbv.episode, "observe_scene", lambda call: done + call == view + 1)
+    stall_at(jaxnbv.planning.episode, "observe_scene", lambda call: done + call == view + 1)
 if stage == "write":
     record = 0 if (folder / "episode.json").exists() else 1
-    stall_at(jaxnbv.files.os, "fsync", lambda call: done + call == view + 1 + record)
+    stall_at(jaxnbv.storage.files.os, "fsync", lambda call: done + call == view + 1 + record)
 run(folder, views=5)
 """
 
@@ -97,7 +97,7 @@ def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_files(tmp_
 def test_one_process_writes_at_a_time(finished, tmp_path):
     folder = shutil.copytree(finished[1], tmp_path / "copy")
     script = (
-        "import sys, time\nfrom pathlib import Path\nfrom jaxnbv.folders import ResultFolder\n"
+        "import sys, time\nfrom pathlib import Path\nfrom jaxnbv.storage.folders import ResultFolder\n"
         "with ResultFolder(sys.argv[1], 'episode.json', 'nothing_*', {}, 'episode').writing():\n"
         "    print('holding', flush=True)\n    sys.stdin.read()\n"
     )

@@ -10,7 +10,7 @@ import pytest
 import scipy.stats
 from weight_space import WeightSpace
 
-from jaxnbv.cloud import PointCloud
+from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.surfaces import GeometricSPSR
 
 COMPUTES = True

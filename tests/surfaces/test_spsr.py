@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from weight_space import WeightSpace
 
-from jaxnbv.cloud import PointCloud
+from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.surfaces.covariance import function_normal_covariance, function_variance, normal_covariance
 

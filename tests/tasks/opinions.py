@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnbv.cloud import PointCloud
+from jaxnbv.geometry.cloud import PointCloud
 
 WEIGHTS = np.random.default_rng(7).normal(size=(4, 6)) * 3.0
 

@@ -8,11 +8,11 @@ import pytest
 from opinions import drawn_cloud, linear, linear_in_numpy
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement, expected_score
-from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
-from jaxnbv.cloud import PointCloud, concatenate, farthest_point_subsample
-from jaxnbv.planner import Planner
-from jaxnbv.pose import fibonacci_sphere, look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud, concatenate, farthest_point_subsample
+from jaxnbv.geometry.pose import fibonacci_sphere, look_at
+from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, GridSurface, scan
 from jaxnbv.search import DiscreteSearch, FarthestView
 from jaxnbv.surfaces import GeometricSPSR

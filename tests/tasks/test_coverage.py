@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from jaxnbv.acquisition import expected_score
-from jaxnbv.camera import Camera
-from jaxnbv.cloud import PointCloud
-from jaxnbv.pose import fibonacci_sphere, look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning import Grid, GridSurface, scan
 from jaxnbv.tasks import Coverage
 

@@ -9,7 +9,7 @@ from scipy.linalg import expm
 from scipy.special import eval_legendre
 
 from jaxnbv.checks import InputError
-from jaxnbv.pose import fibonacci_sphere
+from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.tasks.diffusion import (
     HeatProblem,
     cloud_laplacian,

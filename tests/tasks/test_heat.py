@@ -11,11 +11,11 @@ import robust_laplacian
 import trimesh
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement, expected_score
-from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
-from jaxnbv.cloud import PointCloud
-from jaxnbv.planner import Planner
-from jaxnbv.pose import fibonacci_sphere, look_at
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import fibonacci_sphere, look_at
+from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, GridSurface, TriangleMesh, scan
 from jaxnbv.search import GradientSearch
 from jaxnbv.surfaces import GeometricSPSR

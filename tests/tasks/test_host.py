@@ -8,10 +8,10 @@ import pytest
 from opinions import drawn_cloud, linear, linear_in_numpy
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement
-from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError
-from jaxnbv.cloud import PointCloud
-from jaxnbv.planner import Planner
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid
 from jaxnbv.search import DiscreteSearch
 from jaxnbv.surfaces import GeometricSPSR

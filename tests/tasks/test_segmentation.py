@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement
-from jaxnbv.cloud import PointCloud, concatenate
+from jaxnbv.geometry.cloud import PointCloud, concatenate
 from jaxnbv.tasks import SoftPartCount, part_counts
 
 RNG = np.random.default_rng(0)

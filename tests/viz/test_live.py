@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from test_session import FIRST, session_of, shot
 
 from jaxnbv.checks import InputError
-from jaxnbv.replay import stored_run
+from jaxnbv.planning.replay import stored_run
 from jaxnbv.viz.live import LiveView
 
 viser = pytest.importorskip("viser", reason="viser is not installed")

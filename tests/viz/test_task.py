@@ -13,8 +13,8 @@ from small_run import small_run
 
 import jaxnbv as nbv
 from jaxnbv.answers import Answer, number
-from jaxnbv.datasets import Split, pyramid_scene
 from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.studies.scenes import Split, pyramid_scene
 from jaxnbv.tasks.classification import ClassAnswer
 from jaxnbv.tasks.heat import ColdestAnswer
 from jaxnbv.tasks.segmentation import PartAnswer

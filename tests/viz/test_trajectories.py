@@ -14,8 +14,8 @@ from small_run import CAMERA, small_run
 import jaxnbv as nbv
 from jaxnbv.answers import number
 from jaxnbv.cli.actions.lines import Lines
-from jaxnbv.episode import view_keys
-from jaxnbv.pose import look_at
+from jaxnbv.geometry.pose import look_at
+from jaxnbv.planning.episode import view_keys
 from jaxnbv.search import Search, Trajectories
 from jaxnbv.search.base import best_unvisited
 from jaxnbv.search.candidates import sphere_candidates

@@ -13,17 +13,17 @@ from jaxnbv.cli.actions.run_folder import clear, explained, note, usual_folder
 from jaxnbv.cli.actions.sensors import first_pose, peculiarities, quick_rays, sensor_for
 from jaxnbv.cli.actions.stops import rule
 from jaxnbv.cli.actions.tasks import CommandTask, Given, OfMesh
+from jaxnbv.cli.model_name import ModelName
 from jaxnbv.cli.options import USUAL_SIZE, EpisodeOptions, SensorOptions, SizeOptions
 from jaxnbv.cli.registry import SEARCHES, TASKS, resolve
-from jaxnbv.datasets import Framing
-from jaxnbv.episode import View, simulate
-from jaxnbv.folders import AnotherConfigurationError
-from jaxnbv.model_name import ModelName
-from jaxnbv.planner import Planner
-from jaxnbv.pose import Pose
-from jaxnbv.presets import imagination
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.imagination import imagination
+from jaxnbv.planning.episode import View, simulate
+from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SensorNoise, Surface, load_mesh
-from jaxnbv.sensors import Setting
+from jaxnbv.scanning.sensors import Setting
+from jaxnbv.storage.folders import AnotherConfigurationError
+from jaxnbv.studies.scenes import Framing
 from jaxnbv.viz import write_report
 
 

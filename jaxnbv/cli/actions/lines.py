@@ -6,8 +6,8 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxnbv.answers import Answer
-from jaxnbv.episode import View
-from jaxnbv.planner import Planner
+from jaxnbv.planning.episode import View
+from jaxnbv.planning.planner import Planner
 
 
 class Lines:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import typer
 
-from jaxnbv.replay import stored_run
+from jaxnbv.planning.replay import stored_run
 from jaxnbv.viz.live import LiveView
 
 

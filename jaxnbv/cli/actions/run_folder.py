@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from jaxnbv.checks import require
-from jaxnbv.files import write_text
-from jaxnbv.folders import AnotherConfigurationError, read_json, writing_in
-from jaxnbv.model_name import ModelName
+from jaxnbv.cli.model_name import ModelName
 from jaxnbv.storage import remove_episode
+from jaxnbv.storage.files import write_text
+from jaxnbv.storage.folders import AnotherConfigurationError, read_json, writing_in
 
 _OPTIONS, _FIGURES = "options.json", "figures"
 _REPORT = "report.html", f"{_FIGURES}/*.png"

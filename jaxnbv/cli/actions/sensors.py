@@ -10,9 +10,9 @@ import numpy as np
 from jaxnbv.checks import require
 from jaxnbv.cli.actions.tasks import position
 from jaxnbv.cli.options import DEFAULT_FIRST, SensorOptions
-from jaxnbv.pose import Pose, look_at
+from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.scanning import SDFSurface, Surface, TriangleMesh
-from jaxnbv.sensors import Setting, fitted
+from jaxnbv.scanning.sensors import Setting, fitted
 
 _QUICK_RAYS = 24
 
@@ -20,7 +20,7 @@ _QUICK_RAYS = 24
 def sensor_for(mesh: TriangleMesh, setting: Setting, asked: SensorOptions, quick: bool) -> Setting:
     """The task's camera where it sees all of the mesh; as the paper has it, or as the user asks.
 
-    **Raises:** `ValueError` as `jaxnbv.sensors.fitted` does.
+    **Raises:** `ValueError` as `jaxnbv.scanning.sensors.fitted` does.
     """
     fov = None if asked.fov is None else math.radians(asked.fov)
     if asked.paper:

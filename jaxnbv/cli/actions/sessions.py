@@ -8,8 +8,8 @@ import typer
 from jaxnbv.cli.actions.episodes import planner_of, task_for
 from jaxnbv.cli.actions.sensors import quick_rays
 from jaxnbv.cli.actions.tasks import Given, OfScan, position
-from jaxnbv.model_name import ModelName
-from jaxnbv.replay import StoredSession
+from jaxnbv.cli.model_name import ModelName
+from jaxnbv.planning.replay import StoredSession
 
 
 def replay(

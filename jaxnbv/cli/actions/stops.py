@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from jaxnbv.checks import InputError, require
 from jaxnbv.cli.registry import STOPS, resolve
-from jaxnbv.stopping import Budget, Covered, Found, Stop, Sure, WorthLess
+from jaxnbv.planning.stopping import Budget, Covered, Found, Stop, Sure, WorthLess
 
 NEVER = "never"
 

@@ -11,18 +11,18 @@ import typer
 
 from jaxnbv.checks import InputError
 from jaxnbv.cli.actions.device import prepare
+from jaxnbv.cli.model_name import ModelName
 from jaxnbv.cli.options import Device
 from jaxnbv.cli.registry import resolve
-from jaxnbv.experiments.charts import write_charts
-from jaxnbv.experiments.measures import Record
-from jaxnbv.experiments.page import write_page
-from jaxnbv.experiments.records import RecordFolder
-from jaxnbv.experiments.registry import Entry
-from jaxnbv.experiments.study import Factory, Study
-from jaxnbv.experiments.tables import summary, write_tables
-from jaxnbv.experiments.trials import Cluster, Here, Processes, Runner, Trial
-from jaxnbv.model_name import ModelName
 from jaxnbv.storage import describe
+from jaxnbv.studies.engine.charts import write_charts
+from jaxnbv.studies.engine.measures import Record
+from jaxnbv.studies.engine.page import write_page
+from jaxnbv.studies.engine.records import RecordFolder
+from jaxnbv.studies.engine.study import Factory, Study
+from jaxnbv.studies.engine.tables import summary, write_tables
+from jaxnbv.studies.engine.trials import Cluster, Here, Processes, Runner, Trial
+from jaxnbv.studies.registry import Entry
 
 
 def study(

@@ -11,11 +11,23 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement, Score
-from jaxnbv.camera import Camera
 from jaxnbv.checks import InputError, require
 from jaxnbv.cli.options import DEFAULT_FIRST
-from jaxnbv.cloud import PointCloud
-from jaxnbv.datasets import (
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose, look_at
+from jaxnbv.networks import (
+    CATEGORIES,
+    CloudClassifier,
+    CloudSegmenter,
+    load_checkpoint,
+    network_scale,
+    part_segmenter,
+    pyramid_classifier,
+)
+from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, scan
+from jaxnbv.scanning.sensors import HEAT_SETTING, PART_SETTING, USUAL_SETTING, Setting
+from jaxnbv.studies.scenes import (
     PATTERNS,
     Framing,
     Split,
@@ -26,18 +38,6 @@ from jaxnbv.datasets import (
     pyramid_scene,
     source_view,
 )
-from jaxnbv.networks import (
-    CATEGORIES,
-    CloudClassifier,
-    CloudSegmenter,
-    load_checkpoint,
-    network_scale,
-    part_segmenter,
-    pyramid_classifier,
-)
-from jaxnbv.pose import Pose, look_at
-from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, scan
-from jaxnbv.sensors import HEAT_SETTING, PART_SETTING, USUAL_SETTING, Setting
 from jaxnbv.tasks import Classifier, ColdestPoint, Coverage, CrossEntropy, MixedEntropy, NegativeEntropy, SoftPartCount
 from jaxnbv.tasks.diffusion import HeatProblem
 

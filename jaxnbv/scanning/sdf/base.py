@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnbv.checks import AnyArray, InputError, as_floats, check_type, is_traced, require
-from jaxnbv.pose import Pose
+from jaxnbv.geometry.pose import Pose
 
 # Numbers and lists are converted on the way in, which mypy cannot see.
 if TYPE_CHECKING:

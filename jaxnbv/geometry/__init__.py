@@ -1,0 +1,1 @@
+"""Poses, cameras, clouds, and the frame that they are in."""

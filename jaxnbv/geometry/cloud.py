@@ -1,0 +1,236 @@
+"""Oriented point clouds of fixed capacity."""
+
+import functools
+import warnings
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Real
+
+from jaxnbv.checks import (
+    AnyArray,
+    as_numbers,
+    check_batch,
+    check_index,
+    check_type,
+    checked,
+    require,
+    shown,
+)
+from jaxnbv.display import Displayed
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.depth_image import points_of_depth
+from jaxnbv.geometry.farthest_points import farthest_point_indices
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.volume import Box
+
+# Of a cloud: what an index of 32 bits counts, and far beyond any memory that a planner has.
+_MOST_ROWS = 2**31 - 1
+
+
+class PointCloud(Displayed):
+    """Oriented points (x, n): the paper's D. Rows whose mask is False hold nothing; their values are zero.
+
+    The number of rows is the cloud's capacity, a shape and so fixed under `jit`; `mask` says which rows are filled.
+    Leading axes make a batch of clouds.
+
+    - `points`: positions, in scene units unless said otherwise.
+    - `normals`: unit outward normals.
+    - `missed`: of a sensor's scan, whose rows are its pixels: where the ray met nothing, so that all of it is empty. A
+      row that is neither filled nor missed is invalid and says nothing. None for a cloud that is no sensor's image.
+    """
+
+    points: Float[Array, "*batch n 3"]
+    normals: Float[Array, "*batch n 3"]
+    mask: Bool[Array, "*batch n"]
+    missed: Bool[Array, "*batch n"] | None = None
+
+    def __check_init__(self):
+        shapes = [jnp.shape(leaf) for leaf in (self.points, self.normals, self.mask, self.missed) if leaf is not None]
+        rows = shapes[0][:-1]
+        require(
+            len(rows) > 0 and shapes[0] == shapes[1] == (*rows, 3) and all(shape == rows for shape in shapes[2:]),
+            f"a cloud needs points and normals (..., n, 3) and masks (..., n), got {shapes}: build it with "
+            "PointCloud.from_arrays",
+        )
+        for leaf, name in ((self.mask, "mask"), (self.missed, "missed")):
+            require(leaf is None or leaf.dtype == bool, f"a cloud's {name} is {shown(leaf)}: give an array of truths")
+
+    @classmethod
+    def from_arrays(
+        cls,
+        points: Float[AnyArray, "n 3"] | list,
+        normals: Float[AnyArray, "n 3"] | list,
+        capacity: int | None = None,
+    ) -> "PointCloud":
+        """A cloud of the given points and outward normals, padded to `capacity` rows (default: as many as there are).
+
+        Normals are scaled to unit length, with a `UserWarning` where that changes one by more than 1 %.
+
+        **Raises:** `ValueError` for shapes other than (n, 3), no points at all, an entry that is not finite, a normal
+        of length zero, or more points than the capacity.
+        """
+        points, normals = (as_numbers(rows, name) for rows, name in ((points, "points"), (normals, "normals")))
+        require(
+            points.ndim == 2 and points.shape[1] == 3 and points.shape == normals.shape,
+            f"points and normals must both be (n, 3), got {points.shape} and {normals.shape}",
+        )
+        count = len(points)
+        check_type(capacity, int | None, "the capacity")
+        capacity = count if capacity is None else capacity
+        require(count > 0, "the cloud is empty: give at least one point and its normal")
+        require(capacity <= _MOST_ROWS, f"the capacity is {capacity}; give at most {_MOST_ROWS}")
+        require(
+            count <= capacity,
+            f"{count} points do not fit a capacity of {capacity}: raise the capacity, or thin them first with "
+            f"farthest_point_subsample(cloud, {capacity})",
+        )
+        for name, array in (("points", points), ("normals", normals)):
+            bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+            require(
+                bad.size == 0,
+                f"{bad.size} of the {name} are not finite, the first at row {bad[:1]}: drop these rows",
+            )
+        # Squares of numbers that are very large or small leave the range of float32.
+        largest = np.abs(normals).max(axis=1).astype(np.float64)
+        lengths = largest * np.linalg.norm(normals / np.where(largest > 0, largest, 1.0)[:, None], axis=1)
+        zero = np.flatnonzero(lengths < 1e-12)
+        require(
+            zero.size == 0,
+            f"{zero.size} normals have length zero, the first at row {zero[:1]}: drop these points or estimate normals",
+        )
+        if np.abs(lengths - 1.0).max() > 0.01:
+            worst = int(np.abs(lengths - 1.0).argmax())
+            warnings.warn(
+                f"normals are not of unit length (row {worst}: {lengths[worst]:.4g}); they were normalised",
+                stacklevel=2,
+            )
+        pad = ((0, capacity - count), (0, 0))
+        return cls(
+            jnp.asarray(np.pad(points, pad)),
+            jnp.asarray(np.pad((normals / lengths[:, None]).astype(points.dtype), pad)),
+            jnp.asarray(np.arange(capacity) < count),
+        )
+
+    @classmethod
+    @checked
+    def from_depth(
+        cls,
+        depth: Real[AnyArray, "height width"],
+        camera: Camera,
+        pose: Pose,
+        scale: float = 1.0,
+        stride: int = 1,
+        box: Box | None = None,
+    ) -> "PointCloud":
+        """The cloud that a depth image shows, in the coordinates of the pose: one row a pixel, row by row.
+
+        A pixel of +infinity met nothing within the sensor's reach, which is taken to be the whole scene; one that is
+        zero, negative or NaN is invalid and says nothing. Out of the camera's range a pixel is invalid where it is too
+        near, and met nothing so far where it is too far. Normals come from the differences between neighbouring pixels,
+        on the side where the depth changes less, so they do not mix the two sides of an edge, and are turned to the
+        camera. A pixel with no valid neighbour along an image axis has no normal and is invalid.
+
+        - `depth`: along the camera's forward axis; `scale` times it is in units of the pose: 0.001 where the image is
+          in millimetres and the pose in metres. The range of the camera, and the box, are in units of the pose.
+        - `stride`: take every so many-th row and column alone; the cloud is an image of `camera.strided(stride)`.
+        - `box`: keep points in it alone. A ray that hits behind the box has crossed it, and met nothing; one that hits
+          before it is invalid.
+
+        **Raises:** `ValueError` if the image's shape is not the camera's, or its values cannot be meant: all of them
+        out of the camera's range, a box behind the camera, or depths of another order than the box is away.
+        """
+        return cls(*points_of_depth(depth, camera, pose, scale, stride, box))
+
+    @property
+    def capacity(self) -> int:
+        return self.points.shape[-2]
+
+    @property
+    def count(self) -> Int[Array, "*batch"]:
+        """The number of filled rows."""
+        return jnp.sum(self.mask, axis=-1)
+
+    def to_numpy(self) -> tuple[Float[np.ndarray, "count 3"], Float[np.ndarray, "count 3"]]:
+        """Points and normals of the filled rows of a single cloud.
+
+        **Raises:** `ValueError` for a batch of clouds.
+        """
+        check_single(self)
+        mask = np.asarray(self.mask)
+        return np.asarray(self.points)[mask], np.asarray(self.normals)[mask]
+
+    def __getitem__(self, index) -> "PointCloud":
+        """The cloud, or clouds, at an index of the leading axes.
+
+        **Raises:** `ValueError` of a single cloud, or if there is no such index.
+        """
+        check_index(index, self.mask.shape[:-1], "the cloud")
+        return jax.tree.map(lambda leaf: leaf[index], self)
+
+    def __iter__(self) -> Iterator["PointCloud"]:
+        """The clouds along the first axis of a batch."""
+        check_batch(self.mask.shape[:-1], "the cloud")
+        return (self[index] for index in range(self.mask.shape[0]))
+
+
+def check_single(cloud: PointCloud, name: str = "the cloud") -> None:
+    """**Raises:** `ValueError` for a batch of clouds where one is needed."""
+    batch = cloud.mask.shape[:-1]
+    require(not batch, f"{name} is a batch {batch} of clouds: give one, or use jax.vmap")
+
+
+@checked
+def concatenate(first: PointCloud, second: PointCloud) -> PointCloud:
+    """The union D u D' of the paper, with the capacities added; rows keep their places. It is no sensor's image."""
+    for cloud in (first, second):
+        check_single(cloud)
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=0), _without_rays(first), _without_rays(second))
+
+
+def _without_rays(cloud: PointCloud) -> PointCloud:
+    return PointCloud(cloud.points, cloud.normals, cloud.mask)
+
+
+@checked
+@functools.partial(jax.jit, static_argnames="count")
+def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
+    """`count` points, each as far as can be from those chosen before it, in order of choice (Eldar et al. 1997).
+
+    Starts at the first filled row. Where the cloud has fewer points than `count`, all of them come first and the rest
+    of the rows are masked.
+
+    **Raises:** `ValueError` if `count` < 1.
+    """
+    check_single(cloud)
+    require(1 <= count <= _MOST_ROWS, f"asked for {count} points; ask for at least one and at most {_MOST_ROWS}")
+    chosen = farthest_point_indices(cloud.points, cloud.mask, count)
+    kept = jnp.arange(count) < cloud.count
+    return _take(cloud, chosen, kept)
+
+
+@functools.partial(jax.jit, static_argnames="capacity")
+def limit_capacity(cloud: PointCloud, capacity: int) -> PointCloud:
+    """The cloud in `capacity` rows, the filled ones first: all its points where they fit, else farthest point samples.
+
+    **Raises:** `ValueError` if `capacity` < 1.
+    """
+    require(capacity >= 1, f"a cloud cannot have a capacity of {capacity}; ask for at least one")
+
+    def compact(cloud):
+        order = jnp.argsort(~cloud.mask, stable=True)[:capacity]
+        order = jnp.pad(order, (0, max(0, capacity - cloud.capacity)))
+        return _take(cloud, order, jnp.arange(capacity) < cloud.count)
+
+    if cloud.capacity <= capacity:
+        return compact(cloud)
+    return jax.lax.cond(
+        cloud.count <= capacity, compact, lambda cloud: farthest_point_subsample(cloud, capacity), cloud
+    )
+
+
+def _take(cloud: PointCloud, index: Int[Array, " m"], kept: Bool[Array, " m"]) -> PointCloud:
+    points = jnp.where(kept[:, None], cloud.points[index], 0.0)
+    return PointCloud(points, jnp.where(kept[:, None], cloud.normals[index], 0.0), kept)

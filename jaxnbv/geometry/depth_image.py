@@ -1,0 +1,142 @@
+"""From a depth image to oriented points, and to what its rays have crossed."""
+
+import warnings
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Real
+
+from jaxnbv.checks import AnyArray, as_floats, as_numbers, is_traced, require
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.volume import Box
+
+Rows = tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"]]
+# Depths that are so many times what they should be are in other units, not of another object.
+_OTHER_UNITS = 20.0
+
+
+def points_of_depth(
+    depth: Real[AnyArray, "height width"], camera: Camera, pose: Pose, scale: float, stride: int, box: Box | None
+) -> Rows:
+    """Points, normals, which rows are filled and which rays met nothing: `PointCloud.from_depth`."""
+    shape = (camera.height, camera.width)
+    # Before large numbers are rounded to infinity.
+    missed = (depth if is_traced(depth) else as_numbers(depth, "the depth image", None)) == np.inf
+    depth = scale * as_floats(depth, "the depth image")
+    require(
+        depth.shape == shape,
+        f"the depth image is {depth.shape} but the camera has {shape} pixels: give Camera(height=..., width=...) of "
+        "the image",
+    )
+    require(scale > 0, f"the depth's scale is {scale}; it must be positive")
+    require(pose.position.ndim == 1, f"the pose is a batch {pose.position.shape[:-1]}: give one, poses[0] say")
+    camera, rows = camera.strided(stride), slice(stride // 2, None, stride)
+    depth, missed = depth[rows, rows], missed[rows, rows]
+    if not is_traced(depth, pose):
+        known = np.asarray(depth)
+        _check_meaning(known[np.isfinite(known) & (known > 0)], camera, pose, box)
+    points, normals, mask, missed, inside = _oriented(depth, jnp.asarray(missed), camera, pose, box)
+    if box is not None and not is_traced(points):
+        _warn_of_nothing_inside(np.asarray(points)[np.asarray(mask)], np.asarray(inside)[np.asarray(mask)], box)
+    mask = mask & inside
+    points, normals = (jnp.where(mask[:, None], vectors, 0.0) for vectors in (points, normals))
+    return points, normals, mask, missed
+
+
+@eqx.filter_jit
+def _oriented(
+    depth: Float[Array, "h w"], missed: Bool[Array, "h w"], camera: Camera, pose: Pose, box: Box | None
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"], Bool[Array, " n"]]:
+    """Points, normals, which of them are valid, which rays met nothing in the box, and which points lie in it."""
+    valid = jnp.isfinite(depth) & (depth > 0)
+    if camera.farthest is not None:
+        missed = missed | (valid & (depth > camera.farthest))
+    valid = valid & ~missed & (depth >= camera.nearest)
+    local = jnp.where(valid, depth, 0.0)[..., None] * camera.pixel_directions().reshape(*depth.shape, 3)
+    down, has_down = _one_sided_difference(local, valid, axis=0)
+    right, has_right = _one_sided_difference(local, valid, axis=1)
+    normals = jnp.cross(down, right)
+    normals = normals * -jnp.sign(jnp.sum(normals * local, axis=-1, keepdims=True))
+    length = jnp.linalg.norm(normals, axis=-1, keepdims=True)
+    has_normal = (length[..., 0] > 0) & jnp.isfinite(length[..., 0])
+    mask = (valid & has_down & has_right & has_normal).reshape(-1)
+    normals = (normals / jnp.where(length > 0, length, 1.0)).reshape(-1, 3)
+    points = pose.to_scene(local.reshape(-1, 3))
+    normals = jnp.matmul(normals, pose.rotation.T, precision="highest")
+
+    missed, inside = missed.reshape(-1), jnp.ones_like(mask)
+    if box is not None:
+        crossed = valid.reshape(-1) & (depth.reshape(-1) >= _depth_behind(box, camera, pose))
+        inside = box(points) <= 0
+        missed = missed | (crossed & ~inside)
+    return points, normals, mask, missed, inside
+
+
+def _depth_behind(box: Box, camera: Camera, pose: Pose) -> Float[Array, " n"]:
+    """The depth at which each ray leaves a box; minus infinity for a ray that does not meet it."""
+    directions = jnp.matmul(camera.pixel_directions(), pose.rotation.T, precision="highest")
+    directions = jnp.where(jnp.abs(directions) < 1e-9, 1e-9, directions)
+    sides = jnp.stack([(jnp.asarray(side) - pose.position) / directions for side in (box.low, box.high)])
+    enter, leave = jnp.max(jnp.min(sides, axis=0), axis=1), jnp.min(jnp.max(sides, axis=0), axis=1)
+    return jnp.where(leave > jnp.maximum(enter, 0.0), leave, -jnp.inf)
+
+
+def _check_meaning(depth: Float[np.ndarray, " valid"], camera: Camera, pose: Pose, box: Box | None) -> None:
+    """**Raises:** `ValueError` for depths and a pose that cannot be meant."""
+    if not len(depth):
+        return
+    low, middle, high = (float(value) for value in (depth.min(), np.median(depth), depth.max()))
+    farthest = np.inf if camera.farthest is None else camera.farthest
+    require(
+        high >= camera.nearest and low <= farthest,
+        f"all depths, from {low:.4g} to {high:.4g}, are out of the camera's range of {camera.nearest:.4g} to "
+        f"{farthest:.4g}: give the depth's scale, 0.001 for millimetres and a pose in metres, or another range",
+    )
+    if box is None:
+        return
+    corners = np.stack(np.meshgrid(*zip(box.low, box.high, strict=True)), axis=-1).reshape(-1, 3)
+    ahead = (corners - np.asarray(pose.position)) @ np.asarray(pose.forward)
+    require(
+        float(ahead.max()) > 0,
+        f"the box from {box.low} to {box.high} lies behind the camera at {np.asarray(pose.position)}: give the pose "
+        'from camera to world, not its inverse, and its convention, Pose.from_matrix(matrix, "opengl")',
+    )
+    nearest = max(float(ahead.min()), 1e-3 * float(ahead.max()))
+    require(
+        middle < _OTHER_UNITS * float(ahead.max()) and middle > nearest / _OTHER_UNITS,
+        f"the depths have a median of {middle:.4g}, but the box is {nearest:.4g} to {float(ahead.max()):.4g} away: "
+        "give the depth's scale, 0.001 for millimetres and a pose in metres",
+    )
+
+
+def _warn_of_nothing_inside(points: Float[np.ndarray, "valid 3"], inside: Bool[np.ndarray, " n"], box: Box) -> None:
+    """An image may show none of the object; more often its pose is wrong."""
+    if len(points) and not inside.any():
+        low, high = points.min(axis=0), points.max(axis=0)
+        warnings.warn(
+            f"none of the {len(points)} points of the depth image lies in the box from {box.low} to {box.high}: they "
+            f"lie from {low} to {high}. Is the pose from camera to world, in the right convention, and the box in its "
+            "units?",
+            stacklevel=4,
+        )
+
+
+def _one_sided_difference(points: Float[Array, "h w 3"], valid: Bool[Array, "h w"], axis: int):
+    """Differences between neighbours along an image axis, on the side of the smaller step, and whether there is one."""
+    step = jnp.diff(points, axis=axis)
+    index = [slice(None), slice(None)]
+    later, earlier = list(index), list(index)
+    later[axis], earlier[axis] = slice(1, None), slice(None, -1)
+    size = jnp.where(valid[tuple(later)] & valid[tuple(earlier)], jnp.linalg.norm(step, axis=-1), jnp.inf)
+
+    def shifted(array, before, fill):
+        pad = [(0, 0)] * array.ndim
+        pad[axis] = (1, 0) if before else (0, 1)
+        return jnp.pad(array, pad, constant_values=fill)
+
+    size_back, size_ahead = shifted(size, True, jnp.inf), shifted(size, False, jnp.inf)
+    back, ahead = shifted(step, True, 0.0), shifted(step, False, 0.0)
+    difference = jnp.where((size_back < size_ahead)[..., None], back, ahead)
+    return difference, jnp.isfinite(jnp.minimum(size_back, size_ahead))

@@ -1,0 +1,124 @@
+"""The frame that carries the user's world into the scene: where its origin is, its unit of length, and what is up."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxnbv.checks import AnyArray, as_numbers, check_fields, checked, is_traced, require, shown
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.volume import Box
+
+# Of the sensor's noise a hundredth.
+_ROUNDING = 1e-4
+# Rotations whose second row, the scene's up, is an axis of the world.
+_UP = {
+    "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "-y": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+    "z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+    "-z": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+    "x": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
+    "-x": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
+}
+
+
+class Frame(eqx.Module):
+    """The similarity between the user's world and the scene: scene = scale R (world - center).
+
+    - `scale`: scene units per world unit.
+    - `center`: the world point that becomes the scene's origin.
+    - `up`: the world's axis that becomes the y of the scene, upward in pictures: "y" (R is the identity), "z" as with
+      most robots, "x", or one of these with a minus.
+
+    **Raises:** `ValueError` for a scale that is not positive, or another axis.
+    """
+
+    scale: float = 1.0
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    up: str = eqx.field(static=True, default="y")
+
+    def __check_init__(self):
+        check_fields(self)
+        require(self.scale > 0, f"the frame's scale is {self.scale}; it must be positive")
+        require(self.up in _UP, f"up is {shown(self.up)}; give one of {', '.join(_UP)}")
+
+    @classmethod
+    @checked
+    def fit(cls, points: Float[AnyArray, "n 3"], longest_side: float = 2.5, up: str = "y") -> "Frame":
+        """The frame in which the points' bounding box is centred and its longest side is `longest_side`.
+
+        **Raises:** `ValueError` if there are no points, or they all coincide, or one is not finite.
+        """
+        points = as_numbers(points, "points", np.float64)
+        require(points.ndim == 2 and points.shape[1] == 3, f"the points must be (n, 3), got {points.shape}")
+        require(len(points) > 0, "cannot fit a frame to no points: give the points of the object")
+        require(bool(np.isfinite(points).all()), "cannot fit a frame to points that are not finite: drop them first")
+        low, high = points.min(axis=0), points.max(axis=0)
+        extent = float((high - low).max())
+        require(extent > 0, f"cannot fit a frame: all {len(points)} points lie at {low}; give points that differ")
+        x, y, z = (0.5 * (low + high)).tolist()
+        return cls(longest_side / extent, (x, y, z), up)
+
+    @property
+    def rotation(self) -> Float[np.ndarray, "3 3"]:
+        """R, from directions of the world to those of the scene."""
+        return np.array(_UP[self.up], np.float64)
+
+    def to_scene(self, thing):
+        """World to scene: an array of points (..., 3), a `PointCloud`, a `Pose`, a `Box`, or the range of a `Camera`.
+
+        Clouds and poses are kept in JAX's floating-point type; far from the world's origin, as in coordinates of a map,
+        bring arrays to the scene before they are made of them.
+
+        **Raises:** `ValueError` for a cloud or a pose whose coordinates are rounded by more than 1e-4 scene units.
+        """
+        if isinstance(thing, PointCloud | Pose) and not is_traced(thing):
+            self._check_precision(thing.points if isinstance(thing, PointCloud) else thing.position)
+        center = np.asarray(self.center)
+        return _apply(thing, lambda points: self._turned(points - center) * self.scale, self._turned, self.scale)
+
+    def to_world(self, thing):
+        """Scene to world, for what `to_scene` takes."""
+        center = np.asarray(self.center)
+        return _apply(thing, lambda points: self._back(points / self.scale) + center, self._back, 1.0 / self.scale)
+
+    def _turned(self, vectors):
+        return vectors if self.up == "y" else vectors @ self.rotation.T.astype(vectors.dtype)
+
+    def _back(self, vectors):
+        return vectors if self.up == "y" else vectors @ self.rotation.astype(vectors.dtype)
+
+    def _check_precision(self, coordinates: Array) -> None:
+        largest = float(np.abs(np.asarray(coordinates)).max(initial=0.0))
+        rounding = self.scale * largest * float(jnp.finfo(coordinates.dtype).eps)
+        require(
+            rounding <= _ROUNDING,
+            f"world coordinates of {largest:.4g} are rounded to {rounding:.2g} scene units as {coordinates.dtype}: "
+            "bring the arrays to the scene first, PointCloud.from_arrays(frame.to_scene(points), normals), or enable "
+            "jax_enable_x64",
+        )
+
+
+def _apply(thing, place, turn, scale: float):
+    """A thing whose points are placed, whose directions are turned, and whose lengths are scaled."""
+    if isinstance(thing, PointCloud):
+        points = jnp.where(thing.mask[..., None], place(thing.points), 0.0)
+        return PointCloud(points.astype(thing.points.dtype), turn(thing.normals), thing.mask, thing.missed)
+    if isinstance(thing, Pose):
+        rotation = jnp.swapaxes(turn(jnp.swapaxes(thing.rotation, -1, -2)), -1, -2)
+        return Pose(rotation, place(thing.position).astype(thing.position.dtype))
+    if isinstance(thing, Box):
+        corners = place(np.array([thing.low, thing.high]))
+        return Box(tuple(corners.min(axis=0).tolist()), tuple(corners.max(axis=0).tolist()))
+    if isinstance(thing, Camera):
+        farthest = None if thing.farthest is None else scale * thing.farthest
+        return dataclasses.replace(thing, nearest=scale * thing.nearest, farthest=farthest)
+    if isinstance(thing, Array) and is_traced(thing):
+        return place(thing)
+    found = as_numbers(thing, "the points", None)
+    require(found.shape[-1:] == (3,), f"the points are {shown(thing)}: give an array (..., 3), a cloud or a pose")
+    return place(found)

@@ -1,0 +1,66 @@
+"""Exact distances from many points to a cloud."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnbv.geometry.cloud import PointCloud
+
+_UNROLL = 8
+
+
+@jax.jit
+def nearest_squared_distance(x: Float[Array, "n 3"], cloud: PointCloud) -> Float[Array, " n"]:
+    """min_j |x - y_j|^2 over the filled rows of a cloud; infinite where the cloud is empty.
+
+    The loop runs over the cloud with all of x at hand, so memory stays linear and time follows the number of filled
+    rows, not the capacity. Differentiable once or more in x and in the cloud's points.
+    """
+    return _nearest_squared_distance(x, cloud.points, cloud.mask)
+
+
+@jax.custom_jvp
+def _nearest_squared_distance(x: Float[Array, "n 3"], points: Float[Array, "m 3"], mask: Bool[Array, " m"]):
+    def closer(best, _, value):
+        return jnp.minimum(best, value)
+
+    best = _loop(x, points, mask, jnp.full(x.shape[0], jnp.inf, x.dtype), closer)
+    return jnp.maximum(best + jnp.sum(x**2, axis=-1), 0.0)
+
+
+@_nearest_squared_distance.defjvp
+def _nearest_squared_distance_jvp(primals, tangents):
+    x, points, mask = primals
+    x_dot, points_dot, _ = tangents
+    index = jax.lax.stop_gradient(_nearest_index(x, points, mask))
+    offset = x - points[index]
+    squared = jnp.where(jnp.any(mask), jnp.sum(offset**2, axis=-1), jnp.inf)
+    return squared, 2.0 * jnp.sum(offset * (x_dot - points_dot[index]), axis=-1)
+
+
+def _nearest_index(x: Float[Array, "n 3"], points: Float[Array, "m 3"], mask: Bool[Array, " m"]) -> Int[Array, " n"]:
+    def closer(best, row, value):
+        distance, index = best
+        return jnp.minimum(distance, value), jnp.where(value < distance, row, index)
+
+    start = (jnp.full(x.shape[0], jnp.inf, x.dtype), jnp.zeros(x.shape[0], jnp.int32))
+    return _loop(x, points, mask, start, closer)[1]
+
+
+def _loop(x, points, mask, best, closer):
+    """Fold `closer(best, row, |y|^2 - 2 x.y)` over the rows up to the last filled one, several rows a turn."""
+    padding = -points.shape[0] % _UNROLL
+    squared = jnp.where(mask, jnp.sum(points**2, axis=-1), jnp.inf)
+    planes = jnp.concatenate([jnp.where(mask[:, None], -2.0 * points, 0.0), squared[:, None]], axis=-1)
+    planes = jnp.pad(planes, ((0, padding), (0, 0)), constant_values=jnp.inf).reshape(-1, _UNROLL, 4)
+    planes = planes.at[..., :3].set(jnp.where(jnp.isinf(planes[..., 3:]), 0.0, planes[..., :3]))
+    filled = jnp.max(jnp.where(mask, jnp.arange(points.shape[0]) + 1, 0), initial=0)
+
+    def body(turn, best):
+        rows = planes[turn]
+        for step in range(_UNROLL):
+            a, b, c, offset = rows[step]
+            best = closer(best, turn * _UNROLL + step, x[:, 0] * a + (x[:, 1] * b + (x[:, 2] * c + offset)))
+        return best
+
+    return jax.lax.fori_loop(0, -(-filled // _UNROLL), body, best)

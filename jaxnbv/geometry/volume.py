@@ -1,0 +1,78 @@
+"""Where the object can be: a region of the scene by its signed distance, and points on its boundary."""
+
+import math
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxnbv.checks import AnyArray, InputError, require, shown
+from jaxnbv.geometry.pose import fibonacci_sphere
+
+Volume = Callable[[Float[Array, "n 3"]], Float[Array, " n"]]
+"""A function of points (scene coordinates): negative inside the volume, positive outside, at most the distance to its
+boundary in magnitude. A solid of `jaxnbv.scanning.sdf` is one; so is `Box`."""
+
+_BISECTIONS = 40
+# Beyond the corners of the cube in which a scene may lie.
+_FAR = 3.0
+
+
+def _corner(values) -> tuple[float, ...]:
+    try:
+        return tuple(float(value) for value in values)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"a corner of a box is {shown(values)}; give three numbers") from error
+
+
+class Box(eqx.Module):
+    """The volume between two opposite corners, in scene coordinates. The default holds every scene of `Frame.fit`.
+
+    **Raises:** `ValueError` if a side is not positive or a corner not finite.
+    """
+
+    low: tuple[float, ...] = eqx.field(static=True, converter=_corner, default=(-1.25, -1.25, -1.25))
+    high: tuple[float, ...] = eqx.field(static=True, converter=_corner, default=(1.25, 1.25, 1.25))
+
+    def __check_init__(self):
+        sides = [b - a for a, b in zip(self.low, self.high, strict=False)]
+        require(
+            len(self.low) == len(self.high) == 3 and all(0 < side < math.inf for side in sides),
+            f"a box from {self.low} to {self.high} has no inside: each of three sides must be positive and finite",
+        )
+
+    @classmethod
+    def cube(cls, side: float) -> "Box":
+        """The cube of this side about the origin."""
+        return cls((-0.5 * side,) * 3, (0.5 * side,) * 3)
+
+    @eqx.filter_jit
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        """The signed distance at the points x; exact."""
+        x = jnp.asarray(x)
+        low, high = jnp.asarray(self.low, x.dtype), jnp.asarray(self.high, x.dtype)
+        center, half = 0.5 * (low + high), 0.5 * (high - low)
+        beyond = jnp.abs(x - center) - half
+        outside = jnp.sqrt(jnp.sum(jnp.maximum(beyond, 0.0) ** 2, axis=-1))
+        return outside + jnp.minimum(jnp.max(beyond, axis=-1), 0.0)
+
+
+@eqx.filter_jit
+def boundary_points(volume: Volume, count: int) -> Float[Array, "count 3"]:
+    """Where `count` evenly spread rays from the origin cross the volume's boundary: found by bisection between the
+    origin and a sphere beyond the scene. A ray of a volume that is not star-shaped about the origin has several
+    crossings, of which this is any one.
+    """
+    directions = fibonacci_sphere(count)
+
+    def halve(_, interval):
+        near, far = interval
+        middle = 0.5 * (near + far)
+        inside = volume(middle[:, None] * directions) < 0
+        return jnp.where(inside, middle, near), jnp.where(inside, far, middle)
+
+    ends = jnp.zeros(count, directions.dtype), jnp.full(count, _FAR, directions.dtype)
+    near, far = jax.lax.fori_loop(0, _BISECTIONS, halve, ends)
+    return 0.5 * (near + far)[:, None] * directions

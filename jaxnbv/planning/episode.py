@@ -1,0 +1,287 @@
+"""The simulated episode: scan, ask for the next view, scan again."""
+
+import importlib
+import itertools
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+from tqdm import tqdm
+
+from jaxnbv.checks import check_key, check_type, checked, require
+from jaxnbv.display import Displayed
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.state import State
+from jaxnbv.planning.stopping import Stop, Watch
+from jaxnbv.scanning import GridSurface, SensorNoise, Surface, scan
+from jaxnbv.scanning.surroundings import Surroundings
+from jaxnbv.search import Proposal
+from jaxnbv.storage import EpisodeFolder, describe
+
+
+class View(eqx.Module):
+    """One view of an episode.
+
+    - `pose`: where the sensor was.
+    - `scan`: what it saw, noise included; one row a pixel.
+    - `cloud`: D after this view.
+    - `proposal`: what the search looked at; None for the first view, which was given.
+    - `camera`: which took it, in scene units; None for the planner's.
+    """
+
+    pose: Pose
+    scan: PointCloud
+    cloud: PointCloud
+    proposal: Proposal | None
+    camera: Camera | None = None
+
+
+class Episode(Displayed):
+    """Views that a planner chose of a scene, and what they depend on.
+
+    - `scene`, `noise`: None where a real sensor took the views.
+    - `stopped`: why there are not as many views as were asked for; None where there are.
+    """
+
+    planner: Planner
+    scene: Surface | None
+    noise: SensorNoise | None
+    first: Pose
+    key: PRNGKeyArray
+    views: tuple[View, ...]
+    stopped: str | None = None
+
+    @property
+    def cloud(self) -> PointCloud:
+        """D after the last view, in scene coordinates."""
+        return self.views[-1].cloud
+
+    def states(self) -> Iterator[State]:
+        """The planner's state after each view, made again from the scans."""
+        return self.planner.replay((view.pose, view.scan, view.camera) for view in self.views)
+
+    def state_after(self, views: int) -> State:
+        """The planner's state after so many of the views.
+
+        **Raises:** `ValueError` unless there are so many, and at least one.
+        """
+        check_type(views, int, "the number of views")
+        require(1 <= views <= len(self.views), f"asked for {views} of {len(self.views)} views; ask for one at least")
+        return next(itertools.islice(self.states(), views - 1, None))
+
+    def show(self, progress: bool = True) -> Any:
+        """A picture of all views, which a notebook shows: the surface as it became known, and what the search saw."""
+        return importlib.import_module("jaxnbv.viz.notebook").overview(self, progress)
+
+    def save(self, path: str | Path) -> None:
+        """Write the episode to a folder (see `jaxnbv.storage` for its files); `simulate` can continue from it.
+
+        **Raises:** `ValueError` if the folder holds an episode of another configuration or a longer one, or other
+        files.
+        """
+        folder = EpisodeFolder(path, _config(self.planner, self.scene, self.noise, self.first, self.key))
+        with folder.writing():
+            held = len(folder.read_views())
+            require(
+                held <= len(self.views),
+                f"{path} already holds {held} views of this episode, which has {len(self.views)}: "
+                "choose another folder",
+            )
+            for index, view in enumerate(self.views):
+                folder.write_view(index, view.pose, view.scan, view.proposal)
+            folder.write_cloud(self.cloud)
+
+
+def _config(planner: Planner, scene: Surface | None, noise: SensorNoise | None, first: Pose, key: PRNGKeyArray) -> dict:
+    return describe({"planner": planner, "scene": scene, "noise": noise, "first": first, "key": key})
+
+
+@checked
+def simulate(
+    planner: Planner,
+    scene: Surface,
+    first: Pose,
+    views: int,
+    key: PRNGKeyArray,
+    noise: SensorNoise = SensorNoise(),
+    folder: str | Path | None = None,
+    progress: bool = True,
+    until: Stop | None = None,
+    each: Callable[[View], None] | None = None,
+) -> Episode:
+    """Scan a known surface from `first`, then from the views that the planner asks for, `views` in all, or as many as
+    it takes `until` a rule of `jaxnbv.planning.stopping` ends it; `Sure(0.95) | Budget(seconds=60)`, say.
+
+    View i depends on the key and i alone, not on how many follow. With `folder`, every finished view is written there;
+    a run that was interrupted goes on after the last of them and, on a CPU with the same versions, ends with the same
+    bits as one that was not. (A GPU may add in another order from run to run.) The rule is asked after the last view
+    that is there, so a folder can be continued with another one.
+
+    - `each`: is told every view once it is done, those that the folder holds included.
+
+    **Raises:** `ValueError` if `views` < 1 or more than the planner has room for, if the first view sees nothing, or
+    if the folder belongs to another configuration or holds more views already.
+    """
+    require(views >= 1, f"asked for {views} views; ask for at least one")
+    require(
+        views <= planner.max_views,
+        f"asked for {views} views but the planner has room for {planner.max_views}: raise Planner(max_views=...)",
+    )
+    check_key(key)
+    require(
+        jnp.issubdtype(key.dtype, jax.dtypes.prng_key),
+        f"the key is a raw array of {key.dtype}: make it with jax.random.key(seed)",
+    )
+    require(first.position.ndim == 1, "the first pose is a batch of poses: give one, poses[0] say")
+    store = None if folder is None else EpisodeFolder(folder, _config(planner, scene, noise, first, key))
+    with store.writing() if store else nullcontext():
+        done = store.read_views() if store else []
+        require(
+            len(done) <= views,
+            f"asked for {views} views but {folder} already holds {len(done)}: ask for more, or choose another folder",
+        )
+        finished: list[View] = []
+        with tqdm(total=views * len(STAGES), disable=not progress) as bar:
+
+            def begin(index: int, stage: str) -> None:
+                bar.set_description(f"view {index + 1}/{views}, {stage}")
+                bar.update(index * len(STAGES) + STAGES.index(stage) - bar.n)
+
+            sensor = scene_sensor(scene, planner.camera, noise, planner.surroundings)
+            watch = None if until is None else Watch(until, planner)
+            episode = steps(planner, sensor, first, key, done=done, begin=begin, watch=watch)
+            for index, (view, *_) in enumerate(itertools.islice(episode, views)):
+                finished.append(view)
+                if store and index >= len(done):
+                    store.write_view(index, view.pose, view.scan, view.proposal)
+                if each is not None:
+                    each(view)
+            stopped = watch.reason if watch and len(finished) < views else None
+            bar.update(bar.total - bar.n)
+        if store:
+            store.write_cloud(finished[-1].cloud)
+    return Episode(planner, scene, noise, first, key, tuple(finished), stopped=stopped)
+
+
+# What a sensor sees from a pose; the key is of its noise, for which a real sensor has no use.
+Sensor: TypeAlias = Callable[[Pose, PRNGKeyArray], PointCloud]
+STAGES = ("sampling surfaces", "searching", "scanning")
+
+
+class Step(NamedTuple):
+    """How an episode came to a view, and what the planner knows after it.
+
+    - `surfaces`: the samples that the view was chosen by; None where there were none.
+    - `seconds`: of the search; zero for a view that was given.
+    """
+
+    view: View
+    state: State
+    surfaces: GridSurface | None
+    seconds: float
+
+
+def steps(
+    planner: Planner,
+    sensor: Sensor,
+    first: Pose,
+    key: PRNGKeyArray,
+    camera: Camera | None = None,
+    done: Iterable[tuple[Pose, PointCloud, Proposal | None]] = (),
+    begin: Callable[[int, str], None] = lambda index, stage: None,
+    watch: Watch | None = None,
+) -> Iterator[Step]:
+    """Views from `first` on, each where the planner asks for it, for as long as more are wanted and it has room.
+
+    View i depends on the key and i alone: planners that differ in their search or their acquisition are compared under
+    the same sensor noise, and under the same prior samples at the same view.
+
+    - `camera`: of the sensor, by default the planner's; one of more rays than are imagined saves time.
+    - `done`: views that are known already, in their order; they are told, not asked for.
+    - `begin`: is told the index of a view and which of `STAGES` of it begins.
+    - `watch`: ends them, by its rule.
+
+    **Raises:** `ValueError` as `Planner.init`, `propose` and `observe` do; among others when every candidate has been
+    visited.
+    """
+    known, state = iter(done), None
+    poses: list[Pose] = []
+    for index in range(planner.max_views):
+        sample_key, search_key, noise_key = view_keys(key, index)
+        surfaces, seconds = None, 0.0
+        if (told := next(known, None)) is not None:
+            pose, seen, proposal = told
+        else:
+            pose, proposal = first, None
+            if state is not None:
+                if watch and watch.after(state, poses, sample_key):
+                    return
+                if planner.search.uses_samples:
+                    begin(index, STAGES[0])
+                    surfaces = jax.block_until_ready(planner.sample_surfaces(state, sample_key))
+                begin(index, STAGES[1])
+                start = time.perf_counter()
+                proposal = jax.block_until_ready(planner.choose(state, surfaces, search_key))
+                pose, seconds = proposal.pose, time.perf_counter() - start
+                if watch and watch.before(state, poses, sample_key, proposal):
+                    return
+            begin(index, STAGES[2])
+            seen = sensor(pose, noise_key)
+        state = planner.init(seen, pose, camera) if state is None else planner.observe(state, pose, seen, camera)
+        poses.append(pose)
+        yield Step(View(pose, seen, state.cloud, proposal), state, surfaces, seconds)
+
+
+def scene_sensor(
+    scene: Surface, camera: Camera, noise: SensorNoise = SensorNoise(), surroundings: Surroundings | None = None
+) -> Sensor:
+    """A camera that scans a known surface, with noise, past what stands around it."""
+    return lambda pose, key: observe_scene(scene, camera, pose, noise, key, surroundings)
+
+
+def view_keys(key: PRNGKeyArray, index: int) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:
+    """Keys of view `index` (from 0) of an episode: of its posterior samples, its search and its sensor's noise."""
+    step_key, noise_key = jax.random.split(jax.random.fold_in(key, index))
+    sample_key, search_key = jax.random.split(step_key)
+    return sample_key, search_key, noise_key
+
+
+def observe_scene(
+    scene: Surface,
+    camera: Camera,
+    pose: Pose,
+    noise: SensorNoise,
+    key: PRNGKeyArray,
+    surroundings: Surroundings | None = None,
+) -> PointCloud:
+    """A noisy scan of the true surface, compiled where the surface allows it."""
+    barrier = None if surroundings is None else _barrier(surroundings, camera, pose)
+    if scene.in_jit:
+        return _noisy_scan(scene, camera, pose, barrier, noise, key)
+    return noise(scan(scene, camera, pose, barrier), key)
+
+
+@eqx.filter_jit
+def _barrier(surroundings: Surroundings, camera: Camera, pose: Pose) -> Float[Array, " rays"] | None:
+    return surroundings.barrier(camera, pose)
+
+
+@eqx.filter_jit
+def _noisy_scan(
+    scene: Surface,
+    camera: Camera,
+    pose: Pose,
+    barrier: Float[Array, " rays"] | None,
+    noise: SensorNoise,
+    key: PRNGKeyArray,
+) -> PointCloud:
+    return noise(scan(scene, camera, pose, barrier), key)

@@ -1,0 +1,155 @@
+"""Runs that were stored, read without the planner that made them; sessions, planned again for another utility."""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxnbv.at_sensor import stride_of
+from jaxnbv.checks import InputError, checked, require
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.volume import Box
+from jaxnbv.planning.episode import Episode, View
+from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.session import NextView, Session
+from jaxnbv.search import DiscreteSearch, Proposal
+from jaxnbv.search.base import CandidateSearch
+from jaxnbv.storage import SESSION_RECORD, DepthImage, open_episode, open_session
+from jaxnbv.surfaces import ScreenedSPSR
+from jaxnbv.tasks import Coverage
+
+
+class StoredSession:
+    """The images of a session's folder and what is known of its sensor; not what its planner was.
+
+    **Raises:** `ValueError` if the folder holds no session with an image.
+    """
+
+    @checked
+    def __init__(self, folder: str | Path):
+        self._folder = open_session(folder)
+        config = self._folder.config
+        try:
+            self.cameras = tuple(_camera(camera) for camera in config["cameras"])
+            self.box = Box(**_fields(config["box"]))
+            self.up, self.convention, self.stride = (config[name] for name in ("up", "convention", "stride"))
+        except (KeyError, TypeError) as error:
+            raise InputError(f"{self._folder.record} does not say what the sensor was ({error!r})") from error
+        self.frame = Frame.fit(np.array([self.box.low, self.box.high]), up=self.up)
+        self.views = self._folder.count_images()
+        require(self.views > 0, f"{folder} holds no image yet: add one to the session first")
+
+    def image(self, index: int) -> DepthImage:
+        """The image of an index, from 0.
+
+        **Raises:** `ValueError` if it is damaged.
+        """
+        return self._folder.read_image(index)
+
+    def first_view(self) -> tuple[Pose, PointCloud]:
+        """Pose and scan of the first image, in scene coordinates."""
+        image = self.image(0)
+        pose = Pose.from_matrix(image.matrix, self.convention)
+        camera = self.cameras[image.camera]
+        stride = stride_of(camera) if self.stride is None else self.stride
+        cloud = PointCloud.from_depth(image.depth, camera, pose, image.depth_scale, stride, self.box)
+        return self.frame.to_scene(pose), self.frame.to_scene(cloud)
+
+    def proposal(self, index: int) -> tuple[Proposal, Float[np.ndarray, "h w"] | None] | None:
+        """The session's own proposal for the image of an index, and the depth that was expected of it; None where it
+        was not asked for."""
+        return self._folder.read_proposal(index)
+
+    def candidates(self) -> Float[np.ndarray, "n 4 4"] | None:
+        """The poses that the session's own planner chose among, in world units; None where it has proposed nothing."""
+        for index in range(self.views + 1):
+            if (known := self.proposal(index)) is not None:
+                return np.asarray(self.frame.to_world(known[0].candidates).to_matrix(self.convention))
+        return None
+
+    def replay(self, planner: Planner, out: str | Path | None = None) -> Iterator[tuple[Session, NextView]]:
+        """After each image, the session so far and where this planner would have taken the next one.
+
+        - `planner`: see `Session`; a search over candidates is given those that the session's own planner had, where
+          they are known.
+        - `out`: a folder for the session that results; images are copied there. What was interrupted goes on after the
+          last of them.
+
+        **Raises:** `ValueError` as `Session` and its `add` and `next` do.
+        """
+        require(
+            out is None or Path(out).resolve() != self._folder.path.resolve(),
+            f"{out} holds the session that is to be replayed: choose another folder",
+        )
+        sensor = {"camera": self.cameras, "box": self.box, "up": self.up, "convention": self.convention}
+        poses = self.candidates() if isinstance(planner.search, CandidateSearch) else None
+        settings: dict[str, Any] = {**sensor, "stride": self.stride, "poses": poses, "folder": out}
+        session = Session(planner, **settings)
+        # What was killed may lack the answer to its last image.
+        if session.views:
+            yield session, session.next()
+        for index in range(session.views, self.views):
+            session.add(*self.image(index))
+            yield session, session.next()
+
+
+class StoredRun(NamedTuple):
+    """An episode or a session as it was stored.
+
+    - `episode`: with a planner that has the stored camera and the usual surfaces, for what is to be drawn.
+    - `proposal`, `expected`: for the view after its last; None where there is none.
+    """
+
+    episode: Episode
+    proposal: Proposal | None = None
+    expected: Float[np.ndarray, "h w"] | None = None
+
+
+def stored_run(folder: str | Path) -> StoredRun:
+    """The episode or session of a folder.
+
+    **Raises:** `ValueError` if it holds neither, or one without a view.
+    """
+    planner = Planner(ScreenedSPSR(), Camera(), Coverage(), DiscreteSearch())
+    return (_session_run if (Path(folder) / SESSION_RECORD).exists() else _episode_run)(folder, planner)
+
+
+def _session_run(folder: str | Path, planner: Planner) -> StoredRun:
+    stored = StoredSession(folder)
+    session = Session(
+        planner, stored.cameras, stored.box, stored.up, convention=stored.convention, stride=stored.stride
+    )
+    for index in range(stored.views):
+        session.add(*stored.image(index))
+    asked = [stored.proposal(index) for index in range(stored.views + 1)]
+    views = tuple(
+        dataclasses.replace(view, proposal=None if known is None else known[0])
+        for view, known in zip(session.episode.views, asked, strict=False)
+    )
+    return StoredRun(dataclasses.replace(session.episode, views=views), *(asked[-1] or ()))
+
+
+def _episode_run(folder: str | Path, planner: Planner) -> StoredRun:
+    held = open_episode(folder)
+    views = held.read_views()
+    require(len(views) > 0, f"{folder} holds no view yet")
+    planner = dataclasses.replace(planner, camera=_camera(held.config["planner"]["camera"]))
+    states = planner.replay((pose, scan) for pose, scan, _ in views)
+    shown = tuple(View(pose, scan, state.cloud, own) for (pose, scan, own), state in zip(views, states, strict=True))
+    return StoredRun(Episode(planner, None, None, views[0][0], jax.random.key(0), shown))
+
+
+def _camera(description: dict[str, Any]) -> Camera:
+    fields = _fields(description)
+    return Camera(**{**fields, "center": tuple(fields["center"])})
+
+
+def _fields(description: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in description.items() if name != "type"}

@@ -1,0 +1,288 @@
+"""A live session: depth images of a real sensor in, where to take the next one out, in the user's own world."""
+
+import dataclasses
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray, Real
+
+from jaxnbv.at_sensor import expected_depth, planner_at, stride_of
+from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, check_type, checked, require, shown
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.volume import Box
+from jaxnbv.planning.episode import Episode, View, view_keys
+from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.state import State, with_visited
+from jaxnbv.planning.stopping import Stop, Watch
+from jaxnbv.scanning.surroundings import Surroundings
+from jaxnbv.search import Proposal
+from jaxnbv.storage import DepthImage, SessionFolder, describe
+from jaxnbv.viz import write_report
+from jaxnbv.viz.live import LiveView
+
+_NO_IMAGE = "the session has no image yet: add one first, session.add(depth, matrix)"
+
+
+class NextView(eqx.Module):
+    """Where to take the next image.
+
+    - `matrix`: camera to world, in the convention of the session.
+    - `value`: what the search maximises, as `Planner.propose` gives it; `standard_error`: of the value, as a mean over
+      the posterior samples; None where it is not known.
+    - `expected_depth`: what the sensor is expected to see there, in world units and at the planner's resolution: the
+      mean depth over the posterior samples, NaN where most of them are missed; None without samples.
+    - `proposal`: all that the search looked at, in scene coordinates.
+    """
+
+    matrix: Float[np.ndarray, "4 4"]
+    value: float
+    standard_error: float | None
+    expected_depth: Float[np.ndarray, "h w"] | None
+    proposal: Proposal
+
+
+class Session:
+    """A planner at a real sensor. Matrices are 4 x 4, camera to world, in world units; so is the box.
+
+    - `planner`: in scene coordinates, as for a simulation. The scene is the box, scaled; the planner's camera is
+      replaced by the sensor's with the planner's number of pixels, and what it holds for the default volume, `Box()`,
+      by the box.
+    - `camera`: the sensor, its range in world units; or several, of a rig, of which the first is planned for.
+    - `box`: two corners of a box about the object, without the table.
+    - `up`: the world's axis that is upward, "y" or "z" say.
+    - `surroundings`: what stands around the object, in world units: `Surroundings((table,), margin=0.005)`, say.
+    - `poses`: (n, 4, 4), where the sensor can be held; by default the candidates of the planner's search, in scene
+      units about the box's centre.
+    - `folder`: where images and proposals are kept before they are acted on; a session that was killed goes on from it.
+    - `convention`: of the matrices' axes, see `Pose.from_matrix`.
+    - `stride`: of the images, every so many-th row and column alone is used; by default such that 20,000 rays are left
+      or fewer. Whole images are kept.
+    - `key`: of the posterior samples.
+    - `until`: when it is done, such as `Sure(0.95) | Budget(seconds=600)`; see `jaxnbv.planning.stopping`.
+
+    **Raises:** `ValueError` for a box without inside, poses that the search has no use for, or a folder of another
+    session.
+    """
+
+    @checked
+    def __init__(
+        self,
+        planner: Planner,
+        camera: Camera | tuple | list,
+        box: tuple | list | Box | AnyArray,
+        up: str = "y",
+        poses: Float[AnyArray, "n 4 4"] | None = None,
+        folder: str | Path | None = None,
+        convention: str = "opencv",
+        stride: int | None = None,
+        key: PRNGKeyArray | None = None,
+        until: Stop | None = None,
+        surroundings: Surroundings | None = None,
+    ):
+        self.cameras = tuple(camera) if isinstance(camera, tuple | list) else (camera,)
+        require(len(self.cameras) > 0, "the session has no camera: give one")
+        for one in self.cameras:
+            check_type(one, Camera, "a camera of the session")
+        self.convention = convention
+        self.box = box if isinstance(box, Box) else Box(*_corners(box))
+        self.frame = Frame.fit(np.array([self.box.low, self.box.high]), up=up)
+        self.stride = stride
+        self.key = jax.random.key(0) if key is None else key
+        check_key(self.key)
+        allowed = None if poses is None else self.frame.to_scene(Pose.from_matrix(poses, convention))
+        sensor, volume = self.frame.to_scene(self.cameras[0]), self.frame.to_scene(self.box)
+        self.planner = planner_at(planner, sensor, volume, allowed)
+        if surroundings is not None:
+            self.planner = dataclasses.replace(self.planner, surroundings=surroundings.in_scene(self.frame))
+        self._strides = tuple(stride_of(one) if stride is None else stride for one in self.cameras)
+        self._rays = tuple(one.strided(n) for one, n in zip(self.cameras, self._strides, strict=True))
+        self._watch, self._asked_at = None if until is None else Watch(until, self.planner), 0
+        self._views: list[View] = []
+        self._proposals: dict[int, Proposal] = {}
+        self._next: NextView | None = None
+        self._live: LiveView | None = None
+        self._state: State | None = None
+        self._folder = None if folder is None else SessionFolder(folder, self._config())
+        if self._folder is not None:
+            for index in range(self._folder.count_images()):
+                if (known := self._folder.read_proposal(index)) is not None:
+                    self._proposals[index] = known[0]
+                image = self._folder.read_image(index)
+                self._take(*self._seen(image), image.camera)
+
+    @property
+    def views(self) -> int:
+        """How many images there are so far."""
+        return len(self._views)
+
+    @property
+    def state(self) -> State:
+        """What the planner knows, in scene coordinates.
+
+        **Raises:** `ValueError` before the first image.
+        """
+        if self._state is None:
+            raise InputError(_NO_IMAGE)
+        return self._state
+
+    @property
+    def cloud(self) -> PointCloud:
+        """The points that are kept, in world units.
+
+        **Raises:** `ValueError` before the first image.
+        """
+        return self.frame.to_world(self.state.cloud)
+
+    @property
+    def episode(self) -> Episode:
+        """The session so far, in scene coordinates, as of a simulation.
+
+        **Raises:** `ValueError` before the first image.
+        """
+        require(self.views > 0, _NO_IMAGE)
+        return Episode(self.planner, None, None, self._views[0].pose, self.key, tuple(self._views))
+
+    @property
+    def done(self) -> str | None:
+        """Why no more images are needed, by the rule that was given; None while they are. Asked once an image.
+
+        **Raises:** `ValueError` as `next` does, if the rule does not hold of what there is: then it is asked about what
+        comes next.
+        """
+        if self._watch is None or not self._views:
+            return None
+        if self._asked_at < self.views:
+            key, *_ = view_keys(self.key, self.views)
+            poses = [view.pose for view in self._views]
+            if self._watch.after(self.state, poses, key) is None:
+                self._watch.before(self.state, poses, key, self.next().proposal)
+            self._asked_at = self.views
+        return self._watch.reason
+
+    @checked
+    def add(
+        self,
+        depth: Real[AnyArray, "height width"],
+        matrix: Float[AnyArray, "4 4"] | list,
+        depth_scale: float = 1.0,
+        camera: int = 0,
+    ) -> None:
+        """Take in an image, which is stored first.
+
+        - `depth`: see `PointCloud.from_depth`; `depth_scale` times it is in world units: 0.001 for millimetres where
+          the world is in metres.
+        - `matrix`: where the camera truly was, which need not be what was proposed.
+        - `camera`: which of a rig's cameras it is of.
+
+        **Raises:** `ValueError` as `PointCloud.from_depth`, `Pose.from_matrix`, `Planner.init` and `observe` do, or if
+        another process has added images to the folder. Nothing is changed then.
+        """
+        pixels = as_numbers(depth, "the depth image", None)
+        count = len(self.cameras)
+        require(0 <= camera < count, f"the session has {count} cameras, counted from 0: there is no camera {camera}")
+        image = DepthImage(pixels, as_numbers(matrix, "the matrix of a pose", np.float64), depth_scale, camera)
+        pose, scan = self._seen(image)
+        state = self._after(pose, scan, camera)
+        if self._folder is not None:
+            with self._folder.writing():
+                self._check_alone(self._folder)
+                self._folder.write_image(self.views, image)
+        self._take(pose, scan, camera, state)
+
+    def next(self) -> NextView:
+        """Where to take the next image. It is stored, and the same until an image is added; what was proposed once is
+        not proposed again, for where the sensor could not be held it need not be tried twice.
+
+        **Raises:** `ValueError` before the first image, or as `Planner.propose` does.
+        """
+        if self._next is None:
+            index = self.views
+            known = None if self._folder is None else self._folder.read_proposal(index)
+            proposal, expected = self._propose() if known is None else known
+            if self._folder is not None and known is None:
+                with self._folder.writing():
+                    self._check_alone(self._folder)
+                    self._folder.write_proposal(index, proposal, expected)
+            self._proposals[index] = proposal
+            matrix = np.asarray(self.frame.to_world(proposal.pose).to_matrix(self.convention), np.float64)
+            self._next = NextView(matrix, float(proposal.value), proposal.standard_error, expected, proposal)
+            self._show()
+        return self._next
+
+    def report(self, folder: str | Path | None = None, title: str = "object", progress: bool = True) -> Path:
+        """Write `report.html` and its figures, by default into the session's folder, and return the page's path.
+
+        **Raises:** `ValueError` before the first image, or without a folder.
+        """
+        place = folder or (None if self._folder is None else self._folder.path)
+        if place is None:
+            raise InputError("the session keeps no folder: tell the report one, session.report(folder)")
+        return write_report(self.episode, place, title=title, progress=progress)
+
+    def view(self, port: int = 8080, host: str = "127.0.0.1") -> LiveView:
+        """A page in the browser, which changes with every image and proposal from now on; needs viser.
+
+        **Raises:** `ValueError` if viser is not installed.
+        """
+        self._live = LiveView(port, host)
+        self._show()
+        return self._live
+
+    def _show(self) -> None:
+        if self._live is not None and self.views:
+            asked = self._next
+            proposal, expected = (None, None) if asked is None else (asked.proposal, asked.expected_depth)
+            self._live.update(self.episode, proposal, expected, self.state)
+
+    def _config(self) -> dict:
+        sensor = {"cameras": self.cameras, "box": self.box, "up": self.frame.up, "convention": self.convention}
+        return describe({**sensor, "stride": self.stride, "key": self.key, "planner": self.planner})
+
+    def _seen(self, image: DepthImage) -> tuple[Pose, PointCloud]:
+        """Pose and scan of an image, in scene coordinates."""
+        pose = Pose.from_matrix(image.matrix, self.convention)
+        camera, stride = self.cameras[image.camera], self._strides[image.camera]
+        cloud = PointCloud.from_depth(image.depth, camera, pose, image.depth_scale, stride, self.box)
+        scan, around = self.frame.to_scene(cloud), self.planner.surroundings
+        return self.frame.to_scene(pose), scan if around is None else around.without_obstacles(scan)
+
+    def _after(self, pose: Pose, scan: PointCloud, camera: int) -> State:
+        rays = self.frame.to_scene(self._rays[camera])
+        if self._state is None:
+            return self.planner.init(scan, pose, rays)
+        return self.planner.observe(self._state, pose, scan, rays)
+
+    def _take(self, pose: Pose, scan: PointCloud, camera: int, state: State | None = None) -> None:
+        self._state = self._after(pose, scan, camera) if state is None else state
+        rays, proposal = self.frame.to_scene(self._rays[camera]), self._proposals.get(self.views)
+        self._views.append(View(pose, scan, self._state.cloud, proposal, rays))
+        self._next = None
+        self._show()
+
+    def _propose(self) -> tuple[Proposal, Float[np.ndarray, "h w"] | None]:
+        sample_key, search_key, _ = view_keys(self.key, self.views)
+        surfaces = self.planner.sample_surfaces(self.state, sample_key) if self.planner.search.uses_samples else None
+        proposed = [proposal.pose for index, proposal in sorted(self._proposals.items()) if index < self.views]
+        proposal = self.planner.choose(with_visited(self.state, proposed), surfaces, search_key)
+        if surfaces is None:
+            return proposal, None
+        depth = np.asarray(expected_depth(self.planner, surfaces, proposal.pose))
+        return proposal, depth / self.frame.scale
+
+    def _check_alone(self, folder: SessionFolder) -> None:
+        found = folder.count_images()
+        require(
+            found == self.views,
+            f"{folder.path} holds {found} images, but this session knows {self.views}: another process has added some; "
+            "make the session again, which reads them",
+        )
+
+
+def _corners(box) -> tuple:
+    require(np.shape(box) == (2, 3), f"the box is {shown(box)}; give two corners, (low, high), or a Box")
+    return tuple(as_numbers(corner, "a corner of the box", np.float64).tolist() for corner in box)

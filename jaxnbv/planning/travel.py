@@ -1,0 +1,155 @@
+"""What it costs to go from one view to the next, and what a view is worth given that."""
+
+import itertools
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxnbv.answers import Quantity
+from jaxnbv.checks import check_fields, checked, require
+from jaxnbv.geometry.pose import Pose
+
+CostFunction: TypeAlias = Callable[[Pose, Pose], Float[Array, ""]]
+"""What it costs to go from one pose to another, in units of the user's: not negative, made of JAX operations."""
+
+# Beyond so many the shortest way is not looked for: there are 2^n n^2 pieces of ways.
+_MOST_PLACES = 12
+
+
+@checked
+@jax.jit
+def arc_length(start: Pose, end: Pose) -> Float[Array, ""]:
+    """Length of the way from one camera's place to another's about the origin, in scene units: of the great circle
+    where both are equally far from it, hypot(mean distance x angle, difference of distances) in general."""
+    first, second = start.position, end.position
+    radii = _norm(first), _norm(second)
+    angle = jnp.arctan2(_norm(jnp.cross(first, second)), jnp.sum(first * second))
+    return _norm(jnp.stack([0.5 * (radii[0] + radii[1]) * angle, radii[1] - radii[0]]))
+
+
+@checked
+@jax.jit
+def rotation_angle(start: Pose, end: Pose) -> Float[Array, ""]:
+    """Angle in radians, within [0, pi], by which a camera turns from one pose to another."""
+    turn = jnp.matmul(start.rotation.T, end.rotation, precision="highest")
+    off_axis = jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    return jnp.arctan2(_norm(off_axis), jnp.trace(turn) - 1.0)
+
+
+def _norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
+    """Whose derivative at zero is zero."""
+    squared = jnp.sum(vector**2)
+    return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
+
+
+class Cost(eqx.Module):
+    """How the cost of going to a view counts against its value.
+
+    - `of`: what it costs to go from one pose to another: `arc_length`, `rotation_angle`, or a function of yours.
+    """
+
+    of: eqx.AbstractVar[CostFunction]
+
+    @abstractmethod
+    def __call__(
+        self, values: Float[Array, "*samples poses"], cost: Float[Array, " poses"]
+    ) -> Float[Array, "*samples poses"]:
+        """What the poses are worth, of their values and of what it costs to go there."""
+
+    @abstractmethod
+    def quantity(self, value: Quantity) -> Quantity:
+        """What the worth is, in words, where the value is this."""
+
+
+class ValuePerCost(Cost):
+    """value / (fixed + cost).
+
+    - `fixed`: what every view costs wherever it is, such as the time that an image takes, in the units of `of`.
+
+    **Raises:** `ValueError` if `fixed` is not positive.
+    """
+
+    of: CostFunction
+    fixed: float = eqx.field(static=True, default=1.0)
+
+    def __check_init__(self):
+        check_fields(self)
+        require(self.fixed > 0, f"the fixed cost of a view is {self.fixed}; it must be positive")
+
+    def __call__(
+        self, values: Float[Array, "*samples poses"], cost: Float[Array, " poses"]
+    ) -> Float[Array, "*samples poses"]:
+        return values / (self.fixed + cost)
+
+    def quantity(self, value: Quantity) -> Quantity:
+        meaning = f"{value.meaning.rstrip('.')}, over the cost of going there."
+        return Quantity(f"{value.name} per cost", f"{value.unit or value.name} per unit of cost", meaning, value.smooth)
+
+
+class ValueMinusCost(Cost):
+    """value - weight x cost.
+
+    - `weight`: what a unit of cost is worth, in the units of the value.
+
+    **Raises:** `ValueError` if the weight is negative.
+    """
+
+    of: CostFunction
+    weight: float = eqx.field(static=True, default=1.0)
+
+    def __check_init__(self):
+        check_fields(self)
+        require(self.weight >= 0, f"the weight of the cost is {self.weight}; it must not be negative")
+
+    def __call__(
+        self, values: Float[Array, "*samples poses"], cost: Float[Array, " poses"]
+    ) -> Float[Array, "*samples poses"]:
+        return values - self.weight * cost
+
+    def quantity(self, value: Quantity) -> Quantity:
+        meaning = f"{value.meaning.rstrip('.')}, less {self.weight:g} times the cost of going there."
+        return Quantity(f"{value.name} less cost", value.unit, meaning, value.smooth)
+
+
+@checked
+def visiting_order(start: Pose, poses: Pose, cost: CostFunction = arc_length) -> tuple[int, ...]:
+    """In which order to visit a batch of poses from a start, so that the whole way costs least; exact (Held and Karp
+    1962). The way ends at the last of them.
+
+    **Raises:** `ValueError` for more than twelve poses.
+    """
+    count = poses.position.shape[0]
+    require(count <= _MOST_PLACES, f"asked for the order of {count} poses: give at most {_MOST_PLACES}")
+    first = np.asarray(jax.vmap(lambda pose: cost(start, pose))(poses))
+    between = np.asarray(jax.vmap(lambda a: jax.vmap(lambda b: cost(a, b))(poses))(poses))
+    # Of each set of places and the last of them: the least cost, and the place before it.
+    best = {(1 << last, last): (float(first[last]), -1) for last in range(count)}
+    for size in range(2, count + 1):
+        for places in itertools.combinations(range(count), size):
+            members = sum(1 << place for place in places)
+            for last in places:
+                rest = members & ~(1 << last)
+                ways = (
+                    (best[rest, place][0] + float(between[place, last]), place) for place in places if place != last
+                )
+                best[members, last] = min(ways)
+    members = (1 << count) - 1
+    last = min(range(count), key=lambda place: best[members, place][0])
+    order: list[int] = []
+    while last >= 0:
+        order.append(last)
+        members, last = members & ~(1 << last), best[members, last][1]
+    return tuple(reversed(order))
+
+
+@checked
+def total_cost(poses: Sequence[Pose], cost: CostFunction = arc_length) -> float:
+    """What the way through some poses, in their order, costs; zero for one or none."""
+    return math.fsum(float(cost(a, b)) for a, b in itertools.pairwise(poses))

@@ -1,0 +1,110 @@
+"""From a cloud to a surface: triangles of the posterior mean, and screened Poisson surface reconstruction."""
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxnbv.checks import InputError, checked, require
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.state import State
+from jaxnbv.scanning import Grid, TriangleMesh
+from jaxnbv.scanning.mesh import level_triangles
+from jaxnbv.surfaces import SurfaceModel, SurfacePosterior
+
+# Fewer cannot enclose anything, and Poisson reconstruction answers them with an empty mesh.
+_FEWEST_POINTS = 4
+
+
+@checked
+def mean_mesh(model: SurfaceModel, cloud: PointCloud, grid: Grid = Grid()) -> TriangleMesh:
+    """The surface where the posterior mean equals its level, {x : E f(x) = level}, by marching cubes on a grid.
+
+    The mesh is in scene coordinates (its frame is the identity), its faces wound outward. Where nothing was scanned it
+    is the model's guess. All of it is kept, pieces that hold no point of the cloud included: some continue the object
+    behind what was seen, others are not there, and the cloud does not tell which. It is open where it leaves the grid.
+
+    **Raises:** `ValueError` if the mean does not cross its level within the grid, and as the model's `condition` does.
+    """
+    return _level_mesh(_mean_values(model.condition(cloud), grid), grid)
+
+
+@checked
+def carved_mesh(planner: Planner, state: State) -> TriangleMesh:
+    """The surface of the posterior mean given all that a planner knows, by marching cubes on its grid.
+
+    As `mean_mesh`, but with what its scans saw to be empty: the model is told of it, and what would lie there is carved
+    away, as of the samples. A planner that does not carve gives the `mean_mesh` of its model.
+
+    **Raises:** `ValueError` if nothing crosses the level within the grid, and as `Planner.posterior` does.
+    """
+    values = _mean_values(planner.posterior(state), planner.grid)
+    return _level_mesh(planner.carve(state, values), planner.grid)
+
+
+def _mean_values(posterior: SurfacePosterior, grid: Grid) -> Float[Array, "g g g"]:
+    return posterior.mean_on_grid(grid.axis.astype(posterior.level.dtype)) - posterior.level
+
+
+def _level_mesh(values: Float[Array, "g g g"], grid: Grid) -> TriangleMesh:
+    found = level_triangles(np.array(values), grid)
+    if found is None:
+        raise InputError(
+            f"the posterior mean less its level runs from {values.min():.4g} to {values.max():.4g} on the grid, so no "
+            f"surface lies within [-{grid.half_extent}, {grid.half_extent}]^3: give a Grid whose half extent holds the "
+            "cloud, or a finer one"
+        )
+    return TriangleMesh(found[0], found[1], Frame())
+
+
+def has_poisson() -> bool:
+    """Whether `screened_poisson` can run: `pymeshlab` can be imported."""
+    try:
+        import pymeshlab  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+@checked
+def screened_poisson(cloud: PointCloud, depth: int = 8) -> TriangleMesh:
+    """Screened Poisson surface reconstruction (Kazhdan and Hoppe 2013) of an oriented cloud, as MeshLab has it.
+
+    `depth` is that of the octree: details down to 1 / 2^depth of the cloud's size, where there are points for them.
+    MeshLab's other settings are left as they are. The mesh is in scene coordinates (its frame is the identity), its
+    faces wound outward, and the same from run to run. It bridges what was not scanned, and is open where it leaves a
+    cube 1.1 times the cloud's size.
+
+    It needs `pymeshlab`, an optional dependency of its own license (GPL), and with it the system's OpenGL library.
+
+    **Raises:** `ValueError` if `pymeshlab` is not installed, the depth is not within [1, 12], the cloud has fewer than
+    four points, entries that are not finite, or no surface comes out.
+    """
+    require(1 <= depth <= 12, f"the octree's depth is {depth}; it must be at least 1 and at most 12, such as 8")
+    try:
+        import pymeshlab
+    except ImportError as error:
+        raise InputError(
+            f"Poisson reconstruction needs pymeshlab, which cannot be imported ({error}): "
+            'pip install "jaxnbv[poisson]" and, where it is missing, the system\'s OpenGL library (libGL), or take the '
+            "mean of the posterior"
+        ) from error
+    points, normals = (rows.astype(np.float64) for rows in cloud.to_numpy())
+    require(
+        len(points) >= _FEWEST_POINTS,
+        f"the cloud has {len(points)} points, and a surface needs at least {_FEWEST_POINTS}: scan more of the object",
+    )
+    finite = bool(np.isfinite(points).all() and np.isfinite(normals).all())
+    require(finite, "the cloud has points or normals that are not finite: build it with PointCloud.from_arrays")
+    meshes = pymeshlab.MeshSet(verbose=False)
+    meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=points, v_normals_matrix=normals))
+    # More threads than one change the last bits from run to run.
+    meshes.generate_surface_reconstruction_screened_poisson(depth=depth, threads=1)
+    found = meshes.current_mesh()
+    vertices, faces = found.vertex_matrix(), found.face_matrix()
+    require(
+        len(faces) > 0,
+        f"Poisson reconstruction at depth {depth} found no surface through {len(points)} points: scan more of the "
+        "object, or raise the depth",
+    )
+    return TriangleMesh(vertices, faces.astype(np.int64), Frame())

@@ -1,0 +1,163 @@
+"""What stands around the object, and where cameras may not be for it."""
+
+import functools
+import operator
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from skimage.measure import ransac
+
+from jaxnbv.checks import AnyArray, as_numbers, check_fields, check_type, checked, require, shown
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.geometry.neighbours import nearest_squared_distance
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.tensor_grid import on_tensor_grid
+from jaxnbv.scanning import Grid, SDFSurface
+from jaxnbv.scanning.sdf import HalfSpace, Rotated, SignedDistance
+
+# Beyond this distance from the scene's origin nothing stands in the way of a camera.
+_FAR = 8.0
+
+
+class Surroundings(eqx.Module):
+    """Known obstacles, and how near a camera may come to things; in scene units within a `Planner`.
+
+    An obstacle hides what is behind it, from the sensor and from imagined scans; it is never counted as the object, and
+    no imagined surface is within it.
+
+    - `obstacles`: solids of `jaxnbv.scanning.sdf`: a table is a `HalfSpace`, a mesh is made one by `solid_of_mesh`.
+    - `margin`: points nearer than this to an obstacle are taken for its own.
+    - `clearance`: no camera comes nearer than this to an obstacle, nor to a point that was seen.
+    - `seen_only`: no camera stands where space was not seen to be empty, as far as the planner's grid reaches.
+
+    **Raises:** `ValueError` for obstacles that are not solids, or a negative length.
+    """
+
+    obstacles: tuple[SignedDistance, ...] = ()
+    margin: float = eqx.field(static=True, default=0.03)
+    clearance: float = eqx.field(static=True, default=0.1)
+    seen_only: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        check_fields(self)
+        require(isinstance(self.obstacles, tuple), f"the obstacles are {shown(self.obstacles)}; give a tuple of solids")
+        for obstacle in self.obstacles:
+            check_type(obstacle, SignedDistance, "an obstacle")
+        for name in ("margin", "clearance"):
+            value = getattr(self, name)
+            require(value >= 0, f"the {name} is {value}; it must not be negative")
+
+    def in_scene(self, frame: Frame) -> "Surroundings":
+        """From world units to those of the scene."""
+        solids = tuple(_in_scene(obstacle, frame) for obstacle in self.obstacles)
+        return Surroundings(solids, frame.scale * self.margin, frame.scale * self.clearance, self.seen_only)
+
+    def distance(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        """Signed distance to the nearest obstacle, infinite where there is none."""
+        if not self.obstacles:
+            return jnp.full(jnp.shape(x)[:-1], jnp.inf, jnp.result_type(float))
+        return functools.reduce(operator.or_, self.obstacles)(x)
+
+    def barrier(self, camera: Camera, poses: Pose) -> Float[Array, "*batch rays"] | None:
+        """How far along each ray of a camera the first obstacle stands; infinite where none does, None without any."""
+        if not self.obstacles:
+            return None
+        origins, directions = camera.rays(poses)
+        surface = SDFSurface(functools.reduce(operator.or_, self.obstacles), bounding_radius=_FAR)
+        hits = surface.trace(origins.reshape(-1, 3), directions.reshape(-1, 3))
+        along = jnp.linalg.norm(hits.points - origins.reshape(-1, 3), axis=-1)
+        return jnp.where(hits.mask, along, jnp.inf).reshape(origins.shape[:-1])
+
+    def without_obstacles(self, scan: PointCloud) -> PointCloud:
+        """A scan less the points of obstacles; of an image, their rays met nothing of the object."""
+        own = scan.mask & (self.distance(scan.points) < self.margin)
+        points, normals = (jnp.where(own[..., None], 0.0, rows) for rows in (scan.points, scan.normals))
+        missed = None if scan.missed is None else scan.missed | own
+        return PointCloud(points, normals, scan.mask & ~own, missed)
+
+    def within(self, grid: Grid) -> Bool[Array, "g g g"]:
+        """The nodes of a grid that lie within an obstacle."""
+        axis = jnp.asarray(grid.axis, jnp.result_type(float))
+        return on_tensor_grid(lambda x: self.distance(x) < 0, axis)
+
+    def is_closed(
+        self, poses: Pose, cloud: PointCloud, empty: Bool[Array, "g g g"] | None, half_extent: float | None
+    ) -> Bool[Array, " poses"]:
+        """Whether a camera may not stand at each of a batch of poses, given D and what was seen empty."""
+        closed = self.trespass(poses, cloud) > 0
+        if not self.seen_only or empty is None or half_extent is None:
+            return closed
+        side = empty.shape[0]
+        place = (poses.position + half_extent) * (side - 1) / (2.0 * half_extent)
+        node = jnp.clip(jnp.round(place), 0, side - 1).astype(jnp.int32)
+        known = jnp.any(jnp.abs(poses.position) > half_extent, axis=-1)
+        return closed | ~(known | empty[tuple(node.T)])
+
+    def trespass(self, poses: Pose, cloud: PointCloud) -> Float[Array, " poses"]:
+        """By how much each of a batch of cameras is too near to an obstacle or to D, in scene units; zero where it is
+        not. Differentiable."""
+        seen = jnp.sqrt(jnp.maximum(nearest_squared_distance(poses.position, cloud), 1e-12))
+        return jnp.maximum(self.clearance - jnp.minimum(self.distance(poses.position), seen), 0.0)
+
+
+def _in_scene(solid: SignedDistance, frame: Frame) -> SignedDistance:
+    moved = solid.translate(-np.asarray(frame.center))
+    return Rotated(moved, frame.rotation).scale(frame.scale)
+
+
+class _Plane:
+    """Through three points or more, as scikit-image's RANSAC asks for it: by the first method from 0.26 on, by the
+    second before."""
+
+    point: np.ndarray
+    normal: np.ndarray
+
+    @classmethod
+    def from_estimate(cls, points: np.ndarray) -> "_Plane":
+        plane = cls()
+        plane.estimate(points)
+        return plane
+
+    def estimate(self, points: np.ndarray) -> bool:
+        self.point = points.mean(axis=0)
+        *_, axes = np.linalg.svd(points - self.point)
+        self.normal = axes[2]
+        return True
+
+    def residuals(self, points: np.ndarray) -> np.ndarray:
+        return np.abs((points - self.point) @ self.normal)
+
+
+@checked
+def support_plane(
+    points: Float[AnyArray, "n 3"], up: Float[AnyArray, "3"] | tuple | list, tolerance: float
+) -> HalfSpace:
+    """The table under an object: the plane that most points lie on, by RANSAC, and all below it.
+
+    - `points`: as scanned, table and all, in any units; `up`: a direction that is upward, to 30 degrees.
+    - `tolerance`: how far from the plane its points may be, in the units of the points.
+
+    **Raises:** `ValueError` for fewer than three points, one that is not finite, a tolerance that is not positive, or
+    where the plane of most points is not level.
+    """
+    points = as_numbers(points, "the points", np.float64)
+    require(
+        points.ndim == 2 and points.shape[1:] == (3,) and len(points) >= 3,
+        f"the points are {shown(points)}; give (n, 3), three at least",
+    )
+    require(bool(np.isfinite(points).all()), "the points are not all finite: drop those that are not")
+    require(tolerance > 0, f"the tolerance is {tolerance}; it must be positive")
+    upward = as_numbers(up, "up", np.float64)
+    require(upward.shape == (3,) and bool(np.linalg.norm(upward) > 0), f"up is {shown(up)}; give a direction")
+    plane, _ = ransac(points, _Plane, min_samples=3, residual_threshold=tolerance, max_trials=500, rng=0)
+    cosine = float(plane.normal @ upward / np.linalg.norm(upward))
+    require(
+        abs(cosine) > np.cos(np.radians(30.0)),
+        f"the plane of most points is {np.degrees(np.arccos(abs(cosine))):.0f} degrees off level: show more of the "
+        "table, or give its plane, HalfSpace(point, normal)",
+    )
+    return HalfSpace(plane.point, np.sign(cosine) * plane.normal)

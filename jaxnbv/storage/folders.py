@@ -1,0 +1,201 @@
+"""A folder whose results belong to one configuration and are written by one process at a time."""
+
+import importlib.metadata
+import json
+import os
+import socket
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import filelock
+import jax
+import loky
+
+from jaxnbv.checks import InputError, require
+from jaxnbv.storage.files import PARTS, make_folder, write_text
+
+# Of the files; those of format 1 do not say it, and hold neither index nor checksum.
+FORMAT = 2
+_LOCK = ".lock"
+
+
+class AnotherConfigurationError(InputError):
+    """A folder's results are of another configuration than the one that is asked for."""
+
+
+def software() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    names = ("jaxnbv", "jax", "jaxlib", "equinox", "optax", "optimistix", "numpy", "trimesh", "embreex")
+    return {name: importlib.metadata.version(name) for name in names}
+
+
+def versions(cores: int | None = None) -> dict[str, Any]:
+    """Versions of what the numbers depend on, the kind of device, and the cores that share a sum, by default all."""
+    return software() | {"device": jax.devices()[0].device_kind, "cores": cores or loky.cpu_count()}
+
+
+def differences(found: Any, asked: Any, name: str = "") -> list[str]:
+    """Where two descriptions differ, in words."""
+    if isinstance(found, dict) and isinstance(asked, dict):
+        keys = list(dict.fromkeys([*found, *asked]))
+        nested = (differences(found.get(key), asked.get(key), f"{name}.{key}".lstrip(".")) for key in keys)
+        return [difference for group in nested for difference in group]
+    return [] if found == asked else [f"{name}: {found} there, {asked} now"]
+
+
+def check_format(format: Any, file: Path) -> None:
+    """**Raises:** `ValueError` for a file of a format that is not known here."""
+    require(
+        format in range(1, FORMAT + 1),
+        f"{file} is of format {str(format)[:20]}; this version of jaxnbv reads up to {FORMAT}: install a newer one",
+    )
+
+
+def read_json(file: Path, problem: str, remedy: str) -> dict[str, Any]:
+    """What a JSON file holds.
+
+    **Raises:** `ValueError` that tells `problem` and `remedy`, unless that is an object.
+    """
+    try:
+        content = json.loads(file.read_bytes())
+    except (ValueError, OSError, RecursionError) as error:
+        raise InputError(f"{file} {problem} ({error}): {remedy}") from error
+    require(isinstance(content, dict), f"{file} {problem} (it holds a {type(content).__name__}): {remedy}")
+    return content
+
+
+def read_config(file: Path, problem: str, remedy: str) -> dict[str, Any]:
+    """The configuration in a folder's record.
+
+    **Raises:** as `read_json`, and if there is none.
+    """
+    config = read_json(file, problem, remedy).get("config")
+    if not isinstance(config, dict):
+        raise InputError(f"{file} {problem} (it has no config): {remedy}")
+    return config
+
+
+@contextmanager
+def writing_in(path: Path, *inside: str) -> Iterator[None]:
+    """While this process writes in a folder; what a process that was killed has left of a file is removed first, there
+    and in folders inside.
+
+    **Raises:** `ValueError` if another process writes there, or it cannot be written.
+    """
+    lock = filelock.FileLock(path / _LOCK, timeout=0)
+    try:
+        lock.acquire()
+        # The same file: what another process reads when the lock is taken.
+        (path / _LOCK).write_text(f"process {os.getpid()} on {socket.gethostname()}")
+    except filelock.Timeout as error:
+        raise InputError(
+            f"{path} is being written by {_holder(path)}: wait until it ends, or choose another folder"
+        ) from error
+    # Of filelock, down to the least version that we allow (3.16): there are no locks on this file system.
+    except (OSError, NotImplementedError) as error:
+        lock.release()
+        raise InputError(f"cannot write in {path} ({error}): make room or choose another place") from error
+    try:
+        for folder in (path, *(path / name for name in inside)):
+            for left in folder.glob(PARTS):
+                left.unlink()
+        yield
+    finally:
+        lock.release()
+
+
+def _holder(path: Path) -> str:
+    try:
+        return (path / _LOCK).read_text() or "another process"
+    except OSError:
+        return "another process"
+
+
+class ResultFolder:
+    """A folder, and the configuration that its results have: a record, written with the first of them.
+
+    - `record`: the record's name; `results`: the pattern of the results' names.
+    - `config`: what JSON can say, see `jaxnbv.storage.describe`.
+    - `kind`: what the folder is for, such as "study".
+    - `cores`: how many share a sum, by default all.
+
+    **Raises:** `ValueError` if the folder cannot be made, or holds results of another configuration or other files.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        record: str,
+        results: str,
+        config: dict[str, Any],
+        kind: str,
+        cores: int | None = None,
+    ):
+        self.path, self.config = make_folder(path), json.loads(json.dumps(config))
+        self.record, self.results, self.kind, self.cores = self.path / record, results, kind, cores
+        self.bound = False
+        self._check()
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """While this process writes results.
+
+        **Raises:** `ValueError` if another process does, or the folder cannot be written.
+        """
+        with writing_in(self.path):
+            # Another process may have written since this one looked.
+            self._check()
+            yield
+
+    def bind(self) -> None:
+        """Write the record, if it is not there, before the first result is."""
+        if not self.bound:
+            made_by = versions(self.cores)
+            write_text(
+                self.record, json.dumps({"format": FORMAT, "config": self.config, "versions": made_by}, indent=2)
+            )
+            self.bound = True
+
+    def _check(self) -> None:
+        has_results = any(self.path.glob(self.results))
+        if not self.record.exists():
+            names = sorted(entry.name for entry in self.path.iterdir())
+            foreign = [name for name in names if name != _LOCK and not name.endswith(".partial")]
+            require(
+                not foreign or self.kind == "study",
+                f"the output folder {self.path} holds other files ({', '.join(foreign[:3])}): choose an empty folder",
+            )
+            return
+        found, made_by = self._read_record()
+        # A record without results is of a run that did not come far; it binds nobody.
+        if not has_results:
+            return
+        changed = differences(found, self.config)
+        if changed:
+            raise AnotherConfigurationError(
+                f"the output folder {self.path} belongs to another {self.kind}; it differs in "
+                f"{'; '.join(changed[:3])}. Choose another folder, or the settings it was made with"
+            )
+        now = {key: value for key, value in versions(self.cores).items() if key in made_by}
+        if made_by != now and not self.bound:
+            warnings.warn(
+                f"{self.path} was begun with other versions ({'; '.join(differences(made_by, now))}): "
+                "new results may differ in their last bits from those of an uninterrupted run",
+                stacklevel=3,
+            )
+        self.bound = True
+
+    def _read_record(self) -> tuple[Any, dict[str, Any]]:
+        """The configuration that was written, and the versions that wrote it."""
+        article = "an" if self.kind == "episode" else "a"
+        problem = f"is not {article} {self.kind}'s record"
+        written = read_json(self.record, problem, "choose another output folder")
+        check_format(written.pop("format", 1), self.record)
+        made_by = written.pop("versions", None)
+        # Studies of format 1 have no level of their own for it.
+        config = written.get("config", written if self.kind == "study" else None)
+        require(config is not None, f"{self.record} {problem} (it has no config): choose another output folder")
+        return config, made_by if isinstance(made_by, dict) else {}

@@ -1,0 +1,267 @@
+"""What the studies of classification have in common: which methods' views tell the class, and how soon?"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int, Key
+
+from jaxnbv.checks import require
+from jaxnbv.cli.model_name import ModelName
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.imagination import imagination
+from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale, pretrained_classifier
+from jaxnbv.planning.episode import Sensor, Step
+from jaxnbv.planning.planner import Planner
+from jaxnbv.scanning import Grid, SensorNoise
+from jaxnbv.search import DiscreteSearch
+from jaxnbv.studies.classification.choices import CLASSIFYING, Chooser, classify
+from jaxnbv.studies.classification.measures import HITS_EXPLAINED, ROUGHNESS, diagnostics_chart, hits
+from jaxnbv.studies.engine.measures import Claim, Measure, Record
+from jaxnbv.studies.engine.meshes import class_meshes, numbered
+from jaxnbv.studies.engine.study import Chart, Panel, Scene, Study
+from jaxnbv.studies.readers import MeshFile
+from jaxnbv.studies.scenes import ClassObject, ClassSet, Framing, Split
+from jaxnbv.studies.scenes.class_object import ClassMesh, scan_telling, surface_of
+from jaxnbv.tasks import Coverage
+from jaxnbv.tasks.classification import Classifier
+
+_RANDOM_RUNS = 8
+BASELINES = ("coverage", "farthest", "uncertainty", "random")
+
+
+class Truth(eqx.Module):
+    """The class, and what each candidate would truly show: scans with noise, and how many rays hit what tells it."""
+
+    label: int
+    scans: PointCloud
+    thing: ClassObject | ClassMesh
+    pixels: Int[Array, " candidates"]
+
+
+class ClassificationStudy(Study):
+    """The class of an object. Settings as of `Study`, and
+
+    - `classifier`: of clouds in scene coordinates; it says what is known after each view.
+    - `imagining`: the classifier of D u scan for imagined scans, by default the same; one that is fed fewer points
+      saves time.
+    - `framing`: how large the object stands before the sensor.
+    - `split`: which scenes; tune on those of the validation split.
+    - `num_points`: D is thinned to so many, once a step, before imagined scans are added to it.
+    - `meshes`: files in place of procedural objects, see `class_meshes`, where all of an object tells its class.
+
+    What it is:
+
+    - `objects`: the scenes; `telling`: what of them tells the class, "" for all of the object.
+    - `network`: the name of the shipped classifier; `fed`: the points that it is fed of what was seen, and of that and
+      an imagined scan.
+    - `framings`: each a study of its own; `solid`: whether the objects are nowhere thin, see `imagination`.
+    """
+
+    methods: ClassVar[tuple[str, ...]] = (*CLASSIFYING, *BASELINES, "oracle")
+    reference: ClassVar[str] = "cross-entropy"
+    explanation: ClassVar[str] = f"{HITS_EXPLAINED}Roughness is by the view being chosen, in ( ) its scenes."
+    measures: ClassVar[tuple[Measure, ...]] = (*hits(), ROUGHNESS)
+    claims: ClassVar[tuple[Claim, ...]] = (
+        Claim(
+            "Where local features tell the class, cross-entropy is right sooner than views that know nothing of the "
+            "task, most of all at the second view.",
+            "first",
+            2,
+            BASELINES,
+        ),
+    )
+    charts: ClassVar[Mapping[str, Chart]] = {
+        "hits": Chart((tuple(map(Panel, ("first", "stable"))),)),
+        "diagnostics": diagnostics_chart("roughness"),
+    }
+    quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 40}
+    quick_scenes: ClassVar[int] = 6
+
+    objects: eqx.AbstractClassVar[ClassSet]
+    telling: ClassVar[str] = ""
+    network: eqx.AbstractClassVar[str]
+    fed: ClassVar[tuple[int, int]] = (1024, 512)
+    framings: ClassVar[tuple[Framing, ...]] = (Framing.CLOSE_UP,)
+    solid: ClassVar[bool] = False
+
+    classifier: Classifier = eqx.field(kw_only=True)
+    imagining: Classifier | None = None
+    framing: Framing = eqx.field(static=True, default=Framing.CLOSE_UP)
+    split: Split = eqx.field(static=True, default=Split.TEST)
+    num_points: int = eqx.field(static=True, default=512)
+    meshes: tuple[MeshFile, ...] = eqx.field(static=True, default=())
+
+    @classmethod
+    def configured(cls, model: ModelName, views: int, quick: bool, **options: Any) -> dict[str, Study]:
+        """One for each framing, if none is given.
+
+        - `meshes`: a folder, see `class_meshes`.
+        - `classifier`: the file of a network, see `load_checkpoint`, in place of the one that ships.
+
+        **Raises:** `ValueError` as these do, or if the network does not tell as many classes.
+        """
+        if "meshes" in options:
+            options["meshes"] = class_meshes(options["meshes"], cls.objects.classes)
+        file = options.pop("classifier", None)
+        studies: dict[str, Study] = {}
+        for one in (options["framing"],) if "framing" in options else cls.framings:
+            classifier, imagining = (cls._classifier(file, one.longest_side, fed) for fed in cls.fed)
+            surfaces = imagination(model, one.longest_side, quick, solid=cls.solid)._asdict()
+            settings = {"classifier": classifier, "imagining": imagining, "framing": one} | options
+            name = one.value if len(cls.framings) > 1 else ""
+            studies[name] = cls(views=views, **surfaces | settings | (dict(cls.quick) if quick else {}))
+        return studies
+
+    @classmethod
+    def _classifier(cls, file: str | Path | None, longest_side: float, fed: int) -> CloudClassifier:
+        if file is None:
+            return pretrained_classifier(cls.network, longest_side, fed)
+        network = load_checkpoint(file)
+        classifier = CloudClassifier(network, fed, network_scale(network, longest_side))
+        rows = jnp.zeros((fed, 3))
+        (told,) = jax.eval_shape(classifier, PointCloud(rows, rows, jnp.ones(fed, bool))).shape
+        names = cls.objects.classes
+        require(
+            told == len(names),
+            f"the network in {file} tells {told} classes apart; the study has {len(names)}: {', '.join(names)}",
+        )
+        return classifier
+
+    @classmethod
+    def groups(cls, records: Sequence[Record]) -> dict[str, list[Record]]:
+        """All, and those whose first view shows nothing of what tells the class, and something; no group is empty."""
+        parts: dict[str, list[Record]] = {"all": list(records)}
+        if cls.telling:
+            shown = [record[f"{cls.telling}_pixels"][record["first"]] > 0 for record in records]
+            for word, wanted in (("without", False), ("with", True)):
+                of = [record for record, shows in zip(records, shown, strict=True) if shows is wanted]
+                parts |= {f"first view {word} {cls.telling}": of} if of else {}
+        return parts
+
+    @property
+    def num_scenes(self) -> int | None:
+        return len(self.meshes) or None
+
+    def scene(self, index: int) -> Scene:
+        """An object; its task is the `Truth`.
+
+        **Raises:** `ValueError` if there is no mesh of this index, or it cannot be read.
+        """
+        poses = self.candidates.poses()
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(3), index), self.num_candidates)
+        name, thing = self.thing(index)
+        pixels, scans = scan_telling(thing, self.camera, poses)
+        return Scene(index, name, surface_of(thing), Truth(int(thing.label), _noisy(scans, keys), thing, pixels))
+
+    def thing(self, index: int) -> tuple[str, ClassObject | ClassMesh]:
+        """The object of a scene and its name."""
+        if not self.meshes:
+            return f"{self.network} {index}", self.objects.scene(self.split, index, self.framing)
+        file = numbered(self.meshes, index)
+        return f"{self.objects.classes[file.label]} {file.name}", self.of_mesh(file, index)
+
+    def of_mesh(self, file: MeshFile, index: int) -> ClassMesh:
+        """What a file of `meshes` gives."""
+        return ClassMesh(file.read(), file.label)
+
+    def truth(self, scene: Scene) -> Truth:
+        return scene.task
+
+    def facts(self, scene: Scene, truth: Truth, first: int) -> Record:
+        known = {"name": scene.name, "framing": self.framing.value, "split": self.split.value}
+        return known | {"label": truth.label} | self._shown(truth.pixels)
+
+    @property
+    def grid(self) -> Grid:
+        """In proportion to the object."""
+        return Grid(self.grid_resolution, 0.7 * self.framing.longest_side)
+
+    def planner(self, method: str, scene: Scene) -> Planner:
+        """That of coverage, whose states and samples all methods share; a `Chooser` asks their scores."""
+        return self.planner_of(Coverage(), DiscreteSearch(self.candidates))
+
+    def sensor(self, scene: Scene) -> Sensor:
+        """From a candidate the same scan for all methods and views."""
+        anywhere, poses = super().sensor(scene), self.candidates.poses()
+
+        def look(pose, key):
+            index = _nearest(poses, pose)
+            return anywhere(pose, key) if index is None else scene.task.scans[index]
+
+        return look
+
+    def run_methods(self, scene: Scene, truth: Truth, first: int, methods: Sequence[str]) -> dict[str, Record]:
+        """All methods together: those that stand at the same place share its state and its samples."""
+        chooser = self._chooser(scene)
+        runs: dict[str, list[tuple[int, ...]]] = {method: [(first,)] for method in methods}
+        if "random" in runs:
+            runs["random"] = [self._random_run(scene.index, first, run) for run in range(_RANDOM_RUNS)]
+        diagnostics: dict[str, list[Record]] = {method: [] for method in methods}
+        for view in range(2, self.views + 1):
+            together: dict[tuple[int, ...], list[str]] = {}
+            for method in methods:
+                if method != "random":
+                    together.setdefault(runs[method][0], []).append(method)
+            for visited, group in together.items():
+                for method, choice in chooser.choose(visited, group, view).items():
+                    runs[method] = [(*visited, choice.candidate)]
+                    diagnostics[method].append({"view": view, **choice.diagnostics})
+        found: dict[str, Record] = {
+            method: {"runs": [self._run(chooser, truth, one) for one in of], "diagnostics": diagnostics[method]}
+            for method, of in runs.items()
+        }
+        if "random" in found:
+            correct = chooser.true_answers(first).argmax(axis=1) == truth.label
+            found["random"]["hit"] = float(np.mean(np.delete(correct, first)))
+        return found
+
+    def _chooser(self, scene: Scene) -> Chooser:
+        """For the choices of a scene."""
+        planner, imagining = self.planner("coverage", scene), self.imagining or self.classifier
+        truth, classifiers = scene.task, (self.classifier, imagining, self.num_points)
+        worth = truth.pixels if self.telling else None
+        return Chooser(planner, *classifiers, truth.scans, worth, self.key(scene.index, "scene"))
+
+    def _run(self, chooser: Chooser, truth: Truth, visited: tuple[int, ...]) -> Record:
+        log_p = [chooser.answer(visited[:count]).tolist() for count in range(1, len(visited) + 1)]
+        return {"candidates": list(visited), **self._shown(truth.pixels[np.array(visited)]), "log_p": log_p}
+
+    def _random_run(self, index: int, first: int, run: int) -> tuple[int, ...]:
+        others = np.delete(np.arange(self.num_candidates), first)
+        key = jax.random.fold_in(self.key(index, "episode"), run)
+        chosen = jax.random.choice(key, others, (self.views - 1,), replace=False)
+        return (first, *(int(one) for one in chosen))
+
+    def follow(
+        self, scene: Scene, truth: Truth, method: str, methods: Sequence[str], episode: Iterator[Step]
+    ) -> Record:
+        """Of a method of one's own: what the classifier says after each view, and how much of it tells the class."""
+        log_p, pixels = [], []
+        for view, *_ in episode:
+            log_p.append(np.asarray(classify(self.classifier, view.cloud)).tolist())
+            pose = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], view.pose)
+            pixels.append(int(scan_telling(truth.thing, self.camera, pose)[0][0]))
+        return {"runs": [{**self._shown(pixels), "log_p": log_p}], "diagnostics": []}
+
+    def _shown(self, pixels: Any) -> Record:
+        """How many rays of each view hit what tells the class, where that is a part of the object."""
+        return {f"{self.telling}_pixels": np.asarray(pixels).tolist()} if self.telling else {}
+
+
+@eqx.filter_jit
+def _noisy(scans: PointCloud, keys: Key[Array, " candidates"]) -> PointCloud:
+    return jax.vmap(SensorNoise())(scans, keys)
+
+
+def _nearest(poses: Pose, pose: Pose) -> int | None:
+    """The candidate at a pose; None for a pose of another place or direction."""
+    away = np.linalg.norm(np.asarray(poses.position) - np.asarray(pose.position), axis=1)
+    turned = np.linalg.norm(np.asarray(poses.forward) - np.asarray(pose.forward), axis=1)
+    index = int(np.argmin(away))
+    return index if away[index] + turned[index] < 1e-3 else None

@@ -1,0 +1,105 @@
+"""Charts of a study as PNG files: its measures by view, a line a method, with intervals over scenes."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxnbv.storage.files import make_folder
+from jaxnbv.studies.engine.looks import draw_legend, line_of
+from jaxnbv.studies.engine.measures import Measure, Record, Row, methods_of, result_rows
+from jaxnbv.studies.engine.study import Panel, Study
+from jaxnbv.studies.engine.tables import count_of
+from jaxnbv.viz.figures import STYLE
+from jaxnbv.viz.style import GREY, LINE, log_ticks, save_figure
+
+# Methods side by side, so that equal values do not hide one another: of the distance between two columns.
+_DODGE, _DODGE_NAMED = 0.06, 0.13
+
+
+def write_charts(records: Sequence[Record], study: type[Study], folder: str | Path) -> list[Path]:
+    """Write the study's charts into a folder, and return their paths. Bars at the views are bootstrap intervals: bands
+    between the views of so many methods would hide one another.
+
+    **Raises:** `ValueError` if there are no records, no method that all of them hold, or their numbers of views differ.
+    """
+    methods_of(records, study.methods)
+    folder = make_folder(folder)
+    groups, paths = study.groups(records), []
+    with mpl.rc_context(STYLE):
+        for name, chart in study.charts.items():
+            rows = [(group, members, chart.rows[0]) for group, members in groups.items() if group != "all"]
+            rows = rows if chart.by_group else [("all", list(records), row) for row in chart.rows]
+            figure = _figure(rows, study) if rows else None
+            if figure is not None:
+                paths.append(folder / f"{name}.png")
+                save_figure(figure, paths[-1])
+    return paths
+
+
+def _figure(rows: Sequence[tuple[str, Sequence[Record], Sequence[Panel]]], study: type[Study]) -> Figure | None:
+    """A row of panels for each group of scenes, or for each of the chart's own; None if there is nothing to show."""
+    wide = max(len(panels) for _, _, panels in rows)
+    figure = Figure(figsize=(8.4, 0.4 + (2.9 if len(rows) == 1 else 2.35 * len(rows))), layout="constrained")
+    grid = figure.subplots(len(rows), wide, squeeze=False)
+    shown: set[str] = set()
+    for number, (line, (group, members, panels)) in enumerate(zip(grid, rows, strict=True)):
+        methods = methods_of(members, study.methods)
+        for column, (axes, panel) in enumerate(zip(line, panels, strict=True)):
+            measure = study.measure(panel.measure)
+            found = result_rows(members, methods, [measure])
+            shown |= {row["method"] for row in found}
+            _draw(axes, found, methods, measure, panel)
+            if number == 0 or group == "all":
+                axes.set_title(panel.title or measure.title)
+            is_repeated = column > 0 and measure.percent and study.measure(panels[column - 1].measure).percent
+            unit = f"share of {count_of(len(members), 'scene')} (%)" if measure.percent else measure.unit
+            axes.set_ylabel("" if is_repeated else unit + (f"\n{group}" if group != "all" and column == 0 else ""))
+    if not shown:
+        return None
+    draw_legend(figure, [method for method in methods_of(rows[0][1], study.methods) if method in shown])
+    return figure
+
+
+def _draw(axes: Axes, rows: Sequence[Row], methods: Sequence[str], measure: Measure, panel: Panel) -> None:
+    columns = list(dict.fromkeys(row["at"] for row in rows))
+    named = any(isinstance(column, str) for column in columns)
+    at = {column: float(index if named else column) for index, column in enumerate(columns)}
+    spacing = 1.0 if named or len(columns) < 2 else columns[1] - columns[0]
+    scale = 100.0 if measure.percent else 1.0
+    for index, method in enumerate(methods):
+        own = [row for row in rows if row["method"] == method]
+        dodge = (_DODGE_NAMED if named else _DODGE) * spacing * (index - 0.5 * (len(methods) - 1))
+        x = np.array([at[row["at"]] + dodge for row in own])
+        look = line_of(method)
+        if measure.paired:
+            low, high = (scale * np.array([row[key] for row in own]) for key in ("low", "high"))
+            axes.vlines(x, low, high, color=look["color"], alpha=0.35, lw=2.4, zorder=1)
+        # That of the study, which comes first, above the others.
+        style = look | {"zorder": 2 + (index == 0)} | ({"ls": "none"} if named else {})
+        axes.plot(x, [scale * row["mean"] for row in own], **style)
+    if columns:
+        ends = list(at.values())
+        axes.set(xlim=(ends[0] - 0.5 * spacing, ends[-1] + 0.5 * spacing), xticks=ends)
+        axes.set_xticklabels([str(column).replace(" ", "\n") for column in columns])
+    axes.set_xlabel("" if named else panel.axis or measure.by)
+    _scale(axes, measure, panel)
+    axes.grid(axis="y", color=LINE, lw=0.6)
+    axes.set_axisbelow(True)
+
+
+def _scale(axes: Axes, measure: Measure, panel: Panel) -> None:
+    if measure.percent:
+        axes.set(ylim=(-3, 103), yticks=[0, 25, 50, 75, 100])
+    elif panel.log:
+        axes.set_yscale("log")
+        ticks = log_ticks(*axes.get_ylim()).tolist()
+        axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+        axes.minorticks_off()
+    elif axes.get_ylim()[0] < 0:
+        axes.axhline(0.0, color=GREY, lw=0.7, zorder=0)
+    else:
+        axes.set_ylim(0.0, 1.04 * axes.get_ylim()[1])

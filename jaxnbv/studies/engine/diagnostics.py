@@ -1,0 +1,40 @@
+"""Whether a step's imagined surfaces carry a signal."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.stats import spearmanr
+
+from jaxnbv.checks import AnyArray
+from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.state import State
+from jaxnbv.scanning import GridSurface
+from jaxnbv.surfaces import SurfacePosterior
+
+
+def roughness(planner: Planner, state: State, posterior: SurfacePosterior, surfaces: GridSurface) -> float:
+    """Cells of the grid that a sample's surface crosses, mean over samples, per cell that the mean's surface crosses,
+    carved as the samples are.
+
+    About 1 for samples as smooth as the mean. It rises when the spacing of the data exceeds the kernel's width; near 5
+    an acquisition says little about what a view is worth.
+    """
+    values = posterior.mean_on_grid(surfaces.grid.axis.astype(surfaces.values.dtype)) - posterior.level
+    mean = crossed_cells(np.asarray(planner.carve(state, values)))
+    samples = [crossed_cells(values) for values in np.asarray(surfaces.values)]
+    return float(np.mean(samples)) / max(mean, 1)
+
+
+def crossed_cells(values: Float[np.ndarray, "g g g"]) -> int:
+    """Cells whose eight corners do not share a sign."""
+    inside = values < 0
+    size = inside.shape[0] - 1
+    corners = [inside[i : i + size, j : j + size, k : k + size] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    return int(np.sum(np.any(corners, axis=0) & ~np.all(corners, axis=0)))
+
+
+def rank_correlation(
+    values: Float[AnyArray, " c"], worth: Float[AnyArray, " c"], compared: Bool[np.ndarray, " c"]
+) -> float | None:
+    """Spearman's, between the values and the worth of the candidates compared; None where either does not vary."""
+    a, b = np.asarray(values)[compared], np.asarray(worth)[compared]
+    return None if np.ptp(a) == 0 or np.ptp(b) == 0 else float(spearmanr(a, b).statistic)

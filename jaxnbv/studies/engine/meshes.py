@@ -1,0 +1,96 @@
+"""A folder of meshes as the scenes of a study."""
+
+import itertools
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import trimesh
+
+from jaxnbv.checks import require
+from jaxnbv.scanning import TriangleMesh, load_mesh
+from jaxnbv.studies.readers import MeshFile, ModelNet, OmniObject3D
+from jaxnbv.studies.readers.local_copy import class_folders
+from jaxnbv.studies.readers.modelnet import is_modelnet
+from jaxnbv.studies.readers.omniobject3d import holds_scans, scans_folder
+
+_File = TypeVar("_File")
+
+
+def mesh_files(folder: str | Path) -> tuple[str, ...]:
+    """The mesh files in a folder, sorted: those whose name ends as a format that trimesh reads.
+
+    **Raises:** `ValueError` if there is no such folder, or no mesh in it.
+    """
+    folder = Path(folder)
+    require(folder.is_dir(), f"there is no folder {folder}: give one that holds mesh files")
+    found = tuple(str(file) for file in sorted(folder.iterdir()) if is_mesh_file(file))
+    formats = ", ".join(sorted(trimesh.available_formats()))
+    require(len(found) > 0, f"the folder {folder} holds no mesh: its files must end in {formats}")
+    return found
+
+
+def is_mesh_file(path: Path) -> bool:
+    """Whether a file's name ends as a format that trimesh reads."""
+    return path.suffix[1:].lower() in trimesh.available_formats() and path.is_file()
+
+
+def taking_turns(groups: Iterable[Sequence[_File]]) -> list[_File]:
+    """The first of each group, then the second of each that has one, and so on."""
+    turns = itertools.chain.from_iterable(itertools.zip_longest(*groups))
+    return [one for one in turns if one is not None]
+
+
+def class_meshes(folder: str | Path, classes: Sequence[str]) -> tuple[MeshFile, ...]:
+    """The meshes in a folder `class/.../name` for some of the classes, labelled by their place; these take turns.
+
+    Names of classes may be written with underscores. What is named as in `ModelNet` or `OmniObject3D` is read as these
+    are: of the former the meshes for tests. Of other classes that have a folder `test` the meshes are those in it.
+    Other folders are passed over.
+
+    **Raises:** `ValueError` if there is no such folder, none of a class, or one without a mesh.
+    """
+    folder = Path(folder)
+    require(folder.is_dir(), f"there is no folder {folder}: give one that holds a folder of meshes for each class")
+    folder = scans_folder(folder)
+    found = class_folders(folder)
+    known = [(label, name) for label, name in enumerate(classes) if name in found]
+    require(len(known) > 0, f"the folder {folder} has none of the folders {', '.join(classes)}: give one that has")
+    return tuple(taking_turns([file._replace(label=label) for file in _of_class(found[name])] for label, name in known))
+
+
+def _of_class(folder: Path) -> Sequence[MeshFile]:
+    if is_modelnet(folder):
+        return ModelNet(folder.parent, "test", [folder.name]).files
+    if holds_scans(folder):
+        return OmniObject3D(folder.parent, [folder.name]).files
+    split = folder / "test"
+    inside = sorted((split if split.is_dir() else folder).rglob("*"))
+    files = [file for file in inside if is_mesh_file(file)]
+    require(len(files) > 0, f"the folder {folder} holds no mesh: unpack it again, or take it away")
+    return [MeshFile(0, file.stem, str(file)) for file in files]
+
+
+def numbered(files: Sequence[_File], index: int) -> _File:
+    """The file of a scene.
+
+    **Raises:** `ValueError` if there is none of this index.
+    """
+    require(
+        0 <= index < len(files),
+        f"there is no scene {index}: the study has {len(files)} meshes, counted from 0; run as many scenes",
+    )
+    return files[index]
+
+
+def numbered_mesh(files: Sequence[str], index: int) -> TriangleMesh:
+    """The mesh of a scene, of longest side 2.5.
+
+    **Raises:** `ValueError` if there is no mesh of this index, or it cannot be read.
+    """
+    return load_mesh(numbered(files, index))
+
+
+def as_mesh_files(meshes: str | Path | Sequence[str] | None) -> tuple[str, ...]:
+    """A folder's `mesh_files`, files as they are, or none."""
+    return mesh_files(meshes) if isinstance(meshes, str | Path) else tuple(meshes or ())

@@ -1,0 +1,100 @@
+"""Results of a study on disk: one JSON record a scene, so that a study that was interrupted goes on with the next."""
+
+import hashlib
+import json
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from jaxnbv.checks import InputError, require
+from jaxnbv.storage.files import write_text
+from jaxnbv.storage.folders import FORMAT, ResultFolder, check_format, read_json
+from jaxnbv.studies.engine.measures import Record
+from jaxnbv.studies.engine.trials import Failure, Here, Outcome, Runner, Trial
+
+_FAILED = ".failed"
+
+
+class RecordFolder(ResultFolder):
+    """A folder of records that belong to one configuration, kept beside them in study.json.
+
+    - `runner`: where the missing ones are made.
+
+    **Raises:** `ValueError` if the folder cannot be made or holds records of another configuration.
+    """
+
+    def __init__(self, path: str | Path, config: dict[str, Any], runner: Runner | None = None):
+        self.runner = runner or Here()
+        super().__init__(path, "study.json", "scene_*.json", config, "study", self.runner.cores)
+
+    def collect(self, count: int, run: Trial, progress: bool = True) -> list[Record]:
+        """Records 0 to `count` - 1: those on disk as they are, the others from `run`, each written once it is done.
+
+        Where `run` fails there is no record; `failures` tells of it, and the next call tries again.
+
+        **Raises:** `ValueError` for a record that is damaged, and if another process writes in the folder.
+        """
+        records = {}
+        with self.writing():
+            missing = []
+            for index in range(count):
+                if self._file(index).exists():
+                    records[index] = _read(self._file(index), index)
+                else:
+                    missing.append(index)
+            bar = tqdm(total=count, initial=len(records), desc=self.path.name, unit="scene", disable=not progress)
+            with bar, closing(self.runner.outcomes(run, missing)) as outcomes:
+                for index, outcome in outcomes:
+                    self._write(index, outcome)
+                    if not isinstance(outcome, Failure):
+                        records[index] = _read(self._file(index), index)
+                    bar.update()
+        return [records[index] for index in sorted(records)]
+
+    def failures(self, count: int) -> dict[int, str]:
+        """The errors of scenes that failed, a line each; beside the records, scene_*.failed has their tracebacks."""
+        files = {index: self._file(index).with_suffix(_FAILED) for index in range(count)}
+        return {index: file.read_text().partition("\n")[0] for index, file in files.items() if file.exists()}
+
+    def _file(self, index: int) -> Path:
+        return self.path / f"scene_{index:04d}.json"
+
+    def _write(self, index: int, outcome: Outcome) -> None:
+        failed = self._file(index).with_suffix(_FAILED)
+        if isinstance(outcome, Failure):
+            write_text(failed, f"{outcome.error}\n\n{outcome.traceback}")
+            return
+        # As it will be read: JSON turns keys that are numbers into text, and the checksum sorts them.
+        record = json.loads(json.dumps(outcome))
+        self.bind()
+        sealed = {"format": FORMAT, "index": index, "sha256": _checksum(index, record), "record": record}
+        write_text(self._file(index), json.dumps(sealed))
+        failed.unlink(missing_ok=True)
+
+
+def read_records(folder: str | Path) -> list[Record]:
+    """The records that a folder holds, in order.
+
+    **Raises:** `ValueError` for a record that is damaged.
+    """
+    return [_read(file, int(file.stem.removeprefix("scene_"))) for file in sorted(Path(folder).glob("scene_*.json"))]
+
+
+def _checksum(index: int, record: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps([FORMAT, index, record], sort_keys=True).encode()).hexdigest()
+
+
+def _read(file: Path, index: int) -> dict[str, Any]:
+    """A record; those of format 1 stand in their files as they are."""
+    remedy = "delete it, and it is made again"
+    content = read_json(file, "is damaged", remedy)
+    if "format" not in content:
+        return content
+    check_format(content["format"], file)
+    require(content.get("index") == index, f"{file} is damaged (it is scene {content.get('index')!s:.20}): {remedy}")
+    record = content.get("record")
+    if not isinstance(record, dict) or content.get("sha256") != _checksum(index, record):
+        raise InputError(f"{file} is damaged (its checksum is not that of its record): {remedy}")
+    return record

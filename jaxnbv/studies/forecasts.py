@@ -1,0 +1,262 @@
+"""How good the surfaces that a planner imagines are, measured against the true one.
+
+Samples of the posterior are forecasts: of the depth along a ray, of whether a place is inside, of what a view is worth.
+They are judged by proper scores (Gneiting and Raftery 2007), whose expectation is least for the true distribution, in
+the forms that are fair to small ensembles (Ferro 2014): no number of samples is at an advantage.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxnbv.acquisition import Score, expected_score
+from jaxnbv.checks import AnyArray, InputError, require
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.tensor_grid import on_tensor_grid
+from jaxnbv.geometry.volume import Box
+from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.state import State
+from jaxnbv.scanning import Grid, GridSurface, SDFSurface, Surface, TriangleMesh, scan
+from jaxnbv.studies.engine.diagnostics import rank_correlation
+
+BINS = 10
+
+
+class Truth(eqx.Module):
+    """What is known of the true surface, as arrays alone: one compiled program judges samples against any object.
+
+    - `candidates`: the poses that are imagined from.
+    - `camera`: the one whose rays the depths are along.
+    - `volume`: where the object can be.
+    - `inside`: the nodes of the planner's grid inside the solid; none of them for a surface that encloses nothing.
+    - `depths`: as `ray_depths` gives them, without noise.
+    - `scans`: what the planner's camera would see from the candidates, without noise, as imagined scans have none.
+    """
+
+    candidates: Pose
+    camera: Camera
+    volume: Box
+    inside: Bool[Array, "g g g"]
+    depths: Float[Array, "candidates rays"]
+    scans: PointCloud
+
+    @classmethod
+    def of(cls, scene: Surface, planner: Planner, candidates: Pose, volume: Box, camera: Camera = Camera()) -> "Truth":
+        """The truth of a known surface, in scene coordinates.
+
+        **Raises:** `ValueError` for a kind of surface whose inside is not known.
+        """
+        inside = _inside(scene, planner.grid)
+        look = _scan if scene.in_jit else scan
+        seen = look(scene, camera, candidates)
+        depths = ray_depths(seen, camera, candidates, volume)[0]
+        return cls(candidates, camera, volume, inside, depths, look(scene, planner.camera, candidates))
+
+
+class Reliability(NamedTuple):
+    """Forecast probabilities in bins of equal width; means of an empty bin are None.
+
+    - `forecast`: mean forecast; `observed`: share of what happened; `nodes`: how many forecasts there are.
+    """
+
+    forecast: list[float | None]
+    observed: list[float | None]
+    nodes: list[int]
+
+
+class Judgement(NamedTuple):
+    """How good the samples of one step are. What is not defined is None.
+
+    - `crps`: of the depth, mean over rays, in scene units; less is better, as for the Brier scores.
+    - `brier`, `fair_brier`: of being inside, mean over the unseen nodes; None for a surface that encloses nothing, as
+      are the next three. The plain score takes the share of the samples for the probability; the fair one does not
+      charge the error of this share.
+    - `mean_inside`, `true_inside`: mean probability of being inside, and the share that is inside, of the same nodes.
+    - `reliability`: of the same probabilities.
+    - `in_empty`: share of the imagined hits that lie in space seen to be empty; None without hits.
+    - `rank`: Spearman's correlation of the acquisition with what the candidates truly are worth.
+    - `share_of_best`: what the candidate of the greatest acquisition is truly worth, of what the best one is.
+    """
+
+    crps: float
+    brier: float | None
+    fair_brier: float | None
+    mean_inside: float | None
+    true_inside: float | None
+    reliability: Reliability | None
+    in_empty: float | None
+    rank: float | None
+    share_of_best: float | None
+
+
+def judge(
+    planner: Planner, state: State, surfaces: GridSurface, truth: Truth, seen_empty: Bool[AnyArray, "g g g"]
+) -> Judgement:
+    """How good `surfaces`, the planner's samples given the state, are.
+
+    - `seen_empty`: the nodes that the state's scans have shown to be empty, whether the planner carves by them or not:
+      all planners are judged on the same nodes, those inside the volume that are not seen empty.
+
+    **Raises:** `ValueError` if the truth is on another grid, or there are fewer than two samples.
+    """
+    shape = (planner.grid.resolution,) * 3
+    require(
+        truth.inside.shape == seen_empty.shape == shape,
+        f"the truth is on {truth.inside.shape} nodes and the seen space on {seen_empty.shape}, but the planner's grid "
+        f"has {shape}: make both with the planner's grid",
+    )
+    seen_empty = jnp.asarray(seen_empty)
+    judged = _judge(surfaces, state.cloud, truth, seen_empty, planner.camera, planner.acquisition)
+    crps_depth, in_empty, inside, expected, worth = (np.asarray(leaf) for leaf in judged)
+    record = Judgement(
+        crps=float(crps_depth),
+        brier=None,
+        fair_brier=None,
+        mean_inside=None,
+        true_inside=None,
+        reliability=None,
+        in_empty=None if np.isnan(in_empty) else float(in_empty),
+        rank=rank_correlation(expected, worth, np.ones(len(worth), bool)),
+        share_of_best=share_of_best(expected, worth),
+    )
+    if not bool(truth.inside.any()):
+        return record
+    unseen = np.asarray(_unseen(truth.volume, planner.grid, seen_empty))
+    forecast, happened = inside[unseen], np.asarray(truth.inside)[unseen]
+    plain = brier(forecast, happened)
+    return record._replace(
+        brier=plain,
+        fair_brier=plain - float(np.mean(forecast * (1.0 - forecast))) / (surfaces.values.shape[0] - 1),
+        mean_inside=float(forecast.mean()),
+        true_inside=float(happened.mean()),
+        reliability=reliability(forecast, happened),
+    )
+
+
+def crps(samples: Float[AnyArray, "s *n"], truth: Float[AnyArray, "*n"]) -> Float[Array, "*n"]:
+    """Continuous ranked probability score of an ensemble, element by element, in the unit of the samples:
+
+        mean_s |x_s - y| - sum_{s, s'} |x_s - x_s'| / (2 S (S - 1)).
+
+    This is the fair estimator: unbiased for the score of the distribution that the samples are drawn from, and so
+    sometimes negative. Runs under `jit`.
+
+    **Raises:** `ValueError` for fewer than two samples.
+    """
+    samples, truth = jnp.asarray(samples), jnp.asarray(truth)
+    count = samples.shape[0]
+    require(count >= 2, f"the fair CRPS of {count} samples is not defined: draw at least two")
+    # In order, x_(i) stands above i - 1 others and below S - i, which saves the S^2 differences.
+    weight = jnp.asarray(2 * np.arange(1, count + 1) - count - 1, samples.dtype)
+    spread = jnp.tensordot(weight, jnp.sort(samples, axis=0), axes=1) / (count * (count - 1))
+    return jnp.mean(jnp.abs(samples - truth), axis=0) - spread
+
+
+def exit_depths(
+    volume: Box, origins: Float[AnyArray, "*n 3"], directions: Float[AnyArray, "*n 3"]
+) -> tuple[Float[Array, "*n"], Bool[Array, "*n"]]:
+    """Where rays leave a box, in lengths of their directions, and whether they meet it at all (Kay and Kajiya 1986)."""
+    origins, directions = jnp.asarray(origins), jnp.asarray(directions)
+    safe = jnp.where(jnp.abs(directions) < 1e-9, 1e-9, directions)
+    sides = jnp.stack([(jnp.asarray(side, origins.dtype) - origins) / safe for side in (volume.low, volume.high)])
+    enters, leaves = jnp.max(jnp.min(sides, axis=0), axis=-1), jnp.min(jnp.max(sides, axis=0), axis=-1)
+    return leaves, leaves > jnp.maximum(enters, 0.0)
+
+
+def ray_depths(
+    seen: PointCloud, camera: Camera, poses: Pose, volume: Box
+) -> tuple[Float[Array, "*poses rays"], Bool[Array, "*poses rays"]]:
+    """Depth along the rays of a scan, in scene units, and which rays meet the volume.
+
+    A ray that misses, or hits beyond the volume only, has the depth at which it leaves the volume: there is nothing
+    behind. A hit before the volume counts as it is.
+    """
+    origins, directions = camera.rays(poses)
+    leaves, meets = exit_depths(volume, origins, directions)
+    depth = jnp.sum((seen.points - origins) * directions, axis=-1)
+    return jnp.where(seen.mask, jnp.minimum(depth, leaves), leaves), meets
+
+
+def brier(forecast: Float[AnyArray, " n"], happened: Bool[AnyArray, " n"]) -> float:
+    """Mean squared difference of probabilities and what happened (1 or 0).
+
+    **Raises:** `ValueError` if there are none.
+    """
+    require(len(forecast) > 0, "no forecasts to judge: every node of the volume was seen to be empty, or it has none")
+    return float(np.mean((np.asarray(forecast) - np.asarray(happened)) ** 2))
+
+
+def reliability(forecast: Float[AnyArray, " n"], happened: Bool[AnyArray, " n"], bins: int = BINS) -> Reliability:
+    """Mean forecast and observed frequency by bins of the forecast, [0, 1/bins), ..., [1 - 1/bins, 1]."""
+    forecast, happened = np.asarray(forecast, np.float64), np.asarray(happened)
+    index = np.minimum((forecast * bins).astype(int), bins - 1)
+    count = np.bincount(index, minlength=bins)
+
+    def mean(values: np.ndarray) -> list[float | None]:
+        sums = np.bincount(index, weights=values, minlength=bins)
+        return [float(total / n) if n else None for total, n in zip(sums, count, strict=True)]
+
+    return Reliability(mean(forecast), mean(happened), count.tolist())
+
+
+def empty_share(
+    points: Float[Array, "*n 3"], mask: Bool[Array, "*n"], empty: Bool[Array, "g g g"], grid: Grid
+) -> Float[Array, ""]:
+    """Share of the filled points (scene coordinates) whose nearest node of the grid is empty; NaN without points.
+
+    Runs under `jit`.
+    """
+    node = jnp.clip(jnp.round((points + grid.half_extent) / grid.spacing), 0, grid.resolution - 1).astype(jnp.int32)
+    return jnp.sum(mask & empty[node[..., 0], node[..., 1], node[..., 2]]) / jnp.sum(mask)
+
+
+def share_of_best(values: Float[AnyArray, " c"], worth: Float[AnyArray, " c"]) -> float | None:
+    """What the candidate of the greatest value is worth, of the greatest worth; None where nothing is worth anything.
+
+    One minus this is the relative regret.
+    """
+    values, worth = np.asarray(values), np.asarray(worth)
+    return float(worth[np.argmax(values)] / worth.max()) if worth.max() > 0 else None
+
+
+@eqx.filter_jit
+def _judge(
+    surfaces: GridSurface, cloud: PointCloud, truth: Truth, empty: Bool[Array, "g g g"], camera: Camera, score: Score
+):
+    seen = jax.lax.map(lambda surface: scan(surface, truth.camera, truth.candidates), surfaces)
+    depths, meets = jax.vmap(lambda s: ray_depths(s, truth.camera, truth.candidates, truth.volume))(seen)
+    error = jnp.mean(crps(depths, truth.depths), where=meets[0])
+    share = empty_share(seen.points, seen.mask, empty, surfaces.grid)
+    inside = jnp.mean(surfaces.values < 0, axis=0)
+    expected = expected_score(score, cloud, surfaces, camera, truth.candidates)
+    context = score.context(cloud)
+    worth = jax.lax.map(lambda true: score(context, true), truth.scans, batch_size=score.batch_size)
+    return error, share, inside, expected, worth
+
+
+@eqx.filter_jit
+def _scan(scene: Surface, camera: Camera, poses: Pose) -> PointCloud:
+    return scan(scene, camera, poses)
+
+
+def _inside(scene: Surface, grid: Grid) -> Bool[Array, "g g g"]:
+    if isinstance(scene, TriangleMesh):
+        return scene.to_signed_distance(grid) < 0
+    if isinstance(scene, SDFSurface):
+        return _over_nodes(scene.sdf, grid) < 0
+    raise InputError(f"the inside of a {type(scene).__name__} is not known: give an SDFSurface or a TriangleMesh")
+
+
+def _unseen(volume: Box, grid: Grid, seen_empty: Bool[Array, "g g g"]) -> Bool[Array, "g g g"]:
+    return (_over_nodes(volume, grid) <= 0) & ~seen_empty
+
+
+@eqx.filter_jit
+def _over_nodes(distance, grid: Grid) -> Float[Array, "g g g"]:
+    return on_tensor_grid(distance, jnp.asarray(grid.axis, jnp.result_type(float)))

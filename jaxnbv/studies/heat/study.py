@@ -1,0 +1,253 @@
+"""The study of heat: how near does the coldest point of the scanned cloud come to the object's?"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from jaxnbv.acquisition import ExpectedUtilityImprovement
+from jaxnbv.checks import InputError
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.planning.episode import Step, view_keys
+from jaxnbv.planning.planner import Planner
+from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, mesh_from_sdf
+from jaxnbv.scanning.sensors import HEAT_SETTING
+from jaxnbv.search import CandidateSearch, DiscreteSearch, FarthestView, HalvingSearch, RandomView, UncertaintyView
+from jaxnbv.studies.engine.measures import Claim, Measure, Record, Row
+from jaxnbv.studies.engine.meshes import as_mesh_files, numbered_mesh
+from jaxnbv.studies.engine.study import Chart, Panel, Scene, Study
+from jaxnbv.studies.heat.halving import compare, halving_notes, halving_rows
+from jaxnbv.studies.scenes import heat_scene
+from jaxnbv.tasks import ColdestPoint, Coverage, body_temperature
+from jaxnbv.tasks.diffusion import HeatProblem
+
+_SEARCHES: dict[str, type[CandidateSearch]] = {
+    "heat": DiscreteSearch,
+    "heat-reached": DiscreteSearch,
+    "heat-halving": HalvingSearch,
+    "coverage": DiscreteSearch,
+    "farthest": FarthestView,
+    "uncertainty": UncertaintyView,
+    "random": RandomView,
+}
+# Those that seek cold; the other methods know nothing of heat.
+HEAT_METHODS = tuple(_SEARCHES)[:3]
+# The points among which a cloud's coldest is sought.
+ESTIMATES = {"all": "coldest of all points", "reached": "coldest of the warmed points"}
+# Points colder than this share of the range of temperatures count as coldest: objects have symmetries, and the inner
+# floor of a mug is as cold all over.
+_NEARLY = 0.01
+
+
+class Truth(NamedTuple):
+    """The temperature of the object itself.
+
+    - `mesh`: its surface.
+    - `points`, `temperatures`: of that surface, a fortieth of a scene unit apart, in degrees.
+    """
+
+    mesh: TriangleMesh
+    points: Float[np.ndarray, "n 3"]
+    temperatures: Float[np.ndarray, " n"]
+
+    @property
+    def coldest(self) -> Float[np.ndarray, "3"]:
+        """The coldest point."""
+        return self.points[np.argmin(self.temperatures)]
+
+    @property
+    def region(self) -> Float[np.ndarray, "m 3"]:
+        """All points whose temperature is the least to within a hundredth of the range."""
+        low, high = self.temperatures.min(), self.temperatures.max()
+        return self.points[self.temperatures <= low + _NEARLY * (high - low)]
+
+
+def _of_estimate(quantity: str, estimate: str) -> Callable[[Record, str], list[float]]:
+    def of(record: Record, method: str) -> list[float]:
+        return record["methods"][method]["estimates"][estimate][quantity]
+
+    return of
+
+
+def _error(estimate: str) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
+    def of(record: Record, method: str) -> Float[np.ndarray, " views"]:
+        found = record["methods"][method]["estimates"][estimate]["temperatures"]
+        return np.abs(np.array(found) - record["truth"]["temperature"])
+
+    return of
+
+
+def _saturated(record: Record, method: str) -> list[float | None]:
+    """Whether every view had the value zero, for the methods that seek cold."""
+    return [
+        float(step["value"] == 0.0) if method in HEAT_METHODS else None for step in record["methods"][method]["steps"]
+    ]
+
+
+def _measures(estimate: str) -> tuple[Measure, ...]:
+    def measure(name: str, title: str, of: Callable, unit: str, listed: bool = True) -> Measure:
+        name, title = f"{name}, {estimate}", f"{title}:\n{ESTIMATES[estimate]}"
+        return Measure(name, title, of, unit=unit, better="less", listed=listed)
+
+    near, point = (_of_estimate(quantity, estimate) for quantity in ("distances", "point_distances"))
+    return (
+        measure("distance", "Distance to the coldest points", near, "scene units"),
+        measure("point distance", "Distance to the very coldest point", point, "scene units", listed=False),
+        measure("error", "Error of the lowest temperature", _error(estimate), "degrees"),
+    )
+
+
+class HeatStudy(Study):
+    """How near the coldest point of the cloud comes to the object's coldest points. Settings as of `Study`, and
+
+    - `meshes`: a folder of them, or their files, one a scene, each heated at a random point; without any, scenes are
+      those of `heat_scene`.
+    - `num_points`: points of D to which imagined scans are added, where the temperature is simulated.
+    - `imagined_rays`: rays along a side of an imagined scan; true scans have 50 x 50.
+    - `true_grid`: of the mesh of a procedural object; the default is fine enough for the thinnest rods, of radius 0.04.
+    """
+
+    title: ClassVar[str] = "The coldest point"
+    explanation: ClassVar[str] = (
+        "The estimate is the coldest of all points of the cloud, as in the paper, or of those that the source warms.\n"
+        "The object's coldest points are those within 1 % of its range of temperatures of the lowest. Saturated are\n"
+        "steps at which every view had the value zero: the first candidate is taken then. The lowest temperature is\n"
+        "already that before heating, at a piece of the cloud that is not connected to the source."
+    )
+    methods: ClassVar[tuple[str, ...]] = tuple(_SEARCHES)
+    reference: ClassVar[str] = "heat"
+    measures: ClassVar[tuple[Measure, ...]] = (
+        *_measures("all"),
+        *_measures("reached"),
+        Measure("saturated", "Saturated steps", _saturated, first=2, digits=2, paired=False),
+    )
+    claims: ClassVar[tuple[Claim, ...]] = (
+        Claim(
+            "The utility comes nearer to the coldest point within few views.",
+            "distance, all",
+            4,
+            ("coverage", "farthest", "uncertainty", "random"),
+        ),
+    )
+    charts: ClassVar[Mapping[str, Chart]] = {
+        "coldest": Chart(tuple((Panel(f"distance, {e}"), Panel(f"error, {e}", log=True)) for e in ESTIMATES))
+    }
+    seed: ClassVar[int] = 8
+    radius: ClassVar[float] = HEAT_SETTING.radius
+    quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 24, "num_points": 512}
+    quick_scenes: ClassVar[int] = 3
+
+    views: int = eqx.field(static=True, default=6)
+    num_candidates: int = eqx.field(static=True, default=32)
+    num_samples: int = eqx.field(static=True, default=8)
+    meshes: tuple[str, ...] = eqx.field(static=True, default=(), converter=as_mesh_files)
+    num_points: int = eqx.field(static=True, default=1024)
+    imagined_rays: int = eqx.field(static=True, default=24)
+    true_grid: Grid = Grid(160)
+
+    @property
+    def num_scenes(self) -> int | None:
+        return len(self.meshes) or None
+
+    def scene(self, index: int) -> Scene:
+        """An object; its task is the point where it is heated.
+
+        **Raises:** `ValueError` if there is no mesh of this index, or it cannot be read.
+        """
+        if not self.meshes:
+            made = heat_scene(index)
+            return Scene(index, made.name, made.surface, made.source)
+        mesh = numbered_mesh(self.meshes, index)
+        (source,) = mesh.sample_points(self.key(index, "scene"), 1)
+        return Scene(index, Path(self.meshes[index]).name, mesh, jnp.asarray(source, jnp.result_type(float)))
+
+    def planner(self, method: str, scene: Scene) -> Planner:
+        search = _SEARCHES[method](self.candidates)
+        camera = Camera(height=self.imagined_rays, width=self.imagined_rays)
+        if method not in HEAT_METHODS:
+            return self.planner_of(Coverage(), search, camera)
+        coldest = ColdestPoint(scene.task, reached_only=method == "heat-reached")
+        return self.planner_of(ExpectedUtilityImprovement(coldest, self.num_points), search, camera)
+
+    def shows_enough(self, scene: Scene, seen: PointCloud) -> bool:
+        """The heat source must be seen."""
+        points, _ = seen.to_numpy()
+        return bool((np.linalg.norm(points - np.asarray(scene.task), axis=1) <= HeatProblem.radius).any())
+
+    def truth(self, scene: Scene) -> Truth:
+        return true_temperature(scene.surface, heat_problem(scene), self.true_grid)
+
+    def facts(self, scene: Scene, truth: Truth, first: int) -> Record:
+        low, high = float(truth.temperatures.min()), float(truth.temperatures.max())
+        return {"name": scene.name, "truth": {"point": truth.coldest.tolist(), "temperature": low, "hottest": high}}
+
+    def follow(
+        self, scene: Scene, truth: Truth, method: str, methods: Sequence[str], episode: Iterator[Step]
+    ) -> Record:
+        """After each view the share of the points that the source warms and two estimates of the coldest point, one
+        among all points and one among those (among all, where there are none): where it is, its temperature, its
+        distance to the nearest of the object's coldest points, and that to the very coldest one.
+
+        Of each step the value of the view that was chosen, zero if no view is worth anything, and the seconds of the
+        search. With "heat-halving" among the methods, each step of "heat" asks that search too.
+        """
+        halving = self.planner("heat-halving", scene) if method == "heat" and "heat-halving" in methods else None
+        clouds, taken, compared, before = [], [], [], None
+        for view, step in enumerate(episode):
+            clouds.append(step.state.cloud)
+            if before is not None and (proposal := step.view.proposal) is not None:
+                taken.append({"value": float(proposal.value), "seconds": step.seconds})
+                if halving is not None:
+                    key = view_keys(self.key(scene.index, "episode"), view)[1]
+                    compared.append(compare(halving, before, step.surfaces, key, proposal))
+            before = step.state
+        run = {"steps": taken, **_estimates(clouds, heat_problem(scene), truth)}
+        return run if halving is None else run | {"halving": compared}
+
+    @classmethod
+    def notes(cls, records: Sequence[Record]) -> list[str]:
+        return halving_notes(records, cls.reference)
+
+    @classmethod
+    def own_rows(cls, records: Sequence[Record]) -> dict[str, list[Row]]:
+        return {"halving": halving_rows(records, cls.reference)}
+
+
+def heat_problem(scene: Scene) -> HeatProblem:
+    """The authors' problem, heated where the scene says."""
+    return HeatProblem(np.asarray(scene.task))
+
+
+def true_temperature(surface: Surface, heat: HeatProblem, grid: Grid) -> Truth:
+    """The temperature of an object's whole surface.
+
+    - `grid`: on which a signed distance is meshed.
+    """
+    mesh = mesh_from_sdf(surface.sdf, grid) if isinstance(surface, SDFSurface) else surface
+    if not isinstance(mesh, TriangleMesh):
+        raise InputError(f"the temperature of a {type(mesh).__name__} is not known: give a mesh or a signed distance")
+    points, temperature = body_temperature(mesh, heat)
+    return Truth(mesh, points, temperature.values)
+
+
+def _estimates(clouds: Sequence[PointCloud], heat: HeatProblem, truth: Truth) -> Record:
+    tree = cKDTree(truth.region)
+    lists = ("points", "temperatures", "distances", "point_distances")
+    estimates: dict[str, dict[str, list]] = {name: {key: [] for key in lists} for name in ESTIMATES}
+    shares = []
+    for cloud in clouds:
+        points, temperature = body_temperature(cloud, heat)
+        shares.append(float(temperature.reached.mean()))
+        for name, into in estimates.items():
+            coldest = temperature.coldest(name == "reached" and bool(temperature.reached.any()))
+            into["points"].append(points[coldest].tolist())
+            into["temperatures"].append(float(temperature.values[coldest]))
+            into["distances"].append(float(tree.query(points[coldest])[0]))
+            into["point_distances"].append(float(np.linalg.norm(points[coldest] - truth.coldest)))
+    return {"reached": shares, "estimates": estimates}

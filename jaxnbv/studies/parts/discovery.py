@@ -1,0 +1,172 @@
+"""What the studies of semantic parts have in common: how many views until all parts of an object are found?"""
+
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, ClassVar, TypeAlias
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnbv.acquisition import ExpectedUtilityImprovement
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.networks import CloudSegmenter
+from jaxnbv.planning.episode import Step
+from jaxnbv.planning.planner import Planner
+from jaxnbv.scanning.sensors import PART_SETTING
+from jaxnbv.search import (
+    DiscreteSearch,
+    FarthestView,
+    FreePoses,
+    GradientSearch,
+    RandomView,
+    Search,
+    SpherePoses,
+    UncertaintyView,
+)
+from jaxnbv.studies.engine.measures import Claim, Measure, Record
+from jaxnbv.studies.engine.study import Chart, Panel, Scene, Study
+from jaxnbv.studies.parts.nearest import NearestPart
+from jaxnbv.tasks import Coverage, SoftPartCount, part_counts
+
+# The paper's N_target of its Table 1, and the authors' value for the utility, in points of the 2,048 that the network
+# is fed.
+TARGETS = (20, 40, 60, 80, 100)
+TARGET, NETWORK_POINTS = 60, 2048
+_BY_PARTS = ("discrete", "gradient-2dof", "gradient-6dof")
+_OVER_CANDIDATES: dict[str, Any] = {"farthest": FarthestView, "uncertainty": UncertaintyView, "random": RandomView}
+
+
+# What tells parts apart: a network, or one who knows.
+PartSegmenter: TypeAlias = CloudSegmenter | NearestPart
+
+
+def discovery_time(counts: Int[np.ndarray, "views parts"], target: int) -> int | None:
+    """T_discovery: the first view, from 1, after which every part has at least `target` points; None if none has."""
+    found: Bool[np.ndarray, " views"] = np.all(np.asarray(counts) >= target, axis=1)
+    return int(np.argmax(found)) + 1 if found.any() else None
+
+
+def _times(record: Record, method: str) -> list[float]:
+    """T_discovery by target; one more than the study's views where the parts were not all found."""
+    found = (discovery_time(np.asarray(record["methods"][method]["counts"]), target) for target in TARGETS)
+    return [float(record["study_views"] + 1 if time is None else time) for time in found]
+
+
+def _found(record: Record, method: str) -> list[float]:
+    """Whether all parts had been found in the end, by target."""
+    return [float(time <= record["study_views"]) for time in _times(record, method)]
+
+
+def _found_by_view(record: Record, method: str) -> list[float]:
+    time = _times(record, method)[TARGETS.index(TARGET)]
+    return [float(time <= view) for view in range(1, record["study_views"] + 1)]
+
+
+class PartDiscoveryStudy(Study):
+    """How many views until a segmenter gives enough points to every part that the object has. Settings as of `Study`,
+    and
+
+    - `imagined_rays`: rays along a side of an imagined scan; true scans have 64 x 64.
+    - `num_points`: points that the segmenter is fed of D and an imagined scan; N_target is taken in proportion.
+    - `num_starts`, `iterations`, `learning_rate`: of the gradient searches, which look at half the candidates first.
+    """
+
+    title: ClassVar[str] = "Views until all parts are found"
+    explanation: ClassVar[str] = (
+        "T_discovery for each N_target: views until the segmenter gives that many points to every part of the object;\n"
+        "one more than there are views if that did not happen, so that means are lower bounds."
+    )
+    methods: ClassVar[tuple[str, ...]] = (*_BY_PARTS, *_OVER_CANDIDATES, "coverage")
+    reference: ClassVar[str] = "discrete"
+    measures: ClassVar[tuple[Measure, ...]] = (
+        Measure(
+            "time",
+            "Views until all parts are found",
+            _times,
+            TARGETS,
+            "N_target",
+            unit="views",
+            digits=2,
+            better="less",
+        ),
+        Measure("found", "Objects whose parts were all found", _found, TARGETS, "N_target", percent=True),
+        Measure("found_by_view", f"All parts found, N_target = {TARGET}", _found_by_view, percent=True),
+    )
+    claims: ClassVar[tuple[Claim, ...]] = tuple(
+        Claim(
+            f"The utility finds all parts in fewer views, of {target} points each.",
+            "time",
+            target,
+            (*_OVER_CANDIDATES, "coverage"),
+        )
+        for target in (TARGET, max(TARGETS))
+    )
+    charts: ClassVar[Mapping[str, Chart]] = {
+        "parts": Chart(
+            ((Panel("time", axis="points that every part must have, $N_{target}$"), Panel("found_by_view")),)
+        )
+    }
+    seed: ClassVar[int] = 6
+    radius: ClassVar[float] = PART_SETTING.radius
+    quick: ClassVar[Mapping[str, Any]] = {
+        **Study.quick,
+        "num_candidates": 24,
+        "num_points": 512,
+        "num_starts": 2,
+        "iterations": 4,
+    }
+
+    views: int = eqx.field(static=True, default=6)
+    num_samples: int = eqx.field(static=True, default=8)
+    camera: Camera = PART_SETTING.camera
+    imagined_rays: int = eqx.field(static=True, default=32)
+    num_points: int = eqx.field(static=True, default=1024)
+    num_starts: int = eqx.field(static=True, default=4)
+    iterations: int = eqx.field(static=True, default=8)
+    learning_rate: float = eqx.field(static=True, default=0.03)
+
+    @abstractmethod
+    def segmenter_of(self, scene: Scene, num_points: int | None = None) -> PartSegmenter:
+        """What tells the parts of a scene's object, fed so many points; by default as many as of a cloud alone."""
+
+    @abstractmethod
+    def true_parts(self, scene: Scene, points: Float[Array, "n 3"]) -> Int[Array, " n"]:
+        """The true part of points of the surface: its place among those of the segmenter."""
+
+    def planner(self, method: str, scene: Scene) -> Planner:
+        camera = Camera(height=self.imagined_rays, width=self.imagined_rays)
+        score = self._soft_count(scene) if method in _BY_PARTS else Coverage()
+        return self.planner_of(score, self._search(method), camera)
+
+    def _soft_count(self, scene: Scene) -> ExpectedUtilityImprovement:
+        target = TARGET * self.num_points / NETWORK_POINTS
+        return ExpectedUtilityImprovement(
+            SoftPartCount(self.segmenter_of(scene, self.num_points), target), self.num_points
+        )
+
+    def _search(self, method: str) -> Search:
+        if method.startswith("gradient"):
+            space = SpherePoses(self.radius) if method == "gradient-2dof" else FreePoses(self.radius)
+            candidates = max(self.num_candidates // 2, self.num_starts)
+            return GradientSearch(None, space, self.num_starts, self.iterations, self.learning_rate, candidates)
+        return _OVER_CANDIDATES.get(method, DiscreteSearch)(self.candidates)
+
+    def follow(
+        self, scene: Scene, truth: list[int], method: str, methods: Sequence[str], episode: Iterator[Step]
+    ) -> Record:
+        """How many points the segmenter gives to each part after each view; it stops once every part has the largest
+        of `TARGETS`."""
+        segmenter = self.segmenter_of(scene)
+        counts: list[list[int]] = []
+        for view, *_ in episode:
+            counts.append(np.asarray(_count(segmenter, view.cloud))[truth].tolist())
+            if min(counts[-1]) >= max(TARGETS):
+                break
+        return {"counts": counts}
+
+
+@eqx.filter_jit
+def _count(segmenter: PartSegmenter, cloud: PointCloud) -> Int[Array, " parts"]:
+    return part_counts(segmenter(cloud))

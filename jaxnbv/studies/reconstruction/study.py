@@ -1,0 +1,147 @@
+"""The study of reconstruction: how near is the surface that a method's views give to the true one?"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from jaxnbv.checks import InputError
+from jaxnbv.networks.categories import CATEGORIES
+from jaxnbv.planning.episode import Step
+from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.state import State
+from jaxnbv.scanning import SDFSurface, TriangleMesh
+from jaxnbv.scanning.metrics import SURFACE_POINTS, coverage, surface_distance, truth_points
+from jaxnbv.scanning.reconstruction import carved_mesh, has_poisson, screened_poisson
+from jaxnbv.search import CandidateSearch, DiscreteSearch, FarthestView, RandomView, UncertaintyView
+from jaxnbv.studies.engine.measures import Claim, Measure, Record
+from jaxnbv.studies.engine.meshes import as_mesh_files, numbered_mesh
+from jaxnbv.studies.engine.study import Chart, Panel, Scene, Study
+from jaxnbv.studies.scenes import Split
+from jaxnbv.studies.scenes.parts import part_scene
+from jaxnbv.tasks import Coverage
+
+_SEARCHES: dict[str, type[CandidateSearch]] = {
+    "coverage": DiscreteSearch,
+    "farthest": FarthestView,
+    "uncertainty": UncertaintyView,
+    "random": RandomView,
+}
+POISSON, MEAN = "screened Poisson", "posterior mean"
+RECONSTRUCTIONS = (POISSON, MEAN)
+
+
+def _distance(quantity: str) -> Callable[[Record, str], list[float | None]]:
+    def of(record: Record, method: str) -> list[float | None]:
+        found = record["methods"][method]["reconstructions"]
+        return [None if found[name] is None else found[name][quantity] for name in RECONSTRUCTIONS]
+
+    return of
+
+
+def _distances(name: str, title: str) -> Measure:
+    return Measure(name, title, _distance(name), RECONSTRUCTIONS, "reconstruction", unit="scene units", better="less")
+
+
+class ReconstructionStudy(Study):
+    """How near the surface made of a method's cloud comes to the true one. Settings as of `Study`, and
+
+    - `meshes`: a folder of them, or their files, one a scene; without any, scenes are those of the test split of
+      `part_scene`.
+
+    The posterior's mean is meshed on the grid of the samples, carved as they are.
+    """
+
+    title: ClassVar[str] = "Distances to the true surface after the last view"
+    explanation: ClassVar[str] = (
+        "In scene units (longest side 2.5). Chamfer distance CD = accuracy + completeness: the mean distance from the\n"
+        "reconstruction to the truth, and from the truth to the reconstruction. HD: the Hausdorff distance, the\n"
+        "largest of both. A reconstruction that no scene has (pip install pymeshlab for Poisson) is left out."
+    )
+    methods: ClassVar[tuple[str, ...]] = tuple(_SEARCHES)
+    reference: ClassVar[str] = "coverage"
+    measures: ClassVar[tuple[Measure, ...]] = (
+        _distances("chamfer", "Chamfer distance"),
+        _distances("hausdorff", "Hausdorff distance"),
+        _distances("accuracy", "Accuracy"),
+        _distances("completeness", "Completeness"),
+        Measure("covered", "Surface covered", lambda r, m: r["methods"][m]["coverage"], percent=True, better="more"),
+    )
+    claims: ClassVar[tuple[Claim, ...]] = (
+        Claim(
+            "Surfaces made of coverage's views are as near to the truth as those of baselines made for coverage.",
+            "chamfer",
+            POISSON,
+            ("farthest", "uncertainty"),
+            ahead=False,
+        ),
+    )
+    charts: ClassVar[Mapping[str, Chart]] = {
+        "reconstruction": Chart(((Panel("chamfer"), Panel("hausdorff"), Panel("covered")),))
+    }
+    seed: ClassVar[int] = 4
+    quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 40}
+
+    meshes: tuple[str, ...] = eqx.field(static=True, default=(), converter=as_mesh_files)
+
+    @property
+    def num_scenes(self) -> int | None:
+        return len(self.meshes) or None
+
+    def scene(self, index: int) -> Scene:
+        """An object of longest side 2.5.
+
+        **Raises:** `ValueError` if there is no mesh of this index, or it cannot be read.
+        """
+        if self.meshes:
+            mesh = numbered_mesh(self.meshes, index)
+            return Scene(index, Path(self.meshes[index]).name, mesh)
+        made = part_scene(Split.TEST, index)
+        return Scene(index, f"{CATEGORIES[int(made.category)].name} {index}", SDFSurface(made.solid))
+
+    def planner(self, method: str, scene: Scene) -> Planner:
+        return self.planner_of(Coverage(), _SEARCHES[method](self.candidates))
+
+    @property
+    def mesher(self) -> Planner:
+        """Whose posterior all methods' views are meshed by, those of planners of one's own too."""
+        return self.planner_of(Coverage(), FarthestView(self.candidates))
+
+    def truth(self, scene: Scene) -> Float[np.ndarray, "n 3"]:
+        points = truth_points(scene.surface, self.key(scene.index, "scene"), SURFACE_POINTS)
+        if points is None:
+            raise InputError(f"the surface of scene {scene.index} cannot be sampled: give a mesh")
+        return points
+
+    def follow(
+        self,
+        scene: Scene,
+        truth: Float[np.ndarray, "n 3"],
+        method: str,
+        methods: Sequence[str],
+        episode: Iterator[Step],
+    ) -> Record:
+        """The share of the true surface that is covered after each view, and the distances to it of two
+        reconstructions from the last cloud; that by Poisson reconstruction is None without `pymeshlab`."""
+        views = [view for view, *_ in episode]
+        *_, state = self.mesher.replay((view.pose, view.scan, self.camera) for view in views)
+        found = {name: self._distances(reconstruct(self, state, name), truth, scene.index) for name in RECONSTRUCTIONS}
+        covered = [coverage(view.cloud, truth) for view in views]
+        return {"coverage": covered, "points": int(state.cloud.count), "reconstructions": found}
+
+    def _distances(self, mesh: TriangleMesh | None, truth: Float[np.ndarray, "n 3"], index: int) -> Record | None:
+        if mesh is None:
+            return None
+        distance = surface_distance(mesh.sample_points(self.key(index, "measure"), SURFACE_POINTS), truth)
+        return {"chamfer": distance.chamfer, **distance._asdict()}
+
+
+def reconstruct(study: ReconstructionStudy, state: State, name: str) -> TriangleMesh | None:
+    """One of `RECONSTRUCTIONS` from what is known; None for Poisson reconstruction where `pymeshlab` cannot be
+    imported."""
+    if name == MEAN:
+        return carved_mesh(study.mesher, state)
+    return screened_poisson(state.cloud) if has_poisson() else None

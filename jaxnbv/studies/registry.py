@@ -1,0 +1,114 @@
+"""The studies of `jaxnbv study`, by name: what a command must know before anything heavy is imported.
+
+A new study is a module with a `Study` and an entry here.
+"""
+
+from typing import NamedTuple
+
+
+class Entry(NamedTuple):
+    """One study.
+
+    - `study`: module and class; `pictures`: module and function that draws its own pictures, if there are any.
+    - `question`, `settings`: for the help.
+    - `scenes`, `views`: by default.
+    - `options`: names of its fields that are options of the command.
+    """
+
+    study: str
+    question: str
+    settings: str
+    scenes: int
+    views: int
+    pictures: str = ""
+    options: tuple[str, ...] = ()
+
+
+STUDIES = {
+    "pyramid": Entry(
+        "jaxnbv.studies.classification.pyramid:PyramidStudy",
+        "Which methods find the pattern on a pyramid's base, and how soon is its class known?",
+        "48 candidates, 16 samples on a 64^3 grid, and 512 points for the classifier of imagined scans: fewer "
+        "candidates and a coarser grid than the paper's.",
+        scenes=100,
+        views=5,
+        pictures="jaxnbv.studies.classification.pictures:write_pictures",
+        options=("framing", "classifier"),
+    ),
+    "truck": Entry(
+        "jaxnbv.studies.classification.truck:TruckStudy",
+        "How soon is the class of a truck's cargo known, which most views do not show? The paper's Truck-ModelNet10, "
+        "on procedural trucks and cargo, or on meshes: a folder `trucks`, and folders of the classes' names.",
+        "48 candidates, 16 samples on a 64^3 grid, 1,024 points of what was seen beside an imagined scan and 2,048 of "
+        "what was seen alone: fewer candidates and a coarser grid than the paper's.",
+        scenes=100,
+        views=5,
+        pictures="jaxnbv.studies.classification.pictures:write_pictures",
+        options=("meshes", "classifier"),
+    ),
+    "modelnet10": Entry(
+        "jaxnbv.studies.classification.modelnet10:ModelNet10Study",
+        "Do all methods tell classes alike that differ in global shape? The paper's ModelNet10, on procedural objects, "
+        "or on meshes in folders of the classes' names.",
+        "48 candidates, 16 samples on a 64^3 grid, and 512 points for the classifier of imagined scans: fewer "
+        "candidates and a coarser grid than the paper's.",
+        scenes=100,
+        views=5,
+        pictures="jaxnbv.studies.classification.pictures:write_pictures",
+        options=("meshes", "classifier"),
+    ),
+    "omniobject3d": Entry(
+        "jaxnbv.studies.classification.omniobject3d:OmniObject3DStudy",
+        "How soon are fruits told that differ in what is small? The paper's OmniObject3D, on procedural fruits, or on "
+        "meshes in folders of the classes' names.",
+        "48 candidates, 16 samples on a 64^3 grid, and 512 points for the classifier of imagined scans: fewer "
+        "candidates and a coarser grid than the paper's.",
+        scenes=100,
+        views=5,
+        pictures="jaxnbv.studies.classification.pictures:write_pictures",
+        options=("meshes", "classifier"),
+    ),
+    "parts": Entry(
+        "jaxnbv.studies.parts.study:PartStudy",
+        "How many views until all parts of an object are found? The paper's Table 1, on procedural objects, or on "
+        "meshes whose nodes are their parts, in folders of the classes' names.",
+        "48 candidates at radius 2, 64 x 64 rays. Views are imagined with 32 x 32 rays, 8 samples on a 64^3 grid, and "
+        "1,024 points for the segmenter, 2,048 for what it says of the cloud; gradient search climbs from the best 4 "
+        "of 24 views, 8 steps of 0.03: less of everything than the paper.",
+        scenes=80,
+        views=6,
+        pictures="jaxnbv.studies.parts.pictures:write_pictures",
+        options=("meshes",),
+    ),
+    "heat": Entry(
+        "jaxnbv.studies.heat.study:HeatStudy",
+        "How near does the coldest point of the scanned cloud come to the object's? On procedural objects whose "
+        "coldest point hides, or on your meshes, heated at one place.",
+        "32 candidates at radius 3, 50 x 50 rays. Views are imagined with 24 x 24 rays, 8 samples on a 64^3 grid, and "
+        "added to 1,024 points of the cloud: less of everything than the paper.",
+        scenes=24,
+        views=6,
+        pictures="jaxnbv.studies.heat.pictures:write_pictures",
+        options=("meshes",),
+    ),
+    "reconstruction": Entry(
+        "jaxnbv.studies.reconstruction.study:ReconstructionStudy",
+        "How near is the surface that a method's views give to the true one? The table of the paper's supplement.",
+        "48 candidates, 16 samples on a 64^3 grid: fewer and coarser than the paper's.",
+        scenes=32,
+        views=5,
+        pictures="jaxnbv.studies.reconstruction.pictures:write_pictures",
+        options=("meshes",),
+    ),
+    "searches": Entry(
+        "jaxnbv.studies.classification.searches:SearchStudy",
+        "Do searches by gradient find better views than one over candidates, and what do they cost? On pyramids and "
+        "trucks.",
+        "Settings of the studies of pyramids and trucks; gradient searches climb from the best 4 of 24 views, 8 steps "
+        "of 0.03.",
+        scenes=60,
+        views=5,
+        pictures="jaxnbv.studies.classification.pictures:write_pictures",
+        options=("framing",),
+    ),
+}

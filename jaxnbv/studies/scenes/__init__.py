@@ -1,0 +1,5 @@
+"""Procedural scenes: pyramids, trucks, household objects, fruits, objects with parts, heated objects."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,131 @@
+"""Objects to be heated, in which heat takes ways that few views show: legs and rails, panels, a handle, fins."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from jaxnbv.checks import require
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.scanning import SDFSurface, Surface, scan
+from jaxnbv.search.candidates import sphere_candidates
+from jaxnbv.studies.scenes.labelled import assemble, bar, box, generator, path, ring, rod
+
+_LABEL = 0
+
+
+class HeatScene(eqx.Module):
+    """An object in one piece and where it is heated.
+
+    - `surface`: the object, centred, its longest side 2.5; a procedural one stands upright along y.
+    - `name`: what it is, such as one of `HEAT_OBJECTS`.
+    - `source`: a point of its surface, in scene units; power goes in nearby.
+    """
+
+    surface: Surface
+    name: str = eqx.field(static=True)
+    source: Float[Array, "3"]
+
+
+def heat_scene(index: int) -> HeatScene:
+    """Scene number `index`: the kinds of object take turns, with random proportions, source and turn about y.
+
+    **Raises:** `ValueError` if the index is negative.
+    """
+    require(index >= 0, f"the scene's number is {index}; it must not be negative")
+    name = HEAT_OBJECTS[index % len(HEAT_OBJECTS)]
+    rng = generator(jax.random.fold_in(jax.random.key(1), index))
+    primitives, place = _BUILDERS[name](rng)
+    solid = assemble(primitives, rng.uniform(-np.pi, np.pi))
+    source = solid.centre[0] + jnp.matmul(
+        solid.rotation[0], solid.half_size[0] * jnp.asarray(place), precision="highest"
+    )
+    return HeatScene(SDFSurface(solid), name, source)
+
+
+def source_view(scene: HeatScene, key: PRNGKeyArray, num_candidates: int = 100, radius: float = 3.0) -> Pose:
+    """A candidate of the sphere from which the heat source shows, drawn uniformly from them.
+
+    **Raises:** `ValueError` if there is none.
+    """
+    poses = sphere_candidates(num_candidates, radius)
+    scans = scan(scene.surface, Camera(), poses)
+    near = jnp.linalg.norm(scans.points - scene.source, axis=-1) < 0.05
+    (shown,) = np.nonzero(jnp.any(near & scans.mask, axis=-1))
+    require(len(shown) > 0, f"none of {num_candidates} candidates sees the heat source: ask for more of them")
+    return poses[int(jax.random.choice(key, shown))]
+
+
+# Each gives the primitives, the heated one first, and the source in that one's own frame, in units of its half sizes.
+
+
+def _on_top(rng):
+    return rng.uniform(-0.7, 0.7), 1.0, rng.uniform(-0.7, 0.7)
+
+
+def _desk(rng):
+    """Four legs, a panel behind and a drawer; heated on its top."""
+    half_depth, half_width, height = rng.uniform(0.5, 0.65), rng.uniform(0.95, 1.2), rng.uniform(1.0, 1.3)
+    thick, leg = rng.uniform(0.05, 0.08), rng.uniform(0.05, 0.08)
+    parts = [box(_LABEL, (0, height, 0), (half_depth, thick, half_width))]
+    x, z = half_depth - leg - 0.02, half_width - leg - 0.02
+    parts += [bar(_LABEL, (a, 0, b), (a, height, b), leg, leg) for a in (-x, x) for b in (-z, z)]
+    low = rng.uniform(0.15, 0.4) * height
+    parts.append(box(_LABEL, (-x, 0.5 * (low + height), 0), (0.04, 0.5 * (height - low), z)))
+    half = (0.6 * half_depth, rng.uniform(0.15, 0.25), 0.3)
+    parts.append(box(_LABEL, (0.1, height - thick - half[1] + 0.02, z - 0.4), half))
+    return parts, _on_top(rng)
+
+
+def _chair(rng):
+    """Four legs with rails between them and an open back; heated on its seat."""
+    half_depth, half_width, height = rng.uniform(0.5, 0.6), rng.uniform(0.5, 0.6), rng.uniform(1.0, 1.2)
+    thick, leg, rise = rng.uniform(0.05, 0.08), rng.uniform(0.05, 0.07), rng.uniform(0.8, 1.1)
+    parts = [box(_LABEL, (0, height, 0), (half_depth, thick, half_width), 0.03)]
+    x, z = half_depth - leg, half_width - leg
+    parts += [bar(_LABEL, (a, 0, b), (a, height, b), leg, leg) for a in (-x, x) for b in (-z, z)]
+    for a in (-x, x):
+        y = rng.uniform(0.25, 0.45) * height
+        parts.append(rod(_LABEL, (a, y, -z), (a, y, z), 0.04))
+    for b in (-z, z):
+        y = rng.uniform(0.2, 0.5) * height
+        parts.append(rod(_LABEL, (-x, y, b), (x, y, b), 0.04))
+    parts += [bar(_LABEL, (-x, height, b), (-x - 0.12, height + rise, b), 0.05, 0.05) for b in (-z, z)]
+    for share in (0.45, 0.85):
+        at = -x - 0.12 * share, height + rise * share
+        parts.append(box(_LABEL, (*at, 0), (0.04, 0.1, z)))
+    return parts, _on_top(rng)
+
+
+def _mug(rng):
+    """Hollow, with a handle; heated from below."""
+    radius, half_height, wall = rng.uniform(0.65, 0.8), rng.uniform(0.75, 0.95), rng.uniform(0.045, 0.06)
+    parts = [
+        rod(_LABEL, (0, -half_height, 0), (0, -half_height + 0.12, 0), radius - wall),
+        ring(_LABEL, (0, 0, 0), (0, 1, 0), radius - wall, wall, half_height, 0.03),
+    ]
+    reach, top = rng.uniform(0.45, 0.6), rng.uniform(0.45, 0.65) * half_height
+    angle = np.linspace(0.5 * np.pi, -0.5 * np.pi, 6)
+    handle = np.stack([radius - wall + reach * np.cos(angle), top * np.sin(angle), np.zeros(6)], axis=-1)
+    parts += path(_LABEL, handle, rng.uniform(0.07, 0.1))
+    return parts, (rng.uniform(-0.5, 0.5), -1.0, rng.uniform(-0.5, 0.5))
+
+
+def _fins(rng):
+    """A comb of upright fins on a plate; heated from below."""
+    count, half_depth, half_width = int(rng.integers(6, 10)), rng.uniform(0.6, 0.9), rng.uniform(1.0, 1.2)
+    rise, thick = rng.uniform(0.6, 1.0), rng.uniform(0.06, 0.1)
+    parts = [box(_LABEL, (0, 0, 0), (half_depth, thick, half_width))]
+    places = np.linspace(-half_width + 0.06, half_width - 0.06, count)
+    for z in places:
+        height = rise * rng.uniform(0.7, 1.0)
+        parts.append(box(_LABEL, (0, 0.5 * height, z), (half_depth - 0.02, 0.5 * height, 0.035)))
+    return parts, (rng.uniform(-0.7, 0.7), -1.0, rng.uniform(-0.7, 0.7))
+
+
+_BUILDERS = {"desk": _desk, "chair": _chair, "mug": _mug, "fins": _fins}
+
+# The kinds of heated object.
+HEAT_OBJECTS = tuple(_BUILDERS)

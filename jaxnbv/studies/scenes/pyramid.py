@@ -1,0 +1,135 @@
+"""The synthetic pyramid: five classes that differ in a pattern imprinted on the base, and in nothing else."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from jaxnbv.checks import AnyArray, require
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.scanning.sdf import Matrix, Scalar, Vector, nonnegative, parameter
+from jaxnbv.search.candidates import sphere_candidates
+from jaxnbv.studies.scenes.class_object import ClassObject, scan_telling
+from jaxnbv.studies.scenes.framing import Framing
+from jaxnbv.studies.scenes.patterns import PATTERNS, pattern_distance
+from jaxnbv.studies.scenes.splits import Split, scene_key
+
+
+class Pyramid(ClassObject):
+    """A pyramid on a square base into which a pattern is pressed; a bound.
+
+    In its own frame the base is [-1, 1]^2 at z = 0 and the apex stands at (0, 0, height); a point u of it lies at
+    `scale * rotation @ u + offset` in the scene.
+
+    - `label`: the class, an index of `PATTERNS`.
+    - `size`, `place`, `turn`, `depth`: the pattern's radius, centre, angle and depth, in the pyramid's frame.
+    """
+
+    label: Int[Array, ""]
+    height: Scalar = nonnegative()
+    size: Scalar = nonnegative()
+    place: Float[Array, "2"] = parameter()
+    turn: Scalar = parameter()
+    depth: Scalar = nonnegative()
+    rotation: Matrix = parameter()
+    scale: Scalar = nonnegative()
+    offset: Vector = parameter()
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        u, v, w = self._own(x)
+        slant = jnp.sqrt(1.0 + self.height**2)
+        sides = ((jnp.maximum(jnp.abs(u), jnp.abs(v)) - 1.0) * self.height + w) / slant
+        return self.scale * jnp.maximum(jnp.maximum(sides, -w), -self._imprint(u, v, w))
+
+    def on_base(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
+        """Which points of the surface belong to the base, the pattern included; the tolerance is in scene units."""
+        w = self._own(x)[2]
+        return (self.scale * w <= tolerance) | self.on_pattern(x, tolerance)
+
+    def on_pattern(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
+        """Which points of the surface belong to the pattern, its floor or its walls; the tolerance is in scene units.
+
+        Give hits without noise: a floor is a few hundredths below the base.
+        """
+        u, v, w = self._own(x)
+        return (self.scale * self._imprint(u, v, w) <= tolerance) & (self.scale * w > tolerance)
+
+    def tells(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
+        """Those of the pattern."""
+        return self.on_pattern(x, tolerance)
+
+    def _own(self, x):
+        a, b, c = (x[..., i, None] - self.offset[i] for i in range(3))
+        rotation = self.rotation / self.scale
+        own = a * rotation[0] + b * rotation[1] + c * rotation[2]
+        return own[..., 0], own[..., 1], own[..., 2]
+
+    def _imprint(self, u, v, w):
+        """Signed distance to the prism that was pressed into the base, without end below it."""
+        c, s = jnp.cos(self.turn) / self.size, jnp.sin(self.turn) / self.size
+        u, v = u - self.place[0], v - self.place[1]
+        flat = self.size * pattern_distance(self.label, c * u + s * v, c * v - s * u)
+        return jnp.maximum(flat, w - self.depth)
+
+
+# Least distance of a pattern from the base's edge: with the ranges below no pattern breaks through a side.
+_MARGIN = 0.1
+
+
+def sample_pyramid(key: PRNGKeyArray, label: int | Int[AnyArray, ""], longest_side: float = 2.5) -> Pyramid:
+    """A pyramid of a class with random height, pattern and orientation, centred in the scene.
+
+    `longest_side` is that of its bounding box along the scene's axes. Runs under `jit` and `vmap`.
+
+    **Raises:** `ValueError` if `longest_side` is not positive.
+    """
+    require(longest_side > 0, f"the longest side is {longest_side}; it must be positive")
+    return _sample(key, jnp.asarray(label), longest_side)
+
+
+@jax.jit
+def _sample(key: PRNGKeyArray, label: Int[Array, ""], longest_side: Float[Array, ""] | float) -> Pyramid:
+    height_key, size_key, place_key, turn_key, depth_key, rotation_key = jax.random.split(key, 6)
+    height = jax.random.uniform(height_key, minval=1.2, maxval=1.6)
+    size = jax.random.uniform(size_key, minval=0.7, maxval=0.85)
+    place = (1.0 - _MARGIN - size) * jax.random.uniform(place_key, (2,), minval=-1.0, maxval=1.0)
+    turn = jax.random.uniform(turn_key, maxval=2.0 * jnp.pi)
+    depth = jax.random.uniform(depth_key, minval=0.07, maxval=0.1)
+    rotation = jax.random.orthogonal(rotation_key, 3)
+    rotation = rotation * jnp.linalg.det(rotation)
+    corners = jnp.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0]])
+    corners = jnp.concatenate([corners, jnp.stack([0.0, 0.0, height])[None]])
+    corners = jnp.matmul(corners, rotation.T, precision="highest")
+    low, high = jnp.min(corners, axis=0), jnp.max(corners, axis=0)
+    scale = longest_side / jnp.max(high - low)
+    return Pyramid(label, height, size, place, turn, depth, rotation, scale, -0.5 * scale * (low + high))
+
+
+def pyramid_scene(split: Split, index: int | Int[Array, ""], framing: Framing = Framing.CLOSE_UP) -> Pyramid:
+    """Scene number `index` of a split, the same pyramid in both framings; the classes take turns.
+
+    **Raises:** `ValueError` if the index is negative.
+    """
+    return sample_pyramid(scene_key(0, split, index), index % len(PATTERNS), framing.longest_side)
+
+
+def hidden_view(pyramid: Pyramid, key: PRNGKeyArray, camera: Camera = Camera(), num_candidates: int = 120) -> Pose:
+    """A candidate from which the object shows but not the pattern, drawn uniformly from them.
+
+    **Raises:** `ValueError` if there is none.
+    """
+    poses = sphere_candidates(num_candidates)
+    pixels, scans = scan_telling(pyramid, camera, poses)
+    return poses[choose_hidden(pixels, scans, key)]
+
+
+def choose_hidden(pattern_pixels: Int[AnyArray, " poses"], scans: PointCloud, key: PRNGKeyArray) -> int:
+    """Index of a pose whose scan hits the object but not the pattern, drawn uniformly from them.
+
+    **Raises:** `ValueError` if there is none.
+    """
+    hidden = np.flatnonzero((np.asarray(pattern_pixels) == 0) & (np.asarray(scans.count) > 0))
+    require(len(hidden) > 0, f"the pattern shows from all {len(pattern_pixels)} candidates: ask for more of them")
+    return int(jax.random.choice(key, hidden))

@@ -1,0 +1,122 @@
+"""Depth images as a sensor gives them: units, strides, a box, range; and what cannot be meant."""
+
+import functools
+import operator
+
+import numpy as np
+import pytest
+
+from jaxnbv.checks import InputError
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose, look_at
+from jaxnbv.geometry.volume import Box
+from jaxnbv.scanning import SDFSurface, scan
+from jaxnbv.scanning.sdf import Box as Block
+from jaxnbv.scanning.sdf import Sphere
+
+# In metres, z up: a ball on a table, 0.8 m from the camera, and a pillar between them at the left.
+BALL = Sphere(0.1).translate([0.0, 0.0, 0.1])
+TABLE = Block([0.6, 0.6, 0.02]).translate([0.0, 0.0, -0.02])
+PILLAR = Block([0.01, 0.01, 0.4]).translate([-0.05, -0.5, 0.4])
+POSE = look_at((0.0, -0.8, 0.3), (0.0, 0.0, 0.1), up=(0.0, 0.0, 1.0))
+CAMERA = Camera.from_intrinsics([[90.0, 0.0, 34.0], [0.0, 95.0, 21.5], [0.0, 0.0, 1.0]], width=64, height=48)
+BOX = Box((-0.15, -0.15, 0.002), (0.15, 0.15, 0.25))
+
+
+def depth_of(*solids, camera=CAMERA, pose=POSE):
+    """Along the camera's axis; infinite where nothing is hit."""
+    seen = scan(SDFSurface(functools.reduce(operator.or_, solids)), camera, pose)
+    depth = (np.asarray(seen.points, np.float64) - np.asarray(pose.position)) @ np.asarray(pose.forward, np.float64)
+    return np.where(seen.mask, depth, np.inf).reshape(camera.height, camera.width)
+
+
+def test_millimetres_of_a_sensor_give_the_points_in_metres():
+    """Integers, holes of zero, an off-centre camera with pixels that are not square."""
+    depth = depth_of(BALL)
+    image = np.where(np.isfinite(depth), np.round(1000.0 * depth), 0.0).astype(np.uint16)
+    cloud = PointCloud.from_depth(image, CAMERA, POSE, scale=1e-3)
+    points, normals = cloud.to_numpy()
+    assert len(points) > 200
+    outward = (points - [0.0, 0.0, 0.1]) / 0.1
+    assert np.abs(np.linalg.norm(outward, axis=1) - 1.0).max() < 0.02
+    assert np.median(np.sum(outward * normals, axis=1)) > 0.97
+    assert not np.asarray(cloud.missed).any()
+
+
+@pytest.mark.parametrize("stride", [2, 3, 5])
+def test_a_strided_image_is_that_of_the_strided_camera(stride):
+    strided = CAMERA.strided(stride)
+    cloud = PointCloud.from_depth(depth_of(BALL, TABLE), CAMERA, POSE, stride=stride)
+    expected = PointCloud.from_depth(depth_of(BALL, TABLE, camera=strided), strided, POSE)
+    assert cloud.capacity == strided.num_rays
+    np.testing.assert_array_equal(cloud.mask, expected.mask)
+    np.testing.assert_array_equal(cloud.missed, expected.missed)
+    np.testing.assert_allclose(cloud.points, expected.points, atol=1e-4)
+
+
+def test_a_box_keeps_the_object_and_knows_what_was_crossed():
+    depth = depth_of(BALL, TABLE, PILLAR)
+    whole, cropped = (PointCloud.from_depth(depth, CAMERA, POSE, box=box) for box in (None, BOX))
+    points = np.asarray(whole.points, np.float64)
+    low, high = np.array(BOX.low), np.array(BOX.high)
+    inside = np.asarray(whole.mask) & np.all((points >= low) & (points <= high), axis=1)
+    np.testing.assert_array_equal(cropped.mask, inside)
+    assert inside.sum() > 200
+    # Ray by ray, in float64 and by small steps: does the way to the hit leave the box again, or never meet it?
+    position = np.asarray(POSE.position, np.float64)
+    rays = np.asarray(CAMERA.pixel_directions(), np.float64) @ np.asarray(POSE.rotation, np.float64).T
+    steps = np.linspace(0.0, 3.0, 6001)[:, None, None]
+    places = position + steps * rays
+    within = np.all((places >= low) & (places <= high), axis=2)
+    last = np.where(within.any(axis=0), steps[len(steps) - 1 - np.argmax(within[::-1], axis=0), 0, 0], -np.inf)
+    flat = depth.reshape(-1)
+    hit = np.isfinite(flat)
+    beyond = hit & ~inside & (flat > last)
+    sure = np.abs(flat - last) > 2e-3
+    missed = np.asarray(cropped.missed)
+    np.testing.assert_array_equal(missed[sure], (~hit | beyond)[sure])
+    # The pillar hides a part of the box: of that nothing is known.
+    hidden = ~missed & ~np.asarray(cropped.mask) & hit
+    assert hidden.sum() > 20
+    assert (np.abs(points[hidden & np.asarray(whole.mask)][:, 1] + 0.5) < 0.02).mean() > 0.9
+
+
+def test_beyond_its_range_a_sensor_met_nothing_and_before_it_says_nothing():
+    limited = Camera.from_intrinsics(CAMERA.intrinsics, 64, 48, nearest=0.72, farthest=0.9)
+    depth = depth_of(BALL, TABLE)
+    cloud = PointCloud.from_depth(depth, limited, POSE)
+    flat = depth.reshape(-1)
+    np.testing.assert_array_equal(cloud.missed, flat > 0.9)
+    assert not np.asarray(cloud.mask)[(flat < 0.72) | (flat > 0.9)].any()
+    assert int(cloud.count) > 200
+
+
+def test_what_cannot_be_meant_is_named():
+    depth = depth_of(BALL, TABLE)
+    ranged = Camera.from_intrinsics(CAMERA.intrinsics, 64, 48, nearest=0.1, farthest=3.0)
+    turned = Pose.from_matrix(POSE.matrix, "opengl")
+    for image, camera, pose, options, message in (
+        (1000.0 * depth, ranged, POSE, {}, r"out of the camera's range of 0\.1 to 3: give the depth's scale, 0\.001"),
+        (
+            1000.0 * depth,
+            CAMERA,
+            POSE,
+            {"box": BOX},
+            r"median of .*, but the box is 0\.\d+ to .* away: give the depth's",
+        ),
+        (depth, CAMERA, turned, {"box": BOX}, r"lies behind the camera .* Pose\.from_matrix\(matrix, \"opengl\"\)"),
+        (depth, CAMERA, POSE, {"scale": 0.0}, "scale is 0.0"),
+        (depth, CAMERA, POSE, {"stride": 0}, "stride is 0"),
+        (depth[1:], CAMERA, POSE, {}, r"\(47, 64\) but the camera has \(48, 64\)"),
+    ):
+        with pytest.raises(InputError, match=message):
+            PointCloud.from_depth(image, camera, pose, **options)
+
+
+def test_depths_beyond_the_type_say_nothing_and_only_infinity_says_nothing_is_there():
+    camera, pose = Camera(height=4, width=4), look_at((0.0, 0.0, 2.5))
+    for depth, missed in ((1e15, 0), (3.5e38, 0), (1e300, 0), (np.inf, 16)):
+        cloud = PointCloud.from_depth(np.full((4, 4), depth), camera, pose)
+        assert int(cloud.count) == 0
+        assert int(cloud.missed.sum()) == missed

@@ -1,0 +1,184 @@
+"""Cameras of any intrinsics, against the pinhole formula in float64; range and incidence; poses from matrices."""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from jaxnbv.checks import InputError
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import Pose, look_at
+from jaxnbv.scanning import Carving, Grid, SDFSurface, scan
+from jaxnbv.scanning.sdf import Box, Sphere
+from jaxnbv.viz.render import frustum
+
+sizes = st.integers(2, 60)
+lengths = st.floats(5.0, 500.0)
+shares = st.floats(0.05, 0.95)
+matrices = st.tuples(sizes, sizes, lengths, lengths, shares, shares)
+
+
+def camera_and_matrix(given):
+    width, height, fx, fy, x, y = given
+    matrix = np.array([[fx, 0.0, x * width - 0.5], [0.0, fy, y * height - 0.5], [0.0, 0.0, 1.0]])
+    return Camera.from_intrinsics(matrix, width, height), matrix
+
+
+@settings(max_examples=50, deadline=None)
+@given(matrices)
+def test_rays_go_through_the_pixels_of_the_intrinsic_matrix(values):
+    camera, matrix = camera_and_matrix(values)
+    directions = np.asarray(camera.pixel_directions(), np.float64)
+    seen = directions @ matrix.T
+    column, row = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    np.testing.assert_allclose(seen[:, 0], column.ravel(), atol=1e-3)
+    np.testing.assert_allclose(seen[:, 1], row.ravel(), atol=1e-3)
+    np.testing.assert_allclose(camera.intrinsics, matrix, rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(camera.to_pixels(directions[:, :2]), seen[:, :2] + 0.5, atol=2e-3)
+
+
+@settings(max_examples=50, deadline=None)
+@given(matrices, st.integers(1, 7))
+def test_a_strided_camera_has_the_rays_of_every_so_many_th_pixel(values, stride):
+    camera, _ = camera_and_matrix(values)
+    rows = slice(stride // 2, None, stride)
+    every = np.asarray(camera.pixel_directions()).reshape(camera.height, camera.width, 3)[rows, rows]
+    if every.size == 0:
+        with pytest.raises(InputError, match=f"stride of {stride} leaves none"):
+            camera.strided(stride)
+        return
+    strided = camera.strided(stride)
+    assert (strided.height, strided.width) == every.shape[:2]
+    np.testing.assert_allclose(strided.pixel_directions(), every.reshape(-1, 3), rtol=1e-4, atol=1e-5)
+
+
+@settings(max_examples=50, deadline=None)
+@given(matrices, sizes, sizes)
+def test_a_resized_camera_sees_the_same_and_the_frustum_is_its_border(values, height, width):
+    camera, matrix = camera_and_matrix(values)
+    resized = camera.resized(height, width)
+    assert (resized.height, resized.width) == (height, width)
+    np.testing.assert_allclose(resized.edges, camera.edges, rtol=1e-5)
+    expected = [
+        (-0.5 - matrix[0, 2]) / matrix[0, 0],
+        (-0.5 - matrix[1, 2]) / matrix[1, 1],
+        (camera.width - 0.5 - matrix[0, 2]) / matrix[0, 0],
+        (camera.height - 0.5 - matrix[1, 2]) / matrix[1, 1],
+    ]
+    np.testing.assert_allclose(camera.edges, expected, rtol=1e-5, atol=1e-7)
+    corners = frustum(Pose(np.eye(3), np.zeros(3)), camera, 2.0)[:4, 1]
+    np.testing.assert_allclose(corners[0], [2 * expected[0], 2 * expected[1], 2.0], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(corners[2], [2 * expected[2], 2 * expected[3], 2.0], rtol=1e-5, atol=1e-6)
+
+
+def test_a_focal_length_alone():
+    camera = Camera.from_focal_length(100.0, width=60, height=40)
+    assert camera.focal_lengths == pytest.approx((100.0, 100.0))
+    np.testing.assert_allclose(camera.pixel_directions(), Camera(camera.fov, 40, 60).pixel_directions(), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        ([[100.0, 3.0, 30.0], [0.0, 100.0, 20.0], [0.0, 0.0, 1.0]], "skew of 3"),
+        ([[-100.0, 0.0, 30.0], [0.0, 100.0, 20.0], [0.0, 0.0, 1.0]], "positive focal lengths"),
+        ([[100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [30.0, 20.0, 1.0]], "positive focal lengths"),
+        ([[100.0, 0.0, 320.0], [0.0, 100.0, 240.0], [0.0, 0.0, 1.0]], r"\(320.0, 240.0\) lies outside .* 60 x 40"),
+    ],
+)
+def test_matrices_that_are_none_of_this_image_are_refused(matrix, message):
+    with pytest.raises(InputError, match=message):
+        Camera.from_intrinsics(np.array(matrix), 60, 40)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"nearest": 2.0, "farthest": 1.0}, "from 2.0 to 1.0"),
+        ({"nearest": -1.0}, "from -1.0"),
+        ({"max_incidence": 2.0}, "angle of incidence is 2.0"),
+        ({"aspect": 0.0}, "aspect of the pixels is 0.0"),
+    ],
+)
+def test_limits_that_cannot_be_are_refused(settings, message):
+    with pytest.raises(InputError, match=message):
+        Camera(**settings)
+
+
+def test_a_scan_tells_what_lies_in_range_and_is_not_aslant():
+    """A ball before a wall: analytic depths and angles, ray by ray."""
+    surface = SDFSurface(Sphere(0.5) | Box([1.2, 1.2, 0.1]).translate([0.0, 0.0, -1.0]))
+    pose = look_at((0.0, 0.0, 2.5))
+    whole = Camera(math.radians(50.0), 40, 40)
+    every = scan(surface, whole, pose)
+    depth = 2.5 - np.asarray(every.points)[:, 2]
+    _, rays = whole.rays(pose)
+    cosine = -np.sum(np.asarray(every.normals) * np.asarray(rays), axis=1)
+    hit = np.asarray(every.mask)
+    limited = Camera(math.radians(50.0), 40, 40, nearest=2.1, farthest=3.0, max_incidence=math.radians(60.0))
+    found = scan(surface, limited, pose)
+    expected = hit & (depth >= 2.1) & (depth <= 3.0) & (cosine >= 0.5)
+    for share in (expected, hit & (depth < 2.1), hit & (depth > 3.0), hit & (depth < 3.0) & (cosine < 0.5)):
+        assert 10 < share.sum() < 1500
+    np.testing.assert_array_equal(found.mask, expected)
+    np.testing.assert_array_equal(found.missed, ~hit | (hit & (depth > 3.0)))
+    np.testing.assert_array_equal(np.asarray(found.points)[expected], np.asarray(every.points)[expected])
+    assert not np.asarray(found.points)[~expected].any()
+
+
+def test_what_a_limited_sensor_missed_is_empty_as_far_as_it_reaches():
+    grid, pose = Grid(24), look_at((0.0, 0.0, 2.5))
+    nothing = SDFSurface(Sphere(0.01).translate([0.0, 1.4, 0.0]))
+    seen = {
+        farthest: np.asarray(Carving().seen_empty(grid, scan(nothing, camera, pose), camera, pose))
+        for farthest, camera in ((far, Camera(0.9, 48, 48, farthest=far)) for far in (2.5, None))
+    }
+    deep = 2.5 - grid.axis
+    assert seen[None].any(axis=(0, 1))[deep > 3.0].any()
+    assert not seen[2.5].any(axis=(0, 1))[deep > 2.5 - grid.spacing].any()
+    near = seen[2.5].any(axis=(0, 1))[deep < 2.5 - 2 * grid.spacing]
+    np.testing.assert_array_equal(near, seen[None].any(axis=(0, 1))[deep < 2.5 - 2 * grid.spacing])
+
+
+rotations = st.tuples(st.integers(0, 2**32 - 1), st.lists(st.floats(-3, 3, width=32), min_size=3, max_size=3))
+
+
+@settings(max_examples=50, deadline=None)
+@given(rotations)
+def test_poses_to_matrices_and_back_in_both_conventions(given):
+    seed, position = given
+    rotation = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, position
+    np.testing.assert_allclose(Pose.from_matrix(matrix).matrix, matrix, atol=1e-6)
+    # A camera of OpenGL looks along its own -z, and its y is up.
+    turned = Pose.from_matrix(matrix, "opengl")
+    np.testing.assert_allclose(turned.forward, -rotation[:, 2], atol=1e-6)
+    np.testing.assert_allclose(turned.rotation[:, 1], -rotation[:, 1], atol=1e-6)
+    np.testing.assert_allclose(turned.rotation[:, 0], rotation[:, 0], atol=1e-6)
+    batch = Pose.from_matrix(np.stack([matrix, np.eye(4)]))
+    assert batch.matrix.shape == (2, 4, 4)
+
+
+def test_matrices_that_are_no_poses_are_refused():
+    moved = np.eye(4)
+    moved[:3, 3] = 1.0
+    for matrix, convention, message in (
+        (moved.T, "opencv", r"last row .* not \(0, 0, 0, 1\)"),
+        (2.0 * np.eye(4), "opencv", "last row"),
+        (np.diag([2.0, 2.0, 2.0, 1.0]), "opencv", "not a rotation"),
+        (np.eye(4), "ros", "'ros'; give one of opencv, opengl"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Pose.from_matrix(matrix, convention)
+
+
+def test_a_pose_s_matrix_moves_points_as_the_pose_does():
+    pose = look_at((0.8, 0.9, 2.2), (0.1, 0.2, 0.3))
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    moved = np.concatenate([points, np.ones((5, 1))], axis=1) @ np.asarray(pose.matrix, np.float64).T
+    np.testing.assert_allclose(pose.to_scene(jnp.asarray(points, jnp.float32)), moved[:, :3], atol=1e-5)

@@ -1,0 +1,104 @@
+"""Volumes: box distances against brute force, and points on a volume's boundary."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnbv.geometry.volume import Box, boundary_points
+from jaxnbv.scanning import sdf
+
+RNG = np.random.default_rng(0)
+LOW, HIGH = np.array([-0.5, 0.2, -1.0]), np.array([0.4, 0.9, 1.2])
+OFF_CENTRE = Box(tuple(LOW.tolist()), tuple(HIGH.tolist()))
+
+
+def points_on_faces(low, high, count):
+    """A lattice of count^2 points on each of the six faces, edges included."""
+    u, v = (steps.ravel() for steps in np.meshgrid(*[np.linspace(0.0, 1.0, count)] * 2))
+    faces = [np.insert(np.stack([u, v], axis=1), axis, side, axis=1) for axis in range(3) for side in (0.0, 1.0)]
+    return low + np.concatenate(faces) * (high - low)
+
+
+def test_box_distances_against_the_nearest_of_many_surface_points(x64):
+    x = RNG.uniform(LOW - 0.4, HIGH + 0.4, (400, 3))
+    surface = points_on_faces(LOW, HIGH, 60)
+    nearest = np.sqrt(((x[:, None] - surface) ** 2).sum(-1).min(axis=1))
+    inside = ((x > LOW) & (x < HIGH)).all(axis=1)
+    distance = np.asarray(OFF_CENTRE(x))
+    assert 20 < inside.sum() < 380
+    np.testing.assert_array_equal(distance < 0, inside)
+    # A lattice point lies within half a cell's diagonal of the surface's nearest point.
+    half_cell = 0.5 * np.hypot(1.2, 2.2) / 59
+    assert (np.abs(distance) <= nearest + 1e-12).all()
+    np.testing.assert_allclose(np.abs(distance), nearest, atol=half_cell)
+    np.testing.assert_allclose(OFF_CENTRE(surface), 0.0, atol=1e-12)
+
+
+def test_a_box_takes_points_of_any_leading_shape():
+    x = RNG.uniform(-2.0, 2.0, (4, 5, 3)).astype(np.float32)
+    flat = OFF_CENTRE(x.reshape(-1, 3))
+    np.testing.assert_array_equal(OFF_CENTRE(x), flat.reshape(4, 5))
+    np.testing.assert_allclose(OFF_CENTRE(x[0, 0]), flat[0], rtol=1e-6)
+
+
+def test_a_cube_is_about_the_origin():
+    cube = Box.cube(0.8)
+    assert cube.low == (-0.4, -0.4, -0.4)
+    assert cube.high == (0.4, 0.4, 0.4)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        ((0.0, 0.0, 0.0), (1.0, 0.0, 1.0)),
+        ((0.0, 0.0, 0.5), (1.0, 1.0, 0.2)),
+        ((0.0, float("nan"), 0.0), (1.0, 1.0, 1.0)),
+        ((0.0, 0.0, 0.0), (1.0, 1.0, float("inf"))),
+        ((-float("inf"), 0.0, 0.0), (1.0, 1.0, 1.0)),
+    ],
+)
+def test_a_box_without_an_inside_is_refused(low, high):
+    with pytest.raises(ValueError, match=r"has no inside: each of three sides must be positive and finite"):
+        Box(low, high)
+
+
+def ellipsoid(x):
+    """Smaller in magnitude than the distance to an ellipsoid with half axes 0.9, 0.5 and 0.7."""
+    return 0.5 * (jnp.sqrt(jnp.sum((x / jnp.asarray([0.9, 0.5, 0.7])) ** 2, axis=-1)) - 1.0)
+
+
+BOUNDARIES = {
+    "default box": (Box(), lambda p: np.abs(p).max(axis=1) - 1.25),
+    "box off the centre": (
+        Box((-0.3, -1.1, -0.2), (1.2, 0.4, 0.9)),
+        lambda p: np.maximum([-0.3, -1.1, -0.2] - p, p - [1.2, 0.4, 0.9]).max(axis=1),
+    ),
+    "ball": (sdf.Sphere(0.8), lambda p: np.linalg.norm(p, axis=1) - 0.8),
+    "callable": (ellipsoid, lambda p: np.linalg.norm(p / [0.9, 0.5, 0.7], axis=1) - 1.0),
+}
+
+
+@pytest.mark.parametrize("name", BOUNDARIES)
+def test_boundary_points_lie_on_the_boundary_all_around(name):
+    volume, zero_on_boundary = BOUNDARIES[name]
+    points = np.asarray(boundary_points(volume, 300), np.float64)
+    np.testing.assert_allclose(zero_on_boundary(points), 0.0, atol=2e-6)
+    # Every direction has a point near it: 300 cells of the sphere have a radius of about 0.12 each.
+    directions = points / np.linalg.norm(points, axis=1, keepdims=True)
+    asked = RNG.normal(size=(500, 3))
+    cosines = (asked / np.linalg.norm(asked, axis=1, keepdims=True)) @ directions.T
+    assert np.arccos(cosines.max(axis=1)).max() < 0.3
+
+
+def test_every_face_of_the_default_box_has_its_share_of_points():
+    points = np.asarray(boundary_points(Box(), 120))
+    for axis in range(3):
+        for side in (-1.25, 1.25):
+            on_face = np.abs(points[:, axis] - side) < 1e-5
+            assert 15 <= on_face.sum() <= 25, (axis, side)
+
+
+def test_boundary_points_under_jit_are_the_same():
+    eager = boundary_points(OFF_CENTRE, 50)
+    np.testing.assert_allclose(jax.jit(lambda: boundary_points(OFF_CENTRE, 50))(), eager, atol=1e-6)

@@ -1,0 +1,143 @@
+"""The simulated episode: equal to asking and telling by hand, and to one jitted function."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import Pose, look_at
+from jaxnbv.planning.episode import observe_scene, simulate
+from jaxnbv.planning.planner import Planner
+from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, mesh_from_sdf, scan
+from jaxnbv.scanning.sdf import Capsule, Sphere
+from jaxnbv.search import DiscreteSearch, RandomView
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Coverage
+
+SOLID = Sphere(0.7) | Capsule([0.2, 0.3, -0.4], [0.5, 0.6, 0.9], 0.3)
+SCENE = SDFSurface(SOLID)
+FIRST = look_at((0.8, 0.9, 2.2))
+PLANNER = Planner(
+    GeometricSPSR(truncation=8, lengthscale=0.05),
+    Camera(height=8, width=8),
+    Coverage(),
+    DiscreteSearch(12),
+    num_samples=3,
+    grid=Grid(24),
+    capacity=128,
+    max_views=6,
+)
+KEY = jax.random.key(5)
+
+
+def assert_same_bits(a, b):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+@pytest.fixture(scope="module")
+def episode():
+    return simulate(PLANNER, SCENE, FIRST, 4, KEY, progress=False)
+
+
+def test_simulate_is_the_loop_of_ask_and_tell(episode):
+    """View i draws from fold_in(key, i): one half to choose it, one for the sensor's noise."""
+    pose, state = FIRST, None
+    for index in range(4):
+        choose_key, noise_key = jax.random.split(jax.random.fold_in(KEY, index))
+        proposal = None
+        if state is not None:
+            proposal = PLANNER.propose(state, choose_key)
+            pose = proposal.pose
+        seen = observe_scene(SCENE, PLANNER.camera, pose, SensorNoise(), noise_key)
+        state = PLANNER.init(seen, pose) if state is None else PLANNER.observe(state, pose, seen)
+        view = episode.views[index]
+        assert_same_bits((view.pose, view.scan, view.cloud), (pose, seen, state.cloud))
+        assert_same_bits(view.proposal, proposal)
+        assert_same_bits(episode.state_after(index + 1), state)
+    assert_same_bits(episode.cloud, state.cloud)
+    assert len(episode.views) == 4
+    for wrong in (0, 5):
+        with pytest.raises(ValueError, match=f"asked for {wrong} of 4 views"):
+            episode.state_after(wrong)
+
+
+def test_views_differ_and_scans_carry_the_sensors_noise(episode):
+    positions = np.stack([view.pose.position for view in episode.views])
+    assert np.linalg.norm(positions[:, None] - positions[None], axis=-1)[np.triu_indices(4, 1)].min() > 0.5
+    for view in episode.views:
+        clean = scan(SCENE, PLANNER.camera, view.pose)
+        np.testing.assert_array_equal(view.scan.mask, clean.mask)
+        error = view.scan.to_numpy()[0] - clean.to_numpy()[0]
+        # Five standard errors of a standard deviation from about 150 coordinates.
+        assert abs(error.std() / 0.01 - 1) < 5 / np.sqrt(2 * error.size)
+
+
+def test_a_view_depends_on_the_key_and_its_number_alone(episode):
+    shorter = simulate(PLANNER, SCENE, FIRST, 2, KEY, progress=False)
+    assert_same_bits(shorter.views, episode.views[:2])
+    other = simulate(PLANNER, SCENE, FIRST, 2, jax.random.key(6), progress=False)
+    assert (np.asarray(other.views[0].scan.points) != np.asarray(shorter.views[0].scan.points)).any()
+
+
+def test_a_whole_episode_as_one_jitted_function(episode):
+    """Fusion may round otherwise, so numbers agree to rounding and choices exactly."""
+
+    @jax.jit
+    def run(key, position):
+        noise, first = SensorNoise(), look_at(position)
+
+        def keys(index):
+            return jax.random.split(jax.random.fold_in(key, index))
+
+        seen = noise(scan(SCENE, PLANNER.camera, first), keys(0)[1])
+        state = PLANNER.init(seen, first)
+
+        def step(state, index):
+            choose_key, noise_key = keys(index)
+            proposal = PLANNER.propose(state, choose_key)
+            seen = noise(scan(SCENE, PLANNER.camera, proposal.pose), noise_key)
+            return PLANNER.observe(state, proposal.pose, seen), (proposal.pose, proposal.values)
+
+        return jax.lax.scan(step, state, jnp.arange(1, 4))
+
+    state, (poses, values) = run(KEY, FIRST.position)
+    assert int(state.num_views) == 4
+    for index in range(3):
+        view = episode.views[index + 1]
+        np.testing.assert_allclose(poses.position[index], view.pose.position, atol=1e-5)
+        np.testing.assert_allclose(values[index], view.proposal.values, rtol=0.02, atol=0.02)
+    np.testing.assert_array_equal(state.cloud.mask, episode.cloud.mask)
+    assert int(state.cloud.count) == 128, "farthest points were taken"
+    # Where two points tie to rounding, farthest point sampling may swap them: compare as sets.
+    distance = np.linalg.norm(np.asarray(state.cloud.points)[:, None] - np.asarray(episode.cloud.points), axis=-1)
+    assert (distance.min(axis=1) < 1e-4).mean() > 0.95
+
+
+def test_an_episode_over_a_mesh_runs_outside_jit():
+    mesh = mesh_from_sdf(SOLID, Grid(24))
+    assert not mesh.in_jit
+    planner = eqx.tree_at(lambda p: p.search, PLANNER, RandomView(12), is_leaf=lambda x: x is PLANNER.search)
+    episode = simulate(planner, mesh, FIRST, 2, KEY, progress=False)
+    clean = scan(mesh, planner.camera, episode.views[1].pose)
+    assert int(clean.count) > 5
+    np.testing.assert_array_equal(episode.views[1].scan.mask, clean.mask)
+
+
+@pytest.mark.parametrize("views", [0, -1])
+def test_fewer_than_one_view_is_refused(views):
+    with pytest.raises(ValueError, match=f"asked for {views} views; ask for at least one"):
+        simulate(PLANNER, SCENE, FIRST, views, KEY, progress=False)
+
+
+def test_more_views_than_there_is_room_for_are_refused():
+    with pytest.raises(ValueError, match=r"asked for 7 views.*room for 6.*max_views"):
+        simulate(PLANNER, SCENE, FIRST, 7, KEY, progress=False)
+
+
+def test_a_first_view_that_sees_nothing_is_refused():
+    away = Pose(np.eye(3, dtype=np.float32), np.array([0.0, 0.0, 2.5], np.float32))
+    with pytest.raises(ValueError, match="first scan is empty"):
+        simulate(PLANNER, SCENE, away, 2, KEY, progress=False)

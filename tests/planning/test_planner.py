@@ -1,0 +1,256 @@
+"""The planner: ask and tell, compilation, overflow, bad input."""
+
+import warnings
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnbv.acquisition import ExpectedUtilityImprovement
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud, concatenate, farthest_point_subsample
+from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
+from jaxnbv.planning.episode import simulate
+from jaxnbv.planning.planner import Planner
+from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, scan
+from jaxnbv.scanning.sdf import Capsule, Sphere
+from jaxnbv.search import DiscreteSearch, FarthestView, RandomView, UncertaintyView
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Coverage
+
+SCENE = SDFSurface(Sphere(0.7) | Capsule([0.2, 0.3, -0.4], [0.5, 0.6, 0.9], 0.3))
+FIRST = look_at((0.8, 0.9, 2.2))
+SEARCHES = {kind.__name__: kind(12) for kind in (DiscreteSearch, FarthestView, RandomView, UncertaintyView)}
+
+
+def planner_of(search, **changes):
+    settings = {"num_samples": 3, "grid": Grid(24), "capacity": 128, **changes}
+    model, camera = GeometricSPSR(truncation=8, lengthscale=0.05), Camera(height=8, width=8)
+    return Planner(model, camera, Coverage(), search, **settings)
+
+
+@pytest.fixture(scope="module")
+def planner():
+    return planner_of(SEARCHES["DiscreteSearch"], max_views=8)
+
+
+@pytest.fixture(scope="module")
+def state(planner):
+    return planner.init(scan(SCENE, planner.camera, FIRST), FIRST)
+
+
+@pytest.mark.parametrize("name", SEARCHES)
+def test_nothing_recompiles_after_the_second_view(name, compilations):
+    planner, noise, key = planner_of(SEARCHES[name]), SensorNoise(), jax.random.key(3)
+    after, state, pose = [], None, FIRST
+    observe_scene = eqx.filter_jit(lambda pose, key: noise(scan(SCENE, planner.camera, pose), key))
+    for view in range(5):
+        if state is not None:
+            pose = planner.propose(state, jax.random.fold_in(key, view)).pose
+        seen = observe_scene(pose, jax.random.fold_in(key, view))
+        state = planner.init(seen, pose) if state is None else planner.observe(state, pose, seen)
+        after.append(len(compilations))
+    assert after[0] > 0, "the counter counts nothing"
+    assert after[1:] == [after[1]] * 4, f"compilations after each view: {after}"
+    jax.lax.neg(np.ones(1237 + list(SEARCHES).index(name), np.float32))
+    assert len(compilations) > after[-1], "the counter does not see eager operations"
+
+
+def test_simulated_episodes_do_not_recompile_either(planner, compilations):
+    """A whole second episode, of another seed, first view and noise draw, compiles nothing."""
+    other = look_at((-0.8, 0.9, 2.2))
+    simulate(planner, SCENE, FIRST, 3, jax.random.key(0), progress=False)
+    before = len(compilations)
+    simulate(planner, SCENE, other, 4, jax.random.key(1), progress=False)
+    assert len(compilations) == before
+
+
+def test_asking_and_telling_leave_the_state_as_it_was(planner, state):
+    before = jax.tree.map(np.array, state)
+    proposal = planner.propose(state, jax.random.key(1))
+    seen = scan(SCENE, planner.camera, proposal.pose)
+    after = planner.observe(state, proposal.pose, seen)
+    jax.tree.map(np.testing.assert_array_equal, before, jax.tree.map(np.array, state))
+    assert int(state.num_views) == 1
+    assert int(after.num_views) == 2
+    np.testing.assert_array_equal(after.poses.position[:2], jnp.stack([FIRST.position, proposal.pose.position]))
+    assert int(after.cloud.count) == int(state.cloud.count + seen.count) <= 128
+    with pytest.raises(AttributeError):
+        state.num_views = 3
+    again = planner.propose(state, jax.random.key(1))
+    jax.tree.map(np.testing.assert_array_equal, jax.tree.map(np.array, proposal), jax.tree.map(np.array, again))
+
+
+def test_a_first_scan_from_an_unknown_pose_excludes_nothing():
+    planner = planner_of(SEARCHES["FarthestView"])
+    state = planner.init(scan(SCENE, planner.camera, FIRST))
+    assert int(state.num_views) == 0
+    assert not np.isneginf(planner.propose(state, jax.random.key(0)).values).any()
+
+
+def test_beyond_its_capacity_the_cloud_is_thinned_by_farthest_points(planner, state):
+    proposal_pose = look_at((-0.8, 0.9, 2.2))
+    seen = scan(SCENE, planner.camera, proposal_pose)
+    small = planner_of(SEARCHES["DiscreteSearch"], capacity=40)
+    first = scan(SCENE, small.camera, FIRST)
+    assert int(first.count) > 40
+    start = small.init(first, FIRST)
+    expected = farthest_point_subsample(first, 40)
+    np.testing.assert_array_equal(start.cloud.points, expected.points)
+    after = small.observe(start, proposal_pose, seen)
+    expected = farthest_point_subsample(concatenate(expected, seen), 40)
+    np.testing.assert_array_equal(after.cloud.points, expected.points)
+    np.testing.assert_array_equal(after.cloud.normals, expected.normals)
+    assert bool(after.cloud.mask.all())
+
+
+def test_a_scan_that_saw_nothing_only_records_its_pose(planner, state):
+    away = Pose(np.eye(3, dtype=np.float32), np.array([0.0, 0.0, 2.5], np.float32))
+    seen = scan(SCENE, planner.camera, away)
+    assert int(seen.count) == 0
+    after = planner.observe(state, away, seen)
+    np.testing.assert_array_equal(after.cloud.points, state.cloud.points)
+    assert int(after.num_views) == 2
+
+
+def cloud_at(*points):
+    return PointCloud.from_arrays(list(points), [[0.0, 1.0, 0.0]] * len(points), capacity=4)
+
+
+def test_an_empty_first_scan_is_refused(planner):
+    empty = PointCloud(jnp.zeros((4, 3)), jnp.zeros((4, 3)), jnp.zeros(4, bool))
+    with pytest.raises(ValueError, match=r"first scan is empty.*[Pp]oint the camera"):
+        planner.init(empty, FIRST)
+
+
+@pytest.mark.parametrize("field", ["points", "normals"])
+def test_a_scan_with_nan_is_refused(planner, state, field):
+    bad = eqx.tree_at(lambda c: getattr(c, field), cloud_at([0.0, 0.0, 0.1]), jnp.full((4, 3), jnp.nan))
+    for tell in (lambda: planner.init(bad, FIRST), lambda: planner.observe(state, FIRST, bad)):
+        with pytest.raises(ValueError, match=r"not finite.*mask these rows"):
+            tell()
+
+
+def test_nan_in_a_masked_row_does_no_harm(planner, state):
+    cloud = cloud_at([0.0, 0.0, 0.1])
+    bad = eqx.tree_at(lambda c: c.points, cloud, cloud.points.at[2].set(jnp.nan))
+    after = planner.observe(state, FIRST, bad)
+    assert np.isfinite(after.cloud.points).all()
+    assert int(after.cloud.count) == int(state.cloud.count) + 1
+
+
+def test_a_scan_outside_the_scene_is_refused(planner, state):
+    outside = cloud_at([0.0, 0.1, 0.0], [0.0, -40.0, 0.0])
+    for tell in (lambda: planner.init(outside, FIRST), lambda: planner.observe(state, FIRST, outside)):
+        with pytest.raises(ValueError, match=r"coordinate of 40.*Frame\.to_scene"):
+            tell()
+
+
+def test_no_room_for_another_view_is_refused():
+    planner = planner_of(SEARCHES["FarthestView"], max_views=1)
+    first = scan(SCENE, planner.camera, FIRST)
+    with pytest.raises(ValueError, match=r"holds 1 views.*max_views"):
+        planner.observe(planner.init(first, FIRST), FIRST, first)
+
+
+@pytest.mark.parametrize("kind", [FarthestView, RandomView])
+def test_all_candidates_visited_is_refused(kind):
+    planner = planner_of(kind(2))
+    first = scan(SCENE, planner.camera, FIRST)
+    # Its points alone, which may be told with any pose.
+    first = PointCloud(first.points, first.normals, first.mask)
+    state = planner.init(first, FIRST)
+    for _ in range(2):
+        state = planner.observe(state, planner.propose(state, jax.random.key(0)).pose, first)
+    with pytest.raises(ValueError, match=r"all 2 candidates have been visited.*more candidates"):
+        planner.propose(state, jax.random.key(0))
+
+
+@pytest.mark.parametrize("name", ["num_samples", "capacity", "max_views"])
+@pytest.mark.parametrize("value", [0, -3])
+def test_numbers_below_one_are_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name} is {value}"):
+        planner_of(SEARCHES["FarthestView"], **{name: value})
+
+
+def test_a_score_that_is_not_a_number_is_named(state):
+    utility = ExpectedUtilityImprovement(lambda cloud: jnp.sum(cloud.points) * jnp.nan)
+    planner = planner_of(DiscreteSearch(12))
+    planner = Planner(planner.model, planner.camera, utility, planner.search, 3, planner.grid, 128)
+    with pytest.raises(ValueError, match="NaN"):
+        planner.propose(state, jax.random.key(0))
+
+
+def test_normals_that_are_not_of_unit_length_are_refused(planner):
+    cloud = cloud_at([0.1, 0.2, 0.3], [0.3, 0.2, 0.1])
+    with pytest.raises(ValueError, match=r"1 normals .*from_arrays"):
+        planner.init(PointCloud(cloud.points, cloud.normals.at[1].set(0.0), cloud.mask))
+
+
+def test_a_singular_covariance_is_named():
+    model = GeometricSPSR(noise=1e-5, lengthscale=0.05, truncation=8)
+    points = np.linspace(0, 1e-3, 64)[:, None] * np.ones(3)
+    cloud = PointCloud.from_arrays(points, np.tile([0.0, 0.0, 1.0], (64, 1)))
+    with pytest.raises(ValueError, match=r"64 normals with noise=1e-05 is singular .* raise the noise"):
+        model.condition(cloud)
+    planner = Planner(model, Camera(), Coverage(), DiscreteSearch(4), 2, Grid(12), 64)
+    with pytest.raises(ValueError, match="raise the model's noise"):
+        planner.propose(planner.init(cloud), jax.random.key(0))
+
+
+def test_points_far_apart_are_told_of_with_the_remedy():
+    """Beyond 2.5 lengthscales; a long one of several is enough."""
+    points = np.asarray(fibonacci_sphere(60))
+    cloud = PointCloud.from_arrays(points, points)
+
+    def init(lengthscale, variance):
+        model = GeometricSPSR(lengthscale, variance, 10)
+        Planner(model, Camera(height=8, width=8), Coverage(), DiscreteSearch(6), 2, Grid(16)).init(cloud)
+
+    with pytest.warns(UserWarning, match=r"points are 0\.4\d apart, 2\.\d times .*Scan more densely, or raise"):
+        init(0.025, 0.2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        init((0.025, 0.06), (0.2, 0.2))
+
+
+def test_parts_thinner_than_a_cell_are_told_of_with_the_remedy():
+    """A slab whose two sides were seen, on a grid that is too coarse for it and on one that is not."""
+    axis = np.linspace(-0.5, 0.5, 12)
+    x, y = (side.ravel() for side in np.meshgrid(axis, axis))
+    above, below = (np.stack([x, y, np.full_like(x, z)], axis=1) for z in (0.04, -0.04))
+    up = np.tile([0.0, 0.0, 1.0], (len(x), 1))
+    first, second = PointCloud.from_arrays(above, up), PointCloud.from_arrays(below, -up)
+
+    def observe(resolution):
+        model, camera = GeometricSPSR(0.05, 0.2, 10), Camera(height=8, width=8)
+        planner = Planner(model, camera, Coverage(), DiscreteSearch(6), 2, Grid(resolution), 400)
+        planner.observe(planner.init(first), look_at((0.0, 0.0, -2.5)), second)
+
+    with pytest.warns(UserWarning, match=r"288 of 288 points lie on parts thinner than a cell .*0\.0972.*Raise Grid"):
+        observe(37)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        observe(60)
+
+
+def test_what_is_constant_under_jit_is_checked_too(planner, state):
+    seen = scan(SCENE, planner.camera, FIRST)
+    begun = jax.jit(lambda: planner.init(seen, FIRST))()
+    np.testing.assert_array_equal(begun.cloud.points, state.cloud.points)
+    assert int(jax.jit(lambda state: planner.observe(state, FIRST, seen).num_views)(state)) == 2
+    long = eqx.tree_at(lambda c: c.normals, seen, 2 * seen.normals)
+    with pytest.raises(ValueError, match="not of unit length"):
+        jax.jit(lambda: planner.init(long, FIRST))()
+
+
+def test_a_near_camera_s_own_scan_is_its_image():
+    """Noise of a hundredth is many pixels where the surface is a tenth away."""
+    planner, near = planner_of(SEARCHES["FarthestView"]), look_at((0.0, 0.0, 0.8))
+    ball = SDFSurface(Sphere(0.7))
+    seen = SensorNoise()(scan(ball, planner.camera, near), jax.random.key(0))
+    assert int(planner.init(seen, near).num_views) == 1
+    with pytest.raises(ValueError, match="pixels"):
+        planner.init(seen, look_at((0.0, 0.8, 0.0)))

@@ -1,0 +1,279 @@
+"""A live session: a simulated sensor of 64 x 48 pixels in millimetres, a world in metres with z up, a table in view."""
+
+import jax
+import numpy as np
+import pytest
+
+from jaxnbv.checks import InputError
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.geometry.pose import Pose, look_at
+from jaxnbv.geometry.volume import Box
+from jaxnbv.planning.episode import view_keys
+from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.session import Session
+from jaxnbv.planning.stopping import Budget, WorthLess
+from jaxnbv.scanning import Carving, Grid, SDFSurface, scan
+from jaxnbv.scanning.sdf import Box as Block
+from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.search import DiscreteSearch, FarthestView, GradientSearch
+from jaxnbv.surfaces import GeometricSPSR, OutsideBoundary, ScreenedSPSR
+from jaxnbv.tasks import Coverage
+
+CENTER = np.array([0.3, 0.2, 0.12])
+WORLD = SDFSurface(Sphere(0.1).translate([0.3, 0.2, 0.101]) | Block([1.0, 1.0, 0.02]).translate([0.3, 0.2, -0.021]))
+CAMERA = Camera.from_intrinsics([[90.0, 0.0, 34.0], [0.0, 95.0, 21.5], [0.0, 0.0, 1.0]], width=64, height=48)
+BOX = ((0.18, 0.08, 0.002), (0.42, 0.32, 0.24))
+
+
+def around(angle, elevation, distance=0.6):
+    direction = [np.cos(angle) * np.cos(elevation), np.sin(angle) * np.cos(elevation), np.sin(elevation)]
+    return np.asarray(look_at(CENTER + distance * np.array(direction), CENTER, up=(0.0, 0.0, 1.0)).matrix, np.float64)
+
+
+POSES = np.array([around(angle, e) for e in (0.4, 0.9) for angle in np.arange(0.0, 6.2, np.pi / 3)])
+FIRST = around(0.2, 0.5)
+
+
+def shot(matrix, unit=1000.0):
+    """What the sensor gives: whole millimetres, zero where nothing is hit."""
+    pose = Pose.from_matrix(matrix)
+    seen = scan(WORLD, CAMERA, pose)
+    depth = (np.asarray(seen.points, np.float64) - np.asarray(pose.position)) @ np.asarray(pose.forward, np.float64)
+    image = np.where(seen.mask, unit * depth, 0.0).reshape(48, 64)
+    return np.round(image).astype(np.uint16) if unit > 1 else image
+
+
+def planner_of(search=None, **changes):
+    settings = {"num_samples": 3, "grid": Grid(28), "capacity": 400, "max_views": 8, **changes}
+    model = GeometricSPSR(0.2, truncation=8)
+    return Planner(model, Camera(height=12, width=16), Coverage(), search or DiscreteSearch(), **settings)
+
+
+def session_of(folder=None, **changes):
+    settings = {"camera": CAMERA, "box": BOX, "up": "z", "poses": POSES, "folder": folder, **changes}
+    return Session(settings.pop("planner", None) or planner_of(), **settings)
+
+
+@pytest.fixture(scope="module")
+def finished():
+    """A session of three views."""
+    session = session_of()
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    for _ in range(2):
+        matrix = session.next().matrix
+        session.add(shot(matrix), matrix, depth_scale=1e-3)
+    return session
+
+
+def test_it_asks_and_tells_as_a_planner_in_the_scene_does(finished):
+    """Every step by hand, with the frame."""
+    frame = Frame.fit(np.array(BOX), up="z")
+    box = Box(*BOX)
+    search = DiscreteSearch(frame.to_scene(Pose.from_matrix(POSES)))
+    imagined = frame.to_scene(CAMERA).resized(12, 16)
+    planner = Planner(
+        GeometricSPSR(0.2, truncation=8),
+        imagined,
+        Coverage(),
+        search,
+        3,
+        Grid(28),
+        400,
+        8,
+        Carving(frame.to_scene(box)),
+    )
+    state, matrix = None, FIRST
+    for index in range(3):
+        pose = Pose.from_matrix(matrix)
+        cloud = PointCloud.from_depth(shot(matrix), CAMERA, pose, scale=1e-3, box=box)
+        told = (frame.to_scene(pose), frame.to_scene(CAMERA))
+        scanned = frame.to_scene(cloud)
+        state = planner.init(scanned, *told) if state is None else planner.observe(state, told[0], scanned, told[1])
+        sample_key, search_key, _ = view_keys(jax.random.key(0), index + 1)
+        proposal = planner.choose(state, planner.sample_surfaces(state, sample_key), search_key)
+        matrix = np.asarray(frame.to_world(proposal.pose).matrix)
+        expected = finished.episode.views[index + 1].proposal if index < 2 else finished.next().proposal
+        np.testing.assert_allclose(proposal.values, expected.values, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(proposal.pose.position, expected.pose.position, atol=1e-5)
+    np.testing.assert_allclose(finished.state.cloud.points, state.cloud.points, atol=1e-5)
+
+
+def test_its_matrices_are_those_that_were_given(finished):
+    proposed = finished.next()
+    distance = np.abs(POSES - proposed.matrix).max(axis=(1, 2))
+    assert distance.min() < 1e-5
+    index = int(np.argmax(np.asarray(proposed.proposal.values)))
+    assert int(distance.argmin()) == index
+    assert proposed.value == pytest.approx(float(proposed.proposal.values[index]))
+    assert proposed.standard_error == pytest.approx(float(proposed.proposal.standard_errors[index]))
+    assert finished.next() is proposed
+    assert finished.views == 3
+
+
+def test_its_cloud_lies_on_the_object_in_the_world(finished):
+    points, normals = finished.cloud.to_numpy()
+    outward = points - np.array([0.3, 0.2, 0.101])
+    assert len(points) == 400
+    assert np.abs(np.linalg.norm(outward, axis=1) - 0.1).max() < 0.004
+    assert np.median(np.sum(outward * normals, axis=1)) / 0.1 > 0.95
+
+
+def test_the_expected_depth_is_near_what_is_then_seen(finished):
+    """In metres, at the planner's resolution: by the sensor's pixels at its rays, where both see the ball."""
+    proposed = finished.next()
+    assert proposed.expected_depth.shape == (12, 16)
+    camera = CAMERA.resized(12, 16)
+    seen = scan(WORLD, camera, Pose.from_matrix(proposed.matrix))
+    inside = np.asarray(Box(*BOX)(seen.points)) < 0
+    depth = (np.asarray(seen.points) - proposed.matrix[:3, 3]) @ proposed.matrix[:3, 2]
+    both = (np.asarray(seen.mask) & inside).reshape(12, 16) & np.isfinite(proposed.expected_depth)
+    assert both.sum() > 15
+    assert np.median(np.abs(proposed.expected_depth - depth.reshape(12, 16))[both]) < 0.02
+
+
+@pytest.mark.parametrize(("convention", "unit"), [("opencv", 1.0), ("opengl", 1000.0)])
+def test_metres_and_millimetres_and_both_conventions_tell_the_same(convention, unit, finished):
+    axes = np.diag([1.0, -1.0, -1.0, 1.0]) if convention == "opengl" else np.eye(4)
+    session = session_of(convention=convention, poses=POSES @ axes)
+    session.add(shot(FIRST, unit), FIRST @ axes, depth_scale=1.0 / unit)
+    first = finished.episode.views[1].proposal
+    np.testing.assert_allclose(session.next().matrix @ axes, finished.frame.to_world(first.pose).matrix, atol=1e-5)
+    # Points that are rounded to millimetres are other points.
+    assert session.next().value == pytest.approx(float(first.value), rel=1e-4 if unit > 1 else 0.2)
+
+
+def test_nothing_recompiles_after_the_second_image(compilations):
+    session, after = session_of(planner=planner_of(num_samples=2)), []
+    matrix = FIRST
+    for _ in range(5):
+        session.add(shot(matrix), matrix, depth_scale=1e-3)
+        matrix = session.next().matrix
+        after.append(len(compilations))
+    assert after[0] > 0
+    assert after[2:] == [after[2]] * 3
+
+
+def test_where_the_sensor_could_not_be_held_is_not_proposed_again():
+    """The user took the image from elsewhere; then all others are proposed once, and there is nothing left."""
+    session = session_of(planner=planner_of(FarthestView()), poses=POSES[:4])
+    proposed = []
+    for angle in (0.2, 1.2, 2.2, 3.2):
+        matrix = around(angle, 0.6)
+        session.add(shot(matrix), matrix, depth_scale=1e-3)
+        proposed.append(session.next().matrix)
+    assert len({tuple(np.round(matrix[:3, 3], 4)) for matrix in proposed}) == 4
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    with pytest.raises(InputError, match="all 4 candidates have been visited"):
+        session.next()
+
+
+def test_a_rig_of_two_cameras_is_one_session(tmp_path):
+    """The second has other intrinsics; what both saw is what each saw, in the state and after a restart."""
+    other = Camera.from_intrinsics([[60.0, 0.0, 15.0], [0.0, 60.0, 16.0], [0.0, 0.0, 1.0]], width=32, height=32)
+    matrix = around(3.0, 0.7)
+    pose = Pose.from_matrix(matrix)
+    seen = scan(WORLD, other, pose)
+    depth = (np.asarray(seen.points, np.float64) - np.asarray(pose.position)) @ np.asarray(pose.forward, np.float64)
+    image = np.where(seen.mask, np.round(1000.0 * depth), 0).reshape(32, 32).astype(np.uint16)
+    session = session_of(tmp_path, camera=(CAMERA, other), planner=planner_of(capacity=2000))
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    before = session.cloud.to_numpy()[0]
+    session.add(image, matrix, depth_scale=1e-3, camera=1)
+    points = session.cloud.to_numpy()[0]
+    alone = PointCloud.from_depth(image, other, pose, scale=1e-3, box=Box(*BOX)).to_numpy()[0]
+    np.testing.assert_allclose(points[len(before) :], alone, atol=1e-6)
+    again = session_of(tmp_path, camera=(CAMERA, other), planner=planner_of(capacity=2000))
+    np.testing.assert_array_equal(again.cloud.points, session.cloud.points)
+    assert [view.camera.width for view in again.episode.views] == [64, 32]
+    assert len([*again.episode.states()]) == 2
+    with pytest.raises(InputError, match="the session has 2 cameras, counted from 0: there is no camera 2"):
+        session.add(image, matrix, camera=2)
+    with pytest.raises(InputError, match="has no camera"):
+        session_of(camera=())
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"depth_scale": 1.0}, "give the depth's scale, 0.001 for millimetres"),
+        ({"matrix": FIRST @ np.diag([-1.0, 1.0, -1.0, 1.0])}, "the box .* lies behind the camera"),
+        ({"depth": np.ones((5, 5))}, r"the depth image is \(5, 5\) but the camera has \(48, 64\)"),
+        ({"depth": np.zeros((48, 64))}, "the first scan is empty"),
+    ],
+)
+def test_a_wrong_image_is_named_and_changes_nothing(given, message, tmp_path):
+    session = session_of(tmp_path)
+    right = {"depth": shot(FIRST), "matrix": FIRST, "depth_scale": 1e-3}
+    with pytest.raises(InputError, match=message):
+        session.add(**right | given)
+    assert session.views == 0
+    assert not list(tmp_path.glob("*.npz"))
+    session.add(**right)
+    assert session.views == 1
+
+
+def test_an_image_beside_the_box_is_warned_of():
+    """It may be meant, but for the first one."""
+    session = session_of()
+    inverse = np.linalg.inv(FIRST)
+    with (
+        pytest.warns(
+            UserWarning, match=r"none of the \d+ points .* lies in the box .* Is the pose from camera to world"
+        ),
+        pytest.raises(InputError, match="the first scan is empty"),
+    ):
+        session.add(shot(FIRST), inverse, depth_scale=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: session_of().next(), "no image yet: add one first"),
+        (lambda: session_of().cloud, "no image yet: add one first"),
+        (lambda: session_of(box=((0.0, 0.0), (1.0, 1.0))), "give two corners"),
+        (lambda: session_of(box=((0.0, 0.0, 0.0), (1.0, 1.0, -1.0))), "has no inside"),
+        (lambda: session_of(planner=planner_of(GradientSearch())), "GradientSearch is no search over candidates"),
+        (lambda: session_of(convention="blender"), "the convention is 'blender'"),
+        (lambda: session_of(stride=0), "stride is 0"),
+    ],
+)
+def test_bad_input_is_named(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+def test_the_box_is_the_volume_of_the_model_and_of_the_carving():
+    """What was given another volume keeps it."""
+    own = Box.cube(2.0)
+    planner = planner_of()
+    planner = Planner(
+        ScreenedSPSR(values=(OutsideBoundary(), OutsideBoundary(own))), planner.camera, Coverage(), planner.search
+    )
+    fitted = session_of(planner=planner).planner
+    scene = Frame.fit(np.array(BOX), up="z").to_scene(Box(*BOX))
+    assert fitted.carving.volume == scene
+    assert fitted.model.values[0].volume == scene
+    assert fitted.model.values[1].volume == own
+    assert max(scene.high) == pytest.approx(1.25)
+    assert fitted.camera.fov == pytest.approx(CAMERA.fov)
+
+
+def test_it_is_done_by_its_rule(finished):
+    assert finished.done is None
+    session = session_of(until=WorthLess(1e9))
+    assert session.done is None
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    assert "less than" in session.done
+    session = session_of(until=Budget(seconds=1e9))
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    assert session.done is None
+
+
+def test_a_report_stands_upright_and_needs_no_truth(finished, tmp_path):
+    page = finished.report(tmp_path, progress=False).read_text()
+    assert "that of a real sensor" in page
+    assert page.count("<li>View") == 3
+    with pytest.raises(InputError, match="keeps no folder"):
+        finished.report()

@@ -1,0 +1,116 @@
+"""Views one by one: those of a simulated episode, and what stands behind each."""
+
+import itertools
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+import jaxnbv
+from jaxnbv.acquisition import Score
+from jaxnbv.checks import InputError
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.planning.episode import scene_sensor, steps
+from jaxnbv.planning.planner import Planner
+from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
+from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.search import DiscreteSearch, FarthestView, RandomView, UncertaintyView
+from jaxnbv.search.candidates import sphere_candidates
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Coverage
+
+CANDIDATES, KEY = 10, jax.random.key(3)
+SCENE, FIRST = SDFSurface(Sphere(0.8)), sphere_candidates(CANDIDATES)[2]
+CAMERA = Camera(height=10, width=10)
+
+
+class FirstRow(Score):
+    def context(self, cloud):
+        return None
+
+    def __call__(self, context, scan):
+        return scan.points[0, 0]
+
+
+def planner(search, views=4):
+    return Planner(GeometricSPSR(0.2, truncation=6), CAMERA, Coverage(), search, 2, Grid(16), 150, views)
+
+
+def views_of(planner, key=KEY, noise=SensorNoise(), camera=CAMERA, first=FIRST):
+    for view, *_ in steps(planner, scene_sensor(SCENE, camera, noise), first, key, camera):
+        yield view
+
+
+def assert_same(a, b):
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+@pytest.mark.parametrize("search", [DiscreteSearch(CANDIDATES), FarthestView(CANDIDATES), RandomView(CANDIDATES)])
+def test_views_are_those_of_a_simulated_episode(search):
+    own = planner(search)
+    noise = SensorNoise(0.02)
+    views = list(views_of(own, noise=noise))
+    episode = jaxnbv.simulate(own, SCENE, FIRST, 4, KEY, noise, progress=False)
+    assert len(views) == 4
+    for view, expected in zip(views, episode.views, strict=True):
+        assert_same(view, expected)
+    assert len({tuple(np.asarray(view.pose.position).tolist()) for view in views}) == 4
+    other = list(itertools.islice(views_of(own, jax.random.key(4), noise), 1))
+    assert (other[0].scan.points != views[0].scan.points).any()
+
+
+def test_a_finer_sensor_sees_more_from_the_same_poses():
+    """And nothing is computed of views that nobody asks for."""
+    own = planner(FarthestView(CANDIDATES))
+    fine = views_of(own, camera=Camera(height=20, width=20))
+    for view, coarse in zip(itertools.islice(fine, 3), views_of(own), strict=False):
+        assert view.scan.capacity == 400
+        assert coarse.scan.capacity == 100
+        assert int(view.scan.count) > 3 * int(coarse.scan.count) > 0
+        assert view.cloud.capacity == coarse.cloud.capacity == 150
+        assert_same(view.pose, coarse.pose)
+
+
+def test_it_ends_where_the_planner_has_no_room_and_fails_where_no_candidate_is_left():
+    assert len(list(views_of(planner(FarthestView(CANDIDATES), 1)))) == 1
+    few = views_of(planner(FarthestView(2), 4), first=sphere_candidates(2)[0])
+    assert len(list(itertools.islice(few, 2))) == 2
+    with pytest.raises(InputError, match="have been visited"):
+        next(few)
+
+
+def test_views_that_are_known_are_told_and_not_asked_for():
+    own, asked = planner(RandomView(CANDIDATES)), []
+    whole = list(views_of(own))
+
+    def sensor(pose, key):
+        asked.append(pose)
+        return scene_sensor(SCENE, CAMERA)(pose, key)
+
+    done = [(view.pose, view.scan, view.proposal) for view in whole[:2]]
+    for step, expected in zip(steps(own, sensor, FIRST, KEY, done=done), whole, strict=True):
+        assert_same(step.view, expected)
+    assert len(asked) == 2
+
+
+def test_a_step_holds_the_samples_and_the_state_that_the_next_view_is_chosen_from():
+    own = planner(DiscreteSearch(CANDIDATES), 3)
+    first, second, third = steps(own, scene_sensor(SCENE, CAMERA), FIRST, KEY)
+    assert (first.surfaces, first.seconds) == (None, 0.0)
+    again = own.choose(second.state, third.surfaces, jax.random.key(0))
+    assert_same(again, third.view.proposal)
+    assert third.seconds > 0.0
+
+
+def test_another_score_or_search_does_not_compile_the_sampler_again(compilations):
+    own = planner(DiscreteSearch(CANDIDATES))
+    state = own.init(next(views_of(own)).scan, FIRST)
+    surfaces = own.sample_surfaces(state, KEY)
+    jax.block_until_ready(surfaces.values)
+    del compilations[:]
+    other = eqx.tree_at(lambda p: p.acquisition, planner(UncertaintyView(CANDIDATES)), FirstRow())
+    assert_same(other.sample_surfaces(state, KEY), surfaces)
+    assert not compilations

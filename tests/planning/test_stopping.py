@@ -1,0 +1,210 @@
+"""When an episode ends: rules on scripted answers, and expected coverage against a count of its own."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnbv.acquisition import ExpectedUtilityImprovement
+from jaxnbv.checks import InputError
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import fibonacci_sphere, look_at
+from jaxnbv.planning.episode import simulate
+from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.state import State
+from jaxnbv.planning.stopping import Budget, Covered, Found, SoFar, Sure, WorthLess, expected_coverage
+from jaxnbv.scanning import Grid, GridSurface, SDFSurface, SensorNoise
+from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.search import DiscreteSearch, FarthestView, Proposal
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Coverage, CrossEntropy, NegativeEntropy, SoftPartCount
+
+SCENE, FIRST, KEY = SDFSurface(Sphere(0.8)), look_at((0.0, 0.0, 2.5)), jax.random.key(3)
+CAMERA, GRID = Camera(height=12, width=12), Grid(24)
+SEARCH = DiscreteSearch(10)
+
+
+def planner_of(score, search=SEARCH, **changes):
+    settings = {"num_samples": 2, "grid": GRID, "capacity": 256, "max_views": 8, **changes}
+    return Planner(GeometricSPSR(0.2, truncation=6), CAMERA, score, search, **settings)
+
+
+def state_of(cloud):
+    return State.before_views(cloud, 4, GRID)
+
+
+def cloud_of(count, capacity=256):
+    directions = np.asarray(fibonacci_sphere(count))
+    return PointCloud.from_arrays(0.8 * directions, directions, capacity)
+
+
+def so_far(planner, cloud, poses=(FIRST,), seconds=0.0):
+    return SoFar(planner, state_of(cloud), tuple(poses), seconds, KEY)
+
+
+def proposal_of(value, pose=FIRST):
+    return Proposal(pose, jnp.asarray(value), pose[None], jnp.asarray([value]))
+
+
+def of_count(cloud, enough):
+    """A class that is certain from so many points on, and open below."""
+    sure = jnp.log(jnp.array([0.99, 0.01]))
+    return jnp.where(cloud.count >= enough, sure, jnp.log(jnp.array([0.5, 0.5])))
+
+
+def of_half(cloud):
+    """A class that every half of the points tells, but not always the same one."""
+    left = jnp.sum(jnp.where(cloud.mask, jnp.sign(cloud.points[:, 0]), 0.0)) > 0
+    return jnp.where(left, jnp.log(jnp.array([0.99, 0.01])), jnp.log(jnp.array([0.01, 0.99])))
+
+
+@pytest.mark.parametrize("score", [CrossEntropy, lambda c: ExpectedUtilityImprovement(NegativeEntropy(c))])
+@pytest.mark.parametrize(
+    ("enough", "resamplings", "stops"), [(1, 8, True), (200, 8, False), (200, 0, True), (201, 0, False)]
+)
+def test_sure_asks_all_of_the_cloud_and_halves_of_it(score, enough, resamplings, stops):
+    planner = planner_of(score(functools.partial(of_count, enough=enough)))
+    reason = Sure(0.95, resamplings).after(so_far(planner, cloud_of(200)))
+    assert (reason is not None) == stops
+    if stops:
+        assert reason.startswith("sure of class 0: 0.99")
+
+
+def test_sure_wants_the_same_class_of_every_half():
+    planner = planner_of(CrossEntropy(of_half))
+    assert Sure(0.95, 0).after(so_far(planner, cloud_of(199))) is not None
+    assert Sure(0.95, 16).after(so_far(planner, cloud_of(199))) is None
+
+
+def test_sure_is_asked_the_probability_that_was_given():
+    planner = planner_of(CrossEntropy(functools.partial(of_count, enough=1)))
+    assert Sure(0.98).after(so_far(planner, cloud_of(50))) is not None
+    assert Sure(0.995).after(so_far(planner, cloud_of(50))) is None
+
+
+def segmenter(counts):
+    """Parts of which so many points are predicted, whatever the cloud."""
+    labels = np.repeat(np.arange(len(counts)), counts)
+    return SoftPartCount(lambda cloud: jnp.eye(len(counts))[np.resize(labels, cloud.capacity)])
+
+
+@pytest.mark.parametrize(
+    ("parts", "points", "stops"),
+    [
+        (("part 0", "part 1"), 60, True),
+        (("part 0", "part 2"), 60, False),
+        (("part 2",), 40, True),
+        (("part 2",), 41, False),
+    ],
+)
+def test_found_counts_the_points_of_the_parts_that_are_asked_for(parts, points, stops):
+    planner = planner_of(ExpectedUtilityImprovement(segmenter((80, 80, 40))))
+    reason = Found(points, parts).after(so_far(planner, cloud_of(200, 200)))
+    assert (reason is not None) == stops
+
+
+@pytest.mark.parametrize(("points", "radius"), [(40, 0.1), (150, 0.1), (40, 0.2)])
+def test_expected_coverage_is_that_of_the_samples(points, radius, monkeypatch):
+    """Of a posterior that holds one ball alone, whose rays and points are found anew in float64."""
+    axis = np.asarray(Grid(64).axis)
+    distance = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1), axis=-1) - 0.8
+    ball = GridSurface.from_values(jnp.asarray(distance, jnp.float32)[None], 0.0, Grid(64))
+    planner = planner_of(Coverage(), grid=Grid(64))
+    monkeypatch.setattr(Planner, "sample_surfaces", lambda self, state, key: ball)
+    cloud = cloud_of(points)
+    hits = []
+    for pose in DiscreteSearch(10).candidates.poses():
+        origin = np.asarray(pose.position, np.float64)
+        rays = np.asarray(CAMERA.pixel_directions(), np.float64) @ np.asarray(pose.rotation, np.float64).T
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        along = -rays @ origin
+        inside = 0.8**2 - (origin @ origin - along**2)
+        seen = inside > 0
+        hits.append(origin + (along - np.sqrt(np.maximum(inside, 0.0)))[seen, None] * rays[seen])
+    hits = np.concatenate(hits)
+    nearest = np.linalg.norm(hits[:, None] - cloud.to_numpy()[0][None], axis=-1).min(axis=1)
+    share = float(np.mean(nearest <= radius))
+    assert 0.05 < share < 0.97
+    assert expected_coverage(planner, state_of(cloud), KEY, radius) == pytest.approx(share, abs=0.02)
+    covered = so_far(planner, cloud)
+    assert Covered(share - 0.03, radius).after(covered) is not None
+    assert Covered(min(share + 0.03, 1.0), radius).after(covered) is None
+
+
+def test_worth_less_and_budgets_on_scripted_proposals():
+    planner = planner_of(Coverage())
+    asked = so_far(planner, cloud_of(50))
+    assert "worth 0.3, less than 0.5" in WorthLess(0.5).before(asked, proposal_of(0.3))
+    assert WorthLess(0.5).before(asked, proposal_of(0.5)) is None
+    east, top, west = (look_at(place) for place in ((2.5, 0.0, 0.0), (0.0, 2.5, 0.0), (-2.5, 0.0, 0.0)))
+    quarter = 2.5 * np.pi / 2.0
+    way = so_far(planner, cloud_of(50), (east, top), seconds=30.0)
+    assert Budget(cost=2.01 * quarter).before(way, proposal_of(1.0, west)) is None
+    assert "would cost 3.93, but 1.96 of" in Budget(cost=1.5 * quarter).before(way, proposal_of(1.0, west))
+    assert Budget(seconds=30.5).after(way) is None
+    assert Budget(seconds=30.0).after(way) == "30 of 30 seconds are spent"
+
+
+def test_the_first_rule_that_holds_ends_it():
+    planner = planner_of(Coverage())
+    asked = so_far(planner, cloud_of(50), seconds=10.0)
+    rule = WorthLess(0.5) | Budget(seconds=20.0) | Budget(seconds=5.0)
+    assert rule.after(asked) == "10 of 5 seconds are spent"
+    assert "less than 0.5" in rule.before(asked, proposal_of(0.1))
+    assert rule.before(asked, proposal_of(0.6)) is None
+
+
+def test_an_episode_ends_by_its_rule_and_goes_on_by_another(tmp_path):
+    """The views are those of an episode without a rule."""
+    planner = planner_of(CrossEntropy(functools.partial(of_count, enough=180)), FarthestView(10))
+    whole = simulate(planner, SCENE, FIRST, 6, KEY, SensorNoise(), progress=False)
+    counts = [int(view.cloud.count) for view in whole.views]
+    enough = next(index + 1 for index, count in enumerate(counts) if count >= 180)
+    assert 1 < enough < 5
+    short = simulate(planner, SCENE, FIRST, 6, KEY, folder=tmp_path, progress=False, until=Sure(0.95, 0))
+    assert len(short.views) == enough
+    assert short.stopped.startswith("sure of class 0")
+    again = simulate(planner, SCENE, FIRST, 6, KEY, folder=tmp_path, progress=False, until=Sure(0.95, 0))
+    assert len(again.views) == enough
+    longer = simulate(planner, SCENE, FIRST, 6, KEY, folder=tmp_path, progress=False, until=Budget(seconds=1e6))
+    assert len(longer.views) == 6
+    assert longer.stopped is None
+    for view, expected in zip(longer.views, whole.views, strict=True):
+        np.testing.assert_array_equal(view.scan.points, expected.scan.points)
+
+
+def test_a_view_that_is_worth_too_little_is_not_taken():
+    planner = planner_of(Coverage())
+    episode = simulate(planner, SCENE, FIRST, 6, KEY, progress=False)
+    values = [float(view.proposal.value) for view in episode.views[1:]]
+    limit = 0.5 * (values[0] + values[1])
+    assert values[1] < limit < values[0]
+    short = simulate(planner, SCENE, FIRST, 6, KEY, progress=False, until=WorthLess(limit))
+    assert len(short.views) == 2
+    assert "less than" in short.stopped
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Sure(1.0), "probability is 1.0; it must lie within"),
+        (lambda: Sure(resamplings=-1), "number of resamplings is -1"),
+        (lambda: Found(0), "a part is found by 0 points"),
+        (lambda: Covered(1.5), "share is 1.5"),
+        (lambda: Covered(radius=0.0), "radius is 0.0"),
+        (lambda: Budget(), "of nothing: give seconds or cost"),
+        (lambda: Budget(seconds=0.0), "must be positive"),
+        (lambda: Sure().check(planner_of(Coverage())), "Sure is about a class, but Coverage has no classifier"),
+        (lambda: Found().check(planner_of(Coverage())), "Found is about parts, but Coverage has no segmenter"),
+        (
+            lambda: Found().check(planner_of(ExpectedUtilityImprovement(segmenter((3, 3))))),
+            "does not name the parts",
+        ),
+    ],
+)
+def test_bad_input_is_named(make, message):
+    with pytest.raises(InputError, match=message):
+        make()

@@ -1,0 +1,136 @@
+"""Surfaces from clouds: against the sphere they were scanned from, and against the posterior mean itself."""
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Float
+
+import jaxnbv as nbv
+from jaxnbv.checks import InputError
+from jaxnbv.geometry.pose import fibonacci_sphere
+from jaxnbv.scanning.reconstruction import carved_mesh, has_poisson, mean_mesh, screened_poisson
+from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.surfaces import SurfaceModel, SurfacePosterior
+
+RADIUS = 0.9
+MODEL = nbv.GeometricSPSR(lengthscale=0.05, truncation=10)
+
+
+def sphere_cloud(count=600, capacity=700):
+    """Points all over a sphere about (0.2, 0, 0), in a cloud with rows to spare."""
+    normals = np.asarray(fibonacci_sphere(count, 1.0))
+    return nbv.PointCloud.from_arrays(RADIUS * normals + [0.2, 0.0, 0.0], normals, capacity)
+
+
+def check_sphere(mesh, tolerance):
+    solid = mesh.to_trimesh()
+    radii = np.linalg.norm(mesh.vertices - [0.2, 0.0, 0.0], axis=1)
+    np.testing.assert_allclose(radii, RADIUS, atol=tolerance)
+    assert solid.is_watertight
+    # Wound outward, the volume is positive.
+    assert solid.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=4 * tolerance)
+    assert mesh.frame == nbv.Frame()
+
+
+def test_the_mean_of_a_whole_scan_is_the_surface():
+    check_sphere(mean_mesh(MODEL, sphere_cloud(), nbv.Grid(40)), 0.03)
+
+
+def test_vertices_lie_where_the_posterior_mean_equals_its_level():
+    """Of half a sphere, too, where the rest is the model's guess."""
+    whole = sphere_cloud()
+    half = nbv.PointCloud(whole.points, whole.normals, whole.mask & (whole.points[:, 1] > 0.0))
+    posterior = MODEL.condition(half)
+    mesh = mean_mesh(MODEL, half, nbv.Grid(60))
+    mean = np.asarray(posterior.mean(mesh.vertices[::20].astype(np.float32)) - posterior.level)
+    inside = float(posterior.mean(jnp.array([[0.2, 0.5, 0.0]]))[0] - posterior.level)
+    assert inside < 0
+    assert np.abs(mean).max() < 0.03 * abs(inside)
+    # The half that was seen is right, and there is surface where nothing was seen.
+    seen = mesh.vertices[mesh.vertices[:, 1] > 0.1]
+    assert np.abs(np.linalg.norm(seen - [0.2, 0.0, 0.0], axis=1) - RADIUS).mean() < 0.03
+    assert (mesh.vertices[:, 1] < -0.1).any()
+
+
+class Balls(SurfaceModel):
+    """A model of its own, without a mean field: whatever the cloud, two balls, of which one holds no data."""
+
+    def condition(self, cloud: nbv.PointCloud) -> "BallsPosterior":
+        return BallsPosterior()
+
+
+class BallsPosterior(SurfacePosterior):
+    level: Float[Array, ""] = 0.25
+
+    def __init__(self):
+        self.level = jnp.asarray(0.25)
+
+    def sample(self, key, num_samples):
+        pytest.fail("the mesh of the mean needs no samples")
+
+    def mean(self, x):
+        away = jnp.linalg.norm(x - jnp.array([-0.6, 0.0, 0.0]), axis=-1) - 0.5
+        return jnp.minimum(away, jnp.linalg.norm(x - jnp.array([0.6, 0.3, 0.0]), axis=-1) - 0.3) + 0.25
+
+
+def test_other_models_are_meshed_too_and_pieces_without_data_are_kept():
+    mesh = mean_mesh(Balls(), sphere_cloud(), nbv.Grid(30))
+    parts = sorted(mesh.to_trimesh().split(), key=lambda part: part.volume)
+    assert len(parts) == 2
+    for part, centre, radius in zip(parts, ([0.6, 0.3, 0.0], [-0.6, 0.0, 0.0]), (0.3, 0.5), strict=True):
+        np.testing.assert_allclose(np.linalg.norm(part.vertices - centre, axis=1), radius, atol=0.02)
+
+
+def test_what_was_seen_empty_is_not_meshed():
+    """One of the model's two balls is there, and the camera sees past it through the other."""
+    seen = nbv.SDFSurface(Sphere(0.5).translate((-0.6, 0.0, 0.0)))
+    camera, pose = nbv.Camera(fov=1.3, height=60, width=60), nbv.look_at((0.0, 0.0, 2.5))
+
+    def mesh(carving):
+        search = nbv.FarthestView(nbv.SphereCandidates(8))
+        planner = nbv.Planner(Balls(), camera, nbv.Coverage(), search, 1, nbv.Grid(30), 4000, carving=carving)
+        return carved_mesh(planner, planner.init(nbv.scan(seen, camera, pose), pose))
+
+    (ball,) = mesh(nbv.Carving()).to_trimesh().split()
+    np.testing.assert_allclose(np.linalg.norm(ball.vertices - [-0.6, 0.0, 0.0], axis=1), 0.5, atol=0.03)
+    whole, plain = mesh(None), mean_mesh(Balls(), sphere_cloud(), nbv.Grid(30))
+    np.testing.assert_array_equal(whole.vertices, plain.vertices)
+
+
+def test_a_grid_that_the_surface_does_not_cross_is_refused():
+    with pytest.raises(InputError, match="no surface lies within"):
+        mean_mesh(Balls(), sphere_cloud(), nbv.Grid(8, 0.05))
+
+
+@pytest.mark.skipif(not has_poisson(), reason="pymeshlab, or the system's OpenGL library, is not installed")
+def test_poisson_reconstruction_of_a_whole_scan_is_the_surface():
+    cloud = sphere_cloud()
+    mesh = screened_poisson(cloud, depth=6)
+    check_sphere(mesh, 0.03)
+    again = screened_poisson(cloud, depth=6)
+    np.testing.assert_array_equal(mesh.vertices, again.vertices)
+    assert len(screened_poisson(cloud, depth=3).faces) < 0.5 * len(mesh.faces)
+
+
+def test_poisson_reconstruction_names_what_is_wrong(monkeypatch):
+    cloud = sphere_cloud(20)
+    with pytest.raises(InputError, match="depth is 0"):
+        screened_poisson(cloud, depth=0)
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "pymeshlab", None)
+        with pytest.raises(InputError, match=r'pip install "jaxnbv\[poisson\]"'):
+            screened_poisson(cloud)
+    if not has_poisson():
+        pytest.skip("pymeshlab, or the system's OpenGL library, is not installed")
+    few = jax.tree.map(lambda leaf: leaf[:3], cloud)
+    with pytest.raises(InputError, match="3 points, and a surface needs at least 4"):
+        screened_poisson(few)
+    together = nbv.PointCloud(jnp.zeros_like(cloud.points), cloud.normals, cloud.mask)
+    with pytest.raises(InputError, match="found no surface through 20 points"):
+        screened_poisson(together)
+    broken = nbv.PointCloud(cloud.points.at[0, 0].set(jnp.nan), cloud.normals, cloud.mask)
+    with pytest.raises(InputError, match="not finite"):
+        screened_poisson(broken)

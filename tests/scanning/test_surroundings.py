@@ -1,0 +1,253 @@
+"""Tables, walls and meshes around the object: what they hide, by Embree and float64; where cameras may stand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from jaxnbv.checks import InputError
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.geometry.pose import look_at
+from jaxnbv.planning.episode import simulate
+from jaxnbv.planning.planner import Planner
+from jaxnbv.scanning import Carving, Grid, SDFSurface, SensorNoise, TriangleMesh, scan
+from jaxnbv.scanning.sdf import Box, HalfSpace, Sphere, solid_of_mesh
+from jaxnbv.scanning.surroundings import Surroundings, support_plane
+from jaxnbv.search import DiscreteSearch, GivenPoses, GradientSearch, HalvingSearch, SphereCandidates
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Coverage
+
+CAMERA, BALL = Camera(height=24, width=24), SDFSurface(Sphere(0.8))
+TABLE = HalfSpace([0.0, -0.5, 0.0], [0.0, 1.0, 0.0])
+WALL = Box([0.1, 1.0, 1.0]).translate([1.6, 0.0, 0.0])
+POSES = look_at(np.array([[0.5, -1.8, 1.5], [2.4, 0.3, 0.4], [0.2, 1.9, 1.6]]))
+KEY = jax.random.key(3)
+
+
+def box_mesh(low, high):
+    mesh = trimesh.creation.box(bounds=[low, high])
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+def rays_of(pose):
+    origin = np.asarray(pose.position, np.float64)
+    directions = np.asarray(CAMERA.pixel_directions(), np.float64) @ np.asarray(pose.rotation, np.float64).T
+    return origin, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def first_hits(vertices, faces, pose):
+    """How far along the camera's rays a mesh is met, by Embree; infinite where it is not."""
+    mesh = TriangleMesh(vertices, faces, Frame())
+    origin, directions = rays_of(pose)
+    hits = mesh.trace(np.tile(origin, (len(directions), 1)), directions)
+    along = np.linalg.norm(np.asarray(hits.points, np.float64) - origin, axis=1)
+    return np.where(hits.mask, along, np.inf)
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_a_table_is_met_where_its_plane_is(index):
+    found = np.asarray(Surroundings((TABLE,)).barrier(CAMERA, POSES[index]), np.float64)
+    origin, directions = rays_of(POSES[index])
+    if origin[1] < -0.5:
+        # From within: the way out.
+        assert np.isfinite(found).mean() > 0.3
+    else:
+        along = (-0.5 - origin[1]) / directions[:, 1]
+        near = (along > 0) & (np.linalg.norm(origin + along[:, None] * directions, axis=1) < 7.5)
+        np.testing.assert_allclose(found[near], along[near], rtol=2e-3)
+        assert np.isinf(found[along < 0]).all()
+
+
+@pytest.mark.parametrize("as_mesh", [False, True])
+@pytest.mark.parametrize("index", range(3))
+def test_what_a_wall_hides_is_what_embree_says(as_mesh, index):
+    """The wall as a box, and as a mesh of its twelve triangles."""
+    low, high = [1.5, -1.0, -1.0], [1.7, 1.0, 1.0]
+    mesh = box_mesh(low, high)
+    wall = solid_of_mesh(*mesh, resolution=60) if as_mesh else WALL
+    pose = POSES[index]
+    barrier = Surroundings((wall,)).barrier(CAMERA, pose)
+    expected = first_hits(*mesh, pose)
+    found = np.asarray(barrier)
+    # Beside the edges a cell of the sampled distances counts.
+    same = np.isfinite(found) == np.isfinite(expected)
+    assert same.mean() > (0.95 if as_mesh else 0.99)
+    both = np.isfinite(found) & np.isfinite(expected)
+    assert np.abs(found[both] - expected[both]).max(initial=0.0) < (0.15 if as_mesh else 2e-3)
+    seen, alone = scan(BALL, CAMERA, pose, barrier), scan(BALL, CAMERA, pose)
+    away = np.linalg.norm(np.asarray(alone.points, np.float64) - np.asarray(pose.position), axis=1)
+    visible = np.asarray(alone.mask) & (away < expected)
+    assert (np.asarray(seen.mask) == visible).mean() > (0.95 if as_mesh else 0.99)
+    np.testing.assert_array_equal(seen.missed, ~np.asarray(seen.mask))
+    np.testing.assert_array_equal(seen.points[~np.asarray(seen.mask)], 0.0)
+
+
+def test_solids_of_meshes_have_the_distances_of_their_formulas():
+    ball = trimesh.creation.icosphere(4, radius=0.7)
+    solid = solid_of_mesh(ball.vertices, ball.faces, resolution=50)
+    x = np.random.default_rng(0).uniform(-2.0, 2.0, (400, 3))
+    exact = np.linalg.norm(x, axis=1) - 0.7
+    found = np.asarray(solid(jnp.asarray(x, jnp.float32)))
+    within = np.abs(x).max(axis=1) < 0.8
+    np.testing.assert_allclose(found[within], exact[within], atol=0.03)
+    assert np.all(found[~within] <= exact[~within] + 0.03)
+    assert np.all(found[~within] > 0)
+
+
+def test_points_of_obstacles_are_not_the_objects():
+    points = np.array([[0.0, -0.49, 0.3], [0.0, -0.4, 0.3], [0.1, 0.2, 0.3]])
+    normals = np.tile([0.0, 1.0, 0.0], (3, 1))
+    cloud = PointCloud.from_arrays(points, normals, 4)
+    scanned = PointCloud(cloud.points, cloud.normals, cloud.mask, jnp.array([False, False, False, True]))
+    kept = Surroundings((TABLE,), margin=0.05).without_obstacles(scanned)
+    np.testing.assert_array_equal(kept.mask, [False, True, True, False])
+    np.testing.assert_array_equal(kept.missed, [True, False, False, True])
+    np.testing.assert_array_equal(kept.points[0], 0.0)
+
+
+def test_space_is_seen_empty_up_to_an_obstacle():
+    """Every ray misses the ball's place; nodes before the wall are empty, those behind it are not known."""
+    grid, carving, pose = Grid(40), Carving(), look_at((-2.4, 0.0, 0.0))
+    nothing = scan(SDFSurface(Sphere(0.01).translate([0.0, 5.0, 0.0])), CAMERA, pose)
+    wall = Surroundings((Box([0.1, 2.0, 2.0]).translate([0.5, 0.0, 0.0]),))
+    barrier = wall.barrier(CAMERA, pose)
+    free, known = (np.asarray(carving.seen_empty(grid, nothing, CAMERA, pose, b)) for b in (None, barrier))
+    x = np.asarray(grid.axis)
+    middle = 20
+    assert free[(x > 0.6) & (x < 1.2), middle, middle].all()
+    assert not known[x > 0.4].any()
+    np.testing.assert_array_equal(known[x < 0.4 - 2.5 * grid.spacing], free[x < 0.4 - 2.5 * grid.spacing])
+
+
+def planner_of(search, surroundings=None, **changes):
+    settings = {"num_samples": 3, "grid": Grid(28), "capacity": 256, "max_views": 6, **changes}
+    camera = Camera(height=12, width=12)
+    return Planner(GeometricSPSR(0.1, truncation=8), camera, Coverage(), search, surroundings=surroundings, **settings)
+
+
+def test_imagined_surfaces_end_at_the_table():
+    surroundings = Surroundings((TABLE,))
+    planner = planner_of(DiscreteSearch(8), surroundings)
+    state = planner.init(scan(BALL, planner.camera, POSES[2]), POSES[2])
+    values = np.asarray(planner.sample_surfaces(state, KEY).values)
+    below = np.asarray(planner.grid.axis) < -0.5 - 1e-6
+    assert (values[:, :, below] > 0).all()
+    assert (values < 0).any()
+
+
+def test_views_are_worth_what_the_obstacles_leave_to_see():
+    """A candidate behind the wall sees nothing of the object; without the wall it would."""
+    candidates = GivenPoses(look_at(np.array([[2.4, 0.1, 0.0], [0.0, 2.4, 0.1], [-2.4, 0.0, 0.1]])))
+    first = look_at((0.0, 0.1, 2.4))
+    for surroundings, seen in ((None, True), (Surroundings((WALL,)), False)):
+        planner = planner_of(DiscreteSearch(candidates), surroundings)
+        proposal = planner.propose(planner.init(scan(BALL, planner.camera, first), first), KEY)
+        assert (float(proposal.values[0]) > 0) == seen
+        assert float(proposal.values[1]) > 0
+
+
+def test_an_episode_stands_and_sees_above_the_table():
+    surroundings = Surroundings((TABLE,), clearance=0.3)
+    planner = planner_of(DiscreteSearch(40), surroundings)
+    episode = simulate(planner, BALL, look_at((0.5, 0.8, 2.2)), 4, KEY, SensorNoise(0.0, 0.0), progress=False)
+    for view in episode.views:
+        assert float(view.pose.position[1]) > -0.2
+        assert np.asarray(view.scan.points)[np.asarray(view.scan.mask), 1].min(initial=0.0) > -0.501
+    below = np.asarray(planner.search.candidates.poses().position)[:, 1] < -0.2
+    for view in episode.views[1:]:
+        assert np.isneginf(np.asarray(view.proposal.values)[below]).all()
+
+
+@pytest.mark.parametrize("search", [DiscreteSearch(40), HalvingSearch(40)])
+def test_no_camera_stands_too_near_to_what_was_seen(search):
+    """Of candidates at two distances only the far ones are open: the near ones are within the clearance of the ball."""
+    near, far = SphereCandidates(20, radius=1.1).poses(), SphereCandidates(20, radius=2.5).poses()
+    both = jax.tree.map(lambda *rows: jnp.concatenate(rows), near, far)
+    planner = planner_of(type(search)(both), Surroundings(clearance=0.5), capacity=400)
+    state = planner.init(scan(BALL, planner.camera, POSES[2]), POSES[2])
+    values = np.asarray(planner.propose(state, KEY).values)
+    points = state.cloud.to_numpy()[0]
+    distance = np.linalg.norm(np.asarray(both.position)[:, None] - points[None], axis=-1).min(axis=1)
+    np.testing.assert_array_equal(np.isneginf(values), distance < 0.5)
+    assert 0 < (distance < 0.5).sum() < 20
+
+
+def test_on_request_cameras_stand_in_space_that_was_seen_empty_alone():
+    first = look_at((0.0, 0.0, 2.4))
+    ahead, aside, beyond = [0.0, 0.0, 1.15], [1.6, 0.0, 0.0], [2.4, 0.0, 0.0]
+    planner = planner_of(DiscreteSearch(GivenPoses(look_at(np.array([ahead, aside, beyond])))))
+    for seen_only, expected in ((False, [False, False, False]), (True, [False, True, False])):
+        own = planner_of(planner.search, Surroundings(seen_only=seen_only))
+        state = own.init(scan(BALL, own.camera, first), first)
+        np.testing.assert_array_equal(np.isneginf(np.asarray(own.propose(state, KEY).values)), expected)
+
+
+def test_a_search_by_gradient_stays_out_of_obstacles():
+    """Its starts are all too low; free, ascent stays there."""
+    starts = look_at(2.3 * np.array([[np.cos(a), -0.05, np.sin(a)] for a in (0.3, 1.9, 3.5, 5.1)]))
+    search = GradientSearch(dof=2, num_starts=4, iterations=12, learning_rate=0.05, candidates=starts, turned=False)
+    table = HalfSpace([0.0, -0.2, 0.0], [0.0, 1.0, 0.0])
+    state_of = lambda planner: planner.init(scan(BALL, planner.camera, POSES[2]), POSES[2])  # noqa: E731
+    planner = planner_of(search, Surroundings((table,), clearance=0.4))
+    proposal = planner.propose(state_of(planner), KEY)
+    assert float(proposal.pose.position[1]) >= 0.2 - 1e-5
+    assert np.isneginf(np.asarray(proposal.values)).all()
+    heights = np.asarray(proposal.trajectories.poses.position)[..., 1]
+    assert (heights[:, -1] > heights[:, 0]).all()
+
+
+def test_where_nothing_is_open_it_says_so():
+    planner = planner_of(DiscreteSearch(10), Surroundings(clearance=50.0))
+    state = planner.init(scan(BALL, planner.camera, POSES[2]), POSES[2])
+    with pytest.raises(InputError, match="all 10 candidates have been visited, or no camera may stand there"):
+        planner.propose(state, KEY)
+
+
+def test_from_the_world_to_the_scene():
+    """Distances in the world times the scale are those in the scene."""
+    frame = Frame.fit(np.array([[0.1, 0.2, 0.0], [0.4, 0.5, 0.25]]), up="z")
+    table, block = HalfSpace([0.0, 0.0, 0.01], [0.0, 0.0, 1.0]), Box([0.05, 0.1, 0.2]).translate([0.6, 0.0, 0.2])
+    world = Surroundings((table, block), margin=0.01, clearance=0.05)
+    scene = world.in_scene(frame)
+    x = np.random.default_rng(0).uniform(-0.5, 1.0, (100, 3))
+    places = jnp.asarray(frame.to_scene(x), jnp.float32)
+    np.testing.assert_allclose(scene.distance(places), frame.scale * np.asarray(world.distance(x)), atol=1e-4)
+    assert scene.clearance == pytest.approx(frame.scale * 0.05)
+    assert scene.margin == pytest.approx(frame.scale * 0.01)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_table_is_found_under_an_object(seed):
+    rng = np.random.default_rng(seed)
+    turn = Rotation.from_rotvec(rng.normal(0.0, 0.1, 3)).as_matrix()
+    table = np.concatenate([rng.uniform(-0.6, 0.6, (600, 2)), rng.normal(0.0, 0.001, (600, 1))], axis=1)
+    thing = rng.normal(np.array([0.0, 0.0, 0.15]), 0.03, (300, 3))
+    points = np.concatenate([thing, table]) @ turn.T + [0.3, 0.2, 0.7]
+    plane = support_plane(points, up=(0.0, 0.0, 1.0), tolerance=0.004)
+    assert np.asarray(plane.normal) @ turn[:, 2] > np.cos(np.radians(0.5))
+    assert np.abs(np.asarray(plane(jnp.asarray(points[300:], jnp.float32)))).max() < 0.008
+    assert np.asarray(plane(jnp.asarray(points[:300], jnp.float32))).min() > -0.01
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Surroundings((TABLE,), margin=-1.0), "margin is -1.0"),
+        (lambda: Surroundings(clearance=-0.1), "clearance is -0.1"),
+        (lambda: HalfSpace([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]), "normal is .*: give a direction"),
+        (lambda: solid_of_mesh(*box_mesh([0, 0, 0], [1, 1, 1]), resolution=3), "resolution is 3"),
+        (lambda: solid_of_mesh(np.zeros((3, 3)), np.array([[0, 1, 2]])), "all 3 vertices of the mesh lie at"),
+        (lambda: solid_of_mesh(np.eye(3), np.array([[0, 1, 3]])), "faces refer to vertices 0 to 3"),
+        (lambda: support_plane(np.zeros((2, 3)), (0.0, 0.0, 1.0), 0.01), "three at least"),
+        (lambda: support_plane(np.eye(3), (0.0, 0.0, 0.0), 0.01), "give a direction"),
+        (lambda: support_plane(np.full((4, 3), np.nan), (0.0, 0.0, 1.0), 0.01), "not all finite"),
+        (lambda: support_plane(np.eye(3) * [1, 1, 0.0], (1.0, 0.0, 0.0), 0.01), "degrees off level"),
+    ],
+)
+def test_bad_input_is_named(make, message):
+    with pytest.raises(InputError, match=message):
+        make()

@@ -1,0 +1,227 @@
+"""The studies of trucks, household objects and fruits on a small scale: what they record beside the pyramids'."""
+
+import functools
+import json
+from pathlib import Path
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from jaxnbv.checks import InputError
+from jaxnbv.cli.model_name import ModelName
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.networks import InvariantClassifier, save_checkpoint
+from jaxnbv.search import FarthestView
+from jaxnbv.search.candidates import sphere_candidates
+from jaxnbv.studies.classification.modelnet10 import ModelNet10Study
+from jaxnbv.studies.classification.omniobject3d import OmniObject3DStudy
+from jaxnbv.studies.classification.pictures import write_pictures
+from jaxnbv.studies.classification.truck import TruckStudy
+from jaxnbv.studies.engine.charts import write_charts
+from jaxnbv.studies.engine.measures import values
+from jaxnbv.studies.engine.meshes import class_meshes
+from jaxnbv.studies.engine.tables import summary, write_tables
+from jaxnbv.studies.scenes import FRUITS, HOUSEHOLD, Split, truck_scene
+from jaxnbv.studies.scenes.class_object import scan_telling
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Coverage
+
+SCENE, CANDIDATES = 4, 12
+CAMERA = Camera(height=24, width=24)
+
+
+class Linear(eqx.Module):
+    """An opinion from the means of points and normals."""
+
+    classes: int = eqx.field(static=True)
+
+    def __call__(self, cloud):
+        rows = jnp.concatenate([cloud.points, cloud.normals], axis=-1)
+        mean = jnp.sum(jnp.where(cloud.mask[:, None], rows, 0.0), axis=0) / jnp.maximum(cloud.count, 1)
+        weight = jnp.asarray(np.random.default_rng(1).normal(size=(self.classes, 6)), mean.dtype)
+        return jax.nn.log_softmax(2.0 * weight @ mean)
+
+
+class Unshipped(OmniObject3DStudy):
+    """Without a network."""
+
+    network: ClassVar[str] = "teapot"
+
+
+def small(kind, **settings):
+    few = {"num_candidates": CANDIDATES, "num_samples": 2, "grid_resolution": 20, "capacity": 250, "num_points": 100}
+    model = GeometricSPSR(lengthscale=0.05, truncation=8)
+    classifier = Linear(len(kind.objects.classes))
+    return kind(classifier=classifier, model=model, views=3, camera=CAMERA, **few, **settings)
+
+
+@functools.cache
+def record(kind):
+    return json.loads(json.dumps(small(kind).run_scene(SCENE), allow_nan=False))
+
+
+def test_of_a_truck_the_pixels_of_its_cargo_are_recorded():
+    found, truck = record(TruckStudy), truck_scene(Split.TEST, SCENE)
+    assert list(found["methods"]) == list(TruckStudy.methods)
+    assert found["label"] == int(truck.label) == SCENE
+    poses = sphere_candidates(CANDIDATES, 2.5)
+    _, seen = scan_telling(truck, CAMERA, poses)
+    cargo = np.asarray(jnp.sum((jnp.abs(truck.cargo(seen.points)) < 2e-3) & seen.mask, axis=-1))
+    np.testing.assert_allclose(found["cargo_pixels"], cargo, atol=2)
+    assert cargo.max() > 150 > cargo.min() == 0
+    for held in found["methods"].values():
+        for run in held["runs"]:
+            assert run["cargo_pixels"] == [found["cargo_pixels"][index] for index in run["candidates"]]
+            assert np.shape(run["log_p"]) == (3, 10)
+    shown = values([found], list(TruckStudy.methods), TruckStudy.measure("cargo"))[0]
+    for name, row in zip(TruckStudy.methods, shown, strict=True):
+        if name != "random":
+            pixels = found["methods"][name]["runs"][0]["cargo_pixels"]
+            np.testing.assert_array_equal(row, np.maximum.accumulate(np.array(pixels) >= 150))
+
+
+def test_first_views_of_trucks_are_random_and_told_apart_by_what_they_show():
+    study = small(TruckStudy)
+    firsts = [study.first_view(study.scene(index)) for index in range(12)]
+    assert len({*firsts}) > 5
+    shown = [record(TruckStudy) | {"first": int(np.argmax(record(TruckStudy)["cargo_pixels"]))}]
+    hidden = [record(TruckStudy) | {"first": int(np.argmin(record(TruckStudy)["cargo_pixels"]))}]
+    groups = TruckStudy.groups(shown + hidden)
+    assert groups == {"all": shown + hidden, "first view without cargo": hidden, "first view with cargo": shown}
+    assert {*TruckStudy.groups(shown)} == {"all", "first view with cargo"}
+
+
+@pytest.mark.parametrize("kind", [ModelNet10Study, OmniObject3DStudy])
+def test_where_all_of_the_object_tells_its_class_no_pixels_are_counted(kind):
+    found = record(kind)
+    assert list(found["methods"]) == list(kind.methods)
+    assert found["label"] == SCENE % len(kind.objects.classes)
+    assert not [key for key in found if "pixels" in key]
+    for name, held in found["methods"].items():
+        assert [*held["runs"][0]] == ["candidates", "log_p"]
+        for entry in held["diagnostics"]:
+            assert entry["rank_correlation"] is None
+            assert (entry["roughness"] is None) == (name in ("farthest", "oracle"))
+    assert {*kind.groups([found])} == {"all"}
+
+
+@pytest.mark.parametrize("kind", [TruckStudy, ModelNet10Study, OmniObject3DStudy])
+def test_tables_charts_and_pictures(kind, tmp_path):
+    text = summary([record(kind)], kind)
+    assert kind.title in text
+    assert "Stable hit" in text
+    paths = [*write_tables([record(kind)], kind, tmp_path), *write_charts([record(kind)], kind, tmp_path)]
+    assert all(path.stat().st_size > 0 for path in paths)
+    (picture,) = write_pictures([record(kind)], small(kind), tmp_path, pixels=24)
+    with Image.open(picture) as image:
+        assert np.asarray(image.convert("L")).std() > 5
+
+
+def box_files(folder, *names):
+    for name in names:
+        file = folder / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        trimesh.creation.box((1.0, 0.5, 0.25)).export(file)
+
+
+def test_meshes_of_classes_take_turns_and_other_folders_are_passed_over(tmp_path):
+    """As ModelNet has them, in `test` and with underscores, and in any depth."""
+    box_files(
+        tmp_path, "bench/a.obj", "chair/b.obj", "chair/a.ply", "Night_Stand/train/a.off", "Night_Stand/test/c.off"
+    )
+    box_files(tmp_path, "chair/deep/er/c.stl")
+    (tmp_path / "chair" / "readme.txt").write_text("no mesh")
+    found = class_meshes(tmp_path, HOUSEHOLD)
+    assert [(HOUSEHOLD[mesh.label], Path(mesh.path).name) for mesh in found] == [
+        ("chair", "a.ply"),
+        ("night stand", "c.off"),
+        ("chair", "b.obj"),
+        ("chair", "c.stl"),
+    ]
+
+
+def test_copies_of_modelnet_are_turned_upright(tmp_path):
+    numbers = {"bathtub": range(107, 157), "night_stand": range(201, 287)}
+    box_files(tmp_path, *(f"{name}/test/{name}_{number:04d}.off" for name in numbers for number in numbers[name]))
+    box_files(tmp_path, "bathtub/train/bathtub_0001.off", "chair/y_up.off")
+    found = class_meshes(tmp_path, HOUSEHOLD)
+    assert [(HOUSEHOLD[mesh.label], mesh.name, mesh.up) for mesh in found[:4]] == [
+        ("bathtub", "bathtub_0107", "z"),
+        ("chair", "y_up", "y"),
+        ("night stand", "night_stand_0201", "z"),
+        ("bathtub", "bathtub_0108", "z"),
+    ]
+    assert len(found) == 50 + 86 + 1
+    study = small(ModelNet10Study, meshes=found)
+    # The sides of the box in its file are 1, 0.5 and 0.25.
+    for index, sides in ((0, [2.5, 0.625, 1.25]), (1, [2.5, 1.25, 0.625])):
+        np.testing.assert_allclose(np.ptp(study.scene(index).surface.vertices, axis=0), sides)
+
+
+def test_copies_of_omniobject3d_name_their_scenes_by_object(tmp_path):
+    names = ("apple/apple_003", "apple/apple_001", "toy_car/toy_car_001", "orange/orange_010")
+    box_files(tmp_path / "raw_scans", *(f"{name}/Scan/Scan.obj" for name in names))
+    (tmp_path / "point_clouds").mkdir()
+    for folder in (tmp_path, tmp_path / "raw_scans"):
+        study = small(OmniObject3DStudy, meshes=class_meshes(folder, FRUITS))
+        scenes = [study.scene(index) for index in range(study.num_scenes)]
+        assert [scene.name for scene in scenes] == ["apple apple_001", "orange orange_010", "apple apple_003"]
+        assert [scene.task.label for scene in scenes] == [FRUITS.index(name) for name in ("apple", "orange", "apple")]
+
+
+def test_folders_without_a_class_or_a_mesh_are_refused(tmp_path):
+    with pytest.raises(InputError, match="no folder"):
+        class_meshes(tmp_path / "none", HOUSEHOLD)
+    with pytest.raises(InputError, match="none of the folders bathtub, bed, chair"):
+        class_meshes(tmp_path, HOUSEHOLD)
+    (tmp_path / "sofa" / "test").mkdir(parents=True)
+    with pytest.raises(InputError, match="sofa holds no mesh"):
+        class_meshes(tmp_path, HOUSEHOLD)
+
+
+def test_meshes_in_place_of_procedural_objects(tmp_path):
+    box_files(tmp_path, "chair/a.off", "desk/b.obj")
+    study = small(ModelNet10Study, meshes=class_meshes(tmp_path, HOUSEHOLD))
+    assert study.num_scenes == 2
+    found = study.run_scene(1, ("farthest", "coverage"))
+    assert (found["label"], found["name"]) == (HOUSEHOLD.index("desk"), "desk b")
+    (run,) = found["methods"]["coverage"]["runs"]
+    assert len({*run["candidates"]}) == 3
+    seen = study.scene(1).task.scans[run["candidates"][0]].to_numpy()[0]
+    # A box of sides 2.5, 1.25 and 0.625; the noise is 0.01.
+    away = np.abs(np.abs(seen) - [1.25, 0.625, 0.3125]).min(axis=1)
+    assert away.max() < 0.06
+    (picture,) = write_pictures([found], study, tmp_path, pixels=24)
+    assert picture.exists()
+    with pytest.raises(InputError, match="no scene 2: the study has 2 meshes"):
+        study.run_scene(2)
+    with pytest.raises(InputError, match="2 meshes of cargo and 0 of trucks: give both, or none"):
+        small(TruckStudy, meshes=class_meshes(tmp_path, HOUSEHOLD))
+
+
+def test_a_network_of_ones_own_takes_the_place_of_the_shipped_one(tmp_path):
+    network = InvariantClassifier(len(FRUITS), jax.random.key(0), groups=(20, 8))
+    save_checkpoint(network, tmp_path / "mine.safetensors")
+    made = OmniObject3DStudy.configured(ModelName.SCREENED, 2, True, classifier=tmp_path / "mine.safetensors")
+    (study,) = made.values()
+    assert (study.classifier.num_points, study.imagining.num_points) == OmniObject3DStudy.fed
+    np.testing.assert_array_equal(study.classifier.network.head[1].bias, network.head[1].bias)
+    with pytest.raises(InputError, match=r"tells 5 classes apart; the study has 10: bathtub, bed"):
+        ModelNet10Study.configured(ModelName.SCREENED, 2, True, classifier=tmp_path / "mine.safetensors")
+    with pytest.raises(InputError, match="no classifier of 'teapot' ships: give the file of one"):
+        Unshipped.configured(ModelName.SCREENED, 2, True)
+
+
+def test_a_method_of_ones_own_on_household_objects():
+    def own(study, scene):
+        return study.planner_of(Coverage(), FarthestView(study.candidates))
+
+    found = small(ModelNet10Study).run_scene(SCENE, ("farthest",), {"mine:own": own})["methods"]
+    (ours,), (theirs,) = found["mine:own"]["runs"], found["farthest"]["runs"]
+    np.testing.assert_allclose(ours["log_p"], theirs["log_p"], atol=1e-5)

@@ -1,0 +1,93 @@
+"""The study of searches on a small scale: what must hold between searches that look at the same samples."""
+
+import functools
+import json
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnbv.checks import InputError
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.studies.classification.searches import SearchStudy
+from jaxnbv.studies.engine.tables import summary
+from jaxnbv.surfaces import GeometricSPSR
+
+SCENE, VIEWS = 3, 3
+
+
+class Linear(eqx.Module):
+    """An opinion on five classes from the means of points and normals."""
+
+    def __call__(self, cloud):
+        rows = jnp.concatenate([cloud.points, cloud.normals], axis=-1)
+        mean = jnp.sum(jnp.where(cloud.mask[:, None], rows, 0.0), axis=0) / jnp.maximum(cloud.count, 1)
+        return jax.nn.log_softmax(jnp.asarray(np.random.default_rng(1).normal(size=(5, 6)), mean.dtype) @ mean)
+
+
+@functools.cache
+def study():
+    small = {"num_candidates": 14, "num_samples": 4, "grid_resolution": 20, "capacity": 250, "num_points": 100}
+    seen = {"model": GeometricSPSR(lengthscale=0.05, truncation=8), "camera": Camera(height=12, width=12)}
+    return SearchStudy(classifier=Linear(), views=VIEWS, num_starts=2, iterations=2, **seen, **small)
+
+
+@functools.cache
+def record():
+    return json.loads(json.dumps(study().run_scene(SCENE)))
+
+
+def test_a_search_that_climbs_from_the_candidates_finds_no_less_and_one_with_fewer_samples_no_more():
+    """At the second view, where all look at the same samples."""
+    value = {method: held["values"][0] for method, held in record()["methods"].items()}
+    assert {*value} == {*SearchStudy.methods}
+    assert value["halving"] <= value["discrete"] + 1e-5
+    assert value["hybrid"] >= value["discrete"] - 1e-5
+
+
+def test_each_search_keeps_to_its_poses():
+    poses = {method: study().poses_of(held)[1:] for method, held in record()["methods"].items()}
+    assert all(len(views) == VIEWS - 1 for views in poses.values())
+    candidates = np.asarray(study().candidates.poses().position)
+    for method in ("discrete", "halving"):
+        for pose in poses[method]:
+            assert np.linalg.norm(candidates - pose.position, axis=1).min() < 1e-5
+    for method, views in poses.items():
+        for pose in views:
+            distance = np.linalg.norm(pose.position)
+            cosine = -pose.position @ pose.forward / distance
+            if method == "gradient-constrained":
+                assert 2.2 <= distance <= 2.8
+                assert cosine >= math.cos(math.radians(10.0)) - 1e-5
+            else:
+                assert distance == pytest.approx(2.5, abs=1e-4)
+                assert cosine == pytest.approx(1.0, abs=1e-5)
+
+
+def test_what_is_recorded_is_what_the_classifier_says_of_the_views():
+    scene, held = study().scene(SCENE), record()["methods"]["gradient-2dof"]
+    clouds = [state.cloud for _, state in study().seen(scene, held)]
+    np.testing.assert_allclose(held["runs"][0]["log_p"], [Linear()(cloud) for cloud in clouds], atol=1e-4)
+
+
+def test_times_are_those_of_steps_that_do_not_compile():
+    seconds = record()["methods"]["hybrid"]["seconds"]
+    assert len(seconds) == VIEWS - 1
+    made = {"methods": {"hybrid": {"seconds": [9.0, 0.5, 0.1, 0.3]}, "discrete": {"seconds": [9.0]}}}
+    time = SearchStudy.measure("seconds")
+    assert time.of(made, "hybrid") == [0.3]
+    assert math.isnan(time.of(made, "discrete")[0])
+
+
+def test_tables_tell_values_and_times():
+    text = summary([record()], SearchStudy)
+    assert "Expected cross-entropy of the view (nats), by view" in text
+    assert "Time of a proposal (seconds)" in text
+
+
+def test_free_poses_are_no_method():
+    with pytest.raises(InputError, match="gradient-6dof"):
+        study().run_scene(SCENE, ("gradient-6dof",))

@@ -1,0 +1,102 @@
+"""Records of a study on disk."""
+
+import json
+
+import pytest
+
+from jaxnbv.checks import InputError
+from jaxnbv.studies.engine.records import RecordFolder
+
+
+def test_records_are_kept_and_the_missing_ones_made(tmp_path):
+    asked = []
+
+    def run(index):
+        asked.append(index)
+        if index == 2 and len(asked) == 3:
+            raise KeyboardInterrupt
+        return {"scene": index, "value": 0.1 * index}
+
+    config = {"views": 3, "radii": (1, 2)}
+    with pytest.raises(KeyboardInterrupt):
+        RecordFolder(tmp_path / "a" / "b", config).collect(4, run, progress=False)
+    found = RecordFolder(tmp_path / "a" / "b", config).collect(4, run, progress=False)
+    assert asked == [0, 1, 2, 2, 3]
+    assert found == [{"scene": index, "value": 0.1 * index} for index in range(4)]
+    assert RecordFolder(tmp_path / "a" / "b", config).collect(2, run, progress=False) == found[:2]
+    assert len(asked) == 5
+    (tmp_path / "a" / "b" / "scene_0001.json").unlink()
+    assert RecordFolder(tmp_path / "a" / "b", config).collect(4, run, progress=False) == found
+    assert asked[5:] == [1]
+
+
+def test_folders_of_another_study_and_damaged_records_are_refused(tmp_path):
+    RecordFolder(tmp_path, {"views": 3, "framing": "whole"}).collect(1, lambda index: {"scene": index}, progress=False)
+    with pytest.raises(InputError, match="another study; it differs in views: 3 there, 4 now"):
+        RecordFolder(tmp_path, {"views": 4, "framing": "whole"})
+    for damaged in (b'{"scene": ', b"", b"\xff\xfe\x00"):
+        (tmp_path / "scene_0000.json").write_bytes(damaged)
+        with pytest.raises(InputError, match=r"scene_0000\.json is damaged"):
+            RecordFolder(tmp_path, {"views": 3, "framing": "whole"}).collect(1, lambda index: {}, progress=False)
+    (tmp_path / "study.json").write_bytes(b"[")
+    with pytest.raises(InputError, match=r"study\.json is not a study's record"):
+        RecordFolder(tmp_path, {"views": 3, "framing": "whole"})
+    (tmp_path / "file").write_text("here")
+    with pytest.raises(InputError, match="cannot make the output folder"):
+        RecordFolder(tmp_path / "file", {"views": 3})
+
+
+def test_records_that_are_not_what_they_were_are_refused(tmp_path):
+    config = {"views": 3}
+
+    def collect(count=2):
+        return RecordFolder(tmp_path, config).collect(
+            count, lambda index: {"scene": index, "x": [0.25]}, progress=False
+        )
+
+    expected = collect()
+    file, whole = tmp_path / "scene_0001.json", (tmp_path / "scene_0001.json").read_text()
+    for changed, problem in (
+        (whole.replace("0.25", "0.26"), "checksum"),
+        ((tmp_path / "scene_0000.json").read_text(), "it is scene 0"),
+        ("[]", "it holds a list"),
+        ("null", "it holds a NoneType"),
+        ("[" * 100_000, "recursion"),
+        ('{"format": 2, "index": 1, "record": [], "sha256": ""}', "checksum"),
+    ):
+        assert changed != whole
+        file.write_text(changed)
+        with pytest.raises(InputError, match=rf"scene_0001\.json is damaged .*{problem}.*delete it"):
+            collect()
+    file.write_text('{"format": 3}')
+    with pytest.raises(InputError, match="format 3"):
+        collect()
+    file.unlink()
+    assert collect() == expected
+    for changed in ("[]", "null", "7"):
+        (tmp_path / "study.json").write_text(changed)
+        with pytest.raises(InputError, match=r"study\.json is not a study's record .*choose another"):
+            collect()
+
+
+def test_records_of_the_first_format_are_read(tmp_path):
+    (tmp_path / "study.json").write_text(json.dumps({"views": 3, "versions": {}}))
+    (tmp_path / "scene_0000.json").write_text(json.dumps({"scene": 0, "x": 1.5}))
+    found = RecordFolder(tmp_path, {"views": 3}).collect(2, lambda index: {"scene": index}, progress=False)
+    assert found == [{"scene": 0, "x": 1.5}, {"scene": 1}]
+    with pytest.raises(InputError, match="views: 3 there, 4 now"):
+        RecordFolder(tmp_path, {"views": 4})
+
+
+def test_keys_that_are_numbers_are_read_as_text(tmp_path):
+    found = RecordFolder(tmp_path, {}).collect(1, lambda index: {"by view": {10: 1.5, 9: 0.5}}, progress=False)
+    assert found == [{"by view": {"10": 1.5, "9": 0.5}}]
+
+
+def test_a_study_that_fails_at_once_does_not_bind_its_folder(tmp_path):
+    def fail(index):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        RecordFolder(tmp_path, {"views": 3}).collect(1, fail, progress=False)
+    assert RecordFolder(tmp_path, {"views": 4}).collect(1, lambda index: {}, progress=False) == [{}]

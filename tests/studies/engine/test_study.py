@@ -1,0 +1,152 @@
+"""The engine, with a study as small as can be."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy import ToyStudy
+
+from jaxnbv.checks import InputError
+from jaxnbv.cli.model_name import ModelName
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import limit_capacity
+from jaxnbv.geometry.pose import look_at
+from jaxnbv.planning.planner import Planner
+from jaxnbv.scanning import SDFSurface
+from jaxnbv.search import GivenPoses, RandomView
+from jaxnbv.studies.engine.study import views_of
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Coverage
+
+
+def small(kind=ToyStudy, **settings):
+    few = {"views": 3, "num_candidates": 8, "num_samples": 2, "model": GeometricSPSR(0.05, truncation=4)}
+    fine = {"grid_resolution": 16, "camera": Camera(height=12, width=12), "capacity": 500}
+    return kind(**(few | fine | settings))
+
+
+def without_time(record):
+    return {key: value for key, value in record.items() if key != "seconds"}
+
+
+def test_a_record_is_json_and_methods_share_the_first_view():
+    study = small()
+    record = study.run_scene(3)
+    assert json.loads(json.dumps(record, allow_nan=False)) == record
+    assert (record["scene"], record["name"], record["study_views"]) == (3, "ball 3", 3)
+    assert list(record["methods"]) == ["farthest", "random"]
+    runs = [*record["methods"].values()]
+    assert [views_of(run) for run in runs] == [3, 3]
+    assert runs[0]["views"][0] == runs[1]["views"][0]
+    assert runs[0]["points"][0] == runs[1]["points"][0]
+    first = study.candidates.poses()[record["first"]]
+    assert runs[0]["views"][0]["position"] == first.position.tolist()
+    assert without_time(study.run_scene(3)) == without_time(record)
+    assert study.run_scene(3, ["random"])["methods"] == {"random": runs[1]}
+    assert study.run_scene(4)["first"] != record["first"] or study.run_scene(5)["first"] != record["first"]
+
+
+def test_the_same_views_are_scanned_again_from_a_record_and_from_an_older_one():
+    study = small()
+    scene, run = study.scene(0), study.run_scene(0)["methods"]["farthest"]
+    seen = study.seen(scene, run)
+    assert [int(state.cloud.count) for _, state in seen] == run["points"]
+    scans = [scan for scan, _ in seen]
+    assert int(scans[0].count) + int(scans[1].count) == run["points"][1]
+    positions = np.asarray(study.candidates.poses().position)
+    numbers = [int(np.argmin(np.linalg.norm(positions - view["position"], axis=1))) for view in run["views"]]
+    # The thinned clouds hang on the last digits of the poses: of two points as far the one or the other comes first.
+    for (again, _), scan in zip(study.seen(scene, {"candidates": numbers}), scans, strict=True):
+        np.testing.assert_allclose(again.points, scan.points, atol=1e-5)
+    # The noise is there.
+    distance = np.abs(np.linalg.norm(scans[0].to_numpy()[0], axis=1) - 1.0)
+    assert 1e-4 < distance.mean() < 0.05
+    with pytest.raises(InputError, match="no views"):
+        study.seen(scene, {"views": []})
+
+
+def test_a_method_of_ones_own_stands_in_the_same_record():
+    study, asked = small(), []
+
+    def above(study, scene) -> Planner:
+        asked.append(scene.index)
+        poses = look_at(jnp.array([[0.0, 2.5, 0.1], [0.0, -2.5, 0.1], [0.1, 2.5, 0.0]]))
+        return study.planner_of(Coverage(), RandomView(GivenPoses(poses)))
+
+    record = study.run_scene(2, ["random"], {"mine:above": above})
+    assert asked == [2]
+    assert list(record["methods"]) == ["random", "mine:above"]
+    own = record["methods"]["mine:above"]
+    assert own["views"][0] == record["methods"]["random"]["views"][0]
+    assert {abs(round(view["position"][1], 3)) for view in own["views"][1:]} == {2.5}
+
+
+def test_a_method_of_ones_own_that_makes_no_planner_is_refused_before_anything_is_run(monkeypatch):
+    study = small()
+    monkeypatch.setattr(ToyStudy, "run_methods", lambda *_: pytest.fail("a method was run"))
+
+    def few(study, scene):
+        return Planner(study.model, study.camera, Coverage(), RandomView(3), max_views=1)
+
+    for make, problem in (
+        (lambda study, scene: None, "what the method mine makes is None; give Planner"),
+        (lambda study, scene: 1 / 0, r"the method mine fails on scene 0 \(ZeroDivisionError: .*test_study\.py:\d+\)"),
+        (lambda: None, "the method mine fails on scene 0 .*takes 0 positional arguments"),
+        (few, rf"a planner of 1 views, but the study has {study.views}: give Planner\(max_views={study.views}\)"),
+    ):
+        with pytest.raises(InputError, match=problem):
+            study.run_scene(0, ["random"], {"mine": make})
+
+
+def test_the_first_view_shows_enough():
+    class Picky(ToyStudy):
+        def shows_enough(self, scene, seen):
+            return float(seen.points[seen.mask].mean(axis=0)[1]) > 0.3
+
+    study = small(Picky)
+    for index in range(4):
+        assert float(study.candidates.poses().position[study.run_scene(index, ["random"])["first"]][1]) > 0.5
+    with pytest.raises(InputError, match="none of 3 candidates shows enough of ball 0"):
+        small(Never, views=2, num_candidates=3).run_scene(0)
+
+
+class Never(ToyStudy):
+    def shows_enough(self, scene, seen):
+        return False
+
+
+def test_unknown_methods_and_bad_numbers_are_refused():
+    with pytest.raises(InputError, match="unknown methods: best; choose from farthest, random"):
+        small().run_scene(0, ["best", "random"])
+    for settings in ({"views": 1}, {"views": 9}):
+        with pytest.raises(InputError, match="at least two views"):
+            small(**settings)
+
+
+def test_a_command_configures_it():
+    (name, study), *others = ToyStudy.configured(ModelName.PAPER, 4, quick=True).items()
+    assert (name, others) == ("", [])
+    assert (study.views, study.num_samples, study.carving) == (4, 4, None)
+    assert isinstance(study.model, GeometricSPSR)
+    (study,) = ToyStudy.configured(ModelName.SCREENED, 5, quick=False, num_candidates=20).values()
+    assert (study.num_samples, study.num_candidates) == (16, 20)
+    assert study.carving is not None
+
+
+def test_planners_have_the_studys_settings():
+    planner = small(carving=None).planner("random", None)
+    assert (planner.num_samples, planner.grid.resolution, planner.capacity, planner.max_views) == (2, 16, 500, 3)
+    assert planner.carving is None
+    assert isinstance(small().scene(0).surface, SDFSurface)
+    keys = [small().key(*of) for of in ((0, "first"), (1, "first"), (0, "episode"))]
+    assert len({tuple(jax.random.key_data(key).tolist()) for key in keys}) == 3
+
+
+def test_clouds_are_thinned_to_the_capacity():
+    study = small(capacity=100)
+    run = study.run_scene(0, ["random"])["methods"]["random"]
+    assert run["points"] == [100, 100, 100]
+    scan, state = study.seen(study.scene(0), run)[0]
+    np.testing.assert_array_equal(state.cloud.points, limit_capacity(scan, 100).points)

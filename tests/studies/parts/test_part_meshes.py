@@ -1,0 +1,119 @@
+"""The study of parts on meshes, on a table that the test builds."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+from jaxnbv.checks import InputError
+from jaxnbv.cli.model_name import ModelName
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.scanning import Grid, load_parts
+from jaxnbv.studies.parts import pictures
+from jaxnbv.studies.parts.meshes import MeshPartStudy, part_files
+from jaxnbv.studies.parts.nearest import NearestPart
+from jaxnbv.studies.parts.study import PartStudy
+from jaxnbv.surfaces import GeometricSPSR
+
+# Scene coordinates: the longest side is 2.5 and the box around all is centred. What is hidden stands within the post.
+BOXES = {
+    "hidden": ((0.0, -0.4, 0.0), (0.2, 0.2, 0.2)),
+    "post": ((0.0, -0.35, 0.0), (0.6, 1.3, 0.6)),
+    "slab": ((0.0, 0.65, 0.0), (2.5, 0.7, 2.0)),
+}
+
+
+def save(path, names):
+    path.parent.mkdir(exist_ok=True)
+    scene = trimesh.Scene()
+    for name in names:
+        center, extents = BOXES[name]
+        placed = trimesh.transformations.translation_matrix(center)
+        scene.add_geometry(trimesh.creation.box(extents), node_name=name, transform=placed)
+    scene.export(path)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    save(tmp_path / "bench" / "one.glb", ["slab"])
+    save(tmp_path / "table" / "a.glb", ["hidden", "post", "slab"])
+    save(tmp_path / "table" / "b.glb", ["post", "slab"])
+    return tmp_path
+
+
+def small_study(folder, **settings):
+    model = GeometricSPSR(lengthscale=0.05, truncation=8)
+    small = {"views": 3, "num_candidates": 12, "num_samples": 2, "model": model, "grid_resolution": 20}
+    limits = {"capacity": 1500, "camera": Camera(height=32, width=32), "imagined_rays": 12, "num_points": 100}
+    return MeshPartStudy(meshes=part_files(folder), **(small | limits | settings))
+
+
+def test_files_of_one_node_are_passed_over(folder):
+    assert part_files(folder) == ((str(folder / "table/a.glb"), 3), (str(folder / "table/b.glb"), 2))
+    with pytest.raises(InputError, match="no mesh of two nodes or more"):
+        part_files(folder / "bench")
+    with pytest.raises(InputError, match="there is no folder"):
+        part_files(folder / "chair")
+
+
+def test_points_belong_to_the_nearest_box(folder):
+    oracle = NearestPart.of(load_parts(folder / "table/b.glb"), 4, Grid(64, 1.4), 200)
+    points = np.random.default_rng(0).uniform(-1.2, 1.2, (200, 3))
+    beyond = [np.abs(points - center) - 0.5 * np.array(extents) for center, extents in list(BOXES.values())[1:]]
+    distance = np.stack([np.linalg.norm(np.maximum(b, 0), axis=1) + np.minimum(b.max(axis=1), 0) for b in beyond])
+    # A linear interpolant errs by less than a cell.
+    clear = np.abs(np.abs(distance[0]) - np.abs(distance[1])) > Grid(64, 1.4).spacing
+    assert clear.sum() > 100
+    nearest = np.argmin(np.abs(distance), axis=0)
+    np.testing.assert_array_equal(np.asarray(oracle.nearest(jnp.asarray(points)))[clear], nearest[clear])
+    mask = np.arange(200) < 150
+    cloud = PointCloud(*map(jnp.asarray, (points, np.tile([0.0, 1.0, 0.0], (200, 1)), mask)))
+    p = np.asarray(oracle(cloud))
+    np.testing.assert_allclose(p.sum(axis=1), mask, atol=1e-5)
+    assert (p[:, 2:] == 0).all()
+    fed, parts = oracle.predict(cloud)
+    np.testing.assert_array_equal(parts[:150], oracle.nearest(fed.points[:150]))
+    assert (parts[150:] == -1).all()
+    slope = jax.grad(lambda x: oracle(PointCloud(x, cloud.normals, cloud.mask))[:, 0].sum())(cloud.points)
+    assert np.isfinite(slope).all()
+    assert (slope[:150] != 0).any()
+
+
+def test_it_asks_for_the_parts_that_can_be_seen_and_counts_their_points(folder):
+    study = small_study(folder)
+    assert study.num_scenes == 2
+    record = study.run_scene(0, ("discrete", "farthest"))
+    assert (record["name"], record["category"], record["parts"], record["of"]) == (
+        "table a",
+        "table",
+        ["post", "slab"],
+        3,
+    )
+    scene = study.scene(0)
+    for run in record["methods"].values():
+        for counts, (_, state) in zip(run["counts"], study.seen(scene, run), strict=True):
+            points, _ = state.cloud.to_numpy()
+            # The slab is all that lies above 0.3; noise is 0.01.
+            slab = (points[:, 1] > 0.25).sum()
+            assert abs(counts[1] - slab) <= 0.03 * len(points)
+            assert sum(counts) == len(points)
+    with pytest.raises(InputError, match="there is no scene 2"):
+        study.scene(2)
+
+
+def test_the_command_takes_a_folder(folder, tmp_path):
+    (study,) = PartStudy.configured(ModelName.SCREENED, 3, quick=True, meshes=folder).values()
+    assert isinstance(study, MeshPartStudy)
+    assert [count for _, count in study.meshes] == [3, 2]
+    assert study.num_candidates == PartStudy.quick["num_candidates"]
+
+
+def test_its_pictures_are_of_the_object_with_the_most_parts(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(pictures, "_TRIES", 6)
+    study = small_study(folder)
+    records = [study.run_scene(index, ("farthest",)) for index in (1, 0)]
+    (path,) = pictures.write_pictures(records, study, tmp_path / "out", pixels=24)
+    assert path.name == "parts_001.png"
+    assert path.read_bytes()[:4] == b"\x89PNG"

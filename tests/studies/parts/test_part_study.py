@@ -1,0 +1,241 @@
+"""The part study on a small scale, against scans, counts and scores of its own."""
+
+import functools
+import json
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnbv.acquisition import ExpectedUtilityImprovement
+from jaxnbv.checks import InputError
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import concatenate, limit_capacity
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.networks import CATEGORIES, CloudSegmenter
+from jaxnbv.scanning import SDFSurface, SensorNoise, scan
+from jaxnbv.search import (
+    DiscreteSearch,
+    FarthestView,
+    FreePoses,
+    GradientSearch,
+    RandomView,
+    SpherePoses,
+    UncertaintyView,
+)
+from jaxnbv.search.candidates import sphere_candidates
+from jaxnbv.studies.parts import pictures as part_pictures
+from jaxnbv.studies.parts.study import PartStudy
+from jaxnbv.studies.scenes import Split, part_scene
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Coverage
+
+# A rocket.
+SCENE, CANDIDATES, VIEWS = 10, 12, 3
+CAMERA = Camera(height=32, width=32)
+# The others differ from these in their search or score alone.
+RUN = ("discrete", "farthest", "random")
+
+
+class Pointwise(eqx.Module):
+    """An opinion on each point by itself; once `enough` points are there, the parts take turns."""
+
+    enough: jax.Array
+
+    def __call__(self, points, normals, category, mask):
+        weight = np.random.default_rng(1).normal(size=(6, 50))
+        rows = jnp.concatenate([points, normals], axis=-1) @ jnp.asarray(weight, points.dtype)
+        # The labels of a rocket's three parts differ modulo 3.
+        turns = 9.0 * (jnp.arange(len(points))[:, None] % 3 == jnp.arange(50) % 3)
+        return jax.nn.log_softmax(jnp.where(jnp.sum(mask) >= self.enough, turns, 8.0 * rows))
+
+
+def small_study(enough=10**6, **settings):
+    model = GeometricSPSR(lengthscale=0.05, truncation=8)
+    small = {"views": VIEWS, "num_candidates": CANDIDATES, "num_samples": 2, "model": model, "grid_resolution": 20}
+    limits = {"capacity": 600, "imagined_rays": 12, "num_points": 100, "num_starts": 1, "iterations": 2}
+    segmenter = CloudSegmenter(Pointwise(jnp.asarray(enough)), 0, 500, scale=0.8)
+    return PartStudy(segmenter=segmenter, camera=CAMERA, **(small | limits | settings))
+
+
+@functools.cache
+def whole_record():
+    return small_study().run_scene(SCENE, RUN)
+
+
+def pose_of(view):
+    return Pose(np.asarray(view["rotation"], np.float32), np.asarray(view["position"], np.float32))
+
+
+@eqx.filter_jit
+def noisy_scan(solid, pose, key):
+    return SensorNoise()(scan(SDFSurface(solid), CAMERA, pose), key)
+
+
+def scans(record, method):
+    """What the sensor showed, from the recorded poses and the study's key."""
+    solid = part_scene(Split.TEST, record["scene"]).solid
+    key = small_study().key(record["scene"], "episode")
+    for index, view in enumerate(record["methods"][method]["views"]):
+        _, noise_key = jax.random.split(jax.random.fold_in(key, index))
+        yield noisy_scan(solid, pose_of(view), noise_key)
+
+
+def clouds(record, method, capacity=600):
+    cloud = None
+    for seen in scans(record, method):
+        cloud = limit_capacity(seen if cloud is None else concatenate(cloud, seen), capacity)
+        yield cloud
+
+
+def test_a_record_is_json_and_holds_every_method():
+    record, scene = json.loads(json.dumps(whole_record(), allow_nan=False)), part_scene(Split.TEST, SCENE)
+    assert record == whole_record()
+    assert list(record["methods"]) == list(RUN)
+    assert (record["scene"], record["split"], record["study_views"]) == (SCENE, "test", VIEWS)
+    category = CATEGORIES[int(scene.category)]
+    assert record["category"] == category.name == "rocket"
+    present = [bool(scene.parts[label]) for label in category.labels]
+    assert record["parts"] == [name for name, there in zip(category.parts, present, strict=True) if there]
+    for run in record["methods"].values():
+        assert len(run["views"]) == len(run["counts"]) <= VIEWS
+        assert {len(counts) for counts in run["counts"]} == {len(record["parts"])}
+        positions = [tuple(np.round(view["position"], 3)) for view in run["views"]]
+        assert len(set(positions)) == len(positions)
+
+
+def test_methods_share_the_first_view_which_sees_something():
+    runs = whole_record()["methods"].values()
+    assert len({json.dumps(run["views"][0]) for run in runs}) == 1
+    assert len({json.dumps(run["counts"][0]) for run in runs}) == 1
+    first = pose_of(next(iter(runs))["views"][0])
+    candidate = sphere_candidates(CANDIDATES, 2.0)[whole_record()["first"]]
+    np.testing.assert_array_equal(first.position, candidate.position)
+    assert int(next(scans(whole_record(), "random")).count) > 0
+
+
+def test_poses_are_candidates():
+    candidates = np.asarray(sphere_candidates(CANDIDATES, 2.0).position)
+    for run in whole_record()["methods"].values():
+        for view in run["views"]:
+            assert np.linalg.norm(candidates - view["position"], axis=1).min() < 1e-6
+            np.testing.assert_allclose(pose_of(view).forward, -np.asarray(view["position"]) / 2.0, atol=1e-5)
+
+
+def test_each_method_has_its_search_and_score():
+    study = small_study()
+    planners = {method: study.planner(method, study.scene(SCENE)) for method in study.methods}
+    searches = {
+        "discrete": DiscreteSearch,
+        "gradient-2dof": GradientSearch,
+        "gradient-6dof": GradientSearch,
+        "farthest": FarthestView,
+        "uncertainty": UncertaintyView,
+        "random": RandomView,
+        "coverage": DiscreteSearch,
+    }
+    assert {method: type(planner.search) for method, planner in planners.items()} == searches
+    for method, planner in planners.items():
+        by_parts = method in ("discrete", "gradient-2dof", "gradient-6dof")
+        assert isinstance(planner.acquisition, ExpectedUtilityImprovement if by_parts else Coverage)
+    assert isinstance(planners["gradient-2dof"].search.ascent.space, SpherePoses)
+    assert isinstance(planners["gradient-6dof"].search.ascent.space, FreePoses)
+
+
+@pytest.mark.parametrize("method", ["discrete", "random"])
+def test_counts_are_those_of_the_segmenter_on_all_that_was_seen(method):
+    record, study, scene = whole_record(), small_study(), part_scene(Split.TEST, SCENE)
+    segmenter = CloudSegmenter(study.segmenter.network, scene.category, 500, scale=0.8)
+    run = record["methods"][method]
+    again = study.seen(study.scene(SCENE), run)
+    assert len(again) == len(run["counts"])
+    labels = np.flatnonzero(np.asarray(scene.parts))
+    for counts, cloud, (_, state) in zip(run["counts"], clouds(record, method), again, strict=True):
+        np.testing.assert_allclose(state.cloud.points, cloud.points, atol=1e-5)
+        fed, said = segmenter.predict(cloud)
+        points, normals = np.asarray(fed.points, np.float64), np.asarray(fed.normals, np.float64)
+        weight = np.random.default_rng(1).normal(size=(6, 50))
+        score = np.concatenate([0.8 * points, normals], axis=1) @ weight
+        own = np.array(CATEGORIES[int(scene.category)].labels)
+        expected = np.where(np.asarray(fed.mask), own[np.argmax(score[:, own], axis=1)], -1)
+        assert np.mean(expected == said) > 0.99
+        np.testing.assert_allclose(counts, [(expected == label).sum() for label in labels], atol=2)
+
+
+def test_the_discrete_search_takes_the_candidate_whose_imagined_scans_find_most():
+    record, study, scene = whole_record(), small_study(), part_scene(Split.TEST, SCENE)
+    planner = study.planner("discrete", study.scene(SCENE))
+    views = [pose_of(view) for view in record["methods"]["discrete"]["views"]]
+    segmenter = CloudSegmenter(study.segmenter.network, scene.category, 100, scale=0.8)
+    state = planner.init(next(scans(record, "discrete")), views[0], CAMERA)
+    key = study.key(SCENE, "episode")
+    step_key, _ = jax.random.split(jax.random.fold_in(key, 1))
+    surfaces = planner.sample_surfaces(state, jax.random.split(step_key)[0])
+
+    @eqx.filter_jit
+    def improvements(cloud, surfaces, poses):
+        # N_target = 60 of 2,048 points, in proportion.
+        def utility(cloud):
+            return jnp.sum(jnp.tanh(jnp.sum(segmenter(cloud), axis=0) / (60 * 100 / 2048)))
+
+        known = limit_capacity(cloud, 100)
+
+        def of(surface, pose):
+            seen = scan(surface, planner.camera, pose)
+            return jnp.where(seen.mask.any(), jnp.maximum(utility(concatenate(known, seen)) - utility(known), 0.0), 0.0)
+
+        return jax.lax.map(lambda s: jax.lax.map(lambda p: of(s, p), poses), surfaces)
+
+    poses = sphere_candidates(CANDIDATES, 2.0)
+    value = np.asarray(improvements(state.cloud, surfaces, poses)).mean(axis=0)
+    value[record["first"]] = -np.inf
+    chosen = int(np.argmin(np.linalg.norm(poses.position - views[1].position, axis=1)))
+    # Scans that show all parts are worth nearly the same.
+    assert value[chosen] > value.max() - 1e-4
+    assert np.sum(value > value.max() - 1e-4) < CANDIDATES / 3
+
+
+def test_a_run_stops_once_every_part_has_the_largest_target():
+    """With a segmenter that is even-handed once there are more points than the first view shows."""
+    first = int(next(scans(whole_record(), "farthest")).count)
+    study = small_study(first + 1, capacity=4096)
+    study = eqx.tree_at(lambda s: s.segmenter, study, CloudSegmenter(study.segmenter.network, 0, 2048, scale=0.8))
+    record = study.run_scene(SCENE, ("farthest",))
+    run = record["methods"]["farthest"]
+    assert min(run["counts"][0]) < 100 <= min(run["counts"][-1])
+    assert [min(counts) >= 100 for counts in run["counts"]] == [False] * (len(run["counts"]) - 1) + [True]
+    assert len(run["counts"]) < VIEWS
+    assert run["views"] == whole_record()["methods"]["farthest"]["views"][: len(run["views"])]
+
+
+def test_planners_of_all_categories_share_their_compilations(compilations):
+    study, first = small_study(), pose_of(whole_record()["methods"]["discrete"]["views"][0])
+    state = study.planner("discrete", study.scene(0)).init(next(scans(whole_record(), "discrete")), first, CAMERA)
+    values = []
+    for index in (1, 4):
+        planner = study.planner("discrete", study.scene(index))
+        del compilations[:]
+        values.append(np.asarray(planner.propose(state, jax.random.key(1)).values))
+    assert not compilations
+    assert (values[0] != values[1]).any()
+
+
+def test_pictures_are_of_the_scenes_and_methods_asked_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(part_pictures, "_TRIES", 6)
+    (path,) = part_pictures.write_pictures([whole_record()], small_study(), tmp_path / "a", scenes=2, pixels=24)
+    assert path == tmp_path / "a" / f"parts_{SCENE:03d}.png"
+    assert path.read_bytes()[:4] == b"\x89PNG"
+    with pytest.raises(InputError, match="no records"):
+        part_pictures.write_pictures([], small_study(), tmp_path)
+
+
+def test_unknown_methods_and_bad_numbers_are_refused():
+    with pytest.raises(InputError, match=r"unknown methods: nearest; choose from discrete"):
+        small_study().run_scene(SCENE, ("nearest",))
+    for settings in ({"views": 1}, {"views": CANDIDATES + 1}):
+        with pytest.raises(InputError, match="at least two views"):
+            small_study(**settings)
+    with pytest.raises(InputError, match="must not be negative"):
+        small_study().run_scene(-1, ("farthest",))

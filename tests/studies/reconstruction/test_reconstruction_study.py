@@ -1,0 +1,187 @@
+"""The reconstruction study on a small scale."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+import jaxnbv as nbv
+from jaxnbv.checks import InputError
+from jaxnbv.scanning import scan
+from jaxnbv.scanning.metrics import coverage, surface_distance, truth_points
+from jaxnbv.scanning.reconstruction import has_poisson
+from jaxnbv.search.candidates import sphere_candidates
+from jaxnbv.storage import describe
+from jaxnbv.studies.engine.meshes import mesh_files
+from jaxnbv.studies.engine.records import RecordFolder
+from jaxnbv.studies.reconstruction import study as reconstruction_study
+from jaxnbv.studies.reconstruction.pictures import write_pictures
+from jaxnbv.studies.reconstruction.study import MEAN, POISSON, ReconstructionStudy, reconstruct
+
+# Those that draw no samples compile in a fraction of the time; all planners are of the same make.
+RUN = ("farthest", "random")
+CANDIDATES = 10
+HAS_POISSON = has_poisson()
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory):
+    """A folder with two objects and files that belong to them."""
+    folder = tmp_path_factory.mktemp("meshes")
+    trimesh.creation.torus(1.0, 0.4, 40, 20).export(folder / "b_torus.OBJ", file_type="obj")
+    trimesh.creation.box((1.0, 2.0, 3.0)).export(folder / "a_box.ply")
+    (folder / "readme.md").write_text("objects")
+    (folder / "b_torus.mtl").write_text("newmtl material_0")
+    return folder
+
+
+def small_study(meshes=None, views=3, **settings):
+    model = nbv.GeometricSPSR(lengthscale=0.05, truncation=8)
+    small = {"num_candidates": CANDIDATES, "num_samples": 2, "model": model, "grid_resolution": 20, "capacity": 250}
+    return ReconstructionStudy(meshes=meshes, views=views, **(small | settings))
+
+
+_records: dict = {}
+
+
+@pytest.fixture
+def record(meshes):
+    if not _records:
+        _records["torus"] = small_study(meshes).run_scene(1, RUN)
+    return _records["torus"]
+
+
+def test_a_record_is_json_and_holds_every_method(record):
+    assert json.loads(json.dumps(record, allow_nan=False)) == record
+    assert (record["scene"], record["name"]) == (1, "b_torus.OBJ")
+    assert list(record["methods"]) == list(RUN)
+    assert ReconstructionStudy.methods == ("coverage", "farthest", "uncertainty", "random")
+    for method in record["methods"].values():
+        assert len({tuple(view["position"]) for view in method["views"]}) == 3
+        assert 0 < method["coverage"][0] < method["coverage"][-1] <= 1
+        assert 0 < method["points"] <= 250
+        for name, found in method["reconstructions"].items():
+            if name == POISSON and not HAS_POISSON:
+                assert found is None
+                continue
+            assert found["chamfer"] == found["accuracy"] + found["completeness"]
+            assert 0 < found["chamfer"] < 2 * found["hausdorff"]
+
+
+def test_a_scene_can_be_run_again_with_some_of_the_methods(record, meshes):
+    again = small_study(meshes).run_scene(1, ("random",))
+    assert list(again["methods"]) == ["random"]
+    for name, method in again["methods"].items():
+        assert method == record["methods"][name]
+
+
+def test_planners_differ_in_their_search_alone():
+    study = small_study()
+    scene = study.scene(0)
+    searches = (nbv.DiscreteSearch, nbv.FarthestView, nbv.UncertaintyView, nbv.RandomView)
+    for method, search in zip(study.methods, searches, strict=True):
+        planner = study.planner(method, scene)
+        assert planner.search == search(study.candidates)
+        assert describe(planner) | {"search": None} == describe(study.planner("farthest", scene)) | {"search": None}
+    assert isinstance(planner.acquisition, nbv.Coverage)
+    assert (planner.num_samples, planner.grid, planner.capacity, planner.max_views) == (2, nbv.Grid(20), 250, 3)
+
+
+def test_views_are_those_of_an_episode_from_the_shared_first_view(record, meshes):
+    study = small_study(meshes)
+    scene, poses = study.scene(1), sphere_candidates(CANDIDATES)
+    assert bool(scan(scene.surface, nbv.Camera(), poses[record["first"]]).mask.any())
+    key = study.key(1, "episode")
+    truth = truth_points(scene.surface, study.key(1, "scene"))
+    for name, method in record["methods"].items():
+        episode = nbv.simulate(
+            study.planner(name, scene), scene.surface, poses[record["first"]], 3, key, progress=False
+        )
+        for view, taken, share in zip(episode.views, method["views"], method["coverage"], strict=True):
+            np.testing.assert_array_equal(view.pose.position, np.float32(taken["position"]))
+            assert share == coverage(view.cloud, truth)
+        cloud = study.seen(scene, method)[-1][1].cloud
+        np.testing.assert_array_equal(cloud.points, episode.cloud.points)
+
+
+def test_distances_are_those_of_the_reconstruction_from_the_last_cloud(record, meshes):
+    study = small_study(meshes)
+    truth = study.scene(1).surface.sample_points(jax.random.key(5), 20_000)
+    method = record["methods"]["farthest"]
+    state = study.seen(study.scene(1), method)[-1][1]
+    for name, found in method["reconstructions"].items():
+        if found is not None:
+            points = reconstruct(study, state, name).sample_points(jax.random.key(6), 20_000)
+            expected = surface_distance(points, truth)
+            assert found["chamfer"] == pytest.approx(expected.chamfer, rel=0.05)
+            assert found["hausdorff"] == pytest.approx(expected.hausdorff, rel=0.1)
+
+
+def test_without_pymeshlab_the_mean_alone_is_measured(monkeypatch, meshes):
+    monkeypatch.setattr(reconstruction_study, "has_poisson", lambda: False)
+    found = small_study(meshes).run_scene(1, ("farthest",))["methods"]["farthest"]["reconstructions"]
+    assert found[POISSON] is None
+    assert found[MEAN]["chamfer"] > 0
+
+
+def test_procedural_scenes_differ_and_are_named():
+    study = small_study()
+    first, second = study.scene(0), study.scene(1)
+    assert (first.name, second.name) == ("airplane 0", "bag 1")
+    x = np.random.default_rng(0).uniform(-1.25, 1.25, (50, 3))
+    assert first.surface.in_jit
+    assert np.abs(np.asarray(first.surface.sdf(x) - second.surface.sdf(x))).max() > 0.1
+
+
+def test_mesh_files_are_sorted_and_what_cannot_be_read_is_named(meshes, tmp_path):
+    study = small_study(meshes)
+    assert [study.scene(index).name for index in (0, 1)] == ["a_box.ply", "b_torus.OBJ"]
+    np.testing.assert_allclose(np.ptp(study.scene(0).surface.vertices, axis=0), [2.5 / 3, 5 / 3, 2.5])
+    with pytest.raises(InputError, match="no scene 2: the study has 2 meshes"):
+        study.scene(2)
+    with pytest.raises(InputError, match="holds no mesh"):
+        mesh_files(tmp_path)
+    with pytest.raises(InputError, match="no folder"):
+        mesh_files(tmp_path / "missing")
+    (tmp_path / "broken.ply").write_bytes(b"not a mesh")
+    with pytest.raises(InputError, match=r"cannot read .*broken\.ply"):
+        small_study(tmp_path).run_scene(0)
+
+
+def test_bad_settings_are_refused(meshes):
+    for settings in ({"views": 1}, {"views": 11}):
+        with pytest.raises(InputError, match="at least two views"):
+            small_study(**settings)
+    with pytest.raises(InputError, match="unknown methods: heat; choose from coverage"):
+        small_study(meshes).run_scene(0, ("heat", "random"))
+
+
+def test_an_interrupted_study_goes_on(record, meshes, tmp_path):
+    asked = []
+
+    def run(index):
+        asked.append(index)
+        return record | {"scene": index}
+
+    config = {"study": describe(small_study(meshes))}
+    RecordFolder(tmp_path, config).collect(1, run, progress=False)
+    found = RecordFolder(tmp_path, config).collect(2, run, progress=False)
+    assert asked == [0, 1]
+    assert found == [record | {"scene": 0}, record]
+    for other in (small_study(meshes, views=4), small_study()):
+        with pytest.raises(InputError, match="another study"):
+            RecordFolder(tmp_path, {"study": describe(other)})
+
+
+def test_the_pictures_show_something(record, meshes, tmp_path):
+    folder = tmp_path / "pictures"
+    (picture,) = write_pictures([record], small_study(meshes), folder, pixels=80, dense=2000)
+    assert picture.name == "surfaces_001.png"
+    # The truth and two methods, side by side.
+    image = np.asarray(Image.open(picture).convert("L"))
+    assert image.std() > 5
+    for strip in np.array_split(image[:, 100:], 3, axis=1):
+        assert strip.std() > 5

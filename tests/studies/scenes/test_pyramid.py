@@ -1,0 +1,323 @@
+"""The synthetic pyramid against polygons, closed-form volumes and points placed on its faces by hand."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.path import Path as Polygon
+
+from jaxnbv.checks import InputError
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.scanning import Grid, mesh_from_sdf, scan
+from jaxnbv.scanning.mesh import load_mesh
+from jaxnbv.search.candidates import sphere_candidates
+from jaxnbv.studies.scenes import PATTERNS, Framing, Pyramid, Split, hidden_view, pyramid_scene, sample_pyramid
+from jaxnbv.studies.scenes.class_object import scan_telling
+from jaxnbv.studies.scenes.patterns import pattern_distance
+
+RNG = np.random.default_rng(0)
+CAMERA = Camera(height=24, width=24)
+
+values = eqx.filter_jit(lambda sdf, x: sdf(x))
+on_pattern = eqx.filter_jit(lambda pyramid, x: pyramid.on_pattern(x))
+on_base = eqx.filter_jit(lambda pyramid, x: pyramid.on_base(x))
+
+
+def polar(radii, degrees):
+    return np.stack([radii * np.cos(np.radians(degrees)), radii * np.sin(np.radians(degrees))], axis=-1)
+
+
+def arms():
+    a, b = 0.95, 0.3
+    quarter = np.array([[b, b], [b, a], [-b, a]])
+    return np.concatenate([quarter @ np.array([[c, s], [-s, c]]) for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))])
+
+
+# Outlines, each a closed polygon's corners; the second of the ring is its hole.
+OUTLINES = {
+    "cross": [arms()],
+    "ring": [polar(0.98, np.arange(0, 360, 0.25)), polar(0.5, np.arange(0, 360, 0.25))],
+    "star": [polar(np.tile([1.0, 0.48], 5), 90 + 36 * np.arange(10))],
+    "triangle": [polar(1.0, np.array([90, 210, 330]))],
+    "square": [polar(0.7 * np.sqrt(2), np.array([45, 135, 225, 315]))],
+}
+AREAS = {
+    "cross": 2 * 1.9 * 0.6 - 0.6**2,
+    "ring": np.pi * (0.98**2 - 0.5**2),
+    "star": 5 * 0.48 * np.sin(np.pi / 5),
+    "triangle": 0.75 * np.sqrt(3),
+    "square": 1.4**2,
+}
+
+
+def is_inside(name, points):
+    return np.logical_xor.reduce([Polygon(outline).contains_points(points) for outline in OUTLINES[name]])
+
+
+def edges(name):
+    return [np.concatenate([o[:, None], np.roll(o, -1, axis=0)[:, None]], axis=1) for o in OUTLINES[name]]
+
+
+def distance_to_outline(name, points):
+    nearest = np.full(len(points), np.inf)
+    for start, end in np.concatenate(edges(name)):
+        along = np.clip((points - start) @ (end - start) / np.sum((end - start) ** 2), 0.0, 1.0)
+        nearest = np.minimum(nearest, np.linalg.norm(points - start - along[:, None] * (end - start), axis=1))
+    return nearest
+
+
+def on_outline(name, count):
+    """Points on the outline."""
+    start, end = np.moveaxis(np.concatenate(edges(name)), 1, 0)
+    length = np.linalg.norm(end - start, axis=1)
+    chosen = RNG.choice(len(start), count, p=length / length.sum())
+    return start[chosen] + RNG.random((count, 1)) * (end - start)[chosen]
+
+
+@pytest.mark.parametrize("name", PATTERNS)
+def test_patterns_against_polygons(x64, name):
+    label, tolerance = jnp.asarray(PATTERNS.index(name)), 2e-5 if name == "ring" else 1e-12
+    points = RNG.uniform(-1.4, 1.4, (4000, 2))
+    value = np.asarray(pattern_distance(label, *jnp.asarray(points.T)))
+    distance = distance_to_outline(name, points)
+    np.testing.assert_array_equal((value < 0)[distance > tolerance], is_inside(name, points)[distance > tolerance])
+    assert (np.abs(value) <= distance + tolerance).all()
+    # A bound, but not a lazy one: half of the distance at least, or what a tip of 49 degrees leaves of it.
+    assert (np.abs(value) >= 0.4 * distance - tolerance).all()
+    edge = on_outline(name, 500)
+    assert np.abs(np.asarray(pattern_distance(label, *jnp.asarray(edge.T)))).max() < tolerance
+    assert np.linalg.norm(edge, axis=1).max() <= 1 + 1e-12
+
+
+def to_scene(pyramid, own):
+    rotation = np.asarray(pyramid.rotation, np.float64)
+    return float(pyramid.scale) * np.asarray(own) @ rotation.T + np.asarray(pyramid.offset, np.float64)
+
+
+def of_pattern(pyramid, flat):
+    """From the pattern's plane to the base's."""
+    turn, size = float(pyramid.turn), float(pyramid.size)
+    c, s = np.cos(turn), np.sin(turn)
+    return size * flat @ np.array([[c, s], [-s, c]]) + np.asarray(pyramid.place, np.float64)
+
+
+def name_of(pyramid):
+    return PATTERNS[int(pyramid.label)]
+
+
+def test_the_mesh_lies_on_the_surface_and_holds_the_pyramid_less_its_imprint():
+    for index in range(5):
+        framing = list(Framing)[index % 2]
+        pyramid = pyramid_scene(Split.VALIDATION, index, framing)
+        plain = eqx.tree_at(lambda p: p.depth, pyramid, jnp.asarray(0.0))
+        grid = Grid(100, 0.52 * framing.longest_side)
+        mesh, whole = (mesh_from_sdf(sdf, grid).to_trimesh() for sdf in (pyramid, plain))
+        assert np.abs(np.asarray(values(pyramid, mesh.vertices))).max() < 0.6 * grid.spacing
+        assert np.median(np.abs(np.asarray(values(pyramid, mesh.vertices)))) < 1e-2 * grid.spacing
+        scale, height, size = (float(v) for v in (pyramid.scale, pyramid.height, pyramid.size))
+        assert mesh.is_watertight
+        assert whole.volume == pytest.approx(scale**3 * 4 * height / 3, rel=3e-3)
+        imprint = scale**3 * AREAS[name_of(pyramid)] * size**2 * float(pyramid.depth)
+        assert whole.volume - mesh.volume == pytest.approx(imprint, rel=0.03)
+
+
+@pytest.mark.parametrize("framing", list(Framing))
+def test_the_longest_side_of_the_box_is_as_asked_and_the_box_is_centred(framing):
+    for index in range(8):
+        pyramid = pyramid_scene(Split.TRAIN, index, framing)
+        corners = [[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [0, 0, float(pyramid.height)]]
+        corners = to_scene(pyramid, corners)
+        np.testing.assert_allclose(np.asarray(values(pyramid, corners)), 0.0, atol=2e-6)
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        assert (high - low).max() == pytest.approx(framing.longest_side, rel=1e-5)
+        np.testing.assert_allclose(low + high, 0.0, atol=1e-5)
+    asked = sample_pyramid(jax.random.key(0), 3, 0.7)
+    assert float(asked.scale) == pytest.approx(0.28 * float(sample_pyramid(jax.random.key(0), 3).scale), rel=1e-5)
+
+
+def test_both_framings_show_the_same_pyramid():
+    near, far = (pyramid_scene(Split.TEST, 11, framing) for framing in (Framing.CLOSE_UP, Framing.WHOLE))
+    x = RNG.uniform(-1.5, 1.5, (500, 3))
+    np.testing.assert_allclose(np.asarray(values(far, x / 2)), np.asarray(values(near, x)) / 2, atol=1e-6)
+
+
+def test_slopes_are_at_most_one(x64):
+    for index in range(10):
+        pyramid = pyramid_scene(Split.TRAIN, index, list(Framing)[index // 5])
+        x = RNG.uniform(-1.5, 1.5, (4000, 3))
+        y = x + RNG.normal(size=x.shape) * 10.0 ** RNG.uniform(-3, 0.3, (len(x), 1))
+        change = np.abs(np.asarray(values(pyramid, x)) - np.asarray(values(pyramid, y)))
+        assert (change <= np.linalg.norm(x - y, axis=1) * (1 + 1e-9)).all()
+        assert change.max() > 0.1
+
+
+def scenes(split, count, framing=Framing.CLOSE_UP):
+    build = jax.jit(jax.vmap(lambda index: pyramid_scene(split, index, framing)))
+    return build(jnp.arange(count))
+
+
+def test_no_pattern_breaks_through_a_side_and_none_reaches_the_apex():
+    """The prism's upper rim, where the sides are nearest, over many scenes; the wall is at least 0.01 of the base."""
+    pyramids = scenes(Split.TRAIN, 2000)
+    for index in range(2000):
+        pyramid = jax.tree.map(lambda leaf, index=index: np.asarray(leaf)[index], pyramids)
+        corners = np.concatenate(OUTLINES[PATTERNS[pyramid.label]])
+        reach = np.abs(of_pattern(pyramid, corners)).max()
+        assert reach < 0.9 + 1e-6
+        assert 1.0 - pyramid.depth / pyramid.height - reach > 0.01
+        assert 0 < 3 * pyramid.depth < pyramid.height
+
+
+def clear_of_outline(name, local, count, points=None):
+    """The first of the points, given in the pattern's frame too, that are not near its outline."""
+    some = slice(5 * count)
+    return (local if points is None else points)[some][distance_to_outline(name, local[some]) > 0.03][:count]
+
+
+def faces(pyramid, count=400):
+    """Points in the pyramid's own frame on floor, wall, base and sides, none of them within 0.01 of an edge."""
+    name, height, depth = name_of(pyramid), float(pyramid.height), float(pyramid.depth)
+    flat = RNG.uniform(-1, 1, (20 * count, 2))
+    floor = clear_of_outline(name, flat[is_inside(name, flat)], count)
+    floor = np.insert(of_pattern(pyramid, floor), 2, depth, axis=1)
+    wall = of_pattern(pyramid, on_outline(name, count))
+    wall = np.insert(wall, 2, RNG.uniform(0.012, depth, count), axis=1)
+    base = RNG.uniform(-0.99, 0.99, (20 * count, 2))
+    turn, size = float(pyramid.turn), float(pyramid.size)
+    c, s = np.cos(turn), np.sin(turn)
+    local = (base - np.asarray(pyramid.place, np.float64)) @ np.array([[c, -s], [s, c]]) / size
+    outside = ~is_inside(name, local)
+    base = np.insert(clear_of_outline(name, local[outside], count, base[outside]), 2, 0.0, axis=1)
+    w = RNG.uniform(0.012, height, count)
+    reach = 1.0 - w / height
+    side = np.stack([reach, reach * RNG.uniform(-1, 1, count), w], axis=-1)
+    quarter = RNG.integers(4, size=count)
+    c, s = np.cos(quarter * np.pi / 2), np.sin(quarter * np.pi / 2)
+    side[:, 0], side[:, 1] = c * side[:, 0] - s * side[:, 1], s * side[:, 0] + c * side[:, 1]
+    return floor, wall, base, side
+
+
+@pytest.mark.parametrize("framing", list(Framing))
+def test_points_of_the_faces_are_told_apart(framing):
+    for index in range(10):
+        pyramid = pyramid_scene(Split.TEST, index, framing)
+        for own, is_pattern, is_base in zip(faces(pyramid), (1, 1, 0, 0), (1, 1, 1, 0), strict=True):
+            assert len(own) > 100
+            x = to_scene(pyramid, own)
+            assert np.abs(np.asarray(values(pyramid, x))).max() < 5e-6
+            np.testing.assert_array_equal(on_pattern(pyramid, x), bool(is_pattern))
+            np.testing.assert_array_equal(on_base(pyramid, x), bool(is_base))
+
+
+def test_hits_of_a_scan_lie_on_the_faces_that_they_are_counted_to():
+    """The sphere tracer's hits, classed anew by the plane or outline that each is nearest to."""
+    for index in range(3):
+        pyramid = pyramid_scene(Split.TEST, index)
+        _, scans = scan_telling(pyramid, CAMERA, sphere_candidates(40, 2.5))
+        points, mask = np.asarray(scans.points, np.float64), np.asarray(scans.mask)
+        found = np.asarray(pyramid.on_pattern(scans.points))[mask]
+        own = (points[mask] - np.asarray(pyramid.offset)) @ np.asarray(pyramid.rotation, np.float64)
+        own /= float(pyramid.scale)
+        w, height = own[:, 2], float(pyramid.height)
+        to_side = np.abs((np.abs(own[:, :2]).max(axis=1) - 1) * height + w) / np.sqrt(1 + height**2)
+        expected = (w > 0.01) & (to_side > 0.01)
+        clear = (np.abs(w - 0.01) > 0.009) & (np.abs(to_side - 0.01) > 0.009)
+        np.testing.assert_array_equal(found[clear], expected[clear])
+        assert clear.mean() > 0.95
+        assert 0.05 < found.mean() < 0.6
+
+
+def parameters(pyramids):
+    leaves = (pyramids.height, pyramids.size, pyramids.place, pyramids.turn, pyramids.depth, pyramids.rotation)
+    return np.concatenate([np.asarray(leaf).reshape(len(pyramids.height), -1) for leaf in leaves], axis=1)
+
+
+def test_no_two_scenes_share_a_parameter_within_a_split_or_across():
+    found = np.concatenate([parameters(scenes(split, 1500)) for split in Split])
+    assert len(np.unique(found, axis=0)) == len(found) == 4500
+    # Floats of 24 bits collide by chance: some single numbers recur, the pair of turn and height never does.
+    assert len(np.unique(found[:, [0, 4]], axis=0)) == 4500
+    assert len(np.unique(found[:, 1:4], axis=0)) == 4500
+
+
+def test_scenes_spread_over_their_ranges_and_orientations():
+    pyramids = scenes(Split.TRAIN, 1500)
+    for leaf, low, high in (
+        (pyramids.height, 1.2, 1.6),
+        (pyramids.size, 0.7, 0.85),
+        (pyramids.turn, 0.0, 2 * np.pi),
+        (pyramids.depth, 0.07, 0.1),
+    ):
+        share = (np.asarray(leaf) - low) / (high - low)
+        assert 0 <= share.min() < 0.01
+        assert 0.99 < share.max() <= 1
+    rotation = np.asarray(pyramids.rotation, np.float64)
+    np.testing.assert_allclose(rotation @ rotation.transpose(0, 2, 1), np.tile(np.eye(3), (1500, 1, 1)), atol=1e-5)
+    np.testing.assert_allclose(np.linalg.det(rotation), 1.0, atol=1e-5)
+    # The mean of 1500 random directions has components of standard deviation 1 / sqrt(3 * 1500).
+    assert np.abs(rotation[:, :, 2].mean(axis=0)).max() < 5 / np.sqrt(4500)
+
+
+def test_classes_take_turns_and_a_scene_is_the_same_however_it_is_built():
+    together = scenes(Split.TEST, 12, Framing.WHOLE)
+    assert [int(label) for label in together.label] == [index % 5 for index in range(12)]
+    x = RNG.uniform(-0.7, 0.7, (200, 3))
+    expected = np.asarray(jax.jit(jax.vmap(lambda pyramid: pyramid(x)))(together))
+    for index in (0, 4, 11):
+        alone = pyramid_scene(Split.TEST, index, Framing.WHOLE)
+        for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(together), strict=True):
+            np.testing.assert_allclose(a, b[index], atol=2e-6)
+        np.testing.assert_allclose(values(alone, x), expected[index], atol=2e-6)
+
+
+def test_the_mesh_can_be_exported_and_loaded_again(tmp_path):
+    pyramid = pyramid_scene(Split.TEST, 2)
+    mesh = mesh_from_sdf(pyramid, Grid(60))
+    mesh.to_trimesh().export(tmp_path / "pyramid.ply")
+    loaded = load_mesh(tmp_path / "pyramid.ply")
+    assert len(loaded.faces) == pytest.approx(len(mesh.faces), abs=5)
+    np.testing.assert_allclose(np.ptp(loaded.vertices, axis=0).max(), 2.5, rtol=1e-5)
+    seen = scan(loaded, Camera(height=20, width=20), sphere_candidates(1, 2.5)[0])
+    world = loaded.frame.to_world(seen.points[seen.mask])
+    assert len(world) > 100
+    assert np.abs(np.asarray(values(pyramid, world))).max() < 0.05
+
+
+def test_a_hidden_view_does_not_show_the_pattern():
+    candidates = np.asarray(sphere_candidates(40, 2.5).position)
+    for index, framing in enumerate(Framing):
+        pyramid = pyramid_scene(Split.TEST, index, framing)
+        drawn = [hidden_view(pyramid, jax.random.key(seed), CAMERA, num_candidates=40) for seed in range(5)]
+        again = hidden_view(pyramid, jax.random.key(3), CAMERA, num_candidates=40)
+        np.testing.assert_array_equal(again.position, drawn[3].position)
+        rows = {int(np.linalg.norm(candidates - np.asarray(pose.position), axis=1).argmin()) for pose in drawn}
+        assert len(rows) > 2
+        for pose in drawn:
+            assert np.linalg.norm(candidates - np.asarray(pose.position), axis=1).min() < 1e-6
+            _, (seen,) = scan_telling(pyramid, CAMERA, jax.tree.map(lambda leaf: leaf[None], pose))
+            offset, rotation, scale = map(np.asarray, (pyramid.offset, pyramid.rotation, pyramid.scale))
+            own = (seen.to_numpy()[0] - offset) @ rotation / scale
+            assert len(own) > 100
+            # Only base or sides: whatever is seen above the base lies on a slanted plane.
+            above = own[own[:, 2] > 5e-3]
+            side = (np.abs(above[:, :2]).max(axis=1) - 1) * float(pyramid.height) + above[:, 2]
+            assert np.abs(side).max(initial=0.0) < 2e-2
+
+
+def test_bad_input_is_refused():
+    pyramid = pyramid_scene(Split.TEST, 0)
+    with pytest.raises(InputError, match=r"longest side is 0"):
+        sample_pyramid(jax.random.key(0), 0, 0.0)
+    with pytest.raises(InputError, match="number is -1"):
+        pyramid_scene(Split.TEST, -1)
+    # Turned until its base looks at the one candidate.
+    outward = np.asarray(sphere_candidates(1, 1.0).position)[0]
+    across = np.cross(outward, np.roll(outward, 1))
+    across /= np.linalg.norm(across)
+    rotation = np.stack([across, np.cross(-outward, across), -outward], axis=-1)
+    facing = eqx.tree_at(lambda p: (p.rotation, p.offset), pyramid, (jnp.asarray(rotation), jnp.asarray(0.6 * outward)))
+    with pytest.raises(InputError, match="shows from all 1 candidates"):
+        hidden_view(facing, jax.random.key(0), CAMERA, num_candidates=1)
+    with pytest.raises(InputError, match="must not be negative"):
+        Pyramid(*jax.tree.leaves(eqx.tree_at(lambda p: p.depth, pyramid, jnp.asarray(-0.1))))
