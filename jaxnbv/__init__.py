@@ -3,6 +3,35 @@
 The public names are those of `__init__.pyi`. Each is imported when it is first used, for JAX takes seconds to import.
 """
 
+import sys
+from typing import Any
+
 import lazy_loader
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+# What a notebook shows by a small picture and a line of facts.
+_SHOWN = {
+    "jaxnbv.geometry.cloud": "PointCloud",
+    "jaxnbv.planning.episode": "Episode",
+    "jaxnbv.search.proposal": "Proposal",
+    "jaxnbv.surfaces.base": "SurfacePosterior",
+}
+
+
+def _html_of(shown: Any) -> str:
+    from jaxnbv.viz.notebook import html_of
+
+    return html_of(shown)
+
+
+def _show_in_notebooks() -> None:
+    """Tell IPython, where it runs, how these kinds are shown; until one is, nothing more is imported."""
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    if shell is not None:
+        for module, name in _SHOWN.items():
+            shell.display_formatter.formatters["text/html"].for_type_by_name(module, name, _html_of)
+
+
+_show_in_notebooks()

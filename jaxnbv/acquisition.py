@@ -1,9 +1,9 @@
 """From imagined scans to the value of a pose: the paper's acquisition functions.
 
-    acquisition(theta) = E score(D, scan(theta; f | D)),   estimated by the mean over the step's samples f_1, ..., f_S,
+    alpha(theta) = E alpha(D, scan(theta; f | D)),   estimated by the mean over the step's samples f_1, ..., f_S,
 
-the same samples for all poses (common random numbers). A score sees the context that was computed once from D, and one
-imagined scan.
+the same samples for all poses (common random numbers). An acquisition sees the context that was computed once from D,
+and one imagined scan; what it gives of it is that scan's *score*.
 """
 
 from abc import abstractmethod
@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.answers import Answer, Quantity
 from jaxnbv.checks import InputError, check_fields, checked, require, shown
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
@@ -24,8 +23,34 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import GridSurface, Surface, scan
 
 
-class Score(eqx.Module):
-    """What one imagined scan is worth, given what has been seen."""
+class Quantity(eqx.Module):
+    """What is maximised, for tables and captions.
+
+    - `name`, `unit`: in words; the unit is empty where there is none.
+    - `meaning`: the rest of a caption that begins with "Value:".
+    - `smooth`: whether values between two candidates mean anything.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    smooth: bool = True
+
+
+class Answer(eqx.Module):
+    """What D tells of the question that the views are for: numbers with names. How it reads is said in `jaxnbv.viz`.
+
+    - `names`, `values`: one each.
+    - `form`: how a value is written, in the language of `str.format`.
+    """
+
+    names: tuple[str, ...]
+    values: Float[np.ndarray, " n"]
+    form: str = "{:.4g}"
+
+
+class Acquisition(eqx.Module):
+    """What one imagined scan is worth, given what has been seen; its expectation over the posterior is maximised."""
 
     @abstractmethod
     def context(self, cloud: PointCloud) -> Any:
@@ -42,23 +67,23 @@ class Score(eqx.Module):
 
     @property
     def quantity(self) -> Quantity:
-        """What its expected value is, for tables and captions."""
-        meaning = "score of an imagined scan, mean over posterior samples."
+        """What its expected value is."""
+        meaning = "value of an imagined scan, mean over posterior samples."
         return Quantity(f"acquisition, {type(self).__name__}", "", meaning)
 
     def answer(self, cloud: PointCloud) -> Answer | None:
-        """What D tells of what the score asks, for the report and the terminal; None where there is nothing to tell."""
+        """What D tells of what the acquisition asks; None where there is nothing to tell."""
         return None
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
-        """What `answer` should come to in the end, for the report; None where that is not known.
+        """What `answer` should come to in the end; None where that is not known.
 
         - `scene`: the true surface; `cloud`: points all over it, uniform by area.
         """
         return self.answer(cloud)
 
     def check(self, cloud: PointCloud) -> None:
-        """Raise `ValueError` if what the score is made of gives something impossible on a first D."""
+        """Raise `ValueError` if what the acquisition is made of gives something impossible on a first D."""
         return
 
 
@@ -70,7 +95,7 @@ def preferred_batch_size(function: Any) -> int:
     return getattr(function, "batch_size", 1 if jax.default_backend() == "cpu" else 128)
 
 
-class ExpectedUtilityImprovement(Score):
+class ExpectedUtilityImprovement(Acquisition):
     """max(0, u(D u scan) - u(D)) for any utility u(cloud): the paper's alpha^(u), once averaged over samples.
 
     - `utility`: a function from a `PointCloud` (rows, masked) to a scalar, made of JAX operations.
@@ -78,7 +103,7 @@ class ExpectedUtilityImprovement(Score):
       added to it: for a utility that looks at so many points anyway, and would sample D again for every scan.
 
     A utility may say more of itself by attributes: `improvement`, the `Quantity` of what is expected; `answer(cloud)`,
-    `true_answer(scene, cloud)` and `check(cloud)`, as of a `Score`; `batch_size`. A plain function has its name.
+    `true_answer(scene, cloud)` and `check(cloud)`, as of an `Acquisition`; `batch_size`. A plain function has its name.
     """
 
     utility: Callable[[PointCloud], Float[Array, ""]]
@@ -138,43 +163,55 @@ class ExpectedUtilityImprovement(Score):
         return name if name and name != "<lambda>" else "utility"
 
 
-class Several(Score):
-    """Several scores of the same scans, so that they are compared on the same samples at the cost of one scan.
+def as_acquisition(value: Any) -> Acquisition:
+    """An acquisition as it is; of a function of a cloud, which is a utility, the expected improvement.
 
-    Its value is a vector, the scores' values in their order (a score whose value is a vector itself takes as many
-    places): for `expected_score`, not for a planner.
+    **Raises:** `ValueError` for anything else.
+    """
+    if isinstance(value, Acquisition):
+        return value
+    function = callable(value) and not isinstance(value, type)
+    require(function, f"the acquisition is {shown(value)}: give one, such as Coverage(), or a function of a cloud")
+    return ExpectedUtilityImprovement(value)
+
+
+class Several(Acquisition):
+    """Several acquisitions of the same scans, so that they are compared on the same samples at the cost of one scan.
+
+    Its value is a vector, the members' values in their order (a member whose value is a vector itself takes as many
+    places): for `expected_value` and `Problem.scores`, not for a planner.
     """
 
-    scores: tuple[Score, ...]
+    members: tuple[Acquisition, ...]
 
     def __check_init__(self):
-        known = isinstance(self.scores, tuple) and all(isinstance(score, Score) for score in self.scores)
-        require(known and len(self.scores) > 0, f"the scores are {shown(self.scores)}; give a tuple of some")
+        known = isinstance(self.members, tuple) and all(isinstance(member, Acquisition) for member in self.members)
+        require(known and len(self.members) > 0, f"the members are {shown(self.members)}; give a tuple of some")
 
     def context(self, cloud: PointCloud) -> tuple[Any, ...]:
         """That of each."""
-        return tuple(score.context(cloud) for score in self.scores)
+        return tuple(member.context(cloud) for member in self.members)
 
     def __call__(self, context: tuple[Any, ...], scan: PointCloud) -> Float[Array, " values"]:
         """The scores of one scan."""
-        found = [score(own, scan) for score, own in zip(self.scores, context, strict=True)]
+        found = [member(own, scan) for member, own in zip(self.members, context, strict=True)]
         return jnp.concatenate([jnp.atleast_1d(value) for value in found])
 
     @property
     def batch_size(self) -> int:
         """The least that one prefers."""
-        return min(score.batch_size for score in self.scores)
+        return min(member.batch_size for member in self.members)
 
     def check(self, cloud: PointCloud) -> None:
         """**Raises:** `ValueError` as one of them does."""
-        for score in self.scores:
-            score.check(cloud)
+        for member in self.members:
+            member.check(cloud)
 
 
 @eqx.filter_jit
-def context_of(score: Score, cloud: PointCloud) -> Any:
-    """What a score makes of D, compiled."""
-    return score.context(cloud)
+def context_of(acquisition: Acquisition, cloud: PointCloud) -> Any:
+    """What an acquisition makes of D, compiled."""
+    return acquisition.context(cloud)
 
 
 def zero_if_empty(scan: PointCloud, value: Float[Array, ""]) -> Float[Array, ""]:
@@ -182,8 +219,8 @@ def zero_if_empty(scan: PointCloud, value: Float[Array, ""]) -> Float[Array, ""]
     return jnp.where(jnp.any(scan.mask), value, 0.0)
 
 
-def check_differentiable(score: Score, capacity: int, num_rays: int) -> None:
-    """Check that JAX can differentiate a score in the points and normals of a scan, without computing anything.
+def check_differentiable(acquisition: Acquisition, capacity: int, num_rays: int) -> None:
+    """Check that JAX can differentiate an acquisition in the points and normals of a scan, without computing anything.
 
     - `capacity`: rows of the cloud; `num_rays`: rows of a scan.
 
@@ -195,23 +232,23 @@ def check_differentiable(score: Score, capacity: int, num_rays: int) -> None:
 
     def value(rows):
         points, normals = rows
-        return score(score.context(cloud(capacity)), PointCloud(points, normals, cloud(num_rays).mask))
+        return acquisition(acquisition.context(cloud(capacity)), PointCloud(points, normals, cloud(num_rays).mask))
 
     rows = cloud(num_rays).points, cloud(num_rays).normals
-    # A score that fails by itself says so itself.
+    # One that fails by itself says so itself.
     jax.eval_shape(value, rows)
     try:
         jax.eval_shape(jax.grad(value), rows)
     except ValueError as error:
         raise InputError(
-            f"{type(score).__name__} cannot be differentiated, so no gradient search can use it ({error}). "
+            f"{type(acquisition).__name__} cannot be differentiated, so no gradient search can use it ({error}). "
             "Use DiscreteSearch, which asks for values only"
         ) from error
 
 
 @checked
-def expected_score(
-    score: Score,
+def expected_value(
+    acquisition: Acquisition,
     cloud: PointCloud,
     surfaces: GridSurface,
     camera: Camera,
@@ -220,14 +257,15 @@ def expected_score(
 ) -> Float[Array, "poses *scores"]:
     """The acquisition at each of a batch of poses: mean over the sampled surfaces of the score of what they would show.
 
-    `surfaces` carries the samples along its leading axis; `barrier` is as of `scan`. `Several` scores have an axis of
-    their own.
+    `surfaces` carries the samples along its leading axis; `barrier` is as of `scan`. The members of
+    `Several` have an axis of their own.
     """
-    return jnp.mean(sample_scores(score, score.context(cloud), surfaces, camera, poses, barrier=barrier), axis=0)
+    context = acquisition.context(cloud)
+    return jnp.mean(sample_scores(acquisition, context, surfaces, camera, poses, barrier=barrier), axis=0)
 
 
 def sample_scores(
-    score: Score,
+    acquisition: Acquisition,
     context: Any,
     surfaces: GridSurface,
     camera: Camera,
@@ -237,7 +275,7 @@ def sample_scores(
 ) -> Float[Array, "samples poses *scores"]:
     """The score of what each of the sampled surfaces would show from each of a batch of poses.
 
-    Samples are taken one after the other, with all poses scanned at once and scored `score.batch_size` at a time, so
+    Samples are taken one after the other, with all poses scanned at once and scored `batch_size` of them at a time, so
     memory is that of one sample's scans.
 
     - `own_contexts`: the context has a leading axis of samples, one each.
@@ -246,7 +284,7 @@ def sample_scores(
 
     def of_sample(surface: GridSurface, context: Any) -> Float[Array, "poses *scores"]:
         scans = scan(surface, camera, poses, barrier)
-        return jax.lax.map(lambda imagined: score(context, imagined), scans, batch_size=score.batch_size)
+        return jax.lax.map(lambda imagined: acquisition(context, imagined), scans, batch_size=acquisition.batch_size)
 
     if own_contexts:
         return jax.lax.map(lambda pair: of_sample(*pair), (surfaces, context))

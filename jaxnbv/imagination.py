@@ -1,15 +1,36 @@
-"""Which surfaces are held possible: the paper's, and those that the command line and the studies use by default."""
+"""What is imagined: the surfaces that are held possible given what has been seen.
+
+An `Imagination` is all that a sampled surface depends on but the evidence: the model, the grid on which samples are
+evaluated, how many are drawn, what cuts them, and what stands around the object.
+"""
 
 import dataclasses
 import math
-from typing import NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from jaxnbv.checks import checked, require
-from jaxnbv.cli.model_name import ModelName as ModelName
+from jaxnbv.checks import InputError, check_fields, check_key, check_type, checked, is_traced, require, shown
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud, check_oriented, check_single, concatenate, limit_capacity
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box, Volume
-from jaxnbv.scanning import Carving
+from jaxnbv.scanning import (
+    Carving,
+    Evidence,
+    Grid,
+    GridSurface,
+    Surroundings,
+    TriangleMesh,
+    carve,
+    check_image,
+    scan_samples,
+)
+from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.surfaces import (
     GeometricSPSR,
     OnSurface,
@@ -17,58 +38,289 @@ from jaxnbv.surfaces import (
     ScreenedSPSR,
     SeenEmpty,
     SurfaceModel,
+    SurfacePosterior,
 )
+from jaxnbv.surfaces.base import HALF_WIDTH
+
+MODELS = ("screened", "paper")
+"""The names of `Imagination.preset`."""
 
 
-class Imagination(NamedTuple):
-    """A distribution over surfaces, and what its samples are carved by; both as `Planner` takes them."""
+class Imagination(eqx.Module):
+    """A distribution over surfaces, as a planner imagines them.
 
-    model: SurfaceModel
-    carving: Carving | None
+    - `model`: the prior over surfaces.
+    - `grid`: where samples are evaluated and scanned; empty space is known at its nodes.
+    - `num_samples`: S, posterior samples a step.
+    - `carving`: what samples are cut by: space seen empty, on which the model is conditioned too where it can be, and
+      the outside of a volume. None leaves samples as the model draws them from D, which is the paper's own behaviour.
+    - `surroundings`: what stands around the object, hides it, and keeps cameras out; None for nothing.
 
+    Evidence is an `Evidence` of the same grid, or a cloud alone.
 
-@checked
-def imagination(
-    name: ModelName | str,
-    longest_side: float = 2.5,
-    quick: bool = False,
-    volume: Volume | None = None,
-    solid: bool = False,
-    lengthscale: float | None = None,
-) -> Imagination:
-    """The surfaces of a name, for an object whose box has this longest side, in scene units.
-
-    - `screened`: the default `ScreenedSPSR`, whose lengths are taken in proportion to the longest side and for which
-      the boundary of the volume is outside; carved, so that nothing is inside where the sensor saw empty space, nor
-      outside the volume.
-    - `paper`: the published model at its published values, which conditions on normals alone; not carved.
-    - `quick`: with fewer frequencies.
-    - `volume`: by default the cube of the longest side about the origin.
-    - `solid`: for a body that is nowhere thin, such as the pyramid: its hidden side is as large as the one that was
-      seen, so that nothing follows for the space beside what was seen empty (`SeenEmpty`).
-    - `lengthscale`: that of detail, in place of the model's own short one; see `GeometricSPSR`.
-
-    **Raises:** `ValueError` for another name, or a longest side or lengthscale that is not positive.
+    **Raises:** `ValueError` for no samples, or a grid beyond the torus [-pi, pi]^3.
     """
-    require(longest_side > 0, f"the longest side is {longest_side}; it must be positive")
-    require(
-        lengthscale is None or 0 < lengthscale < math.inf,
-        f"the lengthscale is {lengthscale}; it must be positive and finite",
-    )
-    known = ", ".join(ModelName)
-    require(name in [*ModelName], f"there is no model {name!r}: choose from {known}")
-    if name == ModelName.PAPER:
-        usual_one = GeometricSPSR(0.015, truncation=20) if quick else GeometricSPSR()
-        return Imagination(
-            usual_one if lengthscale is None else dataclasses.replace(usual_one, lengthscale=lengthscale), None
+
+    model: SurfaceModel = eqx.field(default_factory=ScreenedSPSR)
+    grid: Grid = Grid()
+    num_samples: int = eqx.field(static=True, default=16)
+    carving: Carving | None = Carving()
+    surroundings: Surroundings | None = None
+
+    def __check_init__(self):
+        check_fields(self)
+        require(self.num_samples >= 1, f"num_samples is {self.num_samples}; it must be at least 1")
+        require(
+            self.grid.half_extent <= np.pi,
+            f"the grid reaches to {self.grid.half_extent}, beyond the torus [-pi, pi]^3: give Grid(half_extent=...)",
         )
-    volume = Box.cube(longest_side) if volume is None else volume
-    scale, usual = longest_side / 2.5, ScreenedSPSR()
-    lengthscales = scale * (usual.base.lengthscale + (jnp.array([0.005, 0.0]) if quick else 0.0))
-    if lengthscale is not None:
-        lengthscales = lengthscales.at[0].set(lengthscale)
-    # Shorter scales need more frequencies, but time and memory grow with their cube.
-    truncation = min(round((20 if quick else usual.base.truncation) / scale), 30 if quick else 48)
-    base = GeometricSPSR(lengthscales, usual.base.variance, truncation)
-    values = (OutsideBoundary(volume), OnSurface(), *(() if solid else (SeenEmpty(),)))
-    return Imagination(ScreenedSPSR(base, values, reach=scale * usual.reach), Carving(volume))
+
+    @classmethod
+    @checked
+    def preset(
+        cls,
+        name: str = "screened",
+        longest_side: float = 2.5,
+        quick: bool = False,
+        volume: Volume | None = None,
+        solid: bool = False,
+        lengthscale: float | None = None,
+    ) -> "Imagination":
+        """The surfaces of a name, for an object whose box has this longest side, in scene units.
+
+        - `screened`: the default `ScreenedSPSR`, whose lengths are taken in proportion to the longest side and for
+          which the boundary of the volume is outside; carved, so that nothing is inside where the sensor saw empty
+          space, nor outside the volume.
+        - `paper`: the published model at its published values, which conditions on normals alone; not carved.
+        - `quick`: with fewer frequencies.
+        - `volume`: by default the cube of the longest side about the origin.
+        - `solid`: for a body that is nowhere thin, such as the pyramid: its hidden side is as large as the one that was
+          seen, so that nothing follows for the space beside what was seen empty (`SeenEmpty`).
+        - `lengthscale`: that of detail, in place of the model's own short one; see `GeometricSPSR`.
+
+        **Raises:** `ValueError` for another name, or a longest side or lengthscale that is not positive.
+        """
+        require(longest_side > 0, f"the longest side is {longest_side}; it must be positive")
+        require(
+            lengthscale is None or 0 < lengthscale < math.inf,
+            f"the lengthscale is {lengthscale}; it must be positive and finite",
+        )
+        require(name in MODELS, f"there is no model {name!r}: choose from {', '.join(MODELS)}")
+        if name == "paper":
+            paper = GeometricSPSR(0.015, truncation=20) if quick else GeometricSPSR()
+            paper = paper if lengthscale is None else dataclasses.replace(paper, lengthscale=lengthscale)
+            return cls(paper, carving=None)
+        volume = Box.cube(longest_side) if volume is None else volume
+        scale, usual = longest_side / 2.5, ScreenedSPSR()
+        lengthscales = scale * (usual.base.lengthscale + (jnp.array([0.005, 0.0]) if quick else 0.0))
+        if lengthscale is not None:
+            lengthscales = lengthscales.at[0].set(lengthscale)
+        # Shorter scales need more frequencies, but time and memory grow with their cube.
+        truncation = min(round((20 if quick else usual.base.truncation) / scale), 30 if quick else 48)
+        base = GeometricSPSR(lengthscales, usual.base.variance, truncation)
+        values = (OutsideBoundary(volume), OnSurface(), *(() if solid else (SeenEmpty(),)))
+        return cls(ScreenedSPSR(base, values, offset=scale * usual.offset), carving=Carving(volume))
+
+    def within(self, volume: Box) -> "Imagination":
+        """The same for an object in another box: what holds for the default one, `Box()`, holds for this."""
+
+        def placed(leaf):
+            return volume if isinstance(leaf, Box) and leaf == Box() else leaf
+
+        return jax.tree.map(placed, self, is_leaf=lambda leaf: isinstance(leaf, Box))
+
+    def begin(self, cloud: PointCloud, capacity: int, max_views: int) -> Evidence:
+        """A cloud as evidence, before any pose is known.
+
+        - `capacity`: points of it that are kept, by farthest point sampling beyond it.
+        - `max_views`: for how many views there is room.
+        """
+        kept = limit_capacity(cloud, capacity)
+        return Evidence.before_views(kept, max_views, None if self.carving is None else self.grid)
+
+    def observe(self, evidence: Evidence, pose: Pose, scan: PointCloud, camera: Camera) -> Evidence:
+        """The evidence after a scan from a pose: its points, where it was taken, and what it shows to be empty.
+
+        **Raises:** `ValueError` for evidence of another grid.
+        """
+        return _observe(self.carving, self.surroundings, self.known(evidence), pose, scan, camera)
+
+    def record(self, evidence: Evidence, pose: Pose, scan: PointCloud, camera: Camera) -> Evidence:
+        """The evidence after a view whose points it holds already.
+
+        **Raises:** `ValueError` for evidence of another grid.
+        """
+        return _record(self.carving, self.surroundings, self.known(evidence), pose, scan, camera)
+
+    def posterior(self, evidence: Evidence | PointCloud) -> SurfacePosterior:
+        """p(f | evidence), of which `sample` draws before it carves. Space is known to be empty within the volume.
+
+        **Raises:** `ValueError` as the model's `condition` does, and for evidence of another grid.
+        """
+        evidence = self.known(evidence)
+        if self.carving is None or evidence.seen_empty is None:
+            return self.model.condition(evidence)
+        inside = evidence.seen_empty & self.carving.inside(self.grid)
+        return self.model.condition(dataclasses.replace(evidence, seen_empty=inside))
+
+    def sample(
+        self, evidence: Evidence | PointCloud, key: PRNGKeyArray, posterior: SurfacePosterior | None = None
+    ) -> GridSurface:
+        """S samples of the surface given the evidence, carved, on the grid, along a leading axis.
+
+        - `posterior`: that of the evidence, where it is at hand already.
+
+        **Raises:** `ValueError` as `posterior` does, and if the model gives values that are not finite.
+        """
+        check_key(key)
+        check_type(posterior, SurfacePosterior | None, "the posterior")
+        evidence = self.known(evidence)
+        surfaces = _sample(self, evidence, key, posterior)
+        if not is_traced(surfaces):
+            require(
+                bool(jnp.isfinite(surfaces.values).all()),
+                f"the samples of the surface given {int(evidence.cloud.count)} points are not finite: raise the "
+                "model's noise, or enable jax_enable_x64",
+            )
+        return surfaces
+
+    def carve(self, evidence: Evidence | PointCloud, values: Float[Array, "*s g g g"]) -> Float[Array, "*s g g g"]:
+        """Values of f minus its level at the grid's nodes, made positive where the object cannot be: in space that was
+        seen empty, outside its volume, and within obstacles.
+
+        **Raises:** `ValueError` if the values or the evidence are of another grid.
+        """
+        evidence, nodes = self.known(evidence), (self.grid.resolution,) * 3
+        require(jnp.shape(values)[-3:] == nodes, f"the values are {shown(values)}, but the grid has {nodes} nodes")
+        if self.carving is None or evidence.seen_empty is None:
+            return values
+        elsewhere = evidence.seen_empty | self.carving.outside(self.grid)
+        around = self.surroundings
+        return carve(values, elsewhere if around is None else elsewhere | around.within(self.grid))
+
+    def mean(self, evidence: Evidence | PointCloud, posterior: SurfacePosterior | None = None) -> Float[Array, "g g g"]:
+        """E f minus the level at the grid's nodes, carved as the samples are.
+
+        **Raises:** `ValueError` as `posterior` does.
+        """
+        posterior = self.posterior(evidence) if posterior is None else posterior
+        values = posterior.mean_on_grid(self.grid.axis.astype(posterior.level.dtype)) - posterior.level
+        return self.carve(evidence, values)
+
+    def probability_inside(self, evidence: Evidence | PointCloud) -> Float[Array, "g g g"]:
+        """P(f < level | evidence) at the grid's nodes: the share of S samples under a fixed key, carved, so that any
+        model will do.
+
+        **Raises:** `ValueError` as `sample` does.
+        """
+        return jnp.mean(self.sample(evidence, jax.random.key(0)).values < 0, axis=0)
+
+    def mean_mesh(self, evidence: Evidence | PointCloud) -> TriangleMesh:
+        """The surface where the posterior mean equals its level, by marching cubes on the grid, carved as the samples.
+
+        The mesh is in scene coordinates (its frame is the identity), its faces wound outward. Where nothing was scanned
+        it is the model's guess. All of it is kept, pieces that hold no point of the cloud included: some continue the
+        object behind what was seen, others are not there, and the evidence does not tell which. It is open where it
+        leaves the grid.
+
+        **Raises:** `ValueError` if the mean does not cross its level within the grid, and as `posterior` does.
+        """
+        values = np.array(self.mean(evidence))
+        found = level_triangles(values, self.grid)
+        if found is None:
+            half = self.grid.half_extent
+            raise InputError(
+                f"the posterior mean less its level runs from {values.min():.4g} to {values.max():.4g} on the grid, so "
+                f"no surface lies within [-{half}, {half}]^3: give a finer Grid, or one whose half extent holds the "
+                "cloud"
+            )
+        return TriangleMesh(found[0], found[1], Frame())
+
+    def barrier(self, camera: Camera, poses: Pose) -> Float[Array, "*batch rays"] | None:
+        """How far along a camera's rays from a pose or a batch of them obstacles stand; None without any."""
+        return None if self.surroundings is None else self.surroundings.barrier(camera, poses)
+
+    @eqx.filter_jit
+    def scan(self, surfaces: GridSurface, camera: Camera, poses: Pose) -> PointCloud:
+        """What the camera sees of each of s samples from each of p poses, past what stands around: clouds with leading
+        axes (s, p)."""
+        return scan_samples(surfaces, camera, poses, self.barrier(camera, poses))
+
+    def known(self, evidence: Evidence | PointCloud) -> Evidence:
+        """The evidence with what is known of its empty space: none of a cloud alone.
+
+        **Raises:** `ValueError` for evidence of another grid, or without empty space where samples are carved.
+        """
+        if isinstance(evidence, PointCloud):
+            check_single(evidence)
+            return Evidence.before_views(evidence, 0, None if self.carving is None else self.grid)
+        check_type(evidence, Evidence, "the evidence")
+        if self.carving is None:
+            return dataclasses.replace(evidence, seen_empty=None, grid=None)
+        require(
+            bool(evidence.grid == self.grid),
+            f"the evidence knows empty space on {evidence.grid}, but surfaces are carved on {self.grid}: make it with "
+            "the init of the planner that it is given to",
+        )
+        return evidence
+
+    def check(self, pose: Pose | None, scan: PointCloud, camera: Camera, first: bool) -> None:
+        """**Raises:** `ValueError` for a scan that `Planner.init` refuses, or `Planner.observe` if it is not the
+        first."""
+        for value, hint, name in ((scan, PointCloud, "scan"), (pose, Pose | None, "pose"), (camera, Camera, "camera")):
+            check_type(value, hint, f"the {name}")
+        check_single(scan, "the scan")
+        require(pose is None or pose.position.ndim == 1, "the pose is a batch of poses: give one, poses[0] say")
+        if is_traced(scan, pose):
+            return
+        # Within jit too, values of what is not traced are known.
+        with jax.ensure_compile_time_eval():
+            if first or bool(scan.mask.any()):
+                check_oriented(scan, "the scan", min(self.grid.half_extent, HALF_WIDTH))
+            if pose is not None:
+                check_image(scan, camera, pose)
+            if self.carving is not None:
+                self.carving.check_inside(scan, self.grid)
+
+
+# What is compiled takes what it uses: another model does not compile these again.
+
+
+@eqx.filter_jit
+def _observe(
+    carving: Carving | None,
+    surroundings: Surroundings | None,
+    evidence: Evidence,
+    pose: Pose,
+    scan: PointCloud,
+    camera: Camera,
+) -> Evidence:
+    cloud = limit_capacity(concatenate(evidence.cloud, scan), evidence.cloud.capacity)
+    return _record(carving, surroundings, dataclasses.replace(evidence, cloud=cloud), pose, scan, camera)
+
+
+@eqx.filter_jit
+def _record(
+    carving: Carving | None,
+    surroundings: Surroundings | None,
+    evidence: Evidence,
+    pose: Pose,
+    scan: PointCloud,
+    camera: Camera,
+) -> Evidence:
+    poses = jax.tree.map(lambda rows, row: rows.at[evidence.num_views].set(row), evidence.poses, pose)
+    empty: Bool[Array, "g g g"] | None = evidence.seen_empty
+    if carving is not None and empty is not None and evidence.grid is not None:
+        barrier = None if surroundings is None else surroundings.barrier(camera, pose)
+        empty = empty | carving.seen_empty(evidence.grid, scan, camera, pose, barrier)
+    return dataclasses.replace(evidence, poses=poses, num_views=evidence.num_views + 1, seen_empty=empty)
+
+
+@eqx.filter_jit
+def _sample(
+    imagination: Imagination, evidence: Evidence, key: PRNGKeyArray, posterior: SurfacePosterior | None
+) -> GridSurface:
+    posterior = imagination.posterior(evidence) if posterior is None else posterior
+    fields = posterior.sample(key, imagination.num_samples)
+    values = fields.on_grid(imagination.grid.axis) - posterior.level
+    return GridSurface.from_values(imagination.carve(evidence, values), 0.0, imagination.grid)

@@ -8,12 +8,12 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from jaxnbv.cli.model_name import ModelName
-from jaxnbv.cli.registry import SEARCHES, STOPS, TASKS
+from jaxnbv.cli.registry import MODELS, SEARCHES, STOPS, TASKS
 from jaxnbv.studies.scenes import Framing
 
 # The registries are the enumerations.
 Task = StrEnum("Task", {name.replace("-", "_").upper(): name for name in TASKS})  # type: ignore[misc]
+ModelName = StrEnum("ModelName", {name.upper(): name for name in MODELS})  # type: ignore[misc]
 SearchName = StrEnum("SearchName", {name.replace("-", "_").upper(): name for name in SEARCHES})  # type: ignore[misc]
 
 
@@ -88,8 +88,7 @@ NoiseOption = Annotated[float, typer.Option(help="Standard deviation of the sens
 ModelOption = Annotated[
     ModelName,
     typer.Option(
-        help="By what surfaces are imagined: screened knows that the object lies in its box and that space which was "
-        "seen through is empty; paper is the published model, which knows the scanned normals alone."
+        help="By what surfaces are imagined. " + "; ".join(f"{n}: {about}" for n, about in MODELS.items()) + "."
     ),
 ]
 PaperOption = Annotated[

@@ -1,4 +1,4 @@
-"""The tasks, searches and stopping rules of the command line: what it must know before anything heavy is imported.
+"""Tasks, models, searches and stopping rules of the command line: what it must know before anything heavy is imported.
 
 A new task is a class like those of `actions/tasks.py` and an entry here; a new search or rule is a function and an
 entry.
@@ -62,6 +62,11 @@ TASKS = {
     "heat": TaskEntry(f"{_TASKS}:HEAT", "the coldest point while it is heated at one place", ("source",)),
 }
 
+MODELS = {
+    "screened": "knows that the object lies in its box and that space which was seen through is empty",
+    "paper": "the published model, which knows the scanned normals alone",
+}
+
 SEARCHES = {
     "discrete": SearchEntry(f"{_SEARCHES}:discrete", "the expected value of the task over 120 candidates (heat: 100)"),
     "halving": SearchEntry(f"{_SEARCHES}:halving", "drops the worse half again and again while samples are added"),
@@ -86,7 +91,7 @@ STOPS = {
     "sure": StopEntry(f"{_STOPS}:sure", "the class has this probability, and given every half of the points too"),
     "found": StopEntry(f"{_STOPS}:found", "every part has so many points"),
     "covered": StopEntry(f"{_STOPS}:covered", "this share of what can be seen is expected to have been seen"),
-    "worth-less": StopEntry(f"{_STOPS}:worth_less", "the best view is worth less than this"),
+    "value-below": StopEntry(f"{_STOPS}:value_below", "the best view has a value less than this"),
     "seconds": StopEntry(f"{_STOPS}:seconds", "so many have passed"),
     "travel": StopEntry(f"{_STOPS}:travel", "the way from view to view would be longer, in scene units"),
 }

@@ -6,12 +6,12 @@ from typing import Annotated, Any
 import typer
 
 from jaxnbv.cli import actions
-from jaxnbv.cli.model_name import ModelName
 from jaxnbv.cli.options import (
     REQUIRED,
     CategoryOption,
     Device,
     DeviceOption,
+    ModelName,
     ModelOption,
     NetworkOption,
     QuickOption,
@@ -59,7 +59,7 @@ session.command("replay")(
             "category": (CategoryOption, None),
             "source": (SourceOption, None),
             "search": (SearchOption, SearchName("discrete")),
-            "model": (ModelOption, ModelName.SCREENED),
+            "model": (ModelOption, ModelName("screened")),
             "out": (OutOption, None),
             "quick": (QuickOption, False),
             "report": (ReportOption, True),

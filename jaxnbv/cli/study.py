@@ -7,8 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from jaxnbv.cli import actions
-from jaxnbv.cli.model_name import ModelName
-from jaxnbv.cli.options import Device, DeviceOption, ModelOption, command
+from jaxnbv.cli.options import Device, DeviceOption, ModelName, ModelOption, command
 from jaxnbv.studies.registry import STUDIES, Entry
 from jaxnbv.studies.scenes import Framing
 
@@ -88,7 +87,7 @@ def _command(name: str, entry: Entry) -> Callable[..., None]:
         "views": (ViewsOption, entry.views),
         "methods": (MethodsOption, None),
         "own": (OwnOption, None),
-        "model": (ModelOption, ModelName.SCREENED),
+        "model": (ModelOption, ModelName("screened")),
         "out": (FolderOption, None),
         "quick": (QuickOption, False),
         "workers": (WorkersOption, 1),

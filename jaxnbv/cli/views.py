@@ -7,7 +7,6 @@ from typing import Annotated, Any, TypeVar
 import typer
 
 from jaxnbv.cli import actions
-from jaxnbv.cli.model_name import ModelName
 from jaxnbv.cli.options import (
     REQUIRED,
     CandidatesOption,
@@ -19,6 +18,7 @@ from jaxnbv.cli.options import (
     FovOption,
     FramingOption,
     LengthscaleOption,
+    ModelName,
     ModelOption,
     NetworkOption,
     NoiseOption,
@@ -56,7 +56,7 @@ HidingFirstOption = Annotated[
 ]
 _EPISODE: dict[str, tuple[Any, Any]] = {
     "search": (SearchOption, SearchName("discrete")),
-    "model": (ModelOption, ModelName.SCREENED),
+    "model": (ModelOption, ModelName("screened")),
     "views": (ViewsOption, 5),
     "until": (UntilOption, None),
     "seed": (SeedOption, 0),

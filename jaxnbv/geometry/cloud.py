@@ -4,6 +4,7 @@ import functools
 import warnings
 from collections.abc import Iterator
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +20,6 @@ from jaxnbv.checks import (
     require,
     shown,
 )
-from jaxnbv.display import Displayed
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.depth_image import points_of_depth
 from jaxnbv.geometry.farthest_points import farthest_point_indices
@@ -28,9 +28,10 @@ from jaxnbv.geometry.volume import Box
 
 # Of a cloud: what an index of 32 bits counts, and far beyond any memory that a planner has.
 _MOST_ROWS = 2**31 - 1
+_LONGEST_NORMAL = 10.0
 
 
-class PointCloud(Displayed):
+class PointCloud(eqx.Module):
     """Oriented points (x, n): the paper's D. Rows whose mask is False hold nothing; their values are zero.
 
     The number of rows is the cloud's capacity, a shape and so fixed under `jit`; `mask` says which rows are filled.
@@ -180,6 +181,37 @@ def check_single(cloud: PointCloud, name: str = "the cloud") -> None:
     """**Raises:** `ValueError` for a batch of clouds where one is needed."""
     batch = cloud.mask.shape[:-1]
     require(not batch, f"{name} is a batch {batch} of clouds: give one, or use jax.vmap")
+
+
+def check_oriented(cloud: PointCloud, name: str, limit: float, unit: bool = True) -> None:
+    """Check that a cloud whose values are known has oriented points in the scene.
+
+    - `limit`: of the magnitude of their coordinates, in scene units.
+    - `unit`: whether normals must be of unit length (to 1 %); else they may be as long as 10: draws of a prior are not
+      of unit length, and a model may be conditioned on them.
+
+    **Raises:** `ValueError` if it is empty, or has a row that is not finite, not so oriented, or beyond the limit.
+    """
+    points, normals = cloud.to_numpy()
+    require(
+        len(points) > 0,
+        f"{name} is empty: no point to start from. Point the camera at the object, or check the depth image",
+    )
+    finite = bool(np.isfinite(points).all() and np.isfinite(normals).all())
+    require(finite, f"{name} has points or normals that are not finite: drop or mask these rows")
+    lengths = np.linalg.norm(normals, axis=1)
+    wrong = lengths[np.abs(lengths - 1.0) > 0.01] if unit else lengths[lengths > _LONGEST_NORMAL]
+    require(
+        wrong.size == 0,
+        f"{name} has {wrong.size} normals that are not of unit length, such as {wrong[:1]}: "
+        "build it with PointCloud.from_arrays, which normalises",
+    )
+    furthest = float(np.abs(points).max())
+    require(
+        furthest <= float(points.dtype.type(limit)),
+        f"{name} has a point with a coordinate of {furthest:.4g}, outside the scene's cube of half side {limit:.4g}: "
+        "bring it to scene coordinates with Frame.to_scene (or simulate less noise)",
+    )
 
 
 @checked

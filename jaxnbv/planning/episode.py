@@ -1,6 +1,5 @@
 """The simulated episode: scan, ask for the next view, scan again."""
 
-import importlib
 import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -15,17 +14,16 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from tqdm import tqdm
 
 from jaxnbv.checks import check_key, check_type, checked, require
-from jaxnbv.display import Displayed
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.state import State
-from jaxnbv.planning.stopping import Stop, Watch
-from jaxnbv.scanning import GridSurface, SensorNoise, Surface, scan
-from jaxnbv.scanning.surroundings import Surroundings
+from jaxnbv.planning.stopping import Watch
+from jaxnbv.scanning import Evidence, GridSurface, SensorNoise, Surface, Surroundings, as_surface, scan
+from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.search import Proposal
-from jaxnbv.storage import EpisodeFolder, describe
+from jaxnbv.storage import EpisodeFolder, describe, open_episode
+from jaxnbv.tasks import Coverage, Stop
 
 
 class View(eqx.Module):
@@ -45,7 +43,7 @@ class View(eqx.Module):
     camera: Camera | None = None
 
 
-class Episode(Displayed):
+class Episode(eqx.Module):
     """Views that a planner chose of a scene, and what they depend on.
 
     - `scene`, `noise`: None where a real sensor took the views.
@@ -65,22 +63,33 @@ class Episode(Displayed):
         """D after the last view, in scene coordinates."""
         return self.views[-1].cloud
 
-    def states(self) -> Iterator[State]:
-        """The planner's state after each view, made again from the scans."""
+    def evidence(self) -> Iterator[Evidence]:
+        """What the planner knows after each view, made again from the scans."""
         return self.planner.replay((view.pose, view.scan, view.camera) for view in self.views)
 
-    def state_after(self, views: int) -> State:
-        """The planner's state after so many of the views.
+    def evidence_after(self, views: int) -> Evidence:
+        """What the planner knows after so many of the views.
 
         **Raises:** `ValueError` unless there are so many, and at least one.
         """
         check_type(views, int, "the number of views")
         require(1 <= views <= len(self.views), f"asked for {views} of {len(self.views)} views; ask for one at least")
-        return next(itertools.islice(self.states(), views - 1, None))
+        return next(itertools.islice(self.evidence(), views - 1, None))
 
-    def show(self, progress: bool = True) -> Any:
-        """A picture of all views, which a notebook shows: the surface as it became known, and what the search saw."""
-        return importlib.import_module("jaxnbv.viz.notebook").overview(self, progress)
+    @classmethod
+    def load(cls, path: str | Path) -> "Episode":
+        """The episode of a folder, which says what camera was planned for but not how: its planner has this camera and
+        the usual surfaces, for what is to be drawn.
+
+        **Raises:** `ValueError` if the folder holds no episode, or one without a view.
+        """
+        held = open_episode(path)
+        views = held.read_views()
+        require(len(views) > 0, f"{path} holds no view yet")
+        planner = Planner(Coverage(), camera=camera_of(held.config["planner"]["camera"]))
+        known = planner.replay((pose, scan) for pose, scan, _ in views)
+        shown = tuple(View(pose, scan, after.cloud, own) for (pose, scan, own), after in zip(views, known, strict=True))
+        return cls(planner, None, None, views[0][0], jax.random.key(0), shown)
 
     def save(self, path: str | Path) -> None:
         """Write the episode to a folder (see `jaxnbv.storage` for its files); `simulate` can continue from it.
@@ -101,6 +110,12 @@ class Episode(Displayed):
             folder.write_cloud(self.cloud)
 
 
+def camera_of(description: dict[str, Any]) -> Camera:
+    """The camera that a stored configuration describes."""
+    fields = {name: value for name, value in description.items() if name != "type"}
+    return Camera(**{**fields, "center": tuple(fields["center"])})
+
+
 def _config(planner: Planner, scene: Surface | None, noise: SensorNoise | None, first: Pose, key: PRNGKeyArray) -> dict:
     return describe({"planner": planner, "scene": scene, "noise": noise, "first": first, "key": key})
 
@@ -108,7 +123,7 @@ def _config(planner: Planner, scene: Surface | None, noise: SensorNoise | None, 
 @checked
 def simulate(
     planner: Planner,
-    scene: Surface,
+    scene: Surface | SignedDistance,
     first: Pose,
     views: int,
     key: PRNGKeyArray,
@@ -118,15 +133,15 @@ def simulate(
     until: Stop | None = None,
     each: Callable[[View], None] | None = None,
 ) -> Episode:
-    """Scan a known surface from `first`, then from the views that the planner asks for, `views` in all, or as many as
-    it takes `until` a rule of `jaxnbv.planning.stopping` ends it; `Sure(0.95) | Budget(seconds=60)`, say.
+    """Scan a known surface, or solid, from `first`, then from the views that the planner asks for: `views` in all, or
+    as many as it takes `until` a rule of stopping ends it, `Sure(0.95) | Budget(seconds=60)` say.
 
     View i depends on the key and i alone, not on how many follow. With `folder`, every finished view is written there;
     a run that was interrupted goes on after the last of them and, on a CPU with the same versions, ends with the same
     bits as one that was not. (A GPU may add in another order from run to run.) The rule is asked after the last view
     that is there, so a folder can be continued with another one.
 
-    - `each`: is told every view once it is done, those that the folder holds included.
+    - `each`: is called with every view once it is done, those that the folder holds included.
 
     **Raises:** `ValueError` if `views` < 1 or more than the planner has room for, if the first view sees nothing, or
     if the folder belongs to another configuration or holds more views already.
@@ -142,6 +157,7 @@ def simulate(
         f"the key is a raw array of {key.dtype}: make it with jax.random.key(seed)",
     )
     require(first.position.ndim == 1, "the first pose is a batch of poses: give one, poses[0] say")
+    scene = as_surface(scene)
     store = None if folder is None else EpisodeFolder(folder, _config(planner, scene, noise, first, key))
     with store.writing() if store else nullcontext():
         done = store.read_views() if store else []
@@ -156,7 +172,7 @@ def simulate(
                 bar.set_description(f"view {index + 1}/{views}, {stage}")
                 bar.update(index * len(STAGES) + STAGES.index(stage) - bar.n)
 
-            sensor = scene_sensor(scene, planner.camera, noise, planner.surroundings)
+            sensor = scene_sensor(scene, planner.camera, noise, planner.imagination.surroundings)
             watch = None if until is None else Watch(until, planner)
             episode = steps(planner, sensor, first, key, done=done, begin=begin, watch=watch)
             for index, (view, *_) in enumerate(itertools.islice(episode, views)):
@@ -185,7 +201,7 @@ class Step(NamedTuple):
     """
 
     view: View
-    state: State
+    evidence: Evidence
     surfaces: GridSurface | None
     seconds: float
 
@@ -206,39 +222,42 @@ def steps(
     the same sensor noise, and under the same prior samples at the same view.
 
     - `camera`: of the sensor, by default the planner's; one of more rays than are imagined saves time.
-    - `done`: views that are known already, in their order; they are told, not asked for.
+    - `done`: views that are known already, in their order; they are not asked for again.
     - `begin`: is told the index of a view and which of `STAGES` of it begins.
     - `watch`: ends them, by its rule.
 
     **Raises:** `ValueError` as `Planner.init`, `propose` and `observe` do; among others when every candidate has been
     visited.
     """
-    known, state = iter(done), None
+    known, evidence = iter(done), None
     poses: list[Pose] = []
     for index in range(planner.max_views):
         sample_key, search_key, noise_key = view_keys(key, index)
         surfaces, seconds = None, 0.0
-        if (told := next(known, None)) is not None:
-            pose, seen, proposal = told
+        if (taken := next(known, None)) is not None:
+            pose, seen, proposal = taken
         else:
             pose, proposal = first, None
-            if state is not None:
-                if watch and watch.after(state, poses, sample_key):
+            if evidence is not None:
+                if watch and watch.after(evidence, poses, sample_key):
                     return
                 if planner.search.uses_samples:
                     begin(index, STAGES[0])
-                    surfaces = jax.block_until_ready(planner.sample_surfaces(state, sample_key))
+                    surfaces = jax.block_until_ready(planner.sample(evidence, sample_key))
                 begin(index, STAGES[1])
                 start = time.perf_counter()
-                proposal = jax.block_until_ready(planner.choose(state, surfaces, search_key))
+                proposal = jax.block_until_ready(planner.choose(evidence, surfaces, search_key))
                 pose, seconds = proposal.pose, time.perf_counter() - start
-                if watch and watch.before(state, poses, sample_key, proposal):
+                if watch and watch.before(evidence, poses, sample_key, proposal):
                     return
             begin(index, STAGES[2])
             seen = sensor(pose, noise_key)
-        state = planner.init(seen, pose, camera) if state is None else planner.observe(state, pose, seen, camera)
+        if evidence is None:
+            evidence = planner.init(pose, seen, camera)
+        else:
+            evidence = planner.observe(evidence, pose, seen, camera)
         poses.append(pose)
-        yield Step(View(pose, seen, state.cloud, proposal), state, surfaces, seconds)
+        yield Step(View(pose, seen, evidence.cloud, proposal), evidence, surfaces, seconds)
 
 
 def scene_sensor(

@@ -5,24 +5,19 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxnbv.at_sensor import stride_of
 from jaxnbv.checks import InputError, checked, require
-from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
-from jaxnbv.planning.episode import Episode, View
+from jaxnbv.planning.episode import Episode, camera_of
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.session import NextView, Session
-from jaxnbv.search import DiscreteSearch, Proposal
-from jaxnbv.search.base import CandidateSearch
-from jaxnbv.storage import SESSION_RECORD, DepthImage, open_episode, open_session
-from jaxnbv.surfaces import ScreenedSPSR
+from jaxnbv.planning.session import NextView, Session, stride_of
+from jaxnbv.search import CandidateSearch, Proposal
+from jaxnbv.storage import SESSION_RECORD, DepthImage, open_session
 from jaxnbv.tasks import Coverage
 
 
@@ -37,7 +32,7 @@ class StoredSession:
         self._folder = open_session(folder)
         config = self._folder.config
         try:
-            self.cameras = tuple(_camera(camera) for camera in config["cameras"])
+            self.cameras = tuple(camera_of(camera) for camera in config["cameras"])
             self.box = Box(**_fields(config["box"]))
             self.up, self.convention, self.stride = (config[name] for name in ("up", "convention", "stride"))
         except (KeyError, TypeError) as error:
@@ -117,15 +112,15 @@ def stored_run(folder: str | Path) -> StoredRun:
 
     **Raises:** `ValueError` if it holds neither, or one without a view.
     """
-    planner = Planner(ScreenedSPSR(), Camera(), Coverage(), DiscreteSearch())
-    return (_session_run if (Path(folder) / SESSION_RECORD).exists() else _episode_run)(folder, planner)
+    if (Path(folder) / SESSION_RECORD).exists():
+        return _session_run(folder)
+    return StoredRun(Episode.load(folder))
 
 
-def _session_run(folder: str | Path, planner: Planner) -> StoredRun:
+def _session_run(folder: str | Path) -> StoredRun:
     stored = StoredSession(folder)
-    session = Session(
-        planner, stored.cameras, stored.box, stored.up, convention=stored.convention, stride=stored.stride
-    )
+    sensor = stored.cameras, stored.box, stored.up
+    session = Session(Planner(Coverage()), *sensor, convention=stored.convention, stride=stored.stride)
     for index in range(stored.views):
         session.add(*stored.image(index))
     asked = [stored.proposal(index) for index in range(stored.views + 1)]
@@ -134,21 +129,6 @@ def _session_run(folder: str | Path, planner: Planner) -> StoredRun:
         for view, known in zip(session.episode.views, asked, strict=False)
     )
     return StoredRun(dataclasses.replace(session.episode, views=views), *(asked[-1] or ()))
-
-
-def _episode_run(folder: str | Path, planner: Planner) -> StoredRun:
-    held = open_episode(folder)
-    views = held.read_views()
-    require(len(views) > 0, f"{folder} holds no view yet")
-    planner = dataclasses.replace(planner, camera=_camera(held.config["planner"]["camera"]))
-    states = planner.replay((pose, scan) for pose, scan, _ in views)
-    shown = tuple(View(pose, scan, state.cloud, own) for (pose, scan, own), state in zip(views, states, strict=True))
-    return StoredRun(Episode(planner, None, None, views[0][0], jax.random.key(0), shown))
-
-
-def _camera(description: dict[str, Any]) -> Camera:
-    fields = _fields(description)
-    return Camera(**{**fields, "center": tuple(fields["center"])})
 
 
 def _fields(description: dict[str, Any]) -> dict[str, Any]:

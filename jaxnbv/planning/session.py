@@ -1,6 +1,8 @@
 """A live session: depth images of a real sensor in, where to take the next one out, in the user's own world."""
 
 import dataclasses
+import math
+from collections.abc import Callable
 from pathlib import Path
 
 import equinox as eqx
@@ -8,7 +10,6 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray, Real
 
-from jaxnbv.at_sensor import expected_depth, planner_at, stride_of
 from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, check_type, checked, require, shown
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
@@ -17,14 +18,14 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 from jaxnbv.planning.episode import Episode, View, view_keys
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.state import State, with_visited
-from jaxnbv.planning.stopping import Stop, Watch
-from jaxnbv.scanning.surroundings import Surroundings
-from jaxnbv.search import Proposal
+from jaxnbv.planning.stopping import Watch
+from jaxnbv.scanning import Evidence, Surroundings
+from jaxnbv.search import CandidateSearch, GivenPoses, Proposal
 from jaxnbv.storage import DepthImage, SessionFolder, describe
-from jaxnbv.viz import write_report
-from jaxnbv.viz.live import LiveView
+from jaxnbv.tasks import Stop
 
+# A cloud holds some thousands of points; more rays than these only take time.
+_MOST_RAYS = 20_000
 _NO_IMAGE = "the session has no image yet: add one first, session.add(depth, matrix)"
 
 
@@ -96,17 +97,16 @@ class Session:
         check_key(self.key)
         allowed = None if poses is None else self.frame.to_scene(Pose.from_matrix(poses, convention))
         sensor, volume = self.frame.to_scene(self.cameras[0]), self.frame.to_scene(self.box)
-        self.planner = planner_at(planner, sensor, volume, allowed)
-        if surroundings is not None:
-            self.planner = dataclasses.replace(self.planner, surroundings=surroundings.in_scene(self.frame))
+        around = None if surroundings is None else surroundings.in_scene(self.frame)
+        self.planner = _placed(planner, sensor, volume, allowed, around)
         self._strides = tuple(stride_of(one) if stride is None else stride for one in self.cameras)
         self._rays = tuple(one.strided(n) for one, n in zip(self.cameras, self._strides, strict=True))
         self._watch, self._asked_at = None if until is None else Watch(until, self.planner), 0
         self._views: list[View] = []
         self._proposals: dict[int, Proposal] = {}
         self._next: NextView | None = None
-        self._live: LiveView | None = None
-        self._state: State | None = None
+        self._followers: list[Callable[[Session], None]] = []
+        self._evidence: Evidence | None = None
         self._folder = None if folder is None else SessionFolder(folder, self._config())
         if self._folder is not None:
             for index in range(self._folder.count_images()):
@@ -121,14 +121,14 @@ class Session:
         return len(self._views)
 
     @property
-    def state(self) -> State:
+    def evidence(self) -> Evidence:
         """What the planner knows, in scene coordinates.
 
         **Raises:** `ValueError` before the first image.
         """
-        if self._state is None:
+        if self._evidence is None:
             raise InputError(_NO_IMAGE)
-        return self._state
+        return self._evidence
 
     @property
     def cloud(self) -> PointCloud:
@@ -136,7 +136,7 @@ class Session:
 
         **Raises:** `ValueError` before the first image.
         """
-        return self.frame.to_world(self.state.cloud)
+        return self.frame.to_world(self.evidence.cloud)
 
     @property
     def episode(self) -> Episode:
@@ -159,8 +159,8 @@ class Session:
         if self._asked_at < self.views:
             key, *_ = view_keys(self.key, self.views)
             poses = [view.pose for view in self._views]
-            if self._watch.after(self.state, poses, key) is None:
-                self._watch.before(self.state, poses, key, self.next().proposal)
+            if self._watch.after(self.evidence, poses, key) is None:
+                self._watch.before(self.evidence, poses, key, self.next().proposal)
             self._asked_at = self.views
         return self._watch.reason
 
@@ -187,12 +187,12 @@ class Session:
         require(0 <= camera < count, f"the session has {count} cameras, counted from 0: there is no camera {camera}")
         image = DepthImage(pixels, as_numbers(matrix, "the matrix of a pose", np.float64), depth_scale, camera)
         pose, scan = self._seen(image)
-        state = self._after(pose, scan, camera)
+        evidence = self._after(pose, scan, camera)
         if self._folder is not None:
             with self._folder.writing():
                 self._check_alone(self._folder)
                 self._folder.write_image(self.views, image)
-        self._take(pose, scan, camera, state)
+        self._take(pose, scan, camera, evidence)
 
     def next(self) -> NextView:
         """Where to take the next image. It is stored, and the same until an image is added; what was proposed once is
@@ -211,33 +211,23 @@ class Session:
             self._proposals[index] = proposal
             matrix = np.asarray(self.frame.to_world(proposal.pose).to_matrix(self.convention), np.float64)
             self._next = NextView(matrix, float(proposal.value), proposal.standard_error, expected, proposal)
-            self._show()
+            self._tell_followers()
         return self._next
 
-    def report(self, folder: str | Path | None = None, title: str = "object", progress: bool = True) -> Path:
-        """Write `report.html` and its figures, by default into the session's folder, and return the page's path.
+    @property
+    def next_view(self) -> NextView | None:
+        """What `next` gave since the last image; None where it was not asked yet."""
+        return self._next
 
-        **Raises:** `ValueError` before the first image, or without a folder.
-        """
-        place = folder or (None if self._folder is None else self._folder.path)
-        if place is None:
-            raise InputError("the session keeps no folder: tell the report one, session.report(folder)")
-        return write_report(self.episode, place, title=title, progress=progress)
+    def follow(self, follower: "Callable[[Session], None]") -> None:
+        """Call a function with the session now, if it has an image, and after every image and proposal from now on."""
+        self._followers.append(follower)
+        if self.views:
+            follower(self)
 
-    def view(self, port: int = 8080, host: str = "127.0.0.1") -> LiveView:
-        """A page in the browser, which changes with every image and proposal from now on; needs viser.
-
-        **Raises:** `ValueError` if viser is not installed.
-        """
-        self._live = LiveView(port, host)
-        self._show()
-        return self._live
-
-    def _show(self) -> None:
-        if self._live is not None and self.views:
-            asked = self._next
-            proposal, expected = (None, None) if asked is None else (asked.proposal, asked.expected_depth)
-            self._live.update(self.episode, proposal, expected, self.state)
+    def _tell_followers(self) -> None:
+        for follower in self._followers:
+            follower(self)
 
     def _config(self) -> dict:
         sensor = {"cameras": self.cameras, "box": self.box, "up": self.frame.up, "convention": self.convention}
@@ -248,31 +238,30 @@ class Session:
         pose = Pose.from_matrix(image.matrix, self.convention)
         camera, stride = self.cameras[image.camera], self._strides[image.camera]
         cloud = PointCloud.from_depth(image.depth, camera, pose, image.depth_scale, stride, self.box)
-        scan, around = self.frame.to_scene(cloud), self.planner.surroundings
+        scan, around = self.frame.to_scene(cloud), self.planner.imagination.surroundings
         return self.frame.to_scene(pose), scan if around is None else around.without_obstacles(scan)
 
-    def _after(self, pose: Pose, scan: PointCloud, camera: int) -> State:
+    def _after(self, pose: Pose, scan: PointCloud, camera: int) -> Evidence:
         rays = self.frame.to_scene(self._rays[camera])
-        if self._state is None:
-            return self.planner.init(scan, pose, rays)
-        return self.planner.observe(self._state, pose, scan, rays)
+        if self._evidence is None:
+            return self.planner.init(pose, scan, rays)
+        return self.planner.observe(self._evidence, pose, scan, rays)
 
-    def _take(self, pose: Pose, scan: PointCloud, camera: int, state: State | None = None) -> None:
-        self._state = self._after(pose, scan, camera) if state is None else state
+    def _take(self, pose: Pose, scan: PointCloud, camera: int, evidence: Evidence | None = None) -> None:
+        self._evidence = self._after(pose, scan, camera) if evidence is None else evidence
         rays, proposal = self.frame.to_scene(self._rays[camera]), self._proposals.get(self.views)
-        self._views.append(View(pose, scan, self._state.cloud, proposal, rays))
+        self._views.append(View(pose, scan, self._evidence.cloud, proposal, rays))
         self._next = None
-        self._show()
+        self._tell_followers()
 
     def _propose(self) -> tuple[Proposal, Float[np.ndarray, "h w"] | None]:
         sample_key, search_key, _ = view_keys(self.key, self.views)
-        surfaces = self.planner.sample_surfaces(self.state, sample_key) if self.planner.search.uses_samples else None
+        surfaces = self.planner.sample(self.evidence, sample_key)
         proposed = [proposal.pose for index, proposal in sorted(self._proposals.items()) if index < self.views]
-        proposal = self.planner.choose(with_visited(self.state, proposed), surfaces, search_key)
+        proposal = self.planner.choose(self.evidence.with_visited(proposed), surfaces, search_key)
         if surfaces is None:
             return proposal, None
-        depth = np.asarray(expected_depth(self.planner, surfaces, proposal.pose))
-        return proposal, depth / self.frame.scale
+        return proposal, np.asarray(self.planner.expected_depth(surfaces, proposal.pose)) / self.frame.scale
 
     def _check_alone(self, folder: SessionFolder) -> None:
         found = folder.count_images()
@@ -286,3 +275,31 @@ class Session:
 def _corners(box) -> tuple:
     require(np.shape(box) == (2, 3), f"the box is {shown(box)}; give two corners, (low, high), or a Box")
     return tuple(as_numbers(corner, "a corner of the box", np.float64).tolist() for corner in box)
+
+
+def stride_of(camera: Camera) -> int:
+    """The stride that leaves as many rays of an image as are worth their time."""
+    return math.ceil(math.sqrt(camera.num_rays / _MOST_RAYS))
+
+
+def _placed(
+    planner: Planner, camera: Camera, box: Box, poses: Pose | None, surroundings: Surroundings | None
+) -> Planner:
+    """A planner at a sensor, all in scene coordinates: see `Session`.
+
+    - `poses`: where the search may look from, or None for its own candidates.
+
+    **Raises:** `ValueError` if the search does not choose among poses.
+    """
+    imagination, search = planner.imagination.within(box), planner.search
+    if surroundings is not None:
+        imagination = dataclasses.replace(imagination, surroundings=surroundings)
+    if poses is not None:
+        if not isinstance(search, CandidateSearch):
+            raise InputError(
+                f"the session was given poses, but {type(search).__name__} is no search over candidates: use "
+                "DiscreteSearch() or HalvingSearch()"
+            )
+        search = dataclasses.replace(search, candidates=GivenPoses(poses))
+    camera = camera.resized(planner.camera.height, planner.camera.width)
+    return dataclasses.replace(planner, camera=camera, search=search, imagination=imagination)

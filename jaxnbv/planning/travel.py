@@ -1,4 +1,4 @@
-"""What it costs to go from one view to the next, and what a view is worth given that."""
+"""What it costs to go from one view to the next, and how that counts against the value of a view."""
 
 import itertools
 import math
@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.answers import Quantity
+from jaxnbv.acquisition import Quantity
 from jaxnbv.checks import check_fields, checked, require
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.scanning import Evidence
 
 CostFunction: TypeAlias = Callable[[Pose, Pose], Float[Array, ""]]
 """What it costs to go from one pose to another, in units of the user's: not negative, made of JAX operations."""
@@ -57,15 +58,22 @@ class Cost(eqx.Module):
 
     of: eqx.AbstractVar[CostFunction]
 
-    @abstractmethod
     def __call__(
+        self, values: Float[Array, "*samples poses"], evidence: Evidence, poses: Pose
+    ) -> Float[Array, "*samples poses"]:
+        """The values of poses, given the cost of going there from the last view, if there is one."""
+        cost = jax.vmap(lambda pose: self.of(evidence.last_pose, pose))(poses)
+        return self.weigh(values, jnp.where(evidence.num_views > 0, cost, 0.0))
+
+    @abstractmethod
+    def weigh(
         self, values: Float[Array, "*samples poses"], cost: Float[Array, " poses"]
     ) -> Float[Array, "*samples poses"]:
-        """What the poses are worth, of their values and of what it costs to go there."""
+        """The values of poses, given what it costs to go there."""
 
     @abstractmethod
     def quantity(self, value: Quantity) -> Quantity:
-        """What the worth is, in words, where the value is this."""
+        """What the weighed value is, where the value is this."""
 
 
 class ValuePerCost(Cost):
@@ -83,7 +91,7 @@ class ValuePerCost(Cost):
         check_fields(self)
         require(self.fixed > 0, f"the fixed cost of a view is {self.fixed}; it must be positive")
 
-    def __call__(
+    def weigh(
         self, values: Float[Array, "*samples poses"], cost: Float[Array, " poses"]
     ) -> Float[Array, "*samples poses"]:
         return values / (self.fixed + cost)
@@ -108,7 +116,7 @@ class ValueMinusCost(Cost):
         check_fields(self)
         require(self.weight >= 0, f"the weight of the cost is {self.weight}; it must not be negative")
 
-    def __call__(
+    def weigh(
         self, values: Float[Array, "*samples poses"], cost: Float[Array, " poses"]
     ) -> Float[Array, "*samples poses"]:
         return values - self.weight * cost

@@ -1,11 +1,14 @@
 """Surfaces that rays can hit, and the scanner."""
 
+from jaxnbv.scanning.evidence import EmptyPoints as EmptyPoints
+from jaxnbv.scanning.evidence import Evidence as Evidence
 from jaxnbv.scanning.free_space import Carving as Carving
 from jaxnbv.scanning.free_space import carve as carve
 from jaxnbv.scanning.free_space import check_image as check_image
 from jaxnbv.scanning.grid import Grid as Grid
 from jaxnbv.scanning.grid import GridSurface as GridSurface
 from jaxnbv.scanning.grid import imagine as imagine
+from jaxnbv.scanning.grid import mean_depth as mean_depth
 from jaxnbv.scanning.grid import nothing_imagined as nothing_imagined
 from jaxnbv.scanning.grid import scan_samples as scan_samples
 from jaxnbv.scanning.mesh import TriangleMesh as TriangleMesh
@@ -16,5 +19,8 @@ from jaxnbv.scanning.mesh_parts import load_parts as load_parts
 from jaxnbv.scanning.scanner import SensorNoise as SensorNoise
 from jaxnbv.scanning.scanner import scan as scan
 from jaxnbv.scanning.sphere_tracing import SDFSurface as SDFSurface
+from jaxnbv.scanning.sphere_tracing import as_surface as as_surface
 from jaxnbv.scanning.surface import Hits as Hits
 from jaxnbv.scanning.surface import Surface as Surface
+from jaxnbv.scanning.surroundings import Surroundings as Surroundings
+from jaxnbv.scanning.surroundings import support_plane as support_plane

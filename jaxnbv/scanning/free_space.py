@@ -18,10 +18,7 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
 from jaxnbv.geometry.volume import Box, Volume
 from jaxnbv.scanning.grid import Grid
-from jaxnbv.surfaces import EmptyPoints
 
-# A model takes a hundred or two of the empty points, and the time to choose them grows with how many there are.
-_POINTS_ALONG_AXIS = 20
 # Noise takes fewer of the points on a face of the volume two voxels out of it.
 _STRAY = 0.01
 # Off its ray, in scene units: five standard deviations of the sensor that is usual.
@@ -79,12 +76,9 @@ class Carving(eqx.Module):
         return 2.0 * self.margin * grid.spacing
 
     @eqx.filter_jit
-    def empty_points(self, grid: Grid, seen: Bool[Array, "g g g"]) -> EmptyPoints:
-        """The nodes seen empty within the volume, of every few along each axis, for a model to condition on."""
-        stride = -(-grid.resolution // _POINTS_ALONG_AXIS)
-        axis = jnp.asarray(grid.axis, jnp.result_type(float))[::stride]
-        nodes = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-        return EmptyPoints(nodes, seen[::stride, ::stride, ::stride].reshape(-1) & (self.volume(nodes) < 0))
+    def inside(self, grid: Grid) -> Bool[Array, "g g g"]:
+        """The nodes within the volume."""
+        return on_tensor_grid(self.volume, jnp.asarray(grid.axis, jnp.result_type(float))) < 0
 
     def check_inside(self, cloud: PointCloud, grid: Grid) -> None:
         """Check that the volume, widened by two margins, holds the cloud but for one point in a hundred, which noise

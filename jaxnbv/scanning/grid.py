@@ -139,6 +139,18 @@ def scan_samples(
     return jax.lax.map(lambda surface: scan(surface, camera, poses, barrier), surfaces)
 
 
+@eqx.filter_jit
+def mean_depth(scans: PointCloud, pose: Pose) -> Float[Array, " rays"]:
+    """Mean depth along the camera's axis (scene units) over the samples that a ray hits; NaN where it misses most.
+
+    `scans`: of all samples from the pose, along a leading axis.
+    """
+    depth = jnp.einsum("snd,d->sn", scans.points - pose.position, pose.forward, precision="highest")
+    count = jnp.sum(scans.mask, axis=0)
+    mean = jnp.sum(jnp.where(scans.mask, depth, 0.0), axis=0) / jnp.maximum(count, 1)
+    return jnp.where(2 * count >= scans.mask.shape[0], mean, jnp.nan)
+
+
 def nothing_imagined(surfaces: GridSurface, camera: Camera, scans: int) -> PointCloud:
     """Room for so many scans of each of a batch of surfaces, one after the other along the rows; none is taken yet."""
     rows = surfaces.values.shape[0], scans * camera.num_rays

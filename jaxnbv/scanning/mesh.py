@@ -1,6 +1,7 @@
 """TriangleMesh: real objects as they come, soups and open sheets included, met by rays through Embree on the host."""
 
 import io
+import os
 import struct
 import warnings
 from pathlib import Path
@@ -23,7 +24,6 @@ from jaxnbv.geometry.tensor_grid import on_tensor_grid
 from jaxnbv.scanning.grid import Grid, GridSurface
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.scanning.surface import Hits, Surface
-from jaxnbv.storage.files import is_file
 
 
 class _Tree:
@@ -153,7 +153,7 @@ class TriangleMesh(Surface):
         return np.asarray(points)
 
     @property
-    def reach(self) -> float:
+    def bounding_radius(self) -> float:
         """Distance from the scene's origin to the farthest corner."""
         return float(np.linalg.norm(self.vertices, axis=1).max())
 
@@ -241,7 +241,7 @@ def read_nodes(path: str | Path) -> list[tuple[str, trimesh.Trimesh]]:
     **Raises:** `ValueError` if the file is missing, cannot be read, or has no faces.
     """
     path = Path(path)
-    require(is_file(path), f"no mesh file at {shown(str(path))}: check the path")
+    require(os.path.isfile(path), f"no mesh file at {shown(str(path))}: check the path")
     try:
         parts = trimesh.load_scene(_opened(path), path.suffix[1:].lower(), process=False).dump()
     except Exception as error:  # Each of trimesh's readers fails in its own way.

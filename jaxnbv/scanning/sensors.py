@@ -26,24 +26,24 @@ HEAT_SETTING = Setting(Camera(), 3.0, 100)
 SENSOR_RADIUS = USUAL_SETTING.radius
 
 
-def fitted(setting: Setting, reach: float, fov: float | None = None, radius: float | None = None) -> Setting:
-    """The setting whose square image shows all of an object from everywhere, with a twentieth of its reach to spare:
+def fitted(setting: Setting, bounding_radius: float, fov: float | None = None, radius: float | None = None) -> Setting:
+    """The setting whose square image shows all of an object from everywhere, with a twentieth to spare:
 
-        sin(fov / 2) = 1.05 reach / radius
+        sin(fov / 2) = 1.05 bounding_radius / radius
 
-    - `reach`: of the object from the origin, in scene units.
+    - `bounding_radius`: of the object about the origin, in scene units.
     - `fov` (radians), `radius` (scene units): where one is given the other follows; both are taken as they are. By
       default the field of view is the setting's.
 
-    **Raises:** `ValueError` for cameras that would stand within the object's reach, or a field of view outside (0, pi).
+    **Raises:** `ValueError` for cameras that would stand within that, or a field of view outside (0, pi).
     """
-    ball = _ROOM * reach
+    ball = _ROOM * bounding_radius
     if radius is not None:
-        least = reach if fov is not None else ball
+        least = bounding_radius if fov is not None else ball
         require(
             radius > least,
-            f"cameras {radius:.4g} from the centre of an object that reaches {reach:.4g} far cannot see all of it: "
-            f"give more than {least:.4g}",
+            f"cameras {radius:.4g} from the centre of an object that reaches {bounding_radius:.4g} far cannot see all of "
+            f"it: give more than {least:.4g}",
         )
         fov = 2.0 * math.asin(ball / radius) if fov is None else fov
     camera = setting.camera if fov is None else dataclasses.replace(setting.camera, fov=fov)

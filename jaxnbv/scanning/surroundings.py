@@ -16,8 +16,10 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.neighbours import nearest_squared_distance
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
-from jaxnbv.scanning import Grid, SDFSurface
+from jaxnbv.scanning.evidence import Evidence
+from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.sdf import HalfSpace, Rotated, SignedDistance
+from jaxnbv.scanning.sphere_tracing import SDFSurface
 
 # Beyond this distance from the scene's origin nothing stands in the way of a camera.
 _FAR = 8.0
@@ -84,20 +86,12 @@ class Surroundings(eqx.Module):
         axis = jnp.asarray(grid.axis, jnp.result_type(float))
         return on_tensor_grid(lambda x: self.distance(x) < 0, axis)
 
-    def is_closed(
-        self, poses: Pose, cloud: PointCloud, empty: Bool[Array, "g g g"] | None, half_extent: float | None
-    ) -> Bool[Array, " poses"]:
-        """Whether a camera may not stand at each of a batch of poses, given D and what was seen empty."""
-        closed = self.trespass(poses, cloud) > 0
-        if not self.seen_only or empty is None or half_extent is None:
-            return closed
-        side = empty.shape[0]
-        place = (poses.position + half_extent) * (side - 1) / (2.0 * half_extent)
-        node = jnp.clip(jnp.round(place), 0, side - 1).astype(jnp.int32)
-        known = jnp.any(jnp.abs(poses.position) > half_extent, axis=-1)
-        return closed | ~(known | empty[tuple(node.T)])
+    def is_closed(self, poses: Pose, evidence: Evidence) -> Bool[Array, " poses"]:
+        """Whether a camera may not stand at each of a batch of poses, given what was seen."""
+        closed = self.violation(poses, evidence.cloud) > 0
+        return closed | ~evidence.is_seen_empty(poses.position) if self.seen_only else closed
 
-    def trespass(self, poses: Pose, cloud: PointCloud) -> Float[Array, " poses"]:
+    def violation(self, poses: Pose, cloud: PointCloud) -> Float[Array, " poses"]:
         """By how much each of a batch of cameras is too near to an obstacle or to D, in scene units; zero where it is
         not. Differentiable."""
         seen = jnp.sqrt(jnp.maximum(nearest_squared_distance(poses.position, cloud), 1e-12))

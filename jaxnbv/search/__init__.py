@@ -19,7 +19,6 @@ from jaxnbv.search.pose_space import FreePoses as FreePoses
 from jaxnbv.search.pose_space import PoseSpace as PoseSpace
 from jaxnbv.search.pose_space import SpherePoses as SpherePoses
 from jaxnbv.search.problem import Problem as Problem
-from jaxnbv.search.proposal import Batch as Batch
 from jaxnbv.search.proposal import Proposal as Proposal
 from jaxnbv.search.proposal import Trajectories as Trajectories
 from jaxnbv.search.tie_break import TieBreakSearch as TieBreakSearch

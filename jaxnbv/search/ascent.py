@@ -11,7 +11,7 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from jaxnbv.acquisition import Score, check_differentiable
+from jaxnbv.acquisition import Acquisition, check_differentiable
 from jaxnbv.checks import check_fields, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
@@ -61,10 +61,10 @@ class Ascent(eqx.Module):
         # No tolerance is ever met: as many steps as were asked for.
         return optx.OptaxMinimiser(optax.adam(self.learning_rate), rtol=0.0, atol=0.0)
 
-    def check(self, score: Score, camera: Camera, capacity: int) -> None:
-        """Raise `ValueError` if the score has no gradient, or the space makes no sense for the camera."""
+    def check(self, acquisition: Acquisition, camera: Camera, capacity: int) -> None:
+        """Raise `ValueError` if the acquisition has no gradient, or the space makes no sense for the camera."""
         self.space.check_camera(camera)
-        check_differentiable(score, capacity, camera.num_rays)
+        check_differentiable(acquisition, capacity, camera.num_rays)
 
     def climb(self, problem: Problem, candidates: Pose) -> Proposal:
         """The best pose on the trajectories from the best candidates, or the best candidate if none is better."""
@@ -88,11 +88,11 @@ class Ascent(eqx.Module):
 
         def loss(parameters, _):
             pose = self.space.retract(start, parameters)
-            value = problem.acquisition(pose[None])[0]
+            value = problem.values(pose[None])[0]
             # A pose may hide that the gradient which led to it was not a number.
             value = jnp.where(jnp.isfinite(parameters).all(), value, jnp.nan)
             # A pose where no camera may stand is never chosen; the penalty leads out of there.
-            return _PENALTY * problem.trespass(pose[None])[0] - value / scale, (pose, value)
+            return _PENALTY * problem.violation(pose[None])[0] - value / scale, (pose, value)
 
         parameters = jnp.zeros(self.space.num_parameters, start.position.dtype)
         struct, aux_struct = jax.eval_shape(loss, parameters, None)

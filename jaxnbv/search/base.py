@@ -8,8 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxnbv.acquisition import Score
-from jaxnbv.answers import Quantity
+from jaxnbv.acquisition import Acquisition, Quantity, Several
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.search.candidates import Candidates, SphereCandidates, as_candidates
@@ -33,13 +32,13 @@ class Search(eqx.Module):
     uses_samples: eqx.AbstractClassVar[bool]
     weighs_cost: ClassVar[bool] = True
 
-    def check(self, score: Score, camera: Camera, capacity: int) -> None:
-        """Raise `ValueError` if the search cannot work with a score, a camera and a cloud of so many rows."""
+    def check(self, acquisition: Acquisition, camera: Camera, capacity: int) -> None:
+        """Raise `ValueError` if the search cannot work with an acquisition, a camera and a cloud of so many rows."""
         return
 
-    def quantity(self, score: Score) -> Quantity:
-        """What the values of its proposals are: by default the score's."""
-        return score.quantity
+    def quantity(self, acquisition: Acquisition) -> Quantity:
+        """What the values of its proposals are: by default the acquisition's."""
+        return acquisition.quantity
 
     @abstractmethod
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
@@ -47,13 +46,43 @@ class Search(eqx.Module):
 
 
 class CandidateSearch(Search):
-    """A search that chooses one of its candidates.
+    """A search that chooses one of its candidates, in two halves: it scores them, then it picks.
+
+    A study gives several searches the same scores, those of `asks`, and lets each `pick`.
 
     - `candidates`: `SphereCandidates`, `GivenPoses` or others; a number stands for so many on the paper's sphere, and a
       batch of poses for these.
     """
 
     candidates: AnyCandidates = eqx.field(converter=as_candidates, default=SphereCandidates())
+
+    def asks(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
+        """The acquisitions whose scores it picks by; none for a search that does not look at them."""
+        return (acquisition,) if self.uses_samples else ()
+
+    def score(self, problem: Problem, candidates: Pose) -> Float[Array, "asked samples candidates"]:
+        """The first half: the scores of the candidates, sample by sample, by each acquisition that it asks."""
+        asked = self.asks(problem.acquisition)
+        if not asked:
+            return jnp.zeros((0, 0, self.candidates.count))
+        if len(asked) == 1:
+            return problem.scores(candidates)[None]
+        return problem.about(Several(asked)).scores(candidates)
+
+    @abstractmethod
+    def pick(
+        self,
+        problem: Problem,
+        candidates: Pose,
+        scores: Float[Array, "asked samples candidates"],
+        key: PRNGKeyArray,
+    ) -> Proposal:
+        """The second half: one of the candidates, given their scores."""
+
+    def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
+        """Score, then pick."""
+        candidates = self.candidates.poses()
+        return self.pick(problem, candidates, self.score(problem, candidates), key)
 
 
 def best_unvisited(

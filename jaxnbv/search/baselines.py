@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.acquisition import Score
-from jaxnbv.answers import Quantity
+from jaxnbv.acquisition import Acquisition, Quantity
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.search.base import CandidateSearch, best_unvisited
@@ -21,13 +20,18 @@ class FarthestView(CandidateSearch):
     uses_samples: ClassVar[bool] = False
     weighs_cost: ClassVar[bool] = False
 
-    def quantity(self, score: Score) -> Quantity:
+    def quantity(self, acquisition: Acquisition) -> Quantity:
         meaning = "distance from a candidate to the nearest camera so far; the surface is not looked at."
         return Quantity("distance to the nearest camera", "scene units", meaning)
 
-    def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
-        """Values are distances in scene units; the key is not used."""
-        candidates = self.candidates.poses()
+    def pick(
+        self,
+        problem: Problem,
+        candidates: Pose,
+        scores: Float[Array, "asked samples candidates"],
+        key: PRNGKeyArray,
+    ) -> Proposal:
+        """Values are distances in scene units; neither scores nor the key are used."""
         return best_unvisited(problem, candidates, problem.distance_to_visited(candidates))
 
 
@@ -37,13 +41,18 @@ class RandomView(CandidateSearch):
     uses_samples: ClassVar[bool] = False
     weighs_cost: ClassVar[bool] = False
 
-    def quantity(self, score: Score) -> Quantity:
+    def quantity(self, acquisition: Acquisition) -> Quantity:
         meaning = "every open candidate drew a lot; the surface is not looked at."
         return Quantity("lot drawn", "uniform on [0, 1)", meaning, smooth=False)
 
-    def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
-        """Values are the lots that were drawn, uniform on [0, 1)."""
-        candidates = self.candidates.poses()
+    def pick(
+        self,
+        problem: Problem,
+        candidates: Pose,
+        scores: Float[Array, "asked samples candidates"],
+        key: PRNGKeyArray,
+    ) -> Proposal:
+        """Values are the lots that were drawn, uniform on [0, 1); scores are not used."""
         return best_unvisited(problem, candidates, jax.random.uniform(key, (self.candidates.count,)))
 
 
@@ -56,14 +65,23 @@ class UncertaintyView(CandidateSearch):
 
     uses_samples: ClassVar[bool] = True
 
-    def quantity(self, score: Score) -> Quantity:
+    def quantity(self, acquisition: Acquisition) -> Quantity:
         meaning = "length of the principal ray along which the posterior samples disagree whether it has hit."
         return Quantity("uncertain length of the principal ray", "scene units", meaning)
 
-    def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
-        """Values are lengths in scene units; the key is not used."""
-        candidates = self.candidates.poses()
-        return best_unvisited(problem, candidates, problem.worth(uncertain_length(problem, candidates), candidates))
+    def asks(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
+        """None: it looks at the samples themselves."""
+        return ()
+
+    def pick(
+        self,
+        problem: Problem,
+        candidates: Pose,
+        scores: Float[Array, "asked samples candidates"],
+        key: PRNGKeyArray,
+    ) -> Proposal:
+        """Values are lengths in scene units; neither scores nor the key are used."""
+        return best_unvisited(problem, candidates, problem.weigh(uncertain_length(problem, candidates), candidates))
 
 
 def uncertain_length(problem: Problem, poses: Pose) -> Float[Array, " poses"]:

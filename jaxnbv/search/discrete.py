@@ -3,8 +3,9 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.search.base import CandidateSearch, best_unvisited
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal
@@ -15,8 +16,12 @@ class DiscreteSearch(CandidateSearch):
 
     uses_samples: ClassVar[bool] = True
 
-    def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
+    def pick(
+        self,
+        problem: Problem,
+        candidates: Pose,
+        scores: Float[Array, "asked samples candidates"],
+        key: PRNGKeyArray,
+    ) -> Proposal:
         """The argmax of the acquisition over the candidates not visited yet; the key is not used."""
-        candidates = self.candidates.poses()
-        scores = problem.scores(candidates)
-        return best_unvisited(problem, candidates, jnp.mean(scores, axis=0), scores=scores)
+        return best_unvisited(problem, candidates, jnp.mean(scores[0], axis=0), scores=scores[0])

@@ -6,7 +6,7 @@ import equinox as eqx
 import optimistix as optx
 from jaxtyping import PRNGKeyArray
 
-from jaxnbv.acquisition import Score
+from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import check_fields, checked, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
@@ -27,14 +27,14 @@ class GradientSearch(Search):
     - `candidates`: in their place, poses of your own; `turned`: whether the key turns them, if they can be turned.
     - `num_starts`, `iterations`, `learning_rate`, `solver`: see `Ascent`.
 
-    Differentiation keeps what the score computed for all starts and samples, with PointNet++ several gigabytes; fewer
-    starts need less.
+    Differentiation keeps what the acquisition computed for all starts and samples, with PointNet++ several gigabytes;
+    fewer starts need less.
 
     Starts, steps and rate are the paper's. It starts from six views drawn at random, evaluates no others first, and
     returns the best final value; `num_candidates=6` comes nearest to that.
 
     **Raises:** `ValueError` for another `dof`, both `dof` and `space`, fewer candidates than starts, no starts or
-    iterations, or a learning rate that is not positive; within a `Planner`, also for a score that JAX cannot
+    iterations, or a learning rate that is not positive; within a `Planner`, also for an acquisition that JAX cannot
     differentiate, and a camera that the space is not for.
     """
 
@@ -65,9 +65,9 @@ class GradientSearch(Search):
             f"the search has {self.candidates.count} candidates for {num_starts} starts: give it as many at least",
         )
 
-    def check(self, score: Score, camera: Camera, capacity: int) -> None:
+    def check(self, acquisition: Acquisition, camera: Camera, capacity: int) -> None:
         """See `Ascent.check`."""
-        self.ascent.check(score, camera, capacity)
+        self.ascent.check(acquisition, camera, capacity)
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """The best pose that was seen, candidates included; the key turns the candidates, if they are to be turned."""

@@ -1,20 +1,22 @@
 """Discrete search that spends its samples where they matter."""
 
+from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxnbv.checks import check_fields, require
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.search.base import CandidateSearch
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal
 
 
 class HalvingSearch(CandidateSearch):
-    """Successive halving over the candidates of a `DiscreteSearch` (Karnin et al. 2013), for scores that are slow.
+    """Successive halving over the candidates of a `DiscreteSearch` (Karnin et al. 2013), for slow acquisitions.
 
     All candidates are scored on the first few posterior samples; the better half on as many again, the better half of
     these on twice as many, and so on to all S: with 16 samples and `first_samples` 2, 5 scores a candidate in place of
@@ -32,8 +34,25 @@ class HalvingSearch(CandidateSearch):
         require(self.first_samples >= 1, f"first_samples is {self.first_samples}; candidates need at least one")
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
-        """The best of the last round; the value of a candidate that left earlier is its mean until then."""
+        """As `pick`, but candidates are scored only for as long as they are left."""
         candidates = self.candidates.poses()
+
+        def means(left: Int[Array, " left"], samples: slice) -> Float[Array, " left"]:
+            return problem.values(candidates[left], samples)
+
+        return self._halved(problem, candidates, means)
+
+    def pick(
+        self,
+        problem: Problem,
+        candidates: Pose,
+        scores: Float[Array, "asked samples candidates"],
+        key: PRNGKeyArray,
+    ) -> Proposal:
+        """The best of the last round; the value of a candidate that left earlier is its mean until then."""
+        return self._halved(problem, candidates, lambda left, samples: jnp.mean(scores[0, samples][:, left], axis=0))
+
+    def _halved(self, problem: Problem, candidates: Pose, means_of: Callable) -> Proposal:
         is_closed = problem.is_closed(candidates)
         left = jnp.arange(self.candidates.count)
         totals = jnp.zeros(self.candidates.count, candidates.position.dtype)
@@ -42,7 +61,7 @@ class HalvingSearch(CandidateSearch):
             if scored:
                 left = left[jax.lax.top_k(values[left], max(1, len(left) // 2))[1]]
             more = min(max(scored, self.first_samples), problem.num_samples - scored)
-            means = problem.acquisition(candidates[left], slice(scored, scored + more))
+            means = means_of(left, slice(scored, scored + more))
             totals, scored = totals.at[left].add(more * means), scored + more
             values = values.at[left].set(jnp.where(is_closed[left], -jnp.inf, totals[left] / scored))
         best = left[jnp.argmax(values[left])]

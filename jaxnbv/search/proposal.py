@@ -6,9 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnbv.display import Displayed
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.planning.travel import CostFunction, arc_length, visiting_order
 
 
 class Trajectories(eqx.Module):
@@ -27,7 +25,7 @@ class Trajectories(eqx.Module):
         return jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), (poses, values))
 
 
-class Proposal(Displayed):
+class Proposal(eqx.Module):
     """A search's answer: the pose to take next, and what it looked at.
 
     - `value`: the chosen pose's value, in the units of what the search maximises.
@@ -46,7 +44,7 @@ class Proposal(Displayed):
     standard_errors: Float[Array, " candidates"] | None = None
     difference_errors: Float[Array, " candidates"] | None = None
 
-    def is_level(self, errors: float = 2.0) -> Bool[Array, " candidates"] | None:
+    def tied_with_best(self, errors: float = 2.0) -> Bool[Array, " candidates"] | None:
         """Which candidates the samples cannot tell from the best one, itself included: those whose value is within so
         many standard errors of the difference. None where these are not known."""
         if self.difference_errors is None:
@@ -64,35 +62,10 @@ class Proposal(Displayed):
         return float(self.standard_errors[chosen.argmax()]) if chosen.any() else None
 
     @property
-    def others_level(self) -> int | None:
-        """How many other candidates are level with the best one, within two standard errors; None where that is not
+    def num_tied(self) -> int | None:
+        """How many other candidates are tied with the best one, within two standard errors; None where that is not
         known, as for a single sample."""
-        level = self.is_level()
-        if level is None or bool(jnp.isnan(jnp.asarray(self.difference_errors)).any()):
+        tied = self.tied_with_best()
+        if tied is None or bool(jnp.isnan(jnp.asarray(self.difference_errors)).any()):
             return None
-        return int(jnp.sum(level)) - 1
-
-
-class Batch(eqx.Module):
-    """Several views to be taken before the planner is asked again.
-
-    - `proposals`: in the order in which they were chosen; the value of each is what it adds to those before it.
-    - `start`: the last pose so far, None where it is not known; `cost`: what it costs to go from pose to pose.
-    """
-
-    proposals: tuple[Proposal, ...]
-    start: Pose | None
-    cost: CostFunction = arc_length
-
-    @property
-    def poses(self) -> Pose:
-        """The poses (k,), in the order in which they were chosen."""
-        return jax.tree.map(lambda *rows: jnp.stack(rows), *(proposal.pose for proposal in self.proposals))
-
-    @property
-    def order(self) -> tuple[int, ...]:
-        """The order in which it costs least to visit them.
-
-        **Raises:** `ValueError` for more than twelve.
-        """
-        return visiting_order(self.start or self.proposals[0].pose, self.poses, self.cost)
+        return int(jnp.sum(tied)) - 1

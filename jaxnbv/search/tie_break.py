@@ -5,10 +5,11 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.acquisition import Score, Several
+from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import check_fields
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.search.base import CandidateSearch, best_unvisited, first_best
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal
@@ -16,34 +17,43 @@ from jaxnbv.search.proposal import Proposal
 
 class TieBreakSearch(CandidateSearch):
     """The candidate of the highest acquisition; among those that the samples cannot tell from it, the one of the
-    highest second score.
+    highest second acquisition.
 
     While nothing was seen of what matters, no sample shows it either, and a classifier or utility finds all views
     alike: their values differ by the noise of a few samples, and the argmax is a view at random. Candidates count as
-    level within two standard errors of the difference from the best (`Proposal.is_level`), so that the second score
+    tied within two standard errors of the difference from the best (`Proposal.tied_with_best`), so that the second
     decides early, and the first as soon as it tells views apart. Both are asked about the same scans.
 
-    - `second`: decides between level candidates, such as `Coverage()`.
+    - `second`: decides between tied candidates, such as `Coverage()`.
 
     Values of its proposals are the acquisition's; the chosen one need not be the highest.
     """
 
-    second: Score = eqx.field(kw_only=True)
+    second: Acquisition = eqx.field(kw_only=True)
     uses_samples: ClassVar[bool] = True
 
     def __check_init__(self):
         check_fields(self)
 
-    def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
-        """The argmax of the second score over the level candidates not visited yet; the key is not used."""
-        candidates = self.candidates.poses()
-        first, second = problem.about(Several((problem.score, self.second))).scores(candidates)
+    def asks(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
+        """Both."""
+        return acquisition, self.second
+
+    def pick(
+        self,
+        problem: Problem,
+        candidates: Pose,
+        scores: Float[Array, "asked samples candidates"],
+        key: PRNGKeyArray,
+    ) -> Proposal:
+        """The argmax of the second acquisition over the tied candidates not visited yet; the key is not used."""
+        first, second = scores
         found = best_unvisited(problem, candidates, jnp.mean(first, axis=0), scores=first)
-        level = found.is_level()
-        assert level is not None
-        seconds = jnp.where(level & (found.values > -jnp.inf), jnp.mean(second, axis=0), -jnp.inf)
+        tied = found.tied_with_best()
+        assert tied is not None
+        seconds = jnp.where(tied & (found.values > -jnp.inf), jnp.mean(second, axis=0), -jnp.inf)
         index = first_best(seconds)
-        # What is not a number is told of by the planner, whichever score gave it.
+        # What is not a number is told of by the planner, whichever gave it.
         value = jnp.where(jnp.isnan(seconds[index]), jnp.nan, found.values[index])
         value = jnp.where(jnp.isfinite(found.value), value, found.value)
         return dataclasses.replace(found, pose=candidates[index], value=value)

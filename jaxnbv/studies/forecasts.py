@@ -1,6 +1,6 @@
 """How good the surfaces that a planner imagines are, measured against the true one.
 
-Samples of the posterior are forecasts: of the depth along a ray, of whether a place is inside, of what a view is worth.
+Samples of the posterior are forecasts: of the depth along a ray, of whether a place is inside, of the value of a view.
 They are judged by proper scores (Gneiting and Raftery 2007), whose expectation is least for the true distribution, in
 the forms that are fair to small ensembles (Ferro 2014): no number of samples is at an advantage.
 """
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnbv.acquisition import Score, expected_score
+from jaxnbv.acquisition import Acquisition, expected_value
 from jaxnbv.checks import AnyArray, InputError, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
@@ -21,8 +21,7 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
 from jaxnbv.geometry.volume import Box
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.state import State
-from jaxnbv.scanning import Grid, GridSurface, SDFSurface, Surface, TriangleMesh, scan
+from jaxnbv.scanning import Evidence, Grid, GridSurface, SDFSurface, Surface, TriangleMesh, scan
 from jaxnbv.studies.engine.diagnostics import rank_correlation
 
 BINS = 10
@@ -52,7 +51,7 @@ class Truth(eqx.Module):
 
         **Raises:** `ValueError` for a kind of surface whose inside is not known.
         """
-        inside = _inside(scene, planner.grid)
+        inside = _inside(scene, planner.imagination.grid)
         look = _scan if scene.in_jit else scan
         seen = look(scene, camera, candidates)
         depths = ray_depths(seen, camera, candidates, volume)[0]
@@ -80,8 +79,8 @@ class Judgement(NamedTuple):
     - `mean_inside`, `true_inside`: mean probability of being inside, and the share that is inside, of the same nodes.
     - `reliability`: of the same probabilities.
     - `in_empty`: share of the imagined hits that lie in space seen to be empty; None without hits.
-    - `rank`: Spearman's correlation of the acquisition with what the candidates truly are worth.
-    - `share_of_best`: what the candidate of the greatest acquisition is truly worth, of what the best one is.
+    - `rank`: Spearman's correlation of the acquisition with the true values of the candidates.
+    - `share_of_best`: true value of the candidate of the greatest acquisition, as a share of the best one's.
     """
 
     crps: float
@@ -96,24 +95,24 @@ class Judgement(NamedTuple):
 
 
 def judge(
-    planner: Planner, state: State, surfaces: GridSurface, truth: Truth, seen_empty: Bool[AnyArray, "g g g"]
+    planner: Planner, evidence: Evidence, surfaces: GridSurface, truth: Truth, seen_empty: Bool[AnyArray, "g g g"]
 ) -> Judgement:
-    """How good `surfaces`, the planner's samples given the state, are.
+    """How good `surfaces`, the planner's samples given the evidence, are.
 
-    - `seen_empty`: the nodes that the state's scans have shown to be empty, whether the planner carves by them or not:
+    - `seen_empty`: the nodes that the scans have shown to be empty, whether the planner carves by them or not:
       all planners are judged on the same nodes, those inside the volume that are not seen empty.
 
     **Raises:** `ValueError` if the truth is on another grid, or there are fewer than two samples.
     """
-    shape = (planner.grid.resolution,) * 3
+    shape = (planner.imagination.grid.resolution,) * 3
     require(
         truth.inside.shape == seen_empty.shape == shape,
         f"the truth is on {truth.inside.shape} nodes and the seen space on {seen_empty.shape}, but the planner's grid "
         f"has {shape}: make both with the planner's grid",
     )
     seen_empty = jnp.asarray(seen_empty)
-    judged = _judge(surfaces, state.cloud, truth, seen_empty, planner.camera, planner.acquisition)
-    crps_depth, in_empty, inside, expected, worth = (np.asarray(leaf) for leaf in judged)
+    judged = _judge(surfaces, evidence.cloud, truth, seen_empty, planner.camera, planner.acquisition)
+    crps_depth, in_empty, inside, expected, true_values = (np.asarray(leaf) for leaf in judged)
     record = Judgement(
         crps=float(crps_depth),
         brier=None,
@@ -122,12 +121,12 @@ def judge(
         true_inside=None,
         reliability=None,
         in_empty=None if np.isnan(in_empty) else float(in_empty),
-        rank=rank_correlation(expected, worth, np.ones(len(worth), bool)),
-        share_of_best=share_of_best(expected, worth),
+        rank=rank_correlation(expected, true_values, np.ones(len(true_values), bool)),
+        share_of_best=share_of_best(expected, true_values),
     )
     if not bool(truth.inside.any()):
         return record
-    unseen = np.asarray(_unseen(truth.volume, planner.grid, seen_empty))
+    unseen = np.asarray(_unseen(truth.volume, planner.imagination.grid, seen_empty))
     forecast, happened = inside[unseen], np.asarray(truth.inside)[unseen]
     plain = brier(forecast, happened)
     return record._replace(
@@ -216,28 +215,34 @@ def empty_share(
     return jnp.sum(mask & empty[node[..., 0], node[..., 1], node[..., 2]]) / jnp.sum(mask)
 
 
-def share_of_best(values: Float[AnyArray, " c"], worth: Float[AnyArray, " c"]) -> float | None:
-    """What the candidate of the greatest value is worth, of the greatest worth; None where nothing is worth anything.
+def share_of_best(values: Float[AnyArray, " c"], true_values: Float[AnyArray, " c"]) -> float | None:
+    """True value of the candidate of the greatest value, as a share of the greatest; None where all are zero.
 
     One minus this is the relative regret.
     """
-    values, worth = np.asarray(values), np.asarray(worth)
-    return float(worth[np.argmax(values)] / worth.max()) if worth.max() > 0 else None
+    values, true_values = np.asarray(values), np.asarray(true_values)
+    best = float(true_values.max())
+    return float(true_values[np.argmax(values)]) / best if best > 0 else None
 
 
 @eqx.filter_jit
 def _judge(
-    surfaces: GridSurface, cloud: PointCloud, truth: Truth, empty: Bool[Array, "g g g"], camera: Camera, score: Score
+    surfaces: GridSurface,
+    cloud: PointCloud,
+    truth: Truth,
+    empty: Bool[Array, "g g g"],
+    camera: Camera,
+    acquisition: Acquisition,
 ):
     seen = jax.lax.map(lambda surface: scan(surface, truth.camera, truth.candidates), surfaces)
     depths, meets = jax.vmap(lambda s: ray_depths(s, truth.camera, truth.candidates, truth.volume))(seen)
     error = jnp.mean(crps(depths, truth.depths), where=meets[0])
     share = empty_share(seen.points, seen.mask, empty, surfaces.grid)
     inside = jnp.mean(surfaces.values < 0, axis=0)
-    expected = expected_score(score, cloud, surfaces, camera, truth.candidates)
-    context = score.context(cloud)
-    worth = jax.lax.map(lambda true: score(context, true), truth.scans, batch_size=score.batch_size)
-    return error, share, inside, expected, worth
+    expected = expected_value(acquisition, cloud, surfaces, camera, truth.candidates)
+    context = acquisition.context(cloud)
+    true_values = jax.lax.map(lambda true: acquisition(context, true), truth.scans, batch_size=acquisition.batch_size)
+    return error, share, inside, expected, true_values
 
 
 @eqx.filter_jit

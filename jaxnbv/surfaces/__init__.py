@@ -1,6 +1,5 @@
 """p(f) and p(f | D): distributions over implicit surfaces."""
 
-from jaxnbv.surfaces.base import EmptyPoints as EmptyPoints
 from jaxnbv.surfaces.base import Fields as Fields
 from jaxnbv.surfaces.base import SurfaceModel as SurfaceModel
 from jaxnbv.surfaces.base import SurfacePosterior as SurfacePosterior

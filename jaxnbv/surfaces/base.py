@@ -10,18 +10,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, as_numbers, check_key, check_type, is_traced, require
-from jaxnbv.display import Displayed
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
+from jaxnbv.scanning.evidence import Evidence
 
 HALF_WIDTH = 0.5 * math.pi
 """Scattered points must lie in [-HALF_WIDTH, HALF_WIDTH]^3, the cube that the paper scales a scene into."""
-
-# Draws of the prior are not of unit length either, and a model may be conditioned on them.
-_LONGEST_NORMAL = 10.0
 
 
 def on_torus(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -77,31 +74,6 @@ def _check_on_torus(coordinates: Any, owner: Any) -> None:
     )
 
 
-def check_data(cloud: PointCloud) -> None:
-    """Whether a model can be conditioned on a cloud, whose values are known.
-
-    **Raises:** `ValueError` if it is empty, has entries that are not finite, a normal longer than 10, or points outside
-    [-pi/2, pi/2]^3 (scene coordinates).
-    """
-    check_type(cloud, PointCloud, "the cloud")
-    points, normals = cloud.to_numpy()
-    require(len(points) > 0, "cannot condition on an empty cloud: scan the object at least once")
-    finite = np.isfinite(points).all() and np.isfinite(normals).all()
-    require(finite, "the cloud has points or normals that are not finite: build it with PointCloud.from_arrays")
-    longest = float(np.linalg.norm(normals, axis=1).max())
-    require(
-        longest <= _LONGEST_NORMAL,
-        f"a normal has length {longest:.4g} and should be of unit length: build the cloud with PointCloud.from_arrays, "
-        "which normalises",
-    )
-    furthest = float(np.abs(points).max())
-    require(
-        furthest <= float(points.dtype.type(HALF_WIDTH)),
-        f"a point has a coordinate of {furthest:.4g}, outside the scene [-pi/2, pi/2]^3: "
-        "bring the points to the scene with Frame.fit(points).to_scene(points)",
-    )
-
-
 class Fields(eqx.Module):
     """Sampled implicit functions f_1, ..., f_S, each to be evaluated anywhere in the scene."""
 
@@ -115,7 +87,7 @@ class Fields(eqx.Module):
         return on_tensor_grid(self, axis)
 
 
-class SurfacePosterior(Displayed):
+class SurfacePosterior(eqx.Module):
     """p(f | D): the surface is where f equals `level`, and f is greater outside.
 
     An implementation gives `level` and `sample`. One that has closed forms also overrides `mean` and `variance`, which
@@ -143,24 +115,14 @@ class SurfacePosterior(Displayed):
         return jnp.var(self.sample(jax.random.key(0), 64)(x), axis=0, ddof=1)
 
 
-class EmptyPoints(eqx.Module):
-    """Points (scene coordinates) that were seen to be empty. Rows whose mask is False hold nothing."""
-
-    points: Float[Array, "m 3"]
-    mask: Bool[Array, " m"]
-
-
 class SurfaceModel(eqx.Module):
-    """p(f): a prior over implicit surfaces that can be conditioned on oriented points."""
+    """p(f): a prior over implicit surfaces that can be conditioned on what was seen."""
 
     @abstractmethod
-    def condition(self, cloud: PointCloud) -> SurfacePosterior:
-        """p(f | D) for the filled rows of a cloud in scene coordinates."""
+    def condition(self, evidence: Evidence | PointCloud) -> SurfacePosterior:
+        """p(f | evidence): the filled rows of its cloud and, where the model can make use of it, the space that was
+        seen empty. A cloud alone is evidence too; `Evidence.of` makes it so."""
 
     def check(self, cloud: PointCloud) -> None:
         """Warn where a cloud, whose values are known, is not one that the model makes much of."""
         return
-
-    def condition_on_space(self, cloud: PointCloud, empty: EmptyPoints) -> SurfacePosterior:
-        """p(f | D, what was seen empty). A model that makes nothing of emptiness gives p(f | D), as here."""
-        return self.condition(cloud)

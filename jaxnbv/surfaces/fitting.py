@@ -9,8 +9,8 @@ import optimistix as optx
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.checks import check_key, check_type, checked, require
-from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.surfaces.base import check_data
+from jaxnbv.geometry.cloud import PointCloud, check_oriented
+from jaxnbv.surfaces.base import HALF_WIDTH
 from jaxnbv.surfaces.screened import ScreenedSPSR
 from jaxnbv.surfaces.spsr import GeometricSPSR
 
@@ -39,7 +39,7 @@ def fit_hyperparameters(
     check_key(key)
     require(num_points >= 8, f"asked for {num_points} points to fit to; ask for at least 8")
     require(max_steps >= 1, f"asked for {max_steps} steps; ask for at least one")
-    check_data(cloud)
+    check_oriented(cloud, "the cloud", HALF_WIDTH, unit=False)
     base = model.base if isinstance(model, ScreenedSPSR) else model
     found: GeometricSPSR
     found, likelihood = _fit(base, _random_rows(cloud, key, num_points), max_steps)

@@ -20,9 +20,10 @@ import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.checks import AnyArray, check_fields, check_type, is_traced, require, shown
+from jaxnbv.checks import AnyArray, check_fields, is_traced, require, shown
 from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.surfaces.base import EmptyPoints, SurfaceModel, on_torus, sampler
+from jaxnbv.scanning.evidence import Evidence
+from jaxnbv.surfaces.base import SurfaceModel, on_torus, sampler
 from jaxnbv.surfaces.covariance import function_covariance, function_variance
 from jaxnbv.surfaces.nonuniform import NonuniformTransform
 from jaxnbv.surfaces.spsr import GeometricSPSR, GeometricSPSRPosterior, mode_variance
@@ -47,25 +48,25 @@ class ScreenedSPSR(SurfaceModel):
       body, of which values can make use.
     - `values`: what is known of values, see `jaxnbv.surfaces.values`.
     - `level_deviation`: tau, the prior standard deviation of the level; broad beside the values of f.
-    - `reach`: scene units; h is half the median of E f(x_j + reach n_j) - E f(x_j - reach n_j) over the data, given the
-      normals alone, but at least half the prior standard deviation of f: the two sides of a thin sheet cancel.
+    - `offset`: scene units; h is half the median of E f(x_j + offset n_j) - E f(x_j - offset n_j) over the data, given
+      the normals alone, but at least half the prior standard deviation of f: the two sides of a thin sheet cancel.
 
     The cost beyond that of `base` is 3 N^2 M + M^3 for N normals and M values.
 
-    **Raises:** `ValueError` without values, or if tau or the reach is not positive.
+    **Raises:** `ValueError` without values, or if tau or the offset is not positive.
     """
 
     base: GeometricSPSR = eqx.field(default_factory=lambda: GeometricSPSR((0.01, 0.06), (0.2, 0.25), truncation=32))
     values: tuple[ValueSource, ...] = eqx.field(default_factory=lambda: (OutsideBoundary(), OnSurface(), SeenEmpty()))
     level_deviation: float = eqx.field(static=True, default=0.5)
-    reach: float = eqx.field(static=True, default=0.1)
+    offset: float = eqx.field(static=True, default=0.1)
 
     def __check_init__(self):
         check_fields(self)
         known = isinstance(self.values, tuple) and all(isinstance(value, ValueSource) for value in self.values)
         require(known, f"the values are {shown(self.values)}; give a tuple such as (OutsideBoundary(), OnSurface())")
         require(len(self.values) > 0, "no values are given: name some, such as OutsideBoundary(), or use GeometricSPSR")
-        for name in ("level_deviation", "reach"):
+        for name in ("level_deviation", "offset"):
             value = getattr(self, name)
             require(0 < value < math.inf, f"{name} is {value}; it must be positive and finite")
 
@@ -73,18 +74,13 @@ class ScreenedSPSR(SurfaceModel):
         """As that of the base."""
         self.base.check(cloud)
 
-    def condition(self, cloud: PointCloud) -> "ScreenedSPSRPosterior":
-        """p(g | D). The cost is that of the base, and of M triangular solves with its factor.
+    def condition(self, evidence: Evidence | PointCloud) -> "ScreenedSPSRPosterior":
+        """p(g | D, what was seen empty). The cost is that of the base, and of M triangular solves with its factor.
 
         **Raises:** `ValueError` as `GeometricSPSR.condition` does, and if S is singular in the precision at hand.
         """
-        check_type(cloud, PointCloud, "the cloud")
-        nowhere = EmptyPoints(jnp.zeros((1, 3), cloud.points.dtype), jnp.zeros(1, bool))
-        return self.condition_on_space(cloud, nowhere)
-
-    def condition_on_space(self, cloud: PointCloud, empty: EmptyPoints) -> "ScreenedSPSRPosterior":
-        """p(g | D, what was seen empty). **Raises:** as `condition` does."""
-        posterior = _condition(self, self.base.condition(cloud), empty)
+        evidence = Evidence.of(evidence)
+        posterior = _condition(self, self.base.condition(evidence), evidence)
         if not is_traced(posterior.weights):
             require(
                 bool(jnp.isfinite(posterior.weights).all()),
@@ -95,9 +91,11 @@ class ScreenedSPSR(SurfaceModel):
 
 
 @eqx.filter_jit
-def _condition(model: ScreenedSPSR, base: GeometricSPSRPosterior, empty: EmptyPoints) -> "ScreenedSPSRPosterior":
-    spectrum, rows = model.base.spectrum, joined(model.values, base.cloud, empty)
-    half_jump = _half_jump(base, model.reach)
+def _condition(model: ScreenedSPSR, base: GeometricSPSRPosterior, evidence: Evidence) -> "ScreenedSPSRPosterior":
+    # What stands in rows that are not filled must not reach the products.
+    evidence = eqx.tree_at(lambda e: e.cloud, evidence, base.cloud)
+    spectrum, rows = model.base.spectrum, joined(model.values, evidence)
+    half_jump = _half_jump(base, model.offset)
     whitened = jnp.where(rows.mask, base.whitened(rows.points), 0.0)
     explained = jnp.einsum("dnk,dnl->kl", whitened, whitened, precision="highest")
     level_variance = model.level_deviation**2
@@ -120,12 +118,12 @@ def _condition(model: ScreenedSPSR, base: GeometricSPSRPosterior, empty: EmptyPo
     return eqx.tree_at(lambda p: (p.weights, p.mean_coefficients), posterior, (weights, mean))
 
 
-def _half_jump(base: GeometricSPSRPosterior, reach: float) -> Float[Array, ""]:
-    """h: half the median rise of E f given the normals across the data, from `reach` behind to `reach` before."""
+def _half_jump(base: GeometricSPSRPosterior, offset: float) -> Float[Array, ""]:
+    """h: half the median rise of E f given the normals across the data, from `offset` behind to `offset` before."""
     count = jnp.sum(base.cloud.mask)
     order = jnp.argsort(~base.cloud.mask, stable=True)
     chosen = order[(jnp.arange(_JUMP_POINTS) * count) // _JUMP_POINTS]
-    points, step = base.cloud.points[chosen], reach * base.cloud.normals[chosen]
+    points, step = base.cloud.points[chosen], offset * base.cloud.normals[chosen]
     mean = base.mean_field
     least = 0.5 * jnp.sqrt(function_variance(base.model.spectrum))
     return jnp.maximum(0.5 * jnp.median(mean(points + step)[0] - mean(points - step)[0]), least)

@@ -26,8 +26,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from scipy.spatial import cKDTree
 
 from jaxnbv.checks import AnyArray, as_floats, check_type, is_traced, require
-from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.surfaces.base import SurfaceModel, check_data, on_torus, sampler
+from jaxnbv.geometry.cloud import PointCloud, check_oriented
+from jaxnbv.scanning.evidence import Evidence
+from jaxnbv.surfaces.base import HALF_WIDTH, SurfaceModel, on_torus, sampler
 from jaxnbv.surfaces.covariance import (
     Spectra,
     function_covariance,
@@ -130,15 +131,17 @@ class GeometricSPSR(SurfaceModel):
                 stacklevel=2,
             )
 
-    def condition(self, cloud: PointCloud) -> "GeometricSPSRPosterior":
-        """p(f | D). The cost is that of a Cholesky factorisation of the cloud's capacity.
+    def condition(self, evidence: Evidence | PointCloud) -> "GeometricSPSRPosterior":
+        """p(f | D): of the evidence it takes the cloud alone. The cost is that of a Cholesky factorisation of the
+        cloud's capacity.
 
         **Raises:** `ValueError` if the cloud is empty, has entries that are not finite, a normal longer than 10 or
         points outside [-pi/2, pi/2]^3 (scene coordinates), or if A is singular in the precision at hand; under `jit`
         values are not known and are not checked.
         """
+        cloud = Evidence.of(evidence).cloud
         if not is_traced(cloud):
-            check_data(cloud)
+            check_oriented(cloud, "the cloud", HALF_WIDTH, unit=False)
         posterior = _condition(self, cloud)
         if not is_traced(posterior.level):
             require(

@@ -13,10 +13,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxnbv.checks import InputError, check_fields, is_traced, require, shown
-from jaxnbv.geometry.cloud import PointCloud, farthest_point_subsample
+from jaxnbv.geometry.cloud import farthest_point_subsample
 from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.geometry.volume import Box, Volume, boundary_points
-from jaxnbv.surfaces.base import HALF_WIDTH, EmptyPoints
+from jaxnbv.scanning.evidence import Evidence
+from jaxnbv.surfaces.base import HALF_WIDTH
 
 
 class ValueRows(eqx.Module):
@@ -35,8 +36,8 @@ class ValueSource(eqx.Module):
     """A kind of knowledge about values of f."""
 
     @abstractmethod
-    def rows(self, cloud: PointCloud, empty: EmptyPoints) -> ValueRows:
-        """The rows that it adds given D and what was seen empty, as many for all of one capacity; run under `jit`."""
+    def rows(self, evidence: Evidence) -> ValueRows:
+        """The rows that it adds, as many for all evidence of one capacity; run under `jit`."""
 
 
 class OutsideBoundary(ValueSource):
@@ -77,9 +78,9 @@ class OutsideBoundary(ValueSource):
             "[-pi/2, pi/2]^3",
         )
 
-    def rows(self, cloud: PointCloud, empty: EmptyPoints) -> ValueRows:
+    def rows(self, evidence: Evidence) -> ValueRows:
         """One row a point of the boundary."""
-        points = boundary_points(self.volume, self.count).astype(cloud.points.dtype)
+        points = boundary_points(self.volume, self.count).astype(evidence.cloud.points.dtype)
         return _rows(points, self.value, self.noise, jnp.ones(self.count, bool))
 
 
@@ -99,9 +100,9 @@ class OnSurface(ValueSource):
         check_fields(self)
         _check(self.count, self.noise)
 
-    def rows(self, cloud: PointCloud, empty: EmptyPoints) -> ValueRows:
+    def rows(self, evidence: Evidence) -> ValueRows:
         """One row a point."""
-        chosen = farthest_point_subsample(cloud, self.count)
+        chosen = farthest_point_subsample(evidence.cloud, self.count)
         return _rows(chosen.points, 0.0, self.noise, chosen.mask)
 
 
@@ -126,9 +127,9 @@ class Thickness(ValueSource):
         _check(self.count, self.noise)
         require(self.depth > 0, f"the depth of the thickness is {self.depth}; it must be positive")
 
-    def rows(self, cloud: PointCloud, empty: EmptyPoints) -> ValueRows:
+    def rows(self, evidence: Evidence) -> ValueRows:
         """One row a point."""
-        chosen = farthest_point_subsample(cloud, self.count)
+        chosen = farthest_point_subsample(evidence.cloud, self.count)
         behind = chosen.points - self.depth * chosen.normals
         mask = chosen.mask & jnp.all(jnp.abs(behind) <= HALF_WIDTH, axis=1)
         return _rows(jnp.where(mask[:, None], behind, 0.0), self.value, self.noise, mask)
@@ -153,18 +154,19 @@ class SeenEmpty(ValueSource):
         check_fields(self)
         _check(self.count, self.noise)
 
-    def rows(self, cloud: PointCloud, empty: EmptyPoints) -> ValueRows:
+    def rows(self, evidence: Evidence) -> ValueRows:
         """One row a point."""
-        mask = empty.mask & jnp.all(jnp.abs(empty.points) <= HALF_WIDTH, axis=1)
-        index = farthest_point_indices(empty.points, mask, self.count)
+        empty, seen = evidence.empty_points
+        mask = seen & jnp.all(jnp.abs(empty) <= HALF_WIDTH, axis=1)
+        index = farthest_point_indices(empty, mask, self.count)
         kept = jnp.arange(self.count) < jnp.sum(mask)
-        points = jnp.where(kept[:, None], empty.points[index], 0.0).astype(cloud.points.dtype)
+        points = jnp.where(kept[:, None], empty[index], 0.0).astype(evidence.cloud.points.dtype)
         return _rows(points, self.value, self.noise, kept)
 
 
-def joined(sources: tuple[ValueSource, ...], cloud: PointCloud, empty: EmptyPoints) -> ValueRows:
+def joined(sources: tuple[ValueSource, ...], evidence: Evidence) -> ValueRows:
     """The rows of all sources, one behind the other."""
-    parts = [source.rows(cloud, empty) for source in sources]
+    parts = [source.rows(evidence) for source in sources]
     return ValueRows(
         *(jnp.concatenate([getattr(part, name) for part in parts]) for name in ("points", "values", "noise", "mask"))
     )

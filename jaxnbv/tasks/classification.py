@@ -4,25 +4,25 @@ A classifier is any function from a `PointCloud` (rows, masked) to log-probabili
 network of `jaxnbv.networks`, one of your own, or a `HostClassifier`. In an attribute `classes` it may say their names.
 """
 
-from collections.abc import Callable
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.acquisition import Score, context_of, preferred_batch_size, zero_if_empty
-from jaxnbv.answers import Answer, Panel, Quantity
-from jaxnbv.checks import check_fields, require
+from jaxnbv.acquisition import Acquisition, Answer, Quantity, context_of, preferred_batch_size, zero_if_empty
+from jaxnbv.checks import InputError, check_fields, require
 from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.scanning import Surface
+from jaxnbv.tasks.stopping import SoFar, Stop
 
 Classifier: TypeAlias = Callable[[PointCloud], Float[Array, " classes"]]
-# Their shape is checked by `Score.check`.
+# Their shape is checked by `Acquisition.check`.
 Context: TypeAlias = tuple[PointCloud, Array]
-# By when a reader may rely on a class.
-_SURE = 0.95
 
 
 def entropy(log_p: Float[Array, "*batch classes"]) -> Float[Array, "*batch"]:
@@ -71,8 +71,8 @@ class NegativeEntropy(eqx.Module):
         check_log_p(_log_p(self.classifier, cloud))
 
 
-class ClassScore(Score):
-    """A score that compares what a classifier says of D and of D u scan.
+class ClassAcquisition(Acquisition):
+    """An acquisition that compares what a classifier says of D and of D u scan.
 
     - `classifier`: a function from a cloud to log-probabilities.
     - `num_points`: D is thinned to so many by farthest point sampling, once a step, before scans are added to it.
@@ -85,6 +85,15 @@ class ClassScore(Score):
         """D, thinned, and log p^(t)."""
         thinned = limit_capacity(cloud, self.num_points)
         return thinned, self.classifier(thinned)
+
+    @abstractmethod
+    def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, "*values"]:
+        """What a scan is worth that takes the classifier's answer from log p^(t) to log p^(t+1)."""
+
+    def __call__(self, context: Context, scan: PointCloud) -> Float[Array, "*values"]:
+        """`compare`; zero for a scan that sees nothing."""
+        cloud, log_p = context
+        return zero_if_empty(scan, self.compare(log_p, self.classifier(concatenate(cloud, scan))))
 
     @property
     def batch_size(self) -> int:
@@ -111,19 +120,18 @@ class ClassScore(Score):
         )
 
 
-class CrossEntropy(ClassScore):
+class CrossEntropy(ClassAcquisition):
     """The paper's alpha^(CE): -sum_c p_c^(t) log p_c^(t+1), of the classes' probabilities given D and given D u scan.
 
-    - `classifier`, `num_points`: see `ClassScore`.
+    - `classifier`, `num_points`: see `ClassAcquisition`.
     """
 
     classifier: Classifier
     num_points: int = eqx.field(static=True, default=1024)
 
-    def __call__(self, context: Context, scan: PointCloud) -> Float[Array, ""]:
-        """In nats; the least there is, zero, for a scan that sees nothing."""
-        cloud, log_p = context
-        return zero_if_empty(scan, cross_entropy(log_p, self.classifier(concatenate(cloud, scan))))
+    def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, ""]:
+        """In nats; zero is the least there is."""
+        return cross_entropy(log_p, log_q)
 
     @property
     def quantity(self) -> Quantity:
@@ -131,12 +139,12 @@ class CrossEntropy(ClassScore):
         return Quantity("expected cross-entropy", "nats", meaning)
 
 
-class MixedEntropy(ClassScore):
+class MixedEntropy(ClassAcquisition):
     """Cross-entropy while the class is open, entropy reduction once it is nearly settled (the authors' code).
 
     `CrossEntropy` where the entropy of p^(t) is above `threshold` (nats), else max(0, H(p^(t)) - H(p^(t+1))).
 
-    - `classifier`, `num_points`: see `ClassScore`.
+    - `classifier`, `num_points`: see `ClassAcquisition`.
     """
 
     classifier: Classifier
@@ -147,13 +155,11 @@ class MixedEntropy(ClassScore):
         check_fields(self)
         require(self.threshold >= 0, f"the entropy's threshold is {self.threshold}; it must not be negative")
 
-    def __call__(self, context: Context, scan: PointCloud) -> Float[Array, ""]:
-        """In nats; zero for a scan that sees nothing."""
-        cloud, log_p = context
-        log_q = self.classifier(concatenate(cloud, scan))
+    def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, ""]:
+        """In nats."""
         before = entropy(log_p)
         reduction = jnp.maximum(0.0, before - entropy(log_q))
-        return zero_if_empty(scan, jnp.where(before > self.threshold, cross_entropy(log_p, log_q), reduction))
+        return jnp.where(before > self.threshold, cross_entropy(log_p, log_q), reduction)
 
     @property
     def quantity(self) -> Quantity:
@@ -161,51 +167,95 @@ class MixedEntropy(ClassScore):
         return Quantity("expected cross-entropy or reduction of entropy", "nats", meaning)
 
 
+class EntropyReduction(ClassAcquisition):
+    """max(0, H(p^(t)) - H(p^(t+1))): the expected improvement of the utility `NegativeEntropy`.
+
+    - `classifier`, `num_points`: see `ClassAcquisition`.
+    """
+
+    classifier: Classifier
+    num_points: int = eqx.field(static=True, default=1024)
+
+    def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, ""]:
+        """In nats."""
+        return jnp.maximum(0.0, entropy(log_p) - entropy(log_q))
+
+    @property
+    def quantity(self) -> Quantity:
+        return NegativeEntropy(self.classifier).improvement
+
+
+class ClassComparisons(ClassAcquisition):
+    """Several `ClassAcquisition`s of one classifier and as many points, from one answer of it a scan: for
+    `Problem.scores`, not for a planner.
+
+    - `members`: their values become a vector.
+    """
+
+    classifier: Classifier
+    num_points: int = eqx.field(static=True)
+    members: tuple[ClassAcquisition, ...]
+
+    @classmethod
+    def of(cls, members: Sequence[ClassAcquisition]) -> "ClassComparisons":
+        """**Raises:** `ValueError` for members that differ in classifier or number of points, or none."""
+        kinds = {(member.num_points, id(member.classifier)) for member in members}
+        require(len(kinds) == 1, f"the {len(members)} members must be of one classifier and as many points")
+        return cls(members[0].classifier, members[0].num_points, tuple(members))
+
+    def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, " members"]:
+        """Each member's value."""
+        return jnp.stack([member.compare(log_p, log_q) for member in self.members])
+
+
 class ClassAnswer(Answer):
-    """The probabilities of the classes; the likeliest five are told."""
+    """The probabilities of the classes."""
 
     form: str = "{:.2f}"
 
-    @property
-    def shown(self) -> tuple[int, ...]:
-        return tuple(sorted(np.argsort(-self.values)[:5].tolist()))
 
-    def sentence(self, before: Answer | None = None) -> str:
-        best = int(np.argmax(self.values))
-        text = f"The classifier says {self.names[best]} with probability {self.values[best]:.2f}"
-        if before is not None:
-            previous = int(np.argmax(before.values))
-            behind = "" if best == previous else f", behind {self.names[previous]} with {before.values[previous]:.2f}"
-            text += f" (was {before.values[best]:.2f}{behind})"
-        return f"{text}."
+class Sure(Stop):
+    """Stop once the class is known: with this probability given D and given random halves of D too, for a single answer
+    may be sure by chance.
 
-    @property
-    def question(self) -> str:
-        return "Which class is it?"
+    - `probability`: within (0, 1).
+    - `resamplings`: how many halves are drawn.
 
-    @property
-    def found(self) -> str:
-        best = int(np.argmax(self.values))
-        p = self.values[best]
-        return self.names[best] if p == 1.0 else f"{self.names[best]}, probability {p:.2f}"
+    **Raises:** `ValueError` for another probability or a negative number; of an acquisition without a classifier.
+    """
 
-    @property
-    def settled_means(self) -> str:
-        return f"probability {_SURE} or more"
+    probability: float = eqx.field(static=True, default=0.95)
+    resamplings: int = eqx.field(static=True, default=8)
 
-    def settled(self, before: Answer | None) -> bool:
-        """Sure, and not of another class than the view before was sure of."""
-        contradicted = (
-            before is not None
-            and before.values.max() >= _SURE
-            and int(np.argmax(before.values)) != int(np.argmax(self.values))
+    def __check_init__(self):
+        check_fields(self)
+        require(0 < self.probability < 1, f"the probability is {self.probability}; it must lie within (0, 1)")
+        require(self.resamplings >= 0, f"the number of resamplings is {self.resamplings}; it must not be negative")
+
+    def check(self, acquisition: Acquisition) -> None:
+        known = hasattr(acquisition, "classifier") or hasattr(getattr(acquisition, "utility", None), "classifier")
+        require(
+            known,
+            f"Sure is about a class, but {type(acquisition).__name__} has no classifier: use CrossEntropy, "
+            "MixedEntropy or the utility NegativeEntropy, or another rule",
         )
-        return bool(self.values.max() >= _SURE) and not contradicted
 
-    def panels(self, truth: Answer | None) -> tuple[Panel, ...]:
-        """The probabilities of all classes; of the truth, 1 and 0."""
-        true = None if truth is None else truth.values
-        return (Panel("probability", self.names, self.values, true, bars=True, goal=_SURE),)
+    def after(self, so_far: SoFar) -> str | None:
+        acquisition, cloud = so_far.acquisition, so_far.evidence.cloud
+        p = _class_probabilities(acquisition, cloud)
+        best = int(np.argmax(p))
+        least = float(p[best])
+        for index in range(self.resamplings):
+            if least < self.probability:
+                return None
+            half = half_of(cloud, jax.random.fold_in(so_far.key, index))
+            least = min(least, float(_class_probabilities(acquisition, half)[best]))
+        if least < self.probability:
+            return None
+        answer = acquisition.answer(cloud)
+        name = f"class {best}" if answer is None else answer.names[best]
+        halves = f", {least:.2f} at least given a half of the points" if self.resamplings else ""
+        return f"sure of {name}: {float(p[best]):.2f}{halves}"
 
 
 def _true_class(scene: Surface, cloud: PointCloud, answer: Callable[[PointCloud], ClassAnswer]) -> ClassAnswer | None:
@@ -238,14 +288,29 @@ def check_log_p(log_p: Array) -> None:
     )
 
 
-def predict(score: Score, cloud: PointCloud) -> Float[Array, " classes"] | None:
-    """log p of the classes given D, as the score sees them; None for a score that does not classify."""
-    if isinstance(score, ClassScore):
-        return context_of(score, cloud)[1]
-    classifier = getattr(getattr(score, "utility", None), "classifier", None)
-    return None if classifier is None else _log_p(classifier, context_of(score, cloud)[0])
+def predict(acquisition: Acquisition, cloud: PointCloud) -> Float[Array, " classes"] | None:
+    """log p of the classes given D, as the acquisition sees them; None for one that does not classify."""
+    if isinstance(acquisition, ClassAcquisition):
+        return context_of(acquisition, cloud)[1]
+    classifier = getattr(getattr(acquisition, "utility", None), "classifier", None)
+    return None if classifier is None else _log_p(classifier, context_of(acquisition, cloud)[0])
 
 
 @eqx.filter_jit
 def _log_p(classifier: Classifier, cloud: PointCloud) -> Array:
     return classifier(cloud)
+
+
+@jax.jit
+def half_of(cloud: PointCloud, key: PRNGKeyArray) -> PointCloud:
+    """Each of a cloud's points with probability one half."""
+    kept = cloud.mask & jax.random.bernoulli(key, 0.5, cloud.mask.shape)
+    points, normals = (jnp.where(kept[:, None], rows, 0.0) for rows in (cloud.points, cloud.normals))
+    return PointCloud(points, normals, kept)
+
+
+def _class_probabilities(acquisition: Acquisition, cloud: PointCloud) -> Float[np.ndarray, " classes"]:
+    log_p = predict(acquisition, cloud)
+    if log_p is None:
+        raise InputError(f"{type(acquisition).__name__} tells no class")
+    return np.exp(np.asarray(log_p, np.float64))

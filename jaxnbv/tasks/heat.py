@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from loky import cpu_count, get_reusable_executor
 
-from jaxnbv.answers import Answer, Panel, Quantity, coordinates, number
+from jaxnbv.acquisition import Answer, Quantity
 from jaxnbv.checks import AnyArray, InputError, as_numbers, checked, require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.scanning import TriangleMesh
@@ -102,27 +102,6 @@ class ColdestAnswer(Answer):
     """The temperature of the coldest point, and where it is (scene coordinates)."""
 
     point: Float[np.ndarray, "3"] = eqx.field(default_factory=lambda: np.zeros(3))
-
-    def line(self, before: Answer | None = None) -> str:
-        change = "" if before is None else f" (was {number(float(before.values[0]))})"
-        return f"coldest at {coordinates(self.point)}, {number(float(self.values[0]))} degrees{change}"
-
-    def sentence(self, before: Answer | None = None) -> str:
-        return f"The cloud is {self.line(before)}."
-
-    @property
-    def question(self) -> str:
-        return "Where does it stay coldest while it is heated?"
-
-    def panels(self, truth: Answer | None) -> tuple[Panel, ...]:
-        """The temperature of the coldest point and, where the truth is known, its distance to the true one."""
-        true = None if truth is None else truth.values
-        temperature = Panel("lowest temperature (degrees)", ("coldest",), self.values, true)
-        if not isinstance(truth, ColdestAnswer):
-            return (temperature,)
-        distance = np.array([np.linalg.norm(self.point - truth.point)])
-        label = "distance to the true coldest point (scene units)"
-        return temperature, Panel(label, ("distance",), distance, goal=0.0)
 
 
 def _values(

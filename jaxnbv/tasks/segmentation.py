@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxnbv.acquisition import preferred_batch_size
-from jaxnbv.answers import Answer, Panel, Quantity
-from jaxnbv.checks import check_fields, require, shown
+from jaxnbv.acquisition import Acquisition, Answer, Quantity, preferred_batch_size
+from jaxnbv.checks import InputError, check_fields, require, shown
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.scanning import Surface
+from jaxnbv.tasks.stopping import SoFar, Stop
 
 # Of probabilities in 32 bits, or less.
 _SLACK = 1e-2
@@ -101,38 +101,52 @@ class PartAnswer(Answer):
     asked: tuple[int, ...] = ()
     target: float = 60.0
 
-    @property
-    def shown(self) -> tuple[int, ...]:
-        return self.asked
 
-    def sentence(self, before: Answer | None = None) -> str:
-        listed = ", ".join(f"{self.names[index]} {self.values[index]:.0f}" for index in self.shown) or "none"
-        return f"Points predicted of each part: {listed}."
+class Found(Stop):
+    """Stop once all parts are found.
 
-    @property
-    def question(self) -> str:
-        return "Which parts does it have?"
+    - `points`: predicted points of a part by which it is found.
+    - `parts`: names of those to be found; by default all that the segmenter is asked for, of which the object may lack
+      one.
 
-    @property
-    def found(self) -> str:
-        parts = [self.names[index] for index in self.shown if self.values[index] >= self.target]
-        return ", ".join(parts) or "no part yet"
+    **Raises:** `ValueError` for a number of points below one; of an acquisition without a segmenter, or whose
+    segmenter does not know a part.
+    """
 
-    @property
-    def settled_means(self) -> str:
-        return f"{self.target:g} points or more of every part"
+    points: int = eqx.field(static=True, default=60)
+    parts: tuple[str, ...] | None = eqx.field(static=True, default=None)
 
-    def settled(self, before: Answer | None) -> bool:
-        return all(self.values[index] >= self.target for index in self.shown)
+    def __check_init__(self):
+        check_fields(self)
+        require(self.points >= 1, f"a part is found by {self.points} points; give at least 1")
+        names = isinstance(self.parts, tuple) and all(isinstance(name, str) for name in self.parts)
+        require(self.parts is None or names, f"the parts are {shown(self.parts)}; give a tuple of their names")
 
-    def panels(self, truth: Answer | None) -> tuple[Panel, ...]:
-        """The points of each part, and how many parts have N_target of them; of the truth, those that it has at all."""
-        shown = sorted({*self.shown, *(() if truth is None else truth.shown)})
-        names = tuple(self.names[index] for index in shown)
-        found = np.array([np.sum(self.values[shown] >= self.target)], np.float64)
-        there = None if truth is None else np.array([np.sum(truth.values[shown] > 0)], np.float64)
-        points = Panel("points predicted of each part", names, self.values[shown], bars=True, goal=self.target)
-        return Panel(f"parts found ({self.target:g} points or more)", ("parts",), found, there), points
+    def check(self, acquisition: Acquisition) -> None:
+        segmenter = getattr(getattr(acquisition, "utility", None), "segmenter", None)
+        require(
+            segmenter is not None,
+            f"Found is about parts, but {type(acquisition).__name__} has no segmenter: use the utility "
+            "SoftPartCount, or another rule",
+        )
+        known = getattr(segmenter, "part_names", None)
+        names = () if known is None else tuple(known.values())
+        require(
+            bool(self.parts or names),
+            "the segmenter does not name the parts that it is asked for: give Found(parts=...), 'part 0' and so on",
+        )
+        unknown = [name for name in self.parts or () if names and name not in names]
+        require(not unknown, f"the segmenter knows no part {unknown[:1]}: give some of {', '.join(names)}")
+
+    def after(self, so_far: SoFar) -> str | None:
+        answer = so_far.acquisition.answer(so_far.evidence.cloud)
+        if not isinstance(answer, PartAnswer):
+            raise InputError("the acquisition's answer tells no parts")
+        found = dict(zip(answer.names, answer.values.tolist(), strict=True))
+        wanted = self.parts or tuple(answer.names[index] for index in answer.asked)
+        if any(found.get(name, 0) < self.points for name in wanted):
+            return None
+        return f"all of {len(wanted)} parts are found, by {self.points} points or more"
 
 
 @eqx.filter_jit

@@ -1,6 +1,5 @@
-"""Pictures of an episode: an HTML report and PNG figures."""
+"""Pictures and words: the report of an episode, figures, a live page, and what a notebook shows."""
 
-from jaxnbv.viz.data import ReportData as ReportData
-from jaxnbv.viz.data import report_data as report_data
-from jaxnbv.viz.figures import write_figures as write_figures
-from jaxnbv.viz.report import write_report as write_report
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -9,18 +9,17 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from jaxnbv.answers import Quantity
+from jaxnbv.acquisition import Quantity
 from jaxnbv.checks import AnyArray
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import Episode
-from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.state import State
-from jaxnbv.scanning import Grid
+from jaxnbv.scanning import Evidence
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.scanning.metrics import coverage, truth_points
 from jaxnbv.search import Proposal
-from jaxnbv.surfaces import TrigonometricPosterior
+from jaxnbv.viz.answers import words_of
 from jaxnbv.viz.imagined import Imagined, Look, imagined, look
 from jaxnbv.viz.sphere import unit
 from jaxnbv.viz.stage import Stage, stage_of
@@ -33,7 +32,6 @@ COVERAGE_RADIUS = 0.05
 _DEVIATION_ANCHORS = 256
 _SLOPE_ANCHORS = 1024
 _SLOPE_STEP = 0.005
-_SLOW_MEAN_RESOLUTION = 40
 # Of the distance to the nearest point. On a cow after one to five views the surface is off by 0.2 to 0.3 of it (root
 # mean square) between 0.1 and 0.4 from the points, two to three of the posterior's standard deviations; the other way
 # round, from the truth to the surface, which may lack a part, by 0.4 to 0.7.
@@ -62,9 +60,9 @@ class Choice(eqx.Module):
     - `rank`: 1 for the best.
     - `map`: the values that the map is drawn from: the candidates', where they are enough.
     - `ascents`: the trajectories of a gradient search, none of which is among the candidates here; else None.
-    - `level`: how many other candidates cannot be told from the best one by the samples; None where it is not known.
+    - `num_tied`: how many other candidates are tied with the best one; None where it is not known.
     - `errors`: standard errors of the values, and `error` that of the chosen one; None where they are not known.
-    - `is_level`: which candidates the samples cannot tell from the best one, itself included; none where not known.
+    - `tied`: which candidates are tied with the best one, itself included; None where not known.
     """
 
     directions: Float[np.ndarray, "c 3"]
@@ -74,10 +72,10 @@ class Choice(eqx.Module):
     rank: int
     map: SphereMap
     ascents: Ascents | None
-    level: int | None = None
+    num_tied: int | None = None
     errors: Float[np.ndarray, " c"] | None = None
     error: float | None = None
-    is_level: Bool[np.ndarray, " c"] | None = None
+    tied: Bool[np.ndarray, " c"] | None = None
 
     @property
     def visited(self) -> Bool[np.ndarray, " c"]:
@@ -155,11 +153,11 @@ def report_data(
     covered = [None if truth is None else coverage(view.cloud, truth, COVERAGE_RADIUS) for view in episode.views]
     task = task_of(episode, covered, COVERAGE_RADIUS)
     drawn: list[ViewData] = []
-    known: State | None = None
+    known: Evidence | None = None
     bar = tqdm(
-        zip(episode.views, episode.states(), strict=True), "drawing views", len(episode.views), disable=not progress
+        zip(episode.views, episode.evidence(), strict=True), "drawing views", len(episode.views), disable=not progress
     )
-    for index, (view, state) in enumerate(bar):
+    for index, (view, after) in enumerate(bar):
         choice = None if view.proposal is None else choice_of(view.proposal, wider_map(episode, index))
         new, _ = view.scan.to_numpy()
         before = episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), new.dtype)
@@ -170,7 +168,7 @@ def report_data(
                 pose=view.pose,
                 before=before,
                 new=new,
-                surface=allowing_for_unseen(mean_surface(planner, state), view.cloud),
+                surface=allowing_for_unseen(mean_surface(planner.imagination, after), view.cloud),
                 choice=choice,
                 coverage=covered[index],
                 count=int(view.cloud.count),
@@ -179,7 +177,7 @@ def report_data(
                 look=look(view.scan, camera, view.pose, before) if view.scan.capacity == camera.num_rays else None,
             )
         )
-        known = state
+        known = after
     surfaces = [view.surface.vertices for view in drawn if view.surface is not None]
     return ReportData(tuple(drawn), values, task, stage_of(episode, surfaces))
 
@@ -201,10 +199,10 @@ def _sentence(episode: Episode, index: int, choice: Choice | None, covered: list
             points,
             int(view.cloud.count),
             None if before is None or after is None else (before, after),
-            choice.level,
+            choice.num_tied,
         )
     if not task.is_coverage:
-        words += f" {task.answers[index].sentence(task.answers[index - 1] if index else None)}"
+        words += f" {words_of(task.answers[index]).sentence(task.answers[index - 1] if index else None)}"
     return f"View {index + 1} {words}"
 
 
@@ -224,24 +222,18 @@ def choice_of(proposal: Proposal, wider: SphereMap | None = None) -> Choice:
         rank=1 + int(np.sum(values > value)),
         map=wider or SphereMap(directions, values),
         ascents=None if proposal.trajectories is None else ascents_of(proposal.trajectories),
-        level=proposal.others_level,
+        num_tied=proposal.num_tied,
         errors=None if proposal.standard_errors is None else np.asarray(proposal.standard_errors, np.float64),
         error=proposal.standard_error,
-        is_level=None if proposal.others_level is None else np.asarray(proposal.is_level()),
+        tied=None if proposal.num_tied is None else np.asarray(proposal.tied_with_best()),
     )
 
 
-def mean_surface(planner: Planner, state: State) -> MeanSurface | None:
-    """The surface of the posterior mean given a state, carved as the samples are where its mean is
-    quickly evaluated, with its standard deviation; None if the grid holds none."""
-    posterior = planner.posterior(state)
-    grid = planner.grid
-    if not isinstance(posterior, TrigonometricPosterior):
-        grid = Grid(min(grid.resolution, _SLOW_MEAN_RESOLUTION), grid.half_extent)
-    mean = posterior.mean_on_grid(grid.axis.astype(posterior.level.dtype)) - posterior.level
-    # What was seen empty is known at the nodes of the planner's own grid.
-    values = np.array(planner.carve(state, mean) if grid == planner.grid else mean)
-    found = level_triangles(values, grid)
+def mean_surface(imagination: Imagination, evidence: Evidence) -> MeanSurface | None:
+    """The surface of the posterior mean given the evidence, carved as the samples are, with its standard deviation;
+    None if the grid holds none. A posterior that has only samples is drawn from a few fixed ones."""
+    posterior = imagination.posterior(evidence).drawn()
+    found = level_triangles(np.array(imagination.mean(evidence, posterior)), imagination.grid)
     if found is None:
         return None
     vertices, faces, normals = found
@@ -249,7 +241,7 @@ def mean_surface(planner: Planner, state: State) -> MeanSurface | None:
     features = np.concatenate([vertices, 0.1 * normals], axis=1)
     anchors = _spread(features, _SLOPE_ANCHORS)
     few = anchors[:_DEVIATION_ANCHORS]
-    dtype = state.cloud.points.dtype
+    dtype = evidence.cloud.points.dtype
     variance = np.asarray(posterior.variance(vertices[few].astype(dtype)))
     step = _SLOPE_STEP * normals[anchors]
     ahead, behind = (np.asarray(posterior.mean((vertices[anchors] + s).astype(dtype))) for s in (step, -step))

@@ -16,10 +16,11 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 from PIL import Image
 from tqdm import tqdm
 
-from jaxnbv.answers import Quantity, number
+from jaxnbv.acquisition import Quantity
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.storage.files import make_folder, write_whole
 from jaxnbv.viz import sphere
+from jaxnbv.viz.answers import label_of, number
 from jaxnbv.viz.data import Choice, ReportData, ViewData
 from jaxnbv.viz.imagined_figures import imagined_figure
 from jaxnbv.viz.layout import fitted, flow, width_of
@@ -87,7 +88,7 @@ def figures_of(data: ReportData, camera: Camera, stills: Stills) -> dict[str, Ca
             drawings[f"view_{view.number:02d}_trajectories"] = partial(trajectory_figure, data, index, camera)
     progress: list[tuple[str, Any]] = [
         (coverage_series(data)[0], partial(draw_coverage, data=data)),
-        (data.quantity.label, partial(draw_values, data=data)),
+        (label_of(data.quantity), partial(draw_values, data=data)),
     ]
     drawings["task"] = partial(chart_figure, task_charts(data))
     drawings["coverage"] = partial(chart_figure, progress)
@@ -138,7 +139,7 @@ def _view(data: ReportData, index: int, camera: Camera, stills: Stills) -> Figur
         draw_acquisition(figure.add_axes((0.52, 0.22, 0.46, 0.66)), None, data.quantity)
         return figure
     marks = [("★ chosen", NEW)]
-    if rings_level(view.choice):
+    if rings_tied(view.choice):
         marks.append(("◯ level with it", INK))
     if view.choice.ascents is not None:
         marks += [("○ start, ● end of an ascent", INK)]
@@ -157,7 +158,7 @@ def _view(data: ReportData, index: int, camera: Camera, stills: Stills) -> Figur
 
 
 def _bar_label(choice: Choice, quantity: Quantity) -> str:
-    return quantity.label if choice.errors is None else f"{quantity.label}; lines: standard errors"
+    return label_of(quantity) if choice.errors is None else f"{label_of(quantity)}; lines: standard errors"
 
 
 def _map_title(view: ViewData, quantity: Quantity) -> str:
@@ -223,8 +224,8 @@ def draw_acquisition(
         linewidths=0.6 * weight,
         zorder=3,
     )
-    if choice.is_level is not None and rings_level(choice):
-        x, y = places[choice.is_level & shown].T
+    if choice.tied is not None and rings_tied(choice):
+        x, y = places[choice.tied & shown].T
         axes.scatter(x, y, s=52 * weight, facecolors="none", edgecolors=INK, linewidths=1.0 * weight, zorder=4)
     axes.scatter(
         places[~shown, 0], places[~shown, 1], marker="x", c=INK, s=26 * weight, linewidths=1.2 * weight, zorder=4
@@ -243,9 +244,9 @@ def draw_acquisition(
     return colours
 
 
-def rings_level(choice: Choice) -> bool:
+def rings_tied(choice: Choice) -> bool:
     """Whether the candidates that are level with the best are marked: they must be known, and not most of all."""
-    return choice.is_level is not None and 0 < (choice.level or 0) <= len(choice.values) // 3
+    return choice.tied is not None and 0 < (choice.num_tied or 0) <= len(choice.values) // 3
 
 
 def is_smooth(choice: Choice, quantity: Quantity) -> bool:
@@ -269,7 +270,7 @@ def overview_figure(data: ReportData, camera: Camera, stills: Stills | None = No
     columns = min(len(data.views), 5)
     rows = -(-len(data.views) // columns)
     marks = [*_POINTS, ("★ chosen view", NEW), ("× visited views", INK)]
-    if any(view.choice is not None and rings_level(view.choice) for view in data.views):
+    if any(view.choice is not None and rings_tied(view.choice) for view in data.views):
         marks.append(("◯ level with the best", INK))
     if any(view.choice is not None and view.choice.ascents is not None for view in data.views):
         marks += [("○ start of an ascent", INK), ("● end of an ascent", INK)]

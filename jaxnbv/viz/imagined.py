@@ -8,13 +8,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
-from jaxnbv.at_sensor import mean_depth
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.episode import Episode, observe_scene, view_keys
-from jaxnbv.planning.state import State
-from jaxnbv.scanning import SensorNoise, scan_samples
+from jaxnbv.scanning import Evidence, SensorNoise, mean_depth
 from jaxnbv.search import Proposal
 
 SHOWN = 4
@@ -63,25 +61,24 @@ class Imagined(eqx.Module):
     runner_up: Expected | None
 
 
-def imagined(episode: Episode, index: int, state: State) -> Imagined | None:
+def imagined(episode: Episode, index: int, evidence: Evidence) -> Imagined | None:
     """What was imagined before view `index` (from 0) was taken; None for one that was not chosen.
 
-    `state`: the planner's before it. The samples are drawn again with the key of the step, so they are the same.
+    `evidence`: what was known before it. The samples are drawn again with the key of the step, so they are the same.
     """
     planner, view = episode.planner, episode.views[index]
     if view.proposal is None:
         return None
     sample_key, *_ = view_keys(episode.key, index)
-    surfaces = planner.sample_surfaces(state, sample_key)
+    surfaces = planner.imagination.sample(evidence, sample_key)
     other = runner_up(view.proposal) if planner.quantity.smooth else None
     # Two in any case, lest a second program be compiled.
     poses = jax.tree.map(lambda *rows: np.stack(rows), view.pose, view.pose if other is None else other)
-    camera, around = _finer(planner.camera), planner.surroundings
-    scans = scan_samples(surfaces, camera, poses, None if around is None else around.barrier(camera, poses))
-    cloud = state.cloud.to_numpy()[0]
-    samples = tuple(
-        look(_rows(scans, (sample, 0)), camera, view.pose, cloud) for sample in range(min(SHOWN, planner.num_samples))
-    )
+    camera = _finer(planner.camera)
+    scans = planner.imagination.scan(surfaces, camera, poses)
+    cloud = evidence.cloud.to_numpy()[0]
+    count = min(SHOWN, planner.imagination.num_samples)
+    samples = tuple(look(_rows(scans, (sample, 0)), camera, view.pose, cloud) for sample in range(count))
     expected = [
         np.asarray(mean_depth(_rows(scans, (slice(None), i)), pose), np.float64).reshape(camera.height, camera.width)
         for i, pose in enumerate((view.pose, other or view.pose))
@@ -134,7 +131,7 @@ def _finer(camera: Camera) -> Camera:
 def _true_scan(episode: Episode, camera: Camera, pose: Pose) -> PointCloud | None:
     if episode.scene is None:
         return None
-    around, still = episode.planner.surroundings, SensorNoise(0.0, 0.0)
+    around, still = episode.planner.imagination.surroundings, SensorNoise(0.0, 0.0)
     return observe_scene(episode.scene, camera, pose, still, episode.key, around)
 
 

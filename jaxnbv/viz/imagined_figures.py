@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import UInt8
 from matplotlib.figure import Figure
 
-from jaxnbv.answers import number
+from jaxnbv.viz.answers import number
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.imagined import Expected, Imagined
 from jaxnbv.viz.layout import fitted

@@ -14,12 +14,14 @@ from scipy.spatial.transform import Rotation
 from jaxnbv.checks import InputError, checked
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import Episode, view_keys
-from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.state import State
+from jaxnbv.planning.session import Session
+from jaxnbv.scanning import Evidence
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
+from jaxnbv.viz.answers import shown_value, words_of
 from jaxnbv.viz.data import allowing_for_unseen, mean_surface
 from jaxnbv.viz.render import depth_picture, depth_range
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, VALUE, round_range
@@ -61,14 +63,14 @@ class LiveView:
         episode: Episode,
         proposal: Proposal | None = None,
         expected: Float[np.ndarray, "h w"] | None = None,
-        state: State | None = None,
+        evidence: Evidence | None = None,
     ) -> None:
         """Show an episode as it is now.
 
         - `proposal`: for the view after its last; `expected`: the depth image expected there.
-        - `state`: the planner's after its last view, where that is at hand; made again from the scans otherwise.
+        - `evidence`: after its last view, where that is at hand; made again from the scans otherwise.
         """
-        state = episode.state_after(len(episode.views)) if state is None else state
+        evidence = episode.evidence_after(len(episode.views)) if evidence is None else evidence
         key, *_ = view_keys(episode.key, len(episode.views))
         scene = self._server.scene
         with self._server.atomic():
@@ -77,11 +79,21 @@ class LiveView:
             self._drawn = [
                 *_points(scene, episode),
                 *_cameras(scene, episode),
-                *_mean(scene, episode.planner, state),
-                *_imagined(scene, episode.planner, state, key),
+                *_mean(scene, episode.planner.imagination, evidence),
+                *_imagined(scene, episode.planner.imagination, evidence, key),
                 *([] if proposal is None else _choice(scene, episode.planner.camera, proposal, expected)),
             ]
         self._tell(episode, proposal, expected)
+
+    def follow(self, session: Session) -> None:
+        """Show a session from now on, with every image and proposal."""
+
+        def show(session: Session) -> None:
+            asked = session.next_view
+            proposal, expected = (None, None) if asked is None else (asked.proposal, asked.expected_depth)
+            self.update(session.episode, proposal, expected, session.evidence)
+
+        session.follow(show)
 
     def save(self, path: str | Path) -> Path:
         """Write the scene as it is now as one HTML file, which opens offline."""
@@ -96,11 +108,11 @@ class LiveView:
         views, sought = len(episode.views), episode.planner.quantity
         lines = [f"**{views} view{'s' if views > 1 else ''}**, {int(episode.cloud.count):,} points kept"]
         answer = episode.planner.acquisition.answer(episode.cloud)
-        lines += [] if answer is None else [answer.sentence()]
+        lines += [] if answer is None else [words_of(answer).sentence()]
         if proposal is not None:
             error = proposal.standard_error
             about = "" if error is None else f" ± {error:.2g}"
-            lines.append(f"The next view has a {sought.name} of {sought.show(float(proposal.value))}{about}.")
+            lines.append(f"The next view has a {sought.name} of {shown_value(sought, float(proposal.value))}{about}.")
         self._text.content = "\n\n".join(lines)
         if self._image is not None:
             self._image.remove()
@@ -131,8 +143,8 @@ def _cameras(scene: Any, episode: Episode) -> list[Any]:
     return found
 
 
-def _mean(scene: Any, planner: Planner, state: State) -> list[Any]:
-    surface = allowing_for_unseen(mean_surface(planner, state), state.cloud)
+def _mean(scene: Any, imagination: Imagination, evidence: Evidence) -> list[Any]:
+    surface = allowing_for_unseen(mean_surface(imagination, evidence), evidence.cloud)
     if surface is None:
         return []
     low, high = round_range(*np.percentile(surface.deviation, [2.0, 98.0]).tolist())
@@ -141,11 +153,11 @@ def _mean(scene: Any, planner: Planner, state: State) -> list[Any]:
     return [scene.add_mesh_trimesh("/surface of the mean", mesh)]
 
 
-def _imagined(scene: Any, planner: Planner, state: State, key: Any) -> list[Any]:
+def _imagined(scene: Any, imagination: Imagination, evidence: Evidence, key: Any) -> list[Any]:
     # Marching cubes asks for an array that it could write to.
-    values = np.array(planner.sample_surfaces(state, key).values[:_SAMPLES])
+    values = np.array(imagination.sample(evidence, key).values[:_SAMPLES])
     found = []
-    for number, triangles in enumerate((level_triangles(one, planner.grid) for one in values), start=1):
+    for number, triangles in enumerate((level_triangles(one, imagination.grid) for one in values), start=1):
         if triangles is not None:
             name, (vertices, faces, _) = f"/imagined/{number}", triangles
             found.append(

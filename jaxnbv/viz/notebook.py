@@ -13,10 +13,8 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.special import ndtr
 
-from jaxnbv.answers import Quantity
-from jaxnbv.display import Displayed
+from jaxnbv.acquisition import Quantity
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import look_at
 from jaxnbv.planning.episode import Episode
@@ -56,7 +54,7 @@ class Picture:
         return self.png
 
 
-def html_of(shown: Displayed) -> str:
+def html_of(shown: Any) -> str:
     """A small picture and a line of facts, as HTML."""
     drawing = drawing_of(shown)
     caption = html.escape(drawing.facts)
@@ -120,8 +118,7 @@ def _draw_slice(posterior: SurfacePosterior, axes: Axes) -> None:
     axis = jnp.linspace(-_REACH, _REACH, _PIXELS)
     x, y = jnp.meshgrid(axis, axis)
     places = jnp.stack([x.ravel(), y.ravel(), jnp.zeros(_PIXELS**2)], axis=-1)
-    deviation = np.sqrt(np.maximum(posterior.variance(places), 1e-12))
-    inside = ndtr((float(posterior.level) - np.asarray(posterior.mean(places))) / deviation)
+    inside = np.asarray(posterior.probability_inside(places))
     extent = (-_REACH, _REACH, -_REACH, _REACH)
     axes.imshow(inside.reshape(_PIXELS, _PIXELS), VALUE, vmin=0, vmax=1, origin="lower", extent=extent)
     axes.axis("off")
@@ -133,8 +130,8 @@ def _(proposal: Proposal) -> Drawing:
     error = proposal.standard_error
     facts = f"look from ({where}): value {float(proposal.value):.4g}{'' if error is None else f' ± {error:.2g}'}"
     facts += f", {len(proposal.values)} candidates"
-    if proposal.others_level:
-        facts += f", {proposal.others_level} of them as good as the samples can tell"
+    if proposal.num_tied:
+        facts += f", {proposal.num_tied} of them as good as the samples can tell"
     choice = choice_of(proposal)
     return Drawing(lambda axes: draw_acquisition(axes, choice, Quantity("value", "", "")), facts)
 
@@ -159,8 +156,9 @@ def _draw_views(episode: Episode, axes: Axes) -> None:
     frame(axes, still, shown)
 
 
-def overview(episode: Episode, progress: bool = True) -> Picture:
-    """All views of an episode in a strip: the surface as it became known, and what the search looked at."""
+def show(episode: Episode, progress: bool = True) -> Picture:
+    """All views of an episode in a strip, which a notebook shows: the surface as it became known, and what the search
+    looked at."""
     data = report_data(episode, progress=progress, imagine=False)
     with mpl.rc_context(STYLE):
         return Picture(overview_figure(data, episode.planner.camera), 80)

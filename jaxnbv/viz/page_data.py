@@ -9,11 +9,12 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
-from jaxnbv.answers import Quantity
+from jaxnbv.acquisition import Quantity
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.viz import sphere
+from jaxnbv.viz.answers import label_of
 from jaxnbv.viz.data import Choice, MeanSurface, ReportData, ViewData
-from jaxnbv.viz.figures import deviation_range, is_smooth, rings_level, value_range
+from jaxnbv.viz.figures import deviation_range, is_smooth, rings_tied, value_range
 from jaxnbv.viz.render import FRUSTUM_DEPTH, frustum
 from jaxnbv.viz.style import (
     BEFORE,
@@ -62,7 +63,7 @@ def payload(data: ReportData, camera: Camera) -> dict:
             "labels": [f"{tick:g}" for tick in ticks.tolist()],
             "colours": colour_scale(DEVIATION),
         },
-        "value": {"colours": colour_scale(VALUE), "lines": colour_scale(VALUE_LINES), "label": data.quantity.label},
+        "value": {"colours": colour_scale(VALUE), "lines": colour_scale(VALUE_LINES), "label": label_of(data.quantity)},
         "progress": {"label": label, "values": series.tolist()},
         "map": {
             "graticule": [line.round(3).tolist() for line in sphere.graticule()],
@@ -149,7 +150,7 @@ def _choice(choice: Choice, quantity: Quantity) -> dict:
         "directions": choice.directions.round(2).tolist(),
         "values": [None if math.isnan(value) else value for value in choice.values.tolist()],
         "errors": None if choice.errors is None else _numbers(choice.errors),
-        "level": [] if choice.is_level is None or not rings_level(choice) else np.flatnonzero(choice.is_level).tolist(),
+        "level": [] if choice.tied is None or not rings_tied(choice) else np.flatnonzero(choice.tied).tolist(),
         "ranks": ranks.tolist(),
         "chosen": sphere.mollweide(choice.chosen[None]).round(4)[0].tolist(),
         "value": choice.value,
@@ -169,10 +170,10 @@ def _numbers(values: Float[np.ndarray, " n"]) -> list[float | None]:
 def _map_caption(choice: Choice) -> str:
     """What the marks on the map are that not every map has."""
     parts = []
-    if rings_level(choice):
+    if rings_tied(choice):
         parts.append("Rings: level with the best, within two standard errors of the difference.")
-    elif choice.level:
-        parts.append(f"The samples cannot tell the best from {choice.level} of the others: no rings are drawn.")
+    elif choice.num_tied:
+        parts.append(f"The samples cannot tell the best from {choice.num_tied} of the others: no rings are drawn.")
     if choice.ascents is not None:
         parts.append("Lines: gradient ascents, from a ring where they start to a dot where they end.")
         if choice.ascents.is_spatial:

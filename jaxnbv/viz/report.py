@@ -16,13 +16,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from plotly.offline import get_plotlyjs
 
-from jaxnbv.answers import Panel, number
 from jaxnbv.checks import AnyArray, checked
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.planning.episode import Episode
 from jaxnbv.storage import describe
 from jaxnbv.storage.files import make_folder, write_text
 from jaxnbv.storage.folders import versions, writing_in
+from jaxnbv.viz.answers import Panel, label_of, number
 from jaxnbv.viz.data import ReportData, report_data
 from jaxnbv.viz.figures import STYLE, Stills, write_figures
 from jaxnbv.viz.imagined_figures import Tile, depths, looks
@@ -84,7 +84,7 @@ def report_html(episode: Episode, data: ReportData, title: str, stills: Stills |
         "FOUND": html.escape(data.task.found),
         "SURE": html.escape(data.task.sure),
         "SETTINGS": _settings(episode, title),
-        "QUANTITY": html.escape(data.quantity.label[:1].upper() + data.quantity.label[1:]),
+        "QUANTITY": html.escape(_capital(label_of(data.quantity))),
         "MEANING": html.escape(data.quantity.meaning),
         "ASCENTS": _ASCENT_CAPTION if any(view.spatial_ascents is not None for view in data.views) else "",
         "COUNT": str(len(data.views)),
@@ -128,12 +128,16 @@ def _chart(chart: tuple, size: tuple[float, float]) -> str:
         figure.savefig(file, format="svg", metadata={"Date": None})
     place = figure.axes[0].get_position()
     address = "data:image/svg+xml;base64," + base64.b64encode(file.getvalue()).decode()
-    name = html.escape(title[:1].upper() + title[1:])
+    name = html.escape(_capital(title))
     box = ",".join(f"{share:.4f}" for share in (place.x0, place.width, 1.0 - place.y1, place.height))
     return (
         f'<figure class="card"><h2>{name}</h2><div class="chart" data-axes="{box}"><img src="{address}" '
         f'alt="{name}, by view; its numbers are in a table below."><i></i></div></figure>'
     )
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _panels(data: ReportData) -> list[tuple[str, tuple[Panel, ...]]]:
@@ -151,7 +155,7 @@ def _table(panels: tuple[Panel, ...], title: str) -> str:
         f'<tr><th scope="row">{name}</th>{"".join(f"<td>{number(value)}</td>" for value in values.tolist())}</tr>'
         for name, values in rows
     )
-    caption = html.escape(title[:1].upper() + title[1:])
+    caption = html.escape(_capital(title))
     head = f"<caption>{caption}</caption><thead><tr><td></td>{head}</tr></thead>"
     return f"<div><table>{head}<tbody>{body}</tbody></table></div>"
 
@@ -179,14 +183,15 @@ def _tiles(tiles: list[Tile]) -> str:
 
 def _settings(episode: Episode, title: str) -> str:
     planner = episode.planner
-    search, model = (describe(module) for module in (planner.search, planner.model))
+    imagination, carving = planner.imagination, planner.imagination.carving
+    search, model = (describe(module) for module in (planner.search, planner.imagination.model))
     settings = {
         "Object": title,
         "Search": _call(search, depth=2),
         "Acquisition": _call(describe(planner.acquisition)),
         "Surface model": _call(model, depth=2),
-        "Carved by": _call(describe(planner.carving), depth=1) if planner.carving else "nothing, as in the paper",
-        "Posterior samples": f"{planner.num_samples} on a {planner.grid.resolution}³ grid",
+        "Carved by": _call(describe(carving), depth=1) if carving else "nothing, as in the paper",
+        "Posterior samples": f"{imagination.num_samples} on a {imagination.grid.resolution}³ grid",
         "Camera": f"{math.degrees(planner.camera.fov):.0f}°, {planner.camera.width} × {planner.camera.height} pixels",
         "Sensor noise": "that of a real sensor" if episode.noise is None else _call(describe(episode.noise)),
         "Capacity": f"{planner.capacity:,} points",

@@ -4,38 +4,16 @@ import equinox as eqx
 import numpy as np
 import trimesh
 
-from jaxnbv.answers import Answer, Panel
+from jaxnbv.acquisition import Answer
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Surface
 from jaxnbv.scanning.metrics import true_mesh
+from jaxnbv.viz.answers import CoverageAnswer, Panel, words_of
 
-# Points of the true surface that a score is asked about: the planner's own usual capacity.
+# Points of the true surface that an acquisition is asked about: the planner's own usual capacity.
 _TRUE_POINTS = 8192
-
-
-class CoverageAnswer(Answer):
-    """The share of the true surface that was seen, or where that is not known the number of points.
-
-    - `radius`: within which of the cloud a place counts as seen, in scene units; None where points are counted.
-    """
-
-    form: str = "{:.0%}"
-    radius: float | None = None
-
-    @property
-    def question(self) -> str:
-        return "What does it look like all round?"
-
-    @property
-    def found(self) -> str:
-        return f"{self.form.format(self.values[0])} {self.names[0]}"
-
-    def panels(self, truth: Answer | None) -> tuple[Panel, ...]:
-        if self.radius is None:
-            return (Panel(self.names[0], self.names, self.values),)
-        return (Panel(f"coverage (% within {self.radius:g})", self.names, 100.0 * self.values, goal=100.0),)
 
 
 class Task(eqx.Module):
@@ -56,7 +34,7 @@ class Task(eqx.Module):
     @property
     def question(self) -> str:
         """What was asked."""
-        return self.answers[-1].question
+        return words_of(self.answers[-1]).question
 
     @property
     def is_coverage(self) -> bool:
@@ -65,23 +43,24 @@ class Task(eqx.Module):
 
 
 def task_of(episode: Episode, covered: list[float | None], radius: float) -> Task:
-    """The task of an episode's score; that of seeing all of the surface, where the score answers nothing.
+    """The task of an episode's acquisition; that of seeing all of the surface, where it answers nothing.
 
     - `covered`: the share of the true surface that was seen after each view, within `radius`; None where not known.
     """
-    score = episode.planner.acquisition
-    answers = [score.answer(view.cloud) for view in episode.views]
-    told = [answer for answer in answers if answer is not None]
+    acquisition = episode.planner.acquisition
+    given = [acquisition.answer(view.cloud) for view in episode.views]
+    answers = [answer for answer in given if answer is not None]
     truth = None
-    if len(told) == len(answers) and episode.scene is not None:
+    if len(answers) == len(given) and episode.scene is not None:
         cloud = true_cloud(episode.scene)
-        truth = None if cloud is None else score.true_answer(episode.scene, cloud)
-    if len(told) < len(answers):
-        told = [
+        truth = None if cloud is None else acquisition.true_answer(episode.scene, cloud)
+    if len(answers) < len(given):
+        answers = [
             _coverage(int(view.cloud.count), share, radius) for view, share in zip(episode.views, covered, strict=True)
         ]
-    panels = tuple(answer.panels(truth) for answer in told)
-    return Task(tuple(told), truth, panels, _asked(episode.planner), _found(told, truth), _sure(told, episode))
+    panels = tuple(words_of(answer).panels(truth) for answer in answers)
+    head = _asked(episode.planner), _found(answers, truth), _sure(answers, episode)
+    return Task(tuple(answers), truth, panels, *head)
 
 
 def true_cloud(scene: Surface, count: int = _TRUE_POINTS) -> PointCloud | None:
@@ -97,7 +76,7 @@ def true_cloud(scene: Surface, count: int = _TRUE_POINTS) -> PointCloud | None:
 def since(answers: list[Answer]) -> int | None:
     """The first view (from 1) from which on all answers can be relied on; None if not even the last can."""
     befores = [None, *answers[:-1]]
-    relied = [answer.settled(before) for answer, before in zip(answers, befores, strict=True)]
+    relied = [words_of(answer).settled(before) for answer, before in zip(answers, befores, strict=True)]
     return None if not relied[-1] else len(relied) - int(np.argmin([*relied[::-1], False]) - 1)
 
 
@@ -108,18 +87,18 @@ def _coverage(count: int, share: float | None, radius: float) -> CoverageAnswer:
 
 
 def _asked(planner: Planner) -> str:
-    samples = f" over {planner.num_samples} imagined surfaces a step" if planner.search.uses_samples else ""
+    samples = f" over {planner.imagination.num_samples} imagined surfaces a step" if planner.search.uses_samples else ""
     return f"Each view is where the {planner.quantity.name} is highest, by {type(planner.search).__name__}{samples}."
 
 
 def _found(answers: list[Answer], truth: Answer | None) -> str:
-    last = answers[-1].found
+    last = words_of(answers[-1]).found
     text = f"{last[:1].upper()}{last[1:]}"
-    return text if truth is None else f"{text}. In truth: {truth.found}"
+    return text if truth is None else f"{text}. In truth: {words_of(truth).found}"
 
 
 def _sure(answers: list[Answer], episode: Episode) -> str:
     first, count = since(answers), len(answers)
     text = f"From view {first} on" if first else f"Not yet after {count} view{'s' * (count > 1)}"
-    text = f"{text}; sure means {answers[-1].settled_means}."
+    text = f"{text}; sure means {words_of(answers[-1]).settled_means}."
     return f"{text} Ended: {episode.stopped}." if episode.stopped else text

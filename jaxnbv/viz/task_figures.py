@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from matplotlib.transforms import ScaledTranslation
 
-from jaxnbv.answers import Panel, number
+from jaxnbv.viz.answers import Panel, label_of, number
 from jaxnbv.viz.data import COVERAGE_RADIUS, ReportData
 from jaxnbv.viz.style import BEFORE, GREY, INK, LINE, NEW, SERIES
 
@@ -156,7 +156,7 @@ def other_charts(data: ReportData) -> list[tuple[str, Any]]:
     if not data.task.is_coverage:
         charts.append((coverage_series(data)[0], partial(draw_coverage, data=data)))
     if any(view.choice is not None for view in data.views):
-        charts.append((data.quantity.label, partial(draw_values, data=data)))
+        charts.append((label_of(data.quantity), partial(draw_values, data=data)))
     return charts
 
 

@@ -4,11 +4,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxnbv.acquisition import expected_score
+from jaxnbv.acquisition import expected_value
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.episode import Episode, view_keys
-from jaxnbv.search import Proposal, Trajectories
-from jaxnbv.search.candidates import sphere_candidates
+from jaxnbv.search import Proposal, SphereCandidates, Trajectories
 from jaxnbv.viz.sphere import unit
 
 # Fewer candidates than this say little about what lies between them: the map is then made of so many views of its own.
@@ -75,18 +74,18 @@ def wider_map(episode: Episode, index: int) -> SphereMap | None:
     if np.sum(~np.isnan(open_values(proposal))) >= _FEWEST and _on_sphere(proposal.candidates):
         return None
     radius = float(np.median(np.linalg.norm(np.asarray(proposal.candidates.position), axis=-1)))
-    poses = sphere_candidates(MAP_VIEWS, radius)
+    poses = SphereCandidates(MAP_VIEWS, radius).poses()
     return SphereMap(unit(np.asarray(poses.position, dtype=np.float64)), step_values(episode, index, poses))
 
 
 def step_values(episode: Episode, index: int, poses: Pose) -> Float[np.ndarray, " poses"]:
     """The acquisition at a batch of poses, with the samples of the step that chose view `index` (from 0)."""
-    planner, state = episode.planner, episode.state_after(index)
+    planner, evidence = episode.planner, episode.evidence_after(index)
     sample_key, *_ = view_keys(episode.key, index)
-    surfaces = planner.sample_surfaces(state, sample_key)
-    barrier = planner.barrier(poses)
-    found = _expected(planner.acquisition, state.cloud, surfaces, planner.camera, poses, barrier)
+    surfaces = planner.imagination.sample(evidence, sample_key)
+    barrier = planner.imagination.barrier(planner.camera, poses)
+    found = _expected(planner.acquisition, evidence.cloud, surfaces, planner.camera, poses, barrier)
     return np.asarray(found, dtype=np.float64)
 
 
-_expected = eqx.filter_jit(expected_score)
+_expected = eqx.filter_jit(expected_value)

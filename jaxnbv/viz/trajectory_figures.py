@@ -12,6 +12,7 @@ from matplotlib.patheffects import withStroke
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.viz import sphere
+from jaxnbv.viz.answers import label_of
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.layout import fitted, flow
 from jaxnbv.viz.render import Still, draw_cameras, draw_points, draw_segments, frame, frustum
@@ -84,5 +85,5 @@ def trajectory_figure(data: ReportData, index: int, camera: Camera) -> Figure:
     flow(figure, marks, 0.03, 0.918, 0.94, 0.035, 8.0)
     bar = figure.colorbar(colours, cax=figure.add_axes((0.14, 0.1, 0.72, 0.02)), orientation="horizontal")
     bar.outline.set_visible(False)
-    fitted(figure, 0.5, 0.02, f"{data.quantity.label} along the ascents", 0.94, 9.0, ha="center", va="center")
+    fitted(figure, 0.5, 0.02, f"{label_of(data.quantity)} along the ascents", 0.94, 9.0, ha="center", va="center")
     return figure

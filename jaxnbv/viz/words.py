@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from jaxnbv.answers import Quantity, coordinates, number
+from jaxnbv.acquisition import Quantity
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.viz.answers import coordinates, number, shown_value
 
 
 def describe_first(pose: Pose, points: int, covered: float | None) -> str:
@@ -48,7 +49,7 @@ def _reason(
         return f"It was drawn at random from {len(others)} open candidates."
     ascent = f"gradient ascent from {starts} start{'s' if starts > 1 else ''}"
     if starts and (not others or value > others[0]):
-        text = f"Its {values.name}, {values.show(value)}, was found by {ascent}"
+        text = f"Its {values.name}, {shown_value(values, value)}, was found by {ascent}"
         if not others:
             return f"{text}."
         if len(others) == 1:
@@ -57,7 +58,7 @@ def _reason(
         return f"{text}: {margin} ({number(others[0])}; median {number(float(np.median(others)))})."
     best = rank == 1
     stands = "the highest" if best else f"rank {rank}"
-    text = f"Its {values.name}, {values.show(value)}, was {stands} of {len(others)} open candidates"
+    text = f"Its {values.name}, {shown_value(values, value)}, was {stands} of {len(others)} open candidates"
     after = f" The {ascent} found nothing better." if starts else ""
     median = float(np.median(others))
     compared = f"the median candidate had {number(median)}"

@@ -1,23 +1,23 @@
 """What `jaxnbv demo` and `jaxnbv run MESH` do: one episode."""
 
+import dataclasses
 import time
 from pathlib import Path
 
 import jax
 import typer
 
-from jaxnbv.acquisition import Score
+from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError, require
 from jaxnbv.cli.actions.lines import Lines
 from jaxnbv.cli.actions.run_folder import clear, explained, note, usual_folder
 from jaxnbv.cli.actions.sensors import first_pose, peculiarities, quick_rays, sensor_for
 from jaxnbv.cli.actions.stops import rule
 from jaxnbv.cli.actions.tasks import CommandTask, Given, OfMesh
-from jaxnbv.cli.model_name import ModelName
 from jaxnbv.cli.options import USUAL_SIZE, EpisodeOptions, SensorOptions, SizeOptions
 from jaxnbv.cli.registry import SEARCHES, TASKS, resolve
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.imagination import imagination
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import View, simulate
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SensorNoise, Surface, load_mesh
@@ -34,12 +34,12 @@ def demo(task: str, scene: int, framing: Framing, first: str | None, options: Ep
     """
     made: CommandTask = resolve(TASKS[task].task)
     shown = made.demo(scene, framing, options.seed)
-    if shown.told:
-        typer.echo(shown.told)
+    if shown.note:
+        typer.echo(shown.note)
     start = shown.first if first is None else first_pose(first, shown.surface)
     own = shown.longest_side, shown.solid, shown.grid
     setting = quick_rays(made.setting) if options.quick else made.setting
-    planner = planner_of(setting, shown.score, options.search, options.model, options.quick, *own)
+    planner = planner_of(setting, shown.acquisition, options.search, options.model, options.quick, *own)
     _run(shown.name, task, shown.surface, planner, start, options, shown.until)
 
 
@@ -62,9 +62,9 @@ def run(
     surface, made = load_mesh(mesh), task_for(task, network, category, source)
     setting = sensor_for(surface, made.setting, sensor, options.quick)
     start = first_pose(first, surface, None if sensor.paper else setting.radius)
-    score = made.score(Given(OfMesh(surface, start, setting.camera), network, category, source))
-    planner = planner_of(setting, score, options.search, options.model, options.quick, sizes=sizes)
-    for words in peculiarities(mesh, surface, planner.grid.spacing):
+    acquisition = made.acquisition(Given(OfMesh(surface, start, setting.camera), network, category, source))
+    planner = planner_of(setting, acquisition, options.search, options.model, options.quick, sizes=sizes)
+    for words in peculiarities(mesh, surface, planner.imagination.grid.spacing):
         typer.echo(f"note     {words}")
     _run(mesh.stem, task, surface, planner, start, options)
 
@@ -87,9 +87,9 @@ def task_for(task: str, network: Path | None, category: str | None, source: str 
 
 def planner_of(
     setting: Setting,
-    score: Score,
+    acquisition: Acquisition,
     search: str,
-    model: ModelName,
+    model: str,
     quick: bool,
     longest_side: float = 2.5,
     solid: bool = False,
@@ -97,15 +97,14 @@ def planner_of(
     sizes: SizeOptions = USUAL_SIZE,
 ) -> Planner:
     """At the authors' settings, or at small ones, for an object of this longest side."""
-    surfaces, carving = imagination(model, longest_side, quick, solid=solid, lengthscale=sizes.lengthscale)
-    found = resolve(SEARCHES[search].search)
-    if quick:
-        many, grid, capacity = found(setting.radius, sizes.candidates or 40), Grid(56), 1024
-        return Planner(surfaces, setting.camera, score, many, sizes.samples or 4, grid, capacity, carving=carving)
+    imagination = Imagination.preset(model, longest_side, quick, solid=solid, lengthscale=sizes.lengthscale)
+    usual = 4 if quick else 16
+    grid = Grid(56) if quick else grid
+    imagination = dataclasses.replace(imagination, grid=grid, num_samples=sizes.samples or usual)
     # A gradient search looks at its own number of candidates before it climbs.
-    usual = None if search.startswith("gradient") else setting.num_candidates
-    many = found(setting.radius, sizes.candidates or usual)
-    return Planner(surfaces, setting.camera, score, many, sizes.samples or 16, grid=grid, carving=carving)
+    count = 40 if quick else None if search.startswith("gradient") else setting.num_candidates
+    found = resolve(SEARCHES[search].search)(setting.radius, sizes.candidates or count)
+    return Planner(acquisition, found, setting.camera, imagination, capacity=1024 if quick else 8192)
 
 
 def _run(

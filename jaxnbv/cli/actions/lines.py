@@ -5,13 +5,14 @@ import sys
 import numpy as np
 from tqdm import tqdm
 
-from jaxnbv.answers import Answer
+from jaxnbv.acquisition import Answer
 from jaxnbv.planning.episode import View
 from jaxnbv.planning.planner import Planner
+from jaxnbv.viz.answers import words_of
 
 
 class Lines:
-    """Prints the lines of each view that it is told: where from, why, and what it told."""
+    """Prints the lines of each view: where from, why, and what it answered."""
 
     def __init__(self, planner: Planner):
         self.planner, self.count = planner, 0
@@ -22,7 +23,7 @@ class Lines:
         _print(f"view {self.count}   {_line(self.planner, view)}")
         answer = self.planner.acquisition.answer(view.cloud)
         if answer is not None:
-            _print(f"         {answer.line(self.before)}")
+            _print(f"         {words_of(answer).line(self.before)}")
         self.before = answer
 
 
@@ -43,8 +44,8 @@ def _line(planner: Planner, view: View) -> str:
         rank = 1 + int(np.sum(values > float(view.proposal.value)))
         line += f"{'the highest' if rank == 1 else f'rank {rank}'} of {len(values)} candidates"
         line += f" (median {np.median(values):.4g})" if sought.smooth else ""
-        level = view.proposal.others_level
-        return line if level is None else f"{line}, {level} of them within two standard errors"
+        tied = view.proposal.num_tied
+        return line if tied is None else f"{line}, {tied} of them within two standard errors"
     best = values.max(initial=-np.inf)
     better = "found nothing better" if float(view.proposal.value) <= best else f"improved on {best:.4g}"
     return f"{line}where ascent from {len(ways.values)} of {len(values)} candidates {better}"

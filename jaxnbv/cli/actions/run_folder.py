@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from jaxnbv.checks import require
-from jaxnbv.cli.model_name import ModelName
 from jaxnbv.storage import remove_episode
 from jaxnbv.storage.files import write_text
 from jaxnbv.storage.folders import AnotherConfigurationError, read_json, writing_in
@@ -15,9 +14,9 @@ _OPTIONS, _FIGURES = "options.json", "figures"
 _REPORT = "report.html", f"{_FIGURES}/*.png"
 
 
-def usual_folder(name: str, task: str, search: str, model: ModelName, seed: int) -> Path:
+def usual_folder(name: str, task: str, search: str, model: str, seed: int) -> Path:
     """runs/NAME-TASK-SEARCH[-MODEL]-seedN."""
-    parts = name, task, search, *(() if model is ModelName.SCREENED else (model,)), f"seed{seed}"
+    parts = name, task, search, *(() if model == "screened" else (model,)), f"seed{seed}"
     return Path("runs") / re.sub(r"[^A-Za-z0-9_.-]", "_", "-".join(parts))
 
 

@@ -27,7 +27,7 @@ def sensor_for(mesh: TriangleMesh, setting: Setting, asked: SensorOptions, quick
         camera = setting.camera if fov is None else dataclasses.replace(setting.camera, fov=fov)
         setting = setting._replace(camera=camera, radius=setting.radius if asked.radius is None else asked.radius)
     else:
-        setting = fitted(setting, mesh.reach, fov, asked.radius)
+        setting = fitted(setting, mesh.bounding_radius, fov, asked.radius)
     if asked.rays is not None:
         return _with_rays(setting, asked.rays)
     return quick_rays(setting) if quick else setting

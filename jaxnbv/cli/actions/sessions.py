@@ -8,8 +8,9 @@ import typer
 from jaxnbv.cli.actions.episodes import planner_of, task_for
 from jaxnbv.cli.actions.sensors import quick_rays
 from jaxnbv.cli.actions.tasks import Given, OfScan, position
-from jaxnbv.cli.model_name import ModelName
 from jaxnbv.planning.replay import StoredSession
+from jaxnbv.viz import write_report
+from jaxnbv.viz.answers import words_of
 
 
 def replay(
@@ -19,7 +20,7 @@ def replay(
     category: str | None,
     source: str | None,
     search: str,
-    model: ModelName,
+    model: str,
     out: Path | None,
     quick: bool,
     report: bool,
@@ -35,21 +36,21 @@ def replay(
     made = task_for(task, network, category, source)
     given = Given(OfScan(*stored.first_view()), network, category, source)
     setting = quick_rays(made.setting) if quick else made.setting
-    planner = planner_of(setting, made.score(given), search, model, quick)
+    planner = planner_of(setting, made.acquisition(given), search, model, quick)
     out = out or folder.with_name(f"{folder.name}-{task}-{search}")
     sought = planner.quantity
     replayed = None
     for replayed, proposed in stored.replay(planner, out):
-        points = int(replayed.state.cloud.count)
+        points = int(replayed.evidence.cloud.count)
         typer.echo(
             f"image {replayed.views}   {points:5d} points kept; next from {_place(proposed.matrix)}, "
             f"{sought.name} {proposed.value:.4g}{_taken(stored, replayed.views, proposed.matrix)}"
         )
-        answer = planner.acquisition.answer(replayed.state.cloud)
+        answer = planner.acquisition.answer(replayed.evidence.cloud)
         if answer is not None:
-            typer.echo(f"          {answer.line()}")
+            typer.echo(f"          {words_of(answer).line()}")
     if report and replayed is not None:
-        typer.echo(f"report    {replayed.report(title=folder.name)}")
+        typer.echo(f"report    {write_report(replayed.episode, out, title=folder.name)}")
     typer.echo(f"session   {out}")
 
 

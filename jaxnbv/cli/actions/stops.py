@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 from jaxnbv.checks import InputError, require
 from jaxnbv.cli.registry import STOPS, resolve
-from jaxnbv.planning.stopping import Budget, Covered, Found, Stop, Sure, WorthLess
+from jaxnbv.planning.stopping import Budget, ValueBelow
+from jaxnbv.tasks import Covered, Found, Stop, Sure
 
 NEVER = "never"
 
@@ -43,8 +44,8 @@ def covered(number: float) -> Stop:
     return Covered(number)
 
 
-def worth_less(number: float) -> Stop:
-    return WorthLess(number)
+def value_below(number: float) -> Stop:
+    return ValueBelow(number)
 
 
 def seconds(number: float) -> Stop:

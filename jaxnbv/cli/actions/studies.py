@@ -11,7 +11,6 @@ import typer
 
 from jaxnbv.checks import InputError
 from jaxnbv.cli.actions.device import prepare
-from jaxnbv.cli.model_name import ModelName
 from jaxnbv.cli.options import Device
 from jaxnbv.cli.registry import resolve
 from jaxnbv.storage import describe
@@ -32,7 +31,7 @@ def study(
     views: int,
     methods: str | None,
     own: Sequence[str] | None,
-    model: ModelName,
+    model: str,
     out: Path | None,
     quick: bool,
     workers: int,
@@ -51,7 +50,7 @@ def study(
     failed: dict[str, str] = {}
     asked = 0
     given = {option: value for option, value in options.items() if value is not None}
-    of_model = "" if model is ModelName.SCREENED else f"-{model}"
+    of_model = "" if model == "screened" else f"-{model}"
     folder = out or Path("runs") / f"study-{name}{of_model}{'-quick' if quick else ''}"
     if quick:
         typer.echo("--quick: small settings and few scenes. This is not the full study; leave it out for that.")

@@ -1,4 +1,4 @@
-"""What the tasks of the command line are: their sensor, their score, and an object to show them on."""
+"""What the tasks of the command line are: their sensor, their acquisition, and an object to show them on."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxnbv.acquisition import ExpectedUtilityImprovement, Score
+from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement
 from jaxnbv.checks import InputError, require
 from jaxnbv.cli.options import DEFAULT_FIRST
 from jaxnbv.geometry.camera import Camera
@@ -100,18 +100,18 @@ class Given(NamedTuple):
 class Shown(NamedTuple):
     """An object to show a task on.
 
-    - `longest_side`, `solid`, `grid`: of the imagined surfaces; `told`: what is said of the object before.
+    - `longest_side`, `solid`, `grid`: of the imagined surfaces; `note`: what is said of the object before.
     - `until`: what is enough, as of `--until`.
     """
 
     name: str
     surface: Surface
-    score: Score
+    acquisition: Acquisition
     first: Pose
     longest_side: float = Framing.CLOSE_UP.longest_side
     solid: bool = False
     grid: Grid = Grid()
-    told: str = ""
+    note: str = ""
     until: tuple[str, ...] = ()
 
 
@@ -121,8 +121,8 @@ class CommandTask(ABC):
     setting: Setting = USUAL_SETTING
 
     @abstractmethod
-    def score(self, given: Given) -> Score:
-        """The score on a mesh of the user's; options that the task requires are there."""
+    def acquisition(self, given: Given) -> Acquisition:
+        """The acquisition on a mesh of the user's; options that the task requires are there."""
 
     @abstractmethod
     def demo(self, scene: int, framing: Framing, seed: int) -> Shown:
@@ -132,7 +132,7 @@ class CommandTask(ABC):
 class CoverageTask(CommandTask):
     """To see all of an object."""
 
-    def score(self, given: Given) -> Score:
+    def acquisition(self, given: Given) -> Acquisition:
         return Coverage()
 
     def demo(self, scene: int, framing: Framing, seed: int) -> Shown:
@@ -141,12 +141,12 @@ class CoverageTask(CommandTask):
 
 
 class ClassTask(CommandTask):
-    """To know an object's class, by a score of a classifier."""
+    """To know an object's class, by an acquisition of a classifier."""
 
-    def __init__(self, of: Callable[[Classifier], Score]):
+    def __init__(self, of: Callable[[Classifier], Acquisition]):
         self.of = of
 
-    def score(self, given: Given) -> Score:
+    def acquisition(self, given: Given) -> Acquisition:
         assert given.network is not None
         network = load_checkpoint(given.network)
         return self.of(CloudClassifier(network, scale=network_scale(network)))
@@ -155,10 +155,10 @@ class ClassTask(CommandTask):
         """A pyramid. The grid is that of the surfaces that the classifier was trained on."""
         pyramid = pyramid_scene(Split.TEST, scene, framing)
         side, first = framing.longest_side, hidden_view(pyramid, jax.random.key(seed))
-        told = f"the pattern is a {PATTERNS[int(pyramid.label)]}"
-        score = self.of(pyramid_classifier(side))
+        note = f"the pattern is a {PATTERNS[int(pyramid.label)]}"
+        acquisition = self.of(pyramid_classifier(side))
         grid = Grid(64, 0.7 * side)
-        return Shown("pyramid", SDFSurface(pyramid), score, first, side, True, grid, told, ("sure=0.95",))
+        return Shown("pyramid", SDFSurface(pyramid), acquisition, first, side, True, grid, note, ("sure=0.95",))
 
 
 class PartTask(CommandTask):
@@ -166,21 +166,21 @@ class PartTask(CommandTask):
 
     setting = PART_SETTING
 
-    def score(self, given: Given) -> Score:
+    def acquisition(self, given: Given) -> Acquisition:
         assert given.category is not None
         if given.network is None:
-            return self._score(part_segmenter(given.category))
+            return self._of(part_segmenter(given.category))
         network = load_checkpoint(given.network)
-        return self._score(CloudSegmenter(network, given.category, scale=network_scale(network)))
+        return self._of(CloudSegmenter(network, given.category, scale=network_scale(network)))
 
     def demo(self, scene: int, framing: Framing, seed: int) -> Shown:
         """A procedural object."""
         thing = part_scene(Split.TEST, scene)
         category = CATEGORIES[int(thing.category)].name
-        score = self._score(part_segmenter(category))
-        return Shown(category, SDFSurface(thing.solid), score, usual_first())
+        acquisition = self._of(part_segmenter(category))
+        return Shown(category, SDFSurface(thing.solid), acquisition, usual_first())
 
-    def _score(self, segmenter: CloudSegmenter) -> Score:
+    def _of(self, segmenter: CloudSegmenter) -> Acquisition:
         return ExpectedUtilityImprovement(SoftPartCount(segmenter), segmenter.num_points)
 
 
@@ -189,17 +189,17 @@ class HeatTask(CommandTask):
 
     setting = HEAT_SETTING
 
-    def score(self, given: Given) -> Score:
+    def acquisition(self, given: Given) -> Acquisition:
         """Heated at the point that was asked for, or at the one in the middle of the first view."""
-        return self._score(_middle(given.known) if given.source is None else _asked(given.known, given.source))
+        return self._of(_middle(given.known) if given.source is None else _asked(given.known, given.source))
 
     def demo(self, scene: int, framing: Framing, seed: int) -> Shown:
         """A procedural object."""
         heated = heat_scene(scene)
         first = source_view(heated, jax.random.key(seed))
-        return Shown(heated.name, heated.surface, self._score(np.asarray(heated.source)), first)
+        return Shown(heated.name, heated.surface, self._of(np.asarray(heated.source)), first)
 
-    def _score(self, source: np.ndarray) -> Score:
+    def _of(self, source: np.ndarray) -> Acquisition:
         return ExpectedUtilityImprovement(ColdestPoint(source), num_points=2048)
 
 

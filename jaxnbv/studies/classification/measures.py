@@ -37,7 +37,7 @@ def _hit(time_of: Callable) -> Callable[[Record, str], Float[np.ndarray, " views
         share = cumulative_share([time_of(run) for run in correct], len(correct[0]))
         if method == "random" and time_of is first_hit and len(share) >= 2:
             # Exact by view 2; all runs have the first view in common.
-            share[1] = 1.0 if correct[0][0] else held.get("hit", record.get("random_hit"))
+            share[1] = 1.0 if correct[0][0] else held["hit"]
         return share
 
     return of
@@ -67,13 +67,7 @@ def _diagnostic(quantity: str) -> Callable[[Record, str], list[float | None]]:
 
 
 def _of_view(record: Record, method: str, quantity: str, view: int) -> float | None:
-    # Older records hold them beside the methods.
-    entries = record["methods"][method].get("diagnostics") or [
-        entry | {"rank_correlation": entry["rank_correlation"].get(method)}
-        for entry in record.get("diagnostics", ())
-        if method in entry["methods"]
-    ]
-    found = [entry.get(quantity) for entry in entries if entry["view"] == view]
+    found = [entry[quantity] for entry in record["methods"][method]["diagnostics"] if entry["view"] == view]
     return found[0] if found and found[0] is not None and np.isfinite(found[0]) else None
 
 

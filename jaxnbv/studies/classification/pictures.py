@@ -51,7 +51,7 @@ def _picture(record: Record, study: ClassificationStudy, methods: Sequence[str],
     held = [record["methods"][method] for method in methods]
     runs = [method["runs"][0] for method in held]
     views = len(runs[0]["log_p"])
-    taken = [study.poses_of(method if "views" in method else method["runs"][0])[:views] for method in held]
+    taken = [study.poses_of(method)[:views] for method in held]
     scene = study.scene(record["scene"])
     # Four rays a pixel.
     camera = Camera(height=2 * pixels, width=2 * pixels)

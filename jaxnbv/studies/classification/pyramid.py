@@ -37,12 +37,10 @@ class PyramidStudy(ClassificationStudy):
     network: ClassVar[str] = "pyramid"
     framings: ClassVar[tuple[Framing, ...]] = tuple(Framing)
     solid: ClassVar[bool] = True
-    # The last is held by older records alone: carved samples have nothing before the object.
     measures: ClassVar[tuple[Measure, ...]] = (
         *hits(telling),
         diagnostic("rank_correlation", "Rank correlation"),
         ROUGHNESS,
-        diagnostic("near_sensor", "Near-sensor share"),
     )
     charts: ClassVar[Mapping[str, Chart]] = {
         "hits": Chart((tuple(map(Panel, ("first", "stable", "pattern"))),)),

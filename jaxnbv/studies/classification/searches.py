@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 import equinox as eqx
 import numpy as np
 
-from jaxnbv.cli.model_name import ModelName
 from jaxnbv.planning.episode import Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.search import (
@@ -85,8 +84,8 @@ class _Searches(ClassificationStudy):
     learning_rate: float = eqx.field(static=True, default=0.03)
 
     def planner(self, method: str, scene: Scene) -> Planner:
-        score = CrossEntropy(self.imagining or self.classifier, self.num_points)
-        return self.planner_of(score, self._search(method))
+        acquisition = CrossEntropy(self.imagining or self.classifier, self.num_points)
+        return self.planner_of(acquisition, self._search(method))
 
     def _search(self, method: str) -> Search:
         if method in _SPACES:
@@ -132,7 +131,7 @@ class SearchStudy(_Searches, PyramidStudy):
     seed: ClassVar[int] = 10
 
     @classmethod
-    def configured(cls, model: ModelName, views: int, quick: bool, **options: Any) -> dict[str, Study]:
+    def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
         """On pyramids of each framing, and on trucks, if none is given."""
         pyramids = super().configured(model, views, quick, **options)
         if "framing" in options:

@@ -11,27 +11,47 @@ import numpy as np
 from jaxtyping import Array, Int, Key
 
 from jaxnbv.checks import require
-from jaxnbv.cli.model_name import ModelName
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.imagination import imagination
+from jaxnbv.imagination import Imagination
 from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale, pretrained_classifier
-from jaxnbv.planning.episode import Sensor, Step
+from jaxnbv.planning.episode import Sensor, Step, view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SensorNoise
-from jaxnbv.search import DiscreteSearch
-from jaxnbv.studies.classification.choices import CLASSIFYING, Chooser, classify
+from jaxnbv.search import (
+    CandidateSearch,
+    DiscreteSearch,
+    FarthestView,
+    RandomView,
+    TieBreakSearch,
+    UncertaintyView,
+)
 from jaxnbv.studies.classification.measures import HITS_EXPLAINED, ROUGHNESS, diagnostics_chart, hits
+from jaxnbv.studies.classification.shared import OracleView, Shared, classify, propose_together
+from jaxnbv.studies.engine.diagnostics import rank_correlation, roughness
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.meshes import class_meshes, numbered
-from jaxnbv.studies.engine.study import Chart, Panel, Scene, Study
+from jaxnbv.studies.engine.study import Chart, Panel, Scene, Study, pose_record
 from jaxnbv.studies.readers import MeshFile
 from jaxnbv.studies.scenes import ClassObject, ClassSet, Framing, Split
 from jaxnbv.studies.scenes.class_object import ClassMesh, scan_telling, surface_of
-from jaxnbv.tasks import Coverage
-from jaxnbv.tasks.classification import Classifier
+from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, MixedEntropy
+from jaxnbv.tasks.classification import ClassAcquisition, Classifier
 
-_RANDOM_RUNS = 8
+# Of random search, in each scene.
+_RUNS = 8
+_BY_CLASS: dict[str, type[ClassAcquisition]] = {
+    "cross-entropy": CrossEntropy,
+    "entropy": EntropyReduction,
+    "mixed": MixedEntropy,
+    "tie-break": CrossEntropy,
+    "oracle": CrossEntropy,
+}
+_SEARCHES: dict[str, type[CandidateSearch]] = {
+    "farthest": FarthestView,
+    "uncertainty": UncertaintyView,
+    "random": RandomView,
+}
 BASELINES = ("coverage", "farthest", "uncertainty", "random")
 
 
@@ -63,7 +83,7 @@ class ClassificationStudy(Study):
     - `framings`: each a study of its own; `solid`: whether the objects are nowhere thin, see `imagination`.
     """
 
-    methods: ClassVar[tuple[str, ...]] = (*CLASSIFYING, *BASELINES, "oracle")
+    methods: ClassVar[tuple[str, ...]] = ("cross-entropy", "entropy", "mixed", "tie-break", *BASELINES, "oracle")
     reference: ClassVar[str] = "cross-entropy"
     explanation: ClassVar[str] = f"{HITS_EXPLAINED}Roughness is by the view being chosen, in ( ) its scenes."
     measures: ClassVar[tuple[Measure, ...]] = (*hits(), ROUGHNESS)
@@ -98,7 +118,7 @@ class ClassificationStudy(Study):
     meshes: tuple[MeshFile, ...] = eqx.field(static=True, default=())
 
     @classmethod
-    def configured(cls, model: ModelName, views: int, quick: bool, **options: Any) -> dict[str, Study]:
+    def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
         """One for each framing, if none is given.
 
         - `meshes`: a folder, see `class_meshes`.
@@ -112,10 +132,10 @@ class ClassificationStudy(Study):
         studies: dict[str, Study] = {}
         for one in (options["framing"],) if "framing" in options else cls.framings:
             classifier, imagining = (cls._classifier(file, one.longest_side, fed) for fed in cls.fed)
-            surfaces = imagination(model, one.longest_side, quick, solid=cls.solid)._asdict()
-            settings = {"classifier": classifier, "imagining": imagining, "framing": one} | options
+            imagination = Imagination.preset(model, one.longest_side, quick, solid=cls.solid)
+            settings: dict[str, Any] = {"classifier": classifier, "imagining": imagining, "framing": one} | options
             name = one.value if len(cls.framings) > 1 else ""
-            studies[name] = cls(views=views, **surfaces | settings | (dict(cls.quick) if quick else {}))
+            studies[name] = cls(views=views, imagination=imagination, **settings | (dict(cls.quick) if quick else {}))
         return studies
 
     @classmethod
@@ -183,8 +203,14 @@ class ClassificationStudy(Study):
         return Grid(self.grid_resolution, 0.7 * self.framing.longest_side)
 
     def planner(self, method: str, scene: Scene) -> Planner:
-        """That of coverage, whose states and samples all methods share; a `Chooser` asks their scores."""
-        return self.planner_of(Coverage(), DiscreteSearch(self.candidates))
+        classifier, candidates = self.imagining or self.classifier, self.candidates
+        kind, coverage = _BY_CLASS.get(method), Coverage()
+        acquisition = coverage if kind is None else kind(classifier, num_points=self.num_points)
+        if method == "oracle":
+            return self.planner_of(acquisition, OracleView(candidates, scans=scene.task.scans))
+        if method == "tie-break":
+            return self.planner_of(acquisition, TieBreakSearch(candidates, second=coverage))
+        return self.planner_of(acquisition, _SEARCHES.get(method, DiscreteSearch)(candidates))
 
     def sensor(self, scene: Scene) -> Sensor:
         """From a candidate the same scan for all methods and views."""
@@ -197,46 +223,72 @@ class ClassificationStudy(Study):
         return look
 
     def run_methods(self, scene: Scene, truth: Truth, first: int, methods: Sequence[str]) -> dict[str, Record]:
-        """All methods together: those that stand at the same place share its state and its samples."""
-        chooser = self._chooser(scene)
+        """All methods together: those that stand at the same place share its evidence, its samples and their scans."""
+        planners = {method: self.planner(method, scene) for method in methods}
+        shared = Shared(self.planner("coverage", scene), self.classifier, self.candidates.poses(), truth.scans)
         runs: dict[str, list[tuple[int, ...]]] = {method: [(first,)] for method in methods}
         if "random" in runs:
-            runs["random"] = [self._random_run(scene.index, first, run) for run in range(_RANDOM_RUNS)]
+            runs["random"] = [self._random_run(scene, shared, planners["random"], first, run) for run in range(_RUNS)]
         diagnostics: dict[str, list[Record]] = {method: [] for method in methods}
-        for view in range(2, self.views + 1):
-            together: dict[tuple[int, ...], list[str]] = {}
-            for method in methods:
-                if method != "random":
-                    together.setdefault(runs[method][0], []).append(method)
+        for view in range(1, self.views):
+            together: dict[tuple[int, ...], dict[str, Planner]] = {}
+            for method in (method for method in methods if method != "random"):
+                together.setdefault(runs[method][0], {})[method] = planners[method]
             for visited, group in together.items():
-                for method, choice in chooser.choose(visited, group, view).items():
-                    runs[method] = [(*visited, choice.candidate)]
-                    diagnostics[method].append({"view": view, **choice.diagnostics})
+                for method, (index, noted) in self._step(scene, shared, group, visited, view).items():
+                    runs[method] = [(*visited, index)]
+                    diagnostics[method].append({"view": view + 1, **noted})
         found: dict[str, Record] = {
-            method: {"runs": [self._run(chooser, truth, one) for one in of], "diagnostics": diagnostics[method]}
+            method: {
+                "views": [pose_record(shared.poses[index]) for index in of[0]],
+                "runs": [self._run(shared, truth, one) for one in of],
+                "diagnostics": diagnostics[method],
+            }
             for method, of in runs.items()
         }
         if "random" in found:
-            correct = chooser.true_answers(first).argmax(axis=1) == truth.label
+            correct = shared.second_answers(first).argmax(axis=1) == truth.label
             found["random"]["hit"] = float(np.mean(np.delete(correct, first)))
         return found
 
-    def _chooser(self, scene: Scene) -> Chooser:
-        """For the choices of a scene."""
-        planner, imagining = self.planner("coverage", scene), self.imagining or self.classifier
-        truth, classifiers = scene.task, (self.classifier, imagining, self.num_points)
-        worth = truth.pixels if self.telling else None
-        return Chooser(planner, *classifiers, truth.scans, worth, self.key(scene.index, "scene"))
+    def _step(
+        self, scene: Scene, shared: Shared, planners: Mapping[str, Planner], visited: tuple[int, ...], view: int
+    ) -> dict[str, tuple[int, Record]]:
+        """The candidates that methods at one place choose as view `view` (from 0), with the keys of an episode; and how
+        well their values agreed with what the candidates would truly show, and how rough the samples were."""
+        evidence = shared.evidence(visited)
+        sample_key, search_key, _ = view_keys(self.key(scene.index, "episode"), view)
+        surfaces, rough = None, None
+        if any(planner.search.uses_samples for planner in planners.values()):
+            imagination = shared.planner.imagination
+            posterior = imagination.posterior(evidence)
+            surfaces = imagination.sample(evidence, sample_key, posterior)
+            rough = roughness(imagination, evidence, posterior, surfaces)
+        new = ~np.isin(np.arange(self.num_candidates), visited)
+        found: dict[str, tuple[int, Record]] = {}
+        for method, proposal in propose_together(planners, evidence, surfaces, search_key).items():
+            index = _nearest(shared.poses, proposal.pose)
+            assert index is not None
+            shown = scene.task.pixels if self.telling else None
+            rank = None if shown is None else rank_correlation(proposal.values, shown, new)
+            own = rough if planners[method].search.uses_samples else None
+            found[method] = index, {"rank_correlation": rank, "roughness": own}
+        return found
 
-    def _run(self, chooser: Chooser, truth: Truth, visited: tuple[int, ...]) -> Record:
-        log_p = [chooser.answer(visited[:count]).tolist() for count in range(1, len(visited) + 1)]
+    def _random_run(self, scene: Scene, shared: Shared, planner: Planner, first: int, run: int) -> tuple[int, ...]:
+        """The candidates that a search at random chooses, in one of several runs."""
+        key = jax.random.fold_in(self.key(scene.index, "episode"), run)
+        visited: tuple[int, ...] = (first,)
+        for view in range(1, self.views):
+            _, search_key, _ = view_keys(key, view)
+            index = _nearest(shared.poses, planner.choose(shared.evidence(visited), None, search_key).pose)
+            assert index is not None
+            visited = (*visited, index)
+        return visited
+
+    def _run(self, shared: Shared, truth: Truth, visited: tuple[int, ...]) -> Record:
+        log_p = [shared.answer(visited[:count]).tolist() for count in range(1, len(visited) + 1)]
         return {"candidates": list(visited), **self._shown(truth.pixels[np.array(visited)]), "log_p": log_p}
-
-    def _random_run(self, index: int, first: int, run: int) -> tuple[int, ...]:
-        others = np.delete(np.arange(self.num_candidates), first)
-        key = jax.random.fold_in(self.key(index, "episode"), run)
-        chosen = jax.random.choice(key, others, (self.views - 1,), replace=False)
-        return (first, *(int(one) for one in chosen))
 
     def follow(
         self, scene: Scene, truth: Truth, method: str, methods: Sequence[str], episode: Iterator[Step]

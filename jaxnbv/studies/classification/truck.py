@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 import equinox as eqx
 
 from jaxnbv.checks import require
-from jaxnbv.cli.model_name import ModelName
 from jaxnbv.scanning import load_mesh
 from jaxnbv.studies.classification.measures import (
     HITS_EXPLAINED,
@@ -64,7 +63,7 @@ class TruckStudy(ClassificationStudy):
         )
 
     @classmethod
-    def configured(cls, model: ModelName, views: int, quick: bool, **options: Any) -> dict[str, Study]:
+    def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
         """
         - `meshes`: a folder with a folder `trucks` of meshes, and those of the cargo's classes, see `class_meshes`.
 

@@ -5,21 +5,21 @@ from jaxtyping import Bool, Float
 from scipy.stats import spearmanr
 
 from jaxnbv.checks import AnyArray
-from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.state import State
-from jaxnbv.scanning import GridSurface
+from jaxnbv.imagination import Imagination
+from jaxnbv.scanning import Evidence, GridSurface
 from jaxnbv.surfaces import SurfacePosterior
 
 
-def roughness(planner: Planner, state: State, posterior: SurfacePosterior, surfaces: GridSurface) -> float:
+def roughness(
+    imagination: Imagination, evidence: Evidence, posterior: SurfacePosterior, surfaces: GridSurface
+) -> float:
     """Cells of the grid that a sample's surface crosses, mean over samples, per cell that the mean's surface crosses,
     carved as the samples are.
 
     About 1 for samples as smooth as the mean. It rises when the spacing of the data exceeds the kernel's width; near 5
-    an acquisition says little about what a view is worth.
+    an acquisition says little about the value of a view.
     """
-    values = posterior.mean_on_grid(surfaces.grid.axis.astype(surfaces.values.dtype)) - posterior.level
-    mean = crossed_cells(np.asarray(planner.carve(state, values)))
+    mean = crossed_cells(np.asarray(imagination.mean(evidence, posterior)))
     samples = [crossed_cells(values) for values in np.asarray(surfaces.values)]
     return float(np.mean(samples)) / max(mean, 1)
 
@@ -33,8 +33,9 @@ def crossed_cells(values: Float[np.ndarray, "g g g"]) -> int:
 
 
 def rank_correlation(
-    values: Float[AnyArray, " c"], worth: Float[AnyArray, " c"], compared: Bool[np.ndarray, " c"]
+    values: Float[AnyArray, " c"], true_values: Float[AnyArray, " c"], compared: Bool[np.ndarray, " c"]
 ) -> float | None:
-    """Spearman's, between the values and the worth of the candidates compared; None where either does not vary."""
-    a, b = np.asarray(values)[compared], np.asarray(worth)[compared]
+    """Spearman's, between the expected and the true values of the candidates compared; None where either does not
+    vary."""
+    a, b = np.asarray(values)[compared], np.asarray(true_values)[compared]
     return None if np.ptp(a) == 0 or np.ptp(b) == 0 else float(spearmanr(a, b).statistic)

@@ -1,5 +1,6 @@
 """What a study is, and the engine that runs one scene of it with every method."""
 
+import dataclasses
 import itertools
 import time
 import traceback
@@ -12,21 +13,18 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from jaxnbv.acquisition import Score
+from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError, check_type, require
-from jaxnbv.cli.model_name import ModelName
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.imagination import imagination
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import Sensor, Step, scene_sensor, steps, view_keys
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.state import State
-from jaxnbv.scanning import Carving, Grid, Surface
+from jaxnbv.scanning import Evidence, Grid, Surface
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.search import Search, SphereCandidates
 from jaxnbv.studies.engine.measures import Claim, Measure, Record, Row
-from jaxnbv.surfaces import ScreenedSPSR, SurfaceModel
 
 _PURPOSES = ("first", "episode", "scene", "measure")
 
@@ -67,7 +65,8 @@ class Study(eqx.Module):
 
     - `views`: in all, the first included.
     - `num_candidates`: on the sphere of `radius`, at which every search but those by gradient looks.
-    - `num_samples`, `model`, `carving`, `grid_resolution`, `capacity`: of the planner.
+    - `imagination`, `num_samples`, `grid_resolution`, `capacity`: of the planner; the imagination has as many samples
+      on a grid of this resolution.
     - `camera`: the sensor; a planner may imagine fewer rays.
 
     What it is:
@@ -97,8 +96,7 @@ class Study(eqx.Module):
     views: int = eqx.field(static=True, default=5)
     num_candidates: int = eqx.field(static=True, default=48)
     num_samples: int = eqx.field(static=True, default=16)
-    model: SurfaceModel = eqx.field(default_factory=ScreenedSPSR)
-    carving: Carving | None = Carving()
+    imagination: Imagination = eqx.field(default_factory=Imagination)
     grid_resolution: int = eqx.field(static=True, default=64)
     capacity: int = eqx.field(static=True, default=4096)
     camera: Camera = Camera()
@@ -111,13 +109,13 @@ class Study(eqx.Module):
         )
 
     @classmethod
-    def configured(cls, model: ModelName, views: int, quick: bool, **options: Any) -> "dict[str, Study]":
+    def configured(cls, model: str, views: int, quick: bool, **options: Any) -> "dict[str, Study]":
         """The study that a command asks for, or several by the names of their folders; of one alone the name is "".
 
         - `options`: settings of its own.
         """
-        surfaces = imagination(model, quick=quick)._asdict()
-        return {"": cls(views=views, **surfaces | (dict(cls.quick) if quick else {}) | options)}
+        imagined = {"imagination": Imagination.preset(model, quick=quick)}
+        return {"": cls(views=views, **imagined | (dict(cls.quick) if quick else {}) | options)}
 
     @property
     def num_scenes(self) -> int | None:
@@ -189,13 +187,14 @@ class Study(eqx.Module):
         """Where samples are evaluated."""
         return Grid(self.grid_resolution)
 
-    def planner_of(self, score: Score, search: Search, camera: Camera | None = None) -> Planner:
+    def planner_of(self, acquisition: Acquisition, search: Search, camera: Camera | None = None) -> Planner:
         """A planner with the study's settings.
 
         - `camera`: whose scans are imagined, by default the sensor.
         """
-        settings = self.num_samples, self.grid, self.capacity, self.views, self.carving
-        return Planner(self.model, camera or self.camera, score, search, *settings)
+        imagination = dataclasses.replace(self.imagination, grid=self.grid, num_samples=self.num_samples)
+        planned = acquisition, search, camera or self.camera, imagination
+        return Planner(*planned, capacity=self.capacity, max_views=self.views)
 
     def key(self, index: int, purpose: str) -> PRNGKeyArray:
         """What is random in a scene depends on the study, the scene and the purpose alone."""
@@ -257,8 +256,7 @@ class Study(eqx.Module):
         def noted() -> Iterator[Step]:
             first_pose, key = self.candidates.poses()[first], self.key(scene.index, "episode")
             for step in itertools.islice(steps(planner, self.sensor(scene), first_pose, key, self.camera), self.views):
-                pose = step.view.pose
-                views.append({"position": pose.position.tolist(), "rotation": pose.rotation.tolist()})
+                views.append(pose_record(step.view.pose))
                 yield step
 
         return {"views": views, **self.follow(scene, truth, method, methods, noted())}
@@ -272,22 +270,25 @@ class Study(eqx.Module):
                 return candidate
         raise InputError(f"none of {self.num_candidates} candidates shows enough of {scene.name}: give more")
 
-    def seen(self, scene: Scene, run: Record) -> list[tuple[PointCloud, State]]:
-        """Each scan of a method, and what is known after it, made again from the poses of its record."""
+    def seen(self, scene: Scene, run: Record) -> list[tuple[PointCloud, Evidence]]:
+        """Each scan of a method, and the evidence after it, made again from the poses of its record."""
         key, sensor = self.key(scene.index, "episode"), self.sensor(scene)
         poses = self.poses_of(run)
         require(len(poses) > 0, "there are no views to scan again")
         views = [(pose, sensor(pose, view_keys(key, index)[2]), self.camera) for index, pose in enumerate(poses)]
-        # A state depends on the planner through its capacity, its grid and what it carves alone.
-        states = self.planner(self.methods[0], scene).replay(views)
-        return [(scan, state) for (_, scan, _), state in zip(views, states, strict=True)]
+        # It depends on the planner through its capacity and what it carves alone.
+        known = self.planner(self.methods[0], scene).replay(views)
+        return [(scan, evidence) for (_, scan, _), evidence in zip(views, known, strict=True)]
 
     def poses_of(self, run: Record) -> list[Pose]:
-        """Where a method's views were taken; older records hold the numbers of candidates."""
-        if "views" not in run:
-            return [self.candidates.poses()[candidate] for candidate in run["candidates"]]
+        """Where a method's views were taken."""
         arrays = [[np.asarray(view[name], np.float32) for name in ("rotation", "position")] for view in run["views"]]
         return [Pose(rotation, position) for rotation, position in arrays]
+
+
+def pose_record(pose: Pose) -> Record:
+    """A pose as JSON."""
+    return {"position": pose.position.tolist(), "rotation": pose.rotation.tolist()}
 
 
 # A method of one's own: the planner of a scene.
@@ -296,4 +297,4 @@ Factory: TypeAlias = Callable[[Study, Scene], Planner]
 
 def views_of(run: Record) -> int:
     """How many views a record of a method holds."""
-    return len(run["views"] if "views" in run else run["candidates"])
+    return len(run["views"])

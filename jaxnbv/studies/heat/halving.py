@@ -9,28 +9,27 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.state import State
-from jaxnbv.scanning import GridSurface
+from jaxnbv.scanning import Evidence, GridSurface
 from jaxnbv.search import HalvingSearch, Proposal
 from jaxnbv.studies.engine.measures import Record, Row
 from jaxnbv.studies.engine.tables import count_of, underlined
 
 
 def compare(
-    halving: Planner, state: State, surfaces: GridSurface | None, key: PRNGKeyArray, full: Proposal
+    halving: Planner, evidence: Evidence, surfaces: GridSurface | None, key: PRNGKeyArray, full: Proposal
 ) -> dict[str, Any]:
-    """Ask the other search the same: whether it finds the same view, how much less that is worth by the value of the
-    full search, and its seconds."""
+    """Ask the other search the same: whether it finds the same view, how much less the full search values that, and its
+    seconds."""
     start = time.perf_counter()
-    halved = jax.block_until_ready(halving.choose(state, surfaces, key))
+    halved = jax.block_until_ready(halving.choose(evidence, surfaces, key))
     seconds, places = time.perf_counter() - start, np.asarray(full.candidates.position)
     found, best = (int(np.argmin(np.linalg.norm(places - one.pose.position, axis=1))) for one in (halved, full))
     return {
         "same": found == best,
         "regret": float(full.value - full.values[found]),
         "seconds": seconds,
-        "evaluations": halving_evaluations(len(places), halving.num_samples),
-        "full_evaluations": len(places) * halving.num_samples,
+        "evaluations": halving_evaluations(len(places), halving.imagination.num_samples),
+        "full_evaluations": len(places) * halving.imagination.num_samples,
     }
 
 

@@ -91,7 +91,7 @@ def _picture(record: Record, study: HeatStudy, methods: Sequence[str], pixels: i
     for row, (method, run) in enumerate(zip(methods, runs, strict=True)):
         down = top + row * (tile + below)
         tiles.write(given - gap, down + 0.5 * tile, method, fontsize=9, fontweight="bold", ha="right")
-        clouds = [state.cloud for _, state in study.seen(scene, run)]
+        clouds = [evidence.cloud for _, evidence in study.seen(scene, run)]
         taken = study.poses_of(run)
         for column, count in enumerate(columns):
             axes = tiles.place(given + column * (tile + gap), down, tile, tile)

@@ -194,19 +194,19 @@ class HeatStudy(Study):
         among all points and one among those (among all, where there are none): where it is, its temperature, its
         distance to the nearest of the object's coldest points, and that to the very coldest one.
 
-        Of each step the value of the view that was chosen, zero if no view is worth anything, and the seconds of the
+        Of each step the value of the view that was chosen, zero if no view adds anything, and the seconds of the
         search. With "heat-halving" among the methods, each step of "heat" asks that search too.
         """
         halving = self.planner("heat-halving", scene) if method == "heat" and "heat-halving" in methods else None
         clouds, taken, compared, before = [], [], [], None
         for view, step in enumerate(episode):
-            clouds.append(step.state.cloud)
+            clouds.append(step.evidence.cloud)
             if before is not None and (proposal := step.view.proposal) is not None:
                 taken.append({"value": float(proposal.value), "seconds": step.seconds})
                 if halving is not None:
                     key = view_keys(self.key(scene.index, "episode"), view)[1]
                     compared.append(compare(halving, before, step.surfaces, key, proposal))
-            before = step.state
+            before = step.evidence
         run = {"steps": taken, **_estimates(clouds, heat_problem(scene), truth)}
         return run if halving is None else run | {"halving": compared}
 

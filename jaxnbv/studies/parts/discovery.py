@@ -137,8 +137,8 @@ class PartDiscoveryStudy(Study):
 
     def planner(self, method: str, scene: Scene) -> Planner:
         camera = Camera(height=self.imagined_rays, width=self.imagined_rays)
-        score = self._soft_count(scene) if method in _BY_PARTS else Coverage()
-        return self.planner_of(score, self._search(method), camera)
+        acquisition = self._soft_count(scene) if method in _BY_PARTS else Coverage()
+        return self.planner_of(acquisition, self._search(method), camera)
 
     def _soft_count(self, scene: Scene) -> ExpectedUtilityImprovement:
         target = TARGET * self.num_points / NETWORK_POINTS

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxnbv.checks import require
-from jaxnbv.cli.model_name import ModelName
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.scanning import Grid, MeshParts, load_parts, scan
@@ -50,7 +49,7 @@ class MeshPartStudy(PartDiscoveryStudy):
     meshes: tuple[tuple[str, int], ...] = eqx.field(static=True, kw_only=True)
 
     @classmethod
-    def configured(cls, model: ModelName, views: int, quick: bool, **options: Any) -> dict[str, Study]:
+    def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
         """
         - `meshes`: a folder, see `part_files`.
 

@@ -107,8 +107,8 @@ def _picture(record: Record, study: PartDiscoveryStudy, methods: Sequence[str], 
         tiles.write(left + 0.8, down, name, fontsize=9)
 
     def draw(axes: Axes, row: int, column: int) -> None:
-        shown, state = seen[row][column]
-        _draw_view(axes, ghost, segmenter.predict(state.cloud), shown, colours)
+        shown, evidence = seen[row][column]
+        _draw_view(axes, ghost, segmenter.predict(evidence.cloud), shown, colours)
         taken = study.poses_of(runs[row])[: column + 1]
         for index, pose in enumerate(taken):
             _draw_camera(axes, ghost, study.camera, pose, is_new=index == column)

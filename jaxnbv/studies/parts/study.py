@@ -7,7 +7,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxnbv.cli.model_name import ModelName
 from jaxnbv.networks import CATEGORIES, CloudSegmenter, part_segmenter
 from jaxnbv.scanning import SDFSurface
 from jaxnbv.studies.engine.measures import Record
@@ -29,7 +28,7 @@ class PartStudy(PartDiscoveryStudy):
 
     @classmethod
     def configured(
-        cls, model: ModelName, views: int, quick: bool, meshes: str | Path | None = None, **options: Any
+        cls, model: str, views: int, quick: bool, meshes: str | Path | None = None, **options: Any
     ) -> dict[str, Study]:
         """With a folder of meshes, that of their parts.
 

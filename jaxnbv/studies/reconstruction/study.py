@@ -12,10 +12,9 @@ from jaxnbv.checks import InputError
 from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.planning.episode import Step
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.state import State
-from jaxnbv.scanning import SDFSurface, TriangleMesh
+from jaxnbv.scanning import Evidence, SDFSurface, TriangleMesh
 from jaxnbv.scanning.metrics import SURFACE_POINTS, coverage, surface_distance, truth_points
-from jaxnbv.scanning.reconstruction import carved_mesh, has_poisson, screened_poisson
+from jaxnbv.scanning.screened_poisson import has_poisson, screened_poisson
 from jaxnbv.search import CandidateSearch, DiscreteSearch, FarthestView, RandomView, UncertaintyView
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.meshes import as_mesh_files, numbered_mesh
@@ -127,10 +126,12 @@ class ReconstructionStudy(Study):
         """The share of the true surface that is covered after each view, and the distances to it of two
         reconstructions from the last cloud; that by Poisson reconstruction is None without `pymeshlab`."""
         views = [view for view, *_ in episode]
-        *_, state = self.mesher.replay((view.pose, view.scan, self.camera) for view in views)
-        found = {name: self._distances(reconstruct(self, state, name), truth, scene.index) for name in RECONSTRUCTIONS}
+        *_, evidence = self.mesher.replay((view.pose, view.scan, self.camera) for view in views)
+        found = {
+            name: self._distances(reconstruct(self, evidence, name), truth, scene.index) for name in RECONSTRUCTIONS
+        }
         covered = [coverage(view.cloud, truth) for view in views]
-        return {"coverage": covered, "points": int(state.cloud.count), "reconstructions": found}
+        return {"coverage": covered, "points": int(evidence.cloud.count), "reconstructions": found}
 
     def _distances(self, mesh: TriangleMesh | None, truth: Float[np.ndarray, "n 3"], index: int) -> Record | None:
         if mesh is None:
@@ -139,9 +140,9 @@ class ReconstructionStudy(Study):
         return {"chamfer": distance.chamfer, **distance._asdict()}
 
 
-def reconstruct(study: ReconstructionStudy, state: State, name: str) -> TriangleMesh | None:
+def reconstruct(study: ReconstructionStudy, evidence: Evidence, name: str) -> TriangleMesh | None:
     """One of `RECONSTRUCTIONS` from what is known; None for Poisson reconstruction where `pymeshlab` cannot be
     imported."""
     if name == MEAN:
-        return carved_mesh(study.mesher, state)
-    return screened_poisson(state.cloud) if has_poisson() else None
+        return study.mesher.imagination.mean_mesh(evidence)
+    return screened_poisson(evidence.cloud) if has_poisson() else None

@@ -16,7 +16,7 @@ from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.studies.scenes import ClassObject, ClassSet, Framing, Split
 from jaxnbv.studies.scenes.class_object import scan_telling
 from jaxnbv.studies.scenes.splits import scene_key
-from jaxnbv.studies.training.views import joined_views, only, state_after
+from jaxnbv.studies.training.views import evidence_after, joined_views, only
 
 MAX_VIEWS = 5
 # Three standard deviations of the sensor's.
@@ -85,7 +85,7 @@ def _imagined(
 ) -> LabelledClouds:
     key, sample_key, pose_key = jax.random.split(key, 3)
     views, poses, count, pixels = _partial_views(thing, key, MAX_VIEWS - 1)
-    surfaces = planner.sample_surfaces(state_after(planner, views, poses, Camera()), sample_key)
+    surfaces = planner.imagination.sample(evidence_after(planner, views, poses, Camera()), sample_key)
     seen = limit_capacity(joined_views(views), num_points)
 
     def of_sample(surface_and_key):
@@ -93,7 +93,7 @@ def _imagined(
         scans = scan(surface, Camera(), _random_poses(pose_key, num_poses))
         return jax.lax.map(lambda one: farthest_point_subsample(concatenate(seen, one), num_points), scans)
 
-    keys = jax.random.split(pose_key, planner.num_samples)
+    keys = jax.random.split(pose_key, planner.imagination.num_samples)
     clouds = jax.lax.map(of_sample, (surfaces, keys))
     clouds = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), clouds)
     label, taken, most, imagined = (jnp.full(len(clouds.mask), value) for value in (thing.label, count, pixels, True))

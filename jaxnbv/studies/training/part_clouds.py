@@ -16,7 +16,7 @@ from jaxnbv.scanning import SDFSurface, SensorNoise, scan
 from jaxnbv.scanning.sensors import PART_SETTING
 from jaxnbv.studies.scenes import PartScene, Split, part_scene
 from jaxnbv.studies.scenes.labelled import LabelledSolid
-from jaxnbv.studies.training.views import joined_views, only, state_after
+from jaxnbv.studies.training.views import evidence_after, joined_views, only
 
 MAX_VIEWS = 6
 _CLOUDS_A_SCENE = 3
@@ -106,7 +106,7 @@ def _imagined(
         view_key, some_key, sample_key, pose_key = jax.random.split(key, 4)
         views, poses, labels = _views(solid, view_key, camera)
         views = _some(views, some_key, MAX_VIEWS - 1)
-        surfaces = planner.sample_surfaces(state_after(planner, views, poses, camera), sample_key)
+        surfaces = planner.imagination.sample(evidence_after(planner, views, poses, camera), sample_key)
         cloud, labels = _thin(joined_views(views), labels.reshape(-1), num_points)
 
         def of_sample(surface_and_key):
@@ -120,7 +120,7 @@ def _imagined(
             clouds, points_labels = jax.lax.map(joined, scans)
             return LabelledPartClouds(clouds, points_labels, jnp.full(num_poses, category))
 
-        found = jax.lax.map(of_sample, (surfaces, jax.random.split(pose_key, planner.num_samples)))
+        found = jax.lax.map(of_sample, (surfaces, jax.random.split(pose_key, planner.imagination.num_samples)))
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found)
 
     return jax.lax.map(of_scene, (solids, categories, keys))

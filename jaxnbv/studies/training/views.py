@@ -6,7 +6,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.state import State
+from jaxnbv.scanning import Evidence
 
 
 def only(views: PointCloud, used: Bool[Array, " v"]) -> PointCloud:
@@ -22,8 +22,8 @@ def joined_views(views: PointCloud) -> PointCloud:
     return PointCloud(points, normals, mask)
 
 
-def state_after(planner: Planner, views: PointCloud, poses: Pose, camera: Camera) -> State:
-    """The planner's state after all views (v, rays), taken by a camera. Runs under `jit`."""
+def evidence_after(planner: Planner, views: PointCloud, poses: Pose, camera: Camera) -> Evidence:
+    """What a planner knows after all views (v, rays), taken by a camera. Runs under `jit`."""
     seen = ((poses[index], views[index], camera) for index in range(views.mask.shape[0]))
     *_, last = planner.replay(seen)
     return last

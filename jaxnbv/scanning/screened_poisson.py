@@ -1,60 +1,14 @@
-"""From a cloud to a surface: triangles of the posterior mean, and screened Poisson surface reconstruction."""
+"""From a cloud to a surface by screened Poisson surface reconstruction, for comparison."""
 
 import numpy as np
-from jaxtyping import Array, Float
 
 from jaxnbv.checks import InputError, checked, require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
-from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.state import State
-from jaxnbv.scanning import Grid, TriangleMesh
-from jaxnbv.scanning.mesh import level_triangles
-from jaxnbv.surfaces import SurfaceModel, SurfacePosterior
+from jaxnbv.scanning.mesh import TriangleMesh
 
 # Fewer cannot enclose anything, and Poisson reconstruction answers them with an empty mesh.
 _FEWEST_POINTS = 4
-
-
-@checked
-def mean_mesh(model: SurfaceModel, cloud: PointCloud, grid: Grid = Grid()) -> TriangleMesh:
-    """The surface where the posterior mean equals its level, {x : E f(x) = level}, by marching cubes on a grid.
-
-    The mesh is in scene coordinates (its frame is the identity), its faces wound outward. Where nothing was scanned it
-    is the model's guess. All of it is kept, pieces that hold no point of the cloud included: some continue the object
-    behind what was seen, others are not there, and the cloud does not tell which. It is open where it leaves the grid.
-
-    **Raises:** `ValueError` if the mean does not cross its level within the grid, and as the model's `condition` does.
-    """
-    return _level_mesh(_mean_values(model.condition(cloud), grid), grid)
-
-
-@checked
-def carved_mesh(planner: Planner, state: State) -> TriangleMesh:
-    """The surface of the posterior mean given all that a planner knows, by marching cubes on its grid.
-
-    As `mean_mesh`, but with what its scans saw to be empty: the model is told of it, and what would lie there is carved
-    away, as of the samples. A planner that does not carve gives the `mean_mesh` of its model.
-
-    **Raises:** `ValueError` if nothing crosses the level within the grid, and as `Planner.posterior` does.
-    """
-    values = _mean_values(planner.posterior(state), planner.grid)
-    return _level_mesh(planner.carve(state, values), planner.grid)
-
-
-def _mean_values(posterior: SurfacePosterior, grid: Grid) -> Float[Array, "g g g"]:
-    return posterior.mean_on_grid(grid.axis.astype(posterior.level.dtype)) - posterior.level
-
-
-def _level_mesh(values: Float[Array, "g g g"], grid: Grid) -> TriangleMesh:
-    found = level_triangles(np.array(values), grid)
-    if found is None:
-        raise InputError(
-            f"the posterior mean less its level runs from {values.min():.4g} to {values.max():.4g} on the grid, so no "
-            f"surface lies within [-{grid.half_extent}, {grid.half_extent}]^3: give a Grid whose half extent holds the "
-            "cloud, or a finer one"
-        )
-    return TriangleMesh(found[0], found[1], Frame())
 
 
 def has_poisson() -> bool:

@@ -1,0 +1,98 @@
+"""What has been seen: the points that are kept, where they were seen from, and the space that was seen empty."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnbv.checks import check_type
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.scanning.grid import Grid
+
+# A model takes a hundred or two of the empty points, and the time to choose them grows with how many there are.
+_POINTS_ALONG_AXIS = 20
+
+
+class EmptyPoints(NamedTuple):
+    """Points (scene coordinates) that were seen to be empty. Rows whose mask is False hold nothing."""
+
+    points: Float[Array, "m 3"]
+    mask: Bool[Array, " m"]
+
+
+class Evidence(eqx.Module):
+    """What has been seen, in scene coordinates. Immutable and of fixed shapes, so that nothing recompiles as it grows.
+
+    - `cloud`: D, the points that are kept.
+    - `poses`: the views taken in the first `num_views` rows; the others hold the identity.
+    - `seen_empty`: the nodes of `grid` that a scan has shown to be empty; both are None where that is not kept.
+    """
+
+    cloud: PointCloud
+    poses: Pose
+    num_views: Int[Array, ""]
+    seen_empty: Bool[Array, "g g g"] | None = None
+    grid: Grid | None = None
+
+    @classmethod
+    def of(cls, seen: "Evidence | PointCloud") -> "Evidence":
+        """Evidence as it is; a cloud alone as evidence of no known pose.
+
+        **Raises:** `ValueError` for anything else.
+        """
+        check_type(seen, Evidence | PointCloud, "the evidence")
+        return seen if isinstance(seen, Evidence) else cls.before_views(seen, 0, None)
+
+    @classmethod
+    def before_views(cls, cloud: PointCloud, max_views: int, grid: Grid | None) -> "Evidence":
+        """D before any pose is known, with room for so many views.
+
+        - `grid`: on whose nodes empty space is kept; None where it is not.
+        """
+        dtype = jnp.result_type(float)
+        poses = Pose(np.tile(np.eye(3, dtype=dtype), (max_views, 1, 1)), np.zeros((max_views, 3), dtype))
+        empty = None if grid is None else jnp.zeros((grid.resolution,) * 3, bool)
+        return cls(cloud, poses, jnp.asarray(0, jnp.int32), empty, grid)
+
+    @property
+    def max_views(self) -> int:
+        """How many views there is room for."""
+        return self.poses.position.shape[0]
+
+    @property
+    def last_pose(self) -> Pose:
+        """The pose of the last view; the identity where there is none."""
+        return jax.tree.map(lambda rows: rows[self.num_views - 1], self.poses)
+
+    @property
+    def empty_points(self) -> EmptyPoints:
+        """The nodes seen empty, of every few along each axis, for a model to condition on."""
+        if self.seen_empty is None or self.grid is None:
+            return EmptyPoints(jnp.zeros((1, 3), self.cloud.points.dtype), jnp.zeros(1, bool))
+        stride = -(-self.grid.resolution // _POINTS_ALONG_AXIS)
+        axis = jnp.asarray(self.grid.axis, jnp.result_type(float))[::stride]
+        nodes = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+        return EmptyPoints(nodes, self.seen_empty[::stride, ::stride, ::stride].reshape(-1))
+
+    def is_seen_empty(self, points: Float[Array, "n 3"]) -> Bool[Array, " n"]:
+        """Whether the node nearest to each point was seen empty; of points beyond the grid, always."""
+        if self.seen_empty is None or self.grid is None:
+            return jnp.ones(points.shape[:-1], bool)
+        place = (points + self.grid.half_extent) / self.grid.spacing
+        node = jnp.clip(jnp.round(place), 0, self.grid.resolution - 1).astype(jnp.int32)
+        beyond = jnp.any(jnp.abs(points) > self.grid.half_extent, axis=-1)
+        return beyond | self.seen_empty[tuple(jnp.moveaxis(node, -1, 0))]
+
+    def with_visited(self, poses: Sequence[Pose]) -> "Evidence":
+        """The same, with these poses taken for visited too. It has room for twice as many, so that its shapes do not
+        depend on how many they are."""
+        room, count = jax.tree.map(lambda rows: jnp.concatenate([rows, rows]), self.poses), self.num_views
+        for pose in poses:
+            room, count = jax.tree.map(lambda rows, row, at=count: rows.at[at].set(row), room, pose), count + 1
+        return dataclasses.replace(self, poses=room, num_views=count)

@@ -1,0 +1,68 @@
+"""What a rule of stopping is. Each stands with what it knows: a class, parts, coverage here; time and cost in
+`jaxnbv.planning.stopping`. Rules are combined by `|`."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+from jaxtyping import PRNGKeyArray
+
+from jaxnbv.acquisition import Acquisition
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.imagination import Imagination
+from jaxnbv.scanning import Evidence
+
+
+class SoFar(NamedTuple):
+    """An episode between two views.
+
+    - `acquisition`, `camera`, `imagination`: the planner's.
+    - `candidates`: poses that its search chooses among, or others all about the object.
+    - `evidence`: what is known after the views so far; `poses`: theirs.
+    - `seconds`: since this process began to take views.
+    - `key`: that of the next step's samples.
+    """
+
+    acquisition: Acquisition
+    camera: Camera
+    imagination: Imagination
+    candidates: Pose
+    evidence: Evidence
+    poses: tuple[Pose, ...]
+    seconds: float
+    key: PRNGKeyArray
+
+
+class Stop(eqx.Module):
+    """A rule that says when no more views are needed: one after a view, another before the next is taken."""
+
+    def check(self, acquisition: Acquisition) -> None:
+        """Raise `ValueError` if the rule cannot hold of what views are for."""
+        return
+
+    def after(self, so_far: SoFar) -> str | None:
+        """Why the views so far are enough, in words; None to go on."""
+        return None
+
+    def before(self, so_far: SoFar, pose: Pose, value: float) -> str | None:
+        """Why the view that is proposed next, of this value, is not to be taken; None to go on."""
+        return None
+
+    def __or__(self, other: "Stop") -> "Stop":
+        return AnyOf((self, other))
+
+
+class AnyOf(Stop):
+    """The first of some rules that holds."""
+
+    rules: tuple[Stop, ...]
+
+    def check(self, acquisition: Acquisition) -> None:
+        for rule in self.rules:
+            rule.check(acquisition)
+
+    def after(self, so_far: SoFar) -> str | None:
+        return next(filter(None, (rule.after(so_far) for rule in self.rules)), None)
+
+    def before(self, so_far: SoFar, pose: Pose, value: float) -> str | None:
+        return next(filter(None, (rule.before(so_far, pose, value) for rule in self.rules)), None)

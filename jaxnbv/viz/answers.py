@@ -1,0 +1,294 @@
+"""What answers and quantities say, in words and charts; the task that gives them knows numbers only.
+
+`words_of` dispatches on the kind of answer. One of your own is told by its names and values, or as you register it:
+
+    @words_of.register
+    def _(answer: MyAnswer) -> Words: ...
+"""
+
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from jaxnbv.acquisition import Answer, Quantity
+from jaxnbv.tasks.classification import ClassAnswer
+from jaxnbv.tasks.heat import ColdestAnswer
+from jaxnbv.tasks.segmentation import PartAnswer
+
+# An answer that changes by less than this share from one view to the next has settled.
+_SETTLED = 0.05
+# The probability at which a reader may rely on a class.
+_SURE = 0.95
+_CLASSES_SHOWN = 5
+
+
+class Panel(NamedTuple):
+    """A chart's numbers at one view.
+
+    - `label`: of its axis, with the unit.
+    - `names`, `values`: one each.
+    - `true`: what the values would be if all of the surface had been seen; None where that is not known.
+    - `bars`: whether they are drawn beside each other, view by view, rather than as lines over the views.
+    - `goal`: a value to be reached; None without one.
+    """
+
+    label: str
+    names: tuple[str, ...]
+    values: Float[np.ndarray, " n"]
+    true: Float[np.ndarray, " n"] | None = None
+    bars: bool = False
+    goal: float | None = None
+
+
+class Words:
+    """What any answer says; a kind that reads otherwise overrides a part."""
+
+    def __init__(self, answer: Answer):
+        self.answer = answer
+
+    @property
+    def shown(self) -> tuple[int, ...]:
+        """Which of the numbers are shown."""
+        return tuple(range(len(self.answer.names)))
+
+    def line(self, before: Answer | None = None) -> str:
+        """For the terminal: each number, with what it was before the view."""
+
+        def one(index: int) -> str:
+            was = "" if before is None else f"{self._value(before, index)} -> "
+            return f"{self.answer.names[index]} {was}{self._value(self.answer, index)}"
+
+        return "   ".join(map(one, self.shown))
+
+    def sentence(self, before: Answer | None = None) -> str:
+        """For the report."""
+
+        def one(index: int) -> str:
+            was = "" if before is None else f" (was {self._value(before, index)})"
+            return f"{self.answer.names[index]} {self._value(self.answer, index)}{was}"
+
+        text = ", ".join(map(one, self.shown))
+        return f"{text[:1].upper()}{text[1:]}."
+
+    @property
+    def question(self) -> str:
+        """What was asked, for the head of the report."""
+        names = " and ".join(self.answer.names[index] for index in self.shown)
+        return f"{names[:1].upper()}{names[1:]}?"
+
+    @property
+    def found(self) -> str:
+        """The answer in short."""
+        return self.line()
+
+    @property
+    def settled_means(self) -> str:
+        """What `settled` asks."""
+        return f"within {100 * _SETTLED:.0f} % of the view before"
+
+    def settled(self, before: Answer | None) -> bool:
+        """Whether the answer can be relied on, given that of the view before."""
+        if before is None:
+            return False
+        shown = list(self.shown)
+        return bool(np.allclose(self.answer.values[shown], before.values[shown], rtol=_SETTLED))
+
+    def panels(self, truth: Answer | None) -> tuple[Panel, ...]:
+        """Its charts at this view, the same ones at every view.
+
+        `truth`: the answer if all of the surface had been seen; None where that is not known.
+        """
+        names, shown = tuple(self.answer.names[index] for index in self.shown), list(self.shown)
+        true = None if truth is None else truth.values[shown]
+        return (Panel(", ".join(names), names, self.answer.values[shown], true),)
+
+    def _value(self, answer: Answer, index: int) -> str:
+        return self.answer.form.format(answer.values[index])
+
+
+@functools.singledispatch
+def words_of(answer: Answer) -> Words:
+    """What an answer says."""
+    return Words(answer)
+
+
+class _ClassWords(Words):
+    """The likeliest five classes are shown."""
+
+    answer: ClassAnswer
+
+    @property
+    def shown(self) -> tuple[int, ...]:
+        return tuple(sorted(np.argsort(-self.answer.values)[:_CLASSES_SHOWN].tolist()))
+
+    @property
+    def _best(self) -> tuple[str, float]:
+        best = int(np.argmax(self.answer.values))
+        return self.answer.names[best], float(self.answer.values[best])
+
+    def sentence(self, before: Answer | None = None) -> str:
+        name, p = self._best
+        text = f"The classifier says {name} with probability {p:.2f}"
+        if before is not None:
+            best, previous = int(np.argmax(self.answer.values)), int(np.argmax(before.values))
+            behind = f", behind {self.answer.names[previous]} with {before.values[previous]:.2f}"
+            text += f" (was {before.values[best]:.2f}{'' if best == previous else behind})"
+        return f"{text}."
+
+    @property
+    def question(self) -> str:
+        return "Which class is it?"
+
+    @property
+    def found(self) -> str:
+        name, p = self._best
+        return name if p == 1.0 else f"{name}, probability {p:.2f}"
+
+    @property
+    def settled_means(self) -> str:
+        return f"probability {_SURE} or more"
+
+    def settled(self, before: Answer | None) -> bool:
+        """Sure, and not of another class than the view before was sure of."""
+        values = self.answer.values
+        contradicted = (
+            before is not None
+            and before.values.max() >= _SURE
+            and int(np.argmax(before.values)) != int(np.argmax(values))
+        )
+        return bool(values.max() >= _SURE) and not contradicted
+
+    def panels(self, truth: Answer | None) -> tuple[Panel, ...]:
+        """The probabilities of all classes; of the truth, 1 and 0."""
+        true = None if truth is None else truth.values
+        return (Panel("probability", self.answer.names, self.answer.values, true, bars=True, goal=_SURE),)
+
+
+class _PartWords(Words):
+    """The parts that were asked for are shown."""
+
+    answer: PartAnswer
+
+    @property
+    def shown(self) -> tuple[int, ...]:
+        return self.answer.asked
+
+    def sentence(self, before: Answer | None = None) -> str:
+        names, values = self.answer.names, self.answer.values
+        listed = ", ".join(f"{names[index]} {values[index]:.0f}" for index in self.shown) or "none"
+        return f"Points predicted of each part: {listed}."
+
+    @property
+    def question(self) -> str:
+        return "Which parts does it have?"
+
+    @property
+    def found(self) -> str:
+        names, values = self.answer.names, self.answer.values
+        return ", ".join(names[index] for index in self.shown if values[index] >= self.answer.target) or "no part yet"
+
+    @property
+    def settled_means(self) -> str:
+        return f"{self.answer.target:g} points or more of every part"
+
+    def settled(self, before: Answer | None) -> bool:
+        return all(self.answer.values[index] >= self.answer.target for index in self.shown)
+
+    def panels(self, truth: Answer | None) -> tuple[Panel, ...]:
+        """The points of each part, and how many parts have N_target of them; of the truth, those that it has at all."""
+        values, target = self.answer.values, self.answer.target
+        shown = sorted({*self.shown, *(() if truth is None else words_of(truth).shown)})
+        names = tuple(self.answer.names[index] for index in shown)
+        found = np.array([np.sum(values[shown] >= target)], np.float64)
+        there = None if truth is None else np.array([np.sum(truth.values[shown] > 0)], np.float64)
+        points = Panel("points predicted of each part", names, values[shown], bars=True, goal=target)
+        return Panel(f"parts found ({target:g} points or more)", ("parts",), found, there), points
+
+
+class _ColdestWords(Words):
+    """Where the cloud is coldest, and how cold it is there."""
+
+    answer: ColdestAnswer
+
+    def line(self, before: Answer | None = None) -> str:
+        change = "" if before is None else f" (was {number(float(before.values[0]))})"
+        return f"coldest at {coordinates(self.answer.point)}, {number(float(self.answer.values[0]))} degrees{change}"
+
+    def sentence(self, before: Answer | None = None) -> str:
+        return f"The cloud is {self.line(before)}."
+
+    @property
+    def question(self) -> str:
+        return "Where does it stay coldest while it is heated?"
+
+    def panels(self, truth: Answer | None) -> tuple[Panel, ...]:
+        """The temperature of the coldest point and, where the truth is known, its distance to the true one."""
+        true = None if truth is None else truth.values
+        temperature = Panel("lowest temperature (degrees)", ("coldest",), self.answer.values, true)
+        if not isinstance(truth, ColdestAnswer):
+            return (temperature,)
+        distance = np.array([np.linalg.norm(self.answer.point - truth.point)])
+        label = "distance to the true coldest point (scene units)"
+        return temperature, Panel(label, ("distance",), distance, goal=0.0)
+
+
+class CoverageAnswer(Answer):
+    """The share of the true surface that was seen, or where that is not known the number of points.
+
+    - `radius`: within which of the cloud a place counts as seen, in scene units; None where points are counted.
+    """
+
+    form: str = "{:.0%}"
+    radius: float | None = eqx.field(default=None)
+
+
+class _CoverageWords(Words):
+    answer: CoverageAnswer
+
+    @property
+    def question(self) -> str:
+        return "What does it look like all round?"
+
+    @property
+    def found(self) -> str:
+        return f"{self._value(self.answer, 0)} {self.answer.names[0]}"
+
+    def panels(self, truth: Answer | None) -> tuple[Panel, ...]:
+        names, values, radius = self.answer.names, self.answer.values, self.answer.radius
+        if radius is None:
+            return (Panel(names[0], names, values),)
+        return (Panel(f"coverage (% within {radius:g})", names, 100.0 * values, goal=100.0),)
+
+
+for _kind, _words in {
+    ClassAnswer: _ClassWords,
+    PartAnswer: _PartWords,
+    ColdestAnswer: _ColdestWords,
+    CoverageAnswer: _CoverageWords,
+}.items():
+    words_of.register(_kind, _words)
+
+
+def label_of(quantity: Quantity) -> str:
+    """A quantity's name with its unit."""
+    return f"{quantity.name} ({quantity.unit})" if quantity.unit else quantity.name
+
+
+def shown_value(quantity: Quantity, value: float) -> str:
+    """A value with its unit, where the unit is a length or an area."""
+    return f"{number(value)} {quantity.unit}" if quantity.unit.startswith("scene units") else number(value)
+
+
+def coordinates(point: Float[np.ndarray, "3"]) -> str:
+    """A point in scene units."""
+    x, y, z = (f"{coordinate:.2f}".replace("-", "−") for coordinate in point)
+    return f"({x}, {y}, {z})"
+
+
+def number(value: float) -> str:
+    """Three significant digits, without an exponent where none is needed."""
+    text = f"{value:,.0f}" if 999.5 <= abs(value) < 1e7 else f"{value:.3g}"
+    return text.replace("-", "−")
