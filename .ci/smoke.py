@@ -49,7 +49,7 @@ def main() -> None:
             (heat, nbv.DiscreteSearch(4)),
         )
         for score, search in tasks:
-            planner = nbv.Planner(model, camera, score, search, 2, grid, 512)
+            planner = nbv.Planner(score, search, camera, nbv.Imagination(model, grid=grid, num_samples=2), capacity=512)
             episode = nbv.simulate(planner, mesh, nbv.look_at((0.0, 0.0, 2.5)), 2, jax.random.key(0), progress=False)
             assert len(episode.views) == 2
         assert write_report(episode, Path(folder) / "report", progress=False).exists()

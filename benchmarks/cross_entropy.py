@@ -33,12 +33,12 @@ def main() -> None:
     key, pyramid = jax.random.key(0), pyramid_scene(Split.TEST, 0, Framing.CLOSE_UP)
     classifier = pyramid_classifier(Framing.CLOSE_UP.longest_side)
     score = nbv.CrossEntropy(classifier)
-    planner = nbv.Planner(nbv.GeometricSPSR(), nbv.Camera(), score, nbv.DiscreteSearch())
+    planner = nbv.Planner(score, imagination=nbv.Imagination(nbv.GeometricSPSR()))
     first = hidden_view(pyramid, key)
     seen = observe_scene(nbv.SDFSurface(pyramid), planner.camera, first, nbv.SensorNoise(), key)
-    state = planner.init(seen, first)
-    surfaces, poses = planner.sample_surfaces(state, key), sphere_candidates(120, 2.5)
-    context = score.context(state.cloud)
+    evidence = planner.init(first, seen)
+    surfaces, poses = planner.imagination.sample(evidence, key), sphere_candidates(120, 2.5)
+    context = score.context(evidence.cloud)
 
     @eqx.filter_jit
     def scanned(surfaces):
@@ -60,17 +60,17 @@ def main() -> None:
         return jax.lax.map(lambda cloud: classifier.network(cloud.points, cloud.normals, cloud.mask), fed)
 
     seconds = {
-        "posterior samples on the grid": least_time(lambda: planner.sample_surfaces(state, key)),
+        "posterior samples on the grid": least_time(lambda: planner.imagination.sample(evidence, key)),
         "scan of 16 samples from 120 candidates": least_time(lambda: scanned(surfaces)),
         "farthest point sampling of 1,920 clouds": least_time(lambda: thinned(scans)),
         "network on 1,920 clouds": least_time(lambda: answers(fed)),
     }
-    whole = least_time(lambda: planner.propose(state, key))
+    whole = least_time(lambda: planner.propose(evidence, key))
     matrix = jax.random.normal(key, (2000, 2000))
     product = jax.jit(jnp.matmul)
     yardstick = least_time(lambda: product(matrix, matrix), 10)
 
-    print(f"{jax.devices()[0].device_kind}; {int(state.cloud.count)} points")
+    print(f"{jax.devices()[0].device_kind}; {int(evidence.cloud.count)} points")
     for name, value in seconds.items():
         print(f"{name:42s} {value:7.2f} s {value / whole:6.0%}")
     missed = f"  {whole / LIMIT:.2f} x the limit" if whole > LIMIT else ""

@@ -52,17 +52,17 @@ def scene_and_first(task: str, mesh: str | None, seed: int, key: jax.Array) -> t
 
 
 @eqx.filter_jit
-def value(planner: nbv.Planner, state: nbv.State, surfaces: nbv.GridSurface, parameters):
+def value(planner: nbv.Planner, evidence: nbv.State, surfaces: nbv.GridSurface, parameters):
     """The acquisition at six poses of the sphere, moved by parameters."""
     starts = sphere_candidates(6)
     poses = jax.vmap(nbv.SpherePoses().retract)(starts, parameters)
-    return nbv.expected_score(planner.acquisition, state.cloud, surfaces, planner.camera, poses)
+    return nbv.expected_value(planner.acquisition, evidence.cloud, surfaces, planner.camera, poses)
 
 
 @eqx.filter_jit
-def gradient(planner: nbv.Planner, state: nbv.State, surfaces: nbv.GridSurface, parameters):
+def gradient(planner: nbv.Planner, evidence: nbv.State, surfaces: nbv.GridSurface, parameters):
     """Its gradient, and its value with it."""
-    return jax.value_and_grad(lambda moved: value(planner, state, surfaces, moved).sum())(parameters)
+    return jax.value_and_grad(lambda moved: value(planner, evidence, surfaces, moved).sum())(parameters)
 
 
 def run_seed(planners: dict[str, nbv.Planner], task: str, mesh: str | None, seed: int, compiled: bool) -> dict:
@@ -71,19 +71,19 @@ def run_seed(planners: dict[str, nbv.Planner], task: str, mesh: str | None, seed
     scene, first = scene_and_first(task, mesh, seed, first_key)
     planner = planners["discrete"]
     seen = observe_scene(scene, planner.camera, first, nbv.SensorNoise(), noise_key)
-    state = planner.init(seen, first)
-    surfaces = planner.sample_surfaces(state, sample_key)
+    evidence = planner.init(first, seen)
+    surfaces = planner.imagination.sample(evidence, sample_key)
     parameters = jnp.zeros((6, 3))
     row = {
-        "samples": least_time(lambda: planner.sample_surfaces(state, sample_key), 1),
-        "six values": least_time(lambda: value(planner, state, surfaces, parameters)),
-        "six gradients": least_time(lambda: gradient(planner, state, surfaces, parameters)),
+        "samples": least_time(lambda: planner.imagination.sample(evidence, sample_key), 1),
+        "six values": least_time(lambda: value(planner, evidence, surfaces, parameters)),
+        "six gradients": least_time(lambda: gradient(planner, evidence, surfaces, parameters)),
     }
     for name, asked in planners.items():
         if not compiled:
-            jax.block_until_ready(asked.choose(state, surfaces, search_key))
+            jax.block_until_ready(asked.choose(evidence, surfaces, search_key))
         start = time.perf_counter()
-        proposal = jax.block_until_ready(asked.choose(state, surfaces, search_key))
+        proposal = jax.block_until_ready(asked.choose(evidence, surfaces, search_key))
         row[name] = {"value": float(proposal.value), "seconds": time.perf_counter() - start}
     return row
 
@@ -126,7 +126,9 @@ def main() -> None:
         score = nbv.CrossEntropy(pyramid_classifier(Framing.CLOSE_UP.longest_side))
     names = [name for name in SEARCHES if arguments.task == "coverage" or name not in COVERAGE_ONLY]
     names = ["discrete", arguments.only] if arguments.only else names
-    planners = {name: nbv.Planner(nbv.GeometricSPSR(), nbv.Camera(), score, SEARCHES[name]) for name in names}
+    planners = {
+        name: nbv.Planner(score, SEARCHES[name], imagination=nbv.Imagination(nbv.GeometricSPSR())) for name in names
+    }
     label = Path(arguments.mesh).stem if arguments.mesh else arguments.task
     out = arguments.out or Path("benchmarks/results") / f"gradient_{label}{'_only' if arguments.only else ''}.json"
     settings = {"object": arguments.mesh or arguments.task, "planners": describe(planners), "versions": versions()}

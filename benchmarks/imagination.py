@@ -115,19 +115,19 @@ def seen_space(scan: nbv.PointCloud, pose: nbv.Pose) -> jax.Array:
 
 def run(planner: nbv.Planner, views: list, truth: Truth, key: jax.Array, compiled: bool) -> list[dict]:
     """One record for each number of views; seconds are of a run that compiles nothing."""
-    records, state, empty = [], None, jnp.zeros((GRID.resolution,) * 3, bool)
+    records, evidence, empty = [], None, jnp.zeros((GRID.resolution,) * 3, bool)
     for index, (pose, scan) in enumerate(views):
-        state = planner.init(scan, pose) if state is None else planner.observe(state, pose, scan)
+        evidence = planner.init(pose, scan) if evidence is None else planner.observe(evidence, pose, scan)
         empty = empty | seen_space(scan, pose)
-        sample = functools.partial(planner.sample_surfaces, state, jax.random.fold_in(key, index))
+        sample = functools.partial(planner.sample_surfaces, evidence, jax.random.fold_in(key, index))
         if index == 0 and not compiled:
             jax.block_until_ready(sample())
         start = time.perf_counter()
         surfaces = jax.block_until_ready(sample())
         seconds = time.perf_counter() - start
-        record = judge(planner, state, surfaces, truth, empty)._asdict()
+        record = judge(planner, evidence, surfaces, truth, empty)._asdict()
         record["reliability"] = record["reliability"] and record["reliability"]._asdict()
-        records.append(record | {"views": index + 1, "points": int(state.cloud.count), "seconds": seconds})
+        records.append(record | {"views": index + 1, "points": int(evidence.cloud.count), "seconds": seconds})
     return records
 
 

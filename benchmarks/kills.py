@@ -34,11 +34,10 @@ def record_session(folder: Path) -> None:
     """Four images of a ball by a simulated sensor, from where its planner asked for them."""
     camera, ball = nbv.Camera(height=48, width=64), nbv.SDFSurface(nbv.sdf.Sphere(0.1))
     planner = nbv.Planner(
-        nbv.GeometricSPSR(0.05, truncation=12),
-        nbv.Camera(height=12, width=16),
         nbv.Coverage(),
         nbv.DiscreteSearch(20),
-        2,
+        nbv.Camera(height=12, width=16),
+        nbv.Imagination(nbv.GeometricSPSR(0.05, truncation=12), num_samples=2),
     )
     session = nbv.Session(planner, camera, ((-0.12, -0.12, -0.12), (0.12, 0.12, 0.12)), folder=folder)
     matrix = np.asarray(nbv.look_at((0.0, 0.1, 0.3)).matrix)

@@ -91,11 +91,11 @@ def main() -> None:
         tuned = train(network, clouds, labels, jax.random.key(1), arguments.steps, learning_rate=3e-4)
         results["tuned"] = told(tuned, rest, names)
     print(f"tuned on: {', '.join(results['tuned_on']) or 'none'}")
-    for state in ("as it is", "tuned"):
-        if state in results:
-            found = results[state]
+    for evidence in ("as it is", "tuned"):
+        if evidence in results:
+            found = results[evidence]
             error = "" if found["error"] is None else f" ± {found['error']:.0%}"
-            print(f"{state}: {found['right']:.0%}{error} right of {found['objects']} objects")
+            print(f"{evidence}: {found['right']:.0%}{error} right of {found['objects']} objects")
             for name, share in found["by_object"].items():
                 print(f"    {share:4.0%}  {name}")
     if arguments.out:

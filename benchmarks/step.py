@@ -54,21 +54,21 @@ def rival_scan(surfaces: nbv.GridSurface, origins: np.ndarray, directions: np.nd
 
 
 def full_cloud(planner: nbv.Planner, scene: nbv.Surface) -> nbv.State:
-    """A state whose cloud is full: as many views from around the object as that takes."""
-    state = None
+    """A evidence whose cloud is full: as many views from around the object as that takes."""
+    evidence = None
     for index, position in enumerate(nbv.fibonacci_sphere(planner.max_views, 2.5)):
         pose = nbv.look_at(position)
         seen = observe_scene(scene, planner.camera, pose, nbv.SensorNoise(), jax.random.key(index))
-        state = planner.init(seen, pose) if state is None else planner.observe(state, pose, seen)
-        if int(state.cloud.count) == planner.capacity:
+        evidence = planner.init(pose, seen) if evidence is None else planner.observe(evidence, pose, seen)
+        if int(evidence.cloud.count) == planner.capacity:
             break
-    return state
+    return evidence
 
 
 def planner_of(name: str) -> nbv.Planner:
     """The planner of expected coverage with the surfaces of a name."""
     model, carving = nbv.imagination(name)
-    return nbv.Planner(model, nbv.Camera(), nbv.Coverage(), nbv.DiscreteSearch(), carving=carving)
+    return nbv.Planner(nbv.Coverage(), imagination=nbv.Imagination(model, carving=carving))
 
 
 def main() -> None:
@@ -84,14 +84,14 @@ def main() -> None:
     planner, published = (planner_of(name) for name in (arguments.model, ModelName.PAPER))
     first, key = nbv.look_at((0.8, 0.9, 2.2)), jax.random.key(0)
     seen = observe_scene(scene, planner.camera, first, nbv.SensorNoise(), key)
-    state = planner.init(seen, first)
+    evidence = planner.init(first, seen)
 
     start = time.perf_counter()
-    jax.block_until_ready(planner.propose(state, key))
+    jax.block_until_ready(planner.propose(evidence, key))
     seconds = {"first step": time.perf_counter() - start}
 
-    seconds["samples"] = least_time(lambda: planner.sample_surfaces(state, key))
-    surfaces = planner.sample_surfaces(state, key)
+    seconds["samples"] = least_time(lambda: planner.imagination.sample(evidence, key))
+    surfaces = planner.imagination.sample(evidence, key)
     poses = sphere_candidates(120, 2.5)
 
     @jax.jit
@@ -109,14 +109,14 @@ def main() -> None:
         return jnp.mean(jax.lax.map(score, scans), axis=0)
 
     # The stages as they are timed must be the stages of the step.
-    acquisition = nbv.expected_score(planner.acquisition, state.cloud, surfaces, planner.camera, poses)
-    assert bool(jnp.allclose(values(state.cloud, scans), acquisition, rtol=1e-3))
-    seconds["coverage"] = least_time(lambda: values(state.cloud, scans))
-    seconds["step"] = least_time(lambda: planner.propose(state, key))
-    published_state = published.init(seen, first)
+    acquisition = nbv.expected_value(planner.acquisition, evidence.cloud, surfaces, planner.camera, poses)
+    assert bool(jnp.allclose(values(evidence.cloud, scans), acquisition, rtol=1e-3))
+    seconds["coverage"] = least_time(lambda: values(evidence.cloud, scans))
+    seconds["step"] = least_time(lambda: planner.propose(evidence, key))
+    published_state = published.init(first, seen)
     seconds["published"] = least_time(lambda: published.propose(published_state, key))
     full = full_cloud(planner, scene)
-    seconds["samples, full"] = least_time(lambda: planner.sample_surfaces(full, key))
+    seconds["samples, full"] = least_time(lambda: planner.imagination.sample(full, key))
     seconds["coverage, full"] = least_time(lambda: values(full.cloud, scans))
     matrix = jax.random.normal(key, (2000, 2000))
     product = jax.jit(lambda a: a @ a)
@@ -126,7 +126,7 @@ def main() -> None:
     # Linux gives kilobytes, macOS bytes.
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e9 if sys.platform == "darwin" else 1e6)
 
-    print(f"{jax.devices()[0].device_kind}; {int(state.cloud.count)} points, then {int(full.cloud.count)}")
+    print(f"{jax.devices()[0].device_kind}; {int(evidence.cloud.count)} points, then {int(full.cloud.count)}")
     print(f"{'stage':48s} {'seconds':>8s} {'at most':>8s} {'of step':>8s} {'yardsticks':>10s}")
     for name, (text, limit) in FIGURES.items():
         share, yardsticks = seconds[name] / seconds["step"], seconds[name] / seconds["yardstick"]
@@ -141,7 +141,7 @@ def main() -> None:
     print(f"{'peak memory, GB':48s} {peak:8.2f} {PEAK_MEMORY:8.1f}")
     record = {
         "planner": describe(planner),
-        "points": [int(state.cloud.count), int(full.cloud.count)],
+        "points": [int(evidence.cloud.count), int(full.cloud.count)],
         "versions": versions(),
         "seconds": seconds,
         "share_of_step": {name: value / seconds["step"] for name, value in seconds.items()},

@@ -43,10 +43,12 @@ RULES = {
 VIEWS = {"class": 6, "parts": 6, "coverage": 14}
 
 
-def planner_of(score: nbv.Score, radius: float, side: float = 2.5, solid: bool = False) -> nbv.Planner:
+def planner_of(score: nbv.Acquisition, radius: float, side: float = 2.5, solid: bool = False) -> nbv.Planner:
     surfaces, carving = nbv.imagination("screened", side, solid=solid)
     search, grid = nbv.DiscreteSearch(nbv.SphereCandidates(48, radius)), nbv.Grid(64, 0.7 * side)
-    return nbv.Planner(surfaces, nbv.Camera(), score, search, 8, grid, 4096, carving=carving)
+    return nbv.Planner(
+        score, search, imagination=nbv.Imagination(surfaces, grid=grid, num_samples=8, carving=carving), capacity=4096
+    )
 
 
 @functools.cache
@@ -72,16 +74,16 @@ def measured(task: str, index: int) -> dict:
     planner = planner_for(task, category)
     episode = nbv.simulate(planner, surface, first, VIEWS[task], key, progress=False)
     right, ends = [], {name: VIEWS[task] for name in RULES[task]}
-    for count, state in enumerate(episode.states(), start=1):
+    for count, evidence in enumerate(episode.evidence(), start=1):
         if task == "class":
-            right.append(float(int(jnp.argmax(nbv.predict(planner.acquisition, state.cloud))) == int(pyramid.label)))
+            right.append(float(int(jnp.argmax(nbv.predict(planner.acquisition, evidence.cloud))) == int(pyramid.label)))
         elif task == "parts":
-            counts = planner.acquisition.answer(state.cloud).values
+            counts = planner.acquisition.answer(evidence.cloud).values
             right.append(float((counts[np.asarray(thing.parts)] >= 60).all()))
         else:
-            right.append(_seen(surface, planner.camera, planner.search.candidates.poses(), state.cloud))
+            right.append(_seen(surface, planner.camera, planner.search.candidates.poses(), evidence.cloud))
         poses = tuple(view.pose for view in episode.views[:count])
-        so_far = SoFar(planner, state, poses, 0.0, view_keys(key, count)[0])
+        so_far = SoFar(planner, evidence, poses, 0.0, view_keys(key, count)[0])
         for name, rule in RULES[task].items():
             if ends[name] == VIEWS[task] and rule.after(so_far) is not None:
                 ends[name] = count

@@ -39,16 +39,16 @@ def episode(planner: nbv.Planner, mesh: nbv.TriangleMesh, truth: np.ndarray, vie
     """Coverage, and length of the way so far, after each view."""
     direction = jax.random.normal(jax.random.fold_in(key, 99), (3,))
     waiting = [nbv.look_at(2.5 * direction / jnp.linalg.norm(direction))]
-    state, taken, found = None, [], {"coverage": [], "way": []}
+    evidence, taken, found = None, [], {"coverage": [], "way": []}
     for index in range(views):
         if not waiting:
-            batch = planner.propose_batch(state, view_keys(key, index)[0], at_once)
+            batch = planner.propose_batch(evidence, view_keys(key, index)[0], at_once)
             waiting = [batch.poses[number] for number in batch.order]
         pose = waiting.pop(0)
         seen = observe_scene(mesh, planner.camera, pose, nbv.SensorNoise(), view_keys(key, index)[2])
-        state = planner.init(seen, pose) if state is None else planner.observe(state, pose, seen)
+        evidence = planner.init(pose, seen) if evidence is None else planner.observe(evidence, pose, seen)
         taken.append(pose)
-        found["coverage"].append(coverage(state.cloud, truth))
+        found["coverage"].append(coverage(evidence.cloud, truth))
         found["way"].append(total_cost(taken))
     return found
 

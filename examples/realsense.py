@@ -31,7 +31,7 @@ def depth_camera(profile) -> tuple[nbv.Camera, float]:
 def main(folder: str = "live", views: int = 10) -> None:
     pipeline = rs.pipeline()
     camera, scale = depth_camera(pipeline.start())
-    planner = nbv.Planner(nbv.ScreenedSPSR(), nbv.Camera(), nbv.Coverage(), nbv.DiscreteSearch(nbv.Reach()))
+    planner = nbv.Planner(nbv.Coverage(), nbv.DiscreteSearch(nbv.Reach()))
     session = nbv.Session(planner, camera, BOX, up="z", folder=folder, until=nbv.Covered(0.9))
     first = np.asarray(nbv.look_at((0.0, -0.4, 0.4), (0.0, 0.0, 0.15), up=(0.0, 0.0, 1.0)).matrix)
     try:

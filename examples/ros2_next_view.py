@@ -116,7 +116,7 @@ def main() -> None:
         publisher.publish(message)
 
     def start(found: nbv.Camera) -> nbv.Session:
-        planner = nbv.Planner(nbv.ScreenedSPSR(), nbv.Camera(), nbv.Coverage(), nbv.DiscreteSearch(nbv.Reach()))
+        planner = nbv.Planner(nbv.Coverage(), nbv.DiscreteSearch(nbv.Reach()))
         return nbv.Session(planner, found, (low, high), up="z", folder=folder, until=nbv.Covered(0.9))
 
     bridge = Bridge(start, lambda stamp: buffer.lookup_transform(world, camera, stamp).transform, publish)

@@ -38,7 +38,7 @@ class Quantity(eqx.Module):
 
 
 class Answer(eqx.Module):
-    """What D tells of the question that the views are for: numbers with names. How it reads is said in `jaxnbv.viz`.
+    """What D answers to the question that the views are for: numbers with names. How it reads is said in `jaxnbv.viz`.
 
     - `names`, `values`: one each.
     - `form`: how a value is written, in the language of `str.format`.
@@ -50,7 +50,7 @@ class Answer(eqx.Module):
 
 
 class Acquisition(eqx.Module):
-    """What one imagined scan is worth, given what has been seen; its expectation over the posterior is maximised."""
+    """The value of one imagined scan, given what has been seen; its expectation over the posterior is maximised."""
 
     @abstractmethod
     def context(self, cloud: PointCloud) -> Any:
@@ -72,7 +72,7 @@ class Acquisition(eqx.Module):
         return Quantity(f"acquisition, {type(self).__name__}", "", meaning)
 
     def answer(self, cloud: PointCloud) -> Answer | None:
-        """What D tells of what the acquisition asks; None where there is nothing to tell."""
+        """What D answers to what the acquisition asks; None where it has no answer."""
         return None
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:

@@ -34,22 +34,24 @@ def save(figure: Figure, path: Path) -> None:
     image.quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
-def draw_posterior(planner: nbv.Planner, state: nbv.State, surfaces: nbv.GridSurface, scene: nbv.SDFSurface) -> Figure:
+def draw_posterior(
+    planner: nbv.Planner, evidence: nbv.State, surfaces: nbv.GridSurface, scene: nbv.SDFSurface
+) -> Figure:
     """What one view saw; outlines of samples on the plane x = 0, and the probability of being inside there."""
-    axis = np.asarray(planner.grid.axis)
+    axis = np.asarray(planner.imagination.grid.axis)
     middle = len(axis) // 2
     # Variances take long: every second node.
     y, z = np.meshgrid(axis[::2], axis[::2], indexing="ij")
     plane = jnp.asarray(np.stack([np.full(y.size, axis[middle]), y.ravel(), z.ravel()], axis=1))
-    posterior = planner.posterior(state)
+    posterior = planner.imagination.posterior(evidence)
     deviation = np.sqrt(np.maximum(np.asarray(posterior.variance(plane)), 1e-12))
     inside = ndtr((float(posterior.level) - np.asarray(posterior.mean(plane))) / deviation).reshape(y.shape)
     truth = np.asarray(scene.sdf(plane)).reshape(y.shape)
     figure = Figure(figsize=(9.6, 3.5))
     first, second, third = (figure.add_axes((left, 0.02, 0.32, 0.86)) for left in (0.0, 0.34, 0.67))
-    pose = state.poses[0]
+    pose = evidence.poses[0]
     still = Still(beside(pose), None, 500, 2.5)
-    points, _ = state.cloud.to_numpy()
+    points, _ = evidence.cloud.to_numpy()
     shown = draw_points(first, still, points, NEW, 1.2)
     frame(first, still, [shown, *draw_cameras(first, still, [pose], planner.camera, 1.0)])
     first.axis("off")
@@ -69,7 +71,9 @@ def draw_posterior(planner: nbv.Planner, state: nbv.State, surfaces: nbv.GridSur
     return figure
 
 
-def draw_utility(planner: nbv.Planner, state: nbv.State, surfaces: nbv.GridSurface, proposal: nbv.Proposal) -> Figure:
+def draw_utility(
+    planner: nbv.Planner, evidence: nbv.State, surfaces: nbv.GridSurface, proposal: nbv.Proposal
+) -> Figure:
     """Imagined scans of the best candidate and of one of the worst tenth, coloured by what each point is worth."""
     order = np.argsort(np.asarray(proposal.values))
     chosen = np.array([order[-1], order[len(order) // 10]])
@@ -82,14 +86,14 @@ def draw_utility(planner: nbv.Planner, state: nbv.State, surfaces: nbv.GridSurfa
     squares = np.zeros((2, SHOWN, PIXELS**2))
     for row in range(2):
         for column in range(SHOWN):
-            squares[row, column] = nearest_squared_distance(fine.points[column, row], state.cloud)
+            squares[row, column] = nearest_squared_distance(fine.points[column, row], evidence.cloud)
             highest = max(highest, float(np.quantile(squares[row, column][np.asarray(fine.mask[column, row])], 0.98)))
     for row, name in enumerate(("the chosen view", "a poor view")):
         expected = float(proposal.values[chosen[row]])
         figure.text(
             0.012,
             0.955 - 0.49 * row,
-            f"{name}: {expected:.0f} expected, of {planner.num_samples} samples",
+            f"{name}: {expected:.0f} expected, of {planner.imagination.num_samples} samples",
             color=INK,
             fontsize=10,
         )
@@ -105,7 +109,7 @@ def draw_utility(planner: nbv.Planner, state: nbv.State, surfaces: nbv.GridSurfa
             axes.imshow(np.clip(colours, 0, 1).reshape(PIXELS, PIXELS, 3), interpolation="bilinear")
             axes.set(xticks=[], yticks=[])
             own = jax.tree.map(lambda rows, i=(column, row): rows[i], coarse)
-            worth = float(planner.acquisition(planner.acquisition.context(state.cloud), own))
+            worth = float(planner.acquisition(planner.acquisition.context(evidence.cloud), own))
             axes.set_xlabel(f"worth {worth:.0f}", labelpad=2)
     bar = figure.add_axes((0.91, 0.2, 0.014, 0.55))
     scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(0.0, highest), VALUE)
@@ -130,18 +134,23 @@ def main() -> None:
     scene = demo_object()
     model = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=16))
     camera = nbv.Camera(height=32, width=32)
-    planner = nbv.Planner(model, camera, nbv.Coverage(), nbv.DiscreteSearch(), 8, nbv.Grid(72), 1024)
+    planner = nbv.Planner(
+        nbv.Coverage(),
+        camera=camera,
+        imagination=nbv.Imagination(model, grid=nbv.Grid(72), num_samples=8),
+        capacity=1024,
+    )
     first, noise = nbv.look_at((0.8, 0.9, 2.2)), nbv.SensorNoise()
     scan_key, sample_key, search_key = jax.random.split(jax.random.key(0), 3)
-    state = planner.init(noise(nbv.scan(scene, planner.camera, first), scan_key), first)
-    surfaces = planner.sample_surfaces(state, sample_key)
-    proposal = planner.choose(state, surfaces, search_key)
+    evidence = planner.init(first, noise(nbv.scan(scene, planner.camera, first), scan_key))
+    surfaces = planner.imagination.sample(evidence, sample_key)
+    proposal = planner.choose(evidence, surfaces, search_key)
     with mpl.rc_context(STYLE):
-        save(draw_posterior(planner, state, surfaces, scene), folder / "concepts_posterior.png")
-        save(draw_utility(planner, state, surfaces, proposal), folder / "concepts_utility.png")
+        save(draw_posterior(planner, evidence, surfaces, scene), folder / "concepts_posterior.png")
+        save(draw_utility(planner, evidence, surfaces, proposal), folder / "concepts_utility.png")
         searches = (nbv.DiscreteSearch(), nbv.UncertaintyView(), nbv.FarthestView())
         planners = {type(search).__name__: dataclasses.replace(planner, search=search) for search in searches}
-        found = {name: one.choose(state, surfaces, search_key) for name, one in planners.items()}
+        found = {name: one.choose(evidence, surfaces, search_key) for name, one in planners.items()}
         quantities = {name: one.quantity for name, one in planners.items()}
         save(draw_search(found, quantities), folder / "concepts_search.png")
 

@@ -69,7 +69,7 @@ def episode_of(shown: Shown, views: int) -> nbv.Episode:
     setting = fitted(shown.setting, float(np.linalg.norm(points, axis=1).max()))
     camera = setting.camera.resized(RAYS, RAYS)
     search = nbv.DiscreteSearch(SphereCandidates(CANDIDATES, setting.radius))
-    planner = nbv.Planner(nbv.ScreenedSPSR(), camera, shown.score, search, 8, nbv.Grid(72), 4096)
+    planner = nbv.Planner(shown.score, search, camera, nbv.Imagination(grid=nbv.Grid(72), num_samples=8), capacity=4096)
     first = nbv.look_at(setting.radius * FIRST.position / np.linalg.norm(FIRST.position))
     return nbv.simulate(planner, shown.surface, first, views=views, key=jax.random.key(0))
 

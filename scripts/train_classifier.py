@@ -16,8 +16,8 @@ import numpy as np
 import optax
 from cached import cached
 
-from jaxnbv import Camera, Coverage, DiscreteSearch, Grid, Planner, PointCloud
-from jaxnbv.imagination import ModelName, imagination
+from jaxnbv import Coverage, Grid, Planner, PointCloud
+from jaxnbv.imagination import Imagination, ModelName, imagination
 from jaxnbv.networks import Focus, FocusedClassifier, InvariantClassifier, save_checkpoint
 from jaxnbv.networks.pretrained import TRAINED_POINTS, TRAINED_SIDE
 from jaxnbv.studies.scenes import CLASS_SETS, Framing, Split
@@ -80,7 +80,9 @@ class Clouds:
         """Clouds that end in a scan of a posterior sample, 16 from each of `count` scenes."""
         model, carving = imagination(ModelName.SCREENED, framing.longest_side, solid=self.recipe.solid)
         grid = Grid(64, 0.7 * framing.longest_side)
-        planner = Planner(model, Camera(), Coverage(), DiscreteSearch(), 4, grid, 2500, carving=carving)
+        planner = Planner(
+            Coverage(), imagination=Imagination(model, grid=grid, num_samples=4, carving=carving), capacity=2500
+        )
 
         def make(index: int) -> LabelledClouds:
             return imagined_clouds(self.set, split, framing, index, planner, num_points=self.points)
@@ -102,9 +104,9 @@ def concatenated(*parts: LabelledClouds) -> LabelledClouds:
 
 
 def informative(data: LabelledClouds) -> LabelledClouds:
-    """All clouds that show what tells the class, and a quarter of the others, of which there is little to learn."""
+    """All clouds that show the cue of the class, and a quarter of the others, of which there is little to learn."""
     turn = np.arange(len(data.labels)) // (data.labels.max() + 1)
-    rows = (data.telling_pixels > 0) | (turn % 4 == 0)
+    rows = (data.cue_pixels > 0) | (turn % 4 == 0)
     return jax.tree.map(lambda leaf: leaf[rows], data)
 
 
@@ -118,11 +120,11 @@ def thinned(data: LabelledClouds) -> LabelledClouds:
 
 def telling_alone(data: LabelledClouds, points: int = 320) -> LabelledClouds:
     """The points that tell the class, of the clouds that have twenty of them or more."""
-    data = jax.tree.map(lambda leaf: leaf[data.tells.sum(axis=1) >= 20], data)
-    order = np.argsort(~data.tells, axis=1, kind="stable")[:, :points]
+    data = jax.tree.map(lambda leaf: leaf[data.on_cue.sum(axis=1) >= 20], data)
+    order = np.argsort(~data.on_cue, axis=1, kind="stable")[:, :points]
     rows = np.arange(len(order))[:, None]
-    cloud = PointCloud(data.clouds.points[rows, order], data.clouds.normals[rows, order], data.tells[rows, order])
-    return eqx.tree_at(lambda d: (d.clouds, d.tells), data, (cloud, cloud.mask))
+    cloud = PointCloud(data.clouds.points[rows, order], data.clouds.normals[rows, order], data.on_cue[rows, order])
+    return eqx.tree_at(lambda d: (d.clouds, d.on_cue), data, (cloud, cloud.mask))
 
 
 def focus_loss(focus: Focus, example: tuple[PointCloud, Any]) -> Any:
@@ -146,7 +148,7 @@ def report(name: str, network: Any, data: LabelledClouds) -> None:
     uncertain = np.asarray(entropy(log_p))
     print(f"{name}: calibration error {expected_calibration_error(log_p, data.labels):.3f}")
     for low, high in ((0, 1), (1, 150), (150, 500), (500, np.inf)):
-        rows = (data.telling_pixels >= low) & (data.telling_pixels < high) & (data.views + data.imagined > 1)
+        rows = (data.cue_pixels >= low) & (data.cue_pixels < high) & (data.views + data.imagined > 1)
         if rows.any():
             text = f"  {low:>4} to {high - 1:<4g} telling pixels: {rows.sum():5d} clouds"
             print(f"{text}, {right[rows].mean():6.1%} right, entropy {uncertain[rows].mean():.2f} nats")
@@ -175,7 +177,7 @@ def main() -> None:
         alone = telling_alone(scans)
         network = train(network, alone.clouds, alone.labels, jax.random.key(3), first, folder=folder / "alone")
         both = informative(concatenated(thinned(scans), imagined))
-        data, keys = (both.clouds, both.tells), jax.random.split(jax.random.key(4))
+        data, keys = (both.clouds, both.on_cue), jax.random.split(jax.random.key(4))
         # Every point is an example: few clouds make a batch.
         focus = fit(Focus(keys[0]), focus_loss, data, keys[1], recipe.focus, 8, folder=folder / "focus")
         chosen = chosen_clouds(FocusedClassifier(focus, network), both.clouds)

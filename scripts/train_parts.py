@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from cached import cached
 
-from jaxnbv import Coverage, DiscreteSearch, Grid, Planner, PointCloud
-from jaxnbv.imagination import ModelName, imagination
+from jaxnbv import Coverage, Grid, Planner, PointCloud
+from jaxnbv.imagination import Imagination, ModelName, imagination
 from jaxnbv.networks import CATEGORIES, CompactPartSegmenter, part_mask, save_checkpoint
 from jaxnbv.networks.pretrained import TRAINED_SIDE
 from jaxnbv.scanning.sensors import PART_SETTING
@@ -45,7 +45,12 @@ def scanned(folder: Path, split: Split, count: int) -> LabelledPartClouds:
 def imagined(folder: Path, split: Split, count: int) -> LabelledPartClouds:
     """Clouds that end in a scan of a posterior sample, 16 from each of `count` scenes."""
     model, carving = imagination(ModelName.SCREENED)
-    planner = Planner(model, PART_SETTING.camera, Coverage(), DiscreteSearch(), 4, Grid(64), 2500, carving=carving)
+    planner = Planner(
+        Coverage(),
+        camera=PART_SETTING.camera,
+        imagination=Imagination(model, grid=Grid(64), num_samples=4, carving=carving),
+        capacity=2500,
+    )
 
     def make(index):
         return imagined_part_clouds(split, [index], planner)

@@ -45,12 +45,12 @@ def planner(**changes):
 
 
 P = planner()
-STATE = P.init(SCAN, POSE)
-FULL = planner(max_views=1).init(SCAN, POSE)
+STATE = P.init(POSE, SCAN)
+FULL = planner(max_views=1).init(POSE, SCAN)
 
 
 def proposed(acquisition):
-    return planner(acquisition=acquisition).propose(planner(acquisition=acquisition).init(SCAN, POSE), KEY)
+    return planner(acquisition=acquisition).propose(planner(acquisition=acquisition).init(POSE, SCAN), KEY)
 
 
 def parts_of(answer):
@@ -82,8 +82,11 @@ REFUSED = {
     "index of a single pose": (lambda: POSE[0], "a single one"),
     "iteration of a single pose": (lambda: list(POSE), "a single one"),
     "index beyond a batch of clouds": (lambda: SCANS[-7], "no index -7"),
-    "a state without room": (lambda: P.observe(FULL, POSE, SCAN), "max_views"),
-    "a state of another grid's extent": (lambda: planner(grid=nbv.Grid(12, 1.5)).propose(STATE, KEY), "reaches to 1.5"),
+    "a evidence without room": (lambda: P.observe(FULL, POSE, SCAN), "max_views"),
+    "a evidence of another grid's extent": (
+        lambda: planner(grid=nbv.Grid(12, 1.5)).propose(STATE, KEY),
+        "reaches to 1.5",
+    ),
     "a map's coordinates": (lambda: nbv.Frame.fit(MAP).to_scene(nbv.PointCloud.from_arrays(MAP, D)), "rounded"),
     "a map's pose": (lambda: nbv.Frame.fit(MAP).to_scene(nbv.look_at(MAP[0], MAP[1])), "rounded"),
     "points of the plane": (lambda: POSTERIOR.variance(D[:, :2]), "(60, 2)"),
@@ -110,18 +113,18 @@ REFUSED = {
     "logits of parts": (lambda: parts_of(jnp.full((16, 3), 4.0)), "softmax"),
     "no parts": (lambda: parts_of(None), "None"),
     "a ragged image": (lambda: nbv.PointCloud.from_depth([[2.0] * 6] * 5 + [[1]], SMALL, POSE), "numbers"),
-    "a batch of scans": (lambda: P.init(SCANS), "batch"),
-    "a batch of poses": (lambda: P.init(SCAN, POSES), "batch"),
+    "a batch of scans": (lambda: P.init(None, SCANS), "batch"),
+    "a batch of poses": (lambda: P.init(POSES, SCAN), "batch"),
     "a batch of poses, observed": (lambda: P.observe(STATE, POSES, SCAN), "batch"),
     "no pose": (lambda: P.observe(STATE, None, SCAN), "None"),
-    "no state": (lambda: P.propose(None, KEY), "the state is None"),
-    "a scan as a state": (lambda: P.propose(SCAN, KEY), "the state is a PointCloud"),
+    "no state": (lambda: P.propose(None, KEY), "the evidence is None"),
+    "a scan as a state": (lambda: P.propose(SCAN, KEY), "the evidence is a PointCloud"),
     "a number as a key": (lambda: P.propose(STATE, 0), "jax.random.key"),
     "several keys": (lambda: P.propose(STATE, jax.random.split(KEY, 2)), "jax.random.key"),
     "text as surfaces": (lambda: P.choose(STATE, "x", KEY), "'x'"),
-    "text as a posterior": (lambda: P.sample_surfaces(STATE, KEY, "x"), "'x'"),
+    "text as a posterior": (lambda: P.imagination.sample(STATE, KEY, "x"), "'x'"),
     "numbers as views": (lambda: list(P.replay([1, 2])), "pairs"),
-    "values of another grid": (lambda: P.carve(STATE, jnp.zeros((3, 3, 3))), "(3, 3, 3)"),
+    "values of another grid": (lambda: P.imagination.carve(STATE, jnp.zeros((3, 3, 3))), "(3, 3, 3)"),
     "a number as an episode's key": (lambda: nbv.simulate(P, BALL, POSE, 1, 0), "jax.random.key"),
     "a batch of first poses": (lambda: nbv.simulate(P, BALL, POSES, 1, KEY), "batch"),
     "rows that differ in number": (

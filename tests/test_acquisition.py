@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv.acquisition import ExpectedUtilityImprovement, Score, Several, expected_score
+from jaxnbv.acquisition import ExpectedUtilityImprovement, Score, Several, expected_value
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate
@@ -66,7 +66,7 @@ def double_loop(surfaces, score):
 def test_a_score_against_the_double_loop(surfaces, cloud):
     highest = cloud.to_numpy()[0][:, 1].max()
     values = double_loop(surfaces, lambda points, _: np.abs(points[:, 1] - highest).sum())
-    found = expected_score(Toy(), cloud, surfaces, CAMERA, POSES)
+    found = expected_value(Toy(), cloud, surfaces, CAMERA, POSES)
     np.testing.assert_allclose(found, values.mean(axis=0), rtol=1e-4)
     assert values[:, :6].std(axis=0).min() > 0
     assert float(found[6]) == 0
@@ -83,7 +83,7 @@ def test_utility_improvement_against_its_formula(surfaces, cloud):
     change = double_loop(surfaces, improvement)
     assert (change < -0.5).any()
     assert (change > 0.5).any()
-    found = expected_score(ExpectedUtilityImprovement(height), cloud, surfaces, CAMERA, POSES)
+    found = expected_value(ExpectedUtilityImprovement(height), cloud, surfaces, CAMERA, POSES)
     np.testing.assert_allclose(found, np.maximum(change, 0).mean(axis=0), rtol=1e-3, atol=1e-3)
     # Each sample is cut at zero, not their mean.
     assert np.abs(np.maximum(change, 0).mean(axis=0) - np.maximum(change.mean(axis=0), 0)).max() > 0.1
@@ -99,7 +99,7 @@ def test_the_context_is_computed_once_a_step(surfaces, cloud):
             jax.debug.callback(lambda _: ran.append(1), cloud.points[0, 0])
         return height(cloud)
 
-    expected_score(ExpectedUtilityImprovement(utility), cloud, surfaces, CAMERA, POSES).block_until_ready()
+    expected_value(ExpectedUtilityImprovement(utility), cloud, surfaces, CAMERA, POSES).block_until_ready()
     jax.effects_barrier()
     assert len(ran) == 1
 
@@ -107,9 +107,9 @@ def test_the_context_is_computed_once_a_step(surfaces, cloud):
 def test_common_random_numbers(surfaces, cloud):
     """A pose's value does not depend on which others are asked for, nor on their order."""
     score = ExpectedUtilityImprovement(height)
-    together = expected_score(score, cloud, surfaces, CAMERA, POSES)
+    together = expected_value(score, cloud, surfaces, CAMERA, POSES)
     order = np.array([4, 1, 5])
-    some = expected_score(score, cloud, surfaces, CAMERA, POSES[order])
+    some = expected_value(score, cloud, surfaces, CAMERA, POSES[order])
     np.testing.assert_allclose(some, together[order], rtol=1e-5, atol=1e-5)
     assert float(jnp.std(together)) > 0.1
 
@@ -134,8 +134,8 @@ class Vector(Toy):
 
 def test_several_scores_of_the_same_scans_are_each_that_of_its_own(surfaces, cloud):
     scores = (Toy(), Vector(), ExpectedUtilityImprovement(height))
-    found = expected_score(Several(scores), cloud, surfaces, CAMERA, POSES)
-    toy, improvement = (expected_score(score, cloud, surfaces, CAMERA, POSES) for score in (scores[0], scores[2]))
+    found = expected_value(Several(scores), cloud, surfaces, CAMERA, POSES)
+    toy, improvement = (expected_value(score, cloud, surfaces, CAMERA, POSES) for score in (scores[0], scores[2]))
     np.testing.assert_allclose(found, jnp.stack([toy, toy, -toy, improvement], axis=1), rtol=1e-6)
     assert float(jnp.ptp(toy)) > 0 < float(jnp.ptp(improvement))
     assert Several(scores).batch_size == min(score.batch_size for score in scores)

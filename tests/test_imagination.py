@@ -7,7 +7,6 @@ import pytest
 
 from jaxnbv import (
     Box,
-    Camera,
     Carving,
     Coverage,
     GeometricSPSR,
@@ -16,7 +15,7 @@ from jaxnbv import (
     RandomView,
     ScreenedSPSR,
 )
-from jaxnbv.imagination import ModelName, imagination
+from jaxnbv.imagination import Imagination, ModelName, imagination
 
 
 def test_the_papers_model_has_its_published_values_and_is_not_carved():
@@ -42,7 +41,7 @@ def test_lengths_are_in_proportion_to_the_object():
     assert eqx.tree_equal(large, ScreenedSPSR())
     assert jnp.allclose(small.base.lengthscale, 0.5 * large.base.lengthscale)
     assert jnp.array_equal(small.base.variance, large.base.variance)
-    assert small.reach == 0.5 * large.reach
+    assert small.bounding_radius == 0.5 * large.bounding_radius
     assert small.base.truncation > large.base.truncation
 
 
@@ -68,8 +67,8 @@ def test_quick_surfaces_have_fewer_frequencies():
 
 def test_a_planner_takes_what_it_gives():
     model, carving = imagination("paper")
-    planner = Planner(model, Camera(), Coverage(), RandomView(), carving=carving)
-    assert planner.carving is None
+    planner = Planner(Coverage(), RandomView(), imagination=Imagination(model, carving=carving))
+    assert planner.imagination.carving is None
 
 
 def test_another_name_is_refused():

@@ -41,7 +41,7 @@ def smaller(planner_of=nbv.Planner):
 
     def make(*given, **named):
         planner = planner_of(*given, **named)
-        model = planner.model
+        model = planner.imagination.model
         if isinstance(model, nbv.ScreenedSPSR):
             model = dataclasses.replace(model, base=SMALL)
         elif isinstance(model, nbv.GeometricSPSR):
@@ -154,7 +154,13 @@ def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
     )
     poses = poses_about_a_ball(10)
     model, search = nbv.GeometricSPSR(0.02, 0.2, 16), nbv.DiscreteSearch()
-    planner = nbv.Planner(model, nbv.Camera(height=18, width=24), nbv.Coverage(), search, 2, nbv.Grid(40), 2048)
+    planner = nbv.Planner(
+        nbv.Coverage(),
+        search,
+        nbv.Camera(height=18, width=24),
+        nbv.Imagination(model, grid=nbv.Grid(40), num_samples=2),
+        capacity=2048,
+    )
     monkeypatch.setattr(nbv, "Planner", lambda *_: planner)
     given = {"K": INTRINSICS, **CORNERS, "reachable": poses, "first": poses[0], "take_image": image_of_a_ball}
     (block,) = (block for block in blocks("how_to/depth_camera.md") if "nbv.Session(" in block)

@@ -1,4 +1,4 @@
-"""A classifier for objects of which only a small part tells the class."""
+"""A classifier for objects of which only a small part is the cue of the class."""
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ _CENTERS = 384
 
 
 class Focus(eqx.Module):
-    """For every point, whether it tells the class; rotations and translations leave the answers as they are.
+    """For every point, whether it is on the cue of the class; rotations and translations leave the answers as they are.
 
     The edges around each point, what lies around farthest point samples of them, carried back to the points, and a
     perceptron of both; about 12,000 parameters.
@@ -34,7 +34,7 @@ class Focus(eqx.Module):
     def __call__(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"]
     ) -> Float[Array, " n"]:
-        """The logarithm of the odds that a point tells the class; of masked rows it means nothing."""
+        """The logarithm of the odds that a point is on the cue; of masked rows it means nothing."""
         edges = self.edge((points, normals), (points, normals, None), mask)
         order = farthest_point_indices(points, mask, self.around.groups)
         around = self.around((points[order], normals[order]), (points, normals, edges), mask)
@@ -80,7 +80,7 @@ class FocusedClassifier(eqx.Module):
     def chosen(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"]
     ) -> tuple[Float[Array, "few 3"], Float[Array, "few 3"], Bool[Array, " few"]]:
-        """What the network is fed: in farthest point order these are farthest point samples of what tells the class."""
-        tells = mask & (self.focus(points, normals, mask) > 0.0)
-        index = jnp.argsort(~tells, stable=True)[: self.num_points]
-        return points[index], normals[index], tells[index]
+        """What the network is fed: in farthest point order these are farthest point samples of the cue of the class."""
+        on_cue = mask & (self.focus(points, normals, mask) > 0.0)
+        index = jnp.argsort(~on_cue, stable=True)[: self.num_points]
+        return points[index], normals[index], on_cue[index]

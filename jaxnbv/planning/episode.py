@@ -223,7 +223,7 @@ def steps(
 
     - `camera`: of the sensor, by default the planner's; one of more rays than are imagined saves time.
     - `done`: views that are known already, in their order; they are not asked for again.
-    - `begin`: is told the index of a view and which of `STAGES` of it begins.
+    - `begin`: is called with the index of a view and which of `STAGES` of it begins.
     - `watch`: ends them, by its rule.
 
     **Raises:** `ValueError` as `Planner.init`, `propose` and `observe` do; among others when every candidate has been

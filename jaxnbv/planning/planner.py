@@ -60,7 +60,7 @@ class Planner(eqx.Module):
         self.search.check(self.acquisition, self.camera, self.capacity)
         require(
             self.cost is None or self.search.weighs_cost,
-            f"{type(self.search).__name__} does not look at what a view is worth, so its cost cannot count: leave cost "
+            f"{type(self.search).__name__} does not look at the value of a view, so its cost cannot count: leave cost "
             "out, or use another search",
         )
 
@@ -101,8 +101,8 @@ class Planner(eqx.Module):
         return self.choose(evidence, self.sample(evidence, sample_key), search_key)
 
     def propose_batch(self, evidence: Evidence | PointCloud, key: PRNGKeyArray, count: int) -> Batch:
-        """Several poses to take before the next question, chosen greedily: each is worth what it adds, sample by
-        sample, to what the scans before it would show of the same posterior sample. The first is that of `propose`.
+        """Several poses to take before the next question, chosen greedily: the value of each is what it adds, sample
+        by sample, to what the scans before it would show of the same posterior sample. The first is that of `propose`.
 
         For searches that do not look at samples, each is chosen as if those before it had been visited.
 

@@ -104,7 +104,7 @@ class ValuePerCost(Cost):
 class ValueMinusCost(Cost):
     """value - weight x cost.
 
-    - `weight`: what a unit of cost is worth, in the units of the value.
+    - `weight`: the value of a unit of cost, in the units of the value.
 
     **Raises:** `ValueError` if the weight is negative.
     """

@@ -42,8 +42,8 @@ def fitted(setting: Setting, bounding_radius: float, fov: float | None = None, r
         least = bounding_radius if fov is not None else ball
         require(
             radius > least,
-            f"cameras {radius:.4g} from the centre of an object that reaches {bounding_radius:.4g} far cannot see all of "
-            f"it: give more than {least:.4g}",
+            f"cameras {radius:.4g} from the centre of an object that reaches {bounding_radius:.4g} far cannot see all "
+            f"of it: give more than {least:.4g}",
         )
         fov = 2.0 * math.asin(ball / radius) if fov is None else fov
     camera = setting.camera if fov is None else dataclasses.replace(setting.camera, fov=fov)

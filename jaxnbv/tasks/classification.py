@@ -88,7 +88,7 @@ class ClassAcquisition(Acquisition):
 
     @abstractmethod
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, "*values"]:
-        """What a scan is worth that takes the classifier's answer from log p^(t) to log p^(t+1)."""
+        """The value of a scan that takes the classifier's answer from log p^(t) to log p^(t+1)."""
 
     def __call__(self, context: Context, scan: PointCloud) -> Float[Array, "*values"]:
         """`compare`; zero for a scan that sees nothing."""
@@ -116,7 +116,7 @@ class ClassAcquisition(Acquisition):
         names = getattr(self.classifier, "classes", None)
         require(
             names is None or len(names) == len(log_p),
-            f"the classifier names {len(names or ())} classes but tells {len(log_p)} apart: give as many names",
+            f"the classifier names {len(names or ())} classes but gives {len(log_p)} probabilities: give as many names",
         )
 
 

@@ -68,7 +68,7 @@ class ColdestPoint(eqx.Module):
         require(workers >= 1, f"the number of workers is {workers}; it must be at least 1")
         if isinstance(source, HeatProblem):
             twice = (power, T, steps, u0, radius) != (10.0, 5.0, 20, 0.0, 0.1)
-            require(not twice, "the heat is told twice: power, T, steps, u0 and radius are those of the HeatProblem")
+            require(not twice, "the heat is given twice: power, T, steps, u0 and radius are those of the HeatProblem")
             self.heat = source
         else:
             place = source if isinstance(source, Array) else as_numbers(source, "the heat source")
@@ -81,7 +81,7 @@ class ColdestPoint(eqx.Module):
         With no point to take the minimum over it is the least there can be, -(u0 + T power): any point improves on it.
         """
         source = jnp.asarray(self.heat.source, cloud.points.dtype)
-        # The source is told with each cloud: here it may be a value that JAX does not know yet.
+        # The source is passed with each cloud: here it may be a value that JAX does not know yet.
         heat = replace(self.heat, source=np.zeros(3))
         values = partial(_values, heat=heat, reached_only=self.reached_only, workers=self.workers)
         return call_on_host(values, (), "ColdestPoint", cloud.points, cloud.mask, source)

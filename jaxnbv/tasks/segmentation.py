@@ -31,8 +31,8 @@ Segmenter: TypeAlias = Callable[[PointCloud], Float[Array, "points parts"]]
 class SoftPartCount(eqx.Module):
     """The paper's u_S(D) = sum_c tanh(sum_i p_ic / N_target), a utility for `ExpectedUtilityImprovement`.
 
-    A part of which far more than N_target points are seen adds nothing any more, so views are worth what they show of
-    parts not found yet.
+    A part of which far more than N_target points are seen adds nothing any more, so the value of a view is what it shows
+    of parts not found yet.
 
     - `segmenter`: a function from a cloud to the probabilities of the parts, point by point.
     - `target`: N_target, in points that the segmenter looks at; the default is the authors'.
@@ -95,7 +95,7 @@ class SoftPartCount(eqx.Module):
 
 
 class PartAnswer(Answer):
-    """How many points are predicted of each part; `asked`: of which it is told; `target`: N_target."""
+    """How many points are predicted of each part; `asked`: the parts that are shown; `target`: N_target."""
 
     form: str = "{:.0f}"
     asked: tuple[int, ...] = ()

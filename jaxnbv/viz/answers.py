@@ -1,6 +1,6 @@
 """What answers and quantities say, in words and charts; the task that gives them knows numbers only.
 
-`words_of` dispatches on the kind of answer. One of your own is told by its names and values, or as you register it:
+`words_of` dispatches on the kind of answer. One of your own is shown by its names and values, or as you register it:
 
     @words_of.register
     def _(answer: MyAnswer) -> Words: ...

@@ -24,15 +24,15 @@ def describe_choice(
     points: int,
     count: int,
     change: tuple[float, float] | None,
-    level: int | None = None,
+    num_tied: int | None = None,
 ) -> str:
     """Where a view looks from, why it was chosen and what it added, to follow "View 2".
 
     `others`: values of the open candidates, best first; `starts`: of a gradient search's ascents, else 0; `change`:
-    coverage before and after, where it is known; `level`: how many others the samples cannot tell from the best.
+    coverage before and after, where it is known; `num_tied`: how many others are tied with the best.
     """
     turned = f"{nearest_angle(pose, earlier):.0f}° from the nearest earlier view"
-    parts = [f"looks from {place(pose)}{_aim(pose)}, {turned}.", _reason(values, value, rank, others, starts, level)]
+    parts = [f"looks from {place(pose)}{_aim(pose)}, {turned}.", _reason(values, value, rank, others, starts, num_tied)]
     added = f"It added {points:,} points" if points else "It saw nothing"
     kept = f" ({count:,} are kept)" if points else ""
     grown = ""
@@ -43,7 +43,7 @@ def describe_choice(
 
 
 def _reason(
-    values: Quantity, value: float, rank: int, others: tuple[float, ...], starts: int, level: int | None
+    values: Quantity, value: float, rank: int, others: tuple[float, ...], starts: int, num_tied: int | None
 ) -> str:
     if not values.smooth:
         return f"It was drawn at random from {len(others)} open candidates."
@@ -64,21 +64,20 @@ def _reason(
     compared = f"the median candidate had {number(median)}"
     if median > 0 and value / median < 1000:
         compared = f"{number(value / median)} times the median ({number(median)})"
-    told = "" if level is None or len(others) < 2 else f" {told_apart(level, best)}"
+    tied = "" if num_tied is None or len(others) < 2 else f" {tie_sentence(num_tied, best)}"
     if not best:
-        return f"{text}: {compared}, the best {number(others[0])}.{told}{after}"
+        return f"{text}: {compared}, the best {number(others[0])}.{tied}{after}"
     if len(others) < 2:
         return f"{text}: {compared}.{after}"
-    return f"{text}: {compared}, {_margin(value, others[1], 'the runner-up')} ({number(others[1])}).{told}{after}"
+    return f"{text}: {compared}, {_margin(value, others[1], 'the runner-up')} ({number(others[1])}).{tied}{after}"
 
 
-def told_apart(level: int, chosen: bool = True) -> str:
-    """Whether the samples tell the best candidate, be it the chosen one or not, from the others, of which so many are
-    level with it."""
+def tie_sentence(num_tied: int, chosen: bool = True) -> str:
+    """Whether the best candidate, be it the chosen one or not, stands out, or so many others are tied with it."""
     best = "it" if chosen else "the best"
-    if not level:
+    if not num_tied:
         return f"{best.capitalize()} stands out: no other is within two standard errors of it."
-    others = f"{level} other{'s' if level > 1 else ''}"
+    others = f"{num_tied} other{'s' if num_tied > 1 else ''}"
     return f"By the samples {best} cannot be told from {others}, within two standard errors."
 
 

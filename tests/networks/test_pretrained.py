@@ -39,7 +39,7 @@ def test_right_where_the_pattern_is_seen_and_undecided_where_it_is_not(framing):
         assert isinstance(found, LabelledClouds)
         assert isinstance(found.clouds, PointCloud)
         log_p = answers(classifier, found.clouds)
-        pixels = np.asarray(found.telling_pixels)
+        pixels = np.asarray(found.cue_pixels)
         right += (np.argmax(log_p, axis=1) == np.asarray(found.labels))[pixels >= enough].tolist()
         undecided += np.asarray(entropy(log_p))[pixels == 0].tolist()
         first += _CHUNK
@@ -57,7 +57,7 @@ def test_the_class_of_a_cargo_by_what_is_seen_of_it():
     while len(right) < 30:
         found = scanned_clouds(CLASS_SETS["truck"], Split.TEST, Framing.CLOSE_UP, range(first, first + _CHUNK), 2048)
         log_p = answers(classifier, found.clouds)
-        telling = np.asarray(found.tells).sum(axis=1)
+        telling = np.asarray(found.on_cue).sum(axis=1)
         right += (np.argmax(log_p, axis=1) == np.asarray(found.labels))[telling >= 150].tolist()
         undecided += np.asarray(entropy(log_p))[telling == 0].tolist()
         first += _CHUNK

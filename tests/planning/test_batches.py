@@ -41,7 +41,7 @@ def planner_of(search=DiscreteSearch(12), score=Coverage(), **changes):  # noqa:
 
 
 def state_of(planner):
-    return planner.init(scan(SCENE, planner.camera, FIRST), FIRST)
+    return planner.init(FIRST, scan(SCENE, planner.camera, FIRST))
 
 
 def rows(cloud):
@@ -65,13 +65,13 @@ def spread_gain(known, seen):
 )
 def test_a_batch_is_greedy_over_what_the_same_sample_would_show(score, gain):
     planner = planner_of(score=score)
-    state = state_of(planner)
-    batch = planner.propose_batch(state, KEY, 3)
-    surfaces = planner.sample_surfaces(state, jax.random.split(KEY)[0])
+    evidence = state_of(planner)
+    batch = planner.propose_batch(evidence, KEY, 3)
+    surfaces = planner.imagination.sample(evidence, jax.random.split(KEY)[0])
     poses = planner.search.candidates.poses()
     scans = scan_samples(surfaces, planner.camera, poses)
     seen = [[rows(scans[s][p]) for p in range(12)] for s in range(3)]
-    known, taken = [rows(state.cloud)] * 3, []
+    known, taken = [rows(evidence.cloud)] * 3, []
     for proposal in batch.proposals:
         values = np.array([np.mean([gain(known[s], seen[s][p]) for s in range(3)]) for p in range(12)])
         found = np.asarray(proposal.values)
@@ -82,7 +82,7 @@ def test_a_batch_is_greedy_over_what_the_same_sample_would_show(score, gain):
         np.testing.assert_allclose(proposal.pose.position, poses.position[best], atol=1e-6)
         known = [np.concatenate([known[s], seen[s][best]]) for s in range(3)]
         taken.append(best)
-    single = planner.propose(state, KEY)
+    single = planner.propose(evidence, KEY)
     np.testing.assert_array_equal(batch.proposals[0].pose.position, single.pose.position)
 
 
@@ -98,8 +98,8 @@ def test_what_the_first_view_shows_is_worth_little_to_the_second():
 
 def test_the_order_is_that_of_the_shortest_way():
     planner = planner_of(FarthestView(12))
-    state = state_of(planner)
-    batch = planner.propose_batch(state, KEY, 4)
+    evidence = state_of(planner)
+    batch = planner.propose_batch(evidence, KEY, 4)
 
     def length(order):
         return total_cost([FIRST, *(batch.poses[index] for index in order)])
@@ -110,10 +110,10 @@ def test_the_order_is_that_of_the_shortest_way():
 
 def test_a_second_batch_compiles_nothing(compilations):
     planner = planner_of(num_samples=2)
-    state, other = state_of(planner), jax.random.key(9)
-    planner.propose_batch(state, KEY, 3)
+    evidence, other = state_of(planner), jax.random.key(9)
+    planner.propose_batch(evidence, KEY, 3)
     before = len(compilations)
-    planner.propose_batch(state, other, 3)
+    planner.propose_batch(evidence, other, 3)
     assert len(compilations) == before
 
 
@@ -128,10 +128,10 @@ def test_a_second_batch_compiles_nothing(compilations):
 @pytest.mark.parametrize("search", [DiscreteSearch(12), HalvingSearch(12, first_samples=3), UncertaintyView(12)])
 def test_values_are_weighed_against_the_way_from_the_last_view(cost, worth, search):
     plain, weighed = planner_of(search), planner_of(search, cost=cost)
-    state = state_of(plain)
-    second = plain.propose(state, KEY).pose
-    state = plain.observe(state, second, scan(SCENE, plain.camera, second))
-    values, found = (np.asarray(planner.propose(state, KEY).values) for planner in (plain, weighed))
+    evidence = state_of(plain)
+    second = plain.propose(evidence, KEY).pose
+    evidence = plain.observe(evidence, second, scan(SCENE, plain.camera, second))
+    values, found = (np.asarray(planner.propose(evidence, KEY).values) for planner in (plain, weighed))
     places = np.asarray(plain.search.candidates.poses().position, np.float64)
     here = np.asarray(second.position, np.float64)
     angle = np.arccos(np.clip(places @ here / np.linalg.norm(places, axis=1) / np.linalg.norm(here), -1.0, 1.0))
@@ -147,8 +147,8 @@ def test_values_are_weighed_against_the_way_from_the_last_view(cost, worth, sear
 
 def test_standard_errors_are_of_what_is_weighed():
     plain, weighed = planner_of(), planner_of(cost=ValuePerCost(arc_length))
-    state = state_of(plain)
-    errors = [np.asarray(planner.propose(state, KEY).standard_errors) for planner in (plain, weighed)]
+    evidence = state_of(plain)
+    errors = [np.asarray(planner.propose(evidence, KEY).standard_errors) for planner in (plain, weighed)]
     way = np.array([float(arc_length(FIRST, pose)) for pose in plain.search.candidates.poses()])
     np.testing.assert_allclose(errors[1], errors[0] / (1.0 + way), rtol=1e-3)
 
@@ -165,10 +165,10 @@ def test_a_search_by_gradient_weighs_the_way_too():
 
 def test_without_a_last_view_nothing_is_spent():
     planner = planner_of(cost=ValueMinusCost(arc_length, weight=3.0))
-    state = planner.init(scan(SCENE, planner.camera, FIRST))
-    plain = planner_of().propose(state, KEY)
-    np.testing.assert_allclose(planner.propose(state, KEY).values, plain.values, rtol=1e-5)
-    assert planner.propose_batch(state, KEY, 2).start is None
+    evidence = planner.init(None, scan(SCENE, planner.camera, FIRST))
+    plain = planner_of().propose(evidence, KEY)
+    np.testing.assert_allclose(planner.propose(evidence, KEY).values, plain.values, rtol=1e-5)
+    assert planner.propose_batch(evidence, KEY, 2).start is None
 
 
 @pytest.mark.parametrize("search", [FarthestView(12), RandomView(12)])

@@ -8,6 +8,7 @@ import pytest
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose, look_at
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import observe_scene, simulate
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, mesh_from_sdf, scan
@@ -20,12 +21,10 @@ SOLID = Sphere(0.7) | Capsule([0.2, 0.3, -0.4], [0.5, 0.6, 0.9], 0.3)
 SCENE = SDFSurface(SOLID)
 FIRST = look_at((0.8, 0.9, 2.2))
 PLANNER = Planner(
-    GeometricSPSR(truncation=8, lengthscale=0.05),
-    Camera(height=8, width=8),
     Coverage(),
     DiscreteSearch(12),
-    num_samples=3,
-    grid=Grid(24),
+    Camera(height=8, width=8),
+    Imagination(GeometricSPSR(truncation=8, lengthscale=0.05), grid=Grid(24), num_samples=3),
     capacity=128,
     max_views=6,
 )
@@ -44,24 +43,24 @@ def episode():
 
 def test_simulate_is_the_loop_of_ask_and_tell(episode):
     """View i draws from fold_in(key, i): one half to choose it, one for the sensor's noise."""
-    pose, state = FIRST, None
+    pose, evidence = FIRST, None
     for index in range(4):
         choose_key, noise_key = jax.random.split(jax.random.fold_in(KEY, index))
         proposal = None
-        if state is not None:
-            proposal = PLANNER.propose(state, choose_key)
+        if evidence is not None:
+            proposal = PLANNER.propose(evidence, choose_key)
             pose = proposal.pose
         seen = observe_scene(SCENE, PLANNER.camera, pose, SensorNoise(), noise_key)
-        state = PLANNER.init(seen, pose) if state is None else PLANNER.observe(state, pose, seen)
+        evidence = PLANNER.init(pose, seen) if evidence is None else PLANNER.observe(evidence, pose, seen)
         view = episode.views[index]
-        assert_same_bits((view.pose, view.scan, view.cloud), (pose, seen, state.cloud))
+        assert_same_bits((view.pose, view.scan, view.cloud), (pose, seen, evidence.cloud))
         assert_same_bits(view.proposal, proposal)
-        assert_same_bits(episode.state_after(index + 1), state)
-    assert_same_bits(episode.cloud, state.cloud)
+        assert_same_bits(episode.evidence_after(index + 1), evidence)
+    assert_same_bits(episode.cloud, evidence.cloud)
     assert len(episode.views) == 4
     for wrong in (0, 5):
         with pytest.raises(ValueError, match=f"asked for {wrong} of 4 views"):
-            episode.state_after(wrong)
+            episode.evidence_after(wrong)
 
 
 def test_views_differ_and_scans_carry_the_sensors_noise(episode):
@@ -93,26 +92,26 @@ def test_a_whole_episode_as_one_jitted_function(episode):
             return jax.random.split(jax.random.fold_in(key, index))
 
         seen = noise(scan(SCENE, PLANNER.camera, first), keys(0)[1])
-        state = PLANNER.init(seen, first)
+        evidence = PLANNER.init(first, seen)
 
-        def step(state, index):
+        def step(evidence, index):
             choose_key, noise_key = keys(index)
-            proposal = PLANNER.propose(state, choose_key)
+            proposal = PLANNER.propose(evidence, choose_key)
             seen = noise(scan(SCENE, PLANNER.camera, proposal.pose), noise_key)
-            return PLANNER.observe(state, proposal.pose, seen), (proposal.pose, proposal.values)
+            return PLANNER.observe(evidence, proposal.pose, seen), (proposal.pose, proposal.values)
 
-        return jax.lax.scan(step, state, jnp.arange(1, 4))
+        return jax.lax.scan(step, evidence, jnp.arange(1, 4))
 
-    state, (poses, values) = run(KEY, FIRST.position)
-    assert int(state.num_views) == 4
+    evidence, (poses, values) = run(KEY, FIRST.position)
+    assert int(evidence.num_views) == 4
     for index in range(3):
         view = episode.views[index + 1]
         np.testing.assert_allclose(poses.position[index], view.pose.position, atol=1e-5)
         np.testing.assert_allclose(values[index], view.proposal.values, rtol=0.02, atol=0.02)
-    np.testing.assert_array_equal(state.cloud.mask, episode.cloud.mask)
-    assert int(state.cloud.count) == 128, "farthest points were taken"
+    np.testing.assert_array_equal(evidence.cloud.mask, episode.cloud.mask)
+    assert int(evidence.cloud.count) == 128, "farthest points were taken"
     # Where two points tie to rounding, farthest point sampling may swap them: compare as sets.
-    distance = np.linalg.norm(np.asarray(state.cloud.points)[:, None] - np.asarray(episode.cloud.points), axis=-1)
+    distance = np.linalg.norm(np.asarray(evidence.cloud.points)[:, None] - np.asarray(episode.cloud.points), axis=-1)
     assert (distance.min(axis=1) < 1e-4).mean() > 0.95
 
 

@@ -12,6 +12,7 @@ from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate, farthest_point_subsample
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import simulate
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, scan
@@ -37,20 +38,20 @@ def planner():
 
 
 @pytest.fixture(scope="module")
-def state(planner):
-    return planner.init(scan(SCENE, planner.camera, FIRST), FIRST)
+def evidence(planner):
+    return planner.init(FIRST, scan(SCENE, planner.camera, FIRST))
 
 
 @pytest.mark.parametrize("name", SEARCHES)
 def test_nothing_recompiles_after_the_second_view(name, compilations):
     planner, noise, key = planner_of(SEARCHES[name]), SensorNoise(), jax.random.key(3)
-    after, state, pose = [], None, FIRST
+    after, evidence, pose = [], None, FIRST
     observe_scene = eqx.filter_jit(lambda pose, key: noise(scan(SCENE, planner.camera, pose), key))
     for view in range(5):
-        if state is not None:
-            pose = planner.propose(state, jax.random.fold_in(key, view)).pose
+        if evidence is not None:
+            pose = planner.propose(evidence, jax.random.fold_in(key, view)).pose
         seen = observe_scene(pose, jax.random.fold_in(key, view))
-        state = planner.init(seen, pose) if state is None else planner.observe(state, pose, seen)
+        evidence = planner.init(pose, seen) if evidence is None else planner.observe(evidence, pose, seen)
         after.append(len(compilations))
     assert after[0] > 0, "the counter counts nothing"
     assert after[1:] == [after[1]] * 4, f"compilations after each view: {after}"
@@ -67,36 +68,36 @@ def test_simulated_episodes_do_not_recompile_either(planner, compilations):
     assert len(compilations) == before
 
 
-def test_asking_and_telling_leave_the_state_as_it_was(planner, state):
-    before = jax.tree.map(np.array, state)
-    proposal = planner.propose(state, jax.random.key(1))
+def test_asking_and_telling_leave_the_state_as_it_was(planner, evidence):
+    before = jax.tree.map(np.array, evidence)
+    proposal = planner.propose(evidence, jax.random.key(1))
     seen = scan(SCENE, planner.camera, proposal.pose)
-    after = planner.observe(state, proposal.pose, seen)
-    jax.tree.map(np.testing.assert_array_equal, before, jax.tree.map(np.array, state))
-    assert int(state.num_views) == 1
+    after = planner.observe(evidence, proposal.pose, seen)
+    jax.tree.map(np.testing.assert_array_equal, before, jax.tree.map(np.array, evidence))
+    assert int(evidence.num_views) == 1
     assert int(after.num_views) == 2
     np.testing.assert_array_equal(after.poses.position[:2], jnp.stack([FIRST.position, proposal.pose.position]))
-    assert int(after.cloud.count) == int(state.cloud.count + seen.count) <= 128
+    assert int(after.cloud.count) == int(evidence.cloud.count + seen.count) <= 128
     with pytest.raises(AttributeError):
-        state.num_views = 3
-    again = planner.propose(state, jax.random.key(1))
+        evidence.num_views = 3
+    again = planner.propose(evidence, jax.random.key(1))
     jax.tree.map(np.testing.assert_array_equal, jax.tree.map(np.array, proposal), jax.tree.map(np.array, again))
 
 
 def test_a_first_scan_from_an_unknown_pose_excludes_nothing():
     planner = planner_of(SEARCHES["FarthestView"])
-    state = planner.init(scan(SCENE, planner.camera, FIRST))
-    assert int(state.num_views) == 0
-    assert not np.isneginf(planner.propose(state, jax.random.key(0)).values).any()
+    evidence = planner.init(None, scan(SCENE, planner.camera, FIRST))
+    assert int(evidence.num_views) == 0
+    assert not np.isneginf(planner.propose(evidence, jax.random.key(0)).values).any()
 
 
-def test_beyond_its_capacity_the_cloud_is_thinned_by_farthest_points(planner, state):
+def test_beyond_its_capacity_the_cloud_is_thinned_by_farthest_points(planner, evidence):
     proposal_pose = look_at((-0.8, 0.9, 2.2))
     seen = scan(SCENE, planner.camera, proposal_pose)
     small = planner_of(SEARCHES["DiscreteSearch"], capacity=40)
     first = scan(SCENE, small.camera, FIRST)
     assert int(first.count) > 40
-    start = small.init(first, FIRST)
+    start = small.init(FIRST, first)
     expected = farthest_point_subsample(first, 40)
     np.testing.assert_array_equal(start.cloud.points, expected.points)
     after = small.observe(start, proposal_pose, seen)
@@ -106,12 +107,12 @@ def test_beyond_its_capacity_the_cloud_is_thinned_by_farthest_points(planner, st
     assert bool(after.cloud.mask.all())
 
 
-def test_a_scan_that_saw_nothing_only_records_its_pose(planner, state):
+def test_a_scan_that_saw_nothing_only_records_its_pose(planner, evidence):
     away = Pose(np.eye(3, dtype=np.float32), np.array([0.0, 0.0, 2.5], np.float32))
     seen = scan(SCENE, planner.camera, away)
     assert int(seen.count) == 0
-    after = planner.observe(state, away, seen)
-    np.testing.assert_array_equal(after.cloud.points, state.cloud.points)
+    after = planner.observe(evidence, away, seen)
+    np.testing.assert_array_equal(after.cloud.points, evidence.cloud.points)
     assert int(after.num_views) == 2
 
 
@@ -122,28 +123,28 @@ def cloud_at(*points):
 def test_an_empty_first_scan_is_refused(planner):
     empty = PointCloud(jnp.zeros((4, 3)), jnp.zeros((4, 3)), jnp.zeros(4, bool))
     with pytest.raises(ValueError, match=r"first scan is empty.*[Pp]oint the camera"):
-        planner.init(empty, FIRST)
+        planner.init(FIRST, empty)
 
 
 @pytest.mark.parametrize("field", ["points", "normals"])
-def test_a_scan_with_nan_is_refused(planner, state, field):
+def test_a_scan_with_nan_is_refused(planner, evidence, field):
     bad = eqx.tree_at(lambda c: getattr(c, field), cloud_at([0.0, 0.0, 0.1]), jnp.full((4, 3), jnp.nan))
-    for tell in (lambda: planner.init(bad, FIRST), lambda: planner.observe(state, FIRST, bad)):
+    for tell in (lambda: planner.init(FIRST, bad), lambda: planner.observe(evidence, FIRST, bad)):
         with pytest.raises(ValueError, match=r"not finite.*mask these rows"):
             tell()
 
 
-def test_nan_in_a_masked_row_does_no_harm(planner, state):
+def test_nan_in_a_masked_row_does_no_harm(planner, evidence):
     cloud = cloud_at([0.0, 0.0, 0.1])
     bad = eqx.tree_at(lambda c: c.points, cloud, cloud.points.at[2].set(jnp.nan))
-    after = planner.observe(state, FIRST, bad)
+    after = planner.observe(evidence, FIRST, bad)
     assert np.isfinite(after.cloud.points).all()
-    assert int(after.cloud.count) == int(state.cloud.count) + 1
+    assert int(after.cloud.count) == int(evidence.cloud.count) + 1
 
 
-def test_a_scan_outside_the_scene_is_refused(planner, state):
+def test_a_scan_outside_the_scene_is_refused(planner, evidence):
     outside = cloud_at([0.0, 0.1, 0.0], [0.0, -40.0, 0.0])
-    for tell in (lambda: planner.init(outside, FIRST), lambda: planner.observe(state, FIRST, outside)):
+    for tell in (lambda: planner.init(FIRST, outside), lambda: planner.observe(evidence, FIRST, outside)):
         with pytest.raises(ValueError, match=r"coordinate of 40.*Frame\.to_scene"):
             tell()
 
@@ -152,7 +153,7 @@ def test_no_room_for_another_view_is_refused():
     planner = planner_of(SEARCHES["FarthestView"], max_views=1)
     first = scan(SCENE, planner.camera, FIRST)
     with pytest.raises(ValueError, match=r"holds 1 views.*max_views"):
-        planner.observe(planner.init(first, FIRST), FIRST, first)
+        planner.observe(planner.init(FIRST, first), FIRST, first)
 
 
 @pytest.mark.parametrize("kind", [FarthestView, RandomView])
@@ -161,11 +162,11 @@ def test_all_candidates_visited_is_refused(kind):
     first = scan(SCENE, planner.camera, FIRST)
     # Its points alone, which may be told with any pose.
     first = PointCloud(first.points, first.normals, first.mask)
-    state = planner.init(first, FIRST)
+    evidence = planner.init(FIRST, first)
     for _ in range(2):
-        state = planner.observe(state, planner.propose(state, jax.random.key(0)).pose, first)
+        evidence = planner.observe(evidence, planner.propose(evidence, jax.random.key(0)).pose, first)
     with pytest.raises(ValueError, match=r"all 2 candidates have been visited.*more candidates"):
-        planner.propose(state, jax.random.key(0))
+        planner.propose(evidence, jax.random.key(0))
 
 
 @pytest.mark.parametrize("name", ["num_samples", "capacity", "max_views"])
@@ -175,18 +176,24 @@ def test_numbers_below_one_are_refused(name, value):
         planner_of(SEARCHES["FarthestView"], **{name: value})
 
 
-def test_a_score_that_is_not_a_number_is_named(state):
+def test_a_score_that_is_not_a_number_is_named(evidence):
     utility = ExpectedUtilityImprovement(lambda cloud: jnp.sum(cloud.points) * jnp.nan)
     planner = planner_of(DiscreteSearch(12))
-    planner = Planner(planner.model, planner.camera, utility, planner.search, 3, planner.grid, 128)
+    planner = Planner(
+        utility,
+        planner.search,
+        planner.camera,
+        Imagination(planner.imagination.model, grid=planner.imagination.grid, num_samples=3),
+        capacity=128,
+    )
     with pytest.raises(ValueError, match="NaN"):
-        planner.propose(state, jax.random.key(0))
+        planner.propose(evidence, jax.random.key(0))
 
 
 def test_normals_that_are_not_of_unit_length_are_refused(planner):
     cloud = cloud_at([0.1, 0.2, 0.3], [0.3, 0.2, 0.1])
     with pytest.raises(ValueError, match=r"1 normals .*from_arrays"):
-        planner.init(PointCloud(cloud.points, cloud.normals.at[1].set(0.0), cloud.mask))
+        planner.init(None, PointCloud(cloud.points, cloud.normals.at[1].set(0.0), cloud.mask))
 
 
 def test_a_singular_covariance_is_named():
@@ -195,9 +202,11 @@ def test_a_singular_covariance_is_named():
     cloud = PointCloud.from_arrays(points, np.tile([0.0, 0.0, 1.0], (64, 1)))
     with pytest.raises(ValueError, match=r"64 normals with noise=1e-05 is singular .* raise the noise"):
         model.condition(cloud)
-    planner = Planner(model, Camera(), Coverage(), DiscreteSearch(4), 2, Grid(12), 64)
+    planner = Planner(
+        Coverage(), DiscreteSearch(4), imagination=Imagination(model, grid=Grid(12), num_samples=2), capacity=64
+    )
     with pytest.raises(ValueError, match="raise the model's noise"):
-        planner.propose(planner.init(cloud), jax.random.key(0))
+        planner.propose(planner.init(None, cloud), jax.random.key(0))
 
 
 def test_points_far_apart_are_told_of_with_the_remedy():
@@ -207,7 +216,9 @@ def test_points_far_apart_are_told_of_with_the_remedy():
 
     def init(lengthscale, variance):
         model = GeometricSPSR(lengthscale, variance, 10)
-        Planner(model, Camera(height=8, width=8), Coverage(), DiscreteSearch(6), 2, Grid(16)).init(cloud)
+        Planner(
+            Coverage(), DiscreteSearch(6), Camera(height=8, width=8), Imagination(model, grid=Grid(16), num_samples=2)
+        ).init(None, cloud)
 
     with pytest.warns(UserWarning, match=r"points are 0\.4\d apart, 2\.\d times .*Scan more densely, or raise"):
         init(0.025, 0.2)
@@ -226,8 +237,14 @@ def test_parts_thinner_than_a_cell_are_told_of_with_the_remedy():
 
     def observe(resolution):
         model, camera = GeometricSPSR(0.05, 0.2, 10), Camera(height=8, width=8)
-        planner = Planner(model, camera, Coverage(), DiscreteSearch(6), 2, Grid(resolution), 400)
-        planner.observe(planner.init(first), look_at((0.0, 0.0, -2.5)), second)
+        planner = Planner(
+            Coverage(),
+            DiscreteSearch(6),
+            camera,
+            Imagination(model, grid=Grid(resolution), num_samples=2),
+            capacity=400,
+        )
+        planner.observe(planner.init(None, first), look_at((0.0, 0.0, -2.5)), second)
 
     with pytest.warns(UserWarning, match=r"288 of 288 points lie on parts thinner than a cell .*0\.0972.*Raise Grid"):
         observe(37)
@@ -236,14 +253,14 @@ def test_parts_thinner_than_a_cell_are_told_of_with_the_remedy():
         observe(60)
 
 
-def test_what_is_constant_under_jit_is_checked_too(planner, state):
+def test_what_is_constant_under_jit_is_checked_too(planner, evidence):
     seen = scan(SCENE, planner.camera, FIRST)
-    begun = jax.jit(lambda: planner.init(seen, FIRST))()
-    np.testing.assert_array_equal(begun.cloud.points, state.cloud.points)
-    assert int(jax.jit(lambda state: planner.observe(state, FIRST, seen).num_views)(state)) == 2
+    begun = jax.jit(lambda: planner.init(FIRST, seen))()
+    np.testing.assert_array_equal(begun.cloud.points, evidence.cloud.points)
+    assert int(jax.jit(lambda evidence: planner.observe(evidence, FIRST, seen).num_views)(evidence)) == 2
     long = eqx.tree_at(lambda c: c.normals, seen, 2 * seen.normals)
     with pytest.raises(ValueError, match="not of unit length"):
-        jax.jit(lambda: planner.init(long, FIRST))()
+        jax.jit(lambda: planner.init(FIRST, long))()
 
 
 def test_a_near_camera_s_own_scan_is_its_image():
@@ -251,6 +268,6 @@ def test_a_near_camera_s_own_scan_is_its_image():
     planner, near = planner_of(SEARCHES["FarthestView"]), look_at((0.0, 0.0, 0.8))
     ball = SDFSurface(Sphere(0.7))
     seen = SensorNoise()(scan(ball, planner.camera, near), jax.random.key(0))
-    assert int(planner.init(seen, near).num_views) == 1
+    assert int(planner.init(near, seen).num_views) == 1
     with pytest.raises(ValueError, match="pixels"):
-        planner.init(seen, look_at((0.0, 0.8, 0.0)))
+        planner.init(look_at((0.0, 0.8, 0.0)), seen)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from jaxnbv.acquisition import ExpectedUtilityImprovement, Score, expected_score
+from jaxnbv.acquisition import ExpectedUtilityImprovement, Score, expected_value
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
@@ -85,13 +85,13 @@ def move(start, parameters):
 
 @eqx.filter_jit
 def values_at(score, cloud, surfaces, poses):
-    return expected_score(score, cloud, surfaces, CAMERA, poses)
+    return expected_value(score, cloud, surfaces, CAMERA, poses)
 
 
 @eqx.filter_jit
 def slopes_at(score, cloud, surfaces, starts, parameters):
     def total(parameters):
-        return jnp.sum(expected_score(score, cloud, surfaces, CAMERA, jax.vmap(move)(starts, parameters)))
+        return jnp.sum(expected_value(score, cloud, surfaces, CAMERA, jax.vmap(move)(starts, parameters)))
 
     return jax.grad(total)(parameters)
 

@@ -10,10 +10,11 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.geometry.volume import Box
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.session import Session
-from jaxnbv.planning.stopping import Budget, WorthLess
+from jaxnbv.planning.stopping import Budget, ValueBelow
 from jaxnbv.scanning import Carving, Grid, SDFSurface, scan
 from jaxnbv.scanning.sdf import Box as Block
 from jaxnbv.scanning.sdf import Sphere
@@ -74,30 +75,31 @@ def test_it_asks_and_tells_as_a_planner_in_the_scene_does(finished):
     search = DiscreteSearch(frame.to_scene(Pose.from_matrix(POSES)))
     imagined = frame.to_scene(CAMERA).resized(12, 16)
     planner = Planner(
-        GeometricSPSR(0.2, truncation=8),
-        imagined,
         Coverage(),
         search,
-        3,
-        Grid(28),
-        400,
-        8,
-        Carving(frame.to_scene(box)),
+        imagined,
+        Imagination(
+            GeometricSPSR(0.2, truncation=8), grid=Grid(28), num_samples=3, carving=Carving(frame.to_scene(box))
+        ),
+        capacity=400,
+        max_views=8,
     )
-    state, matrix = None, FIRST
+    evidence, matrix = None, FIRST
     for index in range(3):
         pose = Pose.from_matrix(matrix)
         cloud = PointCloud.from_depth(shot(matrix), CAMERA, pose, scale=1e-3, box=box)
         told = (frame.to_scene(pose), frame.to_scene(CAMERA))
         scanned = frame.to_scene(cloud)
-        state = planner.init(scanned, *told) if state is None else planner.observe(state, told[0], scanned, told[1])
+        evidence = (
+            planner.init(scanned, *told) if evidence is None else planner.observe(evidence, told[0], scanned, told[1])
+        )
         sample_key, search_key, _ = view_keys(jax.random.key(0), index + 1)
-        proposal = planner.choose(state, planner.sample_surfaces(state, sample_key), search_key)
+        proposal = planner.choose(evidence, planner.imagination.sample(evidence, sample_key), search_key)
         matrix = np.asarray(frame.to_world(proposal.pose).matrix)
         expected = finished.episode.views[index + 1].proposal if index < 2 else finished.next().proposal
         np.testing.assert_allclose(proposal.values, expected.values, rtol=1e-4, atol=1e-4)
         np.testing.assert_allclose(proposal.pose.position, expected.pose.position, atol=1e-5)
-    np.testing.assert_allclose(finished.state.cloud.points, state.cloud.points, atol=1e-5)
+    np.testing.assert_allclose(finished.state.cloud.points, evidence.cloud.points, atol=1e-5)
 
 
 def test_its_matrices_are_those_that_were_given(finished):
@@ -170,7 +172,7 @@ def test_where_the_sensor_could_not_be_held_is_not_proposed_again():
 
 
 def test_a_rig_of_two_cameras_is_one_session(tmp_path):
-    """The second has other intrinsics; what both saw is what each saw, in the state and after a restart."""
+    """The second has other intrinsics; what both saw is what each saw, in the evidence and after a restart."""
     other = Camera.from_intrinsics([[60.0, 0.0, 15.0], [0.0, 60.0, 16.0], [0.0, 0.0, 1.0]], width=32, height=32)
     matrix = around(3.0, 0.7)
     pose = Pose.from_matrix(matrix)
@@ -187,7 +189,7 @@ def test_a_rig_of_two_cameras_is_one_session(tmp_path):
     again = session_of(tmp_path, camera=(CAMERA, other), planner=planner_of(capacity=2000))
     np.testing.assert_array_equal(again.cloud.points, session.cloud.points)
     assert [view.camera.width for view in again.episode.views] == [64, 32]
-    assert len([*again.episode.states()]) == 2
+    assert len([*again.episode.evidence()]) == 2
     with pytest.raises(InputError, match="the session has 2 cameras, counted from 0: there is no camera 2"):
         session.add(image, matrix, camera=2)
     with pytest.raises(InputError, match="has no camera"):
@@ -249,7 +251,10 @@ def test_the_box_is_the_volume_of_the_model_and_of_the_carving():
     own = Box.cube(2.0)
     planner = planner_of()
     planner = Planner(
-        ScreenedSPSR(values=(OutsideBoundary(), OutsideBoundary(own))), planner.camera, Coverage(), planner.search
+        Coverage(),
+        planner.search,
+        planner.camera,
+        Imagination(ScreenedSPSR(values=(OutsideBoundary(), OutsideBoundary(own)))),
     )
     fitted = session_of(planner=planner).planner
     scene = Frame.fit(np.array(BOX), up="z").to_scene(Box(*BOX))
@@ -262,7 +267,7 @@ def test_the_box_is_the_volume_of_the_model_and_of_the_carving():
 
 def test_it_is_done_by_its_rule(finished):
     assert finished.done is None
-    session = session_of(until=WorthLess(1e9))
+    session = session_of(until=ValueBelow(1e9))
     assert session.done is None
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     assert "less than" in session.done

@@ -11,6 +11,7 @@ import jaxnbv
 from jaxnbv.acquisition import Score
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import scene_sensor, steps
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
@@ -34,7 +35,14 @@ class FirstRow(Score):
 
 
 def planner(search, views=4):
-    return Planner(GeometricSPSR(0.2, truncation=6), CAMERA, Coverage(), search, 2, Grid(16), 150, views)
+    return Planner(
+        Coverage(),
+        search,
+        CAMERA,
+        Imagination(GeometricSPSR(0.2, truncation=6), grid=Grid(16), num_samples=2),
+        capacity=150,
+        max_views=views,
+    )
 
 
 def views_of(planner, key=KEY, noise=SensorNoise(), camera=CAMERA, first=FIRST):
@@ -107,10 +115,10 @@ def test_a_step_holds_the_samples_and_the_state_that_the_next_view_is_chosen_fro
 
 def test_another_score_or_search_does_not_compile_the_sampler_again(compilations):
     own = planner(DiscreteSearch(CANDIDATES))
-    state = own.init(next(views_of(own)).scan, FIRST)
-    surfaces = own.sample_surfaces(state, KEY)
+    evidence = own.init(FIRST, next(views_of(own)).scan)
+    surfaces = own.sample_surfaces(evidence, KEY)
     jax.block_until_ready(surfaces.values)
     del compilations[:]
     other = eqx.tree_at(lambda p: p.acquisition, planner(UncertaintyView(CANDIDATES)), FirstRow())
-    assert_same(other.sample_surfaces(state, KEY), surfaces)
+    assert_same(other.imagination.sample(evidence, KEY), surfaces)
     assert not compilations

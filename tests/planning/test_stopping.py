@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxnbv.planning.state import State
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.checks import InputError
@@ -14,8 +15,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.planning.episode import simulate
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.state import State
-from jaxnbv.planning.stopping import Budget, Covered, Found, SoFar, Sure, WorthLess, expected_coverage
+from jaxnbv.planning.stopping import Budget, Covered, Found, SoFar, Sure, ValueBelow, expected_coverage
 from jaxnbv.scanning import Grid, GridSurface, SDFSurface, SensorNoise
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.search import DiscreteSearch, FarthestView, Proposal
@@ -113,7 +113,7 @@ def test_expected_coverage_is_that_of_the_samples(points, radius, monkeypatch):
     distance = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1), axis=-1) - 0.8
     ball = GridSurface.from_values(jnp.asarray(distance, jnp.float32)[None], 0.0, Grid(64))
     planner = planner_of(Coverage(), grid=Grid(64))
-    monkeypatch.setattr(Planner, "sample_surfaces", lambda self, state, key: ball)
+    monkeypatch.setattr(Planner, "sample_surfaces", lambda self, evidence, key: ball)
     cloud = cloud_of(points)
     hits = []
     for pose in DiscreteSearch(10).candidates.poses():
@@ -137,8 +137,8 @@ def test_expected_coverage_is_that_of_the_samples(points, radius, monkeypatch):
 def test_worth_less_and_budgets_on_scripted_proposals():
     planner = planner_of(Coverage())
     asked = so_far(planner, cloud_of(50))
-    assert "worth 0.3, less than 0.5" in WorthLess(0.5).before(asked, proposal_of(0.3))
-    assert WorthLess(0.5).before(asked, proposal_of(0.5)) is None
+    assert "worth 0.3, less than 0.5" in ValueBelow(0.5).before(asked, proposal_of(0.3))
+    assert ValueBelow(0.5).before(asked, proposal_of(0.5)) is None
     east, top, west = (look_at(place) for place in ((2.5, 0.0, 0.0), (0.0, 2.5, 0.0), (-2.5, 0.0, 0.0)))
     quarter = 2.5 * np.pi / 2.0
     way = so_far(planner, cloud_of(50), (east, top), seconds=30.0)
@@ -151,7 +151,7 @@ def test_worth_less_and_budgets_on_scripted_proposals():
 def test_the_first_rule_that_holds_ends_it():
     planner = planner_of(Coverage())
     asked = so_far(planner, cloud_of(50), seconds=10.0)
-    rule = WorthLess(0.5) | Budget(seconds=20.0) | Budget(seconds=5.0)
+    rule = ValueBelow(0.5) | Budget(seconds=20.0) | Budget(seconds=5.0)
     assert rule.after(asked) == "10 of 5 seconds are spent"
     assert "less than 0.5" in rule.before(asked, proposal_of(0.1))
     assert rule.before(asked, proposal_of(0.6)) is None
@@ -182,7 +182,7 @@ def test_a_view_that_is_worth_too_little_is_not_taken():
     values = [float(view.proposal.value) for view in episode.views[1:]]
     limit = 0.5 * (values[0] + values[1])
     assert values[1] < limit < values[0]
-    short = simulate(planner, SCENE, FIRST, 6, KEY, progress=False, until=WorthLess(limit))
+    short = simulate(planner, SCENE, FIRST, 6, KEY, progress=False, until=ValueBelow(limit))
     assert len(short.views) == 2
     assert "less than" in short.stopped
 

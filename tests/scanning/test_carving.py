@@ -12,6 +12,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import look_at
 from jaxnbv.geometry.volume import Box
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import (
     Carving,
@@ -66,26 +67,33 @@ CARVING, WAVES = Carving(), WavesModel()
 
 def planner_of(carving=CARVING, model=WAVES):
     camera, search = Camera(height=40, width=40), FarthestView(12)
-    return Planner(model, camera, Coverage(), search, 3, SMALL_GRID, capacity=400, max_views=4, carving=carving)
+    return Planner(
+        Coverage(),
+        search,
+        camera,
+        Imagination(model, grid=SMALL_GRID, num_samples=3, carving=carving),
+        capacity=400,
+        max_views=4,
+    )
 
 
 def after_both_sides(planner, surface, poses=POSES):
-    state = planner.init(scan(surface, planner.camera, poses[0]), poses[0])
-    return planner.observe(state, poses[1], scan(surface, planner.camera, poses[1]))
+    evidence = planner.init(poses[0], scan(surface, planner.camera, poses[0]))
+    return planner.observe(evidence, poses[1], scan(surface, planner.camera, poses[1]))
 
 
 def test_no_sample_is_inside_what_was_seen_empty_nor_outside_the_volume():
     planner, raw = planner_of(), planner_of(carving=None)
-    state, raw_state = (after_both_sides(one, SOLIDS["ball"]) for one in (planner, raw))
+    evidence, raw_state = (after_both_sides(one, SOLIDS["ball"]) for one in (planner, raw))
     assert raw_state.seen_empty is None
     expected = np.zeros((30,) * 3, bool)
     for pose in POSES:
         seen = SEE(CARVING, SMALL_GRID, scan(SOLIDS["ball"], planner.camera, pose), planner.camera, pose)
         assert seen.sum() > 200
         expected |= np.asarray(seen)
-    np.testing.assert_array_equal(state.seen_empty, expected)
+    np.testing.assert_array_equal(evidence.seen_empty, expected)
 
-    carved = np.asarray(planner.sample_surfaces(state, jax.random.key(1)).values)
+    carved = np.asarray(planner.imagination.sample(evidence, jax.random.key(1)).values)
     values = np.asarray(raw.sample_surfaces(raw_state, jax.random.key(1)).values)
     outside = (np.linalg.norm(np.maximum(np.abs(nodes_of(SMALL_GRID)) - 1.25, 0.0), axis=-1)) > 2 * SMALL_GRID.spacing
     nowhere = expected | outside
@@ -108,26 +116,28 @@ class Told(WavesModel):
 
 def test_the_model_is_told_of_what_was_seen_empty_within_the_volume():
     told, waves = planner_of(model=Told()), planner_of(carving=None)
-    state = after_both_sides(told, SOLIDS["ball"])
-    empty = CARVING.empty_points(SMALL_GRID, state.seen_empty)
+    evidence = after_both_sides(told, SOLIDS["ball"])
+    empty = CARVING.empty_points(SMALL_GRID, evidence.seen_empty)
     points = np.asarray(empty.points)[np.asarray(empty.mask)]
     assert 50 < len(points) <= 20**3
     index = np.rint((points + SMALL_GRID.half_extent) / SMALL_GRID.spacing).astype(int)
-    assert np.asarray(state.seen_empty)[tuple(index.T)].all()
+    assert np.asarray(evidence.seen_empty)[tuple(index.T)].all()
     assert np.abs(points).max() < 1.25
     key = jax.random.key(0)
-    raw = waves.model.condition(state.cloud).sample(key, 3).on_grid(SMALL_GRID.axis)
-    untouched = ~np.asarray(state.seen_empty | CARVING.outside(SMALL_GRID))
-    level = float((np.asarray(raw) - np.asarray(told.sample_surfaces(state, key).values))[:, untouched].mean())
+    raw = waves.imagination.model.condition(evidence.cloud).sample(key, 3).on_grid(SMALL_GRID.axis)
+    untouched = ~np.asarray(evidence.seen_empty | CARVING.outside(SMALL_GRID))
+    level = float((np.asarray(raw) - np.asarray(told.sample_surfaces(evidence, key).values))[:, untouched].mean())
     np.testing.assert_allclose(level, 1000.0 * len(points) + np.abs(points).max(), rtol=1e-4)
 
 
 def test_without_carving_samples_are_the_models_own():
     raw = planner_of(carving=None)
-    state = after_both_sides(raw, SOLIDS["ball"])
-    posterior = raw.model.condition(state.cloud)
+    evidence = after_both_sides(raw, SOLIDS["ball"])
+    posterior = raw.model.condition(evidence.cloud)
     own = posterior.sample(jax.random.key(2), 3).on_grid(SMALL_GRID.axis) - posterior.level
-    np.testing.assert_allclose(raw.sample_surfaces(state, jax.random.key(2)).values, own, atol=1e-4 * np.abs(own).max())
+    np.testing.assert_allclose(
+        raw.sample_surfaces(evidence, jax.random.key(2)).values, own, atol=1e-4 * np.abs(own).max()
+    )
 
 
 def test_a_state_of_another_kind_of_planner_is_refused():
@@ -135,25 +145,25 @@ def test_a_state_of_another_kind_of_planner_is_refused():
     finer = eqx.tree_at(lambda p: p.grid, planner, Grid(31), is_leaf=lambda x: isinstance(x, Grid))
     scans = scan(SOLIDS["ball"], raw.camera, POSES[0])
     for made_by, used_by in ((raw, planner), (planner, finer)):
-        state = made_by.init(scans, POSES[0])
+        evidence = made_by.init(POSES[0], scans)
         for use in (
             lambda p, s: p.observe(s, POSES[0], scans),
             lambda p, s: p.sample_surfaces(s, jax.random.key(0)),
             lambda p, s: p.posterior(s),
         ):
-            with pytest.raises(ValueError, match="make the state with this planner"):
-                use(used_by, state)
+            with pytest.raises(ValueError, match="make the evidence with this planner"):
+                use(used_by, evidence)
 
 
 def test_what_was_seen_empty_stays_so():
     planner = planner_of()
-    state = planner.init(scan(SOLIDS["ball"], planner.camera, POSES[0]), POSES[0])
+    evidence = planner.init(POSES[0], scan(SOLIDS["ball"], planner.camera, POSES[0]))
     blind = scan(SOLIDS["ball"], planner.camera, POSES[1])
     blind = PointCloud(blind.points, blind.normals, blind.mask & False, blind.missed & False)
-    np.testing.assert_array_equal(planner.observe(state, POSES[1], blind).seen_empty, state.seen_empty)
+    np.testing.assert_array_equal(planner.observe(evidence, POSES[1], blind).seen_empty, evidence.seen_empty)
     both = np.asarray(after_both_sides(planner, SOLIDS["ball"]).seen_empty)
-    assert both[np.asarray(state.seen_empty)].all()
-    assert both.sum() > state.seen_empty.sum()
+    assert both[np.asarray(evidence.seen_empty)].all()
+    assert both.sum() > evidence.seen_empty.sum()
 
 
 SHEET = SDFSurface(BoxSolid([0.6, 0.6, 0.01]))
@@ -178,9 +188,9 @@ def test_carved_samples_keep_a_thin_sheet_that_was_seen_from_both_sides():
     model = GeometricSPSR(truncation=12, lengthscale=0.1)
     planner, raw = (planner_of(carving, model=model) for carving in (Carving(), None))
     sheet = SDFSurface(BoxSolid([0.6, 0.6, 0.04]))
-    state = after_both_sides(planner, sheet, ABOVE_AND_BELOW)
-    values = raw.sample_surfaces(state, jax.random.key(1)).values
-    carved = carve(values, state.seen_empty | planner.carving.outside(SMALL_GRID))
+    evidence = after_both_sides(planner, sheet, ABOVE_AND_BELOW)
+    values = raw.sample_surfaces(evidence, jax.random.key(1)).values
+    carved = carve(values, evidence.seen_empty | planner.imagination.carving.outside(SMALL_GRID))
     narrow, poses = Camera(height=10, width=10, fov=0.35), look_at(jnp.asarray([[0.0, 0.0, 2.5], [0.0, 0.0, -2.5]]))
     surfaces = GridSurface.from_values(jnp.concatenate([values, carved]), 0.0, SMALL_GRID)
     clouds = scan_samples(surfaces, narrow, poses)
@@ -199,10 +209,10 @@ def test_a_scan_of_another_camera_needs_that_camera():
     assert np.ptp(column) > 25
     assert np.ptp(row) > 10
     np.testing.assert_array_equal(planner.init(seen, pose, camera=other).seen_empty, expected)
-    state = planner.init(scan(SOLIDS["ball"], planner.camera, POSES[0]), POSES[0])
-    after = planner.observe(state, pose, seen, camera=other)
-    np.testing.assert_array_equal(after.seen_empty, expected | np.asarray(state.seen_empty))
-    for tell in (lambda: planner.init(seen, pose), lambda: planner.observe(state, pose, seen)):
+    evidence = planner.init(POSES[0], scan(SOLIDS["ball"], planner.camera, POSES[0]))
+    after = planner.observe(evidence, pose, seen, camera=other)
+    np.testing.assert_array_equal(after.seen_empty, expected | np.asarray(evidence.seen_empty))
+    for tell in (lambda: planner.init(pose, seen), lambda: planner.observe(evidence, pose, seen)):
         with pytest.raises(ValueError, match=r"scan has 720 rays but the camera 40 x 40: give the camera that took it"):
             tell()
 
@@ -212,12 +222,12 @@ def test_an_image_of_another_view_is_refused():
     planner = planner_of()
     seen = scan(SOLIDS["ball"], planner.camera, POSES[0])
     noisy = SensorNoise(0.03, 0.03)(seen, jax.random.key(0))
-    assert planner.init(noisy, POSES[0]).num_views == 1
+    assert planner.init(POSES[0], noisy).num_views == 1
     wide = scan(SOLIDS["ball"], Camera(height=40, width=40, fov=1.2), POSES[0])
     turned = jax.tree.map(lambda leaf: leaf[::-1], seen)
     for wrong, pose in ((wide, POSES[0]), (seen, POSES[1]), (turned, POSES[0])):
         with pytest.raises(ValueError, match=r"seen [\d.inf]+ pixels \(median\) from where its rows say"):
-            planner.init(wrong, pose)
+            planner.init(pose, wrong)
 
 
 def test_a_cloud_that_is_no_image_carves_nothing():
@@ -225,10 +235,10 @@ def test_a_cloud_that_is_no_image_carves_nothing():
     points = scan(SOLIDS["ball"], Camera(height=9, width=9), POSES[0])
     cloud = PointCloud.from_arrays(*points.to_numpy())
     assert cloud.missed is None
-    state = planner.init(cloud, POSES[0])
-    assert not state.seen_empty.any()
-    assert not planner.observe(state, POSES[1], cloud).seen_empty.any()
-    unknown = planner.init(scan(SOLIDS["ball"], planner.camera, POSES[0]))
+    evidence = planner.init(POSES[0], cloud)
+    assert not evidence.seen_empty.any()
+    assert not planner.observe(evidence, POSES[1], cloud).seen_empty.any()
+    unknown = planner.init(None, scan(SOLIDS["ball"], planner.camera, POSES[0]))
     assert not unknown.seen_empty.any(), "nothing is known of a scan from an unknown pose"
 
 
@@ -241,17 +251,17 @@ def test_an_object_larger_than_its_volume_is_refused_and_one_that_fits_is_not():
 
     small, fits = boxed(0.3), boxed(0.6)
     far = planner_of()
-    assert int(fits.observe(fits.init(noisy, POSES[0]), POSES[0], noisy).num_views) == 2
+    assert int(fits.observe(fits.init(POSES[0], noisy), POSES[0], noisy).num_views) == 2
     speck = PointCloud.from_arrays([[0.0, 0.0, 0.1]], [[0.0, 0.0, 1.0]])
-    for tell in (lambda: small.init(noisy, POSES[0]), lambda: small.observe(small.init(speck), POSES[0], noisy)):
+    for tell in (lambda: small.init(POSES[0], noisy), lambda: small.observe(small.init(None, speck), POSES[0], noisy)):
         with pytest.raises(
             ValueError, match=r"\d+ of \d+ .* up to 0\.\d+ outside the volume.*declare a larger one, Carving\(Box"
         ):
             tell()
     edge = PointCloud.from_arrays([[0.0, 0.0, 1.25 + 2.1 * SMALL_GRID.spacing]], [[0.0, 0.0, 1.0]])
     with pytest.raises(ValueError, match=r"outside the volume"):
-        far.init(edge)
-    np.testing.assert_array_equal(planner_of(carving=None).init(edge).cloud.count, 1)
+        far.init(None, edge)
+    np.testing.assert_array_equal(planner_of(carving=None).init(None, edge).cloud.count, 1)
     points = np.concatenate([0.1 * RNG.normal(size=(299, 3)), np.asarray(edge.points)])
     stray = PointCloud.from_arrays(points, np.tile([0.0, 0.0, 1.0], (300, 1)))
-    np.testing.assert_array_equal(far.init(stray).cloud.count, 300)
+    np.testing.assert_array_equal(far.init(None, stray).cloud.count, 300)

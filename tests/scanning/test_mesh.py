@@ -261,7 +261,7 @@ TURN = trimesh.transformations.rotation_matrix(0.7, (1.0, 2.0, -0.5))
 def test_the_reach_and_thickness_of_a_turned_box_are_its_diagonal_and_least_side(sides):
     shape = trimesh.creation.box(sides, transform=TURN)
     mesh = TriangleMesh.from_arrays(shape.vertices, shape.faces)
-    assert mesh.reach == pytest.approx(0.5 * np.linalg.norm(sides) * mesh.frame.scale)
+    assert mesh.bounding_radius == pytest.approx(0.5 * np.linalg.norm(sides) * mesh.frame.scale)
     # All directions of a cube are alike: its least extent is between its side and its diagonal.
     if len({*sides}) == 3:
         assert mesh.thickness == pytest.approx(min(sides) * mesh.frame.scale, rel=1e-6)

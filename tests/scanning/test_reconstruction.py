@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxnbv.scanning.reconstruction import has_poisson, mean_mesh, screened_poisson
 from jaxtyping import Array, Float
 
 import jaxnbv as nbv
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.pose import fibonacci_sphere
-from jaxnbv.scanning.reconstruction import carved_mesh, has_poisson, mean_mesh, screened_poisson
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.surfaces import SurfaceModel, SurfacePosterior
 
@@ -91,8 +91,14 @@ def test_what_was_seen_empty_is_not_meshed():
 
     def mesh(carving):
         search = nbv.FarthestView(nbv.SphereCandidates(8))
-        planner = nbv.Planner(Balls(), camera, nbv.Coverage(), search, 1, nbv.Grid(30), 4000, carving=carving)
-        return carved_mesh(planner, planner.init(nbv.scan(seen, camera, pose), pose))
+        planner = nbv.Planner(
+            nbv.Coverage(),
+            search,
+            camera,
+            nbv.Imagination(Balls(), grid=nbv.Grid(30), num_samples=1, carving=carving),
+            capacity=4000,
+        )
+        return planner.imagination.mean_mesh(planner.init(pose, nbv.scan(seen, camera, pose)))
 
     (ball,) = mesh(nbv.Carving()).to_trimesh().split()
     np.testing.assert_allclose(np.linalg.norm(ball.vertices - [-0.6, 0.0, 0.0], axis=1), 0.5, atol=0.03)

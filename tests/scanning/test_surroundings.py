@@ -132,9 +132,9 @@ def planner_of(search, surroundings=None, **changes):
 def test_imagined_surfaces_end_at_the_table():
     surroundings = Surroundings((TABLE,))
     planner = planner_of(DiscreteSearch(8), surroundings)
-    state = planner.init(scan(BALL, planner.camera, POSES[2]), POSES[2])
-    values = np.asarray(planner.sample_surfaces(state, KEY).values)
-    below = np.asarray(planner.grid.axis) < -0.5 - 1e-6
+    evidence = planner.init(POSES[2], scan(BALL, planner.camera, POSES[2]))
+    values = np.asarray(planner.imagination.sample(evidence, KEY).values)
+    below = np.asarray(planner.imagination.grid.axis) < -0.5 - 1e-6
     assert (values[:, :, below] > 0).all()
     assert (values < 0).any()
 
@@ -145,7 +145,7 @@ def test_views_are_worth_what_the_obstacles_leave_to_see():
     first = look_at((0.0, 0.1, 2.4))
     for surroundings, seen in ((None, True), (Surroundings((WALL,)), False)):
         planner = planner_of(DiscreteSearch(candidates), surroundings)
-        proposal = planner.propose(planner.init(scan(BALL, planner.camera, first), first), KEY)
+        proposal = planner.propose(planner.init(first, scan(BALL, planner.camera, first)), KEY)
         assert (float(proposal.values[0]) > 0) == seen
         assert float(proposal.values[1]) > 0
 
@@ -168,9 +168,9 @@ def test_no_camera_stands_too_near_to_what_was_seen(search):
     near, far = SphereCandidates(20, radius=1.1).poses(), SphereCandidates(20, radius=2.5).poses()
     both = jax.tree.map(lambda *rows: jnp.concatenate(rows), near, far)
     planner = planner_of(type(search)(both), Surroundings(clearance=0.5), capacity=400)
-    state = planner.init(scan(BALL, planner.camera, POSES[2]), POSES[2])
-    values = np.asarray(planner.propose(state, KEY).values)
-    points = state.cloud.to_numpy()[0]
+    evidence = planner.init(POSES[2], scan(BALL, planner.camera, POSES[2]))
+    values = np.asarray(planner.propose(evidence, KEY).values)
+    points = evidence.cloud.to_numpy()[0]
     distance = np.linalg.norm(np.asarray(both.position)[:, None] - points[None], axis=-1).min(axis=1)
     np.testing.assert_array_equal(np.isneginf(values), distance < 0.5)
     assert 0 < (distance < 0.5).sum() < 20
@@ -182,8 +182,8 @@ def test_on_request_cameras_stand_in_space_that_was_seen_empty_alone():
     planner = planner_of(DiscreteSearch(GivenPoses(look_at(np.array([ahead, aside, beyond])))))
     for seen_only, expected in ((False, [False, False, False]), (True, [False, True, False])):
         own = planner_of(planner.search, Surroundings(seen_only=seen_only))
-        state = own.init(scan(BALL, own.camera, first), first)
-        np.testing.assert_array_equal(np.isneginf(np.asarray(own.propose(state, KEY).values)), expected)
+        evidence = own.init(first, scan(BALL, own.camera, first))
+        np.testing.assert_array_equal(np.isneginf(np.asarray(own.propose(evidence, KEY).values)), expected)
 
 
 def test_a_search_by_gradient_stays_out_of_obstacles():
@@ -191,7 +191,7 @@ def test_a_search_by_gradient_stays_out_of_obstacles():
     starts = look_at(2.3 * np.array([[np.cos(a), -0.05, np.sin(a)] for a in (0.3, 1.9, 3.5, 5.1)]))
     search = GradientSearch(dof=2, num_starts=4, iterations=12, learning_rate=0.05, candidates=starts, turned=False)
     table = HalfSpace([0.0, -0.2, 0.0], [0.0, 1.0, 0.0])
-    state_of = lambda planner: planner.init(scan(BALL, planner.camera, POSES[2]), POSES[2])  # noqa: E731
+    state_of = lambda planner: planner.init(POSES[2], scan(BALL, planner.camera, POSES[2]))  # noqa: E731
     planner = planner_of(search, Surroundings((table,), clearance=0.4))
     proposal = planner.propose(state_of(planner), KEY)
     assert float(proposal.pose.position[1]) >= 0.2 - 1e-5
@@ -202,9 +202,9 @@ def test_a_search_by_gradient_stays_out_of_obstacles():
 
 def test_where_nothing_is_open_it_says_so():
     planner = planner_of(DiscreteSearch(10), Surroundings(clearance=50.0))
-    state = planner.init(scan(BALL, planner.camera, POSES[2]), POSES[2])
+    evidence = planner.init(POSES[2], scan(BALL, planner.camera, POSES[2]))
     with pytest.raises(InputError, match="all 10 candidates have been visited, or no camera may stand there"):
-        planner.propose(state, KEY)
+        planner.propose(evidence, KEY)
 
 
 def test_from_the_world_to_the_scene():

@@ -11,6 +11,7 @@ import pytest
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose, look_at
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.planner import Planner
 from jaxnbv.search import ConstrainedPoses, FreePoses, GradientSearch, HybridSearch, Problem, SpherePoses
 from jaxnbv.search.ascent import Ascent
@@ -88,20 +89,20 @@ def test_adam_is_optax_in_a_plain_loop(space, x64):
     problem, start = known(), look_at(jnp.asarray([[1.2, 1.0, 1.9]]))
     ways = eqx.filter_jit(lambda problem: Ascent(space, 1, 30, 0.02).climb(problem, start).trajectories)(problem)
     optimiser, parameters = optax.adam(0.02), jnp.zeros(space.num_parameters)
-    state = optimiser.init(parameters)
+    evidence = optimiser.init(parameters)
 
     def loss(parameters):
         pose = space.retract(start[0], parameters)
         return -problem.acquisition(pose[None])[0], pose
 
     @jax.jit
-    def turn(parameters, state):
+    def turn(parameters, evidence):
         gradient, pose = jax.grad(loss, has_aux=True)(parameters)
-        updates, state = optimiser.update(gradient, state)
-        return pose, parameters + updates, state
+        updates, evidence = optimiser.update(gradient, evidence)
+        return pose, parameters + updates, evidence
 
     for step in range(31):
-        expected, parameters, state = turn(parameters, state)
+        expected, parameters, evidence = turn(parameters, evidence)
         np.testing.assert_allclose(ways.poses.position[0, step], expected.position, atol=1e-6)
         np.testing.assert_allclose(ways.poses.rotation[0, step], expected.rotation, atol=1e-6)
     assert float(jnp.abs(ways.poses.position[0, -1] - start.position[0]).max()) > 0.1
@@ -141,4 +142,4 @@ def test_other_degrees_of_freedom_are_refused():
 def test_constraints_wider_than_the_image_are_refused():
     search = GradientSearch(space=ConstrainedPoses(off_axis=0.3))
     with pytest.raises(ValueError, match=r"off_axis is 0\.3 rad but the image ends 0\.262 rad"):
-        Planner(GeometricSPSR(), Camera(), Coverage(), search)
+        Planner(Coverage(), search, imagination=Imagination(GeometricSPSR()))

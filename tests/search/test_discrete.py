@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv.acquisition import expected_score
+from jaxnbv.acquisition import expected_value
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
@@ -43,7 +43,7 @@ def search(problem, seed=0):
 
 def test_the_argmax_of_values_recomputed_one_by_one(problem):
     proposal = search(problem)
-    value, values = eqx.filter_jit(expected_score), []
+    value, values = eqx.filter_jit(expected_value), []
     for position in np.asarray(fibonacci_sphere(12, 2.5)):
         pose = look_at(position[None])
         values.append(value(Coverage(), problem.cloud, problem.surfaces, CAMERA, pose)[0])
@@ -119,7 +119,7 @@ def test_values_that_rounding_may_turn_round_tie_and_the_first_is_taken(problem,
 
 def test_standard_errors_are_those_of_the_scores_sample_by_sample(problem):
     proposal = search(problem)
-    value, poses = eqx.filter_jit(expected_score), look_at(fibonacci_sphere(12, 2.5))
+    value, poses = eqx.filter_jit(expected_value), look_at(fibonacci_sphere(12, 2.5))
     scores = np.array(
         [
             value(
@@ -141,15 +141,15 @@ def test_standard_errors_are_those_of_the_scores_sample_by_sample(problem):
     np.testing.assert_allclose(proposal.difference_errors, of_differences, rtol=1e-3, atol=1e-5)
     for errors in (0.5, 2.0, 5.0):
         level = -differences.mean(axis=0) <= errors * of_differences
-        np.testing.assert_array_equal(proposal.is_level(errors), level)
-    assert proposal.others_level == np.sum(-differences.mean(axis=0) <= 2.0 * of_differences) - 1
-    assert 0 < proposal.others_level < 11
+        np.testing.assert_array_equal(proposal.tied_with_best(errors), level)
+    assert proposal.num_tied == np.sum(-differences.mean(axis=0) <= 2.0 * of_differences) - 1
+    assert 0 < proposal.num_tied < 11
 
 
 def test_a_visited_view_is_level_with_none_and_of_one_sample_nothing_is_known(problem):
     first = search(problem)
     again = search(visit(problem, first.pose))
-    assert not again.is_level()[np.argmax(first.values)]
+    assert not again.tied_with_best()[np.argmax(first.values)]
     alone = eqx.tree_at(lambda p: p.surfaces, problem, jax.tree.map(lambda leaf: leaf[:1], problem.surfaces))
-    assert search(alone).others_level is None
+    assert search(alone).num_tied is None
     np.testing.assert_array_equal(np.isnan(search(alone).standard_errors), True)

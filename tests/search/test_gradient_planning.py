@@ -12,6 +12,7 @@ from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import look_at
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import simulate
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, scan
@@ -31,7 +32,7 @@ SMALL = {"num_starts": 2, "iterations": 3, "num_candidates": 4}
 def planner_of(search, score=None):
     score = Coverage() if score is None else score
     model, camera = GeometricSPSR(truncation=6, lengthscale=0.05), Camera(height=6, width=6)
-    return Planner(model, camera, score, search, num_samples=2, grid=Grid(20), capacity=64, max_views=6)
+    return Planner(score, search, camera, Imagination(model, grid=Grid(20), num_samples=2), capacity=64, max_views=6)
 
 
 PLANNER = planner_of(GradientSearch(dof=2, **SMALL))
@@ -144,9 +145,9 @@ def test_a_derivative_that_is_not_a_number_is_reported(space):
     """The square root's value at zero is finite, its slope is not."""
     score = ExpectedUtilityImprovement(lambda cloud: jnp.sqrt(0.0 * jnp.sum(cloud.points**2)) + 1.0 * cloud.count)
     planner = planner_of(GradientSearch(space=space, **SMALL), score)
-    state = planner.init(scan(SCENE, planner.camera, FIRST), FIRST)
+    evidence = planner.init(FIRST, scan(SCENE, planner.camera, FIRST))
     with pytest.raises(ValueError, match=r"not a number.*derivatives"):
-        planner.propose(state, KEY)
+        planner.propose(evidence, KEY)
 
 
 class Side(eqx.Module):
@@ -160,8 +161,8 @@ class Side(eqx.Module):
 def test_cross_entropy_within_constraints_ends_on_the_object():
     search = GradientSearch(space=ConstrainedPoses(), num_starts=3, iterations=10, num_candidates=8, learning_rate=0.05)
     planner = planner_of(search, CrossEntropy(Side(), num_points=64))
-    state = planner.init(scan(SCENE, planner.camera, FIRST), FIRST)
-    proposal = planner.propose(state, KEY)
+    evidence = planner.init(FIRST, scan(SCENE, planner.camera, FIRST))
+    proposal = planner.propose(evidence, KEY)
     ways = proposal.trajectories
     assert float(proposal.value) == max(float(ways.values.max()), float(proposal.values.max()))
     assert float(ways.values.max()) > float(ways.values[:, 0].max())

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv.acquisition import Score, expected_score
+from jaxnbv.acquisition import Score, expected_value
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
@@ -41,7 +41,7 @@ def problem():
 def table(problem):
     """Scores by sample and candidate."""
     poses = look_at(fibonacci_sphere(CANDIDATES, 2.5))
-    each = eqx.filter_jit(expected_score)
+    each = eqx.filter_jit(expected_value)
 
     def of_sample(sample):
         surface = jax.tree.map(lambda leaf: leaf[sample : sample + 1], problem.surfaces)

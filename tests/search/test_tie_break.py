@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from test_discrete import CAMERA, problem, visit
 
-from jaxnbv.acquisition import Score, Several, expected_score
+from jaxnbv.acquisition import Score, Several, expected_value
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.planning.travel import ValueMinusCost, arc_length
@@ -47,7 +47,7 @@ def search(problem, second, kind=TieBreakSearch):
 
 
 def sample_by_sample(score, problem):
-    poses, value = look_at(fibonacci_sphere(12, 2.5)), eqx.filter_jit(expected_score)
+    poses, value = look_at(fibonacci_sphere(12, 2.5)), eqx.filter_jit(expected_value)
     one = [jax.tree.map(lambda leaf, s=s: leaf[s : s + 1], problem.surfaces) for s in range(3)]
     return np.array([value(score, problem.cloud, surface, CAMERA, poses) for surface in one], np.float64)
 
@@ -90,7 +90,7 @@ def test_visited_views_are_not_chosen(problem):
     for _ in range(3):
         taken.append(search(visit(told, *taken) if taken else told, Height()).pose)
     heights = np.sort(sample_by_sample(Height(), problem).mean(axis=0))[::-1]
-    of = [expected_score(Height(), problem.cloud, problem.surfaces, CAMERA, pose[None])[0] for pose in taken]
+    of = [expected_value(Height(), problem.cloud, problem.surfaces, CAMERA, pose[None])[0] for pose in taken]
     np.testing.assert_allclose(of, heights[:3], rtol=1e-5)
 
 

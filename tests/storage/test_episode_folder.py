@@ -51,10 +51,10 @@ def test_a_view_keeps_which_rays_missed_and_one_of_an_earlier_version_reads_with
 
 def state_after(episode):
     first, *others = episode.views
-    state = episode.planner.init(first.scan, first.pose)
+    evidence = episode.planner.init(first.pose, first.scan)
     for view in others:
-        state = episode.planner.observe(state, view.pose, view.scan)
-    return state
+        evidence = episode.planner.observe(evidence, view.pose, view.scan)
+    return evidence
 
 
 def test_the_record_says_what_made_it(finished):

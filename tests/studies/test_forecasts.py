@@ -12,7 +12,6 @@ from jaxnbv import (
     Box,
     Camera,
     Coverage,
-    DiscreteSearch,
     GeometricSPSR,
     Grid,
     GridSurface,
@@ -22,6 +21,7 @@ from jaxnbv import (
     SDFSurface,
     look_at,
 )
+from jaxnbv.imagination import Imagination
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.studies.forecasts import (
     Truth,
@@ -112,7 +112,9 @@ def test_share_of_best_is_the_worth_of_the_candidate_that_is_chosen():
 @pytest.fixture(scope="module")
 def planner():
     model, camera = GeometricSPSR(lengthscale=0.3, truncation=4), Camera(height=8, width=8)
-    return Planner(model, camera, Coverage(), DiscreteSearch(), 2, GRID, capacity=16, carving=None)
+    return Planner(
+        Coverage(), camera=camera, imagination=Imagination(model, grid=GRID, num_samples=2, carving=None), capacity=16
+    )
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +132,7 @@ def _balls(*radii):
 
 def _state(planner):
     # One point on the right: the ball's left is the farthest from it, its right the nearest.
-    return planner.init(PointCloud.from_arrays([[1.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]]))
+    return planner.init(None, PointCloud.from_arrays([[1.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]]))
 
 
 NOTHING = np.zeros((25, 25, 25), bool)
@@ -181,11 +183,11 @@ def test_a_surface_that_encloses_nothing_has_no_brier_score(planner, truth):
 
 
 def test_nothing_is_compiled_for_another_object(planner, truth, compilations):
-    state, surfaces = _state(planner), _balls(0.5, 0.75)
-    judge(planner, state, surfaces, truth, NOTHING)
+    evidence, surfaces = _state(planner), _balls(0.5, 0.75)
+    judge(planner, evidence, surfaces, truth, NOTHING)
     other = jax.tree.map(jnp.array, truth)
     compilations.clear()
-    judge(planner, state, surfaces, other, NOTHING)
+    judge(planner, evidence, surfaces, other, NOTHING)
     assert not compilations
 
 

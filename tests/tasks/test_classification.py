@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from opinions import drawn_cloud, linear, linear_in_numpy
 
-from jaxnbv.acquisition import ExpectedUtilityImprovement, expected_score
+from jaxnbv.acquisition import ExpectedUtilityImprovement, expected_value
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate, farthest_point_subsample
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, GridSurface, scan
 from jaxnbv.search import DiscreteSearch, FarthestView
@@ -212,7 +213,7 @@ def test_expected_scores_against_a_loop(x64):
         (CrossEntropy(linear), crossed),
         (ExpectedUtilityImprovement(NegativeEntropy(linear)), reduced),
     ):
-        found = expected_score(score, data, surfaces, CAMERA, poses)
+        found = expected_value(score, data, surfaces, CAMERA, poses)
         np.testing.assert_allclose(found, expected.mean(axis=0), rtol=1e-8, atol=1e-12)
 
 
@@ -272,6 +273,6 @@ def test_what_is_no_log_probability_is_named_at_the_first_scan(classifier, messa
         ExpectedUtilityImprovement(NegativeEntropy(classifier)),
     ):
         with pytest.raises(InputError, match=message):
-            Planner(model, camera, score, DiscreteSearch(7), carving=None).init(data)
+            Planner(score, DiscreteSearch(7), camera, Imagination(model, carving=None)).init(None, data)
     # Asked for nothing, it says nothing.
-    Planner(model, camera, CrossEntropy(classifier), FarthestView(7), carving=None).init(data)
+    Planner(CrossEntropy(classifier), FarthestView(7), camera, Imagination(model, carving=None)).init(None, data)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv.acquisition import expected_score
+from jaxnbv.acquisition import expected_value
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
@@ -53,7 +53,7 @@ def test_the_acquisition_against_brute_force_over_all_scans():
         surface = jax.tree.map(lambda leaf, s=s: leaf[s], surfaces)
         expected[s, p] = chamfer(scan(surface, CAMERA, poses[p]).to_numpy()[0], data.to_numpy()[0])
     assert expected.min() > 0
-    found = expected_score(Coverage(), data, surfaces, CAMERA, poses)
+    found = expected_value(Coverage(), data, surfaces, CAMERA, poses)
     np.testing.assert_allclose(found, expected.mean(axis=0), rtol=1e-4)
 
 

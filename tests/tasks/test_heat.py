@@ -10,11 +10,12 @@ import pytest
 import robust_laplacian
 import trimesh
 
-from jaxnbv.acquisition import ExpectedUtilityImprovement, expected_score
+from jaxnbv.acquisition import ExpectedUtilityImprovement, expected_value
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, GridSurface, TriangleMesh, scan
 from jaxnbv.search import GradientSearch
@@ -141,10 +142,10 @@ def test_gradients_are_refused():
         jax.grad(lambda points: utility(eqx.tree_at(lambda c: c.points, cloud, points)))(cloud.points)
     with pytest.raises(InputError, match="use DiscreteSearch"):
         Planner(
-            GeometricSPSR(truncation=4, lengthscale=0.2),
-            CAMERA,
             ExpectedUtilityImprovement(utility),
             GradientSearch(dof=2),
+            CAMERA,
+            Imagination(GeometricSPSR(truncation=4, lengthscale=0.2)),
         )
 
 
@@ -157,7 +158,7 @@ def test_expected_improvements_by_hand():
     points = sphere(400)
     data = cloud_of(points[points[:, 2] > 0.8], capacity=100)
     utility = utility_of(HEAT, workers=2)
-    found = eqx.filter_jit(expected_score)(ExpectedUtilityImprovement(utility), data, surfaces, CAMERA, poses)
+    found = eqx.filter_jit(expected_value)(ExpectedUtilityImprovement(utility), data, surfaces, CAMERA, poses)
     scans = eqx.filter_jit(eqx.filter_vmap(scan, in_axes=(0, None, None)))(surfaces, CAMERA, poses)
     known, seen = data.to_numpy()[0], [[scans[s, i].to_numpy()[0] for i in range(5)] for s in range(2)]
     unions = [[np.concatenate([known, view]).astype(np.float64) for view in views] for views in seen]

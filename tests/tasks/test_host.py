@@ -11,6 +11,7 @@ from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid
 from jaxnbv.search import DiscreteSearch
@@ -105,8 +106,10 @@ def test_a_host_classifier_in_a_planners_search():
     model, search = GeometricSPSR(lengthscale=0.05, truncation=8), DiscreteSearch(7)
     proposals = []
     for classifier in (linear, HostClassifier(Host(), 4)):
-        planner = Planner(model, CAMERA, CrossEntropy(classifier), search, 2, Grid(16, 3.0), 64)
-        proposals.append(planner.propose(planner.init(data), jax.random.key(3)))
+        planner = Planner(
+            CrossEntropy(classifier), search, CAMERA, Imagination(model, grid=Grid(16, 3.0), num_samples=2), capacity=64
+        )
+        proposals.append(planner.propose(planner.init(None, data), jax.random.key(3)))
     np.testing.assert_allclose(proposals[0].values, proposals[1].values, atol=1e-4)
     assert np.ptp(np.asarray(proposals[0].values)) > 1e-2
     np.testing.assert_array_equal(proposals[0].pose.position, proposals[1].pose.position)

@@ -27,7 +27,7 @@ class Metres:
         return nbv.Answer(("height", "points"), np.array([float(self(cloud)), float(cloud.count)]), "{:.1f}")
 
 
-class Unnamed(nbv.Score):
+class Unnamed(nbv.Acquisition):
     def context(self, cloud):
         return None
 
@@ -82,13 +82,15 @@ def test_a_search_that_does_not_ask_the_score_says_so():
 )
 def test_an_impossible_utility_is_named_at_the_first_scan(utility, message):
     score = nbv.ExpectedUtilityImprovement(utility)
-    planner = nbv.Planner(nbv.GeometricSPSR(0.05, truncation=8), nbv.Camera(), score, nbv.DiscreteSearch(4), capacity=5)
+    planner = nbv.Planner(
+        score, nbv.DiscreteSearch(4), imagination=nbv.Imagination(nbv.GeometricSPSR(0.05, truncation=8)), capacity=5
+    )
     with pytest.raises(nbv.InputError, match=message):
-        planner.init(CLOUD)
+        planner.init(None, CLOUD)
 
 
 def test_under_jit_nothing_is_asked():
     score = nbv.ExpectedUtilityImprovement(lambda cloud: jnp.nan * jnp.sum(cloud.mask))
     model = nbv.GeometricSPSR(0.05, truncation=8)
-    planner = nbv.Planner(model, nbv.Camera(), score, nbv.DiscreteSearch(4), capacity=5, carving=None)
+    planner = nbv.Planner(score, nbv.DiscreteSearch(4), imagination=nbv.Imagination(model, carving=None), capacity=5)
     assert jax.eval_shape(planner.init, CLOUD).cloud.capacity == 5

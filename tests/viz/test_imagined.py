@@ -39,7 +39,11 @@ class BallModel(nbv.SurfaceModel):
 @pytest.fixture(scope="module")
 def episode():
     planner = nbv.Planner(
-        BallModel(), CAMERA, nbv.Coverage(), nbv.DiscreteSearch(12), 5, nbv.Grid(64), 1000, carving=None
+        nbv.Coverage(),
+        nbv.DiscreteSearch(12),
+        CAMERA,
+        nbv.Imagination(BallModel(), grid=nbv.Grid(64), num_samples=5, carving=None),
+        capacity=1000,
     )
     first, none = nbv.look_at((0.0, 0.0, 2.5)), nbv.SensorNoise(0.0, 0.0)
     scene = nbv.SDFSurface(Sphere(TRUE_RADIUS))
@@ -48,7 +52,7 @@ def episode():
 
 @pytest.fixture(scope="module")
 def seen(episode):
-    return imagined(episode, 1, episode.state_after(1))
+    return imagined(episode, 1, episode.evidence_after(1))
 
 
 def ball_depth(radius, camera, pose):
@@ -74,7 +78,7 @@ def test_the_samples_are_those_of_the_step(episode, seen):
     assert len(seen.samples) == 4
     found = [middle(sample.depth) for sample in seen.samples]
     np.testing.assert_allclose(found, 2.5 - radii(episode)[:4], atol=2e-3)
-    assert imagined(episode, 0, episode.state_after(1)) is None
+    assert imagined(episode, 0, episode.evidence_after(1)) is None
 
 
 def test_expected_and_seen_depth_are_those_of_balls(episode, seen):
@@ -121,7 +125,7 @@ def test_what_was_seen_before_is_told_from_what_was_not(episode):
 
 def test_without_truth_it_is_beside_what_was_then_seen(episode):
     real = eqx.tree_at(lambda e: e.scene, episode, None)
-    seen = imagined(real, 1, episode.state_after(1))
+    seen = imagined(real, 1, episode.evidence_after(1))
     assert not seen.is_true
     assert seen.seen.depth.shape == (32, 32)
     assert seen.runner_up.seen is None

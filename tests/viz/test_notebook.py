@@ -47,7 +47,7 @@ def test_each_is_a_small_picture_and_a_line(episode):
         (scan, f"{int(scan.count)} points of 144 rays, {144 - int(scan.count)} met nothing; box "),
         (proposal, f"value {float(proposal.value):.4g}"),
         (episode, f"2 views by expected coverage gain, {count:,} points"),
-        (episode.planner.model.condition(episode.cloud), "level "),
+        (episode.planner.imagination.model.condition(episode.cloud), "level "),
     )
     for shown, expected in facts:
         size, caption = parts(shown)
@@ -69,7 +69,7 @@ def test_a_cloud_is_seen_from_where_its_normals_look(episode):
 
 
 def test_the_slice_of_a_posterior_is_inside_the_ball(episode):
-    posterior = episode.planner.model.condition(episode.cloud)
+    posterior = episode.planner.imagination.model.condition(episode.cloud)
     (image,) = drawn(posterior).images
     inside = np.asarray(image.get_array())
     assert inside.shape == (48, 48)
@@ -97,7 +97,7 @@ def test_what_has_no_picture_has_its_facts():
 
 def test_an_episode_is_shown_in_a_strip(episode, monkeypatch):
     """Without surfaces, which take long; the figure is tested with the report's."""
-    monkeypatch.setattr("jaxnbv.viz.data.mean_surface", lambda planner, state: None)
+    monkeypatch.setattr("jaxnbv.viz.data.mean_surface", lambda planner, evidence: None)
     image = Image.open(io.BytesIO(episode.show(progress=False)._repr_png_()))
     assert image.width == 480
     assert image.height > 300

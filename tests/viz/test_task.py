@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxnbv.answers import Answer, number
 from small_run import small_run
 
 import jaxnbv as nbv
-from jaxnbv.answers import Answer, number
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.studies.scenes import Split, pyramid_scene
 from jaxnbv.tasks.classification import ClassAnswer
@@ -47,7 +47,7 @@ def run(score, scene, views=3):
 def plain(request):
     """Pictures of surfaces take long, and have nothing to do with the numbers."""
     patch = pytest.MonkeyPatch()
-    patch.setattr("jaxnbv.viz.data.mean_surface", lambda planner, state: None)
+    patch.setattr("jaxnbv.viz.data.mean_surface", lambda planner, evidence: None)
     yield
     patch.undo()
 

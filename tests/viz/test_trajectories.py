@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxnbv.answers import number
 from PIL import Image
 from small_run import CAMERA, small_run
 
 import jaxnbv as nbv
-from jaxnbv.answers import number
 from jaxnbv.cli.actions.lines import Lines
 from jaxnbv.geometry.pose import look_at
 from jaxnbv.planning.episode import view_keys
@@ -150,16 +150,16 @@ def test_a_map_of_too_few_candidates_is_made_anew_with_the_same_samples(few, few
     assert choice.map.values.shape == (MAP_VIEWS,)
     np.testing.assert_allclose(choice.map.directions, nbv.fibonacci_sphere(MAP_VIEWS, 1.0), atol=1e-6)
     seen, planner = few.views[1].proposal, few.planner
-    state = planner.init(few.views[0].scan, few.views[0].pose)
+    evidence = planner.init(few.views[0].pose, few.views[0].scan)
     # The same samples: at the candidates and on the ways they give what the search saw ...
     poses, values = joined((seen.candidates, seen.values), seen.trajectories.flat)
     np.testing.assert_allclose(step_values(few, 1, poses), values, rtol=1e-3)
     # ... and so do those drawn here, which give the map's values at its views; samples of another step do not.
     key = jax.random.split(jax.random.split(jax.random.fold_in(few.key, 1))[0])[0]
     poses = joined(poses, sphere_candidates(MAP_VIEWS))
-    score = eqx.filter_jit(nbv.expected_score)
+    score = eqx.filter_jit(nbv.expected_value)
     same, other = (
-        np.asarray(score(planner.acquisition, state.cloud, planner.sample_surfaces(state, k), CAMERA, poses))
+        np.asarray(score(planner.acquisition, evidence.cloud, planner.imagination.sample(evidence, k), CAMERA, poses))
         for k in (key, view_keys(few.key, 0)[0])
     )
     together = np.concatenate([values, choice.map.values])

@@ -27,7 +27,13 @@ def test_an_end_beyond_the_images_border_is_never_shown_as_certain():
     scene = nbv.SDFSurface(Capsule([-0.8, 0.0, 0.0], [0.8, 0.0, 0.0], 0.3))
     model = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=16))
     camera = nbv.Camera(height=24, width=24)
-    planner = nbv.Planner(model, camera, nbv.Coverage(), nbv.RandomView(30), 2, nbv.Grid(40), 1024)
+    planner = nbv.Planner(
+        nbv.Coverage(),
+        nbv.RandomView(30),
+        camera,
+        nbv.Imagination(model, grid=nbv.Grid(40), num_samples=2),
+        capacity=1024,
+    )
     first = nbv.look_at((-0.6, 0.0, 1.8), (-0.6, 0.0, 0.0))
     (view,) = report_data(
         nbv.simulate(planner, scene, first, 1, jax.random.key(0), progress=False), progress=False

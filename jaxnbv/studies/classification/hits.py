@@ -1,4 +1,4 @@
-"""When a sequence of views first gives the right class, gives it for good, or first shows what tells it.
+"""When a sequence of views first gives the right class, gives it for good, or first shows its cue.
 
 Views count from 1. A sequence that never does has no such time: None.
 """
@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Integer
 
 from jaxnbv.checks import AnyArray, require
 
-# What the studies call having seen it: rays of one scan that hit what tells the class.
-TELLING_PIXELS = 150
+# What the studies call having seen it: rays of one scan that hit the cue of the class.
+CUE_PIXELS = 150
 
 
 def first_hit(correct: Bool[AnyArray, " views"]) -> int | None:
@@ -27,8 +27,8 @@ def stable_hit(correct: Bool[AnyArray, " views"]) -> int | None:
     return view if view <= len(correct) else None
 
 
-def seen_view(pixels: Integer[AnyArray, " views"], threshold: int = TELLING_PIXELS) -> int | None:
-    """The first view in which at least `threshold` rays hit what tells the class; views do not add up."""
+def seen_view(pixels: Integer[AnyArray, " views"], threshold: int = CUE_PIXELS) -> int | None:
+    """The first view in which at least `threshold` rays hit the cue of the class; views do not add up."""
     return first_hit(np.asarray(pixels) >= threshold)
 
 
@@ -43,15 +43,15 @@ def cumulative_share(times: Sequence[int | None], views: int) -> Float[np.ndarra
 
 
 def random_seen_share(
-    pixels: Integer[AnyArray, " candidates"], first: int, views: int, threshold: int = TELLING_PIXELS
+    pixels: Integer[AnyArray, " candidates"], first: int, views: int, threshold: int = CUE_PIXELS
 ) -> Float[np.ndarray, " views"]:
-    """Exact probability that a random search has shown what tells the class by view 1, 2, ..., `views`.
+    """Exact probability that a random search has shown the cue of the class by view 1, 2, ..., `views`.
 
     After the first camera it takes the other N candidates in an order drawn uniformly without replacement. Of these M
     show it, so by view t it has missed them all with the hypergeometric probability
     C(N - M, t - 1) / C(N, t - 1). If the first camera shows it, the share is 1 throughout.
 
-    - `pixels`: for each candidate the rays of its true scan that hit what tells the class.
+    - `pixels`: for each candidate the rays of its true scan that hit the cue of the class.
     - `first`: the first camera, an index of the candidates.
 
     **Raises:** `ValueError` if there is no such candidate, or there are more views than candidates.

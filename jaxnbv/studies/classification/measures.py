@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnbv.studies.classification.hits import (
-    TELLING_PIXELS,
+    CUE_PIXELS,
     cumulative_share,
     first_hit,
     random_seen_share,
@@ -23,9 +23,9 @@ HITS_EXPLAINED = (
 )
 
 
-def seen_explained(telling: str) -> str:
+def seen_explained(cue: str) -> str:
     """What having seen it means."""
-    return f"{telling.capitalize()} seen: one of the views shows at least {TELLING_PIXELS} pixels of it."
+    return f"{cue.capitalize()} seen: one of the views shows at least {CUE_PIXELS} pixels of it."
 
 
 def _hit(time_of: Callable) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
@@ -43,11 +43,11 @@ def _hit(time_of: Callable) -> Callable[[Record, str], Float[np.ndarray, " views
     return of
 
 
-def _seen(telling: str) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
-    """Whether a view has shown what tells the class, by view; of random search the exact share over all orders."""
+def _seen(cue: str) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
+    """Whether a view has shown the cue of the class, by view; of random search the exact share over all orders."""
 
     def of(record: Record, method: str) -> Float[np.ndarray, " views"]:
-        runs, pixels = record["methods"][method]["runs"], f"{telling}_pixels"
+        runs, pixels = record["methods"][method]["runs"], f"{cue}_pixels"
         views = len(runs[0]["log_p"])
         if method == "random":
             return random_seen_share(np.array(record[pixels]), record["first"], views)
@@ -76,11 +76,11 @@ def diagnostic(name: str, title: str) -> Measure:
     return Measure(name, title, _diagnostic(name), first=2, digits=2, paired=False)
 
 
-def hits(telling: str = "") -> tuple[Measure, ...]:
-    """First and stable hit; and whether a view has shown what tells the class, where that is a part of the object."""
-    seen = Measure(telling, f"{telling.capitalize()} seen", _seen(telling), percent=True)
+def hits(cue: str = "") -> tuple[Measure, ...]:
+    """First and stable hit; and whether a view has shown the cue of the class, where that is a part of the object."""
+    seen = Measure(cue, f"{cue.capitalize()} seen", _seen(cue), percent=True)
     both = [Measure(f.__name__.partition("_")[0], _HIT_TITLES[f], _hit(f), percent=True) for f in _HIT_TITLES]
-    return (*both, seen) if telling else tuple(both)
+    return (*both, seen) if cue else tuple(both)
 
 
 _HIT_TITLES = {first_hit: "First hit", stable_hit: "Stable hit"}

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import scan
-from jaxnbv.studies.classification.hits import TELLING_PIXELS
+from jaxnbv.studies.classification.hits import CUE_PIXELS
 from jaxnbv.studies.classification.study import ClassificationStudy
 from jaxnbv.studies.engine.measures import Record, methods_of
 from jaxnbv.studies.engine.study import Scene
@@ -33,7 +33,7 @@ def write_pictures(
 ) -> list[Path]:
     """Write `views_<scene>.png` for the first scenes, not picked ones; return the paths.
 
-    A row a method, a column a view: the true surface in the sensor's field of view, tinted where it tells the class if
+    A row a method, a column a view: the true surface in the sensor's field of view, tinted where its cue is if
     only a part of the object does, and beneath it the predicted class with its probability once this view is known.
     Rows are cross-entropy, farthest view and uncertainty, those of them that the records hold, else all that they do.
 
@@ -55,14 +55,14 @@ def _picture(record: Record, study: ClassificationStudy, methods: Sequence[str],
     scene = study.scene(record["scene"])
     # Four rays a pixel.
     camera = Camera(height=2 * pixels, width=2 * pixels)
-    images = [[_image(scene, camera, pose, bool(study.telling)) for pose in poses] for poses in taken]
+    images = [[_image(scene, camera, pose, bool(study.cue)) for pose in poses] for poses in taken]
 
     # Inches: all methods share the first view, so it stands once, at the middle of the rows.
     tile, gap, below, left, top, margin = 1.25, 0.1, 0.36, 0.12, 0.8, 0.1 + 0.08 * max(map(len, methods))
     wide, tall = left + views * (tile + gap) + margin + 0.1, top + len(methods) * (tile + below)
     names = study.objects.classes
     title = f"Scene {record['scene']}, {record['framing']}: {names[record['label']]}"
-    framed = f"Framed: at least {TELLING_PIXELS} {study.telling} pixels. " if study.telling else ""
+    framed = f"Framed: at least {CUE_PIXELS} {study.cue} pixels. " if study.cue else ""
     caption = f"{framed}Beneath: prediction so far."
     tiles = Tiles(wide, tall, title, caption)
 
@@ -88,7 +88,7 @@ def _tile(
     axes: Axes, image: Float[np.ndarray, "h w 3"], label: int, run: dict, view: int, study: ClassificationStudy
 ) -> None:
     axes.imshow(image, interpolation="antialiased")
-    shows = bool(study.telling) and run[f"{study.telling}_pixels"][view] >= TELLING_PIXELS
+    shows = bool(study.cue) and run[f"{study.cue}_pixels"][view] >= CUE_PIXELS
     frame(axes, NEW if shows else LINE, 1.6 if shows else 0.8)
     guess = int(np.argmax(run["log_p"][view]))
     right = guess == label
@@ -107,13 +107,13 @@ def _tile(
 
 
 def _image(scene: Scene, camera: Camera, pose: Pose, tinted: bool) -> Float[np.ndarray, "h w 3"]:
-    """Lit from the sensor; four rays a pixel. Tinted where it tells the class."""
+    """Lit from the sensor; four rays a pixel. Tinted where its cue is."""
     seen = scan(scene.surface, camera, jax.tree.map(jnp.asarray, pose))
-    tells = np.asarray(scene.task.thing.tells(seen.points)) if tinted else np.zeros(len(seen.mask), bool)
+    on_cue = np.asarray(scene.task.thing.on_cue(seen.points)) if tinted else np.zeros(len(seen.mask), bool)
     points, normals, hit = (np.asarray(array) for array in (seen.points, seen.normals, seen.mask))
     rays = pose.position - points
     facing = np.where(hit, np.sum(rays * normals, axis=-1) / np.linalg.norm(rays, axis=-1), 0.0)
-    colours = np.where(tells[:, None], _TINTED, _PLAIN) * (0.4 + 0.65 * facing)[:, None]
+    colours = np.where(on_cue[:, None], _TINTED, _PLAIN) * (0.4 + 0.65 * facing)[:, None]
     image = np.where(hit[:, None], np.clip(colours, 0.0, 1.0), _BACKGROUND)
     side = math.isqrt(len(hit)) // 2
     return image.reshape(side, 2, side, 2, 3).mean(axis=(1, 3))

@@ -33,12 +33,12 @@ class PyramidStudy(ClassificationStudy):
         "normal."
     )
     objects: ClassVar[ClassSet] = CLASS_SETS["pyramid"]
-    telling: ClassVar[str] = "pattern"
+    cue: ClassVar[str] = "pattern"
     network: ClassVar[str] = "pyramid"
     framings: ClassVar[tuple[Framing, ...]] = tuple(Framing)
     solid: ClassVar[bool] = True
     measures: ClassVar[tuple[Measure, ...]] = (
-        *hits(telling),
+        *hits(cue),
         diagnostic("rank_correlation", "Rank correlation"),
         ROUGHNESS,
     )

@@ -34,7 +34,7 @@ from jaxnbv.studies.engine.meshes import class_meshes, numbered
 from jaxnbv.studies.engine.study import Chart, Panel, Scene, Study, pose_record
 from jaxnbv.studies.readers import MeshFile
 from jaxnbv.studies.scenes import ClassObject, ClassSet, Framing, Split
-from jaxnbv.studies.scenes.class_object import ClassMesh, scan_telling, surface_of
+from jaxnbv.studies.scenes.class_object import ClassMesh, scan_cue, surface_of
 from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, MixedEntropy
 from jaxnbv.tasks.classification import ClassAcquisition, Classifier
 
@@ -56,7 +56,7 @@ BASELINES = ("coverage", "farthest", "uncertainty", "random")
 
 
 class Truth(eqx.Module):
-    """The class, and what each candidate would truly show: scans with noise, and how many rays hit what tells it."""
+    """The class, and what each candidate would truly show: scans with noise, and how many rays hit its cue."""
 
     label: int
     scans: PointCloud
@@ -77,7 +77,7 @@ class ClassificationStudy(Study):
 
     What it is:
 
-    - `objects`: the scenes; `telling`: what of them tells the class, "" for all of the object.
+    - `objects`: the scenes; `cue`: the part of them that differs by class, "" for all of the object.
     - `network`: the name of the shipped classifier; `fed`: the points that it is fed of what was seen, and of that and
       an imagined scan.
     - `framings`: each a study of its own; `solid`: whether the objects are nowhere thin, see `imagination`.
@@ -104,7 +104,7 @@ class ClassificationStudy(Study):
     quick_scenes: ClassVar[int] = 6
 
     objects: eqx.AbstractClassVar[ClassSet]
-    telling: ClassVar[str] = ""
+    cue: ClassVar[str] = ""
     network: eqx.AbstractClassVar[str]
     fed: ClassVar[tuple[int, int]] = (1024, 512)
     framings: ClassVar[tuple[Framing, ...]] = (Framing.CLOSE_UP,)
@@ -145,23 +145,23 @@ class ClassificationStudy(Study):
         network = load_checkpoint(file)
         classifier = CloudClassifier(network, fed, network_scale(network, longest_side))
         rows = jnp.zeros((fed, 3))
-        (told,) = jax.eval_shape(classifier, PointCloud(rows, rows, jnp.ones(fed, bool))).shape
+        (known,) = jax.eval_shape(classifier, PointCloud(rows, rows, jnp.ones(fed, bool))).shape
         names = cls.objects.classes
         require(
-            told == len(names),
-            f"the network in {file} tells {told} classes apart; the study has {len(names)}: {', '.join(names)}",
+            known == len(names),
+            f"the network in {file} knows {known} classes; the study has {len(names)}: {', '.join(names)}",
         )
         return classifier
 
     @classmethod
     def groups(cls, records: Sequence[Record]) -> dict[str, list[Record]]:
-        """All, and those whose first view shows nothing of what tells the class, and something; no group is empty."""
+        """All, and those whose first view shows nothing of the cue of the class, and something; no group is empty."""
         parts: dict[str, list[Record]] = {"all": list(records)}
-        if cls.telling:
-            shown = [record[f"{cls.telling}_pixels"][record["first"]] > 0 for record in records]
+        if cls.cue:
+            shown = [record[f"{cls.cue}_pixels"][record["first"]] > 0 for record in records]
             for word, wanted in (("without", False), ("with", True)):
                 of = [record for record, shows in zip(records, shown, strict=True) if shows is wanted]
-                parts |= {f"first view {word} {cls.telling}": of} if of else {}
+                parts |= {f"first view {word} {cls.cue}": of} if of else {}
         return parts
 
     @property
@@ -176,7 +176,7 @@ class ClassificationStudy(Study):
         poses = self.candidates.poses()
         keys = jax.random.split(jax.random.fold_in(jax.random.key(3), index), self.num_candidates)
         name, thing = self.thing(index)
-        pixels, scans = scan_telling(thing, self.camera, poses)
+        pixels, scans = scan_cue(thing, self.camera, poses)
         return Scene(index, name, surface_of(thing), Truth(int(thing.label), _noisy(scans, keys), thing, pixels))
 
     def thing(self, index: int) -> tuple[str, ClassObject | ClassMesh]:
@@ -269,7 +269,7 @@ class ClassificationStudy(Study):
         for method, proposal in propose_together(planners, evidence, surfaces, search_key).items():
             index = _nearest(shared.poses, proposal.pose)
             assert index is not None
-            shown = scene.task.pixels if self.telling else None
+            shown = scene.task.pixels if self.cue else None
             rank = None if shown is None else rank_correlation(proposal.values, shown, new)
             own = rough if planners[method].search.uses_samples else None
             found[method] = index, {"rank_correlation": rank, "roughness": own}
@@ -298,12 +298,12 @@ class ClassificationStudy(Study):
         for view, *_ in episode:
             log_p.append(np.asarray(classify(self.classifier, view.cloud)).tolist())
             pose = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], view.pose)
-            pixels.append(int(scan_telling(truth.thing, self.camera, pose)[0][0]))
+            pixels.append(int(scan_cue(truth.thing, self.camera, pose)[0][0]))
         return {"runs": [{**self._shown(pixels), "log_p": log_p}], "diagnostics": []}
 
     def _shown(self, pixels: Any) -> Record:
-        """How many rays of each view hit what tells the class, where that is a part of the object."""
-        return {f"{self.telling}_pixels": np.asarray(pixels).tolist()} if self.telling else {}
+        """How many rays of each view hit the cue of the class, where that is a part of the object."""
+        return {f"{self.cue}_pixels": np.asarray(pixels).tolist()} if self.cue else {}
 
 
 @eqx.filter_jit

@@ -38,11 +38,11 @@ class TruckStudy(ClassificationStudy):
         f"{HITS_EXPLAINED}{seen_explained('cargo')}\nDiagnostics are by the view being chosen, in ( ) their scenes."
     )
     objects: ClassVar[ClassSet] = CLASS_SETS["truck"]
-    telling: ClassVar[str] = "cargo"
+    cue: ClassVar[str] = "cargo"
     network: ClassVar[str] = "truck"
     fed: ClassVar[tuple[int, int]] = (2048, 1024)
     measures: ClassVar[tuple[Measure, ...]] = (
-        *hits(telling),
+        *hits(cue),
         diagnostic("rank_correlation", "Rank correlation"),
         ROUGHNESS,
     )

@@ -22,7 +22,7 @@ class ClassObject(SignedDistance):
 
     label: eqx.AbstractVar[Int[Array, ""]]
 
-    def tells(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
+    def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
         """Which points of the surface tell the class: here all.
 
         Give hits without noise; the tolerance is in scene units.
@@ -41,7 +41,7 @@ class ClassMesh(eqx.Module):
     label: int
     part: TriangleMesh | None = None
 
-    def tells(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[np.ndarray, "*n"]:
+    def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[np.ndarray, "*n"]:
         """As of a `ClassObject`; on the host."""
         if self.part is None:
             return np.ones(x.shape[:-1], bool)
@@ -55,10 +55,8 @@ def surface_of(thing: ClassObject | ClassMesh) -> Surface:
     return thing.mesh if isinstance(thing, ClassMesh) else SDFSurface(thing)
 
 
-def scan_telling(
-    thing: ClassObject | ClassMesh, camera: Camera, poses: Pose
-) -> tuple[Int[Array, " poses"], PointCloud]:
-    """How many rays of each pose hit what tells the class, and the scans, without noise."""
+def scan_cue(thing: ClassObject | ClassMesh, camera: Camera, poses: Pose) -> tuple[Int[Array, " poses"], PointCloud]:
+    """How many rays of each pose hit the cue of the class, and the scans, without noise."""
     return _scan_telling(thing, camera, poses) if isinstance(thing, ClassMesh) else _compiled(thing, camera, poses)
 
 
@@ -66,7 +64,7 @@ def _scan_telling(
     thing: ClassObject | ClassMesh, camera: Camera, poses: Pose
 ) -> tuple[Int[Array, " poses"], PointCloud]:
     scans = scan(surface_of(thing), camera, poses)
-    return jnp.sum(thing.tells(scans.points) & scans.mask, axis=-1), scans
+    return jnp.sum(thing.on_cue(scans.points) & scans.mask, axis=-1), scans
 
 
 _compiled = eqx.filter_jit(_scan_telling)

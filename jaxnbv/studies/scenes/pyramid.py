@@ -11,7 +11,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning.sdf import Matrix, Scalar, Vector, nonnegative, parameter
 from jaxnbv.search.candidates import sphere_candidates
-from jaxnbv.studies.scenes.class_object import ClassObject, scan_telling
+from jaxnbv.studies.scenes.class_object import ClassObject, scan_cue
 from jaxnbv.studies.scenes.framing import Framing
 from jaxnbv.studies.scenes.patterns import PATTERNS, pattern_distance
 from jaxnbv.studies.scenes.splits import Split, scene_key
@@ -56,7 +56,7 @@ class Pyramid(ClassObject):
         u, v, w = self._own(x)
         return (self.scale * self._imprint(u, v, w) <= tolerance) & (self.scale * w > tolerance)
 
-    def tells(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
+    def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
         """Those of the pattern."""
         return self.on_pattern(x, tolerance)
 
@@ -121,7 +121,7 @@ def hidden_view(pyramid: Pyramid, key: PRNGKeyArray, camera: Camera = Camera(), 
     **Raises:** `ValueError` if there is none.
     """
     poses = sphere_candidates(num_candidates)
-    pixels, scans = scan_telling(pyramid, camera, poses)
+    pixels, scans = scan_cue(pyramid, camera, poses)
     return poses[choose_hidden(pixels, scans, key)]
 
 

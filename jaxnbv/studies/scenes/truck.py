@@ -39,7 +39,7 @@ class LoadedTruck(ClassObject):
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         return (self.truck | self.cargo)(x)
 
-    def tells(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
+    def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
         """Those of the cargo."""
         return self.cargo(x) <= tolerance
 

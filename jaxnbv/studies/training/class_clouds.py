@@ -14,7 +14,7 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import SensorNoise, scan
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.studies.scenes import ClassObject, ClassSet, Framing, Split
-from jaxnbv.studies.scenes.class_object import scan_telling
+from jaxnbv.studies.scenes.class_object import scan_cue
 from jaxnbv.studies.scenes.splits import scene_key
 from jaxnbv.studies.training.views import evidence_after, joined_views, only
 
@@ -29,17 +29,17 @@ class LabelledClouds(eqx.Module):
     - `clouds`: in scene units, thinned by farthest point sampling.
     - `labels`: those of the objects.
     - `views`: how many true views the cloud is of.
-    - `telling_pixels`: the most rays of one of these views that hit what tells the class.
+    - `cue_pixels`: the most rays of one of these views that hit the cue of the class.
     - `imagined`: whether a view of a posterior sample was added to them.
-    - `tells`: which points lie where the class is told, up to the sensor's noise.
+    - `on_cue`: which points lie on the cue, up to the sensor's noise.
     """
 
     clouds: PointCloud
     labels: Int[Array, "*batch"]
     views: Int[Array, "*batch"]
-    telling_pixels: Int[Array, "*batch"]
+    cue_pixels: Int[Array, "*batch"]
     imagined: Bool[Array, "*batch"]
-    tells: Bool[Array, "*batch points"]
+    on_cue: Bool[Array, "*batch points"]
 
 
 def scanned_clouds(
@@ -74,7 +74,7 @@ def _scanned(objects: ClassObject, keys: Key[Array, " scenes"], num_points: int)
         thing, key = object_and_key
         views, _, count, pixels = _partial_views(thing, key, MAX_VIEWS)
         cloud = farthest_point_subsample(joined_views(views), num_points)
-        return LabelledClouds(cloud, thing.label, count, pixels, jnp.asarray(False), _tells(thing, cloud))
+        return LabelledClouds(cloud, thing.label, count, pixels, jnp.asarray(False), _on_cue(thing, cloud))
 
     return jax.lax.map(cloud_of, (objects, keys))
 
@@ -97,11 +97,11 @@ def _imagined(
     clouds = jax.lax.map(of_sample, (surfaces, keys))
     clouds = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), clouds)
     label, taken, most, imagined = (jnp.full(len(clouds.mask), value) for value in (thing.label, count, pixels, True))
-    return LabelledClouds(clouds, label, taken, most, imagined, _tells(thing, clouds))
+    return LabelledClouds(clouds, label, taken, most, imagined, _on_cue(thing, clouds))
 
 
-def _tells(thing: ClassObject, cloud: PointCloud) -> Bool[Array, "*batch points"]:
-    return thing.tells(cloud.points, _NOISE) & cloud.mask
+def _on_cue(thing: ClassObject, cloud: PointCloud) -> Bool[Array, "*batch points"]:
+    return thing.on_cue(cloud.points, _NOISE) & cloud.mask
 
 
 def _random_poses(key: PRNGKeyArray, count: int) -> Pose:
@@ -115,7 +115,7 @@ def _partial_views(
     """What one to `most` random views show, their poses, how many they are, and the most telling pixels of one."""
     pose_key, noise_key, count_key = jax.random.split(key, 3)
     poses = _random_poses(pose_key, most)
-    pixels, scans = scan_telling(thing, Camera(), poses)
+    pixels, scans = scan_cue(thing, Camera(), poses)
     count = jax.random.randint(count_key, (), 1, most + 1)
     used = jnp.arange(most) < count
     return only(SensorNoise()(scans, noise_key), used), poses, count, jnp.max(jnp.where(used, pixels, 0))

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from jaxnbv.cli.model_name import ModelName
 from PIL import Image
 
 from jaxnbv.checks import InputError
-from jaxnbv.cli.model_name import ModelName
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.networks import InvariantClassifier, save_checkpoint
 from jaxnbv.search import FarthestView
@@ -28,7 +28,7 @@ from jaxnbv.studies.engine.measures import values
 from jaxnbv.studies.engine.meshes import class_meshes
 from jaxnbv.studies.engine.tables import summary, write_tables
 from jaxnbv.studies.scenes import FRUITS, HOUSEHOLD, Split, truck_scene
-from jaxnbv.studies.scenes.class_object import scan_telling
+from jaxnbv.studies.scenes.class_object import scan_cue
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
 
@@ -71,7 +71,7 @@ def test_of_a_truck_the_pixels_of_its_cargo_are_recorded():
     assert list(found["methods"]) == list(TruckStudy.methods)
     assert found["label"] == int(truck.label) == SCENE
     poses = sphere_candidates(CANDIDATES, 2.5)
-    _, seen = scan_telling(truck, CAMERA, poses)
+    _, seen = scan_cue(truck, CAMERA, poses)
     cargo = np.asarray(jnp.sum((jnp.abs(truck.cargo(seen.points)) < 2e-3) & seen.mask, axis=-1))
     np.testing.assert_allclose(found["cargo_pixels"], cargo, atol=2)
     assert cargo.max() > 150 > cargo.min() == 0

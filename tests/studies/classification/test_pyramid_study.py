@@ -20,7 +20,7 @@ from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.studies.classification.pictures import write_pictures
 from jaxnbv.studies.classification.pyramid import PyramidStudy
 from jaxnbv.studies.scenes import Framing, Pyramid, Split, pyramid_scene
-from jaxnbv.studies.scenes.class_object import scan_telling
+from jaxnbv.studies.scenes.class_object import scan_cue
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
 from jaxnbv.tasks.classification import CrossEntropy, MixedEntropy, NegativeEntropy
@@ -109,7 +109,7 @@ def test_the_first_view_is_that_of_all_methods_and_shows_no_pattern_but_somethin
     firsts = {run["candidates"][0] for method in record["methods"].values() for run in method["runs"]}
     assert firsts == {record["first"]}
     pyramid, poses = pyramid_scene(Split.TEST, SCENE), sphere_candidates(CANDIDATES, 2.5)
-    _, seen = scan_telling(pyramid, CAMERA, poses)
+    _, seen = scan_cue(pyramid, CAMERA, poses)
     pixels = np.asarray(jnp.sum(pyramid.on_pattern(seen.points) & seen.mask, axis=-1))
     assert pixels[record["first"]] == 0 < int(seen.count[record["first"]])
     np.testing.assert_allclose(record["pattern_pixels"], pixels, atol=1)
@@ -140,7 +140,7 @@ def test_diagnostics_of_every_method_at_every_view():
 
 @eqx.filter_jit
 def scores_by_hand(scores, cloud, surfaces, camera, poses):
-    """The mean over samples of each score of each scan: `expected_score`, with scans that all scores share."""
+    """The mean over samples of each score of each scan: `expected_value`, with scans that all scores share."""
     contexts = [score.context(cloud) for score in scores]
 
     def of_scan(one):
@@ -160,23 +160,23 @@ def test_values_are_the_librarys_scores_of_the_same_samples(sharpness):
     chooser = chooser_of(study)
     visited = (2, 7)
     found, _ = chooser.values(visited, [name for name in study.methods if name != "random"], 3)
-    state, planner = chooser.state(visited), chooser.planner
-    assert int(state.num_views) == 2
+    evidence, planner = chooser.state(visited), chooser.planner
+    assert int(evidence.num_views) == 2
     key = jax.random.fold_in(study.key(SCENE, "scene"), 3)
-    surfaces = planner.sample_surfaces(state, key, planner.posterior(state))
+    surfaces = planner.imagination.sample(evidence, key, planner.imagination.posterior(evidence))
     scores = {
         "cross-entropy": CrossEntropy(classifier, num_points=100),
         "mixed": MixedEntropy(classifier, num_points=100),
         "entropy": ExpectedUtilityImprovement(NegativeEntropy(classifier), num_points=100),
         "coverage": Coverage(),
     }
-    expected = scores_by_hand(tuple(scores.values()), state.cloud, surfaces, planner.camera, chooser.poses)
+    expected = scores_by_hand(tuple(scores.values()), evidence.cloud, surfaces, planner.camera, chooser.poses)
     for name, value in zip(scores, expected, strict=True):
         np.testing.assert_allclose(found[name], value, rtol=1e-4, atol=1e-5, err_msg=name)
-    is_open = float(-NegativeEntropy(classifier)(limit_capacity(state.cloud, 100))) > 0.75
+    is_open = float(-NegativeEntropy(classifier)(limit_capacity(evidence.cloud, 100))) > 0.75
     assert is_open == (sharpness < 1)
     np.testing.assert_array_equal(found["mixed"], found["cross-entropy" if is_open else "entropy"])
-    problem = Problem(state.cloud, state.poses, state.num_views, planner.camera, Coverage(), surfaces)
+    problem = Problem(evidence.cloud, evidence.poses, evidence.num_views, planner.camera, Coverage(), surfaces)
     told = problem.about(scores["cross-entropy"])
     view = TieBreakSearch(CANDIDATES, second=scores["coverage"]).propose(told, jax.random.key(0)).pose
     open_values = np.where(np.isin(np.arange(CANDIDATES), visited), -np.inf, found["tie-break"])
@@ -186,7 +186,7 @@ def test_values_are_the_librarys_scores_of_the_same_samples(sharpness):
         new = np.setdiff1d(np.arange(CANDIDATES), visited)
         np.testing.assert_allclose(found[name][new], expected[new], rtol=1e-4, atol=1e-5)
         assert np.isneginf(expected[list(visited)]).all()
-    thinned = limit_capacity(state.cloud, 100)
+    thinned = limit_capacity(evidence.cloud, 100)
     p = np.exp(np.asarray(classifier(thinned), np.float64))
     for candidate in (0, 7):
         q = np.asarray(classifier(concatenate(thinned, chooser.scans[candidate])), np.float64)
@@ -205,11 +205,11 @@ def test_the_choice_is_the_best_candidate_not_visited(chooser):
 def test_answers_are_the_classifiers_of_all_that_was_seen(chooser):
     run = whole_record()["methods"]["coverage"]["runs"][0]
     planner = chooser.planner
-    state = planner.init(chooser.scans[run["candidates"][0]], chooser.poses[run["candidates"][0]])
+    evidence = planner.init(chooser.poses[run["candidates"][0]], chooser.scans[run["candidates"][0]])
     for count, index in enumerate(run["candidates"]):
         if count:
-            state = planner.observe(state, chooser.poses[index], chooser.scans[index])
-        expected = chooser.classifier(state.cloud)
+            evidence = planner.observe(evidence, chooser.poses[index], chooser.scans[index])
+        expected = chooser.classifier(evidence.cloud)
         np.testing.assert_allclose(run["log_p"][count], expected, atol=1e-5)
 
 

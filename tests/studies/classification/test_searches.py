@@ -69,7 +69,7 @@ def test_each_search_keeps_to_its_poses():
 
 def test_what_is_recorded_is_what_the_classifier_says_of_the_views():
     scene, held = study().scene(SCENE), record()["methods"]["gradient-2dof"]
-    clouds = [state.cloud for _, state in study().seen(scene, held)]
+    clouds = [evidence.cloud for _, evidence in study().seen(scene, held)]
     np.testing.assert_allclose(held["runs"][0]["log_p"], [Linear()(cloud) for cloud in clouds], atol=1e-4)
 
 

@@ -6,13 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxnbv.cli.model_name import ModelName
 from toy import ToyStudy
 
 from jaxnbv.checks import InputError
-from jaxnbv.cli.model_name import ModelName
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import limit_capacity
 from jaxnbv.geometry.pose import look_at
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import SDFSurface
 from jaxnbv.search import GivenPoses, RandomView
@@ -52,7 +53,7 @@ def test_the_same_views_are_scanned_again_from_a_record_and_from_an_older_one():
     study = small()
     scene, run = study.scene(0), study.run_scene(0)["methods"]["farthest"]
     seen = study.seen(scene, run)
-    assert [int(state.cloud.count) for _, state in seen] == run["points"]
+    assert [int(evidence.cloud.count) for _, evidence in seen] == run["points"]
     scans = [scan for scan, _ in seen]
     assert int(scans[0].count) + int(scans[1].count) == run["points"][1]
     positions = np.asarray(study.candidates.poses().position)
@@ -88,7 +89,7 @@ def test_a_method_of_ones_own_that_makes_no_planner_is_refused_before_anything_i
     monkeypatch.setattr(ToyStudy, "run_methods", lambda *_: pytest.fail("a method was run"))
 
     def few(study, scene):
-        return Planner(study.model, study.camera, Coverage(), RandomView(3), max_views=1)
+        return Planner(Coverage(), RandomView(3), study.camera, Imagination(study.model), max_views=1)
 
     for make, problem in (
         (lambda study, scene: None, "what the method mine makes is None; give Planner"),
@@ -137,8 +138,13 @@ def test_a_command_configures_it():
 
 def test_planners_have_the_studys_settings():
     planner = small(carving=None).planner("random", None)
-    assert (planner.num_samples, planner.grid.resolution, planner.capacity, planner.max_views) == (2, 16, 500, 3)
-    assert planner.carving is None
+    assert (
+        planner.imagination.num_samples,
+        planner.imagination.grid.resolution,
+        planner.capacity,
+        planner.max_views,
+    ) == (2, 16, 500, 3)
+    assert planner.imagination.carving is None
     assert isinstance(small().scene(0).surface, SDFSurface)
     keys = [small().key(*of) for of in ((0, "first"), (1, "first"), (0, "episode"))]
     assert len({tuple(jax.random.key_data(key).tolist()) for key in keys}) == 3
@@ -148,5 +154,5 @@ def test_clouds_are_thinned_to_the_capacity():
     study = small(capacity=100)
     run = study.run_scene(0, ["random"])["methods"]["random"]
     assert run["points"] == [100, 100, 100]
-    scan, state = study.seen(study.scene(0), run)[0]
-    np.testing.assert_array_equal(state.cloud.points, limit_capacity(scan, 100).points)
+    scan, evidence = study.seen(study.scene(0), run)[0]
+    np.testing.assert_array_equal(evidence.cloud.points, limit_capacity(scan, 100).points)

@@ -13,12 +13,12 @@ import loky
 import psutil
 import pytest
 from deadly import Trial
+from jaxnbv.cli.model_name import ModelName
 from test_study import small, without_time
 from toy import ToyStudy
 
 from jaxnbv.checks import InputError
 from jaxnbv.cli.actions.studies import study
-from jaxnbv.cli.model_name import ModelName
 from jaxnbv.storage.folders import software
 from jaxnbv.studies.engine.records import RecordFolder
 from jaxnbv.studies.engine.trials import Cluster, Here, Processes

@@ -100,9 +100,9 @@ def test_estimates_are_those_of_the_clouds(record):
     assert record["truth"] == {"point": truth.coldest.tolist(), "temperature": low, "hottest": high}
     assert coldest_point(truth.mesh, heat).temperature == low
     run = record["methods"]["heat"]
-    for view, (_, state) in enumerate(study.seen(scene, run)):
+    for view, (_, evidence) in enumerate(study.seen(scene, run)):
         for name, found in run["estimates"].items():
-            expected = coldest_point(state.cloud, heat, reached_only=name == "reached")
+            expected = coldest_point(evidence.cloud, heat, reached_only=name == "reached")
             assert found["points"][view] == expected.point.tolist()
             assert found["temperatures"][view] == expected.temperature
             distance = np.linalg.norm(near - expected.point, axis=1).min()
@@ -128,7 +128,7 @@ def test_halving_is_asked_at_each_step_of_the_full_search(record):
         assert 0.0 <= halved["regret"] <= step["value"]
         assert halved["regret"] == 0.0 or not halved["same"]
         assert (halved["full_evaluations"], halved["evaluations"]) == (36, 30)
-    # Both start from the same view, so that the second is chosen from the same state and samples.
+    # Both start from the same view, so that the second is chosen from the same evidence and samples.
     second = [record["methods"][method]["views"][1]["position"] for method in RUN[:2]]
     second = [np.round(position, 4).tolist() for position in second]
     assert (second[0] == second[1]) == compared[0]["same"]

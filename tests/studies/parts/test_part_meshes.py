@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from jaxnbv.cli.model_name import ModelName
 
 from jaxnbv.checks import InputError
-from jaxnbv.cli.model_name import ModelName
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.scanning import Grid, load_parts
@@ -93,8 +93,8 @@ def test_it_asks_for_the_parts_that_can_be_seen_and_counts_their_points(folder):
     )
     scene = study.scene(0)
     for run in record["methods"].values():
-        for counts, (_, state) in zip(run["counts"], study.seen(scene, run), strict=True):
-            points, _ = state.cloud.to_numpy()
+        for counts, (_, evidence) in zip(run["counts"], study.seen(scene, run), strict=True):
+            points, _ = evidence.cloud.to_numpy()
             # The slab is all that lies above 0.3; noise is 0.01.
             slab = (points[:, 1] > 0.25).sum()
             assert abs(counts[1] - slab) <= 0.03 * len(points)

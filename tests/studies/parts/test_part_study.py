@@ -152,8 +152,8 @@ def test_counts_are_those_of_the_segmenter_on_all_that_was_seen(method):
     again = study.seen(study.scene(SCENE), run)
     assert len(again) == len(run["counts"])
     labels = np.flatnonzero(np.asarray(scene.parts))
-    for counts, cloud, (_, state) in zip(run["counts"], clouds(record, method), again, strict=True):
-        np.testing.assert_allclose(state.cloud.points, cloud.points, atol=1e-5)
+    for counts, cloud, (_, evidence) in zip(run["counts"], clouds(record, method), again, strict=True):
+        np.testing.assert_allclose(evidence.cloud.points, cloud.points, atol=1e-5)
         fed, said = segmenter.predict(cloud)
         points, normals = np.asarray(fed.points, np.float64), np.asarray(fed.normals, np.float64)
         weight = np.random.default_rng(1).normal(size=(6, 50))
@@ -169,10 +169,10 @@ def test_the_discrete_search_takes_the_candidate_whose_imagined_scans_find_most(
     planner = study.planner("discrete", study.scene(SCENE))
     views = [pose_of(view) for view in record["methods"]["discrete"]["views"]]
     segmenter = CloudSegmenter(study.segmenter.network, scene.category, 100, scale=0.8)
-    state = planner.init(next(scans(record, "discrete")), views[0], CAMERA)
+    evidence = planner.init(views[0], next(scans(record, "discrete")), CAMERA)
     key = study.key(SCENE, "episode")
     step_key, _ = jax.random.split(jax.random.fold_in(key, 1))
-    surfaces = planner.sample_surfaces(state, jax.random.split(step_key)[0])
+    surfaces = planner.imagination.sample(evidence, jax.random.split(step_key)[0])
 
     @eqx.filter_jit
     def improvements(cloud, surfaces, poses):
@@ -189,7 +189,7 @@ def test_the_discrete_search_takes_the_candidate_whose_imagined_scans_find_most(
         return jax.lax.map(lambda s: jax.lax.map(lambda p: of(s, p), poses), surfaces)
 
     poses = sphere_candidates(CANDIDATES, 2.0)
-    value = np.asarray(improvements(state.cloud, surfaces, poses)).mean(axis=0)
+    value = np.asarray(improvements(evidence.cloud, surfaces, poses)).mean(axis=0)
     value[record["first"]] = -np.inf
     chosen = int(np.argmin(np.linalg.norm(poses.position - views[1].position, axis=1)))
     # Scans that show all parts are worth nearly the same.
@@ -212,12 +212,12 @@ def test_a_run_stops_once_every_part_has_the_largest_target():
 
 def test_planners_of_all_categories_share_their_compilations(compilations):
     study, first = small_study(), pose_of(whole_record()["methods"]["discrete"]["views"][0])
-    state = study.planner("discrete", study.scene(0)).init(next(scans(whole_record(), "discrete")), first, CAMERA)
+    evidence = study.planner("discrete", study.scene(0)).init(first, next(scans(whole_record(), "discrete")), CAMERA)
     values = []
     for index in (1, 4):
         planner = study.planner("discrete", study.scene(index))
         del compilations[:]
-        values.append(np.asarray(planner.propose(state, jax.random.key(1)).values))
+        values.append(np.asarray(planner.propose(evidence, jax.random.key(1)).values))
     assert not compilations
     assert (values[0] != values[1]).any()
 

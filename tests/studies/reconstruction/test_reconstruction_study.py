@@ -6,13 +6,13 @@ import jax
 import numpy as np
 import pytest
 import trimesh
+from jaxnbv.scanning.reconstruction import has_poisson
 from PIL import Image
 
 import jaxnbv as nbv
 from jaxnbv.checks import InputError
 from jaxnbv.scanning import scan
 from jaxnbv.scanning.metrics import coverage, surface_distance, truth_points
-from jaxnbv.scanning.reconstruction import has_poisson
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.storage import describe
 from jaxnbv.studies.engine.meshes import mesh_files
@@ -87,7 +87,12 @@ def test_planners_differ_in_their_search_alone():
         assert planner.search == search(study.candidates)
         assert describe(planner) | {"search": None} == describe(study.planner("farthest", scene)) | {"search": None}
     assert isinstance(planner.acquisition, nbv.Coverage)
-    assert (planner.num_samples, planner.grid, planner.capacity, planner.max_views) == (2, nbv.Grid(20), 250, 3)
+    assert (planner.imagination.num_samples, planner.imagination.grid, planner.capacity, planner.max_views) == (
+        2,
+        nbv.Grid(20),
+        250,
+        3,
+    )
 
 
 def test_views_are_those_of_an_episode_from_the_shared_first_view(record, meshes):
@@ -111,10 +116,10 @@ def test_distances_are_those_of_the_reconstruction_from_the_last_cloud(record, m
     study = small_study(meshes)
     truth = study.scene(1).surface.sample_points(jax.random.key(5), 20_000)
     method = record["methods"]["farthest"]
-    state = study.seen(study.scene(1), method)[-1][1]
+    evidence = study.seen(study.scene(1), method)[-1][1]
     for name, found in method["reconstructions"].items():
         if found is not None:
-            points = reconstruct(study, state, name).sample_points(jax.random.key(6), 20_000)
+            points = reconstruct(study, evidence, name).sample_points(jax.random.key(6), 20_000)
             expected = surface_distance(points, truth)
             assert found["chamfer"] == pytest.approx(expected.chamfer, rel=0.05)
             assert found["hausdorff"] == pytest.approx(expected.hausdorff, rel=0.1)

@@ -13,7 +13,7 @@ from jaxnbv.scanning import Grid, mesh_from_sdf, scan
 from jaxnbv.scanning.mesh import load_mesh
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.studies.scenes import PATTERNS, Framing, Pyramid, Split, hidden_view, pyramid_scene, sample_pyramid
-from jaxnbv.studies.scenes.class_object import scan_telling
+from jaxnbv.studies.scenes.class_object import scan_cue
 from jaxnbv.studies.scenes.patterns import pattern_distance
 
 RNG = np.random.default_rng(0)
@@ -214,7 +214,7 @@ def test_hits_of_a_scan_lie_on_the_faces_that_they_are_counted_to():
     """The sphere tracer's hits, classed anew by the plane or outline that each is nearest to."""
     for index in range(3):
         pyramid = pyramid_scene(Split.TEST, index)
-        _, scans = scan_telling(pyramid, CAMERA, sphere_candidates(40, 2.5))
+        _, scans = scan_cue(pyramid, CAMERA, sphere_candidates(40, 2.5))
         points, mask = np.asarray(scans.points, np.float64), np.asarray(scans.mask)
         found = np.asarray(pyramid.on_pattern(scans.points))[mask]
         own = (points[mask] - np.asarray(pyramid.offset)) @ np.asarray(pyramid.rotation, np.float64)
@@ -295,7 +295,7 @@ def test_a_hidden_view_does_not_show_the_pattern():
         assert len(rows) > 2
         for pose in drawn:
             assert np.linalg.norm(candidates - np.asarray(pose.position), axis=1).min() < 1e-6
-            _, (seen,) = scan_telling(pyramid, CAMERA, jax.tree.map(lambda leaf: leaf[None], pose))
+            _, (seen,) = scan_cue(pyramid, CAMERA, jax.tree.map(lambda leaf: leaf[None], pose))
             offset, rotation, scale = map(np.asarray, (pyramid.offset, pyramid.rotation, pyramid.scale))
             own = (seen.to_numpy()[0] - offset) @ rotation / scale
             assert len(own) > 100

@@ -18,7 +18,7 @@ CAMERA = nbv.Camera(height=40, width=40)
 @eqx.filter_jit
 def cargo_pixels(scene, poses):
     seen = nbv.scan(nbv.SDFSurface(scene), CAMERA, poses)
-    return jnp.sum(scene.tells(seen.points) & seen.mask, axis=-1), jnp.sum(seen.mask, axis=-1)
+    return jnp.sum(scene.on_cue(seen.points) & seen.mask, axis=-1), jnp.sum(seen.mask, axis=-1)
 
 
 @eqx.filter_jit

@@ -5,9 +5,9 @@ import jax
 import numpy as np
 import pytest
 import trimesh
+from jaxnbv.cli.model_name import ModelName
 
 from jaxnbv.checks import InputError
-from jaxnbv.cli.model_name import ModelName
 from jaxnbv.scanning import TriangleMesh, scan
 from jaxnbv.studies.classification.truck import TruckStudy
 from jaxnbv.studies.scenes.truck_meshes import bed_of, loaded_truck
@@ -66,8 +66,8 @@ def test_the_cargo_stands_on_the_bed_and_tells_the_class(seed):
     assert distance.min() < 0.01
     inside = igl.fast_winding_number(others, truck.faces, own + 1e-3 * (own.mean(axis=0) - own))
     assert (inside < 0.5).all()
-    assert thing.tells(own).all()
-    assert not thing.tells(others).any()
+    assert thing.on_cue(own).all()
+    assert not thing.on_cue(others).any()
 
 
 def test_the_study_counts_the_rays_that_hit_the_cargo(tmp_path):

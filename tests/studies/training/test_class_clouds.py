@@ -6,10 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv.geometry.camera import Camera
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid
-from jaxnbv.search import DiscreteSearch
 from jaxnbv.studies.scenes import CLASS_SETS, PATTERNS, Framing, Split, pyramid_scene
 from jaxnbv.studies.training.class_clouds import MAX_VIEWS, imagined_clouds, scanned_clouds
 from jaxnbv.surfaces import GeometricSPSR
@@ -21,7 +20,7 @@ PORTION = 8
 # The scenes of these rows again, in a portion of their own.
 FEW = slice(4, 7)
 MODEL = GeometricSPSR(lengthscale=0.05, truncation=8)
-PLANNER = Planner(MODEL, Camera(), Coverage(), DiscreteSearch(), 2, Grid(20), 150)
+PLANNER = Planner(Coverage(), imagination=Imagination(MODEL, grid=Grid(20), num_samples=2), capacity=150)
 
 
 def portion_of(split, framing, first, count):
@@ -79,7 +78,7 @@ def test_scanned_clouds_are_samples_of_their_scenes_with_noise(scanned):
 
 
 def test_telling_pixels_vary_and_are_at_most_those_of_one_view(scanned):
-    pixels = np.asarray(scanned.telling_pixels)
+    pixels = np.asarray(scanned.cue_pixels)
     assert pixels.min() >= 0
     assert pixels.max() <= 2500
     views = np.asarray(scanned.views)
@@ -94,7 +93,7 @@ def test_a_cloud_whose_views_miss_the_pattern_has_no_point_in_it():
     """And one with many pixels does; half the depth of the pattern is more than three deviations of the noise."""
     found = clouds_of(Split.VALIDATION, 0, 24)
     shares = {False: [], True: []}
-    for row, pixels in enumerate(np.asarray(found.telling_pixels)):
+    for row, pixels in enumerate(np.asarray(found.cue_pixels)):
         pyramid = pyramid_scene(Split.VALIDATION, row)
         points, _ = found.clouds[row].to_numpy()
         own = own_frame(pyramid, points)
@@ -110,12 +109,12 @@ def test_a_cloud_whose_views_miss_the_pattern_has_no_point_in_it():
 
 def test_points_that_tell_the_class_lie_on_what_tells_it(scanned):
     """In a pyramid's own frame, up to three deviations of the noise: above the base and in the pattern."""
-    counted = np.asarray(scanned.tells).sum(axis=1)
-    assert not (np.asarray(scanned.tells) & ~np.asarray(scanned.clouds.mask)).any()
-    assert counted[np.asarray(scanned.telling_pixels) >= 500].min() > 10
+    counted = np.asarray(scanned.on_cue).sum(axis=1)
+    assert not (np.asarray(scanned.on_cue) & ~np.asarray(scanned.clouds.mask)).any()
+    assert counted[np.asarray(scanned.cue_pixels) >= 500].min() > 10
     for row in range(COUNT):
         pyramid = pyramid_scene(Split.TRAIN, 5 + row)
-        tells = np.asarray(scanned.tells[row])
+        tells = np.asarray(scanned.on_cue[row])
         own = own_frame(pyramid, np.asarray(scanned.clouds.points[row]))
         assert (own[tells, 2] * float(pyramid.scale) > 0.03 - 1e-4).all()
         assert (own[tells, 2] < float(pyramid.depth) + 0.04).all()
@@ -124,13 +123,13 @@ def test_points_that_tell_the_class_lie_on_what_tells_it(scanned):
 def test_clouds_can_be_made_again_in_other_portions(scanned):
     assert_same(scanned, clouds_of(Split.TRAIN, 5, COUNT))
     part = portion_of(Split.TRAIN, Framing.CLOSE_UP, 5 + FEW.start, FEW.stop - FEW.start)
-    np.testing.assert_array_equal(part.telling_pixels, scanned.telling_pixels[FEW])
+    np.testing.assert_array_equal(part.cue_pixels, scanned.cue_pixels[FEW])
     np.testing.assert_allclose(part.clouds.points, scanned.clouds.points[FEW], atol=1e-5)
 
 
 def test_splits_and_framings_differ(scanned):
     other = clouds_of(Split.TEST, 5, COUNT)
-    assert not np.array_equal(other.telling_pixels, scanned.telling_pixels)
+    assert not np.array_equal(other.cue_pixels, scanned.cue_pixels)
     whole = clouds_of(Split.TRAIN, 5, COUNT, Framing.WHOLE)
     np.testing.assert_array_equal(whole.labels, scanned.labels)
     assert (
@@ -143,7 +142,7 @@ def test_imagined_clouds_begin_with_what_was_truly_seen(imagined):
         assert found.clouds.points.shape == (6, POINTS, 3)
         assert np.asarray(found.imagined).all()
         np.testing.assert_array_equal(found.labels, index % len(PATTERNS))
-        assert len(np.unique(found.telling_pixels)) == 1
+        assert len(np.unique(found.cue_pixels)) == 1
         pyramid = pyramid_scene(Split.TRAIN, index)
         clouds = [found.clouds[row].to_numpy() for row in range(6)]
         off = np.abs(np.asarray(distances(pyramid, found.clouds.points)))

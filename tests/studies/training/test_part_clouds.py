@@ -10,9 +10,9 @@ from scipy.spatial import cKDTree
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, scan
-from jaxnbv.search import DiscreteSearch
 from jaxnbv.studies.scenes import Split, part_scene
 from jaxnbv.studies.training import part_clouds
 from jaxnbv.studies.training.part_clouds import imagined_part_clouds, scanned_part_clouds
@@ -24,7 +24,7 @@ SCENES, POINTS = (7, 11), 150
 # Compilation takes nearly all the time of the rest.
 CAMERA = Camera(height=24, width=24)
 MODEL = GeometricSPSR(lengthscale=0.05, truncation=8)
-PLANNER = Planner(MODEL, CAMERA, Coverage(), DiscreteSearch(), 2, Grid(20), 150)
+PLANNER = Planner(Coverage(), camera=CAMERA, imagination=Imagination(MODEL, grid=Grid(20), num_samples=2), capacity=150)
 
 
 @pytest.fixture(scope="module")
