@@ -36,11 +36,8 @@ def main() -> None:
             path = Path(folder) / f"mug.{suffix}"
             solid.export(path)
             mesh = nbv.load_mesh(path)
-        model, camera, grid = (
-            nbv.ScreenedSPSR(nbv.GeometricSPSR(0.02, 0.2, 12)),
-            nbv.Camera(height=16, width=16),
-            nbv.Grid(24),
-        )
+        model, camera = nbv.ScreenedSPSR(nbv.GeometricSPSR(0.02, 0.2, 12)), nbv.Camera(height=16, width=16)
+        imagination = nbv.Imagination(model, grid=nbv.Grid(24), num_samples=2)
         heat = nbv.ExpectedUtilityImprovement(nbv.ColdestPoint(mesh.vertices[0], workers=2), num_points=256)
         bfgs = optimistix.BFGS(1e-3, 1e-3)
         tasks = (
@@ -48,8 +45,8 @@ def main() -> None:
             (nbv.Coverage(), nbv.GradientSearch(num_starts=2, iterations=2, num_candidates=4, solver=bfgs)),
             (heat, nbv.DiscreteSearch(4)),
         )
-        for score, search in tasks:
-            planner = nbv.Planner(score, search, camera, nbv.Imagination(model, grid=grid, num_samples=2), capacity=512)
+        for acquisition, search in tasks:
+            planner = nbv.Planner(acquisition, search, camera, imagination, capacity=512)
             episode = nbv.simulate(planner, mesh, nbv.look_at((0.0, 0.0, 2.5)), 2, jax.random.key(0), progress=False)
             assert len(episode.views) == 2
         assert write_report(episode, Path(folder) / "report", progress=False).exists()

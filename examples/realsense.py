@@ -41,7 +41,7 @@ def main(folder: str = "live", views: int = 10) -> None:
             session.add(depth, matrix, depth_scale=scale)
     finally:
         pipeline.stop()
-    print(session.done or f"{views} images are taken", session.report())
+    print(session.done or f"{views} images are taken", nbv.write_report(session.episode, folder))
 
 
 if __name__ == "__main__":

@@ -79,9 +79,11 @@ from .search import UncertaintyView as UncertaintyView
 from .studies import readers as readers
 from .studies import scenes as scenes
 from .surfaces import Fields as Fields
+from .surfaces import FieldsAbout as FieldsAbout
 from .surfaces import GeometricSPSR as GeometricSPSR
 from .surfaces import OnSurface as OnSurface
 from .surfaces import OutsideBoundary as OutsideBoundary
+from .surfaces import SampledPosterior as SampledPosterior
 from .surfaces import ScreenedSPSR as ScreenedSPSR
 from .surfaces import SeenEmpty as SeenEmpty
 from .surfaces import SurfaceModel as SurfaceModel

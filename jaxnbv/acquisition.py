@@ -214,8 +214,8 @@ def context_of(acquisition: Acquisition, cloud: PointCloud) -> Any:
     return acquisition.context(cloud)
 
 
-def zero_if_empty(scan: PointCloud, value: Float[Array, ""]) -> Float[Array, ""]:
-    """The value, or zero for a scan that sees nothing."""
+def zero_if_empty(scan: PointCloud, value: Float[Array, "*values"]) -> Float[Array, "*values"]:
+    """The value, or values, or zero for a scan that sees nothing."""
     return jnp.where(jnp.any(scan.mask), value, 0.0)
 
 

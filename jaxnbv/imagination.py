@@ -276,7 +276,7 @@ class Imagination(eqx.Module):
         # Within jit too, values of what is not traced are known.
         with jax.ensure_compile_time_eval():
             if first or bool(scan.mask.any()):
-                check_oriented(scan, "the scan", min(self.grid.half_extent, HALF_WIDTH))
+                check_oriented(scan, "the first scan" if first else "the scan", min(self.grid.half_extent, HALF_WIDTH))
             if pose is not None:
                 check_image(scan, camera, pose)
             if self.carving is not None:

@@ -11,7 +11,6 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
-from scipy.special import ndtr
 
 import jaxnbv as nbv
 from jaxnbv.geometry.neighbours import nearest_squared_distance
@@ -35,7 +34,7 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def draw_posterior(
-    planner: nbv.Planner, evidence: nbv.State, surfaces: nbv.GridSurface, scene: nbv.SDFSurface
+    planner: nbv.Planner, evidence: nbv.Evidence, surfaces: nbv.GridSurface, scene: nbv.SDFSurface
 ) -> Figure:
     """What one view saw; outlines of samples on the plane x = 0, and the probability of being inside there."""
     axis = np.asarray(planner.imagination.grid.axis)
@@ -44,8 +43,7 @@ def draw_posterior(
     y, z = np.meshgrid(axis[::2], axis[::2], indexing="ij")
     plane = jnp.asarray(np.stack([np.full(y.size, axis[middle]), y.ravel(), z.ravel()], axis=1))
     posterior = planner.imagination.posterior(evidence)
-    deviation = np.sqrt(np.maximum(np.asarray(posterior.variance(plane)), 1e-12))
-    inside = ndtr((float(posterior.level) - np.asarray(posterior.mean(plane))) / deviation).reshape(y.shape)
+    inside = np.asarray(posterior.probability_inside(plane)).reshape(y.shape)
     truth = np.asarray(scene.sdf(plane)).reshape(y.shape)
     figure = Figure(figsize=(9.6, 3.5))
     first, second, third = (figure.add_axes((left, 0.02, 0.32, 0.86)) for left in (0.0, 0.34, 0.67))
@@ -72,7 +70,7 @@ def draw_posterior(
 
 
 def draw_utility(
-    planner: nbv.Planner, evidence: nbv.State, surfaces: nbv.GridSurface, proposal: nbv.Proposal
+    planner: nbv.Planner, evidence: nbv.Evidence, surfaces: nbv.GridSurface, proposal: nbv.Proposal
 ) -> Figure:
     """Imagined scans of the best candidate and of one of the worst tenth, coloured by what each point is worth."""
     order = np.argsort(np.asarray(proposal.values))
@@ -134,12 +132,8 @@ def main() -> None:
     scene = demo_object()
     model = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=16))
     camera = nbv.Camera(height=32, width=32)
-    planner = nbv.Planner(
-        nbv.Coverage(),
-        camera=camera,
-        imagination=nbv.Imagination(model, grid=nbv.Grid(72), num_samples=8),
-        capacity=1024,
-    )
+    imagination = nbv.Imagination(model, grid=nbv.Grid(72), num_samples=8)
+    planner = nbv.Planner(nbv.Coverage(), camera=camera, imagination=imagination, capacity=1024)
     first, noise = nbv.look_at((0.8, 0.9, 2.2)), nbv.SensorNoise()
     scan_key, sample_key, search_key = jax.random.split(jax.random.key(0), 3)
     evidence = planner.init(first, noise(nbv.scan(scene, planner.camera, first), scan_key))

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 import jaxnbv as nbv
-from jaxnbv.acquisition import Score
+from jaxnbv.acquisition import Acquisition
 from jaxnbv.cli.actions.tasks import PARTS
 from jaxnbv.scanning import SDFSurface, Surface
 from jaxnbv.scanning.metrics import truth_points
@@ -38,14 +38,14 @@ class Shown(NamedTuple):
 
     name: str
     surface: Surface
-    score: Score
+    acquisition: Acquisition
     setting: Setting = USUAL_SETTING
 
 
 def part_object(index: int) -> Shown:
     """Number `index` of the procedural objects, whose parts are asked for."""
     made = PARTS.demo(index, Framing.CLOSE_UP, 0)
-    return Shown(made.name, made.surface, made.score, PART_SETTING)
+    return Shown(made.name, made.surface, made.acquisition, PART_SETTING)
 
 
 def objects() -> list[Shown]:
@@ -69,7 +69,8 @@ def episode_of(shown: Shown, views: int) -> nbv.Episode:
     setting = fitted(shown.setting, float(np.linalg.norm(points, axis=1).max()))
     camera = setting.camera.resized(RAYS, RAYS)
     search = nbv.DiscreteSearch(SphereCandidates(CANDIDATES, setting.radius))
-    planner = nbv.Planner(shown.score, search, camera, nbv.Imagination(grid=nbv.Grid(72), num_samples=8), capacity=4096)
+    imagination = nbv.Imagination(grid=nbv.Grid(72), num_samples=8)
+    planner = nbv.Planner(shown.acquisition, search, camera, imagination, capacity=4096)
     first = nbv.look_at(setting.radius * FIRST.position / np.linalg.norm(FIRST.position))
     return nbv.simulate(planner, shown.surface, first, views=views, key=jax.random.key(0))
 

@@ -6,6 +6,7 @@ checkpoints stay in the output folder, so that a run that was interrupted contin
 """
 
 import argparse
+import dataclasses
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ import optax
 from cached import cached
 
 from jaxnbv import Coverage, Grid, Planner, PointCloud
-from jaxnbv.imagination import Imagination, ModelName, imagination
+from jaxnbv.imagination import Imagination
 from jaxnbv.networks import Focus, FocusedClassifier, InvariantClassifier, save_checkpoint
 from jaxnbv.networks.pretrained import TRAINED_POINTS, TRAINED_SIDE
 from jaxnbv.studies.scenes import CLASS_SETS, Framing, Split
@@ -35,7 +36,7 @@ class Recipe(NamedTuple):
     """What a network is trained on.
 
     - `framings`: how large the objects stand.
-    - `solid`: whether they are nowhere thin, see `imagination`.
+    - `solid`: whether they are nowhere thin, see `Imagination.preset`.
     - `scenes`: of which there are true scans, in each framing; `imagined`: of which there are imagined ones, 16 each.
     - `radii`, `groups`: of the network.
     - `focus`: steps of learning which points tell the class, where these are few; the classifier sees them alone.
@@ -78,11 +79,9 @@ class Clouds:
 
     def imagined(self, split: Split, framing: Framing, count: int) -> LabelledClouds:
         """Clouds that end in a scan of a posterior sample, 16 from each of `count` scenes."""
-        model, carving = imagination(ModelName.SCREENED, framing.longest_side, solid=self.recipe.solid)
-        grid = Grid(64, 0.7 * framing.longest_side)
-        planner = Planner(
-            Coverage(), imagination=Imagination(model, grid=grid, num_samples=4, carving=carving), capacity=2500
-        )
+        preset = Imagination.preset("screened", framing.longest_side, solid=self.recipe.solid)
+        imagination = dataclasses.replace(preset, grid=Grid(64, 0.7 * framing.longest_side), num_samples=4)
+        planner = Planner(Coverage(), imagination=imagination, capacity=2500)
 
         def make(index: int) -> LabelledClouds:
             return imagined_clouds(self.set, split, framing, index, planner, num_points=self.points)

@@ -6,6 +6,7 @@ interrupted continues. Half an hour on two CPU cores.
 """
 
 import argparse
+import dataclasses
 from pathlib import Path
 
 import equinox as eqx
@@ -15,17 +16,13 @@ import numpy as np
 from cached import cached
 
 from jaxnbv import Coverage, Grid, Planner, PointCloud
-from jaxnbv.imagination import Imagination, ModelName, imagination
+from jaxnbv.imagination import Imagination
 from jaxnbv.networks import CATEGORIES, CompactPartSegmenter, part_mask, save_checkpoint
 from jaxnbv.networks.pretrained import TRAINED_SIDE
 from jaxnbv.scanning.sensors import PART_SETTING
 from jaxnbv.studies.scenes import Split
 from jaxnbv.studies.training import fit
-from jaxnbv.studies.training.part_clouds import (
-    LabelledPartClouds,
-    imagined_part_clouds,
-    scanned_part_clouds,
-)
+from jaxnbv.studies.training.part_clouds import LabelledPartClouds, imagined_part_clouds, scanned_part_clouds
 
 WEIGHTS = Path(__file__).parents[1] / "jaxnbv" / "networks" / "weights" / "parts.safetensors"
 # Scenes whose posterior is sampled come from numbers that no scanned cloud uses.
@@ -44,13 +41,8 @@ def scanned(folder: Path, split: Split, count: int) -> LabelledPartClouds:
 
 def imagined(folder: Path, split: Split, count: int) -> LabelledPartClouds:
     """Clouds that end in a scan of a posterior sample, 16 from each of `count` scenes."""
-    model, carving = imagination(ModelName.SCREENED)
-    planner = Planner(
-        Coverage(),
-        camera=PART_SETTING.camera,
-        imagination=Imagination(model, grid=Grid(64), num_samples=4, carving=carving),
-        capacity=2500,
-    )
+    imagination = dataclasses.replace(Imagination.preset(), grid=Grid(64), num_samples=4)
+    planner = Planner(Coverage(), camera=PART_SETTING.camera, imagination=imagination, capacity=2500)
 
     def make(index):
         return imagined_part_clouds(split, [index], planner)

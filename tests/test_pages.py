@@ -46,8 +46,9 @@ def smaller(planner_of=nbv.Planner):
             model = dataclasses.replace(model, base=SMALL)
         elif isinstance(model, nbv.GeometricSPSR):
             model = SMALL
-        less = {"num_samples": 2, "grid": nbv.Grid(24), "capacity": 512, "camera": nbv.Camera(height=12, width=12)}
-        return dataclasses.replace(planner, model=model, **less)
+        imagination = dataclasses.replace(planner.imagination, model=model, grid=nbv.Grid(24), num_samples=2)
+        camera = nbv.Camera(height=12, width=12)
+        return dataclasses.replace(planner, imagination=imagination, capacity=512, camera=camera)
 
     return make
 
@@ -149,9 +150,7 @@ def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
     """Until the ball is expected to be covered. Reports of sessions are tested on their own."""
     monkeypatch.chdir(tmp_path)
     reported = []
-    monkeypatch.setattr(
-        "jaxnbv.planning.session.write_report", lambda episode, folder, **_: reported.append(episode) or folder
-    )
+    monkeypatch.setattr(nbv, "write_report", lambda episode, folder: reported.append(episode))
     poses = poses_about_a_ball(10)
     model, search = nbv.GeometricSPSR(0.02, 0.2, 16), nbv.DiscreteSearch()
     planner = nbv.Planner(
@@ -177,14 +176,15 @@ def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
 
 def test_the_block_for_a_depth_camera_runs():
     pose = nbv.look_at((0.6, -0.6, 0.4), (0.0, 0.0, 0.1), up=(0.0, 0.0, 1.0))
-    small = nbv.GeometricSPSR(0.05, 0.2, 8), nbv.Camera(height=12, width=12), nbv.Coverage(), nbv.DiscreteSearch(12)
+    imagination = nbv.Imagination(nbv.GeometricSPSR(0.05, 0.2, 8), grid=nbv.Grid(24), num_samples=2)
+    small = nbv.Coverage(), nbv.DiscreteSearch(12), nbv.Camera(height=12, width=12), imagination
     given = {
         "nbv": nbv,
         "camera": nbv.Camera.from_intrinsics(INTRINSICS, 640, 480),
         "T": np.asarray(pose.matrix),
         **CORNERS,
         "depth_mm": image_of_a_ball(pose.matrix),
-        "planner": nbv.Planner(*small, num_samples=2, grid=nbv.Grid(24)),
+        "planner": nbv.Planner(*small),
         "key": jax.random.key(0),
     }
     (block,) = (block for block in blocks("how_to/depth_camera.md") if "depth_mm" in block)
@@ -306,7 +306,8 @@ def documented() -> dict[str, list[str]]:
     return names
 
 
-PACKAGES = ("datasets", "networks", "scanning", "search", "surfaces", "tasks", "training", "viz")
+STUDIES = ("studies.readers", "studies.scenes", "studies.training")
+PACKAGES = ("networks", "scanning", "search", "surfaces", "tasks", "viz", *STUDIES)
 
 
 @pytest.mark.parametrize("package", ["jaxnbv", *(f"jaxnbv.{name}" for name in PACKAGES)])

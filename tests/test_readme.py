@@ -45,7 +45,8 @@ np.testing.assert_allclose(np.linalg.norm(cloud.to_numpy()[0], axis=1), 1.0, ato
 LESS = {
     "nbv.ScreenedSPSR(),": "nbv.ScreenedSPSR(nbv.GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=16)),",
     "views=5": "views=2",
-    "num_samples=16": "num_samples=4, grid=nbv.Grid(40), capacity=1024",
+    "num_samples=16": "num_samples=4, grid=nbv.Grid(40)",
+    "imagination=nbv.Imagination( ": "capacity=1024, imagination=nbv.Imagination( ",
     "nbv.DiscreteSearch(),  ": "nbv.DiscreteSearch(24),",
 }
 

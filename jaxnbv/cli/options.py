@@ -4,10 +4,11 @@ import inspect
 from collections.abc import Callable, Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import typer
 
+from jaxnbv.cli.asked import DEFAULT_FIRST, Device
 from jaxnbv.cli.registry import MODELS, SEARCHES, STOPS, TASKS
 from jaxnbv.studies.scenes import Framing
 
@@ -18,14 +19,6 @@ SearchName = StrEnum("SearchName", {name.replace("-", "_").upper(): name for nam
 
 
 REQUIRED = inspect.Parameter.empty
-
-
-class Device(StrEnum):
-    """Where the computation runs."""
-
-    AUTO = "auto"
-    CPU = "cpu"
-    GPU = "gpu"
 
 
 TaskOption = Annotated[
@@ -55,7 +48,6 @@ OutOption = Annotated[
 OverwriteOption = Annotated[
     bool, typer.Option("--overwrite", help="Begin anew: an episode that the output folder holds is removed.")
 ]
-DEFAULT_FIRST = "0.8,0.9,2.2"
 FirstOption = Annotated[
     str | None,
     typer.Option(
@@ -159,45 +151,3 @@ def command(run: Callable[..., None], about: str, options: Mapping[str, tuple[An
         ]
     )
     return called
-
-
-class EpisodeOptions(NamedTuple):
-    """What every command that runs one episode takes.
-
-    - `asked`: all of its options that a view depends on, by name.
-    """
-
-    search: str
-    model: ModelName
-    views: int
-    until: list[str] | None
-    seed: int
-    out: Path | None
-    overwrite: bool
-    noise: float
-    quick: bool
-    report: bool
-    asked: dict[str, Any]
-
-
-class SensorOptions(NamedTuple):
-    """The sensor of `jaxnbv run`; None leaves what fits the object.
-
-    - `fov`: degrees; `radius`: scene units; `rays`: along a side.
-    """
-
-    paper: bool = False
-    fov: float | None = None
-    radius: float | None = None
-    rays: int | None = None
-
-
-class SizeOptions(NamedTuple):
-    """How much is imagined; None leaves the usual number."""
-
-    samples: int | None = None
-    candidates: int | None = None
-    lengthscale: float | None = None
-
-
-USUAL_SIZE = SizeOptions()

@@ -6,10 +6,10 @@ from typing import Annotated, Any
 import typer
 
 from jaxnbv.cli import actions
+from jaxnbv.cli.asked import Device
 from jaxnbv.cli.options import (
     REQUIRED,
     CategoryOption,
-    Device,
     DeviceOption,
     ModelName,
     ModelOption,

@@ -7,7 +7,8 @@ from typing import Annotated, Any
 import typer
 
 from jaxnbv.cli import actions
-from jaxnbv.cli.options import Device, DeviceOption, ModelName, ModelOption, command
+from jaxnbv.cli.asked import Device
+from jaxnbv.cli.options import DeviceOption, ModelName, ModelOption, command
 from jaxnbv.studies.registry import STUDIES, Entry
 from jaxnbv.studies.scenes import Framing
 

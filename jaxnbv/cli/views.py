@@ -7,13 +7,12 @@ from typing import Annotated, Any, TypeVar
 import typer
 
 from jaxnbv.cli import actions
+from jaxnbv.cli.asked import Device, EpisodeOptions, SensorOptions, SizeOptions
 from jaxnbv.cli.options import (
     REQUIRED,
     CandidatesOption,
     CategoryOption,
-    Device,
     DeviceOption,
-    EpisodeOptions,
     FirstOption,
     FovOption,
     FramingOption,
@@ -33,8 +32,6 @@ from jaxnbv.cli.options import (
     SearchName,
     SearchOption,
     SeedOption,
-    SensorOptions,
-    SizeOptions,
     SourceOption,
     Task,
     TaskOption,

@@ -201,10 +201,11 @@ def check_oriented(cloud: PointCloud, name: str, limit: float, unit: bool = True
     require(finite, f"{name} has points or normals that are not finite: drop or mask these rows")
     lengths = np.linalg.norm(normals, axis=1)
     wrong = lengths[np.abs(lengths - 1.0) > 0.01] if unit else lengths[lengths > _LONGEST_NORMAL]
+    allowed = "not of unit length" if unit else f"longer than {_LONGEST_NORMAL:g}"
     require(
         wrong.size == 0,
-        f"{name} has {wrong.size} normals that are not of unit length, such as {wrong[:1]}: "
-        "build it with PointCloud.from_arrays, which normalises",
+        f"{name} has {wrong.size} normals that are {allowed}, such as {wrong[:1]}: build it with "
+        "PointCloud.from_arrays, which normalises",
     )
     furthest = float(np.abs(points).max())
     require(

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Real
 from jaxnbv.checks import AnyArray, as_floats, as_numbers, is_traced, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.geometry.volume import Box
+from jaxnbv.geometry.volume import Box, ray_interval
 
 Rows = tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"]]
 # Depths that are so many times what they should be are in other units, not of another object.
@@ -77,9 +77,7 @@ def _oriented(
 def _depth_behind(box: Box, camera: Camera, pose: Pose) -> Float[Array, " n"]:
     """The depth at which each ray leaves a box; minus infinity for a ray that does not meet it."""
     directions = jnp.matmul(camera.pixel_directions(), pose.rotation.T, precision="highest")
-    directions = jnp.where(jnp.abs(directions) < 1e-9, 1e-9, directions)
-    sides = jnp.stack([(jnp.asarray(side) - pose.position) / directions for side in (box.low, box.high)])
-    enter, leave = jnp.max(jnp.min(sides, axis=0), axis=1), jnp.min(jnp.max(sides, axis=0), axis=1)
+    enter, leave = ray_interval(list(pose.position), list(directions.T), box.low, box.high)
     return jnp.where(leave > jnp.maximum(enter, 0.0), leave, -jnp.inf)
 
 

@@ -1,4 +1,4 @@
-"""Farthest point sampling of the rows of a point set (Eldar et al. 1997)."""
+"""Farthest point sampling of the rows of a point set, in any number of dimensions (Eldar et al. 1997)."""
 
 import functools
 
@@ -10,7 +10,7 @@ from jaxnbv.checks import require
 
 
 @functools.partial(jax.jit, static_argnames="count")
-def farthest_point_indices(points: Float[Array, "n 3"], mask: Bool[Array, " n"], count: int) -> Int[Array, " count"]:
+def farthest_point_indices(points: Float[Array, "n d"], mask: Bool[Array, " n"], count: int) -> Int[Array, " count"]:
     """`count` rows, each as far as can be from those before it, in order of choice; of equals, the first.
 
     Starts at the first filled row. No row is chosen twice while another that is filled is left, duplicates included;
@@ -20,16 +20,17 @@ def farthest_point_indices(points: Float[Array, "n 3"], mask: Bool[Array, " n"],
     **Raises:** `ValueError` if `count` < 1.
     """
     require(count >= 1, f"cannot choose {count} points; ask for at least one")
-    x, y, z = jax.lax.stop_gradient(jnp.where(mask[:, None], points, 0.0)).T
-    rows = jnp.arange(len(x), dtype=jnp.int32)
+    columns = list(jax.lax.stop_gradient(jnp.where(mask[:, None], points, 0.0)).T)
+    rows = jnp.arange(len(points), dtype=jnp.int32)
 
     def choose(carry, _):
         distance, latest = carry
-        nearer = jnp.minimum(distance, (x - x[latest]) ** 2 + (y - y[latest]) ** 2 + (z - z[latest]) ** 2)
+        squares = [(column - column[latest]) ** 2 for column in columns]
+        nearer = jnp.minimum(distance, functools.reduce(jnp.add, squares))
         distance = jnp.where(rows == latest, _CHOSEN, nearer)
         return (distance, _first_of_largest(distance, rows)), latest
 
-    start = jnp.where(mask, jnp.inf, jnp.full_like(x, _EMPTY)), jnp.argmax(mask).astype(jnp.int32)
+    start = jnp.where(mask, jnp.inf, jnp.full_like(columns[0], _EMPTY)), jnp.argmax(mask).astype(jnp.int32)
     return jax.lax.scan(choose, start, length=count)[1]
 
 

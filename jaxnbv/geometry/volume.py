@@ -1,7 +1,8 @@
 """Where the object can be: a region of the scene by its signed distance, and points on its boundary."""
 
+import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -57,6 +58,24 @@ class Box(eqx.Module):
         beyond = jnp.abs(x - center) - half
         outside = jnp.sqrt(jnp.sum(jnp.maximum(beyond, 0.0) ** 2, axis=-1))
         return outside + jnp.minimum(jnp.max(beyond, axis=-1), 0.0)
+
+
+def ray_interval(
+    origin: Sequence[Float[Array, "*#n"]],
+    direction: Sequence[Float[Array, "*#n"]],
+    low: Sequence[float],
+    high: Sequence[float],
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    """Where rays enter a box and leave it, in lengths of their directions (Kay and Kajiya 1986). A ray that enters
+    after it leaves misses the box.
+
+    - `origin`, `direction`: their three components, each an array; `low`, `high`: the corners.
+    """
+    safe = [jnp.where(jnp.abs(d) < 1e-9, 1e-9, d) for d in direction]
+    sides = [((a - x) / d, (b - x) / d) for x, d, a, b in zip(origin, safe, low, high, strict=True)]
+    enter = functools.reduce(jnp.maximum, [jnp.minimum(p, q) for p, q in sides])
+    leave = functools.reduce(jnp.minimum, [jnp.maximum(p, q) for p, q in sides])
+    return enter, leave
 
 
 @eqx.filter_jit

@@ -6,11 +6,7 @@ from jaxnbv.networks.categories import category_index as category_index
 from jaxnbv.networks.categories import part_mask as part_mask
 from jaxnbv.networks.checkpoints import convert_checkpoint as convert_checkpoint
 from jaxnbv.networks.checkpoints import load_checkpoint as load_checkpoint
-from jaxnbv.networks.checkpoints import load_part_segmenter as load_part_segmenter
-from jaxnbv.networks.checkpoints import load_safetensors as load_safetensors
-from jaxnbv.networks.checkpoints import load_torch_checkpoint as load_torch_checkpoint
 from jaxnbv.networks.checkpoints import save_checkpoint as save_checkpoint
-from jaxnbv.networks.checkpoints import save_safetensors as save_safetensors
 from jaxnbv.networks.classifier import CloudClassifier as CloudClassifier
 from jaxnbv.networks.compact_segmenter import CompactPartSegmenter as CompactPartSegmenter
 from jaxnbv.networks.feature_propagation import FeaturePropagation as FeaturePropagation

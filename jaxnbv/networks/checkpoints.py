@@ -94,8 +94,3 @@ def _network(path: str | Path, tensors: _Tensors, metadata: Mapping[str, str]) -
         return build_part_segmenter(tensors) if is_segmenter(tensors) else build_classifier(tensors)
     except InputError as error:
         raise InputError(f"{path} does not hold a network that is known here: {error}") from error
-
-
-# Their former names, for one release.
-load_torch_checkpoint = load_safetensors = load_part_segmenter = load_checkpoint
-save_safetensors = save_checkpoint

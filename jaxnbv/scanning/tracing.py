@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Int8
 
+from jaxnbv.geometry.volume import ray_interval
 from jaxnbv.scanning.cubic import CORNERS, cubic, first_bracket, first_root
 from jaxnbv.scanning.implicit import implicit_depth
 
@@ -175,9 +176,8 @@ def enter(u: Triple, du: Triple, field: Field) -> tuple[March, Float[Array, " n"
     # The box is smaller by a sliver so that no position, rounded and moved ahead, lies out of the grid.
     low, high = 2 * field.ahead, field.g - 1 - 2 * field.ahead
     du = [jnp.where(jnp.abs(d) < 1e-9, 1e-9, d) for d in du]
-    sides = [((low - x) / d, (high - x) / d) for x, d in zip(u, du, strict=True)]
-    start = jnp.maximum(_largest([jnp.minimum(p, q) for p, q in sides]), 0.0)
-    end = _smallest([jnp.maximum(p, q) for p, q in sides])
+    start, end = ray_interval(u, du, 3 * [low], 3 * [high])
+    start = jnp.maximum(start, 0.0)
     u = [jnp.clip(x + start * d, low, high) for x, d in zip(u, du, strict=True)]
     unknown = jnp.zeros(start.shape, jnp.int8)
     return March(u, du, jnp.zeros_like(start), end - start, unknown, start < end), start

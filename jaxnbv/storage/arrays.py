@@ -90,13 +90,11 @@ def _check(data: dict[str, np.ndarray], index: int, schema: Schema, file: Path, 
             )
             if not fits:
                 raise ValueError(f"its {name} is {array.dtype}{list(array.shape)}")
-    # Folders of format 1 say none of these.
-    if "format" in data:
-        check_format(int(data["format"]), file)
-        if int(data["index"]) != index:
-            raise ValueError(f"it is {what} {int(data['index'])}")
-        if str(data["sha256"]) != _checksum({name: array for name, array in data.items() if name != "sha256"}):
-            raise ValueError("its checksum is not that of its arrays")
+    check_format(int(data["format"]), file)
+    if int(data["index"]) != index:
+        raise ValueError(f"it is {what} {int(data['index'])}")
+    if str(data["sha256"]) != _checksum({name: array for name, array in data.items() if name != "sha256"}):
+        raise ValueError("its checksum is not that of its arrays")
 
 
 def _checksum(arrays: dict[str, np.ndarray]) -> str:
@@ -139,7 +137,6 @@ def pose_of(data: Mapping[str, np.ndarray]) -> Pose:
 
 
 def scan_of(data: Mapping[str, np.ndarray]) -> PointCloud:
-    """Folders of earlier versions do not say which rays met nothing."""
     missed = data.get("missed")
     points, normals, mask = (jnp.asarray(data[name]) for name in ("points", "normals", "mask"))
     return PointCloud(points, normals, mask, None if missed is None else jnp.asarray(missed))

@@ -17,7 +17,7 @@ import loky
 from jaxnbv.checks import InputError, require
 from jaxnbv.storage.files import PARTS, make_folder, write_text
 
-# Of the files; those of format 1 do not say it, and hold neither index nor checksum.
+# Of the files.
 FORMAT = 2
 _LOCK = ".lock"
 
@@ -49,8 +49,9 @@ def differences(found: Any, asked: Any, name: str = "") -> list[str]:
 def check_format(format: Any, file: Path) -> None:
     """**Raises:** `ValueError` for a file of a format that is not known here."""
     require(
-        format in range(1, FORMAT + 1),
-        f"{file} is of format {str(format)[:20]}; this version of jaxnbv reads up to {FORMAT}: install a newer one",
+        format == FORMAT,
+        f"{file} is of format {str(format)[:20]}; this version of jaxnbv reads format {FORMAT}: install a newer "
+        "one, or choose another folder",
     )
 
 
@@ -193,9 +194,8 @@ class ResultFolder:
         article = "an" if self.kind == "episode" else "a"
         problem = f"is not {article} {self.kind}'s record"
         written = read_json(self.record, problem, "choose another output folder")
-        check_format(written.pop("format", 1), self.record)
-        made_by = written.pop("versions", None)
-        # Studies of format 1 have no level of their own for it.
-        config = written.get("config", written if self.kind == "study" else None)
+        config = written.get("config")
         require(config is not None, f"{self.record} {problem} (it has no config): choose another output folder")
+        check_format(written.get("format"), self.record)
+        made_by = written.get("versions")
         return config, made_by if isinstance(made_by, dict) else {}

@@ -19,7 +19,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
-from jaxnbv.geometry.volume import Box
+from jaxnbv.geometry.volume import Box, ray_interval
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Evidence, Grid, GridSurface, SDFSurface, Surface, TriangleMesh, scan
 from jaxnbv.studies.engine.diagnostics import rank_correlation
@@ -162,9 +162,8 @@ def exit_depths(
 ) -> tuple[Float[Array, "*n"], Bool[Array, "*n"]]:
     """Where rays leave a box, in lengths of their directions, and whether they meet it at all (Kay and Kajiya 1986)."""
     origins, directions = jnp.asarray(origins), jnp.asarray(directions)
-    safe = jnp.where(jnp.abs(directions) < 1e-9, 1e-9, directions)
-    sides = jnp.stack([(jnp.asarray(side, origins.dtype) - origins) / safe for side in (volume.low, volume.high)])
-    enters, leaves = jnp.max(jnp.min(sides, axis=0), axis=-1), jnp.min(jnp.max(sides, axis=0), axis=-1)
+    start, along = (list(jnp.moveaxis(vectors, -1, 0)) for vectors in (origins, directions))
+    enters, leaves = ray_interval(start, along, volume.low, volume.high)
     return leaves, leaves > jnp.maximum(enters, 0.0)
 
 

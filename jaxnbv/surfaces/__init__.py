@@ -1,13 +1,15 @@
 """p(f) and p(f | D): distributions over implicit surfaces."""
 
 from jaxnbv.surfaces.base import Fields as Fields
+from jaxnbv.surfaces.base import SampledPosterior as SampledPosterior
 from jaxnbv.surfaces.base import SurfaceModel as SurfaceModel
 from jaxnbv.surfaces.base import SurfacePosterior as SurfacePosterior
 from jaxnbv.surfaces.fitting import fit_hyperparameters as fit_hyperparameters
+from jaxnbv.surfaces.pathwise import FieldsAbout as FieldsAbout
+from jaxnbv.surfaces.pathwise import TrigonometricPosterior as TrigonometricPosterior
 from jaxnbv.surfaces.screened import ScreenedSPSR as ScreenedSPSR
 from jaxnbv.surfaces.spsr import GeometricSPSR as GeometricSPSR
 from jaxnbv.surfaces.trigonometric import TrigonometricFields as TrigonometricFields
-from jaxnbv.surfaces.trigonometric import TrigonometricPosterior as TrigonometricPosterior
 from jaxnbv.surfaces.values import OnSurface as OnSurface
 from jaxnbv.surfaces.values import OutsideBoundary as OutsideBoundary
 from jaxnbv.surfaces.values import SeenEmpty as SeenEmpty

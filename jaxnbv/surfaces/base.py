@@ -81,6 +81,17 @@ class Fields(eqx.Module):
     def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
         """All samples at the points x (scene coordinates)."""
 
+    @on_torus
+    def gradient(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n 3"]:
+        """The gradients of all samples at the points x, here by forward differentiation of their values."""
+        x = jnp.asarray(x)
+
+        def along(direction):
+            # A value depends on its own point alone, so that all points can be moved at once.
+            return jax.jvp(self, (x,), (jnp.broadcast_to(direction, x.shape),))[1]
+
+        return jnp.moveaxis(jax.vmap(along)(jnp.eye(3, dtype=x.dtype)), 0, -1)
+
     @on_grid_of_torus
     def on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "s g g g"]:
         """All samples on the tensor grid axis x axis x axis (scene coordinates)."""
@@ -90,8 +101,8 @@ class Fields(eqx.Module):
 class SurfacePosterior(eqx.Module):
     """p(f | D): the surface is where f equals `level`, and f is greater outside.
 
-    An implementation gives `level` and `sample`. One that has closed forms also overrides `mean` and `variance`, which
-    are Monte Carlo estimates here.
+    An implementation gives `level` and `sample`. One that has closed forms overrides `mean`, `variance` and
+    `probability_inside` by them, and `drawn`, by which all four are estimated here, to give itself.
     """
 
     level: eqx.AbstractVar[Float[Array, ""]]
@@ -100,19 +111,77 @@ class SurfacePosterior(eqx.Module):
     def sample(self, key: PRNGKeyArray, num_samples: int) -> Fields:
         """`num_samples` independent samples of the whole function f."""
 
+    def drawn(self, num_samples: int = 64) -> "SurfacePosterior":
+        """The posterior itself where it has closed forms; here with samples drawn once, under a fixed key, by which its
+        moments are estimated. Who asks for more than one moment asks what this gives: the samples are then drawn once.
+
+        **Raises:** `ValueError` if `num_samples` < 2.
+        """
+        check_type(num_samples, int, "the number of samples")
+        require(num_samples >= 2, f"a variance of {num_samples} samples was asked for; ask for at least two")
+        return SampledPosterior(self.level, self, self.sample(jax.random.key(0), num_samples))
+
     def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """E f(x), here from 64 samples under a fixed key."""
-        return jnp.mean(self.sample(jax.random.key(0), 64)(x), axis=0)
+        """E f(x), here as `drawn` estimates it."""
+        return self.drawn().mean(x)
+
+    def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
+        """Var f(x), here as `drawn` estimates it."""
+        return self.drawn().variance(x)
+
+    def probability_inside(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
+        """P(f(x) < level), here as `drawn` estimates it."""
+        return self.drawn().probability_inside(x)
 
     @on_grid_of_torus
     @eqx.filter_jit
     def mean_on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "g g g"]:
         """E f on the tensor grid axis x axis x axis (scene coordinates)."""
-        return on_tensor_grid(self.mean, axis)
+        drawn = self.drawn()
+        return on_tensor_grid(self.mean, axis) if drawn is self else drawn.mean_on_grid(axis)
+
+
+class SampledPosterior(SurfacePosterior):
+    """A posterior whose moments are estimated from samples drawn once: the same functions for all points, so that the
+    mean is smooth, and variances and probabilities belong to it.
+
+    - `level`: that of the posterior.
+    - `posterior`: what was sampled. `sample` draws from it anew: its samples are not among those that are kept.
+    - `fields`: the samples that are kept, at least two.
+
+    With S samples the standard error of the mean is its standard deviation / sqrt(S), that of a probability p is
+    sqrt(p (1 - p) / S), and that of a Gaussian variance is sqrt(2 / (S - 1)) of it.
+    """
+
+    level: Float[Array, ""]
+    posterior: SurfacePosterior
+    fields: Fields
+
+    def sample(self, key: PRNGKeyArray, num_samples: int) -> Fields:
+        """`num_samples` independent samples of the posterior, as its own `sample` draws them."""
+        return self.posterior.sample(key, num_samples)
+
+    def drawn(self, num_samples: int = 64) -> "SampledPosterior":
+        """Itself, of as many samples as were drawn."""
+        return self
+
+    def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
+        """Mean of the samples at the points x (scene coordinates)."""
+        return jnp.mean(self.fields(x), axis=0)
 
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """Var f(x), here from 64 samples under a fixed key."""
-        return jnp.var(self.sample(jax.random.key(0), 64)(x), axis=0, ddof=1)
+        """Variance of the samples at the points x, with S - 1 in its denominator."""
+        return jnp.var(self.fields(x), axis=0, ddof=1)
+
+    def probability_inside(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
+        """Share of the samples that are below the level at the points x."""
+        return jnp.mean(self.fields(x) < self.level, axis=0)
+
+    @on_grid_of_torus
+    @eqx.filter_jit
+    def mean_on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "g g g"]:
+        """Mean of the samples on the tensor grid axis x axis x axis, for which all of them are held there at once."""
+        return jnp.mean(self.fields.on_grid(axis), axis=0)
 
 
 class SurfaceModel(eqx.Module):

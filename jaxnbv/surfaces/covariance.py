@@ -68,6 +68,16 @@ def function_variance(spectrum: Spectra) -> Float[Array, ""]:
     return function_covariance(origin, origin, spectrum)[0, 0]
 
 
+def mode_variance(spectrum: Spectra) -> Float[Array, "a a a"]:
+    """Prior variances of the coefficients of a component of v, see `surfaces/trigonometric.py`."""
+
+    def of_one(spectrum):
+        variance = basis_variance(spectrum)
+        return variance[:, None, None] * variance[:, None] * variance
+
+    return jnp.sum(jax.vmap(of_one)(jnp.atleast_2d(spectrum)), axis=0)
+
+
 def _even(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> Float[Array, "n m"]:
     """sum_{n in Z} s1(n) cos(n (x - y))."""
     truncation = spectrum.shape[0] - 1

@@ -13,6 +13,7 @@ s(n) / |n|^2 sum_k w_k e^{-i n.y_k} besides, and c by -tau^2 1^T w. A stays shar
 """
 
 import math
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,16 +24,12 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxnbv.checks import AnyArray, check_fields, is_traced, require, shown
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.scanning.evidence import Evidence
-from jaxnbv.surfaces.base import SurfaceModel, on_torus, sampler
-from jaxnbv.surfaces.covariance import function_covariance, function_variance
+from jaxnbv.surfaces.base import SurfaceModel, on_torus
+from jaxnbv.surfaces.covariance import function_covariance, function_variance, mode_variance
 from jaxnbv.surfaces.nonuniform import NonuniformTransform
-from jaxnbv.surfaces.spsr import GeometricSPSR, GeometricSPSRPosterior, mode_variance
-from jaxnbv.surfaces.trigonometric import (
-    TrigonometricFields,
-    TrigonometricPosterior,
-    inverse_laplacian,
-    solve_poisson,
-)
+from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, filled
+from jaxnbv.surfaces.spsr import GeometricSPSR, GeometricSPSRPosterior, NormalDraws
+from jaxnbv.surfaces.trigonometric import inverse_laplacian, solve_poisson
 from jaxnbv.surfaces.values import OnSurface, OutsideBoundary, SeenEmpty, ValueRows, ValueSource, joined
 
 _CHUNK_VALUES = 2**24
@@ -114,7 +111,7 @@ def _condition(model: ScreenedSPSR, base: GeometricSPSRPosterior, evidence: Evid
     weights = posterior.solve(half_jump * rows.values - at_rows)
     no_draw = jnp.zeros((1, 3, *base.mean_coefficients.shape), at_rows.dtype)
     normals = solve_triangular(base.cholesky, base.cloud.normals, lower=True)
-    mean = posterior._conditioned(no_draw, normals[None], jnp.zeros(1, at_rows.dtype), weights[None])[0]
+    mean = posterior._updated(no_draw, normals[None], jnp.zeros(1, at_rows.dtype), weights[None])[0]
     return eqx.tree_at(lambda p: (p.weights, p.mean_coefficients), posterior, (weights, mean))
 
 
@@ -127,6 +124,14 @@ def _half_jump(base: GeometricSPSRPosterior, offset: float) -> Float[Array, ""]:
     mean = base.mean_field
     least = 0.5 * jnp.sqrt(function_variance(base.model.spectrum))
     return jnp.maximum(0.5 * jnp.median(mean(points + step)[0] - mean(points - step)[0]), least)
+
+
+class ScreenedDraws(NamedTuple):
+    """v and eps, the level c and the noise e of the values, drawn from the prior."""
+
+    normals: NormalDraws
+    level: Float[Array, " s"]
+    noise: Float[Array, "s m"]
 
 
 class ScreenedSPSRPosterior(TrigonometricPosterior):
@@ -184,30 +189,39 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         of_values = -0.5 * (jnp.sum(residual**2) + log_determinant + count * jnp.log(2.0 * jnp.pi))
         return self.base.log_marginal_likelihood() + of_values
 
-    @sampler
-    @eqx.filter_jit
-    def sample(self, key: PRNGKeyArray, num_samples: int) -> TrigonometricFields:
-        """`num_samples` joint samples of g by pathwise conditioning: functions, to be evaluated anywhere.
+    def data_points(self) -> DataPoints:
+        """The cloud's for gradients, and those of the values."""
+        return DataPoints(self.base.data_points().gradients, filled(self.rows.points, self.rows.mask))
 
-        **Raises:** `ValueError` if `num_samples` < 1.
-        """
+    def level_about(self, means: MeansAtData) -> Float[Array, " s"]:
+        """None: g is relative to the level, which the values tie to m_s + f."""
+        return jnp.zeros(len(means.values), self.weights.dtype)
+
+    def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> ScreenedDraws:
+        """Draws of v and eps, of c, and of e."""
         base_key, level_key, noise_key = jax.random.split(key, 3)
-        coefficients, residual = self.base.prior_draws(base_key, num_samples)
-        dtype, shape = residual.dtype, self.rows.noise.shape
+        normals = self.base.prior_draws(base_key, num_samples)
+        dtype, shape = normals.at_data.dtype, self.rows.noise.shape
         level = self.model.level_deviation * jax.random.normal(level_key, (num_samples,), dtype)
         noise = self.half_jump * self.rows.noise * jax.random.normal(noise_key, (num_samples, *shape), dtype)
+        return ScreenedDraws(normals, level, noise)
+
+    def conditioned(self, draws: ScreenedDraws, means: MeansAtData) -> Float[Array, "s a a a"]:
+        """Coefficients of g: the draws moved by what the normals say, and then by what the values say."""
+        residual = self.base.whitened_residual(draws.normals, means)
+        coefficients, level, noise = draws.normals.coefficients, draws.level, draws.noise
         transform = NonuniformTransform(self.rows.points, self.model.base.truncation)
         at_rows = jax.lax.map(lambda v: transform.evaluate(solve_poisson(v)[None])[:, 0], coefficients)
         # f at the values given the normals: k(Y, X) A^-1 r = B^T C^-1 r, with B the whitened covariance.
-        at_rows = at_rows + jnp.einsum("dnm,snd->sm", self.whitened, residual, precision="highest")
+        at_rows = at_rows + jnp.einsum("dnm,snd->sm", self.whitened, residual, precision="highest") + means.values
         weights = jax.vmap(self.solve)(self.half_jump * self.rows.values - at_rows + level[:, None] - noise)
-        return TrigonometricFields(self._conditioned(coefficients, residual, -level, weights))
+        return self._updated(coefficients, residual, -level, weights)
 
     def solve(self, residual: Float[Array, " m"]) -> Float[Array, " m"]:
         """w = S^-1 r; zero in rows that are not filled."""
         return cho_solve((self.factor, True), jnp.where(self.rows.mask, residual, 0.0))
 
-    def _conditioned(
+    def _updated(
         self,
         coefficients: Float[Array, "s 3 a a a"],
         residual: Float[Array, "s n 3"],
@@ -216,7 +230,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
     ) -> Float[Array, "s a a a"]:
         """Coefficients of g for each v, its whitened residual at the normals, minus its level, and its w."""
         moved = residual - jnp.einsum("dnm,sm->snd", self.whitened, weights, precision="highest")
-        fields = self.base.conditioned(coefficients, moved)
+        fields = self.base.updated(coefficients, moved)
         transform = NonuniformTransform(self.rows.points, self.model.base.truncation)
         variance = mode_variance(self.model.base.spectrum)
         direct = jax.lax.map(lambda w: inverse_laplacian(variance * transform.adjoint(w[:, None])[0]), weights)

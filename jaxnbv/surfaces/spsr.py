@@ -15,7 +15,7 @@ distribution.
 import functools
 import math
 import warnings
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -28,17 +28,20 @@ from scipy.spatial import cKDTree
 from jaxnbv.checks import AnyArray, as_floats, check_type, is_traced, require
 from jaxnbv.geometry.cloud import PointCloud, check_oriented
 from jaxnbv.scanning.evidence import Evidence
-from jaxnbv.surfaces.base import HALF_WIDTH, SurfaceModel, on_torus, sampler
+from jaxnbv.surfaces.base import HALF_WIDTH, SurfaceModel, on_torus
 from jaxnbv.surfaces.covariance import (
     Spectra,
     function_covariance,
     function_normal_covariance,
     function_variance,
+    mode_variance,
 )
 from jaxnbv.surfaces.gram import factorise, on_filled_rows
 from jaxnbv.surfaces.matern import Scalar, circle_spectrum
 from jaxnbv.surfaces.nonuniform import NonuniformTransform
-from jaxnbv.surfaces.trigonometric import TrigonometricFields, TrigonometricPosterior, basis_variance, solve_poisson
+from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, filled
+from jaxnbv.surfaces.reconstruction import level_slope, mean_at_data, reconstruct
+from jaxnbv.surfaces.trigonometric import basis_variance, solve_poisson
 
 _CHUNK_VALUES = 2**24
 _SPARSE = 2.5
@@ -168,26 +171,15 @@ def _condition(model: GeometricSPSR, cloud: PointCloud) -> "GeometricSPSRPosteri
     weights = cho_solve((cholesky, True), normals)
     transform = NonuniformTransform(cloud.points, model.truncation)
     mean = reconstruct(transform, weights, spectrum)
-    at_data = transform.evaluate(mean[None])[:, 0]
-    level = jnp.sum(jnp.where(cloud.mask, at_data, 0.0)) / jnp.sum(cloud.mask)
+    level = mean_at_data(transform, mean, cloud)
     return GeometricSPSRPosterior(level, mean, model, cloud, cholesky, weights)
 
 
-def mode_variance(spectrum: Spectra) -> Float[Array, "a a a"]:
-    """Prior variances of the coefficients of a component of v."""
+class NormalDraws(NamedTuple):
+    """v drawn from the prior, by its coefficients, and v(X) + eps."""
 
-    def of_one(spectrum):
-        variance = basis_variance(spectrum)
-        return variance[:, None, None] * variance[:, None] * variance
-
-    return jnp.sum(jax.vmap(of_one)(jnp.atleast_2d(spectrum)), axis=0)
-
-
-def reconstruct(
-    transform: NonuniformTransform, weights: Float[Array, "n 3"], spectrum: Spectra
-) -> Float[Array, "a a a"]:
-    """Coefficients of the f that k(., X) weights reconstructs."""
-    return solve_poisson(mode_variance(spectrum) * transform.adjoint(weights))
+    coefficients: Float[Array, "s 3 a a a"]
+    at_data: Float[Array, "s n 3"]
 
 
 class GeometricSPSRPosterior(TrigonometricPosterior):
@@ -235,19 +227,20 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         log_determinant = 2.0 * jnp.sum(jnp.log(jnp.diag(self.cholesky)))
         return -0.5 * (fit + 3.0 * log_determinant + 3.0 * count * jnp.log(2.0 * jnp.pi))
 
-    @sampler
-    @eqx.filter_jit
-    def sample(self, key: PRNGKeyArray, num_samples: int) -> TrigonometricFields:
-        """`num_samples` joint samples of f by pathwise conditioning: functions, to be evaluated anywhere.
+    def data_points(self) -> DataPoints:
+        """The cloud's, for gradients and for values."""
+        points = filled(self.cloud.points, self.cloud.mask)
+        return DataPoints(points, points)
 
-        **Raises:** `ValueError` if `num_samples` < 1.
-        """
-        return TrigonometricFields(self.conditioned(*self.prior_draws(key, num_samples)))
+    def level_about(self, means: MeansAtData) -> Float[Array, " s"]:
+        """Mean over the data of what m_s adds to E f(x_j): m_s(x_j) itself, less what grad m_s takes from the normals.
+        The latter is linear in them, so that its slope is computed once for all means."""
+        slope = level_slope(self.cloud, self.cholesky, self.model.spectrum)
+        explained = jnp.einsum("snd,nd->s", means.gradients, slope, precision="highest")
+        return jnp.mean(means.values, axis=1, where=self.cloud.mask) - explained
 
-    def prior_draws(
-        self, key: PRNGKeyArray, num_samples: int
-    ) -> tuple[Float[Array, "s 3 a a a"], Float[Array, "s n 3"]]:
-        """Coefficients of v drawn from the prior, and their residuals at the data, whitened: C^-1 (n - v(X) - eps)."""
+    def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> NormalDraws:
+        """Draws of v and of eps."""
         spectrum, dtype = self.model.spectrum, self.weights.dtype
         scale = jnp.sqrt(mode_variance(spectrum))
         modes = scale.shape[0]
@@ -258,16 +251,23 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
             field_key, noise_key = keys
             coefficients = scale * jax.random.normal(field_key, (3, modes, modes, modes), dtype)
             noise = self.model.noise * jax.random.normal(noise_key, self.cloud.points.shape, dtype)
-            return coefficients, transform.evaluate(coefficients) + noise
+            return NormalDraws(coefficients, transform.evaluate(coefficients) + noise)
 
-        coefficients, at_data = jax.lax.map(prior, (field_keys, noise_keys))
-        residual = jnp.where(self.cloud.mask[:, None], self.cloud.normals - at_data, 0.0)
-        return coefficients, self._solve_triangular(residual, transpose=False)
+        return jax.lax.map(prior, (field_keys, noise_keys))
 
-    def conditioned(
+    def conditioned(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s a a a"]:
+        """Coefficients of Poisson(v + k(., X) A^-1 (n - grad m - v(X) - eps))."""
+        return self.updated(draws.coefficients, self.whitened_residual(draws, means))
+
+    def whitened_residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
+        """C^-1 (n - grad m - v(X) - eps) with A = C C^T, zero in rows that are not filled."""
+        residual = self.cloud.normals - means.gradients - draws.at_data
+        return self._solve_triangular(jnp.where(self.cloud.mask[:, None], residual, 0.0), transpose=False)
+
+    def updated(
         self, coefficients: Float[Array, "s 3 a a a"], whitened: Float[Array, "s n 3"]
     ) -> Float[Array, "s a a a"]:
-        """Coefficients of Poisson(v + k(., X) C^-T z) for each v and z: samples, where z is the whitened residual."""
+        """Coefficients of Poisson(v + k(., X) C^-T z) for each v and each whitened residual z."""
         transform = NonuniformTransform(self.cloud.points, self.model.truncation)
         weights = self._solve_triangular(whitened, transpose=True)
 

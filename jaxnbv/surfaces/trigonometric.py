@@ -8,14 +8,13 @@ derivative of a function with coefficients C_a has the coefficients a C_{-a}.
 All products ask for full float32 precision, which some GPUs would otherwise trade for speed.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnbv.checks import AnyArray
-from jaxnbv.surfaces.base import Fields, SurfacePosterior, on_grid_of_torus, on_torus
+from jaxnbv.surfaces.base import Fields, on_grid_of_torus, on_torus
 
 _CHUNK_VALUES = 2**24
 
@@ -88,34 +87,14 @@ class TrigonometricFields(Fields):
         chunk = max(1, min(x.shape[0], _CHUNK_VALUES // (samples * modes**2)))
         return jax.lax.map(evaluate, x, batch_size=chunk).T
 
+    @on_torus
+    def gradient(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n 3"]:
+        """The gradients of all functions at the points x, from the coefficients of their derivatives."""
+        derivatives = jnp.concatenate([differentiate(self.coefficients, axis) for axis in range(3)])
+        return jnp.stack(jnp.split(TrigonometricFields(derivatives)(x), 3), axis=-1)
+
     @on_grid_of_torus
     def on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "s g g g"]:
         """All functions on the tensor grid axis x axis x axis, one after the other to bound the memory."""
         basis = circle_basis(jnp.asarray(axis, dtype=self.coefficients.dtype), self.coefficients.shape[-1] // 2)
         return jax.lax.map(lambda block: evaluate_on_grid(block, basis), self.coefficients)
-
-
-class TrigonometricPosterior(SurfacePosterior):
-    """A posterior whose mean is a band-limited function.
-
-    - `mean_coefficients`: of E f.
-    """
-
-    mean_coefficients: eqx.AbstractVar[Float[Array, "a a a"]]
-
-    @property
-    def mean_field(self) -> TrigonometricFields:
-        """E f as a single field."""
-        return TrigonometricFields(self.mean_coefficients[None])
-
-    @on_torus
-    @eqx.filter_jit
-    def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """E f(x) at points in scene coordinates."""
-        return self.mean_field(x)[0]
-
-    @on_grid_of_torus
-    @eqx.filter_jit
-    def mean_on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "g g g"]:
-        """E f on the tensor grid axis x axis x axis (scene coordinates)."""
-        return self.mean_field.on_grid(axis)[0]

@@ -31,8 +31,8 @@ Segmenter: TypeAlias = Callable[[PointCloud], Float[Array, "points parts"]]
 class SoftPartCount(eqx.Module):
     """The paper's u_S(D) = sum_c tanh(sum_i p_ic / N_target), a utility for `ExpectedUtilityImprovement`.
 
-    A part of which far more than N_target points are seen adds nothing any more, so the value of a view is what it shows
-    of parts not found yet.
+    A part of which far more than N_target points are seen adds nothing any more, so the value of a view is what it
+    shows of parts not found yet.
 
     - `segmenter`: a function from a cloud to the probabilities of the parts, point by point.
     - `target`: N_target, in points that the segmenter looks at; the default is the authors'.

@@ -4,6 +4,7 @@ import dataclasses
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
@@ -12,6 +13,7 @@ from tqdm import tqdm
 from jaxnbv.acquisition import Quantity
 from jaxnbv.checks import AnyArray
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import Episode
@@ -264,13 +266,11 @@ def allowing_for_unseen(surface: MeanSurface | None, cloud: PointCloud) -> MeanS
 
 
 def _spread(features: np.ndarray, count: int) -> np.ndarray:
-    """`count` rows far from each other, in order of choice; repeated from the start where there are fewer rows."""
-    chosen = np.zeros(min(count, len(features)), dtype=np.int64)
-    distance = np.full(len(features), np.inf)
-    for i in range(1, len(chosen)):
-        distance = np.minimum(distance, np.sum((features - features[chosen[i - 1]]) ** 2, axis=1))
-        chosen[i] = distance.argmax()
-    return np.resize(chosen, count)
+    """`count` rows far from each other, in order of choice; the first again and again where there are fewer rows."""
+    # Padded to a power of two, so that surfaces of other sizes share a compilation.
+    capacity = 1 << (len(features) - 1).bit_length()
+    padded = np.pad(features.astype(np.float32), ((0, capacity - len(features)), (0, 0)))
+    return np.asarray(farthest_point_indices(jnp.asarray(padded), jnp.arange(capacity) < len(features), count))
 
 
 def _interpolate(features: np.ndarray, anchors: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -12,13 +12,12 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.geometry.volume import Box
 from jaxnbv.scanning import SDFSurface, scan
-from jaxnbv.scanning.sdf import Box as Block
-from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.scanning.sdf import Cuboid, Sphere
 
 # In metres, z up: a ball on a table, 0.8 m from the camera, and a pillar between them at the left.
 BALL = Sphere(0.1).translate([0.0, 0.0, 0.1])
-TABLE = Block([0.6, 0.6, 0.02]).translate([0.0, 0.0, -0.02])
-PILLAR = Block([0.01, 0.01, 0.4]).translate([-0.05, -0.5, 0.4])
+TABLE = Cuboid([0.6, 0.6, 0.02]).translate([0.0, 0.0, -0.02])
+PILLAR = Cuboid([0.01, 0.01, 0.4]).translate([-0.05, -0.5, 0.4])
 POSE = look_at((0.0, -0.8, 0.3), (0.0, 0.0, 0.1), up=(0.0, 0.0, 1.0))
 CAMERA = Camera.from_intrinsics([[90.0, 0.0, 34.0], [0.0, 95.0, 21.5], [0.0, 0.0, 1.0]], width=64, height=48)
 BOX = Box((-0.15, -0.15, 0.002), (0.15, 0.15, 0.25))

@@ -13,7 +13,7 @@ from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.scanning import Carving, Grid, SDFSurface, scan
-from jaxnbv.scanning.sdf import Box, Sphere
+from jaxnbv.scanning.sdf import Cuboid, Sphere
 from jaxnbv.viz.render import frustum
 
 sizes = st.integers(2, 60)
@@ -111,7 +111,7 @@ def test_limits_that_cannot_be_are_refused(settings, message):
 
 def test_a_scan_tells_what_lies_in_range_and_is_not_aslant():
     """A ball before a wall: analytic depths and angles, ray by ray."""
-    surface = SDFSurface(Sphere(0.5) | Box([1.2, 1.2, 0.1]).translate([0.0, 0.0, -1.0]))
+    surface = SDFSurface(Sphere(0.5) | Cuboid([1.2, 1.2, 0.1]).translate([0.0, 0.0, -1.0]))
     pose = look_at((0.0, 0.0, 2.5))
     whole = Camera(math.radians(50.0), 40, 40)
     every = scan(surface, whole, pose)

@@ -10,7 +10,6 @@ import pytest
 import safetensors.numpy
 from torch_files import Op, call, checkpoint, named, narrow_network, state_of
 
-from jaxnbv import networks
 from jaxnbv.checks import InputError
 from jaxnbv.networks import (
     CloudClassifier,
@@ -186,10 +185,3 @@ def test_a_network_of_the_other_kind_is_refused_where_it_would_be_fed():
         CloudClassifier(CompactPartSegmenter(jax.random.key(0)))
     with pytest.raises(InputError, match="a CloudClassifier feeds it"):
         CloudSegmenter(InvariantClassifier(3, jax.random.key(0)), "chair")
-
-
-def test_former_names():
-    assert (
-        networks.load_torch_checkpoint is networks.load_safetensors is networks.load_part_segmenter is load_checkpoint
-    )
-    assert networks.save_safetensors is save_checkpoint

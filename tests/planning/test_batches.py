@@ -11,6 +11,7 @@ from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import look_at
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.travel import ValueMinusCost, ValuePerCost, arc_length, rotation_angle, total_cost
 from jaxnbv.scanning import Grid, SDFSurface, scan, scan_samples
@@ -35,12 +36,12 @@ def spread(cloud):
     return jnp.sum(jnp.max(jnp.where(cloud.mask[:, None], jnp.abs(cloud.points), 0.0), axis=0))
 
 
-def planner_of(search=DiscreteSearch(12), score=Coverage(), **changes):  # noqa: B008
-    settings = {"num_samples": 3, "grid": Grid(24), "capacity": 128, "max_views": 6, **changes}
-    return Planner(GeometricSPSR(0.05, truncation=8), Camera(height=8, width=8), score, search, **settings)
+def planner_of(search=DiscreteSearch(12), score=Coverage(), num_samples=3, cost=None):  # noqa: B008
+    imagination = Imagination(GeometricSPSR(0.05, truncation=8), Grid(24), num_samples)
+    return Planner(score, search, Camera(height=8, width=8), imagination, cost, capacity=128, max_views=6)
 
 
-def state_of(planner):
+def evidence_of(planner):
     return planner.init(FIRST, scan(SCENE, planner.camera, FIRST))
 
 
@@ -65,7 +66,7 @@ def spread_gain(known, seen):
 )
 def test_a_batch_is_greedy_over_what_the_same_sample_would_show(score, gain):
     planner = planner_of(score=score)
-    evidence = state_of(planner)
+    evidence = evidence_of(planner)
     batch = planner.propose_batch(evidence, KEY, 3)
     surfaces = planner.imagination.sample(evidence, jax.random.split(KEY)[0])
     poses = planner.search.candidates.poses()
@@ -90,7 +91,7 @@ def test_what_the_first_view_shows_is_worth_little_to_the_second():
     """Two neighbours: alone they are level."""
     candidates = look_at(np.array([[2.5, 0.1, 0.0], [2.5, -0.1, 0.0]]))
     planner = planner_of(DiscreteSearch(candidates))
-    first, second = planner.propose_batch(state_of(planner), KEY, 2).proposals
+    first, second = planner.propose_batch(evidence_of(planner), KEY, 2).proposals
     other = 1 - int(jnp.argmax(first.values))
     assert float(first.values[other]) > 0.8 * float(first.value)
     assert float(second.value) < 0.5 * float(first.values[other])
@@ -98,7 +99,7 @@ def test_what_the_first_view_shows_is_worth_little_to_the_second():
 
 def test_the_order_is_that_of_the_shortest_way():
     planner = planner_of(FarthestView(12))
-    evidence = state_of(planner)
+    evidence = evidence_of(planner)
     batch = planner.propose_batch(evidence, KEY, 4)
 
     def length(order):
@@ -110,7 +111,7 @@ def test_the_order_is_that_of_the_shortest_way():
 
 def test_a_second_batch_compiles_nothing(compilations):
     planner = planner_of(num_samples=2)
-    evidence, other = state_of(planner), jax.random.key(9)
+    evidence, other = evidence_of(planner), jax.random.key(9)
     planner.propose_batch(evidence, KEY, 3)
     before = len(compilations)
     planner.propose_batch(evidence, other, 3)
@@ -128,7 +129,7 @@ def test_a_second_batch_compiles_nothing(compilations):
 @pytest.mark.parametrize("search", [DiscreteSearch(12), HalvingSearch(12, first_samples=3), UncertaintyView(12)])
 def test_values_are_weighed_against_the_way_from_the_last_view(cost, worth, search):
     plain, weighed = planner_of(search), planner_of(search, cost=cost)
-    evidence = state_of(plain)
+    evidence = evidence_of(plain)
     second = plain.propose(evidence, KEY).pose
     evidence = plain.observe(evidence, second, scan(SCENE, plain.camera, second))
     values, found = (np.asarray(planner.propose(evidence, KEY).values) for planner in (plain, weighed))
@@ -147,7 +148,7 @@ def test_values_are_weighed_against_the_way_from_the_last_view(cost, worth, sear
 
 def test_standard_errors_are_of_what_is_weighed():
     plain, weighed = planner_of(), planner_of(cost=ValuePerCost(arc_length))
-    evidence = state_of(plain)
+    evidence = evidence_of(plain)
     errors = [np.asarray(planner.propose(evidence, KEY).standard_errors) for planner in (plain, weighed)]
     way = np.array([float(arc_length(FIRST, pose)) for pose in plain.search.candidates.poses()])
     np.testing.assert_allclose(errors[1], errors[0] / (1.0 + way), rtol=1e-3)
@@ -157,7 +158,7 @@ def test_a_search_by_gradient_weighs_the_way_too():
     """So dear that the best is to stay near."""
     search = GradientSearch(dof=2, num_starts=2, iterations=6, learning_rate=0.05, num_candidates=6)
     planner = planner_of(search, cost=ValueMinusCost(arc_length, weight=1e4))
-    proposal = planner.propose(state_of(planner), KEY)
+    proposal = planner.propose(evidence_of(planner), KEY)
     ways = np.array([[float(arc_length(FIRST, p)) for p in way] for way in proposal.trajectories.poses])
     assert np.all(ways[:, -1] < ways[:, 0])
     assert planner.quantity.name == "expected coverage gain less cost"
@@ -173,7 +174,7 @@ def test_without_a_last_view_nothing_is_spent():
 
 @pytest.mark.parametrize("search", [FarthestView(12), RandomView(12)])
 def test_what_does_not_look_at_values_takes_no_cost(search):
-    with pytest.raises(InputError, match="does not look at what a view is worth"):
+    with pytest.raises(InputError, match="does not look at the value of a view"):
         planner_of(search, cost=ValuePerCost(arc_length))
 
 
@@ -181,4 +182,4 @@ def test_what_does_not_look_at_values_takes_no_cost(search):
 def test_a_batch_needs_room(count):
     planner = planner_of()
     with pytest.raises(InputError, match=f"asked for {count} views at once; give 1 to 5"):
-        planner.propose_batch(state_of(planner), KEY, count)
+        planner.propose_batch(evidence_of(planner), KEY, count)

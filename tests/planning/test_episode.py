@@ -9,7 +9,7 @@ import pytest
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.imagination import Imagination
-from jaxnbv.planning.episode import observe_scene, simulate
+from jaxnbv.planning.episode import Episode, observe_scene, simulate
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, mesh_from_sdf, scan
 from jaxnbv.scanning.sdf import Capsule, Sphere
@@ -61,6 +61,33 @@ def test_simulate_is_the_loop_of_ask_and_tell(episode):
     for wrong in (0, 5):
         with pytest.raises(ValueError, match=f"asked for {wrong} of 4 views"):
             episode.evidence_after(wrong)
+
+
+def test_a_solid_is_simulated_as_its_surface_is():
+    ball = Sphere(1.0)
+    solid, surface = (simulate(PLANNER, scene, FIRST, 2, KEY, progress=False) for scene in (ball, SDFSurface(ball)))
+    assert jax.tree.structure(solid) == jax.tree.structure(surface)
+    assert_same_bits(solid.views, surface.views)
+    assert int(solid.views[1].scan.count) > 5
+
+
+def test_a_folder_gives_the_views_back_with_a_planner_of_its_camera(episode, tmp_path):
+    episode.save(tmp_path)
+    found = Episode.load(tmp_path)
+    assert found.planner.camera == PLANNER.camera
+    assert found.scene is None
+    assert found.noise is None
+    assert len(found.views) == 4
+    for view, expected in zip(found.views, episode.views, strict=True):
+        assert_same_bits((view.pose, view.scan, view.proposal), (expected.pose, expected.scan, expected.proposal))
+    # It does not know how many points were kept, and keeps more of them.
+    seen = np.concatenate([view.scan.to_numpy()[0] for view in episode.views])
+    np.testing.assert_array_equal(found.cloud.to_numpy()[0], seen)
+
+
+def test_a_folder_without_an_episode_is_named(tmp_path):
+    with pytest.raises(ValueError, match=str(tmp_path)):
+        Episode.load(tmp_path)
 
 
 def test_views_differ_and_scans_carry_the_sensors_noise(episode):
@@ -138,5 +165,5 @@ def test_more_views_than_there_is_room_for_are_refused():
 
 def test_a_first_view_that_sees_nothing_is_refused():
     away = Pose(np.eye(3, dtype=np.float32), np.array([0.0, 0.0, 2.5], np.float32))
-    with pytest.raises(ValueError, match="first scan is empty"):
+    with pytest.raises(ValueError, match="the scan is empty: no point to start from"):
         simulate(PLANNER, SCENE, away, 2, KEY, progress=False)

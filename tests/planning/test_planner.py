@@ -26,10 +26,12 @@ FIRST = look_at((0.8, 0.9, 2.2))
 SEARCHES = {kind.__name__: kind(12) for kind in (DiscreteSearch, FarthestView, RandomView, UncertaintyView)}
 
 
-def planner_of(search, **changes):
-    settings = {"num_samples": 3, "grid": Grid(24), "capacity": 128, **changes}
-    model, camera = GeometricSPSR(truncation=8, lengthscale=0.05), Camera(height=8, width=8)
-    return Planner(model, camera, Coverage(), search, **settings)
+MODEL, CAMERA = GeometricSPSR(truncation=8, lengthscale=0.05), Camera(height=8, width=8)
+
+
+def planner_of(search, acquisition=Coverage(), num_samples=3, **changes):  # noqa: B008
+    imagination = Imagination(MODEL, Grid(24), num_samples)
+    return Planner(acquisition, search, CAMERA, imagination, **{"capacity": 128, **changes})
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +70,7 @@ def test_simulated_episodes_do_not_recompile_either(planner, compilations):
     assert len(compilations) == before
 
 
-def test_asking_and_telling_leave_the_state_as_it_was(planner, evidence):
+def test_asking_and_telling_leave_the_evidence_as_it_was(planner, evidence):
     before = jax.tree.map(np.array, evidence)
     proposal = planner.propose(evidence, jax.random.key(1))
     seen = scan(SCENE, planner.camera, proposal.pose)
@@ -89,6 +91,14 @@ def test_a_first_scan_from_an_unknown_pose_excludes_nothing():
     evidence = planner.init(None, scan(SCENE, planner.camera, FIRST))
     assert int(evidence.num_views) == 0
     assert not np.isneginf(planner.propose(evidence, jax.random.key(0)).values).any()
+
+
+@pytest.mark.parametrize("name", SEARCHES)
+def test_a_cloud_alone_is_evidence(name):
+    planner = planner_of(SEARCHES[name])
+    cloud, key = scan(SCENE, planner.camera, FIRST), jax.random.key(4)
+    known, alone = (planner.propose(evidence, key) for evidence in (planner.init(None, cloud), cloud))
+    jax.tree.map(np.testing.assert_array_equal, jax.tree.map(np.array, known), jax.tree.map(np.array, alone))
 
 
 def test_beyond_its_capacity_the_cloud_is_thinned_by_farthest_points(planner, evidence):
@@ -122,7 +132,7 @@ def cloud_at(*points):
 
 def test_an_empty_first_scan_is_refused(planner):
     empty = PointCloud(jnp.zeros((4, 3)), jnp.zeros((4, 3)), jnp.zeros(4, bool))
-    with pytest.raises(ValueError, match=r"first scan is empty.*[Pp]oint the camera"):
+    with pytest.raises(ValueError, match=r"the scan is empty: no point to start from.*[Pp]oint the camera"):
         planner.init(FIRST, empty)
 
 
@@ -178,14 +188,7 @@ def test_numbers_below_one_are_refused(name, value):
 
 def test_a_score_that_is_not_a_number_is_named(evidence):
     utility = ExpectedUtilityImprovement(lambda cloud: jnp.sum(cloud.points) * jnp.nan)
-    planner = planner_of(DiscreteSearch(12))
-    planner = Planner(
-        utility,
-        planner.search,
-        planner.camera,
-        Imagination(planner.imagination.model, grid=planner.imagination.grid, num_samples=3),
-        capacity=128,
-    )
+    planner = planner_of(DiscreteSearch(12), utility)
     with pytest.raises(ValueError, match="NaN"):
         planner.propose(evidence, jax.random.key(0))
 
@@ -202,9 +205,8 @@ def test_a_singular_covariance_is_named():
     cloud = PointCloud.from_arrays(points, np.tile([0.0, 0.0, 1.0], (64, 1)))
     with pytest.raises(ValueError, match=r"64 normals with noise=1e-05 is singular .* raise the noise"):
         model.condition(cloud)
-    planner = Planner(
-        Coverage(), DiscreteSearch(4), imagination=Imagination(model, grid=Grid(12), num_samples=2), capacity=64
-    )
+    imagination = Imagination(model, Grid(12), num_samples=2)
+    planner = Planner(Coverage(), DiscreteSearch(4), imagination=imagination, capacity=64)
     with pytest.raises(ValueError, match="raise the model's noise"):
         planner.propose(planner.init(None, cloud), jax.random.key(0))
 
@@ -215,10 +217,8 @@ def test_points_far_apart_are_told_of_with_the_remedy():
     cloud = PointCloud.from_arrays(points, points)
 
     def init(lengthscale, variance):
-        model = GeometricSPSR(lengthscale, variance, 10)
-        Planner(
-            Coverage(), DiscreteSearch(6), Camera(height=8, width=8), Imagination(model, grid=Grid(16), num_samples=2)
-        ).init(None, cloud)
+        imagination = Imagination(GeometricSPSR(lengthscale, variance, 10), Grid(16), num_samples=2)
+        Planner(Coverage(), DiscreteSearch(6), CAMERA, imagination).init(None, cloud)
 
     with pytest.warns(UserWarning, match=r"points are 0\.4\d apart, 2\.\d times .*Scan more densely, or raise"):
         init(0.025, 0.2)
@@ -236,14 +236,8 @@ def test_parts_thinner_than_a_cell_are_told_of_with_the_remedy():
     first, second = PointCloud.from_arrays(above, up), PointCloud.from_arrays(below, -up)
 
     def observe(resolution):
-        model, camera = GeometricSPSR(0.05, 0.2, 10), Camera(height=8, width=8)
-        planner = Planner(
-            Coverage(),
-            DiscreteSearch(6),
-            camera,
-            Imagination(model, grid=Grid(resolution), num_samples=2),
-            capacity=400,
-        )
+        imagination = Imagination(GeometricSPSR(0.05, 0.2, 10), Grid(resolution), num_samples=2)
+        planner = Planner(Coverage(), DiscreteSearch(6), CAMERA, imagination, capacity=400)
         planner.observe(planner.init(None, first), look_at((0.0, 0.0, -2.5)), second)
 
     with pytest.warns(UserWarning, match=r"288 of 288 points lie on parts thinner than a cell .*0\.0972.*Raise Grid"):

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from jaxnbv.acquisition import ExpectedUtilityImprovement, Score, expected_value
+from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement, expected_value
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
@@ -44,7 +44,7 @@ def spread(cloud):
     return jnp.linalg.slogdet(0.1 * jnp.eye(6) + rows.T @ rows)[1]
 
 
-SCORES = {
+ACQUISITIONS = {
     "coverage": Coverage(),
     "cross-entropy": CrossEntropy(smooth),
     "mixed, open": MixedEntropy(smooth, threshold=0.0),
@@ -54,17 +54,17 @@ SCORES = {
 }
 
 
-class OneOf(Score):
-    """One of several scores, by its weight, so that all share one compilation."""
+class OneOf(Acquisition):
+    """One of several acquisitions, by its weight, so that all share one compilation."""
 
-    scores: list[Score]
+    members: list[Acquisition]
     weights: jax.Array
 
     def context(self, cloud):
-        return [score.context(cloud) for score in self.scores]
+        return [member.context(cloud) for member in self.members]
 
     def __call__(self, context, scan):
-        values = [score(c, scan) for score, c in zip(self.scores, context, strict=True)]
+        values = [member(c, scan) for member, c in zip(self.members, context, strict=True)]
         return jnp.stack(values) @ self.weights
 
 
@@ -192,9 +192,9 @@ def test_derivatives_are_those_of_central_differences(kind, space, x64):
     assert seen.jumps.mean() < 0.03
     assert seen.crosses.mean() < 0.03
     assert seen.grazes.mean() < 0.3
-    weights = jnp.eye(len(SCORES))
-    for name, weight in zip(SCORES, weights, strict=True):
-        found, expected, length = compare(OneOf(list(SCORES.values()), weight), surfaces, pairs)
+    weights = jnp.eye(len(ACQUISITIONS))
+    for name, weight in zip(ACQUISITIONS, weights, strict=True):
+        found, expected, length = compare(OneOf(list(ACQUISITIONS.values()), weight), surfaces, pairs)
         error = np.abs(found - expected)
         worst = np.max((error / (1e-6 * length + 1e-7))[seen.none])
         assert worst < 1, f"{name}: {worst:.3g} times the tolerance"
@@ -205,8 +205,8 @@ def test_a_jump_is_not_in_the_derivative(x64):
     """At a thousandth, silhouettes pass over some pixels: differences there are of another order than elsewhere."""
     surfaces, pairs, step = surfaces_of("blob"), pairs_of("free"), 1e-3
     seen = events(surfaces, pairs, step)
-    weight = jnp.eye(len(SCORES))[0]
-    found, expected, length = compare(OneOf(list(SCORES.values()), weight), surfaces, pairs, step)
+    weight = jnp.eye(len(ACQUISITIONS))[0]
+    found, expected, length = compare(OneOf(list(ACQUISITIONS.values()), weight), surfaces, pairs, step)
     error = np.abs(found - expected) / length
     assert 0.0 < seen.jumps.mean() < 0.2
     assert np.median(error[seen.jumps]) > 30 * np.median(error[~seen.jumps & ~seen.grazes])

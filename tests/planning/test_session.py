@@ -16,14 +16,14 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.session import Session
 from jaxnbv.planning.stopping import Budget, ValueBelow
 from jaxnbv.scanning import Carving, Grid, SDFSurface, scan
-from jaxnbv.scanning.sdf import Box as Block
-from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.scanning.sdf import Cuboid, Sphere
 from jaxnbv.search import DiscreteSearch, FarthestView, GradientSearch
 from jaxnbv.surfaces import GeometricSPSR, OutsideBoundary, ScreenedSPSR
 from jaxnbv.tasks import Coverage
+from jaxnbv.viz import write_report
 
 CENTER = np.array([0.3, 0.2, 0.12])
-WORLD = SDFSurface(Sphere(0.1).translate([0.3, 0.2, 0.101]) | Block([1.0, 1.0, 0.02]).translate([0.3, 0.2, -0.021]))
+WORLD = SDFSurface(Sphere(0.1).translate([0.3, 0.2, 0.101]) | Cuboid([1.0, 1.0, 0.02]).translate([0.3, 0.2, -0.021]))
 CAMERA = Camera.from_intrinsics([[90.0, 0.0, 34.0], [0.0, 95.0, 21.5], [0.0, 0.0, 1.0]], width=64, height=48)
 BOX = ((0.18, 0.08, 0.002), (0.42, 0.32, 0.24))
 
@@ -46,10 +46,9 @@ def shot(matrix, unit=1000.0):
     return np.round(image).astype(np.uint16) if unit > 1 else image
 
 
-def planner_of(search=None, **changes):
-    settings = {"num_samples": 3, "grid": Grid(28), "capacity": 400, "max_views": 8, **changes}
-    model = GeometricSPSR(0.2, truncation=8)
-    return Planner(model, Camera(height=12, width=16), Coverage(), search or DiscreteSearch(), **settings)
+def planner_of(search=DiscreteSearch(), num_samples=3, capacity=400):  # noqa: B008
+    imagination = Imagination(GeometricSPSR(0.2, truncation=8), Grid(28), num_samples)
+    return Planner(Coverage(), search, Camera(height=12, width=16), imagination, capacity=capacity, max_views=8)
 
 
 def session_of(folder=None, **changes):
@@ -74,32 +73,21 @@ def test_it_asks_and_tells_as_a_planner_in_the_scene_does(finished):
     box = Box(*BOX)
     search = DiscreteSearch(frame.to_scene(Pose.from_matrix(POSES)))
     imagined = frame.to_scene(CAMERA).resized(12, 16)
-    planner = Planner(
-        Coverage(),
-        search,
-        imagined,
-        Imagination(
-            GeometricSPSR(0.2, truncation=8), grid=Grid(28), num_samples=3, carving=Carving(frame.to_scene(box))
-        ),
-        capacity=400,
-        max_views=8,
-    )
+    imagination = Imagination(GeometricSPSR(0.2, truncation=8), Grid(28), 3, Carving(frame.to_scene(box)))
+    planner = Planner(Coverage(), search, imagined, imagination, capacity=400, max_views=8)
     evidence, matrix = None, FIRST
     for index in range(3):
         pose = Pose.from_matrix(matrix)
         cloud = PointCloud.from_depth(shot(matrix), CAMERA, pose, scale=1e-3, box=box)
-        told = (frame.to_scene(pose), frame.to_scene(CAMERA))
-        scanned = frame.to_scene(cloud)
-        evidence = (
-            planner.init(scanned, *told) if evidence is None else planner.observe(evidence, told[0], scanned, told[1])
-        )
+        told = (frame.to_scene(pose), frame.to_scene(cloud), frame.to_scene(CAMERA))
+        evidence = planner.init(*told) if evidence is None else planner.observe(evidence, *told)
         sample_key, search_key, _ = view_keys(jax.random.key(0), index + 1)
         proposal = planner.choose(evidence, planner.imagination.sample(evidence, sample_key), search_key)
         matrix = np.asarray(frame.to_world(proposal.pose).matrix)
         expected = finished.episode.views[index + 1].proposal if index < 2 else finished.next().proposal
         np.testing.assert_allclose(proposal.values, expected.values, rtol=1e-4, atol=1e-4)
         np.testing.assert_allclose(proposal.pose.position, expected.pose.position, atol=1e-5)
-    np.testing.assert_allclose(finished.state.cloud.points, evidence.cloud.points, atol=1e-5)
+    np.testing.assert_allclose(finished.evidence.cloud.points, evidence.cloud.points, atol=1e-5)
 
 
 def test_its_matrices_are_those_that_were_given(finished):
@@ -202,7 +190,7 @@ def test_a_rig_of_two_cameras_is_one_session(tmp_path):
         ({"depth_scale": 1.0}, "give the depth's scale, 0.001 for millimetres"),
         ({"matrix": FIRST @ np.diag([-1.0, 1.0, -1.0, 1.0])}, "the box .* lies behind the camera"),
         ({"depth": np.ones((5, 5))}, r"the depth image is \(5, 5\) but the camera has \(48, 64\)"),
-        ({"depth": np.zeros((48, 64))}, "the first scan is empty"),
+        ({"depth": np.zeros((48, 64))}, "the scan is empty: no point to start from"),
     ],
 )
 def test_a_wrong_image_is_named_and_changes_nothing(given, message, tmp_path):
@@ -224,7 +212,7 @@ def test_an_image_beside_the_box_is_warned_of():
         pytest.warns(
             UserWarning, match=r"none of the \d+ points .* lies in the box .* Is the pose from camera to world"
         ),
-        pytest.raises(InputError, match="the first scan is empty"),
+        pytest.raises(InputError, match="the scan is empty: no point to start from"),
     ):
         session.add(shot(FIRST), inverse, depth_scale=1e-3)
 
@@ -234,6 +222,8 @@ def test_an_image_beside_the_box_is_warned_of():
     [
         (lambda: session_of().next(), "no image yet: add one first"),
         (lambda: session_of().cloud, "no image yet: add one first"),
+        (lambda: session_of().evidence, "no image yet: add one first"),
+        (lambda: session_of().episode, "no image yet: add one first"),
         (lambda: session_of(box=((0.0, 0.0), (1.0, 1.0))), "give two corners"),
         (lambda: session_of(box=((0.0, 0.0, 0.0), (1.0, 1.0, -1.0))), "has no inside"),
         (lambda: session_of(planner=planner_of(GradientSearch())), "GradientSearch is no search over candidates"),
@@ -249,18 +239,12 @@ def test_bad_input_is_named(make, message):
 def test_the_box_is_the_volume_of_the_model_and_of_the_carving():
     """What was given another volume keeps it."""
     own = Box.cube(2.0)
-    planner = planner_of()
-    planner = Planner(
-        Coverage(),
-        planner.search,
-        planner.camera,
-        Imagination(ScreenedSPSR(values=(OutsideBoundary(), OutsideBoundary(own)))),
-    )
-    fitted = session_of(planner=planner).planner
+    imagination = Imagination(ScreenedSPSR(values=(OutsideBoundary(), OutsideBoundary(own))))
+    fitted = session_of(planner=Planner(Coverage(), camera=Camera(height=12, width=16), imagination=imagination)).planner
     scene = Frame.fit(np.array(BOX), up="z").to_scene(Box(*BOX))
-    assert fitted.carving.volume == scene
-    assert fitted.model.values[0].volume == scene
-    assert fitted.model.values[1].volume == own
+    assert fitted.imagination.carving.volume == scene
+    assert fitted.imagination.model.values[0].volume == scene
+    assert fitted.imagination.model.values[1].volume == own
     assert max(scene.high) == pytest.approx(1.25)
     assert fitted.camera.fov == pytest.approx(CAMERA.fov)
 
@@ -277,8 +261,21 @@ def test_it_is_done_by_its_rule(finished):
 
 
 def test_a_report_stands_upright_and_needs_no_truth(finished, tmp_path):
-    page = finished.report(tmp_path, progress=False).read_text()
+    page = write_report(finished.episode, tmp_path, progress=False).read_text()
     assert "that of a real sensor" in page
     assert page.count("<li>View") == 3
-    with pytest.raises(InputError, match="keeps no folder"):
-        finished.report()
+
+
+def test_who_follows_is_told_of_every_image_and_proposal():
+    """Beginning with what there is, as the session then stands."""
+    session, early, late = session_of(planner=planner_of(FarthestView())), [], []
+    session.follow(lambda one: early.append((one.views, one.next_view)))
+    assert early == []
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    assert session.next_view is None
+    first = session.next()
+    session.next()
+    session.follow(lambda one: late.append((one.views, one.next_view)))
+    session.add(shot(first.matrix), first.matrix, depth_scale=1e-3)
+    assert early == [(1, None), (1, first), (2, None)]
+    assert late == [(1, first), (2, None)]

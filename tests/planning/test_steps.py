@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxnbv
-from jaxnbv.acquisition import Score
+from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.imagination import Imagination
@@ -26,7 +26,7 @@ SCENE, FIRST = SDFSurface(Sphere(0.8)), sphere_candidates(CANDIDATES)[2]
 CAMERA = Camera(height=10, width=10)
 
 
-class FirstRow(Score):
+class FirstRow(Acquisition):
     def context(self, cloud):
         return None
 
@@ -35,14 +35,8 @@ class FirstRow(Score):
 
 
 def planner(search, views=4):
-    return Planner(
-        Coverage(),
-        search,
-        CAMERA,
-        Imagination(GeometricSPSR(0.2, truncation=6), grid=Grid(16), num_samples=2),
-        capacity=150,
-        max_views=views,
-    )
+    imagination = Imagination(GeometricSPSR(0.2, truncation=6), Grid(16), num_samples=2)
+    return Planner(Coverage(), search, CAMERA, imagination, capacity=150, max_views=views)
 
 
 def views_of(planner, key=KEY, noise=SensorNoise(), camera=CAMERA, first=FIRST):
@@ -104,19 +98,19 @@ def test_views_that_are_known_are_told_and_not_asked_for():
     assert len(asked) == 2
 
 
-def test_a_step_holds_the_samples_and_the_state_that_the_next_view_is_chosen_from():
+def test_a_step_holds_the_samples_and_the_evidence_that_the_next_view_is_chosen_from():
     own = planner(DiscreteSearch(CANDIDATES), 3)
     first, second, third = steps(own, scene_sensor(SCENE, CAMERA), FIRST, KEY)
     assert (first.surfaces, first.seconds) == (None, 0.0)
-    again = own.choose(second.state, third.surfaces, jax.random.key(0))
+    again = own.choose(second.evidence, third.surfaces, jax.random.key(0))
     assert_same(again, third.view.proposal)
     assert third.seconds > 0.0
 
 
-def test_another_score_or_search_does_not_compile_the_sampler_again(compilations):
+def test_another_acquisition_or_search_does_not_compile_the_sampler_again(compilations):
     own = planner(DiscreteSearch(CANDIDATES))
     evidence = own.init(FIRST, next(views_of(own)).scan)
-    surfaces = own.sample_surfaces(evidence, KEY)
+    surfaces = own.imagination.sample(evidence, KEY)
     jax.block_until_ready(surfaces.values)
     del compilations[:]
     other = eqx.tree_at(lambda p: p.acquisition, planner(UncertaintyView(CANDIDATES)), FirstRow())

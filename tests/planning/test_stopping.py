@@ -6,34 +6,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxnbv.planning.state import State
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import simulate
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.stopping import Budget, Covered, Found, SoFar, Sure, ValueBelow, expected_coverage
-from jaxnbv.scanning import Grid, GridSurface, SDFSurface, SensorNoise
+from jaxnbv.planning.stopping import Budget, ValueBelow, so_far
+from jaxnbv.scanning import Evidence, Grid, GridSurface, SDFSurface, SensorNoise
 from jaxnbv.scanning.sdf import Sphere
-from jaxnbv.search import DiscreteSearch, FarthestView, Proposal
+from jaxnbv.search import DiscreteSearch, FarthestView
 from jaxnbv.surfaces import GeometricSPSR
-from jaxnbv.tasks import Coverage, CrossEntropy, NegativeEntropy, SoftPartCount
+from jaxnbv.tasks import Coverage, Covered, CrossEntropy, Found, NegativeEntropy, SoftPartCount, Sure
+from jaxnbv.tasks.coverage import expected_coverage
 
 SCENE, FIRST, KEY = SDFSurface(Sphere(0.8)), look_at((0.0, 0.0, 2.5)), jax.random.key(3)
 CAMERA, GRID = Camera(height=12, width=12), Grid(24)
 SEARCH = DiscreteSearch(10)
 
 
-def planner_of(score, search=SEARCH, **changes):
-    settings = {"num_samples": 2, "grid": GRID, "capacity": 256, "max_views": 8, **changes}
-    return Planner(GeometricSPSR(0.2, truncation=6), CAMERA, score, search, **settings)
-
-
-def state_of(cloud):
-    return State.before_views(cloud, 4, GRID)
+def planner_of(acquisition, search=SEARCH):
+    imagination = Imagination(GeometricSPSR(0.2, truncation=6), GRID, num_samples=2)
+    return Planner(acquisition, search, CAMERA, imagination, capacity=256, max_views=8)
 
 
 def cloud_of(count, capacity=256):
@@ -41,12 +38,8 @@ def cloud_of(count, capacity=256):
     return PointCloud.from_arrays(0.8 * directions, directions, capacity)
 
 
-def so_far(planner, cloud, poses=(FIRST,), seconds=0.0):
-    return SoFar(planner, state_of(cloud), tuple(poses), seconds, KEY)
-
-
-def proposal_of(value, pose=FIRST):
-    return Proposal(pose, jnp.asarray(value), pose[None], jnp.asarray([value]))
+def after(planner, cloud, poses=(FIRST,), seconds=0.0):
+    return so_far(planner, Evidence.before_views(cloud, 4, GRID), poses, KEY, seconds)
 
 
 def of_count(cloud, enough):
@@ -67,7 +60,7 @@ def of_half(cloud):
 )
 def test_sure_asks_all_of_the_cloud_and_halves_of_it(score, enough, resamplings, stops):
     planner = planner_of(score(functools.partial(of_count, enough=enough)))
-    reason = Sure(0.95, resamplings).after(so_far(planner, cloud_of(200)))
+    reason = Sure(0.95, resamplings).after(after(planner, cloud_of(200)))
     assert (reason is not None) == stops
     if stops:
         assert reason.startswith("sure of class 0: 0.99")
@@ -75,14 +68,14 @@ def test_sure_asks_all_of_the_cloud_and_halves_of_it(score, enough, resamplings,
 
 def test_sure_wants_the_same_class_of_every_half():
     planner = planner_of(CrossEntropy(of_half))
-    assert Sure(0.95, 0).after(so_far(planner, cloud_of(199))) is not None
-    assert Sure(0.95, 16).after(so_far(planner, cloud_of(199))) is None
+    assert Sure(0.95, 0).after(after(planner, cloud_of(199))) is not None
+    assert Sure(0.95, 16).after(after(planner, cloud_of(199))) is None
 
 
 def test_sure_is_asked_the_probability_that_was_given():
     planner = planner_of(CrossEntropy(functools.partial(of_count, enough=1)))
-    assert Sure(0.98).after(so_far(planner, cloud_of(50))) is not None
-    assert Sure(0.995).after(so_far(planner, cloud_of(50))) is None
+    assert Sure(0.98).after(after(planner, cloud_of(50))) is not None
+    assert Sure(0.995).after(after(planner, cloud_of(50))) is None
 
 
 def segmenter(counts):
@@ -102,7 +95,7 @@ def segmenter(counts):
 )
 def test_found_counts_the_points_of_the_parts_that_are_asked_for(parts, points, stops):
     planner = planner_of(ExpectedUtilityImprovement(segmenter((80, 80, 40))))
-    reason = Found(points, parts).after(so_far(planner, cloud_of(200, 200)))
+    reason = Found(points, parts).after(after(planner, cloud_of(200, 200)))
     assert (reason is not None) == stops
 
 
@@ -112,8 +105,8 @@ def test_expected_coverage_is_that_of_the_samples(points, radius, monkeypatch):
     axis = np.asarray(Grid(64).axis)
     distance = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1), axis=-1) - 0.8
     ball = GridSurface.from_values(jnp.asarray(distance, jnp.float32)[None], 0.0, Grid(64))
-    planner = planner_of(Coverage(), grid=Grid(64))
-    monkeypatch.setattr(Planner, "sample_surfaces", lambda self, evidence, key: ball)
+    planner = planner_of(Coverage())
+    monkeypatch.setattr(Imagination, "sample", lambda self, evidence, key: ball)
     cloud = cloud_of(points)
     hits = []
     for pose in DiscreteSearch(10).candidates.poses():
@@ -128,33 +121,33 @@ def test_expected_coverage_is_that_of_the_samples(points, radius, monkeypatch):
     nearest = np.linalg.norm(hits[:, None] - cloud.to_numpy()[0][None], axis=-1).min(axis=1)
     share = float(np.mean(nearest <= radius))
     assert 0.05 < share < 0.97
-    assert expected_coverage(planner, state_of(cloud), KEY, radius) == pytest.approx(share, abs=0.02)
-    covered = so_far(planner, cloud)
-    assert Covered(share - 0.03, radius).after(covered) is not None
-    assert Covered(min(share + 0.03, 1.0), radius).after(covered) is None
+    known = after(planner, cloud)
+    assert expected_coverage(known, radius) == pytest.approx(share, abs=0.02)
+    assert Covered(share - 0.03, radius).after(known) is not None
+    assert Covered(min(share + 0.03, 1.0), radius).after(known) is None
 
 
-def test_worth_less_and_budgets_on_scripted_proposals():
+def test_value_below_and_budgets_on_scripted_proposals():
     planner = planner_of(Coverage())
-    asked = so_far(planner, cloud_of(50))
-    assert "worth 0.3, less than 0.5" in ValueBelow(0.5).before(asked, proposal_of(0.3))
-    assert ValueBelow(0.5).before(asked, proposal_of(0.5)) is None
+    asked = after(planner, cloud_of(50))
+    assert "a value of 0.3, less than 0.5" in ValueBelow(0.5).before(asked, FIRST, 0.3)
+    assert ValueBelow(0.5).before(asked, FIRST, 0.5) is None
     east, top, west = (look_at(place) for place in ((2.5, 0.0, 0.0), (0.0, 2.5, 0.0), (-2.5, 0.0, 0.0)))
     quarter = 2.5 * np.pi / 2.0
-    way = so_far(planner, cloud_of(50), (east, top), seconds=30.0)
-    assert Budget(cost=2.01 * quarter).before(way, proposal_of(1.0, west)) is None
-    assert "would cost 3.93, but 1.96 of" in Budget(cost=1.5 * quarter).before(way, proposal_of(1.0, west))
+    way = after(planner, cloud_of(50), (east, top), seconds=30.0)
+    assert Budget(cost=2.01 * quarter).before(way, west, 1.0) is None
+    assert "would cost 3.93, but 1.96 of" in Budget(cost=1.5 * quarter).before(way, west, 1.0)
     assert Budget(seconds=30.5).after(way) is None
     assert Budget(seconds=30.0).after(way) == "30 of 30 seconds are spent"
 
 
 def test_the_first_rule_that_holds_ends_it():
     planner = planner_of(Coverage())
-    asked = so_far(planner, cloud_of(50), seconds=10.0)
+    asked = after(planner, cloud_of(50), seconds=10.0)
     rule = ValueBelow(0.5) | Budget(seconds=20.0) | Budget(seconds=5.0)
     assert rule.after(asked) == "10 of 5 seconds are spent"
-    assert "less than 0.5" in rule.before(asked, proposal_of(0.1))
-    assert rule.before(asked, proposal_of(0.6)) is None
+    assert "less than 0.5" in rule.before(asked, FIRST, 0.1)
+    assert rule.before(asked, FIRST, 0.6) is None
 
 
 def test_an_episode_ends_by_its_rule_and_goes_on_by_another(tmp_path):
@@ -176,7 +169,7 @@ def test_an_episode_ends_by_its_rule_and_goes_on_by_another(tmp_path):
         np.testing.assert_array_equal(view.scan.points, expected.scan.points)
 
 
-def test_a_view_that_is_worth_too_little_is_not_taken():
+def test_a_view_of_too_little_value_is_not_taken():
     planner = planner_of(Coverage())
     episode = simulate(planner, SCENE, FIRST, 6, KEY, progress=False)
     values = [float(view.proposal.value) for view in episode.views[1:]]
@@ -197,10 +190,10 @@ def test_a_view_that_is_worth_too_little_is_not_taken():
         (lambda: Covered(radius=0.0), "radius is 0.0"),
         (lambda: Budget(), "of nothing: give seconds or cost"),
         (lambda: Budget(seconds=0.0), "must be positive"),
-        (lambda: Sure().check(planner_of(Coverage())), "Sure is about a class, but Coverage has no classifier"),
-        (lambda: Found().check(planner_of(Coverage())), "Found is about parts, but Coverage has no segmenter"),
+        (lambda: Sure().check(Coverage()), "Sure is about a class, but Coverage has no classifier"),
+        (lambda: Found().check(Coverage()), "Found is about parts, but Coverage has no segmenter"),
         (
-            lambda: Found().check(planner_of(ExpectedUtilityImprovement(segmenter((3, 3))))),
+            lambda: Found().check(ExpectedUtilityImprovement(segmenter((3, 3)))),
             "does not name the parts",
         ),
     ],

@@ -91,10 +91,10 @@ def test_the_order_is_the_best_of_all(count, seed):
     assert total_cost(way, distance) == pytest.approx(length(found), rel=1e-5)
 
 
-def test_what_a_view_is_worth():
+def test_the_value_of_a_view_given_its_cost():
     values, cost = jnp.array([[4.0, 2.0], [2.0, 0.0]]), jnp.array([1.0, 3.0])
-    np.testing.assert_allclose(ValuePerCost(arc_length, fixed=1.0)(values, cost), [[2.0, 0.5], [1.0, 0.0]])
-    np.testing.assert_allclose(ValueMinusCost(arc_length, weight=0.5)(values, cost), [[3.5, 0.5], [1.5, -1.5]])
+    np.testing.assert_allclose(ValuePerCost(arc_length, fixed=1.0).weigh(values, cost), [[2.0, 0.5], [1.0, 0.0]])
+    np.testing.assert_allclose(ValueMinusCost(arc_length, weight=0.5).weigh(values, cost), [[3.5, 0.5], [1.5, -1.5]])
 
 
 @pytest.mark.parametrize(

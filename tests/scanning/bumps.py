@@ -8,14 +8,14 @@ import scipy.ndimage
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.scanning.grid import Grid, GridSurface
-from jaxnbv.scanning.sdf import Box, Cylinder, Torus
+from jaxnbv.scanning.sdf import Cuboid, Cylinder, Torus
 
 GRID, SMALL = Grid(60, 1.75), Grid(20, 1.75)
 FEW = Camera(height=6, width=6)
 
 
 def solid():
-    bored = Box([0.7, 0.5, 0.6], 0.1) - Cylinder(0.3, 2.0)
+    bored = Cuboid([0.7, 0.5, 0.6], 0.1) - Cylinder(0.3, 2.0)
     return bored | Torus(0.5, 0.15).rotate([1.0, 1.0, 0.0], 0.8).translate([0.3, 0.5, 0.2])
 
 

@@ -12,15 +12,14 @@ from jaxnbv.scanning import (
     Grid,
     SDFSurface,
 )
-from jaxnbv.scanning.sdf import Box as BoxSolid
-from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.scanning.sdf import Cuboid, Sphere
 
 # Rays 0.02 apart on the object, nodes 0.07.
 CAMERA, GRID, POSE = Camera(height=56, width=70, fov=0.5), Grid(50), look_at((0.8, 0.9, 2.2), target=(0.2, 0.0, 0.0))
 CENTRE, RADIUS, HALF = np.array([0.1, -0.2, 0.15]), 0.5, np.array([0.5, 0.3, 0.4])
 SOLIDS = {
     "ball": SDFSurface(Sphere(RADIUS).translate(CENTRE)),
-    "box": SDFSurface(BoxSolid(HALF).translate(CENTRE)),
+    "box": SDFSurface(Cuboid(HALF).translate(CENTRE)),
 }
 SEE = eqx.filter_jit(Carving.seen_empty)
 

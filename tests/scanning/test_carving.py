@@ -24,7 +24,7 @@ from jaxnbv.scanning import (
     scan,
     scan_samples,
 )
-from jaxnbv.scanning.sdf import Box as BoxSolid
+from jaxnbv.scanning.sdf import Cuboid
 from jaxnbv.search import FarthestView
 from jaxnbv.surfaces import Fields, GeometricSPSR, SurfaceModel, SurfacePosterior
 from jaxnbv.tasks import Coverage
@@ -166,7 +166,7 @@ def test_what_was_seen_empty_stays_so():
     assert both.sum() > evidence.seen_empty.sum()
 
 
-SHEET = SDFSurface(BoxSolid([0.6, 0.6, 0.01]))
+SHEET = SDFSurface(Cuboid([0.6, 0.6, 0.01]))
 ABOVE_AND_BELOW = [look_at((0.0, 0.0, 2.5)), look_at((0.0, 0.0, -2.5))]
 
 
@@ -187,7 +187,7 @@ def test_carved_samples_keep_a_thin_sheet_that_was_seen_from_both_sides():
     """Rays straight at the sheet from both sides meet every sample there, as they do where nothing is carved."""
     model = GeometricSPSR(truncation=12, lengthscale=0.1)
     planner, raw = (planner_of(carving, model=model) for carving in (Carving(), None))
-    sheet = SDFSurface(BoxSolid([0.6, 0.6, 0.04]))
+    sheet = SDFSurface(Cuboid([0.6, 0.6, 0.04]))
     evidence = after_both_sides(planner, sheet, ABOVE_AND_BELOW)
     values = raw.sample_surfaces(evidence, jax.random.key(1)).values
     carved = carve(values, evidence.seen_empty | planner.imagination.carving.outside(SMALL_GRID))

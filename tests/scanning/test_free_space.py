@@ -27,8 +27,7 @@ from jaxnbv.scanning import (
     mesh_from_sdf,
     scan,
 )
-from jaxnbv.scanning.sdf import Box as BoxSolid
-from jaxnbv.scanning.sdf import Capsule, Sphere
+from jaxnbv.scanning.sdf import Capsule, Cuboid, Sphere
 from jaxnbv.studies.scenes.demo import demo_object
 
 RNG = np.random.default_rng(0)
@@ -136,7 +135,7 @@ FINE_NODES = jnp.asarray(nodes_of(FINE), jnp.float32)
 @jax.jit
 def marked_and_inside(centre, radius, half, axis, angle, start, end, direction, target, distance, key):
     """How many nodes are marked, how many are inside the solid, and how many are both."""
-    solid = BoxSolid(half).rotate(axis, angle).translate(centre) | Capsule(start, end, radius)
+    solid = Cuboid(half).rotate(axis, angle).translate(centre) | Capsule(start, end, radius)
     pose = look_at(target + distance * direction, target)
     seen = SensorNoise()(scan(SDFSurface(solid), PLAIN, pose), key)
     empty, inside = Carving().seen_empty(FINE, seen, PLAIN, pose), solid(FINE_NODES) < 0

@@ -14,7 +14,7 @@ from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.mesh import TriangleMesh, load_mesh, mesh_from_sdf
 from jaxnbv.scanning.scanner import scan
-from jaxnbv.scanning.sdf import Box, Sphere, Torus
+from jaxnbv.scanning.sdf import Cuboid, Sphere, Torus
 
 SHARED = Path(__file__).parents[3] / "shared" / "meshes"
 RNG = np.random.default_rng(1)
@@ -222,7 +222,7 @@ def test_mesh_of_a_solid():
     np.testing.assert_allclose(np.hypot(ring, mesh.vertices[:, 1]), 0.3, atol=3e-3)
     assert mesh.frame.scale == 1.0
     with pytest.raises(ValueError, match="no surface lies within"):
-        mesh_from_sdf(Sphere(5.0) | Box([4.0, 4.0, 4.0]), Grid(8))
+        mesh_from_sdf(Sphere(5.0) | Cuboid([4.0, 4.0, 4.0]), Grid(8))
 
 
 @pytest.mark.parametrize("name", ["fandisk", "homer", "pickup", "spot", "suzanne", "teapot"])

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
-from jaxnbv.scanning.sdf import Box, Capsule, Cone, Cylinder, SmoothUnion, Sphere, Torus
+from jaxnbv.scanning.sdf import Capsule, Cone, Cuboid, Cylinder, SmoothUnion, Sphere, Torus
 
 RNG = np.random.default_rng(0)
 
@@ -70,8 +70,8 @@ def turned(points, axis, angle):
 CAPSULE_PROFILE = np.concatenate([arc(0, -0.5, 0.3, -np.pi / 2, 0), arc(0, 0.5, 0.3, 0, np.pi / 2)])
 EXACT = {
     "sphere": (Sphere(0.8), 0.8 * np.asarray(fibonacci_sphere(200_000))),
-    "box": (Box([0.7, 0.5, 0.9]), box_surface([0.7, 0.5, 0.9])),
-    "rounded box": (Box([0.7, 0.5, 0.9], 0.2), rounded_box_surface([0.7, 0.5, 0.9], 0.2)),
+    "box": (Cuboid([0.7, 0.5, 0.9]), box_surface([0.7, 0.5, 0.9])),
+    "rounded box": (Cuboid([0.7, 0.5, 0.9], 0.2), rounded_box_surface([0.7, 0.5, 0.9], 0.2)),
     "cylinder": (Cylinder(0.6, 0.8), revolve(np.array([[0, -0.8], [0.6, -0.8], [0.6, 0.8], [0, 0.8]]))),
     "cone": (Cone(0.9, 0.3, 0.6), revolve(np.array([[0, -0.6], [0.9, -0.6], [0.3, 0.6], [0, 0.6]]))),
     "flat cone": (Cone(0.1, 1.0, 0.1), revolve(np.array([[0, -0.1], [0.1, -0.1], [1.0, 0.1], [0, 0.1]]))),
@@ -87,10 +87,10 @@ MUG = (Cylinder(0.8, 0.8) - Cylinder(0.7, 0.8).translate([0, 0.1, 0])) | Torus(0
     [1, 0, 0], np.pi / 2
 ).translate([0.8, 0, 0])
 BOUNDS = {
-    "union": Sphere(0.6).translate([0.3, 0, 0]) | Box([0.5, 0.4, 0.3]),
+    "union": Sphere(0.6).translate([0.3, 0, 0]) | Cuboid([0.5, 0.4, 0.3]),
     "smooth union": SmoothUnion(Sphere(0.6).translate([0.4, 0, 0]), Cylinder(0.3, 0.9), 0.3),
-    "intersection": Sphere(0.8) & Box([0.5, 0.6, 0.7]),
-    "difference": Box([0.8, 0.8, 0.8]) - Sphere(0.9),
+    "intersection": Sphere(0.8) & Cuboid([0.5, 0.6, 0.7]),
+    "difference": Cuboid([0.8, 0.8, 0.8]) - Sphere(0.9),
     "mug": MUG.scale(0.9),
 }
 
@@ -139,7 +139,7 @@ def test_bounds_never_overestimate(name):
 
 
 def test_set_operations_agree_with_membership():
-    a, b = Sphere(0.7).translate([0.3, 0, 0]), Box([0.6, 0.5, 0.4])
+    a, b = Sphere(0.7).translate([0.3, 0, 0]), Cuboid([0.6, 0.5, 0.4])
     x = RNG.uniform(-1.2, 1.2, (20_000, 3))
     in_a = np.linalg.norm(x - [0.3, 0, 0], axis=1) < 0.7
     in_b = (np.abs(x) < [0.6, 0.5, 0.4]).all(axis=1)
@@ -155,7 +155,7 @@ def test_set_operations_agree_with_membership():
 
 def test_rigid_transform_moves_points_as_the_pose_does():
     pose = look_at([0.5, 0.4, -0.3], target=[0.1, 0.9, 0.2])
-    sdf = Box([0.3, 0.5, 0.2])
+    sdf = Cuboid([0.3, 0.5, 0.2])
     x = jnp.asarray(RNG.uniform(-1, 1, (500, 3)), dtype=jnp.result_type(float))
     np.testing.assert_allclose(sdf.transform(pose)(pose.to_scene(x)), sdf(x), atol=1e-6)
 
@@ -165,7 +165,7 @@ def test_rigid_transform_moves_points_as_the_pose_does():
     [
         (lambda: Sphere(-1.0), "must not be negative"),
         (lambda: Sphere(np.nan), "finite"),
-        (lambda: Box([0.1, 0.2, 0.3], 0.15), "round it by less"),
+        (lambda: Cuboid([0.1, 0.2, 0.3], 0.15), "round it by less"),
         (lambda: Sphere(1.0).rotate([0, 0, 0], 1.0), "not zero"),
         (lambda: Sphere(1.0).rotate([0, 1e-30, 0], 1.0), "not zero"),
         (lambda: Sphere(1.0).scale(-2.0), "scaled by -2.0"),

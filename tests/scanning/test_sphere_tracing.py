@@ -10,7 +10,7 @@ import pytest
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning.scanner import scan
-from jaxnbv.scanning.sdf import Box, Cylinder, Sphere, Torus
+from jaxnbv.scanning.sdf import Cuboid, Cylinder, Sphere, Torus
 from jaxnbv.scanning.sphere_tracing import SDFSurface
 
 RNG = np.random.default_rng(0)
@@ -61,7 +61,7 @@ def torus_hit(o, d, major, minor):
 
 SOLIDS = {
     "sphere": (Sphere(0.9), lambda o, d: sphere_hit(o, d, 0.9)),
-    "box": (Box([0.7, 0.5, 0.9]), lambda o, d: box_hit(o, d, np.array([0.7, 0.5, 0.9]))),
+    "box": (Cuboid([0.7, 0.5, 0.9]), lambda o, d: box_hit(o, d, np.array([0.7, 0.5, 0.9]))),
     "cylinder": (Cylinder(0.6, 0.8), lambda o, d: cylinder_hit(o, d, 0.6, 0.8)),
     "torus": (Torus(0.7, 0.3), lambda o, d: torus_hit(o, d, 0.7, 0.3)),
 }
@@ -192,7 +192,7 @@ def test_vmapped_scenes_equal_single_scenes():
     sizes = jnp.asarray(RNG.uniform(0.3, 0.9, (5, 2)), dtype=jnp.result_type(float))
 
     def build(size):
-        box = Box(jnp.stack([size[0], 0.4 * jnp.ones(()), size[1]]), 0.05)
+        box = Cuboid(jnp.stack([size[0], 0.4 * jnp.ones(()), size[1]]), 0.05)
         return box | Sphere(size[1]).translate(jnp.stack([size[0], size[0], 0.0 * size[0]]))
 
     camera, poses = Camera(height=20, width=20, fov=0.7), look_at(fibonacci_sphere(5, 2.5))
@@ -216,7 +216,7 @@ def test_no_recompilation_for_other_solids_of_the_same_make():
         return scan(surface, Camera(height=8, width=8), pose).mask
 
     for radius in (0.5, 0.7):
-        run(SDFSurface(Sphere(radius) | Box([radius, 0.2, 0.3])), look_at([0.0, math.sqrt(2.0), 2.0 * radius]))
+        run(SDFSurface(Sphere(radius) | Cuboid([radius, 0.2, 0.3])), look_at([0.0, math.sqrt(2.0), 2.0 * radius]))
     assert len(traces) == 1
 
 
@@ -227,7 +227,7 @@ def test_a_ball_of_no_size_is_refused():
 
 def test_normals_on_flat_faces_survive_compilation():
     """On a face the slopes of a box come from one of two cases; rounding must not lose both (nor the unit length)."""
-    surface = SDFSurface(Sphere(0.7) | Box([0.4, 0.3, 0.8]).translate([0.3, 0.2, 0.0]))
+    surface = SDFSurface(Sphere(0.7) | Cuboid([0.4, 0.3, 0.8]).translate([0.3, 0.2, 0.0]))
     seen = jax.jit(lambda pose: scan(surface, Camera(height=16, width=16), pose))(look_at(fibonacci_sphere(12, 2.5)))
     assert int(seen.count.sum()) > 2000
     lengths = np.linalg.norm(np.asarray(seen.normals)[np.asarray(seen.mask)], axis=1)

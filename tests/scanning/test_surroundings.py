@@ -15,7 +15,7 @@ from jaxnbv.geometry.pose import look_at
 from jaxnbv.planning.episode import simulate
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Carving, Grid, SDFSurface, SensorNoise, TriangleMesh, scan
-from jaxnbv.scanning.sdf import Box, HalfSpace, Sphere, solid_of_mesh
+from jaxnbv.scanning.sdf import Cuboid, HalfSpace, Sphere, solid_of_mesh
 from jaxnbv.scanning.surroundings import Surroundings, support_plane
 from jaxnbv.search import DiscreteSearch, GivenPoses, GradientSearch, HalvingSearch, SphereCandidates
 from jaxnbv.surfaces import GeometricSPSR
@@ -23,7 +23,7 @@ from jaxnbv.tasks import Coverage
 
 CAMERA, BALL = Camera(height=24, width=24), SDFSurface(Sphere(0.8))
 TABLE = HalfSpace([0.0, -0.5, 0.0], [0.0, 1.0, 0.0])
-WALL = Box([0.1, 1.0, 1.0]).translate([1.6, 0.0, 0.0])
+WALL = Cuboid([0.1, 1.0, 1.0]).translate([1.6, 0.0, 0.0])
 POSES = look_at(np.array([[0.5, -1.8, 1.5], [2.4, 0.3, 0.4], [0.2, 1.9, 1.6]]))
 KEY = jax.random.key(3)
 
@@ -113,7 +113,7 @@ def test_space_is_seen_empty_up_to_an_obstacle():
     """Every ray misses the ball's place; nodes before the wall are empty, those behind it are not known."""
     grid, carving, pose = Grid(40), Carving(), look_at((-2.4, 0.0, 0.0))
     nothing = scan(SDFSurface(Sphere(0.01).translate([0.0, 5.0, 0.0])), CAMERA, pose)
-    wall = Surroundings((Box([0.1, 2.0, 2.0]).translate([0.5, 0.0, 0.0]),))
+    wall = Surroundings((Cuboid([0.1, 2.0, 2.0]).translate([0.5, 0.0, 0.0]),))
     barrier = wall.barrier(CAMERA, pose)
     free, known = (np.asarray(carving.seen_empty(grid, nothing, CAMERA, pose, b)) for b in (None, barrier))
     x = np.asarray(grid.axis)
@@ -210,7 +210,7 @@ def test_where_nothing_is_open_it_says_so():
 def test_from_the_world_to_the_scene():
     """Distances in the world times the scale are those in the scene."""
     frame = Frame.fit(np.array([[0.1, 0.2, 0.0], [0.4, 0.5, 0.25]]), up="z")
-    table, block = HalfSpace([0.0, 0.0, 0.01], [0.0, 0.0, 1.0]), Box([0.05, 0.1, 0.2]).translate([0.6, 0.0, 0.2])
+    table, block = HalfSpace([0.0, 0.0, 0.01], [0.0, 0.0, 1.0]), Cuboid([0.05, 0.1, 0.2]).translate([0.6, 0.0, 0.2])
     world = Surroundings((table, block), margin=0.01, clearance=0.05)
     scene = world.in_scene(frame)
     x = np.random.default_rng(0).uniform(-0.5, 1.0, (100, 3))

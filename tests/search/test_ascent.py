@@ -13,6 +13,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.imagination import Imagination
 from jaxnbv.planning.planner import Planner
+from jaxnbv.scanning import Evidence
 from jaxnbv.search import ConstrainedPoses, FreePoses, GradientSearch, HybridSearch, Problem, SpherePoses
 from jaxnbv.search.ascent import Ascent
 from jaxnbv.search.gradient import _pose_space
@@ -42,15 +43,9 @@ class Known(Problem):
 def known(kind=Known, pose=None, place=(0.9, -1.1, 1.4), gaze=(-0.6, 0.0, -0.8)):
     """The problem, with a pose that has been visited, if one is given."""
     cloud = PointCloud(jnp.zeros((1, 3)), jnp.zeros((1, 3)), jnp.zeros(1, bool))
-    visited = Pose(np.eye(3)[None], np.zeros((1, 3)))
-    problem = kind(cloud, visited, jnp.asarray(0), Camera(), Coverage(), None, jnp.asarray(place), jnp.asarray(gaze))
-    return (
-        problem
-        if pose is None
-        else eqx.tree_at(
-            lambda p: (p.visited, p.num_visited), problem, (jax.tree.map(lambda leaf: leaf[None], pose), jnp.asarray(1))
-        )
-    )
+    visited = Pose(np.eye(3)[None], np.zeros((1, 3))) if pose is None else pose[None]
+    evidence = Evidence(cloud, visited, jnp.asarray(0 if pose is None else 1))
+    return kind(evidence, Camera(), Coverage(), None, jnp.asarray(place), jnp.asarray(gaze))
 
 
 SOLVERS = {"Adam": None, "BFGS": optx.BFGS(rtol=1e-4, atol=1e-4), "NonlinearCG": optx.NonlinearCG(rtol=1e-4, atol=1e-4)}
@@ -89,20 +84,20 @@ def test_adam_is_optax_in_a_plain_loop(space, x64):
     problem, start = known(), look_at(jnp.asarray([[1.2, 1.0, 1.9]]))
     ways = eqx.filter_jit(lambda problem: Ascent(space, 1, 30, 0.02).climb(problem, start).trajectories)(problem)
     optimiser, parameters = optax.adam(0.02), jnp.zeros(space.num_parameters)
-    evidence = optimiser.init(parameters)
+    memory = optimiser.init(parameters)
 
     def loss(parameters):
         pose = space.retract(start[0], parameters)
-        return -problem.acquisition(pose[None])[0], pose
+        return -problem.values(pose[None])[0], pose
 
     @jax.jit
-    def turn(parameters, evidence):
+    def turn(parameters, memory):
         gradient, pose = jax.grad(loss, has_aux=True)(parameters)
-        updates, evidence = optimiser.update(gradient, evidence)
-        return pose, parameters + updates, evidence
+        updates, memory = optimiser.update(gradient, memory)
+        return pose, parameters + updates, memory
 
     for step in range(31):
-        expected, parameters, evidence = turn(parameters, evidence)
+        expected, parameters, memory = turn(parameters, memory)
         np.testing.assert_allclose(ways.poses.position[0, step], expected.position, atol=1e-6)
         np.testing.assert_allclose(ways.poses.rotation[0, step], expected.rotation, atol=1e-6)
     assert float(jnp.abs(ways.poses.position[0, -1] - start.position[0]).max()) > 0.1

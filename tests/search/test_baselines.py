@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
-from jaxnbv.scanning import Grid, GridSurface
+from jaxnbv.scanning import Evidence, Grid, GridSurface
 from jaxnbv.search import FarthestView, Problem, RandomView, UncertaintyView
 from jaxnbv.search.baselines import uncertain_length
 from jaxnbv.tasks import Coverage
@@ -23,8 +23,8 @@ def problem(visited, surfaces=None):
     """Five rows for views, the first of them filled; the rest hold poses that must not count."""
     positions = np.concatenate([visited, np.tile(CANDIDATES[5], (5, 1))])[:5]
     cloud = PointCloud.from_arrays([[0.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    taken = jnp.asarray(len(visited))
-    return Problem(cloud, look_at(positions), taken, Camera(height=4, width=4), Coverage(), surfaces)
+    evidence = Evidence(cloud, look_at(positions), jnp.asarray(len(visited)))
+    return Problem(evidence, Camera(height=4, width=4), Coverage(), surfaces).prepared()
 
 
 def balls(radii, centres=None):

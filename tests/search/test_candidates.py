@@ -98,11 +98,11 @@ def test_bad_numbers_are_named(arguments, message):
         nbv.GivenPoses(nbv.look_at((0.0, 0.0, 2.0)))
 
 
-def problem(visited, surfaces=None, score=None):
+def problem(visited, surfaces=None):
     points = jnp.asarray([[0.0, 0.0, 0.5], [0.1, 0.0, 0.5]])
     cloud = nbv.PointCloud(points, jnp.asarray([[0.0, 0.0, 1.0]] * 2), jnp.ones(2, bool))
     camera = nbv.Camera(height=6, width=6)
-    return nbv.Problem(cloud, visited, jnp.asarray(1), camera, score or nbv.Coverage(), surfaces)
+    return nbv.Problem(nbv.Evidence(cloud, visited, jnp.asarray(1)), camera, nbv.Coverage(), surfaces).prepared()
 
 
 def ball(samples=2):

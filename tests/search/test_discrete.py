@@ -1,5 +1,7 @@
 """The discrete search: the argmax of values recomputed pose by pose, without the views taken before."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,7 +12,7 @@ from jaxnbv.acquisition import expected_value
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
-from jaxnbv.scanning import Grid, GridSurface
+from jaxnbv.scanning import Evidence, Grid, GridSurface
 from jaxnbv.search import DiscreteSearch, Problem, SphereCandidates
 from jaxnbv.search.base import best_unvisited
 from jaxnbv.tasks import Coverage
@@ -27,13 +29,14 @@ def problem():
     surfaces = GridSurface.from_values(values.astype(np.float32), 0.0, GRID)
     cloud = PointCloud.from_arrays(rng.uniform(-1, 1, (30, 3)), np.tile([0.0, 1.0, 0.0], (30, 1)), 32)
     visited = Pose(np.tile(np.eye(3, dtype=np.float32), (4, 1, 1)), np.zeros((4, 3), np.float32))
-    return Problem(cloud, visited, jnp.asarray(0), CAMERA, Coverage(), surfaces)
+    return Problem(Evidence(cloud, visited, jnp.asarray(0)), CAMERA, Coverage(), surfaces).prepared()
 
 
 def visit(problem, *poses):
     rows = jax.tree.map(lambda *leaves: jnp.stack(leaves), *poses)
-    visited = jax.tree.map(lambda all_rows, new: all_rows.at[: len(poses)].set(new), problem.visited, rows)
-    return eqx.tree_at(lambda p: (p.visited, p.num_visited), problem, (visited, jnp.asarray(len(poses))))
+    taken = jax.tree.map(lambda all_rows, new: all_rows.at[: len(poses)].set(new), problem.evidence.poses, rows)
+    evidence = dataclasses.replace(problem.evidence, poses=taken, num_views=jnp.asarray(len(poses)))
+    return dataclasses.replace(problem, evidence=evidence)
 
 
 @eqx.filter_jit
@@ -46,7 +49,7 @@ def test_the_argmax_of_values_recomputed_one_by_one(problem):
     value, values = eqx.filter_jit(expected_value), []
     for position in np.asarray(fibonacci_sphere(12, 2.5)):
         pose = look_at(position[None])
-        values.append(value(Coverage(), problem.cloud, problem.surfaces, CAMERA, pose)[0])
+        values.append(value(Coverage(), problem.evidence.cloud, problem.surfaces, CAMERA, pose)[0])
     np.testing.assert_allclose(proposal.values, values, rtol=1e-5)
     best = int(np.argmax(values))
     assert np.sort(values)[-1] > 1.01 * np.sort(values)[-2]
@@ -78,7 +81,7 @@ def test_only_the_same_place_and_direction_counts_as_visited(problem):
 
 def test_rows_beyond_the_views_taken_hold_nothing(problem):
     best = search(problem).pose
-    stale = eqx.tree_at(lambda p: p.num_visited, visit(problem, best), jnp.asarray(0))
+    stale = eqx.tree_at(lambda p: p.evidence.num_views, visit(problem, best), jnp.asarray(0))
     np.testing.assert_array_equal(search(stale).pose.position, best.position)
 
 
@@ -124,7 +127,7 @@ def test_standard_errors_are_those_of_the_scores_sample_by_sample(problem):
         [
             value(
                 Coverage(),
-                problem.cloud,
+                problem.evidence.cloud,
                 jax.tree.map(lambda leaf, s=s: leaf[s : s + 1], problem.surfaces),
                 CAMERA,
                 poses,
@@ -146,7 +149,7 @@ def test_standard_errors_are_those_of_the_scores_sample_by_sample(problem):
     assert 0 < proposal.num_tied < 11
 
 
-def test_a_visited_view_is_level_with_none_and_of_one_sample_nothing_is_known(problem):
+def test_a_visited_view_is_tied_with_none_and_of_one_sample_nothing_is_known(problem):
     first = search(problem)
     again = search(visit(problem, first.pose))
     assert not again.tied_with_best()[np.argmax(first.values)]

@@ -7,12 +7,13 @@ import numpy as np
 import optimistix as optx
 import pytest
 from scipy.ndimage import gaussian_filter
+from test_discrete import visit
 
-from jaxnbv.acquisition import ExpectedUtilityImprovement, Score
+from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose, look_at
-from jaxnbv.scanning import Grid, GridSurface, scan
+from jaxnbv.scanning import Evidence, Grid, GridSurface, scan
 from jaxnbv.search import (
     ConstrainedPoses,
     DiscreteSearch,
@@ -29,7 +30,7 @@ CAMERA, GRID = Camera(height=8, width=8), Grid(32)
 NODES = np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1)
 
 
-class Nearness(Score):
+class Nearness(Acquisition):
     """4 - |mean of the hits - target|^2; 0, the least for what lies in the unit ball, where nothing is seen."""
 
     target: jax.Array
@@ -50,7 +51,7 @@ def classifier(cloud):
     return jax.nn.log_softmax(3.0 * jnp.sum(features, axis=0) / jnp.maximum(cloud.count, 1))
 
 
-SCORES = {
+ACQUISITIONS = {
     "coverage": Coverage(),
     "cross-entropy": CrossEntropy(classifier),
     "mixed, open": MixedEntropy(classifier, threshold=0.0),
@@ -59,12 +60,12 @@ SCORES = {
 }
 
 
-def problem_of(surfaces, score):
+def problem_of(surfaces, acquisition):
     rng = np.random.default_rng(0)
     cloud = PointCloud.from_arrays(0.5 * rng.normal(size=(20, 3)), np.tile([0.0, 1.0, 0.0], (20, 1)), 24)
     visited = Pose(np.tile(np.eye(3), (6, 1, 1)), np.zeros((6, 3)))
     visited = jax.tree.map(lambda leaf: leaf.astype(jnp.result_type(float)), visited)
-    return Problem(cloud, visited, jnp.asarray(0), CAMERA, score, surfaces)
+    return Problem(Evidence(cloud, visited, jnp.asarray(0)), CAMERA, acquisition, surfaces).prepared()
 
 
 def surfaces_of(*values):
@@ -82,12 +83,6 @@ def rough(seed):
     return surfaces_of(*(np.linalg.norm(NODES - rng.uniform(-0.2, 0.2, 3), axis=-1) - 0.7 + 4.0 * noise))
 
 
-def visit(problem, *poses):
-    rows = jax.tree.map(lambda *leaves: jnp.stack(leaves), *poses)
-    visited = jax.tree.map(lambda all_rows, new: all_rows.at[: len(poses)].set(new), problem.visited, rows)
-    return eqx.tree_at(lambda p: (p.visited, p.num_visited), problem, (visited, jnp.asarray(len(poses))))
-
-
 @eqx.filter_jit
 def propose(search, problem, key):
     return search.propose(problem, key)
@@ -99,7 +94,7 @@ def run(name, problem, seed=0):
 
 @eqx.filter_jit
 def values_at(problem, poses):
-    return problem.acquisition(poses)
+    return problem.values(poses)
 
 
 def uneven(seed):
@@ -260,7 +255,7 @@ def test_a_view_of_nothing_is_worth_nothing_and_not_chosen():
     def slopes(pose):
         def scores(parameters):
             seen = scan(surface, CAMERA, FreePoses().retract(pose, parameters))
-            each = jnp.stack([score(score.context(problem.cloud), seen) for score in SCORES.values()])
+            each = jnp.stack([one(one.context(problem.evidence.cloud), seen) for one in ACQUISITIONS.values()])
             return each, (each, seen.count)
 
         return jax.jacrev(scores, has_aux=True)(jnp.zeros(9))

@@ -29,10 +29,9 @@ OTHER_KEY = jax.random.key(1)
 SMALL = {"num_starts": 2, "iterations": 3, "num_candidates": 4}
 
 
-def planner_of(search, score=None):
-    score = Coverage() if score is None else score
-    model, camera = GeometricSPSR(truncation=6, lengthscale=0.05), Camera(height=6, width=6)
-    return Planner(score, search, camera, Imagination(model, grid=Grid(20), num_samples=2), capacity=64, max_views=6)
+def planner_of(search, acquisition=Coverage()):  # noqa: B008
+    imagination = Imagination(GeometricSPSR(truncation=6, lengthscale=0.05), Grid(20), num_samples=2)
+    return Planner(acquisition, search, Camera(height=6, width=6), imagination, capacity=64, max_views=6)
 
 
 PLANNER = planner_of(GradientSearch(dof=2, **SMALL))

@@ -6,17 +6,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv.acquisition import Score, expected_value
+from jaxnbv.acquisition import Acquisition, expected_value
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
-from jaxnbv.scanning import Grid, GridSurface
+from jaxnbv.scanning import Evidence, Grid, GridSurface
 from jaxnbv.search import DiscreteSearch, HalvingSearch, Problem
 
 GRID, CANDIDATES, SAMPLES = Grid(16), 11, 4
 
 
-class MeanHeight(Score):
+class MeanHeight(Acquisition):
     """Mean of y over the scan."""
 
     def context(self, cloud):
@@ -34,7 +34,8 @@ def problem():
     surfaces = GridSurface.from_values(np.stack(values).astype(np.float32), 0.0, GRID)
     cloud = PointCloud.from_arrays(rng.uniform(-1, 1, (3, 3)), np.tile([0.0, 1.0, 0.0], (3, 1)))
     visited = look_at(fibonacci_sphere(CANDIDATES, 2.5)[:1])
-    return Problem(cloud, visited, jnp.asarray(0), Camera(height=8, width=8), MeanHeight(), surfaces)
+    evidence = Evidence(cloud, visited, jnp.asarray(0))
+    return Problem(evidence, Camera(height=8, width=8), MeanHeight(), surfaces).prepared()
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +46,7 @@ def table(problem):
 
     def of_sample(sample):
         surface = jax.tree.map(lambda leaf: leaf[sample : sample + 1], problem.surfaces)
-        return each(problem.score, problem.cloud, surface, problem.camera, poses)
+        return each(problem.acquisition, problem.evidence.cloud, surface, problem.camera, poses)
 
     return np.stack([of_sample(sample) for sample in range(SAMPLES)]).astype(np.float64)
 
@@ -57,7 +58,7 @@ def propose(search, problem):
 
 @pytest.mark.parametrize("num_visited", [0, 1])
 def test_rounds_recomputed(problem, table, num_visited):
-    problem = eqx.tree_at(lambda p: p.num_visited, problem, jnp.asarray(num_visited))
+    problem = eqx.tree_at(lambda p: p.evidence.num_views, problem, jnp.asarray(num_visited))
     left, values, scored = np.arange(CANDIDATES), np.zeros(CANDIDATES), 0
     while scored < SAMPLES:
         if scored:

@@ -1,4 +1,6 @@
-"""Search that asks a second score where samples cannot tell by the first: against the rule, worked out in NumPy."""
+"""Search that asks a second acquisition where samples cannot tell by the first: against the rule, worked out in NumPy."""
+
+import dataclasses
 
 import equinox as eqx
 import jax
@@ -7,7 +9,7 @@ import numpy as np
 import pytest
 from test_discrete import CAMERA, problem, visit
 
-from jaxnbv.acquisition import Score, Several, expected_value
+from jaxnbv.acquisition import Acquisition, Several, expected_value
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.planning.travel import ValueMinusCost, arc_length
@@ -17,7 +19,7 @@ from jaxnbv.tasks import Coverage
 __all__ = ["problem"]
 
 
-class Height(Score):
+class Height(Acquisition):
     """How high the middle of what a scan shows is, times a factor."""
 
     factor: float = 1.0
@@ -29,7 +31,7 @@ class Height(Score):
         return self.factor * jnp.sum(jnp.where(scan.mask, scan.points[:, 1], 0.0)) / jnp.maximum(scan.count, 1)
 
 
-class Constant(Score):
+class Constant(Acquisition):
     """All scans are worth the same."""
 
     value: float
@@ -49,11 +51,11 @@ def search(problem, second, kind=TieBreakSearch):
 def sample_by_sample(score, problem):
     poses, value = look_at(fibonacci_sphere(12, 2.5)), eqx.filter_jit(expected_value)
     one = [jax.tree.map(lambda leaf, s=s: leaf[s : s + 1], problem.surfaces) for s in range(3)]
-    return np.array([value(score, problem.cloud, surface, CAMERA, poses) for surface in one], np.float64)
+    return np.array([value(score, problem.evidence.cloud, surface, CAMERA, poses) for surface in one], np.float64)
 
 
 @pytest.mark.parametrize("factor", [1.0, -1.0])
-def test_the_best_by_the_second_score_of_those_that_are_level_by_the_first(problem, factor):
+def test_the_best_by_the_second_score_of_those_that_are_tied_by_the_first(problem, factor):
     first, second = sample_by_sample(Coverage(), problem), sample_by_sample(Height(factor), problem).mean(axis=0)
     mean = first.mean(axis=0)
     difference = first[:, [mean.argmax()]] - first
@@ -90,15 +92,15 @@ def test_visited_views_are_not_chosen(problem):
     for _ in range(3):
         taken.append(search(visit(told, *taken) if taken else told, Height()).pose)
     heights = np.sort(sample_by_sample(Height(), problem).mean(axis=0))[::-1]
-    of = [expected_value(Height(), problem.cloud, problem.surfaces, CAMERA, pose[None])[0] for pose in taken]
+    of = [expected_value(Height(), problem.evidence.cloud, problem.surfaces, CAMERA, pose[None])[0] for pose in taken]
     np.testing.assert_allclose(of, heights[:3], rtol=1e-5)
 
 
 def test_the_way_there_counts(problem):
     """Among candidates that are level but for their way the nearest is taken, whatever the second score."""
     here, cost = look_at(jnp.array([0.0, 0.0, 2.5])), ValueMinusCost(arc_length, weight=1e3)
-    told = visit(problem.about(Constant(1.0)), here)
-    found = search(eqx.tree_at(lambda p: p.cost, told, cost, is_leaf=lambda leaf: leaf is None), Height())
+    told = dataclasses.replace(visit(problem.about(Constant(1.0)), here), cost=cost)
+    found = search(told, Height())
     distances = np.linalg.norm(np.asarray(found.candidates.position - here.position), axis=1)
     np.testing.assert_array_equal(found.pose.position, found.candidates.position[distances.argmin()])
 

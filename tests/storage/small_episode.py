@@ -6,6 +6,7 @@ import jax
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import look_at
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import simulate
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
@@ -21,9 +22,10 @@ KEY = jax.random.key(0)
 
 def planner_of(search=None, lengthscale=0.05, **changes):
     search = DiscreteSearch(12) if search is None else search
-    settings = {"num_samples": 3, "grid": Grid(24), "capacity": 128, "max_views": 6, **changes}
     model, camera = GeometricSPSR(truncation=8, lengthscale=lengthscale), Camera(height=8, width=8)
-    return Planner(model, camera, Coverage(), search, **settings)
+    imagined = {name: changes.pop(name, usual) for name, usual in {"num_samples": 3, "grid": Grid(24)}.items()}
+    settings = {"capacity": 128, "max_views": 6, **changes}
+    return Planner(Coverage(), search, camera, Imagination(model, **imagined), **settings)
 
 
 BASE = {"planner": planner_of(), "scene": SCENE, "noise": SensorNoise(), "first": FIRST, "key": KEY}

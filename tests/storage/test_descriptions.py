@@ -62,12 +62,23 @@ def test_a_description_tells_large_arrays_and_functions_apart():
     assert json.loads(json.dumps(describe({"a": (1, 2.5, None, "x", large)})))["a"][:4] == [1, 2.5, None, "x"]
 
 
-def test_a_description_of_a_function_is_the_same_in_every_process():
-    code = "from jaxnbv.storage import describe; print(describe(lambda x: x in {'a', 'b', 'c'} and (lambda: 1)))"
+def test_a_description_of_a_function_is_the_same_in_every_process(tmp_path):
+    (tmp_path / "mine.py").write_text("def utility(x):\n    return x in {'a', 'b', 'c'} and (lambda: 1)\n")
+    code = "from jaxnbv.storage import describe; from mine import utility; print(describe(utility))"
     outputs = set()
     for seed in ("1", "2", "3"):
-        environment = {**os.environ, "PYTHONHASHSEED": seed}
+        environment = {**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": str(tmp_path)}
         outputs.add(
             subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=True).stdout
         )
     assert len(outputs) == 1
+    assert b"return x in" in outputs.pop()
+
+
+def test_a_function_without_source_is_known_by_its_name_and_says_so():
+    namespace = {}
+    exec("def utility(x):\n    return x", namespace)
+    with pytest.warns(UserWarning, match=r"source of the function utility cannot be read.*Define it in a file"):
+        told = describe(namespace["utility"])
+    assert told["function"] == "utility"
+    assert told["source"] is None

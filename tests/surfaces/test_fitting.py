@@ -37,7 +37,7 @@ def test_of_a_screened_model_the_base_is_fitted_and_never_made_less_likely():
 
 def test_nothing_to_fit_to_is_refused():
     empty = PointCloud(jnp.zeros((9, 3)), jnp.zeros((9, 3)), jnp.zeros(9, bool))
-    with pytest.raises(InputError, match="empty cloud"):
+    with pytest.raises(InputError, match="the cloud is empty"):
         fit_hyperparameters(GeometricSPSR(), empty, jax.random.key(0))
     with pytest.raises(InputError, match="asked for 3 points"):
         fit_hyperparameters(GeometricSPSR(), drawn(20), jax.random.key(0), num_points=3)

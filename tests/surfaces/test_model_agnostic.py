@@ -7,7 +7,8 @@ import pytest
 from jaxtyping import Array, Float
 
 import jaxnbv as nbv
-from jaxnbv.scanning.sdf import Box, Sphere
+from jaxnbv.scanning import Evidence
+from jaxnbv.scanning.sdf import Cuboid, Sphere
 
 
 class SphereFields(nbv.Fields):
@@ -29,17 +30,17 @@ class SpherePosterior(nbv.SurfacePosterior):
 
 
 class RandomSpheres(nbv.SurfaceModel):
-    def condition(self, cloud):
-        return SpherePosterior(jnp.asarray(0.0), cloud)
+    def condition(self, evidence):
+        return SpherePosterior(jnp.asarray(0.0), Evidence.of(evidence).cloud)
 
 
 CAMERA = nbv.Camera(height=16, width=16)
-SCENES = {"sphere": nbv.SDFSurface(Sphere(0.7)), "box": nbv.SDFSurface(Box([0.5, 0.6, 0.4]))}
+SCENES = {"sphere": nbv.SDFSurface(Sphere(0.7)), "box": nbv.SDFSurface(Cuboid([0.5, 0.6, 0.4]))}
 
 
-def planner(**changes):
-    settings = {"num_samples": 3, "grid": nbv.Grid(40), "capacity": 512, "max_views": 4} | changes
-    return nbv.Planner(RandomSpheres(), CAMERA, nbv.Coverage(), nbv.DiscreteSearch(12), **settings)
+def planner():
+    imagination = nbv.Imagination(RandomSpheres(), grid=nbv.Grid(40), num_samples=3)
+    return nbv.Planner(nbv.Coverage(), nbv.DiscreteSearch(12), CAMERA, imagination, capacity=512, max_views=4)
 
 
 @pytest.fixture(scope="module")
@@ -53,10 +54,10 @@ def test_proposed_view_is_the_best_by_chamfer_distance_to_exact_scans_of_the_sam
     plan, key = planner(), jax.random.key(1)
     first = nbv.look_at((0.8, 0.9, 2.2))
     cloud = nbv.scan(SCENES["sphere"], CAMERA, first)
-    state = plan.init(cloud, first)
-    proposal = plan.propose(state, key)
+    evidence = plan.init(first, cloud)
+    proposal = plan.propose(evidence, key)
     sample_key, _ = jax.random.split(key)
-    fields = RandomSpheres().condition(state.cloud).sample(sample_key, 3)
+    fields = RandomSpheres().condition(evidence).sample(sample_key, 3)
     known, _ = cloud.to_numpy()
     values = np.zeros(12)
     for i, pose in enumerate(nbv.look_at(nbv.fibonacci_sphere(12, 2.5))[j] for j in range(12)):
@@ -98,11 +99,30 @@ def test_default_grid_evaluation_is_evaluation_at_the_nodes(posterior):
 
 def test_default_moments_are_within_monte_carlo_error(posterior):
     """64 samples; exact moments by a fine sum over the uniform radius. Means to 4.5 standard errors; variances to 4.5
-    standard errors of those of uniform variables, (0.8 / 64)^1/2 = 11 % each (kurtosis 1.8)."""
+    standard errors of those of uniform variables, (0.8 / 64)^1/2 = 11 % each (kurtosis 1.8); and the probability of
+    being inside to 4.5 standard errors and one sample."""
     x = np.random.default_rng(0).uniform(-1.5, 1.5, (8, 3)).astype(np.float32)
     radii = 0.5 + 0.4 * (np.arange(4000) + 0.5) / 4000
     points, normals = posterior.cloud.to_numpy()
-    centres = points.mean(axis=0) - radii[:, None] * normals.mean(axis=0)
-    f = np.linalg.norm(x[:, None] - centres, axis=-1) - radii
+
+    def exact(x):
+        centres = points.mean(axis=0) - radii[:, None] * normals.mean(axis=0)
+        return np.linalg.norm(x[:, None] - centres, axis=-1) - radii
+
+    f = exact(x)
     np.testing.assert_array_less(np.abs(posterior.mean(x) - f.mean(axis=1)), 4.5 * np.sqrt(f.var(axis=1) / 64))
     np.testing.assert_allclose(posterior.variance(x), f.var(axis=1), rtol=0.5)
+    # Points behind the patch that was seen: some are inside of large spheres alone.
+    behind = points.mean(axis=0) - np.linspace(0.05, 2.0, 12, dtype=np.float32)[:, None] * normals.mean(axis=0)
+    inside = (exact(behind) < 0).mean(axis=1)
+    assert ((inside > 0.05) & (inside < 0.95)).sum() >= 3
+    error = np.sqrt(inside * (1 - inside) / 64)
+    np.testing.assert_array_less(np.abs(posterior.probability_inside(behind) - inside), 4.5 * error + 1 / 64)
+
+
+def test_the_mean_on_a_grid_is_that_of_the_same_samples_at_all_its_nodes(posterior):
+    axis = np.linspace(-1.2, 1.4, 5, dtype=np.float32)
+    nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    drawn = posterior.drawn()
+    np.testing.assert_allclose(posterior.mean_on_grid(axis).reshape(-1), drawn.mean(nodes), atol=1e-5)
+    np.testing.assert_allclose(posterior.mean(nodes), drawn.fields(nodes).mean(axis=0), atol=1e-5)

@@ -11,6 +11,7 @@ from weight_space import JointWeightSpace, WeightSpace
 from jaxnbv import (
     Box,
     GeometricSPSR,
+    Grid,
     InputError,
     OnSurface,
     OutsideBoundary,
@@ -19,15 +20,14 @@ from jaxnbv import (
     SeenEmpty,
     Thickness,
 )
-from jaxnbv.surfaces import EmptyPoints, ValueRows, ValueSource
+from jaxnbv.scanning import Evidence
+from jaxnbv.surfaces import ValueRows, ValueSource
 
 RNG = np.random.default_rng(0)
 POINTS, NORMALS = RNG.uniform(-1.0, 1.0, (20, 3)), RNG.standard_normal((20, 3))
 QUERIES = np.concatenate([POINTS[:3], RNG.uniform(-1.4, 1.4, (9, 3))])
 SCALES = {"lengthscale": (0.1, 0.3), "variance": (0.8, 0.6)}
 ONE = {"lengthscale": 0.1, "variance": 0.8}
-
-NOWHERE = EmptyPoints(jnp.zeros((1, 3)), jnp.zeros(1, bool))
 
 
 class Given(ValueSource):
@@ -37,7 +37,7 @@ class Given(ValueSource):
     values: jax.Array
     noise: jax.Array
 
-    def rows(self, cloud, empty):
+    def rows(self, evidence):
         return ValueRows(self.points, self.values, self.noise, jnp.arange(len(self.values)) < len(self.values) - 1)
 
 
@@ -90,7 +90,7 @@ def sphere(count):
 
 def test_the_unit_of_values_is_half_the_rise_of_the_mean_across_the_data():
     data, base = sphere(60), GeometricSPSR(0.03, truncation=8)
-    posterior = ScreenedSPSR(base, reach=0.2).condition(data)
+    posterior = ScreenedSPSR(base, offset=0.2).condition(data)
     mean, (points, normals) = base.condition(data).mean, data.to_numpy()
     rise = np.asarray(mean(points + 0.2 * normals) - mean(points - 0.2 * normals))
     # 256 rows are taken of 60, so some four and some five times.
@@ -113,15 +113,22 @@ def test_values_are_reached_where_they_are_said_to_be():
 
 
 def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
-    """Points half a unit to the side of a scanned ball; a tenth of a unit further than any of them, and far away."""
-    data = sphere(80)
-    beside = np.array([0.0, 1.2, 0.0]) + 0.1 * RNG.standard_normal((40, 3))
-    empty = EmptyPoints(jnp.asarray(np.concatenate([beside, np.full((5, 3), 9.0)])), jnp.arange(45) < 40)
+    """Nodes half a unit to the side of a scanned ball; a tenth of a unit from them, and far away. The corners of the
+    grid, which lie outside the scene, were seen too."""
+    data, grid = sphere(80), Grid(20)
+    axis = np.asarray(grid.axis)
+    nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    is_beside = np.linalg.norm(nodes - [0.0, 1.2, 0.0], axis=-1) < 0.4
+    beyond = (np.abs(nodes) > 1.6).all(axis=-1)
+    assert is_beside.sum() >= 40
+    assert beyond.sum() == 8
     model = ScreenedSPSR(
         GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8), (OutsideBoundary(count=60), SeenEmpty(30))
     )
-    nothing = EmptyPoints(empty.points, jnp.zeros(45, bool))
-    without, knowing = (model.condition_on_space(data, seen) for seen in (nothing, empty))
+    nothing = Evidence.before_views(data, 1, grid)
+    seen = eqx.tree_at(lambda e: e.seen_empty, nothing, jnp.asarray(is_beside | beyond))
+    without, knowing = (model.condition(evidence) for evidence in (nothing, seen))
+    beside = nodes[is_beside]
     near, far = beside + np.array([0.0, 0.0, 0.1]), beside * np.array([1.0, -1.0, 1.0])
 
     def inside(posterior, x):
@@ -130,18 +137,26 @@ def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
     assert inside(knowing, beside) < 0.3 * inside(without, beside)
     assert inside(knowing, near) < 0.5 * inside(without, near)
     assert abs(inside(knowing, far) - inside(without, far)) < 0.1
-    rows = SeenEmpty(30).rows(data, empty)
+    rows = SeenEmpty(30).rows(seen)
     assert np.asarray(rows.mask).all()
-    assert {tuple(p) for p in np.asarray(rows.points)} <= {tuple(p) for p in np.asarray(empty.points)[:40]}
-    assert not np.asarray(SeenEmpty(30).rows(data, NOWHERE).mask).any()
+    assert len(np.unique(np.asarray(rows.points), axis=0)) == 30
+    assert {tuple(p) for p in np.asarray(rows.points)} <= {tuple(p) for p in np.float32(beside)}
+    for evidence in (nothing, Evidence.of(data)):
+        assert not np.asarray(SeenEmpty(30).rows(evidence).mask).any()
+
+
+def test_a_cloud_alone_is_evidence_of_which_nothing_was_seen_empty():
+    data, model = sphere(20), ScreenedSPSR(GeometricSPSR(0.1, truncation=3))
+    alone, of_evidence = (model.condition(seen).mean(QUERIES) for seen in (data, Evidence.before_views(data, 2, None)))
+    assert bool((alone == of_evidence).all())
 
 
 def test_rows_beyond_the_data_are_not_filled():
     data = sphere(20)
-    rows = OnSurface(30).rows(data, NOWHERE)
+    rows = OnSurface(30).rows(Evidence.of(data))
     assert np.asarray(rows.mask).sum() == 20
     assert len(np.unique(np.asarray(rows.points)[:20], axis=0)) == 20
-    deep = Thickness(3.0, 10).rows(data, NOWHERE)
+    deep = Thickness(3.0, 10).rows(Evidence.of(data))
     assert not np.asarray(deep.mask).any()
 
 
@@ -180,7 +195,7 @@ def test_the_posterior_is_differentiable_in_the_data(x64):
     [
         (lambda: ScreenedSPSR(values=()), "no values"),
         (lambda: ScreenedSPSR(level_deviation=0.0), "level_deviation is 0.0"),
-        (lambda: ScreenedSPSR(reach=-1.0), "reach is -1.0"),
+        (lambda: ScreenedSPSR(offset=-1.0), "offset is -1.0"),
         (lambda: OnSurface(0), "number of values is 0"),
         (lambda: OnSurface(noise=0.0), "noise of the values is 0.0"),
         (lambda: SeenEmpty(noise=-1.0), "noise of the values is -1.0"),

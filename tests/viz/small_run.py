@@ -11,15 +11,11 @@ SCENE = nbv.SDFSurface(Sphere(0.7) | Sphere(0.35).translate([0.8, 0.3, 0.0]))
 
 
 def small_planner(search, acquisition=None, **changes) -> nbv.Planner:
-    options = {
-        "model": nbv.GeometricSPSR(0.05, 0.2, 8),
-        "camera": CAMERA,
-        "num_samples": 2,
-        "capacity": 512,
-        "grid": nbv.Grid(24),
-    }
+    imagined = {"model": nbv.GeometricSPSR(0.05, 0.2, 8), "num_samples": 2, "grid": nbv.Grid(24)}
+    imagined |= {name: changes.pop(name) for name in ("carving", "surroundings", *imagined) if name in changes}
     acquisition = nbv.Coverage() if acquisition is None else acquisition
-    return nbv.Planner(search=search, acquisition=acquisition, **(options | changes))
+    options = {"camera": CAMERA, "capacity": 512, "imagination": nbv.Imagination(**imagined)}
+    return nbv.Planner(acquisition, search, **(options | changes))
 
 
 def small_run(search, views=3, scene=SCENE, acquisition=None, noise=None, first=FIRST, **changes) -> nbv.Episode:

@@ -12,9 +12,9 @@ from jaxnbv.checks import InputError, require
 from jaxnbv.cli.actions.lines import Lines
 from jaxnbv.cli.actions.run_folder import clear, explained, note, usual_folder
 from jaxnbv.cli.actions.sensors import first_pose, peculiarities, quick_rays, sensor_for
-from jaxnbv.cli.actions.stops import rule
 from jaxnbv.cli.actions.tasks import CommandTask, Given, OfMesh
-from jaxnbv.cli.options import USUAL_SIZE, EpisodeOptions, SensorOptions, SizeOptions
+from jaxnbv.cli.actions.until import rule
+from jaxnbv.cli.asked import USUAL_SIZE, EpisodeOptions, SensorOptions, SizeOptions
 from jaxnbv.cli.registry import SEARCHES, TASKS, resolve
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.imagination import Imagination

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxnbv.checks import require
 from jaxnbv.cli.actions.tasks import position
-from jaxnbv.cli.options import DEFAULT_FIRST, SensorOptions
+from jaxnbv.cli.asked import DEFAULT_FIRST, SensorOptions
 from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.scanning import SDFSurface, Surface, TriangleMesh
 from jaxnbv.scanning.sensors import Setting, fitted

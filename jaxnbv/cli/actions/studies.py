@@ -11,7 +11,7 @@ import typer
 
 from jaxnbv.checks import InputError
 from jaxnbv.cli.actions.device import prepare
-from jaxnbv.cli.options import Device
+from jaxnbv.cli.asked import Device
 from jaxnbv.cli.registry import resolve
 from jaxnbv.storage import describe
 from jaxnbv.studies.engine.charts import write_charts

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement
 from jaxnbv.checks import InputError, require
-from jaxnbv.cli.options import DEFAULT_FIRST
+from jaxnbv.cli.asked import DEFAULT_FIRST
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose, look_at

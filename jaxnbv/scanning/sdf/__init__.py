@@ -17,9 +17,9 @@ from jaxnbv.scanning.sdf.base import norm as norm
 from jaxnbv.scanning.sdf.base import parameter as parameter
 from jaxnbv.scanning.sdf.sampled import Sampled as Sampled
 from jaxnbv.scanning.sdf.sampled import solid_of_mesh as solid_of_mesh
-from jaxnbv.scanning.sdf.shapes import Box as Box
 from jaxnbv.scanning.sdf.shapes import Capsule as Capsule
 from jaxnbv.scanning.sdf.shapes import Cone as Cone
+from jaxnbv.scanning.sdf.shapes import Cuboid as Cuboid
 from jaxnbv.scanning.sdf.shapes import Cylinder as Cylinder
 from jaxnbv.scanning.sdf.shapes import HalfSpace as HalfSpace
 from jaxnbv.scanning.sdf.shapes import Sphere as Sphere

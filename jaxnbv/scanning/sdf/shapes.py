@@ -26,7 +26,7 @@ class Sphere(SignedDistance):
         return norm(*split(x)) - self.radius
 
 
-class Box(SignedDistance):
+class Cuboid(SignedDistance):
     """The box [-half_size, half_size] with edges rounded by `rounding`, which leaves its outer size as it is. Exact.
 
     **Raises:** `ValueError` also if the rounding is greater than half of a side.

@@ -1,7 +1,7 @@
 """Whether a step's imagined surfaces carry a signal."""
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Real
 from scipy.stats import spearmanr
 
 from jaxnbv.checks import AnyArray
@@ -33,7 +33,7 @@ def crossed_cells(values: Float[np.ndarray, "g g g"]) -> int:
 
 
 def rank_correlation(
-    values: Float[AnyArray, " c"], true_values: Float[AnyArray, " c"], compared: Bool[np.ndarray, " c"]
+    values: Float[AnyArray, " c"], true_values: Real[AnyArray, " c"], compared: Bool[np.ndarray, " c"]
 ) -> float | None:
     """Spearman's, between the expected and the true values of the candidates compared; None where either does not
     vary."""

@@ -87,12 +87,10 @@ def _checksum(index: int, record: dict[str, Any]) -> str:
 
 
 def _read(file: Path, index: int) -> dict[str, Any]:
-    """A record; those of format 1 stand in their files as they are."""
+    """A record."""
     remedy = "delete it, and it is made again"
     content = read_json(file, "is damaged", remedy)
-    if "format" not in content:
-        return content
-    check_format(content["format"], file)
+    check_format(content.get("format"), file)
     require(content.get("index") == index, f"{file} is damaged (it is scene {content.get('index')!s:.20}): {remedy}")
     record = content.get("record")
     if not isinstance(record, dict) or content.get("sha256") != _checksum(index, record):

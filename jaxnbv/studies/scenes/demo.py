@@ -2,7 +2,7 @@
 
 import math
 
-from jaxnbv.scanning.sdf import Box, Capsule, Cone, Cylinder, SignedDistance, SmoothUnion, Sphere, Torus
+from jaxnbv.scanning.sdf import Capsule, Cone, Cuboid, Cylinder, SignedDistance, SmoothUnion, Sphere, Torus
 from jaxnbv.scanning.sphere_tracing import SDFSurface
 
 
@@ -41,7 +41,7 @@ def _spoon() -> SignedDistance:
 
 
 def _sugar() -> SignedDistance:
-    cube = Box([0.12, 0.12, 0.12], 0.03)
+    cube = Cuboid([0.12, 0.12, 0.12], 0.03)
     first = cube.rotate([0.0, 1.0, 0.0], 0.3).translate([-0.55, 0.3, 0.6])
     second = cube.rotate([0.0, 1.0, 0.0], 1.0).translate([-0.78, 0.31, 0.3])
     return first | second

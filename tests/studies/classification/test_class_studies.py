@@ -11,14 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from jaxnbv.cli.model_name import ModelName
 from PIL import Image
 
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
+from jaxnbv.imagination import Imagination
 from jaxnbv.networks import InvariantClassifier, save_checkpoint
-from jaxnbv.search import FarthestView
-from jaxnbv.search.candidates import sphere_candidates
+from jaxnbv.search import FarthestView, SphereCandidates
 from jaxnbv.studies.classification.modelnet10 import ModelNet10Study
 from jaxnbv.studies.classification.omniobject3d import OmniObject3DStudy
 from jaxnbv.studies.classification.pictures import write_pictures
@@ -58,7 +57,7 @@ def small(kind, **settings):
     few = {"num_candidates": CANDIDATES, "num_samples": 2, "grid_resolution": 20, "capacity": 250, "num_points": 100}
     model = GeometricSPSR(lengthscale=0.05, truncation=8)
     classifier = Linear(len(kind.objects.classes))
-    return kind(classifier=classifier, model=model, views=3, camera=CAMERA, **few, **settings)
+    return kind(classifier=classifier, imagination=Imagination(model), views=3, camera=CAMERA, **few, **settings)
 
 
 @functools.cache
@@ -70,7 +69,7 @@ def test_of_a_truck_the_pixels_of_its_cargo_are_recorded():
     found, truck = record(TruckStudy), truck_scene(Split.TEST, SCENE)
     assert list(found["methods"]) == list(TruckStudy.methods)
     assert found["label"] == int(truck.label) == SCENE
-    poses = sphere_candidates(CANDIDATES, 2.5)
+    poses = SphereCandidates(CANDIDATES).poses()
     _, seen = scan_cue(truck, CAMERA, poses)
     cargo = np.asarray(jnp.sum((jnp.abs(truck.cargo(seen.points)) < 2e-3) & seen.mask, axis=-1))
     np.testing.assert_allclose(found["cargo_pixels"], cargo, atol=2)
@@ -208,14 +207,14 @@ def test_meshes_in_place_of_procedural_objects(tmp_path):
 def test_a_network_of_ones_own_takes_the_place_of_the_shipped_one(tmp_path):
     network = InvariantClassifier(len(FRUITS), jax.random.key(0), groups=(20, 8))
     save_checkpoint(network, tmp_path / "mine.safetensors")
-    made = OmniObject3DStudy.configured(ModelName.SCREENED, 2, True, classifier=tmp_path / "mine.safetensors")
+    made = OmniObject3DStudy.configured("screened", 2, True, classifier=tmp_path / "mine.safetensors")
     (study,) = made.values()
     assert (study.classifier.num_points, study.imagining.num_points) == OmniObject3DStudy.fed
     np.testing.assert_array_equal(study.classifier.network.head[1].bias, network.head[1].bias)
     with pytest.raises(InputError, match=r"tells 5 classes apart; the study has 10: bathtub, bed"):
-        ModelNet10Study.configured(ModelName.SCREENED, 2, True, classifier=tmp_path / "mine.safetensors")
+        ModelNet10Study.configured("screened", 2, True, classifier=tmp_path / "mine.safetensors")
     with pytest.raises(InputError, match="no classifier of 'teapot' ships: give the file of one"):
-        Unshipped.configured(ModelName.SCREENED, 2, True)
+        Unshipped.configured("screened", 2, True)
 
 
 def test_a_method_of_ones_own_on_household_objects():

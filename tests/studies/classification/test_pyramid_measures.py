@@ -1,4 +1,4 @@
-"""What the pyramid study measures, from records made by hand; records as they were and as they are."""
+"""What the pyramid study measures, from records made by hand."""
 
 import csv
 import json
@@ -23,8 +23,12 @@ def run(guesses, pixels):
     return {"candidates": list(range(len(guesses))), "pattern_pixels": pixels, "log_p": log_p(guesses)}
 
 
-def record(scene, methods, label=1, angle=100.0, framing="close-up", random_hit=0.25, diagnostics=()):
+def record(scene, methods, label=1, angle=100.0, framing="close-up", random_hit=0.25, diagnostics=None):
     pixels = [0, 200, 0, 200, 0, 0, 0, 0, 0]
+    noted = diagnostics or {}
+    held = {name: {"runs": runs, "diagnostics": noted.get(name, [])} for name, runs in methods.items()}
+    if "random" in held:
+        held["random"]["hit"] = random_hit
     return {
         "scene": scene,
         "framing": framing,
@@ -33,9 +37,7 @@ def record(scene, methods, label=1, angle=100.0, framing="close-up", random_hit=
         "first": 0,
         "angle": angle,
         "pattern_pixels": pixels,
-        "random_hit": random_hit,
-        "methods": {name: {"runs": runs} for name, runs in methods.items()},
-        "diagnostics": list(diagnostics),
+        "methods": held,
         "seconds": 1.0,
     }
 
@@ -58,11 +60,16 @@ def synthetic_records(scenes, views=5, methods=PyramidStudy.methods, framing="cl
         for of_method in runs.values():
             for one in of_method:
                 one["log_p"][0] = first
-        correlations = {name: float(rng.uniform(-1, 1)) for name in methods if name != "random"}
-        entry = {"roughness": 2.0, "near_sensor": None, "rank_correlation": correlations}
-        diagnostics = [entry | {"view": view, "methods": list(correlations)} for view in range(2, views + 1)]
+        diagnostics = {
+            name: [
+                {"view": view, "roughness": 2.0, "rank_correlation": float(rng.uniform(-1, 1))}
+                for view in range(2, views + 1)
+            ]
+            for name in methods
+            if name != "random"
+        }
         angle, hit = float(rng.uniform(80, 180)), float(rng.uniform())
-        made = record(scene, runs, scene % 5, angle, framing, hit, diagnostics if correlations else [])
+        made = record(scene, runs, scene % 5, angle, framing, hit, diagnostics)
         records.append(json.loads(json.dumps(made | {"pattern_pixels": pixels.tolist()})))
     return records
 
@@ -71,12 +78,13 @@ def two_scenes():
     """Cross-entropy hits at view 2 and stays; farthest never sees the pattern, and hits once or never."""
     ours = run([0, 1, 1], [0, 200, 0])
     random = [run([0, 1, 0], [0, 0, 0]), run([0, 0, 1], [0, 0, 0])]
-    diagnostics = [
-        {"view": 2, "methods": ["cross-entropy", "farthest"], "roughness": 1.0, "near_sensor": None}
-        | {"rank_correlation": {"cross-entropy": 0.5, "farthest": -0.5}},
-        {"view": 3, "methods": ["cross-entropy"], "roughness": 3.0, "near_sensor": 0.25}
-        | {"rank_correlation": {"cross-entropy": None}},
-    ]
+    diagnostics = {
+        "cross-entropy": [
+            {"view": 2, "roughness": 1.0, "rank_correlation": 0.5},
+            {"view": 3, "roughness": 3.0, "rank_correlation": None},
+        ],
+        "farthest": [{"view": 2, "roughness": 1.0, "rank_correlation": -0.5}],
+    }
     farthest = run([0, 1, 0], [0, 0, 149]), run([0, 2, 2], [0, 0, 0])
     return [
         record(
@@ -103,30 +111,15 @@ def test_curves_of_hand_made_sequences():
     np.testing.assert_array_equal(curves(records, "farthest", "pattern"), np.zeros((2, 3)))
 
 
-def as_now(record):
-    """Diagnostics and the exact share of random search stand with their methods."""
-    new = json.loads(json.dumps(record))
-    for method, held in new["methods"].items():
-        held["diagnostics"] = [
-            {"view": entry["view"], "roughness": entry["roughness"], "rank_correlation": correlation}
-            for entry in new["diagnostics"]
-            if (correlation := entry["rank_correlation"].get(method)) is not None or method in entry["methods"]
-        ]
-        held |= {"hit": new["random_hit"]} if method == "random" else {}
-    del new["diagnostics"], new["random_hit"]
-    return new
-
-
-@pytest.mark.parametrize("made", [lambda record: record, as_now])
-def test_random_search_is_exact_where_it_can_be(made):
-    records = [made(record) for record in two_scenes()]
+def test_random_search_is_exact_where_it_can_be():
+    records = two_scenes()
     # Two of eight candidates show the pattern.
     exact = [0.0, 2 / 8, 1 - (6 / 8) * (5 / 7)]
     np.testing.assert_allclose(curves(records, "random", "pattern"), [exact, exact])
     # By view 2 half of the runs hit, but the expectation over all candidates is 0.25.
     np.testing.assert_allclose(curves(records, "random", "first"), [[0, 0.25, 1], [0, 0.25, 1]])
     np.testing.assert_allclose(curves(records, "random", "stable"), [[0, 0, 0.5], [0, 0, 0.5]])
-    already = made(record(0, {"random": [run([1, 0, 0], [0, 0, 0])]}, random_hit=0.25))
+    already = record(0, {"random": [run([1, 0, 0], [0, 0, 0])]}, random_hit=0.25)
     np.testing.assert_allclose(curves([already], "random", "first"), [[1, 1, 1]])
 
 
@@ -141,18 +134,14 @@ def test_curves_only_rise_and_stable_hits_follow_first_hits():
         np.testing.assert_array_equal(stable[:, -1], right)
 
 
-@pytest.mark.parametrize("made", [lambda record: record, as_now])
-def test_diagnostics_are_of_the_methods_own_views(made):
-    records = [made(record) for record in two_scenes()]
-    found = result_rows(records, ["cross-entropy", "farthest"], PyramidStudy.measures)
+def test_diagnostics_are_of_the_methods_own_views():
+    found = result_rows(two_scenes(), ["cross-entropy", "farthest"], PyramidStudy.measures)
     rows = {(row["quantity"], row["method"], row["at"]): row for row in found}
     row = rows["rank_correlation", "farthest", 2]
     assert (row["mean"], row["scenes"]) == (-0.5, 1)
     assert rows["roughness", "cross-entropy", 3]["mean"] == 3.0
     assert ("rank_correlation", "cross-entropy", 3) not in rows
     assert ("roughness", "farthest", 3) not in rows
-    # Older records alone hold it.
-    assert (("near_sensor", "cross-entropy", 3) in rows) == (made is not as_now)
 
 
 def read(path):

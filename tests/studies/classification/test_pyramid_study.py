@@ -1,4 +1,4 @@
-"""The pyramid study on a small scale, against the library's own scores and searches."""
+"""The pyramid study on a small scale, against the library's own acquisitions and planners."""
 
 import functools
 import json
@@ -14,11 +14,12 @@ from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import concatenate, limit_capacity
+from jaxnbv.imagination import Imagination
 from jaxnbv.scanning import scan
-from jaxnbv.search import FarthestView, Problem, TieBreakSearch, UncertaintyView
-from jaxnbv.search.candidates import sphere_candidates
+from jaxnbv.search import FarthestView, SphereCandidates
 from jaxnbv.studies.classification.pictures import write_pictures
 from jaxnbv.studies.classification.pyramid import PyramidStudy
+from jaxnbv.studies.classification.shared import propose_together
 from jaxnbv.studies.scenes import Framing, Pyramid, Split, pyramid_scene
 from jaxnbv.studies.scenes.class_object import scan_cue
 from jaxnbv.surfaces import GeometricSPSR
@@ -58,8 +59,8 @@ def small_study(classifier=None, views=3, **settings):
     model = GeometricSPSR(lengthscale=0.05, truncation=8)
     small = {"num_candidates": CANDIDATES, "num_samples": 2, "grid_resolution": 20}
     limits = {"capacity": 250, "num_points": 100}
-    fixed = {"classifier": classifier or Linear(), "framing": Framing.CLOSE_UP, "model": model, "views": views}
-    return PyramidStudy(camera=CAMERA, **(fixed | small | limits | settings))
+    fixed = {"classifier": classifier or Linear(), "framing": Framing.CLOSE_UP, "views": views}
+    return PyramidStudy(camera=CAMERA, imagination=Imagination(model), **(fixed | small | limits | settings))
 
 
 @functools.cache
@@ -67,13 +68,18 @@ def whole_record():
     return small_study().run_scene(SCENE)
 
 
-@pytest.fixture
-def chooser():
-    return chooser_of(small_study())
+def evidence_of(study, planner, scene, candidates):
+    """What a planner knows after the true scans from some candidates."""
+    poses, scans = study.candidates.poses(), scene.task.scans
+    *_, evidence = planner.replay((poses[index], scans[index]) for index in candidates)
+    return evidence
 
 
-def chooser_of(study):
-    return study._chooser(study.scene(SCENE))
+def step_key(study, view, run=None):
+    """The key of a step of an episode: of its samples and its search."""
+    key = study.key(SCENE, "episode")
+    key = key if run is None else jax.random.fold_in(key, run)
+    return jax.random.split(jax.random.fold_in(key, view))[0]
 
 
 def without_time(record):
@@ -108,7 +114,7 @@ def test_the_first_view_is_that_of_all_methods_and_shows_no_pattern_but_somethin
     record = whole_record()
     firsts = {run["candidates"][0] for method in record["methods"].values() for run in method["runs"]}
     assert firsts == {record["first"]}
-    pyramid, poses = pyramid_scene(Split.TEST, SCENE), sphere_candidates(CANDIDATES, 2.5)
+    pyramid, poses = pyramid_scene(Split.TEST, SCENE), SphereCandidates(CANDIDATES).poses()
     _, seen = scan_cue(pyramid, CAMERA, poses)
     pixels = np.asarray(jnp.sum(pyramid.on_pattern(seen.points) & seen.mask, axis=-1))
     assert pixels[record["first"]] == 0 < int(seen.count[record["first"]])
@@ -138,13 +144,27 @@ def test_diagnostics_of_every_method_at_every_view():
             assert entry["rank_correlation"] is None or -1 <= entry["rank_correlation"] <= 1
 
 
+def test_every_choice_is_the_one_that_the_planner_proposes_with_the_same_key():
+    """Each method's planner alone, by `propose`, at each view of its run; and each run of random search."""
+    study, record = small_study(), whole_record()
+    scene, places = study.scene(SCENE), np.asarray(study.candidates.poses().position)
+    for method, held in record["methods"].items():
+        planner = study.planner(method, scene)
+        for run, found in enumerate(held["runs"]):
+            for view in (1, 2):
+                evidence = evidence_of(study, planner, scene, found["candidates"][:view])
+                key = step_key(study, view, run if method == "random" else None)
+                proposed = planner.propose(evidence, key).pose.position
+                np.testing.assert_allclose(places[found["candidates"][view]], proposed, atol=1e-6, err_msg=method)
+
+
 @eqx.filter_jit
-def scores_by_hand(scores, cloud, surfaces, camera, poses):
-    """The mean over samples of each score of each scan: `expected_value`, with scans that all scores share."""
-    contexts = [score.context(cloud) for score in scores]
+def values_by_hand(acquisitions, cloud, surfaces, camera, poses):
+    """The mean over samples of each acquisition of each scan, one after the other."""
+    contexts = [acquisition.context(cloud) for acquisition in acquisitions]
 
     def of_scan(one):
-        return jnp.stack([score(context, one) for score, context in zip(scores, contexts, strict=True)])
+        return jnp.stack([each(context, one) for each, context in zip(acquisitions, contexts, strict=True)])
 
     def of_sample(surface):
         return jax.lax.map(of_scan, scan(surface, camera, poses))
@@ -153,64 +173,47 @@ def scores_by_hand(scores, cloud, surfaces, camera, poses):
 
 
 @pytest.mark.parametrize("sharpness", [0.3, 12.0])
-def test_values_are_the_librarys_scores_of_the_same_samples(sharpness):
-    """Undecided, above the threshold of the mixed score, and nearly decided, below it."""
+def test_values_of_methods_that_share_scans_are_each_their_own(sharpness):
+    """Undecided, above the threshold of the mixed acquisition, and nearly decided, below it."""
     classifier = Linear(sharpness)
     study = small_study(classifier)
-    chooser = chooser_of(study)
-    visited = (2, 7)
-    found, _ = chooser.values(visited, [name for name in study.methods if name != "random"], 3)
-    evidence, planner = chooser.state(visited), chooser.planner
+    scene, visited, key = study.scene(SCENE), [2, 7], jax.random.key(3)
+    planners = {name: study.planner(name, scene) for name in study.methods if name != "random"}
+    planner = planners["coverage"]
+    evidence = evidence_of(study, planner, scene, visited)
     assert int(evidence.num_views) == 2
-    key = jax.random.fold_in(study.key(SCENE, "scene"), 3)
-    surfaces = planner.imagination.sample(evidence, key, planner.imagination.posterior(evidence))
-    scores = {
+    surfaces = planner.imagination.sample(evidence, key)
+    found = propose_together(planners, evidence, surfaces, key)
+    acquisitions = {
         "cross-entropy": CrossEntropy(classifier, num_points=100),
         "mixed": MixedEntropy(classifier, num_points=100),
         "entropy": ExpectedUtilityImprovement(NegativeEntropy(classifier), num_points=100),
         "coverage": Coverage(),
     }
-    expected = scores_by_hand(tuple(scores.values()), evidence.cloud, surfaces, planner.camera, chooser.poses)
-    for name, value in zip(scores, expected, strict=True):
-        np.testing.assert_allclose(found[name], value, rtol=1e-4, atol=1e-5, err_msg=name)
+    poses, new = study.candidates.poses(), np.setdiff1d(np.arange(CANDIDATES), visited)
+    expected = values_by_hand(tuple(acquisitions.values()), evidence.cloud, surfaces, planner.camera, poses)
+    for name, value in zip(acquisitions, np.asarray(expected), strict=True):
+        np.testing.assert_allclose(found[name].values[new], value[new], rtol=1e-4, atol=1e-5, err_msg=name)
+        assert np.isneginf(found[name].values[np.array(visited)]).all()
     is_open = float(-NegativeEntropy(classifier)(limit_capacity(evidence.cloud, 100))) > 0.75
     assert is_open == (sharpness < 1)
-    np.testing.assert_array_equal(found["mixed"], found["cross-entropy" if is_open else "entropy"])
-    problem = Problem(evidence.cloud, evidence.poses, evidence.num_views, planner.camera, Coverage(), surfaces)
-    told = problem.about(scores["cross-entropy"])
-    view = TieBreakSearch(CANDIDATES, second=scores["coverage"]).propose(told, jax.random.key(0)).pose
-    open_values = np.where(np.isin(np.arange(CANDIDATES), visited), -np.inf, found["tie-break"])
-    np.testing.assert_array_equal(view.position, chooser.poses.position[open_values.argmax()])
-    for name, search in (("farthest", FarthestView(CANDIDATES)), ("uncertainty", UncertaintyView(CANDIDATES))):
-        expected = np.asarray(search.propose(problem, jax.random.key(0)).values)
-        new = np.setdiff1d(np.arange(CANDIDATES), visited)
-        np.testing.assert_allclose(found[name][new], expected[new], rtol=1e-4, atol=1e-5)
-        assert np.isneginf(expected[list(visited)]).all()
+    same = found["cross-entropy" if is_open else "entropy"]
+    np.testing.assert_array_equal(found["mixed"].values, same.values)
+    np.testing.assert_array_equal(found["tie-break"].values, found["cross-entropy"].values)
     thinned = limit_capacity(evidence.cloud, 100)
     p = np.exp(np.asarray(classifier(thinned), np.float64))
-    for candidate in (0, 7):
-        q = np.asarray(classifier(concatenate(thinned, chooser.scans[candidate])), np.float64)
-        assert found["oracle"][candidate] == pytest.approx(-np.sum(p * q), rel=1e-4)
+    for candidate in new[[0, 5]]:
+        q = np.asarray(classifier(concatenate(thinned, scene.task.scans[candidate])), np.float64)
+        assert found["oracle"].values[candidate] == pytest.approx(-np.sum(p * q), rel=1e-4)
 
 
-def test_the_choice_is_the_best_candidate_not_visited(chooser):
-    first = whole_record()["first"]
-    values = chooser.values((first,), ["farthest"], 2)[0]["farthest"]
-    best = int(np.delete(np.arange(CANDIDATES), first)[np.delete(values, first).argmax()])
-    assert whole_record()["methods"]["farthest"]["runs"][0]["candidates"][1] == best
-    assert chooser.choose((first,), ["farthest"], 2)["farthest"].candidate == best
-    assert chooser.choose((first, best), ["farthest"], 3)["farthest"].candidate not in (first, best)
-
-
-def test_answers_are_the_classifiers_of_all_that_was_seen(chooser):
-    run = whole_record()["methods"]["coverage"]["runs"][0]
-    planner = chooser.planner
-    evidence = planner.init(chooser.poses[run["candidates"][0]], chooser.scans[run["candidates"][0]])
-    for count, index in enumerate(run["candidates"]):
-        if count:
-            evidence = planner.observe(evidence, chooser.poses[index], chooser.scans[index])
-        expected = chooser.classifier(evidence.cloud)
-        np.testing.assert_allclose(run["log_p"][count], expected, atol=1e-5)
+def test_answers_are_the_classifiers_of_all_that_was_seen():
+    study, run = small_study(), whole_record()["methods"]["coverage"]["runs"][0]
+    scene = study.scene(SCENE)
+    planner = study.planner("coverage", scene)
+    for count in (1, 2, 3):
+        evidence = evidence_of(study, planner, scene, run["candidates"][:count])
+        np.testing.assert_allclose(run["log_p"][count - 1], study.classifier(evidence.cloud), atol=1e-5)
 
 
 def test_a_method_of_ones_own_sees_what_others_see_from_a_candidate(tmp_path):

@@ -12,6 +12,7 @@ import pytest
 
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
+from jaxnbv.imagination import Imagination
 from jaxnbv.studies.classification.searches import SearchStudy
 from jaxnbv.studies.engine.tables import summary
 from jaxnbv.surfaces import GeometricSPSR
@@ -31,8 +32,9 @@ class Linear(eqx.Module):
 @functools.cache
 def study():
     small = {"num_candidates": 14, "num_samples": 4, "grid_resolution": 20, "capacity": 250, "num_points": 100}
-    seen = {"model": GeometricSPSR(lengthscale=0.05, truncation=8), "camera": Camera(height=12, width=12)}
-    return SearchStudy(classifier=Linear(), views=VIEWS, num_starts=2, iterations=2, **seen, **small)
+    model, camera = GeometricSPSR(lengthscale=0.05, truncation=8), Camera(height=12, width=12)
+    steps = {"num_starts": 2, "iterations": 2, "views": VIEWS}
+    return SearchStudy(classifier=Linear(), camera=camera, imagination=Imagination(model), **steps, **small)
 
 
 @functools.cache

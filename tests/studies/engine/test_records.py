@@ -79,13 +79,10 @@ def test_records_that_are_not_what_they_were_are_refused(tmp_path):
             collect()
 
 
-def test_records_of_the_first_format_are_read(tmp_path):
-    (tmp_path / "study.json").write_text(json.dumps({"views": 3, "versions": {}}))
+def test_a_record_that_does_not_say_its_format_is_refused(tmp_path):
     (tmp_path / "scene_0000.json").write_text(json.dumps({"scene": 0, "x": 1.5}))
-    found = RecordFolder(tmp_path, {"views": 3}).collect(2, lambda index: {"scene": index}, progress=False)
-    assert found == [{"scene": 0, "x": 1.5}, {"scene": 1}]
-    with pytest.raises(InputError, match="views: 3 there, 4 now"):
-        RecordFolder(tmp_path, {"views": 4})
+    with pytest.raises(InputError, match=r"scene_0000\.json is of format None"):
+        RecordFolder(tmp_path, {"views": 3}).collect(1, lambda index: {}, progress=False)
 
 
 def test_keys_that_are_numbers_are_read_as_text(tmp_path):

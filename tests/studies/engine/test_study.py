@@ -1,12 +1,12 @@
 """The engine, with a study as small as can be."""
 
+import dataclasses
 import json
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxnbv.cli.model_name import ModelName
 from toy import ToyStudy
 
 from jaxnbv.checks import InputError
@@ -21,9 +21,11 @@ from jaxnbv.studies.engine.study import views_of
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
 
+IMAGINATION = Imagination(GeometricSPSR(0.05, truncation=4))
+
 
 def small(kind=ToyStudy, **settings):
-    few = {"views": 3, "num_candidates": 8, "num_samples": 2, "model": GeometricSPSR(0.05, truncation=4)}
+    few = {"views": 3, "num_candidates": 8, "num_samples": 2, "imagination": IMAGINATION}
     fine = {"grid_resolution": 16, "camera": Camera(height=12, width=12), "capacity": 500}
     return kind(**(few | fine | settings))
 
@@ -89,7 +91,7 @@ def test_a_method_of_ones_own_that_makes_no_planner_is_refused_before_anything_i
     monkeypatch.setattr(ToyStudy, "run_methods", lambda *_: pytest.fail("a method was run"))
 
     def few(study, scene):
-        return Planner(Coverage(), RandomView(3), study.camera, Imagination(study.model), max_views=1)
+        return Planner(Coverage(), RandomView(3), study.camera, study.imagination, max_views=1)
 
     for make, problem in (
         (lambda study, scene: None, "what the method mine makes is None; give Planner"),
@@ -127,17 +129,17 @@ def test_unknown_methods_and_bad_numbers_are_refused():
 
 
 def test_a_command_configures_it():
-    (name, study), *others = ToyStudy.configured(ModelName.PAPER, 4, quick=True).items()
+    (name, study), *others = ToyStudy.configured("paper", 4, quick=True).items()
     assert (name, others) == ("", [])
-    assert (study.views, study.num_samples, study.carving) == (4, 4, None)
-    assert isinstance(study.model, GeometricSPSR)
-    (study,) = ToyStudy.configured(ModelName.SCREENED, 5, quick=False, num_candidates=20).values()
+    assert (study.views, study.num_samples, study.imagination.carving) == (4, 4, None)
+    assert isinstance(study.imagination.model, GeometricSPSR)
+    (study,) = ToyStudy.configured("screened", 5, quick=False, num_candidates=20).values()
     assert (study.num_samples, study.num_candidates) == (16, 20)
-    assert study.carving is not None
+    assert study.imagination.carving is not None
 
 
 def test_planners_have_the_studys_settings():
-    planner = small(carving=None).planner("random", None)
+    planner = small(imagination=dataclasses.replace(IMAGINATION, carving=None)).planner("random", None)
     assert (
         planner.imagination.num_samples,
         planner.imagination.grid.resolution,

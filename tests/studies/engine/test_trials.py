@@ -13,7 +13,6 @@ import loky
 import psutil
 import pytest
 from deadly import Trial
-from jaxnbv.cli.model_name import ModelName
 from test_study import small, without_time
 from toy import ToyStudy
 
@@ -143,7 +142,7 @@ def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypa
 
     def run(out, scenes):
         none = dict.fromkeys(("methods", "own", "out", "scheduler"))
-        settings = {"views": 2, "model": ModelName.PAPER, "quick": False, "workers": 1, "out": tmp_path / out}
+        settings = {"views": 2, "model": "paper", "quick": False, "workers": 1, "out": tmp_path / out}
         study("toy", entry, **none | settings | {"scenes": scenes})
 
     entry = Entry("toy:ToyStudy", "", "", 3, 2)
@@ -158,4 +157,4 @@ def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypa
         run("all", 2)
     assert not (tmp_path / "all" / "results.txt").exists()
     with pytest.raises(InputError, match="exclude each other"):
-        study("toy", entry, 2, 2, None, None, ModelName.PAPER, None, False, 2, "tcp://127.0.0.1:9")
+        study("toy", entry, 2, 2, None, None, "paper", None, False, 2, "tcp://127.0.0.1:9")

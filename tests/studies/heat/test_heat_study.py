@@ -10,6 +10,7 @@ import trimesh
 from PIL import Image
 
 import jaxnbv as nbv
+from jaxnbv.imagination import Imagination
 from jaxnbv.checks import InputError
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.search import HalvingSearch
@@ -30,7 +31,7 @@ CANDIDATES, VIEWS = 12, 3
 
 def small_study(**settings):
     model = nbv.GeometricSPSR(lengthscale=0.05, truncation=8)
-    small = {"views": VIEWS, "num_candidates": CANDIDATES, "num_samples": 3, "model": model, "grid_resolution": 20}
+    small = {"views": VIEWS, "num_candidates": CANDIDATES, "num_samples": 3, "imagination": Imagination(model), "grid_resolution": 20}
     few = {"capacity": 900, "num_points": 200, "imagined_rays": 6, "true_grid": nbv.Grid(48)}
     return HeatStudy(**(small | few | settings))
 

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from jaxnbv.cli.model_name import ModelName
 
+from jaxnbv.imagination import Imagination
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
@@ -45,7 +45,7 @@ def folder(tmp_path):
 
 def small_study(folder, **settings):
     model = GeometricSPSR(lengthscale=0.05, truncation=8)
-    small = {"views": 3, "num_candidates": 12, "num_samples": 2, "model": model, "grid_resolution": 20}
+    small = {"views": 3, "num_candidates": 12, "num_samples": 2, "imagination": Imagination(model), "grid_resolution": 20}
     limits = {"capacity": 1500, "camera": Camera(height=32, width=32), "imagined_rays": 12, "num_points": 100}
     return MeshPartStudy(meshes=part_files(folder), **(small | limits | settings))
 
@@ -104,7 +104,7 @@ def test_it_asks_for_the_parts_that_can_be_seen_and_counts_their_points(folder):
 
 
 def test_the_command_takes_a_folder(folder, tmp_path):
-    (study,) = PartStudy.configured(ModelName.SCREENED, 3, quick=True, meshes=folder).values()
+    (study,) = PartStudy.configured("screened", 3, quick=True, meshes=folder).values()
     assert isinstance(study, MeshPartStudy)
     assert [count for _, count in study.meshes] == [3, 2]
     assert study.num_candidates == PartStudy.quick["num_candidates"]

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnbv.imagination import Imagination
 from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
@@ -54,7 +55,7 @@ class Pointwise(eqx.Module):
 
 def small_study(enough=10**6, **settings):
     model = GeometricSPSR(lengthscale=0.05, truncation=8)
-    small = {"views": VIEWS, "num_candidates": CANDIDATES, "num_samples": 2, "model": model, "grid_resolution": 20}
+    small = {"views": VIEWS, "num_candidates": CANDIDATES, "num_samples": 2, "imagination": Imagination(model), "grid_resolution": 20}
     limits = {"capacity": 600, "imagined_rays": 12, "num_points": 100, "num_starts": 1, "iterations": 2}
     segmenter = CloudSegmenter(Pointwise(jnp.asarray(enough)), 0, 500, scale=0.8)
     return PartStudy(segmenter=segmenter, camera=CAMERA, **(small | limits | settings))

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 import trimesh
+from jaxnbv.imagination import Imagination
 from jaxnbv.scanning.reconstruction import has_poisson
 from PIL import Image
 
@@ -40,7 +41,7 @@ def meshes(tmp_path_factory):
 
 def small_study(meshes=None, views=3, **settings):
     model = nbv.GeometricSPSR(lengthscale=0.05, truncation=8)
-    small = {"num_candidates": CANDIDATES, "num_samples": 2, "model": model, "grid_resolution": 20, "capacity": 250}
+    small = {"num_candidates": CANDIDATES, "num_samples": 2, "imagination": Imagination(model), "grid_resolution": 20, "capacity": 250}
     return ReconstructionStudy(meshes=meshes, views=views, **(small | settings))
 
 

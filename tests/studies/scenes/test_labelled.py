@@ -10,7 +10,7 @@ from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning import SDFSurface, scan
-from jaxnbv.scanning.sdf import Box, Capsule, Cone, Cylinder, Sphere, Torus
+from jaxnbv.scanning.sdf import Capsule, Cone, Cuboid, Cylinder, Sphere, Torus
 from jaxnbv.studies.scenes.labelled import (
     CAPACITY,
     LabelledSolid,
@@ -86,8 +86,8 @@ def test_distances_are_those_of_the_formulas(x64):
 # In units of the object, whose longest side says how `assemble` scales it; none is off its centre.
 CLOSED = {
     "ball": ([ball(3, (1, 2, 3), 0.8)], Sphere(0.8), 1.6),
-    "box": ([box(3, (1, 2, 3), (0.7, 0.5, 0.9), 0.2)], Box([0.7, 0.5, 0.9], 0.2), 1.8),
-    "sharp box": ([box(3, (0, 0, 0), (0.7, 0.5, 0.9), 0.0)], Box([0.7, 0.5, 0.9]), 1.8),
+    "box": ([box(3, (1, 2, 3), (0.7, 0.5, 0.9), 0.2)], Cuboid([0.7, 0.5, 0.9], 0.2), 1.8),
+    "sharp box": ([box(3, (0, 0, 0), (0.7, 0.5, 0.9), 0.0)], Cuboid([0.7, 0.5, 0.9]), 1.8),
     "cylinder": ([rod(3, (1, -0.8, 0), (1, 0.8, 0), 0.6, rounding=0.0)], Cylinder(0.6, 0.8), 1.6),
     "torus": ([ring(3, (1, 0, 0), (0, 1, 0), 0.7, 0.25, 0.25, 0.25)], Torus(0.7, 0.25), 1.9),
     "capsule": (
@@ -95,10 +95,10 @@ CLOSED = {
         Capsule([-0.2, -0.5, -0.2], [0.2, 0.5, 0.2], 0.3),
         1.6,
     ),
-    "bar": ([bar(3, (0, 0, 0), (0, 1.8, 0), 0.5, 0.3, 0.1)], Box([0.3, 0.9, 0.5], 0.1), 1.8),
+    "bar": ([bar(3, (0, 0, 0), (0, 1.8, 0), 0.5, 0.3, 0.1)], Cuboid([0.3, 0.9, 0.5], 0.1), 1.8),
     "turned": (
         [box(3, (0, 0, 0), (0.2, 0.4, 0.9), 0.1, ((0, 1, 0), np.pi / 2))],
-        Box([0.2, 0.4, 0.9], 0.1).rotate([0, 1, 0], np.pi / 2),
+        Cuboid([0.2, 0.4, 0.9], 0.1).rotate([0, 1, 0], np.pi / 2),
         1.8,
     ),
 }

@@ -5,7 +5,6 @@ import jax
 import numpy as np
 import pytest
 import trimesh
-from jaxnbv.cli.model_name import ModelName
 
 from jaxnbv.checks import InputError
 from jaxnbv.scanning import TriangleMesh, scan
@@ -75,7 +74,7 @@ def test_the_study_counts_the_rays_that_hit_the_cargo(tmp_path):
         (tmp_path / folder).mkdir()
         boxes(parts).export(tmp_path / folder / "one.ply")
     settings = {"num_candidates": 8}
-    (study,) = TruckStudy.configured(ModelName.SCREENED, 2, False, meshes=tmp_path, **settings).values()
+    (study,) = TruckStudy.configured("screened", 2, False, meshes=tmp_path, **settings).values()
     assert study.num_scenes == 1
     scene = study.scene(0)
     assert scene.name == "table one"
@@ -91,4 +90,4 @@ def test_the_study_counts_the_rays_that_hit_the_cargo(tmp_path):
     np.testing.assert_allclose(scene.task.pixels, counts, atol=8)
     assert counts.max() > 150
     with pytest.raises(InputError, match=r"there is no folder .*trucks"):
-        TruckStudy.configured(ModelName.SCREENED, 2, False, meshes=tmp_path / "table")
+        TruckStudy.configured("screened", 2, False, meshes=tmp_path / "table")

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_session import BOX, CAMERA, FIRST, POSES, planner_of, session_of, shot
 
-EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
 def load(name):
@@ -110,13 +110,16 @@ def test_the_realsense_loop_runs(monkeypatch, tmp_path, capsys):
             assert camera.intrinsics == pytest.approx(CAMERA.intrinsics)
             super().__init__(planner_of(), CAMERA, BOX, up="z", poses=POSES, folder=given["folder"])
 
-        def report(self):
-            return "reported"
+    def write_report(episode, path):
+        assert len(episode.views) == 3
+        return f"reported in {path}"
 
     monkeypatch.setattr(example, "go_to", go_to)
+    monkeypatch.setattr(example.nbv, "write_report", write_report)
     monkeypatch.setattr(example.nbv, "Session", Small)
     monkeypatch.setattr(example.nbv, "look_at", lambda *a, **k: SimpleNamespace(matrix=FIRST))
-    example.main(str(tmp_path / "live"), views=3)
-    assert "3 images are taken reported" in capsys.readouterr().out
+    folder = str(tmp_path / "live")
+    example.main(folder, views=3)
+    assert f"3 images are taken reported in {folder}" in capsys.readouterr().out
     assert len(list((tmp_path / "live").glob("image_*.npz"))) == 3
     assert FakePipeline.held is None

@@ -1,0 +1,106 @@
+"""The listing is the architecture: imports follow the order of the packages, and go round in no circle."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import jaxnbv
+
+ROOT = Path(jaxnbv.__file__).parent
+# Data flows down this list: each imports only from those before it, and from itself.
+ORDER = (
+    "version",
+    "errors",
+    "checks",
+    "geometry",
+    "scanning",
+    "surfaces",
+    "imagination",
+    "acquisition",
+    "tasks",
+    "search",
+    "storage",
+    "networks",
+    "planning",
+    "viz",
+    "studies",
+    "cli",
+)
+FILES = {
+    ".".join(path.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in ROOT.rglob("*.py")
+}
+
+
+def imported(path: Path, name: str) -> set[str]:
+    """The modules of the package that a file names: in imports anywhere in it, in its stub, and in text that is a
+    module's name, as registries hold and `import_module` takes."""
+    found: set[str] = set()
+    stub = path.with_suffix(".pyi")
+    package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+    for source in (path, stub) if stub.exists() else (path,):
+        for node in ast.walk(ast.parse(source.read_text())):
+            if isinstance(node, ast.Import):
+                found |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                base = f"{package}.{node.module or ''}".rstrip(".") if node.level else node.module or ""
+                found |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.add(node.value.partition(":")[0])
+    # A package whose file is named along with what it holds is meant by what it holds.
+    modules = {module for module in found if module in FILES and module != "jaxnbv"}
+    return modules - {name}
+
+
+GRAPH = {name: imported(path, name) for name, path in FILES.items() if name not in ("jaxnbv", "jaxnbv.cli.__main__")}
+
+
+def package_of(module: str) -> str:
+    return module.split(".")[1]
+
+
+def test_the_listing_holds_these_packages_and_no_others():
+    there = {path.stem for path in ROOT.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    assert there == {*ORDER, "__init__"}
+
+
+@pytest.mark.parametrize("package", ORDER)
+def test_imports_follow_the_order(package):
+    place = ORDER.index(package)
+    wrong = {
+        f"{name} -> {other}"
+        for name, others in GRAPH.items()
+        if package_of(name) == package
+        for other in others
+        if ORDER.index(package_of(other)) > place
+    }
+    assert wrong == set()
+
+
+def test_no_file_imports_itself_by_way_of_others():
+    """Kahn's algorithm; a package's own face, which lists what is in it, counts as no importer."""
+    faces = {name for name, path in FILES.items() if path.name == "__init__.py"}
+    graph = {name: {other for other in others if other not in faces} for name, others in GRAPH.items()}
+    graph = {name: others for name, others in graph.items() if name not in faces}
+    while leaves := [name for name, others in graph.items() if not others & graph.keys()]:
+        for name in leaves:
+            del graph[name]
+    assert graph == {}
+
+
+def test_the_reader_of_imports_sees_each_kind(tmp_path):
+    file = tmp_path / "probe.py"
+    file.write_text(
+        "import jaxnbv.checks\nfrom jaxnbv.search import base\n\ndef f():\n    from jaxnbv.viz import report\n"
+        "    import_module('jaxnbv.cli.registry')\n\nENTRY = 'jaxnbv.studies.heat.study:HeatStudy'\n"
+    )
+    assert imported(file, "jaxnbv.probe") == {
+        "jaxnbv.checks",
+        "jaxnbv.search",
+        "jaxnbv.search.base",
+        "jaxnbv.viz",
+        "jaxnbv.viz.report",
+        "jaxnbv.cli.registry",
+        "jaxnbv.studies.heat.study",
+    }
