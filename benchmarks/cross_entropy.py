@@ -32,13 +32,13 @@ def main() -> None:
 
     key, pyramid = jax.random.key(0), pyramid_scene(Split.TEST, 0, Framing.CLOSE_UP)
     classifier = pyramid_classifier(Framing.CLOSE_UP.longest_side)
-    score = nbv.CrossEntropy(classifier)
-    planner = nbv.Planner(score, imagination=nbv.Imagination(nbv.GeometricSPSR()))
+    acquisition = nbv.CrossEntropy(classifier)
+    planner = nbv.Planner(acquisition, imagination=nbv.Imagination(nbv.GeometricSPSR()))
     first = hidden_view(pyramid, key)
     seen = observe_scene(nbv.SDFSurface(pyramid), planner.camera, first, nbv.SensorNoise(), key)
     evidence = planner.init(first, seen)
     surfaces, poses = planner.imagination.sample(evidence, key), sphere_candidates(120, 2.5)
-    context = score.context(evidence.cloud)
+    context = acquisition.context(evidence.cloud)
 
     @eqx.filter_jit
     def scanned(surfaces):

@@ -52,7 +52,7 @@ def scene_and_first(task: str, mesh: str | None, seed: int, key: jax.Array) -> t
 
 
 @eqx.filter_jit
-def value(planner: nbv.Planner, evidence: nbv.State, surfaces: nbv.GridSurface, parameters):
+def value(planner: nbv.Planner, evidence: nbv.Evidence, surfaces: nbv.GridSurface, parameters):
     """The acquisition at six poses of the sphere, moved by parameters."""
     starts = sphere_candidates(6)
     poses = jax.vmap(nbv.SpherePoses().retract)(starts, parameters)
@@ -60,7 +60,7 @@ def value(planner: nbv.Planner, evidence: nbv.State, surfaces: nbv.GridSurface, 
 
 
 @eqx.filter_jit
-def gradient(planner: nbv.Planner, evidence: nbv.State, surfaces: nbv.GridSurface, parameters):
+def gradient(planner: nbv.Planner, evidence: nbv.Evidence, surfaces: nbv.GridSurface, parameters):
     """Its gradient, and its value with it."""
     return jax.value_and_grad(lambda moved: value(planner, evidence, surfaces, moved).sum())(parameters)
 
@@ -121,13 +121,14 @@ def main() -> None:
     if arguments.task == "cross-entropy" and arguments.mesh:
         parser.error("cross-entropy has a classifier for pyramids only: leave --mesh out")
 
-    score = nbv.Coverage()
+    acquisition = nbv.Coverage()
     if arguments.task == "cross-entropy":
-        score = nbv.CrossEntropy(pyramid_classifier(Framing.CLOSE_UP.longest_side))
+        acquisition = nbv.CrossEntropy(pyramid_classifier(Framing.CLOSE_UP.longest_side))
     names = [name for name in SEARCHES if arguments.task == "coverage" or name not in COVERAGE_ONLY]
     names = ["discrete", arguments.only] if arguments.only else names
     planners = {
-        name: nbv.Planner(score, SEARCHES[name], imagination=nbv.Imagination(nbv.GeometricSPSR())) for name in names
+        name: nbv.Planner(acquisition, SEARCHES[name], imagination=nbv.Imagination(nbv.GeometricSPSR()))
+        for name in names
     }
     label = Path(arguments.mesh).stem if arguments.mesh else arguments.task
     out = arguments.out or Path("benchmarks/results") / f"gradient_{label}{'_only' if arguments.only else ''}.json"

@@ -71,8 +71,8 @@ COLUMNS = (
 def planner_of(variant: Variant) -> nbv.Planner:
     """The planner whose samples are judged; its search is never asked."""
     model, carving = variant(GRID)
-    settings = {"num_samples": 8, "grid": GRID, "capacity": 4096, "max_views": VIEWS, "carving": carving}
-    return nbv.Planner(model, nbv.Camera(), nbv.Coverage(), nbv.DiscreteSearch(), **settings)
+    imagination = nbv.Imagination(model, GRID, 8, carving)
+    return nbv.Planner(nbv.Coverage(), imagination=imagination, capacity=4096, max_views=VIEWS)
 
 
 def objects_of(arguments: argparse.Namespace) -> dict[str, Callable[[], nbv.Surface]]:
@@ -110,7 +110,7 @@ def random_views(scene: nbv.Surface, key: jax.Array) -> list[tuple[nbv.Pose, nbv
 @eqx.filter_jit
 def seen_space(scan: nbv.PointCloud, pose: nbv.Pose) -> jax.Array:
     """What one scan shows to be empty, by the default carving, for all models alike."""
-    return nbv.Carving().seen_empty(GRID, scan, nbv.Camera(), pose)
+    return nbv.Carving().seen_empty(GRID, pose, scan, nbv.Camera())
 
 
 def run(planner: nbv.Planner, views: list, truth: Truth, key: jax.Array, compiled: bool) -> list[dict]:
@@ -119,7 +119,7 @@ def run(planner: nbv.Planner, views: list, truth: Truth, key: jax.Array, compile
     for index, (pose, scan) in enumerate(views):
         evidence = planner.init(pose, scan) if evidence is None else planner.observe(evidence, pose, scan)
         empty = empty | seen_space(scan, pose)
-        sample = functools.partial(planner.sample_surfaces, evidence, jax.random.fold_in(key, index))
+        sample = functools.partial(planner.imagination.sample, evidence, jax.random.fold_in(key, index))
         if index == 0 and not compiled:
             jax.block_until_ready(sample())
         start = time.perf_counter()

@@ -24,7 +24,7 @@ from skimage.measure import marching_cubes
 from timing import least_time
 
 import jaxnbv as nbv
-from jaxnbv.imagination import ModelName
+from jaxnbv.imagination import MODELS
 from jaxnbv.planning.episode import observe_scene
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.storage import describe
@@ -53,7 +53,7 @@ def rival_scan(surfaces: nbv.GridSurface, origins: np.ndarray, directions: np.nd
     return time.perf_counter() - start
 
 
-def full_cloud(planner: nbv.Planner, scene: nbv.Surface) -> nbv.State:
+def full_cloud(planner: nbv.Planner, scene: nbv.Surface) -> nbv.Evidence:
     """A evidence whose cloud is full: as many views from around the object as that takes."""
     evidence = None
     for index, position in enumerate(nbv.fibonacci_sphere(planner.max_views, 2.5)):
@@ -67,21 +67,18 @@ def full_cloud(planner: nbv.Planner, scene: nbv.Surface) -> nbv.State:
 
 def planner_of(name: str) -> nbv.Planner:
     """The planner of expected coverage with the surfaces of a name."""
-    model, carving = nbv.imagination(name)
-    return nbv.Planner(nbv.Coverage(), imagination=nbv.Imagination(model, carving=carving))
+    return nbv.Planner(nbv.Coverage(), imagination=nbv.Imagination.preset(name))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--mesh", help="a mesh file; the demo object if left out")
-    parser.add_argument(
-        "--model", choices=[*ModelName], default=ModelName.SCREENED, help="by what surfaces are imagined"
-    )
+    parser.add_argument("--model", choices=MODELS, default=MODELS[0], help="by what surfaces are imagined")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/step.json"))
     arguments = parser.parse_args()
 
     scene = nbv.load_mesh(arguments.mesh) if arguments.mesh else demo_object()
-    planner, published = (planner_of(name) for name in (arguments.model, ModelName.PAPER))
+    planner, published = (planner_of(name) for name in (arguments.model, "paper"))
     first, key = nbv.look_at((0.8, 0.9, 2.2)), jax.random.key(0)
     seen = observe_scene(scene, planner.camera, first, nbv.SensorNoise(), key)
     evidence = planner.init(first, seen)
@@ -113,8 +110,8 @@ def main() -> None:
     assert bool(jnp.allclose(values(evidence.cloud, scans), acquisition, rtol=1e-3))
     seconds["coverage"] = least_time(lambda: values(evidence.cloud, scans))
     seconds["step"] = least_time(lambda: planner.propose(evidence, key))
-    published_state = published.init(first, seen)
-    seconds["published"] = least_time(lambda: published.propose(published_state, key))
+    published_evidence = published.init(first, seen)
+    seconds["published"] = least_time(lambda: published.propose(published_evidence, key))
     full = full_cloud(planner, scene)
     seconds["samples, full"] = least_time(lambda: planner.imagination.sample(full, key))
     seconds["coverage, full"] = least_time(lambda: values(full.cloud, scans))

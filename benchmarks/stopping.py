@@ -11,6 +11,7 @@ the last scene in the file.
 """
 
 import argparse
+import dataclasses
 import functools
 import json
 from pathlib import Path
@@ -25,10 +26,11 @@ import jaxnbv as nbv
 from jaxnbv.networks import part_segmenter, pyramid_classifier
 from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.planning.episode import view_keys
-from jaxnbv.planning.stopping import Covered, Found, SoFar, Sure
+from jaxnbv.planning.stopping import so_far
 from jaxnbv.storage.files import write_text
 from jaxnbv.studies.engine.statistics import bootstrap_mean
 from jaxnbv.studies.scenes import Framing, Split, hidden_view, part_scene, pyramid_scene
+from jaxnbv.tasks import Covered, Found, Sure
 from jaxnbv.tasks.coverage import SeenBefore
 
 SIDE = Framing.WHOLE.longest_side
@@ -43,12 +45,11 @@ RULES = {
 VIEWS = {"class": 6, "parts": 6, "coverage": 14}
 
 
-def planner_of(score: nbv.Acquisition, radius: float, side: float = 2.5, solid: bool = False) -> nbv.Planner:
-    surfaces, carving = nbv.imagination("screened", side, solid=solid)
-    search, grid = nbv.DiscreteSearch(nbv.SphereCandidates(48, radius)), nbv.Grid(64, 0.7 * side)
-    return nbv.Planner(
-        score, search, imagination=nbv.Imagination(surfaces, grid=grid, num_samples=8, carving=carving), capacity=4096
-    )
+def planner_of(acquisition: nbv.Acquisition, radius: float, side: float = 2.5, solid: bool = False) -> nbv.Planner:
+    imagination = nbv.Imagination.preset("screened", side, solid=solid)
+    imagination = dataclasses.replace(imagination, grid=nbv.Grid(64, 0.7 * side), num_samples=8)
+    search = nbv.DiscreteSearch(nbv.SphereCandidates(48, radius))
+    return nbv.Planner(acquisition, search, imagination=imagination, capacity=4096)
 
 
 @functools.cache
@@ -83,9 +84,9 @@ def measured(task: str, index: int) -> dict:
         else:
             right.append(_seen(surface, planner.camera, planner.search.candidates.poses(), evidence.cloud))
         poses = tuple(view.pose for view in episode.views[:count])
-        so_far = SoFar(planner, evidence, poses, 0.0, view_keys(key, count)[0])
+        known = so_far(planner, evidence, poses, view_keys(key, count)[0])
         for name, rule in RULES[task].items():
-            if ends[name] == VIEWS[task] and rule.after(so_far) is not None:
+            if ends[name] == VIEWS[task] and rule.after(known) is not None:
                 ends[name] = count
     return {"right": right, "ends": ends}
 

@@ -90,8 +90,8 @@ def main() -> None:
         truth = truth_points(mesh, jax.random.key(0))
         found = {}
         for name, (search, cost, at_once) in METHODS.items():
-            settings = {"num_samples": 8, "grid": nbv.Grid(64), "capacity": 4096, "cost": cost}
-            planner = nbv.Planner(nbv.ScreenedSPSR(), nbv.Camera(), nbv.Coverage(), search, **settings)
+            imagination = nbv.Imagination(grid=nbv.Grid(64), num_samples=8)
+            planner = nbv.Planner(nbv.Coverage(), search, imagination=imagination, cost=cost, capacity=4096)
             key = jax.random.fold_in(jax.random.key(4), sum(map(ord, file.stem)))
             found[name] = episode(planner, mesh, truth, asked.views, at_once, key)
         records[file.stem] = found

@@ -24,7 +24,7 @@ def depth_camera(profile) -> tuple[nbv.Camera, float]:
     intrinsics = profile.get_stream(rs.stream.depth).as_video_stream_profile().get_intrinsics()
     matrix = [[intrinsics.fx, 0.0, intrinsics.ppx], [0.0, intrinsics.fy, intrinsics.ppy], [0.0, 0.0, 1.0]]
     # Of a D435: nearer it measures nothing, farther nothing worth having.
-    camera = nbv.Camera.from_intrinsics(matrix, intrinsics.width, intrinsics.height, nearest=0.2, farthest=2.0)
+    camera = nbv.Camera.from_intrinsics(matrix, intrinsics.height, intrinsics.width, nearest=0.2, farthest=2.0)
     return camera, profile.get_device().first_depth_sensor().get_depth_scale()
 
 

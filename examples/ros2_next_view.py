@@ -28,7 +28,7 @@ def image_of(message: Any) -> tuple[np.ndarray, float]:
 
 def camera_of(message: Any) -> nbv.Camera:
     """The camera of an undistorted stream."""
-    return nbv.Camera.from_intrinsics(np.reshape(message.k, (3, 3)), message.width, message.height)
+    return nbv.Camera.from_intrinsics(np.reshape(message.k, (3, 3)), message.height, message.width)
 
 
 def matrix_of(transform: Any) -> np.ndarray:

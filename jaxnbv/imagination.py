@@ -278,7 +278,7 @@ class Imagination(eqx.Module):
             if first or bool(scan.mask.any()):
                 check_oriented(scan, "the first scan" if first else "the scan", min(self.grid.half_extent, HALF_WIDTH))
             if pose is not None:
-                check_image(scan, camera, pose)
+                check_image(pose, scan, camera)
             if self.carving is not None:
                 self.carving.check_inside(scan, self.grid)
 
@@ -312,7 +312,7 @@ def _record(
     empty: Bool[Array, "g g g"] | None = evidence.seen_empty
     if carving is not None and empty is not None and evidence.grid is not None:
         barrier = None if surroundings is None else surroundings.barrier(camera, pose)
-        empty = empty | carving.seen_empty(evidence.grid, scan, camera, pose, barrier)
+        empty = empty | carving.seen_empty(evidence.grid, pose, scan, camera, barrier)
     return dataclasses.replace(evidence, poses=poses, num_views=evidence.num_views + 1, seen_empty=empty)
 
 

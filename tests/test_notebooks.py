@@ -27,7 +27,7 @@ SMALL = {
 scenes = 3
 settings = {
     "views": 2,
-    "model": nbv.GeometricSPSR(0.05, truncation=8),
+    "imagination": nbv.Imagination(nbv.GeometricSPSR(0.05, truncation=8)),
     "num_samples": 2,
     "num_candidates": 8,
     "grid_resolution": 24,

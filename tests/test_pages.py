@@ -180,7 +180,7 @@ def test_the_block_for_a_depth_camera_runs():
     small = nbv.Coverage(), nbv.DiscreteSearch(12), nbv.Camera(height=12, width=12), imagination
     given = {
         "nbv": nbv,
-        "camera": nbv.Camera.from_intrinsics(INTRINSICS, 640, 480),
+        "camera": nbv.Camera.from_intrinsics(INTRINSICS, 480, 640),
         "T": np.asarray(pose.matrix),
         **CORNERS,
         "depth_mm": image_of_a_ball(pose.matrix),

@@ -65,8 +65,8 @@ class Camera(eqx.Module):
     def from_intrinsics(
         cls,
         matrix: Float[AnyArray, "3 3"] | list,
-        width: int,
         height: int,
+        width: int,
         nearest: float = 0.0,
         farthest: float | None = None,
         max_incidence: float = 0.5 * math.pi,
@@ -96,14 +96,14 @@ class Camera(eqx.Module):
 
     @classmethod
     @checked
-    def from_focal_length(cls, focal_length: float, width: int, height: int) -> "Camera":
+    def from_focal_length(cls, focal_length: float, height: int, width: int) -> "Camera":
         """The camera of square pixels, its principal point at the centre, of a focal length in pixels.
 
         **Raises:** `ValueError` if the focal length is not positive.
         """
         matrix = np.diag([focal_length, focal_length, 1.0])
         matrix[:2, 2] = 0.5 * (width - 1), 0.5 * (height - 1)
-        return cls.from_intrinsics(matrix, width, height)
+        return cls.from_intrinsics(matrix, height, width)
 
     @property
     def intrinsics(self) -> Float[np.ndarray, "3 3"]:

@@ -122,7 +122,7 @@ class PointCloud(eqx.Module):
         depth: Real[AnyArray, "height width"],
         camera: Camera,
         pose: Pose,
-        scale: float = 1.0,
+        depth_scale: float = 1.0,
         stride: int = 1,
         box: Box | None = None,
     ) -> "PointCloud":
@@ -134,8 +134,8 @@ class PointCloud(eqx.Module):
         on the side where the depth changes less, so they do not mix the two sides of an edge, and are turned to the
         camera. A pixel with no valid neighbour along an image axis has no normal and is invalid.
 
-        - `depth`: along the camera's forward axis; `scale` times it is in units of the pose: 0.001 where the image is
-          in millimetres and the pose in metres. The range of the camera, and the box, are in units of the pose.
+        - `depth`: along the camera's forward axis; `depth_scale` times it is in units of the pose: 0.001 where the
+          image is in millimetres and the pose in metres. The range of the camera, and the box, are in these units too.
         - `stride`: take every so many-th row and column alone; the cloud is an image of `camera.strided(stride)`.
         - `box`: keep points in it alone. A ray that hits behind the box has crossed it, and met nothing; one that hits
           before it is invalid.
@@ -143,7 +143,7 @@ class PointCloud(eqx.Module):
         **Raises:** `ValueError` if the image's shape is not the camera's, or its values cannot be meant: all of them
         out of the camera's range, a box behind the camera, or depths of another order than the box is away.
         """
-        return cls(*points_of_depth(depth, camera, pose, scale, stride, box))
+        return cls(*points_of_depth(depth, camera, pose, depth_scale, stride, box))
 
     @property
     def capacity(self) -> int:

@@ -29,8 +29,9 @@ class Carving(eqx.Module):
     """No imagined surface is inside where the sensor saw empty space, nor outside the volume that holds the object.
 
     - `volume`: where the object can be, see `jaxnbv.geometry.volume`; by default the box that scenes are scaled to.
-    - `margin`: in spacings of the grid. A node is seen empty if every ray that passes within the margin of it, and its
-      neighbours in the image, went on for the margin beyond it; it is outside if the volume is farther than two.
+    - `margin_voxels`: in spacings of the grid. A node is seen empty if every ray that passes within the margin of it,
+      and its neighbours in the image, went on for the margin beyond it; it is outside if the volume is farther than
+      two.
 
     So a sheet thinner than a voxel keeps its surface, though both its sides were seen; noise on a hit does not carve
     while its standard deviation is below a third of the margin; and nothing is concluded beside a silhouette, where a
@@ -40,21 +41,21 @@ class Carving(eqx.Module):
     """
 
     volume: Volume = Box()
-    margin: float = eqx.field(static=True, default=1.0)
+    margin_voxels: float = eqx.field(static=True, default=1.0)
 
     def __check_init__(self):
         check_fields(self)
         require(
-            0.5 <= self.margin < math.inf,
-            f"the margin of the carving is {self.margin} voxels; it must be finite and at least 0.5",
+            0.5 <= self.margin_voxels < math.inf,
+            f"the margin of the carving is {self.margin_voxels} voxels; it must be finite and at least 0.5",
         )
 
     def seen_empty(
         self,
         grid: Grid,
+        pose: Pose,
         scan: PointCloud,
         camera: Camera,
-        pose: Pose,
         barrier: Float[Array, " rays"] | None = None,
     ) -> Bool[Array, "g g g"]:
         """The nodes that one scan shows to be empty; none for a cloud that is no sensor's image.
@@ -64,7 +65,7 @@ class Carving(eqx.Module):
         depth = _free_depth(scan, camera, pose, barrier)
         if depth is None:
             return jnp.zeros((grid.resolution,) * 3, bool)
-        return _crossed(grid, depth, camera, pose, self.margin * grid.spacing)
+        return _crossed(grid, depth, camera, pose, self.margin_voxels * grid.spacing)
 
     @eqx.filter_jit
     def outside(self, grid: Grid) -> Bool[Array, "g g g"]:
@@ -73,7 +74,7 @@ class Carving(eqx.Module):
         return on_tensor_grid(self.volume, axis) > self._beyond_volume(grid)
 
     def _beyond_volume(self, grid: Grid) -> float:
-        return 2.0 * self.margin * grid.spacing
+        return 2.0 * self.margin_voxels * grid.spacing
 
     @eqx.filter_jit
     def inside(self, grid: Grid) -> Bool[Array, "g g g"]:
@@ -120,7 +121,7 @@ def _beyond(volume: Volume, cloud: PointCloud, limit: float) -> tuple[Int[Array,
     return jnp.sum(distance > limit), jnp.max(distance, initial=-jnp.inf)
 
 
-def check_image(scan: PointCloud, camera: Camera, pose: Pose) -> None:
+def check_image(pose: Pose, scan: PointCloud, camera: Camera) -> None:
     """Check that a scan that says which rays missed is an image of the camera from the pose.
 
     **Raises:** `ValueError` if it has another number of rays, or its points are seen elsewhere in the image than their
@@ -162,10 +163,10 @@ def _free_depth(
     if scan.missed is None:
         return None
     along = jnp.matmul(scan.points - pose.position, pose.forward, precision="highest")
-    reach = jnp.asarray(jnp.inf if camera.farthest is None else camera.farthest)
+    farthest_known = jnp.asarray(jnp.inf if camera.farthest is None else camera.farthest)
     if barrier is not None:
-        reach = jnp.minimum(reach, barrier / jnp.linalg.norm(camera.pixel_directions(), axis=-1))
-    return jnp.where(scan.mask, along, jnp.where(scan.missed, reach, 0.0)).reshape(camera.height, camera.width)
+        farthest_known = jnp.minimum(farthest_known, barrier / jnp.linalg.norm(camera.pixel_directions(), axis=-1))
+    return jnp.where(scan.mask, along, jnp.where(scan.missed, farthest_known, 0.0)).reshape(camera.height, camera.width)
 
 
 def _crossed(grid: Grid, depth: Float[Array, "h w"], camera: Camera, pose: Pose, margin: float) -> Bool[Array, "g g g"]:
@@ -197,13 +198,13 @@ def _crossed(grid: Grid, depth: Float[Array, "h w"], camera: Camera, pose: Pose,
     return jax.lax.map(slab, axis)
 
 
-def _least_within(image: Float[Array, "h w"], reach: int) -> Float[Array, "h w"]:
-    """The least of each pixel and those `reach` rows and columns away, zero beyond the border."""
+def _least_within(image: Float[Array, "h w"], pixels: int) -> Float[Array, "h w"]:
+    """The least of each pixel and those `pixels` rows and columns away, zero beyond the border."""
     for axis in (0, 1):
         pad = [(0, 0), (0, 0)]
-        pad[axis] = (reach, reach)
+        pad[axis] = (pixels, pixels)
         padded = jnp.pad(image, pad)
         size = image.shape[axis]
-        shifted = [jax.lax.slice_in_dim(padded, start, start + size, axis=axis) for start in (0, reach, 2 * reach)]
+        shifted = [jax.lax.slice_in_dim(padded, start, start + size, axis=axis) for start in (0, pixels, 2 * pixels)]
         image = jnp.minimum(jnp.minimum(shifted[0], shifted[1]), shifted[2])
     return image

@@ -244,9 +244,9 @@ def cell_at(rays: March, field: Field) -> tuple[Triple, list[Int[Array, " n"]]]:
     return [x - c for x, c in zip(position, cell, strict=True)], cell
 
 
-def _leave(rays: March, cell: list[Int[Array, " n"]], reach) -> Float[Array, " n"]:
-    """t at which rays leave the cube of cells within a Chebyshev distance `reach` of the cell."""
-    sides = [c + jnp.where(d > 0, reach + 1, -reach) for c, d in zip(cell, rays.du, strict=True)]
+def _leave(rays: March, cell: list[Int[Array, " n"]], cells) -> Float[Array, " n"]:
+    """t at which rays leave the cube of cells within a Chebyshev distance `cells` of the cell."""
+    sides = [c + jnp.where(d > 0, cells + 1, -cells) for c, d in zip(cell, rays.du, strict=True)]
     return _smallest([(side - x) / d for side, x, d in zip(sides, rays.u, rays.du, strict=True)])
 
 

@@ -57,7 +57,7 @@ class GradientSearch(Search):
         turned: bool = True,
     ):
         self.ascent = Ascent(_pose_space(dof, space), num_starts, iterations, learning_rate, solver)
-        of_space = SpaceCandidates(space=self.ascent.space, number=num_candidates)
+        of_space = SpaceCandidates(space=self.ascent.space, num_poses=num_candidates)
         self.candidates = of_space if candidates is None else as_candidates(candidates)
         self.turned = turned
         require(
@@ -105,14 +105,14 @@ class SpaceCandidates(NumberedCandidates):
     """
 
     space: PoseSpace
-    number: int = eqx.field(static=True)
+    num_poses: int = eqx.field(static=True)
 
     def __check_init__(self):
         check_fields(self)
-        require(self.number >= 1, f"the search has {self.number} candidates; it needs at least one")
+        require(self.num_poses >= 1, f"the search has {self.num_poses} candidates; it needs at least one")
 
     def poses(self, key: PRNGKeyArray | None = None) -> Pose:
-        return self.space.candidates(self.number, key)
+        return self.space.candidates(self.num_poses, key)
 
 
 def _pose_space(dof: int | None, space: PoseSpace | None) -> PoseSpace:

@@ -19,19 +19,21 @@ class HalvingSearch(CandidateSearch):
     """Successive halving over the candidates of a `DiscreteSearch` (Karnin et al. 2013), for slow acquisitions.
 
     All candidates are scored on the first few posterior samples; the better half on as many again, the better half of
-    these on twice as many, and so on to all S: with 16 samples and `first_samples` 2, 5 scores a candidate in place of
-    16. Samples are the same for all candidates (common random numbers), so what is compared are differences between
+    these on twice as many, and so on to all S: with 16 samples and `num_first_samples` 2, 5 scores a candidate in place
+    of 16. Samples are the same for all candidates (common random numbers), so what is compared are differences between
     poses on the same surfaces. The view is not always that of the full search.
 
-    - `first_samples`: posterior samples on which every candidate is scored.
+    - `num_first_samples`: posterior samples on which every candidate is scored.
     """
 
-    first_samples: int = eqx.field(static=True, default=2)
+    num_first_samples: int = eqx.field(static=True, default=2)
     uses_samples: ClassVar[bool] = True
 
     def __check_init__(self):
         check_fields(self)
-        require(self.first_samples >= 1, f"first_samples is {self.first_samples}; candidates need at least one")
+        require(
+            self.num_first_samples >= 1, f"num_first_samples is {self.num_first_samples}; candidates need at least one"
+        )
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """As `pick`, but candidates are scored only for as long as they are left."""
@@ -60,7 +62,7 @@ class HalvingSearch(CandidateSearch):
         while scored < problem.num_samples:
             if scored:
                 left = left[jax.lax.top_k(values[left], max(1, len(left) // 2))[1]]
-            more = min(max(scored, self.first_samples), problem.num_samples - scored)
+            more = min(max(scored, self.num_first_samples), problem.num_samples - scored)
             means = means_of(left, slice(scored, scored + more))
             totals, scored = totals.at[left].add(more * means), scored + more
             values = values.at[left].set(jnp.where(is_closed[left], -jnp.inf, totals[left] / scored))

@@ -45,7 +45,7 @@ class OutsideBoundary(ValueSource):
     reconstruction, Kazhdan et al. 2020, as an observation).
 
     - `volume`: see `jaxnbv.geometry.volume`; by default the box that scenes are scaled to.
-    - `count`: points, spread evenly as seen from the origin.
+    - `num_points`: points, spread evenly as seen from the origin.
     - `value`, `noise`: mean and standard deviation, in units of h.
 
     **Raises:** `ValueError` for a count below one, noise that is not positive, or a boundary that leaves the scene,
@@ -53,18 +53,18 @@ class OutsideBoundary(ValueSource):
     """
 
     volume: Volume = Box()
-    count: int = eqx.field(static=True, default=150)
+    num_points: int = eqx.field(static=True, default=150)
     value: float = eqx.field(static=True, default=1.0)
     noise: float = eqx.field(static=True, default=0.5)
 
     def __check_init__(self):
         check_fields(self)
-        _check(self.count, self.noise)
+        _check(self.num_points, self.noise)
         if is_traced(self.volume):
             return
         with jax.ensure_compile_time_eval():
             try:
-                farthest = float(jnp.abs(boundary_points(self.volume, self.count)).max())
+                farthest = float(jnp.abs(boundary_points(self.volume, self.num_points)).max())
                 middle = float(self.volume(jnp.zeros((1, 3)))[0])
             except Exception as error:
                 raise InputError(
@@ -80,29 +80,29 @@ class OutsideBoundary(ValueSource):
 
     def rows(self, evidence: Evidence) -> ValueRows:
         """One row a point of the boundary."""
-        points = boundary_points(self.volume, self.count).astype(evidence.cloud.points.dtype)
-        return _rows(points, self.value, self.noise, jnp.ones(self.count, bool))
+        points = boundary_points(self.volume, self.num_points).astype(evidence.cloud.points.dtype)
+        return _rows(points, self.value, self.noise, jnp.ones(self.num_points, bool))
 
 
 class OnSurface(ValueSource):
     """f(x_j) - c ~ N(0, s_f^2) at some of the data, farthest points (the "screening" of Kazhdan and Hoppe 2013).
 
-    - `count`: how many, or all where there are fewer.
+    - `num_points`: how many, or all where there are fewer.
     - `noise`: standard deviation s_f, in units of h.
 
     **Raises:** `ValueError` for a count below one or noise that is not positive.
     """
 
-    count: int = eqx.field(static=True, default=100)
+    num_points: int = eqx.field(static=True, default=100)
     noise: float = eqx.field(static=True, default=0.1)
 
     def __check_init__(self):
         check_fields(self)
-        _check(self.count, self.noise)
+        _check(self.num_points, self.noise)
 
     def rows(self, evidence: Evidence) -> ValueRows:
         """One row a point."""
-        chosen = farthest_point_subsample(evidence.cloud, self.count)
+        chosen = farthest_point_subsample(evidence.cloud, self.num_points)
         return _rows(chosen.points, 0.0, self.noise, chosen.mask)
 
 
@@ -111,25 +111,25 @@ class Thickness(ValueSource):
     scanned are thicker than a sheet.
 
     - `depth`: behind the point, in scene units.
-    - `count`: how many, or all where there are fewer; farthest points.
+    - `num_points`: how many, or all where there are fewer; farthest points.
     - `value`, `noise`: mean and standard deviation, in units of h.
 
     **Raises:** `ValueError` for a count below one, or a noise or depth that is not positive.
     """
 
     depth: float = eqx.field(static=True, default=0.15)
-    count: int = eqx.field(static=True, default=100)
+    num_points: int = eqx.field(static=True, default=100)
     value: float = eqx.field(static=True, default=-1.0)
     noise: float = eqx.field(static=True, default=1.0)
 
     def __check_init__(self):
         check_fields(self)
-        _check(self.count, self.noise)
+        _check(self.num_points, self.noise)
         require(self.depth > 0, f"the depth of the thickness is {self.depth}; it must be positive")
 
     def rows(self, evidence: Evidence) -> ValueRows:
         """One row a point."""
-        chosen = farthest_point_subsample(evidence.cloud, self.count)
+        chosen = farthest_point_subsample(evidence.cloud, self.num_points)
         behind = chosen.points - self.depth * chosen.normals
         mask = chosen.mask & jnp.all(jnp.abs(behind) <= HALF_WIDTH, axis=1)
         return _rows(jnp.where(mask[:, None], behind, 0.0), self.value, self.noise, mask)
@@ -140,26 +140,26 @@ class SeenEmpty(ValueSource):
     is likely to be empty too. Right of thin things such as furniture, wrong of a body whose hidden side is as large as
     the one that was seen. Of use with a long lengthscale, and with a boundary that holds the far field up.
 
-    - `count`: how many, or all where there are fewer; farthest points.
+    - `num_points`: how many, or all where there are fewer; farthest points.
     - `value`, `noise`: mean and standard deviation, in units of h.
 
     **Raises:** `ValueError` for a count below one or noise that is not positive.
     """
 
-    count: int = eqx.field(static=True, default=150)
+    num_points: int = eqx.field(static=True, default=150)
     value: float = eqx.field(static=True, default=2.0)
     noise: float = eqx.field(static=True, default=1.0)
 
     def __check_init__(self):
         check_fields(self)
-        _check(self.count, self.noise)
+        _check(self.num_points, self.noise)
 
     def rows(self, evidence: Evidence) -> ValueRows:
         """One row a point."""
         empty, seen = evidence.empty_points
         mask = seen & jnp.all(jnp.abs(empty) <= HALF_WIDTH, axis=1)
-        index = farthest_point_indices(empty, mask, self.count)
-        kept = jnp.arange(self.count) < jnp.sum(mask)
+        index = farthest_point_indices(empty, mask, self.num_points)
+        kept = jnp.arange(self.num_points) < jnp.sum(mask)
         points = jnp.where(kept[:, None], empty[index], 0.0).astype(evidence.cloud.points.dtype)
         return _rows(points, self.value, self.noise, kept)
 
@@ -177,6 +177,6 @@ def _rows(points, value: float, noise: float, mask) -> ValueRows:
     return ValueRows(points, value * one, noise * one, mask)
 
 
-def _check(count: int, noise: float) -> None:
-    require(count >= 1, f"the number of values is {count}; it must be at least 1")
+def _check(num_points: int, noise: float) -> None:
+    require(num_points >= 1, f"the number of values is {num_points}; it must be at least 1")
     require(0 < noise < math.inf, f"the noise of the values is {noise}; it must be positive and finite")

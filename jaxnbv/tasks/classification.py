@@ -219,18 +219,20 @@ class Sure(Stop):
     may be sure by chance.
 
     - `probability`: within (0, 1).
-    - `resamplings`: how many halves are drawn.
+    - `num_resamplings`: how many halves are drawn.
 
     **Raises:** `ValueError` for another probability or a negative number; of an acquisition without a classifier.
     """
 
     probability: float = eqx.field(static=True, default=0.95)
-    resamplings: int = eqx.field(static=True, default=8)
+    num_resamplings: int = eqx.field(static=True, default=8)
 
     def __check_init__(self):
         check_fields(self)
         require(0 < self.probability < 1, f"the probability is {self.probability}; it must lie within (0, 1)")
-        require(self.resamplings >= 0, f"the number of resamplings is {self.resamplings}; it must not be negative")
+        require(
+            self.num_resamplings >= 0, f"the number of resamplings is {self.num_resamplings}; it must not be negative"
+        )
 
     def check(self, acquisition: Acquisition) -> None:
         known = hasattr(acquisition, "classifier") or hasattr(getattr(acquisition, "utility", None), "classifier")
@@ -245,7 +247,7 @@ class Sure(Stop):
         p = _class_probabilities(acquisition, cloud)
         best = int(np.argmax(p))
         least = float(p[best])
-        for index in range(self.resamplings):
+        for index in range(self.num_resamplings):
             if least < self.probability:
                 return None
             half = half_of(cloud, jax.random.fold_in(so_far.key, index))
@@ -254,7 +256,7 @@ class Sure(Stop):
             return None
         answer = acquisition.answer(cloud)
         name = f"class {best}" if answer is None else answer.names[best]
-        halves = f", {least:.2f} at least given a half of the points" if self.resamplings else ""
+        halves = f", {least:.2f} at least given a half of the points" if self.num_resamplings else ""
         return f"sure of {name}: {float(p[best]):.2f}{halves}"
 
 

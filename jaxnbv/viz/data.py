@@ -123,7 +123,7 @@ class ViewData(eqx.Module):
         return None if ascents is None or not ascents.is_spatial else ascents
 
     @property
-    def reach(self) -> float:
+    def extent(self) -> float:
         """Distance from the origin to the farthest camera of this view and its ascents."""
         ascents = self.spatial_ascents
         positions = [self.pose.position] if ascents is None else [self.pose.position, ascents.poses.position]

@@ -146,8 +146,8 @@ def _(episode: Episode) -> Drawing:
 def _draw_views(episode: Episode, axes: Axes) -> None:
     """The points, those of the last view told apart, and where the cameras stood."""
     poses = [view.pose for view in episode.views]
-    reach = max(1.8, *(float(np.linalg.norm(pose.position)) for pose in poses))
-    still = Still(beside(poses[-1]), None, 400, reach)
+    extent = max(1.8, *(float(np.linalg.norm(pose.position)) for pose in poses))
+    still = Still(beside(poses[-1]), None, 400, extent)
     shown = [
         draw_points(axes, still, episode.cloud.to_numpy()[0], BEFORE, 1.0),
         draw_points(axes, still, episode.views[-1].scan.to_numpy()[0], NEW, 1.0),

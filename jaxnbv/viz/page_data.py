@@ -53,7 +53,7 @@ def payload(data: ReportData, camera: Camera) -> dict:
         "views": [_view(view, camera, data, points, vertices) for view in data.views],
         "stage": {
             "eye": data.stage.eye.round(4).tolist(),
-            "reach": data.stage.reach,
+            "extent": data.stage.extent,
             "pull": data.stage.pull,
             "shrink": data.stage.depth / FRUSTUM_DEPTH,
         },

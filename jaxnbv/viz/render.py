@@ -52,9 +52,9 @@ def frustum(pose: Pose, camera: Camera, depth: float = FRUSTUM_DEPTH) -> Float[n
 class Still:
     """A perspective picture from one place, `size` pixels a side, in which all cameras of the scene have room."""
 
-    def __init__(self, eye: Float[np.ndarray, "3"], surface: MeanSurface | None, size: int, reach: float):
+    def __init__(self, eye: Float[np.ndarray, "3"], surface: MeanSurface | None, size: int, extent: float):
         self.size = size
-        self.camera = Camera(2.0 * math.atan(1.08 * reach / _DISTANCE), size, size)
+        self.camera = Camera(2.0 * math.atan(1.08 * extent / _DISTANCE), size, size)
         self.pose = look_at(_DISTANCE * eye / np.linalg.norm(eye))
         self.image = np.zeros((size, size, 4))
         self.depth = np.full((size, size), np.inf)
@@ -123,7 +123,7 @@ class Still:
 
 def painted(data: ReportData, index: int, deviation: LogNorm, size: int) -> Still:
     """A picture of the surface after view `index` (from 0), from where all are seen."""
-    still = Still(data.stage.eye, data.views[index].surface, size, data.stage.reach)
+    still = Still(data.stage.eye, data.views[index].surface, size, data.stage.extent)
     still.paint(deviation)
     return still
 

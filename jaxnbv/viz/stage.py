@@ -32,7 +32,7 @@ class Stage(eqx.Module):
     depth: float
 
     @property
-    def reach(self) -> float:
+    def extent(self) -> float:
         """Radius of what is drawn, numbers of cameras included."""
         return 1.1 * (_STAND * self.radius + self.depth)
 

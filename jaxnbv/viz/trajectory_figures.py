@@ -62,8 +62,8 @@ def trajectory_figure(data: ReportData, index: int, camera: Camera) -> Figure:
     axes = figure.add_axes((0.0, 0.13, 1.0, 0.79))
     positions = np.asarray(ascents.poses.position, dtype=np.float64)
     poses = [other.pose for other in data.views[: index + 1]]
-    reach = max(1.8, *(other.reach for other in data.views[: index + 1]))
-    still = Still(data.stage.eye, known.surface, 900, reach)
+    extent = max(1.8, *(other.extent for other in data.views[: index + 1]))
+    still = Still(data.stage.eye, known.surface, 900, extent)
     still.paint(None)
     axes.imshow(still.image, interpolation="bilinear", zorder=1)
     shown = [draw_points(axes, still, view.before, BEFORE, 0.7), still.surface_pixels]
@@ -76,7 +76,7 @@ def trajectory_figure(data: ReportData, index: int, camera: Camera) -> Figure:
         for edges, value, width in zip(frusta, values[steps], np.linspace(0.5, 1.3, len(steps)), strict=True):
             rows = np.tile(colours.to_rgba(value), (len(edges), 1))
             shown.append(draw_segments(axes, still, edges, rows, float(width)))
-    shown += draw_cameras(axes, still, poses, camera, 1.0, beyond=view.reach)
+    shown += draw_cameras(axes, still, poses, camera, 1.0, beyond=view.extent)
     frame(axes, still, shown)
     for label in axes.texts:
         label.set_path_effects([withStroke(linewidth=2.5, foreground="white")])

@@ -34,7 +34,7 @@ def test_millimetres_of_a_sensor_give_the_points_in_metres():
     """Integers, holes of zero, an off-centre camera with pixels that are not square."""
     depth = depth_of(BALL)
     image = np.where(np.isfinite(depth), np.round(1000.0 * depth), 0.0).astype(np.uint16)
-    cloud = PointCloud.from_depth(image, CAMERA, POSE, scale=1e-3)
+    cloud = PointCloud.from_depth(image, CAMERA, POSE, depth_scale=1e-3)
     points, normals = cloud.to_numpy()
     assert len(points) > 200
     outward = (points - [0.0, 0.0, 0.1]) / 0.1
@@ -82,7 +82,7 @@ def test_a_box_keeps_the_object_and_knows_what_was_crossed():
 
 
 def test_beyond_its_range_a_sensor_met_nothing_and_before_it_says_nothing():
-    limited = Camera.from_intrinsics(CAMERA.intrinsics, 64, 48, nearest=0.72, farthest=0.9)
+    limited = Camera.from_intrinsics(CAMERA.intrinsics, 48, 64, nearest=0.72, farthest=0.9)
     depth = depth_of(BALL, TABLE)
     cloud = PointCloud.from_depth(depth, limited, POSE)
     flat = depth.reshape(-1)
@@ -93,7 +93,7 @@ def test_beyond_its_range_a_sensor_met_nothing_and_before_it_says_nothing():
 
 def test_what_cannot_be_meant_is_named():
     depth = depth_of(BALL, TABLE)
-    ranged = Camera.from_intrinsics(CAMERA.intrinsics, 64, 48, nearest=0.1, farthest=3.0)
+    ranged = Camera.from_intrinsics(CAMERA.intrinsics, 48, 64, nearest=0.1, farthest=3.0)
     turned = Pose.from_matrix(POSE.matrix, "opengl")
     for image, camera, pose, options, message in (
         (1000.0 * depth, ranged, POSE, {}, r"out of the camera's range of 0\.1 to 3: give the depth's scale, 0\.001"),

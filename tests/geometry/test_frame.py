@@ -90,7 +90,7 @@ def test_what_a_sensor_sees_in_the_world_is_what_it_sees_in_the_scene(up):
     depth = depth.reshape(12, 14)
     world = frame.to_scene(PointCloud.from_depth(depth, camera, pose, box=box))
     moved = frame.to_scene(camera), frame.to_scene(pose)
-    scene = PointCloud.from_depth(depth, *moved, scale=0.01, box=frame.to_scene(box))
+    scene = PointCloud.from_depth(depth, *moved, depth_scale=0.01, box=frame.to_scene(box))
     assert int(scene.count) > 20
     np.testing.assert_array_equal(world.mask, scene.mask)
     np.testing.assert_array_equal(world.missed, scene.missed)

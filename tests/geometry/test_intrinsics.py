@@ -25,7 +25,7 @@ matrices = st.tuples(sizes, sizes, lengths, lengths, shares, shares)
 def camera_and_matrix(given):
     width, height, fx, fy, x, y = given
     matrix = np.array([[fx, 0.0, x * width - 0.5], [0.0, fy, y * height - 0.5], [0.0, 0.0, 1.0]])
-    return Camera.from_intrinsics(matrix, width, height), matrix
+    return Camera.from_intrinsics(matrix, height, width), matrix
 
 
 @settings(max_examples=50, deadline=None)
@@ -92,7 +92,7 @@ def test_a_focal_length_alone():
 )
 def test_matrices_that_are_none_of_this_image_are_refused(matrix, message):
     with pytest.raises(InputError, match=message):
-        Camera.from_intrinsics(np.array(matrix), 60, 40)
+        Camera.from_intrinsics(np.array(matrix), 40, 60)
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_what_a_limited_sensor_missed_is_empty_as_far_as_it_reaches():
     grid, pose = Grid(24), look_at((0.0, 0.0, 2.5))
     nothing = SDFSurface(Sphere(0.01).translate([0.0, 1.4, 0.0]))
     seen = {
-        farthest: np.asarray(Carving().seen_empty(grid, scan(nothing, camera, pose), camera, pose))
+        farthest: np.asarray(Carving().seen_empty(grid, pose, scan(nothing, camera, pose), camera))
         for farthest, camera in ((far, Camera(0.9, 48, 48, farthest=far)) for far in (2.5, None))
     }
     deep = 2.5 - grid.axis

@@ -126,7 +126,7 @@ def test_a_second_batch_compiles_nothing(compilations):
         (ValueMinusCost(lambda a, b: arc_length(a, b) + rotation_angle(a, b), weight=1.0), None),
     ],
 )
-@pytest.mark.parametrize("search", [DiscreteSearch(12), HalvingSearch(12, first_samples=3), UncertaintyView(12)])
+@pytest.mark.parametrize("search", [DiscreteSearch(12), HalvingSearch(12, num_first_samples=3), UncertaintyView(12)])
 def test_values_are_weighed_against_the_way_from_the_last_view(cost, worth, search):
     plain, weighed = planner_of(search), planner_of(search, cost=cost)
     evidence = evidence_of(plain)

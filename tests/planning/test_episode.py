@@ -165,5 +165,5 @@ def test_more_views_than_there_is_room_for_are_refused():
 
 def test_a_first_view_that_sees_nothing_is_refused():
     away = Pose(np.eye(3, dtype=np.float32), np.array([0.0, 0.0, 2.5], np.float32))
-    with pytest.raises(ValueError, match="the scan is empty: no point to start from"):
+    with pytest.raises(ValueError, match="the first scan is empty: no point to start from"):
         simulate(PLANNER, SCENE, away, 2, KEY, progress=False)

@@ -8,7 +8,7 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from test_session import BOX, CAMERA, FIRST, POSES, planner_of, session_of, shot
+from small_session import BOX, CAMERA, FIRST, POSES, planner_of, session_of, shot
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 

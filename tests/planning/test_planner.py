@@ -132,7 +132,7 @@ def cloud_at(*points):
 
 def test_an_empty_first_scan_is_refused(planner):
     empty = PointCloud(jnp.zeros((4, 3)), jnp.zeros((4, 3)), jnp.zeros(4, bool))
-    with pytest.raises(ValueError, match=r"the scan is empty: no point to start from.*[Pp]oint the camera"):
+    with pytest.raises(ValueError, match=r"the first scan is empty: no point to start from.*[Pp]oint the camera"):
         planner.init(FIRST, empty)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from commands import run_command
-from test_session import BOX, CAMERA, FIRST, planner_of, session_of, shot
+from small_session import BOX, CAMERA, FIRST, planner_of, session_of, shot
 
 from jaxnbv.checks import InputError
 from jaxnbv.planning.replay import StoredSession

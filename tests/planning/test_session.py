@@ -1,59 +1,25 @@
-"""A live session: a simulated sensor of 64 x 48 pixels in millimetres, a world in metres with z up, a table in view."""
+"""A live session at a simulated sensor."""
 
 import jax
 import numpy as np
 import pytest
+from small_session import BOX, CAMERA, FIRST, POSES, WORLD, around, planner_of, session_of, shot
 
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
-from jaxnbv.geometry.pose import Pose, look_at
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import view_keys
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.session import Session
 from jaxnbv.planning.stopping import Budget, ValueBelow
-from jaxnbv.scanning import Carving, Grid, SDFSurface, scan
-from jaxnbv.scanning.sdf import Cuboid, Sphere
+from jaxnbv.scanning import Carving, Grid, scan
 from jaxnbv.search import DiscreteSearch, FarthestView, GradientSearch
 from jaxnbv.surfaces import GeometricSPSR, OutsideBoundary, ScreenedSPSR
 from jaxnbv.tasks import Coverage
 from jaxnbv.viz import write_report
-
-CENTER = np.array([0.3, 0.2, 0.12])
-WORLD = SDFSurface(Sphere(0.1).translate([0.3, 0.2, 0.101]) | Cuboid([1.0, 1.0, 0.02]).translate([0.3, 0.2, -0.021]))
-CAMERA = Camera.from_intrinsics([[90.0, 0.0, 34.0], [0.0, 95.0, 21.5], [0.0, 0.0, 1.0]], width=64, height=48)
-BOX = ((0.18, 0.08, 0.002), (0.42, 0.32, 0.24))
-
-
-def around(angle, elevation, distance=0.6):
-    direction = [np.cos(angle) * np.cos(elevation), np.sin(angle) * np.cos(elevation), np.sin(elevation)]
-    return np.asarray(look_at(CENTER + distance * np.array(direction), CENTER, up=(0.0, 0.0, 1.0)).matrix, np.float64)
-
-
-POSES = np.array([around(angle, e) for e in (0.4, 0.9) for angle in np.arange(0.0, 6.2, np.pi / 3)])
-FIRST = around(0.2, 0.5)
-
-
-def shot(matrix, unit=1000.0):
-    """What the sensor gives: whole millimetres, zero where nothing is hit."""
-    pose = Pose.from_matrix(matrix)
-    seen = scan(WORLD, CAMERA, pose)
-    depth = (np.asarray(seen.points, np.float64) - np.asarray(pose.position)) @ np.asarray(pose.forward, np.float64)
-    image = np.where(seen.mask, unit * depth, 0.0).reshape(48, 64)
-    return np.round(image).astype(np.uint16) if unit > 1 else image
-
-
-def planner_of(search=DiscreteSearch(), num_samples=3, capacity=400):  # noqa: B008
-    imagination = Imagination(GeometricSPSR(0.2, truncation=8), Grid(28), num_samples)
-    return Planner(Coverage(), search, Camera(height=12, width=16), imagination, capacity=capacity, max_views=8)
-
-
-def session_of(folder=None, **changes):
-    settings = {"camera": CAMERA, "box": BOX, "up": "z", "poses": POSES, "folder": folder, **changes}
-    return Session(settings.pop("planner", None) or planner_of(), **settings)
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +44,7 @@ def test_it_asks_and_tells_as_a_planner_in_the_scene_does(finished):
     evidence, matrix = None, FIRST
     for index in range(3):
         pose = Pose.from_matrix(matrix)
-        cloud = PointCloud.from_depth(shot(matrix), CAMERA, pose, scale=1e-3, box=box)
+        cloud = PointCloud.from_depth(shot(matrix), CAMERA, pose, depth_scale=1e-3, box=box)
         told = (frame.to_scene(pose), frame.to_scene(cloud), frame.to_scene(CAMERA))
         evidence = planner.init(*told) if evidence is None else planner.observe(evidence, *told)
         sample_key, search_key, _ = view_keys(jax.random.key(0), index + 1)
@@ -172,7 +138,7 @@ def test_a_rig_of_two_cameras_is_one_session(tmp_path):
     before = session.cloud.to_numpy()[0]
     session.add(image, matrix, depth_scale=1e-3, camera=1)
     points = session.cloud.to_numpy()[0]
-    alone = PointCloud.from_depth(image, other, pose, scale=1e-3, box=Box(*BOX)).to_numpy()[0]
+    alone = PointCloud.from_depth(image, other, pose, depth_scale=1e-3, box=Box(*BOX)).to_numpy()[0]
     np.testing.assert_allclose(points[len(before) :], alone, atol=1e-6)
     again = session_of(tmp_path, camera=(CAMERA, other), planner=planner_of(capacity=2000))
     np.testing.assert_array_equal(again.cloud.points, session.cloud.points)
@@ -190,7 +156,7 @@ def test_a_rig_of_two_cameras_is_one_session(tmp_path):
         ({"depth_scale": 1.0}, "give the depth's scale, 0.001 for millimetres"),
         ({"matrix": FIRST @ np.diag([-1.0, 1.0, -1.0, 1.0])}, "the box .* lies behind the camera"),
         ({"depth": np.ones((5, 5))}, r"the depth image is \(5, 5\) but the camera has \(48, 64\)"),
-        ({"depth": np.zeros((48, 64))}, "the scan is empty: no point to start from"),
+        ({"depth": np.zeros((48, 64))}, "the first scan is empty: no point to start from"),
     ],
 )
 def test_a_wrong_image_is_named_and_changes_nothing(given, message, tmp_path):
@@ -212,7 +178,7 @@ def test_an_image_beside_the_box_is_warned_of():
         pytest.warns(
             UserWarning, match=r"none of the \d+ points .* lies in the box .* Is the pose from camera to world"
         ),
-        pytest.raises(InputError, match="the scan is empty: no point to start from"),
+        pytest.raises(InputError, match="the first scan is empty: no point to start from"),
     ):
         session.add(shot(FIRST), inverse, depth_scale=1e-3)
 
@@ -240,7 +206,9 @@ def test_the_box_is_the_volume_of_the_model_and_of_the_carving():
     """What was given another volume keeps it."""
     own = Box.cube(2.0)
     imagination = Imagination(ScreenedSPSR(values=(OutsideBoundary(), OutsideBoundary(own))))
-    fitted = session_of(planner=Planner(Coverage(), camera=Camera(height=12, width=16), imagination=imagination)).planner
+    fitted = session_of(
+        planner=Planner(Coverage(), camera=Camera(height=12, width=16), imagination=imagination)
+    ).planner
     scene = Frame.fit(np.array(BOX), up="z").to_scene(Box(*BOX))
     assert fitted.imagination.carving.volume == scene
     assert fitted.imagination.model.values[0].volume == scene

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_session import BOX, FIRST, POSES, session_of, shot
+from small_session import BOX, FIRST, POSES, session_of, shot
 
 from jaxnbv.checks import InputError
 

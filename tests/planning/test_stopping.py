@@ -184,7 +184,7 @@ def test_a_view_of_too_little_value_is_not_taken():
     ("make", "message"),
     [
         (lambda: Sure(1.0), "probability is 1.0; it must lie within"),
-        (lambda: Sure(resamplings=-1), "number of resamplings is -1"),
+        (lambda: Sure(num_resamplings=-1), "number of resamplings is -1"),
         (lambda: Found(0), "a part is found by 0 points"),
         (lambda: Covered(1.5), "share is 1.5"),
         (lambda: Covered(radius=0.0), "radius is 0.0"),

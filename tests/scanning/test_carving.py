@@ -1,6 +1,7 @@
-"""The planner and what was seen to be empty: carved samples, what the model is told, refused scans and states."""
+"""The planner and what was seen to be empty: carved samples, what the model is told, refused scans and evidence."""
 
-import equinox as eqx
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +17,7 @@ from jaxnbv.imagination import Imagination
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import (
     Carving,
+    Evidence,
     Grid,
     GridSurface,
     SDFSurface,
@@ -58,7 +60,7 @@ class WavesPosterior(SurfacePosterior):
 
 
 class WavesModel(SurfaceModel):
-    def condition(self, cloud):
+    def condition(self, evidence):
         return WavesPosterior(level=jnp.asarray(0.1))
 
 
@@ -66,15 +68,8 @@ CARVING, WAVES = Carving(), WavesModel()
 
 
 def planner_of(carving=CARVING, model=WAVES):
-    camera, search = Camera(height=40, width=40), FarthestView(12)
-    return Planner(
-        Coverage(),
-        search,
-        camera,
-        Imagination(model, grid=SMALL_GRID, num_samples=3, carving=carving),
-        capacity=400,
-        max_views=4,
-    )
+    imagination = Imagination(model, SMALL_GRID, 3, carving)
+    return Planner(Coverage(), FarthestView(12), Camera(height=40, width=40), imagination, capacity=400, max_views=4)
 
 
 def after_both_sides(planner, surface, poses=POSES):
@@ -84,8 +79,8 @@ def after_both_sides(planner, surface, poses=POSES):
 
 def test_no_sample_is_inside_what_was_seen_empty_nor_outside_the_volume():
     planner, raw = planner_of(), planner_of(carving=None)
-    evidence, raw_state = (after_both_sides(one, SOLIDS["ball"]) for one in (planner, raw))
-    assert raw_state.seen_empty is None
+    evidence, raw_evidence = (after_both_sides(one, SOLIDS["ball"]) for one in (planner, raw))
+    assert raw_evidence.seen_empty is None
     expected = np.zeros((30,) * 3, bool)
     for pose in POSES:
         seen = SEE(CARVING, SMALL_GRID, scan(SOLIDS["ball"], planner.camera, pose), planner.camera, pose)
@@ -94,7 +89,7 @@ def test_no_sample_is_inside_what_was_seen_empty_nor_outside_the_volume():
     np.testing.assert_array_equal(evidence.seen_empty, expected)
 
     carved = np.asarray(planner.imagination.sample(evidence, jax.random.key(1)).values)
-    values = np.asarray(raw.sample_surfaces(raw_state, jax.random.key(1)).values)
+    values = np.asarray(raw.imagination.sample(raw_evidence, jax.random.key(1)).values)
     outside = (np.linalg.norm(np.maximum(np.abs(nodes_of(SMALL_GRID)) - 1.25, 0.0), axis=-1)) > 2 * SMALL_GRID.spacing
     nowhere = expected | outside
     assert (outside & ~expected).any()
@@ -109,7 +104,8 @@ def test_no_sample_is_inside_what_was_seen_empty_nor_outside_the_volume():
 class Told(WavesModel):
     """Is told of space seen empty: its level says of how many points, and how far the farthest is out of the volume."""
 
-    def condition_on_space(self, cloud, empty):
+    def condition(self, evidence):
+        empty = Evidence.of(evidence).empty_points
         outermost = jnp.max(jnp.where(empty.mask, jnp.max(jnp.abs(empty.points), axis=1), 0.0))
         return WavesPosterior(level=1000.0 * jnp.sum(empty.mask) + outermost)
 
@@ -117,7 +113,8 @@ class Told(WavesModel):
 def test_the_model_is_told_of_what_was_seen_empty_within_the_volume():
     told, waves = planner_of(model=Told()), planner_of(carving=None)
     evidence = after_both_sides(told, SOLIDS["ball"])
-    empty = CARVING.empty_points(SMALL_GRID, evidence.seen_empty)
+    within = evidence.seen_empty & CARVING.inside(SMALL_GRID)
+    empty = dataclasses.replace(evidence, seen_empty=within).empty_points
     points = np.asarray(empty.points)[np.asarray(empty.mask)]
     assert 50 < len(points) <= 20**3
     index = np.rint((points + SMALL_GRID.half_extent) / SMALL_GRID.spacing).astype(int)
@@ -126,32 +123,32 @@ def test_the_model_is_told_of_what_was_seen_empty_within_the_volume():
     key = jax.random.key(0)
     raw = waves.imagination.model.condition(evidence.cloud).sample(key, 3).on_grid(SMALL_GRID.axis)
     untouched = ~np.asarray(evidence.seen_empty | CARVING.outside(SMALL_GRID))
-    level = float((np.asarray(raw) - np.asarray(told.sample_surfaces(evidence, key).values))[:, untouched].mean())
+    level = float((np.asarray(raw) - np.asarray(told.imagination.sample(evidence, key).values))[:, untouched].mean())
     np.testing.assert_allclose(level, 1000.0 * len(points) + np.abs(points).max(), rtol=1e-4)
 
 
 def test_without_carving_samples_are_the_models_own():
     raw = planner_of(carving=None)
     evidence = after_both_sides(raw, SOLIDS["ball"])
-    posterior = raw.model.condition(evidence.cloud)
+    posterior = raw.imagination.model.condition(evidence.cloud)
     own = posterior.sample(jax.random.key(2), 3).on_grid(SMALL_GRID.axis) - posterior.level
-    np.testing.assert_allclose(
-        raw.sample_surfaces(evidence, jax.random.key(2)).values, own, atol=1e-4 * np.abs(own).max()
-    )
+    found = raw.imagination.sample(evidence, jax.random.key(2)).values
+    np.testing.assert_allclose(found, own, atol=1e-4 * np.abs(own).max())
 
 
-def test_a_state_of_another_kind_of_planner_is_refused():
+def test_evidence_of_another_kind_of_planner_is_refused():
     planner, raw = planner_of(), planner_of(carving=None)
-    finer = eqx.tree_at(lambda p: p.grid, planner, Grid(31), is_leaf=lambda x: isinstance(x, Grid))
+    finer = dataclasses.replace(planner, imagination=dataclasses.replace(planner.imagination, grid=Grid(31)))
     scans = scan(SOLIDS["ball"], raw.camera, POSES[0])
     for made_by, used_by in ((raw, planner), (planner, finer)):
         evidence = made_by.init(POSES[0], scans)
         for use in (
-            lambda p, s: p.observe(s, POSES[0], scans),
-            lambda p, s: p.sample_surfaces(s, jax.random.key(0)),
-            lambda p, s: p.posterior(s),
+            lambda p, e: p.observe(e, POSES[0], scans),
+            lambda p, e: p.propose(e, jax.random.key(0)),
+            lambda p, e: p.imagination.sample(e, jax.random.key(0)),
+            lambda p, e: p.imagination.posterior(e),
         ):
-            with pytest.raises(ValueError, match="make the evidence with this planner"):
+            with pytest.raises(ValueError, match="make it with the init of the planner that it is given to"):
                 use(used_by, evidence)
 
 
@@ -189,7 +186,7 @@ def test_carved_samples_keep_a_thin_sheet_that_was_seen_from_both_sides():
     planner, raw = (planner_of(carving, model=model) for carving in (Carving(), None))
     sheet = SDFSurface(Cuboid([0.6, 0.6, 0.04]))
     evidence = after_both_sides(planner, sheet, ABOVE_AND_BELOW)
-    values = raw.sample_surfaces(evidence, jax.random.key(1)).values
+    values = raw.imagination.sample(evidence, jax.random.key(1)).values
     carved = carve(values, evidence.seen_empty | planner.imagination.carving.outside(SMALL_GRID))
     narrow, poses = Camera(height=10, width=10, fov=0.35), look_at(jnp.asarray([[0.0, 0.0, 2.5], [0.0, 0.0, -2.5]]))
     surfaces = GridSurface.from_values(jnp.concatenate([values, carved]), 0.0, SMALL_GRID)
@@ -208,7 +205,7 @@ def test_a_scan_of_another_camera_needs_that_camera():
     # Wider than the planner's own image.
     assert np.ptp(column) > 25
     assert np.ptp(row) > 10
-    np.testing.assert_array_equal(planner.init(seen, pose, camera=other).seen_empty, expected)
+    np.testing.assert_array_equal(planner.init(pose, seen, camera=other).seen_empty, expected)
     evidence = planner.init(POSES[0], scan(SOLIDS["ball"], planner.camera, POSES[0]))
     after = planner.observe(evidence, pose, seen, camera=other)
     np.testing.assert_array_equal(after.seen_empty, expected | np.asarray(evidence.seen_empty))

@@ -62,7 +62,7 @@ def pixel(node, camera, pose):
 @pytest.mark.parametrize(("name", "slack"), [("ball", 0.15), ("box", 1.5)])
 def test_a_marked_node_has_a_free_ball_about_it_and_well_inside_free_space_nodes_are_marked(name, slack, margin):
     """But for what is smaller than a pixel: the solid's outline between pixel centres, where only a box has corners."""
-    marked = np.asarray(SEE(Carving(margin=margin), GRID, scan(SOLIDS[name], CAMERA, POSE), CAMERA, POSE))
+    marked = np.asarray(SEE(Carving(margin_voxels=margin), GRID, POSE, scan(SOLIDS[name], CAMERA, POSE), CAMERA))
     nodes = nodes_of(GRID)
     some = RNG.choice(np.flatnonzero(marked), 1000)
     node = nodes.reshape(-1, 3)[some]
@@ -93,7 +93,7 @@ def test_a_node_is_marked_only_if_all_rays_near_it_and_their_neighbours_went_on_
     points = np.asarray(pose.to_scene(jnp.asarray(np.where(hit, depth.ravel(), 0.0)[:, None] * rays, jnp.float32)))
     points = jnp.where(hit[:, None], points, 0.0)
     cloud = PointCloud(points, jnp.zeros_like(points), jnp.asarray(hit), jnp.asarray(np.isinf(depth.ravel())))
-    marked = np.asarray(Carving(margin=margin / grid.spacing).seen_empty(grid, cloud, camera, pose)).ravel()
+    marked = np.asarray(Carving(margin_voxels=margin / grid.spacing).seen_empty(grid, pose, cloud, camera)).ravel()
 
     local = in_camera(nodes_of(grid).reshape(-1, 3), pose)
     unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
@@ -138,7 +138,7 @@ def marked_and_inside(centre, radius, half, axis, angle, start, end, direction, 
     solid = Cuboid(half).rotate(axis, angle).translate(centre) | Capsule(start, end, radius)
     pose = look_at(target + distance * direction, target)
     seen = SensorNoise()(scan(SDFSurface(solid), PLAIN, pose), key)
-    empty, inside = Carving().seen_empty(FINE, seen, PLAIN, pose), solid(FINE_NODES) < 0
+    empty, inside = Carving().seen_empty(FINE, pose, seen, PLAIN), solid(FINE_NODES) < 0
     return jnp.sum(empty), jnp.sum(inside), jnp.sum(empty & inside)
 
 
@@ -239,4 +239,4 @@ def test_carved_values_are_positive_where_empty_and_twice_the_largest_about():
 def test_a_margin_below_half_a_voxel_or_not_finite_is_refused(margin):
     refused = rf"margin of the carving is {margin} voxels.*at least 0\.5|margin is {margin}; it must be a finite number"
     with pytest.raises(ValueError, match=refused):
-        Carving(margin=margin)
+        Carving(margin_voxels=margin)

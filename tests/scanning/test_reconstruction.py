@@ -6,17 +6,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxnbv.scanning.reconstruction import has_poisson, mean_mesh, screened_poisson
 from jaxtyping import Array, Float
 
 import jaxnbv as nbv
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.pose import fibonacci_sphere
+from jaxnbv.scanning.screened_poisson import has_poisson, screened_poisson
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.surfaces import SurfaceModel, SurfacePosterior
 
 RADIUS = 0.9
 MODEL = nbv.GeometricSPSR(lengthscale=0.05, truncation=10)
+
+
+def mean_mesh(model, cloud, grid):
+    return nbv.Imagination(model, grid, carving=None).mean_mesh(cloud)
 
 
 def sphere_cloud(count=600, capacity=700):
@@ -56,9 +60,9 @@ def test_vertices_lie_where_the_posterior_mean_equals_its_level():
 
 
 class Balls(SurfaceModel):
-    """A model of its own, without a mean field: whatever the cloud, two balls, of which one holds no data."""
+    """A model of its own, with a mean in closed form: whatever the cloud, two balls, of which one holds no data."""
 
-    def condition(self, cloud: nbv.PointCloud) -> "BallsPosterior":
+    def condition(self, evidence):
         return BallsPosterior()
 
 
@@ -70,6 +74,9 @@ class BallsPosterior(SurfacePosterior):
 
     def sample(self, key, num_samples):
         pytest.fail("the mesh of the mean needs no samples")
+
+    def drawn(self, num_samples=64):
+        return self
 
     def mean(self, x):
         away = jnp.linalg.norm(x - jnp.array([-0.6, 0.0, 0.0]), axis=-1) - 0.5
@@ -90,15 +97,9 @@ def test_what_was_seen_empty_is_not_meshed():
     camera, pose = nbv.Camera(fov=1.3, height=60, width=60), nbv.look_at((0.0, 0.0, 2.5))
 
     def mesh(carving):
-        search = nbv.FarthestView(nbv.SphereCandidates(8))
-        planner = nbv.Planner(
-            nbv.Coverage(),
-            search,
-            camera,
-            nbv.Imagination(Balls(), grid=nbv.Grid(30), num_samples=1, carving=carving),
-            capacity=4000,
-        )
-        return planner.imagination.mean_mesh(planner.init(pose, nbv.scan(seen, camera, pose)))
+        imagination = nbv.Imagination(Balls(), nbv.Grid(30), num_samples=1, carving=carving)
+        planner = nbv.Planner(nbv.Coverage(), nbv.FarthestView(8), camera, imagination, capacity=4000)
+        return imagination.mean_mesh(planner.init(pose, nbv.scan(seen, camera, pose)))
 
     (ball,) = mesh(nbv.Carving()).to_trimesh().split()
     np.testing.assert_allclose(np.linalg.norm(ball.vertices - [-0.6, 0.0, 0.0], axis=1), 0.5, atol=0.03)

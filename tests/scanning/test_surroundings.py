@@ -12,6 +12,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import look_at
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import simulate
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Carving, Grid, SDFSurface, SensorNoise, TriangleMesh, scan
@@ -115,7 +116,7 @@ def test_space_is_seen_empty_up_to_an_obstacle():
     nothing = scan(SDFSurface(Sphere(0.01).translate([0.0, 5.0, 0.0])), CAMERA, pose)
     wall = Surroundings((Cuboid([0.1, 2.0, 2.0]).translate([0.5, 0.0, 0.0]),))
     barrier = wall.barrier(CAMERA, pose)
-    free, known = (np.asarray(carving.seen_empty(grid, nothing, CAMERA, pose, b)) for b in (None, barrier))
+    free, known = (np.asarray(carving.seen_empty(grid, pose, nothing, CAMERA, b)) for b in (None, barrier))
     x = np.asarray(grid.axis)
     middle = 20
     assert free[(x > 0.6) & (x < 1.2), middle, middle].all()
@@ -123,10 +124,9 @@ def test_space_is_seen_empty_up_to_an_obstacle():
     np.testing.assert_array_equal(known[x < 0.4 - 2.5 * grid.spacing], free[x < 0.4 - 2.5 * grid.spacing])
 
 
-def planner_of(search, surroundings=None, **changes):
-    settings = {"num_samples": 3, "grid": Grid(28), "capacity": 256, "max_views": 6, **changes}
-    camera = Camera(height=12, width=12)
-    return Planner(GeometricSPSR(0.1, truncation=8), camera, Coverage(), search, surroundings=surroundings, **settings)
+def planner_of(search, surroundings=None, capacity=256):
+    imagination = Imagination(GeometricSPSR(0.1, truncation=8), Grid(28), 3, surroundings=surroundings)
+    return Planner(Coverage(), search, Camera(height=12, width=12), imagination, capacity=capacity, max_views=6)
 
 
 def test_imagined_surfaces_end_at_the_table():
@@ -191,9 +191,8 @@ def test_a_search_by_gradient_stays_out_of_obstacles():
     starts = look_at(2.3 * np.array([[np.cos(a), -0.05, np.sin(a)] for a in (0.3, 1.9, 3.5, 5.1)]))
     search = GradientSearch(dof=2, num_starts=4, iterations=12, learning_rate=0.05, candidates=starts, turned=False)
     table = HalfSpace([0.0, -0.2, 0.0], [0.0, 1.0, 0.0])
-    state_of = lambda planner: planner.init(POSES[2], scan(BALL, planner.camera, POSES[2]))  # noqa: E731
     planner = planner_of(search, Surroundings((table,), clearance=0.4))
-    proposal = planner.propose(state_of(planner), KEY)
+    proposal = planner.propose(planner.init(POSES[2], scan(BALL, planner.camera, POSES[2])), KEY)
     assert float(proposal.pose.position[1]) >= 0.2 - 1e-5
     assert np.isneginf(np.asarray(proposal.values)).all()
     heights = np.asarray(proposal.trajectories.poses.position)[..., 1]

@@ -66,7 +66,7 @@ def test_rounds_recomputed(problem, table, num_visited):
         scored = min(max(2 * scored, 1), SAMPLES)
         values[left] = table[:scored, left].mean(axis=0)
         values[:num_visited] = -np.inf
-    proposal = propose(HalvingSearch(CANDIDATES, first_samples=1), problem)
+    proposal = propose(HalvingSearch(CANDIDATES, num_first_samples=1), problem)
     best = left[np.argmax(values[left])]
     np.testing.assert_allclose(proposal.values, values, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(proposal.pose.position, fibonacci_sphere(CANDIDATES, 2.5)[best], atol=1e-6)
@@ -76,7 +76,7 @@ def test_rounds_recomputed(problem, table, num_visited):
 def test_one_round_is_the_discrete_search(problem):
     whole, halving = (
         propose(search, problem)
-        for search in (DiscreteSearch(CANDIDATES), HalvingSearch(CANDIDATES, first_samples=SAMPLES))
+        for search in (DiscreteSearch(CANDIDATES), HalvingSearch(CANDIDATES, num_first_samples=SAMPLES))
     )
     np.testing.assert_array_equal(whole.pose.position, halving.pose.position)
     np.testing.assert_allclose(whole.values, halving.values, rtol=1e-5)
@@ -88,7 +88,7 @@ def test_without_samples_it_says_so(problem):
         HalvingSearch(CANDIDATES).propose(bare, jax.random.key(0))
 
 
-@pytest.mark.parametrize(("arguments", "message"), [((0, 2), "0 candidates"), ((9, 0), "first_samples is 0")])
+@pytest.mark.parametrize(("arguments", "message"), [((0, 2), "0 candidates"), ((9, 0), "num_first_samples is 0")])
 def test_bad_numbers_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         HalvingSearch(*arguments)

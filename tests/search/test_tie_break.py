@@ -1,4 +1,4 @@
-"""Search that asks a second acquisition where samples cannot tell by the first: against the rule, worked out in NumPy."""
+"""Search that asks a second acquisition where samples cannot tell by the first: against the rule, in NumPy."""
 
 import dataclasses
 

@@ -24,7 +24,7 @@ from jaxnbv.surfaces import (
 RNG = np.random.default_rng(0)
 X = RNG.uniform(-1.4, 1.4, (40, 3)).astype(np.float32)
 BASE = GeometricSPSR(0.05, truncation=6, noise=0.1)
-MODELS = {"geometric": BASE, "screened": ScreenedSPSR(BASE, (OutsideBoundary(count=40), OnSurface(20)))}
+MODELS = {"geometric": BASE, "screened": ScreenedSPSR(BASE, (OutsideBoundary(num_points=40), OnSurface(20)))}
 
 
 def sphere(count=40):

@@ -31,7 +31,7 @@ def test_known_values_are_recovered_from_data_of_the_prior(start):
 
 def test_of_a_screened_model_the_base_is_fitted_and_never_made_less_likely():
     data, base = drawn(100), GeometricSPSR(0.3, 0.3, truncation=5, noise=0.4)
-    fitted = fit_hyperparameters(ScreenedSPSR(base, (OutsideBoundary(count=20),)), data, jax.random.key(0))
+    fitted = fit_hyperparameters(ScreenedSPSR(base, (OutsideBoundary(num_points=20),)), data, jax.random.key(0))
     assert fitted.base.condition(data).log_marginal_likelihood() > base.condition(data).log_marginal_likelihood() + 1.0
 
 

@@ -101,7 +101,7 @@ def test_values_are_reached_where_they_are_said_to_be():
     data = sphere(80)
     posterior = ScreenedSPSR(
         GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8),
-        (OutsideBoundary(count=60, noise=0.02), OnSurface(30, noise=0.02), Thickness(0.2, 30, -1.0, noise=0.02)),
+        (OutsideBoundary(num_points=60, noise=0.02), OnSurface(30, noise=0.02), Thickness(0.2, 30, -1.0, noise=0.02)),
     ).condition(data)
     h, rows = float(posterior.half_jump), posterior.rows
     assert h > 0
@@ -123,7 +123,7 @@ def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
     assert is_beside.sum() >= 40
     assert beyond.sum() == 8
     model = ScreenedSPSR(
-        GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8), (OutsideBoundary(count=60), SeenEmpty(30))
+        GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8), (OutsideBoundary(num_points=60), SeenEmpty(30))
     )
     nothing = Evidence.before_views(data, 1, grid)
     seen = eqx.tree_at(lambda e: e.seen_empty, nothing, jnp.asarray(is_beside | beyond))
@@ -180,7 +180,7 @@ def test_a_flat_patch_fills_less_of_the_volume_once_its_boundary_is_outside():
 
 
 def test_the_posterior_is_differentiable_in_the_data(x64):
-    data, model = sphere(20), ScreenedSPSR(GeometricSPSR(0.1, truncation=3), (OutsideBoundary(count=20),))
+    data, model = sphere(20), ScreenedSPSR(GeometricSPSR(0.1, truncation=3), (OutsideBoundary(num_points=20),))
 
     def mean(shift):
         moved = eqx.tree_at(lambda c: c.points, data, data.points + shift)

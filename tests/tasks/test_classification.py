@@ -1,4 +1,4 @@
-"""Classification scores against their formulas in float64 NumPy."""
+"""Acquisitions of classification against their formulas in float64 NumPy."""
 
 import equinox as eqx
 import jax
@@ -19,13 +19,16 @@ from jaxnbv.search import DiscreteSearch, FarthestView
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
 from jaxnbv.tasks.classification import (
+    ClassComparisons,
     CrossEntropy,
+    EntropyReduction,
     MixedEntropy,
     NegativeEntropy,
     cross_entropy,
     entropy,
     predict,
 )
+from jaxnbv.viz.answers import words_of
 
 RNG = np.random.default_rng(0)
 CAMERA, GRID = Camera(height=6, width=7), Grid(20)
@@ -102,6 +105,7 @@ def test_scores_of_chosen_probabilities(x64, p, q):
         MixedEntropy(first_point): crossed if before > 0.75 else reduction,
         MixedEntropy(first_point, threshold=2.0): reduction,
         MixedEntropy(first_point, threshold=0.0): crossed if before > 0 else reduction,
+        EntropyReduction(first_point): reduction,
         ExpectedUtilityImprovement(NegativeEntropy(first_point)): reduction,
     }
     assert float(NegativeEntropy(first_point)(seen)) == pytest.approx(-before, rel=1e-12)
@@ -125,6 +129,7 @@ def test_a_scan_that_sees_nothing(x64):
         CrossEntropy(linear),
         MixedEntropy(linear, threshold=0.0),
         MixedEntropy(linear, threshold=2.0),
+        EntropyReduction(linear),
         ExpectedUtilityImprovement(NegativeEntropy(linear)),
     ]
     for score in scores:
@@ -147,6 +152,7 @@ def test_thinning_is_that_by_hand_and_happens_once_before_scans_are_added(x64):
         CrossEntropy(linear, num_points=16): entropy_in_numpy(p, q),
         MixedEntropy(linear, threshold=0.0, num_points=16): entropy_in_numpy(p, q),
         MixedEntropy(linear, threshold=2.0, num_points=16): reduction,
+        EntropyReduction(linear, num_points=16): reduction,
         ExpectedUtilityImprovement(NegativeEntropy(linear), num_points=16): reduction,
     }
     for score, expected in scores.items():
@@ -176,6 +182,7 @@ def test_thinning_to_what_the_utility_looks_at_leaves_its_value(x64):
         CrossEntropy(linear, num_points=20),
         MixedEntropy(linear, threshold=0.0, num_points=20),
         MixedEntropy(linear, threshold=2.0, num_points=20),
+        EntropyReduction(linear, num_points=20),
         ExpectedUtilityImprovement(NegativeEntropy(linear)),
     ],
 )
@@ -217,6 +224,44 @@ def test_expected_scores_against_a_loop(x64):
         np.testing.assert_allclose(found, expected.mean(axis=0), rtol=1e-8, atol=1e-12)
 
 
+@pytest.mark.parametrize("num_points", [12, 1024])
+def test_reduction_of_entropy_is_the_improvement_of_its_negative(x64, num_points):
+    """On scans of which some add to what is known, some take from it, and one sees nothing."""
+    data = random_cloud(50, 60)
+    scans = [random_cloud(20, 24, 0.5 * np.eye(3)[index % 3] * (-1) ** index) for index in range(8)] + [nothing(24)]
+    own = EntropyReduction(linear, num_points=num_points)
+    improvement = ExpectedUtilityImprovement(NegativeEntropy(linear), num_points=num_points)
+    found, expected = ([float(one(one.context(data), seen)) for seen in scans] for one in (own, improvement))
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-15)
+    assert 0 < np.count_nonzero(found) < len(scans) - 1
+    assert own.quantity == improvement.quantity
+
+
+def test_comparisons_from_one_answer_are_the_members_own():
+    """Of a classifier that is asked once a scan, however many members there are."""
+    asked = []
+
+    def classifier(cloud):
+        jax.debug.callback(lambda _: asked.append(1), cloud.points[0, 0])
+        return linear(cloud)
+
+    kinds = (CrossEntropy, MixedEntropy, EntropyReduction)
+    members = [kind(classifier, num_points=16) for kind in kinds]
+    members.append(MixedEntropy(classifier, threshold=0.0, num_points=16))
+    together, data = ClassComparisons.of(members), random_cloud(50, 60)
+    for seen in (random_cloud(20, 24, (0.4, 0.0, 0.0)), random_cloud(20, 24, (0.0, 0.0, -0.4)), nothing(24)):
+        expected = [float(member(member.context(data), seen)) for member in members]
+        context = together.context(data)
+        jax.effects_barrier()
+        del asked[:]
+        np.testing.assert_allclose(together(context, seen), expected, rtol=1e-6)
+        jax.effects_barrier()
+        assert len(asked) == 1
+    for wrong in ([], [members[0], CrossEntropy(classifier, num_points=17)], [members[0], CrossEntropy(linear, 16)]):
+        with pytest.raises(InputError, match=f"the {len(wrong)} members must be of one classifier and as many points"):
+            ClassComparisons.of(wrong)
+
+
 def test_predictions_are_those_of_d_as_the_score_sees_it():
     data = random_cloud(50, 60)
     thinned = linear_in_numpy(*farthest_point_subsample(data, 12).to_numpy())
@@ -224,6 +269,7 @@ def test_predictions_are_those_of_d_as_the_score_sees_it():
     for score, expected in (
         (CrossEntropy(linear, num_points=12), thinned),
         (MixedEntropy(linear, num_points=12), thinned),
+        (EntropyReduction(linear, num_points=12), thinned),
         (ExpectedUtilityImprovement(NegativeEntropy(linear), num_points=12), thinned),
         (ExpectedUtilityImprovement(NegativeEntropy(linear)), whole),
     ):
@@ -242,14 +288,15 @@ class Named(eqx.Module):
 
 def test_answers_name_the_classes_where_the_classifier_does():
     data = random_cloud(50, 60)
-    for score in (CrossEntropy(Named()), MixedEntropy(Named()), ExpectedUtilityImprovement(NegativeEntropy(Named()))):
+    improvement = ExpectedUtilityImprovement(NegativeEntropy(Named()))
+    for score in (CrossEntropy(Named()), MixedEntropy(Named()), EntropyReduction(Named()), improvement):
         answer = score.answer(data)
         assert answer.names == ("cup", "bowl")
         np.testing.assert_allclose(answer.values, [0.3, 0.7], atol=1e-6)
-        assert answer.line() == "cup 0.30   bowl 0.70"
+        assert words_of(answer).line() == "cup 0.30   bowl 0.70"
     before = eqx.tree_at(lambda a: a.values, answer, np.array([0.9, 0.1]))
-    assert answer.line(before) == "cup 0.90 -> 0.30   bowl 0.10 -> 0.70"
-    assert answer.sentence(before) == (
+    assert words_of(answer).line(before) == "cup 0.90 -> 0.30   bowl 0.10 -> 0.70"
+    assert words_of(answer).sentence(before) == (
         "The classifier says bowl with probability 0.70 (was 0.10, behind cup with 0.90)."
     )
     assert CrossEntropy(linear).answer(data).names[:2] == ("class 0", "class 1")
@@ -266,13 +313,15 @@ def test_answers_name_the_classes_where_the_classifier_does():
 )
 def test_what_is_no_log_probability_is_named_at_the_first_scan(classifier, message):
     data = random_cloud(50, 60)
-    model, camera = GeometricSPSR(lengthscale=0.05, truncation=8), Camera(height=8, width=8)
+    camera = Camera(height=8, width=8)
+    imagination = Imagination(GeometricSPSR(lengthscale=0.05, truncation=8), carving=None)
     for score in (
         CrossEntropy(classifier),
         MixedEntropy(classifier),
+        EntropyReduction(classifier),
         ExpectedUtilityImprovement(NegativeEntropy(classifier)),
     ):
         with pytest.raises(InputError, match=message):
-            Planner(score, DiscreteSearch(7), camera, Imagination(model, carving=None)).init(None, data)
+            Planner(score, DiscreteSearch(7), camera, imagination).init(None, data)
     # Asked for nothing, it says nothing.
-    Planner(CrossEntropy(classifier), FarthestView(7), camera, Imagination(model, carving=None)).init(None, data)
+    Planner(CrossEntropy(classifier), FarthestView(7), camera, imagination).init(None, data)

@@ -103,12 +103,10 @@ def test_a_host_classifier_has_no_gradient():
 def test_a_host_classifier_in_a_planners_search():
     """The same poses and values as the JAX classifier's, through `Planner.propose`."""
     data = random_cloud(40, 40)
-    model, search = GeometricSPSR(lengthscale=0.05, truncation=8), DiscreteSearch(7)
+    imagination = Imagination(GeometricSPSR(lengthscale=0.05, truncation=8), Grid(16, 3.0), num_samples=2)
     proposals = []
     for classifier in (linear, HostClassifier(Host(), 4)):
-        planner = Planner(
-            CrossEntropy(classifier), search, CAMERA, Imagination(model, grid=Grid(16, 3.0), num_samples=2), capacity=64
-        )
+        planner = Planner(CrossEntropy(classifier), DiscreteSearch(7), CAMERA, imagination, capacity=64)
         proposals.append(planner.propose(planner.init(None, data), jax.random.key(3)))
     np.testing.assert_allclose(proposals[0].values, proposals[1].values, atol=1e-4)
     assert np.ptp(np.asarray(proposals[0].values)) > 1e-2

@@ -11,6 +11,7 @@ import pytest
 from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.geometry.cloud import PointCloud, concatenate
 from jaxnbv.tasks import SoftPartCount, part_counts
+from jaxnbv.viz.answers import words_of
 
 RNG = np.random.default_rng(0)
 PARTS = 5
@@ -137,9 +138,10 @@ def test_the_answer_counts_the_points_of_each_part():
     cloud = make_cloud(17, 25)
     counts = np.asarray(part_counts(Linear(weight)(cloud)))
     plain = SoftPartCount(Linear(weight)).answer(cloud)
-    assert plain.shown == tuple(np.flatnonzero(counts))
+    assert plain.asked == words_of(plain).shown == tuple(np.flatnonzero(counts))
     np.testing.assert_array_equal(plain.values, counts)
     named = ExpectedUtilityImprovement(SoftPartCount(Named(weight)), num_points=5).answer(cloud)
-    assert named.line() == f"seat {counts[1]}   leg {counts[3]}"
-    assert named.line(plain) == f"seat {counts[1]} -> {counts[1]}   leg {counts[3]} -> {counts[3]}"
-    assert named.sentence(plain) == f"Points predicted of each part: seat {counts[1]}, leg {counts[3]}."
+    words = words_of(named)
+    assert words.line() == f"seat {counts[1]}   leg {counts[3]}"
+    assert words.line(plain) == f"seat {counts[1]} -> {counts[1]}   leg {counts[3]} -> {counts[3]}"
+    assert words.sentence(plain) == f"Points predicted of each part: seat {counts[1]}, leg {counts[3]}."

@@ -1,4 +1,4 @@
-"""What is sought and what is known, for scores and utilities of one's own as for those that ship."""
+"""What is sought and what is known, for acquisitions and utilities of one's own as for those that ship."""
 
 import jax
 import jax.numpy as jnp
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxnbv as nbv
+from jaxnbv.viz.answers import label_of, words_of
 
 POINTS = np.array([[0.0, 0.3, 0.0], [0.1, 0.8, 0.0], [0.0, -0.2, 0.4]])
 CLOUD = nbv.PointCloud.from_arrays(POINTS, np.eye(3), 5)
@@ -36,12 +37,12 @@ class Unnamed(nbv.Acquisition):
 
 
 def test_a_function_has_its_name_and_value():
-    score = nbv.ExpectedUtilityImprovement(greatest_height)
-    assert score.quantity.label == "expected improvement of greatest height"
-    answer, before = score.answer(CLOUD), score.answer(_first())
-    assert answer.line(before) == "greatest height 0.3 -> 0.8"
-    assert answer.sentence(before) == "Greatest height 0.8 (was 0.3)."
-    assert answer.sentence() == "Greatest height 0.8."
+    acquisition = nbv.ExpectedUtilityImprovement(greatest_height)
+    assert label_of(acquisition.quantity) == "expected improvement of greatest height"
+    answer, before = acquisition.answer(CLOUD), acquisition.answer(_first())
+    assert words_of(answer).line(before) == "greatest height 0.3 -> 0.8"
+    assert words_of(answer).sentence(before) == "Greatest height 0.8 (was 0.3)."
+    assert words_of(answer).sentence() == "Greatest height 0.8."
     assert nbv.ExpectedUtilityImprovement(lambda cloud: 1.0).quantity.name == "expected utility improvement"
 
 
@@ -50,14 +51,14 @@ def _first():
 
 
 def test_a_utility_says_what_it_likes():
-    score = nbv.ExpectedUtilityImprovement(Metres(), num_points=1)
-    assert score.quantity.label == "expected growth (metres)"
-    # Of all of D, however few points the score looks at.
-    assert score.answer(CLOUD).line() == "height 1.6   points 3.0"
-    assert nbv.DiscreteSearch().quantity(score) == score.quantity
+    acquisition = nbv.ExpectedUtilityImprovement(Metres(), num_points=1)
+    assert label_of(acquisition.quantity) == "expected growth (metres)"
+    # Of all of D, however few points the acquisition looks at.
+    assert words_of(acquisition.answer(CLOUD)).line() == "height 1.6   points 3.0"
+    assert nbv.DiscreteSearch().quantity(acquisition) == acquisition.quantity
 
 
-def test_a_score_without_words_has_its_type():
+def test_an_acquisition_without_words_has_its_type():
     assert Unnamed().quantity.name == "acquisition, Unnamed"
     assert Unnamed().answer(CLOUD) is None
     assert nbv.Coverage().answer(CLOUD) is None
@@ -81,16 +82,21 @@ def test_a_search_that_does_not_ask_the_score_says_so():
     ],
 )
 def test_an_impossible_utility_is_named_at_the_first_scan(utility, message):
-    score = nbv.ExpectedUtilityImprovement(utility)
+    acquisition = nbv.ExpectedUtilityImprovement(utility)
     planner = nbv.Planner(
-        score, nbv.DiscreteSearch(4), imagination=nbv.Imagination(nbv.GeometricSPSR(0.05, truncation=8)), capacity=5
+        acquisition,
+        nbv.DiscreteSearch(4),
+        imagination=nbv.Imagination(nbv.GeometricSPSR(0.05, truncation=8)),
+        capacity=5,
     )
     with pytest.raises(nbv.InputError, match=message):
         planner.init(None, CLOUD)
 
 
 def test_under_jit_nothing_is_asked():
-    score = nbv.ExpectedUtilityImprovement(lambda cloud: jnp.nan * jnp.sum(cloud.mask))
+    acquisition = nbv.ExpectedUtilityImprovement(lambda cloud: jnp.nan * jnp.sum(cloud.mask))
     model = nbv.GeometricSPSR(0.05, truncation=8)
-    planner = nbv.Planner(score, nbv.DiscreteSearch(4), imagination=nbv.Imagination(model, carving=None), capacity=5)
-    assert jax.eval_shape(planner.init, CLOUD).cloud.capacity == 5
+    planner = nbv.Planner(
+        acquisition, nbv.DiscreteSearch(4), imagination=nbv.Imagination(model, carving=None), capacity=5
+    )
+    assert jax.eval_shape(lambda cloud: planner.init(None, cloud), CLOUD).cloud.capacity == 5

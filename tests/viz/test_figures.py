@@ -8,13 +8,14 @@ import json
 import matplotlib as mpl
 import numpy as np
 import pytest
-from jaxnbv.answers import Answer, Panel, Quantity
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 from small_run import CAMERA, small_run
 
 import jaxnbv as nbv
+from jaxnbv.acquisition import Answer, Quantity
 from jaxnbv.viz import report_data
+from jaxnbv.viz.answers import Panel
 from jaxnbv.viz.data import MeanSurface
 from jaxnbv.viz.figures import STYLE, Stills, figures_of
 from jaxnbv.viz.page_data import clustered, payload
@@ -33,7 +34,7 @@ def episode():
 def data(episode):
     """Without surfaces, which take long to paint and have no letters."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jaxnbv.viz.data.mean_surface", lambda planner, evidence: None)
+        patch.setattr("jaxnbv.viz.data.mean_surface", lambda imagination, evidence: None)
         return report_data(episode, progress=False)
 
 
@@ -187,7 +188,7 @@ def test_all_cameras_stand_beside_the_object_in_one_picture(episode):
         position = np.asarray(stage.pulled(view.pose).position, np.float64)
         distance = np.linalg.norm(position)
         assert stage.radius < distance < np.linalg.norm(view.pose.position)
-        assert 1.09 * distance <= stage.bounding_radius
+        assert 1.09 * distance <= stage.extent
         np.testing.assert_allclose(position / distance, np.asarray(view.pose.position) / 2.5, atol=0.05)
 
 
@@ -210,7 +211,7 @@ def test_a_record_without_standard_errors_gives_a_page_too(episode):
         for view in episode.views
     )
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jaxnbv.viz.data.mean_surface", lambda planner, evidence: None)
+        patch.setattr("jaxnbv.viz.data.mean_surface", lambda imagination, evidence: None)
         old = report_data(dataclasses.replace(episode, views=views), progress=False, imagine=False)
     shown = payload(old, CAMERA)["views"][1]["choice"]
     assert shown["errors"] is None

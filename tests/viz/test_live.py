@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from test_session import FIRST, session_of, shot
+from small_session import FIRST, session_of, shot
 
 from jaxnbv.checks import InputError
 from jaxnbv.planning.replay import stored_run
@@ -22,7 +22,8 @@ def watched(tmp_path_factory):
     session = session_of(folder)
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     matrix = session.next().matrix
-    page = session.view(port=0)
+    page = LiveView(port=0)
+    page.follow(session)
     session.add(shot(matrix), matrix, depth_scale=1e-3)
     session.next()
     yield folder, session, page

@@ -1,14 +1,18 @@
 """What a notebook shows."""
 
 import base64
+import importlib
 import io
 import math
 import re
+import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from IPython.core.formatters import HTMLFormatter
 from matplotlib.figure import Figure
 from PIL import Image
 from small_run import small_run
@@ -16,7 +20,7 @@ from small_run import small_run
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.viz import sphere
-from jaxnbv.viz.notebook import drawing_of
+from jaxnbv.viz.notebook import drawing_of, html_of
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +32,7 @@ def episode():
 
 def parts(shown):
     """The size of the picture, and the caption."""
-    text = shown._repr_html_()
+    text = html_of(shown)
     image = Image.open(io.BytesIO(base64.b64decode(re.search('base64,([^"]+)"', text).group(1))))
     return image.size, re.search("<figcaption>(.*)</figcaption>", text).group(1)
 
@@ -53,7 +57,7 @@ def test_each_is_a_small_picture_and_a_line(episode):
         size, caption = parts(shown)
         assert size == (264, 264)
         assert expected in caption
-        assert len(shown._repr_html_()) < 100_000
+        assert len(html_of(shown)) < 100_000
     assert "12 candidates" in parts(proposal)[1]
 
 
@@ -90,14 +94,26 @@ def test_a_proposal_has_its_star_and_an_episode_its_cameras(episode):
 
 def test_what_has_no_picture_has_its_facts():
     none = nbv.PointCloud(jnp.zeros((7, 3)), jnp.zeros((7, 3)), jnp.zeros(7, bool))
-    assert none._repr_html_() == "<div>0 points of at most 7</div>"
+    assert html_of(none) == "<div>0 points of at most 7</div>"
     several = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), none)
-    assert several._repr_html_() == "<div>a batch (3,) of clouds of up to 7 points</div>"
+    assert html_of(several) == "<div>a batch (3,) of clouds of up to 7 points</div>"
 
 
 def test_an_episode_is_shown_in_a_strip(episode, monkeypatch):
     """Without surfaces, which take long; the figure is tested with the report's."""
-    monkeypatch.setattr("jaxnbv.viz.data.mean_surface", lambda planner, evidence: None)
-    image = Image.open(io.BytesIO(episode.show(progress=False)._repr_png_()))
+    monkeypatch.setattr("jaxnbv.viz.data.mean_surface", lambda imagination, evidence: None)
+    image = Image.open(io.BytesIO(nbv.show(episode, progress=False)._repr_png_()))
     assert image.width == 480
     assert image.height > 300
+
+
+def test_ipython_is_told_how_they_are_shown(monkeypatch, episode):
+    """By its own formatter, as a notebook asks it; a subclass is shown as its parent."""
+    formatter = HTMLFormatter()
+    shell = SimpleNamespace(display_formatter=SimpleNamespace(formatters={"text/html": formatter}))
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
+    importlib.reload(nbv)
+    posterior = episode.planner.imagination.model.condition(episode.cloud)
+    for shown in (episode, episode.cloud, episode.views[1].proposal, posterior):
+        assert formatter(shown) == html_of(shown)
+    assert formatter(episode.planner) is None

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from jaxnbv.answers import number
 from PIL import Image
 from small_run import CAMERA, small_planner, small_run
 
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.viz import report_data, write_figures, write_report
+from jaxnbv.viz.answers import label_of, number
 from jaxnbv.viz.data import choice_of, mean_surface
 from jaxnbv.viz.render import frustum
 from jaxnbv.viz.sphere import from_mollweide, mollweide, smooth_map
@@ -132,14 +132,14 @@ def test_figures_are_pictures_of_the_stated_size(report):
 )
 def test_baselines_are_labelled_in_their_own_units(search, label, words):
     data = report_data(small_run(search, views=2), progress=False)
-    assert data.quantity.label == label
+    assert label_of(data.quantity) == label
     assert words in data.views[1].sentence
     assert "coverage gain" not in data.views[1].sentence
 
 
 def test_other_scores_keep_their_name():
     utility = nbv.ExpectedUtilityImprovement(lambda cloud: jnp.sum(cloud.mask) * 1.0)
-    assert nbv.DiscreteSearch().quantity(utility).label == "expected utility improvement"
+    assert label_of(nbv.DiscreteSearch().quantity(utility)) == "expected utility improvement"
 
 
 def test_the_sentence_tells_the_numbers_of_the_step(episode, data):
@@ -190,7 +190,7 @@ def test_any_posterior_has_a_surface_with_a_standard_deviation():
     # f = |x| - r with r ~ N(0.9, 0.03^2): the surface is a sphere known to 0.03 all over, estimated from 64 samples.
     planner = small_planner(nbv.RandomView(), model=SphereModel(), grid=nbv.Grid(40))
     cloud = nbv.PointCloud.from_arrays([[0.9, 0.0, 0.0]], [[1.0, 0.0, 0.0]])
-    surface = mean_surface(planner, planner.init(None, cloud))
+    surface = mean_surface(planner.imagination, planner.init(None, cloud))
     radius = np.linalg.norm(surface.vertices, axis=1)
     np.testing.assert_allclose(radius, 0.9, atol=4 * 0.03 / 8 + 0.005)
     np.testing.assert_allclose(surface.deviation, 0.03, rtol=4 / np.sqrt(2 * 64))
@@ -201,7 +201,7 @@ def test_the_surface_of_the_mean_is_carved():
     planner = small_planner(nbv.RandomView(), model=SphereModel(), grid=nbv.Grid(40))
     evidence = planner.init(None, nbv.PointCloud.from_arrays([[0.9, 0.0, 0.0]], [[1.0, 0.0, 0.0]]))
     empty = jnp.broadcast_to((planner.imagination.grid.axis > 0.3)[:, None, None], evidence.seen_empty.shape)
-    vertices = mean_surface(planner, eqx.tree_at(lambda s: s.seen_empty, evidence, empty)).vertices
+    vertices = mean_surface(planner.imagination, eqx.tree_at(lambda s: s.seen_empty, evidence, empty)).vertices
     assert vertices[:, 0].max() < 0.3 + planner.imagination.grid.spacing
     # The other side is as it was.
     left = vertices[vertices[:, 0] < 0.3 - planner.imagination.grid.spacing]
@@ -212,7 +212,7 @@ def test_a_mean_without_a_surface_is_drawn_without_one(tmp_path, episode, data):
     planner = eqx.tree_at(lambda p: p.model, episode.planner, SphereModel())
     far = eqx.tree_at(lambda p: (p.grid, p.carving), planner, (nbv.Grid(40, 0.2), None))
     evidence = eqx.tree_at(lambda s: s.seen_empty, episode.evidence_after(1), None)
-    assert mean_surface(far, evidence) is None
+    assert mean_surface(far.imagination, evidence) is None
     bare = eqx.tree_at(lambda d: [v.surface for v in d.views], data, [None] * 3, is_leaf=lambda x: x is None)
     assert all(path.stat().st_size > 5000 for path in write_figures(bare, CAMERA, tmp_path, progress=False))
 
@@ -221,7 +221,7 @@ def test_what_was_seen_is_known_better_than_what_was_not():
     scene = nbv.SDFSurface(Sphere(0.9))
     model, camera = nbv.GeometricSPSR(truncation=16, lengthscale=0.02), nbv.Camera(height=24, width=24)
     view = small_run(nbv.RandomView(12), views=1, scene=scene, model=model, camera=camera)
-    surface = mean_surface(view.planner, view.evidence_after(1))
+    surface = mean_surface(view.planner.imagination, view.evidence_after(1))
     distance = np.linalg.norm(surface.vertices[:, None] - view.cloud.to_numpy()[0][None, ::4], axis=-1).min(axis=1)
     assert np.median(surface.deviation[distance < 0.1]) < 0.3 * np.median(surface.deviation[distance > 0.6])
 

@@ -9,15 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxnbv.answers import Answer, number
 from small_run import small_run
 
 import jaxnbv as nbv
+from jaxnbv.acquisition import Answer
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.studies.scenes import Split, pyramid_scene
 from jaxnbv.tasks.classification import ClassAnswer
 from jaxnbv.tasks.heat import ColdestAnswer
 from jaxnbv.tasks.segmentation import PartAnswer
+from jaxnbv.viz.answers import number, words_of
 from jaxnbv.viz.data import report_data
 from jaxnbv.viz.report import report_html
 from jaxnbv.viz.task import since, true_cloud
@@ -47,7 +48,7 @@ def run(score, scene, views=3):
 def plain(request):
     """Pictures of surfaces take long, and have nothing to do with the numbers."""
     patch = pytest.MonkeyPatch()
-    patch.setattr("jaxnbv.viz.data.mean_surface", lambda planner, evidence: None)
+    patch.setattr("jaxnbv.viz.data.mean_surface", lambda imagination, evidence: None)
     yield
     patch.undo()
 
@@ -159,22 +160,22 @@ def test_a_class_is_not_known_of_a_scene_without_one():
 def test_heat_is_charted_by_temperature_and_distance():
     found = ColdestAnswer(("coldest",), np.array([0.4]), point=np.array([1.0, 0.0, 2.0]))
     truth = ColdestAnswer(("coldest",), np.array([0.1]), point=np.array([1.0, 3.0, -2.0]))
-    temperature, distance = found.panels(truth)
+    temperature, distance = words_of(found).panels(truth)
     assert (temperature.values[0], temperature.true[0]) == (0.4, 0.1)
     assert distance.values[0] == 5.0
-    (alone,) = found.panels(None)
+    (alone,) = words_of(found).panels(None)
     assert alone.true is None
 
 
 def test_parts_are_found_by_their_points():
     found = PartAnswer(("a", "b", "c", "d"), np.array([70.0, 59.0, 60.0, 500.0]), asked=(0, 1, 2))
     truth = PartAnswer(("a", "b", "c", "d"), np.array([4.0, 9.0, 0.0, 0.0]), asked=(0, 1, 2))
-    count, points = found.panels(truth)
+    count, points = words_of(found).panels(truth)
     assert (count.values[0], count.true[0]) == (2.0, 2.0)
     np.testing.assert_array_equal(points.values, [70.0, 59.0, 60.0])
-    assert found.found == "a, c"
-    assert not found.settled(None)
-    assert PartAnswer(("a",), np.array([60.0]), asked=(0,)).settled(None)
+    assert words_of(found).found == "a, c"
+    assert not words_of(found).settled(None)
+    assert words_of(PartAnswer(("a",), np.array([60.0]), asked=(0,))).settled(None)
 
 
 def classes(*rows):

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxnbv.answers import number
 from PIL import Image
 from small_run import CAMERA, small_run
 
@@ -21,6 +20,7 @@ from jaxnbv.search.base import best_unvisited
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.search.rotations import rotation_from_6d
 from jaxnbv.viz import report_data, sphere, write_figures
+from jaxnbv.viz.answers import number
 from jaxnbv.viz.data import choice_of
 from jaxnbv.viz.report import report_html
 from jaxnbv.viz.trajectories import MAP_VIEWS, step_values

@@ -38,7 +38,7 @@ def halving_evaluations(candidates: int, samples: int) -> int:
     left, scored, total = candidates, 0, 0
     while scored < samples:
         left = max(1, left // 2) if scored else left
-        more = min(max(scored, HalvingSearch.first_samples), samples - scored)
+        more = min(max(scored, HalvingSearch.num_first_samples), samples - scored)
         total, scored = total + left * more, scored + more
     return total
 

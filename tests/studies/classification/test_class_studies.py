@@ -211,7 +211,7 @@ def test_a_network_of_ones_own_takes_the_place_of_the_shipped_one(tmp_path):
     (study,) = made.values()
     assert (study.classifier.num_points, study.imagining.num_points) == OmniObject3DStudy.fed
     np.testing.assert_array_equal(study.classifier.network.head[1].bias, network.head[1].bias)
-    with pytest.raises(InputError, match=r"tells 5 classes apart; the study has 10: bathtub, bed"):
+    with pytest.raises(InputError, match=r"knows 5 classes; the study has 10: bathtub, bed"):
         ModelNet10Study.configured("screened", 2, True, classifier=tmp_path / "mine.safetensors")
     with pytest.raises(InputError, match="no classifier of 'teapot' ships: give the file of one"):
         Unshipped.configured("screened", 2, True)

@@ -51,18 +51,13 @@ def test_a_record_is_json_and_methods_share_the_first_view():
     assert study.run_scene(4)["first"] != record["first"] or study.run_scene(5)["first"] != record["first"]
 
 
-def test_the_same_views_are_scanned_again_from_a_record_and_from_an_older_one():
+def test_the_same_views_are_scanned_again_from_a_record():
     study = small()
     scene, run = study.scene(0), study.run_scene(0)["methods"]["farthest"]
     seen = study.seen(scene, run)
     assert [int(evidence.cloud.count) for _, evidence in seen] == run["points"]
     scans = [scan for scan, _ in seen]
     assert int(scans[0].count) + int(scans[1].count) == run["points"][1]
-    positions = np.asarray(study.candidates.poses().position)
-    numbers = [int(np.argmin(np.linalg.norm(positions - view["position"], axis=1))) for view in run["views"]]
-    # The thinned clouds hang on the last digits of the poses: of two points as far the one or the other comes first.
-    for (again, _), scan in zip(study.seen(scene, {"candidates": numbers}), scans, strict=True):
-        np.testing.assert_allclose(again.points, scan.points, atol=1e-5)
     # The noise is there.
     distance = np.abs(np.linalg.norm(scans[0].to_numpy()[0], axis=1) - 1.0)
     assert 1e-4 < distance.mean() < 0.05

@@ -10,8 +10,8 @@ import trimesh
 from PIL import Image
 
 import jaxnbv as nbv
-from jaxnbv.imagination import Imagination
 from jaxnbv.checks import InputError
+from jaxnbv.imagination import Imagination
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.search import HalvingSearch
 from jaxnbv.search.candidates import sphere_candidates
@@ -31,7 +31,13 @@ CANDIDATES, VIEWS = 12, 3
 
 def small_study(**settings):
     model = nbv.GeometricSPSR(lengthscale=0.05, truncation=8)
-    small = {"views": VIEWS, "num_candidates": CANDIDATES, "num_samples": 3, "imagination": Imagination(model), "grid_resolution": 20}
+    small = {
+        "views": VIEWS,
+        "num_candidates": CANDIDATES,
+        "num_samples": 3,
+        "imagination": Imagination(model),
+        "grid_resolution": 20,
+    }
     few = {"capacity": 900, "num_points": 200, "imagined_rays": 6, "true_grid": nbv.Grid(48)}
     return HeatStudy(**(small | few | settings))
 
@@ -152,8 +158,8 @@ def test_the_scans_that_halving_scores_are_counted_right(candidates, samples):
     def propose(key):
         cloud = nbv.PointCloud(jnp.zeros((1, 3)), jnp.ones((1, 3)), jnp.ones(1, bool))
         surfaces = nbv.GridSurface.from_values(jnp.ones((samples, 4, 4, 4)), 0.0, nbv.Grid(4))
-        visited = sphere_candidates(2)[jnp.arange(1)]
-        problem = Counting(cloud, visited, jnp.asarray(0), nbv.Camera(), nbv.Coverage(), surfaces)
+        evidence = nbv.Evidence.before_views(cloud, 1, None)
+        problem = Counting(evidence, nbv.Camera(), nbv.Coverage(), surfaces)
         return HalvingSearch(candidates).propose(problem, key)
 
     counted.clear()

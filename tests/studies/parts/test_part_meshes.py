@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxnbv.imagination import Imagination
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.imagination import Imagination
 from jaxnbv.scanning import Grid, load_parts
 from jaxnbv.studies.parts import pictures
 from jaxnbv.studies.parts.meshes import MeshPartStudy, part_files
@@ -45,7 +45,13 @@ def folder(tmp_path):
 
 def small_study(folder, **settings):
     model = GeometricSPSR(lengthscale=0.05, truncation=8)
-    small = {"views": 3, "num_candidates": 12, "num_samples": 2, "imagination": Imagination(model), "grid_resolution": 20}
+    small = {
+        "views": 3,
+        "num_candidates": 12,
+        "num_samples": 2,
+        "imagination": Imagination(model),
+        "grid_resolution": 20,
+    }
     limits = {"capacity": 1500, "camera": Camera(height=32, width=32), "imagined_rays": 12, "num_points": 100}
     return MeshPartStudy(meshes=part_files(folder), **(small | limits | settings))
 

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv.imagination import Imagination
 from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import concatenate, limit_capacity
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.imagination import Imagination
 from jaxnbv.networks import CATEGORIES, CloudSegmenter
 from jaxnbv.scanning import SDFSurface, SensorNoise, scan
 from jaxnbv.search import (
@@ -55,10 +55,10 @@ class Pointwise(eqx.Module):
 
 def small_study(enough=10**6, **settings):
     model = GeometricSPSR(lengthscale=0.05, truncation=8)
-    small = {"views": VIEWS, "num_candidates": CANDIDATES, "num_samples": 2, "imagination": Imagination(model), "grid_resolution": 20}
+    small = {"views": VIEWS, "num_candidates": CANDIDATES, "num_samples": 2, "grid_resolution": 20}
     limits = {"capacity": 600, "imagined_rays": 12, "num_points": 100, "num_starts": 1, "iterations": 2}
     segmenter = CloudSegmenter(Pointwise(jnp.asarray(enough)), 0, 500, scale=0.8)
-    return PartStudy(segmenter=segmenter, camera=CAMERA, **(small | limits | settings))
+    return PartStudy(segmenter=segmenter, camera=CAMERA, imagination=Imagination(model), **(small | limits | settings))
 
 
 @functools.cache
@@ -105,6 +105,20 @@ def test_a_record_is_json_and_holds_every_method():
         assert {len(counts) for counts in run["counts"]} == {len(record["parts"])}
         positions = [tuple(np.round(view["position"], 3)) for view in run["views"]]
         assert len(set(positions)) == len(positions)
+
+
+@pytest.mark.parametrize("method", RUN)
+def test_every_choice_is_the_one_that_the_planner_proposes_with_the_same_key(method):
+    record, study = whole_record(), small_study()
+    planner = study.planner(method, study.scene(SCENE))
+    views = [pose_of(view) for view in record["methods"][method]["views"]]
+    evidence = None
+    for index, (pose, seen) in enumerate(zip(views, scans(record, method), strict=True)):
+        if evidence is not None:
+            key = jax.random.split(jax.random.fold_in(study.key(SCENE, "episode"), index))[0]
+            np.testing.assert_allclose(planner.propose(evidence, key).pose.position, pose.position, atol=1e-6)
+        told = pose, seen, study.camera
+        evidence = planner.init(*told) if evidence is None else planner.observe(evidence, *told)
 
 
 def test_methods_share_the_first_view_which_sees_something():

@@ -6,14 +6,14 @@ import jax
 import numpy as np
 import pytest
 import trimesh
-from jaxnbv.imagination import Imagination
-from jaxnbv.scanning.reconstruction import has_poisson
 from PIL import Image
 
 import jaxnbv as nbv
 from jaxnbv.checks import InputError
+from jaxnbv.imagination import Imagination
 from jaxnbv.scanning import scan
 from jaxnbv.scanning.metrics import coverage, surface_distance, truth_points
+from jaxnbv.scanning.screened_poisson import has_poisson
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.storage import describe
 from jaxnbv.studies.engine.meshes import mesh_files
@@ -41,7 +41,13 @@ def meshes(tmp_path_factory):
 
 def small_study(meshes=None, views=3, **settings):
     model = nbv.GeometricSPSR(lengthscale=0.05, truncation=8)
-    small = {"num_candidates": CANDIDATES, "num_samples": 2, "imagination": Imagination(model), "grid_resolution": 20, "capacity": 250}
+    small = {
+        "num_candidates": CANDIDATES,
+        "num_samples": 2,
+        "imagination": Imagination(model),
+        "grid_resolution": 20,
+        "capacity": 250,
+    }
     return ReconstructionStudy(meshes=meshes, views=views, **(small | settings))
 
 

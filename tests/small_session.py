@@ -1,0 +1,47 @@
+"""A simulated sensor of 64 x 48 pixels in millimetres, in a world in metres with z up, with a table in view."""
+
+import numpy as np
+
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import Pose, look_at
+from jaxnbv.imagination import Imagination
+from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.session import Session
+from jaxnbv.scanning import Grid, SDFSurface, scan
+from jaxnbv.scanning.sdf import Cuboid, Sphere
+from jaxnbv.search import DiscreteSearch
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Coverage
+
+CENTER = np.array([0.3, 0.2, 0.12])
+WORLD = SDFSurface(Sphere(0.1).translate([0.3, 0.2, 0.101]) | Cuboid([1.0, 1.0, 0.02]).translate([0.3, 0.2, -0.021]))
+CAMERA = Camera.from_intrinsics([[90.0, 0.0, 34.0], [0.0, 95.0, 21.5], [0.0, 0.0, 1.0]], width=64, height=48)
+BOX = ((0.18, 0.08, 0.002), (0.42, 0.32, 0.24))
+
+
+def around(angle, elevation, distance=0.6):
+    direction = [np.cos(angle) * np.cos(elevation), np.sin(angle) * np.cos(elevation), np.sin(elevation)]
+    return np.asarray(look_at(CENTER + distance * np.array(direction), CENTER, up=(0.0, 0.0, 1.0)).matrix, np.float64)
+
+
+POSES = np.array([around(angle, e) for e in (0.4, 0.9) for angle in np.arange(0.0, 6.2, np.pi / 3)])
+FIRST = around(0.2, 0.5)
+
+
+def shot(matrix, unit=1000.0):
+    """What the sensor gives: whole millimetres, zero where nothing is hit."""
+    pose = Pose.from_matrix(matrix)
+    seen = scan(WORLD, CAMERA, pose)
+    depth = (np.asarray(seen.points, np.float64) - np.asarray(pose.position)) @ np.asarray(pose.forward, np.float64)
+    image = np.where(seen.mask, unit * depth, 0.0).reshape(48, 64)
+    return np.round(image).astype(np.uint16) if unit > 1 else image
+
+
+def planner_of(search=DiscreteSearch(), num_samples=3, capacity=400):  # noqa: B008
+    imagination = Imagination(GeometricSPSR(0.2, truncation=8), Grid(28), num_samples)
+    return Planner(Coverage(), search, Camera(height=12, width=16), imagination, capacity=capacity, max_views=8)
+
+
+def session_of(folder=None, **changes):
+    settings = {"camera": CAMERA, "box": BOX, "up": "z", "poses": POSES, "folder": folder, **changes}
+    return Session(settings.pop("planner", None) or planner_of(), **settings)
