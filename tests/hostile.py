@@ -17,7 +17,7 @@ import numpy as np
 from hypothesis import HealthCheck, Phase, given, settings
 
 import jaxnbv as nbv
-from jaxnbv import datasets
+from jaxnbv.studies import readers
 
 RNG = np.random.default_rng(0)
 DIRECTIONS = RNG.normal(size=(20, 3))
@@ -53,6 +53,7 @@ def number_of_points(cloud):
 
 # What is called, and arguments that work; each is replaced in turn.
 CALLS = {
+    nbv.Budget: {"seconds": 60.0, "cost": 3.0, "of": nbv.arc_length},
     nbv.Box: {"low": (-1.0, -1.0, -1.0), "high": (1.0, 1.0, 1.0)},
     nbv.Camera: {"fov": 0.5, "height": 4, "width": 4, "aspect": 1.0, "center": (0.5, 0.5), "nearest": 0.1}
     | {"farthest": 3.0, "max_incidence": 1.0},
@@ -67,6 +68,7 @@ CALLS = {
     nbv.ConstrainedPoses: {"nearest": 2.0, "farthest": 3.0, "off_axis": 0.1},
     nbv.CrossEntropy: {"classifier": number_of_points, "num_points": 16},
     nbv.DiscreteSearch: {"candidates": 6},
+    nbv.EntropyReduction: {"classifier": number_of_points, "num_points": 16},
     nbv.ExpectedUtilityImprovement: {"utility": number_of_points, "num_points": 16},
     nbv.FarthestView: {"candidates": 6},
     nbv.Frame: {"scale": 1.0, "center": (0.0, 0.0, 0.0)},
@@ -82,12 +84,16 @@ CALLS = {
     | {"initial": 0.0},
     nbv.HostClassifier: {"function": number_of_points, "num_classes": 3},
     nbv.HostSegmenter: {"function": number_of_points, "num_parts": 3},
+    nbv.Imagination: {"model": MODEL, "grid": nbv.Grid(8), "num_samples": 2, "carving": nbv.Carving()}
+    | {"surroundings": None},
+    nbv.Imagination.preset: {"name": "paper", "longest_side": 2.5, "quick": True, "volume": None, "solid": False}
+    | {"lengthscale": 0.1},
     nbv.MixedEntropy: {"classifier": number_of_points, "threshold": 0.5, "num_points": 16},
     nbv.NegativeEntropy: {"classifier": number_of_points},
     nbv.OnSurface: {"num_points": 10, "noise": 0.1},
     nbv.OutsideBoundary: {"volume": nbv.Box(), "num_points": 10, "value": 1.0, "noise": 0.5},
-    nbv.Planner: {"model": MODEL, "camera": SMALL, "acquisition": nbv.Coverage(), "search": nbv.DiscreteSearch(6)}
-    | {"num_samples": 2, "grid": nbv.Grid(8), "capacity": 32, "max_views": 3, "carving": nbv.Carving()},
+    nbv.Planner: {"acquisition": nbv.Coverage(), "search": nbv.DiscreteSearch(6), "camera": SMALL}
+    | {"imagination": nbv.Imagination(MODEL, nbv.Grid(8), 2), "cost": None, "capacity": 32, "max_views": 3},
     nbv.PointCloud.from_arrays: {"points": DIRECTIONS, "normals": DIRECTIONS, "capacity": 32},
     nbv.PointCloud.from_depth: {"depth": np.ones((4, 4)), "camera": SMALL, "pose": POSE}
     | {"depth_scale": 1.0, "stride": 2, "box": nbv.Box()},
@@ -95,10 +101,10 @@ CALLS = {
     nbv.Pose: {"rotation": np.eye(3), "position": np.zeros(3)},
     nbv.RandomView: {"candidates": 6},
     nbv.SDFSurface: {"sdf": BALL, "bounding_radius": 2.0},
-    nbv.ScreenedSPSR: {"base": MODEL, "values": (nbv.OnSurface(),), "level_deviation": 0.5, "reach": 0.1},
+    nbv.ScreenedSPSR: {"base": MODEL, "values": (nbv.OnSurface(),), "level_deviation": 0.5, "offset": 0.1},
     nbv.SeenEmpty: {"num_points": 10, "value": 2.0, "noise": 1.0},
     nbv.SensorNoise: {"points": 0.01, "normals": 0.01},
-    nbv.Several: {"scores": (nbv.Coverage(),)},
+    nbv.Several: {"members": (nbv.Coverage(),)},
     nbv.SoftPartCount: {"segmenter": number_of_points, "target": 60.0},
     nbv.TieBreakSearch: {"candidates": 6, "second": nbv.Coverage()},
     nbv.SphereCandidates: {"num_poses": 6, "radius": 2.5, "min_elevation": 0.0, "up": (0.0, 1.0, 0.0)},
@@ -106,16 +112,16 @@ CALLS = {
     nbv.Thickness: {"depth": 0.1, "num_points": 10, "value": -1.0, "noise": 1.0},
     nbv.TriangleMesh.from_arrays: {"vertices": np.eye(3), "faces": [[0, 1, 2]]},
     nbv.UncertaintyView: {"candidates": 6},
-    datasets.ModelNet: {"folder": COPY, "split": "test", "classes": ["bed"]},
-    datasets.ModelNetPoints: {"folder": COPY, "split": "test", "num_classes": 10},
-    datasets.OmniObject3D: {"folder": COPY, "classes": ["apple"]},
-    datasets.OmniObject3DPoints: {"folder": COPY, "num_points": 1024, "classes": ["apple"]},
-    datasets.ShapeNet: {"folder": COPY, "categories": ["car"], "models": ["a"]},
-    datasets.ShapeNetPart: {"folder": COPY, "split": "test", "categories": ["car"]},
+    readers.ModelNet: {"folder": COPY, "split": "test", "classes": ["bed"]},
+    readers.ModelNetPoints: {"folder": COPY, "split": "test", "num_classes": 10},
+    readers.OmniObject3D: {"folder": COPY, "classes": ["apple"]},
+    readers.OmniObject3DPoints: {"folder": COPY, "num_points": 1024, "classes": ["apple"]},
+    readers.ShapeNet: {"folder": COPY, "categories": ["car"], "models": ["a"]},
+    readers.ShapeNetPart: {"folder": COPY, "split": "test", "categories": ["car"]},
+    nbv.ValueBelow: {"value": 0.1},
     nbv.concatenate: {"first": CLOUD, "second": CLOUD},
     nbv.farthest_point_subsample: {"cloud": CLOUD, "count": 3},
     nbv.fibonacci_sphere: {"count": 6, "radius": 1.0, "min_elevation": 0.0},
-    nbv.imagination: {"name": "paper", "longest_side": 2.5, "quick": True, "volume": None, "solid": False},
     nbv.load_mesh: {"path": "nowhere.obj"},
     nbv.look_at: {"position": (0.0, 0.0, 2.5), "target": (0.0, 0.0, 0.0), "up": (0.0, 1.0, 0.0)},
     nbv.mesh_from_sdf: {"sdf": BALL, "grid": nbv.Grid(8)},

@@ -38,14 +38,13 @@ MAP = D + np.array([5e6, 4e5, 100.0])
 SEGMENTER, CLASSIFIER = (load_checkpoint(WEIGHTS / f"{name}.safetensors") for name in ("parts", "pyramid"))
 
 
-def planner(**changes):
-    settings = {"model": MODEL, "camera": SMALL, "acquisition": nbv.Coverage(), "search": nbv.DiscreteSearch(6)}
-    settings |= {"num_samples": 2, "grid": nbv.Grid(12), "capacity": 64, "max_views": 4}
-    return nbv.Planner(**(settings | changes))
+def planner(acquisition=nbv.Coverage(), grid=nbv.Grid(12), max_views=4):  # noqa: B008
+    imagination = nbv.Imagination(MODEL, grid, num_samples=2)
+    return nbv.Planner(acquisition, nbv.DiscreteSearch(6), SMALL, imagination, capacity=64, max_views=max_views)
 
 
 P = planner()
-STATE = P.init(POSE, SCAN)
+EVIDENCE = P.init(POSE, SCAN)
 FULL = planner(max_views=1).init(POSE, SCAN)
 
 
@@ -82,10 +81,10 @@ REFUSED = {
     "index of a single pose": (lambda: POSE[0], "a single one"),
     "iteration of a single pose": (lambda: list(POSE), "a single one"),
     "index beyond a batch of clouds": (lambda: SCANS[-7], "no index -7"),
-    "a evidence without room": (lambda: P.observe(FULL, POSE, SCAN), "max_views"),
-    "a evidence of another grid's extent": (
-        lambda: planner(grid=nbv.Grid(12, 1.5)).propose(STATE, KEY),
-        "reaches to 1.5",
+    "evidence without room": (lambda: P.observe(FULL, POSE, SCAN), "max_views"),
+    "evidence of another grid's extent": (
+        lambda: planner(grid=nbv.Grid(12, 1.5)).propose(EVIDENCE, KEY),
+        "carved on Grid(resolution=12, half_extent=1.5)",
     ),
     "a map's coordinates": (lambda: nbv.Frame.fit(MAP).to_scene(nbv.PointCloud.from_arrays(MAP, D)), "rounded"),
     "a map's pose": (lambda: nbv.Frame.fit(MAP).to_scene(nbv.look_at(MAP[0], MAP[1])), "rounded"),
@@ -93,7 +92,7 @@ REFUSED = {
     "points of the plane, mean": (lambda: POSTERIOR.mean(D[:, :2]), "(60, 2)"),
     "no points": (lambda: POSTERIOR.mean(None), "None"),
     "complex points": (lambda: POSTERIOR.mean(D + 1j), "real numbers"),
-    "a grid beyond the torus": (lambda: nbv.mean_mesh(MODEL, CLOUD, nbv.Grid(12, 9.4)), "9.4"),
+    "a grid beyond the torus": (lambda: nbv.Imagination(MODEL, nbv.Grid(12, 9.4)).mean_mesh(CLOUD), "9.4"),
     "nodes beyond the torus": (lambda: POSTERIOR.mean_on_grid(np.array([0.0, 10.0])), "10"),
     "nodes that are not finite": (lambda: POSTERIOR.sample(KEY, 2).on_grid(np.array([np.nan, 1.0])), "nan"),
     "a planner's grid beyond the torus": (lambda: planner(grid=nbv.Grid(12, 100.0)), "100"),
@@ -115,16 +114,20 @@ REFUSED = {
     "a ragged image": (lambda: nbv.PointCloud.from_depth([[2.0] * 6] * 5 + [[1]], SMALL, POSE), "numbers"),
     "a batch of scans": (lambda: P.init(None, SCANS), "batch"),
     "a batch of poses": (lambda: P.init(POSES, SCAN), "batch"),
-    "a batch of poses, observed": (lambda: P.observe(STATE, POSES, SCAN), "batch"),
-    "no pose": (lambda: P.observe(STATE, None, SCAN), "None"),
-    "no state": (lambda: P.propose(None, KEY), "the evidence is None"),
-    "a scan as a state": (lambda: P.propose(SCAN, KEY), "the evidence is a PointCloud"),
-    "a number as a key": (lambda: P.propose(STATE, 0), "jax.random.key"),
-    "several keys": (lambda: P.propose(STATE, jax.random.split(KEY, 2)), "jax.random.key"),
-    "text as surfaces": (lambda: P.choose(STATE, "x", KEY), "'x'"),
-    "text as a posterior": (lambda: P.imagination.sample(STATE, KEY, "x"), "'x'"),
+    "a batch of poses, observed": (lambda: P.observe(EVIDENCE, POSES, SCAN), "batch"),
+    "no pose": (lambda: P.observe(EVIDENCE, None, SCAN), "None"),
+    "no evidence": (lambda: P.propose(None, KEY), "the evidence is None"),
+    "text as evidence": (lambda: P.imagination.sample("x", KEY), "the evidence is 'x'"),
+    "a cloud as what was chosen from": (lambda: P.choose(SCAN, None, KEY), "the evidence is a PointCloud"),
+    "a scan as a pose": (lambda: P.init(SCAN, POSE), "the scan is a Pose"),
+    "a class as an acquisition": (lambda: planner(nbv.Coverage), "Coverage"),
+    "a number as an acquisition": (lambda: planner(3), "the acquisition is 3"),
+    "a number as a key": (lambda: P.propose(EVIDENCE, 0), "jax.random.key"),
+    "several keys": (lambda: P.propose(EVIDENCE, jax.random.split(KEY, 2)), "jax.random.key"),
+    "text as surfaces": (lambda: P.choose(EVIDENCE, "x", KEY), "'x'"),
+    "text as a posterior": (lambda: P.imagination.sample(EVIDENCE, KEY, "x"), "'x'"),
     "numbers as views": (lambda: list(P.replay([1, 2])), "pairs"),
-    "values of another grid": (lambda: P.imagination.carve(STATE, jnp.zeros((3, 3, 3))), "(3, 3, 3)"),
+    "values of another grid": (lambda: P.imagination.carve(EVIDENCE, jnp.zeros((3, 3, 3))), "(3, 3, 3)"),
     "a number as an episode's key": (lambda: nbv.simulate(P, BALL, POSE, 1, 0), "jax.random.key"),
     "a batch of first poses": (lambda: nbv.simulate(P, BALL, POSES, 1, KEY), "batch"),
     "rows that differ in number": (

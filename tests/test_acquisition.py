@@ -1,4 +1,4 @@
-"""Expected scores against an explicit double loop over samples and poses."""
+"""Expected values of acquisitions against an explicit double loop over samples and poses."""
 
 import equinox as eqx
 import jax
@@ -6,12 +6,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv.acquisition import ExpectedUtilityImprovement, Score, Several, expected_value
+from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement, Several, expected_value
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
+from jaxnbv.imagination import Imagination
+from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, GridSurface, scan
+from jaxnbv.search import DiscreteSearch, FarthestView
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Coverage
 
 CAMERA = Camera(height=6, width=7)
 GRID = Grid(20)
@@ -44,7 +49,7 @@ def height_in_numpy(points, normals):
     return np.sum(np.tanh(2 * points[:, 1].astype(np.float64) + normals[:, 2]) - 0.1)
 
 
-class Toy(Score):
+class Toy(Acquisition):
     """Counts the rows and weighs them by the context, the highest point of D."""
 
     def context(self, cloud):
@@ -63,7 +68,7 @@ def double_loop(surfaces, score):
     return values
 
 
-def test_a_score_against_the_double_loop(surfaces, cloud):
+def test_an_acquisition_against_the_double_loop(surfaces, cloud):
     highest = cloud.to_numpy()[0][:, 1].max()
     values = double_loop(surfaces, lambda points, _: np.abs(points[:, 1] - highest).sum())
     found = expected_value(Toy(), cloud, surfaces, CAMERA, POSES)
@@ -106,38 +111,71 @@ def test_the_context_is_computed_once_a_step(surfaces, cloud):
 
 def test_common_random_numbers(surfaces, cloud):
     """A pose's value does not depend on which others are asked for, nor on their order."""
-    score = ExpectedUtilityImprovement(height)
-    together = expected_value(score, cloud, surfaces, CAMERA, POSES)
+    acquisition = ExpectedUtilityImprovement(height)
+    together = expected_value(acquisition, cloud, surfaces, CAMERA, POSES)
     order = np.array([4, 1, 5])
-    some = expected_value(score, cloud, surfaces, CAMERA, POSES[order])
+    some = expected_value(acquisition, cloud, surfaces, CAMERA, POSES[order])
     np.testing.assert_allclose(some, together[order], rtol=1e-5, atol=1e-5)
     assert float(jnp.std(together)) > 0.1
 
 
 def test_utility_sees_the_union_of_both_clouds(cloud):
     seen = []
-    score = ExpectedUtilityImprovement(lambda c: seen.append(c) or jnp.sum(c.mask) * 1.0)
+    acquisition = ExpectedUtilityImprovement(lambda c: seen.append(c) or jnp.sum(c.mask) * 1.0)
     other = PointCloud.from_arrays([[1.0, 2.0, 3.0]], [[0.0, 0.0, 1.0]], capacity=4)
-    assert float(score(score.context(cloud), other)) == 1.0
+    assert float(acquisition(acquisition.context(cloud), other)) == 1.0
     expected = concatenate(cloud, other)
     for a, b in zip(jax.tree.leaves(seen[-1]), jax.tree.leaves(expected), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
 class Vector(Toy):
-    """A score that is a vector itself."""
+    """An acquisition that is a vector itself."""
 
     def __call__(self, context, scan):
         value = super().__call__(context, scan)
         return jnp.stack([value, -value])
 
 
-def test_several_scores_of_the_same_scans_are_each_that_of_its_own(surfaces, cloud):
-    scores = (Toy(), Vector(), ExpectedUtilityImprovement(height))
-    found = expected_value(Several(scores), cloud, surfaces, CAMERA, POSES)
-    toy, improvement = (expected_value(score, cloud, surfaces, CAMERA, POSES) for score in (scores[0], scores[2]))
+def test_several_acquisitions_of_the_same_scans_are_each_that_of_its_own(surfaces, cloud):
+    acquisitions = (Toy(), Vector(), ExpectedUtilityImprovement(height))
+    found = expected_value(Several(acquisitions), cloud, surfaces, CAMERA, POSES)
+    toy, improvement = (expected_value(acquisitions[i], cloud, surfaces, CAMERA, POSES) for i in (0, 2))
     np.testing.assert_allclose(found, jnp.stack([toy, toy, -toy, improvement], axis=1), rtol=1e-6)
     assert float(jnp.ptp(toy)) > 0 < float(jnp.ptp(improvement))
-    assert Several(scores).batch_size == min(score.batch_size for score in scores)
+    assert Several(acquisitions).batch_size == min(acquisition.batch_size for acquisition in acquisitions)
     with pytest.raises(InputError, match="it must be finite"):
         Several((Toy(), ExpectedUtilityImprovement(lambda cloud: jnp.nan * cloud.points.sum()))).check(cloud)
+
+
+class Highest(eqx.Module):
+    """A utility that is no function."""
+
+    def __call__(self, cloud):
+        return height(cloud)
+
+
+@pytest.mark.parametrize("utility", [height, Highest()])
+def test_a_plain_function_is_a_utility_whose_improvement_is_sought(utility, cloud):
+    imagination = Imagination(GeometricSPSR(0.1, truncation=6), Grid(16), num_samples=2)
+    plain, explicit = (
+        Planner(acquisition, DiscreteSearch(6), CAMERA, imagination, capacity=16)
+        for acquisition in (utility, ExpectedUtilityImprovement(utility))
+    )
+    assert plain == explicit
+    assert plain.acquisition.num_points is None
+    found, expected = (planner.propose(cloud, jax.random.key(1)) for planner in (plain, explicit))
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
+    assert np.ptp(np.asarray(found.values)) > 1e-3
+
+
+def test_what_is_an_acquisition_stays_it():
+    acquisition = Toy()
+    assert Planner(acquisition, FarthestView(6)).acquisition is acquisition
+
+
+@pytest.mark.parametrize("given", [Coverage, ExpectedUtilityImprovement, 3, "coverage", None])
+def test_what_is_neither_an_acquisition_nor_a_function_is_named(given):
+    name = given.__name__ if isinstance(given, type) else repr(given)
+    with pytest.raises(InputError, match=f"the acquisition is .*{name}.*: give one, such as Coverage"):
+        Planner(given, FarthestView(6))

@@ -67,9 +67,10 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
     arguments = ("run", "ring.ply", "--quick", "--views", "2", "--search", search, "--out", "mine", "--no-report")
     result = run_command(*arguments, *named, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
-    planner = json.loads((tmp_path / "mine" / "episode.json").read_text())["config"]["planner"]
-    assert planner["model"]["type"] == {"screened": "ScreenedSPSR", "paper": "GeometricSPSR"}[model]
-    assert (planner["carving"] is None) == (model == "paper")
+    config = json.loads((tmp_path / "mine" / "episode.json").read_text())["config"]
+    imagination = config["planner"]["imagination"]
+    assert imagination["model"]["type"] == {"screened": "ScreenedSPSR", "paper": "GeometricSPSR"}[model]
+    assert (imagination["carving"] is None) == (model == "paper")
     with np.load(tmp_path / "mine" / "view_01.npz") as view:
         positions, values = view["candidate_positions"], view["values"]
         if "trajectory_values" in view:

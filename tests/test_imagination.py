@@ -1,87 +1,264 @@
-"""The surfaces of a name."""
+"""The surfaces that are held possible: the presets, and what is made of evidence, against closed forms."""
+
+import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array, Float
 
 from jaxnbv import (
     Box,
+    Camera,
     Carving,
     Coverage,
+    Evidence,
+    FarthestView,
+    Fields,
     GeometricSPSR,
+    Grid,
+    Imagination,
     InputError,
+    OutsideBoundary,
     Planner,
     RandomView,
     ScreenedSPSR,
+    SDFSurface,
+    SurfaceModel,
+    SurfacePosterior,
+    Surroundings,
+    look_at,
+    scan,
+    scan_samples,
+    sdf,
 )
-from jaxnbv.imagination import Imagination, ModelName, imagination
+from jaxnbv.imagination import MODELS
+
+preset = Imagination.preset
 
 
 def test_the_papers_model_has_its_published_values_and_is_not_carved():
-    model, carving = imagination("paper")
-    assert isinstance(model, GeometricSPSR)
-    assert carving is None
+    paper = preset("paper")
+    assert isinstance(paper.model, GeometricSPSR)
+    assert paper.carving is None
     published = {"lengthscale": 0.005, "variance": 0.2, "noise": 0.01, "nu": 1.5, "truncation": 50}
     for name, value in published.items():
-        assert jnp.allclose(getattr(model, name), value), name
+        assert jnp.allclose(getattr(paper.model, name), value), name
 
 
 @pytest.mark.parametrize("side", [2.5, 1.25])
 def test_the_default_model_knows_the_box_and_carves_by_it(side):
-    model, carving = imagination(ModelName.SCREENED, side)
-    assert isinstance(model, ScreenedSPSR)
-    assert carving == Carving(Box.cube(side))
-    (volume,) = (source.volume for source in model.values if hasattr(source, "volume"))
+    screened = preset("screened", side)
+    assert isinstance(screened.model, ScreenedSPSR)
+    assert screened.carving == Carving(Box.cube(side))
+    (volume,) = (source.volume for source in screened.model.values if hasattr(source, "volume"))
     assert volume == Box.cube(side)
 
 
 def test_lengths_are_in_proportion_to_the_object():
-    large, small = (imagination("screened", side).model for side in (2.5, 1.25))
+    large, small = (preset("screened", side).model for side in (2.5, 1.25))
     assert eqx.tree_equal(large, ScreenedSPSR())
     assert jnp.allclose(small.base.lengthscale, 0.5 * large.base.lengthscale)
     assert jnp.array_equal(small.base.variance, large.base.variance)
-    assert small.bounding_radius == 0.5 * large.bounding_radius
+    assert small.offset == 0.5 * large.offset
     assert small.base.truncation > large.base.truncation
 
 
 def test_of_a_solid_body_nothing_follows_from_what_was_seen_empty():
-    kinds = [
-        [type(one).__name__ for one in imagination("screened", solid=solid).model.values] for solid in (False, True)
-    ]
+    kinds = [[type(one).__name__ for one in preset("screened", solid=solid).model.values] for solid in (False, True)]
     assert kinds == [["OutsideBoundary", "OnSurface", "SeenEmpty"], ["OutsideBoundary", "OnSurface"]]
 
 
 def test_a_volume_of_ones_own_is_that_of_both():
-    model, carving = imagination("screened", volume=Box.cube(1.0))
-    assert carving.volume == model.values[0].volume == Box.cube(1.0)
-    assert jnp.array_equal(model.base.lengthscale, ScreenedSPSR().base.lengthscale)
+    own = preset("screened", volume=Box.cube(1.0))
+    assert own.carving.volume == own.model.values[0].volume == Box.cube(1.0)
+    assert jnp.array_equal(own.model.base.lengthscale, ScreenedSPSR().base.lengthscale)
 
 
 def test_quick_surfaces_have_fewer_frequencies():
-    for name in ModelName:
-        full, quick = (imagination(name, quick=quick).model for quick in (False, True))
+    for name in MODELS:
+        full, quick = (preset(name, quick=quick).model for quick in (False, True))
         truncations = [getattr(model, "base", model).truncation for model in (full, quick)]
         assert truncations[1] < truncations[0]
 
 
-def test_a_planner_takes_what_it_gives():
-    model, carving = imagination("paper")
-    planner = Planner(Coverage(), RandomView(), imagination=Imagination(model, carving=carving))
-    assert planner.imagination.carving is None
+def test_the_preset_is_the_default():
+    assert eqx.tree_equal(preset(), Imagination())
+    assert Planner(Coverage(), RandomView(), imagination=preset("paper")).imagination.carving is None
 
 
 def test_another_name_is_refused():
     with pytest.raises(InputError, match=r"no model 'mine': choose from screened, paper"):
-        imagination("mine")
+        preset("mine")
     with pytest.raises(InputError, match=r"longest side is -1\.0"):
-        imagination("screened", -1.0)
+        preset("screened", -1.0)
 
 
 @pytest.mark.parametrize("quick", [False, True])
 def test_a_lengthscale_takes_the_place_of_the_short_one(quick):
-    plain, given = (imagination("screened", quick=quick, lengthscale=scale).model.base for scale in (None, 0.03))
+    plain, given = (preset("screened", quick=quick, lengthscale=scale).model.base for scale in (None, 0.03))
     np.testing.assert_allclose(given.lengthscale, [0.03, plain.lengthscale[1]])
-    assert float(imagination("paper", quick=quick, lengthscale=0.03).model.lengthscale) == pytest.approx(0.03)
+    assert float(preset("paper", quick=quick, lengthscale=0.03).model.lengthscale) == pytest.approx(0.03)
     with pytest.raises(InputError, match=r"lengthscale is -1\.0"):
-        imagination("paper", lengthscale=-1.0)
+        preset("paper", lengthscale=-1.0)
+
+
+RADII = 0.25 + 0.15 * np.arange(8)
+GRID, CAMERA, KEY = Grid(26, 1.6), Camera(height=30, width=30), jax.random.key(2)
+POSES = look_at(jnp.array([[0.0, 0.2, 2.5], [2.3, 0.0, -0.9]]))
+SCANS = scan(SDFSurface(sdf.Sphere(0.6)), CAMERA, POSES)
+AWAY = np.linalg.norm(np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1), axis=-1)
+# Few of the nodes are so near to one of the balls that rounding decides.
+SHARE = (AWAY[..., None] < RADII).mean(axis=-1)
+
+
+class Balls(Fields):
+    def __call__(self, x):
+        return 0.3 + jnp.linalg.norm(x, axis=-1) - jnp.asarray(RADII, x.dtype)[:, None]
+
+
+class BallsPosterior(SurfacePosterior):
+    """Whatever was seen, balls of eight radii, of the level 0.3."""
+
+    level: Float[Array, ""]
+
+    def sample(self, key, num_samples):
+        assert num_samples == len(RADII)
+        return Balls()
+
+    def drawn(self, num_samples=8):
+        return self
+
+    def mean(self, x):
+        return 0.3 + jnp.linalg.norm(x, axis=-1) - RADII.mean()
+
+
+class BallsModel(SurfaceModel):
+    def condition(self, evidence):
+        return BallsPosterior(jnp.asarray(0.3))
+
+
+def balls(carving=Carving(), surroundings=None):  # noqa: B008
+    return Imagination(BallsModel(), GRID, len(RADII), carving, surroundings)
+
+
+def seen(imagination):
+    """The evidence after both scans."""
+    evidence = imagination.record(imagination.begin(SCANS[0], 200, 4), POSES[0], SCANS[0], CAMERA)
+    return imagination.observe(evidence, POSES[1], SCANS[1], CAMERA)
+
+
+def test_the_probability_is_the_share_of_the_samples_that_hold_a_node():
+    for evidence in (SCANS[0], seen(balls(None))):
+        np.testing.assert_allclose(balls(None).probability_inside(evidence), SHARE, atol=1e-6)
+    assert len(np.unique(SHARE)) == 9
+    # Of a cloud alone nothing is known to be empty, but the volume is.
+    small = balls(Carving(Box.cube(0.8)))
+    np.testing.assert_allclose(
+        small.probability_inside(SCANS[0]), np.where(small.carving.outside(GRID), 0.0, SHARE), atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("surroundings", [None, Surroundings((sdf.HalfSpace([0.0, -0.3, 0.0], [0.0, 1.0, 0.0]),))])
+def test_nothing_is_imagined_where_the_object_cannot_be(surroundings):
+    imagination = balls(surroundings=surroundings)
+    evidence = seen(imagination)
+    below = np.asarray(GRID.axis)[None, :, None] < (-np.inf if surroundings is None else -0.3)
+    nowhere = np.asarray(evidence.seen_empty) | np.asarray(imagination.carving.outside(GRID)) | below
+    assert (nowhere & (SHARE > 0)).sum() > 50
+    np.testing.assert_allclose(imagination.probability_inside(evidence), np.where(nowhere, 0.0, SHARE), atol=1e-6)
+    values, mean = np.asarray(imagination.sample(evidence, KEY).values), np.asarray(imagination.mean(evidence))
+    assert (values[:, nowhere] > 0).all()
+    assert (mean[nowhere] > 0).all()
+    np.testing.assert_allclose(mean[~nowhere], (AWAY - RADII.mean())[~nowhere], atol=1e-5)
+    np.testing.assert_allclose(values[:, ~nowhere], (AWAY - RADII[:, None, None, None])[:, ~nowhere], atol=1e-5)
+
+
+def test_a_posterior_at_hand_is_not_asked_for_again():
+    imagination, evidence = Imagination(GeometricSPSR(0.1, truncation=6), GRID, 3), SCANS[0]
+    posterior = imagination.posterior(evidence)
+    np.testing.assert_array_equal(
+        imagination.sample(evidence, KEY, posterior).values, imagination.sample(evidence, KEY).values
+    )
+    other = BallsPosterior(jnp.asarray(0.3))
+    np.testing.assert_allclose(imagination.mean(evidence, other), balls().mean(evidence), atol=1e-6)
+
+
+def test_scans_of_samples_end_at_the_surroundings():
+    wall = Surroundings((sdf.Cuboid([0.1, 1.0, 1.0]).translate([1.4, 0.0, -0.5]),))
+    for surroundings in (None, wall):
+        imagination = balls(surroundings=surroundings)
+        surfaces = imagination.sample(SCANS[0], KEY)
+        found = imagination.scan(surfaces, CAMERA, POSES)
+        barrier = None if surroundings is None else wall.barrier(CAMERA, POSES)
+        expected = scan_samples(surfaces, CAMERA, POSES, barrier)
+        np.testing.assert_array_equal(found.mask, expected.mask)
+        np.testing.assert_allclose(found.points, expected.points, atol=1e-5)
+        assert found.mask[:, 0].any()
+        assert found.mask[:, 1].any() == (surroundings is None)
+
+
+def test_another_box_takes_the_place_of_the_default_one_alone():
+    box, own = Box.cube(1.4), Box.cube(2.0)
+    model = ScreenedSPSR(values=(OutsideBoundary(), OutsideBoundary(own, 77), OutsideBoundary(value=2.0)))
+    before = Imagination(model, GRID, 5, Carving(margin_voxels=1.5))
+    after = before.within(box)
+    assert [source.volume for source in after.model.values] == [box, own, box]
+    assert after.carving == Carving(box, 1.5)
+    # The rest is as it was.
+    back = [dataclasses.replace(one, volume=Box()) for one in (after.model.values[0], after.model.values[2])]
+    values = (back[0], after.model.values[1], back[1])
+    model = dataclasses.replace(after.model, values=values)
+    assert eqx.tree_equal(dataclasses.replace(after, model=model, carving=before.carving), before)
+    kept = Imagination(carving=Carving(own)).within(box)
+    assert kept.carving.volume == own
+    assert eqx.tree_equal(preset("screened", 1.25).within(box), preset("screened", 1.25))
+    assert eqx.tree_equal(preset("screened").within(box).carving, Carving(box))
+
+
+@pytest.mark.parametrize("made_by", [balls(None), dataclasses.replace(balls(), grid=Grid(26, 1.5))])
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda own, evidence: own.known(evidence),
+        lambda own, evidence: own.posterior(evidence),
+        lambda own, evidence: own.sample(evidence, KEY),
+        lambda own, evidence: own.carve(evidence, jnp.zeros((26,) * 3)),
+        lambda own, evidence: own.mean(evidence),
+        lambda own, evidence: own.probability_inside(evidence),
+        lambda own, evidence: own.mean_mesh(evidence),
+        lambda own, evidence: own.observe(evidence, POSES[1], SCANS[1], CAMERA),
+        lambda own, evidence: own.record(evidence, POSES[1], SCANS[1], CAMERA),
+    ],
+)
+def test_evidence_of_another_grid_is_refused(made_by, use):
+    with pytest.raises(InputError, match=r"surfaces are carved on Grid\(resolution=26, half_extent=1\.6\)"):
+        use(balls(), seen(made_by))
+    use(balls(), seen(balls()))
+
+
+def test_where_nothing_is_carved_evidence_of_any_grid_will_do():
+    known = balls(None).known(seen(balls()))
+    assert known.seen_empty is None
+    np.testing.assert_array_equal(known.cloud.points, seen(balls()).cloud.points)
+
+
+@pytest.mark.parametrize("carving", [None, Carving()])
+def test_evidence_is_that_of_a_planner(carving):
+    imagination = balls(carving)
+    planner = Planner(Coverage(), FarthestView(6), CAMERA, imagination, capacity=200, max_views=4)
+    evidence = planner.observe(planner.init(POSES[0], SCANS[0]), POSES[1], SCANS[1])
+    found = seen(imagination)
+    assert eqx.tree_equal(found, evidence)
+    assert int(found.num_views) == 2
+    assert int(found.cloud.count) == 200
+    begun = imagination.begin(SCANS[0], 200, 4)
+    assert eqx.tree_equal(begun, planner.init(None, SCANS[0]))
+    assert eqx.tree_equal(imagination.known(SCANS[0]), Evidence.before_views(SCANS[0], 0, carving and GRID))
+
+
+def test_values_of_another_grid_are_refused():
+    with pytest.raises(InputError, match=r"\(25, 25, 25\).* but the grid has \(26, 26, 26\) nodes"):
+        balls().carve(SCANS[0], jnp.zeros((25,) * 3))

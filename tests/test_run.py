@@ -89,9 +89,9 @@ def test_what_is_asked_for_is_taken(ring):
         "fov": np.degrees(camera["fov"]),
         "radius": candidates["radius"],
         "rays": camera["height"],
-        "samples": planner["num_samples"],
-        "candidates": candidates["number"],
-        "lengthscale": planner["model"]["base"]["lengthscale"][0],
+        "samples": planner["imagination"]["num_samples"],
+        "candidates": candidates["num_poses"],
+        "lengthscale": planner["imagination"]["model"]["base"]["lengthscale"][0],
     }
     assert camera["width"] == 33
     assert found == pytest.approx(asked)

@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 
 import jaxnbv
-from jaxnbv import cli, datasets
+from jaxnbv import cli, viz
+from jaxnbv.studies import readers, scenes
 
 HEAVY = {"jax", "equinox", "scipy", "matplotlib", "trimesh"}
-LAZY = pytest.mark.parametrize("package", [jaxnbv, datasets, cli.actions], ids=lambda package: package.__name__)
+PACKAGES = [jaxnbv, readers, scenes, viz, cli.actions]
+LAZY = pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.__name__)
 
 
 def public_imports(package) -> list[ast.stmt]:
@@ -57,6 +59,16 @@ def test_importing_the_package_imports_no_jax_until_a_name_is_used():
     assert result.returncode == 0, result.stderr
 
 
+def test_a_session_at_a_robot_loads_no_pictures_studies_or_networks():
+    """Nor does an episode, until it is drawn."""
+    script = "import jaxnbv, sys; jaxnbv.Session, jaxnbv.simulate, jaxnbv.DiscreteSearch; print(*sys.modules)"
+    result = run_fresh("-c", script)
+    assert result.returncode == 0, result.stderr
+    loaded = {*result.stdout.split()}
+    assert {"jax", "jaxnbv.planning.session", "jaxnbv.storage"} <= loaded
+    assert loaded & {"plotly", "matplotlib", "viser", "jaxnbv.viz", "jaxnbv.studies", "jaxnbv.networks"} == set()
+
+
 def test_version_is_that_of_the_distribution():
     version = importlib.metadata.version("jaxnbv")
     assert jaxnbv.__version__ == version
@@ -86,7 +98,8 @@ def test_type_checkers_see_every_public_name(package):
 def test_every_public_module_can_be_the_first_that_is_used():
     """Modules that import each other in a circle would work after some first names, not after others."""
     imports = public_imports(jaxnbv)
-    first_names = {statement.module or statement.names[0].name: statement.names[0].name for statement in imports}
+    named = [(statement.module, statement.names[0].name) for statement in imports]
+    first_names = {name if inspect.ismodule(getattr(jaxnbv, name)) else module: name for module, name in named}
     script = f"""
 import sys
 for name in {[*first_names.values()]}:
@@ -101,4 +114,4 @@ for name in {[*first_names.values()]}:
 
 def test_shapes_are_checked_in_modules_that_are_imported_late():
     with pytest.raises(jaxtyping.TypeCheckError):
-        datasets.unit_sphere(np.arange(3.0))
+        readers.unit_sphere(np.arange(3.0))

@@ -8,7 +8,10 @@ from scipy.spatial import cKDTree
 
 from jaxnbv.checks import AnyArray, as_numbers, require
 from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, mesh_from_sdf
+from jaxnbv.scanning.grid import Grid
+from jaxnbv.scanning.mesh import TriangleMesh, mesh_from_sdf
+from jaxnbv.scanning.sphere_tracing import SDFSurface
+from jaxnbv.scanning.surface import Surface
 
 # Of the authors: points that each of the two surfaces is sampled at.
 SURFACE_POINTS = 20_000

@@ -150,7 +150,7 @@ def _choice(choice: Choice, quantity: Quantity) -> dict:
         "directions": choice.directions.round(2).tolist(),
         "values": [None if math.isnan(value) else value for value in choice.values.tolist()],
         "errors": None if choice.errors is None else _numbers(choice.errors),
-        "level": [] if choice.tied is None or not rings_tied(choice) else np.flatnonzero(choice.tied).tolist(),
+        "tied": [] if choice.tied is None or not rings_tied(choice) else np.flatnonzero(choice.tied).tolist(),
         "ranks": ranks.tolist(),
         "chosen": sphere.mollweide(choice.chosen[None]).round(4)[0].tolist(),
         "value": choice.value,

@@ -15,11 +15,9 @@ from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
-from jaxnbv.imagination import Imagination
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, GridSurface, TriangleMesh, scan
 from jaxnbv.search import GradientSearch
-from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks.diffusion import HeatProblem
 from jaxnbv.tasks.heat import ColdestPoint, body_temperature, coldest_point
 

@@ -216,7 +216,7 @@ def test_a_record_without_standard_errors_gives_a_page_too(episode):
     shown = payload(old, CAMERA)["views"][1]["choice"]
     assert shown["errors"] is None
     assert shown["error"] is None
-    assert shown["level"] == []
+    assert shown["tied"] == []
     with mpl.rc_context(STYLE):
         for draw in figures_of(old, CAMERA, Stills(old)).values():
             check_letters(draw())

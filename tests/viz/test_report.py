@@ -152,7 +152,7 @@ def test_the_sentence_tells_the_numbers_of_the_step(episode, data):
     before, after = (100 * data.views[i].coverage for i in (0, 1))
     assert f"coverage went from {before:.0f} % to {after:.0f} %" in shown.sentence
     assert shown.choice.rank == 1
-    assert shown.choice.level == view.proposal.num_tied
+    assert shown.choice.num_tied == view.proposal.num_tied
     assert "two standard errors" in shown.sentence
 
 
@@ -209,10 +209,8 @@ def test_the_surface_of_the_mean_is_carved():
 
 
 def test_a_mean_without_a_surface_is_drawn_without_one(tmp_path, episode, data):
-    planner = eqx.tree_at(lambda p: p.model, episode.planner, SphereModel())
-    far = eqx.tree_at(lambda p: (p.grid, p.carving), planner, (nbv.Grid(40, 0.2), None))
-    evidence = eqx.tree_at(lambda s: s.seen_empty, episode.evidence_after(1), None)
-    assert mean_surface(far.imagination, evidence) is None
+    far = nbv.Imagination(SphereModel(), nbv.Grid(40, 0.2), carving=None)
+    assert mean_surface(far, episode.evidence_after(1)) is None
     bare = eqx.tree_at(lambda d: [v.surface for v in d.views], data, [None] * 3, is_leaf=lambda x: x is None)
     assert all(path.stat().st_size > 5000 for path in write_figures(bare, CAMERA, tmp_path, progress=False))
 

@@ -41,12 +41,12 @@ class Walks(Search):
 
     def propose(self, problem, key):
         candidates = sphere_candidates(4)
-        values = problem.acquisition(candidates)
+        values = problem.values(candidates)
         t = jnp.linspace(0.0, 0.7, 6)[:, None]
-        away = (1.0 - t) * candidates.position[:, None] - t * problem.visited.position[0]
+        away = (1.0 - t) * candidates.position[:, None] - t * problem.evidence.poses.position[0]
         poses = look_at(2.5 * away / jnp.linalg.norm(away, axis=-1, keepdims=True))
         flat = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), poses)
-        ways = Trajectories(poses, problem.acquisition(flat).reshape(4, 6))
+        ways = Trajectories(poses, problem.values(flat).reshape(4, 6))
         found = best_unvisited(problem, *joined((candidates, values), ways.flat))
         return nbv.Proposal(found.pose, found.value, candidates, found.values[:4], ways)
 
@@ -265,9 +265,9 @@ def test_pictures_of_a_search_in_space(spatial, spatial_data, tmp_path):
     farthest = np.linalg.norm(ways.poses.position, axis=-1).max()
     # Cameras are drawn nearer than they stood, and so all of them are in the picture.
     stage = page_data(text)["stage"]
-    assert stage["reach"] >= 1.09 * stage["pull"] * farthest
+    assert stage["extent"] >= 1.09 * stage["pull"] * farthest
     assert all(
-        stage["reach"] >= 1.09 * view["pull"] * np.linalg.norm(view["frustum"][0][0])
+        stage["extent"] >= 1.09 * view["pull"] * np.linalg.norm(view["frustum"][0][0])
         for view in page_data(text)["views"]
     )
 
