@@ -234,7 +234,6 @@ class OneValue(Fields):
         ({"means": None}, r"sample_about's means is None; give Fields"),
         ({"means": OneValue()}, r"mean functions give values \(\d+,\) at \d+ points"),
     ],
-    ids=str,
 )
 @BOTH
 def test_what_cannot_be_sampled_about_is_refused(kind, change, message):
