@@ -34,6 +34,8 @@ COVERAGE_RADIUS = 0.05
 _DEVIATION_ANCHORS = 256
 _SLOPE_ANCHORS = 1024
 _SLOPE_STEP = 0.005
+# Of a posterior without closed forms, whose whole functions are laid on the grid.
+_SAMPLES = 16
 # Of the distance to the nearest point. On a cow after one to five views the surface is off by 0.2 to 0.3 of it (root
 # mean square) between 0.1 and 0.4 from the points, two to three of the posterior's standard deviations; the other way
 # round, from the truth to the surface, which may lack a part, by 0.4 to 0.7.
@@ -234,7 +236,7 @@ def choice_of(proposal: Proposal, wider: SphereMap | None = None) -> Choice:
 def mean_surface(imagination: Imagination, evidence: Evidence) -> MeanSurface | None:
     """The surface of the posterior mean given the evidence, carved as the samples are, with its standard deviation;
     None if the grid holds none. A posterior that has only samples is drawn from a few fixed ones."""
-    posterior = imagination.posterior(evidence).drawn()
+    posterior = imagination.posterior(evidence).drawn(_SAMPLES)
     found = level_triangles(np.array(imagination.mean(evidence, posterior)), imagination.grid)
     if found is None:
         return None

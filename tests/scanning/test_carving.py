@@ -83,7 +83,7 @@ def test_no_sample_is_inside_what_was_seen_empty_nor_outside_the_volume():
     assert raw_evidence.seen_empty is None
     expected = np.zeros((30,) * 3, bool)
     for pose in POSES:
-        seen = SEE(CARVING, SMALL_GRID, scan(SOLIDS["ball"], planner.camera, pose), planner.camera, pose)
+        seen = SEE(CARVING, SMALL_GRID, pose, scan(SOLIDS["ball"], planner.camera, pose), planner.camera)
         assert seen.sum() > 200
         expected |= np.asarray(seen)
     np.testing.assert_array_equal(evidence.seen_empty, expected)
@@ -200,7 +200,7 @@ def test_carved_samples_keep_a_thin_sheet_that_was_seen_from_both_sides():
 def test_a_scan_of_another_camera_needs_that_camera():
     planner, other, pose = planner_of(), Camera(height=20, width=36, fov=0.6), POSES[1]
     seen = scan(SOLIDS["ball"], other, pose)
-    expected = np.asarray(SEE(CARVING, SMALL_GRID, seen, other, pose))
+    expected = np.asarray(SEE(CARVING, SMALL_GRID, pose, seen, other))
     column, row, _ = image(nodes_of(SMALL_GRID)[expected], other, pose)
     # Wider than the planner's own image.
     assert np.ptp(column) > 25

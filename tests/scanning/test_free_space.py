@@ -112,7 +112,7 @@ def test_marked_nodes_are_in_view_outside_the_object_and_a_margin_from_it():
     """The demo object: thin, hollow and full of edges. Distances are to the dense mesh that was scanned."""
     camera, poses, nodes = Camera(height=48, width=48), look_at(fibonacci_sphere(6, 2.8)), nodes_of(GRID)
     mesh = mesh_from_sdf(demo_object().sdf, Grid(60, 1.4))
-    empty = np.stack([SEE(Carving(), GRID, scan(mesh, camera, poses[i]), camera, poses[i]) for i in range(6)])
+    empty = np.stack([SEE(Carving(), GRID, poses[i], scan(mesh, camera, poses[i]), camera) for i in range(6)])
     for i in range(6):
         column, row, ahead = image(nodes[empty[i]], camera, poses[i])
         assert (ahead > 2.0 * GRID.spacing).all()
@@ -171,14 +171,14 @@ def with_invalid(cloud, invalid):
 
 
 def test_invalid_pixels_carve_nothing():
-    whole = np.asarray(SEE(Carving(), GRID, BALL_SCAN, CAMERA, POSE))
-    none = SEE(Carving(), GRID, with_invalid(BALL_SCAN, np.ones(CAMERA.num_rays, bool)), CAMERA, POSE)
+    whole = np.asarray(SEE(Carving(), GRID, POSE, BALL_SCAN, CAMERA))
+    none = SEE(Carving(), GRID, POSE, with_invalid(BALL_SCAN, np.ones(CAMERA.num_rays, bool)), CAMERA)
     assert not none.any()
     counts = [whole.sum()]
     # A few specks, then the left half of the image.
     left = np.tile(np.arange(CAMERA.width) < 35, CAMERA.height)
     for invalid in (RNG.random(CAMERA.num_rays) < 0.002, left):
-        less = np.asarray(SEE(Carving(), GRID, with_invalid(BALL_SCAN, invalid), CAMERA, POSE))
+        less = np.asarray(SEE(Carving(), GRID, POSE, with_invalid(BALL_SCAN, invalid), CAMERA))
         assert not (less & ~whole).any()
         counts.append(less.sum())
     assert 0 < counts[1] < 0.98 * counts[0]
@@ -201,8 +201,8 @@ def test_a_depth_image_carves_what_the_scan_carves_and_says_which_rays_missed():
     np.testing.assert_array_equal(cloud.missed, expected)
     assert not (np.asarray(cloud.mask) & expected).any()
     assert not cloud.mask[69]
-    from_depth = np.asarray(SEE(Carving(), GRID, cloud, CAMERA, POSE))
-    from_scan = SEE(Carving(), GRID, with_invalid(BALL_SCAN, ~np.asarray(cloud.mask | cloud.missed)), CAMERA, POSE)
+    from_depth = np.asarray(SEE(Carving(), GRID, POSE, cloud, CAMERA))
+    from_scan = SEE(Carving(), GRID, POSE, with_invalid(BALL_SCAN, ~np.asarray(cloud.mask | cloud.missed)), CAMERA)
     assert from_depth.sum() > 1000
     # Depths are rounded, so a node exactly a margin before a hit may fall either way.
     assert (from_depth != np.asarray(from_scan)).sum() <= 3
@@ -216,7 +216,7 @@ def test_noise_and_frames_keep_the_rays_that_missed():
 
 def test_the_outside_is_what_lies_a_margin_beyond_the_volume():
     grid, half = Grid(30), np.array([0.6, 0.9, 1.1])
-    carving = Carving(Box(tuple((-half).tolist()), tuple(half.tolist())), margin=0.7)
+    carving = Carving(Box(tuple((-half).tolist()), tuple(half.tolist())), margin_voxels=0.7)
     beyond = np.maximum(np.abs(nodes_of(grid)) - half, 0.0)
     np.testing.assert_array_equal(carving.outside(grid), np.linalg.norm(beyond, axis=-1) > 2 * 0.7 * grid.spacing)
     in_ball = np.linalg.norm(nodes_of(grid), axis=-1) - 1.0
@@ -237,6 +237,6 @@ def test_carved_values_are_positive_where_empty_and_twice_the_largest_about():
 
 @pytest.mark.parametrize("margin", [0.49, 0.0, -1.0, math.nan, math.inf])
 def test_a_margin_below_half_a_voxel_or_not_finite_is_refused(margin):
-    refused = rf"margin of the carving is {margin} voxels.*at least 0\.5|margin is {margin}; it must be a finite number"
+    refused = rf"carving is {margin} voxels.*at least 0\.5|margin_voxels is {margin}; it must be a finite number"
     with pytest.raises(ValueError, match=refused):
         Carving(margin_voxels=margin)
