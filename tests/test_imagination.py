@@ -128,9 +128,6 @@ class BallsPosterior(SurfacePosterior):
         assert num_samples == len(RADII)
         return Balls()
 
-    def drawn(self, num_samples=8):
-        return self
-
     def mean(self, x):
         return 0.3 + jnp.linalg.norm(x, axis=-1) - RADII.mean()
 

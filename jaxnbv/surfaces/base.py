@@ -102,7 +102,7 @@ class SurfacePosterior(eqx.Module):
     """p(f | D): the surface is where f equals `level`, and f is greater outside.
 
     An implementation gives `level` and `sample`. One that has closed forms overrides `mean`, `variance` and
-    `probability_inside` by them, and `drawn`, by which all four are estimated here, to give itself.
+    `probability_inside` by them; those that it leaves are estimated from samples drawn under a fixed key.
     """
 
     level: eqx.AbstractVar[Float[Array, ""]]
@@ -112,26 +112,29 @@ class SurfacePosterior(eqx.Module):
         """`num_samples` independent samples of the whole function f."""
 
     def drawn(self, num_samples: int = 64) -> "SurfacePosterior":
-        """The posterior itself where it has closed forms; here with samples drawn once, under a fixed key, by which its
-        moments are estimated. Who asks for more than one moment asks what this gives: the samples are then drawn once.
+        """The posterior itself where it has its own `mean`; else with samples drawn once, under a fixed key, by which
+        its moments are estimated. Ask it for more than one moment: the samples are then drawn once.
 
         **Raises:** `ValueError` if `num_samples` < 2.
         """
         check_type(num_samples, int, "the number of samples")
         require(num_samples >= 2, f"a variance of {num_samples} samples was asked for; ask for at least two")
-        return SampledPosterior(self.level, self, self.sample(jax.random.key(0), num_samples))
+        return self if type(self).mean is not SurfacePosterior.mean else self._estimated(num_samples)
 
     def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """E f(x), here as `drawn` estimates it."""
-        return self.drawn().mean(x)
+        """E f(x), here as samples estimate it."""
+        return self._estimated().mean(x)
 
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """Var f(x), here as `drawn` estimates it."""
-        return self.drawn().variance(x)
+        """Var f(x), here as samples estimate it."""
+        return self._estimated().variance(x)
 
     def probability_inside(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """P(f(x) < level), here as `drawn` estimates it."""
-        return self.drawn().probability_inside(x)
+        """P(f(x) < level), here as samples estimate it."""
+        return self._estimated().probability_inside(x)
+
+    def _estimated(self, num_samples: int = 64) -> "SampledPosterior":
+        return SampledPosterior(self.level, self, self.sample(jax.random.key(0), num_samples))
 
     @on_grid_of_torus
     @eqx.filter_jit
@@ -160,10 +163,6 @@ class SampledPosterior(SurfacePosterior):
     def sample(self, key: PRNGKeyArray, num_samples: int) -> Fields:
         """`num_samples` independent samples of the posterior, as its own `sample` draws them."""
         return self.posterior.sample(key, num_samples)
-
-    def drawn(self, num_samples: int = 64) -> "SampledPosterior":
-        """Itself, of as many samples as were drawn."""
-        return self
 
     def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
         """Mean of the samples at the points x (scene coordinates)."""

@@ -76,10 +76,6 @@ class TrigonometricPosterior(SurfacePosterior):
         """E f as a single field."""
         return TrigonometricFields(self.mean_coefficients[None])
 
-    def drawn(self, num_samples: int = 64) -> "TrigonometricPosterior":
-        """Itself: its moments have closed forms."""
-        return self
-
     @on_torus
     @eqx.filter_jit
     def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:

@@ -75,9 +75,6 @@ class BallsPosterior(SurfacePosterior):
     def sample(self, key, num_samples):
         pytest.fail("the mesh of the mean needs no samples")
 
-    def drawn(self, num_samples=64):
-        return self
-
     def mean(self, x):
         away = jnp.linalg.norm(x - jnp.array([-0.6, 0.0, 0.0]), axis=-1) - 0.5
         return jnp.minimum(away, jnp.linalg.norm(x - jnp.array([0.6, 0.3, 0.0]), axis=-1) - 0.3) + 0.25

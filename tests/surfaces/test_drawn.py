@@ -168,3 +168,19 @@ def test_a_variance_of_one_sample_is_refused():
     for count in (1, 0, -3):
         with pytest.raises(InputError, match=f"variance of {count} samples was asked for"):
             lines().drawn(count)
+
+
+class LinesOfKnownMean(Lines):
+    """They know their mean, x + 0.5 say, and nothing else."""
+
+    def mean(self, x):
+        return jnp.asarray(x)[:, 0] + 0.5
+
+
+def test_a_mean_of_its_own_is_that_of_the_grid_and_the_rest_is_estimated():
+    posterior, axis = LinesOfKnownMean(jnp.asarray(0.4), Calls()), np.linspace(-1.0, 1.2, 5, dtype=np.float32)
+    assert posterior.drawn(8) is posterior
+    expected = np.broadcast_to((axis + 0.5)[:, None, None], (5, 5, 5))
+    np.testing.assert_allclose(posterior.mean_on_grid(axis), expected, atol=1e-6)
+    assert posterior.calls.numbers == []
+    np.testing.assert_array_equal(posterior.variance(X), lines().variance(X))
