@@ -18,7 +18,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, check_oriented, check_single, concatenate, limit_capacity
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.geometry.volume import Box, Volume
+from jaxnbv.geometry.volume import Box, Volume, bounding_box
 from jaxnbv.scanning import (
     Carving,
     Evidence,
@@ -33,14 +33,18 @@ from jaxnbv.scanning import (
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.surfaces import (
     GeometricSPSR,
+    KnownShapes,
     OnSurface,
     OutsideBoundary,
     ScreenedSPSR,
     SeenEmpty,
+    ShapeBank,
+    ShapePoses,
     SurfaceModel,
     SurfacePosterior,
 )
 from jaxnbv.surfaces.base import HALF_WIDTH
+from jaxnbv.surfaces.known_shapes import short_ranged
 
 MODELS = ("screened", "paper")
 """The names of `Imagination.preset`."""
@@ -120,6 +124,30 @@ class Imagination(eqx.Module):
         base = GeometricSPSR(lengthscales, usual.base.variance, truncation)
         values = (OutsideBoundary(volume), OnSurface(), *(() if solid else (SeenEmpty(),)))
         return cls(ScreenedSPSR(base, values, offset=scale * usual.offset), carving=Carving(volume))
+
+    def knowing(self, bank: ShapeBank, poses: ShapePoses) -> "Imagination":
+        """The same of one who has seen these shapes before: `KnownShapes`, registered within the volume, with this
+        model as the answer to "none of these".
+
+        - `poses`: how the shapes can stand in the scene.
+        """
+        box = Box() if self.carving is None else bounding_box(self.carving.volume)
+        scale = max(high - low for low, high in zip(box.low, box.high, strict=True)) / 2.5
+        usual = short_ranged()
+        base = dataclasses.replace(
+            usual.base,
+            lengthscale=scale * usual.base.lengthscale,
+            truncation=min(round(usual.base.truncation / scale), self.model.base.truncation)
+            if isinstance(self.model, ScreenedSPSR)
+            else usual.base.truncation,
+        )
+        residual = dataclasses.replace(usual, base=base, offset=scale * usual.offset)
+        return dataclasses.replace(self, model=KnownShapes(bank, residual, poses, box, self.model))
+
+    @property
+    def unknowing(self) -> "Imagination":
+        """The same without its known shapes, if it has any."""
+        return dataclasses.replace(self, model=self.model.unknown) if isinstance(self.model, KnownShapes) else self
 
     def within(self, volume: Box) -> "Imagination":
         """The same for an object in another box: what holds for the default one, `Box()`, holds for this."""

@@ -9,12 +9,13 @@ from typing import Annotated, Any
 import typer
 
 from jaxnbv.cli.asked import DEFAULT_FIRST, Device
-from jaxnbv.cli.registry import MODELS, SEARCHES, STOPS, TASKS
+from jaxnbv.cli.registry import BANKS, MODELS, SEARCHES, STOPS, STUDY_MODELS, TASKS
 from jaxnbv.studies.scenes import Framing
 
 # The registries are the enumerations.
 Task = StrEnum("Task", {name.replace("-", "_").upper(): name for name in TASKS})  # type: ignore[misc]
 ModelName = StrEnum("ModelName", {name.upper(): name for name in MODELS})  # type: ignore[misc]
+StudyModel = StrEnum("StudyModel", {name.upper(): name for name in STUDY_MODELS})  # type: ignore[misc]
 SearchName = StrEnum("SearchName", {name.replace("-", "_").upper(): name for name in SEARCHES})  # type: ignore[misc]
 
 
@@ -81,6 +82,20 @@ ModelOption = Annotated[
     ModelName,
     typer.Option(
         help="By what surfaces are imagined. " + "; ".join(f"{n}: {about}" for n, about in MODELS.items()) + "."
+    ),
+]
+StudyModelOption = Annotated[
+    StudyModel,
+    typer.Option(
+        help="By what surfaces are imagined. " + "; ".join(f"{n}: {about}" for n, about in STUDY_MODELS.items()) + "."
+    ),
+]
+KnownOption = Annotated[
+    str,
+    typer.Option(
+        metavar="BANK",
+        help="Shapes that are known, which what was seen is compared with: a folder of meshes, or "
+        f"{', '.join(BANKS)}; none: the model alone.",
     ),
 ]
 PaperOption = Annotated[

@@ -67,6 +67,11 @@ MODELS = {
     "paper": "the published model, which knows the scanned normals alone",
 }
 
+STUDY_MODELS = {"known": "screened, and has seen other objects of the kind", **MODELS}
+
+BANKS = ("pyramid", "truck", "household", "fruit", "parts", "heat", "household-real")
+"""The banks of known shapes that ship."""
+
 SEARCHES = {
     "discrete": SearchEntry(f"{_SEARCHES}:discrete", "the expected value of the task over 120 candidates (heat: 100)"),
     "halving": SearchEntry(f"{_SEARCHES}:halving", "drops the worse half again and again while samples are added"),

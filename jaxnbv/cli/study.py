@@ -8,7 +8,7 @@ import typer
 
 from jaxnbv.cli import actions
 from jaxnbv.cli.asked import Device
-from jaxnbv.cli.options import DeviceOption, ModelName, ModelOption, command
+from jaxnbv.cli.options import DeviceOption, StudyModel, StudyModelOption, command
 from jaxnbv.studies.registry import STUDIES, Entry
 from jaxnbv.studies.scenes import Framing
 
@@ -38,7 +38,7 @@ FolderOption = Annotated[
     typer.Option(
         "--out",
         help="Output folder; the scenes already in it are not run again.",
-        show_default="runs/study-NAME[-paper][-quick]",
+        show_default="runs/study-NAME[-MODEL][-quick]",
     ),
 ]
 WorkersOption = Annotated[
@@ -88,7 +88,7 @@ def _command(name: str, entry: Entry) -> Callable[..., None]:
         "views": (ViewsOption, entry.views),
         "methods": (MethodsOption, None),
         "own": (OwnOption, None),
-        "model": (ModelOption, ModelName("screened")),
+        "model": (StudyModelOption, StudyModel(entry.model)),
         "out": (FolderOption, None),
         "quick": (QuickOption, False),
         "workers": (WorkersOption, 1),

@@ -95,3 +95,11 @@ def boundary_points(volume: Volume, count: int) -> Float[Array, "count 3"]:
     ends = jnp.zeros(count, directions.dtype), jnp.full(count, _FAR, directions.dtype)
     near, far = jax.lax.fori_loop(0, _BISECTIONS, halve, ends)
     return 0.5 * (near + far)[:, None] * directions
+
+
+def bounding_box(volume: Volume) -> Box:
+    """The box about a volume's boundary, found along a thousand rays; of a `Box` itself."""
+    if isinstance(volume, Box):
+        return volume
+    points = boundary_points(volume, 1000)
+    return Box(tuple(jnp.min(points, axis=0).tolist()), tuple(jnp.max(points, axis=0).tolist()))

@@ -5,13 +5,16 @@ A new study is a module with a `Study` and an entry here.
 
 from typing import NamedTuple
 
+KNOWN, UNKNOWING = "known", "-screened"
+"""The model of studies that know shapes, and what a method is called besides that is run without them."""
+
 
 class Entry(NamedTuple):
     """One study.
 
     - `study`: module and class; `pictures`: module and function that draws its own pictures, if there are any.
     - `question`, `settings`: for the help.
-    - `scenes`, `views`: by default.
+    - `scenes`, `views`, `model`: by default.
     - `options`: names of its fields that are options of the command.
     """
 
@@ -20,6 +23,7 @@ class Entry(NamedTuple):
     settings: str
     scenes: int
     views: int
+    model: str = "screened"
     pictures: str = ""
     options: tuple[str, ...] = ()
 
@@ -32,6 +36,7 @@ STUDIES = {
         "candidates and a coarser grid than the paper's.",
         scenes=100,
         views=5,
+        model=KNOWN,
         pictures="jaxnbv.studies.classification.pictures:write_pictures",
         options=("framing", "classifier"),
     ),
@@ -43,6 +48,7 @@ STUDIES = {
         "what was seen alone: fewer candidates and a coarser grid than the paper's.",
         scenes=100,
         views=5,
+        model=KNOWN,
         pictures="jaxnbv.studies.classification.pictures:write_pictures",
         options=("meshes", "classifier"),
     ),
@@ -54,6 +60,7 @@ STUDIES = {
         "candidates and a coarser grid than the paper's.",
         scenes=100,
         views=5,
+        model=KNOWN,
         pictures="jaxnbv.studies.classification.pictures:write_pictures",
         options=("meshes", "classifier"),
     ),
@@ -65,6 +72,7 @@ STUDIES = {
         "candidates and a coarser grid than the paper's.",
         scenes=100,
         views=5,
+        model=KNOWN,
         pictures="jaxnbv.studies.classification.pictures:write_pictures",
         options=("meshes", "classifier"),
     ),
@@ -77,6 +85,7 @@ STUDIES = {
         "of 24 views, 8 steps of 0.03: less of everything than the paper.",
         scenes=80,
         views=6,
+        model=KNOWN,
         pictures="jaxnbv.studies.parts.pictures:write_pictures",
         options=("meshes",),
     ),
@@ -88,6 +97,7 @@ STUDIES = {
         "added to 1,024 points of the cloud: less of everything than the paper.",
         scenes=24,
         views=6,
+        model=KNOWN,
         pictures="jaxnbv.studies.heat.pictures:write_pictures",
         options=("meshes",),
     ),
@@ -108,6 +118,7 @@ STUDIES = {
         "of 0.03.",
         scenes=60,
         views=5,
+        model=KNOWN,
         pictures="jaxnbv.studies.classification.pictures:write_pictures",
         options=("framing",),
     ),

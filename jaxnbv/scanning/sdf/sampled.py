@@ -4,7 +4,7 @@ import igl
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.checks import AnyArray, as_numbers, checked, require
 from jaxnbv.scanning.sdf.base import Scalar, SignedDistance, Vector, nonnegative, norm, parameter, split
@@ -36,11 +36,19 @@ class Sampled(SignedDistance):
 
 
 @checked
-def solid_of_mesh(vertices: Float[AnyArray, "v 3"], faces: Int[AnyArray, "f 3"], resolution: int = 64) -> Sampled:
+def solid_of_mesh(
+    vertices: Float[AnyArray, "v 3"],
+    faces: Int[AnyArray, "f 3"],
+    resolution: int = 64,
+    sheet: float = 0.0,
+    cubic: bool = False,
+) -> Sampled:
     """A mesh as a solid, in the coordinates of its vertices: an obstacle, say. Its inside is told by winding numbers,
     so that it may have holes.
 
     - `resolution`: nodes along its longest side.
+    - `sheet`: how thick faces are that have the outside on both sides; without thickness they vanish.
+    - `cubic`: as many nodes along all sides, so that solids of several meshes can be stacked.
 
     **Raises:** `ValueError` for other shapes, indices out of range, or a resolution below four.
     """
@@ -60,11 +68,38 @@ def solid_of_mesh(vertices: Float[AnyArray, "v 3"], faces: Int[AnyArray, "f 3"],
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     longest = float((high - low).max())
     require(longest > 0, f"all {len(vertices)} vertices of the mesh lie at {low}")
+    if cubic:
+        middle = 0.5 * (low + high)
+        low, high = middle - 0.5 * longest, middle + 0.5 * longest
     spacing = (1.0 + 2.0 * _PADDING) * longest / (resolution - 1)
     low = low - _PADDING * longest
-    counts = np.ceil((high + _PADDING * longest - low) / spacing).astype(int) + 1
+    counts = np.ceil((high + _PADDING * longest - low) / spacing - 1e-6).astype(int) + 1
     axes = [start + spacing * np.arange(count) for start, count in zip(low, counts, strict=True)]
-    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
-    distance, *_ = igl.signed_distance(nodes.reshape(-1, 3), vertices, faces, kind)
-    return Sampled(distance.reshape(counts), low, spacing, _PADDING * longest)
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    distance = _signed_distance(nodes, vertices, faces, sheet)
+    return Sampled(jnp.asarray(distance.reshape(counts)), low, spacing, _PADDING * longest)
+
+
+def _signed_distance(
+    points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], sheet: float
+) -> Float[np.ndarray, " n"]:
+    distance = np.sqrt(igl.point_mesh_squared_distance(points, vertices, faces)[0])
+    signed = np.where(_is_inside(points, vertices, faces), -distance, distance)
+    if sheet == 0:
+        return signed
+    corners = vertices[faces]
+    middle, normal = corners.mean(axis=1), np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
+    step = 1e-4 * np.ptp(vertices, axis=0).max() * normal
+    thin = ~(_is_inside(middle + step, vertices, faces) | _is_inside(middle - step, vertices, faces))
+    if not thin.any():
+        return signed
+    beside = np.sqrt(igl.point_mesh_squared_distance(points, vertices, faces[thin])[0])
+    return np.minimum(signed, beside - 0.5 * sheet)
+
+
+def _is_inside(
+    points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> Bool[np.ndarray, " n"]:
+    # Of a solid whose faces are wound the other way the number is negative.
+    return np.abs(igl.fast_winding_number(vertices, faces, points)) > 0.5

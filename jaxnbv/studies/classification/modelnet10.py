@@ -13,6 +13,7 @@ class ModelNet10Study(ClassificationStudy):
     title: ClassVar[str] = "The class of a household object"
     objects: ClassVar[ClassSet] = CLASS_SETS["household"]
     network: ClassVar[str] = "household"
+    bank: ClassVar[str] = "household"
     seed: ClassVar[int] = 12
     claims: ClassVar[tuple[Claim, ...]] = (
         Claim("Where global features tell the class, cross-entropy is as good.", "first", 2, BASELINES, ahead=False),

@@ -12,5 +12,6 @@ class OmniObject3DStudy(ClassificationStudy):
     title: ClassVar[str] = "The class of a fruit"
     objects: ClassVar[ClassSet] = CLASS_SETS["fruit"]
     network: ClassVar[str] = "fruit"
+    bank: ClassVar[str] = "fruit"
     solid: ClassVar[bool] = True
     seed: ClassVar[int] = 14

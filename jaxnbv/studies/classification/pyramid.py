@@ -37,6 +37,7 @@ class PyramidStudy(ClassificationStudy):
     network: ClassVar[str] = "pyramid"
     framings: ClassVar[tuple[Framing, ...]] = tuple(Framing)
     solid: ClassVar[bool] = True
+    bank: ClassVar[str] = "pyramid"
     measures: ClassVar[tuple[Measure, ...]] = (
         *hits(cue),
         diagnostic("rank_correlation", "Rank correlation"),

@@ -13,7 +13,6 @@ from jaxtyping import Array, Int, Key
 from jaxnbv.checks import require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.imagination import Imagination
 from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale, pretrained_classifier
 from jaxnbv.planning.episode import Sensor, Step, view_keys
 from jaxnbv.planning.planner import Planner
@@ -33,6 +32,7 @@ from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.meshes import class_meshes, numbered
 from jaxnbv.studies.engine.study import Chart, Panel, Scene, Study, pose_record
 from jaxnbv.studies.readers import MeshFile
+from jaxnbv.studies.registry import UNKNOWING
 from jaxnbv.studies.scenes import ClassObject, ClassSet, Framing, Split
 from jaxnbv.studies.scenes.class_object import ClassMesh, scan_cue, surface_of
 from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, MixedEntropy
@@ -109,6 +109,7 @@ class ClassificationStudy(Study):
     fed: ClassVar[tuple[int, int]] = (1024, 512)
     framings: ClassVar[tuple[Framing, ...]] = (Framing.CLOSE_UP,)
     solid: ClassVar[bool] = False
+    unknowing: ClassVar[tuple[str, ...]] = ("coverage", "uncertainty")
 
     classifier: Classifier = eqx.field(kw_only=True)
     imagining: Classifier | None = None
@@ -132,7 +133,7 @@ class ClassificationStudy(Study):
         studies: dict[str, Study] = {}
         for one in (options["framing"],) if "framing" in options else cls.framings:
             classifier, imagining = (cls._classifier(file, one.longest_side, fed) for fed in cls.fed)
-            imagination = Imagination.preset(model, one.longest_side, quick, solid=cls.solid)
+            imagination = cls.imagined(model, one.longest_side, quick, cls.solid)
             settings: dict[str, Any] = {"classifier": classifier, "imagining": imagining, "framing": one} | options
             name = one.value if len(cls.framings) > 1 else ""
             studies[name] = cls(views=views, imagination=imagination, **settings | (dict(cls.quick) if quick else {}))
@@ -224,7 +225,7 @@ class ClassificationStudy(Study):
 
     def run_methods(self, scene: Scene, truth: Truth, first: int, methods: Sequence[str]) -> dict[str, Record]:
         """All methods together: those that stand at the same place share its evidence, its samples and their scans."""
-        planners = {method: self.planner(method, scene) for method in methods}
+        planners = {method: self.planner_for(method, scene) for method in methods}
         shared = Shared(self.planner("coverage", scene), self.classifier, self.candidates.poses(), truth.scans)
         runs: dict[str, list[tuple[int, ...]]] = {method: [(first,)] for method in methods}
         if "random" in runs:
@@ -258,21 +259,22 @@ class ClassificationStudy(Study):
         well their values agreed with what the candidates would truly show, and how rough the samples were."""
         evidence = shared.evidence(visited)
         sample_key, search_key, _ = view_keys(self.key(scene.index, "episode"), view)
-        surfaces, rough = None, None
-        if any(planner.search.uses_samples for planner in planners.values()):
-            imagination = shared.planner.imagination
-            posterior = imagination.posterior(evidence)
-            surfaces = imagination.sample(evidence, sample_key, posterior)
-            rough = roughness(imagination, evidence, posterior, surfaces)
         new = ~np.isin(np.arange(self.num_candidates), visited)
         found: dict[str, tuple[int, Record]] = {}
-        for method, proposal in propose_together(planners, evidence, surfaces, search_key).items():
-            index = _nearest(shared.poses, proposal.pose)
-            assert index is not None
-            shown = scene.task.pixels if self.cue else None
-            rank = None if shown is None else rank_correlation(proposal.values, shown, new)
-            own = rough if planners[method].search.uses_samples else None
-            found[method] = index, {"rank_correlation": rank, "roughness": own}
+        for group in _alike(planners):
+            surfaces, rough = None, None
+            if any(planner.search.uses_samples for planner in group.values()):
+                imagination = next(iter(group.values())).imagination
+                posterior = imagination.posterior(evidence)
+                surfaces = imagination.sample(evidence, sample_key, posterior)
+                rough = roughness(imagination, evidence, posterior, surfaces)
+            for method, proposal in propose_together(group, evidence, surfaces, search_key).items():
+                index = _nearest(shared.poses, proposal.pose)
+                assert index is not None
+                shown = scene.task.pixels if self.cue else None
+                rank = None if shown is None else rank_correlation(proposal.values, shown, new)
+                own = rough if planners[method].search.uses_samples else None
+                found[method] = index, {"rank_correlation": rank, "roughness": own}
         return found
 
     def _random_run(self, scene: Scene, shared: Shared, planner: Planner, first: int, run: int) -> tuple[int, ...]:
@@ -304,6 +306,13 @@ class ClassificationStudy(Study):
     def _shown(self, pixels: Any) -> Record:
         """How many rays of each view hit the cue of the class, where that is a part of the object."""
         return {f"{self.cue}_pixels": np.asarray(pixels).tolist()} if self.cue else {}
+
+
+def _alike(planners: Mapping[str, Planner]) -> list[dict[str, Planner]]:
+    """Those that imagine alike together: the study's own, and those that know no shapes."""
+    ways = (False, True)
+    groups = [{name: one for name, one in planners.items() if name.endswith(UNKNOWING) is way} for way in ways]
+    return [group for group in groups if group]
 
 
 @eqx.filter_jit

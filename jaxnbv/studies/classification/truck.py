@@ -39,6 +39,7 @@ class TruckStudy(ClassificationStudy):
     )
     objects: ClassVar[ClassSet] = CLASS_SETS["truck"]
     cue: ClassVar[str] = "cargo"
+    bank: ClassVar[str] = "truck"
     network: ClassVar[str] = "truck"
     fed: ClassVar[tuple[int, int]] = (2048, 1024)
     measures: ClassVar[tuple[Measure, ...]] = (

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from jaxnbv.studies.registry import UNKNOWING
 from jaxnbv.viz.style import GREY, INK
 
 
@@ -36,6 +37,8 @@ LOOKS = {
     "heat-halving": Look("#e69f00", "--", "^"),
     "coverage": Look("#009e73", "-", "D"),
     "farthest": Look("#0072b2", "-", "s"),
+    f"coverage{UNKNOWING}": Look("#009e73", ":", "d"),
+    f"uncertainty{UNKNOWING}": Look("#56b4e9", ":", "p"),
     "uncertainty": Look("#56b4e9", "-", "P"),
     "random": Look(GREY, "--", "X"),
     "oracle": Look(INK, ":", "*"),

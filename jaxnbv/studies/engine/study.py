@@ -25,6 +25,8 @@ from jaxnbv.scanning import Evidence, Grid, Surface
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.search import Search, SphereCandidates
 from jaxnbv.studies.engine.measures import Claim, Measure, Record, Row
+from jaxnbv.studies.registry import KNOWN, UNKNOWING
+from jaxnbv.studies.scenes.banks import bank_poses, shape_bank
 
 _PURPOSES = ("first", "episode", "scene", "measure")
 
@@ -77,6 +79,8 @@ class Study(eqx.Module):
     - `claims`: what the paper says of it.
     - `quick`: settings for a first look, on `quick_scenes` scenes.
     - `seed`: of its first views, noise and samples.
+    - `bank`: of the shapes that are known, see `shape_bank`; "" for none.
+    - `unknowing`: those of the methods that are run once more by one who knows none, as "METHOD-screened".
 
     **Raises:** `ValueError` for fewer than two views, or fewer candidates than views.
     """
@@ -92,6 +96,8 @@ class Study(eqx.Module):
     radius: ClassVar[float] = SENSOR_RADIUS
     quick: ClassVar[Mapping[str, Any]] = {"num_samples": 4, "grid_resolution": 48, "capacity": 1024}
     quick_scenes: ClassVar[int] = 4
+    bank: ClassVar[str] = ""
+    unknowing: ClassVar[tuple[str, ...]] = ()
 
     views: int = eqx.field(static=True, default=5)
     num_candidates: int = eqx.field(static=True, default=48)
@@ -114,8 +120,26 @@ class Study(eqx.Module):
 
         - `options`: settings of its own.
         """
-        imagined = {"imagination": Imagination.preset(model, quick=quick)}
+        imagined = {"imagination": cls.imagined(model, quick=quick)}
         return {"": cls(views=views, **imagined | (dict(cls.quick) if quick else {}) | options)}
+
+    @classmethod
+    def imagined(cls, model: str, longest_side: float = 2.5, quick: bool = False, solid: bool = False) -> Imagination:
+        """As `Imagination.preset`, or for the model `known` the screened one that knows the shapes of `bank`.
+
+        **Raises:** `ValueError` for another model, or `known` where there is no bank.
+        """
+        if model != KNOWN:
+            return Imagination.preset(model, longest_side, quick, solid=solid)
+        require(bool(cls.bank), f"there are no known shapes for {cls.title.lower()}: give another model")
+        plain = Imagination.preset("screened", longest_side, quick, solid=solid)
+        return plain.knowing(shape_bank(cls.bank), bank_poses(cls.bank))
+
+    @classmethod
+    def all_methods(cls, model: str) -> tuple[str, ...]:
+        """The methods, and where shapes are known those of `unknowing`."""
+        again = (f"{name}{UNKNOWING}" for name in cls.unknowing) if model == KNOWN else ()
+        return (*cls.methods, *again)
 
     @property
     def num_scenes(self) -> int | None:
@@ -132,6 +156,13 @@ class Study(eqx.Module):
     @abstractmethod
     def planner(self, method: str, scene: Scene) -> Planner:
         """The planner of one of `methods`; scenes share compilations."""
+
+    def planner_for(self, method: str, scene: Scene) -> Planner:
+        """The planner of a method, of one that knows no shapes too."""
+        planner = self.planner(method.removesuffix(UNKNOWING), scene)
+        if not method.endswith(UNKNOWING):
+            return planner
+        return dataclasses.replace(planner, imagination=planner.imagination.unknowing)
 
     @abstractmethod
     def truth(self, scene: Scene) -> Any:
@@ -187,12 +218,19 @@ class Study(eqx.Module):
         """Where samples are evaluated."""
         return Grid(self.grid_resolution)
 
-    def planner_of(self, acquisition: Acquisition, search: Search, camera: Camera | None = None) -> Planner:
+    def planner_of(
+        self,
+        acquisition: Acquisition,
+        search: Search,
+        camera: Camera | None = None,
+        imagination: Imagination | None = None,
+    ) -> Planner:
         """A planner with the study's settings.
 
         - `camera`: whose scans are imagined, by default the sensor.
+        - `imagination`: by default the study's.
         """
-        imagination = dataclasses.replace(self.imagination, grid=self.grid, num_samples=self.num_samples)
+        imagination = dataclasses.replace(imagination or self.imagination, grid=self.grid, num_samples=self.num_samples)
         planned = acquisition, search, camera or self.camera, imagination
         return Planner(*planned, capacity=self.capacity, max_views=self.views)
 
@@ -214,9 +252,10 @@ class Study(eqx.Module):
         **Raises:** `ValueError` for an unknown method, as `scene` does, if no candidate shows enough, or if one
         of `own` makes no planner of so many views.
         """
+        known = self.all_methods(KNOWN)
         methods = self.methods if methods is None else tuple(methods)
-        unknown = sorted({*methods} - {*self.methods})
-        require(not unknown, f"unknown methods: {', '.join(unknown)}; choose from {', '.join(self.methods)}")
+        unknown = sorted({*methods} - {*known})
+        require(not unknown, f"unknown methods: {', '.join(unknown)}; choose from {', '.join(known)}")
         start = time.perf_counter()
         scene = self.scene(index)
         planners = {name: self._made(name, make, scene) for name, make in (own or {}).items()}
@@ -245,7 +284,7 @@ class Study(eqx.Module):
 
     def run_methods(self, scene: Scene, truth: Any, first: int, methods: Sequence[str]) -> dict[str, Record]:
         """The records of the study's own methods."""
-        return {name: self.run(scene, truth, first, name, methods, self.planner(name, scene)) for name in methods}
+        return {name: self.run(scene, truth, first, name, methods, self.planner_for(name, scene)) for name in methods}
 
     def run(
         self, scene: Scene, truth: Any, first: int, method: str, methods: Sequence[str], planner: Planner

@@ -151,6 +151,9 @@ class HeatStudy(Study):
     imagined_rays: int = eqx.field(static=True, default=24)
     true_grid: Grid = Grid(160)
 
+    bank: ClassVar[str] = "heat"
+    unknowing: ClassVar[tuple[str, ...]] = ("coverage", "uncertainty")
+
     @property
     def num_scenes(self) -> int | None:
         return len(self.meshes) or None

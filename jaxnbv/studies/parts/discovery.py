@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.imagination import Imagination
 from jaxnbv.networks import CloudSegmenter
 from jaxnbv.planning.episode import Step
 from jaxnbv.planning.planner import Planner
@@ -109,6 +110,7 @@ class PartDiscoveryStudy(Study):
         )
     }
     seed: ClassVar[int] = 6
+    unknowing: ClassVar[tuple[str, ...]] = ("coverage", "uncertainty")
     radius: ClassVar[float] = PART_SETTING.radius
     quick: ClassVar[Mapping[str, Any]] = {
         **Study.quick,
@@ -138,7 +140,11 @@ class PartDiscoveryStudy(Study):
     def planner(self, method: str, scene: Scene) -> Planner:
         camera = Camera(height=self.imagined_rays, width=self.imagined_rays)
         acquisition = self._soft_count(scene) if method in _BY_PARTS else Coverage()
-        return self.planner_of(acquisition, self._search(method), camera)
+        return self.planner_of(acquisition, self._search(method), camera, self.imagination_of(scene))
+
+    def imagination_of(self, scene: Scene) -> Imagination:
+        """The study's, or what is known of such a scene."""
+        return self.imagination
 
     def _soft_count(self, scene: Scene) -> ExpectedUtilityImprovement:
         target = TARGET * self.num_points / NETWORK_POINTS

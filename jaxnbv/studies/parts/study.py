@@ -1,12 +1,14 @@
 """The study of semantic parts: how many views until all parts of an object are found? The paper's Table 1."""
 
+import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxnbv.imagination import Imagination
 from jaxnbv.networks import CATEGORIES, CloudSegmenter, part_segmenter
 from jaxnbv.scanning import SDFSurface
 from jaxnbv.studies.engine.measures import Record
@@ -14,6 +16,7 @@ from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.parts.discovery import PartDiscoveryStudy
 from jaxnbv.studies.parts.meshes import MeshPartStudy
 from jaxnbv.studies.scenes import Split, part_scene
+from jaxnbv.surfaces import KnownShapes
 
 
 class PartStudy(PartDiscoveryStudy):
@@ -22,6 +25,8 @@ class PartStudy(PartDiscoveryStudy):
     - `segmenter`: of clouds in scene coordinates; its category is replaced by that of each scene's object.
     - `split`: which scenes; tune on those of the validation split.
     """
+
+    bank: ClassVar[str] = "parts"
 
     segmenter: CloudSegmenter = eqx.field(kw_only=True)
     split: Split = eqx.field(static=True, default=Split.TEST)
@@ -47,6 +52,15 @@ class PartStudy(PartDiscoveryStudy):
         """The network, told the object's category."""
         given = self.segmenter
         return CloudSegmenter(given.network, scene.task.category, num_points or given.num_points, given.scale)
+
+    def imagination_of(self, scene: Scene) -> Imagination:
+        """As the network's, with the shapes of the object's category."""
+        model = self.imagination.model
+        if not isinstance(model, KnownShapes):
+            return self.imagination
+        alike = [index for index, name in enumerate(model.bank.names) if name.rsplit(" ", 1)[0] == scene.name]
+        known = dataclasses.replace(model, bank=model.bank.chosen(alike))
+        return dataclasses.replace(self.imagination, model=known)
 
     def true_parts(self, scene: Scene, points: Float[Array, "n 3"]) -> Int[Array, " n"]:
         return scene.task.solid.label(points)

@@ -1,5 +1,7 @@
 """Stand-ins for the fruits of OmniObject3D, which are told apart by what is small: stem, calyx, pores, tips, gills."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
@@ -103,33 +105,36 @@ class Fruit(ClassObject):
         return (self.scale / self.steepness) * _level(self.numbers, own[..., 0], own[..., 1], own[..., 2])
 
 
-def fruit_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_UP) -> Fruit:
-    """Scene number `index` of a split; the classes take turns.
+def fruit_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_UP, turned: bool = True) -> Fruit:
+    """Scene number `index` of a split; the classes take turns. See `sample_fruit`.
 
     **Raises:** `ValueError` if the index is negative.
     """
-    return sample_fruit(scene_key(7, split, index), index % len(FRUITS), framing.longest_side)
+    return sample_fruit(scene_key(7, split, index), index % len(FRUITS), framing.longest_side, turned)
 
 
-def sample_fruit(key: PRNGKeyArray, label: int | Int[AnyArray, ""], longest_side: float = 2.5) -> Fruit:
-    """A random fruit of a class, turned at random; its bounding box is centred and has the given longest side.
+def sample_fruit(
+    key: PRNGKeyArray, label: int | Int[AnyArray, ""], longest_side: float = 2.5, turned: bool = True
+) -> Fruit:
+    """A random fruit of a class, turned at random or, not `turned`, upright along y; its bounding box is centred and
+    has the given longest side.
 
     Runs under `jit` and `vmap`.
 
     **Raises:** `ValueError` if `longest_side` is not positive.
     """
     require(longest_side > 0, f"the longest side is {longest_side}; it must be positive")
-    return _sample(key, jnp.asarray(label), longest_side)
+    return _sample(key, jnp.asarray(label), longest_side, turned)
 
 
-@jax.jit
-def _sample(key: PRNGKeyArray, label: Int[Array, ""], longest_side: Float[Array, ""] | float) -> Fruit:
+@functools.partial(jax.jit, static_argnames="turned")
+def _sample(key: PRNGKeyArray, label: Int[Array, ""], longest_side: Float[Array, ""] | float, turned: bool) -> Fruit:
     number_key, rotation_key, place_key = jax.random.split(key, 3)
     low, high = (jnp.array([[_range(fruit, name)[end] for name in _NAMES] for fruit in FRUITS]) for end in (0, 1))
     drawn = jax.random.uniform(number_key, (len(_NAMES),), minval=low[label], maxval=high[label])
     numbers = dict(zip(_NAMES, drawn, strict=True))
     rotation = jax.random.orthogonal(rotation_key, 3)
-    rotation = rotation * jnp.linalg.det(rotation)
+    rotation = rotation * jnp.linalg.det(rotation) if turned else jnp.eye(3)
 
     surface = _surface_points(numbers)
     corners = jnp.matmul(surface, rotation.T, precision="highest")

@@ -14,6 +14,7 @@ from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.studies.scenes.labelled import assemble, bar, box, generator, path, ring, rod
 
 _LABEL = 0
+FIRST_TRAINING = 100_000
 
 
 class HeatScene(eqx.Module):
@@ -29,8 +30,9 @@ class HeatScene(eqx.Module):
     source: Float[Array, "3"]
 
 
-def heat_scene(index: int) -> HeatScene:
-    """Scene number `index`: the kinds of object take turns, with random proportions, source and turn about y.
+def heat_scene(index: int, turned: bool = True) -> HeatScene:
+    """Scene number `index`: the kinds of object take turns, with random proportions, source and turn about y, or not
+    `turned`. Those of `FIRST_TRAINING` and beyond are never reported.
 
     **Raises:** `ValueError` if the index is negative.
     """
@@ -38,7 +40,7 @@ def heat_scene(index: int) -> HeatScene:
     name = HEAT_OBJECTS[index % len(HEAT_OBJECTS)]
     rng = generator(jax.random.fold_in(jax.random.key(1), index))
     primitives, place = _BUILDERS[name](rng)
-    solid = assemble(primitives, rng.uniform(-np.pi, np.pi))
+    solid = assemble(primitives, rng.uniform(-np.pi, np.pi) if turned else 0.0)
     source = solid.centre[0] + jnp.matmul(
         solid.rotation[0], solid.half_size[0] * jnp.asarray(place), precision="highest"
     )

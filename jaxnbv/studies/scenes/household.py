@@ -39,17 +39,21 @@ class HouseholdObject(ClassObject):
         return self.solid(x)
 
 
-def household_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_UP) -> HouseholdObject:
-    """Scene number `index` of a split; the classes take turns.
+def household_scene(
+    split: Split, index: int, framing: Framing = Framing.CLOSE_UP, turned: bool = True
+) -> HouseholdObject:
+    """Scene number `index` of a split; the classes take turns. See `sample_household_object`.
 
     **Raises:** `ValueError` if the index is negative.
     """
     key = scene_key(6, split, index)
-    return sample_household_object(HOUSEHOLD[index % len(HOUSEHOLD)], key, framing.longest_side)
+    return sample_household_object(HOUSEHOLD[index % len(HOUSEHOLD)], key, framing.longest_side, turned)
 
 
-def sample_household_object(name: str, key: PRNGKeyArray, longest_side: float = 2.5) -> HouseholdObject:
-    """A random object of one of `HOUSEHOLD`, upright along y, turned about it at random.
+def sample_household_object(
+    name: str, key: PRNGKeyArray, longest_side: float = 2.5, turned: bool = True
+) -> HouseholdObject:
+    """A random object of one of `HOUSEHOLD`, upright along y, turned about it at random or, not `turned`, along x.
 
     Its bounding box is centred; where it has the longest side 2.5, no primitive is thinner than 0.05. Built on the
     host: it does not run under `jit`.
@@ -59,7 +63,7 @@ def sample_household_object(name: str, key: PRNGKeyArray, longest_side: float = 
     require(longest_side > 0, f"the longest side is {longest_side}; it must be positive")
     rng = generator(key)
     primitives = household_primitives(name, rng)
-    solid = assemble(primitives, rng.uniform(-np.pi, np.pi), longest_side)
+    solid = assemble(primitives, rng.uniform(-np.pi, np.pi) if turned else 0.0, longest_side)
     return HouseholdObject(solid=solid, label=jnp.asarray(HOUSEHOLD.index(name)))
 
 

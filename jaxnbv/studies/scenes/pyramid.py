@@ -1,5 +1,7 @@
 """The synthetic pyramid: five classes that differ in a pattern imprinted on the base, and in nothing else."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -78,19 +80,22 @@ class Pyramid(ClassObject):
 _MARGIN = 0.1
 
 
-def sample_pyramid(key: PRNGKeyArray, label: int | Int[AnyArray, ""], longest_side: float = 2.5) -> Pyramid:
-    """A pyramid of a class with random height, pattern and orientation, centred in the scene.
+def sample_pyramid(
+    key: PRNGKeyArray, label: int | Int[AnyArray, ""], longest_side: float = 2.5, turned: bool = True
+) -> Pyramid:
+    """A pyramid of a class with random height and pattern, centred in the scene, and turned in any direction or, not
+    `turned`, upright along z.
 
     `longest_side` is that of its bounding box along the scene's axes. Runs under `jit` and `vmap`.
 
     **Raises:** `ValueError` if `longest_side` is not positive.
     """
     require(longest_side > 0, f"the longest side is {longest_side}; it must be positive")
-    return _sample(key, jnp.asarray(label), longest_side)
+    return _sample(key, jnp.asarray(label), longest_side, turned)
 
 
-@jax.jit
-def _sample(key: PRNGKeyArray, label: Int[Array, ""], longest_side: Float[Array, ""] | float) -> Pyramid:
+@functools.partial(jax.jit, static_argnames="turned")
+def _sample(key: PRNGKeyArray, label: Int[Array, ""], longest_side: Float[Array, ""] | float, turned: bool) -> Pyramid:
     height_key, size_key, place_key, turn_key, depth_key, rotation_key = jax.random.split(key, 6)
     height = jax.random.uniform(height_key, minval=1.2, maxval=1.6)
     size = jax.random.uniform(size_key, minval=0.7, maxval=0.85)
@@ -98,7 +103,7 @@ def _sample(key: PRNGKeyArray, label: Int[Array, ""], longest_side: Float[Array,
     turn = jax.random.uniform(turn_key, maxval=2.0 * jnp.pi)
     depth = jax.random.uniform(depth_key, minval=0.07, maxval=0.1)
     rotation = jax.random.orthogonal(rotation_key, 3)
-    rotation = rotation * jnp.linalg.det(rotation)
+    rotation = rotation * jnp.linalg.det(rotation) if turned else jnp.eye(3)
     corners = jnp.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0]])
     corners = jnp.concatenate([corners, jnp.stack([0.0, 0.0, height])[None]])
     corners = jnp.matmul(corners, rotation.T, precision="highest")
@@ -107,12 +112,14 @@ def _sample(key: PRNGKeyArray, label: Int[Array, ""], longest_side: Float[Array,
     return Pyramid(label, height, size, place, turn, depth, rotation, scale, -0.5 * scale * (low + high))
 
 
-def pyramid_scene(split: Split, index: int | Int[Array, ""], framing: Framing = Framing.CLOSE_UP) -> Pyramid:
-    """Scene number `index` of a split, the same pyramid in both framings; the classes take turns.
+def pyramid_scene(
+    split: Split, index: int | Int[Array, ""], framing: Framing = Framing.CLOSE_UP, turned: bool = True
+) -> Pyramid:
+    """Scene number `index` of a split, the same pyramid in both framings; the classes take turns. See `sample_pyramid`.
 
     **Raises:** `ValueError` if the index is negative.
     """
-    return sample_pyramid(scene_key(0, split, index), index % len(PATTERNS), framing.longest_side)
+    return sample_pyramid(scene_key(0, split, index), index % len(PATTERNS), framing.longest_side, turned)
 
 
 def hidden_view(pyramid: Pyramid, key: PRNGKeyArray, camera: Camera = Camera(), num_candidates: int = 120) -> Pose:

@@ -44,18 +44,19 @@ class LoadedTruck(ClassObject):
         return self.cargo(x) <= tolerance
 
 
-def truck_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_UP) -> LoadedTruck:
+def truck_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_UP, turned: bool = True) -> LoadedTruck:
     """Scene number `index` of a split; the classes of the cargo take turns.
 
     The cargo is turned at random about the vertical, as large as the bed has room for, and the loaded truck in any
-    direction; its bounding box is centred in the scene. Built on the host: it does not run under `jit`.
+    direction, or, not `turned`, upright along y and along x; its bounding box is centred in the scene. Built on the
+    host: it does not run under `jit`.
 
     **Raises:** `ValueError` if the index is negative.
     """
-    return sample_truck(scene_key(5, split, index), index % len(HOUSEHOLD), framing.longest_side)
+    return sample_truck(scene_key(5, split, index), index % len(HOUSEHOLD), framing.longest_side, turned)
 
 
-def sample_truck(key: PRNGKeyArray, label: int, longest_side: float = 2.5) -> LoadedTruck:
+def sample_truck(key: PRNGKeyArray, label: int, longest_side: float = 2.5, turned: bool = True) -> LoadedTruck:
     """A random truck with a random object of a class on its bed, as `truck_scene` places them.
 
     **Raises:** `ValueError` if there is no such class, or `longest_side` is not positive.
@@ -64,8 +65,8 @@ def sample_truck(key: PRNGKeyArray, label: int, longest_side: float = 2.5) -> Lo
     require(longest_side > 0, f"the longest side is {longest_side}; it must be positive")
     rng = generator(key)
     truck, low, high = _truck(rng)
-    turned = rotation_about((0.0, 1.0, 0.0), rng.uniform(-np.pi, np.pi))
-    cargo = [moved(p, rotation=turned) for p in household_primitives(HOUSEHOLD[label], rng)]
+    turn = rotation_about((0.0, 1.0, 0.0), rng.uniform(-np.pi, np.pi))
+    cargo = [moved(p, rotation=turn) for p in household_primitives(HOUSEHOLD[label], rng)]
     least_corner, greatest_corner = bounds(cargo)
     room = rng.uniform(0.85, 0.95) * (high - low) / (greatest_corner - least_corner)
     scale = room.min()
@@ -73,7 +74,7 @@ def sample_truck(key: PRNGKeyArray, label: int, longest_side: float = 2.5) -> Lo
     slack = (high - low) - scale * (greatest_corner - least_corner)
     corner = low + slack * np.array([rng.random(), 0.0, rng.random()])
     cargo = [moved(p, scale, offset=corner - scale * least_corner) for p in cargo]
-    rotation = random_rotation(rng)
+    rotation = random_rotation(rng) if turned else np.eye(3)
     both = fitted([moved(p, rotation=rotation) for p in truck + cargo], longest_side)
     solids = {"truck": united(both[: len(truck)]), "cargo": united(both[len(truck) :])}
     return LoadedTruck(**solids, label=jnp.asarray(label))

@@ -1,0 +1,231 @@
+"""Known shapes as the prior: a mixture over a bank, registered to the scan, with a Gaussian process as the residual.
+
+    prior      f = m_k(T^-1 x) + g,   k ~ pi over shapes 1..K and 0 for none of these,   g a Gaussian process
+    mean       m_k = h tanh(d_k / h), d_k the signed distance, h half the residual's jump across the surface
+    weights    w_k proportional to exp(-beta E_k) over the modes of the fit,  w_0 to exp(-beta E_0)
+    sample     shapes by systematic resampling of w; then f about the mean m_k, or for k = 0 a sample of the model that
+               knows no shapes
+
+The weights are tempered: the likelihood of thousands of normals, which are not independent, would always choose one.
+See `surfaces/registration.py` for E.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from jaxnbv.checks import AnyArray, check_fields, require
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.volume import Box
+from jaxnbv.scanning.evidence import Evidence
+from jaxnbv.scanning.sdf import SignedDistance
+from jaxnbv.surfaces.base import Fields, SurfaceModel, SurfacePosterior, sampler
+from jaxnbv.surfaces.placement import FreeRotation, Placement, ShapePoses
+from jaxnbv.surfaces.registration import Hypotheses, Prior, Seen, register
+from jaxnbv.surfaces.screened import ScreenedSPSR, ScreenedSPSRPosterior
+from jaxnbv.surfaces.shape_bank import ShapeBank
+from jaxnbv.surfaces.spsr import GeometricSPSR
+from jaxnbv.surfaces.values import OnSurface
+
+_NONE = "none of these"
+
+
+def short_ranged() -> ScreenedSPSR:
+    """The usual residual, for scenes 2.5 long."""
+    # With long scales, or values beside the surface, it pulls the surface back to what it would say by itself.
+    return ScreenedSPSR(GeometricSPSR(0.01, truncation=32), (OnSurface(),))
+
+
+class KnownShapes(SurfaceModel):
+    """A mixture over known shapes that fit what was seen, and a model that knows none.
+
+    - `bank`: the shapes.
+    - `residual`: what samples may differ by from the shape, where the scan says so; short-ranged.
+    - `poses`: how shapes can stand in the scene; `box`: what holds the object, and no more than it needs.
+    - `unknown`: the model of what none of the shapes is.
+    - `num_starts`: placements that are tried, over all shapes.
+    - `sharpness`: beta; `unknown_misfit`: E_0, the misfit at which a shape is as likely as none.
+    - `noise_scale`: rho, of the residual's deviation.
+
+    With an empty bank it is `unknown`.
+
+    **Raises:** `ValueError` for a number out of its range.
+    """
+
+    bank: ShapeBank
+    residual: ScreenedSPSR = eqx.field(default_factory=short_ranged)
+    poses: ShapePoses = FreeRotation()
+    box: Box = Box()
+    unknown: SurfaceModel = eqx.field(default_factory=ScreenedSPSR)
+    num_starts: int = eqx.field(static=True, default=4096)
+    sharpness: float = eqx.field(static=True, default=30.0)
+    unknown_misfit: float = eqx.field(static=True, default=0.5)
+    noise_scale: float = eqx.field(static=True, default=0.3)
+
+    def __check_init__(self):
+        check_fields(self)
+        require(self.num_starts >= 1, f"the number of starts is {self.num_starts}; it must be at least 1")
+        for name, value in (("sharpness", self.sharpness), ("noise scale", self.noise_scale)):
+            require(0 <= value < math.inf, f"the {name} is {value}; it must be finite and not negative")
+
+    def check(self, cloud: PointCloud) -> None:
+        """As that of the model that knows no shapes."""
+        self.unknown.check(cloud)
+
+    def condition(self, evidence: Evidence | PointCloud) -> SurfacePosterior:
+        """p(f | evidence), the shapes registered to its cloud and to the space that was seen empty.
+
+        **Raises:** `ValueError` as the `condition` of `residual` and `unknown` does.
+        """
+        evidence = Evidence.of(evidence)
+        unknown = self.unknown.condition(evidence)
+        if self.bank.solids is None:
+            return unknown
+        found = register(self.bank, Prior(self.poses, self.box), Seen.of(evidence), self.num_starts)
+        weights = _weights(found, self.sharpness, self.unknown_misfit)
+        return KnownShapesPosterior(
+            jnp.zeros_like(unknown.level), self, found, weights, self.residual.condition(evidence), unknown
+        )
+
+
+@eqx.filter_jit
+def _weights(found: Hypotheses, sharpness: float, unknown_misfit: float) -> Float[Array, " h_and_none"]:
+    misfit = jnp.append(found.misfit, unknown_misfit)
+    return jax.nn.softmax(-sharpness * misfit, where=jnp.append(found.is_mode, True))
+
+
+class Hypothesis(NamedTuple):
+    """What the object may be: a shape's name, how likely it is, how well it fits, and where it stands."""
+
+    name: str
+    weight: float
+    misfit: float
+    placement: Placement | None
+
+
+class KnownShapesPosterior(SurfacePosterior):
+    """p(f | D) under `KnownShapes`.
+
+    - `level`: zero.
+    - `found`: the shapes that were registered.
+    - `weights`: of each of them, and last of none.
+    - `residual`: p(g | D), about which samples are drawn; `unknown`: p(f | D, none of the shapes).
+    """
+
+    level: Float[Array, ""]
+    model: KnownShapes
+    found: Hypotheses
+    weights: Float[Array, " h_and_none"]
+    residual: ScreenedSPSRPosterior
+    unknown: SurfacePosterior
+
+    @property
+    def hypotheses(self) -> list[Hypothesis]:
+        """What the object may be, most likely first, "none of these" among it."""
+        found, weights = self.found, np.asarray(self.weights)
+        names = [self.model.bank.names[index] for index in np.asarray(found.shape)]
+        known = [
+            Hypothesis(
+                name, float(weight), float(misfit), jax.tree.map(lambda rows, row=row: rows[row], found.placement)
+            )
+            for row, (name, weight, misfit) in enumerate(zip(names, weights[:-1], found.misfit, strict=True))
+            if bool(found.is_mode[row])
+        ]
+        none = Hypothesis(_NONE, float(weights[-1]), self.model.unknown_misfit, None)
+        return sorted([*known, none], key=lambda one: -one.weight)
+
+    @sampler
+    def sample(self, key: PRNGKeyArray, num_samples: int) -> "MixtureFields":
+        """`num_samples` samples of f; which shapes they are about is drawn jointly, by systematic resampling."""
+        return _sample(self, key, num_samples)
+
+
+@eqx.filter_jit
+def _sample(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int) -> "MixtureFields":
+    shape_key, order_key, residual_key, unknown_key = jax.random.split(key, 4)
+    found, bank = posterior.found, posterior.model.bank
+    index = systematic_resampling(shape_key, posterior.weights, num_samples)
+    # The first few samples are no different from the rest.
+    index = jax.random.permutation(order_key, index)
+    is_none = index == len(found.shape)
+    row = jnp.where(is_none, 0, index)
+    solids = bank.shape(found.shape[row]).solid
+    placement = jax.tree.map(lambda rows: rows[row], found.placement)
+    means = PlacedShapes(solids, placement, posterior.residual.half_jump)
+    known = posterior.residual.sample_about(means, residual_key, posterior.model.noise_scale)
+
+    def draw():
+        return posterior.unknown.sample(unknown_key, num_samples)
+
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), eqx.filter_eval_shape(draw))
+    unknown = jax.lax.cond(jnp.any(is_none), draw, lambda: nothing)
+    return MixtureFields(known, unknown, posterior.unknown.level, is_none)
+
+
+def systematic_resampling(
+    key: PRNGKeyArray, weights: Float[Array, " n"], num_samples: int
+) -> Int[Array, " num_samples"]:
+    """Indices so that each is drawn as often as its weight says, but for less than one (Kitagawa 1996)."""
+    places = (jnp.arange(num_samples) + jax.random.uniform(key)) / num_samples
+    total = jnp.cumsum(weights)
+    return jnp.clip(jnp.searchsorted(total / total[-1], places, side="right"), 0, len(weights) - 1)
+
+
+class PlacedShapes(Fields):
+    """h tanh(d / h) of solids, each where it was placed: as steep as the distance at the surface, and bounded.
+
+    - `solids`, `placements`: with a leading axis.
+    - `width`: h, in scene units.
+    """
+
+    solids: SignedDistance
+    placements: Placement
+    width: Float[Array, ""]
+
+    def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
+        """All of them at the points x (scene coordinates)."""
+
+        def one(placed):
+            solid, placement = placed
+            return self.width * jnp.tanh(placement.distance(solid, jnp.asarray(x)) / self.width)
+
+        return jax.lax.map(one, (self.solids, self.placements))
+
+
+class MixtureFields(Fields):
+    """Samples each of which is of one of two kinds.
+
+    - `known`, `unknown`: as many of both; `level`: that of the unknown, which is taken from it.
+    - `is_unknown`: which kind each is of.
+    """
+
+    known: Fields
+    unknown: Fields
+    level: Float[Array, ""]
+    is_unknown: Bool[Array, " s"]
+
+    def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
+        """All samples at the points x (scene coordinates)."""
+        return self._merged(lambda fields: fields(x))
+
+    def gradient(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n 3"]:
+        """The gradients of all samples at the points x."""
+        return self._merged(lambda fields: fields.gradient(x), relative=False)
+
+    def on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "s g g g"]:
+        """All samples on the tensor grid axis x axis x axis, each part as fast as it can be."""
+        return self._merged(lambda fields: fields.on_grid(axis))
+
+    def _merged(self, evaluate: Any, relative: bool = True) -> Array:
+        shape = jax.eval_shape(lambda: evaluate(self.known))
+        zero = jnp.zeros(shape.shape, shape.dtype)
+        # What is asked of none is not computed.
+        known = jax.lax.cond(jnp.all(self.is_unknown), lambda: zero, lambda: evaluate(self.known))
+        unknown = jax.lax.cond(jnp.any(self.is_unknown), lambda: evaluate(self.unknown), lambda: zero)
+        which = self.is_unknown.reshape(-1, *(1,) * (zero.ndim - 1))
+        return jnp.where(which, unknown - self.level if relative else unknown, known)

@@ -1,0 +1,109 @@
+"""Meshes as shapes of a bank: their signed distances on grids, kept in the user's cache."""
+
+import hashlib
+import secrets
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import platformdirs
+import trimesh
+from jaxtyping import Float
+from tqdm import tqdm
+
+from jaxnbv.checks import InputError, require
+from jaxnbv.geometry.pose import fibonacci_sphere
+from jaxnbv.scanning.mesh import TriangleMesh, load_mesh
+from jaxnbv.scanning.sdf import Sampled, solid_of_mesh
+
+# What is kept is made anew where what makes it has changed.
+_VERSION = 1
+
+
+def mesh_paths(meshes: str | Path | Sequence[str | Path]) -> list[Path]:
+    """The files that are named, or all meshes in a folder and those within it: files whose names end as a format that
+    trimesh reads.
+
+    **Raises:** `ValueError` for a folder that is not there or holds no mesh, or for no files.
+    """
+    if isinstance(meshes, str | Path):
+        folder = Path(meshes)
+        require(folder.is_dir(), f"there is no folder {folder}: give one that holds meshes, or a list of files")
+        formats = trimesh.available_formats()
+        meshes = [path for path in sorted(folder.rglob("*")) if path.suffix[1:].lower() in formats and path.is_file()]
+        ends = ", ".join(sorted(formats))
+        require(len(meshes) > 0, f"the folder {folder} holds no mesh: its files must end in {ends}")
+    require(len(meshes) > 0, "no meshes are named: give their files, or a folder")
+    return [Path(path) for path in meshes]
+
+
+def shapes_of_meshes(
+    paths: Sequence[Path], resolution: int, sheet: float, num_extremes: int, progress: bool
+) -> tuple[list[Sampled], Float[np.ndarray, "k p 3"], list[int]]:
+    """The solids of the meshes that can be used, points that are extreme on each, and which they are.
+
+    A `UserWarning` names each mesh that cannot be used, and why.
+
+    **Raises:** `ValueError` if none can.
+    """
+    solids, extremes, used = [], [], []
+    for index, path in enumerate(tqdm(paths, desc="shapes", unit="mesh", disable=not progress)):
+        try:
+            solid, points = _kept(path, resolution, sheet, num_extremes)
+        except InputError as error:
+            warnings.warn(f"{path} is left out of the bank: {error}", stacklevel=3)
+            continue
+        solids.append(solid)
+        extremes.append(points)
+        used.append(index)
+    require(len(used) > 0, f"none of the {len(paths)} meshes can be used, the first of them {paths[0]}")
+    return solids, np.stack(extremes), used
+
+
+def _kept(path: Path, resolution: int, sheet: float, num_extremes: int) -> tuple[Sampled, Float[np.ndarray, "p 3"]]:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path} ({error.strerror or error})") from error
+    settings = f"{_VERSION} {path.suffix} {resolution} {sheet} {num_extremes} ".encode()
+    file = platformdirs.user_cache_path("jaxnbv") / "shapes" / f"{hashlib.sha256(settings + content).hexdigest()}.npz"
+    found = _read(file)
+    if found is None:
+        found = _sampled(load_mesh(path), resolution, sheet, num_extremes)
+        _keep(file, found)
+    return Sampled(*(jnp.asarray(found[name]) for name in ("values", "low", "spacing", "padding"))), found["extremes"]
+
+
+def _sampled(mesh: TriangleMesh, resolution: int, sheet: float, num_extremes: int) -> dict[str, np.ndarray]:
+    solid = solid_of_mesh(mesh.vertices, mesh.faces, resolution, sheet, cubic=True)
+    require(
+        bool((np.asarray(solid.values) < 0).any()), "it is thinner than the grid: raise the resolution or the sheet"
+    )
+    directions = np.asarray(fibonacci_sphere(num_extremes))
+    extremes = mesh.vertices[np.argmax(mesh.vertices @ directions.T, axis=0)]
+    arrays: dict[str, Any] = {name: getattr(solid, name) for name in ("values", "low", "spacing", "padding")}
+    return {name: np.asarray(array, np.float32) for name, array in (arrays | {"extremes": extremes}).items()}
+
+
+def _read(file: Path) -> dict[str, np.ndarray] | None:
+    """What was kept; None where nothing was, or what was is damaged."""
+    try:
+        with np.load(file) as stored:
+            return {name: stored[name] for name in ("values", "low", "spacing", "padding", "extremes")}
+    except Exception:
+        return None
+
+
+def _keep(file: Path, arrays: dict[str, Any]) -> None:
+    """Keep them for the next time, if the disk has room."""
+    partial = file.with_suffix(f".{secrets.token_hex(8)}.npz")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(partial, **arrays)
+        partial.replace(file)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        warnings.warn(f"the shape is not kept for the next time ({error.strerror or error})", stacklevel=2)

@@ -1,0 +1,171 @@
+"""How a known shape can stand in the scene: a placement, and which placements are possible."""
+
+import math
+from abc import abstractmethod
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxnbv.checks import check_fields, require
+from jaxnbv.scanning.sdf import SignedDistance
+
+_GOLDEN = 1.0 / 1.533751168755204288118041
+_SILVER = 1.0 / math.sqrt(2.0)
+
+
+class Placement(eqx.Module):
+    """Points u of a shape's own frame stand at R (s u) + t in the scene, s along each axis of the shape.
+
+    Leading axes make a batch.
+
+    - `rotation`: R. `shift`: t, in scene units. `scale`: s > 0.
+    """
+
+    rotation: Float[Array, "*batch 3 3"]
+    shift: Float[Array, "*batch 3"]
+    scale: Float[Array, "*batch 3"]
+
+    @property
+    def factor(self) -> Float[Array, "*batch"]:
+        """Scene units per unit of the shape's signed distance: the geometric mean of s, exact where all are equal."""
+        return jnp.exp(jnp.mean(jnp.log(self.scale), axis=-1))
+
+    def to_shape(self, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """Points of the scene in the shape's own frame."""
+        away = x - self.shift
+        # R^T x as a sum, which XLA fuses with what follows where it would not a matrix product.
+        turned = sum(away[..., i, None] * self.rotation[i] for i in range(3))
+        return turned / self.scale
+
+    def distance(self, solid: SignedDistance, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """The signed distance of the placed solid at points of the scene."""
+        return self.factor * solid(self.to_shape(x))
+
+    def moved(self, step: Float[Array, "9"]) -> "Placement":
+        """Turned by the rotation vector of the first three numbers about t, shifted by the next three, and scaled by
+        the exponentials of the last."""
+        return Placement(
+            jnp.matmul(_exponential(step[:3]), self.rotation, precision="highest"),
+            self.shift + step[3:6],
+            self.scale * jnp.exp(step[6:]),
+        )
+
+
+def _exponential(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """The rotation about a vector by its length in radians (Rodrigues' formula)."""
+    square = jnp.sum(vector**2)
+    small = square < 1e-12
+    angle = jnp.sqrt(jnp.where(small, 1.0, square))
+    sine = jnp.where(small, 1.0 - square / 6.0, jnp.sin(angle) / angle)
+    versine = jnp.where(small, 0.5 - square / 24.0, (1.0 - jnp.cos(angle)) / angle**2)
+    x, y, z = vector
+    cross = jnp.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return jnp.eye(3) + sine * cross + versine * jnp.matmul(cross, cross, precision="highest")
+
+
+class ShapePoses(eqx.Module):
+    """Which placements of known shapes are possible.
+
+    - `scale`: the least and the greatest s, as shares of the scale at which the shape fills the box that holds the
+      object; the same twice fixes it.
+    - `by_axis`: whether the axes of a shape are scaled each on its own.
+
+    **Raises:** `ValueError` for scales that are not positive, or the least above the greatest.
+    """
+
+    scale: tuple[float, float] = eqx.field(static=True, default=(0.8, 1.25), kw_only=True)
+    by_axis: bool = eqx.field(static=True, default=False, kw_only=True)
+
+    def __check_init__(self):
+        check_fields(self)
+        least, most = self.scale
+        require(0 < least <= most, f"the scales are {self.scale}; give the least, positive, and the greatest")
+
+    @abstractmethod
+    def rotations(self, count: int) -> Float[np.ndarray, "m 3 3"]:
+        """At most `count` rotations, spread evenly over those that are possible: where a search starts."""
+
+    @abstractmethod
+    def turns(self) -> Float[np.ndarray, "3 k"]:
+        """The axes about which a placement can be turned, one a column."""
+
+    @property
+    def steps(self) -> Float[np.ndarray, "9 k"]:
+        """The independent steps of `Placement.moved`, one a column."""
+        turns = self.turns()
+        least, most = self.scale
+        scales = np.zeros((3, 0)) if least == most else np.eye(3) if self.by_axis else np.full((3, 1), 3**-0.5)
+        blocks, row = np.zeros((9, turns.shape[1] + 3 + scales.shape[1])), 0
+        for place, block in zip((0, 3, 6), (turns, np.eye(3), scales), strict=True):
+            blocks[place : place + 3, row : row + block.shape[1]] = block
+            row += block.shape[1]
+        return blocks
+
+
+class FreeRotation(ShapePoses):
+    """Any rotation: an object that may lie on any side."""
+
+    def rotations(self, count: int) -> Float[np.ndarray, "m 3 3"]:
+        """A super-Fibonacci spiral of unit quaternions (Alexa 2022)."""
+        index = np.arange(count) + 0.5
+        inner, outer = np.sqrt(index / count), np.sqrt(1.0 - index / count)
+        a, b = 2.0 * np.pi * index * _SILVER, 2.0 * np.pi * index * _GOLDEN
+        x, y, z, w = inner * np.sin(a), inner * np.cos(a), outer * np.sin(b), outer * np.cos(b)
+        rows = [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+            [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
+            [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+        return np.moveaxis(np.array(rows), -1, 0)
+
+    def turns(self) -> Float[np.ndarray, "3 k"]:
+        """All three."""
+        return np.eye(3)
+
+
+class Upright(ShapePoses):
+    """Any turn about the vertical.
+
+    - `axis`: the vertical, of shapes and scene alike.
+    - `within`: radians to either side to which a turn is searched; refined ones may exceed them.
+
+    **Raises:** `ValueError` also for an axis of zero, or an angle that is not in (0, pi].
+    """
+
+    axis: tuple[float, float, float] = eqx.field(static=True, default=(0.0, 1.0, 0.0))
+    within: float = eqx.field(static=True, default=math.pi)
+
+    def __check_init__(self):
+        require(any(self.axis), "the vertical is zero; give a direction, such as (0, 1, 0)")
+        require(0 < self.within <= math.pi, f"turns are searched within {self.within} rad; give an angle in (0, pi]")
+
+    def rotations(self, count: int) -> Float[np.ndarray, "m 3 3"]:
+        """Evenly spaced turns, no closer than two degrees."""
+        count = max(1, min(count, round(self.within / math.radians(1.0))))
+        angles = self.within * ((2.0 * np.arange(count) + 1.0) / count - 1.0)
+        x, y, z = self._unit
+        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        sine, versine = np.sin(angles)[:, None, None], (1.0 - np.cos(angles))[:, None, None]
+        return np.eye(3) + sine * cross + versine * (cross @ cross)
+
+    def turns(self) -> Float[np.ndarray, "3 k"]:
+        """The vertical."""
+        return self._unit[:, None]
+
+    @property
+    def _unit(self) -> Float[np.ndarray, "3"]:
+        return np.asarray(self.axis) / np.linalg.norm(self.axis)
+
+
+class AsGiven(ShapePoses):
+    """As the bank holds it, but for shift and scale."""
+
+    def rotations(self, count: int) -> Float[np.ndarray, "m 3 3"]:
+        """None but the identity."""
+        return np.eye(3)[None]
+
+    def turns(self) -> Float[np.ndarray, "3 k"]:
+        """None."""
+        return np.zeros((3, 0))

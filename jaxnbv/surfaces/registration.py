@@ -1,0 +1,306 @@
+"""Which known shapes fit what was seen, and where they stand: a search over shapes and placements.
+
+The misfit of a shape of signed distance d, placed by T,
+
+    E = mean_j [ log(1 + d(x_j)^2 / 2 tau^2) + (1 - n_j . grad d(x_j)) / 2 ]
+        + 2 mean_i log(1 + min(d(z_i) + margin, 0)^2 / tau^2) + prior(T)
+
+is that of scanned points x_j with normals n_j, and of points z_i that were seen empty: without these, fits collapse
+onto the patch that was seen. The prior is weak, on shift and scale. All shapes are tried in many rotations; the best
+are refined, all at once, by Gauss-Newton steps on E with its logarithms as weights (iteratively reweighted least
+squares), tau falling from 0.12 to 0.03.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnbv.geometry.cloud import farthest_point_subsample
+from jaxnbv.geometry.volume import Box
+from jaxnbv.scanning.evidence import Evidence
+from jaxnbv.surfaces.placement import Placement, ShapePoses
+from jaxnbv.surfaces.shape_bank import Shape, ShapeBank, values_and_gradients
+
+_NUM_POINTS, _NUM_EMPTY = 256, 512
+_MARGIN = 0.05
+_FIRST_TAU, _LAST_TAU = 0.12, 0.03
+# Standard deviations of shift (scene units) and of the logarithm of the scale about what fills the box, and what this
+# prior weighs in E.
+_SHIFT, _STRETCH, _PRIOR = 0.2, 0.15, 0.02
+# How many are refined, by how many points and steps: of those tried, of the best of these, and of all in the end.
+_COARSE, _FINE, _LAST = (192, 48, 4), (48, 128, 8), (96, 128, 8)
+# Placements that are tried with all shapes.
+_NUM_SHARED = 4
+_AT_ONCE = 256
+_DAMPING = 1e-3
+_LARGEST_STEP = 0.3
+
+
+class Seen(NamedTuple):
+    """What shapes are fitted to, in an order whose beginnings are spread as evenly as the whole."""
+
+    points: Float[Array, "n 3"]
+    normals: Float[Array, "n 3"]
+    mask: Bool[Array, " n"]
+    empty: Float[Array, "m 3"]
+    is_empty: Bool[Array, " m"]
+
+    @classmethod
+    def of(cls, evidence: Evidence) -> "Seen":
+        """Some of the cloud, by farthest point sampling, and some of the nodes seen empty, at random."""
+        cloud = farthest_point_subsample(evidence.cloud, _NUM_POINTS)
+        empty, is_empty = _some_empty(evidence)
+        return cls(cloud.points, cloud.normals, cloud.mask, empty.astype(cloud.points.dtype), is_empty)
+
+    def first(self, count: int) -> "Seen":
+        """The first so many of each."""
+        return Seen(*(rows[:count] for rows in self))
+
+
+def _some_empty(evidence: Evidence) -> tuple[Float[Array, "m 3"], Bool[Array, " m"]]:
+    if evidence.seen_empty is None or evidence.grid is None:
+        return jnp.zeros((_NUM_EMPTY, 3)), jnp.zeros(_NUM_EMPTY, bool)
+    seen = evidence.seen_empty.reshape(-1)
+    order = np.random.default_rng(0).permutation(seen.size)
+    # The place of each node in a fixed random order of those that were seen empty.
+    place = jnp.where(seen[order], jnp.cumsum(seen[order]) - 1, _NUM_EMPTY)
+    chosen = jnp.zeros(_NUM_EMPTY, jnp.int32).at[place].set(order, mode="drop")
+    node = jnp.stack(jnp.unravel_index(chosen, evidence.seen_empty.shape), axis=-1)
+    return jnp.asarray(evidence.grid.axis)[node], jnp.arange(_NUM_EMPTY) < jnp.sum(seen)
+
+
+class Hypotheses(eqx.Module):
+    """Shapes of a bank, each with a placement: the modes of the fit, best first.
+
+    - `shape`: indices of the bank.
+    - `placement`: where each stands.
+    - `misfit`: E.
+    - `is_mode`: false for one that comes within 15 degrees of a better one of the same shape.
+    """
+
+    shape: Int[Array, " h"]
+    placement: Placement
+    misfit: Float[Array, " h"]
+    is_mode: Bool[Array, " h"]
+
+
+class Prior(NamedTuple):
+    """What is known of placements before anything was seen.
+
+    - `poses`: which are possible. `box`: what holds the object, which fills it more or less.
+    """
+
+    poses: ShapePoses
+    box: Box
+
+    def filling(self, shape: Shape, rotation: Float[Array, "3 3"]) -> Placement:
+        """A shape turned so, as large as the box has room for, in its middle."""
+        turned = jnp.matmul(shape.extremes, rotation.T, precision="highest")
+        low, high = jnp.min(turned, axis=0), jnp.max(turned, axis=0)
+        least, most = jnp.asarray(self.box.low, turned.dtype), jnp.asarray(self.box.high, turned.dtype)
+        scale = jnp.min((most - least) / (high - low))
+        return Placement(rotation, 0.5 * (least + most) - 0.5 * scale * (low + high), jnp.broadcast_to(scale, 3))
+
+    def deviation(self, shape: Shape, placement: Placement) -> Float[Array, "9"]:
+        """By how much a placement departs from what fills the box: no turn, the shift, the logarithms of the scale."""
+        usual = self.filling(shape, placement.rotation)
+        shift, stretch = placement.shift - usual.shift, jnp.log(placement.scale / usual.scale)
+        return jnp.concatenate([jnp.zeros_like(shift), shift, stretch])
+
+    def within(self, shape: Shape, placement: Placement) -> Placement:
+        """The placement with its scale clipped to what is possible."""
+        usual = self.filling(shape, placement.rotation).scale
+        least, most = self.poses.scale
+        return eqx.tree_at(lambda p: p.scale, placement, jnp.clip(placement.scale, least * usual, most * usual))
+
+
+_PRECISION = _PRIOR * np.array([0.0] * 3 + [_SHIFT**-2] * 3 + [_STRETCH**-2 / 3.0] * 3)
+
+
+class _Starts(NamedTuple):
+    """Shapes where they are placed, and their misfits."""
+
+    shape: Int[Array, " n"]
+    placement: Placement
+    misfit: Float[Array, " n"]
+
+    def best(self, count: int) -> "_Starts":
+        _, rows = jax.lax.top_k(-self.misfit, min(count, len(self.misfit)))
+        return jax.tree.map(lambda leaf: leaf[rows], self)
+
+
+@eqx.filter_jit
+def register(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Hypotheses:
+    """The shapes and placements that fit what was seen best.
+
+    All shapes are tried in many rotations. Where the best of them came to stand, all others are tried too.
+    """
+    few, some = seen.first(_COARSE[1]), seen.first(_FINE[1])
+    turned = _turned(bank, prior, few, num_starts)
+    coarse = _refined(bank, prior, turned.best(_COARSE[0]), few, _COARSE)
+    fine = _refined(bank, prior, coarse.best(_FINE[0]), some, _FINE)
+    others = _exchanged(bank, prior, fine, few).best(_LAST[0])
+    both = _Starts(*jax.tree.map(lambda *leaves: jnp.concatenate(leaves), fine, others))
+    last = _refined(bank, prior, both.best(_LAST[0]), some, _LAST)
+
+    def judge(start):
+        return _misfit(bank.shape(start.shape), prior, start.placement, seen, _LAST_TAU)
+
+    found = last._replace(misfit=jax.lax.map(judge, last, batch_size=_AT_ONCE)).best(_LAST[0])
+    return Hypotheses(found.shape, found.placement, found.misfit, _modes(found.shape, found.placement.rotation))
+
+
+def _turned(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> _Starts:
+    """All shapes in some rotations each, as they fill the box."""
+    all_of_them = jnp.asarray(prior.poses.rotations(num_starts), seen.points.dtype)
+    count = max(1, min(len(all_of_them), num_starts // len(bank)))
+    # Each shape has its own, evenly spread, so that together they leave no gaps.
+    offsets = np.random.default_rng(0).permutation(len(bank)) / len(bank)
+    places = (np.arange(count) + offsets[:, None]) * len(all_of_them) / count
+
+    def of_shape(shape, rotations):
+        return jax.vmap(lambda one: prior.filling(shape, one))(rotations)
+
+    starts = jax.vmap(of_shape)(bank.shapes, all_of_them[places.astype(int)])
+    return _tried(bank, prior, starts, seen)
+
+
+def _exchanged(bank: ShapeBank, prior: Prior, first: _Starts, seen: Seen) -> _Starts:
+    """All shapes where a few of the best stand that are of different rotations, filling as much of the box."""
+    ordered = first.best(len(first.misfit))
+    mode = _modes(jnp.zeros_like(ordered.shape), ordered.placement.rotation)
+    shapes, where, _ = jax.tree.map(lambda leaf: leaf[jnp.argsort(~mode, stable=True)[:_NUM_SHARED]], ordered)
+    step = jax.vmap(lambda index, placement: prior.deviation(bank.shape(index), placement))(shapes, where)
+
+    def of_shape(shape):
+        return jax.vmap(lambda one, step: prior.filling(shape, one.rotation).moved(step))(where, step)
+
+    return _tried(bank, prior, jax.vmap(of_shape)(bank.shapes), seen)
+
+
+def _tried(bank: ShapeBank, prior: Prior, placements: Placement, seen: Seen) -> _Starts:
+    """The misfits of each shape at its own placements, along a second axis."""
+    num_shapes, count = placements.scale.shape[:2]
+
+    def of_shape(one):
+        shape, where = one
+        return jax.vmap(lambda placement: _misfit(shape, prior, placement, seen, _FIRST_TAU))(where)
+
+    misfit = jax.lax.map(of_shape, (bank.shapes, placements), batch_size=max(1, _AT_ONCE // count))
+    flat = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), placements)
+    return _Starts(jnp.repeat(jnp.arange(num_shapes), count), flat, misfit.reshape(-1))
+
+
+def _refined(bank: ShapeBank, prior: Prior, starts: _Starts, seen: Seen, stage: tuple[int, int, int]) -> _Starts:
+    """The best along Gauss-Newton steps, by E at the last tau, while the tau of the steps falls."""
+    taus = jnp.append(jnp.geomspace(_FIRST_TAU, _LAST_TAU, stage[2]), _LAST_TAU)
+    basis = jnp.asarray(prior.poses.steps, seen.points.dtype)
+
+    def refine(start):
+        shape = bank.shape(start.shape)
+
+        def advance(state, tau):
+            current, best, least = state
+            step, misfit = _newton_step(shape, prior, current, seen, tau, basis)
+            best = jax.tree.map(lambda a, b: jnp.where(misfit < least, a, b), current, best)
+            # The last step is not judged, and lost.
+            return (prior.within(shape, current.moved(step)), best, jnp.minimum(misfit, least)), None
+
+        state = start.placement, start.placement, jnp.asarray(jnp.inf, seen.points.dtype)
+        (_, best, least), _ = jax.lax.scan(advance, state, taus)
+        return _Starts(start.shape, best, least)
+
+    return jax.lax.map(refine, starts, batch_size=_AT_ONCE)
+
+
+def _mean(values: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, ""]:
+    return jnp.sum(jnp.where(mask, values, 0.0)) / jnp.maximum(jnp.sum(mask), 1)
+
+
+def _misfit(
+    shape: Shape, prior: Prior, placement: Placement, seen: Seen, tau: Float[Array, ""] | float
+) -> Float[Array, ""]:
+    """E, with the derivative along the normals as `jax.jvp` gives it."""
+    distance, slope = jax.jvp(lambda x: placement.distance(shape.solid, x), (seen.points,), (seen.normals,))
+    empty = placement.distance(shape.solid, seen.empty)
+    return _summed(distance, slope, empty, prior.deviation(shape, placement), seen, tau)
+
+
+def _summed(
+    distance: Float[Array, " n"],
+    slope: Float[Array, " n"],
+    empty: Float[Array, " m"],
+    deviation: Float[Array, "9"],
+    seen: Seen,
+    tau: Float[Array, ""] | float,
+) -> Float[Array, ""]:
+    of_data = jnp.log1p(distance**2 / (2.0 * tau**2)) + 0.5 * (1.0 - jnp.clip(slope, -1.0, 1.0))
+    of_empty = jnp.log1p(jnp.minimum(empty + _MARGIN, 0.0) ** 2 / tau**2)
+    of_prior = 0.5 * jnp.sum(jnp.asarray(_PRECISION, deviation.dtype) * deviation**2)
+    return _mean(of_data, seen.mask) + 2.0 * _mean(of_empty, seen.is_empty) + of_prior
+
+
+def _newton_step(
+    shape: Shape,
+    prior: Prior,
+    placement: Placement,
+    seen: Seen,
+    tau: Float[Array, ""],
+    basis: Float[Array, "9 k"],
+) -> tuple[Float[Array, "9"], Float[Array, ""]]:
+    """A damped Gauss-Newton step of E, its normals compared as (n - grad d)^2 / 4, within a trust region; and E at the
+    last tau before it."""
+    points = jnp.concatenate([seen.points, seen.empty])
+    distance, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), points)
+    count = len(seen.points)
+    # What the distance at a fixed point of the scene does as the shape is turned about t, shifted and scaled.
+    away = points - placement.shift
+    own = jnp.matmul(away, placement.rotation, precision="highest")
+    own_gradient = jnp.matmul(gradient, placement.rotation, precision="highest")
+    by_scale = distance[:, None] / 3.0 - own * own_gradient
+    rows = jnp.concatenate([jnp.cross(gradient, away), -gradient, by_scale], axis=1)
+    rows = jnp.matmul(rows, basis, precision="highest")
+
+    of_data = jnp.where(seen.mask, 1.0, 0.0) / jnp.maximum(jnp.sum(seen.mask), 1)
+    of_empty = jnp.where(seen.is_empty, 4.0, 0.0) / jnp.maximum(jnp.sum(seen.is_empty), 1)
+    within = jnp.minimum(distance[count:] + _MARGIN, 0.0)
+    residuals = jnp.concatenate([distance[:count], within])
+    weights = jnp.concatenate(
+        [of_data / (tau**2 + 0.5 * distance[:count] ** 2), jnp.where(within < 0, of_empty, 0.0) / (tau**2 + within**2)]
+    )
+
+    # The gradient of a flat piece turns with the shape: d(grad d) = omega x grad d.
+    length = jnp.maximum(jnp.linalg.norm(gradient[:count], axis=1, keepdims=True), 1e-6)
+    unit = gradient[:count] / length
+    turning = jnp.cross(jnp.eye(3, dtype=unit.dtype), unit[:, None])
+    turning = jnp.einsum("nad,ak->ndk", turning, basis[:3], precision="highest")
+    precision, deviation = jnp.asarray(_PRECISION, rows.dtype), prior.deviation(shape, placement)
+
+    normal = jnp.einsum("n,nk,nl->kl", weights, rows, rows, precision="highest")
+    normal = normal + 0.5 * jnp.einsum("n,ndk,ndl->kl", of_data, turning, turning, precision="highest")
+    normal = normal + jnp.matmul(basis.T, precision[:, None] * basis, precision="highest")
+    slope = jnp.einsum("n,n,nk->k", weights, residuals, rows, precision="highest")
+    slope = slope - 0.5 * jnp.einsum("n,nd,ndk->k", of_data, seen.normals - unit, turning, precision="highest")
+    slope = slope + jnp.matmul(basis.T, precision * deviation, precision="highest")
+
+    normal = normal + _DAMPING * jnp.trace(normal) * jnp.eye(len(normal), dtype=normal.dtype)
+    step = jnp.matmul(basis, jnp.linalg.solve(normal, -slope), precision="highest")
+    along = jnp.sum(seen.normals * gradient[:count], axis=1)
+    misfit = _summed(distance[:count], along, distance[count:], deviation, seen, _LAST_TAU)
+    return step * jnp.minimum(1.0, _LARGEST_STEP / jnp.maximum(jnp.max(jnp.abs(step)), 1e-9)), misfit
+
+
+def _modes(shape: Int[Array, " h"], rotation: Float[Array, "h 3 3"]) -> Bool[Array, " h"]:
+    """Which of the hypotheses, best first, are farther than 15 degrees from all better modes of their shape."""
+    trace = jnp.einsum("aij,bij->ab", rotation, rotation, precision="highest")
+    near = (0.5 * (trace - 1.0) > np.cos(np.radians(15.0))) & (shape[:, None] == shape)
+
+    def keep(modes, index):
+        covered = jnp.any(near[index] & modes & (jnp.arange(len(shape)) < index))
+        return modes.at[index].set(~covered), None
+
+    return jax.lax.scan(keep, jnp.zeros(len(shape), bool), jnp.arange(len(shape)))[0]

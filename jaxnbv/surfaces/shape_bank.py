@@ -1,0 +1,172 @@
+"""A bank of known shapes: what an imagination remembers."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, UInt8
+
+from jaxnbv.checks import InputError, check_type, require
+from jaxnbv.geometry.pose import fibonacci_sphere
+from jaxnbv.scanning.sdf import SignedDistance
+from jaxnbv.surfaces.mesh_shapes import mesh_paths, shapes_of_meshes
+
+_NUM_EXTREMES, _FAR, _STRIDES = 128, 4.0, 12
+_LONGEST_NAME = 64
+
+
+class Shape(NamedTuple):
+    """One shape of a bank, or several along a leading axis.
+
+    - `solid`: its signed distance.
+    - `extremes`: points of its surface, among them those that are farthest in any direction, nearly.
+    """
+
+    solid: SignedDistance
+    extremes: Float[Array, "*k p 3"]
+
+
+class ShapeBank(eqx.Module):
+    """Known shapes, each in a frame of its own about its middle, in which shapes of a kind stand alike.
+
+    - `solids`: all of them as one, whose arrays have a leading axis of shapes; None for a bank of none.
+    - `extremes`: points of each surface, among them those that are farthest in any direction, nearly.
+    - `codes`: their names in UTF-8. No program that is compiled depends on them.
+
+    **Raises:** `ValueError` for another number of names than of shapes.
+    """
+
+    solids: SignedDistance | None
+    extremes: Float[Array, "k p 3"]
+    codes: UInt8[Array, "k c"]
+
+    def __check_init__(self):
+        check_type(self.solids, SignedDistance | None, "the bank's solids")
+        rows = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves((self.solids, self.extremes, self.codes))}
+        require(
+            len(rows) == 1,
+            f"the arrays of the bank have {sorted(rows)} rows: make it with ShapeBank.of or ShapeBank.from_meshes",
+        )
+
+    @classmethod
+    def of(cls, solids: Sequence[SignedDistance], names: Sequence[str] | None = None) -> "ShapeBank":
+        """A bank of solids of one kind, as exact as they are: one compiled program evaluates any of them.
+
+        - `names`: by default their numbers.
+
+        **Raises:** `ValueError` for what is no solid, solids of several kinds, or another number of names.
+        """
+        for index, solid in enumerate(solids):
+            check_type(solid, SignedDistance, f"solid {index} of the bank")
+        names = tuple(map(str, range(len(solids)))) if names is None else tuple(names)
+        require(len(names) == len(solids), f"there are {len(names)} names for {len(solids)} solids: give one for each")
+        if not solids:
+            return cls(None, jnp.zeros((0, _NUM_EXTREMES, 3)), encoded(names))
+        kinds = {jax.tree.structure(solid): index for index, solid in reversed(list(enumerate(solids)))}
+        require(
+            len(kinds) == 1,
+            f"the bank's solids are of {len(kinds)} kinds, such as numbers {sorted(kinds.values())[:2]}: give solids "
+            "of one kind, or meshes of them (nbv.mesh_from_sdf) to ShapeBank.from_meshes",
+        )
+        joined = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *solids)
+        return cls(joined, _extremes(joined), encoded(names))
+
+    @classmethod
+    def from_meshes(
+        cls,
+        meshes: str | Path | Sequence[str | Path],
+        resolution: int = 64,
+        sheet: float = 0.05,
+        names: Sequence[str] | None = None,
+        progress: bool = True,
+    ) -> "ShapeBank":
+        """A bank of meshes, centred, their longest sides 2.5: their signed distances on grids, which are kept in the
+        user's cache. Soups and open meshes will do.
+
+        - `meshes`: files, or a folder of which all are taken, also in folders within.
+        - `resolution`: nodes along the longest side.
+        - `sheet`: how thick faces are, in scene units, that have the outside on both sides.
+        - `names`: by default the names of the files, of a folder's with their place in it.
+
+        A `UserWarning` names each mesh that cannot be used and is left out.
+
+        **Raises:** `ValueError` if none can be used, for another number of names, or numbers out of their ranges.
+        """
+        require(resolution >= 8, f"the resolution is {resolution}; it must be at least 8")
+        require(0 < sheet < 1, f"sheets are {sheet} thick; give scene units, above 0 and below 1")
+        paths = mesh_paths(meshes)
+        if names is None:
+            folder = Path(meshes) if isinstance(meshes, str | Path) else None
+            names = [path.stem if folder is None else str(path.relative_to(folder).with_suffix("")) for path in paths]
+        require(len(names) == len(paths), f"there are {len(names)} names for {len(paths)} meshes: give one for each")
+        solids, extremes, used = shapes_of_meshes(paths, resolution, sheet, _NUM_EXTREMES, progress)
+        joined = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *solids)
+        return cls(joined, jnp.asarray(extremes), encoded([names[index] for index in used]))
+
+    @property
+    def shapes(self) -> Shape:
+        """All of them.
+
+        **Raises:** `ValueError` for a bank of none.
+        """
+        if self.solids is None:
+            raise InputError("the bank has no shapes: give some to ShapeBank.of or ShapeBank.from_meshes")
+        return Shape(self.solids, self.extremes)
+
+    def shape(self, index: Int[Array, ""]) -> Shape:
+        """One of them."""
+        return jax.tree.map(lambda rows: rows[index], self.shapes)
+
+    def __len__(self) -> int:
+        return len(self.codes)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all shapes."""
+        return tuple(bytes(code).rstrip(b"\0").decode(errors="ignore") for code in np.asarray(self.codes))
+
+    def chosen(self, indices: Sequence[int]) -> "ShapeBank":
+        """A bank of some of the shapes.
+
+        **Raises:** `ValueError` for an index that it does not have.
+        """
+        wrong = [index for index in indices if not 0 <= index < len(self)]
+        require(not wrong, f"the bank has {len(self)} shapes; there is no number {wrong[:1]}")
+        rows = np.asarray(indices, int)
+        solids = jax.tree.map(lambda leaf: leaf[rows], self.solids) if len(rows) else None
+        return ShapeBank(solids, self.extremes[rows], self.codes[rows])
+
+
+def encoded(names: Sequence[str]) -> UInt8[Array, "k c"]:
+    """Names as the rows of `ShapeBank.codes`, which end after 64 bytes."""
+    rows = [name.encode()[:_LONGEST_NAME].ljust(_LONGEST_NAME, b"\0") for name in names]
+    return jnp.asarray(np.frombuffer(b"".join(rows), np.uint8).reshape(-1, _LONGEST_NAME))
+
+
+@eqx.filter_jit
+def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
+    """Points of a sphere far about each solid, brought to its surface along the gradient."""
+    start = fibonacci_sphere(_NUM_EXTREMES, _FAR)
+
+    def of_solid(solid):
+        def stride(points, _):
+            distance, gradient = values_and_gradients(solid, points)
+            square = jnp.sum(gradient**2, axis=-1)
+            return points - (distance / jnp.where(square > 0, square, 1.0))[:, None] * gradient, None
+
+        return jax.lax.scan(stride, start, length=_STRIDES)[0]
+
+    return jax.lax.map(of_solid, solids, batch_size=16)
+
+
+def values_and_gradients(
+    function: Callable[[Float[Array, "n 3"]], Float[Array, " n"]], points: Float[Array, "n 3"]
+) -> tuple[Float[Array, " n"], Float[Array, "n 3"]]:
+    """Of a function that treats every point by itself, so that one sweep a direction gives all gradients."""
+    values, along = jax.linearize(function, points)
+    columns = [along(jnp.broadcast_to(direction, points.shape)) for direction in jnp.eye(3, dtype=points.dtype)]
+    return values, jnp.stack(columns, axis=-1)

@@ -1,0 +1,210 @@
+"""Known shapes as the prior: registered, weighted, and sampled about."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+import jaxnbv as nbv
+from jaxnbv.scanning.sdf import Cuboid, SignedDistance, Sphere
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.surfaces.known_shapes import systematic_resampling
+from jaxnbv.surfaces.registration import Prior, Seen, register
+
+CAMERA = nbv.Camera(height=40, width=40, fov=60.0)
+QUICK = nbv.ScreenedSPSR(GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=16))
+RESIDUAL = nbv.ScreenedSPSR(GeometricSPSR(0.02, truncation=16), (nbv.OnSurface(),))
+GRID = nbv.Grid(40)
+
+
+class Corner(SignedDistance):
+    """Two boxes that meet: a solid without any symmetry.
+
+    - `arm`: half the length of the second.
+    """
+
+    arm: jax.Array
+
+    def __call__(self, x):
+        first = Cuboid([0.9, 0.3, 0.4])(x)
+        return jnp.minimum(first, Cuboid(jnp.stack([0.2, self.arm, 0.25]))(x - jnp.array([0.6, 0.5, 0.1])))
+
+
+def corner(arm):
+    return Corner(jnp.asarray(arm, jnp.float32))
+
+
+ARMS = (0.35, 0.5, 0.65, 0.8)
+BANK = nbv.ShapeBank.of([corner(arm) for arm in ARMS], [f"arm {arm}" for arm in ARMS])
+
+
+def filling(solid, rotation, bank, index):
+    """The solid turned so, as large as the box has room for and in its middle, by a mesh of its own."""
+    mesh = nbv.mesh_from_sdf(solid, nbv.Grid(120, 2.0))
+    turned = mesh.frame.to_world(mesh.vertices) @ rotation.as_matrix().T
+    low, high = turned.min(axis=0), turned.max(axis=0)
+    scale = 2.5 / (high - low).max()
+    angle = float(np.linalg.norm(rotation.as_rotvec()))
+    placed = solid.rotate(rotation.as_rotvec(), angle) if angle else solid
+    return placed.scale(scale).translate(-0.5 * scale * (low + high)), scale, -0.5 * scale * (low + high)
+
+
+def evidence_of(surface, positions, noise=0.005):
+    planner = nbv.Planner(nbv.Coverage(), camera=CAMERA, imagination=nbv.Imagination(grid=GRID), max_views=4)
+    evidence = None
+    for index, position in enumerate(positions):
+        pose = nbv.look_at(position)
+        scan = nbv.SensorNoise(noise, noise)(nbv.scan(surface, CAMERA, pose), jax.random.key(index))
+        evidence = planner.init(pose, scan) if evidence is None else planner.observe(evidence, pose, scan)
+    return evidence
+
+
+AROUND = ((0.5, 1.0, 3.2), (2.8, 1.2, -1.2), (-2.5, -1.5, -1.5))
+
+
+@pytest.fixture(scope="module")
+def planted():
+    """Eight poses of one shape of the bank, seen from three sides, and what was found."""
+    found = []
+    for seed in range(8):
+        rotation, index = Rotation.random(random_state=seed), seed % len(ARMS)
+        solid, scale, shift = filling(corner(ARMS[index]), rotation, BANK, index)
+        seen = eqx.filter_jit(Seen.of)(evidence_of(nbv.SDFSurface(solid), AROUND))
+        hypotheses = register(BANK, Prior(nbv.FreeRotation(), nbv.Box()), seen, 2048)
+        found.append((index, rotation, scale, shift, hypotheses))
+    return found
+
+
+def test_planted_poses_are_recovered(planted):
+    turned, moved = [], []
+    for _, rotation, _, shift, found in planted:
+        off = Rotation.from_matrix(np.asarray(found.placement.rotation[0])) * rotation.inv()
+        turned.append(np.degrees(off.magnitude()))
+        moved.append(np.linalg.norm(np.asarray(found.placement.shift[0]) - shift))
+    assert np.median(turned) < 3.0
+    assert np.median(moved) < 0.02
+
+
+def test_the_shape_itself_fits_best(planted):
+    assert sum(int(found.shape[0]) == index for index, *_, found in planted) >= 7
+
+
+def test_modes_of_one_shape_are_far_apart(planted):
+    for *_, found in planted:
+        kept = np.asarray(found.is_mode)
+        rotation, shape = np.asarray(found.placement.rotation)[kept], np.asarray(found.shape)[kept]
+        trace = np.einsum("aij,bij->ab", rotation, rotation)
+        near = (trace > 1.0 + 2.0 * np.cos(np.radians(15.0))) & (shape[:, None] == shape)
+        np.testing.assert_array_equal(near, np.eye(len(shape), dtype=bool))
+        assert np.all(np.diff(np.asarray(found.misfit)) >= 0)
+
+
+def test_a_symmetric_shape_stands_in_all_the_ways_that_look_alike():
+    """A bar that was seen from above: it may be turned by half a turn."""
+    bank = nbv.ShapeBank.of([Cuboid([1.2, 0.3, 0.4])])
+    seen = Seen.of(evidence_of(nbv.SDFSurface(Cuboid([1.25, 0.31, 0.42])), ((0.5, 3.0, 1.5),)))
+    found = register(bank, Prior(nbv.Upright(), nbv.Box()), seen, 512)
+    angles = np.degrees(np.arctan2(np.asarray(found.placement.rotation)[:, 0, 2], np.asarray(found.placement.rotation)[:, 0, 0]))
+    good = np.asarray(found.is_mode) & (np.asarray(found.misfit) < 0.2)
+    assert sorted(np.round(np.abs(angles[good])).astype(int).tolist()) == pytest.approx([0, 180], abs=3)
+
+
+def model(bank=BANK, **changed):
+    return nbv.KnownShapes(bank, RESIDUAL, unknown=QUICK, num_starts=1024, **changed)
+
+
+def test_where_no_shape_fits_none_is_the_answer():
+    evidence = evidence_of(nbv.SDFSurface(Sphere(1.2)), AROUND)
+    posterior = model().condition(evidence)
+    assert posterior.hypotheses[0].name == "none of these"
+    assert posterior.hypotheses[0].weight > 0.95
+    surfaces = posterior.sample(jax.random.key(0), 4)
+    plain = QUICK.condition(evidence)
+    x = jnp.asarray(np.random.default_rng(0).uniform(-1.2, 1.2, (64, 3)), jnp.float32)
+    _, _, _, unknown_key = jax.random.split(jax.random.key(0), 4)
+    np.testing.assert_allclose(surfaces(x), plain.sample(unknown_key, 4)(x) - plain.level, atol=1e-6)
+
+
+def test_without_shapes_the_model_is_the_unknown_one_to_the_bit():
+    evidence = evidence_of(nbv.SDFSurface(Sphere(1.2)), AROUND[:1])
+    empty = model(nbv.ShapeBank.of([])).condition(evidence)
+    assert eqx.tree_equal(empty, QUICK.condition(evidence))
+    assert eqx.tree_equal(empty.sample(jax.random.key(3), 2), QUICK.condition(evidence).sample(jax.random.key(3), 2))
+
+
+def test_of_one_exact_shape_samples_are_that_shape_to_the_noise():
+    """On the sides that no view has seen too: points of the true surface lie within the noise of each sample's."""
+    solid, _, _ = filling(corner(0.65), Rotation.from_rotvec([0.0, 0.0, 0.0]), BANK, 2)
+    truth = nbv.mesh_from_sdf(solid, nbv.Grid(100, 1.4))
+    points = jnp.asarray(truth.frame.to_world(truth.sample_points(jax.random.key(1), 400)), jnp.float32)
+    evidence = evidence_of(nbv.SDFSurface(solid), AROUND[:2])
+    known = dataclasses.replace(model(BANK.chosen([2])), poses=nbv.AsGiven())
+    posterior = known.condition(evidence)
+    assert posterior.hypotheses[0].name == "arm 0.65"
+    fields = posterior.sample(jax.random.key(0), 6)
+    slope = jnp.linalg.norm(fields.gradient(points), axis=-1)
+    away = np.abs(np.asarray(fields(points) / slope))
+    # The scale and shift are estimated from noise of 0.005; the residual's own deviation is of that order.
+    assert np.median(away) < 0.015
+    assert np.quantile(away, 0.9) < 0.05
+
+
+def test_weights_are_tempered_fits():
+    evidence = evidence_of(nbv.SDFSurface(filling(corner(0.5), Rotation.identity(), BANK, 1)[0]), AROUND[:1])
+    posterior = model(sharpness=7.0, unknown_misfit=0.4).condition(evidence)
+    found = posterior.found
+    energy = np.append(np.where(found.is_mode, np.exp(-7.0 * np.asarray(found.misfit, np.float64)), 0.0), np.exp(-2.8))
+    np.testing.assert_allclose(posterior.weights, energy / energy.sum(), rtol=1e-4, atol=1e-7)
+    listed = posterior.hypotheses
+    assert sum(one.weight for one in listed) == pytest.approx(1.0, abs=1e-4)
+    assert [one.weight for one in listed] == sorted((one.weight for one in listed), reverse=True)
+    assert "none of these" in [one.name for one in listed]
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.floats(0.0, 1.0), min_size=7, max_size=7).filter(lambda w: sum(w) > 0.1), st.integers(0, 10**6))
+def test_systematic_resampling_draws_each_as_often_as_its_weight_says(weights, seed):
+    weights = np.asarray(weights, np.float32)
+    drawn = np.asarray(systematic_resampling(jax.random.key(seed), jnp.asarray(weights), 16))
+    counts = np.bincount(drawn, minlength=7)
+    expected = 16 * weights.astype(np.float64) / weights.astype(np.float64).sum()
+    assert np.all(np.abs(counts - expected) < 1.0 + 1e-3)
+
+
+def test_the_same_evidence_has_the_same_hypotheses_and_nothing_is_compiled_twice():
+    surface = nbv.SDFSurface(filling(corner(0.5), Rotation.identity(), BANK, 1)[0])
+    imagination = dataclasses.replace(nbv.Imagination(QUICK, GRID, 3).knowing(BANK, nbv.AsGiven()))
+    imagination = dataclasses.replace(imagination, model=dataclasses.replace(imagination.model, residual=RESIDUAL, num_starts=64))
+    first, second = evidence_of(surface, AROUND[:1]), evidence_of(surface, AROUND[:2])
+    assert eqx.tree_equal(imagination.posterior(first).found, imagination.posterior(first).found)
+    imagination.sample(first, jax.random.key(0))
+    with jax.log_compiles(), pytest.MonkeyPatch.context() as patch:
+        compiled = []
+        import logging
+
+        patch.setattr(logging.getLogger("jax._src.interpreters.pxla"), "warning", lambda *a, **k: compiled.append(a))
+        imagination.sample(second, jax.random.key(1))
+    assert compiled == []
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: nbv.KnownShapes(BANK, num_starts=0), "number of starts is 0"),
+        (lambda: nbv.KnownShapes(BANK, sharpness=-1.0), "sharpness is -1.0"),
+        (lambda: nbv.KnownShapes("chairs"), "bank is 'chairs'"),
+        (lambda: nbv.ShapeBank.of([Sphere(1.0), Cuboid([1.0, 1.0, 1.0])]), "of 2 kinds, such as numbers"),
+        (lambda: nbv.ShapeBank.of([Sphere(1.0)], ["a", "b"]), "2 names for 1 solids"),
+        (lambda: nbv.ShapeBank.of([1.0]), "solid 0 of the bank is 1.0"),
+        (lambda: BANK.chosen([9]), "the bank has 4 shapes"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(make, words):
+    with pytest.raises(nbv.InputError, match=words):
+        make()
