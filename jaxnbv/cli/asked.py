@@ -23,6 +23,7 @@ class EpisodeOptions(NamedTuple):
 
     search: str
     model: str
+    known: str | None
     views: int
     until: list[str] | None
     seed: int

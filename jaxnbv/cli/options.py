@@ -91,11 +91,12 @@ StudyModelOption = Annotated[
     ),
 ]
 KnownOption = Annotated[
-    str,
+    str | None,
     typer.Option(
         metavar="BANK",
-        help="Shapes that are known, which what was seen is compared with: a folder of meshes, or "
-        f"{', '.join(BANKS)}; none: the model alone.",
+        help="Shapes that what was seen is compared with, beside the model: upright ones of a folder of meshes, or "
+        f"{', '.join(BANKS)}, which ship; none: the model alone.",
+        show_default="none; demo: other objects of the kind",
     ),
 ]
 PaperOption = Annotated[

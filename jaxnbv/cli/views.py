@@ -16,6 +16,7 @@ from jaxnbv.cli.options import (
     FirstOption,
     FovOption,
     FramingOption,
+    KnownOption,
     LengthscaleOption,
     ModelName,
     ModelOption,
@@ -54,6 +55,7 @@ HidingFirstOption = Annotated[
 _EPISODE: dict[str, tuple[Any, Any]] = {
     "search": (SearchOption, SearchName("discrete")),
     "model": (ModelOption, ModelName("screened")),
+    "known": (KnownOption, None),
     "views": (ViewsOption, 5),
     "until": (UntilOption, None),
     "seed": (SeedOption, 0),

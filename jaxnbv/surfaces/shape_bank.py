@@ -117,8 +117,8 @@ class ShapeBank(eqx.Module):
             raise InputError("the bank has no shapes: give some to ShapeBank.of or ShapeBank.from_meshes")
         return Shape(self.solids, self.extremes)
 
-    def shape(self, index: Int[Array, ""]) -> Shape:
-        """One of them."""
+    def shape(self, index: Int[Array, "*s"]) -> Shape:
+        """One of them, or several."""
         return jax.tree.map(lambda rows: rows[index], self.shapes)
 
     def __len__(self) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 import jaxnbv as nbv
@@ -17,7 +18,7 @@ from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.surfaces.known_shapes import systematic_resampling
 from jaxnbv.surfaces.registration import Prior, Seen, register
 
-CAMERA = nbv.Camera(height=40, width=40, fov=60.0)
+CAMERA = nbv.Camera(height=40, width=40, fov=1.0)
 QUICK = nbv.ScreenedSPSR(GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=16))
 RESIDUAL = nbv.ScreenedSPSR(GeometricSPSR(0.02, truncation=16), (nbv.OnSurface(),))
 GRID = nbv.Grid(40)
@@ -29,7 +30,7 @@ class Corner(SignedDistance):
     - `arm`: half the length of the second.
     """
 
-    arm: jax.Array
+    arm: Float[Array, ""]
 
     def __call__(self, x):
         first = Cuboid([0.9, 0.3, 0.4])(x)
@@ -110,7 +111,9 @@ def test_a_symmetric_shape_stands_in_all_the_ways_that_look_alike():
     bank = nbv.ShapeBank.of([Cuboid([1.2, 0.3, 0.4])])
     seen = Seen.of(evidence_of(nbv.SDFSurface(Cuboid([1.25, 0.31, 0.42])), ((0.5, 3.0, 1.5),)))
     found = register(bank, Prior(nbv.Upright(), nbv.Box()), seen, 512)
-    angles = np.degrees(np.arctan2(np.asarray(found.placement.rotation)[:, 0, 2], np.asarray(found.placement.rotation)[:, 0, 0]))
+    angles = np.degrees(
+        np.arctan2(np.asarray(found.placement.rotation)[:, 0, 2], np.asarray(found.placement.rotation)[:, 0, 0])
+    )
     good = np.asarray(found.is_mode) & (np.asarray(found.misfit) < 0.2)
     assert sorted(np.round(np.abs(angles[good])).astype(int).tolist()) == pytest.approx([0, 180], abs=3)
 
@@ -180,7 +183,9 @@ def test_systematic_resampling_draws_each_as_often_as_its_weight_says(weights, s
 def test_the_same_evidence_has_the_same_hypotheses_and_nothing_is_compiled_twice():
     surface = nbv.SDFSurface(filling(corner(0.5), Rotation.identity(), BANK, 1)[0])
     imagination = dataclasses.replace(nbv.Imagination(QUICK, GRID, 3).knowing(BANK, nbv.AsGiven()))
-    imagination = dataclasses.replace(imagination, model=dataclasses.replace(imagination.model, residual=RESIDUAL, num_starts=64))
+    imagination = dataclasses.replace(
+        imagination, model=dataclasses.replace(imagination.model, residual=RESIDUAL, num_starts=64)
+    )
     first, second = evidence_of(surface, AROUND[:1]), evidence_of(surface, AROUND[:2])
     assert eqx.tree_equal(imagination.posterior(first).found, imagination.posterior(first).found)
     imagination.sample(first, jax.random.key(0))
@@ -198,10 +203,8 @@ def test_the_same_evidence_has_the_same_hypotheses_and_nothing_is_compiled_twice
     [
         (lambda: nbv.KnownShapes(BANK, num_starts=0), "number of starts is 0"),
         (lambda: nbv.KnownShapes(BANK, sharpness=-1.0), "sharpness is -1.0"),
-        (lambda: nbv.KnownShapes("chairs"), "bank is 'chairs'"),
         (lambda: nbv.ShapeBank.of([Sphere(1.0), Cuboid([1.0, 1.0, 1.0])]), "of 2 kinds, such as numbers"),
         (lambda: nbv.ShapeBank.of([Sphere(1.0)], ["a", "b"]), "2 names for 1 solids"),
-        (lambda: nbv.ShapeBank.of([1.0]), "solid 0 of the bank is 1.0"),
         (lambda: BANK.chosen([9]), "the bank has 4 shapes"),
     ],
 )

@@ -24,6 +24,8 @@ from jaxnbv.scanning import Grid, SensorNoise, Surface, load_mesh
 from jaxnbv.scanning.sensors import Setting
 from jaxnbv.storage.folders import AnotherConfigurationError
 from jaxnbv.studies.scenes import Framing
+from jaxnbv.studies.scenes.banks import BANKS, bank_poses, shape_bank
+from jaxnbv.surfaces import ShapeBank, Upright
 from jaxnbv.viz import write_report
 
 
@@ -37,9 +39,11 @@ def demo(task: str, scene: int, framing: Framing, first: str | None, options: Ep
     if shown.note:
         typer.echo(shown.note)
     start = shown.first if first is None else first_pose(first, shown.surface)
-    own = shown.longest_side, shown.solid, shown.grid
     setting = quick_rays(made.setting) if options.quick else made.setting
-    planner = planner_of(setting, shown.acquisition, options.search, options.model, options.quick, *own)
+    known = shown.bank if options.known is None else options.known
+    plain = Imagination.preset(options.model, shown.longest_side, options.quick, solid=shown.solid)
+    imagination = dataclasses.replace(knowing(plain, known), grid=shown.grid)
+    planner = planner_of(setting, shown.acquisition, options.search, imagination, options.quick)
     _run(shown.name, task, shown.surface, planner, start, options, shown.until)
 
 
@@ -63,10 +67,27 @@ def run(
     setting = sensor_for(surface, made.setting, sensor, options.quick)
     start = first_pose(first, surface, None if sensor.paper else setting.radius)
     acquisition = made.acquisition(Given(OfMesh(surface, start, setting.camera), network, category, source))
-    planner = planner_of(setting, acquisition, options.search, options.model, options.quick, sizes=sizes)
+    plain = Imagination.preset(options.model, quick=options.quick, lengthscale=sizes.lengthscale)
+    imagination = knowing(plain, options.known)
+    planner = planner_of(setting, acquisition, options.search, imagination, options.quick, sizes)
     for words in peculiarities(mesh, surface, planner.imagination.grid.spacing):
         typer.echo(f"note     {words}")
     _run(mesh.stem, task, surface, planner, start, options)
+
+
+def knowing(imagination: Imagination, known: str | None) -> Imagination:
+    """One that knows the shapes of a bank that ships, or upright ones of a folder of meshes; none of None or "none".
+
+    **Raises:** `ValueError` if there is no such bank or folder, or no mesh in it that can be used.
+    """
+    if known in (None, "none"):
+        return imagination
+    if known in BANKS:
+        return imagination.knowing(shape_bank(known), bank_poses(known))
+    require(
+        Path(known).is_dir(), f"--known {known}: there is no such folder of meshes; or give {', '.join(BANKS)}, none"
+    )
+    return imagination.knowing(ShapeBank.from_meshes(known), Upright())
 
 
 def task_for(task: str, network: Path | None, category: str | None, source: str | None) -> CommandTask:
@@ -89,17 +110,12 @@ def planner_of(
     setting: Setting,
     acquisition: Acquisition,
     search: str,
-    model: str,
+    imagination: Imagination,
     quick: bool,
-    longest_side: float = 2.5,
-    solid: bool = False,
-    grid: Grid = Grid(),
     sizes: SizeOptions = USUAL_SIZE,
 ) -> Planner:
-    """At the authors' settings, or at small ones, for an object of this longest side."""
-    imagination = Imagination.preset(model, longest_side, quick, solid=solid, lengthscale=sizes.lengthscale)
-    usual = 4 if quick else 16
-    grid = Grid(56) if quick else grid
+    """At the authors' settings, or at small ones."""
+    grid, usual = (Grid(56), 4) if quick else (imagination.grid, 16)
     imagination = dataclasses.replace(imagination, grid=grid, num_samples=sizes.samples or usual)
     # A gradient search looks at its own number of candidates before it climbs.
     count = 40 if quick else None if search.startswith("gradient") else setting.num_candidates

@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import typer
 
-from jaxnbv.cli.actions.episodes import planner_of, task_for
+from jaxnbv.cli.actions.episodes import knowing, planner_of, task_for
 from jaxnbv.cli.actions.sensors import quick_rays
 from jaxnbv.cli.actions.tasks import Given, OfScan, position
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.replay import StoredSession
 from jaxnbv.viz import write_report
 from jaxnbv.viz.answers import words_of
@@ -21,6 +22,7 @@ def replay(
     source: str | None,
     search: str,
     model: str,
+    known: str | None,
     out: Path | None,
     quick: bool,
     report: bool,
@@ -36,7 +38,8 @@ def replay(
     made = task_for(task, network, category, source)
     given = Given(OfScan(*stored.first_view()), network, category, source)
     setting = quick_rays(made.setting) if quick else made.setting
-    planner = planner_of(setting, made.acquisition(given), search, model, quick)
+    imagination = knowing(Imagination.preset(model, quick=quick), known)
+    planner = planner_of(setting, made.acquisition(given), search, imagination, quick)
     out = out or folder.with_name(f"{folder.name}-{task}-{search}")
     sought = planner.quantity
     replayed = None
