@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jaxnbv.studies.registry import UNKNOWING
+from jaxnbv.studies.engine.measures import UNKNOWING
 from jaxnbv.viz.style import GREY, INK
 
 

@@ -12,6 +12,8 @@ from jaxnbv.studies.engine.statistics import Estimate, bootstrap_mean, paired_di
 # What is stored of one scene with every method.
 Record = dict[str, Any]
 Row = dict[str, Any]
+# The model of studies that know shapes, and the end of the name of a method that is run once more without them.
+KNOWN, UNKNOWING = "known", "-screened"
 
 
 class Measure(NamedTuple):

@@ -24,8 +24,7 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Evidence, Grid, Surface
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.search import Search, SphereCandidates
-from jaxnbv.studies.engine.measures import Claim, Measure, Record, Row
-from jaxnbv.studies.registry import KNOWN, UNKNOWING
+from jaxnbv.studies.engine.measures import KNOWN, UNKNOWING, Claim, Measure, Record, Row
 from jaxnbv.studies.scenes.banks import bank_poses, shape_bank
 
 _PURPOSES = ("first", "episode", "scene", "measure")

@@ -1,0 +1,78 @@
+"""The banks of known shapes that ship."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import jaxnbv as nbv
+from jaxnbv.cli.registry import BANKS as LISTED
+from jaxnbv.scanning import sdf
+from jaxnbv.studies.scenes import Split, pyramid_scene, truck_scene
+from jaxnbv.studies.scenes.banks import BANKS, KINDS, bank_poses, read_bank, shape_bank, write_bank
+
+X = np.random.default_rng(0).uniform(-1.3, 1.3, (100, 3)).astype(np.float32)
+
+
+def test_the_command_line_lists_the_banks_that_ship():
+    assert LISTED == BANKS
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_bank_holds_the_objects_of_the_training_split(name):
+    """To the sixteen bits that are stored."""
+    bank, kind = shape_bank(name), KINDS[name]
+    assert len(bank) == kind.number
+    for index in (0, 1, kind.number - 1):
+        expected = kind.shape(index)(X)
+        np.testing.assert_allclose(bank.shape(jnp.asarray(index)).solid(X), expected, atol=4e-3)
+        assert bank.names[index] == f"{kind.names[index % len(kind.names)]} {index}"
+
+
+@pytest.mark.parametrize("name", BANKS)
+def test_extremes_lie_on_the_shapes_and_bound_them(name):
+    bank = shape_bank(name)
+    solids, extremes = bank.shapes
+    picked = jnp.arange(0, len(bank), max(1, len(bank) // 8))
+    some, points = jax.tree.map(lambda rows: rows[picked], (solids, extremes))
+    away = jax.vmap(lambda solid, x: solid(x))(some, points)
+    # A voxel of a mesh; elsewhere sixteen bits, and strides along bounds that fall short.
+    assert np.quantile(np.abs(away), 0.9) < 0.05
+    # Shapes are stored 2.5 long, so that nothing of them is farther out than their extremes.
+    np.testing.assert_allclose(np.ptp(np.asarray(extremes), axis=1).max(axis=1), 2.5, atol=0.04)
+
+
+def test_real_shapes_are_named_by_their_class_and_stand_upright():
+    bank = shape_bank("household-real")
+    assert {"chair", "table", "sofa"} <= {name.split()[0] for name in bank.names}
+    assert isinstance(bank_poses("household-real"), nbv.Upright)
+    longest = np.ptp(np.asarray(bank.extremes), axis=1).max(axis=1)
+    np.testing.assert_allclose(longest, 2.5, atol=0.01)
+
+
+@pytest.mark.parametrize(("scene", "axis"), [(pyramid_scene, 2), (truck_scene, 1)])
+def test_scenes_of_a_split_are_those_of_the_bank_turned(scene, axis):
+    """A scene and its level twin are one object: their distances agree once it is turned back, moved and scaled."""
+    turned, level = scene(Split.TRAIN, 3), scene(Split.TRAIN, 3, turned=False)
+    one, other = (thing.rotation if axis == 2 else thing.truck.rotation[0] for thing in (turned, level))
+    rotation = np.asarray(one) @ np.asarray(other).T
+    np.testing.assert_allclose(Rotation.from_matrix(rotation).as_matrix(), rotation, atol=1e-5)
+    ends = [np.asarray(nbv.mesh_from_sdf(thing, nbv.Grid(64, 1.4)).vertices) for thing in (turned, level)]
+    sides = [np.ptp(points @ frame, axis=0) for points, frame in zip(ends, (rotation, np.eye(3)), strict=True)]
+    np.testing.assert_allclose(sides[0] / sides[0].max(), sides[1] / sides[1].max(), atol=0.05)
+
+
+def test_meshes_are_stored_to_their_quantum(tmp_path):
+    mesh = nbv.mesh_from_sdf(sdf.Sphere(1.0), nbv.Grid(40, 1.2))
+    solid = sdf.solid_of_mesh(mesh.vertices, mesh.faces, 24, cubic=True)
+    bank = nbv.ShapeBank.of([solid, solid], ["a", "b"])
+    write_bank(tmp_path / "bank.npz", bank)
+    found = read_bank(tmp_path / "bank.npz", "household-real")
+    assert found.names == ("a", "b")
+    np.testing.assert_allclose(found.shapes.solid.values, np.clip(bank.shapes.solid.values, -1.016, 1.016), atol=0.0041)
+
+
+def test_another_name_is_refused():
+    with pytest.raises(nbv.InputError, match="no bank of shapes 'chairs': choose from pyramid"):
+        shape_bank("chairs")

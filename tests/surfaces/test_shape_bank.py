@@ -1,0 +1,148 @@
+"""Banks of known shapes: of solids, and of meshes as they come."""
+
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+import jaxnbv as nbv
+from jaxnbv.scanning.sdf import Cuboid, Sphere, solid_of_mesh
+from jaxnbv.surfaces import mesh_shapes
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    """A cache of the test's own."""
+    monkeypatch.setattr(mesh_shapes.platformdirs, "user_cache_path", lambda name: tmp_path / "cache")
+    return tmp_path / "cache" / "shapes"
+
+
+def nodes(count=200, reach=1.2):
+    return np.random.default_rng(0).uniform(-reach, reach, (count, 3)).astype(np.float32)
+
+
+def ball(path, inverted=False):
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.7)
+    if inverted:
+        mesh.invert()
+    mesh.export(path)
+    return path
+
+
+def bank_of(*files, **options):
+    return nbv.ShapeBank.from_meshes(list(files), progress=False, **options)
+
+
+def test_extremes_of_analytic_shapes_are_their_corners():
+    bank = nbv.ShapeBank.of([Cuboid([1.0, 0.5, 0.25]), Cuboid([0.3, 0.6, 0.9])])
+    for half, points in zip(([1.0, 0.5, 0.25], [0.3, 0.6, 0.9]), np.asarray(bank.extremes), strict=True):
+        np.testing.assert_allclose(points.max(axis=0), half, atol=2e-3)
+        np.testing.assert_allclose(points.min(axis=0), -np.asarray(half), atol=2e-3)
+
+
+def test_a_bank_gives_back_its_shapes_and_names():
+    bank = nbv.ShapeBank.of([Sphere(0.5), Sphere(0.8), Sphere(1.0)], ["small", "größer", "x" * 100])
+    assert len(bank) == 3
+    assert bank.names == ("small", "größer", "x" * 64)
+    chosen = bank.chosen([2, 0])
+    assert chosen.names == ("x" * 64, "small")
+    np.testing.assert_allclose(chosen.shape(jnp.asarray(0)).solid(jnp.zeros((1, 3))), [-1.0])
+    assert len(bank.chosen([])) == 0
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_a_closed_mesh_has_the_distances_of_its_solid(tmp_path, inverted):
+    """A ball of radius 1.25 in scene units; a mesh whose faces are wound the other way is the same solid."""
+    bank = bank_of(ball(tmp_path / "ball.ply", inverted))
+    x = nodes()
+    found = bank.shape(jnp.asarray(0)).solid(x)
+    np.testing.assert_allclose(found, np.linalg.norm(x, axis=1) - 1.25, atol=0.02)
+    assert bank.names == ("ball",)
+    np.testing.assert_allclose(np.linalg.norm(bank.extremes[0], axis=1), 1.25, atol=0.01)
+
+
+def test_a_sheet_is_as_thick_as_asked(tmp_path):
+    mesh = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    mesh.export(tmp_path / "sheet.ply")
+    solid = bank_of(tmp_path / "sheet.ply", sheet=0.2).shape(jnp.asarray(0)).solid
+    across = np.stack([np.zeros(5), np.zeros(5), np.linspace(-0.3, 0.3, 5)], axis=1)
+    np.testing.assert_allclose(solid(jnp.asarray(across, jnp.float32)), np.abs(across[:, 2]) - 0.1, atol=0.03)
+
+
+def test_a_closed_solid_is_no_thicker_for_the_sheets():
+    mesh = trimesh.creation.box((1.0, 0.8, 0.6))
+    plain, thick = (solid_of_mesh(mesh.vertices, mesh.faces, 24, sheet=sheet) for sheet in (0.0, 0.3))
+    np.testing.assert_array_equal(plain.values, thick.values)
+
+
+def test_meshes_of_a_folder_are_named_by_their_place(tmp_path):
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    ball(tmp_path / "a" / "b" / "one.obj")
+    ball(tmp_path / "two.stl")
+    (tmp_path / "notes.txt").write_text("no mesh")
+    assert nbv.ShapeBank.from_meshes(tmp_path, resolution=16, progress=False).names == ("a/b/one", "two")
+
+
+def test_what_cannot_be_used_is_named_and_left_out(tmp_path):
+    (tmp_path / "broken.ply").write_bytes(b"ply\nnothing")
+    with pytest.warns(UserWarning, match=r"broken\.ply is left out of the bank: .*cannot read"):
+        bank = bank_of(ball(tmp_path / "ball.ply"), tmp_path / "broken.ply", resolution=16, names=["good", "bad"])
+    assert bank.names == ("good",)
+    with pytest.warns(UserWarning, match="left out"), pytest.raises(nbv.InputError, match="none of the 1 meshes"):
+        bank_of(tmp_path / "broken.ply")
+
+
+def test_what_was_made_is_kept_and_what_changed_is_made_anew(tmp_path, cache, monkeypatch):
+    file = ball(tmp_path / "ball.ply")
+    first = bank_of(file, resolution=16)
+    assert len(list(cache.iterdir())) == 1
+    with monkeypatch.context() as patch:
+        patch.setattr(mesh_shapes, "load_mesh", lambda path: pytest.fail("it was read anew"))
+        again = bank_of(file, resolution=16)
+    np.testing.assert_array_equal(first.shapes.solid.values, again.shapes.solid.values)
+    trimesh.creation.box((1.0, 0.4, 0.4)).export(file)
+    changed = bank_of(file, resolution=16)
+    assert not np.array_equal(first.shapes.solid.values, changed.shapes.solid.values)
+
+
+def test_what_is_kept_damaged_is_made_anew(tmp_path, cache):
+    file = ball(tmp_path / "ball.ply")
+    first = bank_of(file, resolution=16)
+    (kept,) = cache.iterdir()
+    kept.write_bytes(kept.read_bytes()[:100])
+    np.testing.assert_array_equal(bank_of(file, resolution=16).shapes.solid.values, first.shapes.solid.values)
+
+
+def test_a_full_disk_costs_no_shape(tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(mesh_shapes.np, "savez_compressed", refuse)
+    with pytest.warns(UserWarning, match="not kept for the next time .No space left"):
+        assert len(bank_of(ball(tmp_path / "ball.ply"), resolution=16)) == 1
+
+
+def test_meshes_of_one_resolution_share_their_shapes(tmp_path):
+    trimesh.creation.box((1.0, 0.2, 0.4)).export(tmp_path / "box.ply")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        bank = bank_of(ball(tmp_path / "ball.ply"), tmp_path / "box.ply", resolution=24)
+    assert bank.shapes.solid.values.shape == (2, 24, 24, 24)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda folder: nbv.ShapeBank.from_meshes(folder / "none"), "there is no folder"),
+        (lambda folder: nbv.ShapeBank.from_meshes(folder), "holds no mesh"),
+        (lambda folder: nbv.ShapeBank.from_meshes([]), "no meshes are named"),
+        (lambda folder: nbv.ShapeBank.from_meshes([folder / "a.ply"], names=["a", "b"]), "2 names for 1 meshes"),
+        (lambda folder: nbv.ShapeBank.from_meshes([folder / "a.ply"], resolution=4), "resolution is 4"),
+        (lambda folder: nbv.ShapeBank.from_meshes([folder / "a.ply"], sheet=0.0), "sheets are 0.0 thick"),
+    ],
+)
+def test_what_makes_no_bank_is_refused(tmp_path, make, words):
+    with pytest.raises(nbv.InputError, match=words):
+        make(tmp_path)
