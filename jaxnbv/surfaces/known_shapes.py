@@ -63,8 +63,8 @@ class KnownShapes(SurfaceModel):
     box: Box = Box()
     unknown: SurfaceModel = eqx.field(default_factory=ScreenedSPSR)
     num_starts: int = eqx.field(static=True, default=4096)
-    sharpness: float = eqx.field(static=True, default=30.0)
-    unknown_misfit: float = eqx.field(static=True, default=0.5)
+    sharpness: float = eqx.field(static=True, default=20.0)
+    unknown_misfit: float = eqx.field(static=True, default=0.6)
     noise_scale: float = eqx.field(static=True, default=0.3)
 
     def __check_init__(self):

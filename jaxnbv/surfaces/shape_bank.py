@@ -15,7 +15,7 @@ from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.surfaces.mesh_shapes import mesh_paths, shapes_of_meshes
 
-_NUM_EXTREMES, _FAR, _STRIDES = 128, 4.0, 12
+_NUM_EXTREMES, _FAR, _STRIDES, _ARRIVED = 128, 4.0, 40, 0.01
 _LONGEST_NAME = 64
 
 
@@ -158,7 +158,10 @@ def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
             square = jnp.sum(gradient**2, axis=-1)
             return points - (distance / jnp.where(square > 0, square, 1.0))[:, None] * gradient, None
 
-        return jax.lax.scan(stride, start, length=_STRIDES)[0]
+        points = jax.lax.scan(stride, start, length=_STRIDES)[0]
+        # Where the distance is a bound, some are still on their way.
+        arrived = jnp.abs(solid(points)) < _ARRIVED
+        return jnp.where(arrived[:, None], points, points[jnp.argmax(arrived)])
 
     return jax.lax.map(of_solid, solids, batch_size=16)
 
