@@ -32,7 +32,7 @@ from jaxnbv.surfaces.shape_bank import ShapeBank
 from jaxnbv.surfaces.spsr import GeometricSPSR
 from jaxnbv.surfaces.values import OnSurface
 
-_NONE = "none of these"
+NONE = "none of these"
 
 
 def short_ranged() -> ScreenedSPSR:
@@ -136,8 +136,22 @@ class KnownShapesPosterior(SurfacePosterior):
             for row, (name, weight, misfit) in enumerate(zip(names, weights[:-1], found.misfit, strict=True))
             if bool(found.is_mode[row])
         ]
-        none = Hypothesis(_NONE, float(weights[-1]), self.model.unknown_misfit, None)
+        none = Hypothesis(NONE, float(weights[-1]), self.model.unknown_misfit, None)
         return sorted([*known, none], key=lambda one: -one.weight)
+
+    def kinds(self) -> dict[str, float]:
+        """How likely each kind of shape is, most likely first: hypotheses whose names differ by a number alone, such as
+        "chair 3" and "chair 12", are of one kind."""
+        found: dict[str, float] = {}
+        for one in self.hypotheses:
+            kind = kind_of(one.name)
+            found[kind] = found.get(kind, 0.0) + one.weight
+        return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+    def names_of_samples(self, key: PRNGKeyArray, num_samples: int) -> list[str]:
+        """Which shapes the samples of `sample` are about."""
+        names = [*(self.model.bank.names[index] for index in np.asarray(self.found.shape)), NONE]
+        return [names[index] for index in np.asarray(_drawn(self, key, num_samples))]
 
     @sampler
     def sample(self, key: PRNGKeyArray, num_samples: int) -> "MixtureFields":
@@ -147,11 +161,9 @@ class KnownShapesPosterior(SurfacePosterior):
 
 @eqx.filter_jit
 def _sample(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int) -> "MixtureFields":
-    shape_key, order_key, residual_key, unknown_key = jax.random.split(key, 4)
+    _, residual_key, unknown_key = jax.random.split(key, 3)
     found, bank = posterior.found, posterior.model.bank
-    index = systematic_resampling(shape_key, posterior.weights, num_samples)
-    # The first few samples are no different from the rest.
-    index = jax.random.permutation(order_key, index)
+    index = _drawn(posterior, key, num_samples)
     is_none = index == len(found.shape)
     row = jnp.where(is_none, 0, index)
     solids = bank.shape(found.shape[row]).solid
@@ -165,6 +177,21 @@ def _sample(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), eqx.filter_eval_shape(draw))
     unknown = jax.lax.cond(jnp.any(is_none), draw, lambda: nothing)
     return MixtureFields(known, unknown, posterior.unknown.level, is_none)
+
+
+@eqx.filter_jit
+def _drawn(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int) -> Int[Array, " s"]:
+    """The hypothesis that each sample is about; the last is none."""
+    shape_key, order_key = jax.random.split(jax.random.split(key, 3)[0])
+    index = systematic_resampling(shape_key, posterior.weights, num_samples)
+    # The first few samples are no different from the rest.
+    return jax.random.permutation(order_key, index)
+
+
+def kind_of(name: str) -> str:
+    """A shape's name without its number."""
+    head, _, last = name.rpartition(" ")
+    return head if head and last.isdigit() else name
 
 
 def systematic_resampling(

@@ -7,6 +7,7 @@
 """
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -23,6 +24,7 @@ _SETTLED = 0.05
 # The probability at which a reader may rely on a class.
 _SURE = 0.95
 _CLASSES_SHOWN = 5
+_KINDS_SHOWN = 4
 
 
 class Panel(NamedTuple):
@@ -292,3 +294,10 @@ def number(value: float) -> str:
     """Three significant digits, without an exponent where none is needed."""
     text = f"{value:,.0f}" if 999.5 <= abs(value) < 1e7 else f"{value:.3g}"
     return text.replace("-", "−")
+
+
+def may_be_words(kinds: Sequence[tuple[str, float]]) -> str:
+    """What the known shapes say that the object may be, the likeliest first."""
+    shown = [f"{name} {weight:.2f}" for name, weight in kinds[:_KINDS_SHOWN]]
+    rest = sum(weight for _, weight in kinds[_KINDS_SHOWN:])
+    return f"By the shapes that fit, it may be: {', '.join(shown)}{f', others {rest:.2f}' if rest else ''}."

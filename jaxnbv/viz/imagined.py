@@ -14,6 +14,7 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.episode import Episode, observe_scene, view_keys
 from jaxnbv.scanning import Evidence, SensorNoise, mean_depth
 from jaxnbv.search import Proposal
+from jaxnbv.surfaces import KnownShapesPosterior
 
 SHOWN = 4
 _PIXELS = 96
@@ -52,6 +53,8 @@ class Imagined(eqx.Module):
     - `seen`: the true surface from there, or where it is not known the scan; None where that is no image.
     - `is_true`: which of both.
     - `chosen`, `runner_up`: of the chosen camera and of the best of the other candidates; None without one.
+    - `names`: the known shape that each of `samples` is about; `kinds`: what it may be, and how likely that is. Both
+      are empty where no shapes are known.
     """
 
     samples: tuple[Look, ...]
@@ -59,6 +62,8 @@ class Imagined(eqx.Module):
     is_true: bool
     chosen: Expected
     runner_up: Expected | None
+    names: tuple[str, ...] = eqx.field(static=True, default=())
+    kinds: tuple[tuple[str, float], ...] = eqx.field(static=True, default=())
 
 
 def imagined(episode: Episode, index: int, evidence: Evidence) -> Imagined | None:
@@ -70,7 +75,8 @@ def imagined(episode: Episode, index: int, evidence: Evidence) -> Imagined | Non
     if view.proposal is None:
         return None
     sample_key, *_ = view_keys(episode.key, index)
-    surfaces = planner.imagination.sample(evidence, sample_key)
+    posterior = planner.imagination.posterior(evidence)
+    surfaces = planner.imagination.sample(evidence, sample_key, posterior)
     other = runner_up(view.proposal) if planner.quantity.smooth else None
     # Two in any case, lest a second program be compiled.
     poses = jax.tree.map(lambda *rows: np.stack(rows), view.pose, view.pose if other is None else other)
@@ -91,7 +97,10 @@ def imagined(episode: Episode, index: int, evidence: Evidence) -> Imagined | Non
     if other is not None:
         beside = Expected(expected[1], None if true[1] is None else look(true[1], camera, other, cloud).depth)
     chosen = Expected(expected[0], None if taken is None else taken.depth)
-    return Imagined(samples, seen, true[0] is not None, chosen, beside)
+    if not isinstance(posterior, KnownShapesPosterior):
+        return Imagined(samples, seen, true[0] is not None, chosen, beside)
+    names = posterior.names_of_samples(sample_key, planner.imagination.num_samples)[:count]
+    return Imagined(samples, seen, true[0] is not None, chosen, beside, tuple(names), tuple(posterior.kinds().items()))
 
 
 def runner_up(proposal: Proposal) -> Pose | None:

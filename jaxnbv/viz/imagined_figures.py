@@ -29,9 +29,8 @@ _UNSEEN = "#5b8fc7"
 
 def looks(seen: Imagined) -> list[Tile]:
     """The sampled surfaces from the chosen pose, and beside them the truth, or what was then seen."""
-    tiles = [
-        Tile(f"imagined {number}", look_picture(sample, _UNSEEN)) for number, sample in enumerate(seen.samples, start=1)
-    ]
+    names = seen.names or tuple(f"imagined {number}" for number in range(1, len(seen.samples) + 1))
+    tiles = [Tile(name, look_picture(sample, _UNSEEN)) for name, sample in zip(names, seen.samples, strict=True)]
     if seen.seen is None:
         return tiles
     return [*tiles, Tile("the truth" if seen.is_true else "then seen", look_picture(seen.seen, NEW))]

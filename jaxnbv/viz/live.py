@@ -21,7 +21,8 @@ from jaxnbv.scanning import Evidence
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
-from jaxnbv.viz.answers import shown_value, words_of
+from jaxnbv.surfaces import KnownShapesPosterior
+from jaxnbv.viz.answers import may_be_words, shown_value, words_of
 from jaxnbv.viz.data import allowing_for_unseen, mean_surface
 from jaxnbv.viz.render import depth_picture, depth_range
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, VALUE, round_range
@@ -83,7 +84,7 @@ class LiveView:
                 *_imagined(scene, episode.planner.imagination, evidence, key),
                 *([] if proposal is None else _choice(scene, episode.planner.camera, proposal, expected)),
             ]
-        self._tell(episode, proposal, expected)
+        self._tell(episode, evidence, proposal, expected)
 
     def follow(self, session: Session) -> None:
         """Show a session from now on, with every image and proposal."""
@@ -104,11 +105,16 @@ class LiveView:
         """Serve it no more."""
         self._server.stop()
 
-    def _tell(self, episode: Episode, proposal: Proposal | None, expected: np.ndarray | None) -> None:
+    def _tell(
+        self, episode: Episode, evidence: Evidence, proposal: Proposal | None, expected: np.ndarray | None
+    ) -> None:
         views, sought = len(episode.views), episode.planner.quantity
         lines = [f"**{views} view{'s' if views > 1 else ''}**, {int(episode.cloud.count):,} points kept"]
         answer = episode.planner.acquisition.answer(episode.cloud)
         lines += [] if answer is None else [words_of(answer).sentence()]
+        posterior = episode.planner.imagination.posterior(evidence)
+        if isinstance(posterior, KnownShapesPosterior):
+            lines.append(may_be_words(tuple(posterior.kinds().items())))
         if proposal is not None:
             error = proposal.standard_error
             about = "" if error is None else f" ± {error:.2g}"
@@ -154,12 +160,17 @@ def _mean(scene: Any, imagination: Imagination, evidence: Evidence) -> list[Any]
 
 
 def _imagined(scene: Any, imagination: Imagination, evidence: Evidence, key: Any) -> list[Any]:
+    posterior = imagination.posterior(evidence)
+    names = []
+    if isinstance(posterior, KnownShapesPosterior):
+        names = posterior.names_of_samples(key, imagination.num_samples)
     # Marching cubes asks for an array that it could write to.
-    values = np.array(imagination.sample(evidence, key).values[:_SAMPLES])
+    values = np.array(imagination.sample(evidence, key, posterior).values[:_SAMPLES])
     found = []
     for number, triangles in enumerate((level_triangles(one, imagination.grid) for one in values), start=1):
         if triangles is not None:
-            name, (vertices, faces, _) = f"/imagined/{number}", triangles
+            of = f" {names[number - 1]}" if names else ""
+            name, (vertices, faces, _) = f"/imagined/{number}{of}", triangles
             found.append(
                 scene.add_mesh_simple(name, vertices, faces, color=_rgb("#8fb8d8"), opacity=0.9, visible=False)
             )

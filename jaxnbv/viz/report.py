@@ -22,7 +22,7 @@ from jaxnbv.planning.episode import Episode
 from jaxnbv.storage import describe
 from jaxnbv.storage.files import make_folder, write_text
 from jaxnbv.storage.folders import versions, writing_in
-from jaxnbv.viz.answers import Panel, label_of, number
+from jaxnbv.viz.answers import Panel, label_of, may_be_words, number
 from jaxnbv.viz.data import ReportData, report_data
 from jaxnbv.viz.figures import STYLE, Stills, write_figures
 from jaxnbv.viz.imagined_figures import Tile, depths, looks
@@ -167,8 +167,9 @@ def _imagined(data: ReportData, index: int) -> str:
         why = "View 1 was given" if index == 0 else f"What was imagined before view {index + 1} is not known"
         return f'<div class="of" hidden><p>{why}: nothing was imagined before it.</p></div>'
     tiles, scale = depths(seen)
+    may_be = f"<p>{html.escape(may_be_words(seen.kinds))}</p>" if seen.kinds else ""
     return (
-        f'<div class="of" hidden><div class="tiles">{_tiles(looks(seen))}</div><h3>Expected | seen</h3>'
+        f'<div class="of" hidden>{may_be}<div class="tiles">{_tiles(looks(seen))}</div><h3>Expected | seen</h3>'
         f'<div class="tiles">{_tiles(tiles)}</div><p>{html.escape(scale)}</p></div>'
     )
 
