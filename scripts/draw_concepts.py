@@ -15,9 +15,12 @@ from PIL import Image
 import jaxnbv as nbv
 from jaxnbv.geometry.neighbours import nearest_squared_distance
 from jaxnbv.studies.scenes import demo_object
+from jaxnbv.studies.scenes.pyramid import hidden_view
+from jaxnbv.surfaces.known_shapes import kind_of
 from jaxnbv.viz.data import choice_of
 from jaxnbv.viz.figures import STYLE, draw_acquisition
-from jaxnbv.viz.render import Still, beside, draw_cameras, draw_points, frame
+from jaxnbv.viz.imagined import look
+from jaxnbv.viz.render import Still, beside, draw_cameras, draw_points, frame, look_picture
 from jaxnbv.viz.style import BEFORE, GREY, INK, NEW, VALUE
 
 SHOWN = 4
@@ -125,6 +128,43 @@ def draw_search(found: dict[str, nbv.Proposal], quantities: dict[str, nbv.Quanti
     return figure
 
 
+def draw_known() -> Figure:
+    """Bases that were imagined after a view that shows none of the base: by the model alone, and with known shapes."""
+    pyramid = nbv.scenes.pyramid_scene(nbv.scenes.Split.VALIDATION, 2)
+    first = hidden_view(pyramid, jax.random.key(0))
+    plain = dataclasses.replace(nbv.Imagination.preset("screened", solid=True), grid=nbv.Grid(100), num_samples=16)
+    knowing = plain.knowing(nbv.shape_bank("pyramid"), nbv.FreeRotation())
+    planner = nbv.Planner(nbv.Coverage(), imagination=plain)
+    scan = nbv.scan(nbv.SDFSurface(pyramid), planner.camera, first)
+    evidence = planner.init(first, nbv.SensorNoise()(scan, jax.random.key(0)))
+    below = nbv.look_at(np.asarray(pyramid.rotation) @ (1.6, 1.0, -5.0))
+    camera = nbv.Camera(height=PIXELS, width=PIXELS)
+    posterior, key = knowing.posterior(evidence), jax.random.key(0)
+    names = [kind_of(name) for name in posterior.names_of_samples(key, knowing.num_samples)]
+    other = [names.index(name) for name in dict.fromkeys(names)][:SHOWN]
+    rows = (
+        ("by the Gaussian process", plain.sample(evidence, key), range(SHOWN), [""] * SHOWN),
+        ("with known shapes", knowing.sample(evidence, key, posterior), other, [names[index] for index in other]),
+    )
+    cloud = evidence.cloud.to_numpy()[0]
+    figure = Figure(figsize=(9.6, 4.6))
+    for row, (head, surfaces, chosen, labels) in enumerate(rows):
+        figure.text(0.012, 0.955 - 0.49 * row, head, color=INK, fontsize=10)
+        scans = nbv.scan_samples(surfaces, camera, below[None])
+        for column, (index, label) in enumerate(zip(chosen, labels, strict=True)):
+            axes = figure.add_axes((0.01 + 0.2 * column, 0.55 - 0.49 * row, 0.19, 0.385))
+            image = look(jax.tree.map(lambda leaf, i=index: leaf[i, 0], scans), camera, below, cloud)
+            axes.imshow(look_picture(image, "#5b8fc7"))
+            axes.axis("off")
+            axes.text(0.5, -0.02, label, ha="center", va="top", transform=axes.transAxes)
+    axes = figure.add_axes((0.81, 0.305, 0.18, 0.385))
+    seen = nbv.scan(nbv.SDFSurface(pyramid), camera, below)
+    axes.imshow(look_picture(look(seen, camera, below, cloud), NEW))
+    axes.axis("off")
+    axes.text(0.5, -0.02, "the truth", ha="center", va="top", transform=axes.transAxes)
+    return figure
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("docs"))
@@ -147,6 +187,7 @@ def main() -> None:
         found = {name: one.choose(evidence, surfaces, search_key) for name, one in planners.items()}
         quantities = {name: one.quantity for name, one in planners.items()}
         save(draw_search(found, quantities), folder / "concepts_search.png")
+        save(draw_known(), folder / "concepts_known.png")
 
 
 if __name__ == "__main__":

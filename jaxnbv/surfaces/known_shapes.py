@@ -37,8 +37,9 @@ NONE = "none of these"
 
 def short_ranged() -> ScreenedSPSR:
     """The usual residual, for scenes 2.5 long."""
-    # With long scales, or values beside the surface, it pulls the surface back to what it would say by itself.
-    return ScreenedSPSR(GeometricSPSR(0.01, truncation=32), (OnSurface(),))
+    # With long scales, or values beside the surface, it pulls the surface back to what it would say by itself. The noise
+    # is that of the shape's normals: beside an edge that is a little off, they are those of the other face.
+    return ScreenedSPSR(GeometricSPSR(0.01, truncation=32, noise=0.2), (OnSurface(),))
 
 
 class KnownShapes(SurfaceModel):
@@ -50,7 +51,6 @@ class KnownShapes(SurfaceModel):
     - `unknown`: the model of what none of the shapes is.
     - `num_starts`: placements that are tried, over all shapes.
     - `sharpness`: beta; `unknown_misfit`: E_0, the misfit at which a shape is as likely as none.
-    - `noise_scale`: rho, of the residual's deviation.
 
     With an empty bank it is `unknown`.
 
@@ -65,13 +65,13 @@ class KnownShapes(SurfaceModel):
     num_starts: int = eqx.field(static=True, default=4096)
     sharpness: float = eqx.field(static=True, default=20.0)
     unknown_misfit: float = eqx.field(static=True, default=0.6)
-    noise_scale: float = eqx.field(static=True, default=0.3)
 
     def __check_init__(self):
         check_fields(self)
         require(self.num_starts >= 1, f"the number of starts is {self.num_starts}; it must be at least 1")
-        for name, value in (("sharpness", self.sharpness), ("noise scale", self.noise_scale)):
-            require(0 <= value < math.inf, f"the {name} is {value}; it must be finite and not negative")
+        require(
+            0 <= self.sharpness < math.inf, f"the sharpness is {self.sharpness}; it must be finite and not negative"
+        )
 
     def check(self, cloud: PointCloud) -> None:
         """As that of the model that knows no shapes."""
@@ -169,7 +169,7 @@ def _sample(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int
     solids = bank.shape(found.shape[row]).solid
     placement = jax.tree.map(lambda rows: rows[row], found.placement)
     means = PlacedShapes(solids, placement, posterior.residual.half_jump)
-    known = posterior.residual.sample_about(means, residual_key, posterior.model.noise_scale)
+    known = posterior.residual.sample_about(means, residual_key)
 
     def draw():
         return posterior.unknown.sample(unknown_key, num_samples)
