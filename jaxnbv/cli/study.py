@@ -16,7 +16,9 @@ study = typer.Typer(
     help="Measure the paper's claims on many scenes.", no_args_is_help=True, rich_markup_mode="markdown"
 )
 
-ScenesOption = Annotated[int, typer.Option(min=1, help="Scenes of the test split.")]
+ScenesOption = Annotated[
+    str, typer.Option(metavar="N|A:B", help="Scenes of the test split: the first N, or from A up to but without B.")
+]
 ViewsOption = Annotated[int, typer.Option(min=2, help="Views in all, the first one included.")]
 MethodsOption = Annotated[
     str | None, typer.Option(help="Which methods, separated by commas.", show_default="all of the table")
@@ -84,7 +86,7 @@ def _command(name: str, entry: Entry) -> Callable[..., None]:
         actions.study(name, entry, device=device, **given)
 
     shared = {
-        "scenes": (ScenesOption, entry.scenes),
+        "scenes": (ScenesOption, str(entry.scenes)),
         "views": (ViewsOption, entry.views),
         "methods": (MethodsOption, None),
         "own": (OwnOption, None),

@@ -106,6 +106,22 @@ def test_modes_of_one_shape_are_far_apart(planted):
         assert np.all(np.diff(np.asarray(found.misfit)) >= 0)
 
 
+def test_another_library_moves_a_refined_pose_no_further(planted):
+    """Generalised ICP (small_gicp) from the shape's surface, where it was placed, to the scan."""
+    gicp = pytest.importorskip("small_gicp", reason="small_gicp is not installed")
+    for index, rotation, _, shift, found in planted[:4]:
+        placed = jax.tree.map(lambda rows: np.asarray(rows[0], np.float64), found.placement)
+        mesh = nbv.mesh_from_sdf(corner(ARMS[int(found.shape[0])]), nbv.Grid(120, 2.0))
+        own = mesh.frame.to_world(mesh.sample_points(jax.random.key(0), 4000))
+        shape = (placed.scale * own) @ placed.rotation.T + placed.shift
+        solid, *_ = filling(corner(ARMS[index]), rotation, BANK, index)
+        scan = evidence_of(nbv.SDFSurface(solid), AROUND).cloud.to_numpy()[0]
+        result = gicp.align(shape, scan.astype(np.float64), registration_type="GICP", downsampling_resolution=0.02)
+        assert result.converged
+        assert np.degrees(Rotation.from_matrix(result.T_target_source[:3, :3]).magnitude()) < 2.0
+        assert np.linalg.norm(result.T_target_source[:3, 3]) < 0.04
+
+
 def test_a_symmetric_shape_stands_in_all_the_ways_that_look_alike():
     """A bar that was seen from above: it may be turned by half a turn."""
     bank = nbv.ShapeBank.of([Cuboid([1.2, 0.3, 0.4])])

@@ -2,6 +2,7 @@
 
 import functools
 import os
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -27,7 +28,7 @@ from jaxnbv.studies.registry import Entry
 def study(
     name: str,
     entry: Entry,
-    scenes: int,
+    scenes: str,
     views: int,
     methods: str | None,
     own: Sequence[str] | None,
@@ -41,11 +42,12 @@ def study(
 ) -> None:
     """Run a study, or each of those that it consists of, and write what it found.
 
-    **Raises:** `ValueError` for unknown methods, or a method of one's own that cannot be found; and, once all is
-    written, if scenes failed.
+    **Raises:** `ValueError` for no scenes, unknown methods, or a method of one's own that cannot be found; and, once
+    all is written, if scenes failed.
     """
     kind: type[Study] = resolve(entry.study)
     chosen, added = _methods(methods, kind.all_methods(model)), {text: _own(text) for text in own or ()}
+    wanted = _scenes(scenes)
     runner = _runner(workers, scheduler, added)
     failed: dict[str, str] = {}
     asked = 0
@@ -54,16 +56,16 @@ def study(
     folder = out or Path("runs") / f"study-{name}{of_model}{'-quick' if quick else ''}"
     if quick:
         typer.echo("--quick: small settings and few scenes. This is not the full study; leave it out for that.")
-        scenes = min(scenes, kind.quick_scenes)
+        wanted = wanted[: kind.quick_scenes]
     for part, settings in kind.configured(model, views, quick, **given).items():
         config = {"study": describe(settings), "methods": sorted(chosen)}
         config |= {"own": {text: describe(make) for text, make in added.items()}} if added else {}
-        count = min(scenes, settings.num_scenes or scenes)
+        there = wanted if settings.num_scenes is None else [index for index in wanted if index < settings.num_scenes]
         run = functools.partial(_prepared, device, functools.partial(settings.run_scene, methods=chosen, own=added))
         results = RecordFolder(folder / part, config, runner)
-        records, failures = results.collect(count, run), results.failures(count)
+        records, failures = results.collect(there, run), results.failures(there)
         failed |= {f"{part} scene {index}".strip(): error for index, error in failures.items()}
-        asked += count
+        asked += len(there)
         if not records:
             continue
         write_tables(records, type(settings), folder / part)
@@ -97,6 +99,15 @@ def _runner(workers: int, scheduler: str | None, own: Mapping[str, Factory]) -> 
     if workers != 1:
         raise InputError(f"--workers {workers} and --scheduler {scheduler} exclude each other: give one of them")
     return Cluster(scheduler, [sys.modules[factory.__module__] for factory in own.values()])
+
+
+def _scenes(asked: str) -> Sequence[int]:
+    """The first N, or from A up to but without B."""
+    found = re.fullmatch(r"(?:(\d{1,9}):)?(\d{1,9})", asked.strip())
+    scenes = range(int(found[1] or 0), int(found[2])) if found else range(0)
+    if not scenes:
+        raise InputError(f"--scenes {asked} names no scenes: give how many, such as 60, or which, such as 100:130")
+    return scenes
 
 
 def _methods(asked: str | None, known: Sequence[str]) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """A folder of meshes as the scenes of a study."""
 
+import dataclasses
 import itertools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -8,13 +9,17 @@ from typing import TypeVar
 import trimesh
 
 from jaxnbv.checks import require
+from jaxnbv.imagination import Imagination
 from jaxnbv.scanning import TriangleMesh, load_mesh
 from jaxnbv.studies.readers import MeshFile, ModelNet, OmniObject3D
 from jaxnbv.studies.readers.local_copy import class_folders
 from jaxnbv.studies.readers.modelnet import is_modelnet
 from jaxnbv.studies.readers.omniobject3d import holds_scans, scans_folder
+from jaxnbv.surfaces import KnownShapes, ShapeBank, Upright
 
 _File = TypeVar("_File")
+# So that a number fits into a shape's name too.
+_LONGEST = 50
 
 
 def mesh_files(folder: str | Path) -> tuple[str, ...]:
@@ -89,6 +94,21 @@ def numbered_mesh(files: Sequence[str], index: int) -> TriangleMesh:
     **Raises:** `ValueError` if there is no mesh of this index, or it cannot be read.
     """
     return load_mesh(numbered(files, index))
+
+
+def knowing_meshes(imagination: Imagination, files: Sequence[str]) -> Imagination:
+    """One that knows the meshes of a study, upright."""
+    names = [f"{Path(file).stem[:_LONGEST]} {index}" for index, file in enumerate(files)]
+    return imagination.knowing(ShapeBank.from_meshes(files, names=names), Upright())
+
+
+def knowing_others(imagination: Imagination, index: int) -> Imagination:
+    """One of `knowing_meshes` but for the mesh of a scene; any other as it is."""
+    model = imagination.model
+    if not isinstance(model, KnownShapes):
+        return imagination
+    others = [row for row, name in enumerate(model.bank.names) if name.rpartition(" ")[2] != str(index)]
+    return dataclasses.replace(imagination, model=dataclasses.replace(model, bank=model.bank.chosen(others)))
 
 
 def as_mesh_files(meshes: str | Path | Sequence[str] | None) -> tuple[str, ...]:

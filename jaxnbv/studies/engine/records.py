@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -29,8 +30,9 @@ class RecordFolder(ResultFolder):
         self.runner = runner or Here()
         super().__init__(path, "study.json", "scene_*.json", config, "study", self.runner.cores)
 
-    def collect(self, count: int, run: Trial, progress: bool = True) -> list[Record]:
-        """Records 0 to `count` - 1: those on disk as they are, the others from `run`, each written once it is done.
+    def collect(self, scenes: Sequence[int], run: Trial, progress: bool = True) -> list[Record]:
+        """The records of these scenes, in order: those on disk as they are, the others from `run`, each written once it
+        is done.
 
         Where `run` fails there is no record; `failures` tells of it, and the next call tries again.
 
@@ -39,12 +41,12 @@ class RecordFolder(ResultFolder):
         records = {}
         with self.writing():
             missing = []
-            for index in range(count):
+            for index in scenes:
                 if self._file(index).exists():
                     records[index] = _read(self._file(index), index)
                 else:
                     missing.append(index)
-            bar = tqdm(total=count, initial=len(records), desc=self.path.name, unit="scene", disable=not progress)
+            bar = tqdm(total=len(scenes), initial=len(records), desc=self.path.name, unit="scene", disable=not progress)
             with bar, closing(self.runner.outcomes(run, missing)) as outcomes:
                 for index, outcome in outcomes:
                     self._write(index, outcome)
@@ -53,9 +55,9 @@ class RecordFolder(ResultFolder):
                     bar.update()
         return [records[index] for index in sorted(records)]
 
-    def failures(self, count: int) -> dict[int, str]:
+    def failures(self, scenes: Sequence[int]) -> dict[int, str]:
         """The errors of scenes that failed, a line each; beside the records, scene_*.failed has their tracebacks."""
-        files = {index: self._file(index).with_suffix(_FAILED) for index in range(count)}
+        files = {index: self._file(index).with_suffix(_FAILED) for index in scenes}
         return {index: file.read_text().partition("\n")[0] for index, file in files.items() if file.exists()}
 
     def _file(self, index: int) -> Path:

@@ -19,8 +19,8 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, mesh_from_sdf
 from jaxnbv.scanning.sensors import HEAT_SETTING
 from jaxnbv.search import CandidateSearch, DiscreteSearch, FarthestView, HalvingSearch, RandomView, UncertaintyView
-from jaxnbv.studies.engine.measures import Claim, Measure, Record, Row
-from jaxnbv.studies.engine.meshes import as_mesh_files, numbered_mesh
+from jaxnbv.studies.engine.measures import KNOWN, Claim, Measure, Record, Row
+from jaxnbv.studies.engine.meshes import as_mesh_files, knowing_meshes, knowing_others, numbered_mesh
 from jaxnbv.studies.engine.study import Chart, Panel, Scene, Study
 from jaxnbv.studies.heat.halving import compare, halving_notes, halving_rows
 from jaxnbv.studies.scenes import heat_scene
@@ -154,6 +154,16 @@ class HeatStudy(Study):
     bank: ClassVar[str] = "heat"
     unknowing: ClassVar[tuple[str, ...]] = ("coverage", "uncertainty")
 
+    @classmethod
+    def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
+        """
+        - `meshes`: a folder of them. By the model `known` each object is planned by who has seen all others.
+        """
+        if "meshes" in options and model == KNOWN:
+            files = as_mesh_files(options["meshes"])
+            options |= {"meshes": files, "imagination": knowing_meshes(cls.imagined("screened", quick=quick), files)}
+        return super().configured(model, views, quick, **options)
+
     @property
     def num_scenes(self) -> int | None:
         return len(self.meshes) or None
@@ -173,10 +183,11 @@ class HeatStudy(Study):
     def planner(self, method: str, scene: Scene) -> Planner:
         search = _SEARCHES[method](self.candidates)
         camera = Camera(height=self.imagined_rays, width=self.imagined_rays)
+        imagination = knowing_others(self.imagination, scene.index) if self.meshes else self.imagination
         if method not in HEAT_METHODS:
-            return self.planner_of(Coverage(), search, camera)
+            return self.planner_of(Coverage(), search, camera, imagination)
         coldest = ColdestPoint(scene.task, reached_only=method == "heat-reached")
-        return self.planner_of(ExpectedUtilityImprovement(coldest, self.num_points), search, camera)
+        return self.planner_of(ExpectedUtilityImprovement(coldest, self.num_points), search, camera, imagination)
 
     def shows_enough(self, scene: Scene, seen: PointCloud) -> bool:
         """The heat source must be seen."""

@@ -10,10 +10,11 @@ from jaxtyping import Array, Float, Int
 from jaxnbv.checks import require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.imagination import Imagination
 from jaxnbv.scanning import Grid, MeshParts, load_parts, scan
 from jaxnbv.scanning.mesh import read_nodes
-from jaxnbv.studies.engine.measures import Record
-from jaxnbv.studies.engine.meshes import is_mesh_file, numbered, taking_turns
+from jaxnbv.studies.engine.measures import KNOWN, Record
+from jaxnbv.studies.engine.meshes import is_mesh_file, knowing_meshes, knowing_others, numbered, taking_turns
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.parts.discovery import NETWORK_POINTS, TARGETS, PartDiscoveryStudy
 from jaxnbv.studies.parts.nearest import NearestPart
@@ -51,11 +52,19 @@ class MeshPartStudy(PartDiscoveryStudy):
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
         """
-        - `meshes`: a folder, see `part_files`.
+        - `meshes`: a folder, see `part_files`. By the model `known` each object is planned by who has seen all others.
 
         **Raises:** `ValueError` as `part_files` does.
         """
-        return super().configured(model, views, quick, **options | {"meshes": part_files(options["meshes"])})
+        files = part_files(options["meshes"])
+        plain = cls.imagined("screened" if model == KNOWN else model, quick=quick)
+        imagination = knowing_meshes(plain, [file for file, _ in files]) if model == KNOWN else plain
+        given = options | {"meshes": files, "imagination": imagination}
+        return super().configured("screened", views, quick, **given)
+
+    def imagination_of(self, scene: Scene) -> Imagination:
+        """Who has seen all objects but this one."""
+        return knowing_others(self.imagination, scene.index)
 
     @property
     def num_scenes(self) -> int | None:

@@ -24,7 +24,7 @@ def written(folder):
         methods = {name: {"points": of[index]} for name, of in POINTS.items()}
         return {"scene": index, "methods": methods, "seconds": 2.0 + index}
 
-    RecordFolder(folder, CONFIG).collect(3, run, progress=False)
+    RecordFolder(folder, CONFIG).collect(range(3), run, progress=False)
     for name in ("picture_0", "points"):
         Image.new("RGB", (4, 3), "red").save(folder / f"{name}.png")
     return folder
@@ -100,6 +100,6 @@ def test_what_is_no_study_is_refused(tmp_path):
         chapters(tmp_path)
     with pytest.raises(InputError, match=r"must end in \.html or \.md"):
         write_page(written(tmp_path / "a"), tmp_path / "page.pdf")
-    RecordFolder(tmp_path / "b", {"study": {"type": "OtherStudy"}}).collect(1, lambda index: {}, progress=False)
+    RecordFolder(tmp_path / "b", {"study": {"type": "OtherStudy"}}).collect(range(1), lambda index: {}, progress=False)
     with pytest.raises(InputError, match="'OtherStudy', which this version does not know"):
         chapters(tmp_path)

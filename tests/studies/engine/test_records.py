@@ -19,25 +19,27 @@ def test_records_are_kept_and_the_missing_ones_made(tmp_path):
 
     config = {"views": 3, "radii": (1, 2)}
     with pytest.raises(KeyboardInterrupt):
-        RecordFolder(tmp_path / "a" / "b", config).collect(4, run, progress=False)
-    found = RecordFolder(tmp_path / "a" / "b", config).collect(4, run, progress=False)
+        RecordFolder(tmp_path / "a" / "b", config).collect(range(4), run, progress=False)
+    found = RecordFolder(tmp_path / "a" / "b", config).collect(range(4), run, progress=False)
     assert asked == [0, 1, 2, 2, 3]
     assert found == [{"scene": index, "value": 0.1 * index} for index in range(4)]
-    assert RecordFolder(tmp_path / "a" / "b", config).collect(2, run, progress=False) == found[:2]
+    assert RecordFolder(tmp_path / "a" / "b", config).collect(range(2), run, progress=False) == found[:2]
     assert len(asked) == 5
     (tmp_path / "a" / "b" / "scene_0001.json").unlink()
-    assert RecordFolder(tmp_path / "a" / "b", config).collect(4, run, progress=False) == found
+    assert RecordFolder(tmp_path / "a" / "b", config).collect(range(4), run, progress=False) == found
     assert asked[5:] == [1]
 
 
 def test_folders_of_another_study_and_damaged_records_are_refused(tmp_path):
-    RecordFolder(tmp_path, {"views": 3, "framing": "whole"}).collect(1, lambda index: {"scene": index}, progress=False)
+    RecordFolder(tmp_path, {"views": 3, "framing": "whole"}).collect(
+        range(1), lambda index: {"scene": index}, progress=False
+    )
     with pytest.raises(InputError, match="another study; it differs in views: 3 there, 4 now"):
         RecordFolder(tmp_path, {"views": 4, "framing": "whole"})
     for damaged in (b'{"scene": ', b"", b"\xff\xfe\x00"):
         (tmp_path / "scene_0000.json").write_bytes(damaged)
         with pytest.raises(InputError, match=r"scene_0000\.json is damaged"):
-            RecordFolder(tmp_path, {"views": 3, "framing": "whole"}).collect(1, lambda index: {}, progress=False)
+            RecordFolder(tmp_path, {"views": 3, "framing": "whole"}).collect(range(1), lambda index: {}, progress=False)
     (tmp_path / "study.json").write_bytes(b"[")
     with pytest.raises(InputError, match=r"study\.json is not a study's record"):
         RecordFolder(tmp_path, {"views": 3, "framing": "whole"})
@@ -51,7 +53,7 @@ def test_records_that_are_not_what_they_were_are_refused(tmp_path):
 
     def collect(count=2):
         return RecordFolder(tmp_path, config).collect(
-            count, lambda index: {"scene": index, "x": [0.25]}, progress=False
+            range(count), lambda index: {"scene": index, "x": [0.25]}, progress=False
         )
 
     expected = collect()
@@ -82,11 +84,11 @@ def test_records_that_are_not_what_they_were_are_refused(tmp_path):
 def test_a_record_that_does_not_say_its_format_is_refused(tmp_path):
     (tmp_path / "scene_0000.json").write_text(json.dumps({"scene": 0, "x": 1.5}))
     with pytest.raises(InputError, match=r"scene_0000\.json is of format None"):
-        RecordFolder(tmp_path, {"views": 3}).collect(1, lambda index: {}, progress=False)
+        RecordFolder(tmp_path, {"views": 3}).collect(range(1), lambda index: {}, progress=False)
 
 
 def test_keys_that_are_numbers_are_read_as_text(tmp_path):
-    found = RecordFolder(tmp_path, {}).collect(1, lambda index: {"by view": {10: 1.5, 9: 0.5}}, progress=False)
+    found = RecordFolder(tmp_path, {}).collect(range(1), lambda index: {"by view": {10: 1.5, 9: 0.5}}, progress=False)
     assert found == [{"by view": {"10": 1.5, "9": 0.5}}]
 
 
@@ -95,5 +97,5 @@ def test_a_study_that_fails_at_once_does_not_bind_its_folder(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        RecordFolder(tmp_path, {"views": 3}).collect(1, fail, progress=False)
-    assert RecordFolder(tmp_path, {"views": 4}).collect(1, lambda index: {}, progress=False) == [{}]
+        RecordFolder(tmp_path, {"views": 3}).collect(range(1), fail, progress=False)
+    assert RecordFolder(tmp_path, {"views": 4}).collect(range(1), lambda index: {}, progress=False) == [{}]

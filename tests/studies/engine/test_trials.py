@@ -44,19 +44,19 @@ def squares(*indices):
 def check_every_trial_is_in_the_result_once(folder, runner, killed):
     trial = Trial(folder)
     records = RecordFolder(folder / "records", {"views": 3}, runner)
-    assert records.collect(6, trial, progress=False) == squares(0, 1, 2, 5)
+    assert records.collect(range(6), trial, progress=False) == squares(0, 1, 2, 5)
     assert len(trial.beginnings(2)) >= 2
-    failures = records.failures(6)
+    failures = records.failures(range(6))
     assert list(failures) == [3, 4]
     assert failures[3] == "RuntimeError: the third never works"
     assert killed in failures[4]
-    assert list(records.failures(4)) == [3]
+    assert list(records.failures(range(4))) == [3]
     assert "in __call__" in (folder / "records" / "scene_0003.failed").read_text()
     # The next time those that failed are tried alone.
     asked = []
-    again = records.collect(6, lambda index: asked.append(index) or {"square": index**2}, progress=False)
+    again = records.collect(range(6), lambda index: asked.append(index) or {"square": index**2}, progress=False)
     assert again == squares(*range(6))
-    assert records.failures(6) == {}
+    assert records.failures(range(6)) == {}
     return trial
 
 
@@ -101,15 +101,15 @@ def test_on_a_cluster_no_trial_is_lost_though_workers_die(tmp_path, cluster):
 def test_workers_with_other_versions_are_not_used(tmp_path, cluster, monkeypatch):
     monkeypatch.setattr("jaxnbv.studies.engine.trials.software", lambda: software() | {"jax": "0.0.1"})
     records = RecordFolder(tmp_path, {}, Cluster(cluster.scheduler_address))
-    assert records.collect(1, Trial(tmp_path), progress=False) == []
-    assert "other versions than the command: jax: " in records.failures(1)[0]
+    assert records.collect(range(1), Trial(tmp_path), progress=False) == []
+    assert "other versions than the command: jax: " in records.failures(range(1))[0]
     assert not Trial(tmp_path).beginnings(0)
 
 
 def test_a_study_in_processes_finds_what_it_finds_here(tmp_path):
     balls = small(num_candidates=4, views=2)
     here, processes = (
-        RecordFolder(tmp_path / type(runner).__name__, {}, runner).collect(2, balls.run_scene, progress=False)
+        RecordFolder(tmp_path / type(runner).__name__, {}, runner).collect(range(2), balls.run_scene, progress=False)
         for runner in (Here(), Processes(1))
     )
     assert list(map(without_time, here)) == list(map(without_time, processes))
@@ -150,11 +150,17 @@ def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypa
     with pytest.raises(
         InputError, match=r"^1 of 3 scenes failed.*first scene 1 \(RuntimeError: lost\).*/some has scene_\*\.failed"
     ):
-        run("some", 3)
+        run("some", "3")
     assert "2 scenes" in (tmp_path / "some" / "results.txt").read_text()
     monkeypatch.setattr(ToyStudy, "run_scene", lambda self, index, **_: run_scene(self, 1, (), {}))
     with pytest.raises(InputError, match=r"^2 of 2 scenes failed"):
-        run("all", 2)
+        run("all", "2")
     assert not (tmp_path / "all" / "results.txt").exists()
+    monkeypatch.setattr(ToyStudy, "run_scene", lambda self, index, **given: run_scene(self, index + 1, **given))
+    run("range", "7:9")
+    assert sorted(file.name for file in (tmp_path / "range").glob("scene_*")) == ["scene_0007.json", "scene_0008.json"]
+    for wrong in ("0", "3:3", "9:7", "-2", "all"):
+        with pytest.raises(InputError, match=f"--scenes {wrong} names no scenes"):
+            run("wrong", wrong)
     with pytest.raises(InputError, match="exclude each other"):
-        study("toy", entry, 2, 2, None, None, "paper", None, False, 2, "tcp://127.0.0.1:9")
+        study("toy", entry, "2", 2, None, None, "paper", None, False, 2, "tcp://127.0.0.1:9")

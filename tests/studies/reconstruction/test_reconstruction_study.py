@@ -179,8 +179,8 @@ def test_an_interrupted_study_goes_on(record, meshes, tmp_path):
         return record | {"scene": index}
 
     config = {"study": describe(small_study(meshes))}
-    RecordFolder(tmp_path, config).collect(1, run, progress=False)
-    found = RecordFolder(tmp_path, config).collect(2, run, progress=False)
+    RecordFolder(tmp_path, config).collect(range(1), run, progress=False)
+    found = RecordFolder(tmp_path, config).collect(range(2), run, progress=False)
     assert asked == [0, 1]
     assert found == [record | {"scene": 0}, record]
     for other in (small_study(meshes, views=4), small_study()):

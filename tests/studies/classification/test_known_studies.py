@@ -1,0 +1,111 @@
+"""Studies by who has seen other objects of the kind, beside who has not."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from test_pyramid_study import CAMERA, SCENE, evidence_of, small_study, step_key, without_time
+
+import jaxnbv as nbv
+from jaxnbv.cli.registry import STUDY_MODELS
+from jaxnbv.imagination import MODELS
+from jaxnbv.studies.classification.pyramid import PyramidStudy
+from jaxnbv.studies.engine.measures import KNOWN
+from jaxnbv.studies.engine.meshes import knowing_meshes, knowing_others
+from jaxnbv.studies.heat.study import HeatStudy
+from jaxnbv.studies.parts.study import PartStudy
+from jaxnbv.studies.reconstruction.study import ReconstructionStudy
+from jaxnbv.studies.registry import STUDIES
+from jaxnbv.studies.scenes import Split, pyramid_scene
+from jaxnbv.surfaces import GeometricSPSR, KnownShapes, OnSurface, ScreenedSPSR, mesh_shapes
+
+METHODS = ("cross-entropy", "coverage", "uncertainty", "coverage-screened", "uncertainty-screened")
+
+
+def knowing_study():
+    plain = small_study()
+    bank = nbv.ShapeBank.of([pyramid_scene(Split.TRAIN, index, turned=False) for index in range(5)])
+    residual = ScreenedSPSR(GeometricSPSR(0.05, truncation=8), (OnSurface(),))
+    model = KnownShapes(bank, residual, unknown=plain.imagination.model, num_starts=60)
+    return dataclasses.replace(plain, imagination=dataclasses.replace(plain.imagination, model=model))
+
+
+@pytest.fixture(scope="module")
+def record():
+    return knowing_study().run_scene(SCENE, METHODS)
+
+
+def test_a_choice_is_that_of_the_planner_with_the_same_key(record):
+    study = knowing_study()
+    scene, poses = study.scene(SCENE), np.asarray(study.candidates.poses().position)
+    for method in METHODS:
+        planner, candidates = study.planner_for(method, scene), record["methods"][method]["runs"][0]["candidates"]
+        for view in (1, 2):
+            evidence = evidence_of(study, planner, scene, candidates[:view])
+            proposed = planner.propose(evidence, step_key(study, view)).pose.position
+            np.testing.assert_allclose(poses[candidates[view]], proposed, atol=1e-5)
+
+
+def test_the_methods_that_know_no_shapes_are_those_of_a_study_without(record):
+    plain = small_study().run_scene(SCENE, ("coverage", "uncertainty"))
+    for method in ("coverage", "uncertainty"):
+        assert record["methods"][f"{method}-screened"] == plain["methods"][method]
+
+
+def test_a_scene_can_be_run_again(record):
+    assert without_time(knowing_study().run_scene(SCENE, METHODS)) == without_time(record)
+
+
+def test_the_models_of_studies_are_known_and_those_of_the_library():
+    assert tuple(STUDY_MODELS) == (KNOWN, *MODELS)
+    assert STUDIES["pyramid"].model == KNOWN
+    assert PyramidStudy.all_methods("screened") == PyramidStudy.methods
+    assert PyramidStudy.all_methods(KNOWN)[-2:] == ("coverage-screened", "uncertainty-screened")
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_a_study_whose_usual_model_is_known_has_a_bank(name):
+    from jaxnbv.cli.registry import resolve
+
+    kind = resolve(STUDIES[name].study)
+    assert bool(kind.bank) is (STUDIES[name].model == KNOWN)
+
+
+def test_the_preset_of_a_study_knows_its_bank():
+    model = HeatStudy.imagined(KNOWN).model
+    assert isinstance(model, KnownShapes)
+    assert len(model.bank) == 256
+    with pytest.raises(nbv.InputError, match="no known shapes for"):
+        ReconstructionStudy.imagined(KNOWN)
+
+
+def test_parts_are_planned_with_the_shapes_of_their_category():
+    (study,) = PartStudy.configured(KNOWN, 2, quick=True).values()
+    scene = study.scene(2)
+    names = study.planner("discrete", scene).imagination.model.bank.names
+    assert {name.rsplit(" ", 1)[0] for name in names} == {scene.name}
+    assert len(names) == 40
+
+
+def test_of_meshes_each_is_planned_by_who_has_seen_the_others(tmp_path, monkeypatch):
+    import trimesh
+
+    monkeypatch.setattr(mesh_shapes.platformdirs, "user_cache_path", lambda name: tmp_path / "cache")
+    files = []
+    for index in range(3):
+        files.append(str(tmp_path / f"box{index}.ply"))
+        trimesh.creation.box((1.0, 0.5 + 0.1 * index, 0.4)).export(files[-1])
+    imagination = knowing_meshes(nbv.Imagination(), files)
+    assert imagination.model.bank.names == ("box0 0", "box1 1", "box2 2")
+    assert knowing_others(imagination, 1).model.bank.names == ("box0 0", "box2 2")
+    assert knowing_others(nbv.Imagination(), 1) == nbv.Imagination()
+
+
+def test_one_who_knows_no_shapes_any_more_is_as_before():
+    plain = nbv.Imagination.preset("screened", 1.25)
+    knowing = plain.knowing(nbv.ShapeBank.of([nbv.sdf.Sphere(1.0)]), nbv.AsGiven())
+    assert knowing.model.box == nbv.Box.cube(1.25)
+    assert float(knowing.model.residual.base.lengthscale) == pytest.approx(0.005)
+    assert jax.tree.structure(knowing.unknowing) == jax.tree.structure(plain)
+    assert CAMERA.num_rays == 24 * 24
