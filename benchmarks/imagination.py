@@ -2,18 +2,21 @@
 
     python benchmarks/imagination.py [--scenes N] [--parts NAME ...] [--mesh FILE ...] [--candidates 24] [--seeds 0 1]
         [--models NAME ...] [--variant "NAME=EXPRESSION" ...] [--figure PATH] [--reliability PATH]
-        [--better NAME] [--out FILE]
+        [--known FOLDER] [--better NAME] [--out FILE]
 
 Objects are N validation pyramids in close-up, one validation object of each part category named, and the demo object;
 with meshes, these alone and what else is asked for. All models see the same scans of 50 x 50 rays with the default
 noise, from the same two random views. Samples are 8 on a grid of 64^3 nodes; depths are along 32 x 32 rays from each
 candidate. See `jaxnbv.studies.forecasts` for the numbers. Continues with what the file does not hold yet.
 
+With --known the model "known" is the default that has seen the meshes of a folder, upright, all but the object itself.
+
 A variant is a model of your own, carved: --variant "smooth=nbv.GeometricSPSR(lengthscale=0.03, truncation=32)". All of
 jaxnbv, jaxnbv.surfaces and the grid are in scope. A change of a model's code is not noticed: take another file then.
 """
 
 import argparse
+import dataclasses
 import functools
 import hashlib
 import json
@@ -91,6 +94,13 @@ def objects_of(arguments: argparse.Namespace) -> dict[str, Callable[[], nbv.Surf
     for file in map(Path, arguments.mesh):
         found[f"{file.resolve().parent.name}/{file.stem}"] = functools.partial(nbv.load_mesh, file)
     return found
+
+
+def knowing(planner: nbv.Planner, bank: nbv.ShapeBank, name: str) -> nbv.Planner:
+    """One that has seen the shapes of a bank, but for the object of this name."""
+    others = [row for row, known in enumerate(bank.names) if known != name]
+    imagination = planner.imagination.knowing(bank.chosen(others), nbv.Upright())
+    return dataclasses.replace(planner, imagination=imagination)
 
 
 def random_views(scene: nbv.Surface, key: jax.Array) -> list[tuple[nbv.Pose, nbv.PointCloud]]:
@@ -174,6 +184,7 @@ def main() -> None:
     parser.add_argument("--variant", action="append", default=[], metavar="NAME=EXPRESSION", help="a model to add")
     parser.add_argument("--figure", type=Path, help="a picture of the first object, by the first model and --better")
     parser.add_argument("--reliability", type=Path, help="a picture of the first model's reliability and --better's")
+    parser.add_argument("--known", type=Path, help="a folder of meshes, class/name, for the model known")
     parser.add_argument("--better", help="the second model of the pictures; the last if left out")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/imagination.json"))
     arguments = parser.parse_args()
@@ -184,6 +195,9 @@ def main() -> None:
         scope = {**vars(models), **vars(nbv), "nbv": nbv, "grid": GRID}
         model = eval(expression, scope)
         variants[name] = lambda grid, model=model: (model, nbv.Carving())
+    bank = None if arguments.known is None else nbv.ShapeBank.from_meshes(arguments.known)
+    if bank is not None:
+        variants["known"] = VARIANTS["default"]
     names = arguments.models or list(variants)
     if unknown := set(names) - set(variants):
         parser.error(f"there is no model {', '.join(sorted(unknown))}: choose from {', '.join(variants)}")
@@ -200,7 +214,8 @@ def main() -> None:
             scene, truth = make(), None
             for seed in arguments.seeds:
                 base, views = jax.random.fold_in(jax.random.key(seed), zlib.crc32(name.encode())), None
-                for model, planner in planners.items():
+                for model, plain in planners.items():
+                    planner = knowing(plain, bank, name) if bank is not None and model == "known" else plain
                     asked = describe([scene, planner, arguments.candidates, RAYS, VOLUME, LEAST_HITS])
                     label = f"{name}, seed {seed}, {model}"
                     bar.set_description(label)

@@ -28,6 +28,8 @@ POSES = nbv.SphereCandidates(6).poses()
 SMALL = nbv.Camera(height=4, width=4)
 BALL = nbv.sdf.Sphere(1.0)
 MODEL = nbv.GeometricSPSR(0.05, 0.2, 6)
+RESIDUAL = nbv.ScreenedSPSR(MODEL, (nbv.OnSurface(),))
+BANK = nbv.ShapeBank.of([BALL])
 # Until the program ends.
 _HELD = tempfile.TemporaryDirectory()
 COPY = Path(_HELD.name)
@@ -47,8 +49,20 @@ for name, content in {
     (COPY / name).write_text(content)
 
 
+# Of no use, so that nothing is kept in the cache.
+MESH = COPY / "02958343" / "a" / "model.obj"
+
+
 def number_of_points(cloud):
     return jnp.sum(cloud.mask).astype(float)
+
+
+def chosen_of_bank(indices):
+    return BANK.chosen(indices)
+
+
+def knowing(bank, poses):
+    return nbv.Imagination().knowing(bank, poses)
 
 
 # What is called, and arguments that work; each is replaced in turn.
@@ -118,6 +132,16 @@ CALLS = {
     readers.OmniObject3DPoints: {"folder": COPY, "num_points": 1024, "classes": ["apple"]},
     readers.ShapeNet: {"folder": COPY, "categories": ["car"], "models": ["a"]},
     readers.ShapeNetPart: {"folder": COPY, "split": "test", "categories": ["car"]},
+    chosen_of_bank: {"indices": [0]},
+    nbv.AsGiven: {"scale": (0.9, 1.1), "by_axis": False},
+    nbv.FreeRotation: {"scale": (0.9, 1.1), "by_axis": False},
+    knowing: {"bank": BANK, "poses": nbv.Upright()},
+    nbv.KnownShapes: {"bank": BANK, "residual": RESIDUAL, "poses": nbv.Upright(), "box": nbv.Box(), "unknown": MODEL}
+    | {"num_starts": 8, "sharpness": 20.0, "unknown_misfit": 0.6},
+    nbv.ShapeBank.from_meshes: {"meshes": [MESH], "resolution": 8, "sheet": 0.05, "names": ["a"], "progress": False},
+    nbv.ShapeBank.of: {"solids": [BALL], "names": ["ball"]},
+    nbv.Upright: {"axis": (0.0, 1.0, 0.0), "within": 1.0, "scale": (0.9, 1.1), "by_axis": False},
+    nbv.shape_bank: {"name": "fruit"},
     nbv.ValueBelow: {"value": 0.1},
     nbv.concatenate: {"first": CLOUD, "second": CLOUD},
     nbv.farthest_point_subsample: {"cloud": CLOUD, "count": 3},

@@ -5,7 +5,7 @@ import secrets
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,13 +14,22 @@ import trimesh
 from jaxtyping import Float
 from tqdm import tqdm
 
-from jaxnbv.checks import InputError, require
+from jaxnbv.checks import InputError, check_type, require, shown
 from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.scanning.mesh import TriangleMesh, load_mesh
 from jaxnbv.scanning.sdf import Sampled, solid_of_mesh
 
 # What is kept is made anew where what makes it has changed.
 _VERSION = 1
+_T = TypeVar("_T")
+
+
+def listed(values: Sequence[_T], name: str) -> tuple[_T, ...]:
+    """**Raises:** `ValueError` for what cannot be listed."""
+    try:
+        return tuple(values)
+    except TypeError as error:
+        raise InputError(f"{name} are {shown(values)}; give a list") from error
 
 
 def mesh_paths(meshes: str | Path | Sequence[str | Path]) -> list[Path]:
@@ -36,8 +45,11 @@ def mesh_paths(meshes: str | Path | Sequence[str | Path]) -> list[Path]:
         meshes = [path for path in sorted(folder.rglob("*")) if path.suffix[1:].lower() in formats and path.is_file()]
         ends = ", ".join(sorted(formats))
         require(len(meshes) > 0, f"the folder {folder} holds no mesh: its files must end in {ends}")
-    require(len(meshes) > 0, "no meshes are named: give their files, or a folder")
-    return [Path(path) for path in meshes]
+    named = listed(meshes, "the meshes")
+    require(len(named) > 0, "no meshes are named: give their files, or a folder")
+    for path in named:
+        check_type(path, str | Path, "a mesh")
+    return [Path(path) for path in named]
 
 
 def shapes_of_meshes(

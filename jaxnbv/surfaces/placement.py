@@ -138,6 +138,7 @@ class Upright(ShapePoses):
     within: float = eqx.field(static=True, default=math.pi)
 
     def __check_init__(self):
+        check_fields(self)
         require(any(self.axis), "the vertical is zero; give a direction, such as (0, 1, 0)")
         require(0 < self.within <= math.pi, f"turns are searched within {self.within} rad; give an angle in (0, pi]")
 

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
-from jaxnbv.checks import InputError, check_type, require
+from jaxnbv.checks import InputError, check_type, checked, require
 from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.scanning.sdf import SignedDistance
-from jaxnbv.surfaces.mesh_shapes import mesh_paths, shapes_of_meshes
+from jaxnbv.surfaces.mesh_shapes import listed, mesh_paths, shapes_of_meshes
 
 _NUM_EXTREMES, _FAR, _STRIDES, _ARRIVED = 128, 4.0, 40, 0.01
 _LONGEST_NAME = 64
@@ -60,9 +60,10 @@ class ShapeBank(eqx.Module):
 
         **Raises:** `ValueError` for what is no solid, solids of several kinds, or another number of names.
         """
+        solids = listed(solids, "the bank's solids")
         for index, solid in enumerate(solids):
             check_type(solid, SignedDistance, f"solid {index} of the bank")
-        names = tuple(map(str, range(len(solids)))) if names is None else tuple(names)
+        names = tuple(map(str, range(len(solids)))) if names is None else _as_names(names)
         require(len(names) == len(solids), f"there are {len(names)} names for {len(solids)} solids: give one for each")
         if not solids:
             return cls(None, jnp.zeros((0, _NUM_EXTREMES, 3)), encoded(names))
@@ -76,6 +77,7 @@ class ShapeBank(eqx.Module):
         return cls(joined, _extremes(joined), encoded(names))
 
     @classmethod
+    @checked
     def from_meshes(
         cls,
         meshes: str | Path | Sequence[str | Path],
@@ -102,6 +104,7 @@ class ShapeBank(eqx.Module):
         if names is None:
             folder = Path(meshes) if isinstance(meshes, str | Path) else None
             names = [path.stem if folder is None else str(path.relative_to(folder).with_suffix("")) for path in paths]
+        names = _as_names(names)
         require(len(names) == len(paths), f"there are {len(names)} names for {len(paths)} meshes: give one for each")
         solids, extremes, used = shapes_of_meshes(paths, resolution, sheet, _NUM_EXTREMES, progress)
         joined = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *solids)
@@ -134,11 +137,21 @@ class ShapeBank(eqx.Module):
 
         **Raises:** `ValueError` for an index that it does not have.
         """
+        indices = listed(indices, "the indices")
+        for index in indices:
+            check_type(index, int, "an index of the bank")
         wrong = [index for index in indices if not 0 <= index < len(self)]
         require(not wrong, f"the bank has {len(self)} shapes; there is no number {wrong[:1]}")
         rows = np.asarray(indices, int)
         solids = jax.tree.map(lambda leaf: leaf[rows], self.solids) if len(rows) else None
         return ShapeBank(solids, self.extremes[rows], self.codes[rows])
+
+
+def _as_names(names: Sequence[str]) -> tuple[str, ...]:
+    found = listed(names, "the names")
+    for name in found:
+        check_type(name, str, "a name of a shape")
+    return found
 
 
 def encoded(names: Sequence[str]) -> UInt8[Array, "k c"]:

@@ -109,7 +109,7 @@ def test_modes_of_one_shape_are_far_apart(planted):
 def test_another_library_moves_a_refined_pose_no_further(planted):
     """Generalised ICP (small_gicp) from the shape's surface, where it was placed, to the scan."""
     gicp = pytest.importorskip("small_gicp", reason="small_gicp is not installed")
-    for index, rotation, _, shift, found in planted[:4]:
+    for index, rotation, *_, found in planted[:4]:
         placed = jax.tree.map(lambda rows: np.asarray(rows[0], np.float64), found.placement)
         mesh = nbv.mesh_from_sdf(corner(ARMS[int(found.shape[0])]), nbv.Grid(120, 2.0))
         own = mesh.frame.to_world(mesh.sample_points(jax.random.key(0), 4000))

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnbv.checks import require
+from jaxnbv.checks import check_type, require
 from jaxnbv.scanning.sdf import Sampled, SignedDistance
 from jaxnbv.studies.scenes.fruit import FRUITS, fruit_scene
 from jaxnbv.studies.scenes.heat_objects import FIRST_TRAINING, HEAT_OBJECTS, heat_scene
@@ -69,6 +69,7 @@ def shape_bank(name: str) -> ShapeBank:
 
     **Raises:** `ValueError` for another name.
     """
+    check_type(name, str, "the bank's name")
     require(name in BANKS, f"there is no bank of shapes {name!r}: choose from {', '.join(BANKS)}, or make one")
     with resources.as_file(resources.files("jaxnbv.studies.scenes") / "shapes" / f"{name}.npz") as path:
         return read_bank(path, name)
