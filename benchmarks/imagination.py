@@ -99,7 +99,7 @@ def objects_of(arguments: argparse.Namespace) -> dict[str, Callable[[], nbv.Surf
 def knowing(planner: nbv.Planner, bank: nbv.ShapeBank, name: str) -> nbv.Planner:
     """One that has seen the shapes of a bank, but for the object of this name."""
     others = [row for row, known in enumerate(bank.names) if known != name]
-    imagination = planner.imagination.knowing(bank.chosen(others), nbv.Upright())
+    imagination = planner.imagination.knowing(bank.chosen(others), nbv.Upright(by_axis=True))
     return dataclasses.replace(planner, imagination=imagination)
 
 

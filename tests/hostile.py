@@ -137,7 +137,7 @@ CALLS = {
     nbv.FreeRotation: {"scale": (0.9, 1.1), "by_axis": False},
     knowing: {"bank": BANK, "poses": nbv.Upright()},
     nbv.KnownShapes: {"bank": BANK, "residual": RESIDUAL, "poses": nbv.Upright(), "box": nbv.Box(), "unknown": MODEL}
-    | {"num_starts": 8, "sharpness": 20.0, "unknown_misfit": 0.6},
+    | {"num_starts": 8, "noise_scale": 0.1, "sharpness": 20.0, "unknown_misfit": 0.6},
     nbv.ShapeBank.from_meshes: {"meshes": [MESH], "resolution": 8, "sheet": 0.05, "names": ["a"], "progress": False},
     nbv.ShapeBank.of: {"solids": [BALL], "names": ["ball"]},
     nbv.Upright: {"axis": (0.0, 1.0, 0.0), "within": 1.0, "scale": (0.9, 1.1), "by_axis": False},

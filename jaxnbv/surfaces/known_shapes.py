@@ -50,6 +50,8 @@ class KnownShapes(SurfaceModel):
     - `poses`: how shapes can stand in the scene; `box`: what holds the object, and no more than it needs.
     - `unknown`: the model of what none of the shapes is.
     - `num_starts`: placements that are tried, over all shapes.
+    - `noise_scale`: rho, of the residual's deviation where nothing was seen; as large as the prior's it breaks thin parts
+      and lets pieces float about them.
     - `sharpness`: beta; `unknown_misfit`: E_0, the misfit at which a shape is as likely as none.
 
     With an empty bank it is `unknown`.
@@ -63,15 +65,15 @@ class KnownShapes(SurfaceModel):
     box: Box = Box()
     unknown: SurfaceModel = eqx.field(default_factory=ScreenedSPSR)
     num_starts: int = eqx.field(static=True, default=4096)
+    noise_scale: float = eqx.field(static=True, default=0.1)
     sharpness: float = eqx.field(static=True, default=20.0)
-    unknown_misfit: float = eqx.field(static=True, default=0.6)
+    unknown_misfit: float = eqx.field(static=True, default=1.0)
 
     def __check_init__(self):
         check_fields(self)
         require(self.num_starts >= 1, f"the number of starts is {self.num_starts}; it must be at least 1")
-        require(
-            0 <= self.sharpness < math.inf, f"the sharpness is {self.sharpness}; it must be finite and not negative"
-        )
+        for name, value in (("sharpness", self.sharpness), ("noise scale", self.noise_scale)):
+            require(0 <= value < math.inf, f"the {name} is {value}; it must be finite and not negative")
 
     def check(self, cloud: PointCloud) -> None:
         """As that of the model that knows no shapes."""
@@ -169,7 +171,7 @@ def _sample(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int
     solids = bank.shape(found.shape[row]).solid
     placement = jax.tree.map(lambda rows: rows[row], found.placement)
     means = PlacedShapes(solids, placement, posterior.residual.half_jump)
-    known = posterior.residual.sample_about(means, residual_key)
+    known = posterior.residual.sample_about(means, residual_key, posterior.model.noise_scale)
 
     def draw():
         return posterior.unknown.sample(unknown_key, num_samples)

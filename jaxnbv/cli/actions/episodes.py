@@ -87,7 +87,7 @@ def knowing(imagination: Imagination, known: str | None) -> Imagination:
     require(
         Path(known).is_dir(), f"--known {known}: there is no such folder of meshes; or give {', '.join(BANKS)}, none"
     )
-    return imagination.knowing(ShapeBank.from_meshes(known), Upright())
+    return imagination.knowing(ShapeBank.from_meshes(known), Upright(by_axis=True))
 
 
 def task_for(task: str, network: Path | None, category: str | None, source: str | None) -> CommandTask:

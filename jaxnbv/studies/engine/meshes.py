@@ -97,9 +97,9 @@ def numbered_mesh(files: Sequence[str], index: int) -> TriangleMesh:
 
 
 def knowing_meshes(imagination: Imagination, files: Sequence[str]) -> Imagination:
-    """One that knows the meshes of a study, upright."""
+    """One that knows the meshes of a study, upright and of any proportions."""
     names = [f"{Path(file).stem[:_LONGEST]} {index}" for index, file in enumerate(files)]
-    return imagination.knowing(ShapeBank.from_meshes(files, names=names), Upright())
+    return imagination.knowing(ShapeBank.from_meshes(files, names=names), Upright(by_axis=True))
 
 
 def knowing_others(imagination: Imagination, index: int) -> Imagination:

@@ -25,6 +25,8 @@ from jaxnbv.surfaces.shape_bank import encoded
 
 # One unit of the stored distances of a mesh, which are clipped to 127 of them.
 _QUANTUM = 0.008
+# Upright, of any proportions.
+_FURNITURE = Upright(by_axis=True)
 
 
 class Kind(NamedTuple):
@@ -49,10 +51,10 @@ def _heated(index: int) -> SignedDistance:
 KINDS = {
     "pyramid": Kind(1024, PATTERNS, lambda i: pyramid_scene(Split.TRAIN, i, turned=False), FreeRotation()),
     "truck": Kind(512, HOUSEHOLD, lambda i: truck_scene(Split.TRAIN, i, turned=False), FreeRotation()),
-    "household": Kind(512, HOUSEHOLD, lambda i: household_scene(Split.TRAIN, i, turned=False), Upright()),
+    "household": Kind(512, HOUSEHOLD, lambda i: household_scene(Split.TRAIN, i, turned=False), _FURNITURE),
     "fruit": Kind(256, FRUITS, lambda i: fruit_scene(Split.TRAIN, i, turned=False), FreeRotation()),
-    "parts": Kind(520, PART_CATEGORIES, lambda i: part_scene(Split.TRAIN, i).solid, Upright(within=0.35)),
-    "heat": Kind(256, HEAT_OBJECTS, _heated, Upright()),
+    "parts": Kind(520, PART_CATEGORIES, lambda i: part_scene(Split.TRAIN, i).solid, Upright(within=0.35, by_axis=True)),
+    "heat": Kind(256, HEAT_OBJECTS, _heated, _FURNITURE),
 }
 """The banks of procedural objects, by name."""
 
@@ -77,7 +79,7 @@ def shape_bank(name: str) -> ShapeBank:
 
 def bank_poses(name: str) -> ShapePoses:
     """How the shapes of a bank that ships stand in a scene."""
-    return KINDS[name].poses if name in KINDS else Upright()
+    return KINDS[name].poses if name in KINDS else _FURNITURE
 
 
 def made_bank(name: str) -> ShapeBank:
