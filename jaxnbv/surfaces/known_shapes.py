@@ -50,8 +50,8 @@ class KnownShapes(SurfaceModel):
     - `poses`: how shapes can stand in the scene; `box`: what holds the object, and no more than it needs.
     - `unknown`: the model of what none of the shapes is.
     - `num_starts`: placements that are tried, over all shapes.
-    - `noise_scale`: rho, of the residual's deviation where nothing was seen; as large as the prior's it breaks thin parts
-      and lets pieces float about them.
+    - `noise_scale`: rho, of the residual's deviation where nothing was seen; one as large as the prior's breaks thin
+      parts and lets pieces float about them.
     - `sharpness`: beta; `unknown_misfit`: E_0, the misfit at which a shape is as likely as none.
 
     With an empty bank it is `unknown`.
