@@ -101,7 +101,7 @@ class Shown(NamedTuple):
     """An object to show a task on.
 
     - `longest_side`, `solid`, `grid`: of the imagined surfaces; `note`: what is said of the object before.
-    - `until`: what is enough, as of `--until`; `bank`: the shapes that are known, as of `--known`.
+    - `until`: what is enough, as of `--until`.
     """
 
     name: str
@@ -113,7 +113,6 @@ class Shown(NamedTuple):
     grid: Grid = Grid()
     note: str = ""
     until: tuple[str, ...] = ()
-    bank: str = "none"
 
 
 class CommandTask(ABC):
@@ -159,9 +158,7 @@ class ClassTask(CommandTask):
         note = f"the pattern is a {PATTERNS[int(pyramid.label)]}"
         acquisition = self.of(pyramid_classifier(side))
         grid = Grid(64, 0.7 * side)
-        return Shown(
-            "pyramid", SDFSurface(pyramid), acquisition, first, side, True, grid, note, ("sure=0.95",), "pyramid"
-        )
+        return Shown("pyramid", SDFSurface(pyramid), acquisition, first, side, True, grid, note, ("sure=0.95",))
 
 
 class PartTask(CommandTask):
@@ -181,7 +178,7 @@ class PartTask(CommandTask):
         thing = part_scene(Split.TEST, scene)
         category = CATEGORIES[int(thing.category)].name
         acquisition = self._of(part_segmenter(category))
-        return Shown(category, SDFSurface(thing.solid), acquisition, usual_first(), bank="parts")
+        return Shown(category, SDFSurface(thing.solid), acquisition, usual_first())
 
     def _of(self, segmenter: CloudSegmenter) -> Acquisition:
         return ExpectedUtilityImprovement(SoftPartCount(segmenter), segmenter.num_points)
@@ -200,7 +197,7 @@ class HeatTask(CommandTask):
         """A procedural object."""
         heated = heat_scene(scene)
         first = source_view(heated, jax.random.key(seed))
-        return Shown(heated.name, heated.surface, self._of(np.asarray(heated.source)), first, bank="heat")
+        return Shown(heated.name, heated.surface, self._of(np.asarray(heated.source)), first)
 
     def _of(self, source: np.ndarray) -> Acquisition:
         return ExpectedUtilityImprovement(ColdestPoint(source), num_points=2048)
