@@ -11,7 +11,7 @@ class Entry(NamedTuple):
 
     - `study`: module and class; `pictures`: module and function that draws its own pictures, if there are any.
     - `question`, `settings`: for the help.
-    - `scenes`, `views`, `model`: by default.
+    - `scenes`, `views`: by default.
     - `options`: names of its fields that are options of the command.
     """
 
@@ -20,7 +20,6 @@ class Entry(NamedTuple):
     settings: str
     scenes: int
     views: int
-    model: str = "screened"
     pictures: str = ""
     options: tuple[str, ...] = ()
 
@@ -33,7 +32,6 @@ STUDIES = {
         "candidates and a coarser grid than the paper's.",
         scenes=100,
         views=5,
-        model="known",
         pictures="jaxnbv.studies.classification.pictures:write_pictures",
         options=("framing", "classifier"),
     ),
@@ -45,7 +43,6 @@ STUDIES = {
         "what was seen alone: fewer candidates and a coarser grid than the paper's.",
         scenes=100,
         views=5,
-        model="known",
         pictures="jaxnbv.studies.classification.pictures:write_pictures",
         options=("meshes", "classifier"),
     ),
@@ -57,7 +54,6 @@ STUDIES = {
         "candidates and a coarser grid than the paper's.",
         scenes=100,
         views=5,
-        model="known",
         pictures="jaxnbv.studies.classification.pictures:write_pictures",
         options=("meshes", "classifier"),
     ),
@@ -69,7 +65,6 @@ STUDIES = {
         "candidates and a coarser grid than the paper's.",
         scenes=100,
         views=5,
-        model="known",
         pictures="jaxnbv.studies.classification.pictures:write_pictures",
         options=("meshes", "classifier"),
     ),
@@ -82,7 +77,6 @@ STUDIES = {
         "of 24 views, 8 steps of 0.03: less of everything than the paper.",
         scenes=80,
         views=6,
-        model="known",
         pictures="jaxnbv.studies.parts.pictures:write_pictures",
         options=("meshes",),
     ),
@@ -94,7 +88,6 @@ STUDIES = {
         "added to 1,024 points of the cloud: less of everything than the paper.",
         scenes=24,
         views=6,
-        model="known",
         pictures="jaxnbv.studies.heat.pictures:write_pictures",
         options=("meshes",),
     ),
@@ -115,7 +108,6 @@ STUDIES = {
         "of 0.03.",
         scenes=60,
         views=5,
-        model="known",
         pictures="jaxnbv.studies.classification.pictures:write_pictures",
         options=("framing",),
     ),

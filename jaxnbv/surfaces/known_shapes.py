@@ -39,8 +39,8 @@ def short_ranged() -> ScreenedSPSR:
     """The usual residual, for scenes 2.5 long."""
     # With long scales, or values beside the surface, it pulls the surface back to what it would say by itself. The
     # noise is that of the shape's normals: beside an edge that is a little off, they are those of the other face. The
-    # level is that of the shape.
-    return ScreenedSPSR(GeometricSPSR(0.01, truncation=32, noise=0.2), (OnSurface(),), level_deviation=0.02)
+    # level is that of the shape, and values are known no better than where it was put.
+    return ScreenedSPSR(GeometricSPSR(0.01, truncation=32, noise=0.2), (OnSurface(noise=0.3),), level_deviation=0.02)
 
 
 class KnownShapes(SurfaceModel):

@@ -16,7 +16,6 @@ from jaxnbv.studies.engine.meshes import knowing_meshes, knowing_others
 from jaxnbv.studies.heat.study import HeatStudy
 from jaxnbv.studies.parts.study import PartStudy
 from jaxnbv.studies.reconstruction.study import ReconstructionStudy
-from jaxnbv.studies.registry import STUDIES
 from jaxnbv.studies.scenes import Split, pyramid_scene
 from jaxnbv.surfaces import GeometricSPSR, KnownShapes, OnSurface, ScreenedSPSR, mesh_shapes
 
@@ -59,17 +58,8 @@ def test_a_scene_can_be_run_again(record):
 
 def test_the_models_of_studies_are_known_and_those_of_the_library():
     assert tuple(STUDY_MODELS) == (KNOWN, *MODELS)
-    assert STUDIES["pyramid"].model == KNOWN
     assert PyramidStudy.all_methods("screened") == PyramidStudy.methods
     assert PyramidStudy.all_methods(KNOWN)[-2:] == ("coverage-screened", "uncertainty-screened")
-
-
-@pytest.mark.parametrize("name", STUDIES)
-def test_a_study_whose_usual_model_is_known_has_a_bank(name):
-    from jaxnbv.cli.registry import resolve
-
-    kind = resolve(STUDIES[name].study)
-    assert bool(kind.bank) is (STUDIES[name].model == KNOWN)
 
 
 def test_the_preset_of_a_study_knows_its_bank():
