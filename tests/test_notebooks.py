@@ -23,7 +23,6 @@ SMALL = {
     "04_heat_on_your_mesh.ipynb": f"{MODEL}\n{SIZES}\nmesh_file, num_points = None, 300",
     "05_your_own_surface_model.ipynb": f"{SIZES}\nnum_features = 60",
     "06_a_depth_camera.ipynb": f"{MODEL}\n{SIZES}\nmost = 2",
-    "08_objects_you_know.ipynb": f"{SIZES}\nnum_starts = 512",
     "07_a_study_of_your_own.ipynb": """
 scenes = 3
 settings = {
