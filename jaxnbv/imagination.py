@@ -132,17 +132,11 @@ class Imagination(eqx.Module):
         - `poses`: how the shapes can stand in the scene.
         """
         box = Box() if self.carving is None else bounding_box(self.carving.volume)
-        scale = max(high - low for low, high in zip(box.low, box.high, strict=True)) / 2.5
-        usual = short_ranged()
-        base = dataclasses.replace(
-            usual.base,
-            lengthscale=scale * usual.base.lengthscale,
-            truncation=min(round(usual.base.truncation / scale), self.model.base.truncation)
-            if isinstance(self.model, ScreenedSPSR)
-            else usual.base.truncation,
+        longest_side = max(high - low for low, high in zip(box.low, box.high, strict=True))
+        own = (self.model.base.truncation,) if isinstance(self.model, ScreenedSPSR) else ()
+        return dataclasses.replace(
+            self, model=KnownShapes(bank, short_ranged(longest_side, *own), poses, box, self.model)
         )
-        residual = dataclasses.replace(usual, base=base, offset=scale * usual.offset)
-        return dataclasses.replace(self, model=KnownShapes(bank, residual, poses, box, self.model))
 
     @property
     def unknowing(self) -> "Imagination":

@@ -35,12 +35,17 @@ from jaxnbv.surfaces.values import OnSurface
 NONE = "none of these"
 
 
-def short_ranged() -> ScreenedSPSR:
-    """The usual residual, for scenes 2.5 long."""
+def short_ranged(longest_side: float = 2.5, truncation: int = 32) -> ScreenedSPSR:
+    """The usual residual, for an object whose box has this longest side, in scene units.
+
+    - `truncation`: the most frequencies along an axis.
+    """
+    scale = longest_side / 2.5
     # With long scales, or values beside the surface, it pulls the surface back to what it would say by itself. The
     # noise is that of the shape's normals: beside an edge that is a little off, they are those of the other face. The
     # level is that of the shape, and values are known no better than where it was put.
-    return ScreenedSPSR(GeometricSPSR(0.01, truncation=32, noise=0.2), (OnSurface(noise=0.3),), level_deviation=0.02)
+    base = GeometricSPSR(0.01 * scale, truncation=min(round(32 / scale), truncation), noise=0.2)
+    return ScreenedSPSR(base, (OnSurface(noise=0.3),), level_deviation=0.02, offset=0.1 * scale)
 
 
 class KnownShapes(SurfaceModel):
@@ -130,14 +135,17 @@ class KnownShapesPosterior(SurfacePosterior):
     @property
     def hypotheses(self) -> list[Hypothesis]:
         """What the object may be, most likely first, "none of these" among it."""
-        found, weights = self.found, np.asarray(self.weights)
-        names = [self.model.bank.names[index] for index in np.asarray(found.shape)]
+        # On the host at once, not row by row.
+        found, weights = jax.tree.map(np.asarray, self.found), np.asarray(self.weights)
+        names = self.model.bank.names
         known = [
             Hypothesis(
-                name, float(weight), float(misfit), jax.tree.map(lambda rows, row=row: rows[row], found.placement)
+                names[found.shape[row]],
+                float(weights[row]),
+                float(found.misfit[row]),
+                jax.tree.map(lambda rows, row=row: rows[row], self.found.placement),
             )
-            for row, (name, weight, misfit) in enumerate(zip(names, weights[:-1], found.misfit, strict=True))
-            if bool(found.is_mode[row])
+            for row in np.flatnonzero(found.is_mode)
         ]
         none = Hypothesis(NONE, float(weights[-1]), self.model.unknown_misfit, None)
         return sorted([*known, none], key=lambda one: -one.weight)
@@ -153,7 +161,8 @@ class KnownShapesPosterior(SurfacePosterior):
 
     def names_of_samples(self, key: PRNGKeyArray, num_samples: int) -> list[str]:
         """Which shapes the samples of `sample` are about."""
-        names = [*(self.model.bank.names[index] for index in np.asarray(self.found.shape)), NONE]
+        of_bank = self.model.bank.names
+        names = [*(of_bank[index] for index in np.asarray(self.found.shape)), NONE]
         return [names[index] for index in np.asarray(_drawn(self, key, num_samples))]
 
     @sampler

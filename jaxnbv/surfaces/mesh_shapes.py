@@ -3,6 +3,8 @@
 import hashlib
 import secrets
 import warnings
+import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -105,7 +107,7 @@ def _read(file: Path) -> dict[str, np.ndarray] | None:
     try:
         with np.load(file) as stored:
             return {name: stored[name] for name in ("values", "low", "spacing", "padding", "extremes")}
-    except Exception:
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error):
         return None
 
 

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.spatial.transform import Rotation
 
 from jaxnbv.checks import check_fields, require
 from jaxnbv.scanning.sdf import SignedDistance
@@ -113,12 +114,7 @@ class FreeRotation(ShapePoses):
         inner, outer = np.sqrt(index / count), np.sqrt(1.0 - index / count)
         a, b = 2.0 * np.pi * index * _SILVER, 2.0 * np.pi * index * _GOLDEN
         x, y, z, w = inner * np.sin(a), inner * np.cos(a), outer * np.sin(b), outer * np.cos(b)
-        rows = [
-            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
-            [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
-            [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
-        ]
-        return np.moveaxis(np.array(rows), -1, 0)
+        return Rotation.from_quat(np.stack([x, y, z, w], axis=1)).as_matrix()
 
     def turns(self) -> Float[np.ndarray, "3 k"]:
         """All three."""
@@ -146,10 +142,7 @@ class Upright(ShapePoses):
         """Evenly spaced turns, no closer than two degrees."""
         count = max(1, min(count, round(self.within / math.radians(1.0))))
         angles = self.within * ((2.0 * np.arange(count) + 1.0) / count - 1.0)
-        x, y, z = self._unit
-        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        sine, versine = np.sin(angles)[:, None, None], (1.0 - np.cos(angles))[:, None, None]
-        return np.eye(3) + sine * cross + versine * (cross @ cross)
+        return Rotation.from_rotvec(angles[:, None] * self._unit).as_matrix()
 
     def turns(self) -> Float[np.ndarray, "3 k"]:
         """The vertical."""
