@@ -21,7 +21,7 @@ from jaxnbv.scanning import Evidence
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
-from jaxnbv.surfaces import KnownShapesPosterior
+from jaxnbv.surfaces import KnownShapesPosterior, SurfacePosterior
 from jaxnbv.viz.answers import may_be_words, shown_value, words_of
 from jaxnbv.viz.data import allowing_for_unseen, mean_surface
 from jaxnbv.viz.render import depth_picture, depth_range
@@ -73,6 +73,7 @@ class LiveView:
         """
         evidence = episode.evidence_after(len(episode.views)) if evidence is None else evidence
         key, *_ = view_keys(episode.key, len(episode.views))
+        posterior = episode.planner.imagination.posterior(evidence)
         scene = self._server.scene
         with self._server.atomic():
             for handle in self._drawn:
@@ -81,10 +82,10 @@ class LiveView:
                 *_points(scene, episode),
                 *_cameras(scene, episode),
                 *_mean(scene, episode.planner.imagination, evidence),
-                *_imagined(scene, episode.planner.imagination, evidence, key),
+                *_imagined(scene, episode.planner.imagination, evidence, posterior, key),
                 *([] if proposal is None else _choice(scene, episode.planner.camera, proposal, expected)),
             ]
-        self._tell(episode, evidence, proposal, expected)
+        self._tell(episode, posterior, proposal, expected)
 
     def follow(self, session: Session) -> None:
         """Show a session from now on, with every image and proposal."""
@@ -106,13 +107,12 @@ class LiveView:
         self._server.stop()
 
     def _tell(
-        self, episode: Episode, evidence: Evidence, proposal: Proposal | None, expected: np.ndarray | None
+        self, episode: Episode, posterior: SurfacePosterior, proposal: Proposal | None, expected: np.ndarray | None
     ) -> None:
         views, sought = len(episode.views), episode.planner.quantity
         lines = [f"**{views} view{'s' if views > 1 else ''}**, {int(episode.cloud.count):,} points kept"]
         answer = episode.planner.acquisition.answer(episode.cloud)
         lines += [] if answer is None else [words_of(answer).sentence()]
-        posterior = episode.planner.imagination.posterior(evidence)
         if isinstance(posterior, KnownShapesPosterior):
             lines.append(may_be_words(tuple(posterior.kinds().items())))
         if proposal is not None:
@@ -159,8 +159,9 @@ def _mean(scene: Any, imagination: Imagination, evidence: Evidence) -> list[Any]
     return [scene.add_mesh_trimesh("/surface of the mean", mesh)]
 
 
-def _imagined(scene: Any, imagination: Imagination, evidence: Evidence, key: Any) -> list[Any]:
-    posterior = imagination.posterior(evidence)
+def _imagined(
+    scene: Any, imagination: Imagination, evidence: Evidence, posterior: SurfacePosterior, key: Any
+) -> list[Any]:
     names = []
     if isinstance(posterior, KnownShapesPosterior):
         names = posterior.names_of_samples(key, imagination.num_samples)

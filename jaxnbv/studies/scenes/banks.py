@@ -119,16 +119,13 @@ def read_bank(path: Path, name: str) -> ShapeBank:
     )
 
 
+# What is stored, and what it becomes again, by NumPy's kind; truths stay.
+_STORED = {"f": (np.float16, np.float32), "i": (np.int8, np.int32)}
+
+
 def _rounded(array: np.ndarray) -> np.ndarray:
-    return (
-        array.astype(np.float16)
-        if array.dtype.kind == "f"
-        else array.astype(np.int8)
-        if array.dtype.kind == "i"
-        else array
-    )
+    return array.astype(_STORED[array.dtype.kind][0]) if array.dtype.kind in _STORED else array
 
 
 def _restored(array: np.ndarray) -> np.ndarray:
-    kind = array.dtype.kind
-    return array.astype(np.float32) if kind == "f" else array.astype(np.int32) if kind == "i" else array
+    return array.astype(_STORED[array.dtype.kind][1]) if array.dtype.kind in _STORED else array
