@@ -211,8 +211,8 @@ def test_each_study_writes_tables_figures_and_pictures(name, tmp_path):
 
 
 def test_the_demo_of_a_task_tells_what_was_found(tmp_path):
-    arguments = ("demo", "--task", "parts", "--scene", "7", "--quick", "--views", "2", "--search", "farthest")
-    result = run_command(*arguments, cwd=tmp_path)
+    setting = ("--task", "parts", "--known", "parts", "--scene", "7", "--quick", "--views", "2", "--search", "farthest")
+    result = run_command("demo", *setting, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert result.stdout.count("wheel") == 2
     (report,) = tmp_path.rglob("report.html")

@@ -73,7 +73,7 @@ class KnownShapes(SurfaceModel):
     num_starts: int = eqx.field(static=True, default=4096)
     noise_scale: float = eqx.field(static=True, default=0.1)
     sharpness: float = eqx.field(static=True, default=20.0)
-    unknown_misfit: float = eqx.field(static=True, default=1.0)
+    unknown_misfit: float = eqx.field(static=True, default=0.6)
 
     def __check_init__(self):
         check_fields(self)

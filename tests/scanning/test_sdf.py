@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
-from jaxnbv.scanning.sdf import Capsule, Cone, Cuboid, Cylinder, SmoothUnion, Sphere, Torus
+from jaxnbv.scanning.sdf import Capsule, Cone, Cuboid, Cylinder, SmoothUnion, Sphere, Torus, least_of_last
 
 RNG = np.random.default_rng(0)
 
@@ -174,3 +174,10 @@ def test_rigid_transform_moves_points_as_the_pose_does():
 def test_bad_parameters_are_refused(build, message):
     with pytest.raises(ValueError, match=message):
         build()
+
+
+def test_the_least_of_equal_values_has_the_derivative_of_the_first():
+    values = jnp.array([[0.3, -0.2, -0.2, jnp.inf], [0.0, 0.5, 0.0, 0.0]])
+    assert jnp.array_equal(least_of_last(values), values.min(axis=-1))
+    slopes = jax.vmap(jax.grad(least_of_last))(values)
+    assert jnp.array_equal(slopes, jnp.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]]))

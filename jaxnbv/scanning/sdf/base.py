@@ -68,6 +68,23 @@ def greatest(a, b):
     return jnp.where(a >= b, a, b)
 
 
+@jax.custom_jvp
+def least_of_last(values):
+    """The least along the last axis, with the derivative of the first that is least.
+
+    That of `jnp.min` compares the values with their least: compiled apart, they can differ in the last bit, and the
+    derivative is then 0 / 0.
+    """
+    return jnp.min(values, axis=-1)
+
+
+@least_of_last.defjvp
+def _least_of_last_jvp(values, tangents):
+    (values,), (tangents,) = values, tangents
+    is_least = jnp.arange(values.shape[-1]) == jnp.argmin(values, axis=-1, keepdims=True)
+    return least_of_last(values), jnp.sum(jnp.where(is_least, tangents, 0.0), axis=-1)
+
+
 @jax.jit
 def _rotation_about(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "3 3"]:
     """Rodrigues' formula."""

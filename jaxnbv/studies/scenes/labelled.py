@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.checks import AnyArray, is_traced, require
-from jaxnbv.scanning.sdf import SignedDistance, corner_distance, nonnegative, norm, parameter
+from jaxnbv.scanning.sdf import SignedDistance, corner_distance, least_of_last, nonnegative, norm, parameter
 
 # How many primitives a solid can have.
 CAPACITY = 24
@@ -60,7 +60,7 @@ class LabelledSolid(SignedDistance):
             require(bool((np.asarray(self.labels) > _EMPTY).any()), "the solid has no primitive: give at least one")
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        return jnp.min(self.distances(x), axis=-1)
+        return least_of_last(self.distances(x))
 
     def distances(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, f"*n {CAPACITY}"]:
         """Signed distance to each primitive; infinite for slots that are not used."""
