@@ -35,6 +35,7 @@ settings = {
     "camera": nbv.Camera(height=12, width=12),
 }
 """,
+    "08_objects_you_know.ipynb": f"{SIZES}\nnum_starts = 512",
 }
 
 
