@@ -1,0 +1,40 @@
+"""What known shapes cost where none is of the object's class, or all are of another kind: methods of the studies of
+classes, beside the study's own, which knows objects of all classes.
+
+    cd benchmarks
+    jaxnbv study pyramid --framing close-up --model known --views 2 --scenes 60 --methods cross-entropy \
+        --method honesty:without_the_class --method honesty:another_kind --method honesty:no_shapes
+
+All choose by cross-entropy. The other kind is trucks, and pyramids for trucks.
+"""
+
+import dataclasses
+
+from jaxnbv import Imagination, KnownShapes, Planner
+from jaxnbv.studies.classification.study import ClassificationStudy
+from jaxnbv.studies.engine.study import Scene
+from jaxnbv.studies.scenes.banks import bank_poses, shape_bank
+
+
+def without_the_class(study: ClassificationStudy, scene: Scene) -> Planner:
+    """Who has seen the study's objects of all classes but the scene's."""
+    imagination = study.imagination
+    assert isinstance(imagination.model, KnownShapes), "run the study by --model known"
+    bank, own = imagination.model.bank, study.objects.classes[scene.task.label]
+    others = [row for row, name in enumerate(bank.names) if name.rpartition(" ")[0] != own]
+    return _planner(study, scene, imagination.unknowing.knowing(bank.chosen(others), imagination.model.poses))
+
+
+def another_kind(study: ClassificationStudy, scene: Scene) -> Planner:
+    """Who has seen objects of another kind alone."""
+    other = "pyramid" if study.bank == "truck" else "truck"
+    return _planner(study, scene, study.imagination.unknowing.knowing(shape_bank(other), bank_poses(other)))
+
+
+def no_shapes(study: ClassificationStudy, scene: Scene) -> Planner:
+    """Who has seen none."""
+    return _planner(study, scene, study.imagination.unknowing)
+
+
+def _planner(study: ClassificationStudy, scene: Scene, imagination: Imagination) -> Planner:
+    return dataclasses.replace(study, imagination=imagination).planner("cross-entropy", scene)
