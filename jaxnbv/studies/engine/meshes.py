@@ -4,13 +4,16 @@ import dataclasses
 import itertools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import equinox as eqx
 import trimesh
 
 from jaxnbv.checks import require
 from jaxnbv.imagination import Imagination
 from jaxnbv.scanning import TriangleMesh, load_mesh
+from jaxnbv.studies.engine.measures import KNOWN
+from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.readers import MeshFile, ModelNet, OmniObject3D
 from jaxnbv.studies.readers.local_copy import class_folders
 from jaxnbv.studies.readers.modelnet import is_modelnet
@@ -114,3 +117,30 @@ def knowing_others(imagination: Imagination, index: int) -> Imagination:
 def as_mesh_files(meshes: str | Path | Sequence[str] | None) -> tuple[str, ...]:
     """A folder's `mesh_files`, files as they are, or none."""
     return mesh_files(meshes) if isinstance(meshes, str | Path) else tuple(meshes or ())
+
+
+class MeshStudy(Study):
+    """A study of procedural objects, or of meshes. Settings as of `Study`, and
+
+    - `meshes`: a folder of them, or their files, one a scene; without any, scenes are procedural.
+    """
+
+    meshes: tuple[str, ...] = eqx.field(static=True, default=(), converter=as_mesh_files)
+
+    @classmethod
+    def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
+        """
+        - `meshes`: a folder of them. By the model `known` each object is planned by who has seen all others.
+        """
+        if "meshes" in options and model == KNOWN:
+            files = as_mesh_files(options["meshes"])
+            options |= {"meshes": files, "imagination": knowing_meshes(cls.imagined("screened", quick=quick), files)}
+        return super().configured(model, views, quick, **options)
+
+    @property
+    def num_scenes(self) -> int | None:
+        return len(self.meshes) or None
+
+    def imagination_of(self, scene: Scene) -> Imagination:
+        """Who has seen all meshes but that of the scene, or what the study knows."""
+        return knowing_others(self.imagination, scene.index) if self.meshes else self.imagination

@@ -19,9 +19,9 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, mesh_from_sdf
 from jaxnbv.scanning.sensors import HEAT_SETTING
 from jaxnbv.search import CandidateSearch, DiscreteSearch, FarthestView, HalvingSearch, RandomView, UncertaintyView
-from jaxnbv.studies.engine.measures import KNOWN, Claim, Measure, Record, Row
-from jaxnbv.studies.engine.meshes import as_mesh_files, knowing_meshes, knowing_others, numbered_mesh
-from jaxnbv.studies.engine.study import Chart, Panel, Scene, Study
+from jaxnbv.studies.engine.measures import Claim, Measure, Record, Row
+from jaxnbv.studies.engine.meshes import MeshStudy, numbered_mesh
+from jaxnbv.studies.engine.study import Chart, Panel, Scene
 from jaxnbv.studies.heat.halving import compare, halving_notes, halving_rows
 from jaxnbv.studies.scenes import heat_scene
 from jaxnbv.tasks import ColdestPoint, Coverage, body_temperature
@@ -103,14 +103,14 @@ def _measures(estimate: str) -> tuple[Measure, ...]:
     )
 
 
-class HeatStudy(Study):
-    """How near the coldest point of the cloud comes to the object's coldest points. Settings as of `Study`, and
+class HeatStudy(MeshStudy):
+    """How near the coldest point of the cloud comes to the object's coldest points. Settings as of `MeshStudy`, and
 
-    - `meshes`: a folder of them, or their files, one a scene, each heated at a random point; without any, scenes are
-      those of `heat_scene`.
     - `num_points`: points of D to which imagined scans are added, where the temperature is simulated.
     - `imagined_rays`: rays along a side of an imagined scan; true scans have 50 x 50.
     - `true_grid`: of the mesh of a procedural object; the default is fine enough for the thinnest rods, of radius 0.04.
+
+    A mesh is heated at a random point; procedural objects are those of `heat_scene`.
     """
 
     title: ClassVar[str] = "The coldest point"
@@ -140,33 +140,18 @@ class HeatStudy(Study):
     }
     seed: ClassVar[int] = 8
     radius: ClassVar[float] = HEAT_SETTING.radius
-    quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 24, "num_points": 512}
+    quick: ClassVar[Mapping[str, Any]] = {**MeshStudy.quick, "num_candidates": 24, "num_points": 512}
     quick_scenes: ClassVar[int] = 3
 
     views: int = eqx.field(static=True, default=6)
     num_candidates: int = eqx.field(static=True, default=32)
     num_samples: int = eqx.field(static=True, default=8)
-    meshes: tuple[str, ...] = eqx.field(static=True, default=(), converter=as_mesh_files)
     num_points: int = eqx.field(static=True, default=1024)
     imagined_rays: int = eqx.field(static=True, default=24)
     true_grid: Grid = Grid(160)
 
     bank: ClassVar[str] = "heat"
     unknowing: ClassVar[tuple[str, ...]] = ("coverage", "uncertainty")
-
-    @classmethod
-    def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
-        """
-        - `meshes`: a folder of them. By the model `known` each object is planned by who has seen all others.
-        """
-        if "meshes" in options and model == KNOWN:
-            files = as_mesh_files(options["meshes"])
-            options |= {"meshes": files, "imagination": knowing_meshes(cls.imagined("screened", quick=quick), files)}
-        return super().configured(model, views, quick, **options)
-
-    @property
-    def num_scenes(self) -> int | None:
-        return len(self.meshes) or None
 
     def scene(self, index: int) -> Scene:
         """An object; its task is the point where it is heated.
@@ -183,7 +168,7 @@ class HeatStudy(Study):
     def planner(self, method: str, scene: Scene) -> Planner:
         search = _SEARCHES[method](self.candidates)
         camera = Camera(height=self.imagined_rays, width=self.imagined_rays)
-        imagination = knowing_others(self.imagination, scene.index) if self.meshes else self.imagination
+        imagination = self.imagination_of(scene)
         if method not in HEAT_METHODS:
             return self.planner_of(Coverage(), search, camera, imagination)
         coldest = ColdestPoint(scene.task, reached_only=method == "heat-reached")

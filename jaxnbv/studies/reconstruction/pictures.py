@@ -61,12 +61,13 @@ def _picture(record: Record, study: ReconstructionStudy, methods: Sequence[str],
     eye = _eye(np.asarray(study.candidates.poses().position[record["first"]], np.float64))
     held = [record["methods"][method]["reconstructions"] for method in methods]
     names = [name for name in RECONSTRUCTIONS if all(found[name] is not None for found in held)]
+    imagination = study.mesher(scene).imagination
     known = [study.seen(scene, record["methods"][method])[-1][1] for method in methods]
 
     images = {"truth": _image(truth, None, eye, pixels)}
     for method, evidence in zip(methods, known, strict=True):
         for name in names:
-            mesh = reconstruct(study, evidence, name)
+            mesh = reconstruct(imagination, evidence, name)
             if mesh is None:
                 raise InputError(f'the records hold {name}: pip install "jaxnbv[poisson]" to draw it again')
             images[f"{name}, {method}"] = _image(mesh, tree, eye, pixels)

@@ -4,11 +4,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from jaxnbv.checks import InputError
+from jaxnbv.imagination import Imagination
 from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.planning.episode import Step
 from jaxnbv.planning.planner import Planner
@@ -17,8 +17,8 @@ from jaxnbv.scanning.metrics import SURFACE_POINTS, coverage, surface_distance, 
 from jaxnbv.scanning.screened_poisson import has_poisson, screened_poisson
 from jaxnbv.search import CandidateSearch, DiscreteSearch, FarthestView, RandomView, UncertaintyView
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
-from jaxnbv.studies.engine.meshes import as_mesh_files, numbered_mesh
-from jaxnbv.studies.engine.study import Chart, Panel, Scene, Study
+from jaxnbv.studies.engine.meshes import MeshStudy, numbered_mesh
+from jaxnbv.studies.engine.study import Chart, Panel, Scene
 from jaxnbv.studies.scenes import Split
 from jaxnbv.studies.scenes.parts import part_scene
 from jaxnbv.tasks import Coverage
@@ -45,11 +45,9 @@ def _distances(name: str, title: str) -> Measure:
     return Measure(name, title, _distance(name), RECONSTRUCTIONS, "reconstruction", unit="scene units", better="less")
 
 
-class ReconstructionStudy(Study):
-    """How near the surface made of a method's cloud comes to the true one. Settings as of `Study`, and
-
-    - `meshes`: a folder of them, or their files, one a scene; without any, scenes are those of the test split of
-      `part_scene`.
+class ReconstructionStudy(MeshStudy):
+    """How near the surface made of a method's cloud comes to the true one. Settings as of `MeshStudy`; procedural
+    objects are those of the test split of `part_scene`.
 
     The posterior's mean is meshed on the grid of the samples, carved as they are.
     """
@@ -60,6 +58,8 @@ class ReconstructionStudy(Study):
         "reconstruction to the truth, and from the truth to the reconstruction. HD: the Hausdorff distance, the\n"
         "largest of both. A reconstruction that no scene has (pip install pymeshlab for Poisson) is left out."
     )
+    bank: ClassVar[str] = "parts"
+    unknowing: ClassVar[tuple[str, ...]] = ("coverage", "uncertainty")
     methods: ClassVar[tuple[str, ...]] = tuple(_SEARCHES)
     reference: ClassVar[str] = "coverage"
     measures: ClassVar[tuple[Measure, ...]] = (
@@ -82,13 +82,7 @@ class ReconstructionStudy(Study):
         "reconstruction": Chart(((Panel("chamfer"), Panel("hausdorff"), Panel("covered")),))
     }
     seed: ClassVar[int] = 4
-    quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 40}
-
-    meshes: tuple[str, ...] = eqx.field(static=True, default=(), converter=as_mesh_files)
-
-    @property
-    def num_scenes(self) -> int | None:
-        return len(self.meshes) or None
+    quick: ClassVar[Mapping[str, Any]] = {**MeshStudy.quick, "num_candidates": 40}
 
     def scene(self, index: int) -> Scene:
         """An object of longest side 2.5.
@@ -102,12 +96,11 @@ class ReconstructionStudy(Study):
         return Scene(index, f"{CATEGORIES[int(made.category)].name} {index}", SDFSurface(made.solid))
 
     def planner(self, method: str, scene: Scene) -> Planner:
-        return self.planner_of(Coverage(), _SEARCHES[method](self.candidates))
+        return self.planner_of(Coverage(), _SEARCHES[method](self.candidates), imagination=self.imagination_of(scene))
 
-    @property
-    def mesher(self) -> Planner:
+    def mesher(self, scene: Scene) -> Planner:
         """Whose posterior all methods' views are meshed by, those of planners of one's own too."""
-        return self.planner_of(Coverage(), FarthestView(self.candidates))
+        return self.planner("farthest", scene)
 
     def truth(self, scene: Scene) -> Float[np.ndarray, "n 3"]:
         points = truth_points(scene.surface, self.key(scene.index, "scene"), SURFACE_POINTS)
@@ -126,9 +119,11 @@ class ReconstructionStudy(Study):
         """The share of the true surface that is covered after each view, and the distances to it of two
         reconstructions from the last cloud; that by Poisson reconstruction is None without `pymeshlab`."""
         views = [view for view, *_ in episode]
-        *_, evidence = self.mesher.replay((view.pose, view.scan, self.camera) for view in views)
+        mesher = self.mesher(scene)
+        *_, evidence = mesher.replay((view.pose, view.scan, self.camera) for view in views)
         found = {
-            name: self._distances(reconstruct(self, evidence, name), truth, scene.index) for name in RECONSTRUCTIONS
+            name: self._distances(reconstruct(mesher.imagination, evidence, name), truth, scene.index)
+            for name in RECONSTRUCTIONS
         }
         covered = [coverage(view.cloud, truth) for view in views]
         return {"coverage": covered, "points": int(evidence.cloud.count), "reconstructions": found}
@@ -140,9 +135,9 @@ class ReconstructionStudy(Study):
         return {"chamfer": distance.chamfer, **distance._asdict()}
 
 
-def reconstruct(study: ReconstructionStudy, evidence: Evidence, name: str) -> TriangleMesh | None:
+def reconstruct(imagination: Imagination, evidence: Evidence, name: str) -> TriangleMesh | None:
     """One of `RECONSTRUCTIONS` from what is known; None for Poisson reconstruction where `pymeshlab` cannot be
     imported."""
     if name == MEAN:
-        return study.mesher.imagination.mean_mesh(evidence)
+        return imagination.mean_mesh(evidence)
     return screened_poisson(evidence.cloud) if has_poisson() else None

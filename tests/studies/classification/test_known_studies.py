@@ -1,6 +1,7 @@
 """Studies by who has seen other objects of the kind, beside who has not."""
 
 import dataclasses
+from typing import ClassVar
 
 import jax
 import numpy as np
@@ -15,7 +16,6 @@ from jaxnbv.studies.engine.measures import KNOWN
 from jaxnbv.studies.engine.meshes import knowing_meshes, knowing_others
 from jaxnbv.studies.heat.study import HeatStudy
 from jaxnbv.studies.parts.study import PartStudy
-from jaxnbv.studies.reconstruction.study import ReconstructionStudy
 from jaxnbv.studies.scenes import Split, pyramid_scene
 from jaxnbv.surfaces import GeometricSPSR, KnownShapes, OnSurface, ScreenedSPSR, mesh_shapes
 
@@ -66,8 +66,14 @@ def test_the_preset_of_a_study_knows_its_bank():
     model = HeatStudy.imagined(KNOWN).model
     assert isinstance(model, KnownShapes)
     assert len(model.bank) == 256
+
+
+def test_a_study_without_a_bank_refuses_to_know_shapes():
+    class Own(HeatStudy):
+        bank: ClassVar[str] = ""
+
     with pytest.raises(nbv.InputError, match="no known shapes for"):
-        ReconstructionStudy.imagined(KNOWN)
+        Own.imagined(KNOWN)
 
 
 def test_parts_are_planned_with_the_shapes_of_their_category():

@@ -121,12 +121,13 @@ def test_views_are_those_of_an_episode_from_the_shared_first_view(record, meshes
 
 def test_distances_are_those_of_the_reconstruction_from_the_last_cloud(record, meshes):
     study = small_study(meshes)
-    truth = study.scene(1).surface.sample_points(jax.random.key(5), 20_000)
-    method = record["methods"]["farthest"]
-    evidence = study.seen(study.scene(1), method)[-1][1]
+    scene = study.scene(1)
+    truth = scene.surface.sample_points(jax.random.key(5), 20_000)
+    imagination, method = study.mesher(scene).imagination, record["methods"]["farthest"]
+    evidence = study.seen(scene, method)[-1][1]
     for name, found in method["reconstructions"].items():
         if found is not None:
-            points = reconstruct(study, evidence, name).sample_points(jax.random.key(6), 20_000)
+            points = reconstruct(imagination, evidence, name).sample_points(jax.random.key(6), 20_000)
             expected = surface_distance(points, truth)
             assert found["chamfer"] == pytest.approx(expected.chamfer, rel=0.05)
             assert found["hausdorff"] == pytest.approx(expected.hausdorff, rel=0.1)
