@@ -1,0 +1,104 @@
+"""How often the kind of shape that is held likely is the true one: the weights of known shapes, by their frequency.
+
+    python benchmarks/shape_weights.py [--scenes 30] [--kinds NAME ...] [--out FILE]
+
+Of each kind of the studies of classes, N validation scenes and the bank that ships; the first view is the study's, the
+next two are drawn at random. Says after one to three views how often the most likely kind is the true one, how likely
+it was held on average, the weight of the true kind and of none, and the expected calibration error in ten bins: over
+all views together there is enough to fill these. Continues with what the file does not hold yet.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+from jaxnbv.planning.episode import view_keys
+from jaxnbv.storage.files import write_whole
+from jaxnbv.studies.classification.modelnet10 import ModelNet10Study
+from jaxnbv.studies.classification.omniobject3d import OmniObject3DStudy
+from jaxnbv.studies.classification.pyramid import PyramidStudy
+from jaxnbv.studies.classification.study import ClassificationStudy
+from jaxnbv.studies.classification.truck import TruckStudy
+from jaxnbv.studies.engine.measures import KNOWN
+from jaxnbv.studies.scenes import Framing, Split
+from jaxnbv.studies.training import expected_calibration_error
+from jaxnbv.surfaces import KnownShapesPosterior
+from jaxnbv.surfaces.known_shapes import NONE
+
+VIEWS = 3
+KINDS: dict[str, type[ClassificationStudy]] = {
+    "pyramid": PyramidStudy,
+    "truck": TruckStudy,
+    "household": ModelNet10Study,
+    "fruit": OmniObject3DStudy,
+}
+
+
+def study_of(kind: str) -> ClassificationStudy:
+    """On the validation split."""
+    found = KINDS[kind].configured(KNOWN, VIEWS, False, split=Split.VALIDATION, framing=Framing.CLOSE_UP)
+    (study,) = found.values()
+    assert isinstance(study, ClassificationStudy)
+    return study
+
+
+def weights(study: ClassificationStudy, index: int) -> dict:
+    """The true class, and how likely each class and none is after each view."""
+    scene = study.scene(index)
+    planner, sensor, poses = study.planner("coverage", scene), study.sensor(scene), study.candidates.poses()
+    first = study.first_view(scene)
+    order = jax.random.permutation(study.key(index, "measure"), study.num_candidates).tolist()
+    evidence, found = None, []
+    for view, candidate in enumerate([first, *(one for one in order if one != first)][:VIEWS]):
+        pose = poses[candidate]
+        scan = sensor(pose, view_keys(study.key(index, "episode"), view)[2])
+        evidence = planner.init(pose, scan) if evidence is None else planner.observe(evidence, pose, scan)
+        posterior = planner.imagination.posterior(evidence)
+        assert isinstance(posterior, KnownShapesPosterior)
+        kinds = posterior.kinds()
+        found.append([kinds.get(name, 0.0) for name in (*study.objects.classes, NONE)])
+    return {"label": scene.task.label, "weights": found}
+
+
+def show(kind: str, records: list[dict]) -> None:
+    """A line for each number of views, and one for all."""
+    labels = np.array([record["label"] for record in records])
+    held = np.array([record["weights"] for record in records])
+    for view in range(VIEWS):
+        _line(f"{kind}, {view + 1} views", held[:, view], labels)
+    _line(f"{kind}, all", held.reshape(-1, held.shape[-1]), np.repeat(labels, VIEWS))
+
+
+def _line(name: str, held: np.ndarray, labels: np.ndarray) -> None:
+    right, true = held.argmax(axis=1) == labels, held[np.arange(len(held)), labels]
+    error = expected_calibration_error(np.log(np.maximum(held, 1e-12)), labels, bins=10)
+    cells = right.mean(), held.max(axis=1).mean(), true.mean(), held[:, -1].mean(), error
+    print(f"{name:22}{len(held):7}" + "".join(f"{cell:10.2f}" for cell in cells))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scenes", type=int, default=30)
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/shape_weights.json"))
+    arguments = parser.parse_args()
+    held = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    for kind in arguments.kinds:
+        study = study_of(kind)
+        for index in tqdm(range(arguments.scenes), kind):
+            if f"{kind} {index}" not in held:
+                held[f"{kind} {index}"] = weights(study, index)
+                write_whole(arguments.out, lambda out: out.write(json.dumps(held).encode()))
+    heads = "views", "right", "likeliest", "true", "none", "error"
+    print(f"{'':22}{heads[0]:>7}" + "".join(f"{head:>10}" for head in heads[1:]))
+    for kind in arguments.kinds:
+        show(kind, [held[f"{kind} {index}"] for index in range(arguments.scenes)])
+
+
+if __name__ == "__main__":
+    main()
