@@ -90,7 +90,7 @@ def _command(name: str, entry: Entry) -> Callable[..., None]:
         "views": (ViewsOption, entry.views),
         "methods": (MethodsOption, None),
         "own": (OwnOption, None),
-        "model": (StudyModelOption, StudyModel("screened")),
+        "model": (StudyModelOption, StudyModel(entry.model)),
         "out": (FolderOption, None),
         "quick": (QuickOption, False),
         "workers": (WorkersOption, 1),

@@ -11,7 +11,7 @@ class Entry(NamedTuple):
 
     - `study`: module and class; `pictures`: module and function that draws its own pictures, if there are any.
     - `question`, `settings`: for the help.
-    - `scenes`, `views`: by default.
+    - `scenes`, `views`, `model`: by default.
     - `options`: names of its fields that are options of the command.
     """
 
@@ -20,6 +20,7 @@ class Entry(NamedTuple):
     settings: str
     scenes: int
     views: int
+    model: str = "known"
     pictures: str = ""
     options: tuple[str, ...] = ()
 
@@ -97,6 +98,7 @@ STUDIES = {
         "48 candidates, 16 samples on a 64^3 grid: fewer and coarser than the paper's.",
         scenes=32,
         views=5,
+        model="screened",
         pictures="jaxnbv.studies.reconstruction.pictures:write_pictures",
         options=("meshes",),
     ),
@@ -108,6 +110,7 @@ STUDIES = {
         "of 0.03.",
         scenes=60,
         views=5,
+        model="screened",
         pictures="jaxnbv.studies.classification.pictures:write_pictures",
         options=("framing",),
     ),

@@ -52,7 +52,7 @@ def study(
     failed: dict[str, str] = {}
     asked = 0
     given = {option: value for option, value in options.items() if value is not None}
-    of_model = "" if model == "screened" else f"-{model}"
+    of_model = "" if model == entry.model else f"-{model}"
     folder = out or Path("runs") / f"study-{name}{of_model}{'-quick' if quick else ''}"
     if quick:
         typer.echo("--quick: small settings and few scenes. This is not the full study; leave it out for that.")

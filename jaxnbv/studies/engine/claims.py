@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from jaxnbv.studies.engine.measures import Claim, Row
+from jaxnbv.studies.engine.measures import UNKNOWING, Claim, Row
 from jaxnbv.studies.engine.study import Study
 from jaxnbv.studies.engine.tables import difference_text, tight
 
@@ -35,13 +35,15 @@ class Verdict(NamedTuple):
 
 
 def verdicts(study: type[Study], differences: Sequence[Row]) -> list[Verdict]:
-    """On the claims of which a study's differences over all its scenes tell; methods that were not run are left out."""
+    """On the claims of which a study's differences over all its scenes tell; methods that were not run are left out, and
+    those that know no shapes are held against it too."""
     found = []
     for claim in study.claims:
         measure, here = study.measure(claim.measure), ("all", claim.measure, claim.at)
         rows = {row["baseline"]: row for row in differences if (row["group"], row["quantity"], row["at"]) == here}
         against = {}
-        for method in (method for method in claim.than if method in rows):
+        named = (f"{method}{way}" for method in claim.than for way in ("", UNKNOWING))
+        for method in (method for method in named if method in rows):
             row = rows[method]
             where = "level with"
             if row["excludes_zero"]:

@@ -74,3 +74,9 @@ def test_the_claims_of_a_study_name_what_it_has(name):
     for claim in study.claims:
         assert study.measure(claim.measure).listed
         assert {*claim.than} <= {*study.methods} - {study.reference}
+
+
+def test_a_method_that_knows_no_shapes_counts_too():
+    (right,) = verdicts(Shares, [*ROWS[1:3], row("right", "a-screened", -0.2, -0.3, -0.1)])
+    assert list(right.against) == ["a", "a-screened", "b"]
+    assert (right.held, len(right.against)) == (1, 3)
