@@ -40,8 +40,9 @@ def demo(task: str, scene: int, framing: Framing, first: str | None, options: Ep
         typer.echo(shown.note)
     start = shown.first if first is None else first_pose(first, shown.surface)
     setting = quick_rays(made.setting) if options.quick else made.setting
+    known = shown.bank if options.known is None else options.known
     plain = Imagination.preset(options.model, shown.longest_side, options.quick, solid=shown.solid)
-    imagination = dataclasses.replace(knowing(plain, options.known), grid=shown.grid)
+    imagination = dataclasses.replace(knowing(plain, known), grid=shown.grid)
     planner = planner_of(setting, shown.acquisition, options.search, imagination, options.quick)
     _run(shown.name, task, shown.surface, planner, start, options, shown.until)
 

@@ -101,7 +101,7 @@ class Shown(NamedTuple):
     """An object to show a task on.
 
     - `longest_side`, `solid`, `grid`: of the imagined surfaces; `note`: what is said of the object before.
-    - `until`: what is enough, as of `--until`.
+    - `until`: what is enough, as of `--until`; `bank`: the shapes that are known, as of `--known`.
     """
 
     name: str
@@ -113,6 +113,7 @@ class Shown(NamedTuple):
     grid: Grid = Grid()
     note: str = ""
     until: tuple[str, ...] = ()
+    bank: str = "none"
 
 
 class CommandTask(ABC):
@@ -158,7 +159,9 @@ class ClassTask(CommandTask):
         note = f"the pattern is a {PATTERNS[int(pyramid.label)]}"
         acquisition = self.of(pyramid_classifier(side))
         grid = Grid(64, 0.7 * side)
-        return Shown("pyramid", SDFSurface(pyramid), acquisition, first, side, True, grid, note, ("sure=0.95",))
+        return Shown(
+            "pyramid", SDFSurface(pyramid), acquisition, first, side, True, grid, note, ("sure=0.95",), "pyramid"
+        )
 
 
 class PartTask(CommandTask):
@@ -178,7 +181,7 @@ class PartTask(CommandTask):
         thing = part_scene(Split.TEST, scene)
         category = CATEGORIES[int(thing.category)].name
         acquisition = self._of(part_segmenter(category))
-        return Shown(category, SDFSurface(thing.solid), acquisition, usual_first())
+        return Shown(category, SDFSurface(thing.solid), acquisition, usual_first(), bank="parts")
 
     def _of(self, segmenter: CloudSegmenter) -> Acquisition:
         return ExpectedUtilityImprovement(SoftPartCount(segmenter), segmenter.num_points)
@@ -197,7 +200,7 @@ class HeatTask(CommandTask):
         """A procedural object."""
         heated = heat_scene(scene)
         first = source_view(heated, jax.random.key(seed))
-        return Shown(heated.name, heated.surface, self._of(np.asarray(heated.source)), first)
+        return Shown(heated.name, heated.surface, self._of(np.asarray(heated.source)), first, bank="heat")
 
     def _of(self, source: np.ndarray) -> Acquisition:
         return ExpectedUtilityImprovement(ColdestPoint(source), num_points=2048)
