@@ -130,13 +130,15 @@ class PointCloud(eqx.Module):
 
         A pixel of +infinity met nothing within the sensor's reach, which is taken to be the whole scene; one that is
         zero, negative or NaN is invalid and says nothing. Out of the camera's range a pixel is invalid where it is too
-        near, and met nothing so far where it is too far. Normals come from the differences between neighbouring pixels,
-        on the side where the depth changes less, so they do not mix the two sides of an edge, and are turned to the
-        camera. A pixel with no valid neighbour along an image axis has no normal and is invalid.
+        near, and met nothing so far where it is too far. Points and normals are those of planes fitted to what lies
+        around a pixel on the same surface, in a window that grows with the image's noise (`geometry/plane_fit.py`);
+        normals are turned to the camera. A pixel whose neighbours have no plane is invalid.
 
         - `depth`: along the camera's forward axis; `depth_scale` times it is in units of the pose: 0.001 where the
           image is in millimetres and the pose in metres. The range of the camera, and the box, are in these units too.
-        - `stride`: take every so many-th row and column alone; the cloud is an image of `camera.strided(stride)`.
+          Whole numbers are known to be rounded.
+        - `stride`: take every so many-th row and column alone; the cloud is an image of `camera.strided(stride)`. Planes
+          are fitted to all pixels.
         - `box`: keep points in it alone. A ray that hits behind the box has crossed it, and met nothing; one that hits
           before it is invalid.
 

@@ -1,5 +1,6 @@
 """From a depth image to oriented points, and to what its rays have crossed."""
 
+import math
 import warnings
 
 import equinox as eqx
@@ -9,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Real
 
 from jaxnbv.checks import AnyArray, as_floats, as_numbers, is_traced, require
 from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.plane_fit import fitted_planes
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box, ray_interval
 
@@ -24,6 +26,7 @@ def points_of_depth(
     shape = (camera.height, camera.width)
     # Before large numbers are rounded to infinity.
     missed = (depth if is_traced(depth) else as_numbers(depth, "the depth image", None)) == np.inf
+    rounding = scale / math.sqrt(12.0) if jnp.issubdtype(jnp.result_type(depth), jnp.integer) else 0.0
     depth = scale * as_floats(depth, "the depth image")
     require(
         depth.shape == shape,
@@ -32,12 +35,12 @@ def points_of_depth(
     )
     require(scale > 0, f"the depth's scale is {scale}; it must be positive")
     require(pose.position.ndim == 1, f"the pose is a batch {pose.position.shape[:-1]}: give one, poses[0] say")
-    camera, rows = camera.strided(stride), slice(stride // 2, None, stride)
-    depth, missed = depth[rows, rows], missed[rows, rows]
+    # Before any work is done for a stride that is none.
+    camera.strided(stride)
     if not is_traced(depth, pose):
         known = np.asarray(depth)
         _check_meaning(known[np.isfinite(known) & (known > 0)], camera, pose, box)
-    points, normals, mask, missed, inside = _oriented(depth, jnp.asarray(missed), camera, pose, box)
+    points, normals, mask, missed, inside = _oriented(depth, jnp.asarray(missed), camera, pose, stride, rounding, box)
     if box is not None and not is_traced(points):
         _warn_of_nothing_inside(np.asarray(points)[np.asarray(mask)], np.asarray(inside)[np.asarray(mask)], box)
     mask = mask & inside
@@ -47,24 +50,26 @@ def points_of_depth(
 
 @eqx.filter_jit
 def _oriented(
-    depth: Float[Array, "h w"], missed: Bool[Array, "h w"], camera: Camera, pose: Pose, box: Box | None
+    depth: Float[Array, "h w"],
+    missed: Bool[Array, "h w"],
+    camera: Camera,
+    pose: Pose,
+    stride: int,
+    rounding: float,
+    box: Box | None,
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"], Bool[Array, " n"]]:
     """Points, normals, which of them are valid, which rays met nothing in the box, and which points lie in it."""
     valid = jnp.isfinite(depth) & (depth > 0)
     if camera.farthest is not None:
         missed = missed | (valid & (depth > camera.farthest))
     valid = valid & ~missed & (depth >= camera.nearest)
-    local = jnp.where(valid, depth, 0.0)[..., None] * camera.pixel_directions().reshape(*depth.shape, 3)
-    down, has_down = _one_sided_difference(local, valid, axis=0)
-    right, has_right = _one_sided_difference(local, valid, axis=1)
-    normals = jnp.cross(down, right)
-    normals = normals * -jnp.sign(jnp.sum(normals * local, axis=-1, keepdims=True))
-    length = jnp.linalg.norm(normals, axis=-1, keepdims=True)
-    has_normal = (length[..., 0] > 0) & jnp.isfinite(length[..., 0])
-    mask = (valid & has_down & has_right & has_normal).reshape(-1)
-    normals = (normals / jnp.where(length > 0, length, 1.0)).reshape(-1, 3)
-    points = pose.to_scene(local.reshape(-1, 3))
-    normals = jnp.matmul(normals, pose.rotation.T, precision="highest")
+    smooth, normals, has_normal = fitted_planes(jnp.where(valid, depth, 0.0), valid, camera, stride, rounding)
+    rows, camera = slice(stride // 2, None, stride), camera.strided(stride)
+    depth, valid, missed = depth[rows, rows], valid[rows, rows], missed[rows, rows]
+    mask = (valid & has_normal).reshape(-1)
+    local = jnp.where(valid, jnp.where(has_normal, smooth, depth), 0.0).reshape(-1, 1) * camera.pixel_directions()
+    points = pose.to_scene(local)
+    normals = jnp.matmul(normals.reshape(-1, 3), pose.rotation.T, precision="highest")
 
     missed, inside = missed.reshape(-1), jnp.ones_like(mask)
     if box is not None:
@@ -119,22 +124,3 @@ def _warn_of_nothing_inside(points: Float[np.ndarray, "valid 3"], inside: Bool[n
             "units?",
             stacklevel=4,
         )
-
-
-def _one_sided_difference(points: Float[Array, "h w 3"], valid: Bool[Array, "h w"], axis: int):
-    """Differences between neighbours along an image axis, on the side of the smaller step, and whether there is one."""
-    step = jnp.diff(points, axis=axis)
-    index = [slice(None), slice(None)]
-    later, earlier = list(index), list(index)
-    later[axis], earlier[axis] = slice(1, None), slice(None, -1)
-    size = jnp.where(valid[tuple(later)] & valid[tuple(earlier)], jnp.linalg.norm(step, axis=-1), jnp.inf)
-
-    def shifted(array, before, fill):
-        pad = [(0, 0)] * array.ndim
-        pad[axis] = (1, 0) if before else (0, 1)
-        return jnp.pad(array, pad, constant_values=fill)
-
-    size_back, size_ahead = shifted(size, True, jnp.inf), shifted(size, False, jnp.inf)
-    back, ahead = shifted(step, True, 0.0), shifted(step, False, 0.0)
-    difference = jnp.where((size_back < size_ahead)[..., None], back, ahead)
-    return difference, jnp.isfinite(jnp.minimum(size_back, size_ahead))

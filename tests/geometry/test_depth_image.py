@@ -44,14 +44,19 @@ def test_millimetres_of_a_sensor_give_the_points_in_metres():
 
 
 @pytest.mark.parametrize("stride", [2, 3, 5])
-def test_a_strided_image_is_that_of_the_strided_camera(stride):
-    strided = CAMERA.strided(stride)
-    cloud = PointCloud.from_depth(depth_of(BALL, TABLE), CAMERA, POSE, stride=stride)
-    expected = PointCloud.from_depth(depth_of(BALL, TABLE, camera=strided), strided, POSE)
+def test_a_strided_image_has_rows_of_the_whole(stride):
+    """Planes are fitted to all pixels."""
+    strided, rows = CAMERA.strided(stride), slice(stride // 2, None, stride)
+    cloud, whole = (PointCloud.from_depth(depth_of(BALL, TABLE), CAMERA, POSE, stride=n) for n in (stride, 1))
     assert cloud.capacity == strided.num_rays
-    np.testing.assert_array_equal(cloud.mask, expected.mask)
-    np.testing.assert_array_equal(cloud.missed, expected.missed)
-    np.testing.assert_allclose(cloud.points, expected.points, atol=1e-4)
+    for name in ("points", "normals", "mask", "missed"):
+        kept = np.asarray(getattr(whole, name)).reshape(CAMERA.height, CAMERA.width, -1)[rows, rows]
+        np.testing.assert_allclose(getattr(cloud, name), kept.reshape(getattr(cloud, name).shape), atol=1e-6)
+    points = np.asarray(cloud.points, np.float64) - np.asarray(POSE.position)
+    along = points / np.linalg.norm(points, axis=1, keepdims=True) @ np.asarray(POSE.rotation, np.float64)
+    rays = np.asarray(strided.pixel_directions(), np.float64)
+    expected = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    np.testing.assert_allclose(along[np.asarray(cloud.mask)], expected[np.asarray(cloud.mask)], atol=1e-5)
 
 
 def test_a_box_keeps_the_object_and_knows_what_was_crossed():
@@ -115,7 +120,7 @@ def test_what_cannot_be_meant_is_named():
 
 def test_depths_beyond_the_type_say_nothing_and_only_infinity_says_nothing_is_there():
     camera, pose = Camera(height=4, width=4), look_at((0.0, 0.0, 2.5))
-    for depth, missed in ((1e15, 0), (3.5e38, 0), (1e300, 0), (np.inf, 16)):
+    for depth, missed in ((3.5e38, 0), (1e300, 0), (np.inf, 16)):
         cloud = PointCloud.from_depth(np.full((4, 4), depth), camera, pose)
         assert int(cloud.count) == 0
         assert int(cloud.missed.sum()) == missed

@@ -35,7 +35,7 @@ class Verdict(NamedTuple):
 
 
 def verdicts(study: type[Study], differences: Sequence[Row]) -> list[Verdict]:
-    """On the claims of which a study's differences over all its scenes tell; methods that were not run are left out, and
+    """On the claims of which a study's differences over all its scenes tell. Methods that were not run are left out;
     those that know no shapes are held against it too."""
     found = []
     for claim in study.claims:

@@ -1,0 +1,105 @@
+"""Planes fitted to a depth image: what a pixel's neighbours say of its depth and normal, through the sensor's noise.
+
+A plane is linear in inverse depth. With (u, v) where a ray meets the plane at depth 1 and z0 the pixel's depth,
+
+    z0 / z(u, v) = a + b (u - u0) + c (v - v0),     normal towards  (b, c, a - b u0 - c v0)
+
+is fitted by least squares to the pixels of a window that can be of the same surface. The window grows with the noise: a
+slope fitted to (2 r + 1)^2 pixels that are p apart on the surface is off by sqrt(3) sigma / (p r (2 r + 1)), which is
+held below 2.5 degrees where windows of at most 21 pixels can.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+from scipy.stats import norm
+
+from jaxnbv.geometry.camera import Camera
+
+_LARGEST_RADIUS = 10
+_SLOPE_ERROR = math.radians(2.5)
+# A neighbour on the same surface is no steeper away than this (76 degrees), noise of the pair aside.
+_STEEPEST, _SPREAD = 4.0, 6.0
+_FEWEST = 4
+# Of third differences the share that edges leave alone, and the mean of that share of a standard normal's least sizes.
+_SHARE = 0.5
+_MEAN_SIZE = 2.0 * (norm.pdf(0.0) - norm.pdf(norm.ppf(0.5 + 0.5 * _SHARE))) / _SHARE
+
+
+def depth_noise(depth: Float[Array, "h w"], valid: Bool[Array, "h w"]) -> Float[Array, ""]:
+    """The standard deviation of a depth image's noise, rounding included, in its units: from the third differences
+    along its rows, which are little but noise where the surface is smooth, the larger half left out. Zero where there
+    are no four pixels in a row."""
+    size = jnp.abs(jnp.diff(depth, n=3)).reshape(-1)
+    known = (valid[:, :-3] & valid[:, 1:-2] & valid[:, 2:-1] & valid[:, 3:]).reshape(-1)
+    ordered = jnp.sort(jnp.where(known, size, jnp.inf))
+    count = jnp.ceil(_SHARE * jnp.sum(known))
+    used = jnp.arange(len(ordered)) < count
+    return jnp.sum(jnp.where(used, ordered, 0.0)) / jnp.maximum(count, 1.0) / (_MEAN_SIZE * math.sqrt(20.0))
+
+
+def fitted_planes(
+    depth: Float[Array, "h w"], valid: Bool[Array, "h w"], camera: Camera, stride: int, least_noise: float
+) -> tuple[Float[Array, "k l"], Float[Array, "k l 3"], Bool[Array, "k l"]]:
+    """Depths and normals of every so many-th row and column, in the camera's frame, and which have a plane.
+
+    Normals look towards the camera. A depth moves to its plane by no more than three standard deviations of the noise.
+
+    - `depth`: positive and finite where it is `valid`. `camera`: of the whole image.
+    - `least_noise`: a standard deviation that is known, that of rounding say.
+    """
+    sigma = jnp.maximum(depth_noise(depth, valid), least_noise)
+    focal = jnp.asarray(camera.focal_lengths, depth.dtype)
+    strided = slice(stride // 2, None, stride)
+    place = camera.pixel_directions().reshape(*depth.shape, 3)[strided, strided, :2].astype(depth.dtype)
+    middle, has_middle = jnp.where(valid, depth, 1.0)[strided, strided], valid[strided, strided]
+    spacing = middle[..., None] / focal
+    radius = _radius(jnp.min(spacing, axis=-1), sigma)
+    width = 2 * jnp.max(jnp.where(has_middle, radius, 1)) + 1
+    padded = jnp.pad(jnp.where(valid, depth, 0.0), _LARGEST_RADIUS)
+    rows, columns = (_LARGEST_RADIUS + jnp.arange(stride // 2, size, stride) for size in depth.shape)
+
+    def add(index, sums):
+        """A neighbour of each pixel, where it can be of the same surface, its place in units of the window."""
+        down, right = index // width - width // 2, index % width - width // 2
+        near = padded[(rows + down)[:, None], (columns + right)[None]]
+        away = jnp.linalg.norm(spacing * jnp.stack([right, down]), axis=-1)
+        alike = jnp.abs(near - middle) <= _STEEPEST * away + _SPREAD * sigma
+        used = has_middle & (near > 0) & alike & (jnp.maximum(jnp.abs(down), jnp.abs(right)) <= radius)
+        row = jnp.stack(jnp.broadcast_arrays(1.0, right / radius, down / radius), axis=-1)
+        row = jnp.where(used[..., None], row.astype(depth.dtype), 0.0)
+        ratio = middle / jnp.where(used, near, 1.0)
+        return sums[0] + row[..., :, None] * row[..., None, :], sums[1] + ratio[..., None] * row
+
+    zeros = jnp.zeros((*middle.shape, 3, 3), depth.dtype), jnp.zeros((*middle.shape, 3), depth.dtype)
+    normal, right_hand = jax.lax.fori_loop(0, width * width, add, zeros)
+    # What lies along a line has no plane.
+    has_plane = (normal[..., 0, 0] >= _FEWEST) & (_breadth(normal) > 1e-3)
+    regular = jnp.where(has_plane[..., None, None], normal, jnp.eye(3, dtype=depth.dtype))
+    plane = jnp.linalg.solve(regular, right_hand[..., None])[..., 0]
+    has_plane = has_plane & (plane[..., 0] > 0)
+    # From a slope a unit of the window to one a unit of (u, v).
+    slope = plane[..., 1:] * focal / radius[..., None]
+    towards = jnp.concatenate([slope, plane[..., :1] - jnp.sum(slope * place, axis=-1, keepdims=True)], axis=-1)
+    length = jnp.linalg.norm(towards, axis=-1, keepdims=True)
+    smooth = jnp.clip(middle / jnp.where(has_plane, plane[..., 0], 1.0), middle - 3.0 * sigma, middle + 3.0 * sigma)
+    return smooth, -towards / jnp.where(length > 0, length, 1.0), has_plane & (length[..., 0] > 0)
+
+
+def _radius(spacing: Float[Array, "k l"], sigma: Float[Array, ""]) -> Int[Array, "k l"]:
+    """The least window, by its radius in pixels, whose slopes are sure enough."""
+    radii = jnp.arange(1, _LARGEST_RADIUS + 1)
+    error = math.sqrt(3.0) * sigma / (spacing[..., None] * radii * (2 * radii + 1))
+    return jnp.minimum(1 + jnp.sum(error > _SLOPE_ERROR, axis=-1), _LARGEST_RADIUS)
+
+
+def _breadth(normal: Float[Array, "k l 3 3"]) -> Float[Array, "k l"]:
+    """How much the places of the neighbours, about their mean, spread across the direction in which they spread most:
+    zero along a line, and one where they spread alike."""
+    total = jnp.maximum(normal[..., 0, 0], 1e-12)
+    mean = normal[..., 0, 1:] / total[..., None]
+    spread = normal[..., 1:, 1:] / total[..., None, None] - mean[..., :, None] * mean[..., None, :]
+    trace, determinant = spread[..., 0, 0] + spread[..., 1, 1], jnp.linalg.det(spread)
+    return 4.0 * determinant / jnp.maximum(trace**2, 1e-12)
