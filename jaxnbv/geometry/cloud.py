@@ -137,8 +137,8 @@ class PointCloud(eqx.Module):
         - `depth`: along the camera's forward axis; `depth_scale` times it is in units of the pose: 0.001 where the
           image is in millimetres and the pose in metres. The range of the camera, and the box, are in these units too.
           Whole numbers are known to be rounded.
-        - `stride`: take every so many-th row and column alone; the cloud is an image of `camera.strided(stride)`. Planes
-          are fitted to all pixels.
+        - `stride`: take every so many-th row and column alone; the cloud is an image of `camera.strided(stride)`.
+          Planes are fitted to all pixels.
         - `box`: keep points in it alone. A ray that hits behind the box has crossed it, and met nothing; one that hits
           before it is invalid.
 
