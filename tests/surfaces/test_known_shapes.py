@@ -57,7 +57,9 @@ def filling(solid, rotation, bank, index):
 
 
 def evidence_of(surface, positions, noise=0.005):
-    planner = nbv.Planner(nbv.Coverage(), camera=CAMERA, imagination=nbv.Imagination(grid=GRID), max_views=4)
+    planner = nbv.Planner(
+        nbv.Coverage(), camera=CAMERA, imagination=nbv.Imagination(grid=GRID), capacity=1024, max_views=4
+    )
     evidence = None
     for index, position in enumerate(positions):
         pose = nbv.look_at(position)
