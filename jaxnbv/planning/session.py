@@ -20,7 +20,7 @@ from jaxnbv.planning.episode import Episode, View, view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Watch
 from jaxnbv.scanning import Evidence, Surroundings
-from jaxnbv.search import CandidateSearch, GivenPoses, Proposal
+from jaxnbv.search import CandidateSearch, GivenPoses, Proposal, SphereCandidates
 from jaxnbv.storage import DepthImage, SessionFolder, describe
 from jaxnbv.tasks import Stop
 
@@ -58,7 +58,7 @@ class Session:
     - `up`: the world's axis that is upward, "y" or "z" say.
     - `surroundings`: what stands around the object, in world units: `Surroundings((table,), margin=0.005)`, say.
     - `poses`: (n, 4, 4), where the sensor can be held; by default the candidates of the planner's search, in scene
-      units about the box's centre.
+      units about the box's centre, and of a whole sphere the upper half: what is below may be the table.
     - `folder`: where images and proposals are kept before they are acted on; a session that was killed goes on from it.
     - `convention`: of the matrices' axes, see `Pose.from_matrix`.
     - `stride`: of the images, every so many-th row and column alone is used; by default such that 20,000 rays are left
@@ -301,5 +301,7 @@ def _placed(
                 "DiscreteSearch() or HalvingSearch()"
             )
         search = dataclasses.replace(search, candidates=GivenPoses(poses))
+    elif isinstance(search, CandidateSearch) and isinstance(search.candidates, SphereCandidates):
+        search = dataclasses.replace(search, candidates=search.candidates.upper_half)
     camera = camera.resized(planner.camera.height, planner.camera.width)
     return dataclasses.replace(planner, camera=camera, search=search, imagination=imagination)

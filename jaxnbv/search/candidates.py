@@ -1,5 +1,6 @@
 """The poses that a search chooses among, as a value: a search says how, its candidates say where."""
 
+import dataclasses
 import math
 from abc import abstractmethod
 from collections.abc import Callable
@@ -77,11 +78,19 @@ class SphereCandidates(NumberedCandidates):
             f"the least elevation is {self.min_elevation} rad; it must lie within [-pi/2, pi/2)",
         )
 
+    @property
+    def _is_whole(self) -> bool:
+        return self.min_elevation == -0.5 * math.pi
+
+    @property
+    def upper_half(self) -> "SphereCandidates":
+        """Those above the origin, of a whole sphere; one with a least elevation stays as it is."""
+        return dataclasses.replace(self, min_elevation=0.0) if self._is_whole else self
+
     def poses(self, key: PRNGKeyArray | None = None) -> Pose:
         """A dome is turned about its axis, so that the poses of every key are above the elevation."""
-        whole = self.min_elevation == -0.5 * math.pi
         places = fibonacci_sphere(self.num_poses, self.radius, self.min_elevation)
-        if key is not None and whole:
+        if key is not None and self._is_whole:
             turn = rotation_from_6d(jax.random.normal(key, (6,)))
             places, key = jnp.matmul(places, turn.T, precision="highest"), None
         return _looking(places, self.up, key)

@@ -16,7 +16,7 @@ from jaxnbv.planning.episode import view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Budget, ValueBelow
 from jaxnbv.scanning import Carving, Grid, scan
-from jaxnbv.search import DiscreteSearch, FarthestView, GradientSearch
+from jaxnbv.search import DiscreteSearch, FarthestView, GradientSearch, SphereCandidates
 from jaxnbv.surfaces import GeometricSPSR, OutsideBoundary, ScreenedSPSR
 from jaxnbv.tasks import Coverage
 from jaxnbv.viz import write_report
@@ -99,6 +99,17 @@ def test_metres_and_millimetres_and_both_conventions_tell_the_same(convention, u
     # Points that are rounded to millimetres are other points, of other value.
     if unit > 1:
         assert session.next().value == pytest.approx(float(first.value), rel=1e-4)
+
+
+@pytest.mark.parametrize("elevation", [-0.5 * np.pi, -0.3, 0.5])
+def test_without_poses_it_looks_from_above_unless_told_otherwise(elevation):
+    search = DiscreteSearch(SphereCandidates(60, min_elevation=elevation))
+    session = session_of(poses=None, planner=planner_of(search))
+    places = np.asarray(session.frame.to_world(session.planner.search.candidates.poses(jax.random.key(1))).position)
+    away = places - np.mean(BOX, axis=0)
+    lowest = np.arcsin((away[:, 2] / np.linalg.norm(away, axis=1)).min())
+    least = 0.0 if elevation == -0.5 * np.pi else elevation
+    assert least - 1e-3 < lowest < least + 0.1
 
 
 def test_nothing_recompiles_after_the_second_image(compilations):
