@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -196,7 +197,8 @@ class Session:
 
     def next(self) -> NextView:
         """Where to take the next image. It is stored, and the same until an image is added; what was proposed once is
-        not proposed again, for where the sensor could not be held it need not be tried twice.
+        not proposed again, for where the sensor could not be held it need not be tried twice. Warns where the best view
+        is worth no more than three standard errors.
 
         **Raises:** `ValueError` before the first image, or as `Planner.propose` does.
         """
@@ -259,6 +261,7 @@ class Session:
         surfaces = self.planner.sample(self.evidence, sample_key)
         proposed = [proposal.pose for index, proposal in sorted(self._proposals.items()) if index < self.views]
         proposal = self.planner.choose(self.evidence.with_visited(proposed), surfaces, search_key)
+        _warn_of_little(proposal)
         if surfaces is None:
             return proposal, None
         return proposal, np.asarray(self.planner.expected_depth(surfaces, proposal.pose)) / self.frame.scale
@@ -269,6 +272,18 @@ class Session:
             found == self.views,
             f"{folder.path} holds {found} images, but this session knows {self.views}: another process has added some; "
             "make the session again, which reads them",
+        )
+
+
+def _warn_of_little(proposal: Proposal) -> None:
+    """A best view may be worth nothing: of candidates that look elsewhere, or once all has been seen."""
+    value, error = float(proposal.value), proposal.standard_error
+    if value <= (0.0 if error is None else 3.0 * error):
+        sure = "" if error is None else f" ± {error:.2g}"
+        warnings.warn(
+            f"the best view is worth {value:.3g}{sure}: none is sure to show anything new. Stop, or give poses that "
+            "look at the box from elsewhere",
+            stacklevel=4,
         )
 
 

@@ -112,6 +112,14 @@ def test_without_poses_it_looks_from_above_unless_told_otherwise(elevation):
     assert least - 1e-3 < lowest < least + 0.1
 
 
+def test_poses_that_look_away_are_worth_nothing_and_it_says_so():
+    away = POSES @ np.diag([-1.0, 1.0, -1.0, 1.0])
+    session = session_of(poses=away)
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    with pytest.warns(UserWarning, match=r"the best view is worth 0.*give poses that look at the box"):
+        session.next()
+
+
 def test_nothing_recompiles_after_the_second_image(compilations):
     session, after = session_of(planner=planner_of(num_samples=2)), []
     matrix = FIRST
