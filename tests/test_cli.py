@@ -37,7 +37,7 @@ def test_the_same_command_continues_with_more_views(finished):
     folder, _ = finished
     out = folder / "runs" / "pyramid-cross-entropy-discrete-seed0"
     before = {path.name: path.read_bytes() for path in out.glob("view_*.npz")}
-    result = run_command("demo", "--quick", "--views", "3", "--no-report", cwd=folder)
+    result = run_command("demo", "--quick", "--views", "3", "--until", "never", "--no-report", cwd=folder)
     assert result.returncode == 0, result.stderr
     assert (out / "view_02.npz").exists()
     assert all((out / name).read_bytes() == content for name, content in before.items())
