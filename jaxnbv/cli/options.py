@@ -96,7 +96,7 @@ KnownOption = Annotated[
         metavar="BANK",
         help="Shapes that what was seen is compared with, beside the model: upright ones of a folder of meshes, or "
         f"{', '.join(BANKS)}, which ship; none: the model alone.",
-        show_default="none; demo: other objects of the kind",
+        show_default="none; demo --model screened: other objects of the kind",
     ),
 ]
 PaperOption = Annotated[

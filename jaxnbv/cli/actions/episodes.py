@@ -40,7 +40,9 @@ def demo(task: str, scene: int, framing: Framing, first: str | None, options: Ep
         typer.echo(shown.note)
     start = shown.first if first is None else first_pose(first, shown.surface)
     setting = quick_rays(made.setting) if options.quick else made.setting
-    known = shown.bank if options.known is None else options.known
+    # The paper's model knows no shapes.
+    usual = None if options.model == "paper" else shown.bank
+    known = usual if options.known is None else options.known
     plain = Imagination.preset(options.model, shown.longest_side, options.quick, solid=shown.solid)
     imagination = dataclasses.replace(knowing(plain, known), grid=shown.grid)
     planner = planner_of(setting, shown.acquisition, options.search, imagination, options.quick)
