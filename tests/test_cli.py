@@ -12,7 +12,7 @@ from commands import run_command, run_process
 def finished(tmp_path_factory):
     """A folder in which `jaxnbv demo --quick` has run, and what it printed."""
     folder = tmp_path_factory.mktemp("demo")
-    result = run_process("demo", "--quick", "--views", "2", cwd=folder)
+    result = run_process("demo", "--quick", "--known", "none", "--views", "2", cwd=folder)
     assert result.returncode == 0, result.stderr
     return folder, result
 
@@ -37,7 +37,7 @@ def test_the_same_command_continues_with_more_views(finished):
     folder, _ = finished
     out = folder / "runs" / "pyramid-cross-entropy-discrete-seed0"
     before = {path.name: path.read_bytes() for path in out.glob("view_*.npz")}
-    result = run_command("demo", "--quick", "--views", "3", "--until", "never", "--no-report", cwd=folder)
+    result = run_command("demo", "--quick", "--known", "none", "--views", "3", "--no-report", cwd=folder)
     assert result.returncode == 0, result.stderr
     assert (out / "view_02.npz").exists()
     assert all((out / name).read_bytes() == content for name, content in before.items())
@@ -147,7 +147,8 @@ def test_a_folder_of_another_configuration_is_refused(finished):
         assert words in result.stderr
     assert "--views" not in result.stderr
     (folder / out / "options.json").rename(folder / "elsewhere")
-    result = run_command("demo", "--quick", "--views", "2", "--seed", "1", "--out", out, cwd=folder)
+    asked = ("demo", "--quick", "--known", "none", "--views", "2", "--seed", "1", "--out", out)
+    result = run_command(*asked, cwd=folder)
     (folder / "elsewhere").rename(folder / out / "options.json")
     assert result.returncode == 2
     assert "another episode" in result.stderr

@@ -25,8 +25,8 @@ def points_of_depth(
     """Points, normals, which rows are filled and which rays met nothing: `PointCloud.from_depth`."""
     shape = (camera.height, camera.width)
     # Before large numbers are rounded to infinity.
-    missed = (depth if is_traced(depth) else as_numbers(depth, "the depth image", None)) == np.inf
-    rounding = scale / math.sqrt(12.0) if jnp.issubdtype(jnp.result_type(depth), jnp.integer) else 0.0
+    numbers = depth if is_traced(depth) else as_numbers(depth, "the depth image", None)
+    missed, rounding = numbers == np.inf, scale / math.sqrt(12.0) if np.issubdtype(numbers.dtype, np.integer) else 0.0
     depth = scale * as_floats(depth, "the depth image")
     require(
         depth.shape == shape,

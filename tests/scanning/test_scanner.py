@@ -90,9 +90,9 @@ def test_depth_image_round_trip(name):
     assert not np.asarray(back.mask)[invalid.ravel()].any()
     both = np.asarray(back.mask)
     assert both.sum() > 0.9 * (~invalid).sum()
-    np.testing.assert_allclose(np.asarray(back.points)[both], np.asarray(cloud.points)[both], atol=1e-5)
+    np.testing.assert_allclose(np.asarray(back.points)[both], np.asarray(cloud.points)[both], atol=1e-4)
     cosine = np.sum(np.asarray(back.normals) * np.asarray(cloud.normals), axis=1)
     steep = np.sum(np.asarray(cloud.normals) * np.asarray(pose.forward), axis=1) > -0.5
-    # One-sided differences over a pixel, 0.01 to 0.03 on the surface, tilt the normal of a curved surface by about
-    # half the angle between neighbours; a mesh adds the angle between its faces.
+    # Planes through neighbours, 0.01 to 0.03 apart on a curved surface, are off by the square of that over two, and
+    # tilted by less than the angle between neighbours; a mesh adds the angle between its faces.
     assert np.degrees(np.arccos(np.clip(cosine[both & ~steep], -1, 1))).max() < 6.0
