@@ -14,6 +14,7 @@ from jaxnbv import Imagination, KnownShapes, Planner
 from jaxnbv.studies.classification.study import ClassificationStudy
 from jaxnbv.studies.engine.study import Scene
 from jaxnbv.studies.scenes.banks import bank_poses, shape_bank
+from jaxnbv.surfaces.known_shapes import kind_of
 
 
 def without_the_class(study: ClassificationStudy, scene: Scene) -> Planner:
@@ -21,7 +22,7 @@ def without_the_class(study: ClassificationStudy, scene: Scene) -> Planner:
     imagination = study.imagination
     assert isinstance(imagination.model, KnownShapes), "run the study by --model known"
     bank, own = imagination.model.bank, study.objects.classes[scene.task.label]
-    others = [row for row, name in enumerate(bank.names) if name.rpartition(" ")[0] != own]
+    others = [row for row, name in enumerate(bank.names) if kind_of(name) != own]
     return _planner(study, scene, imagination.unknowing.knowing(bank.chosen(others), imagination.model.poses))
 
 

@@ -28,6 +28,7 @@ from jaxnbv.studies.scenes import PART_CATEGORIES, Split, household_scene, part_
 from jaxnbv.studies.scenes.banks import bank_poses, shape_bank
 from jaxnbv.studies.scenes.household import HOUSEHOLD
 from jaxnbv.surfaces import KnownShapes
+from jaxnbv.surfaces.known_shapes import kind_of
 
 # The other kind; and what makes a scene, whose classes take turns.
 OTHER = {"household": "parts", "parts": "heat"}
@@ -48,7 +49,7 @@ def scene_of(kind: str, index: int) -> tuple[str, nbv.Surface]:
 def banks_of(kind: str, own: str) -> dict[str, tuple[nbv.ShapeBank, nbv.ShapePoses]]:
     """The banks that are compared."""
     bank, other = shape_bank(kind), OTHER[kind]
-    others = [row for row, name in enumerate(bank.names) if name.rpartition(" ")[0] != own]
+    others = [row for row, name in enumerate(bank.names) if kind_of(name) != own]
     poses = bank_poses(kind)
     return {
         OWN: (bank, poses),

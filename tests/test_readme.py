@@ -37,7 +37,7 @@ AFTER = """
 assert len(episode.views) == 2
 assert fields(x).shape == (16, 5)
 assert int(evidence.num_views) == 1
-np.testing.assert_allclose(np.linalg.norm(cloud.to_numpy()[0], axis=1), 1.0, atol=1e-3)
+np.testing.assert_allclose(np.linalg.norm(cloud.to_numpy()[0], axis=1), 1.0, atol=1e-4)
 """
 
 

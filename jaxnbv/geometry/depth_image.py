@@ -26,7 +26,8 @@ def points_of_depth(
     shape = (camera.height, camera.width)
     # Before large numbers are rounded to infinity.
     numbers = depth if is_traced(depth) else as_numbers(depth, "the depth image", None)
-    missed, rounding = numbers == np.inf, scale / math.sqrt(12.0) if np.issubdtype(numbers.dtype, np.integer) else 0.0
+    missed = numbers == np.inf
+    rounding = scale / math.sqrt(12.0) if np.issubdtype(numbers.dtype, np.integer) else 0.0
     depth = scale * as_floats(depth, "the depth image")
     require(
         depth.shape == shape,

@@ -10,11 +10,11 @@ held below 2.5 degrees where windows of at most 21 pixels can.
 """
 
 import math
+from statistics import NormalDist
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
-from scipy.stats import norm
 
 from jaxnbv.geometry.camera import Camera
 
@@ -25,7 +25,8 @@ _STEEPEST, _SPREAD = 4.0, 6.0
 _FEWEST = 4
 # Of third differences the share that edges leave alone, and the mean of that share of a standard normal's least sizes.
 _SHARE = 0.5
-_MEAN_SIZE = 2.0 * (norm.pdf(0.0) - norm.pdf(norm.ppf(0.5 + 0.5 * _SHARE))) / _SHARE
+_NORMAL = NormalDist()
+_MEAN_SIZE = 2.0 * (_NORMAL.pdf(0.0) - _NORMAL.pdf(_NORMAL.inv_cdf(0.5 + 0.5 * _SHARE))) / _SHARE
 
 
 def depth_noise(depth: Float[Array, "h w"], valid: Bool[Array, "h w"]) -> Float[Array, ""]:

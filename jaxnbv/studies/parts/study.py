@@ -17,6 +17,7 @@ from jaxnbv.studies.parts.discovery import PartDiscoveryStudy
 from jaxnbv.studies.parts.meshes import MeshPartStudy
 from jaxnbv.studies.scenes import Split, part_scene
 from jaxnbv.surfaces import KnownShapes
+from jaxnbv.surfaces.known_shapes import kind_of
 
 
 class PartStudy(PartDiscoveryStudy):
@@ -58,7 +59,7 @@ class PartStudy(PartDiscoveryStudy):
         model = self.imagination.model
         if not isinstance(model, KnownShapes):
             return self.imagination
-        alike = [index for index, name in enumerate(model.bank.names) if name.rsplit(" ", 1)[0] == scene.name]
+        alike = [index for index, name in enumerate(model.bank.names) if kind_of(name) == scene.name]
         known = dataclasses.replace(model, bank=model.bank.chosen(alike))
         return dataclasses.replace(self.imagination, model=known)
 

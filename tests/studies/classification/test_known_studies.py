@@ -9,17 +9,18 @@ import pytest
 from test_pyramid_study import CAMERA, SCENE, evidence_of, small_study, step_key, without_time
 
 import jaxnbv as nbv
-from jaxnbv.cli.registry import STUDY_MODELS
+from jaxnbv.cli.registry import STUDY_MODELS, resolve
 from jaxnbv.imagination import MODELS
 from jaxnbv.studies.classification.pyramid import PyramidStudy
 from jaxnbv.studies.engine.measures import KNOWN
 from jaxnbv.studies.engine.meshes import knowing_meshes, knowing_others
 from jaxnbv.studies.heat.study import HeatStudy
 from jaxnbv.studies.parts.study import PartStudy
+from jaxnbv.studies.registry import STUDIES
 from jaxnbv.studies.scenes import Split, pyramid_scene
 from jaxnbv.surfaces import GeometricSPSR, KnownShapes, OnSurface, ScreenedSPSR, mesh_shapes
 
-METHODS = ("cross-entropy", "coverage", "coverage-screened")
+METHODS = ("cross-entropy", "coverage", "uncertainty", "coverage-screened", "uncertainty-screened")
 
 
 def knowing_study():
@@ -47,8 +48,9 @@ def test_a_choice_is_that_of_the_planner_with_the_same_key(record):
 
 
 def test_the_methods_that_know_no_shapes_are_those_of_a_study_without(record):
-    plain = small_study().run_scene(SCENE, ("coverage",))
-    assert record["methods"]["coverage-screened"] == plain["methods"]["coverage"]
+    plain = small_study().run_scene(SCENE, ("coverage", "uncertainty"))
+    for method in ("coverage", "uncertainty"):
+        assert record["methods"][f"{method}-screened"] == plain["methods"][method]
 
 
 def test_a_scene_can_be_run_again(record):
@@ -65,6 +67,11 @@ def test_the_preset_of_a_study_knows_its_bank():
     model = HeatStudy.imagined(KNOWN).model
     assert isinstance(model, KnownShapes)
     assert len(model.bank) == 256
+
+
+@pytest.mark.parametrize("name", [name for name, entry in STUDIES.items() if entry.model == KNOWN])
+def test_a_study_whose_usual_model_is_known_has_a_bank(name):
+    assert resolve(STUDIES[name].study).bank
 
 
 def test_a_study_without_a_bank_refuses_to_know_shapes():
