@@ -55,7 +55,7 @@ class Recipe(NamedTuple):
 
 RECIPES = {
     "pyramid": Recipe(tuple(Framing), solid=True, scenes=12_000, imagined=100),
-    "truck": Recipe(scenes=8000, imagined=100, groups=(192, 48), focus=1200, steps=(2500, 2500)),
+    "truck": Recipe(scenes=16_000, imagined=100, groups=(192, 48), focus=2400, steps=(10_000, 5000)),
     "household": Recipe(scenes=8000, imagined=100, groups=(192, 48), steps=(4000, 1000)),
     "fruit": Recipe(solid=True, scenes=5000, imagined=80, groups=(192, 48), steps=(3000, 800)),
 }
@@ -74,8 +74,8 @@ class Clouds:
         def make(first: int) -> LabelledClouds:
             return scanned_clouds(self.set, split, framing, range(first, first + SCANNED_AT_ONCE), self.points)
 
-        file = self.folder / f"scanned-{split}-{framing}-{count}.npz"
-        return self._scaled(framing, cached(file, range(0, count, SCANNED_AT_ONCE), make))
+        folder, firsts = self.folder / f"scanned-{split}-{framing}", range(0, count, SCANNED_AT_ONCE)
+        return self._scaled(framing, cached(folder, firsts, make))
 
     def imagined(self, split: Split, framing: Framing, count: int) -> LabelledClouds:
         """Clouds that end in a scan of a posterior sample, 16 from each of `count` scenes."""
@@ -86,8 +86,8 @@ class Clouds:
         def make(index: int) -> LabelledClouds:
             return imagined_clouds(self.set, split, framing, index, planner, num_points=self.points)
 
-        file = self.folder / f"imagined-{split}-{framing}-{count}.npz"
-        return self._scaled(framing, cached(file, range(FIRST_IMAGINED, FIRST_IMAGINED + count), make))
+        folder, indices = self.folder / f"imagined-{split}-{framing}", range(FIRST_IMAGINED, FIRST_IMAGINED + count)
+        return self._scaled(framing, cached(folder, indices, make))
 
     def _scaled(self, framing: Framing, leaves: list[np.ndarray]) -> LabelledClouds:
         points, normals, mask, *rest = leaves

@@ -36,7 +36,7 @@ def scanned(folder: Path, split: Split, count: int) -> LabelledPartClouds:
     def make(first):
         return scanned_part_clouds(split, range(first, first + 100))
 
-    return _clouds(cached(folder / f"scanned-{split}-{count}.npz", range(0, count, 100), make))
+    return _clouds(cached(folder / f"scanned-{split}", range(0, count, 100), make))
 
 
 def imagined(folder: Path, split: Split, count: int) -> LabelledPartClouds:
@@ -48,7 +48,7 @@ def imagined(folder: Path, split: Split, count: int) -> LabelledPartClouds:
         return imagined_part_clouds(split, [index], planner)
 
     scenes = range(FIRST_IMAGINED, FIRST_IMAGINED + count)
-    return _clouds(cached(folder / f"imagined-{split}-{count}.npz", scenes, make))
+    return _clouds(cached(folder / f"imagined-{split}", scenes, make))
 
 
 def _clouds(leaves: list[np.ndarray]) -> LabelledPartClouds:
