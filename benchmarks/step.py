@@ -14,6 +14,7 @@ import json
 import resource
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -102,7 +103,7 @@ def main() -> None:
     @jax.jit
     def values(cloud, scans):
         context = planner.acquisition.context(cloud)
-        score = jax.vmap(lambda imagined: planner.acquisition(context, imagined))
+        score = partial(nbv.acquisition.scores, planner.acquisition, context, camera=planner.camera, poses=poses)
         return jnp.mean(jax.lax.map(score, scans), axis=0)
 
     # The stages as they are timed must be the stages of the step.

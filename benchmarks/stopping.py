@@ -31,7 +31,7 @@ from jaxnbv.storage.files import write_text
 from jaxnbv.studies.engine.statistics import bootstrap_mean
 from jaxnbv.studies.scenes import Framing, Split, hidden_view, part_scene, pyramid_scene
 from jaxnbv.tasks import Covered, Found, Sure
-from jaxnbv.tasks.coverage import SeenBefore
+from jaxnbv.tasks.new_surface import NewSurface, ShownArea
 
 SIDE = Framing.WHOLE.longest_side
 FIRST = nbv.look_at((0.8, 0.9, 2.2))
@@ -58,7 +58,7 @@ def planner_for(task: str, category: str) -> nbv.Planner:
     if task == "class":
         return planner_of(nbv.CrossEntropy(pyramid_classifier(SIDE)), 2.5, SIDE, solid=True)
     if task == "coverage":
-        return planner_of(nbv.Coverage(), 2.5)
+        return planner_of(nbv.NewSurface(), 2.5)
     utility = nbv.SoftPartCount(part_segmenter(category))
     return planner_of(nbv.ExpectedUtilityImprovement(utility, num_points=1024), 2.0)
 
@@ -92,15 +92,16 @@ def measured(task: str, index: int) -> dict:
 
 
 def _seen(surface: nbv.SDFSurface, camera: nbv.Camera, poses: nbv.Pose, cloud: nbv.PointCloud) -> float:
-    """Share of what the camera would truly see, from all candidates, that lies near D."""
-    near, seen = np.asarray(_counted(surface, camera, poses, cloud))
-    return float(near / seen)
+    """Share of the area that the camera would truly see, from all candidates, that is not new."""
+    new, shown = np.asarray(_areas(surface, camera, poses, cloud))
+    return 1.0 - float(new / shown)
 
 
 @eqx.filter_jit
-def _counted(surface: nbv.SDFSurface, camera: nbv.Camera, poses: nbv.Pose, cloud: nbv.PointCloud):
+def _areas(surface: nbv.SDFSurface, camera: nbv.Camera, poses: nbv.Pose, cloud: nbv.PointCloud):
+    shown = ShownArea(NewSurface())
     scans = nbv.scan(surface, camera, poses)
-    return jnp.sum(jax.lax.map(lambda one: SeenBefore()(cloud, one), scans), axis=0)
+    return jnp.sum(nbv.acquisition.scores(shown, shown.context(cloud), scans, camera, poses), axis=0)
 
 
 def table(task: str, records: list[dict]) -> str:

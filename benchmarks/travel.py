@@ -39,7 +39,7 @@ def episode(planner: nbv.Planner, mesh: nbv.TriangleMesh, truth: np.ndarray, vie
     """Coverage, and length of the way so far, after each view."""
     direction = jax.random.normal(jax.random.fold_in(key, 99), (3,))
     waiting = [nbv.look_at(2.5 * direction / jnp.linalg.norm(direction))]
-    evidence, taken, found = None, [], {"coverage": [], "way": []}
+    evidence, taken, scans, found = None, [], [], {"way": []}
     for index in range(views):
         if not waiting:
             batch = planner.propose_batch(evidence, view_keys(key, index)[0], at_once)
@@ -48,8 +48,9 @@ def episode(planner: nbv.Planner, mesh: nbv.TriangleMesh, truth: np.ndarray, vie
         seen = observe_scene(mesh, planner.camera, pose, nbv.SensorNoise(), view_keys(key, index)[2])
         evidence = planner.init(pose, seen) if evidence is None else planner.observe(evidence, pose, seen)
         taken.append(pose)
-        found["coverage"].append(coverage(evidence.cloud, truth))
+        scans.append(nbv.View(pose, seen, evidence.cloud, None, planner.camera))
         found["way"].append(total_cost(taken))
+    found["coverage"] = coverage(scans, truth)
     return found
 
 

@@ -108,6 +108,7 @@ from .tasks import HostClassifier as HostClassifier
 from .tasks import HostSegmenter as HostSegmenter
 from .tasks import MixedEntropy as MixedEntropy
 from .tasks import NegativeEntropy as NegativeEntropy
+from .tasks import NewSurface as NewSurface
 from .tasks import SoftPartCount as SoftPartCount
 from .tasks import Stop as Stop
 from .tasks import Sure as Sure

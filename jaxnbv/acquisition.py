@@ -29,12 +29,14 @@ class Quantity(eqx.Module):
     - `name`, `unit`: in words; the unit is empty where there is none.
     - `meaning`: the rest of a caption that begins with "Value:".
     - `smooth`: whether values between two candidates mean anything.
+    - `power`: of length that it is, 2 for an area; a session says it in world units.
     """
 
     name: str
     unit: str
     meaning: str
     smooth: bool = True
+    power: int = 0
 
 
 class Answer(eqx.Module):
@@ -56,9 +58,18 @@ class Acquisition(eqx.Module):
     def context(self, cloud: PointCloud) -> Any:
         """Whatever depends on D alone; computed once a step."""
 
-    @abstractmethod
     def __call__(self, context: Any, scan: PointCloud) -> Float[Array, ""]:
-        """The score of one scan (rows, masked). Finite; for a scan that sees nothing, no more than for any other."""
+        """The score of one scan (rows, masked). Finite; for a scan that sees nothing, no more than for any other.
+
+        **Raises:** `NotImplementedError` for an acquisition that has only a `score`.
+        """
+        name = type(self).__name__
+        raise NotImplementedError(f"{name} scores no scan alone: call its score(context, scan, camera, pose)")
+
+    def score(self, context: Any, scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, "*values"]:
+        """The score of one scan that a camera takes from a pose: by default that of the scan alone. Define it in place
+        of `__call__` where it matters how far away, or at which angle, a point was seen."""
+        return self(context, scan)
 
     @property
     def batch_size(self) -> int:
@@ -192,9 +203,9 @@ class Several(Acquisition):
         """That of each."""
         return tuple(member.context(cloud) for member in self.members)
 
-    def __call__(self, context: tuple[Any, ...], scan: PointCloud) -> Float[Array, " values"]:
+    def score(self, context: tuple[Any, ...], scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, " values"]:
         """The scores of one scan."""
-        found = [member(own, scan) for member, own in zip(self.members, context, strict=True)]
+        found = [member.score(own, scan, camera, pose) for member, own in zip(self.members, context, strict=True)]
         return jnp.concatenate([jnp.atleast_1d(value) for value in found])
 
     @property
@@ -219,10 +230,10 @@ def zero_if_empty(scan: PointCloud, value: Float[Array, "*values"]) -> Float[Arr
     return jnp.where(jnp.any(scan.mask), value, 0.0)
 
 
-def check_differentiable(acquisition: Acquisition, capacity: int, num_rays: int) -> None:
+def check_differentiable(acquisition: Acquisition, capacity: int, camera: Camera) -> None:
     """Check that JAX can differentiate an acquisition in the points and normals of a scan, without computing anything.
 
-    - `capacity`: rows of the cloud; `num_rays`: rows of a scan.
+    - `capacity`: rows of the cloud.
 
     **Raises:** `ValueError` if it cannot, as for anything that calls back to host code.
     """
@@ -232,9 +243,10 @@ def check_differentiable(acquisition: Acquisition, capacity: int, num_rays: int)
 
     def value(rows):
         points, normals = rows
-        return acquisition(acquisition.context(cloud(capacity)), PointCloud(points, normals, cloud(num_rays).mask))
+        scan, pose = PointCloud(points, normals, cloud(camera.num_rays).mask), Pose(jnp.eye(3), jnp.zeros(3))
+        return acquisition.score(acquisition.context(cloud(capacity)), scan, camera, pose)
 
-    rows = cloud(num_rays).points, cloud(num_rays).normals
+    rows = cloud(camera.num_rays).points, cloud(camera.num_rays).normals
     # One that fails by itself says so itself.
     jax.eval_shape(value, rows)
     try:
@@ -264,6 +276,17 @@ def expected_value(
     return jnp.mean(sample_scores(acquisition, context, surfaces, camera, poses, barrier=barrier), axis=0)
 
 
+def scores(
+    acquisition: Acquisition, context: Any, scans: PointCloud, camera: Camera, poses: Pose
+) -> Float[Array, "poses *scores"]:
+    """The score of each of a batch of scans, one from each of a batch of poses, `batch_size` of them at a time."""
+    return jax.lax.map(
+        lambda taken: acquisition.score(context, taken[0], camera, taken[1]),
+        (scans, poses),
+        batch_size=acquisition.batch_size,
+    )
+
+
 def sample_scores(
     acquisition: Acquisition,
     context: Any,
@@ -283,8 +306,7 @@ def sample_scores(
     """
 
     def of_sample(surface: GridSurface, context: Any) -> Float[Array, "poses *scores"]:
-        scans = scan(surface, camera, poses, barrier)
-        return jax.lax.map(lambda imagined: acquisition(context, imagined), scans, batch_size=acquisition.batch_size)
+        return scores(acquisition, context, scan(surface, camera, poses, barrier), camera, poses)
 
     if own_contexts:
         return jax.lax.map(lambda pair: of_sample(*pair), (surfaces, context))

@@ -31,6 +31,7 @@ SCANS = nbv.scan(BALL, SMALL, POSES)
 D = np.random.default_rng(0).normal(size=(60, 3))
 D /= np.linalg.norm(D, axis=1, keepdims=True)
 CLOUD = nbv.PointCloud.from_arrays(D, D)
+VIEW = nbv.View(POSE, SCAN, CLOUD, None, SMALL)
 NOT_FINITE = nbv.PointCloud(CLOUD.points.at[0].set(jnp.nan), CLOUD.normals, CLOUD.mask)
 MODEL = nbv.GeometricSPSR(0.05, 0.2, 6)
 POSTERIOR = MODEL.condition(CLOUD)
@@ -139,7 +140,10 @@ REFUSED = {
     "a batch for a posterior": (lambda: MODEL.condition(SCANS), "batch"),
     "a batch to thin": (lambda: nbv.farthest_point_subsample(SCANS, 3), "batch"),
     "a batch to join": (lambda: nbv.concatenate(CLOUD, SCANS), "batch"),
-    "a batch to measure": (lambda: nbv.metrics.coverage(SCANS, D), "batch"),
+    "a batch to measure": (
+        lambda: nbv.metrics.coverage([nbv.View(POSE, SCANS, CLOUD, None, SMALL)], D),
+        "rows of shape",
+    ),
     "text as a cloud": (lambda: nbv.ScreenedSPSR(MODEL).condition("x"), "'x'"),
     "complex coordinates": (lambda: nbv.PointCloud.from_arrays(D + 1j, D), "real numbers"),
     "a complex rotation": (lambda: nbv.Pose(np.eye(3) + 0j, np.zeros(3)), "real numbers"),
@@ -147,8 +151,14 @@ REFUSED = {
     "text as numbers": (lambda: nbv.look_at(["0", "0", "2"]), "real numbers"),
     "text for a frame": (lambda: nbv.Frame().to_scene("x"), "real numbers"),
     "the plane for a frame": (lambda: nbv.Frame().to_world(D[:, :2]), "(60, 2)"),
-    "a masked truth": (lambda: nbv.metrics.coverage(CLOUD, np.ma.masked_array(D, D > 0)), "masked"),
-    "a truth of the plane": (lambda: nbv.metrics.coverage(CLOUD, D[:, :2]), "(60, 2)"),
+    "a masked truth": (
+        lambda: nbv.metrics.coverage([VIEW], np.ma.masked_array(D, D > 0)),
+        "masked",
+    ),
+    "a truth of the plane": (
+        lambda: nbv.metrics.coverage([VIEW], D[:, :2]),
+        "(60, 2)",
+    ),
     "text as a radius": (lambda: nbv.sdf.Sphere("x"), "'x'"),
     "a turn about the plane": (lambda: nbv.sdf.Sphere(1.0).rotate([0.0, 1.0], 1.0), "(2,)"),
     "less text": (lambda: nbv.sdf.Sphere(1.0) - "x", "'x'"),

@@ -1,5 +1,6 @@
-"""Exact distances from many points to a cloud."""
+"""Distances from many points to a cloud: exact, or on a grid."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -17,6 +18,35 @@ def nearest_squared_distance(x: Float[Array, "n 3"], cloud: PointCloud) -> Float
     rows, not the capacity. Differentiable once or more in x and in the cloud's points.
     """
     return _nearest_squared_distance(x, cloud.points, cloud.mask)
+
+
+class DistanceField(eqx.Module):
+    """Distances to a cloud, known at the nodes of a cube about it and linear between them, to be asked at many points.
+
+    - `values`: at the nodes; `low`: the first node; `spacing`: between neighbouring ones.
+    """
+
+    values: Float[Array, "n n n"]
+    low: Float[Array, "3"]
+    spacing: Float[Array, ""]
+
+    @classmethod
+    def of(cls, cloud: PointCloud, margin: float, resolution: int = 64) -> "DistanceField":
+        """The distances to a cloud that is not empty, on so many nodes along each side of a cube that holds it with a
+        margin: what is outside is that far away."""
+        rows = cloud.mask[:, None]
+        low = jnp.min(jnp.where(rows, cloud.points, jnp.inf), axis=0) - margin
+        high = jnp.max(jnp.where(rows, cloud.points, -jnp.inf), axis=0) + margin
+        spacing = jnp.max(high - low) / (resolution - 1)
+        steps = spacing * jnp.arange(resolution)
+        nodes = low + jnp.stack(jnp.meshgrid(steps, steps, steps, indexing="ij"), axis=-1)
+        squared = nearest_squared_distance(nodes.reshape(-1, 3), cloud)
+        return cls(jnp.sqrt(squared).reshape(nodes.shape[:-1]), low, spacing)
+
+    def __call__(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """The distances, of points outside the cube those of its nearest node. Differentiable in x."""
+        places = jnp.moveaxis((x - self.low) / self.spacing, -1, 0)
+        return jax.scipy.ndimage.map_coordinates(self.values, list(places), order=1, mode="nearest")
 
 
 @jax.custom_jvp

@@ -33,14 +33,14 @@ class View(eqx.Module):
     - `scan`: what it saw, noise included; one row a pixel.
     - `cloud`: D after this view.
     - `proposal`: what the search looked at; None for the first view, which was given.
-    - `camera`: which took it, in scene units; None for the planner's.
+    - `camera`: which took it, in scene units.
     """
 
     pose: Pose
     scan: PointCloud
     cloud: PointCloud
     proposal: Proposal | None
-    camera: Camera | None = None
+    camera: Camera
 
 
 class Episode(eqx.Module):
@@ -87,8 +87,11 @@ class Episode(eqx.Module):
         views = held.read_views()
         require(len(views) > 0, f"{path} holds no view yet")
         planner = Planner(Coverage(), camera=camera_of(held.config["planner"]["camera"]))
-        known = planner.replay((pose, scan) for pose, scan, _ in views)
-        shown = tuple(View(pose, scan, after.cloud, own) for (pose, scan, own), after in zip(views, known, strict=True))
+        after = planner.replay((pose, scan) for pose, scan, _ in views)
+        shown = tuple(
+            View(pose, scan, evidence.cloud, proposal, planner.camera)
+            for (pose, scan, proposal), evidence in zip(views, after, strict=True)
+        )
         return cls(planner, None, None, views[0][0], jax.random.key(0), shown)
 
     def save(self, path: str | Path) -> None:
@@ -257,7 +260,7 @@ def steps(
         else:
             evidence = planner.observe(evidence, pose, seen, camera)
         poses.append(pose)
-        yield Step(View(pose, seen, evidence.cloud, proposal), evidence, surfaces, seconds)
+        yield Step(View(pose, seen, evidence.cloud, proposal, camera or planner.camera), evidence, surfaces, seconds)
 
 
 def scene_sensor(

@@ -34,8 +34,8 @@ class NextView(eqx.Module):
     """Where to take the next image.
 
     - `matrix`: camera to world, in the convention of the session.
-    - `value`: what the search maximises, as `Planner.propose` gives it; `standard_error`: of the value, as a mean over
-      the posterior samples; None where it is not known.
+    - `value`: what the search maximises, a length or an area in world units; `standard_error`: of the value, as a mean
+      over the posterior samples; None where it is not known.
     - `expected_depth`: what the sensor is expected to see there, in world units and at the planner's resolution: the
       mean depth over the posterior samples, NaN where most of them are missed; None without samples.
     - `proposal`: all that the search looked at, in scene coordinates.
@@ -212,7 +212,9 @@ class Session:
                     self._folder.write_proposal(index, proposal, expected)
             self._proposals[index] = proposal
             matrix = np.asarray(self.frame.to_world(proposal.pose).to_matrix(self.convention), np.float64)
-            self._next = NextView(matrix, float(proposal.value), proposal.standard_error, expected, proposal)
+            unit, error = self.frame.scale**self.planner.quantity.power, proposal.standard_error
+            value = float(proposal.value) / unit
+            self._next = NextView(matrix, value, None if error is None else error / unit, expected, proposal)
             self._tell_followers()
         return self._next
 

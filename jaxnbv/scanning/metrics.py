@@ -1,13 +1,17 @@
 """How good a set of views was, measured against the true surface: coverage, Chamfer and Hausdorff distance."""
 
-from typing import NamedTuple
+import math
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Bool, Float, PRNGKeyArray
 from scipy.spatial import cKDTree
 
 from jaxnbv.checks import AnyArray, as_numbers, require
+from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.mesh import TriangleMesh, mesh_from_sdf
 from jaxnbv.scanning.sphere_tracing import SDFSurface
@@ -15,25 +19,60 @@ from jaxnbv.scanning.surface import Surface
 
 # Of the authors: points that each of the two surfaces is sampled at.
 SURFACE_POINTS = 20_000
+# The least cosine of incidence at which a pixel shows all of the plane that it meets.
+_GRAZING = 0.2
 
 
-def coverage(cloud: PointCloud, truth: Float[AnyArray, "n 3"], radius: float = 0.05) -> float:
-    """Share of the true surface that lies near the cloud: of the n points of `truth`, those whose nearest point of the
-    cloud is at most `radius` away (both in scene units); in [0, 1].
+def coverage(views: Iterable[Any], truth: Float[AnyArray, "n 3"], size: float = 0.05) -> list[float]:
+    """Share of the true surface that has been seen after each view: of the n points of `truth`, those that a pixel of
+    this view or of one before it shows; in [0, 1].
 
-    With points that are uniform by area it is a share of area. Surface that no camera can see, such as the walls of a
-    closed cavity, counts as not covered, so a complete scan may stay below 1. The cloud's normals are not used: a sheet
-    thinner than `radius` is covered from either side. A cloud without points covers nothing.
+    - `views`: those of an episode, or others that have a `scan`, the `camera` that took it, and the `pose`.
+    - `size`: how far before or behind its pixel's hit a point may be; sensor noise is to be well below it.
 
-    **Raises:** `ValueError` if `truth` is empty or not finite, or `radius` <= 0.
+    Neither the number of rays nor how many points of D are kept matters. With points that are uniform by area it is a
+    share of area. Surface that no camera can see, such as the walls of a closed cavity, counts as not covered, so a
+    complete scan may stay below 1. A sheet thinner than `size` is covered from either side.
+
+    **Raises:** `ValueError` if `truth` is empty or not finite, `size` <= 0, or a scan is no image of its camera.
     """
     truth = _points(truth, "true surface")
-    require(radius > 0, f"the radius is {radius}; it must be positive, in scene units")
-    points, _ = cloud.to_numpy()
-    if not len(points):
-        return 0.0
-    distance, _ = cKDTree(points.astype(np.float64)).query(truth)
-    return float(np.mean(distance <= radius))
+    require(size > 0, f"the size is {size}; it must be positive, in scene units")
+    seen = np.zeros(len(truth), bool)
+    shares = []
+    for view in views:
+        seen |= shows(view.scan, view.camera, view.pose, truth, size)
+        shares.append(float(seen.mean()))
+    return shares
+
+
+def shows(
+    scan: PointCloud, camera: Camera, pose: Pose, truth: Float[np.ndarray, "n 3"], size: float
+) -> Bool[np.ndarray, " n"]:
+    """Whether a scan shows each of some points of the true surface: the point is as far away as the hit of the pixel
+    that it falls into, to `size` and to what the hit's plane gains within half a pixel.
+
+    **Raises:** `ValueError` if the scan is no image of the camera.
+    """
+    points, normals, mask = (np.asarray(rows) for rows in (scan.points, scan.normals, scan.mask))
+    require(
+        points.shape == (camera.num_rays, 3),
+        f"the scan has rows of shape {points.shape[:-1]} but the camera {camera.height} x {camera.width} rays: give "
+        "the camera that took it",
+    )
+    position, rotation = np.asarray(pose.position, np.float64), np.asarray(pose.rotation, np.float64)
+    local = (truth - position) @ rotation
+    ahead = local[:, 2] > 0
+    column, row = np.floor(camera.to_pixels(local[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None])).T
+    inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    pixel = np.where(inside, row * camera.width + column, 0).astype(int)
+
+    ray = points - position
+    distance = np.linalg.norm(ray, axis=1)
+    cosine = np.maximum(np.abs(np.sum(ray * normals, axis=1)) / np.maximum(distance, 1e-12), _GRAZING)
+    gain = 0.5 * math.hypot(*(1.0 / f for f in camera.focal_lengths)) * distance * np.sqrt(1.0 / cosine**2 - 1.0)
+    farther = np.linalg.norm(local, axis=1) - distance[pixel]
+    return inside & mask[pixel] & (np.abs(farther) <= size + gain[pixel])
 
 
 def truth_points(scene: Surface, key: PRNGKeyArray, count: int = SURFACE_POINTS) -> Float[np.ndarray, "count 3"] | None:

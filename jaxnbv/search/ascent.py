@@ -64,7 +64,7 @@ class Ascent(eqx.Module):
     def check(self, acquisition: Acquisition, camera: Camera, capacity: int) -> None:
         """Raise `ValueError` if the acquisition has no gradient, or the space makes no sense for the camera."""
         self.space.check_camera(camera)
-        check_differentiable(acquisition, capacity, camera.num_rays)
+        check_differentiable(acquisition, capacity, camera)
 
     def climb(self, problem: Problem, candidates: Pose) -> Proposal:
         """The best pose on the trajectories from the best candidates, or the best candidate if none is better."""

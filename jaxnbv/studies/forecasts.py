@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnbv.acquisition import Acquisition, expected_value
+from jaxnbv.acquisition import Acquisition, expected_value, scores
 from jaxnbv.checks import AnyArray, InputError, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
@@ -240,7 +240,7 @@ def _judge(
     inside = jnp.mean(surfaces.values < 0, axis=0)
     expected = expected_value(acquisition, cloud, surfaces, camera, truth.candidates)
     context = acquisition.context(cloud)
-    true_values = jax.lax.map(lambda true: acquisition(context, true), truth.scans, batch_size=acquisition.batch_size)
+    true_values = scores(acquisition, context, truth.scans, camera, truth.candidates)
     return error, share, inside, expected, true_values
 
 

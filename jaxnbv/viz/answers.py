@@ -10,7 +10,6 @@ import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -238,13 +237,14 @@ class _ColdestWords(Words):
 
 
 class CoverageAnswer(Answer):
-    """The share of the true surface that was seen, or where that is not known the number of points.
-
-    - `radius`: within which of the cloud a place counts as seen, in scene units; None where points are counted.
-    """
+    """The share of the true surface that was seen; where that is not known, the number of points kept."""
 
     form: str = "{:.0%}"
-    radius: float | None = eqx.field(default=None)
+
+    @property
+    def is_share(self) -> bool:
+        """Whether it is a share."""
+        return self.form.endswith("%}")
 
 
 class _CoverageWords(Words):
@@ -259,10 +259,10 @@ class _CoverageWords(Words):
         return f"{self._value(self.answer, 0)} {self.answer.names[0]}"
 
     def panels(self, truth: Answer | None) -> tuple[Panel, ...]:
-        names, values, radius = self.answer.names, self.answer.values, self.answer.radius
-        if radius is None:
+        names, values = self.answer.names, self.answer.values
+        if not self.answer.is_share:
             return (Panel(names[0], names, values),)
-        return (Panel(f"coverage (% within {radius:g})", names, 100.0 * values, goal=100.0),)
+        return (Panel("surface seen (%)", names, 100.0 * values, goal=100.0),)
 
 
 for _kind, _words in {

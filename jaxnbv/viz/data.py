@@ -29,7 +29,6 @@ from jaxnbv.viz.task import Task, task_of
 from jaxnbv.viz.trajectories import Ascents, SphereMap, ascents_of, open_values, wider_map
 from jaxnbv.viz.words import describe_choice, describe_first
 
-COVERAGE_RADIUS = 0.05
 # The variance of one point costs a triangular solve with the whole cloud, the slope two evaluations of the mean.
 _DEVIATION_ANCHORS = 256
 _SLOPE_ANCHORS = 1024
@@ -99,7 +98,7 @@ class ViewData(eqx.Module):
     - `surface`: with a deviation that allows for what was not seen; None where the posterior mean has no surface within
       the grid.
     - `choice`: None for a view that was given.
-    - `coverage`: share of the true surface within `COVERAGE_RADIUS` of the cloud; None where the truth is not known.
+    - `coverage`: share of the true surface that was seen; None where the truth is not known.
     - `count`: points of the cloud after this view.
     - `sentence`: what happened, in words.
     - `imagined`: what was imagined before it was taken; None for a view that was given.
@@ -154,8 +153,10 @@ def report_data(
     if truth is None and episode.scene is not None:
         truth = truth_points(episode.scene, jax.random.key(0))
     values = planner.quantity
-    covered = [None if truth is None else coverage(view.cloud, truth, COVERAGE_RADIUS) for view in episode.views]
-    task = task_of(episode, covered, COVERAGE_RADIUS)
+    covered: list[float | None] = [None] * len(episode.views)
+    if truth is not None:
+        covered = [*coverage(episode.views, truth)]
+    task = task_of(episode, covered)
     drawn: list[ViewData] = []
     known: Evidence | None = None
     bar = tqdm(
@@ -165,7 +166,7 @@ def report_data(
         choice = None if view.proposal is None else choice_of(view.proposal, wider_map(episode, index))
         new, _ = view.scan.to_numpy()
         before = episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), new.dtype)
-        camera = view.camera or planner.camera
+        camera = view.camera
         drawn.append(
             ViewData(
                 number=index + 1,

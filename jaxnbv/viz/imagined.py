@@ -90,7 +90,7 @@ def imagined(episode: Episode, index: int, evidence: Evidence) -> Imagined | Non
         for i, pose in enumerate((view.pose, other or view.pose))
     ]
     true = [_true_scan(episode, camera, pose) for pose in (view.pose, other or view.pose)]
-    own = view.camera or planner.camera
+    own = view.camera
     taken = look(view.scan, own, view.pose, cloud) if view.scan.capacity == own.num_rays else None
     seen = taken if true[0] is None else look(true[0], camera, view.pose, cloud)
     beside = None

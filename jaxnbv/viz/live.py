@@ -142,7 +142,7 @@ def _cameras(scene: Any, episode: Episode) -> list[Any]:
     found = []
     for number, view in enumerate(episode.views, start=1):
         colour = NEW if number == len(episode.views) else GREY
-        camera = view.camera or episode.planner.camera
+        camera = view.camera
         found.append(_frustum(scene, f"/cameras/view {number}", camera, view.pose, colour))
         # It goes with its camera.
         scene.add_label(f"/cameras/view {number}/number", str(number))

@@ -42,10 +42,10 @@ class Task(eqx.Module):
         return isinstance(self.answers[-1], CoverageAnswer)
 
 
-def task_of(episode: Episode, covered: list[float | None], radius: float) -> Task:
+def task_of(episode: Episode, covered: list[float | None]) -> Task:
     """The task of an episode's acquisition; that of seeing all of the surface, where it answers nothing.
 
-    - `covered`: the share of the true surface that was seen after each view, within `radius`; None where not known.
+    - `covered`: the share of the true surface that was seen after each view; None where not known.
     """
     acquisition = episode.planner.acquisition
     given = [acquisition.answer(view.cloud) for view in episode.views]
@@ -55,9 +55,7 @@ def task_of(episode: Episode, covered: list[float | None], radius: float) -> Tas
         cloud = true_cloud(episode.scene)
         truth = None if cloud is None else acquisition.true_answer(episode.scene, cloud)
     if len(answers) < len(given):
-        answers = [
-            _coverage(int(view.cloud.count), share, radius) for view, share in zip(episode.views, covered, strict=True)
-        ]
+        answers = [_coverage(int(view.cloud.count), share) for view, share in zip(episode.views, covered, strict=True)]
     panels = tuple(words_of(answer).panels(truth) for answer in answers)
     head = _asked(episode.planner), _found(answers, truth), _sure(answers, episode)
     return Task(tuple(answers), truth, panels, *head)
@@ -80,10 +78,10 @@ def since(answers: list[Answer]) -> int | None:
     return None if not relied[-1] else len(relied) - int(np.argmin([*relied[::-1], False]) - 1)
 
 
-def _coverage(count: int, share: float | None, radius: float) -> CoverageAnswer:
+def _coverage(count: int, share: float | None) -> CoverageAnswer:
     if share is None:
         return CoverageAnswer(("points kept",), np.array([float(count)]), "{:,.0f}")
-    return CoverageAnswer(("of the surface seen",), np.array([share]), radius=radius)
+    return CoverageAnswer(("of the surface seen",), np.array([share]))
 
 
 def _asked(planner: Planner) -> str:

@@ -14,7 +14,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from matplotlib.transforms import ScaledTranslation
 
 from jaxnbv.viz.answers import Panel, label_of, number
-from jaxnbv.viz.data import COVERAGE_RADIUS, ReportData
+from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.style import BEFORE, GREY, INK, LINE, NEW, SERIES
 
 _MOST_NAMES, _LONGEST_NAME = 6, 22
@@ -104,7 +104,7 @@ def coverage_series(data: ReportData) -> tuple[str, Float[np.ndarray, " v"]]:
     if any(share is None for share in shares):
         return "points kept", np.array([float(view.count) for view in data.views])
     values = np.array([100.0 * share for share in shares if share is not None])
-    return f"coverage (% within {COVERAGE_RADIUS:g})", values
+    return "surface seen (%)", values
 
 
 def draw_coverage(axes: Axes, data: ReportData) -> None:

@@ -62,8 +62,10 @@ def test_its_matrices_are_those_that_were_given(finished):
     assert distance.min() < 1e-5
     index = int(np.argmax(np.asarray(proposed.proposal.values)))
     assert int(distance.argmin()) == index
-    assert proposed.value == pytest.approx(float(proposed.proposal.values[index]))
-    assert proposed.standard_error == pytest.approx(float(proposed.proposal.standard_errors[index]))
+    # Its value is an area: of the box, 0.24 m wide, the scene is 2.5 wide.
+    unit = (2.5 / max(np.subtract(BOX[1], BOX[0]))) ** 2
+    assert proposed.value * unit == pytest.approx(float(proposed.proposal.values[index]))
+    assert proposed.standard_error * unit == pytest.approx(float(proposed.proposal.standard_errors[index]))
     assert finished.next() is proposed
     assert finished.views == 3
 
@@ -98,7 +100,7 @@ def test_metres_and_millimetres_and_both_conventions_tell_the_same(convention, u
     np.testing.assert_allclose(session.next().matrix @ axes, finished.frame.to_world(first.pose).matrix, atol=1e-5)
     # Points that are rounded to millimetres are other points, of other value.
     if unit > 1:
-        assert session.next().value == pytest.approx(float(first.value), rel=1e-4)
+        assert float(session.next().proposal.value) == pytest.approx(float(first.value), rel=1e-4)
 
 
 @pytest.mark.parametrize("elevation", [-0.5 * np.pi, -0.3, 0.5])

@@ -21,7 +21,7 @@ from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.search import DiscreteSearch, FarthestView
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage, Covered, CrossEntropy, Found, NegativeEntropy, SoftPartCount, Sure
-from jaxnbv.tasks.coverage import expected_coverage
+from jaxnbv.tasks.new_surface import expected_coverage
 
 SCENE, FIRST, KEY = SDFSurface(Sphere(0.8)), look_at((0.0, 0.0, 2.5)), jax.random.key(3)
 CAMERA, GRID = Camera(height=12, width=12), Grid(24)
@@ -99,8 +99,8 @@ def test_found_counts_the_points_of_the_parts_that_are_asked_for(parts, points, 
     assert (reason is not None) == stops
 
 
-@pytest.mark.parametrize(("points", "radius"), [(40, 0.1), (150, 0.1), (40, 0.2)])
-def test_expected_coverage_is_that_of_the_samples(points, radius, monkeypatch):
+@pytest.mark.parametrize(("points", "size"), [(40, 0.1), (150, 0.1), (40, 0.2)])
+def test_expected_coverage_is_that_of_the_samples(points, size, monkeypatch):
     """Of a posterior that holds one ball alone, whose rays and points are found anew in float64."""
     axis = np.asarray(Grid(64).axis)
     distance = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1), axis=-1) - 0.8
@@ -108,7 +108,7 @@ def test_expected_coverage_is_that_of_the_samples(points, radius, monkeypatch):
     planner = planner_of(Coverage())
     monkeypatch.setattr(Imagination, "sample", lambda self, evidence, key: ball)
     cloud = cloud_of(points)
-    hits = []
+    seen_area, all_area = 0.0, 0.0
     for pose in DiscreteSearch(10).candidates.poses():
         origin = np.asarray(pose.position, np.float64)
         rays = np.asarray(CAMERA.pixel_directions(), np.float64) @ np.asarray(pose.rotation, np.float64).T
@@ -116,15 +116,20 @@ def test_expected_coverage_is_that_of_the_samples(points, radius, monkeypatch):
         along = -rays @ origin
         inside = 0.8**2 - (origin @ origin - along**2)
         seen = inside > 0
-        hits.append(origin + (along - np.sqrt(np.maximum(inside, 0.0)))[seen, None] * rays[seen])
-    hits = np.concatenate(hits)
-    nearest = np.linalg.norm(hits[:, None] - cloud.to_numpy()[0][None], axis=-1).min(axis=1)
-    share = float(np.mean(nearest <= radius))
+        along = along[seen] - np.sqrt(inside[seen])
+        hits = origin + along[:, None] * rays[seen]
+        cosine = np.maximum(-np.sum(rays[seen] * hits, axis=1) / 0.8, 0.2)
+        focal = CAMERA.focal_lengths[0]
+        area = along**2 * (rays[seen] @ np.asarray(pose.forward, np.float64)) ** 3 / focal**2 / cosine
+        nearest = np.linalg.norm(hits[:, None] - cloud.to_numpy()[0][None], axis=-1).min(axis=1)
+        all_area += area.sum()
+        seen_area += area @ np.clip(2.0 - nearest / size, 0.0, 1.0)
+    share = float(seen_area / all_area)
     assert 0.05 < share < 0.97
     known = after(planner, cloud)
-    assert expected_coverage(known, radius) == pytest.approx(share, abs=0.02)
-    assert Covered(share - 0.03, radius).after(known) is not None
-    assert Covered(min(share + 0.03, 1.0), radius).after(known) is None
+    assert expected_coverage(known, size) == pytest.approx(share, abs=0.02)
+    assert Covered(share - 0.03, size).after(known) is not None
+    assert Covered(min(share + 0.03, 1.0), size).after(known) is None
 
 
 def test_value_below_and_budgets_on_scripted_proposals():
@@ -187,7 +192,7 @@ def test_a_view_of_too_little_value_is_not_taken():
         (lambda: Sure(num_resamplings=-1), "number of resamplings is -1"),
         (lambda: Found(0), "a part is found by 0 points"),
         (lambda: Covered(1.5), "share is 1.5"),
-        (lambda: Covered(radius=0.0), "radius is 0.0"),
+        (lambda: Covered(size=0.0), "size is 0.0"),
         (lambda: Budget(), "of nothing: give seconds or cost"),
         (lambda: Budget(seconds=0.0), "must be positive"),
         (lambda: Sure().check(Coverage()), "Sure is about a class, but Coverage has no classifier"),

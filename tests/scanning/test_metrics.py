@@ -1,56 +1,73 @@
-"""Coverage against brute force and its bounds; points of known surfaces."""
+"""Coverage of a ball against the areas of its caps; points of known surfaces."""
+
+import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import jaxnbv as nbv
 from jaxnbv.scanning.metrics import coverage, truth_points
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.studies.scenes.demo import demo_object
 
-
-def random_cloud(rng, count, capacity):
-    normals = rng.normal(size=(count, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return nbv.PointCloud.from_arrays(rng.uniform(-1, 1, (count, 3)), normals, capacity)
-
-
-@settings(deadline=None, max_examples=40)
-@given(seed=st.integers(0, 2**31), count=st.integers(1, 30), radius=st.floats(0.01, 1.0))
-def test_coverage_is_the_share_found_by_brute_force(seed, count, radius):
-    rng = np.random.default_rng(seed)
-    cloud, truth = random_cloud(rng, count, 40), rng.uniform(-1, 1, (50, 3))
-    points = cloud.to_numpy()[0].astype(np.float64)
-    nearest = np.linalg.norm(truth[:, None] - points[None], axis=-1).min(axis=1)
-    share = coverage(cloud, truth, radius)
-    assert share == np.mean(nearest <= radius)
-    assert 0.0 <= share <= coverage(cloud, truth, 2 * radius) <= 1.0
+RADIUS, AWAY = 0.8, 2.5
+BALL = nbv.SDFSurface(Sphere(RADIUS))
+# Uniform by area: the share of them in any part of the ball has a standard error of 0.0035 at most.
+POINTS = RADIUS * np.asarray(nbv.fibonacci_sphere(20_000), np.float64)
+SIDES = nbv.look_at(AWAY * jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))
 
 
-def test_rows_that_are_not_filled_cover_nothing():
-    # They hold zeros, so they would cover the origin.
-    cloud = nbv.PointCloud.from_arrays([[1.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]], capacity=4)
-    truth = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    assert coverage(cloud, truth) == 0.5
-    empty = nbv.PointCloud(cloud.points, cloud.normals, cloud.mask & False)
-    assert coverage(empty, truth) == 0.0
+def views_of(camera, poses=SIDES, deviation=0.0):
+    noise = nbv.SensorNoise(deviation, deviation)
+    seen = [noise(nbv.scan(BALL, camera, pose), jax.random.key(i)) for i, pose in enumerate(poses)]
+    return [nbv.View(pose, scan, scan, None, camera) for scan, pose in zip(seen, poses, strict=True)]
+
+
+@pytest.mark.parametrize("pixels", [40, 200])
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_coverage_of_a_ball_is_the_area_of_its_caps(pixels, noise):
+    """From a distance d a ball of radius r shows (1 - r / d) / 2 of its area; from two opposite ones twice that, and
+    from the side what lies between these and half of the rest: all but two opposite parts of the belt."""
+    camera = nbv.Camera(height=pixels, width=pixels, fov=0.75)
+    shares = coverage(views_of(camera, deviation=noise), POINTS)
+    limit = RADIUS / AWAY
+    visible = [POINTS @ np.asarray(pose.position, np.float64) / AWAY >= RADIUS * limit for pose in SIDES]
+    expected = [np.mean(np.any(visible[: count + 1], axis=0)) for count in range(3)]
+    assert expected[:2] == pytest.approx([(1 - limit) / 2, 1 - limit], abs=0.01)
+    # A pixel at the limb shows a little more, or less, than the ball's own limb.
+    np.testing.assert_allclose(shares, expected, atol=0.03)
+    assert shares == sorted(shares)
+
+
+def test_a_view_past_the_object_and_points_elsewhere_are_not_covered():
+    camera = nbv.Camera(height=20, width=20)
+    away = nbv.look_at((0.0, 0.0, AWAY), target=(0.0, 0.0, 2 * AWAY))
+    assert coverage(views_of(camera, away[None]), POINTS) == [0.0]
+    inner, outer = (scale * POINTS[POINTS[:, 2] > 0.9 * RADIUS] for scale in (0.9, 1.1))
+    one = views_of(camera, SIDES[:1])
+    assert coverage(one, inner) == coverage(one, outer) == [0.0]
+    assert coverage(one, inner, size=0.1) == [1.0]
 
 
 @pytest.mark.parametrize(
-    ("truth", "radius", "message"),
+    ("truth", "size", "message"),
     [
         (np.zeros((0, 3)), 0.05, "no points"),
         (np.full((2, 3), np.nan), 0.05, "not finite"),
-        (np.zeros((2, 3)), 0.0, "radius is 0.0"),
+        (np.zeros((2, 3)), 0.0, "size is 0.0"),
     ],
 )
-def test_bad_input_is_named(truth, radius, message):
-    cloud = nbv.PointCloud.from_arrays([[1.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]])
+def test_bad_input_is_named(truth, size, message):
     with pytest.raises(ValueError, match=message):
-        coverage(cloud, truth, radius)
+        coverage(views_of(nbv.Camera(height=4, width=4)), truth, size)
+
+
+def test_a_scan_of_another_camera_is_named():
+    view = views_of(nbv.Camera(height=4, width=4))[0]
+    with pytest.raises(ValueError, match="5 x 5"):
+        coverage([dataclasses.replace(view, camera=nbv.Camera(height=5, width=5))], POINTS)
 
 
 def test_truth_of_a_solid_lies_on_its_surface():

@@ -38,7 +38,15 @@ from jaxnbv.studies.scenes import (
     pyramid_scene,
     source_view,
 )
-from jaxnbv.tasks import Classifier, ColdestPoint, Coverage, CrossEntropy, MixedEntropy, NegativeEntropy, SoftPartCount
+from jaxnbv.tasks import (
+    Classifier,
+    ColdestPoint,
+    CrossEntropy,
+    MixedEntropy,
+    NegativeEntropy,
+    NewSurface,
+    SoftPartCount,
+)
 from jaxnbv.tasks.diffusion import HeatProblem
 
 
@@ -134,11 +142,11 @@ class CoverageTask(CommandTask):
     """To see all of an object."""
 
     def acquisition(self, given: Given) -> Acquisition:
-        return Coverage()
+        return NewSurface()
 
     def demo(self, scene: int, framing: Framing, seed: int) -> Shown:
         """A laid tea mug, the only one."""
-        return Shown("mug", demo_object(), Coverage(), usual_first())
+        return Shown("mug", demo_object(), NewSurface(), usual_first())
 
 
 class ClassTask(CommandTask):

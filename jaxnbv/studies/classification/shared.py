@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.acquisition import Acquisition, Several
+from jaxnbv.acquisition import Acquisition, Several, scores
 from jaxnbv.geometry.cloud import PointCloud, concatenate
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.planner import Planner, checked_proposal
@@ -67,7 +67,7 @@ class OracleView(CandidateSearch):
     def score(self, problem: Problem, candidates: Pose) -> Float[Array, "1 1 candidates"]:
         """The values of the true scans."""
         context = problem.acquisition.context(problem.evidence.cloud)
-        return jax.lax.map(lambda scan: problem.acquisition(context, scan), self.scans)[None, None]
+        return scores(problem.acquisition, context, self.scans, problem.camera, candidates)[None, None]
 
     def pick(
         self,

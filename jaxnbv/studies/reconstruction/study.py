@@ -125,7 +125,7 @@ class ReconstructionStudy(MeshStudy):
             name: self._distances(reconstruct(mesher.imagination, evidence, name), truth, scene.index)
             for name in RECONSTRUCTIONS
         }
-        covered = [coverage(view.cloud, truth) for view in views]
+        covered = coverage(views, truth)
         return {"coverage": covered, "points": int(evidence.cloud.count), "reconstructions": found}
 
     def _distances(self, mesh: TriangleMesh | None, truth: Float[np.ndarray, "n 3"], index: int) -> Record | None:

@@ -1,0 +1,134 @@
+"""Coverage as a person means it: how much of the surface has been seen, and how much more a view would show."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxnbv.acquisition import Acquisition, Quantity, expected_value
+from jaxnbv.checks import check_fields, require
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.neighbours import DistanceField
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.tasks.stopping import SoFar, Stop
+
+# The least cosine of incidence: a pixel at a grazing angle shows a strip whose far end is seen by luck.
+_GRAZING = 0.2
+
+
+class NewSurface(Acquisition):
+    """Expected new area: how much surface an imagined scan shows that is not near D, in squared scene units.
+
+        alpha(D, scan) = sum_x a(x) clip(d(x, D) / size - 1, 0, 1)
+
+    over the hits x of the scan, where d is the distance to the nearest point of D, and a(x) = r^2 omega / cos the area
+    of the pixel on the surface: omega its solid angle, r the distance, cos that of the angle of incidence, at least
+    0.2. The rays of one scan do not overlap, so no part of the surface counts twice; and neither near surfaces, which
+    fill more pixels, nor a single point far from all others outweighs the rest, as in the paper's `Coverage`. It is
+    differentiable in the pose wherever `Coverage` is.
+
+    - `size`: what lies within this distance of D has been seen; what is twice as far is new. In scene units, not below
+      the distance between neighbouring points of D.
+
+    **Raises:** `ValueError` if the size is not positive.
+    """
+
+    size: float = eqx.field(static=True, default=0.1)
+
+    def __check_init__(self):
+        check_fields(self)
+        require(self.size > 0, f"the size is {self.size}; it must be positive, in scene units")
+
+    def context(self, cloud: PointCloud) -> DistanceField:
+        """How far it is to D, on a grid about it."""
+        return DistanceField.of(cloud, 2.0 * self.size)
+
+    def score(self, context: DistanceField, scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, ""]:
+        """The new area of one scan; zero for a scan that sees nothing."""
+        return jnp.sum(visible_area(scan, camera, pose) * self.newness(context, scan.points))
+
+    def newness(self, distance: DistanceField, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """From 0 beside D to 1 at twice the size."""
+        return jnp.clip(distance(points) / self.size - 1.0, 0.0, 1.0)
+
+    @property
+    def quantity(self) -> Quantity:
+        meaning = "area that an imagined scan shows and no scan has shown before, mean over posterior samples."
+        return Quantity("expected new area", "scene units²", meaning, power=2)
+
+    @property
+    def batch_size(self) -> int:
+        """Many scans at once: little is computed of each."""
+        return 128
+
+
+def visible_area(scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, " rays"]:
+    """The area of each pixel on the surface that it shows, in squared scene units; zero where it shows none.
+
+    A pixel of focal lengths fx and fy at depth z and distance r has r^2 omega = z^3 / (r fx fy).
+    """
+    offset = jnp.where(scan.mask[:, None], scan.points - pose.position, pose.forward)
+    depth = jnp.matmul(offset, pose.forward, precision="highest")
+    distance = jnp.linalg.norm(offset, axis=-1)
+    cosine = jnp.abs(jnp.sum(offset * scan.normals, axis=-1)) / distance
+    across, down = camera.focal_lengths
+    facing = depth**3 / (distance * across * down)
+    return jnp.where(scan.mask, facing / jnp.maximum(cosine, _GRAZING), 0.0)
+
+
+class ShownArea(Acquisition):
+    """New area and all area of a scan: for `expected_value`, not for a search."""
+
+    of: NewSurface
+
+    def context(self, cloud: PointCloud) -> DistanceField:
+        return self.of.context(cloud)
+
+    def score(self, context: Any, scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, "2"]:
+        area = visible_area(scan, camera, pose)
+        return jnp.stack([jnp.sum(area * self.of.newness(context, scan.points)), jnp.sum(area)])
+
+    @property
+    def batch_size(self) -> int:
+        return self.of.batch_size
+
+
+class Covered(Stop):
+    """Stop once expected coverage reaches `share`: of the area of the sampled surfaces that the candidates would show,
+    what is not new, as `NewSurface` says.
+
+    - `share`: within (0, 1].
+    - `size`: of `NewSurface`, in scene units.
+
+    **Raises:** `ValueError` for another share, or a size that is not positive.
+    """
+
+    share: float = eqx.field(static=True, default=0.98)
+    size: float = eqx.field(static=True, default=0.1)
+
+    def __check_init__(self):
+        check_fields(self)
+        require(0 < self.share <= 1, f"the share is {self.share}; it must lie within (0, 1]")
+        NewSurface(self.size)
+
+    def after(self, so_far: SoFar) -> str | None:
+        covered = expected_coverage(so_far, self.size)
+        return f"{100 * covered:.1f} % of what can be seen is expected to be covered" if covered >= self.share else None
+
+
+def expected_coverage(so_far: SoFar, size: float = 0.1) -> float:
+    """Share of the area that the camera would see of the posterior's surfaces, from all candidates, that is not new.
+
+    - `size`: of `NewSurface`, in scene units.
+    """
+    surfaces = so_far.imagination.sample(so_far.evidence, so_far.key)
+    barrier = so_far.imagination.barrier(so_far.camera, so_far.candidates)
+    where = so_far.evidence.cloud, surfaces, so_far.camera, so_far.candidates, barrier
+    new, shown = np.asarray(_values(ShownArea(NewSurface(size)), *where)).sum(axis=0)
+    return 1.0 - float(new / shown) if shown else 1.0
+
+
+_values = eqx.filter_jit(expected_value)
