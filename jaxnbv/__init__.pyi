@@ -78,6 +78,7 @@ from .search import Turntable as Turntable
 from .search import UncertaintyView as UncertaintyView
 from .studies import readers as readers
 from .studies import scenes as scenes
+from .studies.readers.recorded import RecordedFrames as RecordedFrames
 from .studies.scenes.banks import shape_bank as shape_bank
 from .surfaces import AsGiven as AsGiven
 from .surfaces import Fields as Fields

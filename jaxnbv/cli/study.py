@@ -8,7 +8,7 @@ import typer
 
 from jaxnbv.cli import actions
 from jaxnbv.cli.asked import Device
-from jaxnbv.cli.options import DeviceOption, StudyModel, StudyModelOption, command
+from jaxnbv.cli.options import REQUIRED, DeviceOption, StudyModel, StudyModelOption, command
 from jaxnbv.studies.registry import STUDIES, Entry
 from jaxnbv.studies.scenes import Framing
 
@@ -64,6 +64,23 @@ OPTIONS = {
         Path | None,
         typer.Option(help="A network's checkpoint: .safetensors, .pth or .pt.", show_default="the one that ships"),
     ],
+    "folder": Annotated[Path, typer.Argument(help="The recording.", show_default=False)],
+    "box": Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(
+            metavar="LOW HIGH",
+            help="What is to be seen: two corners of a box, six numbers in the recording's units.",
+            show_default="about nearly all that was seen",
+        ),
+    ],
+    "up": Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            metavar="X Y Z",
+            help="The direction that is upward, which becomes z of the box.",
+            show_default="as recorded",
+        ),
+    ],
     "framing": Annotated[
         Framing | None,
         typer.Option(
@@ -97,7 +114,7 @@ def _command(name: str, entry: Entry) -> Callable[..., None]:
         "scheduler": (SchedulerOption, None),
         "device": (DeviceOption, Device.AUTO),
     }
-    options = shared | {option: (OPTIONS[option], None) for option in entry.options}
+    options = shared | {option: (OPTIONS[option], REQUIRED if option == "folder" else None) for option in entry.options}
     about = (
         f"{entry.question}\n\nWrites a record a scene, tables as text and CSV, figures and pictures. Interrupted, it "
         f"continues with the next scene.\n\n{entry.settings}"

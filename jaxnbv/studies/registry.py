@@ -102,6 +102,16 @@ STUDIES = {
         pictures="jaxnbv.studies.reconstruction.pictures:write_pictures",
         options=("meshes",),
     ),
+    "recorded": Entry(
+        "jaxnbv.studies.recorded.study:RecordedStudy",
+        "Which frames of a recorded sequence show the most of a box? On a folder of 7-Scenes, of TUM RGB-D, or with a "
+        "frames.json (see RecordedFrames).",
+        "The recorded poses are the candidates. 24 x 32 rays, 8 samples on a 100^3 grid, and 2,000 points kept.",
+        scenes=6,
+        views=6,
+        model="screened",
+        options=("folder", "box", "up"),
+    ),
     "searches": Entry(
         "jaxnbv.studies.classification.searches:SearchStudy",
         "Do searches by gradient find better views than one over candidates, and what do they cost? On pyramids and "

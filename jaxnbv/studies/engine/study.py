@@ -23,7 +23,7 @@ from jaxnbv.planning.episode import Sensor, Step, scene_sensor, steps, view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Evidence, Grid, Surface
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
-from jaxnbv.search import Search, SphereCandidates
+from jaxnbv.search import Candidates, Search, SphereCandidates
 from jaxnbv.studies.engine.measures import KNOWN, UNKNOWING, Claim, Measure, Record, Row
 from jaxnbv.studies.scenes.banks import bank_poses, shape_bank
 
@@ -208,7 +208,7 @@ class Study(eqx.Module):
         return found
 
     @property
-    def candidates(self) -> SphereCandidates:
+    def candidates(self) -> Candidates:
         """Where the sensor can stand."""
         return SphereCandidates(self.num_candidates, self.radius)
 

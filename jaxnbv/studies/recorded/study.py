@@ -1,0 +1,254 @@
+"""The study of a recorded sequence: what its frames show of a box, when they are chosen one by one."""
+
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+from tqdm import tqdm
+
+from jaxnbv.checks import InputError, require
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.volume import Box
+from jaxnbv.imagination import MODELS, Imagination
+from jaxnbv.planning.episode import Sensor, Step
+from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.session import stride_of
+from jaxnbv.scanning import Surface
+from jaxnbv.scanning.surface import Hits
+from jaxnbv.search import CandidateSearch, DiscreteSearch, FarthestView, GivenPoses, RandomView, UncertaintyView
+from jaxnbv.studies.engine.measures import Claim, Measure, Record
+from jaxnbv.studies.engine.study import Chart, Panel, Scene, Study
+from jaxnbv.studies.readers.recorded import RecordedFrames
+from jaxnbv.studies.recorded.searches import EvenlySpaced, MostNewVoxels
+from jaxnbv.tasks import Coverage, NewSurface
+
+_BASELINES: dict[str, type[CandidateSearch]] = {
+    "farthest": FarthestView,
+    "uncertainty": UncertaintyView,
+    "random": RandomView,
+}
+NEW, COVERAGE, EVEN, ORACLE = "new surface", "coverage", "evenly spaced", "oracle"
+# A voxel that fewer frames have seen may be noise.
+_SEEN_BY = 3
+_VOXELS_ALONG_BOX = 80
+# Of the box's voxels that any frame shows; a first view of fewer says nothing.
+_ENOUGH = 0.05
+# Rays by which views are imagined, rows and columns.
+_RAYS = (24, 32)
+# The stride by which the box is looked for.
+_COARSE = 16
+
+
+class Recording(NamedTuple):
+    """A sequence as a study sees it, in scene units.
+
+    - `poses`: of the frames; `scans`: what each showed of the box; `camera`: by which rays.
+    - `shown`: which of the voxels that three frames or more have seen each frame shows.
+    """
+
+    poses: Pose
+    scans: tuple[PointCloud, ...]
+    camera: Camera
+    shown: Bool[np.ndarray, "frames voxels"]
+
+
+class _Unknown(Surface):
+    """The true surface of a recording, which nobody knows."""
+
+    in_jit: ClassVar[bool] = False
+
+    def trace(self, origins, directions) -> Hits:
+        """**Raises:** `ValueError` always."""
+        raise InputError("the true surface of a recording is not known: ask the study's sensor")
+
+
+class RecordedStudy(Study):
+    """Which frames of a recording show the most of a box? Settings as of `Study`, but that candidates are the recorded
+    poses, and a scene is a first view: one of the frames that show a twentieth of the box, at random.
+
+    - `folder`: of `RecordedFrames`; `up`: as it takes it.
+    - `box`: low and high corner of what is to be seen, in the recording's units.
+    - `voxel`: side of the voxels that are counted, in the recording's units.
+
+    Nothing is held out: what a chosen frame shows is what was recorded.
+
+    **Raises:** `ValueError` as `RecordedFrames` does, or if the box holds no voxel that three frames have seen.
+    """
+
+    title: ClassVar[str] = "Voxels of a recorded place that were seen"
+    explanation: ClassVar[str] = (
+        "Share of the voxels in the box, of those that three frames or more have seen, that the chosen frames show.\n"
+        "The oracle knows what each frame shows; evenly spaced frames divide the recording in time."
+    )
+    methods: ClassVar[tuple[str, ...]] = (NEW, COVERAGE, *_BASELINES, EVEN, ORACLE)
+    reference: ClassVar[str] = NEW
+    measures: ClassVar[tuple[Measure, ...]] = (
+        Measure("covered", "Voxels seen", lambda r, m: r["methods"][m]["covered"], percent=True, better="more"),
+        Measure(
+            "gain",
+            "Gain over the first view, as a share of the oracle's",
+            lambda r, m: _gains(r, m),
+            first=2,
+            percent=True,
+            better="more",
+        ),
+    )
+    claims: ClassVar[tuple[Claim, ...]] = (
+        Claim(
+            "Frames chosen by expected new area show more than those of rules that look at no surface.",
+            "covered",
+            4,
+            ("farthest", "random", EVEN),
+        ),
+    )
+    charts: ClassVar[Mapping[str, Chart]] = {"recorded": Chart(((Panel("covered"), Panel("gain")),))}
+    seed: ClassVar[int] = 11
+    quick: ClassVar[Mapping[str, Any]] = {"num_samples": 4, "grid_resolution": 48, "capacity": 1000}
+
+    folder: str = eqx.field(static=True, kw_only=True)
+    box: Box = eqx.field(static=True, kw_only=True)
+    voxel: float = eqx.field(static=True, kw_only=True)
+    up: tuple[float, float, float] | None = eqx.field(static=True, default=None)
+
+    @classmethod
+    def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
+        """
+        - `folder`, `up`: those of the study; `box`: its corners, six numbers, by default about nearly all that was
+          seen. The voxels are an eightieth of its longest side.
+        """
+        require(model in MODELS, f"nothing is known of what was recorded: give a model of {', '.join(MODELS)}")
+        folder, up = str(Path(options["folder"]).resolve()), options.get("up")
+        frames = RecordedFrames(folder, up)
+        corners = options.get("box") or _bounds(frames)
+        box = Box(tuple(corners[:3]), tuple(corners[3:]))
+        longest = max(high - low for low, high in zip(box.low, box.high, strict=True))
+        settings = dict(cls.quick) if quick else {"num_samples": 8, "grid_resolution": 100, "capacity": 2000}
+        study = cls(
+            views=views,
+            num_candidates=len(frames),
+            imagination=Imagination.preset(model, quick=quick, volume=_frame(box).to_scene(box)),
+            camera=_frame(box).to_scene(frames.camera.strided(stride_of(frames.camera))),
+            folder=folder,
+            box=box,
+            voxel=longest / _VOXELS_ALONG_BOX,
+            up=up,
+            **settings,
+        )
+        return {"": study}
+
+    @property
+    def recording(self) -> Recording:
+        """The sequence, read once a process."""
+        return _recording(self.folder, self.up, self.box, self.voxel)
+
+    @property
+    def candidates(self) -> GivenPoses:
+        return GivenPoses(self.recording.poses)
+
+    def scene(self, index: int) -> Scene:
+        return Scene(index, f"{Path(self.folder).name}, start {index}", _Unknown())
+
+    def sensor(self, scene: Scene) -> Sensor:
+        return lambda pose, key: self.recording.scans[self._frame_of(pose)]
+
+    def first_view(self, scene: Scene) -> int:
+        """Another one in each scene, as long as there are others that show enough."""
+        enough = np.flatnonzero(self.recording.shown.mean(axis=1) >= _ENOUGH)
+        require(len(enough) > 0, f"no frame of {self.folder} shows a twentieth of {self.box}: give a smaller box")
+        order = jax.random.permutation(jax.random.key(self.seed), len(enough))
+        return int(enough[order[scene.index % len(enough)]])
+
+    def planner(self, method: str, scene: Scene) -> Planner:
+        acquisition = Coverage() if method == COVERAGE else NewSurface()
+        return self.planner_of(acquisition, self._search(method), self.camera.resized(*_RAYS))
+
+    def _search(self, method: str) -> CandidateSearch:
+        if method in _BASELINES:
+            return _BASELINES[method](self.candidates)
+        if method == EVEN:
+            return EvenlySpaced(self.candidates, views=self.views)
+        if method == ORACLE:
+            return MostNewVoxels(self.candidates, shown=jnp.asarray(self.recording.shown))
+        return DiscreteSearch(self.candidates)
+
+    def truth(self, scene: Scene) -> Bool[np.ndarray, "frames voxels"]:
+        return self.recording.shown
+
+    def follow(
+        self,
+        scene: Scene,
+        truth: Bool[np.ndarray, "frames voxels"],
+        method: str,
+        methods: Sequence[str],
+        episode: Iterator[Step],
+    ) -> Record:
+        """The frames that were chosen, and the share of the voxels that they have shown after each."""
+        frames = [self._frame_of(step.view.pose) for step in episode]
+        seen = np.logical_or.accumulate(truth[frames], axis=0)
+        return {"frames": frames, "covered": seen.mean(axis=1).tolist()}
+
+    def _frame_of(self, pose: Pose) -> int:
+        """The frame that was taken from a pose."""
+        poses = self.recording.poses
+        off = jnp.abs(poses.position - pose.position).sum(-1) + jnp.abs(poses.rotation - pose.rotation).sum((-1, -2))
+        return int(jnp.argmin(off))
+
+
+def _gains(record: Record, method: str) -> list[float | None]:
+    """What views after the first added, as a share of what the oracle's have added by then."""
+    if ORACLE not in record["methods"]:
+        return [None] * (record["study_views"] - 1)
+    own, best = (record["methods"][name]["covered"] for name in (method, ORACLE))
+    return [(a - own[0]) / (b - best[0]) if b > best[0] else None for a, b in zip(own[1:], best[1:], strict=True)]
+
+
+def _points(frames: RecordedFrames, index: int, stride: int) -> Float[np.ndarray, "n 3"]:
+    """Points of a frame in the world, one of so many pixels along each axis."""
+    camera, matrix = frames.camera.strided(stride), frames.matrices[index]
+    rows = slice(stride // 2, None, stride)
+    depth = frames.depth_scale * frames.depth(index)[rows, rows].reshape(-1)
+    local = np.asarray(camera.pixel_directions(), np.float64)[depth > 0] * depth[depth > 0, None]
+    return local @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def _bounds(frames: RecordedFrames) -> list[float]:
+    """Two corners of a box that holds all but a hundredth of what was seen along each axis, to either side."""
+    found = np.concatenate([_points(frames, index, _COARSE) for index in range(len(frames))])
+    require(len(found) > 0, f"no frame of {frames.folder} has measured anything")
+    return np.percentile(found, [1, 99], axis=0).reshape(-1).tolist()
+
+
+def _frame(box: Box) -> Frame:
+    return Frame.fit(np.array([box.low, box.high]), up="z")
+
+
+@functools.cache
+def _recording(folder: str, up: tuple[float, float, float] | None, box: Box, voxel: float) -> Recording:
+    frames, frame = RecordedFrames(folder, up), _frame(box)
+    poses, stride = Pose.from_matrix(frames.matrices), stride_of(frames.camera)
+    camera = frames.camera.strided(stride)
+    nowhere, none = jnp.zeros((camera.num_rays, 3)), jnp.zeros(camera.num_rays, bool)
+    scans, seen = [], []
+    for index in tqdm(range(len(frames)), "reading frames", leave=False):
+        # One that shows nothing of the box says nothing of it.
+        scan = PointCloud(nowhere, nowhere, none, none)
+        if np.any(np.asarray(box(_points(frames, index, stride))) < 0):
+            depth = frames.depth(index)
+            scan = PointCloud.from_depth(depth, frames.camera, poses[index], frames.depth_scale, stride, box)
+        scans.append(frame.to_scene(scan))
+        seen.append(np.unique(np.floor(scan.to_numpy()[0] / voxel).astype(int), axis=0))
+    _, which, counts = np.unique(np.concatenate(seen), axis=0, return_inverse=True, return_counts=True)
+    shown = np.zeros((len(frames), len(counts)), bool)
+    shown[np.repeat(np.arange(len(frames)), [len(rows) for rows in seen]), which] = True
+    shown = shown[:, counts >= _SEEN_BY]
+    require(shown.shape[1] > 0, f"no voxel of {box} is seen by {_SEEN_BY} frames of {folder}: give another box")
+    return Recording(frame.to_scene(poses), tuple(scans), frame.to_scene(camera), shown)

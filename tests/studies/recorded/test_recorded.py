@@ -1,0 +1,257 @@
+"""Recorded sequences: three layouts of one small recording, broken ones, and what the study counts, counted anew."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+import jaxnbv as nbv
+from jaxnbv.studies.recorded.study import EVEN, NEW, ORACLE, RecordedStudy
+
+UNIT = 1000.0
+INTRINSICS = np.array([[40.0, 0.0, 23.5], [0.0, 40.0, 17.5], [0.0, 0.0, 1.0]])
+CAMERA = nbv.Camera.from_intrinsics(INTRINSICS, height=36, width=48)
+COUNT = 9
+
+
+def recorded():
+    """A ball of 0.3 m at (1, 2, 0.5), seen from a half circle about it: depths in mm and matrices in metres."""
+    center, depths, matrices = np.array([1.0, 2.0, 0.5]), [], []
+    for angle in np.linspace(0.0, np.pi, COUNT):
+        eye = center + 1.2 * np.array([np.cos(angle), np.sin(angle), 0.3])
+        pose = nbv.look_at(eye, center, up=(0.0, 0.0, 1.0))
+        ball = nbv.SDFSurface(nbv.sdf.Sphere(0.3).translate(center.tolist()))
+        scan = nbv.scan(ball, CAMERA, pose)
+        depth = (np.asarray(scan.points, np.float64) - eye) @ np.asarray(pose.forward, np.float64)
+        depths.append(np.where(scan.mask, np.round(UNIT * depth), 0).astype(np.uint16).reshape(36, 48))
+        matrices.append(np.asarray(pose.to_matrix(), np.float64))
+    return np.stack(depths), np.stack(matrices)
+
+
+@pytest.fixture(scope="module")
+def sequence():
+    return recorded()
+
+
+def save(path, depth):
+    Image.fromarray(depth).save(path)
+
+
+def seven_scenes(folder, depths, matrices):
+    for index, (depth, matrix) in enumerate(zip(depths, matrices, strict=True)):
+        hole = depth.copy()
+        # The data set's own mark of what was not measured.
+        hole[depth == 0] = 65535
+        save(folder / f"frame-{index:06d}.depth.png", hole)
+        np.savetxt(folder / f"frame-{index:06d}.pose.txt", matrix, delimiter="\t")
+    np.savetxt(folder / "camera-intrinsics.txt", INTRINSICS)
+
+
+def tum(folder, depths, matrices):
+    (folder / "depth").mkdir()
+    images, track = ["# time file"], ["# time tx ty tz qx qy qz qw"]
+    for index, (depth, matrix) in enumerate(zip(depths, matrices, strict=True)):
+        time = 1305031102.16 + 0.03 * index
+        # The data set's calibration is for images of this size.
+        whole = np.zeros((480, 640), np.uint16)
+        whole[:36, :48] = 5 * depth
+        save(folder / "depth" / f"{index}.png", whole)
+        images.append(f"{time:.6f} depth/{index}.png")
+        quaternion = Rotation.from_matrix(matrix[:3, :3]).as_quat()
+        track.append(" ".join(f"{x:.9f}" for x in [time + 0.004, *matrix[:3, 3], *quaternion]))
+    # Of this one nobody knows where it was taken.
+    images.append("1305031109.000000 depth/0.png")
+    (folder / "depth.txt").write_text("\n".join(images))
+    (folder / "groundtruth.txt").write_text("\n".join(track))
+
+
+def plain(folder, depths, matrices):
+    frames = []
+    for index, (depth, matrix) in enumerate(zip(depths, matrices, strict=True)):
+        save(folder / f"{index}.png", depth)
+        frames.append({"depth": f"{index}.png", "pose": matrix.tolist()})
+    said = {"intrinsics": INTRINSICS.tolist(), "depth_scale": 0.001, "frames": frames}
+    (folder / "frames.json").write_text(json.dumps(said))
+
+
+@pytest.mark.parametrize("layout", [seven_scenes, tum, plain])
+def test_layouts_of_one_recording_are_read_alike(layout, sequence, tmp_path):
+    depths, matrices = sequence
+    layout(tmp_path, depths, matrices)
+    frames = nbv.RecordedFrames(tmp_path)
+    assert len(frames) == COUNT
+    np.testing.assert_allclose(frames.matrices, matrices, atol=1e-6)
+    for index in (0, COUNT - 1):
+        depth = frames.depth_scale * frames.depth(index)
+        np.testing.assert_allclose(depth[:36, :48], depths[index] / UNIT, atol=1e-9)
+    expected = [[525.0, 0.0, 319.5], [0.0, 525.0, 239.5], [0.0, 0.0, 1.0]] if layout is tum else INTRINSICS
+    np.testing.assert_allclose(frames.camera.intrinsics, expected)
+
+
+def test_a_world_is_turned_upright(sequence, tmp_path):
+    depths, matrices = sequence
+    tilt = Rotation.from_euler("xyz", [0.4, -0.7, 1.1]).as_matrix()
+    turned = matrices.copy()
+    turned[:, :3, :] = tilt @ matrices[:, :3, :]
+    plain(tmp_path, depths, turned)
+    frames = nbv.RecordedFrames(tmp_path, up=tuple((3.0 * tilt[:, 2]).tolist()))
+    # Heights are those before the world was tilted, and so are all distances.
+    np.testing.assert_allclose(frames.matrices[:, 2, 3], matrices[:, 2, 3], atol=1e-9)
+    steps = [np.diff(m[:, :3, 3], axis=0) for m in (frames.matrices, matrices)]
+    np.testing.assert_allclose(*(np.linalg.norm(step, axis=1) for step in steps), atol=1e-9)
+    assert frames.matrices[0, :3, :3].T @ frames.matrices[0, :3, :3] == pytest.approx(np.eye(3), abs=1e-6)
+
+
+def broken(folder, depths, matrices, name):
+    """A recording with one thing wrong."""
+    if name == "empty":
+        return
+    if name.startswith("tum"):
+        tum(folder, depths, matrices)
+        if name == "tum: other times":
+            (folder / "depth.txt").write_text("17.0 depth/0.png")
+        elif name == "tum: no times":
+            (folder / "depth.txt").write_text("depth/0.png")
+        else:
+            (folder / "depth" / "1.png").unlink()
+        return
+    if name.startswith("json"):
+        plain(folder, depths, matrices)
+        said = json.loads((folder / "frames.json").read_text())
+        if name == "json: no scale":
+            del said["depth_scale"]
+        elif name == "json: no frames":
+            said["frames"] = []
+        elif name == "json: a pose of three rows":
+            said["frames"][0]["pose"] = np.eye(3).tolist()
+        text = json.dumps(said)
+        (folder / "frames.json").write_text(text[:-9] if name == "json: cut" else text)
+        return
+    seven_scenes(folder, depths, matrices)
+    if name == "a pose is missing":
+        (folder / "frame-000003.pose.txt").unlink()
+    elif name == "a pose is no pose":
+        np.savetxt(folder / "frame-000003.pose.txt", np.full((4, 4), 0.5))
+    elif name == "an image is cut":
+        whole = (folder / "frame-000000.depth.png").read_bytes()
+        (folder / "frame-000000.depth.png").write_bytes(whole[:60])
+    elif name == "an image of colours":
+        Image.new("RGB", (48, 36)).save(folder / "frame-000000.depth.png")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("empty", "holds no recorded sequence"),
+        ("tum: other times", "no image of .* has a pose"),
+        ("tum: no times", r"depth\.txt is damaged"),
+        ("tum: an image is missing", r"1 of the 9 files .*1\.png"),
+        ("json: no scale", "has no depth_scale"),
+        ("json: no frames", "must each have a depth"),
+        ("json: a pose of three rows", r"shape \(3, 3\)"),
+        ("json: cut", "is no JSON"),
+        ("a pose is missing", r"no file .*000003\.pose"),
+        ("a pose is no pose", "is no pose"),
+        ("an image is cut", "cannot read the depth image"),
+        ("an image of colours", "one channel of 16 bit"),
+    ],
+)
+def test_what_is_broken_is_named(name, message, sequence, tmp_path):
+    broken(tmp_path, *sequence, name)
+    with pytest.raises(ValueError, match=message):
+        nbv.RecordedFrames(tmp_path)
+
+
+def test_a_frame_that_is_not_there_and_an_up_that_is_none_are_named(sequence, tmp_path):
+    plain(tmp_path, *sequence)
+    with pytest.raises(ValueError, match="no frame 9"):
+        nbv.RecordedFrames(tmp_path).depth(COUNT)
+    with pytest.raises(ValueError, match="give a direction"):
+        nbv.RecordedFrames(tmp_path, up=(0.0, 0.0, 0.0))
+
+
+LOW, HIGH = (0.6, 1.6, 0.3), (1.4, 2.4, 0.9)
+VIEWS = 3
+
+
+@pytest.fixture(scope="module")
+def study(sequence, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("recording")
+    plain(folder, *sequence)
+    return RecordedStudy.configured("screened", VIEWS, quick=True, folder=folder, box=(*LOW, *HIGH))[""]
+
+
+def voxels_of(study, depth, matrix):
+    """Those in the box that a depth image shows, by its pixels, in float64."""
+    row, column = np.nonzero(depth)
+    z = depth[row, column] / UNIT
+    (fx, _, cx), (_, fy, cy), _ = INTRINSICS
+    local = np.stack([(column - cx) / fx * z, (row - cy) / fy * z, z], axis=1)
+    world = local @ matrix[:3, :3].T + matrix[:3, 3]
+    inside = np.all((world > LOW) & (world < HIGH), axis=1)
+    return {tuple(place) for place in np.floor(world[inside] / study.voxel).astype(int)}
+
+
+def test_its_voxels_are_those_that_three_frames_have_seen(study, sequence):
+    """Points are smoothed by a plane before they are counted, so a few lie in the next voxel."""
+    seen = [voxels_of(study, *frame) for frame in zip(*sequence, strict=True)]
+    often = {place for place in set().union(*seen) if sum(place in one for one in seen) >= 3}
+    shown = study.recording.shown
+    assert shown.shape[1] == pytest.approx(len(often), rel=0.1)
+    expected = [len(one & often) / len(often) for one in seen]
+    np.testing.assert_allclose(shown.mean(axis=1), expected, atol=0.05)
+    assert (shown.sum(axis=0) >= 3).all()
+
+
+def test_every_method_is_measured_by_what_its_frames_show(study):
+    record = study.run_scene(1)
+    first, shown = record["first"], study.recording.shown
+    for name, method in record["methods"].items():
+        frames = method["frames"]
+        assert frames[0] == first, name
+        assert len(set(frames)) == VIEWS
+        expected = [shown[frames[: count + 1]].any(axis=0).mean() for count in range(VIEWS)]
+        assert method["covered"] == pytest.approx(expected)
+    assert record["methods"][EVEN]["frames"] == [(first + 3 * part) % COUNT for part in range(VIEWS)]
+    gain = [shown[[first, other]].any(axis=0).sum() for other in range(COUNT)]
+    best = record["methods"][ORACLE]
+    assert gain[best["frames"][1]] == max(gain)
+    assert all(method["covered"][1] <= best["covered"][1] for method in record["methods"].values())
+    of_new = study.measure("gain").of(record, NEW)
+    own = record["methods"][NEW]["covered"]
+    assert of_new[1] == pytest.approx((own[2] - own[0]) / (best["covered"][2] - best["covered"][0]))
+
+
+def test_first_views_differ_and_show_enough(study):
+    firsts = [study.first_view(study.scene(index)) for index in range(4)]
+    assert len(set(firsts)) == 4
+    assert all(study.recording.shown[first].mean() >= 0.05 for first in firsts)
+
+
+def test_what_the_study_cannot_use_is_named(study, sequence, tmp_path):
+    plain(tmp_path, *sequence)
+    with pytest.raises(ValueError, match="give a model of screened, paper"):
+        RecordedStudy.configured("known", VIEWS, quick=True, folder=tmp_path)
+    away = RecordedStudy.configured("screened", VIEWS, quick=True, folder=tmp_path, box=(9, 9, 9, 10, 10, 10))[""]
+    with pytest.raises(ValueError, match="no voxel"):
+        away.run_scene(0)
+
+
+def test_a_frame_that_looks_away_shows_nothing(sequence, tmp_path):
+    depths, matrices = sequence
+    back = np.diag([-1.0, 1.0, -1.0, 1.0])
+    plain(tmp_path, np.concatenate([depths, depths[:1]]), np.concatenate([matrices, matrices[:1] @ back]))
+    study = RecordedStudy.configured("screened", VIEWS, quick=True, folder=tmp_path, box=(*LOW, *HIGH))[""]
+    shown = study.recording.shown.sum(axis=1)
+    assert shown[-1] == 0
+    assert (shown[:-1] > 0).all()
+
+
+def test_a_box_is_found_about_what_was_seen(sequence, tmp_path):
+    plain(tmp_path, *sequence)
+    box = RecordedStudy.configured("screened", VIEWS, quick=True, folder=tmp_path)[""].box
+    # All of the ball but what faces away from all cameras.
+    np.testing.assert_allclose(box.high, [1.3, 2.3, 0.8], atol=0.06)
+    np.testing.assert_allclose(box.low[:2], [0.7, 1.95], atol=0.15)
