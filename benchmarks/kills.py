@@ -39,7 +39,7 @@ def record_session(folder: Path) -> None:
         nbv.Camera(height=12, width=16),
         nbv.Imagination(nbv.GeometricSPSR(0.05, truncation=12), num_samples=2),
     )
-    session = nbv.Session(planner, camera, ((-0.12, -0.12, -0.12), (0.12, 0.12, 0.12)), folder=folder)
+    session = nbv.Session(camera, ((-0.12, -0.12, -0.12), (0.12, 0.12, 0.12)), planner, folder=folder)
     matrix = np.asarray(nbv.look_at((0.0, 0.1, 0.3)).matrix)
     while session.views < 4:
         seen, pose = nbv.scan(ball, camera, nbv.Pose.from_matrix(matrix)), nbv.Pose.from_matrix(matrix)

@@ -31,8 +31,10 @@ def depth_camera(profile) -> tuple[nbv.Camera, float]:
 def main(folder: str = "live", views: int = 10) -> None:
     pipeline = rs.pipeline()
     camera, scale = depth_camera(pipeline.start())
-    planner = nbv.Planner(nbv.Coverage(), nbv.DiscreteSearch(nbv.Reach()))
-    session = nbv.Session(planner, camera, BOX, up="z", folder=folder, until=nbv.Covered(0.9))
+    planner = nbv.Planner(
+        nbv.NewSurface(), nbv.HalvingSearch(nbv.Reach()), nbv.Camera(height=24, width=32), capacity=2000
+    )
+    session = nbv.Session(camera, BOX, planner, up="z", folder=folder, until=nbv.Covered(0.9))
     first = np.asarray(nbv.look_at((0.0, -0.4, 0.4), (0.0, 0.0, 0.15), up=(0.0, 0.0, 1.0)).matrix)
     try:
         while session.views < views and not session.done:

@@ -116,8 +116,9 @@ def main() -> None:
         publisher.publish(message)
 
     def start(found: nbv.Camera) -> nbv.Session:
-        planner = nbv.Planner(nbv.Coverage(), nbv.DiscreteSearch(nbv.Reach()))
-        return nbv.Session(planner, found, (low, high), up="z", folder=folder, until=nbv.Covered(0.9))
+        search, rays = nbv.HalvingSearch(nbv.Reach()), nbv.Camera(height=24, width=32)
+        planner = nbv.Planner(nbv.NewSurface(), search, rays, capacity=2000)
+        return nbv.Session(found, (low, high), planner, up="z", folder=folder, until=nbv.Covered(0.9))
 
     bridge = Bridge(start, lambda stamp: buffer.lookup_transform(world, camera, stamp).transform, publish)
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import InputError, check_fields, checked, require, shown
+from jaxnbv.checks import InputError, check_fields, checked, functions_of_users, is_traced, require, shown
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.geometry.pose import Pose
@@ -219,9 +219,17 @@ class Several(Acquisition):
             member.check(cloud)
 
 
-@eqx.filter_jit
 def context_of(acquisition: Acquisition, cloud: PointCloud) -> Any:
-    """What an acquisition makes of D, compiled."""
+    """What an acquisition makes of D, compiled.
+
+    **Raises:** `ValueError` for a function of the user's that JAX cannot trace.
+    """
+    with functions_of_users():
+        return _context_of(acquisition, cloud)
+
+
+@eqx.filter_jit
+def _context_of(acquisition: Acquisition, cloud: PointCloud) -> Any:
     return acquisition.context(cloud)
 
 
@@ -271,9 +279,14 @@ def expected_value(
 
     `surfaces` carries the samples along its leading axis; `barrier` is as of `scan`. The members of
     `Several` have an axis of their own.
+
+    **Raises:** `ValueError` as the acquisition's `check` does, and for a function of the user's that JAX cannot trace.
     """
-    context = acquisition.context(cloud)
-    return jnp.mean(sample_scores(acquisition, context, surfaces, camera, poses, barrier=barrier), axis=0)
+    if not is_traced(acquisition, cloud):
+        acquisition.check(cloud)
+    with functions_of_users():
+        context = acquisition.context(cloud)
+        return jnp.mean(sample_scores(acquisition, context, surfaces, camera, poses, barrier=barrier), axis=0)
 
 
 def scores(

@@ -4,10 +4,14 @@ import dataclasses
 import functools
 import inspect
 import numbers
+import traceback
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
+import equinox
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +22,8 @@ from jaxnbv.errors import InputError as InputError
 AnyArray = Array | np.ndarray
 _F = TypeVar("_F", bound=Callable[..., Any])
 _LONGEST_SHOWN = 60
+# Where what runs is not a user's.
+_OWN = tuple(str(Path(str(file)).parent) for file in (jax.__file__, equinox.__file__, __file__))
 _NUMBERS = {tuple[float, float]: "two", tuple[float, float, float]: "three"}
 _REAL = (jnp.bool_, jnp.integer, jnp.floating)
 # Of 32 bits. What is larger is infinite there.
@@ -140,6 +146,28 @@ def as_numbers(value: Any, name: str, dtype: Any = float) -> np.ndarray:
         raise
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{name} is {shown(value)}; give numbers") from error
+
+
+@contextmanager
+def functions_of_users() -> Iterator[None]:
+    """Where functions of the user's run under JAX: what they do that it cannot trace is one error with its remedy.
+
+    **Raises:** `ValueError` for a function that calls NumPy, or decides in Python by a value.
+    """
+    try:
+        yield
+    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
+        theirs = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(_OWN)]
+        if not theirs:
+            raise
+        host = isinstance(error, jax.errors.TracerArrayConversionError)
+        at = f"{theirs[-1].filename}:{theirs[-1].lineno}"
+        problem = "calls NumPy or other code outside JAX" if host else "decides in Python by a value that JAX traces"
+        remedy = "write it with jax.numpy" if host else "write it with jnp.where, or jax.lax.cond"
+        raise InputError(
+            f"{theirs[-1].name} {problem} ({at}): {remedy}, or wrap a network that is not of JAX in HostClassifier or "
+            "HostSegmenter"
+        ) from error
 
 
 def shown(value: Any) -> str:

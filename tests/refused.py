@@ -31,6 +31,7 @@ SCANS = nbv.scan(BALL, SMALL, POSES)
 D = np.random.default_rng(0).normal(size=(60, 3))
 D /= np.linalg.norm(D, axis=1, keepdims=True)
 CLOUD = nbv.PointCloud.from_arrays(D, D)
+SHOT = np.asarray((SCAN.points - POSE.position) @ POSE.forward).reshape(6, 6), np.asarray(POSE.matrix)
 VIEW = nbv.View(POSE, SCAN, CLOUD, None, SMALL)
 NOT_FINITE = nbv.PointCloud(CLOUD.points.at[0].set(jnp.nan), CLOUD.normals, CLOUD.mask)
 MODEL = nbv.GeometricSPSR(0.05, 0.2, 6)
@@ -55,6 +56,30 @@ def proposed(acquisition):
 
 def parts_of(answer):
     return proposed(nbv.ExpectedUtilityImprovement(nbv.SoftPartCount(lambda cloud: answer), 16))
+
+
+def greatest_by_numpy(cloud):
+    return np.max(np.asarray(cloud.points)[:, 1])
+
+
+def first_if_positive(cloud):
+    return cloud.points[0, 0] if cloud.points[0, 0] > 0 else jnp.zeros(())
+
+
+class Deciding(nbv.Acquisition):
+    """Scores a scan by a value that JAX traces."""
+
+    def context(self, cloud):
+        return cloud
+
+    def __call__(self, context, scan):
+        return jnp.ones(()) if scan.points[0, 0] > 0 else jnp.zeros(())
+
+
+def expected(acquisition):
+    acquisition = nbv.Planner(acquisition).acquisition
+    surfaces = P.imagination.sample(CLOUD, KEY)
+    return nbv.expected_value(acquisition, CLOUD, surfaces, SMALL, POSES)
 
 
 def session(**changes):
@@ -192,6 +217,23 @@ REFUSED = {
     "an infinite scale": (lambda: CloudSegmenter(SEGMENTER, 4, scale=float("inf")), "inf"),
     "text as classes": (lambda: CloudClassifier(CLASSIFIER, classes="abcde"), "'abcde'"),
     "too few classes": (lambda: proposed(nbv.CrossEntropy(CloudClassifier(CLASSIFIER, classes=("a",)), 16)), "names 1"),
+    "a utility of NumPy": (lambda: proposed(greatest_by_numpy), "jax.numpy"),
+    "a utility of NumPy, alone": (lambda: expected(greatest_by_numpy), "HostClassifier"),
+    "a utility of NumPy in a session": (lambda: session(planner=planner(greatest_by_numpy)).add(*SHOT), "jax.numpy"),
+    "a utility that decides": (lambda: proposed(first_if_positive), "jnp.where"),
+    "an acquisition that decides": (lambda: proposed(Deciding()), "__call__ decides"),
+    "an acquisition that decides, alone": (lambda: expected(Deciding()), "jnp.where"),
+    "a utility of several numbers": (lambda: expected(lambda cloud: cloud.points[:, 1]), "one number"),
+    "probabilities of a class": (lambda: proposed(nbv.CrossEntropy(lambda _: jnp.array([0.3, 0.7]), 16)), "logarithms"),
+    "probabilities of a class, alone": (
+        lambda: expected(nbv.CrossEntropy(lambda _: jnp.array([0.3, 0.7]))),
+        "log_softmax",
+    ),
+    "logits of a class": (lambda: proposed(nbv.CrossEntropy(lambda _: jnp.array([1.0, 2.0]), 16)), "log_softmax"),
+    "a first image of elsewhere": (
+        lambda: session().add(np.full((6, 6), 9.0), SHOT[1]),
+        "the first image shows nothing of the box",
+    ),
     "one score as several": (lambda: nbv.Several(nbv.Coverage()), "a tuple"),
     "no scores": (lambda: nbv.Several(()), "a tuple"),
     "deafening noise": (lambda: nbv.SensorNoise(0.0, 1e20), "1e+20"),
@@ -202,7 +244,6 @@ REFUSED = {
     "up is nowhere": (lambda: nbv.look_at((0, 0, 2), (0, 0, 0), (np.nan, 0, 0)), "got up"),
     "a target nowhere": (lambda: nbv.look_at((0, 0, 2), (np.nan, 0, 0)), "got target"),
     "poses of a session that are one": (lambda: session(poses=np.eye(4)), "give a batch"),
-    "a session without a planner": (lambda: session(planner=None), "give Planner"),
     "a session's box of text": (lambda: session(box="here"), "'here'"),
     "a session's folder that is none": (lambda: session(folder=3), "3"),
     "half a stride": (lambda: session(stride=2.5), "2.5"),

@@ -44,4 +44,4 @@ def planner_of(search=DiscreteSearch(), num_samples=3, capacity=400):  # noqa: B
 
 def session_of(folder=None, **changes):
     settings = {"camera": CAMERA, "box": BOX, "up": "z", "poses": POSES, "folder": folder, **changes}
-    return Session(settings.pop("planner", None) or planner_of(), **settings)
+    return Session(**{"planner": planner_of(), **settings})

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 import inspect
+import json
 import re
 import shlex
 import sys
@@ -15,6 +16,7 @@ import jax
 import numpy as np
 import pytest
 import typer
+from PIL import Image
 
 import jaxnbv as nbv
 from jaxnbv import cli
@@ -154,15 +156,15 @@ def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
     poses = poses_about_a_ball(10)
     model, search = nbv.GeometricSPSR(0.02, 0.2, 16), nbv.DiscreteSearch()
     planner = nbv.Planner(
-        nbv.Coverage(),
+        nbv.NewSurface(),
         search,
         nbv.Camera(height=18, width=24),
         nbv.Imagination(model, grid=nbv.Grid(40), num_samples=2),
         capacity=2048,
     )
-    monkeypatch.setattr(nbv, "Planner", lambda *_: planner)
+    monkeypatch.setattr("jaxnbv.planning.session._usual", lambda: planner)
     given = {"K": INTRINSICS, **CORNERS, "reachable": poses, "first": poses[0], "take_image": image_of_a_ball}
-    (block,) = (block for block in blocks("how_to/depth_camera.md") if "nbv.Session(" in block)
+    (block,) = (block for block in blocks("how_to/depth_camera.md") if "until=" in block)
     exec(block, given)
     session = given["session"]
     assert 3 <= session.views < 10
@@ -174,17 +176,32 @@ def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
     assert points[:, 0].max() > 0.08
 
 
-def test_the_block_for_a_depth_camera_runs():
+def test_the_block_for_a_recording_runs(tmp_path, monkeypatch):
+    pose = nbv.look_at((0.6, -0.6, 0.4), (0.0, 0.0, 0.1), up=(0.0, 0.0, 1.0))
+    folder = tmp_path / "recording"
+    folder.mkdir()
+    Image.fromarray(image_of_a_ball(pose.matrix)).save(folder / "0.png")
+    frames = [{"depth": "0.png", "pose": np.asarray(pose.matrix).tolist()}]
+    said = {"intrinsics": np.asarray(INTRINSICS).tolist(), "depth_scale": 0.001, "frames": frames}
+    (folder / "frames.json").write_text(json.dumps(said))
+    monkeypatch.chdir(tmp_path)
+    given = {"nbv": nbv, **CORNERS}
+    (block,) = (block for block in blocks("how_to/depth_camera.md") if "RecordedFrames" in block)
+    exec(block, given)
+    assert int(given["session"].cloud.count) > 100
+
+
+def test_the_block_for_a_depth_camera_runs(monkeypatch):
     pose = nbv.look_at((0.6, -0.6, 0.4), (0.0, 0.0, 0.1), up=(0.0, 0.0, 1.0))
     imagination = nbv.Imagination(nbv.GeometricSPSR(0.05, 0.2, 8), grid=nbv.Grid(24), num_samples=2)
-    small = nbv.Coverage(), nbv.DiscreteSearch(12), nbv.Camera(height=12, width=12), imagination
+    small = nbv.Planner(nbv.NewSurface(), nbv.DiscreteSearch(12), nbv.Camera(height=12, width=12), imagination)
+    monkeypatch.setattr(nbv, "Planner", lambda *_: small)
     given = {
         "nbv": nbv,
         "camera": nbv.Camera.from_intrinsics(INTRINSICS, 480, 640),
         "T": np.asarray(pose.matrix),
         **CORNERS,
         "depth_mm": image_of_a_ball(pose.matrix),
-        "planner": nbv.Planner(*small),
         "key": jax.random.key(0),
     }
     (block,) = (block for block in blocks("how_to/depth_camera.md") if "depth_mm" in block)
@@ -200,6 +217,7 @@ def test_the_block_for_a_depth_camera_runs():
 
 def test_no_block_of_the_depth_camera_is_left_out():
     assert [("nbv.Session(" in block, "depth_mm" in block) for block in blocks("how_to/depth_camera.md")] == [
+        (True, False),
         (True, False),
         (False, True),
     ]

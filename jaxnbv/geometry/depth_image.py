@@ -19,6 +19,10 @@ Rows = tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[A
 _OTHER_UNITS = 20.0
 
 
+class NothingInside(UserWarning):
+    """No point of a depth image lies in the box that it is to show."""
+
+
 def points_of_depth(
     depth: Real[AnyArray, "height width"], camera: Camera, pose: Pose, scale: float, stride: int, box: Box | None
 ) -> Rows:
@@ -123,5 +127,6 @@ def _warn_of_nothing_inside(points: Float[np.ndarray, "valid 3"], inside: Bool[n
             f"none of the {len(points)} points of the depth image lies in the box from {box.low} to {box.high}: they "
             f"lie from {low} to {high}. Is the pose from camera to world, in the right convention, and the box in its "
             "units?",
+            NothingInside,
             stacklevel=4,
         )

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.acquisition import Acquisition, Quantity, as_acquisition
-from jaxnbv.checks import check_fields, check_key, check_type, is_traced, require, shown
+from jaxnbv.checks import check_fields, check_key, check_type, functions_of_users, is_traced, require, shown
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
@@ -154,7 +154,9 @@ class Planner(eqx.Module):
         check_type(evidence, Evidence, "the evidence")
         check_type(surfaces, GridSurface | None, "the surfaces")
         check_type(imagined, PointCloud | None, "what is imagined")
-        return checked_proposal(_propose(self.search, self.problem(evidence, surfaces, imagined), key), surfaces)
+        with functions_of_users():
+            proposal = _propose(self.search, self.problem(evidence, surfaces, imagined), key)
+        return checked_proposal(proposal, surfaces)
 
     def observe(
         self, evidence: Evidence | PointCloud, pose: Pose, scan: PointCloud, camera: Camera | None = None

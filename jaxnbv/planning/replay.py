@@ -18,7 +18,6 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.session import NextView, Session, stride_of
 from jaxnbv.search import CandidateSearch, Proposal
 from jaxnbv.storage import SESSION_RECORD, DepthImage, open_session
-from jaxnbv.tasks import Coverage
 
 
 class StoredSession:
@@ -86,7 +85,7 @@ class StoredSession:
         sensor = {"camera": self.cameras, "box": self.box, "up": self.up, "convention": self.convention}
         poses = self.candidates() if isinstance(planner.search, CandidateSearch) else None
         settings: dict[str, Any] = {**sensor, "stride": self.stride, "poses": poses, "folder": out}
-        session = Session(planner, **settings)
+        session = Session(planner=planner, **settings)
         # What was killed may lack the answer to its last image.
         if session.views:
             yield session, session.next()
@@ -119,8 +118,7 @@ def stored_run(folder: str | Path) -> StoredRun:
 
 def _session_run(folder: str | Path) -> StoredRun:
     stored = StoredSession(folder)
-    sensor = stored.cameras, stored.box, stored.up
-    session = Session(Planner(Coverage()), *sensor, convention=stored.convention, stride=stored.stride)
+    session = Session(stored.cameras, stored.box, up=stored.up, convention=stored.convention, stride=stored.stride)
     for index in range(stored.views):
         session.add(*stored.image(index))
     asked = [stored.proposal(index) for index in range(stored.views + 1)]

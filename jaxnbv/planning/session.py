@@ -10,20 +10,22 @@ import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray, Real
+from tqdm import tqdm
 
 from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, check_type, checked, require, shown
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.depth_image import NothingInside
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
-from jaxnbv.planning.episode import Episode, View, view_keys
+from jaxnbv.planning.episode import STAGES, Episode, View, view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Watch
 from jaxnbv.scanning import Evidence, Surroundings
-from jaxnbv.search import CandidateSearch, GivenPoses, Proposal, SphereCandidates
+from jaxnbv.search import CandidateSearch, GivenPoses, HalvingSearch, Proposal, SphereCandidates
 from jaxnbv.storage import DepthImage, SessionFolder, describe
-from jaxnbv.tasks import Stop
+from jaxnbv.tasks import NewSurface, Stop
 
 # A cloud holds some thousands of points; more rays than these only take time.
 _MOST_RAYS = 20_000
@@ -51,11 +53,11 @@ class NextView(eqx.Module):
 class Session:
     """A planner at a real sensor. Matrices are 4 x 4, camera to world, in world units; so is the box.
 
-    - `planner`: in scene coordinates, as for a simulation. The scene is the box, scaled; the planner's camera is
-      replaced by the sensor's with the planner's number of pixels, and what it holds for the default volume, `Box()`,
-      by the box.
     - `camera`: the sensor, its range in world units; or several, of a rig, of which the first is planned for.
     - `box`: two corners of a box about the object, without the table.
+    - `planner`: in scene coordinates, as for a simulation. The scene is the box, scaled; the planner's camera is
+      replaced by the sensor's with the planner's number of pixels, and what it holds for the default volume, `Box()`,
+      by the box. By default it looks for `NewSurface`, by a `HalvingSearch` with 24 x 32 rays, and keeps 2,000 points.
     - `up`: the world's axis that is upward, "y" or "z" say.
     - `surroundings`: what stands around the object, in world units: `Surroundings((table,), margin=0.005)`, say.
     - `poses`: (n, 4, 4), where the sensor can be held; by default the candidates of the planner's search, in scene
@@ -66,6 +68,7 @@ class Session:
       or fewer. Whole images are kept.
     - `key`: of the posterior samples.
     - `until`: when it is done, such as `Sure(0.95) | Budget(seconds=600)`; see `jaxnbv.planning.stopping`.
+    - `progress`: whether a bar shows what it is at while it plans.
 
     **Raises:** `ValueError` for a box without inside, poses that the search has no use for, or a folder of another
     session.
@@ -74,9 +77,9 @@ class Session:
     @checked
     def __init__(
         self,
-        planner: Planner,
         camera: Camera | tuple | list,
         box: tuple | list | Box | AnyArray,
+        planner: Planner | None = None,
         up: str = "y",
         poses: Float[AnyArray, "n 4 4"] | None = None,
         folder: str | Path | None = None,
@@ -85,6 +88,7 @@ class Session:
         key: PRNGKeyArray | None = None,
         until: Stop | None = None,
         surroundings: Surroundings | None = None,
+        progress: bool = True,
     ):
         self.cameras = tuple(camera) if isinstance(camera, tuple | list) else (camera,)
         require(len(self.cameras) > 0, "the session has no camera: give one")
@@ -93,13 +97,13 @@ class Session:
         self.convention = convention
         self.box = box if isinstance(box, Box) else Box(*_corners(box))
         self.frame = Frame.fit(np.array([self.box.low, self.box.high]), up=up)
-        self.stride = stride
+        self.stride, self.progress = stride, progress
         self.key = jax.random.key(0) if key is None else key
         check_key(self.key)
         allowed = None if poses is None else self.frame.to_scene(Pose.from_matrix(poses, convention))
         sensor, volume = self.frame.to_scene(self.cameras[0]), self.frame.to_scene(self.box)
         around = None if surroundings is None else surroundings.in_scene(self.frame)
-        self.planner = _placed(planner, sensor, volume, allowed, around)
+        self.planner = _placed(_usual() if planner is None else planner, sensor, volume, allowed, around)
         self._strides = tuple(stride_of(one) if stride is None else stride for one in self.cameras)
         self._rays = tuple(one.strided(n) for one, n in zip(self.cameras, self._strides, strict=True))
         self._watch, self._asked_at = None if until is None else Watch(until, self.planner), 0
@@ -152,15 +156,14 @@ class Session:
     def done(self) -> str | None:
         """Why no more images are needed, by the rule that was given; None while they are. Asked once an image.
 
-        **Raises:** `ValueError` as `next` does, if the rule does not hold of what there is: then it is asked about what
-        comes next.
+        **Raises:** `ValueError` as `next` does, if the rule is about what comes next.
         """
         if self._watch is None or not self._views:
             return None
         if self._asked_at < self.views:
             key, *_ = view_keys(self.key, self.views)
             poses = [view.pose for view in self._views]
-            if self._watch.after(self.evidence, poses, key) is None:
+            if self._watch.after(self.evidence, poses, key) is None and self._watch.rule.plans:
                 self._watch.before(self.evidence, poses, key, self.next().proposal)
             self._asked_at = self.views
         return self._watch.reason
@@ -180,8 +183,9 @@ class Session:
         - `matrix`: where the camera truly was, which need not be what was proposed.
         - `camera`: which of a rig's cameras it is of.
 
-        **Raises:** `ValueError` as `PointCloud.from_depth`, `Pose.from_matrix`, `Planner.init` and `observe` do, or if
-        another process has added images to the folder. Nothing is changed then.
+        **Raises:** `ValueError` as `PointCloud.from_depth`, `Pose.from_matrix`, `Planner.init` and `observe` do, if the
+        first image shows nothing of the box, or if another process has added images to the folder. Nothing is changed
+        then.
         """
         pixels = as_numbers(depth, "the depth image", None)
         count = len(self.cameras)
@@ -241,7 +245,13 @@ class Session:
         """Pose and scan of an image, in scene coordinates."""
         pose = Pose.from_matrix(image.matrix, self.convention)
         camera, stride = self.cameras[image.camera], self._strides[image.camera]
-        cloud = PointCloud.from_depth(image.depth, camera, pose, image.depth_scale, stride, self.box)
+        with warnings.catch_warnings():
+            if not self._views:
+                warnings.simplefilter("error", NothingInside)
+            try:
+                cloud = PointCloud.from_depth(image.depth, camera, pose, image.depth_scale, stride, self.box)
+            except NothingInside as problem:
+                raise InputError(f"the first image shows nothing of the box: {problem}") from problem
         scan, around = self.frame.to_scene(cloud), self.planner.imagination.surroundings
         return self.frame.to_scene(pose), scan if around is None else around.without_obstacles(scan)
 
@@ -260,13 +270,17 @@ class Session:
 
     def _propose(self) -> tuple[Proposal, Float[np.ndarray, "h w"] | None]:
         sample_key, search_key, _ = view_keys(self.key, self.views)
-        surfaces = self.planner.sample(self.evidence, sample_key)
         proposed = [proposal.pose for index, proposal in sorted(self._proposals.items()) if index < self.views]
-        proposal = self.planner.choose(self.evidence.with_visited(proposed), surfaces, search_key)
+        with tqdm(total=2, leave=False, disable=not self.progress) as bar:
+            bar.set_description(f"view {self.views + 1}, {STAGES[0]}")
+            surfaces = jax.block_until_ready(self.planner.sample(self.evidence, sample_key))
+            bar.update()
+            bar.set_description(f"view {self.views + 1}, {STAGES[1]}")
+            proposal = self.planner.choose(self.evidence.with_visited(proposed), surfaces, search_key)
+            expected = None if surfaces is None else self.planner.expected_depth(surfaces, proposal.pose)
+            bar.update()
         _warn_of_little(proposal)
-        if surfaces is None:
-            return proposal, None
-        return proposal, np.asarray(self.planner.expected_depth(surfaces, proposal.pose)) / self.frame.scale
+        return proposal, None if expected is None else np.asarray(expected) / self.frame.scale
 
     def _check_alone(self, folder: SessionFolder) -> None:
         found = folder.count_images()
@@ -297,6 +311,10 @@ def _corners(box) -> tuple:
 def stride_of(camera: Camera) -> int:
     """The stride that leaves as many rays of an image as are worth their time."""
     return math.ceil(math.sqrt(camera.num_rays / _MOST_RAYS))
+
+
+def _usual() -> Planner:
+    return Planner(NewSurface(), HalvingSearch(), Camera(height=24, width=32), capacity=2000)
 
 
 def _placed(

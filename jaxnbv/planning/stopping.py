@@ -46,6 +46,10 @@ class Budget(Stop):
         require(len(given) > 0, "the budget is of nothing: give seconds or cost")
         require(all(limit > 0 for limit in given), f"the budget is {given}; it must be positive")
 
+    @property
+    def plans(self) -> bool:
+        return self.cost is not None
+
     def after(self, so_far: SoFar) -> str | None:
         if self.seconds is None or so_far.seconds < self.seconds:
             return None

@@ -282,6 +282,11 @@ def check_log_p(log_p: Array) -> None:
         f"the classifier's answer has shape {jnp.shape(log_p)}: give log-probabilities, one for each of two classes or "
         "more",
     )
+    require(
+        not bool(jnp.all(log_p >= 0)) or abs(float(jnp.sum(log_p)) - 1.0) >= 1e-3,
+        f"the classifier's answers are probabilities, which sum to {float(jnp.sum(log_p)):.4g}: give their logarithms, "
+        "or log_softmax of its logits",
+    )
     total = float(jnp.sum(jnp.exp(log_p)))
     require(
         abs(total - 1.0) < 1e-3,

@@ -34,7 +34,14 @@ class SoFar(NamedTuple):
 
 
 class Stop(eqx.Module):
-    """A rule that says when no more views are needed: one after a view, another before the next is taken."""
+    """A rule that says when no more views are needed: after a view, or before the next is taken, once it is planned.
+
+    `plans` says whether it has something to say then.
+    """
+
+    @property
+    def plans(self) -> bool:
+        return type(self).before is not Stop.before
 
     def check(self, acquisition: Acquisition) -> None:
         """Raise `ValueError` if the rule cannot hold of what views are for."""
@@ -56,6 +63,10 @@ class AnyOf(Stop):
     """The first of some rules that holds."""
 
     rules: tuple[Stop, ...]
+
+    @property
+    def plans(self) -> bool:
+        return any(rule.plans for rule in self.rules)
 
     def check(self, acquisition: Acquisition) -> None:
         for rule in self.rules:
