@@ -16,6 +16,7 @@ from .geometry.cloud import PointCloud as PointCloud
 from .geometry.cloud import concatenate as concatenate
 from .geometry.cloud import farthest_point_subsample as farthest_point_subsample
 from .geometry.frame import Frame as Frame
+from .geometry.normals import estimate_normals as estimate_normals
 from .geometry.pose import Pose as Pose
 from .geometry.pose import fibonacci_sphere as fibonacci_sphere
 from .geometry.pose import look_at as look_at
@@ -38,6 +39,7 @@ from .planning.travel import arc_length as arc_length
 from .planning.travel import rotation_angle as rotation_angle
 from .planning.travel import visiting_order as visiting_order
 from .scanning import Carving as Carving
+from .scanning import DepthNoise as DepthNoise
 from .scanning import Evidence as Evidence
 from .scanning import Grid as Grid
 from .scanning import GridSurface as GridSurface

@@ -184,6 +184,7 @@ REFUSED = {
         lambda: nbv.metrics.coverage([VIEW], D[:, :2]),
         "(60, 2)",
     ),
+    "normals of points of the plane": (lambda: nbv.estimate_normals(D[:, :2], (0.0, 0.0, 5.0)), "(60, 2)"),
     "text as a radius": (lambda: nbv.sdf.Sphere("x"), "'x'"),
     "a turn about the plane": (lambda: nbv.sdf.Sphere(1.0).rotate([0.0, 1.0], 1.0), "(2,)"),
     "less text": (lambda: nbv.sdf.Sphere(1.0) - "x", "'x'"),

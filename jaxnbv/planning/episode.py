@@ -19,7 +19,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Watch
-from jaxnbv.scanning import Evidence, GridSurface, SensorNoise, Surface, Surroundings, as_surface, scan
+from jaxnbv.scanning import DepthNoise, Evidence, GridSurface, SensorNoise, Surface, Surroundings, as_surface, scan
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.search import Proposal
 from jaxnbv.storage import EpisodeFolder, describe, open_episode
@@ -52,7 +52,7 @@ class Episode(eqx.Module):
 
     planner: Planner
     scene: Surface | None
-    noise: SensorNoise | None
+    noise: SensorNoise | DepthNoise | None
     first: Pose
     key: PRNGKeyArray
     views: tuple[View, ...]
@@ -119,7 +119,9 @@ def camera_of(description: dict[str, Any]) -> Camera:
     return Camera(**{**fields, "center": tuple(fields["center"])})
 
 
-def _config(planner: Planner, scene: Surface | None, noise: SensorNoise | None, first: Pose, key: PRNGKeyArray) -> dict:
+def _config(
+    planner: Planner, scene: Surface | None, noise: SensorNoise | DepthNoise | None, first: Pose, key: PRNGKeyArray
+) -> dict:
     return describe({"planner": planner, "scene": scene, "noise": noise, "first": first, "key": key})
 
 
@@ -130,7 +132,7 @@ def simulate(
     first: Pose,
     views: int,
     key: PRNGKeyArray,
-    noise: SensorNoise = SensorNoise(),
+    noise: SensorNoise | DepthNoise = SensorNoise(),
     folder: str | Path | None = None,
     progress: bool = True,
     until: Stop | None = None,
@@ -264,7 +266,10 @@ def steps(
 
 
 def scene_sensor(
-    scene: Surface, camera: Camera, noise: SensorNoise = SensorNoise(), surroundings: Surroundings | None = None
+    scene: Surface,
+    camera: Camera,
+    noise: SensorNoise | DepthNoise = SensorNoise(),
+    surroundings: Surroundings | None = None,
 ) -> Sensor:
     """A camera that scans a known surface, with noise, past what stands around it."""
     return lambda pose, key: observe_scene(scene, camera, pose, noise, key, surroundings)
@@ -281,7 +286,7 @@ def observe_scene(
     scene: Surface,
     camera: Camera,
     pose: Pose,
-    noise: SensorNoise,
+    noise: SensorNoise | DepthNoise,
     key: PRNGKeyArray,
     surroundings: Surroundings | None = None,
 ) -> PointCloud:
@@ -289,7 +294,7 @@ def observe_scene(
     barrier = None if surroundings is None else _barrier(surroundings, camera, pose)
     if scene.in_jit:
         return _noisy_scan(scene, camera, pose, barrier, noise, key)
-    return noise(scan(scene, camera, pose, barrier), key)
+    return noise(scan(scene, camera, pose, barrier), key, camera, pose)
 
 
 @eqx.filter_jit
@@ -303,7 +308,7 @@ def _noisy_scan(
     camera: Camera,
     pose: Pose,
     barrier: Float[Array, " rays"] | None,
-    noise: SensorNoise,
+    noise: SensorNoise | DepthNoise,
     key: PRNGKeyArray,
 ) -> PointCloud:
-    return noise(scan(scene, camera, pose, barrier), key)
+    return noise(scan(scene, camera, pose, barrier), key, camera, pose)

@@ -1,6 +1,7 @@
 """Surfaces that rays can hit, and the scanner."""
 
 from jaxnbv.scanning import metrics as metrics
+from jaxnbv.scanning.depth_noise import DepthNoise as DepthNoise
 from jaxnbv.scanning.evidence import EmptyPoints as EmptyPoints
 from jaxnbv.scanning.evidence import Evidence as Evidence
 from jaxnbv.scanning.free_space import Carving as Carving

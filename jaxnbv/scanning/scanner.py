@@ -37,8 +37,10 @@ class SensorNoise(eqx.Module):
             f"they must not be negative, nor above {_LOUDEST:g}",
         )
 
-    def __call__(self, cloud: PointCloud, key: PRNGKeyArray) -> PointCloud:
-        """The cloud with noise on its filled rows."""
+    def __call__(
+        self, cloud: PointCloud, key: PRNGKeyArray, camera: Camera | None = None, pose: Pose | None = None
+    ) -> PointCloud:
+        """The cloud with noise on its filled rows, whatever took it."""
         point_key, normal_key = jax.random.split(key)
         points = cloud.points + self.points * jax.random.normal(point_key, cloud.points.shape, cloud.points.dtype)
         normals = cloud.normals + self.normals * jax.random.normal(normal_key, cloud.normals.shape, cloud.points.dtype)
