@@ -110,6 +110,7 @@ STUDIES = {
         scenes=6,
         views=6,
         model="screened",
+        pictures="jaxnbv.studies.recorded.pictures:write_pictures",
         options=("folder", "box", "up"),
     ),
     "searches": Entry(

@@ -23,6 +23,8 @@ class Look(NamedTuple):
 _FIRST, _SECOND, _THIRD = Look("#d55e00", "-", "o"), Look("#cc79a7", "-", "v"), Look("#e69f00", "-", "^")
 LOOKS = {
     "cross-entropy": _FIRST,
+    "new surface": _FIRST,
+    "evenly spaced": Look("#cc79a7", "--", "v"),
     "entropy": _SECOND,
     "mixed": _THIRD,
     "tie-break": Look("#a33b00", "--", "h"),
