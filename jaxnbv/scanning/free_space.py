@@ -4,6 +4,7 @@ A ray says three things: it hit, and was empty up to the hit; it met nothing, an
 invalid and says nothing. A node of the grid is *seen empty* once all rays near it went past it.
 """
 
+import functools
 import math
 
 import equinox as eqx
@@ -171,7 +172,7 @@ def _free_depth(
 
 def _crossed(grid: Grid, depth: Float[Array, "h w"], camera: Camera, pose: Pose, margin: float) -> Bool[Array, "g g g"]:
     """The nodes that the rays about them have crossed, by `margin` (scene units) to all sides."""
-    # nearest[k] is the least depth within 2^k pixels; zero beside the border, beyond which nothing is known.
+    # nearest[k] is the least depth within 2^k pixels, of those that there are.
     nearest = [_least_within(depth, 1)]
     while 2 ** len(nearest) < max(depth.shape):
         nearest.append(_least_within(nearest[-1], 2 ** (len(nearest) - 1)))
@@ -186,24 +187,35 @@ def _crossed(grid: Grid, depth: Float[Array, "h w"], camera: Camera, pose: Pose,
         in_front = ahead > 2.0 * margin
         safe = jnp.where(in_front, ahead, 1.0)
         a, b = right / safe, down / safe
-        column, row = jnp.floor(camera.to_pixels(jnp.stack([a, b], axis=-1))).astype(jnp.int32).T
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        place = camera.to_pixels(jnp.stack([a, b], axis=-1)).T
+        # With rays on all sides of it.
+        inside = (place >= 0.5) & (place <= jnp.array([[camera.width - 0.5], [camera.height - 0.5]]))
+        column, row = jnp.floor(place).astype(jnp.int32)
         # A ball's image is stretched off the axis, at most by this; one pixel more takes in the rays on both sides.
         radius = max(camera.focal_lengths) * margin / (safe - margin) * (1.0 + a**2 + b**2) + 1.0
-        level = jnp.maximum(jnp.ceil(jnp.log2(radius)), 0).astype(jnp.int32)
-        known = in_front & inside & (level < len(nearest))
-        index = [jnp.where(known, i, 0) for i in (level, row, column)]
-        return (known & (pyramid[tuple(index)] >= ahead + margin)).reshape(grid.resolution, -1)
+        radius = jnp.ceil(radius)
+        level = jnp.floor(jnp.log2(radius)).astype(jnp.int32)
+        known = in_front & inside.all(axis=0) & (level < len(nearest))
+        level = jnp.where(known, level, 0)
+        # A square of any size is that of four squares of the power of two below, which overlap.
+        aside = jnp.where(known, radius.astype(jnp.int32) - 2**level, 0)
+        corners = [
+            pyramid[level, jnp.clip(row + down, 0, camera.height - 1), jnp.clip(column + across, 0, camera.width - 1)]
+            for down in (-aside, aside)
+            for across in (-aside, aside)
+        ]
+        least = functools.reduce(jnp.minimum, corners)
+        return (known & (least >= ahead + margin)).reshape(grid.resolution, -1)
 
     return jax.lax.map(slab, axis)
 
 
 def _least_within(image: Float[Array, "h w"], pixels: int) -> Float[Array, "h w"]:
-    """The least of each pixel and those `pixels` rows and columns away, zero beyond the border."""
+    """The least of each pixel and those `pixels` rows and columns away; beyond the border there are none."""
     for axis in (0, 1):
         pad = [(0, 0), (0, 0)]
         pad[axis] = (pixels, pixels)
-        padded = jnp.pad(image, pad)
+        padded = jnp.pad(image, pad, constant_values=jnp.inf)
         size = image.shape[axis]
         shifted = [jax.lax.slice_in_dim(padded, start, start + size, axis=axis) for start in (0, pixels, 2 * pixels)]
         image = jnp.minimum(jnp.minimum(shifted[0], shifted[1]), shifted[2])

@@ -44,13 +44,15 @@ def segment_meets(name, x, pose):
     return np.maximum(enter.max(axis=-1), 0.0) < np.minimum(leave.min(axis=-1), 1.0)
 
 
-def wholly_free(name, node, radius, camera, pose):
-    """Whether the whole ball about each node is in the image, in front of the camera and before the solid."""
+def wholly_free(name, node, radius, camera, pose, in_image=True):
+    """Whether the whole ball about each node is in front of the camera and before the solid, and in the image; or all of
+    it that is in the image."""
     shell = np.asarray(fibonacci_sphere(80), np.float64)
     ball = node[:, None] + radius[:, None, None] * np.concatenate([np.zeros((1, 3)), shell])
     column, row, ahead = image(ball, camera, pose)
     seen = (ahead > 0) & (column > 0) & (column < camera.width) & (row > 0) & (row < camera.height)
-    return (seen & ~segment_meets(name, ball, pose)).all(axis=1)
+    free = ~segment_meets(name, ball, pose)
+    return ((seen & free) if in_image else (~seen | free)).all(axis=1)
 
 
 def pixel(node, camera, pose):
@@ -66,13 +68,14 @@ def test_a_marked_node_has_a_free_ball_about_it_and_well_inside_free_space_nodes
     nodes = nodes_of(GRID)
     some = RNG.choice(np.flatnonzero(marked), 1000)
     node = nodes.reshape(-1, 3)[some]
-    free = wholly_free(name, node, margin * GRID.spacing - slack * pixel(node, CAMERA, POSE), CAMERA, POSE)
+    radius = margin * GRID.spacing - slack * pixel(node, CAMERA, POSE)
+    free = wholly_free(name, node, radius, CAMERA, POSE, in_image=False)
     assert free.all(), f"{(~free).sum()} of 1000 marked nodes are not free"
 
     column, row, ahead = image(nodes, CAMERA, POSE)
     in_image = (ahead > 0) & (column > 0) & (column < CAMERA.width) & (row > 0) & (row < CAMERA.height)
     node = nodes[in_image]
-    radius = 2.0 * GRID.spacing + margin * GRID.spacing + 3.0 * pixel(node, CAMERA, POSE)
+    radius = margin * GRID.spacing + 3.0 * pixel(node, CAMERA, POSE)
     well_inside = np.concatenate(
         [wholly_free(name, node[i : i + 2000], radius[i : i + 2000], CAMERA, POSE) for i in range(0, len(node), 2000)]
     )
@@ -142,7 +145,7 @@ def marked_and_inside(centre, radius, half, axis, angle, start, end, direction, 
     return jnp.sum(empty), jnp.sum(inside), jnp.sum(empty & inside)
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=200, deadline=None, derandomize=True)
 @given(st.integers(0, 2**31))
 def test_noise_on_any_solid_from_anywhere_carves_nothing_of_it(seed):
     """Nodes 0.036 apart: the margin is 3.6 standard deviations."""
