@@ -45,7 +45,7 @@ def segment_meets(name, x, pose):
 
 
 def wholly_free(name, node, radius, camera, pose, in_image=True):
-    """Whether the whole ball about each node is in front of the camera and before the solid, and in the image; or all of
+    """Whether the whole ball about each node is in front of the camera, before the solid and in the image; or all of
     it that is in the image."""
     shell = np.asarray(fibonacci_sphere(80), np.float64)
     ball = node[:, None] + radius[:, None, None] * np.concatenate([np.zeros((1, 3)), shell])
