@@ -100,7 +100,7 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
         (("demo", "--task", "coverage", "--out", "flat.obj"), ("flat.obj", "File exists")),
         (("demo", "--task", "coverage", "--until", "surely=3"), ("'surely=3'", "sure", "never")),
         (("demo", "--task", "coverage", "--until", "sure"), ("'sure'", "a number")),
-        (("demo", "--task", "coverage", "--until", "sure=0.9"), ("Coverage", "classifier")),
+        (("demo", "--task", "coverage", "--until", "sure=0.9"), ("NewSurface", "classifier")),
         (("demo", "--vews", "3"), ("--vews", "--views")),
         (("demo", "--search", "best"), ("best", "discrete")),
         (("demo", "--task", "coverage", "--out", "occupied"), ("occupied", "other files")),

@@ -106,9 +106,9 @@ def test_the_realsense_loop_runs(monkeypatch, tmp_path, capsys):
         return matrix
 
     class Small(example.nbv.Session):
-        def __init__(self, planner, camera, box, **given):
+        def __init__(self, camera, box, planner, **given):
             assert camera.intrinsics == pytest.approx(CAMERA.intrinsics)
-            super().__init__(planner_of(), CAMERA, BOX, up="z", poses=POSES, folder=given["folder"])
+            super().__init__(CAMERA, BOX, planner_of(), up="z", poses=POSES, folder=given["folder"])
 
     def write_report(episode, path):
         assert len(episode.views) == 3

@@ -196,12 +196,11 @@ def test_an_image_beside_the_box_is_warned_of():
     """It may be meant, but for the first one."""
     session = session_of()
     inverse = np.linalg.inv(FIRST)
-    with (
-        pytest.warns(
-            UserWarning, match=r"none of the \d+ points .* lies in the box .* Is the pose from camera to world"
-        ),
-        pytest.raises(InputError, match="the first scan is empty: no point to start from"),
-    ):
+    problem = r"none of the \d+ points .* lies in the box .* Is the pose from camera to world"
+    with pytest.raises(InputError, match=f"the first image shows nothing of the box: {problem}"):
+        session.add(shot(FIRST), inverse, depth_scale=1e-3)
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    with pytest.warns(UserWarning, match=problem):
         session.add(shot(FIRST), inverse, depth_scale=1e-3)
 
 

@@ -9,7 +9,6 @@ from .modelnet import ModelNet as ModelNet
 from .modelnet_points import ModelNetPoints as ModelNetPoints
 from .omniobject3d import OmniObject3D as OmniObject3D
 from .omniobject3d import OmniObject3DPoints as OmniObject3DPoints
-from .recorded import RecordedFrames as RecordedFrames
 from .shapenet import SYNSETS as SYNSETS
 from .shapenet import ShapeNet as ShapeNet
 from .shapenet_part import LabelledShape as LabelledShape
