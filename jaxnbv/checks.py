@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import inspect
 import numbers
+import os
 import traceback
 import types
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 import equinox
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 from jax import Array
 
@@ -23,7 +25,9 @@ AnyArray = Array | np.ndarray
 _F = TypeVar("_F", bound=Callable[..., Any])
 _LONGEST_SHOWN = 60
 # Where what runs is not a user's.
-_OWN = tuple(str(Path(str(file)).parent) for file in (jax.__file__, equinox.__file__, __file__))
+_OWN = tuple(
+    f"{Path(str(file)).parent}{os.sep}" for file in (jax.__file__, equinox.__file__, jaxtyping.__file__, __file__)
+)
 _NUMBERS = {tuple[float, float]: "two", tuple[float, float, float]: "three"}
 _REAL = (jnp.bool_, jnp.integer, jnp.floating)
 # Of 32 bits. What is larger is infinite there.

@@ -20,7 +20,7 @@ from jaxnbv.scanning.surface import Surface
 # Of the authors: points that each of the two surfaces is sampled at.
 SURFACE_POINTS = 20_000
 # The least cosine of incidence at which a pixel shows all of the plane that it meets.
-_GRAZING = 0.2
+GRAZING = 0.2
 
 
 def coverage(views: Iterable[Any], truth: Float[AnyArray, "n 3"], size: float = 0.05) -> list[float]:
@@ -69,7 +69,7 @@ def shows(
 
     ray = points - position
     distance = np.linalg.norm(ray, axis=1)
-    cosine = np.maximum(np.abs(np.sum(ray * normals, axis=1)) / np.maximum(distance, 1e-12), _GRAZING)
+    cosine = np.maximum(np.abs(np.sum(ray * normals, axis=1)) / np.maximum(distance, 1e-12), GRAZING)
     gain = 0.5 * math.hypot(*(1.0 / f for f in camera.focal_lengths)) * distance * np.sqrt(1.0 / cosine**2 - 1.0)
     farther = np.linalg.norm(local, axis=1) - distance[pixel]
     return inside & mask[pixel] & (np.abs(farther) <= size + gain[pixel])

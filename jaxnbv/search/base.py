@@ -85,6 +85,31 @@ class CandidateSearch(Search):
         return self.pick(problem, candidates, self.score(problem, candidates), key)
 
 
+class Rule(CandidateSearch):
+    """A search that values candidates by itself, whatever the acquisition."""
+
+    uses_samples: ClassVar[bool] = False
+    weighs_cost: ClassVar[bool] = False
+
+    def asks(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
+        """None."""
+        return ()
+
+    @abstractmethod
+    def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
+        """Of each candidate; the open one of the highest value is taken."""
+
+    def pick(
+        self,
+        problem: Problem,
+        candidates: Pose,
+        scores: Float[Array, "asked samples candidates"],
+        key: PRNGKeyArray,
+    ) -> Proposal:
+        """The argmax of `values`; there are no scores."""
+        return best_unvisited(problem, candidates, self.values(problem, candidates, key))
+
+
 def best_unvisited(
     problem: Problem,
     candidates: Pose,

@@ -9,54 +9,35 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxnbv.acquisition import Acquisition, Quantity
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.search.base import CandidateSearch, best_unvisited
+from jaxnbv.search.base import Rule
 from jaxnbv.search.problem import Problem
-from jaxnbv.search.proposal import Proposal
 
 
-class FarthestView(CandidateSearch):
+class FarthestView(Rule):
     """Farthest point sampling of views: the candidate whose nearest visited camera is farthest away."""
-
-    uses_samples: ClassVar[bool] = False
-    weighs_cost: ClassVar[bool] = False
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
         meaning = "distance from a candidate to the nearest camera so far; the surface is not looked at."
         return Quantity("distance to the nearest camera", "scene units", meaning)
 
-    def pick(
-        self,
-        problem: Problem,
-        candidates: Pose,
-        scores: Float[Array, "asked samples candidates"],
-        key: PRNGKeyArray,
-    ) -> Proposal:
-        """Values are distances in scene units; neither scores nor the key are used."""
-        return best_unvisited(problem, candidates, problem.distance_to_visited(candidates))
+    def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
+        """Values are distances in scene units; the key is not used."""
+        return problem.distance_to_visited(candidates)
 
 
-class RandomView(CandidateSearch):
+class RandomView(Rule):
     """A candidate drawn uniformly from those not visited yet."""
-
-    uses_samples: ClassVar[bool] = False
-    weighs_cost: ClassVar[bool] = False
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
         meaning = "every open candidate drew a lot; the surface is not looked at."
         return Quantity("lot drawn", "uniform on [0, 1)", meaning, smooth=False)
 
-    def pick(
-        self,
-        problem: Problem,
-        candidates: Pose,
-        scores: Float[Array, "asked samples candidates"],
-        key: PRNGKeyArray,
-    ) -> Proposal:
-        """Values are the lots that were drawn, uniform on [0, 1); scores are not used."""
-        return best_unvisited(problem, candidates, jax.random.uniform(key, (self.candidates.count,)))
+    def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
+        """Values are the lots that were drawn, uniform on [0, 1)."""
+        return jax.random.uniform(key, (self.candidates.count,))
 
 
-class UncertaintyView(CandidateSearch):
+class UncertaintyView(Rule):
     """The candidate whose principal ray is the most uncertain of where it ends (Holalkere et al. 2025).
 
     With the transmittance T(t), the share of the samples whose surface the ray has not entered before t, the value is
@@ -64,24 +45,15 @@ class UncertaintyView(CandidateSearch):
     """
 
     uses_samples: ClassVar[bool] = True
+    weighs_cost: ClassVar[bool] = True
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
         meaning = "length of the principal ray along which the posterior samples disagree whether it has hit."
         return Quantity("uncertain length of the principal ray", "scene units", meaning)
 
-    def asks(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
-        """None: it looks at the samples themselves."""
-        return ()
-
-    def pick(
-        self,
-        problem: Problem,
-        candidates: Pose,
-        scores: Float[Array, "asked samples candidates"],
-        key: PRNGKeyArray,
-    ) -> Proposal:
-        """Values are lengths in scene units; neither scores nor the key are used."""
-        return best_unvisited(problem, candidates, problem.weigh(uncertain_length(problem, candidates), candidates))
+    def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
+        """Values are lengths in scene units; the key is not used."""
+        return problem.weigh(uncertain_length(problem, candidates), candidates)
 
 
 def uncertain_length(problem: Problem, poses: Pose) -> Float[Array, " poses"]:

@@ -13,10 +13,8 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.neighbours import DistanceField
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.scanning.metrics import GRAZING
 from jaxnbv.tasks.stopping import SoFar, Stop
-
-# The least cosine of incidence: a pixel at a grazing angle shows a strip whose far end is seen by luck.
-_GRAZING = 0.2
 
 
 class NewSurface(Acquisition):
@@ -76,7 +74,7 @@ def visible_area(scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, "
     cosine = jnp.abs(jnp.sum(offset * scan.normals, axis=-1)) / distance
     across, down = camera.focal_lengths
     facing = depth**3 / (distance * across * down)
-    return jnp.where(scan.mask, facing / jnp.maximum(cosine, _GRAZING), 0.0)
+    return jnp.where(scan.mask, facing / jnp.maximum(cosine, GRAZING), 0.0)
 
 
 class ShownArea(Acquisition):
