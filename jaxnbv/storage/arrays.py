@@ -28,6 +28,7 @@ SCAN: Schema = {
     "normals": ("f", ("n", 3)),
     "mask": ("b", ("n",)),
     "missed": ("b", ("n",)),
+    "noise": ("f", ("n",)),
 }
 PROPOSAL: Schema = {
     "value": ("f", ()),
@@ -110,7 +111,8 @@ def pose_arrays(pose: Pose) -> dict[str, Any]:
 
 def scan_arrays(scan: PointCloud) -> dict[str, Any]:
     known = {"points": scan.points, "normals": scan.normals, "mask": scan.mask}
-    return known if scan.missed is None else known | {"missed": scan.missed}
+    optional = {"missed": scan.missed, "noise": scan.noise}
+    return known | {name: rows for name, rows in optional.items() if rows is not None}
 
 
 def proposal_arrays(proposal: Proposal) -> dict[str, Any]:
@@ -137,9 +139,8 @@ def pose_of(data: Mapping[str, np.ndarray]) -> Pose:
 
 
 def scan_of(data: Mapping[str, np.ndarray]) -> PointCloud:
-    missed = data.get("missed")
-    points, normals, mask = (jnp.asarray(data[name]) for name in ("points", "normals", "mask"))
-    return PointCloud(points, normals, mask, None if missed is None else jnp.asarray(missed))
+    rows = {name: jnp.asarray(data[name]) for name in SCAN if name in data}
+    return PointCloud(**rows)
 
 
 def proposal_of(data: Mapping[str, np.ndarray]) -> Proposal | None:

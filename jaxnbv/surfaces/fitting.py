@@ -54,7 +54,8 @@ def fit_hyperparameters(
 
 def _random_rows(cloud: PointCloud, key: PRNGKeyArray, count: int) -> PointCloud:
     order = jnp.argsort(jnp.where(cloud.mask, jax.random.uniform(key, cloud.mask.shape), jnp.inf))[:count]
-    return PointCloud(cloud.points[order], cloud.normals[order], cloud.mask[order])
+    noise = None if cloud.noise is None else cloud.noise[order]
+    return PointCloud(cloud.points[order], cloud.normals[order], cloud.mask[order], noise=noise)
 
 
 @eqx.filter_jit
