@@ -7,7 +7,7 @@ from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.imagination import Imagination
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.session import Session
-from jaxnbv.scanning import Grid, SDFSurface, scan
+from jaxnbv.scanning import Grid, SDFSurface, Surroundings, scan
 from jaxnbv.scanning.sdf import Cuboid, Sphere
 from jaxnbv.search import DiscreteSearch
 from jaxnbv.surfaces import GeometricSPSR
@@ -43,5 +43,6 @@ def planner_of(search=DiscreteSearch(), num_samples=3, capacity=400):  # noqa: B
 
 
 def session_of(folder=None, **changes):
-    settings = {"camera": CAMERA, "box": BOX, "up": "z", "poses": POSES, "folder": folder, **changes}
+    told = {"surroundings": Surroundings(), "poses": POSES, "folder": folder}
+    settings = {"camera": CAMERA, "box": BOX, "up": "z", **told, **changes}
     return Session(**{"planner": planner_of(), **settings})

@@ -14,8 +14,10 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 from jaxnbv.planning.episode import Episode, camera_of
+from jaxnbv.planning.placing import stride_of
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.session import NextView, Session, stride_of
+from jaxnbv.planning.session import NextView, Session
+from jaxnbv.scanning import Surroundings
 from jaxnbv.search import CandidateSearch, Proposal
 from jaxnbv.storage import SESSION_RECORD, DepthImage, open_session
 
@@ -34,11 +36,21 @@ class StoredSession:
             self.cameras = tuple(camera_of(camera) for camera in config["cameras"])
             self.box = Box(**_fields(config["box"]))
             self.up, self.convention, self.stride = (config[name] for name in ("up", "convention", "stride"))
+            # A session that was told what stands around it did not look for a table.
+            told = config["planner"]["imagination"]["surroundings"] is not None
+            self.surroundings = Surroundings() if told else None
         except (KeyError, TypeError) as error:
             raise InputError(f"{self._folder.record} does not say what the sensor was ({error!r})") from error
         self.frame = Frame.fit(np.array([self.box.low, self.box.high]), up=self.up)
         self.views = self._folder.count_images()
         require(self.views > 0, f"{folder} holds no image yet: add one to the session first")
+
+    def session(self, **settings: Any) -> Session:
+        """A new session at the same sensor, with other settings of `Session`."""
+        box, up, convention, stride = self.box, self.up, self.convention, self.stride
+        return Session(
+            self.cameras, box, up=up, convention=convention, stride=stride, surroundings=self.surroundings, **settings
+        )
 
     def image(self, index: int) -> DepthImage:
         """The image of an index, from 0.
@@ -82,10 +94,8 @@ class StoredSession:
             out is None or Path(out).resolve() != self._folder.path.resolve(),
             f"{out} holds the session that is to be replayed: choose another folder",
         )
-        sensor = {"camera": self.cameras, "box": self.box, "up": self.up, "convention": self.convention}
         poses = self.candidates() if isinstance(planner.search, CandidateSearch) else None
-        settings: dict[str, Any] = {**sensor, "stride": self.stride, "poses": poses, "folder": out}
-        session = Session(planner=planner, **settings)
+        session = self.session(planner=planner, poses=poses, folder=out)
         # What was killed may lack the answer to its last image.
         if session.views:
             yield session, session.next()
@@ -118,7 +128,7 @@ def stored_run(folder: str | Path) -> StoredRun:
 
 def _session_run(folder: str | Path) -> StoredRun:
     stored = StoredSession(folder)
-    session = Session(stored.cameras, stored.box, up=stored.up, convention=stored.convention, stride=stored.stride)
+    session = stored.session()
     for index in range(stored.views):
         session.add(*stored.image(index))
     asked = [stored.proposal(index) for index in range(stored.views + 1)]

@@ -1,10 +1,9 @@
 """A live session: depth images of a real sensor in, where to take the next one out, in the user's own world."""
 
-import dataclasses
-import math
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray, Real
 from tqdm import tqdm
 
-from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, check_type, checked, require, shown
+from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, check_type, checked, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.depth_image import NothingInside
@@ -20,15 +19,14 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 from jaxnbv.planning.episode import STAGES, Episode, View, view_keys
+from jaxnbv.planning.placing import box_of, on_support, placed, stride_of, usual_planner
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Watch
 from jaxnbv.scanning import Evidence, Surroundings
-from jaxnbv.search import CandidateSearch, GivenPoses, HalvingSearch, Proposal, SphereCandidates
+from jaxnbv.search import Proposal
 from jaxnbv.storage import DepthImage, SessionFolder, describe
-from jaxnbv.tasks import NewSurface, Stop
+from jaxnbv.tasks import Stop
 
-# A cloud holds some thousands of points; more rays than these only take time.
-_MOST_RAYS = 20_000
 _NO_IMAGE = "the session has no image yet: add one first, session.add(depth, matrix)"
 
 
@@ -59,7 +57,9 @@ class Session:
       replaced by the sensor's with the planner's number of pixels, and what it holds for the default volume, `Box()`,
       by the box. By default it looks for `NewSurface`, by a `HalvingSearch` with 24 x 32 rays, and keeps 2,000 points.
     - `up`: the world's axis that is upward, "y" or "z" say.
-    - `surroundings`: what stands around the object, in world units: `Surroundings((table,), margin=0.005)`, say.
+    - `surroundings`: what stands around the object, in world units: `Surroundings((table,), margin=0.005)`, say. By
+      default the plane that the object stands on is looked for in the first image, told of by a warning, and taken for
+      a table: left out of the cloud, and no place for a camera. `Surroundings()` says that there is none.
     - `poses`: (n, 4, 4), where the sensor can be held; by default the candidates of the planner's search, in scene
       units about the box's centre, and of a whole sphere the upper half: what is below may be the table.
     - `folder`: where images and proposals are kept before they are acted on; a session that was killed goes on from it.
@@ -95,7 +95,7 @@ class Session:
         for one in self.cameras:
             check_type(one, Camera, "a camera of the session")
         self.convention = convention
-        self.box = box if isinstance(box, Box) else Box(*_corners(box))
+        self.box = box_of(box)
         self.frame = Frame.fit(np.array([self.box.low, self.box.high]), up=up)
         self.stride, self.progress = stride, progress
         self.key = jax.random.key(0) if key is None else key
@@ -103,7 +103,7 @@ class Session:
         allowed = None if poses is None else self.frame.to_scene(Pose.from_matrix(poses, convention))
         sensor, volume = self.frame.to_scene(self.cameras[0]), self.frame.to_scene(self.box)
         around = None if surroundings is None else surroundings.in_scene(self.frame)
-        self.planner = _placed(_usual() if planner is None else planner, sensor, volume, allowed, around)
+        self.planner = placed(usual_planner() if planner is None else planner, sensor, volume, allowed, around)
         self._strides = tuple(stride_of(one) if stride is None else stride for one in self.cameras)
         self._rays = tuple(one.strided(n) for one, n in zip(self.cameras, self._strides, strict=True))
         self._watch, self._asked_at = None if until is None else Watch(until, self.planner), 0
@@ -118,7 +118,7 @@ class Session:
                 if (known := self._folder.read_proposal(index)) is not None:
                     self._proposals[index] = known[0]
                 image = self._folder.read_image(index)
-                self._take(*self._seen(image), image.camera)
+                self._take(self._looked(image))
 
     @property
     def views(self) -> int:
@@ -191,13 +191,12 @@ class Session:
         count = len(self.cameras)
         require(0 <= camera < count, f"the session has {count} cameras, counted from 0: there is no camera {camera}")
         image = DepthImage(pixels, as_numbers(matrix, "the matrix of a pose", np.float64), depth_scale, camera)
-        pose, scan = self._seen(image)
-        evidence = self._after(pose, scan, camera)
+        look = self._looked(image)
         if self._folder is not None:
             with self._folder.writing():
                 self._check_alone(self._folder)
                 self._folder.write_image(self.views, image)
-        self._take(pose, scan, camera, evidence)
+        self._take(look)
 
     def next(self) -> NextView:
         """Where to take the next image. It is stored, and the same until an image is added; what was proposed once is
@@ -241,10 +240,11 @@ class Session:
         sensor = {"cameras": self.cameras, "box": self.box, "up": self.frame.up, "convention": self.convention}
         return describe({**sensor, "stride": self.stride, "key": self.key, "planner": self.planner})
 
-    def _seen(self, image: DepthImage) -> tuple[Pose, PointCloud]:
-        """Pose and scan of an image, in scene coordinates."""
+    def _looked(self, image: DepthImage) -> "_Look":
+        """What an image adds; nothing of the session is changed."""
         pose = Pose.from_matrix(image.matrix, self.convention)
         camera, stride = self.cameras[image.camera], self._strides[image.camera]
+        planner = self.planner
         with warnings.catch_warnings():
             if not self._views:
                 warnings.simplefilter("error", NothingInside)
@@ -252,19 +252,21 @@ class Session:
                 cloud = PointCloud.from_depth(image.depth, camera, pose, image.depth_scale, stride, self.box)
             except NothingInside as problem:
                 raise InputError(f"the first image shows nothing of the box: {problem}") from problem
-        scan, around = self.frame.to_scene(cloud), self.planner.imagination.surroundings
-        return self.frame.to_scene(pose), scan if around is None else around.without_obstacles(scan)
+        if not self._views and planner.imagination.surroundings is None:
+            whole = PointCloud.from_depth(image.depth, camera, pose, image.depth_scale, stride)
+            planner = on_support(planner, whole, self.box, self.frame)
+        scan, rays = self.frame.to_scene(cloud), self.frame.to_scene(self._rays[image.camera])
+        if (around := planner.imagination.surroundings) is not None:
+            scan = around.without_obstacles(scan)
+        told = self.frame.to_scene(pose), scan, rays
+        evidence = planner.init(*told) if self._evidence is None else planner.observe(self._evidence, *told)
+        return _Look(planner, View(told[0], scan, evidence.cloud, self._proposals.get(self.views), rays), evidence)
 
-    def _after(self, pose: Pose, scan: PointCloud, camera: int) -> Evidence:
-        rays = self.frame.to_scene(self._rays[camera])
-        if self._evidence is None:
-            return self.planner.init(pose, scan, rays)
-        return self.planner.observe(self._evidence, pose, scan, rays)
-
-    def _take(self, pose: Pose, scan: PointCloud, camera: int, evidence: Evidence | None = None) -> None:
-        self._evidence = self._after(pose, scan, camera) if evidence is None else evidence
-        rays, proposal = self.frame.to_scene(self._rays[camera]), self._proposals.get(self.views)
-        self._views.append(View(pose, scan, self._evidence.cloud, proposal, rays))
+    def _take(self, look: "_Look") -> None:
+        self.planner, self._evidence = look.planner, look.evidence
+        if self._watch is not None:
+            self._watch.planner = look.planner
+        self._views.append(look.view)
         self._next = None
         self._tell_followers()
 
@@ -291,6 +293,14 @@ class Session:
         )
 
 
+class _Look(NamedTuple):
+    """A view of the sensor's, what is known after it, and by whom: the first may show what the object stands on."""
+
+    planner: Planner
+    view: View
+    evidence: Evidence
+
+
 def _warn_of_little(proposal: Proposal) -> None:
     """A best view may be worth nothing: of candidates that look elsewhere, or once all has been seen."""
     value, error = float(proposal.value), proposal.standard_error
@@ -301,42 +311,3 @@ def _warn_of_little(proposal: Proposal) -> None:
             "look at the box from elsewhere",
             stacklevel=4,
         )
-
-
-def _corners(box) -> tuple:
-    require(np.shape(box) == (2, 3), f"the box is {shown(box)}; give two corners, (low, high), or a Box")
-    return tuple(as_numbers(corner, "a corner of the box", np.float64).tolist() for corner in box)
-
-
-def stride_of(camera: Camera) -> int:
-    """The stride that leaves as many rays of an image as are worth their time."""
-    return math.ceil(math.sqrt(camera.num_rays / _MOST_RAYS))
-
-
-def _usual() -> Planner:
-    return Planner(NewSurface(), HalvingSearch(), Camera(height=24, width=32), capacity=2000)
-
-
-def _placed(
-    planner: Planner, camera: Camera, box: Box, poses: Pose | None, surroundings: Surroundings | None
-) -> Planner:
-    """A planner at a sensor, all in scene coordinates: see `Session`.
-
-    - `poses`: where the search may look from, or None for its own candidates.
-
-    **Raises:** `ValueError` if the search does not choose among poses.
-    """
-    imagination, search = planner.imagination.within(box), planner.search
-    if surroundings is not None:
-        imagination = dataclasses.replace(imagination, surroundings=surroundings)
-    if poses is not None:
-        if not isinstance(search, CandidateSearch):
-            raise InputError(
-                f"the session was given poses, but {type(search).__name__} is no search over candidates: use "
-                "DiscreteSearch() or HalvingSearch()"
-            )
-        search = dataclasses.replace(search, candidates=GivenPoses(poses))
-    elif isinstance(search, CandidateSearch) and isinstance(search.candidates, SphereCandidates):
-        search = dataclasses.replace(search, candidates=search.candidates.upper_half)
-    camera = camera.resized(planner.camera.height, planner.camera.width)
-    return dataclasses.replace(planner, camera=camera, search=search, imagination=imagination)

@@ -16,6 +16,7 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.neighbours import nearest_squared_distance
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
+from jaxnbv.geometry.volume import Box
 from jaxnbv.scanning.evidence import Evidence
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.sdf import HalfSpace, Rotated, SignedDistance
@@ -23,6 +24,12 @@ from jaxnbv.scanning.sphere_tracing import SDFSurface
 
 # Beyond this distance from the scene's origin nothing stands in the way of a camera.
 _FAR = 8.0
+# A table goes on beside the box, by so much of the box's longest side at least, and may lie so little below it. Of the
+# points beside the box most are on it, of those in the box none is below it, and so many of all are on it.
+_BESIDE, _BELOW = 0.2, 0.05
+_MOST, _NONE, _SOME = 0.5, 0.02, 50
+_LEVEL = np.cos(np.radians(15.0))
+_TOLERANCE = 0.03
 
 
 class Surroundings(eqx.Module):
@@ -147,7 +154,7 @@ def support_plane(
     require(tolerance > 0, f"the tolerance is {tolerance}; it must be positive")
     upward = as_numbers(up, "up", np.float64)
     require(upward.shape == (3,) and bool(np.linalg.norm(upward) > 0), f"up is {shown(up)}; give a direction")
-    plane, _ = ransac(points, _Plane, min_samples=3, residual_threshold=tolerance, max_trials=500, rng=0)
+    plane = _plane_of_most(points, tolerance)
     cosine = float(plane.normal @ upward / np.linalg.norm(upward))
     require(
         abs(cosine) > np.cos(np.radians(30.0)),
@@ -155,3 +162,35 @@ def support_plane(
         "table, or give its plane, HalfSpace(point, normal)",
     )
     return HalfSpace(plane.point, np.sign(cosine) * plane.normal)
+
+
+def plane_under(cloud: PointCloud, box: Box) -> HalfSpace | None:
+    """The plane that an object in a box stands on, and all below it; None where a cloud shows none. In scene
+    coordinates, with y up.
+
+    It is the plane of most points in the box and beside it, and level to 15 degrees. It goes on beside the box, which
+    the top of a table that *is* the object does not, and no more than 2 % of the points in the box are below it.
+    """
+    points, _ = cloud.to_numpy()
+    low, high = np.array(box.low), np.array(box.high)
+    side = float((high - low).max())
+    beside, below = side * _BESIDE * np.array([1.0, 0.0, 1.0]), side * _BELOW * np.array([0.0, 1.0, 0.0])
+    near = points[((points > low - beside - below) & (points < high + beside)).all(axis=1)].astype(np.float64)
+    inside = ((near > low - below) & (near < high)).all(axis=1)
+    if min(inside.sum(), (~inside).sum()) < _SOME:
+        return None
+    plane = _plane_of_most(near, _TOLERANCE)
+    normal = np.sign(plane.normal[1]) * plane.normal
+    height = (near - plane.point) @ normal
+    on = np.abs(height) <= _TOLERANCE
+    found = (
+        normal[1] >= _LEVEL
+        and on[~inside].sum() >= _SOME
+        and on[~inside].mean() >= _MOST
+        and (height[inside] < -_TOLERANCE).mean() <= _NONE
+    )
+    return HalfSpace(plane.point, normal) if found else None
+
+
+def _plane_of_most(points: Float[np.ndarray, "n 3"], tolerance: float) -> _Plane:
+    return ransac(points, _Plane, min_samples=3, residual_threshold=tolerance, max_trials=500, rng=0)[0]

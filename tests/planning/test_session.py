@@ -1,5 +1,7 @@
 """A live session at a simulated sensor."""
 
+import warnings
+
 import jax
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Budget, ValueBelow
-from jaxnbv.scanning import Carving, Grid, scan
+from jaxnbv.scanning import Carving, Grid, Surroundings, scan
 from jaxnbv.search import DiscreteSearch, FarthestView, GradientSearch, SphereCandidates
 from jaxnbv.surfaces import GeometricSPSR, OutsideBoundary, ScreenedSPSR
 from jaxnbv.tasks import Coverage
@@ -268,3 +270,28 @@ def test_who_follows_is_told_of_every_image_and_proposal():
     session.add(shot(first.matrix), first.matrix, depth_scale=1e-3)
     assert early == [(1, None), (1, first), (2, None)]
     assert late == [(1, first), (2, None)]
+
+
+BELOW = np.array([[around(angle, -0.4), around(angle, 0.6)] for angle in (0.5, 2.5, 4.5)]).reshape(-1, 4, 4)
+
+
+def test_the_table_is_found_told_of_and_kept_clear_of():
+    """The box reaches two centimetres into it; half of the poses are below it."""
+    session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), poses=BELOW, surroundings=None)
+    with pytest.warns(UserWarning, match=r"stands on a plane through \[.*, -0\.00.*Surroundings\(\) to keep it"):
+        session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    points, _ = session.cloud.to_numpy()
+    # What is left of the table is nearer to the ball than the margin.
+    assert (points[:, 2] > 0.001).mean() > 0.98
+    assert np.isneginf(np.asarray(session.next().proposal.values)[::2]).all()
+    assert session.next().matrix[2, 3] > 0.1
+
+
+def test_a_table_is_kept_where_that_is_asked_for():
+    session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), poses=BELOW, surroundings=Surroundings())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    points, _ = session.cloud.to_numpy()
+    assert (points[:, 2] < 0.001).mean() > 0.1
+    assert np.isfinite(np.asarray(session.next().proposal.values)).all()

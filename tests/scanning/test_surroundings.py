@@ -12,13 +12,15 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import look_at
+from jaxnbv.geometry.volume import Box
 from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import simulate
 from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Carving, Grid, SDFSurface, SensorNoise, TriangleMesh, scan
-from jaxnbv.scanning.sdf import Cuboid, HalfSpace, Sphere, solid_of_mesh
-from jaxnbv.scanning.surroundings import Surroundings, support_plane
-from jaxnbv.search import DiscreteSearch, GivenPoses, GradientSearch, HalvingSearch, SphereCandidates
+from jaxnbv.scanning import Carving, Evidence, Grid, SDFSurface, SensorNoise, TriangleMesh, scan
+from jaxnbv.scanning.sdf import Capsule, Cuboid, HalfSpace, Sphere, solid_of_mesh
+from jaxnbv.scanning.surroundings import Surroundings, plane_under, support_plane
+from jaxnbv.search import DiscreteSearch, GivenPoses, GradientSearch, HalvingSearch, RandomView, SphereCandidates
+from jaxnbv.search.problem import Problem
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
 
@@ -230,6 +232,87 @@ def test_the_table_is_found_under_an_object(seed):
     assert np.asarray(plane.normal) @ turn[:, 2] > np.cos(np.radians(0.5))
     assert np.abs(np.asarray(plane(jnp.asarray(points[300:], jnp.float32)))).max() < 0.008
     assert np.asarray(plane(jnp.asarray(points[:300], jnp.float32))).min() > -0.01
+
+
+BOX = Box((-0.5, -0.25, -1.25), (0.5, 1.2, 1.25))
+
+
+def level_board(rng, half, height, count=800):
+    """Points of a board about the y axis, with a little noise."""
+    points = rng.uniform(-1.0, 1.0, (count, 3)) * [half[0], 0.0, half[1]] + [0.0, height, 0.0]
+    return points + rng.normal(0.0, 0.005, points.shape)
+
+
+def under(*parts):
+    points = np.concatenate(parts)
+    return plane_under(PointCloud.from_arrays(points, np.tile([0.0, 1.0, 0.0], (len(points), 1))), BOX)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_an_object_stands_on_is_found(seed):
+    """In the box or a little below it, and tilted by as much as 10 degrees."""
+    rng = np.random.default_rng(seed)
+    turn = Rotation.from_euler("xz", rng.uniform(-0.12, 0.12, 2)).as_matrix()
+    height = rng.uniform(-0.3, -0.05)
+    table = level_board(rng, (2.0, 2.0), 0.0) @ turn.T + [0.0, height, 0.0]
+    thing = np.array([0.0, height + 0.55, 0.0]) + rng.uniform(-0.4, 0.4, (400, 3))
+    plane = under(thing, table)
+    assert np.asarray(plane.normal) @ turn[:, 1] > np.cos(np.radians(0.5))
+    assert abs(float(plane(jnp.asarray([0.0, height, 0.0])))) < 0.01
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        lambda rng: [level_board(rng, (0.45, 1.2), 0.4)],
+        lambda rng: [level_board(rng, (0.45, 1.2), 1.0), level_board(rng, (2.0, 2.0), -1.5)],
+        lambda rng: [level_board(rng, (2.0, 2.0), 0.3), rng.uniform(-0.4, 0.0, (200, 3))],
+        lambda rng: [level_board(rng, (2.0, 2.0), 0.0)[:, [1, 0, 2]], rng.uniform(0.1, 0.4, (200, 3))],
+        lambda rng: [rng.uniform(-0.4, 0.4, (30, 3))],
+    ],
+    ids=["a table that is the object", "the top of a box", "things below", "a wall", "few points"],
+)
+def test_what_is_no_support_is_kept(parts):
+    assert under(*parts(np.random.default_rng(0))) is None
+
+
+def test_no_proposal_is_inside_or_under_what_is_known():
+    """1,000 random scenes of a slanted table, a block, an arm between two points, and a few points that were seen.
+    Distances from the definitions, in float64."""
+    camera, clearance = Camera(height=4, width=4), 0.15
+    poses = jax.tree.map(
+        lambda *rows: jnp.concatenate(rows), *(SphereCandidates(60, radius=r).poses() for r in (0.6, 1.2, 2.4))
+    )
+    search = RandomView(GivenPoses(poses))
+
+    @jax.jit
+    def chosen(solids, cloud, key):
+        (point, normal), (half, block), (start, end) = solids
+        arm = Capsule(start, end, 0.1)
+        around = Surroundings((HalfSpace(point, normal), Cuboid(half).translate(block), arm), clearance=clearance)
+        evidence = Evidence.before_views(cloud, 2, None)
+        proposal = search.propose(Problem(evidence, camera, Coverage(), None, around), key)
+        return proposal.pose.position, proposal.value
+
+    rng, looked, x = np.random.default_rng(0), 0, np.asarray(poses.position, np.float64)
+    for _ in range(1000):
+        point, normal = rng.uniform(-0.6, 0.2, 3) * [0, 1, 0], rng.normal([0.0, 1.0, 0.0], [0.2, 0.0, 0.2])
+        half, block = rng.uniform(0.1, 0.5, 3), rng.uniform(-1.5, 1.5, 3)
+        start, end = rng.uniform(-2.0, 2.0, (2, 3))
+        seen = rng.uniform(-1.0, 1.0, (20, 3))
+        cloud = PointCloud.from_arrays(seen, np.tile([0.0, 1.0, 0.0], (20, 1)))
+        solids = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), ((point, normal), (half, block), (start, end)))
+        place, value = (np.asarray(a, np.float64) for a in chosen(solids, cloud, jax.random.key(rng.integers(1 << 30))))
+        assert np.isfinite(value)
+        table = (place - point) @ normal / np.linalg.norm(normal)
+        outside = np.abs(place - block) - half
+        to_block = np.linalg.norm(np.maximum(outside, 0.0)) + min(outside.max(), 0.0)
+        share = np.clip((place - start) @ (end - start) / ((end - start) @ (end - start)), 0.0, 1.0)
+        to_arm = np.linalg.norm(place - start - share * (end - start)) - 0.1
+        to_seen = np.linalg.norm(seen - place, axis=1).min()
+        assert min(table, to_block, to_arm, to_seen) >= clearance - 1e-4
+        looked += ((x - point) @ normal < 0).mean()
+    assert 200 < looked < 800
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,82 @@
+"""A planner at a real sensor: what it is given of the sensor, the box and what the object stands on."""
+
+import dataclasses
+import math
+import warnings
+
+import numpy as np
+
+from jaxnbv.checks import InputError, as_numbers, require, shown
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.volume import Box
+from jaxnbv.planning.planner import Planner
+from jaxnbv.scanning import Surroundings, plane_under
+from jaxnbv.search import CandidateSearch, GivenPoses, HalvingSearch, SphereCandidates
+from jaxnbv.tasks import NewSurface
+
+# A cloud holds some thousands of points; more rays than these only take time.
+_MOST_RAYS = 20_000
+
+
+def usual_planner() -> Planner:
+    """What a session plans by where nothing else is given."""
+    return Planner(NewSurface(), HalvingSearch(), Camera(height=24, width=32), capacity=2000)
+
+
+def box_of(corners) -> Box:
+    """**Raises:** `ValueError` for what is neither a `Box` nor two corners."""
+    if isinstance(corners, Box):
+        return corners
+    require(np.shape(corners) == (2, 3), f"the box is {shown(corners)}; give two corners, (low, high), or a Box")
+    return Box(*(as_numbers(corner, "a corner of the box", np.float64).tolist() for corner in corners))
+
+
+def stride_of(camera: Camera) -> int:
+    """The stride that leaves as many rays of an image as are worth their time."""
+    return math.ceil(math.sqrt(camera.num_rays / _MOST_RAYS))
+
+
+def placed(
+    planner: Planner, camera: Camera, box: Box, poses: Pose | None, surroundings: Surroundings | None
+) -> Planner:
+    """A planner at a sensor, all in scene coordinates: see `Session`.
+
+    - `poses`: where the search may look from, or None for its own candidates.
+
+    **Raises:** `ValueError` if the search does not choose among poses.
+    """
+    imagination, search = planner.imagination.within(box), planner.search
+    if surroundings is not None:
+        imagination = dataclasses.replace(imagination, surroundings=surroundings)
+    if poses is not None:
+        if not isinstance(search, CandidateSearch):
+            raise InputError(
+                f"the session was given poses, but {type(search).__name__} is no search over candidates: use "
+                "DiscreteSearch() or HalvingSearch()"
+            )
+        search = dataclasses.replace(search, candidates=GivenPoses(poses))
+    elif isinstance(search, CandidateSearch) and isinstance(search.candidates, SphereCandidates):
+        search = dataclasses.replace(search, candidates=search.candidates.upper_half)
+    camera = camera.resized(planner.camera.height, planner.camera.width)
+    return dataclasses.replace(planner, camera=camera, search=search, imagination=imagination)
+
+
+def on_support(planner: Planner, cloud: PointCloud, box: Box, frame: Frame) -> Planner:
+    """The planner with the plane that the object stands on among its surroundings, if a first image shows one; with
+    surroundings that hold nothing but the points that were seen, if it does not.
+
+    - `cloud`: of the whole image, what is not in the box included; it and the box in world units.
+    """
+    plane = plane_under(frame.to_scene(cloud), frame.to_scene(box))
+    around = Surroundings(() if plane is None else (plane,))
+    if plane is not None:
+        height = frame.to_world(np.asarray(plane.point, np.float64))
+        warnings.warn(
+            f"the object stands on a plane through {np.round(height, 4).tolist()}, which goes on beyond the box: it is "
+            "taken for a table and left out. Give surroundings=Surroundings() to keep it",
+            stacklevel=5,
+        )
+    return dataclasses.replace(planner, imagination=dataclasses.replace(planner.imagination, surroundings=around))
