@@ -21,9 +21,10 @@ from jaxnbv.studies.engine.meshes import MeshStudy, numbered_mesh
 from jaxnbv.studies.engine.study import Chart, Panel, Scene
 from jaxnbv.studies.scenes import Split
 from jaxnbv.studies.scenes.parts import part_scene
-from jaxnbv.tasks import Coverage
+from jaxnbv.tasks import Coverage, NewSurface
 
 _SEARCHES: dict[str, type[CandidateSearch]] = {
+    "new-surface": DiscreteSearch,
     "coverage": DiscreteSearch,
     "farthest": FarthestView,
     "uncertainty": UncertaintyView,
@@ -59,7 +60,7 @@ class ReconstructionStudy(MeshStudy):
         "largest of both. A reconstruction that no scene has (pip install pymeshlab for Poisson) is left out."
     )
     bank: ClassVar[str] = "parts"
-    unknowing: ClassVar[tuple[str, ...]] = ("coverage", "uncertainty")
+    unknowing: ClassVar[tuple[str, ...]] = ("new-surface", "coverage", "uncertainty")
     methods: ClassVar[tuple[str, ...]] = tuple(_SEARCHES)
     reference: ClassVar[str] = "coverage"
     measures: ClassVar[tuple[Measure, ...]] = (
@@ -96,7 +97,8 @@ class ReconstructionStudy(MeshStudy):
         return Scene(index, f"{CATEGORIES[int(made.category)].name} {index}", SDFSurface(made.solid))
 
     def planner(self, method: str, scene: Scene) -> Planner:
-        return self.planner_of(Coverage(), _SEARCHES[method](self.candidates), imagination=self.imagination_of(scene))
+        sought = NewSurface() if method == "new-surface" else Coverage()
+        return self.planner_of(sought, _SEARCHES[method](self.candidates), imagination=self.imagination_of(scene))
 
     def mesher(self, scene: Scene) -> Planner:
         """Whose posterior all methods' views are meshed by, those of planners of one's own too."""
