@@ -19,7 +19,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Watch
-from jaxnbv.scanning import DepthNoise, Evidence, GridSurface, SensorNoise, Surface, Surroundings, as_surface, scan
+from jaxnbv.scanning import Evidence, GridSurface, Noise, SensorNoise, Surface, Surroundings, as_surface, scan
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.search import Proposal
 from jaxnbv.storage import EpisodeFolder, describe, open_episode
@@ -52,7 +52,7 @@ class Episode(eqx.Module):
 
     planner: Planner
     scene: Surface | None
-    noise: SensorNoise | DepthNoise | None
+    noise: Noise | None
     first: Pose
     key: PRNGKeyArray
     views: tuple[View, ...]
@@ -119,9 +119,7 @@ def camera_of(description: dict[str, Any]) -> Camera:
     return Camera(**{**fields, "center": tuple(fields["center"])})
 
 
-def _config(
-    planner: Planner, scene: Surface | None, noise: SensorNoise | DepthNoise | None, first: Pose, key: PRNGKeyArray
-) -> dict:
+def _config(planner: Planner, scene: Surface | None, noise: Noise | None, first: Pose, key: PRNGKeyArray) -> dict:
     return describe({"planner": planner, "scene": scene, "noise": noise, "first": first, "key": key})
 
 
@@ -132,7 +130,7 @@ def simulate(
     first: Pose,
     views: int,
     key: PRNGKeyArray,
-    noise: SensorNoise | DepthNoise = SensorNoise(),
+    noise: Noise = SensorNoise(),
     folder: str | Path | None = None,
     progress: bool = True,
     until: Stop | None = None,
@@ -268,7 +266,7 @@ def steps(
 def scene_sensor(
     scene: Surface,
     camera: Camera,
-    noise: SensorNoise | DepthNoise = SensorNoise(),
+    noise: Noise = SensorNoise(),
     surroundings: Surroundings | None = None,
 ) -> Sensor:
     """A camera that scans a known surface, with noise, past what stands around it."""
@@ -286,7 +284,7 @@ def observe_scene(
     scene: Surface,
     camera: Camera,
     pose: Pose,
-    noise: SensorNoise | DepthNoise,
+    noise: Noise,
     key: PRNGKeyArray,
     surroundings: Surroundings | None = None,
 ) -> PointCloud:
@@ -308,7 +306,7 @@ def _noisy_scan(
     camera: Camera,
     pose: Pose,
     barrier: Float[Array, " rays"] | None,
-    noise: SensorNoise | DepthNoise,
+    noise: Noise,
     key: PRNGKeyArray,
 ) -> PointCloud:
     return noise(scan(scene, camera, pose, barrier), key, camera, pose)

@@ -2,6 +2,7 @@
 
 from jaxnbv.scanning import metrics as metrics
 from jaxnbv.scanning.depth_noise import DepthNoise as DepthNoise
+from jaxnbv.scanning.depth_noise import Noise as Noise
 from jaxnbv.scanning.evidence import EmptyPoints as EmptyPoints
 from jaxnbv.scanning.evidence import Evidence as Evidence
 from jaxnbv.scanning.free_space import Carving as Carving

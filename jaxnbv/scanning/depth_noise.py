@@ -1,6 +1,7 @@
 """The noise of real depth cameras, which measure disparities: it grows with the square of the depth."""
 
 import math
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -11,6 +12,7 @@ from jaxnbv.checks import check_fields, checked, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.scanning.scanner import SensorNoise
 
 
 class DepthNoise(eqx.Module):
@@ -77,3 +79,7 @@ class DepthNoise(eqx.Module):
         missed = jnp.zeros_like(scan.mask) if scan.missed is None else scan.missed
         image = jnp.where(missed, jnp.inf, depth).reshape(camera.height, camera.width)
         return PointCloud.from_depth(image, camera, pose)
+
+
+Noise: TypeAlias = SensorNoise | DepthNoise
+"""What a sensor makes of a scan without noise: a function of the scan, a key, the camera and the pose."""

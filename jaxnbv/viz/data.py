@@ -21,6 +21,7 @@ from jaxnbv.scanning import Evidence
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.scanning.metrics import coverage, truth_points
 from jaxnbv.search import Proposal
+from jaxnbv.surfaces import SurfacePosterior
 from jaxnbv.viz.answers import words_of
 from jaxnbv.viz.imagined import Imagined, Look, imagined, look
 from jaxnbv.viz.sphere import unit
@@ -158,7 +159,7 @@ def report_data(
         covered = [*coverage(episode.views, truth)]
     task = task_of(episode, covered)
     drawn: list[ViewData] = []
-    known: Evidence | None = None
+    known: tuple[Evidence, SurfacePosterior] | None = None
     bar = tqdm(
         zip(episode.views, episode.evidence(), strict=True), "drawing views", len(episode.views), disable=not progress
     )
@@ -166,23 +167,23 @@ def report_data(
         choice = None if view.proposal is None else choice_of(view.proposal, wider_map(episode, index))
         new, _ = view.scan.to_numpy()
         before = episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), new.dtype)
-        camera = view.camera
+        camera, posterior = view.camera, planner.imagination.posterior(after)
         drawn.append(
             ViewData(
                 number=index + 1,
                 pose=view.pose,
                 before=before,
                 new=new,
-                surface=allowing_for_unseen(mean_surface(planner.imagination, after), view.cloud),
+                surface=allowing_for_unseen(mean_surface(planner.imagination, after, posterior), view.cloud),
                 choice=choice,
                 coverage=covered[index],
                 count=int(view.cloud.count),
                 sentence=_sentence(episode, index, choice, covered, task),
-                imagined=imagined(episode, index, known) if imagine and known is not None else None,
+                imagined=imagined(episode, index, *known) if imagine and known is not None else None,
                 look=look(view.scan, camera, view.pose, before) if view.scan.capacity == camera.num_rays else None,
             )
         )
-        known = after
+        known = after, posterior
     surfaces = [view.surface.vertices for view in drawn if view.surface is not None]
     return ReportData(tuple(drawn), values, task, stage_of(episode, surfaces))
 
@@ -234,10 +235,15 @@ def choice_of(proposal: Proposal, wider: SphereMap | None = None) -> Choice:
     )
 
 
-def mean_surface(imagination: Imagination, evidence: Evidence) -> MeanSurface | None:
+def mean_surface(
+    imagination: Imagination, evidence: Evidence, posterior: SurfacePosterior | None = None
+) -> MeanSurface | None:
     """The surface of the posterior mean given the evidence, carved as the samples are, with its standard deviation;
-    None if the grid holds none. A posterior that has only samples is drawn from a few fixed ones."""
-    posterior = imagination.posterior(evidence).drawn(_SAMPLES)
+    None if the grid holds none. A posterior that has only samples is drawn from a few fixed ones.
+
+    `posterior`: that of the evidence, where it is at hand.
+    """
+    posterior = (imagination.posterior(evidence) if posterior is None else posterior).drawn(_SAMPLES)
     found = level_triangles(np.array(imagination.mean(evidence, posterior)), imagination.grid)
     if found is None:
         return None

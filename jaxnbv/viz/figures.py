@@ -124,7 +124,7 @@ def _save(figure: Figure, path: Path, dpi: int, few_colours: bool = False) -> No
         # The background is the commonest colour; the mean of it and its neighbours is not quite white.
         colours[np.bincount(np.asarray(image).ravel()).argmax()] = 255
         image.putpalette(colours.ravel().tolist())
-    write_whole(path, lambda file: image.save(file, "png", optimize=True, dpi=(dpi, dpi)))
+    write_whole(path, lambda file: image.save(file, "png", dpi=(dpi, dpi)))
 
 
 def _view(data: ReportData, index: int, camera: Camera, stills: Stills) -> Figure:

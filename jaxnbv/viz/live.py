@@ -81,7 +81,7 @@ class LiveView:
             self._drawn = [
                 *_points(scene, episode),
                 *_cameras(scene, episode),
-                *_mean(scene, episode.planner.imagination, evidence),
+                *_mean(scene, episode.planner.imagination, evidence, posterior),
                 *_imagined(scene, episode.planner.imagination, evidence, posterior, key),
                 *([] if proposal is None else _choice(scene, episode.planner.camera, proposal, expected)),
             ]
@@ -149,8 +149,8 @@ def _cameras(scene: Any, episode: Episode) -> list[Any]:
     return found
 
 
-def _mean(scene: Any, imagination: Imagination, evidence: Evidence) -> list[Any]:
-    surface = allowing_for_unseen(mean_surface(imagination, evidence), evidence.cloud)
+def _mean(scene: Any, imagination: Imagination, evidence: Evidence, posterior: SurfacePosterior) -> list[Any]:
+    surface = allowing_for_unseen(mean_surface(imagination, evidence, posterior), evidence.cloud)
     if surface is None:
         return []
     low, high = round_range(*np.percentile(surface.deviation, [2.0, 98.0]).tolist())

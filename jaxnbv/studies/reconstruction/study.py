@@ -24,8 +24,8 @@ from jaxnbv.studies.scenes.parts import part_scene
 from jaxnbv.tasks import Coverage, NewSurface
 
 _SEARCHES: dict[str, type[CandidateSearch]] = {
-    "new-surface": DiscreteSearch,
     "coverage": DiscreteSearch,
+    "new-surface": DiscreteSearch,
     "farthest": FarthestView,
     "uncertainty": UncertaintyView,
     "random": RandomView,
@@ -60,7 +60,7 @@ class ReconstructionStudy(MeshStudy):
         "largest of both. A reconstruction that no scene has (pip install pymeshlab for Poisson) is left out."
     )
     bank: ClassVar[str] = "parts"
-    unknowing: ClassVar[tuple[str, ...]] = ("new-surface", "coverage", "uncertainty")
+    unknowing: ClassVar[tuple[str, ...]] = ("coverage", "new-surface", "uncertainty")
     methods: ClassVar[tuple[str, ...]] = tuple(_SEARCHES)
     reference: ClassVar[str] = "coverage"
     measures: ClassVar[tuple[Measure, ...]] = (

@@ -20,7 +20,9 @@ class EvenlySpaced(Rule):
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
         """Values are 1 for the frame whose turn it is; the key is not used."""
-        first = jnp.argmin(jnp.linalg.norm(candidates.position - problem.evidence.poses.position[0], axis=-1))
+        start = problem.evidence.poses
+        apart = [candidates.position - start.position[0], candidates.forward - start.forward[0]]
+        first = jnp.argmin(jnp.linalg.norm(jnp.concatenate(apart, axis=-1), axis=-1))
         parts = jnp.round(problem.evidence.num_views * candidates.position.shape[0] / self.views).astype(int)
         turn = (first + parts) % candidates.position.shape[0]
         chosen = jnp.arange(candidates.position.shape[0]) == turn

@@ -65,7 +65,7 @@ def test_a_record_is_json_and_holds_every_method(record):
     assert json.loads(json.dumps(record, allow_nan=False)) == record
     assert (record["scene"], record["name"]) == (1, "b_torus.OBJ")
     assert list(record["methods"]) == list(RUN)
-    assert ReconstructionStudy.methods == ("coverage", "farthest", "uncertainty", "random")
+    assert ReconstructionStudy.methods == ("coverage", "new-surface", "farthest", "uncertainty", "random")
     for method in record["methods"].values():
         assert len({tuple(view["position"]) for view in method["views"]}) == 3
         assert 0 < method["coverage"][0] < method["coverage"][-1] <= 1
@@ -85,14 +85,16 @@ def test_a_scene_can_be_run_again_with_some_of_the_methods(record, meshes):
         assert method == record["methods"][name]
 
 
-def test_planners_differ_in_their_search_alone():
+def test_planners_differ_in_what_they_seek_and_their_search_alone():
     study = small_study()
     scene = study.scene(0)
-    searches = (nbv.DiscreteSearch, nbv.FarthestView, nbv.UncertaintyView, nbv.RandomView)
+    searches = (nbv.DiscreteSearch, nbv.DiscreteSearch, nbv.FarthestView, nbv.UncertaintyView, nbv.RandomView)
+    own: dict = {"search": None, "acquisition": None}
     for method, search in zip(study.methods, searches, strict=True):
         planner = study.planner(method, scene)
         assert planner.search == search(study.candidates)
-        assert describe(planner) | {"search": None} == describe(study.planner("farthest", scene)) | {"search": None}
+        assert isinstance(planner.acquisition, nbv.NewSurface if method == "new-surface" else nbv.Coverage)
+        assert describe(planner) | own == describe(study.planner("farthest", scene)) | own
     assert isinstance(planner.acquisition, nbv.Coverage)
     assert (planner.imagination.num_samples, planner.imagination.grid, planner.capacity, planner.max_views) == (
         2,
