@@ -43,8 +43,7 @@ class PointCloud(eqx.Module):
     - `normals`: unit outward normals.
     - `missed`: of a sensor's scan, whose rows are its pixels: where the ray met nothing, so that all of it is empty. A
       row that is neither filled nor missed is invalid and says nothing. None for a cloud that is no sensor's image.
-    - `noise`: standard deviation of each component of the row's normal, beside the noise that a surface model has for
-      all rows. None where none is known of any row.
+    - `noise`: standard deviation of each component of the row's normal; thinning heeds it. None where none is known.
     """
 
     points: Float[Array, "*batch n 3"]
@@ -257,13 +256,14 @@ def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
     """`count` points, each as far as can be from those chosen before it, in order of choice (Eldar et al. 1997).
 
     Starts at the first filled row. Where the cloud has fewer points than `count`, all of them come first and the rest
-    of the rows are masked. Of noisy rows the good ones come first: a distance counts less by 1 + noise / 0.1.
+    of the rows are masked. Sure rows are preferred: a distance counts less by 1 + noise / 0.1, by no
+    more than a half, so that what is noisy all over is not left out.
 
     **Raises:** `ValueError` if `count` < 1.
     """
     check_single(cloud)
     require(1 <= count <= _MOST_ROWS, f"asked for {count} points; ask for at least one and at most {_MOST_ROWS}")
-    worth = None if cloud.noise is None else 1.0 / (1.0 + cloud.noise / _HALVES)
+    worth = None if cloud.noise is None else 1.0 / (1.0 + jnp.minimum(cloud.noise / _HALVES, 1.0))
     chosen = farthest_point_indices(cloud.points, cloud.mask, count, worth)
     kept = jnp.arange(count) < cloud.count
     return _take(cloud, chosen, kept)

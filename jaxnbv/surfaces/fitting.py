@@ -54,8 +54,7 @@ def fit_hyperparameters(
 
 def _random_rows(cloud: PointCloud, key: PRNGKeyArray, count: int) -> PointCloud:
     order = jnp.argsort(jnp.where(cloud.mask, jax.random.uniform(key, cloud.mask.shape), jnp.inf))[:count]
-    noise = None if cloud.noise is None else cloud.noise[order]
-    return PointCloud(cloud.points[order], cloud.normals[order], cloud.mask[order], noise=noise)
+    return PointCloud(cloud.points[order], cloud.normals[order], cloud.mask[order])
 
 
 @eqx.filter_jit

@@ -1,4 +1,4 @@
-"""A = k(X, X) + diag(sigma_j^2), the covariance of the observed normals: its factor, for clouds partly filled."""
+"""A = k(X, X) + noise^2 I, the covariance of the observed normals: its Cholesky factor, for clouds partly filled."""
 
 import functools
 from collections.abc import Callable
@@ -14,31 +14,17 @@ from jaxnbv.surfaces.matern import Scalar
 _ALWAYS_WHOLE = 1024
 
 
-def noise_variance(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Float[Array, "#n"]:
-    """Of each component of each normal: the model's noise, of all rows, and that which the cloud knows of each.
-
-    The latter is of normals of unit length, those of the prior have a mean square of 3 k(0), and only what noise is to
-    the prior counts: so it is scaled as they are.
-    """
-    shared = jnp.atleast_1d(noise**2)
-    if cloud.noise is None:
-        return shared
-    origin = jnp.zeros((1, 3), cloud.points.dtype)
-    return shared + 3.0 * normal_covariance(origin, origin, spectrum)[0, 0] * cloud.noise**2
-
-
 def factorise(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Float[Array, "n n"]:
     """Lower Cholesky factor of A, where a row that is not filled is a row of the identity.
 
     Such a row changes neither the solves nor the determinant.
     """
     capacity = cloud.capacity
-    variance = jnp.where(cloud.mask, noise_variance(cloud, spectrum, noise), 1.0)
 
     def leading(size: int):
         points, mask = cloud.points[:size], cloud.mask[:size]
         kernel = jnp.where(mask[:, None] & mask, normal_covariance(points, points, spectrum), 0.0)
-        block = kernel + jnp.diag(variance[:size])
+        block = kernel + jnp.diag(jnp.where(mask, noise**2, 1.0))
         factor = jnp.linalg.cholesky(block, symmetrize_input=False)
         return jnp.eye(capacity, dtype=factor.dtype).at[:size, :size].set(factor)
 

@@ -4,8 +4,7 @@
              cov(v_d(x), v_d(y)) = sum_{|n|_inf <= L} s(n) cos(n.(x - y)),   s(n) = s1(n_1) s1(n_2) s1(n_3),
              or a sum of such s, one for each lengthscale
     Poisson  f_hat(n) = -i n . v_hat(n) / |n|^2,   f_hat(0) = 0
-    data     n_j = v(x_j) + eps_j,   eps_j ~ N(0, sigma_j^2 I),   A = k(X, X) + diag(sigma_j^2),
-             sigma_j^2 = noise^2, and 3 k(0) noise_j^2 more where the cloud knows the noise of a row
+    data     n_j = v(x_j) + eps_j,   eps_j ~ N(0, noise^2 I),   A = k(X, X) + noise^2 I
     sample   v_post = v + k(., X) A^-1 (n - v(X) - eps), v and eps from the prior;   f = Poisson(v_post)
 
 A sample is one function, band-limited, to be evaluated anywhere. Its prior part, its residual at the data and its
@@ -37,7 +36,7 @@ from jaxnbv.surfaces.covariance import (
     function_variance,
     mode_variance,
 )
-from jaxnbv.surfaces.gram import factorise, noise_variance, on_filled_rows
+from jaxnbv.surfaces.gram import factorise, on_filled_rows
 from jaxnbv.surfaces.matern import Scalar, circle_spectrum
 from jaxnbv.surfaces.nonuniform import NonuniformTransform
 from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, filled
@@ -64,7 +63,7 @@ class GeometricSPSR(SurfaceModel):
     - `lengthscale`: ell, in units of the circumference 2 pi: 0.005 is 0.031 in scene units. Several make a sum of
       independent priors, short ones for detail and long ones for the body.
     - `variance`: per axis, so that without truncation Var v_d = variance^3; one for each lengthscale.
-    - `noise`: standard deviation of each component of the observed normals, beside what the cloud says of its rows.
+    - `noise`: standard deviation of each component of the observed normals.
     - `nu`: smoothness, 1/2, 3/2 or 5/2.
     - `truncation`: L; frequencies up to L along each axis are kept. They hold `kept_variance` of the prior's variance:
       49 % at the default values, which are the paper's.
@@ -167,8 +166,7 @@ def _condition(model: GeometricSPSR, cloud: PointCloud) -> "GeometricSPSRPosteri
     spectrum = model.spectrum
     # Whatever stands in rows that are not filled, NaN included, must not reach the products.
     points, normals = (jnp.where(cloud.mask[:, None], rows, 0.0) for rows in (cloud.points, cloud.normals))
-    noise = None if cloud.noise is None else jnp.where(cloud.mask, cloud.noise, 0.0)
-    cloud = PointCloud(points, normals, cloud.mask, noise=noise)
+    cloud = PointCloud(points, normals, cloud.mask)
     cholesky = factorise(cloud, spectrum, model.noise)
     weights = cho_solve((cholesky, True), normals)
     transform = NonuniformTransform(cloud.points, model.truncation)
@@ -247,13 +245,12 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         scale = jnp.sqrt(mode_variance(spectrum))
         modes = scale.shape[0]
         transform = NonuniformTransform(self.cloud.points, self.model.truncation)
-        deviation = jnp.sqrt(noise_variance(self.cloud, spectrum, self.model.noise))[:, None]
         field_keys, noise_keys = jax.random.split(key, (2, num_samples))
 
         def prior(keys):
             field_key, noise_key = keys
             coefficients = scale * jax.random.normal(field_key, (3, modes, modes, modes), dtype)
-            noise = deviation * jax.random.normal(noise_key, self.cloud.points.shape, dtype)
+            noise = self.model.noise * jax.random.normal(noise_key, self.cloud.points.shape, dtype)
             return NormalDraws(coefficients, transform.evaluate(coefficients) + noise)
 
         return jax.lax.map(prior, (field_keys, noise_keys))

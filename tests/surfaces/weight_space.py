@@ -55,14 +55,11 @@ class WeightSpace:
         return np.concatenate([zero, scale[:, None] * np.sin(angle), -scale[:, None] * np.cos(angle)], axis=2)
 
     def condition(self, points, normals):
-        """Mean (3, k) and covariance (k, k) of the weights, the same covariance for each component.
-
-        The noise is one number, or one a row.
-        """
+        """Mean (3, k) and covariance (k, k) of the weights, the same covariance for each component."""
         features = self.normal_features(points)
-        weighed = (features.T / np.broadcast_to(self.noise, len(points)) ** 2).T
-        covariance = np.linalg.inv(np.eye(self.num_weights) + features.T @ weighed)
-        return (covariance @ weighed.T @ normals).T, covariance
+        precision = np.eye(self.num_weights) + features.T @ features / self.noise**2
+        covariance = np.linalg.inv(precision)
+        return (covariance @ features.T @ normals / self.noise**2).T, covariance
 
     def posterior(self, points, normals, x):
         """Mean (n,) and covariance (n, n) of f(x)."""
@@ -72,7 +69,7 @@ class WeightSpace:
 
     def log_marginal_likelihood(self, points, normals):
         features = self.normal_features(points)
-        covariance = features @ features.T + np.diag(np.broadcast_to(self.noise, len(points)) ** 2)
+        covariance = features @ features.T + self.noise**2 * np.eye(len(points))
         fit = np.sum(normals * np.linalg.solve(covariance, normals))
         return -0.5 * fit - 1.5 * np.linalg.slogdet(2 * np.pi * covariance)[1]
 
