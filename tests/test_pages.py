@@ -162,7 +162,7 @@ def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
         nbv.Imagination(model, grid=nbv.Grid(40), num_samples=2),
         capacity=2048,
     )
-    monkeypatch.setattr("jaxnbv.planning.session._usual", lambda: planner)
+    monkeypatch.setattr("jaxnbv.planning.session.usual_planner", lambda: planner)
     given = {"K": INTRINSICS, **CORNERS, "reachable": poses, "first": poses[0], "take_image": image_of_a_ball}
     (block,) = (block for block in blocks("how_to/depth_camera.md") if "until=" in block)
     exec(block, given)

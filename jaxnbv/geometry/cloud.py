@@ -29,8 +29,6 @@ from jaxnbv.geometry.volume import Box
 # Of a cloud: what an index of 32 bits counts, and far beyond any memory that a planner has.
 _MOST_ROWS = 2**31 - 1
 _LONGEST_NORMAL = 10.0
-# A row whose normal is off by six degrees must be twice as far from those chosen before it as one that is right.
-_HALVES = 0.1
 
 
 class PointCloud(eqx.Module):
@@ -43,7 +41,7 @@ class PointCloud(eqx.Module):
     - `normals`: unit outward normals.
     - `missed`: of a sensor's scan, whose rows are its pixels: where the ray met nothing, so that all of it is empty. A
       row that is neither filled nor missed is invalid and says nothing. None for a cloud that is no sensor's image.
-    - `noise`: standard deviation of each component of the row's normal; thinning heeds it. None where none is known.
+    - `noise`: standard deviation of each component of the row's normal, to drop rows by; None where none is known.
     """
 
     points: Float[Array, "*batch n 3"]
@@ -256,15 +254,13 @@ def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
     """`count` points, each as far as can be from those chosen before it, in order of choice (Eldar et al. 1997).
 
     Starts at the first filled row. Where the cloud has fewer points than `count`, all of them come first and the rest
-    of the rows are masked. Sure rows are preferred: a distance counts less by 1 + noise / 0.1, by no
-    more than a half, so that what is noisy all over is not left out.
+    of the rows are masked.
 
     **Raises:** `ValueError` if `count` < 1.
     """
     check_single(cloud)
     require(1 <= count <= _MOST_ROWS, f"asked for {count} points; ask for at least one and at most {_MOST_ROWS}")
-    worth = None if cloud.noise is None else 1.0 / (1.0 + jnp.minimum(cloud.noise / _HALVES, 1.0))
-    chosen = farthest_point_indices(cloud.points, cloud.mask, count, worth)
+    chosen = farthest_point_indices(cloud.points, cloud.mask, count)
     kept = jnp.arange(count) < cloud.count
     return _take(cloud, chosen, kept)
 

@@ -10,31 +10,25 @@ from jaxnbv.checks import require
 
 
 @functools.partial(jax.jit, static_argnames="count")
-def farthest_point_indices(
-    points: Float[Array, "n d"], mask: Bool[Array, " n"], count: int, worth: Float[Array, " n"] | None = None
-) -> Int[Array, " count"]:
+def farthest_point_indices(points: Float[Array, "n d"], mask: Bool[Array, " n"], count: int) -> Int[Array, " count"]:
     """`count` rows, each as far as can be from those before it, in order of choice; of equals, the first.
 
     Starts at the first filled row. No row is chosen twice while another that is filled is left, duplicates included;
     a cloud of fewer points than `count` gives each of them, then its first filled row again and again. The indices
     carry no derivative; points get theirs through `points[indices]`.
 
-    - `worth`: positive; by how much the distance of each row counts.
-
     **Raises:** `ValueError` if `count` < 1.
     """
     require(count >= 1, f"cannot choose {count} points; ask for at least one")
     columns = list(jax.lax.stop_gradient(jnp.where(mask[:, None], points, 0.0)).T)
     rows = jnp.arange(len(points), dtype=jnp.int32)
-    weights = None if worth is None else jax.lax.stop_gradient(worth) ** 2
 
     def choose(carry, _):
         distance, latest = carry
         squares = [(column - column[latest]) ** 2 for column in columns]
         nearer = jnp.minimum(distance, functools.reduce(jnp.add, squares))
         distance = jnp.where(rows == latest, _CHOSEN, nearer)
-        weighed = distance if weights is None else jnp.where(distance > 0, weights * distance, distance)
-        return (distance, _first_of_largest(weighed, rows)), latest
+        return (distance, _first_of_largest(distance, rows)), latest
 
     start = jnp.where(mask, jnp.inf, jnp.full_like(columns[0], _EMPTY)), jnp.argmax(mask).astype(jnp.int32)
     return jax.lax.scan(choose, start, length=count)[1]

@@ -268,21 +268,3 @@ def test_noise_stays_with_its_rows():
     np.testing.assert_array_equal(limit_capacity(concatenate(clean, cloud), 6).noise, [0.0, 0.0, 0.0, *NOISE])
     turned = Frame(3.0, (1.0, 2.0, 3.0), "z").to_scene(cloud)
     np.testing.assert_array_equal(turned.noise, cloud.noise)
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.integers(0, 10_000), st.integers(2, 15))
-def test_thinning_prefers_rows_that_are_sure(seed, count):
-    """The greedy definition in float64, with distances that count less by 1 + noise / 0.1, a half at least."""
-    rng = np.random.default_rng(seed)
-    points, noise = rng.normal(size=(15, 3)).astype(np.float32), rng.uniform(0.0, 0.5, 15).astype(np.float32)
-    cloud = tagged(points, np.ones(15, bool))
-    cloud = PointCloud(cloud.points, cloud.normals, cloud.mask, noise=jnp.asarray(noise))
-    chosen = [0]
-    while len(chosen) < count:
-        gaps = np.linalg.norm(points[:, None].astype(np.float64) - points[chosen], axis=-1).min(axis=1)
-        gaps[chosen] = -1.0
-        chosen.append(int(np.argmax(gaps / (1.0 + np.minimum(noise / 0.1, 1.0)))))
-    thinned = farthest_point_subsample(cloud, count)
-    np.testing.assert_array_equal(thinned.normals[:, 0], chosen)
-    np.testing.assert_array_equal(thinned.noise, noise[chosen])
