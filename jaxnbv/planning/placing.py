@@ -14,6 +14,7 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Surroundings, plane_under
+from jaxnbv.scanning.sdf import HalfSpace
 from jaxnbv.search import CandidateSearch, GivenPoses, HalvingSearch, SphereCandidates
 from jaxnbv.tasks import NewSurface
 
@@ -72,11 +73,17 @@ def on_support(planner: Planner, cloud: PointCloud, box: Box, frame: Frame) -> P
     """
     plane = plane_under(frame.to_scene(cloud), frame.to_scene(box))
     around = Surroundings(() if plane is None else (plane,))
-    if plane is not None:
-        height = frame.to_world(np.asarray(plane.point, np.float64))
-        warnings.warn(
-            f"the object stands on a plane through {np.round(height, 4).tolist()}, which goes on beyond the box: it is "
-            "taken for a table and left out. Give surroundings=Surroundings() to keep it",
-            stacklevel=5,
-        )
     return dataclasses.replace(planner, imagination=dataclasses.replace(planner.imagination, surroundings=around))
+
+
+def tell_of_support(planner: Planner, frame: Frame) -> None:
+    """Warn of the plane that `on_support` has found, if it has found one."""
+    around = planner.imagination.surroundings
+    for plane in () if around is None else around.obstacles:
+        assert isinstance(plane, HalfSpace)
+        place = np.round(frame.to_world(np.asarray(plane.point, np.float64)), 4).tolist()
+        warnings.warn(
+            f"the object stands on a plane through {place}, which goes on beyond the box: it is taken for a table and "
+            "left out. Give surroundings=Surroundings() to keep it",
+            stacklevel=4,
+        )

@@ -19,7 +19,7 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 from jaxnbv.planning.episode import STAGES, Episode, View, view_keys
-from jaxnbv.planning.placing import box_of, on_support, placed, stride_of, usual_planner
+from jaxnbv.planning.placing import box_of, on_support, placed, stride_of, tell_of_support, usual_planner
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Watch
 from jaxnbv.scanning import Evidence, Surroundings
@@ -192,6 +192,8 @@ class Session:
         require(0 <= camera < count, f"the session has {count} cameras, counted from 0: there is no camera {camera}")
         image = DepthImage(pixels, as_numbers(matrix, "the matrix of a pose", np.float64), depth_scale, camera)
         look = self._looked(image)
+        if look.planner is not self.planner:
+            tell_of_support(look.planner, self.frame)
         if self._folder is not None:
             with self._folder.writing():
                 self._check_alone(self._folder)
