@@ -61,10 +61,10 @@ class Acquisition(eqx.Module):
     def __call__(self, context: Any, scan: PointCloud) -> Float[Array, ""]:
         """The score of one scan (rows, masked). Finite; for a scan that sees nothing, no more than for any other.
 
-        **Raises:** `NotImplementedError` for an acquisition that has only a `score`.
+        **Raises:** `ValueError` for an acquisition that has only a `score`.
         """
         name = type(self).__name__
-        raise NotImplementedError(f"{name} scores no scan alone: call its score(context, scan, camera, pose)")
+        raise InputError(f"{name} scores no scan alone: call its score(context, scan, camera, pose)")
 
     def score(self, context: Any, scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, "*values"]:
         """The score of one scan that a camera takes from a pose: by default that of the scan alone. Define it in place

@@ -161,8 +161,6 @@ REFUSED = {
         "(2, 3)",
     ),
     "rays that differ in number": (lambda: nbv.PointCloud(SCAN.points, SCAN.normals, SCAN.mask, SCAN.mask[:5]), "(5,)"),
-    "noise of other rows": (lambda: nbv.PointCloud.from_arrays(np.eye(3), np.eye(3), noise=[0.1]), "(1,)"),
-    "noise below zero": (lambda: nbv.PointCloud.from_arrays(np.eye(3), np.eye(3), noise=[0.1, -0.1, 0]), "negative"),
     "a mask of numbers": (lambda: nbv.PointCloud(CLOUD.points, CLOUD.normals, jnp.ones(60)), "truths"),
     "a batch for a posterior": (lambda: MODEL.condition(SCANS), "batch"),
     "a batch to thin": (lambda: nbv.farthest_point_subsample(SCANS, 3), "batch"),

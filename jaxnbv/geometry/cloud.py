@@ -41,22 +41,19 @@ class PointCloud(eqx.Module):
     - `normals`: unit outward normals.
     - `missed`: of a sensor's scan, whose rows are its pixels: where the ray met nothing, so that all of it is empty. A
       row that is neither filled nor missed is invalid and says nothing. None for a cloud that is no sensor's image.
-    - `noise`: standard deviation of each component of the row's normal, to drop rows by; None where none is known.
     """
 
     points: Float[Array, "*batch n 3"]
     normals: Float[Array, "*batch n 3"]
     mask: Bool[Array, "*batch n"]
     missed: Bool[Array, "*batch n"] | None = None
-    noise: Float[Array, "*batch n"] | None = None
 
     def __check_init__(self):
-        leaves = self.points, self.normals, self.mask, self.missed, self.noise
-        shapes = [jnp.shape(leaf) for leaf in leaves if leaf is not None]
+        shapes = [jnp.shape(leaf) for leaf in (self.points, self.normals, self.mask, self.missed) if leaf is not None]
         rows = shapes[0][:-1]
         require(
             len(rows) > 0 and shapes[0] == shapes[1] == (*rows, 3) and all(shape == rows for shape in shapes[2:]),
-            f"a cloud needs points and normals (..., n, 3), masks and noise (..., n), got {shapes}: build it with "
+            f"a cloud needs points and normals (..., n, 3) and masks (..., n), got {shapes}: build it with "
             "PointCloud.from_arrays",
         )
         for leaf, name in ((self.mask, "mask"), (self.missed, "missed")):
@@ -68,16 +65,13 @@ class PointCloud(eqx.Module):
         points: Float[AnyArray, "n 3"] | list,
         normals: Float[AnyArray, "n 3"] | list,
         capacity: int | None = None,
-        noise: Float[AnyArray, " n"] | list | None = None,
     ) -> "PointCloud":
         """A cloud of the given points and outward normals, padded to `capacity` rows (default: as many as there are).
 
         Normals are scaled to unit length, with a `UserWarning` where that changes one by more than 1 %.
 
-        - `noise`: standard deviation of each component of each normal, where it is known.
-
         **Raises:** `ValueError` for shapes other than (n, 3), no points at all, an entry that is not finite, a normal
-        of length zero, noise that is negative, or more points than the capacity.
+        of length zero, or more points than the capacity.
         """
         points, normals = (as_numbers(rows, name) for rows, name in ((points, "points"), (normals, "normals")))
         require(
@@ -119,7 +113,6 @@ class PointCloud(eqx.Module):
             jnp.asarray(np.pad(points, pad)),
             jnp.asarray(np.pad((normals / lengths[:, None]).astype(points.dtype), pad)),
             jnp.asarray(np.arange(capacity) < count),
-            noise=None if noise is None else jnp.asarray(np.pad(_noise_of_rows(noise, count), pad[0])),
         )
 
     @classmethod
@@ -139,8 +132,7 @@ class PointCloud(eqx.Module):
         zero, negative or NaN is invalid and says nothing. Out of the camera's range a pixel is invalid where it is too
         near, and met nothing so far where it is too far. Points and normals are those of planes fitted to what lies
         around a pixel on the same surface, in a window that grows with the image's noise (`geometry/plane_fit.py`);
-        normals are turned to the camera, and their noise is what the plane leaves of its pixels. A pixel whose
-        neighbours have no plane is invalid.
+        normals are turned to the camera. A pixel whose neighbours have no plane is invalid.
 
         - `depth`: along the camera's forward axis; `depth_scale` times it is in units of the pose: 0.001 where the
           image is in millimetres and the pose in metres. The range of the camera, and the box, are in these units too.
@@ -230,22 +222,11 @@ def concatenate(first: PointCloud, second: PointCloud) -> PointCloud:
     """The union D u D' of the paper, with the capacities added; rows keep their places. It is no sensor's image."""
     for cloud in (first, second):
         check_single(cloud)
-    known = first.noise is not None or second.noise is not None
-    parts = [_without_rays(cloud, known) for cloud in (first, second)]
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=0), *parts)
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=0), _without_rays(first), _without_rays(second))
 
 
-def _without_rays(cloud: PointCloud, with_noise: bool) -> PointCloud:
-    noise = jnp.zeros(cloud.mask.shape, cloud.points.dtype) if cloud.noise is None else cloud.noise
-    return PointCloud(cloud.points, cloud.normals, cloud.mask, noise=noise if with_noise else None)
-
-
-def _noise_of_rows(noise, count: int) -> Float[np.ndarray, " n"]:
-    noise = as_numbers(noise, "the noise")
-    require(noise.shape == (count,), f"there are {count} points but noise of shape {noise.shape}: give one a point")
-    good = bool(np.isfinite(noise).all() and (noise >= 0).all())
-    require(good, "the noise has entries that are negative or not finite: give standard deviations")
-    return noise
+def _without_rays(cloud: PointCloud) -> PointCloud:
+    return PointCloud(cloud.points, cloud.normals, cloud.mask)
 
 
 @checked
@@ -286,6 +267,5 @@ def limit_capacity(cloud: PointCloud, capacity: int) -> PointCloud:
 
 
 def _take(cloud: PointCloud, index: Int[Array, " m"], kept: Bool[Array, " m"]) -> PointCloud:
-    points, normals = (jnp.where(kept[:, None], rows[index], 0.0) for rows in (cloud.points, cloud.normals))
-    noise = None if cloud.noise is None else jnp.where(kept, cloud.noise[index], 0.0)
-    return PointCloud(points, normals, kept, noise=noise)
+    points = jnp.where(kept[:, None], cloud.points[index], 0.0)
+    return PointCloud(points, jnp.where(kept[:, None], cloud.normals[index], 0.0), kept)

@@ -2,7 +2,6 @@
 
 import math
 import warnings
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,17 +14,7 @@ from jaxnbv.geometry.plane_fit import fitted_planes
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box, ray_interval
 
-
-class Rows(NamedTuple):
-    """What `PointCloud` holds."""
-
-    points: Float[Array, "n 3"]
-    normals: Float[Array, "n 3"]
-    mask: Bool[Array, " n"]
-    missed: Bool[Array, " n"]
-    noise: Float[Array, " n"]
-
-
+Rows = tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"]]
 # Depths that are so many times what they should be are in other units, not of another object.
 _OTHER_UNITS = 20.0
 
@@ -37,7 +26,7 @@ class NothingInside(UserWarning):
 def points_of_depth(
     depth: Real[AnyArray, "height width"], camera: Camera, pose: Pose, scale: float, stride: int, box: Box | None
 ) -> Rows:
-    """The rows of `PointCloud.from_depth`."""
+    """Points, normals, which rows are filled and which rays met nothing: `PointCloud.from_depth`."""
     shape = (camera.height, camera.width)
     # Before large numbers are rounded to infinity.
     numbers = depth if is_traced(depth) else as_numbers(depth, "the depth image", None)
@@ -56,12 +45,12 @@ def points_of_depth(
     if not is_traced(depth, pose):
         known = np.asarray(depth)
         _check_meaning(known[np.isfinite(known) & (known > 0)], camera, pose, box)
-    rows, inside = _oriented(depth, jnp.asarray(missed), camera, pose, stride, rounding, box)
-    mask = rows.mask & inside
-    if box is not None and not is_traced(mask):
-        _warn_of_nothing_inside(np.asarray(rows.points)[np.asarray(rows.mask)], bool(mask.any()), box)
-    points, normals = (jnp.where(mask[:, None], vectors, 0.0) for vectors in (rows.points, rows.normals))
-    return Rows(points, normals, mask, rows.missed, jnp.where(mask, rows.noise, 0.0))
+    points, normals, mask, missed, inside = _oriented(depth, jnp.asarray(missed), camera, pose, stride, rounding, box)
+    if box is not None and not is_traced(points):
+        _warn_of_nothing_inside(np.asarray(points)[np.asarray(mask)], np.asarray(inside)[np.asarray(mask)], box)
+    mask = mask & inside
+    points, normals = (jnp.where(mask[:, None], vectors, 0.0) for vectors in (points, normals))
+    return points, normals, mask, missed
 
 
 @eqx.filter_jit
@@ -73,26 +62,26 @@ def _oriented(
     stride: int,
     rounding: float,
     box: Box | None,
-) -> tuple[Rows, Bool[Array, " n"]]:
-    """The rows, wherever they lie, and which lie in the box; rays that crossed it met nothing."""
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"], Bool[Array, " n"]]:
+    """Points, normals, which of them are valid, which rays met nothing in the box, and which points lie in it."""
     valid = jnp.isfinite(depth) & (depth > 0)
     if camera.farthest is not None:
         missed = missed | (valid & (depth > camera.farthest))
     valid = valid & ~missed & (depth >= camera.nearest)
-    planes = fitted_planes(jnp.where(valid, depth, 0.0), valid, camera, stride, rounding)
+    smooth, normals, has_normal = fitted_planes(jnp.where(valid, depth, 0.0), valid, camera, stride, rounding)
     rows, camera = slice(stride // 2, None, stride), camera.strided(stride)
     depth, valid, missed = depth[rows, rows], valid[rows, rows], missed[rows, rows]
-    mask = (valid & planes.found).reshape(-1)
-    smooth = jnp.where(planes.found, planes.depths, depth)
-    points = pose.to_scene(jnp.where(valid, smooth, 0.0).reshape(-1, 1) * camera.pixel_directions())
-    normals = jnp.matmul(planes.normals.reshape(-1, 3), pose.rotation.T, precision="highest")
+    mask = (valid & has_normal).reshape(-1)
+    local = jnp.where(valid, jnp.where(has_normal, smooth, depth), 0.0).reshape(-1, 1) * camera.pixel_directions()
+    points = pose.to_scene(local)
+    normals = jnp.matmul(normals.reshape(-1, 3), pose.rotation.T, precision="highest")
 
     missed, inside = missed.reshape(-1), jnp.ones_like(mask)
     if box is not None:
         crossed = valid.reshape(-1) & (depth.reshape(-1) >= _depth_behind(box, camera, pose))
         inside = box(points) <= 0
         missed = missed | (crossed & ~inside)
-    return Rows(points, normals, mask, missed, planes.noise.reshape(-1)), inside
+    return points, normals, mask, missed, inside
 
 
 def _depth_behind(box: Box, camera: Camera, pose: Pose) -> Float[Array, " n"]:
@@ -130,9 +119,9 @@ def _check_meaning(depth: Float[np.ndarray, " valid"], camera: Camera, pose: Pos
     )
 
 
-def _warn_of_nothing_inside(points: Float[np.ndarray, "valid 3"], inside: bool, box: Box) -> None:
+def _warn_of_nothing_inside(points: Float[np.ndarray, "valid 3"], inside: Bool[np.ndarray, " n"], box: Box) -> None:
     """An image may show none of the object; more often its pose is wrong."""
-    if len(points) and not inside:
+    if len(points) and not inside.any():
         low, high = points.min(axis=0), points.max(axis=0)
         warnings.warn(
             f"none of the {len(points)} points of the depth image lies in the box from {box.low} to {box.high}: they "

@@ -7,15 +7,10 @@ A plane is linear in inverse depth. With (u, v) where a ray meets the plane at d
 is fitted by least squares to the pixels of a window that can be of the same surface. The window grows with the noise: a
 slope fitted to (2 r + 1)^2 pixels that are p apart on the surface is off by sqrt(3) sigma / (p r (2 r + 1)), which is
 held below 2.5 degrees where windows of at most 21 pixels can.
-
-A normal is as sure as b and c are. Of what the plane leaves of its pixels, the image's noise averages out, and gives
-their variance by the usual formula of least squares. The rest is a bend or an edge, which does not: it may tilt the
-plane by itself over the window's radius.
 """
 
 import math
 from statistics import NormalDist
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -46,21 +41,12 @@ def depth_noise(depth: Float[Array, "h w"], valid: Bool[Array, "h w"]) -> Float[
     return jnp.sum(jnp.where(used, ordered, 0.0)) / jnp.maximum(count, 1.0) / (_MEAN_SIZE * math.sqrt(20.0))
 
 
-class Planes(NamedTuple):
-    """Of so many rows and columns of pixels the depths and normals, in the camera's frame and turned to it, the
-    standard deviation of each component of a normal, and which pixels have a plane."""
-
-    depths: Float[Array, "k l"]
-    normals: Float[Array, "k l 3"]
-    noise: Float[Array, "k l"]
-    found: Bool[Array, "k l"]
-
-
 def fitted_planes(
     depth: Float[Array, "h w"], valid: Bool[Array, "h w"], camera: Camera, stride: int, least_noise: float
-) -> Planes:
-    """The planes of every so many-th row and column. A depth moves to its plane by no more than three standard
-    deviations of the noise.
+) -> tuple[Float[Array, "k l"], Float[Array, "k l 3"], Bool[Array, "k l"]]:
+    """Depths and normals of every so many-th row and column, in the camera's frame, and which have a plane.
+
+    Normals look towards the camera. A depth moves to its plane by no more than three standard deviations of the noise.
 
     - `depth`: positive and finite where it is `valid`. `camera`: of the whole image.
     - `least_noise`: a standard deviation that is known, that of rounding say.
@@ -85,35 +71,22 @@ def fitted_planes(
         used = has_middle & (near > 0) & alike & (jnp.maximum(jnp.abs(down), jnp.abs(right)) <= radius)
         row = jnp.stack(jnp.broadcast_arrays(1.0, right / radius, down / radius), axis=-1)
         row = jnp.where(used[..., None], row.astype(depth.dtype), 0.0)
-        # Less one, which leaves what few digits hold.
-        ratio = jnp.where(used, (middle - near) / jnp.where(used, near, 1.0), 0.0)
-        return (
-            sums[0] + row[..., :, None] * row[..., None, :],
-            sums[1] + ratio[..., None] * row,
-            sums[2] + ratio**2,
-        )
+        ratio = middle / jnp.where(used, near, 1.0)
+        return sums[0] + row[..., :, None] * row[..., None, :], sums[1] + ratio[..., None] * row
 
-    zeros = tuple(jnp.zeros((*middle.shape, *shape), depth.dtype) for shape in ((3, 3), (3,), ()))
-    normal, right_hand, squares = jax.lax.fori_loop(0, width * width, add, zeros)
+    zeros = jnp.zeros((*middle.shape, 3, 3), depth.dtype), jnp.zeros((*middle.shape, 3), depth.dtype)
+    normal, right_hand = jax.lax.fori_loop(0, width * width, add, zeros)
     # What lies along a line has no plane.
     has_plane = (normal[..., 0, 0] >= _FEWEST) & (_breadth(normal) > 1e-3)
     regular = jnp.where(has_plane[..., None, None], normal, jnp.eye(3, dtype=depth.dtype))
-    inverse = jnp.linalg.inv(regular)
-    fit = jnp.einsum("...ij,...j->...i", inverse, right_hand, precision="highest")
-    plane = fit.at[..., 0].add(1.0)
+    plane = jnp.linalg.solve(regular, right_hand[..., None])[..., 0]
     has_plane = has_plane & (plane[..., 0] > 0)
     # From a slope a unit of the window to one a unit of (u, v).
     slope = plane[..., 1:] * focal / radius[..., None]
     towards = jnp.concatenate([slope, plane[..., :1] - jnp.sum(slope * place, axis=-1, keepdims=True)], axis=-1)
     length = jnp.linalg.norm(towards, axis=-1, keepdims=True)
     smooth = jnp.clip(middle / jnp.where(has_plane, plane[..., 0], 1.0), middle - 3.0 * sigma, middle + 3.0 * sigma)
-    slopes = jnp.diagonal(inverse, axis1=-2, axis2=-1)[..., 1:]
-    left = jnp.maximum(squares - jnp.sum(fit * right_hand, axis=-1), 0.0) / jnp.maximum(normal[..., 0, 0] - 3.0, 1.0)
-    own = (sigma / middle) ** 2
-    tilt = own[..., None] * slopes + jnp.maximum(left - own, 0.0)[..., None]
-    length = jnp.where(length > 0, length, 1.0)
-    noise = jnp.sqrt(jnp.mean(tilt * focal**2, axis=-1)) / radius / length[..., 0]
-    return Planes(smooth, -towards / length, jnp.minimum(noise, 1.0), has_plane & jnp.any(towards != 0, axis=-1))
+    return smooth, -towards / jnp.where(length > 0, length, 1.0), has_plane & (length[..., 0] > 0)
 
 
 def _radius(spacing: Float[Array, "k l"], sigma: Float[Array, ""]) -> Int[Array, "k l"]:

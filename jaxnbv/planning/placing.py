@@ -8,12 +8,11 @@ import numpy as np
 
 from jaxnbv.checks import InputError, as_numbers, require, shown
 from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Surroundings, plane_under
+from jaxnbv.scanning import Surroundings
 from jaxnbv.scanning.sdf import HalfSpace
 from jaxnbv.search import CandidateSearch, GivenPoses, HalvingSearch, SphereCandidates
 from jaxnbv.tasks import NewSurface
@@ -65,25 +64,18 @@ def placed(
     return dataclasses.replace(planner, camera=camera, search=search, imagination=imagination)
 
 
-def on_support(planner: Planner, cloud: PointCloud, box: Box, frame: Frame) -> Planner:
-    """The planner with the plane that the object stands on among its surroundings, if a first image shows one; with
-    surroundings that hold nothing but the points that were seen, if it does not.
-
-    - `cloud`: of the whole image, what is not in the box included; it and the box in world units.
-    """
-    plane = plane_under(frame.to_scene(cloud), frame.to_scene(box))
+def on_support(planner: Planner, plane: HalfSpace | None) -> Planner:
+    """The planner with the plane that the object stands on among its surroundings; with surroundings that hold nothing
+    but the points that were seen, if there is none."""
     around = Surroundings(() if plane is None else (plane,))
     return dataclasses.replace(planner, imagination=dataclasses.replace(planner.imagination, surroundings=around))
 
 
-def tell_of_support(planner: Planner, frame: Frame) -> None:
-    """Warn of the plane that `on_support` has found, if it has found one."""
-    around = planner.imagination.surroundings
-    for plane in () if around is None else around.obstacles:
-        assert isinstance(plane, HalfSpace)
-        place = np.round(frame.to_world(np.asarray(plane.point, np.float64)), 4).tolist()
-        warnings.warn(
-            f"the object stands on a plane through {place}, which goes on beyond the box: it is taken for a table and "
-            "left out. Give surroundings=Surroundings() to keep it",
-            stacklevel=4,
-        )
+def warn_of_support(plane: HalfSpace, frame: Frame) -> None:
+    """Say where the plane is, in world units, and how it is kept."""
+    place = np.round(frame.to_world(np.asarray(plane.point, np.float64)), 4).tolist()
+    warnings.warn(
+        f"the object stands on a plane through {place}, which goes on beyond the box: it is taken for a table and left "
+        "out. Give surroundings=Surroundings() to keep it",
+        stacklevel=4,
+    )

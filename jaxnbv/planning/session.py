@@ -19,10 +19,11 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 from jaxnbv.planning.episode import STAGES, Episode, View, view_keys
-from jaxnbv.planning.placing import box_of, on_support, placed, stride_of, tell_of_support, usual_planner
+from jaxnbv.planning.placing import box_of, on_support, placed, stride_of, usual_planner, warn_of_support
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Watch
-from jaxnbv.scanning import Evidence, Surroundings
+from jaxnbv.scanning import Evidence, Surroundings, plane_under
+from jaxnbv.scanning.sdf import HalfSpace
 from jaxnbv.search import Proposal
 from jaxnbv.storage import DepthImage, SessionFolder, describe
 from jaxnbv.tasks import Stop
@@ -192,8 +193,8 @@ class Session:
         require(0 <= camera < count, f"the session has {count} cameras, counted from 0: there is no camera {camera}")
         image = DepthImage(pixels, as_numbers(matrix, "the matrix of a pose", np.float64), depth_scale, camera)
         look = self._looked(image)
-        if look.planner is not self.planner:
-            tell_of_support(look.planner, self.frame)
+        if look.support is not None:
+            warn_of_support(look.support, self.frame)
         if self._folder is not None:
             with self._folder.writing():
                 self._check_alone(self._folder)
@@ -246,7 +247,7 @@ class Session:
         """What an image adds; nothing of the session is changed."""
         pose = Pose.from_matrix(image.matrix, self.convention)
         camera, stride = self.cameras[image.camera], self._strides[image.camera]
-        planner = self.planner
+        planner, support = self.planner, None
         with warnings.catch_warnings():
             if not self._views:
                 warnings.simplefilter("error", NothingInside)
@@ -256,13 +257,15 @@ class Session:
                 raise InputError(f"the first image shows nothing of the box: {problem}") from problem
         if not self._views and planner.imagination.surroundings is None:
             whole = PointCloud.from_depth(image.depth, camera, pose, image.depth_scale, stride)
-            planner = on_support(planner, whole, self.box, self.frame)
+            support = plane_under(self.frame.to_scene(whole), self.frame.to_scene(self.box))
+            planner = on_support(planner, support)
         scan, rays = self.frame.to_scene(cloud), self.frame.to_scene(self._rays[image.camera])
         if (around := planner.imagination.surroundings) is not None:
             scan = around.without_obstacles(scan)
         told = self.frame.to_scene(pose), scan, rays
         evidence = planner.init(*told) if self._evidence is None else planner.observe(self._evidence, *told)
-        return _Look(planner, View(told[0], scan, evidence.cloud, self._proposals.get(self.views), rays), evidence)
+        view = View(told[0], scan, evidence.cloud, self._proposals.get(self.views), rays)
+        return _Look(planner, support, view, evidence)
 
     def _take(self, look: "_Look") -> None:
         self.planner, self._evidence = look.planner, look.evidence
@@ -296,9 +299,11 @@ class Session:
 
 
 class _Look(NamedTuple):
-    """A view of the sensor's, what is known after it, and by whom: the first may show what the object stands on."""
+    """A view of the sensor's and what is known after it. The first may show what the object stands on, by which the
+    planner is another."""
 
     planner: Planner
+    support: HalfSpace | None
     view: View
     evidence: Evidence
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 else:
     AnyCandidates = Candidates
 
+Scores: TypeAlias = Float[Array, "asked samples candidates"]
+"""Of the acquisitions that a search asks, of each posterior sample, at each candidate."""
 
 _TIE = 1e-5
 
@@ -60,7 +62,7 @@ class CandidateSearch(Search):
         """The acquisitions whose scores it picks by; none for a search that does not look at them."""
         return (acquisition,) if self.uses_samples else ()
 
-    def score(self, problem: Problem, candidates: Pose) -> Float[Array, "asked samples candidates"]:
+    def score(self, problem: Problem, candidates: Pose) -> Scores:
         """The first half: the scores of the candidates, sample by sample, by each acquisition that it asks."""
         asked = self.asks(problem.acquisition)
         if not asked:
@@ -70,13 +72,7 @@ class CandidateSearch(Search):
         return problem.about(Several(asked)).scores(candidates)
 
     @abstractmethod
-    def pick(
-        self,
-        problem: Problem,
-        candidates: Pose,
-        scores: Float[Array, "asked samples candidates"],
-        key: PRNGKeyArray,
-    ) -> Proposal:
+    def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
         """The second half: one of the candidates, given their scores."""
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
@@ -99,13 +95,7 @@ class Rule(CandidateSearch):
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
         """Of each candidate; the open one of the highest value is taken."""
 
-    def pick(
-        self,
-        problem: Problem,
-        candidates: Pose,
-        scores: Float[Array, "asked samples candidates"],
-        key: PRNGKeyArray,
-    ) -> Proposal:
+    def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
         """The argmax of `values`; there are no scores."""
         return best_unvisited(problem, candidates, self.values(problem, candidates, key))
 

@@ -3,10 +3,10 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.search.base import CandidateSearch, best_unvisited
+from jaxnbv.search.base import CandidateSearch, Scores, best_unvisited
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal
 
@@ -16,12 +16,6 @@ class DiscreteSearch(CandidateSearch):
 
     uses_samples: ClassVar[bool] = True
 
-    def pick(
-        self,
-        problem: Problem,
-        candidates: Pose,
-        scores: Float[Array, "asked samples candidates"],
-        key: PRNGKeyArray,
-    ) -> Proposal:
+    def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
         """The argmax of the acquisition over the candidates not visited yet; the key is not used."""
         return best_unvisited(problem, candidates, jnp.mean(scores[0], axis=0), scores=scores[0])

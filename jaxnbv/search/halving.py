@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxnbv.checks import check_fields, require
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.search.base import CandidateSearch
+from jaxnbv.search.base import CandidateSearch, Scores
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal
 
@@ -44,13 +44,7 @@ class HalvingSearch(CandidateSearch):
 
         return self._halved(problem, candidates, means)
 
-    def pick(
-        self,
-        problem: Problem,
-        candidates: Pose,
-        scores: Float[Array, "asked samples candidates"],
-        key: PRNGKeyArray,
-    ) -> Proposal:
+    def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
         """The best of the last round; the value of a candidate that left earlier is its mean until then."""
         return self._halved(problem, candidates, lambda left, samples: jnp.mean(scores[0, samples][:, left], axis=0))
 

@@ -5,12 +5,12 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import check_fields
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.search.base import CandidateSearch, best_unvisited, first_best
+from jaxnbv.search.base import CandidateSearch, Scores, best_unvisited, first_best
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal
 
@@ -39,13 +39,7 @@ class TieBreakSearch(CandidateSearch):
         """Both."""
         return acquisition, self.second
 
-    def pick(
-        self,
-        problem: Problem,
-        candidates: Pose,
-        scores: Float[Array, "asked samples candidates"],
-        key: PRNGKeyArray,
-    ) -> Proposal:
+    def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
         """The argmax of the second acquisition over the tied candidates not visited yet; the key is not used."""
         first, second = scores
         found = best_unvisited(problem, candidates, jnp.mean(first, axis=0), scores=first)

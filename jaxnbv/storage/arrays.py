@@ -28,7 +28,6 @@ SCAN: Schema = {
     "normals": ("f", ("n", 3)),
     "mask": ("b", ("n",)),
     "missed": ("b", ("n",)),
-    "noise": ("f", ("n",)),
 }
 PROPOSAL: Schema = {
     "value": ("f", ()),
@@ -111,8 +110,7 @@ def pose_arrays(pose: Pose) -> dict[str, Any]:
 
 def scan_arrays(scan: PointCloud) -> dict[str, Any]:
     known = {"points": scan.points, "normals": scan.normals, "mask": scan.mask}
-    optional = {"missed": scan.missed, "noise": scan.noise}
-    return known | {name: rows for name, rows in optional.items() if rows is not None}
+    return known if scan.missed is None else known | {"missed": scan.missed}
 
 
 def proposal_arrays(proposal: Proposal) -> dict[str, Any]:

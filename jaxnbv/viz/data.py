@@ -235,15 +235,10 @@ def choice_of(proposal: Proposal, wider: SphereMap | None = None) -> Choice:
     )
 
 
-def mean_surface(
-    imagination: Imagination, evidence: Evidence, posterior: SurfacePosterior | None = None
-) -> MeanSurface | None:
-    """The surface of the posterior mean given the evidence, carved as the samples are, with its standard deviation;
-    None if the grid holds none. A posterior that has only samples is drawn from a few fixed ones.
-
-    `posterior`: that of the evidence, where it is at hand.
-    """
-    posterior = (imagination.posterior(evidence) if posterior is None else posterior).drawn(_SAMPLES)
+def mean_surface(imagination: Imagination, evidence: Evidence, posterior: SurfacePosterior) -> MeanSurface | None:
+    """The surface of the mean of the posterior given the evidence, carved as the samples are, with its standard
+    deviation; None if the grid holds none. A posterior that has only samples is drawn from a few fixed ones."""
+    posterior = posterior.drawn(_SAMPLES)
     found = level_triangles(np.array(imagination.mean(evidence, posterior)), imagination.grid)
     if found is None:
         return None

@@ -66,19 +66,16 @@ class Imagined(eqx.Module):
     kinds: tuple[tuple[str, float], ...] = eqx.field(static=True, default=())
 
 
-def imagined(
-    episode: Episode, index: int, evidence: Evidence, posterior: SurfacePosterior | None = None
-) -> Imagined | None:
+def imagined(episode: Episode, index: int, evidence: Evidence, posterior: SurfacePosterior) -> Imagined | None:
     """What was imagined before view `index` (from 0) was taken; None for one that was not chosen.
 
-    `evidence`: what was known before it; `posterior`: given that, where it is at hand. The samples are drawn again with
-    the key of the step, so they are the same.
+    `evidence`: what was known before it; `posterior`: given that. The samples are drawn again with the key of the step,
+    so they are the same.
     """
     planner, view = episode.planner, episode.views[index]
     if view.proposal is None:
         return None
     sample_key, *_ = view_keys(episode.key, index)
-    posterior = planner.imagination.posterior(evidence) if posterior is None else posterior
     surfaces = planner.imagination.sample(evidence, sample_key, posterior)
     other = runner_up(view.proposal) if planner.quantity.smooth else None
     # Two in any case, lest a second program be compiled.

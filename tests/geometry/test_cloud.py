@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate, farthest_point_subsample, limit_capacity
-from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import look_at
 
 GOOD = [[0.0, 0.1, 0.2], [0.3, 0.4, 0.5]]
@@ -251,20 +250,3 @@ def test_a_batch_of_clouds_is_iterated_once():
     clouds = PointCloud(jnp.asarray(points), jnp.asarray(points), jnp.ones((2, 5), bool))
     for cloud, expected in zip(clouds, points, strict=True):
         np.testing.assert_array_equal(cloud.points, np.float32(expected))
-
-
-NOISE = np.float32([0.3, 0.0, 0.1])
-
-
-def noisy():
-    return PointCloud.from_arrays(np.eye(3), np.eye(3), 5, noise=NOISE)
-
-
-def test_noise_stays_with_its_rows():
-    cloud, clean = noisy(), PointCloud.from_arrays(2.0 * np.eye(3), np.eye(3))
-    np.testing.assert_array_equal(cloud.noise, [*NOISE, 0.0, 0.0])
-    np.testing.assert_array_equal(concatenate(clean, cloud).noise, [0.0, 0.0, 0.0, *NOISE, 0.0, 0.0])
-    assert concatenate(clean, clean).noise is None
-    np.testing.assert_array_equal(limit_capacity(concatenate(clean, cloud), 6).noise, [0.0, 0.0, 0.0, *NOISE])
-    turned = Frame(3.0, (1.0, 2.0, 3.0), "z").to_scene(cloud)
-    np.testing.assert_array_equal(turned.noise, cloud.noise)

@@ -71,18 +71,3 @@ def test_normals_see_through_the_noise(noise, median, most, stride):
     position, forward = np.asarray(POSE.position), np.asarray(POSE.forward)
     fitted = ((np.asarray(cloud.points) - position) @ forward)[mask] - depth[rows, rows].reshape(-1)[mask]
     assert np.median(np.abs(fitted)) < 0.6 * np.median(np.abs(measured))
-
-
-@pytest.mark.parametrize("noise", [1e-3, 2e-3, 5e-3])
-def test_the_noise_of_normals_says_by_how_much_they_are_off(noise):
-    """Root mean squares of a component's error over what it is said to be, of each quarter of 2,000 pixels by what is
-    said, the edge of the ball in the last. An error has two components across the normal. Rows share their windows, so
-    that a quarter is some thirty independent ones: 13 % a standard error, beside the bend of the ball."""
-    _, normals = ball_and_plane()
-    cloud = PointCloud.from_depth(image(noise), CAMERA, POSE, depth_scale=1e-3, stride=4)
-    mask, truth = np.asarray(cloud.mask), normals[2::4, 2::4].reshape(-1, 3)
-    error = np.linalg.norm(np.asarray(cloud.normals, np.float64) - truth, axis=1)[mask] / np.sqrt(2.0)
-    said = np.asarray(cloud.noise, np.float64)[mask]
-    assert said.min() > 0.0
-    for quarter in np.array_split(np.argsort(said), 4):
-        assert 0.4 < np.sqrt(np.mean((error[quarter] / said[quarter]) ** 2)) < 2.0

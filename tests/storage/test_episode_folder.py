@@ -1,12 +1,10 @@
 """What an episode's folder holds, that it reads back exactly, continues, and belongs to one configuration."""
 
-import dataclasses
 import json
 import shutil
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
@@ -52,14 +50,6 @@ def test_a_scan_that_is_no_image_reads_as_one(finished, tmp_path):
     ((_, read, _),) = folder.read_views()
     assert read.missed is None
     np.testing.assert_array_equal(read.points, cloud.points)
-
-
-def test_a_scan_keeps_its_noise(finished, tmp_path):
-    view, folder = finished[0].views[0], EpisodeFolder(tmp_path, {})
-    noise = jnp.linspace(0.0, 1.0, len(view.scan.mask))
-    folder.write_view(0, view.pose, dataclasses.replace(view.scan, noise=noise), None)
-    ((_, read, _),) = folder.read_views()
-    np.testing.assert_array_equal(read.noise, noise)
 
 
 def evidence_after(episode):

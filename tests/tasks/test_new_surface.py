@@ -128,7 +128,7 @@ def test_searches_of_both_kinds_take_it_and_a_call_without_a_camera_is_named():
     acquisition = NewSurface()
     for search in (DiscreteSearch(4), GradientSearch(num_candidates=4, num_starts=1, iterations=1)):
         search.check(acquisition, Camera(height=4, width=4), 16)
-    with pytest.raises(NotImplementedError, match=r"score\(context, scan, camera, pose\)"):
+    with pytest.raises(ValueError, match=r"score\(context, scan, camera, pose\)"):
         acquisition(None, cloud_of([[1.0, 0.0, 0.0]]))
     with pytest.raises(ValueError, match=r"size is 0\.0"):
         NewSurface(0.0)

@@ -50,9 +50,14 @@ def episode():
     return nbv.simulate(planner, scene, first, 2, jax.random.key(5), none, progress=False)
 
 
+def before(episode, index):
+    evidence = episode.evidence_after(1)
+    return imagined(episode, index, evidence, episode.planner.imagination.posterior(evidence))
+
+
 @pytest.fixture(scope="module")
 def seen(episode):
-    return imagined(episode, 1, episode.evidence_after(1))
+    return before(episode, 1)
 
 
 def ball_depth(radius, camera, pose):
@@ -78,7 +83,7 @@ def test_the_samples_are_those_of_the_step(episode, seen):
     assert len(seen.samples) == 4
     found = [middle(sample.depth) for sample in seen.samples]
     np.testing.assert_allclose(found, 2.5 - radii(episode)[:4], atol=2e-3)
-    assert imagined(episode, 0, episode.evidence_after(1)) is None
+    assert before(episode, 0) is None
 
 
 def test_expected_and_seen_depth_are_those_of_balls(episode, seen):
@@ -125,7 +130,7 @@ def test_what_was_seen_before_is_told_from_what_was_not(episode):
 
 def test_without_truth_it_is_beside_what_was_then_seen(episode):
     real = eqx.tree_at(lambda e: e.scene, episode, None)
-    seen = imagined(real, 1, episode.evidence_after(1))
+    seen = before(real, 1)
     assert not seen.is_true
     assert seen.seen.depth.shape == (32, 32)
     assert seen.runner_up.seen is None

@@ -15,7 +15,7 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.planner import Planner, checked_proposal
 from jaxnbv.scanning import Evidence, GridSurface
 from jaxnbv.search import CandidateSearch, Problem, Proposal
-from jaxnbv.search.base import best_unvisited
+from jaxnbv.search.base import Scores, best_unvisited
 from jaxnbv.tasks.classification import ClassAcquisition, ClassComparisons, Classifier
 
 
@@ -69,13 +69,7 @@ class OracleView(CandidateSearch):
         context = problem.acquisition.context(problem.evidence.cloud)
         return scores(problem.acquisition, context, self.scans, problem.camera, candidates)[None, None]
 
-    def pick(
-        self,
-        problem: Problem,
-        candidates: Pose,
-        scores: Float[Array, "asked samples candidates"],
-        key: PRNGKeyArray,
-    ) -> Proposal:
+    def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
         """The argmax over the candidates not visited yet; the key is not used."""
         return best_unvisited(problem, candidates, scores[0, 0])
 
@@ -114,7 +108,7 @@ def _place(asked: list[Acquisition], acquisition: Acquisition) -> int:
     return len(asked) - 1
 
 
-def _scores(asked: list[Acquisition], problem: Problem, candidates: Pose) -> Float[Array, "asked samples candidates"]:
+def _scores(asked: list[Acquisition], problem: Problem, candidates: Pose) -> Scores:
     """The scores of all; those of a classifier from one answer of it a scan."""
     by_class = {place: one for place, one in enumerate(asked) if isinstance(one, ClassAcquisition)}
     others = [place for place in range(len(asked)) if place not in by_class]
@@ -126,7 +120,7 @@ def _scores(asked: list[Acquisition], problem: Problem, candidates: Pose) -> Flo
 
 
 @eqx.filter_jit
-def _scored(problem: Problem, several: Several, candidates: Pose) -> Float[Array, "asked samples candidates"]:
+def _scored(problem: Problem, several: Several, candidates: Pose) -> Scores:
     return problem.about(several).scores(candidates)
 
 
@@ -135,7 +129,7 @@ def _pick(
     search: CandidateSearch,
     problem: Problem,
     candidates: Pose,
-    scores: Float[Array, "asked samples candidates"] | None,
+    scores: Scores | None,
     key: PRNGKeyArray,
 ) -> Proposal:
     scores = search.score(problem, candidates) if scores is None else scores

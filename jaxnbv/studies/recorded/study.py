@@ -243,7 +243,7 @@ def _recording(folder: str, up: tuple[float, float, float] | None, box: Box, vox
     scans, seen = [], []
     for index in tqdm(range(len(frames)), "reading frames", leave=False):
         # One that shows nothing of the box says nothing of it.
-        scan = PointCloud(nowhere, nowhere, none, none, nowhere[:, 0])
+        scan = PointCloud(nowhere, nowhere, none, none)
         if np.any(np.asarray(box(_points(frames, index, stride))) < 0):
             depth = frames.depth(index)
             scan = PointCloud.from_depth(depth, frames.camera, poses[index], frames.depth_scale, stride, box)
