@@ -279,7 +279,7 @@ def check_extras(arguments: list[str]) -> None:
 
 CHECKS = {"jaxnbv": parse, "python": check_script, "python3": check_script, "pip": check_extras, "uv": check_extras}
 # Programs of others, whose options are not looked at.
-OTHERS = {"dask", "ruff", "mypy", "pytest", "sphinx-build"}
+OTHERS = {"mkdir", "tar", "dask", "ruff", "mypy", "pytest", "sphinx-build"}
 
 
 @pytest.mark.parametrize("page", ["../README.md", "../CONTRIBUTING.md", *PAGES])

@@ -34,7 +34,7 @@ def episode():
 def data(episode):
     """Without surfaces, which take long to paint and have no letters."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jaxnbv.viz.data.mean_surface", lambda imagination, evidence: None)
+        patch.setattr("jaxnbv.viz.data.mean_surface", lambda *arguments: None)
         return report_data(episode, progress=False)
 
 
@@ -211,7 +211,7 @@ def test_a_record_without_standard_errors_gives_a_page_too(episode):
         for view in episode.views
     )
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jaxnbv.viz.data.mean_surface", lambda imagination, evidence: None)
+        patch.setattr("jaxnbv.viz.data.mean_surface", lambda *arguments: None)
         old = report_data(dataclasses.replace(episode, views=views), progress=False, imagine=False)
     shown = payload(old, CAMERA)["views"][1]["choice"]
     assert shown["errors"] is None
