@@ -28,7 +28,7 @@ from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.planning.episode import view_keys
 from jaxnbv.planning.stopping import so_far
 from jaxnbv.storage.files import write_text
-from jaxnbv.studies.engine.statistics import bootstrap_mean
+from jaxnbv.studies.engine.results import interval
 from jaxnbv.studies.scenes import Framing, Split, hidden_view, part_scene, pyramid_scene
 from jaxnbv.tasks import Covered, Found, Sure
 from jaxnbv.tasks.new_surface import NewSurface, ShownArea
@@ -105,11 +105,11 @@ def _areas(surface: nbv.SDFSurface, camera: nbv.Camera, poses: nbv.Pose, cloud: 
 
 
 def table(task: str, records: list[dict]) -> str:
-    views, generator = VIEWS[task], np.random.default_rng(0)
+    views = VIEWS[task]
 
     def shown(values) -> str:
-        mean, low, high = bootstrap_mean(np.asarray(values, float), generator)
-        return f"{float(mean):5.2f} [{float(low):5.2f}, {float(high):5.2f}]"
+        (low,), (high,) = interval(np.asarray(values, float)[:, None])
+        return f"{np.mean(values):5.2f} [{low:5.2f}, {high:5.2f}]"
 
     last = [record["right"][-1] for record in records]
     lines = [

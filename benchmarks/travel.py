@@ -22,7 +22,7 @@ from jaxnbv.planning.episode import observe_scene, view_keys
 from jaxnbv.planning.travel import arc_length, total_cost
 from jaxnbv.scanning.metrics import coverage, truth_points
 from jaxnbv.storage.files import write_text
-from jaxnbv.studies.engine.statistics import bootstrap_mean
+from jaxnbv.studies.engine.results import interval
 
 CANDIDATES = nbv.SphereCandidates(60)
 # Search, cost, and how many views are chosen at once.
@@ -55,11 +55,11 @@ def episode(planner: nbv.Planner, mesh: nbv.TriangleMesh, truth: np.ndarray, vie
 
 
 def summary(records: dict, views: int) -> str:
-    generator, names = np.random.default_rng(0), list(METHODS)
+    names = list(METHODS)
 
     def shown(values) -> str:
-        mean, low, high = bootstrap_mean(np.asarray(values, float), generator)
-        return f"{float(mean):6.3f} [{float(low):6.3f}, {float(high):6.3f}]"
+        (low,), (high,) = interval(np.asarray(values, float)[:, None])
+        return f"{np.mean(values):6.3f} [{low:6.3f}, {high:6.3f}]"
 
     lines = [f"{len(records)} meshes, means and 90 % intervals over them"]
     for count in range(4, views + 1, 2):

@@ -2,6 +2,8 @@
 
 import re
 import shutil
+import tarfile
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx.application import Sphinx
 
 import jaxnbv
+from jaxnbv.studies.engine.page import write_page
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -35,6 +38,7 @@ html_title = "jaxnbv"
 html_show_copyright = False
 html_math_renderer = "mathml"
 html_static_path = ["_static"]
+html_extra_path = ["_extra"]
 html_css_files = ["site.css"]
 
 
@@ -43,6 +47,15 @@ def _copy_notebooks() -> None:
     folder = Path(__file__).with_name("notebooks")
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(ROOT / "notebooks", folder, ignore=lambda _, names: [n for n in names if not n.endswith(".ipynb")])
+
+
+def _write_results() -> None:
+    """One page of all studies, from the records that are kept."""
+    with tempfile.TemporaryDirectory() as folder:
+        for records in sorted((ROOT / "benchmarks" / "records").glob("*.tar.xz")):
+            with tarfile.open(records) as archive:
+                archive.extractall(folder, filter="data")
+        write_page(folder, Path(__file__).with_name("_extra") / "results.html")
 
 
 def _restructured(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
@@ -79,6 +92,7 @@ def _visit_display(self: Any, node: nodes.math_block) -> None:
 def setup(app: Sphinx) -> None:
     """What Sphinx calls."""
     _copy_notebooks()
+    _write_results()
     app.add_html_math_renderer("mathml", inline_renderers=(_visit_math, None), block_renderers=(_visit_display, None))
     app.connect("autodoc-process-docstring", _restructured)
     app.connect("autodoc-process-signature", _short)

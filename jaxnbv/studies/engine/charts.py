@@ -4,13 +4,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib as mpl
-import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxnbv.storage.files import make_folder
 from jaxnbv.studies.engine.looks import draw_legend, line_of
-from jaxnbv.studies.engine.measures import Measure, Record, Row, methods_of, result_rows
+from jaxnbv.studies.engine.measures import Measure, Record, methods_of
+from jaxnbv.studies.engine.results import means
 from jaxnbv.studies.engine.study import Panel, Study
 from jaxnbv.studies.engine.tables import count_of
 from jaxnbv.viz.figures import STYLE
@@ -50,8 +51,8 @@ def _figure(rows: Sequence[tuple[str, Sequence[Record], Sequence[Panel]]], study
         methods = methods_of(members, study.methods)
         for column, (axes, panel) in enumerate(zip(line, panels, strict=True)):
             measure = study.measure(panel.measure)
-            found = result_rows(members, methods, [measure])
-            shown |= {row["method"] for row in found}
+            found = means(members, methods, [measure])
+            shown |= {*found["method"]}
             _draw(axes, found, methods, measure, panel)
             if number == 0 or group == "all":
                 axes.set_title(panel.title or measure.title)
@@ -64,23 +65,22 @@ def _figure(rows: Sequence[tuple[str, Sequence[Record], Sequence[Panel]]], study
     return figure
 
 
-def _draw(axes: Axes, rows: Sequence[Row], methods: Sequence[str], measure: Measure, panel: Panel) -> None:
-    columns = list(dict.fromkeys(row["at"] for row in rows))
+def _draw(axes: Axes, rows: pd.DataFrame, methods: Sequence[str], measure: Measure, panel: Panel) -> None:
+    columns = rows["at"].unique().tolist()
     named = any(isinstance(column, str) for column in columns)
     at = {column: float(index if named else column) for index, column in enumerate(columns)}
     spacing = 1.0 if named or len(columns) < 2 else columns[1] - columns[0]
     scale = 100.0 if measure.percent else 1.0
     for index, method in enumerate(methods):
-        own = [row for row in rows if row["method"] == method]
+        own = rows[rows["method"] == method]
         dodge = (_DODGE_NAMED if named else _DODGE) * spacing * (index - 0.5 * (len(methods) - 1))
-        x = np.array([at[row["at"]] + dodge for row in own])
+        x = own["at"].map(at).to_numpy(float) + dodge
         look = line_of(method)
         if measure.paired:
-            low, high = (scale * np.array([row[key] for row in own]) for key in ("low", "high"))
-            axes.vlines(x, low, high, color=look["color"], alpha=0.35, lw=2.4, zorder=1)
+            axes.vlines(x, scale * own["low"], scale * own["high"], color=look["color"], alpha=0.35, lw=2.4, zorder=1)
         # That of the study, which comes first, above the others.
         style = look | {"zorder": 2 + (index == 0)} | ({"ls": "none"} if named else {})
-        axes.plot(x, [scale * row["mean"] for row in own], **style)
+        axes.plot(x, scale * own["mean"], **style)
     if columns:
         ends = list(at.values())
         axes.set(xlim=(ends[0] - 0.5 * spacing, ends[-1] + 0.5 * spacing), xticks=ends)

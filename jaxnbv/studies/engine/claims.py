@@ -1,11 +1,14 @@
 """Whether what the paper says of a study holds in its records."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
-from jaxnbv.studies.engine.measures import UNKNOWING, Claim, Row
+import pandas as pd
+
+from jaxnbv.studies.engine.measures import UNKNOWING, Claim
 from jaxnbv.studies.engine.study import Study
-from jaxnbv.studies.engine.tables import difference_text, tight
+from jaxnbv.studies.engine.tables import difference_text
+
+_WHERE = ("ahead of", "level with", "behind")
 
 
 class Verdict(NamedTuple):
@@ -21,34 +24,32 @@ class Verdict(NamedTuple):
     @property
     def held(self) -> int:
         """Against how many of the methods the claim holds."""
-        wanted = ("ahead of",) if self.claim.ahead else ("ahead of", "level with")
-        return sum(where in wanted for where, _ in self.against.values())
+        return sum(where in _WHERE[: 1 if self.claim.ahead else 2] for where, _ in self.against.values())
 
     @property
     def sentence(self) -> str:
         """What was found, the best first."""
-        parts = []
-        for where in ("ahead of", "level with", "behind"):
-            named = [f"{method} ({text})" for method, (found, text) in self.against.items() if found == where]
-            parts += [f"{where} {', '.join(named)}"] if named else []
+        told = [(where, f"{method} ({text})") for method, (where, text) in self.against.items()]
+        parts = [
+            f"{where} {', '.join(named)}" for where in _WHERE if (named := [text for at, text in told if at == where])
+        ]
         return f"Holds against {self.held} of {len(self.against)}: {'; '.join(parts)}."
 
 
-def verdicts(study: type[Study], differences: Sequence[Row]) -> list[Verdict]:
+def verdicts(study: type[Study], differences: pd.DataFrame) -> list[Verdict]:
     """On the claims of which a study's differences over all its scenes tell. Methods that were not run are left out;
     those that know no shapes are held against it too."""
     found = []
     for claim in study.claims:
-        measure, here = study.measure(claim.measure), ("all", claim.measure, claim.at)
-        rows = {row["baseline"]: row for row in differences if (row["group"], row["quantity"], row["at"]) == here}
-        against = {}
+        measure = study.measure(claim.measure)
+        here = differences[(differences["group"] == "all") & (differences["quantity"] == claim.measure)]
+        rows = here[here["at"] == claim.at].set_index("baseline")
         named = (f"{method}{way}" for method in claim.than for way in ("", UNKNOWING))
-        for method in (method for method in named if method in rows):
-            row = rows[method]
-            where = "level with"
-            if row["excludes_zero"]:
-                where = "ahead of" if (row["mean"] < 0) == (measure.better == "less") else "behind"
-            against[method] = where, tight(difference_text(row, measure).rstrip("* "))
+        against = {}
+        for method, row in ((method, rows.loc[method]) for method in named if method in rows.index):
+            better = (row["mean"] < 0) == (measure.better == "less")
+            where = _WHERE[1] if not row["excludes_zero"] else _WHERE[0 if better else 2]
+            against[method] = where, difference_text(row, measure).rstrip("*")
         if against:
             found.append(Verdict(claim, against))
     return found

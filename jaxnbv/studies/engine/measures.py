@@ -7,11 +7,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnbv.checks import require
-from jaxnbv.studies.engine.statistics import Estimate, bootstrap_mean, paired_difference
 
 # What is stored of one scene with every method.
 Record = dict[str, Any]
-Row = dict[str, Any]
 # The model of studies that know shapes, and the end of the name of a method that is run once more without them.
 KNOWN, UNKNOWING = "known", "-screened"
 
@@ -85,87 +83,3 @@ def values(
     lengths = sorted({len(row) for rows in found for row in rows})
     require(len(lengths) == 1, f"the records differ in their number of views, {lengths}: report each by itself")
     return np.array(found, dtype=np.float64)
-
-
-def standard_error(values: Float[np.ndarray, "scenes *rest"]) -> Float[np.ndarray, "*rest"]:
-    """Of the mean over scenes, element by element; NaN for a single scene."""
-    if len(values) < 2:
-        return np.full(values.shape[1:], np.nan)
-    return np.asarray(values.std(axis=0, ddof=1) / np.sqrt(len(values)))
-
-
-def result_rows(records: Sequence[Record], methods: Sequence[str], measures: Sequence[Measure]) -> list[Row]:
-    """Mean, standard error and bootstrap interval over scenes of each measure, method and column; `rank` counts from 1.
-
-    The same resamples of scenes for all methods. What is not paired has no interval; what no scene has has no row.
-    """
-    rows: list[Row] = []
-    for measure in measures:
-        for column, of_column in _columns(records, methods, measure):
-            rows += (
-                _paired(measure, column, methods, of_column)
-                if measure.paired
-                else _each(measure, column, methods, of_column)
-            )
-    return rows
-
-
-def difference_rows(
-    records: Sequence[Record], methods: Sequence[str], measures: Sequence[Measure], reference: str
-) -> list[Row]:
-    """The reference minus each other method over the same scenes, with bootstrap intervals; not of the first view,
-    which all methods share."""
-    others = [method for method in methods if method != reference]
-    if reference not in methods or not others:
-        return []
-    rows: list[Row] = []
-    for measure in measures:
-        for column, of_column in _columns(records, [reference, *others], measure):
-            known = _complete(of_column)
-            if not measure.paired or not len(known) or (measure.by, column) == ("view", 1):
-                continue
-            ours, theirs = np.broadcast_arrays(known[:, :1], known[:, 1:])
-            found = paired_difference(np.asarray(ours), np.asarray(theirs), np.random.default_rng(0))
-            rows += [
-                {"quantity": measure.name, "by": measure.by, "at": column, "method": reference, "baseline": other}
-                | {"mean": float(found.mean[m]), "low": float(found.low[m]), "high": float(found.high[m])}
-                | {"excludes_zero": bool(found.excludes_zero[m]), "scenes": len(known)}
-                for m, other in enumerate(others)
-            ]
-    return rows
-
-
-def _columns(records, methods, measure: Measure) -> list[tuple[Any, Float[np.ndarray, "scenes methods"]]]:
-    found = values(records, methods, measure)
-    return [(label, found[..., index]) for index, label in enumerate(measure.labels(found.shape[-1]))]
-
-
-def _complete(of_column: Float[np.ndarray, "scenes methods"]) -> Float[np.ndarray, "known methods"]:
-    return of_column[~np.isnan(of_column).any(axis=1)]
-
-
-def _paired(measure: Measure, column: Any, methods: Sequence[str], of_column: np.ndarray) -> list[Row]:
-    known = _complete(of_column)
-    if not len(known):
-        return []
-    estimate: Estimate = bootstrap_mean(known, np.random.default_rng(0))
-    sign = -1.0 if measure.better == "more" else 1.0
-    ranks = [int(np.sum(sign * estimate.mean < sign * mean)) + 1 for mean in estimate.mean]
-    errors = standard_error(known)
-    return [
-        {"quantity": measure.name, "by": measure.by, "at": column, "method": method, "mean": float(estimate.mean[m])}
-        | {"standard_error": float(errors[m]), "low": float(estimate.low[m]), "high": float(estimate.high[m])}
-        | {"rank": ranks[m] if measure.better else None, "scenes": len(known)}
-        for m, method in enumerate(methods)
-    ]
-
-
-def _each(measure: Measure, column: Any, methods: Sequence[str], of_column: np.ndarray) -> list[Row]:
-    known = {method: of[~np.isnan(of)] for method, of in zip(methods, of_column.T, strict=True)}
-    nothing = {"low": None, "high": None, "rank": None}
-    return [
-        {"quantity": measure.name, "by": measure.by, "at": column, "method": method, "mean": float(of.mean())}
-        | {"standard_error": float(standard_error(of)), **nothing, "scenes": len(of)}
-        for method, of in known.items()
-        if len(of)
-    ]

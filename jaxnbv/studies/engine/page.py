@@ -1,159 +1,129 @@
-"""Chapters of studies as one page: HTML that opens offline, or Markdown beside its images."""
+"""All studies of a folder on one page: of each its claims, tables, figures, pictures, settings, versions and times."""
 
 import base64
-import html
-import itertools
-from collections.abc import Callable, Sequence
+import json
+import pkgutil
+import tempfile
+from collections.abc import Sequence
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from PIL import Image
+import jinja2
+import pandas as pd
 
 from jaxnbv.checks import require
-from jaxnbv.storage.files import make_folder, write_text, write_whole
-from jaxnbv.studies.engine.chapters import Chapter, Table, chapters
+from jaxnbv.storage.files import make_folder, write_text
+from jaxnbv.storage.folders import read_json
+from jaxnbv.studies.engine.charts import write_charts
+from jaxnbv.studies.engine.claims import Verdict, verdicts
+from jaxnbv.studies.engine.measures import Record
+from jaxnbv.studies.engine.records import read_records
+from jaxnbv.studies.engine.results import LEVEL, results
+from jaxnbv.studies.engine.study import Study
+from jaxnbv.studies.engine.tables import count_of, tables_of
+from jaxnbv.studies.registry import STUDIES
 from jaxnbv.version import __version__
 
-_TITLE = "Results of studies"
-_STYLE = """
-  :root { --ink: #1f2733; --soft: #566071; --line: #d9dee6; --accent: #b34a00; --page: #f6f7f9; }
-  * { box-sizing: border-box; }
-  body { margin: 0; background: var(--page); color: var(--ink); font: 15px/1.5 system-ui, sans-serif; }
-  main { max-width: 1100px; margin: 0 auto; padding: 20px 16px 40px; }
-  h1 { font-size: 24px; }
-  h2 { font-size: 20px; margin: 40px 0 8px; border-top: 1px solid var(--line); padding-top: 20px; }
-  nav a { margin-right: 18px; color: var(--accent); white-space: nowrap; }
-  .scroll { overflow-x: auto; background: #fff; border: 1px solid var(--line); border-radius: 8px; margin: 12px 0; }
-  table { border-collapse: collapse; font-size: 13px; font-variant-numeric: tabular-nums; min-width: 100%; }
-  caption { text-align: left; padding: 8px 12px 2px; font-weight: 600; }
-  th, td { padding: 3px 12px; text-align: right; white-space: nowrap; } th:first-child { text-align: left; }
-  thead th { color: var(--soft); font-weight: 500; border-bottom: 1px solid var(--line); }
-  tbody th { font-weight: 500; } .best { font-weight: 700; } .second { text-decoration: underline; }
-  img { max-width: 100%; height: auto; background: #fff; border: 1px solid var(--line); border-radius: 8px; }
-  figure { margin: 14px 0; } figcaption, .facts, pre { font-size: 13px; color: var(--soft); }
-  pre { overflow-x: auto; } details { font-size: 13px; margin: 8px 0; } summary { cursor: pointer; }
-  .claims td, .claims th { white-space: normal; text-align: left; }
-"""
+_REMEDY = "give a folder that `jaxnbv study` has written"
+
+
+class Chapter(NamedTuple):
+    """One study.
+
+    - `facts`: what was run, in words; `explanation`: what its measures mean.
+    - `scenes`: how many; `claims`: what the paper says, and what was found.
+    - `tables`: by the group of scenes, "" for all of them: titles and cells, see `tables_of`.
+    - `images`: charts, which are drawn anew, and the pictures that lie in its folder; their names, and PNG files.
+    - `settings`: of the study, as JSON.
+    """
+
+    title: str
+    scenes: int
+    facts: list[str]
+    explanation: str
+    claims: list[Verdict]
+    tables: dict[str, list[tuple[str, pd.DataFrame]]]
+    images: list[tuple[str, bytes]]
+    settings: str
 
 
 def write_page(folder: str | Path, out: str | Path) -> Path:
-    """Write a page of all studies in a folder, and return its path.
+    """Write an HTML page of all studies in a folder, which holds its images and opens offline, and return its path.
 
-    - `out`: a file that ends in .html, which holds its images, or in .md, whose images go to a folder beside it, of
-      its name.
-
-    **Raises:** `ValueError` for another ending, and as `chapters` does.
+    **Raises:** `ValueError` for a name that does not end in .html, and as `chapters` does.
     """
     out = Path(out)
-    require(out.suffix in (".html", ".md"), f"the page {out} must end in .html or .md")
-    found = chapters(folder)
+    require(out.suffix == ".html", f"the page {out} must end in .html")
+    template = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
+        Path(__file__).with_name("page.html").read_text()
+    )
+    made = template.render(
+        chapters=chapters(folder),
+        version=__version__,
+        date=f"{datetime.now(UTC):%Y-%m-%d}",
+        encoded=lambda image: base64.b64encode(image).decode(),
+    )
     make_folder(out.parent)
-    write_text(out, as_html(found) if out.suffix == ".html" else _markdown_with_images(found, out))
+    write_text(out, made)
     return out
 
 
-def as_html(found: Sequence[Chapter]) -> str:
-    """One file that opens offline."""
-    links = " ".join(f'<a href="#study{i}">{html.escape(c.title)}</a>' for i, c in enumerate(found))
-    body = "".join(_html_chapter(index, chapter) for index, chapter in enumerate(found))
-    overview = _overview(found)
-    claims = _html_table(overview, "claims") if overview.rows else ""
-    return (
-        f'<!doctype html>\n<html lang="en">\n<head><meta charset="utf-8"><title>{_TITLE}</title>\n'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{_STYLE}</style></head>\n'
-        f'<body><main><h1>{_TITLE}</h1>\n<p class="facts">jaxnbv {__version__}, {datetime.now(UTC):%Y-%m-%d}. '
-        f"Bold: the best. Underlined: the second, or an interval that excludes zero.</p>\n<nav>{links}</nav>\n"
-        f"{claims}{body}</main></body></html>\n"
-    )
+def chapters(folder: str | Path) -> list[Chapter]:
+    """A chapter for each study in a folder or in folders inside, in the order of the registry.
+
+    **Raises:** `ValueError` if there is none, a study is not known here, or a record is damaged.
+    """
+    folder = Path(folder)
+    require(folder.is_dir(), f"there is no folder {folder}: {_REMEDY}")
+    kinds = _kinds()
+    found: dict[tuple[int, Path], Chapter] = {}
+    for file in sorted(folder.rglob("study.json")):
+        if any(file.parent.glob("scene_*.json")):
+            config = read_json(file, "is not a study's record", _REMEDY)
+            name = config.get("config", {}).get("study", {}).get("type")
+            require(name in kinds, f"{file} is of a study {name!r}, which this version does not know: {_REMEDY}")
+            chapter = _chapter(file.parent, file.parent.relative_to(folder), config, kinds[name])
+            found[list(kinds).index(name), file] = chapter
+    require(len(found) > 0, f"{folder} holds no study that has a scene: {_REMEDY}")
+    return [found[place] for place in sorted(found)]
 
 
-def _html_chapter(index: int, chapter: Chapter) -> str:
-    facts = "<br>".join(map(html.escape, chapter.facts))
-    explanation = html.escape(chapter.explanation).replace("\n", " ")
-    claims = "".join(
-        f"<p><strong>{html.escape(v.claim.text)}</strong> {html.escape(v.sentence)}</p>\n" for v in chapter.claims
-    )
-    images = "".join(
-        f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,'
-        f'{base64.b64encode(file.read_bytes()).decode()}"><figcaption>{html.escape(caption)}</figcaption></figure>\n'
-        for caption, file in chapter.images
-    )
-    return (
-        f'<section id="study{index}"><h2>{html.escape(chapter.title)}</h2>\n{claims}<p>{explanation}</p>\n'
-        f'<p class="facts">{facts}</p>\n{images}{_folded(chapter.tables, _html_table)}'
-        f"<details><summary>Settings</summary><pre>{html.escape(chapter.settings)}</pre></details></section>\n"
-    )
+def _kinds() -> dict[str, type[Study]]:
+    """The studies by the names of their classes, those of the registry first."""
+    named = {kind.__qualname__: kind for kind in (pkgutil.resolve_name(entry.study) for entry in STUDIES.values())}
+    todo = [Study]
+    while todo:
+        for kind in todo.pop().__subclasses__():
+            named.setdefault(kind.__qualname__, kind)
+            todo.append(kind)
+    return named
 
 
-def _overview(found: Sequence[Chapter]) -> Table:
-    """All claims of the paper, and whether they hold."""
-    rows = [
-        [chapter.title, str(chapter.scenes), verdict.claim.text, f"{verdict.held} of {len(verdict.against)}"]
-        for chapter in found
-        for verdict in chapter.claims
-    ]
-    return Table(
-        "What the paper says, and whether it holds here", ["study", "scenes", "claim", "holds against methods"], rows
-    )
+def _chapter(path: Path, inside: Path, config: dict[str, Any], kind: type[Study]) -> Chapter:
+    records = read_records(path)
+    found = results(records, kind)
+    parts = {
+        "" if group == "all" else f"{group}: {count_of(len(members), 'scene')}": tables_of(found, kind, group)
+        for group, members in kind.groups(records).items()
+    }
+    with tempfile.TemporaryDirectory() as own:
+        charts = write_charts(records, kind, own)
+        pictures = [file for file in sorted(path.glob("*.png")) if file.stem not in kind.charts]
+        images = [(file.stem.replace("_", " "), file.read_bytes()) for file in (*charts, *pictures)]
+    title = kind.title if inside == Path() else f"{kind.title}: {inside}"
+    told = _facts(records, config), kind.explanation, verdicts(kind, found.differences)
+    return Chapter(title, len(records), *told, parts, images, json.dumps(config.get("config", {}), indent=1))
 
 
-def _folded(tables: Sequence[Table], write: Callable[[Table], str]) -> str:
-    """Those of all scenes, and those of each group of scenes to be opened."""
-    parts = []
-    for group, members in itertools.groupby(tables, key=lambda table: table.group):
-        text = "\n\n".join(map(write, members))
-        parts.append(f"<details><summary>{html.escape(group)}</summary>\n\n{text}\n\n</details>" if group else text)
-    return "\n\n".join(parts)
-
-
-def _html_table(table: Table, kind: str = "") -> str:
-    head = "".join(f'<th scope="col">{html.escape(name)}</th>' for name in table.header)
-    rows = "".join(
-        f'<tr><th scope="row">{html.escape(name)}</th>{"".join(map(_html_cell, cells))}</tr>'
-        for name, *cells in table.rows
-    )
-    caption = f"<caption>{html.escape(table.caption)}</caption>"
-    body = f"{caption}<thead><tr>{head}</tr></thead><tbody>{rows}</tbody>"
-    return f'<div class="scroll"><table class="{kind}">{body}</table></div>\n'
-
-
-def _html_cell(cell: str) -> str:
-    mark = "best" if cell.endswith("**") else "second" if cell.endswith("*") else ""
-    return f'<td class="{mark}">{html.escape(cell.rstrip("* "))}</td>' if mark else f"<td>{html.escape(cell)}</td>"
-
-
-def _markdown_with_images(found: Sequence[Chapter], out: Path) -> str:
-    """The text; its images are copied beside it, and those of a page that was there before are removed."""
-    images, overview = out.with_suffix(""), _overview(found)
-    before = set(images.glob("[0-9]*-*.png"))
-    marks = "Bold: the best. Italic: the second, or an interval that excludes zero."
-    sections = [f"# {_TITLE}", f"Written by `jaxnbv report`, jaxnbv {__version__}. {marks}"]
-    sections += [_markdown_table(overview, "---")] if overview.rows else []
-    for index, chapter in enumerate(found):
-        sections += [f"## {chapter.title}", *(f"**{v.claim.text}** {v.sentence}" for v in chapter.claims)]
-        sections += [chapter.explanation.replace("\n", " "), "\n".join(chapter.facts)]
-        for caption, file in chapter.images:
-            copy = make_folder(images) / f"{index}-{file.name}"
-            # A third of the size, for a repository.
-            image = Image.open(file).convert("RGB").quantize(256)
-            write_whole(copy, partial(image.save, format="png", optimize=True))
-            before.discard(copy)
-            sections.append(f"![{caption}]({images.name}/{copy.name})")
-        sections.append(_folded(chapter.tables, _markdown_table))
-        sections.append(f"<details><summary>Settings</summary>\n\n```json\n{chapter.settings}\n```\n\n</details>")
-    for file in before:
-        file.unlink()
-    return "\n\n".join(sections) + "\n"
-
-
-def _markdown_table(table: Table, rule: str = "---:") -> str:
-    rows = [table.header, ["---", *(rule for _ in table.header[1:])]]
-    rows += [[name, *map(_markdown_cell, cells)] for name, *cells in table.rows]
-    lines = "\n".join(f"| {' | '.join(row)} |" for row in rows)
-    return f"**{table.caption}**\n\n{lines}"
-
-
-def _markdown_cell(cell: str) -> str:
-    text = cell.rstrip("* ").replace("|", "\\|")
-    return f"**{text}**" if cell.endswith("**") else f"*{text}*" if cell.endswith("*") else text
+def _facts(records: Sequence[Record], config: dict[str, Any]) -> list[str]:
+    """Scenes, times, and what the numbers were made with."""
+    seconds = [record["seconds"] for record in records if "seconds" in record]
+    facts = [f"{count_of(len(records), 'scene')}; intervals are the {LEVEL:.0%} bootstrap's, over scenes."]
+    if seconds:
+        mean = sum(seconds) / len(seconds)
+        facts.append(f"{mean:.0f} seconds a scene with all methods, {sum(seconds) / 3600:.2f} hours in all.")
+    made_by = config.get("versions") or {}
+    if made_by:
+        facts.append("Made with " + ", ".join(f"{name} {version}" for name, version in made_by.items()) + ".")
+    return facts

@@ -24,7 +24,7 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Evidence, Grid, Surface
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.search import Candidates, Search, SphereCandidates
-from jaxnbv.studies.engine.measures import KNOWN, UNKNOWING, Claim, Measure, Record, Row
+from jaxnbv.studies.engine.measures import KNOWN, UNKNOWING, Claim, Measure, Record
 from jaxnbv.studies.scenes.banks import bank_poses, shape_bank
 
 _PURPOSES = ("first", "episode", "scene", "measure")
@@ -190,16 +190,6 @@ class Study(eqx.Module):
     def groups(cls, records: Sequence[Record]) -> dict[str, list[Record]]:
         """All records, and parts of them that are told apart."""
         return {"all": list(records)}
-
-    @classmethod
-    def notes(cls, records: Sequence[Record]) -> list[str]:
-        """Further sections of the text."""
-        return []
-
-    @classmethod
-    def own_rows(cls, records: Sequence[Record]) -> dict[str, list[Row]]:
-        """Further tables, by the names of their files."""
-        return {}
 
     @classmethod
     def measure(cls, name: str) -> Measure:

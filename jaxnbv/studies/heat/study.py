@@ -19,10 +19,10 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, mesh_from_sdf
 from jaxnbv.scanning.sensors import HEAT_SETTING
 from jaxnbv.search import CandidateSearch, DiscreteSearch, FarthestView, HalvingSearch, RandomView, UncertaintyView
-from jaxnbv.studies.engine.measures import Claim, Measure, Record, Row
+from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.meshes import MeshStudy, numbered_mesh
 from jaxnbv.studies.engine.study import Chart, Panel, Scene
-from jaxnbv.studies.heat.halving import compare, halving_notes, halving_rows
+from jaxnbv.studies.heat.halving import compare
 from jaxnbv.studies.scenes import heat_scene
 from jaxnbv.tasks import ColdestPoint, Coverage, body_temperature
 from jaxnbv.tasks.diffusion import HeatProblem
@@ -90,6 +90,22 @@ def _saturated(record: Record, method: str) -> list[float | None]:
     ]
 
 
+def _halving(quantity: str) -> Callable[[Record, str], list[float | None]]:
+    """Of halving beside the full search, at the steps where there was something to find."""
+
+    def of(record: Record, method: str) -> list[float | None]:
+        run = record["methods"][method]
+        asked = run.get("halving", [{quantity: np.nan}] * len(run["steps"]))
+        pairs = zip(run["steps"], asked, strict=True)
+        return [float(one[quantity]) if step["value"] > 0.0 else None for step, one in pairs]
+
+    return of
+
+
+def _seconds(record: Record, method: str) -> list[float]:
+    return [float(np.median([step["seconds"] for step in record["methods"][method]["steps"]]))]
+
+
 def _measures(estimate: str) -> tuple[Measure, ...]:
     def measure(name: str, title: str, of: Callable, unit: str, listed: bool = True) -> Measure:
         name, title = f"{name}, {estimate}", f"{title}:\n{ESTIMATES[estimate]}"
@@ -126,6 +142,9 @@ class HeatStudy(MeshStudy):
         *_measures("all"),
         *_measures("reached"),
         Measure("saturated", "Saturated steps", _saturated, first=2, digits=2, paired=False),
+        Measure("same", "Halving finds the view of the full search", _halving("same"), first=2, digits=2, paired=False),
+        Measure("regret", "Value lost by halving", _halving("regret"), first=2, unit="degrees", paired=False),
+        Measure("seconds", "Time of a proposal", _seconds, ("median",), "step", unit="seconds", digits=1),
     )
     claims: ClassVar[tuple[Claim, ...]] = (
         Claim(
@@ -208,14 +227,6 @@ class HeatStudy(MeshStudy):
             before = step.evidence
         run = {"steps": taken, **_estimates(clouds, heat_problem(scene), truth)}
         return run if halving is None else run | {"halving": compared}
-
-    @classmethod
-    def notes(cls, records: Sequence[Record]) -> list[str]:
-        return halving_notes(records, cls.reference)
-
-    @classmethod
-    def own_rows(cls, records: Sequence[Record]) -> dict[str, list[Row]]:
-        return {"halving": halving_rows(records, cls.reference)}
 
 
 def heat_problem(scene: Scene) -> HeatProblem:

@@ -10,7 +10,8 @@ from PIL import Image
 
 from jaxnbv.studies.classification.pyramid import PyramidStudy
 from jaxnbv.studies.engine.charts import write_charts
-from jaxnbv.studies.engine.measures import result_rows, values
+from jaxnbv.studies.engine.measures import values
+from jaxnbv.studies.engine.results import means
 from jaxnbv.studies.engine.tables import summary, write_tables
 
 
@@ -135,13 +136,13 @@ def test_curves_only_rise_and_stable_hits_follow_first_hits():
 
 
 def test_diagnostics_are_of_the_methods_own_views():
-    found = result_rows(two_scenes(), ["cross-entropy", "farthest"], PyramidStudy.measures)
-    rows = {(row["quantity"], row["method"], row["at"]): row for row in found}
-    row = rows["rank_correlation", "farthest", 2]
+    found = means(two_scenes(), ["cross-entropy", "farthest"], PyramidStudy.measures)
+    rows = found.set_index(["quantity", "method", "at"])
+    row = rows.loc["rank_correlation", "farthest", 2]
     assert (row["mean"], row["scenes"]) == (-0.5, 1)
-    assert rows["roughness", "cross-entropy", 3]["mean"] == 3.0
-    assert ("rank_correlation", "cross-entropy", 3) not in rows
-    assert ("roughness", "farthest", 3) not in rows
+    assert rows.loc[("roughness", "cross-entropy", 3), "mean"] == 3.0
+    assert ("rank_correlation", "cross-entropy", 3) not in rows.index
+    assert ("roughness", "farthest", 3) not in rows.index
 
 
 def read(path):
@@ -172,11 +173,11 @@ def test_tables_hold_shares_computed_by_hand(tmp_path):
 
     text = paths[0].read_text(encoding="utf-8")
     assert text == summary(records, PyramidStudy)
-    head, *lines = text.split("First hit, by view\n")[1].splitlines()[:4]
+    head, *lines = text.split("First hit (%), by view\n")[1].splitlines()[:4]
     assert head.split() == ["view", "1", "2", "3"]
     assert lines[1].split()[0] == "farthest"
     assert re.findall(r"\d+", lines[1]) == ["0", "0", "0", "50", "0", "100", "50", "0", "100"]
-    compared = text.split("Stable hit: cross-entropy minus another method")[1].splitlines()[2]
+    compared = text.split("Stable hit (%): cross-entropy minus another method")[1].splitlines()[2]
     assert compared.split() == ["farthest", "+100", "[+100,", "+100]*", "+100", "[+100,", "+100]*"]
     assert max(map(len, text.splitlines())) <= 120
 

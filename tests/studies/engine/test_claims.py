@@ -3,6 +3,7 @@
 import pkgutil
 from typing import ClassVar
 
+import pandas as pd
 import pytest
 from toy import ToyStudy
 
@@ -48,7 +49,7 @@ ROWS = [
 
 def test_a_claim_holds_where_the_interval_lies_on_its_side():
     """Less may be better; of all scenes alone; a claim of which nothing tells is left out."""
-    right, away = verdicts(Shares, ROWS)
+    right, away = verdicts(Shares, pd.DataFrame(ROWS))
     assert {method: where for method, (where, _) in right.against.items()} == {
         "a": "ahead of",
         "b": "level with",
@@ -77,6 +78,6 @@ def test_the_claims_of_a_study_name_what_it_has(name):
 
 
 def test_a_method_that_knows_no_shapes_counts_too():
-    (right,) = verdicts(Shares, [*ROWS[1:3], row("right", "a-screened", -0.2, -0.3, -0.1)])
+    (right,) = verdicts(Shares, pd.DataFrame([*ROWS[1:3], row("right", "a-screened", -0.2, -0.3, -0.1)]))
     assert list(right.against) == ["a", "a-screened", "b"]
     assert (right.held, len(right.against)) == (1, 3)

@@ -1,14 +1,10 @@
 """What the heat study measures, from records made by hand."""
 
-import csv
-
-import numpy as np
 import pytest
 
 from jaxnbv.studies.engine.charts import write_charts
-from jaxnbv.studies.engine.measures import difference_rows, result_rows
+from jaxnbv.studies.engine.results import differences, means
 from jaxnbv.studies.engine.tables import summary, write_tables
-from jaxnbv.studies.heat.halving import halving_rows
 from jaxnbv.studies.heat.study import HeatStudy
 
 
@@ -29,7 +25,7 @@ def made_run(distances, temperatures, values=(0.5, 0.0), halving=None):
 
 
 def asked(same, regret, seconds):
-    return {"same": same, "regret": regret, "seconds": seconds, "evaluations": 192, "full_evaluations": 384}
+    return {"same": same, "regret": regret, "seconds": seconds}
 
 
 def hand_made():
@@ -52,8 +48,8 @@ def hand_made():
 
 
 def rows_of(records, *names):
-    found = result_rows(records, ["heat", "random"], [HeatStudy.measure(name) for name in names])
-    return {(row["quantity"], row["method"], row["at"]): row for row in found}
+    found = means(records, ["heat", "random"], [HeatStudy.measure(name) for name in names])
+    return {(row["quantity"], row["method"], row["at"]): row for row in found.to_dict("records")}
 
 
 def test_measures_are_of_the_estimates():
@@ -71,9 +67,9 @@ def test_measures_are_of_the_estimates():
 
 def test_differences_begin_with_the_first_choice():
     distances = [HeatStudy.measure("distance, all"), HeatStudy.measure("distance, reached")]
-    found = difference_rows(hand_made(), ["heat", "random"], distances, "heat")
-    rows = {(row["quantity"], row["at"]): row for row in found}
-    assert len(rows) == 4
+    found = differences(hand_made(), ["heat", "random"], distances, "heat")
+    assert len(found) == 4
+    rows = found.set_index(["quantity", "at"]).loc
     row = rows["distance, all", 2]
     # Both scenes differ by -0.4, so any resample does; at the third view by -0.4 and -0.2.
     assert (row["mean"], row["low"], row["high"], row["excludes_zero"]) == (*[pytest.approx(-0.4)] * 3, True)
@@ -89,20 +85,15 @@ def test_steps_without_a_view_of_any_value_are_counted_where_cold_is_sought():
 
 
 def test_searches_are_compared_where_there_was_something_to_find():
-    (row,) = halving_rows(hand_made(), "heat")
-    assert (row["steps"], row["open_steps"]) == (4, 3)
-    assert row["same_view"] == pytest.approx(2 / 3)
-    assert (row["mean_regret"], row["mean_value"]) == (pytest.approx(0.2 / 3), pytest.approx(0.3))
-    assert (row["full_seconds"], row["seconds"]) == (11.0, 5.5)
-    assert (row["full_evaluations"], row["evaluations"]) == (384, 192)
+    rows = rows_of(hand_made(), "same", "regret", "seconds")
+    same = [rows["same", "heat", view] for view in (2, 3)]
+    # At the last view of the first scene no candidate had a value.
+    assert [(row["mean"], row["scenes"]) for row in same] == [(0.5, 2), (1.0, 1)]
+    assert rows["regret", "heat", 2]["mean"] == pytest.approx(0.1)
+    assert rows["seconds", "heat", "median"]["mean"] == 11.0
     for record in (records := hand_made()):
         del record["methods"]["heat"]["halving"]
-    assert halving_rows(records, "heat") == []
-    assert "halving" not in summary(records, HeatStudy)
-    # With no step at which the search had anything to find there is no share to tell.
-    records = hand_made()[:1]
-    records[0]["methods"]["heat"]["steps"][0]["value"] = 0.0
-    assert np.isnan(halving_rows(records, "heat")[0]["same_view"])
+    assert "alving" not in summary(records, HeatStudy)
 
 
 def test_the_text_and_the_files_hold_the_tables(tmp_path):
@@ -111,12 +102,8 @@ def test_the_text_and_the_files_hold_the_tables(tmp_path):
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert "heat 1.200 +- 0.200** 0.500 +- 0.100** 0.300 +- 0.100**" in lines
     assert "random -0.400 [-0.400, -0.400]* -0.300 [-0.400, -0.200]*" in lines
-    assert "heat 0.00 ( 2) 0.50 ( 2)" in lines
-    assert "the same view: 67%" in lines
-    assert "imagined scans scored: 192 in place of 384" in lines
+    assert "heat 0.00 (2) 0.50 (2)" in lines
     assert max(map(len, text.splitlines())) <= 120
     paths = write_tables(records, HeatStudy, tmp_path)
-    assert [path.name for path in paths] == ["results.txt", "results.csv", "differences.csv", "halving.csv"]
-    (halving,) = csv.DictReader(paths[-1].open())
-    assert halving["same_view"] == "0.666667"
+    assert [path.name for path in paths] == ["results.txt", "results.csv", "differences.csv"]
     assert [path.name for path in write_charts(records, HeatStudy, tmp_path)] == ["coldest.png"]

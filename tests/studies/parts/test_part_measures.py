@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from jaxnbv.checks import InputError
 from jaxnbv.studies.engine.charts import write_charts
-from jaxnbv.studies.engine.measures import difference_rows, result_rows, values
+from jaxnbv.studies.engine.measures import values
+from jaxnbv.studies.engine.results import differences, means
 from jaxnbv.studies.engine.tables import summary
 from jaxnbv.studies.parts.discovery import TARGETS, discovery_time
 from jaxnbv.studies.parts.study import PartStudy
@@ -35,9 +36,9 @@ def test_discovery_times_by_hand():
 
 
 def test_rows_by_hand():
-    rows = {(row["quantity"], row["method"], row["at"]): row for row in result_rows(RECORDS, [*TIMES], [TIME, FOUND])}
+    rows = means(RECORDS, [*TIMES], [TIME, FOUND]).set_index(["quantity", "method", "at"])
     every = [(method, target) for method in TIMES for target in TARGETS]
-    of_time, of_share = ([rows[name, *of] for of in every] for name in ("time", "found"))
+    of_time, of_share = ([rows.loc[name, *of] for of in every] for name in ("time", "found"))
     assert [row["mean"] for row in of_time] == [1.0, 1.5, 1.5, 2.0, 2.0, 2.5, 3.0, 3.5, 3.5, 4.0]
     assert [row["mean"] for row in of_share] == [1.0] * 5 + [1.0, 1.0, 0.5, 0.5, 0.0]
     # Of two numbers it is half their difference.
@@ -47,9 +48,9 @@ def test_rows_by_hand():
 
 
 def test_differences_are_of_all_targets():
-    rows = difference_rows(RECORDS, [*TIMES], [TIME], "discrete")
-    assert [row["at"] for row in rows] == list(TARGETS)
-    assert [row["mean"] for row in rows] == [-1.5, -1.5, -2.0, -1.5, -2.0]
+    rows = differences(RECORDS, [*TIMES], [TIME], "discrete")
+    assert [*rows["at"]] == list(TARGETS)
+    assert [*rows["mean"]] == [-1.5, -1.5, -2.0, -1.5, -2.0]
 
 
 def test_the_share_by_view_is_of_the_middle_target():
@@ -61,7 +62,7 @@ def test_the_summary_shows_means_errors_shares_and_differences(tmp_path):
     text = summary(RECORDS, PartStudy)
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert "discrete 1.00 +- 0.00** 1.50 +- 0.50** 1.50 +- 0.50** 2.00 +- 1.00** 2.00 +- 1.00**" in lines
-    assert "farthest 100 [100, 100] 100 [100, 100] 50 [ 0, 100] 50 [ 0, 100] 0 [ 0, 0]" in lines
+    assert "farthest 100 [100, 100] 100 [100, 100] 50 [0, 100] 50 [0, 100] 0 [0, 0]" in lines
     assert "-1.50 [-2.00, -1.00]*" in text
     assert [path.name for path in write_charts(RECORDS, PartStudy, tmp_path)] == ["parts.png"]
     with pytest.raises(InputError, match=r"number of views, \[3, 4\]"):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxnbv.studies.engine.charts import write_charts
-from jaxnbv.studies.engine.measures import difference_rows, result_rows
+from jaxnbv.studies.engine.results import differences, means
 from jaxnbv.studies.engine.tables import summary
 from jaxnbv.studies.reconstruction.study import MEAN, POISSON, ReconstructionStudy
 
@@ -43,8 +43,7 @@ def hand_made():
 
 
 def test_distances_are_of_the_scenes_that_have_them():
-    found = result_rows(hand_made(), METHODS, ReconstructionStudy.measures)
-    rows = {(row["at"], row["quantity"], row["method"]): row for row in found}
+    rows = means(hand_made(), METHODS, ReconstructionStudy.measures).set_index(["at", "quantity", "method"]).loc
     row = rows[MEAN, "chamfer", "farthest"]
     assert (row["mean"], row["scenes"], row["rank"]) == (pytest.approx(0.3), 2, 2)
     # Of 0.2 and 0.4: a standard deviation of 0.1414, over the root of two.
@@ -58,8 +57,8 @@ def test_distances_are_of_the_scenes_that_have_them():
 
 
 def test_differences_are_paired():
-    found = difference_rows(hand_made(), METHODS, ReconstructionStudy.measures, "coverage")
-    rows = {(row["at"], row["quantity"]): row for row in found}
+    found = differences(hand_made(), METHODS, ReconstructionStudy.measures, "coverage")
+    rows = found.set_index(["at", "quantity"]).loc
     row = rows[MEAN, "chamfer"]
     # Both scenes differ by -0.1, so any resample does; the Hausdorff distances by 0.1 and -0.1.
     assert (row["mean"], row["low"], row["high"]) == tuple(map(pytest.approx, (-0.1, -0.1, -0.1)))
@@ -72,7 +71,7 @@ def test_the_text_and_the_chart_go_without_a_reconstruction_that_no_scene_has(tm
     text = summary(hand_made(), ReconstructionStudy)
     assert POISSON in text
     assert "-0.100 [-0.100, -0.100]*" in text
-    assert " 55 [ 50,  60]" in text
+    assert " 55 [50, 60]" in text
     assert max(map(len, text.splitlines())) <= 120
     without = hand_made()[:1]
     assert POISSON not in summary(without, ReconstructionStudy)
