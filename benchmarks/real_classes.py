@@ -24,8 +24,7 @@ from jaxnbv.networks.pretrained import TRAINED_POINTS
 from jaxnbv.scanning import SensorNoise, scan
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.storage.folders import versions
-from jaxnbv.studies.engine.meshes import class_meshes
-from jaxnbv.studies.readers import MeshFile
+from jaxnbv.studies.readers import MeshFile, class_meshes
 from jaxnbv.studies.scenes import CLASS_SETS, Framing, Split
 from jaxnbv.studies.training import log_probabilities, train
 from jaxnbv.studies.training.class_clouds import scanned_clouds

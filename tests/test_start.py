@@ -14,6 +14,7 @@ import pytest
 import jaxnbv
 from jaxnbv import cli, viz
 from jaxnbv.studies import readers, scenes
+from jaxnbv.studies.engine.results import interval
 
 HEAVY = {"jax", "equinox", "scipy", "matplotlib", "trimesh"}
 PACKAGES = [jaxnbv, readers, scenes, viz, cli.actions]
@@ -114,4 +115,4 @@ for name in {[*first_names.values()]}:
 
 def test_shapes_are_checked_in_modules_that_are_imported_late():
     with pytest.raises(jaxtyping.TypeCheckError):
-        readers.unit_sphere(np.arange(3.0))
+        interval(np.arange(3.0))

@@ -29,9 +29,9 @@ from jaxnbv.studies.classification.measures import HITS_EXPLAINED, ROUGHNESS, di
 from jaxnbv.studies.classification.shared import OracleView, Shared, classify, propose_together
 from jaxnbv.studies.engine.diagnostics import rank_correlation, roughness
 from jaxnbv.studies.engine.measures import UNKNOWING, Claim, Measure, Record
-from jaxnbv.studies.engine.meshes import class_meshes, numbered
+from jaxnbv.studies.engine.meshes import numbered
 from jaxnbv.studies.engine.study import Chart, Panel, Scene, Study, pose_record
-from jaxnbv.studies.readers import MeshFile
+from jaxnbv.studies.readers import MeshFile, class_meshes
 from jaxnbv.studies.scenes import ClassObject, ClassSet, Framing, Split
 from jaxnbv.studies.scenes.class_object import ClassMesh, scan_cue, surface_of
 from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, MixedEntropy

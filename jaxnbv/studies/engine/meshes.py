@@ -1,8 +1,7 @@
 """A folder of meshes as the scenes of a study."""
 
 import dataclasses
-import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,10 +13,7 @@ from jaxnbv.imagination import Imagination
 from jaxnbv.scanning import TriangleMesh, load_mesh
 from jaxnbv.studies.engine.measures import KNOWN
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.readers import MeshFile, ModelNet, OmniObject3D
-from jaxnbv.studies.readers.local_copy import class_folders
-from jaxnbv.studies.readers.modelnet import is_modelnet
-from jaxnbv.studies.readers.omniobject3d import holds_scans, scans_folder
+from jaxnbv.studies.readers.class_meshes import is_mesh_file
 from jaxnbv.surfaces import KnownShapes, ShapeBank, Upright
 
 _File = TypeVar("_File")
@@ -36,47 +32,6 @@ def mesh_files(folder: str | Path) -> tuple[str, ...]:
     formats = ", ".join(sorted(trimesh.available_formats()))
     require(len(found) > 0, f"the folder {folder} holds no mesh: its files must end in {formats}")
     return found
-
-
-def is_mesh_file(path: Path) -> bool:
-    """Whether a file's name ends as a format that trimesh reads."""
-    return path.suffix[1:].lower() in trimesh.available_formats() and path.is_file()
-
-
-def taking_turns(groups: Iterable[Sequence[_File]]) -> list[_File]:
-    """The first of each group, then the second of each that has one, and so on."""
-    turns = itertools.chain.from_iterable(itertools.zip_longest(*groups))
-    return [one for one in turns if one is not None]
-
-
-def class_meshes(folder: str | Path, classes: Sequence[str]) -> tuple[MeshFile, ...]:
-    """The meshes in a folder `class/.../name` for some of the classes, labelled by their place; these take turns.
-
-    Names of classes may be written with underscores. What is named as in `ModelNet` or `OmniObject3D` is read as these
-    are: of the former the meshes for tests. Of other classes that have a folder `test` the meshes are those in it.
-    Other folders are passed over.
-
-    **Raises:** `ValueError` if there is no such folder, none of a class, or one without a mesh.
-    """
-    folder = Path(folder)
-    require(folder.is_dir(), f"there is no folder {folder}: give one that holds a folder of meshes for each class")
-    folder = scans_folder(folder)
-    found = class_folders(folder)
-    known = [(label, name) for label, name in enumerate(classes) if name in found]
-    require(len(known) > 0, f"the folder {folder} has none of the folders {', '.join(classes)}: give one that has")
-    return tuple(taking_turns([file._replace(label=label) for file in _of_class(found[name])] for label, name in known))
-
-
-def _of_class(folder: Path) -> Sequence[MeshFile]:
-    if is_modelnet(folder):
-        return ModelNet(folder.parent, "test", [folder.name]).files
-    if holds_scans(folder):
-        return OmniObject3D(folder.parent, [folder.name]).files
-    split = folder / "test"
-    inside = sorted((split if split.is_dir() else folder).rglob("*"))
-    files = [file for file in inside if is_mesh_file(file)]
-    require(len(files) > 0, f"the folder {folder} holds no mesh: unpack it again, or take it away")
-    return [MeshFile(0, file.stem, str(file)) for file in files]
 
 
 def numbered(files: Sequence[_File], index: int) -> _File:

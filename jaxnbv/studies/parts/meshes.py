@@ -14,10 +14,11 @@ from jaxnbv.imagination import Imagination
 from jaxnbv.scanning import Grid, MeshParts, load_parts, scan
 from jaxnbv.scanning.mesh import read_nodes
 from jaxnbv.studies.engine.measures import KNOWN, Record
-from jaxnbv.studies.engine.meshes import is_mesh_file, knowing_meshes, knowing_others, numbered, taking_turns
+from jaxnbv.studies.engine.meshes import knowing_meshes, knowing_others, numbered
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.parts.discovery import NETWORK_POINTS, TARGETS, PartDiscoveryStudy
 from jaxnbv.studies.parts.nearest import NearestPart
+from jaxnbv.studies.readers.class_meshes import is_mesh_file, taking_turns
 from jaxnbv.tasks import part_counts
 
 # Where distances from the parts are known: the object's longest side is 2.5.

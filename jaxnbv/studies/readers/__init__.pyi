@@ -1,15 +1,2 @@
-from .labelled_points import LabelledPoints as LabelledPoints
-from .labelled_points import unit_sphere as unit_sphere
-from .mesh_set import LabelledMesh as LabelledMesh
-from .mesh_set import MeshFile as MeshFile
-from .mesh_set import MeshSet as MeshSet
-from .modelnet import MODELNET10 as MODELNET10
-from .modelnet import MODELNET40 as MODELNET40
-from .modelnet import ModelNet as ModelNet
-from .modelnet_points import ModelNetPoints as ModelNetPoints
-from .omniobject3d import OmniObject3D as OmniObject3D
-from .omniobject3d import OmniObject3DPoints as OmniObject3DPoints
-from .shapenet import SYNSETS as SYNSETS
-from .shapenet import ShapeNet as ShapeNet
-from .shapenet_part import LabelledShape as LabelledShape
-from .shapenet_part import ShapeNetPart as ShapeNetPart
+from .class_meshes import MeshFile as MeshFile
+from .class_meshes import class_meshes as class_meshes

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from jaxnbv.checks import AnyArray, InputError, as_numbers, require, shown
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.storage.files import is_file
-from jaxnbv.studies.readers.local_copy import check_listed, checked_folder, read_lines, read_rows, read_text
+from jaxnbv.storage.files import is_file, is_folder
+from jaxnbv.studies.readers.text_files import check_listed, read_lines, read_rows, read_text
 
 # In seconds: an image and a pose of a TUM sequence that lie farther apart are not of one moment.
 _APART = 0.02
@@ -52,7 +52,8 @@ class RecordedFrames:
     """
 
     def __init__(self, folder: str | Path, up: tuple[float, float, float] | None = None):
-        folder = checked_folder(folder)
+        folder = Path(folder)
+        require(is_folder(folder), f"there is no folder {folder}: give the place of the unpacked data set")
         layout = _layout(folder)
         check_listed(layout.files, folder)
         matrices = layout.matrices if up is None else _upward(up) @ layout.matrices

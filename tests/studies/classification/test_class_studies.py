@@ -2,7 +2,6 @@
 
 import functools
 import json
-from pathlib import Path
 from typing import ClassVar
 
 import equinox as eqx
@@ -24,8 +23,8 @@ from jaxnbv.studies.classification.pictures import write_pictures
 from jaxnbv.studies.classification.truck import TruckStudy
 from jaxnbv.studies.engine.charts import write_charts
 from jaxnbv.studies.engine.measures import values
-from jaxnbv.studies.engine.meshes import class_meshes
 from jaxnbv.studies.engine.tables import summary, write_tables
+from jaxnbv.studies.readers import class_meshes
 from jaxnbv.studies.scenes import FRUITS, HOUSEHOLD, Split, truck_scene
 from jaxnbv.studies.scenes.class_object import scan_cue
 from jaxnbv.surfaces import GeometricSPSR
@@ -127,61 +126,6 @@ def box_files(folder, *names):
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
         trimesh.creation.box((1.0, 0.5, 0.25)).export(file)
-
-
-def test_meshes_of_classes_take_turns_and_other_folders_are_passed_over(tmp_path):
-    """As ModelNet has them, in `test` and with underscores, and in any depth."""
-    box_files(
-        tmp_path, "bench/a.obj", "chair/b.obj", "chair/a.ply", "Night_Stand/train/a.off", "Night_Stand/test/c.off"
-    )
-    box_files(tmp_path, "chair/deep/er/c.stl")
-    (tmp_path / "chair" / "readme.txt").write_text("no mesh")
-    found = class_meshes(tmp_path, HOUSEHOLD)
-    assert [(HOUSEHOLD[mesh.label], Path(mesh.path).name) for mesh in found] == [
-        ("chair", "a.ply"),
-        ("night stand", "c.off"),
-        ("chair", "b.obj"),
-        ("chair", "c.stl"),
-    ]
-
-
-def test_copies_of_modelnet_are_turned_upright(tmp_path):
-    numbers = {"bathtub": range(107, 157), "night_stand": range(201, 287)}
-    box_files(tmp_path, *(f"{name}/test/{name}_{number:04d}.off" for name in numbers for number in numbers[name]))
-    box_files(tmp_path, "bathtub/train/bathtub_0001.off", "chair/y_up.off")
-    found = class_meshes(tmp_path, HOUSEHOLD)
-    assert [(HOUSEHOLD[mesh.label], mesh.name, mesh.up) for mesh in found[:4]] == [
-        ("bathtub", "bathtub_0107", "z"),
-        ("chair", "y_up", "y"),
-        ("night stand", "night_stand_0201", "z"),
-        ("bathtub", "bathtub_0108", "z"),
-    ]
-    assert len(found) == 50 + 86 + 1
-    study = small(ModelNet10Study, meshes=found)
-    # The sides of the box in its file are 1, 0.5 and 0.25.
-    for index, sides in ((0, [2.5, 0.625, 1.25]), (1, [2.5, 1.25, 0.625])):
-        np.testing.assert_allclose(np.ptp(study.scene(index).surface.vertices, axis=0), sides)
-
-
-def test_copies_of_omniobject3d_name_their_scenes_by_object(tmp_path):
-    names = ("apple/apple_003", "apple/apple_001", "toy_car/toy_car_001", "orange/orange_010")
-    box_files(tmp_path / "raw_scans", *(f"{name}/Scan/Scan.obj" for name in names))
-    (tmp_path / "point_clouds").mkdir()
-    for folder in (tmp_path, tmp_path / "raw_scans"):
-        study = small(OmniObject3DStudy, meshes=class_meshes(folder, FRUITS))
-        scenes = [study.scene(index) for index in range(study.num_scenes)]
-        assert [scene.name for scene in scenes] == ["apple apple_001", "orange orange_010", "apple apple_003"]
-        assert [scene.task.label for scene in scenes] == [FRUITS.index(name) for name in ("apple", "orange", "apple")]
-
-
-def test_folders_without_a_class_or_a_mesh_are_refused(tmp_path):
-    with pytest.raises(InputError, match="no folder"):
-        class_meshes(tmp_path / "none", HOUSEHOLD)
-    with pytest.raises(InputError, match="none of the folders bathtub, bed, chair"):
-        class_meshes(tmp_path, HOUSEHOLD)
-    (tmp_path / "sofa" / "test").mkdir(parents=True)
-    with pytest.raises(InputError, match="sofa holds no mesh"):
-        class_meshes(tmp_path, HOUSEHOLD)
 
 
 def test_meshes_in_place_of_procedural_objects(tmp_path):
