@@ -10,7 +10,6 @@ import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
@@ -18,9 +17,9 @@ from jaxnbv.scanning import scan
 from jaxnbv.studies.classification.hits import CUE_PIXELS
 from jaxnbv.studies.classification.study import ClassificationStudy
 from jaxnbv.studies.engine.measures import Record, methods_of
+from jaxnbv.studies.engine.pictures import Grid, first_scenes, framed, write_grids
 from jaxnbv.studies.engine.study import Scene
-from jaxnbv.studies.engine.tiles import Tiles, first_scenes, frame, save_pictures
-from jaxnbv.viz.style import GREY, LINE, NEW
+from jaxnbv.viz.style import GREY, NEW
 
 _SHOWN = ("cross-entropy", "farthest", "uncertainty")
 _RIGHT = "#00734f"
@@ -43,67 +42,30 @@ def write_pictures(
     """
     present = methods_of(records, study.methods)
     methods = [method for method in _SHOWN if method in present] or present
-    chosen = first_scenes(records, scenes)
-    return save_pictures(chosen, folder, "views", lambda one: _picture(one, study, methods, pixels))
+    return write_grids(first_scenes(records, scenes), folder, "views", lambda one: _views(one, study, methods, pixels))
 
 
-def _picture(record: Record, study: ClassificationStudy, methods: Sequence[str], pixels: int) -> Figure:
+def _views(record: Record, study: ClassificationStudy, methods: Sequence[str], pixels: int) -> Grid:
     held = [record["methods"][method] for method in methods]
-    runs = [method["runs"][0] for method in held]
-    views = len(runs[0]["log_p"])
-    taken = [study.poses_of(method)[:views] for method in held]
-    scene = study.scene(record["scene"])
+    runs, poses = [method["runs"][0] for method in held], [study.poses_of(method) for method in held]
+    scene, names = study.scene(record["scene"]), study.objects.classes
     # Four rays a pixel.
     camera = Camera(height=2 * pixels, width=2 * pixels)
-    images = [[_image(scene, camera, pose, bool(study.cue)) for pose in poses] for poses in taken]
 
-    # Inches: all methods share the first view, so it stands once, at the middle of the rows.
-    tile, gap, below, left, top, margin = 1.25, 0.1, 0.36, 0.12, 0.8, 0.1 + 0.08 * max(map(len, methods))
-    wide, tall = left + views * (tile + gap) + margin + 0.1, top + len(methods) * (tile + below)
-    names = study.objects.classes
+    def draw(axes: Axes, row: int, column: int) -> None:
+        axes.imshow(_image(scene, camera, poses[row][column], bool(study.cue)), interpolation="antialiased")
+        if study.cue and runs[row][f"{study.cue}_pixels"][column] >= CUE_PIXELS:
+            framed(axes, NEW, 1.6)
+        log_p = runs[row]["log_p"][column]
+        guess = int(np.argmax(log_p))
+        right = guess == record["label"]
+        text = f"{'✓ ' if right else ''}{names[guess]} {np.exp(log_p[guess]):.0%}"
+        axes.set_xlabel(text, fontsize=9, color=_RIGHT if right else GREY, fontweight="bold" if right else "normal")
+
     title = f"Scene {record['scene']}, {record['framing']}: {names[record['label']]}"
-    framed = f"Framed: at least {CUE_PIXELS} {study.cue} pixels. " if study.cue else ""
-    caption = f"{framed}Beneath: prediction so far."
-    tiles = Tiles(wide, tall, title, caption)
-
-    def place(column: int, row: int | float) -> Axes:
-        x = left + column * (tile + gap) + (margin if column else 0.0)
-        return tiles.place(x, top + row * (tile + below), tile, tile)
-
-    for row, (method, run) in enumerate(zip(methods, runs, strict=True)):
-        for column in range(1, views):
-            axes = place(column, row)
-            _tile(axes, images[row][column], record["label"], run, column, study)
-            if row == 0:
-                axes.set_title(f"view {column + 1}", fontsize=9, loc="center", pad=4)
-        x, down = left + tile + margin - 0.02, top + row * (tile + below) + 0.5 * tile
-        tiles.write(x, down, method, fontsize=9, fontweight="bold", ha="right")
-    axes = place(0, 0.5 * (len(methods) - 1))
-    _tile(axes, images[0][0], record["label"], runs[0], 0, study)
-    axes.set_title("view 1, given", fontsize=9, loc="center", pad=4)
-    return tiles.figure
-
-
-def _tile(
-    axes: Axes, image: Float[np.ndarray, "h w 3"], label: int, run: dict, view: int, study: ClassificationStudy
-) -> None:
-    axes.imshow(image, interpolation="antialiased")
-    shows = bool(study.cue) and run[f"{study.cue}_pixels"][view] >= CUE_PIXELS
-    frame(axes, NEW if shows else LINE, 1.6 if shows else 0.8)
-    guess = int(np.argmax(run["log_p"][view]))
-    right = guess == label
-    text = f"{study.objects.classes[guess]} {np.exp(run['log_p'][view][guess]):.0%}"
-    axes.text(
-        0.5,
-        -0.06,
-        f"✓ {text}" if right else text,
-        transform=axes.transAxes,
-        ha="center",
-        va="top",
-        fontsize=9,
-        color=_RIGHT if right else GREY,
-        fontweight="bold" if right else "normal",
-    )
+    caption = f"Framed: at least {CUE_PIXELS} {study.cue} pixels. " if study.cue else ""
+    columns = [f"view {view + 1}" for view in range(len(runs[0]["log_p"]))]
+    return Grid(title, f"{caption}Beneath: prediction so far. View 1 is given.", methods, columns, draw)
 
 
 def _image(scene: Scene, camera: Camera, pose: Pose, tinted: bool) -> Float[np.ndarray, "h w 3"]:

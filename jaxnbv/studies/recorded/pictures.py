@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from jaxnbv.studies.engine.measures import Record, methods_of
-from jaxnbv.studies.engine.tiles import first_scenes, save_pictures
+from jaxnbv.studies.engine.pictures import Grid, first_scenes, write_grids
 from jaxnbv.studies.recorded.study import RecordedStudy
 from jaxnbv.viz.style import GREY, INK, LINE, NEW
 
@@ -19,28 +18,29 @@ _COLUMNS = 4
 def write_pictures(records: Sequence[Record], study: RecordedStudy, folder: str | Path, scenes: int = 3) -> list[Path]:
     """Write `frames_<scene>.png` for the first scenes, not picked ones; return the paths.
 
-    A panel a method: the voxels of the box across its shortest side, those that its frames have shown in colour, the
+    A tile a method: the voxels of the box across its shortest side, those that its frames have shown in colour, the
     way of the recorded camera, and where the chosen frames were taken, in their order.
 
     **Raises:** `ValueError` as `methods_of` does.
     """
     methods = methods_of(records, study.methods)
-    return save_pictures(
-        first_scenes(records, scenes), folder, "frames", lambda record: _picture(record, study, methods)
-    )
+    return write_grids(first_scenes(records, scenes), folder, "frames", lambda one: _frames(one, study, methods))
 
 
-def _picture(record: Record, study: RecordedStudy, methods: Sequence[str]) -> Figure:
-    rows = -(-len(methods) // _COLUMNS)
-    figure = Figure(figsize=(3.1 * _COLUMNS, 2.9 * rows), layout="constrained")
-    panels = figure.subplots(rows, _COLUMNS, squeeze=False, sharex=True, sharey=True).reshape(-1)
-    for axes, method in zip(panels, methods, strict=False):
+def _frames(record: Record, study: RecordedStudy, methods: Sequence[str]) -> Grid:
+    wide = min(_COLUMNS, len(methods))
+
+    def draw(axes: Axes, row: int, column: int) -> None:
+        if row * wide + column >= len(methods):
+            axes.axis("off")
+            return
+        method = methods[row * wide + column]
         _draw(axes, study, record["methods"][method]["frames"])
-        share = record["methods"][method]["covered"][-1]
-        axes.set_title(f"{method}: {100 * share:.0f} %", fontsize=10, color=INK)
-    for axes in panels[len(methods) :]:
-        axes.set_visible(False)
-    return figure
+        axes.set_xlabel(f"{method}: {record['methods'][method]['covered'][-1]:.0%}", fontsize=9, color=INK)
+
+    caption = "Coloured: voxels that the frames show. Numbers: where they were taken, in their order."
+    rows = -(-len(methods) // wide)
+    return Grid(f"{study.title}: {record['name']}", caption, [""] * rows, [""] * wide, draw)
 
 
 def _draw(axes: Axes, study: RecordedStudy, frames: Sequence[int]) -> None:
@@ -58,6 +58,3 @@ def _draw(axes: Axes, study: RecordedStudy, frames: Sequence[int]) -> None:
     for number, place in enumerate(chosen, start=1):
         axes.annotate(str(number), place, textcoords="offset points", xytext=(3, 3), fontsize=8, color=INK, zorder=4)
     axes.set_aspect("equal")
-    axes.tick_params(labelsize=7, colors=GREY)
-    for side in axes.spines.values():
-        side.set_color(LINE)

@@ -237,8 +237,7 @@ def test_planners_of_all_categories_share_their_compilations(compilations):
     assert (values[0] != values[1]).any()
 
 
-def test_pictures_are_of_the_scenes_and_methods_asked_for(tmp_path, monkeypatch):
-    monkeypatch.setattr(part_pictures, "_TRIES", 6)
+def test_pictures_are_of_the_scenes_and_methods_asked_for(tmp_path):
     (path,) = part_pictures.write_pictures([whole_record()], small_study(), tmp_path / "a", scenes=2, pixels=24)
     assert path == tmp_path / "a" / f"parts_{SCENE:03d}.png"
     assert path.read_bytes()[:4] == b"\x89PNG"
