@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 import jaxnbv as nbv
 from jaxnbv.acquisition import Acquisition
-from jaxnbv.cli.actions.tasks import PARTS
+from jaxnbv.cli.actions.tasks import COMMAND_TASKS
 from jaxnbv.scanning import SDFSurface, Surface
 from jaxnbv.scanning.metrics import truth_points
 from jaxnbv.scanning.sensors import PART_SETTING, USUAL_SETTING, Setting, fitted
@@ -44,7 +44,7 @@ class Shown(NamedTuple):
 
 def part_object(index: int) -> Shown:
     """Number `index` of the procedural objects, whose parts are asked for."""
-    made = PARTS.demo(index, Framing.CLOSE_UP, 0)
+    made = COMMAND_TASKS["parts"].demo(index, Framing.CLOSE_UP, 0)
     return Shown(made.name, made.surface, made.acquisition, PART_SETTING)
 
 

@@ -6,8 +6,10 @@ import jax
 import numpy as np
 import pytest
 
-from jaxnbv.cli.actions.tasks import CommandTask
-from jaxnbv.cli.registry import SEARCHES, TASKS, resolve
+from jaxnbv.cli.actions.searches import search_of
+from jaxnbv.cli.actions.tasks import COMMAND_TASKS
+from jaxnbv.cli.actions.until import RULES
+from jaxnbv.cli.registry import SEARCHES, STOPS, TASKS, resolve
 from jaxnbv.search import GradientSearch, Search
 from jaxnbv.search.base import CandidateSearch
 from jaxnbv.studies.engine.study import Chart, Study
@@ -17,18 +19,20 @@ from jaxnbv.studies.registry import STUDIES
 @pytest.mark.parametrize("name", TASKS)
 def test_a_task_has_a_sensor_and_requires_what_it_takes(name):
     entry = TASKS[name]
-    task = resolve(entry.task)
-    assert isinstance(task, CommandTask)
-    assert task.setting.radius > 1.5
+    assert COMMAND_TASKS[name].setting.radius > 1.5
     assert {option for option, _ in entry.requires} <= {*entry.options} <= {"network", "category", "source"}
+
+
+def test_every_task_and_rule_is_there():
+    assert COMMAND_TASKS.keys() == TASKS.keys()
+    assert RULES.keys() == STOPS.keys()
 
 
 @pytest.mark.parametrize("name", SEARCHES)
 def test_a_search_stands_at_the_sensors_distance_with_as_many_candidates(name):
-    make = resolve(SEARCHES[name].search)
-    search = make(2.2, 24)
+    search = search_of(name, 2.2, 24)
     assert isinstance(search, Search)
-    assert isinstance(make(2.2, None), Search)
+    assert isinstance(search_of(name, 2.2, None), Search)
     if isinstance(search, CandidateSearch):
         poses = search.candidates.poses()
     else:

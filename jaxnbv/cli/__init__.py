@@ -7,10 +7,10 @@ from typing import Annotated
 import typer
 
 import jaxnbv
+from jaxnbv.cli.episode import demo, run
 from jaxnbv.cli.session import session
 from jaxnbv.cli.study import study
 from jaxnbv.cli.tools import convert, report, view
-from jaxnbv.cli.views import demo, run
 from jaxnbv.errors import InputError
 
 app = typer.Typer(
@@ -52,7 +52,7 @@ app.command("run")(run)
 app.command()(convert)
 app.command()(view)
 app.command()(report)
-app.add_typer(study, name="study")
+app.command()(study)
 app.add_typer(session, name="session")
 
 

@@ -1,15 +1,12 @@
 """What the commands' options mean."""
 
-import inspect
-from collections.abc import Callable, Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from jaxnbv.cli.asked import DEFAULT_FIRST, Device
-from jaxnbv.cli.registry import BANKS, MODELS, SEARCHES, STOPS, STUDY_MODELS, TASKS
+from jaxnbv.cli.registry import BANKS, DEFAULT_FIRST, MODELS, SEARCHES, STOPS, STUDY_MODELS, TASKS, Device
 from jaxnbv.studies.scenes import Framing
 
 # The registries are the enumerations.
@@ -18,16 +15,17 @@ ModelName = StrEnum("ModelName", {name.upper(): name for name in MODELS})  # typ
 StudyModel = StrEnum("StudyModel", {name.upper(): name for name in STUDY_MODELS})  # type: ignore[misc]
 SearchName = StrEnum("SearchName", {name.replace("-", "_").upper(): name for name in SEARCHES})  # type: ignore[misc]
 
-
-REQUIRED = inspect.Parameter.empty
-
+COVERAGE, CROSS_ENTROPY = Task("coverage"), Task("cross-entropy")
+DISCRETE, SCREENED = SearchName("discrete"), ModelName("screened")
 
 TaskOption = Annotated[
     Task, typer.Option(help="What the views are for. " + "; ".join(f"{n}: {e.about}" for n, e in TASKS.items()) + ".")
 ]
 SearchOption = Annotated[
     SearchName,
-    typer.Option(help="How the next view is found. " + "; ".join(f"{n}: {e.about}" for n, e in SEARCHES.items()) + "."),
+    typer.Option(
+        help="How the next view is found. " + "; ".join(f"{n}: {about}" for n, about in SEARCHES.items()) + "."
+    ),
 ]
 ViewsOption = Annotated[int, typer.Option(help="Views in all, the first one included.")]
 SeedOption = Annotated[
@@ -38,7 +36,7 @@ UntilOption = Annotated[
     typer.Option(
         metavar="RULE=N",
         help="End earlier, by the first of some rules that holds. "
-        + "; ".join(f"{n}=N: {e.about}" for n, e in STOPS.items())
+        + "; ".join(f"{n}=N: {about}" for n, about in STOPS.items())
         + "; never: not earlier.",
         show_default="never; demo of a class: sure=0.95",
     ),
@@ -85,9 +83,10 @@ ModelOption = Annotated[
     ),
 ]
 StudyModelOption = Annotated[
-    StudyModel,
+    StudyModel | None,
     typer.Option(
-        help="By what surfaces are imagined. " + "; ".join(f"{n}: {about}" for n, about in STUDY_MODELS.items()) + "."
+        help="By what surfaces are imagined. " + "; ".join(f"{n}: {about}" for n, about in STUDY_MODELS.items()) + ".",
+        show_default="known, where there are known shapes",
     ),
 ]
 KnownOption = Annotated[
@@ -149,21 +148,84 @@ FramingOption = Annotated[
     ),
 ]
 
-
-def command(run: Callable[..., None], about: str, options: Mapping[str, tuple[Any, Any]]) -> Callable[..., None]:
-    """A function with these options, as Typer reads it, that hands them on to `run`.
-
-    - `options`: annotation and default by name; the default is `REQUIRED` for an argument without one.
-    """
-
-    def called(**given: Any) -> None:
-        run(**given)
-
-    called.__doc__ = about
-    called.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [
-            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-            for name, (annotation, default) in options.items()
-        ]
-    )
-    return called
+ScenesOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="N|A:B",
+        help="Scenes of the test split: the first N, or from A up to but without B.",
+        show_default="as many as the study has by default",
+    ),
+]
+StudyViewsOption = Annotated[
+    int | None, typer.Option(min=2, help="Views in all, the first one included.", show_default="the study's")
+]
+MethodsOption = Annotated[
+    str | None, typer.Option(help="Which methods, separated by commas.", show_default="all of the table")
+]
+OwnOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--method",
+        help="A method of your own in the same table, module:function. The function makes a Planner from the study and "
+        "a scene of it; the module is looked for in the current folder too. Can be given several times.",
+        show_default=False,
+    ),
+]
+StudyQuickOption = Annotated[
+    bool, typer.Option("--quick", help="Small settings and few scenes: minutes, and not the full study.")
+]
+StudyOutOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--out",
+        help="Output folder; the scenes already in it are not run again.",
+        show_default="runs/study-NAME[-MODEL][-quick]",
+    ),
+]
+WorkersOption = Annotated[
+    int, typer.Option(min=1, help="Scenes at a time, in as many processes, which share the cores.")
+]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Run the scenes on a Dask cluster: its scheduler, such as tcp://10.0.0.1:8786. "
+        'Needs `pip install "jaxnbv[cluster]"` here and on its workers.',
+        show_default=False,
+    ),
+]
+MeshesOption = Annotated[
+    Path | None, typer.Option(help="A folder of meshes to scan.", show_default="procedural objects")
+]
+CheckpointOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--classifier",
+        help="A network's checkpoint: .safetensors, .pth or .pt.",
+        show_default="the one that ships",
+    ),
+]
+BoxOption = Annotated[
+    tuple[float, float, float, float, float, float] | None,
+    typer.Option(
+        metavar="LOW HIGH",
+        help="What is to be seen of a recording: two corners of a box, six numbers in its units.",
+        show_default="about nearly all that was seen",
+    ),
+]
+UpOption = Annotated[
+    tuple[float, float, float] | None,
+    typer.Option(
+        metavar="X Y Z",
+        help="The direction of a recording that is upward, which becomes z of the box.",
+        show_default="as recorded",
+    ),
+]
+StudyFramingOption = Annotated[
+    Framing | None,
+    typer.Option(
+        "--framing",
+        help="How large a pyramid stands: a view shows a patch of it, or nearly all.",
+        show_default="both",
+    ),
+]

@@ -1,28 +1,12 @@
 """`jaxnbv session ...`: what a real sensor saw."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from jaxnbv.cli import actions
-from jaxnbv.cli.asked import Device
-from jaxnbv.cli.options import (
-    REQUIRED,
-    CategoryOption,
-    DeviceOption,
-    KnownOption,
-    ModelName,
-    ModelOption,
-    NetworkOption,
-    QuickOption,
-    ReportOption,
-    SearchName,
-    SearchOption,
-    Task,
-    TaskOption,
-    command,
-)
+from jaxnbv.cli import actions, options
+from jaxnbv.cli.registry import Device
 
 session = typer.Typer(
     help="What a real sensor saw, as `jaxnbv.Session` keeps it.", no_args_is_help=True, rich_markup_mode="markdown"
@@ -41,34 +25,26 @@ SourceOption = Annotated[
 ]
 
 
-def _replay(device: Device, **given: Any) -> None:
-    actions.prepare(device)
-    actions.replay(**given)
+@session.command()
+def replay(
+    folder: FolderArgument,
+    task: options.TaskOption = options.COVERAGE,
+    network: options.NetworkOption = None,
+    category: options.CategoryOption = None,
+    source: SourceOption = None,
+    search: options.SearchOption = options.DISCRETE,
+    model: options.ModelOption = options.SCREENED,
+    known: options.KnownOption = None,
+    out: OutOption = None,
+    quick: options.QuickOption = False,
+    report: options.ReportOption = True,
+    device: options.DeviceOption = Device.AUTO,
+) -> None:
+    """Plan a session again, for another task: where would it have looked next after each image?
 
-
-session.command("replay")(
-    command(
-        _replay,
-        """Plan a session again, for another task: where would it have looked next after each image?
-
-        Images, poses and box are the session's, and so are the poses to choose among, if it proposed any.
-        """,
-        {
-            "folder": (FolderArgument, REQUIRED),
-            "task": (TaskOption, Task("coverage")),
-            "network": (NetworkOption, None),
-            "category": (CategoryOption, None),
-            "source": (SourceOption, None),
-            "search": (SearchOption, SearchName("discrete")),
-            "model": (ModelOption, ModelName("screened")),
-            "known": (KnownOption, None),
-            "out": (OutOption, None),
-            "quick": (QuickOption, False),
-            "report": (ReportOption, True),
-            "device": (DeviceOption, Device.AUTO),
-        },
-    )
-)
+    Images, poses and box are the session's, and so are the poses to choose among, if it proposed any.
+    """
+    actions.replay(**locals())
 
 
 @session.callback()

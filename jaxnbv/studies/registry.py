@@ -25,6 +25,11 @@ class Entry(NamedTuple):
     options: tuple[str, ...] = ()
 
 
+def flag(option: str) -> str:
+    """How an option of a study is given."""
+    return "FOLDER" if option == "folder" else f"--{option}"
+
+
 STUDIES = {
     "pyramid": Entry(
         "jaxnbv.studies.classification.pyramid:PyramidStudy",

@@ -5,7 +5,7 @@ import os
 import jax
 import platformdirs
 
-from jaxnbv.cli.asked import Device
+from jaxnbv.cli.registry import Device
 from jaxnbv.errors import InputError
 
 

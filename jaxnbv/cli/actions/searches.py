@@ -1,7 +1,4 @@
-"""What the searches of the command line stand for, about the cameras of a sensor's setting.
-
-Where `count` is None, a search keeps its own number of candidates.
-"""
+"""What the searches of the command line stand for, about the cameras of a sensor's setting."""
 
 from typing import Any
 
@@ -21,55 +18,24 @@ from jaxnbv.search import (
 )
 from jaxnbv.tasks import Coverage
 
-
-def discrete(radius: float, count: int | None) -> Search:
-    """Over all candidates."""
-    return DiscreteSearch(_candidates(radius, count))
-
-
-def halving(radius: float, count: int | None) -> Search:
-    """Over candidates, by successive halving."""
-    return HalvingSearch(_candidates(radius, count))
+_OVER_CANDIDATES: dict[str, type[Search]] = {
+    "discrete": DiscreteSearch,
+    "halving": HalvingSearch,
+    "farthest": FarthestView,
+    "random": RandomView,
+    "uncertainty": UncertaintyView,
+}
 
 
-def tie_break(radius: float, count: int | None) -> Search:
-    """Over all candidates, by coverage where the task does not tell."""
-    return TieBreakSearch(_candidates(radius, count), second=Coverage())
-
-
-def farthest(radius: float, count: int | None) -> Search:
-    """The paper's baseline."""
-    return FarthestView(_candidates(radius, count))
-
-
-def random(radius: float, count: int | None) -> Search:
-    """The paper's baseline."""
-    return RandomView(_candidates(radius, count))
-
-
-def uncertainty(radius: float, count: int | None) -> Search:
-    """The paper's baseline."""
-    return UncertaintyView(_candidates(radius, count))
-
-
-def gradient_2dof(radius: float, count: int | None) -> Search:
-    """Over the sphere."""
-    return GradientSearch(space=SpherePoses(radius), **_number(count))
-
-
-def gradient_6dof(radius: float, count: int | None) -> Search:
-    """Over positions and rotations in a shell."""
-    return GradientSearch(space=ConstrainedPoses(nearest=radius - 0.3, farthest=radius + 0.3), **_number(count))
-
-
-def hybrid(radius: float, count: int | None) -> Search:
-    """Over the sphere, from the best of many candidates."""
-    return HybridSearch(space=SpherePoses(radius), **_number(count))
-
-
-def _candidates(radius: float, count: int | None) -> SphereCandidates:
-    return SphereCandidates(radius=radius) if count is None else SphereCandidates(count, radius)
-
-
-def _number(count: int | None) -> dict[str, Any]:
-    return {} if count is None else {"num_candidates": count}
+def search_of(name: str, radius: float, count: int | None) -> Search:
+    """The search of a name; where `count` is None with its own number of candidates."""
+    candidates = SphereCandidates(radius=radius) if count is None else SphereCandidates(count, radius)
+    if name in _OVER_CANDIDATES:
+        return _OVER_CANDIDATES[name](candidates)
+    if name == "tie-break":
+        return TieBreakSearch(candidates, second=Coverage())
+    number: dict[str, Any] = {} if count is None else {"num_candidates": count}
+    if name == "hybrid":
+        return HybridSearch(space=SpherePoses(radius), **number)
+    shell = ConstrainedPoses(nearest=radius - 0.3, farthest=radius + 0.3)
+    return GradientSearch(space=SpherePoses(radius) if name == "gradient-2dof" else shell, **number)

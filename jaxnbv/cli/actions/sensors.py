@@ -3,13 +3,14 @@
 import dataclasses
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
 
 from jaxnbv.checks import require
 from jaxnbv.cli.actions.tasks import position
-from jaxnbv.cli.asked import DEFAULT_FIRST, SensorOptions
+from jaxnbv.cli.registry import DEFAULT_FIRST
 from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.scanning import SDFSurface, Surface, TriangleMesh
 from jaxnbv.scanning.sensors import Setting, fitted
@@ -17,7 +18,7 @@ from jaxnbv.scanning.sensors import Setting, fitted
 _QUICK_RAYS = 24
 
 
-def sensor_for(mesh: TriangleMesh, setting: Setting, asked: SensorOptions, quick: bool) -> Setting:
+def sensor_for(mesh: TriangleMesh, setting: Setting, asked: SimpleNamespace) -> Setting:
     """The task's camera where it sees all of the mesh; as the paper has it, or as the user asks.
 
     **Raises:** `ValueError` as `jaxnbv.scanning.sensors.fitted` does.
@@ -30,7 +31,7 @@ def sensor_for(mesh: TriangleMesh, setting: Setting, asked: SensorOptions, quick
         setting = fitted(setting, mesh.bounding_radius, fov, asked.radius)
     if asked.rays is not None:
         return _with_rays(setting, asked.rays)
-    return quick_rays(setting) if quick else setting
+    return quick_rays(setting) if asked.quick else setting
 
 
 def quick_rays(setting: Setting) -> Setting:

@@ -5,9 +5,11 @@ from pathlib import Path
 import numpy as np
 import typer
 
+from jaxnbv.cli.actions.device import prepare
 from jaxnbv.cli.actions.episodes import knowing, planner_of, task_for
 from jaxnbv.cli.actions.sensors import quick_rays
 from jaxnbv.cli.actions.tasks import Given, OfScan, position
+from jaxnbv.cli.registry import Device
 from jaxnbv.imagination import Imagination
 from jaxnbv.planning.replay import StoredSession
 from jaxnbv.viz import write_report
@@ -26,11 +28,13 @@ def replay(
     out: Path | None,
     quick: bool,
     report: bool,
+    device: Device,
 ) -> None:
     """Where another task would have looked next, after each image of a session.
 
     **Raises:** `ValueError` for a task without what it needs, or with what it has no use for.
     """
+    prepare(device)
     stored = StoredSession(folder)
     if source is not None:
         place = stored.frame.to_scene(np.array(position("--source", source)))

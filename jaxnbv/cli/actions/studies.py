@@ -10,10 +10,9 @@ from typing import Any
 
 import typer
 
-from jaxnbv.checks import InputError
+from jaxnbv.checks import InputError, require
 from jaxnbv.cli.actions.device import prepare
-from jaxnbv.cli.asked import Device
-from jaxnbv.cli.registry import resolve
+from jaxnbv.cli.registry import Device, resolve
 from jaxnbv.storage import describe
 from jaxnbv.studies.engine.charts import write_charts
 from jaxnbv.studies.engine.measures import Record
@@ -22,17 +21,16 @@ from jaxnbv.studies.engine.records import RecordFolder
 from jaxnbv.studies.engine.study import Factory, Study
 from jaxnbv.studies.engine.tables import summary, write_tables
 from jaxnbv.studies.engine.trials import Cluster, Here, Processes, Runner, Trial
-from jaxnbv.studies.registry import Entry
+from jaxnbv.studies.registry import STUDIES, flag
 
 
 def study(
     name: str,
-    entry: Entry,
-    scenes: str,
-    views: int,
+    scenes: str | None,
+    views: int | None,
     methods: str | None,
     own: Sequence[str] | None,
-    model: str,
+    model: str | None,
     out: Path | None,
     quick: bool,
     workers: int,
@@ -42,22 +40,34 @@ def study(
 ) -> None:
     """Run a study, or each of those that it consists of, and write what it found.
 
-    **Raises:** `ValueError` for no scenes, unknown methods, or a method of one's own that cannot be found; and, once
-    all is written, if scenes failed.
+    - `scenes`, `views`, `model`: None for the study's own; `options`: those of single studies, None where not given.
+
+    **Raises:** `ValueError` for no scenes, unknown methods, an option that the study does not take, or a method of
+    one's own that cannot be found; and, once all is written, if scenes failed.
     """
+    prepare(device)
+    entry = STUDIES[name]
+    given = {option: value for option, value in options.items() if value is not None}
+    for option in given:
+        takers = ", ".join(other for other, one in STUDIES.items() if option in one.options)
+        require(option in entry.options, f"the study {name} takes no {flag(option)}: it is for {takers}")
+    require(
+        "folder" not in entry.options or "folder" in given,
+        f"the study {name} needs a folder: jaxnbv study {name} FOLDER",
+    )
     kind: type[Study] = resolve(entry.study)
+    model = model or entry.model
     chosen, added = _methods(methods, kind.all_methods(model)), {text: _own(text) for text in own or ()}
-    wanted = _scenes(scenes)
+    wanted = _scenes(str(entry.scenes) if scenes is None else scenes)
     runner = _runner(workers, scheduler, added)
     failed: dict[str, str] = {}
     asked = 0
-    given = {option: value for option, value in options.items() if value is not None}
     of_model = "" if model == entry.model else f"-{model}"
     folder = out or Path("runs") / f"study-{name}{of_model}{'-quick' if quick else ''}"
     if quick:
         typer.echo("--quick: small settings and few scenes. This is not the full study; leave it out for that.")
         wanted = wanted[: kind.quick_scenes]
-    for part, settings in kind.configured(model, views, quick, **given).items():
+    for part, settings in kind.configured(model, views or entry.views, quick, **given).items():
         config = {"study": describe(settings), "methods": sorted(chosen)}
         config |= {"own": {text: describe(make) for text, make in added.items()}} if added else {}
         there = wanted if settings.num_scenes is None else [index for index in wanted if index < settings.num_scenes]

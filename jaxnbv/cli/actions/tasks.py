@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement
 from jaxnbv.checks import InputError, require
-from jaxnbv.cli.asked import DEFAULT_FIRST
+from jaxnbv.cli.registry import DEFAULT_FIRST
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose, look_at
@@ -214,9 +214,14 @@ class HeatTask(CommandTask):
         return ExpectedUtilityImprovement(ColdestPoint(source), num_points=2048)
 
 
-COVERAGE, PARTS, HEAT = CoverageTask(), PartTask(), HeatTask()
-CROSS_ENTROPY, MIXED = ClassTask(CrossEntropy), ClassTask(MixedEntropy)
-ENTROPY = ClassTask(lambda classifier: ExpectedUtilityImprovement(NegativeEntropy(classifier), num_points=1024))
+COMMAND_TASKS: dict[str, CommandTask] = {
+    "cross-entropy": ClassTask(CrossEntropy),
+    "entropy": ClassTask(lambda classifier: ExpectedUtilityImprovement(NegativeEntropy(classifier), num_points=1024)),
+    "mixed": ClassTask(MixedEntropy),
+    "coverage": CoverageTask(),
+    "parts": PartTask(),
+    "heat": HeatTask(),
+}
 
 
 def usual_first() -> Pose:

@@ -2,13 +2,21 @@
 
 import functools
 import operator
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from jaxnbv.checks import InputError, require
-from jaxnbv.cli.registry import STOPS, resolve
-from jaxnbv.tasks import Stop
+from jaxnbv.planning.stopping import Budget, ValueBelow
+from jaxnbv.tasks import Covered, Found, Stop, Sure
 
 NEVER = "never"
+RULES: dict[str, Callable[[float], Stop]] = {
+    "sure": Sure,
+    "found": lambda number: Found(int(number) if number.is_integer() else number),  # type: ignore[arg-type]
+    "covered": Covered,
+    "value-below": ValueBelow,
+    "seconds": lambda number: Budget(seconds=number),
+    "travel": lambda number: Budget(cost=number),
+}
 
 
 def rule(texts: Sequence[str]) -> Stop | None:
@@ -23,9 +31,9 @@ def rule(texts: Sequence[str]) -> Stop | None:
 
 def _rule(text: str) -> Stop:
     name, _, value = text.partition("=")
-    require(name in STOPS, f"--until is {text!r}: give {NEVER} or one of {', '.join(STOPS)}, such as sure=0.95")
+    require(name in RULES, f"--until is {text!r}: give {NEVER} or one of {', '.join(RULES)}, such as sure=0.95")
     try:
         number = float(value)
     except ValueError as error:
         raise InputError(f"--until is {text!r}: give a number, such as {name}=0.95") from error
-    return resolve(STOPS[name].stop)(number)
+    return RULES[name](number)

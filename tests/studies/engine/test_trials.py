@@ -21,7 +21,7 @@ from jaxnbv.cli.actions.studies import study
 from jaxnbv.storage.folders import software
 from jaxnbv.studies.engine.records import RecordFolder
 from jaxnbv.studies.engine.trials import Cluster, Here, Processes
-from jaxnbv.studies.registry import Entry
+from jaxnbv.studies.registry import STUDIES, Entry
 
 
 @pytest.fixture(scope="module")
@@ -143,9 +143,9 @@ def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypa
     def run(out, scenes):
         none = dict.fromkeys(("methods", "own", "out", "scheduler"))
         settings = {"views": 2, "model": "paper", "quick": False, "workers": 1, "out": tmp_path / out}
-        study("toy", entry, **none | settings | {"scenes": scenes})
+        study("toy", **none | settings | {"scenes": scenes})
 
-    entry = Entry("toy:ToyStudy", "", "", 3, 2)
+    monkeypatch.setitem(STUDIES, "toy", Entry("toy:ToyStudy", "", "", 3, 2))
     monkeypatch.setattr(ToyStudy, "run_scene", run_scene)
     with pytest.raises(
         InputError, match=r"^1 of 3 scenes failed.*first scene 1 \(RuntimeError: lost\).*/some has scene_\*\.failed"
@@ -163,4 +163,6 @@ def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypa
         with pytest.raises(InputError, match=f"--scenes {wrong} names no scenes"):
             run("wrong", wrong)
     with pytest.raises(InputError, match="exclude each other"):
-        study("toy", entry, "2", 2, None, None, "paper", None, False, 2, "tcp://127.0.0.1:9")
+        study("toy", "2", 2, None, None, "paper", None, False, 2, "tcp://127.0.0.1:9")
+    with pytest.raises(InputError, match="the study toy takes no --meshes: it is for truck"):
+        study("toy", "2", 2, None, None, "paper", None, False, 1, None, meshes=tmp_path)
