@@ -1,6 +1,5 @@
 """All studies of a folder on one page: of each its claims, tables, figures, pictures, settings, versions and times."""
 
-import base64
 import json
 import pkgutil
 import tempfile
@@ -9,7 +8,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jinja2
 import pandas as pd
 
 from jaxnbv.checks import require
@@ -24,6 +22,7 @@ from jaxnbv.studies.engine.study import Study
 from jaxnbv.studies.engine.tables import count_of, tables_of
 from jaxnbv.studies.registry import STUDIES
 from jaxnbv.version import __version__
+from jaxnbv.viz.html import render
 
 _REMEDY = "give a folder that `jaxnbv study` has written"
 
@@ -55,17 +54,9 @@ def write_page(folder: str | Path, out: str | Path) -> Path:
     """
     out = Path(out)
     require(out.suffix == ".html", f"the page {out} must end in .html")
-    template = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
-        Path(__file__).with_name("page.html").read_text()
-    )
-    made = template.render(
-        chapters=chapters(folder),
-        version=__version__,
-        date=f"{datetime.now(UTC):%Y-%m-%d}",
-        encoded=lambda image: base64.b64encode(image).decode(),
-    )
+    found, date = chapters(folder), f"{datetime.now(UTC):%Y-%m-%d}"
     make_folder(out.parent)
-    write_text(out, made)
+    write_text(out, render(Path(__file__).with_name("page.html"), chapters=found, version=__version__, date=date))
     return out
 
 
