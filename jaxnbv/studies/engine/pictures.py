@@ -36,6 +36,7 @@ class Grid(NamedTuple):
     """Tiles in rows and columns under a title and a caption.
 
     - `draw`: fills the tile at a row and a column, given its axes.
+    - `named`: the column beside which the rows' names stand.
     - `marks`: a legend, the look of a `Line2D` by name; `scale`: a bar of colours, and what they mean.
     """
 
@@ -46,6 +47,7 @@ class Grid(NamedTuple):
     draw: Callable[[Axes, int, int], None]
     marks: Mapping[str, Mapping[str, Any]] = {}
     scale: tuple[ScalarMappable, str] | None = None
+    named: int = 0
 
 
 def write_grids(records: Sequence[Record], folder: str | Path, name: str, make: Callable[[Record], Grid]) -> list[Path]:
@@ -75,7 +77,7 @@ def _drawn(grid: Grid) -> Figure:
             grid.draw(axes, row, column)
             if row == 0:
                 axes.set_title(grid.columns[column], fontsize=9, loc="center", pad=4)
-        line[0].set_ylabel(grid.rows[row], fontsize=9, fontweight="bold")
+        line[grid.named].set_ylabel(grid.rows[row], fontsize=9, fontweight="bold")
     handles = [Line2D([], [], ls="none", label=name, **look) for name, look in grid.marks.items()]
     legend = figure.legend(handles=handles, loc="outside lower left", ncols=max(len(handles), 1), frameon=False)
     legend.set_title(grid.caption, prop=FontProperties(size=8))

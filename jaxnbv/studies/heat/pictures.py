@@ -74,13 +74,11 @@ def _clouds(record: Record, study: HeatStudy, methods: Sequence[str], pixels: in
             _mark(axes, still, truth.coldest, "coldest point of the object")
             _mark(axes, still, np.array(estimate["points"][count - 1]), "coldest point of the cloud")
             axes.set_xlabel(f"{estimate['distances'][count - 1]:.2f}", fontsize=8)
-        if column == 1:
-            axes.set_ylabel(methods[row], fontsize=9, fontweight="bold")
 
     caption = "Scanned points, coloured by the temperature that they give. Beneath: how far the estimate is off."
     columns = ["the object", *(f"after {count} views" for count in counts)]
     title, scale = f"Scene {record['scene']}: {record['name']}", (colours, "temperature (degrees)")
-    return Grid(title, caption, [""] * len(methods), columns, draw, _MARKS, scale)
+    return Grid(title, caption, methods, columns, draw, _MARKS, scale, named=1)
 
 
 def _mark(axes: Axes, still: Still, point: Float[np.ndarray, "3"], name: str) -> None:

@@ -85,14 +85,12 @@ def _clouds(record: Record, study: PartDiscoveryStudy, methods: Sequence[str], p
                 framed(axes, _FOUND, 1.6)
             text = f"{'✓ ' if every else ''}{found} of {len(asked)} parts"
             axes.set_xlabel(text, fontsize=9, color=_FOUND if every else GREY, fontweight="bold" if every else "normal")
-        if column == 1:
-            axes.set_ylabel(methods[row], fontsize=9, fontweight="bold")
 
     columns = ["true parts", *(f"view {view + 1}" for view in range(max(map(views_of, runs))))]
     marks = {name: {"marker": "o", "color": colour} for name, colour in zip(record["parts"], own, strict=True)}
     caption = f"Points: the part that the segmenter says. Beneath: parts with {TARGET} points. View 1 is given."
     title = f"Scene {record['scene']}: {scene.name}"
-    return Grid(title, caption, [""] * len(methods), columns, draw, marks)
+    return Grid(title, caption, methods, columns, draw, marks, named=1)
 
 
 def _palette(count: int) -> Float[np.ndarray, "count 3"]:

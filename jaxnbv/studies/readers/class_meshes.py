@@ -54,7 +54,7 @@ class _Layout(NamedTuple):
         return self.files.startswith("*/")
 
 
-LAYOUTS = {
+_LAYOUTS = {
     "ModelNet": _Layout("{split}/{name}_[0-9]*.off", up="z"),
     "OmniObject3D": _Layout("*/Scan/Scan.obj"),
     "ShapeNet v2": _Layout("*/models/model_normalized.obj"),
@@ -108,7 +108,7 @@ def _plain(name: str) -> str:
 
 
 def _of_class(folder: Path, label: int, split: str) -> list[MeshFile]:
-    for layout in LAYOUTS.values():
+    for layout in _LAYOUTS.values():
         inside = sorted(folder.glob(layout.files.format(name=folder.name, split=split)))
         files = [file for file in inside if is_mesh_file(file)]
         if files:
