@@ -8,7 +8,15 @@ from typing import Any
 
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from jaxnbv.errors import explained_imports
+
+_named, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> Any:
+    with explained_imports():
+        return _named(name)
+
 
 # What a notebook shows by a small picture and a line of facts.
 _SHOWN = {

@@ -1,5 +1,50 @@
 """Errors that users can mend."""
 
+import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+EXTRAS = {
+    "igl": "meshes",
+    "skimage": "meshes",
+    "matplotlib": "report",
+    "PIL": "report",
+    "plotly": "report",
+    "jinja2": "report",
+    "loky": "heat",
+    "robust_laplacian": "heat",
+    "pandas": "studies",
+    "viser": "view",
+    "distributed": "cluster",
+    "pymeshlab": "poisson",
+}
+"""Which extra brings what a part of the package needs beyond the dependencies that all of it has."""
+
 
 class InputError(ValueError):
     """Something that the user gave cannot be used; the message says what, and what to do."""
+
+
+@contextmanager
+def explained_imports() -> Iterator[None]:
+    """Where parts of the package are imported that need an extra.
+
+    **Raises:** `ValueError` that says how to install one that is missing.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        missing = str(error.name).partition(".")[0]
+        if missing not in EXTRAS:
+            raise
+        raise InputError(f'this needs {missing}: pip install "jaxnbv[{EXTRAS[missing]}]"') from error
+
+
+def optional(module: str) -> Any:
+    """A module of an extra.
+
+    **Raises:** `ValueError` that says how to install it, if it is missing.
+    """
+    with explained_imports():
+        return importlib.import_module(module)

@@ -13,6 +13,7 @@ import pytest
 
 import jaxnbv
 from jaxnbv import cli, viz
+from jaxnbv.errors import EXTRAS
 from jaxnbv.studies import readers, scenes
 from jaxnbv.studies.engine.results import interval
 
@@ -61,13 +62,31 @@ def test_importing_the_package_imports_no_jax_until_a_name_is_used():
 
 
 def test_a_session_at_a_robot_loads_no_pictures_studies_or_networks():
-    """Nor does an episode, until it is drawn."""
-    script = "import jaxnbv, sys; jaxnbv.Session, jaxnbv.simulate, jaxnbv.DiscreteSearch; print(*sys.modules)"
+    """Nor does an episode, until it is drawn; what needs an extra that is not installed says how it is."""
+    script = f"""
+import sys
+for extra in {[*EXTRAS]}:
+    sys.modules[extra] = None
+import jaxnbv
+jaxnbv.Session, jaxnbv.simulate, jaxnbv.DiscreteSearch, jaxnbv.load_mesh
+print(*sys.modules)
+for use in (lambda: jaxnbv.write_report, lambda: jaxnbv.ColdestPoint((0.0, 0.0, 0.0))):
+    try:
+        use()
+    except jaxnbv.InputError as error:
+        print(error, file=sys.stderr)
+"""
     result = run_fresh("-c", script)
     assert result.returncode == 0, result.stderr
     loaded = {*result.stdout.split()}
     assert {"jax", "jaxnbv.planning.session", "jaxnbv.storage"} <= loaded
-    assert loaded & {"plotly", "matplotlib", "viser", "jaxnbv.viz", "jaxnbv.studies", "jaxnbv.networks"} == set()
+    assert loaded & {"jaxnbv.viz", "jaxnbv.studies"} == set()
+    for line, extra in zip(result.stderr.splitlines(), ("report", "heat"), strict=True):
+        assert line.endswith(f'pip install "jaxnbv[{extra}]"')
+
+
+def test_every_extra_that_is_named_exists():
+    assert {*EXTRAS.values()} <= {*importlib.metadata.metadata("jaxnbv").get_all("Provides-Extra")}
 
 
 def test_version_is_that_of_the_distribution():

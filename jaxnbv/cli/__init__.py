@@ -11,7 +11,7 @@ from jaxnbv.cli.episode import demo, run
 from jaxnbv.cli.session import session
 from jaxnbv.cli.study import study
 from jaxnbv.cli.tools import convert, report, view
-from jaxnbv.errors import InputError
+from jaxnbv.errors import InputError, explained_imports
 
 app = typer.Typer(
     help="""Where should the sensor look next, for what you want to know?
@@ -59,7 +59,8 @@ app.add_typer(session, name="session")
 def main() -> None:
     """Entry point: errors that the user can mend are one line, without a traceback."""
     try:
-        app()
+        with explained_imports():
+            app()
     except InputError as error:
         typer.echo(f"error: {error}", err=True)
         sys.exit(2)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import ClassVar
 
 import equinox as eqx
-import igl
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,14 +15,15 @@ import trimesh
 from embreex.mesh_construction import TriangleMesh as EmbreeTriangles
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
-from skimage.measure import marching_cubes
 
 from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, check_type, checked, is_traced, require, shown
+from jaxnbv.errors import optional
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
 from jaxnbv.scanning.grid import Grid, GridSurface
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.scanning.surface import Hits, Surface
+from jaxnbv.scanning.triangles import distance_to_triangles, winding_number
 
 
 class _Tree:
@@ -177,19 +177,19 @@ class TriangleMesh(Surface):
         """Which points (scene coordinates) lie inside: where the winding number is above 1/2 in magnitude, so that a
         mesh that is wound inside out has an inside too. An open sheet encloses nothing."""
         points = np.asarray(points, dtype=np.float64)
-        return np.asarray(np.abs(igl.fast_winding_number(self.vertices, self.faces, points)) > 0.5)
+        return np.abs(winding_number(points, self.vertices, self.faces)) > 0.5
 
     def to_signed_distance(self, grid: Grid) -> Float[Array, "g g g"]:
         """Distance to the mesh at the grid's nodes, negative inside.
 
-        Inside is where the winding number is above 1/2 (Barill et al. 2018), which forgives small holes. An open
+        Inside is where the winding number is above 1/2, which forgives small holes. An open
         sheet encloses nothing, and a mesh wound inside out has its inside nowhere: their distances are all positive.
         """
         axis = grid.axis
         nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-        sign = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
-        distance = igl.signed_distance(nodes, self.vertices, self.faces, sign)[0]
-        return jnp.asarray(distance.reshape((grid.resolution,) * 3), jnp.result_type(float))
+        distance = distance_to_triangles(nodes, self.vertices, self.faces)
+        signed = np.where(winding_number(nodes, self.vertices, self.faces) > 0.5, -distance, distance)
+        return jnp.asarray(signed.reshape((grid.resolution,) * 3), jnp.result_type(float))
 
     def to_grid_surface(self, grid: Grid) -> GridSurface:
         """The mesh as the zero set of its signed distance on a grid: it rounds off what is finer than the grid, and
@@ -288,7 +288,8 @@ def level_triangles(
     zero, by marching cubes; None if they do not."""
     if not values.min() < 0 < values.max():
         return None
-    vertices, faces, normals, _ = marching_cubes(values, 0.0, spacing=(grid.spacing,) * 3, gradient_direction="descent")
+    marching_cubes, spacing = optional("skimage.measure").marching_cubes, (grid.spacing,) * 3
+    vertices, faces, normals, _ = marching_cubes(values, 0.0, spacing=spacing, gradient_direction="descent")
     lengths = np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return vertices - grid.half_extent, faces, -normals / lengths
 

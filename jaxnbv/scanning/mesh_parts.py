@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import equinox as eqx
-import igl
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -11,6 +10,7 @@ from jaxtyping import Array, Float
 from jaxnbv.checks import require
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.mesh import TriangleMesh, joined_nodes, read_nodes
+from jaxnbv.scanning.triangles import distance_to_triangles
 
 
 class MeshParts(eqx.Module):
@@ -27,9 +27,9 @@ class MeshParts(eqx.Module):
     def distances(self, grid: Grid) -> Float[Array, "parts g g g"]:
         """From the grid's nodes to the surface of each part, in scene units."""
         nodes = np.stack(np.meshgrid(*[grid.axis] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-        squared = [igl.point_mesh_squared_distance(nodes, part.vertices, part.faces)[0] for part in self.parts]
+        found = [distance_to_triangles(nodes, part.vertices, part.faces) for part in self.parts]
         shape = len(self.parts), *(grid.resolution,) * 3
-        return jnp.asarray(np.sqrt(np.stack(squared)).reshape(shape), jnp.result_type(float))
+        return jnp.asarray(np.stack(found).reshape(shape), jnp.result_type(float))
 
 
 def load_parts(path: str | Path, up: str = "y") -> MeshParts:

@@ -2,12 +2,12 @@
 
 import functools
 import operator
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from skimage.measure import ransac
 
 from jaxnbv.checks import AnyArray, as_numbers, check_fields, check_type, checked, require, shown
 from jaxnbv.geometry.camera import Camera
@@ -30,6 +30,8 @@ _BESIDE, _BELOW = 0.2, 0.05
 _MOST, _NONE, _SOME = 0.5, 0.02, 50
 _LEVEL = np.cos(np.radians(15.0))
 _TOLERANCE = 0.03
+# Planes that are tried, and points that each is tried on.
+_DRAWS, _COUNTED = 500, 5000
 
 
 class Surroundings(eqx.Module):
@@ -110,29 +112,6 @@ def _in_scene(solid: SignedDistance, frame: Frame) -> SignedDistance:
     return Rotated(moved, frame.rotation).scale(frame.scale)
 
 
-class _Plane:
-    """Through three points or more, as scikit-image's RANSAC asks for it: by the first method from 0.26 on, by the
-    second before."""
-
-    point: np.ndarray
-    normal: np.ndarray
-
-    @classmethod
-    def from_estimate(cls, points: np.ndarray) -> "_Plane":
-        plane = cls()
-        plane.estimate(points)
-        return plane
-
-    def estimate(self, points: np.ndarray) -> bool:
-        self.point = points.mean(axis=0)
-        *_, axes = np.linalg.svd(points - self.point)
-        self.normal = axes[2]
-        return True
-
-    def residuals(self, points: np.ndarray) -> np.ndarray:
-        return np.abs((points - self.point) @ self.normal)
-
-
 @checked
 def support_plane(
     points: Float[AnyArray, "n 3"], up: Float[AnyArray, "3"] | tuple | list, tolerance: float
@@ -192,5 +171,22 @@ def plane_under(cloud: PointCloud, box: Box) -> HalfSpace | None:
     return HalfSpace(plane.point, normal) if found else None
 
 
+class _Plane(NamedTuple):
+    point: Float[np.ndarray, "3"]
+    normal: Float[np.ndarray, "3"]
+
+
 def _plane_of_most(points: Float[np.ndarray, "n 3"], tolerance: float) -> _Plane:
-    return ransac(points, _Plane, min_samples=3, residual_threshold=tolerance, max_trials=500, rng=0)[0]
+    """By RANSAC (Fischler and Bolles 1981): of planes through three points drawn at random the one that most points
+    are near, then the best fit to these."""
+    draw = np.random.default_rng(0)
+    a, b, c = np.moveaxis(points[draw.integers(0, len(points), (_DRAWS, 3))], 1, 0)
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
+    few = draw.choice(points, min(len(points), _COUNTED), replace=False)
+    near = np.abs(few @ normals.T - np.sum(a * normals, axis=1)) <= tolerance
+    # Three points on a line have no normal.
+    best = np.argmax(np.where(normals.any(axis=1), near.sum(axis=0), -1))
+    on = points[np.abs((points - a[best]) @ normals[best]) <= tolerance]
+    middle = on.mean(axis=0)
+    return _Plane(middle, np.linalg.eigh((on - middle).T @ (on - middle))[1][:, 0])

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from plyfile import PlyData, PlyElement
+import trimesh
 
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
@@ -64,7 +64,11 @@ class EpisodeFolder(ResultFolder):
 
     def write_cloud(self, cloud: PointCloud) -> None:
         """Write the kept points and normals as a binary PLY file, in scene coordinates."""
-        write_cloud(self.path / "cloud.ply", cloud, "scene coordinates")
+        points, normals = cloud.to_numpy()
+        # A mesh without faces: clouds of trimesh have no normals.
+        bare = trimesh.Trimesh(points, vertex_normals=normals, process=False)
+        content = trimesh.exchange.ply.export_ply(bare, vertex_normal=True)
+        write_whole(self.path / "cloud.ply", lambda file: file.write(content))
 
     def _view_file(self, index: int) -> Path:
         return self.path / f"view_{index:02d}.npz"
@@ -96,12 +100,3 @@ def remove_episode(path: str | Path) -> bool:
 
 def _view(data: dict[str, np.ndarray]) -> tuple[Pose, PointCloud, Proposal | None]:
     return pose_of(data), scan_of(data), proposal_of(data)
-
-
-def write_cloud(path: Path, cloud: PointCloud, coordinates: str) -> None:
-    """Write points and normals as a binary PLY file; a comment says in which coordinates."""
-    points, normals = cloud.to_numpy()
-    rows = np.concatenate([points, normals], axis=1)
-    vertices = np.rec.fromarrays(list(rows.T), dtype=[(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")])
-    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=[coordinates])
-    write_whole(path, ply.write)

@@ -12,7 +12,6 @@ from typing import Any
 
 import filelock
 import jax
-import loky
 
 from jaxnbv.checks import InputError, require
 from jaxnbv.storage.files import PARTS, make_folder, write_text
@@ -34,7 +33,7 @@ def software() -> dict[str, str]:
 
 def versions(cores: int | None = None) -> dict[str, Any]:
     """Versions of what the numbers depend on, the kind of device, and the cores that share a sum, by default all."""
-    return software() | {"device": jax.devices()[0].device_kind, "cores": cores or loky.cpu_count()}
+    return software() | {"device": jax.devices()[0].device_kind, "cores": cores or os.cpu_count()}
 
 
 def differences(found: Any, asked: Any, name: str = "") -> list[str]:

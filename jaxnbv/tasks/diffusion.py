@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-import robust_laplacian
 from jax import Array
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
@@ -19,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from jaxnbv.checks import AnyArray, as_numbers, check_fields, is_traced, require
+from jaxnbv.errors import optional
 
 # A point's neighbours in its local triangulation: what Sharp and Crane use.
 _NEIGHBOURS = 30
@@ -135,7 +135,8 @@ def cloud_laplacian(points: Float[np.ndarray, "n 3"]) -> Laplacian:
         one = np.linalg.matrix_rank(points[1:] - points[0]) == 2
         return mesh_laplacian(points, np.array([[0, 1, 2]])) if one else _nothing(3)
     neighbours = min(_NEIGHBOURS, len(points) - 1)
-    return _assemble(lambda: robust_laplacian.point_cloud_laplacian(points, n_neighbors=neighbours), len(points))
+    laplacian = optional("robust_laplacian").point_cloud_laplacian
+    return _assemble(lambda: laplacian(points, n_neighbors=neighbours), len(points))
 
 
 def mesh_laplacian(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Laplacian:
@@ -144,7 +145,7 @@ def mesh_laplacian(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
     **Raises:** `ValueError` for vertices that are not finite.
     """
     vertices, faces = _finite(vertices), np.asarray(faces)
-    return _assemble(lambda: robust_laplacian.mesh_laplacian(vertices, faces), len(vertices))
+    return _assemble(lambda: optional("robust_laplacian").mesh_laplacian(vertices, faces), len(vertices))
 
 
 def _finite(points: np.ndarray) -> np.ndarray:

@@ -10,10 +10,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from loky import cpu_count, get_reusable_executor
 
 from jaxnbv.acquisition import Answer, Quantity
 from jaxnbv.checks import AnyArray, InputError, as_numbers, checked, require
+from jaxnbv.errors import optional
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.tasks.diffusion import HeatProblem, Temperature, cloud_temperature, mesh_temperature, refine
@@ -64,7 +64,7 @@ class ColdestPoint(eqx.Module):
         reached_only: bool = False,
         workers: int | None = None,
     ):
-        workers = cpu_count() if workers is None else workers
+        workers = optional("loky").cpu_count() if workers is None else workers
         require(workers >= 1, f"the number of workers is {workers}; it must be at least 1")
         if isinstance(source, HeatProblem):
             twice = (power, T, steps, u0, radius) != (10.0, 5.0, 20, 0.0, 0.1)
@@ -121,7 +121,7 @@ def _value(points: np.ndarray, heat: HeatProblem, reached_only: bool) -> float:
 def _map(function: Callable, clouds: list, problems: list, workers: int) -> list[float]:
     if workers == 1 or len(clouds) == 1:
         return list(map(function, clouds, problems))
-    executor = get_reusable_executor(workers, timeout=_IDLE_SECONDS, env=_WORKER_ENVIRONMENT)
+    executor = optional("loky").get_reusable_executor(workers, timeout=_IDLE_SECONDS, env=_WORKER_ENVIRONMENT)
     return list(executor.map(function, clouds, problems, chunksize=math.ceil(len(clouds) / (4 * workers))))
 
 

@@ -1,7 +1,6 @@
 """A live view in the browser, by viser: what has been seen, what is imagined, and where to look next."""
 
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import matplotlib as mpl
@@ -11,7 +10,8 @@ from jaxtyping import Float, UInt8
 from matplotlib.colors import Colormap, to_rgb
 from scipy.spatial.transform import Rotation
 
-from jaxnbv.checks import InputError, checked
+from jaxnbv.checks import checked
+from jaxnbv.errors import optional
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.imagination import Imagination
@@ -46,7 +46,7 @@ class LiveView:
 
     @checked
     def __init__(self, port: int = 8080, host: str = "127.0.0.1"):
-        self._server: Any = _viser().ViserServer(host=host, port=port, verbose=False)
+        self._server: Any = optional("viser").ViserServer(host=host, port=port, verbose=False)
         self._server.scene.set_up_direction("+y")
         self._server.initial_camera.position, self._server.initial_camera.look_at = _EYE, (0.0, 0.0, 0.0)
         self._server.gui.configure_theme(control_width="medium")
@@ -219,11 +219,3 @@ def _colours(scale: Colormap, share: np.ndarray) -> UInt8[np.ndarray, "*n 4"]:
 def _rgb(colour: str) -> tuple[int, int, int]:
     red, green, blue = (round(255 * share) for share in to_rgb(colour))
     return red, green, blue
-
-
-def _viser() -> ModuleType:
-    try:
-        import viser
-    except ImportError as error:
-        raise InputError('the live view needs viser: pip install "jaxnbv[view]"') from error
-    return viser

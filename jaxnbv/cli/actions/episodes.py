@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import jax
 import typer
 
+from jaxnbv import viz
 from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError, require
 from jaxnbv.cli.actions.device import prepare
@@ -27,7 +28,6 @@ from jaxnbv.scanning.sensors import Setting
 from jaxnbv.storage.folders import AnotherConfigurationError
 from jaxnbv.studies.scenes.banks import BANKS, bank_poses, shape_bank
 from jaxnbv.surfaces import ShapeBank, Upright
-from jaxnbv.viz import write_report
 
 # No view depends on these.
 _FREE = {"views", "until", "out", "overwrite", "report", "device"}
@@ -151,5 +151,5 @@ def _run(
             f"enough   after view {len(episode.views)}: {episode.stopped}. {saved} of {asked.views} {views} saved"
         )
     if asked.report:
-        typer.echo(f"report   {write_report(episode, folder, title=name)}")
+        typer.echo(f"report   {viz.write_report(episode, folder, title=name)}")
     typer.echo(f"episode  {folder}   ({time.perf_counter() - start:.0f} s)")

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import typer
 
+from jaxnbv import viz
 from jaxnbv.cli.actions.device import prepare
 from jaxnbv.cli.actions.episodes import knowing, planner_of, task_for
 from jaxnbv.cli.actions.sensors import quick_rays
@@ -12,7 +13,6 @@ from jaxnbv.cli.actions.tasks import Given, OfScan, position
 from jaxnbv.cli.registry import Device
 from jaxnbv.imagination import Imagination
 from jaxnbv.planning.replay import StoredSession
-from jaxnbv.viz import write_report
 from jaxnbv.viz.answers import words_of
 
 
@@ -57,7 +57,7 @@ def replay(
         if answer is not None:
             typer.echo(f"          {words_of(answer).line()}")
     if report and replayed is not None:
-        typer.echo(f"report    {write_report(replayed.episode, out, title=folder.name)}")
+        typer.echo(f"report    {viz.write_report(replayed.episode, out, title=folder.name)}")
     typer.echo(f"session   {out}")
 
 

@@ -1,6 +1,5 @@
 """A triangle mesh as a solid that can be traced within JAX: its signed distance, sampled on a grid."""
 
-import igl
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.checks import AnyArray, as_numbers, checked, require
 from jaxnbv.scanning.sdf.base import Scalar, SignedDistance, Vector, nonnegative, norm, parameter, split
+from jaxnbv.scanning.triangles import distance_to_triangles, winding_number
 
 # Of the longest side, on all sides.
 _PADDING = 0.1
@@ -83,7 +83,7 @@ def solid_of_mesh(
 def _signed_distance(
     points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], sheet: float
 ) -> Float[np.ndarray, " n"]:
-    distance = np.sqrt(igl.point_mesh_squared_distance(points, vertices, faces)[0])
+    distance = distance_to_triangles(points, vertices, faces)
     signed = np.where(_is_inside(points, vertices, faces), -distance, distance)
     if sheet == 0:
         return signed
@@ -94,7 +94,7 @@ def _signed_distance(
     thin = ~(_is_inside(middle + step, vertices, faces) | _is_inside(middle - step, vertices, faces))
     if not thin.any():
         return signed
-    beside = np.sqrt(igl.point_mesh_squared_distance(points, vertices, faces[thin])[0])
+    beside = distance_to_triangles(points, vertices, faces[thin])
     return np.minimum(signed, beside - 0.5 * sheet)
 
 
@@ -102,4 +102,4 @@ def _is_inside(
     points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Bool[np.ndarray, " n"]:
     # Of a solid whose faces are wound the other way the number is negative.
-    return np.abs(igl.fast_winding_number(vertices, faces, points)) > 0.5
+    return np.abs(winding_number(points, vertices, faces)) > 0.5

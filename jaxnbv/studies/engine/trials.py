@@ -19,6 +19,7 @@ from loky.process_executor import TerminatedWorkerError
 from tqdm import tqdm
 
 from jaxnbv.checks import InputError, require
+from jaxnbv.errors import optional
 from jaxnbv.storage.folders import differences, software
 from jaxnbv.studies.engine.measures import Record
 
@@ -123,11 +124,7 @@ class Cluster(Runner):
     """
 
     def __init__(self, address: str, modules: Sequence[ModuleType] = ()):
-        try:
-            import cloudpickle
-            import distributed
-        except ImportError as error:
-            raise InputError('--scheduler needs Dask: pip install "jaxnbv[cluster]"') from error
+        distributed, cloudpickle = optional("distributed"), optional("cloudpickle")
         for module in modules:
             cloudpickle.register_pickle_by_value(module)
         try:
@@ -136,10 +133,8 @@ class Cluster(Runner):
             raise InputError(f"no scheduler of Dask answers at {address} ({error}): start one, or mend it") from error
 
     def outcomes(self, trial: Trial, indices: Sequence[int]) -> Outcomes:
-        import cloudpickle
-        from distributed import as_completed
-
-        waiting, here, sent = deque(indices), software(), cloudpickle.dumps(trial)
+        as_completed, dumps = optional("distributed").as_completed, optional("cloudpickle").dumps
+        waiting, here, sent = deque(indices), software(), dumps(trial)
         running: dict[Any, int] = {}
         # With their results, which are lost if a worker dies that still holds them.
         ended = as_completed(with_results=True, raise_errors=False, loop=self.client.loop)

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt16
-from PIL import Image, UnidentifiedImageError
 from scipy.spatial.transform import Rotation
 
 from jaxnbv.checks import AnyArray, InputError, as_numbers, require, shown
+from jaxnbv.errors import optional
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.storage.files import is_file, is_folder
@@ -76,9 +76,10 @@ class RecordedFrames:
         """
         require(0 <= index < len(self), f"there is no frame {index}: {self.folder} has {len(self)}, counted from 0")
         file = self.files[index]
+        images = optional("PIL.Image")
         try:
-            pixels = np.asarray(Image.open(file))
-        except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+            pixels = np.asarray(images.open(file))
+        except (OSError, images.DecompressionBombError) as error:
             raise InputError(f"cannot read the depth image {file} ({error}): unpack the data set again") from error
         whole = pixels.ndim == 2 and pixels.dtype.kind in "iu" and pixels.min() >= 0 and pixels.max() <= _NOT_MEASURED
         require(whole, f"{file} is an image of {pixels.dtype}, {pixels.shape}: depth images have one channel of 16 bit")

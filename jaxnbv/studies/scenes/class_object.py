@@ -1,7 +1,6 @@
 """Objects whose class is asked for."""
 
 import equinox as eqx
-import igl
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -12,6 +11,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import SDFSurface, Surface, TriangleMesh, scan
 from jaxnbv.scanning.sdf import SignedDistance
+from jaxnbv.scanning.triangles import distance_to_triangles
 
 
 class ClassObject(SignedDistance):
@@ -46,8 +46,8 @@ class ClassMesh(eqx.Module):
         if self.part is None:
             return np.ones(x.shape[:-1], bool)
         points = np.asarray(x, np.float64).reshape(-1, 3)
-        squared = igl.point_mesh_squared_distance(points, self.part.vertices, self.part.faces)[0]
-        return (squared <= tolerance**2).reshape(x.shape[:-1])
+        distance = distance_to_triangles(points, self.part.vertices, self.part.faces)
+        return (distance <= tolerance).reshape(x.shape[:-1])
 
 
 def surface_of(thing: ClassObject | ClassMesh) -> Surface:
