@@ -59,7 +59,11 @@ def test_a_rule_ends_it_and_says_what_is_saved(tmp_path):
 
 @pytest.mark.parametrize(
     ("search", "model"),
-    [("farthest", "screened"), ("random", "paper"), ("uncertainty", "paper"), ("gradient-6dof", "screened")],
+    [
+        ("farthest", "screened"),
+        ("uncertainty", "paper"),
+        pytest.param("gradient-6dof", "screened", marks=pytest.mark.slow),
+    ],
 )
 def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
     trimesh.creation.torus(1.0, 0.4).export(tmp_path / "ring.ply")
@@ -187,6 +191,7 @@ def test_the_study_writes_tables_and_figures_and_continues(tmp_path):
     assert "best" in result.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["heat", "reconstruction"])
 def test_each_study_writes_tables_figures_and_pictures(name, tmp_path):
     arguments = (
@@ -211,6 +216,7 @@ def test_each_study_writes_tables_figures_and_pictures(name, tmp_path):
     assert sum(name.endswith(".png") for name in written) >= 2
 
 
+@pytest.mark.slow
 def test_the_demo_of_a_task_tells_what_was_found(tmp_path):
     setting = ("--task", "parts", "--known", "parts", "--scene", "7", "--quick", "--views", "2", "--search", "farthest")
     result = run_command("demo", *setting, cwd=tmp_path)

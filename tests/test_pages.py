@@ -112,6 +112,7 @@ def as_before():
     jax.config.update("jax_default_device", None)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("as_before")
 @pytest.mark.parametrize("page", PROGRAMS)
 def test_the_program_of_a_page_runs(page, tmp_path, monkeypatch):

@@ -118,6 +118,7 @@ def predicted(segmenter, found):
     return jax.lax.map(of_cloud, found)
 
 
+@pytest.mark.slow
 def test_the_shipped_weights_know_the_parts_of_objects_that_they_were_not_trained_on(computes):
     """Three clouds of an object of each procedural category, numbers of the test split that the training never saw."""
     found = scanned_part_clouds(Split.TEST, range(5000, 5013))

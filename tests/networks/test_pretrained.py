@@ -28,7 +28,7 @@ def test_the_weights_are_small():
     assert pyramid_classifier().classes == PATTERNS
 
 
-@pytest.mark.parametrize("framing", list(Framing))
+@pytest.mark.parametrize("framing", [pytest.param(Framing.CLOSE_UP, marks=pytest.mark.slow), Framing.WHOLE])
 def test_right_where_the_pattern_is_seen_and_undecided_where_it_is_not(framing):
     """Fifty test clouds of which one view shows the pattern well, and those met meanwhile that have none of it."""
     enough = {Framing.CLOSE_UP: 500, Framing.WHOLE: 150}[framing]
@@ -49,6 +49,7 @@ def test_right_where_the_pattern_is_seen_and_undecided_where_it_is_not(framing):
     assert np.mean(undecided) >= 1.5
 
 
+@pytest.mark.slow
 def test_the_class_of_a_cargo_by_what_is_seen_of_it():
     """Of test trucks whose cargo a view shows well; where no point of it is seen the classifier is undecided."""
     classifier = pretrained_classifier("truck")
@@ -67,6 +68,7 @@ def test_the_class_of_a_cargo_by_what_is_seen_of_it():
     assert np.mean(undecided) >= 1.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "classes"), [("household", HOUSEHOLD), ("fruit", FRUITS)])
 def test_the_class_of_objects_seen_from_several_sides(name, classes):
     """Of test objects that were not trained on, from three views and more."""

@@ -86,6 +86,7 @@ def record(folder):
     return session
 
 
+@pytest.mark.slow
 def test_a_session_that_was_killed_ends_as_one_that_was_not(tmp_path):
     script = SCRIPT.format(tests=[str(folder) for folder in Path(__file__).parents[:2]])
     process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path / "killed")])

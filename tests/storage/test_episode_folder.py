@@ -192,7 +192,7 @@ def test_a_name_that_is_too_long_is_told(tmp_path):
 
 def test_more_cores_than_before_are_told_of(finished, tmp_path, monkeypatch):
     folder = shutil.copytree(finished[1], tmp_path / "copy")
-    monkeypatch.setattr("jaxnbv.storage.folders.loky.cpu_count", lambda: 64)
+    monkeypatch.setattr("jaxnbv.storage.folders.os.cpu_count", lambda: 64)
     with pytest.warns(UserWarning, match=r"cores: \d+ there, 64 now"):
         run(folder, views=5)
 

@@ -70,6 +70,7 @@ def kill_once(process, reached):
     assert process.returncode == -signal.SIGKILL
 
 
+@pytest.mark.slow
 def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_files(tmp_path):
     """Once when the first view appears, once half way through writing the second, once while the third is scanned."""
     folder, stalled = tmp_path / "killed", tmp_path / "killed.stalled"

@@ -39,12 +39,12 @@ def record():
 def test_a_choice_is_that_of_the_planner_with_the_same_key(record):
     study = knowing_study()
     scene, poses = study.scene(SCENE), np.asarray(study.candidates.poses().position)
-    for method in METHODS:
+    # One by who knows shapes, one by who does not, at the view where both have something to choose by.
+    for method in ("cross-entropy", "uncertainty-screened"):
         planner, candidates = study.planner_for(method, scene), record["methods"][method]["runs"][0]["candidates"]
-        for view in (1, 2):
-            evidence = evidence_of(study, planner, scene, candidates[:view])
-            proposed = planner.propose(evidence, step_key(study, view)).pose.position
-            np.testing.assert_allclose(poses[candidates[view]], proposed, atol=1e-5)
+        evidence = evidence_of(study, planner, scene, candidates[:2])
+        proposed = planner.propose(evidence, step_key(study, 2)).pose.position
+        np.testing.assert_allclose(poses[candidates[2]], proposed, atol=1e-5)
 
 
 def test_the_methods_that_know_no_shapes_are_those_of_a_study_without(record):

@@ -18,6 +18,8 @@ from jaxnbv.studies.engine.tables import summary
 from jaxnbv.surfaces import GeometricSPSR
 
 SCENE, VIEWS = 3, 3
+# One record of all searches, each a program of its own.
+pytestmark = pytest.mark.slow
 
 
 class Linear(eqx.Module):

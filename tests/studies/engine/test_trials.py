@@ -94,6 +94,7 @@ def is_running(process):
         return False
 
 
+@pytest.mark.slow
 def test_on_a_cluster_no_trial_is_lost_though_workers_die(tmp_path, cluster):
     check_every_trial_is_in_the_result_once(tmp_path, Cluster(cluster.scheduler_address), "KilledWorker")
 
@@ -106,6 +107,7 @@ def test_workers_with_other_versions_are_not_used(tmp_path, cluster, monkeypatch
     assert not Trial(tmp_path).beginnings(0)
 
 
+@pytest.mark.slow
 def test_a_study_in_processes_finds_what_it_finds_here(tmp_path):
     balls = small(num_candidates=4, views=2)
     here, processes = (

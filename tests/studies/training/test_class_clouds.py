@@ -137,6 +137,7 @@ def test_splits_and_framings_differ(scanned):
     )
 
 
+@pytest.mark.slow
 def test_imagined_clouds_begin_with_what_was_truly_seen(imagined):
     for index, found in zip((5, 6), imagined, strict=True):
         assert found.clouds.points.shape == (6, POINTS, 3)

@@ -84,6 +84,7 @@ def test_labels_are_those_of_the_surface_nearby(scanned, scenes):
         assert 0.003 < off.std() < 0.025
 
 
+@pytest.mark.slow
 def test_points_are_there_once_and_oriented(scanned, imagined):
     for clouds in (scanned.clouds, imagined.clouds):
         mask = np.asarray(clouds.mask)
