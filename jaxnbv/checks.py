@@ -179,7 +179,10 @@ def shown(value: Any) -> str:
     if isinstance(value, AnyArray):
         return f"an array of shape {value.shape} and type {value.dtype}" if value.ndim else str(value)
     if isinstance(value, str | int | float | complex | tuple | list | dict | None):
-        text = repr(value)
+        try:
+            text = repr(value)
+        except RecursionError:
+            return f"a {type(value).__name__} that is nested too deep"
         return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
     return f"a {type(value).__name__}" if not isinstance(value, type) else f"the class {value.__name__}"
 

@@ -3,10 +3,14 @@
 A program of its own: in the tests annotations are checked by beartype before anything else is.
 """
 
+import dataclasses
+import json
+import os
 import sys
 import tempfile
 import traceback
 import warnings
+import zipfile
 from pathlib import Path
 
 import jax
@@ -16,6 +20,8 @@ from safetensors.numpy import load_file, save_file
 
 import jaxnbv as nbv
 from jaxnbv.networks import CloudClassifier, CloudSegmenter, load_checkpoint
+from jaxnbv.planning.replay import StoredSession
+from jaxnbv.studies.engine.records import read_records
 
 # Until the program ends.
 _HELD = tempfile.TemporaryDirectory()
@@ -100,6 +106,88 @@ def large_view():
     np.savez_compressed(folder / "view_00.npz", points=np.zeros(2**26 + 2**10))
     nbv.simulate(P, BALL, POSE, 1, KEY, folder=folder, progress=False)
 
+
+def folder_of_images(name, count=3):
+    """A session with some images on disk."""
+    stored = session(folder=FOLDER / name)
+    for _ in range(count):
+        stored.add(*SHOT)
+    return FOLDER / name
+
+
+def reopened(name, change):
+    """A session whose folder was changed behind its back."""
+    change(folder_of_images(name))
+    return session(folder=FOLDER / name)
+
+
+def dangling(folder):
+    (folder / "image_01.npz").unlink()
+    (folder / "image_01.npz").symlink_to("elsewhere.npz")
+
+
+def piped(folder):
+    (folder / "image_01.npz").unlink()
+    os.mkfifo(folder / "image_01.npz")
+
+
+def replayed(name, **changes):
+    """A session's record that someone has edited."""
+    record = folder_of_images(name, 1) / "session.json"
+    said = json.loads(record.read_text())
+    said["config"] |= changes
+    record.write_text(json.dumps(said))
+    return StoredSession(FOLDER / name)
+
+
+def older_session_asks():
+    older, newer = (session(folder=FOLDER / "two") for _ in range(2))
+    newer.add(*SHOT)
+    older.next()
+
+
+def cut(name, share, text=None):
+    """A mesh whose file ends early."""
+    ball = nbv.mesh_from_sdf(nbv.sdf.Sphere(1.0), nbv.Grid(16)).to_trimesh()
+    encoding = {"encoding": "ascii"} if name.endswith(".ply") else {}
+    written = ball.export(file_type=name[-3:], **encoding) if text is None else text
+    content = written if isinstance(written, bytes) else written.encode()
+    lines = content.splitlines(keepends=True)
+    (FOLDER / name).write_bytes(b"".join(lines[: int(share * len(lines))]))
+    return nbv.load_mesh(FOLDER / name)
+
+
+def zipped():
+    with (
+        zipfile.ZipFile(FOLDER / "bomb.zip", "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("bomb.obj", "w") as file,
+    ):
+        for _ in range(600):
+            file.write(bytes(2**20))
+    return nbv.load_mesh(FOLDER / "bomb.zip")
+
+
+def records(name):
+    (FOLDER / name).mkdir()
+    (FOLDER / name / "scene_x.json").write_text("{}")
+    return read_records(FOLDER / name)
+
+
+def costing(cost):
+    """A step whose way has a cost."""
+    priced = dataclasses.replace(P, cost=nbv.ValueMinusCost(cost))
+    return priced.propose(priced.init(POSE, SCAN), KEY)
+
+
+def nested(depth):
+    value = []
+    for _ in range(depth):
+        value = [value]
+    return value
+
+
+BOAST = "OFF\n3 10000000 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+NEVER = nbv.Imagination(MODEL, nbv.Grid(12), 2, nbv.Carving(lambda x: jnp.full(x.shape[:1], jnp.nan)))
 
 # What is done, and a word of what must be said.
 REFUSED = {
@@ -257,6 +345,50 @@ REFUSED = {
     ),
     "a probability of text": (lambda: nbv.Sure("0.9"), "'0.9'"),
     "parts that are no names": (lambda: nbv.Found(parts=3), "3"),
+    "a gap among images": (lambda: reopened("gap", lambda f: (f / "image_01.npz").unlink()), "not image_01.npz"),
+    "a link to no image": (lambda: reopened("link", dangling), "image_01.npz is damaged"),
+    "a pipe as an image": (lambda: reopened("pipe", piped), "image_01.npz is damaged"),
+    "an older session that asks": (older_session_asks, "another process has added some"),
+    "a record without cameras": (lambda: replayed("blind", cameras=[]), "what the sensor was"),
+    "a record without a box": (lambda: replayed("boxless", box=None), "what the sensor was"),
+    "a number as a camera": (lambda: replayed("number", cameras=[1]), "what the sensor was"),
+    "a scene without a number": (lambda: records("unnumbered"), "scene_x.json is no record"),
+    "a PLY that ends early": (lambda: cut("early.ply", 0.6), "its header declares"),
+    "an OFF that ends early": (lambda: cut("early.off", 0.6), "its header declares"),
+    "a face of ten million": (lambda: cut("boast.off", 1.0, BOAST), "of the 10000000 faces"),
+    "an archive of half a gigabyte": (zipped, "unpacks to"),
+    "a negative cost": (lambda: costing(lambda a, b: -jnp.sum(b.position**2)), "zero or more"),
+    "an infinite cost": (lambda: costing(lambda a, b: jnp.inf * jnp.sum(b.position**2)), "zero or more"),
+    "a cost that is no number": (lambda: costing(lambda a, b: jnp.nan * b.position[0]), "zero or more"),
+    "a cost of three numbers": (lambda: costing(lambda a, b: b.position), "one number a pose"),
+    "no cost": (lambda: costing(lambda a, b: None), "one number a pose"),
+    "a complex cost": (lambda: costing(lambda a, b: b.position[0] * 1j), "one number a pose"),
+    "a cost of NumPy": (lambda: costing(lambda a, b: np.linalg.norm(b.position)), "jax.numpy"),
+    "a way of no number": (lambda: nbv.visiting_order(POSE, POSES, lambda a, b: jnp.nan * b.position[0]), "one finite"),
+    "a way to one pose": (lambda: nbv.visiting_order(POSE, POSE), "a single one"),
+    "a budget of no number": (
+        lambda: nbv.simulate(
+            P, BALL, POSE, 2, KEY, progress=False, until=nbv.Budget(cost=1.0, of=lambda a, b: jnp.nan * b.position[0])
+        ),
+        "one finite number",
+    ),
+    "a rule or text": (lambda: nbv.Sure(0.9) | "x", "'x'"),
+    "an inverse of intrinsics": (
+        lambda: nbv.Camera.from_intrinsics(np.linalg.inv([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]]), 480, 640),
+        "intrinsic matrix",
+    ),
+    "a table of one point": (lambda: nbv.support_plane(np.ones((50, 3)), (0, 0, 1), 0.01), "on one line"),
+    "too thin a table": (lambda: nbv.support_plane(D, (0, 0, 1), 1e-30), "larger tolerance"),
+    "a volume of no numbers": (
+        lambda: dataclasses.replace(P, imagination=NEVER).init(POSE, SCAN),
+        "outside the volume",
+    ),
+    "a volume of one number": (lambda: nbv.Carving(lambda x: jnp.sum(x)), "one number a point"),
+    "a volume of NumPy": (lambda: nbv.Carving(lambda x: np.linalg.norm(x, axis=1)), "jax.numpy"),
+    "nothing as what is allowed": (lambda: nbv.SphereCandidates(6).where(None), "a function of one pose"),
+    "what is allowed three times": (lambda: nbv.SphereCandidates(6).where(lambda p: p.position > 0), "True or False"),
+    "a number as a key of candidates": (lambda: nbv.SphereCandidates(6).poses(3), "jax.random.key"),
+    "a list in lists": (lambda: nbv.PointCloud.from_arrays(nested(5000), D), "nested too deep"),
     "up without measure": (lambda: nbv.look_at((0, 0, 2), (0, 0, 0), (0, 1e30, 0)), "up direction"),
 }
 

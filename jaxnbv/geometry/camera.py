@@ -84,6 +84,11 @@ class Camera(eqx.Module):
             f"the intrinsic matrix is {found.tolist()}; it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive "
             "focal lengths, in pixels",
         )
+        require(
+            0.1 < fx / fy < 10.0 and 0.02 < height / fy < 100.0,
+            f"the intrinsic matrix has focal lengths {fx:.4g} and {fy:.4g} for an image of {width} x {height}: give it "
+            "in pixels, and not its inverse",
+        )
         require(abs(skew) <= _SKEW * fx, f"the intrinsic matrix has a skew of {skew}: undistort the image first")
         require(
             -0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5,

@@ -1,5 +1,6 @@
 """Networks from files and back: published PointNet++ checkpoints, safetensors, and the files of our own networks."""
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -73,7 +74,7 @@ def _read(path: str | Path) -> tuple[_Tensors, Mapping[str, str]]:
     )
     if suffix != ".safetensors":
         return read_torch_tensors(path), {}
-    require(Path(path).is_file(), f"there is no file {path}: give the path of a safetensors file")
+    require(os.path.isfile(path), f"there is no file {path}: give the path of a safetensors file")
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             types = {name: file.get_slice(name).get_dtype() for name in file.keys()}  # noqa: SIM118

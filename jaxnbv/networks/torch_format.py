@@ -7,6 +7,7 @@ written since PyTorch 1.6 (`data.pkl`, `data/0`, `data/1`, ...), and the older s
 
 import math
 import mmap
+import os
 import struct
 import zipfile
 from collections.abc import Callable
@@ -50,7 +51,7 @@ def read_torch_tensors(path: str | Path) -> dict[str, np.ndarray]:
     asks for anything but tensors and plain values.
     """
     path = Path(path)
-    require(path.is_file(), f"there is no file {path}: give the path of a PyTorch checkpoint")
+    require(os.path.isfile(path), f"there is no file {path}: give the path of a PyTorch checkpoint")
     try:
         with path.open("rb") as file:
             archive = file.read(2) == b"PK"

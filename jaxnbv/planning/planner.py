@@ -156,7 +156,7 @@ class Planner(eqx.Module):
         check_type(imagined, PointCloud | None, "what is imagined")
         with functions_of_users():
             proposal = _propose(self.search, self.problem(evidence, surfaces, imagined), key)
-        return checked_proposal(proposal, surfaces)
+        return checked_proposal(proposal, surfaces, self.cost)
 
     def observe(
         self, evidence: Evidence | PointCloud, pose: Pose, scan: PointCloud, camera: Camera | None = None
@@ -215,7 +215,7 @@ def _propose(search: Search, problem: Problem, key: PRNGKeyArray) -> Proposal:
     return search.propose(problem.prepared(), key)
 
 
-def checked_proposal(proposal: Proposal, surfaces: GridSurface | None) -> Proposal:
+def checked_proposal(proposal: Proposal, surfaces: GridSurface | None, cost: Cost | None = None) -> Proposal:
     """A proposal as it is.
 
     **Raises:** `ValueError` if its value is not finite, or every candidate has been visited.
@@ -223,6 +223,11 @@ def checked_proposal(proposal: Proposal, surfaces: GridSurface | None) -> Propos
     if is_traced(proposal):
         return proposal
     value = proposal.value
+    require(
+        cost is None or not bool(jnp.isnan(value)),
+        "a candidate's value, given the cost of going there, is not a number (NaN): make the cost one finite number, "
+        "zero or more, and the acquisition finite for every scan",
+    )
     require(
         not bool(jnp.isnan(value)) and (surfaces is None or bool(value < jnp.inf)),
         f"the acquisition is {'not a number (NaN)' if jnp.isnan(value) else 'infinite'} for a candidate: it must be "

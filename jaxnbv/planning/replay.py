@@ -1,6 +1,7 @@
 """Runs that were stored, read without the planner that made them; sessions, planned again for another utility."""
 
 import dataclasses
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from jaxnbv.geometry.volume import Box
 from jaxnbv.planning.episode import Episode, camera_of
 from jaxnbv.planning.placing import stride_of
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.session import NextView, Session
+from jaxnbv.planning.session import NextView, Session, check_camera
 from jaxnbv.scanning import Surroundings
 from jaxnbv.search import CandidateSearch, Proposal
 from jaxnbv.storage import SESSION_RECORD, DepthImage, open_session
@@ -39,8 +40,10 @@ class StoredSession:
             # A session that was told what stands around it did not look for a table.
             told = config["planner"]["imagination"]["surroundings"] is not None
             self.surroundings = Surroundings() if told else None
-        except (KeyError, TypeError) as error:
-            raise InputError(f"{self._folder.record} does not say what the sensor was ({error!r})") from error
+            require(len(self.cameras) > 0, "no camera")
+        except (KeyError, TypeError, AttributeError, ValueError) as error:
+            problem = f"{self._folder.record} does not say what the sensor was ({error!r})"
+            raise InputError(f"{problem}: restore it, or give another folder") from error
         self.frame = Frame.fit(np.array([self.box.low, self.box.high]), up=self.up)
         self.views = self._folder.count_images()
         require(self.views > 0, f"{folder} holds no image yet: add one to the session first")
@@ -55,9 +58,11 @@ class StoredSession:
     def image(self, index: int) -> DepthImage:
         """The image of an index, from 0.
 
-        **Raises:** `ValueError` if it is damaged.
+        **Raises:** `ValueError` if it is damaged, or of a camera that the session has not.
         """
-        return self._folder.read_image(index)
+        image = self._folder.read_image(index)
+        check_camera(image.camera, len(self.cameras))
+        return image
 
     def first_view(self) -> tuple[Pose, PointCloud]:
         """Pose and scan of the first image, in scene coordinates."""
@@ -121,7 +126,7 @@ def stored_run(folder: str | Path) -> StoredRun:
 
     **Raises:** `ValueError` if it holds neither, or one without a view.
     """
-    if (Path(folder) / SESSION_RECORD).exists():
+    if os.path.isfile(Path(folder) / SESSION_RECORD):
         return _session_run(folder)
     return StoredRun(Episode.load(folder))
 

@@ -189,8 +189,6 @@ class Session:
         then.
         """
         pixels = as_numbers(depth, "the depth image", None)
-        count = len(self.cameras)
-        require(0 <= camera < count, f"the session has {count} cameras, counted from 0: there is no camera {camera}")
         image = DepthImage(pixels, as_numbers(matrix, "the matrix of a pose", np.float64), depth_scale, camera)
         look = self._looked(image)
         if look.support is not None:
@@ -206,8 +204,11 @@ class Session:
         not proposed again, for where the sensor could not be held it need not be tried twice. Warns where the best view
         is worth no more than three standard errors.
 
-        **Raises:** `ValueError` before the first image, or as `Planner.propose` does.
+        **Raises:** `ValueError` before the first image, as `Planner.propose` does, or if another process has added
+        images to the folder.
         """
+        if self._folder is not None:
+            self._check_alone(self._folder)
         if self._next is None:
             index = self.views
             known = None if self._folder is None else self._folder.read_proposal(index)
@@ -245,6 +246,7 @@ class Session:
 
     def _looked(self, image: DepthImage) -> "_Look":
         """What an image adds; nothing of the session is changed."""
+        check_camera(image.camera, len(self.cameras))
         pose = Pose.from_matrix(image.matrix, self.convention)
         camera, stride = self.cameras[image.camera], self._strides[image.camera]
         planner, support = self.planner, None
@@ -296,6 +298,11 @@ class Session:
             f"{folder.path} holds {found} images, but this session knows {self.views}: another process has added some; "
             "make the session again, which reads them",
         )
+
+
+def check_camera(camera: int, count: int) -> None:
+    """**Raises:** `ValueError` unless the camera is one of so many."""
+    require(0 <= camera < count, f"the session has {count} cameras, counted from 0: there is no camera {camera}")
 
 
 class _Look(NamedTuple):

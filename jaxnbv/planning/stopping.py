@@ -59,7 +59,7 @@ class Budget(Stop):
         if self.cost is None:
             return None
         left = self.cost - total_cost(so_far.poses, self.of)
-        asked = float(self.of(so_far.poses[-1], pose))
+        asked = total_cost((so_far.poses[-1], pose), self.of)
         return (
             f"the next view would cost {asked:.3g}, but {left:.3g} of {self.cost:g} are left" if asked > left else None
         )

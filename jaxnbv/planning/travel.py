@@ -4,7 +4,7 @@ import itertools
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnbv.acquisition import Quantity
-from jaxnbv.checks import check_fields, checked, require
+from jaxnbv.checks import as_numbers, check_batch, check_fields, checked, require, shown
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import Evidence
 
@@ -63,6 +63,10 @@ class Cost(eqx.Module):
     ) -> Float[Array, "*samples poses"]:
         """The values of poses, given the cost of going there from the last view, if there is one."""
         cost = jax.vmap(lambda pose: self.of(evidence.last_pose, pose))(poses)
+        real = isinstance(cost, Array) and not jnp.iscomplexobj(cost) and cost.shape == (len(poses.position),)
+        require(real, f"the cost of going from one pose to another is {shown(cost)}: make it one number a pose")
+        # A view is not chosen because its cost is wrong: the planner refuses what is not a number.
+        cost = jnp.where((cost >= 0) & (cost < jnp.inf), cost, jnp.nan)
         return self.weigh(values, jnp.where(evidence.num_views > 0, cost, 0.0))
 
     @abstractmethod
@@ -131,12 +135,14 @@ def visiting_order(start: Pose, poses: Pose, cost: CostFunction = arc_length) ->
     """In which order to visit a batch of poses from a start, so that the whole way costs least; exact (Held and Karp
     1962). The way ends at the last of them.
 
-    **Raises:** `ValueError` for more than twelve poses.
+    **Raises:** `ValueError` for more than twelve poses or a single one, or a cost that is not one finite number, zero
+    or more.
     """
+    check_batch(poses.position.shape[:-1], "the poses")
     count = poses.position.shape[0]
     require(count <= _MOST_PLACES, f"asked for the order of {count} poses: give at most {_MOST_PLACES}")
-    first = np.asarray(jax.vmap(lambda pose: cost(start, pose))(poses))
-    between = np.asarray(jax.vmap(lambda a: jax.vmap(lambda b: cost(a, b))(poses))(poses))
+    first = _checked_cost(jax.vmap(lambda pose: cost(start, pose))(poses), (count,))
+    between = _checked_cost(jax.vmap(lambda a: jax.vmap(lambda b: cost(a, b))(poses))(poses), (count, count))
     # Of each set of places and the last of them: the least cost, and the place before it.
     best = {(1 << last, last): (float(first[last]), -1) for last in range(count)}
     for size in range(2, count + 1):
@@ -159,5 +165,19 @@ def visiting_order(start: Pose, poses: Pose, cost: CostFunction = arc_length) ->
 
 @checked
 def total_cost(poses: Sequence[Pose], cost: CostFunction = arc_length) -> float:
-    """What the way through some poses, in their order, costs; zero for one or none."""
-    return math.fsum(float(cost(a, b)) for a, b in itertools.pairwise(poses))
+    """What the way through some poses, in their order, costs; zero for one or none.
+
+    **Raises:** `ValueError` for a cost that is not one finite number, zero or more.
+    """
+    return math.fsum(float(_checked_cost(cost(a, b), ())) for a, b in itertools.pairwise(poses))
+
+
+def _checked_cost(found: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "*shape"]:
+    costs = as_numbers(found, "the cost of going from one pose to another", np.float64)
+    proper = costs.shape == shape and bool((costs >= 0).all()) and bool(np.isfinite(costs).all())
+    require(
+        proper,
+        f"the cost of going from one pose to another is {shown(costs) if costs.shape != shape else costs.min()}: make "
+        "it one finite number, zero or more",
+    )
+    return costs

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnbv.checks import check_fields, require
+from jaxnbv.checks import check_fields, functions_of_users, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
@@ -49,6 +49,12 @@ class Carving(eqx.Module):
         require(
             0.5 <= self.margin_voxels < math.inf,
             f"the margin of the carving is {self.margin_voxels} voxels; it must be finite and at least 0.5",
+        )
+        with functions_of_users():
+            found = jax.eval_shape(self.volume, jnp.zeros((2, 3)))
+        require(
+            getattr(found, "shape", None) == (2,) and jnp.issubdtype(found.dtype, jnp.floating),
+            f"the volume says {found} of two points; it must give one number a point",
         )
 
     def seen_empty(
@@ -119,7 +125,8 @@ def _beyond(volume: Volume, cloud: PointCloud, limit: float) -> tuple[Int[Array,
     """How many points lie farther than the limit outside the volume, and how far the farthest does."""
     # All rows, so that clouds of other counts share a compilation.
     distance = jnp.where(cloud.mask, volume(cloud.points), -jnp.inf)
-    return jnp.sum(distance > limit), jnp.max(distance, initial=-jnp.inf)
+    # What is not a number is not inside.
+    return jnp.sum(~(distance <= limit)), jnp.max(distance, initial=-jnp.inf)
 
 
 def check_image(pose: Pose, scan: PointCloud, camera: Camera) -> None:

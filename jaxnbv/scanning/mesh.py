@@ -1,10 +1,6 @@
 """TriangleMesh: real objects as they come, soups and open sheets included, met by rays through Embree on the host."""
 
-import io
-import os
-import struct
 import warnings
-from pathlib import Path
 from typing import ClassVar
 
 import equinox as eqx
@@ -16,7 +12,7 @@ from embreex.mesh_construction import TriangleMesh as EmbreeTriangles
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, check_type, checked, is_traced, require, shown
+from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, check_type, checked, is_traced, require
 from jaxnbv.errors import optional
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
@@ -208,77 +204,6 @@ class TriangleMesh(Surface):
     def to_trimesh(self) -> trimesh.Trimesh:
         """The mesh in scene coordinates as trimesh's own, to show, measure or export."""
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
-
-
-@checked
-def load_mesh(path: str | Path, up: str = "y") -> TriangleMesh:
-    """The mesh in a file of any format that trimesh reads; a scene's geometries are joined where it places them.
-
-    - `up`: the file's axis that is upward, see `Frame`.
-
-    **Raises:** `ValueError` if the file is missing or cannot be read, and as `TriangleMesh.from_arrays` does.
-    """
-    return joined_nodes(path, [mesh for _, mesh in read_nodes(path)], up)
-
-
-def joined_nodes(path: str | Path, meshes: list[trimesh.Trimesh], up: str) -> TriangleMesh:
-    """The mesh that the nodes of a file make together.
-
-    **Raises:** `ValueError` as `TriangleMesh.from_arrays` does, for the file.
-    """
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    vertices = np.concatenate([mesh.vertices for mesh in meshes])
-    faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)])
-    try:
-        return TriangleMesh.from_arrays(vertices, faces, up)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-
-
-def read_nodes(path: str | Path) -> list[tuple[str, trimesh.Trimesh]]:
-    """The nodes of a file that have faces, by name, where its scene places them, in the file's coordinates.
-
-    **Raises:** `ValueError` if the file is missing, cannot be read, or has no faces.
-    """
-    path = Path(path)
-    require(os.path.isfile(path), f"no mesh file at {shown(str(path))}: check the path")
-    try:
-        parts = trimesh.load_scene(_opened(path), path.suffix[1:].lower(), process=False).dump()
-    except Exception as error:  # Each of trimesh's readers fails in its own way.
-        problem = f"cannot read {path} as a mesh ({type(error).__name__}: {error})"
-        raise InputError(f"{problem}: {_why_unread(path)}") from error
-    meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-    require(len(meshes) > 0, f"{path} has no faces: {_why_empty(path)}")
-    return [(str(mesh.metadata.get("node", index)), mesh) for index, mesh in enumerate(meshes)]
-
-
-def _opened(path: Path) -> Path | io.BytesIO:
-    """What trimesh is to read: many OFF files of ModelNet run their first two lines together."""
-    if path.suffix.lower() == ".off":
-        with path.open("rb") as file:
-            if file.read(3) == b"OFF" and file.read(1).isdigit():
-                file.seek(3)
-                return io.BytesIO(b"OFF\n" + file.read())
-    return path
-
-
-def _why_unread(path: Path) -> str:
-    if path.open("rb").read(3) == b"\xef\xbb\xbf":
-        return "it begins with a byte-order mark; save it as UTF-8 without one"
-    formats = sorted(trimesh.available_formats())
-    if path.suffix.lower().removeprefix(".") in formats:
-        return "it is damaged, or not what its name says; export it again"
-    return f"it must be one of {', '.join(formats)}, some of which need a package of their own"
-
-
-def _why_empty(path: Path) -> str:
-    """A binary STL that is cut short reads as an empty one."""
-    if path.suffix.lower() == ".stl":
-        head, length = path.open("rb").read(84), path.stat().st_size
-        count = struct.unpack("<I", head[80:84])[0] if len(head) == 84 else 0
-        if not head.startswith(b"solid") and length != 84 + 50 * count:
-            return f"it has {length} bytes where a binary STL of {count} faces has {84 + 50 * count}; fetch it again"
-    return "a point cloud or an empty file cannot be scanned"
 
 
 def level_triangles(

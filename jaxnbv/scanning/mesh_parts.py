@@ -9,7 +9,8 @@ from jaxtyping import Array, Float
 
 from jaxnbv.checks import require
 from jaxnbv.scanning.grid import Grid
-from jaxnbv.scanning.mesh import TriangleMesh, joined_nodes, read_nodes
+from jaxnbv.scanning.mesh import TriangleMesh
+from jaxnbv.scanning.mesh_files import joined_nodes, read_nodes
 from jaxnbv.scanning.triangles import distance_to_triangles
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnbv.checks import AnyArray, as_numbers, check_fields, check_type, checked, require, shown
+from jaxnbv.checks import AnyArray, InputError, as_numbers, check_fields, check_type, checked, require, shown
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
@@ -32,6 +32,8 @@ _LEVEL = np.cos(np.radians(15.0))
 _TOLERANCE = 0.03
 # Planes that are tried, and points that each is tried on.
 _DRAWS, _COUNTED = 500, 5000
+# The share of the points that a plane has at least.
+_FEWEST = 0.05
 
 
 class Surroundings(eqx.Module):
@@ -134,6 +136,11 @@ def support_plane(
     upward = as_numbers(up, "up", np.float64)
     require(upward.shape == (3,) and bool(np.linalg.norm(upward) > 0), f"up is {shown(up)}; give a direction")
     plane = _plane_of_most(points, tolerance)
+    if plane is None:
+        raise InputError(
+            f"no plane has a twentieth of the {len(points)} points within {tolerance} of it, or they lie on one line: "
+            "show more of the table, or give a larger tolerance"
+        )
     cosine = float(plane.normal @ upward / np.linalg.norm(upward))
     require(
         abs(cosine) > np.cos(np.radians(30.0)),
@@ -159,6 +166,8 @@ def plane_under(cloud: PointCloud, box: Box) -> HalfSpace | None:
     if min(inside.sum(), (~inside).sum()) < _SOME:
         return None
     plane = _plane_of_most(near, _TOLERANCE)
+    if plane is None:
+        return None
     normal = np.sign(plane.normal[1]) * plane.normal
     height = (near - plane.point) @ normal
     on = np.abs(height) <= _TOLERANCE
@@ -176,9 +185,9 @@ class _Plane(NamedTuple):
     normal: Float[np.ndarray, "3"]
 
 
-def _plane_of_most(points: Float[np.ndarray, "n 3"], tolerance: float) -> _Plane:
+def _plane_of_most(points: Float[np.ndarray, "n 3"], tolerance: float) -> _Plane | None:
     """By RANSAC (Fischler and Bolles 1981): of planes through three points drawn at random the one that most points
-    are near, then the best fit to these."""
+    are near, then the best fit to these. None where all lie on a line, or fewer than a twentieth are near."""
     draw = np.random.default_rng(0)
     a, b, c = np.moveaxis(points[draw.integers(0, len(points), (_DRAWS, 3))], 1, 0)
     normals = np.cross(b - a, c - a)
@@ -188,5 +197,7 @@ def _plane_of_most(points: Float[np.ndarray, "n 3"], tolerance: float) -> _Plane
     # Three points on a line have no normal.
     best = np.argmax(np.where(normals.any(axis=1), near.sum(axis=0), -1))
     on = points[np.abs((points - a[best]) @ normals[best]) <= tolerance]
+    if not normals[best].any() or len(on) < max(3, _FEWEST * len(points)):
+        return None
     middle = on.mean(axis=0)
     return _Plane(middle, np.linalg.eigh((on - middle).T @ (on - middle))[1][:, 0])

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from jaxnbv.checks import AnyArray, InputError, check_fields, require, shown
+from jaxnbv.checks import AnyArray, InputError, check_fields, check_key, require, shown
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.search.rotations import rotation_between, rotation_from_6d
@@ -35,10 +35,18 @@ class Candidates(eqx.Module):
     def where(self, allowed: Callable[[Pose], Bool[AnyArray, ""] | bool]) -> "GivenPoses":
         """Those that a predicate of one pose allows: that a robot can reach, say.
 
-        **Raises:** `ValueError` if it allows none.
+        **Raises:** `ValueError` if it allows none, or says something else than a truth.
         """
+        require(callable(allowed), f"what is allowed is {shown(allowed)}; give a function of one pose")
         poses = self.poses()
-        rows = np.array([bool(allowed(poses[index])) for index in range(self.count)])
+        said = [allowed(poses[index]) for index in range(self.count)]
+        for truth in said:
+            array = isinstance(truth, AnyArray | np.bool_) and truth.shape == () and truth.dtype == bool
+            require(
+                array or isinstance(truth, bool),
+                f"the predicate says {shown(truth)} of a pose; it must say True or False",
+            )
+        rows = np.array(said, bool)
         require(rows.any(), f"none of {self.count} candidates is allowed: give more, or allow more")
         return GivenPoses(poses[jnp.asarray(np.flatnonzero(rows))])
 
@@ -91,6 +99,7 @@ class SphereCandidates(NumberedCandidates):
         """A dome is turned about its axis, so that the poses of every key are above the elevation."""
         places = fibonacci_sphere(self.num_poses, self.radius, self.min_elevation)
         if key is not None and self._is_whole:
+            check_key(key)
             turn = rotation_from_6d(jax.random.normal(key, (6,)))
             places, key = jnp.matmul(places, turn.T, precision="highest"), None
         return _looking(places, self.up, key)
@@ -201,6 +210,7 @@ def _check_places(number: int, nearest: float, farthest: float, up: tuple[float,
 def _looking(places: Float[Array, "n 3"], up: tuple[float, float, float], key: PRNGKeyArray | None) -> Pose:
     """Poses at places about the y axis, turned about it at random by a key, and then so that it becomes `up`."""
     if key is not None:
+        check_key(key)
         places = jnp.matmul(places, _about_y(key).T, precision="highest")
     axis = jnp.asarray(up, places.dtype)
     if up[0] or up[2] or up[1] < 0:

@@ -64,6 +64,8 @@ def read_arrays(
     **Raises:** `ValueError` if it is damaged, or not that of the index.
     """
     try:
+        if not file.is_file():
+            raise ValueError("there is no file")
         with np.load(file, allow_pickle=False) as saved:
             held = sum(member.file_size for member in saved.zip.infolist())
             require(held <= _LARGEST, f"{file} is damaged (it unpacks to {held} bytes): delete it")

@@ -59,6 +59,8 @@ def read_json(file: Path, problem: str, remedy: str) -> dict[str, Any]:
 
     **Raises:** `ValueError` that tells `problem` and `remedy`, unless that is an object.
     """
+    # What is no file, such as a pipe, may never end.
+    require(os.path.isfile(file) or not os.path.lexists(file), f"{file} {problem} (it is no file): {remedy}")
     try:
         content = json.loads(file.read_bytes())
     except (ValueError, OSError, RecursionError) as error:
@@ -108,8 +110,9 @@ def writing_in(path: Path, *inside: str) -> Iterator[None]:
 
 
 def _holder(path: Path) -> str:
+    lock = path / _LOCK
     try:
-        return (path / _LOCK).read_text() or "another process"
+        return (lock.is_file() and lock.read_text()) or "another process"
     except OSError:
         return "another process"
 

@@ -5,12 +5,15 @@ image_00.npz      the first depth image as the sensor gave it, its pose and scal
 proposal_01.npz   where the planner wanted the image of that number to be taken; its candidates and their values
 """
 
+import os
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Real
 
+from jaxnbv.checks import require
 from jaxnbv.search import Proposal
 from jaxnbv.storage.arrays import (
     POSE,
@@ -58,11 +61,20 @@ class SessionFolder(ResultFolder):
         super().__init__(path, SESSION_RECORD, "image_*.npz", config, "session")
 
     def count_images(self) -> int:
-        """How many there are, up to the first that is missing."""
-        count = 0
-        while self._image_file(count).exists():
-            count += 1
-        return count
+        """How many there are.
+
+        **Raises:** `ValueError` if one before the last is missing.
+        """
+        # By their names: a link to a file that is gone is an image that cannot be read.
+        names = {name for name in os.listdir(self.path) if re.fullmatch(r"image_\d{2,}\.npz", name)}
+        for index in range(len(names)):
+            file = self._image_file(index)
+            require(
+                file.name in names,
+                f"{self.path} holds {len(names)} images, but not {file.name}: restore it, or move those after it to "
+                "another folder",
+            )
+        return len(names)
 
     def read_image(self, index: int) -> DepthImage:
         """**Raises:** `ValueError` if it is damaged."""

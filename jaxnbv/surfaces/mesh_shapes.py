@@ -1,6 +1,7 @@
 """Meshes as shapes of a bank: their signed distances on grids, kept in the user's cache."""
 
 import hashlib
+import os
 import secrets
 import warnings
 import zipfile
@@ -18,7 +19,8 @@ from tqdm import tqdm
 
 from jaxnbv.checks import InputError, check_type, require, shown
 from jaxnbv.geometry.pose import fibonacci_sphere
-from jaxnbv.scanning.mesh import TriangleMesh, load_mesh
+from jaxnbv.scanning.mesh import TriangleMesh
+from jaxnbv.scanning.mesh_files import load_mesh
 from jaxnbv.scanning.sdf import Sampled, solid_of_mesh
 
 # What is kept is made anew where what makes it has changed.
@@ -42,7 +44,7 @@ def mesh_paths(meshes: str | Path | Sequence[str | Path]) -> list[Path]:
     """
     if isinstance(meshes, str | Path):
         folder = Path(meshes)
-        require(folder.is_dir(), f"there is no folder {folder}: give one that holds meshes, or a list of files")
+        require(os.path.isdir(folder), f"there is no folder {folder}: give one that holds meshes, or a list of files")
         formats = trimesh.available_formats()
         meshes = [path for path in sorted(folder.rglob("*")) if path.suffix[1:].lower() in formats and path.is_file()]
         ends = ", ".join(sorted(formats))
@@ -78,6 +80,7 @@ def shapes_of_meshes(
 
 
 def _kept(path: Path, resolution: int, sheet: float, num_extremes: int) -> tuple[Sampled, Float[np.ndarray, "p 3"]]:
+    require(os.path.isfile(path), f"cannot read {path}: there is no file")
     try:
         content = path.read_bytes()
     except OSError as error:

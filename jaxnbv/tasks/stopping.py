@@ -7,6 +7,7 @@ import equinox as eqx
 from jaxtyping import PRNGKeyArray
 
 from jaxnbv.acquisition import Acquisition
+from jaxnbv.checks import check_type
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.imagination import Imagination
@@ -56,6 +57,7 @@ class Stop(eqx.Module):
         return None
 
     def __or__(self, other: "Stop") -> "Stop":
+        check_type(other, Stop, "a rule of stopping")
         return AnyOf((self, other))
 
 

@@ -12,7 +12,8 @@ import trimesh
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning.grid import Grid
-from jaxnbv.scanning.mesh import TriangleMesh, load_mesh, mesh_from_sdf
+from jaxnbv.scanning.mesh import TriangleMesh, mesh_from_sdf
+from jaxnbv.scanning.mesh_files import load_mesh
 from jaxnbv.scanning.scanner import scan
 from jaxnbv.scanning.sdf import Cuboid, Sphere, Torus
 

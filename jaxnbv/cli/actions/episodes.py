@@ -1,6 +1,7 @@
 """What `jaxnbv demo` and `jaxnbv run MESH` do: one episode."""
 
 import dataclasses
+import os
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -83,7 +84,7 @@ def knowing(imagination: Imagination, known: str | None) -> Imagination:
     if known in BANKS:
         return imagination.knowing(shape_bank(known), bank_poses(known))
     require(
-        Path(known).is_dir(), f"--known {known}: there is no such folder of meshes; or give {', '.join(BANKS)}, none"
+        os.path.isdir(known), f"--known {known}: there is no such folder of meshes; or give {', '.join(BANKS)}, none"
     )
     return imagination.knowing(ShapeBank.from_meshes(known), Upright(by_axis=True))
 

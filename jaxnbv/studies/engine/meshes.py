@@ -1,6 +1,7 @@
 """A folder of meshes as the scenes of a study."""
 
 import dataclasses
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -27,7 +28,7 @@ def mesh_files(folder: str | Path) -> tuple[str, ...]:
     **Raises:** `ValueError` if there is no such folder, or no mesh in it.
     """
     folder = Path(folder)
-    require(folder.is_dir(), f"there is no folder {folder}: give one that holds mesh files")
+    require(os.path.isdir(folder), f"there is no folder {folder}: give one that holds mesh files")
     found = tuple(str(file) for file in sorted(folder.iterdir()) if is_mesh_file(file))
     formats = ", ".join(sorted(trimesh.available_formats()))
     require(len(found) > 0, f"the folder {folder} holds no mesh: its files must end in {formats}")

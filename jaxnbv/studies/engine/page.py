@@ -1,6 +1,7 @@
 """All studies of a folder on one page: of each its claims, tables, figures, pictures, settings, versions and times."""
 
 import json
+import os
 import pkgutil
 import tempfile
 from collections.abc import Sequence
@@ -10,9 +11,9 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from jaxnbv.checks import require
+from jaxnbv.checks import InputError, require
 from jaxnbv.storage.files import make_folder, write_text
-from jaxnbv.storage.folders import read_json
+from jaxnbv.storage.folders import read_config, read_json
 from jaxnbv.studies.engine.charts import write_charts
 from jaxnbv.studies.engine.claims import Verdict, verdicts
 from jaxnbv.studies.engine.measures import Record
@@ -25,6 +26,7 @@ from jaxnbv.version import __version__
 from jaxnbv.viz.html import render
 
 _REMEDY = "give a folder that `jaxnbv study` has written"
+_PROBLEM = "is not a study's record"
 
 
 class Chapter(NamedTuple):
@@ -66,14 +68,16 @@ def chapters(folder: str | Path) -> list[Chapter]:
     **Raises:** `ValueError` if there is none, a study is not known here, or a record is damaged.
     """
     folder = Path(folder)
-    require(folder.is_dir(), f"there is no folder {folder}: {_REMEDY}")
+    require(os.path.isdir(folder), f"there is no folder {folder}: {_REMEDY}")
     kinds = _kinds()
     found: dict[tuple[int, Path], Chapter] = {}
     for file in sorted(folder.rglob("study.json")):
         if any(file.parent.glob("scene_*.json")):
-            config = read_json(file, "is not a study's record", _REMEDY)
-            name = config.get("config", {}).get("study", {}).get("type")
-            require(name in kinds, f"{file} is of a study {name!r}, which this version does not know: {_REMEDY}")
+            config = read_json(file, _PROBLEM, _REMEDY)
+            study = read_config(file, _PROBLEM, _REMEDY).get("study")
+            name = study.get("type") if isinstance(study, dict) else study
+            if not isinstance(name, str) or name not in kinds:
+                raise InputError(f"{file} is of a study {name!r}, which this version does not know: {_REMEDY}")
             chapter = _chapter(file.parent, file.parent.relative_to(folder), config, kinds[name])
             found[list(kinds).index(name), file] = chapter
     require(len(found) > 0, f"{folder} holds no study that has a scene: {_REMEDY}")
@@ -114,7 +118,7 @@ def _facts(records: Sequence[Record], config: dict[str, Any]) -> list[str]:
     if seconds:
         mean = sum(seconds) / len(seconds)
         facts.append(f"{mean:.0f} seconds a scene with all methods, {sum(seconds) / 3600:.2f} hours in all.")
-    made_by = config.get("versions") or {}
-    if made_by:
+    made_by = config.get("versions")
+    if isinstance(made_by, dict) and made_by:
         facts.append("Made with " + ", ".join(f"{name} {version}" for name, version in made_by.items()) + ".")
     return facts

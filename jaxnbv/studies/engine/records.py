@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -58,7 +59,7 @@ class RecordFolder(ResultFolder):
     def failures(self, scenes: Sequence[int]) -> dict[int, str]:
         """The errors of scenes that failed, a line each; beside the records, scene_*.failed has their tracebacks."""
         files = {index: self._file(index).with_suffix(_FAILED) for index in scenes}
-        return {index: file.read_text().partition("\n")[0] for index, file in files.items() if file.exists()}
+        return {index: file.read_text().partition("\n")[0] for index, file in files.items() if os.path.isfile(file)}
 
     def _file(self, index: int) -> Path:
         return self.path / f"scene_{index:04d}.json"
@@ -79,9 +80,14 @@ class RecordFolder(ResultFolder):
 def read_records(folder: str | Path) -> list[Record]:
     """The records that a folder holds, in order.
 
-    **Raises:** `ValueError` for a record that is damaged.
+    **Raises:** `ValueError` for a record that is damaged, or a file of a name that no record has.
     """
-    return [_read(file, int(file.stem.removeprefix("scene_"))) for file in sorted(Path(folder).glob("scene_*.json"))]
+    records = []
+    for file in sorted(Path(folder).glob("scene_*.json")):
+        number = file.stem.removeprefix("scene_")
+        require(number.isdecimal(), f"{file} is no record, which has the number of its scene: move it elsewhere")
+        records.append(_read(file, int(number)))
+    return records
 
 
 def _checksum(index: int, record: dict[str, Any]) -> str:

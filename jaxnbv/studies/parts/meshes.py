@@ -1,5 +1,6 @@
 """The study of parts on real objects: a node of a mesh file is a part, and an oracle tells which points are of it."""
 
+import os
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -12,7 +13,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.imagination import Imagination
 from jaxnbv.scanning import Grid, MeshParts, load_parts, scan
-from jaxnbv.scanning.mesh import read_nodes
+from jaxnbv.scanning.mesh_files import read_nodes
 from jaxnbv.studies.engine.measures import KNOWN, Record
 from jaxnbv.studies.engine.meshes import knowing_meshes, knowing_others, numbered
 from jaxnbv.studies.engine.study import Scene, Study
@@ -113,7 +114,7 @@ def part_files(folder: str | Path) -> tuple[tuple[str, int], ...]:
     **Raises:** `ValueError` if there is no such folder, or no such mesh, or one cannot be read.
     """
     folder = Path(folder)
-    require(folder.is_dir(), f"there is no folder {folder}: give one that holds mesh files")
+    require(os.path.isdir(folder), f"there is no folder {folder}: give one that holds mesh files")
     by_class: dict[Path, list[tuple[str, int]]] = {}
     for file in sorted(path for path in folder.rglob("*") if is_mesh_file(path)):
         count = len(read_nodes(file))

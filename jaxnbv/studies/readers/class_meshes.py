@@ -1,6 +1,7 @@
 """Meshes by class in a local folder, as data sets lay them out."""
 
 import itertools
+import os
 import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -11,7 +12,6 @@ import trimesh
 from jaxnbv.checks import checked, require, shown
 from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.scanning import TriangleMesh, load_mesh
-from jaxnbv.storage.files import is_file, is_folder
 
 _T = TypeVar("_T")
 
@@ -34,7 +34,7 @@ class MeshFile(NamedTuple):
 
         **Raises:** `ValueError` if the file is missing or damaged.
         """
-        require(is_file(Path(self.path)), f"there is no file {self.path}: unpack the data set again")
+        require(os.path.isfile(Path(self.path)), f"there is no file {self.path}: unpack the data set again")
         return load_mesh(self.path, self.up)
 
 
@@ -94,7 +94,9 @@ def class_meshes(folder: str | Path, classes: Sequence[str], split: str = "test"
     named = isinstance(classes, list | tuple) and all(isinstance(name, str) for name in classes)
     require(named, f"the classes are {shown(classes)}: give a list of names")
     require(split in _SPLITS, f"there is no split {shown(split)}: choose from {', '.join(_SPLITS)}")
-    require(is_folder(folder), f"there is no folder {folder}: give one that holds a folder of meshes for each class")
+    require(
+        os.path.isdir(folder), f"there is no folder {folder}: give one that holds a folder of meshes for each class"
+    )
     folder = folder / "raw_scans" if (folder / "raw_scans").is_dir() else folder
     there = {_plain(path.name): path for path in sorted(folder.iterdir()) if path.is_dir()}
     found = [(label, there.get(_plain(name), there.get(_SYNSETS.get(name, "")))) for label, name in enumerate(classes)]

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +14,6 @@ from jaxnbv.checks import AnyArray, InputError, as_numbers, require, shown
 from jaxnbv.errors import optional
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.storage.files import is_file, is_folder
 from jaxnbv.studies.readers.text_files import check_listed, read_lines, read_rows, read_text
 
 # In seconds: an image and a pose of a TUM sequence that lie farther apart are not of one moment.
@@ -53,7 +53,7 @@ class RecordedFrames:
 
     def __init__(self, folder: str | Path, up: tuple[float, float, float] | None = None):
         folder = Path(folder)
-        require(is_folder(folder), f"there is no folder {folder}: give the place of the unpacked data set")
+        require(os.path.isdir(folder), f"there is no folder {folder}: give the place of the unpacked data set")
         layout = _layout(folder)
         check_listed(layout.files, folder)
         matrices = layout.matrices if up is None else _upward(up) @ layout.matrices
@@ -87,9 +87,9 @@ class RecordedFrames:
 
 
 def _layout(folder: Path) -> _Layout:
-    if is_file(folder / "frames.json"):
+    if os.path.isfile(folder / "frames.json"):
         return _plain(folder)
-    if is_file(folder / "groundtruth.txt"):
+    if os.path.isfile(folder / "groundtruth.txt"):
         return _tum(folder)
     files = sorted(folder.glob("*.depth.png"))
     require(
@@ -106,7 +106,7 @@ def _seven_scenes(folder: Path, files: list[Path]) -> _Layout:
     own = folder / "camera-intrinsics.txt"
     # As published with the data set.
     usual = np.array([[585.0, 0.0, 320.0], [0.0, 585.0, 240.0], [0.0, 0.0, 1.0]])
-    return _Layout(files, matrices, read_rows(own, "a b c") if is_file(own) else usual, 1e-3)
+    return _Layout(files, matrices, read_rows(own, "a b c") if os.path.isfile(own) else usual, 1e-3)
 
 
 def _tum(folder: Path) -> _Layout:

@@ -1,5 +1,6 @@
 """Text files of a local copy of a data set: what is missing or damaged is named."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -7,12 +8,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnbv.checks import InputError, require
-from jaxnbv.storage.files import is_file
 
 
 def check_listed(files: Sequence[Path], list_file: Path) -> None:
     """**Raises:** `ValueError` unless all files that a list names are there: how many are not, and the first."""
-    absent = [file for file in files if not is_file(file)]
+    absent = [file for file in files if not os.path.isfile(file)]
     require(
         not absent,
         f"{len(absent)} of the {len(files)} files that {list_file} names are not there, the first {absent[:1]}: unpack "
@@ -22,7 +22,7 @@ def check_listed(files: Sequence[Path], list_file: Path) -> None:
 
 def read_text(path: Path) -> str:
     """**Raises:** `ValueError` if the file is missing or is no text."""
-    require(is_file(path), f"there is no file {path}: the folder is incomplete, unpack the data set again")
+    require(os.path.isfile(path), f"there is no file {path}: the folder is incomplete, unpack the data set again")
     try:
         return path.read_text()
     except (OSError, UnicodeDecodeError) as error:

@@ -10,7 +10,7 @@ from matplotlib.path import Path as Polygon
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.scanning import Grid, mesh_from_sdf, scan
-from jaxnbv.scanning.mesh import load_mesh
+from jaxnbv.scanning.mesh_files import load_mesh
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.studies.scenes import PATTERNS, Framing, Pyramid, Split, hidden_view, pyramid_scene, sample_pyramid
 from jaxnbv.studies.scenes.class_object import scan_cue
