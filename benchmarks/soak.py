@@ -1,0 +1,91 @@
+"""Steps without end: does a planner or a session grow in memory, or compile, as it goes on?
+
+    python benchmarks/soak.py --steps 2000
+
+Small settings, so that what grows shows beside what a step needs. A planner is asked and told about a ball, an episode
+of eight views after another; a session takes an image a step in its one folder, and is asked every tenth. Tables:
+resident memory in MiB, milliseconds a step, and programs compiled since the second view, at ten moments.
+"""
+
+import argparse
+import tempfile
+import time
+from collections.abc import Iterator
+
+import jax
+import numpy as np
+import pandas as pd
+import psutil
+
+import jaxnbv as nbv
+
+CAMERA, BALL = nbv.Camera(height=12, width=16), nbv.SDFSurface(nbv.sdf.Sphere(1.0))
+IMAGINATION = nbv.Imagination(nbv.GeometricSPSR(0.05, truncation=8), nbv.Grid(24), num_samples=2)
+VIEWS = 8
+
+
+def planner(max_views: int) -> nbv.Planner:
+    return nbv.Planner(nbv.Coverage(), nbv.DiscreteSearch(20), CAMERA, IMAGINATION, capacity=512, max_views=max_views)
+
+
+def planning(steps: int) -> Iterator[None]:
+    asked, first = planner(VIEWS), nbv.look_at((0.0, 0.0, 2.5))
+    evidence = None
+    for step in range(steps):
+        if step % VIEWS == 0:
+            evidence = asked.init(first, nbv.scan(BALL, CAMERA, first))
+        pose = asked.propose(evidence, jax.random.key(step)).pose
+        if step % VIEWS < VIEWS - 1:
+            evidence = asked.observe(evidence, pose, nbv.scan(BALL, CAMERA, pose))
+        yield
+
+
+def session(steps: int) -> Iterator[None]:
+    poses = nbv.SphereCandidates(steps, 2.5).poses()
+    matrices = np.asarray(poses.to_matrix())
+    with tempfile.TemporaryDirectory() as folder:
+        taken = nbv.Session(CAMERA, ((-1.2,) * 3, (1.2,) * 3), planner(steps), folder=folder, progress=False)
+        for step in range(steps):
+            pose = poses[step]
+            seen = nbv.scan(BALL, CAMERA, pose)
+            depth = np.asarray((seen.points - pose.position) @ pose.forward)
+            image = np.where(seen.mask, depth, np.inf).reshape(CAMERA.height, CAMERA.width)
+            taken.add(image, matrices[step])
+            if step % 10 == 0:
+                taken.next()
+            yield
+
+
+def watched(going: Iterator[None], steps: int) -> pd.DataFrame:
+    """Memory, time and compilations at ten moments."""
+    process, compiled, rows = psutil.Process(), [], []
+
+    def listen(event: str, duration: float, **_: object) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(duration)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    began, before, every = time.perf_counter(), 0, max(steps // 10, 1)
+    for step, _ in enumerate(going, start=1):
+        # All that is needed again has been compiled: the session is asked for the second time at its eleventh image.
+        if step == 2 * VIEWS:
+            compiled.clear()
+        if step % every == 0:
+            now = time.perf_counter()
+            milliseconds = 1000.0 * (now - began) / (step - before)
+            rows.append((step, process.memory_info().rss / 2**20, milliseconds, len(compiled)))
+            began, before = now, step
+    jax.monitoring.unregister_event_duration_listener(listen)
+    return pd.DataFrame(rows, columns=["steps", "MiB", "ms a step", "compiled"])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, default=2000)
+    steps = parser.parse_args().steps
+    for name, going in {"planner": planning, "session": session}.items():
+        print(f"\n{name}\n{watched(going(steps), steps).to_string(index=False, float_format='%.0f')}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
