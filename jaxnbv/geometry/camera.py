@@ -86,7 +86,7 @@ class Camera(eqx.Module):
         )
         require(
             fy > 0.01 * height,
-            f"the intrinsic matrix has a focal length of {fy:.4g} for {height} rows: give it in pixels, not its inverse",
+            f"the intrinsic matrix has a focal length of {fy:.4g} for {height} rows: give it in pixels, and no inverse",
         )
         require(abs(skew) <= _SKEW * fx, f"the intrinsic matrix has a skew of {skew}: undistort the image first")
         require(
