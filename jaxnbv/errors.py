@@ -15,6 +15,7 @@ EXTRAS = {
     "loky": "heat",
     "robust_laplacian": "heat",
     "pandas": "studies",
+    "gymnasium": "gym",
     "viser": "view",
     "distributed": "cluster",
     "pymeshlab": "poisson",
