@@ -30,11 +30,11 @@ def test_a_package_page_has_links_to_the_web_alone():
     """Of the README, as the package's build rewrites it."""
     text = (ROOT / "README.md").read_text()
     links = re.compile(r"!?\[[^\]]*\]\(([^)]*)\)")
-    assert "docs/demo.png" in links.findall(text)
+    assert "docs/hero.png" in links.findall(text)
     hook = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["metadata"]["hooks"]
     for change in hook["fancy-pypi-readme"]["substitutions"]:
         text = re.sub(change["pattern"], change["replacement"], text)
     left = links.findall(text)
     assert left
     assert all(link.startswith("https://") for link in left)
-    assert "Concepts: posterior, imagination" in text
+    assert "concepts, each formula" in text
