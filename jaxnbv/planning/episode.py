@@ -11,7 +11,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
-from tqdm import tqdm
 
 from jaxnbv.checks import check_key, check_type, checked, require
 from jaxnbv.geometry.camera import Camera
@@ -19,6 +18,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Watch
+from jaxnbv.progress import progress_bar
 from jaxnbv.scanning import Evidence, GridSurface, Noise, SensorNoise, Surface, Surroundings, as_surface, scan
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.search import Proposal
@@ -169,7 +169,7 @@ def simulate(
             f"asked for {views} views but {folder} already holds {len(done)}: ask for more, or choose another folder",
         )
         finished: list[View] = []
-        with tqdm(total=views * len(STAGES), disable=not progress) as bar:
+        with progress_bar(total=views * len(STAGES), wanted=progress) as bar:
 
             def begin(index: int, stage: str) -> None:
                 bar.set_description(f"view {index + 1}/{views}, {stage}")

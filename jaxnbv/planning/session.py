@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray, Real
-from tqdm import tqdm
 
 from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, check_type, checked, require
 from jaxnbv.geometry.camera import Camera
@@ -22,6 +21,7 @@ from jaxnbv.planning.episode import STAGES, Episode, View, view_keys
 from jaxnbv.planning.placing import box_of, on_support, placed, stride_of, usual_planner, warn_of_support
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Watch
+from jaxnbv.progress import progress_bar
 from jaxnbv.scanning import Evidence, Surroundings, plane_under
 from jaxnbv.scanning.sdf import HalfSpace
 from jaxnbv.search import Proposal
@@ -280,7 +280,7 @@ class Session:
     def _propose(self) -> tuple[Proposal, Float[np.ndarray, "h w"] | None]:
         sample_key, search_key, _ = view_keys(self.key, self.views)
         proposed = [proposal.pose for index, proposal in sorted(self._proposals.items()) if index < self.views]
-        with tqdm(total=2, leave=False, disable=not self.progress) as bar:
+        with progress_bar(total=2, wanted=self.progress) as bar:
             bar.set_description(f"view {self.views + 1}, {STAGES[0]}")
             surfaces = jax.block_until_ready(self.planner.sample(self.evidence, sample_key))
             bar.update()

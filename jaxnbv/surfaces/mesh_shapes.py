@@ -15,10 +15,10 @@ import numpy as np
 import platformdirs
 import trimesh
 from jaxtyping import Float
-from tqdm import tqdm
 
 from jaxnbv.checks import InputError, check_type, require, shown
 from jaxnbv.geometry.pose import fibonacci_sphere
+from jaxnbv.progress import progress_bar
 from jaxnbv.scanning.mesh import TriangleMesh
 from jaxnbv.scanning.mesh_files import load_mesh
 from jaxnbv.scanning.sdf import Sampled, solid_of_mesh
@@ -66,7 +66,7 @@ def shapes_of_meshes(
     **Raises:** `ValueError` if none can.
     """
     solids, extremes, used = [], [], []
-    for index, path in enumerate(tqdm(paths, desc="shapes", unit="mesh", disable=not progress)):
+    for index, path in enumerate(progress_bar(paths, progress, desc="meshes read")):
         try:
             solid, points = _kept(path, resolution, sheet, num_extremes)
         except InputError as error:

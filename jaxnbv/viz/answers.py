@@ -22,7 +22,7 @@ from jaxnbv.tasks.segmentation import PartAnswer
 _SETTLED = 0.05
 # The probability at which a reader may rely on a class.
 _SURE = 0.95
-_CLASSES_SHOWN = 5
+_CLASSES_SHOWN, _CLASSES_SAID = 5, 3
 _KINDS_SHOWN = 4
 
 
@@ -124,6 +124,16 @@ class _ClassWords(Words):
     @property
     def shown(self) -> tuple[int, ...]:
         return tuple(sorted(np.argsort(-self.answer.values)[:_CLASSES_SHOWN].tolist()))
+
+    def line(self, before: Answer | None = None) -> str:
+        """The likeliest three, in percent."""
+        best = np.argsort(-self.answer.values)[:_CLASSES_SAID].tolist()
+
+        def one(index: int) -> str:
+            was = "" if before is None else f"{100 * before.values[index]:.0f} -> "
+            return f"{self.answer.names[index]} {was}{100 * self.answer.values[index]:.0f} %"
+
+        return "   ".join(map(one, best))
 
     @property
     def _best(self) -> tuple[str, float]:

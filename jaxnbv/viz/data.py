@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
-from tqdm import tqdm
 
 from jaxnbv.acquisition import Quantity
 from jaxnbv.checks import AnyArray
@@ -17,6 +16,7 @@ from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import Episode
+from jaxnbv.progress import progress_bar
 from jaxnbv.scanning import Evidence
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.scanning.metrics import coverage, truth_points
@@ -160,9 +160,8 @@ def report_data(
     task = task_of(episode, covered)
     drawn: list[ViewData] = []
     known: tuple[Evidence, SurfacePosterior] | None = None
-    bar = tqdm(
-        zip(episode.views, episode.evidence(), strict=True), "drawing views", len(episode.views), disable=not progress
-    )
+    steps, count = zip(episode.views, episode.evidence(), strict=True), len(episode.views)
+    bar = progress_bar(steps, progress, desc="drawing views", total=count)
     for index, (view, after) in enumerate(bar):
         choice = None if view.proposal is None else choice_of(view.proposal, wider_map(episode, index))
         new, _ = view.scan.to_numpy()

@@ -14,10 +14,10 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 from PIL import Image
-from tqdm import tqdm
 
 from jaxnbv.acquisition import Quantity
 from jaxnbv.geometry.camera import Camera
+from jaxnbv.progress import progress_bar
 from jaxnbv.storage.files import make_folder, write_whole
 from jaxnbv.viz import sphere
 from jaxnbv.viz.answers import label_of, number
@@ -106,7 +106,7 @@ def write_figures(
     folder = make_folder(folder)
     drawings = figures_of(data, camera, Stills(data) if stills is None else stills)
     with mpl.rc_context(STYLE):
-        for name, draw in tqdm(drawings.items(), desc="drawing figures", disable=not progress):
+        for name, draw in progress_bar(drawings.items(), progress, desc="drawing figures"):
             small = name == "overview"
             _save(draw(), folder / f"{name}.png", dpi=120 if small else 200, few_colours=small)
     return [folder / f"{name}.png" for name in drawings]

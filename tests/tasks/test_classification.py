@@ -293,9 +293,9 @@ def test_answers_name_the_classes_where_the_classifier_does():
         answer = score.answer(data)
         assert answer.names == ("cup", "bowl")
         np.testing.assert_allclose(answer.values, [0.3, 0.7], atol=1e-6)
-        assert words_of(answer).line() == "cup 0.30   bowl 0.70"
+        assert words_of(answer).line() == "bowl 70 %   cup 30 %"
     before = eqx.tree_at(lambda a: a.values, answer, np.array([0.9, 0.1]))
-    assert words_of(answer).line(before) == "cup 0.90 -> 0.30   bowl 0.10 -> 0.70"
+    assert words_of(answer).line(before) == "bowl 10 -> 70 %   cup 90 -> 30 %"
     assert words_of(answer).sentence(before) == (
         "The classifier says bowl with probability 0.70 (was 0.10, behind cup with 0.90)."
     )

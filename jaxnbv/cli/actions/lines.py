@@ -8,19 +8,22 @@ from tqdm import tqdm
 from jaxnbv.acquisition import Answer
 from jaxnbv.planning.episode import View
 from jaxnbv.planning.planner import Planner
-from jaxnbv.viz.answers import words_of
+from jaxnbv.viz.answers import label_of, number, words_of
 
 
 class Lines:
-    """Prints the lines of each view: where from, why, and what it answered."""
+    """Prints two lines a view, within a hundred columns: where from and why; what it answered."""
 
     def __init__(self, planner: Planner):
         self.planner, self.count = planner, 0
         self.before: Answer | None = None
 
     def __call__(self, view: View) -> None:
+        if not self.count:
+            _print(f"views are chosen by {label_of(self.planner.quantity)}")
         self.count += 1
-        _print(f"view {self.count}   {_line(self.planner, view)}")
+        position = ", ".join(f"{value:+.2f}" for value in np.asarray(view.pose.position))
+        _print(f"view {self.count:<3} ({position})   {int(view.scan.count):,} points   {_why(self.planner, view)}")
         answer = self.planner.acquisition.answer(view.cloud)
         if answer is not None:
             _print(f"         {words_of(answer).line(self.before)}")
@@ -32,20 +35,18 @@ def _print(line: str) -> None:
     tqdm.write(line, file=sys.stdout)
 
 
-def _line(planner: Planner, view: View) -> str:
-    position = ", ".join(f"{value:+.2f}" for value in np.asarray(view.pose.position))
-    line = f"from ({position})   {int(view.scan.count):5d} points, {int(view.cloud.count):5d} kept"
+def _why(planner: Planner, view: View) -> str:
+    """By which value it was chosen, and how that stands among the others."""
     if view.proposal is None:
-        return line
-    sought, values = planner.quantity, np.asarray(view.proposal.values)
+        return "given"
+    value, values = float(view.proposal.value), np.asarray(view.proposal.values, np.float64)
     values = values[np.isfinite(values)]
-    line += f"   {sought.name} {float(view.proposal.value):.4g}, "
-    if (ways := view.proposal.trajectories) is None:
-        rank = 1 + int(np.sum(values > float(view.proposal.value)))
-        line += f"{'the highest' if rank == 1 else f'rank {rank}'} of {len(values)} candidates"
-        line += f" (median {np.median(values):.4g})" if sought.smooth else ""
-        tied = view.proposal.num_tied
-        return line if tied is None else f"{line}, {tied} of them within two standard errors"
-    best = values.max(initial=-np.inf)
-    better = "found nothing better" if float(view.proposal.value) <= best else f"improved on {best:.4g}"
-    return f"{line}where ascent from {len(ways.values)} of {len(values)} candidates {better}"
+    if not planner.quantity.smooth:
+        return f"drawn from {len(values)}"
+    if view.proposal.trajectories is not None:
+        best = float(values.max(initial=-np.inf))
+        return f"{number(value)}, " + ("no ascent found more" if value <= best else f"by ascent from {number(best)}")
+    rank, tied = 1 + int(np.sum(values > value)), view.proposal.num_tied
+    level = f", level with {tied}" if tied else ""
+    stands = "best" if rank == 1 else f"number {rank}"
+    return f"{number(value)}, {stands} of {len(values)} (median {number(float(np.median(values)))}){level}"

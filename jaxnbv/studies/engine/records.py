@@ -3,14 +3,14 @@
 import hashlib
 import json
 import os
+import sys
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from jaxnbv.checks import InputError, require
+from jaxnbv.progress import progress_bar
 from jaxnbv.storage.files import write_text
 from jaxnbv.storage.folders import FORMAT, ResultFolder, check_format, read_json
 from jaxnbv.studies.engine.measures import Record
@@ -47,13 +47,15 @@ class RecordFolder(ResultFolder):
                     records[index] = _read(self._file(index), index)
                 else:
                     missing.append(index)
-            bar = tqdm(total=len(scenes), initial=len(records), desc=self.path.name, unit="scene", disable=not progress)
+            bar = progress_bar(None, progress, True, total=len(scenes), initial=len(records), desc=self.path.name)
             with bar, closing(self.runner.outcomes(run, missing)) as outcomes:
                 for index, outcome in outcomes:
                     self._write(index, outcome)
                     if not isinstance(outcome, Failure):
                         records[index] = _read(self._file(index), index)
                     bar.update()
+                    if progress and bar.disable:
+                        print(f"{self.path.name}: scene {index} is done", file=sys.stderr, flush=True)
         return [records[index] for index in sorted(records)]
 
     def failures(self, scenes: Sequence[int]) -> dict[int, str]:

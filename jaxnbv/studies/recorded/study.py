@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
-from tqdm import tqdm
 
 from jaxnbv.checks import InputError, require
 from jaxnbv.geometry.camera import Camera
@@ -22,6 +21,7 @@ from jaxnbv.imagination import MODELS, Imagination
 from jaxnbv.planning.episode import Sensor, Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.session import stride_of
+from jaxnbv.progress import progress_bar
 from jaxnbv.scanning import Surface
 from jaxnbv.scanning.surface import Hits
 from jaxnbv.search import CandidateSearch, DiscreteSearch, FarthestView, GivenPoses, RandomView, UncertaintyView
@@ -241,7 +241,7 @@ def _recording(folder: str, up: tuple[float, float, float] | None, box: Box, vox
     camera = frames.camera.strided(stride)
     nowhere, none = jnp.zeros((camera.num_rays, 3)), jnp.zeros(camera.num_rays, bool)
     scans, seen = [], []
-    for index in tqdm(range(len(frames)), "reading frames", leave=False):
+    for index in progress_bar(range(len(frames)), desc="reading frames"):
         # One that shows nothing of the box says nothing of it.
         scan = PointCloud(nowhere, nowhere, none, none)
         if np.any(np.asarray(box(_points(frames, index, stride))) < 0):

@@ -15,10 +15,10 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 from scipy.optimize import minimize_scalar
-from tqdm import tqdm
 
 from jaxnbv.checks import AnyArray, InputError, require
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.progress import progress_bar
 from jaxnbv.storage.files import make_folder, write_whole
 
 Network = TypeVar("Network", bound=eqx.Module)
@@ -120,7 +120,7 @@ def fit(
         return (optax.apply_updates(parameters, updates), state), jnp.mean(values)
 
     losses: list[Array] = []
-    with tqdm(total=steps, initial=start, desc="training", disable=not progress) as bar:
+    with progress_bar(total=steps, initial=start, desc="training", wanted=progress) as bar:
         for index in range(start, steps):
             carry, value = step(carry, examples, jnp.asarray(index))
             losses.append(value)
