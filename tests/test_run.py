@@ -116,5 +116,5 @@ def test_a_view_is_told_when_it_is_done(ring):
     with mock.patch.object(Planner, "choose", side_effect=InputError("stopped here")):
         result = run_command(*FARTHEST, cwd=ring)
     assert "stopped here" in result.stderr
-    assert "view 1   from (" in result.stdout
+    assert "view 1   (" in result.stdout
     assert "view 2" not in result.stdout
