@@ -11,11 +11,7 @@ import lazy_loader
 from jaxnbv.errors import explained_imports
 
 _named, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
-
-def __getattr__(name: str) -> Any:
-    with explained_imports():
-        return _named(name)
+__getattr__ = explained_imports()(_named)
 
 
 # What a notebook shows by a small picture and a line of facts.

@@ -18,7 +18,6 @@ EXTRAS = {
     "gymnasium": "gym",
     "viser": "view",
     "distributed": "cluster",
-    "pymeshlab": "poisson",
 }
 """Which extra brings what a part of the package needs beyond the dependencies that all of it has."""
 

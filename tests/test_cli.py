@@ -63,6 +63,7 @@ def test_a_rule_ends_it_and_says_what_is_saved(tmp_path):
     ("search", "model"),
     [
         ("farthest", "screened"),
+        pytest.param("random", "paper", marks=pytest.mark.slow),
         ("uncertainty", "paper"),
         pytest.param("gradient-6dof", "screened", marks=pytest.mark.slow),
     ],

@@ -115,6 +115,24 @@ def test_type_checkers_see_every_public_name(package):
     assert (Path(inspect.getfile(jaxnbv)).parent / "py.typed").exists()
 
 
+@pytest.mark.slow
+def test_every_public_module_can_be_the_first_that_is_used():
+    """Modules that import each other in a circle would work after some first names, not after others."""
+    imports = public_imports(jaxnbv)
+    named = [(statement.module, statement.names[0].name) for statement in imports]
+    first_names = {name if inspect.ismodule(getattr(jaxnbv, name)) else module: name for module, name in named}
+    script = f"""
+import sys
+for name in {[*first_names.values()]}:
+    for module in [module for module in sys.modules if module.split(".")[0] == "jaxnbv"]:
+        del sys.modules[module]
+    import jaxnbv
+    getattr(jaxnbv, name)
+"""
+    result = run_fresh("-c", script)
+    assert result.returncode == 0, result.stderr
+
+
 def test_shapes_are_checked_in_modules_that_are_imported_late():
     with pytest.raises(jaxtyping.TypeCheckError):
         interval(np.arange(3.0))

@@ -35,7 +35,7 @@ class ViewEnvironment(gymnasium.Env[Observation, Any]):
     - `utility`: of the cloud that is kept.
     - `actions`: `Candidates`, of which an action is the number, or a `PoseSpace`, in which an action is the parameters
       that move the last pose, each within [-1, 1].
-    - `views`: in all. `scenes`: numbers that scenes are drawn from.
+    - `views`: in all. `scenes`: how many numbers scenes are drawn from, from 0. `noise`: the sensor's.
 
     **Raises:** `ValueError` for fewer than two views or no scene, and from `step` for what is no action.
     """
@@ -67,6 +67,7 @@ class ViewEnvironment(gymnasium.Env[Observation, Any]):
             if isinstance(actions, Candidates)
             else spaces.Box(-1.0, 1.0, (actions.num_parameters,), np.float32)
         )
+        self._poses = actions.poses() if isinstance(actions, Candidates) else actions.candidates(1, None)
         self._evidence: Evidence | None = None
 
     def reset(
@@ -79,7 +80,7 @@ class ViewEnvironment(gymnasium.Env[Observation, Any]):
         check_type(surface, Surface | SignedDistance, "the scene")
         self._surface, self._evidence = as_surface(surface), None
         if isinstance(self.actions, Candidates):
-            first = self.actions.poses()[int(self.np_random.integers(self.actions.count))]
+            first = self._poses[int(self.np_random.integers(self.actions.count))]
         else:
             first = self.actions.candidates(1, self._key())[0]
         observation = self._look(first)
@@ -92,7 +93,7 @@ class ViewEnvironment(gymnasium.Env[Observation, Any]):
         require(self._evidence is not None, "the environment has no scene yet: call reset first")
         require(self.action_space.contains(action), f"{shown(action)} is no action of {self.action_space}")
         if isinstance(self.actions, Candidates):
-            pose = self.actions.poses()[int(action)]
+            pose = self._poses[int(action)]
         else:
             pose = self.actions.retract(self._pose, jnp.asarray(action))
         before = self._value

@@ -73,8 +73,8 @@ def _declared(path: Path) -> tuple[int, int]:
     with path.open("rb") as file:
         head = file.read(_HEADER).decode("latin1")
     if path.suffix.lower() == ".off":
-        lines = (line.partition("#")[0] for line in head.removeprefix("OFF").splitlines())
-        counts = [int(word) for word in " ".join(lines).split()[:2]]
+        found = re.match(r"\s*[A-Z]*OFF\s*(\d+)\s+(\d+)", re.sub(r"#.*", "", head))
+        counts = [int(count) for count in found.groups()] if found else []
     elif path.suffix.lower() == ".ply":
         elements = dict(re.findall(r"(?m)^element (\w+) (\d+)\s*$", head.partition("end_header")[0]))
         counts = [int(elements.get(name, 0)) for name in ("vertex", "face")]

@@ -1,14 +1,8 @@
 """Pictures and words: the report of an episode, figures, a live page, and what a notebook shows."""
 
-from typing import Any
-
 import lazy_loader
 
 from jaxnbv.errors import explained_imports
 
 _named, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
-
-def __getattr__(name: str) -> Any:
-    with explained_imports():
-        return _named(name)
+__getattr__ = explained_imports()(_named)

@@ -42,7 +42,6 @@ def test_rewards_add_up_to_what_the_utility_rose_by():
     assert steps == 2
     assert total == pytest.approx(told["utility"] - before)
     assert told["utility"] > 0.5
-    # A ray through the middle meets the ball where it is nearest.
     np.testing.assert_allclose(seen["matrix"], POSES.poses()[1].matrix, atol=1e-6)
     assert seen["depth"].max() > 0
 

@@ -293,3 +293,11 @@ def test_a_ball_contains_what_is_nearer_than_its_radius_however_it_is_wound(outw
     distance = np.linalg.norm(points, axis=1)
     clear = np.abs(distance - 1.25) > 0.02
     np.testing.assert_array_equal(mesh.contains(points)[clear], distance[clear] < 1.25)
+
+
+def test_an_off_file_with_comments_or_colours_is_read(tmp_path):
+    text = "OFF\n# a triangle\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+    (tmp_path / "commented.off").write_text(text)
+    (tmp_path / "coloured.off").write_text(text.replace("OFF", "COFF").replace("# a triangle\n", ""))
+    for name in ("commented.off", "coloured.off"):
+        assert load_mesh(tmp_path / name).faces.tolist() == [[0, 1, 2]]

@@ -95,8 +95,8 @@ def test_first_views_of_trucks_are_random_and_told_apart_by_what_they_show():
     assert {*TruckStudy.groups(shown)} == {"all", "first view with cargo"}
 
 
-def test_where_all_of_the_object_tells_its_class_no_pixels_are_counted():
-    kind = OmniObject3DStudy
+@pytest.mark.parametrize("kind", [pytest.param(ModelNet10Study, marks=pytest.mark.slow), OmniObject3DStudy])
+def test_where_all_of_the_object_tells_its_class_no_pixels_are_counted(kind):
     found = record(kind)
     assert list(found["methods"]) == list(kind.methods)
     assert found["label"] == SCENE % len(kind.objects.classes)
@@ -109,7 +109,7 @@ def test_where_all_of_the_object_tells_its_class_no_pixels_are_counted():
     assert {*kind.groups([found])} == {"all"}
 
 
-@pytest.mark.parametrize("kind", [TruckStudy, OmniObject3DStudy])
+@pytest.mark.parametrize("kind", [TruckStudy, pytest.param(ModelNet10Study, marks=pytest.mark.slow), OmniObject3DStudy])
 def test_tables_charts_and_pictures(kind, tmp_path):
     text = summary([record(kind)], kind)
     assert kind.title in text

@@ -36,15 +36,25 @@ def record():
     return knowing_study().run_scene(SCENE, METHODS)
 
 
-def test_a_choice_is_that_of_the_planner_with_the_same_key(record):
+def choices(*methods):
+    return [(method, view) for method in methods for view in (1, 2)]
+
+
+# Here one by who knows shapes and one by who does not; each compiles a planner.
+FEW = [("cross-entropy", 2), ("uncertainty-screened", 2)]
+
+
+@pytest.mark.parametrize(
+    ("method", "view"),
+    [one if one in FEW else pytest.param(*one, marks=pytest.mark.slow) for one in choices(*METHODS)],
+)
+def test_a_choice_is_that_of_the_planner_with_the_same_key(record, method, view):
     study = knowing_study()
     scene, poses = study.scene(SCENE), np.asarray(study.candidates.poses().position)
-    # One by who knows shapes, one by who does not, at the view where both have something to choose by.
-    for method in ("cross-entropy", "uncertainty-screened"):
-        planner, candidates = study.planner_for(method, scene), record["methods"][method]["runs"][0]["candidates"]
-        evidence = evidence_of(study, planner, scene, candidates[:2])
-        proposed = planner.propose(evidence, step_key(study, 2)).pose.position
-        np.testing.assert_allclose(poses[candidates[2]], proposed, atol=1e-5)
+    planner, candidates = study.planner_for(method, scene), record["methods"][method]["runs"][0]["candidates"]
+    evidence = evidence_of(study, planner, scene, candidates[:view])
+    proposed = planner.propose(evidence, step_key(study, view)).pose.position
+    np.testing.assert_allclose(poses[candidates[view]], proposed, atol=1e-5)
 
 
 def test_the_methods_that_know_no_shapes_are_those_of_a_study_without(record):
