@@ -197,6 +197,8 @@ class Imagination(eqx.Module):
         check_key(key)
         check_type(posterior, SurfacePosterior | None, "the posterior")
         evidence = self.known(evidence)
+        # On its own, so that whoever asks for the posterior too compiles it once.
+        posterior = self.posterior(evidence) if posterior is None else posterior
         surfaces = _sample(self, evidence, key, posterior)
         if not is_traced(surfaces):
             require(
@@ -340,9 +342,8 @@ def _record(
 
 @eqx.filter_jit
 def _sample(
-    imagination: Imagination, evidence: Evidence, key: PRNGKeyArray, posterior: SurfacePosterior | None
+    imagination: Imagination, evidence: Evidence, key: PRNGKeyArray, posterior: SurfacePosterior
 ) -> GridSurface:
-    posterior = imagination.posterior(evidence) if posterior is None else posterior
     fields = posterior.sample(key, imagination.num_samples)
     values = fields.on_grid(imagination.grid.axis) - posterior.level
     return GridSurface.from_values(imagination.carve(evidence, values), 0.0, imagination.grid)

@@ -14,8 +14,7 @@ from PIL import Image
 
 import jaxnbv as nbv
 from jaxnbv.geometry.neighbours import nearest_squared_distance
-from jaxnbv.studies.scenes import demo_object
-from jaxnbv.studies.scenes.pyramid import hidden_view
+from jaxnbv.studies.scenes import demo_object, hidden_view
 from jaxnbv.surfaces.known_shapes import kind_of
 from jaxnbv.viz.data import choice_of
 from jaxnbv.viz.figures import STYLE, draw_acquisition

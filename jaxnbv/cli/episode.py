@@ -8,7 +8,6 @@ import typer
 
 from jaxnbv.cli import actions, options
 from jaxnbv.cli.registry import Device
-from jaxnbv.studies.scenes import Framing
 
 MeshArgument = Annotated[
     Path, typer.Argument(metavar="MESH", help="Any mesh that trimesh reads: OBJ, PLY, STL, OFF, glTF, ...")
@@ -16,16 +15,15 @@ MeshArgument = Annotated[
 SceneOption = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Which object: the number of a scene.")]
 HidingFirstOption = Annotated[
     str | None,
-    typer.Option(help="Position of the first camera, x,y,z.", show_default="one that hides the pattern"),
+    typer.Option(help="Position of the first camera, x,y,z.", show_default="one that does not show the cargo"),
 ]
 
 
 def demo(
     task: options.TaskOption = options.CROSS_ENTROPY,
     scene: SceneOption = 0,
-    framing: options.FramingOption = Framing.WHOLE,
     first: HidingFirstOption = None,
-    search: options.SearchOption = options.DISCRETE,
+    search: options.SearchOption = options.HALVING,
     model: options.ModelOption = options.SCREENED,
     known: options.KnownOption = None,
     views: options.ViewsOption = 5,
@@ -38,12 +36,11 @@ def demo(
     report: options.ReportOption = True,
     device: options.DeviceOption = Device.AUTO,
 ) -> None:
-    """Find out which pattern is pressed into the base of a pyramid: no file, no network.
+    """Find out what a truck carries, which the first view does not show: no file, no network.
 
-    The first view does not show the pattern. The pyramid is small enough for a view to see nearly all of its near side;
-    with --framing close-up a view shows a patch of it. With --task parts the object is a procedural one of thirteen
-    categories, with --task heat one of four kinds that is heated at one place, and with --task coverage a laid tea mug,
-    to be seen all round.
+    Farthest view, which knows nothing of the task, then starts from the same view. With --task parts the object is a
+    procedural one of thirteen categories, with --task heat one of four kinds that is heated at one place, and with
+    --task coverage a laid tea mug, to be seen all round.
     """
     actions.demo(SimpleNamespace(**locals()))
 

@@ -16,7 +16,7 @@ StudyModel = StrEnum("StudyModel", {name.upper(): name for name in STUDY_MODELS}
 SearchName = StrEnum("SearchName", {name.replace("-", "_").upper(): name for name in SEARCHES})  # type: ignore[misc]
 
 COVERAGE, CROSS_ENTROPY = Task("coverage"), Task("cross-entropy")
-DISCRETE, SCREENED = SearchName("discrete"), ModelName("screened")
+DISCRETE, HALVING, SCREENED = SearchName("discrete"), SearchName("halving"), ModelName("screened")
 
 TaskOption = Annotated[
     Task, typer.Option(help="What the views are for. " + "; ".join(f"{n}: {e.about}" for n, e in TASKS.items()) + ".")
@@ -141,12 +141,6 @@ QuickOption = Annotated[
 ]
 ReportOption = Annotated[bool, typer.Option("--report/--no-report", help="Write report.html and the figures.")]
 DeviceOption = Annotated[Device, typer.Option(help="Where to compute; auto takes a GPU if JAX sees one.")]
-FramingOption = Annotated[
-    Framing,
-    typer.Option(
-        help="How large the object stands: its longest side 2.5, a view shows a patch; or 1.25, and it nearly fits."
-    ),
-]
 
 ScenesOption = Annotated[
     str | None,

@@ -1,18 +1,23 @@
 """Discrete search that spends its samples where they matter."""
 
 from collections.abc import Callable
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxnbv.checks import check_fields, require
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.search.base import CandidateSearch, Scores
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal
+
+# Candidates that are scored at once, at the least; and the rank of those that fill a block.
+_LEAST = 8
+_NOBODY = np.iinfo(np.int32).max
 
 
 class HalvingSearch(CandidateSearch):
@@ -39,26 +44,69 @@ class HalvingSearch(CandidateSearch):
         """As `pick`, but candidates are scored only for as long as they are left."""
         candidates = self.candidates.poses()
 
-        def means(left: Int[Array, " left"], samples: slice) -> Float[Array, " left"]:
-            return problem.values(candidates[left], samples)
+        def score(left: Int[Array, " left"], sample: Int[Array, ""]) -> Float[Array, " left"]:
+            return problem.scores(candidates[left], sample[None])[0]
 
-        return self._halved(problem, candidates, means)
+        return self._halved(problem, candidates, score)
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
         """The best of the last round; the value of a candidate that left earlier is its mean until then."""
-        return self._halved(problem, candidates, lambda left, samples: jnp.mean(scores[0, samples][:, left], axis=0))
+        return self._halved(problem, candidates, lambda left, sample: scores[0, sample][left])
 
-    def _halved(self, problem: Problem, candidates: Pose, means_of: Callable) -> Proposal:
-        is_closed = problem.is_closed(candidates)
-        left = jnp.arange(self.candidates.count)
-        totals = jnp.zeros(self.candidates.count, candidates.position.dtype)
-        values, scored = totals, 0
-        while scored < problem.num_samples:
-            if scored:
-                left = left[jax.lax.top_k(values[left], max(1, len(left) // 2))[1]]
-            more = min(max(scored, self.num_first_samples), problem.num_samples - scored)
-            means = means_of(left, slice(scored, scored + more))
-            totals, scored = totals.at[left].add(more * means), scored + more
-            values = values.at[left].set(jnp.where(is_closed[left], -jnp.inf, totals[left] / scored))
-        best = left[jnp.argmax(values[left])]
-        return Proposal(candidates[best], values[best], candidates, values)
+    def _halved(self, problem: Problem, candidates: Pose, score: Callable) -> Proposal:
+        count, is_closed = self.candidates.count, problem.is_closed(candidates)
+        nothing = jnp.zeros(count, candidates.position.dtype)
+
+        def ranked(state, left):
+            """Candidates by their means so far, those that have left last; and the means."""
+            order, totals, scored = state
+            values = jnp.where(is_closed, -jnp.inf, totals / jnp.maximum(scored, 1))
+            among = jnp.where(jnp.arange(count) < left, values[order], -jnp.inf)
+            return order[jnp.argsort(-among, stable=True)], values
+
+        def advance(state, block):
+            order, totals, scored = state
+            order = jax.lax.cond(block.sorts, lambda: ranked(state, block.left)[0], lambda: order)
+            taken = order.at[block.ranks].get(mode="fill", fill_value=0)
+            rows = jnp.where(block.ranks < count, taken, count)
+            totals = totals.at[rows].add(score(taken, block.sample), mode="drop")
+            return (order, totals, scored.at[rows].add(1, mode="drop")), None
+
+        blocks, left = self._blocks(problem.num_samples)
+        state, _ = jax.lax.scan(advance, (jnp.arange(count), nothing, nothing), blocks)
+        order, values = ranked(state, left)
+        return Proposal(candidates[order[0]], values[order[0]], candidates, values)
+
+    def _blocks(self, num_samples: int) -> tuple["_Block", int]:
+        """All rounds as blocks of one size, so that what scores them is compiled once; and how many are left in the
+        end."""
+        rounds: list[tuple[int, range]] = []
+        left, scored = self.candidates.count, 0
+        while scored < num_samples:
+            left = max(1, left // 2) if scored else left
+            upto = min(2 * scored if scored else self.num_first_samples, num_samples)
+            rounds.append((left, range(scored, upto)))
+            scored = upto
+        size = max(left, min(_LEAST, self.candidates.count))
+        before, blocks = self.candidates.count, []
+        for left, samples in rounds:
+            for sample in samples:
+                for start in range(0, left, size):
+                    ranks = np.arange(start, start + size)
+                    sorts = start == 0 and 0 < sample == samples[0]
+                    blocks.append((sorts, before, sample, np.where(ranks < left, ranks, _NOBODY)))
+            before = left
+        return _Block(*map(np.stack, zip(*blocks, strict=True))), left
+
+
+class _Block(NamedTuple):
+    """Some candidates that are scored on one sample.
+
+    - `sorts`: whether candidates are ranked before, the first `left` of them.
+    - `ranks`: the ranks of those that are scored.
+    """
+
+    sorts: Bool[np.ndarray, "*blocks"]
+    left: Int[np.ndarray, "*blocks"]
+    sample: Int[np.ndarray, "*blocks"]
+    ranks: Int[np.ndarray, "*blocks size"]

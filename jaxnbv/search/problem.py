@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.acquisition import Acquisition, sample_scores
 from jaxnbv.checks import InputError
@@ -55,11 +55,13 @@ class Problem(eqx.Module):
         """The same step, asked about another acquisition."""
         return dataclasses.replace(self, acquisition=acquisition).prepared()
 
-    def values(self, poses: Pose, samples: slice = slice(None)) -> Float[Array, " poses"]:
-        """The acquisition at a batch of poses, estimated from all posterior samples or from a part of them."""
-        return jnp.mean(self.scores(poses, samples), axis=0)
+    def values(self, poses: Pose) -> Float[Array, " poses"]:
+        """The acquisition at a batch of poses, estimated from all posterior samples."""
+        return jnp.mean(self.scores(poses), axis=0)
 
-    def scores(self, poses: Pose, samples: slice = slice(None)) -> Float[Array, "*scores samples poses"]:
+    def scores(
+        self, poses: Pose, samples: slice | Int[Array, " some"] = slice(None)
+    ) -> Float[Array, "*scores samples poses"]:
         """The scores whose mean is the acquisition, sample by sample; given the cost of going there, if that counts.
 
         Those of a `Several` come along a leading axis.

@@ -11,7 +11,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.surfaces.covariance import Spectra, normal_covariance
 from jaxnbv.surfaces.matern import Scalar
 
-_ALWAYS_WHOLE = 1024
+_ALWAYS_WHOLE = 2048
 
 
 def factorise(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Float[Array, "n n"]:

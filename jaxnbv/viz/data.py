@@ -142,13 +142,18 @@ class ReportData(eqx.Module):
 
 
 def report_data(
-    episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, progress: bool = True, imagine: bool = True
+    episode: Episode,
+    truth: Float[AnyArray, "n 3"] | None = None,
+    progress: bool = True,
+    imagine: bool = True,
+    rival: Episode | None = None,
 ) -> ReportData:
     """Everything that the pictures of an episode show. Conditions the model once a view, and draws the samples of each
     step again; nothing recompiles after the first.
 
     - `truth`: points of the true surface (scene coordinates); by default sampled from the scene, where it can be.
     - `imagine`: whether what the steps imagined is shown.
+    - `rival`: an episode of another search from the same first view.
     """
     planner = episode.planner
     if truth is None and episode.scene is not None:
@@ -157,7 +162,7 @@ def report_data(
     covered: list[float | None] = [None] * len(episode.views)
     if truth is not None:
         covered = [*coverage(episode.views, truth)]
-    task = task_of(episode, covered)
+    task = task_of(episode, covered, rival)
     drawn: list[ViewData] = []
     known: tuple[Evidence, SurfacePosterior] | None = None
     steps, count = zip(episode.views, episode.evidence(), strict=True), len(episode.views)

@@ -43,6 +43,7 @@ def write_report(
     truth: Float[AnyArray, "n 3"] | None = None,
     title: str = "object",
     progress: bool = True,
+    rival: Episode | None = None,
 ) -> Path:
     """Write `report.html` and `figures/*.png` into a folder, which is made where it is missing, and return the page's
     path. Files of an earlier report are replaced.
@@ -50,11 +51,12 @@ def write_report(
     - `truth`: points of the true surface in scene coordinates, for the chart of coverage; by default sampled from the
       scene, where it can be. Without truth the chart counts points.
     - `title`: what the object is called.
+    - `rival`: an episode of another search from the same first view, to be told of.
 
     **Raises:** `ValueError` if the folder cannot be written, or another process writes in it.
     """
     path = make_folder(folder) / "report.html"
-    data = report_data(episode, truth, progress)
+    data = report_data(episode, truth, progress, rival=rival)
     stills = Stills(data)
     with writing_in(path.parent, _FIGURES):
         write_figures(data, episode.planner.camera, path.parent / _FIGURES, progress, stills)

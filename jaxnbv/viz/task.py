@@ -21,7 +21,8 @@ class Task(eqx.Module):
 
     - `answers`: after each view; `truth`: what they should come to, None where that is not known.
     - `panels`: view by view the charts of the answer.
-    - `asked`, `found`, `sure`: how it was asked, what was found and since when, for the head of the report.
+    - `asked`, `found`, `sure`: how it was asked, what was found and since when, for the head of the report; `race`: how
+      another search fared, "" without one.
     """
 
     answers: tuple[Answer, ...]
@@ -30,6 +31,7 @@ class Task(eqx.Module):
     asked: str
     found: str
     sure: str
+    race: str
 
     @property
     def question(self) -> str:
@@ -42,10 +44,11 @@ class Task(eqx.Module):
         return isinstance(self.answers[-1], CoverageAnswer)
 
 
-def task_of(episode: Episode, covered: list[float | None]) -> Task:
+def task_of(episode: Episode, covered: list[float | None], rival: Episode | None = None) -> Task:
     """The task of an episode's acquisition; that of seeing all of the surface, where it answers nothing.
 
     - `covered`: the share of the true surface that was seen after each view; None where not known.
+    - `rival`: an episode of another search from the same first view.
     """
     acquisition = episode.planner.acquisition
     given = [acquisition.answer(view.cloud) for view in episode.views]
@@ -58,7 +61,7 @@ def task_of(episode: Episode, covered: list[float | None]) -> Task:
         answers = [_coverage(int(view.cloud.count), share) for view, share in zip(episode.views, covered, strict=True)]
     panels = tuple(words_of(answer).panels(truth) for answer in answers)
     head = _asked(episode.planner), _found(answers, truth), _sure(answers, episode)
-    return Task(tuple(answers), truth, panels, *head)
+    return Task(tuple(answers), truth, panels, *head, "" if rival is None else race_words(rival))
 
 
 def true_cloud(scene: Surface, count: int = _TRUE_POINTS) -> PointCloud | None:
@@ -76,6 +79,18 @@ def since(answers: list[Answer]) -> int | None:
     befores = [None, *answers[:-1]]
     relied = [words_of(answer).settled(before) for answer, before in zip(answers, befores, strict=True)]
     return None if not relied[-1] else len(relied) - int(np.argmin([*relied[::-1], False]) - 1)
+
+
+def race_words(rival: Episode) -> str:
+    """When another search, from the same first view, could be relied on."""
+    search, count = type(rival.planner.search).__name__, len(rival.views)
+    given = [rival.planner.acquisition.answer(view.cloud) for view in rival.views]
+    answers = [answer for answer in given if answer is not None]
+    if len(answers) < count:
+        return f"{search}, from the same first view, took {count} views."
+    last, first = words_of(answers[-1]).found, since(answers)
+    when = f"sure from view {first} on" if first else f"not sure after {count} views"
+    return f"{search}, from the same first view: {when} ({last})."
 
 
 def _coverage(count: int, share: float | None) -> CoverageAnswer:

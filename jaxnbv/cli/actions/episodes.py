@@ -5,6 +5,7 @@ import os
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import jax
 import typer
@@ -29,19 +30,36 @@ from jaxnbv.scanning.sensors import Setting
 from jaxnbv.storage.folders import AnotherConfigurationError
 from jaxnbv.studies.scenes.banks import BANKS, bank_poses, shape_bank
 from jaxnbv.surfaces import ShapeBank, Upright
+from jaxnbv.viz.task import race_words
 
 # No view depends on these.
 _FREE = {"views", "until", "out", "overwrite", "report", "device"}
 
 
+class Sizes(NamedTuple):
+    """Posterior samples, candidates (None: as many as the sensor's setting has), points of D that are kept, and the
+    grid of the samples (None: the task's own)."""
+
+    samples: int
+    candidates: int | None
+    capacity: int
+    grid: Grid | None = None
+
+
+USUAL, QUICK = Sizes(16, None, 8192), Sizes(4, 40, 1024, Grid(56))
+_DEMO = Sizes(8, 60, 2048)
+# The baseline that races the demo: its folder within the demo's, and its views at most.
+_RIVAL, _RACE_VIEWS = "farthest", 10
+
+
 def demo(asked: SimpleNamespace) -> None:
-    """One episode of a shipped object.
+    """One episode of a shipped object; where a rule says what is enough, `FarthestView` races it.
 
     **Raises:** `ValueError` for a first view from inside the object.
     """
     prepare(asked.device)
     made = COMMAND_TASKS[asked.task]
-    shown = made.demo(asked.scene, asked.framing, asked.seed)
+    shown = made.demo(asked.scene, asked.seed)
     if shown.note:
         typer.echo(shown.note)
     start = shown.first if asked.first is None else first_pose(asked.first, shown.surface)
@@ -49,10 +67,14 @@ def demo(asked: SimpleNamespace) -> None:
     # The paper's model knows no shapes.
     usual = None if asked.model == "paper" else shown.bank
     known = usual if asked.known is None else asked.known
-    plain = Imagination.preset(asked.model, shown.longest_side, asked.quick, solid=shown.solid)
-    imagination = dataclasses.replace(knowing(plain, known), grid=shown.grid)
-    planner = planner_of(setting, shown.acquisition, asked.search, imagination, asked.quick)
-    _run(shown.name, shown.surface, planner, start, asked, shown.until)
+    imagination = dataclasses.replace(
+        knowing(Imagination.preset(asked.model, quick=asked.quick), known), grid=shown.grid
+    )
+    sizes = QUICK if asked.quick else _DEMO
+    planner = planner_of(setting, shown.acquisition, asked.search, imagination, sizes)
+    races = bool(shown.until) and asked.search != "farthest"
+    rival = planner_of(setting, shown.acquisition, "farthest", imagination, sizes) if races else None
+    _run(shown.name, shown.surface, planner, start, asked, rival, shown.until)
 
 
 def run(asked: SimpleNamespace) -> None:
@@ -67,8 +89,9 @@ def run(asked: SimpleNamespace) -> None:
     start = first_pose(asked.first, surface, None if asked.paper else setting.radius)
     given = Given(OfMesh(surface, start, setting.camera), asked.network, asked.category, asked.source)
     plain = Imagination.preset(asked.model, quick=asked.quick, lengthscale=asked.lengthscale)
-    imagination, sizes = knowing(plain, asked.known), (asked.samples, asked.candidates)
-    planner = planner_of(setting, made.acquisition(given), asked.search, imagination, asked.quick, *sizes)
+    usual = QUICK if asked.quick else USUAL
+    sizes = usual._replace(samples=asked.samples or usual.samples, candidates=asked.candidates or usual.candidates)
+    planner = planner_of(setting, made.acquisition(given), asked.search, knowing(plain, asked.known), sizes)
     for words in peculiarities(asked.mesh, surface, planner.imagination.grid.spacing):
         typer.echo(f"note     {words}")
     _run(asked.mesh.stem, surface, planner, start, asked)
@@ -105,25 +128,25 @@ def task_for(task: str, network: Path | None, category: str | None, source: str 
 
 
 def planner_of(
-    setting: Setting,
-    acquisition: Acquisition,
-    search: str,
-    imagination: Imagination,
-    quick: bool,
-    samples: int | None = None,
-    candidates: int | None = None,
+    setting: Setting, acquisition: Acquisition, search: str, imagination: Imagination, sizes: Sizes
 ) -> Planner:
-    """At the authors' settings, or at small ones; None leaves the usual number."""
-    grid, usual = (Grid(56), 4) if quick else (imagination.grid, 16)
-    imagination = dataclasses.replace(imagination, grid=grid, num_samples=samples or usual)
+    """A planner of a task."""
+    grid = sizes.grid or imagination.grid
+    imagination = dataclasses.replace(imagination, grid=grid, num_samples=sizes.samples)
     # A gradient search looks at its own number of candidates before it climbs.
-    count = 40 if quick else None if search.startswith("gradient") else setting.num_candidates
-    found = search_of(search, setting.radius, candidates or count)
-    return Planner(acquisition, found, setting.camera, imagination, capacity=1024 if quick else 8192)
+    usual = None if search.startswith("gradient") else setting.num_candidates
+    found = search_of(search, setting.radius, sizes.candidates or usual)
+    return Planner(acquisition, found, setting.camera, imagination, capacity=sizes.capacity)
 
 
 def _run(
-    name: str, scene: Surface, planner: Planner, first: Pose, asked: SimpleNamespace, until: tuple[str, ...] = ()
+    name: str,
+    scene: Surface,
+    planner: Planner,
+    first: Pose,
+    asked: SimpleNamespace,
+    rival: Planner | None = None,
+    until: tuple[str, ...] = (),
 ) -> None:
     enough, start = rule(asked.until or until), time.perf_counter()
     folder = asked.out or usual_folder(name, asked.task, asked.search, asked.model, asked.seed)
@@ -132,6 +155,7 @@ def _run(
     if asked.quick:
         typer.echo("--quick: small settings; leave it out for the paper's.")
     if asked.overwrite:
+        clear(folder / _RIVAL)
         clear(folder)
     lines = Lines(planner)
 
@@ -143,6 +167,11 @@ def _run(
     key, noise = jax.random.key(asked.seed), SensorNoise(asked.noise, asked.noise)
     try:
         episode = simulate(planner, scene, first, asked.views, key, noise, folder, until=enough, each=tell)
+        raced = (
+            None
+            if rival is None or enough is None
+            else simulate(rival, scene, first, _RACE_VIEWS, key, noise, folder / _RIVAL, until=enough)
+        )
     except AnotherConfigurationError as error:
         raise InputError(explained(folder, options, error)) from error
     if episode.stopped is not None:
@@ -151,6 +180,8 @@ def _run(
         typer.echo(
             f"enough   after view {len(episode.views)}: {episode.stopped}. {saved} of {asked.views} {views} saved"
         )
+    if raced is not None:
+        typer.echo(f"race     {race_words(raced)}")
     if asked.report:
-        typer.echo(f"report   {viz.write_report(episode, folder, title=name)}")
+        typer.echo(f"report   {viz.write_report(episode, folder, title=name, rival=raced)}")
     typer.echo(f"episode  {folder}   ({time.perf_counter() - start:.0f} s)")

@@ -7,7 +7,7 @@ import typer
 
 from jaxnbv import viz
 from jaxnbv.cli.actions.device import prepare
-from jaxnbv.cli.actions.episodes import knowing, planner_of, task_for
+from jaxnbv.cli.actions.episodes import QUICK, USUAL, knowing, planner_of, task_for
 from jaxnbv.cli.actions.sensors import quick_rays
 from jaxnbv.cli.actions.tasks import Given, OfScan, position
 from jaxnbv.cli.registry import Device
@@ -43,7 +43,7 @@ def replay(
     given = Given(OfScan(*stored.first_view()), network, category, source)
     setting = quick_rays(made.setting) if quick else made.setting
     imagination = knowing(Imagination.preset(model, quick=quick), known)
-    planner = planner_of(setting, made.acquisition(given), search, imagination, quick)
+    planner = planner_of(setting, made.acquisition(given), search, imagination, QUICK if quick else USUAL)
     out = out or folder.with_name(f"{folder.name}-{task}-{search}")
     sought = planner.quantity
     replayed = None

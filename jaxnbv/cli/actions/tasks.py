@@ -23,20 +23,21 @@ from jaxnbv.networks import (
     load_checkpoint,
     network_scale,
     part_segmenter,
-    pyramid_classifier,
+    pretrained_classifier,
 )
 from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, scan
 from jaxnbv.scanning.sensors import HEAT_SETTING, PART_SETTING, USUAL_SETTING, Setting
+from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.studies.scenes import (
-    PATTERNS,
+    HOUSEHOLD,
     Framing,
     Split,
     demo_object,
     heat_scene,
     hidden_view,
     part_scene,
-    pyramid_scene,
     source_view,
+    truck_scene,
 )
 from jaxnbv.tasks import (
     Classifier,
@@ -48,6 +49,9 @@ from jaxnbv.tasks import (
     SoftPartCount,
 )
 from jaxnbv.tasks.diffusion import HeatProblem
+
+# Points of a cloud that the demo's classifier is fed.
+_FED = 512
 
 
 class Known(ABC):
@@ -108,20 +112,18 @@ class Given(NamedTuple):
 class Shown(NamedTuple):
     """An object to show a task on.
 
-    - `longest_side`, `solid`, `grid`: of the imagined surfaces; `note`: what is said of the object before.
-    - `until`: what is enough, as of `--until`; `bank`: the shapes that are known, as of `--known`.
+    - `bank`: the shapes that are known, as of `--known`; `grid`: of the imagined surfaces.
+    - `note`: what is said of the object before; `until`: what is enough, as of `--until`.
     """
 
     name: str
     surface: Surface
     acquisition: Acquisition
     first: Pose
-    longest_side: float = Framing.CLOSE_UP.longest_side
-    solid: bool = False
+    bank: str = "none"
     grid: Grid = Grid()
     note: str = ""
     until: tuple[str, ...] = ()
-    bank: str = "none"
 
 
 class CommandTask(ABC):
@@ -134,7 +136,7 @@ class CommandTask(ABC):
         """The acquisition on a mesh of the user's; options that the task requires are there."""
 
     @abstractmethod
-    def demo(self, scene: int, framing: Framing, seed: int) -> Shown:
+    def demo(self, scene: int, seed: int) -> Shown:
         """One of the objects that ship."""
 
 
@@ -144,7 +146,7 @@ class CoverageTask(CommandTask):
     def acquisition(self, given: Given) -> Acquisition:
         return NewSurface()
 
-    def demo(self, scene: int, framing: Framing, seed: int) -> Shown:
+    def demo(self, scene: int, seed: int) -> Shown:
         """A laid tea mug, the only one."""
         return Shown("mug", demo_object(), NewSurface(), usual_first())
 
@@ -160,16 +162,17 @@ class ClassTask(CommandTask):
         network = load_checkpoint(given.network)
         return self.of(CloudClassifier(network, scale=network_scale(network)))
 
-    def demo(self, scene: int, framing: Framing, seed: int) -> Shown:
-        """A pyramid. The grid is that of the surfaces that the classifier was trained on."""
-        pyramid = pyramid_scene(Split.TEST, scene, framing)
-        side, first = framing.longest_side, hidden_view(pyramid, jax.random.key(seed))
-        note = f"the pattern is a {PATTERNS[int(pyramid.label)]}"
-        acquisition = self.of(pyramid_classifier(side))
+    def demo(self, scene: int, seed: int) -> Shown:
+        """A truck; only what it carries tells the class, and the first view, from above the ground, does not show it.
+        The grid is that of the surfaces that the classifier was trained on."""
+        truck = truck_scene(Split.TEST, scene, turned=False)
+        around = sphere_candidates(120)
+        first = hidden_view(truck, jax.random.key(seed), poses=around[np.asarray(around.position[:, 1]) > 0])
+        side = Framing.CLOSE_UP.longest_side
+        acquisition = self.of(pretrained_classifier("truck", side, num_points=_FED))
+        note = f"the truck carries a {HOUSEHOLD[int(truck.label)]}, which the first view does not show"
         grid = Grid(64, 0.7 * side)
-        return Shown(
-            "pyramid", SDFSurface(pyramid), acquisition, first, side, True, grid, note, ("sure=0.95",), "pyramid"
-        )
+        return Shown("truck", SDFSurface(truck), acquisition, first, "truck", grid, note, ("sure=0.95",))
 
 
 class PartTask(CommandTask):
@@ -184,7 +187,7 @@ class PartTask(CommandTask):
         network = load_checkpoint(given.network)
         return self._of(CloudSegmenter(network, given.category, scale=network_scale(network)))
 
-    def demo(self, scene: int, framing: Framing, seed: int) -> Shown:
+    def demo(self, scene: int, seed: int) -> Shown:
         """A procedural object."""
         thing = part_scene(Split.TEST, scene)
         category = CATEGORIES[int(thing.category)].name
@@ -204,7 +207,7 @@ class HeatTask(CommandTask):
         """Heated at the point that was asked for, or at the one in the middle of the first view."""
         return self._of(_middle(given.known) if given.source is None else _asked(given.known, given.source))
 
-    def demo(self, scene: int, framing: Framing, seed: int) -> Shown:
+    def demo(self, scene: int, seed: int) -> Shown:
         """A procedural object."""
         heated = heat_scene(scene)
         first = source_view(heated, jax.random.key(seed))

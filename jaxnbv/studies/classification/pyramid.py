@@ -17,7 +17,7 @@ from jaxnbv.studies.classification.study import ClassificationStudy, Truth
 from jaxnbv.studies.engine.measures import Measure, Record
 from jaxnbv.studies.engine.study import Chart, Panel, Scene
 from jaxnbv.studies.scenes import CLASS_SETS, ClassSet, Framing, Pyramid
-from jaxnbv.studies.scenes.pyramid import choose_hidden
+from jaxnbv.studies.scenes.class_object import choose_hidden
 
 # Of the cameras from which the pattern cannot be seen two fifths lie in each of the first two, a fifth in the last.
 _ANGLES = {"under 110": (0.0, 110.0), "110-140": (110.0, 140.0), "140-180": (140.0, 180.1)}

@@ -1,4 +1,5 @@
 from .class_object import ClassObject as ClassObject
+from .class_object import hidden_view as hidden_view
 from .class_sets import CLASS_SETS as CLASS_SETS
 from .class_sets import ClassSet as ClassSet
 from .demo import demo_object as demo_object
@@ -22,7 +23,6 @@ from .parts import part_scene as part_scene
 from .parts import sample_part_object as sample_part_object
 from .patterns import PATTERNS as PATTERNS
 from .pyramid import Pyramid as Pyramid
-from .pyramid import hidden_view as hidden_view
 from .pyramid import pyramid_scene as pyramid_scene
 from .pyramid import sample_pyramid as sample_pyramid
 from .splits import Split as Split

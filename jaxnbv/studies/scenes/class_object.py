@@ -1,17 +1,19 @@
 """Objects whose class is asked for."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from jaxnbv.checks import AnyArray
+from jaxnbv.checks import AnyArray, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import SDFSurface, Surface, TriangleMesh, scan
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.scanning.triangles import distance_to_triangles
+from jaxnbv.search.candidates import sphere_candidates
 
 
 class ClassObject(SignedDistance):
@@ -68,3 +70,26 @@ def _scan_telling(
 
 
 _compiled = eqx.filter_jit(_scan_telling)
+
+
+def hidden_view(
+    thing: ClassObject | ClassMesh, key: PRNGKeyArray, camera: Camera = Camera(), poses: Pose | None = None
+) -> Pose:
+    """A pose from which the object shows but not the cue of its class, drawn uniformly.
+
+    - `poses`: from which it is drawn, by default the paper's 120.
+
+    **Raises:** `ValueError` if there is none.
+    """
+    poses = sphere_candidates(120) if poses is None else poses
+    return poses[choose_hidden(*scan_cue(thing, camera, poses), key)]
+
+
+def choose_hidden(cue_pixels: Int[AnyArray, " poses"], scans: PointCloud, key: PRNGKeyArray) -> int:
+    """Index of a pose whose scan hits the object but not the cue of its class, drawn uniformly from them.
+
+    **Raises:** `ValueError` if there is none.
+    """
+    hidden = np.flatnonzero((np.asarray(cue_pixels) == 0) & (np.asarray(scans.count) > 0))
+    require(len(hidden) > 0, f"the cue of the class shows from all {len(cue_pixels)} candidates: ask for more of them")
+    return int(jax.random.choice(key, hidden))

@@ -4,16 +4,11 @@ import functools
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, require
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning.sdf import Matrix, Scalar, Vector, nonnegative, parameter
-from jaxnbv.search.candidates import sphere_candidates
-from jaxnbv.studies.scenes.class_object import ClassObject, scan_cue
+from jaxnbv.studies.scenes.class_object import ClassObject
 from jaxnbv.studies.scenes.framing import Framing
 from jaxnbv.studies.scenes.patterns import PATTERNS, pattern_distance
 from jaxnbv.studies.scenes.splits import Split, scene_key
@@ -120,23 +115,3 @@ def pyramid_scene(
     **Raises:** `ValueError` if the index is negative.
     """
     return sample_pyramid(scene_key(0, split, index), index % len(PATTERNS), framing.longest_side, turned)
-
-
-def hidden_view(pyramid: Pyramid, key: PRNGKeyArray, camera: Camera = Camera(), num_candidates: int = 120) -> Pose:
-    """A candidate from which the object shows but not the pattern, drawn uniformly from them.
-
-    **Raises:** `ValueError` if there is none.
-    """
-    poses = sphere_candidates(num_candidates)
-    pixels, scans = scan_cue(pyramid, camera, poses)
-    return poses[choose_hidden(pixels, scans, key)]
-
-
-def choose_hidden(pattern_pixels: Int[AnyArray, " poses"], scans: PointCloud, key: PRNGKeyArray) -> int:
-    """Index of a pose whose scan hits the object but not the pattern, drawn uniformly from them.
-
-    **Raises:** `ValueError` if there is none.
-    """
-    hidden = np.flatnonzero((np.asarray(pattern_pixels) == 0) & (np.asarray(scans.count) > 0))
-    require(len(hidden) > 0, f"the pattern shows from all {len(pattern_pixels)} candidates: ask for more of them")
-    return int(jax.random.choice(key, hidden))

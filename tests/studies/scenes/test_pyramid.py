@@ -288,8 +288,8 @@ def test_a_hidden_view_does_not_show_the_pattern():
     candidates = np.asarray(sphere_candidates(40, 2.5).position)
     for index, framing in enumerate(Framing):
         pyramid = pyramid_scene(Split.TEST, index, framing)
-        drawn = [hidden_view(pyramid, jax.random.key(seed), CAMERA, num_candidates=40) for seed in range(5)]
-        again = hidden_view(pyramid, jax.random.key(3), CAMERA, num_candidates=40)
+        drawn = [hidden_view(pyramid, jax.random.key(seed), CAMERA, sphere_candidates(40)) for seed in range(5)]
+        again = hidden_view(pyramid, jax.random.key(3), CAMERA, sphere_candidates(40))
         np.testing.assert_array_equal(again.position, drawn[3].position)
         rows = {int(np.linalg.norm(candidates - np.asarray(pose.position), axis=1).argmin()) for pose in drawn}
         assert len(rows) > 2
@@ -318,6 +318,6 @@ def test_bad_input_is_refused():
     rotation = np.stack([across, np.cross(-outward, across), -outward], axis=-1)
     facing = eqx.tree_at(lambda p: (p.rotation, p.offset), pyramid, (jnp.asarray(rotation), jnp.asarray(0.6 * outward)))
     with pytest.raises(InputError, match="shows from all 1 candidates"):
-        hidden_view(facing, jax.random.key(0), CAMERA, num_candidates=1)
+        hidden_view(facing, jax.random.key(0), CAMERA, sphere_candidates(1))
     with pytest.raises(InputError, match="must not be negative"):
         Pyramid(*jax.tree.leaves(eqx.tree_at(lambda p: p.depth, pyramid, jnp.asarray(-0.1))))
