@@ -20,7 +20,7 @@ from jaxnbv.scanning import SDFSurface, Surface
 from jaxnbv.scanning.metrics import truth_points
 from jaxnbv.scanning.sensors import PART_SETTING, USUAL_SETTING, Setting, fitted
 from jaxnbv.search import SphereCandidates
-from jaxnbv.studies.scenes import Framing, Split, demo_object, fruit_scene, household_scene, part_scene, truck_scene
+from jaxnbv.studies.scenes import Split, demo_object, fruit_scene, household_scene, part_scene, truck_scene
 from jaxnbv.viz.data import ReportData, report_data
 from jaxnbv.viz.figures import STYLE, Stills, draw_acquisition
 from jaxnbv.viz.imagined_figures import looks
@@ -44,7 +44,7 @@ class Shown(NamedTuple):
 
 def part_object(index: int) -> Shown:
     """Number `index` of the procedural objects, whose parts are asked for."""
-    made = COMMAND_TASKS["parts"].demo(index, Framing.CLOSE_UP, 0)
+    made = COMMAND_TASKS["parts"].demo(index, 0)
     return Shown(made.name, made.surface, made.acquisition, PART_SETTING)
 
 

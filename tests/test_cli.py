@@ -19,7 +19,7 @@ def finished(tmp_path_factory):
 
 def test_demo_leaves_an_episode_a_report_and_figures(finished):
     folder, result = finished
-    out = folder / "runs" / "pyramid-cross-entropy-discrete-seed0"
+    out = folder / "runs" / "truck-cross-entropy-halving-seed0"
     names = {path.name for path in out.iterdir()}
     assert {"episode.json", "view_00.npz", "view_01.npz", "cloud.ply", "report.html"} <= names
     assert list(out.rglob("*.png"))
@@ -32,14 +32,15 @@ def test_demo_leaves_an_episode_a_report_and_figures(finished):
     assert "\r" not in result.stdout + result.stderr
     assert str(out.relative_to(folder) / "report.html") in result.stdout
     config = json.loads((out / "episode.json").read_text())["config"]
-    assert config["planner"]["search"]["type"] == "DiscreteSearch"
+    assert config["planner"]["search"]["type"] == "HalvingSearch"
 
 
 def test_the_same_command_continues_with_more_views(finished):
     folder, _ = finished
-    out = folder / "runs" / "pyramid-cross-entropy-discrete-seed0"
+    out = folder / "runs" / "truck-cross-entropy-halving-seed0"
     before = {path.name: path.read_bytes() for path in out.glob("view_*.npz")}
-    result = run_command("demo", "--quick", "--known", "none", "--views", "3", "--no-report", cwd=folder)
+    asked = ("--quick", "--known", "none", "--views", "3", "--until", "never", "--no-report")
+    result = run_command("demo", *asked, cwd=folder)
     assert result.returncode == 0, result.stderr
     assert (out / "view_02.npz").exists()
     assert all((out / name).read_bytes() == content for name, content in before.items())
@@ -145,7 +146,7 @@ def test_bad_input_is_one_line_that_names_the_value_and_the_remedy(arguments, wo
 def test_a_folder_of_another_configuration_is_refused(finished):
     """In the user's words; in those of the record where they are not known."""
     folder, _ = finished
-    out = "runs/pyramid-cross-entropy-discrete-seed0"
+    out = "runs/truck-cross-entropy-halving-seed0"
     asked = ("demo", "--views", "2", "--seed", "1", "--scene", "3", "--out", out)
     result = run_command(*asked, cwd=folder)
     assert result.returncode == 2

@@ -111,15 +111,20 @@ class SurfacePosterior(eqx.Module):
     def sample(self, key: PRNGKeyArray, num_samples: int) -> Fields:
         """`num_samples` independent samples of the whole function f."""
 
+    @property
+    def has_closed_forms(self) -> bool:
+        """Whether it has its own `mean`; else moments are estimated from samples."""
+        return type(self).mean is not SurfacePosterior.mean
+
     def drawn(self, num_samples: int = 64) -> "SurfacePosterior":
-        """The posterior itself where it has its own `mean`; else with samples drawn once, under a fixed key, by which
+        """The posterior itself where it has closed forms; else with samples drawn once, under a fixed key, by which
         its moments are estimated. Ask it for more than one moment: the samples are then drawn once.
 
         **Raises:** `ValueError` if `num_samples` < 2.
         """
         check_type(num_samples, int, "the number of samples")
         require(num_samples >= 2, f"a variance of {num_samples} samples was asked for; ask for at least two")
-        return self if type(self).mean is not SurfacePosterior.mean else self._estimated(num_samples)
+        return self if self.has_closed_forms else self._estimated(num_samples)
 
     def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
         """E f(x), here as samples estimate it."""

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from jaxnbv.acquisition import Quantity
@@ -15,9 +16,9 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.imagination import Imagination
-from jaxnbv.planning.episode import Episode
+from jaxnbv.planning.episode import Episode, view_keys
 from jaxnbv.progress import progress_bar
-from jaxnbv.scanning import Evidence
+from jaxnbv.scanning import Evidence, Grid, GridSurface
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.scanning.metrics import coverage, truth_points
 from jaxnbv.search import Proposal
@@ -34,8 +35,6 @@ from jaxnbv.viz.words import describe_choice, describe_first
 _DEVIATION_ANCHORS = 256
 _SLOPE_ANCHORS = 1024
 _SLOPE_STEP = 0.005
-# Of a posterior without closed forms, whose whole functions are laid on the grid.
-_SAMPLES = 16
 # Of the distance to the nearest point. On a cow after one to five views the surface is off by 0.2 to 0.3 of it (root
 # mean square) between 0.1 and 0.4 from the points, two to three of the posterior's standard deviations; the other way
 # round, from the truth to the surface, which may lack a part, by 0.4 to 0.7.
@@ -164,7 +163,7 @@ def report_data(
         covered = [*coverage(episode.views, truth)]
     task = task_of(episode, covered, rival)
     drawn: list[ViewData] = []
-    known: tuple[Evidence, SurfacePosterior] | None = None
+    known: tuple[Evidence, SurfacePosterior, GridSurface] | None = None
     steps, count = zip(episode.views, episode.evidence(), strict=True), len(episode.views)
     bar = progress_bar(steps, progress, desc="drawing views", total=count)
     for index, (view, after) in enumerate(bar):
@@ -172,13 +171,17 @@ def report_data(
         new, _ = view.scan.to_numpy()
         before = episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), new.dtype)
         camera, posterior = view.camera, planner.imagination.posterior(after)
+        # With the key of the next step: what it imagined, and moments where the posterior has no closed ones.
+        surfaces = None
+        if (imagine and index + 1 < count) or not posterior.has_closed_forms:
+            surfaces = planner.imagination.sample(after, view_keys(episode.key, index + 1)[0], posterior)
         drawn.append(
             ViewData(
                 number=index + 1,
                 pose=view.pose,
                 before=before,
                 new=new,
-                surface=allowing_for_unseen(mean_surface(planner.imagination, after, posterior), view.cloud),
+                surface=allowing_for_unseen(mean_surface(planner.imagination, after, posterior, surfaces), view.cloud),
                 choice=choice,
                 coverage=covered[index],
                 count=int(view.cloud.count),
@@ -187,9 +190,9 @@ def report_data(
                 look=look(view.scan, camera, view.pose, before) if view.scan.capacity == camera.num_rays else None,
             )
         )
-        known = after, posterior
-    surfaces = [view.surface.vertices for view in drawn if view.surface is not None]
-    return ReportData(tuple(drawn), values, task, stage_of(episode, surfaces))
+        known = None if surfaces is None else (after, posterior, surfaces)
+    vertices = [view.surface.vertices for view in drawn if view.surface is not None]
+    return ReportData(tuple(drawn), values, task, stage_of(episode, vertices))
 
 
 def _sentence(episode: Episode, index: int, choice: Choice | None, covered: list[float | None], task: Task) -> str:
@@ -239,10 +242,17 @@ def choice_of(proposal: Proposal, wider: SphereMap | None = None) -> Choice:
     )
 
 
-def mean_surface(imagination: Imagination, evidence: Evidence, posterior: SurfacePosterior) -> MeanSurface | None:
+def mean_surface(
+    imagination: Imagination, evidence: Evidence, posterior: SurfacePosterior, surfaces: GridSurface | None = None
+) -> MeanSurface | None:
     """The surface of the mean of the posterior given the evidence, carved as the samples are, with its standard
-    deviation; None if the grid holds none. A posterior that has only samples is drawn from a few fixed ones."""
-    posterior = posterior.drawn(_SAMPLES)
+    deviation; None if the grid holds none.
+
+    - `surfaces`: samples of it, by which a posterior without closed forms is drawn; by default under a fixed key.
+    """
+    if not posterior.has_closed_forms:
+        surfaces = imagination.sample(evidence, jax.random.key(0), posterior) if surfaces is None else surfaces
+        return _mean_of_samples(np.asarray(surfaces.values, np.float64), imagination.grid)
     found = level_triangles(np.array(imagination.mean(evidence, posterior)), imagination.grid)
     if found is None:
         return None
@@ -259,6 +269,18 @@ def mean_surface(imagination: Imagination, evidence: Evidence, posterior: Surfac
     spread = _interpolate(features, few, np.sqrt(np.maximum(variance, 1e-30)))
     deviation = spread / _interpolate(features, anchors, np.maximum(slope, 1e-6))
     return MeanSurface(vertices, faces, normals, deviation)
+
+
+def _mean_of_samples(values: Float[np.ndarray, "s g g g"], grid: Grid) -> MeanSurface | None:
+    mean = values.mean(axis=0)
+    found = level_triangles(mean, grid)
+    if found is None:
+        return None
+    vertices, faces, normals = found
+    place = (vertices + grid.half_extent).T / grid.spacing
+    slope = np.linalg.norm([map_coordinates(part, place, order=1) for part in np.gradient(mean, grid.spacing)], axis=0)
+    spread = map_coordinates(values.std(axis=0, ddof=min(1, len(values) - 1)), place, order=1)
+    return MeanSurface(vertices, faces, normals, spread / np.maximum(slope, 1e-6))
 
 
 def allowing_for_unseen(surface: MeanSurface | None, cloud: PointCloud) -> MeanSurface | None:

@@ -12,7 +12,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.episode import Episode, observe_scene, view_keys
-from jaxnbv.scanning import Evidence, SensorNoise, mean_depth
+from jaxnbv.scanning import Evidence, GridSurface, SensorNoise, mean_depth
 from jaxnbv.search import Proposal
 from jaxnbv.surfaces import KnownShapesPosterior, SurfacePosterior
 
@@ -66,17 +66,17 @@ class Imagined(eqx.Module):
     kinds: tuple[tuple[str, float], ...] = eqx.field(static=True, default=())
 
 
-def imagined(episode: Episode, index: int, evidence: Evidence, posterior: SurfacePosterior) -> Imagined | None:
+def imagined(
+    episode: Episode, index: int, evidence: Evidence, posterior: SurfacePosterior, surfaces: GridSurface
+) -> Imagined | None:
     """What was imagined before view `index` (from 0) was taken; None for one that was not chosen.
 
-    `evidence`: what was known before it; `posterior`: given that. The samples are drawn again with the key of the step,
-    so they are the same.
+    `evidence`: what was known before it; `posterior`: given that; `surfaces`: the step's samples.
     """
     planner, view = episode.planner, episode.views[index]
     if view.proposal is None:
         return None
     sample_key, *_ = view_keys(episode.key, index)
-    surfaces = planner.imagination.sample(evidence, sample_key, posterior)
     other = runner_up(view.proposal) if planner.quantity.smooth else None
     # Two in any case, lest a second program be compiled.
     poses = jax.tree.map(lambda *rows: np.stack(rows), view.pose, view.pose if other is None else other)

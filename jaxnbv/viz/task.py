@@ -12,9 +12,6 @@ from jaxnbv.scanning import Surface
 from jaxnbv.scanning.metrics import true_mesh
 from jaxnbv.viz.answers import CoverageAnswer, Panel, words_of
 
-# Points of the true surface that an acquisition is asked about: the planner's own usual capacity.
-_TRUE_POINTS = 8192
-
 
 class Task(eqx.Module):
     """What the views were for.
@@ -55,7 +52,7 @@ def task_of(episode: Episode, covered: list[float | None], rival: Episode | None
     answers = [answer for answer in given if answer is not None]
     truth = None
     if len(answers) == len(given) and episode.scene is not None:
-        cloud = true_cloud(episode.scene)
+        cloud = true_cloud(episode.scene, episode.planner.capacity)
         truth = None if cloud is None else acquisition.true_answer(episode.scene, cloud)
     if len(answers) < len(given):
         answers = [_coverage(int(view.cloud.count), share) for view, share in zip(episode.views, covered, strict=True)]
@@ -64,7 +61,7 @@ def task_of(episode: Episode, covered: list[float | None], rival: Episode | None
     return Task(tuple(answers), truth, panels, *head, "" if rival is None else race_words(rival))
 
 
-def true_cloud(scene: Surface, count: int = _TRUE_POINTS) -> PointCloud | None:
+def true_cloud(scene: Surface, count: int) -> PointCloud | None:
     """Points all over a known surface with their normals, uniform by area; None for a kind that cannot be sampled."""
     mesh = true_mesh(scene)
     if mesh is None:
@@ -82,15 +79,12 @@ def since(answers: list[Answer]) -> int | None:
 
 
 def race_words(rival: Episode) -> str:
-    """When another search, from the same first view, could be relied on."""
+    """How many views another search needed, from the same first view, until the same rule held."""
     search, count = type(rival.planner.search).__name__, len(rival.views)
-    given = [rival.planner.acquisition.answer(view.cloud) for view in rival.views]
-    answers = [answer for answer in given if answer is not None]
-    if len(answers) < count:
-        return f"{search}, from the same first view, took {count} views."
-    last, first = words_of(answers[-1]).found, since(answers)
-    when = f"sure from view {first} on" if first else f"not sure after {count} views"
-    return f"{search}, from the same first view: {when} ({last})."
+    answer = rival.planner.acquisition.answer(rival.views[-1].cloud)
+    found = "" if answer is None else f" ({words_of(answer).found})"
+    needed = f"needed {count} views" if rival.stopped else f"did not find it in {count} views"
+    return f"{search} {needed} from the same start{found}."
 
 
 def _coverage(count: int, share: float | None) -> CoverageAnswer:

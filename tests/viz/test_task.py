@@ -134,13 +134,13 @@ def test_coverage_by_view_is_the_share_of_the_truth_that_was_seen(plain):
 
 
 def test_truth_of_a_scene_is_all_over_it():
-    cloud = true_cloud(nbv.SDFSurface(Sphere(0.9)))
+    cloud = true_cloud(nbv.SDFSurface(Sphere(0.9)), 8192)
     points, normals = cloud.to_numpy()
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), 0.9, atol=0.01)
     assert np.sum(points * normals, axis=1).min() > 0.85
     assert np.abs(points.mean(axis=0)).max() < 5 * 0.9 / np.sqrt(3 * len(points))
     assert (
-        true_cloud(nbv.GridSurface.from_values(jnp.ones((24, 24, 24)).at[12, 12, 12].set(-1.0), 0.0, nbv.Grid(24)))
+        true_cloud(nbv.GridSurface.from_values(jnp.ones((24, 24, 24)).at[12, 12, 12].set(-1.0), 0.0, nbv.Grid(24)), 8192)
         is None
     )
 

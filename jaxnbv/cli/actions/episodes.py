@@ -47,7 +47,7 @@ class Sizes(NamedTuple):
 
 
 USUAL, QUICK = Sizes(16, None, 8192), Sizes(4, 40, 1024, Grid(56))
-_DEMO = Sizes(8, 60, 2048)
+_DEMO = Sizes(16, 60, 2048)
 # The baseline that races the demo: its folder within the demo's, and its views at most.
 _RIVAL, _RACE_VIEWS = "farthest", 10
 
