@@ -2,8 +2,8 @@
 step of one of them: `python scripts/draw_gallery.py`. About fifteen minutes on two cores."""
 
 import argparse
+import dataclasses
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import matplotlib as mpl
@@ -14,11 +14,11 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 import jaxnbv as nbv
-from jaxnbv.acquisition import Acquisition
+from jaxnbv.cli.actions.episodes import DEMO, knowing, planner_of
 from jaxnbv.cli.actions.tasks import COMMAND_TASKS
 from jaxnbv.scanning import SDFSurface, Surface
 from jaxnbv.scanning.metrics import truth_points
-from jaxnbv.scanning.sensors import PART_SETTING, USUAL_SETTING, Setting, fitted
+from jaxnbv.scanning.sensors import USUAL_SETTING, fitted
 from jaxnbv.search import SphereCandidates
 from jaxnbv.studies.scenes import Split, demo_object, fruit_scene, household_scene, part_scene, truck_scene
 from jaxnbv.viz.data import ReportData, report_data
@@ -30,27 +30,14 @@ from jaxnbv.viz.style import GREY
 from jaxnbv.viz.words import percent
 
 VIEWS, RAYS, CANDIDATES = 4, 48, 60
+# Of the demo that the hero shows.
+SEED = 5
 FIRST = nbv.look_at((0.8, 0.9, 2.2))
 
 
-class Shown(NamedTuple):
-    """An object with a name, what is asked of it, and the usual sensor."""
-
-    name: str
-    surface: Surface
-    acquisition: Acquisition
-    setting: Setting = USUAL_SETTING
-
-
-def part_object(index: int) -> Shown:
-    """Number `index` of the procedural objects, whose parts are asked for."""
-    made = COMMAND_TASKS["parts"].demo(index, 0)
-    return Shown(made.name, made.surface, made.acquisition, PART_SETTING)
-
-
-def objects() -> list[Shown]:
+def objects() -> dict[str, Surface]:
     """Those of the gallery."""
-    scenes = {
+    return {
         "mug": demo_object(),
         "truck with a chair": SDFSurface(truck_scene(Split.TEST, 2)),
         "sofa": SDFSurface(household_scene(Split.TEST, 7)),
@@ -60,27 +47,26 @@ def objects() -> list[Shown]:
         "lamp": SDFSurface(part_scene(Split.TEST, 5).solid),
         "motorbike": SDFSurface(part_scene(Split.TEST, 7).solid),
     }
-    return [Shown(name, surface, nbv.Coverage()) for name, surface in scenes.items()]
 
 
-def episode_of(shown: Shown, views: int) -> nbv.Episode:
+def episode_of(surface: Surface, views: int) -> nbv.Episode:
     """Views of an object that fits the image."""
-    points = truth_points(shown.surface, jax.random.key(0))
-    setting = fitted(shown.setting, float(np.linalg.norm(points, axis=1).max()))
+    points = truth_points(surface, jax.random.key(0))
+    setting = fitted(USUAL_SETTING, float(np.linalg.norm(points, axis=1).max()))
     camera = setting.camera.resized(RAYS, RAYS)
     search = nbv.DiscreteSearch(SphereCandidates(CANDIDATES, setting.radius))
     imagination = nbv.Imagination(grid=nbv.Grid(72), num_samples=8)
-    planner = nbv.Planner(shown.acquisition, search, camera, imagination, capacity=4096)
+    planner = nbv.Planner(nbv.Coverage(), search, camera, imagination, capacity=4096)
     first = nbv.look_at(setting.radius * FIRST.position / np.linalg.norm(FIRST.position))
-    return nbv.simulate(planner, shown.surface, first, views=views, key=jax.random.key(0))
+    return nbv.simulate(planner, surface, first, views=views, key=jax.random.key(0))
 
 
 def draw_gallery(figure: Figure, columns: int = 4) -> None:
     """All objects, each as it is known in the end."""
     shown = objects()
     rows = -(-len(shown) // columns)
-    for index, one in enumerate(tqdm(shown, "objects")):
-        episode = episode_of(one, VIEWS)
+    for index, (name, surface) in enumerate(tqdm(shown.items(), "objects")):
+        episode = episode_of(surface, VIEWS)
         data = report_data(episode, progress=False, imagine=False)
         row, column = divmod(index, columns)
         bottom = 1.0 - (row + 1) / rows
@@ -88,14 +74,17 @@ def draw_gallery(figure: Figure, columns: int = 4) -> None:
         draw_scene(axes, data, VIEWS - 1, Stills(data)[VIEWS - 1], episode.planner.camera, weight=0.8, inset=False)
         covered = data.views[-1].coverage
         assert covered is not None
-        text = f"{one.name}, {percent(covered)} covered"
+        text = f"{name}, {percent(covered)} covered"
         figure.text((column + 0.5) / columns, bottom + 0.04 / rows, text, ha="center", va="center", fontsize=9)
 
 
 def draw_hero(figure: Figure) -> None:
     """One step: what is known, what is imagined, which view is worth most, what it shows, and the answer."""
-    one = part_object(7)
-    episode = episode_of(one, 2)
+    made = COMMAND_TASKS["cross-entropy"]
+    shown = made.demo(0, SEED)
+    imagination = dataclasses.replace(knowing(nbv.Imagination.preset(), shown.bank), grid=shown.grid)
+    planner = planner_of(made.setting, shown.acquisition, "halving", imagination, DEMO)
+    episode = nbv.simulate(planner, shown.surface, shown.first, views=2, key=jax.random.key(SEED))
     data: ReportData = report_data(episode, progress=False)
     stills, camera = Stills(data), episode.planner.camera
     seen = data.views[1].imagined
@@ -103,7 +92,7 @@ def draw_hero(figure: Figure) -> None:
     assert seen is not None
     assert choice is not None
     heads = (
-        (f"one view of a {one.name}", "pale is known, dark is guessed"),
+        ("one view of a truck: what does it carry?", "pale is known, dark is guessed"),
         ("what may be there", "four samples from the next pose, blue where nothing was seen"),
         ("what each view is worth", data.quantity.name),
         ("the next view, and the answer", data.task.found),

@@ -140,7 +140,9 @@ def test_truth_of_a_scene_is_all_over_it():
     assert np.sum(points * normals, axis=1).min() > 0.85
     assert np.abs(points.mean(axis=0)).max() < 5 * 0.9 / np.sqrt(3 * len(points))
     assert (
-        true_cloud(nbv.GridSurface.from_values(jnp.ones((24, 24, 24)).at[12, 12, 12].set(-1.0), 0.0, nbv.Grid(24)), 8192)
+        true_cloud(
+            nbv.GridSurface.from_values(jnp.ones((24, 24, 24)).at[12, 12, 12].set(-1.0), 0.0, nbv.Grid(24)), 8192
+        )
         is None
     )
 

@@ -47,7 +47,7 @@ class Sizes(NamedTuple):
 
 
 USUAL, QUICK = Sizes(16, None, 8192), Sizes(4, 40, 1024, Grid(56))
-_DEMO = Sizes(16, 60, 2048)
+DEMO = Sizes(16, 60, 2048)
 # The baseline that races the demo: its folder within the demo's, and its views at most.
 _RIVAL, _RACE_VIEWS = "farthest", 10
 
@@ -70,7 +70,7 @@ def demo(asked: SimpleNamespace) -> None:
     imagination = dataclasses.replace(
         knowing(Imagination.preset(asked.model, quick=asked.quick), known), grid=shown.grid
     )
-    sizes = QUICK if asked.quick else _DEMO
+    sizes = QUICK if asked.quick else DEMO
     planner = planner_of(setting, shown.acquisition, asked.search, imagination, sizes)
     races = bool(shown.until) and asked.search != "farthest"
     rival = planner_of(setting, shown.acquisition, "farthest", imagination, sizes) if races else None
