@@ -120,7 +120,7 @@ def test_legends_of_the_task_have_room(data, names, bars):
     values = np.linspace(0.0, 1.0, len(names))
     panels = Panel("a quantity with a rather long name, and its unit (units)", names, values, values[::-1], bars, 0.9)
     answer = Answer(names, values)
-    task = Task((answer,) * 3, None, ((panels, panels),) * 3, "", "", "")
+    task = Task((answer,) * 3, None, ((panels, panels),) * 3, "", "", "", "")
     shown = dataclasses.replace(data, task=task)
     with mpl.rc_context(STYLE):
         check_letters(figures_of(shown, CAMERA, Stills(shown))["task"]())

@@ -8,7 +8,8 @@ import pytest
 
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
-from jaxnbv.viz.imagined import Expected, imagined, look, runner_up
+from jaxnbv.viz.data import report_data
+from jaxnbv.viz.imagined import Expected, look, runner_up
 from jaxnbv.viz.imagined_figures import depth_error, depths, looks
 
 CAMERA = nbv.Camera(height=32, width=32)
@@ -51,8 +52,7 @@ def episode():
 
 
 def before(episode, index):
-    evidence = episode.evidence_after(1)
-    return imagined(episode, index, evidence, episode.planner.imagination.posterior(evidence))
+    return report_data(episode, progress=False).views[index].imagined
 
 
 @pytest.fixture(scope="module")

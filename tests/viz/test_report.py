@@ -187,6 +187,7 @@ class SphereModel(nbv.SurfaceModel):
 
 
 def surface_of(imagination, evidence):
+    imagination = dataclasses.replace(imagination, num_samples=64)
     return mean_surface(imagination, evidence, imagination.posterior(evidence))
 
 
