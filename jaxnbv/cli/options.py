@@ -38,7 +38,7 @@ UntilOption = Annotated[
         help="End earlier, by the first of some rules that holds. "
         + "; ".join(f"{n}=N: {about}" for n, about in STOPS.items())
         + "; never: not earlier.",
-        show_default="never; demo of a class: sure=0.95",
+        show_default="never; demo of a class: sure=0.95, of parts: found=60",
     ),
 ]
 OutOption = Annotated[

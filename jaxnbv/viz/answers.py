@@ -187,6 +187,10 @@ class _PartWords(Words):
     def shown(self) -> tuple[int, ...]:
         return self.answer.asked
 
+    def line(self, before: Answer | None = None) -> str:
+        """The points of each part, without those before: up to six parts fit into a line."""
+        return super().line()
+
     def sentence(self, before: Answer | None = None) -> str:
         names, values = self.answer.names, self.answer.values
         listed = ", ".join(f"{names[index]} {values[index]:.0f}" for index in self.shown) or "none"

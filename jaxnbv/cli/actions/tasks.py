@@ -192,7 +192,7 @@ class PartTask(CommandTask):
         thing = part_scene(Split.TEST, scene)
         category = CATEGORIES[int(thing.category)].name
         acquisition = self._of(part_segmenter(category))
-        return Shown(category, SDFSurface(thing.solid), acquisition, usual_first(), bank="parts")
+        return Shown(category, SDFSurface(thing.solid), acquisition, usual_first(), bank="parts", until=("found=60",))
 
     def _of(self, segmenter: CloudSegmenter) -> Acquisition:
         return ExpectedUtilityImprovement(SoftPartCount(segmenter), segmenter.num_points)
