@@ -21,8 +21,8 @@ from tqdm import tqdm
 import jaxnbv as nbv
 
 COMMANDS = {
-    "run": ("demo", "--quick", "--views", "4", "--no-report"),
-    "figures": ("demo", "--quick", "--views", "2"),
+    "run": ("demo", "--quick", "--views", "4", "--until", "never", "--no-report"),
+    "figures": ("demo", "--quick", "--views", "2", "--until", "never"),
     "study": ("study", "pyramid", "--quick", "--scenes", "3", "--views", "2", "--framing", "close-up"),
     "session": ("session", "replay", "SESSION", "--quick", "--no-report"),
 }
