@@ -167,11 +167,9 @@ def _run(
     key, noise = jax.random.key(asked.seed), SensorNoise(asked.noise, asked.noise)
     try:
         episode = simulate(planner, scene, first, asked.views, key, noise, folder, until=enough, each=tell)
-        raced = (
-            None
-            if rival is None or enough is None
-            else simulate(rival, scene, first, _RACE_VIEWS, key, noise, folder / _RIVAL, until=enough)
-        )
+        raced = None
+        if rival is not None and enough is not None:
+            raced = simulate(rival, scene, first, _RACE_VIEWS, key, noise, folder / _RIVAL, until=enough)
     except AnotherConfigurationError as error:
         raise InputError(explained(folder, options, error)) from error
     if episode.stopped is not None:
