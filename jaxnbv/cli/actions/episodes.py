@@ -153,7 +153,7 @@ def _run(
     options = {name: str(value) if isinstance(value, Path) else value for name, value in vars(asked).items()}
     options = {name: value for name, value in options.items() if name not in _FREE}
     if asked.quick:
-        typer.echo("--quick: small settings; leave it out for the paper's.")
+        typer.echo("--quick: small settings; leave it out for the usual ones.")
     if asked.overwrite:
         clear(folder / _RIVAL)
         clear(folder)
