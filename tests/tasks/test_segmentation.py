@@ -143,5 +143,5 @@ def test_the_answer_counts_the_points_of_each_part():
     named = ExpectedUtilityImprovement(SoftPartCount(Named(weight)), num_points=5).answer(cloud)
     words = words_of(named)
     assert words.line() == f"seat {counts[1]}   leg {counts[3]}"
-    assert words.line(plain) == f"seat {counts[1]} -> {counts[1]}   leg {counts[3]} -> {counts[3]}"
+    assert words.line(plain) == words.line()
     assert words.sentence(plain) == f"Points predicted of each part: seat {counts[1]}, leg {counts[3]}."
