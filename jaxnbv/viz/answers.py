@@ -32,7 +32,7 @@ class Panel(NamedTuple):
     - `label`: of its axis, with the unit.
     - `names`, `values`: one each.
     - `true`: what the values would be if all of the surface had been seen; None where that is not known.
-    - `bars`: whether they are drawn beside each other, view by view, rather than as lines over the views.
+    - `one_true`: whether the truth is one of the names, which stands out, rather than values to be reached.
     - `goal`: a value to be reached; None without one.
     """
 
@@ -40,7 +40,7 @@ class Panel(NamedTuple):
     names: tuple[str, ...]
     values: Float[np.ndarray, " n"]
     true: Float[np.ndarray, " n"] | None = None
-    bars: bool = False
+    one_true: bool = False
     goal: float | None = None
 
 
@@ -175,7 +175,7 @@ class _ClassWords(Words):
     def panels(self, truth: Answer | None) -> tuple[Panel, ...]:
         """The probabilities of all classes; of the truth, 1 and 0."""
         true = None if truth is None else truth.values
-        return (Panel("probability", self.answer.names, self.answer.values, true, bars=True, goal=_SURE),)
+        return (Panel("probability", self.answer.names, self.answer.values, true, one_true=True, goal=_SURE),)
 
 
 class _PartWords(Words):
@@ -219,7 +219,7 @@ class _PartWords(Words):
         names = tuple(self.answer.names[index] for index in shown)
         found = np.array([np.sum(values[shown] >= target)], np.float64)
         there = None if truth is None else np.array([np.sum(truth.values[shown] > 0)], np.float64)
-        points = Panel("points predicted of each part", names, values[shown], bars=True, goal=target)
+        points = Panel("points predicted of each part", names, values[shown], goal=target)
         return Panel(f"parts found ({target:g} points or more)", ("parts",), found, there), points
 
 

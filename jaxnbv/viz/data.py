@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import trimesh
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
@@ -14,9 +15,10 @@ from jaxnbv.acquisition import Quantity
 from jaxnbv.checks import AnyArray
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.farthest_points import farthest_point_indices
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.imagination import Imagination
-from jaxnbv.planning.episode import Episode, view_keys
+from jaxnbv.planning.episode import Episode, View, view_keys
 from jaxnbv.progress import progress_bar
 from jaxnbv.scanning import Evidence, Grid, GridSurface
 from jaxnbv.scanning.mesh import level_triangles
@@ -29,7 +31,7 @@ from jaxnbv.viz.sphere import unit
 from jaxnbv.viz.stage import Stage, stage_of
 from jaxnbv.viz.task import Task, task_of
 from jaxnbv.viz.trajectories import Ascents, SphereMap, ascents_of, open_values, wider_map
-from jaxnbv.viz.words import describe_choice, describe_first
+from jaxnbv.viz.words import Told, describe_choice, describe_first
 
 # The variance of one point costs a triangular solve with the whole cloud, the slope two evaluations of the mean.
 _DEVIATION_ANCHORS = 256
@@ -53,6 +55,11 @@ class MeanSurface(eqx.Module):
     faces: Int[np.ndarray, "f 3"]
     normals: Float[np.ndarray, "v 3"]
     deviation: Float[np.ndarray, " v"]
+
+    @property
+    def mesh(self) -> trimesh.Trimesh:
+        """Its triangles alone."""
+        return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
 
 class Choice(eqx.Module):
@@ -100,7 +107,7 @@ class ViewData(eqx.Module):
     - `choice`: None for a view that was given.
     - `coverage`: share of the true surface that was seen; None where the truth is not known.
     - `count`: points of the cloud after this view.
-    - `sentence`: what happened, in words.
+    - `told`: what happened, in words.
     - `imagined`: what was imagined before it was taken; None for a view that was given.
     - `look`: the scan itself; None where it is no image.
     """
@@ -113,9 +120,14 @@ class ViewData(eqx.Module):
     choice: Choice | None
     coverage: float | None
     count: int
-    sentence: str
+    told: Told
     imagined: Imagined | None = None
     look: Look | None = None
+
+    @property
+    def sentence(self) -> str:
+        """What happened, in words."""
+        return self.told.sentence(self.number)
 
     @property
     def spatial_ascents(self) -> Ascents | None:
@@ -132,12 +144,16 @@ class ViewData(eqx.Module):
 
 
 class ReportData(eqx.Module):
-    """All views of an episode, what the values of its search mean, what the views were for, whence they are drawn."""
+    """All views of an episode, what the values of its search mean, what the views were for, whence they are drawn.
+
+    - `frame`: to the world that the object's file was given in; the identity where there was none.
+    """
 
     views: tuple[ViewData, ...]
     quantity: Quantity
     task: Task
     stage: Stage
+    frame: Frame
 
 
 def report_data(
@@ -158,10 +174,12 @@ def report_data(
     if truth is None and episode.scene is not None:
         truth = truth_points(episode.scene, jax.random.key(0))
     values = planner.quantity
-    covered: list[float | None] = [None] * len(episode.views)
-    if truth is not None:
-        covered = [*coverage(episode.views, truth)]
-    task = task_of(episode, covered, rival)
+
+    def covered_by(views: tuple[View, ...]) -> list[float | None]:
+        return [None] * len(views) if truth is None else [*coverage(views, truth)]
+
+    covered = covered_by(episode.views)
+    task = task_of(episode, covered, rival, () if rival is None else covered_by(rival.views))
     drawn: list[ViewData] = []
     known: tuple[Evidence, SurfacePosterior, GridSurface] | None = None
     steps, count = zip(episode.views, episode.evidence(), strict=True), len(episode.views)
@@ -185,23 +203,24 @@ def report_data(
                 choice=choice,
                 coverage=covered[index],
                 count=int(view.cloud.count),
-                sentence=_sentence(episode, index, choice, covered, task),
+                told=_told(episode, index, choice, covered, task),
                 imagined=imagined(episode, index, *known) if imagine and known is not None else None,
                 look=look(view.scan, camera, view.pose, before) if view.scan.capacity == camera.num_rays else None,
             )
         )
         known = None if surfaces is None else (after, posterior, surfaces)
-    vertices = [view.surface.vertices for view in drawn if view.surface is not None]
-    return ReportData(tuple(drawn), values, task, stage_of(episode, vertices))
+    means = [view.surface.mesh for view in drawn if view.surface is not None]
+    frame = getattr(episode.scene, "frame", Frame())
+    return ReportData(tuple(drawn), values, task, stage_of(episode, means), frame)
 
 
-def _sentence(episode: Episode, index: int, choice: Choice | None, covered: list[float | None], task: Task) -> str:
+def _told(episode: Episode, index: int, choice: Choice | None, covered: list[float | None], task: Task) -> Told:
     view, before = episode.views[index], covered[index - 1] if index else None
     points, after = int(view.scan.count), covered[index]
     if choice is None or not index:
-        words = describe_first(view.pose, points, after)
+        told = describe_first(view.pose, points, after)
     else:
-        words = describe_choice(
+        told = describe_choice(
             episode.planner.quantity,
             choice.value,
             choice.rank,
@@ -215,8 +234,9 @@ def _sentence(episode: Episode, index: int, choice: Choice | None, covered: list
             choice.num_tied,
         )
     if not task.is_coverage:
-        words += f" {words_of(task.answers[index]).sentence(task.answers[index - 1] if index else None)}"
-    return f"View {index + 1} {words}"
+        answer = words_of(task.answers[index]).sentence(task.answers[index - 1] if index else None)
+        told = told._replace(came=f"{told.came} {answer}")
+    return told
 
 
 def choice_of(proposal: Proposal, wider: SphereMap | None = None) -> Choice:

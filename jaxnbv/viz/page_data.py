@@ -12,8 +12,7 @@ from PIL import Image
 from jaxnbv.acquisition import Quantity
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.viz import sphere
-from jaxnbv.viz.answers import label_of
-from jaxnbv.viz.data import Choice, MeanSurface, ReportData, ViewData
+from jaxnbv.viz.data import Choice, MeanSurface, ReportData
 from jaxnbv.viz.figures import deviation_range, is_smooth, rings_tied, value_range
 from jaxnbv.viz.render import FRUSTUM_DEPTH, frustum
 from jaxnbv.viz.style import (
@@ -28,43 +27,40 @@ from jaxnbv.viz.style import (
     colour_scale,
     spaced_ticks,
 )
-from jaxnbv.viz.task_figures import coverage_series
 from jaxnbv.viz.trajectories import Ascents
 from jaxnbv.viz.trajectory_figures import frusta_steps, small_frusta, spatial_range
 
 # Of all views together, so that a long episode stays a small page.
 _MAX_POINTS, _MAX_VERTICES = 9000, 48_000
 _FEWEST_POINTS, _MOST_POINTS = 400, 1500
-_FEWEST_VERTICES, _MOST_VERTICES = 1500, 9000
+_FEWEST_VERTICES, _MOST_VERTICES = 1500, 6000
+# Coordinates and deviations are written in so many steps of their ranges.
+_STEPS, _GRADES = 1023, 63
 _QUALITY = 82
 # Between numbers under the bar, of its width on a phone.
 _TICK_GAP = 0.14
 
 
-def payload(data: ReportData, camera: Camera) -> dict:
-    """All of it."""
+def payload(data: ReportData) -> dict:
+    """All but the scene in space."""
     low, high = deviation_range(data)
     ticks = spaced_ticks(low, high, _TICK_GAP)
-    label, series = coverage_series(data)
-    count = len(data.views)
-    points = min(max(_MAX_POINTS // count, _FEWEST_POINTS), _MOST_POINTS)
-    vertices = min(max(_MAX_VERTICES // count, _FEWEST_VERTICES), _MOST_VERTICES)
     return {
-        "views": [_view(view, camera, data, points, vertices) for view in data.views],
-        "stage": {
-            "eye": data.stage.eye.round(4).tolist(),
-            "extent": data.stage.extent,
-            "pull": data.stage.pull,
-            "shrink": data.stage.depth / FRUSTUM_DEPTH,
-        },
+        "views": [
+            {
+                "told": view.told,
+                "matrix": np.asarray(data.frame.to_world(view.pose).to_matrix(), np.float64).round(6).tolist(),
+                "choice": None if view.choice is None else _choice(view.choice, data.quantity),
+            }
+            for view in data.views
+        ],
         "deviation": {
             "range": [math.log10(low), math.log10(high)],
             "ticks": np.log10(ticks).tolist(),
             "labels": [f"{tick:g}" for tick in ticks.tolist()],
             "colours": colour_scale(DEVIATION),
         },
-        "value": {"colours": colour_scale(VALUE), "lines": colour_scale(VALUE_LINES), "label": label_of(data.quantity)},
-        "progress": {"label": label, "values": series.tolist()},
+        "value": {"colours": colour_scale(VALUE), "lines": colour_scale(VALUE_LINES)},
         "map": {
             "graticule": [line.round(3).tolist() for line in sphere.graticule()],
             "width": sphere.WIDTH,
@@ -74,23 +70,34 @@ def payload(data: ReportData, camera: Camera) -> dict:
     }
 
 
+def space(data: ReportData, camera: Camera) -> dict:
+    """The scene in space, for a reader who turns it."""
+    count = len(data.views)
+    points = min(max(_MAX_POINTS // count, _FEWEST_POINTS), _MOST_POINTS)
+    vertices = min(max(_MAX_VERTICES // count, _FEWEST_VERTICES), _MOST_VERTICES)
+    return {
+        "eye": data.stage.eye.round(4).tolist(),
+        "extent": data.stage.extent,
+        "pull": data.stage.pull,
+        "shrink": data.stage.depth / FRUSTUM_DEPTH,
+        "views": [
+            {
+                "new": _thinned(view.new, points),
+                "pull": data.stage.pull_of(view.pose),
+                "frustum": frustum(view.pose, camera).round(4).tolist(),
+                "surface": None if view.surface is None else _surface(view.surface, vertices),
+                "ascents": None if view.spatial_ascents is None else _spatial(view.spatial_ascents, camera),
+            }
+            for view in data.views
+        ],
+    }
+
+
 def picture_address(picture: UInt8[np.ndarray, "h w _"], lossless: bool = False) -> str:
     """An image as a data address."""
     file = io.BytesIO()
     Image.fromarray(picture).save(file, format="WEBP", quality=_QUALITY, lossless=lossless, method=6)
     return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
-
-
-def _view(view: ViewData, camera: Camera, data: ReportData, points: int, vertices: int) -> dict:
-    return {
-        "sentence": view.sentence,
-        "new": _thinned(view.new, points),
-        "pull": data.stage.pull_of(view.pose),
-        "frustum": frustum(view.pose, camera).round(4).tolist(),
-        "surface": None if view.surface is None else _surface(view.surface, vertices),
-        "choice": None if view.choice is None else _choice(view.choice, data.quantity),
-        "ascents": None if view.spatial_ascents is None else _spatial(view.spatial_ascents, camera),
-    }
 
 
 def _thinned(points: Float[np.ndarray, "n 3"], limit: int) -> list[list[float]]:
@@ -117,27 +124,34 @@ def clustered(
 
 
 def _surface(surface: MeanSurface, limit: int) -> dict:
-    """Vertices and logarithms of deviations in whole steps of their ranges."""
+    """Columns of vertices and logarithms of deviations in whole steps, from the lowest; of each face its first corner
+    less that of the face before, and its others less its first. Small numbers, which pack well."""
     own, faces = clustered(surface.vertices, surface.faces, limit)
     count = np.bincount(own)
     vertices = np.stack([np.bincount(own, column) / count for column in surface.vertices.T], axis=1)
     deviation = np.bincount(own, np.log10(surface.deviation)) / count
-    low, high = float(vertices.min()), float(vertices.max())
-    least, most = float(deviation.min()), float(deviation.max())
+    # The least corner comes first, by which the faces are in order.
+    turned = np.take_along_axis(faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    turned = turned[np.lexsort(turned.T[::-1])]
+    first = turned[:, :1]
+    low, step, columns = _in_steps(vertices, _STEPS)
+    least, grade, grades = _in_steps(deviation, _GRADES)
     return {
         "low": low,
-        "step": (high - low) / 65535.0,
-        "vertices": _packed(np.round((vertices - low) / max(high - low, 1e-12) * 65535.0), "<u2"),
-        "faces": _packed(faces, "<u2"),
+        "step": step,
+        "vertices": columns.T.tolist(),
+        "faces": np.concatenate([np.diff(first, axis=0, prepend=0), turned[:, 1:] - first], axis=1).ravel().tolist(),
         "least": least,
-        "grade": (most - least) / 255.0,
-        "deviation": _packed(np.round((deviation - least) / max(most - least, 1e-12) * 255.0), "u1"),
+        "grade": grade,
+        "deviation": grades.tolist(),
     }
 
 
-def _packed(array: np.ndarray, dtype: str) -> str:
-    """The bytes of an array as base64."""
-    return base64.b64encode(np.ascontiguousarray(array, dtype).tobytes()).decode()
+def _in_steps(values: Float[np.ndarray, "*n"], steps: int) -> tuple[float, float, Int[np.ndarray, "*n"]]:
+    """The least value, the size of a step, and how many steps each value is above the least."""
+    low = float(values.min())
+    step = max(float(values.max()) - low, 1e-12) / steps
+    return low, step, np.round((values - low) / step).astype(int)
 
 
 def _choice(choice: Choice, quantity: Quantity) -> dict:

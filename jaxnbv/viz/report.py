@@ -27,7 +27,7 @@ from jaxnbv.viz.figures import STYLE, Stills, write_figures
 from jaxnbv.viz.html import render
 from jaxnbv.viz.imagined import Imagined
 from jaxnbv.viz.imagined_figures import Tile, depths, looks
-from jaxnbv.viz.page_data import payload, picture_address
+from jaxnbv.viz.page_data import payload, picture_address, space
 from jaxnbv.viz.render import draw_scene, look_picture
 from jaxnbv.viz.task_figures import chart_figure, other_charts, task_charts
 
@@ -88,10 +88,15 @@ def report_html(episode: Episode, data: ReportData, title: str, stills: Stills |
         tables=[_table(panels) for panels in zip(*data.task.panels, strict=True)],
         imagined=[_imagined(view.imagined) for view in data.views],
         settings=_settings(episode, title),
-        plotly=gzip.compress(get_plotlyjs().encode(), mtime=0),
+        space=_zipped(json.dumps(space(data, camera), allow_nan=False)),
+        plotly=_zipped(get_plotlyjs()),
         # "</" would end the script element that holds the data.
-        data=json.dumps(payload(data, camera), allow_nan=False).replace("</", "<\\/"),
+        data=json.dumps(payload(data), allow_nan=False).replace("</", "<\\/"),
     )
+
+
+def _zipped(text: str) -> bytes:
+    return gzip.compress(text.encode(), mtime=0)
 
 
 class _Scene(NamedTuple):
@@ -103,7 +108,7 @@ class _Scene(NamedTuple):
 
 
 class _Chart(NamedTuple):
-    """A chart as a drawing, and where its views are, so that the page can mark one."""
+    """A chart as a drawing; where its first view begins and how wide each is, so that the page can mark one."""
 
     name: str
     drawing: bytes
@@ -128,7 +133,7 @@ class _Imagined(NamedTuple):
 
 
 def _scene(data: ReportData, index: int, stills: Stills, camera: Camera) -> _Scene:
-    figure = Figure(figsize=_SCENE)
+    figure = Figure(figsize=_SCENE, facecolor="none")
     axes, aspect = figure.add_axes((0, 0, 1, 1)), _SCENE[0] / _SCENE[1]
     across, up = draw_scene(axes, data, index, stills[index], camera, weight=1.2, inset=False, aspect=aspect)
     canvas = FigureCanvasAgg(figure)
@@ -137,16 +142,16 @@ def _scene(data: ReportData, index: int, stills: Stills, camera: Camera) -> _Sce
     look = data.views[index].look
     seen = None if look is None else picture_address(look_picture(look, plain=True), lossless=True)
     corner = f"{'right' if across else 'left'}:0;{'top' if up else 'bottom'}:0"
-    return _Scene(picture_address(np.asarray(canvas.buffer_rgba())[..., :3]), seen, corner)
+    return _Scene(picture_address(np.asarray(canvas.buffer_rgba())), seen, corner)
 
 
 def _chart(chart: tuple, size: tuple[float, float]) -> _Chart:
     title, _ = chart
     figure, file = chart_figure([chart], *size, titled=False), io.BytesIO()
     with mpl.rc_context({"svg.hashsalt": "jaxnbv"}):
-        figure.savefig(file, format="svg", metadata={"Date": None})
-    place = figure.axes[0].get_position()
-    box = ",".join(f"{share:.4f}" for share in (place.x0, place.width, 1.0 - place.y1, place.height))
+        figure.savefig(file, format="svg", metadata={"Date": None}, transparent=True)
+    place, (left, right) = figure.axes[0].get_position(), figure.axes[0].get_xlim()
+    box = ",".join(f"{share:.4f}" for share in (place.x0, place.width / (right - left), 1.0 - place.y1, place.height))
     return _Chart(_capital(title), file.getvalue(), box)
 
 

@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import numpy as np
+import trimesh
 from jaxtyping import Float
 
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere
@@ -11,7 +12,9 @@ from jaxnbv.planning.episode import Episode
 # counts as so many radii at least.
 _DEPTH, _STAND, _CLOSEST = 0.2, 1.06, 0.35
 _SPREAD, _OUTLINE = 99.0, 1000
-_DIRECTIONS, _HIGHEST = 80, 0.7
+_DIRECTIONS, _HIGHEST = 80, 0.8
+# Of the points that are to be seen so many, as seen from so many radii before them.
+_SEEN, _CLEAR = 300, 0.05
 # A camera nearer to the line of sight than this (cosine) would stand in front of the object.
 _IN_FRONT = 0.9
 
@@ -48,10 +51,10 @@ class Stage(eqx.Module):
         return Pose(pose.rotation, self.pull_of(pose) * pose.position)
 
 
-def stage_of(episode: Episode, surfaces: list[Float[np.ndarray, "_ 3"]]) -> Stage:
-    """The stage of an episode, whose surfaces of the mean have these vertices."""
-    points, normals = episode.cloud.to_numpy()
-    known = [np.asarray(rows, np.float64)[:: max(1, len(rows) // _OUTLINE)] for rows in (points, *surfaces)]
+def stage_of(episode: Episode, surfaces: list[trimesh.Trimesh]) -> Stage:
+    """The stage of an episode with these surfaces of the mean, the last one last."""
+    outlines = episode.cloud.to_numpy()[0], *(np.asarray(surface.vertices) for surface in surfaces)
+    known = [np.asarray(rows, np.float64)[:: max(1, len(rows) // _OUTLINE)] for rows in outlines]
     distances = [np.linalg.norm(rows, axis=1) for rows in known]
     radius = max(float(np.percentile(far, _SPREAD)) for far in distances)
     outline = np.concatenate([rows[far <= radius] for rows, far in zip(known, distances, strict=True)])
@@ -62,15 +65,30 @@ def stage_of(episode: Episode, surfaces: list[Float[np.ndarray, "_ 3"]]) -> Stag
     farthest = max(float(np.linalg.norm(position)) for position in positions)
     depth = _DEPTH * radius
     pull = min(1.0, (_STAND * radius + depth) / max(farthest, 1e-9))
-    return Stage(_eye(normals, [view.pose for view in episode.views]), radius, outline, pull, depth)
-
-
-def _eye(normals: Float[np.ndarray, "n 3"], poses: list[Pose]) -> Float[np.ndarray, "3"]:
-    """The direction that most of what was seen faces, but few cameras stand in."""
+    poses = [view.pose for view in episode.views]
     eyes = np.asarray(fibonacci_sphere(_DIRECTIONS), np.float64)
     eyes = eyes[np.abs(eyes[:, 1]) < _HIGHEST]
+    shown = _shown(episode, surfaces[-1] if surfaces else None, eyes, _CLEAR * radius)
+    return Stage(eyes[int(np.argmax(shown - _in_front(poses, eyes)))], radius, outline, pull, depth)
+
+
+def _shown(
+    episode: Episode, surface: trimesh.Trimesh | None, eyes: Float[np.ndarray, "e 3"], clear: float
+) -> Float[np.ndarray, " e"]:
+    """The share of the points that the chosen views have seen which faces an eye, and is not hidden from it."""
+    scans = [view.scan.to_numpy() for view in episode.views[1:] or episode.views]
+    points, normals = (np.concatenate(rows).astype(np.float64) for rows in zip(*scans, strict=True))
+    few = np.linspace(0, len(points) - 1, min(_SEEN, len(points))).astype(int)
+    facing = normals[few] @ eyes.T > 0.2
+    if surface is not None and len(few):
+        rays = np.repeat(eyes[None], len(few), axis=0)
+        origins = points[few, None] + clear * rays
+        facing &= ~surface.ray.intersects_any(origins.reshape(-1, 3), rays.reshape(-1, 3)).reshape(facing.shape)
+    return np.sum(facing, axis=0) / max(len(few), 1)
+
+
+def _in_front(poses: list[Pose], eyes: Float[np.ndarray, "e 3"]) -> Float[np.ndarray, " e"]:
+    """The share of the cameras that stand between an eye and the object."""
     away = np.stack([np.asarray(pose.position, np.float64) for pose in poses])
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
-    facing = np.mean(normals @ eyes.T > 0.2, axis=0)
-    in_front = np.mean(away @ eyes.T > _IN_FRONT, axis=0)
-    return eyes[int(np.argmax(facing - in_front))]
+    return np.mean(away @ eyes.T > _IN_FRONT, axis=0)

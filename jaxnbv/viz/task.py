@@ -1,5 +1,8 @@
 """The task by view: what was asked, what was found, when it was sure, and the numbers for its charts."""
 
+import re
+from collections.abc import Sequence
+
 import equinox as eqx
 import numpy as np
 import trimesh
@@ -13,13 +16,26 @@ from jaxnbv.scanning.metrics import true_mesh
 from jaxnbv.viz.answers import CoverageAnswer, Panel, words_of
 
 
+class Rival(eqx.Module):
+    """Another search from the same first view.
+
+    - `name`: of the search, in words; `words`: how it fared, in a sentence.
+    - `panels`: view by view the charts of its answer; `covered`: the share of the true surface that it had seen.
+    """
+
+    name: str
+    words: str
+    panels: tuple[tuple[Panel, ...], ...]
+    covered: tuple[float | None, ...]
+
+
 class Task(eqx.Module):
     """What the views were for.
 
     - `answers`: after each view; `truth`: what they should come to, None where that is not known.
     - `panels`: view by view the charts of the answer.
-    - `asked`, `found`, `sure`: how it was asked, what was found and since when, for the head of the report; `race`: how
-      another search fared, "" without one.
+    - `asked`, `found`, `sure`: how it was asked, what was found and since when, for the head of the report.
+    - `rival`: how another search fared; None without one.
     """
 
     answers: tuple[Answer, ...]
@@ -28,7 +44,7 @@ class Task(eqx.Module):
     asked: str
     found: str
     sure: str
-    race: str
+    rival: Rival | None = None
 
     @property
     def question(self) -> str:
@@ -41,24 +57,37 @@ class Task(eqx.Module):
         return isinstance(self.answers[-1], CoverageAnswer)
 
 
-def task_of(episode: Episode, covered: list[float | None], rival: Episode | None = None) -> Task:
+def task_of(
+    episode: Episode,
+    covered: Sequence[float | None],
+    rival: Episode | None = None,
+    rival_covered: Sequence[float | None] = (),
+) -> Task:
     """The task of an episode's acquisition; that of seeing all of the surface, where it answers nothing.
 
-    - `covered`: the share of the true surface that was seen after each view; None where not known.
+    - `covered`, `rival_covered`: the share of the true surface that was seen after each view; None where not known.
     - `rival`: an episode of another search from the same first view.
     """
-    acquisition = episode.planner.acquisition
-    given = [acquisition.answer(view.cloud) for view in episode.views]
-    answers = [answer for answer in given if answer is not None]
-    truth = None
-    if len(answers) == len(given) and episode.scene is not None:
+    answers, truth = _answers(episode, covered), None
+    if episode.scene is not None and not isinstance(answers[-1], CoverageAnswer):
         cloud = true_cloud(episode.scene, episode.planner.capacity)
-        truth = None if cloud is None else acquisition.true_answer(episode.scene, cloud)
-    if len(answers) < len(given):
-        answers = [_coverage(int(view.cloud.count), share) for view, share in zip(episode.views, covered, strict=True)]
+        truth = None if cloud is None else episode.planner.acquisition.true_answer(episode.scene, cloud)
     panels = tuple(words_of(answer).panels(truth) for answer in answers)
-    head = _asked(episode.planner), _found(answers, truth), _sure(answers, episode)
-    return Task(tuple(answers), truth, panels, *head, "" if rival is None else race_words(rival))
+    beside = None
+    if rival is not None:
+        others = tuple(words_of(answer).panels(truth) for answer in _answers(rival, rival_covered))
+        beside = Rival(search_name(rival), race_words(rival), others, tuple(rival_covered))
+    head = _asked(episode.planner), _found(answers, truth), _sure(answers)
+    return Task(tuple(answers), truth, panels, *head, beside)
+
+
+def _answers(episode: Episode, covered: Sequence[float | None]) -> list[Answer]:
+    """After each view; how much was seen, where the acquisition answers nothing."""
+    given = [episode.planner.acquisition.answer(view.cloud) for view in episode.views]
+    answers = [answer for answer in given if answer is not None]
+    if len(answers) == len(given):
+        return answers
+    return [_coverage(int(view.cloud.count), share) for view, share in zip(episode.views, covered, strict=True)]
 
 
 def true_cloud(scene: Surface, count: int) -> PointCloud | None:
@@ -73,18 +102,34 @@ def true_cloud(scene: Surface, count: int) -> PointCloud | None:
 
 def since(answers: list[Answer]) -> int | None:
     """The first view (from 1) from which on all answers can be relied on; None if not even the last can."""
-    befores = [None, *answers[:-1]]
-    relied = [words_of(answer).settled(before) for answer, before in zip(answers, befores, strict=True)]
+    relied = _relied(answers)
     return None if not relied[-1] else len(relied) - int(np.argmin([*relied[::-1], False]) - 1)
+
+
+def lost_again(answers: list[Answer]) -> int | None:
+    """The first view (from 1) whose answer could be relied on, if one after it could not; None otherwise."""
+    relied = _relied(answers)
+    first = int(np.argmax(relied))
+    return first + 1 if relied[first] and not all(relied[first:]) else None
+
+
+def _relied(answers: list[Answer]) -> list[bool]:
+    befores = [None, *answers[:-1]]
+    return [words_of(answer).settled(before) for answer, before in zip(answers, befores, strict=True)]
+
+
+def search_name(episode: Episode) -> str:
+    """The kind of an episode's search in words: "farthest view" of `FarthestView`."""
+    return re.sub("(?<!^)(?=[A-Z])", " ", type(episode.planner.search).__name__).lower()
 
 
 def race_words(rival: Episode) -> str:
     """How many views another search needed, from the same first view, until the same rule held."""
-    search, count = type(rival.planner.search).__name__, len(rival.views)
+    name, count = search_name(rival), len(rival.views)
     answer = rival.planner.acquisition.answer(rival.views[-1].cloud)
     found = "" if answer is None else f" ({words_of(answer).found})"
     needed = f"needed {count} views" if rival.stopped else f"did not find it in {count} views"
-    return f"{search} {needed} from the same start{found}."
+    return f"{name.capitalize()} {needed} from the same start{found}."
 
 
 def _coverage(count: int, share: float | None) -> CoverageAnswer:
@@ -94,8 +139,10 @@ def _coverage(count: int, share: float | None) -> CoverageAnswer:
 
 
 def _asked(planner: Planner) -> str:
-    samples = f" over {planner.imagination.num_samples} imagined surfaces a step" if planner.search.uses_samples else ""
-    return f"Each view is where the {planner.quantity.name} is highest, by {type(planner.search).__name__}{samples}."
+    name = planner.quantity.name
+    if not planner.search.uses_samples:
+        return f"Each view is where the {name} is highest."
+    return f"Each view is where the {name} is highest, over {planner.imagination.num_samples} imagined surfaces."
 
 
 def _found(answers: list[Answer], truth: Answer | None) -> str:
@@ -104,8 +151,8 @@ def _found(answers: list[Answer], truth: Answer | None) -> str:
     return text if truth is None else f"{text}. In truth: {words_of(truth).found}"
 
 
-def _sure(answers: list[Answer], episode: Episode) -> str:
-    first, count = since(answers), len(answers)
+def _sure(answers: list[Answer]) -> str:
+    first, count, lost = since(answers), len(answers), lost_again(answers)
     text = f"From view {first} on" if first else f"Not yet after {count} view{'s' * (count > 1)}"
-    text = f"{text}; sure means {words_of(answers[-1]).settled_means}."
-    return f"{text} Ended: {episode.stopped}." if episode.stopped else text
+    again = f" At view {lost} it was sure already, but then not." if lost else ""
+    return f"{text}.{again} Sure means {words_of(answers[-1]).settled_means}."

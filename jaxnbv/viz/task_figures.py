@@ -1,5 +1,6 @@
 """The charts of an episode: its task by view, how much was seen, what the chosen views were worth."""
 
+import itertools
 import textwrap
 from functools import partial
 from typing import Any
@@ -9,7 +10,6 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from matplotlib.transforms import ScaledTranslation
 
@@ -30,41 +30,44 @@ def shown_names(panels: tuple[Panel, ...]) -> list[int]:
     return sorted(np.argsort(-reached, kind="stable")[:_MOST_NAMES].tolist())
 
 
-def draw_panel(axes: Axes, panels: tuple[Panel, ...]) -> None:
-    """Draw a chart of the task, of which each view has a panel: bars side by side, or lines, with what is true."""
+def draw_panel(axes: Axes, panels: tuple[Panel, ...], rival: tuple[Panel, ...] = (), rival_name: str = "") -> None:
+    """Draw a chart of the task, of which each view has a panel, as lines over the views, with what is true; of a rival
+    the number that the chart is about, where it is about one."""
     last, chosen = panels[-1], shown_names(panels)
     values, views = np.stack([panel.values for panel in panels]), np.arange(1, len(panels) + 1)
-    colours = _colours(last, chosen)
+    marked, others = _stands_out(last), iter(SERIES * 2)
     handles: list[Any] = []
-    for place, index in enumerate(chosen):
-        name, colour = textwrap.shorten(last.names[index], _LONGEST_NAME, placeholder="…"), colours[place]
-        if last.bars:
-            width = 0.8 / len(chosen)
-            at = views + width * (place - 0.5 * (len(chosen) - 1))
-            axes.bar(at, values[:, index], 0.9 * width, color=colour, zorder=2)
-            is_true = last.true is not None and last.true[index] > 0
-            handles.append(Patch(color=colour, label=f"{name} (true)" if is_true else name))
-            continue
+    for index in chosen:
+        name = textwrap.shorten(last.names[index], _LONGEST_NAME, placeholder="…")
+        colour, label = (NEW, f"{name} (true)") if index == marked else (next(others), name)
         axes.plot(views, values[:, index], color=colour, lw=1.6, marker="o", ms=5, markeredgecolor="white", zorder=3)
-        handles.append(Line2D([], [], color=colour, marker="o", ms=5, label=name))
-        if last.true is not None:
+        handles.append(Line2D([], [], color=colour, marker="o", ms=5, label=label))
+        if last.true is not None and not last.one_true:
             axes.axhline(last.true[index], color=colour, lw=1.2, ls="--", zorder=1)
-    if last.true is not None and not last.bars:
+    if last.true is not None and not last.one_true:
         handles.append(Line2D([], [], color=GREY, lw=1.2, ls="--", label="in truth"))
+    shown = 0 if len(last.names) == 1 else marked
+    if rival and shown is not None:
+        handles.append(_draw_rival(axes, np.array([panel.values[shown] for panel in rival]), rival_name))
     if last.goal is not None:
         axes.axhline(last.goal, color=GREY, lw=1.0, ls=":", zorder=1)
     if len(handles) > 1:
         legend_below(axes, handles)
     low, high = axes.get_ylim()
     axes.set_ylim(min(low, 0.0) if values.min() >= 0 else low, high + 0.05 * (high - low))
-    over_views(axes, len(panels))
+    over_views(axes, max(len(panels), len(rival)))
 
 
-def _colours(last: Panel, chosen: list[int]) -> list[str]:
-    """Of the numbers that are drawn; one that is the only true one stands out."""
-    marked = [] if last.true is None or not last.bars else [index for index in chosen if last.true[index] > 0]
-    others = iter(SERIES * 2)
-    return [NEW if marked == [index] else next(others) for index in chosen]
+def _stands_out(last: Panel) -> int | None:
+    """Which number is the one true one, if one is."""
+    return int(np.argmax(last.true)) if last.one_true and last.true is not None else None
+
+
+def _draw_rival(axes: Axes, values: Float[np.ndarray, " v"], name: str) -> Line2D:
+    """Draw what another search came to, behind all else; returns its mark for a legend."""
+    style: dict[str, Any] = {"color": GREY, "lw": 1.4, "ls": (0, (4, 2)), "marker": "s", "ms": 3.5}
+    axes.plot(np.arange(1, len(values) + 1), values, zorder=2, **style)
+    return Line2D([], [], label=name, **style)
 
 
 def legend_below(axes: Axes, handles: list[Any]) -> None:
@@ -116,8 +119,13 @@ def draw_coverage(axes: Axes, data: ReportData) -> None:
         for view, value in zip(views, values, strict=True):
             text = number(value) if label == "points kept" else f"{value:.0f}"
             axes.annotate(text, (view, value), (0, 6), textcoords="offset points", ha="center", fontsize=8)
-    axes.set(ylim=(0, 1.18 * max(float(values.max()), 1.0)))
-    over_views(axes, len(values))
+    highest, rival = float(values.max()), data.task.rival
+    if rival is not None and data.views[0].coverage is not None:
+        shares = 100.0 * np.array(rival.covered, np.float64)
+        legend_below(axes, [_draw_rival(axes, shares, rival.name)])
+        highest = max(highest, float(shares.max()))
+    axes.set(ylim=(0, 1.18 * max(highest, 1.0)))
+    over_views(axes, max(len(values), 0 if rival is None else len(rival.covered)))
 
 
 def draw_values(axes: Axes, data: ReportData) -> None:
@@ -146,8 +154,14 @@ def draw_values(axes: Axes, data: ReportData) -> None:
 
 def task_charts(data: ReportData) -> list[tuple[str, Any]]:
     """The title of each chart of the task, and what draws it."""
-    by_chart = zip(*data.task.panels, strict=True)
-    return [(panels[-1].label, partial(draw_panel, panels=panels)) for panels in by_chart]
+    rival = data.task.rival
+    beside = itertools.repeat(()) if rival is None else zip(*rival.panels, strict=True)
+    name = "" if rival is None else rival.name
+    by_chart = zip(zip(*data.task.panels, strict=True), beside, strict=False)
+    return [
+        (panels[-1].label, partial(draw_panel, panels=panels, rival=other, rival_name=name))
+        for panels, other in by_chart
+    ]
 
 
 def other_charts(data: ReportData) -> list[tuple[str, Any]]:

@@ -1,13 +1,15 @@
 """Pictures that can be read: letters that do not collide and are not cut; a page that stays small."""
 
-import base64
 import dataclasses
+import gzip
 import itertools
 import json
 
+import equinox as eqx
 import matplotlib as mpl
 import numpy as np
 import pytest
+import trimesh
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 from small_run import CAMERA, small_run
@@ -18,10 +20,10 @@ from jaxnbv.viz import report_data
 from jaxnbv.viz.answers import Panel
 from jaxnbv.viz.data import MeanSurface
 from jaxnbv.viz.figures import STYLE, Stills, figures_of
-from jaxnbv.viz.page_data import clustered, payload
+from jaxnbv.viz.page_data import clustered, payload, space
 from jaxnbv.viz.stage import stage_of
 from jaxnbv.viz.style import spaced_ticks
-from jaxnbv.viz.task import Task
+from jaxnbv.viz.task import Rival, Task
 
 
 @pytest.fixture(scope="module")
@@ -115,12 +117,15 @@ def test_the_ticks_of_any_range_have_room(data, low, monkeypatch):
 
 
 @pytest.mark.parametrize("names", [("one",), tuple("abcde"), tuple(f"a part of a name of {k}" for k in range(12))])
-@pytest.mark.parametrize("bars", [True, False])
-def test_legends_of_the_task_have_room(data, names, bars):
+@pytest.mark.parametrize("one_true", [True, False])
+def test_legends_of_the_task_have_room(data, names, one_true):
     values = np.linspace(0.0, 1.0, len(names))
-    panels = Panel("a quantity with a rather long name, and its unit (units)", names, values, values[::-1], bars, 0.9)
+    panels = Panel(
+        "a quantity with a rather long name, and its unit (units)", names, values, values[::-1], one_true, 0.9
+    )
     answer = Answer(names, values)
-    task = Task((answer,) * 3, None, ((panels, panels),) * 3, "", "", "", "")
+    rival = Rival("farthest view", "", ((panels, panels),) * 7, (0.5,) * 7)
+    task = Task((answer,) * 3, None, ((panels, panels),) * 3, "", "", "", rival)
     shown = dataclasses.replace(data, task=task)
     with mpl.rc_context(STYLE):
         check_letters(figures_of(shown, CAMERA, Stills(shown))["task"]())
@@ -168,21 +173,28 @@ def test_ten_views_of_fine_surfaces_make_a_small_page(data):
     """Plotly takes 2 MB, packed, and the pictures of a view less than 0.1 MB."""
     shown = of_views(data, 10)
     views = tuple(dataclasses.replace(view, surface=ball()) for view in shown.views)
-    found = payload(dataclasses.replace(shown, views=views), CAMERA)
-    assert len(json.dumps(found)) < 1.2e6
+    found = space(dataclasses.replace(shown, views=views), CAMERA)
+    assert len(gzip.compress(json.dumps(found).encode())) < 4e5
     packed = found["views"][9]["surface"]
-    steps = np.frombuffer(base64.b64decode(packed["vertices"]), "<u2").reshape(-1, 3)
-    vertices = packed["low"] + packed["step"] * steps
-    deviation = packed["least"] + packed["grade"] * np.frombuffer(base64.b64decode(packed["deviation"]), "u1")
-    faces = np.frombuffer(base64.b64decode(packed["faces"]), "<u2").reshape(-1, 3)
+    vertices = packed["low"] + packed["step"] * np.array(packed["vertices"]).T
+    deviation = packed["least"] + packed["grade"] * np.array(packed["deviation"])
+    faces = np.array(packed["faces"]).reshape(-1, 3)
+    faces[:, 0] = np.cumsum(faces[:, 0])
+    faces[:, 1:] += faces[:, :1]
+    assert faces.min() == 0
     assert faces.max() < len(vertices) == len(deviation)
+    corners = vertices[faces]
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    # All of the sphere, and its outside outside.
+    assert 0.5 * np.linalg.norm(areas, axis=1).sum() == pytest.approx(4.0 * np.pi, rel=0.03)
+    assert np.mean(np.sum(areas * corners.mean(axis=1), axis=1) > 0) > 0.99
     np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1.0, atol=0.02)
     np.testing.assert_allclose(deviation[vertices[:, 1] > 0.1], -2.0, atol=0.01)
     np.testing.assert_allclose(deviation[vertices[:, 1] < -0.1], -1.0, atol=0.01)
 
 
 def test_all_cameras_stand_beside_the_object_in_one_picture(episode):
-    stage = stage_of(episode, [ball().vertices])
+    stage = stage_of(episode, [ball().mesh])
     assert np.linalg.norm(stage.eye) == pytest.approx(1.0)
     for view in episode.views:
         position = np.asarray(stage.pulled(view.pose).position, np.float64)
@@ -192,8 +204,23 @@ def test_all_cameras_stand_beside_the_object_in_one_picture(episode):
         np.testing.assert_allclose(position / distance, np.asarray(view.pose.position) / 2.5, atol=0.05)
 
 
+def test_the_picture_is_drawn_from_where_what_the_chosen_views_saw_is_not_hidden(episode):
+    """Inside a box that is open above: points on its floor are seen from above only."""
+    floor = np.stack([*np.mgrid[-0.4:0.4:8j, 0.0:0.1:1j, -0.4:0.4:8j]], axis=-1).reshape(-1, 3)
+    scan = nbv.PointCloud.from_arrays(floor, np.tile([0.0, 1.0, 0.0], (len(floor), 1)))
+    seen = eqx.tree_at(lambda e: [v.scan for v in e.views], episode, [scan] * 3, is_leaf=lambda x: x is None)
+    heights = {}
+    for height in (0.05, 0.6):
+        sides = trimesh.creation.box((1.0, height, 1.0))
+        sides.apply_translation((0.0, 0.5 * height, 0.0))
+        sides.update_faces(sides.face_normals[:, 1] < 0.5)
+        heights[height] = stage_of(seen, [sides]).eye[1]
+        assert stage_of(seen, []).eye[1] > 0.2
+    assert heights[0.6] > 0.6
+
+
 def test_standard_errors_are_on_the_page(episode, data):
-    shown = payload(data, CAMERA)["views"][1]["choice"]
+    shown = payload(data)["views"][1]["choice"]
     proposal = episode.views[1].proposal
     np.testing.assert_allclose(shown["errors"], np.asarray(proposal.standard_errors), rtol=1e-3)
     chosen = int(np.argmax(np.asarray(proposal.values)))
@@ -213,7 +240,7 @@ def test_a_record_without_standard_errors_gives_a_page_too(episode):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jaxnbv.viz.data.mean_surface", lambda *arguments: None)
         old = report_data(dataclasses.replace(episode, views=views), progress=False, imagine=False)
-    shown = payload(old, CAMERA)["views"][1]["choice"]
+    shown = payload(old)["views"][1]["choice"]
     assert shown["errors"] is None
     assert shown["error"] is None
     assert shown["tied"] == []

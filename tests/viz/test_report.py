@@ -1,6 +1,8 @@
 """The report: self-contained, complete, true to the episode; and what its pictures are made of."""
 
+import base64
 import dataclasses
+import gzip
 import json
 import re
 from html.parser import HTMLParser
@@ -66,12 +68,17 @@ def page_data(path):
     return json.loads(next(text for text in scripts if text.startswith('{"views"')))
 
 
+def scene_in_space(path):
+    packed = re.search('id="inspace">([^<]*)<', path.read_text(encoding="utf-8"))[1]
+    return json.loads(gzip.decompress(base64.b64decode(packed)))
+
+
 def test_the_page_loads_nothing_from_elsewhere(report):
     text = report.read_text(encoding="utf-8")
     page = Page(text)
     assert all(load.startswith("data:") for load in page.loads)
     assert "link" in page.tags
-    assert page.tags.count("script") == 3
+    assert page.tags.count("script") == 4
     style = text[text.index("<style>") : text.index("</style>")]
     assert "@import" not in style
     assert "url(" not in style
@@ -86,9 +93,10 @@ def test_the_page_holds_every_view_and_escapes_its_title(report, episode):
     assert not re.search(r"{{|{%", text)
     data = page_data(report)
     assert len(data["views"]) == len(episode.views) == 3
-    for i, (shown, view) in enumerate(zip(data["views"], episode.views, strict=True), start=1):
-        assert shown["sentence"].startswith(f"View {i} ")
-        assert shown["sentence"] in text.replace("&#x27;", "'")
+    spatial = scene_in_space(report)["views"]
+    for told, shown, view in zip(data["views"], spatial, episode.views, strict=True):
+        assert all(part in text.replace("&#x27;", "'") for part in told["told"])
+        np.testing.assert_allclose(told["matrix"], view.pose.to_matrix(), atol=1e-5)
         new = view.scan.to_numpy()[0]
         assert 0 < len(shown["new"]) <= len(new)
         nearest = np.linalg.norm(np.array(shown["new"])[:, None] - new[None], axis=-1).min(axis=1)
@@ -162,7 +170,9 @@ def test_a_scene_without_truth_counts_points(tmp_path, episode):
     scene = nbv.GridSurface.from_values(distance, 0.0, grid)
     lone = dataclasses.replace(episode, scene=scene, views=episode.views[:1])
     path = write_report(lone, tmp_path, progress=False)
-    assert page_data(path)["progress"] == {"label": "points kept", "values": [float(lone.cloud.count)]}
+    page = path.read_text(encoding="utf-8")
+    assert "<h2>Points kept</h2>" in page
+    assert f"<td>{number(float(lone.cloud.count))}</td>" in page
     truth = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
     assert report_data(lone, truth, progress=False).views[0].coverage in (0.0, 0.5, 1.0)
 

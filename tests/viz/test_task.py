@@ -21,7 +21,8 @@ from jaxnbv.tasks.segmentation import PartAnswer
 from jaxnbv.viz.answers import number, words_of
 from jaxnbv.viz.data import report_data
 from jaxnbv.viz.report import report_html
-from jaxnbv.viz.task import since, true_cloud
+from jaxnbv.viz.task import lost_again, since, true_cloud
+from jaxnbv.viz.task_figures import chart_figure, task_charts
 
 NAMES = ("left", "right", "up")
 
@@ -199,6 +200,35 @@ def classes(*rows):
 )
 def test_since_when_an_answer_can_be_relied_on(answers, view):
     assert since(answers) == view
+
+
+@pytest.mark.parametrize(
+    ("answers", "view"), [(classes(0.5, 0.96, 0.97), None), (classes(0.96, 0.9, 0.97), 1), (classes(0.5, 0.6), None)]
+)
+def test_an_answer_that_was_lost_again_is_told(answers, view):
+    assert lost_again(answers) == view
+
+
+def test_a_rival_is_told_of_and_drawn(plain):
+    scene, score = nbv.SDFSurface(pyramid_scene(Split.TEST, 1)), nbv.CrossEntropy(Leaning(), 512)
+    episode = run(score, scene, views=2)
+    other = small_run(nbv.FarthestView(8), 3, scene, score, nbv.SensorNoise(0.0, 0.0))
+    data = report_data(episode, progress=False, imagine=False, rival=other)
+    rival = data.task.rival
+    p = np.exp(np.asarray(Leaning()(other.cloud), np.float64))
+    assert rival.words.startswith("Farthest view did not find it in 3 views from the same start")
+    assert rival.words.endswith(f"({NAMES[int(np.argmax(p))]}, probability {p.max():.2f}).")
+    np.testing.assert_allclose(rival.panels[2][0].values, p, atol=1e-6)
+    truth = nbv.metrics.truth_points(scene, jax.random.key(0))
+    np.testing.assert_allclose(rival.covered, nbv.metrics.coverage(other.views, truth))
+    assert rival.words in report_html(episode, data, "thing")
+    (figure,) = (chart_figure(task_charts(data)),)
+    (axes,) = figure.axes
+    drawn = [line.get_ydata() for line in axes.lines]
+    assert any(
+        len(values) == 3 and np.allclose(values, [panel[0].values[1] for panel in rival.panels]) for values in drawn
+    )
+    assert axes.get_xlim() == (0.5, 3.5)
 
 
 def test_the_page_opens_with_the_answer_and_folds_the_settings_away(plain):
