@@ -1,5 +1,6 @@
 """What the commands' options mean."""
 
+from collections.abc import Iterable
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -18,74 +19,102 @@ SearchName = StrEnum("SearchName", {name.replace("-", "_").upper(): name for nam
 COVERAGE, CROSS_ENTROPY = Task("coverage"), Task("cross-entropy")
 DISCRETE, HALVING, SCREENED = SearchName("discrete"), SearchName("halving"), ModelName("screened")
 
+# The groups of the help.
+_ASK, _SEE, _IMAGINE, _FIND, _RUN = (
+    "What to find out",
+    "Sensor",
+    "What is imagined",
+    "How views are found",
+    "The run",
+)
+
+
+def _listed(choices: Iterable[tuple[str, str]]) -> str:
+    return "; ".join(f"{name}: {about}" for name, about in choices) + "."
+
+
 TaskOption = Annotated[
-    Task, typer.Option(help="What the views are for. " + "; ".join(f"{n}: {e.about}" for n, e in TASKS.items()) + ".")
+    Task,
+    typer.Option(metavar="TASK", help=_listed((n, e.about) for n, e in TASKS.items()), rich_help_panel=_ASK),
 ]
 SearchOption = Annotated[
-    SearchName,
-    typer.Option(
-        help="How the next view is found. " + "; ".join(f"{n}: {about}" for n, about in SEARCHES.items()) + "."
-    ),
+    SearchName, typer.Option(metavar="SEARCH", help=_listed(SEARCHES.items()), rich_help_panel=_FIND)
 ]
-ViewsOption = Annotated[int, typer.Option(help="Views in all, the first one included.")]
+ViewsOption = Annotated[
+    int, typer.Option(metavar="N", help="Views in all, the first one included.", rich_help_panel=_ASK)
+]
 SeedOption = Annotated[
-    int, typer.Option(min=0, max=2**63 - 1, help="Seed of the sensor's noise and of the posterior samples.")
+    int,
+    typer.Option(
+        metavar="N", min=0, max=2**63 - 1, help="Seed of the sensor's noise and of the samples.", rich_help_panel=_RUN
+    ),
 ]
 UntilOption = Annotated[
     list[str] | None,
     typer.Option(
         metavar="RULE=N",
-        help="End earlier, by the first of some rules that holds. "
-        + "; ".join(f"{n}=N: {about}" for n, about in STOPS.items())
-        + "; never: not earlier.",
+        help="End once a rule holds; can be given several times. " + _listed(STOPS.items()) + " Or never.",
         show_default="never; demo of a class: sure=0.95, of parts: found=60",
+        rich_help_panel=_ASK,
     ),
 ]
 OutOption = Annotated[
-    Path | None, typer.Option(help="Output folder.", show_default="runs/NAME-TASK-SEARCH[-MODEL]-seedN")
+    Path | None,
+    typer.Option(
+        metavar="DIR", help="Output folder.", show_default="runs/NAME-TASK-SEARCH[-MODEL]-seedN", rich_help_panel=_RUN
+    ),
 ]
 OverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", help="Begin anew: an episode that the output folder holds is removed.")
+    bool,
+    typer.Option(
+        "--overwrite", help="Begin anew: an episode that the output folder holds is removed.", rich_help_panel=_RUN
+    ),
 ]
 FirstOption = Annotated[
     str | None,
     typer.Option(
-        help="Position of the first camera, x,y,z in scene units; it looks at the origin.",
+        metavar="X,Y,Z",
+        help="Position of the first camera, in scene units; it looks at the origin.",
         show_default=f"from {DEFAULT_FIRST}, as far as the others",
+        rich_help_panel=_SEE,
     ),
 ]
 NetworkOption = Annotated[
     Path | None,
     typer.Option(
-        help="A network, .pth or .safetensors: a classifier for the tasks that are about the class, "
-        "which need one; for parts a part segmenter, in place of the one that ships."
+        metavar="FILE",
+        help="A classifier, .pth or .safetensors, which tasks about the class need; for parts a segmenter.",
+        rich_help_panel=_ASK,
     ),
 ]
 CategoryOption = Annotated[
     str | None,
     typer.Option(
-        help="What the object is, for parts: one of ShapeNet-part's categories, such as chair. Upright along y, "
-        "facing x."
+        metavar="NAME",
+        help="For parts: what the object is, one of ShapeNet-part's categories; upright along y, facing x.",
+        rich_help_panel=_ASK,
     ),
 ]
 SourceOption = Annotated[
     str | None,
     typer.Option(
-        help="Where the object is heated, for heat: x,y,z of a point on it, in scene units.",
+        metavar="X,Y,Z",
+        help="For heat: the point of the object that is heated, in scene units.",
         show_default="the middle of the first view",
+        rich_help_panel=_ASK,
     ),
 ]
-NoiseOption = Annotated[float, typer.Option(help="Standard deviation of the sensor's noise on points and normals.")]
+NoiseOption = Annotated[
+    float, typer.Option(metavar="X", help="Standard deviation of points and normals.", rich_help_panel=_SEE)
+]
 ModelOption = Annotated[
-    ModelName,
-    typer.Option(
-        help="By what surfaces are imagined. " + "; ".join(f"{n}: {about}" for n, about in MODELS.items()) + "."
-    ),
+    ModelName, typer.Option(metavar="MODEL", help=_listed(MODELS.items()), rich_help_panel=_IMAGINE)
 ]
 StudyModelOption = Annotated[
     StudyModel | None,
     typer.Option(
-        help="By what surfaces are imagined. " + "; ".join(f"{n}: {about}" for n, about in STUDY_MODELS.items()) + ".",
+        metavar="MODEL",
+        help="By what surfaces are imagined. " + _listed(STUDY_MODELS.items()),
         show_default="known, where there are known shapes",
     ),
 ]
@@ -93,54 +122,91 @@ KnownOption = Annotated[
     str | None,
     typer.Option(
         metavar="BANK",
-        help="Shapes that what was seen is compared with, beside the model: upright ones of a folder of meshes, or "
-        f"{', '.join(BANKS)}, which ship; none: the model alone.",
-        show_default="none; demo --model screened: other objects of the kind",
+        help=f"Shapes known before: a folder of upright meshes, or one of {', '.join(BANKS)}; or none.",
+        show_default="none; demo: others of the kind",
+        rich_help_panel=_IMAGINE,
     ),
 ]
 PaperOption = Annotated[
     bool,
     typer.Option(
         "--paper",
-        help="The paper's close-up: 30 degrees from 2.5 (parts: 2, heat: 3); a view shows a patch of the object.",
+        help="The paper's close-up: 30 degrees from 2.5 (parts: 2, heat: 3).",
+        rich_help_panel=_SEE,
     ),
 ]
 FovOption = Annotated[
     float | None,
     typer.Option(
-        min=1.0, max=170.0, help="Field of view in degrees.", show_default="30, or what fits the object from --radius"
+        metavar="DEGREES",
+        min=1.0,
+        max=170.0,
+        help="Field of view.",
+        show_default="30, or what fits the object from --radius",
+        rich_help_panel=_SEE,
     ),
 ]
 RadiusOption = Annotated[
     float | None,
     typer.Option(
+        metavar="X",
         help="Distance of the cameras from the object's centre, in scene units.",
         show_default="the object fits the view",
+        rich_help_panel=_SEE,
     ),
 ]
 RaysOption = Annotated[
     int | None,
-    typer.Option(min=4, max=1024, help="Rays along a side of the image.", show_default="50; parts: 64; --quick: 24"),
+    typer.Option(
+        metavar="N",
+        min=4,
+        max=1024,
+        help="Rays along a side of the image.",
+        show_default="50; parts: 64; --quick: 24",
+        rich_help_panel=_SEE,
+    ),
 ]
 SamplesOption = Annotated[
-    int | None, typer.Option(min=1, help="Surfaces that are imagined for each view.", show_default="16; --quick: 4")
+    int | None,
+    typer.Option(
+        metavar="N",
+        min=1,
+        help="Surfaces that are imagined for each view.",
+        show_default="16; --quick: 4",
+        rich_help_panel=_IMAGINE,
+    ),
 ]
 CandidatesOption = Annotated[
     int | None,
-    typer.Option(min=1, help="Poses among which a view is chosen.", show_default="120; heat: 100; --quick: 40"),
+    typer.Option(
+        metavar="N",
+        min=1,
+        help="Poses among which a view is chosen.",
+        show_default="120; heat: 100; --quick: 40",
+        rich_help_panel=_FIND,
+    ),
 ]
 LengthscaleOption = Annotated[
     float | None,
     typer.Option(
-        help="Lengthscale of the imagined surfaces' detail, a share of 2 pi scene units; longer is smoother.",
+        metavar="X",
+        help="Lengthscale of their detail, a share of 2 pi scene units; longer is smoother.",
         show_default="0.01; --model paper: 0.005",
+        rich_help_panel=_IMAGINE,
     ),
 ]
 QuickOption = Annotated[
-    bool, typer.Option("--quick", help="Small settings, for a first look in under a minute; not the paper's.")
+    bool, typer.Option("--quick", help="Small settings, for a first look; not the paper's.", rich_help_panel=_RUN)
 ]
-ReportOption = Annotated[bool, typer.Option("--report/--no-report", help="Write report.html and the figures.")]
-DeviceOption = Annotated[Device, typer.Option(help="Where to compute; auto takes a GPU if JAX sees one.")]
+ReportOption = Annotated[
+    bool, typer.Option("--report/--no-report", help="Write report.html and the figures.", rich_help_panel=_RUN)
+]
+DeviceOption = Annotated[
+    Device,
+    typer.Option(
+        metavar="DEVICE", help="Where to compute: cpu, gpu, or auto, a GPU if JAX sees one.", rich_help_panel=_RUN
+    ),
+]
 
 ScenesOption = Annotated[
     str | None,

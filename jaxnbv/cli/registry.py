@@ -34,19 +34,17 @@ class TaskEntry(NamedTuple):
 _CLASSIFIER = ("network",), (("network", "a classifier: give --network FILE"),)
 
 TASKS = {
-    "cross-entropy": TaskEntry("the object's class, by expected cross-entropy", *_CLASSIFIER),
-    "entropy": TaskEntry("the class, by expected reduction of entropy", *_CLASSIFIER),
-    "mixed": TaskEntry(
-        "the class, by cross-entropy until the entropy falls to 0.75, then by its reduction", *_CLASSIFIER
-    ),
+    "cross-entropy": TaskEntry("the object's class", *_CLASSIFIER),
+    "entropy": TaskEntry("its class, by the entropy that a view removes", *_CLASSIFIER),
+    "mixed": TaskEntry("its class, by one and then the other", *_CLASSIFIER),
     "coverage": TaskEntry("its shape"),
     "parts": TaskEntry("its parts", ("network", "category"), (("category", "--category, such as chair or mug"),)),
-    "heat": TaskEntry("the coldest point while it is heated at one place", ("source",)),
+    "heat": TaskEntry("its coldest point when it is heated", ("source",)),
 }
 
 MODELS = {
-    "screened": "knows that the object lies in its box and that space which was seen through is empty",
-    "paper": "the published model, which knows the scanned normals alone",
+    "screened": "knows what was seen to be empty too",
+    "paper": "knows the scanned normals alone",
 }
 
 STUDY_MODELS = {"known": "screened, and has seen other objects of the kind", **MODELS}
@@ -55,24 +53,24 @@ BANKS = ("pyramid", "truck", "household", "fruit", "parts", "heat", "household-r
 """The banks of known shapes that ship."""
 
 SEARCHES = {
-    "discrete": "the expected value of the task over 120 candidates (heat: 100)",
-    "halving": "drops the worse half again and again while samples are added",
-    "tie-break": "coverage, among the candidates that samples cannot tell from the best",
-    "gradient-2dof": "climbs it by gradient over the sphere",
-    "gradient-6dof": "over positions and rotations (up to 0.3 nearer or farther, the object's centre in view)",
-    "hybrid": "over the sphere from the best candidates",
-    "farthest": "the paper's baseline, farthest from the views so far",
+    "discrete": "the best of all candidates",
+    "halving": "the same, sooner: drops the worse half again and again",
+    "tie-break": "coverage decides where candidates are level",
+    "gradient-2dof": "climbs over the sphere",
+    "gradient-6dof": "climbs over positions and rotations",
+    "hybrid": "climbs from the best candidates",
+    "farthest": "a baseline, far from all views",
     "random": "a baseline",
-    "uncertainty": "a baseline, where the surface is most uncertain",
+    "uncertainty": "a baseline, where the surface is least known",
 }
 
 STOPS = {
-    "sure": "the class has this probability, and given every half of the points too",
-    "found": "every part has so many points",
-    "covered": "this share of what can be seen is expected to have been seen",
-    "value-below": "the best view has a value less than this",
-    "seconds": "so many have passed",
-    "travel": "the way from view to view would be longer, in scene units",
+    "sure": "probability of the class",
+    "found": "points of every part",
+    "covered": "share seen of what can be seen",
+    "value-below": "value of the best view",
+    "seconds": "passed",
+    "travel": "length of the way",
 }
 
 

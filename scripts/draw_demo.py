@@ -1,0 +1,134 @@
+"""The moving picture docs/demo.gif, `jaxnbv demo` view by view: `python scripts/draw_demo.py`. Some five minutes."""
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+import jax
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+import jaxnbv as nbv
+from jaxnbv.cli.actions.episodes import DEMO, knowing, planner_of
+from jaxnbv.cli.actions.tasks import COMMAND_TASKS
+from jaxnbv.cli.actions.until import rule
+from jaxnbv.viz.data import ReportData, report_data
+from jaxnbv.viz.figures import STYLE, Stills
+from jaxnbv.viz.imagined_figures import Tile, looks
+from jaxnbv.viz.render import draw_scene, look_picture
+from jaxnbv.viz.style import GREY, NEW
+from jaxnbv.viz.task_figures import over_views
+
+SIZE, DPI, COLOURS = (9.2, 3.5), 120, 128
+MOST_VIEWS, RACE_VIEWS = 5, 10
+# Milliseconds.
+GUESS, ANSWER, END = 700, 1800, 5000
+
+
+def episodes() -> tuple[nbv.Episode, nbv.Episode]:
+    """The demo, and farthest view from the same start."""
+    made = COMMAND_TASKS["cross-entropy"]
+    shown = made.demo(0, 0)
+    imagination = dataclasses.replace(knowing(nbv.Imagination.preset(), shown.bank), grid=shown.grid)
+    views, found = {"halving": MOST_VIEWS, "farthest": RACE_VIEWS}, []
+    for search, most in views.items():
+        planner = planner_of(made.setting, shown.acquisition, search, imagination, DEMO)
+        key, enough = jax.random.key(0), rule(shown.until)
+        noise = nbv.SensorNoise(0.01, 0.01)
+        found.append(nbv.simulate(planner, shown.surface, shown.first, most, key, noise, until=enough))
+    return found[0], found[1]
+
+
+class Film:
+    """Frames of one size, each shown for a time."""
+
+    def __init__(self, data: ReportData, camera: nbv.Camera):
+        self.data, self.camera, self.stills = data, camera, Stills(data)
+        self.frames: list[Image.Image] = []
+        self.times: list[int] = []
+
+    def add(self, view: int, tile: Tile, head: str, drawn: int, rival: int, time: int) -> None:
+        """What is known after `view` views, a picture from the next pose, and the answers up to a view of each."""
+        figure = Figure(figsize=SIZE)
+        figure.text(0.19, 0.95, f"after view {view}: what is known", ha="center", fontsize=10)
+        draw_scene(
+            figure.add_axes((0.0, 0.0, 0.38, 0.93)),
+            self.data, view - 1, self.stills[view - 1], self.camera, inset=False,
+        )  # fmt: skip
+        figure.text(0.52, 0.95, head, ha="center", fontsize=10)
+        axes = figure.add_axes((0.395, 0.12, 0.25, 0.25 * SIZE[0] / SIZE[1]))
+        axes.imshow(tile.picture, interpolation="bilinear")
+        axes.set(xticks=[], yticks=[], xlabel=tile.name)
+        axes.spines[:].set(visible=True, color=GREY)
+        figure.text(0.84, 0.95, f"probability of a {self._true_name}", ha="center", fontsize=10)
+        self._answers(figure.add_axes((0.72, 0.16, 0.26, 0.7)), drawn, rival)
+        canvas = FigureCanvasAgg(figure)
+        figure.set_dpi(DPI)
+        canvas.draw()
+        image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+        self.frames.append(image)
+        self.times.append(time)
+
+    @property
+    def _true_name(self) -> str:
+        (panel,) = self.data.task.panels[0]
+        return panel.names[int(np.argmax(panel.true))]
+
+    def _answers(self, axes: Axes, drawn: int, rival: int) -> None:
+        task = self.data.task
+        assert task.rival is not None
+        lines = (task.rival.panels[:rival], GREY, "s--", task.rival.name), (task.panels[:drawn], NEW, "o-", "jaxnbv")
+        for panels, colour, marks, name in lines:
+            values = [panel.values[int(np.argmax(panel.true))] for (panel,) in panels]
+            axes.plot(range(1, len(values) + 1), values, marks, color=colour, lw=1.8, ms=5, label=name)
+        axes.axhline(0.95, color=GREY, lw=0.8, ls=":")
+        axes.set(ylim=(0.0, 1.06))
+        over_views(axes, len(task.rival.panels))
+        axes.legend(loc="lower right", frameon=False, fontsize=9)
+
+    def save(self, path: Path) -> None:
+        """With the colours of all frames."""
+        strip = Image.fromarray(np.concatenate([np.asarray(frame)[::3, ::3] for frame in self.frames]))
+        palette = strip.quantize(COLOURS, dither=Image.Dither.NONE)
+        # The background is the commonest colour, and no mean of it and its neighbours.
+        colours = np.asarray(palette.getpalette()).reshape(-1, 3)
+        colours[np.bincount(np.asarray(palette).ravel()).argmax()] = 255
+        palette.putpalette(colours.ravel().tolist())
+        frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in self.frames]
+        frames[0].save(path, save_all=True, append_images=frames[1:], duration=self.times, loop=0, optimize=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "docs", help="folder of the picture")
+    out: Path = parser.parse_args().out
+    episode, rival = episodes()
+    data = report_data(episode, progress=False, rival=rival)
+    views, film = data.views, Film(data, episode.planner.camera)
+    with mpl.rc_context(STYLE):
+        for view in views:
+            assert view.look is not None
+            if view.imagined is not None:
+                for tile in looks(view.imagined)[:4]:
+                    guess = Tile(tile.name.rstrip(" 0123456789") + "?", tile.picture)
+                    film.add(
+                        view.number - 1,
+                        guess,
+                        f"imagined from view {view.number}",
+                        view.number - 1,
+                        view.number - 1,
+                        GUESS,
+                    )
+            seen = Tile("scanned", look_picture(view.look, plain=True))
+            film.add(view.number, seen, f"seen from view {view.number}", view.number, view.number, ANSWER)
+        assert data.task.rival is not None
+        film.add(len(views), seen, f"seen from view {len(views)}", len(views), len(data.task.rival.panels), END)
+    film.save(out / "demo.gif")
+
+
+if __name__ == "__main__":
+    main()
