@@ -91,14 +91,16 @@ class Film:
         axes.legend(loc="lower right", frameon=False, fontsize=9)
 
     def save(self, path: Path) -> None:
-        """With the colours of all frames."""
+        """With the colours of all frames, and a white background: Pillow looks colours up by their leading bits."""
         strip = Image.fromarray(np.concatenate([np.asarray(frame)[::3, ::3] for frame in self.frames]))
-        palette = strip.quantize(COLOURS, dither=Image.Dither.NONE)
-        # The background is the commonest colour, and no mean of it and its neighbours.
-        colours = np.asarray(palette.getpalette()).reshape(-1, 3)
-        colours[np.bincount(np.asarray(palette).ravel()).argmax()] = 255
-        palette.putpalette(colours.ravel().tolist())
-        frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in self.frames]
+        palette = strip.quantize(COLOURS - 1, dither=Image.Dither.NONE)
+        colours = [*palette.getpalette()[: 3 * (COLOURS - 1)], 255, 255, 255]
+        frames = []
+        for frame in self.frames:
+            places = np.array(frame.quantize(palette=palette, dither=Image.Dither.NONE))
+            places[(np.asarray(frame) == 255).all(axis=-1)] = COLOURS - 1
+            frames.append(Image.fromarray(places, "P"))
+            frames[-1].putpalette(colours)
         frames[0].save(path, save_all=True, append_images=frames[1:], duration=self.times, loop=0, optimize=True)
 
 

@@ -224,6 +224,15 @@ def test_no_block_of_the_depth_camera_is_left_out():
     ]
 
 
+def test_messages_that_are_explained_are_given():
+    """Each in the code, where it may be broken over lines."""
+    code = "".join(re.sub(r'"\s*\n\s*f?"', "", path.read_text()) for path in (ROOT / "jaxnbv").rglob("*.py"))
+    said = (DOCS / "how_to" / "trouble.md").read_text().partition("## It says nothing")[0]
+    messages = [phrase for row in re.findall(r"(?m)^\| (`.*?) \|", said) for phrase in re.findall("`([^`]+)`", row)]
+    assert len(messages) > 10
+    assert [message for message in messages if message not in code] == []
+
+
 def commands(text: str) -> list[list[str]]:
     """Those of blocks of shell, without the variables that are set before them."""
     found = []
