@@ -18,6 +18,9 @@ __getattr__ = explained_imports()(_named)
 _SHOWN = {
     "jaxnbv.geometry.cloud": "PointCloud",
     "jaxnbv.planning.episode": "Episode",
+    "jaxnbv.planning.planner": "Planner",
+    "jaxnbv.planning.session": "Session",
+    "jaxnbv.scanning.evidence": "Evidence",
     "jaxnbv.search.proposal": "Proposal",
     "jaxnbv.surfaces.base": "SurfacePosterior",
 }

@@ -1,4 +1,4 @@
-"""What a notebook shows of a cloud, a posterior, a proposal and an episode: a small picture and a line of facts."""
+"""What a notebook shows: of clouds, posteriors, proposals, episodes a picture, and of more a line of facts."""
 
 import base64
 import functools
@@ -15,9 +15,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxnbv.acquisition import Quantity
+from jaxnbv.checks import checked
+from jaxnbv.errors import InputError
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import look_at
 from jaxnbv.planning.episode import Episode
+from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.session import Session
+from jaxnbv.scanning import Evidence
 from jaxnbv.search import Proposal
 from jaxnbv.surfaces import SurfacePosterior
 from jaxnbv.viz.data import choice_of, report_data
@@ -25,7 +30,7 @@ from jaxnbv.viz.figures import STYLE, draw_acquisition, overview_figure
 from jaxnbv.viz.render import Still, beside, draw_cameras, draw_points, frame
 from jaxnbv.viz.style import BEFORE, NEW, VALUE
 
-_INCHES, _DPI = 2.4, 110
+_INCHES, _LARGE, _DPI = 2.4, 4.8, 110
 # Of clouds whose normals look everywhere.
 _USUAL_EYE = np.array([0.8, 0.9, 2.2])
 # Half the side of the slice of a posterior, in scene units, and its pixels along a side.
@@ -156,9 +161,47 @@ def _draw_views(episode: Episode, axes: Axes) -> None:
     frame(axes, still, shown)
 
 
-def show(episode: Episode, progress: bool = True) -> Picture:
-    """All views of an episode in a strip, which a notebook shows: the surface as it became known, and what the search
-    looked at."""
-    data = report_data(episode, progress=progress, imagine=False)
+@drawing_of.register
+def _(evidence: Evidence) -> Drawing:
+    views, cloud = int(evidence.num_views), drawing_of(evidence.cloud)
+    empty = "" if evidence.seen_empty is None else f", {float(np.mean(evidence.seen_empty)):.0%} of the grid seen empty"
+    return Drawing(cloud.draw, f"{views} view{'s' * (views != 1)}{empty}; {cloud.facts}")
+
+
+@drawing_of.register
+def _(session: Session) -> Drawing:
+    if session.views == 0:
+        return Drawing(None, "no image yet")
+    shown, next_view = drawing_of(session.episode), session.next_view
+    value = "" if next_view is None else f"; the next view is worth {next_view.value:.4g}"
+    return Drawing(shown.draw, shown.facts + value)
+
+
+@drawing_of.register
+def _(planner: Planner) -> Drawing:
+    imagination, search = planner.imagination, type(planner.search).__name__
+    by = f" over {imagination.num_samples} samples of {type(imagination.model).__name__}" * planner.search.uses_samples
+    return Drawing(None, f"{search} by {planner.quantity.name}{by}; at most {planner.capacity:,} points are kept")
+
+
+@checked
+def show(
+    shown: PointCloud | Evidence | SurfacePosterior | Proposal | Episode | Session | Planner, progress: bool = True
+) -> Picture:
+    """A picture that a notebook shows: of an episode or a session all views in a strip, the surface as it became known
+    and what the search looked at; of others what a notebook draws small, large.
+
+    **Raises:** `ValueError` for what has no picture: a planner, and what holds no points.
+    """
+    episode = shown.episode if isinstance(shown, Session) and shown.views else shown
     with mpl.rc_context(STYLE):
-        return Picture(overview_figure(data, episode.planner.camera), 80)
+        if isinstance(episode, Episode):
+            data = report_data(episode, progress=progress, imagine=False)
+            return Picture(overview_figure(data, episode.planner.camera), 80)
+        drawing = drawing_of(shown)
+        if drawing.draw is None:
+            raise InputError(f"there is no picture of {drawing.facts}: give what has points")
+        figure = Figure(figsize=(_LARGE, _LARGE))
+        figure.text(0.5, 0.02, drawing.facts, ha="center", fontsize=8)
+        drawing.draw(figure.add_axes((0.02, 0.06, 0.96, 0.92)))
+        return Picture(figure, _DPI)

@@ -15,7 +15,7 @@ import pytest
 from IPython.core.formatters import HTMLFormatter
 from matplotlib.figure import Figure
 from PIL import Image
-from small_run import small_run
+from small_run import small_planner, small_run
 
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
@@ -107,6 +107,27 @@ def test_an_episode_is_shown_in_a_strip(episode, monkeypatch):
     assert image.height > 300
 
 
+def test_others_are_shown_large(episode):
+    posterior = episode.planner.imagination.model.condition(episode.cloud)
+    for shown in (episode.cloud, episode.evidence_after(2), episode.views[1].proposal, posterior):
+        assert Image.open(io.BytesIO(nbv.show(shown)._repr_png_())).size == (528, 528)
+    with pytest.raises(nbv.InputError, match="no picture of DiscreteSearch by expected coverage gain over"):
+        nbv.show(episode.planner)
+
+
+def test_a_session_tells_its_images_and_the_next_view():
+    camera = nbv.Camera(height=12, width=12)
+    session = nbv.Session(camera, ((-1.2,) * 3, (1.2,) * 3), small_planner(nbv.DiscreteSearch(8)))
+    assert html_of(session) == "<div>no image yet</div>"
+    pose = nbv.look_at((0.0, 0.0, 2.5))
+    scan = nbv.scan(nbv.SDFSurface(Sphere(1.0)), camera, pose)
+    session.add(np.asarray((scan.points - pose.position) @ pose.forward).reshape(12, 12), np.asarray(pose.matrix))
+    assert "1 view by" in parts(session)[1]
+    asked = session.next()
+    assert parts(session)[1].endswith(f"the next view is worth {asked.value:.4g}")
+    assert [text.get_text() for text in drawn(session).texts] == ["1"]
+
+
 def test_ipython_is_told_how_they_are_shown(monkeypatch, episode):
     """By its own formatter, as a notebook asks it; a subclass is shown as its parent."""
     formatter = HTMLFormatter()
@@ -114,6 +135,7 @@ def test_ipython_is_told_how_they_are_shown(monkeypatch, episode):
     monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
     importlib.reload(nbv)
     posterior = episode.planner.imagination.model.condition(episode.cloud)
-    for shown in (episode, episode.cloud, episode.views[1].proposal, posterior):
+    evidence, proposal = episode.evidence_after(2), episode.views[1].proposal
+    for shown in (episode, episode.cloud, evidence, proposal, posterior, episode.planner):
         assert formatter(shown) == html_of(shown)
-    assert formatter(episode.planner) is None
+    assert formatter(episode.planner.camera) is None
