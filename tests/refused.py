@@ -232,6 +232,8 @@ REFUSED = {
     "no pose": (lambda: P.observe(EVIDENCE, None, SCAN), "None"),
     "no evidence": (lambda: P.propose(None, KEY), "the evidence is None"),
     "text as evidence": (lambda: P.imagination.sample("x", KEY), "the evidence is 'x'"),
+    "no completer": (lambda: nbv.Completed(MODEL, 3), "completer is 3; give a function"),
+    "completions of the plane": (lambda: nbv.Completed(MODEL, lambda c, k: D[:, :2]).condition(CLOUD), "(60, 2)"),
     "a cloud as what was chosen from": (lambda: P.choose(SCAN, None, KEY), "the evidence is a PointCloud"),
     "a scan as a pose": (lambda: P.init(SCAN, POSE), "the scan is a Pose"),
     "a class as an acquisition": (lambda: planner(nbv.Coverage), "Coverage"),
