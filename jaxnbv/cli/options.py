@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from jaxnbv.cli.registry import BANKS, DEFAULT_FIRST, MODELS, SEARCHES, STOPS, STUDY_MODELS, TASKS, Device
-from jaxnbv.studies.scenes import Framing
+from jaxnbv.studies.scenes import FirstView, Framing
 
 # The registries are the enumerations.
 Task = StrEnum("Task", {name.replace("-", "_").upper(): name for name in TASKS})  # type: ignore[misc]
@@ -287,5 +287,13 @@ StudyFramingOption = Annotated[
         "--framing",
         help="How large a pyramid stands: a view shows a patch of it, or nearly all.",
         show_default="both",
+    ),
+]
+StudyFirstOption = Annotated[
+    FirstView | None,
+    typer.Option(
+        "--first",
+        help="Which first views: any, or of classes only those after which the classifier is wrong.",
+        show_default="any",
     ),
 ]

@@ -28,6 +28,7 @@ def study(
     meshes: options.MeshesOption = None,
     classifier: options.CheckpointOption = None,
     framing: options.StudyFramingOption = None,
+    first: options.StudyFirstOption = None,
     box: options.BoxOption = None,
     up: options.UpOption = None,
     out: options.StudyOutOption = None,

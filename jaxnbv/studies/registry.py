@@ -39,7 +39,7 @@ STUDIES = {
         scenes=100,
         views=5,
         pictures="jaxnbv.studies.classification.pictures:write_pictures",
-        options=("framing", "classifier"),
+        options=("framing", "classifier", "first"),
     ),
     "truck": Entry(
         "jaxnbv.studies.classification.truck:TruckStudy",
@@ -50,7 +50,7 @@ STUDIES = {
         scenes=100,
         views=5,
         pictures="jaxnbv.studies.classification.pictures:write_pictures",
-        options=("meshes", "classifier"),
+        options=("meshes", "classifier", "first"),
     ),
     "modelnet10": Entry(
         "jaxnbv.studies.classification.modelnet10:ModelNet10Study",
@@ -61,7 +61,7 @@ STUDIES = {
         scenes=100,
         views=5,
         pictures="jaxnbv.studies.classification.pictures:write_pictures",
-        options=("meshes", "classifier"),
+        options=("meshes", "classifier", "first"),
     ),
     "omniobject3d": Entry(
         "jaxnbv.studies.classification.omniobject3d:OmniObject3DStudy",
@@ -72,7 +72,7 @@ STUDIES = {
         scenes=100,
         views=5,
         pictures="jaxnbv.studies.classification.pictures:write_pictures",
-        options=("meshes", "classifier"),
+        options=("meshes", "classifier", "first"),
     ),
     "parts": Entry(
         "jaxnbv.studies.parts.study:PartStudy",

@@ -16,7 +16,7 @@ from jaxnbv.studies.classification.measures import (
 from jaxnbv.studies.classification.study import ClassificationStudy, Truth
 from jaxnbv.studies.engine.measures import Measure, Record
 from jaxnbv.studies.engine.study import Chart, Panel, Scene
-from jaxnbv.studies.scenes import CLASS_SETS, ClassSet, Framing, Pyramid
+from jaxnbv.studies.scenes import CLASS_SETS, ClassSet, FirstView, Framing, Pyramid
 from jaxnbv.studies.scenes.class_object import choose_hidden
 
 # Of the cameras from which the pattern cannot be seen two fifths lie in each of the first two, a fifth in the last.
@@ -66,5 +66,9 @@ class PyramidStudy(ClassificationStudy):
         return super().facts(scene, truth, first) | {"angle": float(np.degrees(np.arccos(cosine)))}
 
     def first_view(self, scene: Scene) -> int:
-        """A random one of the candidates that do not show the pattern, but something."""
-        return choose_hidden(scene.task.pixels, scene.task.scans, self.key(scene.index, "first"))
+        """A random one of the candidates that do not show the pattern, but something, as `first` asks."""
+        pixels, scans = scene.task.pixels, scene.task.scans
+        if self.first is not FirstView.ANY:
+            enough = [self.shows_enough(scene, scans[index]) for index in range(self.num_candidates)]
+            pixels = np.where(enough, pixels, 1)
+        return choose_hidden(pixels, scans, self.key(scene.index, "first"))

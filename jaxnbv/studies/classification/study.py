@@ -32,7 +32,7 @@ from jaxnbv.studies.engine.measures import UNKNOWING, Claim, Measure, Record
 from jaxnbv.studies.engine.meshes import numbered
 from jaxnbv.studies.engine.study import Chart, Panel, Scene, Study, pose_record
 from jaxnbv.studies.readers import MeshFile, class_meshes
-from jaxnbv.studies.scenes import ClassObject, ClassSet, Framing, Split
+from jaxnbv.studies.scenes import ClassObject, ClassSet, FirstView, Framing, Split
 from jaxnbv.studies.scenes.class_object import ClassMesh, scan_cue, surface_of
 from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, MixedEntropy
 from jaxnbv.tasks.classification import ClassAcquisition, Classifier
@@ -73,6 +73,7 @@ class ClassificationStudy(Study):
     - `split`: which scenes; tune on those of the validation split.
     - `num_points`: D is thinned to so many, once a step, before imagined scans are added to it.
     - `meshes`: files in place of procedural objects, see `class_meshes`, where all of an object tells its class.
+    - `first`: which views may be the first one.
 
     What it is:
 
@@ -116,6 +117,7 @@ class ClassificationStudy(Study):
     split: Split = eqx.field(static=True, default=Split.TEST)
     num_points: int = eqx.field(static=True, default=512)
     meshes: tuple[MeshFile, ...] = eqx.field(static=True, default=())
+    first: FirstView = eqx.field(static=True, default=FirstView.ANY)
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
@@ -201,6 +203,11 @@ class ClassificationStudy(Study):
     def grid(self) -> Grid:
         """In proportion to the object."""
         return Grid(self.grid_resolution, 0.7 * self.framing.longest_side)
+
+    def shows_enough(self, scene: Scene, seen: PointCloud) -> bool:
+        """Something, of which the classifier may be right."""
+        wrong = self.first is FirstView.ANY or int(classify(self.classifier, seen).argmax()) != scene.task.label
+        return super().shows_enough(scene, seen) and wrong
 
     def planner(self, method: str, scene: Scene) -> Planner:
         classifier, candidates = self.imagining or self.classifier, self.candidates

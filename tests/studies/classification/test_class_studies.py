@@ -1,5 +1,6 @@
 """The studies of trucks, household objects and fruits on a small scale: what they record beside the pyramids'."""
 
+import dataclasses
 import functools
 import json
 from typing import ClassVar
@@ -20,12 +21,13 @@ from jaxnbv.search import FarthestView, SphereCandidates
 from jaxnbv.studies.classification.modelnet10 import ModelNet10Study
 from jaxnbv.studies.classification.omniobject3d import OmniObject3DStudy
 from jaxnbv.studies.classification.pictures import write_pictures
+from jaxnbv.studies.classification.pyramid import PyramidStudy
 from jaxnbv.studies.classification.truck import TruckStudy
 from jaxnbv.studies.engine.charts import write_charts
 from jaxnbv.studies.engine.measures import values
 from jaxnbv.studies.engine.tables import summary, write_tables
 from jaxnbv.studies.readers import class_meshes
-from jaxnbv.studies.scenes import FRUITS, HOUSEHOLD, Split, truck_scene
+from jaxnbv.studies.scenes import FRUITS, HOUSEHOLD, FirstView, Split, truck_scene
 from jaxnbv.studies.scenes.class_object import scan_cue
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
@@ -62,6 +64,21 @@ def small(kind, **settings):
 @functools.cache
 def record(kind):
     return json.loads(json.dumps(small(kind).run_scene(SCENE), allow_nan=False))
+
+
+@pytest.mark.parametrize("kind", [OmniObject3DStudy, PyramidStudy])
+def test_the_first_view_can_be_one_after_which_the_classifier_is_wrong(kind):
+    """Of all such views the first in the order in which any view is drawn; of a pyramid none that shows the pattern."""
+    study = small(kind, first=FirstView.MISCLASSIFIED)
+    for index in range(3):
+        scene = study.scene(index)
+        first = study.first_view(scene)
+        assert int(study.classifier(scene.task.scans[first]).argmax()) != scene.task.label
+        if kind is PyramidStudy:
+            assert int(scene.task.pixels[first]) == 0
+    always_right = lambda cloud: jnp.log(jnp.eye(len(kind.objects.classes))[scene.task.label])  # noqa: E731
+    with pytest.raises(InputError, match=r"allow any view|cue of the class shows"):
+        dataclasses.replace(study, classifier=always_right).first_view(scene)
 
 
 def test_of_a_truck_the_pixels_of_its_cargo_are_recorded():
