@@ -33,6 +33,9 @@ SEARCHES = {
     "discrete": nbv.DiscreteSearch(),
     "2-DOF": nbv.GradientSearch(dof=2),
     "2-DOF, six starts only": nbv.GradientSearch(dof=2, num_candidates=6),
+    # The rates of the authors' published code; the paper's is 0.01.
+    "2-DOF, six starts, rate 5e-3": nbv.GradientSearch(dof=2, num_candidates=6, learning_rate=5e-3),
+    "2-DOF, six starts, rate 1e-4": nbv.GradientSearch(dof=2, num_candidates=6, learning_rate=1e-4),
     "6-DOF": nbv.GradientSearch(dof=6),
     "6-DOF, constrained": nbv.GradientSearch(space=nbv.ConstrainedPoses()),
     "hybrid": nbv.HybridSearch(),
