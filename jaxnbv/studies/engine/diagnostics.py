@@ -14,14 +14,15 @@ def roughness(
     imagination: Imagination, evidence: Evidence, posterior: SurfacePosterior, surfaces: GridSurface
 ) -> float:
     """Cells of the grid that a sample's surface crosses, mean over samples, per cell that the mean's surface crosses,
-    carved as the samples are.
+    carved as the samples are. Of a posterior without closed forms the mean is that of these samples.
 
     About 1 for samples as smooth as the mean. It rises when the spacing of the data exceeds the kernel's width; near 5
     an acquisition says little about the value of a view.
     """
-    mean = crossed_cells(np.asarray(imagination.mean(evidence, posterior)))
-    samples = [crossed_cells(values) for values in np.asarray(surfaces.values)]
-    return float(np.mean(samples)) / max(mean, 1)
+    values = np.asarray(surfaces.values)
+    mean = np.asarray(imagination.mean(evidence, posterior)) if posterior.has_closed_forms else values.mean(axis=0)
+    samples = [crossed_cells(one) for one in values]
+    return float(np.mean(samples)) / max(crossed_cells(mean), 1)
 
 
 def crossed_cells(values: Float[np.ndarray, "g g g"]) -> int:
