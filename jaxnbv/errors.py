@@ -22,6 +22,11 @@ EXTRAS = {
 """Which extra brings what a part of the package needs beyond the dependencies that all of it has."""
 
 
+def install(extra: str) -> str:
+    """The command that installs an extra: from a clone, for there is no release on a package index yet."""
+    return f'pip install ".[{extra}]" in a clone of jaxnbv'
+
+
 class InputError(ValueError):
     """Something that the user gave cannot be used; the message says what, and what to do."""
 
@@ -38,7 +43,7 @@ def explained_imports() -> Iterator[None]:
         missing = str(error.name).partition(".")[0]
         if missing not in EXTRAS:
             raise
-        raise InputError(f'this needs {missing}: pip install "jaxnbv[{EXTRAS[missing]}]"') from error
+        raise InputError(f"this needs {missing}: {install(EXTRAS[missing])}") from error
 
 
 def optional(module: str) -> Any:

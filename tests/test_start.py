@@ -82,7 +82,7 @@ for use in (lambda: jaxnbv.write_report, lambda: jaxnbv.ColdestPoint((0.0, 0.0, 
     assert {"jax", "jaxnbv.planning.session", "jaxnbv.storage"} <= loaded
     assert loaded & {"jaxnbv.viz", "jaxnbv.studies"} == set()
     for line, extra in zip(result.stderr.splitlines(), ("report", "heat"), strict=True):
-        assert line.endswith(f'pip install "jaxnbv[{extra}]"')
+        assert line.endswith(f'pip install ".[{extra}]" in a clone of jaxnbv')
 
 
 def test_every_extra_that_is_named_exists():

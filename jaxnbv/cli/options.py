@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from jaxnbv.cli.registry import BANKS, DEFAULT_FIRST, MODELS, SEARCHES, STOPS, STUDY_MODELS, TASKS, Device
+from jaxnbv.errors import install
 from jaxnbv.studies.scenes import FirstView, Framing
 
 # The registries are the enumerations.
@@ -250,7 +251,7 @@ SchedulerOption = Annotated[
     typer.Option(
         metavar="ADDRESS",
         help="Run the scenes on a Dask cluster: its scheduler, such as tcp://10.0.0.1:8786. "
-        'Needs `pip install "jaxnbv[cluster]"` here and on its workers.',
+        f"Needs `{install('cluster')}`, here and on its workers.",
         show_default=False,
     ),
 ]

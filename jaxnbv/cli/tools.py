@@ -25,7 +25,7 @@ def view(
 ) -> None:
     """Look at a run in the browser: points, cameras, the surface, what is imagined, where to look next.
 
-    Needs viser: `pip install "jaxnbv[view]"`. Surfaces are those of the usual model, given what was seen.
+    Needs viser: `pip install ".[view]"` in a clone. Surfaces are those of the usual model, given what was seen.
     """
     actions.view(folder, html, port)
 

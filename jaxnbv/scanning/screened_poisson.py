@@ -3,6 +3,7 @@
 import numpy as np
 
 from jaxnbv.checks import InputError, checked, require
+from jaxnbv.errors import install
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.scanning.mesh import TriangleMesh
@@ -40,7 +41,7 @@ def screened_poisson(cloud: PointCloud, depth: int = 8) -> TriangleMesh:
     except ImportError as error:
         raise InputError(
             f"Poisson reconstruction needs pymeshlab, which cannot be imported ({error}): "
-            'pip install "jaxnbv[poisson]" and, where it is missing, the system\'s OpenGL library (libGL), or take the '
+            f"{install('poisson')} and, where it is missing, the system's OpenGL library (libGL), or take the "
             "mean of the posterior"
         ) from error
     points, normals = (rows.astype(np.float64) for rows in cloud.to_numpy())

@@ -13,6 +13,7 @@ from matplotlib.colors import LogNorm
 from scipy.spatial import cKDTree
 
 from jaxnbv.checks import InputError
+from jaxnbv.errors import install
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.scanning.metrics import true_mesh
 from jaxnbv.studies.engine.measures import Record, methods_of
@@ -63,7 +64,7 @@ def _surfaces(record: Record, study: ReconstructionStudy, methods: Sequence[str]
             return
         mesh = reconstruct(imagination, known[column - 1], names[row])
         if mesh is None:
-            raise InputError(f'the records hold {names[row]}: pip install "jaxnbv[poisson]" to draw it again')
+            raise InputError(f"the records hold {names[row]}: to draw it again, {install('poisson')}")
         still = still_of(mesh, eye, pixels, lambda points: tree.query(points)[0], _ERRORS)
         axes.imshow(still.image, interpolation="antialiased")
         found = held[column - 1][names[row]]
