@@ -85,9 +85,10 @@ class Film:
         for panels, colour, marks, name in lines:
             values = [panel.values[int(np.argmax(panel.true))] for (panel,) in panels]
             axes.plot(range(1, len(values) + 1), values, marks, color=colour, lw=1.8, ms=5, label=name)
-        axes.axhline(0.95, color=GREY, lw=0.8, ls=":")
+        (panel,) = task.panels[0]
+        axes.axhline(panel.goal, color=GREY, lw=0.8, ls=":")
         axes.set(ylim=(0.0, 1.06))
-        over_views(axes, len(task.rival.panels))
+        over_views(axes, max(len(task.panels), len(task.rival.panels)))
         axes.legend(loc="lower right", frameon=False, fontsize=9)
 
     def save(self, path: Path) -> None:

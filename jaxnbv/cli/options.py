@@ -21,7 +21,7 @@ COVERAGE, CROSS_ENTROPY = Task("coverage"), Task("cross-entropy")
 DISCRETE, HALVING, SCREENED = SearchName("discrete"), SearchName("halving"), ModelName("screened")
 
 # The groups of the help.
-_ASK, _SEE, _IMAGINE, _FIND, _RUN = (
+ASK, _SEE, _IMAGINE, _FIND, RUN = (
     "What to find out",
     "Sensor",
     "What is imagined",
@@ -36,18 +36,18 @@ def _listed(choices: Iterable[tuple[str, str]]) -> str:
 
 TaskOption = Annotated[
     Task,
-    typer.Option(metavar="TASK", help=_listed((n, e.about) for n, e in TASKS.items()), rich_help_panel=_ASK),
+    typer.Option(metavar="TASK", help=_listed((n, e.about) for n, e in TASKS.items()), rich_help_panel=ASK),
 ]
 SearchOption = Annotated[
     SearchName, typer.Option(metavar="SEARCH", help=_listed(SEARCHES.items()), rich_help_panel=_FIND)
 ]
 ViewsOption = Annotated[
-    int, typer.Option(metavar="N", help="Views in all, the first one included.", rich_help_panel=_ASK)
+    int, typer.Option(metavar="N", help="Views in all, the first one included.", rich_help_panel=ASK)
 ]
 SeedOption = Annotated[
     int,
     typer.Option(
-        metavar="N", min=0, max=2**63 - 1, help="Seed of the sensor's noise and of the samples.", rich_help_panel=_RUN
+        metavar="N", min=0, max=2**63 - 1, help="Seed of the sensor's noise and of the samples.", rich_help_panel=RUN
     ),
 ]
 UntilOption = Annotated[
@@ -56,19 +56,19 @@ UntilOption = Annotated[
         metavar="RULE=N",
         help="End once a rule holds; can be given several times. " + _listed(STOPS.items()) + " Or never.",
         show_default="never; demo of a class: sure=0.95, of parts: found=60",
-        rich_help_panel=_ASK,
+        rich_help_panel=ASK,
     ),
 ]
 OutOption = Annotated[
     Path | None,
     typer.Option(
-        metavar="DIR", help="Output folder.", show_default="runs/NAME-TASK-SEARCH[-MODEL]-seedN", rich_help_panel=_RUN
+        metavar="DIR", help="Output folder.", show_default="runs/NAME-TASK-SEARCH[-MODEL]-seedN", rich_help_panel=RUN
     ),
 ]
 OverwriteOption = Annotated[
     bool,
     typer.Option(
-        "--overwrite", help="Begin anew: an episode that the output folder holds is removed.", rich_help_panel=_RUN
+        "--overwrite", help="Begin anew: an episode that the output folder holds is removed.", rich_help_panel=RUN
     ),
 ]
 FirstOption = Annotated[
@@ -85,7 +85,7 @@ NetworkOption = Annotated[
     typer.Option(
         metavar="FILE",
         help="A classifier, .pth or .safetensors, which tasks about the class need; for parts a segmenter.",
-        rich_help_panel=_ASK,
+        rich_help_panel=ASK,
     ),
 ]
 CategoryOption = Annotated[
@@ -93,7 +93,7 @@ CategoryOption = Annotated[
     typer.Option(
         metavar="NAME",
         help="For parts: what the object is, one of ShapeNet-part's categories; upright along y, facing x.",
-        rich_help_panel=_ASK,
+        rich_help_panel=ASK,
     ),
 ]
 SourceOption = Annotated[
@@ -102,7 +102,7 @@ SourceOption = Annotated[
         metavar="X,Y,Z",
         help="For heat: the point of the object that is heated, in scene units.",
         show_default="the middle of the first view",
-        rich_help_panel=_ASK,
+        rich_help_panel=ASK,
     ),
 ]
 NoiseOption = Annotated[
@@ -124,7 +124,7 @@ KnownOption = Annotated[
     typer.Option(
         metavar="BANK",
         help=f"Shapes known before: a folder of upright meshes, or one of {', '.join(BANKS)}; or none.",
-        show_default="none; demo: others of the kind",
+        show_default="none; demo, but for --model paper: others of the kind",
         rich_help_panel=_IMAGINE,
     ),
 ]
@@ -197,15 +197,15 @@ LengthscaleOption = Annotated[
     ),
 ]
 QuickOption = Annotated[
-    bool, typer.Option("--quick", help="Small settings, for a first look; not the paper's.", rich_help_panel=_RUN)
+    bool, typer.Option("--quick", help="Small settings, for a first look; not the paper's.", rich_help_panel=RUN)
 ]
 ReportOption = Annotated[
-    bool, typer.Option("--report/--no-report", help="Write report.html and the figures.", rich_help_panel=_RUN)
+    bool, typer.Option("--report/--no-report", help="Write report.html and the figures.", rich_help_panel=RUN)
 ]
 DeviceOption = Annotated[
     Device,
     typer.Option(
-        metavar="DEVICE", help="Where to compute: cpu, gpu, or auto, a GPU if JAX sees one.", rich_help_panel=_RUN
+        metavar="DEVICE", help="Where to compute: cpu, gpu, or auto, a GPU if JAX sees one.", rich_help_panel=RUN
     ),
 ]
 
@@ -233,7 +233,10 @@ OwnOption = Annotated[
     ),
 ]
 StudyQuickOption = Annotated[
-    bool, typer.Option("--quick", help="Small settings and few scenes: minutes, and not the full study.")
+    bool,
+    typer.Option(
+        "--quick", help="Small settings and few scenes: minutes, and not the full study.", rich_help_panel=RUN
+    ),
 ]
 StudyOutOption = Annotated[
     Path | None,
@@ -241,10 +244,11 @@ StudyOutOption = Annotated[
         "--out",
         help="Output folder; the scenes already in it are not run again.",
         show_default="runs/study-NAME[-MODEL][-quick]",
+        rich_help_panel=RUN,
     ),
 ]
 WorkersOption = Annotated[
-    int, typer.Option(min=1, help="Scenes at a time, in as many processes, which share the cores.")
+    int, typer.Option(min=1, help="Scenes at a time, in as many processes, which share the cores.", rich_help_panel=RUN)
 ]
 SchedulerOption = Annotated[
     str | None,
@@ -253,6 +257,7 @@ SchedulerOption = Annotated[
         help="Run the scenes on a Dask cluster: its scheduler, such as tcp://10.0.0.1:8786. "
         f"Needs `{install('cluster')}`, here and on its workers.",
         show_default=False,
+        rich_help_panel=RUN,
     ),
 ]
 MeshesOption = Annotated[

@@ -14,13 +14,21 @@ session = typer.Typer(
 
 FolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a session.")]
 OutOption = Annotated[
-    Path | None, typer.Option(help="Output folder; a session of its own.", show_default="DIR-TASK-SEARCH")
+    Path | None,
+    typer.Option(
+        metavar="DIR",
+        help="Output folder; a session of its own.",
+        show_default="DIR-TASK-SEARCH",
+        rich_help_panel=options.RUN,
+    ),
 ]
 SourceOption = Annotated[
     str | None,
     typer.Option(
-        help="Where the object is heated, for heat: x,y,z of a point on it, in world units.",
+        metavar="X,Y,Z",
+        help="For heat: the point of the object that is heated, in world units.",
         show_default="the middle of the first image",
+        rich_help_panel=options.ASK,
     ),
 ]
 

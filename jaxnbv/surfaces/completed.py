@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from jaxnbv.checks import InputError, as_numbers, check_fields, is_traced, require
 from jaxnbv.geometry.cloud import PointCloud
@@ -23,12 +23,10 @@ from jaxnbv.surfaces.base import SurfaceModel, SurfacePosterior
 from jaxnbv.surfaces.known_shapes import KnownShapes, short_ranged
 from jaxnbv.surfaces.registration import Seen, as_they_stand
 from jaxnbv.surfaces.screened import ScreenedSPSR
-from jaxnbv.surfaces.shape_bank import ShapeBank, encoded
+from jaxnbv.surfaces.shape_bank import NUM_EXTREMES, Shape, ShapeBank, encoded
 
 Completer = Callable[[PointCloud, PRNGKeyArray], Any]
 """From a cloud and a key to points (m, 3) all over a whole surface, both in scene coordinates."""
-
-_NUM_EXTREMES = 128
 
 
 class Completed(SurfaceModel):
@@ -68,24 +66,23 @@ class Completed(SurfaceModel):
         if is_traced(evidence):
             raise InputError("a completer runs on the host: call condition outside jit")
         keys = jax.random.split(jax.random.key(0), self.num_completions)
-        bank = self._bank([self._points(evidence.cloud, key) for key in keys])
+        bank = _bank([self._completion(self.completer(evidence.cloud, key)) for key in keys])
         unknown = self.model.condition(evidence)
         shapes = KnownShapes(bank, self.residual, unknown=self.model)
         return shapes.given(as_they_stand(bank, Seen.of(evidence)), evidence, unknown)
 
-    def _points(self, cloud: PointCloud, key: PRNGKeyArray) -> Float[np.ndarray, "m 3"]:
+    def _completion(self, answer: Any) -> Shape:
         try:
-            points = as_numbers(self.completer(cloud, key), "its answer", np.float64)
+            points = as_numbers(answer, "its answer", np.float64)
             require(points.ndim == 2 and points.shape[1] == 3, f"its shape is {points.shape}")
-            solid_of_points(points, 4)
+            solid = solid_of_points(points, sheet=self.sheet)
         except InputError as error:
             raise InputError(f"the completer does not return points (m, 3) of a surface: {error}") from error
-        return points
+        directions = np.asarray(fibonacci_sphere(NUM_EXTREMES))
+        return Shape(solid, jnp.asarray(points[np.argmax(points @ directions.T, axis=0)], jnp.result_type(float)))
 
-    def _bank(self, completions: list[Float[np.ndarray, "_ 3"]]) -> ShapeBank:
-        directions = np.asarray(fibonacci_sphere(_NUM_EXTREMES))
-        solids = [solid_of_points(points, sheet=self.sheet) for points in completions]
-        extremes = np.stack([points[np.argmax(points @ directions.T, axis=0)] for points in completions])
-        joined = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *solids)
-        names = [f"completion {number}" for number in range(1, len(completions) + 1)]
-        return ShapeBank(joined, jnp.asarray(extremes, jnp.result_type(float)), encoded(names))
+
+def _bank(completions: list[Shape]) -> ShapeBank:
+    joined = jax.tree.map(lambda *leaves: jnp.stack(leaves), *completions)
+    names = [f"completion {number}" for number in range(1, len(completions) + 1)]
+    return ShapeBank(joined.solid, joined.extremes, encoded(names))

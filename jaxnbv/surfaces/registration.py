@@ -74,7 +74,7 @@ def _some_empty(evidence: Evidence) -> tuple[Float[Array, "m 3"], Bool[Array, " 
 
 
 class Hypotheses(eqx.Module):
-    """Shapes of a bank, each with a placement: the modes of the fit, best first.
+    """Shapes of a bank, each with a placement: the modes of the fit, best first where they were registered.
 
     - `shape`: indices of the bank.
     - `placement`: where each stands.

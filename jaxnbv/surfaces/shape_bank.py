@@ -15,7 +15,7 @@ from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.surfaces.mesh_shapes import listed, mesh_paths, shapes_of_meshes
 
-_NUM_EXTREMES, _FAR, _STRIDES, _ARRIVED = 128, 4.0, 40, 0.01
+NUM_EXTREMES, _FAR, _STRIDES, _ARRIVED = 128, 4.0, 40, 0.01
 _LONGEST_NAME = 64
 
 
@@ -66,7 +66,7 @@ class ShapeBank(eqx.Module):
         names = tuple(map(str, range(len(solids)))) if names is None else _as_names(names)
         require(len(names) == len(solids), f"there are {len(names)} names for {len(solids)} solids: give one for each")
         if not solids:
-            return cls(None, jnp.zeros((0, _NUM_EXTREMES, 3)), encoded(names))
+            return cls(None, jnp.zeros((0, NUM_EXTREMES, 3)), encoded(names))
         kinds = {jax.tree.structure(solid): index for index, solid in reversed(list(enumerate(solids)))}
         require(
             len(kinds) == 1,
@@ -106,7 +106,7 @@ class ShapeBank(eqx.Module):
             names = [path.stem if folder is None else str(path.relative_to(folder).with_suffix("")) for path in paths]
         names = _as_names(names)
         require(len(names) == len(paths), f"there are {len(names)} names for {len(paths)} meshes: give one for each")
-        solids, extremes, used = shapes_of_meshes(paths, resolution, sheet, _NUM_EXTREMES, progress)
+        solids, extremes, used = shapes_of_meshes(paths, resolution, sheet, NUM_EXTREMES, progress)
         joined = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *solids)
         return cls(joined, jnp.asarray(extremes), encoded([names[index] for index in used]))
 
@@ -163,7 +163,7 @@ def encoded(names: Sequence[str]) -> UInt8[Array, "k c"]:
 @eqx.filter_jit
 def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
     """Points of a sphere far about each solid, brought to its surface along the gradient."""
-    start = fibonacci_sphere(_NUM_EXTREMES, _FAR)
+    start = fibonacci_sphere(NUM_EXTREMES, _FAR)
 
     def of_solid(solid):
         def stride(points, _):

@@ -146,14 +146,14 @@ class ViewData(eqx.Module):
 class ReportData(eqx.Module):
     """All views of an episode, what the values of its search mean, what the views were for, whence they are drawn.
 
-    - `frame`: to the world that the object's file was given in; the identity where there was none.
+    - `frame`: to the world that the object's file was given in; None where there was none.
     """
 
     views: tuple[ViewData, ...]
     quantity: Quantity
     task: Task
     stage: Stage
-    frame: Frame
+    frame: Frame | None
 
 
 def report_data(
@@ -210,7 +210,7 @@ def report_data(
         )
         known = None if surfaces is None else (after, posterior, surfaces)
     means = [view.surface.mesh for view in drawn if view.surface is not None]
-    frame = getattr(episode.scene, "frame", Frame())
+    frame = getattr(episode.scene, "frame", None)
     return ReportData(tuple(drawn), values, task, stage_of(episode, means), frame)
 
 

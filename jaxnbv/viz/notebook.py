@@ -4,6 +4,7 @@ import base64
 import functools
 import html
 import io
+import textwrap
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -30,7 +31,7 @@ from jaxnbv.viz.figures import STYLE, draw_acquisition, overview_figure
 from jaxnbv.viz.render import Still, beside, draw_cameras, draw_points, frame
 from jaxnbv.viz.style import BEFORE, NEW, VALUE
 
-_INCHES, _LARGE, _DPI = 2.4, 4.8, 110
+_INCHES, _LARGE, _LETTERS, _DPI = 2.4, 4.8, 62, 110
 # Of clouds whose normals look everywhere.
 _USUAL_EYE = np.array([0.8, 0.9, 2.2])
 # Half the side of the slice of a posterior, in scene units, and its pixels along a side.
@@ -191,7 +192,7 @@ def show(
     """A picture that a notebook shows: of an episode or a session all views in a strip, the surface as it became known
     and what the search looked at; of others what a notebook draws small, large.
 
-    **Raises:** `ValueError` for what has no picture: a planner, and what holds no points.
+    **Raises:** `ValueError` for what has no picture: a planner, a batch of clouds, and what holds no points.
     """
     episode = shown.episode if isinstance(shown, Session) and shown.views else shown
     with mpl.rc_context(STYLE):
@@ -200,8 +201,8 @@ def show(
             return Picture(overview_figure(data, episode.planner.camera), 80)
         drawing = drawing_of(shown)
         if drawing.draw is None:
-            raise InputError(f"there is no picture of {drawing.facts}: give what has points")
+            raise InputError(f"this has no picture: {drawing.facts}. Give one thing that holds points")
         figure = Figure(figsize=(_LARGE, _LARGE))
-        figure.text(0.5, 0.02, drawing.facts, ha="center", fontsize=8)
-        drawing.draw(figure.add_axes((0.02, 0.06, 0.96, 0.92)))
+        figure.text(0.5, 0.02, "\n".join(textwrap.wrap(drawing.facts, _LETTERS)), ha="center", fontsize=8)
+        drawing.draw(figure.add_axes((0.02, 0.1, 0.96, 0.88)))
         return Picture(figure, _DPI)

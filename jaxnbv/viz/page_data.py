@@ -11,6 +11,8 @@ from PIL import Image
 
 from jaxnbv.acquisition import Quantity
 from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.viz import sphere
 from jaxnbv.viz.data import Choice, MeanSurface, ReportData
 from jaxnbv.viz.figures import deviation_range, is_smooth, rings_tied, value_range
@@ -49,7 +51,7 @@ def payload(data: ReportData) -> dict:
         "views": [
             {
                 "told": view.told,
-                "matrix": np.asarray(data.frame.to_world(view.pose).to_matrix(), np.float64).round(6).tolist(),
+                "matrix": _matrix(data.frame, view.pose),
                 "choice": None if view.choice is None else _choice(view.choice, data.quantity),
             }
             for view in data.views
@@ -91,6 +93,12 @@ def space(data: ReportData, camera: Camera) -> dict:
             for view in data.views
         ],
     }
+
+
+def _matrix(frame: Frame | None, pose: Pose) -> list[list[float]]:
+    """Camera to the world of the object's file, or to the scene where there is none, by OpenCV's axes."""
+    placed = pose if frame is None else frame.to_world(pose)
+    return np.asarray(placed.to_matrix(), np.float64).round(6).tolist()
 
 
 def picture_address(picture: UInt8[np.ndarray, "h w _"], lossless: bool = False) -> str:
@@ -169,7 +177,6 @@ def _choice(choice: Choice, quantity: Quantity) -> dict:
         "chosen": sphere.mollweide(choice.chosen[None]).round(4)[0].tolist(),
         "value": choice.value,
         "error": None if choice.error is None or math.isnan(choice.error) else choice.error,
-        "median": float(np.median(choice.open_values)) if choice.open_values.size else None,
         "range": [low, high],
         "image": _map_image(choice, low, high) if is_smooth(choice, quantity) else None,
         "ascents": None if choice.ascents is None else _on_map(choice.ascents),

@@ -88,6 +88,7 @@ def report_html(episode: Episode, data: ReportData, title: str, stills: Stills |
         tables=[_table(panels) for panels in zip(*data.task.panels, strict=True)],
         imagined=[_imagined(view.imagined) for view in data.views],
         settings=_settings(episode, title),
+        units="scene units" if data.frame is None else "the units of the object's file",
         space=_zipped(json.dumps(space(data, camera), allow_nan=False)),
         plotly=_zipped(get_plotlyjs()),
         # "</" would end the script element that holds the data.

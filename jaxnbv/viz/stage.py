@@ -76,7 +76,8 @@ def _shown(
     episode: Episode, surface: trimesh.Trimesh | None, eyes: Float[np.ndarray, "e 3"], clear: float
 ) -> Float[np.ndarray, " e"]:
     """The share of the points that the chosen views have seen which faces an eye, and is not hidden from it."""
-    scans = [view.scan.to_numpy() for view in episode.views[1:] or episode.views]
+    first, *chosen = (view.scan.to_numpy() for view in episode.views)
+    scans = [scan for scan in chosen if len(scan[0])] or [first]
     points, normals = (np.concatenate(rows).astype(np.float64) for rows in zip(*scans, strict=True))
     few = np.linspace(0, len(points) - 1, min(_SEEN, len(points))).astype(int)
     facing = normals[few] @ eyes.T > 0.2

@@ -7,9 +7,9 @@ import equinox as eqx
 import numpy as np
 import trimesh
 
-from jaxnbv.acquisition import Answer
+from jaxnbv.acquisition import Acquisition, Answer
 from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.planning.episode import Episode
+from jaxnbv.planning.episode import Episode, View
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Surface
 from jaxnbv.scanning.metrics import true_mesh
@@ -68,26 +68,27 @@ def task_of(
     - `covered`, `rival_covered`: the share of the true surface that was seen after each view; None where not known.
     - `rival`: an episode of another search from the same first view.
     """
-    answers, truth = _answers(episode, covered), None
+    acquisition = episode.planner.acquisition
+    answers, truth = _answers(acquisition, episode.views, covered), None
     if episode.scene is not None and not isinstance(answers[-1], CoverageAnswer):
         cloud = true_cloud(episode.scene, episode.planner.capacity)
-        truth = None if cloud is None else episode.planner.acquisition.true_answer(episode.scene, cloud)
+        truth = None if cloud is None else acquisition.true_answer(episode.scene, cloud)
     panels = tuple(words_of(answer).panels(truth) for answer in answers)
     beside = None
     if rival is not None:
-        others = tuple(words_of(answer).panels(truth) for answer in _answers(rival, rival_covered))
-        beside = Rival(search_name(rival), race_words(rival), others, tuple(rival_covered))
+        others = tuple(words_of(answer).panels(truth) for answer in _answers(acquisition, rival.views, rival_covered))
+        beside = Rival(search_name(rival), race_words(rival, acquisition), others, tuple(rival_covered))
     head = _asked(episode.planner), _found(answers, truth), _sure(answers)
     return Task(tuple(answers), truth, panels, *head, beside)
 
 
-def _answers(episode: Episode, covered: Sequence[float | None]) -> list[Answer]:
+def _answers(acquisition: Acquisition, views: Sequence[View], covered: Sequence[float | None]) -> list[Answer]:
     """After each view; how much was seen, where the acquisition answers nothing."""
-    given = [episode.planner.acquisition.answer(view.cloud) for view in episode.views]
+    given = [acquisition.answer(view.cloud) for view in views]
     answers = [answer for answer in given if answer is not None]
     if len(answers) == len(given):
         return answers
-    return [_coverage(int(view.cloud.count), share) for view, share in zip(episode.views, covered, strict=True)]
+    return [_coverage(int(view.cloud.count), share) for view, share in zip(views, covered, strict=True)]
 
 
 def true_cloud(scene: Surface, count: int) -> PointCloud | None:
@@ -123,13 +124,15 @@ def search_name(episode: Episode) -> str:
     return re.sub("(?<!^)(?=[A-Z])", " ", type(episode.planner.search).__name__).lower()
 
 
-def race_words(rival: Episode) -> str:
-    """How many views another search needed, from the same first view, until the same rule held."""
-    name, count = search_name(rival), len(rival.views)
-    answer = rival.planner.acquisition.answer(rival.views[-1].cloud)
-    found = "" if answer is None else f" ({words_of(answer).found})"
-    needed = f"needed {count} views" if rival.stopped else f"did not find it in {count} views"
-    return f"{name.capitalize()} {needed} from the same start{found}."
+def race_words(rival: Episode, acquisition: Acquisition) -> str:
+    """How many views another search took, from the same first view; of an acquisition that answers, whether it was
+    enough by the rule that ends both, and what was found."""
+    name, count = search_name(rival).capitalize(), len(rival.views)
+    views, answer = f"{count} view{'s' * (count > 1)}", acquisition.answer(rival.views[-1].cloud)
+    if answer is None:
+        return f"{name} took {views} from the same start."
+    needed = f"needed {views}" if rival.stopped else f"did not find it in {views}"
+    return f"{name} {needed} from the same start ({words_of(answer).found})."
 
 
 def _coverage(count: int, share: float | None) -> CoverageAnswer:

@@ -119,13 +119,13 @@ def draw_coverage(axes: Axes, data: ReportData) -> None:
         for view, value in zip(views, values, strict=True):
             text = number(value) if label == "points kept" else f"{value:.0f}"
             axes.annotate(text, (view, value), (0, 6), textcoords="offset points", ha="center", fontsize=8)
-    highest, rival = float(values.max()), data.task.rival
+    highest, count, rival = float(values.max()), len(values), data.task.rival
     if rival is not None and data.views[0].coverage is not None:
         shares = 100.0 * np.array(rival.covered, np.float64)
         legend_below(axes, [_draw_rival(axes, shares, rival.name)])
-        highest = max(highest, float(shares.max()))
+        highest, count = max(highest, float(shares.max())), max(count, len(shares))
     axes.set(ylim=(0, 1.18 * max(highest, 1.0)))
-    over_views(axes, max(len(values), 0 if rival is None else len(rival.covered)))
+    over_views(axes, count)
 
 
 def draw_values(axes: Axes, data: ReportData) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from jaxnbv.errors import InputError
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning.sdf import (
     Capsule,
@@ -171,14 +172,19 @@ def test_rigid_transform_moves_points_as_the_pose_does():
 
 
 def test_points_all_over_a_surface_are_a_solid():
-    """At random, so that gaps between them are wide: a ball, and a box with a dent that is wider than the gaps."""
-    ball = RNG.standard_normal((8192, 3))
-    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    """At random, so that gaps between them are wide: balls of many and of few points, some of them there twice, and a
+    sheet."""
     places = RNG.uniform(-1.1, 1.1, (2000, 3))
-    found = np.asarray(values(solid_of_points(ball, sheet=0.01), jnp.asarray(places)))
     true = np.linalg.norm(places, axis=1) - 1.0
-    assert np.abs(found - true).max() < 0.06
-    assert np.abs(found - true).mean() < 0.03
+    for count, tolerance in ((8192, 0.06), (1024, 0.15)):
+        ball = RNG.standard_normal((count, 3))
+        ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+        ball = np.concatenate([ball, ball])
+        found = np.asarray(values(solid_of_points(ball, sheet=0.01), jnp.asarray(places)))
+        assert np.abs(found - true).max() < tolerance
+        assert np.abs(found - true).mean() < 0.5 * tolerance
+    with pytest.raises(InputError, match="too far to tell a surface"):
+        solid_of_points(ball[:40])
     sheet = np.stack([*RNG.uniform(-1.0, 1.0, (2, 8192)), np.zeros(8192)], axis=1)
     above = np.stack([*RNG.uniform(-0.8, 0.8, (2, 500)), np.zeros(500)], axis=1)
     solid = solid_of_points(sheet, sheet=0.1)

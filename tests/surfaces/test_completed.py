@@ -89,7 +89,12 @@ def test_a_planner_takes_it_and_compiles_once(compilations):
 
 @pytest.mark.parametrize(
     ("answer", "word"),
-    [(BALL[:, :2], "4096, 2"), ("points", "points"), (np.full((9, 3), np.nan), "finite"), (np.ones((9, 3)), "lie at")],
+    [
+        (BALL[:, :2], "4096, 2"),
+        ("points", "points"),
+        (np.full((9, 3), np.nan), "finite"),
+        (np.ones((9, 3)), "1 different points"),
+    ],
 )
 def test_what_is_no_surface_is_refused(answer, word):
     with pytest.raises(nbv.InputError, match=word) as refused:

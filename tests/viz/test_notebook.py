@@ -111,7 +111,7 @@ def test_others_are_shown_large(episode):
     posterior = episode.planner.imagination.model.condition(episode.cloud)
     for shown in (episode.cloud, episode.evidence_after(2), episode.views[1].proposal, posterior):
         assert Image.open(io.BytesIO(nbv.show(shown)._repr_png_())).size == (528, 528)
-    with pytest.raises(nbv.InputError, match="no picture of DiscreteSearch by expected coverage gain over"):
+    with pytest.raises(nbv.InputError, match="no picture: DiscreteSearch by expected coverage gain over"):
         nbv.show(episode.planner)
 
 

@@ -231,6 +231,17 @@ def test_a_rival_is_told_of_and_drawn(plain):
     assert axes.get_xlim() == (0.5, 3.5)
 
 
+def test_a_rival_is_asked_what_the_episode_is_asked(plain):
+    """Though it would answer something else itself; without an answer it is told how many views it took."""
+    scene, score = nbv.SDFSurface(pyramid_scene(Split.TEST, 1)), nbv.CrossEntropy(Leaning(), 512)
+    other = small_run(nbv.FarthestView(8), 2, scene, nbv.Coverage(), nbv.SensorNoise(0.0, 0.0))
+    (panel,) = report_data(run(score, scene, 2), progress=False, imagine=False, rival=other).task.rival.panels[1]
+    assert panel.names == NAMES
+    task = report_data(other, progress=False, imagine=False, rival=run(score, scene, 1)).task
+    assert task.rival.words == "Random view took 1 view from the same start."
+    assert task.rival.panels[0][0].label == "surface seen (%)"
+
+
 def test_the_page_opens_with_the_answer_and_folds_the_settings_away(plain):
     episode = run(nbv.ExpectedUtilityImprovement(greatest_height), nbv.SDFSurface(Sphere(0.9)), views=2)
     _, text = page_of(episode)

@@ -179,7 +179,7 @@ def _run(
             f"enough   after view {len(episode.views)}: {episode.stopped}. {saved} of {asked.views} {views} saved"
         )
     if raced is not None:
-        typer.echo(f"race     {race_words(raced)}")
+        typer.echo(f"race     {race_words(raced, planner.acquisition)}")
     if asked.report:
         typer.echo(f"report   {viz.write_report(episode, folder, title=name, rival=raced)}")
     typer.echo(f"episode  {folder}   ({time.perf_counter() - start:.0f} s)")

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from jaxnbv.checks import require
 from jaxnbv.studies.classification.measures import (
     HITS_EXPLAINED,
     ROUGHNESS,
@@ -70,5 +71,10 @@ class PyramidStudy(ClassificationStudy):
         pixels, scans = scene.task.pixels, scene.task.scans
         if self.first is not FirstView.ANY:
             enough = [self.shows_enough(scene, scans[index]) for index in range(self.num_candidates)]
+            require(
+                any(enough),
+                f"the classifier is right after all {self.num_candidates} candidates of {scene.name}: give more, or "
+                "ask for --first any",
+            )
             pixels = np.where(enough, pixels, 1)
         return choose_hidden(pixels, scans, self.key(scene.index, "first"))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Key
 
-from jaxnbv.checks import require
+from jaxnbv.checks import InputError, require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale, pretrained_classifier
@@ -205,9 +205,22 @@ class ClassificationStudy(Study):
         return Grid(self.grid_resolution, 0.7 * self.framing.longest_side)
 
     def shows_enough(self, scene: Scene, seen: PointCloud) -> bool:
-        """Something, of which the classifier may be right."""
-        wrong = self.first is FirstView.ANY or int(classify(self.classifier, seen).argmax()) != scene.task.label
-        return super().shows_enough(scene, seen) and wrong
+        """Something, of which the classifier may be wrong only, where `first` says so."""
+        if self.first is FirstView.ANY or not super().shows_enough(scene, seen):
+            return super().shows_enough(scene, seen)
+        return int(classify(self.classifier, seen).argmax()) != scene.task.label
+
+    def first_view(self, scene: Scene) -> int:
+        """A random one of the candidates that show enough.
+
+        **Raises:** `ValueError` if there is none.
+        """
+        try:
+            return super().first_view(scene)
+        except InputError as error:
+            raise InputError(
+                f"{error}, or ask for --first any" if self.first is not FirstView.ANY else str(error)
+            ) from error
 
     def planner(self, method: str, scene: Scene) -> Planner:
         classifier, candidates = self.imagining or self.classifier, self.candidates

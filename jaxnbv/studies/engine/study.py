@@ -296,10 +296,7 @@ class Study(eqx.Module):
         for candidate in jax.random.permutation(self.key(scene.index, "first"), self.num_candidates).tolist():
             if self.shows_enough(scene, sensor(poses[candidate], noise_key)):
                 return candidate
-        raise InputError(
-            f"none of {self.num_candidates} candidates can be the first view of {scene.name}: give more, or allow "
-            "any view"
-        )
+        raise InputError(f"none of {self.num_candidates} candidates shows enough of {scene.name}: give more")
 
     def seen(self, scene: Scene, run: Record) -> list[tuple[PointCloud, Evidence]]:
         """Each scan of a method, and the evidence after it, made again from the poses of its record."""

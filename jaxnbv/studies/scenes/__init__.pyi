@@ -3,7 +3,7 @@ from .class_object import hidden_view as hidden_view
 from .class_sets import CLASS_SETS as CLASS_SETS
 from .class_sets import ClassSet as ClassSet
 from .demo import demo_object as demo_object
-from .framing import FirstView as FirstView
+from .first_view import FirstView as FirstView
 from .framing import Framing as Framing
 from .fruit import FRUITS as FRUITS
 from .fruit import Fruit as Fruit

@@ -13,10 +13,3 @@ class Framing(StrEnum):
     def longest_side(self) -> float:
         """Longest side of the object's box in scene units."""
         return 2.5 if self is Framing.CLOSE_UP else 1.25
-
-
-class FirstView(StrEnum):
-    """Which views of an object may be the first one: any, or those after which the classifier is wrong."""
-
-    ANY = "any"
-    MISCLASSIFIED = "misclassified"
