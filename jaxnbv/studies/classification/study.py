@@ -206,8 +206,9 @@ class ClassificationStudy(Study):
 
     def shows_enough(self, scene: Scene, seen: PointCloud) -> bool:
         """Something, of which the classifier may be wrong only, where `first` says so."""
-        if self.first is FirstView.ANY or not super().shows_enough(scene, seen):
-            return super().shows_enough(scene, seen)
+        shows = super().shows_enough(scene, seen)
+        if self.first is FirstView.ANY or not shows:
+            return shows
         return int(classify(self.classifier, seen).argmax()) != scene.task.label
 
     def first_view(self, scene: Scene) -> int:
@@ -218,9 +219,8 @@ class ClassificationStudy(Study):
         try:
             return super().first_view(scene)
         except InputError as error:
-            raise InputError(
-                f"{error}, or ask for --first any" if self.first is not FirstView.ANY else str(error)
-            ) from error
+            remedy = "" if self.first is FirstView.ANY else ", or ask for --first any"
+            raise InputError(f"{error}{remedy}") from error
 
     def planner(self, method: str, scene: Scene) -> Planner:
         classifier, candidates = self.imagining or self.classifier, self.candidates
