@@ -193,7 +193,7 @@ def _is_number(value: Any) -> bool:
     if isinstance(value, AnyArray) and value.ndim == 0 and getattr(value.dtype, "kind", "") in ("i", "u", "f"):
         value = float(value)
     real = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    return real and abs(value) <= _LARGEST
+    return real and bool(abs(value) <= _LARGEST)
 
 
 def _classes(hint: Any) -> tuple[type, ...]:

@@ -30,7 +30,7 @@ def test_a_package_page_has_links_to_the_web_alone():
     """Of the README, as the package's build rewrites it."""
     text = (ROOT / "README.md").read_text()
     links = re.compile(r"!?\[[^\]]*\]\(([^)]*)\)")
-    assert "docs/hero.png" in links.findall(text)
+    assert "docs/demo.gif" in links.findall(text)
     hook = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["metadata"]["hooks"]
     for change in hook["fancy-pypi-readme"]["substitutions"]:
         text = re.sub(change["pattern"], change["replacement"], text)

@@ -125,7 +125,7 @@ def test_poisson_reconstruction_names_what_is_wrong(monkeypatch):
         screened_poisson(cloud, depth=0)
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "pymeshlab", None)
-        with pytest.raises(InputError, match=r'pip install "jaxnbv\[poisson\]"'):
+        with pytest.raises(InputError, match=r'pip install "\.\[poisson\]"'):
             screened_poisson(cloud)
     if not has_poisson():
         pytest.skip("pymeshlab, or the system's OpenGL library, is not installed")

@@ -92,5 +92,5 @@ def test_a_stored_session_is_shown_without_its_planner(watched):
 
 def test_without_viser_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(InputError, match=r'pip install "jaxnbv\[view\]"'):
+    with pytest.raises(InputError, match=r'pip install "\.\[view\]"'):
         LiveView(0)
