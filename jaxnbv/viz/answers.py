@@ -86,6 +86,11 @@ class Words:
         return self.line()
 
     @property
+    def truly(self) -> str:
+        """The same of an answer that is the truth."""
+        return self.found
+
+    @property
     def settled_means(self) -> str:
         """What `settled` asks."""
         return f"within {100 * _SETTLED:.0f} % of the view before"
@@ -204,6 +209,10 @@ class _PartWords(Words):
     def found(self) -> str:
         names, values = self.answer.names, self.answer.values
         return ", ".join(names[index] for index in self.shown if values[index] >= self.answer.target) or "no part yet"
+
+    @property
+    def truly(self) -> str:
+        return ", ".join(self.answer.names[index] for index in self.shown if self.answer.values[index] > 0)
 
     @property
     def settled_means(self) -> str:

@@ -151,7 +151,7 @@ def _asked(planner: Planner) -> str:
 def _found(answers: list[Answer], truth: Answer | None) -> str:
     last = words_of(answers[-1]).found
     text = f"{last[:1].upper()}{last[1:]}"
-    return text if truth is None else f"{text}. In truth: {words_of(truth).found}"
+    return text if truth is None else f"{text}. In truth: {words_of(truth).truly}"
 
 
 def _sure(answers: list[Answer]) -> str:

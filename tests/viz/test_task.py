@@ -175,6 +175,8 @@ def test_parts_are_found_by_their_points():
     assert (count.values[0], count.true[0]) == (2.0, 2.0)
     np.testing.assert_array_equal(points.values, [70.0, 59.0, 60.0])
     assert words_of(found).found == "a, c"
+    # However few points a part has of the whole surface, the object has it.
+    assert words_of(truth).truly == "a, b"
     assert not words_of(found).settled(None)
     assert words_of(PartAnswer(("a",), np.array([60.0]), asked=(0,))).settled(None)
 
