@@ -29,18 +29,13 @@ MOST_VIEWS, RACE_VIEWS = 5, 10
 GUESS, ANSWER, END = 700, 1800, 5000
 
 
-def episodes() -> tuple[nbv.Episode, nbv.Episode]:
-    """The demo, and farthest view from the same start."""
+def demo_episode(seed: int, search: str, views: int) -> nbv.Episode:
+    """The demo of a seed, by a search of the command line, until its own rule or so many views end it."""
     made = COMMAND_TASKS["cross-entropy"]
-    shown = made.demo(0, 0)
+    shown = made.demo(0, seed)
     imagination = dataclasses.replace(knowing(nbv.Imagination.preset(), shown.bank), grid=shown.grid)
-    views, found = {"halving": MOST_VIEWS, "farthest": RACE_VIEWS}, []
-    for search, most in views.items():
-        planner = planner_of(made.setting, shown.acquisition, search, imagination, DEMO)
-        key, enough = jax.random.key(0), rule(shown.until)
-        noise = nbv.SensorNoise(0.01, 0.01)
-        found.append(nbv.simulate(planner, shown.surface, shown.first, most, key, noise, until=enough))
-    return found[0], found[1]
+    planner = planner_of(made.setting, shown.acquisition, search, imagination, DEMO)
+    return nbv.simulate(planner, shown.surface, shown.first, views, jax.random.key(seed), until=rule(shown.until))
 
 
 class Film:
@@ -51,21 +46,19 @@ class Film:
         self.frames: list[Image.Image] = []
         self.times: list[int] = []
 
-    def add(self, view: int, tile: Tile, head: str, drawn: int, rival: int, time: int) -> None:
-        """What is known after `view` views, a picture from the next pose, and the answers up to a view of each."""
+    def add(self, view: int, tile: Tile, head: str, time: int, rival: int | None = None) -> None:
+        """What is known after `view` views, a picture, and the answers so far; of the rival up to another view."""
         figure = Figure(figsize=SIZE)
         figure.text(0.19, 0.95, f"after view {view}: what is known", ha="center", fontsize=10)
-        draw_scene(
-            figure.add_axes((0.0, 0.0, 0.38, 0.93)),
-            self.data, view - 1, self.stills[view - 1], self.camera, inset=False,
-        )  # fmt: skip
+        known = figure.add_axes((0.0, 0.0, 0.38, 0.93))
+        draw_scene(known, self.data, view - 1, self.stills[view - 1], self.camera, inset=False)
         figure.text(0.52, 0.95, head, ha="center", fontsize=10)
         axes = figure.add_axes((0.395, 0.12, 0.25, 0.25 * SIZE[0] / SIZE[1]))
         axes.imshow(tile.picture, interpolation="bilinear")
         axes.set(xticks=[], yticks=[], xlabel=tile.name)
         axes.spines[:].set(visible=True, color=GREY)
         figure.text(0.84, 0.95, f"probability of a {self._true_name}", ha="center", fontsize=10)
-        self._answers(figure.add_axes((0.72, 0.16, 0.26, 0.7)), drawn, rival)
+        self._answers(figure.add_axes((0.72, 0.16, 0.26, 0.7)), view, view if rival is None else rival)
         canvas = FigureCanvasAgg(figure)
         figure.set_dpi(DPI)
         canvas.draw()
@@ -109,7 +102,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "docs", help="folder of the picture")
     out: Path = parser.parse_args().out
-    episode, rival = episodes()
+    episode, rival = demo_episode(0, "halving", MOST_VIEWS), demo_episode(0, "farthest", RACE_VIEWS)
     data = report_data(episode, progress=False, rival=rival)
     views, film = data.views, Film(data, episode.planner.camera)
     with mpl.rc_context(STYLE):
@@ -118,18 +111,11 @@ def main() -> None:
             if view.imagined is not None:
                 for tile in looks(view.imagined)[:4]:
                     guess = Tile(tile.name.rstrip(" 0123456789") + "?", tile.picture)
-                    film.add(
-                        view.number - 1,
-                        guess,
-                        f"imagined from view {view.number}",
-                        view.number - 1,
-                        view.number - 1,
-                        GUESS,
-                    )
+                    film.add(view.number - 1, guess, f"imagined from view {view.number}", GUESS)
             seen = Tile("scanned", look_picture(view.look, plain=True))
-            film.add(view.number, seen, f"seen from view {view.number}", view.number, view.number, ANSWER)
+            film.add(view.number, seen, f"seen from view {view.number}", ANSWER)
         assert data.task.rival is not None
-        film.add(len(views), seen, f"seen from view {len(views)}", len(views), len(data.task.rival.panels), END)
+        film.add(len(views), seen, f"seen from view {len(views)}", END, len(data.task.rival.panels))
     film.save(out / "demo.gif")
 
 

@@ -2,20 +2,18 @@
 step of one of them: `python scripts/draw_gallery.py`. About fifteen minutes on two cores."""
 
 import argparse
-import dataclasses
 from pathlib import Path
 
 import jax
 import matplotlib as mpl
 import numpy as np
 from draw_concepts import save
+from draw_demo import demo_episode
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
 import jaxnbv as nbv
-from jaxnbv.cli.actions.episodes import DEMO, knowing, planner_of
-from jaxnbv.cli.actions.tasks import COMMAND_TASKS
 from jaxnbv.scanning import SDFSurface, Surface
 from jaxnbv.scanning.metrics import truth_points
 from jaxnbv.scanning.sensors import USUAL_SETTING, fitted
@@ -80,11 +78,7 @@ def draw_gallery(figure: Figure, columns: int = 4) -> None:
 
 def draw_hero(figure: Figure) -> None:
     """One step: what is known, what is imagined, which view is worth most, what it shows, and the answer."""
-    made = COMMAND_TASKS["cross-entropy"]
-    shown = made.demo(0, SEED)
-    imagination = dataclasses.replace(knowing(nbv.Imagination.preset(), shown.bank), grid=shown.grid)
-    planner = planner_of(made.setting, shown.acquisition, "halving", imagination, DEMO)
-    episode = nbv.simulate(planner, shown.surface, shown.first, views=2, key=jax.random.key(SEED))
+    episode = demo_episode(SEED, "halving", 2)
     data: ReportData = report_data(episode, progress=False)
     stills, camera = Stills(data), episode.planner.camera
     seen = data.views[1].imagined

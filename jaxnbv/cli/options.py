@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -20,14 +21,12 @@ SearchName = StrEnum("SearchName", {name.replace("-", "_").upper(): name for nam
 COVERAGE, CROSS_ENTROPY = Task("coverage"), Task("cross-entropy")
 DISCRETE, HALVING, SCREENED = SearchName("discrete"), SearchName("halving"), ModelName("screened")
 
-# The groups of the help.
-ASK, _SEE, _IMAGINE, _FIND, RUN = (
-    "What to find out",
-    "Sensor",
-    "What is imagined",
-    "How views are found",
-    "The run",
-)
+# An option in each group of the help.
+asking = partial(typer.Option, rich_help_panel="What to find out")
+_seeing = partial(typer.Option, rich_help_panel="Sensor")
+_imagining = partial(typer.Option, rich_help_panel="What is imagined")
+_finding = partial(typer.Option, rich_help_panel="How views are found")
+running = partial(typer.Option, rich_help_panel="The run")
 
 
 def _listed(choices: Iterable[tuple[str, str]]) -> str:
@@ -36,81 +35,62 @@ def _listed(choices: Iterable[tuple[str, str]]) -> str:
 
 TaskOption = Annotated[
     Task,
-    typer.Option(metavar="TASK", help=_listed((n, e.about) for n, e in TASKS.items()), rich_help_panel=ASK),
+    asking(metavar="TASK", help=_listed((n, e.about) for n, e in TASKS.items())),
 ]
-SearchOption = Annotated[
-    SearchName, typer.Option(metavar="SEARCH", help=_listed(SEARCHES.items()), rich_help_panel=_FIND)
-]
-ViewsOption = Annotated[
-    int, typer.Option(metavar="N", help="Views in all, the first one included.", rich_help_panel=ASK)
-]
+SearchOption = Annotated[SearchName, _finding(metavar="SEARCH", help=_listed(SEARCHES.items()))]
+ViewsOption = Annotated[int, asking(metavar="N", help="Views in all, the first one included.")]
 SeedOption = Annotated[
     int,
-    typer.Option(
-        metavar="N", min=0, max=2**63 - 1, help="Seed of the sensor's noise and of the samples.", rich_help_panel=RUN
-    ),
+    running(metavar="N", min=0, max=2**63 - 1, help="Seed of the sensor's noise and of the samples."),
 ]
 UntilOption = Annotated[
     list[str] | None,
-    typer.Option(
+    asking(
         metavar="RULE=N",
         help="End once a rule holds; can be given several times. " + _listed(STOPS.items()) + " Or never.",
         show_default="never; demo of a class: sure=0.95, of parts: found=60",
-        rich_help_panel=ASK,
     ),
 ]
 OutOption = Annotated[
     Path | None,
-    typer.Option(
-        metavar="DIR", help="Output folder.", show_default="runs/NAME-TASK-SEARCH[-MODEL]-seedN", rich_help_panel=RUN
-    ),
+    running(metavar="DIR", help="Output folder.", show_default="runs/NAME-TASK-SEARCH[-MODEL]-seedN"),
 ]
 OverwriteOption = Annotated[
     bool,
-    typer.Option(
-        "--overwrite", help="Begin anew: an episode that the output folder holds is removed.", rich_help_panel=RUN
-    ),
+    running("--overwrite", help="Begin anew: an episode that the output folder holds is removed."),
 ]
 FirstOption = Annotated[
     str | None,
-    typer.Option(
+    _seeing(
         metavar="X,Y,Z",
         help="Position of the first camera, in scene units; it looks at the origin.",
         show_default=f"from {DEFAULT_FIRST}, as far as the others",
-        rich_help_panel=_SEE,
     ),
 ]
 NetworkOption = Annotated[
     Path | None,
-    typer.Option(
+    asking(
         metavar="FILE",
         help="A classifier, .pth or .safetensors, which tasks about the class need; for parts a segmenter.",
-        rich_help_panel=ASK,
     ),
 ]
 CategoryOption = Annotated[
     str | None,
-    typer.Option(
+    asking(
         metavar="NAME",
         help="For parts: what the object is, one of ShapeNet-part's categories; upright along y, facing x.",
-        rich_help_panel=ASK,
     ),
 ]
 SourceOption = Annotated[
     str | None,
-    typer.Option(
+    asking(
         metavar="X,Y,Z",
         help="For heat: the point of the object that is heated, in scene units.",
         show_default="the middle of the first view",
-        rich_help_panel=ASK,
     ),
 ]
-NoiseOption = Annotated[
-    float, typer.Option(metavar="X", help="Standard deviation of points and normals.", rich_help_panel=_SEE)
-]
-ModelOption = Annotated[
-    ModelName, typer.Option(metavar="MODEL", help=_listed(MODELS.items()), rich_help_panel=_IMAGINE)
-]
+NoiseOption = Annotated[float, _seeing(metavar="X", help="Standard deviation of points and normals.")]
+ModelOption = Annotated[ModelName, _imagining(metavar="MODEL", help=_listed(MODELS.items()))]
 StudyModelOption = Annotated[
     StudyModel | None,
     typer.Option(
@@ -121,92 +101,63 @@ StudyModelOption = Annotated[
 ]
 KnownOption = Annotated[
     str | None,
-    typer.Option(
+    _imagining(
         metavar="BANK",
         help=f"Shapes known before: a folder of upright meshes, or one of {', '.join(BANKS)}; or none.",
         show_default="none; demo, but for --model paper: others of the kind",
-        rich_help_panel=_IMAGINE,
     ),
 ]
 PaperOption = Annotated[
     bool,
-    typer.Option(
-        "--paper",
-        help="The paper's close-up: 30 degrees from 2.5 (parts: 2, heat: 3).",
-        rich_help_panel=_SEE,
-    ),
+    _seeing("--paper", help="The paper's close-up: 30 degrees from 2.5 (parts: 2, heat: 3)."),
 ]
 FovOption = Annotated[
     float | None,
-    typer.Option(
+    _seeing(
         metavar="DEGREES",
         min=1.0,
         max=170.0,
         help="Field of view.",
         show_default="30, or what fits the object from --radius",
-        rich_help_panel=_SEE,
     ),
 ]
 RadiusOption = Annotated[
     float | None,
-    typer.Option(
+    _seeing(
         metavar="X",
         help="Distance of the cameras from the object's centre, in scene units.",
         show_default="the object fits the view",
-        rich_help_panel=_SEE,
     ),
 ]
 RaysOption = Annotated[
     int | None,
-    typer.Option(
-        metavar="N",
-        min=4,
-        max=1024,
-        help="Rays along a side of the image.",
-        show_default="50; parts: 64; --quick: 24",
-        rich_help_panel=_SEE,
+    _seeing(
+        metavar="N", min=4, max=1024, help="Rays along a side of the image.", show_default="50; parts: 64; --quick: 24"
     ),
 ]
 SamplesOption = Annotated[
     int | None,
-    typer.Option(
-        metavar="N",
-        min=1,
-        help="Surfaces that are imagined for each view.",
-        show_default="16; --quick: 4",
-        rich_help_panel=_IMAGINE,
-    ),
+    _imagining(metavar="N", min=1, help="Surfaces that are imagined for each view.", show_default="16; --quick: 4"),
 ]
 CandidatesOption = Annotated[
     int | None,
-    typer.Option(
-        metavar="N",
-        min=1,
-        help="Poses among which a view is chosen.",
-        show_default="120; heat: 100; --quick: 40",
-        rich_help_panel=_FIND,
+    _finding(
+        metavar="N", min=1, help="Poses among which a view is chosen.", show_default="120; heat: 100; --quick: 40"
     ),
 ]
 LengthscaleOption = Annotated[
     float | None,
-    typer.Option(
+    _imagining(
         metavar="X",
         help="Lengthscale of their detail, a share of 2 pi scene units; longer is smoother.",
         show_default="0.01; --model paper: 0.005",
-        rich_help_panel=_IMAGINE,
     ),
 ]
-QuickOption = Annotated[
-    bool, typer.Option("--quick", help="Small settings, for a first look; not the paper's.", rich_help_panel=RUN)
-]
-ReportOption = Annotated[
-    bool, typer.Option("--report/--no-report", help="Write report.html and the figures.", rich_help_panel=RUN)
-]
+QuickOption = Annotated[bool, running("--quick", help="Small settings, for a first look; not the paper's.")]
+ReportOption = Annotated[bool, running("--report/--no-report", help="Write report.html and the figures.")]
 DeviceOption = Annotated[
     Device,
-    typer.Option(
-        metavar="DEVICE", help="Where to compute: cpu, gpu, or auto, a GPU if JAX sees one.", rich_help_panel=RUN
-    ),
+    running(metavar="DEVICE", help="Where to compute: cpu, gpu, or auto, a GPU if JAX sees one."),
 ]
 
 ScenesOption = Annotated[
@@ -234,30 +185,24 @@ OwnOption = Annotated[
 ]
 StudyQuickOption = Annotated[
     bool,
-    typer.Option(
-        "--quick", help="Small settings and few scenes: minutes, and not the full study.", rich_help_panel=RUN
-    ),
+    running("--quick", help="Small settings and few scenes: minutes, and not the full study."),
 ]
 StudyOutOption = Annotated[
     Path | None,
-    typer.Option(
+    running(
         "--out",
         help="Output folder; the scenes already in it are not run again.",
         show_default="runs/study-NAME[-MODEL][-quick]",
-        rich_help_panel=RUN,
     ),
 ]
-WorkersOption = Annotated[
-    int, typer.Option(min=1, help="Scenes at a time, in as many processes, which share the cores.", rich_help_panel=RUN)
-]
+WorkersOption = Annotated[int, running(min=1, help="Scenes at a time, in as many processes, which share the cores.")]
 SchedulerOption = Annotated[
     str | None,
-    typer.Option(
+    running(
         metavar="ADDRESS",
         help="Run the scenes on a Dask cluster: its scheduler, such as tcp://10.0.0.1:8786. "
         f"Needs `{install('cluster')}`, here and on its workers.",
         show_default=False,
-        rich_help_panel=RUN,
     ),
 ]
 MeshesOption = Annotated[
@@ -266,9 +211,7 @@ MeshesOption = Annotated[
 CheckpointOption = Annotated[
     Path | None,
     typer.Option(
-        "--classifier",
-        help="A network's checkpoint: .safetensors, .pth or .pt.",
-        show_default="the one that ships",
+        "--classifier", help="A network's checkpoint: .safetensors, .pth or .pt.", show_default="the one that ships"
     ),
 ]
 BoxOption = Annotated[
@@ -290,9 +233,7 @@ UpOption = Annotated[
 StudyFramingOption = Annotated[
     Framing | None,
     typer.Option(
-        "--framing",
-        help="How large a pyramid stands: a view shows a patch of it, or nearly all.",
-        show_default="both",
+        "--framing", help="How large a pyramid stands: a view shows a patch of it, or nearly all.", show_default="both"
     ),
 ]
 StudyFirstOption = Annotated[

@@ -15,20 +15,14 @@ session = typer.Typer(
 FolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a session.")]
 OutOption = Annotated[
     Path | None,
-    typer.Option(
-        metavar="DIR",
-        help="Output folder; a session of its own.",
-        show_default="DIR-TASK-SEARCH",
-        rich_help_panel=options.RUN,
-    ),
+    options.running(metavar="DIR", help="Output folder; a session of its own.", show_default="DIR-TASK-SEARCH"),
 ]
 SourceOption = Annotated[
     str | None,
-    typer.Option(
+    options.asking(
         metavar="X,Y,Z",
         help="For heat: the point of the object that is heated, in world units.",
         show_default="the middle of the first image",
-        rich_help_panel=options.ASK,
     ),
 ]
 

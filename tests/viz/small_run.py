@@ -1,5 +1,10 @@
 """A small planner and a small scene, which the tests of pictures share: what is compiled for one serves all."""
 
+import base64
+import gzip
+import json
+import re
+
 import jax
 
 import jaxnbv as nbv
@@ -22,3 +27,9 @@ def small_run(search, views=3, scene=SCENE, acquisition=None, noise=None, first=
     planner = small_planner(search, acquisition, **changes)
     noise = nbv.SensorNoise() if noise is None else noise
     return nbv.simulate(planner, scene, first, views, jax.random.key(0), noise, progress=False)
+
+
+def scene_in_space(page: str) -> dict:
+    """What a report holds packed, for a reader who turns the object."""
+    packed = re.search('id="inspace">([^<]*)<', page)
+    return json.loads(gzip.decompress(base64.b64decode(packed[1])))

@@ -1,8 +1,6 @@
 """The report: self-contained, complete, true to the episode; and what its pictures are made of."""
 
-import base64
 import dataclasses
-import gzip
 import json
 import re
 from html.parser import HTMLParser
@@ -15,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
-from small_run import CAMERA, small_planner, small_run
+from small_run import CAMERA, scene_in_space, small_planner, small_run
 
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
@@ -69,11 +67,6 @@ def page_data(path):
     return json.loads(next(text for text in scripts if text.startswith('{"views"')))
 
 
-def scene_in_space(path):
-    packed = re.search('id="inspace">([^<]*)<', path.read_text(encoding="utf-8"))[1]
-    return json.loads(gzip.decompress(base64.b64decode(packed)))
-
-
 def test_the_page_loads_nothing_from_elsewhere(report):
     text = report.read_text(encoding="utf-8")
     page = Page(text)
@@ -94,7 +87,7 @@ def test_the_page_holds_every_view_and_escapes_its_title(report, episode):
     assert not re.search(r"{{|{%", text)
     data = page_data(report)
     assert len(data["views"]) == len(episode.views) == 3
-    spatial = scene_in_space(report)["views"]
+    spatial = scene_in_space(text)["views"]
     for told, shown, view in zip(data["views"], spatial, episode.views, strict=True):
         assert all(part in text[: text.index('id="inspace"')].replace("&#x27;", "'") for part in told["told"])
         np.testing.assert_allclose(told["matrix"], view.pose.to_matrix(), atol=1e-5)

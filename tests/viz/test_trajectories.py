@@ -1,9 +1,6 @@
 """Gradient searches in pictures: trajectories beside candidates, a map from enough views, frusta in space, words."""
 
-import base64
-import gzip
 import json
-import re
 from typing import ClassVar
 
 import equinox as eqx
@@ -12,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
-from small_run import CAMERA, small_run
+from small_run import CAMERA, scene_in_space, small_run
 
 import jaxnbv as nbv
 from jaxnbv.cli.actions.lines import Lines
@@ -94,11 +91,6 @@ def spatial_data(spatial):
 def page_data(text):
     start = text.index('{"views"')
     return json.loads(text[start : text.index("</script>", start)])
-
-
-def scene_in_space(text):
-    packed = re.search('id="inspace">([^<]*)<', text)[1]
-    return json.loads(gzip.decompress(base64.b64decode(packed)))
 
 
 def trajectories(values) -> Trajectories:
