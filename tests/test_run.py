@@ -9,7 +9,9 @@ import trimesh
 from commands import run_command
 
 from jaxnbv.checks import InputError
+from jaxnbv.cli.actions.run_folder import clear
 from jaxnbv.planning.planner import Planner
+from jaxnbv.storage import EpisodeFolder
 
 
 @pytest.fixture
@@ -47,6 +49,16 @@ def test_an_episode_is_replaced_when_asked(ring):
     result = run_command(*FARTHEST, "--out", "thesis", "--overwrite", cwd=ring)
     assert result.returncode == 2
     assert [path.name for path in (ring / "thesis").glob("thesis*")] == ["thesis.tex"]
+
+
+def test_an_episode_that_raced_it_is_replaced_with_it(tmp_path):
+    """Else its folder would be taken for another program's."""
+    folder = tmp_path / "demo"
+    for path in (folder, folder / "farthest"):
+        EpisodeFolder(path, {}).bind()
+    clear(folder, "farthest")
+    EpisodeFolder(folder, {"seed": 1}).bind()
+    assert not (folder / "farthest").exists()
 
 
 def border_hits(file):

@@ -109,6 +109,13 @@ def writing_in(path: Path, *inside: str) -> Iterator[None]:
         lock.release()
 
 
+def remove_empty(path: Path) -> None:
+    """Remove a folder that holds nothing but its lock."""
+    if path.is_dir() and {file.name for file in path.iterdir()} <= {_LOCK}:
+        (path / _LOCK).unlink(missing_ok=True)
+        path.rmdir()
+
+
 def _holder(path: Path) -> str:
     lock = path / _LOCK
     try:

@@ -155,8 +155,7 @@ def _run(
     if asked.quick:
         typer.echo("--quick: small settings; leave it out for the usual ones.")
     if asked.overwrite:
-        clear(folder / _RIVAL)
-        clear(folder)
+        clear(folder, _RIVAL)
     lines = Lines(planner)
 
     def tell(view: View) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 from jaxnbv.checks import require
 from jaxnbv.storage import remove_episode
 from jaxnbv.storage.files import write_text
-from jaxnbv.storage.folders import AnotherConfigurationError, read_json, writing_in
+from jaxnbv.storage.folders import AnotherConfigurationError, read_json, remove_empty, writing_in
 
 _OPTIONS, _FIGURES = "options.json", "figures"
 _REPORT = "report.html", f"{_FIGURES}/*.png"
@@ -20,12 +20,16 @@ def usual_folder(name: str, task: str, search: str, model: str, seed: int) -> Pa
     return Path("runs") / re.sub(r"[^A-Za-z0-9_.-]", "_", "-".join(parts))
 
 
-def clear(folder: Path) -> None:
-    """Remove an episode, its report, and what was asked for; a folder of something else is left as it is.
+def clear(folder: Path, *inside: str) -> None:
+    """Remove an episode, its report, and what was asked for, and with it the episodes in folders of some names inside;
+    a folder of something else is left as it is.
 
     **Raises:** `ValueError` if another process writes there, or if something else lies among the report's figures;
-    nothing is removed then.
+    nothing is removed there then.
     """
+    for name in inside:
+        clear(folder / name)
+        remove_empty(folder / name)
     figures = folder / _FIGURES
     others = sorted(file.name for file in figures.glob("*") if file.suffix != ".png")
     require(not others, f"{figures} holds {', '.join(others)}, which is of no report: move it, or give another --out")

@@ -62,7 +62,7 @@ class LabelledSolid(SignedDistance):
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         return least_of_last(self.distances(x))
 
-    def distances(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, f"*n {CAPACITY}"]:
+    def distances(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n primitives"]:
         """Signed distance to each primitive; infinite for slots that are not used."""
         a, b, c = (x[..., i, None] - self.centre[:, i] for i in range(3))
         # R^T x written as sums, which XLA fuses with what follows where it would not a matrix product.
