@@ -22,7 +22,7 @@ from jaxnbv.progress import progress_bar
 from jaxnbv.scanning import Evidence, GridSurface, Noise, SensorNoise, Surface, Surroundings, as_surface, scan
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.search import Proposal
-from jaxnbv.storage import EpisodeFolder, describe, open_episode
+from jaxnbv.storage import EpisodeFolder, describe
 from jaxnbv.tasks import Coverage, Stop
 
 
@@ -83,7 +83,7 @@ class Episode(eqx.Module):
 
         **Raises:** `ValueError` if the folder holds no episode, or one without a view.
         """
-        held = open_episode(path)
+        held = EpisodeFolder.open(path)
         views = held.read_views()
         require(len(views) > 0, f"{path} holds no view yet")
         planner = Planner(Coverage(), camera=camera_of(held.config["planner"]["camera"]))

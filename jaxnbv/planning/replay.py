@@ -20,7 +20,7 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.session import NextView, Session, check_camera
 from jaxnbv.scanning import Surroundings
 from jaxnbv.search import CandidateSearch, Proposal
-from jaxnbv.storage import SESSION_RECORD, DepthImage, open_session
+from jaxnbv.storage import DepthImage, SessionFolder
 
 
 class StoredSession:
@@ -31,11 +31,11 @@ class StoredSession:
 
     @checked
     def __init__(self, folder: str | Path):
-        self._folder = open_session(folder)
+        self._folder = SessionFolder.open(folder)
         config = self._folder.config
         try:
             self.cameras = tuple(camera_of(camera) for camera in config["cameras"])
-            self.box = Box(**_fields(config["box"]))
+            self.box = Box(config["box"]["low"], config["box"]["high"])
             self.up, self.convention, self.stride = (config[name] for name in ("up", "convention", "stride"))
             # A session that was told what stands around it did not look for a table.
             told = config["planner"]["imagination"]["surroundings"] is not None
@@ -50,10 +50,8 @@ class StoredSession:
 
     def session(self, **settings: Any) -> Session:
         """A new session at the same sensor, with other settings of `Session`."""
-        box, up, convention, stride = self.box, self.up, self.convention, self.stride
-        return Session(
-            self.cameras, box, up=up, convention=convention, stride=stride, surroundings=self.surroundings, **settings
-        )
+        sensor = {"up": self.up, "convention": self.convention, "stride": self.stride}
+        return Session(self.cameras, self.box, surroundings=self.surroundings, **sensor, **settings)
 
     def image(self, index: int) -> DepthImage:
         """The image of an index, from 0.
@@ -126,12 +124,8 @@ def stored_run(folder: str | Path) -> StoredRun:
 
     **Raises:** `ValueError` if it holds neither, or one without a view.
     """
-    if os.path.isfile(Path(folder) / SESSION_RECORD):
-        return _session_run(folder)
-    return StoredRun(Episode.load(folder))
-
-
-def _session_run(folder: str | Path) -> StoredRun:
+    if not os.path.isfile(Path(folder) / SessionFolder.record_name):
+        return StoredRun(Episode.load(folder))
     stored = StoredSession(folder)
     session = stored.session()
     for index in range(stored.views):
@@ -142,7 +136,3 @@ def _session_run(folder: str | Path) -> StoredRun:
         for view, known in zip(session.episode.views, asked, strict=False)
     )
     return StoredRun(dataclasses.replace(session.episode, views=views), *(asked[-1] or ()))
-
-
-def _fields(description: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in description.items() if name != "type"}

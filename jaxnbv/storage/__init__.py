@@ -2,9 +2,6 @@
 
 from jaxnbv.storage.description import describe as describe
 from jaxnbv.storage.episode_folder import EpisodeFolder as EpisodeFolder
-from jaxnbv.storage.episode_folder import open_episode as open_episode
 from jaxnbv.storage.episode_folder import remove_episode as remove_episode
-from jaxnbv.storage.session_folder import SESSION_RECORD as SESSION_RECORD
 from jaxnbv.storage.session_folder import DepthImage as DepthImage
 from jaxnbv.storage.session_folder import SessionFolder as SessionFolder
-from jaxnbv.storage.session_folder import open_session as open_session

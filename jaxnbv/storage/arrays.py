@@ -2,14 +2,14 @@
 
 import hashlib
 from collections.abc import Callable, Mapping
+from functools import reduce
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
 
 from jaxnbv.checks import InputError, require
-from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.search import Proposal, Trajectories
 from jaxnbv.storage.files import write_whole
@@ -40,47 +40,71 @@ PROPOSAL: Schema = {
     "trajectory_positions": ("f", ("s", "i", 3)),
     "trajectory_values": ("f", ("s", "i")),
 }
-_ERRORS = ("standard_errors", "difference_errors")
+# Where a proposal keeps what it does not keep under the array's own name.
+_PLACES = {
+    "candidate_rotations": "candidates.rotation",
+    "candidate_positions": "candidates.position",
+    "trajectory_rotations": "trajectories.poses.rotation",
+    "trajectory_positions": "trajectories.poses.position",
+    "trajectory_values": "trajectories.values",
+}
 
 
-def write_arrays(file: Path, index: int, data: Mapping[str, Any]) -> None:
-    """Write the file of an index, all or nothing, with a checksum.
+class ArrayFile(NamedTuple):
+    """A kind of numbered file in a folder.
 
-    **Raises:** `ValueError` as `write_whole` does.
+    - `name`: what one is, "view" say; files are called view_00.npz, view_01.npz and so on.
+    - `schema`: of the arrays that one may hold; it need not hold all of them.
+    - `remedy`: what to do about one that is damaged, for the error.
     """
-    arrays: dict[str, Any] = {name: np.asarray(value) for name, value in data.items()}
-    arrays |= {"format": np.asarray(FORMAT), "index": np.asarray(index)}
-    arrays["sha256"] = np.asarray(_checksum(arrays))
-    write_whole(file, lambda opened: np.savez_compressed(opened, **arrays))
+
+    name: str
+    schema: Schema
+    remedy: str
+
+    def path(self, folder: Path, index: int) -> Path:
+        """The file of an index."""
+        return folder / f"{self.name}_{index:02d}.npz"
+
+    def write(self, folder: Path, index: int, data: Mapping[str, Any]) -> None:
+        """Write the file of an index, all or nothing, with a checksum.
+
+        **Raises:** `ValueError` as `write_whole` does.
+        """
+        arrays: dict[str, Any] = {name: np.asarray(value) for name, value in data.items()}
+        arrays |= {"format": np.asarray(FORMAT), "index": np.asarray(index)}
+        arrays["sha256"] = np.asarray(_checksum(arrays))
+        write_whole(self.path(folder, index), lambda opened: np.savez_compressed(opened, **arrays))
+
+    def read(self, folder: Path, index: int, make: Callable[[dict[str, np.ndarray]], T]) -> T:
+        """What is made of those arrays of a file that the schema names.
+
+        **Raises:** `ValueError` if it is damaged, or not that of the index.
+        """
+        file = self.path(folder, index)
+        try:
+            if not file.is_file():
+                raise ValueError("there is no file")
+            with np.load(file, allow_pickle=False) as saved:
+                held = sum(member.file_size for member in saved.zip.infolist())
+                require(held <= _LARGEST, f"{file} is damaged (it unpacks to {held} bytes): delete it")
+                data = {name: saved[name] for name in saved.files}
+            _check_shapes(data, self.schema)
+            check_format(int(data["format"]), file)
+            if int(data["index"]) != index:
+                raise ValueError(f"it is {self.name} {int(data['index'])}")
+            if str(data["sha256"]) != _checksum({name: array for name, array in data.items() if name != "sha256"}):
+                raise ValueError("its checksum is not that of its arrays")
+            return make({name: array for name, array in data.items() if name in self.schema})
+        except InputError:
+            raise
+        # Whatever NumPy and zipfile raise on bits that were turned: some twenty kinds of error.
+        except Exception as error:
+            raise InputError(f"{file} is damaged ({error}): {self.remedy}") from error
 
 
-def read_arrays(
-    file: Path, index: int, schema: Schema, make: Callable[[dict[str, np.ndarray]], T], what: str, remedy: str
-) -> T:
-    """What is made of those arrays of a file that the schema names; it need not hold all of them.
-
-    - `what` and `remedy`: what the file should be, "view" say, and what to do if it is damaged, for the error.
-
-    **Raises:** `ValueError` if it is damaged, or not that of the index.
-    """
-    try:
-        if not file.is_file():
-            raise ValueError("there is no file")
-        with np.load(file, allow_pickle=False) as saved:
-            held = sum(member.file_size for member in saved.zip.infolist())
-            require(held <= _LARGEST, f"{file} is damaged (it unpacks to {held} bytes): delete it")
-            data = {name: saved[name] for name in saved.files}
-        _check(data, index, schema, file, what)
-        return make({name: array for name, array in data.items() if name in schema})
-    except InputError:
-        raise
-    # Whatever NumPy and zipfile raise on bits that were turned: some twenty kinds of error.
-    except Exception as error:
-        raise InputError(f"{file} is damaged ({error}): {remedy}") from error
-
-
-def _check(data: dict[str, np.ndarray], index: int, schema: Schema, file: Path, what: str) -> None:
-    """**Raises:** `ValueError` that says what is damaged; `InputError` for a later format."""
+def _check_shapes(data: dict[str, np.ndarray], schema: Schema) -> None:
+    """**Raises:** `ValueError` that names the array whose kind or shape is not that of the schema."""
     lengths: dict[str, int] = {}
     for name, (kinds, shape) in schema.items():
         if name in data:
@@ -92,11 +116,6 @@ def _check(data: dict[str, np.ndarray], index: int, schema: Schema, file: Path, 
             )
             if not fits:
                 raise ValueError(f"its {name} is {array.dtype}{list(array.shape)}")
-    check_format(int(data["format"]), file)
-    if int(data["index"]) != index:
-        raise ValueError(f"it is {what} {int(data['index'])}")
-    if str(data["sha256"]) != _checksum({name: array for name, array in data.items() if name != "sha256"}):
-        raise ValueError("its checksum is not that of its arrays")
 
 
 def _checksum(arrays: dict[str, np.ndarray]) -> str:
@@ -106,52 +125,29 @@ def _checksum(arrays: dict[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-def pose_arrays(pose: Pose) -> dict[str, Any]:
-    return {"rotation": pose.rotation, "position": pose.position}
+def arrays_of(thing: Any, schema: Schema) -> dict[str, Any]:
+    """Those arrays of a schema that a pose, scan, proposal or image has; none of None."""
+    found = {name: reduce(_held, _PLACES.get(name, name).split("."), thing) for name in schema}
+    return {name: value for name, value in found.items() if value is not None}
 
 
-def scan_arrays(scan: PointCloud) -> dict[str, Any]:
-    known = {"points": scan.points, "normals": scan.normals, "mask": scan.mask}
-    return known if scan.missed is None else known | {"missed": scan.missed}
-
-
-def proposal_arrays(proposal: Proposal) -> dict[str, Any]:
-    """All but the pose."""
-    data = {
-        "value": proposal.value,
-        "values": proposal.values,
-        "candidate_rotations": proposal.candidates.rotation,
-        "candidate_positions": proposal.candidates.position,
-    }
-    errors = {name: getattr(proposal, name) for name in _ERRORS}
-    data |= {name: value for name, value in errors.items() if value is not None}
-    if (ways := proposal.trajectories) is not None:
-        data |= {
-            "trajectory_rotations": ways.poses.rotation,
-            "trajectory_positions": ways.poses.position,
-            "trajectory_values": ways.values,
-        }
-    return data
+def _held(thing: Any, name: str) -> Any:
+    return None if thing is None else getattr(thing, name)
 
 
 def pose_of(data: Mapping[str, np.ndarray]) -> Pose:
     return Pose(data["rotation"], data["position"])
 
 
-def scan_of(data: Mapping[str, np.ndarray]) -> PointCloud:
-    rows = {name: jnp.asarray(data[name]) for name in SCAN if name in data}
-    return PointCloud(**rows)
-
-
 def proposal_of(data: Mapping[str, np.ndarray]) -> Proposal | None:
     """None where the file holds none."""
     if "values" not in data:
         return None
+    held = {name: jnp.asarray(data[name]) for name in PROPOSAL if name in data}
     trajectories = None
-    if "trajectory_values" in data:
-        poses = Pose(data["trajectory_rotations"], data["trajectory_positions"])
-        trajectories = Trajectories(poses, jnp.asarray(data["trajectory_values"]))
-    errors = (None if data.get(name) is None else jnp.asarray(data[name]) for name in _ERRORS)
-    candidates = Pose(data["candidate_rotations"], data["candidate_positions"])
-    value, values = jnp.asarray(data["value"]), jnp.asarray(data["values"])
-    return Proposal(pose_of(data), value, candidates, values, trajectories, *errors)
+    if "trajectory_values" in held:
+        poses = Pose(held["trajectory_rotations"], held["trajectory_positions"])
+        trajectories = Trajectories(poses, held["trajectory_values"])
+    candidates = Pose(held["candidate_rotations"], held["candidate_positions"])
+    errors = (held.get(name) for name in ("standard_errors", "difference_errors"))
+    return Proposal(pose_of(data), held["value"], candidates, held["values"], trajectories, *errors)

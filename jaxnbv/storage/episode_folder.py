@@ -7,32 +7,19 @@ cloud.ply       the points that were kept, once the episode is complete
 """
 
 from pathlib import Path
-from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import trimesh
 
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.search import Proposal
-from jaxnbv.storage.arrays import (
-    POSE,
-    PROPOSAL,
-    SCAN,
-    pose_arrays,
-    pose_of,
-    proposal_arrays,
-    proposal_of,
-    read_arrays,
-    scan_arrays,
-    scan_of,
-    write_arrays,
-)
+from jaxnbv.storage.arrays import POSE, PROPOSAL, SCAN, ArrayFile, arrays_of, pose_of, proposal_of
 from jaxnbv.storage.files import write_whole
-from jaxnbv.storage.folders import ResultFolder, read_config, writing_in
+from jaxnbv.storage.folders import ResultFolder, writing_in
 
-_RECORD, _VIEWS = "episode.json", "view_*.npz"
-_VIEW = {**POSE, **SCAN, **PROPOSAL}
+_VIEW = ArrayFile("view", {**POSE, **SCAN, **PROPOSAL}, "delete it, and its view is scanned again")
 
 
 class EpisodeFolder(ResultFolder):
@@ -42,8 +29,8 @@ class EpisodeFolder(ResultFolder):
     episode's.
     """
 
-    def __init__(self, path: str | Path, config: dict[str, Any]):
-        super().__init__(path, _RECORD, _VIEWS, config, "episode")
+    kind, record_name, results = "episode", "episode.json", "view_*.npz"
+    problem, remedy = "is not an episode's record", "give the folder of a run"
 
     def read_views(self) -> list[tuple[Pose, PointCloud, Proposal | None]]:
         """Pose, scan and proposal of every finished view, up to the first that is missing.
@@ -51,16 +38,15 @@ class EpisodeFolder(ResultFolder):
         **Raises:** `ValueError` if one is damaged.
         """
         views: list[tuple[Pose, PointCloud, Proposal | None]] = []
-        while (file := self._view_file(len(views))).exists():
-            remedy = "delete it, and its view is scanned again"
-            views.append(read_arrays(file, len(views), _VIEW, _view, "view", remedy))
+        while _VIEW.path(self.path, len(views)).exists():
+            views.append(_VIEW.read(self.path, len(views), _view))
         return views
 
     def write_view(self, index: int, pose: Pose, scan: PointCloud, proposal: Proposal | None) -> None:
         """Write one finished view, all or nothing; the first of them binds the folder to its configuration."""
         self.bind()
-        chosen = {} if proposal is None else proposal_arrays(proposal)
-        write_arrays(self._view_file(index), index, pose_arrays(pose) | scan_arrays(scan) | chosen)
+        data = arrays_of(pose, POSE) | arrays_of(scan, SCAN) | arrays_of(proposal, PROPOSAL)
+        _VIEW.write(self.path, index, data)
 
     def write_cloud(self, cloud: PointCloud) -> None:
         """Write the kept points and normals as a binary PLY file, in scene coordinates."""
@@ -70,33 +56,22 @@ class EpisodeFolder(ResultFolder):
         content = trimesh.exchange.ply.export_ply(bare, vertex_normal=True)
         write_whole(self.path / "cloud.ply", lambda file: file.write(content))
 
-    def _view_file(self, index: int) -> Path:
-        return self.path / f"view_{index:02d}.npz"
-
-
-def open_episode(path: str | Path) -> EpisodeFolder:
-    """The folder of an episode, whatever its configuration, which is its `config`.
-
-    **Raises:** `ValueError` if it holds no episode.
-    """
-    record = Path(path) / _RECORD
-    return EpisodeFolder(path, read_config(record, "is not an episode's record", "give the folder of a run"))
-
 
 def remove_episode(path: str | Path) -> bool:
     """Remove the files of an episode from its folder, whatever its configuration; whether there were any.
 
     **Raises:** `ValueError` if another process writes there.
     """
-    path = Path(path)
-    if not (path / _RECORD).exists():
+    path, record = Path(path), Path(path) / EpisodeFolder.record_name
+    if not record.exists():
         return False
     with writing_in(path):
         # The record last, so that what is left of views is never foreign.
-        for file in (*path.glob(_VIEWS), path / "cloud.ply", path / _RECORD):
+        for file in (*path.glob(EpisodeFolder.results), path / "cloud.ply", record):
             file.unlink(missing_ok=True)
     return True
 
 
 def _view(data: dict[str, np.ndarray]) -> tuple[Pose, PointCloud, Proposal | None]:
-    return pose_of(data), scan_of(data), proposal_of(data)
+    scan = PointCloud(**{name: jnp.asarray(data[name]) for name in SCAN if name in data})
+    return pose_of(data), scan, proposal_of(data)

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import filelock
 import jax
@@ -19,6 +19,7 @@ from jaxnbv.storage.files import PARTS, make_folder, write_text
 # Of the files.
 FORMAT = 2
 _LOCK = ".lock"
+_Folder = TypeVar("_Folder", bound="ResultFolder")
 
 
 class AnotherConfigurationError(InputError):
@@ -127,27 +128,33 @@ def _holder(path: Path) -> str:
 class ResultFolder:
     """A folder, and the configuration that its results have: a record, written with the first of them.
 
-    - `record`: the record's name; `results`: the pattern of the results' names.
     - `config`: what JSON can say, see `jaxnbv.storage.describe`.
-    - `kind`: what the folder is for, such as "study".
     - `cores`: how many share a sum, by default all.
+
+    A subclass says what such a folder is of, its `kind`; the name of its record, and the pattern of its results' names;
+    and `problem` and `remedy` of a folder to be opened that has no such record.
 
     **Raises:** `ValueError` if the folder cannot be made, or holds results of another configuration or other files.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        record: str,
-        results: str,
-        config: dict[str, Any],
-        kind: str,
-        cores: int | None = None,
-    ):
-        self.path, self.config = make_folder(path), json.loads(json.dumps(config))
-        self.record, self.results, self.kind, self.cores = self.path / record, results, kind, cores
-        self.bound = False
+    kind: str
+    record_name: str
+    results: str
+    problem: str
+    remedy: str
+
+    def __init__(self, path: str | Path, config: dict[str, Any], cores: int | None = None):
+        self.path, self.config, self.cores = make_folder(path), json.loads(json.dumps(config)), cores
+        self.record, self.bound = self.path / self.record_name, False
         self._check()
+
+    @classmethod
+    def open(cls: type[_Folder], path: str | Path) -> _Folder:
+        """A folder of stored results, whatever their configuration, which is its `config`.
+
+        **Raises:** `ValueError` if it holds none.
+        """
+        return cls(path, read_config(Path(path) / cls.record_name, cls.problem, cls.remedy))
 
     @contextmanager
     def writing(self) -> Iterator[None]:
@@ -179,7 +186,10 @@ class ResultFolder:
                 f"the output folder {self.path} holds other files ({', '.join(foreign[:3])}): choose an empty folder",
             )
             return
-        found, made_by = self._read_record()
+        written = read_json(self.record, self.problem, "choose another output folder")
+        found = written.get("config")
+        require(found is not None, f"{self.record} {self.problem} (it has no config): choose another output folder")
+        check_format(written.get("format"), self.record)
         # A record without results is of a run that did not come far; it binds nobody.
         if not has_results:
             return
@@ -189,6 +199,8 @@ class ResultFolder:
                 f"the output folder {self.path} belongs to another {self.kind}; it differs in "
                 f"{'; '.join(changed[:3])}. Choose another folder, or the settings it was made with"
             )
+        made_by = written.get("versions")
+        made_by = made_by if isinstance(made_by, dict) else {}
         now = {key: value for key, value in versions(self.cores).items() if key in made_by}
         if made_by != now and not self.bound:
             warnings.warn(
@@ -197,14 +209,3 @@ class ResultFolder:
                 stacklevel=3,
             )
         self.bound = True
-
-    def _read_record(self) -> tuple[Any, dict[str, Any]]:
-        """The configuration that was written, and the versions that wrote it."""
-        article = "an" if self.kind == "episode" else "a"
-        problem = f"is not {article} {self.kind}'s record"
-        written = read_json(self.record, problem, "choose another output folder")
-        config = written.get("config")
-        require(config is not None, f"{self.record} {problem} (it has no config): choose another output folder")
-        check_format(written.get("format"), self.record)
-        made_by = written.get("versions")
-        return config, made_by if isinstance(made_by, dict) else {}

@@ -98,8 +98,8 @@ def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_files(tmp_
 def test_one_process_writes_at_a_time(finished, tmp_path):
     folder = shutil.copytree(finished[1], tmp_path / "copy")
     script = (
-        "import sys, time\nfrom pathlib import Path\nfrom jaxnbv.storage.folders import ResultFolder\n"
-        "with ResultFolder(sys.argv[1], 'episode.json', 'nothing_*', {}, 'episode').writing():\n"
+        "import sys\nfrom jaxnbv.storage import EpisodeFolder\nEpisodeFolder.results = 'nothing_*'\n"
+        "with EpisodeFolder(sys.argv[1], {}).writing():\n"
         "    print('holding', flush=True)\n    sys.stdin.read()\n"
     )
     holder = subprocess.Popen([sys.executable, "-c", script, folder], stdin=-1, stdout=-1, text=True)

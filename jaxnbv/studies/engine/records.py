@@ -27,9 +27,12 @@ class RecordFolder(ResultFolder):
     **Raises:** `ValueError` if the folder cannot be made or holds records of another configuration.
     """
 
+    kind, record_name, results = "study", "study.json", "scene_*.json"
+    problem, remedy = "is not a study's record", "give the folder of a study"
+
     def __init__(self, path: str | Path, config: dict[str, Any], runner: Runner | None = None):
         self.runner = runner or Here()
-        super().__init__(path, "study.json", "scene_*.json", config, "study", self.runner.cores)
+        super().__init__(path, config, self.runner.cores)
 
     def collect(self, scenes: Sequence[int], run: Trial, progress: bool = True) -> list[Record]:
         """The records of these scenes, in order: those on disk as they are, the others from `run`, each written once it
