@@ -48,11 +48,6 @@ class _Layout(NamedTuple):
     files: str
     up: str = "y"
 
-    @property
-    def by_object(self) -> bool:
-        """Whether each object has a folder, which names it."""
-        return self.files.startswith("*/")
-
 
 _LAYOUTS = {
     "ModelNet": _Layout("{split}/{name}_[0-9]*.off", up="z"),
@@ -116,7 +111,8 @@ def _of_class(folder: Path, label: int, split: str) -> list[MeshFile]:
         if files:
             break
     require(len(files) > 0, f"the folder {folder} holds no mesh of the split {split}: unpack it again, or take it away")
-    if not layout.by_object:
+    # Else each object has a folder, which names it.
+    if not layout.files.startswith("*/"):
         return [MeshFile(label, file.stem, str(file), layout.up) for file in files]
     named = {file.relative_to(folder).parts[0]: file for file in files}
     absent = [path.name for path in sorted(folder.iterdir()) if path.is_dir() and path.name not in named]

@@ -14,7 +14,6 @@ from jaxnbv.checks import AnyArray, InputError, as_numbers, require, shown
 from jaxnbv.errors import optional
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.studies.readers.text_files import check_listed, read_lines, read_rows, read_text
 
 # In seconds: an image and a pose of a TUM sequence that lie farther apart are not of one moment.
 _APART = 0.02
@@ -55,7 +54,12 @@ class RecordedFrames:
         folder = Path(folder)
         require(os.path.isdir(folder), f"there is no folder {folder}: give the place of the unpacked data set")
         layout = _layout(folder)
-        check_listed(layout.files, folder)
+        absent = [file for file in layout.files if not os.path.isfile(file)]
+        require(
+            not absent,
+            f"{len(absent)} of the {len(layout.files)} files that {folder} names are not there, the first "
+            f"{absent[:1]}: unpack the data set again",
+        )
         matrices = layout.matrices if up is None else _upward(up) @ layout.matrices
         try:
             Pose.from_matrix(matrices)
@@ -102,21 +106,23 @@ def _layout(folder: Path) -> _Layout:
 
 def _seven_scenes(folder: Path, files: list[Path]) -> _Layout:
     poses = [file.with_name(file.name.replace(".depth.png", ".pose.txt")) for file in files]
-    matrices = np.stack([_matrix(read_rows(pose, "r1 r2 r3 t"), str(pose)) for pose in poses])
+    matrices = np.stack([_matrix(_rows(pose, "r1 r2 r3 t"), str(pose)) for pose in poses])
     own = folder / "camera-intrinsics.txt"
     # As published with the data set.
     usual = np.array([[585.0, 0.0, 320.0], [0.0, 585.0, 240.0], [0.0, 0.0, 1.0]])
-    return _Layout(files, matrices, read_rows(own, "a b c") if os.path.isfile(own) else usual, 1e-3)
+    return _Layout(files, matrices, _rows(own, "a b c") if os.path.isfile(own) else usual, 1e-3)
 
 
 def _tum(folder: Path) -> _Layout:
-    listed = [line.split() for line in read_lines(folder / "depth.txt") if not line.startswith("#")]
-    require(
-        len(listed) > 0 and all(len(row) == 2 and _is_time(row[0]) for row in listed),
-        f"{folder / 'depth.txt'} is damaged: each row must be a time and a file",
-    )
-    times = np.array([float(time) for time, _ in listed])
-    track = read_rows(folder / "groundtruth.txt", "time x y z qx qy qz qw")
+    images = folder / "depth.txt"
+    listed = [line.split() for line in _lines(images, "lists nothing") if not line.startswith("#")]
+    try:
+        times = np.array([float(time) for time, _ in listed])
+    except ValueError:
+        times = np.zeros(0)
+    proper = times.size > 0 and bool(np.isfinite(times).all())
+    require(proper, f"{images} is damaged: each row must be a time and a file")
+    track = _rows(folder / "groundtruth.txt", "time x y z qx qy qz qw")
     nearest = np.abs(times[:, None] - track[None, :, 0]).argmin(axis=1)
     kept = np.flatnonzero(np.abs(times - track[nearest, 0]) <= _APART)
     require(len(kept) > 0, f"no image of {folder} has a pose within {_APART} s: its lists are of two sequences")
@@ -129,17 +135,10 @@ def _tum(folder: Path) -> _Layout:
     return _Layout([folder / listed[index][1] for index in kept], matrices, usual, 1.0 / 5000.0)
 
 
-def _is_time(text: str) -> bool:
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False
-
-
 def _plain(folder: Path) -> _Layout:
     path = folder / "frames.json"
     try:
-        said: Any = json.loads(read_text(path))
+        said: Any = json.loads(_text(path))
     except (json.JSONDecodeError, RecursionError) as error:
         raise InputError(f"{path} is no JSON ({error}): write it again") from error
     fields = {"intrinsics": list, "depth_scale": int | float, "frames": list}
@@ -154,6 +153,35 @@ def _plain(folder: Path) -> _Layout:
     matrices = np.stack([_matrix(one["pose"], f"the pose of {one['depth']} in {path}") for one in frames])
     intrinsics = as_numbers(said["intrinsics"], f"the intrinsics in {path}", np.float64)
     return _Layout([folder / one["depth"] for one in frames], matrices, intrinsics, scale)
+
+
+def _text(path: Path) -> str:
+    require(os.path.isfile(path), f"there is no file {path}: the folder is incomplete, unpack the data set again")
+    try:
+        return path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read {path} ({error}): unpack the data set again") from error
+
+
+def _lines(path: Path, nothing: str) -> list[str]:
+    """Those of a text file that are not empty; `nothing` is said of a file without any."""
+    lines = [line.strip() for line in _text(path).splitlines() if line.strip()]
+    require(len(lines) > 0, f"{path} {nothing}: unpack the data set again")
+    return lines
+
+
+def _rows(path: Path, columns: str) -> Float[np.ndarray, "rows columns"]:
+    """The finite numbers in a text file, of which each row has the columns."""
+    lines = _lines(path, "is empty")
+    try:
+        rows = np.loadtxt(lines, ndmin=2)
+    except ValueError as error:
+        raise InputError(f"{path} is damaged ({error}): each row must be {columns}") from error
+    count = len(columns.split())
+    require(rows.shape[1] == count, f"{path} has {rows.shape[1]} columns; expected {count}: {columns}")
+    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    require(bad.size == 0, f"{path} has numbers that are not finite, the first in row {bad[:1]}: unpack it again")
+    return rows
 
 
 def _matrix(values: AnyArray | list, name: str) -> Float[np.ndarray, "4 4"]:
