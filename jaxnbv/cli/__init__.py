@@ -47,12 +47,8 @@ def _options(
     """What is asked of `jaxnbv` itself."""
 
 
-app.command("demo")(demo)
-app.command("run")(run)
-app.command()(convert)
-app.command()(view)
-app.command()(report)
-app.command()(study)
+for _command in (demo, run, convert, view, report, study):
+    app.command()(_command)
 app.add_typer(session, name="session")
 
 

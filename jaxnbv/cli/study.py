@@ -7,34 +7,109 @@ from typing import Annotated
 import typer
 
 from jaxnbv.cli import actions, options
-from jaxnbv.cli.registry import Device
+from jaxnbv.cli.registry import STUDY_MODELS, Device
+from jaxnbv.errors import install
 from jaxnbv.studies.registry import STUDIES, Entry, flag
+from jaxnbv.studies.scenes import FirstView, Framing
 
 StudyName = StrEnum("StudyName", {name.upper(): name for name in STUDIES})  # type: ignore[misc]
-NameArgument = Annotated[
-    StudyName, typer.Argument(metavar="NAME", help=f"Which: {', '.join(STUDIES)}.", show_default=False)
-]
-FolderArgument = Annotated[Path | None, typer.Argument(help="A recording, for recorded.", show_default=False)]
+StudyModel = StrEnum("StudyModel", {name.upper(): name for name in STUDY_MODELS})  # type: ignore[misc]
 
 
 def study(
-    name: NameArgument,
-    folder: FolderArgument = None,
-    scenes: options.ScenesOption = None,
-    views: options.StudyViewsOption = None,
-    methods: options.MethodsOption = None,
-    own: options.OwnOption = None,
-    model: options.StudyModelOption = None,
-    meshes: options.MeshesOption = None,
-    classifier: options.CheckpointOption = None,
-    framing: options.StudyFramingOption = None,
-    first: options.StudyFirstOption = None,
-    box: options.BoxOption = None,
-    up: options.UpOption = None,
-    out: options.StudyOutOption = None,
-    quick: options.StudyQuickOption = False,
-    workers: options.WorkersOption = 1,
-    scheduler: options.SchedulerOption = None,
+    name: Annotated[
+        StudyName, typer.Argument(metavar="NAME", help=f"Which: {', '.join(STUDIES)}.", show_default=False)
+    ],
+    folder: Annotated[Path | None, typer.Argument(help="A recording, for recorded.", show_default=False)] = None,
+    scenes: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N|A:B",
+            help="Scenes of the test split: the first N, or from A up to but without B.",
+            show_default="as many as the study has by default",
+        ),
+    ] = None,
+    views: Annotated[
+        int | None, typer.Option(min=2, help="Views in all, the first one included.", show_default="the study's")
+    ] = None,
+    methods: Annotated[
+        str | None, typer.Option(help="Which methods, separated by commas.", show_default="all of the table")
+    ] = None,
+    own: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--method",
+            help="A method of your own in the same table, module:function. The function makes a Planner from the study "
+            "and a scene of it; the module is looked for in the current folder too. Can be given several times.",
+            show_default=False,
+        ),
+    ] = None,
+    model: Annotated[
+        StudyModel | None,
+        typer.Option(
+            metavar="MODEL",
+            help="By what surfaces are imagined. " + options.listed(STUDY_MODELS.items()),
+            show_default="known, where there are known shapes",
+        ),
+    ] = None,
+    meshes: Annotated[
+        Path | None, typer.Option(help="A folder of meshes to scan.", show_default="procedural objects")
+    ] = None,
+    classifier: Annotated[
+        Path | None,
+        typer.Option(help="A network's checkpoint: .safetensors, .pth or .pt.", show_default="the one that ships"),
+    ] = None,
+    framing: Annotated[
+        Framing | None,
+        typer.Option(
+            help="How large a pyramid stands: a view shows a patch of it, or nearly all.", show_default="both"
+        ),
+    ] = None,
+    first: Annotated[
+        FirstView | None,
+        typer.Option(
+            help="Which first views: any, or of classes only those after which the classifier is wrong.",
+            show_default="any",
+        ),
+    ] = None,
+    box: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(
+            metavar="LOW HIGH",
+            help="What is to be seen of a recording: two corners of a box, six numbers in its units.",
+            show_default="about nearly all that was seen",
+        ),
+    ] = None,
+    up: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            metavar="X Y Z",
+            help="The direction of a recording that is upward, which becomes z of the box.",
+            show_default="as recorded",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        options.running(
+            help="Output folder; the scenes already in it are not run again.",
+            show_default="runs/study-NAME[-MODEL][-quick]",
+        ),
+    ] = None,
+    quick: Annotated[
+        bool, options.running("--quick", help="Small settings and few scenes: minutes, and not the full study.")
+    ] = False,
+    workers: Annotated[
+        int, options.running(min=1, help="Scenes at a time, in as many processes, which share the cores.")
+    ] = 1,
+    scheduler: Annotated[
+        str | None,
+        options.running(
+            metavar="ADDRESS",
+            help="Run the scenes on a Dask cluster: its scheduler, such as tcp://10.0.0.1:8786. "
+            f"Needs `{install('cluster')}`, here and on its workers.",
+            show_default=False,
+        ),
+    ] = None,
     device: options.DeviceOption = Device.AUTO,
 ) -> None:
     actions.study(**locals())
