@@ -1,6 +1,7 @@
 """`jaxnbv session ...`: what a real sensor saw."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Annotated
 
 import typer
@@ -12,7 +13,6 @@ session = typer.Typer(
     help="What a real sensor saw, as `jaxnbv.Session` keeps it.", no_args_is_help=True, rich_markup_mode="markdown"
 )
 
-FolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a session.")]
 OutOption = Annotated[
     Path | None,
     options.running(metavar="DIR", help="Output folder; a session of its own.", show_default="DIR-TASK-SEARCH"),
@@ -29,7 +29,7 @@ SourceOption = Annotated[
 
 @session.command()
 def replay(
-    folder: FolderArgument,
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a session.")],
     task: options.TaskOption = options.COVERAGE,
     network: options.NetworkOption = None,
     category: options.CategoryOption = None,
@@ -46,7 +46,7 @@ def replay(
 
     Images, poses and box are the session's, and so are the poses to choose among, if it proposed any.
     """
-    actions.replay(**locals())
+    actions.replay(SimpleNamespace(**locals()))
 
 
 @session.callback()

@@ -5,7 +5,7 @@ import os
 import time
 from pathlib import Path
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import typer
@@ -17,15 +17,15 @@ from jaxnbv.cli.actions.device import prepare
 from jaxnbv.cli.actions.lines import Lines
 from jaxnbv.cli.actions.run_folder import clear, explained, note, usual_folder
 from jaxnbv.cli.actions.searches import search_of
-from jaxnbv.cli.actions.sensors import first_pose, peculiarities, quick_rays, sensor_for
-from jaxnbv.cli.actions.tasks import COMMAND_TASKS, CommandTask, Given, OfMesh
+from jaxnbv.cli.actions.sensors import first_pose, peculiarities, sensor_for, with_rays
+from jaxnbv.cli.actions.tasks import COMMAND_TASKS, CommandTask, Given
 from jaxnbv.cli.actions.until import rule
 from jaxnbv.cli.registry import TASKS
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import View, simulate
 from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Grid, SensorNoise, Surface, load_mesh
+from jaxnbv.scanning import Grid, SensorNoise, Surface, load_mesh, scan
 from jaxnbv.scanning.sensors import Setting
 from jaxnbv.storage.folders import AnotherConfigurationError
 from jaxnbv.studies.scenes.banks import BANKS, bank_poses, shape_bank
@@ -63,7 +63,7 @@ def demo(asked: SimpleNamespace) -> None:
     if shown.note:
         typer.echo(shown.note)
     start = shown.first if asked.first is None else first_pose(asked.first, shown.surface)
-    setting = quick_rays(made.setting) if asked.quick else made.setting
+    setting = with_rays(made.setting, asked.quick)
     # The paper's model knows no shapes.
     usual = None if asked.model == "paper" else shown.bank
     known = usual if asked.known is None else asked.known
@@ -84,10 +84,16 @@ def run(asked: SimpleNamespace) -> None:
     the object, and a first view from inside it.
     """
     prepare(asked.device)
-    surface, made = load_mesh(asked.mesh), task_for(asked.task, asked.network, asked.category, asked.source)
+    options = {"network": asked.network, "category": asked.category, "source": asked.source}
+    surface, made = load_mesh(asked.mesh), task_for(asked.task, **options)
     setting = sensor_for(surface, made.setting, asked)
     start = first_pose(asked.first, surface, None if asked.paper else setting.radius)
-    given = Given(OfMesh(surface, start, setting.camera), asked.network, asked.category, asked.source)
+    given = Given(
+        start,
+        lambda: surface.sample_points(jax.random.key(0), 20_000),
+        lambda: scan(surface, setting.camera, start).to_numpy()[0],
+        **options,
+    )
     plain = Imagination.preset(asked.model, quick=asked.quick, lengthscale=asked.lengthscale)
     usual = QUICK if asked.quick else USUAL
     sizes = usual._replace(samples=asked.samples or usual.samples, candidates=asked.candidates or usual.candidates)
@@ -112,12 +118,11 @@ def knowing(imagination: Imagination, known: str | None) -> Imagination:
     return imagination.knowing(ShapeBank.from_meshes(known), Upright(by_axis=True))
 
 
-def task_for(task: str, network: Path | None, category: str | None, source: str | None) -> CommandTask:
-    """The task of a name.
+def task_for(task: str, **given: Any) -> CommandTask:
+    """The task of a name, given its `network`, `category` and `source`; None where not.
 
     **Raises:** `ValueError` if it lacks what it needs, or was given what it has no use for.
     """
-    given = {"network": network, "category": category, "source": source}
     for option, value in given.items():
         takers = ", ".join(name for name, entry in TASKS.items() if option in entry.options)
         useless = value is not None and option not in TASKS[task].options

@@ -29,17 +29,14 @@ def sensor_for(mesh: TriangleMesh, setting: Setting, asked: SimpleNamespace) -> 
         setting = setting._replace(camera=camera, radius=setting.radius if asked.radius is None else asked.radius)
     else:
         setting = fitted(setting, mesh.bounding_radius, fov, asked.radius)
-    if asked.rays is not None:
-        return _with_rays(setting, asked.rays)
-    return quick_rays(setting) if asked.quick else setting
+    return with_rays(setting, asked.quick, asked.rays)
 
 
-def quick_rays(setting: Setting) -> Setting:
-    """The setting with as few rays as --quick has."""
-    return _with_rays(setting, _QUICK_RAYS)
-
-
-def _with_rays(setting: Setting, rays: int) -> Setting:
+def with_rays(setting: Setting, quick: bool, rays: int | None = None) -> Setting:
+    """The setting with so many rays along a side; by default its own, or as few as --quick has."""
+    rays = rays or (_QUICK_RAYS if quick else None)
+    if rays is None:
+        return setting
     return setting._replace(camera=setting.camera.resized(rays, rays))
 
 

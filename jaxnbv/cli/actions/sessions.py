@@ -1,6 +1,6 @@
 """What `jaxnbv session replay DIR` does."""
 
-from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import typer
@@ -8,43 +8,30 @@ import typer
 from jaxnbv import viz
 from jaxnbv.cli.actions.device import prepare
 from jaxnbv.cli.actions.episodes import QUICK, USUAL, knowing, planner_of, task_for
-from jaxnbv.cli.actions.sensors import quick_rays
-from jaxnbv.cli.actions.tasks import Given, OfScan, position
-from jaxnbv.cli.registry import Device
+from jaxnbv.cli.actions.sensors import with_rays
+from jaxnbv.cli.actions.tasks import Given, position
 from jaxnbv.imagination import Imagination
 from jaxnbv.planning.replay import StoredSession
 from jaxnbv.viz.answers import words_of
 
 
-def replay(
-    folder: Path,
-    task: str,
-    network: Path | None,
-    category: str | None,
-    source: str | None,
-    search: str,
-    model: str,
-    known: str | None,
-    out: Path | None,
-    quick: bool,
-    report: bool,
-    device: Device,
-) -> None:
+def replay(asked: SimpleNamespace) -> None:
     """Where another task would have looked next, after each image of a session.
 
     **Raises:** `ValueError` for a task without what it needs, or with what it has no use for.
     """
-    prepare(device)
-    stored = StoredSession(folder)
+    prepare(asked.device)
+    stored, source = StoredSession(asked.folder), asked.source
     if source is not None:
         place = stored.frame.to_scene(np.array(position("--source", source)))
         source = ",".join(str(float(x)) for x in place)
-    made = task_for(task, network, category, source)
-    given = Given(OfScan(*stored.first_view()), network, category, source)
-    setting = quick_rays(made.setting) if quick else made.setting
-    imagination = knowing(Imagination.preset(model, quick=quick), known)
-    planner = planner_of(setting, made.acquisition(given), search, imagination, QUICK if quick else USUAL)
-    out = out or folder.with_name(f"{folder.name}-{task}-{search}")
+    options = {"network": asked.network, "category": asked.category, "source": source}
+    made, (first, seen) = task_for(asked.task, **options), stored.first_view()
+    given = Given(first, lambda: seen.to_numpy()[0], lambda: seen.to_numpy()[0], **options)
+    setting = with_rays(made.setting, asked.quick)
+    imagination = knowing(Imagination.preset(asked.model, quick=asked.quick), asked.known)
+    planner = planner_of(setting, made.acquisition(given), asked.search, imagination, QUICK if asked.quick else USUAL)
+    out = asked.out or asked.folder.with_name(f"{asked.folder.name}-{asked.task}-{asked.search}")
     sought = planner.quantity
     replayed = None
     for replayed, proposed in stored.replay(planner, out):
@@ -56,8 +43,8 @@ def replay(
         answer = planner.acquisition.answer(replayed.evidence.cloud)
         if answer is not None:
             typer.echo(f"          {words_of(answer).line()}")
-    if report and replayed is not None:
-        typer.echo(f"report    {viz.write_report(replayed.episode, out, title=folder.name)}")
+    if asked.report and replayed is not None:
+        typer.echo(f"report    {viz.write_report(replayed.episode, out, title=asked.folder.name)}")
     typer.echo(f"session   {out}")
 
 

@@ -1,8 +1,6 @@
 """What the tasks of the command line are: their sensor, their acquisition, and an object to show them on."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,8 +11,6 @@ from jaxtyping import Float
 from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement
 from jaxnbv.checks import InputError, require
 from jaxnbv.cli.registry import DEFAULT_FIRST
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.networks import (
     CATEGORIES,
@@ -25,7 +21,7 @@ from jaxnbv.networks import (
     part_segmenter,
     pretrained_classifier,
 )
-from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, scan
+from jaxnbv.scanning import Grid, SDFSurface, Surface
 from jaxnbv.scanning.sensors import HEAT_SETTING, PART_SETTING, USUAL_SETTING, Setting
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.studies.scenes import (
@@ -54,56 +50,16 @@ from jaxnbv.tasks.diffusion import HeatProblem
 _FED = 512
 
 
-class Known(ABC):
-    """What is known of a user's object before a view of it is chosen, in scene coordinates.
+class Given(NamedTuple):
+    """What a user gives: an object, where its first view is taken, and options that some tasks take.
 
-    - `first`: where the first view is taken.
+    - `points`: of the object, as much of it as is known before a view is chosen; `first_points`: those that the first
+      view shows. Scene coordinates, (n, 3); only some tasks ask for them.
     """
 
     first: Pose
-
-    @abstractmethod
-    def points(self) -> Float[np.ndarray, "n 3"]:
-        """Points of it."""
-
-    @abstractmethod
-    def first_points(self) -> Float[np.ndarray, "n 3"]:
-        """Those that the first view shows."""
-
-
-@dataclass(frozen=True)
-class OfMesh(Known):
-    """Of a mesh all is known. `camera`: which takes the first view."""
-
-    surface: TriangleMesh
-    first: Pose
-    camera: Camera
-
-    def points(self) -> Float[np.ndarray, "n 3"]:
-        return self.surface.sample_points(jax.random.key(0), 20_000)
-
-    def first_points(self) -> Float[np.ndarray, "n 3"]:
-        return scan(self.surface, self.camera, self.first).to_numpy()[0]
-
-
-@dataclass(frozen=True)
-class OfScan(Known):
-    """Of what a sensor saw its first scan."""
-
-    first: Pose
-    seen: PointCloud
-
-    def points(self) -> Float[np.ndarray, "n 3"]:
-        return self.seen.to_numpy()[0]
-
-    def first_points(self) -> Float[np.ndarray, "n 3"]:
-        return self.points()
-
-
-class Given(NamedTuple):
-    """What a user gives: an object, and options that some tasks take."""
-
-    known: Known
+    points: Callable[[], Float[np.ndarray, "n 3"]]
+    first_points: Callable[[], Float[np.ndarray, "n 3"]]
     network: Path | None = None
     category: str | None = None
     source: str | None = None
@@ -126,104 +82,88 @@ class Shown(NamedTuple):
     until: tuple[str, ...] = ()
 
 
-class CommandTask(ABC):
-    """A task of `jaxnbv run` and `jaxnbv demo`. `setting` is its sensor."""
+class CommandTask(NamedTuple):
+    """A task of `jaxnbv run` and `jaxnbv demo`.
 
+    - `acquisition`: on an object of the user's; options that the task requires are there.
+    - `demo`: one of the objects that ship, by the numbers of a scene and of a seed.
+    - `setting`: its sensor.
+    """
+
+    acquisition: Callable[[Given], Acquisition]
+    demo: Callable[[int, int], Shown]
     setting: Setting = USUAL_SETTING
 
-    @abstractmethod
-    def acquisition(self, given: Given) -> Acquisition:
-        """The acquisition on a mesh of the user's; options that the task requires are there."""
 
-    @abstractmethod
-    def demo(self, scene: int, seed: int) -> Shown:
-        """One of the objects that ship."""
+def _mug(scene: int, seed: int) -> Shown:
+    """A laid tea mug, the only one."""
+    return Shown("mug", demo_object(), NewSurface(), usual_first())
 
 
-class CoverageTask(CommandTask):
-    """To see all of an object."""
-
-    def acquisition(self, given: Given) -> Acquisition:
-        return NewSurface()
-
-    def demo(self, scene: int, seed: int) -> Shown:
-        """A laid tea mug, the only one."""
-        return Shown("mug", demo_object(), NewSurface(), usual_first())
-
-
-class ClassTask(CommandTask):
+def _class_task(of: Callable[[Classifier], Acquisition]) -> CommandTask:
     """To know an object's class, by an acquisition of a classifier."""
 
-    def __init__(self, of: Callable[[Classifier], Acquisition]):
-        self.of = of
-
-    def acquisition(self, given: Given) -> Acquisition:
+    def acquisition(given: Given) -> Acquisition:
         assert given.network is not None
         network = load_checkpoint(given.network)
-        return self.of(CloudClassifier(network, scale=network_scale(network)))
+        return of(CloudClassifier(network, scale=network_scale(network)))
 
-    def demo(self, scene: int, seed: int) -> Shown:
+    def demo(scene: int, seed: int) -> Shown:
         """A truck; only what it carries tells the class, and the first view, from above the ground, does not show it.
         The grid is that of the surfaces that the classifier was trained on."""
         truck = truck_scene(Split.TEST, scene, turned=False)
         around = sphere_candidates(120)
         first = hidden_view(truck, jax.random.key(seed), poses=around[np.asarray(around.position[:, 1]) > 0])
         side = Framing.CLOSE_UP.longest_side
-        acquisition = self.of(pretrained_classifier("truck", side, num_points=_FED))
+        shown = of(pretrained_classifier("truck", side, num_points=_FED))
         note = f"the truck carries a {HOUSEHOLD[int(truck.label)]}, which the first view does not show"
         grid = Grid(64, 0.7 * side)
-        return Shown("truck", SDFSurface(truck), acquisition, first, "truck", grid, note, ("sure=0.95",))
+        return Shown("truck", SDFSurface(truck), shown, first, "truck", grid, note, ("sure=0.95",))
+
+    return CommandTask(acquisition, demo)
 
 
-class PartTask(CommandTask):
-    """To find all parts of an object of a category."""
-
-    setting = PART_SETTING
-
-    def acquisition(self, given: Given) -> Acquisition:
-        assert given.category is not None
-        if given.network is None:
-            return self._of(part_segmenter(given.category))
-        network = load_checkpoint(given.network)
-        return self._of(CloudSegmenter(network, given.category, scale=network_scale(network)))
-
-    def demo(self, scene: int, seed: int) -> Shown:
-        """A procedural object."""
-        thing = part_scene(Split.TEST, scene)
-        category = CATEGORIES[int(thing.category)].name
-        acquisition = self._of(part_segmenter(category))
-        return Shown(category, SDFSurface(thing.solid), acquisition, usual_first(), bank="parts", until=("found=60",))
-
-    def _of(self, segmenter: CloudSegmenter) -> Acquisition:
-        return ExpectedUtilityImprovement(SoftPartCount(segmenter), segmenter.num_points)
+def _of_parts(given: Given) -> Acquisition:
+    assert given.category is not None
+    if given.network is None:
+        return _counting(part_segmenter(given.category))
+    network = load_checkpoint(given.network)
+    return _counting(CloudSegmenter(network, given.category, scale=network_scale(network)))
 
 
-class HeatTask(CommandTask):
-    """To find the coldest point of a body that is heated at one place."""
-
-    setting = HEAT_SETTING
-
-    def acquisition(self, given: Given) -> Acquisition:
-        """Heated at the point that was asked for, or at the one in the middle of the first view."""
-        return self._of(_middle(given.known) if given.source is None else _asked(given.known, given.source))
-
-    def demo(self, scene: int, seed: int) -> Shown:
-        """A procedural object."""
-        heated = heat_scene(scene)
-        first = source_view(heated, jax.random.key(seed))
-        return Shown(heated.name, heated.surface, self._of(np.asarray(heated.source)), first, bank="heat")
-
-    def _of(self, source: np.ndarray) -> Acquisition:
-        return ExpectedUtilityImprovement(ColdestPoint(source), num_points=2048)
+def _thing_of_parts(scene: int, seed: int) -> Shown:
+    thing = part_scene(Split.TEST, scene)
+    category = CATEGORIES[int(thing.category)].name
+    shown = _counting(part_segmenter(category))
+    return Shown(category, SDFSurface(thing.solid), shown, usual_first(), bank="parts", until=("found=60",))
 
 
-COMMAND_TASKS: dict[str, CommandTask] = {
-    "cross-entropy": ClassTask(CrossEntropy),
-    "entropy": ClassTask(lambda classifier: ExpectedUtilityImprovement(NegativeEntropy(classifier), num_points=1024)),
-    "mixed": ClassTask(MixedEntropy),
-    "coverage": CoverageTask(),
-    "parts": PartTask(),
-    "heat": HeatTask(),
+def _counting(segmenter: CloudSegmenter) -> Acquisition:
+    return ExpectedUtilityImprovement(SoftPartCount(segmenter), segmenter.num_points)
+
+
+def _of_heat(given: Given) -> Acquisition:
+    """Heated at the point that was asked for, or at the one in the middle of the first view."""
+    return _heated_at(_middle(given) if given.source is None else _asked(given, given.source))
+
+
+def _heated_thing(scene: int, seed: int) -> Shown:
+    heated = heat_scene(scene)
+    first = source_view(heated, jax.random.key(seed))
+    return Shown(heated.name, heated.surface, _heated_at(np.asarray(heated.source)), first, bank="heat")
+
+
+def _heated_at(source: np.ndarray) -> Acquisition:
+    return ExpectedUtilityImprovement(ColdestPoint(source), num_points=2048)
+
+
+COMMAND_TASKS = {
+    "cross-entropy": _class_task(CrossEntropy),
+    "entropy": _class_task(lambda classifier: ExpectedUtilityImprovement(NegativeEntropy(classifier), num_points=1024)),
+    "mixed": _class_task(MixedEntropy),
+    "coverage": CommandTask(lambda given: NewSurface(), _mug),
+    "parts": CommandTask(_of_parts, _thing_of_parts, PART_SETTING),
+    "heat": CommandTask(_of_heat, _heated_thing, HEAT_SETTING),
 }
 
 
@@ -245,8 +185,8 @@ def position(option: str, text: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _asked(known: Known, source: str) -> np.ndarray:
-    place, points = np.asarray(position("--source", source)), known.points()
+def _asked(given: Given, source: str) -> np.ndarray:
+    place, points = np.asarray(position("--source", source)), given.points()
     nearest = points[np.linalg.norm(points - place, axis=1).argmin()]
     distance = float(np.linalg.norm(nearest - place))
     require(
@@ -257,10 +197,10 @@ def _asked(known: Known, source: str) -> np.ndarray:
     return place
 
 
-def _middle(known: Known) -> np.ndarray:
-    points = known.first_points()
+def _middle(given: Given) -> np.ndarray:
+    points = given.first_points()
     require(len(points) > 0, "the first view does not see the object: give another --first, or a --source")
-    away, forward = points - np.asarray(known.first.position), np.asarray(known.first.forward)
+    away, forward = points - np.asarray(given.first.position), np.asarray(given.first.forward)
     along = away @ forward
     beside = np.linalg.norm(away - along[:, None] * forward, axis=1)
     return points[beside.argmin()]
