@@ -24,6 +24,7 @@ from jaxnbv.errors import InputError as InputError
 AnyArray = Array | np.ndarray
 _F = TypeVar("_F", bound=Callable[..., Any])
 _LONGEST_SHOWN = 60
+_hints_of = functools.cache(get_type_hints)
 # Where what runs is not a user's.
 _OWN = tuple(
     f"{Path(str(file)).parent}{os.sep}" for file in (jax.__file__, equinox.__file__, jaxtyping.__file__, __file__)
@@ -64,7 +65,7 @@ def checked(function: _F) -> _F:
     @functools.wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
         bound = signature.bind(*arguments, **named)
-        hints = _hints(function)
+        hints = _hints_of(function)
         for name, value in bound.arguments.items():
             if name in hints:
                 owner = type(arguments[0]).__name__ if function.__name__ == "__init__" else function.__name__
@@ -72,11 +73,6 @@ def checked(function: _F) -> _F:
         return function(*arguments, **named)
 
     return call  # type: ignore[return-value]
-
-
-@functools.cache
-def _hints(function: Callable[..., Any]) -> dict[str, Any]:
-    return get_type_hints(function)
 
 
 def check_type(value: Any, hint: Any, name: str) -> None:

@@ -52,10 +52,8 @@ def explained(folder: Path, asked: dict[str, Any], error: AnotherConfigurationEr
     changed: list[str] = []
     if (folder / _OPTIONS).exists():
         held = read_json(folder / _OPTIONS, "does not hold options", "give another --out, or --overwrite")
-        names = list(dict.fromkeys([*held, *asked]))
-        changed = [
-            _difference(name, held.get(name), asked.get(name)) for name in names if held.get(name) != asked.get(name)
-        ]
+        both = {name: (held.get(name), asked.get(name)) for name in [*held, *asked]}
+        changed = [_difference(name, there, now) for name, (there, now) in both.items() if there != now]
     if not changed:
         return f"{error}; or replace it by --overwrite"
     return (
@@ -67,11 +65,7 @@ def explained(folder: Path, asked: dict[str, Any], error: AnotherConfigurationEr
 def _difference(name: str, there: Any, now: Any) -> str:
     if name == "mesh":
         return f"the mesh {there} there, {now} now"
-    option = f"--{name}"
     if isinstance(there, bool) or isinstance(now, bool):
-        return f"{option} there, not now" if there else f"{option} now, not there"
-    return f"{option} {_said(there)} there, {_said(now)} now"
-
-
-def _said(value: Any) -> str:
-    return "not given" if value is None else str(value)
+        return f"--{name} there, not now" if there else f"--{name} now, not there"
+    there, now = ("not given" if value is None else value for value in (there, now))
+    return f"--{name} {there} there, {now} now"
