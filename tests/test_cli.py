@@ -35,6 +35,7 @@ def test_demo_leaves_an_episode_a_report_and_figures(finished):
     assert config["planner"]["search"]["type"] == "HalvingSearch"
 
 
+@pytest.mark.slow
 def test_the_same_command_continues_with_more_views(finished):
     folder, _ = finished
     out = folder / "runs" / "truck-cross-entropy-halving-seed0"
@@ -163,6 +164,7 @@ def test_a_folder_of_another_configuration_is_refused(finished):
     assert "key" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_published_checkpoint_converts_and_classifies_a_mesh(tmp_path, shared):
     source = shared / "reference" / "pointnet2_cls_ssg.pth"
     result = run_command("convert", str(source), "net.safetensors", cwd=tmp_path)

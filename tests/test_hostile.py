@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 
 def run(name, *arguments):
     script = Path(__file__).with_name(name)
@@ -11,6 +13,7 @@ def run(name, *arguments):
     assert found.returncode == 0, found.stdout + found.stderr
 
 
+@pytest.mark.slow
 def test_any_argument_works_or_is_refused_by_name():
     run("hostile.py", "25")
 

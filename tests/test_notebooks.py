@@ -107,9 +107,8 @@ def kernel():
     manager.shutdown_kernel(now=True)
 
 
-@pytest.mark.parametrize(
-    "name", [name if name.startswith("01") else pytest.param(name, marks=pytest.mark.slow) for name in SMALL]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SMALL)
 def test_notebook_runs(name, kernel, tmp_path):
     """And every cell shows the same kinds of things as it has stored, in the same words."""
     notebook = stored(name)

@@ -143,6 +143,7 @@ def poses_about_a_ball(count):
     return np.asarray(nbv.look_at(places, (0.0, 0.0, 0.1), up=(0.0, 0.0, 1.0)).matrix)
 
 
+@pytest.mark.slow
 def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
     """Until the ball is expected to be covered. Reports of sessions are tested on their own."""
     monkeypatch.chdir(tmp_path)
@@ -171,6 +172,7 @@ def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
     assert points[:, 0].max() > 0.08
 
 
+@pytest.mark.slow
 def test_the_block_for_a_recording_runs(tmp_path, monkeypatch):
     pose = nbv.look_at((0.6, -0.6, 0.4), (0.0, 0.0, 0.1), up=(0.0, 0.0, 1.0))
     folder = tmp_path / "recording"
@@ -186,6 +188,7 @@ def test_the_block_for_a_recording_runs(tmp_path, monkeypatch):
     assert int(given["session"].cloud.count) > 100
 
 
+@pytest.mark.slow
 def test_the_block_for_a_depth_camera_runs(monkeypatch):
     pose = nbv.look_at((0.6, -0.6, 0.4), (0.0, 0.0, 0.1), up=(0.0, 0.0, 1.0))
     imagination = nbv.Imagination(nbv.GeometricSPSR(0.05, 0.2, 8), grid=nbv.Grid(24), num_samples=2)

@@ -154,6 +154,7 @@ def test_standard_errors_are_of_what_is_weighed():
     np.testing.assert_allclose(errors[1], errors[0] / (1.0 + way), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_search_by_gradient_weighs_the_way_too():
     """So dear that the best is to stay near."""
     search = GradientSearch(dof=2, num_starts=2, iterations=6, learning_rate=0.05, num_candidates=6)

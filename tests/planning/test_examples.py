@@ -53,6 +53,7 @@ def test_ros_transforms_are_scipys():
         np.testing.assert_allclose(ros.matrix_of(transform_of(matrix)), matrix, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_ros_bridge_takes_images_and_publishes_where_to_go():
     """As a session by hand does; nothing before the camera is known."""
     ros = load("ros2_next_view")

@@ -179,7 +179,10 @@ def compare(score, surfaces, pairs, step=STEP):
     return found, np.asarray(ahead - behind) / (2 * step), np.repeat(length, pairs.directions.shape[1])
 
 
-@pytest.mark.parametrize(("kind", "space"), [("filling", "sphere"), ("blob", "sphere"), ("rough", "free")])
+@pytest.mark.parametrize(
+    ("kind", "space"),
+    [("filling", "sphere"), ("blob", "sphere"), pytest.param("rough", "free", marks=pytest.mark.slow)],
+)
 def test_derivatives_are_those_of_central_differences(kind, space, x64):
     surfaces, pairs = surfaces_of(kind), pairs_of(space)
     seen = events(surfaces, pairs, STEP)
@@ -212,6 +215,7 @@ def test_a_jump_is_not_in_the_derivative(x64):
     assert np.median(error[seen.jumps]) > 30 * np.median(error[~seen.jumps & ~seen.grazes])
 
 
+@pytest.mark.slow
 def test_derivatives_through_a_network(x64):
     """A network bends at every unit that switches and wherever it picks other points; almost everywhere it agrees."""
     network = CloudClassifier(InvariantClassifier(3, jax.random.key(0)), 96)

@@ -63,6 +63,7 @@ def test_another_planner_looks_elsewhere_among_the_same_poses(stored):
         np.testing.assert_allclose(values[np.isfinite(values)], distance[np.isfinite(values)], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_search_by_gradient_takes_its_own_poses(stored):
     search = GradientSearch(dof=2, num_starts=1, iterations=1, num_candidates=2)
     _, proposed = next(StoredSession(stored[0]).replay(planner_of(search)))

@@ -251,6 +251,7 @@ def test_it_is_done_by_its_rule(finished):
     assert session.done is None
 
 
+@pytest.mark.slow
 def test_a_report_stands_upright_and_needs_no_truth(finished, tmp_path):
     page = write_report(finished.episode, tmp_path, progress=False).read_text()
     assert "that of a real sensor" in page

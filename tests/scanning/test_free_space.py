@@ -145,6 +145,7 @@ def marked_and_inside(centre, radius, half, axis, angle, start, end, direction, 
     return jnp.sum(empty), jnp.sum(inside), jnp.sum(empty & inside)
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(st.integers(0, 2**31))
 def test_noise_on_any_solid_from_anywhere_carves_nothing_of_it(seed):

@@ -142,6 +142,7 @@ def test_grazing_and_missed_rays(name):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_batches_of_surfaces_and_starts_equal_loops_forwards_and_backwards(x64):
     """Starts within surfaces, and surfaces within starts."""
     surfaces, starts, space = small_surfaces(RNG, 16), look_at(fibonacci_sphere(3, 2.5)), FreePoses()

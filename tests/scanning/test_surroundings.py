@@ -188,6 +188,7 @@ def test_on_request_cameras_stand_in_space_that_was_seen_empty_alone():
         np.testing.assert_array_equal(np.isneginf(np.asarray(own.propose(evidence, KEY).values)), expected)
 
 
+@pytest.mark.slow
 def test_a_search_by_gradient_stays_out_of_obstacles():
     """Its starts are all too low; free, ascent stays there."""
     starts = look_at(2.3 * np.array([[np.cos(a), -0.05, np.sin(a)] for a in (0.3, 1.9, 3.5, 5.1)]))

@@ -139,7 +139,10 @@ def test_a_score_that_fails_by_itself_says_so():
         planner_of(GradientSearch(), ExpectedUtilityImprovement(wrong))
 
 
-@pytest.mark.parametrize("space", [SpherePoses(), FreePoses(), ConstrainedPoses()])
+@pytest.mark.parametrize(
+    "space",
+    [SpherePoses(), *(pytest.param(space, marks=pytest.mark.slow) for space in (FreePoses(), ConstrainedPoses()))],
+)
 def test_a_derivative_that_is_not_a_number_is_reported(space):
     """The square root's value at zero is finite, its slope is not."""
     score = ExpectedUtilityImprovement(lambda cloud: jnp.sqrt(0.0 * jnp.sum(cloud.points**2)) + 1.0 * cloud.count)
@@ -157,6 +160,7 @@ class Side(eqx.Module):
         return jax.nn.log_softmax(jnp.stack([3.0 * mean, jnp.zeros(())]))
 
 
+@pytest.mark.slow
 def test_cross_entropy_within_constraints_ends_on_the_object():
     search = GradientSearch(space=ConstrainedPoses(), num_starts=3, iterations=10, num_candidates=8, learning_rate=0.05)
     planner = planner_of(search, CrossEntropy(Side(), num_points=64))

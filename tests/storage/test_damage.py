@@ -67,6 +67,7 @@ def config_of(episode):
     return describe(BASE | {"planner": episode.planner})
 
 
+@pytest.mark.slow
 def test_no_turned_bit_of_a_view_passes(finished, tmp_path):
     """Any one bit: the file is refused by name, or its arrays are the same (bits that mean nothing)."""
     episode, folder = finished

@@ -78,6 +78,7 @@ def test_a_folder_that_is_closed_is_named(tmp_path):
     tmp_path.chmod(0o700)
 
 
+@pytest.mark.slow
 def test_writers_of_one_file_do_not_meet(tmp_path):
     """Each file that a reader finds is one writer's whole."""
     script = (

@@ -59,6 +59,7 @@ def test_samples_are_reproducible_and_distinct():
     assert len(np.unique(np.asarray(first)[:, 0])) == 6
 
 
+@pytest.mark.slow
 def test_posterior_is_calibrated():
     """Simulation-based calibration (Talts et al. 2018). 1,200 problems drawn from the prior in weight space: normals of
     f with noise at 10 random points, conditioned on in float32, 31 samples. The rank of the true f among the samples

@@ -98,7 +98,7 @@ def test_mean_about_functions_equals_regression_of_the_data_less_them(x64, kind,
         np.testing.assert_allclose(found[s], mean, atol=1e-9 * np.abs(mean).max())
 
 
-@BOTH
+@pytest.mark.parametrize("kind", [pytest.param("geometric", marks=pytest.mark.slow), "screened"])
 def test_samples_about_functions_have_their_mean_and_the_scaled_covariance(x64, kind):
     """1,536 samples at twelve points, 512 about each of three functions with three scales. Whitened by the exact
     moments, z' z of the sample mean is chi-square, and the covariance is the identity within 4.5 standard errors."""

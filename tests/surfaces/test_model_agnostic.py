@@ -49,6 +49,7 @@ def posterior():
     return RandomSpheres().condition(cloud)
 
 
+@pytest.mark.slow
 def test_proposed_view_is_the_best_by_chamfer_distance_to_exact_scans_of_the_samples():
     """Each sample is a sphere: its scan in closed form, then the mean over samples of the sum of squared distances."""
     plan, key = planner(), jax.random.key(1)

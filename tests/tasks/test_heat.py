@@ -82,6 +82,7 @@ def test_a_heat_problem_stands_for_its_numbers(x64):
         ColdestPoint(HEAT, T=2.0)
 
 
+@pytest.mark.slow
 def test_neither_workers_nor_the_order_of_the_points_change_a_bit():
     points = np.stack([sphere(90) for _ in range(11)])
     clouds = PointCloud(jnp.asarray(points), jnp.asarray(points), jnp.asarray(RNG.uniform(size=(11, 90)) < 0.7))

@@ -108,6 +108,7 @@ def test_its_expectation_and_that_beside_others_are_the_same():
     assert float(alone[1]) == pytest.approx(float(alone[2]), rel=0.05)
 
 
+@pytest.mark.slow
 def test_it_can_be_climbed(x64):
     """The derivative in the pose is that by central differences, for a small step, of the smooth part of it."""
     surfaces, camera = ball_on_grid(), Camera(height=16, width=16)

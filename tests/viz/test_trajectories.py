@@ -144,6 +144,7 @@ def test_a_search_of_enough_candidates_makes_its_own_map(spatial, spatial_data):
     assert len(alone.values) == 48
 
 
+@pytest.mark.slow
 def test_a_map_of_too_few_candidates_is_made_anew_with_the_same_samples(few, few_data):
     choice = few_data.views[1].choice
     assert choice.values.shape == (4,)
@@ -249,6 +250,7 @@ def test_frusta_stand_along_a_trajectory(spatial):
     assert np.linalg.norm(edges[:, 0, 1] - edges[:, 0, 0], axis=-1).max() < 0.2
 
 
+@pytest.mark.slow
 def test_pictures_of_a_search_in_space(spatial, spatial_data, tmp_path):
     paths = write_figures(spatial_data, CAMERA, tmp_path, progress=False)
     names = ["coverage.png", "overview.png", "task.png", "view_01.png", "view_02.png", "view_02_imagined.png"]

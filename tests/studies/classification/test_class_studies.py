@@ -112,7 +112,8 @@ def test_first_views_of_trucks_are_random_and_told_apart_by_what_they_show():
     assert {*TruckStudy.groups(shown)} == {"all", "first view with cargo"}
 
 
-@pytest.mark.parametrize("kind", [pytest.param(ModelNet10Study, marks=pytest.mark.slow), OmniObject3DStudy])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [ModelNet10Study, OmniObject3DStudy])
 def test_where_all_of_the_object_tells_its_class_no_pixels_are_counted(kind):
     found = record(kind)
     assert list(found["methods"]) == list(kind.methods)

@@ -60,11 +60,13 @@ def check_every_trial_is_in_the_result_once(folder, runner, killed):
     return trial
 
 
+@pytest.mark.slow
 def test_in_processes_no_trial_is_lost_though_some_die(tmp_path):
     trial = check_every_trial_is_in_the_result_once(tmp_path, Processes(2), "died 2 times")
     assert [len(trial.beginnings(index)) for index in range(6)] == [1, 1, 2, 1, 2, 1]
 
 
+@pytest.mark.slow
 def test_processes_end_when_the_command_is_killed(tmp_path):
     program = (
         "from pathlib import Path; from deadly import Endless; from jaxnbv.studies.engine.trials import Processes;"

@@ -87,6 +87,7 @@ def test_points_belong_to_the_nearest_box(folder):
     assert (slope[:150] != 0).any()
 
 
+@pytest.mark.slow
 def test_it_asks_for_the_parts_that_can_be_seen_and_counts_their_points(folder):
     study = small_study(folder)
     assert study.num_scenes == 2

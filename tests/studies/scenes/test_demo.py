@@ -38,6 +38,7 @@ def test_it_is_not_symmetric():
         assert np.abs(np.asarray(distance(x)) - np.asarray(distance(x * mirror))).max() > 0.1
 
 
+@pytest.mark.slow
 def test_its_inside_shows_from_few_views():
     """The mug's floor is seen from above only."""
     camera = Camera(height=25, width=25)

@@ -62,6 +62,7 @@ def assert_same(a, b):
         np.testing.assert_array_equal(x, y)
 
 
+@pytest.mark.slow
 def test_scanned_clouds_are_samples_of_their_scenes_with_noise(scanned):
     np.testing.assert_array_equal(scanned.labels, np.arange(5, 5 + COUNT) % len(PATTERNS))
     assert not np.asarray(scanned.imagined).any()
@@ -120,6 +121,7 @@ def test_points_that_tell_the_class_lie_on_what_tells_it(scanned):
         assert (own[tells, 2] < float(pyramid.depth) + 0.04).all()
 
 
+@pytest.mark.slow
 def test_clouds_can_be_made_again_in_other_portions(scanned):
     assert_same(scanned, clouds_of(Split.TRAIN, 5, COUNT))
     part = portion_of(Split.TRAIN, Framing.CLOSE_UP, 5 + FEW.start, FEW.stop - FEW.start)

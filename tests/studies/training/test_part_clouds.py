@@ -60,6 +60,7 @@ def labels_at(solid, x):
     return solid.label(x)
 
 
+@pytest.mark.slow
 def test_labels_are_those_of_the_surface_nearby(scanned, scenes):
     assert scanned.clouds.points.shape == (6, POINTS, 3)
     assert scanned.labels.shape == (6, POINTS)
