@@ -71,14 +71,12 @@ class Words:
             was = "" if before is None else f" (was {self._value(before, index)})"
             return f"{self.answer.names[index]} {self._value(self.answer, index)}{was}"
 
-        text = ", ".join(map(one, self.shown))
-        return f"{text[:1].upper()}{text[1:]}."
+        return f"{capital(', '.join(map(one, self.shown)))}."
 
     @property
     def question(self) -> str:
         """What was asked, for the head of the report."""
-        names = " and ".join(self.answer.names[index] for index in self.shown)
-        return f"{names[:1].upper()}{names[1:]}?"
+        return f"{capital(' and '.join(self.answer.names[index] for index in self.shown))}?"
 
     @property
     def found(self) -> str:
@@ -121,10 +119,13 @@ def words_of(answer: Answer) -> Words:
     return Words(answer)
 
 
+@words_of.register(ClassAnswer)
 class _ClassWords(Words):
     """The likeliest five classes are shown."""
 
     answer: ClassAnswer
+    question = "Which class is it?"
+    settled_means = f"probability {_SURE} or more"
 
     @property
     def shown(self) -> tuple[int, ...]:
@@ -155,17 +156,9 @@ class _ClassWords(Words):
         return f"{text}."
 
     @property
-    def question(self) -> str:
-        return "Which class is it?"
-
-    @property
     def found(self) -> str:
         name, p = self._best
         return name if p == 1.0 else f"{name}, probability {p:.2f}"
-
-    @property
-    def settled_means(self) -> str:
-        return f"probability {_SURE} or more"
 
     def settled(self, before: Answer | None) -> bool:
         """Sure, and not of another class than the view before was sure of."""
@@ -183,10 +176,12 @@ class _ClassWords(Words):
         return (Panel("probability", self.answer.names, self.answer.values, true, one_true=True, goal=_SURE),)
 
 
+@words_of.register(PartAnswer)
 class _PartWords(Words):
     """The parts that were asked for are shown."""
 
     answer: PartAnswer
+    question = "Which parts does it have?"
 
     @property
     def shown(self) -> tuple[int, ...]:
@@ -200,10 +195,6 @@ class _PartWords(Words):
         names, values = self.answer.names, self.answer.values
         listed = ", ".join(f"{names[index]} {values[index]:.0f}" for index in self.shown) or "none"
         return f"Points predicted of each part: {listed}."
-
-    @property
-    def question(self) -> str:
-        return "Which parts does it have?"
 
     @property
     def found(self) -> str:
@@ -232,10 +223,12 @@ class _PartWords(Words):
         return Panel(f"parts found ({target:g} points or more)", ("parts",), found, there), points
 
 
+@words_of.register(ColdestAnswer)
 class _ColdestWords(Words):
     """Where the cloud is coldest, and how cold it is there."""
 
     answer: ColdestAnswer
+    question = "Where does it stay coldest while it is heated?"
 
     def line(self, before: Answer | None = None) -> str:
         change = "" if before is None else f" (was {number(float(before.values[0]))})"
@@ -243,10 +236,6 @@ class _ColdestWords(Words):
 
     def sentence(self, before: Answer | None = None) -> str:
         return f"The cloud is {self.line(before)}."
-
-    @property
-    def question(self) -> str:
-        return "Where does it stay coldest while it is heated?"
 
     def panels(self, truth: Answer | None) -> tuple[Panel, ...]:
         """The temperature of the coldest point and, where the truth is known, its distance to the true one."""
@@ -264,18 +253,11 @@ class CoverageAnswer(Answer):
 
     form: str = "{:.0%}"
 
-    @property
-    def is_share(self) -> bool:
-        """Whether it is a share."""
-        return self.form.endswith("%}")
 
-
+@words_of.register(CoverageAnswer)
 class _CoverageWords(Words):
     answer: CoverageAnswer
-
-    @property
-    def question(self) -> str:
-        return "What does it look like all round?"
+    question = "What does it look like all round?"
 
     @property
     def found(self) -> str:
@@ -283,18 +265,9 @@ class _CoverageWords(Words):
 
     def panels(self, truth: Answer | None) -> tuple[Panel, ...]:
         names, values = self.answer.names, self.answer.values
-        if not self.answer.is_share:
+        if not self.answer.form.endswith("%}"):
             return (Panel(names[0], names, values),)
         return (Panel("surface seen (%)", names, 100.0 * values, goal=100.0),)
-
-
-for _kind, _words in {
-    ClassAnswer: _ClassWords,
-    PartAnswer: _PartWords,
-    ColdestAnswer: _ColdestWords,
-    CoverageAnswer: _CoverageWords,
-}.items():
-    words_of.register(_kind, _words)
 
 
 def label_of(quantity: Quantity) -> str:
@@ -311,6 +284,11 @@ def coordinates(point: Float[np.ndarray, "3"]) -> str:
     """A point in scene units."""
     x, y, z = (f"{coordinate:.2f}".replace("-", "−") for coordinate in point)
     return f"({x}, {y}, {z})"
+
+
+def capital(text: str) -> str:
+    """A text that starts with a capital letter, and is otherwise as it was."""
+    return text[:1].upper() + text[1:]
 
 
 def number(value: float) -> str:

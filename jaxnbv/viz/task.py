@@ -13,7 +13,7 @@ from jaxnbv.planning.episode import Episode, View
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Surface
 from jaxnbv.scanning.metrics import true_mesh
-from jaxnbv.viz.answers import CoverageAnswer, Panel, words_of
+from jaxnbv.viz.answers import CoverageAnswer, Panel, capital, words_of
 
 
 class Rival(eqx.Module):
@@ -88,7 +88,12 @@ def _answers(acquisition: Acquisition, views: Sequence[View], covered: Sequence[
     answers = [answer for answer in given if answer is not None]
     if len(answers) == len(given):
         return answers
-    return [_coverage(int(view.cloud.count), share) for view, share in zip(views, covered, strict=True)]
+    return [
+        CoverageAnswer(("points kept",), np.array([float(view.cloud.count)]), "{:,.0f}")
+        if share is None
+        else CoverageAnswer(("of the surface seen",), np.array([share]))
+        for view, share in zip(views, covered, strict=True)
+    ]
 
 
 def true_cloud(scene: Surface, count: int) -> PointCloud | None:
@@ -135,12 +140,6 @@ def race_words(rival: Episode, acquisition: Acquisition) -> str:
     return f"{name} {needed} from the same start ({words_of(answer).found})."
 
 
-def _coverage(count: int, share: float | None) -> CoverageAnswer:
-    if share is None:
-        return CoverageAnswer(("points kept",), np.array([float(count)]), "{:,.0f}")
-    return CoverageAnswer(("of the surface seen",), np.array([share]))
-
-
 def _asked(planner: Planner) -> str:
     name = planner.quantity.name
     if not planner.search.uses_samples:
@@ -149,8 +148,7 @@ def _asked(planner: Planner) -> str:
 
 
 def _found(answers: list[Answer], truth: Answer | None) -> str:
-    last = words_of(answers[-1]).found
-    text = f"{last[:1].upper()}{last[1:]}"
+    text = capital(words_of(answers[-1]).found)
     return text if truth is None else f"{text}. In truth: {words_of(truth).truly}"
 
 

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from matplotlib.transforms import ScaledTranslation
 
-from jaxnbv.viz.answers import Panel, label_of, number
+from jaxnbv.viz.answers import Panel, capital, label_of, number
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.style import BEFORE, GREY, INK, LINE, NEW, SERIES
 
@@ -35,7 +35,8 @@ def draw_panel(axes: Axes, panels: tuple[Panel, ...], rival: tuple[Panel, ...] =
     the number that the chart is about, where it is about one."""
     last, chosen = panels[-1], shown_names(panels)
     values, views = np.stack([panel.values for panel in panels]), np.arange(1, len(panels) + 1)
-    marked, others = _stands_out(last), iter(SERIES * 2)
+    marked = int(np.argmax(last.true)) if last.one_true and last.true is not None else None
+    others = iter(SERIES * 2)
     handles: list[Any] = []
     for index in chosen:
         name = textwrap.shorten(last.names[index], _LONGEST_NAME, placeholder="…")
@@ -56,11 +57,6 @@ def draw_panel(axes: Axes, panels: tuple[Panel, ...], rival: tuple[Panel, ...] =
     low, high = axes.get_ylim()
     axes.set_ylim(min(low, 0.0) if values.min() >= 0 else low, high + 0.05 * (high - low))
     over_views(axes, max(len(panels), len(rival)))
-
-
-def _stands_out(last: Panel) -> int | None:
-    """Which number is the one true one, if one is."""
-    return int(np.argmax(last.true)) if last.one_true and last.true is not None else None
 
 
 def _draw_rival(axes: Axes, values: Float[np.ndarray, " v"], name: str) -> Line2D:
@@ -180,5 +176,5 @@ def chart_figure(charts: list[tuple[str, Any]], width: float = 3.6, height: floa
     for axes, (title, draw) in zip(np.atleast_1d(figure.subplots(1, len(charts))), charts, strict=True):
         draw(axes)
         if titled:
-            axes.set_title("\n".join(textwrap.wrap(title[:1].upper() + title[1:], int(12 * width))[:3]), fontsize=9)
+            axes.set_title("\n".join(textwrap.wrap(capital(title), int(12 * width))[:3]), fontsize=9)
     return figure
