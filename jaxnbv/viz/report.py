@@ -6,7 +6,6 @@ import json
 import math
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -21,11 +20,10 @@ from jaxnbv.planning.episode import Episode
 from jaxnbv.storage import describe
 from jaxnbv.storage.files import make_folder, write_text
 from jaxnbv.storage.folders import versions, writing_in
-from jaxnbv.viz.answers import Panel, label_of, may_be_words, number
+from jaxnbv.viz.answers import capital, label_of, may_be_words, number
 from jaxnbv.viz.data import ReportData, report_data
 from jaxnbv.viz.figures import STYLE, Stills, write_figures
 from jaxnbv.viz.html import render
-from jaxnbv.viz.imagined import Imagined
 from jaxnbv.viz.imagined_figures import Tile, depths, looks
 from jaxnbv.viz.page_data import payload, picture_address, space
 from jaxnbv.viz.render import draw_scene, look_picture
@@ -80,17 +78,18 @@ def report_html(episode: Episode, data: ReportData, title: str, stills: Stills |
         title=title,
         task=data.task,
         quantity=data.quantity,
-        label=_capital(label_of(data.quantity)),
+        label=capital(label_of(data.quantity)),
         views=data.views,
         scenes=scenes,
         task_charts=charts[0],
         other_charts=charts[1],
-        tables=[_table(panels) for panels in zip(*data.task.panels, strict=True)],
-        imagined=[_imagined(view.imagined) for view in data.views],
+        tables=list(zip(*data.task.panels, strict=True)),
         settings=_settings(episode, title),
         units="scene units" if data.frame is None else "the units of the object's file",
         space=_zipped(json.dumps(space(data, camera), allow_nan=False)),
         plotly=_zipped(get_plotlyjs()),
+        **{said.__name__: said for said in (capital, number, may_be_words, looks, depths)},
+        address=_tile_address,
         # "</" would end the script element that holds the data.
         data=json.dumps(payload(data), allow_nan=False).replace("</", "<\\/"),
     )
@@ -100,40 +99,8 @@ def _zipped(text: str) -> bytes:
     return gzip.compress(text.encode(), mtime=0)
 
 
-class _Scene(NamedTuple):
+def _scene(data: ReportData, index: int, stills: Stills, camera: Camera) -> tuple[str, str | None, str]:
     """The picture of one view's scene; what the new view saw, if it saw something, and the corner that it goes into."""
-
-    picture: str
-    look: str | None
-    corner: str
-
-
-class _Chart(NamedTuple):
-    """A chart as a drawing; where its first view begins and how wide each is, so that the page can mark one."""
-
-    name: str
-    drawing: bytes
-    box: str
-
-
-class _Table(NamedTuple):
-    """The numbers of a chart of the task: a row a view."""
-
-    title: str
-    names: tuple[str, ...]
-    rows: list[tuple[str, list[str]]]
-
-
-class _Imagined(NamedTuple):
-    """What was imagined before a view: what it may be, pictures by their names, and the scale of depths."""
-
-    may_be: str
-    looks: list[tuple[str, str]]
-    depths: list[tuple[str, str]]
-    scale: str
-
-
-def _scene(data: ReportData, index: int, stills: Stills, camera: Camera) -> _Scene:
     figure = Figure(figsize=_SCENE, facecolor="none")
     axes, aspect = figure.add_axes((0, 0, 1, 1)), _SCENE[0] / _SCENE[1]
     across, up = draw_scene(axes, data, index, stills[index], camera, weight=1.2, inset=False, aspect=aspect)
@@ -143,40 +110,23 @@ def _scene(data: ReportData, index: int, stills: Stills, camera: Camera) -> _Sce
     look = data.views[index].look
     seen = None if look is None else picture_address(look_picture(look, plain=True), lossless=True)
     corner = f"{'right' if across else 'left'}:0;{'top' if up else 'bottom'}:0"
-    return _Scene(picture_address(np.asarray(canvas.buffer_rgba())), seen, corner)
+    return picture_address(np.asarray(canvas.buffer_rgba())), seen, corner
 
 
-def _chart(chart: tuple, size: tuple[float, float]) -> _Chart:
+def _chart(chart: tuple, size: tuple[float, float]) -> tuple[str, bytes, str]:
+    """A chart's name, its drawing, and where its first view begins and how wide each is, so that the page can mark
+    one."""
     title, _ = chart
     figure, file = chart_figure([chart], *size, titled=False), io.BytesIO()
     with mpl.rc_context({"svg.hashsalt": "jaxnbv"}):
         figure.savefig(file, format="svg", metadata={"Date": None}, transparent=True)
     place, (left, right) = figure.axes[0].get_position(), figure.axes[0].get_xlim()
     box = ",".join(f"{share:.4f}" for share in (place.x0, place.width / (right - left), 1.0 - place.y1, place.height))
-    return _Chart(_capital(title), file.getvalue(), box)
+    return capital(title), file.getvalue(), box
 
 
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
-
-
-def _table(panels: tuple[Panel, ...]) -> _Table:
-    last = panels[-1]
-    rows = [(f"view {view}", panel.values) for view, panel in enumerate(panels, start=1)]
-    rows += [] if last.true is None else [("in truth", last.true)]
-    cells = [(name, [number(value) for value in values.tolist()]) for name, values in rows]
-    return _Table(_capital(last.label), tuple(last.names), cells)
-
-
-def _imagined(seen: Imagined | None) -> _Imagined | None:
-    if seen is None:
-        return None
-    tiles, scale = depths(seen)
-    return _Imagined(may_be_words(seen.kinds) if seen.kinds else "", _tiles(looks(seen)), _tiles(tiles), scale)
-
-
-def _tiles(tiles: list[Tile]) -> list[tuple[str, str]]:
-    return [(tile.name, picture_address(tile.picture, lossless=min(tile.picture.shape[:2]) < 64)) for tile in tiles]
+def _tile_address(tile: Tile) -> str:
+    return picture_address(tile.picture, lossless=min(tile.picture.shape[:2]) < 64)
 
 
 def _settings(episode: Episode, title: str) -> dict[str, str]:
