@@ -16,7 +16,7 @@ import jaxnbv as nbv
 from jaxnbv.geometry.neighbours import nearest_squared_distance
 from jaxnbv.studies.scenes import demo_object, hidden_view
 from jaxnbv.surfaces.known_shapes import kind_of
-from jaxnbv.viz.data import choice_of
+from jaxnbv.viz.choice import choice_of
 from jaxnbv.viz.figures import STYLE, draw_acquisition
 from jaxnbv.viz.imagined import look
 from jaxnbv.viz.render import Still, beside, draw_cameras, draw_points, frame, look_picture

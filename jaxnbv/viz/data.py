@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
@@ -23,14 +23,12 @@ from jaxnbv.progress import progress_bar
 from jaxnbv.scanning import Evidence, Grid, GridSurface
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.scanning.metrics import coverage, truth_points
-from jaxnbv.search import Proposal
 from jaxnbv.surfaces import SurfacePosterior
 from jaxnbv.viz.answers import words_of
+from jaxnbv.viz.choice import Ascents, Choice, choice_of, wider_map
 from jaxnbv.viz.imagined import Imagined, Look, imagined, look
-from jaxnbv.viz.sphere import unit
 from jaxnbv.viz.stage import Stage, stage_of
 from jaxnbv.viz.task import Task, task_of
-from jaxnbv.viz.trajectories import Ascents, SphereMap, ascents_of, open_values, wider_map
 from jaxnbv.viz.words import Told, describe_choice, describe_first
 
 # The variance of one point costs a triangular solve with the whole cloud, the slope two evaluations of the mean.
@@ -60,41 +58,6 @@ class MeanSurface(eqx.Module):
     def mesh(self) -> trimesh.Trimesh:
         """Its triangles alone."""
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
-
-
-class Choice(eqx.Module):
-    """What the search looked at when it chose a view.
-
-    - `directions`: unit vectors from the origin to the candidates; `values`: theirs, NaN where excluded as visited.
-    - `chosen`, `value`: direction and value of the pose that was taken.
-    - `rank`: 1 for the best.
-    - `map`: the values that the map is drawn from: the candidates', where they are enough.
-    - `ascents`: the trajectories of a gradient search, none of which is among the candidates here; else None.
-    - `num_tied`: how many other candidates are tied with the best one; None where it is not known.
-    - `errors`: standard errors of the values, and `error` that of the chosen one; None where they are not known.
-    - `tied`: which candidates are tied with the best one, itself included; None where not known.
-    """
-
-    directions: Float[np.ndarray, "c 3"]
-    values: Float[np.ndarray, " c"]
-    chosen: Float[np.ndarray, "3"]
-    value: float
-    rank: int
-    map: SphereMap
-    ascents: Ascents | None
-    num_tied: int | None = None
-    errors: Float[np.ndarray, " c"] | None = None
-    error: float | None = None
-    tied: Bool[np.ndarray, " c"] | None = None
-
-    @property
-    def visited(self) -> Bool[np.ndarray, " c"]:
-        return np.isnan(self.values)
-
-    @property
-    def open_values(self) -> Float[np.ndarray, " o"]:
-        """Values of the candidates that were open, best first."""
-        return np.sort(self.values[~self.visited])[::-1]
 
 
 class ViewData(eqx.Module):
@@ -173,7 +136,6 @@ def report_data(
     planner = episode.planner
     if truth is None and episode.scene is not None:
         truth = truth_points(episode.scene, jax.random.key(0))
-    values = planner.quantity
 
     def covered_by(views: tuple[View, ...]) -> list[float | None]:
         return [None] * len(views) if truth is None else [*coverage(views, truth)]
@@ -211,7 +173,7 @@ def report_data(
         known = None if surfaces is None else (after, posterior, surfaces)
     means = [view.surface.mesh for view in drawn if view.surface is not None]
     frame = getattr(episode.scene, "frame", None)
-    return ReportData(tuple(drawn), values, task, stage_of(episode, means), frame)
+    return ReportData(tuple(drawn), planner.quantity, task, stage_of(episode, means), frame)
 
 
 def _told(episode: Episode, index: int, choice: Choice | None, covered: list[float | None], task: Task) -> Told:
@@ -220,46 +182,14 @@ def _told(episode: Episode, index: int, choice: Choice | None, covered: list[flo
     if choice is None or not index:
         told = describe_first(view.pose, points, after)
     else:
-        told = describe_choice(
-            episode.planner.quantity,
-            choice.value,
-            choice.rank,
-            tuple(choice.open_values.tolist()),
-            0 if choice.ascents is None else len(choice.ascents.values),
-            view.pose,
-            [other.pose for other in episode.views[:index]],
-            points,
-            int(view.cloud.count),
-            None if before is None or after is None else (before, after),
-            choice.num_tied,
-        )
+        earlier = [other.pose for other in episode.views[:index]]
+        change = None if before is None or after is None else (before, after)
+        count = int(view.cloud.count)
+        told = describe_choice(episode.planner.quantity, choice, view.pose, earlier, points, count, change)
     if not task.is_coverage:
         answer = words_of(task.answers[index]).sentence(task.answers[index - 1] if index else None)
         told = told._replace(came=f"{told.came} {answer}")
     return told
-
-
-def choice_of(proposal: Proposal, wider: SphereMap | None = None) -> Choice:
-    """A proposal's candidates as directions, where the chosen one stands among them, and its trajectories.
-
-    `wider`: what the map is to be drawn from in place of the candidates.
-    """
-    values = open_values(proposal)
-    directions = unit(np.asarray(proposal.candidates.position, dtype=np.float64))
-    value = float(proposal.value)
-    return Choice(
-        directions=directions,
-        values=values,
-        chosen=unit(np.asarray(proposal.pose.position, dtype=np.float64)),
-        value=value,
-        rank=1 + int(np.sum(values > value)),
-        map=wider or SphereMap(directions, values),
-        ascents=None if proposal.trajectories is None else ascents_of(proposal.trajectories),
-        num_tied=proposal.num_tied,
-        errors=None if proposal.standard_errors is None else np.asarray(proposal.standard_errors, np.float64),
-        error=proposal.standard_error,
-        tied=None if proposal.num_tied is None else np.asarray(proposal.tied_with_best()),
-    )
 
 
 def mean_surface(

@@ -21,10 +21,11 @@ from jaxnbv.progress import progress_bar
 from jaxnbv.storage.files import make_folder, write_whole
 from jaxnbv.viz import sphere
 from jaxnbv.viz.answers import label_of, number
-from jaxnbv.viz.data import Choice, ReportData, ViewData
+from jaxnbv.viz.choice import Choice
+from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.imagined_figures import imagined_figure
 from jaxnbv.viz.layout import fitted, flow, width_of
-from jaxnbv.viz.render import Still, draw_scene, painted
+from jaxnbv.viz.render import Still, draw_scene
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, round_range, spaced_ticks
 from jaxnbv.viz.task_figures import chart_figure, coverage_series, draw_coverage, draw_values, task_charts
 from jaxnbv.viz.trajectory_figures import draw_ascents, trajectory_figure
@@ -70,7 +71,9 @@ class Stills:
 
     def __getitem__(self, index: int) -> Still:
         if index not in self._stills:
-            self._stills[index] = painted(self._data, index, LogNorm(*deviation_range(self._data)), _STILL)
+            stage, surface = self._data.stage, self._data.views[index].surface
+            still = self._stills[index] = Still(stage.eye, surface, _STILL, stage.extent)
+            still.paint(LogNorm(*deviation_range(self._data)))
         return self._stills[index]
 
 
@@ -128,41 +131,34 @@ def _save(figure: Figure, path: Path, dpi: int, few_colours: bool = False) -> No
 
 
 def _view(data: ReportData, index: int, camera: Camera, stills: Stills) -> Figure:
-    view, norm = data.views[index], LogNorm(*deviation_range(data))
-    figure = Figure(figsize=(8.4, 4.3))
+    view, norm, quantity = data.views[index], LogNorm(*deviation_range(data)), data.quantity
+    choice, figure = view.choice, Figure(figsize=(8.4, 4.3))
     draw_scene(figure.add_axes((0.0, 0.16, 0.5, 0.78)), data, index, stills[index], camera)
     figure.text(0.015, 0.955, f"View {view.number}", fontsize=11, fontweight="bold", va="center")
     flow(figure, _POINTS, 0.125, 0.955, 0.37, 0.045, 8.0)
     _deviation_bar(figure, (0.08, 0.115, 0.34, 0.022), norm)
-    fitted(figure, 0.52, 0.955, _map_title(view, data.quantity), 0.47, 10.0, va="center")
-    if view.choice is None:
-        draw_acquisition(figure.add_axes((0.52, 0.22, 0.46, 0.66)), None, data.quantity)
+    title = "This view was given" if choice is None else f"Why view {view.number}: {quantity.name}"
+    fitted(figure, 0.52, 0.955, title, 0.47, 10.0, va="center")
+    if choice is None:
+        draw_acquisition(figure.add_axes((0.52, 0.22, 0.46, 0.66)), None, quantity)
         return figure
-    marks = [("★ chosen", NEW)]
-    if rings_tied(view.choice):
-        marks.append(("◯ level with it", INK))
-    if view.choice.ascents is not None:
-        marks += [("○ start, ● end of an ascent", INK)]
-    if view.spatial_ascents is not None:
-        marks.append(("(directions of the cameras; map: cameras that look at the centre)", GREY))
-    flow(figure, marks, 0.52, 0.905, 0.47, 0.04, 8.0)
-    colours = draw_acquisition(figure.add_axes((0.54, 0.35, 0.42, 0.5)), view.choice, data.quantity)
-    draw_candidates(figure.add_axes((0.58, 0.15, 0.34, 0.17)), view.choice)
+    marks = [
+        ("★ chosen", NEW, True),
+        ("◯ level with it", INK, choice.rings_tied),
+        ("○ start, ● end of an ascent", INK, choice.ascents is not None),
+        ("(directions of the cameras; map: cameras that look at the centre)", GREY, view.spatial_ascents is not None),
+    ]
+    flow(figure, [(text, colour) for text, colour, there in marks if there], 0.52, 0.905, 0.47, 0.04, 8.0)
+    colours = draw_acquisition(figure.add_axes((0.54, 0.35, 0.42, 0.5)), choice, quantity)
+    draw_candidates(figure.add_axes((0.58, 0.15, 0.34, 0.17)), choice)
     assert colours is not None
     bar = figure.colorbar(colours, cax=figure.add_axes((0.58, 0.115, 0.34, 0.022)), orientation="horizontal")
     bar.outline.set_visible(False)
     bar.locator = MaxNLocator(5)
     bar.formatter = FuncFormatter(lambda value, _: number(value))
-    fitted(figure, 0.75, 0.02, _bar_label(view.choice, data.quantity), 0.46, 9.0, ha="center", va="center")
+    label = label_of(quantity) if choice.errors is None else f"{label_of(quantity)}; lines: standard errors"
+    fitted(figure, 0.75, 0.02, label, 0.46, 9.0, ha="center", va="center")
     return figure
-
-
-def _bar_label(choice: Choice, quantity: Quantity) -> str:
-    return label_of(quantity) if choice.errors is None else f"{label_of(quantity)}; lines: standard errors"
-
-
-def _map_title(view: ViewData, quantity: Quantity) -> str:
-    return "This view was given" if view.choice is None else f"Why view {view.number}: {quantity.name}"
 
 
 def _deviation_bar(figure: Figure, place: tuple[float, float, float, float], norm: LogNorm, size: float = 9.0) -> None:
@@ -184,14 +180,13 @@ def _deviation_bar(figure: Figure, place: tuple[float, float, float, float], nor
 def draw_candidates(axes: Axes, choice: Choice) -> None:
     """Draw the values of the open candidates, the best on top, with their standard errors, over a colour bar of the
     same range."""
-    low, high = value_range(choice)
     order = np.argsort(-np.where(choice.visited, -np.inf, choice.values))[: len(choice.open_values)]
     values, rows = choice.values[order], -np.arange(len(order))
     if choice.errors is not None:
         axes.hlines(rows, values - choice.errors[order], values + choice.errors[order], color=GREY, lw=0.6, zorder=1)
     axes.scatter(values, rows, s=4, color=INK, linewidths=0, zorder=2)
     axes.plot(choice.value, 1.0, "*", color=NEW, ms=8, markeredgecolor="white", zorder=3, clip_on=False)
-    axes.set(xlim=(low, high), ylim=(-len(order), 3.0 + 0.05 * len(order)))
+    axes.set(xlim=choice.range, ylim=(-len(order), 3.0 + 0.05 * len(order)))
     axes.axis("off")
 
 
@@ -207,72 +202,39 @@ def draw_acquisition(
     if choice is None:
         axes.text(0.0, 0.0, "given", ha="center", va="center", color=GREY, fontsize=11 * weight)
         return None
-    colours = ScalarMappable(Normalize(*value_range(choice)), VALUE)
-    if is_smooth(choice, quantity):
+    colours = ScalarMappable(Normalize(*choice.range), VALUE)
+    if choice.makes_a_map(quantity):
         extent = (-sphere.WIDTH, sphere.WIDTH, -sphere.HEIGHT, sphere.HEIGHT)
         smooth = sphere.smooth_map(choice.map.directions, choice.map.values, 240)
         image = axes.imshow(colours.to_rgba(smooth), extent=extent, interpolation="bilinear", zorder=1)
         image.set_clip_path(axes.fill(*sphere.rim().T, facecolor="none")[0])
     places = sphere.mollweide(choice.directions)
     shown = ~choice.visited
-    axes.scatter(
-        places[shown, 0],
-        places[shown, 1],
-        c=colours.to_rgba(choice.values[shown]),
-        s=14 * weight,
-        edgecolors=GREY,
-        linewidths=0.6 * weight,
-        zorder=3,
-    )
-    if choice.tied is not None and rings_tied(choice):
+    dots: dict[str, Any] = {"s": 14 * weight, "edgecolors": GREY, "linewidths": 0.6 * weight}
+    axes.scatter(places[shown, 0], places[shown, 1], c=colours.to_rgba(choice.values[shown]), **dots, zorder=3)
+    if choice.tied is not None and choice.rings_tied:
         x, y = places[choice.tied & shown].T
         axes.scatter(x, y, s=52 * weight, facecolors="none", edgecolors=INK, linewidths=1.0 * weight, zorder=4)
-    axes.scatter(
-        places[~shown, 0], places[~shown, 1], marker="x", c=INK, s=26 * weight, linewidths=1.2 * weight, zorder=4
-    )
+    cross: dict[str, Any] = {"marker": "x", "c": INK, "s": 26 * weight, "linewidths": 1.2 * weight}
+    axes.scatter(places[~shown, 0], places[~shown, 1], **cross, zorder=4)
     if choice.ascents is not None:
         draw_ascents(axes, choice.ascents, weight)
     size = 14 if choice.ascents is None else 11
-    star: dict[str, Any] = {
-        "marker": "*",
-        "ms": size * weight**0.5,
-        "color": NEW,
-        "markeredgecolor": "white",
-        "mew": 1.0,
-    }
-    axes.plot(*sphere.mollweide(choice.chosen[None]).T, **star, zorder=10)
+    star: dict[str, Any] = {"ms": size * weight**0.5, "color": NEW, "markeredgecolor": "white", "mew": 1.0}
+    axes.plot(*sphere.mollweide(choice.chosen[None]).T, "*", **star, zorder=10)
     return colours
-
-
-def rings_tied(choice: Choice) -> bool:
-    """Whether the candidates that are level with the best are marked: they must be known, and not most of all."""
-    return choice.tied is not None and 0 < (choice.num_tied or 0) <= len(choice.values) // 3
-
-
-def is_smooth(choice: Choice, quantity: Quantity) -> bool:
-    """Whether a map between the candidates says something: they must be many, and their values no lots."""
-    return quantity.smooth and int(np.sum(~np.isnan(choice.map.values))) >= 12
-
-
-def value_range(choice: Choice) -> tuple[float, float]:
-    """Range of the colours of a step's map and candidates; not empty."""
-    values = np.concatenate([choice.open_values, choice.map.values[~np.isnan(choice.map.values)]])
-    if not values.size:
-        return 0.0, 1.0
-    low, high = float(values.min()), float(values.max())
-    return (low, high) if high > low else (low - 0.5, low + 0.5)
 
 
 def overview_figure(data: ReportData, camera: Camera, stills: Stills | None = None) -> Figure:
     """Scenes over acquisition maps, at most five to a row, with the charts' story in the titles."""
     stills = Stills(data) if stills is None else stills
-    norm = LogNorm(*deviation_range(data))
     columns = min(len(data.views), 5)
     rows = -(-len(data.views) // columns)
     marks = [*_POINTS, ("★ chosen view", NEW), ("× visited views", INK)]
-    if any(view.choice is not None and rings_tied(view.choice) for view in data.views):
+    choices = [view.choice for view in data.views if view.choice is not None]
+    if any(choice.rings_tied for choice in choices):
         marks.append(("◯ level with the best", INK))
-    if any(view.choice is not None and view.choice.ascents is not None for view in data.views):
+    if any(choice.ascents is not None for choice in choices):
         marks += [("○ start of an ascent", INK), ("● end of an ascent", INK)]
     width = max(3.0 * columns, 6.0)
     # Beside the bar there is room for the words only in a wide strip.
@@ -294,7 +256,7 @@ def overview_figure(data: ReportData, camera: Camera, stills: Stills | None = No
         figure.text(*place(x + 2.88, y + 4.85)[:2], share, fontsize=14, ha="right", va="center")
         draw_acquisition(figure.add_axes(place(x + 0.1, y, 2.8, 1.5)), view.choice, data.quantity, weight=1.2)
     long = 0.5 * width - 1.2 if beside else width - 1.6
-    _deviation_bar(figure, place(0.6, base - 0.35, long, 0.13), norm, 12.0)
+    _deviation_bar(figure, place(0.6, base - 0.35, long, 0.13), LogNorm(*deviation_range(data)), 12.0)
     x, y, room = (0.5 * width + 0.1, base - 0.25, 0.5 * width - 0.3) if beside else (0.3, base - 1.1, width - 0.6)
     text = f"Maps: {data.quantity.name}; dark is high"
     fitted(figure, *place(x, y)[:2], text, room / width, 13.0, va="center")

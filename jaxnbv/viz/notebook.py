@@ -26,7 +26,8 @@ from jaxnbv.planning.session import Session
 from jaxnbv.scanning import Evidence
 from jaxnbv.search import Proposal
 from jaxnbv.surfaces import SurfacePosterior
-from jaxnbv.viz.data import choice_of, report_data
+from jaxnbv.viz.choice import choice_of
+from jaxnbv.viz.data import report_data
 from jaxnbv.viz.figures import STYLE, draw_acquisition, overview_figure
 from jaxnbv.viz.render import Still, beside, draw_cameras, draw_points, frame
 from jaxnbv.viz.style import BEFORE, NEW, VALUE

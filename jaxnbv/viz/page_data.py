@@ -14,8 +14,9 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.viz import sphere
-from jaxnbv.viz.data import Choice, MeanSurface, ReportData
-from jaxnbv.viz.figures import deviation_range, is_smooth, rings_tied, value_range
+from jaxnbv.viz.choice import Ascents, Choice, colour_range
+from jaxnbv.viz.data import MeanSurface, ReportData
+from jaxnbv.viz.figures import deviation_range
 from jaxnbv.viz.render import FRUSTUM_DEPTH, frustum
 from jaxnbv.viz.style import (
     BEFORE,
@@ -29,8 +30,7 @@ from jaxnbv.viz.style import (
     colour_scale,
     spaced_ticks,
 )
-from jaxnbv.viz.trajectories import Ascents
-from jaxnbv.viz.trajectory_figures import frusta_steps, small_frusta, spatial_range
+from jaxnbv.viz.trajectory_figures import frusta_steps, small_frusta
 
 # Of all views together, so that a long episode stays a small page.
 _MAX_POINTS, _MAX_VERTICES = 9000, 48_000
@@ -163,7 +163,10 @@ def _in_steps(values: Float[np.ndarray, "*n"], steps: int) -> tuple[float, float
 
 
 def _choice(choice: Choice, quantity: Quantity) -> dict:
-    low, high = value_range(choice)
+    low, high = choice.range
+    errors = None
+    if choice.errors is not None:
+        errors = [float(f"{error:.4g}") if math.isfinite(error) else None for error in choice.errors.tolist()]
     order = np.argsort(-np.where(choice.visited, -np.inf, choice.values), kind="stable")
     ranks = np.empty(len(order), dtype=int)
     ranks[order] = np.arange(1, len(order) + 1)
@@ -171,27 +174,23 @@ def _choice(choice: Choice, quantity: Quantity) -> dict:
         "places": sphere.mollweide(choice.directions).round(3).tolist(),
         "directions": choice.directions.round(2).tolist(),
         "values": [None if math.isnan(value) else value for value in choice.values.tolist()],
-        "errors": None if choice.errors is None else _numbers(choice.errors),
-        "tied": [] if choice.tied is None or not rings_tied(choice) else np.flatnonzero(choice.tied).tolist(),
+        "errors": errors,
+        "tied": [] if choice.tied is None or not choice.rings_tied else np.flatnonzero(choice.tied).tolist(),
         "ranks": ranks.tolist(),
         "chosen": sphere.mollweide(choice.chosen[None]).round(4)[0].tolist(),
         "value": choice.value,
         "error": None if choice.error is None or math.isnan(choice.error) else choice.error,
         "range": [low, high],
-        "image": _map_image(choice, low, high) if is_smooth(choice, quantity) else None,
+        "image": _map_image(choice, low, high) if choice.makes_a_map(quantity) else None,
         "ascents": None if choice.ascents is None else _on_map(choice.ascents),
         "caption": _map_caption(choice),
     }
 
 
-def _numbers(values: Float[np.ndarray, " n"]) -> list[float | None]:
-    return [None if not math.isfinite(value) else float(f"{value:.4g}") for value in values.tolist()]
-
-
 def _map_caption(choice: Choice) -> str:
     """What the marks on the map are that not every map has."""
     parts = []
-    if rings_tied(choice):
+    if choice.rings_tied:
         parts.append("Rings: level with the best, within two standard errors of the difference.")
     elif choice.num_tied:
         parts.append(f"The samples cannot tell the best from {choice.num_tied} of the others: no rings are drawn.")
@@ -224,7 +223,7 @@ def _spatial(ascents: Ascents, camera: Camera) -> dict:
     return {
         "positions": np.asarray(ascents.poses.position, dtype=np.float64).round(3).tolist(),
         "values": ascents.values.tolist(),
-        "range": list(spatial_range(ascents)),
+        "range": list(colour_range(ascents.values)),
         "steps": frusta_steps(ascents).tolist(),
         "frusta": [small_frusta(ascents, i, camera).round(3).tolist() for i in range(len(ascents.values))],
     }

@@ -13,11 +13,11 @@ from matplotlib.patheffects import withStroke
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.viz import sphere
 from jaxnbv.viz.answers import label_of
+from jaxnbv.viz.choice import Ascents, colour_range
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.layout import fitted, flow
 from jaxnbv.viz.render import Still, draw_cameras, draw_points, draw_segments, frame, frustum
 from jaxnbv.viz.style import BEFORE, INK, VALUE_LINES
-from jaxnbv.viz.trajectories import Ascents
 
 _FRUSTA = 4
 _DEPTH = 0.16
@@ -47,12 +47,6 @@ def small_frusta(ascents: Ascents, start: int, camera: Camera) -> Float[np.ndarr
     return np.stack([frustum(ascents.poses[start, step], camera, _DEPTH) for step in frusta_steps(ascents)])
 
 
-def spatial_range(ascents: Ascents) -> tuple[float, float]:
-    """Range of the values along all trajectories; not empty."""
-    low, high = float(np.nanmin(ascents.values)), float(np.nanmax(ascents.values))
-    return (low, high) if high > low else (low - 0.5, low + 0.5)
-
-
 def trajectory_figure(data: ReportData, index: int, camera: Camera) -> Figure:
     """The ascents that led to view `index` (from 0), in space: what was known, cameras so far and the one chosen."""
     view, known = data.views[index], data.views[index - 1]
@@ -67,7 +61,7 @@ def trajectory_figure(data: ReportData, index: int, camera: Camera) -> Figure:
     still.paint(None)
     axes.imshow(still.image, interpolation="bilinear", zorder=1)
     shown = [draw_points(axes, still, view.before, BEFORE, 0.7), still.surface_pixels]
-    colours = ScalarMappable(Normalize(*spatial_range(ascents)), VALUE_LINES)
+    colours = ScalarMappable(Normalize(*colour_range(ascents.values)), VALUE_LINES)
     for start, values in enumerate(ascents.values):
         ways = np.stack([positions[start, :-1], positions[start, 1:]], axis=1)
         shown.append(draw_segments(axes, still, ways, colours.to_rgba(values[1:]), 1.6))

@@ -19,7 +19,8 @@ import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.viz import report_data, write_figures, write_report
 from jaxnbv.viz.answers import label_of, number
-from jaxnbv.viz.data import choice_of, mean_surface
+from jaxnbv.viz.choice import choice_of
+from jaxnbv.viz.data import mean_surface
 from jaxnbv.viz.page_data import payload
 from jaxnbv.viz.render import frustum
 from jaxnbv.viz.sphere import from_mollweide, mollweide, smooth_map

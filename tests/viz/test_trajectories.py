@@ -21,9 +21,8 @@ from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.search.rotations import rotation_from_6d
 from jaxnbv.viz import report_data, sphere, write_figures
 from jaxnbv.viz.answers import number
-from jaxnbv.viz.data import choice_of
+from jaxnbv.viz.choice import MAP_VIEWS, Ascents, Choice, SphereMap, choice_of, step_values
 from jaxnbv.viz.report import report_html
-from jaxnbv.viz.trajectories import MAP_VIEWS, step_values
 from jaxnbv.viz.trajectory_figures import frusta_steps, small_frusta
 from jaxnbv.viz.words import describe_choice
 
@@ -168,6 +167,15 @@ def test_a_map_of_too_few_candidates_is_made_anew_with_the_same_samples(few, few
     assert np.abs(other / together - 1.0).max() > 0.01
 
 
+def said_of(value, others, starts=0, num_tied=None, pose=None):
+    """What is said of a second view with such a value, beside candidates with others, and ascents from some starts."""
+    values, directions = np.array(others), np.zeros((len(others), 3))
+    ascents = Ascents(trajectories(np.zeros((starts, 2))).poses, np.zeros((starts, 2))) if starts else None
+    choice = Choice(directions, values, np.zeros(3), value, SphereMap(directions, values), ascents, num_tied)
+    pose = look_at((0.0, 0.0, 2.5)) if pose is None else pose
+    return describe_choice(COVERAGE, choice, pose, [look_at((2.5, 0.0, 0.0))], 5, 10, None).sentence(2)
+
+
 @pytest.mark.parametrize(
     ("value", "others", "starts", "words"),
     [
@@ -195,10 +203,7 @@ def test_a_map_of_too_few_candidates_is_made_anew_with_the_same_samples(few, few
     ],
 )
 def test_words_say_what_the_ascent_gained(value, others, starts, words):
-    pose = look_at((0.0, 0.0, 2.5))
-    said = describe_choice(COVERAGE, value, 1, others, starts, pose, [look_at((2.5, 0.0, 0.0))], 5, 10, None).sentence(
-        2
-    )
+    said = said_of(value, others, starts)
     assert words in said
     assert said.startswith(
         "View 2 looks from (0.00, 0.00, 2.50), 0° above the horizon, 90° from the nearest earlier view. Its"
@@ -215,17 +220,12 @@ def test_words_say_what_the_ascent_gained(value, others, starts, words):
     ],
 )
 def test_words_say_whether_the_samples_tell_it_from_the_others(level, words):
-    pose = look_at((0.0, 0.0, 2.5))
-    said = describe_choice(
-        COVERAGE, 3.0, 1, (3.0, 2.0, 1.0), 0, pose, [look_at((2.5, 0.0, 0.0))], 5, 10, None, level
-    ).sentence(2)
-    assert words in said
+    assert words in said_of(3.0, (3.0, 2.0, 1.0), num_tied=level)
 
 
 def test_words_say_where_a_camera_looks_past_the_centre():
     pose = look_at((0.0, 0.0, 2.0), target=(2.0 * np.tan(np.radians(7.0)), 0.0, 0.0))
-    said = describe_choice(COVERAGE, 2.0, 1, (1.0,), 1, pose, [look_at((2.5, 0.0, 0.0))], 5, 10, None).sentence(2)
-    assert "the horizon, 2.00 from the centre and aimed 7° off it, 90° from" in said
+    assert "the horizon, 2.00 from the centre and aimed 7° off it, 90° from" in said_of(2.0, (1.0,), 1, pose=pose)
 
 
 def test_the_sentence_and_the_summary_tell_the_numbers_of_the_step(few, few_data, capsys):
@@ -314,10 +314,7 @@ def test_a_path_over_the_rim_is_cut_there():
 
 
 def test_of_a_candidate_that_is_not_the_best_it_says_how_the_best_stands():
-    pose = look_at((0.0, 0.0, 2.5))
-    said = describe_choice(
-        COVERAGE, 2.0, 2, (3.0, 2.0, 1.0), 0, pose, [look_at((2.5, 0.0, 0.0))], 5, 10, None, 1
-    ).sentence(2)
+    said = said_of(2.0, (3.0, 2.0, 1.0), num_tied=1)
     assert (
         "was rank 2 of 3 open candidates: 1 times the median (2), the best 3. By the samples the best cannot be told"
         in said
