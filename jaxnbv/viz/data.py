@@ -150,7 +150,9 @@ def report_data(
         choice = None if view.proposal is None else choice_of(view.proposal, wider_map(episode, index))
         new, _ = view.scan.to_numpy()
         before = episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), new.dtype)
-        camera, posterior = view.camera, planner.imagination.posterior(after)
+        posterior = planner.imagination.posterior(after)
+        is_image = view.scan.capacity == view.camera.num_rays
+        taken = look(view.scan, view.camera, view.pose, before) if is_image else None
         # With the key of the next step: what it imagined, and moments where the posterior has no closed ones.
         surfaces = None
         if (imagine and index + 1 < count) or not posterior.has_closed_forms:
@@ -166,8 +168,8 @@ def report_data(
                 coverage=covered[index],
                 count=int(view.cloud.count),
                 told=_told(episode, index, choice, covered, task),
-                imagined=imagined(episode, index, *known) if imagine and known is not None else None,
-                look=look(view.scan, camera, view.pose, before) if view.scan.capacity == camera.num_rays else None,
+                imagined=imagined(episode, index, *known, taken) if imagine and known is not None else None,
+                look=taken,
             )
         )
         known = None if surfaces is None else (after, posterior, surfaces)

@@ -67,11 +67,17 @@ class Imagined(eqx.Module):
 
 
 def imagined(
-    episode: Episode, index: int, evidence: Evidence, posterior: SurfacePosterior, surfaces: GridSurface
+    episode: Episode,
+    index: int,
+    evidence: Evidence,
+    posterior: SurfacePosterior,
+    surfaces: GridSurface,
+    taken: Look | None,
 ) -> Imagined | None:
     """What was imagined before view `index` (from 0) was taken; None for one that was not chosen.
 
-    `evidence`: what was known before it; `posterior`: given that; `surfaces`: the step's samples.
+    `evidence`: what was known before it; `posterior`: given that; `surfaces`: the step's samples; `taken`: its own
+    scan, None where that is no image.
     """
     planner, view = episode.planner, episode.views[index]
     if view.proposal is None:
@@ -79,28 +85,30 @@ def imagined(
     sample_key, *_ = view_keys(episode.key, index)
     other = runner_up(view.proposal) if planner.quantity.smooth else None
     # Two in any case, lest a second program be compiled.
-    poses = jax.tree.map(lambda *rows: np.stack(rows), view.pose, view.pose if other is None else other)
+    pair = (view.pose, other or view.pose)
     camera = _finer(planner.camera)
-    scans = planner.imagination.scan(surfaces, camera, poses)
+    scans = planner.imagination.scan(surfaces, camera, jax.tree.map(lambda *rows: np.stack(rows), *pair))
     cloud = evidence.cloud.to_numpy()[0]
     count = min(SHOWN, planner.imagination.num_samples)
     samples = tuple(look(_rows(scans, (sample, 0)), camera, view.pose, cloud) for sample in range(count))
     expected = [
         np.asarray(mean_depth(_rows(scans, (slice(None), i)), pose), np.float64).reshape(camera.height, camera.width)
-        for i, pose in enumerate((view.pose, other or view.pose))
+        for i, pose in enumerate(pair)
     ]
-    true = [_true_scan(episode, camera, pose) for pose in (view.pose, other or view.pose)]
-    own = view.camera
-    taken = look(view.scan, own, view.pose, cloud) if view.scan.capacity == own.num_rays else None
-    seen = taken if true[0] is None else look(true[0], camera, view.pose, cloud)
-    beside = None
+    true, beside = _truth(episode, camera, view.pose, cloud), None
     if other is not None:
-        beside = Expected(expected[1], None if true[1] is None else look(true[1], camera, other, cloud).depth)
-    chosen = Expected(expected[0], None if taken is None else taken.depth)
-    if not isinstance(posterior, KnownShapesPosterior):
-        return Imagined(samples, seen, true[0] is not None, chosen, beside)
-    names = posterior.names_of_samples(sample_key, planner.imagination.num_samples)[:count]
-    return Imagined(samples, seen, true[0] is not None, chosen, beside, tuple(names), tuple(posterior.kinds().items()))
+        beside = Expected(expected[1], _depth(_truth(episode, camera, other, cloud)))
+    names: tuple[str, ...] = ()
+    kinds: tuple[tuple[str, float], ...] = ()
+    if isinstance(posterior, KnownShapesPosterior):
+        names = tuple(posterior.names_of_samples(sample_key, planner.imagination.num_samples)[:count])
+        kinds = tuple(posterior.kinds().items())
+    chosen = Expected(expected[0], _depth(taken))
+    return Imagined(samples, taken if true is None else true, true is not None, chosen, beside, names, kinds)
+
+
+def _depth(seen: Look | None) -> Float[np.ndarray, "h w"] | None:
+    return None if seen is None else seen.depth
 
 
 def runner_up(proposal: Proposal) -> Pose | None:
@@ -120,15 +128,13 @@ def look(scan: PointCloud, camera: Camera, pose: Pose, cloud: Float[np.ndarray, 
     depth = np.where(mask, (points - np.asarray(pose.position, np.float64)) @ forward, np.nan)
     lamp = -forward - 0.5 * right - 0.7 * down
     lit = np.clip(0.35 + 0.65 * normals @ (lamp / np.linalg.norm(lamp)), 0.0, 1.0)
-    known = mask & (cKDTree(cloud).query(points)[0] < _spacing(cloud)) if len(cloud) else np.zeros_like(mask)
+    known = np.zeros_like(mask)
+    if len(cloud):
+        tree = cKDTree(cloud)
+        spacing = np.median(tree.query(cloud, k=2)[0][:, 1]) if len(cloud) > 1 else 0.0
+        known = mask & (tree.query(points)[0] < max(_SEEN, _SPACINGS * spacing))
     shape = camera.height, camera.width
     return Look(mask.reshape(shape), depth.reshape(shape), lit.reshape(shape), known.reshape(shape))
-
-
-def _spacing(cloud: Float[np.ndarray, "n 3"]) -> float:
-    """Within which of a cloud a place counts as seen."""
-    nearest = cKDTree(cloud).query(cloud, k=2)[0][:, 1] if len(cloud) > 1 else np.zeros(1)
-    return max(_SEEN, _SPACINGS * float(np.median(nearest)))
 
 
 def _finer(camera: Camera) -> Camera:
@@ -137,11 +143,11 @@ def _finer(camera: Camera) -> Camera:
     return camera if factor == 1 else camera.resized(factor * camera.height, factor * camera.width)
 
 
-def _true_scan(episode: Episode, camera: Camera, pose: Pose) -> PointCloud | None:
+def _truth(episode: Episode, camera: Camera, pose: Pose, cloud: Float[np.ndarray, "n 3"]) -> Look | None:
     if episode.scene is None:
         return None
     around, still = episode.planner.imagination.surroundings, SensorNoise(0.0, 0.0)
-    return observe_scene(episode.scene, camera, pose, still, episode.key, around)
+    return look(observe_scene(episode.scene, camera, pose, still, episode.key, around), camera, pose, cloud)
 
 
 def _rows(scans: PointCloud, at: tuple) -> PointCloud:
