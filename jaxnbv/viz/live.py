@@ -74,6 +74,7 @@ class LiveView:
         evidence = episode.evidence_after(len(episode.views)) if evidence is None else evidence
         key, *_ = view_keys(episode.key, len(episode.views))
         posterior = episode.planner.imagination.posterior(evidence)
+        picture = None if expected is None else depth_picture(expected, *depth_range([expected]))
         scene = self._server.scene
         with self._server.atomic():
             for handle in self._drawn:
@@ -83,9 +84,9 @@ class LiveView:
                 *_cameras(scene, episode),
                 *_mean(scene, episode.planner.imagination, evidence, posterior),
                 *_imagined(scene, episode.planner.imagination, evidence, posterior, key),
-                *([] if proposal is None else _choice(scene, episode.planner.camera, proposal, expected)),
+                *([] if proposal is None else _choice(scene, episode.planner.camera, proposal, picture)),
             ]
-        self._tell(episode, posterior, proposal, expected)
+        self._tell(episode, posterior, proposal, picture)
 
     def follow(self, session: Session) -> None:
         """Show a session from now on, with every image and proposal."""
@@ -107,7 +108,7 @@ class LiveView:
         self._server.stop()
 
     def _tell(
-        self, episode: Episode, posterior: SurfacePosterior, proposal: Proposal | None, expected: np.ndarray | None
+        self, episode: Episode, posterior: SurfacePosterior, proposal: Proposal | None, picture: np.ndarray | None
     ) -> None:
         views, sought = len(episode.views), episode.planner.quantity
         lines = [f"**{views} view{'s' if views > 1 else ''}**, {int(episode.cloud.count):,} points kept"]
@@ -122,18 +123,15 @@ class LiveView:
         self._text.content = "\n\n".join(lines)
         if self._image is not None:
             self._image.remove()
-        picture = None if expected is None else _depth_picture(expected)
         self._image = None if picture is None else self._server.gui.add_image(picture, label="depth expected there")
 
 
 def _points(scene: Any, episode: Episode) -> list[Any]:
-    last = episode.views[-1]
-    new, _ = last.scan.to_numpy()
+    new, _ = episode.views[-1].scan.to_numpy()
     before = episode.views[-2].cloud.to_numpy()[0] if len(episode.views) > 1 else new[:0]
-    shown = {"before": (before, BEFORE), "new": (new, NEW)}
     return [
         scene.add_point_cloud(f"/points/{name}", points, _rgb(colour), point_size=_POINT, point_shape="circle")
-        for name, (points, colour) in shown.items()
+        for name, points, colour in (("before", before, BEFORE), ("new", new, NEW))
         if len(points)
     ]
 
@@ -142,8 +140,7 @@ def _cameras(scene: Any, episode: Episode) -> list[Any]:
     found = []
     for number, view in enumerate(episode.views, start=1):
         colour = NEW if number == len(episode.views) else GREY
-        camera = view.camera
-        found.append(_frustum(scene, f"/cameras/view {number}", camera, view.pose, colour))
+        found.append(_frustum(scene, f"/cameras/view {number}", view.camera, view.pose, colour))
         # It goes with its camera.
         scene.add_label(f"/cameras/view {number}/number", str(number))
     return found
@@ -162,23 +159,20 @@ def _mean(scene: Any, imagination: Imagination, evidence: Evidence, posterior: S
 def _imagined(
     scene: Any, imagination: Imagination, evidence: Evidence, posterior: SurfacePosterior, key: Any
 ) -> list[Any]:
-    names = []
+    shapes = [""] * _SAMPLES
     if isinstance(posterior, KnownShapesPosterior):
-        names = posterior.names_of_samples(key, imagination.num_samples)
+        shapes = [f" {name}" for name in posterior.names_of_samples(key, imagination.num_samples)]
     # Marching cubes asks for an array that it could write to.
     values = np.array(imagination.sample(evidence, key, posterior).values[:_SAMPLES])
     found = []
-    for number, triangles in enumerate((level_triangles(one, imagination.grid) for one in values), start=1):
-        if triangles is not None:
-            of = f" {names[number - 1]}" if names else ""
-            name, (vertices, faces, _) = f"/imagined/{number}{of}", triangles
-            found.append(
-                scene.add_mesh_simple(name, vertices, faces, color=_rgb("#8fb8d8"), opacity=0.9, visible=False)
-            )
+    for number, (one, shape) in enumerate(zip(values, shapes, strict=False), start=1):
+        if (triangles := level_triangles(one, imagination.grid)) is not None:
+            settings: dict[str, Any] = {"color": _rgb("#8fb8d8"), "opacity": 0.9, "visible": False}
+            found.append(scene.add_mesh_simple(f"/imagined/{number}{shape}", *triangles[:2], **settings))
     return found
 
 
-def _choice(scene: Any, camera: Camera, proposal: Proposal, expected: np.ndarray | None) -> list[Any]:
+def _choice(scene: Any, camera: Camera, proposal: Proposal, picture: np.ndarray | None) -> list[Any]:
     values = np.asarray(proposal.values, np.float64)
     open_ = np.isfinite(values)
     places = np.asarray(proposal.candidates.position)[open_]
@@ -187,7 +181,6 @@ def _choice(scene: Any, camera: Camera, proposal: Proposal, expected: np.ndarray
         low, high = float(values[open_].min()), float(values[open_].max())
         colours = _colours(VALUE, (values[open_] - low) / max(high - low, 1e-12))[:, :3]
         found.append(scene.add_point_cloud("/candidates", places, colours, point_size=_CANDIDATE, point_shape="circle"))
-    picture = None if expected is None else _depth_picture(expected)
     return [*found, _frustum(scene, "/next view", camera, proposal.pose, "#009e73", picture)]
 
 
@@ -205,11 +198,6 @@ def _frustum(
         wxyz=Rotation.from_matrix(np.asarray(pose.rotation, np.float64)).as_quat(scalar_first=True),
         position=np.asarray(pose.position, np.float64),
     )
-
-
-def _depth_picture(depth: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Near is bright; white where nothing is expected."""
-    return depth_picture(depth, *depth_range([depth]))
 
 
 def _colours(scale: Colormap, share: np.ndarray) -> UInt8[np.ndarray, "*n 4"]:
