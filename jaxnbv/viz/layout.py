@@ -29,9 +29,8 @@ def fitted(figure: Figure, x: float, y: float, text: str, width: float, fontsize
 
 def flow(
     figure: Figure, items: Iterable[tuple[str, str]], x: float, y: float, width: float, step: float, fontsize: float
-) -> float:
-    """Texts with their colours from left to right within a width, in as many rows as they need, `step` apart; returns
-    the height of the last one."""
+) -> None:
+    """Texts with their colours from left to right within a width, in as many rows as they need, `step` apart."""
     at, gap = x, 0.14 / figure.get_figwidth()
     for text, colour in items:
         placed = figure.text(at, y, text, color=colour, fontsize=fontsize, va="center")
@@ -40,4 +39,3 @@ def flow(
             at, y = x, y - step
             placed.set_position((at, y))
         at += wide + gap
-    return y

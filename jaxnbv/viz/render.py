@@ -17,6 +17,7 @@ from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.viz.data import MeanSurface, ReportData
 from jaxnbv.viz.imagined import Look
+from jaxnbv.viz.sphere import unit
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, LINE, NEW
 
 FRUSTUM_DEPTH = 0.45
@@ -28,15 +29,12 @@ INSET = 0.24
 _KNOWN = "#c3c9d2"
 
 
-def beside(pose: Pose, radius: float = 1.0) -> Float[np.ndarray, "3"]:
+def beside(pose: Pose) -> Float[np.ndarray, "3"]:
     """Where to look from so as to see what a camera sees, and the camera itself from the side: 40 degrees around."""
-    away = np.asarray(pose.position, dtype=np.float64)
-    away = away / max(float(np.linalg.norm(away)), 1e-12)
+    away = unit(np.asarray(pose.position, dtype=np.float64))
     across = np.cross([0.0, 1.0, 0.0], away)
-    if np.linalg.norm(across) < 1e-3:
-        across = np.array([1.0, 0.0, 0.0])
-    across = across / np.linalg.norm(across)
-    return radius * (math.cos(math.radians(40)) * away + math.sin(math.radians(40)) * across)
+    across = unit(across) if np.linalg.norm(across) >= 1e-3 else np.array([1.0, 0.0, 0.0])
+    return math.cos(math.radians(40)) * away + math.sin(math.radians(40)) * across
 
 
 def frustum(pose: Pose, camera: Camera, depth: float = FRUSTUM_DEPTH) -> Float[np.ndarray, "lines 2 3"]:
@@ -71,8 +69,7 @@ class Still:
         mesh = TriangleMesh(surface.vertices.astype(np.float64), surface.faces.astype(np.int64), Frame())
         # Not by the camera's compiled rays: of millions of pixels, XLA takes seconds over the constants.
         directions = np.asarray(self.fine_camera.pixel_directions()) @ np.asarray(self.pose.rotation).T
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        hits = mesh.trace(np.broadcast_to(np.asarray(self.pose.position), directions.shape), directions)
+        hits = mesh.trace(np.broadcast_to(np.asarray(self.pose.position), directions.shape), unit(directions))
         mask = np.asarray(hits.mask)
         points = np.asarray(hits.points)[mask]
         distance, near = cKDTree(surface.vertices).query(points, k=3)
@@ -121,13 +118,6 @@ class Still:
         return pixels - 0.5, local[:, 2] < self.depth[row, column] + _SLACK
 
 
-def painted(data: ReportData, index: int, deviation: LogNorm, size: int) -> Still:
-    """A picture of the surface after view `index` (from 0), from where all are seen."""
-    still = Still(data.stage.eye, data.views[index].surface, size, data.stage.extent)
-    still.paint(deviation)
-    return still
-
-
 def draw_scene(
     axes: Axes,
     data: ReportData,
@@ -165,14 +155,10 @@ def draw_scene(
 def _free_corner(axes: Axes, extent: list[Float[np.ndarray, "_ 2"]]) -> tuple[int, int]:
     """The corner of a framed axes in which the least share of each of some groups of pixels lies."""
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    places = [(pixels - [left, bottom]) / [right - left, top - bottom] for pixels in extent]
 
     def taken(corner: tuple[int, int]) -> float:
-        total = 0.0
-        for pixels in extent:
-            places = (pixels - [left, bottom]) / [right - left, top - bottom]
-            away = np.abs(places - corner)
-            total += float(np.mean((away < 1.25 * INSET).all(axis=1)))
-        return total
+        return sum(float(np.mean((np.abs(at - corner) < 1.25 * INSET).all(axis=1))) for at in places)
 
     return min(((0, 0), (0, 1), (1, 0), (1, 1)), key=taken)
 

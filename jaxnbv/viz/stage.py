@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere
 from jaxnbv.planning.episode import Episode
+from jaxnbv.viz.sphere import unit
 
 # Fields of view are drawn so deep, in radii of the object, and end at so many of its extents in their direction, which
 # counts as so many radii at least.
@@ -58,18 +59,19 @@ def stage_of(episode: Episode, surfaces: list[trimesh.Trimesh]) -> Stage:
     distances = [np.linalg.norm(rows, axis=1) for rows in known]
     radius = max(float(np.percentile(far, _SPREAD)) for far in distances)
     outline = np.concatenate([rows[far <= radius] for rows, far in zip(known, distances, strict=True)])
-    positions = [np.asarray(view.pose.position, np.float64) for view in episode.views]
-    for view in episode.views:
-        if view.proposal is not None and view.proposal.trajectories is not None:
-            positions += list(np.asarray(view.proposal.trajectories.poses.position, np.float64).reshape(-1, 3))
-    farthest = max(float(np.linalg.norm(position)) for position in positions)
+    cameras = np.stack([np.asarray(view.pose.position, np.float64) for view in episode.views])
+    proposals = [view.proposal for view in episode.views if view.proposal is not None]
+    ways = [proposal.trajectories.poses.position for proposal in proposals if proposal.trajectories is not None]
+    positions = np.concatenate([cameras, *(np.asarray(way, np.float64).reshape(-1, 3) for way in ways)])
+    farthest = float(np.linalg.norm(positions, axis=1).max())
     depth = _DEPTH * radius
     pull = min(1.0, (_STAND * radius + depth) / max(farthest, 1e-9))
-    poses = [view.pose for view in episode.views]
     eyes = np.asarray(fibonacci_sphere(_DIRECTIONS), np.float64)
     eyes = eyes[np.abs(eyes[:, 1]) < _HIGHEST]
     shown = _shown(episode, surfaces[-1] if surfaces else None, eyes, _CLEAR * radius)
-    return Stage(eyes[int(np.argmax(shown - _in_front(poses, eyes)))], radius, outline, pull, depth)
+    # Cameras should not stand between the eye and the object.
+    in_front = np.mean(unit(cameras) @ eyes.T > _IN_FRONT, axis=0)
+    return Stage(eyes[int(np.argmax(shown - in_front))], radius, outline, pull, depth)
 
 
 def _shown(
@@ -86,10 +88,3 @@ def _shown(
         origins = points[few, None] + clear * rays
         facing &= ~surface.ray.intersects_any(origins.reshape(-1, 3), rays.reshape(-1, 3)).reshape(facing.shape)
     return np.sum(facing, axis=0) / max(len(few), 1)
-
-
-def _in_front(poses: list[Pose], eyes: Float[np.ndarray, "e 3"]) -> Float[np.ndarray, " e"]:
-    """The share of the cameras that stand between an eye and the object."""
-    away = np.stack([np.asarray(pose.position, np.float64) for pose in poses])
-    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
-    return np.mean(away @ eyes.T > _IN_FRONT, axis=0)
