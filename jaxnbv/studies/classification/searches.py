@@ -14,7 +14,6 @@ from jaxnbv.planning.episode import Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.search import (
     ConstrainedPoses,
-    DiscreteSearch,
     GradientSearch,
     HalvingSearch,
     HybridSearch,
@@ -85,15 +84,16 @@ class _Searches(ClassificationStudy):
 
     def planner(self, method: str, scene: Scene) -> Planner:
         acquisition = CrossEntropy(self.imagining or self.classifier, self.num_points)
-        return self.planner_of(acquisition, self._search(method))
+        return self.planner_of(acquisition, self.search(method))
 
-    def _search(self, method: str) -> Search:
+    def search(self, method: str) -> Search:
         if method in _SPACES:
             candidates = max(self.num_candidates // 2, self.num_starts)
             steps = self.num_starts, self.iterations, self.learning_rate
             return GradientSearch(None, _SPACES[method](), *steps, num_candidates=candidates)
-        ways = {"discrete": DiscreteSearch, "halving": HalvingSearch}
-        return ways[method](self.candidates) if method in ways else HybridSearch(candidates=self.candidates)
+        if method == "halving":
+            return HalvingSearch(self.candidates)
+        return HybridSearch(candidates=self.candidates) if method == "hybrid" else super().search(method)
 
     def run_methods(self, scene: Scene, truth: Truth, first: int, methods: Sequence[str]) -> dict[str, Record]:
         """One by one, since each search chooses its own poses."""

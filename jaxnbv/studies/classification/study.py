@@ -17,20 +17,13 @@ from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale, pre
 from jaxnbv.planning.episode import Sensor, Step, view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SensorNoise
-from jaxnbv.search import (
-    CandidateSearch,
-    DiscreteSearch,
-    FarthestView,
-    RandomView,
-    TieBreakSearch,
-    UncertaintyView,
-)
+from jaxnbv.search import TieBreakSearch
 from jaxnbv.studies.classification.measures import HITS_EXPLAINED, ROUGHNESS, diagnostics_chart, hits
 from jaxnbv.studies.classification.shared import OracleView, Shared, classify, propose_together
 from jaxnbv.studies.engine.diagnostics import rank_correlation, roughness
 from jaxnbv.studies.engine.measures import UNKNOWING, Claim, Measure, Record
 from jaxnbv.studies.engine.meshes import numbered
-from jaxnbv.studies.engine.study import Chart, Panel, Scene, Study, pose_record
+from jaxnbv.studies.engine.study import RULES, Chart, Panel, Scene, Study, pose_record
 from jaxnbv.studies.readers import MeshFile, class_meshes
 from jaxnbv.studies.scenes import ClassObject, ClassSet, FirstView, Framing, Split
 from jaxnbv.studies.scenes.class_object import ClassMesh, scan_cue, surface_of
@@ -46,12 +39,7 @@ _BY_CLASS: dict[str, type[ClassAcquisition]] = {
     "tie-break": CrossEntropy,
     "oracle": CrossEntropy,
 }
-_SEARCHES: dict[str, type[CandidateSearch]] = {
-    "farthest": FarthestView,
-    "uncertainty": UncertaintyView,
-    "random": RandomView,
-}
-BASELINES = ("coverage", "farthest", "uncertainty", "random")
+BASELINES = ("coverage", *RULES)
 
 
 class Truth(eqx.Module):
@@ -230,7 +218,7 @@ class ClassificationStudy(Study):
             return self.planner_of(acquisition, OracleView(candidates, scans=scene.task.scans))
         if method == "tie-break":
             return self.planner_of(acquisition, TieBreakSearch(candidates, second=coverage))
-        return self.planner_of(acquisition, _SEARCHES.get(method, DiscreteSearch)(candidates))
+        return self.planner_of(acquisition, self.search(method))
 
     def sensor(self, scene: Scene) -> Sensor:
         """From a candidate the same scan for all methods and views."""

@@ -23,11 +23,26 @@ from jaxnbv.planning.episode import Sensor, Step, scene_sensor, steps, view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Evidence, Grid, Surface
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
-from jaxnbv.search import Candidates, Search, SphereCandidates
+from jaxnbv.search import (
+    Candidates,
+    CandidateSearch,
+    DiscreteSearch,
+    FarthestView,
+    RandomView,
+    Search,
+    SphereCandidates,
+    UncertaintyView,
+)
 from jaxnbv.studies.engine.measures import KNOWN, UNKNOWING, Claim, Measure, Record
 from jaxnbv.studies.scenes.banks import bank_poses, shape_bank
 
 _PURPOSES = ("first", "episode", "scene", "measure")
+# The baselines of all studies that look at no acquisition.
+RULES: dict[str, type[CandidateSearch]] = {
+    "farthest": FarthestView,
+    "uncertainty": UncertaintyView,
+    "random": RandomView,
+}
 
 
 class Scene(eqx.Module):
@@ -206,6 +221,10 @@ class Study(eqx.Module):
     def grid(self) -> Grid:
         """Where samples are evaluated."""
         return Grid(self.grid_resolution)
+
+    def search(self, method: str) -> Search:
+        """Over the candidates: one of `RULES`, or the full search by the acquisition."""
+        return RULES.get(method, DiscreteSearch)(self.candidates)
 
     def planner_of(
         self,

@@ -18,26 +18,18 @@ from jaxnbv.planning.episode import Step, view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, mesh_from_sdf
 from jaxnbv.scanning.sensors import HEAT_SETTING
-from jaxnbv.search import CandidateSearch, DiscreteSearch, FarthestView, HalvingSearch, RandomView, UncertaintyView
+from jaxnbv.search import HalvingSearch
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.meshes import MeshStudy, numbered_mesh
-from jaxnbv.studies.engine.study import Chart, Panel, Scene
+from jaxnbv.studies.engine.study import RULES, Chart, Panel, Scene
 from jaxnbv.studies.heat.halving import compare
 from jaxnbv.studies.scenes import heat_scene
 from jaxnbv.tasks import ColdestPoint, Coverage, body_temperature
 from jaxnbv.tasks.diffusion import HeatProblem
 
-_SEARCHES: dict[str, type[CandidateSearch]] = {
-    "heat": DiscreteSearch,
-    "heat-reached": DiscreteSearch,
-    "heat-halving": HalvingSearch,
-    "coverage": DiscreteSearch,
-    "farthest": FarthestView,
-    "uncertainty": UncertaintyView,
-    "random": RandomView,
-}
 # Those that seek cold; the other methods know nothing of heat.
-HEAT_METHODS = tuple(_SEARCHES)[:3]
+HEAT_METHODS = ("heat", "heat-reached", "heat-halving")
+_BASELINES = ("coverage", *RULES)
 # The points among which a cloud's coldest is sought.
 ESTIMATES = {"all": "coldest of all points", "reached": "coldest of the warmed points"}
 # Points colder than this share of the range of temperatures count as coldest: objects have symmetries, and the inner
@@ -136,7 +128,7 @@ class HeatStudy(MeshStudy):
         "steps at which every view had the value zero: the first candidate is taken then. The lowest temperature is\n"
         "already that before heating, at a piece of the cloud that is not connected to the source."
     )
-    methods: ClassVar[tuple[str, ...]] = tuple(_SEARCHES)
+    methods: ClassVar[tuple[str, ...]] = (*HEAT_METHODS, *_BASELINES)
     reference: ClassVar[str] = "heat"
     measures: ClassVar[tuple[Measure, ...]] = (
         *_measures("all"),
@@ -147,12 +139,7 @@ class HeatStudy(MeshStudy):
         Measure("seconds", "Time of a proposal", _seconds, ("median",), "step", unit="seconds", digits=1),
     )
     claims: ClassVar[tuple[Claim, ...]] = (
-        Claim(
-            "The utility comes nearer to the coldest point within few views.",
-            "distance, all",
-            4,
-            ("coverage", "farthest", "uncertainty", "random"),
-        ),
+        Claim("The utility comes nearer to the coldest point within few views.", "distance, all", 4, _BASELINES),
     )
     charts: ClassVar[Mapping[str, Chart]] = {
         "coldest": Chart(tuple((Panel(f"distance, {e}"), Panel(f"error, {e}", log=True)) for e in ESTIMATES))
@@ -185,7 +172,7 @@ class HeatStudy(MeshStudy):
         return Scene(index, Path(self.meshes[index]).name, mesh, jnp.asarray(source, jnp.result_type(float)))
 
     def planner(self, method: str, scene: Scene) -> Planner:
-        search = _SEARCHES[method](self.candidates)
+        search = HalvingSearch(self.candidates) if method == "heat-halving" else self.search(method)
         camera = Camera(height=self.imagined_rays, width=self.imagined_rays)
         imagination = self.imagination_of(scene)
         if method not in HEAT_METHODS:

@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnbv.acquisition import ExpectedUtilityImprovement
+from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.imagination import Imagination
@@ -16,18 +16,9 @@ from jaxnbv.networks import CloudSegmenter
 from jaxnbv.planning.episode import Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning.sensors import PART_SETTING
-from jaxnbv.search import (
-    DiscreteSearch,
-    FarthestView,
-    FreePoses,
-    GradientSearch,
-    RandomView,
-    Search,
-    SpherePoses,
-    UncertaintyView,
-)
+from jaxnbv.search import FreePoses, GradientSearch, Search, SpherePoses
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
-from jaxnbv.studies.engine.study import Chart, Panel, Scene, Study
+from jaxnbv.studies.engine.study import RULES, Chart, Panel, Scene, Study
 from jaxnbv.studies.parts.nearest import NearestPart
 from jaxnbv.tasks import Coverage, SoftPartCount, part_counts
 
@@ -36,7 +27,6 @@ from jaxnbv.tasks import Coverage, SoftPartCount, part_counts
 TARGETS = (20, 40, 60, 80, 100)
 TARGET, NETWORK_POINTS = 60, 2048
 _BY_PARTS = ("discrete", "gradient-2dof", "gradient-6dof")
-_OVER_CANDIDATES: dict[str, Any] = {"farthest": FarthestView, "uncertainty": UncertaintyView, "random": RandomView}
 
 
 # What tells parts apart: a network, or one who knows.
@@ -79,7 +69,7 @@ class PartDiscoveryStudy(Study):
         "T_discovery for each N_target: views until the segmenter gives that many points to every part of the object;\n"
         "one more than there are views if that did not happen, so that means are lower bounds."
     )
-    methods: ClassVar[tuple[str, ...]] = (*_BY_PARTS, *_OVER_CANDIDATES, "coverage")
+    methods: ClassVar[tuple[str, ...]] = (*_BY_PARTS, *RULES, "coverage")
     reference: ClassVar[str] = "discrete"
     measures: ClassVar[tuple[Measure, ...]] = (
         Measure(
@@ -100,7 +90,7 @@ class PartDiscoveryStudy(Study):
             f"The utility finds all parts in fewer views, of {target} points each.",
             "time",
             target,
-            (*_OVER_CANDIDATES, "coverage"),
+            (*RULES, "coverage"),
         )
         for target in (TARGET, max(TARGETS))
     )
@@ -139,25 +129,23 @@ class PartDiscoveryStudy(Study):
 
     def planner(self, method: str, scene: Scene) -> Planner:
         camera = Camera(height=self.imagined_rays, width=self.imagined_rays)
-        acquisition = self._soft_count(scene) if method in _BY_PARTS else Coverage()
-        return self.planner_of(acquisition, self._search(method), camera, self.imagination_of(scene))
+        acquisition: Acquisition = Coverage()
+        if method in _BY_PARTS:
+            target = TARGET * self.num_points / NETWORK_POINTS
+            soft_count = SoftPartCount(self.segmenter_of(scene, self.num_points), target)
+            acquisition = ExpectedUtilityImprovement(soft_count, self.num_points)
+        return self.planner_of(acquisition, self.search(method), camera, self.imagination_of(scene))
 
     def imagination_of(self, scene: Scene) -> Imagination:
         """The study's, or what is known of such a scene."""
         return self.imagination
 
-    def _soft_count(self, scene: Scene) -> ExpectedUtilityImprovement:
-        target = TARGET * self.num_points / NETWORK_POINTS
-        return ExpectedUtilityImprovement(
-            SoftPartCount(self.segmenter_of(scene, self.num_points), target), self.num_points
-        )
-
-    def _search(self, method: str) -> Search:
+    def search(self, method: str) -> Search:
         if method.startswith("gradient"):
             space = SpherePoses(self.radius) if method == "gradient-2dof" else FreePoses(self.radius)
             candidates = max(self.num_candidates // 2, self.num_starts)
             return GradientSearch(None, space, self.num_starts, self.iterations, self.learning_rate, candidates)
-        return _OVER_CANDIDATES.get(method, DiscreteSearch)(self.candidates)
+        return super().search(method)
 
     def follow(
         self, scene: Scene, truth: list[int], method: str, methods: Sequence[str], episode: Iterator[Step]

@@ -15,21 +15,13 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Evidence, SDFSurface, TriangleMesh
 from jaxnbv.scanning.metrics import SURFACE_POINTS, coverage, surface_distance, truth_points
 from jaxnbv.scanning.screened_poisson import has_poisson, screened_poisson
-from jaxnbv.search import CandidateSearch, DiscreteSearch, FarthestView, RandomView, UncertaintyView
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.meshes import MeshStudy, numbered_mesh
-from jaxnbv.studies.engine.study import Chart, Panel, Scene
+from jaxnbv.studies.engine.study import RULES, Chart, Panel, Scene
 from jaxnbv.studies.scenes import Split
 from jaxnbv.studies.scenes.parts import part_scene
 from jaxnbv.tasks import Coverage, NewSurface
 
-_SEARCHES: dict[str, type[CandidateSearch]] = {
-    "coverage": DiscreteSearch,
-    "new-surface": DiscreteSearch,
-    "farthest": FarthestView,
-    "uncertainty": UncertaintyView,
-    "random": RandomView,
-}
 POISSON, MEAN = "screened Poisson", "posterior mean"
 RECONSTRUCTIONS = (POISSON, MEAN)
 
@@ -61,7 +53,7 @@ class ReconstructionStudy(MeshStudy):
     )
     bank: ClassVar[str] = "parts"
     unknowing: ClassVar[tuple[str, ...]] = ("coverage", "new-surface", "uncertainty")
-    methods: ClassVar[tuple[str, ...]] = tuple(_SEARCHES)
+    methods: ClassVar[tuple[str, ...]] = ("coverage", "new-surface", *RULES)
     reference: ClassVar[str] = "coverage"
     measures: ClassVar[tuple[Measure, ...]] = (
         _distances("chamfer", "Chamfer distance"),
@@ -98,7 +90,7 @@ class ReconstructionStudy(MeshStudy):
 
     def planner(self, method: str, scene: Scene) -> Planner:
         sought = NewSurface() if method == "new-surface" else Coverage()
-        return self.planner_of(sought, _SEARCHES[method](self.candidates), imagination=self.imagination_of(scene))
+        return self.planner_of(sought, self.search(method), imagination=self.imagination_of(scene))
 
     def mesher(self, scene: Scene) -> Planner:
         """Whose posterior all methods' views are meshed by, those of planners of one's own too."""

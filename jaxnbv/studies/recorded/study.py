@@ -24,18 +24,13 @@ from jaxnbv.planning.session import stride_of
 from jaxnbv.progress import progress_bar
 from jaxnbv.scanning import Surface
 from jaxnbv.scanning.surface import Hits
-from jaxnbv.search import CandidateSearch, DiscreteSearch, FarthestView, GivenPoses, RandomView, UncertaintyView
+from jaxnbv.search import GivenPoses, Search
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
-from jaxnbv.studies.engine.study import Chart, Panel, Scene, Study
+from jaxnbv.studies.engine.study import RULES, Chart, Panel, Scene, Study
 from jaxnbv.studies.readers.recorded import RecordedFrames
 from jaxnbv.studies.recorded.searches import EvenlySpaced, MostNewVoxels
 from jaxnbv.tasks import Coverage, NewSurface
 
-_BASELINES: dict[str, type[CandidateSearch]] = {
-    "farthest": FarthestView,
-    "uncertainty": UncertaintyView,
-    "random": RandomView,
-}
 NEW, COVERAGE, EVEN, ORACLE = "new surface", "coverage", "evenly spaced", "oracle"
 # A voxel that fewer frames have seen may be noise.
 _SEEN_BY = 3
@@ -92,7 +87,7 @@ class RecordedStudy(Study):
         "Share of the voxels in the box, of those that three frames or more have seen, that the chosen frames show.\n"
         "The oracle knows what each frame shows; evenly spaced frames divide the recording in time."
     )
-    methods: ClassVar[tuple[str, ...]] = (NEW, COVERAGE, *_BASELINES, EVEN, ORACLE)
+    methods: ClassVar[tuple[str, ...]] = (NEW, COVERAGE, *RULES, EVEN, ORACLE)
     reference: ClassVar[str] = NEW
     measures: ClassVar[tuple[Measure, ...]] = (
         Measure("covered", "Voxels seen", lambda r, m: r["methods"][m]["covered"], percent=True, better="more"),
@@ -172,16 +167,14 @@ class RecordedStudy(Study):
 
     def planner(self, method: str, scene: Scene) -> Planner:
         acquisition = Coverage() if method == COVERAGE else NewSurface()
-        return self.planner_of(acquisition, self._search(method), self.camera.resized(*_RAYS))
+        return self.planner_of(acquisition, self.search(method), self.camera.resized(*_RAYS))
 
-    def _search(self, method: str) -> CandidateSearch:
-        if method in _BASELINES:
-            return _BASELINES[method](self.candidates)
+    def search(self, method: str) -> Search:
         if method == EVEN:
             return EvenlySpaced(self.candidates, views=self.views)
         if method == ORACLE:
             return MostNewVoxels(self.candidates, shown=jnp.asarray(self.recording.shown))
-        return DiscreteSearch(self.candidates)
+        return super().search(method)
 
     def truth(self, scene: Scene) -> Bool[np.ndarray, "frames voxels"]:
         return self.recording.shown
