@@ -18,11 +18,10 @@ from tqdm import tqdm
 
 from jaxnbv.planning.episode import view_keys
 from jaxnbv.storage.files import write_whole
-from jaxnbv.studies.classification.modelnet10 import ModelNet10Study
-from jaxnbv.studies.classification.omniobject3d import OmniObject3DStudy
 from jaxnbv.studies.classification.pyramid import PyramidStudy
 from jaxnbv.studies.classification.study import ClassificationStudy
 from jaxnbv.studies.classification.truck import TruckStudy
+from jaxnbv.studies.classification.whole import ModelNet10Study, OmniObject3DStudy
 from jaxnbv.studies.engine.measures import KNOWN
 from jaxnbv.studies.scenes import Framing, Split
 from jaxnbv.studies.training import expected_calibration_error

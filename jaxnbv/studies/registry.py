@@ -53,7 +53,7 @@ STUDIES = {
         options=("meshes", "classifier", "first"),
     ),
     "modelnet10": Entry(
-        "jaxnbv.studies.classification.modelnet10:ModelNet10Study",
+        "jaxnbv.studies.classification.whole:ModelNet10Study",
         "Do all methods tell classes alike that differ in global shape? The paper's ModelNet10, on procedural objects, "
         "or on meshes in folders of the classes' names.",
         "48 candidates, 16 samples on a 64^3 grid, and 512 points for the classifier of imagined scans: fewer "
@@ -64,7 +64,7 @@ STUDIES = {
         options=("meshes", "classifier", "first"),
     ),
     "omniobject3d": Entry(
-        "jaxnbv.studies.classification.omniobject3d:OmniObject3DStudy",
+        "jaxnbv.studies.classification.whole:OmniObject3DStudy",
         "How soon are fruits told that differ in what is small? The paper's OmniObject3D, on procedural fruits, or on "
         "meshes in folders of the classes' names.",
         "48 candidates, 16 samples on a 64^3 grid, and 512 points for the classifier of imagined scans: fewer "

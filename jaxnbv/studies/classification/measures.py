@@ -1,22 +1,20 @@
-"""What studies of classification measure: hits by view, what views have shown, and how good the samples were."""
+"""What studies of classification measure: hits by view, what views have shown, and how good the samples were.
 
-from collections.abc import Callable
+A hit is when a sequence of views first gives the right class, gives it for good, or first shows its cue. Views count
+from 1. A sequence that never does has no such time: None.
+"""
+
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Integer
 
-from jaxnbv.studies.classification.hits import (
-    CUE_PIXELS,
-    cumulative_share,
-    first_hit,
-    random_seen_share,
-    seen_view,
-    stable_hit,
-)
+from jaxnbv.checks import AnyArray, require
 from jaxnbv.studies.engine.measures import Measure, Record
 from jaxnbv.studies.engine.study import Chart, Panel
 
-_CHOSEN = "view being chosen"
+# What the studies call having seen it: rays of one scan that hit the cue of the class.
+CUE_PIXELS = 150
 HITS_EXPLAINED = (
     "First hit: a right prediction so far. Stable hit: right from then to the end. Random search: exact\n"
     "expectation of first hit by view 2, and of what a view shows; else a mean over runs.\n"
@@ -26,6 +24,32 @@ HITS_EXPLAINED = (
 def seen_explained(cue: str) -> str:
     """What having seen it means."""
     return f"{cue.capitalize()} seen: one of the views shows at least {CUE_PIXELS} pixels of it."
+
+
+def hits(cue: str = "") -> tuple[Measure, ...]:
+    """First and stable hit; and whether a view has shown the cue of the class, where that is a part of the object."""
+    first = Measure("first", "First hit", _hit(first_hit), percent=True)
+    stable = Measure("stable", "Stable hit", _hit(stable_hit), percent=True)
+    seen = Measure(cue, f"{cue.capitalize()} seen", _seen(cue), percent=True)
+    return (first, stable, seen) if cue else (first, stable)
+
+
+def hits_and_diagnostics(cue: str = "") -> tuple[Measure, ...]:
+    """With the measures of the samples among which a view is chosen."""
+    titles = {"rank_correlation": "Rank correlation"} if cue else {}
+    return *hits(cue), *(
+        Measure(name, title, _diagnostic(name), first=2, digits=2, paired=False)
+        for name, title in (titles | {"roughness": "Roughness"}).items()
+    )
+
+
+def charts_of(cue: str = "", by_group: str = "") -> dict[str, Chart]:
+    """Of the same; that of the hits once more by the groups of scenes, under a name of its own."""
+    shown = (tuple(Panel(name) for name in ("first", "stable", cue) if name),)
+    names = ("rank_correlation", "roughness") if cue else ("roughness",)
+    diagnostics = (tuple(Panel(name, axis="view being chosen") for name in names),)
+    groups = {by_group: Chart(shown, by_group=True)} if by_group else {}
+    return {"hits": Chart(shown), **groups, "diagnostics": Chart(diagnostics)}
 
 
 def _hit(time_of: Callable) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
@@ -60,33 +84,62 @@ def _diagnostic(quantity: str) -> Callable[[Record, str], list[float | None]]:
     """By the view being chosen; of the posterior that the method's own views made."""
 
     def of(record: Record, method: str) -> list[float | None]:
-        views = len(record["methods"][method]["runs"][0]["log_p"])
-        return [_of_view(record, method, quantity, view) for view in range(2, views + 1)]
+        held = record["methods"][method]
+        found = {entry["view"]: entry[quantity] for entry in held["diagnostics"]}
+        by_view = [found.get(view) for view in range(2, len(held["runs"][0]["log_p"]) + 1)]
+        return [one if one is not None and np.isfinite(one) else None for one in by_view]
 
     return of
 
 
-def _of_view(record: Record, method: str, quantity: str, view: int) -> float | None:
-    found = [entry[quantity] for entry in record["methods"][method]["diagnostics"] if entry["view"] == view]
-    return found[0] if found and found[0] is not None and np.isfinite(found[0]) else None
+def first_hit(correct: Bool[AnyArray, " views"]) -> int | None:
+    """The earliest view with a correct prediction, the paper's T_first."""
+    hits = np.flatnonzero(correct)
+    return int(hits[0]) + 1 if hits.size else None
 
 
-def diagnostic(name: str, title: str) -> Measure:
-    """A measure of the samples among which a view is chosen."""
-    return Measure(name, title, _diagnostic(name), first=2, digits=2, paired=False)
+def stable_hit(correct: Bool[AnyArray, " views"]) -> int | None:
+    """The earliest view from which on the prediction stays correct to the end, the paper's T_stable."""
+    misses = np.flatnonzero(~np.asarray(correct))
+    view = int(misses[-1]) + 2 if misses.size else 1
+    return view if view <= len(correct) else None
 
 
-def hits(cue: str = "") -> tuple[Measure, ...]:
-    """First and stable hit; and whether a view has shown the cue of the class, where that is a part of the object."""
-    seen = Measure(cue, f"{cue.capitalize()} seen", _seen(cue), percent=True)
-    both = [Measure(f.__name__.partition("_")[0], _HIT_TITLES[f], _hit(f), percent=True) for f in _HIT_TITLES]
-    return (*both, seen) if cue else tuple(both)
+def seen_view(pixels: Integer[AnyArray, " views"], threshold: int = CUE_PIXELS) -> int | None:
+    """The first view in which at least `threshold` rays hit the cue of the class; views do not add up."""
+    return first_hit(np.asarray(pixels) >= threshold)
 
 
-_HIT_TITLES = {first_hit: "First hit", stable_hit: "Stable hit"}
-ROUGHNESS = diagnostic("roughness", "Roughness")
+def cumulative_share(times: Sequence[int | None], views: int) -> Float[np.ndarray, " views"]:
+    """Share of the sequences whose time is at most 1, 2, ..., `views`; one that never hits counts in the whole.
+
+    **Raises:** `ValueError` if there are no times.
+    """
+    require(len(times) > 0, "a share of no sequences is not defined: give at least one time")
+    by_view = np.array([np.inf if time is None else time for time in times])
+    return np.mean(by_view[:, None] <= np.arange(1, views + 1), axis=0)
 
 
-def diagnostics_chart(*measures: str) -> Chart:
-    """Measures by the view being chosen, beside each other."""
-    return Chart((tuple(Panel(measure, axis=_CHOSEN) for measure in measures),))
+def random_seen_share(
+    pixels: Integer[AnyArray, " candidates"], first: int, views: int, threshold: int = CUE_PIXELS
+) -> Float[np.ndarray, " views"]:
+    """Exact probability that a random search has shown the cue of the class by view 1, 2, ..., `views`.
+
+    After the first camera it takes the other N candidates in an order drawn uniformly without replacement. Of these M
+    show it, so by view t it has missed them all with the hypergeometric probability
+    C(N - M, t - 1) / C(N, t - 1). If the first camera shows it, the share is 1 throughout.
+
+    - `pixels`: for each candidate the rays of its true scan that hit the cue of the class.
+    - `first`: the first camera, an index of the candidates.
+
+    **Raises:** `ValueError` if there is no such candidate, or there are more views than candidates.
+    """
+    shows = np.asarray(pixels) >= threshold
+    require(0 <= first < len(shows), f"the first camera is candidate {first} of {len(shows)}; count from 0")
+    require(1 <= views <= len(shows), f"{views} views of {len(shows)} candidates: each is taken at most once")
+    if shows[first]:
+        return np.ones(views)
+    others, showing = len(shows) - 1, int(shows.sum())
+    drawn = np.arange(views - 1)
+    miss = np.maximum(others - showing - drawn, 0) / (others - drawn)
+    return 1.0 - np.cumprod(np.append(1.0, miss))

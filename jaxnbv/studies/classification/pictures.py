@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import scan
-from jaxnbv.studies.classification.hits import CUE_PIXELS
+from jaxnbv.studies.classification.measures import CUE_PIXELS
 from jaxnbv.studies.classification.study import ClassificationStudy
 from jaxnbv.studies.engine.measures import Record, methods_of
 from jaxnbv.studies.engine.pictures import Grid, first_scenes, framed, write_grids

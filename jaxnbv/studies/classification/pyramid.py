@@ -6,17 +6,10 @@ from typing import ClassVar
 import numpy as np
 
 from jaxnbv.checks import require
-from jaxnbv.studies.classification.measures import (
-    HITS_EXPLAINED,
-    ROUGHNESS,
-    diagnostic,
-    diagnostics_chart,
-    hits,
-    seen_explained,
-)
+from jaxnbv.studies.classification.measures import HITS_EXPLAINED, charts_of, hits_and_diagnostics, seen_explained
 from jaxnbv.studies.classification.study import ClassificationStudy, Truth
 from jaxnbv.studies.engine.measures import Measure, Record
-from jaxnbv.studies.engine.study import Chart, Panel, Scene
+from jaxnbv.studies.engine.study import Chart, Scene
 from jaxnbv.studies.scenes import CLASS_SETS, ClassSet, FirstView, Framing, Pyramid
 from jaxnbv.studies.scenes.class_object import choose_hidden
 
@@ -39,16 +32,8 @@ class PyramidStudy(ClassificationStudy):
     framings: ClassVar[tuple[Framing, ...]] = tuple(Framing)
     solid: ClassVar[bool] = True
     bank: ClassVar[str] = "pyramid"
-    measures: ClassVar[tuple[Measure, ...]] = (
-        *hits(cue),
-        diagnostic("rank_correlation", "Rank correlation"),
-        ROUGHNESS,
-    )
-    charts: ClassVar[Mapping[str, Chart]] = {
-        "hits": Chart((tuple(map(Panel, ("first", "stable", "pattern"))),)),
-        "angles": Chart((tuple(map(Panel, ("first", "stable", "pattern"))),), by_group=True),
-        "diagnostics": diagnostics_chart("rank_correlation", "roughness"),
-    }
+    measures: ClassVar[tuple[Measure, ...]] = hits_and_diagnostics(cue)
+    charts: ClassVar[Mapping[str, Chart]] = charts_of(cue, "angles")
     seed: ClassVar[int] = 2
 
     @classmethod

@@ -18,12 +18,12 @@ from jaxnbv.planning.episode import Sensor, Step, view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SensorNoise
 from jaxnbv.search import TieBreakSearch
-from jaxnbv.studies.classification.measures import HITS_EXPLAINED, ROUGHNESS, diagnostics_chart, hits
+from jaxnbv.studies.classification.measures import HITS_EXPLAINED, charts_of, hits_and_diagnostics
 from jaxnbv.studies.classification.shared import OracleView, Shared, classify, propose_together
 from jaxnbv.studies.engine.diagnostics import rank_correlation, roughness
 from jaxnbv.studies.engine.measures import UNKNOWING, Claim, Measure, Record
 from jaxnbv.studies.engine.meshes import numbered
-from jaxnbv.studies.engine.study import RULES, Chart, Panel, Scene, Study, pose_record
+from jaxnbv.studies.engine.study import RULES, Chart, Scene, Study, pose_record
 from jaxnbv.studies.readers import MeshFile, class_meshes
 from jaxnbv.studies.scenes import ClassObject, ClassSet, FirstView, Framing, Split
 from jaxnbv.studies.scenes.class_object import ClassMesh, scan_cue, surface_of
@@ -74,7 +74,7 @@ class ClassificationStudy(Study):
     methods: ClassVar[tuple[str, ...]] = ("cross-entropy", "entropy", "mixed", "tie-break", *BASELINES, "oracle")
     reference: ClassVar[str] = "cross-entropy"
     explanation: ClassVar[str] = f"{HITS_EXPLAINED}Roughness is by the view being chosen, in ( ) its scenes."
-    measures: ClassVar[tuple[Measure, ...]] = (*hits(), ROUGHNESS)
+    measures: ClassVar[tuple[Measure, ...]] = hits_and_diagnostics()
     claims: ClassVar[tuple[Claim, ...]] = (
         Claim(
             "Where local features tell the class, cross-entropy is right sooner than views that know nothing of the "
@@ -84,10 +84,7 @@ class ClassificationStudy(Study):
             BASELINES,
         ),
     )
-    charts: ClassVar[Mapping[str, Chart]] = {
-        "hits": Chart((tuple(map(Panel, ("first", "stable"))),)),
-        "diagnostics": diagnostics_chart("roughness"),
-    }
+    charts: ClassVar[Mapping[str, Chart]] = charts_of()
     quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 40}
     quick_scenes: ClassVar[int] = 6
 

@@ -8,18 +8,11 @@ import equinox as eqx
 
 from jaxnbv.checks import require
 from jaxnbv.scanning import load_mesh
-from jaxnbv.studies.classification.measures import (
-    HITS_EXPLAINED,
-    ROUGHNESS,
-    diagnostic,
-    diagnostics_chart,
-    hits,
-    seen_explained,
-)
+from jaxnbv.studies.classification.measures import HITS_EXPLAINED, charts_of, hits_and_diagnostics, seen_explained
 from jaxnbv.studies.classification.study import ClassificationStudy
 from jaxnbv.studies.engine.measures import Measure
 from jaxnbv.studies.engine.meshes import mesh_files
-from jaxnbv.studies.engine.study import Chart, Panel, Study
+from jaxnbv.studies.engine.study import Chart, Study
 from jaxnbv.studies.readers import MeshFile
 from jaxnbv.studies.scenes import CLASS_SETS, ClassSet
 from jaxnbv.studies.scenes.class_object import ClassMesh
@@ -42,16 +35,8 @@ class TruckStudy(ClassificationStudy):
     bank: ClassVar[str] = "truck"
     network: ClassVar[str] = "truck"
     fed: ClassVar[tuple[int, int]] = (2048, 1024)
-    measures: ClassVar[tuple[Measure, ...]] = (
-        *hits(cue),
-        diagnostic("rank_correlation", "Rank correlation"),
-        ROUGHNESS,
-    )
-    charts: ClassVar[Mapping[str, Chart]] = {
-        "hits": Chart((tuple(map(Panel, ("first", "stable", "cargo"))),)),
-        "first_views": Chart((tuple(map(Panel, ("first", "stable", "cargo"))),), by_group=True),
-        "diagnostics": diagnostics_chart("rank_correlation", "roughness"),
-    }
+    measures: ClassVar[tuple[Measure, ...]] = hits_and_diagnostics(cue)
+    charts: ClassVar[Mapping[str, Chart]] = charts_of(cue, "first_views")
     seed: ClassVar[int] = 11
 
     num_points: int = eqx.field(static=True, default=1024)

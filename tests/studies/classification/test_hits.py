@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxnbv.checks import InputError
-from jaxnbv.studies.classification.hits import cumulative_share, first_hit, random_seen_share, seen_view, stable_hit
+from jaxnbv.studies.classification.measures import cumulative_share, first_hit, random_seen_share, seen_view, stable_hit
 
 
 @pytest.mark.parametrize(
