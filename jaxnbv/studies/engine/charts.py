@@ -1,24 +1,65 @@
 """Charts of a study as PNG files: its measures by view, a line a method, with intervals over scenes."""
 
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from jaxnbv.storage.files import make_folder
-from jaxnbv.studies.engine.looks import draw_legend, line_of
-from jaxnbv.studies.engine.measures import Measure, Record, methods_of
+from jaxnbv.studies.engine.measures import UNKNOWING, Measure, Record, methods_of
 from jaxnbv.studies.engine.results import means
 from jaxnbv.studies.engine.study import Panel, Study
 from jaxnbv.studies.engine.tables import count_of
 from jaxnbv.viz.figures import STYLE
-from jaxnbv.viz.style import GREY, LINE, log_ticks, save_figure
+from jaxnbv.viz.style import GREY, INK, LINE, log_ticks, save_figure
 
 # Methods side by side, so that equal values do not hide one another: of the distance between two columns.
 _DODGE, _DODGE_NAMED = 0.06, 0.13
+
+
+class Look(NamedTuple):
+    """Colours that colour-blind readers tell apart (Okabe and Ito); line and marker tell the rest apart in print."""
+
+    colour: str
+    line: str
+    marker: str
+
+
+# What is new stands out in vermilion, its variants beside it; baselines have the same look in every study.
+_FIRST, _SECOND, _THIRD = Look("#d55e00", "-", "o"), Look("#cc79a7", "-", "v"), Look("#e69f00", "-", "^")
+LOOKS = {
+    "cross-entropy": _FIRST,
+    "new surface": _FIRST,
+    "evenly spaced": Look("#cc79a7", "--", "v"),
+    "entropy": _SECOND,
+    "mixed": _THIRD,
+    "tie-break": Look("#a33b00", "--", "h"),
+    "discrete": _FIRST,
+    "gradient-2dof": _THIRD,
+    "gradient-6dof": _SECOND,
+    "gradient-constrained": _SECOND,
+    "halving": Look("#009e73", "--", "D"),
+    "hybrid": Look("#0072b2", "--", "s"),
+    "heat": _FIRST,
+    "heat-reached": _SECOND,
+    "heat-halving": Look("#e69f00", "--", "^"),
+    "coverage": Look("#009e73", "-", "D"),
+    "farthest": Look("#0072b2", "-", "s"),
+    f"coverage{UNKNOWING}": Look("#009e73", ":", "d"),
+    f"uncertainty{UNKNOWING}": Look("#56b4e9", ":", "p"),
+    "uncertainty": Look("#56b4e9", "-", "P"),
+    "random": Look(GREY, "--", "X"),
+    "oracle": Look(INK, ":", "*"),
+}
+# Methods of one's own, in turn.
+_OTHERS = (Look("#8c564b", "-", "p"), Look("#7f3fbf", "-", "h"), Look("#b8860b", "--", "d"))
+_SIZES = {"*": 8.0, "o": 5.0, "P": 6.0, "X": 6.0}
 
 
 def write_charts(records: Sequence[Record], study: type[Study], folder: str | Path) -> list[Path]:
@@ -61,7 +102,7 @@ def _figure(rows: Sequence[tuple[str, Sequence[Record], Sequence[Panel]]], study
             axes.set_ylabel("" if is_repeated else unit + (f"\n{group}" if group != "all" and column == 0 else ""))
     if not shown:
         return None
-    draw_legend(figure, [method for method in methods_of(rows[0][1], study.methods) if method in shown])
+    _draw_legend(figure, [method for method in methods_of(rows[0][1], study.methods) if method in shown])
     return figure
 
 
@@ -75,7 +116,7 @@ def _draw(axes: Axes, rows: pd.DataFrame, methods: Sequence[str], measure: Measu
         own = rows[rows["method"] == method]
         dodge = (_DODGE_NAMED if named else _DODGE) * spacing * (index - 0.5 * (len(methods) - 1))
         x = own["at"].map(at).to_numpy(float) + dodge
-        look = line_of(method)
+        look = _line_of(method)
         if measure.paired:
             axes.vlines(x, scale * own["low"], scale * own["high"], color=look["color"], alpha=0.35, lw=2.4, zorder=1)
         # That of the study, which comes first, above the others.
@@ -103,3 +144,18 @@ def _scale(axes: Axes, measure: Measure, panel: Panel) -> None:
         axes.axhline(0.0, color=GREY, lw=0.7, zorder=0)
     else:
         axes.set_ylim(0.0, 1.04 * axes.get_ylim()[1])
+
+
+def _line_of(method: str) -> dict[str, Any]:
+    """A method's line and markers, as arguments of `Axes.plot`; that of a study's first method is thicker."""
+    look = LOOKS.get(method) or _OTHERS[zlib.crc32(method.encode()) % len(_OTHERS)]
+    ours = look == _FIRST
+    line = {"color": look.colour, "ls": look.line, "lw": 2.0 if ours else 1.2}
+    size = _SIZES.get(look.marker, 4.4) * (1.2 if ours else 1.0)
+    return line | {"marker": look.marker, "ms": size, "markeredgecolor": "white", "mew": 0.4}
+
+
+def _draw_legend(figure: Figure, methods: Sequence[str]) -> None:
+    """The methods, at the right of a figure."""
+    handles = [Line2D([], [], label=method, **_line_of(method)) for method in methods]
+    figure.legend(handles=handles, loc="outside right center", frameon=False, fontsize=9, handlelength=2.6)
