@@ -137,7 +137,6 @@ def draw_on(
     still: Still,
     points: Float[np.ndarray, "n 3"],
     colours: Float[np.ndarray, "n channels"],
-    size: float = 2.5,
 ) -> None:
     """The points that a still's surface does not hide, over it, the nearest last."""
     axes.imshow(still.image, interpolation="antialiased", zorder=1)
@@ -145,7 +144,7 @@ def draw_on(
     depth = (points - np.asarray(still.pose.position)) @ np.asarray(still.pose.forward)
     order = np.argsort(-depth)
     order = order[in_front[order]]
-    axes.scatter(pixels[order, 0], pixels[order, 1], s=size, c=colours[order], linewidths=0, zorder=2)
+    axes.scatter(pixels[order, 0], pixels[order, 1], s=2.5, c=colours[order], linewidths=0, zorder=2)
     shown = np.argwhere(still.image[..., 3] > 0)
     middle, half = 0.5 * (shown.min(axis=0) + shown.max(axis=0)), 0.55 * np.ptp(shown, axis=0).max()
     axes.set(xlim=middle[1] + [-half, half], ylim=middle[0] + [half, -half])

@@ -340,8 +340,3 @@ def pose_record(pose: Pose) -> Record:
 
 # A method of one's own: the planner of a scene.
 Factory: TypeAlias = Callable[[Study, Scene], Planner]
-
-
-def views_of(run: Record) -> int:
-    """How many views a record of a method holds."""
-    return len(run["views"])

@@ -14,7 +14,6 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 
 from jaxnbv.studies.engine.measures import Record, methods_of
 from jaxnbv.studies.engine.pictures import Grid, draw_on, first_scenes, places, shows_from, still_of, write_grids
-from jaxnbv.studies.engine.study import views_of
 from jaxnbv.studies.heat.study import HeatStudy, Truth, heat_problem
 from jaxnbv.tasks import body_temperature
 from jaxnbv.viz.render import Still
@@ -56,7 +55,7 @@ def _clouds(record: Record, study: HeatStudy, methods: Sequence[str], pixels: in
     colours = ScalarMappable(Normalize(0.0, float(truth.temperatures.max())), _HEAT)
     runs = [record["methods"][method] for method in methods]
     seen = [study.seen(scene, run) for run in runs]
-    views = views_of(runs[0])
+    views = len(runs[0]["views"])
     counts = sorted({math.ceil(views / 3), math.ceil(2 * views / 3), views})
 
     def draw(axes: Axes, row: int, column: int) -> None:

@@ -16,7 +16,6 @@ from jaxnbv.scanning import TriangleMesh
 from jaxnbv.scanning.metrics import true_mesh
 from jaxnbv.studies.engine.measures import Record, methods_of
 from jaxnbv.studies.engine.pictures import Grid, draw_on, framed, places, shows_from, still_of, write_grids
-from jaxnbv.studies.engine.study import views_of
 from jaxnbv.studies.parts.discovery import TARGET, PartDiscoveryStudy
 from jaxnbv.viz.style import GREY
 
@@ -71,7 +70,7 @@ def _clouds(record: Record, study: PartDiscoveryStudy, methods: Sequence[str], p
     known = [study.seen(scene, run) for run in runs]
 
     def draw(axes: Axes, row: int, column: int) -> None:
-        if column > views_of(runs[row]) or (column == 0 and row > 0):
+        if column > len(runs[row]["views"]) or (column == 0 and row > 0):
             axes.axis("off")
         elif column == 0:
             draw_on(axes, still, points, colours[of])
@@ -86,7 +85,7 @@ def _clouds(record: Record, study: PartDiscoveryStudy, methods: Sequence[str], p
             text = f"{'✓ ' if every else ''}{found} of {len(asked)} parts"
             axes.set_xlabel(text, fontsize=9, color=_FOUND if every else GREY, fontweight="bold" if every else "normal")
 
-    columns = ["true parts", *(f"view {view + 1}" for view in range(max(map(views_of, runs))))]
+    columns = ["true parts", *(f"view {view + 1}" for view in range(max(len(run["views"]) for run in runs)))]
     marks = {name: {"marker": "o", "color": colour} for name, colour in zip(record["parts"], own, strict=True)}
     caption = f"Points: the part that the segmenter says. Beneath: parts with {TARGET} points. View 1 is given."
     title = f"Scene {record['scene']}: {scene.name}"
