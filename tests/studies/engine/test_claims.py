@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 from toy import ToyStudy
 
-from jaxnbv.studies.engine.claims import verdicts
 from jaxnbv.studies.engine.measures import Claim, Measure
+from jaxnbv.studies.engine.page import verdicts
 from jaxnbv.studies.registry import STUDIES
 
 
