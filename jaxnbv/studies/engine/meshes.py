@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+from abc import abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -47,14 +48,6 @@ def numbered(files: Sequence[_File], index: int) -> _File:
     return files[index]
 
 
-def numbered_mesh(files: Sequence[str], index: int) -> TriangleMesh:
-    """The mesh of a scene, of longest side 2.5.
-
-    **Raises:** `ValueError` if there is no mesh of this index, or it cannot be read.
-    """
-    return load_mesh(numbered(files, index))
-
-
 def knowing_meshes(imagination: Imagination, files: Sequence[str]) -> Imagination:
     """One that knows the meshes of a study, upright and of any proportions."""
     names = [f"{Path(file).stem[:_LONGEST]} {index}" for index, file in enumerate(files)]
@@ -96,6 +89,25 @@ class MeshStudy(Study):
     @property
     def num_scenes(self) -> int | None:
         return len(self.meshes) or None
+
+    def scene(self, index: int) -> Scene:
+        """An object; a mesh has a longest side of 2.5.
+
+        **Raises:** `ValueError` if there is no mesh of this index, or it cannot be read.
+        """
+        if not self.meshes:
+            return self.procedural(index)
+        file = numbered(self.meshes, index)
+        mesh = load_mesh(file)
+        return Scene(index, Path(file).name, mesh, self.task_of(mesh, index))
+
+    @abstractmethod
+    def procedural(self, index: int) -> Scene:
+        """A scene without meshes."""
+
+    def task_of(self, mesh: TriangleMesh, index: int) -> Any:
+        """The task of a scene of a mesh."""
+        return None
 
     def imagination_of(self, scene: Scene) -> Imagination:
         """Who has seen all meshes but that of the scene, or what the study knows."""

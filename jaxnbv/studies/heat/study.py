@@ -1,15 +1,15 @@
 """The study of heat: how near does the coldest point of the scanned cloud come to the object's?"""
 
+import functools
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 from scipy.spatial import cKDTree
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement
@@ -22,7 +22,7 @@ from jaxnbv.scanning import Evidence, Grid, GridSurface, SDFSurface, Surface, Tr
 from jaxnbv.scanning.sensors import HEAT_SETTING
 from jaxnbv.search import HalvingSearch, Proposal
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
-from jaxnbv.studies.engine.meshes import MeshStudy, numbered_mesh
+from jaxnbv.studies.engine.meshes import MeshStudy
 from jaxnbv.studies.engine.study import RULES, Chart, Panel, Scene
 from jaxnbv.studies.scenes import heat_scene
 from jaxnbv.tasks import ColdestPoint, Coverage, body_temperature
@@ -61,21 +61,6 @@ class Truth(NamedTuple):
         return self.points[self.temperatures <= low + _NEARLY * (high - low)]
 
 
-def _of_estimate(quantity: str, estimate: str) -> Callable[[Record, str], list[float]]:
-    def of(record: Record, method: str) -> list[float]:
-        return record["methods"][method]["estimates"][estimate][quantity]
-
-    return of
-
-
-def _error(estimate: str) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
-    def of(record: Record, method: str) -> Float[np.ndarray, " views"]:
-        found = record["methods"][method]["estimates"][estimate]["temperatures"]
-        return np.abs(np.array(found) - record["truth"]["temperature"])
-
-    return of
-
-
 def _saturated(record: Record, method: str) -> list[float | None]:
     """Whether every view had the value zero, for the methods that seek cold."""
     return [
@@ -104,11 +89,17 @@ def _measures(estimate: str) -> tuple[Measure, ...]:
         name, title = f"{name}, {estimate}", f"{title}:\n{ESTIMATES[estimate]}"
         return Measure(name, title, of, unit=unit, better="less", listed=listed)
 
-    near, point = (_of_estimate(quantity, estimate) for quantity in ("distances", "point_distances"))
+    def of(quantity: str, record: Record, method: str) -> list[float]:
+        return record["methods"][method]["estimates"][estimate][quantity]
+
+    def error(record: Record, method: str) -> Float[np.ndarray, " views"]:
+        return np.abs(np.array(of("temperatures", record, method)) - record["truth"]["temperature"])
+
+    near, point = functools.partial(of, "distances"), functools.partial(of, "point_distances")
     return (
         measure("distance", "Distance to the coldest points", near, "scene units"),
         measure("point distance", "Distance to the very coldest point", point, "scene units", listed=False),
-        measure("error", "Error of the lowest temperature", _error(estimate), "degrees"),
+        measure("error", "Error of the lowest temperature", error, "degrees"),
     )
 
 
@@ -160,17 +151,14 @@ class HeatStudy(MeshStudy):
     bank: ClassVar[str] = "heat"
     unknowing: ClassVar[tuple[str, ...]] = ("coverage", "uncertainty")
 
-    def scene(self, index: int) -> Scene:
-        """An object; its task is the point where it is heated.
+    def procedural(self, index: int) -> Scene:
+        made = heat_scene(index)
+        return Scene(index, made.name, made.surface, made.source)
 
-        **Raises:** `ValueError` if there is no mesh of this index, or it cannot be read.
-        """
-        if not self.meshes:
-            made = heat_scene(index)
-            return Scene(index, made.name, made.surface, made.source)
-        mesh = numbered_mesh(self.meshes, index)
+    def task_of(self, mesh: TriangleMesh, index: int) -> Float[Array, "3"]:
+        """The point where it is heated."""
         (source,) = mesh.sample_points(self.key(index, "scene"), 1)
-        return Scene(index, Path(self.meshes[index]).name, mesh, jnp.asarray(source, jnp.result_type(float)))
+        return jnp.asarray(source, jnp.result_type(float))
 
     def planner(self, method: str, scene: Scene) -> Planner:
         search = HalvingSearch(self.candidates) if method == "heat-halving" else self.search(method)

@@ -1,7 +1,6 @@
 """The study of reconstruction: how near is the surface that a method's views give to the true one?"""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,7 +15,7 @@ from jaxnbv.scanning import Evidence, SDFSurface, TriangleMesh
 from jaxnbv.scanning.metrics import SURFACE_POINTS, coverage, surface_distance, truth_points
 from jaxnbv.scanning.screened_poisson import has_poisson, screened_poisson
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
-from jaxnbv.studies.engine.meshes import MeshStudy, numbered_mesh
+from jaxnbv.studies.engine.meshes import MeshStudy
 from jaxnbv.studies.engine.study import RULES, Chart, Panel, Scene
 from jaxnbv.studies.scenes import Split
 from jaxnbv.studies.scenes.parts import part_scene
@@ -26,16 +25,12 @@ POISSON, MEAN = "screened Poisson", "posterior mean"
 RECONSTRUCTIONS = (POISSON, MEAN)
 
 
-def _distance(quantity: str) -> Callable[[Record, str], list[float | None]]:
+def _distances(name: str, title: str) -> Measure:
     def of(record: Record, method: str) -> list[float | None]:
         found = record["methods"][method]["reconstructions"]
-        return [None if found[name] is None else found[name][quantity] for name in RECONSTRUCTIONS]
+        return [None if found[one] is None else found[one][name] for one in RECONSTRUCTIONS]
 
-    return of
-
-
-def _distances(name: str, title: str) -> Measure:
-    return Measure(name, title, _distance(name), RECONSTRUCTIONS, "reconstruction", unit="scene units", better="less")
+    return Measure(name, title, of, RECONSTRUCTIONS, "reconstruction", unit="scene units", better="less")
 
 
 class ReconstructionStudy(MeshStudy):
@@ -77,14 +72,7 @@ class ReconstructionStudy(MeshStudy):
     seed: ClassVar[int] = 4
     quick: ClassVar[Mapping[str, Any]] = {**MeshStudy.quick, "num_candidates": 40}
 
-    def scene(self, index: int) -> Scene:
-        """An object of longest side 2.5.
-
-        **Raises:** `ValueError` if there is no mesh of this index, or it cannot be read.
-        """
-        if self.meshes:
-            mesh = numbered_mesh(self.meshes, index)
-            return Scene(index, Path(self.meshes[index]).name, mesh)
+    def procedural(self, index: int) -> Scene:
         made = part_scene(Split.TEST, index)
         return Scene(index, f"{CATEGORIES[int(made.category)].name} {index}", SDFSurface(made.solid))
 
