@@ -1,5 +1,6 @@
 """What the methods of one scene have in common, computed once: evidence, answers, and scores of the same scans."""
 
+import functools
 from collections.abc import Mapping
 from typing import ClassVar
 
@@ -29,26 +30,17 @@ class Shared:
 
     def __init__(self, planner: Planner, classifier: Classifier, poses: Pose, scans: PointCloud):
         self.planner, self.classifier, self.poses, self.scans = planner, classifier, poses, scans
-        self._evidence: dict[tuple[int, ...], Evidence] = {}
-        self._answers: dict[tuple[int, ...], Float[np.ndarray, " classes"]] = {}
+        self.evidence, self.answer = functools.cache(self._evidence), functools.cache(self._answer)
 
-    def evidence(self, visited: tuple[int, ...]) -> Evidence:
+    def _evidence(self, visited: tuple[int, ...]) -> Evidence:
         """After the views of these candidates."""
-        if visited not in self._evidence:
-            *before, last = visited
-            pose, seen = self.poses[last], self.scans[last]
-            self._evidence[visited] = (
-                self.planner.observe(self.evidence(tuple(before)), pose, seen)
-                if before
-                else self.planner.init(pose, seen)
-            )
-        return self._evidence[visited]
+        *before, last = visited
+        pose, seen = self.poses[last], self.scans[last]
+        return self.planner.observe(self.evidence((*before,)), pose, seen) if before else self.planner.init(pose, seen)
 
-    def answer(self, visited: tuple[int, ...]) -> Float[np.ndarray, " classes"]:
+    def _answer(self, visited: tuple[int, ...]) -> Float[np.ndarray, " classes"]:
         """log p after the views of these candidates."""
-        if visited not in self._answers:
-            self._answers[visited] = np.asarray(classify(self.classifier, self.evidence(visited).cloud))
-        return self._answers[visited]
+        return np.asarray(classify(self.classifier, self.evidence(visited).cloud))
 
     def second_answers(self, first: int) -> Float[np.ndarray, "candidates classes"]:
         """log p after the first view and each of the candidates."""

@@ -265,7 +265,11 @@ class ClassificationStudy(Study):
         sample_key, search_key, _ = view_keys(self.key(scene.index, "episode"), view)
         new = ~np.isin(np.arange(self.num_candidates), visited)
         found: dict[str, tuple[int, Record]] = {}
-        for group in _alike(planners):
+        # Those that imagine alike together: the study's own, and those that know no shapes.
+        for unknowing in (False, True):
+            group = {name: one for name, one in planners.items() if name.endswith(UNKNOWING) is unknowing}
+            if not group:
+                continue
             surfaces, rough = None, None
             if any(planner.search.uses_samples for planner in group.values()):
                 imagination = next(iter(group.values())).imagination
@@ -310,13 +314,6 @@ class ClassificationStudy(Study):
     def _shown(self, pixels: Any) -> Record:
         """How many rays of each view hit the cue of the class, where that is a part of the object."""
         return {f"{self.cue}_pixels": np.asarray(pixels).tolist()} if self.cue else {}
-
-
-def _alike(planners: Mapping[str, Planner]) -> list[dict[str, Planner]]:
-    """Those that imagine alike together: the study's own, and those that know no shapes."""
-    ways = (False, True)
-    groups = [{name: one for name, one in planners.items() if name.endswith(UNKNOWING) is way} for way in ways]
-    return [group for group in groups if group]
 
 
 @eqx.filter_jit
