@@ -21,7 +21,7 @@ def write_tables(records: Sequence[Record], study: type[Study], folder: str | Pa
     """
     folder, found = make_folder(folder), results(records, study)
     texts = {
-        "results.txt": _text(records, study, found),
+        "results.txt": summary(records, study, found=found),
         "results.csv": found.means.round(6).to_csv(index=False),
         "differences.csv": found.differences.round(6).to_csv(index=False),
     }
@@ -30,17 +30,15 @@ def write_tables(records: Sequence[Record], study: type[Study], folder: str | Pa
     return [folder / name for name in texts]
 
 
-def summary(records: Sequence[Record], study: type[Study], groups: bool = True) -> str:
+def summary(records: Sequence[Record], study: type[Study], groups: bool = True, found: Results | None = None) -> str:
     """A study as text: its measures by method, and differences to its reference.
 
     - `groups`: of each group of its scenes; otherwise of all of them alone.
+    - `found`: the results, where they are known.
 
     **Raises:** as `results`.
     """
-    return _text(records, study, results(records, study), groups)
-
-
-def _text(records: Sequence[Record], study: type[Study], found: Results, groups: bool = True) -> str:
+    found = found or results(records, study)
     sections = [
         _underlined(f"{study.title}: {count_of(len(records), 'scene')}"),
         f"{study.explanation}\n"
