@@ -25,6 +25,7 @@ from jaxnbv.scanning import Evidence, Grid, GridSurface, SDFSurface, Surface, Tr
 from jaxnbv.studies.engine.diagnostics import rank_correlation
 
 BINS = 10
+_scan = eqx.filter_jit(scan)
 
 
 class Truth(eqx.Module):
@@ -84,14 +85,14 @@ class Judgement(NamedTuple):
     """
 
     crps: float
-    brier: float | None
-    fair_brier: float | None
-    mean_inside: float | None
-    true_inside: float | None
-    reliability: Reliability | None
-    in_empty: float | None
-    rank: float | None
-    share_of_best: float | None
+    brier: float | None = None
+    fair_brier: float | None = None
+    mean_inside: float | None = None
+    true_inside: float | None = None
+    reliability: Reliability | None = None
+    in_empty: float | None = None
+    rank: float | None = None
+    share_of_best: float | None = None
 
 
 def judge(
@@ -115,18 +116,13 @@ def judge(
     crps_depth, in_empty, inside, expected, true_values = (np.asarray(leaf) for leaf in judged)
     record = Judgement(
         crps=float(crps_depth),
-        brier=None,
-        fair_brier=None,
-        mean_inside=None,
-        true_inside=None,
-        reliability=None,
         in_empty=None if np.isnan(in_empty) else float(in_empty),
         rank=rank_correlation(expected, true_values, np.ones(len(true_values), bool)),
         share_of_best=share_of_best(expected, true_values),
     )
     if not bool(truth.inside.any()):
         return record
-    unseen = np.asarray(_unseen(truth.volume, planner.imagination.grid, seen_empty))
+    unseen = np.asarray((_over_nodes(truth.volume, planner.imagination.grid) <= 0) & ~seen_empty)
     forecast, happened = inside[unseen], np.asarray(truth.inside)[unseen]
     plain = brier(forecast, happened)
     return record._replace(
@@ -244,21 +240,12 @@ def _judge(
     return error, share, inside, expected, true_values
 
 
-@eqx.filter_jit
-def _scan(scene: Surface, camera: Camera, poses: Pose) -> PointCloud:
-    return scan(scene, camera, poses)
-
-
 def _inside(scene: Surface, grid: Grid) -> Bool[Array, "g g g"]:
     if isinstance(scene, TriangleMesh):
         return scene.to_signed_distance(grid) < 0
     if isinstance(scene, SDFSurface):
         return _over_nodes(scene.sdf, grid) < 0
     raise InputError(f"the inside of a {type(scene).__name__} is not known: give an SDFSurface or a TriangleMesh")
-
-
-def _unseen(volume: Box, grid: Grid, seen_empty: Bool[Array, "g g g"]) -> Bool[Array, "g g g"]:
-    return (_over_nodes(volume, grid) <= 0) & ~seen_empty
 
 
 @eqx.filter_jit
