@@ -58,8 +58,7 @@ class PyramidStudy(ClassificationStudy):
             enough = [self.shows_enough(scene, scans[index]) for index in range(self.num_candidates)]
             require(
                 any(enough),
-                f"the classifier is right after all {self.num_candidates} candidates of {scene.name}: give more, or "
-                "ask for --first any",
+                f"the classifier is right after all {self.num_candidates} candidates of {scene.name}: {self.remedy}",
             )
             pixels = np.where(enough, pixels, 1)
         return choose_hidden(pixels, scans, self.key(scene.index, "first"))

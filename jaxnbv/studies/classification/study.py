@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Key
 
-from jaxnbv.checks import InputError, require
+from jaxnbv.checks import require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale, pretrained_classifier
@@ -196,16 +196,10 @@ class ClassificationStudy(Study):
             return shows
         return int(classify(self.classifier, seen).argmax()) != scene.task.label
 
-    def first_view(self, scene: Scene) -> int:
-        """A random one of the candidates that show enough.
-
-        **Raises:** `ValueError` if there is none.
-        """
-        try:
-            return super().first_view(scene)
-        except InputError as error:
-            remedy = "" if self.first is FirstView.ANY else ", or ask for --first any"
-            raise InputError(f"{error}{remedy}") from error
+    @property
+    def remedy(self) -> str:
+        """Where `first` asks for more, to ask for less."""
+        return super().remedy + ("" if self.first is FirstView.ANY else ", or ask for --first any")
 
     def planner(self, method: str, scene: Scene) -> Planner:
         classifier, candidates = self.imagining or self.classifier, self.candidates

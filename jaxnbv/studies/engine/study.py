@@ -213,6 +213,11 @@ class Study(eqx.Module):
         return found
 
     @property
+    def remedy(self) -> str:
+        """What to do where no candidate can be the first one."""
+        return "give more"
+
+    @property
     def candidates(self) -> Candidates:
         """Where the sensor can stand."""
         return SphereCandidates(self.num_candidates, self.radius)
@@ -315,7 +320,7 @@ class Study(eqx.Module):
         for candidate in jax.random.permutation(self.key(scene.index, "first"), self.num_candidates).tolist():
             if self.shows_enough(scene, sensor(poses[candidate], noise_key)):
                 return candidate
-        raise InputError(f"none of {self.num_candidates} candidates shows enough of {scene.name}: give more")
+        raise InputError(f"none of {self.num_candidates} candidates shows enough of {scene.name}: {self.remedy}")
 
     def seen(self, scene: Scene, run: Record) -> list[tuple[PointCloud, Evidence]]:
         """Each scan of a method, and the evidence after it, made again from the poses of its record."""
