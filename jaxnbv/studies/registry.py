@@ -30,49 +30,40 @@ def flag(option: str) -> str:
     return "FOLDER" if option == "folder" else f"--{option}"
 
 
+def _of_classes(
+    study: str,
+    question: str,
+    settings: str = "48 candidates, 16 samples on a 64^3 grid, and 512 points for the classifier of imagined scans: "
+    "fewer candidates and a coarser grid than the paper's.",
+    own: str = "meshes",
+) -> Entry:
+    """A study of classification, with one option of its own."""
+    pictures, options = "jaxnbv.studies.classification.pictures:write_pictures", (own, "classifier", "first")
+    return Entry(study, question, settings, scenes=100, views=5, pictures=pictures, options=options)
+
+
 STUDIES = {
-    "pyramid": Entry(
+    "pyramid": _of_classes(
         "jaxnbv.studies.classification.pyramid:PyramidStudy",
         "Which methods find the pattern on a pyramid's base, and how soon is its class known?",
-        "48 candidates, 16 samples on a 64^3 grid, and 512 points for the classifier of imagined scans: fewer "
-        "candidates and a coarser grid than the paper's.",
-        scenes=100,
-        views=5,
-        pictures="jaxnbv.studies.classification.pictures:write_pictures",
-        options=("framing", "classifier", "first"),
+        own="framing",
     ),
-    "truck": Entry(
+    "truck": _of_classes(
         "jaxnbv.studies.classification.truck:TruckStudy",
         "How soon is the class of a truck's cargo known, which most views do not show? The paper's Truck-ModelNet10, "
         "on procedural trucks and cargo, or on meshes: a folder `trucks`, and folders of the classes' names.",
         "48 candidates, 16 samples on a 64^3 grid, 1,024 points of what was seen beside an imagined scan and 2,048 of "
         "what was seen alone: fewer candidates and a coarser grid than the paper's.",
-        scenes=100,
-        views=5,
-        pictures="jaxnbv.studies.classification.pictures:write_pictures",
-        options=("meshes", "classifier", "first"),
     ),
-    "modelnet10": Entry(
+    "modelnet10": _of_classes(
         "jaxnbv.studies.classification.whole:ModelNet10Study",
         "Do all methods tell classes alike that differ in global shape? The paper's ModelNet10, on procedural objects, "
         "or on meshes in folders of the classes' names.",
-        "48 candidates, 16 samples on a 64^3 grid, and 512 points for the classifier of imagined scans: fewer "
-        "candidates and a coarser grid than the paper's.",
-        scenes=100,
-        views=5,
-        pictures="jaxnbv.studies.classification.pictures:write_pictures",
-        options=("meshes", "classifier", "first"),
     ),
-    "omniobject3d": Entry(
+    "omniobject3d": _of_classes(
         "jaxnbv.studies.classification.whole:OmniObject3DStudy",
         "How soon are fruits told that differ in what is small? The paper's OmniObject3D, on procedural fruits, or on "
         "meshes in folders of the classes' names.",
-        "48 candidates, 16 samples on a 64^3 grid, and 512 points for the classifier of imagined scans: fewer "
-        "candidates and a coarser grid than the paper's.",
-        scenes=100,
-        views=5,
-        pictures="jaxnbv.studies.classification.pictures:write_pictures",
-        options=("meshes", "classifier", "first"),
     ),
     "parts": Entry(
         "jaxnbv.studies.parts.study:PartStudy",
