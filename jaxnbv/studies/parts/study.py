@@ -1,6 +1,10 @@
-"""The study of semantic parts: how many views until all parts of an object are found? The paper's Table 1."""
+"""The studies of semantic parts: how many views until all parts of an object are found? The paper's Table 1.
+
+Objects are procedural and a network tells their parts, or they are mesh files whose nodes are parts and an oracle does.
+"""
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -8,16 +12,124 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxnbv.checks import require
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.imagination import Imagination
 from jaxnbv.networks import CATEGORIES, CloudSegmenter, part_segmenter
-from jaxnbv.scanning import SDFSurface
-from jaxnbv.studies.engine.measures import Record
+from jaxnbv.scanning import Grid, MeshParts, SDFSurface, load_parts, scan
+from jaxnbv.scanning.mesh_files import read_nodes
+from jaxnbv.studies.engine.measures import KNOWN, Record
+from jaxnbv.studies.engine.meshes import knowing_meshes, knowing_others, numbered
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.parts.discovery import PartDiscoveryStudy
-from jaxnbv.studies.parts.meshes import MeshPartStudy
+from jaxnbv.studies.parts.discovery import NETWORK_POINTS, TARGETS, PartDiscoveryStudy
+from jaxnbv.studies.parts.nearest import NearestPart
+from jaxnbv.studies.readers.class_meshes import is_mesh_file, taking_turns
 from jaxnbv.studies.scenes import Split, part_scene
 from jaxnbv.surfaces import KnownShapes
 from jaxnbv.surfaces.known_shapes import kind_of
+from jaxnbv.tasks import part_counts
+
+# Where distances from the parts are known: the object's longest side is 2.5.
+_GRID = Grid(64, 1.4)
+
+
+class PartMesh(eqx.Module):
+    """A mesh and what tells its parts apart."""
+
+    parts: MeshParts
+    oracle: NearestPart
+
+
+class MeshPartStudy(PartDiscoveryStudy):
+    """The parts of real objects, told by `NearestPart`, so that planning is seen without the network's errors. Settings
+    as of `PartDiscoveryStudy`, and
+
+    - `meshes`: files whose nodes are parts, and how many each has.
+
+    The planner is asked for all parts. It is measured on those that can be found: of which all candidates together show
+    as many points as the largest N_target asks.
+    """
+
+    explanation: ClassVar[str] = (
+        f"{PartDiscoveryStudy.explanation}\nAn oracle gives each point to the nearest part; asked is for those of "
+        f"which\nall candidates together show {max(TARGETS)} points of {NETWORK_POINTS}."
+    )
+    seed: ClassVar[int] = 12
+
+    meshes: tuple[tuple[str, int], ...] = eqx.field(static=True, kw_only=True)
+
+    @classmethod
+    def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
+        """
+        - `meshes`: a folder, see `part_files`. By the model `known` each object is planned by who has seen all others.
+
+        **Raises:** `ValueError` as `part_files` does.
+        """
+        files = part_files(options["meshes"])
+        plain = cls.imagined("screened" if model == KNOWN else model, quick=quick)
+        imagination = knowing_meshes(plain, [file for file, _ in files]) if model == KNOWN else plain
+        given = options | {"meshes": files, "imagination": imagination}
+        return super().configured("screened", views, quick, **given)
+
+    def imagination_of(self, scene: Scene) -> Imagination:
+        """Who has seen all objects but this one."""
+        return knowing_others(self.imagination, scene.index)
+
+    @property
+    def num_scenes(self) -> int | None:
+        return len(self.meshes)
+
+    def scene(self, index: int) -> Scene:
+        """An object; its task is the `PartMesh`.
+
+        **Raises:** `ValueError` if there is no mesh of this index, or it cannot be read.
+        """
+        file = Path(numbered(self.meshes, index)[0])
+        parts = load_parts(file)
+        room = max(count for _, count in self.meshes)
+        oracle = NearestPart.of(parts, room, _GRID, NETWORK_POINTS)
+        return Scene(index, f"{file.parent.name} {file.stem}", parts.mesh, PartMesh(parts, oracle))
+
+    def segmenter_of(self, scene: Scene, num_points: int | None = None) -> NearestPart:
+        """The oracle."""
+        oracle = scene.task.oracle
+        return NearestPart(oracle.distances, oracle.grid, num_points or oracle.num_points)
+
+    def true_parts(self, scene: Scene, points: Float[Array, "n 3"]) -> Int[Array, " n"]:
+        return scene.task.oracle.nearest(points)
+
+    def truth(self, scene: Scene) -> list[int]:
+        """The parts that can be found."""
+        camera = Camera(height=self.imagined_rays, width=self.imagined_rays)
+        seen = scan(scene.surface, camera, self.candidates.poses())
+        joined = PointCloud(seen.points.reshape(-1, 3), seen.normals.reshape(-1, 3), seen.mask.reshape(-1))
+        counts = part_counts(scene.task.oracle(joined))
+        found = [int(part) for part in np.flatnonzero(np.asarray(counts) >= max(TARGETS))]
+        require(len(found) > 0, f"{scene.name} has no part that shows {max(TARGETS)} points: leave it out")
+        return found
+
+    def facts(self, scene: Scene, truth: list[int], first: int) -> Record:
+        names = scene.task.parts.names
+        category = Path(self.meshes[scene.index][0]).parent.name
+        return {"name": scene.name, "category": category, "parts": [names[part] for part in truth], "of": len(names)}
+
+
+def part_files(folder: str | Path) -> tuple[tuple[str, int], ...]:
+    """The mesh files in a folder, or in the folders in it, that have two nodes or more, and how many; classes take
+    turns.
+
+    **Raises:** `ValueError` if there is no such folder, or no such mesh, or one cannot be read.
+    """
+    folder = Path(folder)
+    require(os.path.isdir(folder), f"there is no folder {folder}: give one that holds mesh files")
+    by_class: dict[Path, list[tuple[str, int]]] = {}
+    for file in sorted(path for path in folder.rglob("*") if is_mesh_file(path)):
+        count = len(read_nodes(file))
+        if count > 1:
+            by_class.setdefault(file.parent, []).append((str(file), count))
+    require(len(by_class) > 0, f"the folder {folder} holds no mesh of two nodes or more: each part must be a node")
+    return tuple(taking_turns(by_class.values()))
 
 
 class PartStudy(PartDiscoveryStudy):

@@ -12,9 +12,8 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.imagination import Imagination
 from jaxnbv.scanning import Grid, load_parts
 from jaxnbv.studies.parts import pictures
-from jaxnbv.studies.parts.meshes import MeshPartStudy, part_files
 from jaxnbv.studies.parts.nearest import NearestPart
-from jaxnbv.studies.parts.study import PartStudy
+from jaxnbv.studies.parts.study import MeshPartStudy, PartStudy, part_files
 from jaxnbv.surfaces import GeometricSPSR
 
 # Scene coordinates: the longest side is 2.5 and the box around all is centred. What is hidden stands within the post.
