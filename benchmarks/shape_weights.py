@@ -18,10 +18,8 @@ from tqdm import tqdm
 
 from jaxnbv.planning.episode import view_keys
 from jaxnbv.storage.files import write_whole
-from jaxnbv.studies.classification.pyramid import PyramidStudy
+from jaxnbv.studies.classification.objects import ModelNet10Study, OmniObject3DStudy, PyramidStudy, TruckStudy
 from jaxnbv.studies.classification.study import ClassificationStudy
-from jaxnbv.studies.classification.truck import TruckStudy
-from jaxnbv.studies.classification.whole import ModelNet10Study, OmniObject3DStudy
 from jaxnbv.studies.engine.measures import KNOWN
 from jaxnbv.studies.scenes import Framing, Split
 from jaxnbv.studies.training import expected_calibration_error

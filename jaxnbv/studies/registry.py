@@ -44,24 +44,24 @@ def _of_classes(
 
 STUDIES = {
     "pyramid": _of_classes(
-        "jaxnbv.studies.classification.pyramid:PyramidStudy",
+        "jaxnbv.studies.classification.objects:PyramidStudy",
         "Which methods find the pattern on a pyramid's base, and how soon is its class known?",
         own="framing",
     ),
     "truck": _of_classes(
-        "jaxnbv.studies.classification.truck:TruckStudy",
+        "jaxnbv.studies.classification.objects:TruckStudy",
         "How soon is the class of a truck's cargo known, which most views do not show? The paper's Truck-ModelNet10, "
         "on procedural trucks and cargo, or on meshes: a folder `trucks`, and folders of the classes' names.",
         "48 candidates, 16 samples on a 64^3 grid, 1,024 points of what was seen beside an imagined scan and 2,048 of "
         "what was seen alone: fewer candidates and a coarser grid than the paper's.",
     ),
     "modelnet10": _of_classes(
-        "jaxnbv.studies.classification.whole:ModelNet10Study",
+        "jaxnbv.studies.classification.objects:ModelNet10Study",
         "Do all methods tell classes alike that differ in global shape? The paper's ModelNet10, on procedural objects, "
         "or on meshes in folders of the classes' names.",
     ),
     "omniobject3d": _of_classes(
-        "jaxnbv.studies.classification.whole:OmniObject3DStudy",
+        "jaxnbv.studies.classification.objects:OmniObject3DStudy",
         "How soon are fruits told that differ in what is small? The paper's OmniObject3D, on procedural fruits, or on "
         "meshes in folders of the classes' names.",
     ),

@@ -22,9 +22,8 @@ from jaxnbv.search import (
     SpherePoses,
 )
 from jaxnbv.studies.classification.measures import hits, seen_explained
-from jaxnbv.studies.classification.pyramid import PyramidStudy
+from jaxnbv.studies.classification.objects import PyramidStudy, TruckStudy
 from jaxnbv.studies.classification.study import ClassificationStudy, Truth
-from jaxnbv.studies.classification.truck import TruckStudy
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.study import Chart, Panel, Scene, Study
 from jaxnbv.tasks import CrossEntropy

@@ -18,10 +18,8 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.imagination import Imagination
 from jaxnbv.networks import InvariantClassifier, save_checkpoint
 from jaxnbv.search import FarthestView, SphereCandidates
+from jaxnbv.studies.classification.objects import ModelNet10Study, OmniObject3DStudy, PyramidStudy, TruckStudy
 from jaxnbv.studies.classification.pictures import write_pictures
-from jaxnbv.studies.classification.pyramid import PyramidStudy
-from jaxnbv.studies.classification.truck import TruckStudy
-from jaxnbv.studies.classification.whole import ModelNet10Study, OmniObject3DStudy
 from jaxnbv.studies.engine.charts import write_charts
 from jaxnbv.studies.engine.measures import values
 from jaxnbv.studies.engine.tables import summary, write_tables

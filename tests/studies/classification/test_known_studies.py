@@ -11,7 +11,7 @@ from test_pyramid_study import CAMERA, SCENE, evidence_of, small_study, step_key
 import jaxnbv as nbv
 from jaxnbv.cli.registry import STUDY_MODELS, resolve
 from jaxnbv.imagination import MODELS
-from jaxnbv.studies.classification.pyramid import PyramidStudy
+from jaxnbv.studies.classification.objects import PyramidStudy
 from jaxnbv.studies.engine.measures import KNOWN
 from jaxnbv.studies.engine.meshes import knowing_meshes, knowing_others
 from jaxnbv.studies.heat.study import HeatStudy

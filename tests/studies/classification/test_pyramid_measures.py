@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxnbv.studies.classification.pyramid import PyramidStudy
+from jaxnbv.studies.classification.objects import PyramidStudy
 from jaxnbv.studies.engine.charts import write_charts
 from jaxnbv.studies.engine.measures import values
 from jaxnbv.studies.engine.results import means

@@ -17,8 +17,8 @@ from jaxnbv.geometry.cloud import concatenate, limit_capacity
 from jaxnbv.imagination import Imagination
 from jaxnbv.scanning import scan
 from jaxnbv.search import FarthestView, SphereCandidates
+from jaxnbv.studies.classification.objects import PyramidStudy
 from jaxnbv.studies.classification.pictures import write_pictures
-from jaxnbv.studies.classification.pyramid import PyramidStudy
 from jaxnbv.studies.classification.shared import propose_together
 from jaxnbv.studies.scenes import Framing, Pyramid, Split, pyramid_scene
 from jaxnbv.studies.scenes.class_object import scan_cue

@@ -8,7 +8,7 @@ import trimesh
 
 from jaxnbv.checks import InputError
 from jaxnbv.scanning import TriangleMesh, scan
-from jaxnbv.studies.classification.truck import TruckStudy
+from jaxnbv.studies.classification.objects import TruckStudy
 from jaxnbv.studies.scenes.truck_meshes import bed_of, loaded_truck
 
 # Longest side 2.5 and centred: scene coordinates are these. The bed's room: x -1.15 to 0.35, y -0.2 to 0.5, z -0.45 to

@@ -1,0 +1,146 @@
+"""The studies of classes by what their objects are: which methods' views tell the class, and how soon?
+
+Of a pyramid its base has a pattern. Of a loaded truck the outside is most of what can be seen, and says nothing of the
+cargo. Of household objects, the paper's sanity check, and of fruits, from its supplement, all tells the class.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import equinox as eqx
+import numpy as np
+
+from jaxnbv.checks import require
+from jaxnbv.scanning import load_mesh
+from jaxnbv.studies.classification.measures import HITS_EXPLAINED, charts_of, hits_and_diagnostics, seen_explained
+from jaxnbv.studies.classification.study import BASELINES, ClassificationStudy, Truth
+from jaxnbv.studies.engine.measures import Claim, Measure, Record
+from jaxnbv.studies.engine.meshes import mesh_files
+from jaxnbv.studies.engine.study import Chart, Scene, Study
+from jaxnbv.studies.readers import MeshFile
+from jaxnbv.studies.scenes import CLASS_SETS, ClassSet, FirstView, Framing, Pyramid
+from jaxnbv.studies.scenes.class_object import ClassMesh, choose_hidden
+from jaxnbv.studies.scenes.splits import scene_key
+from jaxnbv.studies.scenes.truck_meshes import loaded_truck
+
+# Of the cameras from which the pattern cannot be seen two fifths lie in each of the first two, a fifth in the last.
+_ANGLES = {"under 110": (0.0, 110.0), "110-140": (110.0, 140.0), "140-180": (140.0, 180.1)}
+
+
+class PyramidStudy(ClassificationStudy):
+    """The class of a pyramid whose pattern the first view does not show. Settings as of `ClassificationStudy`."""
+
+    title: ClassVar[str] = "The class of a pyramid"
+    explanation: ClassVar[str] = (
+        f"{HITS_EXPLAINED}{seen_explained('pattern')}\n"
+        "Diagnostics are by the view being chosen, in ( ) their scenes. Angles are of the first view from the base's "
+        "normal."
+    )
+    objects: ClassVar[ClassSet] = CLASS_SETS["pyramid"]
+    cue: ClassVar[str] = "pattern"
+    network: ClassVar[str] = "pyramid"
+    framings: ClassVar[tuple[Framing, ...]] = tuple(Framing)
+    solid: ClassVar[bool] = True
+    bank: ClassVar[str] = "pyramid"
+    measures: ClassVar[tuple[Measure, ...]] = hits_and_diagnostics(cue)
+    charts: ClassVar[Mapping[str, Chart]] = charts_of(cue, "angles")
+    seed: ClassVar[int] = 2
+
+    @classmethod
+    def groups(cls, records: Sequence[Record]) -> dict[str, list[Record]]:
+        """All, and those in each bin of the first view's angle; no bin is empty."""
+        bins = {name: [r for r in records if low <= r["angle"] < high] for name, (low, high) in _ANGLES.items()}
+        return {"all": list(records)} | {f"first view at {name}°": of for name, of in bins.items() if of}
+
+    def facts(self, scene: Scene, truth: Truth, first: int) -> Record:
+        """With the first view's angle from the base's normal, in degrees: at 180 it looks from behind the apex."""
+        direction = np.asarray(self.candidates.poses().position[first])
+        # The base looks along -z of the pyramid's own frame.
+        assert isinstance(truth.thing, Pyramid)
+        outward = -np.asarray(truth.thing.rotation)[:, 2]
+        cosine = np.clip(direction @ outward / np.linalg.norm(direction), -1.0, 1.0)
+        return super().facts(scene, truth, first) | {"angle": float(np.degrees(np.arccos(cosine)))}
+
+    def first_view(self, scene: Scene) -> int:
+        """A random one of the candidates that do not show the pattern, but something, as `first` asks."""
+        pixels, scans = scene.task.pixels, scene.task.scans
+        if self.first is not FirstView.ANY:
+            enough = [self.shows_enough(scene, scans[index]) for index in range(self.num_candidates)]
+            require(
+                any(enough),
+                f"the classifier is right after all {self.num_candidates} candidates of {scene.name}: {self.remedy}",
+            )
+            pixels = np.where(enough, pixels, 1)
+        return choose_hidden(pixels, scans, self.key(scene.index, "first"))
+
+
+class TruckStudy(ClassificationStudy):
+    """The class of a truck's cargo, from a random first view. Settings as of `ClassificationStudy`, and
+
+    - `trucks`: files of trucks that carry what `meshes` names.
+    """
+
+    title: ClassVar[str] = "The class of a truck's cargo"
+    explanation: ClassVar[str] = (
+        f"{HITS_EXPLAINED}{seen_explained('cargo')}\nDiagnostics are by the view being chosen, in ( ) their scenes."
+    )
+    objects: ClassVar[ClassSet] = CLASS_SETS["truck"]
+    cue: ClassVar[str] = "cargo"
+    bank: ClassVar[str] = "truck"
+    network: ClassVar[str] = "truck"
+    fed: ClassVar[tuple[int, int]] = (2048, 1024)
+    measures: ClassVar[tuple[Measure, ...]] = hits_and_diagnostics(cue)
+    charts: ClassVar[Mapping[str, Chart]] = charts_of(cue, "first_views")
+    seed: ClassVar[int] = 11
+
+    num_points: int = eqx.field(static=True, default=1024)
+    trucks: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def __check_init__(self):
+        require(
+            bool(self.trucks) == bool(self.meshes),
+            f"{len(self.meshes)} meshes of cargo and {len(self.trucks)} of trucks: give both, or none",
+        )
+
+    @classmethod
+    def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
+        """
+        - `meshes`: a folder with a folder `trucks` of meshes, and those of the cargo's classes, see `class_meshes`.
+
+        **Raises:** `ValueError` as of a `ClassificationStudy`, or if there is no truck.
+        """
+        if "meshes" in options:
+            options["trucks"] = mesh_files(Path(options["meshes"]) / "trucks")
+        return super().configured(model, views, quick, **options)
+
+    def of_mesh(self, file: MeshFile, index: int) -> ClassMesh:
+        """The cargo on the bed of one of the trucks, which take turns."""
+        truck = load_mesh(self.trucks[index % len(self.trucks)])
+        return loaded_truck(truck, file.read(), file.label, scene_key(self.seed, self.split, index))
+
+
+class ModelNet10Study(ClassificationStudy):
+    """The class of a household object, one of ten that are told by their global shape, for which any views will do;
+    from a random first view. Settings as of `ClassificationStudy`."""
+
+    title: ClassVar[str] = "The class of a household object"
+    objects: ClassVar[ClassSet] = CLASS_SETS["household"]
+    network: ClassVar[str] = "household"
+    bank: ClassVar[str] = "household"
+    seed: ClassVar[int] = 12
+    claims: ClassVar[tuple[Claim, ...]] = (
+        Claim("Where global features tell the class, cross-entropy is as good.", "first", 2, BASELINES, ahead=False),
+    )
+
+
+class OmniObject3DStudy(ClassificationStudy):
+    """The class of a fruit, which is told by what is small on it, from a random first view. Settings as of
+    `ClassificationStudy`."""
+
+    title: ClassVar[str] = "The class of a fruit"
+    objects: ClassVar[ClassSet] = CLASS_SETS["fruit"]
+    network: ClassVar[str] = "fruit"
+    bank: ClassVar[str] = "fruit"
+    solid: ClassVar[bool] = True
+    seed: ClassVar[int] = 14
