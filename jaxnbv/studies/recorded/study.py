@@ -107,6 +107,14 @@ class MostNewVoxels(Rule):
         return gain.astype(candidates.position.dtype)
 
 
+def _gains(record: Record, method: str) -> list[float | None]:
+    """What views after the first added, as a share of what the oracle's have added by then."""
+    if ORACLE not in record["methods"]:
+        return [None] * (record["study_views"] - 1)
+    own, best = (record["methods"][name]["covered"] for name in (method, ORACLE))
+    return [(a - own[0]) / (b - best[0]) if b > best[0] else None for a, b in zip(own[1:], best[1:], strict=True)]
+
+
 class RecordedStudy(Study):
     """Which frames of a recording show the most of a box? Settings as of `Study`, but that candidates are the recorded
     poses, and a scene is a first view: one of the frames that show a twentieth of the box, at random.
@@ -130,12 +138,7 @@ class RecordedStudy(Study):
     measures: ClassVar[tuple[Measure, ...]] = (
         Measure("covered", "Voxels seen", lambda r, m: r["methods"][m]["covered"], percent=True, better="more"),
         Measure(
-            "gain",
-            "Gain over the first view, as a share of the oracle's",
-            lambda r, m: _gains(r, m),
-            first=2,
-            percent=True,
-            better="more",
+            "gain", "Gain over the first view, as a share of the oracle's", _gains, first=2, percent=True, better="more"
         ),
     )
     claims: ClassVar[tuple[Claim, ...]] = (
@@ -235,14 +238,6 @@ class RecordedStudy(Study):
         poses = self.recording.poses
         off = jnp.abs(poses.position - pose.position).sum(-1) + jnp.abs(poses.rotation - pose.rotation).sum((-1, -2))
         return int(jnp.argmin(off))
-
-
-def _gains(record: Record, method: str) -> list[float | None]:
-    """What views after the first added, as a share of what the oracle's have added by then."""
-    if ORACLE not in record["methods"]:
-        return [None] * (record["study_views"] - 1)
-    own, best = (record["methods"][name]["covered"] for name in (method, ORACLE))
-    return [(a - own[0]) / (b - best[0]) if b > best[0] else None for a, b in zip(own[1:], best[1:], strict=True)]
 
 
 def _points(frames: RecordedFrames, index: int, stride: int) -> Float[np.ndarray, "n 3"]:
