@@ -18,7 +18,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.planning.episode import Step, view_keys
 from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Evidence, Grid, GridSurface, SDFSurface, Surface, TriangleMesh, mesh_from_sdf
+from jaxnbv.scanning import Evidence, Grid, GridSurface, SDFSurface, TriangleMesh, mesh_from_sdf
 from jaxnbv.scanning.sensors import HEAT_SETTING
 from jaxnbv.search import HalvingSearch, Proposal
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
@@ -175,7 +175,14 @@ class HeatStudy(MeshStudy):
         return bool((np.linalg.norm(points - np.asarray(scene.task), axis=1) <= HeatProblem.radius).any())
 
     def truth(self, scene: Scene) -> Truth:
-        return true_temperature(scene.surface, heat_problem(scene), self.true_grid)
+        surface = scene.surface
+        mesh = mesh_from_sdf(surface.sdf, self.true_grid) if isinstance(surface, SDFSurface) else surface
+        if not isinstance(mesh, TriangleMesh):
+            raise InputError(
+                f"the temperature of a {type(mesh).__name__} is not known: give a mesh or a signed distance"
+            )
+        points, temperature = body_temperature(mesh, heat_problem(scene))
+        return Truth(mesh, points, temperature.values)
 
     def facts(self, scene: Scene, truth: Truth, first: int) -> Record:
         low, high = float(truth.temperatures.min()), float(truth.temperatures.max())
@@ -208,18 +215,6 @@ class HeatStudy(MeshStudy):
 def heat_problem(scene: Scene) -> HeatProblem:
     """The authors' problem, heated where the scene says."""
     return HeatProblem(np.asarray(scene.task))
-
-
-def true_temperature(surface: Surface, heat: HeatProblem, grid: Grid) -> Truth:
-    """The temperature of an object's whole surface.
-
-    - `grid`: on which a signed distance is meshed.
-    """
-    mesh = mesh_from_sdf(surface.sdf, grid) if isinstance(surface, SDFSurface) else surface
-    if not isinstance(mesh, TriangleMesh):
-        raise InputError(f"the temperature of a {type(mesh).__name__} is not known: give a mesh or a signed distance")
-    points, temperature = body_temperature(mesh, heat)
-    return Truth(mesh, points, temperature.values)
 
 
 def _halved(
