@@ -22,8 +22,7 @@ from jaxnbv.scanning.mesh_files import read_nodes
 from jaxnbv.studies.engine.measures import KNOWN, Record
 from jaxnbv.studies.engine.meshes import knowing_meshes, knowing_others, numbered
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.parts.discovery import NETWORK_POINTS, TARGETS, PartDiscoveryStudy
-from jaxnbv.studies.parts.nearest import NearestPart
+from jaxnbv.studies.parts.discovery import NETWORK_POINTS, TARGETS, NearestPart, PartDiscoveryStudy
 from jaxnbv.studies.readers.class_meshes import is_mesh_file, taking_turns
 from jaxnbv.studies.scenes import Split, part_scene
 from jaxnbv.surfaces import KnownShapes

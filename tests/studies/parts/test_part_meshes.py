@@ -12,7 +12,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.imagination import Imagination
 from jaxnbv.scanning import Grid, load_parts
 from jaxnbv.studies.parts import pictures
-from jaxnbv.studies.parts.nearest import NearestPart
+from jaxnbv.studies.parts.discovery import NearestPart
 from jaxnbv.studies.parts.study import MeshPartStudy, PartStudy, part_files
 from jaxnbv.surfaces import GeometricSPSR
 
