@@ -1,6 +1,6 @@
 """Results of a study as text, and as CSV with one row a number."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -65,15 +65,11 @@ def tables_of(found: Results, study: type[Study], group: str) -> list[tuple[str,
         ):
             here = of[(of["group"] == group) & (of["quantity"] == measure.name)]
             if len(here):
-                made.append((caption, _cells(here, key, measure, text)))
+                texts = [text(row, measure) for _, row in here.iterrows()]
+                cells = here.assign(text=texts).pivot(index=key, columns="at", values="text")
+                ordered = cells.reindex(index=here[key].unique(), columns=here["at"].unique()).fillna("-")
+                made.append((caption, ordered.rename_axis(index=None, columns=measure.by)))
     return made
-
-
-def _cells(rows: pd.DataFrame, key: str, measure: Measure, text: Callable[[pd.Series, Measure], str]) -> pd.DataFrame:
-    texts = [text(row, measure) for _, row in rows.iterrows()]
-    cells = rows.assign(text=texts).pivot(index=key, columns="at", values="text")
-    ordered = cells.reindex(index=rows[key].unique(), columns=rows["at"].unique()).fillna("-")
-    return ordered.rename_axis(index=None, columns=measure.by)
 
 
 def result_text(row: pd.Series, measure: Measure) -> str:
