@@ -8,23 +8,23 @@ from jaxtyping import Array, Bool, Int, PRNGKeyArray
 from jaxnbv.checks import require
 from jaxnbv.networks.categories import NUM_PARTS, category_index
 from jaxnbv.studies.scenes.labelled import LabelledSolid, assemble, generator
-from jaxnbv.studies.scenes.parts import aircraft, belongings, devices, furniture, motorbike, skateboard, vessels
+from jaxnbv.studies.scenes.parts import belongings, furniture, vehicles
 from jaxnbv.studies.scenes.splits import Split, scene_key
 
 # Each lists the primitives of a random object: x is forward, y up and z to the right.
 _BUILDERS = {
-    "airplane": aircraft.airplane,
+    "airplane": vehicles.airplane,
     "bag": belongings.bag,
     "chair": furniture.chair,
-    "earphone": devices.earphone,
+    "earphone": belongings.earphone,
     "guitar": belongings.guitar,
     "lamp": furniture.lamp,
-    "laptop": devices.laptop,
-    "motorbike": motorbike.motorbike,
-    "mug": vessels.mug,
-    "pistol": devices.pistol,
-    "rocket": aircraft.rocket,
-    "skateboard": skateboard.skateboard,
+    "laptop": belongings.laptop,
+    "motorbike": vehicles.motorbike,
+    "mug": belongings.mug,
+    "pistol": belongings.pistol,
+    "rocket": vehicles.rocket,
+    "skateboard": vehicles.skateboard,
     "table": furniture.table,
 }
 
