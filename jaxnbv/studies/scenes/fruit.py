@@ -12,64 +12,28 @@ from jaxnbv.studies.scenes.class_object import ClassObject
 from jaxnbv.studies.scenes.framing import Framing
 from jaxnbv.studies.scenes.splits import Split, scene_key
 
-# Ranges of a fruit's numbers, in units of its half height; what a class does not name is zero.
-_RANGES: dict[str, dict[str, tuple[float, float]]] = {
-    "apple": {
-        "width": (1.02, 1.15),
-        "depth": (1.02, 1.15),
-        "top": (-0.42, -0.28),
-        "top_spread": (0.3, 0.42),
-        "bottom": (-0.24, -0.12),
-        "bottom_spread": (0.26, 0.36),
-        "lobes": (0.05, 0.09),
-        "stalk_low": (0.45, 0.5),
-        "stalk_high": (0.95, 1.2),
-        "stalk_lean": (-0.2, 0.2),
-        "stalk_radius": (0.055, 0.075),
-    },
-    "lemon": {
-        "width": (0.68, 0.82),
-        "depth": (0.68, 0.82),
-        "top": (0.14, 0.26),
-        "top_spread": (0.18, 0.28),
-        "bottom": (0.04, 0.14),
-        "bottom_spread": (0.2, 0.3),
-        "pores": (0.008, 0.018),
-        "pore_number": (11.0, 14.0),
-    },
-    "mango": {
-        "width": (0.6, 0.72),
-        "depth": (0.48, 0.58),
-        "top": (-0.06, -0.02),
-        "top_spread": (0.12, 0.2),
-        "bottom": (0.0, 0.08),
-        "bottom_spread": (0.25, 0.35),
-        "bend": (0.1, 0.24),
-    },
-    "mushroom": {
-        "width": (1.0, 1.25),
-        "depth": (1.0, 1.25),
-        "cut": (0.02, 0.2),
-        "gills": (0.03, 0.06),
-        "stalk_low": (-1.0, -0.6),
-        "stalk_high": (0.2, 0.3),
-        "stalk_lean": (-0.12, 0.12),
-        "stalk_radius": (0.26, 0.4),
-    },
-    "orange": {
-        "width": (1.0, 1.1),
-        "depth": (1.0, 1.1),
-        "top": (0.04, 0.08),
-        "top_spread": (0.08, 0.12),
-        "bottom": (-0.1, -0.03),
-        "bottom_spread": (0.12, 0.2),
-        "pores": (0.015, 0.028),
-        "pore_number": (12.0, 16.0),
-    },
+FRUITS = ("apple", "lemon", "mango", "mushroom", "orange")
+# What a fruit has not: nothing is divided by zero, and what has no cut is cut far below.
+_ZERO, _ONE, _UNCUT = (0.0, 0.0), (1.0, 1.0), (-4.0, -4.0)
+# The range of each of a fruit's numbers, in units of its half height, for each of `FRUITS`.
+_RANGES = {
+    "width": ((1.02, 1.15), (0.68, 0.82), (0.6, 0.72), (1.0, 1.25), (1.0, 1.1)),
+    "depth": ((1.02, 1.15), (0.68, 0.82), (0.48, 0.58), (1.0, 1.25), (1.0, 1.1)),
+    "top": ((-0.42, -0.28), (0.14, 0.26), (-0.06, -0.02), _ZERO, (0.04, 0.08)),
+    "top_spread": ((0.3, 0.42), (0.18, 0.28), (0.12, 0.2), _ONE, (0.08, 0.12)),
+    "bottom": ((-0.24, -0.12), (0.04, 0.14), (0.0, 0.08), _ZERO, (-0.1, -0.03)),
+    "bottom_spread": ((0.26, 0.36), (0.2, 0.3), (0.25, 0.35), _ONE, (0.12, 0.2)),
+    "lobes": ((0.05, 0.09), _ZERO, _ZERO, _ZERO, _ZERO),
+    "stalk_low": ((0.45, 0.5), _ZERO, _ZERO, (-1.0, -0.6), _ZERO),
+    "stalk_high": ((0.95, 1.2), _ZERO, _ZERO, (0.2, 0.3), _ZERO),
+    "stalk_lean": ((-0.2, 0.2), _ZERO, _ZERO, (-0.12, 0.12), _ZERO),
+    "stalk_radius": ((0.055, 0.075), _ZERO, _ZERO, (0.26, 0.4), _ZERO),
+    "pores": (_ZERO, (0.008, 0.018), _ZERO, _ZERO, (0.015, 0.028)),
+    "pore_number": (_ZERO, (11.0, 14.0), _ZERO, _ZERO, (12.0, 16.0)),
+    "bend": (_ZERO, _ZERO, (0.1, 0.24), _ZERO, _ZERO),
+    "cut": (_UNCUT, _UNCUT, _UNCUT, (0.02, 0.2), _UNCUT),
+    "gills": (_ZERO, _ZERO, _ZERO, (0.03, 0.06), _ZERO),
 }
-FRUITS = tuple(_RANGES)
-_NAMES = tuple(dict.fromkeys(name for ranges in _RANGES.values() for name in ranges))
-_UNCUT = -4.0
 _NUM_GILLS = 16
 # Deeper inside than this nothing is met, and directions from the middle are not defined.
 _DEEPEST = 0.2
@@ -130,9 +94,9 @@ def sample_fruit(
 @functools.partial(jax.jit, static_argnames="turned")
 def _sample(key: PRNGKeyArray, label: Int[Array, ""], longest_side: Float[Array, ""] | float, turned: bool) -> Fruit:
     number_key, rotation_key, place_key = jax.random.split(key, 3)
-    low, high = (jnp.array([[_range(fruit, name)[end] for name in _NAMES] for fruit in FRUITS]) for end in (0, 1))
-    drawn = jax.random.uniform(number_key, (len(_NAMES),), minval=low[label], maxval=high[label])
-    numbers = dict(zip(_NAMES, drawn, strict=True))
+    low, high = jnp.array(list(_RANGES.values())).T
+    drawn = jax.random.uniform(number_key, (len(_RANGES),), minval=low[label], maxval=high[label])
+    numbers = dict(zip(_RANGES, drawn, strict=True))
     rotation = jax.random.orthogonal(rotation_key, 3)
     rotation = rotation * jnp.linalg.det(rotation) if turned else jnp.eye(3)
 
@@ -145,12 +109,6 @@ def _sample(key: PRNGKeyArray, label: Int[Array, ""], longest_side: Float[Array,
     steepest = 1.1 * jnp.max(_slopes(numbers, jnp.concatenate([*near, anywhere])))
     offset = -0.5 * scale * (least_corner + greatest_corner)
     return Fruit(label, numbers, jnp.maximum(steepest, 1.0), rotation, scale, offset)
-
-
-def _range(fruit: str, name: str) -> tuple[float, float]:
-    # Nothing is divided by zero, and what has no cut is cut far below.
-    otherwise = {"cut": _UNCUT}.get(name, 1.0 if name.endswith("spread") else 0.0)
-    return _RANGES[fruit].get(name, (otherwise, otherwise))
 
 
 def _level(n: dict[str, Array], x: Array, y: Array, z: Array) -> Array:
