@@ -9,14 +9,14 @@ from jaxtyping import Array, Bool, Int, Key, PRNGKeyArray
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate, farthest_point_subsample, limit_capacity
-from jaxnbv.geometry.pose import Pose, look_at
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import SensorNoise, scan
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.studies.scenes import ClassObject, ClassSet, Framing, Split
 from jaxnbv.studies.scenes.class_object import scan_cue
 from jaxnbv.studies.scenes.splits import scene_key
-from jaxnbv.studies.training.views import evidence_after, joined_views, only
+from jaxnbv.studies.training.views import evidence_after, joined_views, merged, only, random_poses, stacked
 
 MAX_VIEWS = 5
 # Three standard deviations of the sensor's.
@@ -48,7 +48,7 @@ def scanned_clouds(
     """A cloud of each scene, of one to five random views with the sensor's noise."""
     objects = [scenes.scene(split, index, framing) for index in indices]
     keys = jax.vmap(lambda index: scene_key(1, split, index))(jnp.asarray(indices))
-    return _scanned(jax.tree.map(lambda *leaves: jnp.stack(leaves), *objects), keys, num_points)
+    return _scanned(stacked(objects), keys, num_points)
 
 
 def imagined_clouds(
@@ -90,12 +90,11 @@ def _imagined(
 
     def of_sample(surface_and_key):
         surface, pose_key = surface_and_key
-        scans = scan(surface, Camera(), _random_poses(pose_key, num_poses))
+        scans = scan(surface, Camera(), random_poses(pose_key, num_poses, SENSOR_RADIUS))
         return jax.lax.map(lambda one: farthest_point_subsample(concatenate(seen, one), num_points), scans)
 
     keys = jax.random.split(pose_key, planner.imagination.num_samples)
-    clouds = jax.lax.map(of_sample, (surfaces, keys))
-    clouds = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), clouds)
+    clouds = merged(jax.lax.map(of_sample, (surfaces, keys)))
     label, taken, most, imagined = (jnp.full(len(clouds.mask), value) for value in (thing.label, count, pixels, True))
     return LabelledClouds(clouds, label, taken, most, imagined, _on_cue(thing, clouds))
 
@@ -104,17 +103,12 @@ def _on_cue(thing: ClassObject, cloud: PointCloud) -> Bool[Array, "*batch points
     return thing.on_cue(cloud.points, _NOISE) & cloud.mask
 
 
-def _random_poses(key: PRNGKeyArray, count: int) -> Pose:
-    direction = jax.random.normal(key, (count, 3))
-    return look_at(SENSOR_RADIUS * direction / jnp.linalg.norm(direction, axis=-1, keepdims=True))
-
-
 def _partial_views(
     thing: ClassObject, key: PRNGKeyArray, most: int
 ) -> tuple[PointCloud, Pose, Int[Array, ""], Int[Array, ""]]:
     """What one to `most` random views show, their poses, how many they are, and the most telling pixels of one."""
     pose_key, noise_key, count_key = jax.random.split(key, 3)
-    poses = _random_poses(pose_key, most)
+    poses = random_poses(pose_key, most, SENSOR_RADIUS)
     pixels, scans = scan_cue(thing, Camera(), poses)
     count = jax.random.randint(count_key, (), 1, most + 1)
     used = jnp.arange(most) < count

@@ -10,13 +10,14 @@ from jaxtyping import Array, Int, Key, PRNGKeyArray
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate
 from jaxnbv.geometry.farthest_points import farthest_point_indices
-from jaxnbv.geometry.pose import Pose, look_at
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import SDFSurface, SensorNoise, scan
 from jaxnbv.scanning.sensors import PART_SETTING
-from jaxnbv.studies.scenes import PartScene, Split, part_scene
+from jaxnbv.studies.scenes import Split, part_scene
 from jaxnbv.studies.scenes.labelled import LabelledSolid
-from jaxnbv.studies.training.views import evidence_after, joined_views, only
+from jaxnbv.studies.scenes.splits import scene_key
+from jaxnbv.studies.training.views import evidence_after, joined_views, merged, only, random_poses, stacked
 
 MAX_VIEWS = 6
 _CLOUDS_A_SCENE = 3
@@ -39,9 +40,7 @@ def scanned_part_clouds(
     split: Split, indices: Sequence[int], num_points: int = 1024, camera: Camera = PART_SETTING.camera
 ) -> LabelledPartClouds:
     """Three clouds of each scene, of one to six of the same six random views, with the sensor's noise."""
-    solids, categories = _stacked([part_scene(split, index) for index in indices])
-    found = _scanned(solids, categories, _keys(split, indices), num_points, camera)
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found)
+    return merged(_scanned(_keyed(split, indices), num_points, camera))
 
 
 def imagined_part_clouds(
@@ -57,50 +56,34 @@ def imagined_part_clouds(
     The samples are those of a planner that has seen D. A point that was imagined has the label of the part that is
     nearest to it in truth.
     """
-    solids, categories = _stacked([part_scene(split, index) for index in indices])
-    found = _imagined(solids, categories, _keys(split, indices), planner, num_poses, num_points, camera)
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found)
+    return merged(_imagined(_keyed(split, indices), planner, num_poses, num_points, camera))
 
 
-def _stacked(scenes: Sequence[PartScene]) -> tuple[LabelledSolid, Int[Array, " scenes"]]:
-    solids = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[scene.solid for scene in scenes])
-    return solids, jnp.asarray([scene.category for scene in scenes])
+# Solids, their categories, and a key for each.
+_Scenes = tuple[LabelledSolid, Int[Array, " scenes"], Key[Array, " scenes"]]
 
 
-def _keys(split: Split, indices: Sequence[int]) -> Key[Array, " scenes"]:
-    of_split = jax.random.fold_in(jax.random.key(5), list(Split).index(split))
-    return jax.vmap(lambda index: jax.random.fold_in(of_split, index))(jnp.asarray(indices))
+def _keyed(split: Split, indices: Sequence[int]) -> _Scenes:
+    scenes = stacked([part_scene(split, index) for index in indices])
+    keys = jax.vmap(lambda index: scene_key(5, split, index))(jnp.asarray(indices))
+    return scenes.solid, scenes.category, keys
 
 
 @eqx.filter_jit
-def _scanned(
-    solids: LabelledSolid,
-    categories: Int[Array, " scenes"],
-    keys: Key[Array, " scenes"],
-    num_points: int,
-    camera: Camera,
-) -> LabelledPartClouds:
+def _scanned(scenes: _Scenes, num_points: int, camera: Camera) -> LabelledPartClouds:
     def of_scene(scene):
         solid, category, key = scene
         view_key, *keys = jax.random.split(key, 1 + _CLOUDS_A_SCENE)
         views, _, labels = _views(solid, view_key, camera)
         clouds = [_thin(joined_views(_some(views, key, MAX_VIEWS)), labels.reshape(-1), num_points) for key in keys]
-        cloud, labels = jax.tree.map(lambda *leaves: jnp.stack(leaves), *clouds)
+        cloud, labels = stacked(clouds)
         return LabelledPartClouds(cloud, labels, jnp.full(_CLOUDS_A_SCENE, category))
 
-    return jax.lax.map(of_scene, (solids, categories, keys))
+    return jax.lax.map(of_scene, scenes)
 
 
 @eqx.filter_jit
-def _imagined(
-    solids: LabelledSolid,
-    categories: Int[Array, " scenes"],
-    keys: Key[Array, " scenes"],
-    planner: Planner,
-    num_poses: int,
-    num_points: int,
-    camera: Camera,
-) -> LabelledPartClouds:
+def _imagined(scenes: _Scenes, planner: Planner, num_poses: int, num_points: int, camera: Camera) -> LabelledPartClouds:
     def of_scene(scene):
         solid, category, key = scene
         view_key, some_key, sample_key, pose_key = jax.random.split(key, 4)
@@ -111,7 +94,7 @@ def _imagined(
 
         def of_sample(surface_and_key):
             surface, key = surface_and_key
-            scans = scan(surface, camera, _random_poses(key, num_poses))
+            scans = scan(surface, camera, random_poses(key, num_poses, PART_SETTING.radius))
 
             def joined(seen):
                 both = concatenate(cloud, seen)
@@ -120,10 +103,9 @@ def _imagined(
             clouds, points_labels = jax.lax.map(joined, scans)
             return LabelledPartClouds(clouds, points_labels, jnp.full(num_poses, category))
 
-        found = jax.lax.map(of_sample, (surfaces, jax.random.split(pose_key, planner.imagination.num_samples)))
-        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found)
+        return merged(jax.lax.map(of_sample, (surfaces, jax.random.split(pose_key, planner.imagination.num_samples))))
 
-    return jax.lax.map(of_scene, (solids, categories, keys))
+    return jax.lax.map(of_scene, scenes)
 
 
 def _thin(cloud: PointCloud, labels: Int[Array, " n"], count: int) -> tuple[PointCloud, Int[Array, " count"]]:
@@ -134,17 +116,12 @@ def _thin(cloud: PointCloud, labels: Int[Array, " n"], count: int) -> tuple[Poin
     return PointCloud(thinned.points, thinned.normals, kept), labels[index]
 
 
-def _random_poses(key: PRNGKeyArray, count: int) -> Pose:
-    direction = jax.random.normal(key, (count, 3))
-    return look_at(PART_SETTING.radius * direction / jnp.linalg.norm(direction, axis=-1, keepdims=True))
-
-
 def _views(
     solid: LabelledSolid, key: PRNGKeyArray, camera: Camera
 ) -> tuple[PointCloud, Pose, Int[Array, "views rays"]]:
     """What random views show, with noise, their poses, and the true part of every point."""
     pose_key, noise_key = jax.random.split(key)
-    poses = _random_poses(pose_key, MAX_VIEWS)
+    poses = random_poses(pose_key, MAX_VIEWS, PART_SETTING.radius)
     scans = scan(SDFSurface(solid), camera, poses)
     return SensorNoise()(scans, noise_key), poses, solid.label(scans.points)
 
