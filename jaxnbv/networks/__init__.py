@@ -10,8 +10,8 @@ from jaxnbv.networks.checkpoints import save_checkpoint as save_checkpoint
 from jaxnbv.networks.classifier import CloudClassifier as CloudClassifier
 from jaxnbv.networks.compact_segmenter import CompactPartSegmenter as CompactPartSegmenter
 from jaxnbv.networks.feature_propagation import FeaturePropagation as FeaturePropagation
-from jaxnbv.networks.focused import Focus as Focus
-from jaxnbv.networks.focused import FocusedClassifier as FocusedClassifier
+from jaxnbv.networks.invariant import Focus as Focus
+from jaxnbv.networks.invariant import FocusedClassifier as FocusedClassifier
 from jaxnbv.networks.invariant import InvariantClassifier as InvariantClassifier
 from jaxnbv.networks.part_segmentation import PointNet2PartSegmenter as PointNet2PartSegmenter
 from jaxnbv.networks.pointnet2 import PointNet2Classifier as PointNet2Classifier

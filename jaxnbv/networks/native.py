@@ -15,8 +15,7 @@ import numpy as np
 
 from jaxnbv.checks import require
 from jaxnbv.networks.compact_segmenter import CompactPartSegmenter
-from jaxnbv.networks.focused import Focus, FocusedClassifier
-from jaxnbv.networks.invariant import InvariantClassifier
+from jaxnbv.networks.invariant import Focus, FocusedClassifier, InvariantClassifier
 
 NativeNetwork = InvariantClassifier | FocusedClassifier | CompactPartSegmenter
 

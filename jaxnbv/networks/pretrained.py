@@ -5,8 +5,7 @@ from importlib import resources
 from jaxnbv.checks import require
 from jaxnbv.networks.checkpoints import Network, load_checkpoint
 from jaxnbv.networks.classifier import CloudClassifier
-from jaxnbv.networks.focused import FocusedClassifier
-from jaxnbv.networks.invariant import InvariantClassifier
+from jaxnbv.networks.invariant import FocusedClassifier, InvariantClassifier
 from jaxnbv.networks.segmenter import CloudSegmenter
 
 # Longest side of the box of a training object, in scene units.
