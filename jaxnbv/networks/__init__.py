@@ -13,8 +13,8 @@ from jaxnbv.networks.feature_propagation import FeaturePropagation as FeaturePro
 from jaxnbv.networks.invariant import Focus as Focus
 from jaxnbv.networks.invariant import FocusedClassifier as FocusedClassifier
 from jaxnbv.networks.invariant import InvariantClassifier as InvariantClassifier
-from jaxnbv.networks.part_segmentation import PointNet2PartSegmenter as PointNet2PartSegmenter
 from jaxnbv.networks.pointnet2 import PointNet2Classifier as PointNet2Classifier
+from jaxnbv.networks.pointnet2 import PointNet2PartSegmenter as PointNet2PartSegmenter
 from jaxnbv.networks.pretrained import network_scale as network_scale
 from jaxnbv.networks.pretrained import part_segmenter as part_segmenter
 from jaxnbv.networks.pretrained import pretrained_classifier as pretrained_classifier

@@ -11,8 +11,7 @@ from safetensors import SafetensorError
 
 from jaxnbv.checks import InputError, require
 from jaxnbv.networks.native import NativeNetwork, arrays_of, build_native, is_native
-from jaxnbv.networks.part_segmentation import PointNet2PartSegmenter
-from jaxnbv.networks.pointnet2 import PointNet2Classifier
+from jaxnbv.networks.pointnet2 import PointNet2Classifier, PointNet2PartSegmenter
 from jaxnbv.networks.state_dict import build_classifier, build_part_segmenter, is_segmenter, tensors_of
 from jaxnbv.networks.torch_format import read_torch_tensors
 from jaxnbv.storage.files import write_whole

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from jaxnbv.checks import check_fields, require, shown
 from jaxnbv.geometry.cloud import PointCloud, farthest_point_subsample
 from jaxnbv.networks.compact_segmenter import CompactPartSegmenter
-from jaxnbv.networks.part_segmentation import PointNet2PartSegmenter
+from jaxnbv.networks.pointnet2 import PointNet2PartSegmenter
 
 
 class CloudClassifier(eqx.Module):

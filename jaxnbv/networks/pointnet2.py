@@ -1,13 +1,14 @@
-"""PointNet++ classification of one oriented point cloud (Qi et al. 2017), in inference mode."""
+"""PointNet++ of one oriented point cloud, its class or its parts (Qi et al. 2017), in inference mode."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxnbv.checks import require
+from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.networks.feature_propagation import FeaturePropagation
 from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
 
 
@@ -22,6 +23,30 @@ class Level(NamedTuple):
 # As published, for objects that are centred and fill the unit sphere.
 SINGLE_SCALE = (Level(512, (0.2,), (32,)), Level(128, (0.4,), (64,)))
 MULTI_SCALE = (Level(512, (0.1, 0.2, 0.4), (16, 32, 128)), Level(128, (0.2, 0.4, 0.8), (32, 64, 128)))
+PARTS_MULTI_SCALE = (Level(512, (0.1, 0.2, 0.4), (32, 64, 128)), Level(128, (0.4, 0.8), (64, 128)))
+
+
+def _filled(
+    points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None, many: str
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"]]:
+    """Points and normals, zero in rows that are not filled, and which are; `many` says what takes many clouds."""
+    require(
+        points.ndim == 2 and points.shape[1] == 3 and points.shape[0] > 0 and normals.shape == points.shape,
+        f"points and normals must both be (n, 3) with n > 0, got {points.shape} and {normals.shape}: "
+        f"one cloud a call, many with {many}",
+    )
+    mask = jnp.ones(len(points), dtype=bool) if mask is None else mask
+    return jnp.where(mask[:, None], points, 0.0), jnp.where(mask[:, None], normals, 0.0), mask
+
+
+def _down(network: Any, rows: Any, mask: Bool[Array, " n"]) -> tuple[list[Any], Float[Array, " outputs"]]:
+    """Centres and features of each level of a network, from points and their features, and those of the whole."""
+    found = []
+    for level in network.levels:
+        rows = level(*rows, mask)
+        mask = jnp.ones(len(rows[0]), dtype=bool)
+        found.append(rows)
+    return found, network.whole.pool(network.whole.lift(*rows))
 
 
 class PointNet2Classifier(eqx.Module):
@@ -63,19 +88,84 @@ class PointNet2Classifier(eqx.Module):
 
         **Raises:** `ValueError` if points and normals are not both (n, 3), or there are no rows.
         """
-        require(
-            points.ndim == 2 and points.shape[1] == 3 and points.shape[0] > 0 and normals.shape == points.shape,
-            f"points and normals must both be (n, 3) with n > 0, got {points.shape} and {normals.shape}: "
-            "one cloud a call, many with jax.vmap",
-        )
-        if mask is None:
-            mask = jnp.ones(len(points), dtype=bool)
-        points, normals = (jnp.where(mask[:, None], rows, 0.0) for rows in (points, normals))
-        features = normals if self.uses_normals else None
-        for level in self.levels:
-            points, features = level(points, features, mask)
-            mask = jnp.ones(len(points), dtype=bool)
-        x = self.whole.pool(self.whole.lift(points, features))
+        points, normals, mask = _filled(points, normals, mask, "jax.vmap")
+        _, x = _down(self, (points, normals if self.uses_normals else None), mask)
         for layer in self.hidden:
             x = jax.nn.relu(layer(x))
         return jax.nn.log_softmax(self.last(x))
+
+
+class PointNet2PartSegmenter(eqx.Module):
+    """From a cloud and its object's category to log-probabilities of parts, point by point.
+
+    Set abstractions down to one vector, feature propagations back up to the points, then a perceptron. Expects the
+    object centred and inside the unit sphere, as in training. Reverse-mode differentiable in points and normals; which
+    points are sampled, grouped and taken as neighbours is fixed.
+
+    - `levels`: the set abstractions.
+    - `whole`: the PointNet over the last level's centres, coordinates and features.
+    - `propagations`: the way back, the coarsest level first.
+    - `hidden`: the perceptron's first layer, followed by a rectifier.
+    - `last`: its last layer, one output a part.
+    """
+
+    levels: tuple[SetAbstraction, ...]
+    whole: PooledMLP
+    propagations: tuple[FeaturePropagation, ...]
+    hidden: Linear
+    last: Linear
+
+    @property
+    def num_parts(self) -> int:
+        """The number of parts of all categories together."""
+        return self.last.bias.shape[0]
+
+    @property
+    def num_categories(self) -> int:
+        """The number of categories."""
+        carried = self.propagations[-2].layers[-1].bias.shape[0]
+        own = 3 + (6 if self.uses_normals else 3)
+        return self.propagations[-1].layers[0].weight.shape[0] - carried - own
+
+    @property
+    def uses_normals(self) -> bool:
+        """Whether the network was made for oriented points; one that was not ignores the normals."""
+        return self.levels[0].branches[0].layers[0].weight.shape[0] == 9
+
+    def __call__(
+        self,
+        points: Float[Array, "n 3"],
+        normals: Float[Array, "n 3"],
+        category: int | Int[AnyArray, ""] | Float[AnyArray, " categories"],
+        mask: Bool[Array, " n"] | None = None,
+    ) -> Float[Array, "n parts"]:
+        """log p(part) at each point, over the parts of all categories; rows that `mask` does not name mean nothing.
+
+        `category` is its index, which may be traced, or its one-hot vector. What stands in rows that are not named, and
+        how many there are, does not matter to the others. The order of the filled rows does: the first is the first
+        centre, and crowded balls are cut to their first rows.
+
+        **Raises:** `ValueError` if points and normals are not both (n, 3), there are no rows, or there is no such
+        category.
+        """
+        points, normals, mask = _filled(points, normals, mask, "jax.lax.map")
+        # The published network gives the coordinates as features too, beside those relative to a ball's centre.
+        features = jnp.concatenate([points, normals], axis=-1) if self.uses_normals else points
+        one_hot = jnp.broadcast_to(self._one_hot(category, points.dtype), (len(points), self.num_categories))
+        levels, x = _down(self, (points, features), mask)
+        own = [(points, jnp.concatenate([one_hot, points, features], axis=-1)), *levels]
+        x, coarse = x[None], jnp.zeros((1, 3), points.dtype)
+        for (points, features), propagation in zip(reversed(own), self.propagations, strict=True):
+            x, coarse = propagation(points, coarse, features, x), points
+        return jax.nn.log_softmax(self.last(jax.nn.relu(self.hidden(x))), axis=-1)
+
+    def _one_hot(self, category, dtype) -> Float[Array, " categories"]:
+        count = self.num_categories
+        if jnp.ndim(category) == 1:
+            require(len(category) == count, f"the one-hot category has {len(category)} entries; expected {count}")
+            return jnp.asarray(category, dtype)
+        require(
+            is_traced(category) or 0 <= int(category) < count,
+            f"the category is {category}; the network knows 0 to {count - 1}",
+        )
+        return jax.nn.one_hot(category, count, dtype=dtype)

@@ -19,8 +19,14 @@ import numpy as np
 
 from jaxnbv.checks import require
 from jaxnbv.networks.feature_propagation import FeaturePropagation
-from jaxnbv.networks.part_segmentation import PARTS_MULTI_SCALE, PARTS_SINGLE_SCALE, PointNet2PartSegmenter
-from jaxnbv.networks.pointnet2 import MULTI_SCALE, SINGLE_SCALE, Level, PointNet2Classifier
+from jaxnbv.networks.pointnet2 import (
+    MULTI_SCALE,
+    PARTS_MULTI_SCALE,
+    SINGLE_SCALE,
+    Level,
+    PointNet2Classifier,
+    PointNet2PartSegmenter,
+)
 from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
 
 Tensors = Mapping[str, np.ndarray]
@@ -63,7 +69,7 @@ def build_part_segmenter(tensors: Tensors) -> PointNet2PartSegmenter:
     state = _State(tensors)
     state.check_parts(_SEGMENTER)
     known = {6: "points", 9: "with normals"}
-    levels, widths = _levels(state, PARTS_SINGLE_SCALE, PARTS_MULTI_SCALE, known)
+    levels, widths = _levels(state, SINGLE_SCALE, PARTS_MULTI_SCALE, known)
     whole = state.pooled("sa3.mlp_convs", "sa3.mlp_bns", 3 + widths[-1])
     # The first propagation's own inputs: one for each category, the coordinates, and the first level's features.
     name = "fp1.mlp_convs.0.weight"
@@ -90,7 +96,7 @@ def tensors_of(network: PointNet2Classifier | PointNet2PartSegmenter) -> dict[st
     **Raises:** `ValueError` for a network whose sampling or depth is not the published one.
     """
     if isinstance(network, PointNet2PartSegmenter):
-        scales, as_deep = (PARTS_SINGLE_SCALE, PARTS_MULTI_SCALE), len(network.propagations) == 3
+        scales, as_deep = (SINGLE_SCALE, PARTS_MULTI_SCALE), len(network.propagations) == 3
     else:
         scales, as_deep = (SINGLE_SCALE, MULTI_SCALE), len(network.hidden) == 2
     multi = len(network.levels[0].radii) > 1
