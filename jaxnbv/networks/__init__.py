@@ -7,7 +7,8 @@ from jaxnbv.networks.categories import part_mask as part_mask
 from jaxnbv.networks.checkpoints import convert_checkpoint as convert_checkpoint
 from jaxnbv.networks.checkpoints import load_checkpoint as load_checkpoint
 from jaxnbv.networks.checkpoints import save_checkpoint as save_checkpoint
-from jaxnbv.networks.classifier import CloudClassifier as CloudClassifier
+from jaxnbv.networks.clouds import CloudClassifier as CloudClassifier
+from jaxnbv.networks.clouds import CloudSegmenter as CloudSegmenter
 from jaxnbv.networks.compact_segmenter import CompactPartSegmenter as CompactPartSegmenter
 from jaxnbv.networks.feature_propagation import FeaturePropagation as FeaturePropagation
 from jaxnbv.networks.invariant import Focus as Focus
@@ -19,5 +20,4 @@ from jaxnbv.networks.pretrained import network_scale as network_scale
 from jaxnbv.networks.pretrained import part_segmenter as part_segmenter
 from jaxnbv.networks.pretrained import pretrained_classifier as pretrained_classifier
 from jaxnbv.networks.pretrained import pyramid_classifier as pyramid_classifier
-from jaxnbv.networks.segmenter import CloudSegmenter as CloudSegmenter
 from jaxnbv.networks.torch_format import read_torch_tensors as read_torch_tensors

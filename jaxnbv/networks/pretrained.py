@@ -4,9 +4,8 @@ from importlib import resources
 
 from jaxnbv.checks import require
 from jaxnbv.networks.checkpoints import Network, load_checkpoint
-from jaxnbv.networks.classifier import CloudClassifier
+from jaxnbv.networks.clouds import CloudClassifier, CloudSegmenter
 from jaxnbv.networks.invariant import FocusedClassifier, InvariantClassifier
-from jaxnbv.networks.segmenter import CloudSegmenter
 
 # Longest side of the box of a training object, in scene units.
 TRAINED_SIDE = 2.5

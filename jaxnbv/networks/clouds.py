@@ -1,4 +1,4 @@
-"""From a network on arrays to the segmenter of clouds that the segmentation task takes."""
+"""From a network on arrays to the classifier or the segmenter of clouds that the tasks take."""
 
 from collections.abc import Callable
 
@@ -7,11 +7,48 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxnbv.checks import AnyArray, check_type, is_traced, require
+from jaxnbv.checks import AnyArray, check_fields, check_type, is_traced, require, shown
 from jaxnbv.geometry.cloud import PointCloud, farthest_point_subsample
 from jaxnbv.networks.categories import CATEGORIES, category_index, part_mask
+from jaxnbv.networks.compact_segmenter import CompactPartSegmenter
 from jaxnbv.networks.invariant import InvariantClassifier
-from jaxnbv.networks.pointnet2 import PointNet2Classifier
+from jaxnbv.networks.pointnet2 import PointNet2Classifier, PointNet2PartSegmenter
+
+
+class CloudClassifier(eqx.Module):
+    """A network as a function from a `PointCloud` to log-probabilities.
+
+    - `network`: called as `network(points, normals, mask)`.
+    - `num_points`: what it is fed, by farthest point sampling; a smaller cloud is fed as it is, masked.
+    - `scale`: network units per scene unit.
+    - `classes`: their names, where known; by default the network's own.
+
+    **Raises:** `ValueError` if `num_points` or `scale` is not positive, or for a network that segments parts.
+    """
+
+    network: Callable[..., Float[Array, " classes"]]
+    num_points: int = eqx.field(static=True, default=1024)
+    scale: float = eqx.field(static=True, default=1.0)
+    classes: tuple[str, ...] | None = eqx.field(static=True, default=None)
+
+    def __post_init__(self):
+        if self.classes is None:
+            self.classes = getattr(self.network, "classes", None)
+
+    def __check_init__(self):
+        check_fields(self)
+        parts = isinstance(self.network, PointNet2PartSegmenter | CompactPartSegmenter)
+        names = () if self.classes is None else self.classes
+        proper = isinstance(names, tuple) and all(isinstance(name, str) for name in names)
+        require(proper, f"the classes are {shown(self.classes)}; give a tuple of names")
+        require(not parts, "the network segments parts; a CloudSegmenter feeds it clouds")
+        require(self.num_points >= 1, f"num_points is {self.num_points}; the network needs at least one")
+        require(self.scale > 0, f"the scale is {self.scale}; it must be positive")
+
+    def __call__(self, cloud: PointCloud) -> Float[Array, " classes"]:
+        """Log-probabilities of the classes of one cloud in scene coordinates."""
+        fed = farthest_point_subsample(cloud, self.num_points)
+        return self.network(self.scale * fed.points, fed.normals, fed.mask)
 
 
 class CloudSegmenter(eqx.Module):
