@@ -23,7 +23,8 @@ class Level(NamedTuple):
 # As published, for objects that are centred and fill the unit sphere.
 SINGLE_SCALE = (Level(512, (0.2,), (32,)), Level(128, (0.4,), (64,)))
 MULTI_SCALE = (Level(512, (0.1, 0.2, 0.4), (16, 32, 128)), Level(128, (0.2, 0.4, 0.8), (32, 64, 128)))
-PARTS_MULTI_SCALE = (Level(512, (0.1, 0.2, 0.4), (32, 64, 128)), Level(128, (0.4, 0.8), (64, 128)))
+SCALES = SINGLE_SCALE, MULTI_SCALE
+PARTS_SCALES = SINGLE_SCALE, (Level(512, (0.1, 0.2, 0.4), (32, 64, 128)), Level(128, (0.4, 0.8), (64, 128)))
 
 
 def _filled(

@@ -19,14 +19,7 @@ import numpy as np
 
 from jaxnbv.checks import require
 from jaxnbv.networks.feature_propagation import FeaturePropagation
-from jaxnbv.networks.pointnet2 import (
-    MULTI_SCALE,
-    PARTS_MULTI_SCALE,
-    SINGLE_SCALE,
-    Level,
-    PointNet2Classifier,
-    PointNet2PartSegmenter,
-)
+from jaxnbv.networks.pointnet2 import PARTS_SCALES, SCALES, Level, PointNet2Classifier, PointNet2PartSegmenter
 from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
 
 Tensors = Mapping[str, np.ndarray]
@@ -49,8 +42,8 @@ def build_classifier(tensors: Tensors) -> PointNet2Classifier:
     """
     state = _State(tensors)
     state.check_parts(_CLASSIFIER)
-    levels, widths = _levels(state, SINGLE_SCALE, MULTI_SCALE, {3: "points", 6: "with normals"})
-    whole = state.pooled("sa3.mlp_convs", "sa3.mlp_bns", 3 + widths[-1])
+    levels, widths = _levels(state, SCALES, {3: "points", 6: "with normals"})
+    whole = state.pooled("sa3.mlp_convs", 3 + widths[-1])
     hidden = []
     width = _width(whole.layers)
     for number in (1, 2):
@@ -68,9 +61,8 @@ def build_part_segmenter(tensors: Tensors) -> PointNet2PartSegmenter:
     """
     state = _State(tensors)
     state.check_parts(_SEGMENTER)
-    known = {6: "points", 9: "with normals"}
-    levels, widths = _levels(state, SINGLE_SCALE, PARTS_MULTI_SCALE, known)
-    whole = state.pooled("sa3.mlp_convs", "sa3.mlp_bns", 3 + widths[-1])
+    levels, widths = _levels(state, PARTS_SCALES, {6: "points", 9: "with normals"})
+    whole = state.pooled("sa3.mlp_convs", 3 + widths[-1])
     # The first propagation's own inputs: one for each category, the coordinates, and the first level's features.
     name = "fp1.mlp_convs.0.weight"
     inputs = state.take(name, None, None).shape[1]
@@ -81,7 +73,7 @@ def build_part_segmenter(tensors: Tensors) -> PointNet2PartSegmenter:
         require(
             own is not None or inputs >= least, f"the tensor {name} takes {inputs} inputs; expected {least} or more"
         )
-        layers = state.layers(f"fp{number}.mlp_convs", f"fp{number}.mlp_bns", inputs if own is None else own + width)
+        layers = state.layers(f"fp{number}.mlp_convs", inputs if own is None else own + width)
         propagations.append(FeaturePropagation(layers))
         width = _width(layers)
     hidden = _linear(*state.linear("conv1", width, "bn1"))
@@ -96,9 +88,9 @@ def tensors_of(network: PointNet2Classifier | PointNet2PartSegmenter) -> dict[st
     **Raises:** `ValueError` for a network whose sampling or depth is not the published one.
     """
     if isinstance(network, PointNet2PartSegmenter):
-        scales, as_deep = (SINGLE_SCALE, PARTS_MULTI_SCALE), len(network.propagations) == 3
+        scales, as_deep = PARTS_SCALES, len(network.propagations) == 3
     else:
-        scales, as_deep = (SINGLE_SCALE, MULTI_SCALE), len(network.hidden) == 2
+        scales, as_deep = SCALES, len(network.hidden) == 2
     multi = len(network.levels[0].radii) > 1
     expected = scales[multi]
     sampling = tuple((level.centers, level.radii, level.members) for level in network.levels)
@@ -117,17 +109,17 @@ def tensors_of(network: PointNet2Classifier | PointNet2PartSegmenter) -> dict[st
             tensors[f"{norm}.weight"], tensors[f"{norm}.running_var"] = ones, ones - np.asarray(_EPSILON, bias.dtype)
             tensors[f"{norm}.bias"], tensors[f"{norm}.running_mean"] = 0 * ones, 0 * ones
 
-    def put_layers(layers: tuple[Linear, ...], name: str, norm: str, kernel=(1, 1), coordinates_last=False) -> None:
+    def put_layers(layers: tuple[Linear, ...], name: str, kernel=(1, 1), coordinates_last=False) -> None:
         for index, layer in enumerate(layers):
-            put(layer, f"{name}.{index}", f"{norm}.{index}", kernel, roll=coordinates_last and index == 0)
+            put(layer, f"{name}.{index}", f"{_norm(name)}.{index}", kernel, roll=coordinates_last and index == 0)
 
     for number, level in enumerate(network.levels, start=1):
-        for branch, names in zip(level.branches, _branch_names(f"sa{number}", len(level.radii)), strict=True):
-            put_layers(branch.layers, *names, coordinates_last=multi)
-    put_layers(network.whole.layers, "sa3.mlp_convs", "sa3.mlp_bns")
+        for branch, name in zip(level.branches, _branch_names(f"sa{number}", len(level.radii)), strict=True):
+            put_layers(branch.layers, name, coordinates_last=multi)
+    put_layers(network.whole.layers, "sa3.mlp_convs")
     if isinstance(network, PointNet2PartSegmenter):
         for number, propagation in zip((3, 2, 1), network.propagations, strict=True):
-            put_layers(propagation.layers, f"fp{number}.mlp_convs", f"fp{number}.mlp_bns", (1,))
+            put_layers(propagation.layers, f"fp{number}.mlp_convs", (1,))
         put(network.hidden, "conv1", "bn1", (1,))
         put(network.last, "conv2", None, (1,))
     else:
@@ -178,26 +170,26 @@ class _State:
         shift = self.take(f"{norm}.bias", outputs) - self.take(f"{norm}.running_mean", outputs) * scale
         return weight * scale, bias * scale + shift
 
-    def layers(self, name: str, norm: str, inputs: int, coordinates_last: bool = False) -> tuple[Linear, ...]:
+    def layers(self, name: str, inputs: int, coordinates_last: bool = False) -> tuple[Linear, ...]:
         """The layers <name>.0, <name>.1, ...; the coordinates among the first one's inputs are put first."""
         layers: list[Linear] = []
         while not layers or f"{name}.{len(layers)}.weight" in self.tensors:
-            weight, bias = self.linear(f"{name}.{len(layers)}", inputs, f"{norm}.{len(layers)}")
+            weight, bias = self.linear(f"{name}.{len(layers)}", inputs, f"{_norm(name)}.{len(layers)}")
             if coordinates_last and not layers:
                 weight = np.roll(weight, 3, axis=0)
             layers.append(_linear(weight, bias))
             inputs = len(bias)
         return tuple(layers)
 
-    def pooled(self, name: str, norm: str, inputs: int, coordinates_last: bool = False) -> PooledMLP:
+    def pooled(self, name: str, inputs: int, coordinates_last: bool = False) -> PooledMLP:
         """The same layers, as a PointNet."""
-        layers = self.layers(name, norm, inputs, coordinates_last)
+        layers = self.layers(name, inputs, coordinates_last)
         require(len(layers) > 1, f"{name} has one layer only; two or more are needed")
         return PooledMLP(layers)
 
 
 def _levels(
-    state: _State, single: tuple[Level, ...], multiple: tuple[Level, ...], known: dict[int, str]
+    state: _State, scales: tuple[tuple[Level, ...], tuple[Level, ...]], known: dict[int, str]
 ) -> tuple[tuple[SetAbstraction, ...], list[int]]:
     """The set abstractions, and the numbers of features: of the points, then of each level's centres."""
     multi = "sa1.conv_blocks.0.0.weight" in state.tensors
@@ -206,18 +198,21 @@ def _levels(
     choices = " or ".join(f"{number} ({what})" for number, what in known.items())
     require(inputs in known, f"the tensor {first} takes {inputs} inputs; expected {choices}")
     levels, widths = [], [inputs - 3]
-    for number, level in enumerate(multiple if multi else single, start=1):
+    for number, level in enumerate(scales[multi], start=1):
         names = _branch_names(f"sa{number}", len(level.radii))
-        branches = tuple(state.pooled(name, norm, 3 + widths[-1], coordinates_last=multi) for name, norm in names)
+        branches = tuple(state.pooled(name, 3 + widths[-1], coordinates_last=multi) for name in names)
         levels.append(SetAbstraction(branches, level.radii, level.members, level.centers))
         widths.append(sum(_width(branch.layers) for branch in branches))
     return tuple(levels), widths
 
 
-def _branch_names(level: str, radii: int) -> list[tuple[str, str]]:
-    if radii == 1:
-        return [(f"{level}.mlp_convs", f"{level}.mlp_bns")]
-    return [(f"{level}.conv_blocks.{branch}", f"{level}.bn_blocks.{branch}") for branch in range(radii)]
+def _branch_names(level: str, radii: int) -> list[str]:
+    return [f"{level}.mlp_convs"] if radii == 1 else [f"{level}.conv_blocks.{branch}" for branch in range(radii)]
+
+
+def _norm(name: str) -> str:
+    """The batch normalisations after the layers of a name."""
+    return name.replace("mlp_convs", "mlp_bns").replace("conv_blocks", "bn_blocks")
 
 
 def _linear(weight: np.ndarray, bias: np.ndarray) -> Linear:
