@@ -1,4 +1,4 @@
-"""Networks: PointNet++ and published checkpoints, a small rotation-invariant classifier, training and calibration."""
+"""Networks: PointNet++ and published checkpoints, small rotation-invariant classifiers, and a segmenter of parts."""
 
 from jaxnbv.networks.categories import CATEGORIES as CATEGORIES
 from jaxnbv.networks.categories import Category as Category

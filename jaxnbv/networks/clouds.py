@@ -58,7 +58,7 @@ class CloudSegmenter(eqx.Module):
 
     - `network`: called as `network(points, normals, category, mask)`; gives log-probabilities of the fifty parts of
       ShapeNet-part.
-    - `category`: what the object is, by its name in `shapenet.CATEGORIES` or its index there.
+    - `category`: what the object is, by its name in `CATEGORIES` or its index there.
     - `num_points`: what the network is fed, by farthest point sampling; a smaller cloud is fed as it is, masked.
     - `scale`: network units per scene unit.
 

@@ -28,7 +28,7 @@ _BUILDERS = {
     "table": furniture.table,
 }
 
-# The categories that have procedural objects, in the order of `shapenet.CATEGORIES`.
+# The categories that have procedural objects, in the order of `networks.CATEGORIES`.
 PART_CATEGORIES = tuple(_BUILDERS)
 
 # Objects face one way, as ShapeNet's do, but for a small turn about the y axis.
@@ -39,7 +39,7 @@ class PartScene(eqx.Module):
     """An object and what it is.
 
     - `solid`: the object; its labels are the fifty parts'.
-    - `category`: its index in `shapenet.CATEGORIES`.
+    - `category`: its index in `networks.CATEGORIES`.
     - `parts`: which of the fifty parts it has.
     """
 
