@@ -23,6 +23,7 @@ from jaxnbv.scanning import Evidence, GridSurface, Noise, SensorNoise, Surface, 
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.search import Proposal
 from jaxnbv.storage import EpisodeFolder, describe
+from jaxnbv.surfaces import SurfacePosterior
 from jaxnbv.tasks import Coverage, Stop
 
 
@@ -134,7 +135,7 @@ def simulate(
     folder: str | Path | None = None,
     progress: bool = True,
     until: Stop | None = None,
-    each: Callable[[View], None] | None = None,
+    each: Callable[["Step"], None] | None = None,
 ) -> Episode:
     """Scan a known surface, or solid, from `first`, then from the views that the planner asks for: `views` in all, or
     as many as it takes `until` a rule of stopping ends it, `Sure(0.95) | Budget(seconds=60)` say.
@@ -144,7 +145,7 @@ def simulate(
     bits as one that was not. (A GPU may add in another order from run to run.) The rule is asked after the last view
     that is there, so a folder can be continued with another one.
 
-    - `each`: is called with every view once it is done, those that the folder holds included.
+    - `each`: is called with the step to every view once it is done, those that the folder holds included.
 
     **Raises:** `ValueError` if `views` < 1 or more than the planner has room for, if the first view sees nothing, or
     if the folder belongs to another configuration or holds more views already.
@@ -178,12 +179,13 @@ def simulate(
             sensor = scene_sensor(scene, planner.camera, noise, planner.imagination.surroundings)
             watch = None if until is None else Watch(until, planner)
             episode = steps(planner, sensor, first, key, done=done, begin=begin, watch=watch)
-            for index, (view, *_) in enumerate(itertools.islice(episode, views)):
+            for index, step in enumerate(itertools.islice(episode, views)):
+                view = step.view
                 finished.append(view)
                 if store and index >= len(done):
                     store.write_view(index, view.pose, view.scan, view.proposal)
                 if each is not None:
-                    each(view)
+                    each(step)
             stopped = watch.reason if watch and len(finished) < views else None
             bar.update(bar.total - bar.n)
         if store:
@@ -196,16 +198,24 @@ Sensor: TypeAlias = Callable[[Pose, PRNGKeyArray], PointCloud]
 STAGES = ("sampling surfaces", "searching", "scanning")
 
 
+class Basis(NamedTuple):
+    """What a view was chosen by: the evidence before it, the posterior given that, and the step's samples."""
+
+    evidence: Evidence
+    posterior: SurfacePosterior
+    surfaces: GridSurface
+
+
 class Step(NamedTuple):
     """How an episode came to a view, and what the planner knows after it.
 
-    - `surfaces`: the samples that the view was chosen by; None where there were none.
+    - `basis`: None for a view that was given or known already, and where the search looks at no samples.
     - `seconds`: of the search; zero for a view that was given.
     """
 
     view: View
     evidence: Evidence
-    surfaces: GridSurface | None
+    basis: Basis | None
     seconds: float
 
 
@@ -236,7 +246,7 @@ def steps(
     poses: list[Pose] = []
     for index in range(planner.max_views):
         sample_key, search_key, noise_key = view_keys(key, index)
-        surfaces, seconds = None, 0.0
+        basis, seconds = None, 0.0
         if (taken := next(known, None)) is not None:
             pose, seen, proposal = taken
         else:
@@ -246,10 +256,13 @@ def steps(
                     return
                 if planner.search.uses_samples:
                     begin(index, STAGES[0])
-                    surfaces = jax.block_until_ready(planner.sample(evidence, sample_key))
+                    posterior = planner.imagination.posterior(evidence)
+                    surfaces = planner.imagination.sample(evidence, sample_key, posterior)
+                    basis = Basis(evidence, posterior, jax.block_until_ready(surfaces))
                 begin(index, STAGES[1])
                 start = time.perf_counter()
-                proposal = jax.block_until_ready(planner.choose(evidence, surfaces, search_key))
+                sampled = None if basis is None else basis.surfaces
+                proposal = jax.block_until_ready(planner.choose(evidence, sampled, search_key))
                 pose, seconds = proposal.pose, time.perf_counter() - start
                 if watch and watch.before(evidence, poses, sample_key, proposal):
                     return
@@ -260,7 +273,7 @@ def steps(
         else:
             evidence = planner.observe(evidence, pose, seen, camera)
         poses.append(pose)
-        yield Step(View(pose, seen, evidence.cloud, proposal, camera or planner.camera), evidence, surfaces, seconds)
+        yield Step(View(pose, seen, evidence.cloud, proposal, camera or planner.camera), evidence, basis, seconds)
 
 
 def scene_sensor(

@@ -6,3 +6,4 @@ from .figures import write_figures as write_figures
 from .live import LiveView as LiveView
 from .notebook import show as show
 from .report import write_report as write_report
+from .sketches import Sketches as Sketches

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.planning.episode import Episode, observe_scene, view_keys
+from jaxnbv.planning.episode import Episode, View, observe_scene, view_keys
 from jaxnbv.scanning import Evidence, GridSurface, SensorNoise, mean_depth
 from jaxnbv.search import Proposal
 from jaxnbv.surfaces import KnownShapesPosterior, SurfacePosterior
@@ -72,12 +72,10 @@ def imagined(
     evidence: Evidence,
     posterior: SurfacePosterior,
     surfaces: GridSurface,
-    taken: Look | None,
 ) -> Imagined | None:
     """What was imagined before view `index` (from 0) was taken; None for one that was not chosen.
 
-    `evidence`: what was known before it; `posterior`: given that; `surfaces`: the step's samples; `taken`: its own
-    scan, None where that is no image.
+    `evidence`: what was known before it; `posterior`: given that; `surfaces`: the step's samples.
     """
     planner, view = episode.planner, episode.views[index]
     if view.proposal is None:
@@ -95,7 +93,7 @@ def imagined(
         np.asarray(mean_depth(_rows(scans, (slice(None), i)), pose), np.float64).reshape(camera.height, camera.width)
         for i, pose in enumerate(pair)
     ]
-    true, beside = _truth(episode, camera, view.pose, cloud), None
+    true, taken, beside = _truth(episode, camera, view.pose, cloud), taken_look(view, cloud), None
     if other is not None:
         beside = Expected(expected[1], _depth(_truth(episode, camera, other, cloud)))
     names: tuple[str, ...] = ()
@@ -118,6 +116,12 @@ def runner_up(proposal: Proposal) -> Pose | None:
     values = np.where(np.isfinite(values) & ~same, values, -np.inf)
     best = int(values.argmax())
     return None if values[best] == -np.inf else proposal.candidates[best]
+
+
+def taken_look(view: View, cloud: Float[np.ndarray, "n 3"]) -> Look | None:
+    """What a view saw; None where its scan is no image. `cloud`: what had been seen before it."""
+    is_image = view.scan.capacity == view.camera.num_rays
+    return look(view.scan, view.camera, view.pose, cloud) if is_image else None
 
 
 def look(scan: PointCloud, camera: Camera, pose: Pose, cloud: Float[np.ndarray, "n 3"]) -> Look:

@@ -23,7 +23,7 @@ from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
 from jaxnbv.surfaces import KnownShapesPosterior, SurfacePosterior
 from jaxnbv.viz.answers import may_be_words, shown_value, words_of
-from jaxnbv.viz.data import allowing_for_unseen, mean_surface
+from jaxnbv.viz.mean_surface import allowing_for_unseen, mean_surface
 from jaxnbv.viz.render import depth_picture, depth_range
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, VALUE, round_range
 

@@ -15,8 +15,9 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.viz import sphere
 from jaxnbv.viz.choice import Ascents, Choice, colour_range
-from jaxnbv.viz.data import MeanSurface, ReportData
+from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.figures import deviation_range
+from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.render import FRUSTUM_DEPTH, frustum
 from jaxnbv.viz.style import (
     BEFORE,

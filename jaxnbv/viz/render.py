@@ -15,8 +15,9 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.scanning import TriangleMesh
-from jaxnbv.viz.data import MeanSurface, ReportData
+from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.imagined import Look
+from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.sphere import unit
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, LINE, NEW
 

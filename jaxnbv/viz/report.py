@@ -27,6 +27,7 @@ from jaxnbv.viz.html import render
 from jaxnbv.viz.imagined_figures import Tile, depths, looks
 from jaxnbv.viz.page_data import payload, picture_address, space
 from jaxnbv.viz.render import draw_scene, look_picture
+from jaxnbv.viz.sketches import Sketches
 from jaxnbv.viz.task_figures import chart_figure, other_charts, task_charts
 
 _FIGURES = "figures"
@@ -42,6 +43,7 @@ def write_report(
     title: str = "object",
     progress: bool = True,
     rival: Episode | None = None,
+    sketches: Sketches | None = None,
 ) -> Path:
     """Write `report.html` and `figures/*.png` into a folder, which is made where it is missing, and return the page's
     path. Files of an earlier report are replaced.
@@ -50,11 +52,12 @@ def write_report(
       scene, where it can be. Without truth the chart counts points.
     - `title`: what the object is called.
     - `rival`: an episode of another search from the same first view, to be told of.
+    - `sketches`: those of the episode's steps, which else are made again.
 
     **Raises:** `ValueError` if the folder cannot be written, or another process writes in it.
     """
     path = make_folder(folder) / "report.html"
-    data = report_data(episode, truth, progress, rival=rival)
+    data = report_data(episode, truth, progress, rival=rival, sketches=sketches)
     stills = Stills(data)
     with writing_in(path.parent, _FIGURES):
         write_figures(data, episode.planner.camera, path.parent / _FIGURES, progress, stills)

@@ -101,8 +101,8 @@ def test_views_that_are_known_are_told_and_not_asked_for():
 def test_a_step_holds_the_samples_and_the_evidence_that_the_next_view_is_chosen_from():
     own = planner(DiscreteSearch(CANDIDATES), 3)
     first, second, third = steps(own, scene_sensor(SCENE, CAMERA), FIRST, KEY)
-    assert (first.surfaces, first.seconds) == (None, 0.0)
-    again = own.choose(second.evidence, third.surfaces, jax.random.key(0))
+    assert (first.basis, first.seconds) == (None, 0.0)
+    again = own.choose(second.evidence, third.basis.surfaces, jax.random.key(0))
     assert_same(again, third.view.proposal)
     assert third.seconds > 0.0
 

@@ -201,8 +201,8 @@ def test_every_view_is_told_when_it_is_done(tmp_path):
     """Its file is there, and that of the next is not; those of the folder are told too."""
     told = []
 
-    def each(view):
-        told.append((view, len([*tmp_path.glob("view_*.npz")])))
+    def each(step):
+        told.append((step.view, len([*tmp_path.glob("view_*.npz")])))
 
     run(tmp_path, views=2, each=each)
     assert [files for _, files in told] == [1, 2]

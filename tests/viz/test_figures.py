@@ -18,8 +18,8 @@ import jaxnbv as nbv
 from jaxnbv.acquisition import Answer, Quantity
 from jaxnbv.viz import report_data
 from jaxnbv.viz.answers import Panel
-from jaxnbv.viz.data import MeanSurface
 from jaxnbv.viz.figures import STYLE, Stills, figures_of
+from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.page_data import clustered, payload, space
 from jaxnbv.viz.stage import stage_of
 from jaxnbv.viz.style import spaced_ticks
@@ -36,7 +36,7 @@ def episode():
 def data(episode):
     """Without surfaces, which take long to paint and have no letters."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jaxnbv.viz.data.mean_surface", lambda *arguments: None)
+        patch.setattr("jaxnbv.viz.sketches.mean_surface", lambda *arguments: None)
         return report_data(episode, progress=False)
 
 
@@ -234,7 +234,7 @@ def test_a_record_without_standard_errors_gives_a_page_too(episode):
         for view in episode.views
     )
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jaxnbv.viz.data.mean_surface", lambda *arguments: None)
+        patch.setattr("jaxnbv.viz.sketches.mean_surface", lambda *arguments: None)
         old = report_data(dataclasses.replace(episode, views=views), progress=False, imagine=False)
     shown = payload(old)["views"][1]["choice"]
     assert shown["errors"] is None

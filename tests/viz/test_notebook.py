@@ -101,7 +101,7 @@ def test_what_has_no_picture_has_its_facts():
 
 def test_an_episode_is_shown_in_a_strip(episode, monkeypatch):
     """Without surfaces, which take long; the figure is tested with the report's."""
-    monkeypatch.setattr("jaxnbv.viz.data.mean_surface", lambda *arguments: None)
+    monkeypatch.setattr("jaxnbv.viz.sketches.mean_surface", lambda *arguments: None)
     image = Image.open(io.BytesIO(nbv.show(episode, progress=False)._repr_png_()))
     assert image.width == 480
     assert image.height > 300

@@ -20,7 +20,7 @@ from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.viz import report_data, write_figures, write_report
 from jaxnbv.viz.answers import label_of, number
 from jaxnbv.viz.choice import choice_of
-from jaxnbv.viz.data import mean_surface
+from jaxnbv.viz.mean_surface import mean_surface
 from jaxnbv.viz.page_data import payload
 from jaxnbv.viz.render import frustum
 from jaxnbv.viz.sphere import from_mollweide, mollweide, smooth_map

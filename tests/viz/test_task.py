@@ -49,7 +49,7 @@ def run(score, scene, views=3):
 def plain(request):
     """Pictures of surfaces take long, and have nothing to do with the numbers."""
     patch = pytest.MonkeyPatch()
-    patch.setattr("jaxnbv.viz.data.mean_surface", lambda *arguments: None)
+    patch.setattr("jaxnbv.viz.sketches.mean_surface", lambda *arguments: None)
     yield
     patch.undo()
 

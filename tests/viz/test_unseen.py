@@ -6,7 +6,7 @@ import numpy as np
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Capsule
 from jaxnbv.viz import report_data
-from jaxnbv.viz.data import MeanSurface, allowing_for_unseen
+from jaxnbv.viz.mean_surface import MeanSurface, allowing_for_unseen
 
 
 def test_the_deviation_allows_for_a_quarter_of_the_distance_to_the_nearest_point():

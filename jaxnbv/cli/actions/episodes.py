@@ -23,7 +23,7 @@ from jaxnbv.cli.actions.until import rule
 from jaxnbv.cli.registry import TASKS
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.imagination import Imagination
-from jaxnbv.planning.episode import View, simulate
+from jaxnbv.planning.episode import Episode, Step, simulate
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SensorNoise, Surface, load_mesh, scan
 from jaxnbv.scanning.sensors import Setting
@@ -161,14 +161,17 @@ def _run(
         typer.echo("--quick: small settings; leave it out for the usual ones.")
     if asked.overwrite:
         clear(folder, _RIVAL)
+    key, noise = jax.random.key(asked.seed), SensorNoise(asked.noise, asked.noise)
     lines = Lines(planner)
+    sketches = viz.Sketches(Episode(planner, scene, noise, first, key, ())) if asked.report else None
 
-    def tell(view: View) -> None:
+    def tell(step: Step) -> None:
         if lines.count == 0:
             note(folder, options)
-        lines(view)
+        lines(step.view)
+        if sketches is not None:
+            sketches.add(step)
 
-    key, noise = jax.random.key(asked.seed), SensorNoise(asked.noise, asked.noise)
     try:
         episode = simulate(planner, scene, first, asked.views, key, noise, folder, until=enough, each=tell)
         raced = None
@@ -185,5 +188,5 @@ def _run(
     if raced is not None:
         typer.echo(f"race     {race_words(raced, planner.acquisition)}")
     if asked.report:
-        typer.echo(f"report   {viz.write_report(episode, folder, title=name, rival=raced)}")
+        typer.echo(f"report   {viz.write_report(episode, folder, title=name, rival=raced, sketches=sketches)}")
     typer.echo(f"episode  {folder}   ({time.perf_counter() - start:.0f} s)")

@@ -19,8 +19,8 @@ from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.storage.files import make_folder
 from jaxnbv.studies.engine.measures import Record
-from jaxnbv.viz.data import MeanSurface
 from jaxnbv.viz.figures import STYLE
+from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.render import Still
 from jaxnbv.viz.style import LINE, save_figure
 

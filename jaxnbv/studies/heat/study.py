@@ -199,15 +199,14 @@ class HeatStudy(MeshStudy):
         search. With "heat-halving" among the methods, each step of "heat" asks that search too.
         """
         halving = self.planner("heat-halving", scene) if method == "heat" and "heat-halving" in methods else None
-        clouds, taken, compared, before = [], [], [], None
+        clouds, taken, compared = [], [], []
         for view, step in enumerate(episode):
             clouds.append(step.evidence.cloud)
-            if before is not None and (proposal := step.view.proposal) is not None:
+            if (proposal := step.view.proposal) is not None:
                 taken.append({"value": float(proposal.value), "seconds": step.seconds})
-                if halving is not None:
+                if halving is not None and step.basis is not None:
                     key = view_keys(self.key(scene.index, "episode"), view)[1]
-                    compared.append(_halved(halving, before, step.surfaces, key, proposal))
-            before = step.evidence
+                    compared.append(_halved(halving, step.basis.evidence, step.basis.surfaces, key, proposal))
         run = {"steps": taken, **_estimates(clouds, heat_problem(scene), truth)}
         return run if halving is None else run | {"halving": compared}
 

@@ -1,0 +1,72 @@
+"""What costs most of an episode's pictures, drawn step by step while what a step imagined is at hand."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+from jaxnbv.planning.episode import Episode, Step, view_keys
+from jaxnbv.scanning import Evidence, GridSurface
+from jaxnbv.surfaces import SurfacePosterior
+from jaxnbv.viz.imagined import Imagined, imagined
+from jaxnbv.viz.mean_surface import MeanSurface, allowing_for_unseen, mean_surface
+
+
+class Sketch(NamedTuple):
+    """What a step knew before its view was taken.
+
+    - `surface`: of the posterior mean, with a deviation that allows for what was not seen; None where it has none.
+    - `imagined`: None for a view that was not chosen, or not taken.
+    """
+
+    surface: MeanSurface | None
+    imagined: Imagined | None
+
+
+class Sketches:
+    """Those of an episode that is under way: give `add` to `simulate(each=...)`, and the whole to `write_report`.
+
+    - `episode`: without its views, which come one by one.
+    - `held`: sketches by the index of the view, from 0; none of views that were given or read from a folder.
+    """
+
+    def __init__(self, episode: Episode):
+        self.episode, self.held = episode, dict[int, Sketch]()
+
+    def add(self, step: Step) -> None:
+        """The step to the next view."""
+        self.episode = dataclasses.replace(self.episode, views=(*self.episode.views, step.view))
+        if step.basis is not None:
+            index = len(self.episode.views) - 1
+            self.held[index] = _sketch(self.episode, index, *step.basis)
+
+
+def sketches_of(episode: Episode, held: Mapping[int, Sketch], imagine: bool) -> Iterator[Sketch]:
+    """The sketch of the step that follows each view, that of the one after the last included, which was not taken.
+
+    `held`: those that there are; `imagine`: whether the others show what was imagined.
+    """
+    for index, evidence in enumerate(episode.evidence(), start=1):
+        if index in held:
+            yield held[index]
+            continue
+        posterior, surfaces = episode.planner.imagination.posterior(evidence), None
+        # With the key of the step: what it imagined, and moments where the posterior has no closed ones.
+        if (imagine and index < len(episode.views)) or not posterior.has_closed_forms:
+            sample_key, *_ = view_keys(episode.key, index)
+            surfaces = episode.planner.imagination.sample(evidence, sample_key, posterior)
+        yield _sketch(episode, index, evidence, posterior, surfaces, imagine)
+
+
+def _sketch(
+    episode: Episode,
+    index: int,
+    evidence: Evidence,
+    posterior: SurfacePosterior,
+    surfaces: GridSurface | None,
+    imagine: bool = True,
+) -> Sketch:
+    mean = mean_surface(episode.planner.imagination, evidence, posterior, surfaces)
+    seen = None
+    if imagine and surfaces is not None and index < len(episode.views):
+        seen = imagined(episode, index, evidence, posterior, surfaces)
+    return Sketch(allowing_for_unseen(mean, evidence.cloud), seen)
