@@ -93,7 +93,7 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
     ("arguments", "words"),
     [
         (("run", "absent.obj"), ("absent.obj",)),
-        (("demo", "--views", "0"), ("0 views", "at least one")),
+        (("demo", "--task", "coverage", "--views", "0"), ("0 views", "at least one")),
         (("demo", "--task", "coverage", "--first", "1,2"), ("'1,2'", "three numbers")),
         (("demo", "--task", "coverage", "--first", "0,0,0"), ("target",)),
         (("demo", "--task", "coverage", "--first", "0,0,9", "--noise", "-1"), ("-1", "negative")),
@@ -178,6 +178,7 @@ def test_a_published_checkpoint_converts_and_classifies_a_mesh(tmp_path, shared)
     assert "->" in result.stdout
 
 
+@pytest.mark.slow
 def test_the_study_writes_tables_and_figures_and_continues(tmp_path):
     arguments = ("study", "pyramid", "--quick", "--views", "2", "--framing", "whole", "--out", "mine")
     some = ("--methods", "farthest,oracle")

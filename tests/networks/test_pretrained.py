@@ -28,7 +28,8 @@ def test_the_weights_are_small():
     assert pyramid_classifier().classes == PATTERNS
 
 
-@pytest.mark.parametrize("framing", [pytest.param(Framing.CLOSE_UP, marks=pytest.mark.slow), Framing.WHOLE])
+@pytest.mark.slow
+@pytest.mark.parametrize("framing", Framing)
 def test_right_where_the_pattern_is_seen_and_undecided_where_it_is_not(framing):
     """Fifty test clouds of which one view shows the pattern well, and those met meanwhile that have none of it."""
     enough = {Framing.CLOSE_UP: 500, Framing.WHOLE: 150}[framing]

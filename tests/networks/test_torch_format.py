@@ -228,6 +228,7 @@ def test_declared_sizes_cost_nothing(tmp_path):
     refusals(*files)
 
 
+@pytest.mark.slow
 def test_members_that_are_compressed_or_shared_are_refused(tmp_path):
     count = 2**26
     content = {"a": view(storage("0", "FloatStorage", count), 0, (count,), (1,))}

@@ -181,7 +181,10 @@ def compare(score, surfaces, pairs, step=STEP):
 
 @pytest.mark.parametrize(
     ("kind", "space"),
-    [("filling", "sphere"), ("blob", "sphere"), pytest.param("rough", "free", marks=pytest.mark.slow)],
+    [
+        ("blob", "sphere"),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("filling", "sphere"), ("rough", "free"))),
+    ],
 )
 def test_derivatives_are_those_of_central_differences(kind, space, x64):
     surfaces, pairs = surfaces_of(kind), pairs_of(space)

@@ -71,6 +71,7 @@ def test_it_is_asked_under_as_many_keys_and_the_best_are_believed_most():
     assert sum(posterior.kinds().values()) == pytest.approx(1.0, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_a_planner_takes_it_and_compiles_once(compilations):
     imagination = nbv.Imagination(nbv.Completed(PLAIN, the_ball), nbv.Grid(24), 2)
     planner = nbv.Planner(nbv.NewSurface(), nbv.DiscreteSearch(8), CAMERA, imagination, capacity=256)

@@ -198,6 +198,7 @@ def test_systematic_resampling_draws_each_as_often_as_its_weight_says(weights, s
     assert np.all(np.abs(counts - expected) < 1.0 + 1e-3)
 
 
+@pytest.mark.slow
 def test_the_same_evidence_has_the_same_hypotheses_and_nothing_is_compiled_twice():
     surface = nbv.SDFSurface(filling(corner(0.5), Rotation.identity(), BANK, 1)[0])
     imagination = dataclasses.replace(nbv.Imagination(QUICK, GRID, 3).knowing(BANK, nbv.AsGiven()))

@@ -254,6 +254,7 @@ def test_points_where_functions_only_repeat_are_refused():
         assert np.isfinite(ask(near)).all()
 
 
+@pytest.mark.slow
 def test_samples_at_the_data_have_the_posteriors_moments():
     """Of 4,000 samples: a standard deviation is known to 1.1 %. Noise as large as the field, so that draws without it
     would vary less."""

@@ -124,7 +124,9 @@ def test_where_all_of_the_object_tells_its_class_no_pixels_are_counted(kind):
     assert {*kind.groups([found])} == {"all"}
 
 
-@pytest.mark.parametrize("kind", [TruckStudy, pytest.param(ModelNet10Study, marks=pytest.mark.slow), OmniObject3DStudy])
+@pytest.mark.parametrize(
+    "kind", [TruckStudy, *(pytest.param(kind, marks=pytest.mark.slow) for kind in (ModelNet10Study, OmniObject3DStudy))]
+)
 def test_tables_charts_and_pictures(kind, tmp_path):
     text = summary([record(kind)], kind)
     assert kind.title in text

@@ -144,6 +144,7 @@ def test_diagnostics_of_every_method_at_every_view():
             assert entry["rank_correlation"] is None or -1 <= entry["rank_correlation"] <= 1
 
 
+@pytest.mark.slow
 def test_every_choice_is_the_one_that_the_planner_proposes_with_the_same_key():
     """Each method's planner alone, by `propose`, at each view of its run; and each run of random search."""
     study, record = small_study(), whole_record()

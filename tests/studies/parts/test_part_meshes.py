@@ -116,6 +116,7 @@ def test_the_command_takes_a_folder(folder, tmp_path):
     assert study.num_candidates == PartStudy.quick["num_candidates"]
 
 
+@pytest.mark.slow
 def test_its_pictures_are_of_the_object_with_the_most_parts(folder, tmp_path):
     study = small_study(folder)
     records = [study.run_scene(index, ("farthest",)) for index in (1, 0)]

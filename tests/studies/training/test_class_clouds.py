@@ -78,6 +78,7 @@ def test_scanned_clouds_are_samples_of_their_scenes_with_noise(scanned):
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_telling_pixels_vary_and_are_at_most_those_of_one_view(scanned):
     pixels = np.asarray(scanned.cue_pixels)
     assert pixels.min() >= 0
@@ -160,6 +161,7 @@ def test_imagined_clouds_begin_with_what_was_truly_seen(imagined):
         assert len({points.tobytes() for points, _ in clouds}) == 6
 
 
+@pytest.mark.slow
 def test_imagined_clouds_can_be_made_again(imagined):
     again = imagined_of(6)
     assert_same(imagined[1], again)

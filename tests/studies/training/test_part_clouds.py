@@ -113,6 +113,7 @@ def test_thinned_points_keep_their_labels_and_spare_rows_hold_nothing(filled):
     assert not np.asarray(thinned.normals[count:]).any()
 
 
+@pytest.mark.slow
 def test_clouds_of_a_scene_are_of_different_views_and_samples(scanned, imagined):
     assert imagined.clouds.points.shape == (2 * 2 * 3, POINTS, 3)
     assert len({np.asarray(points).tobytes() for points in scanned.clouds.points}) == 6
