@@ -105,7 +105,7 @@ def _matrix(frame: Frame | None, pose: Pose) -> list[list[float]]:
 def picture_address(picture: UInt8[np.ndarray, "h w _"], lossless: bool = False) -> str:
     """An image as a data address."""
     file = io.BytesIO()
-    Image.fromarray(picture).save(file, format="WEBP", quality=_QUALITY, lossless=lossless, method=6)
+    Image.fromarray(picture).save(file, format="WEBP", quality=_QUALITY, lossless=lossless)
     return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
 
 
