@@ -353,6 +353,11 @@ REFUSED = {
     "an older session that asks": (older_session_asks, "another process has added some"),
     "a record without cameras": (lambda: replayed("blind", cameras=[]), "what the sensor was"),
     "a record without a box": (lambda: replayed("boxless", box=None), "what the sensor was"),
+    "a record of half a box": (lambda: replayed("half", box={"high": [1.0] * 3}), "a low and a high corner"),
+    "a record of more than a box": (
+        lambda: replayed("more", box={"low": [0.0] * 3, "high": [1.0] * 3, "middle": [0.5] * 3}),
+        "a low and a high corner",
+    ),
     "a number as a camera": (lambda: replayed("number", cameras=[1]), "what the sensor was"),
     "a scene without a number": (lambda: records("unnumbered"), "scene_x.json is no record"),
     "a PLY that ends early": (lambda: cut("early.ply", 0.6), "its header declares"),

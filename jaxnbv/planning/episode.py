@@ -179,13 +179,15 @@ def simulate(
             sensor = scene_sensor(scene, planner.camera, noise, planner.imagination.surroundings)
             watch = None if until is None else Watch(until, planner)
             episode = steps(planner, sensor, first, key, done=done, begin=begin, watch=watch)
-            for index, step in enumerate(itertools.islice(episode, views)):
-                view = step.view
+            for step in itertools.islice(episode, views):
+                index, view = len(finished), step.view
                 finished.append(view)
                 if store and index >= len(done):
                     store.write_view(index, view.pose, view.scan, view.proposal)
                 if each is not None:
                     each(step)
+                # Its posterior may be large, and is not to be held beside that of the next step.
+                del step
             stopped = watch.reason if watch and len(finished) < views else None
             bar.update(bar.total - bar.n)
         if store:
@@ -204,6 +206,13 @@ class Basis(NamedTuple):
     evidence: Evidence
     posterior: SurfacePosterior
     surfaces: GridSurface
+
+    @classmethod
+    def of(cls, planner: Planner, evidence: Evidence, key: PRNGKeyArray) -> "Basis":
+        """Of the next step, once it is computed."""
+        posterior = planner.imagination.posterior(evidence)
+        surfaces = planner.imagination.sample(evidence, key, posterior)
+        return cls(evidence, posterior, jax.block_until_ready(surfaces))
 
 
 class Step(NamedTuple):
@@ -256,9 +265,7 @@ def steps(
                     return
                 if planner.search.uses_samples:
                     begin(index, STAGES[0])
-                    posterior = planner.imagination.posterior(evidence)
-                    surfaces = planner.imagination.sample(evidence, sample_key, posterior)
-                    basis = Basis(evidence, posterior, jax.block_until_ready(surfaces))
+                    basis = Basis.of(planner, evidence, sample_key)
                 begin(index, STAGES[1])
                 start = time.perf_counter()
                 sampled = None if basis is None else basis.surfaces

@@ -35,6 +35,7 @@ class StoredSession:
         config = self._folder.config
         try:
             self.cameras = tuple(camera_of(camera) for camera in config["cameras"])
+            require(config["box"].keys() - {"type"} == {"low", "high"}, "a box has a low and a high corner")
             self.box = Box(config["box"]["low"], config["box"]["high"])
             self.up, self.convention, self.stride = (config[name] for name in ("up", "convention", "stride"))
             # A session that was told what stands around it did not look for a table.

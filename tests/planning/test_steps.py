@@ -1,6 +1,8 @@
 """Views one by one: those of a simulated episode, and what stands behind each."""
 
+import gc
 import itertools
+import weakref
 
 import equinox as eqx
 import jax
@@ -12,7 +14,7 @@ from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.imagination import Imagination
-from jaxnbv.planning.episode import scene_sensor, steps
+from jaxnbv.planning.episode import scene_sensor, simulate, steps
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
 from jaxnbv.scanning.sdf import Sphere
@@ -105,6 +107,22 @@ def test_a_step_holds_the_samples_and_the_evidence_that_the_next_view_is_chosen_
     again = own.choose(second.evidence, third.basis.surfaces, jax.random.key(0))
     assert_same(again, third.view.proposal)
     assert third.seconds > 0.0
+
+
+def test_an_episode_lets_a_posterior_go_before_it_makes_the_next(monkeypatch):
+    """At thousands of points each holds hundreds of megabytes."""
+    made, posterior = [], Imagination.posterior
+
+    def told(imagination, evidence):
+        gc.collect()
+        assert all(earlier() is None for earlier in made)
+        found = posterior(imagination, evidence)
+        made.append(weakref.ref(found))
+        return found
+
+    monkeypatch.setattr(Imagination, "posterior", told)
+    simulate(planner(DiscreteSearch(CANDIDATES), 4), SCENE, FIRST, 4, KEY, progress=False)
+    assert len(made) == 3
 
 
 def test_another_acquisition_or_search_does_not_compile_the_sampler_again(compilations):
