@@ -231,7 +231,7 @@ def main() -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
     records = json.loads(out.read_text()) if out.exists() else {}
     for file in tqdm(asked.mesh, desc="objects"):
-        names = [f"{file.stem} {repeat}" for repeat in range(repeats)]
+        names = [f"{file.parent.name}/{file.stem} {repeat}" for repeat in range(repeats)]
         if all(name in records for name in names):
             continue
         trial = Trial(file, protocol, asked.half, asked.up)
