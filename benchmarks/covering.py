@@ -18,11 +18,13 @@ CANDIDATES = 800
 class Protocol(NamedTuple):
     """Lengths in metres; `scale`: metres for one scene unit, of an object whose box has these sides.
 
+    - `stride`: of the camera's image, for fewer rays of the same cone.
     - `step`: to what the sensor measures; 0 for exactly. `voxel`: of which one point is kept; 0 for all.
     """
 
     scale: Callable[[np.ndarray], float]
     camera: nbv.Camera
+    stride: int
     distance: float
     tolerance: float
     step: float

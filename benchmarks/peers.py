@@ -34,7 +34,7 @@ from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.storage.files import write_text
 from jaxnbv.studies.engine.results import interval
 
-LOOKED_AT, RAYS = 200, 40
+LOOKED_AT = 200
 # New surface is what lies farther than this from what was seen, in scene units: 1/50 of the longest side, about what
 # 2,048 points kept of an object are apart. Chosen on the bunny, the buddha and the teapot, from 0.1, 0.05 and 0.03.
 SIZE, CAPACITY, SAMPLES = 0.05, 2048, 16
@@ -44,10 +44,20 @@ _WIDE = nbv.Camera(math.radians(70.0), 720, 1280)
 _APART = 1.2 / _WIDE.focal_lengths[1]
 PROTOCOLS = {
     "pb-nbv": Protocol(
-        lambda sides: 0.3 / sides.min(), _D435.strided(2), 0.9, 0.005, 0.0, 0.0, 10_000, 10, 1, (3, 6, 10)
+        lambda sides: 0.3 / float(sides.min()), _D435, 2, 0.9, 0.005, 0.0, 0.0, 10_000, 10, 1, (3, 6, 10)
     ),
     "benbv": Protocol(
-        lambda sides: 0.2 / np.linalg.norm(sides), _WIDE, 1.2, 0.002, 0.001, _APART, 60_000, 15, 10, (3, 6, 10, 15)
+        lambda sides: 0.2 / float(np.linalg.norm(sides)),
+        _WIDE,
+        1,
+        1.2,
+        0.002,
+        0.001,
+        _APART,
+        60_000,
+        15,
+        10,
+        (3, 6, 10, 15),
     ),
 }
 METHODS = {
@@ -64,13 +74,13 @@ METHODS = {
 }
 
 
-def planned(trial: Trial, search: nbv.Search, first: int, seed: int) -> tuple[list[int], list[float]]:
+def planned(trial: Trial, search: nbv.Search, rays: int, first: int, seed: int) -> tuple[list[int], list[float]]:
     """The candidates that a planner takes, and seconds for each choice after those that compile."""
     distance = float(np.linalg.norm(trial.poses.position[0]))
     needed = 2.0 * math.asin(min(1.05 * trial.mesh.bounding_radius / distance, 1.0))
     # In steps, so that objects of about one size share their programs.
     needed = math.radians(5.0) * math.ceil(needed / math.radians(5.0))
-    camera = nbv.Camera(min(needed, trial.protocol.camera.fov), RAYS, RAYS)
+    camera = nbv.Camera(min(needed, trial.protocol.camera.fov), rays, rays)
     planner = nbv.Planner(
         nbv.NewSurface(SIZE),
         search,
@@ -153,7 +163,7 @@ def spread(poses: nbv.Pose) -> Int[np.ndarray, " some"]:
     return np.asarray(farthest_point_indices(poses.position, np.ones(CANDIDATES, bool), LOOKED_AT))
 
 
-def run(trial: Trial, methods: tuple[str, ...], seed: int) -> dict:
+def run(trial: Trial, methods: tuple[str, ...], rays: int, seed: int) -> dict:
     """Of each method the coverage after each view, and the seconds a choice of those that plan."""
     protocol, random, found = trial.protocol, np.random.default_rng(seed), {}
     above = np.asarray(trial.poses.position)[:, 1] >= 0
@@ -177,7 +187,7 @@ def run(trial: Trial, methods: tuple[str, ...], seed: int) -> dict:
     for method in methods:
         seconds: list[float] = []
         if method in searches:
-            taken, seconds = planned(trial, searches[method], first, seed)
+            taken, seconds = planned(trial, searches[method], rays, first, seed)
             shown = trial.covers(taken)
         elif method in others:
             shown = trial.covers(others[method]())
@@ -222,11 +232,14 @@ def main() -> None:
     parser.add_argument("--mesh", nargs="+", type=Path, required=True, help="mesh files")
     parser.add_argument("--up", default="y", help="the files' axis that is upward")
     parser.add_argument("--half", action="store_true", help="candidates on the upper half alone")
+    parser.add_argument("--rays", type=int, default=40, help="rays along a side of the images that are imagined")
+    parser.add_argument("--stride", type=int, help="rows and columns of the sensor's image for one that counts")
     parser.add_argument("--repeats", type=int, help="runs of each object; default: the protocol's")
     parser.add_argument("--out", type=Path, help="default: runs/peers-PROTOCOL[-half].json")
     asked = parser.parse_args()
     protocol, methods = PROTOCOLS[asked.protocol], METHODS[asked.protocol]
-    repeats = asked.repeats or protocol.repeats
+    repeats, stride = asked.repeats or protocol.repeats, asked.stride or protocol.stride
+    protocol = protocol._replace(camera=protocol.camera.strided(stride))
     out = asked.out or Path("runs") / f"peers-{asked.protocol}{'-half' if asked.half else ''}.json"
     out.parent.mkdir(parents=True, exist_ok=True)
     records = json.loads(out.read_text()) if out.exists() else {}
@@ -240,7 +253,7 @@ def main() -> None:
             continue
         for repeat, name in enumerate(names):
             if name not in records:
-                records[name] = run(trial, methods, repeat)
+                records[name] = run(trial, methods, asked.rays, repeat)
                 write_text(out, json.dumps(records))
     print(table(records, methods, protocol))
 
