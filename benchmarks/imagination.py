@@ -7,7 +7,7 @@
 Objects are N validation pyramids in close-up, one validation object of each part category named, and the demo object;
 with meshes, these alone and what else is asked for. All models see the same scans of 50 x 50 rays with the default
 noise, from the same two random views. Samples are 8 on a grid of 64^3 nodes; depths are along 32 x 32 rays from each
-candidate. See `jaxnbv.studies.forecasts` for the numbers. Continues with what the file does not hold yet.
+candidate. See `forecasts.py` for the numbers. Continues with what the file does not hold yet.
 
 With --known the model "known" is the default that has seen the meshes of a folder, upright, all but the object itself.
 
@@ -29,6 +29,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from forecasts import Truth, judge
 from imagination_figures import draw_reliability, draw_samples
 from tqdm import tqdm
 
@@ -39,7 +40,6 @@ from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.storage import describe
 from jaxnbv.storage.files import write_whole
 from jaxnbv.storage.folders import versions
-from jaxnbv.studies.forecasts import Truth, judge
 from jaxnbv.studies.scenes import PART_CATEGORIES, Split, demo_object, part_scene, pyramid_scene
 
 GRID = nbv.Grid(64, 0.7 * 2.5)

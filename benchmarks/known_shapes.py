@@ -17,13 +17,13 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from forecasts import Truth, judge
 from imagination import RAYS, VARIANTS, VOLUME, planner_of, random_views, seen_space
 from tqdm import tqdm
 
 import jaxnbv as nbv
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.storage.files import write_whole
-from jaxnbv.studies.forecasts import Truth, judge
 from jaxnbv.studies.scenes import PART_CATEGORIES, Split, household_scene, part_scene
 from jaxnbv.studies.scenes.banks import bank_poses, shape_bank
 from jaxnbv.studies.scenes.household import HOUSEHOLD

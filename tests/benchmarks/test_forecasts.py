@@ -6,6 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from forecasts import (
+    Truth,
+    brier,
+    crps,
+    empty_share,
+    exit_depths,
+    judge,
+    ray_depths,
+    reliability,
+    share_of_best,
+)
 from scipy.stats import norm
 
 from jaxnbv import (
@@ -23,17 +34,6 @@ from jaxnbv import (
 )
 from jaxnbv.imagination import Imagination
 from jaxnbv.scanning.sdf import Sphere
-from jaxnbv.studies.forecasts import (
-    Truth,
-    brier,
-    crps,
-    empty_share,
-    exit_depths,
-    judge,
-    ray_depths,
-    reliability,
-    share_of_best,
-)
 
 # Nodes 0.125 apart, one of them at the origin, so that |x| - r is interpolated exactly along the axes.
 GRID = Grid(25, 1.5)
