@@ -69,17 +69,23 @@ def sample_truck(key: PRNGKeyArray, label: int, longest_side: float = 2.5, turne
     truck, low, high = _truck(rng)
     turn = rotation_about((0.0, 1.0, 0.0), rng.uniform(-np.pi, np.pi))
     cargo = [moved(p, rotation=turn) for p in household_primitives(HOUSEHOLD[label], rng)]
-    least_corner, greatest_corner = bounds(cargo)
-    room = rng.uniform(0.85, 0.95) * (high - low) / (greatest_corner - least_corner)
-    scale = room.min()
-    # On the bed, anywhere that it has room.
-    slack = (high - low) - scale * (greatest_corner - least_corner)
-    corner = low + slack * np.array([rng.random(), 0.0, rng.random()])
-    cargo = [moved(p, scale, offset=corner - scale * least_corner) for p in cargo]
+    scale, offset = stowed(np.stack([low, high]), bounds(cargo), rng)
+    cargo = [moved(p, scale, offset=offset) for p in cargo]
     rotation = random_rotation(rng) if turned else np.eye(3)
     both = fitted([moved(p, rotation=rotation) for p in truck + cargo], longest_side)
     solids = {"truck": united(both[: len(truck)]), "cargo": united(both[len(truck) :])}
     return LoadedTruck(**solids, label=jnp.asarray(label))
+
+
+def stowed(
+    room: Float[np.ndarray, "2 3"], cargo: Float[np.ndarray, "2 3"], rng: np.random.Generator
+) -> tuple[float, Float[np.ndarray, "3"]]:
+    """By what a cargo is scaled, and then moved, to stand on the floor of a bed, anywhere that it has room, as large
+    as it can be or a little less. Both boxes are given by their lowest and highest corners."""
+    side, size = np.diff(room, axis=0)[0], np.diff(cargo, axis=0)[0]
+    scale = float((rng.uniform(0.85, 0.95) * side / size).min())
+    corner = room[0] + (side - scale * size) * np.array([rng.random(), 0.0, rng.random()])
+    return scale, corner - scale * cargo[0]
 
 
 def random_rotation(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:

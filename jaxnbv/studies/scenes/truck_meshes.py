@@ -7,7 +7,7 @@ from jaxnbv.checks import InputError
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.studies.scenes.class_object import ClassMesh
 from jaxnbv.studies.scenes.labelled import generator, rotation_about
-from jaxnbv.studies.scenes.truck import random_rotation
+from jaxnbv.studies.scenes.truck import random_rotation, stowed
 
 # The truck is looked at from above, along so many lines of rays.
 _LINES = 96
@@ -74,12 +74,9 @@ def loaded_truck(truck: TriangleMesh, cargo: TriangleMesh, label: int, key: PRNG
     **Raises:** `ValueError` as `bed_of` does.
     """
     rng = generator(key)
-    low, high = bed_of(truck)
     turned = cargo.vertices @ rotation_about((0.0, 1.0, 0.0), rng.uniform(-np.pi, np.pi)).T
-    least, greatest = turned.min(axis=0), turned.max(axis=0)
-    scale = (rng.uniform(0.85, 0.95) * (high - low) / (greatest - least)).min()
-    slack = (high - low) - scale * (greatest - least)
-    placed = low + slack * np.array([rng.random(), 0.0, rng.random()]) + scale * (turned - least)
+    scale, offset = stowed(bed_of(truck), np.stack([turned.min(axis=0), turned.max(axis=0)]), rng)
+    placed = scale * turned + offset
     rotation = random_rotation(rng)
     vertices = np.concatenate([truck.vertices, placed]) @ rotation.T
     whole = TriangleMesh.from_arrays(vertices, np.concatenate([truck.faces, cargo.faces + len(truck.vertices)]))
