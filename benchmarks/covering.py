@@ -47,7 +47,11 @@ class Trial:
     """An object in a protocol: points of its surface, candidates about it, and what each pose shows of it."""
 
     def __init__(self, file: Path, protocol: Protocol, half: bool, up: str):
-        self.mesh, self.protocol = nbv.load_mesh(file, up), protocol
+        self.mesh, self.protocol, self.camera = (
+            nbv.load_mesh(file, up),
+            protocol,
+            protocol.camera.strided(protocol.stride),
+        )
         self.unit = protocol.scale(np.ptp(self.mesh.vertices, axis=0))
         key = jax.random.key(zlib.crc32(file.stem.encode()))
         directions = np.array(jax.random.normal(key, (CANDIDATES, 3)), np.float64)
@@ -58,9 +62,9 @@ class Trial:
         self.half, self.poses = half, nbv.look_at(protocol.distance / self.unit * directions)
         points = self.mesh.sample_points(key, protocol.points)
         self.points = one_a_voxel(points, points, protocol.voxel / self.unit)[0] if protocol.voxel else points
-        self.directions = np.asarray(protocol.camera.pixel_directions(), np.float64)
         self._known: dict[int, np.ndarray] = {}
-        self.directions = self.directions.reshape(protocol.camera.height, protocol.camera.width, 3)
+        directions = np.asarray(self.camera.pixel_directions(), np.float64)
+        self._directions = directions.reshape(self.camera.height, self.camera.width, 3)
 
     def covers(self, candidates: Iterable[int]) -> Bool[np.ndarray, "candidates points"]:
         """What each of some candidates covers; none is scanned twice."""
@@ -73,9 +77,9 @@ class Trial:
         """What the sensor sees from a pose, by those of its rays that can meet the object."""
         origin, rotation = np.asarray(pose.position, np.float64), np.asarray(pose.rotation, np.float64)
         local = (self.points - origin) @ rotation
-        column, row = self.protocol.camera.to_pixels(local[:, :2] / local[:, 2:]).T
+        column, row = self.camera.to_pixels(local[:, :2] / local[:, 2:]).T
         rows, columns = (slice(max(int(at.min()) - 1, 0), max(int(at.max()) + 2, 0)) for at in (row, column))
-        local = self.directions[rows, columns].reshape(-1, 3)
+        local = self._directions[rows, columns].reshape(-1, 3)
         directions = local @ rotation.T
         length = np.linalg.norm(directions, axis=1, keepdims=True)
         hits = self.mesh.trace(np.broadcast_to(origin, directions.shape), directions / length)

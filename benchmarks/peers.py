@@ -12,13 +12,15 @@ rows at 1.2 m that measures to 1 mm, the first view at random from above, fiftee
 Covered: of the points of the surface, those that a scanned point is near to within the tolerance. The views of
 `new surface` and `farthest view` are planned with 40 x 40 rays of the part of the cone that holds the object; what
 counts is what the sensor sees, in pb-nbv by every other row and column. `oracle` takes the candidate that truly adds
-most, `uniform` spreads its views before it has seen anything. Continues after the last run in the file.
+most, `uniform` spreads its views before it has seen anything. Continues after the last run in the file, which is of
+the same settings.
 """
 
 import argparse
 import json
 import math
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -41,35 +43,39 @@ SIZE, CAPACITY, SAMPLES = 0.05, 2048, 16
 
 _D435 = nbv.Camera.from_intrinsics([[696.0, 0, 640], [0, 696, 360], [0, 0, 1]], 720, 1280)
 _WIDE = nbv.Camera(math.radians(70.0), 720, 1280)
-_APART = 1.2 / _WIDE.focal_lengths[1]
 PROTOCOLS = {
     "pb-nbv": Protocol(
-        lambda sides: 0.3 / float(sides.min()), _D435, 2, 0.9, 0.005, 0.0, 0.0, 10_000, 10, 1, (3, 6, 10)
+        scale=lambda sides: 0.3 / float(sides.min()),
+        camera=_D435,
+        stride=2,
+        distance=0.9,
+        tolerance=0.005,
+        step=0.0,
+        voxel=0.0,
+        points=10_000,
+        views=10,
+        repeats=1,
+        reported=(3, 6, 10),
     ),
     "benbv": Protocol(
-        lambda sides: 0.2 / float(np.linalg.norm(sides)),
-        _WIDE,
-        1,
-        1.2,
-        0.002,
-        0.001,
-        _APART,
-        60_000,
-        15,
-        10,
-        (3, 6, 10, 15),
+        scale=lambda sides: 0.2 / float(np.linalg.norm(sides)),
+        camera=_WIDE,
+        stride=1,
+        distance=1.2,
+        tolerance=0.002,
+        step=0.001,
+        voxel=1.2 / _WIDE.focal_lengths[1],
+        points=60_000,
+        views=15,
+        repeats=10,
+        reported=(3, 6, 10, 15),
     ),
 }
 METHODS = {
     "pb-nbv": ("new surface", "farthest view", "random", "uniform", "oracle"),
     "benbv": (
-        "new surface",
-        "farthest view",
-        "random sphere",
-        "uniform sphere",
-        "random boundary",
-        "boundary oracle",
-        "oracle",
+        *("new surface", "farthest view", "random sphere", "uniform sphere"),
+        *("random boundary", "boundary oracle", "oracle"),
     ),
 }
 
@@ -104,7 +110,7 @@ def planned(trial: Trial, search: nbv.Search, rays: int, first: int, seed: int) 
 def greedy(trial: Trial, first: int) -> list[int]:
     """The candidates that truly add most, of those that `new surface` looks at."""
     among = spread(trial.poses)
-    covers, taken, known = trial.covers(among), [first], trial.covers([first])[0]
+    covers, taken, known = trial.covers(among.tolist()), [first], trial.covers([first])[0]
     while len(taken) < trial.protocol.views:
         best = int(np.argmax(np.sum(covers & ~known, axis=1)))
         known, taken = known | covers[best], [*taken, int(among[best])]
@@ -121,12 +127,12 @@ def uniform(trial: Trial, first: int) -> list[int]:
     return [first, *nearest[: trial.protocol.views - 1].tolist()]
 
 
-def from_sphere(trial: Trial, angles: Float[np.ndarray, "views 2"]) -> list[Bool[np.ndarray, " points"]]:
-    """What is covered from polar angles and azimuths on BENBV's larger sphere of 1.5 m."""
+def from_sphere(trial: Trial, first: int, angles: Float[np.ndarray, "views 2"]) -> list[Bool[np.ndarray, " points"]]:
+    """What is covered by the first view, and from polar angles and azimuths on BENBV's larger sphere of 1.5 m."""
     polar, azimuth = angles.T
     x, y, z = np.sin(polar) * np.cos(azimuth), np.cos(polar), np.sin(polar) * np.sin(azimuth)
     poses = nbv.look_at(1.5 / trial.unit * np.stack([x, y, z], axis=1))
-    return [trial.look(poses[index]).covers for index in range(len(angles))]
+    return [*trial.covers([first]), *(trial.look(poses[index]).covers for index in range(len(angles)))]
 
 
 def beyond_boundary(trial: Trial, first: int, seed: int, best: bool) -> list[Bool[np.ndarray, " points"]]:
@@ -169,16 +175,15 @@ def run(trial: Trial, methods: tuple[str, ...], rays: int, seed: int) -> dict:
     above = np.asarray(trial.poses.position)[:, 1] >= 0
     first = 0 if protocol.repeats == 1 else int(random.choice(np.nonzero(above)[0]))
     lattice = np.radians([(polar, azimuth) for polar in range(30, 180, 30) for azimuth in range(0, 360, 45)])
-    others = {
-        "random": lambda: [first, *random.choice(np.arange(1, CANDIDATES), protocol.views - 1, replace=False).tolist()],
-        "uniform": lambda: uniform(trial, first),
-        "oracle": lambda: greedy(trial, first),
-    }
-    poses = {
-        "random sphere": lambda: from_sphere(
-            trial, random.uniform((0, 0), (np.pi, 2 * np.pi), (protocol.views - 1, 2))
-        ),
-        "uniform sphere": lambda: from_sphere(trial, random.permutation(lattice)[: protocol.views - 1]),
+    more = protocol.views - 1
+    ways: dict[str, Callable] = {
+        "random": lambda: trial.covers([first, *random.choice(np.arange(1, CANDIDATES), more, replace=False).tolist()]),
+        "uniform": lambda: trial.covers(uniform(trial, first)),
+        "oracle": lambda: trial.covers(greedy(trial, first)),
+        "random sphere": lambda: from_sphere(trial, first, random.uniform((0, 0), (np.pi, 2 * np.pi), (more, 2))),
+        "uniform sphere": lambda: from_sphere(trial, first, random.permutation(lattice)[:more]),
+        "random boundary": lambda: beyond_boundary(trial, first, seed, best=False),
+        "boundary oracle": lambda: beyond_boundary(trial, first, seed, best=True),
     }
     searches = {
         "new surface": nbv.HalvingSearch(trial.poses[spread(trial.poses)]),
@@ -189,12 +194,8 @@ def run(trial: Trial, methods: tuple[str, ...], rays: int, seed: int) -> dict:
         if method in searches:
             taken, seconds = planned(trial, searches[method], rays, first, seed)
             shown = trial.covers(taken)
-        elif method in others:
-            shown = trial.covers(others[method]())
-        elif method in poses:
-            shown = np.stack([*trial.covers([first]), *poses[method]()])
         else:
-            shown = np.stack(beyond_boundary(trial, first, seed, method == "boundary oracle"))
+            shown = np.stack(ways[method]())
         covered = np.mean(np.logical_or.accumulate(shown, axis=0), axis=1)
         covered = np.pad(covered, (0, protocol.views - len(covered)), mode="edge")
         found[method] = {"covered": covered.tolist(), "seconds": float(np.mean(seconds)) if seconds else None}
@@ -238,11 +239,15 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="default: runs/peers-PROTOCOL[-half].json")
     asked = parser.parse_args()
     protocol, methods = PROTOCOLS[asked.protocol], METHODS[asked.protocol]
-    repeats, stride = asked.repeats or protocol.repeats, asked.stride or protocol.stride
-    protocol = protocol._replace(camera=protocol.camera.strided(stride))
+    repeats = asked.repeats or protocol.repeats
+    protocol = protocol._replace(stride=asked.stride or protocol.stride)
     out = asked.out or Path("runs") / f"peers-{asked.protocol}{'-half' if asked.half else ''}.json"
     out.parent.mkdir(parents=True, exist_ok=True)
-    records = json.loads(out.read_text()) if out.exists() else {}
+    settings = {name: getattr(asked, name) for name in ("protocol", "half", "up", "rays")} | {"stride": protocol.stride}
+    held = json.loads(out.read_text()) if out.exists() else {"settings": settings, "runs": {}}
+    if held.get("settings") != settings:
+        parser.error(f"{out} holds runs of {held.get('settings')}, asked for are {settings}: give another --out")
+    records = held["runs"]
     for file in tqdm(asked.mesh, desc="objects"):
         names = [f"{file.parent.name}/{file.stem} {repeat}" for repeat in range(repeats)]
         if all(name in records for name in names):
@@ -254,7 +259,7 @@ def main() -> None:
         for repeat, name in enumerate(names):
             if name not in records:
                 records[name] = run(trial, methods, asked.rays, repeat)
-                write_text(out, json.dumps(records))
+                write_text(out, json.dumps(held))
     print(table(records, methods, protocol))
 
 

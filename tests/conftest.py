@@ -32,7 +32,7 @@ import pytest
 from jaxtyping import install_import_hook
 
 gc.set_threshold(100_000, 20, 100)
-install_import_hook("jaxnbv", "beartype.beartype")
+install_import_hook(["jaxnbv", "forecasts", "covering", "boundary", "peers"], "beartype.beartype")
 
 # Bytes of a worker.
 MEMORY = 3 << 30

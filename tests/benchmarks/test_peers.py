@@ -69,7 +69,7 @@ def test_one_point_a_voxel_is_the_mean():
 @pytest.mark.parametrize("name", PROTOCOLS)
 def test_of_a_ball_a_scan_covers_the_cap_that_the_camera_sees(ball, name):
     protocol = PROTOCOLS[name]
-    trial = Trial(ball, protocol._replace(camera=protocol.camera.strided(protocol.stride)), half=False, up="y")
+    trial = Trial(ball, protocol, half=False, up="y")
     side = 2.0 * trial.mesh.bounding_radius * trial.unit
     assert side == pytest.approx(0.3 if name == "pb-nbv" else 0.2 / math.sqrt(3.0), rel=1e-3)
     look = trial.look(trial.poses[0])
@@ -91,7 +91,7 @@ def test_of_a_ball_a_scan_covers_the_cap_that_the_camera_sees(ball, name):
 
 def test_two_opposite_views_cover_most_of_a_ball_and_the_oracle_finds_the_second(ball):
     protocol = PROTOCOLS["pb-nbv"]
-    coarse = protocol._replace(camera=protocol.camera.strided(8), tolerance=0.02, points=2000)
+    coarse = protocol._replace(stride=8, tolerance=0.02, points=2000)
     trial = Trial(ball, coarse, half=False, up="y")
     first, second, *_ = greedy(trial, 0)
     places = np.asarray(trial.poses.position)
