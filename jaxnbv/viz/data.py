@@ -27,14 +27,15 @@ class ViewData(eqx.Module):
 
     - `number`: from 1.
     - `before`: points kept before this view; `new`: points it added. Scene coordinates.
-    - `surface`: with a deviation that allows for what was not seen; None where the posterior mean has no surface within
-      the grid.
+    - `surface`: of the posterior mean, where it holds points, with a deviation that allows for what was not seen; None
+      where it has none within the grid.
     - `choice`: None for a view that was given.
     - `coverage`: share of the true surface that was seen; None where the truth is not known.
     - `count`: points of the cloud after this view.
     - `told`: what happened, in words.
     - `imagined`: what was imagined before it was taken; None for a view that was given.
     - `look`: the scan itself; None where it is no image.
+    - `guesses`: pieces of the mean's surface that hold no points, if there are some.
     """
 
     number: int
@@ -48,6 +49,7 @@ class ViewData(eqx.Module):
     told: Told
     imagined: Imagined | None = None
     look: Look | None = None
+    guesses: MeanSurface | None = None
 
     @property
     def sentence(self) -> str:
@@ -128,6 +130,7 @@ def report_data(
                 told=_told(episode, index, choice, covered, task),
                 imagined=None if leading is None else leading.imagined,
                 look=taken_look(view, before),
+                guesses=next_one.guesses,
             )
         )
         leading = next_one

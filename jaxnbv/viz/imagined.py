@@ -4,15 +4,19 @@ import math
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import Episode, View, observe_scene, view_keys
-from jaxnbv.scanning import Evidence, GridSurface, SensorNoise, mean_depth
+from jaxnbv.scanning import Evidence, GridSurface, TriangleMesh, mean_depth, scan
+from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.surfaces import KnownShapesPosterior, SurfacePosterior
 
@@ -50,8 +54,7 @@ class Imagined(eqx.Module):
     """What a step knew of its view before it was taken.
 
     - `samples`: some of its sampled surfaces, from the chosen pose.
-    - `seen`: the true surface from there, or where it is not known the scan; None where that is no image.
-    - `is_true`: which of both.
+    - `seen`: what was then seen from there; None where that is no image.
     - `chosen`, `runner_up`: of the chosen camera and of the best of the other candidates; None without one.
     - `names`: the known shape that each of `samples` is about; `kinds`: what it may be, and how likely that is. Both
       are empty where no shapes are known.
@@ -59,7 +62,6 @@ class Imagined(eqx.Module):
 
     samples: tuple[Look, ...]
     seen: Look | None
-    is_true: bool
     chosen: Expected
     runner_up: Expected | None
     names: tuple[str, ...] = eqx.field(static=True, default=())
@@ -82,27 +84,41 @@ def imagined(
         return None
     sample_key, *_ = view_keys(episode.key, index)
     other = runner_up(view.proposal) if planner.quantity.smooth else None
-    # Two in any case, lest a second program be compiled.
-    pair = (view.pose, other or view.pose)
-    camera = _finer(planner.camera)
-    scans = planner.imagination.scan(surfaces, camera, jax.tree.map(lambda *rows: np.stack(rows), *pair))
-    cloud = evidence.cloud.to_numpy()[0]
+    poses = [view.pose] if other is None else [view.pose, other]
+    camera, cloud = _finer(planner.camera), evidence.cloud.to_numpy()[0]
+    scans = _scans(surfaces, camera, jax.tree.map(lambda *rows: np.stack(rows), *poses), planner.imagination)
     count = min(SHOWN, planner.imagination.num_samples)
     samples = tuple(look(_rows(scans, (sample, 0)), camera, view.pose, cloud) for sample in range(count))
     expected = [
         np.asarray(mean_depth(_rows(scans, (slice(None), i)), pose), np.float64).reshape(camera.height, camera.width)
-        for i, pose in enumerate(pair)
+        for i, pose in enumerate(poses)
     ]
-    true, taken, beside = _truth(episode, camera, view.pose, cloud), taken_look(view, cloud), None
+    taken, beside = taken_look(view, cloud), None
     if other is not None:
-        beside = Expected(expected[1], _depth(_truth(episode, camera, other, cloud)))
+        beside = Expected(expected[1], _depth(_not_taken(episode, view, other, cloud)))
     names: tuple[str, ...] = ()
     kinds: tuple[tuple[str, float], ...] = ()
     if isinstance(posterior, KnownShapesPosterior):
         names = tuple(posterior.names_of_samples(sample_key, planner.imagination.num_samples)[:count])
         kinds = tuple(posterior.kinds().items())
-    chosen = Expected(expected[0], _depth(taken))
-    return Imagined(samples, taken if true is None else true, true is not None, chosen, beside, names, kinds)
+    return Imagined(samples, taken, Expected(expected[0], _depth(taken)), beside, names, kinds)
+
+
+def _scans(surfaces: GridSurface, camera: Camera, poses: Pose, imagination: Imagination) -> PointCloud:
+    """What the camera sees of each of s surfaces from each of p poses: clouds with leading axes (s, p).
+
+    Of triangles: a picture is no reason to compile a scan of so many pixels.
+    """
+    barrier, found = imagination.barrier(camera, poses), []
+    for values in np.array(surfaces.values):
+        triangles = level_triangles(values, imagination.grid)
+        if triangles is not None:
+            found.append(scan(TriangleMesh(*triangles[:2], Frame()), camera, poses, barrier))
+            continue
+        misses = jnp.ones((*poses.position.shape[:-1], camera.num_rays), bool)
+        nowhere = jnp.zeros((*misses.shape, 3))
+        found.append(PointCloud(nowhere, nowhere, ~misses, misses))
+    return jax.tree.map(lambda *rows: np.stack(rows), *found)
 
 
 def _depth(seen: Look | None) -> Float[np.ndarray, "h w"] | None:
@@ -124,11 +140,11 @@ def taken_look(view: View, cloud: Float[np.ndarray, "n 3"]) -> Look | None:
     return look(view.scan, view.camera, view.pose, cloud) if is_image else None
 
 
-def look(scan: PointCloud, camera: Camera, pose: Pose, cloud: Float[np.ndarray, "n 3"]) -> Look:
+def look(seen: PointCloud, camera: Camera, pose: Pose, cloud: Float[np.ndarray, "n 3"]) -> Look:
     """The image that a scan is, row by row; `cloud`: what had been seen before it."""
     right, down, forward = np.asarray(pose.rotation, np.float64).T
-    points, normals = (np.asarray(rows, np.float64) for rows in (scan.points, scan.normals))
-    mask = np.asarray(scan.mask)
+    points, normals = (np.asarray(rows, np.float64) for rows in (seen.points, seen.normals))
+    mask = np.asarray(seen.mask)
     depth = np.where(mask, (points - np.asarray(pose.position, np.float64)) @ forward, np.nan)
     lamp = -forward - 0.5 * right - 0.7 * down
     lit = np.clip(0.35 + 0.65 * normals @ (lamp / np.linalg.norm(lamp)), 0.0, 1.0)
@@ -147,11 +163,13 @@ def _finer(camera: Camera) -> Camera:
     return camera if factor == 1 else camera.resized(factor * camera.height, factor * camera.width)
 
 
-def _truth(episode: Episode, camera: Camera, pose: Pose, cloud: Float[np.ndarray, "n 3"]) -> Look | None:
-    if episode.scene is None:
+def _not_taken(episode: Episode, view: View, pose: Pose, cloud: Float[np.ndarray, "n 3"]) -> Look | None:
+    """What the sensor of a view would have seen from another pose; None where the scene is not known."""
+    if episode.scene is None or episode.noise is None:
         return None
-    around, still = episode.planner.imagination.surroundings, SensorNoise(0.0, 0.0)
-    return look(observe_scene(episode.scene, camera, pose, still, episode.key, around), camera, pose, cloud)
+    around = episode.planner.imagination.surroundings
+    seen = observe_scene(episode.scene, view.camera, pose, episode.noise, episode.key, around)
+    return look(seen, view.camera, pose, cloud)
 
 
 def _rows(scans: PointCloud, at: tuple) -> PointCloud:

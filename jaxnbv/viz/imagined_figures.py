@@ -28,12 +28,12 @@ _UNSEEN = "#5b8fc7"
 
 
 def looks(seen: Imagined) -> list[Tile]:
-    """The sampled surfaces from the chosen pose, and beside them the truth, or what was then seen."""
+    """The sampled surfaces from the chosen pose, and beside them what was then seen."""
     names = seen.names or tuple(f"imagined {number}" for number in range(1, len(seen.samples) + 1))
     tiles = [Tile(name, look_picture(sample, _UNSEEN)) for name, sample in zip(names, seen.samples, strict=True)]
     if seen.seen is None:
         return tiles
-    return [*tiles, Tile("the truth" if seen.is_true else "then seen", look_picture(seen.seen, NEW))]
+    return [*tiles, Tile("then seen", look_picture(seen.seen, NEW))]
 
 
 def depths(seen: Imagined) -> tuple[list[Tile], str]:
@@ -45,9 +45,7 @@ def depths(seen: Imagined) -> tuple[list[Tile], str]:
     for name, pair in pairs.items():
         tiles.append(Tile(f"{name}: expected", depth_picture(pair.expected, low, high)))
         if pair.seen is not None:
-            tiles.append(
-                Tile(f"{name}: {'seen' if name == 'chosen' else 'truth'}", depth_picture(pair.seen, low, high))
-            )
+            tiles.append(Tile(f"{name}: seen", depth_picture(pair.seen, low, high)))
             if (error := depth_error(pair)) is not None:
                 errors.append(f"{number(error)} ({name})")
     scale = f"Depth from {low:.2f} (bright) to {high:.2f} scene units (dark); white: nothing there."

@@ -23,7 +23,7 @@ from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
 from jaxnbv.surfaces import KnownShapesPosterior, SurfacePosterior
 from jaxnbv.viz.answers import may_be_words, shown_value, words_of
-from jaxnbv.viz.mean_surface import allowing_for_unseen, mean_surface
+from jaxnbv.viz.mean_surface import as_shown, mean_surface
 from jaxnbv.viz.render import depth_picture, depth_range
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, VALUE, round_range
 
@@ -36,8 +36,8 @@ class LiveView:
     """A page that shows an episode, or a session, and changes with it. All in scene coordinates, y up.
 
     Switched on in its scene tree: points, cameras, the surface of the posterior's mean coloured by how uncertain it is,
-    candidates coloured by value, the next view with the depth that is expected of it; to be switched on: some imagined
-    surfaces.
+    candidates coloured by value, the next view with the depth that is expected of it; to be switched on: pieces of the
+    mean that hold no points, and some imagined surfaces.
 
     - `port`, `host`: where the page is served, by default for this machine alone.
 
@@ -147,13 +147,17 @@ def _cameras(scene: Any, episode: Episode) -> list[Any]:
 
 
 def _mean(scene: Any, imagination: Imagination, evidence: Evidence, posterior: SurfacePosterior) -> list[Any]:
-    surface = allowing_for_unseen(mean_surface(imagination, evidence, posterior), evidence.cloud)
-    if surface is None:
-        return []
-    low, high = round_range(*np.percentile(surface.deviation, [2.0, 98.0]).tolist())
-    share = mpl.colors.LogNorm(low, high, clip=True)(surface.deviation)
-    mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=_colours(DEVIATION, share), process=False)
-    return [scene.add_mesh_trimesh("/surface of the mean", mesh)]
+    surface, guesses = as_shown(mean_surface(imagination, evidence, posterior), evidence.cloud)
+    found = []
+    if surface is not None:
+        low, high = round_range(*np.percentile(surface.deviation, [2.0, 98.0]).tolist())
+        share = mpl.colors.LogNorm(low, high, clip=True)(surface.deviation)
+        mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=_colours(DEVIATION, share), process=False)
+        found.append(scene.add_mesh_trimesh("/surface of the mean", mesh))
+    if guesses is not None:
+        settings: dict[str, Any] = {"color": _rgb(GREY), "opacity": 0.35, "visible": False}
+        found.append(scene.add_mesh_simple("/guesses apart from it", guesses.vertices, guesses.faces, **settings))
+    return found
 
 
 def _imagined(

@@ -89,6 +89,7 @@ def space(data: ReportData, camera: Camera) -> dict:
                 "pull": data.stage.pull_of(view.pose),
                 "frustum": frustum(view.pose, camera).round(4).tolist(),
                 "surface": None if view.surface is None else _surface(view.surface, vertices),
+                "guesses": None if view.guesses is None else _surface(view.guesses, _FEWEST_VERTICES),
                 "ascents": None if view.spatial_ascents is None else _spatial(view.spatial_ascents, camera),
             }
             for view in data.views

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm
+from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 
 from jaxnbv.geometry.camera import Camera
@@ -25,6 +26,8 @@ FRUSTUM_DEPTH = 0.45
 _DISTANCE = 11.0
 _SLACK = 0.04  # Noise and the mean's own error must not hide a point behind the surface that it lies on.
 _HIDDEN = 0.18
+# How wide a hollow is darkened, as a share of the picture; how much at most, and how deep a hollow is then.
+_HOLLOW, _DARKEST, _DEEP = 0.05, 0.4, 0.25
 INSET = 0.24
 # What had been seen before, in images of what was imagined.
 _KNOWN = "#c3c9d2"
@@ -60,9 +63,8 @@ class Still:
         self._surface = surface
 
     def paint(self, deviation: LogNorm | None) -> None:
-        """Trace the surface, coloured by its standard deviation and lit from beside the eye; four rays a pixel.
-
-        Without a range of deviations it is plain.
+        """Trace the surface, coloured by its standard deviation, lit from beside the eye and darker in hollows; four
+        rays a pixel. Without a range of deviations it is plain.
         """
         surface = self._surface
         if surface is None:
@@ -84,8 +86,10 @@ class Still:
         colours = np.tile(mpl.colors.to_rgba(LINE), (len(points), 1))
         if deviation is not None:
             colours = DEVIATION(deviation(np.exp(np.sum(weight * np.log(surface.deviation)[near], axis=1))))
-        colours[:, :3] = np.clip(colours[:, :3] * lit[:, None], 0.0, 1.0)
-        self.show(mask, colours, (points - np.asarray(self.pose.position)) @ forward)
+        depth = (points - np.asarray(self.pose.position)) @ forward
+        shaded = lit * (1.0 - _occlusion(mask.reshape(2 * self.size, -1), depth))
+        colours[:, :3] = np.clip(colours[:, :3] * shaded[:, None], 0.0, 1.0)
+        self.show(mask, colours, depth)
 
     @property
     def fine_camera(self) -> Camera:
@@ -117,6 +121,17 @@ class Still:
         pixels = self.camera.to_pixels(local[:, :2] / local[:, 2:])
         column, row = np.clip(pixels.astype(int), 0, self.size - 1).T
         return pixels - 0.5, local[:, 2] < self.depth[row, column] + _SLACK
+
+
+def _occlusion(mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, " hits"]) -> Float[np.ndarray, " hits"]:
+    """By how much hits are darkened: those that lie deeper than the mean about them, as corners and hollows do (Luft,
+    Colditz and Deussen 2006)."""
+    width, deep = round(_HOLLOW * len(mask)), np.zeros(mask.shape)
+    deep[mask] = depth
+    # The mean of a mean falls off with distance.
+    sums, shares = (uniform_filter(uniform_filter(image, width), width)[mask] for image in (deep, mask.astype(float)))
+    mean = sums / np.maximum(shares, 1e-9)
+    return _DARKEST * np.clip((depth - mean) / _DEEP, 0.0, 1.0)
 
 
 def draw_scene(

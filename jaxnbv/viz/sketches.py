@@ -8,17 +8,19 @@ from jaxnbv.planning.episode import Episode, Step, view_keys
 from jaxnbv.scanning import Evidence, GridSurface
 from jaxnbv.surfaces import SurfacePosterior
 from jaxnbv.viz.imagined import Imagined, imagined
-from jaxnbv.viz.mean_surface import MeanSurface, allowing_for_unseen, mean_surface
+from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
 
 
 class Sketch(NamedTuple):
     """What a step knew before its view was taken.
 
-    - `surface`: of the posterior mean, with a deviation that allows for what was not seen; None where it has none.
+    - `surface`: of the posterior mean, where it holds points, and `guesses`, its other pieces, with a deviation that
+      allows for what was not seen; None where it has none.
     - `imagined`: None for a view that was not chosen, or not taken.
     """
 
     surface: MeanSurface | None
+    guesses: MeanSurface | None
     imagined: Imagined | None
 
 
@@ -69,4 +71,4 @@ def _sketch(
     seen = None
     if imagine and surfaces is not None and index < len(episode.views):
         seen = imagined(episode, index, evidence, posterior, surfaces)
-    return Sketch(allowing_for_unseen(mean, evidence.cloud), seen)
+    return Sketch(*as_shown(mean, evidence.cloud), seen)

@@ -2,25 +2,42 @@
 
 import jax
 import numpy as np
+from scipy.spatial import ConvexHull
 
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Capsule
 from jaxnbv.viz import report_data
-from jaxnbv.viz.mean_surface import MeanSurface, allowing_for_unseen
+from jaxnbv.viz.mean_surface import MeanSurface, as_shown
 
 
 def test_the_deviation_allows_for_a_quarter_of_the_distance_to_the_nearest_point():
     """On a unit sphere of which one point was seen, and is held to be known to 0.03 all over."""
     vertices = np.asarray(nbv.fibonacci_sphere(200), np.float64)
-    faces = np.zeros((1, 3), np.int64)
-    surface = MeanSurface(vertices, faces, vertices, np.full(200, 0.03))
+    surface = MeanSurface(vertices, ConvexHull(vertices).simplices, vertices, np.full(200, 0.03))
     # Rows that hold nothing lie at the origin, and are no points.
-    cloud = nbv.PointCloud.from_arrays([[1.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]], capacity=4)
-    shown = allowing_for_unseen(surface, cloud)
-    chord = 2 * np.sin(0.5 * np.arccos(np.clip(vertices[:, 0], -1, 1)))
+    cloud = nbv.PointCloud.from_arrays(vertices[:1], vertices[:1], capacity=4)
+    shown, guesses = as_shown(surface, cloud)
+    assert shown is not None
+    assert guesses is None
+    chord = 2 * np.sin(0.5 * np.arccos(np.clip(vertices @ vertices[0], -1, 1)))
     np.testing.assert_allclose(shown.deviation, np.sqrt(0.03**2 + (chord / 4) ** 2), rtol=1e-5)
     np.testing.assert_array_equal(shown.vertices, vertices)
-    assert allowing_for_unseen(None, cloud) is None
+    assert as_shown(None, cloud) == (None, None)
+
+
+def test_pieces_that_hold_no_points_are_guesses():
+    """Of two unit spheres one point of the first was seen."""
+    ball = np.asarray(nbv.fibonacci_sphere(200), np.float64)
+    faces = ConvexHull(ball).simplices
+    other = ball + np.array([3.0, 0.0, 0.0])
+    both = np.concatenate([ball, other])
+    surface = MeanSurface(both, np.concatenate([faces, faces + 200]), np.concatenate([ball, ball]), np.full(400, 0.03))
+    cloud = nbv.PointCloud.from_arrays(ball[:1], ball[:1])
+    held, guesses = as_shown(surface, cloud)
+    np.testing.assert_array_equal(held.vertices, ball)
+    np.testing.assert_array_equal(held.faces, faces)
+    np.testing.assert_array_equal(guesses.vertices, other)
+    np.testing.assert_array_equal(guesses.faces, faces)
 
 
 def test_an_end_beyond_the_images_border_is_never_shown_as_certain():
