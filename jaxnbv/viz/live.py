@@ -1,5 +1,7 @@
 """A live view in the browser, by viser: what has been seen, what is imagined, and where to look next."""
 
+import dataclasses
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ from jaxtyping import Float, UInt8
 from matplotlib.colors import Colormap, to_rgb
 from scipy.spatial.transform import Rotation
 
+from jaxnbv.acquisition import Quantity
 from jaxnbv.checks import checked
 from jaxnbv.errors import optional
 from jaxnbv.geometry.camera import Camera
@@ -23,11 +26,12 @@ from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
 from jaxnbv.surfaces import KnownShapesPosterior, SurfacePosterior
 from jaxnbv.viz.answers import may_be_words, shown_value, words_of
-from jaxnbv.viz.mean_surface import as_shown, mean_surface
+from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
 from jaxnbv.viz.render import depth_picture, depth_range
-from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, VALUE, round_range
+from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, VALUE, colour_scale, round_range
 
 _SAMPLES = 4
+_NEXT = "#009e73"
 _EYE = (2.6, 1.7, 2.6)
 _POINT, _CANDIDATE, _FRUSTUM = 0.012, 0.05, 0.22
 
@@ -37,7 +41,7 @@ class LiveView:
 
     Switched on in its scene tree: points, cameras, the surface of the posterior's mean coloured by how uncertain it is,
     candidates coloured by value, the next view with the depth that is expected of it; to be switched on: pieces of the
-    mean that hold no points, and some imagined surfaces.
+    mean that hold no points, and some imagined surfaces. A slider goes back to earlier views.
 
     - `port`, `host`: where the page is served, by default for this machine alone.
 
@@ -51,8 +55,12 @@ class LiveView:
         self._server.initial_camera.position, self._server.initial_camera.look_at = _EYE, (0.0, 0.0, 0.0)
         self._server.gui.configure_theme(control_width="medium")
         self._text = self._server.gui.add_markdown("nothing has been seen yet")
+        self._legend = self._server.gui.add_html("")
         self._image: Any = None
+        self._slider: Any = None
         self._drawn: list[Any] = []
+        # A reader may move the slider while the next view comes.
+        self._drawing = threading.RLock()
 
     @property
     def address(self) -> str:
@@ -71,22 +79,51 @@ class LiveView:
         - `proposal`: for the view after its last; `expected`: the depth image expected there.
         - `evidence`: after its last view, where that is at hand; made again from the scans otherwise.
         """
-        evidence = episode.evidence_after(len(episode.views)) if evidence is None else evidence
-        key, *_ = view_keys(episode.key, len(episode.views))
-        posterior = episode.planner.imagination.posterior(evidence)
-        picture = None if expected is None else depth_picture(expected, *depth_range([expected]))
-        scene = self._server.scene
-        with self._server.atomic():
-            for handle in self._drawn:
-                handle.remove()
-            self._drawn = [
-                *_points(scene, episode),
-                *_cameras(scene, episode),
-                *_mean(scene, episode.planner.imagination, evidence, posterior),
-                *_imagined(scene, episode.planner.imagination, evidence, posterior, key),
-                *([] if proposal is None else _choice(scene, episode.planner.camera, proposal, picture)),
-            ]
-        self._tell(episode, posterior, proposal, picture)
+        views = episode.views
+
+        def show(count: int) -> None:
+            if count == len(views):
+                self._show(episode, proposal, expected, evidence)
+            else:
+                self._show(dataclasses.replace(episode, views=views[:count]), views[count].proposal)
+
+        with self._drawing:
+            if self._slider is not None:
+                self._slider.remove()
+                self._slider = None
+            if len(views) > 1:
+                self._slider = self._server.gui.add_slider("after view", 1, len(views), 1, len(views))
+                self._slider.on_update(lambda event: show(event.target.value))
+            show(len(views))
+
+    def _show(
+        self,
+        episode: Episode,
+        proposal: Proposal | None,
+        expected: Float[np.ndarray, "h w"] | None = None,
+        evidence: Evidence | None = None,
+    ) -> None:
+        scene, imagination, choice = self._server.scene, episode.planner.imagination, []
+        with self._drawing:
+            with self._server.atomic():
+                for handle in self._drawn:
+                    handle.remove()
+                self._drawn = [*_points(scene, episode), *_cameras(scene, episode)]
+            evidence = episode.evidence_after(len(episode.views)) if evidence is None else evidence
+            key, *_ = view_keys(episode.key, len(episode.views))
+            posterior = imagination.posterior(evidence)
+            surface, guesses = as_shown(mean_surface(imagination, evidence, posterior), evidence.cloud)
+            picture = None if expected is None else depth_picture(expected, *depth_range([expected]))
+            with self._server.atomic():
+                if proposal is not None:
+                    choice = _choice(scene, episode.planner.camera, proposal, picture)
+                self._drawn += [
+                    *_mean(scene, surface, guesses),
+                    *_imagined(scene, imagination, evidence, posterior, key),
+                    *choice,
+                ]
+            self._tell(episode, posterior, proposal, picture)
+            self._legend.content = _legend(surface, proposal, episode.planner.quantity)
 
     def follow(self, session: Session) -> None:
         """Show a session from now on, with every image and proposal."""
@@ -146,18 +183,20 @@ def _cameras(scene: Any, episode: Episode) -> list[Any]:
     return found
 
 
-def _mean(scene: Any, imagination: Imagination, evidence: Evidence, posterior: SurfacePosterior) -> list[Any]:
-    surface, guesses = as_shown(mean_surface(imagination, evidence, posterior), evidence.cloud)
+def _mean(scene: Any, surface: MeanSurface | None, guesses: MeanSurface | None) -> list[Any]:
     found = []
     if surface is not None:
-        low, high = round_range(*np.percentile(surface.deviation, [2.0, 98.0]).tolist())
-        share = mpl.colors.LogNorm(low, high, clip=True)(surface.deviation)
+        share = mpl.colors.LogNorm(*_deviations(surface), clip=True)(surface.deviation)
         mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=_colours(DEVIATION, share), process=False)
         found.append(scene.add_mesh_trimesh("/surface of the mean", mesh))
     if guesses is not None:
         settings: dict[str, Any] = {"color": _rgb(GREY), "opacity": 0.35, "visible": False}
         found.append(scene.add_mesh_simple("/guesses apart from it", guesses.vertices, guesses.faces, **settings))
     return found
+
+
+def _deviations(surface: MeanSurface) -> tuple[float, float]:
+    return round_range(*np.percentile(surface.deviation, [2.0, 98.0]).tolist())
 
 
 def _imagined(
@@ -177,15 +216,41 @@ def _imagined(
 
 
 def _choice(scene: Any, camera: Camera, proposal: Proposal, picture: np.ndarray | None) -> list[Any]:
-    values = np.asarray(proposal.values, np.float64)
-    open_ = np.isfinite(values)
-    places = np.asarray(proposal.candidates.position)[open_]
+    values, places = _open_candidates(proposal)
     found = []
-    if open_.any():
-        low, high = float(values[open_].min()), float(values[open_].max())
-        colours = _colours(VALUE, (values[open_] - low) / max(high - low, 1e-12))[:, :3]
+    if len(values):
+        colours = _colours(VALUE, (values - values.min()) / max(float(np.ptp(values)), 1e-12))[:, :3]
         found.append(scene.add_point_cloud("/candidates", places, colours, point_size=_CANDIDATE, point_shape="circle"))
-    return [*found, _frustum(scene, "/next view", camera, proposal.pose, "#009e73", picture)]
+    return [*found, _frustum(scene, "/next view", camera, proposal.pose, _NEXT, picture)]
+
+
+def _open_candidates(proposal: Proposal) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    """Values and positions of the candidates that may be taken."""
+    values = np.asarray(proposal.values, np.float64)
+    return values[np.isfinite(values)], np.asarray(proposal.candidates.position)[np.isfinite(values)]
+
+
+def _legend(surface: MeanSurface | None, proposal: Proposal | None, sought: Quantity) -> str:
+    """What the colours mean, as HTML."""
+    marks = [("points before", BEFORE), ("new points, last camera", NEW), ("earlier cameras", GREY)]
+    marks += [] if proposal is None else [("next view", _NEXT)]
+    rows = [f'<div><b style="color:{colour}">&#9679;</b> {name}</div>' for name, colour in marks]
+    if surface is not None:
+        low, high = _deviations(surface)
+        rows.append(_bar("the surface is known to, in scene units", DEVIATION, f"{low:g}", f"{high:g}"))
+    if proposal is not None and len(values := _open_candidates(proposal)[0]):
+        ends = (shown_value(sought, float(value)) for value in (values.min(), values.max()))
+        rows.append(_bar(f"candidates: {sought.name}", VALUE, *ends))
+    return f'<div style="padding:0 1em 1em;font-size:.85em">{"".join(rows)}</div>'
+
+
+def _bar(name: str, colours: Colormap, low: str, high: str) -> str:
+    steps = ",".join(f"{colour} {100 * at:.0f}%" for at, colour in colour_scale(colours))
+    return (
+        f'<div style="margin-top:.5em">{name}</div>'
+        f'<div style="height:.7em;background:linear-gradient(90deg,{steps})"></div>'
+        f'<div style="display:flex;justify-content:space-between"><span>{low}</span><span>{high}</span></div>'
+    )
 
 
 def _frustum(

@@ -2,6 +2,7 @@
 
 import re
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -71,6 +72,32 @@ def test_the_text_tells_what_is_asked(watched):
     assert "2 views" in text
     assert "expected coverage gain" in text
     assert page._image is not None
+
+
+def test_the_legend_says_what_the_colours_mean(watched):
+    _, session, page = watched
+    values = np.asarray(session.next().proposal.values)
+    text = page._legend.content
+    assert "next view" in text
+    assert "the surface is known to" in text
+    assert f"{values[np.isfinite(values)].max():.3g}"[:3] in text
+
+
+def test_the_slider_goes_back_to_an_earlier_view(watched):
+    _, session, page = watched
+    first, _ = session.episode.views[0].scan.to_numpy()
+    page._slider.value = 1
+    for callback in page._slider._impl.update_cb:
+        callback(SimpleNamespace(target=page._slider))
+    shown = handles(page)
+    np.testing.assert_allclose(shown["/points/new"].points, first, atol=2e-3)
+    assert "/cameras/view 2" not in shown
+    np.testing.assert_allclose(shown["/next view"].position, session.episode.views[1].proposal.pose.position, atol=1e-5)
+    assert "1 view*" in page._text.content
+    page._slider.value = 2
+    for callback in page._slider._impl.update_cb:
+        callback(SimpleNamespace(target=page._slider))
+    assert "/cameras/view 2" in handles(page)
 
 
 def test_one_file_holds_the_scene(watched, tmp_path):
