@@ -64,13 +64,20 @@ class Seen(NamedTuple):
 def _some_empty(evidence: Evidence) -> tuple[Float[Array, "m 3"], Bool[Array, " m"]]:
     if evidence.seen_empty is None or evidence.grid is None:
         return jnp.zeros((_NUM_EMPTY, 3)), jnp.zeros(_NUM_EMPTY, bool)
-    seen = evidence.seen_empty.reshape(-1)
-    order = np.random.default_rng(0).permutation(seen.size)
-    # The place of each node in a fixed random order of those that were seen empty.
-    place = jnp.where(seen[order], jnp.cumsum(seen[order]) - 1, _NUM_EMPTY)
+    order = np.random.default_rng(0).permutation(evidence.seen_empty.size)
+    node, is_empty = _first_seen(evidence.seen_empty, order)
+    return jnp.asarray(evidence.grid.axis)[node], is_empty
+
+
+@jax.jit
+def _first_seen(
+    seen_empty: Bool[Array, "g g g"], order: Int[Array, " nodes"]
+) -> tuple[Int[Array, "m 3"], Bool[Array, " m"]]:
+    """The first nodes in an order of those that were seen empty."""
+    seen = seen_empty.reshape(-1)[order]
+    place = jnp.where(seen, jnp.cumsum(seen) - 1, _NUM_EMPTY)
     chosen = jnp.zeros(_NUM_EMPTY, jnp.int32).at[place].set(order, mode="drop")
-    node = jnp.stack(jnp.unravel_index(chosen, evidence.seen_empty.shape), axis=-1)
-    return jnp.asarray(evidence.grid.axis)[node], jnp.arange(_NUM_EMPTY) < jnp.sum(seen)
+    return jnp.stack(jnp.unravel_index(chosen, seen_empty.shape), axis=-1), jnp.arange(_NUM_EMPTY) < jnp.sum(seen)
 
 
 class Hypotheses(eqx.Module):

@@ -34,7 +34,7 @@ class NewSurface(Acquisition):
     **Raises:** `ValueError` if the size is not positive.
     """
 
-    size: float = eqx.field(static=True, default=0.1)
+    size: float = eqx.field(static=True, default=0.05)
 
     def __check_init__(self):
         check_fields(self)
@@ -105,7 +105,7 @@ class Covered(Stop):
     """
 
     share: float = eqx.field(static=True, default=0.98)
-    size: float = eqx.field(static=True, default=0.1)
+    size: float = eqx.field(static=True, default=0.05)
 
     def __check_init__(self):
         check_fields(self)
@@ -117,7 +117,7 @@ class Covered(Stop):
         return f"{100 * covered:.1f} % of what can be seen is expected to be covered" if covered >= self.share else None
 
 
-def expected_coverage(so_far: SoFar, size: float = 0.1) -> float:
+def expected_coverage(so_far: SoFar, size: float = 0.05) -> float:
     """Share of the area that the camera would see of the posterior's surfaces, from all candidates, that is not new.
 
     - `size`: of `NewSurface`, in scene units.

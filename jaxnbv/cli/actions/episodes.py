@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -164,21 +165,30 @@ def _run(
     key, noise = jax.random.key(asked.seed), SensorNoise(asked.noise, asked.noise)
     lines = Lines(planner)
     sketches = viz.Sketches(Episode(planner, scene, noise, first, key, ())) if asked.report else None
+    race: Future[Episode] | None = None
+    drawn: list[Future[None]] = []
 
     def tell(step: Step) -> None:
+        nonlocal race
         if lines.count == 0:
             note(folder, options)
         lines(step.view)
         if sketches is not None:
-            sketches.add(step)
+            drawn.append(beside.submit(sketches.add, step))
+        # Not before the first view: both would compile what that needs.
+        if race is None and rival is not None and enough is not None:
+            of_rival = (scene, first, _RACE_VIEWS, key, noise, folder / _RIVAL)
+            race = beside.submit(simulate, rival, *of_rival, progress=False, until=enough)
 
     try:
-        episode = simulate(planner, scene, first, asked.views, key, noise, folder, until=enough, each=tell)
-        raced = None
-        if rival is not None and enough is not None:
-            raced = simulate(rival, scene, first, _RACE_VIEWS, key, noise, folder / _RIVAL, until=enough)
+        # While the next view is planned, the last one is drawn and the rival runs.
+        with ThreadPoolExecutor(1) as beside:
+            episode = simulate(planner, scene, first, asked.views, key, noise, folder, until=enough, each=tell)
+        raced = None if race is None else race.result()
     except AnotherConfigurationError as error:
         raise InputError(explained(folder, options, error)) from error
+    for one in drawn:
+        one.result()
     if episode.stopped is not None:
         saved = asked.views - len(episode.views)
         views = "view is" if saved == 1 else "views are"
