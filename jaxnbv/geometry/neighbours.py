@@ -8,6 +8,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnbv.geometry.cloud import PointCloud
 
 _UNROLL = 8
+# Points whose nearest neighbour is looked for.
+_ASKED = 256
 
 
 @jax.jit
@@ -18,6 +20,18 @@ def nearest_squared_distance(x: Float[Array, "n 3"], cloud: PointCloud) -> Float
     rows, not the capacity. Differentiable once or more in x and in the cloud's points.
     """
     return _nearest_squared_distance(x, cloud.points, cloud.mask)
+
+
+def spacing(cloud: PointCloud) -> Float[Array, ""]:
+    """How far a point of a cloud is from its nearest neighbour: the median over some of its points, spread over its
+    rows; zero for fewer than two points."""
+    count = jnp.sum(cloud.mask)
+    order = jnp.argsort(~cloud.mask, stable=True)
+    rows = order[(jnp.arange(_ASKED) * count) // _ASKED]
+    offsets = cloud.points[rows, None] - cloud.points
+    other = cloud.mask & (jnp.arange(cloud.capacity) != rows[:, None])
+    nearest = jnp.min(jnp.where(other, jnp.sum(offsets**2, axis=-1), jnp.inf), axis=1)
+    return jnp.where(count > 1, jnp.sqrt(jnp.median(nearest)), 0.0)
 
 
 class DistanceField(eqx.Module):
@@ -31,7 +45,7 @@ class DistanceField(eqx.Module):
     spacing: Float[Array, ""]
 
     @classmethod
-    def of(cls, cloud: PointCloud, margin: float, resolution: int = 64) -> "DistanceField":
+    def of(cls, cloud: PointCloud, margin: Float[Array, ""] | float, resolution: int = 64) -> "DistanceField":
         """The distances to a cloud that is not empty, on so many nodes along each side of a cube that holds it with a
         margin: what is outside is that far away."""
         rows = cloud.mask[:, None]

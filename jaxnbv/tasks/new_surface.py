@@ -1,5 +1,6 @@
 """Coverage as a person means it: how much of the surface has been seen, and how much more a view would show."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -11,7 +12,7 @@ from jaxnbv.acquisition import Acquisition, Quantity, expected_value
 from jaxnbv.checks import check_fields, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.neighbours import DistanceField
+from jaxnbv.geometry.neighbours import DistanceField, spacing
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning.metrics import GRAZING
 from jaxnbv.tasks.stopping import SoFar, Stop
@@ -20,16 +21,16 @@ from jaxnbv.tasks.stopping import SoFar, Stop
 class NewSurface(Acquisition):
     """Expected new area: how much surface an imagined scan shows that is not near D, in squared scene units.
 
-        alpha(D, scan) = sum_x a(x) clip(d(x, D) / size - 1, 0, 1)
+        alpha(D, scan) = sum_x a(x) clip(d(x, D) / s - 1, 0, 1),   s = max(size, spacing of D),
 
-    over the hits x of the scan, where d is the distance to the nearest point of D, and a(x) = r^2 omega / cos the area
-    of the pixel on the surface: omega its solid angle, r the distance, cos that of the angle of incidence, at least
-    0.2. The rays of one scan do not overlap, so no part of the surface counts twice; and neither near surfaces, which
-    fill more pixels, nor a single point far from all others outweighs the rest, as in the paper's `Coverage`. It is
-    differentiable in the pose wherever `Coverage` is.
+    over the hits x of the scan, where d is the distance to the nearest point of D, the spacing the median of how far
+    its points are from their nearest neighbours, and a(x) = r^2 omega / cos the area of the pixel on the surface: omega
+    its solid angle, r the distance, cos that of the angle of incidence, at least 0.2. The rays of one scan do not
+    overlap, so no part of the surface counts twice; and neither near surfaces, which fill more pixels, nor a single
+    point far from all others outweighs the rest, as in the paper's `Coverage`. It is differentiable in the pose
+    wherever `Coverage` is.
 
-    - `size`: what lies within this distance of D has been seen; what is twice as far is new. In scene units, not below
-      the distance between neighbouring points of D.
+    - `size`: what lies within this distance of D has been seen; what is twice as far is new. In scene units.
 
     **Raises:** `ValueError` if the size is not positive.
     """
@@ -41,16 +42,18 @@ class NewSurface(Acquisition):
         require(self.size > 0, f"the size is {self.size}; it must be positive, in scene units")
 
     def context(self, cloud: PointCloud) -> DistanceField:
-        """How far it is to D, on a grid about it."""
-        return DistanceField.of(cloud, 2.0 * self.size)
+        """How far it is to D, in units of s, on a grid about it."""
+        size = jnp.maximum(self.size, spacing(cloud))
+        distance = DistanceField.of(cloud, 2.0 * size)
+        return dataclasses.replace(distance, values=distance.values / size)
 
     def score(self, context: DistanceField, scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, ""]:
         """The new area of one scan; zero for a scan that sees nothing."""
         return jnp.sum(visible_area(scan, camera, pose) * self.newness(context, scan.points))
 
     def newness(self, distance: DistanceField, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """From 0 beside D to 1 at twice the size."""
-        return jnp.clip(distance(points) / self.size - 1.0, 0.0, 1.0)
+        """From 0 beside D to 1 at 2 s."""
+        return jnp.clip(distance(points) - 1.0, 0.0, 1.0)
 
     @property
     def quantity(self) -> Quantity:

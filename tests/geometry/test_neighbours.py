@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.neighbours import nearest_squared_distance
+from jaxnbv.geometry.neighbours import nearest_squared_distance, spacing
 
 
 def cloud_of(points, mask=None):
@@ -123,3 +123,21 @@ def test_under_vmap_and_jit(x64):
         nearest = points[i][mask[i]][cKDTree(points[i][mask[i]]).query(x[i])[1]]
         expected = 2 * np.arange(1.0, 7.0)[:, None] * (x[i] - nearest)
         np.testing.assert_allclose(gradient[i], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [2, 3, 200, 700])
+def test_the_spacing_is_the_median_distance_between_neighbours(count):
+    """Of some of many points: within a tenth."""
+    points = np.random.default_rng(3).normal(size=(count, 3))
+    rows = np.random.default_rng(4).permutation(1000)[:count]
+    held, mask = np.zeros((1000, 3), np.float32), np.zeros(1000, bool)
+    held[rows], mask[rows] = points, True
+    cloud = PointCloud(jnp.asarray(held), jnp.asarray(held), jnp.asarray(mask))
+    expected = np.median(cKDTree(points).query(points, k=2)[0][:, 1])
+    assert float(spacing(cloud)) == pytest.approx(expected, rel=0.1)
+
+
+def test_fewer_than_two_points_have_no_spacing():
+    for count in (0, 1):
+        cloud = PointCloud(jnp.ones((5, 3)), jnp.ones((5, 3)), jnp.arange(5) < count)
+        assert float(spacing(cloud)) == 0.0

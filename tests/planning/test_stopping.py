@@ -99,7 +99,7 @@ def test_found_counts_the_points_of_the_parts_that_are_asked_for(parts, points, 
     assert (reason is not None) == stops
 
 
-@pytest.mark.parametrize(("points", "size"), [(40, 0.1), (150, 0.1), (40, 0.2)])
+@pytest.mark.parametrize(("points", "size"), [(80, 0.1), (300, 0.05), (80, 0.4)])
 def test_expected_coverage_is_that_of_the_samples(points, size, monkeypatch):
     """Of a posterior that holds one ball alone, whose rays and points are found anew in float64."""
     axis = np.asarray(Grid(64).axis)
@@ -107,7 +107,12 @@ def test_expected_coverage_is_that_of_the_samples(points, size, monkeypatch):
     ball = GridSurface.from_values(jnp.asarray(distance, jnp.float32)[None], 0.0, Grid(64))
     planner = planner_of(Coverage())
     monkeypatch.setattr(Imagination, "sample", lambda self, evidence, key: ball)
-    cloud = cloud_of(points)
+    upper = np.asarray(fibonacci_sphere(points))
+    upper = upper[upper[:, 1] > 0]
+    cloud = PointCloud.from_arrays(0.8 * upper, upper, 256)
+    # What is as far as neighbouring points are apart was seen too.
+    apart = np.linalg.norm(0.8 * (upper[:, None] - upper), axis=-1)
+    apart = max(size, np.median(np.sort(apart, axis=1)[:, 1]))
     seen_area, all_area = 0.0, 0.0
     for pose in DiscreteSearch(10).candidates.poses():
         origin = np.asarray(pose.position, np.float64)
@@ -123,7 +128,7 @@ def test_expected_coverage_is_that_of_the_samples(points, size, monkeypatch):
         area = along**2 * (rays[seen] @ np.asarray(pose.forward, np.float64)) ** 3 / focal**2 / cosine
         nearest = np.linalg.norm(hits[:, None] - cloud.to_numpy()[0][None], axis=-1).min(axis=1)
         all_area += area.sum()
-        seen_area += area @ np.clip(2.0 - nearest / size, 0.0, 1.0)
+        seen_area += area @ np.clip(2.0 - nearest / apart, 0.0, 1.0)
     share = float(seen_area / all_area)
     assert 0.05 < share < 0.97
     known = after(planner, cloud)

@@ -11,7 +11,7 @@ from scipy.integrate import quad
 from jaxnbv.acquisition import Several, expected_value
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.pose import Pose, look_at
+from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
 from jaxnbv.scanning import Grid, GridSurface, SDFSurface, scan
 from jaxnbv.scanning.sdf import Cuboid, Sphere
 from jaxnbv.search import DiscreteSearch, GradientSearch
@@ -77,6 +77,15 @@ def test_the_score_is_the_area_weighed_by_how_far_it_is_to_d():
     assert 0.1 * area.sum() < expected < 0.9 * area.sum()
     # Between nodes a distance is wrong by a small part of their spacing, here 0.026, and to both sides.
     assert found == pytest.approx(expected, rel=0.03)
+
+
+def test_between_the_points_of_a_sparse_cloud_nothing_is_new():
+    """As many points as are 0.1 apart, all over the ball that is looked at: by the size alone half of it were new."""
+    seen, camera = looked_at()
+    cloud = cloud_of(RADIUS * np.asarray(fibonacci_sphere(300)))
+    acquisition = NewSurface(0.02)
+    score = float(acquisition.score(acquisition.context(cloud), seen, camera, POSE))
+    assert score < 0.02 * float(jnp.sum(visible_area(seen, camera, POSE)))
 
 
 def test_nothing_new_is_worth_nothing():
