@@ -37,9 +37,7 @@ from jaxnbv.storage.files import write_text
 from jaxnbv.studies.engine.results import interval
 
 LOOKED_AT = 200
-# New surface is what lies farther than this from what was seen, in scene units: 1/50 of the longest side, about what
-# 2,048 points kept of an object are apart. Chosen on the bunny, the buddha and the teapot, from 0.1, 0.05 and 0.03.
-SIZE, CAPACITY, SAMPLES = 0.05, 2048, 16
+CAPACITY, SAMPLES = 2048, 16
 
 _D435 = nbv.Camera.from_intrinsics([[696.0, 0, 640], [0, 696, 360], [0, 0, 1]], 720, 1280)
 _WIDE = nbv.Camera(math.radians(70.0), 720, 1280)
@@ -88,7 +86,7 @@ def planned(trial: Trial, search: nbv.Search, rays: int, first: int, seed: int) 
     needed = math.radians(5.0) * math.ceil(needed / math.radians(5.0))
     camera = nbv.Camera(min(needed, trial.protocol.camera.fov), rays, rays)
     planner = nbv.Planner(
-        nbv.NewSurface(SIZE),
+        nbv.NewSurface(),
         search,
         camera,
         nbv.Imagination(num_samples=SAMPLES),

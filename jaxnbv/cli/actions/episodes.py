@@ -183,7 +183,11 @@ def _run(
     try:
         # While the next view is planned, the last one is drawn and the rival runs.
         with ThreadPoolExecutor(1) as beside:
-            episode = simulate(planner, scene, first, asked.views, key, noise, folder, until=enough, each=tell)
+            try:
+                episode = simulate(planner, scene, first, asked.views, key, noise, folder, until=enough, each=tell)
+            except BaseException:
+                beside.shutdown(wait=False, cancel_futures=True)
+                raise
         raced = None if race is None else race.result()
     except AnotherConfigurationError as error:
         raise InputError(explained(folder, options, error)) from error
