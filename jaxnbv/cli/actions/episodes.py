@@ -195,9 +195,9 @@ def _run(
         one.result()
     if episode.stopped is not None:
         saved = asked.views - len(episode.views)
-        views = "view is" if saved == 1 else "views are"
+        are = "is" if saved == 1 else "are"
         typer.echo(
-            f"enough   after view {len(episode.views)}: {episode.stopped}. {saved} of {asked.views} {views} saved"
+            f"enough   after view {len(episode.views)}: {episode.stopped}. {saved} of {asked.views} views {are} saved"
         )
     if raced is not None:
         typer.echo(f"race     {race_words(raced, planner.acquisition)}")
