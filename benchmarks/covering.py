@@ -47,11 +47,8 @@ class Trial:
     """An object in a protocol: points of its surface, candidates about it, and what each pose shows of it."""
 
     def __init__(self, file: Path, protocol: Protocol, half: bool, up: str):
-        self.mesh, self.protocol, self.camera = (
-            nbv.load_mesh(file, up),
-            protocol,
-            protocol.camera.strided(protocol.stride),
-        )
+        self.mesh, self.protocol = nbv.load_mesh(file, up), protocol
+        self.camera = protocol.camera.strided(protocol.stride)
         self.unit = protocol.scale(np.ptp(self.mesh.vertices, axis=0))
         key = jax.random.key(zlib.crc32(file.stem.encode()))
         directions = np.array(jax.random.normal(key, (CANDIDATES, 3)), np.float64)

@@ -179,6 +179,12 @@ class PointCloud(eqx.Module):
         return (self[index] for index in range(self.mask.shape[0]))
 
 
+def some_rows(cloud: PointCloud, count: int) -> Int[Array, " count"]:
+    """Filled rows of a single cloud, evenly taken, some of them twice where it has fewer; row 0 where it has none."""
+    order = jnp.argsort(~cloud.mask, stable=True)
+    return order[(jnp.arange(count) * cloud.count) // count]
+
+
 def check_single(cloud: PointCloud, name: str = "the cloud") -> None:
     """**Raises:** `ValueError` for a batch of clouds where one is needed."""
     batch = cloud.mask.shape[:-1]

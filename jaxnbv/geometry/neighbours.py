@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.cloud import PointCloud, some_rows
 
 _UNROLL = 8
 # Points whose nearest neighbour is looked for.
@@ -23,15 +23,13 @@ def nearest_squared_distance(x: Float[Array, "n 3"], cloud: PointCloud) -> Float
 
 
 def spacing(cloud: PointCloud) -> Float[Array, ""]:
-    """How far a point of a cloud is from its nearest neighbour: the median over some of its points, spread over its
-    rows; zero for fewer than two points."""
-    count = jnp.sum(cloud.mask)
-    order = jnp.argsort(~cloud.mask, stable=True)
-    rows = order[(jnp.arange(_ASKED) * count) // _ASKED]
+    """How far a point of a cloud is from its nearest neighbour, in the cloud's units: the median over some of its
+    points, spread over its rows; zero for fewer than two points."""
+    rows = some_rows(cloud, _ASKED)
     offsets = cloud.points[rows, None] - cloud.points
     other = cloud.mask & (jnp.arange(cloud.capacity) != rows[:, None])
     nearest = jnp.min(jnp.where(other, jnp.sum(offsets**2, axis=-1), jnp.inf), axis=1)
-    return jnp.where(count > 1, jnp.sqrt(jnp.median(nearest)), 0.0)
+    return jnp.where(cloud.count > 1, jnp.sqrt(jnp.median(nearest)), 0.0)
 
 
 class DistanceField(eqx.Module):

@@ -22,7 +22,7 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, check_fields, is_traced, require, shown
-from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.cloud import PointCloud, some_rows
 from jaxnbv.scanning.evidence import Evidence
 from jaxnbv.surfaces.base import SurfaceModel, on_torus
 from jaxnbv.surfaces.covariance import function_covariance, function_variance, mode_variance
@@ -117,9 +117,7 @@ def _condition(model: ScreenedSPSR, base: GeometricSPSRPosterior, evidence: Evid
 
 def _half_jump(base: GeometricSPSRPosterior, offset: float) -> Float[Array, ""]:
     """h: half the median rise of E f given the normals across the data, from `offset` behind to `offset` before."""
-    count = jnp.sum(base.cloud.mask)
-    order = jnp.argsort(~base.cloud.mask, stable=True)
-    chosen = order[(jnp.arange(_JUMP_POINTS) * count) // _JUMP_POINTS]
+    chosen = some_rows(base.cloud, _JUMP_POINTS)
     points, step = base.cloud.points[chosen], offset * base.cloud.normals[chosen]
     mean = base.mean_field
     least = 0.5 * jnp.sqrt(function_variance(base.model.spectrum))

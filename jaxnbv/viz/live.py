@@ -103,7 +103,7 @@ class LiveView:
         expected: Float[np.ndarray, "h w"] | None = None,
         evidence: Evidence | None = None,
     ) -> None:
-        scene, imagination, choice = self._server.scene, episode.planner.imagination, []
+        scene, imagination = self._server.scene, episode.planner.imagination
         with self._drawing:
             with self._server.atomic():
                 for handle in self._drawn:
@@ -115,12 +115,10 @@ class LiveView:
             surface, guesses = as_shown(mean_surface(imagination, evidence, posterior), evidence.cloud)
             picture = None if expected is None else depth_picture(expected, *depth_range([expected]))
             with self._server.atomic():
-                if proposal is not None:
-                    choice = _choice(scene, episode.planner.camera, proposal, picture)
                 self._drawn += [
                     *_mean(scene, surface, guesses),
                     *_imagined(scene, imagination, evidence, posterior, key),
-                    *choice,
+                    *([] if proposal is None else _choice(scene, episode.planner.camera, proposal, picture)),
                 ]
             self._tell(episode, posterior, proposal, picture)
             self._legend.content = _legend(surface, proposal, episode.planner.quantity)
