@@ -1,10 +1,11 @@
 """Kill runs at well spread moments and start them again: each ends with the files of a run that was left alone.
 
-    python benchmarks/kills.py --kills 200 --out runs/kills
+    python benchmarks/kills.py --kills 1000 --out runs/kills
 
-Commands are a run, its figures, a study, and a session that is planned again, at small settings; each is killed
-(SIGKILL) at moments that are spread over the time that it takes, and started again until it has been killed so often.
-Then it is let through. Not part of the tests: about ten seconds a kill.
+Commands are a run, two of it at once in one folder, its figures, a study by one process and by two, a session that
+takes images where it says and reports, the same planned again, and a live view as a file, all at small settings. Each
+is killed (SIGKILL) at moments that are spread over the time that it takes, and started again until it has been killed
+so often. Then it is let through. Not part of the tests: about five seconds a kill.
 """
 
 import argparse
@@ -16,41 +17,65 @@ import time
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from tqdm import tqdm
 
 import jaxnbv as nbv
+from jaxnbv.cli.actions.device import prepare
+from jaxnbv.cli.registry import Device
 
+RUN = ("run", "BOX.PLY", "--quick", "--views", "4", "--candidates", "12", "--samples", "2")
+STUDY = ("study", "pyramid", "--quick", "--scenes", "2", "--views", "2", "--methods", "coverage,farthest view")
 COMMANDS = {
-    "run": ("demo", "--quick", "--views", "4", "--until", "never", "--no-report"),
-    "figures": ("demo", "--quick", "--views", "2", "--until", "never"),
-    "study": ("study", "pyramid", "--quick", "--scenes", "3", "--views", "2", "--framing", "close-up"),
-    "session": ("session", "replay", "SESSION", "--quick", "--no-report"),
+    "run": (*RUN, "--no-report"),
+    "two runs in one folder": (*RUN, "--no-report"),
+    "figures": RUN,
+    "study": STUDY,
+    "study by two processes": (*STUDY, "--workers", "2"),
+    "session": ("SESSION",),
+    "session replay": ("session", "replay", "RECORDED", "--quick", "--no-report"),
+    "view": ("view", "RECORDED"),
 }
+STRATA = 8
 # What says when it was made, and by what means.
 UNLIKE = {"report.html", ".lock"}
 
 
-def record_session(folder: Path) -> None:
-    """Four images of a ball by a simulated sensor, from where its planner asked for them."""
+def take_session(folder: Path) -> None:
+    """Four images of a ball by a simulated sensor, from where the planner asks for them, and the report."""
+    prepare(Device.AUTO)
     camera, ball = nbv.Camera(height=48, width=64), nbv.SDFSurface(nbv.sdf.Sphere(0.1))
     planner = nbv.Planner(
         nbv.Coverage(),
         nbv.DiscreteSearch(20),
         nbv.Camera(height=12, width=16),
-        nbv.Imagination(nbv.GeometricSPSR(0.05, truncation=12), num_samples=2),
+        nbv.Imagination(nbv.GeometricSPSR(0.05, truncation=12), nbv.Grid(32), num_samples=2),
+        capacity=256,
     )
     session = nbv.Session(camera, ((-0.12, -0.12, -0.12), (0.12, 0.12, 0.12)), planner, folder=folder)
-    matrix = np.asarray(nbv.look_at((0.0, 0.1, 0.3)).matrix)
+    first = nbv.look_at((0.0, 0.1, 0.3))
     while session.views < 4:
-        seen, pose = nbv.scan(ball, camera, nbv.Pose.from_matrix(matrix)), nbv.Pose.from_matrix(matrix)
+        matrix = np.asarray(session.next().matrix if session.views else first.matrix)
+        pose = nbv.Pose.from_matrix(matrix)
+        seen = nbv.scan(ball, camera, pose)
         depth = np.asarray((seen.points - pose.position) @ pose.forward).reshape(48, 64)
         session.add(np.where(np.asarray(seen.mask).reshape(48, 64), depth, np.inf), matrix)
-        matrix = session.next().matrix
+    nbv.write_report(session.episode, folder / "report")
 
 
-def start(arguments: tuple[str, ...], out: Path) -> subprocess.Popen:
-    command = [sys.executable, "-m", "jaxnbv.cli", *arguments, "--out", str(out)]
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+def start(name: str, out: Path, inputs: Path) -> list[subprocess.Popen]:
+    """The processes of a command; they write to a folder, a view to a file in it."""
+    words = [str(inputs / word.lower()) if word in ("BOX.PLY", "RECORDED") else word for word in COMMANDS[name]]
+    if name == "session":
+        command = [sys.executable, __file__, "--session", str(out)]
+    else:
+        out.mkdir(parents=True, exist_ok=True)
+        into = ["--html", str(out / "view.html")] if name == "view" else ["--out", str(out)]
+        command = [sys.executable, "-m", "jaxnbv.cli", *words, *into]
+    return [
+        subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        for _ in range(2 if name == "two runs in one folder" else 1)
+    ]
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -66,13 +91,18 @@ def content(path: Path) -> bytes:
     return json.dumps({key: value for key, value in record.items() if key != "seconds"}).encode()
 
 
-def let_through(arguments: tuple[str, ...], out: Path) -> float:
+def let_through(name: str, out: Path, inputs: Path) -> float:
     """Seconds that it took."""
     began = time.monotonic()
-    process = start(arguments, out)
+    process, *others = start(name, out, inputs)
     _, errors = process.communicate()
+    for other in others:
+        other.communicate()
+    # Of two in one folder one is refused: it is asked again, alone.
+    if process.returncode and others:
+        return let_through(name, out, inputs)
     if process.returncode:
-        raise SystemExit(f"{' '.join(arguments)} ended with {process.returncode}: {errors.decode()[-2000:]}")
+        raise SystemExit(f"{name} ended with {process.returncode}: {errors.decode()[-2000:]}")
     return time.monotonic() - began
 
 
@@ -81,31 +111,34 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--commands", nargs="+", choices=COMMANDS, default=list(COMMANDS))
     parser.add_argument("--out", type=Path, default=Path("runs/kills"))
+    parser.add_argument("--session", type=Path, help=argparse.SUPPRESS)
     asked = parser.parse_args()
+    if asked.session:
+        return take_session(asked.session)
     shutil.rmtree(asked.out, ignore_errors=True)
+    (inputs := asked.out / "inputs").mkdir(parents=True)
+    trimesh.creation.box((1.0, 0.7, 0.5)).export(inputs / "box.ply")
+    let_through("session", inputs / "recorded", inputs)
     random, failures = np.random.default_rng(0), []
     share = -(-asked.kills // len(asked.commands))
-    if "session" in asked.commands:
-        record_session(asked.out / "recorded")
     for name in asked.commands:
-        arguments = tuple(str(asked.out / "recorded") if word == "SESSION" else word for word in COMMANDS[name])
         # The second time all programs are compiled, as they will be when it is killed.
-        let_through(arguments, asked.out / f"{name}-first")
-        seconds = let_through(arguments, asked.out / f"{name}-whole")
-        expected, killed = contents(asked.out / f"{name}-whole"), 0
+        let_through(name, asked.out / name / "first", inputs)
+        seconds = let_through(name, asked.out / name / "whole", inputs)
+        expected, killed = contents(asked.out / name / "whole"), 0
         with tqdm(total=share, desc=name, unit="kill") as bar:
             while killed < share:
-                out = asked.out / f"{name}-killed"
-                shutil.rmtree(out, ignore_errors=True)
+                shutil.rmtree(out := asked.out / name / "killed", ignore_errors=True)
                 # A few times the same folder, at moments of strata over the whole time.
-                for moment in random.permutation(min(5, share - killed)):
-                    process = start(arguments, out)
-                    time.sleep(seconds * (moment + random.random()) / 5)
-                    killed += process.poll() is None
-                    process.kill()
-                    process.communicate()
+                for moment in random.permutation(min(STRATA, share - killed)):
+                    processes = start(name, out, inputs)
+                    time.sleep(seconds * (moment + random.random()) / STRATA)
+                    killed += any(process.poll() is None for process in processes)
+                    for process in processes:
+                        process.kill()
+                        process.communicate()
                 bar.update(killed - bar.n)
-                let_through(arguments, out)
+                let_through(name, out, inputs)
                 if contents(out) != expected:
                     differ = [file for file, found in contents(out).items() if expected.get(file) != found]
                     failures.append(f"{name} after {killed} kills: {differ or sorted(expected)}")

@@ -24,12 +24,13 @@ IMAGINATION = nbv.Imagination(nbv.GeometricSPSR(0.05, truncation=8), nbv.Grid(24
 VIEWS = 8
 
 
-def planner(max_views: int) -> nbv.Planner:
-    return nbv.Planner(nbv.Coverage(), nbv.DiscreteSearch(20), CAMERA, IMAGINATION, capacity=512, max_views=max_views)
+def planner(max_views: int, candidates: int) -> nbv.Planner:
+    search = nbv.DiscreteSearch(candidates)
+    return nbv.Planner(nbv.Coverage(), search, CAMERA, IMAGINATION, capacity=512, max_views=max_views)
 
 
 def planning(steps: int) -> Iterator[None]:
-    asked, first = planner(VIEWS), nbv.look_at((0.0, 0.0, 2.5))
+    asked, first = planner(VIEWS, 20), nbv.look_at((0.0, 0.0, 2.5))
     evidence = None
     for step in range(steps):
         if step % VIEWS == 0:
@@ -44,7 +45,9 @@ def session(steps: int) -> Iterator[None]:
     poses = nbv.SphereCandidates(steps, 2.5).poses()
     matrices = np.asarray(poses.to_matrix())
     with tempfile.TemporaryDirectory() as folder:
-        taken = nbv.Session(CAMERA, ((-1.2,) * 3, (1.2,) * 3), planner(steps), folder=folder, progress=False)
+        # A session asks for no pose twice.
+        asked = planner(steps, 20 + steps // 10)
+        taken = nbv.Session(CAMERA, ((-1.2,) * 3, (1.2,) * 3), asked, folder=folder, progress=False)
         for step in range(steps):
             pose = poses[step]
             seen = nbv.scan(BALL, CAMERA, pose)

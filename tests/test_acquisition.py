@@ -12,11 +12,12 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.imagination import Imagination
+from jaxnbv.networks import pyramid_classifier
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, GridSurface, scan
 from jaxnbv.search import DiscreteSearch, FarthestView
-from jaxnbv.surfaces import GeometricSPSR
-from jaxnbv.tasks import Coverage
+from jaxnbv.surfaces import GeometricSPSR, ScreenedSPSR
+from jaxnbv.tasks import ColdestPoint, Coverage, CrossEntropy, NewSurface
 
 CAMERA = Camera(height=6, width=7)
 GRID = Grid(20)
@@ -180,3 +181,30 @@ def test_what_is_neither_an_acquisition_nor_a_function_is_named(given):
     name = given.__name__ if isinstance(given, type) else repr(given)
     with pytest.raises(InputError, match=f"the acquisition is .*{name}.*: give one, such as Coverage"):
         Planner(given, FarthestView(6))
+
+
+@pytest.mark.parametrize(
+    ("acquisition", "leaves"),
+    [
+        (Coverage(), False),
+        (NewSurface(), False),
+        (CrossEntropy(pyramid_classifier(), num_points=64), False),
+        (ExpectedUtilityImprovement(ColdestPoint(source=(0.0, 0.0, 1.0))), True),
+    ],
+    ids=["coverage", "new surface", "classes", "heat"],
+)
+def test_only_heat_is_computed_by_the_host(surfaces, cloud, acquisition, leaves):
+    """Its Laplacian has no JAX; all else stays on the device."""
+
+    def step(cloud, surfaces):
+        return expected_value(acquisition, cloud, surfaces, CAMERA, POSES)
+
+    assert ("callback" in str(jax.make_jaxpr(step)(cloud, surfaces))) == leaves
+
+
+@pytest.mark.parametrize("model", [GeometricSPSR(0.2, truncation=4), ScreenedSPSR()], ids=["paper", "screened"])
+def test_no_sample_is_computed_by_the_host(cloud, model):
+    def sample(cloud):
+        return model.condition(cloud).sample(jax.random.key(0), 2).on_grid(GRID.axis)
+
+    assert "callback" not in str(jax.make_jaxpr(sample)(cloud))

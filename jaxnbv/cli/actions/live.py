@@ -5,12 +5,15 @@ from pathlib import Path
 
 import typer
 
+from jaxnbv.cli.actions.device import prepare
+from jaxnbv.cli.registry import Device
 from jaxnbv.planning.replay import stored_run
 from jaxnbv.viz.live import LiveView
 
 
 def view(folder: Path, html: Path | None, port: int) -> None:
     """Show a stored run in the browser until it is interrupted, or write it into a file."""
+    prepare(Device.AUTO)
     run = stored_run(folder)
     page = LiveView(port)
     try:

@@ -1,0 +1,148 @@
+"""Change one place of the code at a time: does a test fail?
+
+    pip install cosmic-ray pytest-cov
+    pytest --dist no --cov=jaxnbv --cov-context=test --cov-report= --durations=0 > runs/durations.txt
+    python benchmarks/mutants.py --mutants 200 --durations runs/durations.txt --out runs/mutants.json
+
+Mutants are those of cosmic-ray: another operator, comparison or number, a condition turned round, a loop without a
+pass, an exception that is not caught. Places are drawn at random from the packages named below, annotations left out,
+and one mutant of each. It is run against the tests that execute its statement (of a module's own statements: the
+module), those of the file named after the module first, then the quick ones, until one fails or ten minutes have
+passed. Run it in a clone: it rewrites the files there, and puts them back. Continues after the last mutant in --out.
+"""
+
+import argparse
+import ast
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from cosmic_ray.ast import ast_nodes, get_ast
+from cosmic_ray.mutating import mutate_code
+from cosmic_ray.plugins import get_operator, operator_names
+from coverage import CoverageData
+from tqdm import tqdm
+
+PARTS = ("surfaces", "scanning", "imagination.py", "search", "planning", "storage")
+SECONDS = 600
+
+
+def places(path: Path) -> dict[tuple[int, int], list[tuple[str, int]]]:
+    """Where a file can be changed, and by which occurrences of which operators."""
+    code = path.read_text()
+    parsed, found = get_ast(code), {}
+    for name in operator_names():
+        # One that takes arguments changes nothing without them.
+        if (kind := get_operator(name)).arguments():
+            continue
+        spots = [at for node in ast_nodes(parsed) for at, _ in kind().mutation_positions(node)]
+        for occurrence, at in enumerate(spots):
+            found.setdefault(at, []).append((name, occurrence))
+    typed = [note for node in ast.walk(ast.parse(code)) if (note := annotation(node)) is not None]
+    return {at: ways for at, ways in found.items() if not any(covers(note, at) for note in typed)}
+
+
+def annotation(node: ast.AST) -> ast.AST | None:
+    return getattr(node, "annotation", None) or getattr(node, "returns", None)
+
+
+def covers(node: ast.AST, at: tuple[int, int]) -> bool:
+    return (node.lineno, node.col_offset) <= at < (node.end_lineno, node.end_col_offset)
+
+
+def statement(code: str, line: int) -> range:
+    """Lines of the smallest statement that holds a line; of one that holds others, its head."""
+    found = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.stmt)]
+    inner = max((node for node in found if node.lineno <= line <= node.end_lineno), key=lambda node: node.lineno)
+    body = getattr(inner, "body", None)
+    return range(inner.lineno, max(body[0].lineno, line + 1) if body else inner.end_lineno + 1)
+
+
+def tests_of(path: Path, code: str, line: int, measured: CoverageData, seconds: dict[str, float]) -> list[str]:
+    """Names of the tests that execute the statement, in the order in which they are asked."""
+    by_line = measured.contexts_by_lineno(str(path.resolve()))
+    of_statement = [context for each in statement(code, line) for context in by_line.get(each, [])]
+    contexts = {context for context in of_statement if context}
+    if "" in of_statement and not contexts:
+        contexts = {context for found in by_line.values() for context in found if context}
+    names = {context.rpartition("|")[0] for context in contexts}
+    return sorted(names, key=lambda name: (f"test_{path.stem}.py" not in name, seconds.get(name, 0.0), name))
+
+
+def outcome(path: Path, mutated: str, tests: list[str]) -> str:
+    """Killed, or survived; of a file that is put back."""
+    if not tests:
+        return "no test"
+    code, times = path.read_text(), path.stat()
+    path.write_text(mutated)
+    # Python tells by size and second whether a file is still the one it compiled.
+    os.utime(path, (time.time() + 10, times.st_mtime + np.random.default_rng().integers(1, 1 << 20)))
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-x",
+        "-n",
+        "0",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-o",
+        "addopts=",
+        *tests,
+    ]
+    try:
+        ended = subprocess.run(command, capture_output=True, timeout=SECONDS).returncode
+    except subprocess.TimeoutExpired:
+        return "no end"
+    finally:
+        path.write_text(code)
+        os.utime(path, (times.st_atime, times.st_mtime))
+    return "killed" if ended else "survived"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--mutants", type=int, default=200)
+    parser.add_argument("--coverage", default=".coverage")
+    parser.add_argument("--durations", type=Path, required=True, help="what pytest --durations=0 printed")
+    parser.add_argument("--out", type=Path, default=Path("runs/mutants.json"))
+    asked = parser.parse_args()
+    measured = CoverageData(asked.coverage)
+    measured.read()
+    told = re.findall(r"^([\d.]+)s \w+ +(tests\S.*)$", asked.durations.read_text(), re.MULTILINE)
+    seconds: dict[str, float] = {}
+    for took, name in told:
+        seconds[name] = seconds.get(name, 0.0) + float(took)
+    files = [
+        file for part in PARTS for file in sorted(Path("jaxnbv").glob(f"{part}/**/*.py" if "." not in part else part))
+    ]
+    drawn = [(path, at, ways) for path in files for at, ways in places(path).items()]
+    random = np.random.default_rng(0)
+    rows = json.loads(asked.out.read_text()) if asked.out.exists() else []
+    chosen = random.choice(len(drawn), asked.mutants, replace=False)
+    for number, index in enumerate(tqdm(chosen, unit="mutant")):
+        path, at, ways = drawn[index]
+        name, occurrence = ways[random.integers(len(ways))]
+        if number < len(rows):
+            continue
+        code = path.read_text()
+        mutated = mutate_code(code, get_operator(name)(), occurrence)
+        tests = tests_of(path, code, at[0], measured, seconds)
+        after = mutated.splitlines()[at[0] - 1].strip()
+        rows.append({"at": f"{path}:{at[0]}", "to": after, "by": name, "is": outcome(path, mutated, tests)})
+        asked.out.parent.mkdir(parents=True, exist_ok=True)
+        asked.out.write_text(json.dumps(rows, indent=1))
+    for row in rows:
+        if row["is"] not in ("killed", "no end"):
+            print(f"{row['is']}: {row['at']}  {row['to']}")
+    print(f"{sum(row['is'] in ('killed', 'no end') for row in rows)} of {len(rows)} killed, of {len(drawn)} places")
+
+
+if __name__ == "__main__":
+    main()
