@@ -97,7 +97,7 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
         (("demo", "--task", "coverage", "--first", "1,2"), ("'1,2'", "three numbers")),
         (("demo", "--task", "coverage", "--first", "0,0,0"), ("target",)),
         (("demo", "--task", "coverage", "--first", "0,0,9", "--noise", "-1"), ("-1", "negative")),
-        (("demo", "--first", "0.8,0,0"), ("0.8,0,0", "inside the object", "outside")),
+        (("demo", "--task", "coverage", "--first", "0.2,0.1,0"), ("0.2,0.1,0", "inside the object", "outside")),
         (("run", "ball.obj", "--first", "0.3,-1,0.2"), ("0.3,-1,0.2", "inside the object", "outside")),
         (("run", "ball.obj", "--radius", "1"), ("cameras 1 from", "1.25", "give more")),
         (("run", "ball.obj", "--lengthscale", "0"), ("lengthscale is 0", "positive")),
@@ -148,7 +148,7 @@ def test_a_folder_of_another_configuration_is_refused(finished):
     """In the user's words; in those of the record where they are not known."""
     folder, _ = finished
     out = "runs/truck-cross-entropy-halving-seed0"
-    asked = ("demo", "--views", "2", "--seed", "1", "--scene", "3", "--out", out)
+    asked = ("demo", "--known", "none", "--views", "2", "--seed", "1", "--scene", "3", "--out", out)
     result = run_command(*asked, cwd=folder)
     assert result.returncode == 2
     assert "another episode" in result.stderr

@@ -205,7 +205,7 @@ def draw_acquisition(
     colours = ScalarMappable(Normalize(*choice.range), VALUE)
     if choice.makes_a_map(quantity):
         extent = (-sphere.WIDTH, sphere.WIDTH, -sphere.HEIGHT, sphere.HEIGHT)
-        smooth = sphere.smooth_map(choice.map.directions, choice.map.values, 240)
+        smooth = sphere.smooth_map(choice.map.directions, choice.map.values)
         image = axes.imshow(colours.to_rgba(smooth), extent=extent, interpolation="bilinear", zorder=1)
         image.set_clip_path(axes.fill(*sphere.rim().T, facecolor="none")[0])
     places = sphere.mollweide(choice.directions)

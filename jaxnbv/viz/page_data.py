@@ -233,7 +233,7 @@ def _spatial(ascents: Ascents, camera: Camera) -> dict:
 
 def _map_image(choice: Choice, low: float, high: float) -> str:
     """The smooth map, coloured as the candidates are; clear outside the rim."""
-    values = sphere.smooth_map(choice.map.directions, choice.map.values, 160)
+    values = sphere.smooth_map(choice.map.directions, choice.map.values)
     colours = VALUE(mpl.colors.Normalize(low, high)(np.nan_to_num(values)), bytes=True)
     colours[..., 3] = np.where(np.isnan(values), 0, 255)
     return picture_address(colours)

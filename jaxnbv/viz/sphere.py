@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import RBFInterpolator
 
 WIDTH, HEIGHT = 2.0 * np.sqrt(2.0), np.sqrt(2.0)  # Half axes of the map's ellipse.
+_ROWS = 160
 
 
 def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
@@ -42,7 +43,7 @@ def from_mollweide(places: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, 
 
 
 def smooth_map(
-    directions: Float[np.ndarray, "c 3"], values: Float[np.ndarray, " c"], height: int
+    directions: Float[np.ndarray, "c 3"], values: Float[np.ndarray, " c"], height: int = _ROWS
 ) -> Float[np.ndarray, "h w"]:
     """The values of candidates carried over the map, `height` by 2 `height` pixels from its top; NaN outside it.
 

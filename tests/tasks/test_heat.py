@@ -151,7 +151,7 @@ def test_expected_improvements_by_hand():
     poses = look_at(jnp.asarray(fibonacci_sphere(5, 2.5)))
     points = sphere(400)
     data = cloud_of(points[points[:, 2] > 0.8], capacity=100)
-    utility = utility_of(HEAT, workers=2)
+    utility = utility_of(HEAT, workers=1)
     found = eqx.filter_jit(expected_value)(ExpectedUtilityImprovement(utility), data, surfaces, CAMERA, poses)
     scans = eqx.filter_jit(eqx.filter_vmap(scan, in_axes=(0, None, None)))(surfaces, CAMERA, poses)
     known, seen = data.to_numpy()[0], [[scans[s, i].to_numpy()[0] for i in range(5)] for s in range(2)]
