@@ -73,7 +73,6 @@ CALLS = {
     | {"farthest": 3.0, "max_incidence": 1.0},
     nbv.Camera.from_intrinsics: {"matrix": np.eye(3), "height": 4, "width": 4, "nearest": 0.1, "farthest": 3.0}
     | {"max_incidence": 1.0},
-    nbv.Camera.from_focal_length: {"focal_length": 5.0, "width": 4, "height": 4},
     SMALL.resized: {"height": 2, "width": 3},
     SMALL.strided: {"stride": 2},
     nbv.Carving: {"volume": nbv.Box(), "margin_voxels": 1.0},

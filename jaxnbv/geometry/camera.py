@@ -98,17 +98,6 @@ class Camera(eqx.Module):
         center = ((cx + 0.5) / width, (cy + 0.5) / height)
         return cls(fov, height, width, fx / fy, center, nearest, farthest, max_incidence)
 
-    @classmethod
-    @checked
-    def from_focal_length(cls, focal_length: float, height: int, width: int) -> "Camera":
-        """The camera of square pixels, its principal point at the centre, of a focal length in pixels.
-
-        **Raises:** `ValueError` if the focal length is not positive.
-        """
-        matrix = np.diag([focal_length, focal_length, 1.0])
-        matrix[:2, 2] = 0.5 * (width - 1), 0.5 * (height - 1)
-        return cls.from_intrinsics(matrix, height, width)
-
     @property
     def intrinsics(self) -> Float[np.ndarray, "3 3"]:
         """The intrinsic matrix of `from_intrinsics`, in pixels."""

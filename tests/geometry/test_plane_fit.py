@@ -10,7 +10,7 @@ from jaxnbv.geometry.plane_fit import depth_noise
 from jaxnbv.geometry.pose import look_at
 
 # A ball of 8 cm before a slanted plane, 0.45 m away: in metres, as a sensor of 640 x 480 pixels sees its middle.
-CAMERA = Camera.from_focal_length(570.0, 160, 200)
+CAMERA = Camera.from_intrinsics([[570.0, 0.0, 99.5], [0.0, 570.0, 79.5], [0.0, 0.0, 1.0]], 160, 200)
 POSE = look_at((0.03, 0.0, 0.45))
 RADIUS = 0.08
 SLANTED, BEHIND = np.array([0.3, -0.2, 1.0]) / np.sqrt(1.13), -0.05

@@ -188,6 +188,7 @@ def test_points_all_over_a_surface_are_a_solid():
     sheet = np.stack([*RNG.uniform(-1.0, 1.0, (2, 8192)), np.zeros(8192)], axis=1)
     above = np.stack([*RNG.uniform(-0.8, 0.8, (2, 500)), np.zeros(500)], axis=1)
     solid = solid_of_points(sheet, sheet=0.1)
+    assert len({*solid.values.shape}) == 1
     assert np.asarray(values(solid, jnp.asarray(above))).max() < 0.0
     assert np.asarray(values(solid, jnp.asarray(above) + jnp.array([0.0, 0.0, 0.15]))).min() > 0.0
 

@@ -136,6 +136,15 @@ def test_a_symmetric_shape_stands_in_all_the_ways_that_look_alike():
     assert sorted(np.round(np.abs(angles[good])).astype(int).tolist()) == pytest.approx([0, 180], abs=3)
 
 
+def test_every_shape_is_tried_once_where_there_are_fewer_starts_than_shapes():
+    """Four, refined, and once more in each of the four places where these came to stand."""
+    nothing = Seen(
+        jnp.zeros((256, 3)), jnp.zeros((256, 3)), jnp.zeros(256, bool), jnp.zeros((512, 3)), jnp.zeros(512, bool)
+    )
+    found = eqx.filter_eval_shape(register, BANK, Prior(nbv.FreeRotation(), nbv.Box()), nothing, 3)
+    assert found.shape.shape == (4 + 4 * 4,)
+
+
 def model(bank=BANK, **changed):
     return nbv.KnownShapes(bank, RESIDUAL, unknown=QUICK, num_starts=1024, **changed)
 

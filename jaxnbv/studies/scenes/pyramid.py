@@ -40,22 +40,13 @@ class Pyramid(ClassObject):
         sides = ((jnp.maximum(jnp.abs(u), jnp.abs(v)) - 1.0) * self.height + w) / slant
         return self.scale * jnp.maximum(jnp.maximum(sides, -w), -self._imprint(u, v, w))
 
-    def on_base(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
-        """Which points of the surface belong to the base, the pattern included; the tolerance is in scene units."""
-        w = self._own(x)[2]
-        return (self.scale * w <= tolerance) | self.on_pattern(x, tolerance)
-
-    def on_pattern(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
+    def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
         """Which points of the surface belong to the pattern, its floor or its walls; the tolerance is in scene units.
 
         Give hits without noise: a floor is a few hundredths below the base.
         """
         u, v, w = self._own(x)
         return (self.scale * self._imprint(u, v, w) <= tolerance) & (self.scale * w > tolerance)
-
-    def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
-        """Those of the pattern."""
-        return self.on_pattern(x, tolerance)
 
     def _own(self, x):
         a, b, c = (x[..., i, None] - self.offset[i] for i in range(3))

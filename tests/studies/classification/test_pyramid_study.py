@@ -116,7 +116,7 @@ def test_the_first_view_is_that_of_all_methods_and_shows_no_pattern_but_somethin
     assert firsts == {record["first"]}
     pyramid, poses = pyramid_scene(Split.TEST, SCENE), SphereCandidates(CANDIDATES).poses()
     _, seen = scan_cue(pyramid, CAMERA, poses)
-    pixels = np.asarray(jnp.sum(pyramid.on_pattern(seen.points) & seen.mask, axis=-1))
+    pixels = np.asarray(jnp.sum(pyramid.on_cue(seen.points) & seen.mask, axis=-1))
     assert pixels[record["first"]] == 0 < int(seen.count[record["first"]])
     np.testing.assert_allclose(record["pattern_pixels"], pixels, atol=1)
     assert pixels.max() > 0.2 * RAYS
