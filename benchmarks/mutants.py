@@ -6,9 +6,10 @@
 
 Mutants are those of cosmic-ray: another operator, comparison or number, a condition turned round, a loop without a
 pass, an exception that is not caught. Places are drawn at random from the packages named below, annotations left out,
-and one mutant of each. It is run against the tests that execute its statement (of a module's own statements: the
-module), those of the file named after the module first, then the quick ones, as many as take two minutes, until one
-fails. Run it in a clone: it rewrites the files there, and puts them back. Continues after the last mutant in --out.
+and one mutant of each. It is run against the tests that execute its statement, then those that execute anything of its
+module, each time those of the file named after the module first, then the quick ones, as many as take two minutes,
+until one fails. Run it in a clone: it rewrites the files there, and puts them back. Continues after the last mutant in
+--out.
 """
 
 import argparse
@@ -19,6 +20,7 @@ import re
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -58,22 +60,27 @@ def covers(node: ast.AST, at: tuple[int, int]) -> bool:
 def statement(code: str, line: int) -> range:
     """Lines of the smallest statement that holds a line; of one that holds others, its head."""
     found = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.stmt)]
-    inner = max((node for node in found if node.lineno <= line <= node.end_lineno), key=lambda node: node.lineno)
+    first = {node: min(one.lineno for one in (node, *getattr(node, "decorator_list", ()))) for node in found}
+    inner = max((node for node in found if first[node] <= line <= node.end_lineno), key=first.__getitem__)
     body = getattr(inner, "body", None)
-    return range(inner.lineno, max(body[0].lineno, line + 1) if body else inner.end_lineno + 1)
+    return range(first[inner], max(body[0].lineno, line + 1) if body else inner.end_lineno + 1)
 
 
 def tests_of(path: Path, code: str, line: int, measured: CoverageData, seconds: dict[str, float]) -> list[str]:
-    """Names of the tests that execute the statement, in the order in which they are asked."""
+    """Names of the tests that are asked, in their order."""
     by_line = measured.contexts_by_lineno(str(path.resolve()))
-    of_statement = [context for each in statement(code, line) for context in by_line.get(each, [])]
-    contexts = {context for context in of_statement if context}
-    if "" in of_statement and not contexts:
-        contexts = {context for found in by_line.values() for context in found if context}
-    names = {context.rpartition("|")[0] for context in contexts}
-    ordered = sorted(names, key=lambda name: (f"test_{path.stem}.py" not in name, seconds.get(name, 0.0), name))
-    taken = np.cumsum([seconds.get(name, 0.0) for name in ordered])
-    return ordered[: 1 + int(np.searchsorted(taken, SECONDS))]
+
+    def running(lines: Iterable[int]) -> set[str]:
+        return {context.rpartition("|")[0] for each in lines for context in by_line.get(each, ()) if context}
+
+    def order(name: str) -> tuple[bool, float, str]:
+        return f"test_{path.stem}.py" not in name, seconds.get(name, 0.0), name
+
+    # What is compiled is traced by the first test of a process alone that needs it.
+    of_statement, of_module = running(statement(code, line)), running(by_line)
+    names = [*sorted(of_statement, key=order), *sorted(of_module - of_statement, key=order)]
+    taken = np.cumsum([seconds.get(name, 0.0) for name in names])
+    return names[: 1 + int(np.searchsorted(taken, SECONDS))]
 
 
 def outcome(path: Path, mutated: str, tests: list[str]) -> str:
@@ -84,22 +91,9 @@ def outcome(path: Path, mutated: str, tests: list[str]) -> str:
     path.write_text(mutated)
     # Python tells by size and second whether a file is still the one it compiled.
     os.utime(path, (time.time() + 10, times.st_mtime + np.random.default_rng().integers(1, 1 << 20)))
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-x",
-        "-n",
-        "0",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "-o",
-        "addopts=",
-        *tests,
-    ]
+    command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "-o", "addopts=", *tests]
     try:
-        ended = subprocess.run(command, capture_output=True, timeout=5.0 * SECONDS).returncode
+        ended = subprocess.run(command, capture_output=True, timeout=3.0 * SECONDS).returncode
     except subprocess.TimeoutExpired:
         return "no end"
     finally:

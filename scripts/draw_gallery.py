@@ -25,7 +25,6 @@ from jaxnbv.viz.imagined_figures import looks
 from jaxnbv.viz.layout import fitted as words
 from jaxnbv.viz.render import draw_scene
 from jaxnbv.viz.style import GREY
-from jaxnbv.viz.words import percent
 
 VIEWS, RAYS, CANDIDATES = 4, 48, 60
 # Of the demo that the hero shows.
@@ -70,9 +69,7 @@ def draw_gallery(figure: Figure, columns: int = 4) -> None:
         bottom = 1.0 - (row + 1) / rows
         axes = figure.add_axes((column / columns, bottom + 0.08 / rows, 1.0 / columns, 0.92 / rows))
         draw_scene(axes, data, VIEWS - 1, Stills(data)[VIEWS - 1], episode.planner.camera, weight=0.8, inset=False)
-        covered = data.views[-1].coverage
-        assert covered is not None
-        text = f"{name}, {percent(covered)} covered"
+        text = f"{name}, {data.views[-1].seen.amount} covered"
         figure.text((column + 0.5) / columns, bottom + 0.04 / rows, text, ha="center", va="center", fontsize=9)
 
 

@@ -249,9 +249,35 @@ class _ColdestWords(Words):
 
 
 class CoverageAnswer(Answer):
-    """The share of the true surface that was seen; where that is not known, the number of points kept."""
+    """How much of the surface was seen: a share of the true one or, where that is not known, the area of what was."""
 
-    form: str = "{:.0%}"
+    @classmethod
+    def of_share(cls, share: float) -> "CoverageAnswer":
+        return cls(("of the surface seen",), np.array([share]), "{:.0%}")
+
+    @classmethod
+    def of_area(cls, area: float) -> "CoverageAnswer":
+        """In squared scene units."""
+        return cls(("of surface seen",), np.array([area]), "{:.3g} scene units²")
+
+    @property
+    def is_share(self) -> bool:
+        return self.form.endswith("%}")
+
+    @property
+    def label(self) -> str:
+        """For an axis of `scaled` values."""
+        return "surface seen (%)" if self.is_share else "surface seen (scene units²)"
+
+    @property
+    def scaled(self) -> float:
+        """In percent, or the area."""
+        return float(self.values[0]) * (100.0 if self.is_share else 1.0)
+
+    @property
+    def amount(self) -> str:
+        """In words."""
+        return f"{self.scaled:.0f} %" if self.is_share else f"{number(self.scaled)} scene units²"
 
 
 @words_of.register(CoverageAnswer)
@@ -264,10 +290,8 @@ class _CoverageWords(Words):
         return f"{self._value(self.answer, 0)} {self.answer.names[0]}"
 
     def panels(self, truth: Answer | None) -> tuple[Panel, ...]:
-        names, values = self.answer.names, self.answer.values
-        if not self.answer.form.endswith("%}"):
-            return (Panel(names[0], names, values),)
-        return (Panel("surface seen (%)", names, 100.0 * values, goal=100.0),)
+        goal = 100.0 if self.answer.is_share else None
+        return (Panel(self.answer.label, self.answer.names, np.array([self.answer.scaled]), goal=goal),)
 
 
 def label_of(quantity: Quantity) -> str:

@@ -9,16 +9,16 @@ from jaxnbv.acquisition import Quantity
 from jaxnbv.checks import AnyArray
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.planning.episode import Episode, View
+from jaxnbv.planning.episode import Episode
 from jaxnbv.progress import progress_bar
-from jaxnbv.scanning.metrics import coverage, truth_points
-from jaxnbv.viz.answers import words_of
+from jaxnbv.scanning.metrics import truth_points
+from jaxnbv.viz.answers import CoverageAnswer, words_of
 from jaxnbv.viz.choice import Ascents, Choice, choice_of, wider_map
 from jaxnbv.viz.imagined import Imagined, Look, taken_look
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.sketches import Sketch, Sketches, sketches_of
 from jaxnbv.viz.stage import Stage, stage_of
-from jaxnbv.viz.task import Task, task_of
+from jaxnbv.viz.task import Task, seen_after, task_of
 from jaxnbv.viz.words import Told, describe_choice, describe_first
 
 
@@ -30,7 +30,7 @@ class ViewData(eqx.Module):
     - `surface`: of the posterior mean, where it holds points, with a deviation that allows for what was not seen; None
       where it has none within the grid.
     - `choice`: None for a view that was given.
-    - `coverage`: share of the true surface that was seen; None where the truth is not known.
+    - `seen`: how much of the surface was seen.
     - `count`: points of the cloud after this view.
     - `told`: what happened, in words.
     - `imagined`: what was imagined before it was taken; None for a view that was given.
@@ -44,7 +44,7 @@ class ViewData(eqx.Module):
     new: Float[np.ndarray, "m 3"]
     surface: MeanSurface | None
     choice: Choice | None
-    coverage: float | None
+    seen: CoverageAnswer
     count: int
     told: Told
     imagined: Imagined | None = None
@@ -102,12 +102,8 @@ def report_data(
     planner = episode.planner
     if truth is None and episode.scene is not None:
         truth = truth_points(episode.scene, jax.random.key(0))
-
-    def covered_by(views: tuple[View, ...]) -> list[float | None]:
-        return [None] * len(views) if truth is None else [*coverage(views, truth)]
-
-    covered = covered_by(episode.views)
-    task = task_of(episode, covered, rival, () if rival is None else covered_by(rival.views))
+    seen = seen_after(episode.views, truth)
+    task = task_of(episode, seen, rival, () if rival is None else seen_after(rival.views, truth))
     drawn: list[ViewData] = []
     held = {} if sketches is None else sketches.held
     following = zip(episode.views, sketches_of(episode, held, imagine), strict=True)
@@ -125,9 +121,9 @@ def report_data(
                 new=new,
                 surface=next_one.surface,
                 choice=choice,
-                coverage=covered[index],
+                seen=seen[index],
                 count=int(view.cloud.count),
-                told=_told(episode, index, choice, covered, task),
+                told=_told(episode, index, choice, task, seen),
                 imagined=None if leading is None else leading.imagined,
                 look=taken_look(view, before),
                 guesses=next_one.guesses,
@@ -139,16 +135,15 @@ def report_data(
     return ReportData(tuple(drawn), planner.quantity, task, stage_of(episode, means), frame)
 
 
-def _told(episode: Episode, index: int, choice: Choice | None, covered: list[float | None], task: Task) -> Told:
-    view, before = episode.views[index], covered[index - 1] if index else None
-    points, after = int(view.scan.count), covered[index]
+def _told(episode: Episode, index: int, choice: Choice | None, task: Task, seen: list[CoverageAnswer]) -> Told:
+    view = episode.views[index]
+    points = int(view.scan.count)
     if choice is None or not index:
-        told = describe_first(view.pose, points, after)
+        told = describe_first(view.pose, points, seen[index])
     else:
         earlier = [other.pose for other in episode.views[:index]]
-        change = None if before is None or after is None else (before, after)
-        count = int(view.cloud.count)
-        told = describe_choice(episode.planner.quantity, choice, view.pose, earlier, points, count, change)
+        came = points, int(view.cloud.count), (seen[index - 1], seen[index])
+        told = describe_choice(episode.planner.quantity, choice, view.pose, earlier, *came)
     if not task.is_coverage:
         answer = words_of(task.answers[index]).sentence(task.answers[index - 1] if index else None)
         told = told._replace(came=f"{told.came} {answer}")

@@ -29,7 +29,6 @@ from jaxnbv.viz.render import Still, draw_scene
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, round_range, spaced_ticks
 from jaxnbv.viz.task_figures import chart_figure, coverage_series, draw_coverage, draw_values, task_charts
 from jaxnbv.viz.trajectory_figures import draw_ascents, trajectory_figure
-from jaxnbv.viz.words import percent
 
 STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
@@ -251,9 +250,14 @@ def overview_figure(data: ReportData, camera: Camera, stills: Stills | None = No
         row, column = divmod(index, columns)
         x, y = left + 3.0 * column, tall - _ROW * (row + 1)
         draw_scene(figure.add_axes(place(x, y + 1.55, 3.0, 3.0)), data, index, stills[index], camera, weight=1.3)
-        share = f"{view.count:,} points" if view.coverage is None else f"{percent(view.coverage)} covered"
         figure.text(*place(x + 0.12, y + 4.85)[:2], f"View {view.number}", fontsize=15, fontweight="bold", va="center")
-        figure.text(*place(x + 2.88, y + 4.85)[:2], share, fontsize=14, ha="right", va="center")
+        figure.text(
+            *place(x + 2.88, y + 4.85)[:2],
+            f"{view.seen.amount}{' seen' * view.seen.is_share}",
+            fontsize=14,
+            ha="right",
+            va="center",
+        )
         draw_acquisition(figure.add_axes(place(x + 0.1, y, 2.8, 1.5)), view.choice, data.quantity, weight=1.2)
     long = 0.5 * width - 1.2 if beside else width - 1.6
     _deviation_bar(figure, place(0.6, base - 0.35, long, 0.13), LogNorm(*deviation_range(data)), 12.0)

@@ -49,7 +49,7 @@ def write_report(
     path. Files of an earlier report are replaced.
 
     - `truth`: points of the true surface in scene coordinates, for the chart of coverage; by default sampled from the
-      scene, where it can be. Without truth the chart counts points.
+      scene, where it can be. Without truth the chart is of the area that the scans have shown.
     - `title`: what the object is called.
     - `rival`: an episode of another search from the same first view, to be told of.
     - `sketches`: those of the episode's steps, which else are made again.

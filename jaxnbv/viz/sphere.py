@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.interpolate import RBFInterpolator
+from scipy.spatial import cKDTree
 
 WIDTH, HEIGHT = 2.0 * np.sqrt(2.0), np.sqrt(2.0)  # Half axes of the map's ellipse.
 _ROWS = 160
@@ -45,7 +46,8 @@ def from_mollweide(places: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, 
 def smooth_map(
     directions: Float[np.ndarray, "c 3"], values: Float[np.ndarray, " c"], height: int = _ROWS
 ) -> Float[np.ndarray, "h w"]:
-    """The values of candidates carried over the map, `height` by 2 `height` pixels from its top; NaN outside it.
+    """The values of candidates carried over the map, `height` by 2 `height` pixels from its top; NaN outside it, and
+    farther from all candidates than nine tenths of them are from the next.
 
     A spline over the chords of the sphere, which goes through the values (NaN ones are left out) and stays within
     their range.
@@ -57,7 +59,9 @@ def smooth_map(
     known = ~np.isnan(values)
     spline = RBFInterpolator(directions[known], values[known], kernel="thin_plate_spline")
     smooth = np.clip(spline(at), values[known].min(), values[known].max())
-    return np.where(inside, smooth, np.nan).reshape(height, 2 * height)
+    tree = cKDTree(directions)
+    near = tree.query(at)[0] <= np.quantile(tree.query(directions, k=2)[0][:, 1], 0.9)
+    return np.where(inside & near, smooth, np.nan).reshape(height, 2 * height)
 
 
 def path(directions: Float[np.ndarray, "n 3"]) -> list[Float[np.ndarray, "_ 2"]]:

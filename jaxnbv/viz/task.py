@@ -4,15 +4,21 @@ import re
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import trimesh
+from jaxtyping import Array, Float
 
 from jaxnbv.acquisition import Acquisition, Answer
+from jaxnbv.checks import AnyArray
+from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.episode import Episode, View
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Surface
-from jaxnbv.scanning.metrics import true_mesh
+from jaxnbv.scanning.metrics import coverage, true_mesh
+from jaxnbv.tasks.new_surface import NewSurface, visible_area
 from jaxnbv.viz.answers import CoverageAnswer, Panel, capital, words_of
 
 
@@ -20,13 +26,13 @@ class Rival(eqx.Module):
     """Another search from the same first view.
 
     - `name`: of the search, in words; `words`: how it fared, in a sentence.
-    - `panels`: view by view the charts of its answer; `covered`: the share of the true surface that it had seen.
+    - `panels`: view by view the charts of its answer; `seen`: how much of the surface it had seen.
     """
 
     name: str
     words: str
     panels: tuple[tuple[Panel, ...], ...]
-    covered: tuple[float | None, ...]
+    seen: tuple[CoverageAnswer, ...]
 
 
 class Task(eqx.Module):
@@ -59,41 +65,53 @@ class Task(eqx.Module):
 
 def task_of(
     episode: Episode,
-    covered: Sequence[float | None],
+    seen: Sequence[CoverageAnswer],
     rival: Episode | None = None,
-    rival_covered: Sequence[float | None] = (),
+    rival_seen: Sequence[CoverageAnswer] = (),
 ) -> Task:
     """The task of an episode's acquisition; that of seeing all of the surface, where it answers nothing.
 
-    - `covered`, `rival_covered`: the share of the true surface that was seen after each view; None where not known.
+    - `seen`, `rival_seen`: how much of the surface was seen after each view.
     - `rival`: an episode of another search from the same first view.
     """
     acquisition = episode.planner.acquisition
-    answers, truth = _answers(acquisition, episode.views, covered), None
+    answers, truth = _answers(acquisition, episode.views, seen), None
     if episode.scene is not None and not isinstance(answers[-1], CoverageAnswer):
         cloud = true_cloud(episode.scene, episode.planner.capacity)
         truth = None if cloud is None else acquisition.true_answer(episode.scene, cloud)
     panels = tuple(words_of(answer).panels(truth) for answer in answers)
     beside = None
     if rival is not None:
-        others = tuple(words_of(answer).panels(truth) for answer in _answers(acquisition, rival.views, rival_covered))
-        beside = Rival(search_name(rival), race_words(rival, acquisition), others, tuple(rival_covered))
+        others = tuple(words_of(answer).panels(truth) for answer in _answers(acquisition, rival.views, rival_seen))
+        beside = Rival(search_name(rival), race_words(rival, acquisition), others, tuple(rival_seen))
     head = _asked(episode.planner), _found(answers, truth), _sure(answers)
     return Task(tuple(answers), truth, panels, *head, beside)
 
 
-def _answers(acquisition: Acquisition, views: Sequence[View], covered: Sequence[float | None]) -> list[Answer]:
+def _answers(acquisition: Acquisition, views: Sequence[View], seen: Sequence[CoverageAnswer]) -> Sequence[Answer]:
     """After each view; how much was seen, where the acquisition answers nothing."""
     given = [acquisition.answer(view.cloud) for view in views]
     answers = [answer for answer in given if answer is not None]
-    if len(answers) == len(given):
-        return answers
-    return [
-        CoverageAnswer(("points kept",), np.array([float(view.cloud.count)]), "{:,.0f}")
-        if share is None
-        else CoverageAnswer(("of the surface seen",), np.array([share]))
-        for view, share in zip(views, covered, strict=True)
+    return answers if len(answers) == len(given) else seen
+
+
+def seen_after(views: Sequence[View], truth: Float[AnyArray, "n 3"] | None) -> list[CoverageAnswer]:
+    """How much of the surface was seen after each view: the share of the true one, of which points are given; else the
+    area that each scan shows and none before it has shown, by `NewSurface`, summed up."""
+    if truth is not None:
+        return [CoverageAnswer.of_share(float(share)) for share in coverage(views, truth)]
+    clouds = [None, *(view.cloud for view in views[:-1])]
+    new = [
+        float(_new_area(cloud, view.scan, view.camera, view.pose)) for cloud, view in zip(clouds, views, strict=True)
     ]
+    return [CoverageAnswer.of_area(float(area)) for area in np.cumsum(new)]
+
+
+@eqx.filter_jit
+def _new_area(cloud: PointCloud | None, scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, ""]:
+    if cloud is None:
+        return jnp.sum(visible_area(scan, camera, pose))
+    return (surface := NewSurface()).score(surface.context(cloud), scan, camera, pose)
 
 
 def true_cloud(scene: Surface, count: int) -> PointCloud | None:
@@ -106,20 +124,20 @@ def true_cloud(scene: Surface, count: int) -> PointCloud | None:
     return PointCloud.from_arrays(np.asarray(points, np.float32), np.asarray(own.face_normals[faces], np.float32))
 
 
-def since(answers: list[Answer]) -> int | None:
+def since(answers: Sequence[Answer]) -> int | None:
     """The first view (from 1) from which on all answers can be relied on; None if not even the last can."""
     relied = _relied(answers)
     return None if not relied[-1] else len(relied) - int(np.argmin([*relied[::-1], False]) - 1)
 
 
-def lost_again(answers: list[Answer]) -> int | None:
+def lost_again(answers: Sequence[Answer]) -> int | None:
     """The first view (from 1) whose answer could be relied on, if one after it could not; None otherwise."""
     relied = _relied(answers)
     first = int(np.argmax(relied))
     return first + 1 if relied[first] and not all(relied[first:]) else None
 
 
-def _relied(answers: list[Answer]) -> list[bool]:
+def _relied(answers: Sequence[Answer]) -> list[bool]:
     befores = [None, *answers[:-1]]
     return [words_of(answer).settled(before) for answer, before in zip(answers, befores, strict=True)]
 
@@ -147,12 +165,12 @@ def _asked(planner: Planner) -> str:
     return f"Each view is where the {name} is highest, over {planner.imagination.num_samples} imagined surfaces."
 
 
-def _found(answers: list[Answer], truth: Answer | None) -> str:
+def _found(answers: Sequence[Answer], truth: Answer | None) -> str:
     text = capital(words_of(answers[-1]).found)
     return text if truth is None else f"{text}. In truth: {words_of(truth).truly}"
 
 
-def _sure(answers: list[Answer]) -> str:
+def _sure(answers: Sequence[Answer]) -> str:
     first, count, lost = since(answers), len(answers), lost_again(answers)
     text = f"From view {first} on" if first else f"Not yet after {count} view{'s' * (count > 1)}"
     again = f" At view {lost} it was sure already, but then not." if lost else ""

@@ -98,28 +98,24 @@ def over_views(axes: Axes, count: int) -> None:
 
 
 def coverage_series(data: ReportData) -> tuple[str, Float[np.ndarray, " v"]]:
-    """The chart of progress: coverage in percent, or where the truth is not known the points that are kept."""
-    shares = [view.coverage for view in data.views]
-    if any(share is None for share in shares):
-        return "points kept", np.array([float(view.count) for view in data.views])
-    values = np.array([100.0 * share for share in shares if share is not None])
-    return "surface seen (%)", values
+    """The chart of progress: how much was seen."""
+    return data.views[0].seen.label, np.array([view.seen.scaled for view in data.views])
 
 
 def draw_coverage(axes: Axes, data: ReportData) -> None:
     """Draw progress by view."""
-    label, values = coverage_series(data)
+    _, values = coverage_series(data)
     views = np.arange(1, len(values) + 1)
     axes.plot(views, values, color=BEFORE, lw=1.4, marker="o", ms=5, markeredgecolor="white")
     if len(views) <= 10:
         for view, value in zip(views, values, strict=True):
-            text = number(value) if label == "points kept" else f"{value:.0f}"
+            text = f"{value:.0f}" if data.views[0].seen.is_share else number(value)
             axes.annotate(text, (view, value), (0, 6), textcoords="offset points", ha="center", fontsize=8)
     highest, count, rival = float(values.max()), len(values), data.task.rival
-    if rival is not None and data.views[0].coverage is not None:
-        shares = 100.0 * np.array(rival.covered, np.float64)
-        legend_below(axes, [_draw_rival(axes, shares, rival.name)])
-        highest, count = max(highest, float(shares.max())), max(count, len(shares))
+    if rival is not None:
+        others = np.array([answer.scaled for answer in rival.seen])
+        legend_below(axes, [_draw_rival(axes, others, rival.name)])
+        highest, count = max(highest, float(others.max())), max(count, len(others))
     axes.set(ylim=(0, 1.18 * max(highest, 1.0)))
     over_views(axes, count)
 

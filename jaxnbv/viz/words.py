@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxnbv.acquisition import Quantity
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.viz.answers import capital, coordinates, number, shown_value
+from jaxnbv.viz.answers import CoverageAnswer, capital, coordinates, number, shown_value
 from jaxnbv.viz.choice import Choice
 from jaxnbv.viz.sphere import unit
 
@@ -26,10 +26,12 @@ class Told(NamedTuple):
         return " ".join(part for part in (f"View {view} {self.where}.", why and f"{why}.", self.came) if part)
 
 
-def describe_first(pose: Pose, points: int, covered: float | None) -> Told:
+def describe_first(pose: Pose, points: int, seen: CoverageAnswer) -> Told:
     """A view that was given."""
-    share = "" if covered is None else f", {percent(covered)} of the true surface"
-    return Told(f"was given. It looks from {place(pose)}", "", "", f"It found {points:,} points{share}.")
+    of = "the true surface" if seen.is_share else "surface"
+    return Told(
+        f"was given. It looks from {place(pose)}", "", "", f"It found {points:,} points, {seen.amount} of {of}."
+    )
 
 
 def describe_choice(
@@ -39,22 +41,19 @@ def describe_choice(
     earlier: list[Pose],
     points: int,
     count: int,
-    change: tuple[float, float] | None,
+    seen: tuple[CoverageAnswer, CoverageAnswer],
 ) -> Told:
     """A view that was chosen.
 
-    `points`, `count`: those that it found, and those that are kept; `change`: coverage before and after, where it is
-    known.
+    `points`, `count`: those that it found, and those that are kept; `seen`: how much was seen before and after.
     """
     here, *others = (unit(np.asarray(p.position, dtype=np.float64)) for p in (pose, *earlier))
     nearest = np.degrees(np.arccos(np.clip(max(here @ there for there in others), -1.0, 1.0)))
     turned = f"{nearest:.0f}° from the nearest earlier view"
     added = f"It added {points:,} points" if points else "It saw nothing"
     kept = f" ({count:,} are kept)" if points else ""
-    grown = ""
-    if change is not None:
-        before, after = (percent(share) for share in change)
-        grown = f"; coverage stayed at {after}" if before == after else f"; coverage went from {before} to {after}"
+    (before, after), what = (one.amount for one in seen), "coverage" if seen[1].is_share else "surface seen"
+    grown = f"; {what} stayed at {after}" if before == after else f"; {what} went from {before} to {after}"
     where, came = f"looks from {place(pose)}{_aim(pose)}, {turned}", f"{added}{kept}{grown}."
     return Told(where, *_reason(quantity, choice), came)
 
@@ -119,8 +118,3 @@ def _aim(pose: Pose) -> str:
     position, forward = (np.asarray(vector, dtype=np.float64) for vector in (pose.position, pose.forward))
     off = np.degrees(np.arccos(np.clip(-unit(position) @ forward, -1.0, 1.0)))
     return "" if off < 0.5 else f", {np.linalg.norm(position):.2f} from the centre and aimed {off:.0f}° off it"
-
-
-def percent(share: float) -> str:
-    """A share in whole percent."""
-    return f"{100 * share:.0f} %"

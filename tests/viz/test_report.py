@@ -162,24 +162,29 @@ def test_the_sentence_tells_the_numbers_of_the_step(episode, data):
     assert f"the highest of {len(values)} open candidates" in shown.sentence
     assert f"{number(values[0] / np.median(values))} times the median" in shown.sentence
     assert f"added {int(view.scan.count):,} points" in shown.sentence
-    before, after = (100 * data.views[i].coverage for i in (0, 1))
+    before, after = (data.views[i].seen.scaled for i in (0, 1))
     assert f"coverage went from {before:.0f} % to {after:.0f} %" in shown.sentence
     assert shown.choice.rank == 1
     assert shown.choice.num_tied == view.proposal.num_tied
     assert "two standard errors" in shown.sentence
 
 
-def test_a_scene_without_truth_counts_points(tmp_path, episode):
+def test_of_a_scene_without_truth_the_area_that_was_seen_is_told(tmp_path, episode):
+    """Of a ball of radius 1 a first view sees the cap before its horizon, 2 pi (1 - 1 / r)."""
     grid = nbv.Grid(24)
     distance = np.linalg.norm(np.stack(np.meshgrid(*[grid.axis] * 3, indexing="ij")), axis=0) - 1.0
     scene = nbv.GridSurface.from_values(distance, 0.0, grid)
-    lone = dataclasses.replace(episode, scene=scene, views=episode.views[:1])
+    camera, pose = nbv.Camera(1.0, 40, 40), nbv.look_at((0.0, 0.0, 2.5))
+    seen = nbv.scan(nbv.SDFSurface(nbv.sdf.Sphere(1.0)), camera, pose)
+    lone = dataclasses.replace(episode, scene=scene, views=(nbv.View(pose, seen, seen, None, camera),))
     path = write_report(lone, tmp_path, progress=False)
     page = path.read_text(encoding="utf-8")
-    assert "<h2>Points kept</h2>" in page
-    assert f"<td>{number(float(lone.cloud.count))}</td>" in page
+    assert "<h2>Surface seen (scene units²)</h2>" in page
+    area = report_data(lone, progress=False, imagine=False).views[0].seen.scaled
+    assert area == pytest.approx(2.0 * np.pi * (1.0 - 1.0 / 2.5), rel=0.15)
+    assert f"<td>{number(area)}</td>" in page
     truth = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-    assert report_data(lone, truth, progress=False).views[0].coverage in (0.0, 0.5, 1.0)
+    assert report_data(lone, truth, progress=False).views[0].seen.scaled in (0.0, 50.0, 100.0)
 
 
 class NoisySphere(nbv.Fields):
@@ -279,6 +284,10 @@ def test_the_map_keeps_areas_and_values():
     known = ~np.isnan(values) & ~np.isnan(smooth[np.minimum(row, 99), np.minimum(column, 199)])
     assert known.sum() > 90
     np.testing.assert_allclose(smooth[row[known], column[known]], values[known], atol=0.1)
+    # Of candidates above the horizon alone nothing is said of what is below it.
+    upper = smooth_map(some[some[:, 1] > 0], values[some[:, 1] > 0], 100)
+    assert np.isfinite(upper[10:45, 60:140]).all()
+    assert np.isnan(upper[70:]).all()
 
 
 def test_a_frustum_is_what_the_camera_sees():

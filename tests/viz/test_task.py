@@ -222,7 +222,7 @@ def test_a_rival_is_told_of_and_drawn(plain):
     assert rival.words.endswith(f"({NAMES[int(np.argmax(p))]}, probability {p.max():.2f}).")
     np.testing.assert_allclose(rival.panels[2][0].values, p, atol=1e-6)
     truth = nbv.metrics.truth_points(scene, jax.random.key(0))
-    np.testing.assert_allclose(rival.covered, nbv.metrics.coverage(other.views, truth))
+    np.testing.assert_allclose([answer.values[0] for answer in rival.seen], nbv.metrics.coverage(other.views, truth))
     assert rival.words in report_html(episode, data, "thing")
     (figure,) = (chart_figure(task_charts(data)),)
     (axes,) = figure.axes
