@@ -277,7 +277,12 @@ class CoverageAnswer(Answer):
     @property
     def amount(self) -> str:
         """In words."""
-        return f"{self.scaled:.0f} %" if self.is_share else f"{number(self.scaled)} scene units²"
+        return f"{self.figure} %" if self.is_share else f"{self.figure} scene units²"
+
+    @property
+    def figure(self) -> str:
+        """The same without a unit."""
+        return f"{self.scaled:.0f}" if self.is_share else number(self.scaled)
 
 
 @words_of.register(CoverageAnswer)

@@ -27,7 +27,7 @@ from jaxnbv.viz.imagined_figures import imagined_figure
 from jaxnbv.viz.layout import fitted, flow, width_of
 from jaxnbv.viz.render import Still, draw_scene
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, round_range, spaced_ticks
-from jaxnbv.viz.task_figures import chart_figure, coverage_series, draw_coverage, draw_values, task_charts
+from jaxnbv.viz.task_figures import chart_figure, draw_coverage, draw_values, task_charts
 from jaxnbv.viz.trajectory_figures import draw_ascents, trajectory_figure
 
 STYLE: dict[Any, Any] = {
@@ -89,7 +89,7 @@ def figures_of(data: ReportData, camera: Camera, stills: Stills) -> dict[str, Ca
         if view.spatial_ascents is not None:
             drawings[f"view_{view.number:02d}_trajectories"] = partial(trajectory_figure, data, index, camera)
     progress: list[tuple[str, Any]] = [
-        (coverage_series(data)[0], partial(draw_coverage, data=data)),
+        (data.views[0].seen.label, partial(draw_coverage, data=data)),
         (label_of(data.quantity), partial(draw_values, data=data)),
     ]
     drawings["task"] = partial(chart_figure, task_charts(data))

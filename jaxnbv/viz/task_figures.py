@@ -97,26 +97,21 @@ def over_views(axes: Axes, count: int) -> None:
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
 
 
-def coverage_series(data: ReportData) -> tuple[str, Float[np.ndarray, " v"]]:
-    """The chart of progress: how much was seen."""
-    return data.views[0].seen.label, np.array([view.seen.scaled for view in data.views])
-
-
 def draw_coverage(axes: Axes, data: ReportData) -> None:
-    """Draw progress by view."""
-    _, values = coverage_series(data)
-    views = np.arange(1, len(values) + 1)
-    axes.plot(views, values, color=BEFORE, lw=1.4, marker="o", ms=5, markeredgecolor="white")
-    if len(views) <= 10:
-        for view, value in zip(views, values, strict=True):
-            text = f"{value:.0f}" if data.views[0].seen.is_share else number(value)
-            axes.annotate(text, (view, value), (0, 6), textcoords="offset points", ha="center", fontsize=8)
-    highest, count, rival = float(values.max()), len(values), data.task.rival
+    """Draw by view how much was seen."""
+    seen = [view.seen for view in data.views]
+    values = [answer.scaled for answer in seen]
+    axes.plot(range(1, len(seen) + 1), values, color=BEFORE, lw=1.4, marker="o", ms=5, markeredgecolor="white")
+    if len(seen) <= 10:
+        for view, answer in enumerate(seen, start=1):
+            at = view, answer.scaled
+            axes.annotate(answer.figure, at, (0, 6), textcoords="offset points", ha="center", fontsize=8)
+    highest, count, rival = max(values), len(values), data.task.rival
     if rival is not None:
         others = np.array([answer.scaled for answer in rival.seen])
         legend_below(axes, [_draw_rival(axes, others, rival.name)])
         highest, count = max(highest, float(others.max())), max(count, len(others))
-    axes.set(ylim=(0, 1.18 * max(highest, 1.0)))
+    axes.set(ylim=(0, 1.18 * highest or 1.0))
     over_views(axes, count)
 
 
@@ -160,7 +155,7 @@ def other_charts(data: ReportData) -> list[tuple[str, Any]]:
     """The other charts: of progress, where that is not the task, and of the chosen views."""
     charts: list[tuple[str, Any]] = []
     if not data.task.is_coverage:
-        charts.append((coverage_series(data)[0], partial(draw_coverage, data=data)))
+        charts.append((data.views[0].seen.label, partial(draw_coverage, data=data)))
     if any(view.choice is not None for view in data.views):
         charts.append((label_of(data.quantity), partial(draw_values, data=data)))
     return charts

@@ -52,8 +52,8 @@ def describe_choice(
     turned = f"{nearest:.0f}° from the nearest earlier view"
     added = f"It added {points:,} points" if points else "It saw nothing"
     kept = f" ({count:,} are kept)" if points else ""
-    (before, after), what = (one.amount for one in seen), "coverage" if seen[1].is_share else "surface seen"
-    grown = f"; {what} stayed at {after}" if before == after else f"; {what} went from {before} to {after}"
+    (before, after), what = (one.figure for one in seen), "coverage" if seen[1].is_share else "surface seen"
+    grown = f"; {what} " + ("stayed at" if before == after else f"went from {before} to") + f" {seen[1].amount}"
     where, came = f"looks from {place(pose)}{_aim(pose)}, {turned}", f"{added}{kept}{grown}."
     return Told(where, *_reason(quantity, choice), came)
 

@@ -17,7 +17,7 @@ from small_run import CAMERA, small_run
 import jaxnbv as nbv
 from jaxnbv.acquisition import Answer, Quantity
 from jaxnbv.viz import report_data
-from jaxnbv.viz.answers import Panel
+from jaxnbv.viz.answers import CoverageAnswer, Panel
 from jaxnbv.viz.figures import STYLE, Stills, figures_of
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.page_data import clustered, payload, space
@@ -124,7 +124,7 @@ def test_legends_of_the_task_have_room(data, names, one_true):
         "a quantity with a rather long name, and its unit (units)", names, values, values[::-1], one_true, 0.9
     )
     answer = Answer(names, values)
-    rival = Rival("farthest view", "", ((panels, panels),) * 7, (0.5,) * 7)
+    rival = Rival("farthest view", "", ((panels, panels),) * 7, (CoverageAnswer.of_share(0.5),) * 7)
     task = Task((answer,) * 3, None, ((panels, panels),) * 3, "", "", "", rival)
     shown = dataclasses.replace(data, task=task)
     with mpl.rc_context(STYLE):

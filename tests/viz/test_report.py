@@ -163,7 +163,7 @@ def test_the_sentence_tells_the_numbers_of_the_step(episode, data):
     assert f"{number(values[0] / np.median(values))} times the median" in shown.sentence
     assert f"added {int(view.scan.count):,} points" in shown.sentence
     before, after = (data.views[i].seen.scaled for i in (0, 1))
-    assert f"coverage went from {before:.0f} % to {after:.0f} %" in shown.sentence
+    assert f"coverage went from {before:.0f} to {after:.0f} %" in shown.sentence
     assert shown.choice.rank == 1
     assert shown.choice.num_tied == view.proposal.num_tied
     assert "two standard errors" in shown.sentence

@@ -20,7 +20,7 @@ from jaxnbv.search.base import best_unvisited
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.search.rotations import rotation_from_6d
 from jaxnbv.viz import report_data, sphere, write_figures
-from jaxnbv.viz.answers import number
+from jaxnbv.viz.answers import CoverageAnswer, number
 from jaxnbv.viz.choice import MAP_VIEWS, Ascents, Choice, SphereMap, choice_of, step_values
 from jaxnbv.viz.report import report_html
 from jaxnbv.viz.trajectory_figures import frusta_steps, small_frusta
@@ -173,7 +173,8 @@ def said_of(value, others, starts=0, num_tied=None, pose=None):
     ascents = Ascents(trajectories(np.zeros((starts, 2))).poses, np.zeros((starts, 2))) if starts else None
     choice = Choice(directions, values, np.zeros(3), value, SphereMap(directions, values), ascents, num_tied)
     pose = look_at((0.0, 0.0, 2.5)) if pose is None else pose
-    return describe_choice(COVERAGE, choice, pose, [look_at((2.5, 0.0, 0.0))], 5, 10, None).sentence(2)
+    seen = CoverageAnswer.of_area(0.2), CoverageAnswer.of_area(0.3)
+    return describe_choice(COVERAGE, choice, pose, [look_at((2.5, 0.0, 0.0))], 5, 10, seen).sentence(2)
 
 
 @pytest.mark.parametrize(
