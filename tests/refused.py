@@ -207,6 +207,7 @@ REFUSED = {
     "no points": (lambda: POSTERIOR.mean(None), "None"),
     "complex points": (lambda: POSTERIOR.mean(D + 1j), "real numbers"),
     "a grid beyond the torus": (lambda: nbv.Imagination(MODEL, nbv.Grid(12, 9.4)).mean_mesh(CLOUD), "9.4"),
+    "a number as a mesh of a bank": (lambda: nbv.ShapeBank.from_meshes(["a.ply", 5]), "a mesh is 5"),
     "points beyond the torus": (lambda: POSTERIOR.probability_inside(10.0 * D), "9.978"),
     "nodes beyond the torus": (lambda: POSTERIOR.mean_on_grid(np.array([0.0, 10.0])), "10"),
     "nodes that are not finite": (lambda: POSTERIOR.sample(KEY, 2).on_grid(np.array([np.nan, 1.0])), "nan"),

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Cuboid, SignedDistance, Sphere
 from jaxnbv.surfaces import GeometricSPSR
-from jaxnbv.surfaces.known_shapes import systematic_resampling
+from jaxnbv.surfaces.known_shapes import kind_of, systematic_resampling
 from jaxnbv.surfaces.registration import Prior, Seen, register
 
 CAMERA = nbv.Camera(height=40, width=40, fov=1.0)
@@ -134,6 +134,11 @@ def test_a_symmetric_shape_stands_in_all_the_ways_that_look_alike():
     )
     good = np.asarray(found.is_mode) & (np.asarray(found.misfit) < 0.2)
     assert sorted(np.round(np.abs(angles[good])).astype(int).tolist()) == pytest.approx([0, 180], abs=3)
+
+
+def test_shapes_of_a_kind_differ_by_their_number():
+    kinds = {"chair 3": "chair", "office chair 12": "office chair", "chair": "chair", "arm 0.5": "arm 0.5", " 7": " 7"}
+    assert {name: kind_of(name) for name in kinds} == kinds
 
 
 def test_every_shape_is_tried_once_where_there_are_fewer_starts_than_shapes():
