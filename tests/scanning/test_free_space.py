@@ -174,6 +174,16 @@ def with_invalid(cloud, invalid):
     return PointCloud(points, normals, cloud.mask & keep, cloud.missed & keep)
 
 
+def test_of_a_camera_among_the_nodes_those_behind_it_are_not_seen():
+    pose = look_at((0.1, 0.2, 0.3), (1.0, 0.4, 0.5))
+    nothing = jnp.zeros((CAMERA.num_rays, 3))
+    missed = jnp.ones(CAMERA.num_rays, bool)
+    empty = np.asarray(SEE(Carving(), GRID, pose, PointCloud(nothing, nothing, ~missed, missed), CAMERA))
+    *_, ahead = image(nodes_of(GRID)[empty], CAMERA, pose)
+    assert len(ahead) > 100
+    assert ahead.min() > 2.0 * GRID.spacing
+
+
 def test_invalid_pixels_carve_nothing():
     whole = np.asarray(SEE(Carving(), GRID, POSE, BALL_SCAN, CAMERA))
     none = SEE(Carving(), GRID, POSE, with_invalid(BALL_SCAN, np.ones(CAMERA.num_rays, bool)), CAMERA)

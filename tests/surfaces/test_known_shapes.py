@@ -146,7 +146,8 @@ def test_every_shape_is_tried_once_where_there_are_fewer_starts_than_shapes():
     nothing = Seen(
         jnp.zeros((256, 3)), jnp.zeros((256, 3)), jnp.zeros(256, bool), jnp.zeros((512, 3)), jnp.zeros(512, bool)
     )
-    found = eqx.filter_eval_shape(register, BANK, Prior(nbv.FreeRotation(), nbv.Box()), nothing, 3)
+    fewest = nbv.KnownShapes(BANK, num_starts=1).num_starts
+    found = eqx.filter_eval_shape(register, BANK, Prior(nbv.FreeRotation(), nbv.Box()), nothing, fewest)
     assert found.shape.shape == (4 + 4 * 4,)
 
 
