@@ -24,10 +24,6 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from cosmic_ray.ast import ast_nodes, get_ast
-from cosmic_ray.mutating import mutate_code
-from cosmic_ray.plugins import get_operator, operator_names
-from coverage import CoverageData
 from tqdm import tqdm
 
 PARTS = ("surfaces", "scanning", "imagination.py", "search", "planning", "storage")
@@ -36,6 +32,9 @@ SECONDS = 120.0
 
 def places(path: Path) -> dict[tuple[int, int], list[tuple[str, int]]]:
     """Where a file can be changed, and by which occurrences of which operators."""
+    from cosmic_ray.ast import ast_nodes, get_ast
+    from cosmic_ray.plugins import get_operator, operator_names
+
     code = path.read_text()
     parsed, found = get_ast(code), {}
     for name in operator_names():
@@ -66,9 +65,8 @@ def statement(code: str, line: int) -> range:
     return range(first[inner], max(body[0].lineno, line + 1) if body else inner.end_lineno + 1)
 
 
-def tests_of(path: Path, code: str, line: int, measured: CoverageData, seconds: dict[str, float]) -> list[str]:
-    """Names of the tests that are asked, in their order."""
-    by_line = measured.contexts_by_lineno(str(path.resolve()))
+def tests_of(path: Path, code: str, line: int, by_line: dict[int, list[str]], seconds: dict[str, float]) -> list[str]:
+    """Names of the tests that are asked, in their order; `by_line`: what ran each line, `seconds`: what they take."""
 
     def running(lines: Iterable[int]) -> set[str]:
         return {context.rpartition("|")[0] for each in lines for context in by_line.get(each, ()) if context}
@@ -109,6 +107,11 @@ def main() -> None:
     parser.add_argument("--durations", type=Path, required=True, help="what pytest --durations=0 printed")
     parser.add_argument("--out", type=Path, default=Path("runs/mutants.json"))
     asked = parser.parse_args()
+    # Not among what the tests need.
+    from cosmic_ray.mutating import mutate_code
+    from cosmic_ray.plugins import get_operator
+    from coverage import CoverageData
+
     measured = CoverageData(asked.coverage)
     measured.read()
     told = re.findall(r"^([\d.]+)s \w+ +(tests\S.*)$", asked.durations.read_text(), re.MULTILINE)
@@ -129,7 +132,7 @@ def main() -> None:
             continue
         code = path.read_text()
         mutated = mutate_code(code, get_operator(name)(), occurrence)
-        tests = tests_of(path, code, at[0], measured, seconds)
+        tests = tests_of(path, code, at[0], measured.contexts_by_lineno(str(path.resolve())), seconds)
         after = mutated.splitlines()[at[0] - 1].strip()
         rows.append({"at": f"{path}:{at[0]}", "to": after, "by": name, "is": outcome(path, mutated, tests)})
         asked.out.parent.mkdir(parents=True, exist_ok=True)

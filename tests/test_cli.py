@@ -97,7 +97,7 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
         (("demo", "--task", "coverage", "--first", "1,2"), ("'1,2'", "three numbers")),
         (("demo", "--task", "coverage", "--first", "0,0,0"), ("target",)),
         (("demo", "--task", "coverage", "--first", "0,0,9", "--noise", "-1"), ("-1", "negative")),
-        (("demo", "--task", "coverage", "--first", "0.2,0.1,0"), ("0.2,0.1,0", "inside the object", "outside")),
+        (("demo", "--first", "0.8,0,0"), ("0.8,0,0", "inside the object", "outside")),
         (("run", "ball.obj", "--first", "0.3,-1,0.2"), ("0.3,-1,0.2", "inside the object", "outside")),
         (("run", "ball.obj", "--radius", "1"), ("cameras 1 from", "1.25", "give more")),
         (("run", "ball.obj", "--lengthscale", "0"), ("lengthscale is 0", "positive")),
