@@ -25,14 +25,14 @@ from jaxnbv.cli.actions.device import prepare
 from jaxnbv.cli.registry import Device
 
 RUN = ("run", "BOX.PLY", "--quick", "--views", "4", "--candidates", "12", "--samples", "2")
-STUDY = ("study", "pyramid", "--quick", "--scenes", "2", "--views", "2", "--methods", "coverage,farthest view")
+STUDY = ("study", "pyramid", "--quick", "--scenes", "2", "--views", "2", "--methods", "coverage,farthest")
 COMMANDS = {
     "run": (*RUN, "--no-report"),
     "two runs in one folder": (*RUN, "--no-report"),
     "figures": RUN,
     "study": STUDY,
     "study by two processes": (*STUDY, "--workers", "2"),
-    "session": ("SESSION",),
+    "session": (),
     "session replay": ("session", "replay", "RECORDED", "--quick", "--no-report"),
     "view": ("view", "RECORDED"),
 }

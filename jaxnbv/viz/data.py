@@ -102,8 +102,9 @@ def report_data(
     planner = episode.planner
     if truth is None and episode.scene is not None:
         truth = truth_points(episode.scene, jax.random.key(0))
-    seen = seen_after(episode.views, truth)
-    task = task_of(episode, seen, rival, () if rival is None else seen_after(rival.views, truth))
+    seen = seen_after(episode.views, truth, planner.acquisition)
+    rival_seen = () if rival is None else seen_after(rival.views, truth, planner.acquisition)
+    task = task_of(episode, seen, rival, rival_seen)
     drawn: list[ViewData] = []
     held = {} if sketches is None else sketches.held
     following = zip(episode.views, sketches_of(episode, held, imagine), strict=True)

@@ -251,13 +251,8 @@ def overview_figure(data: ReportData, camera: Camera, stills: Stills | None = No
         x, y = left + 3.0 * column, tall - _ROW * (row + 1)
         draw_scene(figure.add_axes(place(x, y + 1.55, 3.0, 3.0)), data, index, stills[index], camera, weight=1.3)
         figure.text(*place(x + 0.12, y + 4.85)[:2], f"View {view.number}", fontsize=15, fontweight="bold", va="center")
-        figure.text(
-            *place(x + 2.88, y + 4.85)[:2],
-            f"{view.seen.amount}{' seen' * view.seen.is_share}",
-            fontsize=14,
-            ha="right",
-            va="center",
-        )
+        seen = f"{view.seen.amount}{' seen' * view.seen.is_share}"
+        figure.text(*place(x + 2.88, y + 4.85)[:2], seen, fontsize=14, ha="right", va="center")
         draw_acquisition(figure.add_axes(place(x + 0.1, y, 2.8, 1.5)), view.choice, data.quantity, weight=1.2)
     long = 0.5 * width - 1.2 if beside else width - 1.6
     _deviation_bar(figure, place(0.6, base - 0.35, long, 0.13), LogNorm(*deviation_range(data)), 12.0)

@@ -9,7 +9,6 @@ from scipy.interpolate import RBFInterpolator
 from scipy.spatial import cKDTree
 
 WIDTH, HEIGHT = 2.0 * np.sqrt(2.0), np.sqrt(2.0)  # Half axes of the map's ellipse.
-_ROWS = 160
 
 
 def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
@@ -44,7 +43,7 @@ def from_mollweide(places: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, 
 
 
 def smooth_map(
-    directions: Float[np.ndarray, "c 3"], values: Float[np.ndarray, " c"], height: int = _ROWS
+    directions: Float[np.ndarray, "c 3"], values: Float[np.ndarray, " c"], height: int = 160
 ) -> Float[np.ndarray, "h w"]:
     """The values of candidates carried over the map, `height` by 2 `height` pixels from its top; NaN outside it, and
     farther from all candidates than nine tenths of them are from the next.

@@ -95,23 +95,30 @@ def _answers(acquisition: Acquisition, views: Sequence[View], seen: Sequence[Cov
     return answers if len(answers) == len(given) else seen
 
 
-def seen_after(views: Sequence[View], truth: Float[AnyArray, "n 3"] | None) -> list[CoverageAnswer]:
-    """How much of the surface was seen after each view: the share of the true one, of which points are given; else the
-    area that each scan shows and none before it has shown, by `NewSurface`, summed up."""
+def seen_after(
+    views: Sequence[View], truth: Float[AnyArray, "n 3"] | None, acquisition: Acquisition
+) -> list[CoverageAnswer]:
+    """How much of the surface was seen after each view: the share of the true one, of which points are given in scene
+    coordinates; else the area that each scan shows and none before it has shown, summed up, by the acquisition where it
+    is a `NewSurface`, so that it is what was promised, and by the default one where not."""
     if truth is not None:
         return [CoverageAnswer.of_share(float(share)) for share in coverage(views, truth)]
+    of = acquisition if isinstance(acquisition, NewSurface) else NewSurface()
     clouds = [None, *(view.cloud for view in views[:-1])]
     new = [
-        float(_new_area(cloud, view.scan, view.camera, view.pose)) for cloud, view in zip(clouds, views, strict=True)
+        float(_new_area(of, cloud, view.scan, view.camera, view.pose))
+        for cloud, view in zip(clouds, views, strict=True)
     ]
     return [CoverageAnswer.of_area(float(area)) for area in np.cumsum(new)]
 
 
 @eqx.filter_jit
-def _new_area(cloud: PointCloud | None, scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, ""]:
+def _new_area(
+    of: NewSurface, cloud: PointCloud | None, scan: PointCloud, camera: Camera, pose: Pose
+) -> Float[Array, ""]:
     if cloud is None:
         return jnp.sum(visible_area(scan, camera, pose))
-    return (surface := NewSurface()).score(surface.context(cloud), scan, camera, pose)
+    return of.score(of.context(cloud), scan, camera, pose)
 
 
 def true_cloud(scene: Surface, count: int) -> PointCloud | None:

@@ -25,6 +25,7 @@ from jaxnbv.viz.page_data import payload
 from jaxnbv.viz.render import frustum
 from jaxnbv.viz.sphere import from_mollweide, mollweide, smooth_map
 from jaxnbv.viz.style import log_ticks, round_range
+from jaxnbv.viz.task import seen_after
 
 
 @pytest.fixture(scope="module")
@@ -183,6 +184,13 @@ def test_of_a_scene_without_truth_the_area_that_was_seen_is_told(tmp_path, episo
     area = report_data(lone, progress=False, imagine=False).views[0].seen.scaled
     assert area == pytest.approx(2.0 * np.pi * (1.0 - 1.0 / 2.5), rel=0.15)
     assert f"<td>{number(area)}</td>" in page
+    # Seen again it adds nothing, from the other side as much again.
+    behind = nbv.look_at((0.0, 0.0, -2.5))
+    other = nbv.scan(nbv.SDFSurface(nbv.sdf.Sphere(1.0)), camera, behind)
+    views = *lone.views, *lone.views, nbv.View(behind, other, other, None, camera)
+    once, again, both = (seen.scaled for seen in seen_after(views, None, nbv.Coverage()))
+    assert once == pytest.approx(again) == pytest.approx(area)
+    assert both == pytest.approx(2.0 * area, rel=0.02)
     truth = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
     assert report_data(lone, truth, progress=False).views[0].seen.scaled in (0.0, 50.0, 100.0)
 
