@@ -8,7 +8,7 @@ and one imagined scan; what it gives of it is that scan's *score*.
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -21,6 +21,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import GridSurface, Surface, scan
+from jaxnbv.sharding import shared, shared_map
 
 
 class Quantity(eqx.Module):
@@ -312,15 +313,24 @@ def sample_scores(
     """The score of what each of the sampled surfaces would show from each of a batch of poses.
 
     Samples are taken one after the other, with all poses scanned at once and scored `batch_size` of them at a time, so
-    memory is that of one sample's scans.
+    memory is that of one sample's scans. They are shared among devices, or the poses are where samples are too few.
 
     - `own_contexts`: the context has a leading axis of samples, one each.
     - `barrier`: see `scan`.
     """
 
-    def of_sample(surface: GridSurface, context: Any) -> Float[Array, "poses *scores"]:
-        return scores(acquisition, context, scan(surface, camera, poses, barrier), camera, poses)
+    own, common = (context, None) if own_contexts else (None, context)
+    return shared_map(_of_sample, (surfaces, own), common, (poses, barrier), acquisition, camera)
 
-    if own_contexts:
-        return jax.lax.map(lambda pair: of_sample(*pair), (surfaces, context))
-    return jax.lax.map(lambda surface: of_sample(surface, context), surfaces)
+
+def _of_sample(sample: tuple[GridSurface, Any], common: Any, views: "_Views", acquisition: Acquisition, camera: Camera):
+    surface, own = sample
+    return shared(_of_poses, views, surface, common if own is None else own, acquisition, camera)
+
+
+def _of_poses(views: "_Views", surface: GridSurface, context: Any, acquisition: Acquisition, camera: Camera):
+    poses, barrier = views
+    return scores(acquisition, context, scan(surface, camera, poses, barrier), camera, poses)
+
+
+_Views: TypeAlias = tuple[Pose, Float[Array, "poses rays"] | None]

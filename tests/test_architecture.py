@@ -14,6 +14,7 @@ ORDER = (
     "errors",
     "progress",
     "checks",
+    "sharding",
     "geometry",
     "scanning",
     "surfaces",

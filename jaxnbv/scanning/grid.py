@@ -17,6 +17,7 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import tracing
 from jaxnbv.scanning.scanner import scan
 from jaxnbv.scanning.surface import Hits, Surface
+from jaxnbv.sharding import shared_map
 
 # The cosine of two normals that look in opposite directions, and the share of the points that is worth a warning.
 _OPPOSITE, _THIN_SHARE = -0.8, 0.05
@@ -136,7 +137,7 @@ def scan_samples(
 
     For s surfaces and p poses, clouds with leading axes (s, p); rows as `scan` gives them, and `barrier` as it takes.
     """
-    return jax.lax.map(lambda surface: scan(surface, camera, poses, barrier), surfaces)
+    return shared_map(scan, surfaces, camera, poses, barrier)
 
 
 @eqx.filter_jit
@@ -182,5 +183,5 @@ def _prepared(
 ) -> tuple[Float[Array, "*s g g g"], Bool[Array, ""], Int8[Array, "*s m m m"]]:
     """Values less the level, whether they are finite, and how far each cell is from a change of sign."""
     values = values - level
-    distances = jax.lax.map(tracing.free_distance, values.reshape(-1, *values.shape[-3:]))
+    distances = shared_map(tracing.free_distance, values.reshape(-1, *values.shape[-3:]))
     return values, jnp.isfinite(values).all(), distances.reshape(*values.shape[:-3], *distances.shape[1:])

@@ -24,6 +24,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.volume import Box
 from jaxnbv.scanning.evidence import Evidence
 from jaxnbv.scanning.sdf import SignedDistance
+from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import Fields, SurfaceModel, SurfacePosterior, sampler
 from jaxnbv.surfaces.placement import FreeRotation, Placement, ShapePoses
 from jaxnbv.surfaces.registration import Hypotheses, Prior, Seen, register
@@ -233,11 +234,11 @@ class PlacedShapes(Fields):
     def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
         """All of them at the points x (scene coordinates)."""
 
-        def one(placed):
+        def one(placed, x, width):
             solid, placement = placed
-            return self.width * jnp.tanh(placement.distance(solid, jnp.asarray(x)) / self.width)
+            return width * jnp.tanh(placement.distance(solid, x) / width)
 
-        return jax.lax.map(one, (self.solids, self.placements))
+        return shared_map(one, (self.solids, self.placements), jnp.asarray(x), self.width)
 
 
 class MixtureFields(Fields):

@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxnbv.checks import AnyArray, check_fields, is_traced, require, shown
 from jaxnbv.geometry.cloud import PointCloud, some_rows
 from jaxnbv.scanning.evidence import Evidence
+from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import SurfaceModel, on_torus
 from jaxnbv.surfaces.covariance import function_covariance, function_variance, mode_variance
 from jaxnbv.surfaces.nonuniform import NonuniformTransform
@@ -209,7 +210,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         residual = self.base.whitened_residual(draws.normals, means)
         coefficients, level, noise = draws.normals.coefficients, draws.level, draws.noise
         transform = NonuniformTransform(self.rows.points, self.model.base.truncation)
-        at_rows = jax.lax.map(lambda v: transform.evaluate(solve_poisson(v)[None])[:, 0], coefficients)
+        at_rows = shared_map(_values, coefficients, transform)
         # f at the values given the normals: k(Y, X) A^-1 r = B^T C^-1 r, with B the whitened covariance.
         at_rows = at_rows + jnp.einsum("dnm,snd->sm", self.whitened, residual, precision="highest") + means.values
         weights = jax.vmap(self.solve)(self.half_jump * self.rows.values - at_rows + level[:, None] - noise)
@@ -231,7 +232,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         fields = self.base.updated(coefficients, moved)
         transform = NonuniformTransform(self.rows.points, self.model.base.truncation)
         variance = mode_variance(self.model.base.spectrum)
-        direct = jax.lax.map(lambda w: inverse_laplacian(variance * transform.adjoint(w[:, None])[0]), weights)
+        direct = shared_map(_reconstructed, weights, transform, variance)
         middle = fields.shape[-1] // 2
         constant = constant + self.model.level_deviation**2 * jnp.sum(weights, axis=1)
         return (fields - direct).at[:, middle, middle, middle].add(constant)
@@ -243,3 +244,15 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         cross = cross - jnp.einsum("dnm,dnx->mx", self.whitened, normals, precision="highest")
         cross = jnp.where(self.rows.mask[:, None], cross, 0.0)
         return normals, solve_triangular(self.factor, cross, lower=True)
+
+
+def _values(normals: Float[Array, "3 a a a"], transform: NonuniformTransform) -> Float[Array, " m"]:
+    """Of the f that a normal field reconstructs, at the points of the transform."""
+    return transform.evaluate(solve_poisson(normals)[None])[:, 0]
+
+
+def _reconstructed(
+    weights: Float[Array, " m"], transform: NonuniformTransform, variance: Float[Array, "a a a"]
+) -> Float[Array, "a a a"]:
+    """Coefficients of minus cov(f, f(Y)) w, Y the points of the transform, for modes of this variance of v."""
+    return inverse_laplacian(variance * transform.adjoint(weights[:, None])[0])

@@ -28,6 +28,7 @@ from scipy.spatial import cKDTree
 from jaxnbv.checks import AnyArray, as_floats, check_type, is_traced, require
 from jaxnbv.geometry.cloud import PointCloud, check_oriented
 from jaxnbv.scanning.evidence import Evidence
+from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import HALF_WIDTH, SurfaceModel, on_torus
 from jaxnbv.surfaces.covariance import (
     Spectra,
@@ -247,13 +248,13 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         transform = NonuniformTransform(self.cloud.points, self.model.truncation)
         field_keys, noise_keys = jax.random.split(key, (2, num_samples))
 
-        def prior(keys):
+        def prior(keys, scale, deviation, transform):
             field_key, noise_key = keys
             coefficients = scale * jax.random.normal(field_key, (3, modes, modes, modes), dtype)
-            noise = self.model.noise * jax.random.normal(noise_key, self.cloud.points.shape, dtype)
+            noise = deviation * jax.random.normal(noise_key, self.cloud.points.shape, dtype)
             return NormalDraws(coefficients, transform.evaluate(coefficients) + noise)
 
-        return jax.lax.map(prior, (field_keys, noise_keys))
+        return shared_map(prior, (field_keys, noise_keys), scale, self.model.noise, transform)
 
     def conditioned(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s a a a"]:
         """Coefficients of Poisson(v + k(., X) A^-1 (n - grad m - v(X) - eps))."""
@@ -271,11 +272,11 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         transform = NonuniformTransform(self.cloud.points, self.model.truncation)
         weights = self._solve_triangular(whitened, transpose=True)
 
-        def update(sample):
+        def update(sample, transform, spectrum):
             coefficients, weights = sample
-            return solve_poisson(coefficients) + reconstruct(transform, weights, self.model.spectrum)
+            return solve_poisson(coefficients) + reconstruct(transform, weights, spectrum)
 
-        return jax.lax.map(update, (coefficients, weights))
+        return shared_map(update, (coefficients, weights), transform, self.model.spectrum)
 
     def _solve_triangular(self, rows: Float[Array, "s n 3"], transpose: bool) -> Float[Array, "s n 3"]:
         columns = jnp.moveaxis(rows, 0, 1)

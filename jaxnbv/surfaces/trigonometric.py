@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnbv.checks import AnyArray
+from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import Fields, on_grid_of_torus, on_torus
 
 _CHUNK_VALUES = 2**24
@@ -97,4 +98,4 @@ class TrigonometricFields(Fields):
     def on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "s g g g"]:
         """All functions on the tensor grid axis x axis x axis, one after the other to bound the memory."""
         basis = circle_basis(jnp.asarray(axis, dtype=self.coefficients.dtype), self.coefficients.shape[-1] // 2)
-        return jax.lax.map(lambda block: evaluate_on_grid(block, basis), self.coefficients)
+        return shared_map(evaluate_on_grid, self.coefficients, basis)

@@ -1,0 +1,65 @@
+"""Samples and candidates shared among eight devices have the values of one; each device has its share of the work."""
+
+import subprocess
+import sys
+import textwrap
+
+PROGRAM = """
+    import contextlib
+
+    import jax
+
+    jax.config.update("jax_num_cpu_devices", 8)
+    import jax.numpy as jnp
+    import numpy as np
+    from jax.sharding import AxisType, Mesh
+
+    import jaxnbv as nbv
+    from jaxnbv.sharding import shared, shared_map
+
+
+    def on(devices, kind=AxisType.Auto):
+        mesh = Mesh(jax.devices()[:devices], "devices", axis_types=(kind,))
+        return jax.set_mesh(mesh) if devices > 1 else contextlib.nullcontext()
+
+
+    # What each device is given.
+    seen = []
+    with on(8):
+        for count in (20, 8, 3):
+            jax.eval_shape(lambda rows: shared(lambda own: seen.append(len(own)) or own, rows), jnp.zeros((count, 2)))
+        x, y = jnp.linspace(0.0, 1.0, 20), jnp.array([2.0, 3.0])
+        loss = lambda x, y: jnp.sum(shared_map(lambda a, b: jnp.sin(a * b).sum(), x, y) ** 2)
+        slopes = jax.jit(jax.grad(loss, (0, 1)))(x, y)
+    with on(8, AxisType.Explicit):
+        jax.eval_shape(lambda rows: shared(lambda own: seen.append(len(own)) or own, rows), jnp.zeros((20, 2)))
+    assert seen == [3, 1, 3, 20], seen
+    total = jnp.sin(x[:, None] * y)
+    inner = 2 * total.sum(1, keepdims=True) * jnp.cos(x[:, None] * y)
+    np.testing.assert_allclose(slopes[0], (inner * y).sum(1), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(slopes[1], (inner * x[:, None]).sum(0), rtol=1e-5, atol=1e-5)
+
+    camera, ball = nbv.Camera(height=12, width=12), nbv.SDFSurface(nbv.sdf.Sphere(0.8))
+    first = nbv.look_at((0.3, 1.0, 2.3))
+    model = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.02, 0.05), (0.2, 0.2), 12))
+    imagination = nbv.Imagination(model, nbv.Grid(24), num_samples=9)
+    for search in (nbv.DiscreteSearch(20), nbv.HalvingSearch(20)):
+        planner = nbv.Planner(nbv.NewSurface(), search, camera, imagination, capacity=128)
+        proposals = []
+        for devices in (1, 8):
+            with on(devices):
+                evidence = planner.init(first, nbv.scan(ball, camera, first))
+                proposals.append(planner.propose(evidence, jax.random.key(1)))
+        alone, together = proposals
+        assert len(together.value.sharding.device_set) == 8
+        np.testing.assert_allclose(together.values, alone.values, rtol=1e-5)
+        np.testing.assert_allclose(together.pose.matrix, alone.pose.matrix, atol=1e-4)
+"""
+
+
+def test_eight_devices_agree_with_one(tmp_path):
+    """In a process of its own: how many devices there are is said before JAX starts."""
+    program = tmp_path / "program.py"
+    program.write_text(textwrap.dedent(PROGRAM))
+    ended = subprocess.run([sys.executable, program], capture_output=True, text=True, timeout=600)
+    assert ended.returncode == 0, ended.stderr
