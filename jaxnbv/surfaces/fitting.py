@@ -65,14 +65,14 @@ def _fit(model: GeometricSPSR, cloud: PointCloud, max_steps: int) -> tuple[Geome
         return _with(model, jax.tree.map(jnp.exp, logarithms))
 
     def loss(logarithms, _):
-        likelihood = with_logarithms(logarithms).condition(cloud).log_marginal_likelihood()
+        likelihood = with_logarithms(logarithms).factorised(cloud).log_marginal_likelihood()
         return -likelihood / cloud.count
 
     start = jax.tree.map(jnp.log, _parameters(model))
     solver: Any = optx.BFGS(rtol=_TOLERANCE, atol=_TOLERANCE)
     solution: Any = optx.minimise(loss, solver, start, max_steps=max_steps, throw=False)
     found = with_logarithms(solution.value)
-    return found, found.condition(cloud).log_marginal_likelihood()
+    return found, found.factorised(cloud).log_marginal_likelihood()
 
 
 def _parameters(model: GeometricSPSR):

@@ -27,9 +27,10 @@ from jaxnbv.scanning.evidence import Evidence
 from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import SurfaceModel, on_torus
 from jaxnbv.surfaces.covariance import function_covariance, function_variance, mode_variance
+from jaxnbv.surfaces.given_normals import NormalDraws
 from jaxnbv.surfaces.nonuniform import NonuniformTransform
 from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, filled
-from jaxnbv.surfaces.spsr import GeometricSPSR, GeometricSPSRPosterior, NormalDraws
+from jaxnbv.surfaces.spsr import GeometricSPSR, GeometricSPSRPosterior
 from jaxnbv.surfaces.trigonometric import inverse_laplacian, solve_poisson
 from jaxnbv.surfaces.values import OnSurface, OutsideBoundary, SeenEmpty, ValueRows, ValueSource, joined
 
@@ -75,10 +76,10 @@ class ScreenedSPSR(SurfaceModel):
     def condition(self, evidence: Evidence | PointCloud) -> "ScreenedSPSRPosterior":
         """p(g | D, what was seen empty). The cost is that of the base, and of M triangular solves with its factor.
 
-        **Raises:** `ValueError` as `GeometricSPSR.condition` does, and if S is singular in the precision at hand.
+        **Raises:** `ValueError` as `GeometricSPSR.factorised` does, and if S is singular in the precision at hand.
         """
         evidence = Evidence.of(evidence)
-        posterior = _condition(self, self.base.condition(evidence), evidence)
+        posterior = _condition(self, self.base.factorised(evidence), evidence)
         if not is_traced(posterior.weights):
             require(
                 bool(jnp.isfinite(posterior.weights).all()),
@@ -121,7 +122,7 @@ def _half_jump(base: GeometricSPSRPosterior, offset: float) -> Float[Array, ""]:
     chosen = some_rows(base.cloud, _JUMP_POINTS)
     points, step = base.cloud.points[chosen], offset * base.cloud.normals[chosen]
     mean = base.mean_field
-    least = 0.5 * jnp.sqrt(function_variance(base.model.spectrum))
+    least = 0.5 * jnp.sqrt(function_variance(base.spectrum))
     return jnp.maximum(0.5 * jnp.median(mean(points + step)[0] - mean(points - step)[0]), least)
 
 

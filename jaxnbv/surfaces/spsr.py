@@ -15,34 +15,33 @@ distribution.
 import functools
 import math
 import warnings
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import cho_solve, solve_triangular
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
 from jaxnbv.checks import AnyArray, as_floats, check_type, is_traced, require
 from jaxnbv.geometry.cloud import PointCloud, check_oriented
 from jaxnbv.scanning.evidence import Evidence
-from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import HALF_WIDTH, SurfaceModel, on_torus
 from jaxnbv.surfaces.covariance import (
     Spectra,
     function_covariance,
     function_normal_covariance,
     function_variance,
-    mode_variance,
 )
+from jaxnbv.surfaces.given_normals import NormalDraws, NormalsPosterior, cleared, mean_of
 from jaxnbv.surfaces.gram import factorise, on_filled_rows
+from jaxnbv.surfaces.iterative import MOST_FACTORISED, IterativePosterior, by_conjugate_gradients
 from jaxnbv.surfaces.matern import Scalar, circle_spectrum
-from jaxnbv.surfaces.nonuniform import NonuniformTransform
-from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, filled
-from jaxnbv.surfaces.reconstruction import level_slope, mean_at_data, reconstruct
-from jaxnbv.surfaces.trigonometric import basis_variance, solve_poisson
+from jaxnbv.surfaces.pathwise import MeansAtData
+from jaxnbv.surfaces.trigonometric import basis_variance
 
 _CHUNK_VALUES = 2**24
 _SPARSE = 2.5
@@ -135,18 +134,34 @@ class GeometricSPSR(SurfaceModel):
                 stacklevel=2,
             )
 
-    def condition(self, evidence: Evidence | PointCloud) -> "GeometricSPSRPosterior":
+    def condition(self, evidence: Evidence | PointCloud) -> NormalsPosterior:
         """p(f | D): of the evidence it takes the cloud alone. The cost is that of a Cholesky factorisation of the
-        cloud's capacity.
+        cloud's capacity; beyond a capacity of 16,384, of some hundred transforms a solve (`IterativePosterior`).
 
         **Raises:** `ValueError` if the cloud is empty, has entries that are not finite, a normal longer than 10 or
         points outside [-pi/2, pi/2]^3 (scene coordinates), or if A is singular in the precision at hand; under `jit`
         values are not known and are not checked.
         """
         cloud = Evidence.of(evidence).cloud
+        return self._checked(_iterative if cloud.capacity > MOST_FACTORISED else _factorised, cloud)
+
+    def factorised(self, evidence: Evidence | PointCloud) -> "GeometricSPSRPosterior":
+        """As `condition`, by the factor of A, which values of f and likelihoods need.
+
+        **Raises:** `ValueError` as `condition` does, and for a capacity above 16,384.
+        """
+        cloud = Evidence.of(evidence).cloud
+        require(
+            cloud.capacity <= MOST_FACTORISED,
+            f"the cloud has room for {cloud.capacity} points, and this model takes {MOST_FACTORISED} at most: lower "
+            "the planner's capacity, or use GeometricSPSR, which takes more",
+        )
+        return self._checked(_factorised, cloud)
+
+    def _checked(self, condition: Callable, cloud: PointCloud) -> Any:
         if not is_traced(cloud):
             check_oriented(cloud, "the cloud", HALF_WIDTH, unit=False)
-        posterior = _condition(self, cloud)
+        posterior = condition(self, cloud)
         if not is_traced(posterior.level):
             require(
                 bool(jnp.isfinite(posterior.level)),
@@ -163,49 +178,36 @@ def _kept_variance(model: GeometricSPSR) -> Float[Array, ""]:
 
 
 @eqx.filter_jit
-def _condition(model: GeometricSPSR, cloud: PointCloud) -> "GeometricSPSRPosterior":
-    spectrum = model.spectrum
-    # Whatever stands in rows that are not filled, NaN included, must not reach the products.
-    points, normals = (jnp.where(cloud.mask[:, None], rows, 0.0) for rows in (cloud.points, cloud.normals))
-    cloud = PointCloud(points, normals, cloud.mask)
+def _factorised(model: GeometricSPSR, cloud: PointCloud) -> "GeometricSPSRPosterior":
+    cloud, spectrum = cleared(cloud), model.spectrum
     cholesky = factorise(cloud, spectrum, model.noise)
-    weights = cho_solve((cholesky, True), normals)
-    transform = NonuniformTransform(cloud.points, model.truncation)
-    mean = reconstruct(transform, weights, spectrum)
-    level = mean_at_data(transform, mean, cloud)
-    return GeometricSPSRPosterior(level, mean, model, cloud, cholesky, weights)
+    weights = cho_solve((cholesky, True), cloud.normals)
+    level, mean = mean_of(weights, cloud, spectrum)
+    return GeometricSPSRPosterior(level, mean, cloud, weights, spectrum, model.noise, cholesky)
 
 
-class NormalDraws(NamedTuple):
-    """v drawn from the prior, by its coefficients, and v(X) + eps."""
+@eqx.filter_jit
+def _iterative(model: GeometricSPSR, cloud: PointCloud) -> IterativePosterior:
+    cloud, spectrum = cleared(cloud), model.spectrum
+    weights = by_conjugate_gradients(cloud.normals[None], cloud, spectrum, model.noise)[0]
+    level, mean = mean_of(weights, cloud, spectrum)
+    return IterativePosterior(level, mean, cloud, weights, spectrum, model.noise)
 
-    coefficients: Float[Array, "s 3 a a a"]
-    at_data: Float[Array, "s n 3"]
 
-
-class GeometricSPSRPosterior(TrigonometricPosterior):
+class GeometricSPSRPosterior(NormalsPosterior):
     """p(f | D) under `GeometricSPSR`, in closed form and as pathwise samples.
 
-    - `level`: mean over the data of E f(x_j); the surface is where f equals it.
-    - `mean_coefficients`: of E f, see `surfaces/trigonometric.py`.
-    - `cloud`: D, with zeros in the rows that are not filled.
     - `cholesky`: lower factor of A.
-    - `weights`: A^-1 n.
     """
 
-    level: Float[Array, ""]
-    mean_coefficients: Float[Array, "a a a"]
-    model: GeometricSPSR
-    cloud: PointCloud
     cholesky: Float[Array, "n n"]
-    weights: Float[Array, "n 3"]
 
     @on_torus
     @eqx.filter_jit
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
         """Var f(x) at points in scene coordinates. The cost grows with (number of points) x (capacity)^2."""
         x = jnp.asarray(x, dtype=self.weights.dtype)
-        prior = function_variance(self.model.spectrum)
+        prior = function_variance(self.spectrum)
 
         def at_points(x):
             return jnp.maximum(prior - jnp.sum(self.whitened(x) ** 2, axis=(0, 1)), 0.0)
@@ -219,7 +221,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         """Cov(f(x), f(y)) between points in scene coordinates, all at once."""
         x, y = (jnp.asarray(points, dtype=self.weights.dtype) for points in (x, y))
         explained = jnp.einsum("djn,djm->nm", self.whitened(x), self.whitened(y), precision="highest")
-        return function_covariance(x, y, self.model.spectrum) - explained
+        return function_covariance(x, y, self.spectrum) - explained
 
     def log_marginal_likelihood(self) -> Float[Array, ""]:
         """log p(n_1, ..., n_N | x_1, ..., x_N), summed over the three components."""
@@ -228,55 +230,19 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         log_determinant = 2.0 * jnp.sum(jnp.log(jnp.diag(self.cholesky)))
         return -0.5 * (fit + 3.0 * log_determinant + 3.0 * count * jnp.log(2.0 * jnp.pi))
 
-    def data_points(self) -> DataPoints:
-        """The cloud's, for gradients and for values."""
-        points = filled(self.cloud.points, self.cloud.mask)
-        return DataPoints(points, points)
-
-    def level_about(self, means: MeansAtData) -> Float[Array, " s"]:
-        """Mean over the data of what m_s adds to E f(x_j): m_s(x_j) itself, less what grad m_s takes from the normals.
-        The latter is linear in them, so that its slope is computed once for all means."""
-        slope = level_slope(self.cloud, self.cholesky, self.model.spectrum)
-        explained = jnp.einsum("snd,nd->s", means.gradients, slope, precision="highest")
-        return jnp.mean(means.values, axis=1, where=self.cloud.mask) - explained
-
-    def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> NormalDraws:
-        """Draws of v and of eps."""
-        spectrum, dtype = self.model.spectrum, self.weights.dtype
-        scale = jnp.sqrt(mode_variance(spectrum))
-        modes = scale.shape[0]
-        transform = NonuniformTransform(self.cloud.points, self.model.truncation)
-        field_keys, noise_keys = jax.random.split(key, (2, num_samples))
-
-        def prior(keys, scale, deviation, transform):
-            field_key, noise_key = keys
-            coefficients = scale * jax.random.normal(field_key, (3, modes, modes, modes), dtype)
-            noise = deviation * jax.random.normal(noise_key, self.cloud.points.shape, dtype)
-            return NormalDraws(coefficients, transform.evaluate(coefficients) + noise)
-
-        return shared_map(prior, (field_keys, noise_keys), scale, self.model.noise, transform)
-
-    def conditioned(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s a a a"]:
-        """Coefficients of Poisson(v + k(., X) A^-1 (n - grad m - v(X) - eps))."""
-        return self.updated(draws.coefficients, self.whitened_residual(draws, means))
+    def solve(self, rows: Float[Array, "s n 3"]) -> Float[Array, "s n 3"]:
+        """A^-1 applied to the columns of each block, by the factor."""
+        return self._solve_triangular(self._solve_triangular(rows, transpose=False), transpose=True)
 
     def whitened_residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
         """C^-1 (n - grad m - v(X) - eps) with A = C C^T, zero in rows that are not filled."""
-        residual = self.cloud.normals - means.gradients - draws.at_data
-        return self._solve_triangular(jnp.where(self.cloud.mask[:, None], residual, 0.0), transpose=False)
+        return self._solve_triangular(self.residual(draws, means), transpose=False)
 
     def updated(
         self, coefficients: Float[Array, "s 3 a a a"], whitened: Float[Array, "s n 3"]
     ) -> Float[Array, "s a a a"]:
         """Coefficients of Poisson(v + k(., X) C^-T z) for each v and each whitened residual z."""
-        transform = NonuniformTransform(self.cloud.points, self.model.truncation)
-        weights = self._solve_triangular(whitened, transpose=True)
-
-        def update(sample, transform, spectrum):
-            coefficients, weights = sample
-            return solve_poisson(coefficients) + reconstruct(transform, weights, spectrum)
-
-        return shared_map(update, (coefficients, weights), transform, self.model.spectrum)
+        return self.reconstructed(coefficients, self._solve_triangular(whitened, transpose=True))
 
     def _solve_triangular(self, rows: Float[Array, "s n 3"], transpose: bool) -> Float[Array, "s n 3"]:
         columns = jnp.moveaxis(rows, 0, 1)
@@ -288,7 +254,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         capacity = self.cloud.capacity
 
         def leading(size: int):
-            cross = function_normal_covariance(x, self.cloud.points[:size], self.model.spectrum)
+            cross = function_normal_covariance(x, self.cloud.points[:size], self.spectrum)
             cross = jnp.where(self.cloud.mask[:size], cross, 0.0)
             factor = self.cholesky[:size, :size]
             solved = jax.vmap(lambda c: solve_triangular(factor, c.T, lower=True))(cross)
