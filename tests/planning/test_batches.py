@@ -1,5 +1,6 @@
 """Several views at once, and what it costs to go there: against brute force over pairs on a tiny problem."""
 
+import dataclasses
 import itertools
 
 import jax
@@ -106,6 +107,8 @@ def test_the_order_is_that_of_the_shortest_way():
         return total_cost([FIRST, *(batch.poses[index] for index in order)])
 
     assert length(batch.order) == pytest.approx(min(map(length, itertools.permutations(range(4)))), rel=1e-5)
+    from_first = dataclasses.replace(batch, start=None)
+    assert from_first.order[0] == 0
     assert len({tuple(np.asarray(pose.position).round(4).tolist()) for pose in batch.poses}) == 4
 
 

@@ -147,6 +147,8 @@ def test_value_below_and_budgets_on_scripted_proposals():
     way = after(planner, cloud_of(50), (east, top), seconds=30.0)
     assert Budget(cost=2.01 * quarter).before(way, west, 1.0) is None
     assert "would cost 3.93, but 1.96 of" in Budget(cost=1.5 * quarter).before(way, west, 1.0)
+    assert Budget(cost=1.0).plans
+    assert not Budget(seconds=1.0).plans
     assert Budget(seconds=30.5).after(way) is None
     assert Budget(seconds=30.0).after(way) == "30 of 30 seconds are spent"
 

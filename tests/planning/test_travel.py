@@ -103,6 +103,8 @@ def test_the_value_of_a_view_given_its_cost():
         (lambda: ValuePerCost(arc_length, fixed=0.0), "fixed cost of a view is 0.0; it must be positive"),
         (lambda: ValueMinusCost(arc_length, weight=-1.0), "weight of the cost is -1.0"),
         (lambda: visiting_order(look_at((0.0, 0.0, 1.0)), random_poses(13)), "order of 13 poses: give at most 12"),
+        (lambda: total_cost(list(random_poses(2)), lambda a, b: -1.0), "is -1.0: make it one finite number"),
+        (lambda: total_cost(list(random_poses(2)), lambda a, b: jnp.inf), "is inf: make it one finite number"),
     ],
 )
 def test_bad_input_is_named(make, message):

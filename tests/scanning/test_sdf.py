@@ -89,6 +89,7 @@ EXACT = {
     "pointed cone": (Cone(0.8, 0.0, 0.5), revolve(np.array([[0, -0.5], [0.8, -0.5], [0, 0.5]]))),
     "torus": (Torus(0.7, 0.25), revolve(arc(0.7, 0, 0.25, 0, 2 * np.pi))),
     "capsule": (Capsule([0, -0.5, 0], [0, 0.5, 0], 0.3), revolve(CAPSULE_PROFILE)),
+    "capsule without a length": (Capsule([0, 0, 0], [0, 0, 0], 0.8), 0.8 * np.asarray(fibonacci_sphere(200_000))),
     "moved": (
         Capsule([0, -0.5, 0], [0, 0.5, 0], 0.3).rotate([1, 2, 3], 0.7).scale(0.5).translate([0.2, -0.1, 0.3]),
         0.5 * turned(revolve(CAPSULE_PROFILE), [1, 2, 3], 0.7) + [0.2, -0.1, 0.3],

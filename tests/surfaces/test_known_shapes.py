@@ -136,6 +136,14 @@ def test_a_symmetric_shape_stands_in_all_the_ways_that_look_alike():
     assert sorted(np.round(np.abs(angles[good])).astype(int).tolist()) == pytest.approx([0, 180], abs=3)
 
 
+def test_what_was_seen_empty_is_among_what_shapes_are_fitted_to():
+    evidence = evidence_of(nbv.SDFSurface(Cuboid([0.5, 0.3, 0.4])), AROUND)
+    seen = Seen.of(evidence)
+    assert bool(seen.is_empty.all())
+    assert bool(evidence.is_seen_empty(seen.empty).all())
+    assert not bool(Seen.of(dataclasses.replace(evidence, seen_empty=None, grid=None)).is_empty.any())
+
+
 def test_shapes_of_a_kind_differ_by_their_number():
     kinds = {"chair 3": "chair", "office chair 12": "office chair", "chair": "chair", "arm 0.5": "arm 0.5", " 7": " 7"}
     assert {name: kind_of(name) for name in kinds} == kinds

@@ -42,6 +42,12 @@ def test_extremes_of_analytic_shapes_are_their_corners():
         np.testing.assert_allclose(points.min(axis=0), -np.asarray(half), atol=2e-3)
 
 
+def test_extremes_of_a_ball_are_spread_over_it():
+    """Along the gradient a point goes straight to the middle."""
+    (points,) = np.asarray(nbv.ShapeBank.of([Sphere(0.7)]).extremes)
+    np.testing.assert_allclose(points, 0.7 * np.asarray(nbv.fibonacci_sphere(128)), atol=2e-3)
+
+
 def test_a_bank_gives_back_its_shapes_and_names():
     bank = nbv.ShapeBank.of([Sphere(0.5), Sphere(0.8), Sphere(1.0)], ["small", "größer", "x" * 100])
     assert len(bank) == 3
