@@ -1,6 +1,5 @@
 """Meshes from files of any format that trimesh reads; what is missing, damaged or cut short is named."""
 
-import io
 import os
 import re
 import struct
@@ -54,7 +53,7 @@ def read_nodes(path: str | Path) -> list[tuple[str, trimesh.Trimesh]]:
         if zipfile.is_zipfile(path):
             size = sum(member.file_size for member in zipfile.ZipFile(path).infolist())
             require(size <= _LARGEST, f"{path} unpacks to {size} bytes: unpack it, and give the mesh")
-        parts = trimesh.load_scene(_opened(path), path.suffix[1:].lower(), process=False).dump()
+        parts = trimesh.load_scene(path, path.suffix[1:].lower(), process=False).dump()
     except InputError:
         raise
     except Exception as error:  # Each of trimesh's readers fails in its own way.
@@ -81,16 +80,6 @@ def _declared(path: Path) -> tuple[int, int]:
     else:
         counts = []
     return (counts[0], counts[1]) if len(counts) == 2 else (0, 0)
-
-
-def _opened(path: Path) -> Path | io.BytesIO:
-    """What trimesh is to read: many OFF files of ModelNet run their first two lines together."""
-    if path.suffix.lower() == ".off":
-        with path.open("rb") as file:
-            if file.read(3) == b"OFF" and file.read(1).isdigit():
-                file.seek(3)
-                return io.BytesIO(b"OFF\n" + file.read())
-    return path
 
 
 def _why_unread(path: Path) -> str:
