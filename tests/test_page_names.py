@@ -98,8 +98,8 @@ def test_the_commands_of_a_page_are_there(page, capsys):
 
 def test_commands_that_are_not_there_are_refused():
     """Or the test above would say nothing."""
-    found = commands("```bash\nX=1 jaxnbv run a --vews 3 && python benchmarks/step.py --mash b  # more\n```\n")
-    assert found == [["jaxnbv", "run", "a", "--vews", "3"], ["python", "benchmarks/step.py", "--mash", "b"]]
+    found = commands("```bash\nX=1 jaxnbv run a --vews 3 && python benchmarks/all.py --mash b  # more\n```\n")
+    assert found == [["jaxnbv", "run", "a", "--vews", "3"], ["python", "benchmarks/all.py", "--mash", "b"]]
     with pytest.raises(Exception, match="No such option"):
         parse(found[0][1:])
     with pytest.raises(AssertionError):

@@ -29,6 +29,7 @@ from jaxnbv.viz.answers import may_be_words, shown_value, words_of
 from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
 from jaxnbv.viz.render import depth_picture, depth_range
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, VALUE, colour_scale, round_range
+from jaxnbv.viz.task import seen_after
 
 _SAMPLES = 4
 _NEXT = "#009e73"
@@ -145,9 +146,10 @@ class LiveView:
     def _tell(
         self, episode: Episode, posterior: SurfacePosterior, proposal: Proposal | None, picture: np.ndarray | None
     ) -> None:
-        views, sought = len(episode.views), episode.planner.quantity
-        lines = [f"**{views} view{'s' if views > 1 else ''}**, {int(episode.cloud.count):,} points kept"]
-        answer = episode.planner.acquisition.answer(episode.cloud)
+        views, sought, acquisition = len(episode.views), episode.planner.quantity, episode.planner.acquisition
+        seen = seen_after(episode.views, None, acquisition)[-1]
+        lines = [f"**{views} view{'s' if views > 1 else ''}**, {seen.amount} of surface seen"]
+        answer = acquisition.answer(episode.cloud)
         lines += [] if answer is None else [words_of(answer).sentence()]
         if isinstance(posterior, KnownShapesPosterior):
             lines.append(may_be_words(tuple(posterior.kinds().items())))

@@ -90,7 +90,7 @@ def test_the_slider_goes_back_to_an_earlier_view(watched):
     np.testing.assert_allclose(shown["/points/new"].points, first, atol=2e-3)
     assert "/cameras/view 2" not in shown
     np.testing.assert_allclose(shown["/next view"].position, session.episode.views[1].proposal.pose.position, atol=1e-5)
-    assert "1 view*" in page._text.content
+    assert re.search(r"^\*\*1 view\*\*, [\d.]+ scene units² of surface seen$", page._text.content, re.MULTILINE)
     page._slider.value = 2
     assert "/cameras/view 2" in handles(page)
 

@@ -1,0 +1,238 @@
+"""Time every stage of planning on this machine, as ratios to a yardstick, to rivals, and to what the arithmetic takes.
+
+    python benchmarks/all.py [--mesh FILE] [--only STAGE ...] [--out runs/all]
+    JAX_NUM_CPU_DEVICES=2 python benchmarks/all.py --only devices
+
+The paper's settings: 16 samples, 120 candidates, 50 x 50 rays, samples on a 100^3 grid, one view of a mug or of a
+mesh. Times are after compilation, the least of three; "first" says where it is included. The yardstick is a 2,000^3
+float32 product; the rival of a scan is marching cubes (scikit-image) and Embree (through trimesh) on the same samples,
+meshes and trees included; the floor of a network is its multiply-adds at the yardstick's rate. A step is
+shared among all devices there are. Writes OUT.json and OUT.md.
+"""
+
+import argparse
+import json
+import resource
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from skimage.measure import marching_cubes
+from timing import least_time
+
+import jaxnbv as nbv
+from jaxnbv.networks import pyramid_classifier
+from jaxnbv.planning.episode import observe_scene
+from jaxnbv.search.candidates import sphere_candidates
+from jaxnbv.storage.folders import versions
+from jaxnbv.studies.scenes import Framing, Split, demo_object, hidden_view, pyramid_scene
+
+
+class Bench:
+    """What all stages start from; seconds by stage, and what each is compared to."""
+
+    def __init__(self, mesh: str | None):
+        self.key, self.first = jax.random.key(0), nbv.look_at((0.8, 0.9, 2.2))
+        self.candidates = sphere_candidates(120, 2.5)
+        self.scene = nbv.load_mesh(mesh) if mesh else demo_object()
+        self.rows: dict[str, dict[str, float]] = {}
+
+    def take(self, stage: str, function, **beside: float) -> float:
+        """`beside`: what it is told as a ratio to, by name, in seconds."""
+        return self.note(stage, least_time(function), **beside)
+
+    def note(self, stage: str, seconds: float, **beside: float) -> float:
+        self.rows[stage] = {"seconds": seconds} | {name: seconds / other for name, other in beside.items()}
+        print(f"{stage}: {seconds:.3g} s", flush=True)
+        return seconds
+
+    def evidence(self, planner: nbv.Planner, views: int = 1) -> nbv.Evidence:
+        """After a first view, and others from around the object."""
+        evidence, around = None, map(nbv.look_at, nbv.fibonacci_sphere(views, 2.5))
+        for index, pose in enumerate([self.first, *around][:views]):
+            seen = observe_scene(self.scene, planner.camera, pose, nbv.SensorNoise(), jax.random.key(index))
+            evidence = planner.observe(evidence, pose, seen) if evidence else planner.init(pose, seen)
+        return evidence
+
+
+def rival_scan(surfaces: nbv.GridSurface, camera: nbv.Camera, poses: nbv.Pose) -> float:
+    """Seconds that marching cubes and Embree take for the scans of all samples from all poses."""
+    values, spacing = np.array(surfaces.values), surfaces.grid.spacing
+    origins, directions = (np.asarray(rays).reshape(-1, 3) for rays in camera.rays(poses))
+    start = time.perf_counter()
+    for field in values:
+        vertices, faces, _, _ = marching_cubes(field, 0.0, spacing=(spacing,) * 3)
+        mesh = trimesh.Trimesh(vertices - surfaces.grid.half_extent, faces, process=False)
+        mesh.ray.intersects_id(origins, directions, multiple_hits=False, return_locations=True)
+    return time.perf_counter() - start
+
+
+def coverage(bench: Bench) -> None:
+    """The paper's acquisition by the full search, after one view and with its 8,192 points full."""
+    planner = nbv.Planner(nbv.Coverage())
+    evidence = bench.evidence(planner)
+    start = time.perf_counter()
+    jax.block_until_ready(planner.propose(evidence, bench.key))
+    bench.note("coverage: first step, compilation included", time.perf_counter() - start)
+    step = bench.take("coverage: a step", lambda: planner.propose(evidence, bench.key))
+    bench.take("coverage: samples on the grid", lambda: planner.imagination.sample(evidence, bench.key), step=step)
+    surfaces = planner.imagination.sample(evidence, bench.key)
+    scans = lambda: nbv.scan_samples(surfaces, planner.camera, bench.candidates)  # noqa: E731
+    rival = bench.note(
+        "rival: marching cubes and Embree",
+        min(rival_scan(surfaces, planner.camera, bench.candidates) for _ in range(2)),
+    )
+    bench.take("coverage: 16 samples scanned from 120 candidates", scans, step=step, rival=rival)
+    seen = scans()
+
+    @jax.jit
+    def values(cloud, seen):
+        context = planner.acquisition.context(cloud)
+        score = lambda of: nbv.acquisition.scores(planner.acquisition, context, of, planner.camera, bench.candidates)  # noqa: E731
+        return jnp.mean(jax.lax.map(score, seen), axis=0)
+
+    # What is timed must be what a step does.
+    expected = nbv.expected_value(planner.acquisition, evidence.cloud, surfaces, planner.camera, bench.candidates)
+    np.testing.assert_allclose(values(evidence.cloud, seen), expected, rtol=1e-3)
+    bench.take("coverage: values of the 1,920 scans", lambda: values(evidence.cloud, seen), step=step)
+    full = bench.evidence(planner, 13)
+    bench.take(
+        f"coverage: a step at {int(full.cloud.count):,} points", lambda: planner.propose(full, bench.key), step=step
+    )
+
+
+def sessions(bench: Bench) -> None:
+    """What sessions plan by: new surface by halving, 2,000 points kept."""
+    planner = nbv.Planner(nbv.NewSurface(), nbv.HalvingSearch(), capacity=2000)
+    second = bench.evidence(planner, 2)
+    step = bench.take("new surface, halving, 2,000 points: the second step", lambda: planner.propose(second, bench.key))
+    tenth = bench.evidence(planner, 10)
+    bench.take("new surface, halving, 2,000 points: the tenth", lambda: planner.propose(tenth, bench.key), second=step)
+
+
+def cross_entropy(bench: Bench) -> None:
+    """The shipped classifier of pyramids on 1,920 clouds of 1,024 points, and by halving; the paper's surfaces."""
+    pyramid = pyramid_scene(Split.TEST, 0, Framing.CLOSE_UP)
+    classifier = pyramid_classifier(Framing.CLOSE_UP.longest_side)
+    imagination = nbv.Imagination.preset("paper")
+    planner = nbv.Planner(nbv.CrossEntropy(classifier), imagination=imagination)
+    first = hidden_view(pyramid, bench.key)
+    seen = observe_scene(nbv.SDFSurface(pyramid), planner.camera, first, nbv.SensorNoise(), bench.key)
+    evidence = planner.init(first, seen)
+    step = bench.take("cross-entropy: a step", lambda: planner.propose(evidence, bench.key))
+    halving = nbv.Planner(planner.acquisition, nbv.HalvingSearch(), imagination=imagination)
+    bench.take("cross-entropy: a step by halving", lambda: halving.propose(evidence, bench.key), step=step)
+    bench.take("cross-entropy: samples on the grid", lambda: planner.imagination.sample(evidence, bench.key), step=step)
+    surfaces = planner.imagination.sample(evidence, bench.key)
+    scans = lambda: nbv.scan_samples(surfaces, planner.camera, bench.candidates)  # noqa: E731
+    bench.take("cross-entropy: 16 samples scanned from 120 candidates", scans, step=step)
+    seen = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), scans())
+    known = planner.acquisition.context(evidence.cloud)[0]
+
+    @jax.jit
+    def thinned(seen):
+        join = lambda scan: nbv.farthest_point_subsample(nbv.concatenate(known, scan), classifier.num_points)  # noqa: E731
+        return jax.lax.map(join, seen)
+
+    bench.take("cross-entropy: farthest points of 1,920 clouds", lambda: thinned(seen), step=step)
+    fed = thinned(seen)
+    network = jax.jit(lambda fed: jax.lax.map(lambda c: classifier.network(c.points, c.normals, c.mask), fed))
+    bench.take("cross-entropy: the network on 1,920 clouds", lambda: network(fed), step=step)
+
+
+def gradient(bench: Bench) -> None:
+    """Searches on the same samples, as ratios to the discrete one."""
+    planner = nbv.Planner(nbv.Coverage())
+    evidence = bench.evidence(planner)
+    surfaces = planner.imagination.sample(evidence, bench.key)
+    discrete = bench.take("search: discrete, 120 candidates", lambda: planner.choose(evidence, surfaces, bench.key))
+    searches = {
+        "halving, 120 candidates": nbv.HalvingSearch(),
+        "gradient, six starts": nbv.GradientSearch(dof=2, num_candidates=6),
+        "gradient, 100 candidates": nbv.GradientSearch(dof=2),
+        "hybrid": nbv.HybridSearch(),
+    }
+    for name, search in searches.items():
+        other = nbv.Planner(planner.acquisition, search)
+        bench.take(
+            f"search: {name}", lambda other=other: other.choose(evidence, surfaces, bench.key), discrete=discrete
+        )
+
+
+def networks(bench: Bench) -> None:
+    """PointNet++ at its published sizes, one cloud of 1,024 points, against its multiply-adds."""
+    from networks import NETWORKS, multiply_adds, random_network, timings
+
+    rate = 2000**3 / yardstick()
+    normals = jax.random.normal(bench.key, (16, 1024, 3))
+    normals = normals / jnp.linalg.norm(normals, axis=-1, keepdims=True)
+    for name in NETWORKS:
+        network = random_network(name, bench.key)
+        seconds = timings(network, normals * jnp.array([1.0, 0.7, 0.5]), normals)["one cloud"]
+        bench.note(f"PointNet++ of {name}", seconds, floor=multiply_adds(network) / rate)
+
+
+def devices(bench: Bench) -> None:
+    """A step by the full search on one device and shared among all."""
+    planner, count = nbv.Planner(nbv.NewSurface(), nbv.DiscreteSearch()), len(jax.devices())
+    evidence = bench.evidence(planner)
+    step = lambda: planner.propose(evidence, bench.key)  # noqa: E731
+    alone = bench.take("new surface: a step on one device", step)
+    if count > 1:
+        with jax.set_mesh(jax.sharding.Mesh(jax.devices(), "devices")):
+            bench.take(f"new surface: a step shared among {count} devices", step, alone=alone)
+
+
+def yardstick() -> float:
+    matrix = jax.random.normal(jax.random.key(0), (2000, 2000))
+    product = jax.jit(lambda a: jnp.matmul(a, a, precision="highest"))
+    return least_time(lambda: product(matrix), repeats=10)
+
+
+STAGES = (coverage, sessions, cross_entropy, gradient, networks, devices)
+
+
+def page(record: dict) -> str:
+    """The table as Markdown."""
+    lines = [f"{record['device']}, {record['devices']} of them; peak memory {record['peak_memory_gb']:.1f} GB.", ""]
+    lines += ["| stage | seconds | yardsticks | as a ratio |", "|---|---|---|---|"]
+    for stage, row in record["stages"].items():
+        ratios = [f"{value:.2f} of {name}" for name, value in row.items() if name != "seconds"]
+        yardsticks = row["seconds"] / record["yardstick"]
+        lines.append(f"| {stage} | {row['seconds']:.3g} | {yardsticks:.3g} | {', '.join(ratios)} |")
+    return "\n".join([*lines, "", f"The yardstick takes {record['yardstick']:.3f} s.", ""])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    names = [stage.__name__ for stage in STAGES]
+    parser.add_argument("--mesh", help="a mesh file; a mug if left out")
+    parser.add_argument("--only", nargs="+", choices=names, default=names)
+    parser.add_argument("--out", type=Path, default=Path("runs/all"))
+    asked = parser.parse_args()
+    bench = Bench(asked.mesh)
+    for stage in STAGES:
+        if stage.__name__ in asked.only:
+            stage(bench)
+    # Linux gives kilobytes, macOS bytes.
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e9 if sys.platform == "darwin" else 1e6)
+    record = {
+        "device": jax.devices()[0].device_kind,
+        "devices": len(jax.devices()),
+        "versions": versions(),
+        "yardstick": yardstick(),
+        "peak_memory_gb": peak,
+        "stages": bench.rows,
+    }
+    asked.out.parent.mkdir(parents=True, exist_ok=True)
+    asked.out.with_suffix(".json").write_text(json.dumps(record, indent=2) + "\n")
+    asked.out.with_suffix(".md").write_text(page(record))
+    print(page(record))
+
+
+if __name__ == "__main__":
+    main()
