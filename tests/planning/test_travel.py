@@ -1,5 +1,6 @@
 """What it costs to go from view to view: against closed forms, SciPy and brute force."""
 
+import dataclasses
 import itertools
 
 import jax
@@ -11,8 +12,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from jaxnbv.checks import InputError
+from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.planning.travel import ValueMinusCost, ValuePerCost, arc_length, rotation_angle, total_cost, visiting_order
+from jaxnbv.scanning import Evidence
 
 RNG = np.random.default_rng(0)
 
@@ -95,6 +98,18 @@ def test_the_value_of_a_view_given_its_cost():
     values, cost = jnp.array([[4.0, 2.0], [2.0, 0.0]]), jnp.array([1.0, 3.0])
     np.testing.assert_allclose(ValuePerCost(arc_length, fixed=1.0).weigh(values, cost), [[2.0, 0.5], [1.0, 0.0]])
     np.testing.assert_allclose(ValueMinusCost(arc_length, weight=0.5).weigh(values, cost), [[3.5, 0.5], [1.5, -1.5]])
+
+
+def test_a_cost_that_breaks_its_contract_makes_a_value_of_nothing():
+    """Zero is a cost; less, and what is not finite, is none. The cost is the pose's height."""
+    heights = jnp.array([-1.0, 0.0, jnp.inf, jnp.nan, 2.0])
+    poses = Pose(jnp.broadcast_to(jnp.eye(3), (5, 3, 3)), jnp.zeros((5, 3)).at[:, 1].set(heights))
+    cloud = PointCloud.from_arrays(np.eye(3), np.eye(3))
+    seen = Evidence.before_views(cloud, 1, None)
+    weighed = ValueMinusCost(lambda start, end: end.position[1], weight=0.5)
+    np.testing.assert_array_equal(weighed(jnp.ones(5), seen, poses), 1.0)
+    seen = dataclasses.replace(seen, num_views=seen.num_views + 1)
+    np.testing.assert_array_equal(weighed(jnp.ones(5), seen, poses), [np.nan, 1.0, np.nan, np.nan, 0.0])
 
 
 @pytest.mark.parametrize(
