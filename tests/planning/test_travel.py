@@ -101,12 +101,12 @@ def test_the_value_of_a_view_given_its_cost():
 
 
 def test_a_cost_that_breaks_its_contract_makes_a_value_of_nothing():
-    """Zero is a cost; less, and what is not finite, is none. The cost is the pose's height."""
-    heights = jnp.array([-1.0, 0.0, jnp.inf, jnp.nan, 2.0])
-    poses = Pose(jnp.broadcast_to(jnp.eye(3), (5, 3, 3)), jnp.zeros((5, 3)).at[:, 1].set(heights))
+    """Zero is a cost; less, and what is not finite, is none."""
+    costs = jnp.array([-1.0, 0.0, jnp.inf, jnp.nan, 2.0])
+    poses = Pose(jnp.broadcast_to(jnp.eye(3), (5, 3, 3)), jnp.zeros((5, 3)).at[:, 1].set(jnp.arange(5.0)))
     cloud = PointCloud.from_arrays(np.eye(3), np.eye(3))
     seen = Evidence.before_views(cloud, 1, None)
-    weighed = ValueMinusCost(lambda start, end: end.position[1], weight=0.5)
+    weighed = ValueMinusCost(lambda start, end: costs[end.position[1].astype(int)], weight=0.5)
     np.testing.assert_array_equal(weighed(jnp.ones(5), seen, poses), 1.0)
     seen = dataclasses.replace(seen, num_views=seen.num_views + 1)
     np.testing.assert_array_equal(weighed(jnp.ones(5), seen, poses), [np.nan, 1.0, np.nan, np.nan, 0.0])
