@@ -83,8 +83,8 @@ def task_of(
     beside = None
     if rival is not None:
         others = tuple(words_of(answer).panels(truth) for answer in _answers(acquisition, rival.views, rival_seen))
-        beside = Rival(search_name(rival), race_words(rival, acquisition), others, tuple(rival_seen))
-    head = _asked(episode.planner), _found(answers, truth), _sure(answers)
+        beside = Rival(search_name(rival), race_words(rival, episode), others, tuple(rival_seen))
+    head = _asked(episode.planner), _found(answers, truth), _sure(answers, episode.stopped)
     return Task(tuple(answers), truth, panels, *head, beside)
 
 
@@ -154,15 +154,17 @@ def search_name(episode: Episode) -> str:
     return re.sub("(?<!^)(?=[A-Z])", " ", type(episode.planner.search).__name__).lower()
 
 
-def race_words(rival: Episode, acquisition: Acquisition) -> str:
-    """How many views another search took, from the same first view; of an acquisition that answers, whether it was
-    enough by the rule that ends both, and what was found."""
+def race_words(rival: Episode, episode: Episode) -> str:
+    """How many views another search took, from the same first view; of an acquisition that answers, whether it ended by
+    the rule that ended the episode, what was found, and since when its answers can be relied on."""
     name, count = search_name(rival).capitalize(), len(rival.views)
-    views, answer = f"{count} view{'s' * (count > 1)}", acquisition.answer(rival.views[-1].cloud)
-    if answer is None:
-        return f"{name} took {views} from the same start."
-    needed = f"needed {views}" if rival.stopped else f"did not find it in {views}"
-    return f"{name} {needed} from the same start ({words_of(answer).found})."
+    answers = _answers(episode.planner.acquisition, rival.views, ())
+    needed = "needed" if rival.stopped else "did not end by that rule in" if episode.stopped else "took"
+    text = f"{name} {needed} {count} view{'s' * (count > 1)} from the same start"
+    if not answers:
+        return f"{text}."
+    first = None if rival.stopped else since(answers)
+    return f"{text} ({words_of(answers[-1]).found}{f'; sure from view {first} on' if first else ''})."
 
 
 def _asked(planner: Planner) -> str:
@@ -177,8 +179,9 @@ def _found(answers: Sequence[Answer], truth: Answer | None) -> str:
     return text if truth is None else f"{text}. In truth: {words_of(truth).truly}"
 
 
-def _sure(answers: Sequence[Answer]) -> str:
+def _sure(answers: Sequence[Answer], stopped: str | None) -> str:
     first, count, lost = since(answers), len(answers), lost_again(answers)
     text = f"From view {first} on" if first else f"Not yet after {count} view{'s' * (count > 1)}"
     again = f" At view {lost} it was sure already, but then not." if lost else ""
-    return f"{text}.{again} Sure means {words_of(answers[-1]).settled_means}."
+    ended = "" if stopped is None else f" It ended by its rule: {stopped}."
+    return f"{text}.{again} Sure means {words_of(answers[-1]).settled_means}.{ended}"

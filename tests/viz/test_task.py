@@ -1,5 +1,6 @@
 """The task by view: its numbers, what is true, since when it is sure; in the answers and on the page."""
 
+import dataclasses
 import html
 import re
 from html.parser import HTMLParser
@@ -21,7 +22,7 @@ from jaxnbv.tasks.segmentation import PartAnswer
 from jaxnbv.viz.answers import number, words_of
 from jaxnbv.viz.data import report_data
 from jaxnbv.viz.report import report_html
-from jaxnbv.viz.task import lost_again, since, true_cloud
+from jaxnbv.viz.task import lost_again, race_words, since, true_cloud
 from jaxnbv.viz.task_figures import chart_figure, task_charts
 
 NAMES = ("left", "right", "up")
@@ -218,8 +219,16 @@ def test_a_rival_is_told_of_and_drawn(plain):
     data = report_data(episode, progress=False, imagine=False, rival=other)
     rival = data.task.rival
     p = np.exp(np.asarray(Leaning()(other.cloud), np.float64))
-    assert rival.words.startswith("Farthest view did not find it in 3 views from the same start")
-    assert rival.words.endswith(f"({NAMES[int(np.argmax(p))]}, probability {p.max():.2f}).")
+    found = f"{NAMES[int(np.argmax(p))]}, probability {p.max():.2f}"
+    assert rival.words == f"Farthest view took 3 views from the same start ({found})."
+    ended = dataclasses.replace(episode, stopped="sure of it")
+    assert (
+        race_words(other, ended) == f"Farthest view did not end by that rule in 3 views from the same start ({found})."
+    )
+    assert race_words(dataclasses.replace(other, stopped="sure of it"), ended).startswith(
+        "Farthest view needed 3 views"
+    )
+    assert report_data(ended, progress=False, imagine=False).task.sure.endswith("It ended by its rule: sure of it.")
     np.testing.assert_allclose(rival.panels[2][0].values, p, atol=1e-6)
     truth = nbv.metrics.truth_points(scene, jax.random.key(0))
     np.testing.assert_allclose([answer.values[0] for answer in rival.seen], nbv.metrics.coverage(other.views, truth))

@@ -200,7 +200,7 @@ def _run(
             f"enough   after view {len(episode.views)}: {episode.stopped}. {saved} of {asked.views} views {are} saved"
         )
     if raced is not None:
-        typer.echo(f"race     {race_words(raced, planner.acquisition)}")
+        typer.echo(f"race     {race_words(raced, episode)}")
     if asked.report:
         typer.echo(f"report   {viz.write_report(episode, folder, title=name, rival=raced, sketches=sketches)}")
     typer.echo(f"episode  {folder}   ({time.perf_counter() - start:.0f} s)")
