@@ -349,6 +349,7 @@ REFUSED = {
     ),
     "a probability of text": (lambda: nbv.Sure("0.9"), "'0.9'"),
     "parts that are no names": (lambda: nbv.Found(parts=3), "3"),
+    "a boundary of text": (lambda: nbv.OutsideBoundary(lambda x: "far"), "gives no signed distances of points"),
     "a gap among images": (lambda: reopened("gap", lambda f: (f / "image_01.npz").unlink()), "not image_01.npz"),
     "a link to no image": (lambda: reopened("link", dangling), "image_01.npz is damaged"),
     "a pipe as an image": (lambda: reopened("pipe", piped), "image_01.npz is damaged"),
