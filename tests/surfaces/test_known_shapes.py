@@ -141,7 +141,9 @@ def test_what_was_seen_empty_is_among_what_shapes_are_fitted_to():
     seen = Seen.of(evidence)
     assert bool(seen.is_empty.all())
     assert bool(evidence.is_seen_empty(seen.empty).all())
-    assert not bool(Seen.of(dataclasses.replace(evidence, seen_empty=None, grid=None)).is_empty.any())
+    nothing = dataclasses.replace(evidence, seen_empty=None, grid=None)
+    assert not bool(Seen.of(nothing).is_empty.any())
+    np.testing.assert_array_equal(nothing.is_seen_empty(seen.empty), np.ones(len(seen.empty), bool))
 
 
 def test_shapes_of_a_kind_differ_by_their_number():
