@@ -34,7 +34,7 @@ def demo(
 
     Farthest view, which knows nothing of the task, then starts from the same view. With --task parts the object is a
     procedural one of thirteen categories, with --task heat one of four kinds that is heated at one place, and with
-    --task coverage a laid tea mug, to be seen all round.
+    --task coverage a mug, to be seen all round.
     """
     actions.demo(SimpleNamespace(**locals()))
 

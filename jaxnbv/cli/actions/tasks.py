@@ -96,7 +96,7 @@ class CommandTask(NamedTuple):
 
 
 def _mug(scene: int, seed: int) -> Shown:
-    """A laid tea mug, the only one."""
+    """A mug, the only one."""
     return Shown("mug", demo_object(), NewSurface(), usual_first())
 
 

@@ -1,4 +1,4 @@
-"""The demonstration object: a laid tea mug, built from primitives, with places that a search must go and find."""
+"""The demonstration object: a mug on a saucer, built from primitives, with places that a search must go and find."""
 
 import math
 
