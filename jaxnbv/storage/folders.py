@@ -70,15 +70,14 @@ def read_json(file: Path, problem: str, remedy: str) -> dict[str, Any]:
     return content
 
 
-def read_config(file: Path, problem: str, remedy: str) -> dict[str, Any]:
-    """The configuration in a folder's record.
+def read_record(file: Path, problem: str, remedy: str) -> dict[str, Any]:
+    """A folder's record, with its `config`.
 
-    **Raises:** as `read_json`, and if there is none.
+    **Raises:** as `read_json`, and if it has no configuration.
     """
-    config = read_json(file, problem, remedy).get("config")
-    if not isinstance(config, dict):
-        raise InputError(f"{file} {problem} (it has no config): {remedy}")
-    return config
+    record = read_json(file, problem, remedy)
+    require(isinstance(record.get("config"), dict), f"{file} {problem} (it has no config): {remedy}")
+    return record
 
 
 @contextmanager
@@ -154,7 +153,7 @@ class ResultFolder:
 
         **Raises:** `ValueError` if it holds none.
         """
-        return cls(path, read_config(Path(path) / cls.record_name, cls.problem, cls.remedy))
+        return cls(path, read_record(Path(path) / cls.record_name, cls.problem, cls.remedy)["config"])
 
     @contextmanager
     def writing(self) -> Iterator[None]:
@@ -186,14 +185,12 @@ class ResultFolder:
                 f"the output folder {self.path} holds other files ({', '.join(foreign[:3])}): choose an empty folder",
             )
             return
-        written = read_json(self.record, self.problem, "choose another output folder")
-        found = written.get("config")
-        require(found is not None, f"{self.record} {self.problem} (it has no config): choose another output folder")
+        written = read_record(self.record, self.problem, "choose another output folder")
         check_format(written.get("format"), self.record)
         # A record without results is of a run that did not come far; it binds nobody.
         if not has_results:
             return
-        changed = differences(found, self.config)
+        changed = differences(written["config"], self.config)
         if changed:
             raise AnotherConfigurationError(
                 f"the output folder {self.path} belongs to another {self.kind}; it differs in "

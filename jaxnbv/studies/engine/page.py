@@ -13,7 +13,7 @@ import pandas as pd
 
 from jaxnbv.checks import InputError, require
 from jaxnbv.storage.files import make_folder, write_text
-from jaxnbv.storage.folders import read_config, read_json
+from jaxnbv.storage.folders import read_record
 from jaxnbv.studies.engine.charts import write_charts
 from jaxnbv.studies.engine.measures import UNKNOWING, Claim, Record
 from jaxnbv.studies.engine.records import read_records
@@ -25,7 +25,6 @@ from jaxnbv.version import __version__
 from jaxnbv.viz.html import render
 
 _REMEDY = "give a folder that `jaxnbv study` has written"
-_PROBLEM = "is not a study's record"
 _WHERE = ("ahead of", "level with", "behind")
 
 
@@ -98,12 +97,12 @@ def chapters(folder: str | Path) -> list[Chapter]:
     found: dict[tuple[int, Path], Chapter] = {}
     for file in sorted(folder.rglob("study.json")):
         if any(file.parent.glob("scene_*.json")):
-            config = read_json(file, _PROBLEM, _REMEDY)
-            study = read_config(file, _PROBLEM, _REMEDY).get("study")
+            written = read_record(file, "is not a study's record", _REMEDY)
+            study = written["config"].get("study")
             name = study.get("type") if isinstance(study, dict) else study
             if not isinstance(name, str) or name not in kinds:
                 raise InputError(f"{file} is of a study {name!r}, which this version does not know: {_REMEDY}")
-            chapter = _chapter(file.parent, file.parent.relative_to(folder), config, kinds[name])
+            chapter = _chapter(file.parent, file.parent.relative_to(folder), written, kinds[name])
             found[list(kinds).index(name), file] = chapter
     require(len(found) > 0, f"{folder} holds no study that has a scene: {_REMEDY}")
     return [found[place] for place in sorted(found)]
@@ -139,7 +138,7 @@ def _kinds() -> dict[str, type[Study]]:
     return named
 
 
-def _chapter(path: Path, inside: Path, config: dict[str, Any], kind: type[Study]) -> Chapter:
+def _chapter(path: Path, inside: Path, written: dict[str, Any], kind: type[Study]) -> Chapter:
     records = read_records(path)
     found = results(records, kind)
     parts = {
@@ -151,18 +150,18 @@ def _chapter(path: Path, inside: Path, config: dict[str, Any], kind: type[Study]
         pictures = [file for file in sorted(path.glob("*.png")) if file.stem not in kind.charts]
         images = [(file.stem.replace("_", " "), file.read_bytes()) for file in (*charts, *pictures)]
     title = kind.title if inside == Path() else f"{kind.title}: {inside}"
-    told = _facts(records, config), kind.explanation, verdicts(kind, found.differences)
-    return Chapter(title, len(records), *told, parts, images, json.dumps(config.get("config", {}), indent=1))
+    told = _facts(records, written), kind.explanation, verdicts(kind, found.differences)
+    return Chapter(title, len(records), *told, parts, images, json.dumps(written["config"], indent=1))
 
 
-def _facts(records: Sequence[Record], config: dict[str, Any]) -> list[str]:
+def _facts(records: Sequence[Record], written: dict[str, Any]) -> list[str]:
     """Scenes, times, and what the numbers were made with."""
     seconds = [record["seconds"] for record in records if "seconds" in record]
     facts = [f"{count_of(len(records), 'scene')}; intervals are the {LEVEL:.0%} bootstrap's, over scenes."]
     if seconds:
         mean = sum(seconds) / len(seconds)
         facts.append(f"{mean:.0f} seconds a scene with all methods, {sum(seconds) / 3600:.2f} hours in all.")
-    made_by = config.get("versions")
+    made_by = written.get("versions")
     if isinstance(made_by, dict) and made_by:
         facts.append("Made with " + ", ".join(f"{name} {version}" for name, version in made_by.items()) + ".")
     return facts
