@@ -231,20 +231,17 @@ def united(primitives: list[Primitive]) -> LabelledSolid:
     """
     _check_count(primitives)
 
-    def padded(rows, filling=0.0):
-        rows = np.asarray(rows)
-        spare = np.broadcast_to(filling, (CAPACITY - len(rows), *rows.shape[1:]))
-        return np.concatenate([rows, spare.astype(rows.dtype)])
-
+    spare = Primitive(_EMPTY, np.zeros(3), np.eye(3), np.zeros(3), rounding=0.0)
+    slots = primitives + [spare] * (CAPACITY - len(primitives))
     return LabelledSolid(
-        labels=jnp.asarray(padded([p.label for p in primitives], _EMPTY), jnp.int32),
-        revolved=jnp.asarray(padded([p.revolved for p in primitives], False)),
-        centre=padded([p.centre for p in primitives]),
-        rotation=padded([p.rotation for p in primitives], np.eye(3)),
-        half_size=padded([p.half_size for p in primitives]),
-        rounding=padded([p.rounding for p in primitives]),
-        radius=padded([p.radius for p in primitives]),
-        slant=padded([p.slant for p in primitives]),
+        labels=jnp.asarray([p.label for p in slots], jnp.int32),
+        revolved=jnp.asarray([p.revolved for p in slots]),
+        centre=jnp.asarray([p.centre for p in slots]),
+        rotation=jnp.asarray([p.rotation for p in slots]),
+        half_size=jnp.asarray([p.half_size for p in slots]),
+        rounding=jnp.asarray([p.rounding for p in slots]),
+        radius=jnp.asarray([p.radius for p in slots]),
+        slant=jnp.asarray([p.slant for p in slots]),
     )
 
 
