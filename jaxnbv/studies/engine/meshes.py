@@ -3,7 +3,7 @@
 import dataclasses
 import os
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -54,13 +54,18 @@ def knowing_meshes(imagination: Imagination, files: Sequence[str]) -> Imaginatio
     return imagination.knowing(ShapeBank.from_meshes(files, names=names), Upright(by_axis=True))
 
 
-def knowing_others(imagination: Imagination, index: int) -> Imagination:
-    """One of `knowing_meshes` but for the mesh of a scene; any other as it is."""
+def knowing_those(imagination: Imagination, wanted: Callable[[str], bool]) -> Imagination:
+    """One that knows shapes, of these alone those whose names are wanted; any other as it is."""
     model = imagination.model
     if not isinstance(model, KnownShapes):
         return imagination
-    others = [row for row, name in enumerate(model.bank.names) if name.rpartition(" ")[2] != str(index)]
-    return dataclasses.replace(imagination, model=dataclasses.replace(model, bank=model.bank.chosen(others)))
+    rows = [row for row, name in enumerate(model.bank.names) if wanted(name)]
+    return dataclasses.replace(imagination, model=dataclasses.replace(model, bank=model.bank.chosen(rows)))
+
+
+def knowing_others(imagination: Imagination, index: int) -> Imagination:
+    """One of `knowing_meshes` but for the mesh of a scene; any other as it is."""
+    return knowing_those(imagination, lambda name: name.rpartition(" ")[2] != str(index))
 
 
 def as_mesh_files(meshes: str | Path | Sequence[str] | None) -> tuple[str, ...]:

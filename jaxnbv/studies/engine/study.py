@@ -231,6 +231,10 @@ class Study(eqx.Module):
         """Over the candidates: one of `RULES`, or the full search by the acquisition."""
         return RULES.get(method, DiscreteSearch)(self.candidates)
 
+    def imagination_of(self, scene: Scene) -> Imagination:
+        """The study's, or what is known of such a scene."""
+        return self.imagination
+
     def planner_of(
         self,
         acquisition: Acquisition,

@@ -14,7 +14,6 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, farthest_point_subsample
-from jaxnbv.imagination import Imagination
 from jaxnbv.networks import CloudSegmenter
 from jaxnbv.planning.episode import Step
 from jaxnbv.planning.planner import Planner
@@ -187,10 +186,6 @@ class PartDiscoveryStudy(Study):
             soft_count = SoftPartCount(self.segmenter_of(scene, self.num_points), target)
             acquisition = ExpectedUtilityImprovement(soft_count, self.num_points)
         return self.planner_of(acquisition, self.search(method), camera, self.imagination_of(scene))
-
-    def imagination_of(self, scene: Scene) -> Imagination:
-        """The study's, or what is known of such a scene."""
-        return self.imagination
 
     def search(self, method: str) -> Search:
         if method.startswith("gradient"):

@@ -3,7 +3,6 @@
 Objects are procedural and a network tells their parts, or they are mesh files whose nodes are parts and an oracle does.
 """
 
-import dataclasses
 import os
 from pathlib import Path
 from typing import Any, ClassVar
@@ -20,12 +19,11 @@ from jaxnbv.networks import CATEGORIES, CloudSegmenter, part_segmenter
 from jaxnbv.scanning import Grid, MeshParts, SDFSurface, load_parts, scan
 from jaxnbv.scanning.mesh_files import read_nodes
 from jaxnbv.studies.engine.measures import KNOWN, Record
-from jaxnbv.studies.engine.meshes import knowing_meshes, knowing_others, numbered
+from jaxnbv.studies.engine.meshes import knowing_meshes, knowing_others, knowing_those, numbered
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.parts.discovery import NETWORK_POINTS, TARGETS, NearestPart, PartDiscoveryStudy
 from jaxnbv.studies.readers.class_meshes import is_mesh_file, taking_turns
 from jaxnbv.studies.scenes import Split, part_scene
-from jaxnbv.surfaces import KnownShapes
 from jaxnbv.surfaces.known_shapes import kind_of
 from jaxnbv.tasks import part_counts
 
@@ -167,12 +165,7 @@ class PartStudy(PartDiscoveryStudy):
 
     def imagination_of(self, scene: Scene) -> Imagination:
         """As the network's, with the shapes of the object's category."""
-        model = self.imagination.model
-        if not isinstance(model, KnownShapes):
-            return self.imagination
-        alike = [index for index, name in enumerate(model.bank.names) if kind_of(name) == scene.name]
-        known = dataclasses.replace(model, bank=model.bank.chosen(alike))
-        return dataclasses.replace(self.imagination, model=known)
+        return knowing_those(self.imagination, lambda name: kind_of(name) == scene.name)
 
     def true_parts(self, scene: Scene, points: Float[Array, "n 3"]) -> Int[Array, " n"]:
         return scene.task.solid.label(points)
