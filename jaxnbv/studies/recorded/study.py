@@ -13,7 +13,6 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxnbv.acquisition import Acquisition, Quantity
 from jaxnbv.checks import InputError, require
-from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
@@ -47,14 +46,13 @@ _COARSE = 16
 class Recording(NamedTuple):
     """A sequence as a study sees it.
 
-    - `poses`: of the frames; `scans`: what each showed of the box; `camera`: by which rays; all in scene units.
+    - `poses`: of the frames; `scans`: what each showed of the box; both in scene units.
     - `shown`: which of the voxels that three frames or more have seen each frame shows; `voxels`: their centres, and
       `places`: of the camera, both in the recording's units.
     """
 
     poses: Pose
     scans: tuple[PointCloud, ...]
-    camera: Camera
     shown: Bool[np.ndarray, "frames voxels"]
     voxels: Float[np.ndarray, "voxels 3"]
     places: Float[np.ndarray, "frames 3"]
@@ -264,8 +262,8 @@ def _frame(box: Box) -> Frame:
 def _recording(folder: str, up: tuple[float, float, float] | None, box: Box, voxel: float) -> Recording:
     frames, frame = RecordedFrames(folder, up), _frame(box)
     poses, stride = Pose.from_matrix(frames.matrices), stride_of(frames.camera)
-    camera = frames.camera.strided(stride)
-    nowhere, none = jnp.zeros((camera.num_rays, 3)), jnp.zeros(camera.num_rays, bool)
+    count = frames.camera.strided(stride).num_rays
+    nowhere, none = jnp.zeros((count, 3)), jnp.zeros(count, bool)
     scans, seen = [], []
     for index in progress_bar(range(len(frames)), desc="reading frames"):
         # One that shows nothing of the box says nothing of it.
@@ -281,4 +279,4 @@ def _recording(folder: str, up: tuple[float, float, float] | None, box: Box, vox
     often = counts >= _SEEN_BY
     require(bool(often.any()), f"no voxel of {box} is seen by {_SEEN_BY} frames of {folder}: give another box")
     voxels, places = voxel * (found[often] + 0.5), frames.matrices[:, :3, 3]
-    return Recording(frame.to_scene(poses), tuple(scans), frame.to_scene(camera), shown[:, often], voxels, places)
+    return Recording(frame.to_scene(poses), tuple(scans), shown[:, often], voxels, places)
