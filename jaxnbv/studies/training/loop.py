@@ -15,6 +15,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 from scipy.optimize import minimize_scalar
+from scipy.special import logsumexp
 
 from jaxnbv.checks import AnyArray, InputError, require
 from jaxnbv.geometry.cloud import PointCloud
@@ -153,9 +154,7 @@ def calibrate(network: Network, clouds: PointCloud, labels: Int[AnyArray, " b"])
 
     def loss(log_factor):
         scaled = log_p * np.exp(-log_factor)
-        largest = scaled.max(axis=1, keepdims=True)
-        normaliser = largest[:, 0] + np.log(np.exp(scaled - largest).sum(axis=1))
-        return np.mean(normaliser - scaled[np.arange(len(labels)), labels])
+        return np.mean(logsumexp(scaled, axis=1) - scaled[np.arange(len(labels)), labels])
 
     best = minimize_scalar(loss, bounds=(-3.0, 3.0), method="bounded")
     old: Any = network
