@@ -216,8 +216,8 @@ class ClassificationStudy(Study):
         anywhere, poses = super().sensor(scene), self.candidates.poses()
 
         def look(pose, key):
-            index = _nearest(poses, pose)
-            return anywhere(pose, key) if index is None else scene.task.scans[index]
+            index, is_there = _nearest(poses, pose)
+            return scene.task.scans[index] if is_there else anywhere(pose, key)
 
         return look
 
@@ -271,8 +271,7 @@ class ClassificationStudy(Study):
                 surfaces = imagination.sample(evidence, sample_key, posterior)
                 rough = roughness(imagination, evidence, posterior, surfaces)
             for method, proposal in propose_together(group, evidence, surfaces, search_key).items():
-                index = _nearest(shared.poses, proposal.pose)
-                assert index is not None
+                index, _ = _nearest(shared.poses, proposal.pose)
                 shown = scene.task.pixels if self.cue else None
                 rank = None if shown is None else rank_correlation(proposal.values, shown, new)
                 own = rough if planners[method].search.uses_samples else None
@@ -285,8 +284,7 @@ class ClassificationStudy(Study):
         visited: tuple[int, ...] = (first,)
         for view in range(1, self.views):
             _, search_key, _ = view_keys(key, view)
-            index = _nearest(shared.poses, planner.choose(shared.evidence(visited), None, search_key).pose)
-            assert index is not None
+            index, _ = _nearest(shared.poses, planner.choose(shared.evidence(visited), None, search_key).pose)
             visited = (*visited, index)
         return visited
 
@@ -315,9 +313,9 @@ def _noisy(scans: PointCloud, keys: Key[Array, " candidates"]) -> PointCloud:
     return jax.vmap(SensorNoise())(scans, keys)
 
 
-def _nearest(poses: Pose, pose: Pose) -> int | None:
-    """The candidate at a pose; None for a pose of another place or direction."""
+def _nearest(poses: Pose, pose: Pose) -> tuple[int, bool]:
+    """The candidate nearest to a pose, and whether place and direction are the same."""
     away = np.linalg.norm(np.asarray(poses.position) - np.asarray(pose.position), axis=1)
     turned = np.linalg.norm(np.asarray(poses.forward) - np.asarray(pose.forward), axis=1)
     index = int(np.argmin(away))
-    return index if away[index] + turned[index] < 1e-3 else None
+    return index, bool(away[index] + turned[index] < 1e-3)
