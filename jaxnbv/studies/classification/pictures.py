@@ -1,6 +1,5 @@
 """The qualitative figure of a study of classification: what the sensor saw, view by view and method by method."""
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -40,8 +39,7 @@ def write_pictures(
 
     **Raises:** `ValueError` if there are no records, or no method that all of them hold.
     """
-    present = methods_of(records, study.methods)
-    methods = [method for method in _SHOWN if method in present] or present
+    methods = methods_of(records, study.methods, _SHOWN)
     return write_grids(first_scenes(records, scenes), folder, "views", lambda one: _views(one, study, methods, pixels))
 
 
@@ -77,5 +75,5 @@ def _image(scene: Scene, camera: Camera, pose: Pose, tinted: bool) -> Float[np.n
     facing = np.where(hit, np.sum(rays * normals, axis=-1) / np.linalg.norm(rays, axis=-1), 0.0)
     colours = np.where(on_cue[:, None], _TINTED, _PLAIN) * (0.4 + 0.65 * facing)[:, None]
     image = np.where(hit[:, None], np.clip(colours, 0.0, 1.0), _BACKGROUND)
-    side = math.isqrt(len(hit)) // 2
+    side = camera.height // 2
     return image.reshape(side, 2, side, 2, 3).mean(axis=(1, 3))

@@ -60,8 +60,9 @@ class Claim(NamedTuple):
     ahead: bool = True
 
 
-def methods_of(records: Sequence[Record], known: Sequence[str]) -> list[str]:
-    """The methods that all records hold: those of the study in its order, then others.
+def methods_of(records: Sequence[Record], known: Sequence[str], among: Sequence[str] = ()) -> list[str]:
+    """The methods that all records hold: those of the study in its order, then others; of these those `among` some
+    alone, if there are any.
 
     **Raises:** `ValueError` if there are no records, or no method that all of them hold.
     """
@@ -69,7 +70,7 @@ def methods_of(records: Sequence[Record], known: Sequence[str]) -> list[str]:
     held = dict.fromkeys([*known, *(method for record in records for method in record["methods"])])
     common = [method for method in held if all(method in record["methods"] for record in records)]
     require(len(common) > 0, f"the records have none of {', '.join(held)} in common: run the same for all scenes")
-    return common
+    return [method for method in among if method in common] or common
 
 
 def values(

@@ -42,8 +42,7 @@ def write_pictures(
 
     **Raises:** `ValueError` if there are no records, or no method that all of them hold.
     """
-    present = methods_of(records, study.methods)
-    methods = [method for method in _SHOWN if method in present] or present
+    methods = methods_of(records, study.methods, _SHOWN)
     return write_grids(first_scenes(records, scenes), folder, "heat", lambda one: _clouds(one, study, methods, pixels))
 
 

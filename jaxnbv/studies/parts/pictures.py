@@ -41,8 +41,7 @@ def write_pictures(
 
     **Raises:** `ValueError` if there are no records, or no method that all of them hold.
     """
-    present = methods_of(records, study.methods)
-    methods = [method for method in _SHOWN if method in present] or present
+    methods = methods_of(records, study.methods, _SHOWN)
     chosen: dict[str, Record] = {}
     for record in sorted(records, key=lambda record: -len(record["parts"])):
         chosen.setdefault(record["category"], record)
