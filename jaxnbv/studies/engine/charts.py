@@ -102,7 +102,9 @@ def _figure(rows: Sequence[tuple[str, Sequence[Record], Sequence[Panel]]], study
             axes.set_ylabel("" if is_repeated else unit + (f"\n{group}" if group != "all" and column == 0 else ""))
     if not shown:
         return None
-    _draw_legend(figure, [method for method in methods_of(rows[0][1], study.methods) if method in shown])
+    named = [method for method in methods_of(rows[0][1], study.methods) if method in shown]
+    handles = [Line2D([], [], label=method, **_line_of(method)) for method in named]
+    figure.legend(handles=handles, loc="outside right center", frameon=False, fontsize=9, handlelength=2.6)
     return figure
 
 
@@ -153,9 +155,3 @@ def _line_of(method: str) -> dict[str, Any]:
     line = {"color": look.colour, "ls": look.line, "lw": 2.0 if ours else 1.2}
     size = _SIZES.get(look.marker, 4.4) * (1.2 if ours else 1.0)
     return line | {"marker": look.marker, "ms": size, "markeredgecolor": "white", "mew": 0.4}
-
-
-def _draw_legend(figure: Figure, methods: Sequence[str]) -> None:
-    """The methods, at the right of a figure."""
-    handles = [Line2D([], [], label=method, **_line_of(method)) for method in methods]
-    figure.legend(handles=handles, loc="outside right center", frameon=False, fontsize=9, handlelength=2.6)

@@ -42,14 +42,9 @@ class RecordFolder(ResultFolder):
 
         **Raises:** `ValueError` for a record that is damaged, and if another process writes in the folder.
         """
-        records = {}
         with self.writing():
-            missing = []
-            for index in scenes:
-                if self._file(index).exists():
-                    records[index] = _read(self._file(index), index)
-                else:
-                    missing.append(index)
+            records = {index: _read(self._file(index), index) for index in scenes if self._file(index).exists()}
+            missing = [index for index in scenes if index not in records]
             bar = progress_bar(None, progress, True, total=len(scenes), initial=len(records), desc=self.path.name)
             with bar, closing(self.runner.outcomes(run, missing)) as outcomes:
                 for index, outcome in outcomes:
