@@ -1,10 +1,10 @@
 """What studies of classification measure: hits by view, what views have shown, and how good the samples were.
 
 A hit is when a sequence of views first gives the right class, gives it for good, or first shows its cue. Views count
-from 1. A sequence that never does has no such time: None.
+from 1.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer
@@ -28,8 +28,8 @@ def seen_explained(cue: str) -> str:
 
 def hits(cue: str = "") -> tuple[Measure, ...]:
     """First and stable hit; and whether a view has shown the cue of the class, where that is a part of the object."""
-    first = Measure("first", "First hit", _hit(first_hit), percent=True)
-    stable = Measure("stable", "Stable hit", _hit(stable_hit), percent=True)
+    first = Measure("first", "First hit", _hit(first_hits), percent=True)
+    stable = Measure("stable", "Stable hit", _hit(stable_hits), percent=True)
     seen = Measure(cue, f"{cue.capitalize()} seen", _seen(cue), percent=True)
     return (first, stable, seen) if cue else (first, stable)
 
@@ -52,16 +52,16 @@ def charts_of(cue: str = "", by_group: str = "") -> dict[str, Chart]:
     return {"hits": Chart(shown), **groups, "diagnostics": Chart(diagnostics)}
 
 
-def _hit(time_of: Callable) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
+def _hit(by_view: Callable) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
     """The share of a method's runs that have hit, by view: for all but random search that of one run, 0 or 1."""
 
     def of(record: Record, method: str) -> Float[np.ndarray, " views"]:
         held = record["methods"][method]
-        correct = [np.argmax(run["log_p"], axis=1) == record["label"] for run in held["runs"]]
-        share = cumulative_share([time_of(run) for run in correct], len(correct[0]))
-        if method == "random" and time_of is first_hit and len(share) >= 2:
+        correct = np.array([np.argmax(run["log_p"], axis=1) == record["label"] for run in held["runs"]])
+        share = by_view(correct).mean(axis=0)
+        if method == "random" and by_view is first_hits and len(share) >= 2:
             # Exact by view 2; all runs have the first view in common.
-            share[1] = 1.0 if correct[0][0] else held["hit"]
+            share[1] = 1.0 if correct[0, 0] else held["hit"]
         return share
 
     return of
@@ -72,10 +72,9 @@ def _seen(cue: str) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
 
     def of(record: Record, method: str) -> Float[np.ndarray, " views"]:
         runs, pixels = record["methods"][method]["runs"], f"{cue}_pixels"
-        views = len(runs[0]["log_p"])
         if method == "random":
-            return random_seen_share(np.array(record[pixels]), record["first"], views)
-        return cumulative_share([seen_view(np.array(run[pixels])) for run in runs], views)
+            return random_seen_share(np.array(record[pixels]), record["first"], len(runs[0]["log_p"]))
+        return first_hits(np.array([run[pixels] for run in runs]) >= CUE_PIXELS).mean(axis=0)
 
     return of
 
@@ -92,37 +91,17 @@ def _diagnostic(quantity: str) -> Callable[[Record, str], list[float | None]]:
     return of
 
 
-def first_hit(correct: Bool[AnyArray, " views"]) -> int | None:
-    """The earliest view with a correct prediction, the paper's T_first."""
-    hits = np.flatnonzero(correct)
-    return int(hits[0]) + 1 if hits.size else None
+def first_hits(correct: Bool[np.ndarray, "runs views"]) -> Bool[np.ndarray, "runs views"]:
+    """Whether a prediction was correct by each view: from the paper's T_first on."""
+    return np.logical_or.accumulate(correct, axis=1)
 
 
-def stable_hit(correct: Bool[AnyArray, " views"]) -> int | None:
-    """The earliest view from which on the prediction stays correct to the end, the paper's T_stable."""
-    misses = np.flatnonzero(~np.asarray(correct))
-    view = int(misses[-1]) + 2 if misses.size else 1
-    return view if view <= len(correct) else None
+def stable_hits(correct: Bool[np.ndarray, "runs views"]) -> Bool[np.ndarray, "runs views"]:
+    """Whether predictions are correct from each view to the end: from the paper's T_stable on."""
+    return np.logical_and.accumulate(correct[:, ::-1], axis=1)[:, ::-1]
 
 
-def seen_view(pixels: Integer[AnyArray, " views"], threshold: int = CUE_PIXELS) -> int | None:
-    """The first view in which at least `threshold` rays hit the cue of the class; views do not add up."""
-    return first_hit(np.asarray(pixels) >= threshold)
-
-
-def cumulative_share(times: Sequence[int | None], views: int) -> Float[np.ndarray, " views"]:
-    """Share of the sequences whose time is at most 1, 2, ..., `views`; one that never hits counts in the whole.
-
-    **Raises:** `ValueError` if there are no times.
-    """
-    require(len(times) > 0, "a share of no sequences is not defined: give at least one time")
-    by_view = np.array([np.inf if time is None else time for time in times])
-    return np.mean(by_view[:, None] <= np.arange(1, views + 1), axis=0)
-
-
-def random_seen_share(
-    pixels: Integer[AnyArray, " candidates"], first: int, views: int, threshold: int = CUE_PIXELS
-) -> Float[np.ndarray, " views"]:
+def random_seen_share(pixels: Integer[AnyArray, " candidates"], first: int, views: int) -> Float[np.ndarray, " views"]:
     """Exact probability that a random search has shown the cue of the class by view 1, 2, ..., `views`.
 
     After the first camera it takes the other N candidates in an order drawn uniformly without replacement. Of these M
@@ -134,7 +113,7 @@ def random_seen_share(
 
     **Raises:** `ValueError` if there is no such candidate, or there are more views than candidates.
     """
-    shows = np.asarray(pixels) >= threshold
+    shows = np.asarray(pixels) >= CUE_PIXELS
     require(0 <= first < len(shows), f"the first camera is candidate {first} of {len(shows)}; count from 0")
     require(1 <= views <= len(shows), f"{views} views of {len(shows)} candidates: each is taken at most once")
     if shows[first]:
