@@ -16,7 +16,7 @@ from jaxnbv.storage.files import make_folder, write_text
 from jaxnbv.storage.folders import read_record
 from jaxnbv.studies.engine.charts import write_charts
 from jaxnbv.studies.engine.measures import UNKNOWING, Claim, Record
-from jaxnbv.studies.engine.records import read_records
+from jaxnbv.studies.engine.records import RecordFolder, read_records
 from jaxnbv.studies.engine.results import LEVEL, results
 from jaxnbv.studies.engine.study import Study
 from jaxnbv.studies.engine.tables import count_of, difference_text, tables_of
@@ -97,7 +97,7 @@ def chapters(folder: str | Path) -> list[Chapter]:
     found: dict[tuple[int, Path], Chapter] = {}
     for file in sorted(folder.rglob("study.json")):
         if any(file.parent.glob("scene_*.json")):
-            written = read_record(file, "is not a study's record", _REMEDY)
+            written = read_record(file, RecordFolder.problem, _REMEDY)
             study = written["config"].get("study")
             name = study.get("type") if isinstance(study, dict) else study
             if not isinstance(name, str) or name not in kinds:
