@@ -251,23 +251,21 @@ class _ColdestWords(Words):
 class CoverageAnswer(Answer):
     """How much of the surface was seen: a share of the true one or, where that is not known, the area of what was."""
 
+    is_share: bool = True
+
     @classmethod
     def of_share(cls, share: float) -> "CoverageAnswer":
-        return cls(("of the surface seen",), np.array([share]), "{:.0%}")
+        return cls(("of the surface seen",), np.array([share]))
 
     @classmethod
     def of_area(cls, area: float) -> "CoverageAnswer":
         """In squared scene units."""
-        return cls(("of surface seen",), np.array([area]), "{:.3g} scene units²")
+        return cls(("of surface seen",), np.array([area]), is_share=False)
 
     @property
-    def is_share(self) -> bool:
-        return self.form.endswith("%}")
-
-    @property
-    def label(self) -> str:
-        """For an axis of `scaled` values."""
-        return "surface seen (%)" if self.is_share else "surface seen (scene units²)"
+    def unit(self) -> str:
+        """Of `scaled`."""
+        return "%" if self.is_share else "scene units²"
 
     @property
     def scaled(self) -> float:
@@ -275,9 +273,14 @@ class CoverageAnswer(Answer):
         return float(self.values[0]) * (100.0 if self.is_share else 1.0)
 
     @property
+    def label(self) -> str:
+        """For an axis of `scaled` values."""
+        return f"surface seen ({self.unit})"
+
+    @property
     def amount(self) -> str:
         """In words."""
-        return f"{self.figure} %" if self.is_share else f"{self.figure} scene units²"
+        return f"{self.figure} {self.unit}"
 
     @property
     def figure(self) -> str:
@@ -292,7 +295,7 @@ class _CoverageWords(Words):
 
     @property
     def found(self) -> str:
-        return f"{self._value(self.answer, 0)} {self.answer.names[0]}"
+        return f"{self.answer.amount} {self.answer.names[0]}"
 
     def panels(self, truth: Answer | None) -> tuple[Panel, ...]:
         goal = 100.0 if self.answer.is_share else None

@@ -31,7 +31,6 @@ class ViewData(eqx.Module):
       where it has none within the grid.
     - `choice`: None for a view that was given.
     - `seen`: how much of the surface was seen.
-    - `count`: points of the cloud after this view.
     - `told`: what happened, in words.
     - `imagined`: what was imagined before it was taken; None for a view that was given.
     - `look`: the scan itself; None where it is no image.
@@ -45,7 +44,6 @@ class ViewData(eqx.Module):
     surface: MeanSurface | None
     choice: Choice | None
     seen: CoverageAnswer
-    count: int
     told: Told
     imagined: Imagined | None = None
     look: Look | None = None
@@ -123,7 +121,6 @@ def report_data(
                 surface=next_one.surface,
                 choice=choice,
                 seen=seen[index],
-                count=int(view.cloud.count),
                 told=_told(episode, index, choice, task, seen),
                 imagined=None if leading is None else leading.imagined,
                 look=taken_look(view, before),

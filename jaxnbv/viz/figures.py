@@ -26,7 +26,7 @@ from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.imagined_figures import imagined_figure
 from jaxnbv.viz.layout import fitted, flow, width_of
 from jaxnbv.viz.render import Still, draw_scene
-from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, round_range, spaced_ticks
+from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, middle_range, spaced_ticks
 from jaxnbv.viz.task_figures import chart_figure, draw_coverage, draw_values, task_charts
 from jaxnbv.viz.trajectory_figures import draw_ascents, trajectory_figure
 
@@ -54,11 +54,9 @@ DEVIATION_LABEL = "standard deviation of the surface (scene units)"
 
 
 def deviation_range(data: ReportData) -> tuple[float, float]:
-    """One range of standard deviations for all views, in round numbers: it leaves out a fiftieth at either end."""
+    """One range of standard deviations for all views."""
     all_views = [view.surface.deviation for view in data.views if view.surface is not None]
-    if not all_views:
-        return 1e-3, 1.0
-    return round_range(*np.percentile(np.concatenate(all_views), [2.0, 98.0]).tolist())
+    return middle_range(np.concatenate(all_views)) if all_views else (1e-3, 1.0)
 
 
 class Stills:
@@ -179,7 +177,7 @@ def _deviation_bar(figure: Figure, place: tuple[float, float, float, float], nor
 def draw_candidates(axes: Axes, choice: Choice) -> None:
     """Draw the values of the open candidates, the best on top, with their standard errors, over a colour bar of the
     same range."""
-    order = np.argsort(-np.where(choice.visited, -np.inf, choice.values))[: len(choice.open_values)]
+    order = np.argsort(-choice.values)[: len(choice.open_values)]
     values, rows = choice.values[order], -np.arange(len(order))
     if choice.errors is not None:
         axes.hlines(rows, values - choice.errors[order], values + choice.errors[order], color=GREY, lw=0.6, zorder=1)

@@ -5,11 +5,10 @@ import threading
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import trimesh
 from jaxtyping import Float, UInt8
-from matplotlib.colors import Colormap, to_rgb
+from matplotlib.colors import Colormap, LogNorm, Normalize, to_rgb
 from scipy.spatial.transform import Rotation
 
 from jaxnbv.acquisition import Quantity
@@ -26,9 +25,10 @@ from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
 from jaxnbv.surfaces import KnownShapesPosterior, SurfacePosterior
 from jaxnbv.viz.answers import may_be_words, shown_value, words_of
+from jaxnbv.viz.choice import colour_range, open_values
 from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
 from jaxnbv.viz.render import depth_picture, depth_range
-from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, VALUE, colour_scale, round_range
+from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, VALUE, colour_scale, middle_range
 from jaxnbv.viz.task import seen_after
 
 _SAMPLES = 4
@@ -167,7 +167,7 @@ def _points(scene: Any, episode: Episode) -> list[Any]:
     new, _ = episode.views[-1].scan.to_numpy()
     before = episode.views[-2].cloud.to_numpy()[0] if len(episode.views) > 1 else new[:0]
     return [
-        scene.add_point_cloud(f"/points/{name}", points, _rgb(colour), point_size=_POINT, point_shape="circle")
+        scene.add_point_cloud(f"/points/{name}", points, to_rgb(colour), point_size=_POINT, point_shape="circle")
         for name, points, colour in (("before", before, BEFORE), ("new", new, NEW))
         if len(points)
     ]
@@ -186,17 +186,13 @@ def _cameras(scene: Any, episode: Episode) -> list[Any]:
 def _mean(scene: Any, surface: MeanSurface | None, guesses: MeanSurface | None) -> list[Any]:
     found = []
     if surface is not None:
-        share = mpl.colors.LogNorm(*_deviations(surface), clip=True)(surface.deviation)
-        mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=_colours(DEVIATION, share), process=False)
+        colours = DEVIATION(LogNorm(*middle_range(surface.deviation))(surface.deviation), bytes=True)
+        mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=colours, process=False)
         found.append(scene.add_mesh_trimesh("/surface of the mean", mesh))
     if guesses is not None:
-        settings: dict[str, Any] = {"color": _rgb(GREY), "opacity": 0.35, "visible": False}
+        settings: dict[str, Any] = {"color": to_rgb(GREY), "opacity": 0.35, "visible": False}
         found.append(scene.add_mesh_simple("/guesses apart from it", guesses.vertices, guesses.faces, **settings))
     return found
-
-
-def _deviations(surface: MeanSurface) -> tuple[float, float]:
-    return round_range(*np.percentile(surface.deviation, [2.0, 98.0]).tolist())
 
 
 def _imagined(
@@ -210,24 +206,19 @@ def _imagined(
     found = []
     for number, (one, shape) in enumerate(zip(values, shapes, strict=False), start=1):
         if (triangles := level_triangles(one, imagination.grid)) is not None:
-            settings: dict[str, Any] = {"color": _rgb("#8fb8d8"), "opacity": 0.9, "visible": False}
+            settings: dict[str, Any] = {"color": to_rgb("#8fb8d8"), "opacity": 0.9, "visible": False}
             found.append(scene.add_mesh_simple(f"/imagined/{number}{shape}", *triangles[:2], **settings))
     return found
 
 
 def _choice(scene: Any, camera: Camera, proposal: Proposal, picture: np.ndarray | None) -> list[Any]:
-    values, places = _open_candidates(proposal)
-    found = []
-    if len(values):
-        colours = _colours(VALUE, (values - values.min()) / max(float(np.ptp(values)), 1e-12))[:, :3]
+    values, found = open_values(proposal), []
+    is_open = np.isfinite(values)
+    if is_open.any():
+        places = np.asarray(proposal.candidates.position)[is_open]
+        colours = VALUE(Normalize(*colour_range(values))(values[is_open]), bytes=True)[:, :3]
         found.append(scene.add_point_cloud("/candidates", places, colours, point_size=_CANDIDATE, point_shape="circle"))
     return [*found, _frustum(scene, "/next view", camera, proposal.pose, _NEXT, picture)]
-
-
-def _open_candidates(proposal: Proposal) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Values and positions of the candidates that may be taken."""
-    values = np.asarray(proposal.values, np.float64)
-    return values[np.isfinite(values)], np.asarray(proposal.candidates.position)[np.isfinite(values)]
 
 
 def _legend(surface: MeanSurface | None, proposal: Proposal | None, sought: Quantity) -> str:
@@ -236,10 +227,10 @@ def _legend(surface: MeanSurface | None, proposal: Proposal | None, sought: Quan
     marks += [] if proposal is None else [("next view", _NEXT)]
     rows = [f'<div><b style="color:{colour}">&#9679;</b> {name}</div>' for name, colour in marks]
     if surface is not None:
-        low, high = _deviations(surface)
+        low, high = middle_range(surface.deviation)
         rows.append(_bar("the surface is known to, in scene units", DEVIATION, f"{low:g}", f"{high:g}"))
-    if proposal is not None and len(values := _open_candidates(proposal)[0]):
-        ends = (shown_value(sought, float(value)) for value in (values.min(), values.max()))
+    if proposal is not None and np.isfinite(proposal.values).any():
+        ends = (shown_value(sought, value) for value in colour_range(open_values(proposal)))
         rows.append(_bar(f"candidates: {sought.name}", VALUE, *ends))
     return f'<div style="padding:0 1em 1em;font-size:.85em">{"".join(rows)}</div>'
 
@@ -262,17 +253,8 @@ def _frustum(
         fov=camera.fov,
         aspect=(right - left) / (below - above),
         scale=_FRUSTUM,
-        color=_rgb(colour),
+        color=to_rgb(colour),
         image=picture,
         wxyz=Rotation.from_matrix(np.asarray(pose.rotation, np.float64)).as_quat(scalar_first=True),
         position=np.asarray(pose.position, np.float64),
     )
-
-
-def _colours(scale: Colormap, share: np.ndarray) -> UInt8[np.ndarray, "*n 4"]:
-    return np.round(255.0 * np.asarray(scale(np.asarray(share)))).astype(np.uint8)
-
-
-def _rgb(colour: str) -> tuple[int, int, int]:
-    red, green, blue = (round(255 * share) for share in to_rgb(colour))
-    return red, green, blue

@@ -4,9 +4,9 @@ import base64
 import io
 import math
 
-import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+from matplotlib.colors import Normalize
 from PIL import Image
 
 from jaxnbv.acquisition import Quantity
@@ -165,28 +165,29 @@ def _in_steps(values: Float[np.ndarray, "*n"], steps: int) -> tuple[float, float
 
 
 def _choice(choice: Choice, quantity: Quantity) -> dict:
-    low, high = choice.range
-    errors = None
-    if choice.errors is not None:
-        errors = [float(f"{error:.4g}") if math.isfinite(error) else None for error in choice.errors.tolist()]
-    order = np.argsort(-np.where(choice.visited, -np.inf, choice.values), kind="stable")
-    ranks = np.empty(len(order), dtype=int)
-    ranks[order] = np.arange(1, len(order) + 1)
+    errors = None if choice.errors is None else [_number(float(f"{error:.4g}")) for error in choice.errors.tolist()]
+    # NaN comes last.
+    order = np.argsort(-choice.values, kind="stable")
     return {
         "places": sphere.mollweide(choice.directions).round(3).tolist(),
         "directions": choice.directions.round(2).tolist(),
-        "values": [None if math.isnan(value) else value for value in choice.values.tolist()],
+        "values": [_number(value) for value in choice.values.tolist()],
         "errors": errors,
         "tied": [] if choice.tied is None or not choice.rings_tied else np.flatnonzero(choice.tied).tolist(),
-        "ranks": ranks.tolist(),
+        "ranks": (1 + np.argsort(order)).tolist(),
         "chosen": sphere.mollweide(choice.chosen[None]).round(4)[0].tolist(),
         "value": choice.value,
-        "error": None if choice.error is None or math.isnan(choice.error) else choice.error,
-        "range": [low, high],
-        "image": _map_image(choice, low, high) if choice.makes_a_map(quantity) else None,
+        "error": None if choice.error is None else _number(choice.error),
+        "range": list(choice.range),
+        "image": _map_image(choice) if choice.makes_a_map(quantity) else None,
         "ascents": None if choice.ascents is None else _on_map(choice.ascents),
         "caption": _map_caption(choice),
     }
+
+
+def _number(value: float) -> float | None:
+    """JSON has no NaN."""
+    return value if math.isfinite(value) else None
 
 
 def _map_caption(choice: Choice) -> str:
@@ -231,9 +232,7 @@ def _spatial(ascents: Ascents, camera: Camera) -> dict:
     }
 
 
-def _map_image(choice: Choice, low: float, high: float) -> str:
-    """The smooth map, coloured as the candidates are; clear outside the rim."""
+def _map_image(choice: Choice) -> str:
+    """The smooth map, coloured as the candidates are; clear outside the rim, where it is NaN."""
     values = sphere.smooth_map(choice.map.directions, choice.map.values)
-    colours = VALUE(mpl.colors.Normalize(low, high)(np.nan_to_num(values)), bytes=True)
-    colours[..., 3] = np.where(np.isnan(values), 0, 255)
-    return picture_address(colours)
+    return picture_address(VALUE(Normalize(*choice.range)(values), bytes=True))

@@ -22,9 +22,14 @@ VALUE = LinearSegmentedColormap.from_list("value", mpl.colormaps["BuPu"](np.lins
 VALUE_LINES = LinearSegmentedColormap.from_list("value lines", mpl.colormaps["BuPu"](np.linspace(0.35, 1.0, 256)))
 
 
-def colour_scale(colours: Colormap, steps: int = 32) -> list[list]:
+def colour_scale(colours: Colormap) -> list[list]:
     """A colour map as plotly writes one."""
-    return [[t, mpl.colors.to_hex(colours(t))] for t in np.linspace(0.0, 1.0, steps).tolist()]
+    return [[t, mpl.colors.to_hex(colours(t))] for t in np.linspace(0.0, 1.0, 32).tolist()]
+
+
+def middle_range(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """The range of some positive values in round numbers; it leaves out a fiftieth of them at either end."""
+    return round_range(*np.percentile(values, [2.0, 98.0]).tolist())
 
 
 def round_range(low: float, high: float) -> tuple[float, float]:
