@@ -8,7 +8,6 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
@@ -24,10 +23,10 @@ from jaxnbv.viz.answers import label_of, number
 from jaxnbv.viz.choice import Choice
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.imagined_figures import imagined_figure
-from jaxnbv.viz.layout import fitted, flow, width_of
+from jaxnbv.viz.layout import fitted, flow, pixels_of, width_of
 from jaxnbv.viz.render import Still, draw_scene
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, LINE, NEW, VALUE, middle_range, spaced_ticks
-from jaxnbv.viz.task_figures import chart_figure, draw_coverage, draw_values, task_charts
+from jaxnbv.viz.task_figures import chart_figure, progress_charts, task_charts
 from jaxnbv.viz.trajectory_figures import draw_ascents, trajectory_figure
 
 STYLE: dict[Any, Any] = {
@@ -86,12 +85,8 @@ def figures_of(data: ReportData, camera: Camera, stills: Stills) -> dict[str, Ca
             drawings[f"view_{view.number:02d}_imagined"] = partial(imagined_figure, data, index)
         if view.spatial_ascents is not None:
             drawings[f"view_{view.number:02d}_trajectories"] = partial(trajectory_figure, data, index, camera)
-    progress: list[tuple[str, Any]] = [
-        (data.views[0].seen.label, partial(draw_coverage, data=data)),
-        (label_of(data.quantity), partial(draw_values, data=data)),
-    ]
     drawings["task"] = partial(chart_figure, task_charts(data))
-    drawings["coverage"] = partial(chart_figure, progress)
+    drawings["coverage"] = partial(chart_figure, progress_charts(data))
     drawings["overview"] = partial(overview_figure, data, camera, stills)
     return drawings
 
@@ -113,10 +108,7 @@ def write_figures(
 
 
 def _save(figure: Figure, path: Path, dpi: int, few_colours: bool = False) -> None:
-    canvas = FigureCanvasAgg(figure)
-    figure.set_dpi(dpi)
-    canvas.draw()
-    image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    image = Image.fromarray(pixels_of(figure, dpi)).convert("RGB")
     if few_colours:
         # A third of the size; dithered, so that the colour bars stay smooth.
         image = image.quantize(palette=image.quantize(256), dither=Image.Dither.FLOYDSTEINBERG)

@@ -19,6 +19,7 @@ from jaxnbv.scanning import Evidence, GridSurface, TriangleMesh, mean_depth, sca
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.surfaces import KnownShapesPosterior, SurfacePosterior
+from jaxnbv.viz.sphere import unit
 
 SHOWN = 4
 _PIXELS = 96
@@ -142,19 +143,22 @@ def taken_look(view: View, cloud: Float[np.ndarray, "n 3"]) -> Look | None:
 
 def look(seen: PointCloud, camera: Camera, pose: Pose, cloud: Float[np.ndarray, "n 3"]) -> Look:
     """The image that a scan is, row by row; `cloud`: what had been seen before it."""
-    right, down, forward = np.asarray(pose.rotation, np.float64).T
     points, normals = (np.asarray(rows, np.float64) for rows in (seen.points, seen.normals))
     mask = np.asarray(seen.mask)
-    depth = np.where(mask, (points - np.asarray(pose.position, np.float64)) @ forward, np.nan)
-    lamp = -forward - 0.5 * right - 0.7 * down
-    lit = np.clip(0.35 + 0.65 * normals @ (lamp / np.linalg.norm(lamp)), 0.0, 1.0)
-    known = np.zeros_like(mask)
-    if len(cloud):
-        tree = cKDTree(cloud)
-        spacing = np.median(tree.query(cloud, k=2)[0][:, 1]) if len(cloud) > 1 else 0.0
-        known = mask & (tree.query(points)[0] < max(_SEEN, _SPACINGS * spacing))
+    away = points - np.asarray(pose.position, np.float64)
+    depth = np.where(mask, away @ np.asarray(pose.forward, np.float64), np.nan)
+    lit = np.clip(0.35 + 0.65 * normals @ lamp(pose), 0.0, 1.0)
+    tree = cKDTree(cloud)
+    spacing = np.median(tree.query(cloud, k=2)[0][:, 1]) if len(cloud) > 1 else 0.0
+    known = mask & (tree.query(points)[0] < max(_SEEN, _SPACINGS * spacing))
     shape = camera.height, camera.width
     return Look(mask.reshape(shape), depth.reshape(shape), lit.reshape(shape), known.reshape(shape))
+
+
+def lamp(pose: Pose) -> Float[np.ndarray, "3"]:
+    """The direction to a lamp beside a camera, a unit vector."""
+    right, down, forward = np.asarray(pose.rotation, np.float64).T
+    return unit(-forward - 0.5 * right - 0.7 * down)
 
 
 def _finer(camera: Camera) -> Camera:

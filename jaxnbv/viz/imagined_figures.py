@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from jaxnbv.viz.answers import number
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.imagined import Expected, Imagined
-from jaxnbv.viz.layout import fitted
+from jaxnbv.viz.layout import fitted, framed
 from jaxnbv.viz.render import depth_picture, depth_range, look_picture
 from jaxnbv.viz.style import GREY, NEW
 
@@ -84,8 +84,6 @@ def imagined_figure(data: ReportData, index: int) -> Figure:
             x, y = _GAP + column * (_TILE + _GAP), top - 0.16 - _TILE
             axes = figure.add_axes((*share(x, y), *share(_TILE, _TILE)))
             axes.imshow(tile.picture, interpolation="nearest")
-            axes.set(xticks=[], yticks=[])
-            for side in axes.spines.values():
-                side.set(visible=True, color=GREY, linewidth=0.6)
+            framed(axes, GREY, 0.6)
             fitted(figure, *share(x, y - 0.13), tile.name, _TILE / width, 8.0, va="center")
     return figure

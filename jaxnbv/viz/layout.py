@@ -1,7 +1,10 @@
-"""Letters that neither collide nor leave the picture: they are measured before they are placed."""
+"""Letters that neither collide nor leave the picture: they are measured before they are placed. Frames, pixels."""
 
 from collections.abc import Iterable
 
+import numpy as np
+from jaxtyping import UInt8
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
@@ -9,10 +12,24 @@ from matplotlib.text import Text
 _SMALLEST = 5.0
 
 
+def framed(axes: Axes, colour: str, width: float) -> None:
+    """A picture without ticks, in a frame."""
+    axes.set(xticks=[], yticks=[])
+    for spine in axes.spines.values():
+        spine.set(visible=True, color=colour, linewidth=width)
+
+
+def pixels_of(figure: Figure, dpi: int) -> UInt8[np.ndarray, "h w 4"]:
+    """A figure as an image, drawn at so many dots per inch."""
+    canvas = FigureCanvasAgg(figure)
+    figure.set_dpi(dpi)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())
+
+
 def width_of(text: Text, figure: Figure) -> float:
     """Of a text, as a share of the figure's width."""
-    canvas = FigureCanvasAgg(figure)
-    return float(text.get_window_extent(canvas.get_renderer()).width / figure.bbox.width)
+    return float(text.get_window_extent(FigureCanvasAgg(figure).get_renderer()).width / figure.bbox.width)
 
 
 def fitted(figure: Figure, x: float, y: float, text: str, width: float, fontsize: float, **style) -> Text:

@@ -37,9 +37,7 @@ def from_mollweide(places: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, 
     t = np.arcsin(np.clip(y / HEIGHT, -1.0, 1.0))
     longitude = np.pi * x / (WIDTH * np.maximum(np.cos(t), 1e-9))
     sine = np.clip((2.0 * t + np.sin(2.0 * t)) / np.pi, -1.0, 1.0)
-    ring = np.sqrt(1.0 - sine**2)
-    inside = (x / WIDTH) ** 2 + (y / HEIGHT) ** 2 <= 1.0
-    return np.stack([ring * np.sin(longitude), sine, ring * np.cos(longitude)], axis=1), inside
+    return _directions(longitude, np.arcsin(sine)), (x / WIDTH) ** 2 + (y / HEIGHT) ** 2 <= 1.0
 
 
 def smooth_map(

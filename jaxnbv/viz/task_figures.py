@@ -151,13 +151,21 @@ def task_charts(data: ReportData) -> list[tuple[str, Any]]:
     ]
 
 
+def progress_charts(data: ReportData) -> list[tuple[str, Any]]:
+    """The charts of how much was seen, and of what the chosen views were worth."""
+    return [
+        (data.views[0].seen.label, partial(draw_coverage, data=data)),
+        (label_of(data.quantity), partial(draw_values, data=data)),
+    ]
+
+
 def other_charts(data: ReportData) -> list[tuple[str, Any]]:
-    """The other charts: of progress, where that is not the task, and of the chosen views."""
-    charts: list[tuple[str, Any]] = []
-    if not data.task.is_coverage:
-        charts.append((data.views[0].seen.label, partial(draw_coverage, data=data)))
+    """Those of `progress_charts` that say more than the charts of the task: how much was seen, where that is not the
+    task, and the values, where views were chosen."""
+    seen, values = progress_charts(data)
+    charts = [] if data.task.is_coverage else [seen]
     if any(view.choice is not None for view in data.views):
-        charts.append((label_of(data.quantity), partial(draw_values, data=data)))
+        charts.append(values)
     return charts
 
 

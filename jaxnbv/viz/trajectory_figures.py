@@ -60,7 +60,9 @@ def trajectory_figure(data: ReportData, index: int, camera: Camera) -> Figure:
     still = Still(data.stage.eye, known.surface, 900, extent)
     still.paint(None)
     axes.imshow(still.image, interpolation="bilinear", zorder=1)
-    shown = [draw_points(axes, still, view.before, BEFORE, 0.7), still.surface_pixels]
+    shown = [draw_points(axes, still, view.before, BEFORE, 0.7)]
+    if known.surface is not None:
+        shown.append(still.project(known.surface.vertices)[0])
     colours = ScalarMappable(Normalize(*colour_range(ascents.values)), VALUE_LINES)
     for start, values in enumerate(ascents.values):
         ways = np.stack([positions[start, :-1], positions[start, 1:]], axis=1)

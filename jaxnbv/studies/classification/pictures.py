@@ -16,8 +16,9 @@ from jaxnbv.scanning import scan
 from jaxnbv.studies.classification.measures import CUE_PIXELS
 from jaxnbv.studies.classification.study import ClassificationStudy
 from jaxnbv.studies.engine.measures import Record, methods_of
-from jaxnbv.studies.engine.pictures import Grid, first_scenes, framed, write_grids
+from jaxnbv.studies.engine.pictures import Grid, first_scenes, write_grids
 from jaxnbv.studies.engine.study import Scene
+from jaxnbv.viz.layout import framed
 from jaxnbv.viz.style import GREY, NEW
 
 _SHOWN = ("cross-entropy", "farthest", "uncertainty")

@@ -20,6 +20,7 @@ from jaxnbv.scanning import TriangleMesh
 from jaxnbv.storage.files import make_folder
 from jaxnbv.studies.engine.measures import Record
 from jaxnbv.viz.figures import STYLE
+from jaxnbv.viz.layout import framed
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.render import Still
 from jaxnbv.viz.style import LINE, save_figure
@@ -73,7 +74,7 @@ def _drawn(grid: Grid) -> Figure:
     tiles = figure.subplots(tall, wide, squeeze=False)
     for row, line in enumerate(tiles):
         for column, axes in enumerate(line):
-            framed(axes)
+            framed(axes, LINE, 0.8)
             grid.draw(axes, row, column)
             if row == 0:
                 axes.set_title(grid.columns[column], fontsize=9, loc="center", pad=4)
@@ -89,13 +90,6 @@ def _drawn(grid: Grid) -> Figure:
         bar.ax.tick_params(labelsize=7, length=2)
         bar.outline.set_visible(False)
     return figure
-
-
-def framed(axes: Axes, colour: str = LINE, width: float = 0.8) -> None:
-    """A tile without ticks, in a frame."""
-    axes.set(xticks=[], yticks=[])
-    for spine in axes.spines.values():
-        spine.set(visible=True, color=colour, linewidth=width)
 
 
 def still_of(

@@ -15,8 +15,9 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.scanning.metrics import true_mesh
 from jaxnbv.studies.engine.measures import Record, methods_of
-from jaxnbv.studies.engine.pictures import Grid, draw_on, framed, places, shows_from, still_of, write_grids
+from jaxnbv.studies.engine.pictures import Grid, draw_on, places, shows_from, still_of, write_grids
 from jaxnbv.studies.parts.discovery import TARGET, PartDiscoveryStudy
+from jaxnbv.viz.layout import framed
 from jaxnbv.viz.style import GREY
 
 _SHOWN = ("discrete", "gradient-2dof", "farthest", "uncertainty")
