@@ -28,7 +28,7 @@ from jaxnbv.viz.answers import may_be_words, shown_value, words_of
 from jaxnbv.viz.choice import colour_range, open_values
 from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
 from jaxnbv.viz.render import depth_picture, depth_range
-from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, VALUE, colour_scale, middle_range
+from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, VALUE, gradient, middle_range
 from jaxnbv.viz.task import seen_after
 
 _SAMPLES = 4
@@ -236,10 +236,9 @@ def _legend(surface: MeanSurface | None, proposal: Proposal | None, sought: Quan
 
 
 def _bar(name: str, colours: Colormap, low: str, high: str) -> str:
-    steps = ",".join(f"{colour} {100 * at:.0f}%" for at, colour in colour_scale(colours))
     return (
         f'<div style="margin-top:.5em">{name}</div>'
-        f'<div style="height:.7em;background:linear-gradient(90deg,{steps})"></div>'
+        f'<div style="height:.7em;background:{gradient(colours)}"></div>'
         f'<div style="display:flex;justify-content:space-between"><span>{low}</span><span>{high}</span></div>'
     )
 

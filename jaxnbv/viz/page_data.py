@@ -46,8 +46,6 @@ _TICK_GAP = 0.14
 
 def payload(data: ReportData) -> dict:
     """All but the scene in space."""
-    low, high = deviation_range(data)
-    ticks = spaced_ticks(low, high, _TICK_GAP)
     return {
         "views": [
             {
@@ -58,9 +56,7 @@ def payload(data: ReportData) -> dict:
             for view in data.views
         ],
         "deviation": {
-            "range": [math.log10(low), math.log10(high)],
-            "ticks": np.log10(ticks).tolist(),
-            "labels": [f"{tick:g}" for tick in ticks.tolist()],
+            "range": np.log10(deviation_range(data)).tolist(),
             "colours": colour_scale(DEVIATION),
         },
         "value": {"colours": colour_scale(VALUE), "lines": colour_scale(VALUE_LINES)},
@@ -71,6 +67,14 @@ def payload(data: ReportData) -> dict:
         },
         "style": {"ink": INK, "grey": GREY, "line": LINE, "before": BEFORE, "new": NEW},
     }
+
+
+def deviation_ticks(data: ReportData) -> list[tuple[float, str]]:
+    """The numbers under the bar of deviations, and where they stand, in percent of its width."""
+    low, high = deviation_range(data)
+    ticks = spaced_ticks(low, high, _TICK_GAP)
+    places = 100.0 * np.log(ticks / low) / np.log(high / low)
+    return [(round(place, 2), f"{tick:g}") for place, tick in zip(places.tolist(), ticks.tolist(), strict=True)]
 
 
 def space(data: ReportData, camera: Camera) -> dict:

@@ -17,7 +17,8 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.viz.data import ReportData
-from jaxnbv.viz.imagined import Look
+from jaxnbv.viz.imagined import Look, lamp
+from jaxnbv.viz.layout import framed
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.sphere import unit
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, LINE, NEW
@@ -28,7 +29,7 @@ _SLACK = 0.04  # Noise and the mean's own error must not hide a point behind the
 _HIDDEN = 0.18
 # How wide a hollow is darkened, as a share of the picture; how much at most, and how deep a hollow is then.
 _HOLLOW, _DARKEST, _DEEP = 0.05, 0.4, 0.25
-INSET = 0.24
+_INSET = 0.24
 # What had been seen before, in images of what was imagined.
 _KNOWN = "#c3c9d2"
 
@@ -78,15 +79,12 @@ class Still:
         distance, near = cKDTree(surface.vertices).query(points, k=3)
         weight = 1.0 / (distance + 1e-4)
         weight /= weight.sum(axis=1, keepdims=True)
-        normals = np.sum(weight[..., None] * surface.normals[near], axis=1)
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12
-        right, down, forward = np.asarray(self.pose.rotation).T
-        light = -forward - 0.5 * right - 0.7 * down
-        lit = 0.72 + 0.34 * np.clip(normals @ (light / np.linalg.norm(light)), -0.4, 1.0)
+        normals = unit(np.sum(weight[..., None] * surface.normals[near], axis=1))
+        lit = 0.72 + 0.34 * np.clip(normals @ lamp(self.pose), -0.4, 1.0)
         colours = np.tile(mpl.colors.to_rgba(LINE), (len(points), 1))
         if deviation is not None:
             colours = DEVIATION(deviation(np.exp(np.sum(weight * np.log(surface.deviation)[near], axis=1))))
-        depth = (points - np.asarray(self.pose.position)) @ forward
+        depth = (points - np.asarray(self.pose.position)) @ np.asarray(self.pose.forward)
         shaded = lit * (1.0 - _occlusion(mask.reshape(2 * self.size, -1), depth))
         colours[:, :3] = np.clip(colours[:, :3] * shaded[:, None], 0.0, 1.0)
         self.show(mask, colours, depth)
@@ -109,11 +107,6 @@ class Still:
         deep = np.full(len(mask), np.inf)
         deep[mask] = depth
         self.depth = deep.reshape(self.size, 2, self.size, 2).min(axis=(1, 3))
-
-    @property
-    def surface_pixels(self) -> Float[np.ndarray, "n 2"]:
-        """Where the surface's vertices are; none where there is no surface."""
-        return np.zeros((0, 2)) if self._surface is None else self.project(self._surface.vertices)[0]
 
     def project(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
         """Pixel coordinates of points of the scene, and whether they lie in front of the surface."""
@@ -143,12 +136,11 @@ def draw_scene(
     weight: float = 1.0,
     inset: bool = True,
     aspect: float = 1.0,
-) -> tuple[int, int]:
+) -> None:
     """Draw the scene after view `index` (from 0) into an empty axes: surface, points, the cameras so far, of which the
-    last is new, and in a corner what that one saw.
+    last is new, and in the corner where the least stands in any view what that one saw.
 
-    `weight` scales lines, dots and letters; `aspect` is width over height. Returns that corner, where the least stands
-    in any view: 0 or 1 from the left, and from below.
+    `weight` scales lines, dots and letters; `aspect` is width over height.
     """
     view, stage = data.views[index], data.stage
     axes.imshow(still.image, interpolation="bilinear", zorder=1)
@@ -158,23 +150,22 @@ def draw_scene(
     draw_cameras(axes, still, poses, camera, weight, depth=stage.depth)
     extent = _extent(data, still, camera)
     frame(axes, still, extent, aspect)
-    across, up = corner = _free_corner(axes, extent)
     if inset and view.look is not None:
-        place = axes.inset_axes((across * (1 - INSET), up * (1 - INSET), INSET, INSET))
+        across, up = _free_corner(axes, extent)
+        wide, tall = _INSET / aspect, _INSET
+        place = axes.inset_axes((across * (1 - wide), up * (1 - tall), wide, tall))
         place.imshow(look_picture(view.look, plain=True), interpolation="nearest")
-        place.set(xticks=[], yticks=[])
-        for side in place.spines.values():
-            side.set(visible=True, color=NEW, linewidth=1.2 * weight)
-    return corner
+        framed(place, NEW, 1.2 * weight)
 
 
 def _free_corner(axes: Axes, extent: list[Float[np.ndarray, "_ 2"]]) -> tuple[int, int]:
-    """The corner of a framed axes in which the least share of each of some groups of pixels lies."""
+    """The corner of a framed axes in which the least share of each of some groups of pixels lies: 0 or 1 from the left,
+    and from below."""
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     places = [(pixels - [left, bottom]) / [right - left, top - bottom] for pixels in extent]
 
     def taken(corner: tuple[int, int]) -> float:
-        return sum(float(np.mean((np.abs(at - corner) < 1.25 * INSET).all(axis=1))) for at in places)
+        return sum(float(np.mean((np.abs(at - corner) < 1.25 * _INSET).all(axis=1))) for at in places)
 
     return min(((0, 0), (0, 1), (1, 0), (1, 1)), key=taken)
 

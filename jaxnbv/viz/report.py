@@ -8,9 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import matplotlib as mpl
-import numpy as np
 from jaxtyping import Float
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from plotly.offline import get_plotlyjs
 
@@ -25,9 +23,11 @@ from jaxnbv.viz.data import ReportData, report_data
 from jaxnbv.viz.figures import STYLE, Stills, write_figures
 from jaxnbv.viz.html import render
 from jaxnbv.viz.imagined_figures import Tile, depths, looks
-from jaxnbv.viz.page_data import payload, picture_address, space
-from jaxnbv.viz.render import draw_scene, look_picture
+from jaxnbv.viz.layout import pixels_of
+from jaxnbv.viz.page_data import deviation_ticks, payload, picture_address, space
+from jaxnbv.viz.render import draw_scene
 from jaxnbv.viz.sketches import Sketches
+from jaxnbv.viz.style import DEVIATION, gradient
 from jaxnbv.viz.task_figures import chart_figure, other_charts, task_charts
 
 _FIGURES = "figures"
@@ -89,6 +89,8 @@ def report_html(episode: Episode, data: ReportData, title: str, stills: Stills |
         tables=list(zip(*data.task.panels, strict=True)),
         settings=_settings(episode, title),
         units="scene units" if data.frame is None else "the units of the object's file",
+        gradient=gradient(DEVIATION),
+        ticks=deviation_ticks(data),
         space=_zipped(json.dumps(space(data, camera), allow_nan=False)),
         plotly=_zipped(get_plotlyjs()),
         **{said.__name__: said for said in (capital, number, may_be_words, looks, depths)},
@@ -102,18 +104,13 @@ def _zipped(text: str) -> bytes:
     return gzip.compress(text.encode(), mtime=0)
 
 
-def _scene(data: ReportData, index: int, stills: Stills, camera: Camera) -> tuple[str, str | None, str]:
-    """The picture of one view's scene; what the new view saw, if it saw something, and the corner that it goes into."""
+def _scene(data: ReportData, index: int, stills: Stills, camera: Camera) -> str:
+    """The picture of one view's scene."""
     figure = Figure(figsize=_SCENE, facecolor="none")
-    axes, aspect = figure.add_axes((0, 0, 1, 1)), _SCENE[0] / _SCENE[1]
-    across, up = draw_scene(axes, data, index, stills[index], camera, weight=1.2, inset=False, aspect=aspect)
-    canvas = FigureCanvasAgg(figure)
-    figure.set_dpi(_SCENE_DPI)
-    canvas.draw()
-    look = data.views[index].look
-    seen = None if look is None else picture_address(look_picture(look, plain=True), lossless=True)
-    corner = f"{'right' if across else 'left'}:0;{'top' if up else 'bottom'}:0"
-    return picture_address(np.asarray(canvas.buffer_rgba())), seen, corner
+    # The frame in the corner is not cut.
+    axes = figure.add_axes((0.002, 0.002, 0.996, 0.996))
+    draw_scene(axes, data, index, stills[index], camera, weight=1.2, aspect=_SCENE[0] / _SCENE[1])
+    return picture_address(pixels_of(figure, _SCENE_DPI))
 
 
 def _chart(chart: tuple, size: tuple[float, float]) -> tuple[str, bytes, str]:

@@ -27,6 +27,12 @@ def colour_scale(colours: Colormap) -> list[list]:
     return [[t, mpl.colors.to_hex(colours(t))] for t in np.linspace(0.0, 1.0, 32).tolist()]
 
 
+def gradient(colours: Colormap) -> str:
+    """A colour map as CSS paints it, from left to right."""
+    steps = ", ".join(f"{colour} {100 * at:.0f}%" for at, colour in colour_scale(colours))
+    return f"linear-gradient(90deg, {steps})"
+
+
 def middle_range(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
     """The range of some positive values in round numbers; it leaves out a fiftieth of them at either end."""
     return round_range(*np.percentile(values, [2.0, 98.0]).tolist())
