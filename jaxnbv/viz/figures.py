@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 from PIL import Image
 
@@ -187,7 +188,8 @@ def draw_acquisition(
     axes.axis("off")
     for line in sphere.graticule():
         axes.plot(*line.T, color=LINE, lw=0.5 * weight, alpha=0.6)
-    axes.plot(*sphere.rim().T, color=GREY, lw=0.8 * weight)
+    rim = Ellipse((0.0, 0.0), 2 * sphere.WIDTH, 2 * sphere.HEIGHT, fill=False, color=GREY, lw=0.8 * weight, zorder=2)
+    axes.add_patch(rim)
     if choice is None:
         axes.text(0.0, 0.0, "given", ha="center", va="center", color=GREY, fontsize=11 * weight)
         return None
@@ -196,7 +198,7 @@ def draw_acquisition(
         extent = (-sphere.WIDTH, sphere.WIDTH, -sphere.HEIGHT, sphere.HEIGHT)
         smooth = sphere.smooth_map(choice.map.directions, choice.map.values)
         image = axes.imshow(colours.to_rgba(smooth), extent=extent, interpolation="bilinear", zorder=1)
-        image.set_clip_path(axes.fill(*sphere.rim().T, facecolor="none")[0])
+        image.set_clip_path(rim)
     places = sphere.mollweide(choice.directions)
     shown = ~choice.visited
     dots: dict[str, Any] = {"s": 14 * weight, "edgecolors": GREY, "linewidths": 0.6 * weight}

@@ -9,6 +9,7 @@ from scipy.interpolate import RBFInterpolator
 from scipy.spatial import cKDTree
 
 WIDTH, HEIGHT = 2.0 * np.sqrt(2.0), np.sqrt(2.0)  # Half axes of the map's ellipse.
+_ROWS = 160
 
 
 def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
@@ -40,17 +41,15 @@ def from_mollweide(places: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, 
     return _directions(longitude, np.arcsin(sine)), (x / WIDTH) ** 2 + (y / HEIGHT) ** 2 <= 1.0
 
 
-def smooth_map(
-    directions: Float[np.ndarray, "c 3"], values: Float[np.ndarray, " c"], height: int = 160
-) -> Float[np.ndarray, "h w"]:
-    """The values of candidates carried over the map, `height` by 2 `height` pixels from its top; NaN outside it, and
-    farther from all candidates than nine tenths of them are from the next.
+def smooth_map(directions: Float[np.ndarray, "c 3"], values: Float[np.ndarray, " c"]) -> Float[np.ndarray, "160 320"]:
+    """The values of candidates carried over the map, from its top; NaN outside it, and farther from all candidates than
+    nine tenths of them are from the next.
 
     A spline over the chords of the sphere, which goes through the values (NaN ones are left out) and stays within
     their range.
     """
-    x = WIDTH * ((np.arange(2 * height) + 0.5) / height - 1.0)
-    y = HEIGHT * (1.0 - 2.0 * (np.arange(height) + 0.5) / height)
+    x = WIDTH * ((np.arange(2 * _ROWS) + 0.5) / _ROWS - 1.0)
+    y = HEIGHT * (1.0 - 2.0 * (np.arange(_ROWS) + 0.5) / _ROWS)
     places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     at, inside = from_mollweide(places)
     known = ~np.isnan(values)
@@ -58,7 +57,7 @@ def smooth_map(
     smooth = np.clip(spline(at), values[known].min(), values[known].max())
     tree = cKDTree(directions)
     near = tree.query(at)[0] <= np.quantile(tree.query(directions, k=2)[0][:, 1], 0.9)
-    return np.where(inside & near, smooth, np.nan).reshape(height, 2 * height)
+    return np.where(inside & near, smooth, np.nan).reshape(_ROWS, 2 * _ROWS)
 
 
 def path(directions: Float[np.ndarray, "n 3"]) -> list[Float[np.ndarray, "_ 2"]]:
@@ -92,12 +91,6 @@ def graticule() -> list[Float[np.ndarray, "n 2"]]:
     for longitude in np.radians([-120.0, -60.0, 0.0, 60.0, 120.0]):
         lines.append((np.full_like(fine, longitude), 0.5 * np.pi * fine))
     return [mollweide(_directions(longitude, latitude)) for longitude, latitude in lines]
-
-
-def rim() -> Float[np.ndarray, "n 2"]:
-    """The map's outline."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 181)
-    return np.stack([WIDTH * np.cos(angle), HEIGHT * np.sin(angle)], axis=1)
 
 
 def _directions(longitude: np.ndarray, latitude: np.ndarray) -> np.ndarray:

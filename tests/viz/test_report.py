@@ -286,16 +286,16 @@ def test_the_map_keeps_areas_and_values():
     some = points[::40]
     values = some[:, 1] + some[:, 0] * some[:, 2]
     values[3] = np.nan
-    smooth = smooth_map(some, values, 100)
-    assert smooth.shape == (100, 200)
-    column, row = ((mollweide(some) * [1, -1] / [2 * np.sqrt(2), np.sqrt(2)] + 1) / 2 * [200, 100]).astype(int).T
-    known = ~np.isnan(values) & ~np.isnan(smooth[np.minimum(row, 99), np.minimum(column, 199)])
+    smooth = smooth_map(some, values)
+    assert smooth.shape == (160, 320)
+    column, row = ((mollweide(some) * [1, -1] / [2 * np.sqrt(2), np.sqrt(2)] + 1) / 2 * [320, 160]).astype(int).T
+    known = ~np.isnan(values) & ~np.isnan(smooth[np.minimum(row, 159), np.minimum(column, 319)])
     assert known.sum() > 90
     np.testing.assert_allclose(smooth[row[known], column[known]], values[known], atol=0.1)
     # Of candidates above the horizon alone nothing is said of what is below it.
-    upper = smooth_map(some[some[:, 1] > 0], values[some[:, 1] > 0], 100)
-    assert np.isfinite(upper[10:45, 60:140]).all()
-    assert np.isnan(upper[70:]).all()
+    upper = smooth_map(some[some[:, 1] > 0], values[some[:, 1] > 0])
+    assert np.isfinite(upper[16:72, 96:224]).all()
+    assert np.isnan(upper[112:]).all()
 
 
 def test_a_frustum_is_what_the_camera_sees():

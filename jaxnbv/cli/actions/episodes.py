@@ -19,7 +19,7 @@ from jaxnbv.cli.actions.lines import Lines
 from jaxnbv.cli.actions.run_folder import clear, explained, note, usual_folder
 from jaxnbv.cli.actions.searches import search_of
 from jaxnbv.cli.actions.sensors import first_pose, peculiarities, sensor_for, with_rays
-from jaxnbv.cli.actions.tasks import COMMAND_TASKS, CommandTask, Given
+from jaxnbv.cli.actions.tasks import COMMAND_TASKS, CommandTask, Given, usual_first
 from jaxnbv.cli.actions.until import rule
 from jaxnbv.cli.registry import TASKS
 from jaxnbv.geometry.pose import Pose
@@ -88,7 +88,8 @@ def run(asked: SimpleNamespace) -> None:
     options = {"network": asked.network, "category": asked.category, "source": asked.source}
     surface, made = load_mesh(asked.mesh), task_for(asked.task, **options)
     setting = sensor_for(surface, made.setting, asked)
-    start = first_pose(asked.first, surface, None if asked.paper else setting.radius)
+    usual = usual_first(None if asked.paper else setting.radius)
+    start = usual if asked.first is None else first_pose(asked.first, surface)
     given = Given(
         start,
         lambda: surface.sample_points(jax.random.key(0), 20_000),
@@ -96,8 +97,8 @@ def run(asked: SimpleNamespace) -> None:
         **options,
     )
     plain = Imagination.preset(asked.model, quick=asked.quick, lengthscale=asked.lengthscale)
-    usual = QUICK if asked.quick else USUAL
-    sizes = usual._replace(samples=asked.samples or usual.samples, candidates=asked.candidates or usual.candidates)
+    sizes = QUICK if asked.quick else USUAL
+    sizes = sizes._replace(samples=asked.samples or sizes.samples, candidates=asked.candidates or sizes.candidates)
     planner = planner_of(setting, made.acquisition(given), asked.search, knowing(plain, asked.known), sizes)
     for words in peculiarities(asked.mesh, surface, planner.imagination.grid.spacing):
         typer.echo(f"note     {words}")

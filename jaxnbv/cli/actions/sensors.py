@@ -40,17 +40,11 @@ def with_rays(setting: Setting, quick: bool, rays: int | None = None) -> Setting
     return setting._replace(camera=setting.camera.resized(rays, rays))
 
 
-def first_pose(asked: str | None, surface: Surface, radius: float | None = None) -> Pose:
-    """Where the first view is taken, looking at the origin: where it was asked for, or from the usual side.
-
-    - `radius`: how far away then, in scene units; None for the usual distance.
+def first_pose(asked: str, surface: Surface) -> Pose:
+    """Where the first view was asked for, looking at the origin.
 
     **Raises:** `ValueError` for what is no position, or one inside the object.
     """
-    usual = position("--first", DEFAULT_FIRST)
-    if asked is None:
-        scale = 1.0 if radius is None else radius / math.hypot(*usual)
-        return look_at(tuple(scale * x for x in usual))
     place = position("--first", asked)
     pose, inside = look_at(place), _contains(surface, np.array([place]))
     remedy = f"give a place outside, such as {DEFAULT_FIRST}"

@@ -1,5 +1,6 @@
 """What the tasks of the command line are: their sensor, their acquisition, and an object to show them on."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -167,9 +168,11 @@ COMMAND_TASKS = {
 }
 
 
-def usual_first() -> Pose:
-    """Where a first view is taken if nothing else is said."""
-    return look_at(position("--first", DEFAULT_FIRST))
+def usual_first(radius: float | None = None) -> Pose:
+    """Where a first view is taken if nothing else is said: from the usual side, so far away (scene units)."""
+    usual = position("--first", DEFAULT_FIRST)
+    scale = 1.0 if radius is None else radius / math.hypot(*usual)
+    return look_at(tuple(scale * x for x in usual))
 
 
 def position(option: str, text: str) -> tuple[float, float, float]:
