@@ -170,19 +170,16 @@ def _in_steps(values: Float[np.ndarray, "*n"], steps: int) -> tuple[float, float
 
 def _choice(choice: Choice, quantity: Quantity) -> dict:
     errors = None if choice.errors is None else [_number(float(f"{error:.4g}")) for error in choice.errors.tolist()]
-    # NaN comes last.
-    order = np.argsort(-choice.values, kind="stable")
     return {
         "places": sphere.mollweide(choice.directions).round(3).tolist(),
         "directions": choice.directions.round(2).tolist(),
         "values": [_number(value) for value in choice.values.tolist()],
         "errors": errors,
         "tied": [] if choice.tied is None or not choice.rings_tied else np.flatnonzero(choice.tied).tolist(),
-        "ranks": (1 + np.argsort(order)).tolist(),
         "chosen": sphere.mollweide(choice.chosen[None]).round(4)[0].tolist(),
         "value": choice.value,
         "error": None if choice.error is None else _number(choice.error),
-        "range": list(choice.range),
+        "range": choice.range,
         "image": _map_image(choice) if choice.makes_a_map(quantity) else None,
         "ascents": None if choice.ascents is None else _on_map(choice.ascents),
         "caption": _map_caption(choice),
@@ -230,7 +227,7 @@ def _spatial(ascents: Ascents, camera: Camera) -> dict:
     return {
         "positions": np.asarray(ascents.poses.position, dtype=np.float64).round(3).tolist(),
         "values": ascents.values.tolist(),
-        "range": list(colour_range(ascents.values)),
+        "range": colour_range(ascents.values),
         "steps": frusta_steps(ascents).tolist(),
         "frusta": [small_frusta(ascents, i, camera).round(3).tolist() for i in range(len(ascents.values))],
     }

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import LogNorm
+from matplotlib.colors import LogNorm, Normalize
 from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 
@@ -191,9 +191,8 @@ def look_picture(look: Look, hidden: str = BEFORE, plain: bool = False) -> UInt8
 
 def depth_picture(depth: Float[np.ndarray, "h w"], low: float, high: float) -> UInt8[np.ndarray, "h w 3"]:
     """Near (`low`) is bright, far dark; white where there is none."""
-    share = np.clip((np.nan_to_num(depth, nan=low) - low) / max(high - low, 1e-12), 0.0, 1.0)
-    colours = np.asarray(mpl.colormaps["viridis_r"](share))[..., :3]
-    return np.round(255.0 * np.where(np.isfinite(depth)[..., None], colours, 1.0)).astype(np.uint8)
+    colours = mpl.colormaps["viridis_r"].with_extremes(bad="white")
+    return colours(Normalize(low, high)(depth), bytes=True)[..., :3]
 
 
 def depth_range(images: Iterable[Float[np.ndarray, "_ _"]]) -> tuple[float, float]:
