@@ -94,9 +94,8 @@ def imagined(
         np.asarray(mean_depth(_rows(scans, (slice(None), i)), pose), np.float64).reshape(camera.height, camera.width)
         for i, pose in enumerate(poses)
     ]
-    taken, beside = taken_look(view, cloud), None
-    if other is not None:
-        beside = Expected(expected[1], _depth(_not_taken(episode, view, other, cloud)))
+    taken = taken_look(view, cloud)
+    beside = None if other is None else Expected(expected[1], _depth(_not_taken(episode, view, other, cloud)))
     names: tuple[str, ...] = ()
     kinds: tuple[tuple[str, float], ...] = ()
     if isinstance(posterior, KnownShapesPosterior):

@@ -107,10 +107,10 @@ def _matrix(frame: Frame | None, pose: Pose) -> list[list[float]]:
     return np.asarray(placed.to_matrix(), np.float64).round(6).tolist()
 
 
-def picture_address(picture: UInt8[np.ndarray, "h w _"], lossless: bool = False) -> str:
-    """An image as a data address."""
+def picture_address(picture: UInt8[np.ndarray, "h w _"]) -> str:
+    """An image as a data address; one of few pixels, each of which counts, without loss."""
     file = io.BytesIO()
-    Image.fromarray(picture).save(file, format="WEBP", quality=_QUALITY, lossless=lossless)
+    Image.fromarray(picture).save(file, format="WEBP", quality=_QUALITY, lossless=min(picture.shape[:2]) < 64)
     return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
 
 

@@ -22,7 +22,7 @@ from jaxnbv.viz.answers import capital, label_of, may_be_words, number
 from jaxnbv.viz.data import ReportData, report_data
 from jaxnbv.viz.figures import STYLE, Stills, write_figures
 from jaxnbv.viz.html import render
-from jaxnbv.viz.imagined_figures import Tile, depths, looks
+from jaxnbv.viz.imagined_figures import depths, looks
 from jaxnbv.viz.layout import pixels_of
 from jaxnbv.viz.page_data import deviation_ticks, payload, picture_address, space
 from jaxnbv.viz.render import draw_scene
@@ -94,7 +94,7 @@ def report_html(episode: Episode, data: ReportData, title: str, stills: Stills |
         space=_zipped(json.dumps(space(data, camera), allow_nan=False)),
         plotly=_zipped(get_plotlyjs()),
         **{said.__name__: said for said in (capital, number, may_be_words, looks, depths)},
-        address=_tile_address,
+        address=picture_address,
         # "</" would end the script element that holds the data.
         data=json.dumps(payload(data), allow_nan=False).replace("</", "<\\/"),
     )
@@ -114,30 +114,25 @@ def _scene(data: ReportData, index: int, stills: Stills, camera: Camera) -> str:
 
 
 def _chart(chart: tuple, size: tuple[float, float]) -> tuple[str, bytes, str]:
-    """A chart's name, its drawing, and where its first view begins and how wide each is, so that the page can mark
-    one."""
+    """A chart's name, its drawing, and where its first view begins and how wide each is, in the page's style, which
+    marks one."""
     title, _ = chart
     figure, file = chart_figure([chart], *size, titled=False), io.BytesIO()
     with mpl.rc_context({"svg.hashsalt": "jaxnbv"}):
         figure.savefig(file, format="svg", metadata={"Date": None}, transparent=True)
     place, (left, right) = figure.axes[0].get_position(), figure.axes[0].get_xlim()
-    box = ",".join(f"{share:.4f}" for share in (place.x0, place.width / (right - left), 1.0 - place.y1, place.height))
-    return capital(title), file.getvalue(), box
-
-
-def _tile_address(tile: Tile) -> str:
-    return picture_address(tile.picture, lossless=min(tile.picture.shape[:2]) < 64)
+    box = {"left": place.x0, "wide": place.width / (right - left), "top": 1.0 - place.y1, "tall": place.height}
+    return capital(title), file.getvalue(), "; ".join(f"--{name}: {share:.2%}" for name, share in box.items())
 
 
 def _settings(episode: Episode, title: str) -> dict[str, str]:
     planner = episode.planner
     imagination, carving = planner.imagination, planner.imagination.carving
-    search, model = (describe(module) for module in (planner.search, planner.imagination.model))
     return {
         "Object": title,
-        "Search": _call(search, depth=2),
+        "Search": _call(describe(planner.search), depth=2),
         "Acquisition": _call(describe(planner.acquisition)),
-        "Surface model": _call(model, depth=2),
+        "Surface model": _call(describe(imagination.model), depth=2),
         "Carved by": _call(describe(carving), depth=1) if carving else "nothing, as in the paper",
         "Posterior samples": f"{imagination.num_samples} on a {imagination.grid.resolution}³ grid",
         "Camera": f"{math.degrees(planner.camera.fov):.0f}°, {planner.camera.width} × {planner.camera.height} pixels",

@@ -22,13 +22,9 @@ def mollweide(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """Places on the map of unit vectors: longitude atan2(x, z) to the right, latitude asin(y) upwards."""
     longitude = np.arctan2(directions[:, 0], directions[:, 2])
     sine = np.clip(directions[:, 1], -1.0, 1.0)
-    # 2 t + sin 2 t = pi sin(latitude), by bisection: Newton's steps stall at the poles, where the slope is zero.
-    low, high = np.full_like(sine, -0.5 * np.pi), np.full_like(sine, 0.5 * np.pi)
-    for _ in range(50):
-        t = 0.5 * (low + high)
-        above = 2.0 * t + np.sin(2.0 * t) > np.pi * sine
-        low, high = np.where(above, low, t), np.where(above, t, high)
-    t = 0.5 * (low + high)
+    # 2 t + sin 2 t = pi sin(latitude), from a table: Newton's steps stall at the poles, where the slope is zero.
+    table = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 10_001)
+    t = np.interp(sine, (2.0 * table + np.sin(2.0 * table)) / np.pi, table)
     return np.stack([WIDTH * longitude / np.pi * np.cos(t), HEIGHT * np.sin(t)], axis=1)
 
 

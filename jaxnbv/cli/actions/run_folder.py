@@ -11,7 +11,6 @@ from jaxnbv.storage.files import write_text
 from jaxnbv.storage.folders import AnotherConfigurationError, read_json, remove_empty, writing_in
 
 _OPTIONS, _FIGURES = "options.json", "figures"
-_REPORT = "report.html", f"{_FIGURES}/*.png"
 
 
 def usual_folder(name: str, task: str, search: str, model: str, seed: int) -> Path:
@@ -35,7 +34,7 @@ def clear(folder: Path, *inside: str) -> None:
     require(not others, f"{figures} holds {', '.join(others)}, which is of no report: move it, or give another --out")
     if remove_episode(folder):
         with writing_in(folder):
-            for pattern in (_OPTIONS, *_REPORT):
+            for pattern in (_OPTIONS, "report.html", f"{_FIGURES}/*.png"):
                 for file in folder.glob(pattern):
                     file.unlink()
             if figures.is_dir() and not any(figures.iterdir()):
