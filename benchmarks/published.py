@@ -23,4 +23,4 @@ class MeanCoverage(Coverage):
 
 def mean_coverage(study: ReconstructionStudy, scene: Scene) -> Planner:
     """The study's coverage by the mean."""
-    return study.planner_of(MeanCoverage(), DiscreteSearch(study.candidates), imagination=study.imagination_of(scene))
+    return study.planner_of(MeanCoverage(), DiscreteSearch(study.candidates), scene)

@@ -58,6 +58,7 @@ class _Searches(ClassificationStudy):
         "can be compared. Seconds are of a proposal once it is compiled, the median over the steps of a scene.\n"
     )
     methods: ClassVar[tuple[str, ...]] = ("discrete", "halving", *_SPACES, "hybrid")
+    unknowing: ClassVar[tuple[str, ...]] = ()
     reference: ClassVar[str] = "discrete"
     claims: ClassVar[tuple[Claim, ...]] = (
         Claim(
@@ -83,7 +84,7 @@ class _Searches(ClassificationStudy):
 
     def planner(self, method: str, scene: Scene) -> Planner:
         acquisition = CrossEntropy(self.imagining or self.classifier, self.num_points)
-        return self.planner_of(acquisition, self.search(method))
+        return self.planner_of(acquisition, self.search(method), scene)
 
     def search(self, method: str) -> Search:
         if method in _SPACES:

@@ -206,10 +206,10 @@ class ClassificationStudy(Study):
         kind, coverage = _BY_CLASS.get(method), Coverage()
         acquisition = coverage if kind is None else kind(classifier, num_points=self.num_points)
         if method == "oracle":
-            return self.planner_of(acquisition, OracleView(candidates, scans=scene.task.scans))
+            return self.planner_of(acquisition, OracleView(candidates, scans=scene.task.scans), scene)
         if method == "tie-break":
-            return self.planner_of(acquisition, TieBreakSearch(candidates, second=coverage))
-        return self.planner_of(acquisition, self.search(method))
+            return self.planner_of(acquisition, TieBreakSearch(candidates, second=coverage), scene)
+        return self.planner_of(acquisition, self.search(method), scene)
 
     def sensor(self, scene: Scene) -> Sensor:
         """From a candidate the same scan for all methods and views."""

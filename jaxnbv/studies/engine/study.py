@@ -239,15 +239,15 @@ class Study(eqx.Module):
         self,
         acquisition: Acquisition,
         search: Search,
+        scene: Scene,
         camera: Camera | None = None,
-        imagination: Imagination | None = None,
     ) -> Planner:
-        """A planner with the study's settings.
+        """A planner with the study's settings, and what is known of such a scene.
 
         - `camera`: whose scans are imagined, by default the sensor.
-        - `imagination`: by default the study's.
         """
-        imagination = dataclasses.replace(imagination or self.imagination, grid=self.grid, num_samples=self.num_samples)
+        known = self.imagination_of(scene)
+        imagination = dataclasses.replace(known, grid=self.grid, num_samples=self.num_samples)
         planned = acquisition, search, camera or self.camera, imagination
         return Planner(*planned, capacity=self.capacity, max_views=self.views)
 

@@ -163,11 +163,10 @@ class HeatStudy(MeshStudy):
     def planner(self, method: str, scene: Scene) -> Planner:
         search = HalvingSearch(self.candidates) if method == "heat-halving" else self.search(method)
         camera = Camera(height=self.imagined_rays, width=self.imagined_rays)
-        imagination = self.imagination_of(scene)
         if method not in HEAT_METHODS:
-            return self.planner_of(Coverage(), search, camera, imagination)
+            return self.planner_of(Coverage(), search, scene, camera)
         coldest = ColdestPoint(scene.task, reached_only=method == "heat-reached")
-        return self.planner_of(ExpectedUtilityImprovement(coldest, self.num_points), search, camera, imagination)
+        return self.planner_of(ExpectedUtilityImprovement(coldest, self.num_points), search, scene, camera)
 
     def shows_enough(self, scene: Scene, seen: PointCloud) -> bool:
         """The heat source must be seen."""

@@ -185,7 +185,7 @@ class PartDiscoveryStudy(Study):
             target = TARGET * self.num_points / NETWORK_POINTS
             soft_count = SoftPartCount(self.segmenter_of(scene, self.num_points), target)
             acquisition = ExpectedUtilityImprovement(soft_count, self.num_points)
-        return self.planner_of(acquisition, self.search(method), camera, self.imagination_of(scene))
+        return self.planner_of(acquisition, self.search(method), scene, camera)
 
     def search(self, method: str) -> Search:
         if method.startswith("gradient"):

@@ -78,7 +78,7 @@ class ReconstructionStudy(MeshStudy):
 
     def planner(self, method: str, scene: Scene) -> Planner:
         sought = NewSurface() if method == "new-surface" else Coverage()
-        return self.planner_of(sought, self.search(method), imagination=self.imagination_of(scene))
+        return self.planner_of(sought, self.search(method), scene)
 
     def mesher(self, scene: Scene) -> Planner:
         """Whose posterior all methods' views are meshed by, those of planners of one's own too."""

@@ -206,7 +206,7 @@ class RecordedStudy(Study):
 
     def planner(self, method: str, scene: Scene) -> Planner:
         acquisition = Coverage() if method == COVERAGE else NewSurface()
-        return self.planner_of(acquisition, self.search(method), self.camera.resized(*_RAYS))
+        return self.planner_of(acquisition, self.search(method), scene, self.camera.resized(*_RAYS))
 
     def search(self, method: str) -> Search:
         if method == EVEN:

@@ -180,7 +180,7 @@ def test_a_network_of_ones_own_takes_the_place_of_the_shipped_one(tmp_path):
 
 def test_a_method_of_ones_own_on_household_objects():
     def own(study, scene):
-        return study.planner_of(Coverage(), FarthestView(study.candidates))
+        return study.planner_of(Coverage(), FarthestView(study.candidates), scene)
 
     found = small(ModelNet10Study).run_scene(SCENE, ("farthest",), {"mine:own": own})["methods"]
     (ours,), (theirs,) = found["mine:own"]["runs"], found["farthest"]["runs"]

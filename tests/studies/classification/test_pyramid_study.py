@@ -222,7 +222,7 @@ def test_a_method_of_ones_own_sees_what_others_see_from_a_candidate(tmp_path):
     farthest = study.run_scene(SCENE, ("farthest",))["methods"]["farthest"]["runs"][0]
 
     def own(study, scene):
-        return study.planner_of(Coverage(), FarthestView(study.candidates))
+        return study.planner_of(Coverage(), FarthestView(study.candidates), scene)
 
     record = study.run_scene(SCENE, ("random",), {"mine:own": own})
     (run,) = record["methods"]["mine:own"]["runs"]

@@ -70,7 +70,7 @@ def test_a_method_of_ones_own_stands_in_the_same_record():
     def above(study, scene) -> Planner:
         asked.append(scene.index)
         poses = look_at(jnp.array([[0.0, 2.5, 0.1], [0.0, -2.5, 0.1], [0.1, 2.5, 0.0]]))
-        return study.planner_of(Coverage(), RandomView(GivenPoses(poses)))
+        return study.planner_of(Coverage(), RandomView(GivenPoses(poses)), scene)
 
     record = study.run_scene(2, ["random"], {"mine:above": above})
     assert asked == [2]
@@ -133,7 +133,8 @@ def test_a_command_configures_it():
 
 
 def test_planners_have_the_studys_settings():
-    planner = small(imagination=dataclasses.replace(IMAGINATION, carving=None)).planner("random", None)
+    study = small(imagination=dataclasses.replace(IMAGINATION, carving=None))
+    planner = study.planner("random", study.scene(0))
     assert (
         planner.imagination.num_samples,
         planner.imagination.grid.resolution,

@@ -40,7 +40,7 @@ class ToyStudy(Study):
 
     def planner(self, method, scene):
         search = {"farthest": FarthestView, "random": RandomView}[method]
-        return self.planner_of(Coverage(), search(self.candidates))
+        return self.planner_of(Coverage(), search(self.candidates), scene)
 
     def truth(self, scene):
         return None
