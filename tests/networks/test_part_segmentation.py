@@ -6,8 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import published
 import pytest
 import safetensors.numpy
+from published import layers, near_sphere
 
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.cloud import PointCloud
@@ -22,7 +24,7 @@ from jaxnbv.networks import (
     part_mask,
     save_checkpoint,
 )
-from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
+from jaxnbv.networks.set_abstraction import PooledMLP, SetAbstraction
 
 RNG = np.random.default_rng(0)
 SAMPLING = {
@@ -32,111 +34,48 @@ SAMPLING = {
 segment = eqx.filter_jit(lambda network, *arguments: network(*arguments))
 
 
-def layers(*widths):
-    return tuple(
-        Linear(jnp.asarray(RNG.normal(size=(a, b)) * (2 / a) ** 0.5), jnp.asarray(0.2 * RNG.normal(size=b)))
-        for a, b in itertools.pairwise(widths)
-    )
-
-
 def small_network():
     """Few centres and narrow layers; sixteen categories and fifty parts."""
     return PointNet2PartSegmenter(
         (
-            SetAbstraction((PooledMLP(layers(9, 8, 9)),), (0.6,), (8,), 12),
-            SetAbstraction((PooledMLP(layers(12, 10, 11)),), (1.0,), (8,), 5),
+            SetAbstraction((PooledMLP(layers(RNG, 9, 8, 9)),), (0.6,), (8,), 12),
+            SetAbstraction((PooledMLP(layers(RNG, 12, 10, 11)),), (1.0,), (8,), 5),
         ),
-        PooledMLP(layers(14, 12, 13)),
+        PooledMLP(layers(RNG, 14, 12, 13)),
         (
-            FeaturePropagation(layers(11 + 13, 12)),
-            FeaturePropagation(layers(9 + 12, 10)),
-            FeaturePropagation(layers(25 + 10, 14)),
+            FeaturePropagation(layers(RNG, 11 + 13, 12)),
+            FeaturePropagation(layers(RNG, 9 + 12, 10)),
+            FeaturePropagation(layers(RNG, 25 + 10, 14)),
         ),
-        layers(14, 12)[0],
-        layers(12, 50)[0],
+        layers(RNG, 14, 12)[0],
+        layers(RNG, 12, 50)[0],
     )
 
 
 def rows(n):
-    points = RNG.normal(size=(n, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    normals = points + 0.3 * RNG.normal(size=(n, 3))
-    return jnp.asarray(points), jnp.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+    return near_sphere(RNG, n)
 
 
 def random_state(kind, inputs, categories=16, parts=50):
-    """A narrow network's tensors in the published names; `inputs` counts coordinates twice, as the first level does."""
-    state = {}
+    """`inputs` counts coordinates twice, as the first level does."""
 
-    def put(linear, norm, a, b, kernel):
-        state[f"{linear}.weight"] = RNG.normal(size=(b, a, *kernel)) * (2 / a) ** 0.5
-        state[f"{linear}.bias"] = 0.1 * RNG.normal(size=b)
-        if norm:
-            state[f"{norm}.weight"], state[f"{norm}.running_var"] = RNG.uniform(0.5, 1.5, (2, b))
-            state[f"{norm}.bias"], state[f"{norm}.running_mean"] = 0.1 * RNG.normal(size=(2, b))
-            state[f"{norm}.num_batches_tracked"] = np.array(7)
+    def head(widths):
+        below = 12
+        for number, own in ((3, widths[2]), (2, widths[1]), (1, categories + 3 + widths[0])):
+            for i, pair in enumerate(itertools.pairwise((own + below, 9, 7 + number))):
+                yield f"fp{number}.mlp_convs.{i}", f"fp{number}.mlp_bns.{i}", *pair, (1,)
+            below = 7 + number
+        yield from (("conv1", "bn1", below, 9, (1,)), ("conv2", None, 9, parts, (1,)))
 
-    widths = [inputs - 3]
-    for level, (_, radii, _) in enumerate(SAMPLING[kind], start=1):
-        for branch in range(len(radii)):
-            names = ("mlp_convs", "mlp_bns") if kind == "ssg" else (f"conv_blocks.{branch}", f"bn_blocks.{branch}")
-            for i, pair in enumerate(itertools.pairwise((3 + widths[-1], 5, 6 + branch))):
-                put(f"sa{level}.{names[0]}.{i}", f"sa{level}.{names[1]}.{i}", *pair, (1, 1))
-        widths.append(sum(6 + branch for branch in range(len(radii))))
-    put("sa3.mlp_convs.0", "sa3.mlp_bns.0", 3 + widths[-1], 8, (1, 1))
-    put("sa3.mlp_convs.1", "sa3.mlp_bns.1", 8, 12, (1, 1))
-    below = 12
-    for number, own in ((3, widths[2]), (2, widths[1]), (1, categories + 3 + widths[0])):
-        for i, pair in enumerate(itertools.pairwise((own + below, 9, 7 + number))):
-            put(f"fp{number}.mlp_convs.{i}", f"fp{number}.mlp_bns.{i}", *pair, (1,))
-        below = 7 + number
-    put("conv1", "bn1", below, 9, (1,))
-    put("conv2", None, 9, parts, (1,))
-    return state
+    return published.random_state(RNG, kind, SAMPLING[kind], inputs, head)
 
 
 def plain_network(state, kind, points, normals, category, categories=16):
-    """The published network, layer for layer with its concatenations and batch normalisations, in NumPy."""
-
-    def layer(x, linear, norm=None):
-        weight = state[f"{linear}.weight"]
-        x = x @ weight.reshape(weight.shape[:2]).T + state[f"{linear}.bias"]
-        if norm is None:
-            return x
-        x = (x - state[f"{norm}.running_mean"]) / np.sqrt(state[f"{norm}.running_var"] + 1e-5)
-        return np.maximum(x * state[f"{norm}.weight"] + state[f"{norm}.bias"], 0.0)
-
-    def perceptron(x, linear, norm):
-        for i in range(2):
-            x = layer(x, f"{linear}.{i}", f"{norm}.{i}")
-        return x
-
     features = points if normals is None else np.concatenate([points, normals], axis=1)
     one_hot = np.tile(np.eye(categories)[category], (len(points), 1))
-    stages = [(points, np.concatenate([one_hot, points, features], axis=1))]
-    for level, (count, radii, members) in enumerate(SAMPLING[kind], start=1):
-        chosen, distance = [0], np.full(len(points), np.inf)
-        while len(chosen) < count:
-            distance = np.minimum(distance, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
-            chosen.append(int(np.argmax(distance)))
-        found = []
-        for i in chosen:
-            squared = ((points - points[i]) ** 2).sum(axis=1)
-            row = []
-            for branch, (radius, size) in enumerate(zip(radii, members, strict=True)):
-                group = np.flatnonzero(squared <= radius**2)[:size]
-                offsets = points[group] - points[i]
-                if kind == "ssg":
-                    names, parts = ("mlp_convs", "mlp_bns"), [offsets, features[group]]
-                else:
-                    names, parts = (f"conv_blocks.{branch}", f"bn_blocks.{branch}"), [features[group], offsets]
-                x = np.concatenate(parts, axis=1)
-                row.append(perceptron(x, f"sa{level}.{names[0]}", f"sa{level}.{names[1]}").max(axis=0))
-            found.append(np.concatenate(row))
-        points, features = points[chosen], np.array(found)
-        stages.append((points, features))
-    x = perceptron(np.concatenate([points, features], axis=1), "sa3.mlp_convs", "sa3.mlp_bns").max(axis=0)
-    x = np.tile(x, (len(points), 1))
+    stages, x = published.encode(state, kind, SAMPLING[kind], points, features)
+    stages = [(points, np.concatenate([one_hot, points, features], axis=1)), *stages]
+    x = np.tile(x, (len(stages[-1][0]), 1))
     coarse = None
     for number, (points, own) in zip((3, 2, 1), reversed(stages), strict=True):
         if coarse is not None:
@@ -144,9 +83,10 @@ def plain_network(state, kind, points, normals, category, categories=16):
             nearest = np.argsort(squared, axis=1, kind="stable")[:, :3]
             weights = 1 / (np.take_along_axis(squared, nearest, axis=1) + 1e-8)
             x = np.einsum("nk,nkf->nf", weights / weights.sum(axis=1, keepdims=True), x[nearest])
-        x = perceptron(np.concatenate([own, x], axis=1), f"fp{number}.mlp_convs", f"fp{number}.mlp_bns")
+        x = np.concatenate([own, x], axis=1)
+        x = published.perceptron(state, x, f"fp{number}.mlp_convs", f"fp{number}.mlp_bns")
         coarse = points
-    x = layer(layer(x, "conv1", "bn1"), "conv2")
+    x = published.layer(state, published.layer(state, x, "conv1", "bn1"), "conv2")
     return x - np.log(np.exp(x).sum(axis=1, keepdims=True))
 
 

@@ -1,16 +1,16 @@
 """PointNet++ against published-layout reference outputs, a plain NumPy network, and finite differences."""
 
-import itertools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import published
 import pytest
+from published import layers, near_sphere
 
 from jaxnbv.checks import InputError
 from jaxnbv.networks import PointNet2Classifier, load_checkpoint, save_checkpoint
-from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
+from jaxnbv.networks.set_abstraction import PooledMLP, SetAbstraction
 
 RNG = np.random.default_rng(0)
 SAMPLING = {
@@ -24,101 +24,36 @@ def call(network, *arguments):
     return network(*arguments)
 
 
-def layers(*widths):
-    return tuple(
-        Linear(jnp.asarray(RNG.normal(size=(a, b)) * (2 / a) ** 0.5), jnp.asarray(0.2 * RNG.normal(size=b)))
-        for a, b in itertools.pairwise(widths)
-    )
-
-
 def small_network(inputs=6, members=(8, 16), centers=10):
     """Two radii, then one; few centres; groups as large as asked for."""
-    first = tuple(PooledMLP(layers(inputs, 8, 9)) for _ in members)
-    second = (PooledMLP(layers(3 + 18, 10, 10, 12)),)
+    first = tuple(PooledMLP(layers(RNG, inputs, 8, 9)) for _ in members)
+    second = (PooledMLP(layers(RNG, 3 + 18, 10, 10, 12)),)
     return PointNet2Classifier(
         (
             SetAbstraction(first, (0.4, 0.8), members, centers),
             SetAbstraction(second, (0.9,), members[1:], 6),
         ),
-        PooledMLP(layers(3 + 12, 14, 16)),
-        layers(16, 12),
-        layers(12, 5)[0],
+        PooledMLP(layers(RNG, 3 + 12, 14, 16)),
+        layers(RNG, 16, 12),
+        layers(RNG, 12, 5)[0],
     )
 
 
 def cloud(n):
-    points = RNG.normal(size=(n, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    normals = points + 0.3 * RNG.normal(size=(n, 3))
-    return jnp.asarray(points), jnp.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+    return near_sphere(RNG, n)
 
 
 def random_state(kind, inputs):
-    """A narrow network's tensors in the published names."""
-    state = {}
-
-    def put(linear, norm, a, b, kernel=(1, 1)):
-        state[f"{linear}.weight"] = RNG.normal(size=(b, a, *kernel)) * (2 / a) ** 0.5
-        state[f"{linear}.bias"] = 0.1 * RNG.normal(size=b)
-        if norm:
-            state[f"{norm}.weight"], state[f"{norm}.running_var"] = RNG.uniform(0.5, 1.5, (2, b))
-            state[f"{norm}.bias"], state[f"{norm}.running_mean"] = 0.1 * RNG.normal(size=(2, b))
-            state[f"{norm}.num_batches_tracked"] = np.array(7)
-
-    width = inputs
-    for level, (_, radii, _) in enumerate(SAMPLING[kind], start=1):
-        for branch in range(len(radii)):
-            names = ("mlp_convs", "mlp_bns") if kind == "ssg" else (f"conv_blocks.{branch}", f"bn_blocks.{branch}")
-            for i, (a, b) in enumerate(itertools.pairwise((width, 5, 6 + branch))):
-                put(f"sa{level}.{names[0]}.{i}", f"sa{level}.{names[1]}.{i}", a, b)
-        width = 3 + sum(6 + branch for branch in range(len(radii)))
-    put("sa3.mlp_convs.0", "sa3.mlp_bns.0", width, 8)
-    put("sa3.mlp_convs.1", "sa3.mlp_bns.1", 8, 12)
-    put("fc1", "bn1", 12, 8, ())
-    put("fc2", "bn2", 8, 7, ())
-    put("fc3", None, 7, 4, ())
-    return state
+    head = [("fc1", "bn1", 12, 8, ()), ("fc2", "bn2", 8, 7, ()), ("fc3", None, 7, 4, ())]
+    return published.random_state(RNG, kind, SAMPLING[kind], inputs, lambda widths: head)
 
 
 def plain_network(state, kind, points, features):
-    """The published network, layer for layer with its concatenations and batch normalisations, in NumPy."""
-
-    def layer(x, linear, norm=None):
-        weight = state[f"{linear}.weight"]
-        x = x @ weight.reshape(weight.shape[:2]).T + state[f"{linear}.bias"]
-        if norm is None:
-            return x
-        x = (x - state[f"{norm}.running_mean"]) / np.sqrt(state[f"{norm}.running_var"] + 1e-5)
-        return np.maximum(x * state[f"{norm}.weight"] + state[f"{norm}.bias"], 0.0)
-
-    def pooled(x, linear, norm):
-        for i in range(2):
-            x = layer(x, f"{linear}.{i}", f"{norm}.{i}")
-        return x.max(axis=0)
-
-    for level, (count, radii, members) in enumerate(SAMPLING[kind], start=1):
-        chosen, distance = [0], np.full(len(points), np.inf)
-        while len(chosen) < count:
-            distance = np.minimum(distance, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
-            chosen.append(int(np.argmax(distance)))
-        found = []
-        for i in chosen:
-            squared = ((points - points[i]) ** 2).sum(axis=1)
-            row = []
-            for branch, (radius, size) in enumerate(zip(radii, members, strict=True)):
-                group = np.flatnonzero(squared <= radius**2)[:size]
-                offsets = points[group] - points[i]
-                extra = features[group] if features is not None else np.zeros((len(group), 0))
-                if kind == "ssg":
-                    x = np.concatenate([offsets, extra], axis=1)
-                    row.append(pooled(x, f"sa{level}.mlp_convs", f"sa{level}.mlp_bns"))
-                else:
-                    x = np.concatenate([extra, offsets], axis=1)
-                    row.append(pooled(x, f"sa{level}.conv_blocks.{branch}", f"sa{level}.bn_blocks.{branch}"))
-            found.append(np.concatenate(row))
-        points, features = points[chosen], np.array(found)
-    x = pooled(np.concatenate([points, features], axis=1), "sa3.mlp_convs", "sa3.mlp_bns")
-    x = layer(layer(layer(x, "fc1", "bn1"), "fc2", "bn2"), "fc3")
+    features = np.zeros((len(points), 0)) if features is None else features
+    _, x = published.encode(state, kind, SAMPLING[kind], points, features)
+    for number in (1, 2):
+        x = published.layer(state, x, f"fc{number}", f"bn{number}")
+    x = published.layer(state, x, "fc3")
     return x - np.log(np.exp(x).sum())
 
 

@@ -1,20 +1,19 @@
 """PyTorch files written by hand, opcode by opcode, and a small network to put in them."""
 
-import itertools
 import pickle
 import struct
 import zipfile
 
-import jax.numpy as jnp
 import numpy as np
 import safetensors.numpy
+from published import layers
 
 from jaxnbv.networks import (
     PointNet2Classifier,
     save_checkpoint,
 )
 from jaxnbv.networks.pointnet2 import SINGLE_SCALE
-from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
+from jaxnbv.networks.set_abstraction import PooledMLP, SetAbstraction
 
 STORAGES = {
     "f8": "DoubleStorage",
@@ -104,13 +103,6 @@ def write_stream(path, content, data, counts):
 def checkpoint(path, arrays, **others):
     tensors, data = tensors_and_bytes(arrays)
     return write_archive(path, {"epoch": 3, **others, "model_state_dict": tensors}, data)
-
-
-def layers(rng, *widths):
-    return tuple(
-        Linear(jnp.asarray(rng.normal(size=pair), jnp.float32), jnp.asarray(rng.normal(size=pair[1]), jnp.float32))
-        for pair in itertools.pairwise(widths)
-    )
 
 
 def narrow_network(sampling=SINGLE_SCALE, inputs=6):
