@@ -17,8 +17,6 @@ from bumps import (
     GRID,
     SMALL,
     grid_surface,
-    random_rays,
-    rough_values,
     small_surfaces,
     solid,
     some_bumps,
@@ -205,32 +203,3 @@ def test_every_way_to_batch_fields_and_rays_equals_a_loop(axes, x64):
         assert bool(alone[0][1].any())
         for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
             np.testing.assert_allclose(a[i], b, rtol=1e-9, atol=1e-9)
-
-
-def test_derivatives_in_rays_and_values_against_finite_differences():
-    values = rough_values(GRID, 8, 0.02).astype(np.float32)
-    surface = GridSurface.from_values(values, 0.0, GRID)
-    origins, directions = (jnp.asarray(a) for a in random_rays(9, 60, spread=0.5))
-    shift = jnp.asarray(np.random.default_rng(10).standard_normal((60, 3)), jnp.float32)
-    bend = jnp.asarray(np.random.default_rng(11).standard_normal((60, 3)), jnp.float32)
-
-    @jax.jit
-    def distances(step, values):
-        moved = GridSurface(values, surface.distance, GRID)
-        o, d = origins + step * shift, directions + step * bend
-        return jnp.sum((moved.trace(o, d).points - o) * d, axis=-1) / jnp.sum(d * d, axis=-1)
-
-    zeros, ones = jnp.zeros_like(surface.values), jnp.ones_like(surface.values)
-    derivative = jax.jit(lambda ds, dv: jax.jvp(distances, (0.0, surface.values), (ds, dv))[1])
-    forward, away = derivative(1.0, zeros), derivative(0.0, ones)
-    reverse = jax.jit(jax.grad(lambda step: distances(step, surface.values) @ jnp.arange(60.0)))(0.0)
-    np.testing.assert_allclose(forward @ jnp.arange(60.0), reverse, rtol=1e-4)
-    eps = 1e-3
-    central = (distances(eps, surface.values) - distances(-eps, surface.values)) / (2 * eps)
-    # The interpolant has kinks at the cells' borders; rays that cross one within the difference's step are few.
-    error = np.abs(forward - central) / (1 + np.abs(central))
-    assert np.mean(error < 0.02) > 0.85
-    assert np.median(error) < 3e-3
-    # A higher f everywhere is a smaller object: along the normal, a hit recedes by df / |grad f|.
-    raised = (distances(0.0, surface.values + eps) - distances(0.0, surface.values - eps)) / (2 * eps)
-    assert np.median(np.abs(away - raised) / (1 + np.abs(raised))) < 3e-3

@@ -148,22 +148,6 @@ def test_samples_of_what_was_drawn_are_new_ones():
     assert np.abs(values[:, None] - kept).max(axis=-1).min() > 1e-4
 
 
-class Known(Lines):
-    """A closed form of the mean alone, and of all else that is asked."""
-
-    def drawn(self, num_samples=64):
-        return self
-
-    def mean(self, x):
-        return jnp.asarray(x)[:, 0]
-
-
-def test_a_closed_mean_is_also_that_of_the_grid():
-    posterior, axis = Known(jnp.asarray(0.4), Calls()), np.linspace(-1.0, 1.2, 5, dtype=np.float32)
-    np.testing.assert_allclose(posterior.mean_on_grid(axis), np.broadcast_to(axis[:, None, None], (5, 5, 5)))
-    assert posterior.calls.numbers == []
-
-
 def test_a_variance_of_one_sample_is_refused():
     for count in (1, 0, -3):
         with pytest.raises(InputError, match=f"variance of {count} samples was asked for"):

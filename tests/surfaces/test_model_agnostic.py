@@ -98,29 +98,6 @@ def test_default_grid_evaluation_is_evaluation_at_the_nodes(posterior):
         np.testing.assert_allclose(values[:, i, j, k], expected, atol=1e-5)
 
 
-def test_default_moments_are_within_monte_carlo_error(posterior):
-    """64 samples; exact moments by a fine sum over the uniform radius. Means to 4.5 standard errors; variances to 4.5
-    standard errors of those of uniform variables, (0.8 / 64)^1/2 = 11 % each (kurtosis 1.8); and the probability of
-    being inside to 4.5 standard errors and one sample."""
-    x = np.random.default_rng(0).uniform(-1.5, 1.5, (8, 3)).astype(np.float32)
-    radii = 0.5 + 0.4 * (np.arange(4000) + 0.5) / 4000
-    points, normals = posterior.cloud.to_numpy()
-
-    def exact(x):
-        centres = points.mean(axis=0) - radii[:, None] * normals.mean(axis=0)
-        return np.linalg.norm(x[:, None] - centres, axis=-1) - radii
-
-    f = exact(x)
-    np.testing.assert_array_less(np.abs(posterior.mean(x) - f.mean(axis=1)), 4.5 * np.sqrt(f.var(axis=1) / 64))
-    np.testing.assert_allclose(posterior.variance(x), f.var(axis=1), rtol=0.5)
-    # Points behind the patch that was seen: some are inside of large spheres alone.
-    behind = points.mean(axis=0) - np.linspace(0.05, 2.0, 12, dtype=np.float32)[:, None] * normals.mean(axis=0)
-    inside = (exact(behind) < 0).mean(axis=1)
-    assert ((inside > 0.05) & (inside < 0.95)).sum() >= 3
-    error = np.sqrt(inside * (1 - inside) / 64)
-    np.testing.assert_array_less(np.abs(posterior.probability_inside(behind) - inside), 4.5 * error + 1 / 64)
-
-
 def test_the_mean_on_a_grid_is_that_of_the_same_samples_at_all_its_nodes(posterior):
     axis = np.linspace(-1.2, 1.4, 5, dtype=np.float32)
     nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -254,22 +254,6 @@ def test_points_where_functions_only_repeat_are_refused():
         assert np.isfinite(ask(near)).all()
 
 
-@pytest.mark.slow
-def test_samples_at_the_data_have_the_posteriors_moments():
-    """Of 4,000 samples: a standard deviation is known to 1.1 %. Noise as large as the field, so that draws without it
-    would vary less."""
-    settings = SETTINGS | {"noise": 0.7}
-    values = (
-        GeometricSPSR(**settings)
-        .condition(cloud(POINTS, NORMALS))
-        .sample(jax.random.key(3), 4000)(POINTS.astype(np.float32))
-    )
-    mean, covariance = WeightSpace(**settings).posterior(POINTS, NORMALS, POINTS)
-    deviation = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(np.mean(values, axis=0), mean, atol=5 * deviation.max() / np.sqrt(4000))
-    np.testing.assert_allclose(np.std(values, axis=0), deviation, rtol=0.06)
-
-
 @pytest.mark.parametrize("double", [False, True])
 def test_points_on_the_border_of_the_scene_are_accepted(double):
     with jax.enable_x64(double):
