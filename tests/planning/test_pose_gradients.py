@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
+from solids import nodes
 
 from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement, expected_value
 from jaxnbv.geometry.camera import Camera
@@ -71,7 +72,7 @@ class OneOf(Acquisition):
 def surfaces_of(kind):
     """Two samples, on the nodes: balls that fill the image, blobs that end within it, and rough fields with holes."""
     rng = np.random.default_rng(["filling", "blob", "rough"].index(kind))
-    x = np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1)
+    x = nodes(GRID.axis)
     radius, height = {"filling": (1.1, 0.3), "blob": (0.6, 0.5), "rough": (0.5, 2.5)}[kind]
     noise = gaussian_filter(rng.normal(size=(2, *x.shape[:3])), (0, 2.5, 2.5, 2.5))
     noise *= 0.1 / noise.std()

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from solids import balls
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.checks import InputError
@@ -16,7 +17,7 @@ from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import simulate
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Budget, ValueBelow, so_far
-from jaxnbv.scanning import Evidence, Grid, GridSurface, SDFSurface, SensorNoise
+from jaxnbv.scanning import Evidence, Grid, SDFSurface, SensorNoise
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.search import DiscreteSearch, FarthestView
 from jaxnbv.surfaces import GeometricSPSR
@@ -102,9 +103,7 @@ def test_found_counts_the_points_of_the_parts_that_are_asked_for(parts, points, 
 @pytest.mark.parametrize(("points", "size"), [(80, 0.1), (300, 0.05), (80, 0.4)])
 def test_expected_coverage_is_that_of_the_samples(points, size, monkeypatch):
     """Of a posterior that holds one ball alone, whose rays and points are found anew in float64."""
-    axis = np.asarray(Grid(64).axis)
-    distance = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1), axis=-1) - 0.8
-    ball = GridSurface.from_values(jnp.asarray(distance, jnp.float32)[None], 0.0, Grid(64))
+    ball = balls(Grid(64), [0.8])
     planner = planner_of(Coverage())
     monkeypatch.setattr(Imagination, "sample", lambda self, evidence, key: ball)
     upper = np.asarray(fibonacci_sphere(points))

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.ndimage
+from solids import nodes
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.scanning.grid import Grid, GridSurface
@@ -17,10 +18,6 @@ FEW = Camera(height=6, width=6)
 def solid():
     bored = Cuboid([0.7, 0.5, 0.6], 0.1) - Cylinder(0.3, 2.0)
     return bored | Torus(0.5, 0.15).rotate([1.0, 1.0, 0.0], 0.8).translate([0.3, 0.5, 0.2])
-
-
-def nodes(grid):
-    return np.stack(np.meshgrid(grid.axis, grid.axis, grid.axis, indexing="ij"), axis=-1)
 
 
 class Bumps(eqx.Module):
@@ -38,11 +35,11 @@ def some_bumps(rng):
 
 
 def grid_surface(field, grid):
-    return GridSurface.from_values(field(jnp.asarray(nodes(grid))), 0.0, grid)
+    return GridSurface.from_values(field(jnp.asarray(nodes(grid.axis))), 0.0, grid)
 
 
 def small_surfaces(rng, count):
-    values = np.stack([some_bumps(rng)(nodes(SMALL)) for _ in range(count)])
+    values = np.stack([some_bumps(rng)(nodes(SMALL.axis)) for _ in range(count)])
     return GridSurface.from_values(values, 0.0, SMALL)
 
 
@@ -57,7 +54,7 @@ def rough_values(grid, seed, amplitude):
     """A sphere with smoothed noise, of several cells' wavelength."""
     noise = np.random.default_rng(seed).standard_normal((grid.resolution,) * 3)
     noise = scipy.ndimage.gaussian_filter(noise, 1.2)
-    return np.linalg.norm(nodes(grid), axis=-1) - 0.9 + amplitude * noise / noise.std()
+    return np.linalg.norm(nodes(grid.axis), axis=-1) - 0.9 + amplitude * noise / noise.std()
 
 
 def random_rays(seed, count, radius=2.5, spread=1.0):

@@ -4,6 +4,7 @@ import math
 
 import equinox as eqx
 import numpy as np
+from solids import nodes
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import look_at
@@ -26,7 +27,7 @@ SEE = eqx.filter_jit(Carving.seen_empty)
 
 def nodes_of(grid):
     axis = np.linspace(-grid.half_extent, grid.half_extent, grid.resolution)
-    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    return nodes(axis)
 
 
 def in_camera(x, pose):

@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 import scipy.ndimage
 import trimesh
-from bumps import GRID, nodes, random_rays, rough_values
+from bumps import GRID, random_rays, rough_values
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from skimage.measure import marching_cubes
+from solids import nodes
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
@@ -19,7 +20,7 @@ CAMERA = Camera(height=40, width=40)
 
 
 def sphere(grid=GRID, radius=1.0):
-    return GridSurface.from_values(np.linalg.norm(nodes(grid), axis=-1), radius, grid)
+    return GridSurface.from_values(np.linalg.norm(nodes(grid.axis), axis=-1), radius, grid)
 
 
 def interpolate(values, points, grid):
@@ -63,7 +64,7 @@ def test_sphere_closed_form():
 
 def test_box_closed_form():
     half = np.array([0.7, 0.83, 0.9])
-    q = np.abs(nodes(GRID)) - half
+    q = np.abs(nodes(GRID.axis)) - half
     outside = np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0)
     origins, directions = random_rays(1, 4000, spread=0.6)
     hits = GridSurface.from_values(outside, 0.0, GRID).trace(origins, directions)
@@ -87,7 +88,7 @@ def test_box_closed_form():
 
 
 def test_torus_closed_form():
-    x = nodes(GRID)
+    x = nodes(GRID.axis)
     ring = np.hypot(x[..., 0], x[..., 1]) - 0.85
     values = np.hypot(ring, x[..., 2])
     origins, directions = random_rays(2, 4000)
@@ -168,7 +169,7 @@ def test_no_tunnelling_through_a_two_voxel_sheet(normal, direction, shift, slide
     side = -np.sign(d @ n)
     # A flatter ray enters the box within the sheet.
     assume(abs(d @ n) > 0.15)
-    surface = GridSurface.from_values(np.abs(nodes(grid) @ n - shift) - h, 0.0, grid)
+    surface = GridSurface.from_values(np.abs(nodes(grid.axis) @ n - shift) - h, 0.0, grid)
     across = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
     targets = shift * n + np.linspace(-0.5, 0.5, 64)[:, None] * across + slide * np.cross(n, across)
     hits = surface.trace((targets - 4 * d).astype(np.float32), np.broadcast_to(d, (64, 3)).astype(np.float32))

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from bumps import FEW, GRID, grid_surface, nodes, solid, some_bumps, some_rays
+from bumps import FEW, GRID, grid_surface, solid, some_bumps, some_rays
 from jax.scipy.ndimage import map_coordinates
+from solids import nodes
 
 from jaxnbv.geometry.pose import look_at
 from jaxnbv.scanning.grid import GridSurface
@@ -56,7 +57,7 @@ def optimistix_depth(along, near):
 @pytest.mark.parametrize("name", ["waves", "solid", "grid"])
 def test_gradients_of_depths_equal_those_of_optimistix(name, x64):
     bumps = some_bumps(RNG)
-    function = {"waves": bumps, "solid": solid(), "grid": Interpolant(bumps(jnp.asarray(nodes(GRID))))}[name]
+    function = {"waves": bumps, "solid": solid(), "grid": Interpolant(bumps(jnp.asarray(nodes(GRID.axis))))}[name]
     surface = SDFSurface(solid()) if name == "solid" else grid_surface(bumps, GRID)
     origins, directions = some_rays(RNG, 60)
     hits = surface.trace(origins, directions)

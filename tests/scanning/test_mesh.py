@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from solids import nodes
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
@@ -200,9 +201,8 @@ def test_signed_distance_of_a_sphere_mesh():
     sphere = trimesh.creation.icosphere(4)
     grid = Grid(24, 1.75)
     mesh = TriangleMesh.from_arrays(sphere.vertices, sphere.faces)
-    nodes = np.stack(np.meshgrid(grid.axis, grid.axis, grid.axis, indexing="ij"), axis=-1)
     # An icosphere of 5,120 faces lies within 0.25 % of its sphere.
-    expected = np.linalg.norm(nodes, axis=-1) - 1.25
+    expected = np.linalg.norm(nodes(grid.axis), axis=-1) - 1.25
     np.testing.assert_allclose(mesh.to_signed_distance(grid), expected, atol=4e-3)
     cloud = scan(mesh.to_grid_surface(Grid(60)), Camera(), look_at([0.0, 1.0, 2.3]))
     np.testing.assert_allclose(np.linalg.norm(cloud.points[cloud.mask], axis=1), 1.25, atol=5e-3)

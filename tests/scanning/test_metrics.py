@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from solids import balls
 
 import jaxnbv as nbv
 from jaxnbv.scanning.metrics import coverage, truth_points
@@ -88,7 +89,5 @@ def test_truth_of_a_mesh_is_sampled_by_area():
 
 
 def test_other_surfaces_have_no_truth():
-    grid = nbv.Grid(8)
-    distance = np.linalg.norm(np.stack(np.meshgrid(*[grid.axis] * 3, indexing="ij")), axis=0) - 1.0
-    assert truth_points(nbv.GridSurface.from_values(distance, 0.0, grid), jax.random.key(0)) is None
+    assert truth_points(balls(nbv.Grid(8), [1.0]), jax.random.key(0)) is None
     assert len(truth_points(demo_object(), jax.random.key(0), 10)) == 10

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from solids import balls
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
@@ -25,13 +26,6 @@ def problem(visited, surfaces=None):
     cloud = PointCloud.from_arrays([[0.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     evidence = Evidence(cloud, look_at(positions), jnp.asarray(len(visited)))
     return Problem(evidence, Camera(height=4, width=4), Coverage(), surfaces).prepared()
-
-
-def balls(radii, centres=None):
-    x = np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1)
-    centres = np.zeros((len(radii), 3)) if centres is None else centres
-    values = np.stack([np.linalg.norm(x - c, axis=-1) - r for c, r in zip(centres, radii, strict=True)])
-    return GridSurface.from_values(values.astype(np.float32), 0.0, GRID)
 
 
 def index_of(proposal):
@@ -99,7 +93,7 @@ def slow_uncertain_length(values, position, step):
 def test_uncertainty_against_its_definition():
     """The slow version walks at an eighth of the library's step, which finds the first end late and the last early."""
     rng = np.random.default_rng(0)
-    surfaces = balls([0.9, 0.6, 0.7, 0.3], rng.uniform(-0.5, 0.5, (4, 3)))
+    surfaces = balls(GRID, [0.9, 0.6, 0.7, 0.3], rng.uniform(-0.5, 0.5, (4, 3)))
     search, values = UncertaintyView(12), np.asarray(surfaces.values, dtype=np.float64)
     asked = problem(CANDIDATES[:1], surfaces)
     step = 0.5 * GRID.spacing
@@ -118,26 +112,26 @@ def test_uncertainty_against_its_definition():
 def test_uncertainty_between_the_quantiles_of_many_samples():
     """Forty balls of radii 0.3 ... 1.08: T > 0.05 until the ray enters the third smallest, of radius 0.34."""
     radii = 0.3 + 0.02 * np.arange(40)
-    value = uncertain_length(problem(np.zeros((0, 3)), balls(radii)), look_at(CANDIDATES))
+    value = uncertain_length(problem(np.zeros((0, 3)), balls(GRID, radii)), look_at(CANDIDATES))
     third = radii[2]
     np.testing.assert_allclose(value, radii[-1] - third, atol=1.1 * GRID.spacing)
     # Fewer than twenty samples never let T come to rest between 0 and 0.05: all of them count.
-    few = uncertain_length(problem(np.zeros((0, 3)), balls([1.0, 0.2])), look_at(CANDIDATES))
+    few = uncertain_length(problem(np.zeros((0, 3)), balls(GRID, [1.0, 0.2])), look_at(CANDIDATES))
     np.testing.assert_allclose(few, 0.8, atol=1.1 * GRID.spacing)
 
 
 def test_the_threshold_of_the_transmittance_by_thin_rings_of_samples():
     """Of forty samples one lies far behind the rest: the ray stops counting when two are left, not none."""
     radii = np.array([1.0] * 38 + [0.3] * 2)
-    value = uncertain_length(problem(np.zeros((0, 3)), balls(radii)), look_at(CANDIDATES))
+    value = uncertain_length(problem(np.zeros((0, 3)), balls(GRID, radii)), look_at(CANDIDATES))
     np.testing.assert_allclose(value, 0.0, atol=1.1 * GRID.spacing)
     radii = np.array([1.0] * 37 + [0.3] * 3)
-    value = uncertain_length(problem(np.zeros((0, 3)), balls(radii)), look_at(CANDIDATES))
+    value = uncertain_length(problem(np.zeros((0, 3)), balls(GRID, radii)), look_at(CANDIDATES))
     np.testing.assert_allclose(value, 0.7, atol=1.1 * GRID.spacing)
 
 
 def test_rays_that_stay_open_are_certain_and_rays_of_some_end_where_the_box_does():
-    asked = problem(np.zeros((0, 3)), balls([0.5, 0.5], np.array([[0.0, 0.0, 0.0], [1.1, 0.0, 0.0]])))
+    asked = problem(np.zeros((0, 3)), balls(GRID, [0.5, 0.5], np.array([[0.0, 0.0, 0.0], [1.1, 0.0, 0.0]])))
     poses = look_at(jnp.array([[0.0, 0.0, 2.5], [0.0, 2.5, 1.7], [1.1, 0.0, 2.5]]), target=(0.0, 0.0, 0.0))
     past = eqx.tree_at(lambda p: p.rotation, poses, jnp.broadcast_to(look_at((0.0, 0.0, 1.0)).rotation, (3, 3, 3)))
     # Down the z axis one of two samples is hit at z = 0.5, the other stays open to the box's end at z = -1.75.

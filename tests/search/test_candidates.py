@@ -7,10 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from solids import balls
 
 import jaxnbv as nbv
 from jaxnbv.search.candidates import as_candidates, sphere_candidates
 
+BALLS = balls(nbv.Grid(16), [0.7, 0.7])
 DOME = nbv.SphereCandidates(50, 2.0, math.radians(20.0))
 
 
@@ -105,18 +107,11 @@ def problem(visited, surfaces=None):
     return nbv.Problem(nbv.Evidence(cloud, visited, jnp.asarray(1)), camera, nbv.Coverage(), surfaces).prepared()
 
 
-def ball(samples=2):
-    grid = nbv.Grid(16)
-    x = np.stack(np.meshgrid(*[grid.axis] * 3, indexing="ij"), axis=-1)
-    values = np.linalg.norm(x, axis=-1) - 0.7
-    return nbv.GridSurface.from_values(jnp.asarray(np.stack([values] * samples), jnp.float32), 0.0, grid)
-
-
 @pytest.mark.parametrize("kind", [nbv.DiscreteSearch, nbv.HalvingSearch, nbv.FarthestView, nbv.RandomView])
 def test_every_search_chooses_among_the_poses_it_is_given(kind):
     given = DOME.where(lambda pose: pose.position[2] < 0)
     search = kind(given)
-    asked = problem(given.poses()[jnp.asarray([0])], ball() if search.uses_samples else None)
+    asked = problem(given.poses()[jnp.asarray([0])], BALLS if search.uses_samples else None)
     found = eqx.filter_jit(search.propose)(asked, jax.random.key(0))
     np.testing.assert_array_equal(found.candidates.position, positions(given).astype(np.float32))
     assert found.values[0] == -jnp.inf
@@ -126,7 +121,7 @@ def test_every_search_chooses_among_the_poses_it_is_given(kind):
 
 def test_an_ascent_starts_from_the_poses_it_is_given():
     given = sphere_candidates(3, 2.2)
-    asked = problem(sphere_candidates(1), ball())
+    asked = problem(sphere_candidates(1), BALLS)
     search = nbv.GradientSearch(num_starts=1, iterations=1, candidates=given)
     found = eqx.filter_jit(search.propose)(asked, jax.random.key(0))
     np.testing.assert_array_equal(found.candidates.position, given.position)

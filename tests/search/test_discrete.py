@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from solids import balls
 
 from jaxnbv.acquisition import expected_value
 from jaxnbv.geometry.camera import Camera
@@ -24,9 +25,7 @@ SEARCH = DiscreteSearch(12)
 @pytest.fixture(scope="module")
 def problem():
     rng = np.random.default_rng(0)
-    x = np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1)
-    values = np.stack([np.linalg.norm(x - rng.uniform(-0.5, 0.5, 3), axis=-1) - r for r in (0.8, 0.6, 0.9)])
-    surfaces = GridSurface.from_values(values.astype(np.float32), 0.0, GRID)
+    surfaces = balls(GRID, (0.8, 0.6, 0.9), rng.uniform(-0.5, 0.5, (3, 3)))
     cloud = PointCloud.from_arrays(rng.uniform(-1, 1, (30, 3)), np.tile([0.0, 1.0, 0.0], (30, 1)), 32)
     visited = Pose(np.tile(np.eye(3, dtype=np.float32), (4, 1, 1)), np.zeros((4, 3), np.float32))
     return Problem(Evidence(cloud, visited, jnp.asarray(0)), CAMERA, Coverage(), surfaces).prepared()

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from solids import balls
 
 from jaxnbv.acquisition import Acquisition, expected_value
 from jaxnbv.geometry.camera import Camera
@@ -29,9 +30,7 @@ class MeanHeight(Acquisition):
 @pytest.fixture(scope="module")
 def problem():
     rng = np.random.default_rng(1)
-    x = np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1)
-    values = [np.linalg.norm(x - rng.uniform(-0.5, 0.5, 3), axis=-1) - rng.uniform(0.5, 1.0) for _ in range(SAMPLES)]
-    surfaces = GridSurface.from_values(np.stack(values).astype(np.float32), 0.0, GRID)
+    surfaces = balls(GRID, rng.uniform(0.5, 1.0, SAMPLES), rng.uniform(-0.5, 0.5, (SAMPLES, 3)))
     cloud = PointCloud.from_arrays(rng.uniform(-1, 1, (3, 3)), np.tile([0.0, 1.0, 0.0], (3, 1)))
     visited = look_at(fibonacci_sphere(CANDIDATES, 2.5)[:1])
     evidence = Evidence(cloud, visited, jnp.asarray(0))

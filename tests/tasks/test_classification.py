@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from opinions import drawn_cloud, linear, linear_in_numpy
+from solids import balls
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement, expected_value
 from jaxnbv.checks import InputError
@@ -14,7 +15,7 @@ from jaxnbv.geometry.cloud import PointCloud, concatenate, farthest_point_subsam
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.imagination import Imagination
 from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Grid, GridSurface, scan
+from jaxnbv.scanning import Grid, scan
 from jaxnbv.search import DiscreteSearch, FarthestView
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
@@ -55,13 +56,6 @@ def nothing(capacity):
 def entropy_in_numpy(p, q=None):
     q = p if q is None else q
     return -sum(a * np.log(b) for a, b in zip(p, q, strict=True) if a > 0)
-
-
-def balls(radii):
-    x = np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1)
-    centres = 0.4 * np.eye(3)[: len(radii)]
-    values = np.stack([np.linalg.norm(x - c, axis=-1) - r for c, r in zip(centres, radii, strict=True)])
-    return GridSurface.from_values(values, 0.0, GRID)
 
 
 def test_entropies_of_batches_against_their_formulas(x64):
@@ -207,7 +201,7 @@ def test_gradient_in_the_scan_against_central_differences(x64, score):
 
 
 def test_expected_scores_against_a_loop(x64):
-    surfaces, poses = balls([0.9, 0.7]), look_at(fibonacci_sphere(5, 2.5))
+    surfaces, poses = balls(GRID, [0.9, 0.7], 0.4 * np.eye(3)[:2]), look_at(fibonacci_sphere(5, 2.5))
     data = random_cloud(30, 40)
     p = linear_in_numpy(*data.to_numpy())
     crossed, reduced = np.zeros((2, 5)), np.zeros((2, 5))

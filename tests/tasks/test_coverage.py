@@ -4,12 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from solids import balls
 
 from jaxnbv.acquisition import expected_value
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
-from jaxnbv.scanning import Grid, GridSurface, scan
+from jaxnbv.scanning import Grid, scan
 from jaxnbv.tasks import Coverage
 
 CAMERA, GRID = Camera(height=8, width=8), Grid(20)
@@ -44,9 +45,7 @@ def test_a_scan_that_sees_nothing_or_nothing_new_is_worth_nothing():
 
 def test_the_acquisition_against_brute_force_over_all_scans():
     rng = np.random.default_rng(2)
-    x = np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1)
-    values = np.stack([np.linalg.norm(x - rng.uniform(-0.3, 0.3, 3), axis=-1) - r for r in (0.8, 0.6, 0.9)])
-    surfaces = GridSurface.from_values(values.astype(np.float32), 0.0, GRID)
+    surfaces = balls(GRID, (0.8, 0.6, 0.9), rng.uniform(-0.3, 0.3, (3, 3)))
     data, poses = random_cloud(rng, 60, 64), look_at(fibonacci_sphere(5, 2.5))
     expected = np.zeros((3, 5))
     for s, p in np.ndindex(3, 5):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import robust_laplacian
 import trimesh
+from solids import balls
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement, expected_value
 from jaxnbv.checks import InputError
@@ -16,7 +17,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Grid, GridSurface, TriangleMesh, scan
+from jaxnbv.scanning import Grid, TriangleMesh, scan
 from jaxnbv.search import GradientSearch
 from jaxnbv.tasks.diffusion import HeatProblem
 from jaxnbv.tasks.heat import ColdestPoint, body_temperature, coldest_point
@@ -145,9 +146,7 @@ def test_gradients_are_refused():
 
 def test_expected_improvements_by_hand():
     """A cap is known; views of two balls are worth what they add to it."""
-    nodes = np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1)
-    values = np.stack([np.linalg.norm(nodes, axis=-1) - r for r in (0.95, 1.0)])
-    surfaces = GridSurface.from_values(jnp.asarray(values, jnp.float32), 0.0, GRID)
+    surfaces = balls(GRID, (0.95, 1.0))
     poses = look_at(jnp.asarray(fibonacci_sphere(5, 2.5)))
     points = sphere(400)
     data = cloud_of(points[points[:, 2] > 0.8], capacity=100)

@@ -7,12 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from solids import balls
 
 from jaxnbv.acquisition import Several, expected_value
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
-from jaxnbv.scanning import Grid, GridSurface, SDFSurface, scan
+from jaxnbv.scanning import Grid, SDFSurface, scan
 from jaxnbv.scanning.sdf import Cuboid, Sphere
 from jaxnbv.search import DiscreteSearch, GradientSearch
 from jaxnbv.tasks import Coverage, NewSurface
@@ -99,14 +100,8 @@ def test_nothing_new_is_worth_nothing():
     assert float(acquisition.score(far, seen, camera, POSE)) == pytest.approx(everything, rel=1e-5)
 
 
-def ball_on_grid():
-    grid = Grid(32)
-    nodes = np.stack(np.meshgrid(*[grid.axis] * 3, indexing="ij"), axis=-1)
-    return GridSurface.from_values(jnp.asarray(np.linalg.norm(nodes, axis=-1) - 0.7)[None], 0.0, grid)
-
-
 def test_its_expectation_and_that_beside_others_are_the_same():
-    surfaces, camera = ball_on_grid(), Camera(height=12, width=12)
+    surfaces, camera = balls(Grid(32), [0.7]), Camera(height=12, width=12)
     poses = look_at(jnp.array([[0.0, 0.0, 2.5], [2.5, 0.0, 0.0], [0.0, -2.5, 0.0]]))
     cloud = cloud_of([[0.0, 0.0, 0.7], [0.1, 0.0, 0.69]])
     alone = expected_value(NewSurface(), cloud, surfaces, camera, poses)
@@ -120,7 +115,7 @@ def test_its_expectation_and_that_beside_others_are_the_same():
 @pytest.mark.slow
 def test_it_can_be_climbed(x64):
     """The derivative in the pose is that by central differences, for a small step, of the smooth part of it."""
-    surfaces, camera = ball_on_grid(), Camera(height=16, width=16)
+    surfaces, camera = balls(Grid(32), [0.7]), Camera(height=16, width=16)
     cloud = cloud_of([[0.0, 0.0, 0.7]])
 
     def value(x):

@@ -1,0 +1,17 @@
+"""Nodes of grids, and balls on them as samples of a surface."""
+
+import numpy as np
+
+from jaxnbv.scanning import GridSurface
+
+
+def nodes(axis):
+    """(g, g, g, 3)"""
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+
+
+def balls(grid, radii, centres=None):
+    """One ball a sample, about the origin unless centres are given."""
+    centres = np.zeros((len(radii), 3)) if centres is None else centres
+    away = [np.linalg.norm(nodes(grid.axis) - centre, axis=-1) for centre in centres]
+    return GridSurface.from_values(np.stack(away) - np.reshape(radii, (-1, 1, 1, 1)), 0.0, grid)
