@@ -19,7 +19,16 @@ import numpy as np
 from safetensors.numpy import load_file, save_file
 
 import jaxnbv as nbv
-from jaxnbv.networks import CloudClassifier, CloudSegmenter, load_checkpoint
+from jaxnbv.geometry.cloud import limit_capacity
+from jaxnbv.networks import (
+    CloudClassifier,
+    CloudSegmenter,
+    InvariantClassifier,
+    load_checkpoint,
+    part_segmenter,
+    pretrained_classifier,
+    pyramid_classifier,
+)
 from jaxnbv.planning.replay import StoredSession
 from jaxnbv.studies.engine.records import read_records
 
@@ -39,6 +48,7 @@ D /= np.linalg.norm(D, axis=1, keepdims=True)
 CLOUD = nbv.PointCloud.from_arrays(D, D)
 SHOT = np.asarray((SCAN.points - POSE.position) @ POSE.forward).reshape(6, 6), np.asarray(POSE.matrix)
 VIEW = nbv.View(POSE, SCAN, CLOUD, None, SMALL)
+NO_POINTS = nbv.PointCloud(CLOUD.points, CLOUD.normals, jnp.zeros(60, bool))
 NOT_FINITE = nbv.PointCloud(CLOUD.points.at[0].set(jnp.nan), CLOUD.normals, CLOUD.mask)
 MODEL = nbv.GeometricSPSR(0.05, 0.2, 6)
 POSTERIOR = MODEL.condition(CLOUD)
@@ -189,7 +199,7 @@ def nested(depth):
 BOAST = "OFF\n3 10000000 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 NEVER = nbv.Imagination(MODEL, nbv.Grid(12), 2, nbv.Carving(lambda x: jnp.full(x.shape[:1], jnp.nan)))
 
-# What is done, and a word of what must be said.
+# What is done, and some of what must be said.
 REFUSED = {
     "index beyond a batch": (lambda: POSES[6], "no index 6"),
     "index of a single pose": (lambda: POSE[0], "a single one"),
@@ -400,15 +410,112 @@ REFUSED = {
     "a number as a key of candidates": (lambda: nbv.SphereCandidates(6).poses(3), "jax.random.key"),
     "a list in lists": (lambda: nbv.PointCloud.from_arrays(nested(5000), D), "nested too deep"),
     "up without measure": (lambda: nbv.look_at((0, 0, 2), (0, 0, 0), (0, 1e30, 0)), "up direction"),
+    "no room for samples of a cloud": (lambda: nbv.farthest_point_subsample(CLOUD, 0), "at least one"),
+    "no room for a cloud": (lambda: limit_capacity(CLOUD, 0), "at least one"),
+    "noise below zero": (lambda: nbv.SensorNoise(points=-0.1), "must not be negative"),
+    "a depth's noise below zero": (lambda: nbv.DepthNoise(-1.0), "deviation is -1.0"),
+    "a depth's noise without a scale": (lambda: nbv.DepthNoise(0.1, scale=0.0), "scale is 0.0"),
+    "a depth's noise for another camera": (
+        lambda: nbv.DepthNoise(0.1)(SCAN, KEY, nbv.Camera(), POSE),
+        "give its camera",
+    ),
+    "a ball of no size around a solid": (lambda: nbv.SDFSurface(nbv.sdf.Sphere(1.0), 0.0), "must be positive"),
+    "values of another size": (
+        lambda: nbv.GridSurface.from_values(np.zeros((9, 9, 9)), 0.0, nbv.Grid(12)),
+        "do not fit a grid of 12",
+    ),
+    "values that are not finite": (
+        lambda: nbv.GridSurface.from_values(np.full((12, 12, 12), np.nan), 0.0, nbv.Grid(12)),
+        "not finite",
+    ),
+    "a batch of grids as one": (
+        lambda: nbv.GridSurface.from_values(np.ones((2, 12, 12, 12)), 0.0, nbv.Grid(12)).trace(D, D),
+        "scan_samples",
+    ),
+    "too few nodes": (lambda: nbv.Grid(3), "3^3 nodes is too small"),
+    "a grid turned inside out": (lambda: nbv.Grid(half_extent=-1.0), "half extent is -1"),
+    **{
+        f"no candidates for {kind.__name__}": (lambda kind=kind: kind(0), "0 candidates")
+        for kind in (nbv.DiscreteSearch, nbv.HalvingSearch, nbv.FarthestView, nbv.RandomView, nbv.UncertaintyView)
+    },
+    "no first samples": (lambda: nbv.HalvingSearch(9, 0), "num_first_samples is 0"),
+    "three degrees of freedom": (lambda: nbv.GradientSearch(dof=3), "dof is 3; it must be 2 or 6"),
+    "an object out of the image": (
+        lambda: nbv.Planner(nbv.Coverage(), nbv.GradientSearch(space=nbv.ConstrainedPoses(off_axis=0.3))),
+        "off_axis is 0.3 rad but the image ends 0.262 rad",
+    ),
+    "a utility as a second question": (lambda: nbv.TieBreakSearch(12, second=lambda cloud: 0.0), "second"),
+    "a fit to nothing": (lambda: nbv.fit_hyperparameters(MODEL, NO_POINTS, KEY), "the cloud is empty"),
+    "a fit to three points": (lambda: nbv.fit_hyperparameters(MODEL, CLOUD, KEY, num_points=3), "asked for 3 points"),
+    "no samples of a posterior": (lambda: POSTERIOR.sample(KEY, 0), "asked for 0 samples"),
+    "the variance of one sample": (lambda: POSTERIOR.drawn(1), "variance of 1 samples was asked for"),
+    "a completion under jit": (
+        lambda: jax.jit(lambda cloud: nbv.Completed(MODEL, lambda c, k: D).condition(cloud).level)(CLOUD),
+        "outside jit",
+    ),
+    "a target of no points": (lambda: nbv.SoftPartCount(lambda cloud: None, 0.0), "N_target is"),
+    "a target below zero": (lambda: nbv.SoftPartCount(lambda cloud: None, -3.0), "N_target is"),
+    "no points for a classifier": (lambda: CloudClassifier(CLASSIFIER, num_points=0), "num_points is 0"),
+    "no scale for a classifier": (lambda: CloudClassifier(CLASSIFIER, scale=0.0), "scale is 0.0"),
+    "classes from a segmenter": (lambda: CloudClassifier(SEGMENTER), "a CloudSegmenter feeds it"),
+    "parts from a classifier": (lambda: CloudSegmenter(CLASSIFIER, "chair"), "a CloudClassifier feeds it"),
+    "objects without a side": (lambda: pyramid_classifier(0.0), "longest side is 0.0"),
+    "a classifier that does not ship": (
+        lambda: pretrained_classifier("teapot"),
+        "no classifier of 'teapot' ships: ",
+        "choose from pyramid",
+    ),
+    "mugs without a side": (lambda: part_segmenter("mug", longest_side=0.0), "longest side"),
+    "a category that does not ship": (lambda: part_segmenter("spoon"), "category 'spoon'"),
+    "no such category": (lambda: CloudSegmenter(SEGMENTER, "sofa"), "no category 'sofa'"),
+    "a category too many": (lambda: CloudSegmenter(SEGMENTER, 16), "the category is 16"),
+    "no points for a segmenter": (lambda: CloudSegmenter(SEGMENTER, 3, num_points=0), "num_points is 0"),
+    "no scale for a segmenter": (lambda: CloudSegmenter(SEGMENTER, 3, scale=0.0), "the scale is 0.0"),
+    "a segmenter of seven parts": (
+        lambda: CloudSegmenter(lambda *_: jnp.zeros((60, 7)), 3, num_points=60)(CLOUD),
+        "knows 7 parts",
+    ),
+    **{
+        f"levels of {levels}": (
+            lambda levels=levels: InvariantClassifier(5, KEY, **levels),
+            "the second level no more groups",
+        )
+        for levels in ({"groups": (64, 65)}, {"groups": (64, 0)}, {"radii": (0.2, 0.0)})
+    },
+    "fewer than one view": (
+        lambda: nbv.simulate(P, BALL, POSE, 0, KEY, progress=False),
+        "asked for 0 views; ask for at least one",
+    ),
+    "more views than there is room for": (
+        lambda: nbv.simulate(P, BALL, POSE, 7, KEY, progress=False),
+        "asked for 7 views",
+        "room for 4",
+        "max_views",
+    ),
+    "a first view of nothing": (
+        lambda: nbv.simulate(P, BALL, nbv.look_at((0, 0, 2.5), (0, 0, 5)), 2, KEY, progress=False),
+        "the first scan is empty: no point to start from",
+        "oint the camera",
+    ),
+    "a score that is no number": (
+        lambda: proposed(nbv.ExpectedUtilityImprovement(lambda c: jnp.sum(c.points) * jnp.nan)),
+        "is nan: it must be finite",
+    ),
+    "normals without length": (
+        lambda: P.init(None, nbv.PointCloud(CLOUD.points, CLOUD.normals.at[1].set(0.0), CLOUD.mask)),
+        "1 normals ",
+        "from_arrays",
+    ),
 }
 
 
-def problem(action, word):
+def problem(action, *words):
     """What is wrong with how something is refused, or None."""
     try:
         action()
     except nbv.InputError as error:
-        return None if word in str(error) else f"says {str(error)[:200]!r} without {word!r}"
+        missing = [word for word in words if word not in str(error)]
+        return f"says {str(error)[:200]!r} without {missing}" if missing else None
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         return f"{type(error).__name__}: {str(error)[:150]!r} ({where.filename}:{where.lineno})"

@@ -217,12 +217,6 @@ def test_limit_capacity_thins_by_farthest_points_what_does_not_fit():
     assert bool(kept.mask.all())
 
 
-@pytest.mark.parametrize("function", [farthest_point_subsample, limit_capacity])
-def test_no_room_at_all_is_refused(function):
-    with pytest.raises(ValueError, match="at least one"):
-        function(PointCloud.from_arrays(GOOD, UP), 0)
-
-
 def test_nan_in_masked_rows_never_enters_farthest_point_samples():
     points = np.full((60, 3), np.nan, np.float32)
     points[:50] = np.random.default_rng(0).uniform(-1, 1, (50, 3))

@@ -13,7 +13,6 @@ from torch_files import Op, call, checkpoint, named, narrow_network, state_of
 from jaxnbv.checks import InputError
 from jaxnbv.networks import (
     CloudClassifier,
-    CloudSegmenter,
     CompactPartSegmenter,
     InvariantClassifier,
     convert_checkpoint,
@@ -178,10 +177,3 @@ def test_files_that_hold_no_whole_network_of_our_own_are_refused(own, tmp_path):
         file.write_bytes(safetensors.numpy.save(whole, {"classes": "a,b"}))
         with pytest.raises(InputError, match="names 2 classes; the network has 3"):
             load_checkpoint(file)
-
-
-def test_a_network_of_the_other_kind_is_refused_where_it_would_be_fed():
-    with pytest.raises(InputError, match="a CloudSegmenter feeds it"):
-        CloudClassifier(CompactPartSegmenter(jax.random.key(0)))
-    with pytest.raises(InputError, match="a CloudClassifier feeds it"):
-        CloudSegmenter(InvariantClassifier(3, jax.random.key(0)), "chair")

@@ -14,8 +14,6 @@ from jaxnbv.networks import (
     CloudClassifier,
     InvariantClassifier,
     load_checkpoint,
-    pretrained_classifier,
-    pyramid_classifier,
     save_checkpoint,
 )
 from jaxnbv.networks.native import arrays_of
@@ -77,12 +75,6 @@ def test_rotations_and_translations_do_not_matter(x64, levels, dtype, tolerance)
         answer(net, (points @ mirror).astype(dtype), (normals @ mirror).astype(dtype)), still, atol=tolerance
     )
     assert np.abs(answer(net, 0.8 * points.astype(dtype), normals.astype(dtype)) - still).max() > 5 * tolerance
-
-
-@pytest.mark.parametrize("levels", [{"groups": (64, 65)}, {"groups": (64, 0)}, {"radii": (0.2, 0.0)}])
-def test_levels_that_do_not_fit_are_refused(levels):
-    with pytest.raises(InputError, match="the second level no more groups"):
-        InvariantClassifier(5, jax.random.key(0), **levels)
 
 
 @pytest.mark.parametrize("levels", [USUAL, OTHER])
@@ -230,21 +222,3 @@ def test_a_cloud_classifier_is_sampling_and_the_network_in_its_units(x64):
         np.testing.assert_allclose(CloudClassifier(net, num_points, scale)(cloud), expected, atol=1e-12)
     halved = PointCloud.from_arrays(0.5 * points, normals, 230)
     np.testing.assert_allclose(CloudClassifier(net, 64, 2.0)(halved), CloudClassifier(net, 64, 1.0)(cloud), atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"), [({"num_points": 0}, "num_points is 0"), ({"scale": 0.0}, r"scale is 0\.0")]
-)
-def test_a_cloud_classifier_without_points_or_scale_is_refused(arguments, message):
-    with pytest.raises(InputError, match=message):
-        CloudClassifier(network(), **arguments)
-
-
-def test_the_longest_side_of_the_shipped_classifiers_objects_must_be_positive():
-    with pytest.raises(InputError, match=r"longest side is 0\.0"):
-        pyramid_classifier(0.0)
-
-
-def test_a_network_that_was_not_trained_is_refused():
-    with pytest.raises(InputError, match=r"no classifier of 'teapot' ships: .* choose from pyramid"):
-        pretrained_classifier("teapot")

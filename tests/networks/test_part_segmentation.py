@@ -268,17 +268,3 @@ def test_gradients_reach_filled_rows_only_whatever_stands_in_the_others():
         assert np.isfinite(gradient).all()
         assert np.abs(gradient).max() > 1e-4
         assert not np.asarray(gradient)[30:].any()
-
-
-def test_settings_that_cannot_be_used_are_refused():
-    network, cloud = small_network(), cloud_of(*rows(30), 30)
-    with pytest.raises(InputError, match="no category 'sofa'"):
-        CloudSegmenter(network, "sofa")
-    with pytest.raises(InputError, match="the category is 16"):
-        CloudSegmenter(network, 16)
-    with pytest.raises(InputError, match="num_points is 0"):
-        CloudSegmenter(network, 3, num_points=0)
-    with pytest.raises(InputError, match=r"the scale is 0\.0"):
-        CloudSegmenter(network, 3, scale=0.0)
-    with pytest.raises(InputError, match="knows 7 parts"):
-        CloudSegmenter(lambda *_: jnp.zeros((30, 7)), 3)(cloud)

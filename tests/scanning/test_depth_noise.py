@@ -67,13 +67,3 @@ def test_an_episode_can_be_scanned_with_it(tmp_path):
     again = nbv.simulate(planner, scene, first, 2, KEY, noise, tmp_path / "ball", progress=False)
     np.testing.assert_array_equal(episode.cloud.points, again.cloud.points)
     assert int(episode.views[1].scan.count) > 10
-
-
-def test_what_it_cannot_be_is_named():
-    with pytest.raises(ValueError, match=r"deviation is -1\.0"):
-        nbv.DepthNoise(-1.0)
-    with pytest.raises(ValueError, match=r"scale is 0\.0"):
-        nbv.DepthNoise(0.1, scale=0.0)
-    scan = nbv.scan(nbv.SDFSurface(nbv.sdf.Sphere(0.8)), nbv.Camera(height=4, width=4), nbv.look_at((0.0, 0.0, 2.5)))
-    with pytest.raises(ValueError, match="give its camera"):
-        nbv.DepthNoise(0.1)(scan, KEY, nbv.Camera(), nbv.look_at((0.0, 0.0, 2.5)))

@@ -277,17 +277,3 @@ def test_normals_are_interpolated_central_differences():
     np.testing.assert_allclose(np.abs(np.sum(normals * gradient, axis=1)), 1.0, atol=1e-4)
     directions = random_rays(15, 4000)[1][np.asarray(hits.mask)]
     assert (np.sum(normals * directions, axis=1) <= 1e-6).all()
-
-
-def test_refused_input():
-    with pytest.raises(ValueError, match="do not fit a grid of 60"):
-        GridSurface.from_values(np.zeros((50, 50, 50)), 0.0, GRID)
-    with pytest.raises(ValueError, match="not finite"):
-        GridSurface.from_values(np.full((60, 60, 60), np.nan), 0.0, GRID)
-    batch = GridSurface.from_values(np.ones((2, 60, 60, 60)), 0.0, GRID)
-    with pytest.raises(ValueError, match="scan_samples"):
-        batch.trace(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
-    with pytest.raises(ValueError, match="3\\^3 nodes is too small"):
-        Grid(3)
-    with pytest.raises(ValueError, match="half extent is -1"):
-        Grid(half_extent=-1.0)

@@ -76,8 +76,3 @@ def test_normals_of_a_batch_of_noisy_scans_are_unit():
     scans = scan(SURFACES["sdf"], Camera(height=6, width=6), look_at([[0.0, 0.0, 2.5], [2.5, 0.0, 0.0]]))
     noisy = SensorNoise()(scans, jax.random.key(0))
     np.testing.assert_allclose(np.linalg.norm(noisy.normals, axis=-1), np.asarray(scans.mask), atol=1e-5)
-
-
-def test_negative_noise_is_refused():
-    with pytest.raises(ValueError, match="must not be negative"):
-        SensorNoise(points=-0.1)

@@ -206,11 +206,6 @@ def test_no_recompilation_for_other_solids_of_the_same_make():
     assert len(traces) == 1
 
 
-def test_a_ball_of_no_size_is_refused():
-    with pytest.raises(ValueError, match="must be positive"):
-        SDFSurface(Sphere(1.0), 0.0)
-
-
 def test_normals_on_flat_faces_survive_compilation():
     """On a face the slopes of a box come from one of two cases; rounding must not lose both (nor the unit length)."""
     surface = SDFSurface(Sphere(0.7) | Cuboid([0.4, 0.3, 0.8]).translate([0.3, 0.2, 0.0]))

@@ -10,14 +10,10 @@ import pytest
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.pose import Pose, look_at
-from jaxnbv.imagination import Imagination
-from jaxnbv.planning.planner import Planner
+from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
 from jaxnbv.scanning import Evidence
 from jaxnbv.search import ConstrainedPoses, FreePoses, GradientSearch, HybridSearch, Problem, SpherePoses
 from jaxnbv.search.ascent import Ascent
-from jaxnbv.search.gradient import _pose_space
-from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
 
 
@@ -60,6 +56,12 @@ def test_a_pose_in_space_is_found(kind, solver):
     assert float(found.values.max()) < 4.9
     np.testing.assert_allclose(found.pose.position, [0.9, -1.1, 1.4], atol=0.03)
     np.testing.assert_allclose(found.pose.forward, [-0.6, 0.0, -0.8], atol=0.03)
+
+
+def test_it_starts_from_the_poses_it_is_given():
+    given = look_at(fibonacci_sphere(3, 2.2))
+    found = propose(GradientSearch(num_starts=1, iterations=1, candidates=given), known(), jax.random.key(0))
+    np.testing.assert_array_equal(found.candidates.position, given.position)
 
 
 class Constant(Known):
@@ -126,15 +128,3 @@ def test_a_start_at_the_origin_gives_numbers(space):
 def test_bad_settings_are_refused(kind, arguments, message):
     with pytest.raises(ValueError, match=message):
         kind(**arguments)
-
-
-def test_other_degrees_of_freedom_are_refused():
-    """By the message, too, where the types of arguments are not checked as here."""
-    with pytest.raises(ValueError, match="dof is 3; it must be 2 or 6"):
-        _pose_space(3, None)
-
-
-def test_constraints_wider_than_the_image_are_refused():
-    search = GradientSearch(space=ConstrainedPoses(off_axis=0.3))
-    with pytest.raises(ValueError, match=r"off_axis is 0\.3 rad but the image ends 0\.262 rad"):
-        Planner(Coverage(), search, imagination=Imagination(GeometricSPSR()))

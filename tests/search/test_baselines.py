@@ -148,9 +148,3 @@ def test_a_ray_that_meets_a_look_on_the_boxes_face_is_still_open():
     # Surfaces at z = -0.5 and z = 0.25, seen from z = 1.5; looks every quarter, at 1.5, 1.25, 1.0, ...
     value = uncertain_length(problem(np.zeros((0, 3)), surfaces), look_at(jnp.array([[0.0, 0.0, 1.5]])))
     np.testing.assert_allclose(value, 0.75, atol=0.26)
-
-
-@pytest.mark.parametrize("search", [FarthestView, RandomView, UncertaintyView])
-def test_no_candidates_are_refused(search):
-    with pytest.raises(ValueError, match="0 candidates"):
-        search(0)

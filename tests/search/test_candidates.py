@@ -119,14 +119,6 @@ def test_every_search_chooses_among_the_poses_it_is_given(kind):
     np.testing.assert_array_equal(found.pose.position, found.candidates.position[chosen])
 
 
-def test_an_ascent_starts_from_the_poses_it_is_given():
-    given = sphere_candidates(3, 2.2)
-    asked = problem(sphere_candidates(1), BALLS)
-    search = nbv.GradientSearch(num_starts=1, iterations=1, candidates=given)
-    found = eqx.filter_jit(search.propose)(asked, jax.random.key(0))
-    np.testing.assert_array_equal(found.candidates.position, given.position)
-
-
 def test_gradient_and_hybrid_search_differ_in_their_defaults_alone():
     plain, hybrid = nbv.GradientSearch(), nbv.HybridSearch()
     assert (plain.ascent.num_starts, plain.ascent.iterations, plain.candidates.count) == (6, 20, 100)

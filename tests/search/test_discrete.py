@@ -13,7 +13,7 @@ from jaxnbv.acquisition import expected_value
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
-from jaxnbv.scanning import Evidence, Grid, GridSurface
+from jaxnbv.scanning import Evidence, Grid
 from jaxnbv.search import DiscreteSearch, Problem, SphereCandidates
 from jaxnbv.search.base import best_unvisited
 from jaxnbv.tasks import Coverage
@@ -88,17 +88,6 @@ def test_it_is_deterministic(problem):
     a, b = search(problem), search(problem, 7)
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         np.testing.assert_array_equal(x, y)
-
-
-def test_without_samples_it_says_so(problem):
-    bare = eqx.tree_at(lambda p: p.surfaces, problem, None, is_leaf=lambda leaf: isinstance(leaf, GridSurface))
-    with pytest.raises(ValueError, match="uses_samples"):
-        SEARCH.propose(bare, jax.random.key(0))
-
-
-def test_no_candidates_are_refused():
-    with pytest.raises(ValueError, match="0 candidates"):
-        DiscreteSearch(0)
 
 
 @pytest.mark.parametrize(

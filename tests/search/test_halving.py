@@ -11,7 +11,7 @@ from jaxnbv.acquisition import Acquisition, expected_value
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
-from jaxnbv.scanning import Evidence, Grid, GridSurface
+from jaxnbv.scanning import Evidence, Grid
 from jaxnbv.search import DiscreteSearch, HalvingSearch, Problem
 
 GRID, CANDIDATES, SAMPLES = Grid(16), 11, 4
@@ -79,15 +79,3 @@ def test_one_round_is_the_discrete_search(problem):
     )
     np.testing.assert_array_equal(whole.pose.position, halving.pose.position)
     np.testing.assert_allclose(whole.values, halving.values, rtol=1e-5)
-
-
-def test_without_samples_it_says_so(problem):
-    bare = eqx.tree_at(lambda p: p.surfaces, problem, None, is_leaf=lambda leaf: isinstance(leaf, GridSurface))
-    with pytest.raises(ValueError, match="uses_samples"):
-        HalvingSearch(CANDIDATES).propose(bare, jax.random.key(0))
-
-
-@pytest.mark.parametrize(("arguments", "message"), [((0, 2), "0 candidates"), ((9, 0), "num_first_samples is 0")])
-def test_bad_numbers_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        HalvingSearch(*arguments)

@@ -9,6 +9,7 @@ from test_discrete import CAMERA, problem, visit
 from test_tie_break import Height
 
 from jaxnbv.acquisition import Several, expected_value
+from jaxnbv.scanning import GridSurface
 from jaxnbv.search import (
     DiscreteSearch,
     FarthestView,
@@ -83,6 +84,13 @@ def test_scores_are_those_of_each_sample_by_each_acquisition_that_is_asked(name,
             sample = jax.tree.map(lambda leaf, s=index: leaf[s : s + 1], problem.surfaces)
             expected = value(acquisition, problem.evidence.cloud, sample, CAMERA, POSES)
             np.testing.assert_allclose(row, expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", [name for name, search in SEARCHES.items() if search.uses_samples])
+def test_without_samples_it_says_so(name, problem):
+    bare = eqx.tree_at(lambda p: p.surfaces, problem, None, is_leaf=lambda leaf: isinstance(leaf, GridSurface))
+    with pytest.raises(ValueError, match="uses_samples"):
+        SEARCHES[name].propose(bare, KEY)
 
 
 def test_searches_share_the_scores_of_a_study(asked):

@@ -10,7 +10,6 @@ import pytest
 from test_discrete import CAMERA, problem, visit
 
 from jaxnbv.acquisition import Acquisition, Several, expected_value
-from jaxnbv.checks import InputError
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.planning.travel import ValueMinusCost, arc_length
 from jaxnbv.search import DiscreteSearch, TieBreakSearch
@@ -107,11 +106,6 @@ def test_the_way_there_counts(problem):
 
 def test_a_second_score_that_is_no_number_is_told_of(problem):
     assert np.isnan(float(search(problem, Constant(np.nan)).value))
-
-
-def test_a_second_question_must_be_a_score():
-    with pytest.raises((InputError, TypeError), match="second"):
-        TieBreakSearch(12, second=lambda cloud: 0.0)
 
 
 def test_scores_of_several_questions_are_those_of_each(problem):

@@ -101,9 +101,3 @@ def test_what_is_no_surface_is_refused(answer, word):
     with pytest.raises(nbv.InputError, match=word) as refused:
         nbv.Completed(PLAIN, lambda cloud, key: answer).condition(SCAN)
     assert "completer" in str(refused.value)
-
-
-def test_it_runs_on_the_host_only():
-    model = nbv.Completed(PLAIN, the_ball)
-    with pytest.raises(nbv.InputError, match="outside jit"):
-        jax.jit(lambda cloud: model.condition(cloud).level)(SCAN)

@@ -148,12 +148,6 @@ def test_samples_of_what_was_drawn_are_new_ones():
     assert np.abs(values[:, None] - kept).max(axis=-1).min() > 1e-4
 
 
-def test_a_variance_of_one_sample_is_refused():
-    for count in (1, 0, -3):
-        with pytest.raises(InputError, match=f"variance of {count} samples was asked for"):
-            lines().drawn(count)
-
-
 class LinesOfKnownMean(Lines):
     """They know their mean, x + 0.5 say, and nothing else."""
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from weight_space import WeightSpace
 
-from jaxnbv import GeometricSPSR, InputError, OutsideBoundary, PointCloud, ScreenedSPSR, fit_hyperparameters
+from jaxnbv import GeometricSPSR, OutsideBoundary, PointCloud, ScreenedSPSR, fit_hyperparameters
 
 RNG = np.random.default_rng(0)
 TRUE = {"lengthscale": 0.1, "variance": 0.8, "noise": 0.2}
@@ -33,11 +33,3 @@ def test_of_a_screened_model_the_base_is_fitted_and_never_made_less_likely():
     data, base = drawn(100), GeometricSPSR(0.3, 0.3, truncation=5, noise=0.4)
     fitted = fit_hyperparameters(ScreenedSPSR(base, (OutsideBoundary(num_points=20),)), data, jax.random.key(0))
     assert fitted.base.condition(data).log_marginal_likelihood() > base.condition(data).log_marginal_likelihood() + 1.0
-
-
-def test_nothing_to_fit_to_is_refused():
-    empty = PointCloud(jnp.zeros((9, 3)), jnp.zeros((9, 3)), jnp.zeros(9, bool))
-    with pytest.raises(InputError, match="the cloud is empty"):
-        fit_hyperparameters(GeometricSPSR(), empty, jax.random.key(0))
-    with pytest.raises(InputError, match="asked for 3 points"):
-        fit_hyperparameters(GeometricSPSR(), drawn(20), jax.random.key(0), num_points=3)

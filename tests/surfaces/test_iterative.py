@@ -9,7 +9,7 @@ from weight_space import WeightSpace
 import jaxnbv as nbv
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.surfaces import GeometricSPSR, spsr
-from jaxnbv.surfaces.iterative import MOST_FACTORISED, IterativePosterior
+from jaxnbv.surfaces.iterative import IterativePosterior
 
 SETTINGS = {"lengthscale": 0.1, "variance": 0.8, "noise": 0.2, "nu": 1.5, "truncation": 4}
 RNG = np.random.default_rng(3)
@@ -62,11 +62,11 @@ def test_what_does_not_converge_is_refused(monkeypatch):
         GeometricSPSR(0.1, 0.8, 4, noise=0.01).condition(cloud(capacity=31))
 
 
-def test_the_capacity_tells_which_is_taken():
-    points = jnp.zeros((MOST_FACTORISED + 1, 3))
-    few = PointCloud(points, points.at[:, 0].set(1.0), jnp.arange(len(points)) < 1)
+def test_the_capacity_tells_which_is_taken(monkeypatch):
+    monkeypatch.setattr("jaxnbv.surfaces.spsr.MOST_FACTORISED", 38)
     model = GeometricSPSR(**SETTINGS)
-    assert isinstance(model.condition(few), IterativePosterior)
+    assert not isinstance(model.condition(cloud(capacity=38)), IterativePosterior)
+    assert isinstance(model.condition(cloud(capacity=39)), IterativePosterior)
     for refusing in (model.factorised, nbv.ScreenedSPSR(model).condition):
-        with pytest.raises(ValueError, match=r"room for 16385 points.*16384 at most: lower the planner's capacity"):
-            refusing(few)
+        with pytest.raises(ValueError, match=r"room for 39 points.*38 at most: lower the planner's capacity"):
+            refusing(cloud(capacity=39))

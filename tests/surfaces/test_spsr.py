@@ -264,12 +264,6 @@ def test_points_on_the_border_of_the_scene_are_accepted(double):
         np.testing.assert_allclose(posterior.mean(QUERIES), mean, atol=1e-3)
 
 
-def test_fewer_than_one_sample_is_refused():
-    posterior = GeometricSPSR(**SETTINGS).condition(cloud(POINTS, NORMALS))
-    with pytest.raises(ValueError, match="asked for 0 samples"):
-        posterior.sample(jax.random.key(0), 0)
-
-
 @pytest.mark.parametrize("count", [1, 260, 261, 500, 1040])
 def test_a_large_capacity_gives_what_its_filled_rows_give(x64, count):
     """Beyond a thousand rows the leading ones alone are worked on: a quarter of 1,040 are 260."""

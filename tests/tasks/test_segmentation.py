@@ -123,12 +123,6 @@ def test_counts_of_predicted_points():
     np.testing.assert_array_equal(part_counts(jnp.asarray(p, jnp.float32)), expected)
 
 
-@pytest.mark.parametrize("target", [0.0, -3.0])
-def test_a_target_that_is_not_positive_is_refused(target):
-    with pytest.raises(ValueError, match="N_target is"):
-        SoftPartCount(certain(0), target)
-
-
 class Named(Linear):
     part_names: ClassVar[dict[int, str]] = {1: "seat", 3: "leg"}
 
