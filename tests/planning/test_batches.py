@@ -7,16 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_planner import FIRST, SCENE, planner_of
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.checks import InputError
-from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import look_at
-from jaxnbv.imagination import Imagination
-from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.travel import ValueMinusCost, ValuePerCost, arc_length, rotation_angle, total_cost
-from jaxnbv.scanning import Grid, SDFSurface, scan, scan_samples
-from jaxnbv.scanning.sdf import Capsule, Sphere
+from jaxnbv.scanning import scan, scan_samples
 from jaxnbv.search import (
     DiscreteSearch,
     FarthestView,
@@ -25,21 +22,14 @@ from jaxnbv.search import (
     RandomView,
     UncertaintyView,
 )
-from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
 
-SCENE = SDFSurface(Sphere(0.7) | Capsule([0.2, 0.3, -0.4], [0.5, 0.6, 0.9], 0.3))
-FIRST, KEY = look_at((0.8, 0.9, 2.2)), jax.random.key(3)
+KEY = jax.random.key(3)
 
 
 def spread(cloud):
     """How far points reach along each axis: a utility whose improvements are not sums over points."""
     return jnp.sum(jnp.max(jnp.where(cloud.mask[:, None], jnp.abs(cloud.points), 0.0), axis=0))
-
-
-def planner_of(search=DiscreteSearch(12), score=Coverage(), num_samples=3, cost=None):  # noqa: B008
-    imagination = Imagination(GeometricSPSR(0.05, truncation=8), Grid(24), num_samples)
-    return Planner(score, search, Camera(height=8, width=8), imagination, cost, capacity=128, max_views=6)
 
 
 def evidence_of(planner):
@@ -121,15 +111,19 @@ def test_a_second_batch_compiles_nothing(compilations):
     assert len(compilations) == before
 
 
+PER_COST = ValuePerCost(arc_length, fixed=0.5), lambda value, cost: value / (0.5 + cost)
+
+
 @pytest.mark.parametrize(
-    ("cost", "worth"),
+    ("search", "cost", "worth"),
     [
-        (ValuePerCost(arc_length, fixed=0.5), lambda value, cost: value / (0.5 + cost)),
-        (ValueMinusCost(arc_length, weight=3.0), lambda value, cost: value - 3.0 * cost),
-        (ValueMinusCost(lambda a, b: arc_length(a, b) + rotation_angle(a, b), weight=1.0), None),
+        (DiscreteSearch(12), *PER_COST),
+        (HalvingSearch(12, num_first_samples=3), *PER_COST),
+        (UncertaintyView(12), *PER_COST),
+        (DiscreteSearch(12), ValueMinusCost(arc_length, weight=3.0), lambda value, cost: value - 3.0 * cost),
+        (DiscreteSearch(12), ValueMinusCost(lambda a, b: arc_length(a, b) + rotation_angle(a, b), weight=1.0), None),
     ],
 )
-@pytest.mark.parametrize("search", [DiscreteSearch(12), HalvingSearch(12, num_first_samples=3), UncertaintyView(12)])
 def test_values_are_weighed_against_the_way_from_the_last_view(cost, worth, search):
     plain, weighed = planner_of(search), planner_of(search, cost=cost)
     evidence = evidence_of(plain)

@@ -5,29 +5,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_planner import FIRST, SCENE, SOLID, planner_of
 
-from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import look_at
-from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import Episode, observe_scene, simulate
-from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, mesh_from_sdf, scan
-from jaxnbv.scanning.sdf import Capsule, Sphere
-from jaxnbv.search import DiscreteSearch, RandomView
-from jaxnbv.surfaces import GeometricSPSR
-from jaxnbv.tasks import Coverage
+from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.search import RandomView
 
-SOLID = Sphere(0.7) | Capsule([0.2, 0.3, -0.4], [0.5, 0.6, 0.9], 0.3)
-SCENE = SDFSurface(SOLID)
-FIRST = look_at((0.8, 0.9, 2.2))
-PLANNER = Planner(
-    Coverage(),
-    DiscreteSearch(12),
-    Camera(height=8, width=8),
-    Imagination(GeometricSPSR(truncation=8, lengthscale=0.05), grid=Grid(24), num_samples=3),
-    capacity=128,
-    max_views=6,
-)
+PLANNER = planner_of()
 KEY = jax.random.key(5)
 
 

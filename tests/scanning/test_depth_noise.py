@@ -59,7 +59,7 @@ def test_a_noisy_scan_is_an_image_of_the_same_rays():
 def test_an_episode_can_be_scanned_with_it(tmp_path):
     imagination = nbv.Imagination(nbv.GeometricSPSR(0.2, truncation=5), nbv.Grid(20), num_samples=2)
     planner = nbv.Planner(
-        nbv.NewSurface(0.2), nbv.DiscreteSearch(5), nbv.Camera(height=16, width=16), imagination, capacity=200
+        nbv.Coverage(), nbv.FarthestView(5), nbv.Camera(height=16, width=16), imagination, capacity=200
     )
     scene, first = nbv.sdf.Sphere(0.8), nbv.look_at((0.0, 0.0, 2.5))
     noise = nbv.DepthNoise.realsense_d435(scale=5.0)

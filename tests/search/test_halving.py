@@ -12,7 +12,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning import Evidence, Grid
-from jaxnbv.search import DiscreteSearch, HalvingSearch, Problem
+from jaxnbv.search import HalvingSearch, Problem
 
 GRID, CANDIDATES, SAMPLES = Grid(16), 11, 4
 
@@ -55,27 +55,18 @@ def propose(search, problem):
     return search.propose(problem, jax.random.key(0))
 
 
-@pytest.mark.parametrize("num_visited", [0, 1])
-def test_rounds_recomputed(problem, table, num_visited):
+@pytest.mark.parametrize(("num_visited", "first"), [(0, 1), (1, 1), (0, SAMPLES)])
+def test_rounds_recomputed(problem, table, num_visited, first):
     problem = eqx.tree_at(lambda p: p.evidence.num_views, problem, jnp.asarray(num_visited))
     left, values, scored = np.arange(CANDIDATES), np.zeros(CANDIDATES), 0
     while scored < SAMPLES:
         if scored:
             left = left[np.argsort(-values[left], kind="stable")[: len(left) // 2]]
-        scored = min(max(2 * scored, 1), SAMPLES)
+        scored = min(max(2 * scored, first), SAMPLES)
         values[left] = table[:scored, left].mean(axis=0)
         values[:num_visited] = -np.inf
-    proposal = propose(HalvingSearch(CANDIDATES, num_first_samples=1), problem)
+    proposal = propose(HalvingSearch(CANDIDATES, num_first_samples=first), problem)
     best = left[np.argmax(values[left])]
     np.testing.assert_allclose(proposal.values, values, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(proposal.pose.position, fibonacci_sphere(CANDIDATES, 2.5)[best], atol=1e-6)
     assert float(proposal.value) == pytest.approx(values[best], rel=1e-4)
-
-
-def test_one_round_is_the_discrete_search(problem):
-    whole, halving = (
-        propose(search, problem)
-        for search in (DiscreteSearch(CANDIDATES), HalvingSearch(CANDIDATES, num_first_samples=SAMPLES))
-    )
-    np.testing.assert_array_equal(whole.pose.position, halving.pose.position)
-    np.testing.assert_allclose(whole.values, halving.values, rtol=1e-5)
