@@ -200,7 +200,8 @@ for file in sys.argv[1:]:
     return messages
 
 
-def test_short_programs_for_huge_values_are_refused_at_once(tmp_path):
+def short_programs(folder):
+    """For huge values."""
     huge, stored = nested(60), named("torch", "FloatStorage")
     contents = (
         {"a": Op(b"Q", ("storage", huge, "0", "cpu", 1))},
@@ -209,23 +210,41 @@ def test_short_programs_for_huge_values_are_refused_at_once(tmp_path):
         {"a": call(named("collections", "OrderedDict"), [(huge, 1)])},
         {"a": huge},
     )
-    files = [write_archive(tmp_path / f"net{index}.pth", content, {}) for index, content in enumerate(contents)]
-    assert all("nested too deep" in message for message in refusals(*files))
+    return [write_archive(folder / f"short{index}.pth", content, {}) for index, content in enumerate(contents)]
+
+
+def repeated_copies(folder):
+    """Calls that copy the same again and again."""
+    pairs = dumps([(str(index), None) for index in range(30_000)])[2:-1]
+    of_pairs = Op(pairs + b"q\x00ccollections\nOrderedDict\nq\x01" + 3000 * b"h\x01h\x00\x85R")
+    text = program("a" * 1_000_000) + b"q\x00" + program("latin1") + b"q\x01c_codecs\nencode\nq\x02"
+    of_text = Op(text + 3000 * b"h\x02h\x00h\x01\x86R")
+    return [
+        write_archive(folder / f"copies{index}.pth", {"a": content}, {})
+        for index, content in enumerate((of_pairs, of_text))
+    ]
+
+
+def declared_sizes(folder):
+    """An index of the memo, the lengths of a text, of a longer one and of an integer, in both layouts."""
+    files = []
+    for size in (b"r\xff\xff\xff\xff", b"X\xff\xff\xff\x7f", b"\x8d" + b"\xff" * 5 + bytes(3), b"\x8b\xff\xff\xff\x7f"):
+        files.append(write_archive(folder / f"{len(files)}.pth", {"a": Op(b"K\x01" + size)}, {}))
+        files.append(folder / f"{len(files)}.pth")
+        files[-1].write_bytes(b"\x80\x02K\x01" + size + b".")
+    return files
+
+
+def test_what_is_short_but_would_take_much_is_refused_at_once(tmp_path):
+    short, copying = short_programs(tmp_path), repeated_copies(tmp_path)
+    messages = refusals(*short, *copying, *declared_sizes(tmp_path))
+    assert all("nested too deep" in message for message in messages[: len(short)])
+    assert all("copy more than the file holds" in message for message in messages[len(short) :][: len(copying)])
 
 
 def test_keys_that_are_no_names_are_refused(tmp_path):
     with pytest.raises(InputError, match="neither a string nor an integer"):
         read_torch_tensors(write_archive(tmp_path / "net.pth", {(1, 2): 1}, {}))
-
-
-def test_declared_sizes_cost_nothing(tmp_path):
-    """An index of the memo, the lengths of a text, of a longer one and of an integer, in both layouts."""
-    files = []
-    for size in (b"r\xff\xff\xff\xff", b"X\xff\xff\xff\x7f", b"\x8d" + b"\xff" * 5 + bytes(3), b"\x8b\xff\xff\xff\x7f"):
-        files.append(write_archive(tmp_path / f"{len(files)}.pth", {"a": Op(b"K\x01" + size)}, {}))
-        files.append(tmp_path / f"{len(files)}.pth")
-        files[-1].write_bytes(b"\x80\x02K\x01" + size + b".")
-    refusals(*files)
 
 
 @pytest.mark.slow
@@ -268,18 +287,6 @@ def test_operations_that_no_tensor_needs_are_refused(tmp_path):
     for body in (b"\x8f", b"c__builtin__\nset\n)\x81", b"(ios\nsystem\n"):
         with pytest.raises(InputError, match=r"refused"):
             read_torch_tensors(write_archive(tmp_path / "net.pth", {"a": Op(body)}, {}))
-
-
-def test_calls_that_copy_the_same_again_and_again_are_refused(tmp_path):
-    pairs = dumps([(str(index), None) for index in range(30_000)])[2:-1]
-    of_pairs = Op(pairs + b"q\x00ccollections\nOrderedDict\nq\x01" + 3000 * b"h\x01h\x00\x85R")
-    text = program("a" * 1_000_000) + b"q\x00" + program("latin1") + b"q\x01c_codecs\nencode\nq\x02"
-    of_text = Op(text + 3000 * b"h\x02h\x00h\x01\x86R")
-    files = [
-        write_archive(tmp_path / f"net{index}.pth", {"a": content}, {})
-        for index, content in enumerate((of_pairs, of_text))
-    ]
-    assert all("copy more than the file holds" in message for message in refusals(*files))
 
 
 def test_storages_that_an_older_file_does_not_fill_are_refused(tmp_path, state):

@@ -103,7 +103,7 @@ def test_the_order_is_that_of_the_shortest_way():
 
 
 def test_a_second_batch_compiles_nothing(compilations):
-    planner = planner_of(num_samples=2)
+    planner = planner_of()
     evidence, other = evidence_of(planner), jax.random.key(9)
     planner.propose_batch(evidence, KEY, 3)
     before = len(compilations)

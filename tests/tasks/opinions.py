@@ -1,5 +1,6 @@
-"""An opinion on four classes, in JAX and in NumPy, and clouds to have it of."""
+"""Opinions on classes, in JAX and in NumPy, and on parts, and clouds to have them of."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,3 +27,17 @@ def drawn_cloud(rng, count, capacity, center=(0.0, 0.0, 0.0)):
     normals = rng.normal(size=(count, 3))
     points = np.asarray(center) + 0.5 * rng.normal(size=(count, 3))
     return PointCloud.from_arrays(points, normals / np.linalg.norm(normals, axis=1, keepdims=True), capacity)
+
+
+def nothing(capacity):
+    return PointCloud(jnp.zeros((capacity, 3)), jnp.zeros((capacity, 3)), jnp.zeros(capacity, bool))
+
+
+class Linear(eqx.Module):
+    """Probabilities of parts that follow from where a point is and how it faces."""
+
+    weight: jax.Array
+
+    def __call__(self, cloud):
+        features = jnp.concatenate([cloud.points, cloud.normals], axis=-1)
+        return jnp.where(cloud.mask[:, None], jax.nn.softmax(features @ self.weight, axis=-1), 0.0)

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from opinions import drawn_cloud, linear, linear_in_numpy
+from opinions import drawn_cloud, linear, linear_in_numpy, nothing
 from solids import balls
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement, expected_value
@@ -47,10 +47,6 @@ def random_cloud(count, capacity, center=(0.0, 0.0, 0.0)):
 def one_point(p):
     """A cloud that `first_point` takes for the probabilities p."""
     return PointCloud.from_arrays(np.array([p]), np.array([[0.0, 0.0, 1.0]]))
-
-
-def nothing(capacity):
-    return PointCloud(jnp.zeros((capacity, 3)), jnp.zeros((capacity, 3)), jnp.zeros(capacity, bool))
 
 
 def entropy_in_numpy(p, q=None):

@@ -1,9 +1,9 @@
 """The coverage acquisition against brute force in float64."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from opinions import drawn_cloud, nothing
 from solids import balls
 
 from jaxnbv.acquisition import expected_value
@@ -16,12 +16,6 @@ from jaxnbv.tasks import Coverage
 CAMERA, GRID = Camera(height=8, width=8), Grid(20)
 
 
-def random_cloud(rng, count, capacity):
-    normals = rng.normal(size=(count, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return PointCloud.from_arrays(rng.uniform(-1.2, 1.2, (count, 3)), normals, capacity)
-
-
 def chamfer(points, data):
     squared = ((points[:, None].astype(np.float64) - data[None].astype(np.float64)) ** 2).sum(-1)
     return squared.min(axis=1).sum() if len(points) else 0.0
@@ -29,24 +23,23 @@ def chamfer(points, data):
 
 def test_one_scan_against_brute_force():
     rng = np.random.default_rng(0)
-    data, seen = random_cloud(rng, 37, 50), random_cloud(rng, 23, 40)
+    data, seen = drawn_cloud(rng, 37, 50), drawn_cloud(rng, 23, 40)
     score = Coverage()
     expected = chamfer(seen.to_numpy()[0], data.to_numpy()[0])
     assert float(score(score.context(data), seen)) == pytest.approx(expected, rel=1e-5)
 
 
 def test_a_scan_that_sees_nothing_or_nothing_new_is_worth_nothing():
-    data = random_cloud(np.random.default_rng(1), 20, 32)
+    data = drawn_cloud(np.random.default_rng(1), 20, 32)
     score = Coverage()
-    empty = PointCloud(jnp.zeros((9, 3)), jnp.zeros((9, 3)), jnp.zeros(9, bool))
-    assert float(score(score.context(data), empty)) == 0
+    assert float(score(score.context(data), nothing(9))) == 0
     assert float(score(score.context(data), data)) == pytest.approx(0.0, abs=1e-5)
 
 
 def test_the_acquisition_against_brute_force_over_all_scans():
     rng = np.random.default_rng(2)
     surfaces = balls(GRID, (0.8, 0.6, 0.9), rng.uniform(-0.3, 0.3, (3, 3)))
-    data, poses = random_cloud(rng, 60, 64), look_at(fibonacci_sphere(5, 2.5))
+    data, poses = drawn_cloud(rng, 60, 64), look_at(fibonacci_sphere(5, 2.5))
     expected = np.zeros((3, 5))
     for s, p in np.ndindex(3, 5):
         surface = jax.tree.map(lambda leaf, s=s: leaf[s], surfaces)
@@ -59,7 +52,7 @@ def test_the_acquisition_against_brute_force_over_all_scans():
 def test_gradient_in_the_scan(x64):
     """d/dx min_y |x - y|^2 = 2 (x - y*); masked rows and normals have none."""
     rng = np.random.default_rng(3)
-    data, seen = random_cloud(rng, 15, 20), random_cloud(rng, 6, 9)
+    data, seen = drawn_cloud(rng, 15, 20), drawn_cloud(rng, 6, 9)
     score = Coverage()
     gradient = jax.grad(lambda points: score(data, PointCloud(points, seen.normals, seen.mask)))(seen.points)
     points, known = np.asarray(seen.points)[:6], np.asarray(data.points)[:15]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import robust_laplacian
 import trimesh
+from opinions import nothing
 from solids import balls
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement, expected_value
@@ -41,10 +42,6 @@ def utility_of(heat, reached_only=False, workers=None):
     return ColdestPoint(
         heat.source, heat.power, heat.duration, heat.steps, heat.initial, heat.radius, reached_only, workers
     )
-
-
-def nothing(capacity):
-    return PointCloud(jnp.zeros((capacity, 3)), jnp.zeros((capacity, 3)), jnp.zeros(capacity, bool))
 
 
 def least_in_numpy(points, heat):

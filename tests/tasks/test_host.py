@@ -1,11 +1,10 @@
 """Classifiers and segmenters on the host against the same in JAX."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from opinions import drawn_cloud, linear, linear_in_numpy
+from opinions import Linear, drawn_cloud, linear, linear_in_numpy
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.checks import InputError
@@ -111,16 +110,6 @@ def test_a_host_classifier_in_a_planners_search():
     np.testing.assert_allclose(proposals[0].values, proposals[1].values, atol=1e-4)
     assert np.ptp(np.asarray(proposals[0].values)) > 1e-2
     np.testing.assert_array_equal(proposals[0].pose.position, proposals[1].pose.position)
-
-
-class Linear(eqx.Module):
-    """Probabilities of parts that follow from where a point is and how it faces."""
-
-    weight: jax.Array
-
-    def __call__(self, cloud):
-        features = jnp.concatenate([cloud.points, cloud.normals], axis=-1)
-        return jnp.where(cloud.mask[:, None], jax.nn.softmax(features @ self.weight, axis=-1), 0.0)
 
 
 def in_numpy(weight, calls):

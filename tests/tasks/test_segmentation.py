@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from opinions import Linear, drawn_cloud, nothing
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.geometry.cloud import PointCloud, concatenate
@@ -17,20 +18,8 @@ RNG = np.random.default_rng(0)
 PARTS = 5
 
 
-class Linear(eqx.Module):
-    """Probabilities that follow from where a point is and how it faces."""
-
-    weight: jax.Array
-
-    def __call__(self, cloud):
-        features = jnp.concatenate([cloud.points, cloud.normals], axis=-1)
-        return jnp.where(cloud.mask[:, None], jax.nn.softmax(features @ self.weight, axis=-1), 0.0)
-
-
 def make_cloud(filled, capacity):
-    normals = RNG.standard_normal((filled, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return PointCloud.from_arrays(RNG.uniform(-1, 1, (filled, 3)), normals, capacity)
+    return drawn_cloud(RNG, filled, capacity)
 
 
 def by_hand(cloud, weight, target):
@@ -107,13 +96,12 @@ def test_a_new_part_is_worth_more_than_more_of_the_same():
 def test_it_is_at_most_the_number_of_parts_and_zero_of_nothing():
     utility = SoftPartCount(Linear(jnp.zeros((6, PARTS))), 1.0)
     assert float(utility(make_cloud(400, 400))) == pytest.approx(PARTS)
-    assert float(utility(PointCloud(jnp.zeros((4, 3)), jnp.zeros((4, 3)), jnp.zeros(4, bool)))) == 0.0
+    assert float(utility(nothing(4))) == 0.0
 
 
 def test_a_scan_that_sees_nothing_is_worth_nothing():
     score = ExpectedUtilityImprovement(SoftPartCount(certain(1)))
-    nothing = PointCloud(jnp.zeros((4, 3)), jnp.zeros((4, 3)), jnp.zeros(4, bool))
-    assert float(score(score.context(make_cloud(5, 8)), nothing)) == 0.0
+    assert float(score(score.context(make_cloud(5, 8)), nothing(4))) == 0.0
 
 
 def test_counts_of_predicted_points():
