@@ -493,7 +493,7 @@ REFUSED = {
         "max_views",
     ),
     "a first view of nothing": (
-        lambda: nbv.simulate(P, BALL, nbv.look_at((0, 0, 2.5), (0, 0, 5)), 2, KEY, progress=False),
+        lambda: P.init(POSE, NO_POINTS),
         "the first scan is empty: no point to start from",
         "oint the camera",
     ),

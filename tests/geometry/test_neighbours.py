@@ -34,14 +34,6 @@ def test_against_kdtree_with_masked_rows_anywhere(count, share):
     np.testing.assert_allclose(found, distance**2, atol=3e-6)
 
 
-def test_float64_to_rounding(x64):
-    rng = np.random.default_rng(1)
-    x, points = rng.normal(size=(40, 3)), rng.normal(size=(70, 3))
-    mask = np.arange(70) % 3 == 1
-    found = nearest_squared_distance(jnp.asarray(x), cloud_of(points, mask))
-    np.testing.assert_allclose(found, brute_force(x, points[mask]), atol=1e-13)
-
-
 def test_points_of_the_cloud_are_at_distance_zero_and_never_below():
     points = np.random.default_rng(2).uniform(-1.5, 1.5, (64, 3)).astype(np.float32)
     found = np.asarray(nearest_squared_distance(jnp.asarray(points), cloud_of(points)))

@@ -89,12 +89,6 @@ def test_a_point_on_the_sphere_is_within():
         np.testing.assert_array_equal(found, ball_by_loop(points, points, mask, radius, 90))
 
 
-def test_a_centre_alone_gets_the_first_filled_row():
-    mask = jnp.arange(7) >= 3
-    found = ball_query(jnp.full((2, 3), 50.0), jnp.zeros((7, 3)), mask, 1.0, 4)
-    np.testing.assert_array_equal(found, 3)
-
-
 def test_under_vmap_and_map_as_one_by_one():
     points = jnp.asarray(RNG.normal(size=(4, 90, 3)), jnp.float32)
     mask = jnp.asarray(RNG.random((4, 90)) < 0.6)

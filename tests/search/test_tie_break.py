@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_discrete import CAMERA, problem, visit
 
-from jaxnbv.acquisition import Acquisition, Several, expected_value
+from jaxnbv.acquisition import Acquisition, expected_value
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.planning.travel import ValueMinusCost, arc_length
 from jaxnbv.search import DiscreteSearch, TieBreakSearch
@@ -106,10 +106,3 @@ def test_the_way_there_counts(problem):
 
 def test_a_second_score_that_is_no_number_is_told_of(problem):
     assert np.isnan(float(search(problem, Constant(np.nan)).value))
-
-
-def test_scores_of_several_questions_are_those_of_each(problem):
-    poses = look_at(fibonacci_sphere(5, 2.5))
-    both = problem.about(Several((Coverage(), Height()))).scores(poses)
-    for found, score in zip(both, (Coverage(), Height()), strict=True):
-        np.testing.assert_allclose(found, problem.about(score).scores(poses), rtol=1e-6)
