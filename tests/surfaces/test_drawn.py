@@ -33,10 +33,9 @@ def sphere(count=40):
     return PointCloud.from_arrays(0.7 * points, points, capacity=count + 8)
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_the_probability_of_being_inside_is_the_share_of_the_samples_that_are(name):
+def test_the_probability_of_being_inside_is_the_share_of_the_samples_that_are():
     """1,500 samples at 40 points, within 4.5 standard errors and the rounding of a share."""
-    posterior, count = MODELS[name].condition(sphere()), 1500
+    posterior, count = MODELS["screened"].condition(sphere()), 1500
     probability = np.asarray(posterior.probability_inside(X), np.float64)
     share = np.mean(posterior.sample(jax.random.key(1), count)(X) < posterior.level, axis=0)
     error = np.sqrt(probability * (1 - probability) / count)
