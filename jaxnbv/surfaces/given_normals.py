@@ -1,7 +1,9 @@
 """What posteriors given oriented points share, whatever solves A w = n for them.
 
-mean     Poisson(k(., X) A^-1 n)
-sample   Poisson(v + k(., X) A^-1 (n - v(X) - eps)), v and eps from the prior
+    mean     Poisson(k(., X) A^-1 n)
+    sample   Poisson(v + k(., X) A^-1 (n - v(X) - eps)), v and eps from the prior
+
+Names are those of `jaxnbv.surfaces.spsr`.
 """
 
 from abc import abstractmethod
