@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from on_grid import nodes
 from scipy.ndimage import gaussian_filter, map_coordinates
-from solids import nodes
 
 from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement, expected_value
 from jaxnbv.geometry.camera import Camera

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.ndimage
-from solids import nodes
+from on_grid import nodes
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.scanning.grid import Grid, GridSurface

@@ -4,7 +4,7 @@ import math
 
 import equinox as eqx
 import numpy as np
-from solids import nodes
+from on_grid import nodes
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import look_at

@@ -8,8 +8,8 @@ import trimesh
 from bumps import GRID, random_rays, rough_values
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from on_grid import nodes
 from skimage.measure import marching_cubes
-from solids import nodes
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at

@@ -10,7 +10,7 @@ import optimistix as optx
 import pytest
 from bumps import FEW, GRID, grid_surface, solid, some_bumps, some_rays
 from jax.scipy.ndimage import map_coordinates
-from solids import nodes
+from on_grid import nodes
 
 from jaxnbv.geometry.pose import look_at
 from jaxnbv.scanning.grid import GridSurface

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from solids import nodes
+from on_grid import nodes
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from solids import balls
+from on_grid import balls
 
 from jaxnbv.acquisition import expected_value
 from jaxnbv.geometry.camera import Camera

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+from on_grid import balls, nodes
 from scipy.ndimage import gaussian_filter
-from solids import balls, nodes
 from test_discrete import visit
 
 from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement

@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from on_grid import balls
 from opinions import drawn_cloud, linear, linear_in_numpy, nothing
-from solids import balls
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement, expected_value
 from jaxnbv.checks import InputError

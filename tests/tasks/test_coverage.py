@@ -3,8 +3,8 @@
 import jax
 import numpy as np
 import pytest
+from on_grid import balls
 from opinions import drawn_cloud, nothing
-from solids import balls
 
 from jaxnbv.acquisition import expected_value
 from jaxnbv.geometry.camera import Camera

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import robust_laplacian
 import trimesh
+from on_grid import balls
 from opinions import nothing
-from solids import balls
 
 from jaxnbv.acquisition import ExpectedUtilityImprovement, expected_value
 from jaxnbv.checks import InputError

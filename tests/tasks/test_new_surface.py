@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from on_grid import balls
 from scipy.integrate import quad
-from solids import balls
 
 from jaxnbv.acquisition import Several, expected_value
 from jaxnbv.geometry.camera import Camera

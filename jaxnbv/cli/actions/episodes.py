@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import textwrap
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -201,7 +202,8 @@ def _run(
             f"enough   after view {len(episode.views)}: {episode.stopped}. {saved} of {asked.views} views {are} saved"
         )
     if raced is not None:
-        typer.echo(f"race     {race_words(raced, episode)}")
+        told = race_words(raced, episode)
+        typer.echo(textwrap.fill(told, 100, initial_indent="race     ", subsequent_indent="         "))
     if asked.report:
         typer.echo(f"report   {viz.write_report(episode, folder, title=name, rival=raced, sketches=sketches)}")
     typer.echo(f"episode  {folder}   ({time.perf_counter() - start:.0f} s)")
