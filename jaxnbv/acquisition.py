@@ -318,19 +318,23 @@ def sample_scores(
     - `own_contexts`: the context has a leading axis of samples, one each.
     - `barrier`: see `scan`.
     """
-
     own, common = (context, None) if own_contexts else (None, context)
     return shared_map(_of_sample, (surfaces, own), common, (poses, barrier), acquisition, camera)
 
 
-def _of_sample(sample: tuple[GridSurface, Any], common: Any, views: "_Views", acquisition: Acquisition, camera: Camera):
+# Poses, and how far along the rays from each obstacles stand.
+_Views: TypeAlias = tuple[Pose, Float[Array, "poses rays"] | None]
+
+
+def _of_sample(
+    sample: tuple[GridSurface, Any], common: Any, views: _Views, acquisition: Acquisition, camera: Camera
+) -> Float[Array, "poses *scores"]:
     surface, own = sample
     return shared(_of_poses, views, surface, common if own is None else own, acquisition, camera)
 
 
-def _of_poses(views: "_Views", surface: GridSurface, context: Any, acquisition: Acquisition, camera: Camera):
+def _of_poses(
+    views: _Views, surface: GridSurface, context: Any, acquisition: Acquisition, camera: Camera
+) -> Float[Array, "poses *scores"]:
     poses, barrier = views
     return scores(acquisition, context, scan(surface, camera, poses, barrier), camera, poses)
-
-
-_Views: TypeAlias = tuple[Pose, Float[Array, "poses rays"] | None]

@@ -34,8 +34,8 @@ def shared(function: Callable[..., Any], rows: Any, *common: Any) -> Any:
     if devices == 1 or count < devices:
         return function(rows, *common)
     # The last devices take some of the first rows again where they do not come out even.
-    taken = jnp.arange(-(-count // devices) * devices) % count
-    arrays, rest = eqx.partition((jax.tree.map(lambda leaf: leaf[taken], rows), common), eqx.is_array)
+    rows = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf[: -count % devices]]), rows)
+    arrays, rest = eqx.partition((rows, common), eqx.is_array)
 
     def on_each(share: Any, common: Any) -> Any:
         share, common = eqx.combine((share, common), rest)

@@ -35,13 +35,12 @@ class IterativePosterior(NormalsPosterior):
     @eqx.filter_jit
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
         """Var f(x) at points in scene coordinates: a solve each."""
-        x = jnp.asarray(x, dtype=self.weights.dtype)
+        x, prior = jnp.asarray(x, dtype=self.weights.dtype), function_variance(self.spectrum)
 
         def at_point(point):
             cross = function_normal_covariance(point[None], self.cloud.points, self.spectrum)[:, 0].T
             cross = jnp.where(self.cloud.mask[:, None], cross, 0.0)
-            explained = jnp.sum(cross * self.solve(cross[None])[0])
-            return jnp.maximum(function_variance(self.spectrum) - explained, 0.0)
+            return jnp.maximum(prior - jnp.sum(cross * self.solve(cross[None])[0]), 0.0)
 
         return jax.lax.map(at_point, x)
 
