@@ -27,6 +27,7 @@ from timing import least_time
 import jaxnbv as nbv
 from jaxnbv.networks import pyramid_classifier
 from jaxnbv.planning.episode import observe_scene
+from jaxnbv.scanning import samples_at_once
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.storage.folders import versions
 from jaxnbv.studies.scenes import Framing, Split, demo_object, hidden_view, pyramid_scene
@@ -92,7 +93,7 @@ def coverage(bench: Bench) -> None:
     def values(cloud, seen):
         context = planner.acquisition.context(cloud)
         score = lambda of: nbv.acquisition.scores(planner.acquisition, context, of, planner.camera, bench.candidates)  # noqa: E731
-        return jnp.mean(jax.lax.map(score, seen), axis=0)
+        return jnp.mean(jax.lax.map(score, seen, batch_size=samples_at_once(planner.camera, bench.candidates)), axis=0)
 
     # What is timed must be what a step does.
     expected = nbv.expected_value(planner.acquisition, evidence.cloud, surfaces, planner.camera, bench.candidates)

@@ -20,8 +20,8 @@ from jaxnbv.checks import InputError, check_fields, checked, functions_of_users,
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.scanning import GridSurface, Surface, scan
-from jaxnbv.sharding import shared, shared_map
+from jaxnbv.scanning import GridSurface, Surface, samples_at_once, scan
+from jaxnbv.sharding import on_cpu, shared, shared_map
 
 
 class Quantity(eqx.Module):
@@ -104,7 +104,7 @@ def preferred_batch_size(function: Any) -> int:
 
     Otherwise a CPU takes them one by one, lest a network's layers leave its cache, and a GPU many at once.
     """
-    return getattr(function, "batch_size", 1 if jax.default_backend() == "cpu" else 128)
+    return getattr(function, "batch_size", 1 if on_cpu() else 128)
 
 
 class ExpectedUtilityImprovement(Acquisition):
@@ -291,13 +291,15 @@ def expected_value(
 
 
 def scores(
-    acquisition: Acquisition, context: Any, scans: PointCloud, camera: Camera, poses: Pose
+    acquisition: Acquisition, context: Any, scans: PointCloud, camera: Camera, poses: Pose, samples: int = 1
 ) -> Float[Array, "poses *scores"]:
-    """The score of each of a batch of scans, one from each of a batch of poses, `batch_size` of them at a time."""
+    """The score of each of a batch of scans, one from each of a batch of poses, `batch_size` of them at a time; fewer
+    where several samples are scored together.
+    """
     return jax.lax.map(
         lambda taken: acquisition.score(context, taken[0], camera, taken[1]),
         (scans, poses),
-        batch_size=acquisition.batch_size,
+        batch_size=max(1, acquisition.batch_size // samples),
     )
 
 
@@ -312,14 +314,16 @@ def sample_scores(
 ) -> Float[Array, "samples poses *scores"]:
     """The score of what each of the sampled surfaces would show from each of a batch of poses.
 
-    Samples are taken one after the other, with all poses scanned at once and scored `batch_size` of them at a time, so
-    memory is that of one sample's scans. They are shared among devices, or the poses are where samples are too few.
+    All poses are scanned at once, of one sample or of `samples_at_once`, so memory is that of these scans; they are
+    scored `batch_size` of them at a time. Samples are shared among devices, or the poses are where samples are too few.
 
     - `own_contexts`: the context has a leading axis of samples, one each.
     - `barrier`: see `scan`.
     """
     own, common = (context, None) if own_contexts else (None, context)
-    return shared_map(_of_sample, (surfaces, own), common, (poses, barrier), acquisition, camera)
+    together = min(samples_at_once(camera, poses), surfaces.values.shape[0])
+    views = poses, barrier
+    return shared_map(_of_sample, (surfaces, own), common, views, acquisition, camera, together, at_once=together)
 
 
 # Poses, and how far along the rays from each obstacles stand.
@@ -327,14 +331,14 @@ _Views: TypeAlias = tuple[Pose, Float[Array, "poses rays"] | None]
 
 
 def _of_sample(
-    sample: tuple[GridSurface, Any], common: Any, views: _Views, acquisition: Acquisition, camera: Camera
+    sample: tuple[GridSurface, Any], common: Any, views: _Views, acquisition: Acquisition, camera: Camera, together: int
 ) -> Float[Array, "poses *scores"]:
     surface, own = sample
-    return shared(_of_poses, views, surface, common if own is None else own, acquisition, camera)
+    return shared(_of_poses, views, surface, common if own is None else own, acquisition, camera, together)
 
 
 def _of_poses(
-    views: _Views, surface: GridSurface, context: Any, acquisition: Acquisition, camera: Camera
+    views: _Views, surface: GridSurface, context: Any, acquisition: Acquisition, camera: Camera, together: int
 ) -> Float[Array, "poses *scores"]:
     poses, barrier = views
-    return scores(acquisition, context, scan(surface, camera, poses, barrier), camera, poses)
+    return scores(acquisition, context, scan(surface, camera, poses, barrier), camera, poses, together)

@@ -18,9 +18,16 @@ import jax.numpy as jnp
 from jax.sharding import AxisType, PartitionSpec, get_abstract_mesh
 
 
-def shared_map(function: Callable[..., Any], rows: Any, *common: Any) -> Any:
-    """`function(row, *common)` for each row of a tree, as `jax.lax.map`, with a share of the rows on each device."""
-    return shared(lambda share, *common: jax.lax.map(lambda row: function(row, *common), share), rows, *common)
+def shared_map(function: Callable[..., Any], rows: Any, *common: Any, at_once: int = 1) -> Any:
+    """`function(row, *common)` for each row of a tree, as `jax.lax.map`, with a share of the rows on each device.
+
+    - `at_once`: rows that a device takes together.
+    """
+
+    def each(share: Any, *common: Any) -> Any:
+        return jax.lax.map(lambda row: function(row, *common), share, batch_size=None if at_once == 1 else at_once)
+
+    return shared(each, rows, *common)
 
 
 def shared(function: Callable[..., Any], rows: Any, *common: Any) -> Any:
@@ -44,6 +51,12 @@ def shared(function: Callable[..., Any], rows: Any, *common: Any) -> Any:
     specs, whole = (PartitionSpec(axes), PartitionSpec()), PartitionSpec()
     everywhere = jax.shard_map(on_each, in_specs=specs, out_specs=whole, axis_names=set(axes), check_vma=False)
     return jax.tree.map(lambda leaf: leaf[:count], everywhere(*arrays))
+
+
+def on_cpu() -> bool:
+    """Whether programs run on the CPU: `jax_default_device` says so, or else what JAX found."""
+    device = jax.config.jax_default_device
+    return (jax.default_backend() if device is None else getattr(device, "platform", device)) == "cpu"
 
 
 def _axes() -> tuple[tuple[str, ...], int]:

@@ -6,7 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement, Several, expected_value
+from jaxnbv.acquisition import (
+    Acquisition,
+    ExpectedUtilityImprovement,
+    Several,
+    expected_value,
+    preferred_batch_size,
+)
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate
@@ -14,8 +20,9 @@ from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.imagination import Imagination
 from jaxnbv.networks import pyramid_classifier
 from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Grid, GridSurface, scan
-from jaxnbv.search import DiscreteSearch, FarthestView
+from jaxnbv.scanning import Grid, GridSurface, SDFSurface, samples_at_once, scan
+from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.search import DiscreteSearch, FarthestView, GradientSearch
 from jaxnbv.surfaces import GeometricSPSR, ScreenedSPSR
 from jaxnbv.tasks import ColdestPoint, Coverage, CrossEntropy, NewSurface
 
@@ -183,23 +190,57 @@ def test_what_is_neither_an_acquisition_nor_a_function_is_named(given):
         Planner(given, FarthestView(6))
 
 
-@pytest.mark.parametrize(
-    ("acquisition", "leaves"),
-    [
-        (Coverage(), False),
-        (NewSurface(), False),
-        (CrossEntropy(pyramid_classifier(), num_points=64), False),
-        (ExpectedUtilityImprovement(ColdestPoint(source=(0.0, 0.0, 1.0))), True),
-    ],
-    ids=["coverage", "new surface", "classes", "heat"],
-)
-def test_only_heat_is_computed_by_the_host(surfaces, cloud, acquisition, leaves):
+ACQUISITIONS = {
+    "coverage": Coverage(),
+    "new surface": NewSurface(),
+    "classes": CrossEntropy(pyramid_classifier(), num_points=64),
+    "heat": ExpectedUtilityImprovement(ColdestPoint(source=(0.0, 0.0, 1.0))),
+}
+
+
+@pytest.mark.parametrize("name", ACQUISITIONS)
+def test_only_heat_is_computed_by_the_host(surfaces, cloud, name):
     """Its Laplacian has no JAX; all else stays on the device."""
 
     def step(cloud, surfaces):
-        return expected_value(acquisition, cloud, surfaces, CAMERA, POSES)
+        return expected_value(ACQUISITIONS[name], cloud, surfaces, CAMERA, POSES)
 
-    assert ("callback" in str(jax.make_jaxpr(step)(cloud, surfaces))) == leaves
+    assert ("callback" in str(jax.make_jaxpr(step)(cloud, surfaces))) == (name == "heat")
+
+
+@pytest.mark.parametrize("name", ACQUISITIONS)
+def test_samples_that_a_gpu_takes_together_have_the_same_scores(surfaces, cloud, name, monkeypatch):
+    alone = expected_value(ACQUISITIONS[name], cloud, surfaces, CAMERA, POSES)
+    for module in ("acquisition", "scanning.grid", "tasks.coverage", "tasks.new_surface"):
+        monkeypatch.setattr(f"jaxnbv.{module}.on_cpu", lambda: False)
+    assert samples_at_once(CAMERA, POSES) > 3
+    together = expected_value(ACQUISITIONS[name], cloud, surfaces, CAMERA, POSES)
+    np.testing.assert_allclose(together, alone, rtol=1e-4, atol=1e-5)
+
+
+def test_a_device_that_is_set_counts_and_not_the_one_that_was_found(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert preferred_batch_size(height) == 128
+    with jax.default_device(jax.devices("cpu")[0]):
+        assert preferred_batch_size(height) == 1
+    with jax.default_device("cpu"):
+        assert preferred_batch_size(height) == 1
+
+
+@pytest.mark.parametrize("search", [DiscreteSearch(6), GradientSearch(6, num_candidates=6)], ids=["search", "ascent"])
+@pytest.mark.parametrize("model", [GeometricSPSR(0.1, truncation=6), ScreenedSPSR()], ids=["paper", "screened"])
+def test_all_products_have_full_precision(model, search):
+    """GPUs multiply float32 matrices with 10 bits of each number unless asked not to."""
+    first = look_at((0.3, 1.0, 2.3))
+
+    def step(angle, key):
+        solid = Sphere(0.5).translate((0.1, 0.0, 0.0)).rotate((1.0, 2.0, 3.0), angle)
+        planner = Planner(ACQUISITIONS["classes"], search, CAMERA, Imagination(model, Grid(16), 2), capacity=64)
+        evidence = planner.init(first, scan(SDFSurface(solid), CAMERA, first))
+        return planner.propose(planner.observe(evidence, first, scan(SDFSurface(solid), CAMERA, first)), key)
+
+    program = str(jax.make_jaxpr(step)(0.3, jax.random.key(0)))
+    assert program.count("dot_general[") == program.count("precision=(Precision.HIGHEST, Precision.HIGHEST)") > 20
 
 
 @pytest.mark.parametrize("model", [GeometricSPSR(0.2, truncation=4), ScreenedSPSR()], ids=["paper", "screened"])

@@ -108,7 +108,7 @@ class ViewEnvironment(gymnasium.Env[Observation, Any]):
         known = self._evidence
         self._evidence = planner.init(pose, scan) if known is None else planner.observe(known, pose, scan)
         self._pose, self._value = pose, float(self.utility(self._evidence.cloud))
-        along = (scan.points - pose.position) @ pose.forward
+        along = jnp.matmul(scan.points - pose.position, pose.forward, precision="highest")
         depth = jnp.where(scan.mask, jnp.maximum(along, 0.0), 0.0).reshape(planner.camera.height, planner.camera.width)
         return {"depth": np.asarray(depth, np.float32), "matrix": np.asarray(pose.matrix, np.float32)}
 

@@ -17,7 +17,7 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import tracing
 from jaxnbv.scanning.scanner import scan
 from jaxnbv.scanning.surface import Hits, Surface
-from jaxnbv.sharding import shared_map
+from jaxnbv.sharding import on_cpu, shared_map
 
 # The cosine of two normals that look in opposite directions, and the share of the points that is worth a warning.
 _OPPOSITE, _THIN_SHARE = -0.8, 0.05
@@ -137,7 +137,13 @@ def scan_samples(
 
     For s surfaces and p poses, clouds with leading axes (s, p); rows as `scan` gives them, and `barrier` as it takes.
     """
-    return shared_map(scan, surfaces, camera, poses, barrier)
+    return shared_map(scan, surfaces, camera, poses, barrier, at_once=samples_at_once(camera, poses))
+
+
+def samples_at_once(camera: Camera, poses: Pose) -> int:
+    """How many samples are scanned together from a batch of poses: one on a CPU, lest its scans leave the cache; on a
+    GPU as many as make eight million rays."""
+    return 1 if on_cpu() else max(1, 2**23 // (poses.position.shape[0] * camera.num_rays))
 
 
 @eqx.filter_jit

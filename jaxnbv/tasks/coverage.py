@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 from jaxnbv.acquisition import Acquisition, Quantity
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.neighbours import nearest_squared_distance
+from jaxnbv.sharding import on_cpu
 
 
 class Coverage(Acquisition):
@@ -27,4 +28,4 @@ class Coverage(Acquisition):
     @property
     def batch_size(self) -> int:
         """Many scans at once: the loop over D runs once for all of them."""
-        return 128
+        return 128 if on_cpu() else 2048

@@ -17,7 +17,7 @@ class HostClassifier(eqx.Module):
     """A classifier that runs outside JAX, a PyTorch model say: for search over candidates only.
 
     - `function`: from points (b, n, 3), unit normals (b, n, 3) and mask (b, n), as NumPy arrays, to log-probabilities
-      (b, num_classes). It is called with up to 128 candidates of one posterior sample at once.
+      (b, num_classes). It is called with up to 128 scans at once.
     - `num_classes`: how many classes it tells apart.
 
     **Raises:** `ValueError` when a gradient is asked for. A function that returns another shape, or fails, fails within
@@ -56,8 +56,8 @@ class HostSegmenter(eqx.Module):
     """A segmenter that runs outside JAX, a PyTorch model say: for search over candidates only.
 
     - `function`: from points (b, n, 3), unit normals (b, n, 3) and mask (b, n), as NumPy arrays, to probabilities of
-      the parts (b, n, num_parts). It is called with up to 128 candidates of one posterior sample at once; rows that the
-      mask leaves out count for nothing, whatever it says of them.
+      the parts (b, n, num_parts). It is called with up to 128 scans at once; rows that the mask leaves out count for
+      nothing, whatever it says of them.
     - `num_parts`: how many parts it tells apart.
 
     **Raises:** as `HostClassifier`.

@@ -15,6 +15,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.neighbours import DistanceField, spacing
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning.metrics import GRAZING
+from jaxnbv.sharding import on_cpu
 from jaxnbv.tasks.stopping import SoFar, Stop
 
 
@@ -63,7 +64,7 @@ class NewSurface(Acquisition):
     @property
     def batch_size(self) -> int:
         """Many scans at once: little is computed of each."""
-        return 128
+        return 128 if on_cpu() else 2048
 
 
 def visible_area(scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, " rays"]:

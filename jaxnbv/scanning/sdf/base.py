@@ -87,11 +87,11 @@ def _least_of_last_jvp(values, tangents):
 
 @jax.jit
 def _rotation_about(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Rodrigues' formula."""
-    x, y, z = axis / norm(*axis)
+    """Rodrigues' formula, cos I + sin [k]_x + (1 - cos) k k^T about the unit axis k."""
+    x, y, z = unit = axis / norm(*axis)
     zero = jnp.zeros_like(x)
     cross = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-    return jnp.eye(3) + jnp.sin(angle) * cross + (1.0 - jnp.cos(angle)) * cross @ cross
+    return jnp.cos(angle) * jnp.eye(3) + jnp.sin(angle) * cross + (1.0 - jnp.cos(angle)) * unit[:, None] * unit
 
 
 def corner_distance(*q):
