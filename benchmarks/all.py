@@ -27,7 +27,7 @@ from timing import least_time
 import jaxnbv as nbv
 from jaxnbv.networks import pyramid_classifier
 from jaxnbv.planning.episode import observe_scene
-from jaxnbv.scanning import samples_at_once
+from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.storage.folders import versions
 from jaxnbv.studies.scenes import Framing, Split, demo_object, hidden_view, pyramid_scene

@@ -20,7 +20,8 @@ from jaxnbv.checks import InputError, check_fields, checked, functions_of_users,
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.scanning import GridSurface, Surface, samples_at_once, scan
+from jaxnbv.scanning import GridSurface, Surface, scan
+from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.sharding import on_cpu, shared, shared_map
 
 

@@ -55,7 +55,7 @@ def shared(function: Callable[..., Any], rows: Any, *common: Any) -> Any:
 
 def on_cpu() -> bool:
     """Whether programs run on the CPU: `jax_default_device` says so, or else what JAX found."""
-    device = jax.config.jax_default_device
+    device = jax.config.jax_default_device  # type: ignore[attr-defined]
     return (jax.default_backend() if device is None else getattr(device, "platform", device)) == "cpu"
 
 

@@ -20,7 +20,8 @@ from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.imagination import Imagination
 from jaxnbv.networks import pyramid_classifier
 from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Grid, GridSurface, SDFSurface, samples_at_once, scan
+from jaxnbv.scanning import Grid, GridSurface, SDFSurface, scan
+from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.search import DiscreteSearch, FarthestView, GradientSearch
 from jaxnbv.surfaces import GeometricSPSR, ScreenedSPSR

@@ -13,7 +13,6 @@ from jaxnbv.scanning.grid import GridSurface as GridSurface
 from jaxnbv.scanning.grid import imagine as imagine
 from jaxnbv.scanning.grid import mean_depth as mean_depth
 from jaxnbv.scanning.grid import nothing_imagined as nothing_imagined
-from jaxnbv.scanning.grid import samples_at_once as samples_at_once
 from jaxnbv.scanning.grid import scan_samples as scan_samples
 from jaxnbv.scanning.mesh import TriangleMesh as TriangleMesh
 from jaxnbv.scanning.mesh import mesh_from_sdf as mesh_from_sdf
