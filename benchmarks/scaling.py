@@ -1,0 +1,89 @@
+"""How the time of a step grows with points, samples, candidates and rays, as JSON and a figure.
+
+    python benchmarks/scaling.py [--out runs/scaling]
+
+One of the four is changed at a time, about what sessions plan by: new surface, two views of a mug of which 2,000 points
+are kept, 16 samples, 120 candidates, 50 x 50 rays, here by the full search. Times are after compilation, the least of
+three: of the samples (posterior, values on the grid) and of the search. Continues after the last time in the file:
+give another file for another machine.
+"""
+
+import argparse
+import dataclasses
+import functools
+import json
+from pathlib import Path
+
+import jax
+import matplotlib.pyplot as plt
+from timing import least_time
+
+import jaxnbv as nbv
+from jaxnbv.planning.episode import observe_scene
+from jaxnbv.storage.files import write_text
+from jaxnbv.studies.scenes import demo_object
+
+USUAL = {"points": 2000, "samples": 16, "candidates": 120, "rays": 50**2}
+ASKED = {
+    "points": (500, 1000, 2000, 4000, 8000),
+    "samples": (4, 8, 16, 32, 64),
+    "candidates": (30, 60, 120, 240, 480),
+    "rays": tuple(side**2 for side in (12, 25, 50, 100, 200)),
+}
+STAGES = {"samples": "posterior and samples", "search": "search"}
+
+
+@functools.cache
+def measured(points: int, samples: int, candidates: int, rays: int) -> dict[str, float]:
+    """Seconds by stage."""
+    side, key = round(rays**0.5), jax.random.key(0)
+    imagination = dataclasses.replace(nbv.Imagination(), num_samples=samples)
+    camera, search = nbv.Camera(height=side, width=side), nbv.DiscreteSearch(candidates)
+    planner = nbv.Planner(nbv.NewSurface(), search, camera, imagination, capacity=points)
+    # The sensor's own rays are more than those that are imagined: D is full at any size.
+    sensor, scene, evidence = nbv.Camera(height=150, width=150), demo_object(), None
+    for position in ((0.8, 0.9, 2.2), (-1.4, 0.6, -1.9)):
+        pose = nbv.look_at(position)
+        seen = observe_scene(scene, sensor, pose, nbv.SensorNoise(), key)
+        evidence = planner.observe(evidence, pose, seen, sensor) if evidence else planner.init(pose, seen, sensor)
+    assert int(evidence.cloud.count) == points
+    surfaces = planner.sample(evidence, key)
+    return {
+        "samples": least_time(lambda: planner.sample(evidence, key)),
+        "search": least_time(lambda: planner.choose(evidence, surfaces, key)),
+    }
+
+
+def figure(held: dict[str, dict[str, dict[str, float]]], path: Path) -> None:
+    """A panel for each of the four, both axes logarithmic."""
+    shown, panels = plt.subplots(1, len(ASKED), figsize=(11, 2.7), sharey=True, layout="constrained")
+    for panel, (name, sizes) in zip(panels, ASKED.items(), strict=True):
+        for stage, label in STAGES.items():
+            panel.loglog(sizes, [held[name][str(size)][stage] for size in sizes], "o-", label=label)
+        panel.set(xlabel=name, xticks=sizes, xticklabels=[f"{size:,}" for size in sizes])
+        panel.minorticks_off()
+        panel.axvline(USUAL[name], color="0.8", zorder=0)
+        panel.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("seconds")
+    panels[0].legend(frameon=False)
+    shown.savefig(path, dpi=150)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("runs/scaling"))
+    out = parser.parse_args().out
+    out.parent.mkdir(parents=True, exist_ok=True)
+    file = out.with_suffix(".json")
+    held = json.loads(file.read_text()) if file.exists() else {}
+    for name, sizes in ASKED.items():
+        for size in sizes:
+            if str(size) not in held.setdefault(name, {}):
+                held[name][str(size)] = measured(**USUAL | {name: size})
+                print(f"{size:,} {name}: {held[name][str(size)]}", flush=True)
+                write_text(file, json.dumps(held))
+    figure(held, out.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    main()
