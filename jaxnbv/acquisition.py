@@ -22,7 +22,7 @@ from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import GridSurface, Surface, scan
 from jaxnbv.scanning.grid import samples_at_once
-from jaxnbv.sharding import on_cpu, shared, shared_map
+from jaxnbv.sharding import on_cpu, share_of, shared, shared_map
 
 
 class Quantity(eqx.Module):
@@ -322,7 +322,7 @@ def sample_scores(
     - `barrier`: see `scan`.
     """
     own, common = (context, None) if own_contexts else (None, context)
-    together = min(samples_at_once(camera, poses), surfaces.values.shape[0])
+    together = min(samples_at_once(camera, poses), share_of(surfaces.values.shape[0]))
     views = poses, barrier
     return shared_map(_of_sample, (surfaces, own), common, views, acquisition, camera, together, at_once=together)
 

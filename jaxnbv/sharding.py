@@ -53,6 +53,12 @@ def shared(function: Callable[..., Any], rows: Any, *common: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[:count], everywhere(*arrays))
 
 
+def share_of(count: int) -> int:
+    """How many of so many rows each device takes."""
+    _, devices = _axes()
+    return count if count < devices else -(-count // devices)
+
+
 def on_cpu() -> bool:
     """Whether programs run on the CPU: `jax_default_device` says so, or else what JAX found."""
     device = jax.config.jax_default_device  # type: ignore[attr-defined]
