@@ -28,7 +28,7 @@ ASKED = {
     "points": (500, 1000, 2000, 4000, 8000),
     "samples": (4, 8, 16, 32, 64),
     "candidates": (30, 60, 120, 240, 480),
-    "rays": tuple(side**2 for side in (12, 25, 50, 100, 200)),
+    "rays": tuple(side**2 for side in (12, 25, 50, 100)),
 }
 STAGES = {"samples": "posterior and samples", "search": "search"}
 
@@ -64,7 +64,8 @@ def figure(held: dict[str, dict[str, dict[str, float]]], path: Path) -> None:
         panel.minorticks_off()
         panel.axvline(USUAL[name], color="0.8", zorder=0)
         panel.spines[["top", "right"]].set_visible(False)
-    panels[0].set_ylabel("seconds")
+    seconds = (0.02, 0.1, 0.5, 1, 2, 5, 10, 50)
+    panels[0].set(ylabel="seconds", yticks=seconds, yticklabels=seconds, ylim=panels[0].get_ylim())
     panels[0].legend(frameon=False)
     shown.savefig(path, dpi=150)
 

@@ -25,7 +25,7 @@ from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.search import DiscreteSearch, FarthestView, GradientSearch
 from jaxnbv.surfaces import GeometricSPSR, ScreenedSPSR
-from jaxnbv.tasks import ColdestPoint, Coverage, CrossEntropy, NewSurface
+from jaxnbv.tasks import ColdestPoint, Coverage, CrossEntropy, HostClassifier, NewSurface
 
 CAMERA = Camera(height=6, width=7)
 GRID = Grid(20)
@@ -209,13 +209,21 @@ def test_only_heat_is_computed_by_the_host(surfaces, cloud, name):
     assert ("callback" in str(jax.make_jaxpr(step)(cloud, surfaces))) == (name == "heat")
 
 
-@pytest.mark.parametrize("name", ACQUISITIONS)
+def sides(points, normals, mask):
+    """Of clouds, log-probabilities of which side has more, in NumPy."""
+    logits = np.sum(points[..., :2] * mask[..., None], axis=1)
+    return logits - np.log(np.exp(logits).sum(axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize("name", ["coverage", "new surface", "classes", "host"])
 def test_samples_that_a_gpu_takes_together_have_the_same_scores(surfaces, cloud, name, monkeypatch):
-    alone = expected_value(ACQUISITIONS[name], cloud, surfaces, CAMERA, POSES)
+    acquisition = CrossEntropy(HostClassifier(sides, 2)) if name == "host" else ACQUISITIONS[name]
+    alone = expected_value(acquisition, cloud, surfaces, CAMERA, POSES)
     for module in ("acquisition", "scanning.grid", "tasks.coverage", "tasks.new_surface"):
         monkeypatch.setattr(f"jaxnbv.{module}.on_cpu", lambda: False)
     assert samples_at_once(CAMERA, POSES) > 3
-    together = expected_value(ACQUISITIONS[name], cloud, surfaces, CAMERA, POSES)
+    together = expected_value(acquisition, cloud, surfaces, CAMERA, POSES)
+    assert float(jnp.ptp(alone)) > 1e-3
     np.testing.assert_allclose(together, alone, rtol=1e-4, atol=1e-5)
 
 
