@@ -17,9 +17,11 @@ from jaxnbv.geometry.neighbours import nearest_squared_distance
 from jaxnbv.studies.scenes import demo_object, hidden_view
 from jaxnbv.surfaces.known_shapes import kind_of
 from jaxnbv.viz.choice import choice_of
-from jaxnbv.viz.figures import STYLE, draw_acquisition
-from jaxnbv.viz.imagined import look
-from jaxnbv.viz.render import Still, beside, draw_cameras, draw_points, frame, look_picture
+from jaxnbv.viz.choice_figures import draw_acquisition
+from jaxnbv.viz.figures import STYLE
+from jaxnbv.viz.imagined import look, look_picture
+from jaxnbv.viz.render import Still, beside, draw_items, frame
+from jaxnbv.viz.scene import seen_items
 from jaxnbv.viz.style import BEFORE, GREY, INK, NEW, VALUE
 
 SHOWN = 4
@@ -52,8 +54,7 @@ def draw_posterior(
     pose = evidence.poses[0]
     still = Still(beside(pose), None, 500, 2.5)
     points, _ = evidence.cloud.to_numpy()
-    shown = draw_points(first, still, points, NEW, 1.2)
-    frame(first, still, [shown, *draw_cameras(first, still, [pose], planner.camera, 1.0)])
+    frame(first, still, draw_items(first, still, seen_items(points[:0], points, [pose], planner.camera)))
     first.axis("off")
     for sample in np.asarray(surfaces.values[:SHOWN, middle]):
         second.contour(axis, axis, sample, levels=[0.0], colors=[BEFORE], linewidths=0.9, alpha=0.75)

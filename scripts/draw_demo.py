@@ -18,8 +18,8 @@ from jaxnbv.cli.actions.tasks import COMMAND_TASKS
 from jaxnbv.cli.actions.until import rule
 from jaxnbv.viz.data import ReportData, report_data
 from jaxnbv.viz.figures import STYLE, Stills
-from jaxnbv.viz.imagined_figures import Tile, looks
-from jaxnbv.viz.render import draw_scene, look_picture
+from jaxnbv.viz.imagined import Tile, look_picture, looks
+from jaxnbv.viz.render import draw_scene
 from jaxnbv.viz.style import GREY, NEW
 from jaxnbv.viz.task_figures import over_views
 

@@ -19,9 +19,10 @@ from jaxnbv.scanning.metrics import truth_points
 from jaxnbv.scanning.sensors import USUAL_SETTING, fitted
 from jaxnbv.search import SphereCandidates
 from jaxnbv.studies.scenes import Split, demo_object, fruit_scene, household_scene, part_scene, truck_scene
+from jaxnbv.viz.choice_figures import draw_acquisition
 from jaxnbv.viz.data import ReportData, report_data
-from jaxnbv.viz.figures import STYLE, Stills, draw_acquisition
-from jaxnbv.viz.imagined_figures import looks
+from jaxnbv.viz.figures import STYLE, Stills
+from jaxnbv.viz.imagined import looks
 from jaxnbv.viz.layout import fitted as words
 from jaxnbv.viz.render import draw_scene
 from jaxnbv.viz.style import GREY

@@ -4,26 +4,13 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxnbv.acquisition import Quantity, expected_value
+from jaxnbv.acquisition import Quantity
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.planning.episode import Episode, view_keys
-from jaxnbv.search import Proposal, SphereCandidates
+from jaxnbv.search import Proposal
 from jaxnbv.viz.sphere import unit
 
-# Fewer candidates than this say little about what lies between them: the map is then made of so many views of its own.
-_FEWEST = 30
-MAP_VIEWS = 120
+# Fewer candidates than this say little about what lies between them.
 _FEWEST_OF_A_MAP = 12
-
-
-class SphereMap(eqx.Module):
-    """Values of cameras that look at the origin, from which the map over the sphere is interpolated.
-
-    - `directions`: unit vectors from the origin to them; `values`: theirs, NaN where excluded as visited.
-    """
-
-    directions: Float[np.ndarray, "c 3"]
-    values: Float[np.ndarray, " c"]
 
 
 class Ascents(eqx.Module):
@@ -43,14 +30,9 @@ class Ascents(eqx.Module):
     @property
     def is_spatial(self) -> bool:
         """Whether cameras left the sphere that they started from, or looked past its centre."""
-        return not _on_sphere(self.poses)
-
-
-def _on_sphere(poses: Pose) -> bool:
-    """Whether all cameras stand at one distance from the origin and look at it."""
-    positions = np.asarray(poses.position, dtype=np.float64)
-    past = np.asarray(poses.forward, dtype=np.float64) + unit(positions)
-    return bool(np.ptp(np.linalg.norm(positions, axis=-1)) < 1e-3 and np.linalg.norm(past, axis=-1).max() < 1e-3)
+        positions = np.asarray(self.poses.position, dtype=np.float64)
+        past = np.asarray(self.poses.forward, dtype=np.float64) + unit(positions)
+        return bool(np.ptp(np.linalg.norm(positions, axis=-1)) > 1e-3 or np.linalg.norm(past, axis=-1).max() > 1e-3)
 
 
 class Choice(eqx.Module):
@@ -58,7 +40,6 @@ class Choice(eqx.Module):
 
     - `directions`: unit vectors from the origin to the candidates; `values`: theirs, NaN where excluded as visited.
     - `chosen`, `value`: direction and value of the pose that was taken.
-    - `map`: the values that the map is drawn from: the candidates', where they are enough.
     - `ascents`: the trajectories of a gradient search, none of which is among the candidates here; else None.
     - `num_tied`: how many other candidates are tied with the best one; None where it is not known.
     - `errors`: standard errors of the values, and `error` that of the chosen one; None where they are not known.
@@ -69,7 +50,6 @@ class Choice(eqx.Module):
     values: Float[np.ndarray, " c"]
     chosen: Float[np.ndarray, "3"]
     value: float
-    map: SphereMap
     ascents: Ascents | None
     num_tied: int | None = None
     errors: Float[np.ndarray, " c"] | None = None
@@ -93,31 +73,38 @@ class Choice(eqx.Module):
     @property
     def range(self) -> tuple[float, float]:
         """Of the colours of the map and the candidates; not empty."""
-        return colour_range(np.concatenate([self.values, self.map.values]))
+        return colour_range(self.values)
 
     @property
     def rings_tied(self) -> bool:
         """Whether the candidates that are level with the best are marked: they must be known, and not most of all."""
         return self.tied is not None and 0 < (self.num_tied or 0) <= len(self.values) // 3
 
+    @property
+    def caption(self) -> str:
+        """What the marks on the map are that not every map has."""
+        parts = []
+        if self.num_tied and not self.rings_tied:
+            parts.append(f"The samples cannot tell the best from {self.num_tied} of the others: no rings are drawn.")
+        if self.ascents is not None:
+            parts.append("Lines: gradient ascents, from a ring where they start to a dot where they end.")
+            if self.ascents.is_spatial:
+                parts.append("They change position and rotation; drawn is the direction of the position.")
+        return " ".join(parts)
+
     def makes_a_map(self, quantity: Quantity) -> bool:
         """Whether a map between the candidates says something: they must be many, and their values no lots."""
-        return quantity.smooth and int(np.sum(~np.isnan(self.map.values))) >= _FEWEST_OF_A_MAP
+        return quantity.smooth and len(self.open_values) >= _FEWEST_OF_A_MAP
 
 
-def choice_of(proposal: Proposal, wider: SphereMap | None = None) -> Choice:
-    """A proposal's candidates as directions, where the chosen one stands among them, and its trajectories.
-
-    `wider`: what the map is to be drawn from in place of the candidates.
-    """
+def choice_of(proposal: Proposal) -> Choice:
+    """A proposal's candidates as directions, where the chosen one stands among them, and its trajectories."""
     values, ways = open_values(proposal), proposal.trajectories
-    directions = unit(np.asarray(proposal.candidates.position, dtype=np.float64))
     return Choice(
-        directions=directions,
+        directions=unit(np.asarray(proposal.candidates.position, dtype=np.float64)),
         values=values,
         chosen=unit(np.asarray(proposal.pose.position, dtype=np.float64)),
         value=float(proposal.value),
-        map=wider or SphereMap(directions, values),
         ascents=None if ways is None else Ascents(ways.poses, np.asarray(ways.values, np.float64)),
         num_tied=proposal.num_tied,
         errors=None if proposal.standard_errors is None else np.asarray(proposal.standard_errors, np.float64),
@@ -139,33 +126,3 @@ def open_values(proposal: Proposal) -> Float[np.ndarray, " c"]:
     """The values of a proposal's candidates, NaN where one was excluded as visited."""
     values = np.asarray(proposal.values, dtype=np.float64)
     return np.where(np.isfinite(values), values, np.nan)
-
-
-def wider_map(episode: Episode, index: int) -> SphereMap | None:
-    """What to draw the map of view `index` (from 0) from, where the candidates of a gradient search do not make one.
-
-    They are too few, or not cameras on one sphere that look at its centre. None where they will do.
-
-    The posterior samples are those of the step, so that values can be compared with the search's own.
-    """
-    proposal = episode.views[index].proposal
-    if proposal is None or proposal.trajectories is None:
-        return None
-    if np.sum(~np.isnan(open_values(proposal))) >= _FEWEST and _on_sphere(proposal.candidates):
-        return None
-    radius = float(np.median(np.linalg.norm(np.asarray(proposal.candidates.position), axis=-1)))
-    poses = SphereCandidates(MAP_VIEWS, radius).poses()
-    return SphereMap(unit(np.asarray(poses.position, dtype=np.float64)), step_values(episode, index, poses))
-
-
-def step_values(episode: Episode, index: int, poses: Pose) -> Float[np.ndarray, " poses"]:
-    """The acquisition at a batch of poses, with the samples of the step that chose view `index` (from 0)."""
-    planner, evidence = episode.planner, episode.evidence_after(index)
-    sample_key, *_ = view_keys(episode.key, index)
-    surfaces = planner.imagination.sample(evidence, sample_key)
-    barrier = planner.imagination.barrier(planner.camera, poses)
-    found = _expected(planner.acquisition, evidence.cloud, surfaces, planner.camera, poses, barrier)
-    return np.asarray(found, dtype=np.float64)
-
-
-_expected = eqx.filter_jit(expected_value)

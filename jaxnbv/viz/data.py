@@ -13,7 +13,7 @@ from jaxnbv.planning.episode import Episode
 from jaxnbv.progress import progress_bar
 from jaxnbv.scanning.metrics import truth_points
 from jaxnbv.viz.answers import CoverageAnswer, words_of
-from jaxnbv.viz.choice import Ascents, Choice, choice_of, wider_map
+from jaxnbv.viz.choice import Ascents, Choice, choice_of
 from jaxnbv.viz.imagined import Imagined, Look, taken_look
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.sketches import Sketch, Sketches, sketches_of
@@ -60,13 +60,6 @@ class ViewData(eqx.Module):
         ascents = None if self.choice is None else self.choice.ascents
         return None if ascents is None or not ascents.is_spatial else ascents
 
-    @property
-    def extent(self) -> float:
-        """Distance from the origin to the farthest camera of this view and its ascents."""
-        ascents = self.spatial_ascents
-        positions = [self.pose.position] if ascents is None else [self.pose.position, ascents.poses.position]
-        return max(float(np.linalg.norm(position, axis=-1).max()) for position in positions)
-
 
 class ReportData(eqx.Module):
     """All views of an episode, what the values of its search mean, what the views were for, whence they are drawn.
@@ -111,7 +104,7 @@ def report_data(
     for index, (view, next_one) in enumerate(bar):
         new, _ = view.scan.to_numpy()
         before = episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), new.dtype)
-        choice = None if view.proposal is None else choice_of(view.proposal, wider_map(episode, index))
+        choice = None if view.proposal is None else choice_of(view.proposal)
         drawn.append(
             ViewData(
                 number=index + 1,

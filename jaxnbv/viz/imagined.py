@@ -1,12 +1,17 @@
 """What a step imagined: sampled surfaces as the chosen camera would see them, and the depth that was expected there."""
 
 import math
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import matplotlib as mpl
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
 from jaxnbv.geometry.camera import Camera
@@ -14,15 +19,20 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.imagination import Imagination
-from jaxnbv.planning.episode import Episode, View, observe_scene, view_keys
+from jaxnbv.planning.episode import Episode, View, view_keys
 from jaxnbv.scanning import Evidence, GridSurface, TriangleMesh, mean_depth, scan
 from jaxnbv.scanning.mesh import level_triangles
-from jaxnbv.search import Proposal
 from jaxnbv.surfaces import KnownShapesPosterior, SurfacePosterior
+from jaxnbv.viz.answers import number
+from jaxnbv.viz.layout import fitted, framed
 from jaxnbv.viz.sphere import unit
+from jaxnbv.viz.style import BEFORE, GREY, NEW
 
 SHOWN = 4
 _PIXELS = 96
+# What had been seen before; and what was imagined elsewhere, lighter than the points, so that its shape shows.
+_KNOWN, _UNSEEN = "#c3c9d2", "#5b8fc7"
+_TILE, _GAP = 1.3, 0.12
 # Nearer to the cloud than this, or than so many of its own spacings, a surface was seen before.
 _SEEN, _SPACINGS = 0.05, 3.0
 
@@ -40,31 +50,19 @@ class Look(eqx.Module):
     known: Bool[np.ndarray, "h w"]
 
 
-class Expected(eqx.Module):
-    """The depth that a camera was expected to measure, and what it measured or, not taken, would have.
-
-    - `expected`: mean over the samples that a ray hits, NaN where it misses most.
-    - `seen`: NaN where the ray met nothing; None where that is not known. It may have other pixels.
-    """
-
-    expected: Float[np.ndarray, "h w"]
-    seen: Float[np.ndarray, "i j"] | None
-
-
 class Imagined(eqx.Module):
     """What a step knew of its view before it was taken.
 
     - `samples`: some of its sampled surfaces, from the chosen pose.
-    - `seen`: what was then seen from there; None where that is no image.
-    - `chosen`, `runner_up`: of the chosen camera and of the best of the other candidates; None without one.
+    - `depth`: the mean over all samples that a ray hits, NaN where it misses most; in scene units.
+    - `seen`: what was then seen from there, which may have other pixels; None where that is no image.
     - `names`: the known shape that each of `samples` is about; `kinds`: what it may be, and how likely that is. Both
       are empty where no shapes are known.
     """
 
     samples: tuple[Look, ...]
+    depth: Float[np.ndarray, "h w"]
     seen: Look | None
-    chosen: Expected
-    runner_up: Expected | None
     names: tuple[str, ...] = eqx.field(static=True, default=())
     kinds: tuple[tuple[str, float], ...] = eqx.field(static=True, default=())
 
@@ -84,54 +82,36 @@ def imagined(
     if view.proposal is None:
         return None
     sample_key, *_ = view_keys(episode.key, index)
-    other = runner_up(view.proposal) if planner.quantity.smooth else None
-    poses = [view.pose] if other is None else [view.pose, other]
     camera, cloud = _finer(planner.camera), evidence.cloud.to_numpy()[0]
-    scans = _scans(surfaces, camera, jax.tree.map(lambda *rows: np.stack(rows), *poses), planner.imagination)
-    count = min(SHOWN, planner.imagination.num_samples)
-    samples = tuple(look(_rows(scans, (sample, 0)), camera, view.pose, cloud) for sample in range(count))
-    expected = [
-        np.asarray(mean_depth(_rows(scans, (slice(None), i)), pose), np.float64).reshape(camera.height, camera.width)
-        for i, pose in enumerate(poses)
-    ]
-    taken = taken_look(view, cloud)
-    beside = None if other is None else Expected(expected[1], _depth(_not_taken(episode, view, other, cloud)))
+    scans = _scans(surfaces, camera, view.pose, planner.imagination)
+    samples = tuple(
+        look(jax.tree.map(lambda rows, at=sample: rows[at], scans), camera, view.pose, cloud)
+        for sample in range(min(SHOWN, planner.imagination.num_samples))
+    )
+    expected = np.asarray(mean_depth(scans, view.pose), np.float64).reshape(camera.height, camera.width)
     names: tuple[str, ...] = ()
     kinds: tuple[tuple[str, float], ...] = ()
     if isinstance(posterior, KnownShapesPosterior):
-        names = tuple(posterior.names_of_samples(sample_key, planner.imagination.num_samples)[:count])
+        names = tuple(posterior.names_of_samples(sample_key, planner.imagination.num_samples)[: len(samples)])
         kinds = tuple(posterior.kinds().items())
-    return Imagined(samples, taken, Expected(expected[0], _depth(taken)), beside, names, kinds)
+    return Imagined(samples, expected, taken_look(view, cloud), names, kinds)
 
 
-def _scans(surfaces: GridSurface, camera: Camera, poses: Pose, imagination: Imagination) -> PointCloud:
-    """What the camera sees of each of s surfaces from each of p poses: clouds with leading axes (s, p).
+def _scans(surfaces: GridSurface, camera: Camera, pose: Pose, imagination: Imagination) -> PointCloud:
+    """What the camera sees of each of s surfaces: clouds with a leading axis s.
 
     Of triangles: a picture is no reason to compile a scan of so many pixels.
     """
-    barrier, found = imagination.barrier(camera, poses), []
+    barrier, found = imagination.barrier(camera, pose), []
     for values in np.array(surfaces.values):
         triangles = level_triangles(values, imagination.grid)
         if triangles is not None:
-            found.append(scan(TriangleMesh(*triangles[:2], Frame()), camera, poses, barrier))
+            found.append(scan(TriangleMesh(*triangles[:2], Frame()), camera, pose, barrier))
             continue
-        misses = jnp.ones((*poses.position.shape[:-1], camera.num_rays), bool)
+        misses = jnp.ones(camera.num_rays, bool)
         nowhere = jnp.zeros((*misses.shape, 3))
         found.append(PointCloud(nowhere, nowhere, ~misses, misses))
     return jax.tree.map(lambda *rows: np.stack(rows), *found)
-
-
-def _depth(seen: Look | None) -> Float[np.ndarray, "h w"] | None:
-    return None if seen is None else seen.depth
-
-
-def runner_up(proposal: Proposal) -> Pose | None:
-    """The best open candidate but the chosen one; None if there is no other."""
-    values = np.asarray(proposal.values, np.float64)
-    same = np.linalg.norm(np.asarray(proposal.candidates.position) - np.asarray(proposal.pose.position), axis=1) < 1e-6
-    values = np.where(np.isfinite(values) & ~same, values, -np.inf)
-    best = int(values.argmax())
-    return None if values[best] == -np.inf else proposal.candidates[best]
 
 
 def taken_look(view: View, cloud: Float[np.ndarray, "n 3"]) -> Look | None:
@@ -166,14 +146,74 @@ def _finer(camera: Camera) -> Camera:
     return camera if factor == 1 else camera.resized(factor * camera.height, factor * camera.width)
 
 
-def _not_taken(episode: Episode, view: View, pose: Pose, cloud: Float[np.ndarray, "n 3"]) -> Look | None:
-    """What the sensor of a view would have seen from another pose; None where the scene is not known."""
-    if episode.scene is None or episode.noise is None:
+def look_picture(look: Look, hidden: str = BEFORE, plain: bool = False) -> UInt8[np.ndarray, "h w 3"]:
+    """A lit image of a look: grey where it had been seen before, in a colour of `hidden` elsewhere; white where a ray
+    met nothing. `plain`: all in grey."""
+    tints = np.array([mpl.colors.to_rgb(colour) for colour in (hidden, _KNOWN)])
+    colours = tints[(look.known | plain).astype(int)] * (0.25 + 0.75 * look.lit[..., None])
+    return np.round(255.0 * np.where(look.mask[..., None], colours, 1.0)).astype(np.uint8)
+
+
+def depth_picture(depth: Float[np.ndarray, "h w"], low: float, high: float) -> UInt8[np.ndarray, "h w 3"]:
+    """Near (`low`) is bright, far dark; white where there is none."""
+    colours = mpl.colormaps["viridis_r"].with_extremes(bad="white")
+    return colours(Normalize(low, high)(depth), bytes=True)[..., :3]
+
+
+def depth_range(images: Iterable[Float[np.ndarray, "_ _"]]) -> tuple[float, float]:
+    """The least and the greatest depth in some images; not empty."""
+    found = np.concatenate([image[np.isfinite(image)] for image in images])
+    return (float(found.min()), float(found.max())) if found.size else (0.0, 1.0)
+
+
+class Tile(NamedTuple):
+    """A small picture, and what it is."""
+
+    name: str
+    picture: UInt8[np.ndarray, "h w 3"]
+
+
+def looks(seen: Imagined) -> list[Tile]:
+    """The sampled surfaces from the chosen pose, and beside them what was then seen."""
+    names = seen.names or tuple(f"imagined {number}" for number in range(1, len(seen.samples) + 1))
+    tiles = [Tile(name, look_picture(sample, _UNSEEN)) for name, sample in zip(names, seen.samples, strict=True)]
+    if seen.seen is None:
+        return tiles
+    return [*tiles, Tile("then seen", look_picture(seen.seen, NEW))]
+
+
+def depths(seen: Imagined) -> tuple[list[Tile], str]:
+    """Expected and seen depth, and their scale in words."""
+    images = {"expected depth": seen.depth} | ({} if seen.seen is None else {"depth seen": seen.seen.depth})
+    low, high = depth_range(images.values())
+    tiles = [Tile(name, depth_picture(image, low, high)) for name, image in images.items()]
+    scale = f"Depth from {low:.2f} (bright) to {high:.2f} scene units (dark); white: nothing there."
+    error = None if seen.seen is None else depth_error(seen.depth, seen.seen.depth)
+    return tiles, scale if error is None else f"{scale} Median error: {number(error)}."
+
+
+def depth_error(expected: Float[np.ndarray, "h w"], seen: Float[np.ndarray, "i j"]) -> float | None:
+    """Median of the difference where both say something, in scene units; None where their pixels do not compare."""
+    # Pixels of the coarser image lie at the middle of those of the finer one.
+    down, across = (max(fine // coarse, 1) for fine, coarse in zip(expected.shape, seen.shape, strict=True))
+    expected = expected[down // 2 :: down, across // 2 :: across]
+    if expected.shape != seen.shape or not np.isfinite(expected - seen).any():
         return None
-    around = episode.planner.imagination.surroundings
-    seen = observe_scene(episode.scene, view.camera, pose, episode.noise, episode.key, around)
-    return look(seen, view.camera, pose, cloud)
+    return float(np.nanmedian(np.abs(expected - seen)))
 
 
-def _rows(scans: PointCloud, at: tuple) -> PointCloud:
-    return jax.tree.map(lambda rows: rows[at], scans)
+def imagined_figure(seen: Imagined, view: int) -> Figure:
+    """What was imagined before a view (from 1), in a row of pictures."""
+    (more, scale), tiles = depths(seen), looks(seen)
+    tiles = [*tiles, *more]
+    width, tall = len(tiles) * (_TILE + _GAP) + _GAP, _TILE + 0.85
+    figure = Figure(figsize=(width, tall))
+    head, room = f"What was imagined from the pose of view {view} (grey: seen before). {scale}", 1.0 - 2 * _GAP / width
+    fitted(figure, _GAP / width, 1.0 - 0.25 / tall, head, room, 9.0, va="center")
+    for column, tile in enumerate(tiles):
+        x = (_GAP + column * (_TILE + _GAP)) / width
+        axes = figure.add_axes((x, 0.35 / tall, _TILE / width, _TILE / tall))
+        axes.imshow(tile.picture, interpolation="nearest")
+        framed(axes, GREY, 0.6)
+        fitted(figure, x, 0.17 / tall, tile.name, _TILE / width, 8.0, va="center")
+    return figure

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import UInt8
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.text import Text
 
 _SMALLEST = 5.0
@@ -27,12 +27,12 @@ def pixels_of(figure: Figure, dpi: int) -> UInt8[np.ndarray, "h w 4"]:
     return np.asarray(canvas.buffer_rgba())
 
 
-def width_of(text: Text, figure: Figure) -> float:
+def width_of(text: Text, figure: Figure | SubFigure) -> float:
     """Of a text, as a share of the figure's width."""
-    return float(text.get_window_extent(FigureCanvasAgg(figure).get_renderer()).width / figure.bbox.width)
+    return float(text.get_window_extent().width / figure.bbox.width)
 
 
-def fitted(figure: Figure, x: float, y: float, text: str, width: float, fontsize: float, **style) -> Text:
+def fitted(figure: Figure | SubFigure, x: float, y: float, text: str, width: float, fontsize: float, **style) -> Text:
     """A text at a place of the figure, its letters as small as it takes for `width`; cut where they would be too
     small."""
     placed = figure.text(x, y, text, fontsize=fontsize, **style)
@@ -45,10 +45,16 @@ def fitted(figure: Figure, x: float, y: float, text: str, width: float, fontsize
 
 
 def flow(
-    figure: Figure, items: Iterable[tuple[str, str]], x: float, y: float, width: float, step: float, fontsize: float
+    figure: Figure | SubFigure,
+    items: Iterable[tuple[str, str]],
+    x: float,
+    y: float,
+    width: float,
+    step: float,
+    fontsize: float,
 ) -> None:
     """Texts with their colours from left to right within a width, in as many rows as they need, `step` apart."""
-    at, gap = x, 0.14 / figure.get_figwidth()
+    at, gap = x, 0.14 * figure.dpi / figure.bbox.width
     for text, colour in items:
         placed = figure.text(at, y, text, color=colour, fontsize=fontsize, va="center")
         wide = width_of(placed, figure)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import threading
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,9 @@ from jaxnbv.storage.files import write_text
 from jaxnbv.surfaces import KnownShapesPosterior, SurfacePosterior
 from jaxnbv.viz.answers import may_be_words, shown_value, words_of
 from jaxnbv.viz.choice import colour_range, open_values
+from jaxnbv.viz.imagined import depth_picture, depth_range
 from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
-from jaxnbv.viz.render import depth_picture, depth_range
+from jaxnbv.viz.scene import Cameras, Item, Points, Solid, seen_items, surface_items
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, VALUE, gradient, middle_range
 from jaxnbv.viz.task import seen_after
 
@@ -109,7 +111,7 @@ class LiveView:
             with self._server.atomic():
                 for handle in self._drawn:
                     handle.remove()
-                self._drawn = [*_points(scene, episode), *_cameras(scene, episode)]
+                self._drawn = _drawn(scene, _seen(episode))
             evidence = episode.evidence_after(len(episode.views)) if evidence is None else evidence
             key, *_ = view_keys(episode.key, len(episode.views))
             posterior = imagination.posterior(evidence)
@@ -117,7 +119,7 @@ class LiveView:
             picture = None if expected is None else depth_picture(expected, *depth_range([expected]))
             with self._server.atomic():
                 self._drawn += [
-                    *_mean(scene, surface, guesses),
+                    *_drawn(scene, surface_items(surface, guesses)),
                     *_imagined(scene, imagination, evidence, posterior, key),
                     *([] if proposal is None else _choice(scene, episode.planner.camera, proposal, picture)),
                 ]
@@ -163,35 +165,31 @@ class LiveView:
         self._image = None if picture is None else self._server.gui.add_image(picture, label="depth expected there")
 
 
-def _points(scene: Any, episode: Episode) -> list[Any]:
+def _seen(episode: Episode) -> tuple[Item, ...]:
     new, _ = episode.views[-1].scan.to_numpy()
     before = episode.views[-2].cloud.to_numpy()[0] if len(episode.views) > 1 else new[:0]
-    return [
-        scene.add_point_cloud(f"/points/{name}", points, to_rgb(colour), point_size=_POINT, point_shape="circle")
-        for name, points, colour in (("before", before, BEFORE), ("new", new, NEW))
-        if len(points)
-    ]
+    return seen_items(before, new, [view.pose for view in episode.views], episode.views[-1].camera)
 
 
-def _cameras(scene: Any, episode: Episode) -> list[Any]:
+def _drawn(scene: Any, items: Iterable[Item]) -> list[Any]:
     found = []
-    for number, view in enumerate(episode.views, start=1):
-        colour = NEW if number == len(episode.views) else GREY
-        found.append(_frustum(scene, f"/cameras/view {number}", view.camera, view.pose, colour))
-        # It goes with its camera.
-        scene.add_label(f"/cameras/view {number}/number", str(number))
-    return found
-
-
-def _mean(scene: Any, surface: MeanSurface | None, guesses: MeanSurface | None) -> list[Any]:
-    found = []
-    if surface is not None:
-        colours = DEVIATION(LogNorm(*middle_range(surface.deviation))(surface.deviation), bytes=True)
-        mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=colours, process=False)
-        found.append(scene.add_mesh_trimesh("/surface of the mean", mesh))
-    if guesses is not None:
-        settings: dict[str, Any] = {"color": to_rgb(GREY), "opacity": 0.35, "visible": False}
-        found.append(scene.add_mesh_simple("/guesses apart from it", guesses.vertices, guesses.faces, **settings))
+    for item in items:
+        match item:
+            case Points() if len(item.places):
+                settings: dict[str, Any] = {"point_size": _POINT, "point_shape": "circle"}
+                found.append(scene.add_point_cloud(f"/{item.name}", item.places, to_rgb(item.colour), **settings))
+            case Cameras():
+                for number, pose in enumerate(item.poses, start=item.first):
+                    found.append(_frustum(scene, f"/cameras/view {number}", item.camera, pose, item.colour))
+                    # It goes with its camera.
+                    scene.add_label(f"/cameras/view {number}/number", str(number))
+            case Solid(name, surface, is_guess=True):
+                settings = {"color": to_rgb(GREY), "opacity": 0.35, "visible": False}
+                found.append(scene.add_mesh_simple(f"/{name}", surface.vertices, surface.faces, **settings))
+            case Solid(name, surface):
+                colours = DEVIATION(LogNorm(*middle_range(surface.deviation))(surface.deviation), bytes=True)
+                mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=colours, process=False)
+                found.append(scene.add_mesh_trimesh(f"/{name}", mesh))
     return found
 
 

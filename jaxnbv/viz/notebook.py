@@ -27,10 +27,12 @@ from jaxnbv.scanning import Evidence
 from jaxnbv.search import Proposal
 from jaxnbv.surfaces import SurfacePosterior
 from jaxnbv.viz.choice import choice_of
+from jaxnbv.viz.choice_figures import draw_acquisition
 from jaxnbv.viz.data import report_data
-from jaxnbv.viz.figures import STYLE, draw_acquisition, overview_figure
-from jaxnbv.viz.render import Still, beside, draw_cameras, draw_points, frame
-from jaxnbv.viz.style import BEFORE, NEW, VALUE
+from jaxnbv.viz.figures import STYLE, overview_figure
+from jaxnbv.viz.render import Still, beside, draw_items, frame
+from jaxnbv.viz.scene import seen_items
+from jaxnbv.viz.style import BEFORE, VALUE
 
 _INCHES, _LARGE, _LETTERS, _DPI = 2.4, 4.8, 62, 110
 # Of clouds whose normals look everywhere.
@@ -155,11 +157,8 @@ def _draw_views(episode: Episode, axes: Axes) -> None:
     poses = [view.pose for view in episode.views]
     extent = max(1.8, *(float(np.linalg.norm(pose.position)) for pose in poses))
     still = Still(beside(poses[-1]), None, 400, extent)
-    shown = [
-        draw_points(axes, still, episode.cloud.to_numpy()[0], BEFORE, 1.0),
-        draw_points(axes, still, episode.views[-1].scan.to_numpy()[0], NEW, 1.0),
-        *draw_cameras(axes, still, poses, episode.planner.camera, 0.8),
-    ]
+    points, new = episode.cloud.to_numpy()[0], episode.views[-1].scan.to_numpy()[0]
+    shown = draw_items(axes, still, seen_items(points, new, poses, episode.planner.camera), 0.8)
     frame(axes, still, shown)
 
 

@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Iterable
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import LogNorm
 from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 
@@ -17,21 +18,19 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.viz.data import ReportData
-from jaxnbv.viz.imagined import Look, lamp
+from jaxnbv.viz.imagined import lamp, look_picture
 from jaxnbv.viz.layout import framed
 from jaxnbv.viz.mean_surface import MeanSurface
+from jaxnbv.viz.scene import Cameras, Points, frustum, seen_items
 from jaxnbv.viz.sphere import unit
-from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, LINE, NEW
+from jaxnbv.viz.style import DEVIATION, LINE, NEW
 
-FRUSTUM_DEPTH = 0.45
 _DISTANCE = 11.0
 _SLACK = 0.04  # Noise and the mean's own error must not hide a point behind the surface that it lies on.
 _HIDDEN = 0.18
 # How wide a hollow is darkened, as a share of the picture; how much at most, and how deep a hollow is then.
 _HOLLOW, _DARKEST, _DEEP = 0.05, 0.4, 0.25
 _INSET = 0.24
-# What had been seen before, in images of what was imagined.
-_KNOWN = "#c3c9d2"
 
 
 def beside(pose: Pose) -> Float[np.ndarray, "3"]:
@@ -40,16 +39,6 @@ def beside(pose: Pose) -> Float[np.ndarray, "3"]:
     across = np.cross([0.0, 1.0, 0.0], away)
     across = unit(across) if np.linalg.norm(across) >= 1e-3 else np.array([1.0, 0.0, 0.0])
     return math.cos(math.radians(40)) * away + math.sin(math.radians(40)) * across
-
-
-def frustum(pose: Pose, camera: Camera, depth: float = FRUSTUM_DEPTH) -> Float[np.ndarray, "lines 2 3"]:
-    """Edges of a camera's field of view up to a depth, as segments in scene coordinates."""
-    left, top, right, bottom = camera.edges
-    corners = depth * np.array([[left, top, 1.0], [right, top, 1.0], [right, bottom, 1.0], [left, bottom, 1.0]])
-    corners = corners @ np.asarray(pose.rotation, dtype=np.float64).T + np.asarray(pose.position)
-    apex = np.broadcast_to(np.asarray(pose.position), corners.shape)
-    sides = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
-    return np.concatenate([np.stack([apex, corners], axis=1), sides])
 
 
 class Still:
@@ -144,10 +133,8 @@ def draw_scene(
     """
     view, stage = data.views[index], data.stage
     axes.imshow(still.image, interpolation="bilinear", zorder=1)
-    draw_points(axes, still, view.before, BEFORE, 0.7 * weight)
-    draw_points(axes, still, view.new, NEW, 1.1 * weight)
     poses = [stage.pulled(other.pose) for other in data.views[: index + 1]]
-    draw_cameras(axes, still, poses, camera, weight, depth=stage.depth)
+    draw_items(axes, still, seen_items(view.before, view.new, poses, camera, stage.depth), weight)
     extent = _extent(data, still, camera)
     frame(axes, still, extent, aspect)
     if inset and view.look is not None:
@@ -181,37 +168,32 @@ def _extent(data: ReportData, still: Still, camera: Camera) -> list[Float[np.nda
     return [np.clip(pixels, 0, still.size) for pixels in shown]
 
 
-def look_picture(look: Look, hidden: str = BEFORE, plain: bool = False) -> UInt8[np.ndarray, "h w 3"]:
-    """A lit image of a look: grey where it had been seen before, in a colour of `hidden` elsewhere; white where a ray
-    met nothing. `plain`: all in grey."""
-    tints = np.array([mpl.colors.to_rgb(colour) for colour in (hidden, _KNOWN)])
-    colours = tints[(look.known | plain).astype(int)] * (0.25 + 0.75 * look.lit[..., None])
-    return np.round(255.0 * np.where(look.mask[..., None], colours, 1.0)).astype(np.uint8)
+def draw_items(
+    axes: Axes, still: Still, items: Iterable[Points | Cameras], weight: float = 1.0
+) -> list[Float[np.ndarray, "_ 2"]]:
+    """Draw points that the surface does not hide, and numbered cameras; returns the pixels of all."""
+    taken = []
+    for item in items:
+        if isinstance(item, Points):
+            pixels, in_front = still.project(item.places)
+            x, y = pixels[in_front].T
+            axes.scatter(x, y, s=item.weight * weight, c=item.colour, linewidths=0, zorder=2)
+            taken.append(pixels)
+            continue
+        for number, pose in enumerate(item.poses, start=item.first):
+            ends = frustum(pose, item.camera, item.depth)
+            taken.append(_draw_segments(axes, still, ends, item.colour, item.weight * weight))
+            beyond = 1.09 * np.asarray(pose.position, np.float64)[None]
+            (apex,), (apex_in_front,) = still.project(beyond)
+            taken.append(apex[None])
+            style: dict[str, Any] = {"fontweight": "bold" if item.weight > 1.0 else "normal", "color": item.colour}
+            style |= {"alpha": 1.0 if apex_in_front else 0.4, "fontsize": 9 * weight, "zorder": 4}
+            axes.text(apex[0], apex[1], str(number), ha="center", va="center", **style)
+    return taken
 
 
-def depth_picture(depth: Float[np.ndarray, "h w"], low: float, high: float) -> UInt8[np.ndarray, "h w 3"]:
-    """Near (`low`) is bright, far dark; white where there is none."""
-    colours = mpl.colormaps["viridis_r"].with_extremes(bad="white")
-    return colours(Normalize(low, high)(depth), bytes=True)[..., :3]
-
-
-def depth_range(images: Iterable[Float[np.ndarray, "_ _"]]) -> tuple[float, float]:
-    """The least and the greatest depth in some images; not empty."""
-    found = np.concatenate([image[np.isfinite(image)] for image in images])
-    return (float(found.min()), float(found.max())) if found.size else (0.0, 1.0)
-
-
-def draw_points(
-    axes: Axes, still: Still, points: Float[np.ndarray, "n 3"], colour: str, size: float
-) -> Float[np.ndarray, "n 2"]:
-    """Draw the points that the surface does not hide; returns the pixels of all."""
-    pixels, in_front = still.project(points)
-    axes.scatter(pixels[in_front, 0], pixels[in_front, 1], s=size, c=colour, linewidths=0, zorder=2)
-    return pixels
-
-
-def draw_segments(
-    axes: Axes, still: Still, ends: Float[np.ndarray, "n 2 3"], colours: Float[np.ndarray, "n 4"], width: float
+def _draw_segments(
+    axes: Axes, still: Still, ends: Float[np.ndarray, "n 2 3"], colour: str, width: float
 ) -> Float[np.ndarray, "m 2"]:
     """Draw segments of the scene, faint where they stand behind the surface; returns pixels along them."""
     # Cut fine, so that a part can be hidden.
@@ -221,50 +203,9 @@ def draw_segments(
     pixels, in_front = pixels.reshape(25, -1, 2), in_front.reshape(25, -1)
     segments = np.stack([pixels[:-1], pixels[1:]], axis=2).reshape(-1, 2, 2)
     shown = (in_front[:-1] & in_front[1:]).reshape(-1)
-    rows = np.tile(colours, (24, 1))
-    rows[:, 3] *= np.where(shown, 1.0, _HIDDEN)
-    axes.add_collection(LineCollection(list(segments), colors=rows, linewidths=width, capstyle="round", zorder=3))
+    colours = [mpl.colors.to_rgba(colour, alpha) for alpha in np.where(shown, 1.0, _HIDDEN)]
+    axes.add_collection(LineCollection(list(segments), colors=colours, linewidths=width, capstyle="round", zorder=3))
     return pixels.reshape(-1, 2)
-
-
-def draw_cameras(
-    axes: Axes,
-    still: Still,
-    poses: list[Pose],
-    camera: Camera,
-    weight: float,
-    beyond: float = 0.0,
-    depth: float = FRUSTUM_DEPTH,
-) -> list[Float[np.ndarray, "_ 2"]]:
-    """Draw numbered frusta, of which the last is new; returns the pixels that they take.
-
-    - `beyond`: distance from the origin within which the new number would be in the way.
-    - `depth`: of the fields of view.
-    """
-    taken = []
-    for number, pose in enumerate(poses, start=1):
-        is_new = number == len(poses)
-        colour = NEW if is_new else GREY
-        ends = frustum(pose, camera, depth)
-        width = (1.5 if is_new else 0.9) * weight
-        taken.append(draw_segments(axes, still, ends, mpl.colors.to_rgba_array([colour] * len(ends)), width))
-        position = np.asarray(pose.position, dtype=np.float64)
-        away = max(1.0, beyond / max(float(np.linalg.norm(position)), 1e-12)) if is_new else 1.0
-        apex, apex_in_front = still.project(position[None] * 1.09 * away)
-        taken.append(apex)
-        axes.text(
-            apex[0, 0],
-            apex[0, 1],
-            str(number),
-            color=colour,
-            alpha=1.0 if apex_in_front[0] else 0.4,
-            fontsize=9 * weight,
-            fontweight="bold" if is_new else "normal",
-            ha="center",
-            va="center",
-            zorder=4,
-        )
-    return taken
 
 
 def frame(axes: Axes, still: Still, shown: list[Float[np.ndarray, "_ 2"]], aspect: float = 1.0) -> None:

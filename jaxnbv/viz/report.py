@@ -1,5 +1,6 @@
 """The report of an episode: one HTML page that opens offline, and the same pictures as PNG files."""
 
+import base64
 import gzip
 import io
 import json
@@ -8,8 +9,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import matplotlib as mpl
-from jaxtyping import Float
+import numpy as np
+from jaxtyping import Float, UInt8
 from matplotlib.figure import Figure
+from PIL import Image
 from plotly.offline import get_plotlyjs
 
 from jaxnbv.checks import AnyArray, checked
@@ -19,20 +22,23 @@ from jaxnbv.storage import describe
 from jaxnbv.storage.files import make_folder, write_text
 from jaxnbv.storage.folders import versions, writing_in
 from jaxnbv.viz.answers import capital, label_of, may_be_words, number
+from jaxnbv.viz.choice_figures import draw_choice
 from jaxnbv.viz.data import ReportData, report_data
-from jaxnbv.viz.figures import STYLE, Stills, write_figures
+from jaxnbv.viz.figures import STYLE, Stills, deviation_range, write_figures
 from jaxnbv.viz.html import render
-from jaxnbv.viz.imagined_figures import depths, looks
+from jaxnbv.viz.imagined import depths, looks
 from jaxnbv.viz.layout import pixels_of
-from jaxnbv.viz.page_data import deviation_ticks, payload, picture_address, space
 from jaxnbv.viz.render import draw_scene
 from jaxnbv.viz.sketches import Sketches
-from jaxnbv.viz.style import DEVIATION, gradient
+from jaxnbv.viz.space import figures_in_space
+from jaxnbv.viz.style import DEVIATION, bar_ticks, gradient
 from jaxnbv.viz.task_figures import chart_figure, other_charts, task_charts
 
 _FIGURES = "figures"
 _SCENE, _SCENE_DPI = (6.8, 5.9), 100
 _CHART, _SMALL_CHART = (4.4, 2.6), (3.1, 2.6)
+_WHY, _WHY_DPI = (5.2, 4.6), 150
+_QUALITY = 82
 
 
 @checked
@@ -73,6 +79,7 @@ def report_html(episode: Episode, data: ReportData, title: str, stills: Stills |
     stills, camera = Stills(data) if stills is None else stills, episode.planner.camera
     with mpl.rc_context(STYLE):
         scenes = [_scene(data, index, stills, camera) for index in range(len(data.views))]
+        whys = [_why(data, index) for index in range(len(data.views))]
         own = task_charts(data)
         size = _CHART if len(own) == 1 else _SMALL_CHART
         charts = [_chart(chart, size) for chart in own], [_chart(chart, _CHART) for chart in other_charts(data)]
@@ -84,20 +91,41 @@ def report_html(episode: Episode, data: ReportData, title: str, stills: Stills |
         label=capital(label_of(data.quantity)),
         views=data.views,
         scenes=scenes,
+        whys=whys,
         task_charts=charts[0],
         other_charts=charts[1],
         tables=list(zip(*data.task.panels, strict=True)),
         settings=_settings(episode, title),
         units="scene units" if data.frame is None else "the units of the object's file",
         gradient=gradient(DEVIATION),
-        ticks=deviation_ticks(data),
-        space=_zipped(json.dumps(space(data, camera), allow_nan=False)),
+        ticks=_deviation_ticks(data),
+        # Plotly writes a figure with its numbers packed.
+        space=_zipped(f"[{','.join(str(figure.to_json()) for figure in figures_in_space(data, camera))}]"),
         plotly=_zipped(get_plotlyjs()),
         **{said.__name__: said for said in (capital, number, may_be_words, looks, depths)},
         address=picture_address,
-        # "</" would end the script element that holds the data.
-        data=json.dumps(payload(data), allow_nan=False).replace("</", "<\\/"),
+        poses=[_matrix(data, index) for index in range(len(data.views))],
     )
+
+
+def picture_address(picture: UInt8[np.ndarray, "h w _"]) -> str:
+    """An image as a data address; one of few pixels, each of which counts, without loss."""
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, format="WEBP", quality=_QUALITY, lossless=min(picture.shape[:2]) < 64)
+    return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
+
+
+def _matrix(data: ReportData, index: int) -> str:
+    """Camera to the world of the object's file, or to the scene where there is none, by OpenCV's axes; as JSON."""
+    pose = data.views[index].pose
+    placed = pose if data.frame is None else data.frame.to_world(pose)
+    return json.dumps(np.asarray(placed.to_matrix(), np.float64).round(6).tolist())
+
+
+def _deviation_ticks(data: ReportData) -> list[tuple[float, str]]:
+    """The numbers under the bar of deviations, and where they stand, in percent of its width."""
+    low, high = deviation_range(data)
+    return [(round(100.0 * math.log(tick / low, high / low), 2), f"{tick:g}") for tick in bar_ticks(low, high)]
 
 
 def _zipped(text: str) -> bytes:
@@ -111,6 +139,13 @@ def _scene(data: ReportData, index: int, stills: Stills, camera: Camera) -> str:
     axes = figure.add_axes((0.002, 0.002, 0.996, 0.996))
     draw_scene(axes, data, index, stills[index], camera, weight=1.2, aspect=_SCENE[0] / _SCENE[1])
     return picture_address(pixels_of(figure, _SCENE_DPI))
+
+
+def _why(data: ReportData, index: int) -> str:
+    """Why a view was chosen."""
+    figure = Figure(figsize=_WHY, facecolor="none")
+    draw_choice(figure, data.views[index].choice, data.quantity)
+    return picture_address(pixels_of(figure, _WHY_DPI))
 
 
 def _chart(chart: tuple, size: tuple[float, float]) -> tuple[str, bytes, str]:

@@ -51,17 +51,11 @@ def log_ticks(low: float, high: float) -> Float[np.ndarray, " n"]:
     return ticks[(ticks >= low * 0.9999) & (ticks <= high * 1.0001)]
 
 
-def spaced_ticks(low: float, high: float, gap: float) -> Float[np.ndarray, " n"]:
-    """Those of `log_ticks` that have room: no two nearer than a share `gap` of the axis, powers of ten before fives
-    before twos."""
-    ticks = log_ticks(low, high)
-    at = np.log(ticks / low) / np.log(high / low)
-    first = np.round(ticks / 10.0 ** np.floor(np.log10(ticks) + 1e-9))
-    chosen: list[int] = []
-    for index in sorted(range(len(ticks)), key=lambda index: {1.0: 0, 5.0: 1}.get(first[index], 2)):
-        if all(abs(at[index] - at[other]) >= gap for other in chosen):
-            chosen.append(index)
-    return ticks[sorted(chosen)]
+def bar_ticks(low: float, high: float) -> list[float]:
+    """Numbers under a bar of logarithms from `low` to `high`: at most five powers of ten, or both ends where there is
+    one at most."""
+    decades = [tick for tick in log_ticks(low, high).tolist() if round(np.log10(tick), 9).is_integer()]
+    return decades[:: -(-len(decades) // 5)] if len(decades) > 1 else [low, high]
 
 
 def save_figure(figure: Figure, path: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxnbv.acquisition import Quantity
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.viz.answers import CoverageAnswer, capital, coordinates, number, shown_value
+from jaxnbv.viz.answers import CoverageAnswer, coordinates, number, shown_value
 from jaxnbv.viz.choice import Choice
 from jaxnbv.viz.sphere import unit
 
@@ -64,45 +64,23 @@ def _reason(quantity: Quantity, choice: Choice) -> tuple[str, str]:
     if not quantity.smooth:
         return f"It was drawn at random from {len(others)} open candidates", ""
     starts = 0 if choice.ascents is None else len(choice.ascents.values)
-    ascent = f"gradient ascent from {starts} start{'s' if starts > 1 else ''}"
-    text = f"Its {quantity.name}, {shown_value(quantity, value)}, was"
-    if starts and not others:
-        return f"{text} found by {ascent}", ""
-    median = float(np.median(others))
-    if starts and value > others[0]:
-        text = f"{text} found by {ascent}"
-        if len(others) == 1:
-            return text, f"{_margin(value, others[0], 'the one open candidate')} ({number(others[0])})"
-        margin = _margin(value, others[0], f"the best of {len(others)} open candidates")
-        return text, f"{margin} ({number(others[0])}; median {number(median)})"
-    best = choice.rank == 1
-    text = f"{text} {'the highest' if best else f'rank {choice.rank}'} of {len(others)} open candidates"
-    compared = f"the median candidate had {number(median)}"
-    if median > 0 and value / median < 1000:
-        compared = f"{number(value / median)} times the median ({number(median)})"
-    runner_up = ""
-    if not best:
-        runner_up = f", the best {number(others[0])}"
-    elif len(others) > 1:
-        runner_up = f", {_margin(value, others[1], 'the runner-up')} ({number(others[1])})"
-    tied, it, level = "", "it" if best else "the best", choice.num_tied
-    if level == 0 and len(others) > 1:
-        tied = f". {capital(it)} stands out: no other is within two standard errors of it"
-    elif level and len(others) > 1:
-        equals = f"{level} other{'s' if level > 1 else ''}"
-        tied = f". By the samples {it} cannot be told from {equals}, within two standard errors"
-    after = f". The {ascent} found nothing better" if starts else ""
-    return text, f"{compared}{runner_up}{tied}{after}"
-
-
-def _margin(value: float, other: float, name: str) -> str:
-    """How far a value is ahead of another, which has a name."""
-    if other <= 0:
-        return f"ahead of {name}"
-    ahead = value / other - 1.0
-    if ahead >= 1:
-        return f"{number(ahead + 1)} times {name}"
-    return f"level with {name}" if ahead < 5e-4 else f"{float(f'{100 * ahead:.2g}'):g} % above {name}"
+    climbed = starts > 0 and (not others or value > others[0])
+    rank = "the highest" if choice.rank == 1 else f"rank {choice.rank}"
+    found = f"found by gradient ascent from {starts} start{'s' * (starts > 1)}"
+    how = found if climbed else f"{rank} of {len(others)} open candidates"
+    text = f"Its {quantity.name}, {shown_value(quantity, value)}, was {how}"
+    rest = others if climbed or choice.rank > 1 else others[1:]
+    if not rest:
+        return text, ""
+    compared = (
+        f"best {'candidate' if climbed else 'other'} {number(rest[0])}, median {number(float(np.median(others)))}"
+    )
+    if choice.num_tied is None:
+        return text, compared
+    many = (
+        "no other is" if choice.num_tied == 0 else f"{choice.num_tied} other{'s are' if choice.num_tied > 1 else ' is'}"
+    )
+    return text, f"{compared}; {many} within two standard errors of the best"
 
 
 def place(pose: Pose) -> str:

@@ -14,7 +14,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.scanning import Carving, Grid, SDFSurface, scan
 from jaxnbv.scanning.sdf import Cuboid, Sphere
-from jaxnbv.viz.render import frustum
+from jaxnbv.viz.scene import frustum
 
 sizes = st.integers(2, 60)
 lengths = st.floats(5.0, 500.0)

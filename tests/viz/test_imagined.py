@@ -1,6 +1,5 @@
 """What a step imagined: the same samples as it was chosen by, as its camera would see them."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +8,7 @@ import pytest
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.viz.data import report_data
-from jaxnbv.viz.imagined import Expected, look, runner_up
-from jaxnbv.viz.imagined_figures import depth_error, depths, looks
+from jaxnbv.viz.imagined import depth_error, depths, look, looks
 
 CAMERA = nbv.Camera(height=32, width=32)
 TRUE_RADIUS = 1.0
@@ -87,31 +85,22 @@ def test_the_samples_are_those_of_the_step(episode, seen):
 
 
 def test_expected_and_seen_depth_are_those_of_balls(episode, seen):
-    pose, other = episode.views[1].pose, runner_up(episode.views[1].proposal)
-    fine = CAMERA.resized(96, 96)
-    for pair, at in ((seen.chosen, pose), (seen.runner_up, other)):
-        assert pair.expected.shape == (96, 96)
-        each = np.stack([ball_depth(radius, fine, at) for radius in radii(episode)]).reshape(5, 96, 96)
-        hits = np.isfinite(each)
-        mean = np.where(hits, each, 0.0).sum(axis=0) / np.maximum(hits.sum(axis=0), 1)
-        sure = hits.all(axis=0)
-        # Within the rim, where a trilinear ball and a round one are the same to a thousandth.
-        inner = sure & (mean < 2.0)
-        assert inner.sum() > 2000
-        np.testing.assert_allclose(pair.expected[inner], mean[inner], atol=5e-3)
-        assert np.isnan(pair.expected[~hits.any(axis=0)]).all()
-        true = ball_depth(TRUE_RADIUS, CAMERA, at).reshape(32, 32)
-        inner = np.isfinite(true) & (true < 2.1)
-        np.testing.assert_allclose(pair.seen[inner], true[inner], atol=2e-3)
-    np.testing.assert_allclose(middle(seen.seen.depth), 2.5 - TRUE_RADIUS, atol=2e-3)
-
-
-def test_the_runner_up_is_the_best_other_candidate(episode):
-    poses = nbv.look_at(nbv.fibonacci_sphere(5, 2.5))
-    chosen = nbv.Proposal(poses[3], jnp.asarray(4.0), poses, jnp.array([1.0, 2.0, -jnp.inf, 4.0, 3.0]))
-    np.testing.assert_array_equal(runner_up(chosen).position, poses[4].position)
-    alone = eqx.tree_at(lambda p: p.values, chosen, jnp.array([-jnp.inf] * 3 + [4.0, -jnp.inf]))
-    assert runner_up(alone) is None
+    pose, fine = episode.views[1].pose, CAMERA.resized(96, 96)
+    each = np.stack([ball_depth(radius, fine, pose) for radius in radii(episode)]).reshape(5, 96, 96)
+    hits = np.isfinite(each)
+    mean = np.where(hits, each, 0.0).sum(axis=0) / np.maximum(hits.sum(axis=0), 1)
+    # Within the rim, where a trilinear ball and a round one are the same to a thousandth.
+    inner = hits.all(axis=0) & (mean < 2.0)
+    assert inner.sum() > 2000
+    np.testing.assert_allclose(seen.depth[inner], mean[inner], atol=5e-3)
+    assert np.isnan(seen.depth[~hits.any(axis=0)]).all()
+    true = ball_depth(TRUE_RADIUS, CAMERA, pose).reshape(32, 32)
+    inner = np.isfinite(true) & (true < 2.1)
+    np.testing.assert_allclose(seen.seen.depth[inner], true[inner], atol=2e-3)
+    assert [tile.name for tile in looks(seen)] == [*(f"imagined {k}" for k in range(1, 5)), "then seen"]
+    tiles, words = depths(seen)
+    assert [tile.name for tile in tiles] == ["expected depth", "depth seen"]
+    assert "Median error: " in words
 
 
 def test_what_was_seen_before_is_told_from_what_was_not(episode):
@@ -127,21 +116,11 @@ def test_what_was_seen_before_is_told_from_what_was_not(episode):
     assert 0.0 <= image.lit.min() <= image.lit.max() <= 1.0
 
 
-def test_where_the_scene_is_not_known_nothing_is_beside_the_runner_up(episode):
-    real = eqx.tree_at(lambda e: e.scene, episode, None)
-    seen = before(real, 1)
-    assert seen.seen.depth.shape == (32, 32)
-    assert seen.runner_up.seen is None
-    assert [tile.name for tile in looks(seen)] == [*(f"imagined {k}" for k in range(1, 5)), "then seen"]
-    assert [tile.name for tile in depths(seen)[0]] == ["chosen: expected", "chosen: seen", "runner-up: expected"]
-
-
 def test_the_error_compares_pixel_with_pixel():
     coarse = np.arange(16.0).reshape(4, 4)
     fine = np.kron(coarse, np.ones((3, 3)))
-    assert depth_error(Expected(fine + 0.25, coarse)) == pytest.approx(0.25)
+    assert depth_error(fine + 0.25, coarse) == pytest.approx(0.25)
     half = np.where(coarse < 8, np.nan, coarse)
-    assert depth_error(Expected(fine - 0.5, half)) == pytest.approx(0.5)
-    assert depth_error(Expected(fine, None)) is None
-    assert depth_error(Expected(fine, np.full((4, 4), np.nan))) is None
-    assert depth_error(Expected(fine[:10], coarse)) is None
+    assert depth_error(fine - 0.5, half) == pytest.approx(0.5)
+    assert depth_error(fine, np.full((4, 4), np.nan)) is None
+    assert depth_error(fine[:10], coarse) is None

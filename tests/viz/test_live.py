@@ -37,7 +37,7 @@ def handles(page):
 def test_all_that_is_known_is_in_the_scene(watched):
     _, _, page = watched
     shown = handles(page)
-    expected = {"/points/before", "/points/new", "/surface of the mean", "/candidates", "/next view", "/imagined/1"}
+    expected = {"/points before", "/new points", "/surface of the mean", "/candidates", "/next view", "/imagined/1"}
     assert expected <= set(shown)
     assert {"/cameras/view 1", "/cameras/view 2"} <= set(shown)
     assert "/cameras/view 3" not in shown
@@ -61,8 +61,8 @@ def test_points_are_those_of_the_last_scan_and_those_before(watched):
     _, session, page = watched
     new, _ = session.episode.views[-1].scan.to_numpy()
     before, _ = session.episode.views[0].cloud.to_numpy()
-    np.testing.assert_allclose(handles(page)["/points/new"].points, new, atol=2e-3)
-    np.testing.assert_allclose(handles(page)["/points/before"].points, before, atol=2e-3)
+    np.testing.assert_allclose(handles(page)["/new points"].points, new, atol=2e-3)
+    np.testing.assert_allclose(handles(page)["/points before"].points, before, atol=2e-3)
 
 
 def test_the_text_tells_what_is_asked(watched):
@@ -87,7 +87,7 @@ def test_the_slider_goes_back_to_an_earlier_view(watched):
     first, _ = session.episode.views[0].scan.to_numpy()
     page._slider.value = 1
     shown = handles(page)
-    np.testing.assert_allclose(shown["/points/new"].points, first, atol=2e-3)
+    np.testing.assert_allclose(shown["/new points"].points, first, atol=2e-3)
     assert "/cameras/view 2" not in shown
     np.testing.assert_allclose(shown["/next view"].position, session.episode.views[1].proposal.pose.position, atol=1e-5)
     assert re.search(r"^\*\*1 view\*\*, [\d.]+ scene units² of surface seen$", page._text.content, re.MULTILINE)

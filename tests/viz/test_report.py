@@ -1,6 +1,8 @@
 """The report: self-contained, complete, true to the episode; and what its pictures are made of."""
 
+import base64
 import dataclasses
+import html
 import json
 import re
 from html.parser import HTMLParser
@@ -21,8 +23,9 @@ from jaxnbv.viz import report_data, write_figures, write_report
 from jaxnbv.viz.answers import label_of, number
 from jaxnbv.viz.choice import choice_of
 from jaxnbv.viz.mean_surface import mean_surface
-from jaxnbv.viz.page_data import payload
-from jaxnbv.viz.render import frustum
+from jaxnbv.viz.report import report_html
+from jaxnbv.viz.scene import frustum
+from jaxnbv.viz.space import figures_in_space
 from jaxnbv.viz.sphere import from_mollweide, mollweide, smooth_map
 from jaxnbv.viz.style import log_ticks, round_range
 from jaxnbv.viz.task import seen_after
@@ -64,9 +67,9 @@ class Page(HTMLParser):
             self._script = False
 
 
-def page_data(path):
-    scripts = Page(path.read_text(encoding="utf-8")).scripts
-    return json.loads(next(text for text in scripts if text.startswith('{"views"')))
+def poses_of(text):
+    """Those that a reader copies."""
+    return [json.loads(html.unescape(pose)) for pose in re.findall('data-pose="([^"]*)"', text)]
 
 
 def test_the_page_loads_nothing_from_elsewhere(report):
@@ -74,7 +77,7 @@ def test_the_page_loads_nothing_from_elsewhere(report):
     page = Page(text)
     assert all(load.startswith("data:") for load in page.loads)
     assert "link" in page.tags
-    assert page.tags.count("script") == 4
+    assert page.tags.count("script") == 3
     style = text[text.index("<style>") : text.index("</style>")]
     assert "@import" not in style
     assert "url(" not in style
@@ -82,36 +85,39 @@ def test_the_page_loads_nothing_from_elsewhere(report):
     assert report.stat().st_size < 4e6
 
 
-def test_the_page_holds_every_view_and_escapes_its_title(report, episode):
+def test_the_page_holds_every_view_and_escapes_its_title(report, episode, data):
     text = report.read_text(encoding="utf-8")
     assert "a &lt;mug&gt; &amp; saucer" in text
     assert "<mug>" not in text
     assert not re.search(r"{{|{%", text)
-    data = page_data(report)
-    assert len(data["views"]) == len(episode.views) == 3
-    spatial = scene_in_space(text)["views"]
-    for told, shown, view in zip(data["views"], spatial, episode.views, strict=True):
-        assert all(part in text[: text.index('id="inspace"')].replace("&#x27;", "'") for part in told["told"])
-        np.testing.assert_allclose(told["matrix"], view.pose.to_matrix(), atol=1e-5)
-        new = view.scan.to_numpy()[0]
-        assert 0 < len(shown["new"]) <= len(new)
-        nearest = np.linalg.norm(np.array(shown["new"])[:, None] - new[None], axis=-1).min(axis=1)
-        assert nearest.max() < 1e-3
-        np.testing.assert_allclose(shown["frustum"][0][0], view.pose.position, atol=1e-4)
-    assert data["views"][0]["choice"] is None
-    for shown, view in zip(data["views"][1:], episode.views[1:], strict=True):
-        values = np.array([np.nan if v is None else v for v in shown["choice"]["values"]])
-        assert shown["choice"]["value"] == pytest.approx(float(view.proposal.value))
-        assert np.nanmax(values) == pytest.approx(float(view.proposal.value))
-        assert np.isnan(values).sum() == np.isneginf(np.asarray(view.proposal.values)).sum()
-        assert shown["choice"]["image"].startswith("data:image/webp;base64,")
+    spatial = scene_in_space(text)
+    assert len(spatial) == len(episode.views) == 3
+    for matrix, shown, view, told in zip(poses_of(text), spatial, episode.views, data.views, strict=True):
+        assert all(part in html.unescape(text) for part in told.told)
+        np.testing.assert_allclose(matrix, view.pose.to_matrix(), atol=1e-5)
+        (points,) = (trace for trace in shown["data"] if trace["name"] == "new points")
+        assert points["x"]["dtype"] == "f4"
+        count = len(base64.b64decode(points["x"]["bdata"])) // 4
+        assert count == int(view.scan.count)
+
+
+def test_what_is_drawn_in_space_stands_where_it_is(episode, data):
+    """Plotly's z is our y; coordinates are rounded to 1 / 256."""
+    shown = figures_in_space(data, CAMERA)[2]
+    traces = {trace.name: trace for trace in reversed(shown.data)}
+    names = ["surface of the mean", "points before", "new points", "cameras", "new camera"]
+    assert [name for name in names if name in traces] == names
+    places = {name: np.stack([trace.y, trace.z, trace.x], axis=1) for name, trace in traces.items()}
+    np.testing.assert_allclose(places["new points"], episode.views[2].scan.to_numpy()[0], atol=1 / 500)
+    np.testing.assert_allclose(places["points before"], episode.views[1].cloud.to_numpy()[0], atol=1 / 500)
+    np.testing.assert_allclose(places["new camera"][0], data.stage.pulled(episode.views[2].pose).position, atol=1 / 500)
 
 
 def test_poses_are_in_the_units_of_the_objects_file(episode, data):
     """That of a mesh which lies elsewhere and is larger; without a file they are in scene units."""
     assert data.frame is None
     frame = nbv.Frame(0.5, (1.0, 2.0, 3.0), "z")
-    matrix = np.array(payload(dataclasses.replace(data, frame=frame))["views"][1]["matrix"])
+    matrix = np.array(poses_of(report_html(episode, dataclasses.replace(data, frame=frame), "mug"))[1])
     pose = np.asarray(episode.views[1].pose.to_matrix(), np.float64)
     np.testing.assert_allclose(matrix[:3, 3], frame.rotation.T @ pose[:3, 3] / 0.5 + [1.0, 2.0, 3.0], atol=1e-5)
     np.testing.assert_allclose(matrix[:3, :3], frame.rotation.T @ pose[:3, :3], atol=1e-6)
@@ -161,7 +167,7 @@ def test_the_sentence_tells_the_numbers_of_the_step(episode, data):
     values = np.sort(np.asarray(view.proposal.values, np.float64))[::-1]
     values = values[np.isfinite(values)]
     assert f"the highest of {len(values)} open candidates" in shown.sentence
-    assert f"{number(values[0] / np.median(values))} times the median" in shown.sentence
+    assert f"best other {number(values[1])}, median {number(np.median(values))}" in shown.sentence
     assert f"added {int(view.scan.count):,} points" in shown.sentence
     before, after = (data.views[i].seen.scaled for i in (0, 1))
     assert f"coverage went from {before:.0f} to {after:.0f} %" in shown.sentence

@@ -1,0 +1,86 @@
+"""What stands in the scene after a view: told once, drawn by still pictures, the page in space and the live view."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.viz.choice import Ascents
+from jaxnbv.viz.mean_surface import MeanSurface
+from jaxnbv.viz.style import BEFORE, GREY, NEW
+
+FRUSTUM_DEPTH = 0.45
+
+
+class Points(NamedTuple):
+    """Points of one colour, in scene coordinates; those of more `weight` are drawn larger."""
+
+    name: str
+    places: Float[np.ndarray, "n 3"]
+    colour: str
+    weight: float
+
+
+class Cameras(NamedTuple):
+    """Fields of view of one colour up to a depth, with their numbers, the first of which is `first`."""
+
+    name: str
+    poses: Sequence[Pose]
+    camera: Camera
+    colour: str
+    first: int
+    weight: float
+    depth: float = FRUSTUM_DEPTH
+
+
+class Solid(NamedTuple):
+    """A surface: coloured by its deviation, or of one pale colour where it is a guess, which is offered, not shown."""
+
+    name: str
+    surface: MeanSurface
+    is_guess: bool = False
+
+
+class Ways(NamedTuple):
+    """The ascents of a gradient search, coloured by value."""
+
+    name: str
+    ascents: Ascents
+
+
+Item = Points | Cameras | Solid | Ways
+
+
+def seen_items(
+    before: Float[np.ndarray, "n 3"],
+    new: Float[np.ndarray, "m 3"],
+    poses: Sequence[Pose],
+    camera: Camera,
+    depth: float = FRUSTUM_DEPTH,
+) -> tuple[Points | Cameras, ...]:
+    """The points before the last of some views, those that it added, and the cameras."""
+    return (
+        Points("points before", before, BEFORE, 0.7),
+        Points("new points", new, NEW, 1.1),
+        Cameras("cameras", poses[:-1], camera, GREY, 1, 0.9, depth),
+        Cameras("new camera", poses[-1:], camera, NEW, len(poses), 1.5, depth),
+    )
+
+
+def surface_items(surface: MeanSurface | None, guesses: MeanSurface | None) -> tuple[Solid, ...]:
+    """The surface of the mean, and its pieces that hold no points."""
+    mean = () if surface is None else (Solid("surface of the mean", surface),)
+    return mean if guesses is None else (*mean, Solid("guesses apart from it", guesses, is_guess=True))
+
+
+def frustum(pose: Pose, camera: Camera, depth: float = FRUSTUM_DEPTH) -> Float[np.ndarray, "lines 2 3"]:
+    """Edges of a camera's field of view up to a depth, as segments in scene coordinates."""
+    left, top, right, bottom = camera.edges
+    corners = depth * np.array([[left, top, 1.0], [right, top, 1.0], [right, bottom, 1.0], [left, bottom, 1.0]])
+    corners = corners @ np.asarray(pose.rotation, dtype=np.float64).T + np.asarray(pose.position)
+    apex = np.broadcast_to(np.asarray(pose.position), corners.shape)
+    sides = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+    return np.concatenate([np.stack([apex, corners], axis=1), sides])

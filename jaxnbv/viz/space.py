@@ -1,0 +1,146 @@
+"""The scene in space, for a reader of the page who turns it: plotly's figures of what stands in it."""
+
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+from jaxtyping import Float, Int
+
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.viz.answers import number
+from jaxnbv.viz.choice import Ascents, colour_range
+from jaxnbv.viz.data import ReportData
+from jaxnbv.viz.figures import deviation_range
+from jaxnbv.viz.mean_surface import MeanSurface
+from jaxnbv.viz.scene import Cameras, Item, Points, Solid, Ways, frustum, seen_items, surface_items
+from jaxnbv.viz.style import DEVIATION, INK, VALUE_LINES, colour_scale
+
+# Of all views together, so that a long episode stays a small page.
+_MAX_POINTS, _MAX_VERTICES = 18_000, 24_000
+_MOST_POINTS, _MOST_VERTICES, _FEWEST_VERTICES = 3000, 4000, 1500
+# Coordinates are rounded to this, in scene units: a power of two, whose multiples pack well.
+_GRAIN = 1 / 256
+_LIGHT = {"ambient": 0.72, "diffuse": 0.45, "specular": 0.04, "roughness": 0.9}
+
+
+def figures_in_space(data: ReportData, camera: Camera) -> list[go.Figure]:
+    """One figure a view. Its legend switches what is shown, which stays from one view to the next."""
+    stage, count = data.stage, len(data.views)
+    points = min(_MAX_POINTS // count, _MOST_POINTS)
+    vertices = min(max(_MAX_VERTICES // count, _FEWEST_VERTICES), _MOST_VERTICES)
+    grades = np.log10(deviation_range(data))
+    figures = []
+    for index, view in enumerate(data.views):
+        poses = [stage.pulled(other.pose) for other in data.views[: index + 1]]
+        items: list[Item] = [*surface_items(view.surface, view.guesses)]
+        items += seen_items(view.before, view.new, poses, camera, stage.depth)
+        if view.spatial_ascents is not None:
+            items.append(Ways("gradient ascents", view.spatial_ascents))
+        drawn = [trace for item in items for trace in _traces(item, points, vertices, grades, stage.pull)]
+        figures.append(go.Figure(drawn, _layout(stage.eye, stage.extent)))
+    return figures
+
+
+def _layout(eye: Float[np.ndarray, "3"], extent: float) -> dict[str, Any]:
+    axis = {"range": [-extent, extent], "visible": False}
+    x, y, z = (1.15 * eye).tolist()
+    view = {"eye": {"x": z, "y": x, "z": y}, "projection": {"type": "perspective"}}
+    scene = {f"{name}axis": axis for name in "xyz"}
+    return {
+        "scene": {**scene, "camera": view, "aspectmode": "cube", "dragmode": "turntable", "uirevision": "kept"},
+        "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom", "itemsizing": "constant"},
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "font": {"color": INK},
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "uirevision": "kept",
+        "template": "none",
+    }
+
+
+def _placed(places: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
+    """Coordinates by plotly's names: it turns a scene about its own z, which is our y."""
+    x, y, z = (_GRAIN * np.round(np.asarray(places, np.float64).T / _GRAIN)).astype(np.float32)
+    return {"x": z, "y": x, "z": y}
+
+
+def _traces(
+    item: Item, points: int, vertices: int, grades: Float[np.ndarray, "2"], pull: float
+) -> list[dict[str, Any]]:
+    named = {"name": item.name, "legendgroup": item.name, "hoverinfo": "skip", "showlegend": True}
+    match item:
+        case Points():
+            rows = np.linspace(0, len(item.places) - 1, min(points, len(item.places))).astype(int)
+            marker = {"color": item.colour, "size": 1.0 + item.weight}
+            return [{"type": "scatter3d", "mode": "markers", "marker": marker, **_placed(item.places[rows]), **named}]
+        case Cameras():
+            if not item.poses:
+                return []
+            edges = np.concatenate([frustum(pose, item.camera, item.depth) for pose in item.poses])
+            wires = _lines(edges, {"color": item.colour, "width": 3.0 * item.weight})
+            numbers = {
+                **_placed(1.09 * np.stack([np.asarray(pose.position, np.float64) for pose in item.poses])),
+                "text": [f"<b>{item.first + i}</b>" for i in range(len(item.poses))],
+                "textfont": {"color": item.colour, "size": 14},
+            }
+            return [wires | named, {"type": "scatter3d", "mode": "text", **numbers, **named, "showlegend": False}]
+        case Solid():
+            shown = {"opacity": 0.35, "visible": "legendonly"} if item.is_guess else {}
+            limit = _FEWEST_VERTICES if item.is_guess else vertices
+            return [_mesh(item.surface, limit, grades) | named | shown]
+        case Ways():
+            return [named | trace for trace in _ascents(item.ascents, pull)]
+
+
+def _lines(segments: Float[np.ndarray, "n k 3"], line: dict[str, Any]) -> dict[str, Any]:
+    """Broken lines, with a gap behind each."""
+    gapped = np.pad(np.asarray(segments, np.float64), ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
+    return {"type": "scatter3d", "mode": "lines", "line": line, **_placed(gapped.reshape(-1, 3))}
+
+
+def _ascents(ascents: Ascents, pull: float) -> list[dict[str, Any]]:
+    """Ways, drawn as near as the cameras, in the colours of their values; the values at their ends."""
+    positions = pull * np.asarray(ascents.poses.position, np.float64)
+    low, high = colour_range(ascents.values)
+    colours = {"colorscale": colour_scale(VALUE_LINES), "cmin": low, "cmax": high, "width": 5}
+    ways = _lines(positions, {"color": np.pad(ascents.values, ((0, 0), (0, 1)), mode="edge").ravel(), **colours})
+    marker = {"size": 3, "color": INK, "symbol": ["circle-open", "circle"] * len(positions)}
+    values = [number(value) for value in ascents.values[:, [0, -1]].ravel().tolist()]
+    ends = {"type": "scatter3d", "mode": "markers", "marker": marker, "text": values, "hoverinfo": "text"}
+    return [ways, ends | _placed(positions[:, [0, -1]].reshape(-1, 3)) | {"showlegend": False}]
+
+
+def _mesh(surface: MeanSurface, limit: int, grades: Float[np.ndarray, "2"]) -> dict[str, Any]:
+    """A coarser mesh, coloured by the logarithm of its deviation."""
+    own, faces = clustered(surface.vertices, surface.faces, limit)
+    count = np.bincount(own)
+    vertices = np.stack([np.bincount(own, column) / count for column in surface.vertices.T], axis=1)
+    deviation = np.bincount(own, np.log10(surface.deviation)) / count
+    return {
+        "type": "mesh3d",
+        **_placed(vertices),
+        **dict(zip("ijk", faces.T.astype(np.uint16), strict=True)),
+        "intensity": np.round(deviation, 2).astype(np.float32),
+        "cmin": grades[0],
+        "cmax": grades[1],
+        "colorscale": colour_scale(DEVIATION),
+        "showscale": False,
+        "lighting": _LIGHT,
+        "lightposition": {"x": 4000, "y": 3000, "z": 8000},
+    }
+
+
+def clustered(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], limit: int
+) -> tuple[Int[np.ndarray, " v"], Int[np.ndarray, "g 3"]]:
+    """A coarser mesh of at most `limit` vertices: the cluster of each vertex, those within one cell of a lattice, and
+    the faces between clusters (Rossignac and Borrel 1993)."""
+    own = np.arange(len(vertices))
+    cell = 0.01
+    while own.max(initial=-1) + 1 > limit:
+        steps = np.floor(vertices / cell).astype(np.int64)
+        steps -= steps.min(axis=0)
+        _, own = np.unique(np.ravel_multi_index(steps.T, steps.max(axis=0) + 1), return_inverse=True)
+        cell *= 1.2
+    joined = own[faces]
+    a, b, c = joined.T
+    return own, np.unique(joined[(a != b) & (b != c) & (c != a)], axis=0)
