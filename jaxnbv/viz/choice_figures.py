@@ -7,7 +7,6 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure, SubFigure
-from matplotlib.patches import Ellipse
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from jaxnbv.acquisition import Quantity
@@ -59,46 +58,42 @@ def draw_acquisition(
     axes: Axes, choice: Choice | None, quantity: Quantity, weight: float = 1.0
 ) -> ScalarMappable | None:
     """Draw the candidates' values as a map of the sphere; returns what a colour bar needs, None for a given view."""
-    axes.set(xlim=(-2.95, 2.95), ylim=(-1.6, 1.6), aspect="equal")
     axes.axis("off")
-    for line in sphere.graticule():
-        axes.plot(*line.T, color=LINE, lw=0.5 * weight, alpha=0.6)
-    rim = Ellipse((0.0, 0.0), 2 * sphere.WIDTH, 2 * sphere.HEIGHT, fill=False, color=GREY, lw=0.8 * weight, zorder=2)
-    axes.add_patch(rim)
+    globe: Any = axes.inset_axes((0.0, 0.0, 1.0, 1.0), projection="mollweide")
+    globe.set_longitude_grid(60)
+    globe.set_latitude_grid(30)
+    globe.set_longitude_grid_ends(90)
+    globe.grid(color=LINE, lw=0.5 * weight, alpha=0.6)
+    globe.tick_params(labelbottom=False, labelleft=False)
+    globe.spines["geo"].set(color=GREY, linewidth=0.8 * weight)
     if choice is None:
-        axes.text(0.0, 0.0, "given", ha="center", va="center", color=GREY, fontsize=11 * weight)
+        globe.text(0.0, 0.0, "given", ha="center", va="center", color=GREY, fontsize=11 * weight)
         return None
     colours = ScalarMappable(Normalize(*choice.range), VALUE)
     if choice.makes_a_map(quantity):
-        extent = (-sphere.WIDTH, sphere.WIDTH, -sphere.HEIGHT, sphere.HEIGHT)
-        smooth = sphere.smooth_map(choice.directions, choice.values)
-        image = axes.imshow(colours.to_rgba(smooth), extent=extent, interpolation="bilinear", zorder=1)
-        image.set_clip_path(rim)
-    places = sphere.mollweide(choice.directions)
-    shown = ~choice.visited
-    dots: dict[str, Any] = {"s": 14 * weight, "edgecolors": GREY, "linewidths": 0.6 * weight}
-    axes.scatter(places[shown, 0], places[shown, 1], c=colours.to_rgba(choice.values[shown]), **dots, zorder=3)
+        globe.pcolormesh(*sphere.smooth_map(choice.directions, choice.values), cmap=VALUE, norm=colours.norm)
+    places, shown = sphere.on_map(choice.directions), ~choice.visited
+    dots: dict[str, Any] = {"s": 14 * weight, "edgecolors": GREY, "linewidths": 0.6 * weight, "clip_on": False}
+    globe.scatter(*places[shown].T, c=colours.to_rgba(choice.values[shown]), **dots, zorder=3)
     if choice.tied is not None and choice.rings_tied:
-        x, y = places[choice.tied & shown].T
-        axes.scatter(x, y, s=52 * weight, facecolors="none", edgecolors=INK, linewidths=1.0 * weight, zorder=4)
-    cross: dict[str, Any] = {"marker": "x", "c": INK, "s": 26 * weight, "linewidths": 1.2 * weight}
-    axes.scatter(places[~shown, 0], places[~shown, 1], **cross, zorder=4)
+        rings: dict[str, Any] = {"s": 52 * weight, "facecolors": "none", "edgecolors": INK, "clip_on": False}
+        globe.scatter(*places[choice.tied & shown].T, linewidths=1.0 * weight, **rings, zorder=4)
+    globe.scatter(*places[~shown].T, marker="x", c=INK, s=26 * weight, linewidths=1.2 * weight, zorder=4)
     if choice.ascents is not None:
-        draw_ascents(axes, choice.ascents, weight)
+        _draw_ascents(globe, choice.ascents, weight)
     size = 14 if choice.ascents is None else 11
     star: dict[str, Any] = {"ms": size * weight**0.5, "color": NEW, "markeredgecolor": "white", "mew": 1.0}
-    axes.plot(*sphere.mollweide(choice.chosen[None]).T, "*", **star, zorder=10)
+    globe.plot(*sphere.on_map(choice.chosen[None]).T, "*", **star, zorder=10, clip_on=False)
     return colours
 
 
-def draw_ascents(axes: Axes, ascents: Ascents, weight: float = 1.0) -> None:
-    """Draw trajectories on the map of the sphere, each from a ring to a dot."""
-    rim: dict[str, Any] = {"color": "white", "lw": 2.2 * weight, "solid_capstyle": "round", "zorder": 6}
+def _draw_ascents(globe: Any, ascents: Ascents, weight: float) -> None:
+    """Draw trajectories on the map, each from a ring to a dot."""
     for directions in ascents.directions:
-        for piece in sphere.path(directions):
-            axes.plot(*piece.T, **rim)
-            axes.plot(*piece.T, color=INK, lw=1.1 * weight, solid_capstyle="round", zorder=7)
-    mark: dict[str, Any] = {"ls": "none", "marker": "o"}
-    starts, ends = (sphere.mollweide(ascents.directions[:, step]) for step in (0, -1))
-    axes.plot(*starts.T, ms=4.6 * weight, mew=1.0 * weight, mfc="white", mec=INK, zorder=8, **mark)
-    axes.plot(*ends.T, ms=3.4 * weight, mew=0.5 * weight, mfc=INK, mec="white", zorder=9, **mark)
+        way = sphere.path(directions).T
+        globe.plot(*way, color="white", lw=2.2 * weight, zorder=6)
+        globe.plot(*way, color=INK, lw=1.1 * weight, zorder=7)
+    mark: dict[str, Any] = {"ls": "none", "marker": "o", "clip_on": False}
+    starts, ends = (sphere.on_map(ascents.directions[:, step]).T for step in (0, -1))
+    globe.plot(*starts, ms=4.6 * weight, mew=1.0 * weight, mfc="white", mec=INK, zorder=8, **mark)
+    globe.plot(*ends, ms=3.4 * weight, mew=0.5 * weight, mfc=INK, mec="white", zorder=9, **mark)

@@ -8,6 +8,7 @@ import math
 from datetime import UTC, datetime
 from pathlib import Path
 
+import equinox as eqx
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -161,35 +162,12 @@ def _chart(chart: tuple, size: tuple[float, float]) -> tuple[str, bytes, str]:
 
 
 def _settings(episode: Episode, title: str) -> dict[str, str]:
-    planner = episode.planner
-    imagination, carving = planner.imagination, planner.imagination.carving
     return {
         "Object": title,
-        "Search": _call(describe(planner.search), depth=2),
-        "Acquisition": _call(describe(planner.acquisition)),
-        "Surface model": _call(describe(imagination.model), depth=2),
-        "Carved by": _call(describe(carving), depth=1) if carving else "nothing, as in the paper",
-        "Posterior samples": f"{imagination.num_samples} on a {imagination.grid.resolution}³ grid",
-        "Camera": f"{math.degrees(planner.camera.fov):.0f}°, {planner.camera.width} × {planner.camera.height} pixels",
-        "Sensor noise": "that of a real sensor" if episode.noise is None else _call(describe(episode.noise)),
-        "Capacity": f"{planner.capacity:,} points",
+        "Planner": eqx.tree_pformat(episode.planner, width=110),
+        "Sensor noise": "that of a real sensor" if episode.noise is None else eqx.tree_pformat(episode.noise),
         "Seed": ", ".join(str(word) for word in describe(episode.key)["data"]),
         "Ended": episode.stopped or "after as many views as were asked for",
         "Versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
         "Written": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
     }
-
-
-def _call(description: dict, depth: int = 0) -> str:
-    """A module's description as the call that made it; of the modules within, down to a depth, too."""
-    arguments = {name: value for name, value in description.items() if name != "type" and value is not None}
-    inside = ", ".join(f"{name}={_short(value, depth)}" for name, value in arguments.items())
-    return f"{description['type']}({inside})" if inside else str(description["type"])
-
-
-def _short(value, depth: int) -> str:
-    if isinstance(value, list) and any(isinstance(one, dict) for one in value):
-        return f"({', '.join(_short(one, depth) for one in value)})"
-    if isinstance(value, dict):
-        return _call(value, depth - 1) if depth > 0 and "type" in value else value.get("type", "...")
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

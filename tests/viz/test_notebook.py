@@ -86,8 +86,9 @@ def test_the_slice_of_a_posterior_is_inside_the_ball(episode):
 
 
 def test_a_proposal_has_its_star_and_an_episode_its_cameras(episode):
-    star = drawn(episode.views[1].proposal).lines[-1]
-    expected = sphere.mollweide(np.asarray(episode.views[1].pose.position)[None] / 2.5)[0]
+    (globe,) = drawn(episode.views[1].proposal).child_axes
+    star = globe.lines[-1]
+    expected = sphere.on_map(np.asarray(episode.views[1].pose.position)[None] / 2.5)[0]
     np.testing.assert_allclose(np.ravel(star.get_data()), expected, atol=1e-3)
     assert [text.get_text() for text in drawn(episode).texts] == ["1", "2"]
 
