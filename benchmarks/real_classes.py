@@ -1,6 +1,6 @@
-"""How often a shipped classifier is right on real objects, as it is and tuned on a few of them.
+"""How often the shipped classifier of household objects is right on real ones, as it is and tuned on a few of them.
 
-    python benchmarks/real_classes.py household FOLDER [--few 2] [--steps 300] [--out results.json]
+    python benchmarks/real_classes.py FOLDER [--few 2] [--steps 300] [--out results.json]
 
 FOLDER holds a folder of meshes for each class, as `jaxnbv study modelnet10 --meshes` takes it. The first objects of
 each class, `few` of them where the class has more, tune the network, together with stand-ins so that it does not
@@ -25,7 +25,7 @@ from jaxnbv.scanning import SensorNoise, scan
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.storage.folders import versions
 from jaxnbv.studies.readers import MeshFile, class_meshes
-from jaxnbv.studies.scenes import CLASS_SETS, Framing, Split
+from jaxnbv.studies.scenes import CLASS_SETS, HOUSEHOLD, Framing, Split
 from jaxnbv.studies.training import log_probabilities, train
 from jaxnbv.studies.training.class_clouds import scanned_clouds
 
@@ -59,14 +59,13 @@ def told(network, objects: list[tuple[MeshFile, PointCloud]], names: tuple[str, 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("set", choices=sorted({"household", "fruit"}))
     parser.add_argument("folder", type=Path)
     parser.add_argument("--few", type=int, default=2)
     parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
 
-    names, points = CLASS_SETS[arguments.set].classes, TRAINED_POINTS[arguments.set]
+    names, points = HOUSEHOLD, TRAINED_POINTS["household"]
     files = class_meshes(arguments.folder, names)
     objects = [(file, clouds_of(file, number, points)) for number, file in enumerate(files)]
     few: list[tuple[MeshFile, PointCloud]] = []
@@ -76,11 +75,11 @@ def main() -> None:
         count = min(arguments.few, len(of_class) - 1)
         few, rest = few + of_class[:count], rest + of_class[count:]
 
-    network = pretrained_classifier(arguments.set).network
+    network = pretrained_classifier("household").network
     results = {"versions": versions(), "tuned_on": [f"{names[f.label]} {f.name}" for f, _ in few]}
     results["as it is"] = told(network, rest, names)
     if few:
-        made = scanned_clouds(CLASS_SETS[arguments.set], Split.TRAIN, Framing.CLOSE_UP, range(STAND_INS), points)
+        made = scanned_clouds(CLASS_SETS["household"], Split.TRAIN, Framing.CLOSE_UP, range(STAND_INS), points)
         clouds = jax.tree.map(
             lambda *leaves: np.concatenate(leaves),
             PointCloud(made.clouds.points, made.clouds.normals, made.clouds.mask),

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from jaxnbv.planning.episode import view_keys
 from jaxnbv.storage.files import write_whole
-from jaxnbv.studies.classification.objects import ModelNet10Study, OmniObject3DStudy, PyramidStudy, TruckStudy
+from jaxnbv.studies.classification.objects import ModelNet10Study, PyramidStudy, TruckStudy
 from jaxnbv.studies.classification.study import ClassificationStudy
 from jaxnbv.studies.engine.measures import KNOWN
 from jaxnbv.studies.scenes import Framing, Split
@@ -31,7 +31,6 @@ KINDS: dict[str, type[ClassificationStudy]] = {
     "pyramid": PyramidStudy,
     "truck": TruckStudy,
     "household": ModelNet10Study,
-    "fruit": OmniObject3DStudy,
 }
 
 

@@ -57,7 +57,6 @@ RECIPES = {
     "pyramid": Recipe(tuple(Framing), solid=True, scenes=12_000, imagined=100),
     "truck": Recipe(scenes=16_000, imagined=100, groups=(192, 48), focus=2400, steps=(10_000, 5000)),
     "household": Recipe(scenes=8000, imagined=100, groups=(192, 48), steps=(4000, 1000)),
-    "fruit": Recipe(solid=True, scenes=5000, imagined=80, groups=(192, 48), steps=(3000, 800)),
 }
 
 

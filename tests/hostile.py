@@ -135,7 +135,7 @@ CALLS = {
     nbv.ShapeBank.from_meshes: {"meshes": [MESH], "resolution": 8, "sheet": 0.05, "names": ["a"], "progress": False},
     nbv.ShapeBank.of: {"solids": [BALL], "names": ["ball"]},
     nbv.Upright: {"axis": (0.0, 1.0, 0.0), "within": 1.0, "scale": (0.9, 1.1), "by_axis": False},
-    nbv.shape_bank: {"name": "fruit"},
+    nbv.shape_bank: {"name": "heat"},
     nbv.ValueBelow: {"value": 0.1},
     nbv.concatenate: {"first": CLOUD, "second": CLOUD},
     nbv.farthest_point_subsample: {"cloud": CLOUD, "count": 3},

@@ -49,7 +49,7 @@ MODELS = {
 
 STUDY_MODELS = {"known": "screened, and has seen other objects of the kind", **MODELS}
 
-BANKS = ("pyramid", "truck", "household", "fruit", "parts", "heat", "household-real")
+BANKS = ("pyramid", "truck", "household", "parts", "heat", "household-real")
 """The banks of known shapes that ship."""
 
 SEARCHES = {

@@ -10,7 +10,7 @@ from jaxnbv.networks.invariant import FocusedClassifier, InvariantClassifier
 # Longest side of the box of a training object, in scene units.
 TRAINED_SIDE = 2.5
 # Points of a cloud that each classifier was trained on.
-TRAINED_POINTS = {"pyramid": 1024, "truck": 2048, "household": 1024, "fruit": 1024}
+TRAINED_POINTS = {"pyramid": 1024, "truck": 2048, "household": 1024}
 
 
 def pyramid_classifier(longest_side: float = TRAINED_SIDE, num_points: int = 1024) -> CloudClassifier:

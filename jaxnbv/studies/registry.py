@@ -62,9 +62,9 @@ STUDIES = {
     ),
     "omniobject3d": _of_classes(
         "jaxnbv.studies.classification.objects:OmniObject3DStudy",
-        "How soon are fruits told that differ in what is small? The paper's OmniObject3D, on procedural fruits, or on "
-        "meshes in folders of the classes' names.",
-    ),
+        "How soon are fruits told that differ in what is small? The paper's OmniObject3D, on meshes of yours in folders "
+        "of the classes' names, with a classifier of yours.",
+    )._replace(model="screened"),
     "parts": Entry(
         "jaxnbv.studies.parts.study:PartStudy",
         "How many views until all parts of an object are found? The paper's Table 1, on procedural objects, or on "

@@ -9,7 +9,7 @@ import pytest
 
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.networks import pretrained_classifier, pyramid_classifier
-from jaxnbv.studies.scenes import CLASS_SETS, FRUITS, HOUSEHOLD, PATTERNS, Framing, Split
+from jaxnbv.studies.scenes import CLASS_SETS, HOUSEHOLD, PATTERNS, Framing, Split
 from jaxnbv.studies.training.class_clouds import LabelledClouds, scanned_clouds
 from jaxnbv.tasks.classification import entropy
 
@@ -70,12 +70,11 @@ def test_the_class_of_a_cargo_by_what_is_seen_of_it():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "classes"), [("household", HOUSEHOLD), ("fruit", FRUITS)])
-def test_the_class_of_objects_seen_from_several_sides(name, classes):
+def test_the_class_of_objects_seen_from_several_sides():
     """Of test objects that were not trained on, from three views and more."""
-    classifier = pretrained_classifier(name)
-    assert classifier.classes == classes
-    found = scanned_clouds(CLASS_SETS[name], Split.TEST, Framing.CLOSE_UP, range(60))
+    classifier = pretrained_classifier("household")
+    assert classifier.classes == HOUSEHOLD
+    found = scanned_clouds(CLASS_SETS["household"], Split.TEST, Framing.CLOSE_UP, range(60))
     rows = np.asarray(found.views) >= 3
     right = np.argmax(answers(classifier, found.clouds), axis=1) == np.asarray(found.labels)
     assert rows.sum() >= 25

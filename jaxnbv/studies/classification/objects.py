@@ -1,7 +1,7 @@
 """The studies of classes by what their objects are: which methods' views tell the class, and how soon?
 
 Of a pyramid its base has a pattern. Of a loaded truck the outside is most of what can be seen, and says nothing of the
-cargo. Of household objects, the paper's sanity check, and of fruits, from its supplement, all tells the class.
+cargo. Of household objects, the paper's sanity check, and of scanned fruits, from its supplement, all tells the class.
 """
 
 from collections.abc import Mapping, Sequence
@@ -135,12 +135,25 @@ class ModelNet10Study(ClassificationStudy):
 
 
 class OmniObject3DStudy(ClassificationStudy):
-    """The class of a fruit, which is told by what is small on it, from a random first view. Settings as of
-    `ClassificationStudy`."""
+    """The class of a scanned fruit, which is told by what is small on it, from a random first view. Meshes and classifier
+    are the user's. Settings as of `ClassificationStudy`."""
 
     title: ClassVar[str] = "The class of a fruit"
-    objects: ClassVar[ClassSet] = CLASS_SETS["fruit"]
-    network: ClassVar[str] = "fruit"
-    bank: ClassVar[str] = "fruit"
+    objects: ClassVar[ClassSet] = ClassSet(("apple", "lemon", "mango", "mushroom", "orange"))
+    network: ClassVar[str] = ""
     solid: ClassVar[bool] = True
     seed: ClassVar[int] = 14
+
+    @classmethod
+    def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
+        """
+        **Raises:** `ValueError` as of a `ClassificationStudy`, or if `meshes` or `classifier` is not given.
+        """
+        needed = {
+            "meshes": f"--meshes FOLDER, a folder with a folder of meshes for each of {', '.join(cls.objects.classes)}",
+            "classifier": "--classifier FILE, the checkpoint of a network that tells these apart, such as a PointNet++ "
+            "that was trained in PyTorch",
+        }
+        missing = [text for name, text in needed.items() if name not in options]
+        require(not missing, f"nothing ships for the study omniobject3d: give {' and '.join(missing)}")
+        return super().configured(model, views, quick, **options)

@@ -168,7 +168,7 @@ class ClassificationStudy(Study):
 
     def thing(self, index: int) -> tuple[str, ClassObject | ClassMesh]:
         """The object of a scene and its name."""
-        if not self.meshes:
+        if self.objects.scene is not None and not self.meshes:
             return f"{self.network} {index}", self.objects.scene(self.split, index, self.framing)
         file = numbered(self.meshes, index)
         return f"{self.objects.classes[file.label]} {file.name}", self.of_mesh(file, index)

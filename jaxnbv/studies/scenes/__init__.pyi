@@ -5,10 +5,6 @@ from .class_sets import ClassSet as ClassSet
 from .demo import demo_object as demo_object
 from .first_view import FirstView as FirstView
 from .framing import Framing as Framing
-from .fruit import FRUITS as FRUITS
-from .fruit import Fruit as Fruit
-from .fruit import fruit_scene as fruit_scene
-from .fruit import sample_fruit as sample_fruit
 from .heat_objects import HEAT_OBJECTS as HEAT_OBJECTS
 from .heat_objects import HeatScene as HeatScene
 from .heat_objects import heat_scene as heat_scene

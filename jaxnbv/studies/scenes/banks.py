@@ -12,7 +12,6 @@ import numpy as np
 
 from jaxnbv.checks import check_type, require
 from jaxnbv.scanning.sdf import Sampled, SignedDistance
-from jaxnbv.studies.scenes.fruit import FRUITS, fruit_scene
 from jaxnbv.studies.scenes.heat_objects import FIRST_TRAINING, HEAT_OBJECTS, heat_scene
 from jaxnbv.studies.scenes.household import HOUSEHOLD, household_scene
 from jaxnbv.studies.scenes.parts import PART_CATEGORIES, part_scene
@@ -52,7 +51,6 @@ KINDS = {
     "pyramid": Kind(1024, PATTERNS, lambda i: pyramid_scene(Split.TRAIN, i, turned=False), FreeRotation()),
     "truck": Kind(512, HOUSEHOLD, lambda i: truck_scene(Split.TRAIN, i, turned=False), FreeRotation()),
     "household": Kind(512, HOUSEHOLD, lambda i: household_scene(Split.TRAIN, i, turned=False), _FURNITURE),
-    "fruit": Kind(256, FRUITS, lambda i: fruit_scene(Split.TRAIN, i, turned=False), FreeRotation()),
     "parts": Kind(520, PART_CATEGORIES, lambda i: part_scene(Split.TRAIN, i).solid, Upright(within=0.35, by_axis=True)),
     "heat": Kind(256, HEAT_OBJECTS, _heated, _FURNITURE),
 }

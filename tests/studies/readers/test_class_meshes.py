@@ -9,7 +9,7 @@ import trimesh
 
 from jaxnbv.checks import InputError
 from jaxnbv.studies.readers import class_meshes
-from jaxnbv.studies.scenes import FRUITS, HOUSEHOLD
+from jaxnbv.studies.scenes import HOUSEHOLD
 
 
 def box_files(folder, *names):
@@ -64,7 +64,7 @@ def test_copies_of_omniobject3d_name_objects_by_their_folder(tmp_path):
     box_files(tmp_path / "raw_scans", *(f"{name}/Scan/Scan.obj" for name in names))
     (tmp_path / "point_clouds").mkdir()
     for folder in (tmp_path, tmp_path / "raw_scans"):
-        assert found_in(folder, FRUITS)[1] == [("apple", "apple_001"), ("orange", "orange_010"), ("apple", "apple_003")]
+        assert found_in(folder, ["apple", "lemon", "orange"])[1] == [("apple", "apple_001"), ("orange", "orange_010"), ("apple", "apple_003")]
     (tmp_path / "raw_scans" / "apple" / "apple_001" / "Scan" / "Scan.obj").unlink()
     with pytest.warns(UserWarning, match=r"1 of the 2 objects of .*apple have no mesh and are left out: apple_001;"):
         assert [file.name for file in class_meshes(tmp_path, ["apple"])] == ["apple_003"]
