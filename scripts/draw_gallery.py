@@ -18,7 +18,7 @@ from jaxnbv.scanning import SDFSurface, Surface
 from jaxnbv.scanning.metrics import truth_points
 from jaxnbv.scanning.sensors import USUAL_SETTING, fitted
 from jaxnbv.search import SphereCandidates
-from jaxnbv.studies.scenes import Split, demo_object, fruit_scene, household_scene, part_scene, truck_scene
+from jaxnbv.studies.scenes import Split, demo_object, household_scene, part_scene, truck_scene
 from jaxnbv.viz.choice_figures import draw_acquisition
 from jaxnbv.viz.data import ReportData, report_data
 from jaxnbv.viz.figures import STYLE, Stills
@@ -40,7 +40,7 @@ def objects() -> dict[str, Surface]:
         "truck with a chair": SDFSurface(truck_scene(Split.TEST, 2)),
         "sofa": SDFSurface(household_scene(Split.TEST, 7)),
         "toilet": SDFSurface(household_scene(Split.TEST, 9)),
-        "mushroom": SDFSurface(fruit_scene(Split.TEST, 3)),
+        "bathtub": SDFSurface(household_scene(Split.TEST, 0)),
         "guitar": SDFSurface(part_scene(Split.TEST, 4).solid),
         "lamp": SDFSurface(part_scene(Split.TEST, 5).solid),
         "motorbike": SDFSurface(part_scene(Split.TEST, 7).solid),
