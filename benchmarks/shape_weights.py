@@ -20,9 +20,9 @@ from jaxnbv.planning.episode import view_keys
 from jaxnbv.storage.files import write_whole
 from jaxnbv.studies.classification.objects import ModelNet10Study, PyramidStudy, TruckStudy
 from jaxnbv.studies.classification.study import ClassificationStudy
+from jaxnbv.studies.engine.diagnostics import expected_calibration_error
 from jaxnbv.studies.engine.measures import KNOWN
 from jaxnbv.studies.scenes import Framing, Split
-from jaxnbv.studies.training import expected_calibration_error
 from jaxnbv.surfaces import KnownShapesPosterior
 from jaxnbv.surfaces.known_shapes import NONE
 

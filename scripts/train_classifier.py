@@ -1,12 +1,14 @@
 """Train, calibrate and test a classifier that ships with jaxnbv: `python scripts/train_classifier.py truck`.
 
 Two stages: clouds of true scans, then the same beside clouds whose last view is of a posterior sample, since those are
-what an acquisition feeds the network; where little of a cloud tells the class, first which points do. Clouds and
-checkpoints stay in the output folder, so that a run that was interrupted continues. One to two hours on one CPU core.
+what an acquisition feeds the network; where little of a cloud tells the class, first which points do. Clouds and the
+network after each stage stay in the output folder, so that a run that was interrupted continues. One to two hours on
+one CPU core.
 """
 
 import argparse
 import dataclasses
+import functools
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,21 +17,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from cached import cached
+from training import calibrate, fit, log_probabilities, train
+from training_clouds import LabelledClouds, Source, concatenated
 
 from jaxnbv import Coverage, Grid, Planner, PointCloud
 from jaxnbv.imagination import Imagination
 from jaxnbv.networks import Focus, FocusedClassifier, InvariantClassifier, save_checkpoint
 from jaxnbv.networks.pretrained import TRAINED_POINTS, TRAINED_SIDE
+from jaxnbv.studies.engine.diagnostics import expected_calibration_error
 from jaxnbv.studies.scenes import CLASS_SETS, Framing, Split
-from jaxnbv.studies.training import calibrate, expected_calibration_error, fit, log_probabilities, train
-from jaxnbv.studies.training.class_clouds import LabelledClouds, imagined_clouds, scanned_clouds
 from jaxnbv.tasks.classification import entropy
 
 WEIGHTS = Path(__file__).parents[1] / "jaxnbv" / "networks" / "weights"
-# Scenes whose posterior is sampled come from numbers that no scanned cloud uses.
-FIRST_IMAGINED = 100_000
-SCANNED_AT_ONCE = 100
 
 
 class Recipe(NamedTuple):
@@ -37,8 +36,8 @@ class Recipe(NamedTuple):
 
     - `framings`: how large the objects stand.
     - `solid`: whether they are nowhere thin, see `Imagination.preset`.
-    - `scenes`: of which there are true scans, in each framing; `imagined`: of which there are imagined ones, 16 each.
-    - `radii`, `groups`: of the network.
+    - `scenes`: of which there are true scans, in each framing; of 100 there are imagined ones, 16 each.
+    - `groups`: of the network.
     - `focus`: steps of learning which points tell the class, where these are few; the classifier sees them alone.
     - `steps`: on true scans, or what of them tells the class, and on these beside imagined ones.
     """
@@ -46,59 +45,25 @@ class Recipe(NamedTuple):
     framings: tuple[Framing, ...] = (Framing.CLOSE_UP,)
     solid: bool = False
     scenes: int = 10_000
-    imagined: int = 200
-    radii: tuple[float, ...] = (0.25, 0.8)
-    groups: tuple[int, ...] = (256, 64)
+    groups: tuple[int, ...] = (192, 48)
     focus: int = 0
     steps: tuple[int, int] = (8000, 4000)
 
 
 RECIPES = {
-    "pyramid": Recipe(tuple(Framing), solid=True, scenes=12_000, imagined=100),
-    "truck": Recipe(scenes=16_000, imagined=100, groups=(192, 48), focus=2400, steps=(10_000, 5000)),
-    "household": Recipe(scenes=8000, imagined=100, groups=(192, 48), steps=(4000, 1000)),
+    "pyramid": Recipe(tuple(Framing), solid=True, scenes=12_000, groups=(256, 64)),
+    "truck": Recipe(scenes=16_000, focus=2400, steps=(10_000, 5000)),
+    "household": Recipe(scenes=8000, steps=(4000, 1000)),
 }
 
 
-class Clouds:
-    """The clouds of a set, made once and kept in a folder; in the network's units."""
-
-    def __init__(self, name: str, folder: Path):
-        self.set, self.recipe, self.folder = CLASS_SETS[name], RECIPES[name], folder
-        self.points = TRAINED_POINTS[name]
-
-    def scanned(self, split: Split, framing: Framing, count: int) -> LabelledClouds:
-        """Clouds of true scans."""
-
-        def make(first: int) -> LabelledClouds:
-            return scanned_clouds(self.set, split, framing, range(first, first + SCANNED_AT_ONCE), self.points)
-
-        folder, firsts = self.folder / f"scanned-{split}-{framing}", range(0, count, SCANNED_AT_ONCE)
-        return self._scaled(framing, cached(folder, firsts, make))
-
-    def imagined(self, split: Split, framing: Framing, count: int) -> LabelledClouds:
-        """Clouds that end in a scan of a posterior sample, 16 from each of `count` scenes."""
-        preset = Imagination.preset("screened", framing.longest_side, solid=self.recipe.solid)
-        imagination = dataclasses.replace(preset, grid=Grid(64, 0.7 * framing.longest_side), num_samples=4)
-        planner = Planner(Coverage(), imagination=imagination, capacity=2500)
-
-        def make(index: int) -> LabelledClouds:
-            return imagined_clouds(self.set, split, framing, index, planner, num_points=self.points)
-
-        folder, indices = self.folder / f"imagined-{split}-{framing}", range(FIRST_IMAGINED, FIRST_IMAGINED + count)
-        return self._scaled(framing, cached(folder, indices, make))
-
-    def _scaled(self, framing: Framing, leaves: list[np.ndarray]) -> LabelledClouds:
-        points, normals, mask, *rest = leaves
-        return LabelledClouds(PointCloud(points * (TRAINED_SIDE / framing.longest_side), normals, mask), *rest)
-
-    def joined(self, make, split: Split, count: int) -> LabelledClouds:
-        """Clouds of all framings."""
-        return concatenated(*(make(split, framing, count) for framing in self.recipe.framings))
-
-
-def concatenated(*parts: LabelledClouds) -> LabelledClouds:
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+def source(name: str, framing: Framing, folder: Path) -> Source:
+    """The clouds of a set's objects in a framing."""
+    preset = Imagination.preset("screened", framing.longest_side, solid=RECIPES[name].solid)
+    imagination = dataclasses.replace(preset, grid=Grid(64, 0.7 * framing.longest_side), num_samples=4)
+    planner = Planner(Coverage(), imagination=imagination, capacity=2500)
+    scene = functools.partial(CLASS_SETS[name].scene, framing=framing)
+    return Source(folder / framing, scene, planner, TRAINED_POINTS[name], scale=TRAINED_SIDE / framing.longest_side)
 
 
 def informative(data: LabelledClouds) -> LabelledClouds:
@@ -118,11 +83,12 @@ def thinned(data: LabelledClouds) -> LabelledClouds:
 
 def telling_alone(data: LabelledClouds, points: int = 320) -> LabelledClouds:
     """The points that tell the class, of the clouds that have twenty of them or more."""
-    data = jax.tree.map(lambda leaf: leaf[data.on_cue.sum(axis=1) >= 20], data)
-    order = np.argsort(~data.on_cue, axis=1, kind="stable")[:, :points]
+    data = jax.tree.map(lambda leaf: leaf[data.point_labels.sum(axis=1) >= 20], data)
+    order = np.argsort(~data.point_labels, axis=1, kind="stable")[:, :points]
     rows = np.arange(len(order))[:, None]
-    cloud = PointCloud(data.clouds.points[rows, order], data.clouds.normals[rows, order], data.on_cue[rows, order])
-    return eqx.tree_at(lambda d: (d.clouds, d.on_cue), data, (cloud, cloud.mask))
+    tells = data.point_labels[rows, order]
+    cloud = PointCloud(data.clouds.points[rows, order], data.clouds.normals[rows, order], tells)
+    return eqx.tree_at(lambda d: (d.clouds, d.point_labels), data, (cloud, tells))
 
 
 def focus_loss(focus: Focus, example: tuple[PointCloud, Any]) -> Any:
@@ -150,10 +116,9 @@ def report(name: str, network: Any, data: LabelledClouds) -> None:
         if rows.any():
             text = f"  {low:>4} to {high - 1:<4g} telling pixels: {rows.sum():5d} clouds"
             print(f"{text}, {right[rows].mean():6.1%} right, entropy {uncertain[rows].mean():.2f} nats")
-    for views in range(1, 6):
+    for views in np.unique(data.views):
         rows = data.views == views
-        if rows.any():
-            print(f"  {views} views: {rows.sum():5d} clouds, {right[rows].mean():6.1%} right")
+        print(f"  {views} views: {rows.sum():5d} clouds, {right[rows].mean():6.1%} right")
 
 
 def main() -> None:
@@ -163,39 +128,37 @@ def main() -> None:
     parser.add_argument("--weights", type=Path, help="default: the package's")
     arguments = parser.parse_args()
     folder: Path = arguments.out or Path("runs") / f"{arguments.set}-network"
-    folder.mkdir(parents=True, exist_ok=True)
-    clouds, recipe = Clouds(arguments.set, folder), RECIPES[arguments.set]
+    recipe, names = RECIPES[arguments.set], CLASS_SETS[arguments.set].classes
+    sources = {framing: source(arguments.set, framing, folder) for framing in recipe.framings}
     first, second = recipe.steps
 
-    names = clouds.set.classes
-    network: Any = InvariantClassifier(len(names), jax.random.key(0), recipe.radii, names, recipe.groups)
-    scans = clouds.joined(clouds.scanned, Split.TRAIN, recipe.scenes)
-    imagined = informative(clouds.joined(clouds.imagined, Split.TRAIN, recipe.imagined))
+    network: Any = InvariantClassifier(len(names), jax.random.key(0), classes=names, groups=recipe.groups)
+    scans = concatenated(*(one.scanned(Split.TRAIN, recipe.scenes) for one in sources.values()))
+    imagined = informative(concatenated(*(one.imagined(Split.TRAIN, 100) for one in sources.values())))
     if recipe.focus:
         alone = telling_alone(scans)
-        network = train(network, alone.clouds, alone.labels, jax.random.key(3), first, folder=folder / "alone")
+        network = train(network, alone.clouds, alone.labels, jax.random.key(3), first, file=folder / "alone.eqx")
         both = informative(concatenated(thinned(scans), imagined))
-        data, keys = (both.clouds, both.on_cue), jax.random.split(jax.random.key(4))
+        data, keys = (both.clouds, both.point_labels), jax.random.split(jax.random.key(4))
         # Every point is an example: few clouds make a batch.
-        focus = fit(Focus(keys[0]), focus_loss, data, keys[1], recipe.focus, 8, folder=folder / "focus")
+        focus = fit(Focus(keys[0]), focus_loss, data, keys[1], recipe.focus, 8, file=folder / "focus.eqx")
         chosen = chosen_clouds(FocusedClassifier(focus, network), both.clouds)
-        network = train(network, chosen, both.labels, jax.random.key(2), second, folder=folder / "imagined")
+        network = train(network, chosen, both.labels, jax.random.key(2), second, file=folder / "imagined.eqx")
         network = FocusedClassifier(focus, network)
     else:
         scans = thinned(informative(scans))
-        network = train(network, scans.clouds, scans.labels, jax.random.key(1), first, folder=folder / "scanned")
+        network = train(network, scans.clouds, scans.labels, jax.random.key(1), first, file=folder / "scanned.eqx")
         both = concatenated(scans, imagined)
-        network = train(network, both.clouds, both.labels, jax.random.key(2), second, folder=folder / "imagined")
+        network = train(network, both.clouds, both.labels, jax.random.key(2), second, file=folder / "imagined.eqx")
 
-    held_out = clouds.joined(clouds.scanned, Split.VALIDATION, 1000)
+    held_out = concatenated(*(one.scanned(Split.VALIDATION, 1000) for one in sources.values()))
     network = calibrate(network, jax.tree.map(jnp.asarray, held_out.clouds), held_out.labels)
     print(f"temperature {float(network.temperature):.3f}")
-    for framing in recipe.framings:
-        report(f"true scans, test split, {framing}", network, clouds.scanned(Split.TEST, framing, 1000))
-    report("imagined scans, validation split", network, clouds.joined(clouds.imagined, Split.VALIDATION, 15))
+    for framing, one in sources.items():
+        report(f"true scans, test split, {framing}", network, one.scanned(Split.TEST, 1000))
+        report(f"imagined scans, validation split, {framing}", network, one.imagined(Split.VALIDATION, 15))
 
     weights: Path = arguments.weights or WEIGHTS / f"{arguments.set}.safetensors"
-    weights.parent.mkdir(parents=True, exist_ok=True)
     save_checkpoint(network, weights)
     print(f"{weights}   {weights.stat().st_size / 1e6:.2f} MB")
 

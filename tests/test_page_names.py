@@ -127,7 +127,7 @@ def documented() -> dict[str, list[str]]:
     return names
 
 
-STUDIES = ("studies.readers", "studies.scenes", "studies.training")
+STUDIES = ("studies.readers", "studies.scenes")
 PACKAGES = ("networks", "scanning", "search", "surfaces", "tasks", "viz", *STUDIES)
 
 

@@ -62,8 +62,8 @@ STUDIES = {
     ),
     "omniobject3d": _of_classes(
         "jaxnbv.studies.classification.objects:OmniObject3DStudy",
-        "How soon are fruits told that differ in what is small? The paper's OmniObject3D, on meshes of yours in folders "
-        "of the classes' names, with a classifier of yours.",
+        "How soon are fruits told that differ in what is small? The paper's OmniObject3D, on meshes of yours in "
+        "folders of the classes' names, with a classifier of yours.",
     )._replace(model="screened"),
     "parts": Entry(
         "jaxnbv.studies.parts.study:PartStudy",

@@ -7,14 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from training_clouds import scanned_clouds
 
 from jaxnbv.networks import (
     CATEGORIES,
     CompactPartSegmenter,
     part_segmenter,
 )
-from jaxnbv.studies.scenes import Split
-from jaxnbv.studies.training.part_clouds import LabelledPartClouds, scanned_part_clouds
+from jaxnbv.scanning.sensors import PART_SETTING
+from jaxnbv.studies.scenes import Split, part_scene
 
 RNG = np.random.default_rng(0)
 COUNT = 300
@@ -111,7 +112,7 @@ def test_gradients_are_finite_and_those_of_finite_differences(network, x64):
 @eqx.filter_jit
 def predicted(segmenter, found):
     def of_cloud(example):
-        own = eqx.tree_at(lambda s: s.category, segmenter, example.categories)
+        own = eqx.tree_at(lambda s: s.category, segmenter, example.labels)
         return own.predict(example.clouds)
 
     return jax.lax.map(of_cloud, found)
@@ -119,14 +120,13 @@ def predicted(segmenter, found):
 
 @pytest.mark.slow
 def test_the_shipped_weights_know_the_parts_of_objects_that_they_were_not_trained_on(computes):
-    """Three clouds of an object of each procedural category, numbers of the test split that the training never saw."""
-    found = scanned_part_clouds(Split.TEST, range(5000, 5013))
-    assert isinstance(found, LabelledPartClouds)
+    """Two objects of each procedural category, numbers of the test split that the training never saw."""
+    found = scanned_clouds(part_scene, Split.TEST, range(5000, 5026), setting=PART_SETTING)
     fed, said = jax.tree.map(np.asarray, predicted(part_segmenter("chair", num_points=1024), found))
     # Farthest point samples of farthest point samples are themselves, in their order.
     np.testing.assert_array_equal(fed.points, found.clouds.points)
-    mask, labels = np.asarray(found.clouds.mask), np.asarray(found.labels)
-    for category, rows, there in zip(np.asarray(found.categories), said, mask, strict=True):
+    mask, labels = np.asarray(found.clouds.mask), np.asarray(found.point_labels)
+    for category, rows, there in zip(np.asarray(found.labels), said, mask, strict=True):
         assert set(rows[there].tolist()) <= set(CATEGORIES[category].labels)
         assert (rows[~there] == -1).all()
     assert np.mean(said[mask] == labels[mask]) >= 0.85

@@ -1,16 +1,16 @@
 """The shipped classifier on pyramids that it was not trained on."""
 
+from functools import partial
 from importlib import resources
 
 import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from training_clouds import scanned_clouds
 
-from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.networks import pretrained_classifier, pyramid_classifier
-from jaxnbv.studies.scenes import CLASS_SETS, HOUSEHOLD, PATTERNS, Framing, Split
-from jaxnbv.studies.training.class_clouds import LabelledClouds, scanned_clouds
+from jaxnbv.studies.scenes import HOUSEHOLD, PATTERNS, Framing, Split, household_scene, pyramid_scene, truck_scene
 from jaxnbv.tasks.classification import entropy
 
 COMPUTES = True
@@ -36,9 +36,7 @@ def test_right_where_the_pattern_is_seen_and_undecided_where_it_is_not(framing):
     classifier = pyramid_classifier(framing.longest_side)
     right, undecided, first = [], [], 0
     while len(right) < 50:
-        found = scanned_clouds(CLASS_SETS["pyramid"], Split.TEST, framing, range(first, first + _CHUNK))
-        assert isinstance(found, LabelledClouds)
-        assert isinstance(found.clouds, PointCloud)
+        found = scanned_clouds(partial(pyramid_scene, framing=framing), Split.TEST, range(first, first + _CHUNK))
         log_p = answers(classifier, found.clouds)
         pixels = np.asarray(found.cue_pixels)
         right += (np.argmax(log_p, axis=1) == np.asarray(found.labels))[pixels >= enough].tolist()
@@ -57,9 +55,9 @@ def test_the_class_of_a_cargo_by_what_is_seen_of_it():
     assert classifier.classes == HOUSEHOLD
     right, undecided, first = [], [], 0
     while len(right) < 30:
-        found = scanned_clouds(CLASS_SETS["truck"], Split.TEST, Framing.CLOSE_UP, range(first, first + _CHUNK), 2048)
+        found = scanned_clouds(truck_scene, Split.TEST, range(first, first + _CHUNK), 2048)
         log_p = answers(classifier, found.clouds)
-        telling = np.asarray(found.on_cue).sum(axis=1)
+        telling = np.asarray(found.point_labels).sum(axis=1)
         right += (np.argmax(log_p, axis=1) == np.asarray(found.labels))[telling >= 150].tolist()
         undecided += np.asarray(entropy(log_p))[telling == 0].tolist()
         first += _CHUNK
@@ -74,7 +72,7 @@ def test_the_class_of_objects_seen_from_several_sides():
     """Of test objects that were not trained on, from three views and more."""
     classifier = pretrained_classifier("household")
     assert classifier.classes == HOUSEHOLD
-    found = scanned_clouds(CLASS_SETS["household"], Split.TEST, Framing.CLOSE_UP, range(60))
+    found = scanned_clouds(household_scene, Split.TEST, range(60))
     rows = np.asarray(found.views) >= 3
     right = np.argmax(answers(classifier, found.clouds), axis=1) == np.asarray(found.labels)
     assert rows.sum() >= 25

@@ -135,8 +135,8 @@ class ModelNet10Study(ClassificationStudy):
 
 
 class OmniObject3DStudy(ClassificationStudy):
-    """The class of a scanned fruit, which is told by what is small on it, from a random first view. Meshes and classifier
-    are the user's. Settings as of `ClassificationStudy`."""
+    """The class of a scanned fruit, which is told by what is small on it, from a random first view, on meshes and by a
+    classifier of the user's. Settings as of `ClassificationStudy`."""
 
     title: ClassVar[str] = "The class of a fruit"
     objects: ClassVar[ClassSet] = ClassSet(("apple", "lemon", "mango", "mushroom", "orange"))

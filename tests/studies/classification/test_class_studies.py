@@ -1,4 +1,4 @@
-"""The studies of trucks, household objects and scanned fruits on a small scale: what they record beside the pyramids'."""
+"""The studies of trucks, household objects and scans on a small scale: what they record beside the pyramids'."""
 
 import dataclasses
 import functools

@@ -64,7 +64,8 @@ def test_copies_of_omniobject3d_name_objects_by_their_folder(tmp_path):
     box_files(tmp_path / "raw_scans", *(f"{name}/Scan/Scan.obj" for name in names))
     (tmp_path / "point_clouds").mkdir()
     for folder in (tmp_path, tmp_path / "raw_scans"):
-        assert found_in(folder, ["apple", "lemon", "orange"])[1] == [("apple", "apple_001"), ("orange", "orange_010"), ("apple", "apple_003")]
+        found = found_in(folder, ["apple", "lemon", "orange"])[1]
+        assert found == [("apple", "apple_001"), ("orange", "orange_010"), ("apple", "apple_003")]
     (tmp_path / "raw_scans" / "apple" / "apple_001" / "Scan" / "Scan.obj").unlink()
     with pytest.warns(UserWarning, match=r"1 of the 2 objects of .*apple have no mesh and are left out: apple_001;"):
         assert [file.name for file in class_meshes(tmp_path, ["apple"])] == ["apple_003"]

@@ -1,6 +1,6 @@
 """How often the shipped classifier of household objects is right on real ones, as it is and tuned on a few of them.
 
-    python benchmarks/real_classes.py FOLDER [--few 2] [--steps 300] [--out results.json]
+    python scripts/real_classes.py FOLDER [--few 2] [--steps 300] [--out results.json]
 
 FOLDER holds a folder of meshes for each class, as `jaxnbv study modelnet10 --meshes` takes it. The first objects of
 each class, `few` of them where the class has more, tune the network, together with stand-ins so that it does not
@@ -15,19 +15,18 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from training import log_probabilities, train
+from training_clouds import joined_views, random_poses, scanned_clouds
 
 from jaxnbv import Camera, PointCloud
 from jaxnbv.geometry.cloud import farthest_point_subsample
-from jaxnbv.geometry.pose import look_at
 from jaxnbv.networks import pretrained_classifier
 from jaxnbv.networks.pretrained import TRAINED_POINTS
 from jaxnbv.scanning import SensorNoise, scan
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.storage.folders import versions
 from jaxnbv.studies.readers import MeshFile, class_meshes
-from jaxnbv.studies.scenes import CLASS_SETS, HOUSEHOLD, Framing, Split
-from jaxnbv.studies.training import log_probabilities, train
-from jaxnbv.studies.training.class_clouds import scanned_clouds
+from jaxnbv.studies.scenes import HOUSEHOLD, Split, household_scene
 
 CLOUDS, VIEWS, STAND_INS = 10, 5, 200
 
@@ -38,11 +37,9 @@ def clouds_of(file: MeshFile, number: int, points: int) -> PointCloud:
     made = []
     for key in jax.random.split(jax.random.fold_in(jax.random.key(0), number), CLOUDS):
         place_key, noise_key = jax.random.split(key)
-        direction = jax.random.normal(place_key, (VIEWS, 3))
-        poses = look_at(SENSOR_RADIUS * direction / jnp.linalg.norm(direction, axis=-1, keepdims=True))
+        poses = random_poses(place_key, VIEWS, SENSOR_RADIUS)
         seen = SensorNoise()(scan(mesh, Camera(), poses), noise_key)
-        joined = PointCloud(seen.points.reshape(-1, 3), seen.normals.reshape(-1, 3), seen.mask.reshape(-1))
-        made.append(farthest_point_subsample(joined, points))
+        made.append(farthest_point_subsample(joined_views(seen), points))
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *made)
 
 
@@ -79,7 +76,7 @@ def main() -> None:
     results = {"versions": versions(), "tuned_on": [f"{names[f.label]} {f.name}" for f, _ in few]}
     results["as it is"] = told(network, rest, names)
     if few:
-        made = scanned_clouds(CLASS_SETS["household"], Split.TRAIN, Framing.CLOSE_UP, range(STAND_INS), points)
+        made = scanned_clouds(household_scene, Split.TRAIN, range(STAND_INS), points)
         clouds = jax.tree.map(
             lambda *leaves: np.concatenate(leaves),
             PointCloud(made.clouds.points, made.clouds.normals, made.clouds.mask),

@@ -1,0 +1,152 @@
+"""Training clouds: what they hold, that they can be made again, and that splits differ."""
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from training_clouds import MOST_VIEWS, Source, imagined_clouds, scanned_clouds
+
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import fibonacci_sphere, look_at
+from jaxnbv.imagination import Imagination
+from jaxnbv.planning.planner import Planner
+from jaxnbv.scanning import Grid, SDFSurface, scan
+from jaxnbv.scanning.sensors import PART_SETTING
+from jaxnbv.studies.scenes import PATTERNS, Split, part_scene, pyramid_scene
+from jaxnbv.surfaces import GeometricSPSR
+from jaxnbv.tasks import Coverage
+
+COUNT, POINTS = 24, 200
+MODEL = GeometricSPSR(lengthscale=0.05, truncation=8)
+PLANNER = Planner(Coverage(), imagination=Imagination(MODEL, grid=Grid(20), num_samples=2), capacity=150)
+# A motorbike and a skateboard. Compilation takes nearly all the time of the rest.
+PARTS, SETTING = (7, 11), PART_SETTING._replace(camera=Camera(height=24, width=24))
+
+
+@pytest.fixture(scope="module")
+def scanned():
+    return scanned_clouds(pyramid_scene, Split.TRAIN, range(5, 5 + COUNT), POINTS)
+
+
+@pytest.fixture(scope="module")
+def imagined():
+    return imagined_clouds(pyramid_scene, Split.TRAIN, 5, PLANNER, POINTS)
+
+
+@eqx.filter_jit
+def distances(solid, x):
+    return solid(x)
+
+
+def own_frame(pyramid, points):
+    """Points in the frame of the pyramid."""
+    offset, rotation, scale = map(np.asarray, (pyramid.offset, pyramid.rotation, pyramid.scale))
+    return (points - offset) @ rotation / scale
+
+
+def test_scanned_clouds_are_samples_of_their_scenes_with_noise(scanned):
+    np.testing.assert_array_equal(scanned.labels, np.arange(5, 5 + COUNT) % len(PATTERNS))
+    assert scanned.clouds.points.shape == (COUNT, POINTS, 3)
+    assert not np.asarray(scanned.imagined).any()
+    assert {*np.asarray(scanned.views).tolist()} == {*range(1, MOST_VIEWS + 1)}
+    assert np.asarray(scanned.clouds.count > 50).all()
+    for row in range(COUNT):
+        _, normals = scanned.clouds[row].to_numpy()
+        off = distances(pyramid_scene(Split.TRAIN, 5 + row), scanned.clouds.points[row])
+        off = np.asarray(off)[scanned.clouds.mask[row]]
+        # Farthest point samples favour what noise moves out: its standard deviation is 0.01 along each axis.
+        assert np.abs(off).max() < 0.06
+        assert 0.004 < off.std() < 0.025
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
+
+
+def test_points_that_tell_the_class_lie_in_the_pattern_where_a_view_shows_it(scanned):
+    """In a pyramid's own frame, up to three deviations of the noise; half the pattern's depth is more than that."""
+    shares = {False: [], True: []}
+    tells, mask = np.asarray(scanned.point_labels), np.asarray(scanned.clouds.mask)
+    assert not (tells & ~mask).any()
+    for row, pixels in enumerate(np.asarray(scanned.cue_pixels)):
+        pyramid = pyramid_scene(Split.TRAIN, 5 + row)
+        own = own_frame(pyramid, np.asarray(scanned.clouds.points[row]))
+        assert (own[tells[row], 2] * float(pyramid.scale) > 0.03 - 1e-4).all()
+        assert (own[tells[row], 2] < float(pyramid.depth) + 0.04).all()
+        side = (np.abs(own[:, :2]).max(axis=1) - 1) * float(pyramid.height) + own[:, 2]
+        inner = mask[row] & (own[:, 2] > 0.5 * float(pyramid.depth)) & (side < -0.12)
+        if pixels == 0 or pixels > 500:
+            shares[bool(pixels)].append((inner.sum() / mask[row].sum(), tells[row].sum()))
+    unseen, seen = (np.array(shares[key]) for key in (False, True))
+    assert len(unseen) >= 2
+    assert len(seen) >= 5
+    assert unseen.max(axis=0)[0] < 0.01
+    assert (seen.min(axis=0) > (0.02, 10)).all()
+    assert np.asarray(scanned.cue_pixels).max() <= 2500
+
+
+def test_clouds_can_be_made_again_in_other_portions_and_splits_differ(scanned):
+    few = slice(4, 7)
+    part = scanned_clouds(pyramid_scene, Split.TRAIN, range(5, 5 + COUNT)[few], POINTS)
+    np.testing.assert_array_equal(part.cue_pixels, scanned.cue_pixels[few])
+    np.testing.assert_allclose(part.clouds.points, scanned.clouds.points[few], atol=1e-5)
+    other = scanned_clouds(pyramid_scene, Split.TEST, range(5, 5 + COUNT)[few], POINTS)
+    assert not np.array_equal(other.cue_pixels, part.cue_pixels)
+
+
+@pytest.mark.slow
+def test_imagined_clouds_begin_with_what_was_truly_seen(imagined):
+    assert imagined.clouds.points.shape == (8, POINTS, 3)
+    assert np.asarray(imagined.imagined).all()
+    np.testing.assert_array_equal(imagined.labels, 0)
+    assert len(np.unique(imagined.cue_pixels)) == 1
+    clouds = [imagined.clouds[row].to_numpy() for row in range(8)]
+    off = np.abs(np.asarray(distances(pyramid_scene(Split.TRAIN, 5), imagined.clouds.points)))
+    on_surface = np.sum((off < 0.04) & np.asarray(imagined.clouds.mask), axis=1)
+    for (points, normals), count in zip(clouds, on_surface, strict=True):
+        assert np.isfinite(points).all()
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-4)
+        # Some of the points are D's, on the true surface; the sample's are not all.
+        assert 20 < count <= len(points)
+    shared = {tuple(p) for p in clouds[0][0]} & {tuple(p) for p in clouds[1][0]}
+    assert 5 < len(shared) < len(clouds[0][0])
+    assert len({points.tobytes() for points, _ in clouds}) == 8
+
+
+@pytest.mark.slow
+def test_clouds_are_kept_in_the_units_of_the_network(tmp_path, monkeypatch):
+    monkeypatch.setattr("training_clouds._AT_ONCE", 3)
+    source = Source(tmp_path, pyramid_scene, PLANNER, POINTS, scale=2.0)
+    made = source.scanned(Split.TEST, 6)
+    again = scanned_clouds(pyramid_scene, Split.TEST, range(6), POINTS)
+    np.testing.assert_allclose(made.clouds.points, 2.0 * again.clouds.points, atol=2e-5)
+    np.testing.assert_array_equal(made.labels, again.labels)
+    monkeypatch.setattr("training_clouds.scanned_clouds", None)
+    for one, other in zip(jax.tree.leaves(source.scanned(Split.TEST, 6)), jax.tree.leaves(made), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@eqx.filter_jit
+def surface_points(solid):
+    """Noiseless hits from many sides, by another camera than the clouds', with their labels."""
+    camera = Camera(fov=1.0, height=64, width=64)
+    hits = jax.lax.map(lambda pose: scan(SDFSurface(solid), camera, pose), look_at(fibonacci_sphere(16, 2.7)))
+    return hits.points.reshape(-1, 3), solid.label(hits.points).reshape(-1), hits.mask.reshape(-1)
+
+
+@pytest.mark.slow
+def test_points_of_parts_have_the_label_of_the_surface_nearby():
+    found = scanned_clouds(part_scene, Split.TRAIN, PARTS, POINTS, SETTING)
+    for row, index in enumerate(PARTS):
+        scene = part_scene(Split.TRAIN, index)
+        assert int(found.labels[row]) == int(scene.category)
+        points, labels, mask = (np.asarray(one) for one in surface_points(scene.solid))
+        points, labels = points[mask], labels[mask]
+        there = np.asarray(found.clouds.mask[row])
+        noisy, own = np.asarray(found.clouds.points[row])[there], np.asarray(found.point_labels[row])[there]
+        assert np.asarray(scene.parts)[own].all()
+        # Six deviations of the noise.
+        near = cKDTree(points).query_ball_point(noisy, 0.06)
+        alike = [set(labels[index]) for index in near]
+        assert np.mean([len(some) > 0 for some in alike]) > 0.9
+        sure = [(some, label) for some, label in zip(alike, own, strict=True) if len(some) == 1]
+        assert len(sure) > 0.3 * there.sum()
+        assert np.mean([label in some for some, label in sure]) > 0.99
