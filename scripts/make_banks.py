@@ -7,15 +7,48 @@ Those of procedural objects take half a minute; that of real ones needs the mesh
 import argparse
 from pathlib import Path
 
-from jaxnbv.studies.scenes.banks import KINDS, REAL, made_bank, write_bank
+import jax
+import numpy as np
+
+from jaxnbv.scanning.sdf import Sampled
+from jaxnbv.studies.scenes import HEAT_OBJECTS, HOUSEHOLD, PART_CATEGORIES, PATTERNS
+from jaxnbv.studies.scenes.banks import KINDS, QUANTUM
 from jaxnbv.surfaces import ShapeBank
 
 BANKS = Path(__file__).parents[1] / "jaxnbv" / "studies" / "scenes" / "shapes"
+# How many, and the kinds of object, which take turns.
+NUMBERS = {
+    "pyramid": (1024, PATTERNS),
+    "truck": (512, HOUSEHOLD),
+    "household": (512, HOUSEHOLD),
+    "parts": (520, PART_CATEGORIES),
+    "heat": (256, HEAT_OBJECTS),
+}
+
+
+def made_bank(name: str) -> ShapeBank:
+    """A bank of procedural objects."""
+    count, kinds = NUMBERS[name]
+    names = [f"{kinds[index % len(kinds)]} {index}" for index in range(count)]
+    return ShapeBank.of([KINDS[name].shape(index) for index in range(count)], names)
+
+
+def write_bank(path: Path, bank: ShapeBank) -> None:
+    """Numbers are rounded to sixteen bits, whole ones and distances on grids to eight; see `read_bank`."""
+    solids, extremes = bank.shapes
+    leaves = [np.asarray(leaf) for leaf in (*jax.tree.leaves(solids), extremes)]
+    if isinstance(solids, Sampled):
+        steps = np.clip(np.round(leaves[0] / QUANTUM), -127, 127).astype(np.int8)
+        # Neighbours are alike, so that their differences take less room.
+        leaves[0] = np.diff(steps, axis=-1, prepend=np.int8(0))
+    narrow = {"f": np.float16, "i": np.int8, "b": np.bool_}
+    arrays = {f"{index:02d}": leaf.astype(narrow[leaf.dtype.kind]) for index, leaf in enumerate(leaves)}
+    np.savez_compressed(path, names=np.array(bank.names), **arrays)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("names", nargs="*", default=list(KINDS), help="which")
+    parser.add_argument("names", nargs="*", default=list(NUMBERS), help="which")
     parser.add_argument("--household", type=Path, help="folder of real meshes, class/cc-0_name.glb")
     arguments = parser.parse_args()
     BANKS.mkdir(exist_ok=True)
@@ -24,7 +57,7 @@ def main() -> None:
     if arguments.household is not None:
         files = sorted(arguments.household.glob("*/cc-0_*.glb"))
         names = [f"{file.parent.name.replace('_', ' ')} {file.stem.removeprefix('cc-0_')}" for file in files]
-        write_bank(BANKS / f"{REAL}.npz", ShapeBank.from_meshes(files, names=names))
+        write_bank(BANKS / "household-real.npz", ShapeBank.from_meshes(files, names=names))
     for file in sorted(BANKS.iterdir()):
         print(f"{file.name}: {file.stat().st_size / 1000:.0f} kB")
 

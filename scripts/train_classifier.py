@@ -25,7 +25,16 @@ from jaxnbv.imagination import Imagination
 from jaxnbv.networks import Focus, FocusedClassifier, InvariantClassifier, save_checkpoint
 from jaxnbv.networks.pretrained import TRAINED_POINTS, TRAINED_SIDE
 from jaxnbv.studies.engine.diagnostics import expected_calibration_error
-from jaxnbv.studies.scenes import CLASS_SETS, Framing, Split
+from jaxnbv.studies.scenes import (
+    HOUSEHOLD,
+    PATTERNS,
+    ClassSet,
+    Framing,
+    Split,
+    household_scene,
+    pyramid_scene,
+    truck_scene,
+)
 from jaxnbv.tasks.classification import entropy
 
 WEIGHTS = Path(__file__).parents[1] / "jaxnbv" / "networks" / "weights"
@@ -34,6 +43,7 @@ WEIGHTS = Path(__file__).parents[1] / "jaxnbv" / "networks" / "weights"
 class Recipe(NamedTuple):
     """What a network is trained on.
 
+    - `objects`: the scenes and their classes.
     - `framings`: how large the objects stand.
     - `solid`: whether they are nowhere thin, see `Imagination.preset`.
     - `scenes`: of which there are true scans, in each framing; of 100 there are imagined ones, 16 each.
@@ -42,6 +52,7 @@ class Recipe(NamedTuple):
     - `steps`: on true scans, or what of them tells the class, and on these beside imagined ones.
     """
 
+    objects: ClassSet
     framings: tuple[Framing, ...] = (Framing.CLOSE_UP,)
     solid: bool = False
     scenes: int = 10_000
@@ -51,9 +62,9 @@ class Recipe(NamedTuple):
 
 
 RECIPES = {
-    "pyramid": Recipe(tuple(Framing), solid=True, scenes=12_000, groups=(256, 64)),
-    "truck": Recipe(scenes=16_000, focus=2400, steps=(10_000, 5000)),
-    "household": Recipe(scenes=8000, steps=(4000, 1000)),
+    "pyramid": Recipe(ClassSet(PATTERNS, pyramid_scene), tuple(Framing), solid=True, scenes=12_000, groups=(256, 64)),
+    "truck": Recipe(ClassSet(HOUSEHOLD, truck_scene), scenes=16_000, focus=2400, steps=(10_000, 5000)),
+    "household": Recipe(ClassSet(HOUSEHOLD, household_scene), scenes=8000, steps=(4000, 1000)),
 }
 
 
@@ -62,7 +73,7 @@ def source(name: str, framing: Framing, folder: Path) -> Source:
     preset = Imagination.preset("screened", framing.longest_side, solid=RECIPES[name].solid)
     imagination = dataclasses.replace(preset, grid=Grid(64, 0.7 * framing.longest_side), num_samples=4)
     planner = Planner(Coverage(), imagination=imagination, capacity=2500)
-    scene = functools.partial(CLASS_SETS[name].scene, framing=framing)
+    scene = functools.partial(RECIPES[name].objects.scene, framing=framing)
     return Source(folder / framing, scene, planner, TRAINED_POINTS[name], scale=TRAINED_SIDE / framing.longest_side)
 
 
@@ -128,7 +139,7 @@ def main() -> None:
     parser.add_argument("--weights", type=Path, help="default: the package's")
     arguments = parser.parse_args()
     folder: Path = arguments.out or Path("runs") / f"{arguments.set}-network"
-    recipe, names = RECIPES[arguments.set], CLASS_SETS[arguments.set].classes
+    recipe, names = RECIPES[arguments.set], RECIPES[arguments.set].objects.classes
     sources = {framing: source(arguments.set, framing, folder) for framing in recipe.framings}
     first, second = recipe.steps
 

@@ -28,7 +28,7 @@ def pretrained_classifier(
 ) -> CloudClassifier:
     """The shipped classifier of the procedural scenes of a name, whose boxes have this longest side, in scene units.
 
-    - `name`: of `jaxnbv.studies.scenes.CLASS_SETS`.
+    - `name`: "pyramid", "truck" or "household".
     - `num_points`: what it is fed, by default as many as it was trained on; with half as many it is a little less often
       right, and twice as fast.
 

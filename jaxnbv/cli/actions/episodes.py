@@ -30,7 +30,7 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SensorNoise, Surface, load_mesh, scan
 from jaxnbv.scanning.sensors import Setting
 from jaxnbv.storage.folders import AnotherConfigurationError
-from jaxnbv.studies.scenes.banks import BANKS, bank_poses, shape_bank
+from jaxnbv.studies.scenes.banks import KINDS, bank_poses, shape_bank
 from jaxnbv.surfaces import ShapeBank, Upright
 from jaxnbv.viz.task import race_words
 
@@ -113,10 +113,10 @@ def knowing(imagination: Imagination, known: str | None) -> Imagination:
     """
     if known in (None, "none"):
         return imagination
-    if known in BANKS:
+    if known in KINDS:
         return imagination.knowing(shape_bank(known), bank_poses(known))
     require(
-        os.path.isdir(known), f"--known {known}: there is no such folder of meshes; or give {', '.join(BANKS)}, none"
+        os.path.isdir(known), f"--known {known}: there is no such folder of meshes; or give {', '.join(KINDS)}, none"
     )
     return imagination.knowing(ShapeBank.from_meshes(known), Upright(by_axis=True))
 

@@ -19,7 +19,17 @@ from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.meshes import mesh_files
 from jaxnbv.studies.engine.study import Chart, Scene, Study
 from jaxnbv.studies.readers import MeshFile
-from jaxnbv.studies.scenes import CLASS_SETS, ClassSet, FirstView, Framing, Pyramid
+from jaxnbv.studies.scenes import (
+    HOUSEHOLD,
+    PATTERNS,
+    ClassSet,
+    FirstView,
+    Framing,
+    Pyramid,
+    household_scene,
+    pyramid_scene,
+    truck_scene,
+)
 from jaxnbv.studies.scenes.class_object import ClassMesh, choose_hidden
 from jaxnbv.studies.scenes.splits import scene_key
 from jaxnbv.studies.scenes.truck_meshes import loaded_truck
@@ -37,7 +47,7 @@ class PyramidStudy(ClassificationStudy):
         "Diagnostics are by the view being chosen, in ( ) their scenes. Angles are of the first view from the base's "
         "normal."
     )
-    objects: ClassVar[ClassSet] = CLASS_SETS["pyramid"]
+    objects: ClassVar[ClassSet] = ClassSet(PATTERNS, pyramid_scene)
     cue: ClassVar[str] = "pattern"
     network: ClassVar[str] = "pyramid"
     framings: ClassVar[tuple[Framing, ...]] = tuple(Framing)
@@ -85,7 +95,7 @@ class TruckStudy(ClassificationStudy):
     explanation: ClassVar[str] = (
         f"{HITS_EXPLAINED}{seen_explained('cargo')}\nDiagnostics are by the view being chosen, in ( ) their scenes."
     )
-    objects: ClassVar[ClassSet] = CLASS_SETS["truck"]
+    objects: ClassVar[ClassSet] = ClassSet(HOUSEHOLD, truck_scene)
     cue: ClassVar[str] = "cargo"
     bank: ClassVar[str] = "truck"
     network: ClassVar[str] = "truck"
@@ -125,7 +135,7 @@ class ModelNet10Study(ClassificationStudy):
     from a random first view. Settings as of `ClassificationStudy`."""
 
     title: ClassVar[str] = "The class of a household object"
-    objects: ClassVar[ClassSet] = CLASS_SETS["household"]
+    objects: ClassVar[ClassSet] = ClassSet(HOUSEHOLD, household_scene)
     network: ClassVar[str] = "household"
     bank: ClassVar[str] = "household"
     seed: ClassVar[int] = 12

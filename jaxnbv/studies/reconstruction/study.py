@@ -17,8 +17,7 @@ from jaxnbv.scanning.screened_poisson import has_poisson, screened_poisson
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.meshes import MeshStudy
 from jaxnbv.studies.engine.study import RULES, Chart, Panel, Scene
-from jaxnbv.studies.scenes import Split
-from jaxnbv.studies.scenes.parts import part_scene
+from jaxnbv.studies.scenes import Split, part_scene
 from jaxnbv.tasks import Coverage, NewSurface
 
 POISSON, MEAN = "screened Poisson", "posterior mean"

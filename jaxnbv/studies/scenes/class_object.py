@@ -1,5 +1,8 @@
 """Objects whose class is asked for."""
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,9 +14,10 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import SDFSurface, Surface, TriangleMesh, scan
-from jaxnbv.scanning.sdf import SignedDistance
+from jaxnbv.scanning.sdf import SignedDistance, least_of_last
 from jaxnbv.scanning.triangles import distance_to_triangles
 from jaxnbv.search.candidates import sphere_candidates
+from jaxnbv.studies.scenes.labelled import LabelledSolid
 
 
 class ClassObject(SignedDistance):
@@ -30,6 +34,34 @@ class ClassObject(SignedDistance):
         Give hits without noise; the tolerance is in scene units.
         """
         return jnp.ones(x.shape[:-1], bool)
+
+
+class SolidObject(ClassObject):
+    """Labelled primitives; a bound. Those of label 0 say nothing of the class, all others tell it.
+
+    - `solid`: where it stands in the scene.
+    """
+
+    solid: LabelledSolid
+    label: Int[Array, ""]
+
+    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+        return self.solid(x)
+
+    def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
+        """Those of the primitives that tell the class."""
+        return least_of_last(jnp.where(self.solid.labels > 0, self.solid.distances(x), jnp.inf)) <= tolerance
+
+
+class ClassSet(NamedTuple):
+    """Scenes of several classes.
+
+    - `classes`: their names.
+    - `scene`: of a split, an index and a framing; None where meshes alone are such scenes.
+    """
+
+    classes: tuple[str, ...]
+    scene: Callable[..., ClassObject] | None = None
 
 
 class ClassMesh(eqx.Module):

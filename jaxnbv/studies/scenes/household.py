@@ -2,78 +2,28 @@
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxnbv.checks import AnyArray, require
-from jaxnbv.studies.scenes.class_object import ClassObject
-from jaxnbv.studies.scenes.framing import Framing
-from jaxnbv.studies.scenes.labelled import (
-    LabelledSolid,
-    Primitive,
-    assemble,
-    ball,
-    bar,
-    box,
-    generator,
-    path,
-    ring,
-    rod,
-)
+from jaxnbv.studies.scenes.class_object import SolidObject
+from jaxnbv.studies.scenes.labelled import assemble, ball, bar, box, generator, path, ring, rod
 from jaxnbv.studies.scenes.parts import furniture
-from jaxnbv.studies.scenes.splits import Split, scene_key
+from jaxnbv.studies.scenes.splits import Framing, Split, scene_key
 
-_LABEL = 0
-
-
-class HouseholdObject(ClassObject):
-    """An object of one of `HOUSEHOLD`; a bound.
-
-    - `solid`: where it stands in the scene.
-    - `label`: its class, an index of `HOUSEHOLD`.
-    """
-
-    solid: LabelledSolid
-    label: Int[Array, ""]
-
-    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        return self.solid(x)
+_LABEL = 1
 
 
-def household_scene(
-    split: Split, index: int, framing: Framing = Framing.CLOSE_UP, turned: bool = True
-) -> HouseholdObject:
-    """Scene number `index` of a split; the classes take turns. See `sample_household_object`.
-
-    **Raises:** `ValueError` if the index is negative.
-    """
-    key = scene_key(6, split, index)
-    return sample_household_object(HOUSEHOLD[index % len(HOUSEHOLD)], key, framing.longest_side, turned)
-
-
-def sample_household_object(
-    name: str, key: PRNGKeyArray, longest_side: float = 2.5, turned: bool = True
-) -> HouseholdObject:
-    """A random object of one of `HOUSEHOLD`, upright along y, turned about it at random or, not `turned`, along x.
+def household_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_UP, turned: bool = True) -> SolidObject:
+    """Scene number `index` of a split; the classes take turns: a random object of one of `HOUSEHOLD`, upright along y,
+    turned about it at random or, not `turned`, along x.
 
     Its bounding box is centred; where it has the longest side 2.5, no primitive is thinner than 0.05. Built on the
     host: it does not run under `jit`.
 
-    **Raises:** `ValueError` for another class, or if `longest_side` is not positive.
+    **Raises:** `ValueError` if the index is negative.
     """
-    require(longest_side > 0, f"the longest side is {longest_side}; it must be positive")
-    rng = generator(key)
-    primitives = household_primitives(name, rng)
-    solid = assemble(primitives, rng.uniform(-np.pi, np.pi) if turned else 0.0, longest_side)
-    return HouseholdObject(solid=solid, label=jnp.asarray(HOUSEHOLD.index(name)))
-
-
-def household_primitives(name: str, rng: np.random.Generator) -> list[Primitive]:
-    """What a random object of a class consists of: x is forward, y up and z to the right.
-
-    **Raises:** `ValueError` for another class.
-    """
-    require(name in _BUILDERS, f"there are no stand-ins of the class '{name}': choose from {', '.join(HOUSEHOLD)}")
-    return _BUILDERS[name](rng)
+    label, rng = index % len(HOUSEHOLD), generator(scene_key(6, split, index))
+    primitives = BUILDERS[HOUSEHOLD[label]](rng)
+    solid = assemble(primitives, rng.uniform(-np.pi, np.pi) if turned else 0.0, framing.longest_side)
+    return SolidObject(solid=solid, label=jnp.asarray(label))
 
 
 def _corners(x: float, z: float) -> list[tuple[float, float]]:
@@ -259,7 +209,8 @@ def _toilet(rng):
     return [*parts, inside, rod(_LABEL, (0.1, level + 0.05, 0), (0.1, level + 0.12, 0), bowl + 0.02)]
 
 
-_BUILDERS = {
+# Each lists the primitives of a random object: x is forward, y up and z to the right.
+BUILDERS = {
     "bathtub": _bathtub,
     "bed": _bed,
     "chair": furniture.chair,
@@ -273,4 +224,4 @@ _BUILDERS = {
 }
 
 # The classes, in the order of ModelNet10.
-HOUSEHOLD = tuple(_BUILDERS)
+HOUSEHOLD = tuple(BUILDERS)

@@ -13,19 +13,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.checks import AnyArray, require
 from jaxnbv.scanning.sdf import SignedDistance, corner_distance, least_of_last, nonnegative, norm, parameter
 
-# How many primitives a solid can have.
+# How many primitives a solid has room for, or a multiple of it.
 CAPACITY = 24
 
-_LONGEST_SIDE = 2.5
 _EMPTY = -1
 _UNTURNED, _UNMOVED = np.eye(3), np.zeros(3)
 
 
 class LabelledSolid(SignedDistance):
-    """The union of up to 24 labelled primitives; a bound.
+    """The union of labelled primitives; a bound.
 
     A point x has the coordinates u = rotation^T (x - centre) in a primitive's own frame. With h = half_size and
     t = rounding, its distance is that of the box [-h, h] rounded by t,
@@ -40,24 +39,16 @@ class LabelledSolid(SignedDistance):
     - `revolved`: which primitives are revolved; `radius` is then that of the ring, 0 for a solid, and `slant` its
       growth with height.
     - `labels`: the label of each primitive; -1 marks a slot that is not used.
-
-    **Raises:** `ValueError` also if a rounding is greater than a half size, or no slot is used.
     """
 
-    labels: Int[Array, f"{CAPACITY}"]
-    revolved: Bool[Array, f"{CAPACITY}"]
-    centre: Float[Array, f"{CAPACITY} 3"] = parameter()
-    rotation: Float[Array, f"{CAPACITY} 3 3"] = parameter()
-    half_size: Float[Array, f"{CAPACITY} 3"] = nonnegative()
-    rounding: Float[Array, f"{CAPACITY}"] = nonnegative()
-    radius: Float[Array, f"{CAPACITY}"] = nonnegative()
-    slant: Float[Array, f"{CAPACITY}"] = parameter()
-
-    def __check_init__(self):
-        if not is_traced(self):
-            over = np.flatnonzero(np.asarray(self.rounding) > np.asarray(self.half_size).min(axis=1))
-            require(len(over) == 0, f"primitives {over} are rounded by more than a half size: round them by less")
-            require(bool((np.asarray(self.labels) > _EMPTY).any()), "the solid has no primitive: give at least one")
+    labels: Int[Array, " slots"]
+    revolved: Bool[Array, " slots"]
+    centre: Float[Array, "slots 3"] = parameter()
+    rotation: Float[Array, "slots 3 3"] = parameter()
+    half_size: Float[Array, "slots 3"] = nonnegative()
+    rounding: Float[Array, " slots"] = nonnegative()
+    radius: Float[Array, " slots"] = nonnegative()
+    slant: Float[Array, " slots"] = parameter()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         return least_of_last(self.distances(x))
@@ -188,13 +179,9 @@ def _upright(axis):
     return np.stack([np.cross(axis, level), axis, level], axis=1)
 
 
-def assemble(primitives: list[Primitive], turn: float = 0.0, longest_side: float = _LONGEST_SIDE) -> LabelledSolid:
+def assemble(primitives: list[Primitive], turn: float = 0.0, longest_side: float = 2.5) -> LabelledSolid:
     """The union of primitives, turned about the y axis by an angle in radians, then moved and scaled: its bounding box
-    is centred in the scene and has the given longest side.
-
-    **Raises:** `ValueError` if there are no primitives or more than a solid can have.
-    """
-    _check_count(primitives)
+    is centred in the scene and has the given longest side."""
     turned = rotation_about((0.0, 1.0, 0.0), turn)
     return united(fitted([moved(p, rotation=turned) for p in primitives], longest_side))
 
@@ -224,30 +211,17 @@ def fitted(primitives: list[Primitive], longest_side: float) -> list[Primitive]:
     return [moved(p, scale, offset=-0.5 * scale * (low + high)) for p in primitives]
 
 
-def united(primitives: list[Primitive]) -> LabelledSolid:
+def united(primitives: list[Primitive], capacity: int = CAPACITY) -> LabelledSolid:
     """The union of primitives, where they are.
 
-    **Raises:** `ValueError` if there are no primitives or more than a solid can have.
+    **Raises:** `ValueError` if there are no primitives or more than the capacity.
     """
-    _check_count(primitives)
-
-    spare = Primitive(_EMPTY, np.zeros(3), np.eye(3), np.zeros(3), rounding=0.0)
-    slots = primitives + [spare] * (CAPACITY - len(primitives))
-    return LabelledSolid(
-        labels=jnp.asarray([p.label for p in slots], jnp.int32),
-        revolved=jnp.asarray([p.revolved for p in slots]),
-        centre=jnp.asarray([p.centre for p in slots]),
-        rotation=jnp.asarray([p.rotation for p in slots]),
-        half_size=jnp.asarray([p.half_size for p in slots]),
-        rounding=jnp.asarray([p.rounding for p in slots]),
-        radius=jnp.asarray([p.radius for p in slots]),
-        slant=jnp.asarray([p.slant for p in slots]),
-    )
-
-
-def _check_count(primitives: list[Primitive]) -> None:
     count = len(primitives)
-    require(1 <= count <= CAPACITY, f"the object has {count} primitives; a solid holds 1 to {CAPACITY}")
+    require(1 <= count <= capacity, f"the object has {count} primitives; a solid holds 1 to {capacity}")
+    spare = Primitive(_EMPTY, np.zeros(3), np.eye(3), np.zeros(3), rounding=0.0)
+    slots = primitives + [spare] * (capacity - count)
+    fields = {field.name: jnp.asarray([getattr(p, field.name) for p in slots]) for field in dataclasses.fields(spare)}
+    return LabelledSolid(labels=fields.pop("label"), **fields)
 
 
 def generator(key) -> np.random.Generator:

@@ -6,12 +6,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from jaxnbv.checks import AnyArray, require
+from jaxnbv.checks import AnyArray
 from jaxnbv.scanning.sdf import Matrix, Scalar, Vector, nonnegative, parameter
 from jaxnbv.studies.scenes.class_object import ClassObject
-from jaxnbv.studies.scenes.framing import Framing
 from jaxnbv.studies.scenes.patterns import PATTERNS, pattern_distance
-from jaxnbv.studies.scenes.splits import Split, scene_key
+from jaxnbv.studies.scenes.splits import Framing, Split, scene_key
 
 
 class Pyramid(ClassObject):
@@ -62,26 +61,26 @@ class Pyramid(ClassObject):
         return jnp.maximum(flat, w - self.depth)
 
 
+def pyramid_scene(
+    split: Split, index: int | Int[Array, ""], framing: Framing = Framing.CLOSE_UP, turned: bool = True
+) -> Pyramid:
+    """Scene number `index` of a split, the same pyramid in both framings; the classes take turns.
+
+    A pyramid with random height and pattern, centred in the scene, and turned in any direction or, not `turned`,
+    upright along z. Runs under `jit` and `vmap`.
+
+    **Raises:** `ValueError` if the index is negative.
+    """
+    key, label = scene_key(0, split, index), jnp.asarray(index % len(PATTERNS))
+    return _pyramid(key, label, framing.longest_side, turned)
+
+
 # Least distance of a pattern from the base's edge: with the ranges below no pattern breaks through a side.
 _MARGIN = 0.1
 
 
-def sample_pyramid(
-    key: PRNGKeyArray, label: int | Int[AnyArray, ""], longest_side: float = 2.5, turned: bool = True
-) -> Pyramid:
-    """A pyramid of a class with random height and pattern, centred in the scene, and turned in any direction or, not
-    `turned`, upright along z.
-
-    `longest_side` is that of its bounding box along the scene's axes. Runs under `jit` and `vmap`.
-
-    **Raises:** `ValueError` if `longest_side` is not positive.
-    """
-    require(longest_side > 0, f"the longest side is {longest_side}; it must be positive")
-    return _sample(key, jnp.asarray(label), longest_side, turned)
-
-
 @functools.partial(jax.jit, static_argnames="turned")
-def _sample(key: PRNGKeyArray, label: Int[Array, ""], longest_side: Float[Array, ""] | float, turned: bool) -> Pyramid:
+def _pyramid(key: PRNGKeyArray, label: Int[Array, ""], longest_side: Float[Array, ""] | float, turned: bool) -> Pyramid:
     height_key, size_key, place_key, turn_key, depth_key, rotation_key = jax.random.split(key, 6)
     height = jax.random.uniform(height_key, minval=1.2, maxval=1.6)
     size = jax.random.uniform(size_key, minval=0.7, maxval=0.85)
@@ -96,13 +95,3 @@ def _sample(key: PRNGKeyArray, label: Int[Array, ""], longest_side: Float[Array,
     low, high = jnp.min(corners, axis=0), jnp.max(corners, axis=0)
     scale = longest_side / jnp.max(high - low)
     return Pyramid(label, height, size, place, turn, depth, rotation, scale, -0.5 * scale * (low + high))
-
-
-def pyramid_scene(
-    split: Split, index: int | Int[Array, ""], framing: Framing = Framing.CLOSE_UP, turned: bool = True
-) -> Pyramid:
-    """Scene number `index` of a split, the same pyramid in both framings; the classes take turns. See `sample_pyramid`.
-
-    **Raises:** `ValueError` if the index is negative.
-    """
-    return sample_pyramid(scene_key(0, split, index), index % len(PATTERNS), framing.longest_side, turned)

@@ -1,4 +1,4 @@
-"""Which scenes are trained on, tuned on and reported, and the key that makes each."""
+"""Which scenes, how large an object stands, and from where it is seen first."""
 
 from enum import StrEnum
 
@@ -9,11 +9,30 @@ from jaxnbv.checks import require
 
 
 class Split(StrEnum):
-    """Which scenes: no two splits share one."""
+    """Which scenes are trained on, tuned on and reported: no two splits share one."""
 
     TRAIN = "train"
     VALIDATION = "validation"
     TEST = "test"
+
+
+class Framing(StrEnum):
+    """How large the object stands before the sensor: a view shows a patch, or nearly all of its near side."""
+
+    CLOSE_UP = "close-up"
+    WHOLE = "whole"
+
+    @property
+    def longest_side(self) -> float:
+        """Longest side of the object's box in scene units."""
+        return 2.5 if self is Framing.CLOSE_UP else 1.25
+
+
+class FirstView(StrEnum):
+    """Which views of an object may be the first one: any, or those after which the classifier is wrong."""
+
+    ANY = "any"
+    MISCLASSIFIED = "misclassified"
 
 
 def scene_key(seed: int, split: Split, index: int | Int[Array, ""]) -> PRNGKeyArray:

@@ -1,16 +1,13 @@
 """A truck with an open bed that carries an object of one of ten classes: only the cargo tells the class."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Float
 
-from jaxnbv.checks import AnyArray, require
-from jaxnbv.studies.scenes.class_object import ClassObject
-from jaxnbv.studies.scenes.framing import Framing
-from jaxnbv.studies.scenes.household import HOUSEHOLD, household_primitives
+from jaxnbv.studies.scenes.class_object import SolidObject
+from jaxnbv.studies.scenes.household import BUILDERS, HOUSEHOLD
 from jaxnbv.studies.scenes.labelled import (
-    LabelledSolid,
+    CAPACITY,
     Primitive,
     bounds,
     box,
@@ -21,32 +18,13 @@ from jaxnbv.studies.scenes.labelled import (
     rotation_about,
     united,
 )
-from jaxnbv.studies.scenes.splits import Split, scene_key
+from jaxnbv.studies.scenes.splits import Framing, Split, scene_key
 
-_TRUCK, _CARGO = 0, 1
-
-
-class LoadedTruck(ClassObject):
-    """A truck and its cargo; a bound.
-
-    - `truck`, `cargo`: where they stand in the scene.
-    - `label`: the cargo's class, an index of `HOUSEHOLD`.
-    """
-
-    truck: LabelledSolid
-    cargo: LabelledSolid
-    label: Int[Array, ""]
-
-    def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        # One union of all primitives is half the program that a union of two would be.
-        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), self.truck, self.cargo)(x)
-
-    def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
-        """Those of the cargo."""
-        return self.cargo(x) <= tolerance
+# Says nothing of the class; primitives of the cargo have other labels.
+_TRUCK = 0
 
 
-def truck_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_UP, turned: bool = True) -> LoadedTruck:
+def truck_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_UP, turned: bool = True) -> SolidObject:
     """Scene number `index` of a split; the classes of the cargo take turns.
 
     The cargo is turned at random about the vertical, as large as the bed has room for, and the loaded truck in any
@@ -55,26 +33,15 @@ def truck_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_UP, t
 
     **Raises:** `ValueError` if the index is negative.
     """
-    return sample_truck(scene_key(5, split, index), index % len(HOUSEHOLD), framing.longest_side, turned)
-
-
-def sample_truck(key: PRNGKeyArray, label: int, longest_side: float = 2.5, turned: bool = True) -> LoadedTruck:
-    """A random truck with a random object of a class on its bed, as `truck_scene` places them.
-
-    **Raises:** `ValueError` if there is no such class, or `longest_side` is not positive.
-    """
-    require(0 <= label < len(HOUSEHOLD), f"there is no class {label}: give 0 to {len(HOUSEHOLD) - 1}")
-    require(longest_side > 0, f"the longest side is {longest_side}; it must be positive")
-    rng = generator(key)
+    label, rng = index % len(HOUSEHOLD), generator(scene_key(5, split, index))
     truck, low, high = _truck(rng)
     turn = rotation_about((0.0, 1.0, 0.0), rng.uniform(-np.pi, np.pi))
-    cargo = [moved(p, rotation=turn) for p in household_primitives(HOUSEHOLD[label], rng)]
+    cargo = [moved(p, rotation=turn) for p in BUILDERS[HOUSEHOLD[label]](rng)]
     scale, offset = stowed(np.stack([low, high]), bounds(cargo), rng)
     cargo = [moved(p, scale, offset=offset) for p in cargo]
     rotation = random_rotation(rng) if turned else np.eye(3)
-    both = fitted([moved(p, rotation=rotation) for p in truck + cargo], longest_side)
-    solids = {"truck": united(both[: len(truck)]), "cargo": united(both[len(truck) :])}
-    return LoadedTruck(**solids, label=jnp.asarray(label))
+    both = fitted([moved(p, rotation=rotation) for p in truck + cargo], framing.longest_side)
+    return SolidObject(solid=united(both, 2 * CAPACITY), label=jnp.asarray(label))
 
 
 def stowed(

@@ -1,11 +1,10 @@
 """Scenes of part-labelled objects: the categories take turns."""
 
 import equinox as eqx
-import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Int
 
-from jaxnbv.checks import require
 from jaxnbv.networks.categories import NUM_PARTS, category_index
 from jaxnbv.studies.scenes.labelled import LabelledSolid, assemble, generator
 from jaxnbv.studies.scenes.parts import belongings, furniture, vehicles
@@ -48,29 +47,16 @@ class PartScene(eqx.Module):
     parts: Bool[Array, "50"]
 
 
-def sample_part_object(category: str, key: PRNGKeyArray) -> LabelledSolid:
-    """A random object of a category, upright along y and facing x up to 10 degrees, labelled by its parts.
+def part_scene(split: Split, index: int) -> PartScene:
+    """Scene number `index` of a split; the categories take turns: a random object of one of `PART_CATEGORIES`, upright
+    along y and facing x up to 10 degrees.
 
     Its bounding box is centred and has the longest side 2.5; no part is thinner than 0.05. Built on the host: it does
     not run under `jit`.
 
-    **Raises:** `ValueError` for a category that has no procedural objects.
-    """
-    require(
-        category in _BUILDERS,
-        f"there are no procedural objects of the category '{category}': choose from {', '.join(PART_CATEGORIES)}",
-    )
-    rng = generator(key)
-    return assemble(_BUILDERS[category](rng), rng.uniform(-_LARGEST_TURN, _LARGEST_TURN))
-
-
-def part_scene(split: Split, index: int) -> PartScene:
-    """Scene number `index` of a split; the categories take turns.
-
     **Raises:** `ValueError` if the index is negative.
     """
-    key = scene_key(0, split, index)
-    category = PART_CATEGORIES[index % len(PART_CATEGORIES)]
-    solid = sample_part_object(category, key)
+    category, rng = PART_CATEGORIES[index % len(PART_CATEGORIES)], generator(scene_key(0, split, index))
+    solid = assemble(_BUILDERS[category](rng), rng.uniform(-_LARGEST_TURN, _LARGEST_TURN))
     parts = np.isin(np.arange(NUM_PARTS), np.asarray(solid.labels))
-    return PartScene(solid, jax.numpy.asarray(category_index(category)), jax.numpy.asarray(parts))
+    return PartScene(solid, jnp.asarray(category_index(category)), jnp.asarray(parts))
