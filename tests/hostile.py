@@ -125,7 +125,7 @@ CALLS = {
     nbv.Thickness: {"depth": 0.1, "num_points": 10, "value": -1.0, "noise": 1.0},
     nbv.TriangleMesh.from_arrays: {"vertices": np.eye(3), "faces": [[0, 1, 2]]},
     nbv.UncertaintyView: {"candidates": 6},
-    readers.class_meshes: {"folder": COPY, "classes": ["bed"], "split": "test"},
+    readers.class_meshes: {"folder": COPY, "classes": ["bed"]},
     chosen_of_bank: {"indices": [0]},
     nbv.AsGiven: {"scale": (0.9, 1.1), "by_axis": False},
     nbv.FreeRotation: {"scale": (0.9, 1.1), "by_axis": False},

@@ -2,18 +2,28 @@
 
 import itertools
 import os
-import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import trimesh
 
-from jaxnbv.checks import checked, require, shown
+from jaxnbv.checks import InputError, checked, require, shown
 from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.scanning import TriangleMesh, load_mesh
 
 _T = TypeVar("_T")
+# Patterns of the meshes in the folder of a class, with their axis that is upward; {name} is the folder's own.
+_LAYOUTS = {
+    "test/{name}_[0-9]*.off": "z",  # ModelNet
+    "*/Scan/Scan.obj": "y",  # OmniObject3D
+    "*/models/model_normalized.obj": "y",  # ShapeNet v2
+    "*/model.obj": "y",  # ShapeNet v1
+    "test/**/*": "y",
+    "**/*": "y",
+}
+# Categories of ShapeNet lie in folders of WordNet's numbers.
+_SYNSETS = {category.name: category.synset for category in CATEGORIES}
 
 
 class MeshFile(NamedTuple):
@@ -34,32 +44,7 @@ class MeshFile(NamedTuple):
 
         **Raises:** `ValueError` if the file is missing or damaged.
         """
-        require(os.path.isfile(Path(self.path)), f"there is no file {self.path}: unpack the data set again")
         return load_mesh(self.path, self.up)
-
-
-class _Layout(NamedTuple):
-    """What lies in the folder of a class.
-
-    - `files`: a pattern of its meshes; {name} is the folder's own, {split} "train" or "test".
-    - `up`: their axis that is upward.
-    """
-
-    files: str
-    up: str = "y"
-
-
-_LAYOUTS = {
-    "ModelNet": _Layout("{split}/{name}_[0-9]*.off", up="z"),
-    "OmniObject3D": _Layout("*/Scan/Scan.obj"),
-    "ShapeNet v2": _Layout("*/models/model_normalized.obj"),
-    "ShapeNet v1": _Layout("*/model.obj"),
-    "split": _Layout("{split}/**/*"),
-    "any": _Layout("**/*"),
-}
-_SPLITS = ("train", "test")
-# Categories of ShapeNet lie in folders of WordNet's numbers.
-_SYNSETS = {category.name: category.synset for category in CATEGORIES}
 
 
 def is_mesh_file(path: Path) -> bool:
@@ -74,28 +59,27 @@ def taking_turns(groups: Iterable[Sequence[_T]]) -> list[_T]:
 
 
 @checked
-def class_meshes(folder: str | Path, classes: Sequence[str], split: str = "test") -> tuple[MeshFile, ...]:
+def class_meshes(folder: str | Path, classes: Sequence[str]) -> tuple[MeshFile, ...]:
     """The meshes in a folder `class/.../name` for those of the classes that have one, labelled by their place in
     `classes`; these take turns. Other folders are passed over.
 
     Names of classes may be written with underscores. How a class is laid out is seen from its files: as in ModelNet,
     OmniObject3D or ShapeNet (whose folders are numbers, which can be given as names too), or in any other way. Where
-    there are splits the meshes are those of `split`. Folders of objects without a mesh are named by a `UserWarning`.
+    there is a split `test` the meshes are its.
 
-    **Raises:** `ValueError` if there is no such folder, none of a class, or one without a mesh; and unless classes and
-    split are names.
+    **Raises:** `ValueError` if there is no such folder, none of a class, or one without a mesh; and unless classes are
+    names.
     """
     folder = Path(folder)
     named = isinstance(classes, list | tuple) and all(isinstance(name, str) for name in classes)
     require(named, f"the classes are {shown(classes)}: give a list of names")
-    require(split in _SPLITS, f"there is no split {shown(split)}: choose from {', '.join(_SPLITS)}")
     require(
         os.path.isdir(folder), f"there is no folder {folder}: give one that holds a folder of meshes for each class"
     )
     folder = folder / "raw_scans" if (folder / "raw_scans").is_dir() else folder
     there = {_plain(path.name): path for path in sorted(folder.iterdir()) if path.is_dir()}
     found = [(label, there.get(_plain(name), there.get(_SYNSETS.get(name, "")))) for label, name in enumerate(classes)]
-    groups = [_of_class(path, label, split) for label, path in found if path is not None]
+    groups = [_of_class(path, label) for label, path in found if path is not None]
     require(len(groups) > 0, f"the folder {folder} has none of the folders {', '.join(classes)}: give one that has")
     return tuple(taking_turns(groups))
 
@@ -104,22 +88,11 @@ def _plain(name: str) -> str:
     return name.lower().replace("_", " ")
 
 
-def _of_class(folder: Path, label: int, split: str) -> list[MeshFile]:
-    for layout in _LAYOUTS.values():
-        inside = sorted(folder.glob(layout.files.format(name=folder.name, split=split)))
-        files = [file for file in inside if is_mesh_file(file)]
+def _of_class(folder: Path, label: int) -> list[MeshFile]:
+    for pattern, up in _LAYOUTS.items():
+        files = [file for file in sorted(folder.glob(pattern.format(name=folder.name))) if is_mesh_file(file)]
         if files:
-            break
-    require(len(files) > 0, f"the folder {folder} holds no mesh of the split {split}: unpack it again, or take it away")
-    # Else each object has a folder, which names it.
-    if not layout.files.startswith("*/"):
-        return [MeshFile(label, file.stem, str(file), layout.up) for file in files]
-    named = {file.relative_to(folder).parts[0]: file for file in files}
-    absent = [path.name for path in sorted(folder.iterdir()) if path.is_dir() and path.name not in named]
-    if absent:
-        warnings.warn(
-            f"{len(absent)} of the {len(absent) + len(named)} objects of {folder} have no mesh and are left out: "
-            f"{', '.join(absent[:3])}{', ...' if len(absent) > 3 else ''}; unpack the data set again if you want them",
-            stacklevel=3,
-        )
-    return [MeshFile(label, name, str(file), layout.up) for name, file in named.items()]
+            # Where each object has a folder, this names it.
+            names = [file.relative_to(folder).parts[0] if pattern.startswith("*/") else file.stem for file in files]
+            return [MeshFile(label, name, str(file), up) for name, file in zip(names, files, strict=True)]
+    raise InputError(f"the folder {folder} holds no mesh: unpack it again, or take it away")

@@ -1,6 +1,5 @@
 """Folders of meshes by class, in tiny copies of the layouts of data sets, whole, partial and damaged."""
 
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +19,8 @@ def box_files(folder, *names):
         trimesh.creation.box((1.0, 0.5, 0.25)).export(file)
 
 
-def found_in(folder, classes, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        files = class_meshes(folder, classes, **options)
+def found_in(folder, classes):
+    files = class_meshes(folder, classes)
     return files, [(classes[file.label], file.name) for file in files]
 
 
@@ -56,7 +53,6 @@ def test_copies_of_modelnet_are_turned_upright(tmp_path):
     ]
     for file, sides in ((files[0], [2.5, 0.625, 1.25]), (files[1], [2.5, 1.25, 0.625])):
         np.testing.assert_allclose(np.ptp(file.read().vertices, axis=0), sides)
-    assert found_in(tmp_path, ["bathtub"], split="train")[1] == [("bathtub", "bathtub_0001")]
 
 
 def test_copies_of_omniobject3d_name_objects_by_their_folder(tmp_path):
@@ -66,9 +62,6 @@ def test_copies_of_omniobject3d_name_objects_by_their_folder(tmp_path):
     for folder in (tmp_path, tmp_path / "raw_scans"):
         found = found_in(folder, ["apple", "lemon", "orange"])[1]
         assert found == [("apple", "apple_001"), ("orange", "orange_010"), ("apple", "apple_003")]
-    (tmp_path / "raw_scans" / "apple" / "apple_001" / "Scan" / "Scan.obj").unlink()
-    with pytest.warns(UserWarning, match=r"1 of the 2 objects of .*apple have no mesh and are left out: apple_001;"):
-        assert [file.name for file in class_meshes(tmp_path, ["apple"])] == ["apple_003"]
 
 
 @pytest.mark.parametrize("form", ["model.obj", "models/model_normalized.obj"], ids=["v1", "v2"])
@@ -97,5 +90,5 @@ def test_a_damaged_mesh_is_named_when_it_is_read(tmp_path):
     assert files[0].read().faces.shape == (12, 3)
     with pytest.raises(InputError, match=r"b\.off"):
         files[1].read()
-    with pytest.raises(InputError, match=r"there is no file .*c\.off"):
+    with pytest.raises(InputError, match="no mesh file at"):
         files[2].read()
