@@ -13,7 +13,7 @@ from .labelled import LabelledSolid as LabelledSolid
 from .part_scenes import PART_CATEGORIES as PART_CATEGORIES
 from .part_scenes import PartScene as PartScene
 from .part_scenes import part_scene as part_scene
-from .patterns import PATTERNS as PATTERNS
+from .pyramid import PATTERNS as PATTERNS
 from .pyramid import Pyramid as Pyramid
 from .pyramid import pyramid_scene as pyramid_scene
 from .splits import FirstView as FirstView

@@ -1,5 +1,7 @@
 """Objects to be heated, in which heat takes ways that few views show: legs and rails, panels, a handle, fins."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,9 +13,12 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import SDFSurface, Surface, scan
 from jaxnbv.search.candidates import sphere_candidates
-from jaxnbv.studies.scenes.labelled import assemble, bar, box, generator, path, ring, rod
+from jaxnbv.studies.scenes import labelled
+from jaxnbv.studies.scenes.labelled import assemble, generator
 
-_LABEL = 0
+# Nobody asks for the labels of a heated object.
+bar, box, ring, rod = (partial(make, 0) for make in (labelled.bar, labelled.box, labelled.ring, labelled.rod))
+path = partial(labelled.path, 0)
 FIRST_TRAINING = 100_000
 
 
@@ -71,13 +76,13 @@ def _desk(rng):
     """Four legs, a panel behind and a drawer; heated on its top."""
     half_depth, half_width, height = rng.uniform(0.5, 0.65), rng.uniform(0.95, 1.2), rng.uniform(1.0, 1.3)
     thick, leg = rng.uniform(0.05, 0.08), rng.uniform(0.05, 0.08)
-    parts = [box(_LABEL, (0, height, 0), (half_depth, thick, half_width))]
+    parts = [box((0, height, 0), (half_depth, thick, half_width))]
     x, z = half_depth - leg - 0.02, half_width - leg - 0.02
-    parts += [bar(_LABEL, (a, 0, b), (a, height, b), leg, leg) for a in (-x, x) for b in (-z, z)]
+    parts += [bar((a, 0, b), (a, height, b), leg, leg) for a in (-x, x) for b in (-z, z)]
     low = rng.uniform(0.15, 0.4) * height
-    parts.append(box(_LABEL, (-x, 0.5 * (low + height), 0), (0.04, 0.5 * (height - low), z)))
+    parts.append(box((-x, 0.5 * (low + height), 0), (0.04, 0.5 * (height - low), z)))
     half = (0.6 * half_depth, rng.uniform(0.15, 0.25), 0.3)
-    parts.append(box(_LABEL, (0.1, height - thick - half[1] + 0.02, z - 0.4), half))
+    parts.append(box((0.1, height - thick - half[1] + 0.02, z - 0.4), half))
     return parts, _on_top(rng)
 
 
@@ -85,19 +90,19 @@ def _chair(rng):
     """Four legs with rails between them and an open back; heated on its seat."""
     half_depth, half_width, height = rng.uniform(0.5, 0.6), rng.uniform(0.5, 0.6), rng.uniform(1.0, 1.2)
     thick, leg, rise = rng.uniform(0.05, 0.08), rng.uniform(0.05, 0.07), rng.uniform(0.8, 1.1)
-    parts = [box(_LABEL, (0, height, 0), (half_depth, thick, half_width), 0.03)]
+    parts = [box((0, height, 0), (half_depth, thick, half_width), 0.03)]
     x, z = half_depth - leg, half_width - leg
-    parts += [bar(_LABEL, (a, 0, b), (a, height, b), leg, leg) for a in (-x, x) for b in (-z, z)]
+    parts += [bar((a, 0, b), (a, height, b), leg, leg) for a in (-x, x) for b in (-z, z)]
     for a in (-x, x):
         y = rng.uniform(0.25, 0.45) * height
-        parts.append(rod(_LABEL, (a, y, -z), (a, y, z), 0.04))
+        parts.append(rod((a, y, -z), (a, y, z), 0.04))
     for b in (-z, z):
         y = rng.uniform(0.2, 0.5) * height
-        parts.append(rod(_LABEL, (-x, y, b), (x, y, b), 0.04))
-    parts += [bar(_LABEL, (-x, height, b), (-x - 0.12, height + rise, b), 0.05, 0.05) for b in (-z, z)]
+        parts.append(rod((-x, y, b), (x, y, b), 0.04))
+    parts += [bar((-x, height, b), (-x - 0.12, height + rise, b), 0.05, 0.05) for b in (-z, z)]
     for share in (0.45, 0.85):
         at = -x - 0.12 * share, height + rise * share
-        parts.append(box(_LABEL, (*at, 0), (0.04, 0.1, z)))
+        parts.append(box((*at, 0), (0.04, 0.1, z)))
     return parts, _on_top(rng)
 
 
@@ -105,13 +110,13 @@ def _mug(rng):
     """Hollow, with a handle; heated from below."""
     radius, half_height, wall = rng.uniform(0.65, 0.8), rng.uniform(0.75, 0.95), rng.uniform(0.045, 0.06)
     parts = [
-        rod(_LABEL, (0, -half_height, 0), (0, -half_height + 0.12, 0), radius - wall),
-        ring(_LABEL, (0, 0, 0), (0, 1, 0), radius - wall, wall, half_height, 0.03),
+        rod((0, -half_height, 0), (0, -half_height + 0.12, 0), radius - wall),
+        ring((0, 0, 0), (0, 1, 0), radius - wall, wall, half_height, 0.03),
     ]
     reach, top = rng.uniform(0.45, 0.6), rng.uniform(0.45, 0.65) * half_height
     angle = np.linspace(0.5 * np.pi, -0.5 * np.pi, 6)
     handle = np.stack([radius - wall + reach * np.cos(angle), top * np.sin(angle), np.zeros(6)], axis=-1)
-    parts += path(_LABEL, handle, rng.uniform(0.07, 0.1))
+    parts += path(handle, rng.uniform(0.07, 0.1))
     return parts, (rng.uniform(-0.5, 0.5), -1.0, rng.uniform(-0.5, 0.5))
 
 
@@ -119,11 +124,11 @@ def _fins(rng):
     """A comb of upright fins on a plate; heated from below."""
     count, half_depth, half_width = int(rng.integers(6, 10)), rng.uniform(0.6, 0.9), rng.uniform(1.0, 1.2)
     rise, thick = rng.uniform(0.6, 1.0), rng.uniform(0.06, 0.1)
-    parts = [box(_LABEL, (0, 0, 0), (half_depth, thick, half_width))]
+    parts = [box((0, 0, 0), (half_depth, thick, half_width))]
     places = np.linspace(-half_width + 0.06, half_width - 0.06, count)
     for z in places:
         height = rise * rng.uniform(0.7, 1.0)
-        parts.append(box(_LABEL, (0, 0.5 * height, z), (half_depth - 0.02, 0.5 * height, 0.035)))
+        parts.append(box((0, 0.5 * height, z), (half_depth - 0.02, 0.5 * height, 0.035)))
     return parts, (rng.uniform(-0.7, 0.7), -1.0, rng.uniform(-0.7, 0.7))
 
 

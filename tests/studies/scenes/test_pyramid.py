@@ -14,7 +14,7 @@ from jaxnbv.scanning.mesh_files import load_mesh
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.studies.scenes import PATTERNS, Framing, Pyramid, Split, hidden_view, pyramid_scene
 from jaxnbv.studies.scenes.class_object import scan_cue
-from jaxnbv.studies.scenes.patterns import pattern_distance
+from jaxnbv.studies.scenes.pyramid import pattern_distance
 
 RNG = np.random.default_rng(0)
 CAMERA = Camera(height=24, width=24)
