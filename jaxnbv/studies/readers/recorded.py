@@ -151,11 +151,9 @@ def _upward(up: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:
     found = as_numbers(up, "up", np.float64)
     length = float(np.linalg.norm(found)) if found.shape == (3,) else 0.0
     require(0 < length < math.inf, f"up is {shown(up)}; give a direction, such as (0, -1, 0)")
-    z = found / length
     # Of a world whose x is upward, y takes its place.
-    beside = np.eye(3)[int(abs(z[0]) > 0.9)]
-    x = beside - (beside @ z) * z
-    x /= np.linalg.norm(x)
+    beside = np.eye(3)[int(abs(found[0]) > 0.9 * length)]
+    rotation, _ = Rotation.align_vectors(np.eye(3)[[2, 0]], [found / length, beside], weights=[np.inf, 1.0])
     turn = np.eye(4)
-    turn[:3, :3] = np.stack([x, np.cross(z, x), z])
+    turn[:3, :3] = rotation.as_matrix()
     return turn
