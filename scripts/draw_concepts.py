@@ -28,13 +28,17 @@ SHOWN = 4
 PIXELS = 160
 
 
-def save(figure: Figure, path: Path) -> None:
-    """With few colours, which makes the file small."""
-    figure.set_dpi(170)
+def drawn(figure: Figure, dpi: int) -> Image.Image:
+    """A figure as an image."""
+    figure.set_dpi(dpi)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    image.quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+
+
+def save(figure: Figure, path: Path) -> None:
+    """With few colours, which makes the file small."""
+    drawn(figure, 170).quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def draw_posterior(

@@ -7,8 +7,8 @@ from pathlib import Path
 import jax
 import matplotlib as mpl
 import numpy as np
+from draw_concepts import drawn
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -59,11 +59,7 @@ class Film:
         axes.spines[:].set(visible=True, color=GREY)
         figure.text(0.84, 0.95, f"probability of a {self._true_name}", ha="center", fontsize=10)
         self._answers(figure.add_axes((0.72, 0.16, 0.26, 0.7)), view, view if rival is None else rival)
-        canvas = FigureCanvasAgg(figure)
-        figure.set_dpi(DPI)
-        canvas.draw()
-        image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-        self.frames.append(image)
+        self.frames.append(drawn(figure, DPI))
         self.times.append(time)
 
     @property
