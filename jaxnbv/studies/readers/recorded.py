@@ -5,7 +5,7 @@ import math
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float, UInt16
@@ -25,14 +25,8 @@ _INTRINSICS_7_SCENES = np.array([[585.0, 0.0, 320.0], [0.0, 585.0, 240.0], [0.0,
 _INTRINSICS_TUM = np.array([[525.0, 0.0, 319.5], [0.0, 525.0, 239.5], [0.0, 0.0, 1.0]])
 
 
-class _Layout(NamedTuple):
-    """What a data set says of a sequence: files, matrices from camera to world, intrinsics in pixels, and how long a
-    unit of the depth images is."""
-
-    files: list[Path]
-    matrices: Float[np.ndarray, "n 4 4"]
-    intrinsics: Float[np.ndarray, "3 3"]
-    depth_scale: float
+# Files, matrices from camera to world, intrinsics in pixels, and how long a unit of the depth images is.
+_Layout: TypeAlias = tuple[list[Path], Float[np.ndarray, "n 4 4"], Float[np.ndarray, "3 3"], float]
 
 
 class RecordedFrames:
@@ -64,22 +58,21 @@ class RecordedFrames:
                 "TUM RGB-D (depth.txt and groundtruth.txt), or one with frames.json"
             )
         try:
-            layout = read(folder)
-            matrices = turn @ layout.matrices
+            files, matrices, intrinsics, depth_scale = read(folder)
+            matrices = turn @ matrices
             Pose.from_matrix(matrices)
         except (OSError, ValueError, LookupError, TypeError) as error:
             problem = f"the recording in {folder} is not whole ({type(error).__name__}: {error})"
             raise InputError(f"{problem}: unpack the data set again") from error
-        absent = [file for file in layout.files if not os.path.isfile(file)]
+        absent = [file for file in files if not os.path.isfile(file)]
         require(
             not absent,
-            f"{len(absent)} of the {len(layout.files)} files that {folder} names are not there, the first "
+            f"{len(absent)} of the {len(files)} files that {folder} names are not there, the first "
             f"{absent[:1]}: unpack the data set again",
         )
-        self.folder, self.files, self.matrices = folder, tuple(layout.files), matrices
-        self.depth_scale = layout.depth_scale
+        self.folder, self.files, self.matrices, self.depth_scale = folder, tuple(files), matrices, depth_scale
         height, width = self.depth(0).shape
-        self.camera = Camera.from_intrinsics(layout.intrinsics, height, width)
+        self.camera = Camera.from_intrinsics(intrinsics, height, width)
 
     def __len__(self) -> int:
         return len(self.files)
@@ -105,7 +98,7 @@ def _seven_scenes(folder: Path) -> _Layout:
     poses = [_table(file.with_name(file.name.replace(".depth.png", ".pose.txt"))) for file in files]
     own = folder / "camera-intrinsics.txt"
     intrinsics = _table(own) if os.path.isfile(own) else _INTRINSICS_7_SCENES
-    return _Layout(files, np.stack(poses), intrinsics, 1e-3)
+    return files, np.stack(poses), intrinsics, 1e-3
 
 
 def _tum(folder: Path) -> _Layout:
@@ -118,7 +111,7 @@ def _tum(folder: Path) -> _Layout:
     found = track[nearest[kept]]
     matrices = np.tile(np.eye(4), (len(kept), 1, 1))
     matrices[:, :3, :3], matrices[:, :3, 3] = Rotation.from_quat(found[:, 4:]).as_matrix(), found[:, 1:4]
-    return _Layout([folder / images[index, 1] for index in kept], matrices, _INTRINSICS_TUM, 1.0 / 5000.0)
+    return [folder / images[index, 1] for index in kept], matrices, _INTRINSICS_TUM, 1.0 / 5000.0
 
 
 def _plain(folder: Path) -> _Layout:
@@ -127,7 +120,7 @@ def _plain(folder: Path) -> _Layout:
     matrices = np.stack([np.array(frame["pose"], float) for frame in said["frames"]])
     scale = float(said["depth_scale"])
     require(0 < scale < math.inf, f"the depth_scale is {scale}; it must be positive and finite")
-    return _Layout(files, matrices, np.array(said["intrinsics"], float), scale)
+    return files, matrices, np.array(said["intrinsics"], float), scale
 
 
 # By a file that tells it.

@@ -1,9 +1,12 @@
 """Trucks and cargo from mesh files: where the bed of a truck is, and what stands on it."""
 
+import operator
+from collections.abc import Iterator
+
 import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 
-from jaxnbv.checks import InputError
+from jaxnbv.checks import require
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.studies.scenes.class_object import ClassMesh
 from jaxnbv.studies.scenes.labelled import generator, rotation_about
@@ -30,27 +33,22 @@ def bed_of(truck: TriangleMesh) -> Float[np.ndarray, "2 3"]:
     hits = truck.trace(above, np.tile([0.0, -1.0, 0.0], (len(above), 1)))
     heights = np.where(hits.mask, np.asarray(hits.points)[:, 1], -np.inf).reshape(_LINES, _LINES)
     tall = high[1] - low[1]
-    best, floor, area = None, 0.0, 0
-    for level in np.arange(low[1] + _LOWEST * tall, low[1] + _HIGHEST * tall, 0.5 * _EVEN * tall):
-        found = _largest_rectangle(np.abs(heights - level) <= 0.5 * _EVEN * tall)
-        size = (found[1] - found[0]) * (found[3] - found[2])
-        if size > area:
-            best, area = found, size
-            floor = float(heights[found[0] : found[1], found[2] : found[3]].max())
-    if best is None or area < 0.1 * _LINES**2:
-        raise InputError(
-            f"the largest level place of the truck covers {area / _LINES**2:.0%} of its outline: give one that stands "
-            "upright and has an open bed"
-        )
-    half = 0.5 * (high - low) / _LINES
-    first = [across[0][best[0]] - half[0], floor, across[1][best[2]] - half[2]]
-    last = [across[0][best[1] - 1] + half[0], high[1], across[1][best[3] - 1] + half[2]]
-    return np.array([first, last])
+    step = 0.5 * _EVEN * tall
+    levels = np.arange(low[1] + _LOWEST * tall, low[1] + _HIGHEST * tall, step)
+    rectangles = (found for level in levels for found in _rectangles(np.abs(heights - level) <= step))
+    area, rows, columns = max(rectangles, key=operator.itemgetter(0), default=(0, slice(0), slice(0)))
+    require(
+        area >= 0.1 * _LINES**2,
+        f"the largest level place of the truck covers {area / _LINES**2:.0%} of its outline: give one that stands "
+        "upright and has an open bed",
+    )
+    half, x, z = 0.5 * (high - low) / _LINES, across[0][rows], across[1][columns]
+    floor = float(heights[rows, columns].max())
+    return np.array([[x[0] - half[0], floor, z[0] - half[2]], [x[-1] + half[0], high[1], z[-1] + half[2]]])
 
 
-def _largest_rectangle(flags: Bool[np.ndarray, "m n"]) -> tuple[int, int, int, int]:
-    """The first and the end of the rows and of the columns of the largest rectangle of true entries."""
-    best, area = (0, 0, 0, 0), 0
+def _rectangles(flags: Bool[np.ndarray, "m n"]) -> Iterator[tuple[int, slice, slice]]:
+    """The widest rectangle of true entries between any two rows: its area, rows and columns."""
     for top in range(len(flags)):
         whole = np.ones(flags.shape[1], bool)
         for bottom in range(top, len(flags)):
@@ -58,12 +56,10 @@ def _largest_rectangle(flags: Bool[np.ndarray, "m n"]) -> tuple[int, int, int, i
             edges = np.flatnonzero(np.diff(np.concatenate([[0], whole.astype(np.int8), [0]])))
             if len(edges) == 0:
                 break
-            lengths = edges[1::2] - edges[::2]
-            widest = int(np.argmax(lengths))
-            if (bottom + 1 - top) * lengths[widest] > area:
-                area = int((bottom + 1 - top) * lengths[widest])
-                best = (top, bottom + 1, int(edges[2 * widest]), int(edges[2 * widest + 1]))
-    return best
+            widths = edges[1::2] - edges[::2]
+            widest = int(np.argmax(widths))
+            columns = slice(edges[2 * widest], edges[2 * widest + 1])
+            yield int((bottom + 1 - top) * widths[widest]), slice(top, bottom + 1), columns
 
 
 def loaded_truck(truck: TriangleMesh, cargo: TriangleMesh, label: int, key: PRNGKeyArray) -> ClassMesh:
