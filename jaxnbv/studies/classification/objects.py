@@ -165,5 +165,5 @@ class OmniObject3DStudy(ClassificationStudy):
             "that was trained in PyTorch",
         }
         missing = [text for name, text in needed.items() if name not in options]
-        require(not missing, f"nothing ships for the study omniobject3d: give {' and '.join(missing)}")
+        require(not missing, f"nothing ships for the study omniobject3d: give {', and '.join(missing)}")
         return super().configured(model, views, quick, **options)
