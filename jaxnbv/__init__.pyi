@@ -84,7 +84,6 @@ from .studies import scenes as scenes
 from .studies.readers.recorded import RecordedFrames as RecordedFrames
 from .studies.scenes.banks import shape_bank as shape_bank
 from .surfaces import AsGiven as AsGiven
-from .surfaces import Completed as Completed
 from .surfaces import Fields as Fields
 from .surfaces import FieldsAbout as FieldsAbout
 from .surfaces import FreeRotation as FreeRotation

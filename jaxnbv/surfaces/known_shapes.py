@@ -96,10 +96,6 @@ class KnownShapes(SurfaceModel):
         if self.bank.solids is None:
             return unknown
         found = register(self.bank, Prior(self.poses, self.box), Seen.of(evidence), self.num_starts)
-        return self.given(found, evidence, unknown)
-
-    def given(self, found: Hypotheses, evidence: Evidence, unknown: SurfacePosterior) -> "KnownShapesPosterior":
-        """The mixture over shapes whose placements are known, and over `unknown`, what none of them is."""
         weights = _weights(found, self.sharpness, self.unknown_misfit)
         return KnownShapesPosterior(
             jnp.zeros_like(unknown.level), self, found, weights, self.residual.condition(evidence), unknown

@@ -81,7 +81,7 @@ def _first_seen(
 
 
 class Hypotheses(eqx.Module):
-    """Shapes of a bank, each with a placement: the modes of the fit, best first where they were registered.
+    """Shapes of a bank, each with a placement: the modes of the fit, best first.
 
     - `shape`: indices of the bank.
     - `placement`: where each stands.
@@ -159,20 +159,6 @@ def register(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Hypo
 
     found = last._replace(misfit=jax.lax.map(judge, last, batch_size=_AT_ONCE)).best(_LAST[0])
     return Hypotheses(found.shape, found.placement, found.misfit, _modes(found.shape, found.placement.rotation))
-
-
-@eqx.filter_jit
-def as_they_stand(bank: ShapeBank, seen: Seen) -> Hypotheses:
-    """All shapes of a bank where they are, which is in the scene, and how well each fits what was seen."""
-    count, dtype = len(bank), seen.points.dtype
-    origin = Placement(jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype), jnp.ones(3, dtype))
-
-    def judge(shape):
-        distance, slope = jax.jvp(shape.solid, (seen.points,), (seen.normals,))
-        return _summed(distance, slope, shape.solid(seen.empty), jnp.zeros(9, dtype), seen, _LAST_TAU)
-
-    placements = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), origin)
-    return Hypotheses(jnp.arange(count), placements, jax.lax.map(judge, bank.shapes), jnp.ones(count, bool))
 
 
 def _turned(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> _Starts:

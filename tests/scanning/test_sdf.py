@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from jaxnbv.errors import InputError
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.scanning.sdf import (
     Capsule,
@@ -21,7 +20,6 @@ from jaxnbv.scanning.sdf import (
     Sphere,
     Torus,
     least_of_last,
-    solid_of_points,
 )
 
 RNG = np.random.default_rng(0)
@@ -170,28 +168,6 @@ def test_rigid_transform_moves_points_as_the_pose_does():
     sdf = Cuboid([0.3, 0.5, 0.2])
     x = jnp.asarray(RNG.uniform(-1, 1, (500, 3)), dtype=jnp.result_type(float))
     np.testing.assert_allclose(sdf.transform(pose)(pose.to_scene(x)), sdf(x), atol=1e-6)
-
-
-def test_points_all_over_a_surface_are_a_solid():
-    """At random, so that gaps between them are wide: balls of many and of few points, some of them there twice, and a
-    sheet."""
-    places = RNG.uniform(-1.1, 1.1, (2000, 3))
-    true = np.linalg.norm(places, axis=1) - 1.0
-    for count, tolerance in ((8192, 0.06), (1024, 0.15)):
-        ball = RNG.standard_normal((count, 3))
-        ball /= np.linalg.norm(ball, axis=1, keepdims=True)
-        ball = np.concatenate([ball, ball])
-        found = np.asarray(values(solid_of_points(ball, sheet=0.01), jnp.asarray(places)))
-        assert np.abs(found - true).max() < tolerance
-        assert np.abs(found - true).mean() < 0.5 * tolerance
-    with pytest.raises(InputError, match="too far to tell a surface"):
-        solid_of_points(ball[:40])
-    sheet = np.stack([*RNG.uniform(-1.0, 1.0, (2, 8192)), np.zeros(8192)], axis=1)
-    above = np.stack([*RNG.uniform(-0.8, 0.8, (2, 500)), np.zeros(500)], axis=1)
-    solid = solid_of_points(sheet, sheet=0.1)
-    assert len({*solid.values.shape}) == 1
-    assert np.asarray(values(solid, jnp.asarray(above))).max() < 0.0
-    assert np.asarray(values(solid, jnp.asarray(above) + jnp.array([0.0, 0.0, 0.15]))).min() > 0.0
 
 
 @pytest.mark.parametrize(

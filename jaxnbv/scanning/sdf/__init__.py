@@ -18,7 +18,6 @@ from jaxnbv.scanning.sdf.base import norm as norm
 from jaxnbv.scanning.sdf.base import parameter as parameter
 from jaxnbv.scanning.sdf.sampled import Sampled as Sampled
 from jaxnbv.scanning.sdf.sampled import solid_of_mesh as solid_of_mesh
-from jaxnbv.scanning.sdf.sampled import solid_of_points as solid_of_points
 from jaxnbv.scanning.sdf.shapes import Capsule as Capsule
 from jaxnbv.scanning.sdf.shapes import Cone as Cone
 from jaxnbv.scanning.sdf.shapes import Cuboid as Cuboid

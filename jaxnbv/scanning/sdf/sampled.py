@@ -1,13 +1,9 @@
-"""Meshes and points as solids that can be traced within JAX: their signed distances, sampled on grids."""
-
-from typing import NamedTuple
+"""Meshes as solids that can be traced within JAX: their signed distances, sampled on grids."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.ndimage
 from jaxtyping import Array, Bool, Float, Int
-from scipy.spatial import cKDTree
 
 from jaxnbv.checks import AnyArray, as_numbers, checked, require
 from jaxnbv.scanning.sdf.base import Scalar, SignedDistance, Vector, nonnegative, norm, parameter, split
@@ -15,9 +11,6 @@ from jaxnbv.scanning.triangles import distance_to_triangles, winding_number
 
 # Of the longest side, on all sides.
 _PADDING = 0.1
-# Gaps between points that are closed, in cells and in distances between neighbours: n places at random
-# leave gaps of up to sqrt(x / ln 2) times the median distance, with 2 n x exp(-x) = 1: of 8,192 it is 4.2.
-_CELLS_CLOSED, _NEIGHBOURS_CLOSED, _WIDEST_GAP = 1.5, 4.5, 0.5
 
 
 class Sampled(SignedDistance):
@@ -72,77 +65,20 @@ def solid_of_mesh(
     )
     require(bool(np.isfinite(vertices).all()), "the mesh has vertices that are not finite")
     require(resolution >= 4, f"the resolution is {resolution}; it must be at least 4")
-    lattice = _Lattice.about(vertices, "vertices of the mesh", resolution, cubic)
-    return lattice.solid(_signed_distance(lattice.nodes, vertices, faces, sheet))
-
-
-@checked
-def solid_of_points(points: Float[AnyArray, "n 3"], resolution: int = 64, sheet: float = 0.05) -> Sampled:
-    """Points all over a surface as a solid, in their coordinates; they need no normals. Its outside is what can be
-    reached from beyond them through no gap as narrow as those between them, which are closed.
-
-    - `resolution`: nodes along its longest side; there are as many along all sides.
-    - `sheet`: how thick the surface is where it encloses nothing.
-
-    **Raises:** `ValueError` for other shapes, points that are not finite or too few to tell a surface, or a resolution
-    below 16.
-    """
-    points = as_numbers(points, "the points", np.float64)
-    require(points.ndim == 2 and points.shape[1] == 3, f"the points must be (n, 3), got {points.shape}")
-    require(bool(np.isfinite(points).all()), "the points are not all finite")
-    require(resolution >= 16, f"the resolution is {resolution}; it must be at least 16")
-    # A point that is there twice would be its own neighbour.
-    points = np.unique(points, axis=0)
-    require(len(points) >= 4, f"there are {len(points)} different points; give four or more")
-    tree, longest = cKDTree(points), float(np.ptp(points, axis=0).max())
-    gap = _NEIGHBOURS_CLOSED * float(np.median(tree.query(points, k=2)[0][:, 1]))
-    require(
-        gap < _WIDEST_GAP * longest,
-        f"the points are {gap / _NEIGHBOURS_CLOSED:.3g} apart, too far to tell a surface of {longest:.3g}: give more",
-    )
-    # The outside must go round all that is closed.
-    room = gap / longest + (_CELLS_CLOSED + 1.0) / (resolution - 1)
-    lattice = _Lattice.about(points, "points", resolution, cubic=True, padding=max(_PADDING, 1.3 * room))
-    away = tree.query(lattice.nodes)[0].reshape(lattice.counts)
-    closed = max(_CELLS_CLOSED * lattice.spacing, gap)
-    regions, _ = scipy.ndimage.label(away > closed)
-    outside = regions == regions[0, 0, 0]
-    # A node outside and its neighbour within stand half a cell each from where the distance is `closed`.
-    deep = lattice.spacing * (scipy.ndimage.distance_transform_edt(~outside) - 0.5)
-    return lattice.solid(np.where(outside, away, closed - deep) - 0.5 * sheet)
-
-
-class _Lattice(NamedTuple):
-    """Nodes of a grid about some places, with room on all sides."""
-
-    low: Float[np.ndarray, "3"]
-    spacing: float
-    counts: Int[np.ndarray, "3"]
-    padding: float
-
-    @classmethod
-    def about(
-        cls, places: Float[np.ndarray, "n 3"], name: str, resolution: int, cubic: bool, padding: float = _PADDING
-    ) -> "_Lattice":
-        low, high = places.min(axis=0), places.max(axis=0)
-        longest = float((high - low).max())
-        require(longest > 0, f"all {len(places)} {name} lie at {low}")
-        if cubic:
-            middle = 0.5 * (low + high)
-            low, high = middle - 0.5 * longest, middle + 0.5 * longest
-        spacing = (1.0 + 2.0 * padding) * longest / (resolution - 1)
-        low = low - padding * longest
-        counts = np.ceil((high + padding * longest - low) / spacing - 1e-6).astype(int) + 1
-        return cls(low, spacing, counts, padding * longest)
-
-    @property
-    def nodes(self) -> Float[np.ndarray, "n 3"]:
-        axes = [start + self.spacing * np.arange(count) for start, count in zip(self.low, self.counts, strict=True)]
-        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-
-    def solid(self, distance: Float[np.ndarray, "..."]) -> Sampled:
-        """That of the distances at the nodes."""
-        return Sampled(jnp.asarray(distance.reshape(self.counts)), self.low, self.spacing, self.padding)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    longest = float((high - low).max())
+    require(longest > 0, f"all {len(vertices)} vertices of the mesh lie at {low}")
+    if cubic:
+        middle = 0.5 * (low + high)
+        low, high = middle - 0.5 * longest, middle + 0.5 * longest
+    padding = _PADDING * longest
+    spacing = (1.0 + 2.0 * _PADDING) * longest / (resolution - 1)
+    low = low - padding
+    counts = np.ceil((high + padding - low) / spacing - 1e-6).astype(int) + 1
+    axes = [start + spacing * np.arange(count) for start, count in zip(low, counts, strict=True)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    distance = _signed_distance(nodes, vertices, faces, sheet)
+    return Sampled(jnp.asarray(distance.reshape(counts)), low, spacing, padding)
 
 
 def _signed_distance(
