@@ -101,7 +101,6 @@ from .surfaces import SurfacePosterior as SurfacePosterior
 from .surfaces import Thickness as Thickness
 from .surfaces import Upright as Upright
 from .surfaces import ValueSource as ValueSource
-from .surfaces import fit_hyperparameters as fit_hyperparameters
 from .tasks import ColdestPoint as ColdestPoint
 from .tasks import Coverage as Coverage
 from .tasks import Covered as Covered

@@ -222,13 +222,6 @@ REFUSED = {
     "nodes beyond the torus": (lambda: POSTERIOR.mean_on_grid(np.array([0.0, 10.0])), "10"),
     "nodes that are not finite": (lambda: POSTERIOR.sample(KEY, 2).on_grid(np.array([np.nan, 1.0])), "nan"),
     "a planner's grid beyond the torus": (lambda: planner(grid=nbv.Grid(12, 100.0)), "100"),
-    "a fit to a cloud outside": (
-        lambda: nbv.fit_hyperparameters(MODEL, nbv.PointCloud.from_arrays(100.0 * D, D), KEY),
-        "outside the scene",
-    ),
-    "a fit to what is not finite": (lambda: nbv.fit_hyperparameters(MODEL, NOT_FINITE, KEY), "not finite"),
-    "a fit without steps": (lambda: nbv.fit_hyperparameters(MODEL, CLOUD, KEY, max_steps=0), "0 steps"),
-    "a fit of no model": (lambda: nbv.fit_hyperparameters("x", CLOUD, KEY), "the model is 'x'"),
     "an infinite score": (
         lambda: proposed(nbv.ExpectedUtilityImprovement(lambda c: jnp.where(c.points.shape[0] > 64, jnp.inf, 1.0))),
         "infinite",
@@ -443,8 +436,6 @@ REFUSED = {
         "off_axis is 0.3 rad but the image ends 0.262 rad",
     ),
     "a utility as a second question": (lambda: nbv.TieBreakSearch(12, second=lambda cloud: 0.0), "second"),
-    "a fit to nothing": (lambda: nbv.fit_hyperparameters(MODEL, NO_POINTS, KEY), "the cloud is empty"),
-    "a fit to three points": (lambda: nbv.fit_hyperparameters(MODEL, CLOUD, KEY, num_points=3), "asked for 3 points"),
     "no samples of a posterior": (lambda: POSTERIOR.sample(KEY, 0), "asked for 0 samples"),
     "the variance of one sample": (lambda: POSTERIOR.drawn(1), "variance of 1 samples was asked for"),
     "a target of no points": (lambda: nbv.SoftPartCount(lambda cloud: None, 0.0), "N_target is"),

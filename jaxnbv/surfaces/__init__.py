@@ -4,7 +4,6 @@ from jaxnbv.surfaces.base import Fields as Fields
 from jaxnbv.surfaces.base import SampledPosterior as SampledPosterior
 from jaxnbv.surfaces.base import SurfaceModel as SurfaceModel
 from jaxnbv.surfaces.base import SurfacePosterior as SurfacePosterior
-from jaxnbv.surfaces.fitting import fit_hyperparameters as fit_hyperparameters
 from jaxnbv.surfaces.known_shapes import Hypothesis as Hypothesis
 from jaxnbv.surfaces.known_shapes import KnownShapes as KnownShapes
 from jaxnbv.surfaces.known_shapes import KnownShapesPosterior as KnownShapesPosterior

@@ -181,14 +181,6 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         prior = function_covariance(x, y, self.model.base.spectrum) + self.model.level_deviation**2
         return prior - by_normals - by_values
 
-    def log_marginal_likelihood(self) -> Float[Array, ""]:
-        """log p(normals) + log p(values | normals)."""
-        mask, count = self.rows.mask, jnp.sum(self.rows.mask)
-        residual = jnp.matmul(self.factor.T, self.weights, precision="highest")
-        log_determinant = 2.0 * jnp.sum(jnp.where(mask, jnp.log(jnp.diag(self.factor)), 0.0))
-        of_values = -0.5 * (jnp.sum(residual**2) + log_determinant + count * jnp.log(2.0 * jnp.pi))
-        return self.base.log_marginal_likelihood() + of_values
-
     def data_points(self) -> DataPoints:
         """The cloud's for gradients, and those of the values."""
         return DataPoints(self.base.data_points().gradients, filled(self.rows.points, self.rows.mask))

@@ -77,10 +77,10 @@ def regression(posterior, scales, s, x, noise=0.2):
     if hasattr(posterior, "half_jump"):
         h = float(posterior.half_jump)
         data = POINTS, less, noise, AT[:-1], h * VALUES[:-1] - exact(s, AT[:-1])[0], h * VALUE_NOISE[:-1]
-        mean, covariance, _ = JointWeightSpace(parts, 0.7).posterior(data, x)
+        mean, covariance = JointWeightSpace(parts, 0.7).posterior(data, x)
         return exact(s, x)[0] + mean, covariance
     data = POINTS, less, noise, np.zeros((0, 3)), np.zeros(0), np.zeros(0)
-    mean, covariance, _ = JointWeightSpace(parts, 0.0).posterior(data, np.concatenate([x, POINTS]))
+    mean, covariance = JointWeightSpace(parts, 0.0).posterior(data, np.concatenate([x, POINTS]))
     whole = np.concatenate([exact(s, x)[0], exact(s, POINTS)[0]]) + mean
     return whole[: len(x)] - whole[len(x) :].mean(), covariance[: len(x), : len(x)]
 

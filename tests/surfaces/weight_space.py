@@ -94,7 +94,7 @@ class JointWeightSpace:
         return np.concatenate([*parts, np.zeros((3 * len(x), 1))], axis=1)
 
     def posterior(self, data, x):
-        """Mean (n,) and covariance (n, n) of g(x), and log p(data), by the joint covariance of all observations.
+        """Mean (n,) and covariance (n, n) of g(x), by the joint covariance of all observations.
 
         `data`: points, normals, their noise, and points, values and noise (m,) of the values.
         """
@@ -107,6 +107,4 @@ class JointWeightSpace:
         cross = queries @ features.T
         mean = cross @ np.linalg.solve(covariance, observed)
         explained = cross @ np.linalg.solve(covariance, cross.T)
-        fit = observed @ np.linalg.solve(covariance, observed)
-        likelihood = -0.5 * (fit + np.linalg.slogdet(2 * np.pi * covariance)[1])
-        return mean, queries @ queries.T - explained, likelihood
+        return mean, queries @ queries.T - explained
