@@ -48,7 +48,7 @@ VOLUME = nbv.Box()
 VIEWS, LEAST_HITS = 2, 100
 
 Variant = Callable[[nbv.Grid], tuple[nbv.SurfaceModel, nbv.Carving | None]]
-TWO_SCALES, USUAL = nbv.ScreenedSPSR().base, nbv.ScreenedSPSR().values
+TWO_SCALES = nbv.ScreenedSPSR().base
 VARIANTS: dict[str, Variant] = {
     "paper": lambda grid: (nbv.GeometricSPSR(), None),
     "+ carving": lambda grid: (nbv.GeometricSPSR(), nbv.Carving()),
@@ -56,7 +56,6 @@ VARIANTS: dict[str, Variant] = {
     "+ two scales": lambda grid: (nbv.ScreenedSPSR(TWO_SCALES, (nbv.OutsideBoundary(),)), nbv.Carving()),
     "+ on surface": lambda grid: (nbv.ScreenedSPSR(values=(nbv.OutsideBoundary(), nbv.OnSurface())), nbv.Carving()),
     "default": lambda grid: (nbv.ScreenedSPSR(), nbv.Carving()),
-    "+ thickness": lambda grid: (nbv.ScreenedSPSR(values=(*USUAL, nbv.Thickness())), nbv.Carving()),
 }
 # What the table shows: heading, key of the record, digits.
 COLUMNS = (

@@ -98,7 +98,6 @@ from .surfaces import ShapeBank as ShapeBank
 from .surfaces import ShapePoses as ShapePoses
 from .surfaces import SurfaceModel as SurfaceModel
 from .surfaces import SurfacePosterior as SurfacePosterior
-from .surfaces import Thickness as Thickness
 from .surfaces import Upright as Upright
 from .surfaces import ValueSource as ValueSource
 from .tasks import ColdestPoint as ColdestPoint

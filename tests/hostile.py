@@ -122,7 +122,6 @@ CALLS = {
     nbv.TieBreakSearch: {"candidates": 6, "second": nbv.Coverage()},
     nbv.SphereCandidates: {"num_poses": 6, "radius": 2.5, "min_elevation": 0.0, "up": (0.0, 1.0, 0.0)},
     nbv.SpherePoses: {"radius": 2.5},
-    nbv.Thickness: {"depth": 0.1, "num_points": 10, "value": -1.0, "noise": 1.0},
     nbv.TriangleMesh.from_arrays: {"vertices": np.eye(3), "faces": [[0, 1, 2]]},
     nbv.UncertaintyView: {"candidates": 6},
     readers.class_meshes: {"folder": COPY, "classes": ["bed"]},

@@ -21,6 +21,5 @@ from jaxnbv.surfaces.trigonometric import TrigonometricFields as TrigonometricFi
 from jaxnbv.surfaces.values import OnSurface as OnSurface
 from jaxnbv.surfaces.values import OutsideBoundary as OutsideBoundary
 from jaxnbv.surfaces.values import SeenEmpty as SeenEmpty
-from jaxnbv.surfaces.values import Thickness as Thickness
 from jaxnbv.surfaces.values import ValueRows as ValueRows
 from jaxnbv.surfaces.values import ValueSource as ValueSource

@@ -106,35 +106,6 @@ class OnSurface(ValueSource):
         return _rows(chosen.points, 0.0, self.noise, chosen.mask)
 
 
-class Thickness(ValueSource):
-    """f(x_j - depth n_j) - c ~ N(value, s^2) with a negative value, behind some of the data: most things that are
-    scanned are thicker than a sheet.
-
-    - `depth`: behind the point, in scene units.
-    - `num_points`: how many, or all where there are fewer; farthest points.
-    - `value`, `noise`: mean and standard deviation, in units of h.
-
-    **Raises:** `ValueError` for a count below one, or a noise or depth that is not positive.
-    """
-
-    depth: float = eqx.field(static=True, default=0.15)
-    num_points: int = eqx.field(static=True, default=100)
-    value: float = eqx.field(static=True, default=-1.0)
-    noise: float = eqx.field(static=True, default=1.0)
-
-    def __check_init__(self):
-        check_fields(self)
-        _check(self.num_points, self.noise)
-        require(self.depth > 0, f"the depth of the thickness is {self.depth}; it must be positive")
-
-    def rows(self, evidence: Evidence) -> ValueRows:
-        """One row a point."""
-        chosen = farthest_point_subsample(evidence.cloud, self.num_points)
-        behind = chosen.points - self.depth * chosen.normals
-        mask = chosen.mask & jnp.all(jnp.abs(behind) <= HALF_WIDTH, axis=1)
-        return _rows(jnp.where(mask[:, None], behind, 0.0), self.value, self.noise, mask)
-
-
 class SeenEmpty(ValueSource):
     """f(z) - c ~ N(value, s^2) with a positive value, at points z that were seen empty: what was not seen beside them
     is likely to be empty too. Right of thin things such as furniture, wrong of a body whose hidden side is as large as
