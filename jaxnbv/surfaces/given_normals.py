@@ -1,26 +1,69 @@
-"""What posteriors given oriented points share, whatever solves A w = n for them.
+"""p(f | D) under `GeometricSPSR`: its closed forms, and what is drawn and solved for its samples.
 
+    factor   A = k(X, X) + noise^2 I = C C^T
     mean     Poisson(k(., X) A^-1 n)
     sample   Poisson(v + k(., X) A^-1 (n - v(X) - eps)), v and eps from the prior
 
-Names are those of `jaxnbv.surfaces.spsr`.
+Names are those of `jaxnbv.surfaces.spsr`. Clouds are partly filled: a row of A that is not filled is one of the
+identity, which changes neither solves nor determinants.
 """
 
-from abc import abstractmethod
+import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from jaxnbv.checks import AnyArray
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.sharding import shared_map
-from jaxnbv.surfaces.covariance import Spectra, mode_variance
+from jaxnbv.surfaces.base import on_torus
+from jaxnbv.surfaces.covariance import (
+    Spectra,
+    function_covariance,
+    function_normal_covariance,
+    function_variance,
+    mode_variance,
+    normal_covariance,
+)
 from jaxnbv.surfaces.matern import Scalar
 from jaxnbv.surfaces.nonuniform import NonuniformTransform
 from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, filled
 from jaxnbv.surfaces.trigonometric import solve_poisson
+
+_CHUNK_VALUES = 2**24
+_ALWAYS_WHOLE = 2048
+
+
+def factorise(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Float[Array, "n n"]:
+    """C, the lower Cholesky factor of A."""
+    capacity = cloud.capacity
+
+    def leading(size: int):
+        points, mask = cloud.points[:size], cloud.mask[:size]
+        kernel = jnp.where(mask[:, None] & mask, normal_covariance(points, points, spectrum), 0.0)
+        block = kernel + jnp.diag(jnp.where(mask, noise**2, 1.0))
+        factor = jnp.linalg.cholesky(block, symmetrize_input=False)
+        return jnp.eye(capacity, dtype=factor.dtype).at[:size, :size].set(factor)
+
+    return _on_filled_rows(cloud, leading)
+
+
+def _on_filled_rows(cloud: PointCloud, leading: Callable[[int], Float[Array, "*of"]]) -> Float[Array, "*of"]:
+    """`leading(size)` for a share of the rows, the leading ones, that holds all that are filled: so the time follows
+    them while the shapes stay fixed. Each share is compiled, which few rows are not worth."""
+    capacity = cloud.capacity
+    if capacity <= _ALWAYS_WHOLE:
+        return leading(capacity)
+    sizes = [-(-capacity * eighths // 8) for eighths in (2, 3, 4, 5, 6, 8)]
+    filled = jnp.max(jnp.where(cloud.mask, jnp.arange(capacity) + 1, 0))
+    return jax.lax.switch(
+        jnp.searchsorted(jnp.asarray(sizes), filled), [functools.partial(leading, size) for size in sizes]
+    )
 
 
 class NormalDraws(NamedTuple):
@@ -30,14 +73,15 @@ class NormalDraws(NamedTuple):
     at_data: Float[Array, "s n 3"]
 
 
-class NormalsPosterior(TrigonometricPosterior):
-    """p(f | D) under `GeometricSPSR`.
+class GeometricSPSRPosterior(TrigonometricPosterior):
+    """p(f | D) under `GeometricSPSR`, in closed form and as pathwise samples.
 
     - `level`: mean over the data of E f(x_j); the surface is where f equals it.
     - `mean_coefficients`: of E f, see `surfaces/trigonometric.py`.
     - `cloud`: D, with zeros in the rows that are not filled.
     - `weights`: A^-1 n.
     - `spectrum`, `noise`: of the prior and of the normals.
+    - `cholesky`: C.
     """
 
     level: Float[Array, ""]
@@ -46,15 +90,53 @@ class NormalsPosterior(TrigonometricPosterior):
     weights: Float[Array, "n 3"]
     spectrum: Spectra
     noise: Scalar
+    cholesky: Float[Array, "n n"]
 
     @property
     def truncation(self) -> int:
         """L."""
         return self.spectrum.shape[-1] - 1
 
-    @abstractmethod
-    def solve(self, rows: Float[Array, "s n 3"]) -> Float[Array, "s n 3"]:
-        """A^-1 applied to the columns of each block; zero in rows that are not filled, where it is zero."""
+    @on_torus
+    @eqx.filter_jit
+    def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
+        """Var f(x) at points in scene coordinates. The cost grows with (number of points) x (capacity)^2."""
+        x = jnp.asarray(x, dtype=self.weights.dtype)
+        prior = function_variance(self.spectrum)
+
+        def at_points(x):
+            return jnp.maximum(prior - jnp.sum(self.whitened(x) ** 2, axis=(0, 1)), 0.0)
+
+        chunk = max(1, min(x.shape[0], _CHUNK_VALUES // self.cloud.capacity))
+        return jax.lax.map(lambda point: at_points(point[None])[0], x, batch_size=chunk)
+
+    @on_torus
+    @eqx.filter_jit
+    def covariance(self, x: Float[AnyArray, "n 3"], y: Float[AnyArray, "m 3"]) -> Float[Array, "n m"]:
+        """Cov(f(x), f(y)) between points in scene coordinates, all at once."""
+        x, y = (jnp.asarray(points, dtype=self.weights.dtype) for points in (x, y))
+        explained = jnp.einsum("djn,djm->nm", self.whitened(x), self.whitened(y), precision="highest")
+        return function_covariance(x, y, self.spectrum) - explained
+
+    def log_marginal_likelihood(self) -> Float[Array, ""]:
+        """log p(n_1, ..., n_N | x_1, ..., x_N), summed over the three components."""
+        count = self.cloud.count
+        fit = jnp.sum(self.cloud.normals * self.weights)
+        log_determinant = 2.0 * jnp.sum(jnp.log(jnp.diag(self.cholesky)))
+        return -0.5 * (fit + 3.0 * log_determinant + 3.0 * count * jnp.log(2.0 * jnp.pi))
+
+    def whitened(self, x: Float[Array, "n 3"]) -> Float[Array, "3 capacity n"]:
+        """C^-1 cov(v_d(X), f(x)): the sum of its squares is the variance that the data explain."""
+        capacity = self.cloud.capacity
+
+        def leading(size: int):
+            cross = function_normal_covariance(x, self.cloud.points[:size], self.spectrum)
+            cross = jnp.where(self.cloud.mask[:size], cross, 0.0)
+            factor = self.cholesky[:size, :size]
+            solved = jax.vmap(lambda c: solve_triangular(factor, c.T, lower=True))(cross)
+            return jnp.pad(solved, ((0, 0), (0, capacity - size), (0, 0)))
+
+        return _on_filled_rows(self.cloud, leading)
 
     def data_points(self) -> DataPoints:
         """The cloud's, for gradients and for values."""
@@ -84,23 +166,34 @@ class NormalsPosterior(TrigonometricPosterior):
 
     def conditioned(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s a a a"]:
         """Coefficients of Poisson(v + k(., X) A^-1 (n - grad m - v(X) - eps))."""
-        return self.reconstructed(draws.coefficients, self.solve(self.residual(draws, means)))
+        return self.updated(draws.coefficients, self.whitened_residual(draws, means))
 
-    def residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
-        """n - grad m - v(X) - eps, zero in rows that are not filled."""
-        return jnp.where(self.cloud.mask[:, None], self.cloud.normals - means.gradients - draws.at_data, 0.0)
+    def whitened_residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
+        """C^-1 (n - grad m - v(X) - eps), zero in rows that are not filled."""
+        residual = self.cloud.normals - means.gradients - draws.at_data
+        return self._solve_triangular(jnp.where(self.cloud.mask[:, None], residual, 0.0), transpose=False)
 
-    def reconstructed(
-        self, coefficients: Float[Array, "s 3 a a a"], weights: Float[Array, "s n 3"]
+    def updated(
+        self, coefficients: Float[Array, "s 3 a a a"], whitened: Float[Array, "s n 3"]
     ) -> Float[Array, "s a a a"]:
-        """Coefficients of Poisson(v + k(., X) w) for each v and each w."""
+        """Coefficients of Poisson(v + k(., X) C^-T z) for each v and each whitened residual z."""
         transform = NonuniformTransform(self.cloud.points, self.truncation)
 
         def update(sample, transform, spectrum):
             coefficients, weights = sample
             return solve_poisson(coefficients) + reconstruct(transform, weights, spectrum)
 
+        weights = self._solve_triangular(whitened, transpose=True)
         return shared_map(update, (coefficients, weights), transform, self.spectrum)
+
+    def solve(self, rows: Float[Array, "s n 3"]) -> Float[Array, "s n 3"]:
+        """A^-1 applied to the columns of each block."""
+        return self._solve_triangular(self._solve_triangular(rows, transpose=False), transpose=True)
+
+    def _solve_triangular(self, rows: Float[Array, "s n 3"], transpose: bool) -> Float[Array, "s n 3"]:
+        columns = jnp.moveaxis(rows, 0, 1)
+        solved = solve_triangular(self.cholesky, columns.reshape(len(columns), -1), lower=True, trans=int(transpose))
+        return jnp.moveaxis(solved.reshape(columns.shape), 1, 0)
 
 
 def reconstruct(
@@ -108,21 +201,6 @@ def reconstruct(
 ) -> Float[Array, "a a a"]:
     """Coefficients of the f that k(., X) weights reconstructs: its Laplacian is their divergence."""
     return solve_poisson(mode_variance(spectrum) * transform.adjoint(weights))
-
-
-def cleared(cloud: PointCloud) -> PointCloud:
-    """With zeros in the rows that are not filled: whatever stands there, NaN included, must not reach the products."""
-    points, normals = (jnp.where(cloud.mask[:, None], rows, 0.0) for rows in (cloud.points, cloud.normals))
-    return PointCloud(points, normals, cloud.mask)
-
-
-def mean_of(
-    weights: Float[Array, "n 3"], cloud: PointCloud, spectrum: Spectra
-) -> tuple[Float[Array, ""], Float[Array, "a a a"]]:
-    """The level, and the coefficients of E f, for weights A^-1 n."""
-    transform = NonuniformTransform(cloud.points, spectrum.shape[-1] - 1)
-    mean = reconstruct(transform, weights, spectrum)
-    return mean_at_data(transform, mean, cloud), mean
 
 
 def mean_at_data(
@@ -134,7 +212,7 @@ def mean_at_data(
 
 
 @eqx.filter_jit
-def _level_slope(posterior: NormalsPosterior) -> Float[Array, "n 3"]:
+def _level_slope(posterior: GeometricSPSRPosterior) -> Float[Array, "n 3"]:
     """Derivative of the level with respect to the normals: A^-1 of that with respect to A^-1 n."""
     cloud, spectrum = posterior.cloud, posterior.spectrum
     transform = NonuniformTransform(cloud.points, posterior.truncation)

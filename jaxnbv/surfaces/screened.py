@@ -27,10 +27,10 @@ from jaxnbv.scanning.evidence import Evidence
 from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import SurfaceModel, on_torus
 from jaxnbv.surfaces.covariance import function_covariance, function_variance, mode_variance
-from jaxnbv.surfaces.given_normals import NormalDraws
+from jaxnbv.surfaces.given_normals import GeometricSPSRPosterior, NormalDraws
 from jaxnbv.surfaces.nonuniform import NonuniformTransform
 from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, filled
-from jaxnbv.surfaces.spsr import GeometricSPSR, GeometricSPSRPosterior
+from jaxnbv.surfaces.spsr import GeometricSPSR
 from jaxnbv.surfaces.trigonometric import inverse_laplacian, solve_poisson
 from jaxnbv.surfaces.values import OnSurface, OutsideBoundary, SeenEmpty, ValueRows, ValueSource, joined
 
@@ -76,10 +76,10 @@ class ScreenedSPSR(SurfaceModel):
     def condition(self, evidence: Evidence | PointCloud) -> "ScreenedSPSRPosterior":
         """p(g | D, what was seen empty). The cost is that of the base, and of M triangular solves with its factor.
 
-        **Raises:** `ValueError` as `GeometricSPSR.factorised` does, and if S is singular in the precision at hand.
+        **Raises:** `ValueError` as `GeometricSPSR.condition` does, and if S is singular in the precision at hand.
         """
         evidence = Evidence.of(evidence)
-        posterior = _condition(self, self.base.factorised(evidence), evidence)
+        posterior = _condition(self, self.base.condition(evidence), evidence)
         if not is_traced(posterior.weights):
             require(
                 bool(jnp.isfinite(posterior.weights).all()),

@@ -15,36 +15,29 @@ distribution.
 import functools
 import math
 import warnings
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import cho_solve, solve_triangular
+from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
-from jaxnbv.checks import AnyArray, as_floats, check_type, is_traced, require
+from jaxnbv.checks import as_floats, check_type, is_traced, require
 from jaxnbv.geometry.cloud import PointCloud, check_oriented
 from jaxnbv.scanning.evidence import Evidence
-from jaxnbv.surfaces.base import HALF_WIDTH, SurfaceModel, on_torus
-from jaxnbv.surfaces.covariance import (
-    Spectra,
-    function_covariance,
-    function_normal_covariance,
-    function_variance,
-)
-from jaxnbv.surfaces.given_normals import NormalDraws, NormalsPosterior, cleared, mean_of
-from jaxnbv.surfaces.gram import factorise, on_filled_rows
-from jaxnbv.surfaces.iterative import MOST_FACTORISED, IterativePosterior, by_conjugate_gradients
+from jaxnbv.surfaces.base import HALF_WIDTH, SurfaceModel
+from jaxnbv.surfaces.covariance import Spectra
+from jaxnbv.surfaces.given_normals import GeometricSPSRPosterior, factorise, mean_at_data, reconstruct
 from jaxnbv.surfaces.matern import Scalar, circle_spectrum
-from jaxnbv.surfaces.pathwise import MeansAtData
+from jaxnbv.surfaces.nonuniform import NonuniformTransform
 from jaxnbv.surfaces.trigonometric import basis_variance
 
-_CHUNK_VALUES = 2**24
 _SPARSE = 2.5
+# Points whose covariance is factorised: 1.1 GB in float32, and as much again while it is.
+_LARGEST = 16384
 
 # Numbers and tuples are converted on the way in, which mypy cannot see.
 if TYPE_CHECKING:
@@ -134,34 +127,23 @@ class GeometricSPSR(SurfaceModel):
                 stacklevel=2,
             )
 
-    def condition(self, evidence: Evidence | PointCloud) -> NormalsPosterior:
+    def condition(self, evidence: Evidence | PointCloud) -> GeometricSPSRPosterior:
         """p(f | D): of the evidence it takes the cloud alone. The cost is that of a Cholesky factorisation of the
-        cloud's capacity; beyond a capacity of 16,384, of some hundred transforms a solve (`IterativePosterior`).
+        cloud's capacity.
 
         **Raises:** `ValueError` if the cloud is empty, has entries that are not finite, a normal longer than 10 or
-        points outside [-pi/2, pi/2]^3 (scene coordinates), or if A is singular in the precision at hand; under `jit`
-        values are not known and are not checked.
-        """
-        cloud = Evidence.of(evidence).cloud
-        return self._checked(_iterative if cloud.capacity > MOST_FACTORISED else _factorised, cloud)
-
-    def factorised(self, evidence: Evidence | PointCloud) -> "GeometricSPSRPosterior":
-        """As `condition`, by the factor of A, which values of f and likelihoods need.
-
-        **Raises:** `ValueError` as `condition` does, and for a capacity above 16,384.
+        points outside [-pi/2, pi/2]^3 (scene coordinates), if its capacity is above 16,384, or if A is singular in the
+        precision at hand; under `jit` values are not known and are not checked.
         """
         cloud = Evidence.of(evidence).cloud
         require(
-            cloud.capacity <= MOST_FACTORISED,
-            f"the cloud has room for {cloud.capacity} points, and this model takes {MOST_FACTORISED} at most: lower "
-            "the planner's capacity, or use GeometricSPSR, which takes more",
+            cloud.capacity <= _LARGEST,
+            f"the cloud has room for {cloud.capacity} points, and this model takes {_LARGEST} at most: lower the "
+            "planner's capacity, or thin the cloud with farthest_point_subsample",
         )
-        return self._checked(_factorised, cloud)
-
-    def _checked(self, condition: Callable, cloud: PointCloud) -> Any:
         if not is_traced(cloud):
             check_oriented(cloud, "the cloud", HALF_WIDTH, unit=False)
-        posterior = condition(self, cloud)
+        posterior = _condition(self, cloud)
         if not is_traced(posterior.level):
             require(
                 bool(jnp.isfinite(posterior.level)),
@@ -178,86 +160,13 @@ def _kept_variance(model: GeometricSPSR) -> Float[Array, ""]:
 
 
 @eqx.filter_jit
-def _factorised(model: GeometricSPSR, cloud: PointCloud) -> "GeometricSPSRPosterior":
-    cloud, spectrum = cleared(cloud), model.spectrum
+def _condition(model: GeometricSPSR, cloud: PointCloud) -> GeometricSPSRPosterior:
+    # Whatever stands in rows that are not filled, NaN included, must not reach the products.
+    points, normals = (jnp.where(cloud.mask[:, None], rows, 0.0) for rows in (cloud.points, cloud.normals))
+    cloud, spectrum = PointCloud(points, normals, cloud.mask), model.spectrum
     cholesky = factorise(cloud, spectrum, model.noise)
     weights = cho_solve((cholesky, True), cloud.normals)
-    level, mean = mean_of(weights, cloud, spectrum)
+    transform = NonuniformTransform(cloud.points, model.truncation)
+    mean = reconstruct(transform, weights, spectrum)
+    level = mean_at_data(transform, mean, cloud)
     return GeometricSPSRPosterior(level, mean, cloud, weights, spectrum, model.noise, cholesky)
-
-
-@eqx.filter_jit
-def _iterative(model: GeometricSPSR, cloud: PointCloud) -> IterativePosterior:
-    cloud, spectrum = cleared(cloud), model.spectrum
-    weights = by_conjugate_gradients(cloud.normals[None], cloud, spectrum, model.noise)[0]
-    level, mean = mean_of(weights, cloud, spectrum)
-    return IterativePosterior(level, mean, cloud, weights, spectrum, model.noise)
-
-
-class GeometricSPSRPosterior(NormalsPosterior):
-    """p(f | D) under `GeometricSPSR`, in closed form and as pathwise samples.
-
-    - `cholesky`: lower factor of A.
-    """
-
-    cholesky: Float[Array, "n n"]
-
-    @on_torus
-    @eqx.filter_jit
-    def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """Var f(x) at points in scene coordinates. The cost grows with (number of points) x (capacity)^2."""
-        x = jnp.asarray(x, dtype=self.weights.dtype)
-        prior = function_variance(self.spectrum)
-
-        def at_points(x):
-            return jnp.maximum(prior - jnp.sum(self.whitened(x) ** 2, axis=(0, 1)), 0.0)
-
-        chunk = max(1, min(x.shape[0], _CHUNK_VALUES // self.cloud.capacity))
-        return jax.lax.map(lambda point: at_points(point[None])[0], x, batch_size=chunk)
-
-    @on_torus
-    @eqx.filter_jit
-    def covariance(self, x: Float[AnyArray, "n 3"], y: Float[AnyArray, "m 3"]) -> Float[Array, "n m"]:
-        """Cov(f(x), f(y)) between points in scene coordinates, all at once."""
-        x, y = (jnp.asarray(points, dtype=self.weights.dtype) for points in (x, y))
-        explained = jnp.einsum("djn,djm->nm", self.whitened(x), self.whitened(y), precision="highest")
-        return function_covariance(x, y, self.spectrum) - explained
-
-    def log_marginal_likelihood(self) -> Float[Array, ""]:
-        """log p(n_1, ..., n_N | x_1, ..., x_N), summed over the three components."""
-        count = self.cloud.count
-        fit = jnp.sum(self.cloud.normals * self.weights)
-        log_determinant = 2.0 * jnp.sum(jnp.log(jnp.diag(self.cholesky)))
-        return -0.5 * (fit + 3.0 * log_determinant + 3.0 * count * jnp.log(2.0 * jnp.pi))
-
-    def solve(self, rows: Float[Array, "s n 3"]) -> Float[Array, "s n 3"]:
-        """A^-1 applied to the columns of each block, by the factor."""
-        return self._solve_triangular(self._solve_triangular(rows, transpose=False), transpose=True)
-
-    def whitened_residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
-        """C^-1 (n - grad m - v(X) - eps) with A = C C^T, zero in rows that are not filled."""
-        return self._solve_triangular(self.residual(draws, means), transpose=False)
-
-    def updated(
-        self, coefficients: Float[Array, "s 3 a a a"], whitened: Float[Array, "s n 3"]
-    ) -> Float[Array, "s a a a"]:
-        """Coefficients of Poisson(v + k(., X) C^-T z) for each v and each whitened residual z."""
-        return self.reconstructed(coefficients, self._solve_triangular(whitened, transpose=True))
-
-    def _solve_triangular(self, rows: Float[Array, "s n 3"], transpose: bool) -> Float[Array, "s n 3"]:
-        columns = jnp.moveaxis(rows, 0, 1)
-        solved = solve_triangular(self.cholesky, columns.reshape(len(columns), -1), lower=True, trans=int(transpose))
-        return jnp.moveaxis(solved.reshape(columns.shape), 1, 0)
-
-    def whitened(self, x: Float[Array, "n 3"]) -> Float[Array, "3 capacity n"]:
-        """C^-1 cov(v_d(X), f(x)) with A = C C^T: the sum of its squares is the variance that the data explain."""
-        capacity = self.cloud.capacity
-
-        def leading(size: int):
-            cross = function_normal_covariance(x, self.cloud.points[:size], self.spectrum)
-            cross = jnp.where(self.cloud.mask[:size], cross, 0.0)
-            factor = self.cholesky[:size, :size]
-            solved = jax.vmap(lambda c: solve_triangular(factor, c.T, lower=True))(cross)
-            return jnp.pad(solved, ((0, 0), (0, capacity - size), (0, 0)))
-
-        return on_filled_rows(self.cloud, leading)

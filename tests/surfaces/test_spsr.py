@@ -177,7 +177,7 @@ def test_posterior_is_differentiable_in_data_queries_and_hyperparameters(x64):
 def test_variance_does_not_depend_on_the_size_of_its_chunks(x64, monkeypatch):
     posterior = GeometricSPSR(**SETTINGS).condition(cloud(POINTS, NORMALS))
     whole = posterior.variance(QUERIES)
-    monkeypatch.setattr("jaxnbv.surfaces.spsr._CHUNK_VALUES", 5 * len(POINTS))
+    monkeypatch.setattr("jaxnbv.surfaces.given_normals._CHUNK_VALUES", 5 * len(POINTS))
     # Two more than before, so that it is compiled anew.
     np.testing.assert_allclose(posterior.variance(np.concatenate([QUERIES, QUERIES[:2]]))[:-2], whole, rtol=1e-10)
 
@@ -231,6 +231,8 @@ def test_kept_variance_is_the_prior_variance_of_weight_space(nu):
 def test_bad_clouds_are_refused():
     model = GeometricSPSR(lengthscale=0.1, truncation=3)
     good = cloud(POINTS, NORMALS)
+    with pytest.raises(ValueError, match=r"room for 16385 points.*16384 at most: lower the planner's capacity"):
+        model.condition(cloud(POINTS, NORMALS, 16385))
     with pytest.raises(ValueError, match="the cloud is empty: no point to start from"):
         model.condition(PointCloud(good.points, good.normals, jnp.zeros(30, bool)))
     with pytest.raises(ValueError, match="not finite"):
