@@ -91,7 +91,6 @@ from .surfaces import GeometricSPSR as GeometricSPSR
 from .surfaces import KnownShapes as KnownShapes
 from .surfaces import OnSurface as OnSurface
 from .surfaces import OutsideBoundary as OutsideBoundary
-from .surfaces import SampledPosterior as SampledPosterior
 from .surfaces import ScreenedSPSR as ScreenedSPSR
 from .surfaces import SeenEmpty as SeenEmpty
 from .surfaces import ShapeBank as ShapeBank

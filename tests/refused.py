@@ -437,7 +437,6 @@ REFUSED = {
     ),
     "a utility as a second question": (lambda: nbv.TieBreakSearch(12, second=lambda cloud: 0.0), "second"),
     "no samples of a posterior": (lambda: POSTERIOR.sample(KEY, 0), "asked for 0 samples"),
-    "the variance of one sample": (lambda: POSTERIOR.drawn(1), "variance of 1 samples was asked for"),
     "a target of no points": (lambda: nbv.SoftPartCount(lambda cloud: None, 0.0), "N_target is"),
     "a target below zero": (lambda: nbv.SoftPartCount(lambda cloud: None, -3.0), "N_target is"),
     "no points for a classifier": (lambda: CloudClassifier(CLASSIFIER, num_points=0), "num_points is 0"),

@@ -1,7 +1,6 @@
 """p(f) and p(f | D): distributions over implicit surfaces."""
 
 from jaxnbv.surfaces.base import Fields as Fields
-from jaxnbv.surfaces.base import SampledPosterior as SampledPosterior
 from jaxnbv.surfaces.base import SurfaceModel as SurfaceModel
 from jaxnbv.surfaces.base import SurfacePosterior as SurfacePosterior
 from jaxnbv.surfaces.known_shapes import Hypothesis as Hypothesis

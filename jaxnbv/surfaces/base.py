@@ -20,21 +20,36 @@ from jaxnbv.scanning.evidence import Evidence
 HALF_WIDTH = 0.5 * math.pi
 """Scattered points must lie in [-HALF_WIDTH, HALF_WIDTH]^3, the cube that the paper scales a scene into."""
 
+_ESTIMATED_BY = 64
 
-def on_torus(method: Callable[..., Any]) -> Callable[..., Any]:
-    """A method of points (n, 3), which must lie on the torus, [-pi, pi]^3: beyond it functions only repeat. Its eighth
-    in the middle is the scene; outside that nothing is known but that the surface does not lie there."""
 
-    @functools.wraps(method)
-    def call(self: Any, *points: Any) -> Any:
-        for x in points:
-            found = x if is_traced(x) else as_numbers(x, "the points", None)
-            shaped = found.ndim == 2 and found.shape[1] == 3
-            require(shaped, f"the points have shape {found.shape}: give an array (n, 3)")
-            _check_on_torus(found, self)
-        return method(self, *points)
+def _on_torus(is_given: Callable[[Any], bool], wanted: str) -> Callable[..., Any]:
+    """Of a method, that its arguments are arrays of a shape, on the torus, [-pi, pi]^3: beyond it functions only
+    repeat. Its eighth in the middle is the scene; outside that nothing is known but that the surface is not there."""
 
-    return call
+    def checking(method: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(method)
+        def call(self: Any, *arrays: Any) -> Any:
+            for array in arrays:
+                found = array if is_traced(array) else as_numbers(array, "the coordinates", None)
+                require(is_given(found), f"the coordinates have shape {found.shape}: give {wanted}")
+                if is_traced(found, self) or not found.size:
+                    continue
+                furthest = float(np.abs(found).max())
+                require(
+                    furthest <= 2.0 * HALF_WIDTH + 1e-6,
+                    f"a point has a coordinate of {furthest:.4g}, outside [-pi, pi]^3, where surfaces only repeat; the "
+                    "scene is [-pi/2, pi/2]^3: bring the points there with Frame.to_scene",
+                )
+            return method(self, *arrays)
+
+        return call
+
+    return checking
+
+
+on_torus = _on_torus(lambda x: x.ndim == 2 and x.shape[1] == 3, "points (n, 3)")
+on_grid_of_torus = _on_torus(lambda axis: axis.ndim == 1, "the nodes along one axis of a grid (g,)")
 
 
 def sampler(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -48,30 +63,6 @@ def sampler(method: Callable[..., Any]) -> Callable[..., Any]:
         return method(self, key, int(num_samples))
 
     return call
-
-
-def on_grid_of_torus(method: Callable[..., Any]) -> Callable[..., Any]:
-    """A method of the nodes along one axis (g,) of a grid, which must lie on the torus as points of `on_torus` do."""
-
-    @functools.wraps(method)
-    def call(self: Any, axis: Any) -> Any:
-        found = axis if is_traced(axis) else as_numbers(axis, "the nodes along an axis", None)
-        require(found.ndim == 1, f"the nodes along an axis have shape {found.shape}: give an array (g,)")
-        _check_on_torus(found, self)
-        return method(self, axis)
-
-    return call
-
-
-def _check_on_torus(coordinates: Any, owner: Any) -> None:
-    if is_traced(coordinates, owner) or not coordinates.size:
-        return
-    furthest = float(np.abs(coordinates).max())
-    require(
-        furthest <= 2.0 * HALF_WIDTH + 1e-6,
-        f"a point has a coordinate of {furthest:.4g}, outside [-pi, pi]^3, where surfaces only repeat; the scene is "
-        "[-pi/2, pi/2]^3: bring the points there with Frame.to_scene",
-    )
 
 
 class Fields(eqx.Module):
@@ -102,7 +93,8 @@ class SurfacePosterior(eqx.Module):
     """p(f | D): the surface is where f equals `level`, and f is greater outside.
 
     An implementation gives `level` and `sample`. One that has closed forms overrides `mean`, `variance` and
-    `probability_inside` by them; those that it leaves are estimated from samples drawn under a fixed key.
+    `probability_inside` by them; those that it leaves are estimated from S = 64 samples drawn under a fixed key,
+    the same functions for all points.
     """
 
     level: eqx.AbstractVar[Float[Array, ""]]
@@ -116,76 +108,28 @@ class SurfacePosterior(eqx.Module):
         """Whether it has its own `mean`; else moments are estimated from samples."""
         return type(self).mean is not SurfacePosterior.mean
 
-    def drawn(self, num_samples: int = 64) -> "SurfacePosterior":
-        """The posterior itself where it has closed forms; else with samples drawn once, under a fixed key, by which
-        its moments are estimated. Ask it for more than one moment: the samples are then drawn once.
-
-        **Raises:** `ValueError` if `num_samples` < 2.
-        """
-        check_type(num_samples, int, "the number of samples")
-        require(num_samples >= 2, f"a variance of {num_samples} samples was asked for; ask for at least two")
-        return self if self.has_closed_forms else self._estimated(num_samples)
-
     def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """E f(x), here as samples estimate it."""
-        return self._estimated().mean(x)
+        """E f(x), here the mean of samples, of standard error sqrt(Var f / S)."""
+        return jnp.mean(self._kept()(x), axis=0)
 
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """Var f(x), here as samples estimate it."""
-        return self._estimated().variance(x)
+        """Var f(x), here that of samples, S - 1 in its denominator."""
+        return jnp.var(self._kept()(x), axis=0, ddof=1)
 
     def probability_inside(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """P(f(x) < level), here as samples estimate it."""
-        return self._estimated().probability_inside(x)
-
-    def _estimated(self, num_samples: int = 64) -> "SampledPosterior":
-        return SampledPosterior(self.level, self, self.sample(jax.random.key(0), num_samples))
+        """P(f(x) < level), here the share of samples."""
+        return jnp.mean(self._kept()(x) < self.level, axis=0)
 
     @on_grid_of_torus
     @eqx.filter_jit
     def mean_on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "g g g"]:
         """E f on the tensor grid axis x axis x axis (scene coordinates)."""
-        drawn = self.drawn()
-        return on_tensor_grid(self.mean, axis) if drawn is self else drawn.mean_on_grid(axis)
+        if self.has_closed_forms:
+            return on_tensor_grid(self.mean, axis)
+        return jnp.mean(self._kept().on_grid(axis), axis=0)
 
-
-class SampledPosterior(SurfacePosterior):
-    """A posterior whose moments are estimated from samples drawn once: the same functions for all points, so that the
-    mean is smooth, and variances and probabilities belong to it.
-
-    - `level`: that of the posterior.
-    - `posterior`: what was sampled. `sample` draws from it anew: its samples are not among those that are kept.
-    - `fields`: the samples that are kept, at least two.
-
-    With S samples the standard error of the mean is its standard deviation / sqrt(S), that of a probability p is
-    sqrt(p (1 - p) / S), and that of a Gaussian variance is sqrt(2 / (S - 1)) of it.
-    """
-
-    level: Float[Array, ""]
-    posterior: SurfacePosterior
-    fields: Fields
-
-    def sample(self, key: PRNGKeyArray, num_samples: int) -> Fields:
-        """`num_samples` independent samples of the posterior, as its own `sample` draws them."""
-        return self.posterior.sample(key, num_samples)
-
-    def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """Mean of the samples at the points x (scene coordinates)."""
-        return jnp.mean(self.fields(x), axis=0)
-
-    def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """Variance of the samples at the points x, with S - 1 in its denominator."""
-        return jnp.var(self.fields(x), axis=0, ddof=1)
-
-    def probability_inside(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """Share of the samples that are below the level at the points x."""
-        return jnp.mean(self.fields(x) < self.level, axis=0)
-
-    @on_grid_of_torus
-    @eqx.filter_jit
-    def mean_on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "g g g"]:
-        """Mean of the samples on the tensor grid axis x axis x axis, for which all of them are held there at once."""
-        return jnp.mean(self.fields.on_grid(axis), axis=0)
+    def _kept(self) -> Fields:
+        return self.sample(jax.random.key(0), _ESTIMATED_BY)
 
 
 class SurfaceModel(eqx.Module):
