@@ -122,8 +122,8 @@ class TrigonometricPosterior(SurfacePosterior):
         own; where it is a part of f with a distribution, it is drawn with the sample.
 
         - `means`: any functions, which need not be band-limited nor periodic; differentiable once.
-        - `noise_scale`: rho, one number or one for each mean function. The samples' deviation from `mean_about(means)`
-          is rho times that of the posterior; 0 gives these means themselves.
+        - `noise_scale`: rho, one number or one for each mean function. The samples' deviation from their mean is rho
+          times that of the posterior; 0 gives E f about each m_s, whatever the key.
 
         **Raises:** `ValueError` for means that are no `Fields`, a noise scale that is negative or not finite, another
         number of them than of mean functions, or means that are not finite at the data.
@@ -142,30 +142,18 @@ class TrigonometricPosterior(SurfacePosterior):
             require(least >= 0, f"a noise scale is {least:.4g}; it must not be negative")
             require(most < np.inf, f"a noise scale is {most:.4g}; it must be finite")
         unscaled = not is_traced(scale) and least == most == 1.0
-        return self._about(means, at_data, _sampled(self, key, at_data, None if unscaled else scale))
-
-    @checked
-    def mean_about(self, means: Fields) -> FieldsAbout:
-        """E f about each of S mean functions, relative to this posterior's level as those of `sample_about` are.
-
-        **Raises:** `ValueError` for means that are no `Fields`, or not finite at the data.
-        """
-        at_data = _at_data(means, self.data_points())
-        return self._about(means, at_data, _mean(self, at_data))
-
-    def _about(self, means: Fields, at_data: MeansAtData, coefficients: Float[Array, "s a a a"]) -> FieldsAbout:
-        middle = coefficients.shape[-1] // 2
+        coefficients = _sampled(self, key, at_data, None if unscaled else scale)
         levels = self.level_about(at_data)
         if not is_traced(levels, coefficients):
             finite = jnp.isfinite(coefficients).all(axis=(1, 2, 3)) & jnp.isfinite(levels)
             bad = np.flatnonzero(~np.asarray(finite))
             require(
                 bad.size == 0,
-                f"{bad.size} of the {len(finite)} mean functions, the first of them number {bad[:1]}, have values or "
+                f"{bad.size} of the {count} mean functions, the first of them number {bad[:1]}, have values or "
                 "gradients at the data that are not finite",
             )
-        relative = coefficients.at[:, middle, middle, middle].add(-levels)
-        return FieldsAbout(means, TrigonometricFields(relative))
+        middle = coefficients.shape[-1] // 2
+        return FieldsAbout(means, TrigonometricFields(coefficients.at[:, middle, middle, middle].add(-levels)))
 
     @abstractmethod
     def data_points(self) -> DataPoints:
@@ -227,9 +215,3 @@ def _sampled(
 
 def _scaled(draws: Any, scale: Float[Array, "*s"]) -> Any:
     return jax.tree.map(lambda draw: draw * scale.reshape(-1, *(1,) * (draw.ndim - 1)), draws)
-
-
-@eqx.filter_jit
-def _mean(posterior: TrigonometricPosterior, means: MeansAtData) -> Float[Array, "s a a a"]:
-    draws = jax.eval_shape(lambda: posterior.prior_draws(jax.random.key(0), len(means.values)))
-    return posterior.conditioned(jax.tree.map(lambda draw: jnp.zeros(draw.shape, draw.dtype), draws), means)
