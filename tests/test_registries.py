@@ -37,7 +37,7 @@ def test_a_search_stands_at_the_sensors_distance_with_as_many_candidates(name):
         poses = search.candidates.poses()
     else:
         assert isinstance(search, GradientSearch)
-        poses = search.ascent.space.candidates(24, jax.random.key(0))
+        poses = search.space.candidates(24, jax.random.key(0))
     distance = np.linalg.norm(poses.position, axis=1)
     assert len(distance) == 24
     assert distance.mean() == pytest.approx(2.2, abs=0.1)

@@ -1,31 +1,42 @@
 """Search by gradient: the acquisition is a differentiable function of the pose."""
 
+import dataclasses
+import math
+from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
 import optimistix as optx
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.acquisition import Acquisition
+from jaxnbv.acquisition import Acquisition, check_differentiable
 from jaxnbv.checks import check_fields, checked, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.search.ascent import Ascent
-from jaxnbv.search.base import Search
+from jaxnbv.search.base import Search, best_unvisited
 from jaxnbv.search.candidates import Candidates, NumberedCandidates, as_candidates
 from jaxnbv.search.pose_space import FreePoses, PoseSpace, SpherePoses
 from jaxnbv.search.problem import Problem
-from jaxnbv.search.proposal import Proposal
+from jaxnbv.search.proposal import Proposal, Trajectories
+
+# In ranges of the candidates' values, for each scene unit.
+_PENALTY = 10.0
 
 
 class GradientSearch(Search):
-    """Multi-start gradient ascent over 2-DOF or 6-DOF poses.
+    """Multi-start gradient ascent over 2-DOF or 6-DOF poses, all starts at once, through Optimistix.
 
     - `dof`: 2 for `SpherePoses()`, 6 for `FreePoses()`; or give a `space` of your own, `ConstrainedPoses()` say.
     - `num_candidates`: poses, spread evenly over the space and turned at random, that are evaluated first; the ascent
       starts from the best `num_starts` of them. With as many candidates as starts, every candidate is a start.
     - `candidates`: in their place, poses of your own; `turned`: whether the key turns them, if they can be turned.
-    - `num_starts`, `iterations`, `learning_rate`, `solver`: see `Ascent`.
+    - `iterations`: steps from each start; each evaluates the acquisition and its gradient once.
+    - `learning_rate`: Adam's, in the units of the space's parameters: radians or scene units, about.
+    - `solver`: a minimiser of Optimistix in place of Adam, such as `optimistix.BFGS(rtol=1e-4, atol=1e-4)`; the
+      objective that it is given is of order 1.
 
     Differentiation keeps what the acquisition computed for all starts and samples, with PointNet++ several gigabytes;
     fewer starts need less.
@@ -38,7 +49,11 @@ class GradientSearch(Search):
     differentiate, and a camera that the space is not for.
     """
 
-    ascent: Ascent
+    space: PoseSpace
+    num_starts: int = eqx.field(static=True)
+    iterations: int = eqx.field(static=True)
+    learning_rate: float = eqx.field(static=True)
+    solver: optx.AbstractMinimiser | None
     candidates: Candidates
     turned: bool = eqx.field(static=True)
     uses_samples: ClassVar[bool] = True
@@ -56,22 +71,85 @@ class GradientSearch(Search):
         candidates: Candidates | Pose | None = None,
         turned: bool = True,
     ):
-        self.ascent = Ascent(_pose_space(dof, space), num_starts, iterations, learning_rate, solver)
-        of_space = SpaceCandidates(space=self.ascent.space, num_poses=num_candidates)
+        self.space = _pose_space(dof, space)
+        self.num_starts, self.iterations, self.learning_rate = num_starts, iterations, learning_rate
+        of_space = SpaceCandidates(space=self.space, num_poses=num_candidates)
         self.candidates = of_space if candidates is None else as_candidates(candidates)
-        self.turned = turned
+        self.solver, self.turned = solver, turned
+
+    def __check_init__(self):
+        check_fields(self)
+        for name in ("num_starts", "iterations"):
+            value = getattr(self, name)
+            require(value >= 1, f"{name} is {value}; it must be at least 1")
         require(
-            self.candidates.count >= num_starts,
-            f"the search has {self.candidates.count} candidates for {num_starts} starts: give it as many at least",
+            0 < self.learning_rate < math.inf,
+            f"the learning rate is {self.learning_rate}; it must be positive and finite, such as 0.01",
+        )
+        require(
+            self.candidates.count >= self.num_starts,
+            f"the search has {self.candidates.count} candidates for {self.num_starts} starts: give it as many at least",
         )
 
+    @property
+    def minimiser(self) -> optx.AbstractMinimiser:
+        """The solver, by default Adam."""
+        if self.solver is not None:
+            return self.solver
+        # No tolerance is ever met: as many steps as were asked for.
+        return optx.OptaxMinimiser(optax.adam(self.learning_rate), rtol=0.0, atol=0.0)
+
     def check(self, acquisition: Acquisition, camera: Camera, capacity: int) -> None:
-        """See `Ascent.check`."""
-        self.ascent.check(acquisition, camera, capacity)
+        """Raise `ValueError` if the acquisition has no gradient, or the space makes no sense for the camera."""
+        self.space.check_camera(camera)
+        check_differentiable(acquisition, capacity, camera)
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
-        """The best pose that was seen, candidates included; the key turns the candidates, if they are to be turned."""
-        return self.ascent.climb(problem, self.candidates.poses(key if self.turned else None))
+        """The best pose on the ways from the best candidates, or the best candidate if none is better; the key turns
+        the candidates, if they are to be turned."""
+        candidates = self.candidates.poses(key if self.turned else None)
+        scores = problem.scores(candidates)
+        values = jnp.mean(scores, axis=0)
+        order = jnp.argsort(jnp.where(problem.is_closed(candidates), -jnp.inf, values), descending=True)
+        # Solvers that search along a line expect differences of order one.
+        scale = jnp.max(values) - jnp.min(values)
+        scale = jnp.where(scale > 0, scale, 1.0)
+        trajectories = jax.vmap(partial(self._walk, problem, scale))(candidates[order[: self.num_starts]])
+        found = best_unvisited(problem, candidates, values, tie=0.0, scores=scores)
+        passed = best_unvisited(problem, *trajectories.flat, tie=0.0)
+        # Whatever is not a number comes through, so that the planner can say so.
+        better = ~(passed.value <= found.value)
+        pose, value = jax.tree.map(partial(jnp.where, better), *[(p.pose, p.value) for p in (passed, found)])
+        return dataclasses.replace(found, pose=pose, value=value, trajectories=trajectories)
+
+    def _walk(self, problem: Problem, scale: Float[Array, ""], start: Pose) -> Trajectories:
+        """Where the solver stood: every pose it evaluated or, of one that searches along a line, those it accepted."""
+        solver = self.minimiser
+
+        def loss(parameters, _):
+            pose = self.space.retract(start, parameters)
+            value = problem.values(pose[None])[0]
+            # A pose may hide that the gradient which led to it was not a number.
+            value = jnp.where(jnp.isfinite(parameters).all(), value, jnp.nan)
+            # A pose where no camera may stand is never chosen; the penalty leads out of there.
+            return _PENALTY * problem.violation(pose[None])[0] - value / scale, (pose, value)
+
+        parameters = jnp.zeros(self.space.num_parameters, start.position.dtype)
+        struct, aux_struct = jax.eval_shape(loss, parameters, None)
+        state = solver.init(loss, parameters, None, {}, struct, aux_struct, frozenset())
+        state, rest = eqx.partition(state, eqx.is_array)
+
+        def step(carry, _):
+            parameters, state = carry
+            whole = eqx.combine(state, rest)
+            done, _ = solver.terminate(loss, parameters, None, {}, whole, frozenset())
+            moved, whole, seen = solver.step(loss, parameters, None, {}, whole, frozenset())
+            after = moved, eqx.filter(whole, eqx.is_array)
+            return jax.tree.map(partial(jnp.where, done), carry, after), seen
+
+        # One step more, for the value of the pose that the last one led to.
+        _, (poses, values) = jax.lax.scan(step, (parameters, state), length=self.iterations + 1)
+        return Trajectories(poses, values)
 
 
 class HybridSearch(GradientSearch):

@@ -155,8 +155,8 @@ def test_each_method_has_its_search_and_score():
     for method, planner in planners.items():
         by_parts = method in ("discrete", "gradient-2dof", "gradient-6dof")
         assert isinstance(planner.acquisition, ExpectedUtilityImprovement if by_parts else Coverage)
-    assert isinstance(planners["gradient-2dof"].search.ascent.space, SpherePoses)
-    assert isinstance(planners["gradient-6dof"].search.ascent.space, FreePoses)
+    assert isinstance(planners["gradient-2dof"].search.space, SpherePoses)
+    assert isinstance(planners["gradient-6dof"].search.space, FreePoses)
 
 
 @pytest.mark.parametrize("method", ["discrete", "random"])
