@@ -120,7 +120,7 @@ CALLS = {
     nbv.Several: {"members": (nbv.Coverage(),)},
     nbv.SoftPartCount: {"segmenter": number_of_points, "target": 60.0},
     nbv.TieBreakSearch: {"candidates": 6, "second": nbv.Coverage()},
-    nbv.SphereCandidates: {"num_poses": 6, "radius": 2.5, "min_elevation": 0.0, "up": (0.0, 1.0, 0.0)},
+    nbv.SphereCandidates: {"count": 6, "radius": 2.5, "min_elevation": 0.0, "up": (0.0, 1.0, 0.0)},
     nbv.SpherePoses: {"radius": 2.5},
     nbv.TriangleMesh.from_arrays: {"vertices": np.eye(3), "faces": [[0, 1, 2]]},
     nbv.UncertaintyView: {"candidates": 6},

@@ -102,7 +102,7 @@ def test_what_is_asked_for_is_taken(ring):
         "radius": candidates["radius"],
         "rays": camera["height"],
         "samples": planner["imagination"]["num_samples"],
-        "candidates": candidates["num_poses"],
+        "candidates": candidates["count"],
         "lengthscale": planner["imagination"]["model"]["base"]["lengthscale"][0],
     }
     assert camera["width"] == 33

@@ -11,6 +11,7 @@ from jaxnbv.search.candidates import Reach as Reach
 from jaxnbv.search.candidates import SphereCandidates as SphereCandidates
 from jaxnbv.search.candidates import Turntable as Turntable
 from jaxnbv.search.discrete import DiscreteSearch as DiscreteSearch
+from jaxnbv.search.discrete import TieBreakSearch as TieBreakSearch
 from jaxnbv.search.gradient import GradientSearch as GradientSearch
 from jaxnbv.search.gradient import HybridSearch as HybridSearch
 from jaxnbv.search.halving import HalvingSearch as HalvingSearch
@@ -21,4 +22,3 @@ from jaxnbv.search.pose_space import SpherePoses as SpherePoses
 from jaxnbv.search.problem import Problem as Problem
 from jaxnbv.search.proposal import Proposal as Proposal
 from jaxnbv.search.proposal import Trajectories as Trajectories
-from jaxnbv.search.tie_break import TieBreakSearch as TieBreakSearch

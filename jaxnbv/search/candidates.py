@@ -51,20 +51,10 @@ class Candidates(eqx.Module):
         return GivenPoses(poses[jnp.asarray(np.flatnonzero(rows))])
 
 
-class NumberedCandidates(Candidates):
-    """Of which there are as many as are asked for: `num_poses`."""
-
-    num_poses: eqx.AbstractVar[int]
-
-    @property
-    def count(self) -> int:
-        return self.num_poses
-
-
-class SphereCandidates(NumberedCandidates):
+class SphereCandidates(Candidates):
     """The paper's pool: a Fibonacci sphere of cameras that look at the origin, or the part of it above an elevation.
 
-    - `num_poses`: of cameras, evenly spaced on what there is of the sphere.
+    - `count`: of cameras, evenly spaced on what there is of the sphere.
     - `radius`: in scene units.
     - `min_elevation`: radians above the plane through the origin across `up`; 0 leaves a dome over a table.
     - `up`: the direction that is upward, in the scene and in the images.
@@ -73,14 +63,14 @@ class SphereCandidates(NumberedCandidates):
     [-pi/2, pi/2), or an `up` without direction.
     """
 
-    num_poses: int = eqx.field(static=True, default=120)
+    count: int = eqx.field(static=True, default=120)
     radius: float = eqx.field(static=True, default=SENSOR_RADIUS)
     min_elevation: float = eqx.field(static=True, default=-0.5 * math.pi)
     up: tuple[float, float, float] = eqx.field(static=True, default=(0.0, 1.0, 0.0))
 
     def __check_init__(self):
         check_fields(self)
-        _check_places(self.num_poses, self.radius, self.radius, self.up)
+        _check_places(self.count, self.radius, self.radius, self.up)
         require(
             -0.5 * math.pi <= self.min_elevation < 0.5 * math.pi,
             f"the least elevation is {self.min_elevation} rad; it must lie within [-pi/2, pi/2)",
@@ -97,7 +87,7 @@ class SphereCandidates(NumberedCandidates):
 
     def poses(self, key: PRNGKeyArray | None = None) -> Pose:
         """A dome is turned about its axis, so that the poses of every key are above the elevation."""
-        places = fibonacci_sphere(self.num_poses, self.radius, self.min_elevation)
+        places = fibonacci_sphere(self.count, self.radius, self.min_elevation)
         if key is not None and self._is_whole:
             check_key(key)
             turn = rotation_from_6d(jax.random.normal(key, (6,)))
@@ -105,10 +95,10 @@ class SphereCandidates(NumberedCandidates):
         return _looking(places, self.up, key)
 
 
-class Turntable(NumberedCandidates):
+class Turntable(Candidates):
     """A camera that stands still before a turntable: as the object sees it, on a circle about the axis `up`.
 
-    - `num_poses`: of positions of the table, evenly spaced.
+    - `count`: of positions of the table, evenly spaced.
     - `radius`: the camera's distance from the centre of the scene, at which it looks; `elevation`: its angle above the
       plane across `up`, in radians.
 
@@ -116,14 +106,14 @@ class Turntable(NumberedCandidates):
     (-pi/2, pi/2), or an `up` without direction.
     """
 
-    num_poses: int = eqx.field(static=True, default=36)
+    count: int = eqx.field(static=True, default=36)
     radius: float = eqx.field(static=True, default=SENSOR_RADIUS)
     elevation: float = eqx.field(static=True, default=math.radians(30.0))
     up: tuple[float, float, float] = eqx.field(static=True, default=(0.0, 1.0, 0.0))
 
     def __check_init__(self):
         check_fields(self)
-        _check_places(self.num_poses, self.radius, self.radius, self.up)
+        _check_places(self.count, self.radius, self.radius, self.up)
         require(
             -0.5 * math.pi < self.elevation < 0.5 * math.pi,
             f"the elevation is {self.elevation} rad; it must lie within (-pi/2, pi/2)",
@@ -131,23 +121,23 @@ class Turntable(NumberedCandidates):
 
     def poses(self, key: PRNGKeyArray | None = None) -> Pose:
         """With a key the table starts at a random angle."""
-        angle = 2.0 * np.pi * np.arange(self.num_poses) / self.num_poses
+        angle = 2.0 * np.pi * np.arange(self.count) / self.count
         ring = np.cos(self.elevation)
         places = np.stack([ring * np.cos(angle), np.full_like(angle, np.sin(self.elevation)), ring * np.sin(angle)], 1)
         return _looking(self.radius * jnp.asarray(places, jnp.result_type(float)), self.up, key)
 
 
-class Reach(NumberedCandidates):
+class Reach(Candidates):
     """Where an arm can hold a camera that looks at the centre: between two distances and two elevations about `up`.
 
-    - `num_poses`: of places; directions as of a Fibonacci sphere, distances uniform in the volume between them.
+    - `count`: of places; directions as of a Fibonacci sphere, distances uniform in the volume between them.
     - `nearest`, `farthest`: in scene units; `min_elevation`, `max_elevation`: in radians above the plane across `up`.
 
     **Raises:** `ValueError` for no places, distances or elevations of which the second is not greater, or an `up`
     without direction.
     """
 
-    num_poses: int = eqx.field(static=True, default=120)
+    count: int = eqx.field(static=True, default=120)
     nearest: float = eqx.field(static=True, default=2.0)
     farthest: float = eqx.field(static=True, default=3.0)
     min_elevation: float = eqx.field(static=True, default=0.0)
@@ -156,7 +146,7 @@ class Reach(NumberedCandidates):
 
     def __check_init__(self):
         check_fields(self)
-        _check_places(self.num_poses, self.nearest, self.farthest, self.up)
+        _check_places(self.count, self.nearest, self.farthest, self.up)
         require(
             -0.5 * math.pi <= self.min_elevation < self.max_elevation <= 0.5 * math.pi,
             f"the elevations are {self.min_elevation} and {self.max_elevation} rad; the second must be greater, and "
@@ -165,9 +155,9 @@ class Reach(NumberedCandidates):
 
     def poses(self, key: PRNGKeyArray | None = None) -> Pose:
         """With a key all places are turned about `up`."""
-        index = np.arange(self.num_poses)
+        index = np.arange(self.count)
         low, high = math.sin(self.min_elevation), math.sin(self.max_elevation)
-        y = high - (high - low) * (index + 0.5) / self.num_poses
+        y = high - (high - low) * (index + 0.5) / self.count
         ring, angle = np.sqrt(1.0 - y**2), index * math.pi * (3.0 - math.sqrt(5.0))
         # The plastic number's sequence, so that directions and distances are even together (Roberts 2018).
         share = (0.5 + index / _PLASTIC**2) % 1.0

@@ -17,7 +17,7 @@ from jaxnbv.checks import check_fields, checked, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.search.base import Search, best_unvisited
-from jaxnbv.search.candidates import Candidates, NumberedCandidates, as_candidates
+from jaxnbv.search.candidates import Candidates, as_candidates
 from jaxnbv.search.pose_space import FreePoses, PoseSpace, SpherePoses
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal, Trajectories
@@ -73,7 +73,7 @@ class GradientSearch(Search):
     ):
         self.space = _pose_space(dof, space)
         self.num_starts, self.iterations, self.learning_rate = num_starts, iterations, learning_rate
-        of_space = SpaceCandidates(space=self.space, num_poses=num_candidates)
+        of_space = SpaceCandidates(self.space, num_candidates)
         self.candidates = of_space if candidates is None else as_candidates(candidates)
         self.solver, self.turned = solver, turned
 
@@ -176,21 +176,21 @@ class HybridSearch(GradientSearch):
         super().__init__(dof, space, num_starts, iterations, learning_rate, num_candidates, solver, candidates, turned)
 
 
-class SpaceCandidates(NumberedCandidates):
+class SpaceCandidates(Candidates):
     """Poses of a pose space, spread evenly over it.
 
     **Raises:** `ValueError` for a number below one.
     """
 
     space: PoseSpace
-    num_poses: int = eqx.field(static=True)
+    count: int = eqx.field(static=True, default=100)
 
     def __check_init__(self):
         check_fields(self)
-        require(self.num_poses >= 1, f"the search has {self.num_poses} candidates; it needs at least one")
+        require(self.count >= 1, f"the search has {self.count} candidates; it needs at least one")
 
     def poses(self, key: PRNGKeyArray | None = None) -> Pose:
-        return self.space.candidates(self.num_poses, key)
+        return self.space.candidates(self.count, key)
 
 
 def _pose_space(dof: int | None, space: PoseSpace | None) -> PoseSpace:
