@@ -57,14 +57,6 @@ def test_random_view_is_uniform_over_what_is_unvisited():
     assert np.sum((counts - 200.0) ** 2 / 200.0) < chi2.ppf(1 - 1e-4, df=9)
 
 
-def test_random_view_is_reproducible_and_excludes():
-    search, asked = RandomView(12), problem(CANDIDATES[[3, 8]])
-    a, b = search.propose(asked, jax.random.key(4)), search.propose(asked, jax.random.key(4))
-    np.testing.assert_array_equal(a.values, b.values)
-    assert index_of(a) == index_of(b) == np.asarray(a.values).argmax()
-    np.testing.assert_array_equal(np.flatnonzero(np.isneginf(a.values)), [3, 8])
-
-
 def slow_uncertain_length(values, position, step):
     """Walk the ray through the box and count, step by step, the samples that it has not entered yet."""
     axis, h, g = GRID.axis, GRID.spacing, GRID.resolution
@@ -107,17 +99,6 @@ def test_uncertainty_against_its_definition():
     best = np.asarray(proposal.values).argmax()
     assert index_of(proposal) == best
     assert expected[best] > expected[1:].max() - 2.25 * step
-
-
-def test_uncertainty_between_the_quantiles_of_many_samples():
-    """Forty balls of radii 0.3 ... 1.08: T > 0.05 until the ray enters the third smallest, of radius 0.34."""
-    radii = 0.3 + 0.02 * np.arange(40)
-    value = uncertain_length(problem(np.zeros((0, 3)), balls(GRID, radii)), look_at(CANDIDATES))
-    third = radii[2]
-    np.testing.assert_allclose(value, radii[-1] - third, atol=1.1 * GRID.spacing)
-    # Fewer than twenty samples never let T come to rest between 0 and 0.05: all of them count.
-    few = uncertain_length(problem(np.zeros((0, 3)), balls(GRID, [1.0, 0.2])), look_at(CANDIDATES))
-    np.testing.assert_allclose(few, 0.8, atol=1.1 * GRID.spacing)
 
 
 def test_the_threshold_of_the_transmittance_by_thin_rings_of_samples():

@@ -2,17 +2,15 @@
 
 import math
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from on_grid import balls
+from small_problem import propose, three_balls, visit
 
 import jaxnbv as nbv
 from jaxnbv.search.candidates import as_candidates, sphere_candidates
 
-BALLS = balls(nbv.Grid(16), [0.7, 0.7])
 DOME = nbv.SphereCandidates(50, 2.0, math.radians(20.0))
 
 
@@ -100,33 +98,12 @@ def test_bad_numbers_are_named(arguments, message):
         nbv.GivenPoses(nbv.look_at((0.0, 0.0, 2.0)))
 
 
-def problem(visited, surfaces=None):
-    points = jnp.asarray([[0.0, 0.0, 0.5], [0.1, 0.0, 0.5]])
-    cloud = nbv.PointCloud(points, jnp.asarray([[0.0, 0.0, 1.0]] * 2), jnp.ones(2, bool))
-    camera = nbv.Camera(height=6, width=6)
-    return nbv.Problem(nbv.Evidence(cloud, visited, jnp.asarray(1)), camera, nbv.Coverage(), surfaces).prepared()
-
-
 @pytest.mark.parametrize("kind", [nbv.DiscreteSearch, nbv.HalvingSearch, nbv.FarthestView, nbv.RandomView])
 def test_every_search_chooses_among_the_poses_it_is_given(kind):
     given = DOME.where(lambda pose: pose.position[2] < 0)
     search = kind(given)
-    asked = problem(given.poses()[jnp.asarray([0])], BALLS if search.uses_samples else None)
-    found = eqx.filter_jit(search.propose)(asked, jax.random.key(0))
+    found = propose(search, visit(three_balls(), given.poses()[0]))
     np.testing.assert_array_equal(found.candidates.position, positions(given).astype(np.float32))
     assert found.values[0] == -jnp.inf
     chosen = int(np.argmax(found.values))
     np.testing.assert_array_equal(found.pose.position, found.candidates.position[chosen])
-
-
-def test_gradient_and_hybrid_search_differ_in_their_defaults_alone():
-    plain, hybrid = nbv.GradientSearch(), nbv.HybridSearch()
-    assert (plain.ascent.num_starts, plain.ascent.iterations, plain.candidates.count) == (6, 20, 100)
-    assert (hybrid.ascent.num_starts, hybrid.ascent.iterations, hybrid.candidates.count) == (3, 6, 120)
-    assert plain.turned
-    assert not hybrid.turned
-    same = nbv.GradientSearch(None, None, 3, 6, 0.02, 120, turned=False)
-    assert jax.tree.leaves(same) == jax.tree.leaves(hybrid)
-    assert all(getattr(same, name) == getattr(hybrid, name) for name in ("ascent", "candidates", "turned"))
-    with pytest.raises(nbv.InputError, match="2 candidates for 6 starts"):
-        nbv.GradientSearch(candidates=sphere_candidates(2))

@@ -1,93 +1,61 @@
-"""The discrete search: the argmax of values recomputed pose by pose, without the views taken before."""
-
-import dataclasses
+"""Searches over candidates by their scores: discrete and halving against loops over poses, samples and rounds."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from on_grid import balls
+from small_problem import KEY, POSES, Height, propose, sample_by_sample, three_balls, visit, with_samples
 
-from jaxnbv.acquisition import expected_value
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
-from jaxnbv.scanning import Evidence, Grid
-from jaxnbv.search import DiscreteSearch, Problem, SphereCandidates
+from jaxnbv.acquisition import Several
+from jaxnbv.geometry.pose import look_at
+from jaxnbv.scanning import GridSurface
+from jaxnbv.search import (
+    DiscreteSearch,
+    FarthestView,
+    HalvingSearch,
+    RandomView,
+    TieBreakSearch,
+    UncertaintyView,
+)
 from jaxnbv.search.base import best_unvisited
 from jaxnbv.tasks import Coverage
 
-CAMERA, GRID = Camera(height=8, width=8), Grid(20)
-SEARCH = DiscreteSearch(12)
+SEARCH, PROBLEM = DiscreteSearch(12), three_balls()
 
 
-@pytest.fixture(scope="module")
-def problem():
-    rng = np.random.default_rng(0)
-    surfaces = balls(GRID, (0.8, 0.6, 0.9), rng.uniform(-0.5, 0.5, (3, 3)))
-    cloud = PointCloud.from_arrays(rng.uniform(-1, 1, (30, 3)), np.tile([0.0, 1.0, 0.0], (30, 1)), 32)
-    visited = Pose(np.tile(np.eye(3, dtype=np.float32), (4, 1, 1)), np.zeros((4, 3), np.float32))
-    return Problem(Evidence(cloud, visited, jnp.asarray(0)), CAMERA, Coverage(), surfaces).prepared()
-
-
-def visit(problem, *poses):
-    rows = jax.tree.map(lambda *leaves: jnp.stack(leaves), *poses)
-    taken = jax.tree.map(lambda all_rows, new: all_rows.at[: len(poses)].set(new), problem.evidence.poses, rows)
-    evidence = dataclasses.replace(problem.evidence, poses=taken, num_views=jnp.asarray(len(poses)))
-    return dataclasses.replace(problem, evidence=evidence)
-
-
-@eqx.filter_jit
-def search(problem, seed=0):
-    return SEARCH.propose(problem, jax.random.key(seed))
-
-
-def test_the_argmax_of_values_recomputed_one_by_one(problem):
-    proposal = search(problem)
-    value, values = eqx.filter_jit(expected_value), []
-    for position in np.asarray(fibonacci_sphere(12, 2.5)):
-        pose = look_at(position[None])
-        values.append(value(Coverage(), problem.evidence.cloud, problem.surfaces, CAMERA, pose)[0])
+def test_the_argmax_of_values_recomputed_one_by_one():
+    proposal = propose(SEARCH, PROBLEM)
+    values = [sample_by_sample(PROBLEM, poses=pose[None]).mean() for pose in POSES]
     np.testing.assert_allclose(proposal.values, values, rtol=1e-5)
     best = int(np.argmax(values))
     assert np.sort(values)[-1] > 1.01 * np.sort(values)[-2]
-    np.testing.assert_allclose(proposal.pose.position, fibonacci_sphere(12, 2.5)[best], atol=1e-6)
-    np.testing.assert_allclose(proposal.pose.rotation, look_at(proposal.pose.position).rotation, atol=1e-6)
+    jax.tree.map(np.testing.assert_array_equal, proposal.candidates, POSES)
+    jax.tree.map(np.testing.assert_array_equal, proposal.pose, POSES[best])
     assert float(proposal.value) == pytest.approx(float(values[best]), rel=1e-5)
-    np.testing.assert_allclose(proposal.candidates.position, fibonacci_sphere(12, 2.5), atol=1e-6)
 
 
-def test_visited_views_are_excluded_one_after_the_other(problem):
-    values = np.asarray(search(problem).values)
+def test_visited_views_are_excluded_one_after_the_other():
+    values = np.asarray(propose(SEARCH, PROBLEM).values)
     order, taken = np.argsort(-values), []
     for rank in range(4):
-        proposal = search(visit(problem, *taken) if taken else problem)
+        proposal = propose(SEARCH, visit(PROBLEM, *taken))
         np.testing.assert_array_equal(proposal.pose.position, proposal.candidates.position[order[rank]])
         np.testing.assert_array_equal(np.isneginf(proposal.values), np.isin(np.arange(12), order[:rank]))
         taken.append(proposal.pose)
 
 
-def test_only_the_same_place_and_direction_counts_as_visited(problem):
-    best = search(problem).pose
+def test_only_the_same_place_and_direction_counts_as_visited():
+    best = propose(SEARCH, PROBLEM).pose
     elsewhere = look_at(best.position, target=(0.0, 0.3, 0.1))
     aside = look_at(best.position + jnp.array([0.01, 0.0, 0.0]))
     turned = look_at(best.position, up=(0.0, 0.0, 1.0))
     for pose, is_visited in [(best, True), (turned, True), (elsewhere, False), (aside, False)]:
-        again = search(visit(problem, pose))
+        again = propose(SEARCH, visit(PROBLEM, pose))
         assert bool((again.pose.position != best.position).any()) == is_visited
-
-
-def test_rows_beyond_the_views_taken_hold_nothing(problem):
-    best = search(problem).pose
-    stale = eqx.tree_at(lambda p: p.evidence.num_views, visit(problem, best), jnp.asarray(0))
-    np.testing.assert_array_equal(search(stale).pose.position, best.position)
-
-
-def test_it_is_deterministic(problem):
-    a, b = search(problem), search(problem, 7)
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_array_equal(x, y)
+    # Rows beyond the views that were taken hold nothing.
+    stale = eqx.tree_at(lambda p: p.evidence.num_views, visit(PROBLEM, best), jnp.asarray(0))
+    np.testing.assert_array_equal(propose(SEARCH, stale).pose.position, best.position)
 
 
 @pytest.mark.parametrize(
@@ -101,29 +69,14 @@ def test_it_is_deterministic(problem):
         ([-np.inf] * 4, 0),
     ],
 )
-def test_values_that_rounding_may_turn_round_tie_and_the_first_is_taken(problem, values, expected):
-    poses = SphereCandidates(4).poses()
-    found = best_unvisited(problem, poses, jnp.asarray(values))
-    np.testing.assert_array_equal(found.pose.position, poses.position[expected])
+def test_values_that_rounding_may_turn_round_tie_and_the_first_is_taken(values, expected):
+    found = best_unvisited(PROBLEM, POSES[:4], jnp.asarray(values))
+    np.testing.assert_array_equal(found.pose.position, POSES.position[expected])
     assert float(found.value) == np.float32(values[expected])
 
 
-def test_standard_errors_are_those_of_the_scores_sample_by_sample(problem):
-    proposal = search(problem)
-    value, poses = eqx.filter_jit(expected_value), look_at(fibonacci_sphere(12, 2.5))
-    scores = np.array(
-        [
-            value(
-                Coverage(),
-                problem.evidence.cloud,
-                jax.tree.map(lambda leaf, s=s: leaf[s : s + 1], problem.surfaces),
-                CAMERA,
-                poses,
-            )
-            for s in range(3)
-        ],
-        np.float64,
-    )
+def test_standard_errors_are_those_of_the_scores_sample_by_sample():
+    proposal, scores = propose(SEARCH, PROBLEM), sample_by_sample(PROBLEM)
     best = scores.mean(axis=0).argmax()
     expected = scores.std(axis=0, ddof=1) / np.sqrt(3)
     np.testing.assert_allclose(proposal.standard_errors, expected, rtol=1e-4)
@@ -135,12 +88,96 @@ def test_standard_errors_are_those_of_the_scores_sample_by_sample(problem):
         np.testing.assert_array_equal(proposal.tied_with_best(errors), level)
     assert proposal.num_tied == np.sum(-differences.mean(axis=0) <= 2.0 * of_differences) - 1
     assert 0 < proposal.num_tied < 11
+    again = propose(SEARCH, visit(PROBLEM, proposal.pose))
+    assert not again.tied_with_best()[np.argmax(proposal.values)]
 
 
-def test_a_visited_view_is_tied_with_none_and_of_one_sample_nothing_is_known(problem):
-    first = search(problem)
-    again = search(visit(problem, first.pose))
-    assert not again.tied_with_best()[np.argmax(first.values)]
-    alone = eqx.tree_at(lambda p: p.surfaces, problem, jax.tree.map(lambda leaf: leaf[:1], problem.surfaces))
-    assert search(alone).num_tied is None
-    np.testing.assert_array_equal(np.isnan(search(alone).standard_errors), True)
+def test_of_one_sample_no_errors_are_known():
+    alone = propose(SEARCH, with_samples(PROBLEM, slice(0, 1)))
+    assert alone.num_tied is None
+    np.testing.assert_array_equal(np.isnan(alone.standard_errors), True)
+
+
+@pytest.mark.parametrize(("num_visited", "first"), [(0, 1), (1, 1), (0, 3)])
+def test_rounds_of_halving_recomputed(num_visited, first):
+    table, left, values, scored = sample_by_sample(PROBLEM), np.arange(12), np.zeros(12), 0
+    while scored < 3:
+        if scored:
+            left = left[np.argsort(-values[left], kind="stable")[: len(left) // 2]]
+        scored = min(max(2 * scored, first), 3)
+        values[left] = table[:scored, left].mean(axis=0)
+        values[:num_visited] = -np.inf
+    problem = visit(PROBLEM, *[POSES[i] for i in range(num_visited)])
+    proposal = propose(HalvingSearch(12, num_first_samples=first), problem)
+    best = left[np.argmax(values[left])]
+    np.testing.assert_allclose(proposal.values, values, rtol=1e-4, atol=1e-6)
+    np.testing.assert_array_equal(proposal.pose.position, POSES.position[best])
+    assert float(proposal.value) == pytest.approx(values[best], rel=1e-4)
+
+
+# The two halves of a search: what it proposes is what it picks by the scores that it asks for.
+
+SEARCHES = {
+    "discrete": SEARCH,
+    "halving": HalvingSearch(12, num_first_samples=1),
+    "tie-break": TieBreakSearch(12, second=Height()),
+    "farthest": FarthestView(12),
+    "random": RandomView(12),
+    "uncertainty": UncertaintyView(12),
+}
+ASKED = {"discrete": (Coverage(),), "halving": (Coverage(),), "tie-break": (Coverage(), Height())}
+
+
+@eqx.filter_jit
+def score(search, problem):
+    return search.score(problem, POSES)
+
+
+@eqx.filter_jit
+def pick(search, problem, scores):
+    return search.pick(problem, POSES, scores, KEY)
+
+
+@pytest.fixture(scope="module", params=[(), (3, 8)])
+def asked(request):
+    """The problem, before any view and after some."""
+    return visit(PROBLEM, *[POSES[index] for index in request.param])
+
+
+def assert_same(found, expected):
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    jax.tree.map(np.testing.assert_array_equal, found.pose, expected.pose)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", SEARCHES)
+def test_what_is_picked_by_the_scores_is_what_is_proposed(name, asked):
+    search = SEARCHES[name]
+    assert_same(pick(search, asked, score(search, asked)), propose(search, asked))
+
+
+@pytest.mark.parametrize("name", SEARCHES)
+def test_scores_are_those_of_each_sample_by_each_acquisition_that_is_asked(name):
+    found, acquisitions = score(SEARCHES[name], PROBLEM), ASKED.get(name, ())
+    assert SEARCHES[name].asks(Coverage()) == acquisitions
+    assert found.shape == ((len(acquisitions), 3, 12) if acquisitions else (0, 0, 12))
+    for scores, acquisition in zip(found, acquisitions, strict=True):
+        np.testing.assert_allclose(scores, sample_by_sample(PROBLEM, acquisition), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", [name for name, search in SEARCHES.items() if search.uses_samples])
+def test_without_samples_it_says_so(name):
+    bare = eqx.tree_at(lambda p: p.surfaces, PROBLEM, None, is_leaf=lambda leaf: isinstance(leaf, GridSurface))
+    with pytest.raises(ValueError, match="uses_samples"):
+        SEARCHES[name].propose(bare, KEY)
+
+
+def test_searches_share_the_scores_of_a_study(asked):
+    """Those of both acquisitions, asked once, serve every search that asks for one or both."""
+    both = eqx.filter_jit(lambda problem: problem.about(Several((Coverage(), Height()))).scores(POSES))(asked)
+    for name, rows in {"discrete": [0], "halving": [0], "tie-break": [0, 1]}.items():
+        assert_same(pick(SEARCHES[name], asked, both[jnp.asarray(rows)]), propose(SEARCHES[name], asked))
+    by_height = propose(SEARCH, eqx.filter_jit(lambda problem: problem.about(Height()))(asked))
+    assert_same(pick(SEARCH, asked, both[1:]), by_height)
+    assert (by_height.pose.position != propose(SEARCH, asked).pose.position).any()

@@ -1,6 +1,5 @@
 """Gradient searches within a planner: compilation, episodes on disk, scores that have no gradient."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +20,7 @@ from jaxnbv.search import ConstrainedPoses, DiscreteSearch, FreePoses, GradientS
 from jaxnbv.storage import EpisodeFolder, describe
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage, HostClassifier
-from jaxnbv.tasks.classification import CrossEntropy, MixedEntropy, NegativeEntropy
+from jaxnbv.tasks.classification import CrossEntropy
 
 ELSEWHERE, KEY = look_at((-0.8, 0.9, 2.2)), jax.random.key(0)
 OTHER_KEY = jax.random.key(1)
@@ -79,15 +78,8 @@ def sgd(rate):
         (GradientSearch(dof=2), GradientSearch(dof=6)),
         (GradientSearch(dof=2), HybridSearch(dof=2)),
         (GradientSearch(dof=6), GradientSearch(space=FreePoses(radius=2.4))),
-        (GradientSearch(space=ConstrainedPoses()), GradientSearch(space=ConstrainedPoses(nearest=2.1))),
-        (GradientSearch(), GradientSearch(learning_rate=0.02)),
-        (GradientSearch(), GradientSearch(iterations=21)),
         (GradientSearch(), GradientSearch(num_candidates=61)),
         (GradientSearch(), GradientSearch(solver=optx.BFGS(rtol=1e-4, atol=1e-4))),
-        (
-            GradientSearch(solver=optx.BFGS(rtol=1e-3, atol=1e-4)),
-            GradientSearch(solver=optx.BFGS(rtol=1e-4, atol=1e-4)),
-        ),
         (GradientSearch(solver=sgd(0.1)), GradientSearch(solver=sgd(0.2))),
     ],
 )
@@ -112,21 +104,14 @@ def called_back_with_normals(cloud):
 HOST = HostClassifier(on_host, 2)
 
 
-@pytest.mark.parametrize("kind", [GradientSearch, HybridSearch])
 @pytest.mark.parametrize(
     "score",
-    [
-        CrossEntropy(HOST),
-        MixedEntropy(HOST),
-        ExpectedUtilityImprovement(NegativeEntropy(HOST)),
-        ExpectedUtilityImprovement(called_back),
-        ExpectedUtilityImprovement(called_back_with_normals),
-    ],
-    ids=["cross-entropy", "mixed", "entropy", "of points", "of normals"],
+    [CrossEntropy(HOST), ExpectedUtilityImprovement(called_back), ExpectedUtilityImprovement(called_back_with_normals)],
+    ids=["cross-entropy", "of points", "of normals"],
 )
-def test_a_score_without_gradient_is_refused_at_once(kind, score):
+def test_a_score_without_gradient_is_refused_at_once(score):
     with pytest.raises(ValueError, match=rf"{type(score).__name__} cannot be differentiated.*DiscreteSearch"):
-        planner_of(kind(), score)
+        planner_of(GradientSearch(), score)
     planner_of(DiscreteSearch(), score)
 
 
@@ -149,23 +134,3 @@ def test_a_derivative_that_is_not_a_number_is_reported(space):
     evidence = planner.init(FIRST, scan(SCENE, planner.camera, FIRST))
     with pytest.raises(ValueError, match=r"not a number.*derivatives"):
         planner.propose(evidence, KEY)
-
-
-class Side(eqx.Module):
-    """Says on which side of x = 0 the points are, the more surely the farther they are on average."""
-
-    def __call__(self, cloud):
-        mean = jnp.sum(jnp.where(cloud.mask, cloud.points[:, 0], 0.0)) / jnp.maximum(cloud.count, 1)
-        return jax.nn.log_softmax(jnp.stack([3.0 * mean, jnp.zeros(())]))
-
-
-@pytest.mark.slow
-def test_cross_entropy_within_constraints_ends_on_the_object():
-    search = GradientSearch(space=ConstrainedPoses(), num_starts=3, iterations=10, num_candidates=8, learning_rate=0.05)
-    planner = planner_of(search, CrossEntropy(Side(), num_points=64))
-    evidence = planner.init(FIRST, scan(SCENE, planner.camera, FIRST))
-    proposal = planner.propose(evidence, KEY)
-    ways = proposal.trajectories
-    assert float(proposal.value) == max(float(ways.values.max()), float(proposal.values.max()))
-    assert float(ways.values.max()) > float(ways.values[:, 0].max())
-    assert int(scan(SCENE, planner.camera, proposal.pose).count) > 0

@@ -74,9 +74,3 @@ def test_an_arm_s_places_are_even_in_its_volume():
 def test_places_that_cannot_be_are_named(make, message):
     with pytest.raises(nbv.InputError, match=message):
         make()
-
-
-def test_a_search_chooses_among_them():
-    assert nbv.DiscreteSearch(nbv.Turntable(12)).candidates.count == 12
-    allowed = nbv.Reach(60).where(lambda pose: pose.position[0] > 0)
-    assert 20 < allowed.count < 40

@@ -117,24 +117,6 @@ def test_degrees_of_freedom(name, x64):
             assert values[freedoms:].max(initial=0.0) < 1e-12
 
 
-@pytest.mark.parametrize("name", SPACES)
-def test_forward_and_reverse_mode_agree(name):
-    start, parameters = starts_of(name, 1)[0], real(0.5 * RNG.normal(size=SPACES[name].num_parameters))
-    forward = JACOBIAN[name](start, parameters)
-    reverse = jax.jit(jax.jacrev(SPACES[name].retract, argnums=1))(start, parameters)
-    np.testing.assert_allclose(forward.rotation, reverse.rotation, atol=1e-5)
-    np.testing.assert_allclose(forward.position, reverse.position, atol=1e-5)
-
-
-def test_sphere_keeps_its_radius_and_looks_at_the_origin():
-    start = LOOK_AT(real(RNG.uniform(0.5, 4.0, (MANY, 1)) * units(MANY)))
-    for size in (0.1, 1.0, 1e6):
-        end = RETRACT_MANY["sphere"](start, real(size * RNG.normal(size=(MANY, 3))))
-        np.testing.assert_allclose(np.linalg.norm(end.position, axis=1), 2.5, rtol=1e-6)
-        assert_rotation(end.rotation)
-        assert angle_to_origin(end).max() < 1e-5
-
-
 def test_sphere_reaches_every_direction_and_does_not_roll():
     start, wanted = starts_inside(MANY, 2.5), units(MANY)
     before = np.asarray(start.position, np.float64) / 2.5
@@ -241,14 +223,9 @@ def test_roll_turns_the_image_about_the_axis():
     ("build", "message"),
     [
         (lambda: SpherePoses(0.0), "radius is 0.0; it must be positive"),
-        (lambda: SpherePoses(math.inf), "radius is inf"),
-        (lambda: FreePoses(-1.0), "radius is -1.0; it must be positive"),
         (lambda: FreePoses(math.nan), "radius is nan"),
         (lambda: ConstrainedPoses(2.0, 2.0), "from 2.0 to 2.0"),
-        (lambda: ConstrainedPoses(3.0, 2.0), "from 3.0 to 2.0"),
         (lambda: ConstrainedPoses(0.0, 2.0), "from 0.0 to 2.0"),
-        (lambda: ConstrainedPoses(2.0, math.inf), "farthest is inf"),
-        (lambda: ConstrainedPoses(off_axis=0.0), "off_axis is 0.0 rad"),
         (lambda: ConstrainedPoses(off_axis=0.5 * math.pi), "off_axis is 1.57"),
     ],
 )

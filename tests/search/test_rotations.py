@@ -55,11 +55,6 @@ def test_rotations_come_back():
     np.testing.assert_allclose(FROM_6D(columns), rotations, atol=5e-7)
 
 
-def test_rotations_come_back_in_double_precision(x64):
-    rotations = Rotation.random(500, random_state=2).as_matrix()
-    np.testing.assert_allclose(rotation_from_6d(rotation_to_6d(rotations)), rotations, atol=1e-15)
-
-
 def test_batches_of_any_rank_equal_single_ones():
     columns = RNG.normal(size=(2, 5, 6)).astype(np.float32)
     together = rotation_from_6d(columns)
@@ -78,14 +73,6 @@ def test_random_columns_against_gram_schmidt_in_double_precision():
     # The rounding of two unit vectors turns what is left of the second by itself over the sine between them.
     assert (np.abs(got - gram_schmidt(columns)).max(axis=(1, 2)) * sine).max() < 1e-6
     assert_rotations(got, 2e-6)
-
-
-def test_nearly_parallel_columns_still_follow_gram_schmidt():
-    """At 1e-3 rad float32 knows the second axis to 1e-4."""
-    a = RNG.normal(size=(500, 3)).astype(np.float32)
-    columns = np.concatenate([a, a + 1e-3 * RNG.normal(size=a.shape)], axis=1).astype(np.float32)
-    assert np.abs(np.asarray(FROM_6D(columns)) - gram_schmidt(columns)).max(axis=(1, 2)).mean() < 2e-3
-    assert_rotations(FROM_6D(columns))
 
 
 @settings(max_examples=400, deadline=None, derandomize=True)
@@ -111,18 +98,6 @@ def test_parallel_pairs_give_rotations(double):
         a = np.concatenate([units(4000), [[1, 1, 0], [1, 1, 1], [0, 1, 1], [1, 2, 2]]])
         for b in (a, -3 * a, a * (1 + 4 * np.finfo(dtype).eps * RNG.normal(size=a.shape))):
             assert_rotations(rotation_from_6d(np.concatenate([a, b], axis=1).astype(dtype)))
-
-
-def test_lengths_do_not_matter():
-    columns = RNG.normal(size=(300, 6)).astype(np.float32)
-    expected = np.asarray(FROM_6D(columns))
-    for longer, other in ((2.0**40, 1.0), (2.0**-40, 1.0), (1.0, 2.0**40), (1.0, 2.0**-40)):
-        scales = np.float32([longer] * 3 + [other] * 3)
-        np.testing.assert_allclose(FROM_6D(columns * scales), expected, atol=2e-5)
-    # So the derivative along either vector is zero.
-    jacobian = np.asarray(jax.vmap(jax.jacfwd(rotation_from_6d))(jnp.asarray(columns)))
-    length = np.linalg.norm(columns, axis=1) + 1
-    assert (np.abs(np.einsum("nijk,nk->nij", jacobian[..., :3], columns[:, :3])).max(axis=(1, 2)) / length).max() < 1e-3
 
 
 def test_derivatives_of_the_map_against_central_differences(x64):

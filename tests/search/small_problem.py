@@ -1,0 +1,88 @@
+"""One step's question, small: three balls as samples, a few points seen, twelve candidates; and its scores by loops."""
+
+import dataclasses
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from on_grid import balls
+
+from jaxnbv.acquisition import Acquisition, expected_value
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.scanning import Evidence, Grid
+from jaxnbv.search import Problem, SphereCandidates
+from jaxnbv.tasks import Coverage
+
+CAMERA, POSES, KEY = Camera(height=8, width=8), SphereCandidates(12).poses(), jax.random.key(5)
+
+
+def problem_of(surfaces, acquisition=Coverage(), camera=CAMERA):  # noqa: B008
+    """Room for six views, none of them taken."""
+    rng = np.random.default_rng(0)
+    cloud = PointCloud.from_arrays(rng.uniform(-1, 1, (30, 3)), np.tile([0.0, 1.0, 0.0], (30, 1)), 32)
+    dtype = jnp.result_type(float)
+    views = Pose(np.tile(np.eye(3, dtype=dtype), (6, 1, 1)), np.zeros((6, 3), dtype))
+    return Problem(Evidence(cloud, views, jnp.asarray(0)), camera, acquisition, surfaces).prepared()
+
+
+@functools.cache
+def three_balls():
+    rng = np.random.default_rng(0)
+    return problem_of(balls(Grid(20), (0.8, 0.6, 0.9), rng.uniform(-0.5, 0.5, (3, 3))))
+
+
+def visit(problem, *poses):
+    """The same after views from these poses, and no others."""
+    if not poses:
+        return problem
+    rows = jax.tree.map(lambda *leaves: jnp.stack(leaves), *poses)
+    taken = jax.tree.map(lambda all_rows, new: all_rows.at[: len(poses)].set(new), problem.evidence.poses, rows)
+    evidence = dataclasses.replace(problem.evidence, poses=taken, num_views=jnp.asarray(len(poses)))
+    return dataclasses.replace(problem, evidence=evidence)
+
+
+@eqx.filter_jit
+def propose(search, problem, key=KEY):
+    return search.propose(problem, key)
+
+
+def with_samples(problem, rows):
+    return eqx.tree_at(lambda p: p.surfaces, problem, jax.tree.map(lambda leaf: leaf[rows], problem.surfaces))
+
+
+def sample_by_sample(problem, acquisition=Coverage(), poses=POSES):  # noqa: B008
+    """Scores (samples, candidates), each sample by itself."""
+    value = eqx.filter_jit(expected_value)
+    of = [
+        value(acquisition, problem.evidence.cloud, with_samples(problem, slice(s, s + 1)).surfaces, CAMERA, poses)
+        for s in range(problem.num_samples)
+    ]
+    return np.array(of, np.float64)
+
+
+class Height(Acquisition):
+    """How high the middle of what a scan shows is, times a factor."""
+
+    factor: float = 1.0
+
+    def context(self, cloud):
+        return None
+
+    def __call__(self, context, scan):
+        return self.factor * jnp.sum(jnp.where(scan.mask, scan.points[:, 1], 0.0)) / jnp.maximum(scan.count, 1)
+
+
+class Constant(Acquisition):
+    """All scans are worth the same."""
+
+    value: float
+
+    def context(self, cloud):
+        return None
+
+    def __call__(self, context, scan):
+        return jnp.asarray(self.value)
