@@ -10,7 +10,6 @@ import sys
 import tempfile
 import traceback
 import warnings
-import zipfile
 from pathlib import Path
 
 import jax
@@ -165,16 +164,6 @@ def cut(name, share, text=None):
     lines = content.splitlines(keepends=True)
     (FOLDER / name).write_bytes(b"".join(lines[: int(share * len(lines))]))
     return nbv.load_mesh(FOLDER / name)
-
-
-def zipped():
-    with (
-        zipfile.ZipFile(FOLDER / "bomb.zip", "w", zipfile.ZIP_DEFLATED) as archive,
-        archive.open("bomb.obj", "w") as file,
-    ):
-        for _ in range(600):
-            file.write(bytes(2**20))
-    return nbv.load_mesh(FOLDER / "bomb.zip")
 
 
 def records(name):
@@ -367,7 +356,6 @@ REFUSED = {
     "a PLY that ends early": (lambda: cut("early.ply", 0.6), "its header declares"),
     "an OFF that ends early": (lambda: cut("early.off", 0.6), "its header declares"),
     "a face of ten million": (lambda: cut("boast.off", 1.0, BOAST), "of the 10000000 faces"),
-    "an archive of half a gigabyte": (zipped, "unpacks to"),
     "a negative cost": (lambda: costing(lambda a, b: -jnp.sum(b.position**2)), "zero or more"),
     "an infinite cost": (lambda: costing(lambda a, b: jnp.inf * jnp.sum(b.position**2)), "zero or more"),
     "a cost that is no number": (lambda: costing(lambda a, b: jnp.nan * b.position[0]), "zero or more"),

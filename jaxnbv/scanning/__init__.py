@@ -16,9 +16,9 @@ from jaxnbv.scanning.grid import nothing_imagined as nothing_imagined
 from jaxnbv.scanning.grid import scan_samples as scan_samples
 from jaxnbv.scanning.mesh import TriangleMesh as TriangleMesh
 from jaxnbv.scanning.mesh import mesh_from_sdf as mesh_from_sdf
+from jaxnbv.scanning.mesh_files import MeshParts as MeshParts
 from jaxnbv.scanning.mesh_files import load_mesh as load_mesh
-from jaxnbv.scanning.mesh_parts import MeshParts as MeshParts
-from jaxnbv.scanning.mesh_parts import load_parts as load_parts
+from jaxnbv.scanning.mesh_files import load_parts as load_parts
 from jaxnbv.scanning.scanner import SensorNoise as SensorNoise
 from jaxnbv.scanning.scanner import scan as scan
 from jaxnbv.scanning.sphere_tracing import SDFSurface as SDFSurface

@@ -1,20 +1,22 @@
-"""Meshes from files of any format that trimesh reads; what is missing, damaged or cut short is named."""
+"""Meshes, and their parts, from files of any format that trimesh reads."""
 
 import os
 import re
-import struct
-import zipfile
 from pathlib import Path
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import trimesh
+from jaxtyping import Array, Float
 
 from jaxnbv.checks import InputError, checked, require, shown
+from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.mesh import TriangleMesh
+from jaxnbv.scanning.triangles import distance_to_triangles
 
-# In bytes: what a header of PLY or OFF is shorter than, and what an archive may unpack to.
-_HEADER, _LARGEST = 2**16, 2**29
-_AGAIN = "fetch or export it again"
+# Of a PLY or OFF file: bytes that its header is shorter than.
+_HEADER = 2**16
 
 
 @checked
@@ -26,6 +28,41 @@ def load_mesh(path: str | Path, up: str = "y") -> TriangleMesh:
     **Raises:** `ValueError` if the file is missing or cannot be read, and as `TriangleMesh.from_arrays` does.
     """
     return joined_nodes(path, [mesh for _, mesh in read_nodes(path)], up)
+
+
+class MeshParts(eqx.Module):
+    """A mesh whose file has a node for each part.
+
+    - `mesh`: the whole.
+    - `parts`: the triangles of each, in the scene coordinates of the whole; `names`: those of the nodes.
+    """
+
+    mesh: TriangleMesh
+    parts: tuple[TriangleMesh, ...]
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def distances(self, grid: Grid) -> Float[Array, "parts g g g"]:
+        """From the grid's nodes to the surface of each part, in scene units."""
+        nodes = np.stack(np.meshgrid(*[grid.axis] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        found = [distance_to_triangles(nodes, part.vertices, part.faces) for part in self.parts]
+        shape = len(self.parts), *(grid.resolution,) * 3
+        return jnp.asarray(np.stack(found).reshape(shape), jnp.result_type(float))
+
+
+def load_parts(path: str | Path, up: str = "y") -> MeshParts:
+    """The mesh in a file and its parts, one for each node that has a face of positive area, in the order of names.
+
+    - `up`: the file's axis that is upward, see `Frame`.
+
+    **Raises:** `ValueError` as `load_mesh` does, or if there is one part alone.
+    """
+    nodes = read_nodes(path)
+    mesh = joined_nodes(path, [node for _, node in nodes], up)
+    solid = [(name, node, node.faces[node.area_faces > 0]) for name, node in sorted(nodes, key=lambda node: node[0])]
+    whole = [(name, node, faces) for name, node, faces in solid if len(faces)]
+    require(len(whole) > 1, f"{path} has one node: a file has parts if each of them is a node")
+    parts = tuple(TriangleMesh(mesh.frame.to_scene(node.vertices), faces, mesh.frame) for _, node, faces in whole)
+    return MeshParts(mesh, parts, tuple(name for name, *_ in whole))
 
 
 def joined_nodes(path: str | Path, meshes: list[trimesh.Trimesh], up: str) -> TriangleMesh:
@@ -50,20 +87,19 @@ def read_nodes(path: str | Path) -> list[tuple[str, trimesh.Trimesh]]:
     path = Path(path)
     require(os.path.isfile(path), f"no mesh file at {shown(str(path))}: check the path")
     try:
-        if zipfile.is_zipfile(path):
-            size = sum(member.file_size for member in zipfile.ZipFile(path).infolist())
-            require(size <= _LARGEST, f"{path} unpacks to {size} bytes: unpack it, and give the mesh")
         parts = trimesh.load_scene(path, path.suffix[1:].lower(), process=False).dump()
-    except InputError:
-        raise
     except Exception as error:  # Each of trimesh's readers fails in its own way.
-        problem = f"cannot read {path} as a mesh ({type(error).__name__}: {error})"
-        raise InputError(f"{problem}: {_why_unread(path)}") from error
+        formats = ", ".join(sorted(trimesh.available_formats()))
+        raise InputError(
+            f"cannot read {path} as a mesh ({type(error).__name__}: {error}): it is damaged, or none of {formats}, "
+            "some of which need a package of their own"
+        ) from error
     meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-    require(len(meshes) > 0, f"{path} has no faces: {_why_empty(path)}")
+    require(len(meshes) > 0, f"{path} has no faces: it is a point cloud, empty, or an STL that was cut short")
     found = sum(len(mesh.vertices) for mesh in meshes), sum(len(mesh.faces) for mesh in meshes)
     for what, count, declared in zip(("vertices", "faces"), found, _declared(path), strict=True):
-        require(count >= declared, f"{path} has {count} of the {declared} {what} that its header declares: {_AGAIN}")
+        message = f"{path} has {count} of the {declared} {what} that its header declares: fetch it again"
+        require(count >= declared, message)
     return [(str(mesh.metadata.get("node", index)), mesh) for index, mesh in enumerate(meshes)]
 
 
@@ -80,22 +116,3 @@ def _declared(path: Path) -> tuple[int, int]:
     else:
         counts = []
     return (counts[0], counts[1]) if len(counts) == 2 else (0, 0)
-
-
-def _why_unread(path: Path) -> str:
-    if path.open("rb").read(3) == b"\xef\xbb\xbf":
-        return "it begins with a byte-order mark; save it as UTF-8 without one"
-    formats = sorted(trimesh.available_formats())
-    if path.suffix.lower().removeprefix(".") in formats:
-        return "it is damaged, or not what its name says; export it again"
-    return f"it must be one of {', '.join(formats)}, some of which need a package of their own"
-
-
-def _why_empty(path: Path) -> str:
-    """A binary STL that is cut short reads as an empty one."""
-    if path.suffix.lower() == ".stl":
-        head, length = path.open("rb").read(84), path.stat().st_size
-        count = struct.unpack("<I", head[80:84])[0] if len(head) == 84 else 0
-        if not head.startswith(b"solid") and length != 84 + 50 * count:
-            return f"it has {length} bytes where a binary STL of {count} faces has {84 + 50 * count}; fetch it again"
-    return "a point cloud or an empty file cannot be scanned"
