@@ -242,7 +242,8 @@ def _judge(
 
 def _inside(scene: Surface, grid: Grid) -> Bool[Array, "g g g"]:
     if isinstance(scene, TriangleMesh):
-        return scene.to_signed_distance(grid) < 0
+        nodes = np.stack(np.meshgrid(*[grid.axis] * 3, indexing="ij"), axis=-1)
+        return jnp.asarray(scene.contains(nodes.reshape(-1, 3)).reshape(nodes.shape[:3]))
     if isinstance(scene, SDFSurface):
         return _over_nodes(scene.sdf, grid) < 0
     raise InputError(f"the inside of a {type(scene).__name__} is not known: give an SDFSurface or a TriangleMesh")

@@ -10,16 +10,16 @@ import numpy as np
 import trimesh
 from embreex.mesh_construction import TriangleMesh as EmbreeTriangles
 from embreex.rtcore_scene import EmbreeScene
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, check_type, checked, is_traced, require
 from jaxnbv.errors import optional
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
-from jaxnbv.scanning.grid import Grid, GridSurface
+from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.scanning.surface import Hits, Surface
-from jaxnbv.scanning.triangles import distance_to_triangles, winding_number
+from jaxnbv.scanning.triangles import winding_number
 
 
 class _Tree:
@@ -113,7 +113,7 @@ class TriangleMesh(Surface):
         require(
             not is_traced(self, origins, directions),
             "a TriangleMesh is scanned by host code and cannot be traced by JAX: scan it outside jit, vmap and grad, "
-            "or trace mesh.to_grid_surface(Grid()) instead, which runs inside",
+            "or trace SDFSurface(sdf.solid_of_mesh(mesh.vertices, mesh.faces)) instead, which runs inside",
         )
         origins, directions = (np.asarray(a, dtype=np.float64) for a in (origins, directions))
         scene = self._tree.of(self.vertices, self.faces)
@@ -174,32 +174,6 @@ class TriangleMesh(Surface):
         mesh that is wound inside out has an inside too. An open sheet encloses nothing."""
         points = np.asarray(points, dtype=np.float64)
         return np.abs(winding_number(points, self.vertices, self.faces)) > 0.5
-
-    def to_signed_distance(self, grid: Grid) -> Float[Array, "g g g"]:
-        """Distance to the mesh at the grid's nodes, negative inside.
-
-        Inside is where the winding number is above 1/2, which forgives small holes. An open
-        sheet encloses nothing, and a mesh wound inside out has its inside nowhere: their distances are all positive.
-        """
-        axis = grid.axis
-        nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-        distance = distance_to_triangles(nodes, self.vertices, self.faces)
-        signed = np.where(winding_number(nodes, self.vertices, self.faces) > 0.5, -distance, distance)
-        return jnp.asarray(signed.reshape((grid.resolution,) * 3), jnp.result_type(float))
-
-    def to_grid_surface(self, grid: Grid) -> GridSurface:
-        """The mesh as the zero set of its signed distance on a grid: it rounds off what is finer than the grid, and
-        can be traced inside `jit`.
-
-        **Raises:** `ValueError` if the mesh encloses no node of the grid, such as an open sheet.
-        """
-        distance = self.to_signed_distance(grid)
-        require(
-            bool((distance < 0).any()),
-            "the mesh encloses nothing that the grid can hold: close it, orient its faces outward, refine the grid, "
-            "or scan the mesh itself",
-        )
-        return GridSurface.from_values(distance, 0.0, grid)
 
     def to_trimesh(self) -> trimesh.Trimesh:
         """The mesh in scene coordinates as trimesh's own, to show, measure or export."""

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from on_grid import nodes
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
@@ -113,7 +112,7 @@ def test_tracing_under_jit_names_the_remedy():
     mesh = TriangleMesh.from_arrays(SHAPES["box"].vertices, SHAPES["box"].faces)
     o, d = (jnp.asarray(a, dtype=jnp.result_type(float)) for a in some_rays(3))
     for call in (lambda: jax.jit(lambda o, d: mesh.trace(o, d))(o, d), lambda: jax.jit(lambda m: m.trace(o, d))(mesh)):
-        with pytest.raises(ValueError, match="to_grid_surface"):
+        with pytest.raises(ValueError, match="solid_of_mesh"):
             call()
 
 
@@ -195,23 +194,6 @@ def test_samples_lie_on_the_surface_and_are_even_by_area():
     assert (np.abs(on.mean(axis=0) - share) < 5 * np.sqrt(share * (1 - share) / 20_000)).all()
     np.testing.assert_array_equal(points, mesh.sample_points(jax.random.key(0), 20_000))
     assert (points != mesh.sample_points(jax.random.key(1), 20_000)).any()
-
-
-def test_signed_distance_of_a_sphere_mesh():
-    sphere = trimesh.creation.icosphere(4)
-    grid = Grid(24, 1.75)
-    mesh = TriangleMesh.from_arrays(sphere.vertices, sphere.faces)
-    # An icosphere of 5,120 faces lies within 0.25 % of its sphere.
-    expected = np.linalg.norm(nodes(grid.axis), axis=-1) - 1.25
-    np.testing.assert_allclose(mesh.to_signed_distance(grid), expected, atol=4e-3)
-    cloud = scan(mesh.to_grid_surface(Grid(60)), Camera(), look_at([0.0, 1.0, 2.3]))
-    np.testing.assert_allclose(np.linalg.norm(cloud.points[cloud.mask], axis=1), 1.25, atol=5e-3)
-
-
-def test_an_open_sheet_has_no_grid_surface():
-    sheet = TriangleMesh.from_arrays(TRIANGLE, [[0, 1, 2]])
-    with pytest.raises(ValueError, match="encloses nothing"):
-        sheet.to_grid_surface(Grid(12))
 
 
 def test_mesh_of_a_solid():
