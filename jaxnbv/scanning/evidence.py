@@ -80,15 +80,6 @@ class Evidence(eqx.Module):
         nodes = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
         return EmptyPoints(nodes, self.seen_empty[::stride, ::stride, ::stride].reshape(-1))
 
-    def is_seen_empty(self, points: Float[Array, "n 3"]) -> Bool[Array, " n"]:
-        """Whether the node nearest to each point was seen empty; of points beyond the grid, always."""
-        if self.seen_empty is None or self.grid is None:
-            return jnp.ones(points.shape[:-1], bool)
-        place = (points + self.grid.half_extent) / self.grid.spacing
-        node = jnp.clip(jnp.round(place), 0, self.grid.resolution - 1).astype(jnp.int32)
-        beyond = jnp.any(jnp.abs(points) > self.grid.half_extent, axis=-1)
-        return beyond | self.seen_empty[tuple(jnp.moveaxis(node, -1, 0))]
-
     def with_visited(self, poses: Sequence[Pose]) -> "Evidence":
         """The same, with these poses taken for visited too. It has room for twice as many, so that its shapes do not
         depend on how many they are."""

@@ -45,7 +45,6 @@ class Surroundings(eqx.Module):
     - `obstacles`: solids of `jaxnbv.scanning.sdf`: a table is a `HalfSpace`, a mesh is made one by `solid_of_mesh`.
     - `margin`: points nearer than this to an obstacle are taken for its own.
     - `clearance`: no camera comes nearer than this to an obstacle, nor to a point that was seen.
-    - `seen_only`: no camera stands where space was not seen to be empty, as far as the planner's grid reaches.
 
     **Raises:** `ValueError` for obstacles that are not solids, or a negative length.
     """
@@ -53,7 +52,6 @@ class Surroundings(eqx.Module):
     obstacles: tuple[SignedDistance, ...] = ()
     margin: float = eqx.field(static=True, default=0.03)
     clearance: float = eqx.field(static=True, default=0.1)
-    seen_only: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
         check_fields(self)
@@ -67,7 +65,7 @@ class Surroundings(eqx.Module):
     def in_scene(self, frame: Frame) -> "Surroundings":
         """From world units to those of the scene."""
         solids = tuple(_in_scene(obstacle, frame) for obstacle in self.obstacles)
-        return Surroundings(solids, frame.scale * self.margin, frame.scale * self.clearance, self.seen_only)
+        return Surroundings(solids, frame.scale * self.margin, frame.scale * self.clearance)
 
     def distance(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         """Signed distance to the nearest obstacle, infinite where there is none."""
@@ -99,8 +97,7 @@ class Surroundings(eqx.Module):
 
     def is_closed(self, poses: Pose, evidence: Evidence) -> Bool[Array, " poses"]:
         """Whether a camera may not stand at each of a batch of poses, given what was seen."""
-        closed = self.violation(poses, evidence.cloud) > 0
-        return closed | ~evidence.is_seen_empty(poses.position) if self.seen_only else closed
+        return self.violation(poses, evidence.cloud) > 0
 
     def violation(self, poses: Pose, cloud: PointCloud) -> Float[Array, " poses"]:
         """By how much each of a batch of cameras is too near to an obstacle or to D, in scene units; zero where it is

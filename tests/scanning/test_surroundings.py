@@ -183,16 +183,6 @@ def test_no_camera_stands_too_near_to_what_was_seen(search):
     assert 0 < (distance < 0.5).sum() < 20
 
 
-def test_on_request_cameras_stand_in_space_that_was_seen_empty_alone():
-    first = look_at((0.0, 0.0, 2.4))
-    ahead, aside, beyond = [0.0, 0.0, 1.15], [1.6, 0.0, 0.0], [2.4, 0.0, 0.0]
-    search = FarthestView(GivenPoses(look_at(np.array([ahead, aside, beyond]))))
-    for seen_only, expected in ((False, [False, False, False]), (True, [False, True, False])):
-        own = planner_of(search, Surroundings(seen_only=seen_only))
-        evidence = own.init(first, scan(BALL, own.camera, first))
-        np.testing.assert_array_equal(np.isneginf(np.asarray(own.propose(evidence, KEY).values)), expected)
-
-
 @pytest.mark.slow
 def test_a_search_by_gradient_stays_out_of_obstacles():
     """Its starts are all too low; free, ascent stays there."""
