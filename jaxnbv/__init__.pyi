@@ -56,7 +56,6 @@ from .scanning import metrics as metrics
 from .scanning import scan as scan
 from .scanning import scan_samples as scan_samples
 from .scanning import sdf as sdf
-from .scanning import support_plane as support_plane
 from .scanning.screened_poisson import screened_poisson as screened_poisson
 from .search import Candidates as Candidates
 from .search import ConstrainedPoses as ConstrainedPoses

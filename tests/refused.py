@@ -376,8 +376,6 @@ REFUSED = {
         lambda: nbv.Camera.from_intrinsics(np.linalg.inv([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]]), 480, 640),
         "intrinsic matrix",
     ),
-    "a table of one point": (lambda: nbv.support_plane(np.ones((50, 3)), (0, 0, 1), 0.01), "on one line"),
-    "too thin a table": (lambda: nbv.support_plane(D, (0, 0, 1), 1e-30), "larger tolerance"),
     "a volume of no numbers": (
         lambda: dataclasses.replace(P, imagination=NEVER).init(POSE, SCAN),
         "outside the volume",

@@ -27,4 +27,3 @@ from jaxnbv.scanning.surface import Hits as Hits
 from jaxnbv.scanning.surface import Surface as Surface
 from jaxnbv.scanning.surroundings import Surroundings as Surroundings
 from jaxnbv.scanning.surroundings import plane_under as plane_under
-from jaxnbv.scanning.surroundings import support_plane as support_plane

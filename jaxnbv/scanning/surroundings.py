@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnbv.checks import AnyArray, InputError, as_numbers, check_fields, check_type, checked, require, shown
+from jaxnbv.checks import AnyArray, check_fields, check_type, require, shown
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
@@ -109,42 +109,6 @@ class Surroundings(eqx.Module):
 def _in_scene(solid: SignedDistance, frame: Frame) -> SignedDistance:
     moved = solid.translate(-np.asarray(frame.center))
     return Rotated(moved, frame.rotation).scale(frame.scale)
-
-
-@checked
-def support_plane(
-    points: Float[AnyArray, "n 3"], up: Float[AnyArray, "3"] | tuple | list, tolerance: float
-) -> HalfSpace:
-    """The table under an object: the plane that most points lie on, by RANSAC, and all below it.
-
-    - `points`: as scanned, table and all, in any units; `up`: a direction that is upward, to 30 degrees.
-    - `tolerance`: how far from the plane its points may be, in the units of the points.
-
-    **Raises:** `ValueError` for fewer than three points, one that is not finite, a tolerance that is not positive, or
-    where the plane of most points is not level.
-    """
-    points = as_numbers(points, "the points", np.float64)
-    require(
-        points.ndim == 2 and points.shape[1:] == (3,) and len(points) >= 3,
-        f"the points are {shown(points)}; give (n, 3), three at least",
-    )
-    require(bool(np.isfinite(points).all()), "the points are not all finite: drop those that are not")
-    require(tolerance > 0, f"the tolerance is {tolerance}; it must be positive")
-    upward = as_numbers(up, "up", np.float64)
-    require(upward.shape == (3,) and bool(np.linalg.norm(upward) > 0), f"up is {shown(up)}; give a direction")
-    plane = _plane_of_most(points, tolerance)
-    if plane is None:
-        raise InputError(
-            f"no plane has a twentieth of the {len(points)} points within {tolerance} of it, or they lie on one line: "
-            "show more of the table, or give a larger tolerance"
-        )
-    cosine = float(plane.normal @ upward / np.linalg.norm(upward))
-    require(
-        abs(cosine) > np.cos(np.radians(30.0)),
-        f"the plane of most points is {np.degrees(np.arccos(abs(cosine))):.0f} degrees off level: show more of the "
-        "table, or give its plane, HalfSpace(point, normal)",
-    )
-    return HalfSpace(plane.point, np.sign(cosine) * plane.normal)
 
 
 def plane_under(cloud: PointCloud, box: Box) -> HalfSpace | None:

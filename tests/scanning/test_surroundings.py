@@ -18,7 +18,7 @@ from jaxnbv.planning.episode import simulate
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Carving, Evidence, Grid, SDFSurface, SensorNoise, TriangleMesh, scan
 from jaxnbv.scanning.sdf import Capsule, Cuboid, HalfSpace, Sphere, solid_of_mesh
-from jaxnbv.scanning.surroundings import Surroundings, plane_under, support_plane
+from jaxnbv.scanning.surroundings import Surroundings, plane_under
 from jaxnbv.search import (
     DiscreteSearch,
     FarthestView,
@@ -217,19 +217,6 @@ def test_from_the_world_to_the_scene():
     assert scene.margin == pytest.approx(frame.scale * 0.01)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_table_is_found_under_an_object(seed):
-    rng = np.random.default_rng(seed)
-    turn = Rotation.from_rotvec(rng.normal(0.0, 0.1, 3)).as_matrix()
-    table = np.concatenate([rng.uniform(-0.6, 0.6, (600, 2)), rng.normal(0.0, 0.001, (600, 1))], axis=1)
-    thing = rng.normal(np.array([0.0, 0.0, 0.15]), 0.03, (300, 3))
-    points = np.concatenate([thing, table]) @ turn.T + [0.3, 0.2, 0.7]
-    plane = support_plane(points, up=(0.0, 0.0, 1.0), tolerance=0.004)
-    assert np.asarray(plane.normal) @ turn[:, 2] > np.cos(np.radians(0.5))
-    assert np.abs(np.asarray(plane(jnp.asarray(points[300:], jnp.float32)))).max() < 0.008
-    assert np.asarray(plane(jnp.asarray(points[:300], jnp.float32))).min() > -0.01
-
-
 BOX = Box((-0.5, -0.25, -1.25), (0.5, 1.2, 1.25))
 
 
@@ -320,10 +307,6 @@ def test_no_proposal_is_inside_or_under_what_is_known():
         (lambda: solid_of_mesh(*box_mesh([0, 0, 0], [1, 1, 1]), resolution=3), "resolution is 3"),
         (lambda: solid_of_mesh(np.zeros((3, 3)), np.array([[0, 1, 2]])), "all 3 vertices of the mesh lie at"),
         (lambda: solid_of_mesh(np.eye(3), np.array([[0, 1, 3]])), "faces refer to vertices 0 to 3"),
-        (lambda: support_plane(np.zeros((2, 3)), (0.0, 0.0, 1.0), 0.01), "three at least"),
-        (lambda: support_plane(np.eye(3), (0.0, 0.0, 0.0), 0.01), "give a direction"),
-        (lambda: support_plane(np.full((4, 3), np.nan), (0.0, 0.0, 1.0), 0.01), "not all finite"),
-        (lambda: support_plane(np.eye(3) * [1, 1, 0.0], (1.0, 0.0, 0.0), 0.01), "degrees off level"),
     ],
 )
 def test_bad_input_is_named(make, message):
