@@ -27,7 +27,6 @@ from jaxnbv.scanning import (
     Surroundings,
     TriangleMesh,
     carve,
-    check_image,
     scan_samples,
 )
 from jaxnbv.scanning.mesh import level_triangles
@@ -301,8 +300,11 @@ class Imagination(eqx.Module):
         with jax.ensure_compile_time_eval():
             if first or bool(scan.mask.any()):
                 check_oriented(scan, "the first scan" if first else "the scan", min(self.grid.half_extent, HALF_WIDTH))
-            if pose is not None:
-                check_image(pose, scan, camera)
+            require(
+                pose is None or scan.missed is None or scan.capacity == camera.num_rays,
+                f"the scan has {scan.capacity} rays but the camera {camera.height} x {camera.width}: give the camera "
+                "that took it, as observe(state, pose, scan, camera), and the pose that it was taken from",
+            )
             if self.carving is not None:
                 self.carving.check_inside(scan, self.grid)
 

@@ -7,7 +7,6 @@ from jaxnbv.scanning.evidence import EmptyPoints as EmptyPoints
 from jaxnbv.scanning.evidence import Evidence as Evidence
 from jaxnbv.scanning.free_space import Carving as Carving
 from jaxnbv.scanning.free_space import carve as carve
-from jaxnbv.scanning.free_space import check_image as check_image
 from jaxnbv.scanning.grid import Grid as Grid
 from jaxnbv.scanning.grid import GridSurface as GridSurface
 from jaxnbv.scanning.grid import imagine as imagine

@@ -22,8 +22,6 @@ from jaxnbv.scanning.grid import Grid
 
 # Noise takes fewer of the points on a face of the volume two voxels out of it.
 _STRAY = 0.01
-# Off its ray, in scene units: five standard deviations of the sensor that is usual.
-_NOISE = 0.05
 
 
 class Carving(eqx.Module):
@@ -127,41 +125,6 @@ def _beyond(volume: Volume, cloud: PointCloud, limit: float) -> tuple[Int[Array,
     distance = jnp.where(cloud.mask, volume(cloud.points), -jnp.inf)
     # What is not a number is not inside.
     return jnp.sum(~(distance <= limit)), jnp.max(distance, initial=-jnp.inf)
-
-
-def check_image(pose: Pose, scan: PointCloud, camera: Camera) -> None:
-    """Check that a scan that says which rays missed is an image of the camera from the pose.
-
-    **Raises:** `ValueError` if it has another number of rays, or its points are seen elsewhere in the image than their
-    rows say: half of them by more than a tenth of its longer side, which is beyond any noise.
-    """
-    if scan.missed is None:
-        return
-    remedy = "give the camera that took it, as observe(state, pose, scan, camera), and the pose that it was taken from"
-    require(
-        scan.capacity == camera.num_rays,
-        f"the scan has {scan.capacity} rays but the camera {camera.height} x {camera.width}: {remedy}",
-    )
-    off = float(_pixels_off(scan, camera, pose))
-    require(
-        off <= 0.1 * max(camera.height, camera.width),
-        f"the scan's points are seen {off:.3g} pixels (median) from where its rows say, in an image of "
-        f"{camera.height} x {camera.width}: {remedy}",
-    )
-
-
-@eqx.filter_jit
-def _pixels_off(scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, ""]:
-    """Median distance, in pixels along a side, of the filled rows from their own pixels; zero where none is filled."""
-    local = jnp.matmul(scan.points - pose.position, pose.rotation, precision="highest")
-    seen = scan.mask & (local[:, 2] > 0)
-    image = local[:, :2] / jnp.where(seen, local[:, 2], 1.0)[:, None]
-    aside = jnp.abs(image - camera.pixel_directions()[:, :2])
-    off = jnp.max(aside * jnp.array(camera.focal_lengths), axis=1)
-    # Beside a near camera a little noise is many pixels.
-    off = jnp.where(jnp.max(aside, axis=1) * local[:, 2] < _NOISE, 0.0, off)
-    off = jnp.where(scan.mask, jnp.where(seen, off, jnp.inf), jnp.nan)
-    return jnp.where(jnp.any(scan.mask), jnp.nanmedian(off), 0.0)
 
 
 def _free_depth(
