@@ -18,11 +18,11 @@ from jaxnbv.scanning.mesh import mesh_from_sdf as mesh_from_sdf
 from jaxnbv.scanning.mesh_files import MeshParts as MeshParts
 from jaxnbv.scanning.mesh_files import load_mesh as load_mesh
 from jaxnbv.scanning.mesh_files import load_parts as load_parts
+from jaxnbv.scanning.scanner import Hits as Hits
 from jaxnbv.scanning.scanner import SensorNoise as SensorNoise
+from jaxnbv.scanning.scanner import Surface as Surface
 from jaxnbv.scanning.scanner import scan as scan
 from jaxnbv.scanning.sphere_tracing import SDFSurface as SDFSurface
 from jaxnbv.scanning.sphere_tracing import as_surface as as_surface
-from jaxnbv.scanning.surface import Hits as Hits
-from jaxnbv.scanning.surface import Surface as Surface
 from jaxnbv.scanning.surroundings import Surroundings as Surroundings
 from jaxnbv.scanning.surroundings import plane_under as plane_under

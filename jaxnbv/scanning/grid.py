@@ -15,8 +15,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import tracing
-from jaxnbv.scanning.scanner import scan
-from jaxnbv.scanning.surface import Hits, Surface
+from jaxnbv.scanning.scanner import Hits, Surface, scan
 from jaxnbv.sharding import on_cpu, shared_map
 
 # The cosine of two normals that look in opposite directions, and the share of the points that is worth a warning.

@@ -17,8 +17,8 @@ from jaxnbv.errors import optional
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
 from jaxnbv.scanning.grid import Grid
+from jaxnbv.scanning.scanner import Hits, Surface
 from jaxnbv.scanning.sdf import SignedDistance
-from jaxnbv.scanning.surface import Hits, Surface
 from jaxnbv.scanning.triangles import winding_number
 
 

@@ -14,8 +14,8 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.mesh import TriangleMesh, mesh_from_sdf
+from jaxnbv.scanning.scanner import Surface
 from jaxnbv.scanning.sphere_tracing import SDFSurface
-from jaxnbv.scanning.surface import Surface
 
 # Of the authors: points that each of the two surfaces is sampled at.
 SURFACE_POINTS = 20_000

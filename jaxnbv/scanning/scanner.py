@@ -1,20 +1,50 @@
-"""The paper's scan(theta; f): the oriented points that a depth camera sees of a surface."""
+"""Surfaces that rays can hit, and the paper's scan(theta; f): the oriented points that a depth camera sees of one."""
 
 import math
+from abc import abstractmethod
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from jaxnbv.checks import check_fields, checked, require
+from jaxnbv.checks import AnyArray, check_fields, checked, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.scanning.surface import Hits, Surface
 
 # Beyond any sensor; squares of much larger numbers are infinite.
 _LOUDEST = 1e6
+
+
+class Hits(eqx.Module):
+    """Where rays first meet a surface.
+
+    - `points`: the hits, in scene coordinates; zero where the ray misses.
+    - `normals`: unit normals on the side of the ray's origin; zero where the ray misses.
+    - `mask`: whether the ray hits at all.
+    """
+
+    points: Float[Array, "rays 3"]
+    normals: Float[Array, "rays 3"]
+    mask: Bool[Array, "rays"]
+
+
+class Surface(eqx.Module):
+    """Anything that rays can hit.
+
+    `in_jit` says whether `trace` runs under JAX transformations; a surface that needs host code says False.
+    """
+
+    in_jit: eqx.AbstractClassVar[bool]
+
+    @abstractmethod
+    def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
+        """First hits of the rays origin + t direction, t >= 0, with unit directions; of either side of the surface.
+
+        A sensor sees only what faces it: an origin inside the surface sees the surface from within, its normals turned
+        to the origin like all others.
+        """
 
 
 class SensorNoise(eqx.Module):

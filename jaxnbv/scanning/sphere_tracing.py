@@ -10,8 +10,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxnbv.checks import AnyArray, check_fields, require
 from jaxnbv.scanning.implicit import implicit_depth
+from jaxnbv.scanning.scanner import Hits, Surface
 from jaxnbv.scanning.sdf import SignedDistance
-from jaxnbv.scanning.surface import Hits, Surface
 
 # Far above the rounding of float32 distances in the scene (4e-7), far below any part worth seeing.
 _SHORTEST_STRIDE = 1e-3

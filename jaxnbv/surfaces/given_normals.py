@@ -23,6 +23,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import on_torus
 from jaxnbv.surfaces.covariance import (
+    Scalar,
     Spectra,
     function_covariance,
     function_normal_covariance,
@@ -30,7 +31,6 @@ from jaxnbv.surfaces.covariance import (
     mode_variance,
     normal_covariance,
 )
-from jaxnbv.surfaces.matern import Scalar
 from jaxnbv.surfaces.nonuniform import NonuniformTransform
 from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, filled
 from jaxnbv.surfaces.trigonometric import solve_poisson

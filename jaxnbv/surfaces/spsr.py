@@ -29,9 +29,8 @@ from jaxnbv.checks import as_floats, check_type, is_traced, require
 from jaxnbv.geometry.cloud import PointCloud, check_oriented
 from jaxnbv.scanning.evidence import Evidence
 from jaxnbv.surfaces.base import HALF_WIDTH, SurfaceModel
-from jaxnbv.surfaces.covariance import Spectra
+from jaxnbv.surfaces.covariance import Scalar, Spectra, circle_spectrum
 from jaxnbv.surfaces.given_normals import GeometricSPSRPosterior, factorise, mean_at_data, reconstruct
-from jaxnbv.surfaces.matern import Scalar, circle_spectrum
 from jaxnbv.surfaces.nonuniform import NonuniformTransform
 from jaxnbv.surfaces.trigonometric import basis_variance
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from jaxnbv.geometry.pose import fibonacci_sphere, look_at
+from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.scanning.sdf import (
     Capsule,
     Cone,
@@ -161,13 +161,6 @@ def test_set_operations_agree_with_membership():
     smooth = np.asarray(SmoothUnion(a, b, 0.2)(x))
     assert (smooth <= union + 1e-6).all()
     assert (smooth >= union - 0.05 - 1e-6).all()
-
-
-def test_rigid_transform_moves_points_as_the_pose_does():
-    pose = look_at([0.5, 0.4, -0.3], target=[0.1, 0.9, 0.2])
-    sdf = Cuboid([0.3, 0.5, 0.2])
-    x = jnp.asarray(RNG.uniform(-1, 1, (500, 3)), dtype=jnp.result_type(float))
-    np.testing.assert_allclose(sdf.transform(pose)(pose.to_scene(x)), sdf(x), atol=1e-6)
 
 
 @pytest.mark.parametrize(

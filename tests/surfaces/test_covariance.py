@@ -6,12 +6,12 @@ import pytest
 from weight_space import lattice, lattice_spectrum
 
 from jaxnbv.surfaces.covariance import (
+    circle_spectrum,
     function_covariance,
     function_normal_covariance,
     function_variance,
     normal_covariance,
 )
-from jaxnbv.surfaces.matern import circle_spectrum
 
 RNG = np.random.default_rng(0)
 X, Y = RNG.uniform(-1.5, 1.5, (7, 3)), RNG.uniform(-1.5, 1.5, (5, 3))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from weight_space import lattice_spectrum
 
-from jaxnbv.surfaces.matern import circle_spectrum
+from jaxnbv.surfaces.covariance import circle_spectrum
 
 SMOOTHNESS = (0.5, 1.5, 2.5)
 

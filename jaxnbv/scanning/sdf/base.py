@@ -153,10 +153,6 @@ class SignedDistance(eqx.Module):
             require(longer, f"the axis of rotation is {axis}: give a direction that is not zero")
         return Rotated(self, _rotation_about(axis, angle))
 
-    def transform(self, pose: Pose) -> "Translated":
-        """The solid moved rigidly: a point p of it goes to `pose.rotation @ p + pose.position`."""
-        return Rotated(self, pose.rotation).translate(pose.position)
-
     def scale(self, factor) -> "Scaled":
         """The solid scaled about the origin by a positive factor."""
         return Scaled(self, factor)

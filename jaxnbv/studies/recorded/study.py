@@ -23,7 +23,7 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.session import stride_of
 from jaxnbv.progress import progress_bar
 from jaxnbv.scanning import Surface
-from jaxnbv.scanning.surface import Hits
+from jaxnbv.scanning.scanner import Hits
 from jaxnbv.search import GivenPoses, Problem, Search
 from jaxnbv.search.base import Rule
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
