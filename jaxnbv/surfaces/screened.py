@@ -161,25 +161,19 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
         """Var g(x) at points in scene coordinates."""
         x = jnp.asarray(x, dtype=self.weights.dtype)
-        prior = function_variance(self.model.base.spectrum) + self.model.level_deviation**2
+        spectrum = self.model.base.spectrum
+        prior = function_variance(spectrum) + self.model.level_deviation**2
 
         def at_point(point):
-            normals, values = self._explained(point[None])
+            # Whitened covariances of g with the normals, and with what the values say beyond them.
+            normals = self.base.whitened(point[None])
+            cross = function_covariance(self.rows.points, point[None], spectrum) + self.model.level_deviation**2
+            cross = cross - jnp.einsum("dnm,dnx->mx", self.whitened, normals, precision="highest")
+            values = solve_triangular(self.factor, jnp.where(self.rows.mask[:, None], cross, 0.0), lower=True)
             return jnp.maximum(prior - jnp.sum(normals**2) - jnp.sum(values**2), 0.0)
 
         chunk = max(1, min(x.shape[0], _CHUNK_VALUES // self.base.cloud.capacity))
         return jax.lax.map(at_point, x, batch_size=chunk)
-
-    @on_torus
-    @eqx.filter_jit
-    def covariance(self, x: Float[AnyArray, "n 3"], y: Float[AnyArray, "m 3"]) -> Float[Array, "n m"]:
-        """Cov(g(x), g(y)) between points in scene coordinates, all at once."""
-        x, y = (jnp.asarray(points, dtype=self.weights.dtype) for points in (x, y))
-        (normals_x, values_x), (normals_y, values_y) = self._explained(x), self._explained(y)
-        by_normals = jnp.einsum("djn,djm->nm", normals_x, normals_y, precision="highest")
-        by_values = jnp.matmul(values_x.T, values_y, precision="highest")
-        prior = function_covariance(x, y, self.model.base.spectrum) + self.model.level_deviation**2
-        return prior - by_normals - by_values
 
     def data_points(self) -> DataPoints:
         """The cloud's for gradients, and those of the values."""
@@ -229,14 +223,6 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         middle = fields.shape[-1] // 2
         constant = constant + self.model.level_deviation**2 * jnp.sum(weights, axis=1)
         return (fields - direct).at[:, middle, middle, middle].add(constant)
-
-    def _explained(self, x: Float[Array, "n 3"]) -> tuple[Float[Array, "3 capacity n"], Float[Array, "m n"]]:
-        """Whitened covariances of g(x) with the normals, and with what the values say beyond them."""
-        normals = self.base.whitened(x)
-        cross = function_covariance(self.rows.points, x, self.model.base.spectrum) + self.model.level_deviation**2
-        cross = cross - jnp.einsum("dnm,dnx->mx", self.whitened, normals, precision="highest")
-        cross = jnp.where(self.rows.mask[:, None], cross, 0.0)
-        return normals, solve_triangular(self.factor, cross, lower=True)
 
 
 def _values(normals: Float[Array, "3 a a a"], transform: NonuniformTransform) -> Float[Array, " m"]:
