@@ -90,7 +90,7 @@ CALLS = {
     nbv.GeometricSPSR: {"lengthscale": 0.05, "variance": 0.2, "truncation": 6, "noise": 0.01, "nu": 1.5},
     nbv.GivenPoses: {"given": POSES},
     nbv.GradientSearch: {"dof": 2, "space": None, "num_starts": 2, "iterations": 2, "learning_rate": 0.01}
-    | {"num_candidates": 6, "solver": None, "candidates": None, "turned": True},
+    | {"num_candidates": 6, "solver": None, "candidates": None},
     nbv.Grid: {"resolution": 8, "half_extent": 1.5},
     nbv.HalvingSearch: {"candidates": 6, "num_first_samples": 2},
     nbv.HeatProblem: {"source": (0.0, 1.0, 0.0), "radius": 0.1, "power": 10.0, "duration": 5.0, "steps": 2}

@@ -6,15 +6,14 @@ from abc import abstractmethod
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float
 
-from jaxnbv.checks import AnyArray, InputError, check_fields, check_key, require, shown
+from jaxnbv.checks import AnyArray, InputError, check_fields, require, shown
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
-from jaxnbv.search.rotations import rotation_between, rotation_from_6d
+from jaxnbv.search.rotations import rotation_between
 
 # The real root of x^3 = x + 1.
 _PLASTIC = 1.324717957244746
@@ -29,8 +28,8 @@ class Candidates(eqx.Module):
         """How many poses there are."""
 
     @abstractmethod
-    def poses(self, key: PRNGKeyArray | None = None) -> Pose:
-        """The poses (count,): always the same ones or, where any others would do as well, turned at random by a key."""
+    def poses(self) -> Pose:
+        """The poses (count,), always the same ones."""
 
     def where(self, allowed: Callable[[Pose], Bool[AnyArray, ""] | bool]) -> "GivenPoses":
         """Those that a predicate of one pose allows: that a robot can reach, say.
@@ -77,22 +76,12 @@ class SphereCandidates(Candidates):
         )
 
     @property
-    def _is_whole(self) -> bool:
-        return self.min_elevation == -0.5 * math.pi
-
-    @property
     def upper_half(self) -> "SphereCandidates":
         """Those above the origin, of a whole sphere; one with a least elevation stays as it is."""
-        return dataclasses.replace(self, min_elevation=0.0) if self._is_whole else self
+        return dataclasses.replace(self, min_elevation=0.0) if self.min_elevation == -0.5 * math.pi else self
 
-    def poses(self, key: PRNGKeyArray | None = None) -> Pose:
-        """A dome is turned about its axis, so that the poses of every key are above the elevation."""
-        places = fibonacci_sphere(self.count, self.radius, self.min_elevation)
-        if key is not None and self._is_whole:
-            check_key(key)
-            turn = rotation_from_6d(jax.random.normal(key, (6,)))
-            places, key = jnp.matmul(places, turn.T, precision="highest"), None
-        return _looking(places, self.up, key)
+    def poses(self) -> Pose:
+        return _looking(fibonacci_sphere(self.count, self.radius, self.min_elevation), self.up)
 
 
 class Turntable(Candidates):
@@ -119,12 +108,11 @@ class Turntable(Candidates):
             f"the elevation is {self.elevation} rad; it must lie within (-pi/2, pi/2)",
         )
 
-    def poses(self, key: PRNGKeyArray | None = None) -> Pose:
-        """With a key the table starts at a random angle."""
+    def poses(self) -> Pose:
         angle = 2.0 * np.pi * np.arange(self.count) / self.count
         ring = np.cos(self.elevation)
         places = np.stack([ring * np.cos(angle), np.full_like(angle, np.sin(self.elevation)), ring * np.sin(angle)], 1)
-        return _looking(self.radius * jnp.asarray(places, jnp.result_type(float)), self.up, key)
+        return _looking(self.radius * jnp.asarray(places, jnp.result_type(float)), self.up)
 
 
 class Reach(Candidates):
@@ -153,8 +141,7 @@ class Reach(Candidates):
             "both within [-pi/2, pi/2]",
         )
 
-    def poses(self, key: PRNGKeyArray | None = None) -> Pose:
-        """With a key all places are turned about `up`."""
+    def poses(self) -> Pose:
         index = np.arange(self.count)
         low, high = math.sin(self.min_elevation), math.sin(self.max_elevation)
         y = high - (high - low) * (index + 0.5) / self.count
@@ -163,11 +150,11 @@ class Reach(Candidates):
         share = (0.5 + index / _PLASTIC**2) % 1.0
         distance = np.cbrt(self.nearest**3 + share * (self.farthest**3 - self.nearest**3))
         places = distance[:, None] * np.stack([ring * np.cos(angle), y, ring * np.sin(angle)], axis=1)
-        return _looking(jnp.asarray(places, jnp.result_type(float)), self.up, key)
+        return _looking(jnp.asarray(places, jnp.result_type(float)), self.up)
 
 
 class GivenPoses(Candidates):
-    """These poses, whatever the key.
+    """These poses.
 
     **Raises:** `ValueError` unless they are a batch (n,) of one at least.
     """
@@ -183,7 +170,7 @@ class GivenPoses(Candidates):
     def count(self) -> int:
         return self.given.position.shape[0]
 
-    def poses(self, key: PRNGKeyArray | None = None) -> Pose:
+    def poses(self) -> Pose:
         return self.given
 
 
@@ -197,11 +184,8 @@ def _check_places(number: int, nearest: float, farthest: float, up: tuple[float,
     require(0 < math.hypot(*up) < math.inf, f"up is {up}; it must be a direction, such as (0, 1, 0)")
 
 
-def _looking(places: Float[Array, "n 3"], up: tuple[float, float, float], key: PRNGKeyArray | None) -> Pose:
-    """Poses at places about the y axis, turned about it at random by a key, and then so that it becomes `up`."""
-    if key is not None:
-        check_key(key)
-        places = jnp.matmul(places, _about_y(key).T, precision="highest")
+def _looking(places: Float[Array, "n 3"], up: tuple[float, float, float]) -> Pose:
+    """Poses at places about the y axis, turned so that it becomes `up`."""
     axis = jnp.asarray(up, places.dtype)
     if up[0] or up[2] or up[1] < 0:
         turn = rotation_between(jnp.asarray([0.0, 1.0, 0.0], places.dtype), axis / jnp.linalg.norm(axis))
@@ -226,9 +210,3 @@ def as_candidates(value: object) -> Candidates:
 def sphere_candidates(count: int, radius: float = SENSOR_RADIUS) -> Pose:
     """The poses of `SphereCandidates`."""
     return SphereCandidates(count, radius).poses()
-
-
-def _about_y(key: PRNGKeyArray) -> Array:
-    angle = jax.random.uniform(key, maxval=2.0 * jnp.pi)
-    cosine, sine, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros(()), jnp.ones(())
-    return jnp.stack([cosine, zero, sine, zero, one, zero, -sine, zero, cosine]).reshape(3, 3)

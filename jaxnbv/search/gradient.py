@@ -32,7 +32,7 @@ class GradientSearch(Search):
     - `dof`: 2 for `SpherePoses()`, 6 for `FreePoses()`; or give a `space` of your own, `ConstrainedPoses()` say.
     - `num_candidates`: poses, spread evenly over the space and turned at random, that are evaluated first; the ascent
       starts from the best `num_starts` of them. With as many candidates as starts, every candidate is a start.
-    - `candidates`: in their place, poses of your own; `turned`: whether the key turns them, if they can be turned.
+    - `candidates`: in their place, poses of your own, as they are.
     - `iterations`: steps from each start; each evaluates the acquisition and its gradient once.
     - `learning_rate`: Adam's, in the units of the space's parameters: radians or scene units, about.
     - `solver`: a minimiser of Optimistix in place of Adam, such as `optimistix.BFGS(rtol=1e-4, atol=1e-4)`; the
@@ -53,9 +53,10 @@ class GradientSearch(Search):
     num_starts: int = eqx.field(static=True)
     iterations: int = eqx.field(static=True)
     learning_rate: float = eqx.field(static=True)
+    num_candidates: int = eqx.field(static=True)
     solver: optx.AbstractMinimiser | None
-    candidates: Candidates
-    turned: bool = eqx.field(static=True)
+    candidates: Candidates | None
+    turned: ClassVar[bool] = True
     uses_samples: ClassVar[bool] = True
 
     @checked
@@ -69,13 +70,12 @@ class GradientSearch(Search):
         num_candidates: int = 100,
         solver: optx.AbstractMinimiser | None = None,
         candidates: Candidates | Pose | None = None,
-        turned: bool = True,
     ):
         self.space = _pose_space(dof, space)
         self.num_starts, self.iterations, self.learning_rate = num_starts, iterations, learning_rate
-        of_space = SpaceCandidates(self.space, num_candidates)
-        self.candidates = of_space if candidates is None else as_candidates(candidates)
-        self.solver, self.turned = solver, turned
+        self.solver = solver
+        self.candidates = None if candidates is None else as_candidates(candidates)
+        self.num_candidates = num_candidates if self.candidates is None else self.candidates.count
 
     def __check_init__(self):
         check_fields(self)
@@ -87,8 +87,8 @@ class GradientSearch(Search):
             f"the learning rate is {self.learning_rate}; it must be positive and finite, such as 0.01",
         )
         require(
-            self.candidates.count >= self.num_starts,
-            f"the search has {self.candidates.count} candidates for {self.num_starts} starts: give it as many at least",
+            self.num_candidates >= self.num_starts,
+            f"the search has {self.num_candidates} candidates for {self.num_starts} starts: give it as many at least",
         )
 
     @property
@@ -106,8 +106,11 @@ class GradientSearch(Search):
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """The best pose on the ways from the best candidates, or the best candidate if none is better; the key turns
-        the candidates, if they are to be turned."""
-        candidates = self.candidates.poses(key if self.turned else None)
+        the space's candidates."""
+        if self.candidates is None:
+            candidates = self.space.candidates(self.num_candidates, key if self.turned else None)
+        else:
+            candidates = self.candidates.poses()
         scores = problem.scores(candidates)
         values = jnp.mean(scores, axis=0)
         order = jnp.argsort(jnp.where(problem.is_closed(candidates), -jnp.inf, values), descending=True)
@@ -155,11 +158,13 @@ class GradientSearch(Search):
 class HybridSearch(GradientSearch):
     """The discrete search, then gradient ascent from its best few candidates: a `GradientSearch` with other defaults.
 
-    Steps are fewer and longer. On the sphere the candidates are those of a `DiscreteSearch` with as many, so the value
-    found is never below its.
+    Steps are fewer and longer. The candidates are not turned: on the sphere they are those of a `DiscreteSearch` with
+    as many, so the value found is never below its.
 
     **Raises:** `ValueError` as `GradientSearch` does.
     """
+
+    turned: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -171,26 +176,8 @@ class HybridSearch(GradientSearch):
         num_candidates: int = 120,
         solver: optx.AbstractMinimiser | None = None,
         candidates: Candidates | Pose | None = None,
-        turned: bool = False,
     ):
-        super().__init__(dof, space, num_starts, iterations, learning_rate, num_candidates, solver, candidates, turned)
-
-
-class SpaceCandidates(Candidates):
-    """Poses of a pose space, spread evenly over it.
-
-    **Raises:** `ValueError` for a number below one.
-    """
-
-    space: PoseSpace
-    count: int = eqx.field(static=True, default=100)
-
-    def __check_init__(self):
-        check_fields(self)
-        require(self.count >= 1, f"the search has {self.count} candidates; it needs at least one")
-
-    def poses(self, key: PRNGKeyArray | None = None) -> Pose:
-        return self.space.candidates(self.count, key)
+        super().__init__(dof, space, num_starts, iterations, learning_rate, num_candidates, solver, candidates)
 
 
 def _pose_space(dof: int | None, space: PoseSpace | None) -> PoseSpace:

@@ -9,14 +9,14 @@ from abc import abstractmethod
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.checks import check_fields, require
 from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
-from jaxnbv.search.candidates import SphereCandidates
 from jaxnbv.search.rotations import normalise, rotation_between, rotation_from_6d, rotation_to_6d
 
 
@@ -62,8 +62,7 @@ class SpherePoses(PoseSpace):
         require(0 < self.radius < math.inf, f"the sphere's radius is {self.radius}; it must be positive and finite")
 
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
-        """A Fibonacci sphere of cameras that look at the origin."""
-        return SphereCandidates(count, self.radius).poses(key)
+        return _about_origin(count, self.radius, key)
 
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
         _, after = _directions(start, parameters)
@@ -89,8 +88,7 @@ class FreePoses(PoseSpace):
         require(0 < self.radius < math.inf, f"the radius is {self.radius}; it must be positive and finite")
 
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
-        """A Fibonacci sphere of cameras that look at the origin."""
-        return SphereCandidates(count, self.radius).poses(key)
+        return _about_origin(count, self.radius, key)
 
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
         rotation = rotation_from_6d(rotation_to_6d(start.rotation) + parameters[:6])
@@ -134,8 +132,8 @@ class ConstrainedPoses(PoseSpace):
         return 0.5 * (self.nearest + self.farthest)
 
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
-        """A Fibonacci sphere of cameras in the middle of the shell that look at the origin."""
-        return SphereCandidates(count, self._middle).poses(key)
+        """A sphere of them in the middle of the shell."""
+        return _about_origin(count, self._middle, key)
 
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
         direction, distance, gaze, roll = jnp.split(parameters, (3, 4, 6))
@@ -165,6 +163,15 @@ class ConstrainedPoses(PoseSpace):
             f"off_axis is {self.off_axis:.3g} rad but the image ends {half:.3g} rad from the camera's axis: the "
             "object's centre would leave it; lower off_axis, or widen the camera's field of view",
         )
+
+
+def _about_origin(count: int, radius: float, key: PRNGKeyArray | None) -> Pose:
+    """A Fibonacci sphere of cameras that look at the origin, turned at random by a key."""
+    places = fibonacci_sphere(count, radius)
+    if key is not None:
+        turn = rotation_from_6d(jax.random.normal(key, (6,)))
+        places = jnp.matmul(places, turn.T, precision="highest")
+    return look_at(places)
 
 
 def _directions(start: Pose, parameters: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:

@@ -109,7 +109,7 @@ def test_metres_and_millimetres_and_both_conventions_tell_the_same(convention, u
 def test_without_poses_it_looks_from_above_unless_told_otherwise(elevation):
     search = DiscreteSearch(SphereCandidates(60, min_elevation=elevation))
     session = session_of(poses=None, planner=planner_of(search))
-    places = np.asarray(session.frame.to_world(session.planner.search.candidates.poses(jax.random.key(1))).position)
+    places = np.asarray(session.frame.to_world(session.planner.search.candidates.poses()).position)
     away = places - np.mean(BOX, axis=0)
     lowest = np.arcsin((away[:, 2] / np.linalg.norm(away, axis=1)).min())
     least = 0.0 if elevation == -0.5 * np.pi else elevation

@@ -187,7 +187,7 @@ def test_no_camera_stands_too_near_to_what_was_seen(search):
 def test_a_search_by_gradient_stays_out_of_obstacles():
     """Its starts are all too low; free, ascent stays there."""
     starts = look_at(2.3 * np.array([[np.cos(a), -0.05, np.sin(a)] for a in (0.3, 1.9, 3.5, 5.1)]))
-    search = GradientSearch(dof=2, num_starts=4, iterations=12, learning_rate=0.05, candidates=starts, turned=False)
+    search = GradientSearch(dof=2, num_starts=4, iterations=12, learning_rate=0.05, candidates=starts)
     table = HalfSpace([0.0, -0.2, 0.0], [0.0, 1.0, 0.0])
     planner = planner_of(search, Surroundings((table,), clearance=0.4))
     proposal = planner.propose(planner.init(POSES[2], scan(BALL, planner.camera, POSES[2])), KEY)

@@ -2,10 +2,11 @@
 
 import math
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from small_problem import propose, three_balls, visit
 
 import jaxnbv as nbv
@@ -14,8 +15,8 @@ from jaxnbv.search.candidates import as_candidates, sphere_candidates
 DOME = nbv.SphereCandidates(50, 2.0, math.radians(20.0))
 
 
-def positions(candidates, key=None):
-    return np.asarray(candidates.poses(key).position, np.float64)
+def positions(candidates):
+    return np.asarray(candidates.poses().position, np.float64)
 
 
 def test_the_whole_sphere_is_the_papers_lattice():
@@ -26,9 +27,8 @@ def test_the_whole_sphere_is_the_papers_lattice():
     assert nbv.SphereCandidates().count == len(positions(nbv.SphereCandidates())) == 120
 
 
-@pytest.mark.parametrize("key", [None, jax.random.key(3)])
-def test_a_dome_covers_what_is_above_its_elevation_evenly(key):
-    height = positions(DOME, key)[:, 1] / 2.0
+def test_a_dome_covers_what_is_above_its_elevation_evenly():
+    height = positions(DOME)[:, 1] / 2.0
     least = math.sin(math.radians(20.0))
     # Uniform by area is uniform in height (Archimedes): the k-th of n heights is the middle of its share.
     np.testing.assert_allclose(np.sort(height), least + (1 - least) * (np.arange(50) + 0.5) / 50, atol=1e-6)
@@ -52,12 +52,53 @@ def _distances(points):
     return np.linalg.norm(points[:, None] - points[None], axis=-1)
 
 
-@pytest.mark.parametrize("candidates", [DOME, nbv.SphereCandidates(20)])
-def test_a_key_turns_them_as_one(candidates):
-    one, other = (positions(candidates, jax.random.key(seed)) for seed in (0, 1))
-    np.testing.assert_allclose(_distances(one), _distances(positions(candidates)), atol=1e-5)
-    assert np.abs(one - other).max() > 0.1
-    np.testing.assert_array_equal(one, positions(candidates, jax.random.key(0)))
+UP = (0.6, 0.0, 0.8)
+
+
+def elevations(poses, up):
+    places = np.asarray(poses.position, np.float64)
+    return np.arcsin(places @ np.array(up) / np.linalg.norm(places, axis=1))
+
+
+@pytest.mark.parametrize("up", [(0.0, 1.0, 0.0), UP])
+def test_a_turntable_is_a_circle_in_even_steps(up):
+    table = nbv.Turntable(8, 2.0, math.radians(25.0), up)
+    poses = table.poses()
+    places = np.asarray(poses.position, np.float64)
+    assert table.count == len(places) == 8
+    np.testing.assert_allclose(np.linalg.norm(places, axis=1), 2.0, rtol=1e-6)
+    np.testing.assert_allclose(elevations(poses, up), math.radians(25.0), atol=1e-6)
+    steps = np.linalg.norm(np.roll(places, -1, axis=0) - places, axis=1)
+    # The chord of 45 degrees on the circle of radius 2 cos 25.
+    np.testing.assert_allclose(steps, 2 * 2.0 * math.cos(math.radians(25.0)) * math.sin(math.pi / 8), rtol=1e-5)
+    np.testing.assert_allclose(poses.forward, -places / 2.0, atol=1e-6)
+    # The camera's y axis points down.
+    assert (np.asarray(poses.rotation)[:, :, 1] @ np.array(up) < -0.8).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(0.5, 2.0), st.floats(0.0, 2.0), st.floats(-1.5, 1.4), st.floats(0.05, 1.0))
+def test_an_arm_reaches_between_its_bounds(nearest, more, low, wider):
+    high = min(low + wider, 0.5 * math.pi)
+    reach = nbv.Reach(40, nearest, nearest + more, low, high, UP)
+    poses = reach.poses()
+    distance = np.linalg.norm(np.asarray(poses.position, np.float64), axis=1)
+    assert reach.count == len(distance) == 40
+    assert (distance >= nearest - 1e-5).all()
+    assert (distance <= nearest + more + 1e-5).all()
+    assert (elevations(poses, UP) >= low - 1e-4).all()
+    assert (elevations(poses, UP) <= high + 1e-4).all()
+    np.testing.assert_allclose(poses.forward, -np.asarray(poses.position) / distance[:, None], atol=1e-5)
+
+
+def test_an_arm_s_places_are_even_in_its_volume():
+    """In boxes of equal volume, by height and by the cube of the distance: binomial would be 12.5 +- 3.4."""
+    reach = nbv.Reach(200, 1.0, 3.0, 0.0, math.radians(80.0))
+    places = np.asarray(reach.poses().position, np.float64)
+    distance = np.linalg.norm(places, axis=1)
+    height = places[:, 1] / distance / math.sin(math.radians(80.0))
+    counts, *_ = np.histogram2d(height, (distance**3 - 1.0) / 26.0, bins=4, range=[(0, 1), (0, 1)])
+    assert np.abs(counts - 12.5).max() <= 4
 
 
 def test_a_predicate_keeps_what_it_allows():
@@ -74,7 +115,7 @@ def test_a_predicate_keeps_what_it_allows():
 def test_numbers_and_poses_stand_for_candidates():
     assert as_candidates(7) == nbv.SphereCandidates(7)
     poses = sphere_candidates(3, 2.0)
-    np.testing.assert_array_equal(as_candidates(poses).poses(jax.random.key(0)).position, poses.position)
+    np.testing.assert_array_equal(as_candidates(poses).poses().position, poses.position)
     assert as_candidates(DOME) is DOME
     for wrong in ("many", 2.5, None):
         with pytest.raises(nbv.InputError, match="give how many"):
@@ -82,20 +123,22 @@ def test_numbers_and_poses_stand_for_candidates():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("make", "message"),
     [
-        ((0,), "0 candidates"),
-        ((10, 0.0), "radius of 0.0"),
-        ((10, math.inf), "radius is inf; it must be a finite number"),
-        ((10, 2.5, 2.0), "elevation is 2.0 rad"),
-        ((10, 2.5, 0.0, (0.0, 0.0, 0.0)), "must be a direction"),
+        (lambda: nbv.SphereCandidates(0), "0 candidates"),
+        (lambda: nbv.SphereCandidates(10, 0.0), "radius of 0.0"),
+        (lambda: nbv.SphereCandidates(10, math.inf), "radius is inf; it must be a finite number"),
+        (lambda: nbv.SphereCandidates(10, 2.5, 2.0), "elevation is 2.0 rad"),
+        (lambda: nbv.SphereCandidates(10, up=(0.0, 0.0, 0.0)), "must be a direction"),
+        (lambda: nbv.Turntable(8, 2.0, 1.6), "elevation is 1.6 rad"),
+        (lambda: nbv.Reach(8, 3.0, 2.0), "distances of 3.0 to 2.0"),
+        (lambda: nbv.Reach(8, min_elevation=1.0, max_elevation=0.5), "elevations are 1.0 and 0.5 rad"),
+        (lambda: nbv.GivenPoses(nbv.look_at((0.0, 0.0, 2.0))), "give a batch"),
     ],
 )
-def test_bad_numbers_are_named(arguments, message):
+def test_places_that_cannot_be_are_named(make, message):
     with pytest.raises(nbv.InputError, match=message):
-        nbv.SphereCandidates(*arguments)
-    with pytest.raises(nbv.InputError, match="give a batch"):
-        nbv.GivenPoses(nbv.look_at((0.0, 0.0, 2.0)))
+        make()
 
 
 @pytest.mark.parametrize("kind", [nbv.DiscreteSearch, nbv.HalvingSearch, nbv.FarthestView, nbv.RandomView])

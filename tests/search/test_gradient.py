@@ -172,7 +172,7 @@ def test_trajectories_hold_every_look(name):
     ways, count = found.trajectories, len(found.values)
     assert ways.values.shape == (2, 41)
     assert ways.poses.position.shape == (2, 41, 3)
-    assert count == (20 if name == "hybrid" else search.candidates.count)
+    assert count == (20 if name == "hybrid" else search.num_candidates)
     poses, values = ways.flat
     np.testing.assert_allclose(values_at(problem, poses), values, rtol=1e-4)
     # All starts of a step together.
