@@ -67,9 +67,14 @@ class Carving(eqx.Module):
 
         - `barrier`: how far along each ray something else than the object stands, beyond which nothing is known.
         """
-        depth = _free_depth(scan, camera, pose, barrier)
-        if depth is None:
+        if scan.missed is None:
             return jnp.zeros((grid.resolution,) * 3, bool)
+        # Depth along the camera's axis up to which each pixel's ray was empty.
+        along = jnp.matmul(scan.points - pose.position, pose.forward, precision="highest")
+        known = jnp.asarray(jnp.inf if camera.farthest is None else camera.farthest)
+        if barrier is not None:
+            known = jnp.minimum(known, barrier / jnp.linalg.norm(camera.pixel_directions(), axis=-1))
+        depth = jnp.where(scan.mask, along, jnp.where(scan.missed, known, 0.0)).reshape(camera.height, camera.width)
         return _crossed(grid, depth, camera, pose, self.margin_voxels * grid.spacing)
 
     @eqx.filter_jit
@@ -125,19 +130,6 @@ def _beyond(volume: Volume, cloud: PointCloud, limit: float) -> tuple[Int[Array,
     distance = jnp.where(cloud.mask, volume(cloud.points), -jnp.inf)
     # What is not a number is not inside.
     return jnp.sum(~(distance <= limit)), jnp.max(distance, initial=-jnp.inf)
-
-
-def _free_depth(
-    scan: PointCloud, camera: Camera, pose: Pose, barrier: Float[Array, " rays"] | None
-) -> Float[Array, "h w"] | None:
-    """Depth along the camera's axis up to which each pixel's ray was empty; None for a cloud that is no image."""
-    if scan.missed is None:
-        return None
-    along = jnp.matmul(scan.points - pose.position, pose.forward, precision="highest")
-    farthest_known = jnp.asarray(jnp.inf if camera.farthest is None else camera.farthest)
-    if barrier is not None:
-        farthest_known = jnp.minimum(farthest_known, barrier / jnp.linalg.norm(camera.pixel_directions(), axis=-1))
-    return jnp.where(scan.mask, along, jnp.where(scan.missed, farthest_known, 0.0)).reshape(camera.height, camera.width)
 
 
 def _crossed(grid: Grid, depth: Float[Array, "h w"], camera: Camera, pose: Pose, margin: float) -> Bool[Array, "g g g"]:

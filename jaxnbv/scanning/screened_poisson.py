@@ -8,9 +8,6 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.scanning.mesh import TriangleMesh
 
-# Fewer cannot enclose anything, and Poisson reconstruction answers them with an empty mesh.
-_FEWEST_POINTS = 4
-
 
 def has_poisson() -> bool:
     """Whether `screened_poisson` can run: `pymeshlab` can be imported."""
@@ -26,14 +23,11 @@ def screened_poisson(cloud: PointCloud, depth: int = 8) -> TriangleMesh:
     """Screened Poisson surface reconstruction (Kazhdan and Hoppe 2013) of an oriented cloud, as MeshLab has it.
 
     `depth` is that of the octree: details down to 1 / 2^depth of the cloud's size, where there are points for them.
-    MeshLab's other settings are left as they are. The mesh is in scene coordinates (its frame is the identity), its
-    faces wound outward, and the same from run to run. It bridges what was not scanned, and is open where it leaves a
-    cube 1.1 times the cloud's size.
+    The mesh is in scene coordinates (its frame is the identity), its faces wound outward, and the same from run to run.
+    It bridges what was not scanned, and is open where it leaves a cube 1.1 times the cloud's size.
 
-    It needs `pymeshlab`, an optional dependency of its own license (GPL), and with it the system's OpenGL library.
-
-    **Raises:** `ValueError` if `pymeshlab` is not installed, the depth is not within [1, 12], the cloud has fewer than
-    four points, entries that are not finite, or no surface comes out.
+    **Raises:** `ValueError` if `pymeshlab`, an optional dependency (GPL), is not installed, the depth is not within
+    [1, 12], the cloud has fewer than four points, entries that are not finite, or no surface comes out.
     """
     require(1 <= depth <= 12, f"the octree's depth is {depth}; it must be at least 1 and at most 12, such as 8")
     try:
@@ -46,8 +40,8 @@ def screened_poisson(cloud: PointCloud, depth: int = 8) -> TriangleMesh:
         ) from error
     points, normals = (rows.astype(np.float64) for rows in cloud.to_numpy())
     require(
-        len(points) >= _FEWEST_POINTS,
-        f"the cloud has {len(points)} points, and a surface needs at least {_FEWEST_POINTS}: scan more of the object",
+        len(points) >= 4,
+        f"the cloud has {len(points)} points, and a surface needs at least 4: scan more of the object",
     )
     finite = bool(np.isfinite(points).all() and np.isfinite(normals).all())
     require(finite, "the cloud has points or normals that are not finite: build it with PointCloud.from_arrays")

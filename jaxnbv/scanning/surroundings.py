@@ -2,7 +2,6 @@
 
 import functools
 import operator
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -64,7 +63,8 @@ class Surroundings(eqx.Module):
 
     def in_scene(self, frame: Frame) -> "Surroundings":
         """From world units to those of the scene."""
-        solids = tuple(_in_scene(obstacle, frame) for obstacle in self.obstacles)
+        moved = (obstacle.translate(-np.asarray(frame.center)) for obstacle in self.obstacles)
+        solids = tuple(Rotated(solid, frame.rotation).scale(frame.scale) for solid in moved)
         return Surroundings(solids, frame.scale * self.margin, frame.scale * self.clearance)
 
     def distance(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
@@ -106,11 +106,6 @@ class Surroundings(eqx.Module):
         return jnp.maximum(self.clearance - jnp.minimum(self.distance(poses.position), seen), 0.0)
 
 
-def _in_scene(solid: SignedDistance, frame: Frame) -> SignedDistance:
-    moved = solid.translate(-np.asarray(frame.center))
-    return Rotated(moved, frame.rotation).scale(frame.scale)
-
-
 def plane_under(cloud: PointCloud, box: Box) -> HalfSpace | None:
     """The plane that an object in a box stands on, and all below it; None where a cloud shows none. In scene
     coordinates, with y up.
@@ -126,11 +121,12 @@ def plane_under(cloud: PointCloud, box: Box) -> HalfSpace | None:
     inside = ((near > low - below) & (near < high)).all(axis=1)
     if min(inside.sum(), (~inside).sum()) < _SOME:
         return None
-    plane = _plane_of_most(near, _TOLERANCE)
+    plane = _plane_of_most(near)
     if plane is None:
         return None
-    normal = np.sign(plane.normal[1]) * plane.normal
-    height = (near - plane.point) @ normal
+    point, normal = plane
+    normal = np.sign(normal[1]) * normal
+    height = (near - point) @ normal
     on = np.abs(height) <= _TOLERANCE
     found = (
         normal[1] >= _LEVEL
@@ -138,27 +134,25 @@ def plane_under(cloud: PointCloud, box: Box) -> HalfSpace | None:
         and on[~inside].mean() >= _MOST
         and (height[inside] < -_TOLERANCE).mean() <= _NONE
     )
-    return HalfSpace(plane.point, normal) if found else None
+    return HalfSpace(point, normal) if found else None
 
 
-class _Plane(NamedTuple):
-    point: Float[np.ndarray, "3"]
-    normal: Float[np.ndarray, "3"]
-
-
-def _plane_of_most(points: Float[np.ndarray, "n 3"], tolerance: float) -> _Plane | None:
-    """By RANSAC (Fischler and Bolles 1981): of planes through three points drawn at random the one that most points
-    are near, then the best fit to these. None where all lie on a line, or fewer than a twentieth are near."""
+def _plane_of_most(
+    points: Float[np.ndarray, "n 3"],
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None:
+    """A point and the normal of it, by RANSAC (Fischler and Bolles 1981): of planes through three points drawn at
+    random the one that most points are near, then the best fit to these. None where all lie on a line, or fewer than a
+    twentieth are near."""
     draw = np.random.default_rng(0)
     a, b, c = np.moveaxis(points[draw.integers(0, len(points), (_DRAWS, 3))], 1, 0)
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
     few = draw.choice(points, min(len(points), _COUNTED), replace=False)
-    near = np.abs(few @ normals.T - np.sum(a * normals, axis=1)) <= tolerance
+    near = np.abs(few @ normals.T - np.sum(a * normals, axis=1)) <= _TOLERANCE
     # Three points on a line have no normal.
     best = np.argmax(np.where(normals.any(axis=1), near.sum(axis=0), -1))
-    on = points[np.abs((points - a[best]) @ normals[best]) <= tolerance]
+    on = points[np.abs((points - a[best]) @ normals[best]) <= _TOLERANCE]
     if not normals[best].any() or len(on) < max(3, _FEWEST * len(points)):
         return None
     middle = on.mean(axis=0)
-    return _Plane(middle, np.linalg.eigh((on - middle).T @ (on - middle))[1][:, 0])
+    return middle, np.linalg.eigh((on - middle).T @ (on - middle))[1][:, 0]

@@ -38,14 +38,11 @@ class Candidates(eqx.Module):
         """
         require(callable(allowed), f"what is allowed is {shown(allowed)}; give a function of one pose")
         poses = self.poses()
-        said = [allowed(poses[index]) for index in range(self.count)]
+        said = [np.asarray(allowed(poses[index])) for index in range(self.count)]
         for truth in said:
-            array = isinstance(truth, AnyArray | np.bool_) and truth.shape == () and truth.dtype == bool
-            require(
-                array or isinstance(truth, bool),
-                f"the predicate says {shown(truth)} of a pose; it must say True or False",
-            )
-        rows = np.array(said, bool)
+            single = truth.shape == () and truth.dtype == bool
+            require(single, f"the predicate says {shown(truth)} of a pose; it must say True or False")
+        rows = np.array(said)
         require(rows.any(), f"none of {self.count} candidates is allowed: give more, or allow more")
         return GivenPoses(poses[jnp.asarray(np.flatnonzero(rows))])
 

@@ -83,7 +83,6 @@ class KnownShapes(SurfaceModel):
             require(0 <= value < math.inf, f"the {name} is {value}; it must be finite and not negative")
 
     def check(self, cloud: PointCloud) -> None:
-        """As that of the model that knows no shapes."""
         self.unknown.check(cloud)
 
     def condition(self, evidence: Evidence | PointCloud) -> SurfacePosterior:
@@ -228,8 +227,6 @@ class PlacedShapes(Fields):
     width: Float[Array, ""]
 
     def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
-        """All of them at the points x (scene coordinates)."""
-
         def one(placed, x, width):
             solid, placement = placed
             return width * jnp.tanh(placement.distance(solid, x) / width)
@@ -250,15 +247,12 @@ class MixtureFields(Fields):
     is_unknown: Bool[Array, " s"]
 
     def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
-        """All samples at the points x (scene coordinates)."""
         return self._merged(lambda fields: fields(x))
 
     def gradient(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n 3"]:
-        """The gradients of all samples at the points x."""
         return self._merged(lambda fields: fields.gradient(x), relative=False)
 
     def on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "s g g g"]:
-        """All samples on the tensor grid axis x axis x axis, each part as fast as it can be."""
         return self._merged(lambda fields: fields.on_grid(axis))
 
     def _merged(self, evaluate: Any, relative: bool = True) -> Array:

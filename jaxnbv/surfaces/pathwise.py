@@ -51,15 +51,12 @@ class FieldsAbout(Fields):
     residual: TrigonometricFields
 
     def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
-        """All samples at the points x (scene coordinates)."""
         return self.means(x) + self.residual(x)
 
     def gradient(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n 3"]:
-        """The gradients of all samples at the points x, those of the means as they give them."""
         return self.means.gradient(x) + self.residual.gradient(x)
 
     def on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "s g g g"]:
-        """All samples on the tensor grid axis x axis x axis, each part as fast as it can be."""
         return self.means.on_grid(axis) + self.residual.on_grid(axis)
 
 
@@ -79,18 +76,15 @@ class TrigonometricPosterior(SurfacePosterior):
     @on_torus
     @eqx.filter_jit
     def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """E f(x) at points in scene coordinates."""
         return self.mean_field(x)[0]
 
     @on_grid_of_torus
     @eqx.filter_jit
     def mean_on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "g g g"]:
-        """E f on the tensor grid axis x axis x axis (scene coordinates)."""
         return self.mean_field.on_grid(axis)[0]
 
     @abstractmethod
-    def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """Var f(x) at points in scene coordinates."""
+    def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]: ...
 
     @on_torus
     @eqx.filter_jit
@@ -210,8 +204,6 @@ def _sampled(
 ) -> Float[Array, "s a a a"]:
     draws = posterior.prior_draws(key, len(means.values))
     # A product by one would change how the sums it stands in are rounded.
-    return posterior.conditioned(draws if scale is None else _scaled(draws, scale), means)
-
-
-def _scaled(draws: Any, scale: Float[Array, "*s"]) -> Any:
-    return jax.tree.map(lambda draw: draw * scale.reshape(-1, *(1,) * (draw.ndim - 1)), draws)
+    if scale is not None:
+        draws = jax.tree.map(lambda draw: draw * scale.reshape(-1, *(1,) * (draw.ndim - 1)), draws)
+    return posterior.conditioned(draws, means)

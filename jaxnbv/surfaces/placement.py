@@ -117,7 +117,6 @@ class FreeRotation(ShapePoses):
         return Rotation.from_quat(np.stack([x, y, z, w], axis=1)).as_matrix()
 
     def turns(self) -> Float[np.ndarray, "3 k"]:
-        """All three."""
         return np.eye(3)
 
 
@@ -145,7 +144,6 @@ class Upright(ShapePoses):
         return Rotation.from_rotvec(angles[:, None] * self._unit).as_matrix()
 
     def turns(self) -> Float[np.ndarray, "3 k"]:
-        """The vertical."""
         return self._unit[:, None]
 
     @property
@@ -157,9 +155,7 @@ class AsGiven(ShapePoses):
     """As the bank holds it, but for shift and scale."""
 
     def rotations(self, count: int) -> Float[np.ndarray, "m 3 3"]:
-        """None but the identity."""
         return np.eye(3)[None]
 
     def turns(self) -> Float[np.ndarray, "3 k"]:
-        """None."""
         return np.zeros((3, 0))

@@ -70,7 +70,6 @@ class ScreenedSPSR(SurfaceModel):
             require(0 < value < math.inf, f"{name} is {value}; it must be positive and finite")
 
     def check(self, cloud: PointCloud) -> None:
-        """As that of the base."""
         self.base.check(cloud)
 
     def condition(self, evidence: Evidence | PointCloud) -> "ScreenedSPSRPosterior":
@@ -159,7 +158,6 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
     @on_torus
     @eqx.filter_jit
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """Var g(x) at points in scene coordinates."""
         x = jnp.asarray(x, dtype=self.weights.dtype)
         spectrum = self.model.base.spectrum
         prior = function_variance(spectrum) + self.model.level_deviation**2

@@ -90,7 +90,6 @@ class TrigonometricFields(Fields):
 
     @on_torus
     def gradient(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n 3"]:
-        """The gradients of all functions at the points x, from the coefficients of their derivatives."""
         derivatives = jnp.concatenate([differentiate(self.coefficients, axis) for axis in range(3)])
         return jnp.stack(jnp.split(TrigonometricFields(derivatives)(x), 3), axis=-1)
 

@@ -79,7 +79,6 @@ class OutsideBoundary(ValueSource):
         )
 
     def rows(self, evidence: Evidence) -> ValueRows:
-        """One row a point of the boundary."""
         points = boundary_points(self.volume, self.num_points).astype(evidence.cloud.points.dtype)
         return _rows(points, self.value, self.noise, jnp.ones(self.num_points, bool))
 
@@ -101,7 +100,6 @@ class OnSurface(ValueSource):
         _check(self.num_points, self.noise)
 
     def rows(self, evidence: Evidence) -> ValueRows:
-        """One row a point."""
         chosen = farthest_point_subsample(evidence.cloud, self.num_points)
         return _rows(chosen.points, 0.0, self.noise, chosen.mask)
 
@@ -126,7 +124,6 @@ class SeenEmpty(ValueSource):
         _check(self.num_points, self.noise)
 
     def rows(self, evidence: Evidence) -> ValueRows:
-        """One row a point."""
         empty, seen = evidence.empty_points
         mask = seen & jnp.all(jnp.abs(empty) <= HALF_WIDTH, axis=1)
         index = farthest_point_indices(empty, mask, self.num_points)
