@@ -76,7 +76,6 @@ from .search import SphereCandidates as SphereCandidates
 from .search import SpherePoses as SpherePoses
 from .search import TieBreakSearch as TieBreakSearch
 from .search import Trajectories as Trajectories
-from .search import Turntable as Turntable
 from .search import UncertaintyView as UncertaintyView
 from .studies import readers as readers
 from .studies import scenes as scenes

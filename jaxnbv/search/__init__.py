@@ -9,7 +9,6 @@ from jaxnbv.search.candidates import Candidates as Candidates
 from jaxnbv.search.candidates import GivenPoses as GivenPoses
 from jaxnbv.search.candidates import Reach as Reach
 from jaxnbv.search.candidates import SphereCandidates as SphereCandidates
-from jaxnbv.search.candidates import Turntable as Turntable
 from jaxnbv.search.discrete import DiscreteSearch as DiscreteSearch
 from jaxnbv.search.discrete import TieBreakSearch as TieBreakSearch
 from jaxnbv.search.gradient import GradientSearch as GradientSearch

@@ -81,37 +81,6 @@ class SphereCandidates(Candidates):
         return _looking(fibonacci_sphere(self.count, self.radius, self.min_elevation), self.up)
 
 
-class Turntable(Candidates):
-    """A camera that stands still before a turntable: as the object sees it, on a circle about the axis `up`.
-
-    - `count`: of positions of the table, evenly spaced.
-    - `radius`: the camera's distance from the centre of the scene, at which it looks; `elevation`: its angle above the
-      plane across `up`, in radians.
-
-    **Raises:** `ValueError` for no positions, a radius that is not positive, an elevation that is not within
-    (-pi/2, pi/2), or an `up` without direction.
-    """
-
-    count: int = eqx.field(static=True, default=36)
-    radius: float = eqx.field(static=True, default=SENSOR_RADIUS)
-    elevation: float = eqx.field(static=True, default=math.radians(30.0))
-    up: tuple[float, float, float] = eqx.field(static=True, default=(0.0, 1.0, 0.0))
-
-    def __check_init__(self):
-        check_fields(self)
-        _check_places(self.count, self.radius, self.radius, self.up)
-        require(
-            -0.5 * math.pi < self.elevation < 0.5 * math.pi,
-            f"the elevation is {self.elevation} rad; it must lie within (-pi/2, pi/2)",
-        )
-
-    def poses(self) -> Pose:
-        angle = 2.0 * np.pi * np.arange(self.count) / self.count
-        ring = np.cos(self.elevation)
-        places = np.stack([ring * np.cos(angle), np.full_like(angle, np.sin(self.elevation)), ring * np.sin(angle)], 1)
-        return _looking(self.radius * jnp.asarray(places, jnp.result_type(float)), self.up)
-
-
 class Reach(Candidates):
     """Where an arm can hold a camera that looks at the centre: between two distances and two elevations about `up`.
 

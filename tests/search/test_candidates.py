@@ -60,22 +60,6 @@ def elevations(poses, up):
     return np.arcsin(places @ np.array(up) / np.linalg.norm(places, axis=1))
 
 
-@pytest.mark.parametrize("up", [(0.0, 1.0, 0.0), UP])
-def test_a_turntable_is_a_circle_in_even_steps(up):
-    table = nbv.Turntable(8, 2.0, math.radians(25.0), up)
-    poses = table.poses()
-    places = np.asarray(poses.position, np.float64)
-    assert table.count == len(places) == 8
-    np.testing.assert_allclose(np.linalg.norm(places, axis=1), 2.0, rtol=1e-6)
-    np.testing.assert_allclose(elevations(poses, up), math.radians(25.0), atol=1e-6)
-    steps = np.linalg.norm(np.roll(places, -1, axis=0) - places, axis=1)
-    # The chord of 45 degrees on the circle of radius 2 cos 25.
-    np.testing.assert_allclose(steps, 2 * 2.0 * math.cos(math.radians(25.0)) * math.sin(math.pi / 8), rtol=1e-5)
-    np.testing.assert_allclose(poses.forward, -places / 2.0, atol=1e-6)
-    # The camera's y axis points down.
-    assert (np.asarray(poses.rotation)[:, :, 1] @ np.array(up) < -0.8).all()
-
-
 @settings(max_examples=30, deadline=None)
 @given(st.floats(0.5, 2.0), st.floats(0.0, 2.0), st.floats(-1.5, 1.4), st.floats(0.05, 1.0))
 def test_an_arm_reaches_between_its_bounds(nearest, more, low, wider):
@@ -130,7 +114,6 @@ def test_numbers_and_poses_stand_for_candidates():
         (lambda: nbv.SphereCandidates(10, math.inf), "radius is inf; it must be a finite number"),
         (lambda: nbv.SphereCandidates(10, 2.5, 2.0), "elevation is 2.0 rad"),
         (lambda: nbv.SphereCandidates(10, up=(0.0, 0.0, 0.0)), "must be a direction"),
-        (lambda: nbv.Turntable(8, 2.0, 1.6), "elevation is 1.6 rad"),
         (lambda: nbv.Reach(8, 3.0, 2.0), "distances of 3.0 to 2.0"),
         (lambda: nbv.Reach(8, min_elevation=1.0, max_elevation=0.5), "elevations are 1.0 and 0.5 rad"),
         (lambda: nbv.GivenPoses(nbv.look_at((0.0, 0.0, 2.0))), "give a batch"),
