@@ -16,7 +16,7 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.episode import observe_scene
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Evidence, SensorNoise, Surface, as_surface
-from jaxnbv.scanning.depth_noise import Noise
+from jaxnbv.scanning.scanner import Noise
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.search import Candidates, PoseSpace
 

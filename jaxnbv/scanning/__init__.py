@@ -1,8 +1,6 @@
 """Surfaces that rays can hit, and the scanner."""
 
 from jaxnbv.scanning import metrics as metrics
-from jaxnbv.scanning.depth_noise import DepthNoise as DepthNoise
-from jaxnbv.scanning.depth_noise import Noise as Noise
 from jaxnbv.scanning.evidence import EmptyPoints as EmptyPoints
 from jaxnbv.scanning.evidence import Evidence as Evidence
 from jaxnbv.scanning.free_space import Carving as Carving
@@ -18,7 +16,9 @@ from jaxnbv.scanning.mesh import mesh_from_sdf as mesh_from_sdf
 from jaxnbv.scanning.mesh_files import MeshParts as MeshParts
 from jaxnbv.scanning.mesh_files import load_mesh as load_mesh
 from jaxnbv.scanning.mesh_files import load_parts as load_parts
+from jaxnbv.scanning.scanner import DepthNoise as DepthNoise
 from jaxnbv.scanning.scanner import Hits as Hits
+from jaxnbv.scanning.scanner import Noise as Noise
 from jaxnbv.scanning.scanner import SensorNoise as SensorNoise
 from jaxnbv.scanning.scanner import Surface as Surface
 from jaxnbv.scanning.scanner import scan as scan

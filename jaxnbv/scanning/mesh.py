@@ -19,7 +19,7 @@ from jaxnbv.geometry.tensor_grid import on_tensor_grid
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.scanner import Hits, Surface
 from jaxnbv.scanning.sdf import SignedDistance
-from jaxnbv.scanning.triangles import winding_number
+from jaxnbv.scanning.sdf.sampled import winding_number
 
 
 class _Tree:

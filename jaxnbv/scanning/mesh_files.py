@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jaxnbv.checks import InputError, checked, require, shown
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.mesh import TriangleMesh
-from jaxnbv.scanning.triangles import distance_to_triangles
+from jaxnbv.scanning.sdf.sampled import distance_to_triangles
 
 # Of a PLY or OFF file: bytes that its header is shorter than.
 _HEADER = 2**16

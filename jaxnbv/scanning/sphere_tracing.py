@@ -9,8 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxnbv.checks import AnyArray, check_fields, require
-from jaxnbv.scanning.implicit import implicit_depth
-from jaxnbv.scanning.scanner import Hits, Surface
+from jaxnbv.scanning.scanner import Hits, Surface, implicit_depth
 from jaxnbv.scanning.sdf import SignedDistance
 
 # Far above the rounding of float32 distances in the scene (4e-7), far below any part worth seeing.

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, Int8
 
 from jaxnbv.geometry.volume import ray_interval
 from jaxnbv.scanning.cubic import CORNERS, cubic, first_bracket, first_root
-from jaxnbv.scanning.implicit import implicit_depth
+from jaxnbv.scanning.scanner import implicit_depth
 
 # A march goes on with an eighth of its rays once no more are under way; batches smaller than this stay together. Each
 # size is compiled: a quarter takes as long to run and a quarter longer to compile.

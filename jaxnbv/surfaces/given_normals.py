@@ -31,9 +31,8 @@ from jaxnbv.surfaces.covariance import (
     mode_variance,
     normal_covariance,
 )
-from jaxnbv.surfaces.nonuniform import NonuniformTransform
 from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, filled
-from jaxnbv.surfaces.trigonometric import solve_poisson
+from jaxnbv.surfaces.trigonometric import NonuniformTransform, solve_poisson
 
 _CHUNK_VALUES = 2**24
 _ALWAYS_WHOLE = 2048

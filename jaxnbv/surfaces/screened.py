@@ -28,10 +28,9 @@ from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import SurfaceModel, on_torus
 from jaxnbv.surfaces.covariance import function_covariance, function_variance, mode_variance
 from jaxnbv.surfaces.given_normals import GeometricSPSRPosterior, NormalDraws
-from jaxnbv.surfaces.nonuniform import NonuniformTransform
 from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, filled
 from jaxnbv.surfaces.spsr import GeometricSPSR
-from jaxnbv.surfaces.trigonometric import inverse_laplacian, solve_poisson
+from jaxnbv.surfaces.trigonometric import NonuniformTransform, inverse_laplacian, solve_poisson
 from jaxnbv.surfaces.values import OnSurface, OutsideBoundary, SeenEmpty, ValueRows, ValueSource, joined
 
 _CHUNK_VALUES = 2**24

@@ -31,8 +31,7 @@ from jaxnbv.scanning.evidence import Evidence
 from jaxnbv.surfaces.base import HALF_WIDTH, SurfaceModel
 from jaxnbv.surfaces.covariance import Scalar, Spectra, circle_spectrum
 from jaxnbv.surfaces.given_normals import GeometricSPSRPosterior, factorise, mean_at_data, reconstruct
-from jaxnbv.surfaces.nonuniform import NonuniformTransform
-from jaxnbv.surfaces.trigonometric import basis_variance
+from jaxnbv.surfaces.trigonometric import NonuniformTransform, basis_variance
 
 _SPARSE = 2.5
 # Points whose covariance is factorised: 1.1 GB in float32, and as much again while it is.

@@ -14,8 +14,7 @@ from on_grid import nodes
 
 from jaxnbv.geometry.pose import look_at
 from jaxnbv.scanning.grid import GridSurface
-from jaxnbv.scanning.implicit import implicit_depth
-from jaxnbv.scanning.scanner import scan
+from jaxnbv.scanning.scanner import implicit_depth, scan
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.scanning.sphere_tracing import SDFSurface
 from jaxnbv.search.pose_space import FreePoses

@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv.surfaces.nonuniform import NonuniformTransform
-from jaxnbv.surfaces.trigonometric import TrigonometricFields
+from jaxnbv.surfaces.trigonometric import NonuniformTransform, TrigonometricFields
 
 RNG = np.random.default_rng(0)
 

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.checks import AnyArray, as_numbers, checked, require
+from jaxnbv.errors import optional
 from jaxnbv.scanning.sdf.base import Scalar, SignedDistance, Vector, nonnegative, norm, parameter, split
-from jaxnbv.scanning.triangles import distance_to_triangles, winding_number
 
 # Of the longest side, on all sides.
 _PADDING = 0.1
@@ -104,3 +104,18 @@ def _is_inside(
 ) -> Bool[np.ndarray, " n"]:
     # Of a solid whose faces are wound the other way the number is negative.
     return np.abs(winding_number(points, vertices, faces)) > 0.5
+
+
+def distance_to_triangles(
+    points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> Float[np.ndarray, " n"]:
+    """From each point to the nearest triangle."""
+    return np.sqrt(optional("igl").point_mesh_squared_distance(points, vertices, faces)[0])
+
+
+def winding_number(
+    points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> Float[np.ndarray, " n"]:
+    """How often the triangles wind around each point (Barill et al. 2018): 1 inside a closed mesh, -1 inside one that
+    is wound inside out, between them and 0 by a small hole."""
+    return np.asarray(optional("igl").fast_winding_number(vertices, faces, points))

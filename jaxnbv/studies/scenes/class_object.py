@@ -15,7 +15,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import SDFSurface, Surface, TriangleMesh, scan
 from jaxnbv.scanning.sdf import SignedDistance, least_of_last
-from jaxnbv.scanning.triangles import distance_to_triangles
+from jaxnbv.scanning.sdf.sampled import distance_to_triangles
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.studies.scenes.labelled import LabelledSolid
 
