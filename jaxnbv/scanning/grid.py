@@ -101,8 +101,8 @@ class GridSurface(Surface):
         """First zeros along the rays inside the box; see `Surface.trace`.
 
         A hit is where the interpolant first differs in sign from its sign at the ray's start (its origin, or where it
-        enters the box), zero counted as negative. A ray that only touches the surface, a double root, may fall either
-        way by rounding. Normals are central differences interpolated linearly, so they are continuous.
+        enters the box), zero counted as negative. Normals are central differences interpolated linearly, so they are
+        continuous.
 
         Differentiable in origins, directions and values: at a hit x = o + t d the implicit function theorem gives
         dt = -(df + grad f . (do + t dd)) / (grad f . d), its denominator kept from zero where the ray grazes, so that

@@ -24,15 +24,13 @@ GRAZING = 0.2
 
 
 def coverage(views: Iterable[Any], truth: Float[AnyArray, "n 3"], size: float = 0.05) -> list[float]:
-    """Share of the true surface that has been seen after each view: of the n points of `truth`, those that a pixel of
-    this view or of one before it shows; in [0, 1].
+    """Share in [0, 1] of the n points of `truth` that a pixel of a view, or of one before it, shows; after each view.
 
     - `views`: those of an episode, or others that have a `scan`, the `camera` that took it, and the `pose`.
     - `size`: how far before or behind its pixel's hit a point may be; sensor noise is to be well below it.
 
-    Neither the number of rays nor how many points of D are kept matters. With points that are uniform by area it is a
-    share of area. Surface that no camera can see, such as the walls of a closed cavity, counts as not covered, so a
-    complete scan may stay below 1. A sheet thinner than `size` is covered from either side.
+    With points that are uniform by area it is a share of area. Surface that no camera can see, such as the walls of a
+    closed cavity, counts as not covered. A sheet thinner than `size` is covered from either side.
 
     **Raises:** `ValueError` if `truth` is empty or not finite, `size` <= 0, or a scan is no image of its camera.
     """
@@ -76,11 +74,7 @@ def shows(
 
 
 def truth_points(scene: Surface, key: PRNGKeyArray, count: int = SURFACE_POINTS) -> Float[np.ndarray, "count 3"] | None:
-    """`count` points of a known surface, uniform by area, in scene coordinates; None for a kind of surface that cannot
-    be sampled.
-
-    Meshes are sampled as they are, a signed distance on its marching-cubes mesh over the scene's grid.
-    """
+    """`count` points of the `true_mesh`, uniform by area, in scene coordinates; None where there is none."""
     mesh = true_mesh(scene)
     return None if mesh is None else mesh.sample_points(key, count)
 
@@ -116,9 +110,8 @@ class SurfaceDistance(NamedTuple):
 def surface_distance(reconstruction: Float[AnyArray, "n 3"], truth: Float[AnyArray, "m 3"]) -> SurfaceDistance:
     """Chamfer and Hausdorff distance between two surfaces, from points of each (`TriangleMesh.sample_points`).
 
-    Both are symmetric. Two samples of one surface do not coincide: n points that are uniform on an area A have a mean
-    distance of about sqrt(A / n) / 2 to another sample, which is 0.01 for 20,000 points and an area of 8, and so a
-    Chamfer distance of twice that.
+    Two samples of one surface do not coincide: n points that are uniform on an area A have a mean distance of about
+    sqrt(A / n) / 2 to another sample, and so a Chamfer distance of twice that.
 
     **Raises:** `ValueError` if either has no points, or some that are not finite.
     """

@@ -1,4 +1,5 @@
-"""Surfaces that rays can hit, and the paper's scan(theta; f): the oriented points that a depth camera sees of one."""
+"""Surfaces that rays can hit; the paper's scan(theta; f), the oriented points that a depth camera sees of one; sensors'
+noise; and how a hit moves with the ray and the surface."""
 
 import math
 from abc import abstractmethod

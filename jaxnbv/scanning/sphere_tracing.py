@@ -36,9 +36,8 @@ class SDFSurface(Surface):
     stride. A part thinner than that along a ray may be missed, and a ray that runs along a flat face at an angle of
     less than a degree may use up its 512 strides and miss.
 
-    Hits are differentiable in the rays and in the solid's parameters by the implicit function theorem,
-    dt = -(grad f . (do + t dd) + df) / (grad f . d), with the denominator held at 0.05 for grazing rays. Misses have
-    derivative zero.
+    Hits are differentiable in the rays and in the solid's parameters by `implicit_depth`, with slopes held at 0.05 for
+    grazing rays.
 
     **Raises:** `ValueError` if the bounding radius is not positive.
     """

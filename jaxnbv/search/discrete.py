@@ -29,10 +29,9 @@ class TieBreakSearch(CandidateSearch):
     """The candidate of the highest acquisition; among those that the samples cannot tell from it, the one of the
     highest second acquisition.
 
-    While nothing was seen of what matters, no sample shows it either, and a classifier or utility finds all views
-    alike: their values differ by the noise of a few samples, and the argmax is a view at random. Candidates count as
-    tied within two standard errors of the difference from the best (`Proposal.tied_with_best`), so that the second
-    decides early, and the first as soon as it tells views apart. Both are asked about the same scans.
+    While nothing was seen of what matters, no sample shows it either, and the argmax is a view at random. Candidates
+    count as tied within two standard errors of the difference from the best (`Proposal.tied_with_best`), so that the
+    second decides early, and the first as soon as it tells views apart. Both are asked about the same scans.
 
     - `second`: decides between tied candidates, such as `Coverage()`.
 

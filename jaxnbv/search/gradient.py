@@ -38,11 +38,9 @@ class GradientSearch(Search):
     - `solver`: a minimiser of Optimistix in place of Adam, such as `optimistix.BFGS(rtol=1e-4, atol=1e-4)`; the
       objective that it is given is of order 1.
 
-    Differentiation keeps what the acquisition computed for all starts and samples, with PointNet++ several gigabytes;
-    fewer starts need less.
-
     Starts, steps and rate are the paper's. It starts from six views drawn at random, evaluates no others first, and
-    returns the best final value; `num_candidates=6` comes nearest to that.
+    returns the best final value; `num_candidates=6` comes nearest to that. Differentiation keeps what the acquisition
+    computed for all starts and samples, with PointNet++ several gigabytes.
 
     **Raises:** `ValueError` for another `dof`, both `dof` and `space`, fewer candidates than starts, no starts or
     iterations, or a learning rate that is not positive; within a `Planner`, also for an acquisition that JAX cannot

@@ -25,8 +25,7 @@ class HalvingSearch(CandidateSearch):
 
     All candidates are scored on the first few posterior samples; the better half on as many again, the better half of
     these on twice as many, and so on to all S: with 16 samples and `num_first_samples` 2, 5 scores a candidate in place
-    of 16. Samples are the same for all candidates (common random numbers), so what is compared are differences between
-    poses on the same surfaces. The view is not always that of the full search.
+    of 16. The view is not always that of the full search.
 
     - `num_first_samples`: posterior samples on which every candidate is scored.
     """

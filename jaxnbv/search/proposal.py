@@ -63,8 +63,7 @@ class Proposal(eqx.Module):
 
     @property
     def num_tied(self) -> int | None:
-        """How many other candidates are tied with the best one, within two standard errors; None where that is not
-        known, as for a single sample."""
+        """How many other candidates are tied with the best one; None where that is not known."""
         tied = self.tied_with_best()
         if tied is None or bool(jnp.isnan(jnp.asarray(self.difference_errors)).any()):
             return None

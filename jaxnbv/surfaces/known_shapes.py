@@ -151,8 +151,7 @@ class KnownShapesPosterior(SurfacePosterior):
         return sorted([*known, none], key=lambda one: -one.weight)
 
     def kinds(self) -> dict[str, float]:
-        """How likely each kind of shape is, most likely first: hypotheses whose names differ by a number alone, such as
-        "chair 3" and "chair 12", are of one kind."""
+        """How likely each kind of shape is, most likely first: "chair 3" and "chair 12" are of one kind."""
         found: dict[str, float] = {}
         for one in self.hypotheses:
             kind = kind_of(one.name)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
-from jaxnbv.checks import InputError, check_type, checked, require
+from jaxnbv.checks import check_type, checked, require
 from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.surfaces.mesh_shapes import listed, mesh_paths, shapes_of_meshes
@@ -112,12 +112,8 @@ class ShapeBank(eqx.Module):
 
     @property
     def shapes(self) -> Shape:
-        """All of them.
-
-        **Raises:** `ValueError` for a bank of none.
-        """
-        if self.solids is None:
-            raise InputError("the bank has no shapes: give some to ShapeBank.of or ShapeBank.from_meshes")
+        """All of them; there are some."""
+        assert self.solids is not None
         return Shape(self.solids, self.extremes)
 
     def shape(self, index: Int[Array, "*s"]) -> Shape:
@@ -137,11 +133,9 @@ class ShapeBank(eqx.Module):
 
         **Raises:** `ValueError` for an index that it does not have.
         """
-        indices = listed(indices, "the indices")
-        for index in indices:
+        for index in listed(indices, "the indices"):
             check_type(index, int, "an index of the bank")
-        wrong = [index for index in indices if not 0 <= index < len(self)]
-        require(not wrong, f"the bank has {len(self)} shapes; there is no number {wrong[:1]}")
+            require(0 <= index < len(self), f"the bank has {len(self)} shapes; there is no number {index}")
         rows = np.asarray(indices, int)
         solids = jax.tree.map(lambda leaf: leaf[rows], self.solids) if len(rows) else None
         return ShapeBank(solids, self.extremes[rows], self.codes[rows])

@@ -7,9 +7,8 @@
     data     n_j = v(x_j) + eps_j,   eps_j ~ N(0, noise^2 I),   A = k(X, X) + noise^2 I
     sample   v_post = v + k(., X) A^-1 (n - v(X) - eps), v and eps from the prior;   f = Poisson(v_post)
 
-A sample is one function, band-limited, to be evaluated anywhere. Its prior part, its residual at the data and its
-update come from the same draw (Matheron's rule; Wilson et al. 2020), so samples have exactly the posterior's
-distribution.
+The prior part of a sample, its residual at the data and its update come from the same draw (Matheron's rule; Wilson et
+al. 2020), so samples have exactly the posterior's distribution.
 """
 
 import functools
