@@ -80,7 +80,7 @@ class Planner(eqx.Module):
 
         **Raises:** `ValueError` if the cloud is empty, if a point is not finite or outside the scene's grid, or more
         than stray ones outside the carving's volume, a normal not of unit length (to 1 %), or the scan an image of
-        another camera or from another pose; and as the acquisition's `check` does.
+        another camera; and as the acquisition's `check` does.
         """
         camera = camera or self.camera
         self.imagination.check(pose, scan, camera, first=True)

@@ -12,14 +12,14 @@ from embreex.mesh_construction import TriangleMesh as EmbreeTriangles
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
-from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, check_type, checked, is_traced, require
+from jaxnbv.checks import AnyArray, InputError, check_key, check_type, checked, is_traced, require
 from jaxnbv.errors import optional
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.scanner import Hits, Surface
 from jaxnbv.scanning.sdf import SignedDistance
-from jaxnbv.scanning.sdf.sampled import winding_number
+from jaxnbv.scanning.sdf.sampled import checked_triangles, winding_number
 
 
 class _Tree:
@@ -73,27 +73,7 @@ class TriangleMesh(Surface):
         **Raises:** `ValueError` for other shapes, no faces, indices that are not integers or out of range, vertices
         that are not finite, or no face of positive area.
         """
-        vertices = as_numbers(vertices, "the mesh's vertices", np.float64)
-        faces = as_numbers(faces, "the mesh's faces", None)
-        require(
-            faces.size > 0,
-            "the mesh has no faces: a point cloud or an empty file cannot be scanned; give a triangle mesh",
-        )
-        for name, array in (("vertices", vertices), ("faces", faces)):
-            require(array.ndim == 2 and array.shape[1] == 3, f"the mesh's {name} must be (n, 3), got {array.shape}")
-        require(faces.dtype.kind in "iu", f"faces are rows of vertex indices and must be integers, got {faces.dtype}")
-        low, high = int(faces.min()), int(faces.max())
-        require(
-            low >= 0 and high < len(vertices),
-            f"faces refer to vertices {low} to {high}, but there are {len(vertices)}, counted from 0: "
-            "renumber or drop these faces",
-        )
-        bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
-        require(
-            bad.size == 0,
-            f"{bad.size} vertices of the mesh are not finite, the first at row {bad[:1]}: "
-            "drop them and the faces that use them",
-        )
+        vertices, faces = checked_triangles(vertices, faces)
         # Half of the cross product, compared with the size of the mesh so that the unit of length does not matter.
         corners = vertices[faces]
         area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)

@@ -11,6 +11,7 @@ are refined, all at once, by Gauss-Newton steps on E with its logarithms as weig
 squares), tau falling from 0.12 to 0.03.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -86,13 +87,18 @@ class Hypotheses(eqx.Module):
     - `shape`: indices of the bank.
     - `placement`: where each stands.
     - `misfit`: E.
-    - `is_mode`: false for one that comes within 15 degrees of a better one of the same shape.
+    - `is_mode`: false for one found within 15 degrees of a better one of the same shape.
     """
 
     shape: Int[Array, " h"]
     placement: Placement
     misfit: Float[Array, " h"]
     is_mode: Bool[Array, " h"]
+
+    def best(self, count: int) -> "Hypotheses":
+        """Those of the least misfit."""
+        _, rows = jax.lax.top_k(-self.misfit, min(count, len(self.misfit)))
+        return jax.tree.map(lambda leaf: leaf[rows], self)
 
 
 class Prior(NamedTuple):
@@ -128,18 +134,6 @@ class Prior(NamedTuple):
 _PRECISION = _PRIOR * np.array([0.0] * 3 + [_SHIFT**-2] * 3 + [_STRETCH**-2 / 3.0] * 3)
 
 
-class _Starts(NamedTuple):
-    """Shapes where they are placed, and their misfits."""
-
-    shape: Int[Array, " n"]
-    placement: Placement
-    misfit: Float[Array, " n"]
-
-    def best(self, count: int) -> "_Starts":
-        _, rows = jax.lax.top_k(-self.misfit, min(count, len(self.misfit)))
-        return jax.tree.map(lambda leaf: leaf[rows], self)
-
-
 @eqx.filter_jit
 def register(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Hypotheses:
     """The shapes and placements that fit what was seen best.
@@ -151,17 +145,17 @@ def register(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Hypo
     coarse = _refined(bank, prior, turned.best(_COARSE[0]), few, _COARSE)
     fine = _refined(bank, prior, coarse.best(_FINE[0]), some, _FINE)
     others = _exchanged(bank, prior, fine, few).best(_LAST[0])
-    both = _Starts(*jax.tree.map(lambda *leaves: jnp.concatenate(leaves), fine, others))
+    both = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), fine, others)
     last = _refined(bank, prior, both.best(_LAST[0]), some, _LAST)
 
     def judge(start):
         return _misfit(bank.shape(start.shape), prior, start.placement, seen, _LAST_TAU)
 
-    found = last._replace(misfit=jax.lax.map(judge, last, batch_size=_AT_ONCE)).best(_LAST[0])
-    return Hypotheses(found.shape, found.placement, found.misfit, _modes(found.shape, found.placement.rotation))
+    found = dataclasses.replace(last, misfit=jax.lax.map(judge, last, batch_size=_AT_ONCE)).best(_LAST[0])
+    return dataclasses.replace(found, is_mode=_modes(found.shape, found.placement.rotation))
 
 
-def _turned(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> _Starts:
+def _turned(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Hypotheses:
     """All shapes in some rotations each, as they fill the box."""
     all_of_them = jnp.asarray(prior.poses.rotations(num_starts), seen.points.dtype)
     count = max(1, min(len(all_of_them), num_starts // len(bank)))
@@ -176,12 +170,13 @@ def _turned(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> _Star
     return _tried(bank, prior, starts, seen)
 
 
-def _exchanged(bank: ShapeBank, prior: Prior, first: _Starts, seen: Seen) -> _Starts:
+def _exchanged(bank: ShapeBank, prior: Prior, first: Hypotheses, seen: Seen) -> Hypotheses:
     """All shapes where a few of the best stand that are of different rotations, filling as much of the box."""
     ordered = first.best(len(first.misfit))
     mode = _modes(jnp.zeros_like(ordered.shape), ordered.placement.rotation)
-    shapes, where, _ = jax.tree.map(lambda leaf: leaf[jnp.argsort(~mode, stable=True)[:_NUM_SHARED]], ordered)
-    step = jax.vmap(lambda index, placement: prior.deviation(bank.shape(index), placement))(shapes, where)
+    few = jax.tree.map(lambda leaf: leaf[jnp.argsort(~mode, stable=True)[:_NUM_SHARED]], ordered)
+    where = few.placement
+    step = jax.vmap(lambda index, placement: prior.deviation(bank.shape(index), placement))(few.shape, where)
 
     def of_shape(shape):
         return jax.vmap(lambda one, step: prior.filling(shape, one.rotation).moved(step))(where, step)
@@ -189,7 +184,7 @@ def _exchanged(bank: ShapeBank, prior: Prior, first: _Starts, seen: Seen) -> _St
     return _tried(bank, prior, jax.vmap(of_shape)(bank.shapes), seen)
 
 
-def _tried(bank: ShapeBank, prior: Prior, placements: Placement, seen: Seen) -> _Starts:
+def _tried(bank: ShapeBank, prior: Prior, placements: Placement, seen: Seen) -> Hypotheses:
     """The misfits of each shape at its own placements, along a second axis."""
     num_shapes, count = placements.scale.shape[:2]
 
@@ -199,10 +194,11 @@ def _tried(bank: ShapeBank, prior: Prior, placements: Placement, seen: Seen) -> 
 
     misfit = jax.lax.map(of_shape, (bank.shapes, placements), batch_size=max(1, _AT_ONCE // count))
     flat = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), placements)
-    return _Starts(jnp.repeat(jnp.arange(num_shapes), count), flat, misfit.reshape(-1))
+    shape = jnp.repeat(jnp.arange(num_shapes), count)
+    return Hypotheses(shape, flat, misfit.reshape(-1), jnp.ones(len(shape), bool))
 
 
-def _refined(bank: ShapeBank, prior: Prior, starts: _Starts, seen: Seen, stage: tuple[int, int, int]) -> _Starts:
+def _refined(bank: ShapeBank, prior: Prior, starts: Hypotheses, seen: Seen, stage: tuple[int, int, int]) -> Hypotheses:
     """The best along Gauss-Newton steps, by E at the last tau, while the tau of the steps falls."""
     taus = jnp.append(jnp.geomspace(_FIRST_TAU, _LAST_TAU, stage[2]), _LAST_TAU)
     basis = jnp.asarray(prior.poses.steps, seen.points.dtype)
@@ -219,7 +215,7 @@ def _refined(bank: ShapeBank, prior: Prior, starts: _Starts, seen: Seen, stage: 
 
         state = start.placement, start.placement, jnp.asarray(jnp.inf, seen.points.dtype)
         (_, best, least), _ = jax.lax.scan(advance, state, taus)
-        return _Starts(start.shape, best, least)
+        return Hypotheses(start.shape, best, least, start.is_mode)
 
     return jax.lax.map(refine, starts, batch_size=_AT_ONCE)
 

@@ -1,5 +1,7 @@
 """Meshes as solids that can be traced within JAX: their signed distances, sampled on grids."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,20 +52,9 @@ def solid_of_mesh(
     - `sheet`: how thick faces are that have the outside on both sides; without thickness they vanish.
     - `cubic`: as many nodes along all sides, so that solids of several meshes can be stacked.
 
-    **Raises:** `ValueError` for other shapes, indices out of range, or a resolution below four.
+    **Raises:** `ValueError` for triangles as `TriangleMesh.from_arrays` does, or a resolution below four.
     """
-    vertices = as_numbers(vertices, "the mesh's vertices", np.float64)
-    faces = as_numbers(faces, "the mesh's faces", np.int64)
-    for name, array in (("vertices", vertices), ("faces", faces)):
-        require(
-            array.ndim == 2 and array.shape[1] == 3 and len(array) > 0,
-            f"the mesh's {name} must be (n, 3), got {array.shape}",
-        )
-    require(
-        faces.min() >= 0 and faces.max() < len(vertices),
-        f"faces refer to vertices {faces.min()} to {faces.max()}, but there are {len(vertices)}",
-    )
-    require(bool(np.isfinite(vertices).all()), "the mesh has vertices that are not finite")
+    vertices, faces = checked_triangles(vertices, faces)
     require(resolution >= 4, f"the resolution is {resolution}; it must be at least 4")
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     longest = float((high - low).max())
@@ -104,6 +95,32 @@ def _is_inside(
 ) -> Bool[np.ndarray, " n"]:
     # Of a solid whose faces are wound the other way the number is negative.
     return np.abs(winding_number(points, vertices, faces)) > 0.5
+
+
+def checked_triangles(vertices: Any, faces: Any) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """**Raises:** `ValueError` for what is no mesh of triangles."""
+    vertices = as_numbers(vertices, "the mesh's vertices", np.float64)
+    faces = as_numbers(faces, "the mesh's faces", None)
+    require(
+        faces.size > 0,
+        "the mesh has no faces: a point cloud or an empty file cannot be scanned; give a triangle mesh",
+    )
+    for name, array in (("vertices", vertices), ("faces", faces)):
+        require(array.ndim == 2 and array.shape[1] == 3, f"the mesh's {name} must be (n, 3), got {array.shape}")
+    require(faces.dtype.kind in "iu", f"faces are rows of vertex indices and must be integers, got {faces.dtype}")
+    low, high = int(faces.min()), int(faces.max())
+    require(
+        low >= 0 and high < len(vertices),
+        f"faces refer to vertices {low} to {high}, but there are {len(vertices)}, counted from 0: "
+        "renumber or drop these faces",
+    )
+    bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+    require(
+        bad.size == 0,
+        f"{bad.size} vertices of the mesh are not finite, the first at row {bad[:1]}: "
+        "drop them and the faces that use them",
+    )
+    return vertices, faces
 
 
 def distance_to_triangles(
