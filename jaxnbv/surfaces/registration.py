@@ -90,10 +90,10 @@ class Hypotheses(eqx.Module):
     - `is_mode`: false for one found within 15 degrees of a better one of the same shape.
     """
 
-    shape: Int[Array, " h"]
+    shape: Int[Array, "*h"]
     placement: Placement
-    misfit: Float[Array, " h"]
-    is_mode: Bool[Array, " h"]
+    misfit: Float[Array, "*h"]
+    is_mode: Bool[Array, "*h"]
 
     def best(self, count: int) -> "Hypotheses":
         """Those of the least misfit."""

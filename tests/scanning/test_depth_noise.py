@@ -54,16 +54,3 @@ def test_a_noisy_scan_is_an_image_of_the_same_rays():
     exact = nbv.DepthNoise(0.0)(seen, KEY, camera, pose)
     off = np.linalg.norm(np.asarray(exact.points)[np.asarray(exact.mask)], axis=1) - 0.8
     assert np.median(np.abs(off)) < 2e-3
-
-
-def test_an_episode_can_be_scanned_with_it(tmp_path):
-    imagination = nbv.Imagination(nbv.GeometricSPSR(0.2, truncation=5), nbv.Grid(20), num_samples=2)
-    planner = nbv.Planner(
-        nbv.Coverage(), nbv.FarthestView(5), nbv.Camera(height=16, width=16), imagination, capacity=200
-    )
-    scene, first = nbv.sdf.Sphere(0.8), nbv.look_at((0.0, 0.0, 2.5))
-    noise = nbv.DepthNoise.realsense_d435(scale=5.0)
-    episode = nbv.simulate(planner, scene, first, 2, KEY, noise, tmp_path / "ball", progress=False)
-    again = nbv.simulate(planner, scene, first, 2, KEY, noise, tmp_path / "ball", progress=False)
-    np.testing.assert_array_equal(episode.cloud.points, again.cloud.points)
-    assert int(episode.views[1].scan.count) > 10

@@ -6,12 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import trimesh
 from free_scenes import CAMERA, CENTRE, GRID, HALF, POSE, RADIUS, SEE, SOLIDS, image, in_camera, nodes_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import maximum_filter
-from scipy.spatial import cKDTree
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
@@ -24,11 +22,9 @@ from jaxnbv.scanning import (
     SDFSurface,
     SensorNoise,
     carve,
-    mesh_from_sdf,
     scan,
 )
 from jaxnbv.scanning.sdf import Capsule, Cuboid, Sphere
-from jaxnbv.studies.scenes.demo import demo_object
 
 RNG = np.random.default_rng(0)
 
@@ -109,26 +105,6 @@ def test_a_node_is_marked_only_if_all_rays_near_it_and_their_neighbours_went_on_
     assert marked.sum() > 50
     assert (seen & ~allowed).sum() > 200
     assert not (marked & ~allowed).any()
-
-
-def test_marked_nodes_are_in_view_outside_the_object_and_a_margin_from_it():
-    """The demo object: thin, hollow and full of edges. Distances are to the dense mesh that was scanned."""
-    camera, poses, nodes = Camera(height=48, width=48), look_at(fibonacci_sphere(6, 2.8)), nodes_of(GRID)
-    mesh = mesh_from_sdf(demo_object().sdf, Grid(60, 1.4))
-    empty = np.stack([SEE(Carving(), GRID, poses[i], scan(mesh, camera, poses[i]), camera) for i in range(6)])
-    for i in range(6):
-        column, row, ahead = image(nodes[empty[i]], camera, poses[i])
-        assert (ahead > 2.0 * GRID.spacing).all()
-        assert ((column > 0) & (column < camera.width) & (row > 0) & (row < camera.height)).all()
-    marked = nodes[empty.any(axis=0)]
-    assert len(marked) > 1000
-    solid = trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
-    assert solid.is_watertight
-    assert not solid.contains(marked).any()
-    distance, _ = cKDTree(solid.sample(100_000, seed=0)).query(marked)
-    # A pixel and a half at the far side of the object.
-    assert distance.min() > GRID.spacing - 1.5 * camera.fov / camera.height * 4.0
-    assert distance.min() < 3.0 * GRID.spacing
 
 
 FINE, PLAIN = Grid(40, 0.7), Camera()

@@ -104,11 +104,6 @@ def test_what_was_seen_empty_is_not_meshed():
     np.testing.assert_array_equal(whole.vertices, plain.vertices)
 
 
-def test_a_grid_that_the_surface_does_not_cross_is_refused():
-    with pytest.raises(InputError, match="no surface lies within"):
-        mean_mesh(Balls(), sphere_cloud(), nbv.Grid(8, 0.05))
-
-
 @pytest.mark.skipif(not has_poisson(), reason="pymeshlab, or the system's OpenGL library, is not installed")
 def test_poisson_reconstruction_of_a_whole_scan_is_the_surface():
     cloud = sphere_cloud()

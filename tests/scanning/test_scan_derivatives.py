@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from bumps import (
-    FEW,
     GRID,
     SMALL,
     grid_surface,
@@ -138,41 +137,6 @@ def test_grazing_and_missed_rays(name):
             assert not np.asarray(by_direction)[~mask].any()
     for a, b in zip(jax.tree.leaves(forward), jax.tree.leaves(reverse), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.slow
-def test_batches_of_surfaces_and_starts_equal_loops_forwards_and_backwards(x64):
-    """Starts within surfaces, and surfaces within starts."""
-    surfaces, starts, space = small_surfaces(RNG, 16), look_at(fibonacci_sphere(3, 2.5)), FreePoses()
-    parameters, weights = (
-        jnp.asarray(0.05 * RNG.normal(size=(3, 9))),
-        jnp.asarray(RNG.normal(size=(2, FEW.num_rays, 3))),
-    )
-
-    def seen(values, distance, start, parameters):
-        cloud = scan(GridSurface(values, distance, SMALL), FEW, space.retract(start, parameters))
-        return jnp.sum(weights[0] * cloud.points) + jnp.sum(weights[1] * cloud.normals)
-
-    @jax.jit
-    def reverse(surface, *pose):
-        return jax.value_and_grad(seen, argnums=(0, 3))(surface.values, surface.distance, *pose)
-
-    def forward(surface, *pose):
-        return jax.jacfwd(seen, argnums=3)(surface.values, surface.distance, *pose)
-
-    of_surface, of_start = (0, None, None), (None, 0, 0)
-    arguments = surfaces, starts, parameters
-    outer = jax.jit(jax.vmap(jax.vmap(reverse, of_start), of_surface))(*arguments)
-    inner = jax.jit(jax.vmap(jax.vmap(reverse, of_surface), of_start))(*arguments)
-    ahead = jax.jit(jax.vmap(jax.vmap(forward, of_start), of_surface))(*arguments)
-    assert (np.abs(ahead).max(axis=-1) > 0.1).all()
-    for i, j in np.ndindex(16, 3):
-        one = jax.tree.map(lambda leaf, i=i: leaf[i], surfaces), starts[j], parameters[j]
-        single = reverse(*one)
-        for a, b, c in zip(*map(jax.tree.leaves, (outer, inner, single)), strict=True):
-            np.testing.assert_allclose(a[i, j], c, rtol=1e-9, atol=1e-9)
-            np.testing.assert_allclose(b[j, i], c, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(ahead[i, j], single[1][1], rtol=1e-9, atol=1e-9)
 
 
 @jax.jit

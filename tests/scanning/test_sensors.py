@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from jaxnbv.checks import InputError
-from jaxnbv.geometry.pose import look_at
 from jaxnbv.scanning.sensors import HEAT_SETTING, PART_SETTING, USUAL_SETTING, fitted
 from jaxnbv.search import SphereCandidates
 
@@ -53,13 +52,3 @@ def test_both_are_taken_as_given():
 def test_cameras_within_the_object_are_refused(asked, words):
     with pytest.raises(InputError, match=words):
         fitted(USUAL_SETTING, 1.2, **asked)
-
-
-def test_from_further_away_the_same_ball_stands_under_the_angle_of_the_sine():
-    """A ray along the silhouette touches the ball: its angle with the axis is arcsin(reach / radius)."""
-    found = fitted(USUAL_SETTING, 1.0)
-    edge = look_at((0.0, 0.0, found.radius))
-    a = 0.5 * found.camera.fov
-    direction = np.asarray(edge.rotation) @ [math.sin(a), 0.0, math.cos(a)]
-    away = np.linalg.norm(np.cross(direction, np.asarray(edge.position)))
-    assert away == pytest.approx(1.05, rel=1e-5)

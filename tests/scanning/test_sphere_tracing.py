@@ -1,7 +1,5 @@
 """Sphere tracing against closed forms in float64 NumPy, and its derivatives against finite differences."""
 
-import math
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -112,59 +110,6 @@ def test_normals_of_the_sphere_are_radial_and_turned_to_the_sensor():
     np.testing.assert_allclose(inner.normals, -inner.points / 0.9, atol=2e-5)
 
 
-@pytest.mark.parametrize("name", [*SOLIDS, "mug"])
-def test_derivatives_of_hits_equal_central_differences(name):
-    with jax.enable_x64(True):
-        sdf = MUG if name == "mug" else SOLIDS[name][0]
-        sdf = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), dtype=jnp.float64), sdf)
-        o, d = (jnp.asarray(a, dtype=jnp.float64) for a in some_rays(150))
-
-        def trace(sdf, o, d):
-            hits = SDFSurface(sdf).trace(o, d)
-            return (hits.points, hits.normals), hits.mask
-
-        @jax.jit
-        def derived(at, along):
-            return jax.jvp(trace, at, along, has_aux=True)
-
-        do, dd = jnp.asarray(RNG.normal(size=(2, *o.shape)))
-        ds = jax.tree.map(lambda leaf: jnp.asarray(RNG.normal(size=leaf.shape)), sdf)
-        if name == "mug":  # A random matrix would not keep its rotations.
-            ds = jax.tree.map(jnp.zeros_like, ds)
-
-        def move(h):
-            return jax.tree.map(lambda a, b: a + h * b, (sdf, o, d), (ds, do, dd))
-
-        along, h = (ds, do, dd), 1e-5
-        (_, normals), (dx, dn), mask = derived((sdf, o, d), along)
-        (ahead, _, hit_ahead), (behind, _, hit_behind) = derived(move(h), along), derived(move(-h), along)
-        same = np.asarray(mask & hit_ahead & hit_behind)
-        facing = -np.sum(np.asarray(normals) * np.asarray(d), axis=1)
-        # Where a ray changes the face it meets there is no derivative: the differences jump.
-        smooth = np.linalg.norm(np.asarray(ahead[1] - behind[1]), axis=1) < 1e-2
-        use = same & smooth & (facing > 0.15)
-        assert use.sum() > 40
-        np.testing.assert_allclose(dx[use], (ahead[0] - behind[0])[use] / (2 * h), rtol=1e-4, atol=1e-4)
-        np.testing.assert_allclose(dn[use], (ahead[1] - behind[1])[use] / (2 * h), rtol=1e-3, atol=1e-3)
-        assert not np.asarray(dx)[~np.asarray(mask)].any()
-        assert bool(jnp.isfinite(dx).all() & jnp.isfinite(dn).all())
-
-
-def test_reverse_mode_has_no_nan_where_rays_miss():
-    o, d = some_rays(300)
-    surface = SDFSurface(MUG)
-
-    def total(surface, o):
-        hits = surface.trace(o, d)
-        return jnp.sum(hits.points**2) + jnp.sum(hits.normals[:, 0]), hits.mask
-
-    (gradient, rays), mask = jax.jit(jax.grad(total, argnums=(0, 1), has_aux=True))(surface, jnp.asarray(o))
-    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves((gradient, rays)))
-    missed = ~np.asarray(mask)
-    assert missed.any()
-    assert not np.asarray(rays)[missed].any()
-
-
 def test_vmapped_scenes_equal_single_scenes():
     sizes = jnp.asarray(RNG.uniform(0.3, 0.9, (5, 2)), dtype=jnp.result_type(float))
 
@@ -182,19 +127,6 @@ def test_vmapped_scenes_equal_single_scenes():
             assert bool((cloud.mask == alone.mask).all())
             np.testing.assert_allclose(cloud.points, alone.points, atol=1e-5)
             np.testing.assert_allclose(cloud.normals, alone.normals, atol=1e-4)
-
-
-def test_no_recompilation_for_other_solids_of_the_same_make():
-    traces = []
-
-    @jax.jit
-    def run(surface, pose):
-        traces.append(None)
-        return scan(surface, Camera(height=8, width=8), pose).mask
-
-    for radius in (0.5, 0.7):
-        run(SDFSurface(Sphere(radius) | Cuboid([radius, 0.2, 0.3])), look_at([0.0, math.sqrt(2.0), 2.0 * radius]))
-    assert len(traces) == 1
 
 
 def test_normals_on_flat_faces_survive_compilation():

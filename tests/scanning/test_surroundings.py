@@ -24,7 +24,6 @@ from jaxnbv.search import (
     FarthestView,
     GivenPoses,
     GradientSearch,
-    HalvingSearch,
     RandomView,
     SphereCandidates,
 )
@@ -167,20 +166,6 @@ def test_an_episode_stands_and_sees_above_the_table():
     below = np.asarray(TABLED.search.candidates.poses().position)[:, 1] < -0.2
     for view in episode.views[1:]:
         assert np.isneginf(np.asarray(view.proposal.values)[below]).all()
-
-
-@pytest.mark.parametrize("search", [DiscreteSearch(40), HalvingSearch(40)])
-def test_no_camera_stands_too_near_to_what_was_seen(search):
-    """Of candidates at two distances only the far ones are open: the near ones are within the clearance of the ball."""
-    near, far = SphereCandidates(20, radius=1.1).poses(), SphereCandidates(20, radius=2.5).poses()
-    both = jax.tree.map(lambda *rows: jnp.concatenate(rows), near, far)
-    planner = planner_of(type(search)(both), Surroundings(clearance=0.5), capacity=400)
-    evidence = planner.init(POSES[2], scan(BALL, planner.camera, POSES[2]))
-    values = np.asarray(planner.propose(evidence, KEY).values)
-    points = evidence.cloud.to_numpy()[0]
-    distance = np.linalg.norm(np.asarray(both.position)[:, None] - points[None], axis=-1).min(axis=1)
-    np.testing.assert_array_equal(np.isneginf(values), distance < 0.5)
-    assert 0 < (distance < 0.5).sum() < 20
 
 
 @pytest.mark.slow

@@ -49,16 +49,6 @@ def test_sample_mean_and_joint_covariance_equal_weight_space(noise):
     assert scipy.stats.chi2.sf(np.sum(lower**2), 55) > 1e-4
 
 
-def test_samples_are_reproducible_and_distinct():
-    rng = np.random.default_rng(0)
-    posterior = GeometricSPSR(**SETTINGS).condition(padded(*rng.uniform(-1, 1, (2, 12, 3)), np.arange(12), 16))
-    x = jnp.asarray(rng.uniform(-1.5, 1.5, (5, 3)), jnp.float32)
-    first, again, other = (posterior.sample(jax.random.key(seed), 6)(x) for seed in (0, 0, 1))
-    assert bool((first == again).all())
-    assert not bool(jnp.isclose(first, other).any())
-    assert len(np.unique(np.asarray(first)[:, 0])) == 6
-
-
 @pytest.mark.slow
 def test_posterior_is_calibrated():
     """Simulation-based calibration (Talts et al. 2018). 1,200 problems drawn from the prior in weight space: normals of

@@ -108,22 +108,6 @@ def test_modes_of_one_shape_are_far_apart(planted):
         assert np.all(np.diff(np.asarray(found.misfit)) >= 0)
 
 
-def test_another_library_moves_a_refined_pose_no_further(planted):
-    """Generalised ICP (small_gicp) from the shape's surface, where it was placed, to the scan."""
-    gicp = pytest.importorskip("small_gicp", reason="small_gicp is not installed")
-    for index, rotation, *_, found in planted[:4]:
-        placed = jax.tree.map(lambda rows: np.asarray(rows[0], np.float64), found.placement)
-        mesh = nbv.mesh_from_sdf(corner(ARMS[int(found.shape[0])]), nbv.Grid(120, 2.0))
-        own = mesh.frame.to_world(mesh.sample_points(jax.random.key(0), 4000))
-        shape = (placed.scale * own) @ placed.rotation.T + placed.shift
-        solid, *_ = filling(corner(ARMS[index]), rotation, BANK, index)
-        scan = evidence_of(nbv.SDFSurface(solid), AROUND).cloud.to_numpy()[0]
-        result = gicp.align(shape, scan.astype(np.float64), registration_type="GICP", downsampling_resolution=0.02)
-        assert result.converged
-        assert np.degrees(Rotation.from_matrix(result.T_target_source[:3, :3]).magnitude()) < 2.0
-        assert np.linalg.norm(result.T_target_source[:3, 3]) < 0.04
-
-
 def test_a_symmetric_shape_stands_in_all_the_ways_that_look_alike():
     """A bar that was seen from above: it may be turned by half a turn."""
     bank = nbv.ShapeBank.of([Cuboid([1.2, 0.3, 0.4])])
@@ -150,16 +134,6 @@ def test_what_was_seen_empty_is_among_what_shapes_are_fitted_to():
 def test_shapes_of_a_kind_differ_by_their_number():
     kinds = {"chair 3": "chair", "office chair 12": "office chair", "chair": "chair", "arm 0.5": "arm 0.5", " 7": " 7"}
     assert {name: kind_of(name) for name in kinds} == kinds
-
-
-def test_every_shape_is_tried_once_where_there_are_fewer_starts_than_shapes():
-    """Four, refined, and once more in each of the four places where these came to stand."""
-    nothing = Seen(
-        jnp.zeros((256, 3)), jnp.zeros((256, 3)), jnp.zeros(256, bool), jnp.zeros((512, 3)), jnp.zeros(512, bool)
-    )
-    fewest = nbv.KnownShapes(BANK, num_starts=1).num_starts
-    found = eqx.filter_eval_shape(register, BANK, Prior(nbv.FreeRotation(), nbv.Box()), nothing, fewest)
-    assert found.shape.shape == (4 + 4 * 4,)
 
 
 def model(bank=BANK, **changed):

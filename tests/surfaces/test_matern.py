@@ -1,7 +1,5 @@
 """The Matern spectrum on the circle against its lattice sum, and its kernel against the Matern kernel on the line."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from weight_space import lattice_spectrum
@@ -36,17 +34,3 @@ def test_kernel_is_the_matern_kernel_of_the_line_wrapped_around_the_circle(x64, 
     turns = np.zeros(1) if lengthscale < 0.1 else np.arange(-30, 31)
     on_line = MATERN[nu](np.abs(t[:, None] / (2 * np.pi) + turns) / lengthscale).sum(axis=1)
     np.testing.assert_allclose(kernel, variance * on_line / on_line[0], atol=2e-5)
-
-
-@pytest.mark.parametrize("nu", SMOOTHNESS)
-@pytest.mark.parametrize("lengthscale", [0.005, 0.1, 1.0])
-def test_gradient_in_the_lengthscale_equals_finite_differences(nu, lengthscale):
-    """Float32 derivatives against central differences of the float64 lattice sum."""
-    gradient = jax.jacfwd(lambda scale: circle_spectrum(nu, scale, 0.7, 50))(jnp.float32(lengthscale))
-    backward = jax.jacrev(lambda scale: circle_spectrum(nu, scale, 0.7, 50))(jnp.float32(lengthscale))
-    step = 1e-4 * lengthscale
-    higher, lower = (lattice_spectrum(nu, lengthscale + sign * step, 0.7, 50) for sign in (1, -1))
-    expected = (higher - lower) / (2 * step)
-    tolerance = 1e-4 * np.abs(expected).max()
-    np.testing.assert_allclose(gradient, expected, atol=tolerance)
-    np.testing.assert_allclose(backward, expected, atol=tolerance)

@@ -147,14 +147,6 @@ def test_means_of_zero_give_the_very_numbers_of_samples_about_none(kind, scale):
     assert bool((about(x) == plain(x)).all())
 
 
-@BOTH
-def test_a_mean_of_zero_gives_the_posterior_mean(x64, kind):
-    posterior = make(kind, "two scales").condition(cloud())
-    mean = posterior.mean(QUERIES)
-    about = mean_about(posterior, Zeros(2))(QUERIES)
-    np.testing.assert_allclose(about, jnp.stack([mean, mean]), atol=1e-12 * float(jnp.abs(mean).max()))
-
-
 def test_automatic_gradients_equal_those_by_hand(x64):
     expected = np.stack([exact(s, QUERIES)[1] for s in range(3)])
     found = bumps().gradient(QUERIES)

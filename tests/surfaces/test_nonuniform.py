@@ -56,30 +56,6 @@ def test_transform_and_adjoint_equal_direct_sums(truncation, dtype, tolerance):
     assert abs(left - right) < (1e-13 if dtype == np.float64 else 1e-6) * scale
 
 
-def test_gradients_through_the_window_equal_finite_differences_of_the_function(x64):
-    """d/dx of `evaluate`, and of `adjoint` paired with coefficients, against differences of the direct evaluation."""
-    truncation, h = 6, 1e-5
-    modes = 2 * truncation + 1
-    points = RNG.uniform(-1.5, 1.5, (12, 3))
-    coefficients = jnp.asarray(RNG.standard_normal((1, modes, modes, modes)))
-    values = RNG.standard_normal((12, 1))
-    field = TrigonometricFields(coefficients)
-
-    def forward(x):
-        return jnp.vdot(NonuniformTransform(x, truncation).evaluate(coefficients), values)
-
-    def backward(x):
-        return jnp.vdot(NonuniformTransform(x, truncation).adjoint(jnp.asarray(values)), coefficients)
-
-    expected = np.zeros((12, 3))
-    for axis in range(3):
-        step = h * np.eye(3)[axis]
-        expected[:, axis] = values[:, 0] * np.asarray(field(points + step) - field(points - step))[0] / (2 * h)
-    for function in (forward, backward):
-        gradient = jax.jit(jax.grad(function))(jnp.asarray(points))
-        np.testing.assert_allclose(gradient, expected, atol=1e-6 * np.abs(expected).max())
-
-
 def test_gradients_on_nodes_and_borders_are_those_of_the_function():
     """A point on a node has a window that ends exactly on its last node, where the square root starts."""
     nodes = -np.pi / 2 + np.pi / 12 * np.arange(13)

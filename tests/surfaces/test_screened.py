@@ -127,36 +127,11 @@ def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
         assert not np.asarray(SeenEmpty(30).rows(evidence).mask).any()
 
 
-def test_a_cloud_alone_is_evidence_of_which_nothing_was_seen_empty():
-    data, model = sphere(20), ScreenedSPSR(GeometricSPSR(0.1, truncation=3))
-    alone, of_evidence = (model.condition(seen).mean(QUERIES) for seen in (data, Evidence.before_views(data, 2, None)))
-    assert bool((alone == of_evidence).all())
-
-
 def test_rows_beyond_the_data_are_not_filled():
     data = sphere(20)
     rows = OnSurface(30).rows(Evidence.of(data))
     assert np.asarray(rows.mask).sum() == 20
     assert len(np.unique(np.asarray(rows.points)[:20], axis=0)) == 20
-
-
-def test_a_flat_patch_fills_less_of_the_volume_once_its_boundary_is_outside():
-    """From a flat patch alone the far field stands at the level, so that about half of it is inside."""
-    side = np.linspace(-0.5, 0.5, 12)
-    u, v = (a.reshape(-1) for a in np.meshgrid(side, side))
-    points = np.stack([u, v, np.zeros_like(u)], axis=1)
-    data = PointCloud.from_arrays(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)))
-    base = GeometricSPSR(0.02, truncation=16)
-    corner = Box.cube(2.0)
-    far = RNG.uniform(-1.25, 1.25, (400, 3))
-    far = far[np.abs(far).max(axis=1) > 1.0]
-
-    def inside(model):
-        posterior = model.condition(data)
-        return float((posterior.sample(jax.random.key(0), 32)(far) < posterior.level).mean())
-
-    assert inside(base) > 0.3
-    assert inside(ScreenedSPSR(base, (OutsideBoundary(corner, 100),))) < 0.15
 
 
 def test_the_posterior_is_differentiable_in_the_data(x64):

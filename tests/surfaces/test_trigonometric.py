@@ -49,19 +49,6 @@ def test_ways_to_the_gradient_agree(x64):
         np.testing.assert_allclose(derivative, central, atol=1e-6)
 
 
-def test_jit_grad_and_vmap_go_through_fields():
-    fields = TrigonometricFields(jnp.asarray(COEFFICIENTS[0], jnp.float32))
-    x = jnp.asarray(POINTS, jnp.float32)
-    values = fields(x)
-    np.testing.assert_allclose(jax.jit(lambda fields, x: fields(x))(fields, x), values, atol=1e-4)
-    np.testing.assert_allclose(
-        jax.vmap(fields)(x.reshape(4, 5, 3)).transpose(1, 0, 2).reshape(3, 20), values, atol=1e-4
-    )
-    gradient = jax.jit(jax.grad(lambda x: jnp.sum(fields(x)[1])))(x)
-    expected = [direct(np.asarray(differentiate(fields.coefficients, d)), POINTS)[1] for d in range(3)]
-    np.testing.assert_allclose(gradient.T, expected, atol=1e-3)
-
-
 def test_poisson_solution_has_the_divergence_as_laplacian_and_mean_zero(x64):
     """Laplacian f = div v at points, the derivatives by central differences of values; h^2 L^2 / 12 is 1.3e-6."""
     v = COEFFICIENTS[:1]
