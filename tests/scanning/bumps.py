@@ -43,13 +43,6 @@ def small_surfaces(rng, count):
     return GridSurface.from_values(values, 0.0, SMALL)
 
 
-def some_rays(rng, count, spread=0.7):
-    origins = rng.normal(size=(count, 3))
-    origins *= 2.5 / np.linalg.norm(origins, axis=1, keepdims=True)
-    directions = rng.uniform(-spread, spread, (count, 3)) - origins
-    return jnp.asarray(origins), jnp.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
-
-
 def rough_values(grid, seed, amplitude):
     """A sphere with smoothed noise, of several cells' wavelength."""
     noise = np.random.default_rng(seed).standard_normal((grid.resolution,) * 3)
@@ -57,10 +50,32 @@ def rough_values(grid, seed, amplitude):
     return np.linalg.norm(nodes(grid.axis), axis=-1) - 0.9 + amplitude * noise / noise.std()
 
 
-def random_rays(seed, count, radius=2.5, spread=1.0):
-    rng = np.random.default_rng(seed)
+def random_rays(rng, count, radius=2.5, spread=1.0, dtype=np.float32):
+    """From places on a sphere towards places in a cube; `rng` may be a seed."""
+    rng = np.random.default_rng(rng)
     origins = rng.standard_normal((count, 3))
     origins *= radius / np.linalg.norm(origins, axis=1, keepdims=True)
     directions = rng.uniform(-spread, spread, (count, 3)) - origins
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return origins.astype(np.float32), directions.astype(np.float32)
+    return origins.astype(dtype), directions.astype(dtype)
+
+
+def sphere_hit(o, d, radius):
+    """How far along rays a ball about the origin is met, from outside or within, in float64; infinite where not."""
+    o, d = o.astype(float), d.astype(float)
+    b = np.sum(o * d, axis=1)
+    squared = b**2 - np.sum(o**2, axis=1) + radius**2
+    root = np.sqrt(np.maximum(squared, 0))
+    t = np.where(-b - root > 0, -b - root, -b + root)
+    return np.where((squared > 0) & (t > 0), t, np.inf)
+
+
+def box_hit(o, d, half):
+    """As of a ball, and the outward normal there."""
+    o, d = o.astype(float), d.astype(float)
+    a, b = (-half - o) / d, (half - o) / d
+    near, far = np.minimum(a, b), np.maximum(a, b)
+    enter, leave = near.max(axis=1), far.min(axis=1)
+    t = np.where(enter > 0, enter, leave)
+    normal = -np.sign(d) * (np.arange(3) == near.argmax(axis=1)[:, None])
+    return np.where((enter < leave) & (t > 0), t, np.inf), normal

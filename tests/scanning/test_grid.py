@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 import scipy.ndimage
-from bumps import GRID, random_rays, rough_values
+from bumps import GRID, box_hit, random_rays, rough_values
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from on_grid import nodes
@@ -66,10 +66,8 @@ def test_box_closed_form():
     outside = np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0)
     origins, directions = random_rays(1, 4000, spread=0.6)
     hits = GridSurface.from_values(outside, 0.0, GRID).trace(origins, directions)
-    o, d = origins.astype(np.float64), directions.astype(np.float64)
-    near = np.minimum((-half - o) / d, (half - o) / d)
-    t, axis = near.max(axis=1), near.argmax(axis=1)
-    expected = o + t[:, None] * d
+    t, normal = box_hit(origins, directions, half)
+    expected = origins + t[:, None] * directions.astype(np.float64)
     assert np.asarray(hits.mask).all()
     error = np.linalg.norm(np.asarray(hits.points) - expected, axis=1)
     # The distance is linear around a face, so interpolation is exact two voxels away from the edges.
@@ -77,7 +75,6 @@ def test_box_closed_form():
     face = margin > 2 * GRID.spacing
     assert face.sum() > 1000
     assert error[face].max() < 1e-5 / 0.2
-    normal = -np.sign(d[np.arange(len(d)), axis])[:, None] * np.eye(3)[axis]
     # Central differences reach a voxel further out, and as far inwards, where another face may be the nearest.
     face = margin > 4 * GRID.spacing
     np.testing.assert_allclose(np.asarray(hits.normals)[face], normal[face], atol=1e-4)

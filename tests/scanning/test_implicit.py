@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from bumps import FEW, GRID, grid_surface, solid, some_bumps, some_rays
+from bumps import FEW, GRID, grid_surface, random_rays, solid, some_bumps
 from jax.scipy.ndimage import map_coordinates
 from on_grid import nodes
 
@@ -58,7 +58,7 @@ def test_gradients_of_depths_equal_those_of_optimistix(name, x64):
     bumps = some_bumps(RNG)
     function = {"waves": bumps, "solid": solid(), "grid": Interpolant(bumps(jnp.asarray(nodes(GRID.axis))))}[name]
     surface = SDFSurface(solid()) if name == "solid" else grid_surface(bumps, GRID)
-    origins, directions = some_rays(RNG, 60)
+    origins, directions = map(jnp.asarray, random_rays(RNG, 60, spread=0.7, dtype=float))
     hits = surface.trace(origins, directions)
     use = np.asarray(hits.mask) & (-np.sum(hits.normals * directions, axis=1) > 0.2)
     origins, directions = origins[use], directions[use]

@@ -7,21 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from bumps import box_hit, random_rays
 
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.mesh import TriangleMesh, mesh_from_sdf
-from jaxnbv.scanning.mesh_files import load_mesh
+from jaxnbv.scanning.mesh_files import load_mesh, load_parts
 from jaxnbv.scanning.sdf import Cuboid, Sphere, Torus
 
 SHARED = Path(__file__).parents[3] / "shared" / "meshes"
 RNG = np.random.default_rng(1)
-
-
-def some_rays(count):
-    origins = RNG.normal(size=(count, 3))
-    origins *= 2.5 / np.linalg.norm(origins, axis=1, keepdims=True)
-    directions = RNG.uniform(-0.8, 0.8, (count, 3)) - origins
-    return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 def moller_trumbore(vertices, faces, o, d):
@@ -49,7 +43,7 @@ SHAPES = {
 @pytest.mark.parametrize("name", SHAPES)
 def test_hits_equal_moller_trumbore(name):
     mesh = TriangleMesh.from_arrays(SHAPES[name].vertices + 7.0, SHAPES[name].faces)
-    o, d = some_rays(500)
+    o, d = random_rays(RNG, 500, spread=0.8, dtype=float)
     hits = mesh.trace(o, d)
     t = moller_trumbore(mesh.vertices, mesh.faces, o, d)
     mask = np.asarray(hits.mask)
@@ -65,17 +59,13 @@ def test_hits_of_a_box_equal_the_closed_form():
     mesh = TriangleMesh.from_arrays(SHAPES["box"].vertices, SHAPES["box"].faces)
     half = np.array([0.5, 1.25, 0.75])
     np.testing.assert_allclose(np.abs(mesh.vertices), np.broadcast_to(half, (8, 3)))
-    o, d = some_rays(2000)
+    o, d = random_rays(RNG, 2000, spread=0.8, dtype=float)
     hits = mesh.trace(o, d)
-    low, high = (-half - o) / d, (half - o) / d
-    enter, leave = np.minimum(low, high), np.maximum(low, high)
-    t = enter.max(axis=1)
-    expected = t < leave.min(axis=1)
+    t, normal = box_hit(o, d, half)
     mask = np.asarray(hits.mask)
-    assert (mask != expected).mean() < 0.002
-    use = mask & expected
+    assert (mask != np.isfinite(t)).mean() < 0.002
+    use = mask & np.isfinite(t)
     np.testing.assert_allclose(np.asarray(hits.points)[use], (o + t[:, None] * d)[use], atol=1e-6)
-    normal = -np.sign(d) * (np.arange(3) == enter.argmax(axis=1)[:, None])
     assert (np.linalg.norm(np.asarray(hits.normals) - normal, axis=1)[use] < 1e-6).mean() > 0.998
 
 
@@ -84,7 +74,7 @@ def test_normals_face_the_sensor_for_any_winding_and_open_sheets():
     flip = RNG.random(len(sphere.faces)) < 0.5
     faces = np.where(flip[:, None], sphere.faces[:, ::-1], sphere.faces)
     straight = TriangleMesh.from_arrays(sphere.vertices, sphere.faces)
-    o, d = some_rays(500)
+    o, d = random_rays(RNG, 500, spread=0.8, dtype=float)
     expected, hits = straight.trace(o, d), TriangleMesh.from_arrays(sphere.vertices, faces).trace(o, d)
     np.testing.assert_allclose(hits.points, expected.points, atol=1e-6)
     np.testing.assert_allclose(hits.normals, expected.normals, atol=1e-6)
@@ -106,7 +96,7 @@ def test_frame_and_unused_vertices():
 
 def test_tracing_under_jit_names_the_remedy():
     mesh = TriangleMesh.from_arrays(SHAPES["box"].vertices, SHAPES["box"].faces)
-    o, d = (jnp.asarray(a, dtype=jnp.result_type(float)) for a in some_rays(3))
+    o, d = (jnp.asarray(a, dtype=jnp.result_type(float)) for a in random_rays(RNG, 3))
     for call in (lambda: jax.jit(lambda o, d: mesh.trace(o, d))(o, d), lambda: jax.jit(lambda m: m.trace(o, d))(mesh)):
         with pytest.raises(ValueError, match="solid_of_mesh"):
             call()
@@ -243,3 +233,50 @@ def test_a_ball_contains_what_is_nearer_than_its_radius_however_it_is_wound(outw
     distance = np.linalg.norm(points, axis=1)
     clear = np.abs(distance - 1.25) > 0.02
     np.testing.assert_array_equal(mesh.contains(points)[clear], distance[clear] < 1.25)
+
+
+# A slab that stands on a post: the whole is 4 wide and 3 high.
+BOXES = {"post": ((0.0, 1.0, 0.0), (1.0, 2.0, 1.0)), "slab": ((0.5, 2.5, 0.0), (4.0, 1.0, 2.0))}
+
+
+def saved(path, boxes=BOXES):
+    scene = trimesh.Scene()
+    for name, (center, extents) in boxes.items():
+        placed = trimesh.transformations.translation_matrix(center)
+        scene.add_geometry(trimesh.creation.box(extents), node_name=name, transform=placed)
+    scene.export(path)
+    return path
+
+
+def box_distance(x, center, extents):
+    """From points to the surface of a box."""
+    beyond = np.abs(x - center) - 0.5 * np.asarray(extents)
+    outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
+    return np.where((beyond <= 0).all(axis=-1), -beyond.max(axis=-1), outside)
+
+
+def test_parts_are_the_nodes_where_the_whole_has_them(tmp_path):
+    found = load_parts(saved(tmp_path / "table.glb"))
+    whole = load_mesh(tmp_path / "table.glb")
+    assert found.names == ("post", "slab")
+    joined = np.concatenate([part.vertices for part in found.parts])
+    np.testing.assert_allclose(np.sort(joined, axis=0), np.sort(found.mesh.vertices, axis=0), atol=1e-6)
+    np.testing.assert_array_equal(found.mesh.vertices, whole.vertices)
+    # Longest side 4, now 2.5; the box around both is centred at (0.5, 1.5, 0).
+    expected = (np.array([0.0, 1.0, 0.0]) - [0.5, 1.5, 0.0]) * 2.5 / 4
+    np.testing.assert_allclose(found.parts[0].vertices.mean(axis=0), expected, atol=1e-6)
+
+
+def test_distances_are_those_from_each_box(tmp_path):
+    grid = Grid(9, 1.4)
+    distances = np.asarray(load_parts(saved(tmp_path / "table.glb")).distances(grid))
+    nodes = np.stack(np.meshgrid(grid.axis, grid.axis, grid.axis, indexing="ij"), axis=-1)
+    for distance, (center, extents) in zip(distances, BOXES.values(), strict=True):
+        expected = box_distance(nodes, (np.array(center) - [0.5, 1.5, 0.0]) * 0.625, np.array(extents) * 0.625)
+        np.testing.assert_allclose(distance, expected, atol=1e-5)
+
+
+def test_a_file_of_one_node_has_no_parts(tmp_path):
+    path = saved(tmp_path / "slab.glb", {"slab": BOXES["slab"]})
+    with pytest.raises(ValueError, match=r"slab\.glb has one node"):
+        load_parts(path)

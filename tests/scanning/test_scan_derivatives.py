@@ -16,10 +16,10 @@ from bumps import (
     GRID,
     SMALL,
     grid_surface,
+    random_rays,
     small_surfaces,
     solid,
     some_bumps,
-    some_rays,
 )
 
 from jaxnbv.geometry.camera import Camera
@@ -150,7 +150,9 @@ def traced(weights, surface, origins, directions):
 
 @pytest.mark.parametrize("axes", [(0, 0, 0), (0, None, None), (None, 0, None)])
 def test_every_way_to_batch_fields_and_rays_equals_a_loop(axes, x64):
-    origins, directions = (rays + 0.05 * RNG.normal(size=(4, 30, 3)) for rays in some_rays(RNG, 30))
+    origins, directions = (
+        rays + 0.05 * RNG.normal(size=(4, 30, 3)) for rays in random_rays(RNG, 30, spread=0.7, dtype=float)
+    )
     weights = jnp.asarray(RNG.normal(size=(2, 30, 3)))
     # What is not batched is the first of the batch.
     given = [

@@ -1,4 +1,4 @@
-"""The ascent on acquisitions in closed form: known maxima, Adam by hand, ties, degenerate starts, bad settings."""
+"""Gradient searches on acquisitions in closed form: Adam by hand, ties, degenerate starts, bad settings."""
 
 import jax
 import jax.numpy as jnp
@@ -6,12 +6,10 @@ import numpy as np
 import optax
 import optimistix as optx
 import pytest
-from small_problem import propose
+from small_problem import problem_of, propose, visit
 
 from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
-from jaxnbv.scanning import Evidence
 from jaxnbv.search import ConstrainedPoses, FreePoses, GradientSearch, Problem, SpherePoses
 from jaxnbv.tasks import Coverage
 
@@ -30,12 +28,11 @@ class Known(Problem):
         return 5.0 - jnp.sum((poses.position - self.place) ** 2 + (poses.forward - self.gaze) ** 2, axis=-1)[None]
 
 
-def known(kind=Known, pose=None, place=(0.9, -1.1, 1.4), gaze=(-0.6, 0.0, -0.8)):
-    """The problem, with a pose that has been visited, if one is given."""
-    cloud = PointCloud(jnp.zeros((1, 3)), jnp.zeros((1, 3)), jnp.zeros(1, bool))
-    visited = Pose(np.eye(3)[None], np.zeros((1, 3))) if pose is None else pose[None]
-    evidence = Evidence(cloud, visited, jnp.asarray(0 if pose is None else 1))
-    return kind(evidence, Camera(), Coverage(), None, jnp.asarray(place), jnp.asarray(gaze))
+def known(kind=Known, *poses):
+    """The problem, with poses that have been visited."""
+    problem = problem_of(None)
+    place, gaze = jnp.asarray((0.9, -1.1, 1.4)), jnp.asarray((-0.6, 0.0, -0.8))
+    return kind(visit(problem, *poses).evidence, Camera(), Coverage(), None, place, gaze)
 
 
 SOLVERS = {"Adam": None, "BFGS": optx.BFGS(rtol=1e-4, atol=1e-4), "NonlinearCG": optx.NonlinearCG(rtol=1e-4, atol=1e-4)}

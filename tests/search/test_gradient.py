@@ -1,4 +1,4 @@
-"""Gradient searches: known maxima, bookkeeping, constraints, scans that see nothing, bad input."""
+"""Gradient searches: known maxima, bookkeeping, scans that see nothing, Adam by hand, degenerate starts, bad input."""
 
 import equinox as eqx
 import jax
