@@ -11,9 +11,9 @@ import pytest
 from jaxtyping import Array, Float
 from scipy.stats import chi2
 from weight_space import JointWeightSpace, WeightSpace
+from weight_space import cloud as padded
 
 from jaxnbv.errors import InputError
-from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.surfaces import Fields, GeometricSPSR, ScreenedSPSR, ValueRows, ValueSource
 
 RNG = np.random.default_rng(0)
@@ -59,10 +59,8 @@ class Given(ValueSource):
         return ValueRows(*arrays, jnp.arange(13) < 12)
 
 
-def cloud(capacity=27, dtype=None):
-    pad = ((0, capacity - len(POINTS)), (0, 0))
-    arrays = (jnp.asarray(np.pad(a, pad), dtype) for a in (POINTS, NORMALS))
-    return PointCloud(*arrays, jnp.arange(capacity) < len(POINTS))
+def cloud(dtype=None):
+    return padded(POINTS, NORMALS, 27, dtype)
 
 
 def make(kind, scales, noise=0.2):

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 import scipy.stats
 from jaxtyping import Array, Float
-from weight_space import WeightSpace
+from weight_space import WeightSpace, ball, cloud
 
 from jaxnbv.errors import InputError
-from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.surfaces import Fields, GeometricSPSR, OnSurface, OutsideBoundary, ScreenedSPSR, SurfacePosterior
 
 RNG = np.random.default_rng(0)
@@ -18,16 +17,10 @@ X = RNG.uniform(-1.4, 1.4, (40, 3)).astype(np.float32)
 AXIS = np.linspace(-1.0, 1.2, 5, dtype=np.float32)
 
 
-def sphere(count=40):
-    points = RNG.standard_normal((count, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    return PointCloud.from_arrays(0.7 * points, points, capacity=count + 8)
-
-
 def test_the_probability_of_being_inside_is_the_share_of_the_samples_that_are():
     """1,500 samples at 40 points, within 4.5 standard errors and the rounding of a share."""
     values = OutsideBoundary(num_points=40), OnSurface(20)
-    posterior = ScreenedSPSR(GeometricSPSR(0.05, truncation=6, noise=0.1), values).condition(sphere())
+    posterior = ScreenedSPSR(GeometricSPSR(0.05, truncation=6, noise=0.1), values).condition(ball(RNG, 40))
     assert posterior.has_closed_forms
     count, probability = 1500, np.asarray(posterior.probability_inside(X), np.float64)
     share = np.mean(posterior.sample(jax.random.key(1), count)(X) < posterior.level, axis=0)
@@ -39,9 +32,7 @@ def test_the_probability_of_being_inside_is_the_share_of_the_samples_that_are():
 def test_the_probability_of_being_inside_is_that_of_weight_space(x64):
     settings = {"lengthscale": 0.1, "variance": 0.8, "noise": 0.2, "nu": 1.5, "truncation": 3}
     points, normals = RNG.uniform(-1.0, 1.0, (20, 3)), RNG.standard_normal((20, 3))
-    posterior = GeometricSPSR(**settings).condition(
-        PointCloud(jnp.asarray(points), jnp.asarray(normals), jnp.ones(20, bool))
-    )
+    posterior = GeometricSPSR(**settings).condition(cloud(points, normals))
     x = np.asarray(X, np.float64)
     mean, covariance = WeightSpace(**settings).posterior(points, normals, np.concatenate([x, points]))
     level = mean[len(x) :].mean()

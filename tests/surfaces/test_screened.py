@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from weight_space import JointWeightSpace, WeightSpace
+from weight_space import JointWeightSpace, WeightSpace, ball, cloud
 
 from jaxnbv import (
     Box,
@@ -14,7 +14,6 @@ from jaxnbv import (
     InputError,
     OnSurface,
     OutsideBoundary,
-    PointCloud,
     ScreenedSPSR,
     SeenEmpty,
 )
@@ -39,12 +38,6 @@ class Given(ValueSource):
         return ValueRows(self.points, self.values, self.noise, jnp.arange(len(self.values)) < len(self.values) - 1)
 
 
-def cloud(points, normals, capacity):
-    pad = ((0, capacity - len(points)), (0, 0))
-    arrays = (jnp.asarray(np.pad(a, pad)) for a in (points, normals))
-    return PointCloud(*arrays, jnp.arange(capacity) < len(points))
-
-
 def problem(hyperparameters, capacity=27):
     at = RNG.uniform(-1.2, 1.2, (13, 3))
     values, noise = RNG.standard_normal(13), RNG.uniform(0.1, 1.0, 13)
@@ -65,14 +58,8 @@ def test_posterior_equals_one_regression_of_normals_and_values(x64, hyperparamet
     np.testing.assert_allclose(posterior.variance(QUERIES), np.diag(covariance), atol=1e-9 * covariance.max())
 
 
-def sphere(count):
-    points = RNG.standard_normal((count, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    return PointCloud.from_arrays(0.7 * points, points, capacity=count + 16)
-
-
 def test_the_unit_of_values_is_half_the_rise_of_the_mean_across_the_data():
-    data, base = sphere(60), GeometricSPSR(0.03, truncation=8)
+    data, base = ball(RNG, 60), GeometricSPSR(0.03, truncation=8)
     posterior = ScreenedSPSR(base, offset=0.2).condition(data)
     mean, (points, normals) = base.condition(data).mean, data.to_numpy()
     rise = np.asarray(mean(points + 0.2 * normals) - mean(points - 0.2 * normals))
@@ -81,7 +68,7 @@ def test_the_unit_of_values_is_half_the_rise_of_the_mean_across_the_data():
 
 
 def test_values_are_reached_where_they_are_said_to_be():
-    data = sphere(80)
+    data = ball(RNG, 80)
     posterior = ScreenedSPSR(
         GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8),
         (OutsideBoundary(num_points=60, noise=0.02), OnSurface(30, noise=0.02)),
@@ -97,7 +84,7 @@ def test_values_are_reached_where_they_are_said_to_be():
 def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
     """Nodes half a unit to the side of a scanned ball; a tenth of a unit from them, and far away. The corners of the
     grid, which lie outside the scene, were seen too."""
-    data, grid = sphere(80), Grid(20)
+    data, grid = ball(RNG, 80), Grid(20)
     axis = np.asarray(grid.axis)
     nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
     is_beside = np.linalg.norm(nodes - [0.0, 1.2, 0.0], axis=-1) < 0.4
@@ -128,14 +115,14 @@ def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
 
 
 def test_rows_beyond_the_data_are_not_filled():
-    data = sphere(20)
+    data = ball(RNG, 20)
     rows = OnSurface(30).rows(Evidence.of(data))
     assert np.asarray(rows.mask).sum() == 20
     assert len(np.unique(np.asarray(rows.points)[:20], axis=0)) == 20
 
 
 def test_the_posterior_is_differentiable_in_the_data(x64):
-    data, model = sphere(20), ScreenedSPSR(GeometricSPSR(0.1, truncation=3), (OutsideBoundary(num_points=20),))
+    data, model = ball(RNG, 20), ScreenedSPSR(GeometricSPSR(0.1, truncation=3), (OutsideBoundary(num_points=20),))
 
     def mean(shift):
         moved = eqx.tree_at(lambda c: c.points, data, data.points + shift)

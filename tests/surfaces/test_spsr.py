@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from weight_space import WeightSpace
+from weight_space import WeightSpace, cloud
 
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.surfaces import GeometricSPSR
@@ -14,13 +14,6 @@ RNG = np.random.default_rng(0)
 POINTS, NORMALS = RNG.uniform(-1.3, 1.3, (30, 3)), RNG.standard_normal((30, 3))
 QUERIES = np.concatenate([POINTS[:4], RNG.uniform(-1.5, 1.5, (12, 3))])
 SETTINGS = {"lengthscale": 0.1, "variance": 0.8, "noise": 0.2, "nu": 1.5, "truncation": 4}
-
-
-def cloud(points, normals, capacity=None, dtype=None):
-    """Normals as they are: `from_arrays` would scale them to unit length."""
-    pad = ((0, (capacity or len(points)) - len(points)), (0, 0))
-    arrays = (jnp.asarray(np.pad(a, pad), dtype) for a in (points, normals))
-    return PointCloud(*arrays, jnp.arange(capacity or len(points)) < len(points))
 
 
 @pytest.mark.parametrize(

@@ -4,13 +4,30 @@ Over the half H of the integer lattice whose first component that is not zero is
 
     v_d(x) = sqrt(s(0)) w_d0 + sum_{n in H} sqrt(2 s(n)) (w_dn cos(n.x) + w'_dn sin(n.x)),   f(x) = sum_d Psi_d(x) w_d
 
-where Psi_d solves Laplacian f = dv_d/dx_d mode by mode. Shares no code, basis or kernel with the package.
+where Psi_d solves Laplacian f = dv_d/dx_d mode by mode. Shares no code, basis or kernel with the package. And clouds.
 """
 
 import functools
 import math
 
+import jax.numpy as jnp
 import numpy as np
+
+from jaxnbv.geometry.cloud import PointCloud
+
+
+def cloud(points, normals, capacity=None, dtype=None):
+    """Normals as they are: `from_arrays` would scale them to unit length."""
+    pad = ((0, (capacity or len(points)) - len(points)), (0, 0))
+    arrays = (jnp.asarray(np.pad(a, pad), dtype) for a in (points, normals))
+    return PointCloud(*arrays, jnp.arange(capacity or len(points)) < len(points))
+
+
+def ball(rng, count):
+    """Points of a ball of 0.7, in a cloud with rows to spare."""
+    points = rng.standard_normal((count, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return PointCloud.from_arrays(0.7 * points, points, capacity=count + 16)
 
 
 @functools.cache
