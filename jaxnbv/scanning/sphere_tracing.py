@@ -132,34 +132,33 @@ class _March(eqx.Module):
     f: Float[Array, " n"]
     alive: Bool[Array, " n"]
 
-    def distance(self, sdf: SignedDistance, depth: Float[Array, " n"]) -> Float[Array, " n"]:
-        return sdf(self.origins + depth[:, None] * self.directions)
-
 
 def _advance(sdf: SignedDistance, march: _March, count, enough: int):
     """Stride on until at most `enough` rays are alive or `_MAX_STRIDES` are used up; also the number of strides."""
-    origins, directions = march.origins, march.directions
+    along = _Along(sdf, march.origins, march.directions)
 
     def body(carry):
         count, before, f_before, depth, f, alive = carry
         further = depth + jnp.maximum(jnp.abs(f), _SHORTEST_STRIDE)
         before, f_before = jnp.where(alive, depth, before), jnp.where(alive, f, f_before)
-        depth, f = jnp.where(alive, further, depth), jnp.where(alive, march.distance(sdf, further), f)
+        depth, f = jnp.where(alive, further, depth), jnp.where(alive, along(further), f)
         return count + 1, before, f_before, depth, f, alive & (march.side * f > 0) & (depth < march.leave)
 
     carry = (count, march.before, march.f_before, march.depth, march.f, march.alive)
     count, *rest = jax.lax.while_loop(lambda c: (c[0] < _MAX_STRIDES) & (jnp.sum(c[-1]) > enough), body, carry)
-    return _March(origins, directions, march.side, march.leave, *rest), count
+    return _March(march.origins, march.directions, march.side, march.leave, *rest), count
 
 
 def _refine(sdf: SignedDistance, march: _March) -> Float[Array, " n"]:
     """The root within the last stride, by regula falsi; the bracket is short, so a few chords reach rounding error."""
 
+    along = _Along(sdf, march.origins, march.directions)
+
     def chord(_, bracket):
         low, f_low, high, f_high = bracket
         drop = f_low - f_high
         root = low + (high - low) * f_low / jnp.where(drop == 0, 1.0, drop)
-        f = march.distance(sdf, root)
+        f = along(root)
         ahead = march.side * f > 0
         low, f_low = jnp.where(ahead, root, low), jnp.where(ahead, f, f_low)
         high, f_high = jnp.where(ahead, high, root), jnp.where(ahead, f_high, f)

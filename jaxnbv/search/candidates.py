@@ -142,11 +142,8 @@ class GivenPoses(Candidates):
 
 def _check_places(number: int, nearest: float, farthest: float, up: tuple[float, float, float]) -> None:
     require(number >= 1, f"the search has {number} candidates; it needs at least one")
-    sphere = f"the candidates have a radius of {nearest}; it must be positive"
-    shell = (
-        f"the candidates have distances of {nearest} to {farthest}; they must be positive, the second not the smaller"
-    )
-    require(0 < nearest <= farthest < math.inf, sphere if nearest == farthest else shell)
+    away = nearest if nearest == farthest else f"{nearest} to {farthest}"
+    require(0 < nearest <= farthest < math.inf, f"the candidates stand {away} away; give scene units, above 0")
     require(0 < math.hypot(*up) < math.inf, f"up is {up}; it must be a direction, such as (0, 1, 0)")
 
 

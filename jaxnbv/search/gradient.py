@@ -69,7 +69,9 @@ class GradientSearch(Search):
         solver: optx.AbstractMinimiser | None = None,
         candidates: Candidates | Pose | None = None,
     ):
-        self.space = _pose_space(dof, space)
+        require(dof is None or space is None, f"both dof={dof} and space={space} were given: give one of them")
+        require(dof in (None, 2, 6), f"dof is {dof}; it must be 2 or 6 (or give a space)")
+        self.space = space or (FreePoses() if dof == 6 else SpherePoses())
         self.num_starts, self.iterations, self.learning_rate = num_starts, iterations, learning_rate
         self.solver = solver
         self.candidates = None if candidates is None else as_candidates(candidates)
@@ -158,8 +160,6 @@ class HybridSearch(GradientSearch):
 
     Steps are fewer and longer. The candidates are not turned: on the sphere they are those of a `DiscreteSearch` with
     as many, so the value found is never below its.
-
-    **Raises:** `ValueError` as `GradientSearch` does.
     """
 
     turned: ClassVar[bool] = False
@@ -176,12 +176,3 @@ class HybridSearch(GradientSearch):
         candidates: Candidates | Pose | None = None,
     ):
         super().__init__(dof, space, num_starts, iterations, learning_rate, num_candidates, solver, candidates)
-
-
-def _pose_space(dof: int | None, space: PoseSpace | None) -> PoseSpace:
-    """The space that is meant by the number of degrees of freedom, by default 2, or that was given."""
-    if space is not None:
-        require(dof is None, f"both dof={dof} and space={space} were given: give one of them")
-        return space
-    require(dof in (None, 2, 6), f"dof is {dof}; it must be 2 or 6 (or give a space)")
-    return FreePoses() if dof == 6 else SpherePoses()

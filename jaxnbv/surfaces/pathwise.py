@@ -97,10 +97,7 @@ class TrigonometricPosterior(SurfacePosterior):
 
     @sampler
     def sample(self, key: PRNGKeyArray, num_samples: int) -> TrigonometricFields:
-        """`num_samples` joint samples of f by pathwise conditioning: functions, to be evaluated anywhere.
-
-        **Raises:** `ValueError` if `num_samples` < 1.
-        """
+        """`num_samples` joint samples of f by pathwise conditioning: functions, to be evaluated anywhere."""
         about_zero = _at_data(_Zeros(num_samples), self.data_points())
         return TrigonometricFields(_sampled(self, key, about_zero, None))
 
