@@ -6,12 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from on_grid import balls
 
 import jaxnbv as nbv
 from jaxnbv.scanning.metrics import coverage, truth_points
 from jaxnbv.scanning.sdf import Sphere
-from jaxnbv.studies.scenes.demo import demo_object
 
 RADIUS, AWAY = 0.8, 2.5
 BALL = nbv.SDFSurface(Sphere(RADIUS))
@@ -86,8 +84,3 @@ def test_truth_of_a_mesh_is_sampled_by_area():
     points = truth_points(mesh, jax.random.key(1), 2000)
     share = np.mean(points[:, 2] > 0)
     assert abs(share - 0.8) < 4 * np.sqrt(0.8 * 0.2 / 2000)
-
-
-def test_other_surfaces_have_no_truth():
-    assert truth_points(balls(nbv.Grid(8), [1.0]), jax.random.key(0)) is None
-    assert len(truth_points(demo_object(), jax.random.key(0), 10)) == 10
