@@ -143,17 +143,6 @@ def test_evidence_of_another_kind_of_planner_is_refused():
                 use(used_by, evidence)
 
 
-def test_what_was_seen_empty_stays_so():
-    planner = planner_of()
-    evidence = planner.init(POSES[0], scan(SOLIDS["ball"], planner.camera, POSES[0]))
-    blind = scan(SOLIDS["ball"], planner.camera, POSES[1])
-    blind = PointCloud(blind.points, blind.normals, blind.mask & False, blind.missed & False)
-    np.testing.assert_array_equal(planner.observe(evidence, POSES[1], blind).seen_empty, evidence.seen_empty)
-    both = np.asarray(after_both_sides(planner, SOLIDS["ball"]).seen_empty)
-    assert both[np.asarray(evidence.seen_empty)].all()
-    assert both.sum() > evidence.seen_empty.sum()
-
-
 SHEET = SDFSurface(Cuboid([0.6, 0.6, 0.01]))
 ABOVE_AND_BELOW = [look_at((0.0, 0.0, 2.5)), look_at((0.0, 0.0, -2.5))]
 

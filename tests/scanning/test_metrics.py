@@ -75,12 +75,3 @@ def test_truth_of_a_solid_lies_on_its_surface():
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), 0.8, atol=2e-3)
     # Uniform by area: the height on a sphere is uniform, with a standard error of 0.8 / sqrt(3 * 500) = 0.021.
     assert abs(points[:, 1].mean()) < 4 * 0.021
-
-
-def test_truth_of_a_mesh_is_sampled_by_area():
-    # Two triangles in planes apart, of areas 1/2 and 2: 80 % of the points lie on the large one.
-    vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 1], [0, 2, 1]]
-    mesh = nbv.TriangleMesh.from_arrays(np.array(vertices, float), np.array([[0, 1, 2], [3, 4, 5]]))
-    points = truth_points(mesh, jax.random.key(1), 2000)
-    share = np.mean(points[:, 2] > 0)
-    assert abs(share - 0.8) < 4 * np.sqrt(0.8 * 0.2 / 2000)

@@ -138,24 +138,7 @@ def planner_of(search, surroundings=None, capacity=256):
     return Planner(Coverage(), search, Camera(height=12, width=12), imagination, capacity=capacity, max_views=6)
 
 
-# Of both tests of the table, so that its samples are drawn by one program.
 TABLED = planner_of(DiscreteSearch(40), Surroundings((TABLE,), clearance=0.3))
-
-
-def test_imagined_surfaces_end_at_the_table():
-    evidence = TABLED.init(POSES[2], scan(BALL, TABLED.camera, POSES[2]))
-    values = np.asarray(TABLED.imagination.sample(evidence, KEY).values)
-    below = np.asarray(TABLED.imagination.grid.axis) < -0.5 - 1e-6
-    assert (values[:, :, below] > 0).all()
-    assert (values < 0).any()
-
-
-def test_views_are_worth_what_the_obstacles_leave_to_see():
-    """A candidate behind the wall sees nothing of the object; its mirror image, where no wall is, does."""
-    places = np.array([[2.4, 0.1, 0.0], [0.0, 2.4, 0.1], [-2.4, 0.1, 0.0]])
-    planner, first = planner_of(DiscreteSearch(GivenPoses(look_at(places))), Surroundings((WALL,))), POSES[2]
-    proposal = planner.propose(planner.init(first, scan(BALL, planner.camera, first)), KEY)
-    np.testing.assert_array_equal(np.asarray(proposal.values) > 0, [False, True, True])
 
 
 def test_an_episode_stands_and_sees_above_the_table():

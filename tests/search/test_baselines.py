@@ -111,15 +111,6 @@ def test_the_threshold_of_the_transmittance_by_thin_rings_of_samples():
     np.testing.assert_allclose(value, 0.7, atol=1.1 * GRID.spacing)
 
 
-def test_rays_that_stay_open_are_certain_and_rays_of_some_end_where_the_box_does():
-    asked = problem(np.zeros((0, 3)), balls(GRID, [0.5, 0.5], np.array([[0.0, 0.0, 0.0], [1.1, 0.0, 0.0]])))
-    poses = look_at(jnp.array([[0.0, 0.0, 2.5], [0.0, 2.5, 1.7], [1.1, 0.0, 2.5]]), target=(0.0, 0.0, 0.0))
-    past = eqx.tree_at(lambda p: p.rotation, poses, jnp.broadcast_to(look_at((0.0, 0.0, 1.0)).rotation, (3, 3, 3)))
-    # Down the z axis one of two samples is hit at z = 0.5, the other stays open to the box's end at z = -1.75.
-    expected = [0.5 + GRID.half_extent, 0.0, 0.5 + GRID.half_extent]
-    np.testing.assert_allclose(uncertain_length(asked, past), expected, atol=1.1 * GRID.spacing)
-
-
 def test_a_ray_that_meets_a_look_on_the_boxes_face_is_still_open():
     """The first look lies exactly on the face at z = 1, where interpolation has a neighbour only on one side."""
     grid = Grid(5, 1.0)

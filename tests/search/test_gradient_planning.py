@@ -115,14 +115,6 @@ def test_a_score_without_gradient_is_refused_at_once(score):
     planner_of(DiscreteSearch(), score)
 
 
-def test_a_score_that_fails_by_itself_says_so():
-    def wrong(cloud):
-        raise ValueError("no such thing")
-
-    with pytest.raises(ValueError, match=r"^no such thing"):
-        planner_of(GradientSearch(), ExpectedUtilityImprovement(wrong))
-
-
 @pytest.mark.parametrize(
     "space",
     [SpherePoses(), *(pytest.param(space, marks=pytest.mark.slow) for space in (FreePoses(), ConstrainedPoses()))],

@@ -55,16 +55,6 @@ def test_rotations_come_back():
     np.testing.assert_allclose(FROM_6D(columns), rotations, atol=5e-7)
 
 
-def test_batches_of_any_rank_equal_single_ones():
-    columns = RNG.normal(size=(2, 5, 6)).astype(np.float32)
-    together = rotation_from_6d(columns)
-    assert together.shape == (2, 5, 3, 3)
-    for i, j in np.ndindex(2, 5):
-        np.testing.assert_allclose(together[i, j], rotation_from_6d(columns[i, j]), atol=1e-6)
-    a, b = units(10).reshape(2, 5, 3), units(10).reshape(2, 5, 3)
-    np.testing.assert_allclose(rotation_between(a, b)[1, 3], rotation_between(a[1, 3], b[1, 3]), atol=1e-6)
-
-
 def test_random_columns_against_gram_schmidt_in_double_precision():
     columns = RNG.normal(size=(5000, 6)).astype(np.float32)
     a, b = np.split(columns.astype(np.float64), 2, axis=-1)

@@ -145,14 +145,6 @@ def test_means_of_zero_give_the_very_numbers_of_samples_about_none(kind, scale):
     assert bool((about(x) == plain(x)).all())
 
 
-def test_automatic_gradients_equal_those_by_hand(x64):
-    expected = np.stack([exact(s, QUERIES)[1] for s in range(3)])
-    found = bumps().gradient(QUERIES)
-    assert found.shape == (3, 12, 3)
-    np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
-    np.testing.assert_allclose(jax.jit(lambda f, x: f.gradient(x))(bumps(), QUERIES), expected, atol=1e-12)
-
-
 def test_gradients_and_grids_of_samples_about_functions_are_those_of_their_values(x64):
     """Gradients against central differences, h^2 / 6 of a third derivative of order L^2; nodes against points."""
     posterior = make("screened", "two scales").condition(cloud())
@@ -164,20 +156,6 @@ def test_gradients_and_grids_of_samples_about_functions_are_those_of_their_value
     axis = np.linspace(-1.3, 1.1, 5)
     nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     np.testing.assert_allclose(fields.on_grid(axis).reshape(3, -1), fields(nodes), atol=1e-12)
-
-
-@BOTH
-def test_the_whole_may_be_compiled(x64, kind):
-    model, means, axis = make(kind, "one scale"), bumps(), np.linspace(-1.0, 1.0, 4)
-
-    def values(data, means, key, scale):
-        return model.condition(data).sample_about(means, key, scale).on_grid(axis)
-
-    arguments = cloud(), means, jax.random.key(0), jnp.array([0.3, 1.0, 0.0])
-    expected = values(*arguments)
-    np.testing.assert_allclose(
-        jax.jit(values)(*arguments), expected, rtol=0, atol=1e-10 * float(jnp.abs(expected).max())
-    )
 
 
 class Balls(Fields):

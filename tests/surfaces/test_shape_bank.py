@@ -1,7 +1,5 @@
 """Banks of known shapes: of solids, and of meshes as they come."""
 
-import warnings
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -40,12 +38,6 @@ def test_extremes_of_analytic_shapes_are_their_corners():
     for half, points in zip(([1.0, 0.5, 0.25], [0.3, 0.6, 0.9]), np.asarray(bank.extremes), strict=True):
         np.testing.assert_allclose(points.max(axis=0), half, atol=2e-3)
         np.testing.assert_allclose(points.min(axis=0), -np.asarray(half), atol=2e-3)
-
-
-def test_extremes_of_a_ball_are_spread_over_it():
-    """Along the gradient a point goes straight to the middle."""
-    (points,) = np.asarray(nbv.ShapeBank.of([Sphere(0.7)]).extremes)
-    np.testing.assert_allclose(points, 0.7 * np.asarray(nbv.fibonacci_sphere(128)), atol=2e-3)
 
 
 def test_a_bank_gives_back_its_shapes_and_names():
@@ -128,14 +120,6 @@ def test_a_full_disk_costs_no_shape(tmp_path, monkeypatch):
     monkeypatch.setattr(mesh_shapes.np, "savez_compressed", refuse)
     with pytest.warns(UserWarning, match="not kept for the next time .No space left"):
         assert len(bank_of(ball(tmp_path / "ball.ply"), resolution=16)) == 1
-
-
-def test_meshes_of_one_resolution_share_their_shapes(tmp_path):
-    trimesh.creation.box((1.0, 0.2, 0.4)).export(tmp_path / "box.ply")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        bank = bank_of(ball(tmp_path / "ball.ply"), tmp_path / "box.ply", resolution=24)
-    assert bank.shapes.solid.values.shape == (2, 24, 24, 24)
 
 
 @pytest.mark.parametrize(

@@ -190,16 +190,6 @@ def test_points_where_functions_only_repeat_are_refused():
         assert np.isfinite(ask(near)).all()
 
 
-@pytest.mark.parametrize("double", [False, True])
-def test_points_on_the_border_of_the_scene_are_accepted(double):
-    with jax.enable_x64(double):
-        points = np.concatenate([POINTS[2:], np.pi / 2 * np.array([[1, -1, 1], [-1, 0, 0]])])
-        normals = np.concatenate([NORMALS[2:], [[1.0, 0, 0], [0, 1, 0]]])
-        posterior = GeometricSPSR(**SETTINGS).condition(cloud(points, normals))
-        mean, _ = WeightSpace(**SETTINGS).posterior(points, normals, QUERIES)
-        np.testing.assert_allclose(posterior.mean(QUERIES), mean, atol=1e-3)
-
-
 @pytest.mark.parametrize("count", [1, 10, 11, 29, 40])
 def test_a_large_capacity_gives_what_its_filled_rows_give(x64, monkeypatch, count):
     """Of a capacity above the limit a share of the rows is worked on, the leading ones: a quarter of 40 are 10."""
