@@ -33,8 +33,7 @@ class Carving(eqx.Module):
       two.
 
     So a sheet thinner than a voxel keeps its surface, though both its sides were seen; noise on a hit does not carve
-    while its standard deviation is below a third of the margin; and nothing is concluded beside a silhouette, where a
-    ray that hit is among the neighbours.
+    while its standard deviation is below a third of the margin.
 
     **Raises:** `ValueError` if the margin is below half a voxel or not finite.
     """

@@ -25,9 +25,8 @@ _OPPOSITE, _THIN_SHARE = -0.8, 0.05
 class Grid(eqx.Module):
     """The regular grid of `resolution`^3 nodes that spans [-half_extent, half_extent]^3 of the scene.
 
-    The defaults are the paper's: 100^3 nodes on [-1.75, 1.75]^3. Surfaces are known by their values at the nodes: a
-    part thinner than a cell, `spacing`, may lie between them and be missed, as a slab one cell thick is at a sixth of
-    all offsets. Take a finer grid for thin things.
+    The defaults are the paper's: 100^3 nodes on [-1.75, 1.75]^3. A part thinner than a cell, `spacing`, may lie between
+    the nodes and be missed: take a finer grid for thin things.
     """
 
     resolution: int = eqx.field(static=True, default=100)

@@ -62,7 +62,10 @@ class SensorNoise(eqx.Module):
     def __check_init__(self):
         check_fields(self)
         deviations = f"{self.points} and {self.normals}"
-        require(min(self.points, self.normals) >= 0, f"the noise's standard deviations are {deviations}, below 0")
+        require(
+            min(self.points, self.normals) >= 0,
+            f"the noise's standard deviations are {deviations}; they must not be negative",
+        )
 
     def __call__(
         self, cloud: PointCloud, key: PRNGKeyArray, camera: Camera | None = None, pose: Pose | None = None

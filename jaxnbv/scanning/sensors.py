@@ -1,5 +1,4 @@
-"""The authors' sensors: which camera each task has, and how far from the object's centre it stands; and the same camera
-where an object fits its image."""
+"""The authors' sensors: which camera each task has and how far away it stands; and the same where an object fits in."""
 
 import dataclasses
 import math

@@ -109,8 +109,8 @@ def best_unvisited(
 ) -> Proposal:
     """The candidate of the highest value among those that are open; the first of them where values tie.
 
-    `tie`: the relative difference within which they do, by default what sums differ by that are added in another order,
-    on another number of cores. `scores`: those whose means the values are, for their standard errors.
+    `tie`: the relative difference within which they do, by default what sums in another order differ by. `scores`:
+    those whose means the values are, for their standard errors.
     """
     values = jnp.where(problem.is_closed(candidates), -jnp.inf, values)
     index = first_best(values, tie)
@@ -122,7 +122,7 @@ def best_unvisited(
 
 
 def first_best(values: Float[Array, " candidates"], tie: float = _TIE) -> Int[Array, ""]:
-    """Index of the highest value, the first of them where values tie, as of `best_unvisited`."""
+    """Index of the highest value, ties as of `best_unvisited`."""
     best = jnp.max(values)
     # Nothing ties with an infinite value, and NaN is told of by the planner.
     tied = values >= best - jnp.where(jnp.isfinite(best), tie * jnp.abs(best), 0.0)

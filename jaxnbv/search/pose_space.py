@@ -47,9 +47,8 @@ class PoseSpace(eqx.Module):
 class SpherePoses(PoseSpace):
     """2-DOF: on the sphere of a radius about the origin, looking at it.
 
-    The parameters (3,) are added to the unit vector from the origin to the start, and the sum is normalised:
-    every direction can be reached. The camera does not roll, so that nothing singular happens at the poles; how its
-    image stands depends on where it started. A start at another radius is moved to this one.
+    The parameters (3,) are added to the unit vector from the origin to the start, and the sum is normalised. The camera
+    does not roll, so that nothing singular happens at the poles. A start at another radius is moved to this one.
 
     **Raises:** `ValueError` unless the radius is positive and finite.
     """
@@ -102,10 +101,9 @@ class ConstrainedPoses(PoseSpace):
       and outside any object: corners of the scene's cube are 2.17 away.
     - `off_axis`: greatest angle between the optical axis and the direction to the origin, in radians.
 
-    All parameters lead to poses that obey, so that no step of an optimiser has to be taken back. The parameters (8,):
-    of the direction from the origin, as in `SpherePoses` (3); of the distance (1) and of where the origin stands in
-    the image (2), each mapped into its range by s / sqrt(1 + s^2); and of the roll, added to (cos, sin) = (1, 0) and
-    normalised (2). A start that does not obey, or stands on the limit, is moved just inside.
+    All parameters (8,) lead to poses that obey: of the direction from the origin, as in `SpherePoses` (3); of the
+    distance (1) and of where the origin stands in the image (2), each mapped into its range by s / sqrt(1 + s^2); and
+    of the roll, added to (cos, sin) = (1, 0) and normalised (2). A start that does not obey is moved just inside.
 
     **Raises:** `ValueError` unless 0 < nearest < farthest and 0 < off_axis < pi / 2.
     """

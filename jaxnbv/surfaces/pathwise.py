@@ -109,10 +109,9 @@ class TrigonometricPosterior(SurfacePosterior):
         values less those of m_s. With a mean of zero it is that of `sample` under the same key.
 
         The samples are relative to the level of this posterior, whatever that of the mean is: a surface is where
-        `fields(x) == posterior.level`. Where the level is the mean of E f over the data, each mean function has its
-        own; where it is a part of f with a distribution, it is drawn with the sample.
+        `fields(x) == posterior.level`.
 
-        - `means`: any functions, which need not be band-limited nor periodic; differentiable once.
+        - `means`: any functions, differentiable once.
         - `noise_scale`: rho, one number or one for each mean function. The samples' deviation from their mean is rho
           times that of the posterior; 0 gives E f about each m_s, whatever the key.
 

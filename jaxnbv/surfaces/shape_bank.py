@@ -34,7 +34,7 @@ class ShapeBank(eqx.Module):
     """Known shapes, each in a frame of its own about its middle, in which shapes of a kind stand alike.
 
     - `solids`: all of them as one, whose arrays have a leading axis of shapes; None for a bank of none.
-    - `extremes`: points of each surface, among them those that are farthest in any direction, nearly.
+    - `extremes`: of each, as of a `Shape`.
     - `codes`: their names in UTF-8. No program that is compiled depends on them.
 
     **Raises:** `ValueError` for another number of names than of shapes.
