@@ -127,22 +127,6 @@ def test_the_model_is_told_of_what_was_seen_empty_within_the_volume():
     np.testing.assert_allclose(level, 1000.0 * len(points) + np.abs(points).max(), rtol=1e-4)
 
 
-def test_evidence_of_another_kind_of_planner_is_refused():
-    planner, raw = planner_of(), planner_of(carving=None)
-    finer = dataclasses.replace(planner, imagination=dataclasses.replace(planner.imagination, grid=Grid(31)))
-    scans = scan(SOLIDS["ball"], raw.camera, POSES[0])
-    for made_by, used_by in ((raw, planner), (planner, finer)):
-        evidence = made_by.init(POSES[0], scans)
-        for use in (
-            lambda p, e: p.observe(e, POSES[0], scans),
-            lambda p, e: p.propose(e, jax.random.key(0)),
-            lambda p, e: p.imagination.sample(e, jax.random.key(0)),
-            lambda p, e: p.imagination.posterior(e),
-        ):
-            with pytest.raises(ValueError, match="make it with the init of the planner that it is given to"):
-                use(used_by, evidence)
-
-
 SHEET = SDFSurface(Cuboid([0.6, 0.6, 0.01]))
 ABOVE_AND_BELOW = [look_at((0.0, 0.0, 2.5)), look_at((0.0, 0.0, -2.5))]
 
