@@ -1,6 +1,6 @@
 """p(f | D) under `GeometricSPSR`: its closed forms, and what is drawn and solved for its samples.
 
-    factor   A = k(X, X) + noise^2 I = C C^T
+    factor   A = k(X, X) + noise^2 I = C C^T; of more points than `MOST_FACTORISED` A^-1 is by conjugate gradients
     mean     Poisson(k(., X) A^-1 n)
     sample   Poisson(v + k(., X) A^-1 (n - v(X) - eps)), v and eps from the prior
 
@@ -15,10 +15,11 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
+from jax.scipy.linalg import cho_solve, solve_triangular
+from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.checks import AnyArray
+from jaxnbv.checks import AnyArray, InputError
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import on_torus
@@ -34,8 +35,12 @@ from jaxnbv.surfaces.covariance import (
 from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, filled
 from jaxnbv.surfaces.trigonometric import NonuniformTransform, solve_poisson
 
+MOST_FACTORISED = 16384
+"""The capacity up to which A is factorised: 1.1 GB in float32, and as much again while it is."""
+
 _CHUNK_VALUES = 2**24
 _ALWAYS_WHOLE = 2048
+_MOST_PRODUCTS = 2000
 
 
 def factorise(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Float[Array, "n n"]:
@@ -65,6 +70,26 @@ def _on_filled_rows(cloud: PointCloud, leading: Callable[[int], Float[Array, "*o
     )
 
 
+def by_conjugate_gradients(
+    rows: Float[Array, "s n 3"], cloud: PointCloud, spectrum: Spectra, noise: Scalar
+) -> Float[Array, "s n 3"]:
+    """A^-1 applied to the columns of each block, which are zero in rows that are not filled; NaN where that did not
+    converge. A is never made: A = Phi S Phi^T + noise^2 I, with Phi the basis at the data and S the variances of the
+    modes, so a product is a transform to coefficients and back; for 50,000 points with L = 50 about 200 will do."""
+    tolerance = float(jnp.finfo(rows.dtype).eps) ** 0.8
+
+    def solved(rows, transform, variance, noise, mask):
+        def product(rows):
+            return jnp.where(mask, transform.evaluate(variance * transform.adjoint(rows)), 0.0) + noise**2 * rows
+
+        found, _ = cg(product, rows, tol=tolerance, maxiter=_MOST_PRODUCTS)
+        left = jnp.linalg.norm(rows - product(found)) / jnp.linalg.norm(rows)
+        return jnp.where(left < 10 * tolerance, found, jnp.nan)
+
+    transform = NonuniformTransform(cloud.points, spectrum.shape[-1] - 1)
+    return shared_map(solved, rows, transform, mode_variance(spectrum), noise, cloud.mask[:, None])
+
+
 class NormalDraws(NamedTuple):
     """v drawn from the prior, by its coefficients, and v(X) + eps."""
 
@@ -80,7 +105,8 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
     - `cloud`: D, with zeros in the rows that are not filled.
     - `weights`: A^-1 n.
     - `spectrum`, `noise`: of the prior and of the normals.
-    - `cholesky`: C.
+    - `cholesky`: C; None of more points than are factorised. Then a variance is a solve each, samples and means are
+      exact to 1e-4 of the largest value in float32, and `covariance` and `log_marginal_likelihood` are not offered.
     """
 
     level: Float[Array, ""]
@@ -89,7 +115,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
     weights: Float[Array, "n 3"]
     spectrum: Spectra
     noise: Scalar
-    cholesky: Float[Array, "n n"]
+    cholesky: Float[Array, "n n"] | None
 
     @property
     def truncation(self) -> int:
@@ -103,11 +129,15 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         x = jnp.asarray(x, dtype=self.weights.dtype)
         prior = function_variance(self.spectrum)
 
-        def at_points(x):
-            return jnp.maximum(prior - jnp.sum(self.whitened(x) ** 2, axis=(0, 1)), 0.0)
+        def at_point(point):
+            if self.cholesky is None:
+                cross = function_normal_covariance(point[None], self.cloud.points, self.spectrum)[:, 0].T
+                cross = jnp.where(self.cloud.mask[:, None], cross, 0.0)
+                return jnp.maximum(prior - jnp.sum(cross * self.solve(cross[None])[0]), 0.0)
+            return jnp.maximum(prior - jnp.sum(self.whitened(point[None]) ** 2), 0.0)
 
-        chunk = max(1, min(x.shape[0], _CHUNK_VALUES // self.cloud.capacity))
-        return jax.lax.map(lambda point: at_points(point[None])[0], x, batch_size=chunk)
+        chunk = None if self.cholesky is None else max(1, min(x.shape[0], _CHUNK_VALUES // self.cloud.capacity))
+        return jax.lax.map(at_point, x, batch_size=chunk)
 
     @on_torus
     @eqx.filter_jit
@@ -121,7 +151,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         """log p(n_1, ..., n_N | x_1, ..., x_N), summed over the three components."""
         count = self.cloud.count
         fit = jnp.sum(self.cloud.normals * self.weights)
-        log_determinant = 2.0 * jnp.sum(jnp.log(jnp.diag(self.cholesky)))
+        log_determinant = 2.0 * jnp.sum(jnp.log(jnp.diag(self.factor)))
         return -0.5 * (fit + 3.0 * log_determinant + 3.0 * count * jnp.log(2.0 * jnp.pi))
 
     def whitened(self, x: Float[Array, "n 3"]) -> Float[Array, "3 capacity n"]:
@@ -131,7 +161,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         def leading(size: int):
             cross = function_normal_covariance(x, self.cloud.points[:size], self.spectrum)
             cross = jnp.where(self.cloud.mask[:size], cross, 0.0)
-            factor = self.cholesky[:size, :size]
+            factor = self.factor[:size, :size]
             solved = jax.vmap(lambda c: solve_triangular(factor, c.T, lower=True))(cross)
             return jnp.pad(solved, ((0, 0), (0, capacity - size), (0, 0)))
 
@@ -165,34 +195,70 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
 
     def conditioned(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s a a a"]:
         """Coefficients of Poisson(v + k(., X) A^-1 (n - grad m - v(X) - eps))."""
-        return self.updated(draws.coefficients, self.whitened_residual(draws, means))
+        return self._reconstructed(draws.coefficients, self.solve(self._residual(draws, means)))
+
+    def _residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
+        """n - grad m - v(X) - eps, zero in rows that are not filled."""
+        return jnp.where(self.cloud.mask[:, None], self.cloud.normals - means.gradients - draws.at_data, 0.0)
 
     def whitened_residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
         """C^-1 (n - grad m - v(X) - eps), zero in rows that are not filled."""
-        residual = self.cloud.normals - means.gradients - draws.at_data
-        return self._solve_triangular(jnp.where(self.cloud.mask[:, None], residual, 0.0), transpose=False)
+        return self._solve_triangular(self._residual(draws, means), transpose=False)
 
     def updated(
         self, coefficients: Float[Array, "s 3 a a a"], whitened: Float[Array, "s n 3"]
     ) -> Float[Array, "s a a a"]:
         """Coefficients of Poisson(v + k(., X) C^-T z) for each v and each whitened residual z."""
+        return self._reconstructed(coefficients, self._solve_triangular(whitened, transpose=True))
+
+    def _reconstructed(
+        self, coefficients: Float[Array, "s 3 a a a"], weights: Float[Array, "s n 3"]
+    ) -> Float[Array, "s a a a"]:
         transform = NonuniformTransform(self.cloud.points, self.truncation)
 
         def update(sample, transform, spectrum):
             coefficients, weights = sample
             return solve_poisson(coefficients) + reconstruct(transform, weights, spectrum)
 
-        weights = self._solve_triangular(whitened, transpose=True)
         return shared_map(update, (coefficients, weights), transform, self.spectrum)
 
     def solve(self, rows: Float[Array, "s n 3"]) -> Float[Array, "s n 3"]:
         """A^-1 applied to the columns of each block."""
+        if self.cholesky is None:
+            return by_conjugate_gradients(rows, self.cloud, self.spectrum, self.noise)
         return self._solve_triangular(self._solve_triangular(rows, transpose=False), transpose=True)
+
+    @property
+    def factor(self) -> Float[Array, "n n"]:
+        """C.
+
+        **Raises:** `ValueError` of more points than are factorised.
+        """
+        if self.cholesky is None:
+            raise InputError(f"the factor of more than {MOST_FACTORISED} points is not made: keep fewer")
+        return self.cholesky
 
     def _solve_triangular(self, rows: Float[Array, "s n 3"], transpose: bool) -> Float[Array, "s n 3"]:
         columns = jnp.moveaxis(rows, 0, 1)
-        solved = solve_triangular(self.cholesky, columns.reshape(len(columns), -1), lower=True, trans=int(transpose))
+        solved = solve_triangular(self.factor, columns.reshape(len(columns), -1), lower=True, trans=int(transpose))
         return jnp.moveaxis(solved.reshape(columns.shape), 1, 0)
+
+
+@eqx.filter_jit
+def given_normals(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> GeometricSPSRPosterior:
+    """p(f | D), by the factor of A up to a capacity of `MOST_FACTORISED`, by conjugate gradients beyond."""
+    # Whatever stands in rows that are not filled, NaN included, must not reach the products.
+    points, normals = (jnp.where(cloud.mask[:, None], rows, 0.0) for rows in (cloud.points, cloud.normals))
+    cloud, cholesky = PointCloud(points, normals, cloud.mask), None
+    if cloud.capacity > MOST_FACTORISED:
+        weights = by_conjugate_gradients(cloud.normals[None], cloud, spectrum, noise)[0]
+    else:
+        cholesky = factorise(cloud, spectrum, noise)
+        weights = cho_solve((cholesky, True), cloud.normals)
+    transform = NonuniformTransform(cloud.points, spectrum.shape[-1] - 1)
+    mean = reconstruct(transform, weights, spectrum)
+    level = mean_at_data(transform, mean, cloud)
+    return GeometricSPSRPosterior(level, mean, cloud, weights, spectrum, noise, cholesky)
 
 
 def reconstruct(

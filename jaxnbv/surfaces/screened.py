@@ -27,7 +27,7 @@ from jaxnbv.scanning.evidence import Evidence
 from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import SurfaceModel, on_torus
 from jaxnbv.surfaces.covariance import function_covariance, function_variance, mode_variance
-from jaxnbv.surfaces.given_normals import GeometricSPSRPosterior, NormalDraws
+from jaxnbv.surfaces.given_normals import MOST_FACTORISED, GeometricSPSRPosterior, NormalDraws
 from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, filled
 from jaxnbv.surfaces.spsr import GeometricSPSR
 from jaxnbv.surfaces.trigonometric import NonuniformTransform, inverse_laplacian, solve_poisson
@@ -74,9 +74,16 @@ class ScreenedSPSR(SurfaceModel):
     def condition(self, evidence: Evidence | PointCloud) -> "ScreenedSPSRPosterior":
         """p(g | D, what was seen empty). The cost is that of the base, and of M triangular solves with its factor.
 
-        **Raises:** `ValueError` as `GeometricSPSR.condition` does, and if S is singular in the precision at hand.
+        **Raises:** `ValueError` as `GeometricSPSR.condition` does, for a capacity above 16,384, and if S is singular in
+        the precision at hand.
         """
         evidence = Evidence.of(evidence)
+        capacity = evidence.cloud.capacity
+        require(
+            capacity <= MOST_FACTORISED,
+            f"the cloud has room for {capacity} points, and this model takes {MOST_FACTORISED} at most: lower the "
+            "planner's capacity, or use GeometricSPSR, which takes more",
+        )
         posterior = _condition(self, self.base.condition(evidence), evidence)
         if not is_traced(posterior.weights):
             require(
@@ -110,7 +117,7 @@ def _condition(model: ScreenedSPSR, base: GeometricSPSRPosterior, evidence: Evid
     at_rows = transform.evaluate(base.mean_coefficients[None])[:, 0]
     weights = posterior.solve(half_jump * rows.values - at_rows)
     no_draw = jnp.zeros((1, 3, *base.mean_coefficients.shape), at_rows.dtype)
-    normals = solve_triangular(base.cholesky, base.cloud.normals, lower=True)
+    normals = solve_triangular(base.factor, base.cloud.normals, lower=True)
     mean = posterior._updated(no_draw, normals[None], jnp.zeros(1, at_rows.dtype), weights[None])[0]
     return eqx.tree_at(lambda p: (p.weights, p.mean_coefficients), posterior, (weights, mean))
 

@@ -20,7 +20,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
@@ -29,12 +28,10 @@ from jaxnbv.geometry.cloud import PointCloud, check_oriented
 from jaxnbv.scanning.evidence import Evidence
 from jaxnbv.surfaces.base import HALF_WIDTH, SurfaceModel
 from jaxnbv.surfaces.covariance import Scalar, Spectra, circle_spectrum
-from jaxnbv.surfaces.given_normals import GeometricSPSRPosterior, factorise, mean_at_data, reconstruct
-from jaxnbv.surfaces.trigonometric import NonuniformTransform, basis_variance
+from jaxnbv.surfaces.given_normals import GeometricSPSRPosterior, given_normals
+from jaxnbv.surfaces.trigonometric import basis_variance
 
 _SPARSE = 2.5
-# Points whose covariance is factorised: 1.1 GB in float32, and as much again while it is.
-_LARGEST = 16384
 
 # Numbers and tuples are converted on the way in, which mypy cannot see.
 if TYPE_CHECKING:
@@ -126,21 +123,16 @@ class GeometricSPSR(SurfaceModel):
 
     def condition(self, evidence: Evidence | PointCloud) -> GeometricSPSRPosterior:
         """p(f | D): of the evidence it takes the cloud alone. The cost is that of a Cholesky factorisation of the
-        cloud's capacity.
+        cloud's capacity; beyond a capacity of 16,384, of some hundred transforms a solve.
 
         **Raises:** `ValueError` if the cloud is empty, has entries that are not finite, a normal longer than 10 or
-        points outside [-pi/2, pi/2]^3 (scene coordinates), if its capacity is above 16,384, or if A is singular in the
-        precision at hand; under `jit` values are not known and are not checked.
+        points outside [-pi/2, pi/2]^3 (scene coordinates), or if A is singular in the precision at hand; under `jit`
+        values are not known and are not checked.
         """
         cloud = Evidence.of(evidence).cloud
-        require(
-            cloud.capacity <= _LARGEST,
-            f"the cloud has room for {cloud.capacity} points, and this model takes {_LARGEST} at most: lower the "
-            "planner's capacity, or thin the cloud with farthest_point_subsample",
-        )
         if not is_traced(cloud):
             check_oriented(cloud, "the cloud", HALF_WIDTH, unit=False)
-        posterior = _condition(self, cloud)
+        posterior = given_normals(cloud, self.spectrum, self.noise)
         if not is_traced(posterior.level):
             require(
                 bool(jnp.isfinite(posterior.level)),
@@ -154,16 +146,3 @@ class GeometricSPSR(SurfaceModel):
 def _kept_variance(model: GeometricSPSR) -> Float[Array, ""]:
     kept = jnp.sum(jax.vmap(basis_variance)(jnp.atleast_2d(model.spectrum))[:, model.truncation :], axis=1)
     return jnp.sum(kept**3) / jnp.sum(model.variance**3)
-
-
-@eqx.filter_jit
-def _condition(model: GeometricSPSR, cloud: PointCloud) -> GeometricSPSRPosterior:
-    # Whatever stands in rows that are not filled, NaN included, must not reach the products.
-    points, normals = (jnp.where(cloud.mask[:, None], rows, 0.0) for rows in (cloud.points, cloud.normals))
-    cloud, spectrum = PointCloud(points, normals, cloud.mask), model.spectrum
-    cholesky = factorise(cloud, spectrum, model.noise)
-    weights = cho_solve((cholesky, True), cloud.normals)
-    transform = NonuniformTransform(cloud.points, model.truncation)
-    mean = reconstruct(transform, weights, spectrum)
-    level = mean_at_data(transform, mean, cloud)
-    return GeometricSPSRPosterior(level, mean, cloud, weights, spectrum, model.noise, cholesky)

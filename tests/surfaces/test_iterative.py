@@ -1,0 +1,74 @@
+"""Conjugate gradients against the factorisation, and what they refuse."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from weight_space import WeightSpace
+
+import jaxnbv as nbv
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.surfaces import GeometricSPSR, given_normals
+from jaxnbv.surfaces.pathwise import MeansAtData
+
+SETTINGS = {"lengthscale": 0.1, "variance": 0.8, "noise": 0.2, "nu": 1.5, "truncation": 4}
+RNG = np.random.default_rng(3)
+POINTS, NORMALS, QUERIES = RNG.uniform(-1.3, 1.3, (30, 3)), RNG.standard_normal((30, 3)), RNG.uniform(-1.5, 1.5, (9, 3))
+
+
+def cloud(capacity: int) -> PointCloud:
+    """Rows that are not filled hold what is not a number."""
+    rows = (np.pad(a, ((0, capacity - 30), (0, 0)), constant_values=np.nan) for a in (POINTS, NORMALS))
+    return PointCloud(*map(jnp.asarray, rows), jnp.arange(capacity) < 30)
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """Capacities above 36 are not factorised; those here are the file's own, since what is compiled is kept."""
+    monkeypatch.setattr(given_normals, "MOST_FACTORISED", 36)
+
+
+def test_all_that_is_offered_equals_the_factorisation_and_weight_space(x64, few):
+    model, key = GeometricSPSR(**SETTINGS), jax.random.key(0)
+    posterior, factorised = model.condition(cloud(47)), model.condition(cloud(36))
+    assert posterior.cholesky is None
+    assert factorised.cholesky is not None
+    mean, covariance = WeightSpace(**SETTINGS).posterior(POINTS, NORMALS, QUERIES)
+    np.testing.assert_allclose(posterior.mean(QUERIES), mean, atol=1e-8 * np.abs(mean).max())
+    np.testing.assert_allclose(posterior.variance(QUERIES), np.diag(covariance), atol=1e-8 * covariance.max())
+    np.testing.assert_allclose(posterior.level, factorised.level, atol=1e-8)
+    # The same rows in both, since capacities differ.
+    rows = posterior.cloud.normals[None]
+    np.testing.assert_allclose(posterior.solve(rows)[:, :36], factorised.solve(rows[:, :36]), atol=1e-8)
+    draws = posterior.prior_draws(key, 2)
+    same = draws._replace(at_data=draws.at_data[:, :36])
+    none = MeansAtData(jnp.zeros(()), jnp.zeros(()))
+    np.testing.assert_allclose(posterior.conditioned(draws, none), factorised.conditioned(same, none), atol=1e-8)
+
+
+def test_float32_is_exact_to_a_ten_thousandth(monkeypatch):
+    """A sphere of 2,000 points at the default noise, against float64."""
+    points = RNG.standard_normal((2000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    model, queries = GeometricSPSR(lengthscale=0.03, truncation=12), 1.3 * points[::20]
+    with jax.enable_x64(True):
+        expected = model.condition(PointCloud.from_arrays(points, points)).mean(queries)
+    monkeypatch.setattr(given_normals, "MOST_FACTORISED", 1999)
+    found = model.condition(PointCloud.from_arrays(points, points)).mean(queries)
+    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_what_does_not_converge_is_refused(few, monkeypatch):
+    """Two steps for thirty points; of a capacity of its own, so that it is compiled so."""
+    monkeypatch.setattr(given_normals, "_MOST_PRODUCTS", 2)
+    with pytest.raises(ValueError, match=r"singular in float32: raise the noise"):
+        GeometricSPSR(0.1, 0.8, 4, noise=0.01).condition(cloud(41))
+
+
+def test_what_needs_the_factor_is_refused(few, monkeypatch):
+    model = GeometricSPSR(**SETTINGS)
+    with pytest.raises(ValueError, match=r"more than 36 points is not made"):
+        model.condition(cloud(42)).log_marginal_likelihood()
+    monkeypatch.setattr("jaxnbv.surfaces.screened.MOST_FACTORISED", 36)
+    with pytest.raises(ValueError, match=r"room for 39 points.*36 at most: lower the planner's capacity"):
+        nbv.ScreenedSPSR(model).condition(cloud(39))
