@@ -19,9 +19,8 @@ from timing import least_time
 
 from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.networks import PointNet2Classifier
-from jaxnbv.networks.grouping import ball_query
+from jaxnbv.networks.layers import Linear, PooledMLP, SetAbstraction, ball_query
 from jaxnbv.networks.pointnet2 import MULTI_SCALE, SINGLE_SCALE
-from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
 from jaxnbv.storage.folders import versions
 
 NETWORKS = {

@@ -10,10 +10,10 @@ from jaxnbv.networks.checkpoints import save_checkpoint as save_checkpoint
 from jaxnbv.networks.clouds import CloudClassifier as CloudClassifier
 from jaxnbv.networks.clouds import CloudSegmenter as CloudSegmenter
 from jaxnbv.networks.compact_segmenter import CompactPartSegmenter as CompactPartSegmenter
-from jaxnbv.networks.feature_propagation import FeaturePropagation as FeaturePropagation
 from jaxnbv.networks.invariant import Focus as Focus
 from jaxnbv.networks.invariant import FocusedClassifier as FocusedClassifier
 from jaxnbv.networks.invariant import InvariantClassifier as InvariantClassifier
+from jaxnbv.networks.layers import FeaturePropagation as FeaturePropagation
 from jaxnbv.networks.pointnet2 import PointNet2Classifier as PointNet2Classifier
 from jaxnbv.networks.pointnet2 import PointNet2PartSegmenter as PointNet2PartSegmenter
 from jaxnbv.networks.pretrained import network_scale as network_scale

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxnbv.networks.categories import CATEGORIES, NUM_PARTS
-from jaxnbv.networks.feature_propagation import FeaturePropagation
-from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
+from jaxnbv.networks.layers import FeaturePropagation, Linear, PooledMLP, SetAbstraction
 
 
 class CompactPartSegmenter(eqx.Module):

@@ -9,9 +9,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxnbv.checks import require
 from jaxnbv.geometry.farthest_points import farthest_point_indices
-from jaxnbv.networks.feature_propagation import interpolate
-from jaxnbv.networks.grouping import ball_query
-from jaxnbv.networks.set_abstraction import product
+from jaxnbv.networks.layers import ball_query, interpolate, product
 
 _POOLED = 192
 _CENTERS = 384

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.checks import AnyArray, is_traced, require
-from jaxnbv.networks.feature_propagation import FeaturePropagation
-from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
+from jaxnbv.networks.layers import FeaturePropagation, Linear, PooledMLP, SetAbstraction
 
 
 class Level(NamedTuple):

@@ -18,9 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnbv.checks import require
-from jaxnbv.networks.feature_propagation import FeaturePropagation
+from jaxnbv.networks.layers import FeaturePropagation, Linear, PooledMLP, SetAbstraction
 from jaxnbv.networks.pointnet2 import PARTS_SCALES, SCALES, Level, PointNet2Classifier, PointNet2PartSegmenter
-from jaxnbv.networks.set_abstraction import Linear, PooledMLP, SetAbstraction
 
 Tensors = Mapping[str, np.ndarray]
 

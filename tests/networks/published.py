@@ -5,7 +5,7 @@ import itertools
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnbv.networks.set_abstraction import Linear
+from jaxnbv.networks.layers import Linear
 
 
 def layers(rng, *widths):

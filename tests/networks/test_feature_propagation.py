@@ -7,19 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv.networks.feature_propagation import FeaturePropagation, interpolate
-from jaxnbv.networks.set_abstraction import Linear
+from jaxnbv.networks.layers import FeaturePropagation, Linear, interpolate
 
 RNG = np.random.default_rng(0)
-
-
 jitted = jax.jit(interpolate)
 
 
-def by_loop(points, coarse, features, mask):
+def by_loop(points, coarse, features):
     result = np.zeros((len(points), features.shape[1]))
     for i, x in enumerate(points):
-        squared = {j: ((x - coarse[j]) ** 2).sum() for j in np.flatnonzero(mask)}
+        squared = {j: ((x - y) ** 2).sum() for j, y in enumerate(coarse)}
         nearest = sorted(squared, key=squared.get)[:3]
         weights = [1 / (squared[j] + 1e-8) for j in nearest]
         for j, w in zip(nearest, weights, strict=True):
@@ -28,30 +25,18 @@ def by_loop(points, coarse, features, mask):
 
 
 @pytest.mark.parametrize("m", [1, 2, 40])
-def test_against_a_loop_and_masked_rows_may_hold_anything(x64, m):
+def test_against_a_loop(x64, m):
     points, coarse, features = RNG.normal(size=(30, 3)), RNG.normal(size=(m, 3)), RNG.normal(size=(m, 5))
     points[0] = coarse[0]
-    for filled in sorted({0, 1, 2, m // 2, m}):
-        mask = RNG.permutation(m) < filled
-        expected = by_loop(points, coarse, features, mask)
-        assert expected.any() == mask.any()
-        hidden = [np.where(mask[:, None], rows, np.nan) for rows in (coarse, features)]
-        np.testing.assert_allclose(jitted(points, *hidden, mask), expected, atol=1e-12)
-
-
-def test_without_a_mask_all_coarse_points_count(x64):
-    points, coarse, features = RNG.normal(size=(30, 3)), RNG.normal(size=(9, 3)), RNG.normal(size=(9, 5))
-    expected = by_loop(points, coarse, features, np.ones(9, bool))
-    np.testing.assert_allclose(jitted(points, coarse, features), expected, atol=1e-12)
+    np.testing.assert_allclose(jitted(points, coarse, features), by_loop(points, coarse, features), atol=1e-12)
 
 
 def test_gradients_against_central_differences(x64):
     arrays = [RNG.normal(size=shape) for shape in ((6, 3), (7, 3), (7, 2))]
-    mask = jnp.arange(7) != 4
 
     @jax.jit
     def value(arrays):
-        return jnp.sum(jnp.arange(1.0, 13.0).reshape(6, 2) * interpolate(*arrays, mask))
+        return jnp.sum(jnp.arange(1.0, 13.0).reshape(6, 2) * interpolate(*arrays))
 
     gradients = jax.jit(jax.grad(value))(arrays)
     for which, array in enumerate(arrays):
@@ -80,12 +65,12 @@ def test_gradients_are_bounded_however_close_the_coarse_points_are():
 
 def test_a_propagation_is_a_perceptron_of_own_then_interpolated_features(x64):
     points, coarse = RNG.normal(size=(9, 3)), RNG.normal(size=(5, 3))
-    own, features, mask = RNG.normal(size=(9, 4)), RNG.normal(size=(5, 6)), np.arange(5) != 2
+    own, features = RNG.normal(size=(9, 4)), RNG.normal(size=(5, 6))
     layers = [(RNG.normal(size=pair), RNG.normal(size=pair[1])) for pair in itertools.pairwise((10, 7, 3))]
-    x = np.concatenate([own, by_loop(points, coarse, features, mask)], axis=1)
+    x = np.concatenate([own, by_loop(points, coarse, features)], axis=1)
     for weight, bias in layers:
         x = np.maximum(x @ weight + bias, 0.0)
     propagation = FeaturePropagation(tuple(Linear(*map(jnp.asarray, layer)) for layer in layers))
-    found = jax.jit(propagation.__call__)(points, coarse, own, features, mask)
+    found = jax.jit(propagation.__call__)(points, coarse, own, features)
     assert (x > 0).any()
     np.testing.assert_allclose(found, x, atol=1e-11)

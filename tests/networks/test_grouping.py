@@ -7,7 +7,7 @@ import pytest
 
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.farthest_points import farthest_point_indices
-from jaxnbv.networks.grouping import ball_query
+from jaxnbv.networks.layers import ball_query
 
 RNG = np.random.default_rng(0)
 

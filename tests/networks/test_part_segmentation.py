@@ -24,7 +24,7 @@ from jaxnbv.networks import (
     part_mask,
     save_checkpoint,
 )
-from jaxnbv.networks.set_abstraction import PooledMLP, SetAbstraction
+from jaxnbv.networks.layers import PooledMLP, SetAbstraction
 
 RNG = np.random.default_rng(0)
 SAMPLING = {

@@ -10,7 +10,7 @@ from published import layers, near_sphere
 
 from jaxnbv.checks import InputError
 from jaxnbv.networks import PointNet2Classifier, load_checkpoint, save_checkpoint
-from jaxnbv.networks.set_abstraction import PooledMLP, SetAbstraction
+from jaxnbv.networks.layers import PooledMLP, SetAbstraction
 
 RNG = np.random.default_rng(0)
 SAMPLING = {

@@ -12,8 +12,8 @@ from jaxnbv.networks import (
     PointNet2Classifier,
     save_checkpoint,
 )
+from jaxnbv.networks.layers import PooledMLP, SetAbstraction
 from jaxnbv.networks.pointnet2 import SINGLE_SCALE
-from jaxnbv.networks.set_abstraction import PooledMLP, SetAbstraction
 
 STORAGES = {
     "f8": "DoubleStorage",
