@@ -73,20 +73,19 @@ def contiguous(shape):
 
 
 def tensors_and_bytes(arrays, *view_metadata):
-    """The pickle's tensors, and the bytes of their storages, big-endian where the array is."""
+    """The pickle's tensors, and the bytes of their storages."""
     tensors, data = {}, {}
     for index, (name, array) in enumerate(arrays.items()):
-        kind = STORAGES[array.dtype.newbyteorder("<").str[1:]]
+        kind = STORAGES[array.dtype.str[1:]]
         stored = storage(str(index), kind, array.size, *view_metadata)
         tensors[name], data[str(index)] = view(stored, 0, array.shape, contiguous(array.shape)), array.tobytes()
     return tensors, data
 
 
-def write_archive(path, content, data, order="little"):
+def write_archive(path, content, data):
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("net/data.pkl", dumps(content))
-        if order:
-            archive.writestr("net/byteorder", order)
+        archive.writestr("net/byteorder", "little")
         for key, value in data.items():
             archive.writestr(f"net/data/{key}", value)
         archive.writestr("net/version", "3\n")
