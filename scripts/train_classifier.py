@@ -22,7 +22,7 @@ from training_clouds import LabelledClouds, Source, concatenated
 
 from jaxnbv import Coverage, Grid, Planner, PointCloud
 from jaxnbv.imagination import Imagination
-from jaxnbv.networks import Focus, FocusedClassifier, InvariantClassifier, save_checkpoint
+from jaxnbv.networks import Focus, InvariantClassifier, save_checkpoint
 from jaxnbv.networks.pretrained import TRAINED_POINTS, TRAINED_SIDE
 from jaxnbv.studies.engine.diagnostics import expected_calibration_error
 from jaxnbv.studies.scenes import (
@@ -110,9 +110,9 @@ def focus_loss(focus: Focus, example: tuple[PointCloud, Any]) -> Any:
 
 
 @eqx.filter_jit
-def chosen_clouds(network: FocusedClassifier, clouds: PointCloud) -> PointCloud:
-    """What the network's classifier is fed of each cloud."""
-    return jax.lax.map(lambda cloud: PointCloud(*network.chosen(cloud.points, cloud.normals, cloud.mask)), clouds)
+def chosen_clouds(focus: Focus, clouds: PointCloud) -> PointCloud:
+    """What a focused classifier sees of each cloud."""
+    return jax.lax.map(lambda cloud: PointCloud(*focus.chosen(cloud.points, cloud.normals, cloud.mask)), clouds)
 
 
 def report(name: str, network: Any, data: LabelledClouds) -> None:
@@ -153,9 +153,9 @@ def main() -> None:
         data, keys = (both.clouds, both.point_labels), jax.random.split(jax.random.key(4))
         # Every point is an example: few clouds make a batch.
         focus = fit(Focus(keys[0]), focus_loss, data, keys[1], recipe.focus, 8, file=folder / "focus.eqx")
-        chosen = chosen_clouds(FocusedClassifier(focus, network), both.clouds)
+        chosen = chosen_clouds(focus, both.clouds)
         network = train(network, chosen, both.labels, jax.random.key(2), second, file=folder / "imagined.eqx")
-        network = FocusedClassifier(focus, network)
+        network = eqx.tree_at(lambda net: net.focus, network, focus, is_leaf=lambda leaf: leaf is None)
     else:
         scans = thinned(informative(scans))
         network = train(network, scans.clouds, scans.labels, jax.random.key(1), first, file=folder / "scanned.eqx")

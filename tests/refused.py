@@ -15,6 +15,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 import jaxnbv as nbv
@@ -103,8 +104,10 @@ def session(**changes):
 
 
 def stored(name, changes):
-    arrays = load_file(WEIGHTS / "pyramid.safetensors")
-    save_file(changes(arrays), FOLDER / name)
+    file = WEIGHTS / "pyramid.safetensors"
+    with safe_open(file, "numpy") as opened:
+        metadata = opened.metadata()
+    save_file(changes(load_file(file)), FOLDER / name, metadata)
     return load_checkpoint(FOLDER / name)
 
 

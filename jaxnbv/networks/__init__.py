@@ -11,7 +11,6 @@ from jaxnbv.networks.clouds import CloudClassifier as CloudClassifier
 from jaxnbv.networks.clouds import CloudSegmenter as CloudSegmenter
 from jaxnbv.networks.compact_segmenter import CompactPartSegmenter as CompactPartSegmenter
 from jaxnbv.networks.invariant import Focus as Focus
-from jaxnbv.networks.invariant import FocusedClassifier as FocusedClassifier
 from jaxnbv.networks.invariant import InvariantClassifier as InvariantClassifier
 from jaxnbv.networks.layers import FeaturePropagation as FeaturePropagation
 from jaxnbv.networks.pointnet2 import PointNet2Classifier as PointNet2Classifier

@@ -1,28 +1,39 @@
-"""Networks from files and back: published PointNet++ checkpoints, safetensors, and the files of our own networks."""
+"""Networks from files and back: published PointNet++ checkpoints, and the files of our own networks.
 
+Of our own a file holds the arrays, by attribute paths such as `pattern.pair.weight`, and in its metadata the kind of
+network and what it was made of.
+"""
+
+import functools
+import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import safetensors.numpy
 from safetensors import SafetensorError
 
 from jaxnbv.checks import InputError, require
-from jaxnbv.networks.native import NativeNetwork, arrays_of, build_native, is_native
+from jaxnbv.networks.compact_segmenter import CompactPartSegmenter
+from jaxnbv.networks.invariant import InvariantClassifier
 from jaxnbv.networks.pointnet2 import PointNet2Classifier, PointNet2PartSegmenter
 from jaxnbv.networks.state_dict import build_classifier, build_part_segmenter, is_segmenter, tensors_of
 from jaxnbv.networks.torch_format import read_torch_tensors
 from jaxnbv.storage.files import write_whole
 
-Network = PointNet2Classifier | PointNet2PartSegmenter | NativeNetwork
+OwnNetwork = InvariantClassifier | CompactPartSegmenter
+Network = PointNet2Classifier | PointNet2PartSegmenter | OwnNetwork
 _Tensors = Mapping[str, np.ndarray]
-_SAFETENSORS_TYPES = {"F64", "F32", "F16", "I64", "I32", "I16", "I8", "U64", "U32", "U16", "U8", "BOOL"}
+_KINDS: dict[str, type] = {kind.__name__: kind for kind in (InvariantClassifier, CompactPartSegmenter)}
 
 
 def load_checkpoint(path: str | Path) -> Network:
-    """The network in a PyTorch (.pth, .pt) or .safetensors file, recognised by the names of its tensors.
+    """The network in a PyTorch (.pth, .pt) or .safetensors file.
 
     That is a classifier or a part segmenter: PointNet++ as published, or one of our own that `save_checkpoint` wrote.
     Nothing in the file is run, and PyTorch is not needed. `CloudClassifier` and `CloudSegmenter` feed it clouds.
@@ -40,8 +51,10 @@ def save_checkpoint(network: Network | _Tensors, path: str | Path) -> None:
     and for a place that cannot be written.
     """
     metadata: dict[str, str] = {}
-    if isinstance(network, NativeNetwork):
-        tensors, metadata = arrays_of(network)
+    if isinstance(network, OwnNetwork):
+        settings = network.settings if isinstance(network, InvariantClassifier) else {}
+        tensors = {name: np.asarray(leaf) for name, leaf in _named(network)}
+        metadata = {"network": json.dumps({"kind": type(network).__name__, **settings})}
     else:
         tensors = dict(network if isinstance(network, Mapping) else tensors_of(network))
     # bfloat16 is unknown to NumPy and so to most readers of safetensors; float32 holds it exactly.
@@ -60,7 +73,7 @@ def convert_checkpoint(source: str | Path, target: str | Path) -> Network:
     require(Path(target).suffix == ".safetensors", f"the target {target} must end in .safetensors")
     tensors, metadata = _read(source)
     network = _network(source, tensors, metadata)
-    save_checkpoint(network if isinstance(network, NativeNetwork) else tensors, target)
+    save_checkpoint(network if isinstance(network, OwnNetwork) else tensors, target)
     return network
 
 
@@ -76,21 +89,50 @@ def _read(path: str | Path) -> tuple[_Tensors, Mapping[str, str]]:
     require(os.path.isfile(path), f"there is no file {path}: give the path of a safetensors file")
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
-            types = {name: file.get_slice(name).get_dtype() for name in file.keys()}  # noqa: SIM118
-            for name, kind in types.items():
-                known = kind in _SAFETENSORS_TYPES
-                require(known, f"{path}: the array {name} is of type {kind}, which NumPy has not; write it as float32")
-            return {name: file.get_tensor(name) for name in types}, file.metadata() or {}
-    except InputError:
-        raise
+            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is damaged or no safetensors file ({error}): fetch or write it again") from error
 
 
 def _network(path: str | Path, tensors: _Tensors, metadata: Mapping[str, str]) -> Network:
     try:
-        if is_native(tensors):
-            return build_native(tensors, metadata)
+        if "network" in metadata:
+            return _filled(_blank(metadata["network"]), tensors)
         return build_part_segmenter(tensors) if is_segmenter(tensors) else build_classifier(tensors)
     except InputError as error:
         raise InputError(f"{path} does not hold a network that is known here: {error}") from error
+
+
+def _blank(said: str) -> Any:
+    """The shapes of one of our own networks that a file's metadata tell of."""
+    try:
+        settings = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in json.loads(said).items()
+        }
+        kind = _KINDS[settings.pop("kind")]
+        return eqx.filter_eval_shape(functools.partial(kind, key=jax.random.key(0), **settings))
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"its metadata say {said[:200]!r}, which makes no network ({error})") from error
+
+
+def _filled(blank: Any, arrays: _Tensors) -> Any:
+    """The network of the shapes of `blank`, with these arrays."""
+    expected = {name: leaf.shape for name, leaf in _named(blank)}
+    leaves: dict[str, np.ndarray] = {}
+    for name in sorted(expected.keys() | arrays.keys()):
+        require(name in arrays, f"the array {name} is missing")
+        require(name in expected, f"the array {name} has no place in it")
+        found = arrays[name].shape
+        require(found == expected[name], f"the array {name} has shape {found}; expected {expected[name]}")
+        # Numbers of 64 bits may not be finite in the type that they are used in.
+        with np.errstate(over="ignore"):
+            leaves[name] = arrays[name].astype(jnp.result_type(float))
+        require(bool(np.isfinite(leaves[name]).all()), f"the array {name} has entries that are not finite")
+    temperature = leaves.get("temperature")
+    require(temperature is None or bool(temperature > 0), f"the temperature is {temperature}; it must be positive")
+    return jax.tree.unflatten(jax.tree.structure(blank), [jnp.asarray(leaves[name]) for name in expected])
+
+
+def _named(network: Any) -> list[tuple[str, Any]]:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(network)
+    return [(jax.tree_util.keystr(path, simple=True, separator="."), leaf) for path, leaf in leaves]

@@ -12,7 +12,8 @@ from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.networks.layers import ball_query, interpolate, product
 
 _POOLED = 192
-_CENTERS = 384
+# Of `Focus`: the centres of its second level, and the points that it chooses.
+_CENTERS, _CHOSEN = 384, 320
 
 
 class PairLevel(eqx.Module):
@@ -67,64 +68,6 @@ def _affine(layer: Any, rows: Float[Array, "*rows inputs"]) -> Float[Array, "*ro
     return product(rows, layer.weight.T) + layer.bias
 
 
-class InvariantClassifier(eqx.Module):
-    """PointNet++ on point-pair features, which rotations and translations leave as they are.
-
-    Two levels of grouping, at the scale of an edge and at that of a pattern, and a maximum over all groups; about
-    75,000 parameters.
-
-    - `num_classes`, and their names `classes`, where known.
-    - `radii`: of the two levels, in the units of the points.
-    - `groups`: how many each level has; more see more of what is small beside the rest.
-    - `temperature`: divides the logits; above 1 it makes an over-confident network more careful (Guo et al. 2017).
-
-    **Raises:** `ValueError` if the names are not as many as the classes, a radius is not positive, or the second level
-    has more groups than the first.
-    """
-
-    edge: PairLevel
-    pattern: PairLevel
-    head: tuple[eqx.nn.Linear, ...]
-    temperature: Float[Array, ""]
-    classes: tuple[str, ...] | None = eqx.field(static=True)
-
-    def __init__(
-        self,
-        num_classes: int,
-        key: PRNGKeyArray,
-        radii: tuple[float, float] = (0.25, 0.8),
-        classes: tuple[str, ...] | None = None,
-        groups: tuple[int, int] = (256, 64),
-    ):
-        named = num_classes if classes is None else len(classes)
-        require(named == num_classes, f"{classes} names {named} classes; the network has {num_classes}")
-        require(
-            min(radii) > 0 and 1 <= groups[1] <= groups[0],
-            f"the levels have radii {radii} and {groups} groups: give positive radii, and the second level no more "
-            "groups than the first",
-        )
-        edge_key, pattern_key, first_key, last_key = jax.random.split(key, 4)
-        self.edge = PairLevel(0, 32, 64, radii[0], groups[0], 24, edge_key)
-        self.pattern = PairLevel(64, 112, _POOLED, radii[1], groups[1], 48, pattern_key)
-        self.head = (eqx.nn.Linear(_POOLED, _POOLED, key=first_key), eqx.nn.Linear(_POOLED, num_classes, key=last_key))
-        self.temperature, self.classes = jnp.asarray(1.0), classes
-
-    def __call__(
-        self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None = None
-    ) -> Float[Array, " classes"]:
-        """Log-probabilities of the classes; the normals are unit. Masked rows do not matter."""
-        mask = jnp.ones(len(points), bool) if mask is None else mask
-        # In farthest point order the first rows are themselves farthest point samples of all.
-        order = farthest_point_indices(points, mask, self.edge.groups)
-        centers = points[order], normals[order]
-        edges = self.edge(centers, (points, normals, None), mask)
-        coarse = centers[0][: self.pattern.groups], centers[1][: self.pattern.groups]
-        patterns = self.pattern(coarse, (*centers, edges), jnp.ones(len(order), bool))
-        pooled = jnp.where(jnp.any(mask), jnp.max(patterns, axis=0), 0.0)
-        hidden, output = self.head
-        return jax.nn.log_softmax(_affine(output, jax.nn.relu(_affine(hidden, pooled))) / self.temperature)
-
-
 class Focus(eqx.Module):
     """For every point, whether it is on the cue of the class; rotations and translations leave the answers as they are.
 
@@ -153,45 +96,87 @@ class Focus(eqx.Module):
         first, last = self.head
         return _affine(last, jax.nn.relu(_affine(first, jnp.concatenate([edges, carried], axis=-1))))[:, 0]
 
+    def chosen(
+        self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"]
+    ) -> tuple[Float[Array, "few 3"], Float[Array, "few 3"], Bool[Array, " few"]]:
+        """The first 320 points that are on the cue by better than even odds: in farthest point order they are farthest
+        point samples of it."""
+        on_cue = mask & (self(points, normals, mask) > 0.0)
+        index = jnp.argsort(~on_cue, stable=True)[:_CHOSEN]
+        return points[index], normals[index], on_cue[index]
 
-class FocusedClassifier(eqx.Module):
-    """The class by those points alone that tell it.
 
-    - `focus`: which these are; it is not sure of a point below even odds.
-    - `network`: the classifier of these, or of no points at all where there are none.
-    - `num_points`: how many it is fed, the first of them.
+class InvariantClassifier(eqx.Module):
+    """PointNet++ on point-pair features, which rotations and translations leave as they are.
 
-    **Raises:** `ValueError` if `num_points` is not positive.
+    Two levels of grouping, at the scale of an edge and at that of a pattern, and a maximum over all groups; about
+    75,000 parameters.
+
+    - `num_classes`, and their names `classes`, where known.
+    - `radii`: of the two levels, in the units of the points.
+    - `groups`: how many each level has; more see more of what is small beside the rest.
+    - `focused`: whether it sees those points alone that its `focus` chooses.
+    - `temperature`: divides the logits; above 1 it makes an over-confident network more careful (Guo et al. 2017).
+
+    **Raises:** `ValueError` if the names are not as many as the classes, a radius is not positive, or the second level
+    has more groups than the first.
     """
 
-    focus: Focus
-    network: InvariantClassifier
-    num_points: int = eqx.field(static=True, default=320)
+    edge: PairLevel
+    pattern: PairLevel
+    head: tuple[eqx.nn.Linear, ...]
+    temperature: Float[Array, ""]
+    focus: Focus | None
+    classes: tuple[str, ...] | None = eqx.field(static=True)
 
-    def __check_init__(self):
-        require(self.num_points >= 1, f"num_points is {self.num_points}; the network needs at least one")
+    def __init__(
+        self,
+        num_classes: int,
+        key: PRNGKeyArray,
+        radii: tuple[float, float] = (0.25, 0.8),
+        classes: tuple[str, ...] | None = None,
+        groups: tuple[int, int] = (256, 64),
+        focused: bool = False,
+    ):
+        named = num_classes if classes is None else len(classes)
+        require(named == num_classes, f"{classes} names {named} classes; the network has {num_classes}")
+        require(
+            min(radii) > 0 and 1 <= groups[1] <= groups[0],
+            f"the levels have radii {radii} and {groups} groups: give positive radii, and the second level no more "
+            "groups than the first",
+        )
+        edge_key, pattern_key, first_key, last_key = jax.random.split(key, 4)
+        self.edge = PairLevel(0, 32, 64, radii[0], groups[0], 24, edge_key)
+        self.pattern = PairLevel(64, 112, _POOLED, radii[1], groups[1], 48, pattern_key)
+        self.head = (eqx.nn.Linear(_POOLED, _POOLED, key=first_key), eqx.nn.Linear(_POOLED, num_classes, key=last_key))
+        self.focus = Focus(jax.random.fold_in(key, 1)) if focused else None
+        self.temperature, self.classes = jnp.asarray(1.0), classes
 
     @property
-    def classes(self) -> tuple[str, ...] | None:
-        """Their names, where known."""
-        return self.network.classes
-
-    @property
-    def temperature(self) -> Float[Array, ""]:
-        """That of the network."""
-        return self.network.temperature
+    def settings(self) -> dict[str, Any]:
+        """What it was made of, beside a key."""
+        levels = self.edge, self.pattern
+        return {
+            "num_classes": self.head[1].out_features,
+            "radii": tuple(level.radius for level in levels),
+            "classes": self.classes,
+            "groups": tuple(level.groups for level in levels),
+            "focused": self.focus is not None,
+        }
 
     def __call__(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None = None
     ) -> Float[Array, " classes"]:
         """Log-probabilities of the classes; the normals are unit. Masked rows do not matter."""
         mask = jnp.ones(len(points), bool) if mask is None else mask
-        return self.network(*self.chosen(points, normals, mask))
-
-    def chosen(
-        self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"]
-    ) -> tuple[Float[Array, "few 3"], Float[Array, "few 3"], Bool[Array, " few"]]:
-        """What the network is fed: in farthest point order these are farthest point samples of the cue of the class."""
-        on_cue = mask & (self.focus(points, normals, mask) > 0.0)
-        index = jnp.argsort(~on_cue, stable=True)[: self.num_points]
-        return points[index], normals[index], on_cue[index]
+        if self.focus is not None:
+            points, normals, mask = self.focus.chosen(points, normals, mask)
+        # In farthest point order the first rows are themselves farthest point samples of all.
+        order = farthest_point_indices(points, mask, self.edge.groups)
+        centers = points[order], normals[order]
+        edges = self.edge(centers, (points, normals, None), mask)
+        coarse = centers[0][: self.pattern.groups], centers[1][: self.pattern.groups]
+        patterns = self.pattern(coarse, (*centers, edges), jnp.ones(len(order), bool))
+        pooled = jnp.where(jnp.any(mask), jnp.max(patterns, axis=0), 0.0)
+        hidden, output = self.head
+        return jax.nn.log_softmax(_affine(output, jax.nn.relu(_affine(hidden, pooled))) / self.temperature)

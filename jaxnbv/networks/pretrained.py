@@ -5,7 +5,7 @@ from importlib import resources
 from jaxnbv.checks import require
 from jaxnbv.networks.checkpoints import Network, load_checkpoint
 from jaxnbv.networks.clouds import CloudClassifier, CloudSegmenter
-from jaxnbv.networks.invariant import FocusedClassifier, InvariantClassifier
+from jaxnbv.networks.invariant import InvariantClassifier
 
 # Longest side of the box of a training object, in scene units.
 TRAINED_SIDE = 2.5
@@ -55,13 +55,12 @@ def part_segmenter(category: str | int, num_points: int = 2048, longest_side: fl
 def network_scale(network: Network, longest_side: float = TRAINED_SIDE) -> float:
     """Network units per scene unit, for an object whose box has this longest side in the scene.
 
-    `InvariantClassifier` and `FocusedClassifier` take objects 2.5 long, the others those that fill the unit sphere or
-    its box.
+    `InvariantClassifier` takes objects 2.5 long, the others those that fill the unit sphere or its box.
 
     **Raises:** `ValueError` if `longest_side` is not positive.
     """
     require(longest_side > 0, f"the longest side is {longest_side}; it must be positive")
-    return (TRAINED_SIDE if isinstance(network, InvariantClassifier | FocusedClassifier) else 2.0) / longest_side
+    return (TRAINED_SIDE if isinstance(network, InvariantClassifier) else 2.0) / longest_side
 
 
 def _shipped(name: str) -> Network:

@@ -1,22 +1,14 @@
-"""The invariant network: what does not matter to it, its derivatives, its files."""
+"""The invariant network: what does not matter to it, its derivatives."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import safetensors.numpy
 from scipy.spatial.transform import Rotation
 
-from jaxnbv.checks import InputError
 from jaxnbv.geometry.cloud import PointCloud, farthest_point_subsample
-from jaxnbv.networks import (
-    CloudClassifier,
-    InvariantClassifier,
-    load_checkpoint,
-    save_checkpoint,
-)
-from jaxnbv.networks.native import arrays_of
+from jaxnbv.networks import CloudClassifier, InvariantClassifier
 
 RNG = np.random.default_rng(0)
 # Of most clouds, so that one program answers them.
@@ -75,27 +67,6 @@ def test_rotations_and_translations_do_not_matter(x64, levels, dtype, tolerance)
         answer(net, (points @ mirror).astype(dtype), (normals @ mirror).astype(dtype)), still, atol=tolerance
     )
     assert np.abs(answer(net, 0.8 * points.astype(dtype), normals.astype(dtype)) - still).max() > 5 * tolerance
-
-
-@pytest.mark.parametrize("levels", [USUAL, OTHER])
-def test_a_file_tells_the_levels(levels, tmp_path):
-    net = network(**levels)
-    save_checkpoint(net, tmp_path / "net.safetensors")
-    again = load_checkpoint(tmp_path / "net.safetensors")
-    for level in ("edge", "pattern"):
-        ours, theirs = getattr(again, level), getattr(net, level)
-        assert (ours.radius, ours.groups) == (theirs.radius, theirs.groups)
-    cloud = [rows.astype(np.float32) for rows in oriented(COUNT)]
-    np.testing.assert_allclose(answer(again, *cloud), answer(net, *cloud), atol=1e-6)
-
-
-def test_a_file_whose_levels_are_no_numbers_is_refused(tmp_path):
-    arrays, metadata = arrays_of(network())
-    for said in ("64,many", "", "64"):
-        file = tmp_path / "net.safetensors"
-        safetensors.numpy.save_file(arrays, file, {**metadata, "groups": said})
-        with pytest.raises(InputError, match=f"groups='{said}'; expected numbers, 2"):
-            load_checkpoint(file)
 
 
 def test_turning_normals_alone_matters(x64):
