@@ -18,11 +18,11 @@ import numpy as np
 import safetensors.numpy
 from safetensors import SafetensorError
 
-from jaxnbv.checks import InputError, require
+from jaxnbv.checks import InputError, checked, require
 from jaxnbv.networks.compact_segmenter import CompactPartSegmenter
 from jaxnbv.networks.invariant import InvariantClassifier
 from jaxnbv.networks.pointnet2 import PointNet2Classifier, PointNet2PartSegmenter
-from jaxnbv.networks.state_dict import build_classifier, build_part_segmenter, is_segmenter, tensors_of
+from jaxnbv.networks.published import published_network
 from jaxnbv.networks.torch_format import read_torch_tensors
 from jaxnbv.storage.files import write_whole
 
@@ -44,25 +44,15 @@ def load_checkpoint(path: str | Path) -> Network:
     return _network(path, *_read(path))
 
 
-def save_checkpoint(network: Network | _Tensors, path: str | Path) -> None:
-    """Write a network, or tensors in the published names, as a safetensors file; PyTorch can load either.
+@checked
+def save_checkpoint(network: OwnNetwork, path: str | Path) -> None:
+    """Write one of our own networks as a safetensors file.
 
-    **Raises:** `ValueError` for a PointNet++ whose sampling is not the published one, which the file could not tell,
-    and for a place that cannot be written.
+    **Raises:** `ValueError` for another network, and for a place that cannot be written.
     """
-    metadata: dict[str, str] = {}
-    if isinstance(network, OwnNetwork):
-        settings = network.settings if isinstance(network, InvariantClassifier) else {}
-        tensors = {name: np.asarray(leaf) for name, leaf in _named(network)}
-        metadata = {"network": json.dumps({"kind": type(network).__name__, **settings})}
-    else:
-        tensors = dict(network if isinstance(network, Mapping) else tensors_of(network))
-    # bfloat16 is unknown to NumPy and so to most readers of safetensors; float32 holds it exactly.
-    arrays = {
-        name: np.array(tensor, np.float32 if tensor.dtype == jnp.bfloat16 else tensor.dtype, order="C")
-        for name, tensor in tensors.items()
-    }
-    write_whole(Path(path), lambda file: file.write(safetensors.numpy.save(arrays, metadata)))
+    settings = network.settings if isinstance(network, InvariantClassifier) else {}
+    metadata = {"network": json.dumps({"kind": type(network).__name__, **settings})}
+    _write({name: np.asarray(leaf) for name, leaf in _named(network)}, metadata, path)
 
 
 def convert_checkpoint(source: str | Path, target: str | Path) -> Network:
@@ -73,8 +63,17 @@ def convert_checkpoint(source: str | Path, target: str | Path) -> Network:
     require(Path(target).suffix == ".safetensors", f"the target {target} must end in .safetensors")
     tensors, metadata = _read(source)
     network = _network(source, tensors, metadata)
-    save_checkpoint(network if isinstance(network, OwnNetwork) else tensors, target)
+    # bfloat16 is unknown to NumPy and so to most readers of safetensors; float32 holds it exactly.
+    arrays = {
+        name: array.astype(np.float32) if array.dtype == jnp.bfloat16 else array for name, array in tensors.items()
+    }
+    _write(arrays, metadata, target)
     return network
+
+
+def _write(tensors: _Tensors, metadata: Mapping[str, str], path: str | Path) -> None:
+    arrays = {name: np.array(array, order="C") for name, array in tensors.items()}
+    write_whole(Path(path), lambda file: file.write(safetensors.numpy.save(arrays, dict(metadata))))
 
 
 def _read(path: str | Path) -> tuple[_Tensors, Mapping[str, str]]:
@@ -98,7 +97,7 @@ def _network(path: str | Path, tensors: _Tensors, metadata: Mapping[str, str]) -
     try:
         if "network" in metadata:
             return _filled(_blank(metadata["network"]), tensors)
-        return build_part_segmenter(tensors) if is_segmenter(tensors) else build_classifier(tensors)
+        return published_network(tensors)
     except InputError as error:
         raise InputError(f"{path} does not hold a network that is known here: {error}") from error
 
@@ -106,10 +105,9 @@ def _network(path: str | Path, tensors: _Tensors, metadata: Mapping[str, str]) -
 def _blank(said: str) -> Any:
     """The shapes of one of our own networks that a file's metadata tell of."""
     try:
-        settings = {
-            name: tuple(value) if isinstance(value, list) else value for name, value in json.loads(said).items()
-        }
-        kind = _KINDS[settings.pop("kind")]
+        found = json.loads(said)
+        kind = _KINDS[found.pop("kind")]
+        settings = {name: tuple(value) if isinstance(value, list) else value for name, value in found.items()}
         return eqx.filter_eval_shape(functools.partial(kind, key=jax.random.key(0), **settings))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"its metadata say {said[:200]!r}, which makes no network ({error})") from error

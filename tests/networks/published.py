@@ -7,6 +7,12 @@ import numpy as np
 
 from jaxnbv.networks.layers import Linear
 
+# Centres, radii and members of each level.
+CLASSIFIERS = {
+    "ssg": ((512, (0.2,), (32,)), (128, (0.4,), (64,))),
+    "msg": ((512, (0.1, 0.2, 0.4), (16, 32, 128)), (128, (0.2, 0.4, 0.8), (32, 64, 128))),
+}
+
 
 def layers(rng, *widths):
     return tuple(
@@ -40,6 +46,12 @@ def random_state(rng, kind, sampling, inputs, head):
     for layer in head(widths):
         put(*layer)
     return state
+
+
+def classifier_state(rng, kind, inputs):
+    """A narrow classifier's tensors: four classes of points, or of points with normals where there are six inputs."""
+    head = [("fc1", "bn1", 12, 8, ()), ("fc2", "bn2", 8, 7, ()), ("fc3", None, 7, 4, ())]
+    return random_state(rng, kind, CLASSIFIERS[kind], inputs, lambda widths: head)
 
 
 def _names(kind, level, branch):

@@ -7,7 +7,8 @@ import jax
 import numpy as np
 import pytest
 import safetensors.numpy
-from torch_files import checkpoint, narrow_network, state_of
+from published import classifier_state
+from torch_files import checkpoint
 
 from jaxnbv.checks import InputError
 from jaxnbv.networks import (
@@ -19,12 +20,13 @@ from jaxnbv.networks import (
     read_torch_tensors,
     save_checkpoint,
 )
-from jaxnbv.networks.pointnet2 import MULTI_SCALE, SINGLE_SCALE
+
+RNG = np.random.default_rng(0)
 
 
 @pytest.fixture
-def state(tmp_path):
-    return state_of(narrow_network(), tmp_path)
+def state():
+    return classifier_state(RNG, "ssg", 6)
 
 
 def assert_same(found, expected, rtol=1e-6):
@@ -33,23 +35,15 @@ def assert_same(found, expected, rtol=1e-6):
         np.testing.assert_allclose(a, b, rtol=rtol, atol=rtol)
 
 
-@pytest.mark.parametrize("sampling", [SINGLE_SCALE, MULTI_SCALE])
-@pytest.mark.parametrize("inputs", [3, 6])
-def test_a_network_survives_safetensors_and_the_archive(tmp_path, sampling, inputs):
-    network = narrow_network(sampling, inputs)
-    arrays = state_of(network, tmp_path)
-    assert_same(load_checkpoint(tmp_path / "state.safetensors"), network)
-    read = load_checkpoint(checkpoint(tmp_path / "net.pth", arrays))
-    assert_same(read, network)
-    assert read.uses_normals == (inputs == 6)
-    assert read.num_classes == 4
-    assert [level.radii for level in read.levels] == [level.radii for level in sampling]
-
-
-def test_training_checkpoints_with_the_prefix_of_several_devices(tmp_path, state):
-    file = checkpoint(tmp_path / "net.pth", {f"module.{k}": v for k, v in state.items()})
+@pytest.mark.parametrize("prefix", ["", "module."])
+def test_a_network_is_the_same_from_safetensors_and_from_pytorch(tmp_path, state, prefix):
+    safetensors.numpy.save_file(state, tmp_path / "net.safetensors")
+    network = load_checkpoint(tmp_path / "net.safetensors")
+    file = checkpoint(tmp_path / "net.pth", {f"{prefix}{name}": array for name, array in state.items()})
     assert set(read_torch_tensors(file)) == set(state)
-    assert_same(load_checkpoint(file), load_checkpoint(tmp_path / "state.safetensors"))
+    assert_same(load_checkpoint(file), network)
+    with pytest.raises(InputError, match="network is a PointNet2Classifier"):
+        save_checkpoint(network, tmp_path / "again.safetensors")
 
 
 def test_tensors_that_make_no_classifier_are_named(tmp_path, state):
@@ -62,19 +56,17 @@ def test_tensors_that_make_no_classifier_are_named(tmp_path, state):
     ones = np.ones((4, 9), np.float32)
     assert "sa2.mlp_bns.1.running_var is missing" in problem({}, ["sa2.mlp_bns.1.running_var"])
     assert "sa1.mlp_convs.0.weight is missing" in problem({}, ["sa1.mlp_convs.0.weight"])
-    assert "fc3.weight has shape (4, 9); expected (any, 6)" in problem({"fc3.weight": ones})
+    assert "fc3.weight has shape (4, 9); expected (any, 7)" in problem({"fc3.weight": ones})
     assert "takes 9 inputs" in problem({"sa1.mlp_convs.0.weight": ones})
     assert "sa3.mlp_bns.0.bias has shape (4, 9)" in problem({"sa3.mlp_bns.0.bias": ones})
     assert "negative" in problem({"bn1.running_var": -state["bn1.running_var"]})
     assert "not finite" in problem({"bn1.bias": np.full_like(state["bn1.bias"], np.nan)})
-    both = problem({"fp3.mlp_convs.0.weight": ones})
-    assert "['bn2', 'fc1', 'fc2', 'fc3'] belong to another kind of network" in both
     assert "no place in it, such as ['fc1.extra']" in problem({"fc1.extra": ones})
 
 
 def test_conversion_keeps_every_tensor(tmp_path, state):
     state["bn1.num_batches_tracked"] = np.array(11)
-    state["fc1.weight"] = state["fc1.weight"].astype(np.float64)
+    state["fc1.weight"] = state["fc1.weight"].astype(np.float32)
     source = checkpoint(tmp_path / "net.pth", state)
     network = convert_checkpoint(source, tmp_path / "net.safetensors")
     written = safetensors.numpy.load_file(tmp_path / "net.safetensors")
@@ -97,6 +89,7 @@ def test_conversion_refuses_and_leaves_nothing_behind(tmp_path, state):
 
 def test_safetensors_files_that_are_damaged_or_missing(tmp_path, state):
     file = tmp_path / "state.safetensors"
+    safetensors.numpy.save_file(state, file)
     whole = file.read_bytes()
     for damaged in (b"", b"abc", whole[:50], whole[:-3]):
         file.write_bytes(damaged)
@@ -105,15 +98,9 @@ def test_safetensors_files_that_are_damaged_or_missing(tmp_path, state):
     with pytest.raises(InputError, match="no file"):
         load_checkpoint(tmp_path / "nowhere.safetensors")
     with pytest.raises(InputError, match="cannot write"):
-        save_checkpoint(state, tmp_path / "nowhere" / "net.safetensors")
+        save_checkpoint(CompactPartSegmenter(jax.random.key(0)), tmp_path / "nowhere" / "net.safetensors")
     with pytest.raises(InputError, match=r"\.pth or \.pt"):
         load_checkpoint(tmp_path / "net.onnx")
-
-
-def test_a_network_with_other_radii_is_not_saved(tmp_path):
-    other = tuple(level._replace(radii=(0.3,)) for level in SINGLE_SCALE)
-    with pytest.raises(InputError, match="published"):
-        save_checkpoint(narrow_network(other), tmp_path / "net.safetensors")
 
 
 OWN = {

@@ -7,16 +7,13 @@ import numpy as np
 import published
 import pytest
 from published import layers, near_sphere
+from safetensors.numpy import save_file
 
 from jaxnbv.checks import InputError
-from jaxnbv.networks import PointNet2Classifier, load_checkpoint, save_checkpoint
+from jaxnbv.networks import PointNet2Classifier, load_checkpoint
 from jaxnbv.networks.layers import PooledMLP, SetAbstraction
 
 RNG = np.random.default_rng(0)
-SAMPLING = {
-    "ssg": ((512, (0.2,), (32,)), (128, (0.4,), (64,))),
-    "msg": ((512, (0.1, 0.2, 0.4), (16, 32, 128)), (128, (0.2, 0.4, 0.8), (32, 64, 128))),
-}
 
 
 @eqx.filter_jit
@@ -43,14 +40,9 @@ def cloud(n):
     return near_sphere(RNG, n)
 
 
-def random_state(kind, inputs):
-    head = [("fc1", "bn1", 12, 8, ()), ("fc2", "bn2", 8, 7, ()), ("fc3", None, 7, 4, ())]
-    return published.random_state(RNG, kind, SAMPLING[kind], inputs, lambda widths: head)
-
-
 def plain_network(state, kind, points, features):
     features = np.zeros((len(points), 0)) if features is None else features
-    _, x = published.encode(state, kind, SAMPLING[kind], points, features)
+    _, x = published.encode(state, kind, published.CLASSIFIERS[kind], points, features)
     for number in (1, 2):
         x = published.layer(state, x, f"fc{number}", f"bn{number}")
     x = published.layer(state, x, "fc3")
@@ -78,8 +70,8 @@ def test_against_a_plain_network(x64, tmp_path, kind, inputs, n, repeated):
     The reference then returns to the first centre where farthest point sampling here goes through the duplicates; the
     maximum over a group is the same.
     """
-    state = random_state(kind, inputs)
-    save_checkpoint(state, tmp_path / "net.safetensors")
+    state = published.classifier_state(RNG, kind, inputs)
+    save_file(state, tmp_path / "net.safetensors")
     network = load_checkpoint(tmp_path / "net.safetensors")
     rows = np.concatenate([np.arange(n - repeated), RNG.integers(0, n - repeated, repeated)])
     points, normals = (array[rows] for array in cloud(n))

@@ -5,6 +5,7 @@ import struct
 
 import numpy as np
 import pytest
+from published import classifier_state
 from torch_files import (
     STORAGES,
     Op,
@@ -12,8 +13,6 @@ from torch_files import (
     checkpoint,
     dumps,
     named,
-    narrow_network,
-    state_of,
     storage,
     tensors_and_bytes,
     view,
@@ -28,8 +27,8 @@ RNG = np.random.default_rng(0)
 
 
 @pytest.fixture
-def state(tmp_path):
-    return state_of(narrow_network(), tmp_path)
+def state():
+    return classifier_state(RNG, "ssg", 6)
 
 
 def test_tensors_of_every_type(tmp_path):

@@ -1,19 +1,10 @@
-"""PyTorch files written by hand, opcode by opcode, and a small network to put in them."""
+"""PyTorch files written by hand, opcode by opcode."""
 
 import pickle
 import struct
 import zipfile
 
 import numpy as np
-import safetensors.numpy
-from published import layers
-
-from jaxnbv.networks import (
-    PointNet2Classifier,
-    save_checkpoint,
-)
-from jaxnbv.networks.layers import PooledMLP, SetAbstraction
-from jaxnbv.networks.pointnet2 import SINGLE_SCALE
 
 STORAGES = {
     "f8": "DoubleStorage",
@@ -102,20 +93,3 @@ def write_stream(path, content, data, counts):
 def checkpoint(path, arrays, **others):
     tensors, data = tensors_and_bytes(arrays)
     return write_archive(path, {"epoch": 3, **others, "model_state_dict": tensors}, data)
-
-
-def narrow_network(sampling=SINGLE_SCALE, inputs=6):
-    rng = np.random.default_rng(0)
-    levels, width = [], inputs
-    for level in sampling:
-        branches = tuple(PooledMLP(layers(rng, width, 4, 5 + branch)) for branch in range(len(level.radii)))
-        levels.append(SetAbstraction(branches, level.radii, level.members, level.centers))
-        width = 3 + sum(5 + branch for branch in range(len(level.radii)))
-    return PointNet2Classifier(
-        tuple(levels), PooledMLP(layers(rng, width, 6, 8)), layers(rng, 8, 7, 6), layers(rng, 6, 4)[0]
-    )
-
-
-def state_of(network, folder):
-    save_checkpoint(network, folder / "state.safetensors")
-    return safetensors.numpy.load_file(folder / "state.safetensors")

@@ -1,0 +1,138 @@
+"""The names and shapes of the tensors of the widely used PyTorch PointNet++, and the networks that they make.
+
+    sa1, sa2     mlp_convs.<layer>, mlp_bns.<layer>              one radius
+                 conv_blocks.<radius>.<layer>, bn_blocks. ...    several radii
+    sa3          mlp_convs.<layer>, mlp_bns.<layer>              all points
+    fc1, bn1, fc2, bn2, fc3                                      the classifier's perceptron
+    fp3, fp2, fp1    mlp_convs.<layer>, mlp_bns.<layer>          the part segmenter's way back
+    conv1, bn1, conv2                                            its perceptron
+
+Channels, layers, classes, parts and the use of normals are read off the shapes; the radii are those published for one
+radius or for several. Weights are kept in inference form, W' = W g / sqrt(v + eps), b' = (b - m) g / sqrt(v + eps) + h,
+with the batch normalisation's scale g, shift h and running mean m and variance v.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnbv.checks import require
+from jaxnbv.networks.layers import FeaturePropagation, Linear, PooledMLP, SetAbstraction
+from jaxnbv.networks.pointnet2 import PARTS_SCALES, SCALES, Level, PointNet2Classifier, PointNet2PartSegmenter
+
+Tensors = Mapping[str, np.ndarray]
+
+_EPSILON = 1e-5
+
+
+def published_network(tensors: Tensors) -> PointNet2Classifier | PointNet2PartSegmenter:
+    """The network that the tensors make: a part segmenter where they carry features back to the points.
+
+    **Raises:** `ValueError` that names the tensor which is missing, not of its shape, not finite or without a place.
+    """
+    state = _State(tensors)
+    segments = any(name.startswith("fp") for name in tensors)
+    network = _part_segmenter(state) if segments else _classifier(state)
+    require(not state.left, f"{len(state.left)} tensors have no place in it, such as {sorted(state.left)[:1]}")
+    return network
+
+
+def _classifier(state: "_State") -> PointNet2Classifier:
+    levels, whole, _ = _encoder(state, SCALES, {3: "points", 6: "with normals"})
+    first = state.linear("fc1", _width(whole.layers), "bn1")
+    second = state.linear("fc2", _width((first,)), "bn2")
+    return PointNet2Classifier(levels, whole, (first, second), state.linear("fc3", _width((second,))))
+
+
+def _part_segmenter(state: "_State") -> PointNet2PartSegmenter:
+    levels, whole, widths = _encoder(state, PARTS_SCALES, {6: "points", 9: "with normals"})
+    width = _width(whole.layers)
+    propagations = []
+    # The last one's own inputs: one for each category, the coordinates, and the points' features.
+    for number, own in ((3, widths[2]), (2, widths[1]), (1, None)):
+        layers = state.layers(f"fp{number}.mlp_convs", None if own is None else own + width)
+        propagations.append(FeaturePropagation(layers))
+        width = _width(layers)
+    hidden = state.linear("conv1", width, "bn1")
+    network = PointNet2PartSegmenter(
+        levels, whole, tuple(propagations), hidden, state.linear("conv2", _width((hidden,)))
+    )
+    require(network.num_categories > 0, "the tensor fp1.mlp_convs.0.weight has no inputs for categories")
+    return network
+
+
+def _encoder(
+    state: "_State", scales: tuple[tuple[Level, ...], tuple[Level, ...]], known: dict[int, str]
+) -> tuple[tuple[SetAbstraction, ...], PooledMLP, list[int]]:
+    """The set abstractions, the PointNet of all, and the numbers of features: of the points, then of each level."""
+    multi = "sa1.conv_blocks.0.0.weight" in state.tensors
+    first = "sa1.conv_blocks.0.0.weight" if multi else "sa1.mlp_convs.0.weight"
+    inputs = state.take(first, None, None).shape[1]
+    choices = " or ".join(f"{number} ({what})" for number, what in known.items())
+    require(inputs in known, f"the tensor {first} takes {inputs} inputs; expected {choices}")
+    levels, widths = [], [inputs - 3]
+    for number, level in enumerate(scales[multi], start=1):
+        blocks = [f"conv_blocks.{index}" for index in range(len(level.radii))] if multi else ["mlp_convs"]
+        branches = tuple(state.pooled(f"sa{number}.{block}", 3 + widths[-1], roll=multi) for block in blocks)
+        levels.append(SetAbstraction(branches, level.radii, level.members, level.centers))
+        widths.append(sum(_width(branch.layers) for branch in branches))
+    return tuple(levels), state.pooled("sa3.mlp_convs", 3 + widths[-1]), widths
+
+
+class _State:
+    """Tensors by name, each with its shape checked; what has not been taken in the end has no place."""
+
+    def __init__(self, tensors: Tensors):
+        self.tensors = {name: array for name, array in tensors.items() if not name.endswith("num_batches_tracked")}
+        self.left = set(self.tensors)
+
+    def take(self, name: str, *shape: int | None) -> np.ndarray:
+        """The tensor as float64, whose shape must be this; None stands for any length, and 1s may follow."""
+        require(name in self.tensors, f"the tensor {name} is missing")
+        found = self.tensors[name].shape
+        fits = len(found) >= len(shape) and all(a in (None, b) for a, b in zip(shape, found, strict=False))
+        require(
+            fits and all(length == 1 for length in found[len(shape) :]),
+            f"the tensor {name} has shape {found}; expected ({', '.join(str(a or 'any') for a in shape)})",
+        )
+        self.left.discard(name)
+        return np.asarray(self.tensors[name], dtype=np.float64).reshape(found[: len(shape)])
+
+    def linear(self, name: str, inputs: int | None, norm: str | None = None, roll: bool = False) -> Linear:
+        """A layer, the batch normalisation after it included; `roll` puts the coordinates, its last inputs, first."""
+        weight = self.take(f"{name}.weight", None, inputs).T
+        outputs = weight.shape[1]
+        bias = self.take(f"{name}.bias", outputs)
+        if norm is not None:
+            variance = self.take(f"{norm}.running_var", outputs)
+            require(bool((variance >= 0).all()), f"the tensor {norm}.running_var has negative entries")
+            scale = self.take(f"{norm}.weight", outputs) / np.sqrt(variance + _EPSILON)
+            shift = self.take(f"{norm}.bias", outputs) - self.take(f"{norm}.running_mean", outputs) * scale
+            weight, bias = weight * scale, bias * scale + shift
+        weight = np.roll(weight, 3, axis=0) if roll else weight
+        with np.errstate(over="ignore"):
+            arrays = [array.astype(jnp.result_type(float)) for array in (weight, bias)]
+        finite = all(np.isfinite(array).all() for array in arrays)
+        require(finite, f"the layer {name} has entries that are not finite as {arrays[0].dtype}: train it again")
+        return Linear(*map(jnp.asarray, arrays))
+
+    def layers(self, name: str, inputs: int | None, roll: bool = False) -> tuple[Linear, ...]:
+        """The layers <name>.0, <name>.1, ..., each followed by its batch normalisation."""
+        norm = name.replace("mlp_convs", "mlp_bns").replace("conv_blocks", "bn_blocks")
+        layers: list[Linear] = []
+        while not layers or f"{name}.{len(layers)}.weight" in self.tensors:
+            number = len(layers)
+            layers.append(self.linear(f"{name}.{number}", inputs, f"{norm}.{number}", roll and number == 0))
+            inputs = _width(layers)
+        return tuple(layers)
+
+    def pooled(self, name: str, inputs: int, roll: bool = False) -> PooledMLP:
+        """The same layers, as a PointNet."""
+        layers = self.layers(name, inputs, roll)
+        require(len(layers) > 1, f"{name} has one layer only; two or more are needed")
+        return PooledMLP(layers)
+
+
+def _width(layers: Sequence[Linear]) -> int:
+    return layers[-1].bias.shape[0]
