@@ -1,4 +1,4 @@
-"""`jaxnbv convert`: checkpoints. `jaxnbv view`: a run in the browser. `jaxnbv report`: what studies have found."""
+"""`jaxnbv view`: a run in the browser. `jaxnbv report`: what studies have found."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,14 +6,6 @@ from typing import Annotated
 import typer
 
 from jaxnbv.cli import actions
-
-
-def convert(
-    source: Annotated[Path, typer.Argument(help="A PointNet++ network saved by PyTorch, .pth or .pt.")],
-    target: Annotated[Path, typer.Argument(help="The .safetensors file to write.")],
-) -> None:
-    """Rewrite a PyTorch checkpoint as safetensors. Nothing in it is run, and PyTorch is not needed."""
-    actions.convert(source, target)
 
 
 def view(

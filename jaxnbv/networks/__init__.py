@@ -4,7 +4,6 @@ from jaxnbv.networks.categories import CATEGORIES as CATEGORIES
 from jaxnbv.networks.categories import Category as Category
 from jaxnbv.networks.categories import category_index as category_index
 from jaxnbv.networks.categories import part_mask as part_mask
-from jaxnbv.networks.checkpoints import convert_checkpoint as convert_checkpoint
 from jaxnbv.networks.checkpoints import load_checkpoint as load_checkpoint
 from jaxnbv.networks.checkpoints import save_checkpoint as save_checkpoint
 from jaxnbv.networks.clouds import CloudClassifier as CloudClassifier

@@ -41,7 +41,13 @@ def load_checkpoint(path: str | Path) -> Network:
     **Raises:** `ValueError` for another suffix, a file that is missing or damaged, and for tensors that make none of
     these networks.
     """
-    return _network(path, *_read(path))
+    tensors, metadata = _read(path)
+    try:
+        if "network" in metadata:
+            return _filled(_blank(metadata["network"]), tensors)
+        return published_network(tensors)
+    except InputError as error:
+        raise InputError(f"{path} does not hold a network that is known here: {error}") from error
 
 
 @checked
@@ -52,28 +58,8 @@ def save_checkpoint(network: OwnNetwork, path: str | Path) -> None:
     """
     settings = network.settings if isinstance(network, InvariantClassifier) else {}
     metadata = {"network": json.dumps({"kind": type(network).__name__, **settings})}
-    _write({name: np.asarray(leaf) for name, leaf in _named(network)}, metadata, path)
-
-
-def convert_checkpoint(source: str | Path, target: str | Path) -> Network:
-    """Rewrite the model's tensors of any checkpoint, unchanged, as a safetensors file; returns the network.
-
-    **Raises:** `ValueError` as `load_checkpoint` does, or if the target does not end in .safetensors.
-    """
-    require(Path(target).suffix == ".safetensors", f"the target {target} must end in .safetensors")
-    tensors, metadata = _read(source)
-    network = _network(source, tensors, metadata)
-    # bfloat16 is unknown to NumPy and so to most readers of safetensors; float32 holds it exactly.
-    arrays = {
-        name: array.astype(np.float32) if array.dtype == jnp.bfloat16 else array for name, array in tensors.items()
-    }
-    _write(arrays, metadata, target)
-    return network
-
-
-def _write(tensors: _Tensors, metadata: Mapping[str, str], path: str | Path) -> None:
-    arrays = {name: np.array(array, order="C") for name, array in tensors.items()}
-    write_whole(Path(path), lambda file: file.write(safetensors.numpy.save(arrays, dict(metadata))))
+    arrays = {name: np.array(leaf, order="C") for name, leaf in _named(network)}
+    write_whole(Path(path), lambda file: file.write(safetensors.numpy.save(arrays, metadata)))
 
 
 def _read(path: str | Path) -> tuple[_Tensors, Mapping[str, str]]:
@@ -91,15 +77,6 @@ def _read(path: str | Path) -> tuple[_Tensors, Mapping[str, str]]:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is damaged or no safetensors file ({error}): fetch or write it again") from error
-
-
-def _network(path: str | Path, tensors: _Tensors, metadata: Mapping[str, str]) -> Network:
-    try:
-        if "network" in metadata:
-            return _filled(_blank(metadata["network"]), tensors)
-        return published_network(tensors)
-    except InputError as error:
-        raise InputError(f"{path} does not hold a network that is known here: {error}") from error
 
 
 def _blank(said: str) -> Any:

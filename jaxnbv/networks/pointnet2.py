@@ -68,11 +68,6 @@ class PointNet2Classifier(eqx.Module):
     last: Linear
 
     @property
-    def num_classes(self) -> int:
-        """The number of classes."""
-        return self.last.bias.shape[0]
-
-    @property
     def uses_normals(self) -> bool:
         """Whether the network was made for oriented points; one that was not ignores the normals."""
         return self.levels[0].branches[0].layers[0].weight.shape[0] == 6
@@ -114,11 +109,6 @@ class PointNet2PartSegmenter(eqx.Module):
     propagations: tuple[FeaturePropagation, ...]
     hidden: Linear
     last: Linear
-
-    @property
-    def num_parts(self) -> int:
-        """The number of parts of all categories together."""
-        return self.last.bias.shape[0]
 
     @property
     def num_categories(self) -> int:

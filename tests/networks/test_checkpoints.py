@@ -1,4 +1,4 @@
-"""Networks from checkpoints: read, refused, converted."""
+"""Networks from checkpoints: read or refused."""
 
 import json
 
@@ -15,7 +15,6 @@ from jaxnbv.networks import (
     CloudClassifier,
     CompactPartSegmenter,
     InvariantClassifier,
-    convert_checkpoint,
     load_checkpoint,
     read_torch_tensors,
     save_checkpoint,
@@ -64,29 +63,6 @@ def test_tensors_that_make_no_classifier_are_named(tmp_path, state):
     assert "no place in it, such as ['fc1.extra']" in problem({"fc1.extra": ones})
 
 
-def test_conversion_keeps_every_tensor(tmp_path, state):
-    state["bn1.num_batches_tracked"] = np.array(11)
-    state["fc1.weight"] = state["fc1.weight"].astype(np.float32)
-    source = checkpoint(tmp_path / "net.pth", state)
-    network = convert_checkpoint(source, tmp_path / "net.safetensors")
-    written = safetensors.numpy.load_file(tmp_path / "net.safetensors")
-    assert set(written) == set(state)
-    for name, array in state.items():
-        np.testing.assert_array_equal(written[name], array, strict=True)
-    assert_same(load_checkpoint(tmp_path / "net.safetensors"), network, rtol=0)
-    assert_same(load_checkpoint(source), network, rtol=0)
-
-
-def test_conversion_refuses_and_leaves_nothing_behind(tmp_path, state):
-    del state["fc3.bias"]
-    source = checkpoint(tmp_path / "net.pth", state)
-    with pytest.raises(InputError, match=r"fc3\.bias is missing"):
-        convert_checkpoint(source, tmp_path / "net.safetensors")
-    with pytest.raises(InputError, match=r"must end in \.safetensors"):
-        convert_checkpoint(source, tmp_path / "net.npz")
-    assert not list(tmp_path.glob("net.s*"))
-
-
 def test_safetensors_files_that_are_damaged_or_missing(tmp_path, state):
     file = tmp_path / "state.safetensors"
     safetensors.numpy.save_file(state, file)
@@ -119,8 +95,6 @@ def test_networks_of_our_own_come_back(own, tmp_path):
     save_checkpoint(own, tmp_path / "net.safetensors")
     found = load_checkpoint(tmp_path / "net.safetensors")
     assert_same(found, own, rtol=0)
-    assert_same(convert_checkpoint(tmp_path / "net.safetensors", tmp_path / "copy.safetensors"), own, rtol=0)
-    assert_same(load_checkpoint(tmp_path / "copy.safetensors"), own, rtol=0)
     if isinstance(own, InvariantClassifier):
         assert CloudClassifier(found).classes == own.classes
 
