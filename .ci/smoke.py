@@ -13,7 +13,7 @@ import numpy as np
 import optimistix
 
 import jaxnbv as nbv
-from jaxnbv.networks import load_checkpoint, pyramid_classifier, save_checkpoint
+from jaxnbv.networks import load_checkpoint, pretrained_classifier, save_checkpoint
 from jaxnbv.studies.scenes import demo_object
 
 CAMERA = nbv.Camera(height=16, width=16)
@@ -48,7 +48,7 @@ def planning() -> None:
         depth = np.where(scan.mask, (np.asarray(scan.points) - FIRST.position) @ FIRST.forward, 0.0)
         session.add(depth.reshape(16, 16), FIRST.matrix)
         assert np.isfinite(session.next().value)
-        classifier = pyramid_classifier(num_points=64)
+        classifier = pretrained_classifier("pyramid", num_points=64)
         save_checkpoint(classifier.network, Path(folder) / "net.safetensors")
         assert load_checkpoint(Path(folder) / "net.safetensors").classes == classifier.classes
 

@@ -25,7 +25,7 @@ from skimage.measure import marching_cubes
 from timing import least_time
 
 import jaxnbv as nbv
-from jaxnbv.networks import pyramid_classifier
+from jaxnbv.networks import pretrained_classifier
 from jaxnbv.planning.episode import observe_scene
 from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.search.candidates import sphere_candidates
@@ -117,7 +117,7 @@ def sessions(bench: Bench) -> None:
 def cross_entropy(bench: Bench) -> None:
     """The shipped classifier of pyramids on 1,920 clouds of 1,024 points, and by halving; the paper's surfaces."""
     pyramid = pyramid_scene(Split.TEST, 0, Framing.CLOSE_UP)
-    classifier = pyramid_classifier(Framing.CLOSE_UP.longest_side)
+    classifier = pretrained_classifier("pyramid", Framing.CLOSE_UP.longest_side)
     imagination = nbv.Imagination.preset("paper")
     planner = nbv.Planner(nbv.CrossEntropy(classifier), imagination=imagination)
     first = hidden_view(pyramid, bench.key)

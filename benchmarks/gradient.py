@@ -22,7 +22,7 @@ from timing import least_time
 from tqdm import tqdm
 
 import jaxnbv as nbv
-from jaxnbv.networks import pyramid_classifier
+from jaxnbv.networks import pretrained_classifier
 from jaxnbv.planning.episode import observe_scene
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.storage import describe
@@ -126,7 +126,7 @@ def main() -> None:
 
     acquisition = nbv.Coverage()
     if arguments.task == "cross-entropy":
-        acquisition = nbv.CrossEntropy(pyramid_classifier(Framing.CLOSE_UP.longest_side))
+        acquisition = nbv.CrossEntropy(pretrained_classifier("pyramid", Framing.CLOSE_UP.longest_side))
     names = [name for name in SEARCHES if arguments.task == "coverage" or name not in COVERAGE_ONLY]
     names = ["discrete", arguments.only] if arguments.only else names
     planners = {

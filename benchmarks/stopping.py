@@ -23,7 +23,7 @@ import numpy as np
 from tqdm import tqdm
 
 import jaxnbv as nbv
-from jaxnbv.networks import part_segmenter, pyramid_classifier
+from jaxnbv.networks import part_segmenter, pretrained_classifier
 from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.planning.episode import view_keys
 from jaxnbv.planning.stopping import so_far
@@ -56,7 +56,7 @@ def planner_of(acquisition: nbv.Acquisition, radius: float, side: float = 2.5, s
 def planner_for(task: str, category: str) -> nbv.Planner:
     """One for all objects of a category, so that nothing is compiled twice."""
     if task == "class":
-        return planner_of(nbv.CrossEntropy(pyramid_classifier(SIDE)), 2.5, SIDE, solid=True)
+        return planner_of(nbv.CrossEntropy(pretrained_classifier("pyramid", SIDE)), 2.5, SIDE, solid=True)
     if task == "coverage":
         return planner_of(nbv.NewSurface(), 2.5)
     utility = nbv.SoftPartCount(part_segmenter(category))

@@ -27,7 +27,6 @@ from jaxnbv.networks import (
     load_checkpoint,
     part_segmenter,
     pretrained_classifier,
-    pyramid_classifier,
 )
 from jaxnbv.planning.replay import StoredSession
 from jaxnbv.studies.engine.records import read_records
@@ -430,7 +429,7 @@ REFUSED = {
     "no scale for a classifier": (lambda: CloudClassifier(CLASSIFIER, scale=0.0), "scale is 0.0"),
     "classes from a segmenter": (lambda: CloudClassifier(SEGMENTER), "a CloudSegmenter feeds it"),
     "parts from a classifier": (lambda: CloudSegmenter(CLASSIFIER, "chair"), "a CloudClassifier feeds it"),
-    "objects without a side": (lambda: pyramid_classifier(0.0), "longest side is 0.0"),
+    "objects without a side": (lambda: pretrained_classifier("pyramid", 0.0), "longest side is 0.0"),
     "a classifier that does not ship": (
         lambda: pretrained_classifier("teapot"),
         "no classifier of 'teapot' ships: ",

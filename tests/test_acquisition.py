@@ -18,7 +18,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.imagination import Imagination
-from jaxnbv.networks import pyramid_classifier
+from jaxnbv.networks import pretrained_classifier
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, GridSurface, SDFSurface, scan
 from jaxnbv.scanning.grid import samples_at_once
@@ -194,7 +194,7 @@ def test_what_is_neither_an_acquisition_nor_a_function_is_named(given):
 ACQUISITIONS = {
     "coverage": Coverage(),
     "new surface": NewSurface(),
-    "classes": CrossEntropy(pyramid_classifier(), num_points=64),
+    "classes": CrossEntropy(pretrained_classifier("pyramid"), num_points=64),
     "heat": ExpectedUtilityImprovement(ColdestPoint(source=(0.0, 0.0, 1.0))),
 }
 

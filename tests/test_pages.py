@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 import jaxnbv as nbv
-from jaxnbv.networks import pyramid_classifier, save_checkpoint
+from jaxnbv.networks import pretrained_classifier, save_checkpoint
 from jaxnbv.studies.scenes import demo_object
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -75,7 +75,7 @@ def before_pytorch(monkeypatch):
 
     functions = {"Tensor": Tensor, "from_numpy": np.asarray, "no_grad": nullcontext, "log_softmax": log_softmax}
     stand_in(monkeypatch, "torch", jit=SimpleNamespace(load=load), **functions)
-    save_checkpoint(pyramid_classifier(num_points=64).network, "net.safetensors")
+    save_checkpoint(pretrained_classifier("pyramid", num_points=64).network, "net.safetensors")
 
 
 def before_cluster(monkeypatch):

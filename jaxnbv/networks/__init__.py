@@ -11,11 +11,8 @@ from jaxnbv.networks.clouds import CloudSegmenter as CloudSegmenter
 from jaxnbv.networks.compact_segmenter import CompactPartSegmenter as CompactPartSegmenter
 from jaxnbv.networks.invariant import Focus as Focus
 from jaxnbv.networks.invariant import InvariantClassifier as InvariantClassifier
-from jaxnbv.networks.layers import FeaturePropagation as FeaturePropagation
 from jaxnbv.networks.pointnet2 import PointNet2Classifier as PointNet2Classifier
 from jaxnbv.networks.pointnet2 import PointNet2PartSegmenter as PointNet2PartSegmenter
 from jaxnbv.networks.pretrained import network_scale as network_scale
 from jaxnbv.networks.pretrained import part_segmenter as part_segmenter
 from jaxnbv.networks.pretrained import pretrained_classifier as pretrained_classifier
-from jaxnbv.networks.pretrained import pyramid_classifier as pyramid_classifier
-from jaxnbv.networks.torch_format import read_torch_tensors as read_torch_tensors

@@ -13,16 +13,6 @@ TRAINED_SIDE = 2.5
 TRAINED_POINTS = {"pyramid": 1024, "truck": 2048, "household": 1024}
 
 
-def pyramid_classifier(longest_side: float = TRAINED_SIDE, num_points: int = 1024) -> CloudClassifier:
-    """The shipped classifier of synthetic pyramids whose box has this longest side, in scene units.
-
-    It was trained on 1,024 points a cloud; fed 512 it is a little less often right, and twice as fast.
-
-    **Raises:** `ValueError` if `longest_side` or `num_points` is not positive.
-    """
-    return pretrained_classifier("pyramid", longest_side, num_points)
-
-
 def pretrained_classifier(
     name: str, longest_side: float = TRAINED_SIDE, num_points: int | None = None
 ) -> CloudClassifier:

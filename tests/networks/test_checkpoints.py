@@ -16,9 +16,9 @@ from jaxnbv.networks import (
     CompactPartSegmenter,
     InvariantClassifier,
     load_checkpoint,
-    read_torch_tensors,
     save_checkpoint,
 )
+from jaxnbv.networks.torch_format import read_torch_tensors
 
 RNG = np.random.default_rng(0)
 

@@ -16,13 +16,12 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.networks import (
     CATEGORIES,
     CloudSegmenter,
-    FeaturePropagation,
     PointNet2PartSegmenter,
     category_index,
     load_checkpoint,
     part_mask,
 )
-from jaxnbv.networks.layers import PooledMLP, SetAbstraction
+from jaxnbv.networks.layers import FeaturePropagation, PooledMLP, SetAbstraction
 
 RNG = np.random.default_rng(0)
 SAMPLING = {

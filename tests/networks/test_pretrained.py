@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from training_clouds import scanned_clouds
 
-from jaxnbv.networks import pretrained_classifier, pyramid_classifier
+from jaxnbv.networks import pretrained_classifier
 from jaxnbv.studies.scenes import HOUSEHOLD, PATTERNS, Framing, Split, household_scene, pyramid_scene, truck_scene
 from jaxnbv.tasks.classification import entropy
 
@@ -25,7 +25,7 @@ def answers(classifier, clouds):
 def test_the_weights_are_small():
     file = resources.files("jaxnbv.networks") / "weights" / "pyramid.safetensors"
     assert len(file.read_bytes()) < 4 * 2**20
-    assert pyramid_classifier().classes == PATTERNS
+    assert pretrained_classifier("pyramid").classes == PATTERNS
 
 
 @pytest.mark.slow
@@ -33,7 +33,7 @@ def test_the_weights_are_small():
 def test_right_where_the_pattern_is_seen_and_undecided_where_it_is_not(framing):
     """Fifty test clouds of which one view shows the pattern well, and those met meanwhile that have none of it."""
     enough = {Framing.CLOSE_UP: 500, Framing.WHOLE: 150}[framing]
-    classifier = pyramid_classifier(framing.longest_side)
+    classifier = pretrained_classifier("pyramid", framing.longest_side)
     right, undecided, first = [], [], 0
     while len(right) < 50:
         found = scanned_clouds(partial(pyramid_scene, framing=framing), Split.TEST, range(first, first + _CHUNK))

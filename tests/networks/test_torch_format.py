@@ -21,7 +21,7 @@ from torch_files import (
 )
 
 from jaxnbv.checks import InputError
-from jaxnbv.networks import read_torch_tensors
+from jaxnbv.networks.torch_format import read_torch_tensors
 
 RNG = np.random.default_rng(0)
 
