@@ -27,13 +27,13 @@ PARTS_SCALES = SINGLE_SCALE, (Level(512, (0.1, 0.2, 0.4), (32, 64, 128)), Level(
 
 
 def _filled(
-    points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None, many: str
+    points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"]]:
-    """Points and normals, zero in rows that are not filled, and which are; `many` says what takes many clouds."""
+    """Points and normals, zero in rows that are not filled, and which are."""
     require(
         points.ndim == 2 and points.shape[1] == 3 and points.shape[0] > 0 and normals.shape == points.shape,
         f"points and normals must both be (n, 3) with n > 0, got {points.shape} and {normals.shape}: "
-        f"one cloud a call, many with {many}",
+        "one cloud a call, many with jax.lax.map",
     )
     mask = jnp.ones(len(points), dtype=bool) if mask is None else mask
     return jnp.where(mask[:, None], points, 0.0), jnp.where(mask[:, None], normals, 0.0), mask
@@ -83,7 +83,7 @@ class PointNet2Classifier(eqx.Module):
 
         **Raises:** `ValueError` if points and normals are not both (n, 3), or there are no rows.
         """
-        points, normals, mask = _filled(points, normals, mask, "jax.vmap")
+        points, normals, mask = _filled(points, normals, mask)
         _, x = _down(self, (points, normals if self.uses_normals else None), mask)
         for layer in self.hidden:
             x = jax.nn.relu(layer(x))
@@ -126,36 +126,30 @@ class PointNet2PartSegmenter(eqx.Module):
         self,
         points: Float[Array, "n 3"],
         normals: Float[Array, "n 3"],
-        category: int | Int[AnyArray, ""] | Float[AnyArray, " categories"],
+        category: int | Int[AnyArray, ""],
         mask: Bool[Array, " n"] | None = None,
     ) -> Float[Array, "n parts"]:
         """log p(part) at each point, over the parts of all categories; rows that `mask` does not name mean nothing.
 
-        `category` is its index, which may be traced, or its one-hot vector. What stands in rows that are not named, and
-        how many there are, does not matter to the others. The order of the filled rows does: the first is the first
+        `category` is its index, which may be traced. What stands in rows that are not named, and how many there are,
+        does not matter to the others. The order of the filled rows does: the first is the first
         centre, and crowded balls are cut to their first rows.
 
         **Raises:** `ValueError` if points and normals are not both (n, 3), there are no rows, or there is no such
         category.
         """
-        points, normals, mask = _filled(points, normals, mask, "jax.lax.map")
+        points, normals, mask = _filled(points, normals, mask)
+        count = self.num_categories
+        require(
+            is_traced(category) or 0 <= int(category) < count,
+            f"the category is {category}; the network knows 0 to {count - 1}",
+        )
         # The published network gives the coordinates as features too, beside those relative to a ball's centre.
         features = jnp.concatenate([points, normals], axis=-1) if self.uses_normals else points
-        one_hot = jnp.broadcast_to(self._one_hot(category, points.dtype), (len(points), self.num_categories))
+        one_hot = jnp.broadcast_to(jax.nn.one_hot(category, count, dtype=points.dtype), (len(points), count))
         levels, x = _down(self, (points, features), mask)
         own = [(points, jnp.concatenate([one_hot, points, features], axis=-1)), *levels]
         x, coarse = x[None], jnp.zeros((1, 3), points.dtype)
         for (points, features), propagation in zip(reversed(own), self.propagations, strict=True):
             x, coarse = propagation(points, coarse, features, x), points
         return jax.nn.log_softmax(self.last(jax.nn.relu(self.hidden(x))), axis=-1)
-
-    def _one_hot(self, category, dtype) -> Float[Array, " categories"]:
-        count = self.num_categories
-        if jnp.ndim(category) == 1:
-            require(len(category) == count, f"the one-hot category has {len(category)} entries; expected {count}")
-            return jnp.asarray(category, dtype)
-        require(
-            is_traced(category) or 0 <= int(category) < count,
-            f"the category is {category}; the network knows 0 to {count - 1}",
-        )
-        return jax.nn.one_hot(category, count, dtype=dtype)
