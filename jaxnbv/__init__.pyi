@@ -106,13 +106,11 @@ from .tasks import Found as Found
 from .tasks import HostClassifier as HostClassifier
 from .tasks import HostSegmenter as HostSegmenter
 from .tasks import MixedEntropy as MixedEntropy
-from .tasks import NegativeEntropy as NegativeEntropy
 from .tasks import NewSurface as NewSurface
 from .tasks import SoftPartCount as SoftPartCount
 from .tasks import Stop as Stop
 from .tasks import Sure as Sure
 from .tasks import coldest_point as coldest_point
-from .tasks import predict as predict
 from .tasks.diffusion import HeatProblem as HeatProblem
 from .version import __version__ as __version__
 from .viz import LiveView as LiveView

@@ -102,7 +102,6 @@ CALLS = {
     nbv.Imagination.preset: {"name": "paper", "longest_side": 2.5, "quick": True, "volume": None, "solid": False}
     | {"lengthscale": 0.1},
     nbv.MixedEntropy: {"classifier": number_of_points, "threshold": 0.5, "num_points": 16},
-    nbv.NegativeEntropy: {"classifier": number_of_points},
     nbv.OnSurface: {"num_points": 10, "noise": 0.1},
     nbv.OutsideBoundary: {"volume": nbv.Box(), "num_points": 10, "value": 1.0, "noise": 0.5},
     nbv.Planner: {"acquisition": nbv.Coverage(), "search": nbv.DiscreteSearch(6), "camera": SMALL}

@@ -4,9 +4,7 @@ from jaxnbv.tasks.classification import Classifier as Classifier
 from jaxnbv.tasks.classification import CrossEntropy as CrossEntropy
 from jaxnbv.tasks.classification import EntropyReduction as EntropyReduction
 from jaxnbv.tasks.classification import MixedEntropy as MixedEntropy
-from jaxnbv.tasks.classification import NegativeEntropy as NegativeEntropy
 from jaxnbv.tasks.classification import Sure as Sure
-from jaxnbv.tasks.classification import predict as predict
 from jaxnbv.tasks.coverage import Coverage as Coverage
 from jaxnbv.tasks.heat import Coldest as Coldest
 from jaxnbv.tasks.heat import ColdestPoint as ColdestPoint

@@ -38,39 +38,6 @@ def cross_entropy(
     return -jnp.sum(jnp.exp(log_p) * jnp.maximum(log_q, least), axis=-1)
 
 
-class NegativeEntropy(eqx.Module):
-    """The paper's u_E(D) = sum_c p_c log p_c, a utility for `ExpectedUtilityImprovement`."""
-
-    classifier: Classifier
-
-    def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
-        """u_E in nats: 0 where the class is certain, -log(classes) where nothing is known."""
-        return -entropy(self.classifier(cloud))
-
-    @property
-    def batch_size(self) -> int:
-        """As the classifier prefers."""
-        return preferred_batch_size(self.classifier)
-
-    @property
-    def improvement(self) -> Quantity:
-        """What its expected improvement is."""
-        meaning = "how much an imagined scan lowers the entropy of the classes, mean over posterior samples."
-        return Quantity("expected reduction of entropy", "nats", meaning)
-
-    def answer(self, cloud: PointCloud) -> "ClassAnswer":
-        """The probabilities of the classes."""
-        return _answer(self.classifier, _log_p(self.classifier, cloud))
-
-    def true_answer(self, scene: Surface, cloud: PointCloud) -> "ClassAnswer | None":
-        """The object's own class, where it says one."""
-        return _true_class(scene, cloud, self.answer)
-
-    def check(self, cloud: PointCloud) -> None:
-        """**Raises:** `ValueError` if the classifier's answer on D is not a vector of log-probabilities."""
-        check_log_p(_log_p(self.classifier, cloud))
-
-
 class ClassAcquisition(Acquisition):
     """An acquisition that compares what a classifier says of D and of D u scan.
 
@@ -78,8 +45,8 @@ class ClassAcquisition(Acquisition):
     - `num_points`: D is thinned to so many by farthest point sampling, once a step, before scans are added to it.
     """
 
-    classifier: eqx.AbstractVar[Classifier]
-    num_points: eqx.AbstractVar[int]
+    classifier: Classifier
+    num_points: int = eqx.field(static=True, default=1024)
 
     def context(self, cloud: PointCloud) -> Context:
         """D, thinned, and log p^(t)."""
@@ -88,7 +55,7 @@ class ClassAcquisition(Acquisition):
 
     @abstractmethod
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, "*values"]:
-        """The value of a scan that takes the classifier's answer from log p^(t) to log p^(t+1)."""
+        """The value, in nats, of a scan that takes the classifier's answer from log p^(t) to log p^(t+1)."""
 
     def __call__(self, context: Context, scan: PointCloud) -> Float[Array, "*values"]:
         """`compare`; zero for a scan that sees nothing."""
@@ -102,17 +69,33 @@ class ClassAcquisition(Acquisition):
 
     def answer(self, cloud: PointCloud) -> "ClassAnswer":
         """The probabilities of the classes given D."""
-        return _answer(self.classifier, context_of(self, cloud)[1])
+        p = np.exp(np.asarray(context_of(self, cloud)[1], np.float64))
+        names = getattr(self.classifier, "classes", None) or tuple(f"class {index}" for index in range(len(p)))
+        return ClassAnswer(tuple(names), p)
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> "ClassAnswer | None":
-        """The object's own class, where it says one."""
-        return _true_class(scene, cloud, self.answer)
+        """The object's own class, where it says one that the classifier knows."""
+        label = getattr(getattr(scene, "sdf", None), "label", None)
+        if not isinstance(label, Array) or label.ndim > 0:
+            return None
+        names = self.answer(cloud).names
+        return ClassAnswer(names, np.eye(len(names))[int(label)]) if 0 <= int(label) < len(names) else None
 
     def check(self, cloud: PointCloud) -> None:
         """**Raises:** `ValueError` if the classifier's answer on D is not a vector of log-probabilities, one for each
         of the classes that it names."""
         log_p = context_of(self, cloud)[1]
-        check_log_p(log_p)
+        require(
+            jnp.ndim(log_p) == 1 and jnp.size(log_p) >= 2,
+            f"the classifier's answer has shape {jnp.shape(log_p)}: give log-probabilities, one for each of two "
+            "classes or more",
+        )
+        total = float(jnp.sum(jnp.exp(log_p)))
+        require(
+            abs(total - 1.0) < 1e-3,
+            f"the classifier's answers are not log-probabilities: their exponentials sum to {total:.4g}; give "
+            "log_softmax of its logits, or the logarithms of probabilities",
+        )
         names = getattr(self.classifier, "classes", None)
         require(
             names is None or len(names) == len(log_p),
@@ -123,11 +106,9 @@ class ClassAcquisition(Acquisition):
 class CrossEntropy(ClassAcquisition):
     """The paper's alpha^(CE): -sum_c p_c^(t) log p_c^(t+1), of the classes' probabilities given D and given D u scan.
 
-    - `classifier`, `num_points`: see `ClassAcquisition`.
+    - `classifier`: a function from a cloud to log-probabilities.
+    - `num_points`: D is thinned to so many by farthest point sampling, once a step.
     """
-
-    classifier: Classifier
-    num_points: int = eqx.field(static=True, default=1024)
 
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, ""]:
         """In nats; zero is the least there is."""
@@ -139,17 +120,31 @@ class CrossEntropy(ClassAcquisition):
         return Quantity("expected cross-entropy", "nats", meaning)
 
 
+class EntropyReduction(ClassAcquisition):
+    """max(0, H(p^(t)) - H(p^(t+1))): the expected improvement of the paper's u_E(D) = sum_c p_c log p_c.
+
+    - `classifier`, `num_points`: as of `CrossEntropy`.
+    """
+
+    def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, ""]:
+        """In nats."""
+        return jnp.maximum(0.0, entropy(log_p) - entropy(log_q))
+
+    @property
+    def quantity(self) -> Quantity:
+        meaning = "how much an imagined scan lowers the entropy of the classes, mean over posterior samples."
+        return Quantity("expected reduction of entropy", "nats", meaning)
+
+
 class MixedEntropy(ClassAcquisition):
     """Cross-entropy while the class is open, entropy reduction once it is nearly settled (the authors' code).
 
-    `CrossEntropy` where the entropy of p^(t) is above `threshold` (nats), else max(0, H(p^(t)) - H(p^(t+1))).
+    `CrossEntropy` where the entropy of p^(t) is above `threshold` (nats), else `EntropyReduction`.
 
-    - `classifier`, `num_points`: see `ClassAcquisition`.
+    - `classifier`, `num_points`: as of `CrossEntropy`.
     """
 
-    classifier: Classifier
     threshold: float = eqx.field(static=True, default=0.75)
-    num_points: int = eqx.field(static=True, default=1024)
 
     def __check_init__(self):
         check_fields(self)
@@ -167,24 +162,6 @@ class MixedEntropy(ClassAcquisition):
         return Quantity("expected cross-entropy or reduction of entropy", "nats", meaning)
 
 
-class EntropyReduction(ClassAcquisition):
-    """max(0, H(p^(t)) - H(p^(t+1))): the expected improvement of the utility `NegativeEntropy`.
-
-    - `classifier`, `num_points`: see `ClassAcquisition`.
-    """
-
-    classifier: Classifier
-    num_points: int = eqx.field(static=True, default=1024)
-
-    def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, ""]:
-        """In nats."""
-        return jnp.maximum(0.0, entropy(log_p) - entropy(log_q))
-
-    @property
-    def quantity(self) -> Quantity:
-        return NegativeEntropy(self.classifier).improvement
-
-
 class ClassComparisons(ClassAcquisition):
     """Several `ClassAcquisition`s of one classifier and as many points, from one answer of it a scan: for
     `Problem.scores`, not for a planner.
@@ -192,9 +169,7 @@ class ClassComparisons(ClassAcquisition):
     - `members`: their values become a vector.
     """
 
-    classifier: Classifier
-    num_points: int = eqx.field(static=True)
-    members: tuple[ClassAcquisition, ...]
+    members: tuple[ClassAcquisition, ...] = ()
 
     @classmethod
     def of(cls, members: Sequence[ClassAcquisition]) -> "ClassComparisons":
@@ -235,77 +210,31 @@ class Sure(Stop):
         )
 
     def check(self, acquisition: Acquisition) -> None:
-        known = hasattr(acquisition, "classifier") or hasattr(getattr(acquisition, "utility", None), "classifier")
-        require(
-            known,
-            f"Sure is about a class, but {type(acquisition).__name__} has no classifier: use CrossEntropy, "
-            "MixedEntropy or the utility NegativeEntropy, or another rule",
-        )
+        _of_classes(acquisition)
 
     def after(self, so_far: SoFar) -> str | None:
-        acquisition, cloud = so_far.acquisition, so_far.evidence.cloud
-        p = _class_probabilities(acquisition, cloud)
-        best = int(np.argmax(p))
-        least = float(p[best])
+        acquisition, cloud = _of_classes(so_far.acquisition), so_far.evidence.cloud
+        answer = acquisition.answer(cloud)
+        best = int(np.argmax(answer.values))
+        least = float(answer.values[best])
         for index in range(self.num_resamplings):
             if least < self.probability:
                 return None
-            half = half_of(cloud, jax.random.fold_in(so_far.key, index))
-            least = min(least, float(_class_probabilities(acquisition, half)[best]))
+            half = acquisition.answer(half_of(cloud, jax.random.fold_in(so_far.key, index)))
+            least = min(least, float(half.values[best]))
         if least < self.probability:
             return None
-        answer = acquisition.answer(cloud)
-        name = f"class {best}" if answer is None else answer.names[best]
         halves = f", {least:.2f} at least given a half of the points" if self.num_resamplings else ""
-        return f"sure of {name}: {float(p[best]):.2f}{halves}"
+        return f"sure of {answer.names[best]}: {float(answer.values[best]):.2f}{halves}"
 
 
-def _true_class(scene: Surface, cloud: PointCloud, answer: Callable[[PointCloud], ClassAnswer]) -> ClassAnswer | None:
-    """The answer that a scene's own class would be, in the names of that on a cloud."""
-    label = getattr(getattr(scene, "sdf", None), "label", None)
-    if not isinstance(label, Array) or label.ndim > 0:
-        return None
-    names = answer(cloud).names
-    return ClassAnswer(names, np.eye(len(names))[int(label)]) if 0 <= int(label) < len(names) else None
-
-
-def _answer(classifier: Classifier, log_p: Float[Array, " classes"]) -> ClassAnswer:
-    p = np.exp(np.asarray(log_p, np.float64))
-    names = getattr(classifier, "classes", None) or tuple(f"class {index}" for index in range(len(p)))
-    return ClassAnswer(tuple(names), p)
-
-
-def check_log_p(log_p: Array) -> None:
-    """Raise `ValueError` unless these are log-probabilities of classes."""
-    require(
-        jnp.ndim(log_p) == 1 and jnp.size(log_p) >= 2,
-        f"the classifier's answer has shape {jnp.shape(log_p)}: give log-probabilities, one for each of two classes or "
-        "more",
-    )
-    require(
-        not bool(jnp.all(log_p >= 0)) or abs(float(jnp.sum(log_p)) - 1.0) >= 1e-3,
-        f"the classifier's answers are probabilities, which sum to {float(jnp.sum(log_p)):.4g}: give their logarithms, "
-        "or log_softmax of its logits",
-    )
-    total = float(jnp.sum(jnp.exp(log_p)))
-    require(
-        abs(total - 1.0) < 1e-3,
-        f"the classifier's answers are not log-probabilities: their exponentials sum to {total:.4g}; apply log_softmax "
-        "to its logits",
-    )
-
-
-def predict(acquisition: Acquisition, cloud: PointCloud) -> Float[Array, " classes"] | None:
-    """log p of the classes given D, as the acquisition sees them; None for one that does not classify."""
-    if isinstance(acquisition, ClassAcquisition):
-        return context_of(acquisition, cloud)[1]
-    classifier = getattr(getattr(acquisition, "utility", None), "classifier", None)
-    return None if classifier is None else _log_p(classifier, context_of(acquisition, cloud)[0])
-
-
-@eqx.filter_jit
-def _log_p(classifier: Classifier, cloud: PointCloud) -> Array:
-    return classifier(cloud)
+def _of_classes(acquisition: Acquisition) -> ClassAcquisition:
+    if not isinstance(acquisition, ClassAcquisition):
+        raise InputError(
+            f"Sure is about a class, but {type(acquisition).__name__} has no classifier: use CrossEntropy or "
+            "MixedEntropy, or another rule"
+        )
+    return acquisition
 
 
 @jax.jit
@@ -314,10 +243,3 @@ def half_of(cloud: PointCloud, key: PRNGKeyArray) -> PointCloud:
     kept = cloud.mask & jax.random.bernoulli(key, 0.5, cloud.mask.shape)
     points, normals = (jnp.where(kept[:, None], rows, 0.0) for rows in (cloud.points, cloud.normals))
     return PointCloud(points, normals, kept)
-
-
-def _class_probabilities(acquisition: Acquisition, cloud: PointCloud) -> Float[np.ndarray, " classes"]:
-    log_p = predict(acquisition, cloud)
-    if log_p is None:
-        raise InputError(f"{type(acquisition).__name__} tells no class")
-    return np.exp(np.asarray(log_p, np.float64))

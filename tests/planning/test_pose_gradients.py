@@ -24,7 +24,7 @@ from jaxnbv.networks import CloudClassifier, InvariantClassifier
 from jaxnbv.scanning import Grid, GridSurface, scan_samples
 from jaxnbv.search import FreePoses, SpherePoses
 from jaxnbv.tasks import Coverage
-from jaxnbv.tasks.classification import CrossEntropy, MixedEntropy, NegativeEntropy
+from jaxnbv.tasks.classification import CrossEntropy, EntropyReduction, MixedEntropy
 
 CAMERA, GRID, STEP = Camera(height=8, width=8), Grid(26), 1e-6
 NUM_DIRECTIONS, NUM_SPHERE, NUM_FREE = 3, 3, 9
@@ -50,7 +50,7 @@ ACQUISITIONS = {
     "cross-entropy": CrossEntropy(smooth),
     "mixed, open": MixedEntropy(smooth, threshold=0.0),
     "mixed, settled": MixedEntropy(smooth, threshold=9.0),
-    "entropy": ExpectedUtilityImprovement(NegativeEntropy(smooth)),
+    "entropy": EntropyReduction(smooth),
     "custom": ExpectedUtilityImprovement(spread),
 }
 

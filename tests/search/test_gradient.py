@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from small_problem import problem_of as any_problem_of
 from small_problem import propose, visit
 
-from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement
+from jaxnbv.acquisition import Acquisition
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import look_at
 from jaxnbv.scanning import Grid, GridSurface, scan
@@ -23,7 +23,7 @@ from jaxnbv.search import (
     HybridSearch,
 )
 from jaxnbv.tasks import Coverage
-from jaxnbv.tasks.classification import CrossEntropy, MixedEntropy, NegativeEntropy
+from jaxnbv.tasks.classification import CrossEntropy, EntropyReduction, MixedEntropy
 
 CAMERA, GRID = Camera(height=8, width=8), Grid(32)
 NODES = nodes(GRID.axis)
@@ -55,7 +55,7 @@ ACQUISITIONS = {
     "cross-entropy": CrossEntropy(classifier),
     "mixed, open": MixedEntropy(classifier, threshold=0.0),
     "mixed, settled": MixedEntropy(classifier, threshold=9.0),
-    "improvement": ExpectedUtilityImprovement(NegativeEntropy(classifier)),
+    "improvement": EntropyReduction(classifier),
 }
 
 

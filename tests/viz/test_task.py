@@ -151,7 +151,7 @@ def test_truth_of_a_scene_is_all_over_it():
 
 def test_a_class_is_not_known_of_a_scene_without_one():
     ball, cloud = nbv.SDFSurface(Sphere(0.9)), nbv.PointCloud.from_arrays([[0.0, 0.9, 0.0]], [[0.0, 1.0, 0.0]])
-    for score in (nbv.CrossEntropy(Leaning()), nbv.ExpectedUtilityImprovement(nbv.NegativeEntropy(Leaning()))):
+    for score in (nbv.CrossEntropy(Leaning()), nbv.EntropyReduction(Leaning())):
         assert score.true_answer(ball, cloud) is None
         known = score.true_answer(nbv.SDFSurface(pyramid_scene(Split.TEST, 2)), cloud)
         np.testing.assert_array_equal(known.values, [0.0, 0.0, 1.0])

@@ -40,8 +40,8 @@ from jaxnbv.tasks import (
     Classifier,
     ColdestPoint,
     CrossEntropy,
+    EntropyReduction,
     MixedEntropy,
-    NegativeEntropy,
     NewSurface,
     SoftPartCount,
 )
@@ -160,7 +160,7 @@ def _heated_at(source: np.ndarray) -> Acquisition:
 
 COMMAND_TASKS = {
     "cross-entropy": _class_task(CrossEntropy),
-    "entropy": _class_task(lambda classifier: ExpectedUtilityImprovement(NegativeEntropy(classifier), num_points=1024)),
+    "entropy": _class_task(EntropyReduction),
     "mixed": _class_task(MixedEntropy),
     "coverage": CommandTask(lambda given: NewSurface(), _mug),
     "parts": CommandTask(_of_parts, _thing_of_parts, PART_SETTING),
