@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Shaped
 
@@ -34,30 +35,14 @@ class HostClassifier(eqx.Module):
 
     def __call__(self, cloud: PointCloud) -> Float[Array, " classes"]:
         """Log-probabilities of one cloud; under `vmap`, of all of them in one call."""
-        return call_on_host(self._log_p, (self.num_classes,), "a HostClassifier", *_rows(cloud))
-
-    def _log_p(self, points: np.ndarray, normals: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        log_p = np.asarray(self.function(points, normals, mask))
-        expected = (len(mask), self.num_classes)
-        require(
-            log_p.shape == expected,
-            f"the classifier returned shape {log_p.shape}, not {expected}: log-probabilities, a row a cloud",
-        )
-        total = np.exp(log_p).sum(axis=-1)
-        require(
-            bool((np.abs(total - 1.0) < 1e-3).all()),
-            f"the classifier's answers are not log-probabilities: their exponentials sum to {total.flat[0]:.4g}; "
-            "apply log_softmax to its logits",
-        )
-        return log_p
+        return _of_cloud(self.function, (self.num_classes,), "HostClassifier", cloud)
 
 
 class HostSegmenter(eqx.Module):
     """A segmenter that runs outside JAX, a PyTorch model say: for search over candidates only.
 
-    - `function`: from points (b, n, 3), unit normals (b, n, 3) and mask (b, n), as NumPy arrays, to probabilities of
-      the parts (b, n, num_parts). It is called with up to 128 scans at once; rows that the mask leaves out count for
-      nothing, whatever it says of them.
+    - `function`: as of `HostClassifier`, to probabilities of the parts (b, n, num_parts); rows that the mask leaves out
+      count for nothing, whatever it says of them.
     - `num_parts`: how many parts it tells apart.
 
     **Raises:** as `HostClassifier`.
@@ -73,27 +58,12 @@ class HostSegmenter(eqx.Module):
 
     def __call__(self, cloud: PointCloud) -> Float[Array, "points parts"]:
         """Probabilities of the parts of one cloud's points; under `vmap`, of all clouds in one call."""
-        return call_on_host(self._p, (cloud.capacity, self.num_parts), "a HostSegmenter", *_rows(cloud))
-
-    def _p(self, points: np.ndarray, normals: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        p = np.asarray(self.function(points, normals, mask))
-        expected = (*mask.shape, self.num_parts)
-        require(
-            p.shape == expected,
-            f"the segmenter returned shape {p.shape}, not {expected}: probabilities, a row a point",
-        )
-        p = np.where(mask[..., None], p, 0.0)
-        odd = p[mask].size and float(np.abs(p[mask].sum(axis=-1) - 1.0).max())
-        require(
-            bool((p >= 0).all()) and odd < 1e-3,
-            f"the segmenter's answers are not probabilities: their sum is off one by up to {odd:.4g}; apply softmax to "
-            "its logits",
-        )
-        return p
+        p = _of_cloud(self.function, (cloud.capacity, self.num_parts), "HostSegmenter", cloud)
+        return jnp.where(cloud.mask[:, None], p, 0.0)
 
 
-def _rows(cloud: PointCloud) -> tuple[Array, Array, Array]:
-    return cloud.points, cloud.normals, cloud.mask
+def _of_cloud(function: Callable, shape: tuple[int, ...], name: str, cloud: PointCloud) -> Float[Array, "..."]:
+    return call_on_host(function, shape, name, cloud.points, cloud.normals, cloud.mask)
 
 
 def call_on_host(
@@ -102,7 +72,7 @@ def call_on_host(
     """A function of NumPy arrays with a leading axis more than here: of one entry or, under `vmap`, of all of them.
 
     - `shape`: of the result of one entry; it has the type of the first array.
-    - `name`: of what is called, for the error where its derivative is asked for.
+    - `name`: of what is called, for errors.
 
     **Raises:** `ValueError` when it is differentiated.
     """
@@ -115,8 +85,10 @@ def _call(arrays: tuple[Any, ...], function: Callable, shape: tuple[int, ...], n
 
     def call(*given):
         batch = given[0].shape[: given[0].ndim - own_axes]
-        flat = (np.asarray(a).reshape(-1, *a.shape[len(batch) :]) for a in given)
-        return np.asarray(function(*flat), dtype).reshape((*batch, *shape))
+        flat = [np.asarray(array).reshape(-1, *array.shape[len(batch) :]) for array in given]
+        found, expected = np.asarray(function(*flat), dtype), (len(flat[0]), *shape)
+        require(found.shape == expected, f"the function of {name} returned shape {found.shape}, not {expected}")
+        return found.reshape((*batch, *shape))
 
     return jax.pure_callback(call, jax.ShapeDtypeStruct(shape, dtype), *arrays, vmap_method="broadcast_all")
 

@@ -74,18 +74,10 @@ def test_a_host_classifier_of_a_large_batch_comes_back():
     np.testing.assert_allclose(jax.jit(jax.vmap(host))(cloud), expected, rtol=1e-6)
 
 
-def test_a_host_classifier_that_gives_logits_or_nan_is_refused():
-    cloud = PointCloud(jnp.ones((3, 3)), jnp.ones((3, 3)), jnp.ones(3, bool))
-    for answer in ([2.0, -1.0], [0.5, 0.5], [np.nan, np.nan]):
-        host = HostClassifier(lambda points, normals, mask, answer=answer: np.array([answer]), 2)
-        with pytest.raises(Exception, match="not log-probabilities"):
-            jax.block_until_ready(host(cloud))
-
-
 @pytest.mark.parametrize("wrap", [lambda f: f, jax.jit])
 def test_a_host_classifier_that_returns_another_shape_says_so(wrap):
     host = HostClassifier(lambda points, normals, mask: np.zeros(4), 4)
-    with pytest.raises((RuntimeError, InputError), match=r"returned shape \(4,\), not \(1, 4\): log-prob"):
+    with pytest.raises((RuntimeError, InputError), match=r"HostClassifier returned shape \(4,\), not \(1, 4\)"):
         jax.block_until_ready(wrap(host)(random_cloud(5, 5)))
 
 
@@ -138,22 +130,9 @@ def test_a_segmenter_on_the_host_is_one_in_jax():
     assert scores[1].batch_size == 128
 
 
-@pytest.mark.parametrize(
-    ("function", "message"),
-    [
-        (lambda points, normals, mask: np.ones((len(mask), PARTS)), "the segmenter returned shape"),
-        (lambda points, normals, mask: np.full((*mask.shape, PARTS), 1.0), "apply softmax"),
-        (lambda points, normals, mask: np.full((*mask.shape, PARTS), np.nan), "not probabilities"),
-    ],
-)
-def test_what_is_no_probability_is_named(function, message):
-    with pytest.raises(Exception, match=message):
-        jax.block_until_ready(HostSegmenter(function, PARTS)(random_cloud(4, 6)))
-
-
 def test_a_segmenter_on_the_host_has_no_derivative():
     host, cloud = HostSegmenter(in_numpy(np.ones((6, PARTS)), []), PARTS), random_cloud(4, 6)
-    with pytest.raises(InputError, match="a HostSegmenter has no derivative"):
+    with pytest.raises(InputError, match="HostSegmenter has no derivative"):
         jax.grad(lambda points: jnp.sum(host(PointCloud(points, cloud.normals, cloud.mask))))(cloud.points)
     with pytest.raises(InputError, match="num_parts is 0"):
         HostSegmenter(in_numpy, 0)
