@@ -76,8 +76,7 @@ CALLS = {
     SMALL.resized: {"height": 2, "width": 3},
     SMALL.strided: {"stride": 2},
     nbv.Carving: {"volume": nbv.Box(), "margin_voxels": 1.0},
-    nbv.ColdestPoint: {"source": (0.0, 1.0, 0.0), "power": 10.0, "T": 5.0, "steps": 20, "u0": 0.0, "radius": 0.1}
-    | {"reached_only": False, "workers": 1},
+    nbv.ColdestPoint: {"heat": (0.0, 1.0, 0.0), "reached_only": False, "workers": 1},
     nbv.ConstrainedPoses: {"nearest": 2.0, "farthest": 3.0, "off_axis": 0.1},
     nbv.CrossEntropy: {"classifier": number_of_points, "num_points": 16},
     nbv.DiscreteSearch: {"candidates": 6},

@@ -195,7 +195,7 @@ ACQUISITIONS = {
     "coverage": Coverage(),
     "new surface": NewSurface(),
     "classes": CrossEntropy(pretrained_classifier("pyramid"), num_points=64),
-    "heat": ExpectedUtilityImprovement(ColdestPoint(source=(0.0, 0.0, 1.0))),
+    "heat": ExpectedUtilityImprovement(ColdestPoint((0.0, 0.0, 1.0))),
 }
 
 

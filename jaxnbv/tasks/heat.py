@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnbv.acquisition import Answer, Quantity
-from jaxnbv.checks import AnyArray, InputError, as_numbers, checked, require
+from jaxnbv.checks import AnyArray, InputError, checked, require
 from jaxnbv.errors import optional
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.scanning import TriangleMesh
@@ -34,11 +34,8 @@ class ColdestPoint(eqx.Module):
     Its Laplacian runs on the host, so search over candidates only, as in the paper. Equal to the last bit whatever the
     order of the points and the number of workers.
 
-    - `source`: (3,), where the body is heated, in scene coordinates: within `radius` of it, with `power`. Scenes that
-      differ in the source alone share one compilation. Or a whole `HeatProblem`, in place of it and the next five.
-    - `T`, `steps`: how long, and in how many steps of implicit Euler.
-    - `u0`: the temperature at the beginning. All of these are explained in `HeatProblem`, which `heat` holds; the
-      defaults are the authors'.
+    - `heat`: the `HeatProblem`, or its source alone, (3,) in scene coordinates, with the authors' values for the rest.
+      Scenes that differ in the source alone share one compilation.
     - `reached_only`: take the minimum over the points that the source can warm. The paper takes it over all, where it
       stays at u0, the least there can be, from the moment that D or an imagined scan has one piece that is not
       connected to the source: no view improves on that.
@@ -55,24 +52,14 @@ class ColdestPoint(eqx.Module):
     @checked
     def __init__(
         self,
-        source: Float[AnyArray, "3"] | Sequence[float] | HeatProblem,
-        power: float = 10.0,
-        T: float = 5.0,
-        steps: int = 20,
-        u0: float = 0.0,
-        radius: float = 0.1,
+        heat: HeatProblem | Float[AnyArray, "3"] | Sequence[float],
         reached_only: bool = False,
         workers: int | None = None,
     ):
         workers = optional("loky").cpu_count() if workers is None else workers
         require(workers >= 1, f"the number of workers is {workers}; it must be at least 1")
-        if isinstance(source, HeatProblem):
-            twice = (power, T, steps, u0, radius) != (10.0, 5.0, 20, 0.0, 0.1)
-            require(not twice, "the heat is given twice: power, T, steps, u0 and radius are those of the HeatProblem")
-            self.heat = source
-        else:
-            place = source if isinstance(source, Array) else as_numbers(source, "the heat source")
-            self.heat = HeatProblem(place, radius, power, T, steps, u0)
+        # A list is converted on the way in, which mypy cannot see.
+        self.heat = heat if isinstance(heat, HeatProblem) else HeatProblem(heat)  # type: ignore[arg-type]
         self.reached_only, self.workers = reached_only, workers
 
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:

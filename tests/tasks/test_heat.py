@@ -39,9 +39,7 @@ def cloud_of(points, capacity=None):
 
 
 def utility_of(heat, reached_only=False, workers=None):
-    return ColdestPoint(
-        heat.source, heat.power, heat.duration, heat.steps, heat.initial, heat.radius, reached_only, workers
-    )
+    return ColdestPoint(heat, reached_only, workers)
 
 
 def least_in_numpy(points, heat):
@@ -72,12 +70,10 @@ def test_the_utility_against_a_dense_solve(x64):
         assert abs(value - float(found)) > 1e-3
 
 
-def test_a_heat_problem_stands_for_its_numbers(x64):
-    cloud = cloud_of(sphere(60))
-    assert float(ColdestPoint(HEAT, workers=1)(cloud)) == float(utility_of(HEAT, workers=1)(cloud))
-    assert ColdestPoint(HEAT).heat is HEAT
-    with pytest.raises(InputError, match="the heat is given twice"):
-        ColdestPoint(HEAT, T=2.0)
+def test_a_source_alone_is_heated_as_by_the_authors():
+    heat = ColdestPoint(POLE).heat
+    np.testing.assert_array_equal(heat.source, POLE)
+    assert (heat.radius, heat.power, heat.duration, heat.steps, heat.initial) == (0.1, 10.0, 5.0, 20, 0.0)
 
 
 @pytest.mark.slow
