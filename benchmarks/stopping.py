@@ -31,7 +31,7 @@ from jaxnbv.storage.files import write_text
 from jaxnbv.studies.engine.results import interval
 from jaxnbv.studies.scenes import Framing, Split, hidden_view, part_scene, pyramid_scene
 from jaxnbv.tasks import Covered, Found, Sure
-from jaxnbv.tasks.new_surface import NewSurface, ShownArea
+from jaxnbv.tasks.coverage import NewSurface, ShownArea
 
 SIDE = Framing.WHOLE.longest_side
 FIRST = nbv.look_at((0.8, 0.9, 2.2))

@@ -219,7 +219,7 @@ def sides(points, normals, mask):
 def test_samples_that_a_gpu_takes_together_have_the_same_scores(surfaces, cloud, name, monkeypatch):
     acquisition = CrossEntropy(HostClassifier(sides, 2)) if name == "host" else ACQUISITIONS[name]
     alone = expected_value(acquisition, cloud, surfaces, CAMERA, POSES)
-    for module in ("acquisition", "scanning.grid", "tasks.coverage", "tasks.new_surface"):
+    for module in ("acquisition", "scanning.grid", "tasks.coverage", "tasks.coverage"):
         monkeypatch.setattr(f"jaxnbv.{module}.on_cpu", lambda: False)
     assert samples_at_once(CAMERA, POSES) > 3
     together = expected_value(acquisition, cloud, surfaces, CAMERA, POSES)

@@ -1,12 +1,27 @@
-"""Geometric exploration: scan what is far from everything scanned so far."""
+"""Coverage: how much of the surface has been seen, and how much more a view would show."""
 
+import dataclasses
+from typing import Any
+
+import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.acquisition import Acquisition, Quantity
+from jaxnbv.acquisition import Acquisition, Quantity, expected_value
+from jaxnbv.checks import check_fields, require
+from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.neighbours import nearest_squared_distance
+from jaxnbv.geometry.neighbours import DistanceField, nearest_squared_distance, spacing
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.scanning.metrics import GRAZING
 from jaxnbv.sharding import on_cpu
+from jaxnbv.tasks.stopping import SoFar, Stop
+
+
+def _many() -> int:
+    """Scans at once, where little is computed of each."""
+    return 128 if on_cpu() else 2048
 
 
 class Coverage(Acquisition):
@@ -28,4 +43,121 @@ class Coverage(Acquisition):
     @property
     def batch_size(self) -> int:
         """Many scans at once: the loop over D runs once for all of them."""
-        return 128 if on_cpu() else 2048
+        return _many()
+
+
+class NewSurface(Acquisition):
+    """Expected new area: how much surface an imagined scan shows that is not near D, in squared scene units.
+
+        alpha(D, scan) = sum_x a(x) clip(d(x, D) / s - 1, 0, 1),   s = max(size, spacing of D),
+
+    over the hits x of the scan, where d is the distance to the nearest point of D, the spacing the median of how far
+    its points are from their nearest neighbours, and a(x) = r^2 omega / cos the area of the pixel on the surface: omega
+    its solid angle, r the distance, cos that of the angle of incidence, at least 0.2. The rays of one scan do not
+    overlap, so no part of the surface counts twice; and neither near surfaces, which fill more pixels, nor a single
+    point far from all others outweighs the rest, as in the paper's `Coverage`. It is differentiable in the pose
+    wherever `Coverage` is.
+
+    - `size`: what lies within this distance of D has been seen; what is twice as far is new. In scene units.
+
+    **Raises:** `ValueError` if the size is not positive.
+    """
+
+    size: float = eqx.field(static=True, default=0.05)
+
+    def __check_init__(self):
+        check_fields(self)
+        require(self.size > 0, f"the size is {self.size}; it must be positive, in scene units")
+
+    def context(self, cloud: PointCloud) -> DistanceField:
+        """How far it is to D, in units of s, on a grid about it."""
+        size = jnp.maximum(self.size, spacing(cloud))
+        distance = DistanceField.of(cloud, 2.0 * size)
+        return dataclasses.replace(distance, values=distance.values / size)
+
+    def score(self, context: DistanceField, scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, ""]:
+        """The new area of one scan; zero for a scan that sees nothing."""
+        return jnp.sum(visible_area(scan, camera, pose) * self.newness(context, scan.points))
+
+    def newness(self, distance: DistanceField, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """From 0 beside D to 1 at 2 s."""
+        return jnp.clip(distance(points) - 1.0, 0.0, 1.0)
+
+    @property
+    def quantity(self) -> Quantity:
+        meaning = "area that an imagined scan shows and no scan has shown before, mean over posterior samples."
+        return Quantity("expected new area", "scene units²", meaning, power=2)
+
+    @property
+    def batch_size(self) -> int:
+        """Many scans at once."""
+        return _many()
+
+
+def visible_area(scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, " rays"]:
+    """The area of each pixel on the surface that it shows, in squared scene units; zero where it shows none.
+
+    A pixel of focal lengths fx and fy at depth z and distance r has r^2 omega = z^3 / (r fx fy).
+    """
+    offset = jnp.where(scan.mask[:, None], scan.points - pose.position, pose.forward)
+    depth = jnp.matmul(offset, pose.forward, precision="highest")
+    distance = jnp.linalg.norm(offset, axis=-1)
+    cosine = jnp.abs(jnp.sum(offset * scan.normals, axis=-1)) / distance
+    across, down = camera.focal_lengths
+    facing = depth**3 / (distance * across * down)
+    return jnp.where(scan.mask, facing / jnp.maximum(cosine, GRAZING), 0.0)
+
+
+class ShownArea(Acquisition):
+    """New area and all area of a scan: for `expected_value`, not for a search."""
+
+    of: NewSurface
+
+    def context(self, cloud: PointCloud) -> DistanceField:
+        return self.of.context(cloud)
+
+    def score(self, context: Any, scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, "2"]:
+        area = visible_area(scan, camera, pose)
+        return jnp.stack([jnp.sum(area * self.of.newness(context, scan.points)), jnp.sum(area)])
+
+    @property
+    def batch_size(self) -> int:
+        return _many()
+
+
+class Covered(Stop):
+    """Stop once expected coverage reaches `share`: of the area of the sampled surfaces that the candidates would show,
+    what is not new, as `NewSurface` says.
+
+    - `share`: within (0, 1].
+    - `size`: of `NewSurface`, in scene units.
+
+    **Raises:** `ValueError` for another share, or a size that is not positive.
+    """
+
+    share: float = eqx.field(static=True, default=0.98)
+    size: float = eqx.field(static=True, default=0.05)
+
+    def __check_init__(self):
+        check_fields(self)
+        require(0 < self.share <= 1, f"the share is {self.share}; it must lie within (0, 1]")
+        NewSurface(self.size)
+
+    def after(self, so_far: SoFar) -> str | None:
+        covered = expected_coverage(so_far, self.size)
+        return f"{100 * covered:.1f} % of what can be seen is expected to be covered" if covered >= self.share else None
+
+
+def expected_coverage(so_far: SoFar, size: float = 0.05) -> float:
+    """Share of the area that the camera would see of the posterior's surfaces, from all candidates, that is not new.
+
+    - `size`: of `NewSurface`, in scene units.
+    """
+    surfaces = so_far.imagination.sample(so_far.evidence, so_far.key)
+    barrier = so_far.imagination.barrier(so_far.camera, so_far.candidates)
+    where = so_far.evidence.cloud, surfaces, so_far.camera, so_far.candidates, barrier
+    new, shown = np.asarray(_values(ShownArea(NewSurface(size)), *where)).sum(axis=0)
+    return 1.0 - float(new / shown) if shown else 1.0
+
+
+_values = eqx.filter_jit(expected_value)

@@ -18,7 +18,7 @@ from jaxnbv.planning.episode import Episode, View
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Surface
 from jaxnbv.scanning.metrics import coverage, true_mesh
-from jaxnbv.tasks.new_surface import NewSurface, visible_area
+from jaxnbv.tasks.coverage import NewSurface, visible_area
 from jaxnbv.viz.answers import CoverageAnswer, Panel, capital, words_of
 
 

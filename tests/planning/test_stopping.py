@@ -22,7 +22,7 @@ from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.search import DiscreteSearch, FarthestView
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage, Covered, CrossEntropy, EntropyReduction, Found, SoftPartCount, Sure
-from jaxnbv.tasks.new_surface import expected_coverage
+from jaxnbv.tasks.coverage import expected_coverage
 
 SCENE, FIRST, KEY = SDFSurface(Sphere(0.8)), look_at((0.0, 0.0, 2.5)), jax.random.key(3)
 CAMERA, GRID = Camera(height=12, width=12), Grid(24)

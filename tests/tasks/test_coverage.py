@@ -1,19 +1,143 @@
-"""The coverage acquisition against brute force in float64."""
+"""Coverage and expected new area against integrals over known surfaces and brute force in float64."""
+
+import math
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from on_grid import balls
 from opinions import drawn_cloud, nothing
+from scipy.integrate import quad
 
-from jaxnbv.acquisition import expected_value
+from jaxnbv.acquisition import Several, expected_value
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
-from jaxnbv.scanning import Grid, scan
-from jaxnbv.tasks import Coverage
+from jaxnbv.scanning import Grid, SDFSurface, scan
+from jaxnbv.scanning.sdf import Cuboid, Sphere
+from jaxnbv.search import DiscreteSearch, GradientSearch
+from jaxnbv.tasks import Coverage, NewSurface
+from jaxnbv.tasks.coverage import visible_area
 
-CAMERA, GRID = Camera(height=8, width=8), Grid(20)
+SMALL, POSE = Camera(height=8, width=8), look_at((0.4, 1.1, 2.2))
+RADIUS, AWAY = 0.5, math.dist((0, 0, 0), (0.4, 1.1, 2.2))
+
+
+def looked_at(height=24, width=24):
+    """A ball in a camera of so many pixels."""
+    camera = Camera(height=height, width=width, aspect=height / width)
+    return scan(SDFSurface(Sphere(RADIUS)), camera, POSE), camera
+
+
+def ball_area(sharpest: float) -> float:
+    """Area of the ball that is seen, less what lies at a cosine of incidence below the sharpest: there a pixel counts
+    cos / sharpest of its area."""
+
+    def strip(angle):
+        distance = math.sqrt(AWAY**2 + RADIUS**2 - 2 * AWAY * RADIUS * math.cos(angle))
+        cosine = (AWAY * math.cos(angle) - RADIUS) / distance
+        return 2 * math.pi * RADIUS**2 * math.sin(angle) * min(1.0, cosine / sharpest)
+
+    return quad(strip, 0.0, math.acos(RADIUS / AWAY), limit=200)[0]
+
+
+@pytest.mark.parametrize(("height", "width"), [(240, 240), (120, 240)])
+def test_the_area_of_a_ball_is_its_integral(height, width):
+    seen, camera = looked_at(height, width)
+    # A pixel of the limb is seen or not: a share of about one in a hundred of the area.
+    assert float(jnp.sum(visible_area(seen, camera, POSE))) == pytest.approx(ball_area(0.2), rel=0.02)
+
+
+def test_the_area_of_a_slanted_face_does_not_depend_on_the_rays_or_the_distance():
+    face = SDFSurface(Cuboid((0.5, 0.4, 1e-3)))
+    for pixels, away in ((120, 1.0), (200, 1.0), (200, 1.6)):
+        camera, pose = Camera(height=pixels, width=pixels, fov=1.0), look_at((away, 0.3 * away, 1.5 * away))
+        area = float(jnp.sum(visible_area(scan(face, camera, pose), camera, pose)))
+        # Its border is known to a pixel: a share of 2 / 120 * (1 / 1.0 + 1 / 0.8) of the face, most of it by chance.
+        assert area == pytest.approx(1.0 * 0.8, rel=0.03)
+
+
+def cloud_of(points, capacity=None):
+    points = np.asarray(points, float)
+    return PointCloud.from_arrays(points, points / np.linalg.norm(points, axis=1, keepdims=True), capacity)
+
+
+def test_the_score_is_the_area_weighed_by_how_far_it_is_to_d():
+    seen, camera = looked_at()
+    rng = np.random.default_rng(0)
+    data = rng.normal(size=(40, 3)) + np.array([0.0, 4.0, 0.0])
+    data *= RADIUS / np.linalg.norm(data, axis=1, keepdims=True)
+    acquisition, cloud = NewSurface(0.15), cloud_of(data, 64)
+    context = acquisition.context(cloud)
+    found = float(acquisition.score(context, seen, camera, POSE))
+
+    points, mask = np.asarray(seen.points, np.float64), np.asarray(seen.mask)
+    distance = np.linalg.norm(points[:, None] - data[None], axis=-1).min(axis=1)
+    area = np.asarray(visible_area(seen, camera, POSE), np.float64)
+    expected = float(np.sum(area[mask] * np.clip(distance[mask] / 0.15 - 1.0, 0.0, 1.0)))
+    assert 0.1 * area.sum() < expected < 0.9 * area.sum()
+    # Between nodes a distance is wrong by a small part of their spacing, here 0.026, and to both sides.
+    assert found == pytest.approx(expected, rel=0.03)
+
+
+def test_between_the_points_of_a_sparse_cloud_nothing_is_new():
+    """As many points as are 0.1 apart, all over the ball that is looked at: by the size alone half of it were new."""
+    seen, camera = looked_at()
+    cloud = cloud_of(RADIUS * np.asarray(fibonacci_sphere(300)))
+    acquisition = NewSurface(0.02)
+    score = float(acquisition.score(acquisition.context(cloud), seen, camera, POSE))
+    assert score < 0.02 * float(jnp.sum(visible_area(seen, camera, POSE)))
+
+
+def test_nothing_new_is_worth_nothing():
+    seen, camera = looked_at()
+    acquisition = NewSurface()
+    assert float(acquisition.score(acquisition.context(seen), seen, camera, POSE)) == 0.0
+    empty = PointCloud(jnp.zeros_like(seen.points), jnp.zeros_like(seen.points), seen.mask & False)
+    far = acquisition.context(cloud_of([[1.0, 1.0, 1.0]]))
+    assert float(acquisition.score(far, empty, camera, POSE)) == 0.0
+    everything = float(jnp.sum(visible_area(seen, camera, POSE)))
+    assert float(acquisition.score(far, seen, camera, POSE)) == pytest.approx(everything, rel=1e-5)
+
+
+def test_its_expectation_and_that_beside_others_are_the_same():
+    surfaces, camera = balls(Grid(32), [0.7]), Camera(height=12, width=12)
+    poses = look_at(jnp.array([[0.0, 0.0, 2.5], [2.5, 0.0, 0.0], [0.0, -2.5, 0.0]]))
+    cloud = cloud_of([[0.0, 0.0, 0.7], [0.1, 0.0, 0.69]])
+    alone = expected_value(NewSurface(), cloud, surfaces, camera, poses)
+    both = expected_value(Several((Coverage(), NewSurface())), cloud, surfaces, camera, poses)
+    np.testing.assert_allclose(both[:, 1], alone, rtol=1e-6)
+    # From the first pose some has been seen.
+    assert float(alone[0]) < float(alone[1]) - 0.01
+    assert float(alone[1]) == pytest.approx(float(alone[2]), rel=0.05)
+
+
+@pytest.mark.slow
+def test_it_can_be_climbed(x64):
+    """The derivative in the pose is that by central differences, for a small step, of the smooth part of it."""
+    surfaces, camera = balls(Grid(32), [0.7]), Camera(height=16, width=16)
+    cloud = cloud_of([[0.0, 0.0, 0.7]])
+
+    def value(x):
+        pose = look_at(jnp.array([x, 0.4, 2.4]))
+        return expected_value(NewSurface(0.3), cloud, surfaces, camera, pose[None])[0]
+
+    found = float(jax.grad(value)(0.5))
+    step = 1e-6
+    differences = (value(0.5 + step) - value(0.5 - step)) / (2 * step)
+    assert abs(found) > 1e-3
+    assert found == pytest.approx(float(differences), rel=1e-3)
+
+
+def test_searches_of_both_kinds_take_it_and_a_call_without_a_camera_is_named():
+    acquisition = NewSurface()
+    for search in (DiscreteSearch(4), GradientSearch(num_candidates=4, num_starts=1, iterations=1)):
+        search.check(acquisition, Camera(height=4, width=4), 16)
+    with pytest.raises(ValueError, match=r"score\(context, scan, camera, pose\)"):
+        acquisition(None, cloud_of([[1.0, 0.0, 0.0]]))
+    with pytest.raises(ValueError, match=r"size is 0\.0"):
+        NewSurface(0.0)
 
 
 def chamfer(points, data):
@@ -30,14 +154,14 @@ def test_a_scan_that_sees_nothing_or_nothing_new_is_worth_nothing():
 
 def test_the_acquisition_against_brute_force_over_all_scans():
     rng = np.random.default_rng(2)
-    surfaces = balls(GRID, (0.8, 0.6, 0.9), rng.uniform(-0.3, 0.3, (3, 3)))
+    surfaces = balls(Grid(20), (0.8, 0.6, 0.9), rng.uniform(-0.3, 0.3, (3, 3)))
     data, poses = drawn_cloud(rng, 60, 64), look_at(fibonacci_sphere(5, 2.5))
     expected = np.zeros((3, 5))
     for s, p in np.ndindex(3, 5):
         surface = jax.tree.map(lambda leaf, s=s: leaf[s], surfaces)
-        expected[s, p] = chamfer(scan(surface, CAMERA, poses[p]).to_numpy()[0], data.to_numpy()[0])
+        expected[s, p] = chamfer(scan(surface, SMALL, poses[p]).to_numpy()[0], data.to_numpy()[0])
     assert expected.min() > 0
-    found = expected_value(Coverage(), data, surfaces, CAMERA, poses)
+    found = expected_value(Coverage(), data, surfaces, SMALL, poses)
     np.testing.assert_allclose(found, expected.mean(axis=0), rtol=1e-4)
 
 
