@@ -20,15 +20,6 @@ def angle(a, b):
     return math.acos(np.clip(np.dot(a, b) / np.linalg.norm(a) / np.linalg.norm(b), -1.0, 1.0))
 
 
-def test_corner_pixel_by_hand():
-    """fov 90 degrees, 4 rows: the image plane at z = 1 is 2 high, so pixels are 1/2 wide and the corner at -3/4."""
-    directions = np.asarray(Camera(fov=math.pi / 2, height=4, width=6).pixel_directions()).reshape(4, 6, 3)
-    np.testing.assert_allclose(directions[0, 0], [-1.25, -0.75, 1.0], atol=1e-6)
-    np.testing.assert_allclose(directions[3, 5], [1.25, 0.75, 1.0], atol=1e-6)
-    np.testing.assert_allclose(directions[0, 5], [1.25, -0.75, 1.0], atol=1e-6)
-    np.testing.assert_allclose(directions[2, 3], [0.25, 0.25, 1.0], atol=1e-6)
-
-
 def test_field_of_view_is_the_vertical_angle_between_the_images_edges():
     """The centres of the first and last of n rows lie at the share (n - 1)/n of the edges' tangent."""
     camera = Camera(fov=math.radians(30.0), height=50, width=9)

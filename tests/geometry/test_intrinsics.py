@@ -75,12 +75,6 @@ def test_a_resized_camera_sees_the_same_and_the_frustum_is_its_border(values, he
     np.testing.assert_allclose(corners[2], [2 * expected[2], 2 * expected[3], 2.0], rtol=1e-5, atol=1e-6)
 
 
-def test_a_centred_matrix_of_square_pixels_is_the_plain_camera():
-    camera = Camera.from_intrinsics([[100.0, 0.0, 29.5], [0.0, 100.0, 19.5], [0.0, 0.0, 1.0]], 40, 60)
-    assert camera.focal_lengths == pytest.approx((100.0, 100.0))
-    np.testing.assert_allclose(camera.pixel_directions(), Camera(camera.fov, 40, 60).pixel_directions(), atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("matrix", "message"),
     [

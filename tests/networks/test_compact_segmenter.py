@@ -1,7 +1,5 @@
 """The small part segmenter: what it depends on, its gradients, its file; the shipped weights on new objects."""
 
-from importlib import resources
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -130,8 +128,3 @@ def test_the_shipped_weights_know_the_parts_of_objects_that_they_were_not_traine
         assert set(rows[there].tolist()) <= set(CATEGORIES[category].labels)
         assert (rows[~there] == -1).all()
     assert np.mean(said[mask] == labels[mask]) >= 0.85
-
-
-def test_the_shipped_weights_are_small():
-    file = resources.files("jaxnbv.networks") / "weights" / "parts.safetensors"
-    assert len(file.read_bytes()) < 2**20

@@ -3,7 +3,6 @@
 import itertools
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import published
@@ -132,17 +131,6 @@ def test_masked_rows_and_capacity_do_not_matter():
         np.testing.assert_allclose(found[place], expected, atol=1e-5)
 
 
-def test_all_categories_share_one_program(compilations):
-    network, (points, normals) = small_network(), rows(30)
-    categories = [jnp.asarray(category) for category in range(16)]
-    first = segment(network, points, normals, categories[0])
-    compilations.clear()
-    answers = np.stack([segment(network, points, normals, category) for category in categories])
-    assert not compilations
-    np.testing.assert_array_equal(answers[0], first)
-    assert all(np.abs(a - b).max() > 1e-3 for a, b in itertools.pairwise(answers))
-
-
 def test_calls_that_cannot_be_answered_are_refused():
     network, (points, normals) = small_network(), rows(30)
     for category in (-1, 16, np.asarray(50)):
@@ -222,16 +210,3 @@ def test_scenes_of_all_categories_and_scales_share_one_program(compilations):
     assert not compilations
     for answer, allowed in zip(answers, part_mask(), strict=True):
         np.testing.assert_array_equal(np.asarray(answer).any(axis=0), allowed)
-
-
-def test_gradients_reach_filled_rows_only_whatever_stands_in_the_others():
-    segmenter, cloud = CloudSegmenter(small_network(), "chair", 40), cloud_of(*rows(30), 50)
-
-    def total(points, normals):
-        return jnp.sum(segmenter(PointCloud(points, normals, cloud.mask))[:, 13])
-
-    filled = [jnp.where(cloud.mask[:, None], array, jnp.nan) for array in (cloud.points, cloud.normals)]
-    for gradient in jax.jit(jax.grad(total, argnums=(0, 1)))(*filled):
-        assert np.isfinite(gradient).all()
-        assert np.abs(gradient).max() > 1e-4
-        assert not np.asarray(gradient)[30:].any()

@@ -10,7 +10,7 @@ from on_grid import balls
 from opinions import drawn_cloud, nothing
 from scipy.integrate import quad
 
-from jaxnbv.acquisition import Several, expected_value
+from jaxnbv.acquisition import expected_value
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
@@ -99,18 +99,6 @@ def test_nothing_new_is_worth_nothing():
     assert float(acquisition.score(far, empty, camera, POSE)) == 0.0
     everything = float(jnp.sum(visible_area(seen, camera, POSE)))
     assert float(acquisition.score(far, seen, camera, POSE)) == pytest.approx(everything, rel=1e-5)
-
-
-def test_its_expectation_and_that_beside_others_are_the_same():
-    surfaces, camera = balls(Grid(32), [0.7]), Camera(height=12, width=12)
-    poses = look_at(jnp.array([[0.0, 0.0, 2.5], [2.5, 0.0, 0.0], [0.0, -2.5, 0.0]]))
-    cloud = cloud_of([[0.0, 0.0, 0.7], [0.1, 0.0, 0.69]])
-    alone = expected_value(NewSurface(), cloud, surfaces, camera, poses)
-    both = expected_value(Several((Coverage(), NewSurface())), cloud, surfaces, camera, poses)
-    np.testing.assert_allclose(both[:, 1], alone, rtol=1e-6)
-    # From the first pose some has been seen.
-    assert float(alone[0]) < float(alone[1]) - 0.01
-    assert float(alone[1]) == pytest.approx(float(alone[2]), rel=0.05)
 
 
 @pytest.mark.slow

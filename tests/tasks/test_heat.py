@@ -99,18 +99,6 @@ def test_scenes_that_differ_in_the_source_share_a_compilation(compilations):
     assert float(first) != float(second)
 
 
-def test_many_sources_at_once(x64):
-    points, sources = sphere(80), sphere(3)
-    utilities = eqx.filter_vmap(lambda source: utility_of(dataclasses.replace(HEAT, source=source), workers=1))(
-        jnp.asarray(sources)
-    )
-    values = eqx.filter_vmap(lambda utility: utility(cloud_of(points)))(utilities)
-    for value, source in zip(values, sources, strict=True):
-        assert float(value) == pytest.approx(
-            -least_in_numpy(points, dataclasses.replace(HEAT, source=source)), rel=1e-9
-        )
-
-
 def test_what_the_source_does_not_reach(x64):
     near, far = sphere(60), sphere(60) + np.array([9.0, 0.0, 0.0])
     everything, reached = (utility_of(HEAT, only, workers=1) for only in (False, True))

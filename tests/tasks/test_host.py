@@ -43,15 +43,6 @@ def test_a_host_classifier_equals_the_one_in_jax_in_one_call_a_batch():
     expected = np.stack([linear(cloud) for cloud in clouds])
     calls = {
         "one": (lambda f: f(clouds[0]), [(1, 20)], expected[0]),
-        "jit": (lambda f: jax.jit(f)(clouds[0]), [(1, 20)], expected[0]),
-        "vmap": (lambda f: jax.vmap(f)(batch), [(6, 20)], expected),
-        "jit of vmap": (lambda f: jax.jit(jax.vmap(f))(batch), [(6, 20)], expected),
-        "vmap of some": (
-            lambda f: jax.vmap(lambda p: f(PointCloud(p, clouds[0].normals, clouds[0].mask)))(batch.points[:, :20]),
-            [(6, 20)],
-            np.stack([linear(PointCloud(c.points, clouds[0].normals, clouds[0].mask)) for c in clouds]),
-        ),
-        "map": (lambda f: jax.lax.map(f, batch), [(1, 20)] * 6, expected),
         "map in batches": (lambda f: jax.lax.map(f, batch, batch_size=4), [(4, 20), (2, 20)], expected),
         "vmap of vmap": (
             lambda f: jax.vmap(jax.vmap(f))(jax.tree.map(lambda a: a.reshape(2, 3, *a.shape[1:]), batch)),

@@ -1,4 +1,6 @@
-"""Farthest point sampling and ball queries against loops in NumPy."""
+"""Farthest point sampling, ball queries and interpolation against loops in NumPy."""
+
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +9,7 @@ import pytest
 
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.farthest_points import farthest_point_indices
-from jaxnbv.networks.layers import ball_query
+from jaxnbv.networks.layers import FeaturePropagation, Linear, ball_query, interpolate
 
 RNG = np.random.default_rng(0)
 
@@ -52,24 +54,6 @@ def test_farthest_points_against_a_loop_and_masked_rows_may_hold_anything(x64, n
     assert len(set(np.asarray(found).tolist())) == min(count, mask.sum())
 
 
-def test_of_points_equally_far_the_first_is_chosen():
-    points = lattice(5)
-    for mask in (np.ones(len(points), bool), some_mask(len(points), 0.5)):
-        found = farthest_point_indices(jnp.asarray(points), jnp.asarray(mask), 60)
-        np.testing.assert_array_equal(found, farthest_by_loop(points, mask, 60))
-
-
-def test_duplicates_come_last_and_then_the_first_filled_row_again_and_again():
-    points = np.repeat(RNG.integers(0, 9, (6, 3)).astype(np.float32), 3, axis=0)
-    mask = np.arange(18) >= 4
-    found = np.asarray(farthest_point_indices(jnp.asarray(points), jnp.asarray(mask), 30))
-    np.testing.assert_array_equal(found, farthest_by_loop(points, mask, 30))
-    assert sorted(map(tuple, points[found[:5]])) == sorted(set(map(tuple, points[mask])))
-    assert sorted(found[:14]) == list(range(4, 18))
-    np.testing.assert_array_equal(found[14:], 4)
-    np.testing.assert_array_equal(farthest_point_indices(jnp.asarray(points), jnp.zeros(18, bool), 3), 0)
-
-
 @pytest.mark.parametrize(("n", "count"), [(1, 1), (1, 4), (31, 8), (64, 40), (200, 64), (200, 256)])
 @pytest.mark.parametrize("share", [1.0, 0.4])
 def test_balls_against_a_loop(x64, n, count, share):
@@ -89,41 +73,52 @@ def test_a_point_on_the_sphere_is_within():
         np.testing.assert_array_equal(found, ball_by_loop(points, points, mask, radius, 90))
 
 
-def test_under_vmap_and_map_as_one_by_one():
-    points = jnp.asarray(RNG.normal(size=(4, 90, 3)), jnp.float32)
-    mask = jnp.asarray(RNG.random((4, 90)) < 0.6)
-
-    def rows(points, mask):
-        chosen = farthest_point_indices(points, mask, 12)
-        return chosen, ball_query(points[chosen], points, mask, 0.7, 9)
-
-    one_by_one = [rows(points[i], mask[i]) for i in range(4)]
-    for together in (jax.vmap(rows)(points, mask), jax.lax.map(lambda cloud: rows(*cloud), (points, mask))):
-        for i, (chosen, groups) in enumerate(one_by_one):
-            np.testing.assert_array_equal(together[0][i], chosen)
-            np.testing.assert_array_equal(together[1][i], groups)
-
-
-def test_gradients_reach_points_through_the_gathers_only(x64):
-    points, mask = jnp.asarray(RNG.normal(size=(40, 3))), jnp.ones(40, bool)
-
-    def spread(points):
-        centers = points[farthest_point_indices(points, mask, 6)]
-        return jnp.sum((points[ball_query(centers, points, mask, 1.0, 5)] - centers[:, None]) ** 2)
-
-    chosen = np.asarray(farthest_point_indices(points, mask, 6))
-    groups = np.asarray(ball_query(points[chosen], points, mask, 1.0, 5))
-    expected = np.zeros((40, 3))
-    for i, group in zip(chosen, groups, strict=True):
-        for j in group:
-            expected[j] += 2 * np.asarray(points[j] - points[i])
-            expected[i] -= 2 * np.asarray(points[j] - points[i])
-    assert np.abs(expected).max() > 0.1
-    np.testing.assert_allclose(jax.grad(spread)(points), expected, atol=1e-12)
-
-
 def test_counts_below_one_are_refused():
     with pytest.raises(InputError, match="at least one"):
         farthest_point_indices(jnp.zeros((3, 3)), jnp.ones(3, bool), 0)
     with pytest.raises(InputError, match="at least one"):
         ball_query(jnp.zeros((3, 3)), jnp.zeros((3, 3)), jnp.ones(3, bool), 1.0, 0)
+
+
+def interpolated_by_loop(points, coarse, features):
+    result = np.zeros((len(points), features.shape[1]))
+    for i, x in enumerate(points):
+        squared = {j: ((x - y) ** 2).sum() for j, y in enumerate(coarse)}
+        nearest = sorted(squared, key=squared.get)[:3]
+        weights = [1 / (squared[j] + 1e-8) for j in nearest]
+        for j, w in zip(nearest, weights, strict=True):
+            result[i] += w / sum(weights) * features[j]
+    return result
+
+
+@pytest.mark.parametrize("m", [1, 2, 40])
+def test_interpolation_against_a_loop(x64, m):
+    points, coarse, features = RNG.normal(size=(30, 3)), RNG.normal(size=(m, 3)), RNG.normal(size=(m, 5))
+    points[0] = coarse[0]
+    np.testing.assert_allclose(
+        jax.jit(interpolate)(points, coarse, features), interpolated_by_loop(points, coarse, features), atol=1e-12
+    )
+
+
+def test_gradients_are_bounded_however_close_the_coarse_points_are():
+    """Single precision, where the weights span eight orders of magnitude; two coarse points coincide."""
+    coarse = jnp.asarray([[0.0, 0, 0], [0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
+    features = jnp.asarray([[1.0], [1.0], [2.0], [3.0]])
+    both = jax.jit(jax.value_and_grad(lambda x, y: interpolate(x, y, features)[0, 0], argnums=(0, 1)))
+    for distance in (0.0, 1e-5, 1e-4, 1e-2):
+        value, gradient = both(jnp.asarray([[0.0, 0, distance]]), coarse)
+        assert all(np.isfinite(g).all() and np.abs(g).max() < 100 for g in gradient)
+        assert float(value) == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_propagation_is_a_perceptron_of_own_then_interpolated_features(x64):
+    points, coarse = RNG.normal(size=(9, 3)), RNG.normal(size=(5, 3))
+    own, features = RNG.normal(size=(9, 4)), RNG.normal(size=(5, 6))
+    layers = [(RNG.normal(size=pair), RNG.normal(size=pair[1])) for pair in itertools.pairwise((10, 7, 3))]
+    x = np.concatenate([own, interpolated_by_loop(points, coarse, features)], axis=1)
+    for weight, bias in layers:
+        x = np.maximum(x @ weight + bias, 0.0)
+    propagation = FeaturePropagation(tuple(Linear(*map(jnp.asarray, layer)) for layer in layers))
+    found = jax.jit(propagation.__call__)(points, coarse, own, features)
+    assert (x > 0).any()
+    np.testing.assert_allclose(found, x, atol=1e-11)
