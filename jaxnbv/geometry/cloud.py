@@ -94,9 +94,7 @@ class PointCloud(eqx.Module):
                 bad.size == 0,
                 f"{bad.size} of the {name} are not finite, the first at row {bad[:1]}: drop these rows",
             )
-        # Squares of numbers that are very large or small leave the range of float32.
-        largest = np.abs(normals).max(axis=1).astype(np.float64)
-        lengths = largest * np.linalg.norm(normals / np.where(largest > 0, largest, 1.0)[:, None], axis=1)
+        lengths = np.linalg.norm(normals.astype(np.float64), axis=1)
         zero = np.flatnonzero(lengths < 1e-12)
         require(
             zero.size == 0,

@@ -19,9 +19,8 @@ import safetensors.numpy
 from safetensors import SafetensorError
 
 from jaxnbv.checks import InputError, checked, require
-from jaxnbv.networks.compact_segmenter import CompactPartSegmenter
 from jaxnbv.networks.invariant import InvariantClassifier
-from jaxnbv.networks.pointnet2 import PointNet2Classifier, PointNet2PartSegmenter
+from jaxnbv.networks.pointnet2 import CompactPartSegmenter, PointNet2Classifier, PointNet2PartSegmenter
 from jaxnbv.networks.published import published_network
 from jaxnbv.networks.torch_format import read_torch_tensors
 from jaxnbv.storage.files import write_whole

@@ -10,9 +10,8 @@ from jaxtyping import Array, Float, Int
 from jaxnbv.checks import AnyArray, check_fields, check_type, is_traced, require, shown
 from jaxnbv.geometry.cloud import PointCloud, farthest_point_subsample
 from jaxnbv.networks.categories import CATEGORIES, category_index, part_mask
-from jaxnbv.networks.compact_segmenter import CompactPartSegmenter
 from jaxnbv.networks.invariant import InvariantClassifier
-from jaxnbv.networks.pointnet2 import PointNet2Classifier, PointNet2PartSegmenter
+from jaxnbv.networks.pointnet2 import CompactPartSegmenter, PointNet2Classifier, PointNet2PartSegmenter
 
 
 class CloudClassifier(eqx.Module):

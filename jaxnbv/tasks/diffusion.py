@@ -126,10 +126,7 @@ def cloud_laplacian(points: Float[np.ndarray, "n 3"]) -> Laplacian:
     A point is tied to some of its 30 nearest (to all others, if they are fewer), however far they are: pieces of more
     points are separate once they are far from one another. Points without a triangle, such as those of a lone line,
     conduct no heat.
-
-    **Raises:** `ValueError` for points that are not finite.
     """
-    points = _finite(points)
     if len(points) == 3:
         # Of two neighbours the library makes what happens to lie in memory.
         one = np.linalg.matrix_rank(points[1:] - points[0]) == 2
@@ -140,19 +137,8 @@ def cloud_laplacian(points: Float[np.ndarray, "n 3"]) -> Laplacian:
 
 
 def mesh_laplacian(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Laplacian:
-    """The Laplacian of triangles, manifold or not: heat flows where they share vertices.
-
-    **Raises:** `ValueError` for vertices that are not finite.
-    """
-    vertices, faces = _finite(vertices), np.asarray(faces)
+    """The Laplacian of triangles, manifold or not: heat flows where they share vertices."""
     return _assemble(lambda: optional("robust_laplacian").mesh_laplacian(vertices, faces), len(vertices))
-
-
-def _finite(points: np.ndarray) -> np.ndarray:
-    points = np.asarray(points, np.float64)
-    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
-    require(bad.size == 0, f"{bad.size} points are not finite, the first at row {bad[:1]}: drop these rows")
-    return points
 
 
 def _nothing(count: int) -> Laplacian:
@@ -223,6 +209,8 @@ def mesh_temperature(
 
 def _merge(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The distinct points, sorted, and the row of each point among them."""
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    require(bad.size == 0, f"{bad.size} points are not finite, the first at row {bad[:1]}: drop these rows")
     distinct, place = np.unique(np.asarray(points, np.float64), axis=0, return_inverse=True)
     return distinct, place.reshape(-1)
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -79,16 +79,9 @@ class ColdestPoint(eqx.Module):
         meaning = "how much colder than now the coldest point is with an imagined scan, mean over posterior samples."
         return Quantity("expected fall of the least temperature", "degrees", meaning)
 
-    def answer(self, cloud: PointCloud) -> "ColdestAnswer":
+    def answer(self, cloud: PointCloud) -> "Coldest":
         """Where the cloud is coldest, and its temperature there."""
-        point, temperature = coldest_point(cloud, self.heat, self.reached_only)
-        return ColdestAnswer(("coldest",), np.array([temperature]), point=point)
-
-
-class ColdestAnswer(Answer):
-    """The temperature of the coldest point, and where it is (scene coordinates)."""
-
-    point: Float[np.ndarray, "3"] = eqx.field(default_factory=lambda: np.zeros(3))
+        return coldest_point(cloud, self.heat, self.reached_only)
 
 
 def _values(
@@ -128,11 +121,14 @@ def body_temperature(
     return vertices, mesh_temperature(vertices, faces, heat)
 
 
-class Coldest(NamedTuple):
-    """The coldest point (scene coordinates) and its temperature in degrees."""
+class Coldest(Answer):
+    """The coldest point (scene coordinates), and its temperature in degrees, which is the answer's one value."""
 
-    point: Float[np.ndarray, "3"]
-    temperature: float
+    point: Float[np.ndarray, "3"] = eqx.field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def temperature(self) -> float:
+        return float(self.values[0])
 
 
 @checked
@@ -149,4 +145,4 @@ def coldest_point(body: PointCloud | TriangleMesh, heat: HeatProblem, reached_on
     if coldest is None:
         reason = f"none of its {len(points)} points is connected to the source" if len(points) else "it is empty"
         raise InputError(f"the body has no coldest point, as {reason}: scan the heat source first")
-    return Coldest(points[coldest], float(temperature.values[coldest]))
+    return Coldest(("coldest",), temperature.values[[coldest]], point=points[coldest])

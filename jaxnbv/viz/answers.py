@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from jaxnbv.acquisition import Answer, Quantity
 from jaxnbv.tasks.classification import ClassAnswer
-from jaxnbv.tasks.heat import ColdestAnswer
+from jaxnbv.tasks.heat import Coldest
 from jaxnbv.tasks.segmentation import PartAnswer
 
 # An answer that changes by less than this share from one view to the next has settled.
@@ -223,11 +223,11 @@ class _PartWords(Words):
         return Panel(f"parts found ({target:g} points or more)", ("parts",), found, there), points
 
 
-@words_of.register(ColdestAnswer)
+@words_of.register(Coldest)
 class _ColdestWords(Words):
     """Where the cloud is coldest, and how cold it is there."""
 
-    answer: ColdestAnswer
+    answer: Coldest
     question = "Where does it stay coldest while it is heated?"
 
     def line(self, before: Answer | None = None) -> str:
@@ -241,7 +241,7 @@ class _ColdestWords(Words):
         """The temperature of the coldest point and, where the truth is known, its distance to the true one."""
         true = None if truth is None else truth.values
         temperature = Panel("lowest temperature (degrees)", ("coldest",), self.answer.values, true)
-        if not isinstance(truth, ColdestAnswer):
+        if not isinstance(truth, Coldest):
             return (temperature,)
         distance = np.array([np.linalg.norm(self.answer.point - truth.point)])
         label = "distance to the true coldest point (scene units)"

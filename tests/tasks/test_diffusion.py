@@ -43,7 +43,10 @@ def test_zonal_harmonics_on_the_sphere_decay_as_they_should():
     radius, duration, steps = 1.3, 0.2, 8
     ball = trimesh.creation.icosphere(4, radius)
     points = sphere_points(3000, radius)
-    bodies = [(points, cloud_laplacian(points)), (ball.vertices, mesh_laplacian(ball.vertices, ball.faces))]
+    bodies = [
+        (points, cloud_laplacian(points)),
+        (ball.vertices, mesh_laplacian(*map(np.asarray, (ball.vertices, ball.faces)))),
+    ]
     for points, laplacian in bodies:
         points = np.asarray(points)
         assert laplacian.mass.sum() == pytest.approx(4 * np.pi * radius**2, rel=0.01)

@@ -17,7 +17,7 @@ from jaxnbv.acquisition import Answer
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.studies.scenes import Split, pyramid_scene
 from jaxnbv.tasks.classification import ClassAnswer
-from jaxnbv.tasks.heat import ColdestAnswer
+from jaxnbv.tasks.heat import Coldest
 from jaxnbv.tasks.segmentation import PartAnswer
 from jaxnbv.viz.answers import number, words_of
 from jaxnbv.viz.data import report_data
@@ -160,8 +160,8 @@ def test_a_class_is_not_known_of_a_scene_without_one():
 
 
 def test_heat_is_charted_by_temperature_and_distance():
-    found = ColdestAnswer(("coldest",), np.array([0.4]), point=np.array([1.0, 0.0, 2.0]))
-    truth = ColdestAnswer(("coldest",), np.array([0.1]), point=np.array([1.0, 3.0, -2.0]))
+    found = Coldest(("coldest",), np.array([0.4]), point=np.array([1.0, 0.0, 2.0]))
+    truth = Coldest(("coldest",), np.array([0.1]), point=np.array([1.0, 3.0, -2.0]))
     temperature, distance = words_of(found).panels(truth)
     assert (temperature.values[0], temperature.true[0]) == (0.4, 0.1)
     assert distance.values[0] == 5.0
