@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxnbv.checks import AnyArray, check_fields, check_type, is_traced, require, shown
 from jaxnbv.geometry.cloud import PointCloud, farthest_point_subsample
-from jaxnbv.networks.categories import CATEGORIES, category_index, part_mask
+from jaxnbv.networks.categories import CATEGORIES, NUM_PARTS, category_index, part_mask
 from jaxnbv.networks.invariant import InvariantClassifier
 from jaxnbv.networks.pointnet2 import CompactPartSegmenter, PointNet2Classifier, PointNet2PartSegmenter
 
@@ -77,10 +77,10 @@ class CloudSegmenter(eqx.Module):
         num_points: int = 2048,
         scale: float | Float[AnyArray, ""] = 1.0,
     ):
-        index = category_index(category) if isinstance(category, str) else category
         check_type(network, Callable, "the network")
         check_type(num_points, int, "num_points")
         check_type(scale, float, "the scale")
+        index = category_index(category) if isinstance(category, str) else category
         if not is_traced(index):
             index = index.item() if isinstance(index, AnyArray) and index.ndim == 0 else index
             check_type(index, int, "the category")
@@ -114,11 +114,8 @@ class CloudSegmenter(eqx.Module):
 
     def _probabilities(self, fed: PointCloud) -> Float[Array, "num_points parts"]:
         log_p = self.network(self.scale * fed.points, fed.normals, self.category, fed.mask)
-        parts = part_mask().shape[1]
-        require(
-            log_p.shape[-1] == parts,
-            f"the network knows {log_p.shape[-1]} parts; give one that knows the {parts} of ShapeNet-part",
-        )
+        known = log_p.shape[-1]
+        require(known == NUM_PARTS, f"the network knows {known} parts; give one that knows the 50 of ShapeNet-part")
         allowed = jnp.asarray(part_mask())[self.category]
         p = jax.nn.softmax(jnp.where(allowed, log_p, -jnp.inf), axis=-1)
         return jnp.where(fed.mask[:, None], p, 0.0)
