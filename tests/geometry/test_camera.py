@@ -116,19 +116,10 @@ def test_look_at_and_rays_run_under_jit_and_are_differentiable():
         (np.full((3, 3), np.nan), "not finite"),
     ],
 )
-def test_a_pose_that_is_not_a_rotation_is_refused(rotation, message):
-    with pytest.raises(ValueError, match=message):
-        Pose(rotation, np.zeros(3))
-
-
-def test_one_bad_pose_of_a_batch_is_refused():
-    rotation = np.tile(np.eye(3), (4, 1, 1))
-    Pose(rotation, np.zeros((4, 3)))
-    with pytest.raises(ValueError, match="not finite"):
-        Pose(rotation, np.array([[0.0] * 3] * 3 + [[0.0, np.inf, 0.0]]))
-    rotation[2] = -rotation[2]
-    with pytest.raises(ValueError, match=r"not a rotation.*look_at"):
-        Pose(rotation, np.zeros((4, 3)))
+def test_a_pose_that_is_not_a_rotation_is_refused_and_so_is_one_of_a_batch(rotation, message):
+    for rotations in (rotation, np.stack([np.eye(3), np.eye(3), rotation])):
+        with pytest.raises(ValueError, match=message):
+            Pose(rotations, np.zeros(rotations.shape[:-1]))
 
 
 @pytest.mark.parametrize(
@@ -143,18 +134,6 @@ def test_one_bad_pose_of_a_batch_is_refused():
 def test_look_at_without_a_direction_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         look_at(*arguments)
-
-
-@pytest.mark.parametrize("fov", [0.0, -0.5, math.pi, math.nan])
-def test_an_impossible_field_of_view_is_refused(fov):
-    with pytest.raises(ValueError, match=r"field of view|fov is nan; it must be a finite number"):
-        Camera(fov=fov)
-
-
-@pytest.mark.parametrize("size", [(0, 5), (5, 0), (-1, 5)])
-def test_an_image_without_pixels_is_refused(size):
-    with pytest.raises(ValueError, match="at least one"):
-        Camera(height=size[0], width=size[1])
 
 
 @pytest.mark.parametrize("count", [12, 120, 1000])

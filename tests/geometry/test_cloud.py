@@ -215,20 +215,3 @@ def test_limit_capacity_thins_by_farthest_points_what_does_not_fit():
     kept = limit_capacity(tagged(points, mask), 9)
     np.testing.assert_array_equal(kept.normals[:, 0], greedy(points, mask, 9))
     assert bool(kept.mask.all())
-
-
-def test_nan_in_masked_rows_never_enters_farthest_point_samples():
-    points = np.full((60, 3), np.nan, np.float32)
-    points[:50] = np.random.default_rng(0).uniform(-1, 1, (50, 3))
-    cloud = PointCloud(jnp.asarray(points), jnp.asarray(points), jnp.arange(60) < 50)
-    chosen = limit_capacity(cloud, 20)
-    assert bool(chosen.mask.all())
-    assert len(np.unique(np.asarray(chosen.points), axis=0)) == 20
-    assert bool(jnp.isfinite(chosen.points).all())
-
-
-def test_a_batch_of_clouds_is_iterated_once():
-    points = np.random.default_rng(0).normal(size=(2, 5, 3))
-    clouds = PointCloud(jnp.asarray(points), jnp.asarray(points), jnp.ones((2, 5), bool))
-    for cloud, expected in zip(clouds, points, strict=True):
-        np.testing.assert_array_equal(cloud.points, np.float32(expected))

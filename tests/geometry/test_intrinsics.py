@@ -96,9 +96,14 @@ def test_matrices_that_are_none_of_this_image_are_refused(matrix, message):
         ({"nearest": -1.0}, "from -1.0"),
         ({"max_incidence": 2.0}, "angle of incidence is 2.0"),
         ({"aspect": 0.0}, "aspect of the pixels is 0.0"),
+        ({"fov": 0.0}, "field of view is 0.0"),
+        ({"fov": math.pi}, "field of view is 3.14"),
+        ({"fov": math.nan}, "fov is nan; it must be a finite number"),
+        ({"height": 0}, "at least one"),
+        ({"width": -1}, "at least one"),
     ],
 )
-def test_limits_that_cannot_be_are_refused(settings, message):
+def test_cameras_that_cannot_be_are_refused(settings, message):
     with pytest.raises(InputError, match=message):
         Camera(**settings)
 
