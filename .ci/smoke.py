@@ -54,7 +54,7 @@ def planning() -> None:
 
 
 def everything() -> None:
-    """What `jaxnbv[gym,studies]` brings; pymeshlab and viser are extras of their own."""
+    """What `jaxnbv[studies]` brings; pymeshlab and viser are extras of their own."""
     for module in pkgutil.walk_packages(nbv.__path__, "jaxnbv."):
         importlib.import_module(module.name)
     for action in ((), ("run",), ("demo",), ("study",)):

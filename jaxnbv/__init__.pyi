@@ -26,7 +26,6 @@ from .planning.batch import Batch as Batch
 from .planning.episode import Episode as Episode
 from .planning.episode import View as View
 from .planning.episode import simulate as simulate
-from .planning.gym import ViewEnvironment as ViewEnvironment
 from .planning.planner import Planner as Planner
 from .planning.replay import StoredSession as StoredSession
 from .planning.replay import stored_run as stored_run

@@ -15,7 +15,6 @@ EXTRAS = {
     "loky": "heat",
     "robust_laplacian": "heat",
     "pandas": "studies",
-    "gymnasium": "gym",
     "viser": "view",
     "distributed": "cluster",
 }
