@@ -33,7 +33,6 @@ from .planning.session import NextView as NextView
 from .planning.session import Session as Session
 from .planning.stopping import Budget as Budget
 from .planning.stopping import ValueBelow as ValueBelow
-from .planning.travel import ValueMinusCost as ValueMinusCost
 from .planning.travel import ValuePerCost as ValuePerCost
 from .planning.travel import arc_length as arc_length
 from .planning.travel import rotation_angle as rotation_angle

@@ -176,7 +176,7 @@ def records(name):
 
 def costing(cost):
     """A step whose way has a cost."""
-    priced = dataclasses.replace(P, cost=nbv.ValueMinusCost(cost))
+    priced = dataclasses.replace(P, cost=nbv.ValuePerCost(cost))
     return priced.propose(priced.init(POSE, SCAN), KEY)
 
 

@@ -15,7 +15,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.imagination import Imagination
 from jaxnbv.planning.batch import Batch
-from jaxnbv.planning.travel import Cost, arc_length
+from jaxnbv.planning.travel import ValuePerCost, arc_length
 from jaxnbv.scanning import Evidence, GridSurface, imagine, mean_depth, nothing_imagined
 from jaxnbv.search import DiscreteSearch, Problem, Proposal, Search
 
@@ -33,7 +33,7 @@ class Planner(eqx.Module):
     - `search`: how its expectation over the imagined surfaces is maximised.
     - `camera`: the sensor whose scans are imagined.
     - `imagination`: the surfaces that are held possible given the evidence.
-    - `cost`: `ValuePerCost` or `ValueMinusCost` of going from the last view to the next; None where it does not count.
+    - `cost`: of going from the last view to the next; None where it does not count.
     - `capacity`: points of D that are kept, by farthest point sampling beyond it.
     - `max_views`: views for which evidence has room.
 
@@ -48,7 +48,7 @@ class Planner(eqx.Module):
     search: Search = DiscreteSearch()
     camera: Camera = Camera()
     imagination: Imagination = eqx.field(default_factory=Imagination)
-    cost: Cost | None = None
+    cost: ValuePerCost | None = None
     capacity: int = eqx.field(static=True, default=8192)
     max_views: int = eqx.field(static=True, default=32)
 
@@ -215,7 +215,7 @@ def _propose(search: Search, problem: Problem, key: PRNGKeyArray) -> Proposal:
     return search.propose(problem.prepared(), key)
 
 
-def checked_proposal(proposal: Proposal, surfaces: GridSurface | None, cost: Cost | None = None) -> Proposal:
+def checked_proposal(proposal: Proposal, surfaces: GridSurface | None, cost: ValuePerCost | None = None) -> Proposal:
     """A proposal as it is.
 
     **Raises:** `ValueError` if its value is not finite, or every candidate has been visited.

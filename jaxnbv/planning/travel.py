@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
@@ -50,13 +49,21 @@ def _norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
     return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
 
 
-class Cost(eqx.Module):
-    """How the cost of going to a view counts against its value.
+class ValuePerCost(eqx.Module):
+    """How the cost of going to a view counts against its value: value / (fixed + cost).
 
     - `of`: what it costs to go from one pose to another: `arc_length`, `rotation_angle`, or a function of yours.
+    - `fixed`: what every view costs wherever it is, such as the time that an image takes, in the units of `of`.
+
+    **Raises:** `ValueError` if `fixed` is not positive.
     """
 
-    of: eqx.AbstractVar[CostFunction]
+    of: CostFunction = arc_length
+    fixed: float = eqx.field(static=True, default=1.0)
+
+    def __check_init__(self):
+        check_fields(self)
+        require(self.fixed > 0, f"the fixed cost of a view is {self.fixed}; it must be positive")
 
     def __call__(
         self, values: Float[Array, "*samples poses"], evidence: Evidence, poses: Pose
@@ -67,67 +74,12 @@ class Cost(eqx.Module):
         require(real, f"the cost of going from one pose to another is {shown(cost)}: make it one number a pose")
         # A view is not chosen because its cost is wrong: the planner refuses what is not a number.
         cost = jnp.where((cost >= 0) & (cost < jnp.inf), cost, jnp.nan)
-        return self.weigh(values, jnp.where(evidence.num_views > 0, cost, 0.0))
+        return values / (self.fixed + jnp.where(evidence.num_views > 0, cost, 0.0))
 
-    @abstractmethod
-    def weigh(
-        self, values: Float[Array, "*samples poses"], cost: Float[Array, " poses"]
-    ) -> Float[Array, "*samples poses"]:
-        """The values of poses, given what it costs to go there."""
-
-    @abstractmethod
     def quantity(self, value: Quantity) -> Quantity:
         """What the weighed value is, where the value is this."""
-
-
-class ValuePerCost(Cost):
-    """value / (fixed + cost).
-
-    - `fixed`: what every view costs wherever it is, such as the time that an image takes, in the units of `of`.
-
-    **Raises:** `ValueError` if `fixed` is not positive.
-    """
-
-    of: CostFunction
-    fixed: float = eqx.field(static=True, default=1.0)
-
-    def __check_init__(self):
-        check_fields(self)
-        require(self.fixed > 0, f"the fixed cost of a view is {self.fixed}; it must be positive")
-
-    def weigh(
-        self, values: Float[Array, "*samples poses"], cost: Float[Array, " poses"]
-    ) -> Float[Array, "*samples poses"]:
-        return values / (self.fixed + cost)
-
-    def quantity(self, value: Quantity) -> Quantity:
         meaning = f"{value.meaning.rstrip('.')}, over the cost of going there."
         return Quantity(f"{value.name} per cost", f"{value.unit or value.name} per unit of cost", meaning, value.smooth)
-
-
-class ValueMinusCost(Cost):
-    """value - weight x cost.
-
-    - `weight`: the value of a unit of cost, in the units of the value.
-
-    **Raises:** `ValueError` if the weight is negative.
-    """
-
-    of: CostFunction
-    weight: float = eqx.field(static=True, default=1.0)
-
-    def __check_init__(self):
-        check_fields(self)
-        require(self.weight >= 0, f"the weight of the cost is {self.weight}; it must not be negative")
-
-    def weigh(
-        self, values: Float[Array, "*samples poses"], cost: Float[Array, " poses"]
-    ) -> Float[Array, "*samples poses"]:
-        return values - self.weight * cost
-
-    def quantity(self, value: Quantity) -> Quantity:
-        meaning = f"{value.meaning.rstrip('.')}, less {self.weight:g} times the cost of going there."
-        return Quantity(f"{value.name} less cost", value.unit, meaning, value.smooth)
 
 
 @checked

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose, look_at
-from jaxnbv.planning.travel import ValueMinusCost, ValuePerCost, arc_length, rotation_angle, total_cost, visiting_order
+from jaxnbv.planning.travel import ValuePerCost, arc_length, rotation_angle, total_cost, visiting_order
 from jaxnbv.scanning import Evidence
 
 RNG = np.random.default_rng(0)
@@ -94,29 +94,22 @@ def test_the_order_is_the_best_of_all(count, seed):
     assert total_cost(way, distance) == pytest.approx(length(found), rel=1e-5)
 
 
-def test_the_value_of_a_view_given_its_cost():
-    values, cost = jnp.array([[4.0, 2.0], [2.0, 0.0]]), jnp.array([1.0, 3.0])
-    np.testing.assert_allclose(ValuePerCost(arc_length, fixed=1.0).weigh(values, cost), [[2.0, 0.5], [1.0, 0.0]])
-    np.testing.assert_allclose(ValueMinusCost(arc_length, weight=0.5).weigh(values, cost), [[3.5, 0.5], [1.5, -1.5]])
-
-
 def test_a_cost_that_breaks_its_contract_makes_a_value_of_nothing():
     """Zero is a cost; less, and what is not finite, is none."""
     costs = jnp.array([-1.0, 0.0, jnp.inf, jnp.nan, 2.0])
     poses = Pose(jnp.broadcast_to(jnp.eye(3), (5, 3, 3)), jnp.zeros((5, 3)).at[:, 1].set(jnp.arange(5.0)))
     cloud = PointCloud.from_arrays(np.eye(3), np.eye(3))
     seen = Evidence.before_views(cloud, 1, None)
-    weighed = ValueMinusCost(lambda start, end: costs[end.position[1].astype(int)], weight=0.5)
-    np.testing.assert_array_equal(weighed(jnp.ones(5), seen, poses), 1.0)
+    weighed = ValuePerCost(lambda start, end: costs[end.position[1].astype(int)], fixed=0.5)
+    np.testing.assert_array_equal(weighed(jnp.ones(5), seen, poses), 2.0)
     seen = dataclasses.replace(seen, num_views=seen.num_views + 1)
-    np.testing.assert_array_equal(weighed(jnp.ones(5), seen, poses), [np.nan, 1.0, np.nan, np.nan, 0.0])
+    np.testing.assert_allclose(weighed(jnp.ones(5), seen, poses), [np.nan, 2.0, np.nan, np.nan, 0.4])
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: ValuePerCost(arc_length, fixed=0.0), "fixed cost of a view is 0.0; it must be positive"),
-        (lambda: ValueMinusCost(arc_length, weight=-1.0), "weight of the cost is -1.0"),
         (lambda: visiting_order(look_at((0.0, 0.0, 1.0)), random_poses(13)), "order of 13 poses: give at most 12"),
         (lambda: total_cost(list(random_poses(2)), lambda a, b: -1.0), "is -1.0: make it one finite number"),
         (lambda: total_cost(list(random_poses(2)), lambda a, b: jnp.inf), "is inf: make it one finite number"),

@@ -8,7 +8,7 @@ import pytest
 from small_problem import Constant, Height, propose, sample_by_sample, three_balls, visit, with_samples
 
 from jaxnbv.geometry.pose import look_at
-from jaxnbv.planning.travel import ValueMinusCost, arc_length
+from jaxnbv.planning.travel import ValuePerCost, arc_length
 from jaxnbv.search import DiscreteSearch, TieBreakSearch
 from jaxnbv.tasks import Coverage
 
@@ -54,7 +54,7 @@ def test_visited_views_are_not_chosen():
 
 def test_the_way_there_counts():
     """Among candidates that are level but for their way the nearest is taken, whatever the second score."""
-    here, cost = look_at(jnp.array([0.0, 0.0, 2.5])), ValueMinusCost(arc_length, weight=1e3)
+    here, cost = look_at(jnp.array([0.0, 0.0, 2.5])), ValuePerCost(arc_length, fixed=1e-3)
     told = dataclasses.replace(visit(PROBLEM.about(Constant(1.0)), here), cost=cost)
     found = search(told, Height())
     distances = np.linalg.norm(np.asarray(found.candidates.position - here.position), axis=1)
