@@ -1,11 +1,11 @@
-"""Coverage by views and by the camera's way, with and without the cost of going there; three views at once.
+"""Coverage by views and by the camera's way, with and without the cost of going there.
 
     python benchmarks/travel.py --mesh FILE ... [--views 8] [--out FILE]
 
 Each mesh is scanned from one random first view on, by coverage over 60 candidates on a sphere: for its value, for its
-value per cost (fixed + length of the way, in scene units), from the farthest view, and three views at a time
-(`propose_batch`, visited in the order of the shortest way). All see the same noise and the same samples at the same
-view. Coverage is the share of the true surface within 0.05 of the cloud. Continues after the last mesh in the file.
+value per cost (fixed + length of the way, in scene units), and from the farthest view. All see the same noise and the
+same samples at the same view. Coverage is the share of the true surface within 0.05 of the cloud. Continues after the
+last mesh in the file.
 """
 
 import argparse
@@ -25,26 +25,23 @@ from jaxnbv.storage.files import write_text
 from jaxnbv.studies.engine.results import interval
 
 CANDIDATES = nbv.SphereCandidates(60)
-# Search, cost, and how many views are chosen at once.
+# Search and cost.
 METHODS = {
-    "value": (nbv.DiscreteSearch(CANDIDATES), None, 1),
-    "value per cost, fixed 2": (nbv.DiscreteSearch(CANDIDATES), nbv.ValuePerCost(arc_length, fixed=2.0), 1),
-    "value per cost, fixed 0.5": (nbv.DiscreteSearch(CANDIDATES), nbv.ValuePerCost(arc_length, fixed=0.5), 1),
-    "farthest view": (nbv.FarthestView(CANDIDATES), None, 1),
-    "three at once": (nbv.DiscreteSearch(CANDIDATES), None, 3),
+    "value": (nbv.DiscreteSearch(CANDIDATES), None),
+    "value per cost, fixed 2": (nbv.DiscreteSearch(CANDIDATES), nbv.ValuePerCost(arc_length, fixed=2.0)),
+    "value per cost, fixed 0.5": (nbv.DiscreteSearch(CANDIDATES), nbv.ValuePerCost(arc_length, fixed=0.5)),
+    "farthest view": (nbv.FarthestView(CANDIDATES), None),
 }
 
 
-def episode(planner: nbv.Planner, mesh: nbv.TriangleMesh, truth: np.ndarray, views: int, at_once: int, key) -> dict:
+def episode(planner: nbv.Planner, mesh: nbv.TriangleMesh, truth: np.ndarray, views: int, key) -> dict:
     """Coverage, and length of the way so far, after each view."""
     direction = jax.random.normal(jax.random.fold_in(key, 99), (3,))
-    waiting = [nbv.look_at(2.5 * direction / jnp.linalg.norm(direction))]
+    pose = nbv.look_at(2.5 * direction / jnp.linalg.norm(direction))
     evidence, taken, scans, found = None, [], [], {"way": []}
     for index in range(views):
-        if not waiting:
-            batch = planner.propose_batch(evidence, view_keys(key, index)[0], at_once)
-            waiting = [batch.poses[number] for number in batch.order]
-        pose = waiting.pop(0)
+        if evidence is not None:
+            pose = planner.propose(evidence, view_keys(key, index)[0]).pose
         seen = observe_scene(mesh, planner.camera, pose, nbv.SensorNoise(), view_keys(key, index)[2])
         evidence = planner.init(pose, seen) if evidence is None else planner.observe(evidence, pose, seen)
         taken.append(pose)
@@ -90,11 +87,11 @@ def main() -> None:
         mesh = nbv.load_mesh(file)
         truth = truth_points(mesh, jax.random.key(0))
         found = {}
-        for name, (search, cost, at_once) in METHODS.items():
+        for name, (search, cost) in METHODS.items():
             imagination = nbv.Imagination(grid=nbv.Grid(64), num_samples=8)
             planner = nbv.Planner(nbv.Coverage(), search, imagination=imagination, cost=cost, capacity=4096)
             key = jax.random.fold_in(jax.random.key(4), sum(map(ord, file.stem)))
-            found[name] = episode(planner, mesh, truth, asked.views, at_once, key)
+            found[name] = episode(planner, mesh, truth, asked.views, key)
         records[file.stem] = found
         write_text(asked.out, json.dumps(records))
     print(summary(records, asked.views))

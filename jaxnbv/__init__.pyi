@@ -22,7 +22,6 @@ from .geometry.pose import fibonacci_sphere as fibonacci_sphere
 from .geometry.pose import look_at as look_at
 from .geometry.volume import Box as Box
 from .imagination import Imagination as Imagination
-from .planning.batch import Batch as Batch
 from .planning.episode import Episode as Episode
 from .planning.episode import View as View
 from .planning.episode import simulate as simulate
@@ -36,7 +35,6 @@ from .planning.stopping import ValueBelow as ValueBelow
 from .planning.travel import ValuePerCost as ValuePerCost
 from .planning.travel import arc_length as arc_length
 from .planning.travel import rotation_angle as rotation_angle
-from .planning.travel import visiting_order as visiting_order
 from .scanning import Carving as Carving
 from .scanning import DepthNoise as DepthNoise
 from .scanning import Evidence as Evidence

@@ -288,7 +288,7 @@ def expected_value(
         acquisition.check(cloud)
     with functions_of_users():
         context = acquisition.context(cloud)
-        return jnp.mean(sample_scores(acquisition, context, surfaces, camera, poses, barrier=barrier), axis=0)
+        return jnp.mean(sample_scores(acquisition, context, surfaces, camera, poses, barrier), axis=0)
 
 
 def scores(
@@ -310,7 +310,6 @@ def sample_scores(
     surfaces: GridSurface,
     camera: Camera,
     poses: Pose,
-    own_contexts: bool = False,
     barrier: Float[Array, "poses rays"] | None = None,
 ) -> Float[Array, "samples poses *scores"]:
     """The score of what each of the sampled surfaces would show from each of a batch of poses.
@@ -318,13 +317,11 @@ def sample_scores(
     All poses are scanned at once, of one sample or of `samples_at_once`, so memory is that of these scans; they are
     scored `batch_size` of them at a time. Samples are shared among devices, or the poses are where samples are too few.
 
-    - `own_contexts`: the context has a leading axis of samples, one each.
     - `barrier`: see `scan`.
     """
-    own, common = (context, None) if own_contexts else (None, context)
     together = min(samples_at_once(camera, poses), share_of(surfaces.values.shape[0]))
     views = poses, barrier
-    return shared_map(_of_sample, (surfaces, own), common, views, acquisition, camera, together, at_once=together)
+    return shared_map(_of_sample, surfaces, context, views, acquisition, camera, together, at_once=together)
 
 
 # Poses, and how far along the rays from each obstacles stand.
@@ -332,10 +329,9 @@ _Views: TypeAlias = tuple[Pose, Float[Array, "poses rays"] | None]
 
 
 def _of_sample(
-    sample: tuple[GridSurface, Any], common: Any, views: _Views, acquisition: Acquisition, camera: Camera, together: int
+    surface: GridSurface, context: Any, views: _Views, acquisition: Acquisition, camera: Camera, together: int
 ) -> Float[Array, "poses *scores"]:
-    surface, own = sample
-    return shared(_of_poses, views, surface, common if own is None else own, acquisition, camera, together)
+    return shared(_of_poses, views, surface, context, acquisition, camera, together)
 
 
 def _of_poses(

@@ -364,8 +364,6 @@ REFUSED = {
     "no cost": (lambda: costing(lambda a, b: None), "one number a pose"),
     "a complex cost": (lambda: costing(lambda a, b: b.position[0] * 1j), "one number a pose"),
     "a cost of NumPy": (lambda: costing(lambda a, b: np.linalg.norm(b.position)), "jax.numpy"),
-    "a way of no number": (lambda: nbv.visiting_order(POSE, POSES, lambda a, b: jnp.nan * b.position[0]), "one finite"),
-    "a way to one pose": (lambda: nbv.visiting_order(POSE, POSE), "a single one"),
     "a budget of no number": (
         lambda: nbv.simulate(
             P, BALL, POSE, 2, KEY, progress=False, until=nbv.Budget(cost=1.0, of=lambda a, b: jnp.nan * b.position[0])

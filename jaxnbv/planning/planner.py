@@ -14,9 +14,8 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.imagination import Imagination
-from jaxnbv.planning.batch import Batch
-from jaxnbv.planning.travel import ValuePerCost, arc_length
-from jaxnbv.scanning import Evidence, GridSurface, imagine, mean_depth, nothing_imagined
+from jaxnbv.planning.travel import ValuePerCost
+from jaxnbv.scanning import Evidence, GridSurface, mean_depth
 from jaxnbv.search import DiscreteSearch, Problem, Proposal, Search
 
 # Functions are converted on the way in, which mypy cannot see.
@@ -100,62 +99,25 @@ class Planner(eqx.Module):
         sample_key, search_key = jax.random.split(key)
         return self.choose(evidence, self.sample(evidence, sample_key), search_key)
 
-    def propose_batch(self, evidence: Evidence | PointCloud, key: PRNGKeyArray, count: int) -> Batch:
-        """Several poses to take before the next question, chosen greedily: the value of each is what it adds, sample
-        by sample, to what the scans before it would show of the same posterior sample. The first is that of `propose`.
-
-        For searches that do not look at samples, each is chosen as if those before it had been visited.
-
-        **Raises:** `ValueError` for fewer than one, or more than the evidence has room for, or as `propose` does.
-        """
-        check_key(key)
-        check_type(count, int, "the number of views")
-        evidence = self._known(evidence)
-        room = evidence.max_views - (0 if is_traced(evidence.num_views) else int(evidence.num_views))
-        require(1 <= count <= room, f"asked for {count} views at once; give 1 to {room}, for which there is room")
-        sample_key, search_key = jax.random.split(key)
-        surfaces = self.sample(evidence, sample_key)
-        proposals = [self.choose(evidence, surfaces, search_key)]
-        imagined = None if surfaces is None else nothing_imagined(surfaces, self.camera, count - 1)
-        for index in range(count - 1):
-            if surfaces is not None and imagined is not None:
-                pose = proposals[-1].pose
-                barrier = self.imagination.barrier(self.camera, pose[None])
-                imagined = imagine(imagined, surfaces, self.camera, pose, barrier, jnp.asarray(index))
-            after = evidence.with_visited([proposal.pose for proposal in proposals])
-            proposals.append(self.choose(after, surfaces, jax.random.fold_in(search_key, index), imagined))
-        seen = is_traced(evidence.num_views) or int(evidence.num_views) > 0
-        start = evidence.last_pose if seen else None
-        return Batch(tuple(proposals), start, arc_length if self.cost is None else self.cost.of)
-
     def sample(self, evidence: Evidence, key: PRNGKeyArray) -> GridSurface | None:
         """The first half of `propose`: the step's samples; None for a search that asks for none."""
         return self.imagination.sample(evidence, key) if self.search.uses_samples else None
 
-    def problem(self, evidence: Evidence, surfaces: GridSurface | None, imagined: PointCloud | None = None) -> Problem:
+    def problem(self, evidence: Evidence, surfaces: GridSurface | None) -> Problem:
         """What the search is asked, given the step's samples; see `choose`."""
         around = self.imagination.surroundings
-        return Problem(evidence, self.camera, self.acquisition, surfaces, around, self.cost, imagined)
+        return Problem(evidence, self.camera, self.acquisition, surfaces, around, self.cost)
 
-    def choose(
-        self,
-        evidence: Evidence,
-        surfaces: GridSurface | None,
-        key: PRNGKeyArray,
-        imagined: PointCloud | None = None,
-    ) -> Proposal:
+    def choose(self, evidence: Evidence, surfaces: GridSurface | None, key: PRNGKeyArray) -> Proposal:
         """The second half of `propose`: the search, given the step's samples (any that a model of your own drew).
-
-        - `imagined`: what would be known of each of the samples before this view, beside D; of leading axis S.
 
         **Raises:** `ValueError` if every candidate has been visited, or a score is not finite.
         """
         check_key(key)
         check_type(evidence, Evidence, "the evidence")
         check_type(surfaces, GridSurface | None, "the surfaces")
-        check_type(imagined, PointCloud | None, "what is imagined")
         with functions_of_users():
-            proposal = _propose(self.search, self.problem(evidence, surfaces, imagined), key)
+            proposal = _propose(self.search, self.problem(evidence, surfaces), key)
         return checked_proposal(proposal, surfaces, self.cost)
 
     def observe(

@@ -1,9 +1,8 @@
 """What it costs to go from one view to the next, and how that counts against the value of a view."""
 
 import itertools
-import math
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -12,15 +11,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnbv.acquisition import Quantity
-from jaxnbv.checks import as_numbers, check_batch, check_fields, checked, require, shown
+from jaxnbv.checks import as_numbers, check_fields, checked, require, shown
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import Evidence
 
 CostFunction: TypeAlias = Callable[[Pose, Pose], Float[Array, ""]]
 """What it costs to go from one pose to another, in units of the user's: not negative, made of JAX operations."""
-
-# Beyond so many the shortest way is not looked for: there are 2^n n^2 pieces of ways.
-_MOST_PLACES = 12
 
 
 @checked
@@ -83,53 +79,15 @@ class ValuePerCost(eqx.Module):
 
 
 @checked
-def visiting_order(start: Pose, poses: Pose, cost: CostFunction = arc_length) -> tuple[int, ...]:
-    """In which order to visit a batch of poses from a start, so that the whole way costs least; exact (Held and Karp
-    1962). The way ends at the last of them.
-
-    **Raises:** `ValueError` for more than twelve poses or a single one, or a cost that is not one finite number, zero
-    or more.
-    """
-    check_batch(poses.position.shape[:-1], "the poses")
-    count = poses.position.shape[0]
-    require(count <= _MOST_PLACES, f"asked for the order of {count} poses: give at most {_MOST_PLACES}")
-    first = _checked_cost(jax.vmap(lambda pose: cost(start, pose))(poses), (count,))
-    between = _checked_cost(jax.vmap(lambda a: jax.vmap(lambda b: cost(a, b))(poses))(poses), (count, count))
-    # Of each set of places and the last of them: the least cost, and the place before it.
-    best = {(1 << last, last): (float(first[last]), -1) for last in range(count)}
-    for size in range(2, count + 1):
-        for places in itertools.combinations(range(count), size):
-            members = sum(1 << place for place in places)
-            for last in places:
-                rest = members & ~(1 << last)
-                ways = (
-                    (best[rest, place][0] + float(between[place, last]), place) for place in places if place != last
-                )
-                best[members, last] = min(ways)
-    members = (1 << count) - 1
-    last = min(range(count), key=lambda place: best[members, place][0])
-    order: list[int] = []
-    while last >= 0:
-        order.append(last)
-        members, last = members & ~(1 << last), best[members, last][1]
-    return tuple(reversed(order))
-
-
-@checked
 def total_cost(poses: Sequence[Pose], cost: CostFunction = arc_length) -> float:
     """What the way through some poses, in their order, costs; zero for one or none.
 
     **Raises:** `ValueError` for a cost that is not one finite number, zero or more.
     """
-    return math.fsum(float(_checked_cost(cost(a, b), ())) for a, b in itertools.pairwise(poses))
-
-
-def _checked_cost(found: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "*shape"]:
-    costs = as_numbers(found, "the cost of going from one pose to another", np.float64)
-    proper = costs.shape == shape and bool((costs >= 0).all()) and bool(np.isfinite(costs).all())
-    require(
-        proper,
-        f"the cost of going from one pose to another is {shown(costs) if costs.shape != shape else costs.min()}: make "
-        "it one finite number, zero or more",
-    )
-    return costs
+    name, way = "the cost of going from one pose to another", 0.0
+    for start, end in itertools.pairwise(poses):
+        found = as_numbers(cost(start, end), name, np.float64)
+        proper = found.shape == () and bool(0 <= found < np.inf)
+        require(proper, f"{name} is {shown(found)}: make it one finite number, zero or more")
+        way += float(found)
+    return way

@@ -7,9 +7,7 @@ from jaxnbv.scanning.free_space import Carving as Carving
 from jaxnbv.scanning.free_space import carve as carve
 from jaxnbv.scanning.grid import Grid as Grid
 from jaxnbv.scanning.grid import GridSurface as GridSurface
-from jaxnbv.scanning.grid import imagine as imagine
 from jaxnbv.scanning.grid import mean_depth as mean_depth
-from jaxnbv.scanning.grid import nothing_imagined as nothing_imagined
 from jaxnbv.scanning.grid import scan_samples as scan_samples
 from jaxnbv.scanning.mesh import TriangleMesh as TriangleMesh
 from jaxnbv.scanning.mesh import mesh_from_sdf as mesh_from_sdf

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Int8
+from jaxtyping import Array, Bool, Float, Int8
 from scipy.spatial import cKDTree
 
 from jaxnbv.checks import AnyArray, as_floats, check_fields, is_traced, require
@@ -154,31 +154,6 @@ def mean_depth(scans: PointCloud, pose: Pose) -> Float[Array, " rays"]:
     count = jnp.sum(scans.mask, axis=0)
     mean = jnp.sum(jnp.where(scans.mask, depth, 0.0), axis=0) / jnp.maximum(count, 1)
     return jnp.where(2 * count >= scans.mask.shape[0], mean, jnp.nan)
-
-
-def nothing_imagined(surfaces: GridSurface, camera: Camera, scans: int) -> PointCloud:
-    """Room for so many scans of each of a batch of surfaces, one after the other along the rows; none is taken yet."""
-    rows = surfaces.values.shape[0], scans * camera.num_rays
-    nowhere = jnp.zeros((*rows, 3), surfaces.values.dtype)
-    return PointCloud(nowhere, nowhere, jnp.zeros(rows, bool))
-
-
-@eqx.filter_jit
-def imagine(
-    imagined: PointCloud,
-    surfaces: GridSurface,
-    camera: Camera,
-    pose: Pose,
-    barrier: Float[Array, "1 rays"] | None,
-    index: Int[Array, ""],
-) -> PointCloud:
-    """With the scan of an index, that of each surface from a pose."""
-    scans = scan_samples(surfaces, camera, pose[None], barrier)[:, 0]
-    scans = PointCloud(scans.points, scans.normals, scans.mask)
-    start = index * camera.num_rays
-    return jax.tree.map(
-        lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new, start, axis=1), imagined, scans
-    )
 
 
 @jax.jit

@@ -12,7 +12,6 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnbv.acquisition import Acquisition, sample_scores
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud, concatenate
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import Evidence, GridSurface, Surroundings
 
@@ -29,8 +28,7 @@ class Problem(eqx.Module):
     - `surfaces`: the step's posterior samples along a leading axis; None for a search that does not ask for them.
     - `surroundings`: what stands around the object, hides it, and keeps cameras out; None for nothing.
     - `cost`: how the cost of going there counts against the value; None where it does not.
-    - `imagined`: what earlier views of a batch would show of each sample, along the same axis; None for a single view.
-    - `context`: what the acquisition makes of D, once, or of D and what is imagined, once a sample; see `prepared`.
+    - `context`: what the acquisition makes of D, once; see `prepared`.
     """
 
     evidence: Evidence
@@ -39,16 +37,11 @@ class Problem(eqx.Module):
     surfaces: GridSurface | None
     surroundings: Surroundings | None = None
     cost: Weighing | None = None
-    imagined: PointCloud | None = None
     context: Any = None
 
     def prepared(self) -> "Problem":
         """The same with the acquisition's context, as searches ask for it; nothing to prepare without samples."""
-        cloud, context = self.evidence.cloud, None
-        if self.imagined is not None:
-            context = jax.lax.map(lambda scan: self.acquisition.context(concatenate(cloud, scan)), self.imagined)
-        elif self.surfaces is not None:
-            context = self.acquisition.context(cloud)
+        context = None if self.surfaces is None else self.acquisition.context(self.evidence.cloud)
         return dataclasses.replace(self, context=context)
 
     def about(self, acquisition: Acquisition) -> "Problem":
@@ -66,14 +59,9 @@ class Problem(eqx.Module):
 
         Those of a `Several` come along a leading axis.
         """
-
-        def part(tree):
-            return jax.tree.map(lambda leaf: leaf[samples], tree)
-
-        own = self.imagined is not None
-        context = part(self.context) if own else self.context
+        some = jax.tree.map(lambda leaf: leaf[samples], self._sampled)
         barrier = None if self.surroundings is None else self.surroundings.barrier(self.camera, poses)
-        values = sample_scores(self.acquisition, context, part(self._sampled), self.camera, poses, own, barrier)
+        values = sample_scores(self.acquisition, self.context, some, self.camera, poses, barrier)
         return self.weigh(jnp.moveaxis(values, (0, 1), (-2, -1)), poses)
 
     def weigh(self, values: Float[Array, "*samples poses"], poses: Pose) -> Float[Array, "*samples poses"]:

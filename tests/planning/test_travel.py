@@ -1,23 +1,26 @@
-"""What it costs to go from view to view: against closed forms, SciPy and brute force."""
+"""What it costs to go from view to view: against closed forms and SciPy; and how that weighs on a view's value."""
 
 import dataclasses
-import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from small_planner import FIRST, SCENE, planner_of
 
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose, look_at
-from jaxnbv.planning.travel import ValuePerCost, arc_length, rotation_angle, total_cost, visiting_order
-from jaxnbv.scanning import Evidence
+from jaxnbv.planning.travel import ValuePerCost, arc_length, rotation_angle, total_cost
+from jaxnbv.scanning import Evidence, scan
+from jaxnbv.search import DiscreteSearch, FarthestView, GradientSearch, HalvingSearch, RandomView, UncertaintyView
 
-RNG = np.random.default_rng(0)
+RNG, KEY = np.random.default_rng(0), jax.random.key(3)
+
+
+def evidence_of(planner):
+    return planner.init(FIRST, scan(SCENE, planner.camera, FIRST))
 
 
 def random_poses(count):
@@ -73,27 +76,6 @@ def test_the_derivative_of_the_way_is_that_of_its_differences():
     np.testing.assert_allclose(found, differences, atol=2e-3)
 
 
-@settings(max_examples=15, deadline=None)
-@given(st.integers(1, 6), st.integers(0, 10_000))
-def test_the_order_is_the_best_of_all(count, seed):
-    rng = np.random.default_rng(seed)
-    poses = Pose(np.tile(np.eye(3), (count, 1, 1)), rng.normal(size=(count, 3)))
-    start = Pose(np.eye(3), rng.normal(size=3))
-
-    def distance(a, b):
-        return jnp.linalg.norm(a.position - b.position)
-
-    def length(order):
-        places = np.concatenate([start.position[None], np.asarray(poses.position)[list(order)]])
-        return np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
-
-    found = visiting_order(start, poses, distance)
-    assert sorted(found) == list(range(count))
-    assert length(found) == pytest.approx(min(map(length, itertools.permutations(range(count)))), rel=1e-5)
-    way = [start, *(poses[index] for index in found)]
-    assert total_cost(way, distance) == pytest.approx(length(found), rel=1e-5)
-
-
 def test_a_cost_that_breaks_its_contract_makes_a_value_of_nothing():
     """Zero is a cost; less, and what is not finite, is none."""
     costs = jnp.array([-1.0, 0.0, jnp.inf, jnp.nan, 2.0])
@@ -106,11 +88,73 @@ def test_a_cost_that_breaks_its_contract_makes_a_value_of_nothing():
     np.testing.assert_allclose(weighed(jnp.ones(5), seen, poses), [np.nan, 2.0, np.nan, np.nan, 0.4])
 
 
+PER_COST = ValuePerCost(arc_length, fixed=0.5), lambda value, cost: value / (0.5 + cost)
+
+
+@pytest.mark.parametrize(
+    ("search", "cost", "worth"),
+    [
+        (DiscreteSearch(12), *PER_COST),
+        (HalvingSearch(12, num_first_samples=3), *PER_COST),
+        (UncertaintyView(12), *PER_COST),
+        (
+            DiscreteSearch(12),
+            ValuePerCost(lambda a, b: 2.0 * arc_length(a, b)),
+            lambda value, cost: value / (1.0 + 2.0 * cost),
+        ),
+    ],
+)
+def test_values_are_weighed_against_the_way_from_the_last_view(cost, worth, search):
+    plain, weighed = planner_of(search), planner_of(search, cost=cost)
+    evidence = evidence_of(plain)
+    second = plain.propose(evidence, KEY).pose
+    evidence = plain.observe(evidence, second, scan(SCENE, plain.camera, second))
+    values, found = (np.asarray(planner.propose(evidence, KEY).values) for planner in (plain, weighed))
+    places = np.asarray(plain.search.candidates.poses().position, np.float64)
+    here = np.asarray(second.position, np.float64)
+    angle = np.arccos(np.clip(places @ here / np.linalg.norm(places, axis=1) / np.linalg.norm(here), -1.0, 1.0))
+    expected = worth(values, 2.5 * angle)
+    # The others left the rounds of halving early, by other samples.
+    open_ = np.isfinite(values)
+    np.testing.assert_allclose(found[open_], expected[open_], rtol=2e-3, atol=5e-3)
+
+
+def test_standard_errors_are_of_what_is_weighed():
+    plain, weighed = planner_of(), planner_of(cost=ValuePerCost(arc_length))
+    evidence = evidence_of(plain)
+    errors = [np.asarray(planner.propose(evidence, KEY).standard_errors) for planner in (plain, weighed)]
+    way = np.array([float(arc_length(FIRST, pose)) for pose in plain.search.candidates.poses()])
+    np.testing.assert_allclose(errors[1], errors[0] / (1.0 + way), rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_a_search_by_gradient_weighs_the_way_too():
+    """So dear that the best is to stay near."""
+    search = GradientSearch(dof=2, num_starts=2, iterations=6, learning_rate=0.05, num_candidates=6)
+    planner = planner_of(search, cost=ValuePerCost(arc_length, fixed=1e-3))
+    proposal = planner.propose(evidence_of(planner), KEY)
+    ways = np.array([[float(arc_length(FIRST, p)) for p in way] for way in proposal.trajectories.poses])
+    assert np.all(ways[:, -1] < ways[:, 0])
+    assert planner.quantity.name == "expected coverage gain per cost"
+
+
+def test_without_a_last_view_nothing_is_spent():
+    planner = planner_of(cost=ValuePerCost(arc_length))
+    evidence = planner.init(None, scan(SCENE, planner.camera, FIRST))
+    plain = planner_of().propose(evidence, KEY)
+    np.testing.assert_allclose(planner.propose(evidence, KEY).values, plain.values, rtol=1e-5)
+
+
+@pytest.mark.parametrize("search", [FarthestView(12), RandomView(12)])
+def test_what_does_not_look_at_values_takes_no_cost(search):
+    with pytest.raises(InputError, match="does not look at the value of a view"):
+        planner_of(search, cost=ValuePerCost(arc_length))
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: ValuePerCost(arc_length, fixed=0.0), "fixed cost of a view is 0.0; it must be positive"),
-        (lambda: visiting_order(look_at((0.0, 0.0, 1.0)), random_poses(13)), "order of 13 poses: give at most 12"),
         (lambda: total_cost(list(random_poses(2)), lambda a, b: -1.0), "is -1.0: make it one finite number"),
         (lambda: total_cost(list(random_poses(2)), lambda a, b: jnp.inf), "is inf: make it one finite number"),
     ],
