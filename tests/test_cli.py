@@ -166,10 +166,9 @@ def test_a_folder_of_another_configuration_is_refused(finished):
 
 @pytest.mark.slow
 def test_a_published_checkpoint_classifies_a_mesh(tmp_path, shared):
-    source = shared / "reference" / "pointnet2_cls_ssg.pth"
     trimesh.creation.torus(1.0, 0.4).export(tmp_path / "ring.ply")
-    sizes = ("--candidates", "2", "--samples", "2", "--quick", "--views", "2")
-    arguments = ("--task", "mixed", "--network", str(source), *sizes, "--no-report")
+    network = str(shared / "reference" / "pointnet2_cls_ssg.pth")
+    arguments = ("--task", "mixed", "--network", network, "--quick", "--views", "2", "--no-report")
     result = run_command("run", "ring.ply", *arguments, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "->" in result.stdout
@@ -235,7 +234,7 @@ def test_help_names_every_option(command, tmp_path):
     result = run_command(*command, "--help", cwd=tmp_path)
     assert result.returncode == 0
     expected = (
-        ["demo", "run", "study", "view"]
+        ["demo", "run", "study", "report"]
         if not command
         else ["--task", "--search", "--views", "--first", "--seed", "--out", "--overwrite"]
     )

@@ -38,7 +38,6 @@ def run_fresh(*arguments: str) -> subprocess.CompletedProcess:
         (("--version",), 0),
         (("demo", "--help"), 0),
         (("run", "--help"), 0),
-        (("view", "--help"), 0),
         (("study", "--help"), 0),
         (("study", "pyramid", "--help"), 0),
         (("dmeo",), 2),
