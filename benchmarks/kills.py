@@ -3,8 +3,8 @@
     python benchmarks/kills.py --kills 1000 --out runs/kills
 
 Commands are a run, two of it at once in one folder, its figures, a study by one process and by two, a session that
-takes images where it says and reports, the same planned again, and a live view as a file, all at small settings. Each
-is killed (SIGKILL) at moments that are spread over the time that it takes, and started again until it has been killed
+takes images where it says and reports, and the same planned again, all at small settings. Each is
+killed (SIGKILL) at moments that are spread over the time that it takes, and started again until it has been killed
 so often. Then it is let through. Not part of the tests: about five seconds a kill.
 """
 
@@ -34,7 +34,6 @@ COMMANDS = {
     "study by two processes": (*STUDY, "--workers", "2"),
     "session": (),
     "session replay": ("session", "replay", "RECORDED", "--quick", "--no-report"),
-    "view": ("view", "RECORDED"),
 }
 STRATA = 8
 # What says when it was made, and by what means.
@@ -64,14 +63,13 @@ def take_session(folder: Path) -> None:
 
 
 def start(name: str, out: Path, inputs: Path) -> list[subprocess.Popen]:
-    """The processes of a command; they write to a folder, a view to a file in it."""
+    """The processes of a command, which write to a folder."""
     words = [str(inputs / word.lower()) if word in ("BOX.PLY", "RECORDED") else word for word in COMMANDS[name]]
     if name == "session":
         command = [sys.executable, __file__, "--session", str(out)]
     else:
         out.mkdir(parents=True, exist_ok=True)
-        into = ["--html", str(out / "view.html")] if name == "view" else ["--out", str(out)]
-        command = [sys.executable, "-m", "jaxnbv.cli", *words, *into]
+        command = [sys.executable, "-m", "jaxnbv.cli", *words, "--out", str(out)]
     return [
         subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
         for _ in range(2 if name == "two runs in one folder" else 1)

@@ -1,5 +1,5 @@
-"""The command line: `jaxnbv demo`, `jaxnbv run MESH`, `jaxnbv study pyramid`, `jaxnbv report DIR`, `jaxnbv
-session replay DIR` and `jaxnbv view RUN`."""
+"""The command line: `jaxnbv demo`, `jaxnbv run MESH`, `jaxnbv study pyramid`, `jaxnbv report DIR`
+and `jaxnbv session replay DIR`."""
 
 import sys
 from typing import Annotated
@@ -10,7 +10,7 @@ import jaxnbv
 from jaxnbv.cli.episode import demo, run
 from jaxnbv.cli.session import session
 from jaxnbv.cli.study import study
-from jaxnbv.cli.tools import report, view
+from jaxnbv.cli.tools import report
 from jaxnbv.errors import InputError, explained_imports
 
 app = typer.Typer(
@@ -47,7 +47,7 @@ def _options(
     """What is asked of `jaxnbv` itself."""
 
 
-for _command in (demo, run, view, report, study):
+for _command in (demo, run, report, study):
     app.command()(_command)
 app.add_typer(session, name="session")
 

@@ -1,10 +1,8 @@
 """Runs that were stored, read without the planner that made them; sessions, planned again for another utility."""
 
-import dataclasses
-import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -14,7 +12,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
-from jaxnbv.planning.episode import Episode, camera_of
+from jaxnbv.planning.episode import camera_of
 from jaxnbv.planning.placing import stride_of
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.session import NextView, Session, check_camera
@@ -106,34 +104,3 @@ class StoredSession:
         for index in range(session.views, self.views):
             session.add(*self.image(index))
             yield session, session.next()
-
-
-class StoredRun(NamedTuple):
-    """An episode or a session as it was stored.
-
-    - `episode`: with a planner that has the stored camera and the usual surfaces, for what is to be drawn.
-    - `proposal`, `expected`: for the view after its last; None where there is none.
-    """
-
-    episode: Episode
-    proposal: Proposal | None = None
-    expected: Float[np.ndarray, "h w"] | None = None
-
-
-def stored_run(folder: str | Path) -> StoredRun:
-    """The episode or session of a folder.
-
-    **Raises:** `ValueError` if it holds neither, or one without a view.
-    """
-    if not os.path.isfile(Path(folder) / SessionFolder.record_name):
-        return StoredRun(Episode.load(folder))
-    stored = StoredSession(folder)
-    session = stored.session()
-    for index in range(stored.views):
-        session.add(*stored.image(index))
-    asked = [stored.proposal(index) for index in range(stored.views + 1)]
-    views = tuple(
-        dataclasses.replace(view, proposal=None if known is None else known[0])
-        for view, known in zip(session.episode.views, asked, strict=False)
-    )
-    return StoredRun(dataclasses.replace(session.episode, views=views), *(asked[-1] or ()))

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from small_session import FIRST, session_of, shot
 
 from jaxnbv.checks import InputError
-from jaxnbv.planning.replay import stored_run
 from jaxnbv.viz.live import LiveView
 
 viser = pytest.importorskip("viser", reason="viser is not installed")
@@ -101,15 +100,6 @@ def test_one_file_holds_the_scene(watched, tmp_path):
     text = path.read_text()
     assert "<html" in text
     assert not re.findall(r'<(?:script|link|img)[^>]*(?:src|href)="https?:', text)
-
-
-def test_a_stored_session_is_shown_without_its_planner(watched):
-    folder, session, _ = watched
-    run = stored_run(folder)
-    assert len(run.episode.views) == 2
-    np.testing.assert_array_equal(run.episode.views[1].scan.points, session.episode.views[1].scan.points)
-    np.testing.assert_array_equal(run.proposal.values, session.next().proposal.values)
-    np.testing.assert_array_equal(run.expected, session.next().expected_depth)
 
 
 def test_without_viser_it_says_what_to_install(monkeypatch):
