@@ -26,7 +26,6 @@ from .planning.episode import Episode as Episode
 from .planning.episode import View as View
 from .planning.episode import simulate as simulate
 from .planning.planner import Planner as Planner
-from .planning.replay import StoredSession as StoredSession
 from .planning.session import NextView as NextView
 from .planning.session import Session as Session
 from .planning.stopping import Budget as Budget

@@ -4,7 +4,6 @@ A program of its own: in the tests annotations are checked by beartype before an
 """
 
 import dataclasses
-import json
 import os
 import sys
 import tempfile
@@ -28,7 +27,6 @@ from jaxnbv.networks import (
     part_segmenter,
     pretrained_classifier,
 )
-from jaxnbv.planning.replay import StoredSession
 from jaxnbv.studies.engine.records import read_records
 
 # Until the program ends.
@@ -140,15 +138,6 @@ def dangling(folder):
 def piped(folder):
     (folder / "image_01.npz").unlink()
     os.mkfifo(folder / "image_01.npz")
-
-
-def replayed(name, **changes):
-    """A session's record that someone has edited."""
-    record = folder_of_images(name, 1) / "session.json"
-    said = json.loads(record.read_text())
-    said["config"] |= changes
-    record.write_text(json.dumps(said))
-    return StoredSession(FOLDER / name)
 
 
 def older_session_asks():
@@ -345,14 +334,6 @@ REFUSED = {
     "a link to no image": (lambda: reopened("link", dangling), "image_01.npz is damaged"),
     "a pipe as an image": (lambda: reopened("pipe", piped), "image_01.npz is damaged"),
     "an older session that asks": (older_session_asks, "another process has added some"),
-    "a record without cameras": (lambda: replayed("blind", cameras=[]), "what the sensor was"),
-    "a record without a box": (lambda: replayed("boxless", box=None), "what the sensor was"),
-    "a record of half a box": (lambda: replayed("half", box={"high": [1.0] * 3}), "a low and a high corner"),
-    "a record of more than a box": (
-        lambda: replayed("more", box={"low": [0.0] * 3, "high": [1.0] * 3, "middle": [0.5] * 3}),
-        "a low and a high corner",
-    ),
-    "a number as a camera": (lambda: replayed("number", cameras=[1]), "what the sensor was"),
     "a scene without a number": (lambda: records("unnumbered"), "scene_x.json is no record"),
     "a PLY that ends early": (lambda: cut("early.ply", 0.6), "its header declares"),
     "an OFF that ends early": (lambda: cut("early.off", 0.6), "its header declares"),

@@ -1,5 +1,5 @@
-"""The command line: `jaxnbv demo`, `jaxnbv run MESH`, `jaxnbv study pyramid`, `jaxnbv report DIR`
-and `jaxnbv session replay DIR`."""
+"""The command line: `jaxnbv demo`, `jaxnbv run MESH`, `jaxnbv study pyramid` and
+`jaxnbv report DIR`."""
 
 import sys
 from typing import Annotated
@@ -8,7 +8,6 @@ import typer
 
 import jaxnbv
 from jaxnbv.cli.episode import demo, run
-from jaxnbv.cli.session import session
 from jaxnbv.cli.study import study
 from jaxnbv.cli.tools import report
 from jaxnbv.errors import InputError, explained_imports
@@ -49,7 +48,6 @@ def _options(
 
 for _command in (demo, run, report, study):
     app.command()(_command)
-app.add_typer(session, name="session")
 
 
 def main() -> None:

@@ -1,6 +1,5 @@
 from .device import prepare as prepare
 from .episodes import demo as demo
 from .episodes import run as run
-from .sessions import replay as replay
 from .studies import report as report
 from .studies import study as study
