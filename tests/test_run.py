@@ -9,9 +9,7 @@ import trimesh
 from commands import run_command
 
 from jaxnbv.checks import InputError
-from jaxnbv.cli.actions.run_folder import clear
 from jaxnbv.planning.planner import Planner
-from jaxnbv.storage import EpisodeFolder
 
 
 @pytest.fixture
@@ -23,42 +21,6 @@ def ring(tmp_path):
 
 # Without samples of surfaces, in seconds.
 FARTHEST = ("run", "ring.ply", "--search", "farthest", "--views", "2", "--no-report")
-
-
-def test_an_episode_is_replaced_when_asked(ring):
-    """With its report."""
-    for seed in ("0", "1"):
-        result = run_command(*FARTHEST, "--out", "mine", "--seed", seed, *(("--overwrite",) * int(seed)), cwd=ring)
-        assert result.returncode == 0, result.stderr
-        config = json.loads((ring / "mine" / "episode.json").read_text())["config"]
-        assert config["key"]["data"] == [0, int(seed)]
-        assert not (ring / "mine" / "report.html").exists()
-        (ring / "mine" / "figures").mkdir()
-        for name in ("report.html", "figures/view_01.png"):
-            (ring / "mine" / name).write_text("drawn")
-    result = run_command(*FARTHEST, "--out", "mine", "--views", "3", "--seed", "1", cwd=ring)
-    assert result.returncode == 0, result.stderr
-    (ring / "mine" / "figures" / "thesis.tex").write_text("mine")
-    held = {path: path.read_bytes() for path in (ring / "mine").rglob("*") if path.is_file()}
-    result = run_command(*FARTHEST, "--out", "mine", "--overwrite", cwd=ring)
-    assert result.returncode == 2
-    assert "thesis.tex" in result.stderr
-    assert all(path.read_bytes() == content for path, content in held.items())
-    (ring / "thesis").mkdir()
-    (ring / "thesis" / "thesis.tex").write_text("mine")
-    result = run_command(*FARTHEST, "--out", "thesis", "--overwrite", cwd=ring)
-    assert result.returncode == 2
-    assert [path.name for path in (ring / "thesis").glob("thesis*")] == ["thesis.tex"]
-
-
-def test_an_episode_that_raced_it_is_replaced_with_it(tmp_path):
-    """Else its folder would be taken for another program's."""
-    folder = tmp_path / "demo"
-    for path in (folder, folder / "farthest"):
-        EpisodeFolder(path, {}).bind()
-    clear(folder, "farthest")
-    EpisodeFolder(folder, {"seed": 1}).bind()
-    assert not (folder / "farthest").exists()
 
 
 def border_hits(file):

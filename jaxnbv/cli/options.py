@@ -47,9 +47,6 @@ UntilOption = Annotated[
 OutOption = Annotated[
     Path | None, running(metavar="DIR", help="Output folder.", show_default="runs/NAME-TASK-SEARCH[-MODEL]-seedN")
 ]
-OverwriteOption = Annotated[
-    bool, running("--overwrite", help="Begin anew: an episode that the output folder holds is removed.")
-]
 NetworkOption = Annotated[
     Path | None,
     asking(

@@ -2,6 +2,5 @@
 
 from jaxnbv.storage.description import describe as describe
 from jaxnbv.storage.episode_folder import EpisodeFolder as EpisodeFolder
-from jaxnbv.storage.episode_folder import remove_episode as remove_episode
 from jaxnbv.storage.session_folder import DepthImage as DepthImage
 from jaxnbv.storage.session_folder import SessionFolder as SessionFolder

@@ -57,21 +57,6 @@ class EpisodeFolder(ResultFolder):
         write_whole(self.path / "cloud.ply", lambda file: file.write(content))
 
 
-def remove_episode(path: str | Path) -> bool:
-    """Remove the files of an episode from its folder, whatever its configuration; whether there were any.
-
-    **Raises:** `ValueError` if another process writes there.
-    """
-    path, record = Path(path), Path(path) / EpisodeFolder.record_name
-    if not record.exists():
-        return False
-    with writing_in(path):
-        # The record last, so that what is left of views is never foreign.
-        for file in (*path.glob(EpisodeFolder.results), path / "cloud.ply", record):
-            file.unlink(missing_ok=True)
-    return True
-
-
 def _view(data: dict[str, np.ndarray]) -> tuple[Pose, PointCloud, Proposal | None]:
     scan = PointCloud(**{name: jnp.asarray(data[name]) for name in SCAN if name in data})
     return pose_of(data), scan, proposal_of(data)

@@ -22,10 +22,6 @@ _LOCK = ".lock"
 _Folder = TypeVar("_Folder", bound="ResultFolder")
 
 
-class AnotherConfigurationError(InputError):
-    """A folder's results are of another configuration than the one that is asked for."""
-
-
 def software() -> dict[str, str]:
     """Versions of what the numbers depend on."""
     names = ("jaxnbv", "jax", "jaxlib", "equinox", "optax", "optimistix", "numpy", "trimesh", "embreex")
@@ -109,13 +105,6 @@ def writing_in(path: Path, *inside: str) -> Iterator[None]:
         lock.release()
 
 
-def remove_empty(path: Path) -> None:
-    """Remove a folder that holds nothing but its lock."""
-    if path.is_dir() and {file.name for file in path.iterdir()} <= {_LOCK}:
-        (path / _LOCK).unlink(missing_ok=True)
-        path.rmdir()
-
-
 def _holder(path: Path) -> str:
     lock = path / _LOCK
     try:
@@ -192,9 +181,9 @@ class ResultFolder:
             return
         changed = differences(written["config"], self.config)
         if changed:
-            raise AnotherConfigurationError(
+            raise InputError(
                 f"the output folder {self.path} belongs to another {self.kind}; it differs in "
-                f"{'; '.join(changed[:3])}. Choose another folder, or the settings it was made with"
+                f"{'; '.join(changed[:3])}. Choose another folder, remove this one, or give the settings it was made with"
             )
         made_by = written.get("versions")
         made_by = made_by if isinstance(made_by, dict) else {}

@@ -17,7 +17,7 @@ from jaxnbv.geometry.pose import look_at
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import SensorNoise
 from jaxnbv.search import FarthestView
-from jaxnbv.storage import EpisodeFolder, describe, remove_episode
+from jaxnbv.storage import EpisodeFolder, describe
 
 
 def test_views_come_back_with_the_same_bits(finished):
@@ -210,19 +210,3 @@ def test_every_view_is_told_when_it_is_done(tmp_path):
     episode = run(tmp_path, views=3, each=each)
     assert [files for _, files in told] == [2, 2, 3]
     assert all(view is own for (view, _), own in zip(told, episode.views, strict=True))
-
-
-def test_a_removed_episode_makes_room_for_another_and_leaves_other_files(tmp_path):
-    assert not remove_episode(tmp_path / "nowhere")
-    run(tmp_path, views=2)
-    (tmp_path / "mine.txt").write_text("kept")
-    assert remove_episode(tmp_path)
-    assert [*contents(tmp_path)] == ["mine.txt"]
-    (tmp_path / "mine.txt").unlink()
-    run(tmp_path, views=1, planner=planner_of(num_samples=4))
-
-
-def test_what_holds_no_episode_is_not_touched(tmp_path):
-    (tmp_path / "view_00.npz").write_text("mine")
-    assert not remove_episode(tmp_path)
-    assert (tmp_path / "view_00.npz").exists()

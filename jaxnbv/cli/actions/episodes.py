@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 import textwrap
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,10 +15,9 @@ import typer
 
 from jaxnbv import viz
 from jaxnbv.acquisition import Acquisition
-from jaxnbv.checks import InputError, require
+from jaxnbv.checks import require
 from jaxnbv.cli.actions.device import prepare
 from jaxnbv.cli.actions.lines import Lines
-from jaxnbv.cli.actions.run_folder import clear, explained, note, usual_folder
 from jaxnbv.cli.actions.searches import search_of
 from jaxnbv.cli.actions.sensors import first_pose, peculiarities, sensor_for, with_rays
 from jaxnbv.cli.actions.tasks import COMMAND_TASKS, CommandTask, Given, usual_first
@@ -29,13 +29,9 @@ from jaxnbv.planning.episode import Episode, Step, simulate
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SensorNoise, Surface, load_mesh, scan
 from jaxnbv.scanning.sensors import Setting
-from jaxnbv.storage.folders import AnotherConfigurationError
 from jaxnbv.studies.scenes.banks import KINDS, bank_poses, shape_bank
 from jaxnbv.surfaces import ShapeBank, Upright
 from jaxnbv.viz.task import race_words
-
-# No view depends on these.
-_FREE = {"views", "until", "out", "overwrite", "report", "device"}
 
 
 class Sizes(NamedTuple):
@@ -157,13 +153,10 @@ def _run(
     until: tuple[str, ...] = (),
 ) -> None:
     enough, start = rule(asked.until or until), time.perf_counter()
-    folder = asked.out or usual_folder(name, asked.task, asked.search, asked.model, asked.seed)
-    options = {name: str(value) if isinstance(value, Path) else value for name, value in vars(asked).items()}
-    options = {name: value for name, value in options.items() if name not in _FREE}
+    parts = name, asked.task, asked.search, *(() if asked.model == "screened" else (asked.model,)), f"seed{asked.seed}"
+    folder = asked.out or Path("runs") / re.sub(r"[^A-Za-z0-9_.-]", "_", "-".join(parts))
     if asked.quick:
         typer.echo("--quick: small settings; leave it out for the usual ones.")
-    if asked.overwrite:
-        clear(folder, _RIVAL)
     key, noise = jax.random.key(asked.seed), SensorNoise(asked.noise, asked.noise)
     lines = Lines(planner)
     sketches = viz.Sketches(Episode(planner, scene, noise, first, key, ())) if asked.report else None
@@ -172,8 +165,6 @@ def _run(
 
     def tell(step: Step) -> None:
         nonlocal race
-        if lines.count == 0:
-            note(folder, options)
         lines(step.view)
         if sketches is not None:
             drawn.append(beside.submit(sketches.add, step))
@@ -182,17 +173,14 @@ def _run(
             of_rival = (scene, first, _RACE_VIEWS, key, noise, folder / _RIVAL)
             race = beside.submit(simulate, rival, *of_rival, progress=False, until=enough)
 
-    try:
-        # While the next view is planned, the last one is drawn and the rival runs.
-        with ThreadPoolExecutor(1) as beside:
-            try:
-                episode = simulate(planner, scene, first, asked.views, key, noise, folder, until=enough, each=tell)
-            except BaseException:
-                beside.shutdown(wait=False, cancel_futures=True)
-                raise
-        raced = None if race is None else race.result()
-    except AnotherConfigurationError as error:
-        raise InputError(explained(folder, options, error)) from error
+    # While the next view is planned, the last one is drawn and the rival runs.
+    with ThreadPoolExecutor(1) as beside:
+        try:
+            episode = simulate(planner, scene, first, asked.views, key, noise, folder, until=enough, each=tell)
+        except BaseException:
+            beside.shutdown(wait=False, cancel_futures=True)
+            raise
+    raced = None if race is None else race.result()
     for one in drawn:
         one.result()
     if episode.stopped is not None:
