@@ -21,10 +21,10 @@ import trimesh
 from tqdm import tqdm
 
 import jaxnbv as nbv
-from jaxnbv.cli.actions.device import prepare
+from jaxnbv.cli.device import prepare
 from jaxnbv.cli.registry import Device
 
-RUN = ("run", "BOX.PLY", "--quick", "--views", "4", "--candidates", "12", "--samples", "2")
+RUN = ("run", "BOX.PLY", "--quick", "--views", "4")
 STUDY = ("study", "pyramid", "--quick", "--scenes", "2", "--views", "2", "--methods", "coverage,farthest")
 COMMANDS = {
     "run": (*RUN, "--no-report"),

@@ -5,7 +5,6 @@ evaluated, how many are drawn, what cuts them, and what stands around the object
 """
 
 import dataclasses
-import math
 
 import equinox as eqx
 import jax
@@ -87,7 +86,6 @@ class Imagination(eqx.Module):
         quick: bool = False,
         volume: Volume | None = None,
         solid: bool = False,
-        lengthscale: float | None = None,
     ) -> "Imagination":
         """The surfaces of a name, for an object whose box has this longest side, in scene units.
 
@@ -99,25 +97,16 @@ class Imagination(eqx.Module):
         - `volume`: by default the cube of the longest side about the origin.
         - `solid`: for a body that is nowhere thin, such as the pyramid: its hidden side is as large as the one that was
           seen, so that nothing follows for the space beside what was seen empty (`SeenEmpty`).
-        - `lengthscale`: that of detail, in place of the model's own short one; see `GeometricSPSR`.
 
-        **Raises:** `ValueError` for another name, or a longest side or lengthscale that is not positive.
+        **Raises:** `ValueError` for another name, or a longest side that is not positive.
         """
         require(longest_side > 0, f"the longest side is {longest_side}; it must be positive")
-        require(
-            lengthscale is None or 0 < lengthscale < math.inf,
-            f"the lengthscale is {lengthscale}; it must be positive and finite",
-        )
         require(name in MODELS, f"there is no model {name!r}: choose from {', '.join(MODELS)}")
         if name == "paper":
-            paper = GeometricSPSR(0.015, truncation=20) if quick else GeometricSPSR()
-            paper = paper if lengthscale is None else dataclasses.replace(paper, lengthscale=lengthscale)
-            return cls(paper, carving=None)
+            return cls(GeometricSPSR(0.015, truncation=20) if quick else GeometricSPSR(), carving=None)
         volume = Box.cube(longest_side) if volume is None else volume
         scale, usual = longest_side / 2.5, ScreenedSPSR()
         lengthscales = scale * (usual.base.lengthscale + (jnp.array([0.005, 0.0]) if quick else 0.0))
-        if lengthscale is not None:
-            lengthscales = lengthscales.at[0].set(lengthscale)
         # Shorter scales need more frequencies, but time and memory grow with their cube.
         truncation = min(round((20 if quick else usual.base.truncation) / scale), 30 if quick else 48)
         base = GeometricSPSR(lengthscales, usual.base.variance, truncation)

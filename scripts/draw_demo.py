@@ -13,9 +13,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import jaxnbv as nbv
-from jaxnbv.cli.actions.episodes import DEMO, knowing, planner_of
-from jaxnbv.cli.actions.tasks import COMMAND_TASKS
-from jaxnbv.cli.actions.until import rule
+from jaxnbv.cli.play import DEMO, imagined, planner_of, rule
+from jaxnbv.cli.tasks import COMMAND_TASKS
 from jaxnbv.viz.data import ReportData, report_data
 from jaxnbv.viz.figures import STYLE, Stills
 from jaxnbv.viz.imagined import Tile, look_picture, looks
@@ -33,7 +32,7 @@ def demo_episode(seed: int, search: str, views: int) -> nbv.Episode:
     """The demo of a seed, by a search of the command line, until its own rule or so many views end it."""
     made = COMMAND_TASKS["cross-entropy"]
     shown = made.demo(0, seed)
-    imagination = dataclasses.replace(knowing(nbv.Imagination.preset(), shown.bank), grid=shown.grid)
+    imagination = dataclasses.replace(imagined("screened", False, shown.bank), grid=shown.grid)
     planner = planner_of(made.setting, shown.acquisition, search, imagination, DEMO)
     return nbv.simulate(planner, shown.surface, shown.first, views, jax.random.key(seed), until=rule(shown.until))
 

@@ -98,8 +98,7 @@ CALLS = {
     nbv.HostSegmenter: {"function": number_of_points, "num_parts": 3},
     nbv.Imagination: {"model": MODEL, "grid": nbv.Grid(8), "num_samples": 2, "carving": nbv.Carving()}
     | {"surroundings": None},
-    nbv.Imagination.preset: {"name": "paper", "longest_side": 2.5, "quick": True, "volume": None, "solid": False}
-    | {"lengthscale": 0.1},
+    nbv.Imagination.preset: {"name": "paper", "longest_side": 2.5, "quick": True, "volume": None, "solid": False},
     nbv.MixedEntropy: {"classifier": number_of_points, "threshold": 0.5, "num_points": 16},
     nbv.OnSurface: {"num_points": 10, "noise": 0.1},
     nbv.OutsideBoundary: {"volume": nbv.Box(), "num_points": 10, "value": 1.0, "noise": 0.5},

@@ -96,15 +96,6 @@ def test_another_name_is_refused():
         preset("screened", -1.0)
 
 
-@pytest.mark.parametrize("quick", [False, True])
-def test_a_lengthscale_takes_the_place_of_the_short_one(quick):
-    plain, given = (preset("screened", quick=quick, lengthscale=scale).model.base for scale in (None, 0.03))
-    np.testing.assert_allclose(given.lengthscale, [0.03, plain.lengthscale[1]])
-    assert float(preset("paper", quick=quick, lengthscale=0.03).model.lengthscale) == pytest.approx(0.03)
-    with pytest.raises(InputError, match=r"lengthscale is -1\.0"):
-        preset("paper", lengthscale=-1.0)
-
-
 RADII = 0.25 + 0.15 * np.arange(8)
 GRID, CAMERA, KEY = Grid(26, 1.6), Camera(height=30, width=30), jax.random.key(2)
 POSES = look_at(jnp.array([[0.0, 0.2, 2.5], [2.3, 0.0, -0.9]]))

@@ -6,10 +6,10 @@ import jax
 import numpy as np
 import pytest
 
-from jaxnbv.cli.actions.searches import search_of
-from jaxnbv.cli.actions.tasks import COMMAND_TASKS
-from jaxnbv.cli.actions.until import RULES
+from jaxnbv.cli.play import rule
 from jaxnbv.cli.registry import SEARCHES, STOPS, TASKS, resolve
+from jaxnbv.cli.searches import search_of
+from jaxnbv.cli.tasks import COMMAND_TASKS
 from jaxnbv.search import GradientSearch, Search
 from jaxnbv.search.base import CandidateSearch
 from jaxnbv.studies.engine.study import Chart, Study
@@ -20,12 +20,12 @@ from jaxnbv.studies.registry import STUDIES
 def test_a_task_has_a_sensor_and_requires_what_it_takes(name):
     entry = TASKS[name]
     assert COMMAND_TASKS[name].setting.radius > 1.5
-    assert {option for option, _ in entry.requires} <= {*entry.options} <= {"network", "category", "source"}
+    assert {*entry.requires} <= {*entry.options} <= {"network", "category", "source"}
 
 
 def test_every_task_and_rule_is_there():
     assert COMMAND_TASKS.keys() == TASKS.keys()
-    assert RULES.keys() == STOPS.keys()
+    assert all(rule([f"{name}=0.5" if name != "found" else "found=60"]) is not None for name in STOPS)
 
 
 @pytest.mark.parametrize("name", SEARCHES)

@@ -31,7 +31,7 @@ def border_hits(file):
     return int(image.sum() - image[1:-1, 1:-1].sum()), int(image.sum())
 
 
-@pytest.mark.parametrize("asked", [(), ("--fov", "70"), ("--radius", "2"), ("--task", "heat", "--rays", "30")])
+@pytest.mark.parametrize("asked", [(), ("--task", "heat")])
 def test_an_object_fits_the_view(asked, ring):
     result = run_command(*FARTHEST, *asked, "--out", "mine", cwd=ring)
     assert result.returncode == 0, result.stderr
@@ -50,25 +50,6 @@ def test_the_papers_close_up_is_there_when_asked(ring):
     assert config["planner"]["camera"]["fov"] == pytest.approx(np.radians(30))
     assert config["planner"]["search"]["candidates"]["radius"] == 2.5
     np.testing.assert_allclose(config["first"]["position"], [0.8, 0.9, 2.2])
-
-
-def test_what_is_asked_for_is_taken(ring):
-    asked = {"fov": 40, "radius": 7.5, "rays": 33, "samples": 3, "candidates": 21, "lengthscale": 0.02}
-    options = [text for name, value in asked.items() for text in (f"--{name}", str(value))]
-    result = run_command(*FARTHEST, *options, "--out", "mine", cwd=ring)
-    assert result.returncode == 0, result.stderr
-    planner = json.loads((ring / "mine" / "episode.json").read_text())["config"]["planner"]
-    camera, candidates = planner["camera"], planner["search"]["candidates"]
-    found = {
-        "fov": np.degrees(camera["fov"]),
-        "radius": candidates["radius"],
-        "rays": camera["height"],
-        "samples": planner["imagination"]["num_samples"],
-        "candidates": candidates["count"],
-        "lengthscale": planner["imagination"]["model"]["base"]["lengthscale"][0],
-    }
-    assert camera["width"] == 33
-    assert found == pytest.approx(asked)
 
 
 def test_a_flat_and_open_mesh_is_named_as_such(ring):

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 import jaxnbv
-from jaxnbv import cli, viz
+from jaxnbv import viz
 from jaxnbv.errors import EXTRAS
 from jaxnbv.studies import readers, scenes
 from jaxnbv.studies.engine.results import interval
 
 HEAVY = {"jax", "equinox", "scipy", "matplotlib", "trimesh"}
-PACKAGES = [jaxnbv, readers, scenes, viz, cli.actions]
+PACKAGES = [jaxnbv, readers, scenes, viz]
 LAZY = pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.__name__)
 
 

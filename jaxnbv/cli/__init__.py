@@ -8,8 +8,7 @@ import typer
 
 import jaxnbv
 from jaxnbv.cli.episode import demo, run
-from jaxnbv.cli.study import study
-from jaxnbv.cli.tools import report
+from jaxnbv.cli.study import report, study
 from jaxnbv.errors import InputError, explained_imports
 
 app = typer.Typer(

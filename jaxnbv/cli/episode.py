@@ -1,13 +1,14 @@
 """`jaxnbv demo` and `jaxnbv run MESH`: one episode."""
 
+import dataclasses
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Annotated
 
 import typer
 
-from jaxnbv.cli import actions, options
-from jaxnbv.cli.registry import DEFAULT_FIRST, Device
+from jaxnbv.cli import options
+from jaxnbv.cli.registry import DEFAULT_FIRST, TASKS, Device
+from jaxnbv.errors import InputError
 
 
 def demo(
@@ -35,7 +36,26 @@ def demo(
     procedural one of thirteen categories, with --task heat one of four kinds that is heated at one place, and with
     --task coverage a mug, to be seen all round.
     """
-    actions.demo(SimpleNamespace(**locals()))
+    from jaxnbv.cli.device import prepare
+    from jaxnbv.cli.play import DEMO, QUICK, first_pose, imagined, planner_of, play, usual_folder
+    from jaxnbv.cli.tasks import COMMAND_TASKS
+
+    prepare(device)
+    made = COMMAND_TASKS[task]
+    shown = made.demo(scene, seed)
+    if shown.note:
+        typer.echo(shown.note)
+    start = shown.first if first is None else first_pose(first, shown.surface)
+    # The paper's model knows no shapes.
+    usual = "none" if model == "paper" else shown.bank
+    imagination = dataclasses.replace(imagined(model, quick, known or usual), grid=shown.grid)
+    sizes = QUICK if quick else DEMO
+    planner = planner_of(made.setting, shown.acquisition, search, imagination, sizes)
+    races = bool(shown.until) and search != "farthest"
+    rival = planner_of(made.setting, shown.acquisition, "farthest", imagination, sizes) if races else None
+    folder = out or usual_folder(shown.name, task, search, model, seed)
+    enough = until or shown.until
+    play(shown.name, shown.surface, planner, start, views, seed, noise, folder, enough, quick, report, rival)
 
 
 def run(
@@ -43,8 +63,20 @@ def run(
         Path, typer.Argument(metavar="MESH", help="Any mesh that trimesh reads: OBJ, PLY, STL, OFF, glTF, ...")
     ],
     task: options.TaskOption = options.COVERAGE,
-    network: options.NetworkOption = None,
-    category: options.CategoryOption = None,
+    network: Annotated[
+        Path | None,
+        options.asking(
+            metavar="FILE",
+            help="A classifier, .pth or .safetensors, which tasks about the class need; for parts a segmenter.",
+        ),
+    ] = None,
+    category: Annotated[
+        str | None,
+        options.asking(
+            metavar="NAME",
+            help="For parts: what the object is, one of ShapeNet-part's categories; upright along y, facing x.",
+        ),
+    ] = None,
     source: Annotated[
         str | None,
         options.asking(
@@ -64,54 +96,6 @@ def run(
     paper: Annotated[
         bool, options.seeing("--paper", help="The paper's close-up: 30 degrees from 2.5 (parts: 2, heat: 3).")
     ] = False,
-    fov: Annotated[
-        float | None,
-        options.seeing(
-            metavar="DEGREES",
-            min=1.0,
-            max=170.0,
-            help="Field of view.",
-            show_default="30, or what fits the object from --radius",
-        ),
-    ] = None,
-    radius: Annotated[
-        float | None,
-        options.seeing(
-            metavar="X",
-            help="Distance of the cameras from the object's centre, in scene units.",
-            show_default="the object fits the view",
-        ),
-    ] = None,
-    rays: Annotated[
-        int | None,
-        options.seeing(
-            metavar="N",
-            min=4,
-            max=1024,
-            help="Rays along a side of the image.",
-            show_default="50; parts: 64; --quick: 24",
-        ),
-    ] = None,
-    samples: Annotated[
-        int | None,
-        options.imagining(
-            metavar="N", min=1, help="Surfaces that are imagined for each view.", show_default="16; --quick: 4"
-        ),
-    ] = None,
-    candidates: Annotated[
-        int | None,
-        options.finding(
-            metavar="N", min=1, help="Poses among which a view is chosen.", show_default="120; heat: 100; --quick: 40"
-        ),
-    ] = None,
-    lengthscale: Annotated[
-        float | None,
-        options.imagining(
-            metavar="X",
-            help="Lengthscale of their detail, a share of 2 pi scene units; longer is smoother.",
-            show_default="0.01; --model paper: 0.005",
-        ),
-    ] = None,
     search: options.SearchOption = options.DISCRETE,
     model: options.ModelOption = options.SCREENED,
     known: options.KnownOption = None,
@@ -129,4 +113,29 @@ def run(
     The mesh may be open, a soup of triangles or inconsistently wound. It is scaled and centred so that its longest side
     is 2.5 scene units; cameras stand as far from its centre as it takes to see all of it.
     """
-    actions.run(SimpleNamespace(**locals()))
+    given = {"network": network, "category": category, "source": source}
+    for option, value in given.items():
+        takers = ", ".join(name for name, entry in TASKS.items() if option in entry.options)
+        if value is not None and option not in TASKS[task].options:
+            raise InputError(f"--task {task} takes no --{option}: it is for {takers}")
+    for option, hint in TASKS[task].requires.items():
+        if given[option] is None:
+            raise InputError(f"--task {task} needs {hint}")
+
+    from jaxnbv.cli.device import prepare
+    from jaxnbv.cli.play import QUICK, USUAL, first_pose, imagined, peculiarities, planner_of, play, usual_folder
+    from jaxnbv.cli.tasks import COMMAND_TASKS, Given, usual_first
+    from jaxnbv.scanning import load_mesh
+    from jaxnbv.scanning.sensors import fitted
+
+    prepare(device)
+    surface, made = load_mesh(mesh), COMMAND_TASKS[task]
+    setting = made.setting if paper else fitted(made.setting, surface.bounding_radius)
+    usual = usual_first(None if paper else setting.radius)
+    start = usual if first is None else first_pose(first, surface)
+    acquisition = made.acquisition(Given(surface, setting.camera, start, network, category, source))
+    planner = planner_of(setting, acquisition, search, imagined(model, quick, known), QUICK if quick else USUAL)
+    for words in peculiarities(mesh, surface, planner.imagination.grid.spacing):
+        typer.echo(f"note     {words}")
+    folder = out or usual_folder(mesh.stem, task, search, model, seed)
+    play(mesh.stem, surface, planner, start, views, seed, noise, folder, until or (), quick, report)

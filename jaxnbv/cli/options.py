@@ -47,20 +47,6 @@ UntilOption = Annotated[
 OutOption = Annotated[
     Path | None, running(metavar="DIR", help="Output folder.", show_default="runs/NAME-TASK-SEARCH[-MODEL]-seedN")
 ]
-NetworkOption = Annotated[
-    Path | None,
-    asking(
-        metavar="FILE",
-        help="A classifier, .pth or .safetensors, which tasks about the class need; for parts a segmenter.",
-    ),
-]
-CategoryOption = Annotated[
-    str | None,
-    asking(
-        metavar="NAME",
-        help="For parts: what the object is, one of ShapeNet-part's categories; upright along y, facing x.",
-    ),
-]
 NoiseOption = Annotated[float, seeing(metavar="X", help="Standard deviation of points and normals.")]
 ModelOption = Annotated[ModelName, imagining(metavar="MODEL", help=listed(MODELS.items()))]
 KnownOption = Annotated[

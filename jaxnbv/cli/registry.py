@@ -1,11 +1,12 @@
 """What the command line must know before anything heavy is imported: tasks, models, searches, rules, devices.
 
-A new task, search or rule is a name here and what it stands for: in `actions/tasks.py`, `actions/searches.py` or
-`actions/until.py`.
+A new task, search or rule is a name here and what it stands for, in `tasks.py`, `searches.py` or `play.py`.
 """
 
 import importlib
+from collections.abc import Mapping
 from enum import StrEnum
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 DEFAULT_FIRST = "0.8,0.9,2.2"
@@ -28,17 +29,17 @@ class TaskEntry(NamedTuple):
 
     about: str
     options: tuple[str, ...] = ()
-    requires: tuple[tuple[str, str], ...] = ()
+    requires: Mapping[str, str] = MappingProxyType({})
 
 
-_CLASSIFIER = ("network",), (("network", "a classifier: give --network FILE"),)
+_CLASSIFIER = ("network",), {"network": "a classifier: give --network FILE"}
 
 TASKS = {
     "cross-entropy": TaskEntry("the object's class", *_CLASSIFIER),
     "entropy": TaskEntry("its class, by the entropy that a view removes", *_CLASSIFIER),
     "mixed": TaskEntry("its class, by one and then the other", *_CLASSIFIER),
     "coverage": TaskEntry("its shape"),
-    "parts": TaskEntry("its parts", ("network", "category"), (("category", "--category, such as chair or mug"),)),
+    "parts": TaskEntry("its parts", ("network", "category"), {"category": "--category, such as chair or mug"}),
     "heat": TaskEntry("its coldest point when it is heated", ("source",)),
 }
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from jaxnbv.cli import actions, options
+from jaxnbv.cli import options
 from jaxnbv.cli.registry import STUDY_MODELS, Device
 from jaxnbv.errors import install
 from jaxnbv.studies.registry import STUDIES, Entry, flag
@@ -112,7 +112,22 @@ def study(
     ] = None,
     device: options.DeviceOption = Device.AUTO,
 ) -> None:
-    actions.study(**locals())
+    asked = dict(locals())
+    from jaxnbv.cli.actions import studies
+
+    studies.study(**asked)
+
+
+def report(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="A folder of studies, or one in which such folders lie.")
+    ],
+    out: Annotated[Path | None, typer.Option(help="The page, an HTML file.", show_default="DIR/report.html")] = None,
+) -> None:
+    """Gather studies on one page: tables, figures, pictures, settings, versions and times. Nothing is run."""
+    from jaxnbv.studies.engine.page import write_page
+
+    typer.echo(f"{write_page(folder, out or folder / 'report.html')}")
 
 
 def _about(name: str, entry: Entry) -> str:

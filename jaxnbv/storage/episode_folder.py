@@ -6,8 +6,6 @@ view_00.npz     pose and scan of the first view; view_01.npz and on also hold th
 cloud.ply       the points that were kept, once the episode is complete
 """
 
-from pathlib import Path
-
 import jax.numpy as jnp
 import numpy as np
 import trimesh
@@ -17,7 +15,7 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.search import Proposal
 from jaxnbv.storage.arrays import POSE, PROPOSAL, SCAN, ArrayFile, arrays_of, pose_of, proposal_of
 from jaxnbv.storage.files import write_whole
-from jaxnbv.storage.folders import ResultFolder, writing_in
+from jaxnbv.storage.folders import ResultFolder
 
 _VIEW = ArrayFile("view", {**POSE, **SCAN, **PROPOSAL}, "delete it, and its view is scanned again")
 

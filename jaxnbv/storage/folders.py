@@ -183,7 +183,7 @@ class ResultFolder:
         if changed:
             raise InputError(
                 f"the output folder {self.path} belongs to another {self.kind}; it differs in "
-                f"{'; '.join(changed[:3])}. Choose another folder, remove this one, or give the settings it was made with"
+                f"{'; '.join(changed[:3])}. Choose another folder, or remove this one"
             )
         made_by = written.get("versions")
         made_by = made_by if isinstance(made_by, dict) else {}

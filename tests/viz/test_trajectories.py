@@ -10,7 +10,7 @@ import pytest
 from small_run import CAMERA, small_run
 
 import jaxnbv as nbv
-from jaxnbv.cli.actions.lines import Lines
+from jaxnbv.cli.lines import Lines
 from jaxnbv.geometry.pose import look_at
 from jaxnbv.search import Search, Trajectories
 from jaxnbv.search.base import best_unvisited

@@ -11,12 +11,11 @@ from typing import Any
 import typer
 
 from jaxnbv.checks import InputError, require
-from jaxnbv.cli.actions.device import prepare
+from jaxnbv.cli.device import prepare
 from jaxnbv.cli.registry import Device, resolve
 from jaxnbv.storage import describe
 from jaxnbv.studies.engine.charts import write_charts
 from jaxnbv.studies.engine.measures import Record
-from jaxnbv.studies.engine.page import write_page
 from jaxnbv.studies.engine.records import RecordFolder
 from jaxnbv.studies.engine.study import Factory, Study
 from jaxnbv.studies.engine.tables import summary, write_tables
@@ -90,11 +89,6 @@ def study(
             f"{len(failed)} of {asked} scenes failed, the first {where} ({error}): {folder} has scene_*.failed that "
             "tell how, and the same command tries them again"
         )
-
-
-def report(folder: Path, out: Path) -> None:
-    """Write the page of all studies in a folder."""
-    typer.echo(f"{write_page(folder, out)}")
 
 
 def _prepared(device: Device, run: Trial, index: int) -> Record:

@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
 from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement
 from jaxnbv.checks import InputError, require
 from jaxnbv.cli.registry import DEFAULT_FIRST
+from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.networks import (
     CATEGORIES,
@@ -22,7 +22,7 @@ from jaxnbv.networks import (
     part_segmenter,
     pretrained_classifier,
 )
-from jaxnbv.scanning import Grid, SDFSurface, Surface
+from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, scan
 from jaxnbv.scanning.sensors import HEAT_SETTING, PART_SETTING, USUAL_SETTING, Setting
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.studies.scenes import (
@@ -52,15 +52,11 @@ _FED = 512
 
 
 class Given(NamedTuple):
-    """What a user gives: an object, where its first view is taken, and options that some tasks take.
+    """What a user gives: a mesh, the camera, where its first view is taken, and options that some tasks take."""
 
-    - `points`: of the object, as much of it as is known before a view is chosen; `first_points`: those that the first
-      view shows. Scene coordinates, (n, 3); only some tasks ask for them.
-    """
-
+    mesh: TriangleMesh
+    camera: Camera
     first: Pose
-    points: Callable[[], Float[np.ndarray, "n 3"]]
-    first_points: Callable[[], Float[np.ndarray, "n 3"]]
     network: Path | None = None
     category: str | None = None
     source: str | None = None
@@ -189,7 +185,7 @@ def position(option: str, text: str) -> tuple[float, float, float]:
 
 
 def _asked(given: Given, source: str) -> np.ndarray:
-    place, points = np.asarray(position("--source", source)), given.points()
+    place, points = np.asarray(position("--source", source)), given.mesh.sample_points(jax.random.key(0), 20_000)
     nearest = points[np.linalg.norm(points - place, axis=1).argmin()]
     distance = float(np.linalg.norm(nearest - place))
     require(
@@ -201,7 +197,7 @@ def _asked(given: Given, source: str) -> np.ndarray:
 
 
 def _middle(given: Given) -> np.ndarray:
-    points = given.first_points()
+    points, _ = scan(given.mesh, given.camera, given.first).to_numpy()
     require(len(points) > 0, "the first view does not see the object: give another --first, or a --source")
     away, forward = points - np.asarray(given.first.position), np.asarray(given.first.forward)
     along = away @ forward
