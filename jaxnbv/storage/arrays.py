@@ -1,10 +1,10 @@
-"""Numbered files of arrays in a folder of results: their kinds and shapes are known, and checked when they are read."""
+"""Numbered files of arrays in a folder of results: they are sealed by a checksum, and checked when they are read."""
 
 import hashlib
 from collections.abc import Callable, Mapping
 from functools import reduce
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,30 +16,24 @@ from jaxnbv.storage.files import write_whole
 from jaxnbv.storage.folders import FORMAT, check_format
 
 T = TypeVar("T")
-Schema: TypeAlias = Mapping[str, tuple[str, tuple[int | str, ...]]]
-"""Of each array the kinds that its type may have, and its shape; what a letter stands for is the same in all."""
 
 # In bytes, unpacked: sixteen million rays, far more than a camera has.
 _LARGEST = 2**29
 
-POSE: Schema = {"rotation": ("f", (3, 3)), "position": ("f", (3,))}
-SCAN: Schema = {
-    "points": ("f", ("n", 3)),
-    "normals": ("f", ("n", 3)),
-    "mask": ("b", ("n",)),
-    "missed": ("b", ("n",)),
-}
-PROPOSAL: Schema = {
-    "value": ("f", ()),
-    "values": ("f", ("c",)),
-    "candidate_rotations": ("f", ("c", 3, 3)),
-    "candidate_positions": ("f", ("c", 3)),
-    "standard_errors": ("f", ("c",)),
-    "difference_errors": ("f", ("c",)),
-    "trajectory_rotations": ("f", ("s", "i", 3, 3)),
-    "trajectory_positions": ("f", ("s", "i", 3)),
-    "trajectory_values": ("f", ("s", "i")),
-}
+# Names of arrays, which are checked by their checksum when they are read.
+POSE = ("rotation", "position")
+SCAN = ("points", "normals", "mask", "missed")
+PROPOSAL = (
+    "value",
+    "values",
+    "candidate_rotations",
+    "candidate_positions",
+    "standard_errors",
+    "difference_errors",
+    "trajectory_rotations",
+    "trajectory_positions",
+    "trajectory_values",
+)
 # Where a proposal keeps what it does not keep under the array's own name.
 _PLACES = {
     "candidate_rotations": "candidates.rotation",
@@ -54,12 +48,12 @@ class ArrayFile(NamedTuple):
     """A kind of numbered file in a folder.
 
     - `name`: what one is, "view" say; files are called view_00.npz, view_01.npz and so on.
-    - `schema`: of the arrays that one may hold; it need not hold all of them.
+    - `arrays`: names of those that one may hold; it need not hold all of them.
     - `remedy`: what to do about one that is damaged, for the error.
     """
 
     name: str
-    schema: Schema
+    arrays: tuple[str, ...]
     remedy: str
 
     def path(self, folder: Path, index: int) -> Path:
@@ -77,7 +71,7 @@ class ArrayFile(NamedTuple):
         write_whole(self.path(folder, index), lambda opened: np.savez_compressed(opened, **arrays))
 
     def read(self, folder: Path, index: int, make: Callable[[dict[str, np.ndarray]], T]) -> T:
-        """What is made of those arrays of a file that the schema names.
+        """What is made of those arrays of a file that are known.
 
         **Raises:** `ValueError` if it is damaged, or not that of the index.
         """
@@ -89,33 +83,17 @@ class ArrayFile(NamedTuple):
                 held = sum(member.file_size for member in saved.zip.infolist())
                 require(held <= _LARGEST, f"{file} is damaged (it unpacks to {held} bytes): delete it")
                 data = {name: saved[name] for name in saved.files}
-            _check_shapes(data, self.schema)
             check_format(int(data["format"]), file)
             if int(data["index"]) != index:
                 raise ValueError(f"it is {self.name} {int(data['index'])}")
             if str(data["sha256"]) != _checksum({name: array for name, array in data.items() if name != "sha256"}):
                 raise ValueError("its checksum is not that of its arrays")
-            return make({name: array for name, array in data.items() if name in self.schema})
+            return make({name: array for name, array in data.items() if name in self.arrays})
         except InputError:
             raise
         # Whatever NumPy and zipfile raise on bits that were turned: some twenty kinds of error.
         except Exception as error:
             raise InputError(f"{file} is damaged ({error}): {self.remedy}") from error
-
-
-def _check_shapes(data: dict[str, np.ndarray], schema: Schema) -> None:
-    """**Raises:** `ValueError` that names the array whose kind or shape is not that of the schema."""
-    lengths: dict[str, int] = {}
-    for name, (kinds, shape) in schema.items():
-        if name in data:
-            array = data[name]
-            fits = array.dtype.kind in kinds and array.ndim == len(shape)
-            fits = fits and all(
-                length == (lengths.setdefault(axis, length) if isinstance(axis, str) else axis)
-                for axis, length in zip(shape, array.shape, strict=True)
-            )
-            if not fits:
-                raise ValueError(f"its {name} is {array.dtype}{list(array.shape)}")
 
 
 def _checksum(arrays: dict[str, np.ndarray]) -> str:
@@ -125,9 +103,9 @@ def _checksum(arrays: dict[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-def arrays_of(thing: Any, schema: Schema) -> dict[str, Any]:
-    """Those arrays of a schema that a pose, scan, proposal or image has; none of None."""
-    found = {name: reduce(_held, _PLACES.get(name, name).split("."), thing) for name in schema}
+def arrays_of(thing: Any, names: tuple[str, ...]) -> dict[str, Any]:
+    """Those of some arrays that a pose, scan, proposal or image has; none of None."""
+    found = {name: reduce(_held, _PLACES.get(name, name).split("."), thing) for name in names}
     return {name: value for name, value in found.items() if value is not None}
 
 

@@ -17,7 +17,7 @@ from jaxnbv.storage.arrays import POSE, PROPOSAL, SCAN, ArrayFile, arrays_of, po
 from jaxnbv.storage.files import write_whole
 from jaxnbv.storage.folders import ResultFolder
 
-_VIEW = ArrayFile("view", {**POSE, **SCAN, **PROPOSAL}, "delete it, and its view is scanned again")
+_VIEW = ArrayFile("view", (*POSE, *SCAN, *PROPOSAL), "delete it, and its view is scanned again")
 
 
 class EpisodeFolder(ResultFolder):

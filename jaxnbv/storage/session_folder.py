@@ -14,18 +14,11 @@ from jaxtyping import Float, Real
 
 from jaxnbv.checks import require
 from jaxnbv.search import Proposal
-from jaxnbv.storage.arrays import POSE, PROPOSAL, ArrayFile, Schema, arrays_of, proposal_of
+from jaxnbv.storage.arrays import POSE, PROPOSAL, ArrayFile, arrays_of, proposal_of
 from jaxnbv.storage.folders import ResultFolder
 
-_PIXELS: Schema = {
-    "depth": ("uif", ("h", "w")),
-    "matrix": ("f", (4, 4)),
-    "depth_scale": ("f", ()),
-    "camera": ("i", ()),
-}
-_IMAGE = ArrayFile("image", _PIXELS, "restore it, or delete it and those after it")
-_EXPECTED: Schema = {"expected_depth": ("f", ("h", "w"))}
-_PROPOSAL = ArrayFile("proposal", {**POSE, **PROPOSAL, **_EXPECTED}, "delete it, and it is asked for again")
+_IMAGE = ArrayFile("image", ("depth", "matrix", "depth_scale", "camera"), "restore it, or delete it and those after it")
+_PROPOSAL = ArrayFile("proposal", (*POSE, *PROPOSAL, "expected_depth"), "delete it, and it is asked for again")
 
 
 class DepthImage(NamedTuple):

@@ -49,18 +49,8 @@ def test_a_view_that_is_not_what_it_was_is_refused(finished, tmp_path):
     assert "checksum" in problem()
     rewritten(file, {}, ["missed"])
     assert "checksum" in problem()
-    unsealed = ("format", "index", "sha256")
-    for name, array in (
-        ("mask", np.ones(63, bool)),
-        ("points", np.zeros((64, 2), np.float32)),
-        ("normals", np.zeros((64, 3), int)),
-        ("values", np.zeros(11, np.float32)),
-        ("rotation", np.zeros((3, 3, 1), np.float32)),
-        ("missed", np.array(["x"] * 64)),
-    ):
-        rewritten(file, {name: array}, unsealed)
-        # Where two lengths should be one, the later array is named.
-        assert f"its {'candidate_rotations' if name == 'values' else name} is " in problem()
+    rewritten(file, {}, ["sha256"])
+    assert "sha256" in problem()
 
 
 def config_of(episode):
