@@ -32,7 +32,6 @@ from .planning.stopping import Budget as Budget
 from .planning.stopping import ValueBelow as ValueBelow
 from .planning.travel import ValuePerCost as ValuePerCost
 from .planning.travel import arc_length as arc_length
-from .planning.travel import rotation_angle as rotation_angle
 from .scanning import Carving as Carving
 from .scanning import DepthNoise as DepthNoise
 from .scanning import Evidence as Evidence

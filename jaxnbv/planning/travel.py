@@ -30,15 +30,6 @@ def arc_length(start: Pose, end: Pose) -> Float[Array, ""]:
     return _norm(jnp.stack([0.5 * (radii[0] + radii[1]) * angle, radii[1] - radii[0]]))
 
 
-@checked
-@jax.jit
-def rotation_angle(start: Pose, end: Pose) -> Float[Array, ""]:
-    """Angle in radians, within [0, pi], by which a camera turns from one pose to another."""
-    turn = jnp.matmul(start.rotation.T, end.rotation, precision="highest")
-    off_axis = jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    return jnp.arctan2(_norm(off_axis), jnp.trace(turn) - 1.0)
-
-
 def _norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
     """Whose derivative at zero is zero."""
     squared = jnp.sum(vector**2)
@@ -48,7 +39,7 @@ def _norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
 class ValuePerCost(eqx.Module):
     """How the cost of going to a view counts against its value: value / (fixed + cost).
 
-    - `of`: what it costs to go from one pose to another: `arc_length`, `rotation_angle`, or a function of yours.
+    - `of`: what it costs to go from one pose to another: `arc_length`, or a function of yours.
     - `fixed`: what every view costs wherever it is, such as the time that an image takes, in the units of `of`.
 
     **Raises:** `ValueError` if `fixed` is not positive.
