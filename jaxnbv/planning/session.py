@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray, Real
 
-from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, check_type, checked, require
+from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, checked, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.depth_image import NothingInside
@@ -52,7 +52,7 @@ class NextView(eqx.Module):
 class Session:
     """A planner at a real sensor. Matrices are 4 x 4, camera to world, in world units; so is the box.
 
-    - `camera`: the sensor, its range in world units; or several, of a rig, of which the first is planned for.
+    - `camera`: the sensor, its range in world units.
     - `box`: two corners of a box about the object, without the table.
     - `planner`: in scene coordinates, as for a simulation. The scene is the box, scaled; the planner's camera is
       replaced by the sensor's with the planner's number of pixels, and what it holds for the default volume, `Box()`,
@@ -78,7 +78,7 @@ class Session:
     @checked
     def __init__(
         self,
-        camera: Camera | tuple | list,
+        camera: Camera,
         box: tuple | list | Box | AnyArray,
         planner: Planner | None = None,
         up: str = "y",
@@ -91,22 +91,17 @@ class Session:
         surroundings: Surroundings | None = None,
         progress: bool = True,
     ):
-        self.cameras = tuple(camera) if isinstance(camera, tuple | list) else (camera,)
-        require(len(self.cameras) > 0, "the session has no camera: give one")
-        for one in self.cameras:
-            check_type(one, Camera, "a camera of the session")
-        self.convention = convention
+        self.camera, self.convention = camera, convention
         self.box = box_of(box)
         self.frame = Frame.fit(np.array([self.box.low, self.box.high]), up=up)
-        self.stride, self.progress = stride, progress
+        self.stride, self.progress = stride_of(camera) if stride is None else stride, progress
         self.key = jax.random.key(0) if key is None else key
         check_key(self.key)
         allowed = None if poses is None else self.frame.to_scene(Pose.from_matrix(poses, convention))
-        sensor, volume = self.frame.to_scene(self.cameras[0]), self.frame.to_scene(self.box)
+        sensor, volume = self.frame.to_scene(camera), self.frame.to_scene(self.box)
         around = None if surroundings is None else surroundings.in_scene(self.frame)
         self.planner = placed(usual_planner() if planner is None else planner, sensor, volume, allowed, around)
-        self._strides = tuple(stride_of(one) if stride is None else stride for one in self.cameras)
-        self._rays = tuple(one.strided(n) for one, n in zip(self.cameras, self._strides, strict=True))
+        self._rays = self.frame.to_scene(camera.strided(self.stride))
         self._watch, self._asked_at = None if until is None else Watch(until, self.planner), 0
         self._views: list[View] = []
         self._proposals: dict[int, Proposal] = {}
@@ -175,21 +170,19 @@ class Session:
         depth: Real[AnyArray, "height width"],
         matrix: Float[AnyArray, "4 4"] | list,
         depth_scale: float = 1.0,
-        camera: int = 0,
     ) -> None:
         """Take in an image, which is stored first.
 
         - `depth`: see `PointCloud.from_depth`; `depth_scale` times it is in world units: 0.001 for millimetres where
           the world is in metres.
         - `matrix`: where the camera truly was, which need not be what was proposed.
-        - `camera`: which of a rig's cameras it is of.
 
         **Raises:** `ValueError` as `PointCloud.from_depth`, `Pose.from_matrix`, `Planner.init` and `observe` do, if the
         first image shows nothing of the box, or if another process has added images to the folder. Nothing is changed
         then.
         """
         pixels = as_numbers(depth, "the depth image", None)
-        image = DepthImage(pixels, as_numbers(matrix, "the matrix of a pose", np.float64), depth_scale, camera)
+        image = DepthImage(pixels, as_numbers(matrix, "the matrix of a pose", np.float64), depth_scale)
         look = self._looked(image)
         if look.support is not None:
             warn_of_support(look.support, self.frame)
@@ -241,14 +234,13 @@ class Session:
             follower(self)
 
     def _config(self) -> dict:
-        sensor = {"cameras": self.cameras, "box": self.box, "up": self.frame.up, "convention": self.convention}
+        sensor = {"camera": self.camera, "box": self.box, "up": self.frame.up, "convention": self.convention}
         return describe({**sensor, "stride": self.stride, "key": self.key, "planner": self.planner})
 
     def _looked(self, image: DepthImage) -> "_Look":
         """What an image adds; nothing of the session is changed."""
-        check_camera(image.camera, len(self.cameras))
         pose = Pose.from_matrix(image.matrix, self.convention)
-        camera, stride = self.cameras[image.camera], self._strides[image.camera]
+        camera, stride, rays = self.camera, self.stride, self._rays
         planner, support = self.planner, None
         with warnings.catch_warnings():
             if not self._views:
@@ -261,7 +253,7 @@ class Session:
             whole = PointCloud.from_depth(image.depth, camera, pose, image.depth_scale, stride)
             support = plane_under(self.frame.to_scene(whole), self.frame.to_scene(self.box))
             planner = on_support(planner, support)
-        scan, rays = self.frame.to_scene(cloud), self.frame.to_scene(self._rays[image.camera])
+        scan = self.frame.to_scene(cloud)
         if (around := planner.imagination.surroundings) is not None:
             scan = around.without_obstacles(scan)
         told = self.frame.to_scene(pose), scan, rays
@@ -298,11 +290,6 @@ class Session:
             f"{folder.path} holds {found} images, but this session knows {self.views}: another process has added some; "
             "make the session again, which reads them",
         )
-
-
-def check_camera(camera: int, count: int) -> None:
-    """**Raises:** `ValueError` unless the camera is one of so many."""
-    require(0 <= camera < count, f"the session has {count} cameras, counted from 0: there is no camera {camera}")
 
 
 class _Look(NamedTuple):

@@ -17,7 +17,7 @@ from jaxnbv.search import Proposal
 from jaxnbv.storage.arrays import POSE, PROPOSAL, ArrayFile, arrays_of, proposal_of
 from jaxnbv.storage.folders import ResultFolder
 
-_IMAGE = ArrayFile("image", ("depth", "matrix", "depth_scale", "camera"), "restore it, or delete it and those after it")
+_IMAGE = ArrayFile("image", ("depth", "matrix", "depth_scale"), "restore it, or delete it and those after it")
 _PROPOSAL = ArrayFile("proposal", (*POSE, *PROPOSAL, "expected_depth"), "delete it, and it is asked for again")
 
 
@@ -26,13 +26,11 @@ class DepthImage(NamedTuple):
 
     - `depth`: along the forward axis; `depth_scale` times it is in world units.
     - `matrix`: camera to world, in the convention of the session.
-    - `camera`: which of the session's cameras it is of.
     """
 
     depth: Real[np.ndarray, "h w"]
     matrix: Float[np.ndarray, "4 4"]
     depth_scale: float
-    camera: int = 0
 
 
 class SessionFolder(ResultFolder):
@@ -85,7 +83,7 @@ class SessionFolder(ResultFolder):
 
 
 def _image(data: dict[str, np.ndarray]) -> DepthImage:
-    return DepthImage(data["depth"], data["matrix"], float(data["depth_scale"]), int(data["camera"]))
+    return DepthImage(data["depth"], data["matrix"], float(data["depth_scale"]))
 
 
 def _proposal(data: dict[str, np.ndarray]) -> tuple[Proposal, Float[np.ndarray, "h w"] | None]:

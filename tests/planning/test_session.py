@@ -149,31 +149,6 @@ def test_where_the_sensor_could_not_be_held_is_not_proposed_again():
         session.next()
 
 
-def test_a_rig_of_two_cameras_is_one_session(tmp_path):
-    """The second has other intrinsics; what both saw is what each saw, in the evidence and after a restart."""
-    other = Camera.from_intrinsics([[60.0, 0.0, 15.0], [0.0, 60.0, 16.0], [0.0, 0.0, 1.0]], width=32, height=32)
-    matrix = around(3.0, 0.7)
-    pose = Pose.from_matrix(matrix)
-    seen = scan(WORLD, other, pose)
-    depth = (np.asarray(seen.points, np.float64) - np.asarray(pose.position)) @ np.asarray(pose.forward, np.float64)
-    image = np.where(seen.mask, np.round(1000.0 * depth), 0).reshape(32, 32).astype(np.uint16)
-    session = session_of(tmp_path, camera=(CAMERA, other), planner=planner_of(capacity=2000))
-    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    before = session.cloud.to_numpy()[0]
-    session.add(image, matrix, depth_scale=1e-3, camera=1)
-    points = session.cloud.to_numpy()[0]
-    alone = PointCloud.from_depth(image, other, pose, depth_scale=1e-3, box=Box(*BOX)).to_numpy()[0]
-    np.testing.assert_allclose(points[len(before) :], alone, atol=1e-6)
-    again = session_of(tmp_path, camera=(CAMERA, other), planner=planner_of(capacity=2000))
-    np.testing.assert_array_equal(again.cloud.points, session.cloud.points)
-    assert [view.camera.width for view in again.episode.views] == [64, 32]
-    assert len([*again.episode.evidence()]) == 2
-    with pytest.raises(InputError, match="the session has 2 cameras, counted from 0: there is no camera 2"):
-        session.add(image, matrix, camera=2)
-    with pytest.raises(InputError, match="has no camera"):
-        session_of(camera=())
-
-
 @pytest.mark.parametrize(
     ("given", "message"),
     [
