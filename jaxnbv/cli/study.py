@@ -33,7 +33,7 @@ def study(
         int | None, typer.Option(min=2, help="Views in all, the first one included.", show_default="the study's")
     ] = None,
     methods: Annotated[
-        str | None, typer.Option(help="Which methods, separated by commas.", show_default="all of the table")
+        str | None, typer.Option(help="Which methods, separated by commas.", show_default="those of the table")
     ] = None,
     own: Annotated[
         list[str] | None,
@@ -138,7 +138,7 @@ def _about(name: str, entry: Entry) -> str:
 study.__doc__ = "\n\n".join(
     [
         "Measure a claim of the paper on many scenes, with the same scenes, first views and noise for all methods.",
-        "Writes a record a scene, tables, figures and pictures. Interrupted, it continues with the next scene.",
+        "Writes a record a scene, tables, a chart and pictures. Interrupted, it continues with the next scene.",
         *(_about(name, entry) for name, entry in STUDIES.items()),
     ]
 )

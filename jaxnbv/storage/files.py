@@ -36,9 +36,14 @@ def write_whole(path: Path, write: Callable[[Any], Any]) -> None:
         ) from error
 
 
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write bytes as `write_whole` does."""
+    write_whole(path, lambda file: file.write(content))
+
+
 def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text as `write_whole` does."""
-    write_whole(path, lambda file: file.write(text.encode()))
+    write_bytes(path, text.encode())
 
 
 def make_folder(path: str | Path) -> Path:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 class Entry(NamedTuple):
     """One study.
 
-    - `study`: module and class; `pictures`: module and function that draws its own pictures, if there are any.
+    - `study`: module and class; `pictures`: module and function that draws a scene of it, see `Tiles`.
     - `question`, `settings`: for the help.
     - `scenes`, `views`, `model`: by default.
     - `options`: names of its fields that are options of the command.
@@ -38,7 +38,7 @@ def _of_classes(
     own: str = "meshes",
 ) -> Entry:
     """A study of classification, with one option of its own."""
-    pictures, options = "jaxnbv.studies.classification.pictures:write_pictures", (own, "classifier", "first")
+    pictures, options = "jaxnbv.studies.classification.pictures:tiles", (own, "classifier", "first")
     return Entry(study, question, settings, scenes=100, views=5, pictures=pictures, options=options)
 
 
@@ -74,7 +74,7 @@ STUDIES = {
         "of 24 views, 8 steps of 0.03: less of everything than the paper.",
         scenes=80,
         views=6,
-        pictures="jaxnbv.studies.parts.pictures:write_pictures",
+        pictures="jaxnbv.studies.parts.pictures:tiles",
         options=("meshes",),
     ),
     "heat": Entry(
@@ -85,7 +85,7 @@ STUDIES = {
         "added to 1,024 points of the cloud: less of everything than the paper.",
         scenes=24,
         views=6,
-        pictures="jaxnbv.studies.heat.pictures:write_pictures",
+        pictures="jaxnbv.studies.heat.pictures:tiles",
         options=("meshes",),
     ),
     "reconstruction": Entry(
@@ -95,7 +95,7 @@ STUDIES = {
         scenes=32,
         views=5,
         model="screened",
-        pictures="jaxnbv.studies.reconstruction.pictures:write_pictures",
+        pictures="jaxnbv.studies.reconstruction.pictures:tiles",
         options=("meshes",),
     ),
     "recorded": Entry(
@@ -106,19 +106,7 @@ STUDIES = {
         scenes=6,
         views=6,
         model="screened",
-        pictures="jaxnbv.studies.recorded.pictures:write_pictures",
+        pictures="jaxnbv.studies.recorded.pictures:tiles",
         options=("folder", "box", "up"),
-    ),
-    "searches": Entry(
-        "jaxnbv.studies.classification.searches:SearchStudy",
-        "Do searches by gradient find better views than one over candidates, and what do they cost? On pyramids and "
-        "trucks.",
-        "Settings of the studies of pyramids and trucks; gradient searches climb from the best 4 of 24 views, 8 steps "
-        "of 0.03.",
-        scenes=60,
-        views=5,
-        model="screened",
-        pictures="jaxnbv.studies.classification.pictures:write_pictures",
-        options=("framing",),
     ),
 }

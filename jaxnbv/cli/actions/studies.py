@@ -14,11 +14,13 @@ from jaxnbv.checks import InputError, require
 from jaxnbv.cli.device import prepare
 from jaxnbv.cli.registry import Device, resolve
 from jaxnbv.storage import describe
-from jaxnbv.studies.engine.charts import write_charts
+from jaxnbv.storage.files import write_bytes, write_text
+from jaxnbv.studies.engine.chart import chart
 from jaxnbv.studies.engine.measures import Record
+from jaxnbv.studies.engine.pictures import write_pictures
 from jaxnbv.studies.engine.records import RecordFolder
-from jaxnbv.studies.engine.study import Factory, Study
-from jaxnbv.studies.engine.tables import summary, write_tables
+from jaxnbv.studies.engine.results import results, summary
+from jaxnbv.studies.engine.study import CHART, Factory, Study
 from jaxnbv.studies.engine.trials import Cluster, Here, Processes, Runner, Trial
 from jaxnbv.studies.registry import STUDIES, flag
 
@@ -56,7 +58,8 @@ def study(
     )
     kind: type[Study] = resolve(entry.study)
     model = model or entry.model
-    chosen, added = _methods(methods, kind.all_methods(model)), {text: _own(text) for text in own or ()}
+    named = None if methods is None else [name.strip() for name in methods.split(",")]
+    chosen, added = kind.chosen(named, model), {text: _own(text) for text in own or ()}
     wanted = _scenes(str(entry.scenes) if scenes is None else scenes)
     runner = _runner(workers, scheduler, added)
     failed: dict[str, str] = {}
@@ -71,18 +74,19 @@ def study(
         config |= {"own": {text: describe(make) for text, make in added.items()}} if added else {}
         there = wanted if settings.num_scenes is None else [index for index in wanted if index < settings.num_scenes]
         run = functools.partial(_prepared, device, functools.partial(settings.run_scene, methods=chosen, own=added))
-        results = RecordFolder(folder / part, config, runner)
-        records, failures = results.collect(there, run), results.failures(there)
+        held = RecordFolder(folder / part, config, runner)
+        records, failures = held.collect(there, run), held.failures(there)
         failed |= {f"{part} scene {index}".strip(): error for index, error in failures.items()}
         asked += len(there)
         if not records:
             continue
-        write_tables(records, type(settings), folder / part)
-        write_charts(records, type(settings), folder / part)
+        table = results(records, type(settings))
+        write_text(folder / part / "results.csv", table.round(6).to_csv(index=False))
+        write_bytes(folder / part / CHART, chart(table, type(settings)))
         if entry.pictures:
-            resolve(entry.pictures)(records, settings, folder / part)
-        typer.echo(f"\n{f'{part}. ' if part else ''}{summary(records, type(settings), groups=False)}")
-        typer.echo(f"All tables as CSV, figures and pictures: {folder / part}\n")
+            write_pictures(records, settings, folder / part, resolve(entry.pictures))
+        typer.echo(f"\n{f'{part}. ' if part else ''}{summary(table, type(settings))}")
+        typer.echo(f"All tables as CSV, chart and pictures: {folder / part}\n")
     if failed:
         where, error = next(iter(failed.items()))
         raise InputError(
@@ -112,16 +116,6 @@ def _scenes(asked: str) -> Sequence[int]:
     if not scenes:
         raise InputError(f"--scenes {asked} names no scenes: give how many, such as 60, or which, such as 100:130")
     return scenes
-
-
-def _methods(asked: str | None, known: Sequence[str]) -> tuple[str, ...]:
-    if asked is None:
-        return tuple(known)
-    names = {name.strip() for name in asked.split(",")}
-    unknown = sorted(names - {*known})
-    if unknown:
-        raise InputError(f"unknown methods: {', '.join(unknown)}; choose from {', '.join(known)}")
-    return tuple(name for name in known if name in names)
 
 
 def _own(text: str) -> Factory:

@@ -4,7 +4,6 @@ Of a pyramid its base has a pattern. Of a loaded truck the outside is most of wh
 cargo. Of household objects, the paper's sanity check, and of scanned fruits, from its supplement, all tells the class.
 """
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -13,17 +12,15 @@ import numpy as np
 
 from jaxnbv.checks import require
 from jaxnbv.scanning import load_mesh
-from jaxnbv.studies.classification.measures import HITS_EXPLAINED, charts_of, hits_and_diagnostics, seen_explained
 from jaxnbv.studies.classification.study import BASELINES, ClassificationStudy, Truth
-from jaxnbv.studies.engine.measures import Claim, Measure, Record
+from jaxnbv.studies.engine.measures import Claim, Record
 from jaxnbv.studies.engine.meshes import mesh_files
-from jaxnbv.studies.engine.study import Chart, Scene, Study
+from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.readers import MeshFile
 from jaxnbv.studies.scenes import (
     HOUSEHOLD,
     PATTERNS,
     ClassSet,
-    FirstView,
     Framing,
     Pyramid,
     household_scene,
@@ -34,34 +31,28 @@ from jaxnbv.studies.scenes.class_object import ClassMesh, choose_hidden
 from jaxnbv.studies.scenes.splits import scene_key
 from jaxnbv.studies.scenes.truck_meshes import loaded_truck
 
-# Of the cameras from which the pattern cannot be seen two fifths lie in each of the first two, a fifth in the last.
-_ANGLES = {"under 110": (0.0, 110.0), "110-140": (110.0, 140.0), "140-180": (140.0, 180.1)}
+# Degrees. Of the cameras from which the pattern cannot be seen two fifths lie in each of the first two, a fifth in the
+# last.
+_ANGLES = (0, 110, 140)
 
 
 class PyramidStudy(ClassificationStudy):
     """The class of a pyramid whose pattern the first view does not show. Settings as of `ClassificationStudy`."""
 
     title: ClassVar[str] = "The class of a pyramid"
-    explanation: ClassVar[str] = (
-        f"{HITS_EXPLAINED}{seen_explained('pattern')}\n"
-        "Diagnostics are by the view being chosen, in ( ) their scenes. Angles are of the first view from the base's "
-        "normal."
-    )
     objects: ClassVar[ClassSet] = ClassSet(PATTERNS, pyramid_scene)
     cue: ClassVar[str] = "pattern"
     network: ClassVar[str] = "pyramid"
     framings: ClassVar[tuple[Framing, ...]] = tuple(Framing)
     solid: ClassVar[bool] = True
     bank: ClassVar[str] = "pyramid"
-    measures: ClassVar[tuple[Measure, ...]] = hits_and_diagnostics(cue)
-    charts: ClassVar[Mapping[str, Chart]] = charts_of(cue, "angles")
     seed: ClassVar[int] = 2
 
     @classmethod
-    def groups(cls, records: Sequence[Record]) -> dict[str, list[Record]]:
-        """All, and those in each bin of the first view's angle; no bin is empty."""
-        bins = {name: [r for r in records if low <= r["angle"] < high] for name, (low, high) in _ANGLES.items()}
-        return {"all": list(records)} | {f"first view at {name}°": of for name, of in bins.items() if of}
+    def group(cls, record: Record) -> str:
+        """By the first view's angle from the base's normal."""
+        least = max(angle for angle in _ANGLES if angle <= record["angle"])
+        return f"first view at {least:03d}° or more from the base's normal"
 
     def facts(self, scene: Scene, truth: Truth, first: int) -> Record:
         """With the first view's angle from the base's normal, in degrees: at 180 it looks from behind the apex."""
@@ -74,15 +65,10 @@ class PyramidStudy(ClassificationStudy):
 
     def first_view(self, scene: Scene) -> int:
         """A random one of the candidates that do not show the pattern, but something, as `first` asks."""
-        pixels, scans = scene.task.pixels, scene.task.scans
-        if self.first is not FirstView.ANY:
-            enough = [self.shows_enough(scene, scans[index]) for index in range(self.num_candidates)]
-            require(
-                any(enough),
-                f"the classifier is right after all {self.num_candidates} candidates of {scene.name}: {self.remedy}",
-            )
-            pixels = np.where(enough, pixels, 1)
-        return choose_hidden(pixels, scans, self.key(scene.index, "first"))
+        scans = scene.task.scans
+        enough = [self.shows_enough(scene, scans[index]) for index in range(self.num_candidates)]
+        require(any(enough), f"none of {self.num_candidates} candidates shows enough of {scene.name}: ask for more")
+        return choose_hidden(np.where(enough, scene.task.pixels, 1), scans, self.key(scene.index, "first"))
 
 
 class TruckStudy(ClassificationStudy):
@@ -92,16 +78,11 @@ class TruckStudy(ClassificationStudy):
     """
 
     title: ClassVar[str] = "The class of a truck's cargo"
-    explanation: ClassVar[str] = (
-        f"{HITS_EXPLAINED}{seen_explained('cargo')}\nDiagnostics are by the view being chosen, in ( ) their scenes."
-    )
     objects: ClassVar[ClassSet] = ClassSet(HOUSEHOLD, truck_scene)
     cue: ClassVar[str] = "cargo"
     bank: ClassVar[str] = "truck"
     network: ClassVar[str] = "truck"
     fed: ClassVar[tuple[int, int]] = (2048, 1024)
-    measures: ClassVar[tuple[Measure, ...]] = hits_and_diagnostics(cue)
-    charts: ClassVar[Mapping[str, Chart]] = charts_of(cue, "first_views")
     seed: ClassVar[int] = 11
 
     num_points: int = eqx.field(static=True, default=1024)

@@ -1,6 +1,6 @@
 """What the studies of classification have in common: which methods' views tell the class, and how soon?"""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -8,22 +8,23 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, Key
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
+from jaxnbv.acquisition import scores
 from jaxnbv.checks import require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale, pretrained_classifier
-from jaxnbv.planning.episode import Sensor, Step, view_keys
+from jaxnbv.planning.episode import Sensor, Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SensorNoise
-from jaxnbv.search import TieBreakSearch
-from jaxnbv.studies.classification.measures import HITS_EXPLAINED, charts_of, hits_and_diagnostics
-from jaxnbv.studies.classification.shared import OracleView, Shared, classify, propose_together
+from jaxnbv.search import CandidateSearch, Problem, Proposal, TieBreakSearch
+from jaxnbv.search.base import Scores, best_unvisited
+from jaxnbv.studies.classification.measures import CUE_PIXELS, MEASURES
 from jaxnbv.studies.engine.diagnostics import rank_correlation, roughness
-from jaxnbv.studies.engine.measures import UNKNOWING, Claim, Measure, Record
+from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.meshes import numbered
-from jaxnbv.studies.engine.study import RULES, Chart, Scene, Study, pose_record
+from jaxnbv.studies.engine.study import RULES, Scene, Study
 from jaxnbv.studies.readers import MeshFile, class_meshes
 from jaxnbv.studies.scenes import ClassObject, ClassSet, FirstView, Framing, Split
 from jaxnbv.studies.scenes.class_object import ClassMesh, scan_cue, surface_of
@@ -32,14 +33,14 @@ from jaxnbv.tasks.classification import ClassAcquisition, Classifier
 
 # Of random search, in each scene.
 _RUNS = 8
-_BY_CLASS: dict[str, type[ClassAcquisition]] = {
-    "cross-entropy": CrossEntropy,
+BASELINES = ("coverage", *RULES)
+_GRADIENT = ("gradient-2dof", "gradient-constrained")
+# All others choose by cross-entropy, in their ways of searching.
+_ACQUISITIONS: dict[str, type[ClassAcquisition] | None] = {
+    **dict.fromkeys(BASELINES),
     "entropy": EntropyReduction,
     "mixed": MixedEntropy,
-    "tie-break": CrossEntropy,
-    "oracle": CrossEntropy,
 }
-BASELINES = ("coverage", *RULES)
 
 
 class Truth(eqx.Module):
@@ -49,6 +50,25 @@ class Truth(eqx.Module):
     scans: PointCloud
     thing: ClassObject | ClassMesh
     pixels: Int[Array, " candidates"]
+
+
+class OracleView(CandidateSearch):
+    """The candidate whose true scan has the highest value: what the acquisition would choose that knows the surface.
+
+    - `scans`: what each candidate would truly show.
+    """
+
+    scans: PointCloud = eqx.field(kw_only=True)
+    uses_samples: ClassVar[bool] = False
+
+    def score(self, problem: Problem, candidates: Pose) -> Float[Array, "1 1 candidates"]:
+        """The values of the true scans."""
+        context = problem.acquisition.context(problem.evidence.cloud)
+        return scores(problem.acquisition, context, self.scans, problem.camera, candidates)[None, None]
+
+    def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
+        """The argmax over the candidates not visited yet; the key is not used."""
+        return best_unvisited(problem, candidates, scores[0, 0])
 
 
 class ClassificationStudy(Study):
@@ -72,9 +92,15 @@ class ClassificationStudy(Study):
     """
 
     methods: ClassVar[tuple[str, ...]] = ("cross-entropy", "entropy", "mixed", "tie-break", *BASELINES, "oracle")
+    further: ClassVar[tuple[str, ...]] = ("halving", *_GRADIENT, "hybrid")
+    pictured: ClassVar[tuple[str, ...]] = ("cross-entropy", "farthest", "uncertainty")
     reference: ClassVar[str] = "cross-entropy"
-    explanation: ClassVar[str] = f"{HITS_EXPLAINED}Roughness is by the view being chosen, in ( ) its scenes."
-    measures: ClassVar[tuple[Measure, ...]] = hits_and_diagnostics()
+    explanation: ClassVar[str] = (
+        "First hit: a right prediction so far. Stable hit: right from then to the end. Of random search both are\n"
+        f"means over {_RUNS} runs. Cue seen: one of the views shows at least {CUE_PIXELS} pixels of what differs by\n"
+        "class. Rank correlation and roughness are by the view being chosen."
+    )
+    measures: ClassVar[tuple[Measure, ...]] = MEASURES
     claims: ClassVar[tuple[Claim, ...]] = (
         Claim(
             "Where local features tell the class, cross-entropy is right sooner than views that know nothing of the "
@@ -83,8 +109,14 @@ class ClassificationStudy(Study):
             2,
             BASELINES,
         ),
+        Claim(
+            "Search over candidates tells the class as soon as search by gradient, or almost.",
+            "stable",
+            2,
+            _GRADIENT,
+            ahead=False,
+        ),
     )
-    charts: ClassVar[Mapping[str, Chart]] = charts_of()
     quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 40}
     quick_scenes: ClassVar[int] = 6
 
@@ -141,15 +173,12 @@ class ClassificationStudy(Study):
         return classifier
 
     @classmethod
-    def groups(cls, records: Sequence[Record]) -> dict[str, list[Record]]:
-        """All, and those whose first view shows nothing of the cue of the class, and something; no group is empty."""
-        parts: dict[str, list[Record]] = {"all": list(records)}
-        if cls.cue:
-            shown = [record[f"{cls.cue}_pixels"][record["first"]] > 0 for record in records]
-            for word, wanted in (("without", False), ("with", True)):
-                of = [record for record, shows in zip(records, shown, strict=True) if shows is wanted]
-                parts |= {f"first view {word} {cls.cue}": of} if of else {}
-        return parts
+    def group(cls, record: Record) -> str:
+        """Whether the first view, which all methods share, shows something of the cue of the class."""
+        if not cls.cue:
+            return ""
+        pixels = next(iter(record["methods"].values()))["pixels"]
+        return f"first view {'with' if pixels[0][0] else 'without'} {cls.cue}"
 
     @property
     def num_scenes(self) -> int | None:
@@ -160,10 +189,9 @@ class ClassificationStudy(Study):
 
         **Raises:** `ValueError` if there is no mesh of this index, or it cannot be read.
         """
-        poses = self.candidates.poses()
         keys = jax.random.split(jax.random.fold_in(jax.random.key(3), index), self.num_candidates)
         name, thing = self.thing(index)
-        pixels, scans = scan_cue(thing, self.camera, poses)
+        pixels, scans = scan_cue(thing, self.camera, self.candidates.poses())
         return Scene(index, name, surface_of(thing), Truth(int(thing.label), _noisy(scans, keys), thing, pixels))
 
     def thing(self, index: int) -> tuple[str, ClassObject | ClassMesh]:
@@ -181,8 +209,7 @@ class ClassificationStudy(Study):
         return scene.task
 
     def facts(self, scene: Scene, truth: Truth, first: int) -> Record:
-        known = {"name": scene.name, "framing": self.framing.value, "split": self.split.value}
-        return known | {"label": truth.label} | self._shown(truth.pixels)
+        return {"name": scene.name, "framing": self.framing.value, "split": self.split.value, "label": truth.label}
 
     @property
     def grid(self) -> Grid:
@@ -194,118 +221,57 @@ class ClassificationStudy(Study):
         shows = super().shows_enough(scene, seen)
         if self.first is FirstView.ANY or not shows:
             return shows
-        return int(classify(self.classifier, seen).argmax()) != scene.task.label
-
-    @property
-    def remedy(self) -> str:
-        """Where `first` asks for more, to ask for less."""
-        return super().remedy + ("" if self.first is FirstView.ANY else ", or ask for --first any")
+        return int(_classify(self.classifier, seen).argmax()) != scene.task.label
 
     def planner(self, method: str, scene: Scene) -> Planner:
-        classifier, candidates = self.imagining or self.classifier, self.candidates
-        kind, coverage = _BY_CLASS.get(method), Coverage()
-        acquisition = coverage if kind is None else kind(classifier, num_points=self.num_points)
+        kind, search = _ACQUISITIONS.get(method, CrossEntropy), self.search(method)
+        acquisition = kind(self.imagining or self.classifier, num_points=self.num_points) if kind else Coverage()
         if method == "oracle":
-            return self.planner_of(acquisition, OracleView(candidates, scans=scene.task.scans), scene)
+            search = OracleView(self.candidates, scans=scene.task.scans)
         if method == "tie-break":
-            return self.planner_of(acquisition, TieBreakSearch(candidates, second=coverage), scene)
-        return self.planner_of(acquisition, self.search(method), scene)
+            search = TieBreakSearch(self.candidates, second=Coverage())
+        return self.planner_of(acquisition, search, scene)
 
     def sensor(self, scene: Scene) -> Sensor:
         """From a candidate the same scan for all methods and views."""
         anywhere, poses = super().sensor(scene), self.candidates.poses()
 
         def look(pose, key):
-            index, is_there = _nearest(poses, pose)
-            return scene.task.scans[index] if is_there else anywhere(pose, key)
+            apart = [np.asarray(poses.position) - pose.position, np.asarray(poses.forward) - pose.forward]
+            away = np.linalg.norm(np.concatenate(apart, axis=1), axis=1)
+            return scene.task.scans[int(away.argmin())] if away.min() < 1e-3 else anywhere(pose, key)
 
         return look
 
-    def run_methods(self, scene: Scene, truth: Truth, first: int, methods: Sequence[str]) -> dict[str, Record]:
-        """All methods together: those that stand at the same place share its evidence, its samples and their scans."""
-        planners = {method: self.planner_for(method, scene) for method in methods}
-        shared = Shared(self.planner("coverage", scene), self.classifier, self.candidates.poses(), truth.scans)
-        runs: dict[str, list[tuple[int, ...]]] = {method: [(first,)] for method in methods}
-        if "random" in runs:
-            runs["random"] = [self._random_run(scene, shared, planners["random"], first, run) for run in range(_RUNS)]
-        diagnostics: dict[str, list[Record]] = {method: [] for method in methods}
-        for view in range(1, self.views):
-            together: dict[tuple[int, ...], dict[str, Planner]] = {}
-            for method in (method for method in methods if method != "random"):
-                together.setdefault(runs[method][0], {})[method] = planners[method]
-            for visited, group in together.items():
-                for method, (index, noted) in self._step(scene, shared, group, visited, view).items():
-                    runs[method] = [(*visited, index)]
-                    diagnostics[method].append({"view": view + 1, **noted})
-        found: dict[str, Record] = {
-            method: {
-                "views": [pose_record(shared.poses[index]) for index in of[0]],
-                "runs": [self._run(shared, truth, one) for one in of],
-                "diagnostics": diagnostics[method],
-            }
-            for method, of in runs.items()
-        }
-        if "random" in found:
-            correct = shared.second_answers(first).argmax(axis=1) == truth.label
-            found["random"]["hit"] = float(np.mean(np.delete(correct, first)))
-        return found
-
-    def _step(
-        self, scene: Scene, shared: Shared, planners: Mapping[str, Planner], visited: tuple[int, ...], view: int
-    ) -> dict[str, tuple[int, Record]]:
-        """The candidates that methods at one place choose as view `view` (from 0), with the keys of an episode; and how
-        well their values agreed with what the candidates would truly show, and how rough the samples were."""
-        evidence = shared.evidence(visited)
-        sample_key, search_key, _ = view_keys(self.key(scene.index, "episode"), view)
-        new = ~np.isin(np.arange(self.num_candidates), visited)
-        found: dict[str, tuple[int, Record]] = {}
-        # Those that imagine alike together: the study's own, and those that know no shapes.
-        for unknowing in (False, True):
-            group = {name: one for name, one in planners.items() if name.endswith(UNKNOWING) is unknowing}
-            if not group:
-                continue
-            surfaces, rough = None, None
-            if any(planner.search.uses_samples for planner in group.values()):
-                imagination = next(iter(group.values())).imagination
-                posterior = imagination.posterior(evidence)
-                surfaces = imagination.sample(evidence, sample_key, posterior)
-                rough = roughness(imagination, evidence, posterior, surfaces)
-            for method, proposal in propose_together(group, evidence, surfaces, search_key).items():
-                index, _ = _nearest(shared.poses, proposal.pose)
-                shown = scene.task.pixels if self.cue else None
-                rank = None if shown is None else rank_correlation(proposal.values, shown, new)
-                own = rough if planners[method].search.uses_samples else None
-                found[method] = index, {"rank_correlation": rank, "roughness": own}
-        return found
-
-    def _random_run(self, scene: Scene, shared: Shared, planner: Planner, first: int, run: int) -> tuple[int, ...]:
-        """The candidates that a search at random chooses, in one of several runs."""
-        key = jax.random.fold_in(self.key(scene.index, "episode"), run)
-        visited: tuple[int, ...] = (first,)
-        for view in range(1, self.views):
-            _, search_key, _ = view_keys(key, view)
-            index, _ = _nearest(shared.poses, planner.choose(shared.evidence(visited), None, search_key).pose)
-            visited = (*visited, index)
-        return visited
-
-    def _run(self, shared: Shared, truth: Truth, visited: tuple[int, ...]) -> Record:
-        log_p = [shared.answer(visited[:count]).tolist() for count in range(1, len(visited) + 1)]
-        return {"candidates": list(visited), **self._shown(truth.pixels[np.array(visited)]), "log_p": log_p}
-
-    def follow(
-        self, scene: Scene, truth: Truth, method: str, methods: Sequence[str], episode: Iterator[Step]
+    def run(
+        self, scene: Scene, truth: Truth, first: int, method: str, planner: Planner, key: PRNGKeyArray | None = None
     ) -> Record:
-        """Of a method of one's own: what the classifier says after each view, and how much of it tells the class."""
-        log_p, pixels = [], []
-        for view, *_ in episode:
-            log_p.append(np.asarray(classify(self.classifier, view.cloud)).tolist())
-            pose = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], view.pose)
-            pixels.append(int(scan_cue(truth.thing, self.camera, pose)[0][0]))
-        return {"runs": [{**self._shown(pixels), "log_p": log_p}], "diagnostics": []}
+        """Of random search several runs in one."""
+        if method != "random":
+            return super().run(scene, truth, first, method, planner, key)
+        episode = self.key(scene.index, "episode")
+        keys = [jax.random.fold_in(episode, run) for run in range(_RUNS)]
+        runs = [super(ClassificationStudy, self).run(scene, truth, first, method, planner, key) for key in keys]
+        return runs[0] | {name: [run[name][0] for run in runs] for name in ("log_p", "pixels")}
 
-    def _shown(self, pixels: Any) -> Record:
-        """How many rays of each view hit the cue of the class, where that is a part of the object."""
-        return {f"{self.cue}_pixels": np.asarray(pixels).tolist()} if self.cue else {}
+    def follow(self, scene: Scene, truth: Truth, planner: Planner, episode: Iterator[Step]) -> Record:
+        """Of its run what the classifier says after each view, and how many rays of the view hit the cue of the class;
+        and by the view being chosen how well values agreed with what the candidates would truly show, and how rough
+        the samples were."""
+        found: dict[str, list] = {name: [] for name in ("log_p", "pixels", "rank_correlation", "roughness")}
+        for view, _, basis, _ in episode:
+            found["log_p"].append(np.asarray(_classify(self.classifier, view.cloud)).tolist())
+            pose = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], view.pose)
+            found["pixels"].append(int(scan_cue(truth.thing, self.camera, pose)[0][0]))
+            rank, rough = None, None
+            if self.cue and view.proposal is not None and len(view.proposal.values) == self.num_candidates:
+                values = np.asarray(view.proposal.values)
+                rank = rank_correlation(values, truth.pixels, np.isfinite(values))
+            if basis is not None:
+                rough = roughness(planner.imagination, basis.evidence, basis.posterior, basis.surfaces)
+            found["rank_correlation"].append(rank)
+            found["roughness"].append(rough)
+        return found | {"log_p": [found["log_p"]], "pixels": [found["pixels"]] if self.cue else []}
 
 
 @eqx.filter_jit
@@ -313,9 +279,7 @@ def _noisy(scans: PointCloud, keys: Key[Array, " candidates"]) -> PointCloud:
     return jax.vmap(SensorNoise())(scans, keys)
 
 
-def _nearest(poses: Pose, pose: Pose) -> tuple[int, bool]:
-    """The candidate nearest to a pose, and whether place and direction are the same."""
-    away = np.linalg.norm(np.asarray(poses.position) - np.asarray(pose.position), axis=1)
-    turned = np.linalg.norm(np.asarray(poses.forward) - np.asarray(pose.forward), axis=1)
-    index = int(np.argmin(away))
-    return index, bool(away[index] + turned[index] < 1e-3)
+@eqx.filter_jit
+def _classify(classifier: Classifier, cloud: PointCloud) -> Float[Array, " classes"]:
+    """log p, compiled."""
+    return classifier(cloud)

@@ -1,4 +1,4 @@
-"""Pictures of a study: a grid of tiles a scene, such as a row a method and a column a view."""
+"""Pictures of a study: for each scene a grid of tiles, a row a method and a column a view, beside the truth."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import matplotlib as mpl
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
@@ -15,81 +15,110 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.lines import Line2D
 
-from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.storage.files import make_folder
 from jaxnbv.studies.engine.measures import Record
+from jaxnbv.studies.engine.study import Study
 from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.layout import framed
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.render import Still
-from jaxnbv.viz.style import LINE, save_figure
+from jaxnbv.viz.style import GREY, LINE, save_figure
 
+PIXELS = 420
+RIGHT = "#00734f"
 # Inches of a tile, and of what stands beside and above all of them.
 _TILE, _BESIDE, _ABOVE = (1.75, 1.95), 0.35, 0.75
 # A still is coloured at vertices: no triangle may be larger than what its colours vary over. Half of what it spans.
 _EDGE, _REACH = 0.05, 1.6
-# Places to look from, their distance, and how far from a point it still shows.
-_PLACES, _DISTANCE, _NEAR = 80, 11.0, 0.05
 
 
-class Grid(NamedTuple):
-    """Tiles in rows and columns under a title and a caption.
+class Tiles(NamedTuple):
+    """How a study draws a scene.
 
-    - `draw`: fills the tile at a row and a column, given its axes.
-    - `named`: the column beside which the rows' names stand.
+    - `caption`: beneath all.
+    - `tile`: fills the tile of a method at a column, given its axes.
+    - `truth`: fills the tile of the truth, which stands before the first row; None for none.
+    - `columns`: what the tiles of a method are; "" for its views.
     - `marks`: a legend, the look of a `Line2D` by name; `scale`: a bar of colours, and what they mean.
     """
 
-    title: str
     caption: str
-    rows: Sequence[str]
-    columns: Sequence[str]
-    draw: Callable[[Axes, int, int], None]
+    tile: Callable[[Axes, str, int], None]
+    truth: Callable[[Axes], object] | None = None
+    columns: tuple[str, ...] = ()
     marks: Mapping[str, Mapping[str, Any]] = {}
     scale: tuple[ScalarMappable, str] | None = None
-    named: int = 0
 
 
-def write_grids(records: Sequence[Record], folder: str | Path, name: str, make: Callable[[Record], Grid]) -> list[Path]:
-    """Write `<name>_<scene>.png` for each record into a folder; return the paths."""
+# Of a scene's record, the methods that are shown, and the pixels along a side of a tile.
+Draw = Callable[[Any, Record, Sequence[str], int], Tiles]
+
+
+def write_pictures(
+    records: Sequence[Record], study: Study, folder: str | Path, draw: Draw, scenes: int = 3, pixels: int = PIXELS
+) -> list[Path]:
+    """Write `scene_<number>.png` for the first scenes, not picked ones, into a folder; return the paths. Methods are
+    those of the study that are `pictured`, or all that the records hold."""
     folder, paths = make_folder(folder), []
-    with mpl.rc_context(STYLE):
-        for record in records:
-            paths.append(folder / f"{name}_{record['scene']:03d}.png")
-            save_figure(_drawn(make(record)), paths[-1])
+    for record in sorted(records, key=lambda record: record["scene"])[:scenes]:
+        held = record["methods"]
+        methods = [method for method in study.pictured if method in held] or list(held)
+        paths.append(folder / f"scene_{record['scene']:04d}.png")
+        with mpl.rc_context(STYLE):
+            save_figure(_drawn(draw(study, record, methods, pixels), record, methods), paths[-1])
     return paths
 
 
-def first_scenes(records: Sequence[Record], count: int) -> list[Record]:
-    """Not picked ones."""
-    return sorted(records, key=lambda record: record["scene"])[:count]
-
-
-def _drawn(grid: Grid) -> Figure:
-    tall, wide = len(grid.rows), len(grid.columns)
-    size = wide * _TILE[0] + _BESIDE * (3 if grid.scale else 1), tall * _TILE[1] + _ABOVE
+def _drawn(tiles: Tiles, record: Record, methods: Sequence[str]) -> Figure:
+    runs = [record["methods"][method] for method in methods]
+    columns = tiles.columns or tuple(f"view {view + 1}" for view in range(max(len(run["views"]) for run in runs)))
+    start, tall = int(tiles.truth is not None), len(methods)
+    wide = start + len(columns)
+    size = wide * _TILE[0] + _BESIDE * (3 if tiles.scale else 1), tall * _TILE[1] + _ABOVE
     figure = Figure(figsize=size, layout="constrained")
-    figure.suptitle(grid.title, x=0.01, ha="left", fontsize=10, fontweight="bold")
-    tiles = figure.subplots(tall, wide, squeeze=False)
-    for row, line in enumerate(tiles):
-        for column, axes in enumerate(line):
+    figure.suptitle(f"Scene {record['scene']}: {record['name']}", x=0.01, ha="left", fontsize=10, fontweight="bold")
+    grid = figure.subplots(tall, wide, squeeze=False)
+    for axes, title in zip(grid[0], ("truth", *columns)[1 - start :], strict=True):
+        axes.set_title(title, fontsize=9, loc="center", pad=4)
+    for row, (method, run) in enumerate(zip(methods, runs, strict=True)):
+        for axes in grid[row]:
             framed(axes, LINE, 0.8)
-            grid.draw(axes, row, column)
-            if row == 0:
-                axes.set_title(grid.columns[column], fontsize=9, loc="center", pad=4)
-        line[grid.named].set_ylabel(grid.rows[row], fontsize=9, fontweight="bold")
-    handles = [Line2D([], [], ls="none", label=name, **look) for name, look in grid.marks.items()]
+        if tiles.truth is not None:
+            tiles.truth(grid[row, 0]) if row == 0 else grid[row, 0].axis("off")
+        for column, axes in enumerate(grid[row, start:]):
+            if tiles.columns or column < len(run["views"]):
+                tiles.tile(axes, method, column)
+            else:
+                axes.axis("off")
+        grid[row, start].set_ylabel(method, fontsize=9, fontweight="bold")
+    handles = [Line2D([], [], ls="none", label=name, **look) for name, look in tiles.marks.items()]
     legend = figure.legend(handles=handles, loc="outside lower left", ncols=max(len(handles), 1), frameon=False)
-    legend.set_title(grid.caption, prop=FontProperties(size=8))
+    legend.set_title(tiles.caption, prop=FontProperties(size=8))
     legend.set_alignment("left")
-    if grid.scale:
-        colours, label = grid.scale
-        bar = figure.colorbar(colours, ax=tiles, location="right", shrink=min(1.0, 2.0 / tall), aspect=25)
+    if tiles.scale:
+        colours, label = tiles.scale
+        bar = figure.colorbar(colours, ax=grid, location="right", shrink=min(1.0, 2.0 / tall), aspect=25)
         bar.set_label(label, fontsize=8)
         bar.ax.tick_params(labelsize=7, length=2)
         bar.outline.set_visible(False)
     return figure
+
+
+def say(axes: Axes, text: str, right: bool = False) -> None:
+    """A line beneath a tile, which stands out where it is right."""
+    colour, weight = (RIGHT, "bold") if right else (GREY, "normal")
+    axes.set_xlabel(f"{'✓ ' if right else ''}{text}", fontsize=9, color=colour, fontweight=weight)
+
+
+def across(study: Study, record: Record) -> Float[np.ndarray, "3"]:
+    """Where to look from to see what the first view, which all methods share, does not show: from across the object,
+    and from above."""
+    position = np.asarray(study.candidates.poses().position[record["first"]], np.float64)
+    away = -position[[0, 2]]
+    length = np.linalg.norm(away)
+    away = away / length if length > 1e-3 else np.array([0.6, 0.8])
+    return np.array([away[0], 0.55, away[1]])
 
 
 def still_of(
@@ -107,23 +136,6 @@ def still_of(
     still = Still(eye, surface, size, _REACH)
     still.paint(norm)
     return still
-
-
-def places() -> Float[np.ndarray, "n 3"]:
-    """Where a person may stand to look: all around, from a little below to well above."""
-    around = np.asarray(fibonacci_sphere(_PLACES, _DISTANCE), np.float64)
-    return around[(around[:, 1] > -0.2 * _DISTANCE) & (around[:, 1] < 0.7 * _DISTANCE)]
-
-
-def shows_from(
-    mesh: TriangleMesh, eyes: Float[np.ndarray, "e 3"], points: Float[np.ndarray, "n 3"]
-) -> Bool[np.ndarray, "e n"]:
-    """Whether what is first hit from a place in the direction of a point of the mesh lies near it."""
-    away = points[None] - eyes[:, None]
-    away /= np.linalg.norm(away, axis=-1, keepdims=True)
-    hits = mesh.trace(np.broadcast_to(eyes[:, None], away.shape).reshape(-1, 3), away.reshape(-1, 3))
-    near = np.linalg.norm(np.asarray(hits.points).reshape(away.shape) - points, axis=-1) < _NEAR
-    return near & np.asarray(hits.mask).reshape(near.shape)
 
 
 def draw_on(

@@ -1,105 +1,168 @@
-"""What the records of a study say: means over scenes and paired differences, with bootstrap intervals, as tables."""
+"""What the records of a study say, in one table; as text, as a chart, and beside the paper's claims."""
 
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
 from scipy.stats import bootstrap
 
-from jaxnbv.studies.engine.measures import Measure, Record, methods_of, values
+from jaxnbv.checks import require
+from jaxnbv.studies.engine.measures import UNKNOWING, Measure, Record
 from jaxnbv.studies.engine.study import Study
 
 LEVEL = 0.90
-_AT = ["quantity", "by", "at", "method"]
-_MEANS = [*_AT, "mean", "standard_error", "low", "high", "rank", "scenes"]
-_DIFFERENCES = [*_AT, "baseline", "mean", "low", "high", "excludes_zero", "scenes"]
+_ALL = "all"
+_WHERE = ("ahead of", "level with", "behind")
 
 
-class Results(NamedTuple):
-    """A row a number, of each group of scenes: see `means` and `differences`."""
+def results(records: Sequence[Record], study: type[Study]) -> pd.DataFrame:
+    """A row for each group of scenes, measure, place ("at") and method: the mean over the scenes, its standard error
+    and interval (`low`, `high`); and the `lead` of the study's reference, its value less the method's on the same
+    scenes, with its interval.
 
-    means: pd.DataFrame
-    differences: pd.DataFrame
+    Only scenes count in which all methods have a value; methods that never have one have no row.
 
-
-def results(records: Sequence[Record], study: type[Study]) -> Results:
-    """All measures of a study, of each group of its scenes.
-
-    **Raises:** `ValueError` if there are no records, no method that all of them hold, or their numbers of views differ.
+    **Raises:** `ValueError` if there are no records.
     """
-    methods_of(records, study.methods)
-    tables: tuple[list[pd.DataFrame], list[pd.DataFrame]] = [], []
-    for group, members in study.groups(records).items():
-        methods = methods_of(members, study.methods)
-        found = means(members, methods, study.measures), differences(members, methods, study.measures, study.reference)
-        for into, table in zip(tables, found, strict=True):
-            table.insert(0, "group", group)
-            into.append(table)
-    return Results(*(pd.concat(of, ignore_index=True) for of in tables))
+    require(len(records) > 0, "there are no records: run the study for at least one scene")
+    rows = []
+    for record in records:
+        for measure in study.measures:
+            for method in record["methods"]:
+                found = measure.of(record, method)
+                by_place = found if isinstance(found, Mapping) else dict(enumerate(found, start=1))
+                here = record["scene"], study.group(record), measure.name, measure.by, method
+                rows += [(*here, at, value) for at, value in by_place.items()]
+    every = pd.DataFrame(rows, columns=["scene", "group", "quantity", "by", "method", "at", "value"])
+    every["value"] = every["value"].astype(float)
+    groups = every[every["group"] != ""].sort_values("group", kind="stable")
+    keys = ["group", "quantity", "by", "at"]
+    parts = pd.concat([every.assign(group=_ALL), groups]).groupby(keys, sort=False)
+    tables = [_compared(part, study.reference).assign(**dict(zip(keys, key, strict=True))) for key, part in parts]
+    return pd.concat(tables, ignore_index=True)[[*keys, *tables[0].columns.drop(keys)]]
+
+
+def _compared(part: pd.DataFrame, reference: str) -> pd.DataFrame:
+    """The rows of one number."""
+    values = part.pivot(index="scene", columns="method", values="value")[part["method"].unique()]
+    values = values.dropna(axis="columns", how="all").dropna()
+    values = values if len(values) else values[[]]
+    row = pd.DataFrame({"scenes": values.count(), "mean": values.mean(), "standard_error": values.sem()})
+    row[["low", "high"]] = interval(values.to_numpy()).T
+    if reference in values:
+        lead = values.rsub(values[reference], axis=0)
+        row["lead"] = lead.mean()
+        row[["lead_low", "lead_high"]] = interval(lead.to_numpy()).T
+    return row.rename_axis("method").reset_index()
 
 
 def interval(values: Float[np.ndarray, "scenes columns"]) -> Float[np.ndarray, "2 columns"]:
     """The ends of the percentile bootstrap interval of each column's mean, as Efron has it: whole scenes are drawn with
     replacement, the same for all columns. One scene alone has an interval without width."""
-    if len(values) == 1:
-        return np.repeat(values, 2, axis=0)
+    if len(values) < 2:
+        return np.stack([values.sum(axis=0)] * 2)
     settings = {"confidence_level": LEVEL, "method": "percentile", "rng": np.random.default_rng(0)}
     drawn = bootstrap((values,), np.mean, axis=0, **settings).confidence_interval
     return np.stack([drawn.low, drawn.high])
 
 
-def means(records: Sequence[Record], methods: Sequence[str], measures: Sequence[Measure]) -> pd.DataFrame:
-    """Mean, standard error and interval over scenes of each measure, column and method; `rank` counts from 1, where one
-    is better than another. What is not paired has no interval; what no scene has has no row."""
-    rows = []
-    for measure, at, frame in _frames(records, methods, measures):
-        known = frame.dropna() if measure.paired else frame.dropna(axis="columns", how="all")
-        if known.empty:
-            continue
-        row = pd.DataFrame({"mean": known.mean(), "standard_error": known.sem(), "scenes": known.count()})
-        row["low"], row["high"] = interval(known.to_numpy()) if measure.paired else (np.nan, np.nan)
-        ranked = measure.paired and measure.better is not None
-        row["rank"] = row["mean"].rank(method="min", ascending=measure.better == "less") if ranked else np.nan
-        rows.append(_labelled(row, "method", measure, at))
-    return _together(rows, _MEANS).astype({"rank": "Int64"})
+def groups_of(found: pd.DataFrame) -> dict[str, int]:
+    """The groups of scenes, of which the first is all, and how many scenes each has."""
+    return found.groupby("group", sort=False)["scenes"].max().to_dict()
 
 
-def differences(
-    records: Sequence[Record], methods: Sequence[str], measures: Sequence[Measure], reference: str
-) -> pd.DataFrame:
-    """The reference (`method`) less each other method (`baseline`) over the same scenes, with intervals; not of the
-    first view, which all methods share."""
-    rows = []
-    for measure, at, frame in _frames(records, methods, measures):
-        known = frame.dropna()
-        others = known.columns.drop(reference, errors="ignore")
-        if not measure.paired or reference not in known or known.empty or (measure.by, at) == ("view", 1):
-            continue
-        less = known[others].rsub(known[reference], axis=0)
-        if less.empty:
-            continue
-        row = pd.DataFrame({"mean": less.mean(), "scenes": less.count(), "method": reference})
-        row["low"], row["high"] = interval(less.to_numpy())
-        row["excludes_zero"] = (row["low"] > 0) | (row["high"] < 0)
-        rows.append(_labelled(row, "baseline", measure, at))
-    return _together(rows, _DIFFERENCES)
+def tables(found: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[tuple[str, pd.DataFrame]]:
+    """Of each measure its means by method, and the leads of the reference: titles, and cells of text."""
+    made = []
+    for measure in study.measures:
+        here = found[(found["group"] == group) & (found["quantity"] == measure.name)]
+        unit = f" ({measure.unit})" if measure.unit else ""
+        others = here[(here["method"] != study.reference) & ~((measure.by == "view") & (here["at"] == 1))]
+        others = others.dropna(subset="lead")
+        best = here.groupby("at", sort=False)["mean"].transform("min" if measure.less else "max") == here["mean"]
+        for title, rows, cells in (
+            (f"{measure.title}{unit}, by {measure.by}", here, _means(here, measure, best)),
+            (f"{measure.title}{unit}: {study.reference} minus another method", others, _leads(others, measure)),
+        ):
+            if len(rows):
+                table = rows.assign(text=cells).pivot(index="method", columns="at", values="text")
+                ordered = table.reindex(index=rows["method"].unique(), columns=rows["at"].unique()).fillna("-")
+                made.append((title, ordered.rename_axis(index=None, columns=measure.by)))
+    return made
 
 
-def _frames(
-    records: Sequence[Record], methods: Sequence[str], measures: Sequence[Measure]
-) -> Iterator[tuple[Measure, Any, pd.DataFrame]]:
-    """Of each measure and each of its columns a table: a row a scene, a column a method."""
-    for measure in measures:
-        found = values(records, methods, measure)
-        for place, at in enumerate(measure.labels(found.shape[-1])):
-            yield measure, at, pd.DataFrame(found[..., place], columns=list(methods))
+def _means(rows: pd.DataFrame, measure: Measure, best: pd.Series) -> list[str]:
+    """Shares with their interval, other means with their standard error; a star marks the best."""
+    texts = []
+    for row, star in zip(rows.itertuples(), best, strict=True):
+        if measure.unit == "%":
+            text = f"{100 * row.mean:.0f} [{100 * row.low:.0f}, {100 * row.high:.0f}]"
+        else:
+            error = "" if pd.isna(row.standard_error) else f" +- {row.standard_error:.{measure.digits}f}"
+            text = f"{row.mean:.{measure.digits}f}{error}"
+        texts.append(text + "*" * star)
+    return texts
 
 
-def _labelled(row: pd.DataFrame, name: str, measure: Measure, at: Any) -> pd.DataFrame:
-    return row.rename_axis(name).reset_index().assign(quantity=measure.name, by=measure.by, at=[at] * len(row))
+def _leads(rows: pd.DataFrame, measure: Measure) -> list[str]:
+    """With their interval; a star marks those whose interval excludes zero."""
+    form, scale = ("+.0f", 100) if measure.unit == "%" else (f"+.{measure.digits}f", 1)
+    return [
+        f"{scale * lead:{form}} [{scale * low:{form}}, {scale * high:{form}}]" + "*" * (low > 0 or high < 0)
+        for lead, low, high in zip(rows["lead"], rows["lead_low"], rows["lead_high"], strict=True)
+    ]
 
 
-def _together(rows: Sequence[pd.DataFrame], columns: list[str]) -> pd.DataFrame:
-    return pd.concat(rows, ignore_index=True)[columns] if rows else pd.DataFrame(columns=columns)
+def summary(found: pd.DataFrame, study: type[Study]) -> str:
+    """A study as text, of all its scenes."""
+    title = f"{study.title}: {count_of(groups_of(found)[_ALL], 'scene')}"
+    sections = [f"{title}\n{'=' * len(title)}\n\n{study.explanation}\n{explained(study)}\n"]
+    sections += [f"{title}\n{cells.to_string()}\n" for title, cells in tables(found, study)]
+    return "\n".join(sections)
+
+
+def explained(study: type[Study]) -> str:
+    """What stands in the cells of tables."""
+    return (
+        f"Mean over scenes +- its standard error, or in percent; in [ ] the {LEVEL:.0%} bootstrap interval over\n"
+        f"scenes; * the best. Differences: {study.reference} minus another method over the same scenes, * where the\n"
+        "interval excludes zero."
+    )
+
+
+class Verdict(NamedTuple):
+    """A claim, and against how many of the methods that it names it holds; a sentence tells of each."""
+
+    claim: str
+    held: int
+    methods: int
+    sentence: str
+
+
+def verdicts(found: pd.DataFrame, study: type[Study]) -> list[Verdict]:
+    """On each claim, by all scenes: how the reference fares beside the methods that it names, those of them that know
+    no shapes too. It is level with a method where the interval includes zero. A claim on methods that were not run is
+    left out."""
+    said = []
+    for claim in study.claims:
+        (measure,) = (one for one in study.measures if one.name == claim.measure)
+        at = found[(found["group"] == _ALL) & (found["quantity"] == claim.measure) & (found["at"] == claim.at)]
+        rows = at[at["method"].str.removesuffix(UNKNOWING).isin(claim.than)].dropna(subset="lead")
+        told: dict[str, list[str]] = {where: [] for where in _WHERE}
+        for row, text in zip(rows.itertuples(), _leads(rows, measure), strict=True):
+            level = row.lead_low <= 0 <= row.lead_high
+            better = (row.lead < 0) == measure.less
+            told[_WHERE[1 if level else 0 if better else 2]].append(f"{row.method} ({text.rstrip('*')})")
+        if len(rows):
+            held = sum(len(told[where]) for where in _WHERE[: 1 if claim.ahead else 2])
+            parts = "; ".join(f"{where} {', '.join(named)}" for where, named in told.items() if named)
+            sentence = f"Holds against {held} of {len(rows)}: {parts}."
+            said.append(Verdict(claim.text, held, len(rows), sentence))
+    return said
+
+
+def count_of(count: int, thing: str) -> str:
+    """ "1 scene", "2 scenes"."""
+    return f"{count} {thing}{'s' if count != 1 else ''}"

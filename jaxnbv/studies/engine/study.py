@@ -6,7 +6,7 @@ import time
 import traceback
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import equinox as eqx
 import jax
@@ -25,24 +25,42 @@ from jaxnbv.scanning import Evidence, Grid, Surface
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.search import (
     Candidates,
-    CandidateSearch,
+    ConstrainedPoses,
     DiscreteSearch,
     FarthestView,
+    FreePoses,
+    GradientSearch,
+    HalvingSearch,
+    HybridSearch,
+    PoseSpace,
     RandomView,
     Search,
     SphereCandidates,
+    SpherePoses,
     UncertaintyView,
 )
 from jaxnbv.studies.engine.measures import KNOWN, UNKNOWING, Claim, Measure, Record
 from jaxnbv.studies.scenes.banks import bank_poses, shape_bank
 
+# The file of a study's chart.
+CHART = "chart.png"
 _PURPOSES = ("first", "episode", "scene", "measure")
 # The baselines of all studies that look at no acquisition.
-RULES: dict[str, type[CandidateSearch]] = {
+RULES = ("farthest", "uncertainty", "random")
+_SEARCHES: dict[str, Callable[..., Search]] = {
     "farthest": FarthestView,
     "uncertainty": UncertaintyView,
     "random": RandomView,
+    "halving": HalvingSearch,
+    "hybrid": lambda candidates: HybridSearch(candidates=candidates),
 }
+# Free poses drift to views that miss the object, as the paper found; constrained ones keep it in view.
+_SPACES: dict[str, Callable[[float], PoseSpace]] = {
+    "gradient-2dof": SpherePoses,
+    "gradient-6dof": FreePoses,
+    "gradient-constrained": lambda radius: ConstrainedPoses(radius - 0.3, radius + 0.3),
+}
+_LEARNING_RATE = 0.03
 
 
 class Scene(eqx.Module):
@@ -58,22 +76,6 @@ class Scene(eqx.Module):
     task: Any = None
 
 
-class Panel(NamedTuple):
-    """One panel of a chart: a measure by its name; a title and a label of the axis in place of the measure's."""
-
-    measure: str
-    title: str = ""
-    axis: str = ""
-    log: bool = False
-
-
-class Chart(NamedTuple):
-    """Rows of panels; or one row for each group of scenes."""
-
-    rows: tuple[tuple[Panel, ...], ...]
-    by_group: bool = False
-
-
 class Study(eqx.Module):
     """What all scenes of a study share, and what it measures. A new study says what is left open here.
 
@@ -84,13 +86,14 @@ class Study(eqx.Module):
     - `imagination`, `num_samples`, `grid_resolution`, `capacity`: of the planner; the imagination has as many samples
       on a grid of this resolution.
     - `camera`: the sensor; a planner may imagine fewer rays.
+    - `num_starts`, `iterations`: of searches by gradient, which look at half the candidates first.
 
     What it is:
 
     - `title`, `explanation`: for tables.
-    - `methods`: by name, in order; `reference`: the one that the others are compared with.
-    - `measures`, `charts`: what tables and figures show; charts by the names of their files.
-    - `claims`: what the paper says of it.
+    - `methods`: by name, in order; `reference`: the one that the others are compared with; `further`: methods that are
+      run where a command names them; `pictured`: those that pictures show, by default all.
+    - `measures`: what tables and the chart show; `claims`: what the paper says of it.
     - `quick`: settings for a first look, on `quick_scenes` scenes.
     - `seed`: of its first views, noise and samples.
     - `bank`: of the shapes that are known, see `shape_bank`; "" for none.
@@ -104,11 +107,18 @@ class Study(eqx.Module):
     methods: eqx.AbstractClassVar[tuple[str, ...]]
     reference: eqx.AbstractClassVar[str]
     measures: eqx.AbstractClassVar[tuple[Measure, ...]]
-    charts: eqx.AbstractClassVar[Mapping[str, Chart]]
     seed: eqx.AbstractClassVar[int]
+    further: ClassVar[tuple[str, ...]] = ()
+    pictured: ClassVar[tuple[str, ...]] = ()
     claims: ClassVar[tuple[Claim, ...]] = ()
     radius: ClassVar[float] = SENSOR_RADIUS
-    quick: ClassVar[Mapping[str, Any]] = {"num_samples": 4, "grid_resolution": 48, "capacity": 1024}
+    quick: ClassVar[Mapping[str, Any]] = {
+        "num_samples": 4,
+        "grid_resolution": 48,
+        "capacity": 1024,
+        "num_starts": 2,
+        "iterations": 3,
+    }
     quick_scenes: ClassVar[int] = 4
     bank: ClassVar[str] = ""
     unknowing: ClassVar[tuple[str, ...]] = ()
@@ -120,6 +130,8 @@ class Study(eqx.Module):
     grid_resolution: int = eqx.field(static=True, default=64)
     capacity: int = eqx.field(static=True, default=4096)
     camera: Camera = Camera()
+    num_starts: int = eqx.field(static=True, default=4)
+    iterations: int = eqx.field(static=True, default=8)
 
     def __check_init__(self):
         require(
@@ -150,10 +162,19 @@ class Study(eqx.Module):
         return plain.knowing(shape_bank(cls.bank), bank_poses(cls.bank))
 
     @classmethod
-    def all_methods(cls, model: str) -> tuple[str, ...]:
-        """The methods, and where shapes are known those of `unknowing`."""
-        again = (f"{name}{UNKNOWING}" for name in cls.unknowing) if model == KNOWN else ()
-        return (*cls.methods, *again)
+    def chosen(cls, names: Sequence[str] | None, model: str) -> tuple[str, ...]:
+        """The methods of these names, in order; by default `methods`, and where shapes are known those of
+        `unknowing`.
+
+        **Raises:** `ValueError` for an unknown method.
+        """
+        again = tuple(f"{name}{UNKNOWING}" for name in cls.unknowing) if model == KNOWN else ()
+        known = (*cls.methods, *again, *cls.further)
+        if names is None:
+            return (*cls.methods, *again)
+        unknown = sorted({*names} - {*known})
+        require(not unknown, f"unknown methods: {', '.join(unknown)}; choose from {', '.join(known)}")
+        return tuple(name for name in known if name in names)
 
     @property
     def num_scenes(self) -> int | None:
@@ -183,11 +204,8 @@ class Study(eqx.Module):
         """What is measured against, computed once a scene."""
 
     @abstractmethod
-    def follow(self, scene: Scene, truth: Any, method: str, methods: Sequence[str], episode: Iterator[Step]) -> Record:
-        """What is recorded of a method's episode, as JSON; it may stop early.
-
-        - `methods`: all that are run on the scene.
-        """
+    def follow(self, scene: Scene, truth: Any, planner: Planner, episode: Iterator[Step]) -> Record:
+        """What is recorded of a planner's episode, as JSON; it may stop early."""
 
     def facts(self, scene: Scene, truth: Any, first: int) -> Record:
         """What is recorded of the scene itself, as JSON."""
@@ -202,20 +220,9 @@ class Study(eqx.Module):
         return bool(seen.mask.any())
 
     @classmethod
-    def groups(cls, records: Sequence[Record]) -> dict[str, list[Record]]:
-        """All records, and parts of them that are told apart."""
-        return {"all": list(records)}
-
-    @classmethod
-    def measure(cls, name: str) -> Measure:
-        """One of `measures`."""
-        (found,) = (measure for measure in cls.measures if measure.name == name)
-        return found
-
-    @property
-    def remedy(self) -> str:
-        """What to do where no candidate can be the first one."""
-        return "give more"
+    def group(cls, record: Record) -> str:
+        """The scenes among which tables tell of this one too; "" for none."""
+        return ""
 
     @property
     def candidates(self) -> Candidates:
@@ -228,8 +235,11 @@ class Study(eqx.Module):
         return Grid(self.grid_resolution)
 
     def search(self, method: str) -> Search:
-        """Over the candidates: one of `RULES`, or the full search by the acquisition."""
-        return RULES.get(method, DiscreteSearch)(self.candidates)
+        """Of the name's kind, or over all candidates by the acquisition."""
+        if method in _SPACES:
+            settings = self.num_starts, self.iterations, _LEARNING_RATE, max(self.num_candidates // 2, self.num_starts)
+            return GradientSearch(None, _SPACES[method](self.radius), *settings)
+        return _SEARCHES.get(method, DiscreteSearch)(self.candidates)
 
     def imagination_of(self, scene: Scene) -> Imagination:
         """The study's, or what is known of such a scene."""
@@ -266,20 +276,18 @@ class Study(eqx.Module):
 
         - `methods`: some of the study's, by default all; `own`: further ones, and what makes their planners.
 
-        **Raises:** `ValueError` for an unknown method, as `scene` does, if no candidate shows enough, or if one
-        of `own` makes no planner of so many views.
+        **Raises:** `ValueError` for an unknown method, as `scene` does, if no candidate shows enough, or if one of
+        `own` makes no planner of so many views.
         """
-        known = self.all_methods(KNOWN)
-        methods = self.methods if methods is None else tuple(methods)
-        unknown = sorted({*methods} - {*known})
-        require(not unknown, f"unknown methods: {', '.join(unknown)}; choose from {', '.join(known)}")
+        methods = self.methods if methods is None else self.chosen(methods, KNOWN)
         start = time.perf_counter()
         scene = self.scene(index)
         planners = {name: self._made(name, make, scene) for name, make in (own or {}).items()}
         first, truth = self.first_view(scene), self.truth(scene)
         record = {"scene": index, **self.facts(scene, truth, first), "first": first, "study_views": self.views}
-        record["methods"] = self.run_methods(scene, truth, first, methods) | {
-            name: self.run(scene, truth, first, name, methods, planner) for name, planner in planners.items()
+        planned = {name: self.planner_for(name, scene) for name in methods}
+        record["methods"] = {
+            name: self.run(scene, truth, first, name, planner) for name, planner in (planned | planners).items()
         }
         return record | {"seconds": time.perf_counter() - start}
 
@@ -299,23 +307,28 @@ class Study(eqx.Module):
         )
         return planner
 
-    def run_methods(self, scene: Scene, truth: Any, first: int, methods: Sequence[str]) -> dict[str, Record]:
-        """The records of the study's own methods."""
-        return {name: self.run(scene, truth, first, name, methods, self.planner_for(name, scene)) for name in methods}
-
     def run(
-        self, scene: Scene, truth: Any, first: int, method: str, methods: Sequence[str], planner: Planner
+        self, scene: Scene, truth: Any, first: int, method: str, planner: Planner, key: PRNGKeyArray | None = None
     ) -> Record:
-        """The record of one method: its views' poses, and what `follow` makes of its episode."""
+        """The record of one method: its views' poses, of each step the value of the view that was chosen and the
+        seconds of the search, and what `follow` makes of the episode.
+
+        - `key`: of the episode, by default the one that all methods share.
+        """
         views: list[dict[str, list]] = []
+        taken: list[dict[str, float]] = []
+        key = self.key(scene.index, "episode") if key is None else key
+        episode = steps(planner, self.sensor(scene), self.candidates.poses()[first], key, self.camera)
 
         def noted() -> Iterator[Step]:
-            first_pose, key = self.candidates.poses()[first], self.key(scene.index, "episode")
-            for step in itertools.islice(steps(planner, self.sensor(scene), first_pose, key, self.camera), self.views):
-                views.append(pose_record(step.view.pose))
+            for step in itertools.islice(episode, self.views):
+                pose, proposal = step.view.pose, step.view.proposal
+                views.append({"position": pose.position.tolist(), "rotation": pose.rotation.tolist()})
+                if proposal is not None:
+                    taken.append({"value": float(proposal.value), "seconds": step.seconds})
                 yield step
 
-        return {"views": views, **self.follow(scene, truth, method, methods, noted())}
+        return {"views": views, "steps": taken, **self.follow(scene, truth, planner, noted())}
 
     def first_view(self, scene: Scene) -> int:
         """A random one of the candidates from which the object shows enough."""
@@ -324,14 +337,13 @@ class Study(eqx.Module):
         for candidate in jax.random.permutation(self.key(scene.index, "first"), self.num_candidates).tolist():
             if self.shows_enough(scene, sensor(poses[candidate], noise_key)):
                 return candidate
-        raise InputError(f"none of {self.num_candidates} candidates shows enough of {scene.name}: {self.remedy}")
+        raise InputError(f"none of {self.num_candidates} candidates shows enough of {scene.name}: ask for more")
 
     def seen(self, scene: Scene, run: Record) -> list[tuple[PointCloud, Evidence]]:
         """Each scan of a method, and the evidence after it, made again from the poses of its record."""
         key, sensor = self.key(scene.index, "episode"), self.sensor(scene)
-        poses = self.poses_of(run)
-        require(len(poses) > 0, "there are no views to scan again")
-        views = [(pose, sensor(pose, view_keys(key, index)[2]), self.camera) for index, pose in enumerate(poses)]
+        poses = enumerate(self.poses_of(run))
+        views = [(pose, sensor(pose, view_keys(key, index)[2]), self.camera) for index, pose in poses]
         # It depends on the planner through its capacity and what it carves alone.
         known = self.planner(self.methods[0], scene).replay(views)
         return [(scan, evidence) for (_, scan, _), evidence in zip(views, known, strict=True)]
@@ -340,11 +352,6 @@ class Study(eqx.Module):
         """Where a method's views were taken."""
         arrays = [[np.asarray(view[name], np.float32) for name in ("rotation", "position")] for view in run["views"]]
         return [Pose(rotation, position) for rotation, position in arrays]
-
-
-def pose_record(pose: Pose) -> Record:
-    """A pose as JSON."""
-    return {"position": pose.position.tolist(), "rotation": pose.rotation.tolist()}
 
 
 # A method of one's own: the planner of a scene.

@@ -1,7 +1,7 @@
 """What the studies of semantic parts have in common: how many views until all parts of an object are found?"""
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, TypeAlias
 
 import equinox as eqx
@@ -19,9 +19,8 @@ from jaxnbv.planning.episode import Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, MeshParts
 from jaxnbv.scanning.sensors import PART_SETTING
-from jaxnbv.search import FreePoses, GradientSearch, Search, SpherePoses
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
-from jaxnbv.studies.engine.study import RULES, Chart, Panel, Scene, Study
+from jaxnbv.studies.engine.study import RULES, Scene, Study
 from jaxnbv.tasks import Coverage, SoftPartCount, part_counts
 
 # The paper's N_target of its Table 1, and the authors' value for the utility, in points of the 2,048 that the network
@@ -29,6 +28,7 @@ from jaxnbv.tasks import Coverage, SoftPartCount, part_counts
 TARGETS = (20, 40, 60, 80, 100)
 TARGET, NETWORK_POINTS = 60, 2048
 _BY_PARTS = ("discrete", "gradient-2dof", "gradient-6dof")
+_BASELINES = (*RULES, "coverage")
 # Twice the standard deviation of the sensor's noise.
 _WIDTH = 0.02
 # Of a part that is not there: its probability is zero, and so is every derivative.
@@ -90,19 +90,20 @@ def discovery_time(counts: Int[np.ndarray, "views parts"], target: int) -> int |
     return int(np.argmax(found)) + 1 if found.any() else None
 
 
-def _times(record: Record, method: str) -> list[float]:
+def _times(record: Record, method: str) -> dict[int, float]:
     """T_discovery by target; one more than the study's views where the parts were not all found."""
-    found = (discovery_time(np.asarray(record["methods"][method]["counts"]), target) for target in TARGETS)
-    return [float(record["study_views"] + 1 if time is None else time) for time in found]
+    counts = np.asarray(record["methods"][method]["counts"])
+    found = {target: discovery_time(counts, target) for target in TARGETS}
+    return {target: float(record["study_views"] + 1 if time is None else time) for target, time in found.items()}
 
 
-def _found(record: Record, method: str) -> list[float]:
+def _found(record: Record, method: str) -> dict[int, float]:
     """Whether all parts had been found in the end, by target."""
-    return [float(time <= record["study_views"]) for time in _times(record, method)]
+    return {target: float(time <= record["study_views"]) for target, time in _times(record, method).items()}
 
 
 def _found_by_view(record: Record, method: str) -> list[float]:
-    time = _times(record, method)[TARGETS.index(TARGET)]
+    time = _times(record, method)[TARGET]
     return [float(time <= view) for view in range(1, record["study_views"] + 1)]
 
 
@@ -112,7 +113,6 @@ class PartDiscoveryStudy(Study):
 
     - `imagined_rays`: rays along a side of an imagined scan; true scans have 64 x 64.
     - `num_points`: points that the segmenter is fed of D and an imagined scan; N_target is taken in proportion.
-    - `num_starts`, `iterations`, `learning_rate`: of the gradient searches, which look at half the candidates first.
     """
 
     title: ClassVar[str] = "Views until all parts are found"
@@ -120,36 +120,18 @@ class PartDiscoveryStudy(Study):
         "T_discovery for each N_target: views until the segmenter gives that many points to every part of the object;\n"
         "one more than there are views if that did not happen, so that means are lower bounds."
     )
-    methods: ClassVar[tuple[str, ...]] = (*_BY_PARTS, *RULES, "coverage")
+    methods: ClassVar[tuple[str, ...]] = (*_BY_PARTS, *_BASELINES)
+    pictured: ClassVar[tuple[str, ...]] = ("discrete", "gradient-2dof", "farthest", "uncertainty")
     reference: ClassVar[str] = "discrete"
     measures: ClassVar[tuple[Measure, ...]] = (
-        Measure(
-            "time",
-            "Views until all parts are found",
-            _times,
-            TARGETS,
-            "N_target",
-            unit="views",
-            digits=2,
-            better="less",
-        ),
-        Measure("found", "Objects whose parts were all found", _found, TARGETS, "N_target", percent=True),
-        Measure("found_by_view", f"All parts found, N_target = {TARGET}", _found_by_view, percent=True),
+        Measure("time", "Views until all parts are found", _times, "N_target", "views", digits=2, less=True),
+        Measure("found", "Objects whose parts were all found", _found, "N_target", "%"),
+        Measure("found_by_view", f"All parts found, N_target = {TARGET}", _found_by_view, unit="%"),
     )
     claims: ClassVar[tuple[Claim, ...]] = tuple(
-        Claim(
-            f"The utility finds all parts in fewer views, of {target} points each.",
-            "time",
-            target,
-            (*RULES, "coverage"),
-        )
+        Claim(f"The utility finds all parts in fewer views, of {target} points each.", "time", target, _BASELINES)
         for target in (TARGET, max(TARGETS))
     )
-    charts: ClassVar[Mapping[str, Chart]] = {
-        "parts": Chart(
-            ((Panel("time", axis="points that every part must have, $N_{target}$"), Panel("found_by_view")),)
-        )
-    }
     seed: ClassVar[int] = 6
     unknowing: ClassVar[tuple[str, ...]] = ("coverage", "uncertainty")
     radius: ClassVar[float] = PART_SETTING.radius
@@ -157,8 +139,6 @@ class PartDiscoveryStudy(Study):
         **Study.quick,
         "num_candidates": 24,
         "num_points": 512,
-        "num_starts": 2,
-        "iterations": 4,
     }
 
     views: int = eqx.field(static=True, default=6)
@@ -166,9 +146,6 @@ class PartDiscoveryStudy(Study):
     camera: Camera = PART_SETTING.camera
     imagined_rays: int = eqx.field(static=True, default=32)
     num_points: int = eqx.field(static=True, default=1024)
-    num_starts: int = eqx.field(static=True, default=4)
-    iterations: int = eqx.field(static=True, default=8)
-    learning_rate: float = eqx.field(static=True, default=0.03)
 
     @abstractmethod
     def segmenter_of(self, scene: Scene, num_points: int | None = None) -> PartSegmenter:
@@ -187,16 +164,7 @@ class PartDiscoveryStudy(Study):
             acquisition = ExpectedUtilityImprovement(soft_count, self.num_points)
         return self.planner_of(acquisition, self.search(method), scene, camera)
 
-    def search(self, method: str) -> Search:
-        if method.startswith("gradient"):
-            space = SpherePoses(self.radius) if method == "gradient-2dof" else FreePoses(self.radius)
-            candidates = max(self.num_candidates // 2, self.num_starts)
-            return GradientSearch(None, space, self.num_starts, self.iterations, self.learning_rate, candidates)
-        return super().search(method)
-
-    def follow(
-        self, scene: Scene, truth: list[int], method: str, methods: Sequence[str], episode: Iterator[Step]
-    ) -> Record:
+    def follow(self, scene: Scene, truth: list[int], planner: Planner, episode: Iterator[Step]) -> Record:
         """How many points the segmenter gives to each part after each view; it stops once every part has the largest
         of `TARGETS`."""
         segmenter = self.segmenter_of(scene)

@@ -1,6 +1,6 @@
 """The study of reconstruction: how near is the surface that a method's views give to the true one?"""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,7 +16,7 @@ from jaxnbv.scanning.metrics import SURFACE_POINTS, coverage, surface_distance, 
 from jaxnbv.scanning.screened_poisson import has_poisson, screened_poisson
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.meshes import MeshStudy
-from jaxnbv.studies.engine.study import RULES, Chart, Panel, Scene
+from jaxnbv.studies.engine.study import RULES, Scene
 from jaxnbv.studies.scenes import Split, part_scene
 from jaxnbv.tasks import Coverage, NewSurface
 
@@ -25,11 +25,11 @@ RECONSTRUCTIONS = (POISSON, MEAN)
 
 
 def _distances(name: str, title: str) -> Measure:
-    def of(record: Record, method: str) -> list[float | None]:
+    def of(record: Record, method: str) -> dict[str, float | None]:
         found = record["methods"][method]["reconstructions"]
-        return [None if found[one] is None else found[one][name] for one in RECONSTRUCTIONS]
+        return {way: None if distances is None else distances[name] for way, distances in found.items()}
 
-    return Measure(name, title, of, RECONSTRUCTIONS, "reconstruction", unit="scene units", better="less")
+    return Measure(name, title, of, "reconstruction", "scene units", less=True)
 
 
 class ReconstructionStudy(MeshStudy):
@@ -54,7 +54,7 @@ class ReconstructionStudy(MeshStudy):
         _distances("hausdorff", "Hausdorff distance"),
         _distances("accuracy", "Accuracy"),
         _distances("completeness", "Completeness"),
-        Measure("covered", "Surface covered", lambda r, m: r["methods"][m]["coverage"], percent=True, better="more"),
+        Measure("covered", "Surface covered", lambda r, m: r["methods"][m]["coverage"], unit="%"),
     )
     claims: ClassVar[tuple[Claim, ...]] = (
         Claim(
@@ -65,9 +65,6 @@ class ReconstructionStudy(MeshStudy):
             ahead=False,
         ),
     )
-    charts: ClassVar[Mapping[str, Chart]] = {
-        "reconstruction": Chart(((Panel("chamfer"), Panel("hausdorff"), Panel("covered")),))
-    }
     seed: ClassVar[int] = 4
     quick: ClassVar[Mapping[str, Any]] = {**MeshStudy.quick, "num_candidates": 40}
 
@@ -93,8 +90,7 @@ class ReconstructionStudy(MeshStudy):
         self,
         scene: Scene,
         truth: Float[np.ndarray, "n 3"],
-        method: str,
-        methods: Sequence[str],
+        planner: Planner,
         episode: Iterator[Step],
     ) -> Record:
         """The share of the true surface that is covered after each view, and the distances to it of two

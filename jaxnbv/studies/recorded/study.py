@@ -1,7 +1,7 @@
 """The study of a recorded sequence: what its frames show of a box, when they are chosen one by one."""
 
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -27,7 +27,7 @@ from jaxnbv.scanning.scanner import Hits
 from jaxnbv.search import GivenPoses, Problem, Search
 from jaxnbv.search.base import Rule
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
-from jaxnbv.studies.engine.study import RULES, Chart, Panel, Scene, Study
+from jaxnbv.studies.engine.study import RULES, Scene, Study
 from jaxnbv.studies.readers.recorded import RecordedFrames
 from jaxnbv.tasks import Coverage, NewSurface
 
@@ -105,12 +105,13 @@ class MostNewVoxels(Rule):
         return gain.astype(candidates.position.dtype)
 
 
-def _gains(record: Record, method: str) -> list[float | None]:
+def _gains(record: Record, method: str) -> dict[int, float | None]:
     """What views after the first added, as a share of what the oracle's have added by then."""
     if ORACLE not in record["methods"]:
-        return [None] * (record["study_views"] - 1)
+        return {}
     own, best = (record["methods"][name]["covered"] for name in (method, ORACLE))
-    return [(a - own[0]) / (b - best[0]) if b > best[0] else None for a, b in zip(own[1:], best[1:], strict=True)]
+    added = enumerate(zip(own[1:], best[1:], strict=True), start=2)
+    return {view: (a - own[0]) / (b - best[0]) if b > best[0] else None for view, (a, b) in added}
 
 
 class RecordedStudy(Study):
@@ -134,10 +135,8 @@ class RecordedStudy(Study):
     methods: ClassVar[tuple[str, ...]] = (NEW, COVERAGE, *RULES, EVEN, ORACLE)
     reference: ClassVar[str] = NEW
     measures: ClassVar[tuple[Measure, ...]] = (
-        Measure("covered", "Voxels seen", lambda r, m: r["methods"][m]["covered"], percent=True, better="more"),
-        Measure(
-            "gain", "Gain over the first view, as a share of the oracle's", _gains, first=2, percent=True, better="more"
-        ),
+        Measure("covered", "Voxels seen", lambda r, m: r["methods"][m]["covered"], unit="%"),
+        Measure("gain", "Gain over the first view, of the oracle's", _gains, unit="%"),
     )
     claims: ClassVar[tuple[Claim, ...]] = (
         Claim(
@@ -147,7 +146,6 @@ class RecordedStudy(Study):
             ("farthest", "random", EVEN),
         ),
     )
-    charts: ClassVar[Mapping[str, Chart]] = {"recorded": Chart(((Panel("covered"), Panel("gain")),))}
     seed: ClassVar[int] = 17
     quick: ClassVar[Mapping[str, Any]] = {"num_samples": 4, "grid_resolution": 48, "capacity": 1000}
 
@@ -222,8 +220,7 @@ class RecordedStudy(Study):
         self,
         scene: Scene,
         truth: Bool[np.ndarray, "frames voxels"],
-        method: str,
-        methods: Sequence[str],
+        planner: Planner,
         episode: Iterator[Step],
     ) -> Record:
         """The frames that were chosen, and the share of the voxels that they have shown after each."""

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from jaxnbv.studies.engine.charts import write_charts
+from jaxnbv.studies.engine.tables import summary, write_tables
 from PIL import Image
 
 from jaxnbv.checks import InputError
@@ -19,9 +21,7 @@ from jaxnbv.networks import InvariantClassifier, save_checkpoint
 from jaxnbv.search import FarthestView, SphereCandidates
 from jaxnbv.studies.classification.objects import ModelNet10Study, OmniObject3DStudy, PyramidStudy, TruckStudy
 from jaxnbv.studies.classification.pictures import write_pictures
-from jaxnbv.studies.engine.charts import write_charts
 from jaxnbv.studies.engine.measures import values
-from jaxnbv.studies.engine.tables import summary, write_tables
 from jaxnbv.studies.readers import class_meshes
 from jaxnbv.studies.scenes import HOUSEHOLD, FirstView, Split, truck_scene
 from jaxnbv.studies.scenes.class_object import scan_cue

@@ -6,13 +6,13 @@ import re
 
 import numpy as np
 import pytest
+from jaxnbv.studies.engine.charts import write_charts
+from jaxnbv.studies.engine.tables import summary, write_tables
 from PIL import Image
 
 from jaxnbv.studies.classification.objects import PyramidStudy
-from jaxnbv.studies.engine.charts import write_charts
 from jaxnbv.studies.engine.measures import values
 from jaxnbv.studies.engine.results import means
-from jaxnbv.studies.engine.tables import summary, write_tables
 
 
 def log_p(guesses):

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxnbv.studies.classification.shared import propose_together
 from PIL import Image
 
 from jaxnbv.checks import InputError
@@ -18,7 +19,6 @@ from jaxnbv.scanning import scan
 from jaxnbv.search import FarthestView, SphereCandidates
 from jaxnbv.studies.classification.objects import PyramidStudy
 from jaxnbv.studies.classification.pictures import write_pictures
-from jaxnbv.studies.classification.shared import propose_together
 from jaxnbv.studies.scenes import Framing, Pyramid, Split, pyramid_scene
 from jaxnbv.studies.scenes.class_object import scan_cue
 from jaxnbv.surfaces import GeometricSPSR

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxnbv.studies.classification.searches import SearchStudy
+from jaxnbv.studies.engine.tables import summary
 
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.imagination import Imagination
-from jaxnbv.studies.classification.searches import SearchStudy
-from jaxnbv.studies.engine.tables import summary
 from jaxnbv.surfaces import GeometricSPSR
 
 SCENE, VIEWS = 3, 3

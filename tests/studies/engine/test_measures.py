@@ -5,14 +5,14 @@ import csv
 import numpy as np
 import pandas as pd
 import pytest
+from jaxnbv.studies.engine.charts import write_charts
+from jaxnbv.studies.engine.tables import summary, write_tables
 from PIL import Image
 from toy import ToyStudy
 
 from jaxnbv.checks import InputError
-from jaxnbv.studies.engine.charts import write_charts
 from jaxnbv.studies.engine.measures import Measure, methods_of, values
 from jaxnbv.studies.engine.results import differences, means
-from jaxnbv.studies.engine.tables import summary, write_tables
 
 POINTS, MANY, ODD = ToyStudy.measures
 BOTH = ["farthest", "random"]

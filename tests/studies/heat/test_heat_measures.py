@@ -1,10 +1,10 @@
 """What the heat study measures, from records made by hand."""
 
 import pytest
-
 from jaxnbv.studies.engine.charts import write_charts
-from jaxnbv.studies.engine.results import differences, means
 from jaxnbv.studies.engine.tables import summary, write_tables
+
+from jaxnbv.studies.engine.results import differences, means
 from jaxnbv.studies.heat.study import HeatStudy
 
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from jaxnbv.studies.engine.charts import write_charts
+from jaxnbv.studies.engine.tables import summary
 
 from jaxnbv.checks import InputError
-from jaxnbv.studies.engine.charts import write_charts
 from jaxnbv.studies.engine.measures import values
 from jaxnbv.studies.engine.results import differences, means
-from jaxnbv.studies.engine.tables import summary
 from jaxnbv.studies.parts.discovery import TARGETS, discovery_time
 from jaxnbv.studies.parts.study import PartStudy
 

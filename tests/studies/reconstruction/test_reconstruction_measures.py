@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-
 from jaxnbv.studies.engine.charts import write_charts
-from jaxnbv.studies.engine.results import differences, means
 from jaxnbv.studies.engine.tables import summary
+
+from jaxnbv.studies.engine.results import differences, means
 from jaxnbv.studies.reconstruction.study import MEAN, POISSON, ReconstructionStudy
 
 METHODS = ["coverage", "farthest"]

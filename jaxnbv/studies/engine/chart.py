@@ -1,0 +1,100 @@
+"""The chart of a study: its measures by view, a line a method, with intervals over scenes."""
+
+import io
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxnbv.studies.engine.measures import UNKNOWING, Measure
+from jaxnbv.studies.engine.results import groups_of
+from jaxnbv.studies.engine.study import Study
+from jaxnbv.viz.figures import STYLE
+from jaxnbv.viz.style import GREY, INK, LINE
+
+# Methods side by side, so that equal values do not hide one another: of the distance between two columns.
+_DODGE = 0.06
+_PANELS_A_ROW = 3
+# Colour, line and marker: colour-blind readers tell the colours apart (Okabe and Ito), the rest tells them in print.
+# What is new stands out in vermilion, its variants beside it; baselines look alike in every study.
+_OURS, _SECOND, _THIRD = ("#d55e00", "-", "o"), ("#cc79a7", "-", "v"), ("#e69f00", "-", "^")
+LOOKS = {
+    "cross-entropy": _OURS,
+    "new surface": _OURS,
+    "discrete": _OURS,
+    "heat": _OURS,
+    "entropy": _SECOND,
+    "gradient-6dof": _SECOND,
+    "gradient-constrained": _SECOND,
+    "heat-reached": _SECOND,
+    "mixed": _THIRD,
+    "gradient-2dof": _THIRD,
+    "tie-break": ("#a33b00", "--", "h"),
+    "evenly spaced": ("#cc79a7", "--", "v"),
+    "halving": ("#009e73", "--", "D"),
+    "heat-halving": ("#e69f00", "--", "^"),
+    "hybrid": ("#0072b2", "--", "s"),
+    "coverage": ("#009e73", "-", "D"),
+    "farthest": ("#0072b2", "-", "s"),
+    "uncertainty": ("#56b4e9", "-", "P"),
+    f"coverage{UNKNOWING}": ("#009e73", ":", "d"),
+    f"uncertainty{UNKNOWING}": ("#56b4e9", ":", "p"),
+    "random": (GREY, "--", "X"),
+    "oracle": (INK, ":", "*"),
+}
+# Methods of one's own, in turn.
+_OTHERS = (("#8c564b", "-", "p"), ("#7f3fbf", "-", "h"), ("#b8860b", "--", "d"))
+
+
+def chart(found: pd.DataFrame, study: type[Study]) -> bytes:
+    """A PNG file of the results of all scenes, a panel a measure. Bars at the views are bootstrap intervals: bands
+    between the views of so many methods would hide one another."""
+    (group, scenes), *_ = groups_of(found).items()
+    here = found[found["group"] == group]
+    shown = [measure for measure in study.measures if (here["quantity"] == measure.name).any()]
+    tall, wide = -(-len(shown) // _PANELS_A_ROW), min(len(shown), _PANELS_A_ROW)
+    file = io.BytesIO()
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(8.4, 0.4 + 2.5 * tall), layout="constrained")
+        panels = figure.subplots(tall, wide, squeeze=False).ravel()
+        for axes, measure in zip(panels, shown, strict=False):
+            _draw(axes, here[here["quantity"] == measure.name], measure, here["method"].unique())
+            unit = f"share of scenes (%), n = {scenes}" if measure.unit == "%" else measure.unit
+            axes.set(title=measure.title, xlabel=measure.by, ylabel=unit)
+        for axes in panels[len(shown) :]:
+            axes.axis("off")
+        lines = {line.get_label(): line for axes in panels for line, *_ in axes.containers}
+        figure.legend(lines.values(), lines, loc="outside right center", frameon=False, handlelength=2.6)
+        figure.savefig(file, format="png", dpi=200)
+    return file.getvalue()
+
+
+def _draw(axes: Axes, rows: pd.DataFrame, measure: Measure, methods: np.ndarray) -> None:
+    columns = rows["at"].unique()
+    scale = 100.0 if measure.unit == "%" else 1.0
+    for index, method in enumerate(methods):
+        own = scale * rows[rows["method"] == method].set_index("at")[["mean", "low", "high"]].reindex(columns)
+        x = np.arange(len(columns)) + _DODGE * (index - 0.5 * (len(methods) - 1))
+        bars = np.abs(own[["low", "high"]].sub(own["mean"], axis=0)).T.to_numpy()
+        if own["mean"].notna().any():
+            axes.errorbar(x, own["mean"], bars, label=method, zorder=2 + (index == 0), **_look(method, index))
+    axes.set_xticks(range(len(columns)), [str(column).replace(" ", "\n") for column in columns])
+    axes.set_xlim(-0.5, len(columns) - 0.5)
+    if measure.unit == "%":
+        axes.set(ylim=(-3, 103), yticks=[0, 25, 50, 75, 100])
+    elif (rows["mean"] >= 0).all():
+        axes.set_ylim(0.0, 1.04 * axes.get_ylim()[1])
+    axes.grid(axis="y", color=LINE, lw=0.6)
+    axes.set_axisbelow(True)
+
+
+def _look(method: str, index: int) -> dict[str, Any]:
+    """A method's line, markers and bars, as arguments of `Axes.errorbar`; those of new ways of choosing are thicker."""
+    colour, line, marker = LOOKS.get(method) or _OTHERS[index % len(_OTHERS)]
+    width, size = (2.0, 5.5) if (colour, line, marker) == _OURS else (1.2, 4.4)
+    bars = {"ecolor": mpl.colors.to_rgba(colour, 0.35), "elinewidth": 2.4}
+    edges = {"markeredgecolor": "white", "mew": 0.4}
+    return {"color": colour, "ls": line, "lw": width, "marker": marker, "ms": size, **bars, **edges}
