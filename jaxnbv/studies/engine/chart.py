@@ -61,7 +61,7 @@ def chart(found: pd.DataFrame, study: type[Study]) -> bytes:
         figure = Figure(figsize=(8.4, 0.4 + 2.5 * tall), layout="constrained")
         panels = figure.subplots(tall, wide, squeeze=False).ravel()
         for axes, measure in zip(panels, shown, strict=False):
-            _draw(axes, here[here["quantity"] == measure.name], measure, here["method"].unique())
+            _draw(axes, here[here["quantity"] == measure.name], measure, here["method"].unique().tolist())
             unit = f"share of scenes (%), n = {scenes}" if measure.unit == "%" else measure.unit
             axes.set(title=measure.title, xlabel=measure.by, ylabel=unit)
         for axes in panels[len(shown) :]:
@@ -72,8 +72,8 @@ def chart(found: pd.DataFrame, study: type[Study]) -> bytes:
     return file.getvalue()
 
 
-def _draw(axes: Axes, rows: pd.DataFrame, measure: Measure, methods: np.ndarray) -> None:
-    columns = rows["at"].unique()
+def _draw(axes: Axes, rows: pd.DataFrame, measure: Measure, methods: list[str]) -> None:
+    columns = rows["at"].unique().tolist()
     scale = 100.0 if measure.unit == "%" else 1.0
     for index, method in enumerate(methods):
         own = scale * rows[rows["method"] == method].set_index("at")[["mean", "low", "high"]].reindex(columns)

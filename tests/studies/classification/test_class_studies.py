@@ -10,21 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from jaxnbv.studies.engine.charts import write_charts
-from jaxnbv.studies.engine.tables import summary, write_tables
+from jaxnbv.studies.engine.tables import summary
 from PIL import Image
 
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.imagination import Imagination
 from jaxnbv.networks import InvariantClassifier, save_checkpoint
-from jaxnbv.search import FarthestView, SphereCandidates
+from jaxnbv.search import FarthestView
 from jaxnbv.studies.classification.objects import ModelNet10Study, OmniObject3DStudy, PyramidStudy, TruckStudy
 from jaxnbv.studies.classification.pictures import write_pictures
-from jaxnbv.studies.engine.measures import values
 from jaxnbv.studies.readers import class_meshes
-from jaxnbv.studies.scenes import HOUSEHOLD, FirstView, Split, truck_scene
-from jaxnbv.studies.scenes.class_object import scan_cue
+from jaxnbv.studies.scenes import HOUSEHOLD, FirstView
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
 
@@ -67,65 +64,32 @@ def test_the_first_view_can_be_one_after_which_the_classifier_is_wrong(kind):
         if kind is PyramidStudy:
             assert int(scene.task.pixels[first]) == 0
     always_right = lambda cloud: jnp.log(jnp.eye(len(kind.objects.classes))[scene.task.label])  # noqa: E731
-    with pytest.raises(InputError, match="ask for --first any"):
+    with pytest.raises(InputError, match="shows enough of"):
         dataclasses.replace(study, classifier=always_right).first_view(scene)
-
-
-def test_of_a_truck_the_pixels_of_its_cargo_are_recorded():
-    found, truck = record(TruckStudy), truck_scene(Split.TEST, SCENE)
-    labels = truck.solid.labels
-    cargo = eqx.tree_at(lambda solid: solid.labels, truck.solid, jnp.where(labels > 0, labels, -1))
-    assert list(found["methods"]) == list(TruckStudy.methods)
-    assert found["label"] == int(truck.label) == SCENE
-    poses = SphereCandidates(CANDIDATES).poses()
-    _, seen = scan_cue(truck, CAMERA, poses)
-    cargo = np.asarray(jnp.sum((jnp.abs(cargo(seen.points)) < 2e-3) & seen.mask, axis=-1))
-    np.testing.assert_allclose(found["cargo_pixels"], cargo, atol=2)
-    assert cargo.max() > 150 > cargo.min() == 0
-    for held in found["methods"].values():
-        for run in held["runs"]:
-            assert run["cargo_pixels"] == [found["cargo_pixels"][index] for index in run["candidates"]]
-            assert np.shape(run["log_p"]) == (3, 10)
-    shown = values([found], list(TruckStudy.methods), TruckStudy.measure("cargo"))[0]
-    for name, row in zip(TruckStudy.methods, shown, strict=True):
-        if name != "random":
-            pixels = found["methods"][name]["runs"][0]["cargo_pixels"]
-            np.testing.assert_array_equal(row, np.maximum.accumulate(np.array(pixels) >= 150))
 
 
 def test_first_views_of_trucks_are_random_and_told_apart_by_what_they_show():
     study = small(TruckStudy)
     firsts = [study.first_view(study.scene(index)) for index in range(12)]
     assert len({*firsts}) > 5
-    shown = [record(TruckStudy) | {"first": int(np.argmax(record(TruckStudy)["cargo_pixels"]))}]
-    hidden = [record(TruckStudy) | {"first": int(np.argmin(record(TruckStudy)["cargo_pixels"]))}]
-    groups = TruckStudy.groups(shown + hidden)
-    assert groups == {"all": shown + hidden, "first view without cargo": hidden, "first view with cargo": shown}
-    assert {*TruckStudy.groups(shown)} == {"all", "first view with cargo"}
-
-
-@pytest.mark.slow
-def test_where_all_of_the_object_tells_its_class_no_pixels_are_counted():
-    found = record(ModelNet10Study)
-    assert list(found["methods"]) == list(ModelNet10Study.methods)
-    assert found["label"] == SCENE
-    assert not [key for key in found if "pixels" in key]
-    for name, held in found["methods"].items():
-        assert [*held["runs"][0]] == ["candidates", "log_p"]
-        for entry in held["diagnostics"]:
-            assert entry["rank_correlation"] is None
-            assert (entry["roughness"] is None) == (name in ("farthest", "oracle"))
-    assert {*ModelNet10Study.groups([found])} == {"all"}
+    for pixels, group in ((0, "first view without cargo"), (3, "first view with cargo")):
+        assert TruckStudy.group({"methods": {"farthest": {"pixels": [[pixels, 400]]}}}) == group
 
 
 @pytest.mark.parametrize("kind", [TruckStudy, pytest.param(ModelNet10Study, marks=pytest.mark.slow)])
-def test_tables_charts_and_pictures(kind, tmp_path):
-    text = summary([record(kind)], kind)
-    assert kind.title in text
-    assert "Stable hit" in text
-    paths = [*write_tables([record(kind)], kind, tmp_path), *write_charts([record(kind)], kind, tmp_path)]
-    assert all(path.stat().st_size > 0 for path in paths)
-    (picture,) = write_pictures([record(kind)], small(kind), tmp_path, pixels=24)
+def test_records_tables_charts_and_pictures(kind, tmp_path):
+    """Where all of the object tells its class no pixels are counted."""
+    found = record(kind)
+    assert list(found["methods"]) == list(kind.methods)
+    assert found["label"] == SCENE % len(kind.objects.classes)
+    for held in found["methods"].values():
+        assert np.shape(held["log_p"])[1:] == (3, 10)
+        assert bool(held["pixels"]) == bool(kind.cue)
+    table = results([found], kind)
+    assert ("seen" in {*table["quantity"]}) == bool(kind.cue)
+    assert kind.title in summary(table, kind)
+    assert chart(table, kind)[:4] == b"\x89PNG"
+    (picture,) = write_pictures([found], small(kind), tmp_path, tiles, pixels=24)
     with Image.open(picture) as image:
         assert np.asarray(image.convert("L")).std() > 5
 
@@ -143,13 +107,12 @@ def test_meshes_in_place_of_procedural_objects(tmp_path):
     assert study.num_scenes == 2
     found = study.run_scene(1, ("farthest", "coverage"))
     assert (found["label"], found["name"]) == (HOUSEHOLD.index("desk"), "desk b")
-    (run,) = found["methods"]["coverage"]["runs"]
-    assert len({*run["candidates"]}) == 3
-    seen = study.scene(1).task.scans[run["candidates"][0]].to_numpy()[0]
+    assert len({tuple(view["position"]) for view in found["methods"]["coverage"]["views"]}) == 3
+    seen = study.scene(1).task.scans[found["first"]].to_numpy()[0]
     # A box of sides 2.5, 1.25 and 0.625; the noise is 0.01.
     away = np.abs(np.abs(seen) - [1.25, 0.625, 0.3125]).min(axis=1)
     assert away.max() < 0.06
-    (picture,) = write_pictures([found], study, tmp_path, pixels=24)
+    (picture,) = write_pictures([found], study, tmp_path, tiles, pixels=24)
     assert picture.exists()
     with pytest.raises(InputError, match="no scene 2: the study has 2 meshes"):
         study.run_scene(2)
@@ -178,5 +141,4 @@ def test_a_method_of_ones_own_on_household_objects():
         return study.planner_of(Coverage(), FarthestView(study.candidates), scene)
 
     found = small(ModelNet10Study).run_scene(SCENE, ("farthest",), {"mine:own": own})["methods"]
-    (ours,), (theirs,) = found["mine:own"]["runs"], found["farthest"]["runs"]
-    np.testing.assert_allclose(ours["log_p"], theirs["log_p"], atol=1e-5)
+    np.testing.assert_allclose(found["mine:own"]["log_p"], found["farthest"]["log_p"], atol=1e-5)

@@ -1,12 +1,9 @@
-"""Hits on hand-made sequences; random search against every order there is."""
-
-import itertools
+"""Hits on hand-made sequences."""
 
 import numpy as np
 import pytest
 
-from jaxnbv.checks import InputError
-from jaxnbv.studies.classification.measures import first_hits, random_seen_share, stable_hits
+from jaxnbv.studies.classification.measures import first_hits, stable_hits
 from jaxnbv.studies.classification.objects import PyramidStudy
 
 
@@ -32,30 +29,37 @@ def test_hits_by_view_of_hand_made_sequences(correct, first, stable):
     np.testing.assert_array_equal(stable_hits(np.concatenate([~correct, correct]))[1:], stable)
 
 
-def test_the_pattern_is_seen_in_one_view_not_in_their_sum():
-    runs = [{"pattern_pixels": pixels} for pixels in ([0, 100, 100, 150, 0], [0, 149, 149, 149, 149])]
-    record = {"methods": {"farthest": {"runs": runs}}}
-    np.testing.assert_array_equal(PyramidStudy.measure("pattern").of(record, "farthest"), [0.0, 0.0, 0.0, 0.5, 0.5])
+def run(*guesses):
+    return np.log(0.1 + 0.5 * np.eye(5)[np.array(guesses)]).tolist()
 
 
-@pytest.mark.parametrize("showing", range(7))
-@pytest.mark.parametrize("first_shows", [False, True])
-def test_random_search_agrees_with_all_orders(showing, first_shows):
-    first, views = 3, 7
-    others = [i for i in range(7) if i != first]
-    pixels = np.full(7, 149)
-    pixels[others[:showing]] = 150
-    pixels[first] = 150 if first_shows else 0
-    orders = [(first, *order) for order in itertools.permutations(others)]
-    shown = np.array([np.maximum.accumulate(pixels[list(order)] >= 150) for order in orders])
-    np.testing.assert_allclose(random_seen_share(pixels, first, views), shown.mean(axis=0), atol=1e-14)
+def made(method, log_p, pixels):
+    noted = {"rank_correlation": [None, 0.5, None], "roughness": [None, 1.0, 3.0]}
+    steps = [{"value": 2.0, "seconds": 9.0}, {"value": 1.0, "seconds": 0.3}, {"value": 1.0, "seconds": 0.1}]
+    return {"scene": 0, "label": 1, "methods": {method: {"log_p": log_p, "pixels": pixels, "steps": steps, **noted}}}
 
 
-def test_random_search_over_one_view_and_bad_input():
-    pixels = np.array([0, 200, 0])
-    np.testing.assert_array_equal(random_seen_share(pixels, 0, 1), [0.0])
-    np.testing.assert_array_equal(random_seen_share(np.array([0, 149, 0]), 0, 2), [0.0, 0.0])
-    with pytest.raises(InputError, match="4 views of 3 candidates"):
-        random_seen_share(pixels, 0, 4)
-    with pytest.raises(InputError, match="candidate 3 of 3"):
-        random_seen_share(pixels, 3, 2)
+def measured(record, name):
+    (measure,) = (one for one in PyramidStudy.measures if one.name == name)
+    (method,) = record["methods"]
+    return measure.of(record, method)
+
+
+def test_measures_of_a_hand_made_record():
+    """Of random search they are means over its runs; the pattern is seen in one view, not in their sum."""
+    record = made("random", [run(0, 1, 0), run(0, 0, 1)], [[0, 149, 149], [0, 150, 0]])
+    np.testing.assert_array_equal(measured(record, "first"), [0.0, 0.5, 1.0])
+    np.testing.assert_array_equal(measured(record, "stable"), [0.0, 0.0, 0.5])
+    np.testing.assert_array_equal(measured(record, "seen"), [0.0, 0.5, 0.5])
+    assert measured(record, "rank_correlation") == [None, 0.5, None]
+    # The value of random search is no cross-entropy.
+    assert measured(record, "value") == {}
+    assert measured(record, "seconds") == {"median": pytest.approx(0.2)}
+    hybrid = made("hybrid", [run(0, 1, 1)], [])
+    assert measured(hybrid, "value") == {2: 2.0, 3: 1.0, 4: 1.0}
+    assert measured(hybrid, "seen") == []
+
+
+@pytest.mark.parametrize(("angle", "least"), [(80.0, "000"), (110.0, "110"), (139.9, "110"), (179.0, "140")])
+def test_pyramids_are_told_apart_by_the_angle_of_the_first_view(angle, least):
+    assert PyramidStudy.group({"angle": angle}) == f"first view at {least}° or more from the base's normal"

@@ -155,11 +155,11 @@ def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypa
         InputError, match=r"^1 of 3 scenes failed.*first scene 1 \(RuntimeError: lost\).*/some has scene_\*\.failed"
     ):
         run("some", "3")
-    assert "2 scenes" in (tmp_path / "some" / "results.txt").read_text()
+    assert "points" in (tmp_path / "some" / "results.csv").read_text()
     monkeypatch.setattr(ToyStudy, "run_scene", lambda self, index, **_: run_scene(self, 1, (), {}))
     with pytest.raises(InputError, match=r"^2 of 2 scenes failed"):
         run("all", "2")
-    assert not (tmp_path / "all" / "results.txt").exists()
+    assert not (tmp_path / "all" / "results.csv").exists()
     monkeypatch.setattr(ToyStudy, "run_scene", lambda self, index, **given: run_scene(self, index + 1, **given))
     run("range", "7:9")
     assert sorted(file.name for file in (tmp_path / "range").glob("scene_*")) == ["scene_0007.json", "scene_0008.json"]

@@ -1,13 +1,12 @@
 """A study as small as can be."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 from jaxnbv.scanning import SDFSurface
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.search import FarthestView, RandomView
 from jaxnbv.studies.engine.measures import Claim, Measure
-from jaxnbv.studies.engine.study import Chart, Panel, Scene, Study
+from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.tasks import Coverage
 
 
@@ -19,21 +18,16 @@ class ToyStudy(Study):
     methods: ClassVar[tuple[str, ...]] = ("farthest", "random")
     reference: ClassVar[str] = "farthest"
     measures: ClassVar[tuple[Measure, ...]] = (
-        Measure("points", "Points", lambda r, m: r["methods"][m]["points"], digits=1, better="more"),
-        Measure("many", "Many points", lambda r, m: [float(n > 3000) for n in r["methods"][m]["points"]], percent=True),
-        Measure("odd", "Odd ones", lambda r, m: r["methods"][m].get("odd", [None]), ("once",), "time", paired=False),
+        Measure("points", "Points", lambda r, m: r["methods"][m]["points"], digits=1),
+        Measure("many", "Many points", lambda r, m: [float(n > 3000) for n in r["methods"][m]["points"]], unit="%"),
+        Measure("odd", "Odd ones", lambda r, m: {"once": r["methods"][m].get("odd")}, "time"),
     )
-    charts: ClassVar[Mapping[str, Chart]] = {
-        "points": Chart(((Panel("points", log=True), Panel("many")), (Panel("odd"), Panel("points")))),
-        "halves": Chart(((Panel("many"), Panel("points")),), by_group=True),
-    }
     claims: ClassVar[tuple[Claim, ...]] = (Claim("Far apart | more is seen.", "points", 2, ("random", "absent")),)
     seed: ClassVar[int] = 11
 
     @classmethod
-    def groups(cls, records):
-        halves = {"even": [r for r in records if r["scene"] % 2 == 0], "odd": [r for r in records if r["scene"] % 2]}
-        return {"all": list(records)} | {name: of for name, of in halves.items() if of}
+    def group(cls, record):
+        return "odd" if record["scene"] % 2 else "even"
 
     def scene(self, index):
         return Scene(index, f"ball {index}", SDFSurface(Sphere(1.0)))
@@ -45,5 +39,5 @@ class ToyStudy(Study):
     def truth(self, scene):
         return None
 
-    def follow(self, scene, truth, method, methods, episode):
+    def follow(self, scene, truth, planner, episode):
         return {"points": [int(view.cloud.count) for view, *_ in episode]}
