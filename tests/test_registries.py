@@ -12,7 +12,7 @@ from jaxnbv.cli.searches import search_of
 from jaxnbv.cli.tasks import COMMAND_TASKS
 from jaxnbv.search import GradientSearch, Search
 from jaxnbv.search.base import CandidateSearch
-from jaxnbv.studies.engine.study import Chart, Study
+from jaxnbv.studies.engine.study import Study
 from jaxnbv.studies.registry import STUDIES
 
 
@@ -51,10 +51,6 @@ def test_a_study_is_declared_in_full(name):
     assert study.reference in study.methods
     names = [measure.name for measure in study.measures]
     assert len({*names}) == len(names)
-    for chart in study.charts.values():
-        assert isinstance(chart, Chart)
-        for panel in (panel for row in chart.rows for panel in row):
-            assert panel.measure in names
     # Settings, or what else it is configured by.
     taken = {*inspect.signature(study).parameters, *inspect.signature(study.configured).parameters}
     assert {*entry.options} <= taken - {"model", "views", "quick", "options"}

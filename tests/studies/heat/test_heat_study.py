@@ -12,7 +12,8 @@ from jaxnbv.checks import InputError
 from jaxnbv.imagination import Imagination
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.search.candidates import sphere_candidates
-from jaxnbv.studies.heat.pictures import write_pictures
+from jaxnbv.studies.engine.pictures import write_pictures
+from jaxnbv.studies.heat.pictures import tiles
 from jaxnbv.studies.heat.study import HeatStudy, Truth, heat_problem
 from jaxnbv.studies.scenes import heat_scene
 from jaxnbv.tasks import coldest_point
@@ -108,9 +109,7 @@ def test_estimates_are_those_of_the_clouds(record):
             assert found["temperatures"][view] == expected.temperature
             distance = np.linalg.norm(near - expected.point, axis=1).min()
             assert found["distances"][view] == pytest.approx(distance)
-            plain = np.linalg.norm(truth.coldest - expected.point)
-            assert found["point_distances"][view] == pytest.approx(plain)
-            assert found["distances"][view] <= plain
+            assert found["distances"][view] <= np.linalg.norm(truth.coldest - expected.point)
 
 
 def test_the_coldest_points_are_those_within_a_hundredth_of_the_range():
@@ -121,17 +120,10 @@ def test_the_coldest_points_are_those_within_a_hundredth_of_the_range():
     np.testing.assert_array_equal(truth.coldest, points[0])
 
 
-def test_halving_is_asked_at_each_step_of_the_full_search(record):
-    assert all("halving" not in record["methods"][method] for method in RUN[1:])
-    compared = record["methods"]["heat"]["halving"]
-    assert len(compared) == VIEWS - 1
-    for step, halved in zip(record["methods"]["heat"]["steps"], compared, strict=True):
-        assert 0.0 <= halved["regret"] <= step["value"]
-        assert halved["regret"] == 0.0 or not halved["same"]
-    # Both start from the same view, so that the second is chosen from the same evidence and samples.
-    second = [record["methods"][method]["views"][1]["position"] for method in RUN[:2]]
-    second = [np.round(position, 4).tolist() for position in second]
-    assert (second[0] == second[1]) == compared[0]["same"]
+def test_halving_finds_the_second_view_of_the_full_search(record):
+    """Both start from the same view, so that it is chosen from the same evidence and samples."""
+    second = [np.round(record["methods"][method]["views"][1]["position"], 4).tolist() for method in RUN[:2]]
+    assert second[0] == second[1]
 
 
 def test_methods_differ_in_what_they_seek():
@@ -151,8 +143,8 @@ def test_bad_settings_are_refused():
 
 
 def test_the_picture_shows_every_cloud_beside_the_truth(record, tmp_path):
-    (path,) = write_pictures([record], small_study(), tmp_path / "pictures", pixels=80)
-    assert path.name == "heat_000.png"
+    (path,) = write_pictures([record], small_study(), tmp_path / "pictures", tiles, pixels=80)
+    assert path.name == "scene_0000.png"
     image = np.asarray(Image.open(path).convert("RGB")).astype(int)
     assert image.std() > 5
     # The green star of the true coldest point, in the truth and in all three views of both methods that are shown.

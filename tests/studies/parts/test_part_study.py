@@ -27,7 +27,8 @@ from jaxnbv.search import (
     UncertaintyView,
 )
 from jaxnbv.search.candidates import sphere_candidates
-from jaxnbv.studies.parts import pictures as part_pictures
+from jaxnbv.studies.engine.pictures import write_pictures
+from jaxnbv.studies.parts.pictures import tiles
 from jaxnbv.studies.parts.study import PartStudy
 from jaxnbv.studies.scenes import Split, part_scene
 from jaxnbv.surfaces import GeometricSPSR
@@ -238,11 +239,9 @@ def test_planners_of_all_categories_share_their_compilations(compilations):
 
 
 def test_pictures_are_of_the_scenes_and_methods_asked_for(tmp_path):
-    (path,) = part_pictures.write_pictures([whole_record()], small_study(), tmp_path / "a", scenes=2, pixels=24)
-    assert path == tmp_path / "a" / f"parts_{SCENE:03d}.png"
+    (path,) = write_pictures([whole_record()], small_study(), tmp_path / "a", tiles, scenes=2, pixels=24)
+    assert path == tmp_path / "a" / f"scene_{SCENE:04d}.png"
     assert path.read_bytes()[:4] == b"\x89PNG"
-    with pytest.raises(InputError, match="no records"):
-        part_pictures.write_pictures([], small_study(), tmp_path)
 
 
 def test_unknown_methods_and_bad_numbers_are_refused():

@@ -1,14 +1,9 @@
 """What the reconstruction study measures, from records made by hand."""
 
-import numpy as np
 import pytest
-from jaxnbv.studies.engine.charts import write_charts
 from jaxnbv.studies.engine.tables import summary
 
-from jaxnbv.studies.engine.results import differences, means
 from jaxnbv.studies.reconstruction.study import MEAN, POISSON, ReconstructionStudy
-
-METHODS = ["coverage", "farthest"]
 
 
 def found(accuracy, completeness, hausdorff):
@@ -43,38 +38,18 @@ def hand_made():
 
 
 def test_distances_are_of_the_scenes_that_have_them():
-    rows = means(hand_made(), METHODS, ReconstructionStudy.measures).set_index(["at", "quantity", "method"]).loc
-    row = rows[MEAN, "chamfer", "farthest"]
-    assert (row["mean"], row["scenes"], row["rank"]) == (pytest.approx(0.3), 2, 2)
+    table = results(hand_made(), ReconstructionStudy).set_index(["at", "quantity", "method"]).sort_index()
+    row = table.loc[MEAN, "chamfer", "farthest"]
     # Of 0.2 and 0.4: a standard deviation of 0.1414, over the root of two.
-    assert row["standard_error"] == pytest.approx(0.1)
-    assert (row["low"], row["high"]) == (pytest.approx(0.2), pytest.approx(0.4))
-    assert rows[MEAN, "hausdorff", "farthest"]["mean"] == pytest.approx(0.7)
-    poisson = rows[POISSON, "hausdorff", "farthest"]
-    assert (poisson["mean"], poisson["scenes"], poisson["rank"]) == (pytest.approx(0.4), 1, 1)
-    assert np.isnan(poisson["standard_error"])
-    assert rows[2, "covered", "farthest"]["mean"] == pytest.approx(0.55)
-
-
-def test_differences_are_paired():
-    found = differences(hand_made(), METHODS, ReconstructionStudy.measures, "coverage")
-    rows = found.set_index(["at", "quantity"]).loc
-    row = rows[MEAN, "chamfer"]
+    assert (row["mean"], row["standard_error"], row["scenes"]) == (pytest.approx(0.3), pytest.approx(0.1), 2)
     # Both scenes differ by -0.1, so any resample does; the Hausdorff distances by 0.1 and -0.1.
-    assert (row["mean"], row["low"], row["high"]) == tuple(map(pytest.approx, (-0.1, -0.1, -0.1)))
-    assert row["excludes_zero"]
-    assert rows[MEAN, "hausdorff"]["mean"] == pytest.approx(0.0, abs=1e-12)
-    assert not rows[MEAN, "hausdorff"]["excludes_zero"]
+    assert [row["lead"], row["lead_low"], row["lead_high"]] == pytest.approx([-0.1] * 3)
+    assert table.loc[(MEAN, "hausdorff", "farthest"), "lead"] == pytest.approx(0.0, abs=1e-12)
+    poisson = table.loc[POISSON, "hausdorff", "farthest"]
+    assert (poisson["mean"], poisson["scenes"]) == (pytest.approx(0.4), 1)
+    assert table.loc[(2, "covered", "farthest"), "mean"] == pytest.approx(0.55)
 
 
-def test_the_text_and_the_chart_go_without_a_reconstruction_that_no_scene_has(tmp_path):
-    text = summary(hand_made(), ReconstructionStudy)
-    assert POISSON in text
-    assert "-0.100 [-0.100, -0.100]*" in text
-    assert " 55 [50, 60]" in text
-    assert max(map(len, text.splitlines())) <= 120
-    without = hand_made()[:1]
-    assert POISSON not in summary(without, ReconstructionStudy)
-    for records in (hand_made(), without):
-        (path,) = write_charts(records, ReconstructionStudy, tmp_path)
-        assert path.name == "reconstruction.png"
+def test_the_text_goes_without_a_reconstruction_that_no_scene_has():
+    assert POISSON in summary(results(hand_made(), ReconstructionStudy), ReconstructionStudy)
+    assert POISSON not in summary(results(hand_made()[:1], ReconstructionStudy), ReconstructionStudy)

@@ -8,7 +8,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import jaxnbv as nbv
-from jaxnbv.studies.recorded.pictures import write_pictures
+from jaxnbv.studies.engine.pictures import write_pictures
+from jaxnbv.studies.recorded.pictures import tiles
 from jaxnbv.studies.recorded.study import EVEN, NEW, ORACLE, RecordedStudy
 
 UNIT = 1000.0
@@ -220,15 +221,15 @@ def test_every_method_is_measured_by_what_its_frames_show(study):
     best = record["methods"][ORACLE]
     assert gain[best["frames"][1]] == max(gain)
     assert all(method["covered"][1] <= best["covered"][1] for method in record["methods"].values())
-    of_new = study.measure("gain").of(record, NEW)
+    of_new = study.measures[1].of(record, NEW)
     own = record["methods"][NEW]["covered"]
-    assert of_new[1] == pytest.approx((own[2] - own[0]) / (best["covered"][2] - best["covered"][0]))
+    assert of_new[3] == pytest.approx((own[2] - own[0]) / (best["covered"][2] - best["covered"][0]))
 
 
 def test_its_pictures_show_every_method(study, tmp_path):
     record = study.run_scene(0, methods=(EVEN, ORACLE))
-    (path,) = write_pictures([record], study, tmp_path)
-    assert path.name == "frames_000.png"
+    (path,) = write_pictures([record], study, tmp_path, tiles)
+    assert path.name == "scene_0000.png"
     pixels = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
     assert len(np.unique(pixels, axis=0)) > 20
 
