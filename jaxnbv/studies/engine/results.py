@@ -51,6 +51,7 @@ def _compared(part: pd.DataFrame, reference: str) -> pd.DataFrame:
     values = values if len(values) else values[[]]
     row = pd.DataFrame({"scenes": values.count(), "mean": values.mean(), "standard_error": values.sem()})
     row[["low", "high"]] = interval(values.to_numpy()).T
+    row[["lead", "lead_low", "lead_high"]] = np.nan
     if reference in values:
         lead = values.rsub(values[reference], axis=0)
         row["lead"] = lead.mean()

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from jaxnbv.studies.engine.tables import summary
 from PIL import Image
 
 from jaxnbv.checks import InputError
@@ -19,7 +18,10 @@ from jaxnbv.imagination import Imagination
 from jaxnbv.networks import InvariantClassifier, save_checkpoint
 from jaxnbv.search import FarthestView
 from jaxnbv.studies.classification.objects import ModelNet10Study, OmniObject3DStudy, PyramidStudy, TruckStudy
-from jaxnbv.studies.classification.pictures import write_pictures
+from jaxnbv.studies.classification.pictures import tiles
+from jaxnbv.studies.engine.chart import chart
+from jaxnbv.studies.engine.pictures import write_pictures
+from jaxnbv.studies.engine.results import results, summary
 from jaxnbv.studies.readers import class_meshes
 from jaxnbv.studies.scenes import HOUSEHOLD, FirstView
 from jaxnbv.surfaces import GeometricSPSR
@@ -32,12 +34,12 @@ CAMERA = Camera(height=24, width=24)
 class Linear(eqx.Module):
     """An opinion from the means of points and normals."""
 
-    classes: int = eqx.field(static=True)
+    count: int = eqx.field(static=True)
 
     def __call__(self, cloud):
         rows = jnp.concatenate([cloud.points, cloud.normals], axis=-1)
         mean = jnp.sum(jnp.where(cloud.mask[:, None], rows, 0.0), axis=0) / jnp.maximum(cloud.count, 1)
-        weight = jnp.asarray(np.random.default_rng(1).normal(size=(self.classes, 6)), mean.dtype)
+        weight = jnp.asarray(np.random.default_rng(1).normal(size=(self.count, 6)), mean.dtype)
         return jax.nn.log_softmax(2.0 * weight @ mean)
 
 

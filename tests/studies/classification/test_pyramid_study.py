@@ -16,7 +16,8 @@ from jaxnbv.geometry.cloud import concatenate, limit_capacity
 from jaxnbv.imagination import Imagination
 from jaxnbv.search import FarthestView, SphereCandidates
 from jaxnbv.studies.classification.objects import PyramidStudy
-from jaxnbv.studies.classification.pictures import write_pictures
+from jaxnbv.studies.classification.pictures import tiles
+from jaxnbv.studies.engine.pictures import write_pictures
 from jaxnbv.studies.scenes import Framing, Pyramid, Split, pyramid_scene
 from jaxnbv.studies.scenes.class_object import scan_cue
 from jaxnbv.surfaces import GeometricSPSR
@@ -95,9 +96,9 @@ def test_a_record_is_json_and_holds_every_method():
     assert record["scene"] == SCENE
     assert record["framing"] == "close-up"
     assert record["label"] == int(pyramid.label)
-    places = [tuple(place) for place in np.round(SphereCandidates(CANDIDATES).poses().position, 4).tolist()]
+    places = [tuple(place) for place in np.asarray(SphereCandidates(CANDIDATES).poses().position).tolist()]
     for name, method in record["methods"].items():
-        taken = [tuple(np.round(view["position"], 4).tolist()) for view in method["views"]]
+        taken = [tuple(view["position"]) for view in method["views"]]
         assert len({*taken}) == 3
         assert {*taken} <= {*places}
         assert np.shape(method["log_p"]) == (8 if name == "random" else 1, 3, 5)

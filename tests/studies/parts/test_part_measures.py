@@ -4,6 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from jaxnbv.studies.engine.results import results
 from jaxnbv.studies.parts.discovery import TARGETS, discovery_time
 from jaxnbv.studies.parts.study import PartStudy
 

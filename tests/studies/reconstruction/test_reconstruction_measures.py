@@ -1,8 +1,8 @@
 """What the reconstruction study measures, from records made by hand."""
 
 import pytest
-from jaxnbv.studies.engine.tables import summary
 
+from jaxnbv.studies.engine.results import results, summary
 from jaxnbv.studies.reconstruction.study import MEAN, POISSON, ReconstructionStudy
 
 
