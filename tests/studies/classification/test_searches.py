@@ -1,4 +1,4 @@
-"""Searches for the class on a small scale: what must hold between searches that look at the same samples."""
+"""Searches of the studies of classes on a small scale: what must hold between those that look at the same samples."""
 
 import functools
 import json
