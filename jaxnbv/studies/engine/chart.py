@@ -66,7 +66,7 @@ def chart(found: pd.DataFrame, study: type[Study]) -> bytes:
             axes.set(title=measure.title, xlabel=measure.by, ylabel=unit)
         for axes in panels[len(shown) :]:
             axes.axis("off")
-        lines = {line.get_label(): line for axes in panels for line, *_ in axes.containers}
+        lines = {line.get_label(): line for axes in panels for line in axes.containers}
         figure.legend(lines.values(), lines, loc="outside right center", frameon=False, handlelength=2.6)
         figure.savefig(file, format="png", dpi=200)
     return file.getvalue()
