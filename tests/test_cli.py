@@ -218,7 +218,7 @@ def test_help_names_every_option(command, tmp_path):
     result = run_command(*command, "--help", cwd=tmp_path)
     assert result.returncode == 0
     expected = (
-        ["demo", "run", "study", "report"]
+        ["demo", "run", "view", "study", "report"]
         if not command
         else ["--task", "--search", "--views", "--first", "--seed", "--out"]
     )

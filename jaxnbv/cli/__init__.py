@@ -1,5 +1,4 @@
-"""The command line: `jaxnbv demo`, `jaxnbv run MESH`, `jaxnbv study pyramid` and
-`jaxnbv report DIR`."""
+"""The command line: `jaxnbv demo`, `jaxnbv run MESH`, `jaxnbv view RUN`, `jaxnbv study NAME`, `jaxnbv report DIR`."""
 
 import sys
 from typing import Annotated
@@ -7,7 +6,7 @@ from typing import Annotated
 import typer
 
 import jaxnbv
-from jaxnbv.cli.episode import demo, run
+from jaxnbv.cli.episode import demo, run, view
 from jaxnbv.cli.study import report, study
 from jaxnbv.errors import InputError, explained_imports
 
@@ -45,7 +44,7 @@ def _options(
     """What is asked of `jaxnbv` itself."""
 
 
-for _command in (demo, run, report, study):
+for _command in (demo, run, view, report, study):
     app.command()(_command)
 
 

@@ -1,6 +1,7 @@
-"""`jaxnbv demo` and `jaxnbv run MESH`: one episode."""
+"""`jaxnbv demo` and `jaxnbv run MESH`: one episode. `jaxnbv view RUN`: a look at one."""
 
 import dataclasses
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -139,3 +140,34 @@ def run(
         typer.echo(f"note     {words}")
     folder = out or usual_folder(mesh.stem, task, search, model, seed)
     play(mesh.stem, surface, planner, start, views, seed, noise, folder, until or (), quick, report)
+
+
+def view(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run.")],
+    html: Annotated[
+        Path | None, typer.Option(help="Write the scene into one HTML file, which opens offline, and end.")
+    ] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Where the page is served.")] = 8080,
+) -> None:
+    """Look at a run in the browser: points, cameras, the surface, what is imagined, where to look next.
+
+    Surfaces are those of the usual model, given what was seen.
+    """
+    from jaxnbv.cli.device import prepare
+    from jaxnbv.planning.episode import Episode
+    from jaxnbv.viz import LiveView
+
+    prepare(Device.AUTO)
+    episode, page = Episode.load(folder), LiveView(port)
+    try:
+        page.update(episode)
+        if html is not None:
+            typer.echo(f"page     {page.save(html)}")
+            return
+        typer.echo(f"look at {page.address}; end with Ctrl-C")
+        while True:
+            time.sleep(3600.0)
+    except KeyboardInterrupt:
+        typer.echo("ended")
+    finally:
+        page.stop()

@@ -113,9 +113,9 @@ def study(
     device: options.DeviceOption = Device.AUTO,
 ) -> None:
     asked = dict(locals())
-    from jaxnbv.cli.actions import studies
+    from jaxnbv.cli.run_study import run_study
 
-    studies.study(**asked)
+    run_study(**asked)
 
 
 def report(

@@ -5,7 +5,7 @@ network of `jaxnbv.networks`, one of your own, or a `HostClassifier`. In an attr
 """
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TypeAlias
 
 import equinox as eqx
@@ -160,27 +160,6 @@ class MixedEntropy(ClassAcquisition):
     def quantity(self) -> Quantity:
         meaning = "expected cross-entropy, or expected reduction of entropy once the class is nearly settled."
         return Quantity("expected cross-entropy or reduction of entropy", "nats", meaning)
-
-
-class ClassComparisons(ClassAcquisition):
-    """Several `ClassAcquisition`s of one classifier and as many points, from one answer of it a scan: for
-    `Problem.scores`, not for a planner.
-
-    - `members`: their values become a vector.
-    """
-
-    members: tuple[ClassAcquisition, ...] = ()
-
-    @classmethod
-    def of(cls, members: Sequence[ClassAcquisition]) -> "ClassComparisons":
-        """**Raises:** `ValueError` for members that differ in classifier or number of points, or none."""
-        kinds = {(member.num_points, id(member.classifier)) for member in members}
-        require(len(kinds) == 1, f"the {len(members)} members must be of one classifier and as many points")
-        return cls(members[0].classifier, members[0].num_points, tuple(members))
-
-    def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, " members"]:
-        """Each member's value."""
-        return jnp.stack([member.compare(log_p, log_q) for member in self.members])
 
 
 class ClassAnswer(Answer):

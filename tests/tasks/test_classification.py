@@ -19,7 +19,6 @@ from jaxnbv.scanning import Grid, scan
 from jaxnbv.search import DiscreteSearch, FarthestView
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks.classification import (
-    ClassComparisons,
     CrossEntropy,
     EntropyReduction,
     MixedEntropy,
@@ -204,31 +203,6 @@ def test_expected_scores_against_a_loop(x64):
     ):
         found = expected_value(score, data, surfaces, CAMERA, poses)
         np.testing.assert_allclose(found, expected.mean(axis=0), rtol=1e-8, atol=1e-12)
-
-
-def test_comparisons_from_one_answer_are_the_members_own():
-    """Of a classifier that is asked once a scan, however many members there are."""
-    asked = []
-
-    def classifier(cloud):
-        jax.debug.callback(lambda _: asked.append(1), cloud.points[0, 0])
-        return linear(cloud)
-
-    kinds = (CrossEntropy, MixedEntropy, EntropyReduction)
-    members = [kind(classifier, num_points=16) for kind in kinds]
-    members.append(MixedEntropy(classifier, threshold=0.0, num_points=16))
-    together, data = ClassComparisons.of(members), random_cloud(50, 60)
-    for seen in (random_cloud(20, 24, (0.4, 0.0, 0.0)), random_cloud(20, 24, (0.0, 0.0, -0.4)), nothing(24)):
-        expected = [float(member(member.context(data), seen)) for member in members]
-        context = together.context(data)
-        jax.effects_barrier()
-        del asked[:]
-        np.testing.assert_allclose(together(context, seen), expected, rtol=1e-6)
-        jax.effects_barrier()
-        assert len(asked) == 1
-    for wrong in ([], [members[0], CrossEntropy(classifier, num_points=17)], [members[0], CrossEntropy(linear, 16)]):
-        with pytest.raises(InputError, match=f"the {len(wrong)} members must be of one classifier and as many points"):
-            ClassComparisons.of(wrong)
 
 
 class Named(eqx.Module):

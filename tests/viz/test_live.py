@@ -6,9 +6,12 @@ import sys
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from small_run import small_run
 from small_session import FIRST, session_of, shot
 
+import jaxnbv as nbv
 from jaxnbv.checks import InputError
+from jaxnbv.cli import episode as commands
 from jaxnbv.viz.live import LiveView
 
 viser = pytest.importorskip("viser", reason="viser is not installed")
@@ -100,6 +103,13 @@ def test_one_file_holds_the_scene(watched, tmp_path):
     text = path.read_text()
     assert "<html" in text
     assert not re.findall(r'<(?:script|link|img)[^>]*(?:src|href)="https?:', text)
+
+
+def test_the_command_writes_a_run_into_one_file(tmp_path, capsys):
+    small_run(nbv.DiscreteSearch(8), views=2).save(tmp_path / "run")
+    commands.view(tmp_path / "run", tmp_path / "scene.html", port=0)
+    assert "scene.html" in capsys.readouterr().out
+    assert "<html" in (tmp_path / "scene.html").read_text()
 
 
 def test_without_viser_it_says_what_to_install(monkeypatch):

@@ -3,6 +3,8 @@ from .class_object import ClassSet as ClassSet
 from .class_object import SolidObject as SolidObject
 from .class_object import hidden_view as hidden_view
 from .demo import demo_object as demo_object
+from .framing import FirstView as FirstView
+from .framing import Framing as Framing
 from .heat_objects import HEAT_OBJECTS as HEAT_OBJECTS
 from .heat_objects import HeatScene as HeatScene
 from .heat_objects import heat_scene as heat_scene
@@ -16,7 +18,5 @@ from .part_scenes import part_scene as part_scene
 from .pyramid import PATTERNS as PATTERNS
 from .pyramid import Pyramid as Pyramid
 from .pyramid import pyramid_scene as pyramid_scene
-from .splits import FirstView as FirstView
-from .splits import Framing as Framing
 from .splits import Split as Split
 from .truck import truck_scene as truck_scene

@@ -7,9 +7,10 @@ import numpy as np
 
 from jaxnbv.studies.scenes import labelled
 from jaxnbv.studies.scenes.class_object import SolidObject
+from jaxnbv.studies.scenes.framing import Framing
 from jaxnbv.studies.scenes.labelled import assemble, generator
 from jaxnbv.studies.scenes.parts import furniture
-from jaxnbv.studies.scenes.splits import Framing, Split, scene_key
+from jaxnbv.studies.scenes.splits import Split, scene_key
 
 # All of an object tells its class: its primitives have the label 1.
 ball, bar, box, ring, rod = (

@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from jaxnbv.checks import AnyArray
 from jaxnbv.scanning.sdf import Matrix, Scalar, Vector, nonnegative, parameter
 from jaxnbv.studies.scenes.class_object import ClassObject
-from jaxnbv.studies.scenes.splits import Framing, Split, scene_key
+from jaxnbv.studies.scenes.framing import Framing
+from jaxnbv.studies.scenes.splits import Split, scene_key
 
 PATTERNS = ("cross", "ring", "star", "triangle", "square")
 

@@ -5,6 +5,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnbv.studies.scenes.class_object import SolidObject
+from jaxnbv.studies.scenes.framing import Framing
 from jaxnbv.studies.scenes.household import BUILDERS, HOUSEHOLD
 from jaxnbv.studies.scenes.labelled import (
     CAPACITY,
@@ -18,7 +19,7 @@ from jaxnbv.studies.scenes.labelled import (
     rotation_about,
     united,
 )
-from jaxnbv.studies.scenes.splits import Framing, Split, scene_key
+from jaxnbv.studies.scenes.splits import Split, scene_key
 
 # Says nothing of the class; primitives of the cargo have other labels.
 _TRUCK = 0

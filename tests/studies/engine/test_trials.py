@@ -17,7 +17,7 @@ from test_study import small, without_time
 from toy import ToyStudy
 
 from jaxnbv.checks import InputError
-from jaxnbv.cli.actions.studies import study
+from jaxnbv.cli.run_study import run_study
 from jaxnbv.storage.folders import software
 from jaxnbv.studies.engine.records import RecordFolder
 from jaxnbv.studies.engine.trials import Cluster, Here, Processes
@@ -147,7 +147,7 @@ def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypa
     def run(out, scenes):
         none = dict.fromkeys(("methods", "own", "out", "scheduler"))
         settings = {"views": 2, "model": "paper", "quick": False, "workers": 1, "out": tmp_path / out}
-        study("toy", **none | settings | {"scenes": scenes})
+        run_study("toy", **none | settings | {"scenes": scenes})
 
     monkeypatch.setitem(STUDIES, "toy", Entry("toy:ToyStudy", "", "", 3, 2))
     monkeypatch.setattr(ToyStudy, "run_scene", run_scene)
@@ -167,6 +167,6 @@ def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypa
         with pytest.raises(InputError, match=f"--scenes {wrong} names no scenes"):
             run("wrong", wrong)
     with pytest.raises(InputError, match="exclude each other"):
-        study("toy", "2", 2, None, None, "paper", None, False, 2, "tcp://127.0.0.1:9")
+        run_study("toy", "2", 2, None, None, "paper", None, False, 2, "tcp://127.0.0.1:9")
     with pytest.raises(InputError, match="the study toy takes no --meshes: it is for truck"):
-        study("toy", "2", 2, None, None, "paper", None, False, 1, None, meshes=tmp_path)
+        run_study("toy", "2", 2, None, None, "paper", None, False, 1, None, meshes=tmp_path)

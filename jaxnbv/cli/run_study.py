@@ -25,7 +25,7 @@ from jaxnbv.studies.engine.trials import Cluster, Here, Processes, Runner, Trial
 from jaxnbv.studies.registry import STUDIES, flag
 
 
-def study(
+def run_study(
     name: str,
     scenes: str | None,
     views: int | None,
