@@ -14,8 +14,7 @@ from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
 from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import simulate
 from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, scan
-from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.scanning import Grid, SensorNoise, scan
 from jaxnbv.search import DiscreteSearch, FarthestView, RandomView, UncertaintyView
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
@@ -218,13 +217,3 @@ def test_what_is_constant_under_jit_is_checked_too(planner, evidence):
     long = eqx.tree_at(lambda c: c.normals, seen, 2 * seen.normals)
     with pytest.raises(ValueError, match="not of unit length"):
         jax.jit(lambda: planner.init(FIRST, long))()
-
-
-def test_a_near_camera_s_own_scan_is_its_image():
-    """Noise of a hundredth is many pixels where the surface is a tenth away."""
-    planner, near = planner_of(SEARCHES["FarthestView"]), look_at((0.0, 0.0, 0.8))
-    ball = SDFSurface(Sphere(0.7))
-    seen = SensorNoise()(scan(ball, planner.camera, near), jax.random.key(0))
-    assert int(planner.init(near, seen).num_views) == 1
-    with pytest.raises(ValueError, match="pixels"):
-        planner.init(look_at((0.0, 0.8, 0.0)), seen)
