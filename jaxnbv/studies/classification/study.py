@@ -252,7 +252,7 @@ class ClassificationStudy(Study):
         episode = self.key(scene.index, "episode")
         keys = [jax.random.fold_in(episode, run) for run in range(_RUNS)]
         runs = [super(ClassificationStudy, self).run(scene, truth, first, method, planner, key) for key in keys]
-        return runs[0] | {name: [run[name][0] for run in runs] for name in ("log_p", "pixels")}
+        return runs[0] | {name: [row for run in runs for row in run[name]] for name in ("log_p", "pixels")}
 
     def follow(self, scene: Scene, truth: Truth, planner: Planner, episode: Iterator[Step]) -> Record:
         """Of its run what the classifier says after each view, and how many rays of the view hit the cue of the class;

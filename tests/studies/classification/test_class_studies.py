@@ -78,7 +78,7 @@ def test_first_views_of_trucks_are_random_and_told_apart_by_what_they_show():
         assert TruckStudy.group({"methods": {"farthest": {"pixels": [[pixels, 400]]}}}) == group
 
 
-@pytest.mark.parametrize("kind", [TruckStudy, pytest.param(ModelNet10Study, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", [ModelNet10Study, pytest.param(TruckStudy, marks=pytest.mark.slow)])
 def test_records_tables_charts_and_pictures(kind, tmp_path):
     """Where all of the object tells its class no pixels are counted."""
     found = record(kind)
