@@ -24,7 +24,8 @@ from jaxnbv.studies.classification.measures import CUE_PIXELS, MEASURES
 from jaxnbv.studies.engine.diagnostics import rank_correlation, roughness
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.meshes import numbered
-from jaxnbv.studies.engine.study import RULES, Scene, Study
+from jaxnbv.studies.engine.searches import RULES
+from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.readers import MeshFile, class_meshes
 from jaxnbv.studies.scenes import ClassObject, ClassSet, FirstView, Framing, Split
 from jaxnbv.studies.scenes.class_object import ClassMesh, scan_cue, surface_of

@@ -23,44 +23,14 @@ from jaxnbv.planning.episode import Sensor, Step, scene_sensor, steps, view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Evidence, Grid, Surface
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
-from jaxnbv.search import (
-    Candidates,
-    ConstrainedPoses,
-    DiscreteSearch,
-    FarthestView,
-    FreePoses,
-    GradientSearch,
-    HalvingSearch,
-    HybridSearch,
-    PoseSpace,
-    RandomView,
-    Search,
-    SphereCandidates,
-    SpherePoses,
-    UncertaintyView,
-)
+from jaxnbv.search import Candidates, Search, SphereCandidates
 from jaxnbv.studies.engine.measures import KNOWN, UNKNOWING, Claim, Measure, Record
+from jaxnbv.studies.engine.searches import search_of
 from jaxnbv.studies.scenes.banks import bank_poses, shape_bank
 
 # The file of a study's chart.
 CHART = "chart.png"
 _PURPOSES = ("first", "episode", "scene", "measure")
-# The baselines of all studies that look at no acquisition.
-RULES = ("farthest", "uncertainty", "random")
-_SEARCHES: dict[str, Callable[..., Search]] = {
-    "farthest": FarthestView,
-    "uncertainty": UncertaintyView,
-    "random": RandomView,
-    "halving": HalvingSearch,
-    "hybrid": lambda candidates: HybridSearch(candidates=candidates),
-}
-# Free poses drift to views that miss the object, as the paper found; constrained ones keep it in view.
-_SPACES: dict[str, Callable[[float], PoseSpace]] = {
-    "gradient-2dof": SpherePoses,
-    "gradient-6dof": FreePoses,
-    "gradient-constrained": lambda radius: ConstrainedPoses(radius - 0.3, radius + 0.3),
-}
-_LEARNING_RATE = 0.03
 
 
 class Scene(eqx.Module):
@@ -236,10 +206,8 @@ class Study(eqx.Module):
 
     def search(self, method: str) -> Search:
         """Of the name's kind, or over all candidates by the acquisition."""
-        if method in _SPACES:
-            settings = self.num_starts, self.iterations, _LEARNING_RATE, max(self.num_candidates // 2, self.num_starts)
-            return GradientSearch(None, _SPACES[method](self.radius), *settings)
-        return _SEARCHES.get(method, DiscreteSearch)(self.candidates)
+        climbs = self.num_starts, self.iterations
+        return search_of(method, self.candidates, self.num_candidates, self.radius, *climbs)
 
     def imagination_of(self, scene: Scene) -> Imagination:
         """The study's, or what is known of such a scene."""

@@ -20,7 +20,8 @@ from jaxnbv.scanning import Grid, SDFSurface, TriangleMesh, mesh_from_sdf
 from jaxnbv.scanning.sensors import HEAT_SETTING
 from jaxnbv.studies.engine.measures import SECONDS, Claim, Measure, Record
 from jaxnbv.studies.engine.meshes import MeshStudy
-from jaxnbv.studies.engine.study import RULES, Scene
+from jaxnbv.studies.engine.searches import RULES
+from jaxnbv.studies.engine.study import Scene
 from jaxnbv.studies.scenes import heat_scene
 from jaxnbv.tasks import ColdestPoint, Coverage, body_temperature
 from jaxnbv.tasks.diffusion import HeatProblem

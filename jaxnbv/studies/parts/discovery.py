@@ -20,7 +20,8 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, MeshParts
 from jaxnbv.scanning.sensors import PART_SETTING
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
-from jaxnbv.studies.engine.study import RULES, Scene, Study
+from jaxnbv.studies.engine.searches import RULES
+from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.tasks import Coverage, SoftPartCount, part_counts
 
 # The paper's N_target of its Table 1, and the authors' value for the utility, in points of the 2,048 that the network

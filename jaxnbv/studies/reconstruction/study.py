@@ -16,7 +16,8 @@ from jaxnbv.scanning.metrics import SURFACE_POINTS, coverage, surface_distance, 
 from jaxnbv.scanning.screened_poisson import has_poisson, screened_poisson
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.meshes import MeshStudy
-from jaxnbv.studies.engine.study import RULES, Scene
+from jaxnbv.studies.engine.searches import RULES
+from jaxnbv.studies.engine.study import Scene
 from jaxnbv.studies.scenes import Split, part_scene
 from jaxnbv.tasks import Coverage, NewSurface
 

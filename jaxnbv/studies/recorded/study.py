@@ -27,7 +27,8 @@ from jaxnbv.scanning.scanner import Hits
 from jaxnbv.search import GivenPoses, Problem, Search
 from jaxnbv.search.base import Rule
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
-from jaxnbv.studies.engine.study import RULES, Scene, Study
+from jaxnbv.studies.engine.searches import RULES
+from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.readers.recorded import RecordedFrames
 from jaxnbv.tasks import Coverage, NewSurface
 

@@ -1,0 +1,47 @@
+"""The searches of studies, by the names of their methods."""
+
+from collections.abc import Callable
+
+from jaxnbv.search import (
+    Candidates,
+    ConstrainedPoses,
+    DiscreteSearch,
+    FarthestView,
+    FreePoses,
+    GradientSearch,
+    HalvingSearch,
+    HybridSearch,
+    PoseSpace,
+    RandomView,
+    Search,
+    SpherePoses,
+    UncertaintyView,
+)
+
+# The baselines of all studies that look at no acquisition.
+RULES = ("farthest", "uncertainty", "random")
+_OVER_CANDIDATES: dict[str, Callable[..., Search]] = {
+    "farthest": FarthestView,
+    "uncertainty": UncertaintyView,
+    "random": RandomView,
+    "halving": HalvingSearch,
+    "hybrid": lambda candidates: HybridSearch(candidates=candidates),
+}
+# Free poses drift to views that miss the object, as the paper found; constrained ones keep it in view.
+_SPACES: dict[str, Callable[[float], PoseSpace]] = {
+    "gradient-2dof": SpherePoses,
+    "gradient-6dof": FreePoses,
+    "gradient-constrained": lambda radius: ConstrainedPoses(radius - 0.3, radius + 0.3),
+}
+_LEARNING_RATE = 0.03
+
+
+def search_of(
+    method: str, candidates: Candidates, num_candidates: int, radius: float, num_starts: int, iterations: int
+) -> Search:
+    """Of the name's kind, or over all candidates by the acquisition. One by gradient, about `radius` (scene units),
+    looks at half as many candidates first, and climbs from `num_starts` of them."""
+    if method in _SPACES:
+        settings = num_starts, iterations, _LEARNING_RATE, max(num_candidates // 2, num_starts)
+        return GradientSearch(None, _SPACES[method](radius), *settings)
+    return _OVER_CANDIDATES.get(method, DiscreteSearch)(candidates)
