@@ -174,19 +174,21 @@ def play(
     lines = Lines(planner)
     sketches = viz.Sketches(Episode(planner, scene, spread, first, key, ())) if report else None
     race: Future[Episode] | None = None
-    drawn: list[Future[None]] = []
+    jobs: list[Future[None]] = []
 
     def tell(step: Step) -> None:
         nonlocal race
         lines(step.view)
+        if views > 1 and not jobs:
+            jobs.append(beside.submit(planner.compile, step.evidence))
         if sketches is not None:
-            drawn.append(beside.submit(sketches.add, step))
+            jobs.append(beside.submit(sketches.add, step))
         # Not before the first view: both would compile what that needs.
         if race is None and rival is not None and enough is not None:
             of_rival = (scene, first, _RACE_VIEWS, key, spread, folder / "farthest")
             race = beside.submit(simulate, rival, *of_rival, progress=False, until=enough)
 
-    # While the next view is planned, the last one is drawn and the rival runs.
+    # While the next view is planned, its search is compiled, the last one is drawn and the rival runs.
     with ThreadPoolExecutor(1) as beside:
         try:
             episode = simulate(planner, scene, first, views, key, spread, folder, until=enough, each=tell)
@@ -194,8 +196,8 @@ def play(
             beside.shutdown(wait=False, cancel_futures=True)
             raise
     raced = None if race is None else race.result()
-    for one in drawn:
-        one.result()
+    for job in jobs:
+        job.result()
     if episode.stopped is not None:
         saved = views - len(episode.views)
         are = "is" if saved == 1 else "are"

@@ -117,8 +117,18 @@ class Planner(eqx.Module):
         check_type(evidence, Evidence, "the evidence")
         check_type(surfaces, GridSurface | None, "the surfaces")
         with functions_of_users():
-            proposal = _propose(self.search, self.problem(evidence, surfaces), key)
+            # Its context is a program of its own, which `init` has compiled.
+            proposal = _propose(self.search, self.problem(evidence, surfaces).prepared(), key)
         return checked_proposal(proposal, surfaces, self.cost)
+
+    def compile(self, evidence: Evidence) -> None:
+        """Compile `choose` for evidence of these shapes and run nothing: in a thread, while surfaces are sampled."""
+        surfaces, grid, count = None, self.imagination.grid, self.imagination.num_samples
+        if self.search.uses_samples:
+            nodes, cells = (count, *3 * [grid.resolution]), (count, *3 * [grid.resolution - 1])
+            surfaces = GridSurface(jnp.zeros(nodes), jnp.zeros(cells, jnp.int8), grid)
+        problem = self.problem(evidence, surfaces).prepared()
+        _propose.lower(self.search, problem, jax.random.key(0)).compile()
 
     def observe(
         self, evidence: Evidence | PointCloud, pose: Pose, scan: PointCloud, camera: Camera | None = None
@@ -174,7 +184,7 @@ class Planner(eqx.Module):
 
 @eqx.filter_jit
 def _propose(search: Search, problem: Problem, key: PRNGKeyArray) -> Proposal:
-    return search.propose(problem.prepared(), key)
+    return search.propose(problem, key)
 
 
 def checked_proposal(proposal: Proposal, surfaces: GridSurface | None, cost: ValuePerCost | None = None) -> Proposal:

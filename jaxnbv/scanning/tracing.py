@@ -217,7 +217,7 @@ def _stride(rays: March, field: Field) -> March:
         return rays._replace(t=t, sign=sign, alive=alive), free & alive
 
     few = rays.t.size // 8
-    return jax.lax.while_loop(lambda state: jnp.sum(state[1]) > few, step, step((rays, rays.alive)))[0]
+    return jax.lax.while_loop(lambda state: jnp.sum(state[1]) > few, step, (rays, jnp.ones_like(rays.alive)))[0]
 
 
 def _search_cell(rays: March, field: Field) -> March:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnbv.acquisition import Acquisition, sample_scores
+from jaxnbv.acquisition import Acquisition, context_of, sample_scores
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
@@ -41,7 +41,7 @@ class Problem(eqx.Module):
 
     def prepared(self) -> "Problem":
         """The same with the acquisition's context, as searches ask for it; nothing to prepare without samples."""
-        context = None if self.surfaces is None else self.acquisition.context(self.evidence.cloud)
+        context = None if self.surfaces is None else context_of(self.acquisition, self.evidence.cloud)
         return dataclasses.replace(self, context=context)
 
     def about(self, acquisition: Acquisition) -> "Problem":
