@@ -128,7 +128,7 @@ class Planner(eqx.Module):
             nodes, cells = (count, *3 * [grid.resolution]), (count, *3 * [grid.resolution - 1])
             surfaces = GridSurface(jnp.zeros(nodes), jnp.zeros(cells, jnp.int8), grid)
         problem = self.problem(evidence, surfaces).prepared()
-        _propose.lower(self.search, problem, jax.random.key(0)).compile()
+        _propose.lower(self.search, problem, jax.random.key(0)).compile()  # type: ignore[attr-defined]
 
     def observe(
         self, evidence: Evidence | PointCloud, pose: Pose, scan: PointCloud, camera: Camera | None = None
