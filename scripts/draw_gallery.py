@@ -84,17 +84,17 @@ def draw_hero(figure: Figure) -> None:
     assert seen is not None
     assert choice is not None
     heads = (
-        ("one view of a truck: what does it carry?", "pale is known, dark is guessed"),
-        ("what may be there", "four samples from the next pose, blue where nothing was seen"),
-        ("what each view is worth", data.quantity.name),
+        ("a truck: what does it carry?", "pale is known, dark is guessed"),
+        ("what may be there", "four guesses; blue: not seen yet"),
+        ("what each view is worth", "purple: may change the answer"),
         ("the next view, and the answer", data.task.found),
     )
     widths = (3.0, 2.6, 2.6, 3.0)
     total, left = sum(widths), 0.0
     for place, ((head, below), width) in enumerate(zip(heads, widths, strict=True)):
         x, w = left / total, width / total
-        figure.text(x + 0.5 * w, 0.96, head, ha="center", va="center", fontsize=9.5)
-        words(figure, x + 0.5 * w, 0.885, below, 0.94 * w, 8.0, ha="center", va="center", color=GREY)
+        figure.text(x + 0.5 * w, 0.96, head, ha="center", va="center", fontsize=12)
+        words(figure, x + 0.5 * w, 0.875, below, 0.96 * w, 10.5, ha="center", va="center", color=GREY)
         if place in (0, 3):
             index = 0 if place == 0 else 1
             draw_scene(figure.add_axes((x, 0.0, w, 0.86)), data, index, stills[index], camera, inset=False)
