@@ -40,6 +40,7 @@ html_math_renderer = "mathml"
 html_static_path = ["_static"]
 html_extra_path = ["_extra"]
 html_css_files = ["site.css"]
+html_js_files = ["copy.js"]
 
 
 def _copy_notebooks() -> None:
