@@ -26,7 +26,7 @@ from jaxnbv.sharding import on_cpu, share_of, shared, shared_map
 
 
 class Quantity(eqx.Module):
-    """What is maximised, for tables and captions.
+    """The name, unit and meaning of what is maximised, for tables and captions.
 
     - `name`, `unit`: in words; the unit is empty where there is none.
     - `meaning`: the rest of a caption that begins with "Value:".
@@ -42,7 +42,7 @@ class Quantity(eqx.Module):
 
 
 class Answer(eqx.Module):
-    """What D answers to the question that the views are for: numbers with names. How it reads is said in `jaxnbv.viz`.
+    """What the cloud D answers to the question: numbers with names. `jaxnbv.viz` puts them into words.
 
     - `names`, `values`: one each.
     - `form`: how a value is written, in the language of `str.format`.
@@ -54,7 +54,7 @@ class Answer(eqx.Module):
 
 
 class Acquisition(eqx.Module):
-    """The value of one imagined scan, given what has been seen; its expectation over the posterior is maximised."""
+    """What one imagined scan is worth, given what has been seen. A search maximises the mean over the posterior."""
 
     @abstractmethod
     def context(self, cloud: PointCloud) -> Any:
@@ -189,7 +189,7 @@ def as_acquisition(value: Any) -> Acquisition:
 
 
 class Several(Acquisition):
-    """Several acquisitions of the same scans, so that they are compared on the same samples at the cost of one scan.
+    """Several acquisitions of the same scans: compared on the same samples, at the cost of one scan.
 
     Its value is a vector, the members' values in their order (a member whose value is a vector itself takes as many
     places): for `expected_value` and `Problem.scores`, not for a planner.

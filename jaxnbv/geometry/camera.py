@@ -21,14 +21,14 @@ _SKEW = 1e-6
 
 
 class Camera(eqx.Module):
-    """A pinhole depth camera. Its pixels are told from the image's top left corner: their centres are at 0.5, 1.5, ...
+    """A pinhole depth camera. Pixels are counted from the image's top left corner: their centres are at 0.5, 1.5, ...
 
     - `fov`: vertical field of view in radians, within (0, pi), as if the principal point were at the image's centre.
     - `height`, `width`: pixels; one ray through the centre of each.
     - `aspect`: focal length across over focal length down, in pixels; 1 for square pixels.
     - `center`: the principal point, as shares of the width and the height.
     - `nearest`, `farthest`: depths along the viewing direction between which the sensor measures, in scene units; None
-      is no limit. A hit nearer than the first is invalid; where none is nearer than the second, nothing was met so far.
+      is no limit. A hit before `nearest` is invalid; a ray without a hit before `farthest` met nothing up to there.
     - `max_incidence`: largest angle in radians, within (0, pi/2], between a ray and the normal at which a hit returns.
 
     The defaults are the paper's: 30 degrees, 50 x 50, no limits.

@@ -28,15 +28,15 @@ else:
 class Planner(eqx.Module):
     """Bayesian next-best-view selection (the paper's Algorithm 1) as ask/tell over immutable evidence.
 
-    - `acquisition`: what the view is for; of a plain function of a cloud, a utility, the expected improvement.
-    - `search`: how its expectation over the imagined surfaces is maximised.
+    - `acquisition`: what a view is worth. A plain function of a cloud is a utility, whose expected improvement is sought.
+    - `search`: how the pose that is expected to be worth most is found.
     - `camera`: the sensor whose scans are imagined.
     - `imagination`: the surfaces that are held possible given the evidence.
     - `cost`: of going from the last view to the next; None where it does not count.
     - `capacity`: points of D that are kept, by farthest point sampling beyond it.
     - `max_views`: views for which evidence has room.
 
-    All methods are pure and run under `jit`. They compile once a planner: at the first view, nothing after the second.
+    All methods are pure and run under `jit`. A planner compiles at its first two views, and nothing after them.
     A cloud alone, of no known pose, is evidence too.
 
     **Raises:** `ValueError` for numbers below one, and if the search cannot work with the acquisition or the camera: a

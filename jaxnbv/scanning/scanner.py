@@ -80,13 +80,13 @@ class SensorNoise(eqx.Module):
 
 
 class DepthNoise(eqx.Module):
-    """What triangulation does to a depth image: a disparity is 1/z but for a factor, so noise and rounding are the same
+    """What triangulation does to a depth image: a disparity is 1/z times a constant, so noise and rounding are the same
     at all depths in 1/z, and in z they grow as z^2,
 
         1/z' = step round((1/z + deviation eps) / step),   eps ~ N(0, 1).
 
-    Points and normals are then found as of any depth image, by `PointCloud.from_depth`. Which hits return at all the
-    camera says: its range and `max_incidence`.
+    Points and normals are then found as of any depth image, by `PointCloud.from_depth`. Which hits return at all is
+    up to the camera: its range and `max_incidence`.
 
     - `deviation`, `step`: in 1 / metre; a step of 0 does not round.
     - `scale`: scene units a metre, `frame.scale` where the world is in metres.

@@ -38,7 +38,7 @@ class RandomView(Rule):
 
 
 class UncertaintyView(Rule):
-    """The candidate whose principal ray is the most uncertain of where it ends (Holalkere et al. 2025).
+    """The candidate whose principal ray is the least certain about where it ends (Holalkere et al. 2025).
 
     With the transmittance T(t), the share of the samples whose surface the ray has not entered before t, the value is
     the length of the ray between the first t with T(t) < 1 and the last t with T(t) > 0.05.

@@ -20,7 +20,7 @@ _PLASTIC = 1.324717957244746
 
 
 class Candidates(eqx.Module):
-    """Where the camera may stand, a number of poses that is fixed."""
+    """Where the camera may stand: a fixed number of poses."""
 
     @property
     @abstractmethod

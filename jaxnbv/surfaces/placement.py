@@ -152,7 +152,7 @@ class Upright(ShapePoses):
 
 
 class AsGiven(ShapePoses):
-    """As the bank holds it, but for shift and scale."""
+    """Not turned: as the bank holds it, but for shift and scale."""
 
     def rotations(self, count: int) -> Float[np.ndarray, "m 3 3"]:
         return np.eye(3)[None]

@@ -31,7 +31,7 @@ class Shape(NamedTuple):
 
 
 class ShapeBank(eqx.Module):
-    """Known shapes, each in a frame of its own about its middle, in which shapes of a kind stand alike.
+    """Known shapes, each centred in a frame of its own; shapes of a kind stand alike in theirs.
 
     - `solids`: all of them as one, whose arrays have a leading axis of shapes; None for a bank of none.
     - `extremes`: of each, as of a `Shape`.

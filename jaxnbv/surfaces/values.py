@@ -106,7 +106,7 @@ class OnSurface(ValueSource):
 
 class SeenEmpty(ValueSource):
     """f(z) - c ~ N(value, s^2) with a positive value, at points z that were seen empty: what was not seen beside them
-    is likely to be empty too. Right of thin things such as furniture, wrong of a body whose hidden side is as large as
+    is likely to be empty too. True of thin things such as furniture, false of a body whose hidden side is as large as
     the one that was seen.
 
     - `num_points`: how many, or all where there are fewer; farthest points.

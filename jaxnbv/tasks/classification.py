@@ -169,8 +169,8 @@ class ClassAnswer(Answer):
 
 
 class Sure(Stop):
-    """Stop once the class is known: with this probability given D and given random halves of D too, for a single answer
-    may be sure by chance.
+    """Stop once the class is known: it has this probability given D, and given each of several random halves of D too,
+    since a single answer may be sure by chance.
 
     - `probability`: within (0, 1).
     - `num_resamplings`: how many halves are drawn.

@@ -126,8 +126,8 @@ class ShownArea(Acquisition):
 
 
 class Covered(Stop):
-    """Stop once expected coverage reaches `share`: of the area of the sampled surfaces that the candidates would show,
-    what is not new, as `NewSurface` says.
+    """Stop once this share of what the candidates can show is expected to have been seen: of the area that they would
+    show of the sampled surfaces, the part that is not new to `NewSurface`.
 
     - `share`: within (0, 1].
     - `size`: of `NewSurface`, in scene units.

@@ -31,8 +31,8 @@ _WORKER_ENVIRONMENT = {"JAX_PLATFORMS": "cpu", "OPENBLAS_NUM_THREADS": "1", "OMP
 class ColdestPoint(eqx.Module):
     """The paper's u_H(D) = -min u^(T), a utility for `ExpectedUtilityImprovement`.
 
-    Its Laplacian runs on the host, so search over candidates only, as in the paper. Equal to the last bit whatever the
-    order of the points and the number of workers.
+    Its Laplacian runs on the host, so it has no gradient: search over candidates, as in the paper. Values are equal to
+    the last bit whatever the order of the points and the number of workers.
 
     - `heat`: the `HeatProblem`, or its source alone, (3,) in scene coordinates, with the authors' values for the rest.
       Scenes that differ in the source alone share one compilation.

@@ -105,7 +105,7 @@ class PartAnswer(Answer):
 class Found(Stop):
     """Stop once all parts are found.
 
-    - `points`: predicted points of a part by which it is found.
+    - `points`: a part is found once so many points are predicted to be of it.
     - `parts`: names of those to be found; by default all that the segmenter is asked for, of which the object may lack
       one.
 

@@ -35,9 +35,9 @@ class SoFar(NamedTuple):
 
 
 class Stop(eqx.Module):
-    """A rule that says when no more views are needed: after a view, or before the next is taken, once it is planned.
+    """A rule that says when no more views are needed: after a view, or when the next is planned but not yet taken.
 
-    `plans` says whether it has something to say then.
+    `plans`: whether it is asked about the planned view too.
     """
 
     @property

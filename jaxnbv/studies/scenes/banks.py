@@ -57,7 +57,7 @@ def shape_bank(name: str) -> ShapeBank:
     """A bank that ships.
 
     - `name`: "pyramid", "truck", "household", "parts" or "heat", procedural objects of the training split; or
-      "household-real", pieces of furniture that were modelled by people, see its credits in the README.
+      "household-real", pieces of furniture that were modelled by people, credited in `docs/how_to/known_shapes.md`.
 
     **Raises:** `ValueError` for another name.
     """
