@@ -73,7 +73,7 @@ def _short(app: Sphinx, what: str, name: str, obj: Any, options: Any, given: str
     """Arrays and keys by the names that the code has for them."""
 
     def renamed(text: str | None) -> str | None:
-        text = text and text.replace("jaxlib._jax.Array", "Array")
+        text = text and text.replace("jaxlib._jax.Array", "Array").replace("~jaxtyping.", "").replace("jaxtyping.", "")
         return text and text.replace("Key[Array, ''] | UInt32[Array, '2'] | UInt32[Array, '4']", "PRNGKeyArray")
 
     return renamed(given), renamed(returned)

@@ -1,7 +1,8 @@
-/* A button beside each block of code copies it. */
+/* A button in the corner of each block of code copies it; what a notebook printed has none. */
 document.addEventListener("DOMContentLoaded", () => {
   if (!navigator.clipboard) return;
   for (const block of document.querySelectorAll("div.highlight")) {
+    if (block.closest(".cell_output")) continue;
     const button = document.createElement("button");
     button.className = "copy";
     button.type = "button";
