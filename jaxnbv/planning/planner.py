@@ -28,7 +28,7 @@ else:
 class Planner(eqx.Module):
     """Bayesian next-best-view selection (the paper's Algorithm 1) as ask/tell over immutable evidence.
 
-    - `acquisition`: what a view is worth. A plain function of a cloud is a utility, whose expected improvement is sought.
+    - `acquisition`: what a view is worth. A plain function of a cloud is taken as a utility to improve.
     - `search`: how the pose that is expected to be worth most is found.
     - `camera`: the sensor whose scans are imagined.
     - `imagination`: the surfaces that are held possible given the evidence.
