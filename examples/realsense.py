@@ -1,4 +1,5 @@
-"""Where to hold a RealSense camera next: `python realsense.py`, with `pip install jaxnbv pyrealsense2`.
+"""Where to hold a RealSense camera next: `python examples/realsense.py`, in a clone, after
+`pip install ".[report]" pyrealsense2`.
 
 The depth stream's intrinsics and unit are read from the camera. How your robot or your hand is told to go somewhere,
 and where it then truly is, you fill in: `go_to` takes and gives a 4 x 4 matrix, camera to world, in metres.
