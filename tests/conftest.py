@@ -46,7 +46,6 @@ LONGEST_FIRST = (
     "test_cli.py",
     "test_notebooks.py",
     "test_pages.py",
-    "test_readme.py",
     "test_scan_derivatives.py",
     "test_gradient.py",
     "test_spsr.py",

@@ -1,4 +1,4 @@
-"""The programs of the site's pages run, one a page."""
+"""The programs of the README and of the site's pages run, one a page."""
 
 import dataclasses
 import json
@@ -11,6 +11,7 @@ from types import ModuleType, SimpleNamespace
 import jax
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 import jaxnbv as nbv
@@ -124,6 +125,35 @@ def test_the_program_of_a_page_runs(page, tmp_path, monkeypatch):
         assert np.isfinite(float(names[name].value))
 
 
+# Less of what takes long alone: frequencies of the prior, views, samples, nodes, points, rays and candidates.
+LESS = {
+    "nbv.ScreenedSPSR(),": "nbv.ScreenedSPSR(nbv.GeometricSPSR(0.05, truncation=8)),",
+    "views=5": "views=2",
+    "num_samples=16": "num_samples=4, grid=nbv.Grid(24)",
+    "imagination=nbv.Imagination(": "capacity=512, camera=nbv.Camera(height=12, width=12), imagination=nbv.Imagination(",
+    "nbv.DiscreteSearch(),": "nbv.DiscreteSearch(12),",
+}
+
+
+def test_the_script_of_the_readme_runs(tmp_path, monkeypatch):
+    """As it is written, but for sizes, with a scan that is told by its points alone."""
+    monkeypatch.chdir(tmp_path)
+    trimesh.creation.icosphere().export("spot.obj")
+    script = blocks("../README.md")[0]
+    for text, less in LESS.items():
+        assert script.count(text) == 1
+        script = script.replace(text, less)
+    pose = nbv.look_at((0.0, 0.0, 2.5))
+    seen = nbv.scan(nbv.SDFSurface(nbv.sdf.Sphere(1.0)), nbv.Camera(height=12, width=12), pose)
+    scan = nbv.PointCloud(seen.points, seen.normals, seen.mask)
+    given = {"key": jax.random.key(2), "pose": pose, "scan": scan, "x": np.random.default_rng(0).normal(size=(5, 3))}
+    exec(compile(script, "README.md", "exec"), given)
+    assert len(given["episode"].views) == 2
+    assert given["fields"](given["x"]).shape == (16, 5)
+    assert int(given["evidence"].num_views) == 2
+    assert (tmp_path / "runs" / "spot" / "cloud.ply").exists()
+
+
 def image_of_a_ball(matrix):
     """Of 0.1 metres, on the table z = 0; in millimetres along the camera's axis."""
     matrix = np.asarray(matrix, np.float64)
@@ -214,8 +244,4 @@ def test_the_block_for_a_depth_camera_runs(monkeypatch):
 
 
 def test_no_block_of_the_depth_camera_is_left_out():
-    assert [("nbv.Session(" in block, "depth_mm" in block) for block in blocks("how_to/depth_camera.md")] == [
-        (True, False),
-        (True, False),
-        (False, True),
-    ]
+    assert len(blocks("how_to/depth_camera.md")) == 3
