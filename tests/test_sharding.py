@@ -6,6 +6,7 @@ import textwrap
 
 PROGRAM = """
     import contextlib
+    import dataclasses
 
     import jax
 
@@ -39,18 +40,19 @@ PROGRAM = """
     np.testing.assert_allclose(slopes[0], (inner * y).sum(1), rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(slopes[1], (inner * x[:, None]).sum(0), rtol=1e-5, atol=1e-5)
 
-    camera, ball = nbv.Camera(height=12, width=12), nbv.SDFSurface(nbv.sdf.Sphere(0.8))
-    first = nbv.look_at((0.3, 1.0, 2.3))
-    model = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.02, 0.05), (0.2, 0.2), 12))
+    camera, first, key = nbv.Camera(height=12, width=12), nbv.look_at((0.3, 1.0, 2.3)), jax.random.key(1)
+    # Few values, since each device solves for all of them.
+    model = nbv.ScreenedSPSR(nbv.GeometricSPSR(0.05, truncation=8), (nbv.OutsideBoundary(num_points=40),))
     imagination = nbv.Imagination(model, nbv.Grid(24), num_samples=9)
-    for search in (nbv.DiscreteSearch(20), nbv.HalvingSearch(20)):
-        planner = nbv.Planner(nbv.NewSurface(), search, camera, imagination, capacity=128)
-        proposals = []
-        for devices in (1, 8):
-            with on(devices):
-                evidence = planner.init(first, nbv.scan(ball, camera, first))
-                proposals.append(planner.propose(evidence, jax.random.key(1)))
-        alone, together = proposals
+    planner = nbv.Planner(nbv.NewSurface(), nbv.DiscreteSearch(20), camera, imagination, capacity=64)
+    halving = dataclasses.replace(planner, search=nbv.HalvingSearch(20))
+    evidence = planner.init(first, nbv.scan(nbv.SDFSurface(nbv.sdf.Sphere(0.8)), camera, first))
+    found = []
+    for devices in (1, 8):
+        with on(devices):
+            surfaces = planner.sample(evidence, key)
+            found.append([one.choose(evidence, surfaces, key) for one in (planner, halving)])
+    for alone, together in zip(*found, strict=True):
         assert len(together.value.sharding.device_set) == 8
         np.testing.assert_allclose(together.values, alone.values, rtol=1e-5)
         np.testing.assert_allclose(together.pose.matrix, alone.pose.matrix, atol=1e-4)
