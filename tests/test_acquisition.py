@@ -5,14 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from on_grid import balls
+from opinions import linear, linear_of_batch
 
-from jaxnbv.acquisition import (
-    Acquisition,
-    ExpectedUtilityImprovement,
-    Several,
-    expected_value,
-    preferred_batch_size,
-)
+from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement, Several, expected_value, preferred_batch_size
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate
@@ -20,7 +16,7 @@ from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.imagination import Imagination
 from jaxnbv.networks import pretrained_classifier
 from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Grid, GridSurface, SDFSurface, scan
+from jaxnbv.scanning import Grid, SDFSurface, scan
 from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.search import DiscreteSearch, FarthestView, GradientSearch
@@ -37,10 +33,7 @@ POSES = eqx.tree_at(lambda pose: pose.rotation, POSES, POSES.rotation.at[-1].set
 @pytest.fixture(scope="module")
 def surfaces():
     """Three balls apart from the origin, as samples of a surface."""
-    x = np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1)
-    centres, radii = np.array([[0.2, 0.0, 0.1], [-0.3, 0.3, 0.0], [0.0, -0.2, 0.4]]), [0.9, 0.7, 0.5]
-    values = np.stack([np.linalg.norm(x - c, axis=-1) - r for c, r in zip(centres, radii, strict=True)])
-    return GridSurface.from_values(values.astype(np.float32), 0.0, GRID)
+    return balls(GRID, [0.9, 0.7, 0.5], [[0.2, 0.0, 0.1], [-0.3, 0.3, 0.0], [0.0, -0.2, 0.4]])
 
 
 @pytest.fixture(scope="module")
@@ -166,22 +159,11 @@ class Highest(eqx.Module):
 
 
 @pytest.mark.parametrize("utility", [height, Highest()])
-def test_a_plain_function_is_a_utility_whose_improvement_is_sought(utility, cloud):
-    imagination = Imagination(GeometricSPSR(0.1, truncation=6), Grid(16), num_samples=2)
-    plain, explicit = (
-        Planner(acquisition, DiscreteSearch(6), CAMERA, imagination, capacity=16)
-        for acquisition in (utility, ExpectedUtilityImprovement(utility))
-    )
+def test_a_plain_function_is_a_utility_whose_improvement_is_sought(utility):
+    plain, explicit = (Planner(given, FarthestView(6)) for given in (utility, ExpectedUtilityImprovement(utility)))
     assert plain == explicit
     assert plain.acquisition.num_points is None
-    found, expected = (planner.propose(cloud, jax.random.key(1)) for planner in (plain, explicit))
-    jax.tree.map(np.testing.assert_array_equal, found, expected)
-    assert np.ptp(np.asarray(found.values)) > 1e-3
-
-
-def test_what_is_an_acquisition_stays_it():
-    acquisition = Toy()
-    assert Planner(acquisition, FarthestView(6)).acquisition is acquisition
+    assert Planner(acquisition := Toy(), FarthestView(6)).acquisition is acquisition
 
 
 @pytest.mark.parametrize("given", [Coverage, ExpectedUtilityImprovement, 3, "coverage", None])
@@ -209,17 +191,14 @@ def test_only_heat_is_computed_by_the_host(surfaces, cloud, name):
     assert ("callback" in str(jax.make_jaxpr(step)(cloud, surfaces))) == (name == "heat")
 
 
-def sides(points, normals, mask):
-    """Of clouds, log-probabilities of which side has more, in NumPy."""
-    logits = np.sum(points[..., :2] * mask[..., None], axis=1)
-    return logits - np.log(np.exp(logits).sum(axis=1, keepdims=True))
-
-
-@pytest.mark.parametrize("name", ["coverage", "new surface", "classes", "host"])
-def test_samples_that_a_gpu_takes_together_have_the_same_scores(surfaces, cloud, name, monkeypatch):
-    acquisition = CrossEntropy(HostClassifier(sides, 2)) if name == "host" else ACQUISITIONS[name]
+@pytest.mark.parametrize(
+    "acquisition",
+    [Coverage(), NewSurface(), CrossEntropy(linear), CrossEntropy(HostClassifier(linear_of_batch, 4))],
+    ids=["coverage", "new surface", "classes", "host"],
+)
+def test_samples_that_a_gpu_takes_together_have_the_same_scores(surfaces, cloud, acquisition, monkeypatch):
     alone = expected_value(acquisition, cloud, surfaces, CAMERA, POSES)
-    for module in ("acquisition", "scanning.grid", "tasks.coverage", "tasks.coverage"):
+    for module in ("acquisition", "scanning.grid", "tasks.coverage"):
         monkeypatch.setattr(f"jaxnbv.{module}.on_cpu", lambda: False)
     assert samples_at_once(CAMERA, POSES) > 3
     together = expected_value(acquisition, cloud, surfaces, CAMERA, POSES)

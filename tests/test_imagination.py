@@ -23,7 +23,6 @@ from jaxnbv import (
     InputError,
     OutsideBoundary,
     Planner,
-    RandomView,
     ScreenedSPSR,
     SDFSurface,
     SurfaceModel,
@@ -48,13 +47,10 @@ def test_the_papers_model_has_its_published_values_and_is_not_carved():
         assert jnp.allclose(getattr(paper.model, name), value), name
 
 
-@pytest.mark.parametrize("side", [2.5, 1.25])
-def test_the_default_model_knows_the_box_and_carves_by_it(side):
-    screened = preset("screened", side)
-    assert isinstance(screened.model, ScreenedSPSR)
-    assert screened.carving == Carving(Box.cube(side))
-    (volume,) = (source.volume for source in screened.model.values if hasattr(source, "volume"))
-    assert volume == Box.cube(side)
+@pytest.mark.parametrize(("given", "side"), [({"longest_side": 1.25}, 1.25), ({"volume": Box.cube(1.0)}, 1.0)])
+def test_the_default_model_knows_the_box_and_carves_by_it(given, side):
+    screened = preset("screened", **given)
+    assert screened.carving.volume == screened.model.values[0].volume == Box.cube(side)
 
 
 def test_lengths_are_in_proportion_to_the_object():
@@ -71,12 +67,6 @@ def test_of_a_solid_body_nothing_follows_from_what_was_seen_empty():
     assert kinds == [["OutsideBoundary", "OnSurface", "SeenEmpty"], ["OutsideBoundary", "OnSurface"]]
 
 
-def test_a_volume_of_ones_own_is_that_of_both():
-    own = preset("screened", volume=Box.cube(1.0))
-    assert own.carving.volume == own.model.values[0].volume == Box.cube(1.0)
-    assert jnp.array_equal(own.model.base.lengthscale, ScreenedSPSR().base.lengthscale)
-
-
 def test_quick_surfaces_have_fewer_frequencies():
     for name in MODELS:
         full, quick = (preset(name, quick=quick).model for quick in (False, True))
@@ -84,16 +74,14 @@ def test_quick_surfaces_have_fewer_frequencies():
         assert truncations[1] < truncations[0]
 
 
-def test_the_preset_is_the_default():
+def test_the_preset_is_the_default_and_another_name_is_refused():
     assert eqx.tree_equal(preset(), Imagination())
-    assert Planner(Coverage(), RandomView(), imagination=preset("paper")).imagination.carving is None
-
-
-def test_another_name_is_refused():
-    with pytest.raises(InputError, match=r"no model 'mine': choose from screened, paper"):
-        preset("mine")
-    with pytest.raises(InputError, match=r"longest side is -1\.0"):
-        preset("screened", -1.0)
+    for message, wrong in {
+        r"no model 'mine': choose from screened, paper": ("mine",),
+        r"-1\.0": ("screened", -1.0),
+    }.items():
+        with pytest.raises(InputError, match=message):
+            preset(*wrong)
 
 
 RADII = 0.25 + 0.15 * np.arange(8)
@@ -176,16 +164,15 @@ def test_a_posterior_at_hand_is_not_asked_for_again():
 
 def test_scans_of_samples_end_at_the_surroundings():
     wall = Surroundings((sdf.Cuboid([0.1, 1.0, 1.0]).translate([1.4, 0.0, -0.5]),))
-    for surroundings in (None, wall):
-        imagination = balls(surroundings=surroundings)
-        surfaces = imagination.sample(SCANS[0], KEY)
-        found = imagination.scan(surfaces, CAMERA, POSES)
-        barrier = None if surroundings is None else wall.barrier(CAMERA, POSES)
-        expected = scan_samples(surfaces, CAMERA, POSES, barrier)
-        np.testing.assert_array_equal(found.mask, expected.mask)
-        np.testing.assert_allclose(found.points, expected.points, atol=1e-5)
-        assert found.mask[:, 0].any()
-        assert found.mask[:, 1].any() == (surroundings is None)
+    imagination = balls(surroundings=wall)
+    surfaces = imagination.sample(SCANS[0], KEY)
+    found = imagination.scan(surfaces, CAMERA, POSES)
+    free, expected = (scan_samples(surfaces, CAMERA, POSES, b) for b in (None, wall.barrier(CAMERA, POSES)))
+    np.testing.assert_array_equal(found.mask, expected.mask)
+    np.testing.assert_allclose(found.points, expected.points, atol=1e-5)
+    assert found.mask[:, 0].any()
+    assert free.mask[:, 1].any()
+    assert not found.mask[:, 1].any()
 
 
 def test_another_box_takes_the_place_of_the_default_one_alone():
@@ -207,24 +194,22 @@ def test_another_box_takes_the_place_of_the_default_one_alone():
 
 
 @pytest.mark.parametrize("made_by", [balls(None), dataclasses.replace(balls(), grid=Grid(26, 1.5))])
-@pytest.mark.parametrize(
-    "use",
-    [
-        lambda own, evidence: own.known(evidence),
-        lambda own, evidence: own.posterior(evidence),
-        lambda own, evidence: own.sample(evidence, KEY),
-        lambda own, evidence: own.carve(evidence, jnp.zeros((26,) * 3)),
-        lambda own, evidence: own.mean(evidence),
-        lambda own, evidence: own.probability_inside(evidence),
-        lambda own, evidence: own.mean_mesh(evidence),
-        lambda own, evidence: own.observe(evidence, POSES[1], SCANS[1], CAMERA),
-        lambda own, evidence: own.record(evidence, POSES[1], SCANS[1], CAMERA),
-    ],
-)
-def test_evidence_of_another_grid_is_refused(made_by, use):
-    with pytest.raises(InputError, match=r"surfaces are carved on Grid\(resolution=26, half_extent=1\.6\)"):
-        use(balls(), seen(made_by))
-    use(balls(), seen(balls()))
+def test_evidence_of_another_grid_is_refused(made_by):
+    own, evidence, fits = balls(), seen(made_by), seen(balls())
+    for use in (
+        own.known,
+        own.posterior,
+        lambda evidence: own.sample(evidence, KEY),
+        lambda evidence: own.carve(evidence, jnp.zeros((26,) * 3)),
+        own.mean,
+        own.probability_inside,
+        own.mean_mesh,
+        lambda evidence: own.observe(evidence, POSES[1], SCANS[1], CAMERA),
+        lambda evidence: own.record(evidence, POSES[1], SCANS[1], CAMERA),
+    ):
+        with pytest.raises(InputError, match=r"surfaces are carved on Grid\(resolution=26, half_extent=1\.6\)"):
+            use(evidence)
+        use(fits)
 
 
 def test_where_nothing_is_carved_evidence_of_any_grid_will_do():

@@ -130,7 +130,7 @@ LESS = {
     "nbv.ScreenedSPSR(),": "nbv.ScreenedSPSR(nbv.GeometricSPSR(0.05, truncation=8)),",
     "views=5": "views=2",
     "num_samples=16": "num_samples=4, grid=nbv.Grid(24)",
-    "imagination=nbv.Imagination(": "capacity=512, camera=nbv.Camera(height=12, width=12), imagination=nbv.Imagination(",
+    "nbv.NewSurface(),": "nbv.NewSurface(), capacity=512, camera=nbv.Camera(height=12, width=12),",
     "nbv.DiscreteSearch(),": "nbv.DiscreteSearch(12),",
 }
 

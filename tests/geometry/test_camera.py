@@ -1,52 +1,193 @@
-"""Camera, poses, look_at and the Fibonacci sphere, against trigonometry by hand."""
+"""Cameras of any intrinsics against the pinhole formula in float64, their range and incidence; poses, look_at, matrices
+and the Fibonacci sphere."""
 
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
+from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
+from jaxnbv.scanning import Carving, Grid, SDFSurface, scan
+from jaxnbv.scanning.sdf import Cuboid, Sphere
+from jaxnbv.viz.scene import frustum
 
 coordinate = st.floats(-3.0, 3.0, width=32)
 vector = st.tuples(coordinate, coordinate, coordinate)
+# Of few sizes, since each is compiled for.
+sizes = st.sampled_from([2, 7, 60])
+lengths = st.floats(5.0, 500.0)
+shares = st.floats(0.05, 0.95)
+matrices = st.tuples(sizes, sizes, lengths, lengths, shares, shares)
 
 
-def angle(a, b):
-    return math.acos(np.clip(np.dot(a, b) / np.linalg.norm(a) / np.linalg.norm(b), -1.0, 1.0))
+def camera_and_matrix(given):
+    width, height, fx, fy, x, y = given
+    matrix = np.array([[fx, 0.0, x * width - 0.5], [0.0, fy, y * height - 0.5], [0.0, 0.0, 1.0]])
+    return Camera.from_intrinsics(matrix, height, width), matrix
 
 
-def test_field_of_view_is_the_vertical_angle_between_the_images_edges():
-    """The centres of the first and last of n rows lie at the share (n - 1)/n of the edges' tangent."""
-    camera = Camera(fov=math.radians(30.0), height=50, width=9)
-    _, rays = camera.rays(look_at((0.0, 0.0, 2.5)))
-    rays = np.asarray(rays, dtype=np.float64).reshape(50, 9, 3)
-    expected = 2 * math.atan(49 / 50 * math.tan(math.radians(15.0)))
-    assert angle(rays[0, 4], rays[-1, 4]) == pytest.approx(expected, abs=1e-5)
-    expected = 2 * math.atan(8 / 50 * math.tan(math.radians(15.0)))  # eight square pixels across
-    a, b = rays[24, 0] + rays[25, 0], rays[24, 8] + rays[25, 8]
-    assert angle(a, b) == pytest.approx(expected, abs=1e-5)
+@settings(max_examples=50, deadline=None)
+@given(matrices)
+def test_rays_go_through_the_pixels_of_the_intrinsic_matrix(values):
+    camera, matrix = camera_and_matrix(values)
+    directions = np.asarray(camera.pixel_directions(), np.float64)
+    seen = directions @ matrix.T
+    column, row = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    np.testing.assert_allclose(seen[:, 0], column.ravel(), atol=1e-3)
+    np.testing.assert_allclose(seen[:, 1], row.ravel(), atol=1e-3)
+    np.testing.assert_allclose(camera.intrinsics, matrix, rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(camera.to_pixels(directions[:, :2]), seen[:, :2] + 0.5, atol=2e-3)
 
 
-def test_rays_leave_the_sensor_with_unit_length_and_the_middle_one_goes_forward():
-    camera, pose = Camera(height=5, width=7), look_at((0.8, 0.9, 2.2), target=(0.1, -0.2, 0.3))
-    origins, directions = camera.rays(pose)
-    assert origins.shape == directions.shape == (35, 3) == (camera.num_rays, 3)
-    np.testing.assert_allclose(origins, np.tile([0.8, 0.9, 2.2], (35, 1)), atol=1e-7)
-    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-6)
-    np.testing.assert_allclose(directions[17], pose.forward, atol=1e-6)
+@settings(max_examples=50, deadline=None)
+@given(matrices, st.integers(1, 7))
+def test_a_strided_camera_has_the_rays_of_every_so_many_th_pixel(values, stride):
+    camera, _ = camera_and_matrix(values)
+    rows = slice(stride // 2, None, stride)
+    every = np.asarray(camera.pixel_directions()).reshape(camera.height, camera.width, 3)[rows, rows]
+    if every.size == 0:
+        with pytest.raises(InputError, match=f"stride of {stride} leaves none"):
+            camera.strided(stride)
+        return
+    strided = camera.strided(stride)
+    assert (strided.height, strided.width) == every.shape[:2]
+    np.testing.assert_allclose(strided.pixel_directions(), every.reshape(-1, 3), rtol=1e-4, atol=1e-5)
 
 
-def test_look_at_axes_are_those_of_opencv():
+@settings(max_examples=50, deadline=None)
+@given(matrices, sizes, sizes)
+def test_a_resized_camera_sees_the_same_and_the_frustum_is_its_border(values, height, width):
+    camera, matrix = camera_and_matrix(values)
+    resized = camera.resized(height, width)
+    assert (resized.height, resized.width) == (height, width)
+    np.testing.assert_allclose(resized.edges, camera.edges, rtol=1e-5)
+    expected = [
+        (-0.5 - matrix[0, 2]) / matrix[0, 0],
+        (-0.5 - matrix[1, 2]) / matrix[1, 1],
+        (camera.width - 0.5 - matrix[0, 2]) / matrix[0, 0],
+        (camera.height - 0.5 - matrix[1, 2]) / matrix[1, 1],
+    ]
+    np.testing.assert_allclose(camera.edges, expected, rtol=1e-5, atol=1e-7)
+    corners = frustum(Pose(np.eye(3), np.zeros(3)), camera, 2.0)[:4, 1]
+    np.testing.assert_allclose(corners[0], [2 * expected[0], 2 * expected[1], 2.0], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(corners[2], [2 * expected[2], 2 * expected[3], 2.0], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        ([[100.0, 3.0, 30.0], [0.0, 100.0, 20.0], [0.0, 0.0, 1.0]], "skew of 3"),
+        ([[-100.0, 0.0, 30.0], [0.0, 100.0, 20.0], [0.0, 0.0, 1.0]], "positive focal lengths"),
+        ([[100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [30.0, 20.0, 1.0]], "positive focal lengths"),
+        ([[100.0, 0.0, 320.0], [0.0, 100.0, 240.0], [0.0, 0.0, 1.0]], r"\(320.0, 240.0\) lies outside .* 60 x 40"),
+    ],
+)
+def test_matrices_that_are_none_of_this_image_are_refused(matrix, message):
+    with pytest.raises(InputError, match=message):
+        Camera.from_intrinsics(np.array(matrix), 40, 60)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"nearest": 2.0, "farthest": 1.0}, "from 2.0 to 1.0"),
+        ({"nearest": -1.0}, "from -1.0"),
+        ({"max_incidence": 2.0}, "angle of incidence is 2.0"),
+        ({"aspect": 0.0}, "aspect of the pixels is 0.0"),
+        ({"fov": 0.0}, "field of view is 0.0"),
+        ({"fov": math.pi}, "field of view is 3.14"),
+        ({"fov": math.nan}, "fov is nan; it must be a finite number"),
+        ({"height": 0}, "at least one"),
+        ({"width": -1}, "at least one"),
+    ],
+)
+def test_cameras_that_cannot_be_are_refused(settings, message):
+    with pytest.raises(InputError, match=message):
+        Camera(**settings)
+
+
+def test_a_scan_tells_what_lies_in_range_and_is_not_aslant():
+    """A ball before a wall: analytic depths and angles, ray by ray."""
+    surface = SDFSurface(Sphere(0.5) | Cuboid([1.2, 1.2, 0.1]).translate([0.0, 0.0, -1.0]))
     pose = look_at((0.0, 0.0, 2.5))
-    np.testing.assert_allclose(pose.rotation, [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]], atol=1e-7)
-    np.testing.assert_allclose(pose.to_scene(jnp.array([[0.5, 0.25, 2.0]])), [[0.5, -0.25, 0.5]], atol=1e-6)
-    pose = look_at((3.0, 0.0, 0.0), target=(1.0, 0.0, 0.0), up=(0.0, 0.0, 2.0))
-    np.testing.assert_allclose(pose.rotation.T, [[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]], atol=1e-7)
+    whole = Camera(math.radians(50.0), 40, 40)
+    every = scan(surface, whole, pose)
+    depth = 2.5 - np.asarray(every.points)[:, 2]
+    _, rays = whole.rays(pose)
+    cosine = -np.sum(np.asarray(every.normals) * np.asarray(rays), axis=1)
+    hit = np.asarray(every.mask)
+    limited = Camera(math.radians(50.0), 40, 40, nearest=2.1, farthest=3.0, max_incidence=math.radians(60.0))
+    found = scan(surface, limited, pose)
+    expected = hit & (depth >= 2.1) & (depth <= 3.0) & (cosine >= 0.5)
+    for share in (expected, hit & (depth < 2.1), hit & (depth > 3.0), hit & (depth < 3.0) & (cosine < 0.5)):
+        assert 10 < share.sum() < 1500
+    np.testing.assert_array_equal(found.mask, expected)
+    np.testing.assert_array_equal(found.missed, ~hit | (hit & (depth > 3.0)))
+    np.testing.assert_array_equal(np.asarray(found.points)[expected], np.asarray(every.points)[expected])
+    assert not np.asarray(found.points)[~expected].any()
+
+
+def test_what_a_limited_sensor_missed_is_empty_as_far_as_it_reaches():
+    grid, pose, see = Grid(24), look_at((0.0, 0.0, 2.5)), eqx.filter_jit(Carving.seen_empty)
+    nothing = SDFSurface(Sphere(0.01).translate([0.0, 1.4, 0.0]))
+    seen = {
+        farthest: np.asarray(see(Carving(), grid, pose, scan(nothing, camera, pose), camera))
+        for farthest, camera in ((far, Camera(0.9, 48, 48, farthest=far)) for far in (2.5, None))
+    }
+    deep = 2.5 - grid.axis
+    assert seen[None].any(axis=(0, 1))[deep > 3.0].any()
+    assert not seen[2.5].any(axis=(0, 1))[deep > 2.5 - grid.spacing].any()
+    near = seen[2.5].any(axis=(0, 1))[deep < 2.5 - 2 * grid.spacing]
+    np.testing.assert_array_equal(near, seen[None].any(axis=(0, 1))[deep < 2.5 - 2 * grid.spacing])
+
+
+rotations = st.tuples(st.integers(0, 2**32 - 1), st.lists(st.floats(-3, 3, width=32), min_size=3, max_size=3))
+
+
+@settings(max_examples=50, deadline=None)
+@given(rotations)
+def test_poses_to_matrices_and_back_in_both_conventions(given):
+    seed, position = given
+    rotation = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, position
+    np.testing.assert_allclose(Pose.from_matrix(matrix).matrix, matrix, atol=1e-6)
+    # A camera of OpenGL looks along its own -z, and its y is up.
+    turned = Pose.from_matrix(matrix, "opengl")
+    np.testing.assert_allclose(turned.forward, -rotation[:, 2], atol=1e-6)
+    np.testing.assert_allclose(turned.rotation[:, 1], -rotation[:, 1], atol=1e-6)
+    np.testing.assert_allclose(turned.rotation[:, 0], rotation[:, 0], atol=1e-6)
+    batch = Pose.from_matrix(np.stack([matrix, np.eye(4)]))
+    assert batch.matrix.shape == (2, 4, 4)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "convention", "message"),
+    [
+        (np.eye(4) + np.eye(4, k=-3), "opencv", r"last row .* not \(0, 0, 0, 1\)"),
+        (2.0 * np.eye(4), "opencv", "last row"),
+        (np.diag([2.0, 2.0, 2.0, 1.0]), "opencv", "not a rotation"),
+        (np.eye(4), "ros", "'ros'; give one of opencv, opengl"),
+    ],
+)
+def test_matrices_that_are_no_poses_are_refused(matrix, convention, message):
+    with pytest.raises(InputError, match=message):
+        Pose.from_matrix(matrix, convention)
+
+
+def test_a_pose_s_matrix_moves_points_as_the_pose_does():
+    pose = look_at((0.8, 0.9, 2.2), (0.1, 0.2, 0.3))
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    moved = np.concatenate([points, np.ones((5, 1))], axis=1) @ np.asarray(pose.matrix, np.float64).T
+    np.testing.assert_allclose(pose.to_scene(jnp.asarray(points, jnp.float32)), moved[:, :3], atol=1e-5)
 
 
 @settings(max_examples=100, deadline=None)
@@ -75,20 +216,6 @@ def test_looking_along_up_is_defined(side, tilt):
     np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-5)
     np.testing.assert_allclose(rotation[:, 2], [-tilt / 2.5, -side, 0.0], atol=1e-5)
     assert np.linalg.det(rotation) == pytest.approx(1.0, abs=1e-5)
-
-
-def test_batches_equal_single_poses():
-    positions = np.random.default_rng(0).normal(size=(2, 3, 3))
-    camera, poses = Camera(height=3, width=4), look_at(positions)
-    origins, directions = camera.rays(poses)
-    assert poses.rotation.shape == (2, 3, 3, 3)
-    assert directions.shape == (2, 3, 12, 3)
-    for i in np.ndindex(2, 3):
-        alone = look_at(positions[i])
-        np.testing.assert_allclose(poses[i].rotation, alone.rotation, atol=1e-6)
-        np.testing.assert_allclose(poses[i].forward, alone.forward, atol=1e-6)
-        for batched, single in zip((origins[i], directions[i]), camera.rays(alone), strict=True):
-            np.testing.assert_allclose(batched, single, atol=1e-6)
 
 
 def test_look_at_and_rays_run_under_jit_and_are_differentiable():
@@ -123,17 +250,19 @@ def test_a_pose_that_is_not_a_rotation_is_refused_and_so_is_one_of_a_batch(rotat
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("make", "arguments", "message"),
     [
-        (((1.0, 2.0, 3.0), (1.0, 2.0, 3.0)), "apart from its target"),
-        (((np.nan, 0.0, 1.0),), "finite"),
-        (((0.0, 0.0, 1e30),), r"distance from its target is a finite number, got position \[0"),
-        (((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "up direction"),
+        (look_at, ((1.0, 2.0, 3.0), (1.0, 2.0, 3.0)), "apart from its target"),
+        (look_at, ((np.nan, 0.0, 1.0),), "finite"),
+        (look_at, ((0.0, 0.0, 1e30),), r"distance from its target is a finite number, got position \[0"),
+        (look_at, ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "up direction"),
+        (fibonacci_sphere, (0, 1.0), "Fibonacci"),
+        (fibonacci_sphere, (5, 0.0), "radius"),
     ],
 )
-def test_look_at_without_a_direction_is_refused(arguments, message):
+def test_places_without_a_direction_are_refused(make, arguments, message):
     with pytest.raises(ValueError, match=message):
-        look_at(*arguments)
+        make(*arguments)
 
 
 @pytest.mark.parametrize("count", [12, 120, 1000])
@@ -150,12 +279,6 @@ def test_fibonacci_sphere_is_even(count):
     probes = np.random.default_rng(1).normal(size=(2000, 3))
     probes /= np.linalg.norm(probes, axis=1, keepdims=True)
     assert np.linalg.norm(probes[:, None] - unit[None], axis=-1).min(axis=1).max() < bound
-
-
-@pytest.mark.parametrize(("count", "radius"), [(0, 1.0), (-3, 1.0), (5, 0.0), (5, -1.0)])
-def test_fibonacci_sphere_refuses_nothing(count, radius):
-    with pytest.raises(ValueError, match=r"Fibonacci|radius"):
-        fibonacci_sphere(count, radius)
 
 
 def test_a_batch_of_poses_is_iterated_once():

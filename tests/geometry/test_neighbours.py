@@ -84,18 +84,6 @@ def test_second_derivatives(x64):
         np.testing.assert_allclose(hessian(x[0]), 2 * np.eye(3), atol=1e-12)
 
 
-def test_under_vmap_and_jit(x64):
-    rng = np.random.default_rng(5)
-    x, points = rng.normal(size=(4, 6, 3)), rng.normal(size=(4, 19, 3))
-    mask = rng.random((4, 19)) < 0.5
-    mask[0, 5:] = False
-    mask[:, 3] = True
-    f = jax.jit(jax.vmap(lambda x, points, mask: nearest_squared_distance(x, cloud_of(points, mask))))
-    found = f(jnp.asarray(x), jnp.asarray(points), jnp.asarray(mask))
-    for i in range(4):
-        np.testing.assert_allclose(found[i], brute_force(x[i], points[i][mask[i]]), atol=1e-13)
-
-
 @pytest.mark.parametrize("count", [2, 3, 200, 700])
 def test_the_spacing_is_the_median_distance_between_neighbours(count):
     """Of some of many points: within a tenth."""

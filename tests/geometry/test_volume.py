@@ -34,13 +34,6 @@ def test_box_distances_against_the_nearest_of_many_surface_points(x64):
     np.testing.assert_allclose(OFF_CENTRE(surface), 0.0, atol=1e-12)
 
 
-def test_a_box_takes_points_of_any_leading_shape():
-    x = RNG.uniform(-2.0, 2.0, (4, 5, 3)).astype(np.float32)
-    flat = OFF_CENTRE(x.reshape(-1, 3))
-    np.testing.assert_array_equal(OFF_CENTRE(x), flat.reshape(4, 5))
-    np.testing.assert_allclose(OFF_CENTRE(x[0, 0]), flat[0], rtol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("low", "high"),
     [

@@ -23,6 +23,11 @@ def linear_in_numpy(points, normals):
     return p / p.sum()
 
 
+def linear_of_batch(points, normals, mask):
+    """`linear` as it is asked on the host."""
+    return np.log([linear_in_numpy(p[m], n[m]) for p, n, m in zip(points, normals, mask, strict=True)])
+
+
 def drawn_cloud(rng, count, capacity, center=(0.0, 0.0, 0.0)):
     normals = rng.normal(size=(count, 3))
     points = np.asarray(center) + 0.5 * rng.normal(size=(count, 3))
