@@ -19,8 +19,8 @@ from jaxnbv.surfaces.known_shapes import kind_of, systematic_resampling
 from jaxnbv.surfaces.registration import Prior, Seen, register
 
 CAMERA = nbv.Camera(height=40, width=40, fov=1.0)
-QUICK = nbv.ScreenedSPSR(GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=16))
-RESIDUAL = nbv.ScreenedSPSR(GeometricSPSR(0.02, truncation=16), (nbv.OnSurface(),))
+QUICK = nbv.ScreenedSPSR(GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=8))
+RESIDUAL = nbv.ScreenedSPSR(GeometricSPSR(0.02, truncation=12), (nbv.OnSurface(),))
 GRID = nbv.Grid(40)
 
 
@@ -45,20 +45,30 @@ ARMS = (0.35, 0.5, 0.65, 0.8)
 BANK = nbv.ShapeBank.of([corner(arm) for arm in ARMS], [f"arm {arm}" for arm in ARMS])
 
 
-def filling(solid, rotation, bank, index):
-    """The solid turned so, as large as the box has room for and in its middle, by a mesh of its own."""
-    mesh = nbv.mesh_from_sdf(solid, nbv.Grid(120, 2.0))
-    turned = mesh.frame.to_world(mesh.vertices) @ rotation.as_matrix().T
+def filling(arm, rotation):
+    """The solid turned so, as large as the box has room for and in its middle, by its corners; its scale and shift."""
+    boxes = np.array([[0.0, 0.0, 0.0], [0.6, 0.5, 0.1]]), np.array([[0.9, 0.3, 0.4], [0.2, arm, 0.25]])
+    signs = np.array(list(np.ndindex(2, 2, 2))) * 2.0 - 1.0
+    turned = (boxes[0][:, None] + signs * boxes[1][:, None]).reshape(-1, 3) @ rotation.as_matrix().T
     low, high = turned.min(axis=0), turned.max(axis=0)
     scale = 2.5 / (high - low).max()
-    angle = float(np.linalg.norm(rotation.as_rotvec()))
-    placed = solid.rotate(rotation.as_rotvec(), angle) if angle else solid
-    return placed.scale(scale).translate(-0.5 * scale * (low + high)), scale, -0.5 * scale * (low + high)
+    shift = -0.5 * scale * (low + high)
+    placed = corner(arm).rotate(rotation.as_rotvec(), float(np.linalg.norm(rotation.as_rotvec())))
+    return nbv.SDFSurface(placed.scale(scale).translate(shift)), scale, shift
+
+
+# Nearly none, which is a rotation too.
+UPRIGHT = Rotation.from_rotvec([0.0, 1e-6, 0.0])
+
+
+def model(bank=BANK, **changed):
+    """Alike in most tests, which then share what was compiled."""
+    return nbv.KnownShapes(bank, RESIDUAL, unknown=QUICK, num_starts=2048, **changed)
 
 
 def evidence_of(surface, positions, noise=0.005):
     planner = nbv.Planner(
-        nbv.Coverage(), camera=CAMERA, imagination=nbv.Imagination(grid=GRID), capacity=1024, max_views=4
+        nbv.Coverage(), camera=CAMERA, imagination=nbv.Imagination(grid=GRID), capacity=512, max_views=4
     )
     evidence = None
     for index, position in enumerate(positions):
@@ -77,16 +87,15 @@ def planted():
     found = []
     for seed in range(8):
         rotation, index = Rotation.random(random_state=seed), seed % len(ARMS)
-        solid, scale, shift = filling(corner(ARMS[index]), rotation, BANK, index)
-        seen = eqx.filter_jit(Seen.of)(evidence_of(nbv.SDFSurface(solid), AROUND))
-        hypotheses = register(BANK, Prior(nbv.FreeRotation(), nbv.Box()), seen, 2048)
-        found.append((index, rotation, scale, shift, hypotheses))
+        surface, _, shift = filling(ARMS[index], rotation)
+        seen = Seen.of(evidence_of(surface, AROUND))
+        found.append((index, rotation, shift, register(BANK, Prior(nbv.FreeRotation(), nbv.Box()), seen, 2048)))
     return found
 
 
 def test_planted_poses_are_recovered(planted):
     turned, moved = [], []
-    for _, rotation, _, shift, found in planted:
+    for _, rotation, shift, found in planted:
         off = Rotation.from_matrix(np.asarray(found.placement.rotation[0])) * rotation.inv()
         turned.append(np.degrees(off.magnitude()))
         moved.append(np.linalg.norm(np.asarray(found.placement.shift[0]) - shift))
@@ -124,9 +133,9 @@ def test_what_was_seen_empty_is_among_what_shapes_are_fitted_to():
     evidence = evidence_of(nbv.SDFSurface(Cuboid([0.5, 0.3, 0.4])), AROUND)
     seen = Seen.of(evidence)
     assert bool(seen.is_empty.all())
-    nodes = np.argwhere(np.asarray(evidence.seen_empty)) * GRID.spacing - GRID.half_extent
-    apart = np.linalg.norm(np.asarray(seen.empty)[:, None] - nodes, axis=-1).min(axis=1)
-    np.testing.assert_allclose(apart, 0.0, atol=1e-5)
+    node = (np.asarray(seen.empty, np.float64) + GRID.half_extent) / GRID.spacing
+    np.testing.assert_allclose(node, np.rint(node), atol=1e-4)
+    assert np.asarray(evidence.seen_empty)[tuple(np.rint(node).astype(int).T)].all()
     nothing = dataclasses.replace(evidence, seen_empty=None, grid=None)
     assert not bool(Seen.of(nothing).is_empty.any())
 
@@ -134,10 +143,6 @@ def test_what_was_seen_empty_is_among_what_shapes_are_fitted_to():
 def test_shapes_of_a_kind_differ_by_their_number():
     kinds = {"chair 3": "chair", "office chair 12": "office chair", "chair": "chair", "arm 0.5": "arm 0.5", " 7": " 7"}
     assert {name: kind_of(name) for name in kinds} == kinds
-
-
-def model(bank=BANK, **changed):
-    return nbv.KnownShapes(bank, RESIDUAL, unknown=QUICK, num_starts=1024, **changed)
 
 
 def test_where_no_shape_fits_none_is_the_answer():
@@ -161,14 +166,16 @@ def test_without_shapes_the_model_is_the_unknown_one_to_the_bit():
 
 def test_of_one_exact_shape_samples_are_that_shape_to_the_noise():
     """On the sides that no view has seen too: points of the true surface lie within the noise of each sample's."""
-    solid, _, _ = filling(corner(0.65), Rotation.from_rotvec([0.0, 0.0, 0.0]), BANK, 2)
-    truth = nbv.mesh_from_sdf(solid, nbv.Grid(100, 1.4))
+    surface, _, _ = filling(0.65, UPRIGHT)
+    truth = nbv.mesh_from_sdf(surface.sdf, nbv.Grid(100, 1.4))
     points = jnp.asarray(truth.frame.to_world(truth.sample_points(jax.random.key(1), 400)), jnp.float32)
-    evidence = evidence_of(nbv.SDFSurface(solid), AROUND[:2])
-    known = dataclasses.replace(model(BANK.chosen([2])), poses=nbv.AsGiven())
-    posterior = known.condition(evidence)
+    posterior = model().condition(evidence_of(surface, AROUND[:2]))
+    # Held for certain, in the best of the ways that it was found to stand.
+    best = int(np.flatnonzero(np.asarray(posterior.found.shape) == 2)[0])
+    certain = jnp.zeros_like(posterior.weights).at[best].set(1.0)
+    posterior = eqx.tree_at(lambda p: p.weights, posterior, certain)
     assert posterior.hypotheses[0].name == "arm 0.65"
-    fields = posterior.sample(jax.random.key(0), 6)
+    fields = posterior.sample(jax.random.key(0), 4)
     slope = jnp.linalg.norm(fields.gradient(points), axis=-1)
     away = np.abs(np.asarray(fields(points) / slope))
     # The scale and shift are estimated from noise of 0.005; the residual's own deviation is of that order.
@@ -177,7 +184,7 @@ def test_of_one_exact_shape_samples_are_that_shape_to_the_noise():
 
 
 def test_weights_are_tempered_fits():
-    evidence = evidence_of(nbv.SDFSurface(filling(corner(0.5), Rotation.identity(), BANK, 1)[0]), AROUND[:1])
+    evidence = evidence_of(filling(0.5, UPRIGHT)[0], AROUND[:1])
     posterior = model(sharpness=7.0, unknown_misfit=0.4).condition(evidence)
     found = posterior.found
     energy = np.append(np.where(found.is_mode, np.exp(-7.0 * np.asarray(found.misfit, np.float64)), 0.0), np.exp(-2.8))
@@ -200,7 +207,7 @@ def test_systematic_resampling_draws_each_as_often_as_its_weight_says(weights, s
 
 @pytest.mark.slow
 def test_the_same_evidence_has_the_same_hypotheses_and_nothing_is_compiled_twice(compilations):
-    surface = nbv.SDFSurface(filling(corner(0.5), Rotation.identity(), BANK, 1)[0])
+    surface, _, _ = filling(0.5, UPRIGHT)
     imagination = dataclasses.replace(nbv.Imagination(QUICK, GRID, 3).knowing(BANK, nbv.AsGiven()))
     imagination = dataclasses.replace(
         imagination, model=dataclasses.replace(imagination.model, residual=RESIDUAL, num_starts=64)
