@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnbv.geometry.cloud import PointCloud
+import jaxnbv as nbv
 
 WEIGHTS = np.random.default_rng(7).normal(size=(4, 6)) * 3.0
 
@@ -31,11 +31,11 @@ def linear_of_batch(points, normals, mask):
 def drawn_cloud(rng, count, capacity, center=(0.0, 0.0, 0.0)):
     normals = rng.normal(size=(count, 3))
     points = np.asarray(center) + 0.5 * rng.normal(size=(count, 3))
-    return PointCloud.from_arrays(points, normals / np.linalg.norm(normals, axis=1, keepdims=True), capacity)
+    return nbv.PointCloud.from_arrays(points, normals / np.linalg.norm(normals, axis=1, keepdims=True), capacity)
 
 
 def nothing(capacity):
-    return PointCloud(jnp.zeros((capacity, 3)), jnp.zeros((capacity, 3)), jnp.zeros(capacity, bool))
+    return nbv.PointCloud(jnp.zeros((capacity, 3)), jnp.zeros((capacity, 3)), jnp.zeros(capacity, bool))
 
 
 class Linear(eqx.Module):

@@ -8,25 +8,17 @@ import pytest
 from on_grid import balls
 from opinions import linear, linear_of_batch
 
-from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement, Several, expected_value, preferred_batch_size
-from jaxnbv.checks import InputError
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud, concatenate
-from jaxnbv.geometry.pose import fibonacci_sphere, look_at
-from jaxnbv.imagination import Imagination
+import jaxnbv as nbv
+from jaxnbv.acquisition import preferred_batch_size
 from jaxnbv.networks import pretrained_classifier
-from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Grid, SDFSurface, scan
+from jaxnbv.scanning import scan
 from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.scanning.sdf import Sphere
-from jaxnbv.search import DiscreteSearch, FarthestView, GradientSearch
-from jaxnbv.surfaces import GeometricSPSR, ScreenedSPSR
-from jaxnbv.tasks import ColdestPoint, Coverage, CrossEntropy, HostClassifier, NewSurface
 
-CAMERA = Camera(height=6, width=7)
-GRID = Grid(20)
+CAMERA = nbv.Camera(height=6, width=7)
+GRID = nbv.Grid(20)
 # The last looks away from the object and sees nothing.
-POSES = look_at(jnp.concatenate([fibonacci_sphere(6, 2.5), jnp.array([[0.0, 3.0, 0.0]])]))
+POSES = nbv.look_at(jnp.concatenate([nbv.fibonacci_sphere(6, 2.5), jnp.array([[0.0, 3.0, 0.0]])]))
 POSES = eqx.tree_at(lambda pose: pose.rotation, POSES, POSES.rotation.at[-1].set(jnp.eye(3)))
 
 
@@ -39,7 +31,7 @@ def surfaces():
 @pytest.fixture(scope="module")
 def cloud():
     rng = np.random.default_rng(0)
-    return PointCloud.from_arrays(0.4 * rng.normal(size=(9, 3)), np.tile([0.0, 1.0, 0.0], (9, 1)), capacity=12)
+    return nbv.PointCloud.from_arrays(0.4 * rng.normal(size=(9, 3)), np.tile([0.0, 1.0, 0.0], (9, 1)), capacity=12)
 
 
 def height(cloud):
@@ -51,7 +43,7 @@ def height_in_numpy(points, normals):
     return np.sum(np.tanh(2 * points[:, 1].astype(np.float64) + normals[:, 2]) - 0.1)
 
 
-class Toy(Acquisition):
+class Toy(nbv.Acquisition):
     """Counts the rows and weighs them by the context, the highest point of D."""
 
     def context(self, cloud):
@@ -73,7 +65,7 @@ def double_loop(surfaces, score):
 def test_an_acquisition_against_the_double_loop(surfaces, cloud):
     highest = cloud.to_numpy()[0][:, 1].max()
     values = double_loop(surfaces, lambda points, _: np.abs(points[:, 1] - highest).sum())
-    found = expected_value(Toy(), cloud, surfaces, CAMERA, POSES)
+    found = nbv.expected_value(Toy(), cloud, surfaces, CAMERA, POSES)
     np.testing.assert_allclose(found, values.mean(axis=0), rtol=1e-4)
     assert values[:, :6].std(axis=0).min() > 0
     assert float(found[6]) == 0
@@ -90,7 +82,7 @@ def test_utility_improvement_against_its_formula(surfaces, cloud):
     change = double_loop(surfaces, improvement)
     assert (change < -0.5).any()
     assert (change > 0.5).any()
-    found = expected_value(ExpectedUtilityImprovement(height), cloud, surfaces, CAMERA, POSES)
+    found = nbv.expected_value(nbv.ExpectedUtilityImprovement(height), cloud, surfaces, CAMERA, POSES)
     np.testing.assert_allclose(found, np.maximum(change, 0).mean(axis=0), rtol=1e-3, atol=1e-3)
     # Each sample is cut at zero, not their mean.
     assert np.abs(np.maximum(change, 0).mean(axis=0) - np.maximum(change.mean(axis=0), 0)).max() > 0.1
@@ -106,7 +98,7 @@ def test_the_context_is_computed_once_a_step(surfaces, cloud):
             jax.debug.callback(lambda _: ran.append(1), cloud.points[0, 0])
         return height(cloud)
 
-    expected_value(ExpectedUtilityImprovement(utility), cloud, surfaces, CAMERA, POSES).block_until_ready()
+    nbv.expected_value(nbv.ExpectedUtilityImprovement(utility), cloud, surfaces, CAMERA, POSES).block_until_ready()
     jax.effects_barrier()
     # And once before it, to check it.
     assert len(ran) == 2
@@ -114,20 +106,20 @@ def test_the_context_is_computed_once_a_step(surfaces, cloud):
 
 def test_common_random_numbers(surfaces, cloud):
     """A pose's value does not depend on which others are asked for, nor on their order."""
-    acquisition = ExpectedUtilityImprovement(height)
-    together = expected_value(acquisition, cloud, surfaces, CAMERA, POSES)
+    acquisition = nbv.ExpectedUtilityImprovement(height)
+    together = nbv.expected_value(acquisition, cloud, surfaces, CAMERA, POSES)
     order = np.array([4, 1, 5])
-    some = expected_value(acquisition, cloud, surfaces, CAMERA, POSES[order])
+    some = nbv.expected_value(acquisition, cloud, surfaces, CAMERA, POSES[order])
     np.testing.assert_allclose(some, together[order], rtol=1e-5, atol=1e-5)
     assert float(jnp.std(together)) > 0.1
 
 
 def test_utility_sees_the_union_of_both_clouds(cloud):
     seen = []
-    acquisition = ExpectedUtilityImprovement(lambda c: seen.append(c) or jnp.sum(c.mask) * 1.0)
-    other = PointCloud.from_arrays([[1.0, 2.0, 3.0]], [[0.0, 0.0, 1.0]], capacity=4)
+    acquisition = nbv.ExpectedUtilityImprovement(lambda c: seen.append(c) or jnp.sum(c.mask) * 1.0)
+    other = nbv.PointCloud.from_arrays([[1.0, 2.0, 3.0]], [[0.0, 0.0, 1.0]], capacity=4)
     assert float(acquisition(acquisition.context(cloud), other)) == 1.0
-    expected = concatenate(cloud, other)
+    expected = nbv.concatenate(cloud, other)
     for a, b in zip(jax.tree.leaves(seen[-1]), jax.tree.leaves(expected), strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -141,14 +133,14 @@ class Vector(Toy):
 
 
 def test_several_acquisitions_of_the_same_scans_are_each_that_of_its_own(surfaces, cloud):
-    acquisitions = (Toy(), Vector(), ExpectedUtilityImprovement(height))
-    found = expected_value(Several(acquisitions), cloud, surfaces, CAMERA, POSES)
-    toy, improvement = (expected_value(acquisitions[i], cloud, surfaces, CAMERA, POSES) for i in (0, 2))
+    acquisitions = (Toy(), Vector(), nbv.ExpectedUtilityImprovement(height))
+    found = nbv.expected_value(nbv.Several(acquisitions), cloud, surfaces, CAMERA, POSES)
+    toy, improvement = (nbv.expected_value(acquisitions[i], cloud, surfaces, CAMERA, POSES) for i in (0, 2))
     np.testing.assert_allclose(found, jnp.stack([toy, toy, -toy, improvement], axis=1), rtol=1e-6)
     assert float(jnp.ptp(toy)) > 0 < float(jnp.ptp(improvement))
-    assert Several(acquisitions).batch_size == min(acquisition.batch_size for acquisition in acquisitions)
-    with pytest.raises(InputError, match="it must be finite"):
-        Several((Toy(), ExpectedUtilityImprovement(lambda cloud: jnp.nan * cloud.points.sum()))).check(cloud)
+    assert nbv.Several(acquisitions).batch_size == min(acquisition.batch_size for acquisition in acquisitions)
+    with pytest.raises(nbv.InputError, match="it must be finite"):
+        nbv.Several((Toy(), nbv.ExpectedUtilityImprovement(lambda cloud: jnp.nan * cloud.points.sum()))).check(cloud)
 
 
 class Highest(eqx.Module):
@@ -160,24 +152,26 @@ class Highest(eqx.Module):
 
 @pytest.mark.parametrize("utility", [height, Highest()])
 def test_a_plain_function_is_a_utility_whose_improvement_is_sought(utility):
-    plain, explicit = (Planner(given, FarthestView(6)) for given in (utility, ExpectedUtilityImprovement(utility)))
+    plain, explicit = (
+        nbv.Planner(given, nbv.FarthestView(6)) for given in (utility, nbv.ExpectedUtilityImprovement(utility))
+    )
     assert plain == explicit
     assert plain.acquisition.num_points is None
-    assert Planner(acquisition := Toy(), FarthestView(6)).acquisition is acquisition
+    assert nbv.Planner(acquisition := Toy(), nbv.FarthestView(6)).acquisition is acquisition
 
 
-@pytest.mark.parametrize("given", [Coverage, ExpectedUtilityImprovement, 3, "coverage", None])
+@pytest.mark.parametrize("given", [nbv.Coverage, nbv.ExpectedUtilityImprovement, 3, "coverage", None])
 def test_what_is_neither_an_acquisition_nor_a_function_is_named(given):
     name = given.__name__ if isinstance(given, type) else repr(given)
-    with pytest.raises(InputError, match=f"the acquisition is .*{name}.*: give one, such as Coverage"):
-        Planner(given, FarthestView(6))
+    with pytest.raises(nbv.InputError, match=f"the acquisition is .*{name}.*: give one, such as Coverage"):
+        nbv.Planner(given, nbv.FarthestView(6))
 
 
 ACQUISITIONS = {
-    "coverage": Coverage(),
-    "new surface": NewSurface(),
-    "classes": CrossEntropy(pretrained_classifier("pyramid"), num_points=64),
-    "heat": ExpectedUtilityImprovement(ColdestPoint((0.0, 0.0, 1.0))),
+    "coverage": nbv.Coverage(),
+    "new surface": nbv.NewSurface(),
+    "classes": nbv.CrossEntropy(pretrained_classifier("pyramid"), num_points=64),
+    "heat": nbv.ExpectedUtilityImprovement(nbv.ColdestPoint((0.0, 0.0, 1.0))),
 }
 
 
@@ -186,22 +180,27 @@ def test_only_heat_is_computed_by_the_host(surfaces, cloud, name):
     """Its Laplacian has no JAX; all else stays on the device."""
 
     def step(cloud, surfaces):
-        return expected_value(ACQUISITIONS[name], cloud, surfaces, CAMERA, POSES)
+        return nbv.expected_value(ACQUISITIONS[name], cloud, surfaces, CAMERA, POSES)
 
     assert ("callback" in str(jax.make_jaxpr(step)(cloud, surfaces))) == (name == "heat")
 
 
 @pytest.mark.parametrize(
     "acquisition",
-    [Coverage(), NewSurface(), CrossEntropy(linear), CrossEntropy(HostClassifier(linear_of_batch, 4))],
+    [
+        nbv.Coverage(),
+        nbv.NewSurface(),
+        nbv.CrossEntropy(linear),
+        nbv.CrossEntropy(nbv.HostClassifier(linear_of_batch, 4)),
+    ],
     ids=["coverage", "new surface", "classes", "host"],
 )
 def test_samples_that_a_gpu_takes_together_have_the_same_scores(surfaces, cloud, acquisition, monkeypatch):
-    alone = expected_value(acquisition, cloud, surfaces, CAMERA, POSES)
+    alone = nbv.expected_value(acquisition, cloud, surfaces, CAMERA, POSES)
     for module in ("acquisition", "scanning.grid", "tasks.coverage"):
         monkeypatch.setattr(f"jaxnbv.{module}.on_cpu", lambda: False)
     assert samples_at_once(CAMERA, POSES) > 3
-    together = expected_value(acquisition, cloud, surfaces, CAMERA, POSES)
+    together = nbv.expected_value(acquisition, cloud, surfaces, CAMERA, POSES)
     assert float(jnp.ptp(alone)) > 1e-3
     np.testing.assert_allclose(together, alone, rtol=1e-4, atol=1e-5)
 
@@ -215,23 +214,27 @@ def test_a_device_that_is_set_counts_and_not_the_one_that_was_found(monkeypatch)
         assert preferred_batch_size(height) == 1
 
 
-@pytest.mark.parametrize("search", [DiscreteSearch(6), GradientSearch(6, num_candidates=6)], ids=["search", "ascent"])
-@pytest.mark.parametrize("model", [GeometricSPSR(0.1, truncation=6), ScreenedSPSR()], ids=["paper", "screened"])
+@pytest.mark.parametrize(
+    "search", [nbv.DiscreteSearch(6), nbv.GradientSearch(6, num_candidates=6)], ids=["search", "ascent"]
+)
+@pytest.mark.parametrize("model", [nbv.GeometricSPSR(0.1, truncation=6), nbv.ScreenedSPSR()], ids=["paper", "screened"])
 def test_all_products_have_full_precision(model, search):
     """GPUs multiply float32 matrices with 10 bits of each number unless asked not to."""
-    first = look_at((0.3, 1.0, 2.3))
+    first = nbv.look_at((0.3, 1.0, 2.3))
 
     def step(angle, key):
         solid = Sphere(0.5).translate((0.1, 0.0, 0.0)).rotate((1.0, 2.0, 3.0), angle)
-        planner = Planner(ACQUISITIONS["classes"], search, CAMERA, Imagination(model, Grid(16), 2), capacity=64)
-        evidence = planner.init(first, scan(SDFSurface(solid), CAMERA, first))
-        return planner.propose(planner.observe(evidence, first, scan(SDFSurface(solid), CAMERA, first)), key)
+        planner = nbv.Planner(
+            ACQUISITIONS["classes"], search, CAMERA, nbv.Imagination(model, nbv.Grid(16), 2), capacity=64
+        )
+        evidence = planner.init(first, scan(nbv.SDFSurface(solid), CAMERA, first))
+        return planner.propose(planner.observe(evidence, first, scan(nbv.SDFSurface(solid), CAMERA, first)), key)
 
     program = str(jax.make_jaxpr(step)(0.3, jax.random.key(0)))
     assert program.count("dot_general[") == program.count("precision=(Precision.HIGHEST, Precision.HIGHEST)") > 20
 
 
-@pytest.mark.parametrize("model", [GeometricSPSR(0.2, truncation=4), ScreenedSPSR()], ids=["paper", "screened"])
+@pytest.mark.parametrize("model", [nbv.GeometricSPSR(0.2, truncation=4), nbv.ScreenedSPSR()], ids=["paper", "screened"])
 def test_no_sample_is_computed_by_the_host(cloud, model):
     def sample(cloud):
         return model.condition(cloud).sample(jax.random.key(0), 2).on_grid(GRID.axis)

@@ -9,53 +9,30 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Float
 
-from jaxnbv import (
-    Box,
-    Camera,
-    Carving,
-    Coverage,
-    Evidence,
-    FarthestView,
-    Fields,
-    GeometricSPSR,
-    Grid,
-    Imagination,
-    InputError,
-    OutsideBoundary,
-    Planner,
-    ScreenedSPSR,
-    SDFSurface,
-    SurfaceModel,
-    SurfacePosterior,
-    Surroundings,
-    look_at,
-    scan,
-    scan_samples,
-    sdf,
-)
+import jaxnbv as nbv
 from jaxnbv.imagination import MODELS
 
-preset = Imagination.preset
+preset = nbv.Imagination.preset
 
 
 def test_the_papers_model_has_its_published_values_and_is_not_carved():
     paper = preset("paper")
-    assert isinstance(paper.model, GeometricSPSR)
+    assert isinstance(paper.model, nbv.GeometricSPSR)
     assert paper.carving is None
     published = {"lengthscale": 0.005, "variance": 0.2, "noise": 0.01, "nu": 1.5, "truncation": 50}
     for name, value in published.items():
         assert jnp.allclose(getattr(paper.model, name), value), name
 
 
-@pytest.mark.parametrize(("given", "side"), [({"longest_side": 1.25}, 1.25), ({"volume": Box.cube(1.0)}, 1.0)])
+@pytest.mark.parametrize(("given", "side"), [({"longest_side": 1.25}, 1.25), ({"volume": nbv.Box.cube(1.0)}, 1.0)])
 def test_the_default_model_knows_the_box_and_carves_by_it(given, side):
     screened = preset("screened", **given)
-    assert screened.carving.volume == screened.model.values[0].volume == Box.cube(side)
+    assert screened.carving.volume == screened.model.values[0].volume == nbv.Box.cube(side)
 
 
 def test_lengths_are_in_proportion_to_the_object():
     large, small = (preset("screened", side).model for side in (2.5, 1.25))
-    assert eqx.tree_equal(large, ScreenedSPSR())
+    assert eqx.tree_equal(large, nbv.ScreenedSPSR())
     assert jnp.allclose(small.base.lengthscale, 0.5 * large.base.lengthscale)
     assert jnp.array_equal(small.base.variance, large.base.variance)
     assert small.offset == 0.5 * large.offset
@@ -75,30 +52,30 @@ def test_quick_surfaces_have_fewer_frequencies():
 
 
 def test_the_preset_is_the_default_and_another_name_is_refused():
-    assert eqx.tree_equal(preset(), Imagination())
+    assert eqx.tree_equal(preset(), nbv.Imagination())
     for message, wrong in {
         r"no model 'mine': choose from screened, paper": ("mine",),
         r"-1\.0": ("screened", -1.0),
     }.items():
-        with pytest.raises(InputError, match=message):
+        with pytest.raises(nbv.InputError, match=message):
             preset(*wrong)
 
 
 RADII = 0.25 + 0.15 * np.arange(8)
-GRID, CAMERA, KEY = Grid(26, 1.6), Camera(height=30, width=30), jax.random.key(2)
-POSES = look_at(jnp.array([[0.0, 0.2, 2.5], [2.3, 0.0, -0.9]]))
-SCANS = scan(SDFSurface(sdf.Sphere(0.6)), CAMERA, POSES)
+GRID, CAMERA, KEY = nbv.Grid(26, 1.6), nbv.Camera(height=30, width=30), jax.random.key(2)
+POSES = nbv.look_at(jnp.array([[0.0, 0.2, 2.5], [2.3, 0.0, -0.9]]))
+SCANS = nbv.scan(nbv.SDFSurface(nbv.sdf.Sphere(0.6)), CAMERA, POSES)
 AWAY = np.linalg.norm(np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1), axis=-1)
 # Few of the nodes are so near to one of the balls that rounding decides.
 SHARE = (AWAY[..., None] < RADII).mean(axis=-1)
 
 
-class Balls(Fields):
+class Balls(nbv.Fields):
     def __call__(self, x):
         return 0.3 + jnp.linalg.norm(x, axis=-1) - jnp.asarray(RADII, x.dtype)[:, None]
 
 
-class BallsPosterior(SurfacePosterior):
+class BallsPosterior(nbv.SurfacePosterior):
     """Whatever was seen, balls of eight radii, of the level 0.3."""
 
     level: Float[Array, ""]
@@ -111,13 +88,13 @@ class BallsPosterior(SurfacePosterior):
         return 0.3 + jnp.linalg.norm(x, axis=-1) - RADII.mean()
 
 
-class BallsModel(SurfaceModel):
+class BallsModel(nbv.SurfaceModel):
     def condition(self, evidence):
         return BallsPosterior(jnp.asarray(0.3))
 
 
-def balls(carving=Carving(), surroundings=None):  # noqa: B008
-    return Imagination(BallsModel(), GRID, len(RADII), carving, surroundings)
+def balls(carving=nbv.Carving(), surroundings=None):  # noqa: B008
+    return nbv.Imagination(BallsModel(), GRID, len(RADII), carving, surroundings)
 
 
 def seen(imagination):
@@ -131,13 +108,15 @@ def test_the_probability_is_the_share_of_the_samples_that_hold_a_node():
         np.testing.assert_allclose(balls(None).probability_inside(evidence), SHARE, atol=1e-6)
     assert len(np.unique(SHARE)) == 9
     # Of a cloud alone nothing is known to be empty, but the volume is.
-    small = balls(Carving(Box.cube(0.8)))
+    small = balls(nbv.Carving(nbv.Box.cube(0.8)))
     np.testing.assert_allclose(
         small.probability_inside(SCANS[0]), np.where(small.carving.outside(GRID), 0.0, SHARE), atol=1e-6
     )
 
 
-@pytest.mark.parametrize("surroundings", [None, Surroundings((sdf.HalfSpace([0.0, -0.3, 0.0], [0.0, 1.0, 0.0]),))])
+@pytest.mark.parametrize(
+    "surroundings", [None, nbv.Surroundings((nbv.sdf.HalfSpace([0.0, -0.3, 0.0], [0.0, 1.0, 0.0]),))]
+)
 def test_nothing_is_imagined_where_the_object_cannot_be(surroundings):
     imagination = balls(surroundings=surroundings)
     evidence = seen(imagination)
@@ -153,7 +132,7 @@ def test_nothing_is_imagined_where_the_object_cannot_be(surroundings):
 
 
 def test_a_posterior_at_hand_is_not_asked_for_again():
-    imagination, evidence = Imagination(GeometricSPSR(0.1, truncation=6), GRID, 3), SCANS[0]
+    imagination, evidence = nbv.Imagination(nbv.GeometricSPSR(0.1, truncation=6), GRID, 3), SCANS[0]
     posterior = imagination.posterior(evidence)
     np.testing.assert_array_equal(
         imagination.sample(evidence, KEY, posterior).values, imagination.sample(evidence, KEY).values
@@ -163,11 +142,11 @@ def test_a_posterior_at_hand_is_not_asked_for_again():
 
 
 def test_scans_of_samples_end_at_the_surroundings():
-    wall = Surroundings((sdf.Cuboid([0.1, 1.0, 1.0]).translate([1.4, 0.0, -0.5]),))
+    wall = nbv.Surroundings((nbv.sdf.Cuboid([0.1, 1.0, 1.0]).translate([1.4, 0.0, -0.5]),))
     imagination = balls(surroundings=wall)
     surfaces = imagination.sample(SCANS[0], KEY)
     found = imagination.scan(surfaces, CAMERA, POSES)
-    free, expected = (scan_samples(surfaces, CAMERA, POSES, b) for b in (None, wall.barrier(CAMERA, POSES)))
+    free, expected = (nbv.scan_samples(surfaces, CAMERA, POSES, b) for b in (None, wall.barrier(CAMERA, POSES)))
     np.testing.assert_array_equal(found.mask, expected.mask)
     np.testing.assert_allclose(found.points, expected.points, atol=1e-5)
     assert found.mask[:, 0].any()
@@ -176,24 +155,26 @@ def test_scans_of_samples_end_at_the_surroundings():
 
 
 def test_another_box_takes_the_place_of_the_default_one_alone():
-    box, own = Box.cube(1.4), Box.cube(2.0)
-    model = ScreenedSPSR(values=(OutsideBoundary(), OutsideBoundary(own, 77), OutsideBoundary(value=2.0)))
-    before = Imagination(model, GRID, 5, Carving(margin_voxels=1.5))
+    box, own = nbv.Box.cube(1.4), nbv.Box.cube(2.0)
+    model = nbv.ScreenedSPSR(
+        values=(nbv.OutsideBoundary(), nbv.OutsideBoundary(own, 77), nbv.OutsideBoundary(value=2.0))
+    )
+    before = nbv.Imagination(model, GRID, 5, nbv.Carving(margin_voxels=1.5))
     after = before.within(box)
     assert [source.volume for source in after.model.values] == [box, own, box]
-    assert after.carving == Carving(box, 1.5)
+    assert after.carving == nbv.Carving(box, 1.5)
     # The rest is as it was.
-    back = [dataclasses.replace(one, volume=Box()) for one in (after.model.values[0], after.model.values[2])]
+    back = [dataclasses.replace(one, volume=nbv.Box()) for one in (after.model.values[0], after.model.values[2])]
     values = (back[0], after.model.values[1], back[1])
     model = dataclasses.replace(after.model, values=values)
     assert eqx.tree_equal(dataclasses.replace(after, model=model, carving=before.carving), before)
-    kept = Imagination(carving=Carving(own)).within(box)
+    kept = nbv.Imagination(carving=nbv.Carving(own)).within(box)
     assert kept.carving.volume == own
     assert eqx.tree_equal(preset("screened", 1.25).within(box), preset("screened", 1.25))
-    assert eqx.tree_equal(preset("screened").within(box).carving, Carving(box))
+    assert eqx.tree_equal(preset("screened").within(box).carving, nbv.Carving(box))
 
 
-@pytest.mark.parametrize("made_by", [balls(None), dataclasses.replace(balls(), grid=Grid(26, 1.5))])
+@pytest.mark.parametrize("made_by", [balls(None), dataclasses.replace(balls(), grid=nbv.Grid(26, 1.5))])
 def test_evidence_of_another_grid_is_refused(made_by):
     own, evidence, fits = balls(), seen(made_by), seen(balls())
     for use in (
@@ -207,7 +188,7 @@ def test_evidence_of_another_grid_is_refused(made_by):
         lambda evidence: own.observe(evidence, POSES[1], SCANS[1], CAMERA),
         lambda evidence: own.record(evidence, POSES[1], SCANS[1], CAMERA),
     ):
-        with pytest.raises(InputError, match=r"surfaces are carved on Grid\(resolution=26, half_extent=1\.6\)"):
+        with pytest.raises(nbv.InputError, match=r"surfaces are carved on Grid\(resolution=26, half_extent=1\.6\)"):
             use(evidence)
         use(fits)
 
@@ -218,10 +199,10 @@ def test_where_nothing_is_carved_evidence_of_any_grid_will_do():
     np.testing.assert_array_equal(known.cloud.points, seen(balls()).cloud.points)
 
 
-@pytest.mark.parametrize("carving", [None, Carving()])
+@pytest.mark.parametrize("carving", [None, nbv.Carving()])
 def test_evidence_is_that_of_a_planner(carving):
     imagination = balls(carving)
-    planner = Planner(Coverage(), FarthestView(6), CAMERA, imagination, capacity=200, max_views=4)
+    planner = nbv.Planner(nbv.Coverage(), nbv.FarthestView(6), CAMERA, imagination, capacity=200, max_views=4)
     evidence = planner.observe(planner.init(POSES[0], SCANS[0]), POSES[1], SCANS[1])
     found = seen(imagination)
     assert eqx.tree_equal(found, evidence)
@@ -229,9 +210,9 @@ def test_evidence_is_that_of_a_planner(carving):
     assert int(found.cloud.count) == 200
     begun = imagination.begin(SCANS[0], 200, 4)
     assert eqx.tree_equal(begun, planner.init(None, SCANS[0]))
-    assert eqx.tree_equal(imagination.known(SCANS[0]), Evidence.before_views(SCANS[0], 0, carving and GRID))
+    assert eqx.tree_equal(imagination.known(SCANS[0]), nbv.Evidence.before_views(SCANS[0], 0, carving and GRID))
 
 
 def test_values_of_another_grid_are_refused():
-    with pytest.raises(InputError, match=r"\(25, 25, 25\).* but the grid has \(26, 26, 26\) nodes"):
+    with pytest.raises(nbv.InputError, match=r"\(25, 25, 25\).* but the grid has \(26, 26, 26\) nodes"):
         balls().carve(SCANS[0], jnp.zeros((25,) * 3))

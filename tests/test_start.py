@@ -10,11 +10,10 @@ from pathlib import Path
 import pytest
 
 import jaxnbv
-from jaxnbv import viz
+import jaxnbv as nbv
 from jaxnbv.errors import EXTRAS
-from jaxnbv.studies import readers, scenes
 
-PACKAGES = [jaxnbv, readers, scenes, viz]
+PACKAGES = [jaxnbv, nbv.readers, nbv.scenes, nbv.viz]
 LAZY = pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.__name__)
 
 

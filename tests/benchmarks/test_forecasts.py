@@ -6,38 +6,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from forecasts import (
-    Truth,
-    brier,
-    crps,
-    empty_share,
-    exit_depths,
-    judge,
-    ray_depths,
-    reliability,
-    share_of_best,
-)
+from forecasts import Truth, brier, crps, empty_share, exit_depths, judge, ray_depths, reliability, share_of_best
 from scipy.stats import norm
 
-from jaxnbv import (
-    Box,
-    Camera,
-    Coverage,
-    GeometricSPSR,
-    Grid,
-    GridSurface,
-    InputError,
-    Planner,
-    PointCloud,
-    SDFSurface,
-    look_at,
-)
-from jaxnbv.imagination import Imagination
+import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
 
 # Nodes 0.125 apart, one of them at the origin, so that |x| - r is interpolated exactly along the axes.
-GRID = Grid(25, 1.5)
-VOLUME = Box()
+GRID = nbv.Grid(25, 1.5)
+VOLUME = nbv.Box()
 
 
 def test_crps_of_three_samples_by_hand():
@@ -45,7 +22,7 @@ def test_crps_of_three_samples_by_hand():
     assert float(crps(jnp.array([3.0, 0.0, 1.0]), jnp.array(1.0))) == pytest.approx(0.0, abs=1e-6)
     assert float(crps(jnp.array([0.0, 2.0]), jnp.array(5.0))) == pytest.approx(4.0 - 1.0)
     np.testing.assert_allclose(crps(jnp.array([[1.0, 2.0], [1.0, 2.0]]), jnp.array([1.0, 5.0])), [0.0, 3.0])
-    with pytest.raises(InputError, match="CRPS of 1 samples"):
+    with pytest.raises(nbv.InputError, match="CRPS of 1 samples"):
         crps(jnp.ones((1, 2)), jnp.ones(2))
 
 
@@ -59,14 +36,8 @@ def test_crps_of_a_gaussian_is_unbiased_for_few_samples(truth):
     assert scores.mean() == pytest.approx(exact, abs=4.0 * float(scores.std()) / math.sqrt(40_000))
 
 
-def test_crps_of_yes_and_no_is_the_fair_brier_score():
-    samples = np.array([1.0, 0.0, 0.0, 1.0, 1.0])
-    # (0.6 - 1)^2 - 0.6 * 0.4 / 4.
-    assert float(crps(samples, np.array(1.0))) == pytest.approx(0.16 - 0.06)
-
-
 def test_rays_leave_a_box_where_geometry_says():
-    box = Box((-1.0, -1.0, -1.0), (1.0, 2.0, 1.0))
+    box = nbv.Box((-1.0, -1.0, -1.0), (1.0, 2.0, 1.0))
     diagonal = np.ones(3) / math.sqrt(3.0)
     origins = np.array([[0, 0, -3], [0, 0, 0], [0, 0, 0], [0, 2.5, -3], [0, 0, 3], [0.5, -4, 0.5]], float)
     directions = np.array([[0, 0, 1], diagonal, [0, 1, 0], [0, 0, 1], [0, 0, 1], [0, 1, 0]], float)
@@ -76,10 +47,10 @@ def test_rays_leave_a_box_where_geometry_says():
 
 
 def test_misses_and_hits_beyond_the_volume_have_its_far_side_as_depth():
-    camera, poses = Camera(height=1, width=1), look_at(np.array([[0.0, 0.0, 2.5]] * 4))
+    camera, poses = nbv.Camera(height=1, width=1), nbv.look_at(np.array([[0.0, 0.0, 2.5]] * 4))
     points = jnp.array([[[0.0, 0.0, 0.75]], [[0.0, 0.0, 0.0]], [[0.0, 0.0, -1.5]], [[0.0, 0.0, 1.5]]])
     mask = jnp.array([[True], [False], [True], [True]])
-    depths, meets = ray_depths(PointCloud(points, points, mask), camera, poses, VOLUME)
+    depths, meets = ray_depths(nbv.PointCloud(points, points, mask), camera, poses, VOLUME)
     np.testing.assert_allclose(depths[:, 0], [1.75, 3.75, 3.75, 1.0], rtol=1e-6)
     assert bool(meets.all())
 
@@ -91,7 +62,7 @@ def test_brier_and_reliability_by_hand():
     assert bins.nodes == [1, 0, 2, 0, 0, 0, 0, 0, 0, 1]
     assert (bins.forecast[0], bins.forecast[1], bins.forecast[2], bins.forecast[9]) == (0.0, None, 0.25, 1.0)
     assert (bins.observed[0], bins.observed[1], bins.observed[2], bins.observed[9]) == (0.0, None, 0.5, 0.0)
-    with pytest.raises(InputError, match="no forecasts"):
+    with pytest.raises(nbv.InputError, match="no forecasts"):
         brier(np.zeros(0), np.zeros(0, bool))
 
 
@@ -111,28 +82,31 @@ def test_share_of_best_is_the_worth_of_the_candidate_that_is_chosen():
 
 @pytest.fixture(scope="module")
 def planner():
-    model, camera = GeometricSPSR(lengthscale=0.3, truncation=4), Camera(height=8, width=8)
-    return Planner(
-        Coverage(), camera=camera, imagination=Imagination(model, grid=GRID, num_samples=2, carving=None), capacity=16
+    model, camera = nbv.GeometricSPSR(lengthscale=0.3, truncation=4), nbv.Camera(height=8, width=8)
+    return nbv.Planner(
+        nbv.Coverage(),
+        camera=camera,
+        imagination=nbv.Imagination(model, grid=GRID, num_samples=2, carving=None),
+        capacity=16,
     )
 
 
 @pytest.fixture(scope="module")
 def truth(planner):
-    candidates = look_at(np.array([[2.5, 0.0, 0.0], [-2.5, 0.0, 0.0], [0.0, 2.5, 0.0]]))
-    return Truth.of(SDFSurface(Sphere(1.0)), planner, candidates, VOLUME, Camera(height=1, width=1))
+    candidates = nbv.look_at(np.array([[2.5, 0.0, 0.0], [-2.5, 0.0, 0.0], [0.0, 2.5, 0.0]]))
+    return Truth.of(nbv.SDFSurface(Sphere(1.0)), planner, candidates, VOLUME, nbv.Camera(height=1, width=1))
 
 
 def _balls(*radii):
     """Samples that are balls."""
     x, y, z = np.meshgrid(GRID.axis, GRID.axis, GRID.axis, indexing="ij")
     distance = np.sqrt(x**2 + y**2 + z**2)
-    return GridSurface.from_values(jnp.stack([jnp.asarray(distance - r, jnp.float32) for r in radii]), 0.0, GRID)
+    return nbv.GridSurface.from_values(jnp.stack([jnp.asarray(distance - r, jnp.float32) for r in radii]), 0.0, GRID)
 
 
 def _state(planner):
     # One point on the right: the ball's left is the farthest from it, its right the nearest.
-    return planner.init(None, PointCloud.from_arrays([[1.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]]))
+    return planner.init(None, nbv.PointCloud.from_arrays([[1.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]]))
 
 
 NOTHING = np.zeros((25, 25, 25), bool)
@@ -170,7 +144,7 @@ def test_only_unseen_nodes_are_judged_and_hits_in_seen_space_counted(planner, tr
     record = judge(planner, _state(planner), _balls(0.5, 0.5), truth, seen)
     assert record.in_empty == pytest.approx(1 / 3)
     assert sum(record.reliability.nodes) == (21 - 8) * 21 * 21
-    with pytest.raises(InputError, match="make both with the planner's grid"):
+    with pytest.raises(nbv.InputError, match="make both with the planner's grid"):
         judge(planner, _state(planner), _balls(0.5, 0.5), truth, seen[1:, 1:, 1:])
 
 
@@ -192,5 +166,5 @@ def test_nothing_is_compiled_for_another_object(planner, truth, compilations):
 
 
 def test_the_inside_must_be_known(planner, truth):
-    with pytest.raises(InputError, match="inside of a GridSurface is not known"):
+    with pytest.raises(nbv.InputError, match="inside of a GridSurface is not known"):
         Truth.of(jax.tree.map(lambda leaf: leaf[0], _balls(0.5)), planner, truth.candidates, VOLUME)

@@ -12,10 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jaxnbv.checks import InputError
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
-from jaxnbv.scanning import Carving, Grid, SDFSurface, scan
+import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Cuboid, Sphere
 from jaxnbv.viz.scene import frustum
 
@@ -31,7 +28,7 @@ matrices = st.tuples(sizes, sizes, lengths, lengths, shares, shares)
 def camera_and_matrix(given):
     width, height, fx, fy, x, y = given
     matrix = np.array([[fx, 0.0, x * width - 0.5], [0.0, fy, y * height - 0.5], [0.0, 0.0, 1.0]])
-    return Camera.from_intrinsics(matrix, height, width), matrix
+    return nbv.Camera.from_intrinsics(matrix, height, width), matrix
 
 
 @settings(max_examples=50, deadline=None)
@@ -54,7 +51,7 @@ def test_a_strided_camera_has_the_rays_of_every_so_many_th_pixel(values, stride)
     rows = slice(stride // 2, None, stride)
     every = np.asarray(camera.pixel_directions()).reshape(camera.height, camera.width, 3)[rows, rows]
     if every.size == 0:
-        with pytest.raises(InputError, match=f"stride of {stride} leaves none"):
+        with pytest.raises(nbv.InputError, match=f"stride of {stride} leaves none"):
             camera.strided(stride)
         return
     strided = camera.strided(stride)
@@ -76,7 +73,7 @@ def test_a_resized_camera_sees_the_same_and_the_frustum_is_its_border(values, he
         (camera.height - 0.5 - matrix[1, 2]) / matrix[1, 1],
     ]
     np.testing.assert_allclose(camera.edges, expected, rtol=1e-5, atol=1e-7)
-    corners = frustum(Pose(np.eye(3), np.zeros(3)), camera, 2.0)[:4, 1]
+    corners = frustum(nbv.Pose(np.eye(3), np.zeros(3)), camera, 2.0)[:4, 1]
     np.testing.assert_allclose(corners[0], [2 * expected[0], 2 * expected[1], 2.0], rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(corners[2], [2 * expected[2], 2 * expected[3], 2.0], rtol=1e-5, atol=1e-6)
 
@@ -91,8 +88,8 @@ def test_a_resized_camera_sees_the_same_and_the_frustum_is_its_border(values, he
     ],
 )
 def test_matrices_that_are_none_of_this_image_are_refused(matrix, message):
-    with pytest.raises(InputError, match=message):
-        Camera.from_intrinsics(np.array(matrix), 40, 60)
+    with pytest.raises(nbv.InputError, match=message):
+        nbv.Camera.from_intrinsics(np.array(matrix), 40, 60)
 
 
 @pytest.mark.parametrize(
@@ -110,22 +107,22 @@ def test_matrices_that_are_none_of_this_image_are_refused(matrix, message):
     ],
 )
 def test_cameras_that_cannot_be_are_refused(settings, message):
-    with pytest.raises(InputError, match=message):
-        Camera(**settings)
+    with pytest.raises(nbv.InputError, match=message):
+        nbv.Camera(**settings)
 
 
 def test_a_scan_tells_what_lies_in_range_and_is_not_aslant():
     """A ball before a wall: analytic depths and angles, ray by ray."""
-    surface = SDFSurface(Sphere(0.5) | Cuboid([1.2, 1.2, 0.1]).translate([0.0, 0.0, -1.0]))
-    pose = look_at((0.0, 0.0, 2.5))
-    whole = Camera(math.radians(50.0), 40, 40)
-    every = scan(surface, whole, pose)
+    surface = nbv.SDFSurface(Sphere(0.5) | Cuboid([1.2, 1.2, 0.1]).translate([0.0, 0.0, -1.0]))
+    pose = nbv.look_at((0.0, 0.0, 2.5))
+    whole = nbv.Camera(math.radians(50.0), 40, 40)
+    every = nbv.scan(surface, whole, pose)
     depth = 2.5 - np.asarray(every.points)[:, 2]
     _, rays = whole.rays(pose)
     cosine = -np.sum(np.asarray(every.normals) * np.asarray(rays), axis=1)
     hit = np.asarray(every.mask)
-    limited = Camera(math.radians(50.0), 40, 40, nearest=2.1, farthest=3.0, max_incidence=math.radians(60.0))
-    found = scan(surface, limited, pose)
+    limited = nbv.Camera(math.radians(50.0), 40, 40, nearest=2.1, farthest=3.0, max_incidence=math.radians(60.0))
+    found = nbv.scan(surface, limited, pose)
     expected = hit & (depth >= 2.1) & (depth <= 3.0) & (cosine >= 0.5)
     for share in (expected, hit & (depth < 2.1), hit & (depth > 3.0), hit & (depth < 3.0) & (cosine < 0.5)):
         assert 10 < share.sum() < 1500
@@ -136,11 +133,11 @@ def test_a_scan_tells_what_lies_in_range_and_is_not_aslant():
 
 
 def test_what_a_limited_sensor_missed_is_empty_as_far_as_it_reaches():
-    grid, pose, see = Grid(24), look_at((0.0, 0.0, 2.5)), eqx.filter_jit(Carving.seen_empty)
-    nothing = SDFSurface(Sphere(0.01).translate([0.0, 1.4, 0.0]))
+    grid, pose, see = nbv.Grid(24), nbv.look_at((0.0, 0.0, 2.5)), eqx.filter_jit(nbv.Carving.seen_empty)
+    nothing = nbv.SDFSurface(Sphere(0.01).translate([0.0, 1.4, 0.0]))
     seen = {
-        farthest: np.asarray(see(Carving(), grid, pose, scan(nothing, camera, pose), camera))
-        for farthest, camera in ((far, Camera(0.9, 48, 48, farthest=far)) for far in (2.5, None))
+        farthest: np.asarray(see(nbv.Carving(), grid, pose, nbv.scan(nothing, camera, pose), camera))
+        for farthest, camera in ((far, nbv.Camera(0.9, 48, 48, farthest=far)) for far in (2.5, None))
     }
     deep = 2.5 - grid.axis
     assert seen[None].any(axis=(0, 1))[deep > 3.0].any()
@@ -159,13 +156,13 @@ def test_poses_to_matrices_and_back_in_both_conventions(given):
     rotation = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, position
-    np.testing.assert_allclose(Pose.from_matrix(matrix).matrix, matrix, atol=1e-6)
+    np.testing.assert_allclose(nbv.Pose.from_matrix(matrix).matrix, matrix, atol=1e-6)
     # A camera of OpenGL looks along its own -z, and its y is up.
-    turned = Pose.from_matrix(matrix, "opengl")
+    turned = nbv.Pose.from_matrix(matrix, "opengl")
     np.testing.assert_allclose(turned.forward, -rotation[:, 2], atol=1e-6)
     np.testing.assert_allclose(turned.rotation[:, 1], -rotation[:, 1], atol=1e-6)
     np.testing.assert_allclose(turned.rotation[:, 0], rotation[:, 0], atol=1e-6)
-    batch = Pose.from_matrix(np.stack([matrix, np.eye(4)]))
+    batch = nbv.Pose.from_matrix(np.stack([matrix, np.eye(4)]))
     assert batch.matrix.shape == (2, 4, 4)
 
 
@@ -179,12 +176,12 @@ def test_poses_to_matrices_and_back_in_both_conventions(given):
     ],
 )
 def test_matrices_that_are_no_poses_are_refused(matrix, convention, message):
-    with pytest.raises(InputError, match=message):
-        Pose.from_matrix(matrix, convention)
+    with pytest.raises(nbv.InputError, match=message):
+        nbv.Pose.from_matrix(matrix, convention)
 
 
 def test_a_pose_s_matrix_moves_points_as_the_pose_does():
-    pose = look_at((0.8, 0.9, 2.2), (0.1, 0.2, 0.3))
+    pose = nbv.look_at((0.8, 0.9, 2.2), (0.1, 0.2, 0.3))
     points = np.random.default_rng(0).normal(size=(5, 3))
     moved = np.concatenate([points, np.ones((5, 1))], axis=1) @ np.asarray(pose.matrix, np.float64).T
     np.testing.assert_allclose(pose.to_scene(jnp.asarray(points, jnp.float32)), moved[:, :3], atol=1e-5)
@@ -197,7 +194,7 @@ def test_look_at_is_a_rotation_that_faces_its_target_with_up_above(position, tar
     offset = target - position
     assume(np.linalg.norm(offset) > 0.1)
     assume(np.linalg.norm(up) > 0.1)
-    pose = look_at(position, target, up)
+    pose = nbv.look_at(position, target, up)
     rotation = np.asarray(pose.rotation, dtype=np.float64)
     np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-5)
     assert np.linalg.det(rotation) == pytest.approx(1.0, abs=1e-5)
@@ -212,17 +209,17 @@ def test_look_at_is_a_rotation_that_faces_its_target_with_up_above(position, tar
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("tilt", [0.0, 1e-7, 1e-5, 1e-3])
 def test_looking_along_up_is_defined(side, tilt):
-    rotation = np.asarray(look_at((tilt, 2.5 * side, 0.0)).rotation)
+    rotation = np.asarray(nbv.look_at((tilt, 2.5 * side, 0.0)).rotation)
     np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-5)
     np.testing.assert_allclose(rotation[:, 2], [-tilt / 2.5, -side, 0.0], atol=1e-5)
     assert np.linalg.det(rotation) == pytest.approx(1.0, abs=1e-5)
 
 
 def test_look_at_and_rays_run_under_jit_and_are_differentiable():
-    camera = Camera(height=2, width=3)
+    camera = nbv.Camera(height=2, width=3)
 
     def last_ray(position):
-        return camera.rays(look_at(position))[1][-1]
+        return camera.rays(nbv.look_at(position))[1][-1]
 
     position = jnp.array([0.8, 0.9, 2.2])
     np.testing.assert_allclose(jax.jit(last_ray)(position), last_ray(position), atol=1e-6)
@@ -246,18 +243,18 @@ def test_look_at_and_rays_run_under_jit_and_are_differentiable():
 def test_a_pose_that_is_not_a_rotation_is_refused_and_so_is_one_of_a_batch(rotation, message):
     for rotations in (rotation, np.stack([np.eye(3), np.eye(3), rotation])):
         with pytest.raises(ValueError, match=message):
-            Pose(rotations, np.zeros(rotations.shape[:-1]))
+            nbv.Pose(rotations, np.zeros(rotations.shape[:-1]))
 
 
 @pytest.mark.parametrize(
     ("make", "arguments", "message"),
     [
-        (look_at, ((1.0, 2.0, 3.0), (1.0, 2.0, 3.0)), "apart from its target"),
-        (look_at, ((np.nan, 0.0, 1.0),), "finite"),
-        (look_at, ((0.0, 0.0, 1e30),), r"distance from its target is a finite number, got position \[0"),
-        (look_at, ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "up direction"),
-        (fibonacci_sphere, (0, 1.0), "Fibonacci"),
-        (fibonacci_sphere, (5, 0.0), "radius"),
+        (nbv.look_at, ((1.0, 2.0, 3.0), (1.0, 2.0, 3.0)), "apart from its target"),
+        (nbv.look_at, ((np.nan, 0.0, 1.0),), "finite"),
+        (nbv.look_at, ((0.0, 0.0, 1e30),), r"distance from its target is a finite number, got position \[0"),
+        (nbv.look_at, ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "up direction"),
+        (nbv.fibonacci_sphere, (0, 1.0), "Fibonacci"),
+        (nbv.fibonacci_sphere, (5, 0.0), "radius"),
     ],
 )
 def test_places_without_a_direction_are_refused(make, arguments, message):
@@ -268,7 +265,7 @@ def test_places_without_a_direction_are_refused(make, arguments, message):
 @pytest.mark.parametrize("count", [12, 120, 1000])
 def test_fibonacci_sphere_is_even(count):
     """Nearest neighbours against Fejes Toth's bound, which no set of n points on the sphere can exceed."""
-    points = np.asarray(fibonacci_sphere(count, 2.5), dtype=np.float64)
+    points = np.asarray(nbv.fibonacci_sphere(count, 2.5), dtype=np.float64)
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), 2.5, atol=1e-5)
     unit = points / 2.5
     distance = np.linalg.norm(unit[:, None] - unit[None], axis=-1) + 9 * np.eye(count)
@@ -282,7 +279,7 @@ def test_fibonacci_sphere_is_even(count):
 
 
 def test_a_batch_of_poses_is_iterated_once():
-    poses = look_at(fibonacci_sphere(3, 2.5))
+    poses = nbv.look_at(nbv.fibonacci_sphere(3, 2.5))
     for pose, again in zip(poses, [poses[0], poses[1], poses[-1]], strict=True):
         np.testing.assert_array_equal(pose.position, again.position)
-    assert [len(list(row)) for row in look_at(np.ones((2, 3, 3)))] == [3, 3]
+    assert [len(list(row)) for row in nbv.look_at(np.ones((2, 3, 3)))] == [3, 3]

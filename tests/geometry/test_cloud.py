@@ -9,16 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud, farthest_point_subsample, limit_capacity
-from jaxnbv.geometry.pose import look_at
+import jaxnbv as nbv
+from jaxnbv.geometry.cloud import limit_capacity
 
 GOOD = [[0.0, 0.1, 0.2], [0.3, 0.4, 0.5]]
 UP = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
 
 
 def test_from_arrays_pads_to_its_capacity():
-    cloud = PointCloud.from_arrays(GOOD, UP, capacity=5)
+    cloud = nbv.PointCloud.from_arrays(GOOD, UP, capacity=5)
     assert cloud.capacity == 5
     assert int(cloud.count) == 2
     np.testing.assert_array_equal(cloud.mask, [True, True, False, False, False])
@@ -27,7 +26,7 @@ def test_from_arrays_pads_to_its_capacity():
     np.testing.assert_array_equal(normals, UP)
     assert not np.asarray(cloud.points)[2:].any()
     assert not np.asarray(cloud.normals)[2:].any()
-    assert PointCloud.from_arrays(GOOD, UP).capacity == 2
+    assert nbv.PointCloud.from_arrays(GOOD, UP).capacity == 2
 
 
 @pytest.mark.parametrize(
@@ -45,27 +44,27 @@ def test_from_arrays_pads_to_its_capacity():
 )
 def test_bad_input_is_refused_with_value_and_remedy(points, normals, capacity, value, remedy):
     with pytest.raises(ValueError, match=value) as error:
-        PointCloud.from_arrays(points, normals, capacity)
+        nbv.PointCloud.from_arrays(points, normals, capacity)
     assert error.match(remedy)
 
 
 @pytest.mark.parametrize("length", [5.0, 1e30, 3e38, 1e-11])
 def test_normals_of_other_lengths_keep_their_direction_with_a_warning(length):
     with pytest.warns(UserWarning, match=r"row 0: .*normalised"):
-        cloud = PointCloud.from_arrays(GOOD, length * np.array([[0.6, 0.8, 0.0], [0.0, 0.6, -0.8]]))
+        cloud = nbv.PointCloud.from_arrays(GOOD, length * np.array([[0.6, 0.8, 0.0], [0.0, 0.6, -0.8]]))
     np.testing.assert_allclose(cloud.normals, [[0.6, 0.8, 0.0], [0.0, 0.6, -0.8]], rtol=1e-6)
 
 
 def test_masked_rows_are_not_taken_for_data():
     points = np.ma.masked_array(GOOD, [[False] * 3, [True] * 3])
     with pytest.raises(ValueError, match="points is a masked array: give what is valid"):
-        PointCloud.from_arrays(points, UP)
-    np.testing.assert_array_equal(PointCloud.from_arrays(np.ma.masked_array(GOOD), UP).points, np.float32(GOOD))
+        nbv.PointCloud.from_arrays(points, UP)
+    np.testing.assert_array_equal(nbv.PointCloud.from_arrays(np.ma.masked_array(GOOD), UP).points, np.float32(GOOD))
 
 
 @pytest.mark.filterwarnings("error")
 def test_normals_within_one_per_cent_are_normalised_quietly():
-    cloud = PointCloud.from_arrays(GOOD, [[0.0, 1.005, 0.0], [0.0, 0.0, 0.995]])
+    cloud = nbv.PointCloud.from_arrays(GOOD, [[0.0, 1.005, 0.0], [0.0, 0.0, 0.995]])
     np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1.0, atol=1e-6)
 
 
@@ -80,11 +79,11 @@ def rays_by_hand(camera, pose):
 
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.3, 0.4, 0.8), (-0.7, 0.2, 0.6)])
 def test_depth_of_a_plane_gives_its_points_and_exact_normals(x64, normal):
-    camera, pose = Camera(height=6, width=9), look_at((0.3, -0.2, 2.4))
+    camera, pose = nbv.Camera(height=6, width=9), nbv.look_at((0.3, -0.2, 2.4))
     normal = np.asarray(normal) / np.linalg.norm(normal)
     rays, origin = rays_by_hand(camera, pose), np.asarray(pose.position)
     depth = (0.1 - origin @ normal) / (rays @ normal)
-    cloud = PointCloud.from_depth(depth, camera, pose)
+    cloud = nbv.PointCloud.from_depth(depth, camera, pose)
     assert bool(cloud.mask.all())
     expected = (origin + depth[..., None] * rays).reshape(-1, 3)
     np.testing.assert_allclose(cloud.points, expected, atol=1e-12)
@@ -93,12 +92,12 @@ def test_depth_of_a_plane_gives_its_points_and_exact_normals(x64, normal):
 
 def test_depth_of_a_sphere_gives_normals_within_a_pixel(x64):
     """A plane through what lies within a step h on a unit sphere is tilted by less than h, and off by its sagitta."""
-    camera, pose = Camera(height=60, width=60, fov=0.3), look_at((0.8, 0.9, 2.2), target=(0.1, 0.0, 0.0))
+    camera, pose = nbv.Camera(height=60, width=60, fov=0.3), nbv.look_at((0.8, 0.9, 2.2), target=(0.1, 0.0, 0.0))
     rays, origin = rays_by_hand(camera, pose), np.asarray(pose.position)
     a, b, c = (rays**2).sum(-1), rays @ origin, origin @ origin - 1
     with np.errstate(invalid="ignore"):
         depth = (-b - np.sqrt(b**2 - a * c)) / a
-    cloud = PointCloud.from_depth(depth, camera, pose)
+    cloud = nbv.PointCloud.from_depth(depth, camera, pose)
     np.testing.assert_array_equal(cloud.mask, np.isfinite(depth).ravel())
     points, normals = cloud.to_numpy()
     cosine = -np.sum(points * (points - origin), axis=1) / np.linalg.norm(points - origin, axis=1)
@@ -111,16 +110,16 @@ def test_depth_of_a_sphere_gives_normals_within_a_pixel(x64):
 
 
 def test_a_step_edge_does_not_mix_its_two_sides(x64):
-    camera, pose = Camera(height=5, width=16, fov=0.1), look_at((0.0, 0.0, 2.5))
+    camera, pose = nbv.Camera(height=5, width=16, fov=0.1), nbv.look_at((0.0, 0.0, 2.5))
     depth = np.where(np.arange(16) < 7, 1.0, 2.0) * np.ones((5, 1))
-    cloud = PointCloud.from_depth(depth, camera, pose)
+    cloud = nbv.PointCloud.from_depth(depth, camera, pose)
     assert bool(cloud.mask.all())
     np.testing.assert_allclose(cloud.normals, np.tile([0.0, 0.0, 1.0], (80, 1)), atol=1e-12)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 0.0, -1.0])
 def test_invalid_pixels_and_pixels_without_a_plane_are_masked(bad):
-    camera, pose = Camera(height=6, width=7), look_at((0.8, 0.9, 2.2))
+    camera, pose = nbv.Camera(height=6, width=7), nbv.look_at((0.8, 0.9, 2.2))
     depth = np.full((6, 7), 2.0)
     depth[1, 2] = bad
     # A pixel alone, one of a row alone, and one at the end of a row.
@@ -133,7 +132,7 @@ def test_invalid_pixels_and_pixels_without_a_plane_are_masked(bad):
         near = np.argwhere(valid)[np.abs(np.argwhere(valid) - (row, column)).max(axis=1) <= 1]
         expected[row, column] = len(near) >= 4 and np.linalg.matrix_rank(near - near[0]) == 2
     assert 10 < expected.sum() < valid.sum()
-    cloud = PointCloud.from_depth(depth, camera, pose)
+    cloud = nbv.PointCloud.from_depth(depth, camera, pose)
     np.testing.assert_array_equal(cloud.mask.reshape(6, 7), expected)
     assert np.isfinite(cloud.points).all()
     assert not np.asarray(cloud.points)[~expected.ravel()].any()
@@ -157,10 +156,10 @@ def tagged(points, mask):
     mask = np.asarray(mask)
     points = np.where(mask[:, None], points, 0.0).astype(np.float32)
     tags = np.where(mask[:, None], np.arange(len(points))[:, None] * np.ones(3), 0.0).astype(np.float32)
-    return PointCloud(jnp.asarray(points), jnp.asarray(tags), jnp.asarray(mask))
+    return nbv.PointCloud(jnp.asarray(points), jnp.asarray(tags), jnp.asarray(mask))
 
 
-subsample = jax.jit(farthest_point_subsample, static_argnums=1)
+subsample = jax.jit(nbv.farthest_point_subsample, static_argnums=1)
 
 
 @settings(max_examples=60, deadline=None)

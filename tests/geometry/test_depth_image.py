@@ -6,26 +6,21 @@ import operator
 import numpy as np
 import pytest
 
-from jaxnbv.checks import InputError
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.pose import Pose, look_at
-from jaxnbv.geometry.volume import Box
-from jaxnbv.scanning import SDFSurface, scan
+import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Cuboid, Sphere
 
 # In metres, z up: a ball on a table, 0.8 m from the camera, and a pillar between them at the left.
 BALL = Sphere(0.1).translate([0.0, 0.0, 0.1])
 TABLE = Cuboid([0.6, 0.6, 0.02]).translate([0.0, 0.0, -0.02])
 PILLAR = Cuboid([0.01, 0.01, 0.4]).translate([-0.05, -0.5, 0.4])
-POSE = look_at((0.0, -0.8, 0.3), (0.0, 0.0, 0.1), up=(0.0, 0.0, 1.0))
-CAMERA = Camera.from_intrinsics([[90.0, 0.0, 34.0], [0.0, 95.0, 21.5], [0.0, 0.0, 1.0]], width=64, height=48)
-BOX = Box((-0.15, -0.15, 0.002), (0.15, 0.15, 0.25))
+POSE = nbv.look_at((0.0, -0.8, 0.3), (0.0, 0.0, 0.1), up=(0.0, 0.0, 1.0))
+CAMERA = nbv.Camera.from_intrinsics([[90.0, 0.0, 34.0], [0.0, 95.0, 21.5], [0.0, 0.0, 1.0]], width=64, height=48)
+BOX = nbv.Box((-0.15, -0.15, 0.002), (0.15, 0.15, 0.25))
 
 
 def depth_of(*solids, camera=CAMERA, pose=POSE):
     """Along the camera's axis; infinite where nothing is hit."""
-    seen = scan(SDFSurface(functools.reduce(operator.or_, solids)), camera, pose)
+    seen = nbv.scan(nbv.SDFSurface(functools.reduce(operator.or_, solids)), camera, pose)
     depth = (np.asarray(seen.points, np.float64) - np.asarray(pose.position)) @ np.asarray(pose.forward, np.float64)
     return np.where(seen.mask, depth, np.inf).reshape(camera.height, camera.width)
 
@@ -34,7 +29,7 @@ def test_millimetres_of_a_sensor_give_the_points_in_metres():
     """Integers, holes of zero, an off-centre camera with pixels that are not square."""
     depth = depth_of(BALL)
     image = np.where(np.isfinite(depth), np.round(1000.0 * depth), 0.0).astype(np.uint16)
-    cloud = PointCloud.from_depth(image, CAMERA, POSE, depth_scale=1e-3)
+    cloud = nbv.PointCloud.from_depth(image, CAMERA, POSE, depth_scale=1e-3)
     points, normals = cloud.to_numpy()
     assert len(points) > 200
     outward = (points - [0.0, 0.0, 0.1]) / 0.1
@@ -47,7 +42,7 @@ def test_millimetres_of_a_sensor_give_the_points_in_metres():
 def test_a_strided_image_has_rows_of_the_whole(stride):
     """Planes are fitted to all pixels."""
     strided, rows = CAMERA.strided(stride), slice(stride // 2, None, stride)
-    cloud, whole = (PointCloud.from_depth(depth_of(BALL, TABLE), CAMERA, POSE, stride=n) for n in (stride, 1))
+    cloud, whole = (nbv.PointCloud.from_depth(depth_of(BALL, TABLE), CAMERA, POSE, stride=n) for n in (stride, 1))
     assert cloud.capacity == strided.num_rays
     for name in ("points", "normals", "mask", "missed"):
         kept = np.asarray(getattr(whole, name)).reshape(CAMERA.height, CAMERA.width, -1)[rows, rows]
@@ -61,7 +56,7 @@ def test_a_strided_image_has_rows_of_the_whole(stride):
 
 def test_a_box_keeps_the_object_and_knows_what_was_crossed():
     depth = depth_of(BALL, TABLE, PILLAR)
-    whole, cropped = (PointCloud.from_depth(depth, CAMERA, POSE, box=box) for box in (None, BOX))
+    whole, cropped = (nbv.PointCloud.from_depth(depth, CAMERA, POSE, box=box) for box in (None, BOX))
     points = np.asarray(whole.points, np.float64)
     low, high = np.array(BOX.low), np.array(BOX.high)
     inside = np.asarray(whole.mask) & np.all((points >= low) & (points <= high), axis=1)
@@ -87,9 +82,9 @@ def test_a_box_keeps_the_object_and_knows_what_was_crossed():
 
 
 def test_beyond_its_range_a_sensor_met_nothing_and_before_it_says_nothing():
-    limited = Camera.from_intrinsics(CAMERA.intrinsics, 48, 64, nearest=0.72, farthest=0.9)
+    limited = nbv.Camera.from_intrinsics(CAMERA.intrinsics, 48, 64, nearest=0.72, farthest=0.9)
     depth = depth_of(BALL, TABLE)
-    cloud = PointCloud.from_depth(depth, limited, POSE)
+    cloud = nbv.PointCloud.from_depth(depth, limited, POSE)
     flat = depth.reshape(-1)
     np.testing.assert_array_equal(cloud.missed, flat > 0.9)
     assert not np.asarray(cloud.mask)[(flat < 0.72) | (flat > 0.9)].any()
@@ -98,8 +93,8 @@ def test_beyond_its_range_a_sensor_met_nothing_and_before_it_says_nothing():
 
 def test_what_cannot_be_meant_is_named():
     depth = depth_of(BALL, TABLE)
-    ranged = Camera.from_intrinsics(CAMERA.intrinsics, 48, 64, nearest=0.1, farthest=3.0)
-    turned = Pose.from_matrix(POSE.matrix, "opengl")
+    ranged = nbv.Camera.from_intrinsics(CAMERA.intrinsics, 48, 64, nearest=0.1, farthest=3.0)
+    turned = nbv.Pose.from_matrix(POSE.matrix, "opengl")
     for image, camera, pose, options, message in (
         (1000.0 * depth, ranged, POSE, {}, r"out of the camera's range of 0\.1 to 3: give the depth's scale, 0\.001"),
         (
@@ -114,13 +109,13 @@ def test_what_cannot_be_meant_is_named():
         (depth, CAMERA, POSE, {"stride": 0}, "stride is 0"),
         (depth[1:], CAMERA, POSE, {}, r"\(47, 64\) but the camera has \(48, 64\).*Camera\(height"),
     ):
-        with pytest.raises(InputError, match=message):
-            PointCloud.from_depth(image, camera, pose, **options)
+        with pytest.raises(nbv.InputError, match=message):
+            nbv.PointCloud.from_depth(image, camera, pose, **options)
 
 
 def test_depths_beyond_the_type_say_nothing_and_only_infinity_says_nothing_is_there():
-    camera, pose = Camera(height=4, width=4), look_at((0.0, 0.0, 2.5))
+    camera, pose = nbv.Camera(height=4, width=4), nbv.look_at((0.0, 0.0, 2.5))
     for depth, missed in ((3.5e38, 0), (1e300, 0), (np.inf, 16)):
-        cloud = PointCloud.from_depth(np.full((4, 4), depth), camera, pose)
+        cloud = nbv.PointCloud.from_depth(np.full((4, 4), depth), camera, pose)
         assert int(cloud.count) == 0
         assert int(cloud.missed.sum()) == missed

@@ -5,13 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxnbv.checks import InputError
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.frame import Frame
-from jaxnbv.geometry.pose import look_at
-from jaxnbv.geometry.volume import Box
-from jaxnbv.scanning import SDFSurface, load_mesh, scan
+import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
 
 AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
@@ -20,12 +14,12 @@ UPS = [*AXES, *(f"-{axis}" for axis in AXES)]
 
 def test_frame_centres_the_box_and_scales_its_longest_side():
     world = np.array([[10.0, 0.0, -3.0], [14.0, 1.0, -1.0], [12.0, 0.5, -2.9]])
-    frame = Frame.fit(world)
+    frame = nbv.Frame.fit(world)
     scene = frame.to_scene(world)
     np.testing.assert_allclose(scene.min(axis=0), [-1.25, -0.3125, -0.625], atol=1e-12)
     np.testing.assert_allclose(scene.max(axis=0), [1.25, 0.3125, 0.625], atol=1e-12)
     np.testing.assert_allclose(frame.to_world(scene), world, atol=1e-12)
-    assert Frame.fit(world, longest_side=1.0).scale == pytest.approx(0.25)
+    assert nbv.Frame.fit(world, longest_side=1.0).scale == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize(
@@ -38,12 +32,12 @@ def test_frame_centres_the_box_and_scales_its_longest_side():
 )
 def test_frame_of_no_extent_is_refused(points, message):
     with pytest.raises(ValueError, match=message):
-        Frame.fit(points)
+        nbv.Frame.fit(points)
 
 
 @pytest.mark.parametrize("up", UPS)
 def test_up_is_the_scene_s_y_by_a_rotation(up):
-    frame = Frame(2.0, (1.0, 2.0, 3.0), up)
+    frame = nbv.Frame(2.0, (1.0, 2.0, 3.0), up)
     axis = np.array(AXES[up[-1]], float) * (-1.0 if up.startswith("-") else 1.0)
     np.testing.assert_array_equal(frame.rotation @ axis, [0.0, 1.0, 0.0])
     np.testing.assert_array_equal(frame.rotation @ frame.rotation.T, np.eye(3))
@@ -56,19 +50,19 @@ def test_up_is_the_scene_s_y_by_a_rotation(up):
 @pytest.mark.parametrize("up", ["y", "-z"])
 def test_what_a_sensor_sees_in_the_world_is_what_it_sees_in_the_scene(up):
     """A depth image, its camera, pose and box, brought to the scene before or after it becomes a cloud."""
-    frame = Frame(0.01, (50.0, -20.0, 30.0), up)
-    camera = Camera(0.6, 12, 14, nearest=150.0, farthest=260.0)
-    pose = look_at((50.0, 90.0, 190.0), (48.0, -18.0, 31.0), up=(0.1, 0.9, 0.3))
-    box = Box((0.0, -60.0, -20.0), (75.0, 30.0, 80.0))
-    ball = SDFSurface(Sphere(45.0).translate([50.0, -20.0, 30.0]), bounding_radius=400.0)
-    seen = scan(ball, camera, pose)
+    frame = nbv.Frame(0.01, (50.0, -20.0, 30.0), up)
+    camera = nbv.Camera(0.6, 12, 14, nearest=150.0, farthest=260.0)
+    pose = nbv.look_at((50.0, 90.0, 190.0), (48.0, -18.0, 31.0), up=(0.1, 0.9, 0.3))
+    box = nbv.Box((0.0, -60.0, -20.0), (75.0, 30.0, 80.0))
+    ball = nbv.SDFSurface(Sphere(45.0).translate([50.0, -20.0, 30.0]), bounding_radius=400.0)
+    seen = nbv.scan(ball, camera, pose)
     depth = np.where(
         seen.mask, (np.asarray(seen.points) - np.asarray(pose.position)) @ np.asarray(pose.forward), np.inf
     )
     depth = depth.reshape(12, 14)
-    world = frame.to_scene(PointCloud.from_depth(depth, camera, pose, box=box))
+    world = frame.to_scene(nbv.PointCloud.from_depth(depth, camera, pose, box=box))
     moved = frame.to_scene(camera), frame.to_scene(pose)
-    scene = PointCloud.from_depth(depth, *moved, depth_scale=0.01, box=frame.to_scene(box))
+    scene = nbv.PointCloud.from_depth(depth, *moved, depth_scale=0.01, box=frame.to_scene(box))
     assert int(scene.count) > 20
     np.testing.assert_array_equal(world.mask, scene.mask)
     np.testing.assert_array_equal(world.missed, scene.missed)
@@ -84,7 +78,7 @@ def test_what_a_sensor_sees_in_the_world_is_what_it_sees_in_the_scene(up):
 def test_a_mesh_of_another_up_stands_upright(tmp_path):
     trimesh.creation.cylinder(0.1, 2.0).export(tmp_path / "pole.ply")
     for up, expected in (("z", 1), ("y", 2)):
-        vertices = load_mesh(tmp_path / "pole.ply", up).vertices
+        vertices = nbv.load_mesh(tmp_path / "pole.ply", up).vertices
         assert np.argmax(np.ptp(vertices, axis=0)) == expected
-    with pytest.raises(InputError, match="up is 'north'; give one of y, -y"):
-        load_mesh(tmp_path / "pole.ply", "north")
+    with pytest.raises(nbv.InputError, match="up is 'north'; give one of y, -y"):
+        nbv.load_mesh(tmp_path / "pole.ply", "north")

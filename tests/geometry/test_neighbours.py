@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from jaxnbv.geometry.cloud import PointCloud
+import jaxnbv as nbv
 from jaxnbv.geometry.neighbours import nearest_squared_distance, spacing
 
 
 def cloud_of(points, mask=None):
     points = jnp.asarray(points)
     mask = jnp.ones(len(points), bool) if mask is None else jnp.asarray(mask)
-    return PointCloud(points, jnp.zeros_like(points).at[:, 0].set(1.0), mask)
+    return nbv.PointCloud(points, jnp.zeros_like(points).at[:, 0].set(1.0), mask)
 
 
 def brute_force(x, points):
@@ -91,12 +91,12 @@ def test_the_spacing_is_the_median_distance_between_neighbours(count):
     rows = np.random.default_rng(4).permutation(1000)[:count]
     held, mask = np.zeros((1000, 3), np.float32), np.zeros(1000, bool)
     held[rows], mask[rows] = points, True
-    cloud = PointCloud(jnp.asarray(held), jnp.asarray(held), jnp.asarray(mask))
+    cloud = nbv.PointCloud(jnp.asarray(held), jnp.asarray(held), jnp.asarray(mask))
     expected = np.median(cKDTree(points).query(points, k=2)[0][:, 1])
     assert float(spacing(cloud)) == pytest.approx(expected, rel=0.1)
 
 
 def test_fewer_than_two_points_have_no_spacing():
     for count in (0, 1):
-        cloud = PointCloud(jnp.ones((5, 3)), jnp.ones((5, 3)), jnp.arange(5) < count)
+        cloud = nbv.PointCloud(jnp.ones((5, 3)), jnp.ones((5, 3)), jnp.arange(5) < count)
         assert float(spacing(cloud)) == 0.0

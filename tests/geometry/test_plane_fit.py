@@ -4,14 +4,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud
+import jaxnbv as nbv
 from jaxnbv.geometry.plane_fit import depth_noise
-from jaxnbv.geometry.pose import look_at
 
 # A ball of 8 cm before a slanted plane, 0.45 m away: in metres, as a sensor of 640 x 480 pixels sees its middle.
-CAMERA = Camera.from_intrinsics([[570.0, 0.0, 99.5], [0.0, 570.0, 79.5], [0.0, 0.0, 1.0]], 160, 200)
-POSE = look_at((0.03, 0.0, 0.45))
+CAMERA = nbv.Camera.from_intrinsics([[570.0, 0.0, 99.5], [0.0, 570.0, 79.5], [0.0, 0.0, 1.0]], 160, 200)
+POSE = nbv.look_at((0.03, 0.0, 0.45))
 RADIUS = 0.08
 SLANTED, BEHIND = np.array([0.3, -0.2, 1.0]) / np.sqrt(1.13), -0.05
 
@@ -60,7 +58,7 @@ def test_normals_see_through_the_noise(noise, median, most, stride):
     """Degrees, half and nine tenths of the pixels; the edge of the ball among them. Depths are better than measured."""
     depth, normals = ball_and_plane()
     rows = slice(stride // 2, None, stride)
-    cloud = PointCloud.from_depth(image(noise), CAMERA, POSE, depth_scale=1e-3, stride=stride)
+    cloud = nbv.PointCloud.from_depth(image(noise), CAMERA, POSE, depth_scale=1e-3, stride=stride)
     mask, truth = np.asarray(cloud.mask), normals[rows, rows].reshape(-1, 3)
     assert mask.mean() > 0.99
     cosine = np.sum(np.asarray(cloud.normals, np.float64) * truth, axis=1)[mask]

@@ -4,12 +4,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv.geometry.volume import Box, boundary_points
-from jaxnbv.scanning import sdf
+import jaxnbv as nbv
+from jaxnbv.geometry.volume import boundary_points
 
 RNG = np.random.default_rng(0)
 LOW, HIGH = np.array([-0.5, 0.2, -1.0]), np.array([0.4, 0.9, 1.2])
-OFF_CENTRE = Box(tuple(LOW.tolist()), tuple(HIGH.tolist()))
+OFF_CENTRE = nbv.Box(tuple(LOW.tolist()), tuple(HIGH.tolist()))
 
 
 def points_on_faces(low, high, count):
@@ -46,7 +46,7 @@ def test_box_distances_against_the_nearest_of_many_surface_points(x64):
 )
 def test_a_box_without_an_inside_is_refused(low, high):
     with pytest.raises(ValueError, match=r"has no inside: each of three sides must be positive and finite"):
-        Box(low, high)
+        nbv.Box(low, high)
 
 
 def ellipsoid(x):
@@ -55,12 +55,12 @@ def ellipsoid(x):
 
 
 BOUNDARIES = {
-    "default box": (Box(), lambda p: np.abs(p).max(axis=1) - 1.25),
+    "default box": (nbv.Box(), lambda p: np.abs(p).max(axis=1) - 1.25),
     "box off the centre": (
-        Box((-0.3, -1.1, -0.2), (1.2, 0.4, 0.9)),
+        nbv.Box((-0.3, -1.1, -0.2), (1.2, 0.4, 0.9)),
         lambda p: np.maximum([-0.3, -1.1, -0.2] - p, p - [1.2, 0.4, 0.9]).max(axis=1),
     ),
-    "ball": (sdf.Sphere(0.8), lambda p: np.linalg.norm(p, axis=1) - 0.8),
+    "ball": (nbv.sdf.Sphere(0.8), lambda p: np.linalg.norm(p, axis=1) - 0.8),
     "callable": (ellipsoid, lambda p: np.linalg.norm(p / [0.9, 0.5, 0.7], axis=1) - 1.0),
 }
 

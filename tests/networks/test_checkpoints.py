@@ -10,14 +10,8 @@ import safetensors.numpy
 from published import classifier_state
 from torch_files import checkpoint
 
-from jaxnbv.checks import InputError
-from jaxnbv.networks import (
-    CloudClassifier,
-    CompactPartSegmenter,
-    InvariantClassifier,
-    load_checkpoint,
-    save_checkpoint,
-)
+import jaxnbv as nbv
+from jaxnbv.networks import CloudClassifier, CompactPartSegmenter, InvariantClassifier, load_checkpoint, save_checkpoint
 from jaxnbv.networks.torch_format import read_torch_tensors
 
 RNG = np.random.default_rng(0)
@@ -41,14 +35,14 @@ def test_a_network_is_the_same_from_safetensors_and_from_pytorch(tmp_path, state
     file = checkpoint(tmp_path / "net.pth", {f"{prefix}{name}": array for name, array in state.items()})
     assert set(read_torch_tensors(file)) == set(state)
     assert_same(load_checkpoint(file), network)
-    with pytest.raises(InputError, match="network is a PointNet2Classifier"):
+    with pytest.raises(nbv.InputError, match="network is a PointNet2Classifier"):
         save_checkpoint(network, tmp_path / "again.safetensors")
 
 
 def test_tensors_that_make_no_classifier_are_named(tmp_path, state):
     def problem(changes, without=()):
         arrays = {name: array for name, array in {**state, **changes}.items() if name not in without}
-        with pytest.raises(InputError, match=r"net\.pth does not hold") as error:
+        with pytest.raises(nbv.InputError, match=r"net\.pth does not hold") as error:
             load_checkpoint(checkpoint(tmp_path / "net.pth", arrays))
         return str(error.value)
 
@@ -69,13 +63,13 @@ def test_safetensors_files_that_are_damaged_or_missing(tmp_path, state):
     whole = file.read_bytes()
     for damaged in (b"", b"abc", whole[:50], whole[:-3]):
         file.write_bytes(damaged)
-        with pytest.raises(InputError, match=r"state\.safetensors is damaged"):
+        with pytest.raises(nbv.InputError, match=r"state\.safetensors is damaged"):
             load_checkpoint(file)
-    with pytest.raises(InputError, match="no file"):
+    with pytest.raises(nbv.InputError, match="no file"):
         load_checkpoint(tmp_path / "nowhere.safetensors")
-    with pytest.raises(InputError, match="cannot write"):
+    with pytest.raises(nbv.InputError, match="cannot write"):
         save_checkpoint(CompactPartSegmenter(jax.random.key(0)), tmp_path / "nowhere" / "net.safetensors")
-    with pytest.raises(InputError, match=r"\.pth or \.pt"):
+    with pytest.raises(nbv.InputError, match=r"\.pth or \.pt"):
         load_checkpoint(tmp_path / "net.onnx")
 
 
@@ -110,7 +104,7 @@ def test_files_that_hold_no_whole_network_of_our_own_are_refused(own, tmp_path):
     def problem(changes, without=(), said=said):
         arrays = {key: array for key, array in {**whole, **changes}.items() if key not in without}
         safetensors.numpy.save_file(arrays, file, {"network": said})
-        with pytest.raises(InputError, match=r"net\.safetensors does not hold") as error:
+        with pytest.raises(nbv.InputError, match=r"net\.safetensors does not hold") as error:
             load_checkpoint(file)
         return str(error.value)
 

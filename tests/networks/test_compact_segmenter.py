@@ -7,11 +7,7 @@ import numpy as np
 import pytest
 from training_clouds import scanned_clouds
 
-from jaxnbv.networks import (
-    CATEGORIES,
-    CompactPartSegmenter,
-    part_segmenter,
-)
+from jaxnbv.networks import CATEGORIES, CompactPartSegmenter, part_segmenter
 from jaxnbv.scanning.sensors import PART_SETTING
 from jaxnbv.studies.scenes import Split, part_scene
 

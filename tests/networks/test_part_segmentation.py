@@ -10,8 +10,7 @@ import pytest
 from published import layers, near_sphere
 from safetensors.numpy import save_file
 
-from jaxnbv.checks import InputError
-from jaxnbv.geometry.cloud import PointCloud
+import jaxnbv as nbv
 from jaxnbv.networks import (
     CATEGORIES,
     CloudSegmenter,
@@ -134,9 +133,9 @@ def test_masked_rows_and_capacity_do_not_matter():
 def test_calls_that_cannot_be_answered_are_refused():
     network, (points, normals) = small_network(), rows(30)
     for category in (-1, 16, np.asarray(50)):
-        with pytest.raises(InputError, match="the network knows 0 to 15"):
+        with pytest.raises(nbv.InputError, match="the network knows 0 to 15"):
             network(points, normals, category)
-    with pytest.raises(InputError, match="n > 0"):
+    with pytest.raises(nbv.InputError, match="n > 0"):
         network(points[:0], normals[:0], 3)
 
 
@@ -146,7 +145,7 @@ def test_tensors_that_make_no_segmenter_are_named(tmp_path):
     def problem(changes, without=()):
         arrays = {name: array for name, array in {**state, **changes}.items() if name not in without}
         save_file(arrays, tmp_path / "net.safetensors")
-        with pytest.raises(InputError, match=r"net\.safetensors does not hold") as error:
+        with pytest.raises(nbv.InputError, match=r"net\.safetensors does not hold") as error:
             load_checkpoint(tmp_path / "net.safetensors")
         return str(error.value)
 
@@ -168,7 +167,7 @@ def test_the_parts_of_all_categories_make_up_the_fifty():
     assert np.flatnonzero(mask[category_index("chair")]).tolist() == [12, 13, 14, 15]
     assert [category_index(category.name) for category in CATEGORIES] == list(range(16))
     assert len({category.synset for category in CATEGORIES}) == 16
-    with pytest.raises(InputError, match=r"no category 'sofa'.*chair"):
+    with pytest.raises(nbv.InputError, match=r"no category 'sofa'.*chair"):
         category_index("sofa")
 
 
@@ -176,7 +175,7 @@ answers_of = eqx.filter_jit(lambda segmenter, cloud: (segmenter(cloud), *segment
 
 
 def cloud_of(points, normals, capacity):
-    return PointCloud.from_arrays(np.asarray(points), np.asarray(normals), capacity)
+    return nbv.PointCloud.from_arrays(np.asarray(points), np.asarray(normals), capacity)
 
 
 def test_a_cloud_segmenter_gives_probabilities_of_the_categorys_parts():
@@ -196,7 +195,7 @@ def test_a_cloud_segmenter_gives_probabilities_of_the_categorys_parts():
     np.testing.assert_allclose(p[:30, 47:], given / given.sum(axis=1, keepdims=True), atol=1e-5)
     np.testing.assert_array_equal(labels, np.where(np.arange(40) < 30, p.argmax(axis=1), -1))
     assert set(np.asarray(labels[:30]).tolist()) <= {47, 48, 49}
-    p, _, labels = answers_of(segmenter, PointCloud(cloud.points, cloud.normals, jnp.zeros(50, bool)))
+    p, _, labels = answers_of(segmenter, nbv.PointCloud(cloud.points, cloud.normals, jnp.zeros(50, bool)))
     assert not np.asarray(p).any()
     assert (np.asarray(labels) == -1).all()
 

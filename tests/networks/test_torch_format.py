@@ -20,7 +20,7 @@ from torch_files import (
     write_stream,
 )
 
-from jaxnbv.checks import InputError
+import jaxnbv as nbv
 from jaxnbv.networks.torch_format import read_torch_tensors
 
 RNG = np.random.default_rng(0)
@@ -74,7 +74,7 @@ def test_the_older_layout(tmp_path, state):
     whole = file.read_bytes()
     for cut in (1, 5, 30, len(whole) // 2, len(whole) - 1):
         file.write_bytes(whole[:cut])
-        with pytest.raises(InputError, match=r"net\.pth"):
+        with pytest.raises(nbv.InputError, match=r"net\.pth"):
             read_torch_tensors(file)
 
 
@@ -93,7 +93,7 @@ def test_whatever_else_a_file_asks_for_is_not_run(tmp_path, module, name, layout
         write_stream(file, attack, {}, [])
     else:
         file.write_bytes(dumps(attack))
-    with pytest.raises(InputError, match=r"net\.pth"):
+    with pytest.raises(nbv.InputError, match=r"net\.pth"):
         read_torch_tensors(file)
     assert not mark.exists()
 
@@ -123,13 +123,13 @@ def test_damaged_archives_are_refused(tmp_path, state):
     whole = file.read_bytes()
     for damaged in (b"", b"PK", b"<html>not found</html>", whole[:40], whole[: len(whole) // 2], whole[:-5]):
         file.write_bytes(damaged)
-        with pytest.raises(InputError, match=r"net\.pth"):
+        with pytest.raises(nbv.InputError, match=r"net\.pth"):
             read_torch_tensors(file)
     at = whole.index(np.ascontiguousarray(state["fc1.weight"]).tobytes())
     file.write_bytes(whole[: at + 9] + bytes([whole[at + 9] ^ 1]) + whole[at + 10 :])
-    with pytest.raises(InputError, match=r"net\.pth is damaged"):
+    with pytest.raises(nbv.InputError, match=r"net\.pth is damaged"):
         read_torch_tensors(file)
-    with pytest.raises(InputError, match="no file"):
+    with pytest.raises(nbv.InputError, match="no file"):
         read_torch_tensors(tmp_path / "nowhere.pth")
 
 
@@ -146,20 +146,20 @@ def test_damaged_archives_are_refused(tmp_path, state):
 def test_tensors_that_leave_their_storage_are_refused(tmp_path, offset, shape, strides):
     content = {"a": view(storage("0", "FloatStorage", 24), offset, shape, strides)}
     file = write_archive(tmp_path / "net.pth", content, {"0": bytes(96)})
-    with pytest.raises(InputError, match=r"net\.pth is damaged"):
+    with pytest.raises(nbv.InputError, match=r"net\.pth is damaged"):
         read_torch_tensors(file)
 
 
 def test_missing_and_mismatched_storages_are_named(tmp_path):
     content = {"a": view(storage("0", "FloatStorage", 24), 0, (24,), (1,))}
     for data, problem in (({}, "net/data/0"), ({"0": bytes(95)}, "buffer is smaller")):
-        with pytest.raises(InputError, match=problem):
+        with pytest.raises(nbv.InputError, match=problem):
             read_torch_tensors(write_archive(tmp_path / "net.pth", content, data))
 
 
 @pytest.mark.parametrize("content", [{}, {"epoch": 3}, [1, 2], {"model_state_dict": {"a": 1.0}}, {1: 2}])
 def test_files_without_a_state_dictionary_are_refused(tmp_path, content):
-    with pytest.raises(InputError, match=r"state_dict"):
+    with pytest.raises(nbv.InputError, match=r"state_dict"):
         read_torch_tensors(write_archive(tmp_path / "net.pth", content, {}))
 
 
@@ -167,5 +167,5 @@ def test_storages_that_an_older_file_does_not_fill_are_refused(tmp_path, state):
     content, data = tensors_and_bytes(state, None)
     first = dict(list(data.items())[:1])
     file = write_stream(tmp_path / "net.pth", content, first, [next(iter(state.values())).size])
-    with pytest.raises(InputError, match="lists other storages than its tensors need"):
+    with pytest.raises(nbv.InputError, match="lists other storages than its tensors need"):
         read_torch_tensors(file)

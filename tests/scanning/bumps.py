@@ -7,12 +7,11 @@ import numpy as np
 import scipy.ndimage
 from on_grid import nodes
 
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.scanning.grid import Grid, GridSurface
+import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Cuboid, Cylinder, Torus
 
-GRID, SMALL = Grid(60, 1.75), Grid(20, 1.75)
-FEW = Camera(height=6, width=6)
+GRID, SMALL = nbv.Grid(60, 1.75), nbv.Grid(20, 1.75)
+FEW = nbv.Camera(height=6, width=6)
 
 
 def solid():
@@ -35,12 +34,12 @@ def some_bumps(rng):
 
 
 def grid_surface(field, grid):
-    return GridSurface.from_values(field(jnp.asarray(nodes(grid.axis))), 0.0, grid)
+    return nbv.GridSurface.from_values(field(jnp.asarray(nodes(grid.axis))), 0.0, grid)
 
 
 def small_surfaces(rng, count):
     values = np.stack([some_bumps(rng)(nodes(SMALL.axis)) for _ in range(count)])
-    return GridSurface.from_values(values, 0.0, SMALL)
+    return nbv.GridSurface.from_values(values, 0.0, SMALL)
 
 
 def rough_values(grid, seed, amplitude):

@@ -6,23 +6,21 @@ import equinox as eqx
 import numpy as np
 from on_grid import nodes
 
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.pose import look_at
-from jaxnbv.scanning import (
-    Carving,
-    Grid,
-    SDFSurface,
-)
+import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Cuboid, Sphere
 
 # Rays 0.02 apart on the object, nodes 0.07.
-CAMERA, GRID, POSE = Camera(height=56, width=70, fov=0.5), Grid(50), look_at((0.8, 0.9, 2.2), target=(0.2, 0.0, 0.0))
+CAMERA, GRID, POSE = (
+    nbv.Camera(height=56, width=70, fov=0.5),
+    nbv.Grid(50),
+    nbv.look_at((0.8, 0.9, 2.2), target=(0.2, 0.0, 0.0)),
+)
 CENTRE, RADIUS, HALF = np.array([0.1, -0.2, 0.15]), 0.5, np.array([0.5, 0.3, 0.4])
 SOLIDS = {
-    "ball": SDFSurface(Sphere(RADIUS).translate(CENTRE)),
-    "box": SDFSurface(Cuboid(HALF).translate(CENTRE)),
+    "ball": nbv.SDFSurface(Sphere(RADIUS).translate(CENTRE)),
+    "box": nbv.SDFSurface(Cuboid(HALF).translate(CENTRE)),
 }
-SEE = eqx.filter_jit(Carving.seen_empty)
+SEE = eqx.filter_jit(nbv.Carving.seen_empty)
 
 
 def nodes_of(grid):

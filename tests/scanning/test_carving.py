@@ -9,34 +9,16 @@ import pytest
 from free_scenes import SEE, SOLIDS, image, nodes_of
 from jaxtyping import Array, Float
 
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.pose import look_at
-from jaxnbv.geometry.volume import Box
-from jaxnbv.imagination import Imagination
-from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import (
-    Carving,
-    Evidence,
-    Grid,
-    GridSurface,
-    SDFSurface,
-    SensorNoise,
-    carve,
-    scan,
-    scan_samples,
-)
+import jaxnbv as nbv
+from jaxnbv.scanning import carve
 from jaxnbv.scanning.sdf import Cuboid
-from jaxnbv.search import FarthestView
-from jaxnbv.surfaces import Fields, GeometricSPSR, SurfaceModel, SurfacePosterior
-from jaxnbv.tasks import Coverage
 
 RNG = np.random.default_rng(0)
-SMALL_GRID = Grid(30, 1.6)
-POSES = [look_at((0.0, 0.3, 2.5)), look_at((0.0, 0.3, -2.5))]
+SMALL_GRID = nbv.Grid(30, 1.6)
+POSES = [nbv.look_at((0.0, 0.3, 2.5)), nbv.look_at((0.0, 0.3, -2.5))]
 
 
-class Waves(Fields):
+class Waves(nbv.Fields):
     """A ball under random waves, whatever was scanned: dents and islands all over the scene."""
 
     phases: Float[Array, "s 3"]
@@ -46,7 +28,7 @@ class Waves(Fields):
         return jnp.linalg.norm(x, axis=-1) - 0.6 + waves
 
 
-class WavesPosterior(SurfacePosterior):
+class WavesPosterior(nbv.SurfacePosterior):
     level: Float[Array, ""]
 
     def sample(self, key, num_samples):
@@ -59,22 +41,24 @@ class WavesPosterior(SurfacePosterior):
         return jnp.full(x.shape[0], 1.5)
 
 
-class WavesModel(SurfaceModel):
+class WavesModel(nbv.SurfaceModel):
     def condition(self, evidence):
         return WavesPosterior(level=jnp.asarray(0.1))
 
 
-CARVING, WAVES = Carving(), WavesModel()
+CARVING, WAVES = nbv.Carving(), WavesModel()
 
 
 def planner_of(carving=CARVING, model=WAVES):
-    imagination = Imagination(model, SMALL_GRID, 3, carving)
-    return Planner(Coverage(), FarthestView(12), Camera(height=40, width=40), imagination, capacity=400, max_views=4)
+    imagination = nbv.Imagination(model, SMALL_GRID, 3, carving)
+    return nbv.Planner(
+        nbv.Coverage(), nbv.FarthestView(12), nbv.Camera(height=40, width=40), imagination, capacity=400, max_views=4
+    )
 
 
 def after_both_sides(planner, surface, poses=POSES):
-    evidence = planner.init(poses[0], scan(surface, planner.camera, poses[0]))
-    return planner.observe(evidence, poses[1], scan(surface, planner.camera, poses[1]))
+    evidence = planner.init(poses[0], nbv.scan(surface, planner.camera, poses[0]))
+    return planner.observe(evidence, poses[1], nbv.scan(surface, planner.camera, poses[1]))
 
 
 def test_no_sample_is_inside_what_was_seen_empty_nor_outside_the_volume():
@@ -83,7 +67,7 @@ def test_no_sample_is_inside_what_was_seen_empty_nor_outside_the_volume():
     assert raw_evidence.seen_empty is None
     expected = np.zeros((30,) * 3, bool)
     for pose in POSES:
-        seen = SEE(CARVING, SMALL_GRID, pose, scan(SOLIDS["ball"], planner.camera, pose), planner.camera)
+        seen = SEE(CARVING, SMALL_GRID, pose, nbv.scan(SOLIDS["ball"], planner.camera, pose), planner.camera)
         assert seen.sum() > 200
         expected |= np.asarray(seen)
     np.testing.assert_array_equal(evidence.seen_empty, expected)
@@ -105,7 +89,7 @@ class Told(WavesModel):
     """Is told of space seen empty: its level says of how many points, and how far the farthest is out of the volume."""
 
     def condition(self, evidence):
-        empty = Evidence.of(evidence).empty_points
+        empty = nbv.Evidence.of(evidence).empty_points
         outermost = jnp.max(jnp.where(empty.mask, jnp.max(jnp.abs(empty.points), axis=1), 0.0))
         return WavesPosterior(level=1000.0 * jnp.sum(empty.mask) + outermost)
 
@@ -127,21 +111,24 @@ def test_the_model_is_told_of_what_was_seen_empty_within_the_volume():
     np.testing.assert_allclose(level, 1000.0 * len(points) + np.abs(points).max(), rtol=1e-4)
 
 
-SHEET = SDFSurface(Cuboid([0.6, 0.6, 0.01]))
-ABOVE_AND_BELOW = [look_at((0.0, 0.0, 2.5)), look_at((0.0, 0.0, -2.5))]
+SHEET = nbv.SDFSurface(Cuboid([0.6, 0.6, 0.01]))
+ABOVE_AND_BELOW = [nbv.look_at((0.0, 0.0, 2.5)), nbv.look_at((0.0, 0.0, -2.5))]
 
 
 def test_carved_samples_keep_a_thin_sheet_that_was_seen_from_both_sides():
     """Rays straight at the sheet from both sides meet every sample there, as they do where nothing is carved."""
-    model = GeometricSPSR(truncation=12, lengthscale=0.1)
-    planner, raw = (planner_of(carving, model=model) for carving in (Carving(), None))
-    sheet = SDFSurface(Cuboid([0.6, 0.6, 0.04]))
+    model = nbv.GeometricSPSR(truncation=12, lengthscale=0.1)
+    planner, raw = (planner_of(carving, model=model) for carving in (nbv.Carving(), None))
+    sheet = nbv.SDFSurface(Cuboid([0.6, 0.6, 0.04]))
     evidence = after_both_sides(planner, sheet, ABOVE_AND_BELOW)
     values = raw.imagination.sample(evidence, jax.random.key(1)).values
     carved = carve(values, evidence.seen_empty | planner.imagination.carving.outside(SMALL_GRID))
-    narrow, poses = Camera(height=10, width=10, fov=0.35), look_at(jnp.asarray([[0.0, 0.0, 2.5], [0.0, 0.0, -2.5]]))
-    surfaces = GridSurface.from_values(jnp.concatenate([values, carved]), 0.0, SMALL_GRID)
-    clouds = scan_samples(surfaces, narrow, poses)
+    narrow, poses = (
+        nbv.Camera(height=10, width=10, fov=0.35),
+        nbv.look_at(jnp.asarray([[0.0, 0.0, 2.5], [0.0, 0.0, -2.5]])),
+    )
+    surfaces = nbv.GridSurface.from_values(jnp.concatenate([values, carved]), 0.0, SMALL_GRID)
+    clouds = nbv.scan_samples(surfaces, narrow, poses)
     on_sheet = np.asarray(clouds.mask) & (np.abs(np.asarray(clouds.points)[..., 2]) < 2.0 * SMALL_GRID.spacing)
     before, after = on_sheet.reshape(2, 3, 2, -1).mean(axis=-1)
     assert (before > 0.5).all(), "the model does not see the sheet"
@@ -149,15 +136,15 @@ def test_carved_samples_keep_a_thin_sheet_that_was_seen_from_both_sides():
 
 
 def test_a_scan_of_another_camera_needs_that_camera():
-    planner, other, pose = planner_of(), Camera(height=20, width=36, fov=0.6), POSES[1]
-    seen = scan(SOLIDS["ball"], other, pose)
+    planner, other, pose = planner_of(), nbv.Camera(height=20, width=36, fov=0.6), POSES[1]
+    seen = nbv.scan(SOLIDS["ball"], other, pose)
     expected = np.asarray(SEE(CARVING, SMALL_GRID, pose, seen, other))
     column, row, _ = image(nodes_of(SMALL_GRID)[expected], other, pose)
     # Wider than the planner's own image.
     assert np.ptp(column) > 25
     assert np.ptp(row) > 10
     np.testing.assert_array_equal(planner.init(pose, seen, camera=other).seen_empty, expected)
-    evidence = planner.init(POSES[0], scan(SOLIDS["ball"], planner.camera, POSES[0]))
+    evidence = planner.init(POSES[0], nbv.scan(SOLIDS["ball"], planner.camera, POSES[0]))
     after = planner.observe(evidence, pose, seen, camera=other)
     np.testing.assert_array_equal(after.seen_empty, expected | np.asarray(evidence.seen_empty))
     for tell in (lambda: planner.init(pose, seen), lambda: planner.observe(evidence, pose, seen)):
@@ -167,36 +154,36 @@ def test_a_scan_of_another_camera_needs_that_camera():
 
 def test_a_cloud_that_is_no_image_carves_nothing():
     planner = planner_of()
-    points = scan(SOLIDS["ball"], Camera(height=9, width=9), POSES[0])
-    cloud = PointCloud.from_arrays(*points.to_numpy())
+    points = nbv.scan(SOLIDS["ball"], nbv.Camera(height=9, width=9), POSES[0])
+    cloud = nbv.PointCloud.from_arrays(*points.to_numpy())
     assert cloud.missed is None
     evidence = planner.init(POSES[0], cloud)
     assert not evidence.seen_empty.any()
     assert not planner.observe(evidence, POSES[1], cloud).seen_empty.any()
-    unknown = planner.init(None, scan(SOLIDS["ball"], planner.camera, POSES[0]))
+    unknown = planner.init(None, nbv.scan(SOLIDS["ball"], planner.camera, POSES[0]))
     assert not unknown.seen_empty.any(), "nothing is known of a scan from an unknown pose"
 
 
 def test_an_object_larger_than_its_volume_is_refused_and_one_that_fits_is_not():
     """The ball's near side reaches 0.65 along z; two margins are 0.22."""
-    noisy = SensorNoise()(scan(SOLIDS["ball"], Camera(height=40, width=40), POSES[0]), jax.random.key(0))
+    noisy = nbv.SensorNoise()(nbv.scan(SOLIDS["ball"], nbv.Camera(height=40, width=40), POSES[0]), jax.random.key(0))
 
     def boxed(half):
-        return planner_of(Carving(Box((-half,) * 3, (half,) * 3)))
+        return planner_of(nbv.Carving(nbv.Box((-half,) * 3, (half,) * 3)))
 
     small, fits = boxed(0.3), boxed(0.6)
     far = planner_of()
     assert int(fits.observe(fits.init(POSES[0], noisy), POSES[0], noisy).num_views) == 2
-    speck = PointCloud.from_arrays([[0.0, 0.0, 0.1]], [[0.0, 0.0, 1.0]])
+    speck = nbv.PointCloud.from_arrays([[0.0, 0.0, 0.1]], [[0.0, 0.0, 1.0]])
     for tell in (lambda: small.init(POSES[0], noisy), lambda: small.observe(small.init(None, speck), POSES[0], noisy)):
         with pytest.raises(
             ValueError, match=r"\d+ of \d+ .* up to 0\.\d+ outside the volume.*declare a larger one, Carving\(Box"
         ):
             tell()
-    edge = PointCloud.from_arrays([[0.0, 0.0, 1.25 + 2.1 * SMALL_GRID.spacing]], [[0.0, 0.0, 1.0]])
+    edge = nbv.PointCloud.from_arrays([[0.0, 0.0, 1.25 + 2.1 * SMALL_GRID.spacing]], [[0.0, 0.0, 1.0]])
     with pytest.raises(ValueError, match=r"outside the volume"):
         far.init(None, edge)
     np.testing.assert_array_equal(planner_of(carving=None).init(None, edge).cloud.count, 1)
     points = np.concatenate([0.1 * RNG.normal(size=(299, 3)), np.asarray(edge.points)])
-    stray = PointCloud.from_arrays(points, np.tile([0.0, 0.0, 1.0], (300, 1)))
+    stray = nbv.PointCloud.from_arrays(points, np.tile([0.0, 0.0, 1.0], (300, 1)))
     np.testing.assert_array_equal(far.init(None, stray).cloud.count, 300)

@@ -1,6 +1,8 @@
-"""Traced hits on sampled fields: closed forms, a float64 brute-force march, Embree on marching cubes, properties."""
+"""Traced hits on sampled fields: closed forms, a float64 brute-force march, Embree on marching cubes, properties; and
+the parts of the march."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.ndimage
@@ -9,16 +11,14 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from on_grid import nodes
 
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.pose import fibonacci_sphere, look_at
-from jaxnbv.scanning.grid import Grid, GridSurface, scan_samples
-from jaxnbv.scanning.scanner import scan
+import jaxnbv as nbv
+from jaxnbv.scanning import cubic, tracing
 
-CAMERA = Camera(height=40, width=40)
+CAMERA = nbv.Camera(height=40, width=40)
 
 
 def sphere(grid=GRID, radius=1.0):
-    return GridSurface.from_values(np.linalg.norm(nodes(grid.axis), axis=-1), radius, grid)
+    return nbv.GridSurface.from_values(np.linalg.norm(nodes(grid.axis), axis=-1), radius, grid)
 
 
 def interpolate(values, points, grid):
@@ -65,7 +65,7 @@ def test_box_closed_form():
     q = np.abs(nodes(GRID.axis)) - half
     outside = np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0)
     origins, directions = random_rays(1, 4000, spread=0.6)
-    hits = GridSurface.from_values(outside, 0.0, GRID).trace(origins, directions)
+    hits = nbv.GridSurface.from_values(outside, 0.0, GRID).trace(origins, directions)
     t, normal = box_hit(origins, directions, half)
     expected = origins + t[:, None] * directions.astype(np.float64)
     assert np.asarray(hits.mask).all()
@@ -100,9 +100,9 @@ def brute_force(values, origins, directions, grid, step):
 
 @pytest.mark.parametrize("amplitude", [0.05, 0.5])
 def test_brute_force_march(amplitude):
-    grid = Grid(32, 1.5)
+    grid = nbv.Grid(32, 1.5)
     values = rough_values(grid, 3, amplitude).astype(np.float32)
-    surface = GridSurface.from_values(values, 0.0, grid)
+    surface = nbv.GridSurface.from_values(values, 0.0, grid)
     outside, inside = random_rays(4, 200), random_rays(5, 100, radius=0.6)
     origins, directions = (np.concatenate(pair) for pair in zip(outside, inside, strict=True))
     hits = surface.trace(origins, directions)
@@ -125,13 +125,13 @@ unit = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(unit, unit, st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
 def test_no_tunnelling_through_a_two_voxel_sheet(normal, direction, shift, slide):
-    grid = Grid(40, 1.75)
+    grid = nbv.Grid(40, 1.75)
     h = grid.spacing
     n, d = (np.array(v) / np.linalg.norm(v) for v in (normal, direction))
     side = -np.sign(d @ n)
     # A flatter ray enters the box within the sheet.
     assume(abs(d @ n) > 0.15)
-    surface = GridSurface.from_values(np.abs(nodes(grid.axis) @ n - shift) - h, 0.0, grid)
+    surface = nbv.GridSurface.from_values(np.abs(nodes(grid.axis) @ n - shift) - h, 0.0, grid)
     across = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
     targets = shift * n + np.linspace(-0.5, 0.5, 64)[:, None] * across + slide * np.cross(n, across)
     hits = surface.trace((targets - 4 * d).astype(np.float32), np.broadcast_to(d, (64, 3)).astype(np.float32))
@@ -143,9 +143,9 @@ def test_no_tunnelling_through_a_two_voxel_sheet(normal, direction, shift, slide
 
 
 def test_axis_parallel_rays_through_nodes_and_edges():
-    grid = Grid(33, 1.6)
+    grid = nbv.Grid(33, 1.6)
     values = rough_values(grid, 7, 0.1).astype(np.float32)
-    surface = GridSurface.from_values(values, 0.0, grid)
+    surface = nbv.GridSurface.from_values(values, 0.0, grid)
     a, b = np.meshgrid(grid.axis[1:-1], grid.axis[1:-1] + 0.25 * grid.spacing * (np.arange(31) % 3))
     a, b = a.ravel(), b.ravel()
     for axis in range(3):
@@ -172,9 +172,9 @@ def test_far_origins_and_rays_on_the_border_of_the_box():
 
 def test_samples_in_a_batch_equal_single_ones():
     values = np.stack([rough_values(GRID, seed, 0.1) for seed in range(3)]).astype(np.float32)
-    surfaces = GridSurface.from_values(values, 0.05, GRID)
-    poses = look_at(fibonacci_sphere(6, 2.5))
-    clouds = scan_samples(surfaces, CAMERA, poses)
+    surfaces = nbv.GridSurface.from_values(values, 0.05, GRID)
+    poses = nbv.look_at(nbv.fibonacci_sphere(6, 2.5))
+    clouds = nbv.scan_samples(surfaces, CAMERA, poses)
     assert clouds.points.shape == (3, 6, 1600, 3)
     assert clouds.mask.shape == (3, 6, 1600)
     origins, directions = camera_rays(poses)
@@ -185,10 +185,10 @@ def test_samples_in_a_batch_equal_single_ones():
         return np.abs(np.asarray(a) - np.asarray(b)).max(axis=-1) > 1e-5
 
     for i in range(3):
-        single = GridSurface.from_values(values[i], 0.05, GRID)
+        single = nbv.GridSurface.from_values(values[i], 0.05, GRID)
         np.testing.assert_array_equal(single.distance, surfaces.distance[i])
         for j in range(6):
-            expected = scan(single, CAMERA, poses[j])
+            expected = nbv.scan(single, CAMERA, poses[j])
             assert (clouds.mask[i, j] != expected.mask).mean() <= 0.002
             assert differs(clouds.points[i, j], expected.points).mean() <= 0.002
         assert (vmapped.mask[i] != clouds.mask[i].reshape(-1)).mean() <= 0.002
@@ -197,7 +197,7 @@ def test_samples_in_a_batch_equal_single_ones():
 
 def test_normals_are_interpolated_central_differences():
     values = rough_values(GRID, 14, 0.1).astype(np.float32)
-    hits = GridSurface.from_values(values, 0.0, GRID).trace(*random_rays(15, 4000))
+    hits = nbv.GridSurface.from_values(values, 0.0, GRID).trace(*random_rays(15, 4000))
     points = np.asarray(hits.points, np.float64)[np.asarray(hits.mask)]
     gradient = np.stack([interpolate(g, points, GRID) for g in np.gradient(values.astype(np.float64))], axis=1)
     gradient /= np.linalg.norm(gradient, axis=1, keepdims=True)
@@ -205,3 +205,38 @@ def test_normals_are_interpolated_central_differences():
     np.testing.assert_allclose(np.abs(np.sum(normals * gradient, axis=1)), 1.0, atol=1e-4)
     directions = random_rays(15, 4000)[1][np.asarray(hits.mask)]
     assert (np.sum(normals * directions, axis=1) <= 1e-6).all()
+
+
+def test_roots_of_cubics():
+    rng = np.random.default_rng(12)
+    c = rng.standard_normal((4, 5000))
+    c[3, :500], c[2:, 500:1000] = 0.0, 0.0
+    c = np.where(c[0] < 0, -c, c)
+    expected = np.full(5000, np.inf)
+    for i in range(5000):
+        roots = np.roots(np.trim_zeros(c[::-1, i], "f"))
+        real = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real >= 0) & (roots.real <= 1)]
+        expected[i] = real.min(initial=np.inf)
+    _, found = cubic.first_bracket([jnp.asarray(row, jnp.float32) for row in c])
+    root = cubic.first_root([jnp.asarray(row, jnp.float32) for row in c])
+    # Double roots, and roots at an end of the interval, may fall either way in float32.
+    assert (np.asarray(found) == np.isfinite(expected)).mean() > 0.999
+    hit = np.isfinite(expected) & np.asarray(found)
+    error = np.abs(np.asarray(root) - expected)[hit]
+    value = np.abs(np.polynomial.polynomial.polyval(np.asarray(root, np.float64), c, tensor=False))[hit]
+    assert value.max() < 1e-4
+    assert np.mean(error < 1e-4) > 0.99
+
+
+def test_free_distance_against_a_distance_transform():
+    axis = np.linspace(-1.75, 1.75, 60)
+    noise = scipy.ndimage.gaussian_filter(np.random.default_rng(13).standard_normal((60, 60, 60)), 1.2)
+    values = np.sqrt(axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2) - 0.9 + 0.1 * noise / noise.std()
+    distance = np.asarray(tracing.free_distance(jnp.asarray(values, jnp.float32)))
+    positive = values > 0
+    corners = [positive[i : i + 59, j : j + 59, k : k + 59] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    crossed = np.any(corners, axis=0) & ~np.all(corners, axis=0)
+    exact = scipy.ndimage.distance_transform_cdt(~crossed, metric="chessboard")
+    levels = np.array([0, 1, 2, 3, 5, 9, 17])
+    np.testing.assert_array_equal(np.abs(distance), levels[np.searchsorted(levels, exact, side="right") - 1])
+    np.testing.assert_array_equal(np.sign(distance), np.where(crossed, 0, np.where(corners[0], 1, -1)))

@@ -12,12 +12,9 @@ from bumps import FEW, GRID, grid_surface, random_rays, solid, some_bumps
 from jax.scipy.ndimage import map_coordinates
 from on_grid import nodes
 
-from jaxnbv.geometry.pose import look_at
-from jaxnbv.scanning.grid import GridSurface
-from jaxnbv.scanning.scanner import implicit_depth, scan
+import jaxnbv as nbv
+from jaxnbv.scanning.scanner import implicit_depth
 from jaxnbv.scanning.sdf import Sphere
-from jaxnbv.scanning.sphere_tracing import SDFSurface
-from jaxnbv.search.pose_space import FreePoses
 
 RNG = np.random.default_rng(0)
 
@@ -57,7 +54,7 @@ def optimistix_depth(along, near):
 def test_gradients_of_depths_equal_those_of_optimistix(name, x64):
     bumps = some_bumps(RNG)
     function = {"waves": bumps, "solid": solid(), "grid": Interpolant(bumps(jnp.asarray(nodes(GRID.axis))))}[name]
-    surface = SDFSurface(solid()) if name == "solid" else grid_surface(bumps, GRID)
+    surface = nbv.SDFSurface(solid()) if name == "solid" else grid_surface(bumps, GRID)
     origins, directions = map(jnp.asarray, random_rays(RNG, 60, spread=0.7, dtype=float))
     hits = surface.trace(origins, directions)
     use = np.asarray(hits.mask) & (-np.sum(hits.normals * directions, axis=1) > 0.2)
@@ -77,9 +74,9 @@ def test_gradients_of_depths_equal_those_of_optimistix(name, x64):
             held = jnp.full(len(near), 0.01)
             return weights @ implicit_depth(along, jax.lax.stop_gradient(depth), held > 0, held)
         if name == "solid":
-            traced = SDFSurface(along.function)
+            traced = nbv.SDFSurface(along.function)
         else:
-            traced = GridSurface(along.function.values, surface.distance, GRID)
+            traced = nbv.GridSurface(along.function.values, surface.distance, GRID)
         points = traced.trace(along.origins, along.directions).points
         offset, square = points - along.origins, jnp.sum(along.directions**2, axis=1)
         return weights @ (jnp.sum(offset * along.directions, axis=1) / square)
@@ -114,7 +111,7 @@ def test_rule_on_straight_functions_by_hand():
 
 def depths(surface, space, start, parameters):
     pose = space.retract(start, parameters)
-    cloud = scan(surface, FEW, pose)
+    cloud = nbv.scan(surface, FEW, pose)
     return jnp.sum((cloud.points - pose.position) * FEW.rays(pose)[1], axis=-1) * cloud.mask
 
 
@@ -128,7 +125,7 @@ def hessian_and_gradient(run):
 
 def test_second_derivatives_of_depths_of_a_ball_in_closed_form(x64):
     """t = -b - sqrt(b^2 - c), b = o . d, c = o . o - r^2."""
-    start, space = look_at((0.4, 2.4, 0.5)), FreePoses()
+    start, space = nbv.look_at((0.4, 2.4, 0.5)), nbv.FreePoses()
     parameters = jnp.asarray(0.02 * RNG.normal(size=9))
 
     def closed(parameters):
@@ -138,7 +135,7 @@ def test_second_derivatives_of_depths_of_a_ball_in_closed_form(x64):
         hit = b * b > c
         return jnp.where(hit, -b - jnp.sqrt(jnp.where(hit, b * b - c, 1.0)), 0.0)
 
-    run = functools.partial(depths, SDFSurface(Sphere(0.6)), space, start)
+    run = functools.partial(depths, nbv.SDFSurface(Sphere(0.6)), space, start)
     hessian, gradient = hessian_and_gradient(run)(parameters)
     expected = jax.jit(jax.hessian(closed))(parameters)
     misses = ~np.asarray(expected).any(axis=(1, 2))

@@ -9,9 +9,8 @@ import pytest
 import trimesh
 from bumps import box_hit, random_rays
 
-from jaxnbv.scanning.grid import Grid
-from jaxnbv.scanning.mesh import TriangleMesh, mesh_from_sdf
-from jaxnbv.scanning.mesh_files import load_mesh, load_parts
+import jaxnbv as nbv
+from jaxnbv.scanning.mesh_files import load_parts
 from jaxnbv.scanning.sdf import Cuboid, Sphere, Torus
 
 SHARED = Path(__file__).parents[3] / "shared" / "meshes"
@@ -42,7 +41,7 @@ SHAPES = {
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_hits_equal_moller_trumbore(name):
-    mesh = TriangleMesh.from_arrays(SHAPES[name].vertices + 7.0, SHAPES[name].faces)
+    mesh = nbv.TriangleMesh.from_arrays(SHAPES[name].vertices + 7.0, SHAPES[name].faces)
     o, d = random_rays(RNG, 500, spread=0.8, dtype=float)
     hits = mesh.trace(o, d)
     t = moller_trumbore(mesh.vertices, mesh.faces, o, d)
@@ -56,7 +55,7 @@ def test_hits_equal_moller_trumbore(name):
 
 
 def test_hits_of_a_box_equal_the_closed_form():
-    mesh = TriangleMesh.from_arrays(SHAPES["box"].vertices, SHAPES["box"].faces)
+    mesh = nbv.TriangleMesh.from_arrays(SHAPES["box"].vertices, SHAPES["box"].faces)
     half = np.array([0.5, 1.25, 0.75])
     np.testing.assert_allclose(np.abs(mesh.vertices), np.broadcast_to(half, (8, 3)))
     o, d = random_rays(RNG, 2000, spread=0.8, dtype=float)
@@ -73,12 +72,12 @@ def test_normals_face_the_sensor_for_any_winding_and_open_sheets():
     sphere = SHAPES["icosphere"]
     flip = RNG.random(len(sphere.faces)) < 0.5
     faces = np.where(flip[:, None], sphere.faces[:, ::-1], sphere.faces)
-    straight = TriangleMesh.from_arrays(sphere.vertices, sphere.faces)
+    straight = nbv.TriangleMesh.from_arrays(sphere.vertices, sphere.faces)
     o, d = random_rays(RNG, 500, spread=0.8, dtype=float)
-    expected, hits = straight.trace(o, d), TriangleMesh.from_arrays(sphere.vertices, faces).trace(o, d)
+    expected, hits = straight.trace(o, d), nbv.TriangleMesh.from_arrays(sphere.vertices, faces).trace(o, d)
     np.testing.assert_allclose(hits.points, expected.points, atol=1e-6)
     np.testing.assert_allclose(hits.normals, expected.normals, atol=1e-6)
-    sheet = TriangleMesh.from_arrays([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [2, 0, 3]])
+    sheet = nbv.TriangleMesh.from_arrays([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [2, 0, 3]])
     for side in (1.0, -1.0):
         hits = sheet.trace(np.array([[0.1, 0.2, side]]), np.array([[0.0, 0.0, -side]]))
         np.testing.assert_allclose(hits.points, [[0.1, 0.2, 0.0]], atol=1e-6)
@@ -89,13 +88,13 @@ def test_normals_face_the_sensor_for_any_winding_and_open_sheets():
 
 def test_frame_and_unused_vertices():
     vertices = np.array([[0, 0, 0], [10, 0, 0], [0, 4, 0], [0, 0, 2], [999, 999, 999]], dtype=float)
-    mesh = TriangleMesh.from_arrays(vertices, [[0, 1, 2], [0, 2, 3], [0, 1, 3]])
+    mesh = nbv.TriangleMesh.from_arrays(vertices, [[0, 1, 2], [0, 2, 3], [0, 1, 3]])
     assert np.ptp(mesh.vertices, axis=0).max() == pytest.approx(2.5)
     np.testing.assert_allclose(mesh.frame.to_world(mesh.vertices), vertices[:4], atol=1e-9)
 
 
 def test_tracing_under_jit_names_the_remedy():
-    mesh = TriangleMesh.from_arrays(SHAPES["box"].vertices, SHAPES["box"].faces)
+    mesh = nbv.TriangleMesh.from_arrays(SHAPES["box"].vertices, SHAPES["box"].faces)
     o, d = (jnp.asarray(a, dtype=jnp.result_type(float)) for a in random_rays(RNG, 3))
     for call in (lambda: jax.jit(lambda o, d: mesh.trace(o, d))(o, d), lambda: jax.jit(lambda m: m.trace(o, d))(mesh)):
         with pytest.raises(ValueError, match="solid_of_mesh"):
@@ -117,51 +116,40 @@ TRIANGLE = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
 )
 def test_broken_arrays_are_refused(vertices, faces, message):
     # The function below the run-time check of shapes, which refuses some of these first.
-    build = getattr(TriangleMesh.from_arrays, "__func__", TriangleMesh.from_arrays)
+    build = getattr(nbv.TriangleMesh.from_arrays, "__func__", nbv.TriangleMesh.from_arrays)
     with pytest.raises((ValueError, TypeError), match=f"{message}|[Tt]ype-check"):
-        build(TriangleMesh, vertices, faces)
+        build(nbv.TriangleMesh, vertices, faces)
 
 
 def test_zero_area_faces_are_dropped_and_counted():
     with pytest.warns(UserWarning, match="dropped 2 of 3 faces"):
-        mesh = TriangleMesh.from_arrays(TRIANGLE, [[0, 1, 2], [0, 0, 1], [2, 2, 2]])
+        mesh = nbv.TriangleMesh.from_arrays(TRIANGLE, [[0, 1, 2], [0, 0, 1], [2, 2, 2]])
     assert len(mesh.faces) == 1
 
 
 def test_broken_files_are_refused(tmp_path):
     with pytest.raises(ValueError, match="no mesh file"):
-        load_mesh(tmp_path / "absent.obj")
+        nbv.load_mesh(tmp_path / "absent.obj")
     for name, content in (("garbage.ply", b"\x00\x01garbage"), ("garbage.glb", b"nonsense"), ("mesh.xyzw", b"1")):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(ValueError, match="cannot read"):
-            load_mesh(tmp_path / name)
+            nbv.load_mesh(tmp_path / name)
     for name, content in (("empty.obj", ""), ("points.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n")):
         (tmp_path / name).write_text(content)
         with pytest.raises(ValueError, match=r"no faces|cannot read"):
-            load_mesh(tmp_path / name)
+            nbv.load_mesh(tmp_path / name)
     whole = SHAPES["box"].export(file_type="stl")
     for length in (90, 400, len(whole) - 1):
         (tmp_path / "cut.stl").write_bytes(whole[:length])
         with pytest.raises(ValueError, match=r"has no faces: .* an STL that was cut short|cannot read"):
-            load_mesh(tmp_path / "cut.stl")
+            nbv.load_mesh(tmp_path / "cut.stl")
     (tmp_path / "nan.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n")
     with pytest.raises(ValueError, match=r"nan\.obj.*not finite"):
-        load_mesh(tmp_path / "nan.obj")
-
-
-def test_a_scene_is_joined_where_it_places_its_parts(tmp_path):
-    scene = trimesh.Scene()
-    box = trimesh.creation.box((1.0, 1.0, 1.0))
-    scene.add_geometry(box)
-    scene.add_geometry(box.copy(), transform=trimesh.transformations.translation_matrix([4.0, 0.0, 0.0]))
-    scene.export(tmp_path / "two.glb")
-    mesh = load_mesh(tmp_path / "two.glb")
-    assert len(mesh.faces) == 24
-    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [2.5, 0.5, 0.5], atol=1e-6)
+        nbv.load_mesh(tmp_path / "nan.obj")
 
 
 def test_samples_lie_on_the_surface_and_are_even_by_area():
-    mesh = TriangleMesh.from_arrays(SHAPES["box"].vertices, SHAPES["box"].faces)
+    mesh = nbv.TriangleMesh.from_arrays(SHAPES["box"].vertices, SHAPES["box"].faces)
     points = mesh.sample_points(jax.random.key(0), 20_000)
     half = np.array([0.5, 1.25, 0.75])
     on = np.isclose(np.abs(points), half, atol=1e-6)
@@ -175,7 +163,7 @@ def test_samples_lie_on_the_surface_and_are_even_by_area():
 
 
 def test_mesh_of_a_solid():
-    mesh = mesh_from_sdf(Torus(0.8, 0.3), Grid(80))
+    mesh = nbv.mesh_from_sdf(Torus(0.8, 0.3), nbv.Grid(80))
     assert mesh.to_trimesh().is_watertight
     # Marching cubes inscribes: a deficit of order spacing^2 / radius^2, and outward faces give a positive volume.
     assert mesh.to_trimesh().volume == pytest.approx(2 * np.pi**2 * 0.8 * 0.3**2, rel=0.02)
@@ -183,7 +171,7 @@ def test_mesh_of_a_solid():
     np.testing.assert_allclose(np.hypot(ring, mesh.vertices[:, 1]), 0.3, atol=3e-3)
     assert mesh.frame.scale == 1.0
     with pytest.raises(ValueError, match="no surface lies within"):
-        mesh_from_sdf(Sphere(5.0) | Cuboid([4.0, 4.0, 4.0]), Grid(8))
+        nbv.mesh_from_sdf(Sphere(5.0) | Cuboid([4.0, 4.0, 4.0]), nbv.Grid(8))
 
 
 def test_an_off_file_whose_first_two_lines_run_together_is_read(tmp_path):
@@ -192,7 +180,7 @@ def test_an_off_file_whose_first_two_lines_run_together_is_read(tmp_path):
     assert text.startswith("OFF\n8 12 0")
     for name, written in (("well", text), ("glued", "OFF" + text[4:])):
         (tmp_path / f"{name}.off").write_text(written)
-    well, glued = (load_mesh(tmp_path / f"{name}.off") for name in ("well", "glued"))
+    well, glued = (nbv.load_mesh(tmp_path / f"{name}.off") for name in ("well", "glued"))
     np.testing.assert_array_equal(glued.vertices, well.vertices)
     np.testing.assert_array_equal(glued.faces, well.faces)
     np.testing.assert_allclose(np.ptp(glued.vertices, axis=0), [0.625, 1.25, 2.5], rtol=1e-6)
@@ -204,7 +192,7 @@ TURN = trimesh.transformations.rotation_matrix(0.7, (1.0, 2.0, -0.5))
 @pytest.mark.parametrize("sides", [(1.0, 1.0, 1.0), (4.0, 2.0, 0.3), (4.0, 2.0, 1e-4)])
 def test_the_reach_and_thickness_of_a_turned_box_are_its_diagonal_and_least_side(sides):
     shape = trimesh.creation.box(sides, transform=TURN)
-    mesh = TriangleMesh.from_arrays(shape.vertices, shape.faces)
+    mesh = nbv.TriangleMesh.from_arrays(shape.vertices, shape.faces)
     assert mesh.bounding_radius == pytest.approx(0.5 * np.linalg.norm(sides) * mesh.frame.scale)
     # All directions of a cube are alike: its least extent is between its side and its diagonal.
     if len({*sides}) == 3:
@@ -219,14 +207,14 @@ def test_open_edges_are_those_of_one_face(name, apart):
     vertices, faces = shape.vertices, shape.faces
     if apart:
         vertices, faces = vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
-    assert TriangleMesh.from_arrays(vertices, faces).open_edges == (0, len(shape.edges_unique))
-    assert TriangleMesh.from_arrays(vertices, faces[1:]).open_edges == (3, len(shape.edges_unique))
+    assert nbv.TriangleMesh.from_arrays(vertices, faces).open_edges == (0, len(shape.edges_unique))
+    assert nbv.TriangleMesh.from_arrays(vertices, faces[1:]).open_edges == (3, len(shape.edges_unique))
 
 
 @pytest.mark.parametrize("outward", [True, False])
 def test_a_ball_contains_what_is_nearer_than_its_radius_however_it_is_wound(outward):
     shape = trimesh.creation.icosphere(4)
-    mesh = TriangleMesh.from_arrays(shape.vertices, shape.faces[:, :: 1 if outward else -1])
+    mesh = nbv.TriangleMesh.from_arrays(shape.vertices, shape.faces[:, :: 1 if outward else -1])
     points = RNG.uniform(-1.7, 1.7, (400, 3))
     distance = np.linalg.norm(points, axis=1)
     clear = np.abs(distance - 1.25) > 0.02
@@ -255,7 +243,7 @@ def box_distance(x, center, extents):
 
 def test_parts_are_the_nodes_where_the_whole_has_them(tmp_path):
     found = load_parts(saved(tmp_path / "table.glb"))
-    whole = load_mesh(tmp_path / "table.glb")
+    whole = nbv.load_mesh(tmp_path / "table.glb")
     assert found.names == ("post", "slab")
     joined = np.concatenate([part.vertices for part in found.parts])
     np.testing.assert_allclose(np.sort(joined, axis=0), np.sort(found.mesh.vertices, axis=0), atol=1e-6)
@@ -266,7 +254,7 @@ def test_parts_are_the_nodes_where_the_whole_has_them(tmp_path):
 
 
 def test_distances_are_those_from_each_box(tmp_path):
-    grid = Grid(9, 1.4)
+    grid = nbv.Grid(9, 1.4)
     distances = np.asarray(load_parts(saved(tmp_path / "table.glb")).distances(grid))
     nodes = np.stack(np.meshgrid(grid.axis, grid.axis, grid.axis, indexing="ij"), axis=-1)
     for distance, (center, extents) in zip(distances, BOXES.values(), strict=True):

@@ -1,4 +1,4 @@
-"""Coverage of a ball against the areas of its caps; points of known surfaces."""
+"""Coverage of a ball against the areas of its caps; distances of surfaces against brute force and closed forms."""
 
 import dataclasses
 
@@ -6,9 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.distance import cdist, directed_hausdorff
 
 import jaxnbv as nbv
-from jaxnbv.scanning.metrics import coverage, truth_points
+from jaxnbv.scanning.metrics import SURFACE_POINTS, coverage, surface_distance, truth_points
 from jaxnbv.scanning.sdf import Sphere
 
 RADIUS, AWAY = 0.8, 2.5
@@ -75,3 +79,56 @@ def test_truth_of_a_solid_lies_on_its_surface():
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), 0.8, atol=2e-3)
     # Uniform by area: the height on a sphere is uniform, with a standard error of 0.8 / sqrt(3 * 500) = 0.021.
     assert abs(points[:, 1].mean()) < 4 * 0.021
+
+
+def points_of(mesh, seed, count=SURFACE_POINTS):
+    return nbv.TriangleMesh(mesh.vertices, mesh.faces, nbv.Frame()).sample_points(jax.random.key(seed), count)
+
+
+@settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 2**31), n=st.integers(1, 40), m=st.integers(1, 40))
+def test_distances_are_those_found_by_brute_force(seed, n, m):
+    rng = np.random.default_rng(seed)
+    first, second = rng.normal(size=(n, 3)), rng.normal(size=(m, 3))
+    found, between = surface_distance(first, second), cdist(first, second)
+    assert found.accuracy == pytest.approx(between.min(axis=1).mean())
+    assert found.completeness == pytest.approx(between.min(axis=0).mean())
+    assert found.chamfer == pytest.approx(found.accuracy + found.completeness)
+    both = directed_hausdorff(first, second)[0], directed_hausdorff(second, first)[0]
+    assert found.hausdorff == pytest.approx(max(both))
+
+
+def test_concentric_spheres_are_their_radii_apart():
+    inner, outer = (trimesh.creation.icosphere(5, radius) for radius in (0.6, 0.9))
+    found = surface_distance(points_of(inner, 0), points_of(outer, 1))
+    for value in (found.accuracy, found.completeness):
+        # Nearest samples lie beside the foot of the perpendicular, a little farther.
+        assert 0.299 < value < 0.302
+    assert 0.3 < found.hausdorff < 0.32
+
+
+def test_a_square_shifted_in_its_plane_lacks_a_strip():
+    """Of the unit square a strip of width s sticks out on one side, where the mean distance is s / 2."""
+    square = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
+    shifted = square.copy().apply_translation([0.4, 0.0, 0.0])
+    found = surface_distance(points_of(square, 0), points_of(shifted, 1))
+    floor = 0.5 / np.sqrt(SURFACE_POINTS)
+    assert found.accuracy == pytest.approx(0.4 * 0.2 + 0.6 * floor, abs=0.004)
+    assert found.completeness == pytest.approx(found.accuracy, abs=0.004)
+    assert found.hausdorff == pytest.approx(0.4, abs=0.01)
+
+
+def test_two_samples_of_one_surface_are_as_far_apart_as_documented():
+    sphere = trimesh.creation.icosphere(4, 0.8)
+    found = surface_distance(points_of(sphere, 0), points_of(sphere, 1))
+    assert found.chamfer == pytest.approx(np.sqrt(sphere.area / SURFACE_POINTS), rel=0.03)
+    assert found.hausdorff < 0.06
+
+
+@pytest.mark.parametrize(("points", "message"), [(np.zeros((0, 3)), "no points"), (np.full((1, 3), np.inf), "finite")])
+def test_bad_points_are_named(points, message):
+    good = np.zeros((2, 3))
+    with pytest.raises(nbv.InputError, match=f"reconstruction has.*{message}"):
+        surface_distance(points, good)
+    with pytest.raises(nbv.InputError, match=f"true surface has.*{message}"):
+        surface_distance(good, points)

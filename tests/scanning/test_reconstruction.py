@@ -9,11 +9,8 @@ import pytest
 from jaxtyping import Array, Float
 
 import jaxnbv as nbv
-from jaxnbv.checks import InputError
-from jaxnbv.geometry.pose import fibonacci_sphere
-from jaxnbv.scanning.screened_poisson import has_poisson, screened_poisson
+from jaxnbv.scanning.screened_poisson import has_poisson
 from jaxnbv.scanning.sdf import Sphere
-from jaxnbv.surfaces import SurfaceModel, SurfacePosterior
 
 RADIUS = 0.9
 MODEL = nbv.GeometricSPSR(lengthscale=0.05, truncation=10)
@@ -25,7 +22,7 @@ def mean_mesh(model, cloud, grid):
 
 def sphere_cloud(count=600, capacity=700):
     """Points all over a sphere about (0.2, 0, 0), in a cloud with rows to spare."""
-    normals = np.asarray(fibonacci_sphere(count, 1.0))
+    normals = np.asarray(nbv.fibonacci_sphere(count, 1.0))
     return nbv.PointCloud.from_arrays(RADIUS * normals + [0.2, 0.0, 0.0], normals, capacity)
 
 
@@ -59,14 +56,14 @@ def test_vertices_lie_where_the_posterior_mean_equals_its_level():
     assert (mesh.vertices[:, 1] < -0.1).any()
 
 
-class Balls(SurfaceModel):
+class Balls(nbv.SurfaceModel):
     """A model of its own, with a mean in closed form: whatever the cloud, two balls, of which one holds no data."""
 
     def condition(self, evidence):
         return BallsPosterior()
 
 
-class BallsPosterior(SurfacePosterior):
+class BallsPosterior(nbv.SurfacePosterior):
     level: Float[Array, ""] = 0.25
 
     def __init__(self):
@@ -107,26 +104,26 @@ def test_what_was_seen_empty_is_not_meshed():
 @pytest.mark.skipif(not has_poisson(), reason="pymeshlab, or the system's OpenGL library, is not installed")
 def test_poisson_reconstruction_of_a_whole_scan_is_the_surface():
     cloud = sphere_cloud()
-    mesh = screened_poisson(cloud, depth=6)
+    mesh = nbv.screened_poisson(cloud, depth=6)
     check_sphere(mesh, 0.03)
-    again = screened_poisson(cloud, depth=6)
+    again = nbv.screened_poisson(cloud, depth=6)
     np.testing.assert_array_equal(mesh.vertices, again.vertices)
-    assert len(screened_poisson(cloud, depth=3).faces) < 0.5 * len(mesh.faces)
+    assert len(nbv.screened_poisson(cloud, depth=3).faces) < 0.5 * len(mesh.faces)
 
 
 def test_poisson_reconstruction_names_what_is_wrong(monkeypatch):
     cloud = sphere_cloud(20)
-    with pytest.raises(InputError, match="depth is 0"):
-        screened_poisson(cloud, depth=0)
+    with pytest.raises(nbv.InputError, match="depth is 0"):
+        nbv.screened_poisson(cloud, depth=0)
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "pymeshlab", None)
-        with pytest.raises(InputError, match=r'pip install "\.\[poisson\]"'):
-            screened_poisson(cloud)
+        with pytest.raises(nbv.InputError, match=r'pip install "\.\[poisson\]"'):
+            nbv.screened_poisson(cloud)
     if not has_poisson():
         pytest.skip("pymeshlab, or the system's OpenGL library, is not installed")
     few = jax.tree.map(lambda leaf: leaf[:3], cloud)
     together = nbv.PointCloud(jnp.zeros_like(cloud.points), cloud.normals, cloud.mask)
     broken = nbv.PointCloud(cloud.points.at[0, 0].set(jnp.nan), cloud.normals, cloud.mask)
     for wrong, message in ((few, "3 points, and"), (together, "no surface through 20"), (broken, "not finite")):
-        with pytest.raises(InputError, match=message):
-            screened_poisson(wrong)
+        with pytest.raises(nbv.InputError, match=message):
+            nbv.screened_poisson(wrong)

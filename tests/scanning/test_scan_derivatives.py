@@ -12,27 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bumps import (
-    GRID,
-    SMALL,
-    grid_surface,
-    random_rays,
-    small_surfaces,
-    solid,
-    some_bumps,
-)
+from bumps import GRID, SMALL, grid_surface, random_rays, small_surfaces, solid, some_bumps
 
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.pose import fibonacci_sphere, look_at
-from jaxnbv.scanning.grid import GridSurface
-from jaxnbv.scanning.scanner import scan
+import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
-from jaxnbv.scanning.sphere_tracing import SDFSurface
-from jaxnbv.search.pose_space import FreePoses, SpherePoses
 
 RNG = np.random.default_rng(0)
-CAMERA = Camera(height=24, width=24)
-SPACES = {"sphere": SpherePoses(), "free": FreePoses()}
+CAMERA = nbv.Camera(height=24, width=24)
+SPACES = {"sphere": nbv.SpherePoses(), "free": nbv.FreePoses()}
 
 
 def is_grazing(surface, points, normals, directions):
@@ -40,7 +27,7 @@ def is_grazing(surface, points, normals, directions):
 
     On a solid a sine of 0.05; on a grid 0.03 of the spread of f over the corners of the hit's cell.
     """
-    if isinstance(surface, SDFSurface):
+    if isinstance(surface, nbv.SDFSurface):
         return -np.sum(normals * directions, axis=-1) < 0.055
     position = (points + GRID.half_extent) / GRID.spacing
     cell = np.floor(position).astype(int)
@@ -69,7 +56,7 @@ def looks(surface, pose, moved):
     """Points, normals, mask and rays; and the derivatives, forwards, of the first two for a pose that is moved."""
 
     def look(pose):
-        cloud = scan(surface, CAMERA, pose)
+        cloud = nbv.scan(surface, CAMERA, pose)
         return (cloud.points, cloud.normals), (cloud.mask, CAMERA.rays(pose)[1])
 
     return jax.jvp(look, (pose,), (moved,), has_aux=True)
@@ -79,10 +66,10 @@ def looks(surface, pose, moved):
 @pytest.mark.parametrize("name", ["field", "distances on a grid", "solid"])
 def test_scans_as_functions_of_a_pose_against_central_differences(name, space, x64):
     if name == "solid":
-        surface = SDFSurface(solid())
+        surface = nbv.SDFSurface(solid())
     else:
         surface = grid_surface(some_bumps(RNG) if name == "field" else solid(), GRID)
-    starts, count, h = look_at(fibonacci_sphere(6, 2.5)), SPACES[space].num_parameters, 1e-6
+    starts, count, h = nbv.look_at(nbv.fibonacci_sphere(6, 2.5)), SPACES[space].num_parameters, 1e-6
     at, step = 0.1 * RNG.normal(size=(6, count)), RNG.normal(size=(6, count))
     values, slopes, (masks, rays) = looks(surface, *moves(space, starts, at, step, jnp.asarray([0.0, h, -h])))
     points, normals = (np.asarray(value) for value in values)
@@ -108,7 +95,7 @@ def test_scans_as_functions_of_a_pose_against_central_differences(name, space, x
 @pytest.mark.parametrize("name", ["solid", "grid"])
 def test_grazing_and_missed_rays(name):
     """A ball of 0.9: slopes as great as the rays graze but bounded, and zero, to the last bit, beside it."""
-    surface = SDFSurface(Sphere(0.9)) if name == "solid" else grid_surface(Sphere(0.9), GRID)
+    surface = nbv.SDFSurface(Sphere(0.9)) if name == "solid" else grid_surface(Sphere(0.9), GRID)
     # The ball on the grid is smaller by up to 1.2e-3.
     miss = 0.9 + np.linspace(-4e-3, 1e-3, 200)
     turn = RNG.uniform(0, 2 * np.pi, 200)
@@ -142,7 +129,7 @@ def test_grazing_and_missed_rays(name):
 @jax.jit
 def traced(weights, surface, origins, directions):
     def total(values, origins, directions):
-        hits = GridSurface(values, surface.distance, SMALL).trace(origins, directions)
+        hits = nbv.GridSurface(values, surface.distance, SMALL).trace(origins, directions)
         return jnp.sum(weights[0] * hits.points) + jnp.sum(weights[1] * hits.normals), hits.mask
 
     return jax.value_and_grad(total, argnums=(0, 1, 2), has_aux=True)(surface.values, origins, directions)

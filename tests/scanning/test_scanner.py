@@ -1,32 +1,30 @@
-"""The scanner: rows, batches of poses, sensor noise, and the round trip through a depth image."""
+"""The scanner: rows, batches of poses, sensor noise, depth images; where a camera stands so that an object fits."""
+
+import math
 
 import jax
 import numpy as np
 import pytest
 import trimesh
 
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.pose import fibonacci_sphere, look_at
-from jaxnbv.scanning.mesh import TriangleMesh
-from jaxnbv.scanning.scanner import SensorNoise, scan
+import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
-from jaxnbv.scanning.sphere_tracing import SDFSurface
+from jaxnbv.scanning.sensors import HEAT_SETTING, PART_SETTING, USUAL_SETTING, fitted
 
 ICOSPHERE = trimesh.creation.icosphere(4)
 SURFACES = {
-    "sdf": SDFSurface(Sphere(0.6).translate([0.2, 0.1, 0.0])),
-    "mesh": TriangleMesh.from_arrays(ICOSPHERE.vertices, ICOSPHERE.faces),
+    "sdf": nbv.SDFSurface(Sphere(0.6).translate([0.2, 0.1, 0.0])),
+    "mesh": nbv.TriangleMesh.from_arrays(ICOSPHERE.vertices, ICOSPHERE.faces),
 }
 
 
 @pytest.mark.parametrize("name", SURFACES)
 def test_batched_poses_equal_single_ones(name):
-    camera, poses = Camera(height=12, width=17), look_at(fibonacci_sphere(6, 2.5))
-    batch = scan(SURFACES[name], camera, poses)
+    camera, poses = nbv.Camera(height=12, width=17), nbv.look_at(nbv.fibonacci_sphere(6, 2.5))
+    batch = nbv.scan(SURFACES[name], camera, poses)
     assert batch.points.shape == (6, 12 * 17, 3)
     for i in range(6):
-        alone = scan(SURFACES[name], camera, poses[i])
+        alone = nbv.scan(SURFACES[name], camera, poses[i])
         assert bool((alone.mask == batch.mask[i]).all())
         np.testing.assert_allclose(alone.points, batch.points[i], atol=1e-5)
         np.testing.assert_allclose(alone.normals, batch.normals[i], atol=1e-4)
@@ -34,9 +32,9 @@ def test_batched_poses_equal_single_ones(name):
 
 def test_rows_are_pixels_row_by_row_and_misses_are_masked():
     """A small sphere low and right in the image fills exactly the pixels whose rays pass within its radius."""
-    camera, pose = Camera(height=20, width=30, fov=0.6), look_at([0.0, 0.0, 2.5])
+    camera, pose = nbv.Camera(height=20, width=30, fov=0.6), nbv.look_at([0.0, 0.0, 2.5])
     centre, radius = np.array([0.4, -0.3, 0.2]), 0.2
-    cloud = scan(SDFSurface(Sphere(radius).translate(centre)), camera, pose)
+    cloud = nbv.scan(nbv.SDFSurface(Sphere(radius).translate(centre)), camera, pose)
     focal = 10 / np.tan(0.3)
     row, column = np.mgrid[:20, :30]
     x, y = (column + 0.5 - 15) / focal, (row + 0.5 - 10) / focal
@@ -52,8 +50,8 @@ def test_rows_are_pixels_row_by_row_and_misses_are_masked():
 def test_noise_has_the_stated_statistics():
     n = 40_000
     normals = np.tile([0.0, 0.6, 0.8], (n, 1))
-    clean = PointCloud.from_arrays(np.tile([0.3, -0.2, 0.5], (n, 1)), normals, capacity=n + 10)
-    noisy = SensorNoise(points=0.02, normals=0.05)(clean, jax.random.key(0))
+    clean = nbv.PointCloud.from_arrays(np.tile([0.3, -0.2, 0.5], (n, 1)), normals, capacity=n + 10)
+    noisy = nbv.SensorNoise(points=0.02, normals=0.05)(clean, jax.random.key(0))
     points, turned = noisy.to_numpy()
     error = points - [0.3, -0.2, 0.5]
     # Five standard errors: sigma / sqrt(n) of a mean, sigma / sqrt(2 n) of a standard deviation.
@@ -73,6 +71,37 @@ def test_noise_has_the_stated_statistics():
 
 
 def test_normals_of_a_batch_of_noisy_scans_are_unit():
-    scans = scan(SURFACES["sdf"], Camera(height=6, width=6), look_at([[0.0, 0.0, 2.5], [2.5, 0.0, 0.0]]))
-    noisy = SensorNoise()(scans, jax.random.key(0))
+    scans = nbv.scan(SURFACES["sdf"], nbv.Camera(height=6, width=6), nbv.look_at([[0.0, 0.0, 2.5], [2.5, 0.0, 0.0]]))
+    noisy = nbv.SensorNoise()(scans, jax.random.key(0))
     np.testing.assert_allclose(np.linalg.norm(noisy.normals, axis=-1), np.asarray(scans.mask), atol=1e-5)
+
+
+def seen_share(setting, reach):
+    """Share of points of a sphere about the origin that every candidate's image holds."""
+    points = np.random.default_rng(0).normal(size=(2000, 3))
+    points *= reach / np.linalg.norm(points, axis=1, keepdims=True)
+    inside = np.ones(len(points), bool)
+    for pose in nbv.SphereCandidates(20, setting.radius).poses():
+        local = (points - np.asarray(pose.position)) @ np.asarray(pose.rotation)
+        column, row = setting.camera.to_pixels(local[:, :2] / local[:, 2:]).T
+        inside &= (column >= 0) & (column <= setting.camera.width) & (row >= 0) & (row <= setting.camera.height)
+        inside &= local[:, 2] > 0
+    return inside.mean()
+
+
+@pytest.mark.parametrize("setting", [USUAL_SETTING, PART_SETTING, HEAT_SETTING])
+def test_all_of_an_object_is_seen_from_everywhere_and_hardly_more(setting):
+    found = fitted(setting, 1.7)
+    assert seen_share(found, 1.7) == 1.0
+    assert seen_share(found, 1.7 * 1.06) < 1.0
+    assert found._replace(radius=setting.radius) == setting
+
+
+def test_from_further_away_the_same_ball_stands_under_the_angle_of_the_sine():
+    """A ray along the silhouette touches the ball: its angle with the axis is arcsin(reach / radius)."""
+    found = fitted(USUAL_SETTING, 1.0)
+    edge = nbv.look_at((0.0, 0.0, found.radius))
+    a = 0.5 * found.camera.fov
+    direction = np.asarray(edge.rotation) @ [math.sin(a), 0.0, math.cos(a)]
+    away = np.linalg.norm(np.cross(direction, np.asarray(edge.position)))
+    assert away == pytest.approx(1.05, rel=1e-5)

@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 from bumps import box_hit, random_rays, sphere_hit
 
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.pose import fibonacci_sphere, look_at
-from jaxnbv.scanning.scanner import scan
+import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Cuboid, Sphere, Torus
-from jaxnbv.scanning.sphere_tracing import SDFSurface
 
 RNG = np.random.default_rng(0)
 
@@ -43,7 +40,7 @@ def test_hits_equal_closed_forms(name, inside):
     o, d = random_rays(RNG, 2000)
     if inside:
         o = np.zeros_like(o) + np.float32([0.65 if name == "torus" else 0.1, 0.05, 0.02])
-    hits = SDFSurface(sdf).trace(o, d)
+    hits = nbv.SDFSurface(sdf).trace(o, d)
     t = expected(o.astype(float), d.astype(float))
     mask = np.asarray(hits.mask)
     # Only rays that skim the silhouette may differ: 0.2 % of them.
@@ -64,11 +61,11 @@ def test_hits_equal_closed_forms(name, inside):
 
 def test_normals_of_the_sphere_are_radial_and_turned_to_the_sensor():
     o, d = random_rays(RNG, 2000)
-    outer = SDFSurface(Sphere(0.9)).trace(o, d)
+    outer = nbv.SDFSurface(Sphere(0.9)).trace(o, d)
     mask = np.asarray(outer.mask)
     # A normal is taken 1e-5 before its hit, which turns a grazing ray's by as much.
     np.testing.assert_allclose(outer.normals[mask], outer.points[mask] / 0.9, atol=2e-5)
-    inner = SDFSurface(Sphere(0.9)).trace(np.zeros_like(o), d)
+    inner = nbv.SDFSurface(Sphere(0.9)).trace(np.zeros_like(o), d)
     assert bool(inner.mask.all())
     np.testing.assert_allclose(inner.normals, -inner.points / 0.9, atol=2e-5)
 
@@ -80,12 +77,12 @@ def test_vmapped_scenes_equal_single_scenes():
         box = Cuboid(jnp.stack([size[0], 0.4 * jnp.ones(()), size[1]]), 0.05)
         return box | Sphere(size[1]).translate(jnp.stack([size[0], size[0], 0.0 * size[0]]))
 
-    camera, poses = Camera(height=20, width=20, fov=0.7), look_at(fibonacci_sphere(5, 2.5))
-    together = jax.jit(jax.vmap(lambda size, pose: scan(SDFSurface(build(size)), camera, pose)))(sizes, poses)
-    batch = jax.vmap(lambda size: SDFSurface(build(size)))(sizes)
-    again = jax.jit(jax.vmap(lambda surface, pose: scan(surface, camera, pose)))(batch, poses)
+    camera, poses = nbv.Camera(height=20, width=20, fov=0.7), nbv.look_at(nbv.fibonacci_sphere(5, 2.5))
+    together = jax.jit(jax.vmap(lambda size, pose: nbv.scan(nbv.SDFSurface(build(size)), camera, pose)))(sizes, poses)
+    batch = jax.vmap(lambda size: nbv.SDFSurface(build(size)))(sizes)
+    again = jax.jit(jax.vmap(lambda surface, pose: nbv.scan(surface, camera, pose)))(batch, poses)
     for i in (0, 3):
-        alone = jax.jit(scan)(SDFSurface(build(sizes[i])), camera, poses[i])
+        alone = jax.jit(nbv.scan)(nbv.SDFSurface(build(sizes[i])), camera, poses[i])
         for cloud in (together[i], again[i]):
             assert bool((cloud.mask == alone.mask).all())
             np.testing.assert_allclose(cloud.points, alone.points, atol=1e-5)
@@ -94,8 +91,10 @@ def test_vmapped_scenes_equal_single_scenes():
 
 def test_normals_on_flat_faces_survive_compilation():
     """On a face the slopes of a box come from one of two cases; rounding must not lose both (nor the unit length)."""
-    surface = SDFSurface(Sphere(0.7) | Cuboid([0.4, 0.3, 0.8]).translate([0.3, 0.2, 0.0]))
-    seen = jax.jit(lambda pose: scan(surface, Camera(height=16, width=16), pose))(look_at(fibonacci_sphere(12, 2.5)))
+    surface = nbv.SDFSurface(Sphere(0.7) | Cuboid([0.4, 0.3, 0.8]).translate([0.3, 0.2, 0.0]))
+    seen = jax.jit(lambda pose: nbv.scan(surface, nbv.Camera(height=16, width=16), pose))(
+        nbv.look_at(nbv.fibonacci_sphere(12, 2.5))
+    )
     assert int(seen.count.sum()) > 2000
     lengths = np.linalg.norm(np.asarray(seen.normals)[np.asarray(seen.mask)], axis=1)
     np.testing.assert_allclose(lengths, 1.0, atol=1e-5)

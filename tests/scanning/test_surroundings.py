@@ -7,33 +7,14 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from jaxnbv.checks import InputError
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.frame import Frame
-from jaxnbv.geometry.pose import look_at
-from jaxnbv.geometry.volume import Box
-from jaxnbv.imagination import Imagination
-from jaxnbv.planning.episode import simulate
-from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Carving, Evidence, Grid, SDFSurface, SensorNoise, TriangleMesh, scan
+import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Capsule, Cuboid, HalfSpace, Sphere, solid_of_mesh
-from jaxnbv.scanning.surroundings import Surroundings, plane_under
-from jaxnbv.search import (
-    DiscreteSearch,
-    GivenPoses,
-    GradientSearch,
-    RandomView,
-    SphereCandidates,
-)
-from jaxnbv.search.problem import Problem
-from jaxnbv.surfaces import GeometricSPSR
-from jaxnbv.tasks import Coverage
+from jaxnbv.scanning.surroundings import plane_under
 
-CAMERA, BALL = Camera(height=24, width=24), SDFSurface(Sphere(0.8))
+CAMERA, BALL = nbv.Camera(height=24, width=24), nbv.SDFSurface(Sphere(0.8))
 TABLE = HalfSpace([0.0, -0.5, 0.0], [0.0, 1.0, 0.0])
 WALL = Cuboid([0.1, 1.0, 1.0]).translate([1.6, 0.0, 0.0])
-POSES = look_at(np.array([[0.5, -1.8, 1.5], [2.4, 0.3, 0.4], [0.2, 1.9, 1.6]]))
+POSES = nbv.look_at(np.array([[0.5, -1.8, 1.5], [2.4, 0.3, 0.4], [0.2, 1.9, 1.6]]))
 KEY = jax.random.key(3)
 
 
@@ -50,7 +31,7 @@ def rays_of(pose):
 
 def first_hits(vertices, faces, pose):
     """How far along the camera's rays a mesh is met, by Embree; infinite where it is not."""
-    mesh = TriangleMesh(vertices, faces, Frame())
+    mesh = nbv.TriangleMesh(vertices, faces, nbv.Frame())
     origin, directions = rays_of(pose)
     hits = mesh.trace(np.tile(origin, (len(directions), 1)), directions)
     along = np.linalg.norm(np.asarray(hits.points, np.float64) - origin, axis=1)
@@ -59,7 +40,7 @@ def first_hits(vertices, faces, pose):
 
 @pytest.mark.parametrize("index", range(3))
 def test_a_table_is_met_where_its_plane_is(index):
-    found = np.asarray(Surroundings((TABLE,)).barrier(CAMERA, POSES[index]), np.float64)
+    found = np.asarray(nbv.Surroundings((TABLE,)).barrier(CAMERA, POSES[index]), np.float64)
     origin, directions = rays_of(POSES[index])
     if origin[1] < -0.5:
         # From within: the way out.
@@ -79,7 +60,7 @@ def test_what_a_wall_hides_is_what_embree_says(as_mesh, index):
     mesh = box_mesh(low, high)
     wall = solid_of_mesh(*mesh, resolution=60) if as_mesh else WALL
     pose = POSES[index]
-    barrier = Surroundings((wall,)).barrier(CAMERA, pose)
+    barrier = nbv.Surroundings((wall,)).barrier(CAMERA, pose)
     expected = first_hits(*mesh, pose)
     found = np.asarray(barrier)
     # Beside the edges a cell of the sampled distances counts.
@@ -87,7 +68,7 @@ def test_what_a_wall_hides_is_what_embree_says(as_mesh, index):
     assert same.mean() > (0.95 if as_mesh else 0.99)
     both = np.isfinite(found) & np.isfinite(expected)
     assert np.abs(found[both] - expected[both]).max(initial=0.0) < (0.15 if as_mesh else 2e-3)
-    seen, alone = scan(BALL, CAMERA, pose, barrier), scan(BALL, CAMERA, pose)
+    seen, alone = nbv.scan(BALL, CAMERA, pose, barrier), nbv.scan(BALL, CAMERA, pose)
     away = np.linalg.norm(np.asarray(alone.points, np.float64) - np.asarray(pose.position), axis=1)
     visible = np.asarray(alone.mask) & (away < expected)
     assert (np.asarray(seen.mask) == visible).mean() > (0.95 if as_mesh else 0.99)
@@ -110,9 +91,9 @@ def test_solids_of_meshes_have_the_distances_of_their_formulas():
 def test_points_of_obstacles_are_not_the_objects():
     points = np.array([[0.0, -0.49, 0.3], [0.0, -0.4, 0.3], [0.1, 0.2, 0.3]])
     normals = np.tile([0.0, 1.0, 0.0], (3, 1))
-    cloud = PointCloud.from_arrays(points, normals, 4)
-    scanned = PointCloud(cloud.points, cloud.normals, cloud.mask, jnp.array([False, False, False, True]))
-    kept = Surroundings((TABLE,), margin=0.05).without_obstacles(scanned)
+    cloud = nbv.PointCloud.from_arrays(points, normals, 4)
+    scanned = nbv.PointCloud(cloud.points, cloud.normals, cloud.mask, jnp.array([False, False, False, True]))
+    kept = nbv.Surroundings((TABLE,), margin=0.05).without_obstacles(scanned)
     np.testing.assert_array_equal(kept.mask, [False, True, True, False])
     np.testing.assert_array_equal(kept.missed, [True, False, False, True])
     np.testing.assert_array_equal(kept.points[0], 0.0)
@@ -120,9 +101,9 @@ def test_points_of_obstacles_are_not_the_objects():
 
 def test_space_is_seen_empty_up_to_an_obstacle():
     """Every ray misses the ball's place; nodes before the wall are empty, those behind it are not known."""
-    grid, carving, pose = Grid(40), Carving(), look_at((-2.4, 0.0, 0.0))
-    nothing = scan(SDFSurface(Sphere(0.01).translate([0.0, 5.0, 0.0])), CAMERA, pose)
-    wall = Surroundings((Cuboid([0.1, 2.0, 2.0]).translate([0.5, 0.0, 0.0]),))
+    grid, carving, pose = nbv.Grid(40), nbv.Carving(), nbv.look_at((-2.4, 0.0, 0.0))
+    nothing = nbv.scan(nbv.SDFSurface(Sphere(0.01).translate([0.0, 5.0, 0.0])), CAMERA, pose)
+    wall = nbv.Surroundings((Cuboid([0.1, 2.0, 2.0]).translate([0.5, 0.0, 0.0]),))
     barrier = wall.barrier(CAMERA, pose)
     free, known = (np.asarray(carving.seen_empty(grid, pose, nothing, CAMERA, b)) for b in (None, barrier))
     x = np.asarray(grid.axis)
@@ -133,15 +114,19 @@ def test_space_is_seen_empty_up_to_an_obstacle():
 
 
 def planner_of(search, surroundings=None, capacity=256):
-    imagination = Imagination(GeometricSPSR(0.1, truncation=8), Grid(28), 3, surroundings=surroundings)
-    return Planner(Coverage(), search, Camera(height=12, width=12), imagination, capacity=capacity, max_views=6)
+    imagination = nbv.Imagination(nbv.GeometricSPSR(0.1, truncation=8), nbv.Grid(28), 3, surroundings=surroundings)
+    return nbv.Planner(
+        nbv.Coverage(), search, nbv.Camera(height=12, width=12), imagination, capacity=capacity, max_views=6
+    )
 
 
-TABLED = planner_of(DiscreteSearch(40), Surroundings((TABLE,), clearance=0.3))
+TABLED = planner_of(nbv.DiscreteSearch(40), nbv.Surroundings((TABLE,), clearance=0.3))
 
 
 def test_an_episode_stands_and_sees_above_the_table():
-    episode = simulate(TABLED, BALL, look_at((0.5, 0.8, 2.2)), 4, KEY, SensorNoise(0.0, 0.0), progress=False)
+    episode = nbv.simulate(
+        TABLED, BALL, nbv.look_at((0.5, 0.8, 2.2)), 4, KEY, nbv.SensorNoise(0.0, 0.0), progress=False
+    )
     for view in episode.views:
         assert float(view.pose.position[1]) > -0.2
         assert np.asarray(view.scan.points)[np.asarray(view.scan.mask), 1].min(initial=0.0) > -0.501
@@ -153,11 +138,11 @@ def test_an_episode_stands_and_sees_above_the_table():
 @pytest.mark.slow
 def test_a_search_by_gradient_stays_out_of_obstacles():
     """Its starts are all too low; free, ascent stays there."""
-    starts = look_at(2.3 * np.array([[np.cos(a), -0.05, np.sin(a)] for a in (0.3, 1.9, 3.5, 5.1)]))
-    search = GradientSearch(dof=2, num_starts=4, iterations=12, learning_rate=0.05, candidates=starts)
+    starts = nbv.look_at(2.3 * np.array([[np.cos(a), -0.05, np.sin(a)] for a in (0.3, 1.9, 3.5, 5.1)]))
+    search = nbv.GradientSearch(dof=2, num_starts=4, iterations=12, learning_rate=0.05, candidates=starts)
     table = HalfSpace([0.0, -0.2, 0.0], [0.0, 1.0, 0.0])
-    planner = planner_of(search, Surroundings((table,), clearance=0.4))
-    proposal = planner.propose(planner.init(POSES[2], scan(BALL, planner.camera, POSES[2])), KEY)
+    planner = planner_of(search, nbv.Surroundings((table,), clearance=0.4))
+    proposal = planner.propose(planner.init(POSES[2], nbv.scan(BALL, planner.camera, POSES[2])), KEY)
     assert float(proposal.pose.position[1]) >= 0.2 - 1e-5
     assert np.isneginf(np.asarray(proposal.values)).all()
     heights = np.asarray(proposal.trajectories.poses.position)[..., 1]
@@ -166,9 +151,9 @@ def test_a_search_by_gradient_stays_out_of_obstacles():
 
 def test_from_the_world_to_the_scene():
     """Distances in the world times the scale are those in the scene."""
-    frame = Frame.fit(np.array([[0.1, 0.2, 0.0], [0.4, 0.5, 0.25]]), up="z")
+    frame = nbv.Frame.fit(np.array([[0.1, 0.2, 0.0], [0.4, 0.5, 0.25]]), up="z")
     table, block = HalfSpace([0.0, 0.0, 0.01], [0.0, 0.0, 1.0]), Cuboid([0.05, 0.1, 0.2]).translate([0.6, 0.0, 0.2])
-    world = Surroundings((table, block), margin=0.01, clearance=0.05)
+    world = nbv.Surroundings((table, block), margin=0.01, clearance=0.05)
     scene = world.in_scene(frame)
     x = np.random.default_rng(0).uniform(-0.5, 1.0, (100, 3))
     places = jnp.asarray(frame.to_scene(x), jnp.float32)
@@ -177,7 +162,7 @@ def test_from_the_world_to_the_scene():
     assert scene.margin == pytest.approx(frame.scale * 0.01)
 
 
-BOX = Box((-0.5, -0.25, -1.25), (0.5, 1.2, 1.25))
+BOX = nbv.Box((-0.5, -0.25, -1.25), (0.5, 1.2, 1.25))
 
 
 def level_board(rng, half, height, count=800):
@@ -188,7 +173,7 @@ def level_board(rng, half, height, count=800):
 
 def under(*parts):
     points = np.concatenate(parts)
-    return plane_under(PointCloud.from_arrays(points, np.tile([0.0, 1.0, 0.0], (len(points), 1))), BOX)
+    return plane_under(nbv.PointCloud.from_arrays(points, np.tile([0.0, 1.0, 0.0], (len(points), 1))), BOX)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -222,19 +207,19 @@ def test_what_is_no_support_is_kept(parts):
 def test_no_proposal_is_inside_or_under_what_is_known():
     """1,000 random scenes of a slanted table, a block, an arm between two points, and a few points that were seen.
     Distances from the definitions, in float64."""
-    camera, clearance = Camera(height=4, width=4), 0.15
+    camera, clearance = nbv.Camera(height=4, width=4), 0.15
     poses = jax.tree.map(
-        lambda *rows: jnp.concatenate(rows), *(SphereCandidates(60, radius=r).poses() for r in (0.6, 1.2, 2.4))
+        lambda *rows: jnp.concatenate(rows), *(nbv.SphereCandidates(60, radius=r).poses() for r in (0.6, 1.2, 2.4))
     )
-    search = RandomView(GivenPoses(poses))
+    search = nbv.RandomView(nbv.GivenPoses(poses))
 
     @jax.jit
     def chosen(solids, cloud, key):
         (point, normal), (half, block), (start, end) = solids
         arm = Capsule(start, end, 0.1)
-        around = Surroundings((HalfSpace(point, normal), Cuboid(half).translate(block), arm), clearance=clearance)
-        evidence = Evidence.before_views(cloud, 2, None)
-        proposal = search.propose(Problem(evidence, camera, Coverage(), None, around), key)
+        around = nbv.Surroundings((HalfSpace(point, normal), Cuboid(half).translate(block), arm), clearance=clearance)
+        evidence = nbv.Evidence.before_views(cloud, 2, None)
+        proposal = search.propose(nbv.Problem(evidence, camera, nbv.Coverage(), None, around), key)
         return proposal.pose.position, proposal.value
 
     rng, looked, x = np.random.default_rng(0), 0, np.asarray(poses.position, np.float64)
@@ -243,7 +228,7 @@ def test_no_proposal_is_inside_or_under_what_is_known():
         half, block = rng.uniform(0.1, 0.5, 3), rng.uniform(-1.5, 1.5, 3)
         start, end = rng.uniform(-2.0, 2.0, (2, 3))
         seen = rng.uniform(-1.0, 1.0, (20, 3))
-        cloud = PointCloud.from_arrays(seen, np.tile([0.0, 1.0, 0.0], (20, 1)))
+        cloud = nbv.PointCloud.from_arrays(seen, np.tile([0.0, 1.0, 0.0], (20, 1)))
         solids = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), ((point, normal), (half, block), (start, end)))
         place, value = (np.asarray(a, np.float64) for a in chosen(solids, cloud, jax.random.key(rng.integers(1 << 30))))
         assert np.isfinite(value)
@@ -261,8 +246,8 @@ def test_no_proposal_is_inside_or_under_what_is_known():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Surroundings((TABLE,), margin=-1.0), "margin is -1.0"),
-        (lambda: Surroundings(clearance=-0.1), "clearance is -0.1"),
+        (lambda: nbv.Surroundings((TABLE,), margin=-1.0), "margin is -1.0"),
+        (lambda: nbv.Surroundings(clearance=-0.1), "clearance is -0.1"),
         (lambda: HalfSpace([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]), "normal is .*: give a direction"),
         (lambda: solid_of_mesh(*box_mesh([0, 0, 0], [1, 1, 1]), resolution=3), "resolution is 3"),
         (lambda: solid_of_mesh(np.zeros((3, 3)), np.array([[0, 1, 2]])), "all 3 vertices of the mesh lie at"),
@@ -270,5 +255,5 @@ def test_no_proposal_is_inside_or_under_what_is_known():
     ],
 )
 def test_bad_input_is_named(make, message):
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(nbv.InputError, match=message):
         make()

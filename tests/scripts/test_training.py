@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from training import calibrate, log_probabilities, train
 
-from jaxnbv.geometry.cloud import PointCloud
+import jaxnbv as nbv
 from jaxnbv.studies.engine.diagnostics import expected_calibration_error
 
 RNG = np.random.default_rng(0)
@@ -32,7 +32,7 @@ def toy_clouds(count):
     """Clouds about one of three corners; which one is the class."""
     labels = np.arange(count) % 3
     points = (np.eye(3)[labels][:, None] + 0.3 * RNG.normal(size=(count, 6, 3))).astype(np.float32)
-    return PointCloud(jnp.asarray(points), jnp.zeros_like(points), jnp.ones((count, 6), bool)), labels
+    return nbv.PointCloud(jnp.asarray(points), jnp.zeros_like(points), jnp.ones((count, 6), bool)), labels
 
 
 def same(a, b):
@@ -67,7 +67,7 @@ def test_calibration_recovers_a_known_temperature(factor, start):
     """Labels drawn from softmax(logits / factor); the likelihood's curvature gives the standard error."""
     count = 3000
     points = (2.0 * RNG.normal(size=(count, 1, 3))).astype(np.float32)
-    clouds = PointCloud(jnp.asarray(points), jnp.zeros_like(points), jnp.ones((count, 1), bool))
+    clouds = nbv.PointCloud(jnp.asarray(points), jnp.zeros_like(points), jnp.ones((count, 1), bool))
     network = eqx.tree_at(lambda n: n.linear.weight, Toy(start), 2.0 * jnp.eye(3))
     logits = np.asarray(jax.vmap(network.linear)(clouds.points[:, 0]), np.float64) / factor
     p = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)

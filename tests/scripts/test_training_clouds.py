@@ -7,21 +7,17 @@ import pytest
 from scipy.spatial import cKDTree
 from training_clouds import MOST_VIEWS, Source, imagined_clouds, scanned_clouds
 
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.pose import fibonacci_sphere, look_at
-from jaxnbv.imagination import Imagination
-from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Grid, SDFSurface, scan
+import jaxnbv as nbv
 from jaxnbv.scanning.sensors import PART_SETTING
 from jaxnbv.studies.scenes import PATTERNS, Split, part_scene, pyramid_scene
-from jaxnbv.surfaces import GeometricSPSR
-from jaxnbv.tasks import Coverage
 
 COUNT, POINTS = 24, 200
-MODEL = GeometricSPSR(lengthscale=0.05, truncation=8)
-PLANNER = Planner(Coverage(), imagination=Imagination(MODEL, grid=Grid(20), num_samples=2), capacity=150)
+MODEL = nbv.GeometricSPSR(lengthscale=0.05, truncation=8)
+PLANNER = nbv.Planner(
+    nbv.Coverage(), imagination=nbv.Imagination(MODEL, grid=nbv.Grid(20), num_samples=2), capacity=150
+)
 # A motorbike and a skateboard. Compilation takes nearly all the time of the rest.
-PARTS, SETTING = (7, 11), PART_SETTING._replace(camera=Camera(height=24, width=24))
+PARTS, SETTING = (7, 11), PART_SETTING._replace(camera=nbv.Camera(height=24, width=24))
 
 
 @pytest.fixture(scope="module")
@@ -127,8 +123,10 @@ def test_clouds_are_kept_in_the_units_of_the_network(tmp_path, monkeypatch):
 @eqx.filter_jit
 def surface_points(solid):
     """Noiseless hits from many sides, by another camera than the clouds', with their labels."""
-    camera = Camera(fov=1.0, height=64, width=64)
-    hits = jax.lax.map(lambda pose: scan(SDFSurface(solid), camera, pose), look_at(fibonacci_sphere(16, 2.7)))
+    camera = nbv.Camera(fov=1.0, height=64, width=64)
+    hits = jax.lax.map(
+        lambda pose: nbv.scan(nbv.SDFSurface(solid), camera, pose), nbv.look_at(nbv.fibonacci_sphere(16, 2.7))
+    )
     return hits.points.reshape(-1, 3), solid.label(hits.points).reshape(-1), hits.mask.reshape(-1)
 
 

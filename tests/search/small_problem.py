@@ -9,30 +9,24 @@ import jax.numpy as jnp
 import numpy as np
 from on_grid import balls
 
-from jaxnbv.acquisition import Acquisition, expected_value
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.pose import Pose
-from jaxnbv.scanning import Evidence, Grid
-from jaxnbv.search import Problem, SphereCandidates
-from jaxnbv.tasks import Coverage
+import jaxnbv as nbv
 
-CAMERA, POSES, KEY = Camera(height=8, width=8), SphereCandidates(12).poses(), jax.random.key(5)
+CAMERA, POSES, KEY = nbv.Camera(height=8, width=8), nbv.SphereCandidates(12).poses(), jax.random.key(5)
 
 
-def problem_of(surfaces, acquisition=Coverage(), camera=CAMERA):  # noqa: B008
+def problem_of(surfaces, acquisition=nbv.Coverage(), camera=CAMERA):  # noqa: B008
     """Room for six views, none of them taken."""
     rng = np.random.default_rng(0)
-    cloud = PointCloud.from_arrays(rng.uniform(-1, 1, (30, 3)), np.tile([0.0, 1.0, 0.0], (30, 1)), 32)
+    cloud = nbv.PointCloud.from_arrays(rng.uniform(-1, 1, (30, 3)), np.tile([0.0, 1.0, 0.0], (30, 1)), 32)
     dtype = jnp.result_type(float)
-    views = Pose(np.tile(np.eye(3, dtype=dtype), (6, 1, 1)), np.zeros((6, 3), dtype))
-    return Problem(Evidence(cloud, views, jnp.asarray(0)), camera, acquisition, surfaces).prepared()
+    views = nbv.Pose(np.tile(np.eye(3, dtype=dtype), (6, 1, 1)), np.zeros((6, 3), dtype))
+    return nbv.Problem(nbv.Evidence(cloud, views, jnp.asarray(0)), camera, acquisition, surfaces).prepared()
 
 
 @functools.cache
 def three_balls():
     rng = np.random.default_rng(0)
-    return problem_of(balls(Grid(20), (0.8, 0.6, 0.9), rng.uniform(-0.5, 0.5, (3, 3))))
+    return problem_of(balls(nbv.Grid(20), (0.8, 0.6, 0.9), rng.uniform(-0.5, 0.5, (3, 3))))
 
 
 def visit(problem, *poses):
@@ -54,9 +48,9 @@ def with_samples(problem, rows):
     return eqx.tree_at(lambda p: p.surfaces, problem, jax.tree.map(lambda leaf: leaf[rows], problem.surfaces))
 
 
-def sample_by_sample(problem, acquisition=Coverage(), poses=POSES):  # noqa: B008
+def sample_by_sample(problem, acquisition=nbv.Coverage(), poses=POSES):  # noqa: B008
     """Scores (samples, candidates), each sample by itself."""
-    value = eqx.filter_jit(expected_value)
+    value = eqx.filter_jit(nbv.expected_value)
     of = [
         value(acquisition, problem.evidence.cloud, with_samples(problem, slice(s, s + 1)).surfaces, CAMERA, poses)
         for s in range(problem.num_samples)
@@ -64,7 +58,7 @@ def sample_by_sample(problem, acquisition=Coverage(), poses=POSES):  # noqa: B00
     return np.array(of, np.float64)
 
 
-class Height(Acquisition):
+class Height(nbv.Acquisition):
     """How high the middle of what a scan shows is, times a factor."""
 
     factor: float = 1.0
@@ -76,7 +70,7 @@ class Height(Acquisition):
         return self.factor * jnp.sum(jnp.where(scan.mask, scan.points[:, 1], 0.0)) / jnp.maximum(scan.count, 1)
 
 
-class Constant(Acquisition):
+class Constant(nbv.Acquisition):
     """All scans are worth the same."""
 
     value: float

@@ -8,13 +8,10 @@ import optimistix as optx
 import pytest
 from small_problem import problem_of, propose, visit
 
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
-from jaxnbv.search import ConstrainedPoses, FreePoses, GradientSearch, Problem, SpherePoses
-from jaxnbv.tasks import Coverage
+import jaxnbv as nbv
 
 
-class Known(Problem):
+class Known(nbv.Problem):
     """5 - |position - place|^2 - |forward - gaze|^2: an acquisition in closed form, without surfaces."""
 
     place: jax.Array
@@ -32,7 +29,7 @@ def known(kind=Known, *poses):
     """The problem, with poses that have been visited."""
     problem = problem_of(None)
     place, gaze = jnp.asarray((0.9, -1.1, 1.4)), jnp.asarray((-0.6, 0.0, -0.8))
-    return kind(visit(problem, *poses).evidence, Camera(), Coverage(), None, place, gaze)
+    return kind(visit(problem, *poses).evidence, nbv.Camera(), nbv.Coverage(), None, place, gaze)
 
 
 SOLVERS = {"Adam": None, "BFGS": optx.BFGS(rtol=1e-4, atol=1e-4), "NonlinearCG": optx.NonlinearCG(rtol=1e-4, atol=1e-4)}
@@ -41,7 +38,7 @@ SOLVERS = {"Adam": None, "BFGS": optx.BFGS(rtol=1e-4, atol=1e-4), "NonlinearCG":
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_a_pose_in_space_is_found(solver):
     steps = {"num_starts": 2, "iterations": 80, "learning_rate": 0.05, "solver": SOLVERS[solver]}
-    found = propose(GradientSearch(dof=6, num_candidates=12, **steps), known(), jax.random.key(1))
+    found = propose(nbv.GradientSearch(dof=6, num_candidates=12, **steps), known(), jax.random.key(1))
     assert float(found.value) == pytest.approx(5.0, abs=1e-3)
     assert float(found.values.max()) < 4.9
     np.testing.assert_allclose(found.pose.position, [0.9, -1.1, 1.4], atol=0.03)
@@ -49,8 +46,8 @@ def test_a_pose_in_space_is_found(solver):
 
 
 def test_it_starts_from_the_poses_it_is_given():
-    given = look_at(fibonacci_sphere(3, 2.2))
-    found = propose(GradientSearch(num_starts=1, iterations=1, candidates=given), known(), jax.random.key(0))
+    given = nbv.look_at(nbv.fibonacci_sphere(3, 2.2))
+    found = propose(nbv.GradientSearch(num_starts=1, iterations=1, candidates=given), known(), jax.random.key(0))
     np.testing.assert_array_equal(found.candidates.position, given.position)
 
 
@@ -62,7 +59,7 @@ class Constant(Known):
 
 
 def test_where_values_tie_the_first_candidate_wins():
-    search, key = GradientSearch(num_starts=2, iterations=4, num_candidates=9), jax.random.key(0)
+    search, key = nbv.GradientSearch(num_starts=2, iterations=4, num_candidates=9), jax.random.key(0)
     found = propose(search, known(Constant), key)
     jax.tree.map(np.testing.assert_array_equal, found.pose, found.candidates[0])
     np.testing.assert_array_equal(found.values, 7.0)
@@ -70,11 +67,11 @@ def test_where_values_tie_the_first_candidate_wins():
     jax.tree.map(np.testing.assert_array_equal, again.pose, found.candidates[1])
 
 
-@pytest.mark.parametrize("space", [SpherePoses(), FreePoses(), ConstrainedPoses()])
+@pytest.mark.parametrize("space", [nbv.SpherePoses(), nbv.FreePoses(), nbv.ConstrainedPoses()])
 def test_adam_is_optax_in_a_plain_loop(space, x64):
-    problem, start = known(), look_at(jnp.asarray([[1.2, 1.0, 1.9]]))
+    problem, start = known(), nbv.look_at(jnp.asarray([[1.2, 1.0, 1.9]]))
     steps = {"num_starts": 1, "iterations": 30, "learning_rate": 0.02}
-    ways = propose(GradientSearch(space=space, candidates=start, **steps), problem, jax.random.key(0)).trajectories
+    ways = propose(nbv.GradientSearch(space=space, candidates=start, **steps), problem, jax.random.key(0)).trajectories
     optimiser, parameters = optax.adam(0.02), jnp.zeros(space.num_parameters)
     memory = optimiser.init(parameters)
 
@@ -95,9 +92,9 @@ def test_adam_is_optax_in_a_plain_loop(space, x64):
     assert float(jnp.abs(ways.poses.position[0, -1] - start.position[0]).max()) > 0.1
 
 
-@pytest.mark.parametrize("space", [SpherePoses(), ConstrainedPoses(), FreePoses()])
+@pytest.mark.parametrize("space", [nbv.SpherePoses(), nbv.ConstrainedPoses(), nbv.FreePoses()])
 def test_a_start_at_the_origin_gives_numbers(space):
-    start = Pose(np.eye(3, dtype=np.float32), np.zeros(3, np.float32))
+    start = nbv.Pose(np.eye(3, dtype=np.float32), np.zeros(3, np.float32))
     parameters = jnp.zeros(space.num_parameters)
     move = jax.jit(lambda p: space.retract(start, p))
     for tree in (move(parameters), jax.jit(jax.jacrev(move))(parameters)):
@@ -107,7 +104,7 @@ def test_a_start_at_the_origin_gives_numbers(space):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"dof": 2, "space": FreePoses()}, "both dof=2 and space"),
+        ({"dof": 2, "space": nbv.FreePoses()}, "both dof=2 and space"),
         *(({"learning_rate": rate}, f"learning.rate is {rate}") for rate in (0.0, np.nan, np.inf)),
         ({"num_starts": 0}, "num_starts is 0"),
         ({"iterations": 0}, "iterations is 0"),
@@ -116,4 +113,4 @@ def test_a_start_at_the_origin_gives_numbers(space):
 )
 def test_bad_settings_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
-        GradientSearch(**arguments)
+        nbv.GradientSearch(**arguments)

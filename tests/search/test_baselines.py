@@ -8,24 +8,19 @@ import pytest
 from on_grid import balls
 from scipy.stats import chi2
 
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.pose import fibonacci_sphere, look_at
-from jaxnbv.scanning import Evidence, Grid, GridSurface
-from jaxnbv.search import FarthestView, Problem, RandomView, UncertaintyView
+import jaxnbv as nbv
 from jaxnbv.search.baselines import uncertain_length
-from jaxnbv.tasks import Coverage
 
-GRID = Grid(24)
-CANDIDATES = np.asarray(fibonacci_sphere(12, 2.5), dtype=np.float64)
+GRID = nbv.Grid(24)
+CANDIDATES = np.asarray(nbv.fibonacci_sphere(12, 2.5), dtype=np.float64)
 
 
 def problem(visited, surfaces=None):
     """Five rows for views, the first of them filled; the rest hold poses that must not count."""
     positions = np.concatenate([visited, np.tile(CANDIDATES[5], (5, 1))])[:5]
-    cloud = PointCloud.from_arrays([[0.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    evidence = Evidence(cloud, look_at(positions), jnp.asarray(len(visited)))
-    return Problem(evidence, Camera(height=4, width=4), Coverage(), surfaces).prepared()
+    cloud = nbv.PointCloud.from_arrays([[0.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    evidence = nbv.Evidence(cloud, nbv.look_at(positions), jnp.asarray(len(visited)))
+    return nbv.Problem(evidence, nbv.Camera(height=4, width=4), nbv.Coverage(), surfaces).prepared()
 
 
 def index_of(proposal):
@@ -33,7 +28,7 @@ def index_of(proposal):
 
 
 def test_farthest_view_against_its_definition():
-    search, visited = FarthestView(12), [np.array([0.8, 0.9, 2.2])]
+    search, visited = nbv.FarthestView(12), [np.array([0.8, 0.9, 2.2])]
     for _ in range(4):
         proposal = search.propose(problem(np.array(visited)), jax.random.key(0))
         nearest = np.array([min(np.linalg.norm(c - v) for v in visited) for c in CANDIDATES])
@@ -47,7 +42,7 @@ def test_farthest_view_against_its_definition():
 
 def test_random_view_is_uniform_over_what_is_unvisited():
     """2,000 draws over ten candidates; the chi-square test has size 1e-4."""
-    search, asked = RandomView(12), problem(CANDIDATES[[3, 8]])
+    search, asked = nbv.RandomView(12), problem(CANDIDATES[[3, 8]])
     draw = eqx.filter_jit(jax.vmap(lambda key: search.propose(asked, key).pose.position))
     chosen = np.asarray(draw(jax.random.split(jax.random.key(0), 2000)))
     index = np.linalg.norm(CANDIDATES - chosen[:, None], axis=-1).argmin(axis=1)
@@ -86,7 +81,7 @@ def test_uncertainty_against_its_definition():
     """The slow version walks at an eighth of the library's step, which finds the first end late and the last early."""
     rng = np.random.default_rng(0)
     surfaces = balls(GRID, [0.9, 0.6, 0.7, 0.3], rng.uniform(-0.5, 0.5, (4, 3)))
-    search, values = UncertaintyView(12), np.asarray(surfaces.values, dtype=np.float64)
+    search, values = nbv.UncertaintyView(12), np.asarray(surfaces.values, dtype=np.float64)
     asked = problem(CANDIDATES[:1], surfaces)
     step = 0.5 * GRID.spacing
     expected = np.array([slow_uncertain_length(values, c, step / 8) for c in CANDIDATES])
@@ -104,19 +99,19 @@ def test_uncertainty_against_its_definition():
 def test_the_threshold_of_the_transmittance_by_thin_rings_of_samples():
     """Of forty samples one lies far behind the rest: the ray stops counting when two are left, not none."""
     radii = np.array([1.0] * 38 + [0.3] * 2)
-    value = uncertain_length(problem(np.zeros((0, 3)), balls(GRID, radii)), look_at(CANDIDATES))
+    value = uncertain_length(problem(np.zeros((0, 3)), balls(GRID, radii)), nbv.look_at(CANDIDATES))
     np.testing.assert_allclose(value, 0.0, atol=1.1 * GRID.spacing)
     radii = np.array([1.0] * 37 + [0.3] * 3)
-    value = uncertain_length(problem(np.zeros((0, 3)), balls(GRID, radii)), look_at(CANDIDATES))
+    value = uncertain_length(problem(np.zeros((0, 3)), balls(GRID, radii)), nbv.look_at(CANDIDATES))
     np.testing.assert_allclose(value, 0.7, atol=1.1 * GRID.spacing)
 
 
 def test_a_ray_that_meets_a_look_on_the_boxes_face_is_still_open():
     """The first look lies exactly on the face at z = 1, where interpolation has a neighbour only on one side."""
-    grid = Grid(5, 1.0)
+    grid = nbv.Grid(5, 1.0)
     values = np.broadcast_to(grid.axis + 0.5, (2, 5, 5, 5)).astype(np.float32)
     values = np.stack([values[0], values[1] - 0.75])
-    surfaces = GridSurface.from_values(values, 0.0, grid)
+    surfaces = nbv.GridSurface.from_values(values, 0.0, grid)
     # Surfaces at z = -0.5 and z = 0.25, seen from z = 1.5; looks every quarter, at 1.5, 1.25, 1.0, ...
-    value = uncertain_length(problem(np.zeros((0, 3)), surfaces), look_at(jnp.array([[0.0, 0.0, 1.5]])))
+    value = uncertain_length(problem(np.zeros((0, 3)), surfaces), nbv.look_at(jnp.array([[0.0, 0.0, 1.5]])))
     np.testing.assert_allclose(value, 0.75, atol=0.26)

@@ -1,27 +1,18 @@
-"""Searches over candidates by their scores: discrete and halving against loops over poses, samples and rounds."""
+"""Searches over candidates by their scores: discrete, halving, tie-break against loops over poses, samples, rounds."""
+
+import dataclasses
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_problem import KEY, POSES, Height, propose, sample_by_sample, three_balls, visit, with_samples
+from small_problem import KEY, POSES, Constant, Height, propose, sample_by_sample, three_balls, visit, with_samples
 
-from jaxnbv.acquisition import Several
-from jaxnbv.geometry.pose import fibonacci_sphere, look_at
-from jaxnbv.scanning import GridSurface
-from jaxnbv.search import (
-    DiscreteSearch,
-    FarthestView,
-    HalvingSearch,
-    RandomView,
-    TieBreakSearch,
-    UncertaintyView,
-)
+import jaxnbv as nbv
 from jaxnbv.search.base import best_unvisited
-from jaxnbv.tasks import Coverage
 
-SEARCH, PROBLEM = DiscreteSearch(12), three_balls()
+SEARCH, PROBLEM = nbv.DiscreteSearch(12), three_balls()
 
 
 def test_the_argmax_of_values_recomputed_one_by_one():
@@ -30,7 +21,7 @@ def test_the_argmax_of_values_recomputed_one_by_one():
     np.testing.assert_allclose(proposal.values, values, rtol=1e-5)
     best = int(np.argmax(values))
     assert np.sort(values)[-1] > 1.01 * np.sort(values)[-2]
-    np.testing.assert_allclose(proposal.candidates.position, fibonacci_sphere(12, 2.5), atol=1e-6)
+    np.testing.assert_allclose(proposal.candidates.position, nbv.fibonacci_sphere(12, 2.5), atol=1e-6)
     np.testing.assert_allclose(proposal.pose.position, POSES.position[best], atol=1e-6)
     np.testing.assert_allclose(proposal.pose.rotation, POSES.rotation[best], atol=1e-6)
     assert float(proposal.value) == pytest.approx(float(values[best]), rel=1e-5)
@@ -48,9 +39,9 @@ def test_visited_views_are_excluded_one_after_the_other():
 
 def test_only_the_same_place_and_direction_counts_as_visited():
     best = propose(SEARCH, PROBLEM).pose
-    elsewhere = look_at(best.position, target=(0.0, 0.3, 0.1))
-    aside = look_at(best.position + jnp.array([0.01, 0.0, 0.0]))
-    turned = look_at(best.position, up=(0.0, 0.0, 1.0))
+    elsewhere = nbv.look_at(best.position, target=(0.0, 0.3, 0.1))
+    aside = nbv.look_at(best.position + jnp.array([0.01, 0.0, 0.0]))
+    turned = nbv.look_at(best.position, up=(0.0, 0.0, 1.0))
     for pose, is_visited in [(best, True), (turned, True), (elsewhere, False), (aside, False)]:
         again = propose(SEARCH, visit(PROBLEM, pose))
         assert bool((again.pose.position != best.position).any()) == is_visited
@@ -109,7 +100,7 @@ def test_rounds_of_halving_recomputed(num_visited, first):
         values[left] = table[:scored, left].mean(axis=0)
         values[:num_visited] = -np.inf
     problem = visit(PROBLEM, *[POSES[i] for i in range(num_visited)])
-    proposal = propose(HalvingSearch(12, num_first_samples=first), problem)
+    proposal = propose(nbv.HalvingSearch(12, num_first_samples=first), problem)
     best = left[np.argmax(values[left])]
     np.testing.assert_allclose(proposal.values, values, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(proposal.pose.position, POSES.position[best], atol=1e-6)
@@ -120,13 +111,13 @@ def test_rounds_of_halving_recomputed(num_visited, first):
 
 SEARCHES = {
     "discrete": SEARCH,
-    "halving": HalvingSearch(12, num_first_samples=1),
-    "tie-break": TieBreakSearch(12, second=Height()),
-    "farthest": FarthestView(12),
-    "random": RandomView(12),
-    "uncertainty": UncertaintyView(12),
+    "halving": nbv.HalvingSearch(12, num_first_samples=1),
+    "tie-break": nbv.TieBreakSearch(12, second=Height()),
+    "farthest": nbv.FarthestView(12),
+    "random": nbv.RandomView(12),
+    "uncertainty": nbv.UncertaintyView(12),
 }
-ASKED = {"discrete": (Coverage(),), "halving": (Coverage(),), "tie-break": (Coverage(), Height())}
+ASKED = {"discrete": (nbv.Coverage(),), "halving": (nbv.Coverage(),), "tie-break": (nbv.Coverage(), Height())}
 
 
 @eqx.filter_jit
@@ -161,7 +152,7 @@ def test_what_is_picked_by_the_scores_is_what_is_proposed(name, asked):
 @pytest.mark.parametrize("name", SEARCHES)
 def test_scores_are_those_of_each_sample_by_each_acquisition_that_is_asked(name):
     found, acquisitions = score(SEARCHES[name], PROBLEM), ASKED.get(name, ())
-    assert SEARCHES[name].asks(Coverage()) == acquisitions
+    assert SEARCHES[name].asks(nbv.Coverage()) == acquisitions
     assert found.shape == ((len(acquisitions), 3, 12) if acquisitions else (0, 0, 12))
     for scores, acquisition in zip(found, acquisitions, strict=True):
         np.testing.assert_allclose(scores, sample_by_sample(PROBLEM, acquisition), rtol=1e-5, atol=1e-6)
@@ -169,16 +160,59 @@ def test_scores_are_those_of_each_sample_by_each_acquisition_that_is_asked(name)
 
 @pytest.mark.parametrize("name", [name for name, search in SEARCHES.items() if search.uses_samples])
 def test_without_samples_it_says_so(name):
-    bare = eqx.tree_at(lambda p: p.surfaces, PROBLEM, None, is_leaf=lambda leaf: isinstance(leaf, GridSurface))
+    bare = eqx.tree_at(lambda p: p.surfaces, PROBLEM, None, is_leaf=lambda leaf: isinstance(leaf, nbv.GridSurface))
     with pytest.raises(ValueError, match="uses_samples"):
         SEARCHES[name].propose(bare, KEY)
 
 
-def test_searches_share_the_scores_of_a_study(asked):
-    """Those of both acquisitions, asked once, serve every search that asks for one or both."""
-    both = eqx.filter_jit(lambda problem: problem.about(Several((Coverage(), Height()))).scores(POSES))(asked)
-    for name, rows in {"discrete": [0], "halving": [0], "tie-break": [0, 1]}.items():
-        assert_same(pick(SEARCHES[name], asked, both[jnp.asarray(rows)]), propose(SEARCHES[name], asked))
-    by_height = propose(SEARCH, eqx.filter_jit(lambda problem: problem.about(Height()))(asked))
-    assert_same(pick(SEARCH, asked, both[1:]), by_height)
-    assert (by_height.pose.position != propose(SEARCH, asked).pose.position).any()
+PROBLEM = three_balls()
+
+
+def tie_break(problem, second):
+    return propose(nbv.TieBreakSearch(12, second=second), problem)
+
+
+@pytest.mark.parametrize("factor", [1.0, -1.0])
+def test_the_best_by_the_second_score_of_those_that_are_tied_by_the_first(factor):
+    first, second = sample_by_sample(PROBLEM), sample_by_sample(PROBLEM, Height(factor)).mean(axis=0)
+    mean = first.mean(axis=0)
+    difference = first[:, [mean.argmax()]] - first
+    level = difference.mean(axis=0) <= 2.0 * difference.std(axis=0, ddof=1) / np.sqrt(3)
+    assert 1 < level.sum() < 12
+    expected = int(np.argmax(np.where(level, second, -np.inf)))
+    proposal = tie_break(PROBLEM, Height(factor))
+    assert expected != int(np.argmin(np.where(level, second, np.inf)))
+    np.testing.assert_array_equal(proposal.pose.position, proposal.candidates.position[expected])
+    assert float(proposal.value) == pytest.approx(mean[expected], rel=1e-5)
+    np.testing.assert_allclose(proposal.values, mean, rtol=1e-5)
+
+
+def test_where_the_first_tells_nothing_the_second_decides_and_where_it_tells_all_the_first_does():
+    told = tie_break(PROBLEM.about(Constant(1.0)), nbv.Coverage())
+    np.testing.assert_array_equal(told.pose.position, propose(nbv.DiscreteSearch(12), PROBLEM).pose.position)
+    # Samples that are all alike tell all, and a single one too.
+    for rows in (jnp.zeros(3, int), slice(0, 1)):
+        found = tie_break(with_samples(PROBLEM, rows), Height())
+        assert float(found.value) == float(found.values.max())
+
+
+def test_a_tie_break_does_not_choose_visited_views():
+    told, taken = PROBLEM.about(Constant(0.0)), []
+    for _ in range(3):
+        taken.append(tie_break(visit(told, *taken), Height()).pose)
+    heights = np.sort(sample_by_sample(PROBLEM, Height()).mean(axis=0))[::-1]
+    of = [sample_by_sample(PROBLEM, Height(), pose[None]).mean() for pose in taken]
+    np.testing.assert_allclose(of, heights[:3], rtol=1e-5)
+
+
+def test_the_way_there_counts_among_ties():
+    """Among candidates that are level but for their way the nearest is taken, whatever the second score."""
+    here, cost = nbv.look_at(jnp.array([0.0, 0.0, 2.5])), nbv.ValuePerCost(nbv.arc_length, fixed=1e-3)
+    told = dataclasses.replace(visit(PROBLEM.about(Constant(1.0)), here), cost=cost)
+    found = tie_break(told, Height())
+    distances = np.linalg.norm(np.asarray(found.candidates.position - here.position), axis=1)
+    np.testing.assert_array_equal(found.pose.position, found.candidates.position[distances.argmin()])
+
+
+def test_a_second_score_that_is_no_number_is_told_of():
+    assert np.isnan(float(tie_break(PROBLEM, Constant(np.nan)).value))

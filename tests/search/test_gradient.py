@@ -11,25 +11,14 @@ from scipy.ndimage import gaussian_filter
 from small_problem import problem_of as any_problem_of
 from small_problem import propose, visit
 
-from jaxnbv.acquisition import Acquisition
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.pose import look_at
-from jaxnbv.scanning import Grid, GridSurface, scan
-from jaxnbv.search import (
-    ConstrainedPoses,
-    DiscreteSearch,
-    FreePoses,
-    GradientSearch,
-    HybridSearch,
-)
-from jaxnbv.tasks import Coverage
-from jaxnbv.tasks.classification import CrossEntropy, EntropyReduction, MixedEntropy
+import jaxnbv as nbv
+from jaxnbv.scanning import scan
 
-CAMERA, GRID = Camera(height=8, width=8), Grid(32)
+CAMERA, GRID = nbv.Camera(height=8, width=8), nbv.Grid(32)
 NODES = nodes(GRID.axis)
 
 
-class Nearness(Acquisition):
+class Nearness(nbv.Acquisition):
     """4 - |mean of the hits - target|^2; 0, the least for what lies in the unit ball, where nothing is seen."""
 
     target: jax.Array
@@ -51,11 +40,11 @@ def classifier(cloud):
 
 
 ACQUISITIONS = {
-    "coverage": Coverage(),
-    "cross-entropy": CrossEntropy(classifier),
-    "mixed, open": MixedEntropy(classifier, threshold=0.0),
-    "mixed, settled": MixedEntropy(classifier, threshold=9.0),
-    "improvement": EntropyReduction(classifier),
+    "coverage": nbv.Coverage(),
+    "cross-entropy": nbv.CrossEntropy(classifier),
+    "mixed, open": nbv.MixedEntropy(classifier, threshold=0.0),
+    "mixed, settled": nbv.MixedEntropy(classifier, threshold=9.0),
+    "improvement": nbv.EntropyReduction(classifier),
 }
 
 
@@ -68,7 +57,7 @@ def rough(seed):
     rng = np.random.default_rng(seed)
     noise = gaussian_filter(rng.normal(size=(2, *NODES.shape[:3])), (0, 2, 2, 2))
     away = [np.linalg.norm(NODES - rng.uniform(-0.2, 0.2, 3), axis=-1) for _ in range(2)]
-    return GridSurface.from_values(np.stack(away) - 0.7 + 4.0 * noise, 0.0, GRID)
+    return nbv.GridSurface.from_values(np.stack(away) - 0.7 + 4.0 * noise, 0.0, GRID)
 
 
 def run(name, problem, seed=0):
@@ -96,11 +85,11 @@ def assert_close(a, b, atol=1e-5):
 COMMON = {"num_starts": 2, "iterations": 40, "learning_rate": 0.05}
 FEW, LINE = {**COMMON, "num_candidates": 6}, {"rtol": 1e-4, "atol": 1e-4}
 SEARCHES = {
-    "2-DOF": GradientSearch(dof=2, **FEW),
-    "BFGS": GradientSearch(dof=2, **FEW, solver=optx.BFGS(**LINE)),
-    "hybrid": HybridSearch(dof=2, **COMMON, num_candidates=20),
-    "6-DOF": GradientSearch(dof=6, **FEW),
-    "constrained": GradientSearch(space=ConstrainedPoses(2.0, 3.0), **{**FEW, "learning_rate": 0.1}),
+    "2-DOF": nbv.GradientSearch(dof=2, **FEW),
+    "BFGS": nbv.GradientSearch(dof=2, **FEW, solver=optx.BFGS(**LINE)),
+    "hybrid": nbv.HybridSearch(dof=2, **COMMON, num_candidates=20),
+    "6-DOF": nbv.GradientSearch(dof=6, **FEW),
+    "constrained": nbv.GradientSearch(space=nbv.ConstrainedPoses(2.0, 3.0), **{**FEW, "learning_rate": 0.1}),
 }
 
 
@@ -165,7 +154,7 @@ def test_trajectories_hold_every_look_and_the_best_of_all_is_returned(name):
         assert_equal(found.pose, poses[int(jnp.argmax(values))])
         downhill += int((ways.values[:, -1] < ways.values.max(axis=1)).sum())
         if name == "hybrid":
-            discrete = propose(DiscreteSearch(20), problem, jax.random.key(0))
+            discrete = propose(nbv.DiscreteSearch(20), problem, jax.random.key(0))
             assert_close(found.candidates, discrete.candidates)
             np.testing.assert_allclose(found.values, discrete.values, rtol=1e-4)
             assert float(found.value) >= float(discrete.value) - 1e-4
@@ -197,18 +186,18 @@ def test_the_key_alone_decides():
 
 def test_a_view_of_nothing_is_worth_nothing_and_not_chosen():
     """Cameras may fly and turn freely; some of the starts look away from the object."""
-    problem = problem_of(rough(0), Coverage())
-    away = look_at(jnp.asarray([[0.0, 0.0, 2.5], [2.5, 0.0, 0.0]]), target=(0.0, 9.0, 9.0))
-    towards = look_at(jnp.asarray([[1.5, -2.0, 0.3]]))
+    problem = problem_of(rough(0), nbv.Coverage())
+    away = nbv.look_at(jnp.asarray([[0.0, 0.0, 2.5], [2.5, 0.0, 0.0]]), target=(0.0, 9.0, 9.0))
+    towards = nbv.look_at(jnp.asarray([[1.5, -2.0, 0.3]]))
     candidates = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), away, towards)
     steps = {"num_starts": 3, "iterations": 12, "learning_rate": 0.3}
-    found = propose(GradientSearch(dof=6, candidates=candidates, **steps), problem, jax.random.key(0))
+    found = propose(nbv.GradientSearch(dof=6, candidates=candidates, **steps), problem, jax.random.key(0))
     surface = jax.tree.map(lambda leaf: leaf[0], problem.surfaces)
 
     @jax.jit
     def slopes(pose):
         def scores(parameters):
-            seen = scan(surface, CAMERA, FreePoses().retract(pose, parameters))
+            seen = scan(surface, CAMERA, nbv.FreePoses().retract(pose, parameters))
             each = jnp.stack([one(one.context(problem.evidence.cloud), seen) for one in ACQUISITIONS.values()])
             return each, (each, seen.count)
 

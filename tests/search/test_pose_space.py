@@ -13,14 +13,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.pose import Pose, look_at
-from jaxnbv.search.pose_space import ConstrainedPoses, FreePoses, SpherePoses
+import jaxnbv as nbv
 from jaxnbv.search.rotations import rotation_to_6d
 
 RNG = np.random.default_rng(0)
-LOOK_AT = jax.jit(look_at)
-SPHERE, FREE, CONSTRAINED = SpherePoses(), FreePoses(), ConstrainedPoses(2.0, 3.0)
+LOOK_AT = jax.jit(nbv.look_at)
+SPHERE, FREE, CONSTRAINED = nbv.SpherePoses(), nbv.FreePoses(), nbv.ConstrainedPoses(2.0, 3.0)
 SPACES = {"sphere": SPHERE, "free": FREE, "constrained": CONSTRAINED}
 RETRACT = {name: jax.jit(space.retract) for name, space in SPACES.items()}
 RETRACT_MANY = {name: jax.jit(jax.vmap(space.retract)) for name, space in SPACES.items()}
@@ -45,7 +43,7 @@ def starts_inside(count, radius=None):
     at_centre = LOOK_AT(real((radius or RNG.uniform(2.1, 2.9, (count, 1))) * units(count)))
     turn = 0.0 if radius else RNG.uniform(-0.1, 0.1, (count, 3))
     turn = Rotation.from_rotvec(np.broadcast_to(turn, (count, 3)) * [1, 1, 10]).as_matrix()
-    return Pose(at_centre.rotation @ real(turn), at_centre.position)
+    return nbv.Pose(at_centre.rotation @ real(turn), at_centre.position)
 
 
 def starts_of(name, count):
@@ -146,7 +144,7 @@ def test_steps_to_the_far_side(name):
 @pytest.mark.parametrize("pole", [-1.0, 1.0])
 def test_nothing_happens_at_the_poles(pole, offset, x64):
     """The derivative of the rotation is as at any other place: a turn of the camera by as much as it moves."""
-    start = look_at(jnp.asarray([offset, pole * 2.5, 0.5 * offset]))
+    start = nbv.look_at(jnp.asarray([offset, pole * 2.5, 0.5 * offset]))
     move = np.cross(np.asarray(start.position) / 2.5, units(1)[0])
     slope = jacobian("sphere", start, np.zeros(3)) @ move
     central = (FLAT(start, jnp.asarray(1e-5 * move)) - FLAT(start, jnp.asarray(-1e-5 * move))) / 2e-5
@@ -178,7 +176,7 @@ quaternion = st.tuples(*[st.floats(-1.0, 1.0, width=32)] * 4).filter(lambda q: n
 @example((0.0, 0.0, 2.5), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, -1.0, 1e6, -1e6, 1e6, -1.0, 0.0))
 @example((9.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (1e6,) * 8)
 def test_every_start_and_all_parameters_obey(position, quaternion, parameters):
-    start = Pose(real(Rotation.from_quat(quaternion).as_matrix()), real(position))
+    start = nbv.Pose(real(Rotation.from_quat(quaternion).as_matrix()), real(position))
     assert_obeys(RETRACT["constrained"](start, real(parameters)))
     assert np.isfinite(jacobian("constrained", start, parameters)).all()
 
@@ -186,15 +184,15 @@ def test_every_start_and_all_parameters_obey(position, quaternion, parameters):
 def test_starts_that_look_straight_away_are_turned_to_the_origin():
     """The origin is behind them, but for rounding: which way they are turned is open."""
     at_centre = LOOK_AT(real(RNG.uniform(0.5, 4.0, (MANY, 1)) * units(MANY)))
-    away = Pose(at_centre.rotation * real([1.0, -1.0, -1.0]), at_centre.position)
+    away = nbv.Pose(at_centre.rotation * real([1.0, -1.0, -1.0]), at_centre.position)
     for parameters in (np.zeros((MANY, 8)), RNG.normal(size=(MANY, 8))):
         assert_obeys(RETRACT_MANY["constrained"](away, real(parameters)))
 
 
 def test_constrained_poses_fill_their_range():
     """Distances from end to end, and the origin anywhere in the cone, reach all that is allowed and no more."""
-    space = ConstrainedPoses(1.5, 4.0, math.radians(25.0))
-    start = look_at((0.0, 0.0, 2.0))
+    space = nbv.ConstrainedPoses(1.5, 4.0, math.radians(25.0))
+    start = nbv.look_at((0.0, 0.0, 2.0))
     parameters = np.zeros((2, 8))
     parameters[:, 3], parameters[:, 4] = (-30.0, 30.0), (-30.0, 30.0)
     end = jax.jit(jax.vmap(space.retract, in_axes=(None, 0)))(start, real(parameters))
@@ -209,7 +207,7 @@ def test_roll_turns_the_image_about_the_axis():
     start = starts_inside(1)[0]
     end = RETRACT["constrained"](start, real(parameters))
     np.testing.assert_allclose(angle_to_origin(end), angle_to_origin(start), atol=1e-5)
-    straight = look_at((0.0, 0.0, 2.5))
+    straight = nbv.look_at((0.0, 0.0, 2.5))
     turn = np.asarray(straight.rotation.T @ RETRACT["constrained"](straight, real(parameters)).rotation)
     np.testing.assert_allclose(Rotation.from_matrix(turn).as_rotvec(), [0.0, 0.0, 0.7], atol=1e-5)
 
@@ -217,11 +215,11 @@ def test_roll_turns_the_image_about_the_axis():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: SpherePoses(0.0), "radius is 0.0; it must be positive"),
-        (lambda: FreePoses(math.nan), "radius is nan"),
-        (lambda: ConstrainedPoses(2.0, 2.0), "from 2.0 to 2.0"),
-        (lambda: ConstrainedPoses(0.0, 2.0), "from 0.0 to 2.0"),
-        (lambda: ConstrainedPoses(off_axis=0.5 * math.pi), "off_axis is 1.57"),
+        (lambda: nbv.SpherePoses(0.0), "radius is 0.0; it must be positive"),
+        (lambda: nbv.FreePoses(math.nan), "radius is nan"),
+        (lambda: nbv.ConstrainedPoses(2.0, 2.0), "from 2.0 to 2.0"),
+        (lambda: nbv.ConstrainedPoses(0.0, 2.0), "from 0.0 to 2.0"),
+        (lambda: nbv.ConstrainedPoses(off_axis=0.5 * math.pi), "off_axis is 1.57"),
     ],
 )
 def test_refused_spaces(build, message):
@@ -231,11 +229,11 @@ def test_refused_spaces(build, message):
 
 def test_refused_cameras():
     """The default camera ends 15 degrees from its centre; half as wide as high, it ends at about half of that."""
-    CONSTRAINED.check_camera(Camera())
+    CONSTRAINED.check_camera(nbv.Camera())
     with pytest.raises(ValueError, match=r"off_axis is 0.175 rad but the image ends 0.133 rad"):
-        CONSTRAINED.check_camera(Camera(width=25))
+        CONSTRAINED.check_camera(nbv.Camera(width=25))
     with pytest.raises(ValueError, match="centre would leave it"):
-        ConstrainedPoses(off_axis=math.radians(15.1)).check_camera(Camera())
-    ConstrainedPoses(off_axis=math.radians(14.9)).check_camera(Camera(width=80))
+        nbv.ConstrainedPoses(off_axis=math.radians(15.1)).check_camera(nbv.Camera())
+    nbv.ConstrainedPoses(off_axis=math.radians(14.9)).check_camera(nbv.Camera(width=80))
     for space in (SPHERE, FREE):
-        space.check_camera(Camera(width=1))
+        space.check_camera(nbv.Camera(width=1))

@@ -10,8 +10,7 @@ import pytest
 import scipy.stats
 from weight_space import WeightSpace
 
-from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.surfaces import GeometricSPSR
+import jaxnbv as nbv
 
 COMPUTES = True
 SETTINGS = {"lengthscale": 0.15, "variance": 1.0, "noise": 0.3, "nu": 1.5, "truncation": 2}
@@ -23,7 +22,7 @@ def padded(points, normals, rows, capacity):
     arrays = rng.uniform(-1.5, 1.5, (2, *points.shape[:-2], capacity, 3))
     mask = np.zeros((*points.shape[:-2], capacity), bool)
     arrays[0][..., rows, :], arrays[1][..., rows, :], mask[..., rows] = points, normals, True
-    return PointCloud(*(jnp.asarray(a, jnp.float32) for a in arrays), jnp.asarray(mask))
+    return nbv.PointCloud(*(jnp.asarray(a, jnp.float32) for a in arrays), jnp.asarray(mask))
 
 
 @pytest.mark.parametrize("noise", [0.3, 0.05])
@@ -36,7 +35,7 @@ def test_sample_mean_and_joint_covariance_equal_weight_space(noise):
     points, normals = rng.uniform(-0.6, 0.6, (12, 3)), rng.standard_normal((12, 3))
     x = np.concatenate([points[:4], rng.uniform(-1.5, 1.5, (6, 3))])
     mean, covariance = WeightSpace(**settings).posterior(points, normals, x)
-    posterior = GeometricSPSR(**settings).condition(padded(points, normals, np.arange(2, 14), 16))
+    posterior = nbv.GeometricSPSR(**settings).condition(padded(points, normals, np.arange(2, 14), 16))
     draws = [np.asarray(posterior.sample(jax.random.key(seed), 8000)(x), np.float64) for seed in range(3)]
     white = np.linalg.solve(np.linalg.cholesky(covariance), (np.concatenate(draws) - mean).T)
     count = white.shape[1]
@@ -67,7 +66,7 @@ def test_posterior_is_calibrated():
         truth[i] = np.einsum("dnk,dk->n", oracle.function_features(x[i]), weights)
         normals[i] = oracle.normal_features(points[i]) @ weights.T
     normals += oracle.noise * rng.standard_normal(normals.shape)
-    model = GeometricSPSR(**settings)
+    model = nbv.GeometricSPSR(**settings)
 
     def sample(problem):
         cloud, x, key = problem

@@ -7,8 +7,7 @@ import pytest
 from weight_space import WeightSpace
 
 import jaxnbv as nbv
-from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.surfaces import GeometricSPSR, given_normals
+from jaxnbv.surfaces import given_normals
 from jaxnbv.surfaces.pathwise import MeansAtData
 
 SETTINGS = {"lengthscale": 0.1, "variance": 0.8, "noise": 0.2, "nu": 1.5, "truncation": 4}
@@ -16,10 +15,10 @@ RNG = np.random.default_rng(3)
 POINTS, NORMALS, QUERIES = RNG.uniform(-1.3, 1.3, (30, 3)), RNG.standard_normal((30, 3)), RNG.uniform(-1.5, 1.5, (9, 3))
 
 
-def cloud(capacity: int) -> PointCloud:
+def cloud(capacity: int) -> nbv.PointCloud:
     """Rows that are not filled hold what is not a number."""
     rows = (np.pad(a, ((0, capacity - 30), (0, 0)), constant_values=np.nan) for a in (POINTS, NORMALS))
-    return PointCloud(*map(jnp.asarray, rows), jnp.arange(capacity) < 30)
+    return nbv.PointCloud(*map(jnp.asarray, rows), jnp.arange(capacity) < 30)
 
 
 @pytest.fixture
@@ -29,7 +28,7 @@ def few(monkeypatch):
 
 
 def test_all_that_is_offered_equals_the_factorisation_and_weight_space(x64, few):
-    model, key = GeometricSPSR(**SETTINGS), jax.random.key(0)
+    model, key = nbv.GeometricSPSR(**SETTINGS), jax.random.key(0)
     posterior, factorised = model.condition(cloud(47)), model.condition(cloud(36))
     assert posterior.cholesky is None
     assert factorised.cholesky is not None
@@ -51,11 +50,11 @@ def test_float32_is_exact_to_a_ten_thousandth(monkeypatch):
     points = RNG.standard_normal((500, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     queries = 0.65 * points[::5]
-    model = GeometricSPSR(lengthscale=0.03, truncation=12)
+    model = nbv.GeometricSPSR(lengthscale=0.03, truncation=12)
     with jax.enable_x64(True):
-        expected = model.condition(PointCloud.from_arrays(0.5 * points, points)).mean(queries)
+        expected = model.condition(nbv.PointCloud.from_arrays(0.5 * points, points)).mean(queries)
     monkeypatch.setattr(given_normals, "MOST_FACTORISED", 499)
-    found = model.condition(PointCloud.from_arrays(0.5 * points, points)).mean(queries)
+    found = model.condition(nbv.PointCloud.from_arrays(0.5 * points, points)).mean(queries)
     np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
 
 
@@ -63,11 +62,11 @@ def test_what_does_not_converge_is_refused(few, monkeypatch):
     """Two steps for thirty points; of a capacity of its own, so that it is compiled so."""
     monkeypatch.setattr(given_normals, "_MOST_PRODUCTS", 2)
     with pytest.raises(ValueError, match=r"singular in float32: raise the noise"):
-        GeometricSPSR(0.1, 0.8, 4, noise=0.01).condition(cloud(41))
+        nbv.GeometricSPSR(0.1, 0.8, 4, noise=0.01).condition(cloud(41))
 
 
 def test_what_needs_the_factor_is_refused(few, monkeypatch):
-    model = GeometricSPSR(**SETTINGS)
+    model = nbv.GeometricSPSR(**SETTINGS)
     with pytest.raises(ValueError, match=r"more than 36 points is not made"):
         model.condition(cloud(42)).log_marginal_likelihood()
     monkeypatch.setattr("jaxnbv.surfaces.screened.MOST_FACTORISED", 36)

@@ -14,13 +14,12 @@ from scipy.spatial.transform import Rotation
 
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Cuboid, SignedDistance, Sphere
-from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.surfaces.known_shapes import kind_of, systematic_resampling
 from jaxnbv.surfaces.registration import Prior, Seen, register
 
 CAMERA = nbv.Camera(height=40, width=40, fov=1.0)
-QUICK = nbv.ScreenedSPSR(GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=8))
-RESIDUAL = nbv.ScreenedSPSR(GeometricSPSR(0.02, truncation=12), (nbv.OnSurface(),))
+QUICK = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=8))
+RESIDUAL = nbv.ScreenedSPSR(nbv.GeometricSPSR(0.02, truncation=12), (nbv.OnSurface(),))
 GRID = nbv.Grid(40)
 
 

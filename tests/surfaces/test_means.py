@@ -13,8 +13,8 @@ from scipy.stats import chi2
 from weight_space import JointWeightSpace, WeightSpace
 from weight_space import cloud as padded
 
-from jaxnbv.errors import InputError
-from jaxnbv.surfaces import Fields, GeometricSPSR, ScreenedSPSR, ValueRows, ValueSource
+import jaxnbv as nbv
+from jaxnbv.surfaces import ValueRows
 
 RNG = np.random.default_rng(0)
 POINTS, NORMALS = RNG.uniform(-1.0, 1.0, (20, 3)), RNG.standard_normal((20, 3))
@@ -26,7 +26,7 @@ WIDTH = 0.5
 SCALES = {"one scale": ((0.1,), (0.8,)), "two scales": ((0.1, 0.3), (0.8, 0.6))}
 
 
-class Bumps(Fields):
+class Bumps(nbv.Fields):
     """sum_k a_sk exp(-|x - c_sk|^2 / 2 w^2) + x^T Q_s x / 2."""
 
     centres: Float[Array, "s k 3"]
@@ -51,7 +51,7 @@ def exact(s, x):
     return value, -np.sum(each[..., None] * apart, axis=1) / WIDTH**2 + x @ QUADRATICS[s]
 
 
-class Given(ValueSource):
+class Given(nbv.ValueSource):
     """Values at the points of the tests; the last row is not filled."""
 
     def rows(self, evidence):
@@ -64,8 +64,8 @@ def cloud(dtype=None):
 
 
 def make(kind, scales, noise=0.2):
-    base = GeometricSPSR(*SCALES[scales], truncation=3, noise=noise)
-    return base if kind == "geometric" else ScreenedSPSR(base, (Given(),), level_deviation=0.7)
+    base = nbv.GeometricSPSR(*SCALES[scales], truncation=3, noise=noise)
+    return base if kind == "geometric" else nbv.ScreenedSPSR(base, (Given(),), level_deviation=0.7)
 
 
 def regression(posterior, scales, s, x, noise=0.2):
@@ -128,7 +128,7 @@ def test_no_noise_gives_the_means_whatever_the_key(x64, kind):
     assert float(jnp.abs(mixed[1] - mean[1]).min()) > 1e-6
 
 
-class Zeros(Fields):
+class Zeros(nbv.Fields):
     count: int = eqx.field(static=True)
 
     def __call__(self, x):
@@ -158,7 +158,7 @@ def test_gradients_and_grids_of_samples_about_functions_are_those_of_their_value
     np.testing.assert_allclose(fields.on_grid(axis).reshape(3, -1), fields(nodes), atol=1e-12)
 
 
-class Balls(Fields):
+class Balls(nbv.Fields):
     """Distances to spheres about the origin, where they have no gradient."""
 
     radii: Float[Array, " s"]
@@ -189,7 +189,7 @@ def flat(x):
     return jnp.zeros((1, len(x)))
 
 
-class OneValue(Fields):
+class OneValue(nbv.Fields):
     def __call__(self, x):
         return jnp.sum(x, axis=1)
 
@@ -208,7 +208,7 @@ class OneValue(Fields):
 def test_what_cannot_be_sampled_about_is_refused(kind, change, message):
     posterior = make(kind, "one scale").condition(cloud(dtype=jnp.float32))
     given = {"means": bumps(jnp.float32), "key": jax.random.key(0), "noise_scale": 1.0} | change
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(nbv.InputError, match=message):
         posterior.sample_about(**given)
 
 
@@ -216,5 +216,5 @@ def test_what_cannot_be_sampled_about_is_refused(kind, change, message):
 def test_means_that_are_not_finite_at_the_data_are_refused(kind):
     posterior = make(kind, "one scale").condition(cloud(dtype=jnp.float32))
     means = eqx.tree_at(lambda m: m.heights, bumps(jnp.float32), jnp.asarray(HEIGHTS, jnp.float32).at[1, 2].set(np.nan))
-    with pytest.raises(InputError, match=r"1 of the 3 mean functions, the first of them number \[1\]"):
+    with pytest.raises(nbv.InputError, match=r"1 of the 3 mean functions, the first of them number \[1\]"):
         posterior.sample_about(means, jax.random.key(0), 0.3)

@@ -7,7 +7,6 @@ import pytest
 from jaxtyping import Array, Float
 
 import jaxnbv as nbv
-from jaxnbv.scanning import Evidence
 from jaxnbv.scanning.sdf import Cuboid, Sphere
 
 
@@ -31,7 +30,7 @@ class SpherePosterior(nbv.SurfacePosterior):
 
 class RandomSpheres(nbv.SurfaceModel):
     def condition(self, evidence):
-        return SpherePosterior(jnp.asarray(0.0), Evidence.of(evidence).cloud)
+        return SpherePosterior(jnp.asarray(0.0), nbv.Evidence.of(evidence).cloud)
 
 
 CAMERA = nbv.Camera(height=16, width=16)
@@ -41,12 +40,6 @@ SCENES = {"sphere": nbv.SDFSurface(Sphere(0.7)), "box": nbv.SDFSurface(Cuboid([0
 def planner():
     imagination = nbv.Imagination(RandomSpheres(), grid=nbv.Grid(40), num_samples=3)
     return nbv.Planner(nbv.Coverage(), nbv.DiscreteSearch(12), CAMERA, imagination, capacity=512, max_views=4)
-
-
-@pytest.fixture(scope="module")
-def posterior():
-    cloud = nbv.scan(SCENES["sphere"], CAMERA, nbv.look_at((0.8, 0.9, 2.2)))
-    return RandomSpheres().condition(cloud)
 
 
 @pytest.mark.slow
@@ -86,21 +79,3 @@ def test_a_simulated_episode_sees_the_surface(name):
     assert np.abs(distance).max() < 1e-3
     positions = np.array([view.pose.position for view in episode.views])
     assert np.linalg.norm(positions[:, None] - positions, axis=-1)[np.triu_indices(3, 1)].min() > 0.5
-
-
-def test_default_grid_evaluation_is_evaluation_at_the_nodes(posterior):
-    fields = posterior.sample(jax.random.key(2), 3)
-    axis = np.linspace(-1.2, 1.4, 6, dtype=np.float32)
-    values = np.asarray(fields.on_grid(axis))
-    for i, j, k in np.ndindex(6, 6, 6):
-        node = np.array([axis[i], axis[j], axis[k]])
-        expected = np.linalg.norm(node - np.asarray(fields.centres), axis=1) - np.asarray(fields.radii)
-        np.testing.assert_allclose(values[:, i, j, k], expected, atol=1e-5)
-
-
-def test_the_mean_on_a_grid_is_that_of_the_same_samples_at_all_its_nodes(posterior):
-    axis = np.linspace(-1.2, 1.4, 5, dtype=np.float32)
-    nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    expected = posterior.sample(jax.random.key(0), 64)(nodes).mean(axis=0)
-    np.testing.assert_allclose(posterior.mean_on_grid(axis).reshape(-1), expected, atol=1e-5)
-    np.testing.assert_allclose(posterior.mean(nodes), expected, atol=1e-5)

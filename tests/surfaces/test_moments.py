@@ -9,8 +9,7 @@ import scipy.stats
 from jaxtyping import Array, Float
 from weight_space import WeightSpace, ball, cloud
 
-from jaxnbv.errors import InputError
-from jaxnbv.surfaces import Fields, GeometricSPSR, OnSurface, OutsideBoundary, ScreenedSPSR, SurfacePosterior
+import jaxnbv as nbv
 
 RNG = np.random.default_rng(0)
 X = RNG.uniform(-1.4, 1.4, (40, 3)).astype(np.float32)
@@ -19,8 +18,8 @@ AXIS = np.linspace(-1.0, 1.2, 5, dtype=np.float32)
 
 def test_the_probability_of_being_inside_is_the_share_of_the_samples_that_are():
     """1,500 samples at 40 points, within 4.5 standard errors and the rounding of a share."""
-    values = OutsideBoundary(num_points=40), OnSurface(20)
-    posterior = ScreenedSPSR(GeometricSPSR(0.05, truncation=6, noise=0.1), values).condition(ball(RNG, 40))
+    values = nbv.OutsideBoundary(num_points=40), nbv.OnSurface(20)
+    posterior = nbv.ScreenedSPSR(nbv.GeometricSPSR(0.05, truncation=6, noise=0.1), values).condition(ball(RNG, 40))
     assert posterior.has_closed_forms
     count, probability = 1500, np.asarray(posterior.probability_inside(X), np.float64)
     share = np.mean(posterior.sample(jax.random.key(1), count)(X) < posterior.level, axis=0)
@@ -32,17 +31,17 @@ def test_the_probability_of_being_inside_is_the_share_of_the_samples_that_are():
 def test_the_probability_of_being_inside_is_that_of_weight_space(x64):
     settings = {"lengthscale": 0.1, "variance": 0.8, "noise": 0.2, "nu": 1.5, "truncation": 3}
     points, normals = RNG.uniform(-1.0, 1.0, (20, 3)), RNG.standard_normal((20, 3))
-    posterior = GeometricSPSR(**settings).condition(cloud(points, normals))
+    posterior = nbv.GeometricSPSR(**settings).condition(cloud(points, normals))
     x = np.asarray(X, np.float64)
     mean, covariance = WeightSpace(**settings).posterior(points, normals, np.concatenate([x, points]))
     level = mean[len(x) :].mean()
     expected = scipy.stats.norm.cdf((level - mean[: len(x)]) / np.sqrt(np.diag(covariance)[: len(x)]))
     np.testing.assert_allclose(posterior.probability_inside(x), expected, rtol=1e-8)
-    with pytest.raises(InputError, match=r"coordinate of 3\.2, outside"):
+    with pytest.raises(nbv.InputError, match=r"coordinate of 3\.2, outside"):
         posterior.probability_inside(np.full((1, 3), 3.2))
 
 
-class Shifted(Fields):
+class Shifted(nbv.Fields):
     """a_s x + b_s."""
 
     slopes: Float[Array, " s"]
@@ -52,7 +51,7 @@ class Shifted(Fields):
         return self.slopes[:, None] * jnp.asarray(x)[:, 0] + self.offsets[:, None]
 
 
-class Lines(SurfacePosterior):
+class Lines(nbv.SurfacePosterior):
     """Lines of random slope and offset."""
 
     level: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(0.4))

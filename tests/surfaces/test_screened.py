@@ -7,18 +7,8 @@ import numpy as np
 import pytest
 from weight_space import JointWeightSpace, WeightSpace, ball, cloud
 
-from jaxnbv import (
-    Box,
-    GeometricSPSR,
-    Grid,
-    InputError,
-    OnSurface,
-    OutsideBoundary,
-    ScreenedSPSR,
-    SeenEmpty,
-)
-from jaxnbv.scanning import Evidence
-from jaxnbv.surfaces import ValueRows, ValueSource
+import jaxnbv as nbv
+from jaxnbv.surfaces import ValueRows
 
 RNG = np.random.default_rng(0)
 POINTS, NORMALS = RNG.uniform(-1.0, 1.0, (20, 3)), RNG.standard_normal((20, 3))
@@ -27,7 +17,7 @@ SCALES = {"lengthscale": (0.1, 0.3), "variance": (0.8, 0.6)}
 ONE = {"lengthscale": 0.1, "variance": 0.8}
 
 
-class Given(ValueSource):
+class Given(nbv.ValueSource):
     """Values at points of the test's choice; the last row is not filled."""
 
     points: jax.Array
@@ -42,8 +32,8 @@ def problem(hyperparameters, capacity=27):
     at = RNG.uniform(-1.2, 1.2, (13, 3))
     values, noise = RNG.standard_normal(13), RNG.uniform(0.1, 1.0, 13)
     source = Given(*(jnp.asarray(a) for a in (at, values, noise)))
-    base = GeometricSPSR(truncation=3, noise=0.2, **hyperparameters)
-    posterior = ScreenedSPSR(base, (source,), level_deviation=0.7).condition(cloud(POINTS, NORMALS, capacity))
+    base = nbv.GeometricSPSR(truncation=3, noise=0.2, **hyperparameters)
+    posterior = nbv.ScreenedSPSR(base, (source,), level_deviation=0.7).condition(cloud(POINTS, NORMALS, capacity))
     ells, variances = (np.atleast_1d(hyperparameters[name]) for name in ("lengthscale", "variance"))
     scales = [WeightSpace(ell, variance, 0.2, 1.5, 3) for ell, variance in zip(ells, variances, strict=True)]
     h = float(posterior.half_jump)
@@ -59,8 +49,8 @@ def test_posterior_equals_one_regression_of_normals_and_values(x64, hyperparamet
 
 
 def test_the_unit_of_values_is_half_the_rise_of_the_mean_across_the_data():
-    data, base = ball(RNG, 60), GeometricSPSR(0.03, truncation=8)
-    posterior = ScreenedSPSR(base, offset=0.2).condition(data)
+    data, base = ball(RNG, 60), nbv.GeometricSPSR(0.03, truncation=8)
+    posterior = nbv.ScreenedSPSR(base, offset=0.2).condition(data)
     mean, (points, normals) = base.condition(data).mean, data.to_numpy()
     rise = np.asarray(mean(points + 0.2 * normals) - mean(points - 0.2 * normals))
     # 256 rows are taken of 60, so some four and some five times.
@@ -69,9 +59,9 @@ def test_the_unit_of_values_is_half_the_rise_of_the_mean_across_the_data():
 
 def test_values_are_reached_where_they_are_said_to_be():
     data = ball(RNG, 80)
-    posterior = ScreenedSPSR(
-        GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8),
-        (OutsideBoundary(num_points=60, noise=0.02), OnSurface(30, noise=0.02)),
+    posterior = nbv.ScreenedSPSR(
+        nbv.GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8),
+        (nbv.OutsideBoundary(num_points=60, noise=0.02), nbv.OnSurface(30, noise=0.02)),
     ).condition(data)
     h, rows = float(posterior.half_jump), posterior.rows
     assert h > 0
@@ -84,17 +74,18 @@ def test_values_are_reached_where_they_are_said_to_be():
 def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
     """Nodes half a unit to the side of a scanned ball; a tenth of a unit from them, and far away. The corners of the
     grid, which lie outside the scene, were seen too."""
-    data, grid = ball(RNG, 80), Grid(20)
+    data, grid = ball(RNG, 80), nbv.Grid(20)
     axis = np.asarray(grid.axis)
     nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
     is_beside = np.linalg.norm(nodes - [0.0, 1.2, 0.0], axis=-1) < 0.4
     beyond = (np.abs(nodes) > 1.6).all(axis=-1)
     assert is_beside.sum() >= 40
     assert beyond.sum() == 8
-    model = ScreenedSPSR(
-        GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8), (OutsideBoundary(num_points=60), SeenEmpty(30))
+    model = nbv.ScreenedSPSR(
+        nbv.GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8),
+        (nbv.OutsideBoundary(num_points=60), nbv.SeenEmpty(30)),
     )
-    nothing = Evidence.before_views(data, 1, grid)
+    nothing = nbv.Evidence.before_views(data, 1, grid)
     seen = eqx.tree_at(lambda e: e.seen_empty, nothing, jnp.asarray(is_beside | beyond))
     without, knowing = (model.condition(evidence) for evidence in (nothing, seen))
     beside = nodes[is_beside]
@@ -106,23 +97,26 @@ def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
     assert inside(knowing, beside) < 0.3 * inside(without, beside)
     assert inside(knowing, near) < 0.5 * inside(without, near)
     assert abs(inside(knowing, far) - inside(without, far)) < 0.1
-    rows = SeenEmpty(30).rows(seen)
+    rows = nbv.SeenEmpty(30).rows(seen)
     assert np.asarray(rows.mask).all()
     assert len(np.unique(np.asarray(rows.points), axis=0)) == 30
     assert {tuple(p) for p in np.asarray(rows.points)} <= {tuple(p) for p in np.float32(beside)}
-    for evidence in (nothing, Evidence.of(data)):
-        assert not np.asarray(SeenEmpty(30).rows(evidence).mask).any()
+    for evidence in (nothing, nbv.Evidence.of(data)):
+        assert not np.asarray(nbv.SeenEmpty(30).rows(evidence).mask).any()
 
 
 def test_rows_beyond_the_data_are_not_filled():
     data = ball(RNG, 20)
-    rows = OnSurface(30).rows(Evidence.of(data))
+    rows = nbv.OnSurface(30).rows(nbv.Evidence.of(data))
     assert np.asarray(rows.mask).sum() == 20
     assert len(np.unique(np.asarray(rows.points)[:20], axis=0)) == 20
 
 
 def test_the_posterior_is_differentiable_in_the_data(x64):
-    data, model = ball(RNG, 20), ScreenedSPSR(GeometricSPSR(0.1, truncation=3), (OutsideBoundary(num_points=20),))
+    data, model = (
+        ball(RNG, 20),
+        nbv.ScreenedSPSR(nbv.GeometricSPSR(0.1, truncation=3), (nbv.OutsideBoundary(num_points=20),)),
+    )
 
     def mean(shift):
         moved = eqx.tree_at(lambda c: c.points, data, data.points + shift)
@@ -135,16 +129,16 @@ def test_the_posterior_is_differentiable_in_the_data(x64):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ScreenedSPSR(values=()), "no values"),
-        (lambda: ScreenedSPSR(level_deviation=0.0), "level_deviation is 0.0"),
-        (lambda: ScreenedSPSR(offset=-1.0), "offset is -1.0"),
-        (lambda: OnSurface(0), "number of values is 0"),
-        (lambda: SeenEmpty(noise=-1.0), "noise of the values is -1.0"),
-        (lambda: OutsideBoundary(Box.cube(4.0)), "coordinate of 2"),
-        (lambda: OutsideBoundary(Box((1.0, 1.0, 1.0), (1.2, 1.2, 1.2))), "must enclose the origin"),
-        (lambda: GeometricSPSR((0.1, 0.2), 0.3), "as many variances as lengthscales"),
+        (lambda: nbv.ScreenedSPSR(values=()), "no values"),
+        (lambda: nbv.ScreenedSPSR(level_deviation=0.0), "level_deviation is 0.0"),
+        (lambda: nbv.ScreenedSPSR(offset=-1.0), "offset is -1.0"),
+        (lambda: nbv.OnSurface(0), "number of values is 0"),
+        (lambda: nbv.SeenEmpty(noise=-1.0), "noise of the values is -1.0"),
+        (lambda: nbv.OutsideBoundary(nbv.Box.cube(4.0)), "coordinate of 2"),
+        (lambda: nbv.OutsideBoundary(nbv.Box((1.0, 1.0, 1.0), (1.2, 1.2, 1.2))), "must enclose the origin"),
+        (lambda: nbv.GeometricSPSR((0.1, 0.2), 0.3), "as many variances as lengthscales"),
     ],
 )
 def test_settings_that_mean_nothing_are_refused(make, message):
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(nbv.InputError, match=message):
         make()

@@ -6,7 +6,7 @@ import pytest
 import trimesh
 
 import jaxnbv as nbv
-from jaxnbv.scanning.sdf import Cuboid, Sphere, solid_of_mesh
+from jaxnbv.scanning.sdf import Sphere, solid_of_mesh
 from jaxnbv.surfaces import mesh_shapes
 
 
@@ -31,13 +31,6 @@ def ball(path, inverted=False):
 
 def bank_of(*files, **options):
     return nbv.ShapeBank.from_meshes(list(files), progress=False, **options)
-
-
-def test_extremes_of_analytic_shapes_are_their_corners():
-    bank = nbv.ShapeBank.of([Cuboid([1.0, 0.5, 0.25]), Cuboid([0.3, 0.6, 0.9])])
-    for half, points in zip(([1.0, 0.5, 0.25], [0.3, 0.6, 0.9]), np.asarray(bank.extremes), strict=True):
-        np.testing.assert_allclose(points.max(axis=0), half, atol=2e-3)
-        np.testing.assert_allclose(points.min(axis=0), -np.asarray(half), atol=2e-3)
 
 
 def test_a_bank_gives_back_its_shapes_and_names():

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from weight_space import WeightSpace, cloud
 
-from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.surfaces import GeometricSPSR
+import jaxnbv as nbv
 from jaxnbv.surfaces.covariance import function_normal_covariance, function_variance, normal_covariance
 
 RNG = np.random.default_rng(0)
@@ -23,7 +22,7 @@ SETTINGS = {"lengthscale": 0.1, "variance": 0.8, "noise": 0.2, "nu": 1.5, "trunc
 )
 def test_posterior_equals_regression_in_weight_space(x64, changes):
     settings = SETTINGS | changes
-    oracle, posterior = WeightSpace(**settings), GeometricSPSR(**settings).condition(cloud(POINTS, NORMALS, 37))
+    oracle, posterior = WeightSpace(**settings), nbv.GeometricSPSR(**settings).condition(cloud(POINTS, NORMALS, 37))
     mean, covariance = oracle.posterior(POINTS, NORMALS, QUERIES)
     np.testing.assert_allclose(posterior.mean(QUERIES), mean, atol=1e-9 * np.abs(mean).max())
     np.testing.assert_allclose(posterior.covariance(QUERIES, QUERIES), covariance, atol=1e-9 * covariance.max())
@@ -36,11 +35,11 @@ def test_posterior_equals_regression_in_weight_space(x64, changes):
 
 
 def test_order_padding_and_the_values_of_masked_rows_change_nothing(x64):
-    model = GeometricSPSR(**SETTINGS)
+    model = nbv.GeometricSPSR(**SETTINGS)
     rows = RNG.permutation(37)[:30]
     points, normals = 100.0 * RNG.standard_normal((2, 37, 3))
     points[rows], normals[rows] = POINTS, NORMALS
-    scattered = PointCloud(jnp.asarray(points), jnp.asarray(normals), jnp.zeros(37, bool).at[rows].set(True))
+    scattered = nbv.PointCloud(jnp.asarray(points), jnp.asarray(normals), jnp.zeros(37, bool).at[rows].set(True))
     results = []
     for data in (cloud(POINTS, NORMALS), cloud(POINTS, NORMALS, 37), scattered):
         posterior = model.condition(data)
@@ -56,10 +55,10 @@ def test_float32_posterior_is_near_that_of_float64():
     points = RNG.standard_normal((120, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     settings = {"lengthscale": 0.03, "truncation": 9, "noise": 0.05}
-    single = GeometricSPSR(**settings).condition(cloud(points, points, 128))
+    single = nbv.GeometricSPSR(**settings).condition(cloud(points, points, 128))
     results = [single.mean(QUERIES), single.variance(QUERIES), single.log_marginal_likelihood()]
     with jax.enable_x64(True):
-        double = GeometricSPSR(**settings).condition(cloud(points, points, 128))
+        double = nbv.GeometricSPSR(**settings).condition(cloud(points, points, 128))
         expected = [double.mean(QUERIES), double.variance(QUERIES), double.log_marginal_likelihood()]
     for actual, value in zip(results, expected, strict=True):
         np.testing.assert_allclose(actual, value, atol=3e-4 * float(np.abs(value).max()))
@@ -68,7 +67,7 @@ def test_float32_posterior_is_near_that_of_float64():
 def reference_problem(shared, truncation):
     data = np.load(shared / "reference" / "geospsr_spot.npz")
     noise = float(data["noise_variance"]) ** 0.5
-    model = GeometricSPSR(float(data["lengthscale"]), float(data["variance_1d"]), truncation, noise)
+    model = nbv.GeometricSPSR(float(data["lengthscale"]), float(data["variance_1d"]), truncation, noise)
     return data, model, jnp.asarray(data["points"]), jnp.asarray(data["queries"])
 
 
@@ -80,7 +79,7 @@ def test_reference_formula_from_these_covariances(x64, shared):
     """The reference's mean and variance, assembled as it does: k(X, X) of all frequencies (here up to 400) in A, the
     cross-covariance and the prior variance of f truncated at L = 20. Equal to 1e-4."""
     data, model, x, queries = reference_problem(shared, 20)
-    untruncated = GeometricSPSR(model.lengthscale, model.variance, 400, model.noise)
+    untruncated = nbv.GeometricSPSR(model.lengthscale, model.variance, 400, model.noise)
     kernel = np.asarray(normal_covariance(x, x, untruncated.spectrum))
     np.testing.assert_allclose(kernel[:16, :16], data["kernel_16x16"], atol=1e-4 * kernel.max())
     kernel = kernel + float(data["noise_variance"]) * np.eye(len(kernel))
@@ -108,8 +107,8 @@ def test_posterior_is_differentiable_in_data_queries_and_hyperparameters(x64):
 
     def package(parameters):
         p = parameters
-        model = GeometricSPSR(p["lengthscale"], p["variance"], noise=p["noise"], **keep)
-        posterior = model.condition(PointCloud(p["points"], p["normals"], jnp.ones(30, bool)))
+        model = nbv.GeometricSPSR(p["lengthscale"], p["variance"], noise=p["noise"], **keep)
+        posterior = model.condition(nbv.PointCloud(p["points"], p["normals"], jnp.ones(30, bool)))
         x = p["queries"]
         return jnp.stack(
             [
@@ -148,23 +147,23 @@ def test_posterior_is_differentiable_in_data_queries_and_hyperparameters(x64):
 )
 def test_bad_hyperparameters_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
-        GeometricSPSR(**settings)
+        nbv.GeometricSPSR(**settings)
 
 
 def test_a_truncation_that_keeps_little_variance_is_reported():
     with pytest.warns(UserWarning, match=r"truncation=10 keeps \d+% of the prior's variance"):
-        GeometricSPSR(truncation=10)
+        nbv.GeometricSPSR(truncation=10)
 
 
 @pytest.mark.parametrize("nu", [0.5, 1.5, 2.5])
 def test_kept_variance_is_the_prior_variance_of_weight_space(nu):
-    kept = GeometricSPSR(lengthscale=0.1, variance=0.8, truncation=4, nu=nu).kept_variance
+    kept = nbv.GeometricSPSR(lengthscale=0.1, variance=0.8, truncation=4, nu=nu).kept_variance
     oracle = WeightSpace(lengthscale=0.1, variance=0.8, truncation=4, nu=nu)
     np.testing.assert_allclose(kept, (oracle.amplitude**2).sum() / 0.8**3 + oracle.constant**2 / 0.8**3, rtol=1e-5)
 
 
 def test_bad_clouds_are_refused():
-    model = GeometricSPSR(lengthscale=0.1, truncation=3)
+    model = nbv.GeometricSPSR(lengthscale=0.1, truncation=3)
     good = cloud(POINTS, NORMALS)
     for points, normals, mask, message in (
         (good.points, good.normals, jnp.zeros(30, bool), "the cloud is empty: no point to start from"),
@@ -174,11 +173,11 @@ def test_bad_clouds_are_refused():
         (good.points, good.normals.at[4].set(jnp.array([0.0, 100.0, 0.0])), good.mask, "1 normals .* longer than 10"),
     ):
         with pytest.raises(ValueError, match=message):
-            model.condition(PointCloud(points, normals, mask))
+            model.condition(nbv.PointCloud(points, normals, mask))
 
 
 def test_points_where_functions_only_repeat_are_refused():
-    posterior = GeometricSPSR(**SETTINGS).condition(cloud(POINTS, NORMALS, dtype=jnp.float32))
+    posterior = nbv.GeometricSPSR(**SETTINGS).condition(cloud(POINTS, NORMALS, dtype=jnp.float32))
     fields, far = posterior.sample(jax.random.key(0), 2), np.array([[0.0, 0.0, -3.2]], np.float32)
     near = np.array([[0.0, 0.0, np.pi]], np.float32)
     asked = (posterior.mean, posterior.variance, fields, lambda x: posterior.covariance(x, QUERIES))
@@ -194,7 +193,7 @@ def test_a_large_capacity_gives_what_its_filled_rows_give(x64, monkeypatch, coun
     monkeypatch.setattr("jaxnbv.surfaces.given_normals._ALWAYS_WHOLE", 30)
     rng = np.random.default_rng(count)
     points, normals = rng.uniform(-1.3, 1.3, (count, 3)), rng.standard_normal((count, 3))
-    oracle, posterior = WeightSpace(**SETTINGS), GeometricSPSR(**SETTINGS).condition(cloud(points, normals, 40))
+    oracle, posterior = WeightSpace(**SETTINGS), nbv.GeometricSPSR(**SETTINGS).condition(cloud(points, normals, 40))
     mean, covariance = oracle.posterior(points, normals, QUERIES)
     np.testing.assert_allclose(posterior.mean(QUERIES), mean, atol=1e-9 * np.abs(mean).max())
     np.testing.assert_allclose(posterior.covariance(QUERIES, QUERIES), covariance, atol=1e-9 * covariance.max())

@@ -13,21 +13,21 @@ import math
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnbv.geometry.cloud import PointCloud
+import jaxnbv as nbv
 
 
 def cloud(points, normals, capacity=None, dtype=None):
     """Normals as they are: `from_arrays` would scale them to unit length."""
     pad = ((0, (capacity or len(points)) - len(points)), (0, 0))
     arrays = (jnp.asarray(np.pad(a, pad), dtype) for a in (points, normals))
-    return PointCloud(*arrays, jnp.arange(capacity or len(points)) < len(points))
+    return nbv.PointCloud(*arrays, jnp.arange(capacity or len(points)) < len(points))
 
 
 def ball(rng, count):
     """Points of a ball of 0.7, in a cloud with rows to spare."""
     points = rng.standard_normal((count, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
-    return PointCloud.from_arrays(0.7 * points, points, capacity=count + 16)
+    return nbv.PointCloud.from_arrays(0.7 * points, points, capacity=count + 16)
 
 
 @functools.cache

@@ -10,24 +10,18 @@ from on_grid import balls
 from opinions import drawn_cloud, nothing
 from scipy.integrate import quad
 
-from jaxnbv.acquisition import expected_value
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.pose import fibonacci_sphere, look_at
-from jaxnbv.scanning import Grid, SDFSurface, scan
+import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Cuboid, Sphere
-from jaxnbv.search import DiscreteSearch, GradientSearch
-from jaxnbv.tasks import Coverage, NewSurface
 from jaxnbv.tasks.coverage import visible_area
 
-SMALL, POSE = Camera(height=8, width=8), look_at((0.4, 1.1, 2.2))
+SMALL, POSE = nbv.Camera(height=8, width=8), nbv.look_at((0.4, 1.1, 2.2))
 RADIUS, AWAY = 0.5, math.dist((0, 0, 0), (0.4, 1.1, 2.2))
 
 
 def looked_at(height=24, width=24):
     """A ball in a camera of so many pixels."""
-    camera = Camera(height=height, width=width, aspect=height / width)
-    return scan(SDFSurface(Sphere(RADIUS)), camera, POSE), camera
+    camera = nbv.Camera(height=height, width=width, aspect=height / width)
+    return nbv.scan(nbv.SDFSurface(Sphere(RADIUS)), camera, POSE), camera
 
 
 def ball_area(sharpest: float) -> float:
@@ -50,17 +44,17 @@ def test_the_area_of_a_ball_is_its_integral(height, width):
 
 
 def test_the_area_of_a_slanted_face_does_not_depend_on_the_rays_or_the_distance():
-    face = SDFSurface(Cuboid((0.5, 0.4, 1e-3)))
+    face = nbv.SDFSurface(Cuboid((0.5, 0.4, 1e-3)))
     for pixels, away in ((120, 1.0), (200, 1.0), (200, 1.6)):
-        camera, pose = Camera(height=pixels, width=pixels, fov=1.0), look_at((away, 0.3 * away, 1.5 * away))
-        area = float(jnp.sum(visible_area(scan(face, camera, pose), camera, pose)))
+        camera, pose = nbv.Camera(height=pixels, width=pixels, fov=1.0), nbv.look_at((away, 0.3 * away, 1.5 * away))
+        area = float(jnp.sum(visible_area(nbv.scan(face, camera, pose), camera, pose)))
         # Its border is known to a pixel: a share of 2 / 120 * (1 / 1.0 + 1 / 0.8) of the face, most of it by chance.
         assert area == pytest.approx(1.0 * 0.8, rel=0.03)
 
 
 def cloud_of(points, capacity=None):
     points = np.asarray(points, float)
-    return PointCloud.from_arrays(points, points / np.linalg.norm(points, axis=1, keepdims=True), capacity)
+    return nbv.PointCloud.from_arrays(points, points / np.linalg.norm(points, axis=1, keepdims=True), capacity)
 
 
 def test_the_score_is_the_area_weighed_by_how_far_it_is_to_d():
@@ -68,7 +62,7 @@ def test_the_score_is_the_area_weighed_by_how_far_it_is_to_d():
     rng = np.random.default_rng(0)
     data = rng.normal(size=(40, 3)) + np.array([0.0, 4.0, 0.0])
     data *= RADIUS / np.linalg.norm(data, axis=1, keepdims=True)
-    acquisition, cloud = NewSurface(0.15), cloud_of(data, 64)
+    acquisition, cloud = nbv.NewSurface(0.15), cloud_of(data, 64)
     context = acquisition.context(cloud)
     found = float(acquisition.score(context, seen, camera, POSE))
 
@@ -84,8 +78,8 @@ def test_the_score_is_the_area_weighed_by_how_far_it_is_to_d():
 def test_between_the_points_of_a_sparse_cloud_nothing_is_new():
     """As many points as are 0.1 apart, all over the ball that is looked at: by the size alone half of it were new."""
     seen, camera = looked_at()
-    cloud = cloud_of(RADIUS * np.asarray(fibonacci_sphere(300)))
-    acquisition = NewSurface(0.02)
+    cloud = cloud_of(RADIUS * np.asarray(nbv.fibonacci_sphere(300)))
+    acquisition = nbv.NewSurface(0.02)
     score = float(acquisition.score(acquisition.context(cloud), seen, camera, POSE))
     assert score < 0.02 * float(jnp.sum(visible_area(seen, camera, POSE)))
 
@@ -93,12 +87,12 @@ def test_between_the_points_of_a_sparse_cloud_nothing_is_new():
 @pytest.mark.slow
 def test_it_can_be_climbed(x64):
     """The derivative in the pose is that by central differences, for a small step, of the smooth part of it."""
-    surfaces, camera = balls(Grid(32), [0.7]), Camera(height=16, width=16)
+    surfaces, camera = balls(nbv.Grid(32), [0.7]), nbv.Camera(height=16, width=16)
     cloud = cloud_of([[0.0, 0.0, 0.7]])
 
     def value(x):
-        pose = look_at(jnp.array([x, 0.4, 2.4]))
-        return expected_value(NewSurface(0.3), cloud, surfaces, camera, pose[None])[0]
+        pose = nbv.look_at(jnp.array([x, 0.4, 2.4]))
+        return nbv.expected_value(nbv.NewSurface(0.3), cloud, surfaces, camera, pose[None])[0]
 
     found = float(jax.grad(value)(0.5))
     step = 1e-6
@@ -108,13 +102,13 @@ def test_it_can_be_climbed(x64):
 
 
 def test_searches_of_both_kinds_take_it_and_a_call_without_a_camera_is_named():
-    acquisition = NewSurface()
-    for search in (DiscreteSearch(4), GradientSearch(num_candidates=4, num_starts=1, iterations=1)):
-        search.check(acquisition, Camera(height=4, width=4), 16)
+    acquisition = nbv.NewSurface()
+    for search in (nbv.DiscreteSearch(4), nbv.GradientSearch(num_candidates=4, num_starts=1, iterations=1)):
+        search.check(acquisition, nbv.Camera(height=4, width=4), 16)
     with pytest.raises(ValueError, match=r"score\(context, scan, camera, pose\)"):
         acquisition(None, cloud_of([[1.0, 0.0, 0.0]]))
     with pytest.raises(ValueError, match=r"size is 0\.0"):
-        NewSurface(0.0)
+        nbv.NewSurface(0.0)
 
 
 def chamfer(points, data):
@@ -122,7 +116,7 @@ def chamfer(points, data):
     return squared.min(axis=1).sum() if len(points) else 0.0
 
 
-@pytest.mark.parametrize("score", [Coverage(), NewSurface()])
+@pytest.mark.parametrize("score", [nbv.Coverage(), nbv.NewSurface()])
 def test_a_scan_that_sees_nothing_or_nothing_new_is_worth_nothing(score):
     seen, camera = looked_at()
     known, far = (score.context(cloud) for cloud in (seen, cloud_of([[1.0, 1.0, 1.0]])))
@@ -133,14 +127,14 @@ def test_a_scan_that_sees_nothing_or_nothing_new_is_worth_nothing(score):
 
 def test_the_acquisition_against_brute_force_over_all_scans():
     rng = np.random.default_rng(2)
-    surfaces = balls(Grid(20), (0.8, 0.6, 0.9), rng.uniform(-0.3, 0.3, (3, 3)))
-    data, poses = drawn_cloud(rng, 60, 64), look_at(fibonacci_sphere(5, 2.5))
+    surfaces = balls(nbv.Grid(20), (0.8, 0.6, 0.9), rng.uniform(-0.3, 0.3, (3, 3)))
+    data, poses = drawn_cloud(rng, 60, 64), nbv.look_at(nbv.fibonacci_sphere(5, 2.5))
     expected = np.zeros((3, 5))
     for s, p in np.ndindex(3, 5):
         surface = jax.tree.map(lambda leaf, s=s: leaf[s], surfaces)
-        expected[s, p] = chamfer(scan(surface, SMALL, poses[p]).to_numpy()[0], data.to_numpy()[0])
+        expected[s, p] = chamfer(nbv.scan(surface, SMALL, poses[p]).to_numpy()[0], data.to_numpy()[0])
     assert expected.min() > 0
-    found = expected_value(Coverage(), data, surfaces, SMALL, poses)
+    found = nbv.expected_value(nbv.Coverage(), data, surfaces, SMALL, poses)
     np.testing.assert_allclose(found, expected.mean(axis=0), rtol=1e-4)
 
 
@@ -148,8 +142,8 @@ def test_gradient_in_the_scan(x64):
     """d/dx min_y |x - y|^2 = 2 (x - y*); masked rows and normals have none."""
     rng = np.random.default_rng(3)
     data, seen = drawn_cloud(rng, 15, 20), drawn_cloud(rng, 6, 9)
-    score = Coverage()
-    gradient = jax.grad(lambda points: score(data, PointCloud(points, seen.normals, seen.mask)))(seen.points)
+    score = nbv.Coverage()
+    gradient = jax.grad(lambda points: score(data, nbv.PointCloud(points, seen.normals, seen.mask)))(seen.points)
     points, known = np.asarray(seen.points)[:6], np.asarray(data.points)[:15]
     nearest = known[((points[:, None] - known[None]) ** 2).sum(-1).argmin(axis=1)]
     np.testing.assert_allclose(gradient[:6], 2 * (points - nearest), atol=1e-12)

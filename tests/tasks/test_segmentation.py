@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from opinions import Linear, drawn_cloud, nothing
 
-from jaxnbv.acquisition import ExpectedUtilityImprovement
-from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.tasks import SoftPartCount, part_counts
+import jaxnbv as nbv
+from jaxnbv.tasks import part_counts
 from jaxnbv.viz.answers import words_of
 
 RNG = np.random.default_rng(0)
@@ -35,7 +34,7 @@ def by_hand(cloud, weight, target):
 def test_the_formula_with_masked_rows(x64, target):
     weight = 2.0 * RNG.standard_normal((6, PARTS))
     cloud = make_cloud(17, 25)
-    utility = SoftPartCount(Linear(jnp.asarray(weight)), target)
+    utility = nbv.SoftPartCount(Linear(jnp.asarray(weight)), target)
     assert float(utility(cloud)) == pytest.approx(by_hand(cloud, weight, target), rel=1e-12)
     # What stands in empty rows must not count.
     dirty = eqx.tree_at(lambda c: c.points, cloud, jnp.where(cloud.mask[:, None], cloud.points, 9.0))
@@ -43,11 +42,11 @@ def test_the_formula_with_masked_rows(x64, target):
 
 
 def test_its_gradient_against_central_differences(x64):
-    utility = SoftPartCount(Linear(jnp.asarray(2.0 * RNG.standard_normal((6, PARTS)))), 3.0)
+    utility = nbv.SoftPartCount(Linear(jnp.asarray(2.0 * RNG.standard_normal((6, PARTS)))), 3.0)
     cloud = make_cloud(9, 12)
 
     def value(points, normals):
-        return utility(PointCloud(points, normals, cloud.mask))
+        return utility(nbv.PointCloud(points, normals, cloud.mask))
 
     slopes = jax.grad(value, argnums=(0, 1))(cloud.points, cloud.normals)
     for argument, slope in enumerate(slopes):
@@ -70,7 +69,7 @@ def certain(part):
 
 def test_it_saturates_for_a_part_that_is_found():
     def gain(seen):
-        score = ExpectedUtilityImprovement(SoftPartCount(certain(2), 60.0))
+        score = nbv.ExpectedUtilityImprovement(nbv.SoftPartCount(certain(2), 60.0))
         return float(score(score.context(make_cloud(seen, 1000)), make_cloud(30, 30)))
 
     gains = [gain(seen) for seen in (1, 60, 200, 600)]
@@ -81,7 +80,7 @@ def test_it_saturates_for_a_part_that_is_found():
 
 
 def test_it_is_at_most_the_number_of_parts_and_zero_of_nothing():
-    utility = SoftPartCount(Linear(jnp.zeros((6, PARTS))), 1.0)
+    utility = nbv.SoftPartCount(Linear(jnp.zeros((6, PARTS))), 1.0)
     assert float(utility(make_cloud(400, 400))) == pytest.approx(PARTS)
     assert float(utility(nothing(4))) == 0.0
 
@@ -101,10 +100,10 @@ def test_the_answer_counts_the_points_of_each_part():
     weight = jnp.asarray(2.0 * RNG.standard_normal((6, PARTS)))
     cloud = make_cloud(17, 25)
     counts = np.asarray(part_counts(Linear(weight)(cloud)))
-    plain = SoftPartCount(Linear(weight)).answer(cloud)
+    plain = nbv.SoftPartCount(Linear(weight)).answer(cloud)
     assert plain.asked == words_of(plain).shown == tuple(np.flatnonzero(counts))
     np.testing.assert_array_equal(plain.values, counts)
-    named = ExpectedUtilityImprovement(SoftPartCount(Named(weight)), num_points=5).answer(cloud)
+    named = nbv.ExpectedUtilityImprovement(nbv.SoftPartCount(Named(weight)), num_points=5).answer(cloud)
     words = words_of(named)
     assert words.line() == f"seat {counts[1]}   leg {counts[3]}"
     assert words.line(plain) == words.line()
