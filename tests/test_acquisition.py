@@ -160,13 +160,6 @@ def test_a_plain_function_is_a_utility_whose_improvement_is_sought(utility):
     assert nbv.Planner(acquisition := Toy(), nbv.FarthestView(6)).acquisition is acquisition
 
 
-@pytest.mark.parametrize("given", [nbv.Coverage, nbv.ExpectedUtilityImprovement, 3, "coverage", None])
-def test_what_is_neither_an_acquisition_nor_a_function_is_named(given):
-    name = given.__name__ if isinstance(given, type) else repr(given)
-    with pytest.raises(nbv.InputError, match=f"the acquisition is .*{name}.*: give one, such as Coverage"):
-        nbv.Planner(given, nbv.FarthestView(6))
-
-
 ACQUISITIONS = {
     "coverage": nbv.Coverage(),
     "new surface": nbv.NewSurface(),

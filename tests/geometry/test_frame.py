@@ -22,19 +22,6 @@ def test_frame_centres_the_box_and_scales_its_longest_side():
     assert nbv.Frame.fit(world, longest_side=1.0).scale == pytest.approx(0.25)
 
 
-@pytest.mark.parametrize(
-    ("points", "message"),
-    [
-        (np.zeros((0, 3)), "no points"),
-        (np.ones((4, 3)), "all 4 points lie at"),
-        (np.array([[0.0, 0.0, 0.0], [1.0, np.nan, 0.0]]), "not finite"),
-    ],
-)
-def test_frame_of_no_extent_is_refused(points, message):
-    with pytest.raises(ValueError, match=message):
-        nbv.Frame.fit(points)
-
-
 @pytest.mark.parametrize("up", UPS)
 def test_up_is_the_scene_s_y_by_a_rotation(up):
     frame = nbv.Frame(2.0, (1.0, 2.0, 3.0), up)

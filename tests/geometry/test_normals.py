@@ -1,7 +1,6 @@
 """Normals of plain points against those of the surface that they were drawn from."""
 
 import numpy as np
-import pytest
 
 import jaxnbv as nbv
 
@@ -28,18 +27,3 @@ def test_more_neighbours_smooth_noise():
     few, many = (np.median(angles(nbv.estimate_normals(points, (0, 0, 5.0), k), up)) for k in (8, 64))
     assert many < 0.3 * few
     assert many < 3.0
-
-
-@pytest.mark.parametrize(
-    ("points", "viewpoint", "neighbours", "message"),
-    [
-        (CENTRES[:10], (0, 0, 5.0), 16, "16 of 10 points"),
-        (CENTRES, (0, 0, 5.0), 2, "three at least"),
-        (CENTRES, (0, 5.0), 16, r"shape \(2,\)"),
-        (np.where(CENTRES > 0.99, np.nan, CENTRES), (0, 0, 5.0), 16, "not finite"),
-        (CENTRES, tuple(CENTRES[5]), 16, "where the sensor stands"),
-    ],
-)
-def test_what_has_no_normals_is_named(points, viewpoint, neighbours, message):
-    with pytest.raises(ValueError, match=message):
-        nbv.estimate_normals(points, viewpoint, neighbours)

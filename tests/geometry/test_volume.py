@@ -34,21 +34,6 @@ def test_box_distances_against_the_nearest_of_many_surface_points(x64):
     np.testing.assert_allclose(OFF_CENTRE(surface), 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("low", "high"),
-    [
-        ((0.0, 0.0, 0.0), (1.0, 0.0, 1.0)),
-        ((0.0, 0.0, 0.5), (1.0, 1.0, 0.2)),
-        ((0.0, float("nan"), 0.0), (1.0, 1.0, 1.0)),
-        ((0.0, 0.0, 0.0), (1.0, 1.0, float("inf"))),
-        ((-float("inf"), 0.0, 0.0), (1.0, 1.0, 1.0)),
-    ],
-)
-def test_a_box_without_an_inside_is_refused(low, high):
-    with pytest.raises(ValueError, match=r"has no inside: each of three sides must be positive and finite"):
-        nbv.Box(low, high)
-
-
 def ellipsoid(x):
     """Smaller in magnitude than the distance to an ellipsoid with half axes 0.9, 0.5 and 0.7."""
     return 0.5 * (jnp.sqrt(jnp.sum((x / jnp.asarray([0.9, 0.5, 0.7])) ** 2, axis=-1)) - 1.0)

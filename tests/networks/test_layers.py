@@ -5,8 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import jaxnbv as nbv
-from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.networks.layers import ball_query, interpolate
 
 RNG = np.random.default_rng(0)
@@ -48,13 +46,6 @@ def test_a_point_on_the_sphere_is_within():
     for radius in (1.0, 2.0, 3.0):
         found = ball_query(jnp.asarray(points), jnp.asarray(points), jnp.asarray(mask), radius, 90)
         np.testing.assert_array_equal(found, ball_by_loop(points, points, mask, radius, 90))
-
-
-def test_counts_below_one_are_refused():
-    with pytest.raises(nbv.InputError, match="at least one"):
-        farthest_point_indices(jnp.zeros((3, 3)), jnp.ones(3, bool), 0)
-    with pytest.raises(nbv.InputError, match="at least one"):
-        ball_query(jnp.zeros((3, 3)), jnp.zeros((3, 3)), jnp.ones(3, bool), 1.0, 0)
 
 
 def interpolated_by_loop(points, coarse, features):

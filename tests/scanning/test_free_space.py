@@ -197,10 +197,3 @@ def test_carved_values_are_positive_where_empty_and_twice_the_largest_about():
     largest = maximum_filter(np.abs(values), size=(1, 3, 3, 3), mode="nearest")
     np.testing.assert_array_equal(carved[:, empty], 2 * largest[:, empty])
     assert (np.asarray(carve(jnp.zeros((4, 4, 4)), jnp.ones((4, 4, 4), bool))) > 0).all()
-
-
-@pytest.mark.parametrize("margin", [0.49, 0.0, -1.0, math.nan, math.inf])
-def test_a_margin_below_half_a_voxel_or_not_finite_is_refused(margin):
-    refused = rf"carving is {margin} voxels.*at least 0\.5|margin_voxels is {margin}; it must be a finite number"
-    with pytest.raises(ValueError, match=refused):
-        nbv.Carving(margin_voxels=margin)

@@ -104,23 +104,6 @@ def test_tracing_under_jit_names_the_remedy():
 TRIANGLE = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
 
 
-@pytest.mark.parametrize(
-    ("vertices", "faces", "message"),
-    [
-        (TRIANGLE, np.zeros((0, 3), dtype=int), "no faces"),
-        ([*TRIANGLE[:2], [0.0, np.nan, 0.0]], [[0, 1, 2]], "not finite"),
-        (TRIANGLE, [[0, 1, 3]], "but there are 3"),
-        (TRIANGLE, [[0, 1, 1]], "zero area"),
-        (TRIANGLE, np.array([[0.0, 1.0, 2.0]]), "integers"),
-    ],
-)
-def test_broken_arrays_are_refused(vertices, faces, message):
-    # The function below the run-time check of shapes, which refuses some of these first.
-    build = getattr(nbv.TriangleMesh.from_arrays, "__func__", nbv.TriangleMesh.from_arrays)
-    with pytest.raises((ValueError, TypeError), match=f"{message}|[Tt]ype-check"):
-        build(nbv.TriangleMesh, vertices, faces)
-
-
 def test_zero_area_faces_are_dropped_and_counted():
     with pytest.warns(UserWarning, match="dropped 2 of 3 faces"):
         mesh = nbv.TriangleMesh.from_arrays(TRIANGLE, [[0, 1, 2], [0, 0, 1], [2, 2, 2]])

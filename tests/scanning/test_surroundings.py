@@ -241,19 +241,3 @@ def test_no_proposal_is_inside_or_under_what_is_known():
         assert min(table, to_block, to_arm, to_seen) >= clearance - 1e-4
         looked += ((x - point) @ normal < 0).mean()
     assert 200 < looked < 800
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: nbv.Surroundings((TABLE,), margin=-1.0), "margin is -1.0"),
-        (lambda: nbv.Surroundings(clearance=-0.1), "clearance is -0.1"),
-        (lambda: HalfSpace([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]), "normal is .*: give a direction"),
-        (lambda: solid_of_mesh(*box_mesh([0, 0, 0], [1, 1, 1]), resolution=3), "resolution is 3"),
-        (lambda: solid_of_mesh(np.zeros((3, 3)), np.array([[0, 1, 2]])), "all 3 vertices of the mesh lie at"),
-        (lambda: solid_of_mesh(np.eye(3), np.array([[0, 1, 3]])), "faces refer to vertices 0 to 3"),
-    ],
-)
-def test_bad_input_is_named(make, message):
-    with pytest.raises(nbv.InputError, match=message):
-        make()

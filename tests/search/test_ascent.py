@@ -99,18 +99,3 @@ def test_a_start_at_the_origin_gives_numbers(space):
     move = jax.jit(lambda p: space.retract(start, p))
     for tree in (move(parameters), jax.jit(jax.jacrev(move))(parameters)):
         assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(tree))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"dof": 2, "space": nbv.FreePoses()}, "both dof=2 and space"),
-        *(({"learning_rate": rate}, f"learning.rate is {rate}") for rate in (0.0, np.nan, np.inf)),
-        ({"num_starts": 0}, "num_starts is 0"),
-        ({"iterations": 0}, "iterations is 0"),
-        ({"num_starts": 7, "num_candidates": 6}, "6 candidates for 7 starts"),
-    ],
-)
-def test_bad_settings_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        nbv.GradientSearch(**arguments)

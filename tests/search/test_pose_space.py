@@ -210,30 +210,3 @@ def test_roll_turns_the_image_about_the_axis():
     straight = nbv.look_at((0.0, 0.0, 2.5))
     turn = np.asarray(straight.rotation.T @ RETRACT["constrained"](straight, real(parameters)).rotation)
     np.testing.assert_allclose(Rotation.from_matrix(turn).as_rotvec(), [0.0, 0.0, 0.7], atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (lambda: nbv.SpherePoses(0.0), "radius is 0.0; it must be positive"),
-        (lambda: nbv.FreePoses(math.nan), "radius is nan"),
-        (lambda: nbv.ConstrainedPoses(2.0, 2.0), "from 2.0 to 2.0"),
-        (lambda: nbv.ConstrainedPoses(0.0, 2.0), "from 0.0 to 2.0"),
-        (lambda: nbv.ConstrainedPoses(off_axis=0.5 * math.pi), "off_axis is 1.57"),
-    ],
-)
-def test_refused_spaces(build, message):
-    with pytest.raises(ValueError, match=message):
-        build()
-
-
-def test_refused_cameras():
-    """The default camera ends 15 degrees from its centre; half as wide as high, it ends at about half of that."""
-    CONSTRAINED.check_camera(nbv.Camera())
-    with pytest.raises(ValueError, match=r"off_axis is 0.175 rad but the image ends 0.133 rad"):
-        CONSTRAINED.check_camera(nbv.Camera(width=25))
-    with pytest.raises(ValueError, match="centre would leave it"):
-        nbv.ConstrainedPoses(off_axis=math.radians(15.1)).check_camera(nbv.Camera())
-    nbv.ConstrainedPoses(off_axis=math.radians(14.9)).check_camera(nbv.Camera(width=80))
-    for space in (SPHERE, FREE):
-        space.check_camera(nbv.Camera(width=1))

@@ -217,18 +217,3 @@ def test_the_same_evidence_has_the_same_hypotheses_and_nothing_is_compiled_twice
     compilations.clear()
     imagination.sample(second, jax.random.key(1))
     assert not compilations
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: nbv.KnownShapes(BANK, num_starts=0), "number of starts is 0"),
-        (lambda: nbv.KnownShapes(BANK, sharpness=-1.0), "sharpness is -1.0"),
-        (lambda: nbv.ShapeBank.of([Sphere(1.0), Cuboid([1.0, 1.0, 1.0])]), "of 2 kinds, such as numbers"),
-        (lambda: nbv.ShapeBank.of([Sphere(1.0)], ["a", "b"]), "2 names for 1 solids"),
-        (lambda: BANK.chosen([9]), "the bank has 4 shapes"),
-    ],
-)
-def test_what_makes_no_sense_is_refused(make, words):
-    with pytest.raises(nbv.InputError, match=words):
-        make()

@@ -88,17 +88,3 @@ def test_steps_are_independent_and_of_unit_length(poses, count):
     steps = poses.steps
     assert steps.shape == (9, count)
     np.testing.assert_allclose(steps.T @ steps, np.eye(count), atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: nbv.FreeRotation(scale=(0.0, 1.0)), "the scales are"),
-        (lambda: nbv.FreeRotation(scale=(2.0, 1.0)), "the scales are"),
-        (lambda: nbv.Upright((0.0, 0.0, 0.0)), "the vertical is zero"),
-        (lambda: nbv.Upright(within=4.0), "within 4.0 rad"),
-    ],
-)
-def test_what_is_impossible_is_refused(make, words):
-    with pytest.raises(nbv.InputError, match=words):
-        make()

@@ -124,21 +124,3 @@ def test_the_posterior_is_differentiable_in_the_data(x64):
 
     slope = jax.grad(mean)(0.0)
     np.testing.assert_allclose(slope, (mean(1e-5) - mean(-1e-5)) / 2e-5, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: nbv.ScreenedSPSR(values=()), "no values"),
-        (lambda: nbv.ScreenedSPSR(level_deviation=0.0), "level_deviation is 0.0"),
-        (lambda: nbv.ScreenedSPSR(offset=-1.0), "offset is -1.0"),
-        (lambda: nbv.OnSurface(0), "number of values is 0"),
-        (lambda: nbv.SeenEmpty(noise=-1.0), "noise of the values is -1.0"),
-        (lambda: nbv.OutsideBoundary(nbv.Box.cube(4.0)), "coordinate of 2"),
-        (lambda: nbv.OutsideBoundary(nbv.Box((1.0, 1.0, 1.0), (1.2, 1.2, 1.2))), "must enclose the origin"),
-        (lambda: nbv.GeometricSPSR((0.1, 0.2), 0.3), "as many variances as lengthscales"),
-    ],
-)
-def test_settings_that_mean_nothing_are_refused(make, message):
-    with pytest.raises(nbv.InputError, match=message):
-        make()

@@ -113,19 +113,3 @@ def test_a_full_disk_costs_no_shape(tmp_path, monkeypatch):
     monkeypatch.setattr(mesh_shapes.np, "savez_compressed", refuse)
     with pytest.warns(UserWarning, match="not kept for the next time .No space left"):
         assert len(bank_of(ball(tmp_path / "ball.ply"), resolution=16)) == 1
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda folder: nbv.ShapeBank.from_meshes(folder / "none"), "there is no folder"),
-        (lambda folder: nbv.ShapeBank.from_meshes(folder), "holds no mesh"),
-        (lambda folder: nbv.ShapeBank.from_meshes([]), "no meshes are named"),
-        (lambda folder: nbv.ShapeBank.from_meshes([folder / "a.ply"], names=["a", "b"]), "2 names for 1 meshes"),
-        (lambda folder: nbv.ShapeBank.from_meshes([folder / "a.ply"], resolution=4), "resolution is 4"),
-        (lambda folder: nbv.ShapeBank.from_meshes([folder / "a.ply"], sheet=0.0), "sheets are 0.0 thick"),
-    ],
-)
-def test_what_makes_no_bank_is_refused(tmp_path, make, words):
-    with pytest.raises(nbv.InputError, match=words):
-        make(tmp_path)

@@ -136,20 +136,6 @@ def test_posterior_is_differentiable_in_data_queries_and_hyperparameters(x64):
         assert np.abs(expected).max() > 1e-3
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"nu": 1.0}, "nu is 1.0"),
-        ({"lengthscale": np.nan}, "lengthscale is nan"),
-        ({"variance": 0.0}, "variance is 0.0"),
-        ({"truncation": 0}, "truncation is 0"),
-    ],
-)
-def test_bad_hyperparameters_are_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        nbv.GeometricSPSR(**settings)
-
-
 def test_a_truncation_that_keeps_little_variance_is_reported():
     with pytest.warns(UserWarning, match=r"truncation=10 keeps \d+% of the prior's variance"):
         nbv.GeometricSPSR(truncation=10)
