@@ -25,8 +25,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from boundary import boundary_views
-from covering import CANDIDATES, Look, Protocol, Trial
+from covering import CANDIDATES, Look, Protocol, Trial, boundary_views
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from tqdm import tqdm

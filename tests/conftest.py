@@ -32,9 +32,7 @@ import pytest
 from jaxtyping import install_import_hook
 
 gc.set_threshold(100_000, 20, 100)
-install_import_hook(
-    ["jaxnbv", "forecasts", "covering", "boundary", "peers", "training", "training_clouds"], "beartype.beartype"
-)
+install_import_hook(["jaxnbv", "forecasts", "covering", "peers", "training", "training_clouds"], "beartype.beartype")
 
 # Bytes of a worker.
 MEMORY = 3 << 30

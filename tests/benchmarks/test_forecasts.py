@@ -2,11 +2,10 @@
 
 import math
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from forecasts import Truth, brier, crps, empty_share, exit_depths, judge, ray_depths, reliability, share_of_best
+from forecasts import Truth, brier, crps, empty_share, exit_depths, judge, ray_depths, reliability
 from scipy.stats import norm
 
 import jaxnbv as nbv
@@ -73,11 +72,6 @@ def test_share_in_empty_space_asks_the_nearest_node():
     # 0.07 is nearer to the node at 0.125, 0.05 to the one at 0; beyond the grid its last node is the nearest.
     assert float(empty_share(points, mask, empty, GRID)) == pytest.approx(2 / 3)
     assert np.isnan(empty_share(points, mask & False, empty, GRID))
-
-
-def test_share_of_best_is_the_worth_of_the_candidate_that_is_chosen():
-    assert share_of_best(np.array([1.0, 3.0, 2.0]), np.array([8.0, 2.0, 4.0])) == pytest.approx(0.25)
-    assert share_of_best(np.array([1.0, 3.0]), np.zeros(2)) is None
 
 
 @pytest.fixture(scope="module")
@@ -154,17 +148,3 @@ def test_a_surface_that_encloses_nothing_has_no_brier_score(planner, truth):
     assert record.brier is None
     assert record.reliability is None
     assert record.crps == pytest.approx(0.25, abs=1e-3)
-
-
-def test_nothing_is_compiled_for_another_object(planner, truth, compilations):
-    evidence, surfaces = _state(planner), _balls(0.5, 0.75)
-    judge(planner, evidence, surfaces, truth, NOTHING)
-    other = jax.tree.map(jnp.array, truth)
-    compilations.clear()
-    judge(planner, evidence, surfaces, other, NOTHING)
-    assert not compilations
-
-
-def test_the_inside_must_be_known(planner, truth):
-    with pytest.raises(nbv.InputError, match="inside of a GridSurface is not known"):
-        Truth.of(jax.tree.map(lambda leaf: leaf[0], _balls(0.5)), planner, truth.candidates, VOLUME)

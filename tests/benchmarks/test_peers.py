@@ -7,8 +7,7 @@ import jax
 import numpy as np
 import pytest
 import trimesh
-from boundary import boundary_views, is_boundary
-from covering import Trial, one_a_voxel
+from covering import Trial, boundary_views, is_boundary, one_a_voxel
 from peers import PROTOCOLS, greedy, score
 from scipy.spatial import cKDTree
 

@@ -34,7 +34,7 @@ class RandomSpheres(nbv.SurfaceModel):
 
 
 CAMERA = nbv.Camera(height=16, width=16)
-SCENES = {"sphere": nbv.SDFSurface(Sphere(0.7)), "box": nbv.SDFSurface(Cuboid([0.5, 0.6, 0.4]))}
+BALL, BOX = nbv.SDFSurface(Sphere(0.7)), nbv.SDFSurface(Cuboid([0.5, 0.6, 0.4]))
 
 
 def planner():
@@ -47,7 +47,7 @@ def test_proposed_view_is_the_best_by_chamfer_distance_to_exact_scans_of_the_sam
     """Each sample is a sphere: its scan in closed form, then the mean over samples of the sum of squared distances."""
     plan, key = planner(), jax.random.key(1)
     first = nbv.look_at((0.8, 0.9, 2.2))
-    cloud = nbv.scan(SCENES["sphere"], CAMERA, first)
+    cloud = nbv.scan(BALL, CAMERA, first)
     evidence = plan.init(first, cloud)
     proposal = plan.propose(evidence, key)
     sample_key, _ = jax.random.split(key)
@@ -67,14 +67,13 @@ def test_proposed_view_is_the_best_by_chamfer_distance_to_exact_scans_of_the_sam
     np.testing.assert_allclose(proposal.pose.position, nbv.fibonacci_sphere(12, 2.5)[np.argmax(values)], atol=1e-6)
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_a_simulated_episode_sees_the_surface(name):
+def test_a_simulated_episode_sees_a_box_by_spheres():
     first = nbv.look_at((0.8, 0.9, 2.2))
     noise = nbv.SensorNoise(0.0, 0.0)
-    episode = nbv.simulate(planner(), SCENES[name], first, 3, jax.random.key(0), noise, progress=False)
+    episode = nbv.simulate(planner(), BOX, first, 3, jax.random.key(0), noise, progress=False)
     assert len(episode.views) == 3
     points, _ = episode.cloud.to_numpy()
-    distance = np.asarray(SCENES[name].sdf(jnp.asarray(points)))
+    distance = np.asarray(BOX.sdf(jnp.asarray(points)))
     assert len(points) > len(episode.views[0].scan.to_numpy()[0])
     assert np.abs(distance).max() < 1e-3
     positions = np.array([view.pose.position for view in episode.views])

@@ -19,7 +19,7 @@ AXIS = np.linspace(-1.0, 1.2, 5, dtype=np.float32)
 def test_the_probability_of_being_inside_is_the_share_of_the_samples_that_are():
     """1,500 samples at 40 points, within 4.5 standard errors and the rounding of a share."""
     values = nbv.OutsideBoundary(num_points=40), nbv.OnSurface(20)
-    posterior = nbv.ScreenedSPSR(nbv.GeometricSPSR(0.05, truncation=6, noise=0.1), values).condition(ball(RNG, 40))
+    posterior = nbv.ScreenedSPSR(nbv.GeometricSPSR(0.05, truncation=4, noise=0.1), values).condition(ball(RNG, 40))
     assert posterior.has_closed_forms
     count, probability = 1500, np.asarray(posterior.probability_inside(X), np.float64)
     share = np.mean(posterior.sample(jax.random.key(1), count)(X) < posterior.level, axis=0)
