@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from free_scenes import SEE
 from scipy.spatial.transform import Rotation
 
 import jaxnbv as nbv
@@ -101,11 +102,11 @@ def test_points_of_obstacles_are_not_the_objects():
 
 def test_space_is_seen_empty_up_to_an_obstacle():
     """Every ray misses the ball's place; nodes before the wall are empty, those behind it are not known."""
-    grid, carving, pose = nbv.Grid(40), nbv.Carving(), nbv.look_at((-2.4, 0.0, 0.0))
+    grid, pose = nbv.Grid(40), nbv.look_at((-2.4, 0.0, 0.0))
     nothing = nbv.scan(nbv.SDFSurface(Sphere(0.01).translate([0.0, 5.0, 0.0])), CAMERA, pose)
     wall = nbv.Surroundings((Cuboid([0.1, 2.0, 2.0]).translate([0.5, 0.0, 0.0]),))
     barrier = wall.barrier(CAMERA, pose)
-    free, known = (np.asarray(carving.seen_empty(grid, pose, nothing, CAMERA, b)) for b in (None, barrier))
+    free, known = (np.asarray(SEE(nbv.Carving(), grid, pose, nothing, CAMERA, b)) for b in (None, barrier))
     x = np.asarray(grid.axis)
     middle = 20
     assert free[(x > 0.6) & (x < 1.2), middle, middle].all()
