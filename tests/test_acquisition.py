@@ -104,26 +104,6 @@ def test_the_context_is_computed_once_a_step(surfaces, cloud):
     assert len(ran) == 2
 
 
-def test_common_random_numbers(surfaces, cloud):
-    """A pose's value does not depend on which others are asked for, nor on their order."""
-    acquisition = nbv.ExpectedUtilityImprovement(height)
-    together = nbv.expected_value(acquisition, cloud, surfaces, CAMERA, POSES)
-    order = np.array([4, 1, 5])
-    some = nbv.expected_value(acquisition, cloud, surfaces, CAMERA, POSES[order])
-    np.testing.assert_allclose(some, together[order], rtol=1e-5, atol=1e-5)
-    assert float(jnp.std(together)) > 0.1
-
-
-def test_utility_sees_the_union_of_both_clouds(cloud):
-    seen = []
-    acquisition = nbv.ExpectedUtilityImprovement(lambda c: seen.append(c) or jnp.sum(c.mask) * 1.0)
-    other = nbv.PointCloud.from_arrays([[1.0, 2.0, 3.0]], [[0.0, 0.0, 1.0]], capacity=4)
-    assert float(acquisition(acquisition.context(cloud), other)) == 1.0
-    expected = nbv.concatenate(cloud, other)
-    for a, b in zip(jax.tree.leaves(seen[-1]), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 class Vector(Toy):
     """An acquisition that is a vector itself."""
 

@@ -62,12 +62,6 @@ def test_masked_rows_are_not_taken_for_data():
     np.testing.assert_array_equal(nbv.PointCloud.from_arrays(np.ma.masked_array(GOOD), UP).points, np.float32(GOOD))
 
 
-@pytest.mark.filterwarnings("error")
-def test_normals_within_one_per_cent_are_normalised_quietly():
-    cloud = nbv.PointCloud.from_arrays(GOOD, [[0.0, 1.005, 0.0], [0.0, 0.0, 0.995]])
-    np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1.0, atol=1e-6)
-
-
 def rays_by_hand(camera, pose):
     """Rays through the pixel centres with a forward component of one, in float64."""
     focal = camera.height / 2 / math.tan(camera.fov / 2)

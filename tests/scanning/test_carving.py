@@ -111,7 +111,6 @@ def test_the_model_is_told_of_what_was_seen_empty_within_the_volume():
     np.testing.assert_allclose(level, 1000.0 * len(points) + np.abs(points).max(), rtol=1e-4)
 
 
-SHEET = nbv.SDFSurface(Cuboid([0.6, 0.6, 0.01]))
 ABOVE_AND_BELOW = [nbv.look_at((0.0, 0.0, 2.5)), nbv.look_at((0.0, 0.0, -2.5))]
 
 

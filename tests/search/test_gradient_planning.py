@@ -64,11 +64,7 @@ def sgd(rate):
 @pytest.mark.parametrize(
     ("one", "other"),
     [
-        (nbv.GradientSearch(dof=2), nbv.GradientSearch(dof=6)),
-        (nbv.GradientSearch(dof=2), nbv.HybridSearch(dof=2)),
         (nbv.GradientSearch(dof=6), nbv.GradientSearch(space=nbv.FreePoses(radius=2.4))),
-        (nbv.GradientSearch(), nbv.GradientSearch(num_candidates=61)),
-        (nbv.GradientSearch(), nbv.GradientSearch(solver=optx.BFGS(rtol=1e-4, atol=1e-4))),
         (nbv.GradientSearch(solver=sgd(0.1)), nbv.GradientSearch(solver=sgd(0.2))),
     ],
 )

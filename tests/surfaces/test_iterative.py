@@ -1,5 +1,6 @@
 """Conjugate gradients against the factorisation, and what they refuse."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,11 +39,13 @@ def test_all_that_is_offered_equals_the_factorisation_and_weight_space(x64, few)
     np.testing.assert_allclose(posterior.level, factorised.level, atol=1e-8)
     # The same rows in both, since capacities differ.
     rows = posterior.cloud.normals[None]
-    np.testing.assert_allclose(posterior.solve(rows)[:, :36], factorised.solve(rows[:, :36]), atol=1e-8)
-    draws = posterior.prior_draws(key, 2)
+    solve = eqx.filter_jit(lambda posterior, rows: posterior.solve(rows))
+    np.testing.assert_allclose(solve(posterior, rows)[:, :36], solve(factorised, rows[:, :36]), atol=1e-8)
+    draws = eqx.filter_jit(posterior.prior_draws)(key, 2)
     same = draws._replace(at_data=draws.at_data[:, :36])
     none = MeansAtData(jnp.zeros(()), jnp.zeros(()))
-    np.testing.assert_allclose(posterior.conditioned(draws, none), factorised.conditioned(same, none), atol=1e-8)
+    conditioned = eqx.filter_jit(lambda posterior, draws: posterior.conditioned(draws, none))
+    np.testing.assert_allclose(conditioned(posterior, draws), conditioned(factorised, same), atol=1e-8)
 
 
 def test_float32_is_exact_to_a_ten_thousandth(monkeypatch):

@@ -100,9 +100,7 @@ def test_planted_poses_are_recovered(planted):
         moved.append(np.linalg.norm(np.asarray(found.placement.shift[0]) - shift))
     assert np.median(turned) < 3.0
     assert np.median(moved) < 0.02
-
-
-def test_the_shape_itself_fits_best(planted):
+    # The shape itself fits best.
     assert sum(int(found.shape[0]) == index for index, *_, found in planted) >= 7
 
 
