@@ -81,12 +81,12 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
     assert imagination["model"]["type"] == {"screened": "ScreenedSPSR", "paper": "GeometricSPSR"}[model]
     assert (imagination["carving"] is None) == (model == "paper")
     with np.load(tmp_path / "mine" / "view_01.npz") as view:
-        positions, values = view["candidate_positions"], view["values"]
-        if "trajectory_values" in view:
-            positions = np.concatenate([positions, view["trajectory_positions"].reshape(-1, 3)])
-            values = np.concatenate([values, view["trajectory_values"].ravel()])
-        chosen = np.flatnonzero((positions == view["position"]).all(axis=1))
-        assert values[chosen].max() == values.max() == view["value"]
+        positions, values = view["proposal.candidates.position"], view["proposal.values"]
+        if "proposal.trajectories.values" in view:
+            positions = np.concatenate([positions, view["proposal.trajectories.poses.position"].reshape(-1, 3)])
+            values = np.concatenate([values, view["proposal.trajectories.values"].ravel()])
+        chosen = np.flatnonzero((positions == view["pose.position"]).all(axis=1))
+        assert values[chosen].max() == values.max() == view["proposal.value"]
 
 
 @pytest.mark.parametrize(

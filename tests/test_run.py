@@ -26,8 +26,8 @@ FARTHEST = ("run", "ring.ply", "--search", "farthest", "--views", "2", "--no-rep
 def border_hits(file):
     """How many of the rays along the image's border met the object, and how many of all."""
     with np.load(file) as view:
-        side = round(len(view["mask"]) ** 0.5)
-        image = view["mask"].reshape(side, side)
+        side = round(len(view["scan.mask"]) ** 0.5)
+        image = view["scan.mask"].reshape(side, side)
     return int(image.sum() - image[1:-1, 1:-1].sum()), int(image.sum())
 
 

@@ -22,7 +22,8 @@ from jaxnbv.progress import progress_bar
 from jaxnbv.scanning import Evidence, GridSurface, Noise, SensorNoise, Surface, Surroundings, as_surface, scan
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.search import Proposal
-from jaxnbv.storage import EpisodeFolder, describe
+from jaxnbv.storage import RunFolder, describe
+from jaxnbv.storage.folders import read_record
 from jaxnbv.surfaces import SurfacePosterior
 from jaxnbv.tasks import Coverage, Stop
 
@@ -84,10 +85,10 @@ class Episode(eqx.Module):
 
         **Raises:** `ValueError` if the folder holds no episode, or one without a view.
         """
-        held = EpisodeFolder.open(path)
-        views = held.read_views()
+        config = read_record(Path(path), "episode", "give the folder of a run")["config"]
+        views = read_views(RunFolder(path, "episode", config))
         require(len(views) > 0, f"{path} holds no view yet")
-        planner = Planner(Coverage(), camera=camera_of(held.config["planner"]["camera"]))
+        planner = Planner(Coverage(), camera=camera_of(config["planner"]["camera"]))
         after = planner.replay((pose, scan) for pose, scan, _ in views)
         shown = tuple(
             View(pose, scan, evidence.cloud, proposal, planner.camera)
@@ -101,17 +102,26 @@ class Episode(eqx.Module):
         **Raises:** `ValueError` if the folder holds an episode of another configuration or a longer one, or other
         files.
         """
-        folder = EpisodeFolder(path, _config(self.planner, self.scene, self.noise, self.first, self.key))
+        folder = RunFolder(path, "episode", _config(self.planner, self.scene, self.noise, self.first, self.key))
         with folder.writing():
-            held = len(folder.read_views())
+            held = folder.count("view")
             require(
                 held <= len(self.views),
                 f"{path} already holds {held} views of this episode, which has {len(self.views)}: "
                 "choose another folder",
             )
             for index, view in enumerate(self.views):
-                folder.write_view(index, view.pose, view.scan, view.proposal)
+                folder.write("view", index, pose=view.pose, scan=view.scan, proposal=view.proposal)
             folder.write_cloud(self.cloud)
+
+
+def read_views(folder: RunFolder) -> list[tuple[Pose, PointCloud, Proposal | None]]:
+    """Pose, scan and proposal of every view that a folder holds.
+
+    **Raises:** `ValueError` if one is damaged, or missing between others.
+    """
+    views = (folder.read("view", index) for index in range(folder.count("view")))
+    return [(view["pose"], view["scan"], view.get("proposal")) for view in views]
 
 
 def camera_of(description: dict[str, Any]) -> Camera:
@@ -162,9 +172,9 @@ def simulate(
     )
     require(first.position.ndim == 1, "the first pose is a batch of poses: give one, poses[0] say")
     scene = as_surface(scene)
-    store = None if folder is None else EpisodeFolder(folder, _config(planner, scene, noise, first, key))
+    store = None if folder is None else RunFolder(folder, "episode", _config(planner, scene, noise, first, key))
     with store.writing() if store else nullcontext():
-        done = store.read_views() if store else []
+        done = read_views(store) if store else []
         require(
             len(done) <= views,
             f"asked for {views} views but {folder} already holds {len(done)}: ask for more, or choose another folder",
@@ -177,13 +187,13 @@ def simulate(
                 bar.update(index * len(STAGES) + STAGES.index(stage) - bar.n)
 
             sensor = scene_sensor(scene, planner.camera, noise, planner.imagination.surroundings)
-            watch = None if until is None else Watch(until, planner)
+            watch = None if until is None else Watch(until, planner.acquisition)
             episode = steps(planner, sensor, first, key, done=done, begin=begin, watch=watch)
             for step in itertools.islice(episode, views):
                 index, view = len(finished), step.view
                 finished.append(view)
                 if store and index >= len(done):
-                    store.write_view(index, view.pose, view.scan, view.proposal)
+                    store.write("view", index, pose=view.pose, scan=view.scan, proposal=view.proposal)
                 if each is not None:
                     each(step)
                 # Its posterior may be large, and is not to be held beside that of the next step.
@@ -261,7 +271,7 @@ def steps(
         else:
             pose, proposal = first, None
             if evidence is not None:
-                if watch and watch.after(evidence, poses, sample_key):
+                if watch and watch.ends(planner, evidence, poses, sample_key):
                     return
                 if planner.search.uses_samples:
                     begin(index, STAGES[0])
@@ -271,7 +281,7 @@ def steps(
                 sampled = None if basis is None else basis.surfaces
                 proposal = jax.block_until_ready(planner.choose(evidence, sampled, search_key))
                 pose, seconds = proposal.pose, time.perf_counter() - start
-                if watch and watch.before(evidence, poses, sample_key, proposal):
+                if watch and watch.ends(planner, evidence, poses, sample_key, proposal):
                     return
             begin(index, STAGES[2])
             seen = sensor(pose, noise_key)
@@ -308,19 +318,12 @@ def observe_scene(
     key: PRNGKeyArray,
     surroundings: Surroundings | None = None,
 ) -> PointCloud:
-    """A noisy scan of the true surface, compiled where the surface allows it."""
+    """A noisy scan of the true surface, past what stands around it; compiled where the surface allows it."""
     barrier = None if surroundings is None else _barrier(surroundings, camera, pose)
-    if scene.in_jit:
-        return _noisy_scan(scene, camera, pose, barrier, noise, key)
-    return noise(scan(scene, camera, pose, barrier), key, camera, pose)
+    observe = _noisy_scan_in_jit if scene.in_jit else _noisy_scan
+    return observe(scene, camera, pose, barrier, noise, key)
 
 
-@eqx.filter_jit
-def _barrier(surroundings: Surroundings, camera: Camera, pose: Pose) -> Float[Array, " rays"] | None:
-    return surroundings.barrier(camera, pose)
-
-
-@eqx.filter_jit
 def _noisy_scan(
     scene: Surface,
     camera: Camera,
@@ -330,3 +333,6 @@ def _noisy_scan(
     key: PRNGKeyArray,
 ) -> PointCloud:
     return noise(scan(scene, camera, pose, barrier), key, camera, pose)
+
+
+_noisy_scan_in_jit, _barrier = eqx.filter_jit(_noisy_scan), eqx.filter_jit(Surroundings.barrier)

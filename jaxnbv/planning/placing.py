@@ -64,18 +64,15 @@ def placed(
     return dataclasses.replace(planner, camera=camera, search=search, imagination=imagination)
 
 
-def on_support(planner: Planner, plane: HalfSpace | None) -> Planner:
-    """The planner with the plane that the object stands on among its surroundings; with surroundings that hold nothing
-    but the points that were seen, if there is none."""
+def on_support(planner: Planner, plane: HalfSpace | None, frame: Frame) -> Planner:
+    """The planner with the plane that the object stands on among its surroundings, told of by a warning in world units;
+    with surroundings that hold nothing but the points that were seen, if there is none."""
+    if plane is not None:
+        place = np.round(frame.to_world(np.asarray(plane.point, np.float64)), 4).tolist()
+        warnings.warn(
+            f"the object stands on a plane through {place}, which goes on beyond the box: it is taken for a table and "
+            "left out. Give surroundings=Surroundings() to keep it",
+            stacklevel=5,
+        )
     around = Surroundings(() if plane is None else (plane,))
     return dataclasses.replace(planner, imagination=dataclasses.replace(planner.imagination, surroundings=around))
-
-
-def warn_of_support(plane: HalfSpace, frame: Frame) -> None:
-    """Say where the plane is, in world units, and how it is kept."""
-    place = np.round(frame.to_world(np.asarray(plane.point, np.float64)), 4).tolist()
-    warnings.warn(
-        f"the object stands on a plane through {place}, which goes on beyond the box: it is taken for a table and left "
-        "out. Give surroundings=Surroundings() to keep it",
-        stacklevel=4,
-    )

@@ -1,9 +1,10 @@
 """A live session: depth images of a real sensor in, where to take the next one out, in the user's own world."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,14 +19,13 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 from jaxnbv.planning.episode import STAGES, Episode, View, view_keys
-from jaxnbv.planning.placing import box_of, on_support, placed, stride_of, usual_planner, warn_of_support
+from jaxnbv.planning.placing import box_of, on_support, placed, stride_of, usual_planner
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Watch
 from jaxnbv.progress import progress_bar
 from jaxnbv.scanning import Evidence, Surroundings, plane_under
-from jaxnbv.scanning.sdf import HalfSpace
 from jaxnbv.search import Proposal
-from jaxnbv.storage import DepthImage, SessionFolder, describe
+from jaxnbv.storage import RunFolder, describe
 from jaxnbv.tasks import Stop
 
 _NO_IMAGE = "the session has no image yet: add one first, session.add(depth, matrix)"
@@ -102,19 +102,19 @@ class Session:
         around = None if surroundings is None else surroundings.in_scene(self.frame)
         self.planner = placed(usual_planner() if planner is None else planner, sensor, volume, allowed, around)
         self._rays = self.frame.to_scene(camera.strided(self.stride))
-        self._watch, self._asked_at = None if until is None else Watch(until, self.planner), 0
+        self._watch, self._asked_at = None if until is None else Watch(until, self.planner.acquisition), 0
         self._views: list[View] = []
         self._proposals: dict[int, Proposal] = {}
         self._next: NextView | None = None
         self._followers: list[Callable[[Session], None]] = []
         self._evidence: Evidence | None = None
-        self._folder = None if folder is None else SessionFolder(folder, self._config())
+        self._folder = None if folder is None else RunFolder(folder, "session", self._config())
         if self._folder is not None:
-            for index in range(self._folder.count_images()):
-                if (known := self._folder.read_proposal(index)) is not None:
-                    self._proposals[index] = known[0]
-                image = self._folder.read_image(index)
-                self._take(self._looked(image))
+            for index in range(self._folder.count("image")):
+                if self._folder.file("proposal", index).exists():
+                    self._proposals[index] = self._folder.read("proposal", index)["proposal"]
+                image = self._folder.read("image", index)
+                self._take(*self._looked(image["depth"], image["matrix"], float(image["depth_scale"])))
 
     @property
     def views(self) -> int:
@@ -159,8 +159,9 @@ class Session:
         if self._asked_at < self.views:
             key, *_ = view_keys(self.key, self.views)
             poses = [view.pose for view in self._views]
-            if self._watch.after(self.evidence, poses, key) is None and self._watch.rule.plans:
-                self._watch.before(self.evidence, poses, key, self.next().proposal)
+            known = self.planner, self.evidence, poses, key
+            if not self._watch.ends(*known) and self._watch.rule.plans:
+                self._watch.ends(*known, self.next().proposal)
             self._asked_at = self.views
         return self._watch.reason
 
@@ -182,15 +183,12 @@ class Session:
         then.
         """
         pixels = as_numbers(depth, "the depth image", None)
-        image = DepthImage(pixels, as_numbers(matrix, "the matrix of a pose", np.float64), depth_scale)
-        look = self._looked(image)
-        if look.support is not None:
-            warn_of_support(look.support, self.frame)
-        if self._folder is not None:
-            with self._folder.writing():
-                self._check_alone(self._folder)
-                self._folder.write_image(self.views, image)
-        self._take(look)
+        place = as_numbers(matrix, "the matrix of a pose", np.float64)
+        look = self._looked(pixels, place, depth_scale)
+        with self._alone() as folder:
+            if folder is not None:
+                folder.write("image", self.views, depth=pixels, matrix=place, depth_scale=depth_scale)
+        self._take(*look)
 
     def next(self) -> NextView:
         """Where to take the next image. It is stored, and the same until an image is added; what was proposed once is
@@ -200,21 +198,20 @@ class Session:
         **Raises:** `ValueError` before the first image, as `Planner.propose` does, or if another process has added
         images to the folder.
         """
-        if self._folder is not None:
-            self._check_alone(self._folder)
         if self._next is None:
             index = self.views
-            known = None if self._folder is None else self._folder.read_proposal(index)
-            proposal, expected = self._propose() if known is None else known
-            if self._folder is not None and known is None:
-                with self._folder.writing():
-                    self._check_alone(self._folder)
-                    self._folder.write_proposal(index, proposal, expected)
-            self._proposals[index] = proposal
+            with self._alone() as folder:
+                if folder is not None and folder.file("proposal", index).exists():
+                    found = folder.read("proposal", index)
+                else:
+                    found = self._propose()
+                    if folder is not None:
+                        folder.write("proposal", index, **found)
+            self._proposals[index] = proposal = found["proposal"]
             matrix = np.asarray(self.frame.to_world(proposal.pose).to_matrix(self.convention), np.float64)
             unit, error = self.frame.scale**self.planner.quantity.power, proposal.standard_error
-            value = float(proposal.value) / unit
-            self._next = NextView(matrix, value, None if error is None else error / unit, expected, proposal)
+            value, error = float(proposal.value) / unit, None if error is None else error / unit
+            self._next = NextView(matrix, value, error, found.get("expected_depth"), proposal)
             self._tell_followers()
         return self._next
 
@@ -237,69 +234,70 @@ class Session:
         sensor = {"camera": self.camera, "box": self.box, "up": self.frame.up, "convention": self.convention}
         return describe({**sensor, "stride": self.stride, "key": self.key, "planner": self.planner})
 
-    def _looked(self, image: DepthImage) -> "_Look":
-        """What an image adds; nothing of the session is changed."""
-        pose = Pose.from_matrix(image.matrix, self.convention)
-        camera, stride, rays = self.camera, self.stride, self._rays
-        planner, support = self.planner, None
+    def _looked(
+        self, depth: Real[np.ndarray, "h w"], matrix: Float[np.ndarray, "4 4"], depth_scale: float
+    ) -> tuple[Planner, View, Evidence]:
+        """An image as a view, and what is known after it; nothing of the session is changed. The first may show what
+        the object stands on, by which the planner is another."""
+        pose, planner, rays = Pose.from_matrix(matrix, self.convention), self.planner, self._rays
+        shown = depth, self.camera, pose, depth_scale, self.stride
         with warnings.catch_warnings():
             if not self._views:
                 warnings.simplefilter("error", NothingInside)
             try:
-                cloud = PointCloud.from_depth(image.depth, camera, pose, image.depth_scale, stride, self.box)
+                cloud = PointCloud.from_depth(*shown, self.box)
             except NothingInside as problem:
                 raise InputError(f"the first image shows nothing of the box: {problem}") from problem
         if not self._views and planner.imagination.surroundings is None:
-            whole = PointCloud.from_depth(image.depth, camera, pose, image.depth_scale, stride)
-            support = plane_under(self.frame.to_scene(whole), self.frame.to_scene(self.box))
-            planner = on_support(planner, support)
+            whole = self.frame.to_scene(PointCloud.from_depth(*shown))
+            planner = on_support(planner, plane_under(whole, self.frame.to_scene(self.box)), self.frame)
         scan = self.frame.to_scene(cloud)
         if (around := planner.imagination.surroundings) is not None:
             scan = around.without_obstacles(scan)
         told = self.frame.to_scene(pose), scan, rays
         evidence = planner.init(*told) if self._evidence is None else planner.observe(self._evidence, *told)
-        view = View(told[0], scan, evidence.cloud, self._proposals.get(self.views), rays)
-        return _Look(planner, support, view, evidence)
+        return planner, View(told[0], scan, evidence.cloud, self._proposals.get(self.views), rays), evidence
 
-    def _take(self, look: "_Look") -> None:
-        self.planner, self._evidence = look.planner, look.evidence
-        if self._watch is not None:
-            self._watch.planner = look.planner
-        self._views.append(look.view)
+    def _take(self, planner: Planner, view: View, evidence: Evidence) -> None:
+        self.planner, self._evidence = planner, evidence
+        self._views.append(view)
         self._next = None
         self._tell_followers()
 
-    def _propose(self) -> tuple[Proposal, Float[np.ndarray, "h w"] | None]:
+    def _propose(self) -> dict[str, Any]:
+        """The next proposal, and the depth image that is expected there, in world units."""
         sample_key, search_key, _ = view_keys(self.key, self.views)
         proposed = [proposal.pose for index, proposal in sorted(self._proposals.items()) if index < self.views]
+        expected = None
         with progress_bar(total=2, wanted=self.progress) as bar:
             bar.set_description(f"view {self.views + 1}, {STAGES[0]}")
             surfaces = jax.block_until_ready(self.planner.sample(self.evidence, sample_key))
             bar.update()
             bar.set_description(f"view {self.views + 1}, {STAGES[1]}")
             proposal = self.planner.choose(self.evidence.with_visited(proposed), surfaces, search_key)
-            expected = None if surfaces is None else self.planner.expected_depth(surfaces, proposal.pose)
+            if surfaces is not None:
+                expected = np.asarray(self.planner.expected_depth(surfaces, proposal.pose)) / self.frame.scale
             bar.update()
         _warn_of_little(proposal)
-        return proposal, None if expected is None else np.asarray(expected) / self.frame.scale
+        return {"proposal": proposal, "expected_depth": expected}
 
-    def _check_alone(self, folder: SessionFolder) -> None:
-        found = folder.count_images()
-        require(
-            found == self.views,
-            f"{folder.path} holds {found} images, but this session knows {self.views}: another process has added some; "
-            "make the session again, which reads them",
-        )
+    @contextmanager
+    def _alone(self) -> Iterator[RunFolder | None]:
+        """The folder, if there is one, while nobody else writes there.
 
-
-class _Look(NamedTuple):
-    """A view of the sensor's and what is known after it. The first may show what the object stands on, by which the
-    planner is another."""
-
-    planner: Planner
-    support: HalfSpace | None
-    view: View
-    evidence: Evidence
+        **Raises:** `ValueError` if another process does, or has added images.
+        """
+        if self._folder is None:
+            yield None
+            return
+        with self._folder.writing():
+            found = self._folder.count("image")
+            require(
+                found == self.views,
+                f"{self._folder.path} holds {found} images, but this session knows {self.views}: another process has "
+                "added some; make the session again, which reads them",
+            )
+            yield self._folder
 
 
 def _warn_of_little(proposal: Proposal) -> None:

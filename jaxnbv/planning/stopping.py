@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import equinox as eqx
 from jaxtyping import PRNGKeyArray
 
+from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import check_fields, require
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.planner import Planner
@@ -66,26 +67,31 @@ class Budget(Stop):
 
 
 class Watch:
-    """A rule that is asked as an episode goes on.
+    """A rule that is asked as an episode goes on; `reason` is why it ends.
 
-    **Raises:** `ValueError` if the rule cannot hold of what the planner's views are for.
+    **Raises:** `ValueError` if the rule cannot hold of what views are for.
     """
 
-    def __init__(self, rule: Stop, planner: Planner):
-        rule.check(planner.acquisition)
-        self.rule, self.planner, self.began = rule, planner, time.monotonic()
+    def __init__(self, rule: Stop, acquisition: Acquisition):
+        rule.check(acquisition)
+        self.rule, self.began = rule, time.monotonic()
         self.reason: str | None = None
 
-    def after(self, evidence: Evidence, poses: Sequence[Pose], key: PRNGKeyArray) -> str | None:
-        """Why the views so far are enough; None to go on."""
-        self.reason = self.rule.after(so_far(self.planner, evidence, poses, key, time.monotonic() - self.began))
-        return self.reason
-
-    def before(self, evidence: Evidence, poses: Sequence[Pose], key: PRNGKeyArray, proposal: Proposal) -> str | None:
-        """Why what is proposed is not to be taken; None to go on."""
-        now = so_far(self.planner, evidence, poses, key, time.monotonic() - self.began)
-        self.reason = self.rule.before(now, proposal.pose, float(proposal.value))
-        return self.reason
+    def ends(
+        self,
+        planner: Planner,
+        evidence: Evidence,
+        poses: Sequence[Pose],
+        key: PRNGKeyArray,
+        proposal: Proposal | None = None,
+    ) -> bool:
+        """Whether the views so far are enough or, once the next is proposed, it is not to be taken."""
+        known = so_far(planner, evidence, poses, key, time.monotonic() - self.began)
+        if proposal is None:
+            self.reason = self.rule.after(known)
+        else:
+            self.reason = self.rule.before(known, proposal.pose, float(proposal.value))
+        return self.reason is not None
 
 
 def so_far(

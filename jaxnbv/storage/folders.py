@@ -3,12 +3,11 @@
 import importlib.metadata
 import json
 import os
-import socket
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import filelock
 import jax
@@ -16,10 +15,7 @@ import jax
 from jaxnbv.checks import InputError, require
 from jaxnbv.storage.files import PARTS, make_folder, write_text
 
-# Of the files.
-FORMAT = 2
 _LOCK = ".lock"
-_Folder = TypeVar("_Folder", bound="ResultFolder")
 
 
 def software() -> dict[str, str]:
@@ -42,12 +38,12 @@ def differences(found: Any, asked: Any, name: str = "") -> list[str]:
     return [] if found == asked else [f"{name}: {found} there, {asked} now"]
 
 
-def check_format(format: Any, file: Path) -> None:
+def check_format(found: Any, known: int, file: Path) -> None:
     """**Raises:** `ValueError` for a file of a format that is not known here."""
     require(
-        format == FORMAT,
-        f"{file} is of format {str(format)[:20]}; this version of jaxnbv reads format {FORMAT}: install a newer "
-        "one, or choose another folder",
+        found == known,
+        f"{file} is of format {str(found)[:20]}; this version of jaxnbv reads format {known}: install a newer one, or "
+        "choose another folder",
     )
 
 
@@ -66,11 +62,12 @@ def read_json(file: Path, problem: str, remedy: str) -> dict[str, Any]:
     return content
 
 
-def read_record(file: Path, problem: str, remedy: str) -> dict[str, Any]:
-    """A folder's record, with its `config`.
+def read_record(folder: Path, kind: str, remedy: str) -> dict[str, Any]:
+    """The record of a folder, with its `config`.
 
-    **Raises:** as `read_json`, and if it has no configuration.
+    **Raises:** `ValueError` that tells `remedy` if there is none, or it has no configuration.
     """
+    file, problem = folder / f"{kind}.json", f"is no {kind} record"
     record = read_json(file, problem, remedy)
     require(isinstance(record.get("config"), dict), f"{file} {problem} (it has no config): {remedy}")
     return record
@@ -86,15 +83,12 @@ def writing_in(path: Path, *inside: str) -> Iterator[None]:
     lock = filelock.FileLock(path / _LOCK, timeout=0)
     try:
         lock.acquire()
-        # The same file: what another process reads when the lock is taken.
-        (path / _LOCK).write_text(f"process {os.getpid()} on {socket.gethostname()}")
     except filelock.Timeout as error:
         raise InputError(
-            f"{path} is being written by {_holder(path)}: wait until it ends, or choose another folder"
+            f"{path} is being written by another process: wait until it ends, or choose another folder"
         ) from error
     # Of filelock, down to the least version that we allow (3.16): there are no locks on this file system.
     except (OSError, NotImplementedError) as error:
-        lock.release()
         raise InputError(f"cannot write in {path} ({error}): make room or choose another place") from error
     try:
         for folder in (path, *(path / name for name in inside)):
@@ -105,44 +99,26 @@ def writing_in(path: Path, *inside: str) -> Iterator[None]:
         lock.release()
 
 
-def _holder(path: Path) -> str:
-    lock = path / _LOCK
-    try:
-        return (lock.is_file() and lock.read_text()) or "another process"
-    except OSError:
-        return "another process"
-
-
 class ResultFolder:
     """A folder, and the configuration that its results have: a record, written with the first of them.
 
     - `config`: what JSON can say, see `jaxnbv.storage.describe`.
     - `cores`: how many share a sum, by default all.
 
-    A subclass says what such a folder is of, its `kind`; the name of its record, and the pattern of its results' names;
-    and `problem` and `remedy` of a folder to be opened that has no such record.
+    A subclass says of what `kind` its results are, after which the record is named, the `pattern` of their names, and
+    the number of their `format`.
 
     **Raises:** `ValueError` if the folder cannot be made, or holds results of another configuration or other files.
     """
 
     kind: str
-    record_name: str
-    results: str
-    problem: str
-    remedy: str
+    pattern: str
+    format: int
 
     def __init__(self, path: str | Path, config: dict[str, Any], cores: int | None = None):
         self.path, self.config, self.cores = make_folder(path), json.loads(json.dumps(config)), cores
-        self.record, self.bound = self.path / self.record_name, False
+        self.bound = False
         self._check()
-
-    @classmethod
-    def open(cls: type[_Folder], path: str | Path) -> _Folder:
-        """A folder of stored results, whatever their configuration, which is its `config`.
-
-        **Raises:** `ValueError` if it holds none.
-        """
-        return cls(path, read_record(Path(path) / cls.record_name, cls.problem, cls.remedy)["config"])
 
     @contextmanager
     def writing(self) -> Iterator[None]:
@@ -158,15 +134,13 @@ class ResultFolder:
     def bind(self) -> None:
         """Write the record, if it is not there, before the first result is."""
         if not self.bound:
-            made_by = versions(self.cores)
-            write_text(
-                self.record, json.dumps({"format": FORMAT, "config": self.config, "versions": made_by}, indent=2)
-            )
+            record = {"format": self.format, "config": self.config, "versions": versions(self.cores)}
+            write_text(self.path / f"{self.kind}.json", json.dumps(record, indent=2))
             self.bound = True
 
     def _check(self) -> None:
-        has_results = any(self.path.glob(self.results))
-        if not self.record.exists():
+        file = self.path / f"{self.kind}.json"
+        if not file.exists():
             names = sorted(entry.name for entry in self.path.iterdir())
             foreign = [name for name in names if name != _LOCK and not name.endswith(".partial")]
             require(
@@ -174,24 +148,22 @@ class ResultFolder:
                 f"the output folder {self.path} holds other files ({', '.join(foreign[:3])}): choose an empty folder",
             )
             return
-        written = read_record(self.record, self.problem, "choose another output folder")
-        check_format(written.get("format"), self.record)
+        written = read_record(self.path, self.kind, "choose another output folder")
+        check_format(written.get("format"), self.format, file)
         # A record without results is of a run that did not come far; it binds nobody.
-        if not has_results:
+        if not any(self.path.glob(self.pattern)):
             return
         changed = differences(written["config"], self.config)
-        if changed:
-            raise InputError(
-                f"the output folder {self.path} belongs to another {self.kind}; it differs in "
-                f"{'; '.join(changed[:3])}. Choose another folder, or remove this one"
-            )
-        made_by = written.get("versions")
-        made_by = made_by if isinstance(made_by, dict) else {}
-        now = {key: value for key, value in versions(self.cores).items() if key in made_by}
-        if made_by != now and not self.bound:
+        require(
+            not changed,
+            f"the output folder {self.path} belongs to another {self.kind}; it differs in {'; '.join(changed[:3])}. "
+            "Choose another folder, or remove this one",
+        )
+        other = differences(written.get("versions"), versions(self.cores))
+        if other and not self.bound:
             warnings.warn(
-                f"{self.path} was begun with other versions ({'; '.join(differences(made_by, now))}): "
-                "new results may differ in their last bits from those of an uninterrupted run",
+                f"{self.path} was begun with other versions ({'; '.join(other)}): new results may differ in their last "
+                "bits from those of an uninterrupted run",
                 stacklevel=3,
             )
         self.bound = True

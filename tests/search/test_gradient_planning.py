@@ -9,7 +9,8 @@ import pytest
 from small_planner import FIRST, SCENE
 
 import jaxnbv as nbv
-from jaxnbv.storage import EpisodeFolder, describe
+from jaxnbv.planning.episode import read_views
+from jaxnbv.storage import RunFolder, describe
 
 ELSEWHERE, KEY = nbv.look_at((-0.8, 0.9, 2.2)), jax.random.key(0)
 OTHER_KEY = jax.random.key(1)
@@ -41,7 +42,7 @@ def contents(folder):
 def test_trajectories_come_back_from_disk_with_the_same_bits(tmp_path):
     episode = nbv.simulate(PLANNER, SCENE, FIRST, 4, KEY, folder=tmp_path / "whole", progress=False)
     config = describe({"planner": PLANNER, "scene": SCENE, "noise": nbv.SensorNoise(), "first": FIRST, "key": KEY})
-    views = EpisodeFolder(tmp_path / "whole", config).read_views()
+    views = read_views(RunFolder(tmp_path / "whole", "episode", config))
     assert views[0][2] is None
     for (_, _, read), view in zip(views[1:], episode.views[1:], strict=True):
         assert read.trajectories.values.shape == (2, 4)

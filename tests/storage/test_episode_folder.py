@@ -14,16 +14,17 @@ from small_episode import FIRST, KEY, SCENE, contents, planner_of, run
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import look_at
+from jaxnbv.planning.episode import read_views
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import SensorNoise
 from jaxnbv.search import FarthestView
-from jaxnbv.storage import EpisodeFolder, describe
+from jaxnbv.storage import RunFolder, describe
 
 
 def test_views_come_back_with_the_same_bits(finished):
     episode, folder = finished
     config = describe({"planner": episode.planner, "scene": SCENE, "noise": SensorNoise(), "first": FIRST, "key": KEY})
-    views = EpisodeFolder(folder, config).read_views()
+    views = read_views(RunFolder(folder, "episode", config))
     assert len(views) == 5
     assert views[0][2] is None
     for read, view in zip(views, episode.views, strict=True):
@@ -37,17 +38,17 @@ def test_views_come_back_with_the_same_bits(finished):
 def test_a_view_keeps_which_rays_missed(finished):
     episode, folder = finished
     config = json.loads((folder / "episode.json").read_text())["config"]
-    for read, view in zip(EpisodeFolder(folder, config).read_views(), episode.views, strict=True):
+    for read, view in zip(read_views(RunFolder(folder, "episode", config)), episode.views, strict=True):
         assert 0 < np.asarray(read[1].missed).sum() < 64
         np.testing.assert_array_equal(read[1].missed, ~np.asarray(view.scan.mask))
 
 
 def test_a_scan_that_is_no_image_reads_as_one(finished, tmp_path):
     episode, _ = finished
-    view, folder = episode.views[0], EpisodeFolder(tmp_path, {})
+    view, folder = episode.views[0], RunFolder(tmp_path, "episode", {})
     cloud = PointCloud(view.scan.points, view.scan.normals, view.scan.mask)
-    folder.write_view(0, view.pose, cloud, None)
-    ((_, read, _),) = folder.read_views()
+    folder.write("view", 0, pose=view.pose, scan=cloud, proposal=None)
+    ((_, read, _),) = read_views(folder)
     assert read.missed is None
     np.testing.assert_array_equal(read.points, cloud.points)
 

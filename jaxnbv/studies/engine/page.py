@@ -11,7 +11,7 @@ from jaxnbv.checks import InputError, require
 from jaxnbv.storage.files import make_folder, write_text
 from jaxnbv.storage.folders import read_record
 from jaxnbv.studies.engine.chart import chart
-from jaxnbv.studies.engine.records import RecordFolder, read_records
+from jaxnbv.studies.engine.records import read_records
 from jaxnbv.studies.engine.results import Verdict, count_of, explained, groups_of, results, tables, verdicts
 from jaxnbv.studies.engine.study import CHART, Study
 from jaxnbv.studies.registry import STUDIES
@@ -64,7 +64,7 @@ def chapters(folder: str | Path) -> list[Chapter]:
     found: dict[tuple[int, Path], Chapter] = {}
     for file in sorted(folder.rglob("study.json")):
         if any(file.parent.glob("scene_*.json")):
-            written = read_record(file, RecordFolder.problem, _REMEDY)
+            written = read_record(file.parent, "study", _REMEDY)
             study = written["config"].get("study")
             name = study.get("type") if isinstance(study, dict) else study
             if not isinstance(name, str) or name not in kinds:

@@ -12,11 +12,12 @@ from typing import Any
 from jaxnbv.checks import InputError, require
 from jaxnbv.progress import progress_bar
 from jaxnbv.storage.files import write_text
-from jaxnbv.storage.folders import FORMAT, ResultFolder, check_format, read_json
+from jaxnbv.storage.folders import ResultFolder, check_format, read_json
 from jaxnbv.studies.engine.measures import Record
 from jaxnbv.studies.engine.trials import Failure, Here, Outcome, Runner, Trial
 
 _FAILED = ".failed"
+_FORMAT = 2
 
 
 class RecordFolder(ResultFolder):
@@ -27,8 +28,7 @@ class RecordFolder(ResultFolder):
     **Raises:** `ValueError` if the folder cannot be made or holds records of another configuration.
     """
 
-    kind, record_name, results = "study", "study.json", "scene_*.json"
-    problem, remedy = "is not a study's record", "give the folder of a study"
+    kind, pattern, format = "study", "scene_*.json", _FORMAT
 
     def __init__(self, path: str | Path, config: dict[str, Any], runner: Runner | None = None):
         self.runner = runner or Here()
@@ -72,7 +72,7 @@ class RecordFolder(ResultFolder):
         # As it will be read: JSON turns keys that are numbers into text, and the checksum sorts them.
         record = json.loads(json.dumps(outcome))
         self.bind()
-        sealed = {"format": FORMAT, "index": index, "sha256": _checksum(index, record), "record": record}
+        sealed = {"format": _FORMAT, "index": index, "sha256": _checksum(index, record), "record": record}
         write_text(self._file(index), json.dumps(sealed))
         failed.unlink(missing_ok=True)
 
@@ -91,14 +91,14 @@ def read_records(folder: str | Path) -> list[Record]:
 
 
 def _checksum(index: int, record: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps([FORMAT, index, record], sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps([_FORMAT, index, record], sort_keys=True).encode()).hexdigest()
 
 
 def _read(file: Path, index: int) -> dict[str, Any]:
     """A record."""
     remedy = "delete it, and it is made again"
     content = read_json(file, "is damaged", remedy)
-    check_format(content.get("format"), file)
+    check_format(content.get("format"), _FORMAT, file)
     require(content.get("index") == index, f"{file} is damaged (it is scene {content.get('index')!s:.20}): {remedy}")
     record = content.get("record")
     if not isinstance(record, dict) or content.get("sha256") != _checksum(index, record):

@@ -41,7 +41,7 @@ def test_folders_of_another_study_and_damaged_records_are_refused(tmp_path):
         with pytest.raises(InputError, match=r"scene_0000\.json is damaged"):
             RecordFolder(tmp_path, {"views": 3, "framing": "whole"}).collect(range(1), lambda index: {}, progress=False)
     (tmp_path / "study.json").write_bytes(b"[")
-    with pytest.raises(InputError, match=r"study\.json is not a study's record"):
+    with pytest.raises(InputError, match=r"study\.json is no study record"):
         RecordFolder(tmp_path, {"views": 3, "framing": "whole"})
     (tmp_path / "file").write_text("here")
     with pytest.raises(InputError, match="cannot make the output folder"):
@@ -77,7 +77,7 @@ def test_records_that_are_not_what_they_were_are_refused(tmp_path):
     assert collect() == expected
     for changed in ("[]", "null", "7"):
         (tmp_path / "study.json").write_text(changed)
-        with pytest.raises(InputError, match=r"study\.json is not a study's record .*choose another"):
+        with pytest.raises(InputError, match=r"study\.json is no study record .*choose another"):
             collect()
 
 
