@@ -21,8 +21,7 @@ import trimesh
 from tqdm import tqdm
 
 import jaxnbv as nbv
-from jaxnbv.cli.device import prepare
-from jaxnbv.cli.registry import Device
+from jaxnbv.cli import keep_programs
 
 RUN = ("run", "BOX.PLY", "--quick", "--views", "4")
 STUDY = ("study", "pyramid", "--quick", "--scenes", "2", "--views", "2", "--methods", "coverage,farthest")
@@ -41,7 +40,7 @@ UNLIKE = {"report.html", ".lock"}
 
 def take_session(folder: Path) -> None:
     """Four images of a ball by a simulated sensor, from where the planner asks for them, and the report."""
-    prepare(Device.AUTO)
+    keep_programs()
     camera, ball = nbv.Camera(height=48, width=64), nbv.SDFSurface(nbv.sdf.Sphere(0.1))
     planner = nbv.Planner(
         nbv.Coverage(),

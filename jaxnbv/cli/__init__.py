@@ -1,8 +1,10 @@
 """The command line: `jaxnbv demo`, `jaxnbv run MESH`, `jaxnbv view RUN`, `jaxnbv study NAME`, `jaxnbv report DIR`."""
 
+import os
 import sys
 from typing import Annotated
 
+import platformdirs
 import typer
 
 import jaxnbv
@@ -48,8 +50,16 @@ for _command in (demo, run, view, report, study):
     app.command()(_command)
 
 
+def keep_programs() -> None:
+    """Keep what JAX compiles, once it is imported, for later runs and for processes that this one starts."""
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(platformdirs.user_cache_path("jaxnbv") / "xla")
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+
+
 def main() -> None:
     """Entry point: errors that the user can mend are one line, without a traceback."""
+    keep_programs()
     try:
         with explained_imports():
             app()

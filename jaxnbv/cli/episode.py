@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from jaxnbv.cli import options
-from jaxnbv.cli.registry import DEFAULT_FIRST, TASKS, Device
+from jaxnbv.cli.registry import DEFAULT_FIRST, TASKS
 from jaxnbv.errors import InputError
 
 
@@ -29,7 +29,6 @@ def demo(
     noise: options.NoiseOption = 0.01,
     quick: options.QuickOption = False,
     report: options.ReportOption = True,
-    device: options.DeviceOption = Device.AUTO,
 ) -> None:
     """Find out what a truck carries, which the first view does not show: no file, no network.
 
@@ -37,11 +36,9 @@ def demo(
     procedural one of thirteen categories, with --task heat one of four kinds that is heated at one place, and with
     --task coverage a mug, to be seen all round.
     """
-    from jaxnbv.cli.device import prepare
     from jaxnbv.cli.play import DEMO, QUICK, first_pose, imagined, planner_of, play, usual_folder
     from jaxnbv.cli.tasks import COMMAND_TASKS
 
-    prepare(device)
     made = COMMAND_TASKS[task]
     shown = made.demo(scene, seed)
     if shown.note:
@@ -107,7 +104,6 @@ def run(
     noise: options.NoiseOption = 0.01,
     quick: options.QuickOption = False,
     report: options.ReportOption = True,
-    device: options.DeviceOption = Device.AUTO,
 ) -> None:
     """Choose views of a mesh, scanned by a simulated depth camera.
 
@@ -123,13 +119,11 @@ def run(
         if given[option] is None:
             raise InputError(f"--task {task} needs {hint}")
 
-    from jaxnbv.cli.device import prepare
     from jaxnbv.cli.play import QUICK, USUAL, first_pose, imagined, peculiarities, planner_of, play, usual_folder
     from jaxnbv.cli.tasks import COMMAND_TASKS, Given, usual_first
     from jaxnbv.scanning import load_mesh
     from jaxnbv.scanning.sensors import fitted
 
-    prepare(device)
     surface, made = load_mesh(mesh), COMMAND_TASKS[task]
     setting = made.setting if paper else fitted(made.setting, surface.bounding_radius)
     usual = usual_first(None if paper else setting.radius)
@@ -153,11 +147,9 @@ def view(
 
     Surfaces are those of the usual model, given what was seen.
     """
-    from jaxnbv.cli.device import prepare
     from jaxnbv.planning.episode import Episode
     from jaxnbv.viz import LiveView
 
-    prepare(Device.AUTO)
     episode, page = Episode.load(folder), LiveView(port)
     try:
         page.update(episode)

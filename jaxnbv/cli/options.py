@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from jaxnbv.cli.registry import BANKS, MODELS, SEARCHES, STOPS, TASKS, Device
+from jaxnbv.cli.registry import BANKS, MODELS, SEARCHES, STOPS, TASKS
 
 # The registries are the enumerations.
 Task = StrEnum("Task", {name.replace("-", "_").upper(): name for name in TASKS})  # type: ignore[misc]
@@ -59,6 +59,3 @@ KnownOption = Annotated[
 ]
 QuickOption = Annotated[bool, running("--quick", help="Small settings, for a first look; not the paper's.")]
 ReportOption = Annotated[bool, running("--report/--no-report", help="Write report.html and the figures.")]
-DeviceOption = Annotated[
-    Device, running(metavar="DEVICE", help="Where to compute: cpu, gpu, or auto, a GPU if JAX sees one.")
-]

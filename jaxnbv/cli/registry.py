@@ -1,23 +1,14 @@
-"""What the command line must know before anything heavy is imported: tasks, models, searches, rules, devices.
+"""What the command line must know before anything heavy is imported: tasks, models, searches, rules.
 
 A new task, search or rule is a name here and what it stands for, in `tasks.py`, `searches.py` or `play.py`.
 """
 
 import importlib
 from collections.abc import Mapping
-from enum import StrEnum
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 DEFAULT_FIRST = "0.8,0.9,2.2"
-
-
-class Device(StrEnum):
-    """Where the computation runs."""
-
-    AUTO = "auto"
-    CPU = "cpu"
-    GPU = "gpu"
 
 
 class TaskEntry(NamedTuple):

@@ -11,17 +11,15 @@ from typing import Any
 import typer
 
 from jaxnbv.checks import InputError, require
-from jaxnbv.cli.device import prepare
-from jaxnbv.cli.registry import Device, resolve
+from jaxnbv.cli.registry import resolve
 from jaxnbv.storage import describe
 from jaxnbv.storage.files import write_bytes, write_text
 from jaxnbv.studies.engine.chart import chart
-from jaxnbv.studies.engine.measures import Record
 from jaxnbv.studies.engine.pictures import write_pictures
 from jaxnbv.studies.engine.records import RecordFolder
 from jaxnbv.studies.engine.results import results, summary
 from jaxnbv.studies.engine.study import CHART, Factory, Study
-from jaxnbv.studies.engine.trials import Cluster, Here, Processes, Runner, Trial
+from jaxnbv.studies.engine.trials import Cluster, Here, Processes, Runner
 from jaxnbv.studies.registry import STUDIES, flag
 
 
@@ -36,7 +34,6 @@ def run_study(
     quick: bool,
     workers: int,
     scheduler: str | None,
-    device: Device = Device.AUTO,
     **options: Any,
 ) -> None:
     """Run a study, or each of those that it consists of, and write what it found.
@@ -46,7 +43,6 @@ def run_study(
     **Raises:** `ValueError` for no scenes, unknown methods, an option that the study does not take, or a method of
     one's own that cannot be found; and, once all is written, if scenes failed.
     """
-    prepare(device)
     entry = STUDIES[name]
     given = {option: value for option, value in options.items() if value is not None}
     for option in given:
@@ -73,7 +69,7 @@ def run_study(
         config = {"study": describe(settings), "methods": sorted(chosen)}
         config |= {"own": {text: describe(make) for text, make in added.items()}} if added else {}
         there = wanted if settings.num_scenes is None else [index for index in wanted if index < settings.num_scenes]
-        run = functools.partial(_prepared, device, functools.partial(settings.run_scene, methods=chosen, own=added))
+        run = functools.partial(settings.run_scene, methods=chosen, own=added)
         held = RecordFolder(folder / part, config, runner)
         records, failures = held.collect(there, run), held.failures(there)
         failed |= {f"{part} scene {index}".strip(): error for index, error in failures.items()}
@@ -93,12 +89,6 @@ def run_study(
             f"{len(failed)} of {asked} scenes failed, the first {where} ({error}): {folder} has scene_*.failed that "
             "tell how, and the same command tries them again"
         )
-
-
-def _prepared(device: Device, run: Trial, index: int) -> Record:
-    """A trial in a process that has not prepared itself."""
-    prepare(device)
-    return run(index)
 
 
 def _runner(workers: int, scheduler: str | None, own: Mapping[str, Factory]) -> Runner:

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from jaxnbv.cli import options
-from jaxnbv.cli.registry import STUDY_MODELS, Device
+from jaxnbv.cli.registry import STUDY_MODELS
 from jaxnbv.errors import install
 from jaxnbv.studies.registry import STUDIES, Entry, flag
 from jaxnbv.studies.scenes import FirstView, Framing
@@ -110,7 +110,6 @@ def study(
             show_default=False,
         ),
     ] = None,
-    device: options.DeviceOption = Device.AUTO,
 ) -> None:
     asked = dict(locals())
     from jaxnbv.cli.run_study import run_study
