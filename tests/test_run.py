@@ -52,20 +52,6 @@ def test_the_papers_close_up_is_there_when_asked(ring):
     np.testing.assert_allclose(config["first"]["position"], [0.8, 0.9, 2.2])
 
 
-def test_a_flat_and_open_mesh_is_named_as_such(ring):
-    turned = trimesh.transformations.rotation_matrix(0.5, (1.0, 0.3, 0.2))
-    (ring / "sheet.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 2 0\nv 0 2 0\nf 1 2 3\nf 1 3 4\n")
-    sheet = trimesh.load_mesh(ring / "sheet.obj")
-    sheet.apply_transform(turned).export(ring / "sheet.obj")
-    result = run_command("run", "sheet.obj", *FARTHEST[2:], cwd=ring)
-    assert result.returncode == 0, result.stderr
-    assert "sheet.obj is flat" in result.stdout
-    assert "4 of its 5 edges" in result.stdout
-    result = run_command(*FARTHEST, cwd=ring)
-    assert "flat" not in result.stdout
-    assert "open" not in result.stdout
-
-
 def test_a_view_is_told_when_it_is_done(ring):
     """Before the next is looked for, which fails here."""
     with mock.patch.object(Planner, "choose", side_effect=InputError("stopped here")):

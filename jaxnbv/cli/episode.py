@@ -119,7 +119,7 @@ def run(
         if given[option] is None:
             raise InputError(f"--task {task} needs {hint}")
 
-    from jaxnbv.cli.play import QUICK, USUAL, first_pose, imagined, peculiarities, planner_of, play, usual_folder
+    from jaxnbv.cli.play import QUICK, USUAL, first_pose, imagined, planner_of, play, usual_folder
     from jaxnbv.cli.tasks import COMMAND_TASKS, Given, usual_first
     from jaxnbv.scanning import load_mesh
     from jaxnbv.scanning.sensors import fitted
@@ -130,8 +130,6 @@ def run(
     start = usual if first is None else first_pose(first, surface)
     acquisition = made.acquisition(Given(surface, setting.camera, start, network, category, source))
     planner = planner_of(setting, acquisition, search, imagined(model, quick, known), QUICK if quick else USUAL)
-    for words in peculiarities(mesh, surface, planner.imagination.grid.spacing):
-        typer.echo(f"note     {words}")
     folder = out or usual_folder(mesh.stem, task, search, model, seed)
     play(mesh.stem, surface, planner, start, views, seed, noise, folder, until or (), quick, report)
 

@@ -105,26 +105,6 @@ def first_pose(asked: str, surface: Surface) -> Pose:
     return pose
 
 
-def peculiarities(path: Path, mesh: TriangleMesh, cell: float) -> list[str]:
-    """What a user should know of a mesh before it is scanned: that it is flat, or open.
-
-    - `cell`: of the grid on which surfaces are imagined, in scene units.
-    """
-    found = []
-    if mesh.thickness < cell:
-        found.append(
-            f"{path.name} is flat: it is {mesh.thickness:.2g} thick, less than a cell of the grid ({cell:.2g}) where "
-            "imagined surfaces live: some will miss it"
-        )
-    loose, edges = mesh.open_edges
-    if loose:
-        found.append(
-            f"{path.name} is open: {loose:,} of its {edges:,} edges belong to one face only. It is scanned from both "
-            "sides; the surfaces that are imagined are closed"
-        )
-    return found
-
-
 def rule(texts: Sequence[str]) -> Stop | None:
     """The rule that some options make together, "sure=0.95" say; None for none, or "never".
 

@@ -133,21 +133,6 @@ class TriangleMesh(Surface):
         """Distance from the scene's origin to the farthest corner."""
         return float(np.linalg.norm(self.vertices, axis=1).max())
 
-    @property
-    def thickness(self) -> float:
-        """Extent along the direction in which the corners vary least, in scene units; zero for a plane sheet."""
-        centred = self.vertices - self.vertices.mean(axis=0)
-        _, directions = np.linalg.eigh(centred.T @ centred)
-        return float(np.ptp(centred @ directions[:, 0]))
-
-    @property
-    def open_edges(self) -> tuple[int, int]:
-        """How many edges belong to one face only, and how many there are; corners at one place are taken for one."""
-        _, places = np.unique(self.vertices.round(6), axis=0, return_inverse=True)
-        sides = np.sort(places.reshape(-1)[self.faces][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        _, counts = np.unique(sides, axis=0, return_counts=True)
-        return int(np.sum(counts == 1)), len(counts)
-
     @checked
     def contains(self, points: Float[AnyArray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Which points (scene coordinates) lie inside: where the winding number is above 1/2 in magnitude, so that a
