@@ -8,17 +8,15 @@ from typing import Annotated
 import typer
 
 from jaxnbv.cli import options
-from jaxnbv.cli.registry import DEFAULT_FIRST, TASKS
+from jaxnbv.cli.options import Position
+from jaxnbv.cli.registry import TASKS
 from jaxnbv.errors import InputError
 
 
 def demo(
     task: options.TaskOption = options.CROSS_ENTROPY,
     scene: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Which object: the number of a scene.")] = 0,
-    first: Annotated[
-        str | None,
-        typer.Option(help="Position of the first camera, x,y,z.", show_default="one that does not show the cargo"),
-    ] = None,
+    first: options.FirstOption = None,
     search: options.SearchOption = options.HALVING,
     model: options.ModelOption = options.SCREENED,
     known: options.KnownOption = None,
@@ -76,21 +74,14 @@ def run(
         ),
     ] = None,
     source: Annotated[
-        str | None,
+        Position | None,
         options.asking(
-            metavar="X,Y,Z",
-            help="For heat: the point of the object that is heated, in scene units.",
+            metavar="X Y Z",
+            help="For heat: the object is heated at its point nearest to this, in scene units.",
             show_default="the middle of the first view",
         ),
     ] = None,
-    first: Annotated[
-        str | None,
-        options.seeing(
-            metavar="X,Y,Z",
-            help="Position of the first camera, in scene units; it looks at the origin.",
-            show_default=f"from {DEFAULT_FIRST}, as far as the others",
-        ),
-    ] = None,
+    first: options.FirstOption = None,
     paper: Annotated[
         bool, options.seeing("--paper", help="The paper's close-up: 30 degrees from 2.5 (parts: 2, heat: 3).")
     ] = False,

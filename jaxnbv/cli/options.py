@@ -57,5 +57,14 @@ KnownOption = Annotated[
         show_default="none; demo, but for --model paper: others of the kind",
     ),
 ]
+Position = tuple[float, float, float]
+FirstOption = Annotated[
+    Position | None,
+    seeing(
+        metavar="X Y Z",
+        help="Where the first camera stands, in scene units; it looks at the origin.",
+        show_default="from 0.8 0.9 2.2, as far as the others; demo: where the answer hides",
+    ),
+]
 QuickOption = Annotated[bool, running("--quick", help="Small settings, for a first look; not the paper's.")]
 ReportOption = Annotated[bool, running("--report/--no-report", help="Write report.html and the figures.")]

@@ -21,9 +21,9 @@ from jaxnbv import viz
 from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError, require
 from jaxnbv.cli.lines import Lines
-from jaxnbv.cli.registry import DEFAULT_FIRST, STOPS
+from jaxnbv.cli.options import Position
+from jaxnbv.cli.registry import STOPS
 from jaxnbv.cli.searches import search_of
-from jaxnbv.cli.tasks import position
 from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import Episode, Step, simulate
@@ -90,18 +90,17 @@ def planner_of(
     return Planner(acquisition, found, camera, imagination, capacity=sizes.capacity)
 
 
-def first_pose(asked: str, surface: Surface) -> Pose:
+def first_pose(place: Position, surface: Surface) -> Pose:
     """Where the first view was asked for, looking at the origin.
 
-    **Raises:** `ValueError` for what is no position, or one inside the object.
+    **Raises:** `ValueError` for a position inside the object.
     """
-    place = position("--first", asked)
     pose, inside = look_at(place), False
     if isinstance(surface, TriangleMesh):
         inside = bool(surface.contains(np.array([place]))[0])
     elif isinstance(surface, SDFSurface):
         inside = bool(surface.sdf(jnp.array([place]))[0] < 0)
-    require(not inside, f"--first is {asked}, inside the object: give a place outside, such as {DEFAULT_FIRST}")
+    require(not inside, f"--first is {place}, inside the object: give a place outside")
     return pose
 
 

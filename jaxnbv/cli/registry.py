@@ -8,8 +8,6 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-DEFAULT_FIRST = "0.8,0.9,2.2"
-
 
 class TaskEntry(NamedTuple):
     """What the views are for.

@@ -9,8 +9,8 @@ import jax
 import numpy as np
 
 from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement
-from jaxnbv.checks import InputError, require
-from jaxnbv.cli.registry import DEFAULT_FIRST
+from jaxnbv.checks import require
+from jaxnbv.cli.options import Position
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.networks import (
@@ -45,7 +45,6 @@ from jaxnbv.tasks import (
     NewSurface,
     SoftPartCount,
 )
-from jaxnbv.tasks.diffusion import HeatProblem
 
 # Points of a cloud that the demo's classifier is fed.
 _FED = 512
@@ -59,7 +58,7 @@ class Given(NamedTuple):
     first: Pose
     network: Path | None = None
     category: str | None = None
-    source: str | None = None
+    source: Position | None = None
 
 
 class Shown(NamedTuple):
@@ -139,11 +138,6 @@ def _counting(segmenter: CloudSegmenter) -> Acquisition:
     return ExpectedUtilityImprovement(SoftPartCount(segmenter), segmenter.num_points)
 
 
-def _of_heat(given: Given) -> Acquisition:
-    """Heated at the point that was asked for, or at the one in the middle of the first view."""
-    return _heated_at(_middle(given) if given.source is None else _asked(given, given.source))
-
-
 def _heated_thing(scene: int, seed: int) -> Shown:
     heated = heat_scene(scene)
     first = source_view(heated, jax.random.key(seed))
@@ -160,46 +154,24 @@ COMMAND_TASKS = {
     "mixed": _class_task(MixedEntropy),
     "coverage": CommandTask(lambda given: NewSurface(), _mug),
     "parts": CommandTask(_of_parts, _thing_of_parts, PART_SETTING),
-    "heat": CommandTask(_of_heat, _heated_thing, HEAT_SETTING),
+    "heat": CommandTask(lambda given: _heated_at(_source(given)), _heated_thing, HEAT_SETTING),
 }
 
 
 def usual_first(radius: float | None = None) -> Pose:
     """Where a first view is taken if nothing else is said: from the usual side, so far away (scene units)."""
-    usual = position("--first", DEFAULT_FIRST)
+    usual = (0.8, 0.9, 2.2)
     scale = 1.0 if radius is None else radius / math.hypot(*usual)
     return look_at(tuple(scale * x for x in usual))
 
 
-def position(option: str, text: str) -> tuple[float, float, float]:
-    """Three numbers of an option.
-
-    **Raises:** `ValueError` unless these are three finite numbers.
-    """
-    try:
-        x, y, z = (float(part) for part in text.split(","))
-    except ValueError as error:
-        raise InputError(f"{option} is {text!r}; give three numbers such as {DEFAULT_FIRST}") from error
-    require(bool(np.isfinite([x, y, z]).all()), f"{option} is {text!r}; its numbers must be finite")
-    return x, y, z
-
-
-def _asked(given: Given, source: str) -> np.ndarray:
-    place, points = np.asarray(position("--source", source)), given.mesh.sample_points(jax.random.key(0), 20_000)
-    nearest = points[np.linalg.norm(points - place, axis=1).argmin()]
-    distance = float(np.linalg.norm(nearest - place))
-    require(
-        distance <= HeatProblem.radius,
-        f"--source is {source}, {distance:.2f} away from the object, but heat goes in within {HeatProblem.radius} "
-        f"only. The nearest point is {','.join(f'{x:.2f}' for x in nearest)}",
-    )
-    return place
-
-
-def _middle(given: Given) -> np.ndarray:
+def _source(given: Given) -> np.ndarray:
+    """The object's point nearest to the place that was asked for, or the one in the middle of the first view."""
+    if given.source is not None:
+        points = given.mesh.sample_points(jax.random.key(0), 20_000)
+        return points[np.linalg.norm(points - given.source, axis=1).argmin()]
     points, _ = scan(given.mesh, given.camera, given.first).to_numpy()
     require(len(points) > 0, "the first view does not see the object: give another --first, or a --source")
     away, forward = points - np.asarray(given.first.position), np.asarray(given.first.forward)
-    along = away @ forward
-    beside = np.linalg.norm(away - along[:, None] * forward, axis=1)
+    beside = np.linalg.norm(away - (away @ forward)[:, None] * forward, axis=1)
     return points[beside.argmin()]
