@@ -54,7 +54,7 @@ def test_a_rule_ends_it_and_says_what_is_saved(tmp_path):
     result = run_command(*arguments, *rules, "--out", "mine", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "enough   after view 1: the next view would cost" in result.stdout
-    assert "2 of 3 views are saved" in result.stdout
+    assert "Views saved: 2 of 3" in result.stdout
     assert len(list((tmp_path / "mine").glob("view_*.npz"))) == 1
     result = run_command(*arguments, "--until", "never", "--out", "mine", cwd=tmp_path)
     assert len(list((tmp_path / "mine").glob("view_*.npz"))) == 3
@@ -67,7 +67,7 @@ def test_a_rule_ends_it_and_says_what_is_saved(tmp_path):
         ("farthest", "screened"),
         pytest.param("random", "paper", marks=pytest.mark.slow),
         ("uncertainty", "paper"),
-        pytest.param("gradient-6dof", "screened", marks=pytest.mark.slow),
+        pytest.param("gradient-constrained", "screened", marks=pytest.mark.slow),
     ],
 )
 def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):

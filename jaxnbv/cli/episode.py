@@ -1,6 +1,5 @@
 """`jaxnbv demo` and `jaxnbv run MESH`: one episode. `jaxnbv view RUN`: a look at one."""
 
-import dataclasses
 import time
 from pathlib import Path
 from typing import Annotated
@@ -8,25 +7,16 @@ from typing import Annotated
 import typer
 
 from jaxnbv.cli import options
-from jaxnbv.cli.options import Position
 from jaxnbv.cli.registry import TASKS
 from jaxnbv.errors import InputError
 
 
+@options.with_options(task="cross-entropy", search="halving")
 def demo(
-    task: options.TaskOption = options.CROSS_ENTROPY,
-    scene: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Which object: the number of a scene.")] = 0,
-    first: options.FirstOption = None,
-    search: options.SearchOption = options.HALVING,
-    model: options.ModelOption = options.SCREENED,
-    known: options.KnownOption = None,
-    views: options.ViewsOption = 5,
-    until: options.UntilOption = None,
-    seed: options.SeedOption = 0,
-    out: options.OutOption = None,
-    noise: options.NoiseOption = 0.01,
-    quick: options.QuickOption = False,
-    report: options.ReportOption = True,
+    asked: options.Asked,
+    scene: Annotated[
+        int, options.asking(metavar="N", min=0, max=2**31 - 1, help="Which object: the number of a scene.")
+    ] = 0,
 ) -> None:
     """Find out what a truck carries, which the first view does not show: no file, no network.
 
@@ -34,31 +24,22 @@ def demo(
     procedural one of thirteen categories, with --task heat one of four kinds that is heated at one place, and with
     --task coverage a mug, to be seen all round.
     """
-    from jaxnbv.cli.play import DEMO, QUICK, first_pose, imagined, planner_of, play, usual_folder
+    from jaxnbv.cli.play import DEMO, first_pose, play
     from jaxnbv.cli.tasks import COMMAND_TASKS
 
-    made = COMMAND_TASKS[task]
-    shown = made.demo(scene, seed)
-    if shown.note:
-        typer.echo(shown.note)
-    start = shown.first if first is None else first_pose(first, shown.surface)
-    # The paper's model knows no shapes.
-    usual = "none" if model == "paper" else shown.bank
-    imagination = dataclasses.replace(imagined(model, quick, known or usual), grid=shown.grid)
-    sizes = QUICK if quick else DEMO
-    planner = planner_of(made.setting, shown.acquisition, search, imagination, sizes)
-    races = bool(shown.until) and search != "farthest"
-    rival = planner_of(made.setting, shown.acquisition, "farthest", imagination, sizes) if races else None
-    folder = out or usual_folder(shown.name, task, search, model, seed)
-    enough = until or shown.until
-    play(shown.name, shown.surface, planner, start, views, seed, noise, folder, enough, quick, report, rival)
+    made = COMMAND_TASKS[asked.task]
+    shown = made.demo(scene, asked.seed)
+    if asked.first is not None:
+        shown = shown._replace(first=first_pose(asked.first, shown.surface))
+    play(asked, shown, made.setting, DEMO)
 
 
+@options.with_options()
 def run(
+    asked: options.Asked,
     mesh: Annotated[
         Path, typer.Argument(metavar="MESH", help="Any mesh that trimesh reads: OBJ, PLY, STL, OFF, glTF, ...")
     ],
-    task: options.TaskOption = options.COVERAGE,
     network: Annotated[
         Path | None,
         options.asking(
@@ -74,55 +55,41 @@ def run(
         ),
     ] = None,
     source: Annotated[
-        Position | None,
+        options.Position | None,
         options.asking(
             metavar="X Y Z",
             help="For heat: the object is heated at its point nearest to this, in scene units.",
             show_default="the middle of the first view",
         ),
     ] = None,
-    first: options.FirstOption = None,
     paper: Annotated[
         bool, options.seeing("--paper", help="The paper's close-up: 30 degrees from 2.5 (parts: 2, heat: 3).")
     ] = False,
-    search: options.SearchOption = options.DISCRETE,
-    model: options.ModelOption = options.SCREENED,
-    known: options.KnownOption = None,
-    views: options.ViewsOption = 5,
-    until: options.UntilOption = None,
-    seed: options.SeedOption = 0,
-    out: options.OutOption = None,
-    noise: options.NoiseOption = 0.01,
-    quick: options.QuickOption = False,
-    report: options.ReportOption = True,
 ) -> None:
     """Choose views of a mesh, scanned by a simulated depth camera.
 
     The mesh may be open, a soup of triangles or inconsistently wound. It is scaled and centred so that its longest side
     is 2.5 scene units; cameras stand as far from its centre as it takes to see all of it.
     """
-    given = {"network": network, "category": category, "source": source}
+    task, given = TASKS[asked.task], {"network": network, "category": category, "source": source}
     for option, value in given.items():
         takers = ", ".join(name for name, entry in TASKS.items() if option in entry.options)
-        if value is not None and option not in TASKS[task].options:
-            raise InputError(f"--task {task} takes no --{option}: it is for {takers}")
-    for option, hint in TASKS[task].requires.items():
-        if given[option] is None:
-            raise InputError(f"--task {task} needs {hint}")
+        if value is not None and option not in task.options:
+            raise InputError(f"--task {asked.task} takes no --{option}: it is for {takers}")
+        if value is None and option in task.requires:
+            raise InputError(f"--task {asked.task} needs {task.requires[option]}")
 
-    from jaxnbv.cli.play import QUICK, USUAL, first_pose, imagined, planner_of, play, usual_folder
-    from jaxnbv.cli.tasks import COMMAND_TASKS, Given, usual_first
+    from jaxnbv.cli.play import USUAL, first_pose, play
+    from jaxnbv.cli.tasks import COMMAND_TASKS, Given, Shown, usual_first
     from jaxnbv.scanning import load_mesh
     from jaxnbv.scanning.sensors import fitted
 
-    surface, made = load_mesh(mesh), COMMAND_TASKS[task]
+    surface, made = load_mesh(mesh), COMMAND_TASKS[asked.task]
     setting = made.setting if paper else fitted(made.setting, surface.bounding_radius)
     usual = usual_first(None if paper else setting.radius)
-    start = usual if first is None else first_pose(first, surface)
+    start = usual if asked.first is None else first_pose(asked.first, surface)
     acquisition = made.acquisition(Given(surface, setting.camera, start, network, category, source))
-    planner = planner_of(setting, acquisition, search, imagined(model, quick, known), QUICK if quick else USUAL)
-    folder = out or usual_folder(mesh.stem, task, search, model, seed)
-    play(mesh.stem, surface, planner, start, views, seed, noise, folder, until or (), quick, report)
+    play(asked, Shown(mesh.stem, surface, acquisition, start), setting, USUAL)
 
 
 def view(

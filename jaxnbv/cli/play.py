@@ -7,7 +7,7 @@ import os
 import re
 import textwrap
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
@@ -21,9 +21,9 @@ from jaxnbv import viz
 from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError, require
 from jaxnbv.cli.lines import Lines
-from jaxnbv.cli.options import Position
+from jaxnbv.cli.options import Asked, Position
 from jaxnbv.cli.registry import STOPS
-from jaxnbv.cli.searches import search_of
+from jaxnbv.cli.tasks import Shown
 from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import Episode, Step, simulate
@@ -31,9 +31,11 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Budget, ValueBelow
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, Surface, TriangleMesh
 from jaxnbv.scanning.sensors import Setting
+from jaxnbv.search import Search, SphereCandidates, TieBreakSearch
+from jaxnbv.studies.engine import searches
 from jaxnbv.studies.scenes.banks import KINDS, bank_poses, shape_bank
 from jaxnbv.surfaces import ShapeBank, Upright
-from jaxnbv.tasks import Covered, Found, Stop, Sure
+from jaxnbv.tasks import Coverage, Covered, Found, Stop, Sure
 from jaxnbv.viz.task import race_words
 
 
@@ -52,12 +54,41 @@ USUAL, QUICK = Sizes(16, None, 8192), Sizes(4, 40, 1024, Grid(56), 24)
 DEMO = Sizes(16, 60, 2048)
 # Views of the baseline that races the demo, at most.
 _RACE_VIEWS = 10
+RULES: dict[str, Callable[[float], Stop]] = {
+    "sure": Sure,
+    "found": lambda points: Found(int(points)),
+    "covered": Covered,
+    "value-below": ValueBelow,
+    "seconds": lambda seconds: Budget(seconds=seconds),
+    "travel": lambda length: Budget(cost=length),
+}
+"""What the rules of `--until` stand for."""
 
 
-def usual_folder(name: str, task: str, search: str, model: str, seed: int) -> Path:
-    """runs/NAME-TASK-SEARCH[-MODEL]-seedN."""
-    parts = name, task, search, *(() if model == "screened" else (model,)), f"seed{seed}"
-    return Path("runs") / re.sub(r"[^A-Za-z0-9_.-]", "_", "-".join(parts))
+def rule(texts: Sequence[str]) -> Stop | None:
+    """The rule that some options make together, "sure=0.95" say; None for none, or "never".
+
+    **Raises:** `ValueError` for a name that is not known, or what is no number.
+    """
+    if not texts or list(texts) == ["never"]:
+        return None
+    rules = []
+    for text in texts:
+        name, _, value = text.partition("=")
+        require(name in RULES, f"--until is {text!r}: give never or one of {', '.join(STOPS)}, such as sure=0.95")
+        try:
+            rules.append(RULES[name](float(value)))
+        except (ValueError, OverflowError) as error:
+            raise InputError(f"--until is {text!r} ({error}): give a number, such as {name}=0.95") from error
+    return functools.reduce(operator.or_, rules)
+
+
+def search_of(name: str, radius: float, count: int) -> Search:
+    """The search of a name, about cameras so far away."""
+    candidates = SphereCandidates(count, radius)
+    if name == "tie-break":
+        return TieBreakSearch(candidates, second=Coverage())
+    return searches.search_of(name, candidates, count, radius, num_starts=6, iterations=20)
 
 
 def imagined(model: str, quick: bool, known: str | None) -> Imagination:
@@ -83,9 +114,7 @@ def planner_of(
     """A planner of a task."""
     grid = sizes.grid or imagination.grid
     imagination = dataclasses.replace(imagination, grid=grid, num_samples=sizes.samples)
-    # A gradient search looks at its own number of candidates before it climbs.
-    usual = None if search.startswith("gradient") else setting.num_candidates
-    found = search_of(search, setting.radius, sizes.candidates or usual)
+    found = search_of(search, setting.radius, sizes.candidates or setting.num_candidates)
     camera = setting.camera if sizes.rays is None else setting.camera.resized(sizes.rays, sizes.rays)
     return Planner(acquisition, found, camera, imagination, capacity=sizes.capacity)
 
@@ -104,54 +133,27 @@ def first_pose(place: Position, surface: Surface) -> Pose:
     return pose
 
 
-def rule(texts: Sequence[str]) -> Stop | None:
-    """The rule that some options make together, "sure=0.95" say; None for none, or "never".
-
-    **Raises:** `ValueError` for a name that is not known, or what is no number.
-    """
-    if not texts or list(texts) == ["never"]:
-        return None
-    return functools.reduce(operator.or_, map(_rule, texts))
-
-
-def _rule(text: str) -> Stop:
-    name, _, value = text.partition("=")
-    require(name in STOPS, f"--until is {text!r}: give never or one of {', '.join(STOPS)}, such as sure=0.95")
-    try:
-        number = float(value)
-    except ValueError as error:
-        raise InputError(f"--until is {text!r}: give a number, such as {name}=0.95") from error
-    if name == "seconds":
-        return Budget(seconds=number)
-    if name == "travel":
-        return Budget(cost=number)
-    if name == "found":
-        return Found(int(number) if number.is_integer() else number)  # type: ignore[arg-type]
-    return {"sure": Sure, "covered": Covered, "value-below": ValueBelow}[name](number)
-
-
-def play(
-    name: str,
-    scene: Surface,
-    planner: Planner,
-    first: Pose,
-    views: int,
-    seed: int,
-    noise: float,
-    folder: Path,
-    until: Sequence[str] = (),
-    quick: bool = False,
-    report: bool = True,
-    rival: Planner | None = None,
-) -> None:
-    """Simulate an episode into a folder, tell of each view as it is done, and report; where a rule says what is enough,
-    a rival races it from the same first view."""
-    enough, start = rule(until), time.perf_counter()
-    if quick:
+def play(asked: Asked, shown: Shown, setting: Setting, sizes: Sizes) -> None:
+    """Simulate an episode into a folder, tell of each view as it is done, and report; where the object says what is
+    enough, farthest view races it from the same first view."""
+    began = time.perf_counter()
+    if asked.quick:
         typer.echo("--quick: small settings; leave it out for the usual ones.")
-    key, spread = jax.random.key(seed), SensorNoise(noise, noise)
+        sizes = QUICK
+    if shown.note:
+        typer.echo(shown.note)
+    # The paper's model knows no shapes.
+    usual = "none" if asked.model == "paper" else shown.bank
+    imagination = dataclasses.replace(imagined(asked.model, asked.quick, asked.known or usual), grid=shown.grid)
+    planner = planner_of(setting, shown.acquisition, asked.search, imagination, sizes)
+    rival = planner_of(setting, shown.acquisition, "farthest", imagination, sizes)
+    parts = shown.name, asked.task, asked.search, *(() if asked.model == "screened" else (asked.model,))
+    folder = asked.out or Path("runs") / re.sub(r"[^A-Za-z0-9_.-]", "_", f"{'-'.join(parts)}-seed{asked.seed}")
+    enough = rule(asked.until or shown.until)
+    key, noise = jax.random.key(asked.seed), SensorNoise(asked.noise, asked.noise)
+    races = bool(shown.until) and enough is not None and asked.search != "farthest"
     lines = Lines(planner)
-    sketches = viz.Sketches(Episode(planner, scene, spread, first, key, ())) if report else None
+    sketches = viz.Sketches(Episode(planner, shown.surface, noise, shown.first, key, ())) if asked.report else None
     race: Future[Episode] | None = None
     jobs: list[Future[None]] = []
 
@@ -163,14 +165,15 @@ def play(
         if sketches is not None:
             jobs.append(beside.submit(sketches.add, step))
         # Not before the first view: both would compile what that needs.
-        if race is None and rival is not None and enough is not None:
-            of_rival = (scene, first, _RACE_VIEWS, key, spread, folder / "farthest")
+        if race is None and races:
+            of_rival = (shown.surface, shown.first, _RACE_VIEWS, key, noise, folder / "farthest")
             race = beside.submit(simulate, rival, *of_rival, progress=False, until=enough)
 
     # While the next view is planned, its search is compiled, the last one is drawn and the rival runs.
     with ThreadPoolExecutor(1) as beside:
         try:
-            episode = simulate(planner, scene, first, views, key, spread, folder, until=enough, each=tell)
+            of_planner = (shown.surface, shown.first, asked.views, key, noise, folder)
+            episode = simulate(planner, *of_planner, until=enough, each=tell)
         except BaseException:
             beside.shutdown(wait=False, cancel_futures=True)
             raise
@@ -178,12 +181,12 @@ def play(
     for job in jobs:
         job.result()
     if episode.stopped is not None:
-        saved = views - len(episode.views)
-        are = "is" if saved == 1 else "are"
-        typer.echo(f"enough   after view {len(episode.views)}: {episode.stopped}. {saved} of {views} views {are} saved")
+        views, saved = len(episode.views), asked.views - len(episode.views)
+        typer.echo(f"enough   after view {views}: {episode.stopped}. Views saved: {saved} of {asked.views}")
     if raced is not None:
-        told = race_words(raced, episode)
-        typer.echo(textwrap.fill(told, 100, initial_indent="race     ", subsequent_indent="         "))
-    if report:
-        typer.echo(f"report   {viz.write_report(episode, folder, title=name, rival=raced, sketches=sketches)}")
-    typer.echo(f"episode  {folder}   ({time.perf_counter() - start:.0f} s)")
+        told_of = race_words(raced, episode)
+        typer.echo(textwrap.fill(told_of, 100, initial_indent="race     ", subsequent_indent="         "))
+    if asked.report:
+        page = viz.write_report(episode, folder, title=shown.name, rival=raced, sketches=sketches)
+        typer.echo(f"report   {page}")
+    typer.echo(f"episode  {folder}   ({time.perf_counter() - began:.0f} s)")

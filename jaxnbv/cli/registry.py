@@ -1,6 +1,6 @@
 """What the command line must know before anything heavy is imported: tasks, models, searches, rules.
 
-A new task, search or rule is a name here and what it stands for, in `tasks.py`, `searches.py` or `play.py`.
+A new task, search or rule is a name here and what it stands for, in `tasks.py` or `play.py`.
 """
 
 import importlib
@@ -47,7 +47,7 @@ SEARCHES = {
     "halving": "the same, sooner: drops the worse half again and again",
     "tie-break": "coverage decides where candidates are level",
     "gradient-2dof": "climbs over the sphere",
-    "gradient-6dof": "climbs over positions and rotations",
+    "gradient-constrained": "climbs over positions and rotations",
     "hybrid": "climbs from the best candidates",
     "farthest": "a baseline, far from all views",
     "random": "a baseline",

@@ -1,8 +1,7 @@
 """`jaxnbv study NAME`: the runs behind the paper's tables and figures."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import typer
 
@@ -12,8 +11,11 @@ from jaxnbv.errors import install
 from jaxnbv.studies.registry import STUDIES, Entry, flag
 from jaxnbv.studies.scenes import FirstView, Framing
 
-StudyName = StrEnum("StudyName", {name.upper(): name for name in STUDIES})  # type: ignore[misc]
-StudyModel = StrEnum("StudyModel", {name.upper(): name for name in STUDY_MODELS})  # type: ignore[misc]
+if TYPE_CHECKING:
+    StudyName: TypeAlias = str
+    StudyModel: TypeAlias = str
+else:
+    StudyName, StudyModel = Literal[tuple(STUDIES)], Literal[tuple(STUDY_MODELS)]
 
 
 def study(
