@@ -112,15 +112,13 @@ def _own(text: str) -> Factory:
     """A function of a module that may lie in the current folder."""
     if (here := os.getcwd()) not in sys.path:
         sys.path.insert(0, here)
-    module, _, function = text.partition(":")
-    if not module or not function:
-        raise InputError(f"--method {text} names no function: write module:function, such as mine:planner")
     try:
         made = resolve(text)
-    except (ImportError, AttributeError, TypeError) as error:
-        raise InputError(f"--method {text} cannot be found ({error}): start where the module lies") from error
-    except (Exception, SystemExit) as error:  # whatever a module of the user's does as it is imported
-        raise InputError(f"--method {text}: its module fails ({type(error).__name__}: {error})") from error
-    if not callable(made):
-        raise InputError(f"--method {text} is a {type(made).__name__}; give a function of a study and a scene")
+    # Whatever a module of the user's does as it is imported.
+    except (Exception, SystemExit) as error:
+        raise InputError(
+            f"--method {text} cannot be found ({type(error).__name__}: {error}): write module:function, such as "
+            "mine:planner, and start where the module lies"
+        ) from error
+    require(callable(made), f"--method {text} is a {type(made).__name__}; give a function of a study and a scene")
     return made

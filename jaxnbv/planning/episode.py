@@ -5,11 +5,10 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.checks import check_key, check_type, checked, require
@@ -88,7 +87,8 @@ class Episode(eqx.Module):
         config = read_record(Path(path), "episode", "give the folder of a run")["config"]
         views = read_views(RunFolder(path, "episode", config))
         require(len(views) > 0, f"{path} holds no view yet")
-        planner = Planner(Coverage(), camera=camera_of(config["planner"]["camera"]))
+        camera = {name: value for name, value in config["planner"]["camera"].items() if name != "type"}
+        planner = Planner(Coverage(), camera=Camera(**camera | {"center": tuple(camera["center"])}))
         after = planner.replay((pose, scan) for pose, scan, _ in views)
         shown = tuple(
             View(pose, scan, evidence.cloud, proposal, planner.camera)
@@ -122,12 +122,6 @@ def read_views(folder: RunFolder) -> list[tuple[Pose, PointCloud, Proposal | Non
     """
     views = (folder.read("view", index) for index in range(folder.count("view")))
     return [(view["pose"], view["scan"], view.get("proposal")) for view in views]
-
-
-def camera_of(description: dict[str, Any]) -> Camera:
-    """The camera that a stored configuration describes."""
-    fields = {name: value for name, value in description.items() if name != "type"}
-    return Camera(**{**fields, "center": tuple(fields["center"])})
 
 
 def _config(planner: Planner, scene: Surface | None, noise: Noise | None, first: Pose, key: PRNGKeyArray) -> dict:
@@ -166,10 +160,6 @@ def simulate(
         f"asked for {views} views but the planner has room for {planner.max_views}: raise Planner(max_views=...)",
     )
     check_key(key)
-    require(
-        jnp.issubdtype(key.dtype, jax.dtypes.prng_key),
-        f"the key is a raw array of {key.dtype}: make it with jax.random.key(seed)",
-    )
     require(first.position.ndim == 1, "the first pose is a batch of poses: give one, poses[0] say")
     scene = as_surface(scene)
     store = None if folder is None else RunFolder(folder, "episode", _config(planner, scene, noise, first, key))
@@ -186,7 +176,9 @@ def simulate(
                 bar.set_description(f"view {index + 1}/{views}, {stage}")
                 bar.update(index * len(STAGES) + STAGES.index(stage) - bar.n)
 
-            sensor = scene_sensor(scene, planner.camera, noise, planner.imagination.surroundings)
+            def sensor(pose: Pose, key: PRNGKeyArray) -> PointCloud:
+                return observe_scene(scene, planner.camera, pose, noise, key, planner.imagination.surroundings)
+
             watch = None if until is None else Watch(until, planner.acquisition)
             episode = steps(planner, sensor, first, key, done=done, begin=begin, watch=watch)
             for step in itertools.islice(episode, views):
@@ -291,16 +283,6 @@ def steps(
             evidence = planner.observe(evidence, pose, seen, camera)
         poses.append(pose)
         yield Step(View(pose, seen, evidence.cloud, proposal, camera or planner.camera), evidence, basis, seconds)
-
-
-def scene_sensor(
-    scene: Surface,
-    camera: Camera,
-    noise: Noise = SensorNoise(),
-    surroundings: Surroundings | None = None,
-) -> Sensor:
-    """A camera that scans a known surface, with noise, past what stands around it."""
-    return lambda pose, key: observe_scene(scene, camera, pose, noise, key, surroundings)
 
 
 def view_keys(key: PRNGKeyArray, index: int) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:

@@ -119,7 +119,7 @@ class Planner(eqx.Module):
         with functions_of_users():
             # Its context is a program of its own, which `init` has compiled.
             proposal = _propose(self.search, self.problem(evidence, surfaces).prepared(), key)
-        return checked_proposal(proposal, surfaces, self.cost)
+        return _checked_proposal(proposal, surfaces)
 
     def compile(self, evidence: Evidence) -> None:
         """Compile `choose` for evidence of these shapes and run nothing: in a thread, while surfaces are sampled."""
@@ -187,7 +187,7 @@ def _propose(search: Search, problem: Problem, key: PRNGKeyArray) -> Proposal:
     return search.propose(problem, key)
 
 
-def checked_proposal(proposal: Proposal, surfaces: GridSurface | None, cost: ValuePerCost | None = None) -> Proposal:
+def _checked_proposal(proposal: Proposal, surfaces: GridSurface | None) -> Proposal:
     """A proposal as it is.
 
     **Raises:** `ValueError` if its value is not finite, or every candidate has been visited.
@@ -195,15 +195,12 @@ def checked_proposal(proposal: Proposal, surfaces: GridSurface | None, cost: Val
     if is_traced(proposal):
         return proposal
     value = proposal.value
+    known = not bool(jnp.isnan(value))
     require(
-        cost is None or not bool(jnp.isnan(value)),
-        "a candidate's value, given the cost of going there, is not a number (NaN): make the cost one finite number, "
-        "zero or more, and the acquisition finite for every scan",
-    )
-    require(
-        not bool(jnp.isnan(value)) and (surfaces is None or bool(value < jnp.inf)),
-        f"the acquisition is {'not a number (NaN)' if jnp.isnan(value) else 'infinite'} for a candidate: it must be "
-        "finite for every scan, one that sees nothing included, and for a gradient search so must its derivatives",
+        known and (surfaces is None or bool(value < jnp.inf)),
+        f"the acquisition is {'infinite' if known else 'not a number (NaN)'} for a candidate: it must be finite for "
+        "every scan, one that sees nothing included, for a gradient search so must its derivatives, and the cost of "
+        "going there, if it counts, one finite number, zero or more",
     )
     require(
         bool(value > -jnp.inf),

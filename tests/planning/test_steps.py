@@ -14,7 +14,7 @@ from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.imagination import Imagination
-from jaxnbv.planning.episode import scene_sensor, simulate, steps
+from jaxnbv.planning.episode import observe_scene, simulate, steps
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
 from jaxnbv.scanning.sdf import Sphere
@@ -36,13 +36,17 @@ class FirstRow(Acquisition):
         return scan.points[0, 0]
 
 
+def sensor_of(camera=CAMERA, noise=SensorNoise()):
+    return lambda pose, key: observe_scene(SCENE, camera, pose, noise, key)
+
+
 def planner(search, views=4):
     imagination = Imagination(GeometricSPSR(0.2, truncation=6), Grid(16), num_samples=2)
     return Planner(Coverage(), search, CAMERA, imagination, capacity=150, max_views=views)
 
 
 def views_of(planner, key=KEY, noise=SensorNoise(), camera=CAMERA, first=FIRST):
-    for view, *_ in steps(planner, scene_sensor(SCENE, camera, noise), first, key, camera):
+    for view, *_ in steps(planner, sensor_of(camera, noise), first, key, camera):
         yield view
 
 
@@ -92,7 +96,7 @@ def test_views_that_are_known_are_told_and_not_asked_for():
 
     def sensor(pose, key):
         asked.append(pose)
-        return scene_sensor(SCENE, CAMERA)(pose, key)
+        return sensor_of()(pose, key)
 
     done = [(view.pose, view.scan, view.proposal) for view in whole[:2]]
     for step, expected in zip(steps(own, sensor, FIRST, KEY, done=done), whole, strict=True):
@@ -102,7 +106,7 @@ def test_views_that_are_known_are_told_and_not_asked_for():
 
 def test_a_step_holds_the_samples_and_the_evidence_that_the_next_view_is_chosen_from():
     own = planner(DiscreteSearch(CANDIDATES), 3)
-    first, second, third = steps(own, scene_sensor(SCENE, CAMERA), FIRST, KEY)
+    first, second, third = steps(own, sensor_of(), FIRST, KEY)
     assert (first.basis, first.seconds) == (None, 0.0)
     again = own.choose(second.evidence, third.basis.surfaces, jax.random.key(0))
     assert_same(again, third.view.proposal)

@@ -25,7 +25,6 @@ _OVER_CANDIDATES: dict[str, Callable[..., Search]] = {
     "uncertainty": UncertaintyView,
     "random": RandomView,
     "halving": HalvingSearch,
-    "hybrid": lambda candidates: HybridSearch(candidates=candidates),
 }
 # Free poses drift to views that miss the object, as the paper found; constrained ones keep it in view.
 _SPACES: dict[str, Callable[[float], PoseSpace]] = {
@@ -44,4 +43,6 @@ def search_of(
     if method in _SPACES:
         settings = num_starts, iterations, _LEARNING_RATE, max(num_candidates // 2, num_starts)
         return GradientSearch(None, _SPACES[method](radius), *settings)
+    if method == "hybrid":
+        return HybridSearch(space=SpherePoses(radius), candidates=candidates)
     return _OVER_CANDIDATES.get(method, DiscreteSearch)(candidates)

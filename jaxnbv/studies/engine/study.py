@@ -19,9 +19,9 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.imagination import Imagination
-from jaxnbv.planning.episode import Sensor, Step, scene_sensor, steps, view_keys
+from jaxnbv.planning.episode import Sensor, Step, observe_scene, steps, view_keys
 from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Evidence, Grid, Surface
+from jaxnbv.scanning import Evidence, Grid, SensorNoise, Surface
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.search import Candidates, Search, SphereCandidates
 from jaxnbv.studies.engine.measures import KNOWN, UNKNOWING, Claim, Measure, Record
@@ -183,7 +183,7 @@ class Study(eqx.Module):
 
     def sensor(self, scene: Scene) -> Sensor:
         """What the camera sees of a scene."""
-        return scene_sensor(scene.surface, self.camera)
+        return lambda pose, key: observe_scene(scene.surface, self.camera, pose, SensorNoise(), key)
 
     def shows_enough(self, scene: Scene, seen: PointCloud) -> bool:
         """Whether a scan can be the first one."""
