@@ -319,7 +319,6 @@ REFUSED = {
     "poses of a session that are one": (lambda: session(poses=np.eye(4)), "give a batch"),
     "a session's box of text": (lambda: session(box="here"), "'here'"),
     "a session's folder that is none": (lambda: session(folder=3), "3"),
-    "half a stride": (lambda: session(stride=2.5), "2.5"),
     "a rule that is none": (lambda: session(until=0.95), "0.95"),
     "a session's pose of three rows": (lambda: session().add(np.ones((6, 6)), np.eye(3)), "(3, 3)"),
     "a depth image of text": (lambda: session().add("image", np.eye(4)), "'image'"),

@@ -50,7 +50,8 @@ class NextView(eqx.Module):
 
 
 class Session:
-    """A planner at a real sensor. Matrices are 4 x 4, camera to world, in world units; so is the box.
+    """A planner at a real sensor. Matrices are 4 x 4, camera to world, in world units; so is the box. Of an image every
+    so many-th row and column is used, such that 20,000 rays are left or fewer; whole images are kept.
 
     - `camera`: the sensor, its range in world units.
     - `box`: two corners of a box about the object, without the table.
@@ -65,8 +66,6 @@ class Session:
       units about the box's centre, and of a whole sphere the upper half: what is below may be the table.
     - `folder`: where images and proposals are kept before they are acted on; a session that was killed goes on from it.
     - `convention`: of the matrices' axes, see `Pose.from_matrix`.
-    - `stride`: of the images, every so many-th row and column alone is used; by default such that 20,000 rays are left
-      or fewer. Whole images are kept.
     - `key`: of the posterior samples.
     - `until`: when it is done, such as `Sure(0.95) | Budget(seconds=600)`; see `jaxnbv.planning.stopping`.
     - `progress`: whether a bar shows what it is at while it plans.
@@ -85,7 +84,6 @@ class Session:
         poses: Float[AnyArray, "n 4 4"] | None = None,
         folder: str | Path | None = None,
         convention: str = "opencv",
-        stride: int | None = None,
         key: PRNGKeyArray | None = None,
         until: Stop | None = None,
         surroundings: Surroundings | None = None,
@@ -94,7 +92,7 @@ class Session:
         self.camera, self.convention = camera, convention
         self.box = box_of(box)
         self.frame = Frame.fit(np.array([self.box.low, self.box.high]), up=up)
-        self.stride, self.progress = stride_of(camera) if stride is None else stride, progress
+        self.stride, self.progress = stride_of(camera), progress
         self.key = jax.random.key(0) if key is None else key
         check_key(self.key)
         allowed = None if poses is None else self.frame.to_scene(Pose.from_matrix(poses, convention))
@@ -232,7 +230,7 @@ class Session:
 
     def _config(self) -> dict:
         sensor = {"camera": self.camera, "box": self.box, "up": self.frame.up, "convention": self.convention}
-        return describe({**sensor, "stride": self.stride, "key": self.key, "planner": self.planner})
+        return describe({**sensor, "key": self.key, "planner": self.planner})
 
     def _looked(
         self, depth: Real[np.ndarray, "h w"], matrix: Float[np.ndarray, "4 4"], depth_scale: float

@@ -192,7 +192,6 @@ def test_an_image_beside_the_box_is_warned_of():
         (lambda: session_of(box=((0.0, 0.0, 0.0), (1.0, 1.0, -1.0))), "has no inside"),
         (lambda: session_of(planner=planner_of(GradientSearch())), "GradientSearch is no search over candidates"),
         (lambda: session_of(convention="blender"), "the convention is 'blender'"),
-        (lambda: session_of(stride=0), "stride is 0"),
     ],
 )
 def test_bad_input_is_named(make, message):
