@@ -9,6 +9,14 @@ SCENE, FIRST = nbv.SDFSurface(SOLID), nbv.look_at((0.8, 0.9, 2.2))
 MODEL, CAMERA = nbv.GeometricSPSR(truncation=8, lengthscale=0.05), nbv.Camera(height=8, width=8)
 
 
-def planner_of(search=nbv.DiscreteSearch(12), score=nbv.Coverage(), num_samples=3, cost=None, **changes):  # noqa: B008
-    imagination = nbv.Imagination(MODEL, nbv.Grid(24), num_samples)
+def planner_of(
+    search=nbv.DiscreteSearch(12),  # noqa: B008
+    score=nbv.Coverage(),  # noqa: B008
+    num_samples=3,
+    cost=None,
+    model=MODEL,
+    grid=nbv.Grid(24),
+    **changes,
+):
+    imagination = nbv.Imagination(model, grid, num_samples)
     return nbv.Planner(score, search, CAMERA, imagination, cost, **{"capacity": 128, "max_views": 6, **changes})

@@ -160,7 +160,7 @@ def play(asked: Asked, shown: Shown, setting: Setting, sizes: Sizes) -> None:
     def tell(step: Step) -> None:
         nonlocal race
         lines(step.view)
-        if views > 1 and not jobs:
+        if asked.views > 1 and not jobs:
             jobs.append(beside.submit(planner.compile, step.evidence))
         if sketches is not None:
             jobs.append(beside.submit(sketches.add, step))

@@ -33,7 +33,7 @@ def evidence(planner):
     return planner.init(FIRST, scan(SCENE, planner.camera, FIRST))
 
 
-@pytest.mark.parametrize("name", SEARCHES)
+@pytest.mark.parametrize("name", ["DiscreteSearch", "FarthestView"])
 def test_nothing_recompiles_after_the_second_view(name, compilations):
     planner, noise, key = planner_of(SEARCHES[name]), SensorNoise(), jax.random.key(3)
     after, evidence, pose = [], None, FIRST
@@ -97,9 +97,7 @@ def test_a_first_scan_from_an_unknown_pose_excludes_nothing():
     assert not np.isneginf(planner.propose(evidence, jax.random.key(0)).values).any()
 
 
-@pytest.mark.parametrize("name", ["DiscreteSearch", "FarthestView"])
-def test_a_cloud_alone_is_evidence(name):
-    planner = planner_of(SEARCHES[name])
+def test_a_cloud_alone_is_evidence(planner):
     cloud, key = scan(SCENE, planner.camera, FIRST), jax.random.key(4)
     known, alone = (planner.propose(evidence, key) for evidence in (planner.init(None, cloud), cloud))
     jax.tree.map(np.testing.assert_array_equal, jax.tree.map(np.array, known), jax.tree.map(np.array, alone))
@@ -157,24 +155,10 @@ def test_a_scan_outside_the_scene_is_refused(planner, evidence):
             tell()
 
 
-@pytest.mark.parametrize("kind", [FarthestView, RandomView])
-def test_all_candidates_visited_is_refused(kind):
-    planner = planner_of(kind(2))
-    first = scan(SCENE, planner.camera, FIRST)
-    # Its points alone, which may be told with any pose.
-    first = PointCloud(first.points, first.normals, first.mask)
-    evidence = planner.init(FIRST, first)
-    for _ in range(2):
-        evidence = planner.observe(evidence, planner.propose(evidence, jax.random.key(0)).pose, first)
-    with pytest.raises(ValueError, match=r"all 2 candidates have been visited.*more candidates"):
-        planner.propose(evidence, jax.random.key(0))
-
-
 @pytest.mark.parametrize("name", ["num_samples", "capacity", "max_views"])
-@pytest.mark.parametrize("value", [0, -3])
-def test_numbers_below_one_are_refused(name, value):
-    with pytest.raises(ValueError, match=f"{name} is {value}"):
-        planner_of(SEARCHES["FarthestView"], **{name: value})
+def test_numbers_below_one_are_refused(name):
+    with pytest.raises(ValueError, match=f"{name} is 0"):
+        planner_of(SEARCHES["FarthestView"], **{name: 0})
 
 
 def test_a_singular_covariance_is_named():

@@ -9,7 +9,6 @@ import jax
 import numpy as np
 import pytest
 
-import jaxnbv
 from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
@@ -54,20 +53,6 @@ def assert_same(a, b):
     assert jax.tree.structure(a) == jax.tree.structure(b)
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         np.testing.assert_array_equal(x, y)
-
-
-@pytest.mark.parametrize("search", [DiscreteSearch(CANDIDATES), FarthestView(CANDIDATES), RandomView(CANDIDATES)])
-def test_views_are_those_of_a_simulated_episode(search):
-    own = planner(search)
-    noise = SensorNoise(0.02)
-    views = list(views_of(own, noise=noise))
-    episode = jaxnbv.simulate(own, SCENE, FIRST, 4, KEY, noise, progress=False)
-    assert len(views) == 4
-    for view, expected in zip(views, episode.views, strict=True):
-        assert_same(view, expected)
-    assert len({tuple(np.asarray(view.pose.position).tolist()) for view in views}) == 4
-    other = list(itertools.islice(views_of(own, jax.random.key(4), noise), 1))
-    assert (other[0].scan.points != views[0].scan.points).any()
 
 
 def test_a_finer_sensor_sees_more_from_the_same_poses():

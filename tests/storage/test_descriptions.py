@@ -10,16 +10,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_episode import BASE, planner_of
+from small_episode import BASE
+from small_planner import planner_of
 
 from jaxnbv.geometry.pose import look_at
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
 from jaxnbv.scanning.sdf import Capsule, Sphere
 from jaxnbv.search import DiscreteSearch, FarthestView, SphereCandidates
 from jaxnbv.storage import describe
+from jaxnbv.surfaces import GeometricSPSR
 
 CHANGES = {
-    "model": {"planner": planner_of(lengthscale=0.051)},
+    "model": {"planner": planner_of(model=GeometricSPSR(truncation=8, lengthscale=0.051))},
     "search": {"planner": planner_of(FarthestView(12))},
     "candidates": {"planner": planner_of(DiscreteSearch(13))},
     "radius": {"planner": planner_of(DiscreteSearch(SphereCandidates(12, 2.6)))},

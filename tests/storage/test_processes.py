@@ -47,7 +47,7 @@ def start(folder, stage="none", view=0):
     command = [sys.executable, "-c", SCRIPT, str(folder), stage, str(view)]
     environment = {
         **os.environ,
-        "PYTHONPATH": os.pathsep.join([str(ROOT), str(Path(__file__).parent)]),
+        "PYTHONPATH": os.pathsep.join(str(folder) for folder in (ROOT, *Path(__file__).parents[:2])),
         "JAX_COMPILATION_CACHE_DIR": str(folder.with_name("compiled")),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         # The promise is about programs as users run them.
