@@ -1,7 +1,7 @@
 """A live session: depth images of a real sensor in, where to take the next one out, in the user's own world."""
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -104,7 +104,6 @@ class Session:
         self._views: list[View] = []
         self._proposals: dict[int, Proposal] = {}
         self._next: NextView | None = None
-        self._followers: list[Callable[[Session], None]] = []
         self._evidence: Evidence | None = None
         self._folder = None if folder is None else RunFolder(folder, "session", self._config())
         if self._folder is not None:
@@ -210,23 +209,12 @@ class Session:
             unit, error = self.frame.scale**self.planner.quantity.power, proposal.standard_error
             value, error = float(proposal.value) / unit, None if error is None else error / unit
             self._next = NextView(matrix, value, error, found.get("expected_depth"), proposal)
-            self._tell_followers()
         return self._next
 
     @property
     def next_view(self) -> NextView | None:
         """What `next` gave since the last image; None where it was not asked yet."""
         return self._next
-
-    def follow(self, follower: "Callable[[Session], None]") -> None:
-        """Call a function with the session now, if it has an image, and after every image and proposal from now on."""
-        self._followers.append(follower)
-        if self.views:
-            follower(self)
-
-    def _tell_followers(self) -> None:
-        for follower in self._followers:
-            follower(self)
 
     def _config(self) -> dict:
         sensor = {"camera": self.camera, "box": self.box, "up": self.frame.up, "convention": self.convention}
@@ -260,7 +248,6 @@ class Session:
         self.planner, self._evidence = planner, evidence
         self._views.append(view)
         self._next = None
-        self._tell_followers()
 
     def _propose(self) -> dict[str, Any]:
         """The next proposal, and the depth image that is expected there, in world units."""

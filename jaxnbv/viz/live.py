@@ -70,18 +70,11 @@ class LiveView:
         """Of the page."""
         return f"http://{self._server.get_host()}:{self._server.get_port()}"
 
-    def update(
-        self,
-        episode: Episode,
-        proposal: Proposal | None = None,
-        expected: Float[np.ndarray, "h w"] | None = None,
-        evidence: Evidence | None = None,
-    ) -> None:
-        """Show an episode as it is now.
-
-        - `proposal`: for the view after its last; `expected`: the depth image expected there.
-        - `evidence`: after its last view, where that is at hand; made again from the scans otherwise.
-        """
+    def update(self, shown: Episode | Session) -> None:
+        """Show an episode as it is now, or a session and where it asks for the next image."""
+        episode = shown.episode if isinstance(shown, Session) else shown
+        asked, evidence = (shown.next_view, shown.evidence) if isinstance(shown, Session) else (None, None)
+        proposal, expected = (None, None) if asked is None else (asked.proposal, asked.expected_depth)
         views = episode.views
 
         def show(count: int) -> None:
@@ -125,16 +118,6 @@ class LiveView:
                 ]
             self._tell(episode, posterior, proposal, picture)
             self._legend.content = _legend(surface, proposal, episode.planner.quantity)
-
-    def follow(self, session: Session) -> None:
-        """Show a session from now on, with every image and proposal."""
-
-        def show(session: Session) -> None:
-            asked = session.next_view
-            proposal, expected = (None, None) if asked is None else (asked.proposal, asked.expected_depth)
-            self.update(session.episode, proposal, expected, session.evidence)
-
-        session.follow(show)
 
     def save(self, path: str | Path) -> Path:
         """Write the scene as it is now as one HTML file, which opens offline."""

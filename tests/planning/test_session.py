@@ -232,21 +232,6 @@ def test_a_report_stands_upright_and_needs_no_truth(finished, tmp_path):
     assert page.count("<li>View") == 3
 
 
-def test_who_follows_is_told_of_every_image_and_proposal():
-    """Beginning with what there is, as the session then stands."""
-    session, early, late = session_of(planner=planner_of(FarthestView())), [], []
-    session.follow(lambda one: early.append((one.views, one.next_view)))
-    assert early == []
-    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    assert session.next_view is None
-    first = session.next()
-    session.next()
-    session.follow(lambda one: late.append((one.views, one.next_view)))
-    session.add(shot(first.matrix), first.matrix, depth_scale=1e-3)
-    assert early == [(1, None), (1, first), (2, None)]
-    assert late == [(1, first), (2, None)]
-
-
 BELOW = np.array([[around(angle, -0.4), around(angle, 0.6)] for angle in (0.5, 2.5, 4.5)]).reshape(-1, 4, 4)
 
 

@@ -19,15 +19,15 @@ viser = pytest.importorskip("viser", reason="viser is not installed")
 
 @pytest.fixture(scope="module")
 def watched(tmp_path_factory):
-    """A session of two images and the next question, watched from its first question on."""
+    """A session of two images and the next question, and the page that shows it."""
     folder = tmp_path_factory.mktemp("live") / "session"
     session = session_of(folder)
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     matrix = session.next().matrix
     page = LiveView(port=0)
-    page.follow(session)
     session.add(shot(matrix), matrix, depth_scale=1e-3)
     session.next()
+    page.update(session)
     yield folder, session, page
     page.stop()
 
