@@ -216,7 +216,6 @@ REFUSED = {
     "a class as an acquisition": (lambda: planner(nbv.Coverage), "Coverage"),
     "a number as a key": (lambda: P.propose(EVIDENCE, 0), "jax.random.key"),
     "several keys": (lambda: P.propose(EVIDENCE, jax.random.split(KEY, 2)), "jax.random.key"),
-    "numbers as views": (lambda: list(P.replay([1, 2])), "pairs"),
     "values of another grid": (lambda: P.imagination.carve(EVIDENCE, jnp.zeros((3, 3, 3))), "(3, 3, 3)"),
     "a batch of first poses": (lambda: nbv.simulate(P, BALL, POSES, 1, KEY), "batch"),
     "rows that differ in number": (

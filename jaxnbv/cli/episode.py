@@ -73,11 +73,11 @@ def run(
     """
     task, given = TASKS[asked.task], {"network": network, "category": category, "source": source}
     for option, value in given.items():
-        takers = ", ".join(name for name, entry in TASKS.items() if option in entry.options)
-        if value is not None and option not in task.options:
+        if value is not None and option not in task.requires + task.options:
+            takers = ", ".join(name for name, entry in TASKS.items() if option in entry.requires + entry.options)
             raise InputError(f"--task {asked.task} takes no --{option}: it is for {takers}")
         if value is None and option in task.requires:
-            raise InputError(f"--task {asked.task} needs {task.requires[option]}")
+            raise InputError(f"--task {asked.task} needs --{option}")
 
     from jaxnbv.cli.play import USUAL, first_pose, play
     from jaxnbv.cli.tasks import COMMAND_TASKS, Given, Shown, usual_first

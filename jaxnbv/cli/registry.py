@@ -4,8 +4,6 @@ A new task, search or rule is a name here and what it stands for, in `tasks.py` 
 """
 
 import importlib
-from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 
@@ -13,23 +11,21 @@ class TaskEntry(NamedTuple):
     """What the views are for.
 
     - `about`: a clause for the help.
-    - `options`: those of `run` that it takes, and which of them it `requires`, with a hint.
+    - `requires`: options of `run` without which it does not go; `options`: others that it takes.
     """
 
     about: str
+    requires: tuple[str, ...] = ()
     options: tuple[str, ...] = ()
-    requires: Mapping[str, str] = MappingProxyType({})
 
-
-_CLASSIFIER = ("network",), {"network": "a classifier: give --network FILE"}
 
 TASKS = {
-    "cross-entropy": TaskEntry("the object's class", *_CLASSIFIER),
-    "entropy": TaskEntry("its class, by the entropy that a view removes", *_CLASSIFIER),
-    "mixed": TaskEntry("its class, by one and then the other", *_CLASSIFIER),
+    "cross-entropy": TaskEntry("the object's class", ("network",)),
+    "entropy": TaskEntry("its class, by the entropy that a view removes", ("network",)),
+    "mixed": TaskEntry("its class, by one and then the other", ("network",)),
     "coverage": TaskEntry("its shape"),
-    "parts": TaskEntry("its parts", ("network", "category"), {"category": "--category, such as chair or mug"}),
-    "heat": TaskEntry("its coldest point when it is heated", ("source",)),
+    "parts": TaskEntry("its parts", ("category",), ("network",)),
+    "heat": TaskEntry("its coldest point when it is heated", options=("source",)),
 }
 
 MODELS = {

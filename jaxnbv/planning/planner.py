@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.acquisition import Acquisition, Quantity, as_acquisition
-from jaxnbv.checks import check_fields, check_key, check_type, functions_of_users, is_traced, require, shown
+from jaxnbv.checks import check_fields, check_key, check_type, functions_of_users, is_traced, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
@@ -103,11 +103,6 @@ class Planner(eqx.Module):
         """The first half of `propose`: the step's samples; None for a search that asks for none."""
         return self.imagination.sample(evidence, key) if self.search.uses_samples else None
 
-    def problem(self, evidence: Evidence, surfaces: GridSurface | None) -> Problem:
-        """What the search is asked, given the step's samples; see `choose`."""
-        around = self.imagination.surroundings
-        return Problem(evidence, self.camera, self.acquisition, surfaces, around, self.cost)
-
     def choose(self, evidence: Evidence, surfaces: GridSurface | None, key: PRNGKeyArray) -> Proposal:
         """The second half of `propose`: the search, given the step's samples (any that a model of your own drew).
 
@@ -117,8 +112,7 @@ class Planner(eqx.Module):
         check_type(evidence, Evidence, "the evidence")
         check_type(surfaces, GridSurface | None, "the surfaces")
         with functions_of_users():
-            # Its context is a program of its own, which `init` has compiled.
-            proposal = _propose(self.search, self.problem(evidence, surfaces).prepared(), key)
+            proposal = _propose(self.search, self._problem(evidence, surfaces), key)
         return _checked_proposal(proposal, surfaces)
 
     def compile(self, evidence: Evidence) -> None:
@@ -127,8 +121,7 @@ class Planner(eqx.Module):
         if self.search.uses_samples:
             nodes, cells = (count, *3 * [grid.resolution]), (count, *3 * [grid.resolution - 1])
             surfaces = GridSurface(jnp.zeros(nodes), jnp.zeros(cells, jnp.int8), grid)
-        problem = self.problem(evidence, surfaces).prepared()
-        _propose.lower(self.search, problem, jax.random.key(0)).compile()  # type: ignore[attr-defined]
+        _propose.lower(self.search, self._problem(evidence, surfaces), jax.random.key(0)).compile()  # type: ignore[attr-defined]
 
     def observe(
         self, evidence: Evidence | PointCloud, pose: Pose, scan: PointCloud, camera: Camera | None = None
@@ -159,15 +152,10 @@ class Planner(eqx.Module):
     def replay(
         self, views: Iterable[tuple[Pose, PointCloud] | tuple[Pose, PointCloud, Camera | None]]
     ) -> Iterator[Evidence]:
-        """The evidence after each of some views, poses and scans: `init` with the first, then `observe`. A third says
-        which camera took a scan.
-
-        **Raises:** `ValueError` as these do.
-        """
+        """The evidence after each of some views, poses and scans: `init` with the first, then `observe`, and raises as
+        these do. A third says which camera took a scan."""
         evidence = None
         for view in views:
-            known = isinstance(view, tuple | list) and len(view) in (2, 3)
-            require(known, f"a view is {shown(view)}; give pairs of a pose and a scan")
             evidence = self.init(*view) if evidence is None else self.observe(evidence, *view)
             yield evidence
 
@@ -177,6 +165,11 @@ class Planner(eqx.Module):
         scans = self.imagination.scan(surfaces, self.camera, pose[None])
         depth = mean_depth(jax.tree.map(lambda rows: rows[:, 0], scans), pose)
         return depth.reshape(self.camera.height, self.camera.width)
+
+    def _problem(self, evidence: Evidence, surfaces: GridSurface | None) -> Problem:
+        """What the search is asked. The acquisition's context is a program of its own, which `init` has compiled."""
+        around = self.imagination.surroundings
+        return Problem(evidence, self.camera, self.acquisition, surfaces, around, self.cost).prepared()
 
     def _known(self, evidence: Evidence | PointCloud) -> Evidence:
         return self.init(None, evidence) if isinstance(evidence, PointCloud) else self.imagination.known(evidence)
