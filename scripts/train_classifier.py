@@ -17,14 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from training import calibrate, fit, log_probabilities, train
+from training import calibrate, expected_calibration_error, fit, log_probabilities, train
 from training_clouds import LabelledClouds, Source, concatenated
 
 from jaxnbv import Coverage, Grid, Planner, PointCloud
 from jaxnbv.imagination import Imagination
 from jaxnbv.networks import Focus, InvariantClassifier, save_checkpoint
 from jaxnbv.networks.pretrained import TRAINED_POINTS, TRAINED_SIDE
-from jaxnbv.studies.engine.diagnostics import expected_calibration_error
 from jaxnbv.studies.scenes import (
     HOUSEHOLD,
     PATTERNS,

@@ -109,3 +109,14 @@ def calibrate(network: Network, clouds: PointCloud, labels: Int[AnyArray, " b"])
     best = minimize_scalar(loss, bounds=(-3.0, 3.0), method="bounded")
     old: Any = network
     return eqx.tree_at(lambda net: net.temperature, network, old.temperature * np.exp(best.x))
+
+
+def expected_calibration_error(
+    log_p: Float[AnyArray, "b classes"], labels: Int[AnyArray, " b"], bins: int = 15
+) -> float:
+    """Mean distance between confidence and accuracy over bins of equal width in confidence, weighted by their rows."""
+    p = np.exp(np.asarray(log_p, np.float64))
+    confidence, right = p.max(axis=1), p.argmax(axis=1) == np.asarray(labels)
+    index = np.minimum((confidence * bins).astype(int), bins - 1)
+    gaps = np.bincount(index, weights=confidence - right, minlength=bins)
+    return float(np.abs(gaps).sum() / len(p))

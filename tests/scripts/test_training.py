@@ -5,10 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from training import calibrate, log_probabilities, train
+from training import calibrate, expected_calibration_error, log_probabilities, train
 
 import jaxnbv as nbv
-from jaxnbv.studies.engine.diagnostics import expected_calibration_error
 
 RNG = np.random.default_rng(0)
 
@@ -81,3 +80,11 @@ def test_calibration_recovers_a_known_temperature(factor, start):
     before, after = (np.asarray(log_probabilities(n, clouds)) for n in (network, calibrated))
     assert expected_calibration_error(after, labels) < 0.03
     assert expected_calibration_error(before, labels) > 0.05
+
+
+def test_calibration_error_of_a_hand_made_example():
+    """Confidences 0.9 (right), 0.78 (wrong), 0.52 and 0.55 (both right); no bin ends at one of them."""
+    p = np.array([[0.9, 0.1], [0.22, 0.78], [0.52, 0.48], [0.45, 0.55]])
+    labels = np.array([0, 0, 0, 1])
+    for bins, expected in ((5, (0.1 + 0.78 + 0.48 + 0.45) / 4), (3, (0.48 + 0.45 + 1.68 - 1) / 4), (2, 0.25 / 4)):
+        assert expected_calibration_error(np.log(p), labels, bins=bins) == pytest.approx(expected)

@@ -1,7 +1,7 @@
-"""Whether a step's imagined surfaces carry a signal, and whether probabilities are frequencies."""
+"""Whether a step's imagined surfaces carry a signal."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Real
+from jaxtyping import Bool, Float, Real
 from scipy.stats import spearmanr
 
 from jaxnbv.checks import AnyArray
@@ -40,14 +40,3 @@ def rank_correlation(
     vary."""
     a, b = np.asarray(values)[compared], np.asarray(true_values)[compared]
     return None if np.ptp(a) == 0 or np.ptp(b) == 0 else float(spearmanr(a, b).statistic)
-
-
-def expected_calibration_error(
-    log_p: Float[AnyArray, "b classes"], labels: Int[AnyArray, " b"], bins: int = 15
-) -> float:
-    """Mean distance between confidence and accuracy over bins of equal width in confidence, weighted by their rows."""
-    p = np.exp(np.asarray(log_p, np.float64))
-    confidence, right = p.max(axis=1), p.argmax(axis=1) == np.asarray(labels)
-    index = np.minimum((confidence * bins).astype(int), bins - 1)
-    gaps = np.bincount(index, weights=confidence - right, minlength=bins)
-    return float(np.abs(gaps).sum() / len(p))

@@ -7,12 +7,7 @@ import pytest
 
 from jaxnbv import Evidence, GeometricSPSR, Grid, GridSurface, PointCloud
 from jaxnbv.imagination import Imagination
-from jaxnbv.studies.engine.diagnostics import (
-    crossed_cells,
-    expected_calibration_error,
-    rank_correlation,
-    roughness,
-)
+from jaxnbv.studies.engine.diagnostics import crossed_cells, rank_correlation, roughness
 
 
 def test_a_plane_crosses_one_layer_of_cells():
@@ -50,11 +45,3 @@ def test_rank_correlation_is_of_the_candidates_compared():
     # Ranks 1, 2, 3, 4 against 2, 3, 4, 1: 1 - 6 (1 + 1 + 1 + 9) / (4 (16 - 1)) = -0.2.
     assert rank_correlation(values, true_values, np.ones(4, bool)) == pytest.approx(-0.2)
     assert rank_correlation(np.ones(4), true_values, np.ones(4, bool)) is None
-
-
-def test_calibration_error_of_a_hand_made_example():
-    """Confidences 0.9 (right), 0.78 (wrong), 0.52 and 0.55 (both right); no bin ends at one of them."""
-    p = np.array([[0.9, 0.1], [0.22, 0.78], [0.52, 0.48], [0.45, 0.55]])
-    labels = np.array([0, 0, 0, 1])
-    for bins, expected in ((5, (0.1 + 0.78 + 0.48 + 0.45) / 4), (3, (0.48 + 0.45 + 1.68 - 1) / 4), (2, 0.25 / 4)):
-        assert expected_calibration_error(np.log(p), labels, bins=bins) == pytest.approx(expected)
