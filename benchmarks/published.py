@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxnbv import Coverage, DiscreteSearch, Planner, PointCloud
 from jaxnbv.studies.engine.study import Scene
-from jaxnbv.studies.reconstruction.study import ReconstructionStudy
+from jaxnbv.studies.reconstruction import ReconstructionStudy
 
 
 class MeanCoverage(Coverage):

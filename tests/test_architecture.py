@@ -95,7 +95,7 @@ def test_the_reader_of_imports_sees_each_kind(tmp_path):
     file = tmp_path / "probe.py"
     file.write_text(
         "import jaxnbv.checks\nfrom jaxnbv.search import base\n\ndef f():\n    from jaxnbv.viz import report\n"
-        "    import_module('jaxnbv.cli.registry')\n\nENTRY = 'jaxnbv.studies.heat.study:HeatStudy'\n"
+        "    import_module('jaxnbv.cli.registry')\n\nENTRY = 'jaxnbv.studies.parts.study:PartStudy'\n"
     )
     assert imported(file, "jaxnbv.probe") == {
         "jaxnbv.checks",
@@ -104,5 +104,5 @@ def test_the_reader_of_imports_sees_each_kind(tmp_path):
         "jaxnbv.viz",
         "jaxnbv.viz.report",
         "jaxnbv.cli.registry",
-        "jaxnbv.studies.heat.study",
+        "jaxnbv.studies.parts.study",
     }

@@ -79,8 +79,7 @@ def run_study(
         table = results(records, type(settings))
         write_text(folder / part / "results.csv", table.round(6).to_csv(index=False))
         write_bytes(folder / part / CHART, chart(table, type(settings)))
-        if entry.pictures:
-            write_pictures(records, settings, folder / part, resolve(entry.pictures))
+        write_pictures(records, settings, folder / part)
         typer.echo(f"\n{f'{part}. ' if part else ''}{summary(table, type(settings))}")
         typer.echo(f"All tables as CSV, chart and pictures: {folder / part}\n")
     if failed:

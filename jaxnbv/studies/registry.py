@@ -9,7 +9,7 @@ from typing import NamedTuple
 class Entry(NamedTuple):
     """One study.
 
-    - `study`: module and class; `pictures`: module and function that draws a scene of it, see `Tiles`.
+    - `study`: module and class.
     - `question`, `settings`: for the help.
     - `scenes`, `views`, `model`: by default.
     - `options`: names of its fields that are options of the command.
@@ -21,7 +21,6 @@ class Entry(NamedTuple):
     scenes: int
     views: int
     model: str = "known"
-    pictures: str = ""
     options: tuple[str, ...] = ()
 
 
@@ -38,8 +37,7 @@ def _of_classes(
     own: str = "meshes",
 ) -> Entry:
     """A study of classification, with one option of its own."""
-    pictures, options = "jaxnbv.studies.classification.pictures:tiles", (own, "classifier", "first")
-    return Entry(study, question, settings, scenes=100, views=5, pictures=pictures, options=options)
+    return Entry(study, question, settings, scenes=100, views=5, options=(own, "classifier", "first"))
 
 
 STUDIES = {
@@ -74,39 +72,35 @@ STUDIES = {
         "of 24 views, 8 steps of 0.03: less of everything than the paper.",
         scenes=80,
         views=6,
-        pictures="jaxnbv.studies.parts.pictures:tiles",
         options=("meshes",),
     ),
     "heat": Entry(
-        "jaxnbv.studies.heat.study:HeatStudy",
+        "jaxnbv.studies.heat:HeatStudy",
         "How near does the coldest point of the scanned cloud come to the object's? On procedural objects whose "
         "coldest point hides, or on your meshes, heated at one place.",
         "32 candidates at radius 3, 50 x 50 rays. Views are imagined with 24 x 24 rays, 8 samples on a 64^3 grid, and "
         "added to 1,024 points of the cloud: less of everything than the paper.",
         scenes=24,
         views=6,
-        pictures="jaxnbv.studies.heat.pictures:tiles",
         options=("meshes",),
     ),
     "reconstruction": Entry(
-        "jaxnbv.studies.reconstruction.study:ReconstructionStudy",
+        "jaxnbv.studies.reconstruction:ReconstructionStudy",
         "How near is the surface that a method's views give to the true one? The table of the paper's supplement.",
         "48 candidates, 16 samples on a 64^3 grid: fewer and coarser than the paper's.",
         scenes=32,
         views=5,
         model="screened",
-        pictures="jaxnbv.studies.reconstruction.pictures:tiles",
         options=("meshes",),
     ),
     "recorded": Entry(
-        "jaxnbv.studies.recorded.study:RecordedStudy",
+        "jaxnbv.studies.recorded:RecordedStudy",
         "Which frames of a recorded sequence show the most of a box? On a folder of 7-Scenes, of TUM RGB-D, or with a "
         "frames.json (see RecordedFrames).",
         "The recorded poses are the candidates. 24 x 32 rays, 8 samples on a 100^3 grid, and 2,000 points kept.",
         scenes=6,
         views=6,
         model="screened",
-        pictures="jaxnbv.studies.recorded.pictures:tiles",
         options=("folder", "box", "up"),
     ),
 }

@@ -11,12 +11,11 @@ import equinox as eqx
 import numpy as np
 
 from jaxnbv.checks import require
-from jaxnbv.scanning import load_mesh
 from jaxnbv.studies.classification.study import BASELINES, ClassificationStudy, Truth
 from jaxnbv.studies.engine.measures import Claim, Record
-from jaxnbv.studies.engine.meshes import mesh_files
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.readers import MeshFile
+from jaxnbv.studies.readers.class_meshes import mesh_files
 from jaxnbv.studies.scenes import (
     HOUSEHOLD,
     PATTERNS,
@@ -86,7 +85,7 @@ class TruckStudy(ClassificationStudy):
     seed: ClassVar[int] = 11
 
     num_points: int = eqx.field(static=True, default=1024)
-    trucks: tuple[str, ...] = eqx.field(static=True, default=())
+    trucks: tuple[MeshFile, ...] = eqx.field(static=True, default=())
 
     def __check_init__(self):
         require(
@@ -107,7 +106,7 @@ class TruckStudy(ClassificationStudy):
 
     def of_mesh(self, file: MeshFile, index: int) -> ClassMesh:
         """The cargo on the bed of one of the trucks, which take turns."""
-        truck = load_mesh(self.trucks[index % len(self.trucks)])
+        truck = self.trucks[index % len(self.trucks)].read()
         return loaded_truck(truck, file.read(), file.label, scene_key(self.seed, self.split, index))
 
 

@@ -1,36 +1,41 @@
 """What the studies of classification have in common: which methods' views tell the class, and how soon?"""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import matplotlib as mpl
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
+from matplotlib.axes import Axes
 
-from jaxnbv.acquisition import scores
+from jaxnbv.acquisition import Acquisition, scores
 from jaxnbv.checks import require
+from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale, pretrained_classifier
 from jaxnbv.planning.episode import Sensor, Step
 from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Grid, SensorNoise
-from jaxnbv.search import CandidateSearch, Problem, Proposal, TieBreakSearch
+from jaxnbv.scanning import Grid, SensorNoise, scan
+from jaxnbv.search import CandidateSearch, Problem, Proposal, Search, TieBreakSearch
 from jaxnbv.search.base import Scores, best_unvisited
 from jaxnbv.studies.classification.measures import CUE_PIXELS, MEASURES
 from jaxnbv.studies.engine.diagnostics import rank_correlation, roughness
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
-from jaxnbv.studies.engine.meshes import numbered
 from jaxnbv.studies.engine.searches import RULES
 from jaxnbv.studies.engine.study import Scene, Study
+from jaxnbv.studies.engine.tiles import Tiles, say
 from jaxnbv.studies.readers import MeshFile, class_meshes
 from jaxnbv.studies.scenes import ClassObject, ClassSet, FirstView, Framing, Split
 from jaxnbv.studies.scenes.class_object import ClassMesh, scan_cue, surface_of
 from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, MixedEntropy
 from jaxnbv.tasks.classification import ClassAcquisition, Classifier
+from jaxnbv.viz.layout import framed
+from jaxnbv.viz.style import NEW
 
 # Of random search, in each scene.
 _RUNS = 8
@@ -42,6 +47,8 @@ _ACQUISITIONS: dict[str, type[ClassAcquisition] | None] = {
     "entropy": EntropyReduction,
     "mixed": MixedEntropy,
 }
+_BACKGROUND = np.array(mpl.colors.to_rgb("#f3f5f8"))
+_PLAIN, _TINTED = np.array([0.68, 0.72, 0.78]), np.array(mpl.colors.to_rgb(NEW))
 
 
 class Truth(eqx.Module):
@@ -81,7 +88,6 @@ class ClassificationStudy(Study):
     - `framing`: how large the object stands before the sensor.
     - `split`: which scenes; tune on those of the validation split.
     - `num_points`: D is thinned to so many, once a step, before imagined scans are added to it.
-    - `meshes`: files in place of procedural objects, see `class_meshes`, where all of an object tells its class.
     - `first`: which views may be the first one.
 
     What it is:
@@ -127,27 +133,24 @@ class ClassificationStudy(Study):
     fed: ClassVar[tuple[int, int]] = (1024, 512)
     framings: ClassVar[tuple[Framing, ...]] = (Framing.CLOSE_UP,)
     solid: ClassVar[bool] = False
-    unknowing: ClassVar[tuple[str, ...]] = ("coverage", "uncertainty")
 
     classifier: Classifier = eqx.field(kw_only=True)
     imagining: Classifier | None = None
     framing: Framing = eqx.field(static=True, default=Framing.CLOSE_UP)
     split: Split = eqx.field(static=True, default=Split.TEST)
     num_points: int = eqx.field(static=True, default=512)
-    meshes: tuple[MeshFile, ...] = eqx.field(static=True, default=())
     first: FirstView = eqx.field(static=True, default=FirstView.ANY)
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
         """One for each framing, if none is given.
 
-        - `meshes`: a folder, see `class_meshes`.
         - `classifier`: the file of a network, see `load_checkpoint`, in place of the one that ships.
 
-        **Raises:** `ValueError` as these do, or if the network does not tell as many classes.
+        **Raises:** `ValueError` as it does, or if the network does not tell as many classes.
         """
         if "meshes" in options:
-            options["meshes"] = class_meshes(options["meshes"], cls.objects.classes)
+            options["meshes"] = cls.files_in(options["meshes"])
         file = options.pop("classifier", None)
         studies: dict[str, Study] = {}
         for one in (options["framing"],) if "framing" in options else cls.framings:
@@ -157,6 +160,10 @@ class ClassificationStudy(Study):
             name = one.value if len(cls.framings) > 1 else ""
             studies[name] = cls(views=views, imagination=imagination, **settings | (dict(cls.quick) if quick else {}))
         return studies
+
+    @classmethod
+    def files_in(cls, folder: str | Path) -> tuple[MeshFile, ...]:
+        return class_meshes(folder, cls.objects.classes)
 
     @classmethod
     def _classifier(cls, file: str | Path | None, longest_side: float, fed: int) -> CloudClassifier:
@@ -181,10 +188,6 @@ class ClassificationStudy(Study):
         pixels = next(iter(record["methods"].values()))["pixels"]
         return f"first view {'with' if pixels[0][0] else 'without'} {cls.cue}"
 
-    @property
-    def num_scenes(self) -> int | None:
-        return len(self.meshes) or None
-
     def scene(self, index: int) -> Scene:
         """An object; its task is the `Truth`.
 
@@ -197,17 +200,15 @@ class ClassificationStudy(Study):
 
     def thing(self, index: int) -> tuple[str, ClassObject | ClassMesh]:
         """The object of a scene and its name."""
-        if self.objects.scene is not None and not self.meshes:
+        file = self.file(index)
+        if file is None:
+            assert self.objects.scene is not None
             return f"{self.network} {index}", self.objects.scene(self.split, index, self.framing)
-        file = numbered(self.meshes, index)
         return f"{self.objects.classes[file.label]} {file.name}", self.of_mesh(file, index)
 
     def of_mesh(self, file: MeshFile, index: int) -> ClassMesh:
         """What a file of `meshes` gives."""
         return ClassMesh(file.read(), file.label)
-
-    def truth(self, scene: Scene) -> Truth:
-        return scene.task
 
     def facts(self, scene: Scene, truth: Truth, first: int) -> Record:
         return {"name": scene.name, "framing": self.framing.value, "split": self.split.value, "label": truth.label}
@@ -224,14 +225,16 @@ class ClassificationStudy(Study):
             return shows
         return int(_classify(self.classifier, seen).argmax()) != scene.task.label
 
-    def planner(self, method: str, scene: Scene) -> Planner:
-        kind, search = _ACQUISITIONS.get(method, CrossEntropy), self.search(method)
-        acquisition = kind(self.imagining or self.classifier, num_points=self.num_points) if kind else Coverage()
+    def acquisition(self, method: str, scene: Scene) -> Acquisition:
+        kind = _ACQUISITIONS.get(method, CrossEntropy)
+        return kind(self.imagining or self.classifier, num_points=self.num_points) if kind else Coverage()
+
+    def search(self, method: str, scene: Scene) -> Search:
         if method == "oracle":
-            search = OracleView(self.candidates, scans=scene.task.scans)
+            return OracleView(self.candidates, scans=scene.task.scans)
         if method == "tie-break":
-            search = TieBreakSearch(self.candidates, second=Coverage())
-        return self.planner_of(acquisition, search, scene)
+            return TieBreakSearch(self.candidates, second=Coverage())
+        return super().search(method, scene)
 
     def sensor(self, scene: Scene) -> Sensor:
         """From a candidate the same scan for all methods and views."""
@@ -274,6 +277,24 @@ class ClassificationStudy(Study):
             found["roughness"].append(rough)
         return found | {"log_p": [found["log_p"]], "pixels": [found["pixels"]] if self.cue else []}
 
+    def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
+        """The true surface in the sensor's field of view, its cue tinted; beneath it the predicted class with its
+        probability once this view is known."""
+        held, scene, names = record["methods"], self.scene(record["scene"]), self.objects.classes
+        poses = {method: self.poses_of(held[method]) for method in methods}
+        camera = Camera(height=pixels, width=pixels)
+
+        def tile(axes: Axes, method: str, view: int) -> None:
+            axes.imshow(_image(scene, camera, poses[method][view], bool(self.cue)), interpolation="antialiased")
+            if self.cue and held[method]["pixels"][0][view] >= CUE_PIXELS:
+                framed(axes, NEW, 1.6)
+            log_p = held[method]["log_p"][0][view]
+            guess = int(np.argmax(log_p))
+            say(axes, f"{names[guess]} {np.exp(log_p[guess]):.0%}", guess == record["label"])
+
+        framing = f"Framed: at least {CUE_PIXELS} {self.cue} pixels. " if self.cue else ""
+        return Tiles(f"{framing}Beneath: prediction so far, of class {names[record['label']]}. View 1 is given.", tile)
+
 
 @eqx.filter_jit
 def _noisy(scans: PointCloud, keys: Key[Array, " candidates"]) -> PointCloud:
@@ -284,3 +305,15 @@ def _noisy(scans: PointCloud, keys: Key[Array, " candidates"]) -> PointCloud:
 def _classify(classifier: Classifier, cloud: PointCloud) -> Float[Array, " classes"]:
     """log p, compiled."""
     return classifier(cloud)
+
+
+def _image(scene: Scene, camera: Camera, pose: Pose, tinted: bool) -> Float[np.ndarray, "h w 3"]:
+    """Lit from the sensor, tinted where its cue is."""
+    seen = scan(scene.surface, camera, jax.tree.map(jnp.asarray, pose))
+    on_cue = np.asarray(scene.task.thing.on_cue(seen.points)) & tinted
+    points, normals, hit = (np.asarray(array) for array in (seen.points, seen.normals, seen.mask))
+    rays = pose.position - points
+    facing = np.where(hit, np.sum(rays * normals, axis=-1) / np.linalg.norm(rays, axis=-1), 0.0)
+    colours = np.where(on_cue[:, None], _TINTED, _PLAIN) * (0.4 + 0.65 * facing)[:, None]
+    image = np.where(hit[:, None], np.clip(colours, 0.0, 1.0), _BACKGROUND)
+    return image.reshape(camera.height, camera.width, 3)

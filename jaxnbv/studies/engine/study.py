@@ -6,6 +6,7 @@ import time
 import traceback
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
 
 import equinox as eqx
@@ -24,8 +25,11 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Evidence, Grid, SensorNoise, Surface
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.search import Candidates, Search, SphereCandidates
+from jaxnbv.studies.engine.known import knowing_meshes, knowing_others
 from jaxnbv.studies.engine.measures import KNOWN, UNKNOWING, Claim, Measure, Record
 from jaxnbv.studies.engine.searches import search_of
+from jaxnbv.studies.engine.tiles import Tiles
+from jaxnbv.studies.readers.class_meshes import MeshFile, mesh_files
 from jaxnbv.studies.scenes.banks import bank_poses, shape_bank
 
 # The file of a study's chart.
@@ -55,8 +59,9 @@ class Study(eqx.Module):
     - `num_candidates`: on the sphere of `radius`, at which every search but those by gradient looks.
     - `imagination`, `num_samples`, `grid_resolution`, `capacity`: of the planner; the imagination has as many samples
       on a grid of this resolution.
-    - `camera`: the sensor; a planner may imagine fewer rays.
+    - `camera`: the sensor; a planner may imagine fewer rays, see `imagined_camera`.
     - `num_starts`, `iterations`: of searches by gradient, which look at half the candidates first.
+    - `meshes`: files, one a scene; without any, scenes are procedural.
 
     What it is:
 
@@ -91,7 +96,7 @@ class Study(eqx.Module):
     }
     quick_scenes: ClassVar[int] = 4
     bank: ClassVar[str] = ""
-    unknowing: ClassVar[tuple[str, ...]] = ()
+    unknowing: ClassVar[tuple[str, ...]] = ("coverage", "uncertainty")
 
     views: int = eqx.field(static=True, default=5)
     num_candidates: int = eqx.field(static=True, default=48)
@@ -102,6 +107,7 @@ class Study(eqx.Module):
     camera: Camera = Camera()
     num_starts: int = eqx.field(static=True, default=4)
     iterations: int = eqx.field(static=True, default=8)
+    meshes: tuple[MeshFile, ...] = eqx.field(static=True, default=())
 
     def __check_init__(self):
         require(
@@ -114,10 +120,26 @@ class Study(eqx.Module):
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> "dict[str, Study]":
         """The study that a command asks for, or several by the names of their folders; of one alone the name is "".
 
-        - `options`: settings of its own.
+        - `options`: settings of its own. `meshes` is a folder, see `files_in`; by the model `known` each of its objects
+          is planned by who has seen all others.
+
+        **Raises:** `ValueError` as `files_in` and `imagined` do.
         """
-        imagined = {"imagination": cls.imagined(model, quick=quick)}
-        return {"": cls(views=views, **imagined | (dict(cls.quick) if quick else {}) | options)}
+        files = cls.files_in(options.pop("meshes")) if "meshes" in options else ()
+        if files and model == KNOWN:
+            imagination = knowing_meshes(cls.imagined("screened", quick=quick), files)
+        else:
+            imagination = cls.imagined(model, quick=quick)
+        settings = {"imagination": imagination, "meshes": files} | (dict(cls.quick) if quick else {})
+        return {"": cls(views=views, **settings | options)}
+
+    @classmethod
+    def files_in(cls, folder: str | Path) -> tuple[MeshFile, ...]:
+        """The meshes in a folder that can be scenes.
+
+        **Raises:** `ValueError` if there is none.
+        """
+        return mesh_files(folder)
 
     @classmethod
     def imagined(cls, model: str, longest_side: float = 2.5, quick: bool = False, solid: bool = False) -> Imagination:
@@ -149,7 +171,7 @@ class Study(eqx.Module):
     @property
     def num_scenes(self) -> int | None:
         """How many scenes there are; None for as many as are asked for."""
-        return None
+        return len(self.meshes) or None
 
     @abstractmethod
     def scene(self, index: int) -> Scene:
@@ -158,20 +180,38 @@ class Study(eqx.Module):
         **Raises:** `ValueError` if there is none of this index, or it cannot be read.
         """
 
-    @abstractmethod
-    def planner(self, method: str, scene: Scene) -> Planner:
-        """The planner of one of `methods`; scenes share compilations."""
+    def file(self, index: int) -> MeshFile | None:
+        """The mesh of a scene; None where scenes are procedural.
 
-    def planner_for(self, method: str, scene: Scene) -> Planner:
+        **Raises:** `ValueError` if there is none of this index.
+        """
+        count = len(self.meshes)
+        require(
+            count == 0 or 0 <= index < count,
+            f"there is no scene {index}: the study has {count} meshes, counted from 0; run as many scenes",
+        )
+        return self.meshes[index] if count else None
+
+    @abstractmethod
+    def acquisition(self, method: str, scene: Scene) -> Acquisition:
+        """What one of `methods` looks for; scenes share compilations."""
+
+    def search(self, method: str, scene: Scene) -> Search:
+        """Of the method's name, or over all candidates by the acquisition."""
+        climbs = self.num_starts, self.iterations
+        return search_of(method, self.candidates, self.num_candidates, self.radius, *climbs)
+
+    def planner(self, method: str, scene: Scene) -> Planner:
         """The planner of a method, of one that knows no shapes too."""
-        planner = self.planner(method.removesuffix(UNKNOWING), scene)
-        if not method.endswith(UNKNOWING):
+        known = method.removesuffix(UNKNOWING)
+        planner = self.planner_of(self.acquisition(known, scene), self.search(known, scene), scene)
+        if known == method:
             return planner
         return dataclasses.replace(planner, imagination=planner.imagination.unknowing)
 
-    @abstractmethod
     def truth(self, scene: Scene) -> Any:
-        """What is measured against, computed once a scene."""
+        """What is measured against, computed once a scene: by default its task."""
+        return scene.task
 
     @abstractmethod
     def follow(self, scene: Scene, truth: Any, planner: Planner, episode: Iterator[Step]) -> Record:
@@ -180,6 +220,10 @@ class Study(eqx.Module):
     def facts(self, scene: Scene, truth: Any, first: int) -> Record:
         """What is recorded of the scene itself, as JSON."""
         return {"name": scene.name}
+
+    def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles | None:
+        """How a scene's record is drawn, in tiles of so many pixels along a side; None where it is not."""
+        return None
 
     def sensor(self, scene: Scene) -> Sensor:
         """What the camera sees of a scene."""
@@ -204,29 +248,20 @@ class Study(eqx.Module):
         """Where samples are evaluated."""
         return Grid(self.grid_resolution)
 
-    def search(self, method: str) -> Search:
-        """Of the name's kind, or over all candidates by the acquisition."""
-        climbs = self.num_starts, self.iterations
-        return search_of(method, self.candidates, self.num_candidates, self.radius, *climbs)
+    @property
+    def imagined_camera(self) -> Camera:
+        """By which planners imagine scans."""
+        return self.camera
 
     def imagination_of(self, scene: Scene) -> Imagination:
-        """The study's, or what is known of such a scene."""
-        return self.imagination
+        """What is known of such a scene: of meshes all but its own, where these are known."""
+        return knowing_others(self.imagination, self.meshes, scene.index) if self.meshes else self.imagination
 
-    def planner_of(
-        self,
-        acquisition: Acquisition,
-        search: Search,
-        scene: Scene,
-        camera: Camera | None = None,
-    ) -> Planner:
-        """A planner with the study's settings, and what is known of such a scene.
-
-        - `camera`: whose scans are imagined, by default the sensor.
-        """
+    def planner_of(self, acquisition: Acquisition, search: Search, scene: Scene) -> Planner:
+        """A planner with the study's settings, and what is known of such a scene."""
         known = self.imagination_of(scene)
         imagination = dataclasses.replace(known, grid=self.grid, num_samples=self.num_samples)
-        planned = acquisition, search, camera or self.camera, imagination
+        planned = acquisition, search, self.imagined_camera, imagination
         return Planner(*planned, capacity=self.capacity, max_views=self.views)
 
     def key(self, index: int, purpose: str) -> PRNGKeyArray:
@@ -253,7 +288,7 @@ class Study(eqx.Module):
         planners = {name: self._made(name, make, scene) for name, make in (own or {}).items()}
         first, truth = self.first_view(scene), self.truth(scene)
         record = {"scene": index, **self.facts(scene, truth, first), "first": first, "study_views": self.views}
-        planned = {name: self.planner_for(name, scene) for name in methods}
+        planned = {name: self.planner(name, scene) for name in methods}
         record["methods"] = {
             name: self.run(scene, truth, first, name, planner) for name, planner in (planned | planners).items()
         }

@@ -1,15 +1,17 @@
 """What the studies of semantic parts have in common: how many views until all parts of an object are found?"""
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar, TypeAlias
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, ClassVar, TypeAlias, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import matplotlib as mpl
 import numpy as np
 from jax.scipy.ndimage import map_coordinates
 from jaxtyping import Array, Bool, Float, Int
+from matplotlib.axes import Axes
 
 from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement
 from jaxnbv.geometry.camera import Camera
@@ -17,12 +19,15 @@ from jaxnbv.geometry.cloud import PointCloud, farthest_point_subsample
 from jaxnbv.networks import CloudSegmenter
 from jaxnbv.planning.episode import Step
 from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Grid, MeshParts
+from jaxnbv.scanning import Grid, MeshParts, TriangleMesh
+from jaxnbv.scanning.metrics import true_mesh
 from jaxnbv.scanning.sensors import PART_SETTING
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.searches import RULES
 from jaxnbv.studies.engine.study import Scene, Study
+from jaxnbv.studies.engine.tiles import Tiles, across, draw_on, say, still_of
 from jaxnbv.tasks import Coverage, SoftPartCount, part_counts
+from jaxnbv.viz.style import GREY, SERIES
 
 # The paper's N_target of its Table 1, and the authors' value for the utility, in points of the 2,048 that the network
 # is fed.
@@ -34,6 +39,8 @@ _BASELINES = (*RULES, "coverage")
 _WIDTH = 0.02
 # Of a part that is not there: its probability is zero, and so is every derivative.
 _NOWHERE = 100.0
+# Points of the true surface that are drawn.
+_DENSE = 8000
 
 
 class NearestPart(eqx.Module):
@@ -134,13 +141,8 @@ class PartDiscoveryStudy(Study):
         for target in (TARGET, max(TARGETS))
     )
     seed: ClassVar[int] = 6
-    unknowing: ClassVar[tuple[str, ...]] = ("coverage", "uncertainty")
     radius: ClassVar[float] = PART_SETTING.radius
-    quick: ClassVar[Mapping[str, Any]] = {
-        **Study.quick,
-        "num_candidates": 24,
-        "num_points": 512,
-    }
+    quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 24, "num_points": 512}
 
     views: int = eqx.field(static=True, default=6)
     num_samples: int = eqx.field(static=True, default=8)
@@ -156,14 +158,16 @@ class PartDiscoveryStudy(Study):
     def true_parts(self, scene: Scene, points: Float[Array, "n 3"]) -> Int[Array, " n"]:
         """The true part of points of the surface: its place among those of the segmenter."""
 
-    def planner(self, method: str, scene: Scene) -> Planner:
-        camera = Camera(height=self.imagined_rays, width=self.imagined_rays)
-        acquisition: Acquisition = Coverage()
-        if method in _BY_PARTS:
-            target = TARGET * self.num_points / NETWORK_POINTS
-            soft_count = SoftPartCount(self.segmenter_of(scene, self.num_points), target)
-            acquisition = ExpectedUtilityImprovement(soft_count, self.num_points)
-        return self.planner_of(acquisition, self.search(method), scene, camera)
+    @property
+    def imagined_camera(self) -> Camera:
+        return Camera(height=self.imagined_rays, width=self.imagined_rays)
+
+    def acquisition(self, method: str, scene: Scene) -> Acquisition:
+        if method not in _BY_PARTS:
+            return Coverage()
+        target = TARGET * self.num_points / NETWORK_POINTS
+        soft_count = SoftPartCount(self.segmenter_of(scene, self.num_points), target)
+        return ExpectedUtilityImprovement(soft_count, self.num_points)
 
     def follow(self, scene: Scene, truth: list[int], planner: Planner, episode: Iterator[Step]) -> Record:
         """How many points the segmenter gives to each part after each view; it stops once every part has the largest
@@ -175,6 +179,32 @@ class PartDiscoveryStudy(Study):
             if min(counts[-1]) >= max(TARGETS):
                 break
         return {"counts": counts}
+
+    def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
+        """The cloud so far over the true shape, coloured by the part that the segmenter says; beneath it how many parts
+        have N_target = 60 points. A method ends once every part has 100."""
+        scene, held = self.scene(record["scene"]), record["methods"]
+        asked, segmenter = np.asarray(self.truth(scene)), self.segmenter_of(scene)
+        own, point = [SERIES[part % len(SERIES)] for part in range(len(asked))], jnp.zeros((1, 3))
+        labels = jax.eval_shape(segmenter, PointCloud(point, point, jnp.zeros(1, bool))).shape[1]
+        colours = np.tile(mpl.colors.to_rgb(GREY), (labels, 1))
+        colours[asked] = mpl.colors.to_rgba_array(own)[:, :3]
+        mesh = cast(TriangleMesh, true_mesh(scene.surface))
+        points = mesh.sample_points(jax.random.key(0), _DENSE)
+        of = np.asarray(self.true_parts(scene, jnp.asarray(points, jnp.float32)))
+        still = still_of(mesh, across(record), pixels)
+        known = {method: self.seen(scene, held[method]) for method in methods}
+
+        def tile(axes: Axes, method: str, view: int) -> None:
+            fed, predicted = segmenter.predict(known[method][view][1].cloud)
+            mask = np.asarray(fed.mask)
+            draw_on(axes, still, np.asarray(fed.points)[mask], colours[np.asarray(predicted)[mask]])
+            found = sum(count >= TARGET for count in held[method]["counts"][view])
+            say(axes, f"{found} of {len(asked)} parts", found == len(asked))
+
+        marks = {name: {"marker": "o", "color": colour} for name, colour in zip(record["parts"], own, strict=True)}
+        caption = f"Points: the part that the segmenter says. Beneath: parts with {TARGET} points. View 1 is given."
+        return Tiles(caption, tile, lambda axes: draw_on(axes, still, points, colours[of]), marks=marks)
 
 
 @eqx.filter_jit

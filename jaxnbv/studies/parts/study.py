@@ -3,7 +3,6 @@
 Objects are procedural and a network tells their parts, or they are mesh files whose nodes are parts and an oracle does.
 """
 
-import os
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -12,17 +11,16 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxnbv.checks import require
-from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.imagination import Imagination
 from jaxnbv.networks import CATEGORIES, CloudSegmenter, part_segmenter
 from jaxnbv.scanning import Grid, MeshParts, SDFSurface, load_parts, scan
 from jaxnbv.scanning.mesh_files import read_nodes
-from jaxnbv.studies.engine.measures import KNOWN, Record
-from jaxnbv.studies.engine.meshes import knowing_meshes, knowing_others, knowing_those, numbered
+from jaxnbv.studies.engine.known import knowing_those
+from jaxnbv.studies.engine.measures import Record
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.parts.discovery import NETWORK_POINTS, TARGETS, NearestPart, PartDiscoveryStudy
-from jaxnbv.studies.readers.class_meshes import is_mesh_file, taking_turns
+from jaxnbv.studies.readers.class_meshes import MeshFile, mesh_files, taking_turns
 from jaxnbv.studies.scenes import Split, part_scene
 from jaxnbv.surfaces.known_shapes import kind_of
 from jaxnbv.tasks import part_counts
@@ -42,7 +40,7 @@ class MeshPartStudy(PartDiscoveryStudy):
     """The parts of real objects, told by `NearestPart`, so that planning is seen without the network's errors. Settings
     as of `PartDiscoveryStudy`, and
 
-    - `meshes`: files whose nodes are parts, and how many each has.
+    - `meshes`: files whose nodes are parts; `room`: for as many parts as any has.
 
     The planner is asked for all parts. It is measured on those that can be found: of which all candidates together show
     as many points as the largest N_target asks.
@@ -54,39 +52,34 @@ class MeshPartStudy(PartDiscoveryStudy):
     )
     seed: ClassVar[int] = 12
 
-    meshes: tuple[tuple[str, int], ...] = eqx.field(static=True, kw_only=True)
+    room: int = eqx.field(static=True, kw_only=True)
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
+        room = max(len(read_nodes(file.path)) for file in cls.files_in(options["meshes"]))
+        return super().configured(model, views, quick, room=room, **options)
+
+    @classmethod
+    def files_in(cls, folder: str | Path) -> tuple[MeshFile, ...]:
+        """Those of two nodes or more, by folder and name; folders take turns.
+
+        **Raises:** `ValueError` if there is no such mesh, or one cannot be read.
         """
-        - `meshes`: a folder, see `part_files`. By the model `known` each object is planned by who has seen all others.
-
-        **Raises:** `ValueError` as `part_files` does.
-        """
-        files = part_files(options["meshes"])
-        plain = cls.imagined("screened" if model == KNOWN else model, quick=quick)
-        imagination = knowing_meshes(plain, [file for file, _ in files]) if model == KNOWN else plain
-        given = options | {"meshes": files, "imagination": imagination}
-        return super().configured("screened", views, quick, **given)
-
-    def imagination_of(self, scene: Scene) -> Imagination:
-        """Who has seen all objects but this one."""
-        return knowing_others(self.imagination, scene.index)
-
-    @property
-    def num_scenes(self) -> int | None:
-        return len(self.meshes)
+        by_class: dict[str, list[MeshFile]] = {}
+        for file in mesh_files(folder):
+            if len(read_nodes(file.path)) > 1:
+                kind = Path(file.path).parent.name
+                by_class.setdefault(kind, []).append(file._replace(name=f"{kind} {file.name}"))
+        require(len(by_class) > 0, f"the folder {folder} holds no mesh of two nodes or more: each part must be a node")
+        return tuple(taking_turns(by_class.values()))
 
     def scene(self, index: int) -> Scene:
-        """An object; its task is the `PartMesh`.
-
-        **Raises:** `ValueError` if there is no mesh of this index, or it cannot be read.
-        """
-        file = Path(numbered(self.meshes, index)[0])
-        parts = load_parts(file)
-        room = max(count for _, count in self.meshes)
-        oracle = NearestPart.of(parts, room, _GRID, NETWORK_POINTS)
-        return Scene(index, f"{file.parent.name} {file.stem}", parts.mesh, PartMesh(parts, oracle))
+        """An object; its task is the `PartMesh`."""
+        file = self.file(index)
+        assert file is not None
+        parts = load_parts(file.path)
+        oracle = NearestPart.of(parts, self.room, _GRID, NETWORK_POINTS)
+        return Scene(index, file.name, parts.mesh, PartMesh(parts, oracle))
 
     def segmenter_of(self, scene: Scene, num_points: int | None = None) -> NearestPart:
         """The oracle."""
@@ -98,8 +91,7 @@ class MeshPartStudy(PartDiscoveryStudy):
 
     def truth(self, scene: Scene) -> list[int]:
         """The parts that can be found."""
-        camera = Camera(height=self.imagined_rays, width=self.imagined_rays)
-        seen = scan(scene.surface, camera, self.candidates.poses())
+        seen = scan(scene.surface, self.imagined_camera, self.candidates.poses())
         joined = PointCloud(seen.points.reshape(-1, 3), seen.normals.reshape(-1, 3), seen.mask.reshape(-1))
         counts = part_counts(scene.task.oracle(joined))
         found = [int(part) for part in np.flatnonzero(np.asarray(counts) >= max(TARGETS))]
@@ -108,25 +100,8 @@ class MeshPartStudy(PartDiscoveryStudy):
 
     def facts(self, scene: Scene, truth: list[int], first: int) -> Record:
         names = scene.task.parts.names
-        category = Path(self.meshes[scene.index][0]).parent.name
+        category = Path(self.meshes[scene.index].path).parent.name
         return {"name": scene.name, "category": category, "parts": [names[part] for part in truth], "of": len(names)}
-
-
-def part_files(folder: str | Path) -> tuple[tuple[str, int], ...]:
-    """The mesh files in a folder, or in the folders in it, that have two nodes or more, and how many; classes take
-    turns.
-
-    **Raises:** `ValueError` if there is no such folder, or no such mesh, or one cannot be read.
-    """
-    folder = Path(folder)
-    require(os.path.isdir(folder), f"there is no folder {folder}: give one that holds mesh files")
-    by_class: dict[Path, list[tuple[str, int]]] = {}
-    for file in sorted(path for path in folder.rglob("*") if is_mesh_file(path)):
-        count = len(read_nodes(file))
-        if count > 1:
-            by_class.setdefault(file.parent, []).append((str(file), count))
-    require(len(by_class) > 0, f"the folder {folder} holds no mesh of two nodes or more: each part must be a node")
-    return tuple(taking_turns(by_class.values()))
 
 
 class PartStudy(PartDiscoveryStudy):
@@ -145,10 +120,7 @@ class PartStudy(PartDiscoveryStudy):
     def configured(
         cls, model: str, views: int, quick: bool, meshes: str | Path | None = None, **options: Any
     ) -> dict[str, Study]:
-        """With a folder of meshes, that of their parts.
-
-        **Raises:** `ValueError` as `part_files` does.
-        """
+        """With a folder of meshes, that of their parts."""
         if meshes is not None:
             return MeshPartStudy.configured(model, views, quick, meshes=meshes, **options)
         return super().configured(model, views, quick, segmenter=part_segmenter(category=0), **options)

@@ -47,11 +47,6 @@ class MeshFile(NamedTuple):
         return load_mesh(self.path, self.up)
 
 
-def is_mesh_file(path: Path) -> bool:
-    """Whether a file's name ends as a format that trimesh reads."""
-    return path.suffix[1:].lower() in trimesh.available_formats() and path.is_file()
-
-
 def taking_turns(groups: Iterable[Sequence[_T]]) -> list[_T]:
     """The first of each group, then the second of each that has one, and so on."""
     turns = itertools.chain.from_iterable(itertools.zip_longest(*groups))
@@ -70,12 +65,9 @@ def class_meshes(folder: str | Path, classes: Sequence[str]) -> tuple[MeshFile, 
     **Raises:** `ValueError` if there is no such folder, none of a class, or one without a mesh; and unless classes are
     names.
     """
-    folder = Path(folder)
     named = isinstance(classes, list | tuple) and all(isinstance(name, str) for name in classes)
     require(named, f"the classes are {shown(classes)}: give a list of names")
-    require(
-        os.path.isdir(folder), f"there is no folder {folder}: give one that holds a folder of meshes for each class"
-    )
+    folder = _existing(folder)
     folder = folder / "raw_scans" if (folder / "raw_scans").is_dir() else folder
     there = {_plain(path.name): path for path in sorted(folder.iterdir()) if path.is_dir()}
     found = [(label, there.get(_plain(name), there.get(_SYNSETS.get(name, "")))) for label, name in enumerate(classes)]
@@ -88,11 +80,26 @@ def _plain(name: str) -> str:
     return name.lower().replace("_", " ")
 
 
+def mesh_files(folder: str | Path) -> tuple[MeshFile, ...]:
+    """The meshes in a folder, at any depth and sorted, all of the label 0.
+
+    **Raises:** `ValueError` if there is no such folder, or no mesh in it.
+    """
+    return tuple(_of_class(_existing(folder), 0))
+
+
+def _existing(folder: str | Path) -> Path:
+    require(os.path.isdir(folder), f"there is no folder {folder}: give one that holds meshes")
+    return Path(folder)
+
+
 def _of_class(folder: Path, label: int) -> list[MeshFile]:
+    formats = trimesh.available_formats()
     for pattern, up in _LAYOUTS.items():
-        files = [file for file in sorted(folder.glob(pattern.format(name=folder.name))) if is_mesh_file(file)]
+        found = sorted(folder.glob(pattern.format(name=folder.name)))
+        files = [file for file in found if file.suffix[1:].lower() in formats and file.is_file()]
         if files:
             # Where each object has a folder, this names it.
             names = [file.relative_to(folder).parts[0] if pattern.startswith("*/") else file.stem for file in files]
             return [MeshFile(label, name, str(file), up) for name, file in zip(names, files, strict=True)]
-    raise InputError(f"the folder {folder} holds no mesh: unpack it again, or take it away")
+    raise InputError(f"the folder {folder} holds no mesh: its files must end in {', '.join(sorted(formats))}")

@@ -16,16 +16,13 @@ from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.imagination import Imagination
 from jaxnbv.networks import InvariantClassifier, save_checkpoint
-from jaxnbv.search import FarthestView
 from jaxnbv.studies.classification.objects import ModelNet10Study, OmniObject3DStudy, PyramidStudy, TruckStudy
-from jaxnbv.studies.classification.pictures import tiles
 from jaxnbv.studies.engine.chart import chart
 from jaxnbv.studies.engine.pictures import write_pictures
 from jaxnbv.studies.engine.results import results, summary
 from jaxnbv.studies.readers import class_meshes
 from jaxnbv.studies.scenes import HOUSEHOLD, FirstView
 from jaxnbv.surfaces import GeometricSPSR
-from jaxnbv.tasks import Coverage
 
 SCENE, CANDIDATES = 4, 12
 CAMERA = Camera(height=24, width=24)
@@ -91,7 +88,7 @@ def test_records_tables_charts_and_pictures(kind, tmp_path):
     assert ("seen" in {*table["quantity"]}) == bool(kind.cue)
     assert kind.title in summary(table, kind)
     assert chart(table, kind)[:4] == b"\x89PNG"
-    (picture,) = write_pictures([found], small(kind), tmp_path, tiles, pixels=24)
+    (picture,) = write_pictures([found], small(kind), tmp_path, pixels=24)
     with Image.open(picture) as image:
         assert np.asarray(image.convert("L")).std() > 5
 
@@ -114,7 +111,7 @@ def test_meshes_in_place_of_procedural_objects(tmp_path):
     # A box of sides 2.5, 1.25 and 0.625; the noise is 0.01.
     away = np.abs(np.abs(seen) - [1.25, 0.625, 0.3125]).min(axis=1)
     assert away.max() < 0.06
-    (picture,) = write_pictures([found], study, tmp_path, tiles, pixels=24)
+    (picture,) = write_pictures([found], study, tmp_path, pixels=24)
     assert picture.exists()
     with pytest.raises(InputError, match="no scene 2: the study has 2 meshes"):
         study.run_scene(2)
@@ -136,11 +133,3 @@ def test_a_network_of_ones_own_takes_the_place_of_the_shipped_one(tmp_path):
     for name, word in (("meshes", "--classifier FILE"), ("classifier", "--meshes FOLDER.* lemon, mango")):
         with pytest.raises(InputError, match=f"nothing ships for the study omniobject3d: give {word}"):
             OmniObject3DStudy.configured("screened", 2, True, **{name: given[name]})
-
-
-def test_a_method_of_ones_own_on_household_objects():
-    def own(study, scene):
-        return study.planner_of(Coverage(), FarthestView(study.candidates), scene)
-
-    found = small(ModelNet10Study).run_scene(SCENE, ("farthest",), {"mine:own": own})["methods"]
-    np.testing.assert_allclose(found["mine:own"]["log_p"], found["farthest"]["log_p"], atol=1e-5)

@@ -6,6 +6,7 @@ from typing import ClassVar
 import jax
 import numpy as np
 import pytest
+import trimesh
 from test_pyramid_study import CAMERA, SCENE, chosen, evidence_of, small_study, step_key, without_time
 
 import jaxnbv as nbv
@@ -13,8 +14,7 @@ from jaxnbv.cli.registry import STUDY_MODELS, resolve
 from jaxnbv.imagination import MODELS
 from jaxnbv.studies.classification.objects import PyramidStudy
 from jaxnbv.studies.engine.measures import KNOWN
-from jaxnbv.studies.engine.meshes import knowing_meshes, knowing_others
-from jaxnbv.studies.heat.study import HeatStudy
+from jaxnbv.studies.heat import HeatStudy
 from jaxnbv.studies.parts.study import PartStudy
 from jaxnbv.studies.registry import STUDIES
 from jaxnbv.studies.scenes import Split, pyramid_scene
@@ -51,7 +51,7 @@ FEW = [("cross-entropy", 2), ("uncertainty-screened", 2)]
 def test_a_choice_is_that_of_the_planner_with_the_same_key(record, method, view):
     study = knowing_study()
     scene, poses = study.scene(SCENE), np.asarray(study.candidates.poses().position)
-    planner, candidates = study.planner_for(method, scene), chosen(study, record["methods"][method])
+    planner, candidates = study.planner(method, scene), chosen(study, record["methods"][method])
     evidence = evidence_of(study, planner, scene, candidates[:view])
     proposed = planner.propose(evidence, step_key(study, view)).pose.position
     np.testing.assert_allclose(poses[candidates[view]], proposed, atol=1e-5)
@@ -61,10 +61,6 @@ def test_the_methods_that_know_no_shapes_are_those_of_a_study_without(record):
     plain = small_study().run_scene(SCENE, ("coverage", "uncertainty"))
     for method in ("coverage", "uncertainty"):
         assert without_time(record["methods"][f"{method}-screened"]) == without_time(plain["methods"][method])
-
-
-def test_a_scene_can_be_run_again(record):
-    assert without_time(knowing_study().run_scene(SCENE, METHODS)) == without_time(record)
 
 
 def test_the_models_of_studies_are_known_and_those_of_the_library():
@@ -101,17 +97,14 @@ def test_parts_are_planned_with_the_shapes_of_their_category():
 
 
 def test_of_meshes_each_is_planned_by_who_has_seen_the_others(tmp_path, monkeypatch):
-    import trimesh
-
     monkeypatch.setattr(mesh_shapes.platformdirs, "user_cache_path", lambda name: tmp_path / "cache")
-    files = []
     for index in range(3):
-        files.append(str(tmp_path / f"box{index}.ply"))
-        trimesh.creation.box((1.0, 0.5 + 0.1 * index, 0.4)).export(files[-1])
-    imagination = knowing_meshes(nbv.Imagination(), files)
-    assert imagination.model.bank.names == ("box0 0", "box1 1", "box2 2")
-    assert knowing_others(imagination, 1).model.bank.names == ("box0 0", "box2 2")
-    assert knowing_others(nbv.Imagination(), 1) == nbv.Imagination()
+        trimesh.creation.box((1.0, 0.5 + 0.1 * index, 0.4)).export(tmp_path / f"box{index}.ply")
+    (study,) = HeatStudy.configured(KNOWN, 2, quick=True, meshes=tmp_path).values()
+    assert study.imagination.model.bank.names == ("box0 0", "box1 1", "box2 2")
+    assert study.planner("coverage", study.scene(1)).imagination.model.bank.names == ("box0 0", "box2 2")
+    (plain,) = HeatStudy.configured("paper", 2, quick=True, meshes=tmp_path).values()
+    assert plain.imagination_of(plain.scene(1)) == plain.imagination
 
 
 def test_one_who_knows_no_shapes_any_more_is_as_before():

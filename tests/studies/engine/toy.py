@@ -4,7 +4,6 @@ from typing import ClassVar
 
 from jaxnbv.scanning import SDFSurface
 from jaxnbv.scanning.sdf import Sphere
-from jaxnbv.search import FarthestView, RandomView
 from jaxnbv.studies.engine.measures import Claim, Measure
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.tasks import Coverage
@@ -32,12 +31,8 @@ class ToyStudy(Study):
     def scene(self, index):
         return Scene(index, f"ball {index}", SDFSurface(Sphere(1.0)))
 
-    def planner(self, method, scene):
-        search = {"farthest": FarthestView, "random": RandomView}[method]
-        return self.planner_of(Coverage(), search(self.candidates), scene)
-
-    def truth(self, scene):
-        return None
+    def acquisition(self, method, scene):
+        return Coverage()
 
     def follow(self, scene, truth, planner, episode):
         return {"points": [int(view.cloud.count) for view, *_ in episode]}

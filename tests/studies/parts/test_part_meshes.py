@@ -13,8 +13,7 @@ from jaxnbv.imagination import Imagination
 from jaxnbv.scanning import Grid, load_parts
 from jaxnbv.studies.engine.pictures import write_pictures
 from jaxnbv.studies.parts.discovery import NearestPart
-from jaxnbv.studies.parts.pictures import tiles
-from jaxnbv.studies.parts.study import MeshPartStudy, PartStudy, part_files
+from jaxnbv.studies.parts.study import MeshPartStudy, PartStudy
 from jaxnbv.surfaces import GeometricSPSR
 
 # Scene coordinates: the longest side is 2.5 and the box around all is centred. What is hidden stands within the post.
@@ -53,15 +52,17 @@ def small_study(folder, **settings):
         "grid_resolution": 20,
     }
     limits = {"capacity": 1500, "camera": Camera(height=32, width=32), "imagined_rays": 12, "num_points": 100}
-    return MeshPartStudy(meshes=part_files(folder), **(small | limits | settings))
+    return MeshPartStudy(meshes=MeshPartStudy.files_in(folder), room=3, **(small | limits | settings))
 
 
 def test_files_of_one_node_are_passed_over(folder):
-    assert part_files(folder) == ((str(folder / "table/a.glb"), 3), (str(folder / "table/b.glb"), 2))
+    found = MeshPartStudy.files_in(folder)
+    assert [(file.name, file.path) for file in found] == [
+        ("table a", str(folder / "table/a.glb")),
+        ("table b", str(folder / "table/b.glb")),
+    ]
     with pytest.raises(InputError, match="no mesh of two nodes or more"):
-        part_files(folder / "bench")
-    with pytest.raises(InputError, match="there is no folder"):
-        part_files(folder / "chair")
+        MeshPartStudy.files_in(folder / "bench")
 
 
 def test_points_belong_to_the_nearest_box(folder):
@@ -113,12 +114,12 @@ def test_it_asks_for_the_parts_that_can_be_seen_and_counts_their_points(folder):
 def test_the_command_takes_a_folder(folder, tmp_path):
     (study,) = PartStudy.configured("screened", 3, quick=True, meshes=folder).values()
     assert isinstance(study, MeshPartStudy)
-    assert [count for _, count in study.meshes] == [3, 2]
+    assert study.room == 3
     assert study.num_candidates == PartStudy.quick["num_candidates"]
 
 
 @pytest.mark.slow
 def test_its_pictures(folder, tmp_path):
     study = small_study(folder)
-    (path,) = write_pictures([study.run_scene(0, ("farthest",))], study, tmp_path / "out", tiles, pixels=24)
+    (path,) = write_pictures([study.run_scene(0, ("farthest",))], study, tmp_path / "out", pixels=24)
     assert path.read_bytes()[:4] == b"\x89PNG"

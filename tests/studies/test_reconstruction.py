@@ -1,4 +1,4 @@
-"""The reconstruction study on a small scale."""
+"""The reconstruction study on a small scale, and its measures of records made by hand."""
 
 import json
 
@@ -16,12 +16,11 @@ from jaxnbv.scanning.metrics import coverage, surface_distance, truth_points
 from jaxnbv.scanning.screened_poisson import has_poisson
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.storage import describe
-from jaxnbv.studies.engine.meshes import mesh_files
+from jaxnbv.studies import reconstruction
 from jaxnbv.studies.engine.pictures import write_pictures
-from jaxnbv.studies.engine.records import RecordFolder
-from jaxnbv.studies.reconstruction import pictures
-from jaxnbv.studies.reconstruction import study as reconstruction_study
-from jaxnbv.studies.reconstruction.study import MEAN, POISSON, ReconstructionStudy, reconstruct
+from jaxnbv.studies.engine.results import results, summary
+from jaxnbv.studies.readers.class_meshes import mesh_files
+from jaxnbv.studies.reconstruction import MEAN, POISSON, ReconstructionStudy, reconstruct
 
 # Those that draw no samples compile in a fraction of the time; all planners are of the same make.
 RUN = ("farthest", "random")
@@ -40,7 +39,7 @@ def meshes(tmp_path_factory):
     return folder
 
 
-def small_study(meshes=None, views=3, **settings):
+def small_study(folder=None, views=3, **settings):
     model = nbv.GeometricSPSR(lengthscale=0.05, truncation=8)
     small = {
         "num_candidates": CANDIDATES,
@@ -49,24 +48,19 @@ def small_study(meshes=None, views=3, **settings):
         "grid_resolution": 20,
         "capacity": 250,
     }
+    meshes = mesh_files(folder) if folder else ()
     return ReconstructionStudy(meshes=meshes, views=views, **(small | settings))
 
 
-_records: dict = {}
-
-
-@pytest.fixture
+@pytest.fixture(scope="module")
 def record(meshes):
-    if not _records:
-        _records["torus"] = small_study(meshes).run_scene(1, RUN)
-    return _records["torus"]
+    return small_study(meshes).run_scene(1, RUN)
 
 
 def test_a_record_is_json_and_holds_every_method(record):
     assert json.loads(json.dumps(record, allow_nan=False)) == record
-    assert (record["scene"], record["name"]) == (1, "b_torus.OBJ")
+    assert (record["scene"], record["name"]) == (1, "b_torus")
     assert list(record["methods"]) == list(RUN)
-    assert ReconstructionStudy.methods == ("coverage", "new-surface", "farthest", "uncertainty", "random")
     for method in record["methods"].values():
         assert len({tuple(view["position"]) for view in method["views"]}) == 3
         assert 0 < method["coverage"][0] < method["coverage"][-1] <= 1
@@ -77,14 +71,6 @@ def test_a_record_is_json_and_holds_every_method(record):
                 continue
             assert found["chamfer"] == found["accuracy"] + found["completeness"]
             assert 0 < found["chamfer"] < 2 * found["hausdorff"]
-
-
-def test_a_scene_can_be_run_again_with_some_of_the_methods(record, meshes):
-    again = small_study(meshes).run_scene(1, ("random",))
-    assert list(again["methods"]) == ["random"]
-    for name, method in again["methods"].items():
-        assert method["views"] == record["methods"][name]["views"]
-        assert method["reconstructions"] == record["methods"][name]["reconstructions"]
 
 
 def test_planners_differ_in_what_they_seek_and_their_search_alone():
@@ -138,7 +124,7 @@ def test_distances_are_those_of_the_reconstruction_from_the_last_cloud(record, m
 
 
 def test_without_pymeshlab_the_mean_alone_is_measured(monkeypatch, meshes):
-    monkeypatch.setattr(reconstruction_study, "has_poisson", lambda: False)
+    monkeypatch.setattr(reconstruction, "has_poisson", lambda: False)
     found = small_study(meshes).run_scene(1, ("farthest",))["methods"]["farthest"]["reconstructions"]
     assert found[POISSON] is None
     assert found[MEAN]["chamfer"] > 0
@@ -155,7 +141,7 @@ def test_procedural_scenes_differ_and_are_named():
 
 def test_mesh_files_are_sorted_and_what_cannot_be_read_is_named(meshes, tmp_path):
     study = small_study(meshes)
-    assert [study.scene(index).name for index in (0, 1)] == ["a_box.ply", "b_torus.OBJ"]
+    assert [study.scene(index).name for index in (0, 1)] == ["a_box", "b_torus"]
     np.testing.assert_allclose(np.ptp(study.scene(0).surface.vertices, axis=0), [2.5 / 3, 5 / 3, 2.5])
     with pytest.raises(InputError, match="no scene 2: the study has 2 meshes"):
         study.scene(2)
@@ -168,38 +154,62 @@ def test_mesh_files_are_sorted_and_what_cannot_be_read_is_named(meshes, tmp_path
         small_study(tmp_path).run_scene(0)
 
 
-def test_bad_settings_are_refused(meshes):
-    for settings in ({"views": 1}, {"views": 11}):
-        with pytest.raises(InputError, match="at least two views"):
-            small_study(**settings)
-    with pytest.raises(InputError, match="unknown methods: heat; choose from coverage"):
-        small_study(meshes).run_scene(0, ("heat", "random"))
-
-
-def test_an_interrupted_study_goes_on(record, meshes, tmp_path):
-    asked = []
-
-    def run(index):
-        asked.append(index)
-        return record | {"scene": index}
-
-    config = {"study": describe(small_study(meshes))}
-    RecordFolder(tmp_path, config).collect(range(1), run, progress=False)
-    found = RecordFolder(tmp_path, config).collect(range(2), run, progress=False)
-    assert asked == [0, 1]
-    assert found == [record | {"scene": 0}, record]
-    for other in (small_study(meshes, views=4), small_study()):
-        with pytest.raises(InputError, match="another study"):
-            RecordFolder(tmp_path, {"study": describe(other)})
-
-
 def test_the_pictures_show_something(record, meshes, tmp_path, monkeypatch):
-    monkeypatch.setattr(pictures, "_DENSE", 2000)
+    monkeypatch.setattr(reconstruction, "_DENSE", 2000)
     folder = tmp_path / "pictures"
-    (picture,) = write_pictures([record], small_study(meshes), folder, pictures.tiles, pixels=80)
+    (picture,) = write_pictures([record], small_study(meshes), folder, pixels=80)
     assert picture.name == "scene_0001.png"
     # The truth and two methods, side by side.
     image = np.asarray(Image.open(picture).convert("L"))
     assert image.std() > 5
     for strip in np.array_split(image[:, 100:], 3, axis=1):
         assert strip.std() > 5
+
+
+def found(accuracy, completeness, hausdorff):
+    both = accuracy + completeness
+    return {"chamfer": both, "accuracy": accuracy, "completeness": completeness, "hausdorff": hausdorff}
+
+
+def made_record(scene, **methods):
+    """Of each method the distances of Poisson reconstruction and of the mean."""
+    return {"scene": scene, "name": f"object {scene}", "first": 0, "seconds": 1.0} | {
+        "methods": {
+            name: {
+                "candidates": [0, 1],
+                "coverage": [0.25, 0.5 + 0.1 * scene],
+                "points": 100,
+                "reconstructions": {POISSON: poisson, MEAN: mean},
+            }
+            for name, (poisson, mean) in methods.items()
+        }
+    }
+
+
+def hand_made():
+    return [
+        made_record(0, farthest=(None, found(0.1, 0.1, 0.5)), coverage=(None, found(0.05, 0.05, 0.6))),
+        made_record(
+            1,
+            farthest=(found(0.1, 0.2, 0.4), found(0.2, 0.2, 0.9)),
+            coverage=(found(0.1, 0.1, 0.5), found(0.1, 0.2, 0.8)),
+        ),
+    ]
+
+
+def test_distances_are_of_the_scenes_that_have_them():
+    table = results(hand_made(), ReconstructionStudy).set_index(["at", "quantity", "method"]).sort_index()
+    row = table.loc[MEAN, "chamfer", "farthest"]
+    # Of 0.2 and 0.4: a standard deviation of 0.1414, over the root of two.
+    assert (row["mean"], row["standard_error"], row["scenes"]) == (pytest.approx(0.3), pytest.approx(0.1), 2)
+    # Both scenes differ by -0.1, so any resample does; the Hausdorff distances by 0.1 and -0.1.
+    assert [row["lead"], row["lead_low"], row["lead_high"]] == pytest.approx([-0.1] * 3)
+    assert table.loc[(MEAN, "hausdorff", "farthest"), "lead"] == pytest.approx(0.0, abs=1e-12)
+    poisson = table.loc[POISSON, "hausdorff", "farthest"]
+    assert (poisson["mean"], poisson["scenes"]) == (pytest.approx(0.4), 1)
+    assert table.loc[(2, "covered", "farthest"), "mean"] == pytest.approx(0.55)
+
+
+def test_the_text_goes_without_a_reconstruction_that_no_scene_has():
+    assert POISSON in summary(results(hand_made(), ReconstructionStudy), ReconstructionStudy)
+    assert POISSON not in summary(results(hand_made()[:1], ReconstructionStudy), ReconstructionStudy)

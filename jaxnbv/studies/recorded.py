@@ -1,7 +1,7 @@
 """The study of a recorded sequence: what its frames show of a box, when they are chosen one by one."""
 
 import functools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -10,9 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from matplotlib.axes import Axes
 
 from jaxnbv.acquisition import Acquisition, Quantity
 from jaxnbv.checks import InputError, require
+from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
@@ -29,10 +31,12 @@ from jaxnbv.search.base import Rule
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.searches import RULES
 from jaxnbv.studies.engine.study import Scene, Study
+from jaxnbv.studies.engine.tiles import Tiles, say
 from jaxnbv.studies.readers.recorded import RecordedFrames
 from jaxnbv.tasks import Coverage, NewSurface
+from jaxnbv.viz.style import GREY, INK, LINE, NEW
 
-NEW, COVERAGE, EVEN, ORACLE = "new surface", "coverage", "evenly spaced", "oracle"
+NEW_AREA, COVERAGE, EVEN, ORACLE = "new surface", "coverage", "evenly spaced", "oracle"
 # A voxel that fewer frames have seen may be noise.
 _SEEN_BY = 3
 _VOXELS_ALONG_BOX = 80
@@ -133,8 +137,8 @@ class RecordedStudy(Study):
         "Share of the voxels in the box, of those that three frames or more have seen, that the chosen frames show.\n"
         "The oracle knows what each frame shows; evenly spaced frames divide the recording in time."
     )
-    methods: ClassVar[tuple[str, ...]] = (NEW, COVERAGE, *RULES, EVEN, ORACLE)
-    reference: ClassVar[str] = NEW
+    methods: ClassVar[tuple[str, ...]] = (NEW_AREA, COVERAGE, *RULES, EVEN, ORACLE)
+    reference: ClassVar[str] = NEW_AREA
     measures: ClassVar[tuple[Measure, ...]] = (
         Measure("covered", "Voxels seen", lambda r, m: r["methods"][m]["covered"], unit="%"),
         Measure("gain", "Gain over the first view, of the oracle's", _gains, unit="%"),
@@ -203,16 +207,19 @@ class RecordedStudy(Study):
         order = jax.random.permutation(jax.random.key(self.seed), len(enough))
         return int(enough[order[scene.index % len(enough)]])
 
-    def planner(self, method: str, scene: Scene) -> Planner:
-        acquisition = Coverage() if method == COVERAGE else NewSurface()
-        return self.planner_of(acquisition, self.search(method), scene, self.camera.resized(*_RAYS))
+    @property
+    def imagined_camera(self) -> Camera:
+        return self.camera.resized(*_RAYS)
 
-    def search(self, method: str) -> Search:
+    def acquisition(self, method: str, scene: Scene) -> Acquisition:
+        return Coverage() if method == COVERAGE else NewSurface()
+
+    def search(self, method: str, scene: Scene) -> Search:
         if method == EVEN:
             return EvenlySpaced(self.candidates, views=self.views)
         if method == ORACLE:
             return MostNewVoxels(self.candidates, shown=jnp.asarray(self.recording.shown))
-        return super().search(method)
+        return super().search(method, scene)
 
     def truth(self, scene: Scene) -> Bool[np.ndarray, "frames voxels"]:
         return self.recording.shown
@@ -228,6 +235,27 @@ class RecordedStudy(Study):
         frames = [self._frame_of(step.view.pose) for step in episode]
         seen = np.logical_or.accumulate(truth[frames], axis=0)
         return {"frames": frames, "covered": seen.mean(axis=1).tolist()}
+
+    def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
+        """The voxels of the box across its shortest side, those that the frames so far have shown in colour; the way of
+        the recorded camera, and where the chosen frames were taken, in their order."""
+        recording, held = self.recording, record["methods"]
+        kept = np.sort(np.argsort(np.subtract(self.box.high, self.box.low))[1:])
+        voxels, places = recording.voxels[:, kept], recording.places[:, kept]
+
+        def tile(axes: Axes, method: str, view: int) -> None:
+            frames = held[method]["frames"][: view + 1]
+            seen = recording.shown[frames].any(axis=0)
+            for which, colour in ((~seen, LINE), (seen, NEW)):
+                axes.scatter(voxels[which, 0], voxels[which, 1], s=2.0, c=colour, linewidths=0)
+            axes.plot(places[:, 0], places[:, 1], color=GREY, lw=0.6)
+            axes.scatter(places[frames, 0], places[frames, 1], s=14.0, c=INK, zorder=3)
+            for number, place in enumerate(places[frames], start=1):
+                axes.annotate(str(number), place, textcoords="offset points", xytext=(3, 3), fontsize=8, zorder=4)
+            axes.set_aspect("equal")
+            say(axes, f"{held[method]['covered'][view]:.0%}")
+
+        return Tiles("Coloured: voxels that the frames show. Numbers: where they were taken, in their order.", tile)
 
     def _frame_of(self, pose: Pose) -> int:
         """The frame that was taken from a pose."""

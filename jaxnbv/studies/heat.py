@@ -1,16 +1,20 @@
 """The study of heat: how near does the coldest point of the scanned cloud come to the object's?"""
 
 import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import matplotlib as mpl
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, Normalize
 from scipy.spatial import cKDTree
 
-from jaxnbv.acquisition import ExpectedUtilityImprovement
+from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
@@ -18,13 +22,15 @@ from jaxnbv.planning.episode import Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, TriangleMesh, mesh_from_sdf
 from jaxnbv.scanning.sensors import HEAT_SETTING
+from jaxnbv.search import Search
 from jaxnbv.studies.engine.measures import SECONDS, Claim, Measure, Record
-from jaxnbv.studies.engine.meshes import MeshStudy
 from jaxnbv.studies.engine.searches import RULES
-from jaxnbv.studies.engine.study import Scene
+from jaxnbv.studies.engine.study import Scene, Study
+from jaxnbv.studies.engine.tiles import Tiles, across, draw_on, say, still_of
 from jaxnbv.studies.scenes import heat_scene
 from jaxnbv.tasks import ColdestPoint, Coverage, body_temperature
 from jaxnbv.tasks.diffusion import HeatProblem
+from jaxnbv.viz.render import Still
 
 # Those that seek cold; the other methods know nothing of heat.
 HEAT_METHODS = ("heat", "heat-reached", "heat-halving")
@@ -34,6 +40,13 @@ ESTIMATES = {"all": "of all points", "reached": "of the warmed points"}
 # Points colder than this share of the range of temperatures count as coldest: objects have symmetries, and the inner
 # floor of a mug is as cold all over.
 _NEARLY = 0.01
+# Without its palest colours, which would not stand out against the grey of what was not scanned.
+_HEAT = LinearSegmentedColormap.from_list("heat", mpl.colormaps["inferno"](np.linspace(0.0, 0.9, 256)))
+_MARKS: dict[str, dict[str, Any]] = {
+    "heat source": {"marker": "X", "color": "#d55e00", "ms": 6.0, "mec": "white"},
+    "coldest point of the object": {"marker": "*", "color": "#009e73", "ms": 10.0, "mec": "white"},
+    "coldest point of the cloud": {"marker": "o", "color": "#0072b2", "ms": 5.5, "mec": "white"},
+}
 
 
 class Truth(NamedTuple):
@@ -81,8 +94,8 @@ def _measures(estimate: str) -> tuple[Measure, ...]:
     )
 
 
-class HeatStudy(MeshStudy):
-    """How near the coldest point of the cloud comes to the object's coldest points. Settings as of `MeshStudy`, and
+class HeatStudy(Study):
+    """How near the coldest point of the cloud comes to the object's coldest points. Settings as of `Study`, and
 
     - `num_points`: points of D to which imagined scans are added, where the temperature is simulated.
     - `imagined_rays`: rays along a side of an imagined scan; true scans have 50 x 50.
@@ -111,8 +124,9 @@ class HeatStudy(MeshStudy):
         Claim("The utility comes nearer to the coldest point within few views.", "distance, all", 4, _BASELINES),
     )
     seed: ClassVar[int] = 8
+    bank: ClassVar[str] = "heat"
     radius: ClassVar[float] = HEAT_SETTING.radius
-    quick: ClassVar[Mapping[str, Any]] = {**MeshStudy.quick, "num_candidates": 24, "num_points": 512}
+    quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 24, "num_points": 512}
     quick_scenes: ClassVar[int] = 3
 
     views: int = eqx.field(static=True, default=6)
@@ -122,25 +136,28 @@ class HeatStudy(MeshStudy):
     imagined_rays: int = eqx.field(static=True, default=24)
     true_grid: Grid = Grid(160)
 
-    bank: ClassVar[str] = "heat"
-    unknowing: ClassVar[tuple[str, ...]] = ("coverage", "uncertainty")
+    @property
+    def imagined_camera(self) -> Camera:
+        return Camera(height=self.imagined_rays, width=self.imagined_rays)
 
-    def procedural(self, index: int) -> Scene:
-        made = heat_scene(index)
-        return Scene(index, made.name, made.surface, made.source)
-
-    def task_of(self, mesh: TriangleMesh, index: int) -> Float[Array, "3"]:
-        """The point where it is heated."""
+    def scene(self, index: int) -> Scene:
+        """An object; its task is the point where it is heated."""
+        file = self.file(index)
+        if file is None:
+            made = heat_scene(index)
+            return Scene(index, made.name, made.surface, made.source)
+        mesh = file.read()
         (source,) = mesh.sample_points(self.key(index, "scene"), 1)
-        return jnp.asarray(source, jnp.result_type(float))
+        return Scene(index, file.name, mesh, jnp.asarray(source, jnp.result_type(float)))
 
-    def planner(self, method: str, scene: Scene) -> Planner:
-        search = self.search(method.removeprefix("heat-"))
-        camera = Camera(height=self.imagined_rays, width=self.imagined_rays)
+    def acquisition(self, method: str, scene: Scene) -> Acquisition:
         if method not in HEAT_METHODS:
-            return self.planner_of(Coverage(), search, scene, camera)
+            return Coverage()
         coldest = ColdestPoint(scene.task, reached_only=method == "heat-reached")
-        return self.planner_of(ExpectedUtilityImprovement(coldest, self.num_points), search, scene, camera)
+        return ExpectedUtilityImprovement(coldest, self.num_points)
+
+    def search(self, method: str, scene: Scene) -> Search:
+        return super().search(method.removeprefix("heat-"), scene)
 
     def shows_enough(self, scene: Scene, seen: PointCloud) -> bool:
         """The heat source must be seen."""
@@ -178,7 +195,39 @@ class HeatStudy(MeshStudy):
                 into["distances"].append(float(tree.query(points[coldest])[0]))
         return {"reached": shares, "estimates": estimates}
 
+    def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
+        """The points of the cloud that can be seen, coloured by temperature, over the grey of the object; its coldest
+        point, and the estimate."""
+        scene, held = self.scene(record["scene"]), record["methods"]
+        truth, heat = self.truth(scene), heat_problem(scene)
+        still = still_of(truth.mesh, across(record), pixels)
+        colours = ScalarMappable(Normalize(0.0, float(truth.temperatures.max())), _HEAT)
+        seen = {method: self.seen(scene, held[method]) for method in methods}
+
+        def draw_truth(axes: Axes) -> None:
+            draw_on(axes, still, truth.points, colours.to_rgba(truth.temperatures))
+            _mark(axes, still, np.asarray(heat.source, np.float64), "heat source")
+            _mark(axes, still, truth.coldest, "coldest point of the object")
+
+        def tile(axes: Axes, method: str, view: int) -> None:
+            points, temperature = body_temperature(seen[method][view][1].cloud, heat)
+            draw_on(axes, still, points, colours.to_rgba(temperature.values))
+            estimate = held[method]["estimates"]["all"]
+            _mark(axes, still, truth.coldest, "coldest point of the object")
+            _mark(axes, still, np.array(estimate["points"][view]), "coldest point of the cloud")
+            say(axes, f"{estimate['distances'][view]:.2f}")
+
+        caption = "Scanned points, coloured by the temperature that they give. Beneath: how far the estimate is off."
+        return Tiles(caption, tile, draw_truth, marks=_MARKS, scale=(colours, "temperature (degrees)"))
+
 
 def heat_problem(scene: Scene) -> HeatProblem:
     """The authors' problem, heated where the scene says."""
     return HeatProblem(np.asarray(scene.task))
+
+
+def _mark(axes: Axes, still: Still, point: Float[np.ndarray, "3"], name: str) -> None:
+    """Hollow if the object hides it."""
+    pixels, in_front = still.project(point[None])
+    look = _MARKS[name] if in_front[0] else _MARKS[name] | {"mfc": "white", "mec": _MARKS[name]["color"]}
+    axes.plot(pixels[0, 0], pixels[0, 1], zorder=6, **look)

@@ -1,28 +1,40 @@
 """The study of reconstruction: how near is the surface that a method's views give to the true one?"""
 
-from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, ClassVar, cast
 
+import jax
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm
+from scipy.spatial import cKDTree
 
+from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError
+from jaxnbv.errors import install
 from jaxnbv.imagination import Imagination
 from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.planning.episode import Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Evidence, SDFSurface, TriangleMesh
-from jaxnbv.scanning.metrics import SURFACE_POINTS, coverage, surface_distance, truth_points
+from jaxnbv.scanning.metrics import SURFACE_POINTS, coverage, surface_distance, true_mesh, truth_points
 from jaxnbv.scanning.screened_poisson import has_poisson, screened_poisson
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
-from jaxnbv.studies.engine.meshes import MeshStudy
 from jaxnbv.studies.engine.searches import RULES
-from jaxnbv.studies.engine.study import Scene
+from jaxnbv.studies.engine.study import Scene, Study
+from jaxnbv.studies.engine.tiles import Tiles, across, say, still_of
 from jaxnbv.studies.scenes import Split, part_scene
 from jaxnbv.tasks import Coverage, NewSurface
+from jaxnbv.viz.style import DEVIATION
 
 POISSON, MEAN = "screened Poisson", "posterior mean"
 RECONSTRUCTIONS = (POISSON, MEAN)
+# Distances to the truth that the pictures tell apart: from the sensor's noise to a fifth of the object.
+_ERRORS = LogNorm(0.01, 0.5)
+# Points of the true surface that they are measured to there.
+_DENSE = 200_000
 
 
 def _distances(name: str, title: str) -> Measure:
@@ -33,8 +45,8 @@ def _distances(name: str, title: str) -> Measure:
     return Measure(name, title, of, "reconstruction", "scene units", less=True)
 
 
-class ReconstructionStudy(MeshStudy):
-    """How near the surface made of a method's cloud comes to the true one. Settings as of `MeshStudy`; procedural
+class ReconstructionStudy(Study):
+    """How near the surface made of a method's cloud comes to the true one. Settings as of `Study`; procedural
     objects are those of the test split of `part_scene`.
 
     The posterior's mean is meshed on the grid of the samples, carved as they are.
@@ -67,15 +79,18 @@ class ReconstructionStudy(MeshStudy):
         ),
     )
     seed: ClassVar[int] = 4
-    quick: ClassVar[Mapping[str, Any]] = {**MeshStudy.quick, "num_candidates": 40}
+    quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 40}
 
-    def procedural(self, index: int) -> Scene:
+    def scene(self, index: int) -> Scene:
+        """An object."""
+        file = self.file(index)
+        if file is not None:
+            return Scene(index, file.name, file.read())
         made = part_scene(Split.TEST, index)
         return Scene(index, f"{CATEGORIES[int(made.category)].name} {index}", SDFSurface(made.solid))
 
-    def planner(self, method: str, scene: Scene) -> Planner:
-        sought = NewSurface() if method == "new-surface" else Coverage()
-        return self.planner_of(sought, self.search(method), scene)
+    def acquisition(self, method: str, scene: Scene) -> Acquisition:
+        return NewSurface() if method == "new-surface" else Coverage()
 
     def mesher(self, scene: Scene) -> Planner:
         """Whose posterior all methods' views are meshed by, those of planners of one's own too."""
@@ -111,6 +126,28 @@ class ReconstructionStudy(MeshStudy):
             return None
         distance = surface_distance(mesh.sample_points(self.key(index, "measure"), SURFACE_POINTS), truth)
         return {"chamfer": distance.chamfer, **distance._asdict()}
+
+    def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
+        """Each reconstruction after the last view, coloured by the distance to the true surface."""
+        scene, held = self.scene(record["scene"]), record["methods"]
+        truth = cast(TriangleMesh, true_mesh(scene.surface))
+        tree = cKDTree(truth.sample_points(jax.random.key(0), _DENSE))
+        eye, imagination = across(record), self.mesher(scene).imagination
+        known = {method: self.seen(scene, held[method])[-1][1] for method in methods}
+        made = {method: held[method]["reconstructions"] for method in methods}
+        names = tuple(name for name in RECONSTRUCTIONS if all(found[name] is not None for found in made.values()))
+
+        def tile(axes: Axes, method: str, column: int) -> None:
+            mesh = reconstruct(imagination, known[method], names[column])
+            if mesh is None:
+                raise InputError(f"the records hold {names[column]}: to draw it again, {install('poisson')}")
+            still = still_of(mesh, eye, pixels, lambda points: tree.query(points)[0], _ERRORS)
+            axes.imshow(still.image, interpolation="antialiased")
+            found = made[method][names[column]]
+            say(axes, f"CD {found['chamfer']:.3f}, HD {found['hausdorff']:.3f}")
+
+        scale = ScalarMappable(_ERRORS, DEVIATION), "distance to the true surface\n(scene units)"
+        return Tiles("", tile, lambda axes: axes.imshow(still_of(truth, eye, pixels).image), names, scale=scale)
 
 
 def reconstruct(imagination: Imagination, evidence: Evidence, name: str) -> TriangleMesh | None:

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxnbv as nbv
 from jaxnbv.studies.engine.pictures import write_pictures
-from jaxnbv.studies.recorded.pictures import tiles
-from jaxnbv.studies.recorded.study import EVEN, NEW, ORACLE, RecordedStudy
+from jaxnbv.studies.recorded import EVEN, NEW_AREA, ORACLE, RecordedStudy
 
 UNIT = 1000.0
 INTRINSICS = np.array([[40.0, 0.0, 23.5], [0.0, 40.0, 17.5], [0.0, 0.0, 1.0]])
@@ -221,14 +220,14 @@ def test_every_method_is_measured_by_what_its_frames_show(study):
     best = record["methods"][ORACLE]
     assert gain[best["frames"][1]] == max(gain)
     assert all(method["covered"][1] <= best["covered"][1] for method in record["methods"].values())
-    of_new = study.measures[1].of(record, NEW)
-    own = record["methods"][NEW]["covered"]
+    of_new = study.measures[1].of(record, NEW_AREA)
+    own = record["methods"][NEW_AREA]["covered"]
     assert of_new[3] == pytest.approx((own[2] - own[0]) / (best["covered"][2] - best["covered"][0]))
 
 
 def test_its_pictures_show_every_method(study, tmp_path):
     record = study.run_scene(0, methods=(EVEN, ORACLE))
-    (path,) = write_pictures([record], study, tmp_path, tiles)
+    (path,) = write_pictures([record], study, tmp_path)
     assert path.name == "scene_0000.png"
     pixels = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
     assert len(np.unique(pixels, axis=0)) > 20

@@ -1,0 +1,91 @@
+"""What a study draws of a scene: tiles, and the tools to fill them."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm
+
+from jaxnbv.scanning import TriangleMesh
+from jaxnbv.studies.engine.measures import Record
+from jaxnbv.viz.mean_surface import MeanSurface
+from jaxnbv.viz.render import Still
+from jaxnbv.viz.style import GREY
+
+_RIGHT = "#00734f"
+# A still is coloured at vertices: no triangle may be larger than what its colours vary over. Half of what it spans.
+_EDGE, _REACH = 0.05, 1.6
+
+
+class Tiles(NamedTuple):
+    """How a study draws a scene.
+
+    - `caption`: beneath all.
+    - `tile`: fills the tile of a method at a column, given its axes.
+    - `truth`: fills the tile of the truth, which stands before the first row; None for none.
+    - `columns`: what the tiles of a method are; "" for its views.
+    - `marks`: a legend, the look of a `Line2D` by name; `scale`: a bar of colours, and what they mean.
+    """
+
+    caption: str
+    tile: Callable[[Axes, str, int], None]
+    truth: Callable[[Axes], object] | None = None
+    columns: tuple[str, ...] = ()
+    marks: Mapping[str, Mapping[str, Any]] = {}
+    scale: tuple[ScalarMappable, str] | None = None
+
+
+def say(axes: Axes, text: str, right: bool = False) -> None:
+    """A line beneath a tile, which stands out where it is right."""
+    colour, weight = (_RIGHT, "bold") if right else (GREY, "normal")
+    axes.set_xlabel(f"{'✓ ' if right else ''}{text}", fontsize=9, color=colour, fontweight=weight)
+
+
+def across(record: Record) -> Float[np.ndarray, "3"]:
+    """Where to look from to see what the first view, which all methods share, does not show: from across the object,
+    and from above."""
+    run = next(iter(record["methods"].values()))
+    position = np.asarray(run["views"][0]["position"])
+    away = -position[[0, 2]]
+    length = np.linalg.norm(away)
+    away = away / length if length > 1e-3 else np.array([0.6, 0.8])
+    return np.array([away[0], 0.55, away[1]])
+
+
+def still_of(
+    mesh: TriangleMesh,
+    eye: Float[np.ndarray, "3"],
+    size: int,
+    value: Callable[[np.ndarray], Float[np.ndarray, " n"]] | None = None,
+    norm: LogNorm | None = None,
+) -> Still:
+    """A picture of a mesh, plain or coloured by a positive value at its points."""
+    vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _EDGE, max_iter=12)
+    fine = trimesh.Trimesh(vertices, faces)
+    values = np.ones(len(fine.vertices)) if value is None else np.maximum(value(fine.vertices), 1e-6)
+    surface = MeanSurface(np.asarray(fine.vertices), np.asarray(fine.faces), np.asarray(fine.vertex_normals), values)
+    still = Still(eye, surface, size, _REACH)
+    still.paint(norm)
+    return still
+
+
+def draw_on(
+    axes: Axes,
+    still: Still,
+    points: Float[np.ndarray, "n 3"],
+    colours: Float[np.ndarray, "n channels"],
+) -> None:
+    """The points that a still's surface does not hide, over it, the nearest last."""
+    axes.imshow(still.image, interpolation="antialiased", zorder=1)
+    pixels, in_front = still.project(points)
+    depth = (points - np.asarray(still.pose.position)) @ np.asarray(still.pose.forward)
+    order = np.argsort(-depth)
+    order = order[in_front[order]]
+    axes.scatter(pixels[order, 0], pixels[order, 1], s=2.5, c=colours[order], linewidths=0, zorder=2)
+    shown = np.argwhere(still.image[..., 3] > 0)
+    middle, half = 0.5 * (shown.min(axis=0) + shown.max(axis=0)), 0.55 * np.ptp(shown, axis=0).max()
+    axes.set(xlim=middle[1] + [-half, half], ylim=middle[0] + [half, -half])

@@ -1,1 +1,0 @@
-"""Reconstruction of the surface: the table of the paper's supplement."""

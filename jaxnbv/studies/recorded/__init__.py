@@ -1,1 +1,0 @@
-"""The study of a recorded sequence: which of its frames show a place in the fewest views."""
