@@ -16,7 +16,6 @@ EXTRAS = {
     "robust_laplacian": "heat",
     "pandas": "studies",
     "viser": "view",
-    "distributed": "cluster",
 }
 """Which extra brings what a part of the package needs beyond the dependencies that all of it has."""
 

@@ -79,23 +79,10 @@ def before_pytorch(monkeypatch):
     save_checkpoint(pretrained_classifier("pyramid", num_points=64).network, "net.safetensors")
 
 
-def before_cluster(monkeypatch):
-    """Clusters that take what they are told."""
-
-    def cluster(**given):
-        assert given["n_workers" if "image" in given else "cores"] >= 1
-        return SimpleNamespace(scale=lambda jobs: None, scheduler_address="tcp://10.0.0.1:8786")
-
-    stand_in(monkeypatch, "dask_jobqueue", SLURMCluster=cluster)
-    stand_in(monkeypatch, "dask_kubernetes")
-    stand_in(monkeypatch, "dask_kubernetes.operator", KubeCluster=cluster)
-
-
 # What a page leaves to its reader.
 BEFORE = {
     "how_to/mesh.md": before_mesh,
     "how_to/pytorch_classifier.md": before_pytorch,
-    "how_to/cluster.md": before_cluster,
 }
 NAMES = {"how_to/utility.md": {"source": np.array([0.0, 1.25, 0.0])}}
 

@@ -4,7 +4,7 @@ import functools
 import os
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ from jaxnbv.studies.engine.pictures import write_pictures
 from jaxnbv.studies.engine.records import RecordFolder
 from jaxnbv.studies.engine.results import results, summary
 from jaxnbv.studies.engine.study import CHART, Factory, Study
-from jaxnbv.studies.engine.trials import Cluster, Here, Processes, Runner
 from jaxnbv.studies.registry import STUDIES, flag
 
 
@@ -33,7 +32,6 @@ def run_study(
     out: Path | None,
     quick: bool,
     workers: int,
-    scheduler: str | None,
     **options: Any,
 ) -> None:
     """Run a study, or each of those that it consists of, and write what it found.
@@ -57,7 +55,6 @@ def run_study(
     named = None if methods is None else [name.strip() for name in methods.split(",")]
     chosen, added = kind.chosen(named, model), {text: _own(text) for text in own or ()}
     wanted = _scenes(str(entry.scenes) if scenes is None else scenes)
-    runner = _runner(workers, scheduler, added)
     failed: dict[str, str] = {}
     asked = 0
     of_model = "" if model == entry.model else f"-{model}"
@@ -70,7 +67,7 @@ def run_study(
         config |= {"own": {text: describe(make) for text, make in added.items()}} if added else {}
         there = wanted if settings.num_scenes is None else [index for index in wanted if index < settings.num_scenes]
         run = functools.partial(settings.run_scene, methods=chosen, own=added)
-        held = RecordFolder(folder / part, config, runner)
+        held = RecordFolder(folder / part, config, workers)
         records, failures = held.collect(there, run), held.failures(there)
         failed |= {f"{part} scene {index}".strip(): error for index, error in failures.items()}
         asked += len(there)
@@ -88,14 +85,6 @@ def run_study(
             f"{len(failed)} of {asked} scenes failed, the first {where} ({error}): {folder} has scene_*.failed that "
             "tell how, and the same command tries them again"
         )
-
-
-def _runner(workers: int, scheduler: str | None, own: Mapping[str, Factory]) -> Runner:
-    if scheduler is None:
-        return Here() if workers == 1 else Processes(workers)
-    if workers != 1:
-        raise InputError(f"--workers {workers} and --scheduler {scheduler} exclude each other: give one of them")
-    return Cluster(scheduler, [sys.modules[factory.__module__] for factory in own.values()])
 
 
 def _scenes(asked: str) -> Sequence[int]:

@@ -7,7 +7,6 @@ import typer
 
 from jaxnbv.cli import options
 from jaxnbv.cli.registry import STUDY_MODELS
-from jaxnbv.errors import install
 from jaxnbv.studies.registry import STUDIES, Entry, flag
 from jaxnbv.studies.scenes import FirstView, Framing
 
@@ -103,15 +102,6 @@ def study(
     workers: Annotated[
         int, options.running(min=1, help="Scenes at a time, in as many processes, which share the cores.")
     ] = 1,
-    scheduler: Annotated[
-        str | None,
-        options.running(
-            metavar="ADDRESS",
-            help="Run the scenes on a Dask cluster: its scheduler, such as tcp://10.0.0.1:8786. "
-            f"Needs `{install('cluster')}`, here and on its workers.",
-            show_default=False,
-        ),
-    ] = None,
 ) -> None:
     asked = dict(locals())
     from jaxnbv.cli.run_study import run_study

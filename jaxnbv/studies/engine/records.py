@@ -14,7 +14,7 @@ from jaxnbv.progress import progress_bar
 from jaxnbv.storage.files import write_text
 from jaxnbv.storage.folders import ResultFolder, check_format, read_json
 from jaxnbv.studies.engine.measures import Record
-from jaxnbv.studies.engine.trials import Failure, Here, Outcome, Runner, Trial
+from jaxnbv.studies.engine.trials import Failure, Outcome, Trial, cores_of, outcomes
 
 _FAILED = ".failed"
 _FORMAT = 2
@@ -23,16 +23,16 @@ _FORMAT = 2
 class RecordFolder(ResultFolder):
     """A folder of records that belong to one configuration, kept beside them in study.json.
 
-    - `runner`: where the missing ones are made.
+    - `workers`: how many missing ones are made at a time.
 
     **Raises:** `ValueError` if the folder cannot be made or holds records of another configuration.
     """
 
     kind, pattern, format = "study", "scene_*.json", _FORMAT
 
-    def __init__(self, path: str | Path, config: dict[str, Any], runner: Runner | None = None):
-        self.runner = runner or Here()
-        super().__init__(path, config, self.runner.cores)
+    def __init__(self, path: str | Path, config: dict[str, Any], workers: int = 1):
+        self.workers = workers
+        super().__init__(path, config, cores_of(workers))
 
     def collect(self, scenes: Sequence[int], run: Trial, progress: bool = True) -> list[Record]:
         """The records of these scenes, in order: those on disk as they are, the others from `run`, each written once it
@@ -46,8 +46,8 @@ class RecordFolder(ResultFolder):
             records = {index: _read(self._file(index), index) for index in scenes if self._file(index).exists()}
             missing = [index for index in scenes if index not in records]
             bar = progress_bar(None, progress, True, total=len(scenes), initial=len(records), desc=self.path.name)
-            with bar, closing(self.runner.outcomes(run, missing)) as outcomes:
-                for index, outcome in outcomes:
+            with bar, closing(outcomes(run, missing, self.workers)) as ended:
+                for index, outcome in ended:
                     self._write(index, outcome)
                     if not isinstance(outcome, Failure):
                         records[index] = _read(self._file(index), index)
