@@ -29,7 +29,7 @@ def household_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_U
     **Raises:** `ValueError` if the index is negative.
     """
     label, rng = index % len(HOUSEHOLD), generator(scene_key(6, split, index))
-    primitives = BUILDERS[HOUSEHOLD[label]](rng)
+    primitives = list(BUILDERS[HOUSEHOLD[label]](rng))
     solid = assemble(primitives, rng.uniform(-np.pi, np.pi) if turned else 0.0, framing.longest_side)
     return SolidObject(solid=solid, label=jnp.asarray(label))
 
@@ -42,91 +42,87 @@ def _bathtub(rng):
     """A basin that stands on feet or on a plinth, with a rim, and a tap or none."""
     x, z, height, wall = rng.uniform(0.42, 0.52), rng.uniform(0.95, 1.15), rng.uniform(0.25, 0.34), 0.06
     soft = rng.uniform(0.02, 0.06)
-    parts = [box((0, -height + wall, 0), (x - 0.02, wall, z - 0.02), soft)]
-    parts += [box((side * (x - wall), 0, 0), (wall, height, z), soft) for side in (-1, 1)]
-    parts += [box((0, 0, side * (z - wall)), (x, height, wall), soft) for side in (-1, 1)]
+    yield box((0, -height + wall, 0), (x - 0.02, wall, z - 0.02), soft)
+    yield from (box((side * (x - wall), 0, 0), (wall, height, z), soft) for side in (-1, 1))
+    yield from (box((0, 0, side * (z - wall)), (x, height, wall), soft) for side in (-1, 1))
     if rng.random() < 0.6:
         reach = rng.uniform(0.03, 0.07)
-        parts += [box((side * (x - wall), height, 0), (wall + reach, 0.04, z + reach)) for side in (-1, 1)]
-        parts += [box((0, height, side * (z - wall)), (x + reach, 0.04, wall + reach)) for side in (-1, 1)]
+        yield from (box((side * (x - wall), height, 0), (wall + reach, 0.04, z + reach)) for side in (-1, 1))
+        yield from (box((0, height, side * (z - wall)), (x + reach, 0.04, wall + reach)) for side in (-1, 1))
     if rng.random() < 0.5:
-        parts += [ball((a, -height - 0.04, b), 0.1) for a, b in _corners(x - 0.14, z - 0.2)]
+        yield from (ball((a, -height - 0.04, b), 0.1) for a, b in _corners(x - 0.14, z - 0.2))
     else:
-        parts.append(box((0, -height - 0.05, 0), (x - 0.06, 0.1, z - 0.06)))
+        yield box((0, -height - 0.05, 0), (x - 0.06, 0.1, z - 0.06))
     if rng.random() < 0.5:
         top = height + rng.uniform(0.2, 0.3)
         spout = [(0, height - 0.1, z - wall), (0, top, z - wall), (0, top - 0.03, z - 0.32)]
-        parts += path(spout, 0.04)
-    return parts
+        yield from path(spout, 0.04)
 
 
 def _bed(rng):
     """A mattress in a frame, a headboard, a lower footboard or none, pillows."""
     x, z, level = rng.uniform(0.95, 1.15), rng.uniform(0.45, 0.9), rng.uniform(0.2, 0.35)
     thick, frame = rng.uniform(0.09, 0.16), 0.07
-    parts = [
-        box((0, level, 0), (x, frame, z)),
-        box((0, level + frame + thick - 0.02, 0), (x - 0.04, thick, z - 0.04), rng.uniform(0.03, 0.08)),
-    ]
+    yield box((0, level, 0), (x, frame, z))
+    yield box((0, level + frame + thick - 0.02, 0), (x - 0.04, thick, z - 0.04), rng.uniform(0.03, 0.08))
     if rng.random() < 0.6:
-        parts += [bar((a, 0, b), (a, level, b), 0.05, 0.05) for a, b in _corners(x - 0.07, z - 0.07)]
+        yield from (bar((a, 0, b), (a, level, b), 0.05, 0.05) for a, b in _corners(x - 0.07, z - 0.07))
     else:
-        parts.append(box((0, 0.5 * level, 0), (x - 0.1, 0.5 * level, z - 0.1)))
+        yield box((0, 0.5 * level, 0), (x - 0.1, 0.5 * level, z - 0.1))
     rise = rng.uniform(0.35, 0.7)
-    parts.append(box((-x, 0.5 * (level + rise), 0), (0.04, 0.5 * (level + rise), z)))
+    yield box((-x, 0.5 * (level + rise), 0), (0.04, 0.5 * (level + rise), z))
     if rng.random() < 0.5:
         low = level + rng.uniform(0.12, 0.3)
-        parts.append(box((x, 0.5 * low, 0), (0.04, 0.5 * low, z)))
+        yield box((x, 0.5 * low, 0), (0.04, 0.5 * low, z))
     top = level + frame + 2 * thick
     places = (0.0,) if z < 0.6 else (-0.48 * z, 0.48 * z)
     half = 0.6 * z if z < 0.6 else 0.38 * z
-    return parts + [box((-x + 0.25, top + 0.01, b), (0.16, 0.07, half), 0.06) for b in places]
+    yield from (box((-x + 0.25, top + 0.01, b), (0.16, 0.07, half), 0.06) for b in places)
 
 
 def _desk(rng):
     """A wide top on a chest of drawers and legs or a panel, or on two chests, and a panel behind."""
     x, z, height, thick = rng.uniform(0.45, 0.6), rng.uniform(0.95, 1.2), rng.uniform(0.9, 1.1), 0.05
-    parts = [box((0, height, 0), (x, thick, z))]
+    yield box((0, height, 0), (x, thick, z))
     sides = (-1, 1) if rng.random() < 0.5 else (rng.choice([-1, 1]),)
     half = rng.uniform(0.22, 0.3)
     gap = rng.choice([0.05, 0.35])
     for side in sides:
         middle, centre = 0.5 * (gap + height), side * (z - half - 0.04)
-        parts.append(box((0, middle, centre), (x - 0.06, 0.5 * (height - gap), half)))
+        yield box((0, middle, centre), (x - 0.06, 0.5 * (height - gap), half))
         count = int(rng.integers(2, 4))
         tall = (height - gap) / count
         for place in range(count):
             y = gap + (place + 0.5) * tall
-            parts.append(box((x - 0.05, y, centre), (0.04, 0.5 * tall - 0.03, half - 0.03)))
+            yield box((x - 0.05, y, centre), (0.04, 0.5 * tall - 0.03, half - 0.03))
     if len(sides) == 1:
         b = -sides[0] * (z - 0.07)
         if rng.random() < 0.5:
-            parts += [bar((a, 0, b), (a, height, b), 0.045, 0.045) for a in (-x + 0.07, x - 0.07)]
+            yield from (bar((a, 0, b), (a, height, b), 0.045, 0.045) for a in (-x + 0.07, x - 0.07))
         else:
-            parts.append(box((0, 0.5 * height, b), (x - 0.06, 0.5 * height, 0.04)))
+            yield box((0, 0.5 * height, b), (x - 0.06, 0.5 * height, 0.04))
     low = rng.uniform(0.3, 0.6) * height
-    parts.append(box((-x + 0.08, 0.5 * (low + height), 0), (0.035, 0.5 * (height - low), z - 0.06)))
-    return parts
+    yield box((-x + 0.08, 0.5 * (low + height), 0), (0.035, 0.5 * (height - low), z - 0.06))
 
 
 def _dresser(rng):
     """A wide chest with two or three columns of drawers that have knobs, on feet or a plinth."""
     x, z, height = rng.uniform(0.32, 0.42), rng.uniform(0.85, 1.1), rng.uniform(0.45, 0.6)
-    parts = [box((0, 0, 0), (x, height, z)), box((0.02, height + 0.02, 0), (x + 0.05, 0.045, z + 0.04))]
+    yield box((0, 0, 0), (x, height, z))
+    yield box((0.02, height + 0.02, 0), (x + 0.05, 0.045, z + 0.04))
     columns, rows = int(rng.integers(2, 4)), int(rng.integers(2, 4))
     rows = 2 if columns == 3 else rows
     wide, tall = 2 * z / columns, 2 * height / rows
     for column in range(columns):
         for row in range(rows):
             y, b = -height + (row + 0.5) * tall, -z + (column + 0.5) * wide
-            parts.append(box((x + 0.01, y, b), (0.035, 0.5 * tall - 0.03, 0.5 * wide - 0.03)))
-            parts.append(ball((x + 0.07, y, b), 0.045))
+            yield box((x + 0.01, y, b), (0.035, 0.5 * tall - 0.03, 0.5 * wide - 0.03))
+            yield ball((x + 0.07, y, b), 0.045)
     if rng.random() < 0.5:
         feet = _corners(x - 0.08, z - 0.08)
-        parts += [bar((a, -height - 0.18, b), (a, -height, b), 0.05, 0.05) for a, b in feet]
+        yield from (bar((a, -height - 0.18, b), (a, -height, b), 0.05, 0.05) for a, b in feet)
     else:
-        parts.append(box((0, -height - 0.04, 0), (x - 0.04, 0.08, z - 0.04)))
-    return parts
+        yield box((0, -height - 0.04, 0), (x - 0.04, 0.08, z - 0.04))
 
 
 def _monitor(rng):
@@ -135,41 +131,43 @@ def _monitor(rng):
     tilt = rng.uniform(0.0, 0.15)
     level = height + rng.uniform(0.25, 0.4)
     lean = ((0.0, 0.0, 1.0), tilt)
-    parts = [box((0, level, 0), (thick, height, z), 0.03, lean)]
+    yield box((0, level, 0), (thick, height, z), 0.03, lean)
     rim = 0.05
     front = thick + 0.02
     for side in (-1, 1):
         along = np.array([-np.sin(tilt), np.cos(tilt), 0.0]) * side * (height - rim)
         out = np.array([np.cos(tilt), np.sin(tilt), 0.0]) * front
-        parts.append(box(np.array([0, level, 0]) + out + along, (0.03, rim, z), 0.02, lean))
+        yield box(np.array([0, level, 0]) + out + along, (0.03, rim, z), 0.02, lean)
         centre = np.array([0, level, side * (z - rim)]) + out
-        parts.append(box(centre, (0.03, height, rim), 0.02, lean))
+        yield box(centre, (0.03, height, rim), 0.02, lean)
     if rng.random() < 0.5:
-        parts.append(box((-thick - 0.04, level, 0), (0.08, 0.5 * height, 0.5 * z), 0.04))
+        yield box((-thick - 0.04, level, 0), (0.08, 0.5 * height, 0.5 * z), 0.04)
     neck = rng.uniform(0.06, 0.12)
-    parts.append(bar((-0.08, 0.03, 0), (-0.06, level - 0.3 * height, 0), neck, 0.05))
+    yield bar((-0.08, 0.03, 0), (-0.06, level - 0.3 * height, 0), neck, 0.05)
     foot = rng.uniform(0.3, 0.45)
     if rng.random() < 0.5:
-        return [*parts, rod((0, 0, 0), (0, 0.08, 0), foot, 0.85 * foot)]
-    return [*parts, box((0, 0.04, 0), (0.75 * foot, 0.04, 1.2 * foot))]
+        yield rod((0, 0, 0), (0, 0.08, 0), foot, 0.85 * foot)
+        return
+    yield box((0, 0.04, 0), (0.75 * foot, 0.04, 1.2 * foot))
 
 
 def _night_stand(rng):
     """A small chest as high as wide: a drawer above an open shelf, or two drawers; on legs."""
     x, z, height, legs = rng.uniform(0.55, 0.7), rng.uniform(0.6, 0.75), rng.uniform(0.5, 0.7), rng.uniform(0.25, 0.6)
     wall, top = 0.05, legs + 2 * height
-    parts = [box((0, top, 0), (x + 0.06, wall, z + 0.06)), box((0, legs, 0), (x, wall, z))]
-    parts += [box((0, legs + height, b), (x, height, wall)) for b in (-z + wall, z - wall)]
-    parts.append(box((-x + wall, legs + height, 0), (wall, height, z)))
+    yield box((0, top, 0), (x + 0.06, wall, z + 0.06))
+    yield box((0, legs, 0), (x, wall, z))
+    yield from (box((0, legs + height, b), (x, height, wall)) for b in (-z + wall, z - wall))
+    yield box((-x + wall, legs + height, 0), (wall, height, z))
     rows = 2 if rng.random() < 0.5 else 1
     tall = height if rows == 2 else rng.uniform(0.7, 1.1) * height
     for row in range(rows):
         y = top - wall - (row + 0.5) * tall
-        parts.append(box((0, y, 0), (x + 0.02, 0.5 * tall - 0.03, z - 0.07)))
-        parts.append(ball((x + 0.07, y, 0), 0.08))
+        yield box((0, y, 0), (x + 0.02, 0.5 * tall - 0.03, z - 0.07))
+        yield ball((x + 0.07, y, 0), 0.08)
     thick = rng.uniform(0.05, 0.08)
     feet = _corners(x - thick, z - thick)
-    return parts + [bar((a, 0, b), (a, legs, b), thick, thick) for a, b in feet]
+    yield from (bar((a, 0, b), (a, legs, b), thick, thick) for a, b in feet)
 
 
 def _sofa(rng):
@@ -177,18 +175,18 @@ def _sofa(rng):
     x, z, seat = rng.uniform(0.4, 0.52), rng.uniform(0.85, 1.15), rng.uniform(0.18, 0.26)
     rise, arm = rng.uniform(0.35, 0.55), rng.uniform(0.1, 0.16)
     soft = rng.uniform(0.03, 0.08)
-    parts = [box((0, seat, 0), (x, 0.16, z), soft)]
-    parts.append(box((-x + 0.06, seat + 0.5 * rise, 0), (0.12, 0.5 * rise + 0.1, z), soft))
+    yield box((0, seat, 0), (x, 0.16, z), soft)
+    yield box((-x + 0.06, seat + 0.5 * rise, 0), (0.12, 0.5 * rise + 0.1, z), soft)
     high = rng.uniform(0.15, 0.28)
-    parts += [box((0.02, seat + high, b), (x, high + 0.14, arm), soft) for b in (-z, z)]
+    yield from (box((0.02, seat + high, b), (x, high + 0.14, arm), soft) for b in (-z, z))
     count = 2 if z < 0.95 else 3
     wide = (z - arm) / count
     for place in range(count):
         b = -z + arm + (2 * place + 1) * wide
-        parts.append(box((0.08, seat + 0.2, b), (x - 0.06, 0.08, wide - 0.01), 0.05))
+        yield box((0.08, seat + 0.2, b), (x - 0.06, 0.08, wide - 0.01), 0.05)
         if rise > 0.42:
-            parts.append(box((-x + 0.26, seat + 0.28 + 0.4 * rise, b), (0.1, 0.4 * rise, wide - 0.02), 0.07))
-    return parts + [bar((a, 0, b), (a, seat, b), 0.05, 0.05) for a, b in _corners(x - 0.1, z - 0.08)]
+            yield box((-x + 0.26, seat + 0.28 + 0.4 * rise, b), (0.1, 0.4 * rise, wide - 0.02), 0.07)
+    yield from (bar((a, 0, b), (a, seat, b), 0.05, 0.05) for a, b in _corners(x - 0.1, z - 0.08))
 
 
 def _toilet(rng):
@@ -196,28 +194,28 @@ def _toilet(rng):
     bowl, level = rng.uniform(0.4, 0.48), rng.uniform(0.55, 0.7)
     deep, slant = 0.2, rng.uniform(0.3, 0.6)
     foot = rng.uniform(0.22, 0.3)
-    parts = [
-        ring((0.1, level - deep, 0), (0, 1, 0), bowl - 0.08 - slant * deep, 0.07, deep, 0.03, slant),
-        rod((0.1, level - 2 * deep - 0.02, 0), (0.1, level - deep, 0), bowl - 2 * slant * deep, bowl - 0.12),
-        rod((0.05, 0, 0), (0.05, level - 2 * deep + 0.05, 0), foot, 0.85 * foot),
-        ring((0.1, level + 0.02, 0), (0, 1, 0), bowl - 0.06, 0.1, 0.04, 0.03),
-    ]
+    yield ring((0.1, level - deep, 0), (0, 1, 0), bowl - 0.08 - slant * deep, 0.07, deep, 0.03, slant)
+    yield rod((0.1, level - 2 * deep - 0.02, 0), (0.1, level - deep, 0), bowl - 2 * slant * deep, bowl - 0.12)
+    yield rod((0.05, 0, 0), (0.05, level - 2 * deep + 0.05, 0), foot, 0.85 * foot)
+    yield ring((0.1, level + 0.02, 0), (0, 1, 0), bowl - 0.06, 0.1, 0.04, 0.03)
     z, tall = rng.uniform(0.4, 0.55), rng.uniform(0.3, 0.42)
     behind = 0.1 - bowl - 0.2
-    parts.append(box((behind, level + tall, 0), (0.16, tall, z), 0.04))
-    parts.append(box((behind, level + 2 * tall, 0), (0.19, 0.04, z + 0.03)))
-    parts.append(box((behind + 0.15, level - 0.05, 0), (0.3, 0.09, 0.22)))
+    yield box((behind, level + tall, 0), (0.16, tall, z), 0.04)
+    yield box((behind, level + 2 * tall, 0), (0.19, 0.04, z + 0.03))
+    yield box((behind + 0.15, level - 0.05, 0), (0.3, 0.09, 0.22))
     if rng.random() < 0.5:
         lean = rng.uniform(0.0, 0.15)
         lid = np.array([behind + 0.21 + 0.5 * lean * bowl, level + 0.06 + bowl, 0.0])
         out = np.array([np.cos(lean), np.sin(lean), 0.0])
-        return [*parts, rod(lid - 0.035 * out, lid + 0.035 * out, bowl)]
+        yield rod(lid - 0.035 * out, lid + 0.035 * out, bowl)
+        return
     # Nothing sees into a bowl that is shut.
     inside = rod((0.1, level - deep, 0), (0.1, level + 0.07, 0), bowl - 0.1)
-    return [*parts, inside, rod((0.1, level + 0.05, 0), (0.1, level + 0.12, 0), bowl + 0.02)]
+    yield inside
+    yield rod((0.1, level + 0.05, 0), (0.1, level + 0.12, 0), bowl + 0.02)
 
 
-# Each lists the primitives of a random object: x is forward, y up and z to the right.
+# Each gives the primitives of a random object: x is forward, y up and z to the right.
 BUILDERS = {
     "bathtub": _bathtub,
     "bed": _bed,

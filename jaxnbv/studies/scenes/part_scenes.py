@@ -10,7 +10,7 @@ from jaxnbv.studies.scenes.labelled import LabelledSolid, assemble, generator
 from jaxnbv.studies.scenes.parts import belongings, furniture, vehicles
 from jaxnbv.studies.scenes.splits import Split, scene_key
 
-# Each lists the primitives of a random object: x is forward, y up and z to the right.
+# Each gives the primitives of a random object: x is forward, y up and z to the right.
 _BUILDERS = {
     "airplane": vehicles.airplane,
     "bag": belongings.bag,
@@ -57,6 +57,7 @@ def part_scene(split: Split, index: int) -> PartScene:
     **Raises:** `ValueError` if the index is negative.
     """
     category, rng = PART_CATEGORIES[index % len(PART_CATEGORIES)], generator(scene_key(0, split, index))
-    solid = assemble(_BUILDERS[category](rng), rng.uniform(-_LARGEST_TURN, _LARGEST_TURN))
+    primitives = list(_BUILDERS[category](rng))
+    solid = assemble(primitives, rng.uniform(-_LARGEST_TURN, _LARGEST_TURN))
     parts = np.isin(np.arange(NUM_PARTS), np.asarray(solid.labels))
     return PartScene(solid, jnp.asarray(category_index(category)), jnp.asarray(parts))

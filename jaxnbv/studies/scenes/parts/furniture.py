@@ -1,5 +1,7 @@
 """Chairs, tables and lamps."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from jaxnbv.networks.categories import CATEGORIES, category_index
@@ -10,23 +12,22 @@ TOP, TABLE_LEG, DRAWER = CATEGORIES[category_index("table")].labels
 BASE, SHADE, CANOPY, TUBE = CATEGORIES[category_index("lamp")].labels
 
 
-def chair(rng: np.random.Generator) -> list[Primitive]:
+def chair(rng: np.random.Generator) -> Iterator[Primitive]:
     """Four legs, a pedestal with a star of feet, or runners; a panel or slats behind; armrests or none."""
     half_width, half_depth = rng.uniform(0.5, 0.65), rng.uniform(0.5, 0.62)
     height, rise = rng.uniform(0.9, 1.15), rng.uniform(1.0, 1.4)
     thick = rng.uniform(0.05, 0.09)
     lean = rng.uniform(0.05, 0.3)
-    parts = [box(SEAT, (0, height, 0), (half_depth, thick, half_width), rng.uniform(0.02, thick))]
-    parts += _chair_legs(rng, half_width, half_depth, height - thick)
-    parts += _chair_back(rng, half_width, half_depth, height, rise, lean)
+    yield box(SEAT, (0, height, 0), (half_depth, thick, half_width), rng.uniform(0.02, thick))
+    yield from _chair_legs(rng, half_width, half_depth, height - thick)
+    yield from _chair_back(rng, half_width, half_depth, height, rise, lean)
     if rng.random() < 0.6:
         top, front = height + rng.uniform(0.4, 0.6), rng.uniform(0.1, 0.9) * half_depth
         behind = -half_depth + 0.05 - lean * (top - height) / rise
         for side in (-1, 1):
             z = side * (half_width - 0.02)
-            parts.append(bar(ARM, (behind, top, z), (front, top, z), 0.07, 0.045, 0.03))
-            parts.append(bar(ARM, (front - 0.1, height, z), (front - 0.1, top, z), 0.045, 0.045, 0.02))
-    return parts
+            yield bar(ARM, (behind, top, z), (front, top, z), 0.07, 0.045, 0.03)
+            yield bar(ARM, (front - 0.1, height, z), (front - 0.1, top, z), 0.045, 0.045, 0.02)
 
 
 def _chair_legs(rng, half_width, half_depth, height):
@@ -34,28 +35,28 @@ def _chair_legs(rng, half_width, half_depth, height):
     x, z, splay = half_depth - 0.08, half_width - 0.08, rng.uniform(0.0, 0.12)
     corners = [(a, b) for a in (-1, 1) for b in (-1, 1)]
     if kind == "star":
-        parts = [rod(LEG, (0, 0.12, 0), (0, height + 0.02, 0), rng.uniform(0.06, 0.1))]
+        yield rod(LEG, (0, 0.12, 0), (0, height + 0.02, 0), rng.uniform(0.06, 0.1))
         reach, turn = rng.uniform(0.5, 0.62), rng.uniform(0, 2 * np.pi)
         for angle in turn + 2 * np.pi * np.arange(5) / 5:
             tip = (reach * np.cos(angle), 0.06, reach * np.sin(angle))
-            parts.append(bar(LEG, (0, 0.14, 0), tip, 0.05, 0.045))
-        return parts
+            yield bar(LEG, (0, 0.14, 0), tip, 0.05, 0.045)
+        return
     radius = rng.uniform(0.045, 0.07)
     feet = [(a * (x + splay), 0.0, b * (z + splay)) for a, b in corners]
     tops = [(a * x, height + 0.03, b * z) for a, b in corners]
     if kind == "runners":
-        parts = [bar(LEG, foot, top, radius, radius) for foot, top in zip(feet, tops, strict=True)]
-        return parts + [
+        yield from (bar(LEG, foot, top, radius, radius) for foot, top in zip(feet, tops, strict=True))
+        yield from (
             bar(LEG, (-x - splay - radius, 0.03, b), (x + splay + radius, 0.03, b), radius, 0.05)
             for b in (-z - splay, z + splay)
-        ]
+        )
+        return
     taper = rng.uniform(0.7, 1.0)
-    parts = [rod(LEG, foot, top, max(0.04, taper * radius), radius) for foot, top in zip(feet, tops, strict=True)]
+    yield from (rod(LEG, foot, top, max(0.04, taper * radius), radius) for foot, top in zip(feet, tops, strict=True))
     if rng.random() < 0.4:
         y = rng.uniform(0.25, 0.5) * height
         at = x + splay * (1 - y / height), z + splay * (1 - y / height)
-        parts += [rod(LEG, (-at[0], y, b * at[1]), (at[0], y, b * at[1]), 0.04) for b in (-1, 1)]
-    return parts
+        yield from (rod(LEG, (-at[0], y, b * at[1]), (at[0], y, b * at[1]), 0.04) for b in (-1, 1))
 
 
 def _chair_back(rng, half_width, half_depth, height, rise, lean):
@@ -66,90 +67,90 @@ def _chair_back(rng, half_width, half_depth, height, rise, lean):
 
     if rng.random() < 0.5:
         gap = rng.choice([0.0, 0.25])
-        parts = [bar(BACK, at(gap, 0.0), at(1.0, 0.0), half_width - 0.02, thick, 0.03)]
+        yield bar(BACK, at(gap, 0.0), at(1.0, 0.0), half_width - 0.02, thick, 0.03)
         if gap:
-            parts += [bar(BACK, at(0.0, z), at(0.4, z), 0.05, thick) for z in (-0.5 * half_width, 0.5 * half_width)]
-        return parts
+            yield from (bar(BACK, at(0.0, z), at(0.4, z), 0.05, thick) for z in (-0.5 * half_width, 0.5 * half_width))
+        return
     z = half_width - 0.06
-    parts = [bar(BACK, at(0.0, side * z), at(1.0, side * z), 0.06, 0.05) for side in (-1, 1)]
+    yield from (bar(BACK, at(0.0, side * z), at(1.0, side * z), 0.06, 0.05) for side in (-1, 1))
     if rng.random() < 0.5:
-        parts.append(bar(BACK, at(0.85, 0.0), at(1.0, 0.0), z, thick))
+        yield bar(BACK, at(0.85, 0.0), at(1.0, 0.0), z, thick)
         places = np.linspace(-1, 1, int(rng.integers(2, 4)) + 2)[1:-1]
-        return parts + [bar(BACK, at(0.0, place * z), at(0.9, place * z), 0.05, 0.035) for place in places]
-    return parts + [bar(BACK, at(c - 0.08, 0.0), at(c + 0.08, 0.0), z, 0.035) for c in (0.4, 0.65, 0.92)]
+        yield from (bar(BACK, at(0.0, place * z), at(0.9, place * z), 0.05, 0.035) for place in places)
+        return
+    yield from (bar(BACK, at(c - 0.08, 0.0), at(c + 0.08, 0.0), z, 0.035) for c in (0.4, 0.65, 0.92))
 
 
-def table(rng: np.random.Generator) -> list[Primitive]:
+def table(rng: np.random.Generator) -> Iterator[Primitive]:
     """A rectangular or round top on four legs, on a pedestal or on two panels; drawers or a shelf below, or neither."""
     height, thick = rng.uniform(1.0, 1.5), rng.uniform(0.045, 0.08)
     if rng.random() < 0.3:
         radius = rng.uniform(0.95, 1.2)
-        parts = [rod(TOP, (0, height - thick, 0), (0, height + thick, 0), radius, rounding=0.03)]
+        yield rod(TOP, (0, height - thick, 0), (0, height + thick, 0), radius, rounding=0.03)
         if rng.random() < 0.6:
             foot = rng.uniform(0.5, 0.7) * radius
             column = rng.uniform(0.08, 0.14)
-            parts.append(rod(TABLE_LEG, (0, 0.05, 0), (0, height, 0), column * rng.uniform(1.0, 1.6), column))
-            parts.append(rod(TABLE_LEG, (0, 0.0, 0), (0, 0.12, 0), foot, 0.85 * foot, rounding=0.03))
+            yield rod(TABLE_LEG, (0, 0.05, 0), (0, height, 0), column * rng.uniform(1.0, 1.6), column)
+            yield rod(TABLE_LEG, (0, 0.0, 0), (0, 0.12, 0), foot, 0.85 * foot, rounding=0.03)
         else:
-            parts += _table_legs(rng, 0.65 * radius, 0.65 * radius, height)
-        return parts
+            yield from _table_legs(rng, 0.65 * radius, 0.65 * radius, height)
+        return
     half_depth, half_width = rng.uniform(0.55, 0.8), rng.uniform(0.95, 1.25)
-    parts = [box(TOP, (0, height, 0), (half_depth, thick, half_width), 0.02)]
+    yield box(TOP, (0, height, 0), (half_depth, thick, half_width), 0.02)
     if rng.random() < 0.3:
         for side in (-1, 1):
             z = side * (half_width - 0.15)
-            parts.append(box(TABLE_LEG, (0, 0.5 * height, z), (half_depth - 0.08, 0.5 * height, 0.05)))
+            yield box(TABLE_LEG, (0, 0.5 * height, z), (half_depth - 0.08, 0.5 * height, 0.05))
     else:
-        parts += _table_legs(rng, half_depth - 0.1, half_width - 0.1, height)
+        yield from _table_legs(rng, half_depth - 0.1, half_width - 0.1, height)
     extra = rng.choice(["drawer", "drawers", "shelf", "none"])
     if extra == "shelf":
         y = rng.uniform(0.2, 0.4) * height
-        parts.append(box(DRAWER, (0, y, 0), (half_depth - 0.12, 0.045, half_width - 0.12)))
+        yield box(DRAWER, (0, y, 0), (half_depth - 0.12, 0.045, half_width - 0.12))
     elif extra != "none":
         half = np.array([0.7 * half_depth, rng.uniform(0.12, 0.2), rng.uniform(0.25, 0.35)])
         places = [0.0] if extra == "drawer" else [-0.5 * half_width, 0.5 * half_width]
         for z in places:
             y = height - thick - half[1] + 0.02
-            parts.append(box(DRAWER, (0.15 * half_depth, y, z), half))
-            parts.append(box(DRAWER, (0.85 * half_depth + 0.02, y, z), (0.05, 0.035, 0.09)))
-    return parts
+            yield box(DRAWER, (0.15 * half_depth, y, z), half)
+            yield box(DRAWER, (0.85 * half_depth + 0.02, y, z), (0.05, 0.035, 0.09))
 
 
 def _table_legs(rng, x, z, height):
     radius, taper, square = rng.uniform(0.05, 0.09), rng.uniform(0.7, 1.0), rng.random() < 0.5
-    parts = []
     for a, b in ((-x, -z), (-x, z), (x, -z), (x, z)):
         foot, top = (a, 0.0, b), (a, height, b)
         if square:
-            parts.append(bar(TABLE_LEG, foot, top, radius, radius))
+            yield bar(TABLE_LEG, foot, top, radius, radius)
         else:
-            parts.append(rod(TABLE_LEG, foot, top, max(0.045, taper * radius), radius))
-    return parts
+            yield rod(TABLE_LEG, foot, top, max(0.045, taper * radius), radius)
 
 
-def lamp(rng: np.random.Generator) -> list[Primitive]:
+def lamp(rng: np.random.Generator) -> Iterator[Primitive]:
     """A standing lamp, a desk lamp with a bent arm, or one that hangs from a canopy; the shade is open below."""
     kind = rng.choice(["standing", "desk", "hanging"], p=[0.4, 0.3, 0.3])
     tube = rng.uniform(0.045, 0.07)
     if kind == "desk":
-        return _desk_lamp(rng, tube)
+        yield from _desk_lamp(rng, tube)
+        return
     narrow, wide = rng.uniform(0.3, 0.5), rng.uniform(0.55, 0.85)
     tall = rng.uniform(0.6, 0.9)
     if kind == "hanging":
         drop, cap = rng.uniform(0.9, 1.4), rng.uniform(0.22, 0.35)
-        parts = [rod(TUBE, (0, tall - 0.1, 0), (0, tall + drop, 0), tube)]
-        parts.append(rod(CANOPY, (0, tall + drop - rng.uniform(0.12, 0.25), 0), (0, tall + drop, 0), 0.5 * cap, cap))
-        parts.append(rod(SHADE, (0, tall - 0.06, 0), (0, tall, 0), narrow + 0.03))
-        return [*parts, _shade((0, 0, 0), (0, tall, 0), wide, narrow)]
+        yield rod(TUBE, (0, tall - 0.1, 0), (0, tall + drop, 0), tube)
+        yield rod(CANOPY, (0, tall + drop - rng.uniform(0.12, 0.25), 0), (0, tall + drop, 0), 0.5 * cap, cap)
+        yield rod(SHADE, (0, tall - 0.06, 0), (0, tall, 0), narrow + 0.03)
+        yield _shade((0, 0, 0), (0, tall, 0), wide, narrow)
+        return
     pole, foot = rng.uniform(1.2, 1.7), rng.uniform(0.4, 0.6)
     low, high = pole - 0.5 * tall, pole + 0.5 * tall
-    parts = [rod(TUBE, (0, 0.05, 0), (0, pole, 0), tube)]
-    parts.append(rod(BASE, (0, 0, 0), (0, rng.uniform(0.1, 0.3), 0), foot, rng.uniform(0.4, 0.9) * foot))
+    yield rod(TUBE, (0, 0.05, 0), (0, pole, 0), tube)
+    yield rod(BASE, (0, 0, 0), (0, rng.uniform(0.1, 0.3), 0), foot, rng.uniform(0.4, 0.9) * foot)
     # Two spokes carry the shade.
     reach = 0.5 * (narrow + wide)
-    parts.append(rod(TUBE, (0, pole, -reach), (0, pole, reach), 0.035))
-    parts.append(rod(TUBE, (-reach, pole, 0), (reach, pole, 0), 0.035))
-    return [*parts, _shade((0, low, 0), (0, high, 0), wide, narrow)]
+    yield rod(TUBE, (0, pole, -reach), (0, pole, reach), 0.035)
+    yield rod(TUBE, (-reach, pole, 0), (reach, pole, 0), 0.035)
+    yield _shade((0, low, 0), (0, high, 0), wide, narrow)
 
 
 def _desk_lamp(rng, tube):
@@ -159,10 +160,10 @@ def _desk_lamp(rng, tube):
     down = np.array([rng.uniform(0.3, 0.7), -1.0, 0.0])
     down /= np.linalg.norm(down)
     tall, narrow, wide = rng.uniform(0.45, 0.6), rng.uniform(0.15, 0.22), rng.uniform(0.4, 0.5)
-    parts = [rod(BASE, (0, 0, 0), (0, rng.uniform(0.1, 0.16), 0), foot, 0.85 * foot, 0.03)]
-    parts += path(TUBE, [(0, 0.05, 0), elbow, head], tube)
-    parts.append(rod(SHADE, head - 0.08 * down, head + 0.08 * down, narrow + 0.03))
-    return [*parts, _shade(head + tall * down, head, wide, narrow)]
+    yield rod(BASE, (0, 0, 0), (0, rng.uniform(0.1, 0.16), 0), foot, 0.85 * foot, 0.03)
+    yield from path(TUBE, [(0, 0.05, 0), elbow, head], tube)
+    yield rod(SHADE, head - 0.08 * down, head + 0.08 * down, narrow + 0.03)
+    yield _shade(head + tall * down, head, wide, narrow)
 
 
 def _shade(low, high, wide, narrow):

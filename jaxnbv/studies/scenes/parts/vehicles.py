@@ -1,5 +1,7 @@
 """Airplanes, rockets, motorbikes and skateboards."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from jaxnbv.networks.categories import CATEGORIES, category_index
@@ -11,115 +13,104 @@ TANK, SEAT, WHEEL, HANDLE, LIGHT, FRAME = CATEGORIES[category_index("motorbike")
 SKATE_WHEEL, DECK, TRUCK = CATEGORIES[category_index("skateboard")].labels
 
 
-def airplane(rng: np.random.Generator) -> list[Primitive]:
+def airplane(rng: np.random.Generator) -> Iterator[Primitive]:
     """Swept wings, low or high, with two or four engines below them, or two beside the tail; a low or a high tail."""
     radius, sweep = rng.uniform(0.12, 0.17), rng.uniform(0.1, 0.6)
-    parts = [
-        rod(BODY, (-0.55, 0, 0), (0.85, 0, 0), radius, rounding=0.0),
-        rod(BODY, (0.83, 0, 0), (1.22, -0.02, 0), radius, 0.35 * radius, rounding=0.03),
-        rod(BODY, (-1.25, 0.06, 0), (-0.53, 0, 0), 0.4 * radius, radius),
-    ]
+    yield rod(BODY, (-0.55, 0, 0), (0.85, 0, 0), radius, rounding=0.0)
+    yield rod(BODY, (0.83, 0, 0), (1.22, -0.02, 0), radius, 0.35 * radius, rounding=0.03)
+    yield rod(BODY, (-1.25, 0.06, 0), (-0.53, 0, 0), 0.4 * radius, radius)
     span, chord, height = rng.uniform(0.95, 1.25), rng.uniform(0.17, 0.24), rng.choice([-0.5, 0.6]) * radius
     dihedral = rng.uniform(0.0, 0.12)
     kind = rng.choice(["two", "four", "tail"], p=[0.45, 0.3, 0.25])
     size = rng.uniform(0.08, 0.1)
     for side in (-1, 1):
         root, tip = np.array([0.15, height, 0.0]), np.array([0.15 - sweep, height + dihedral, side * span])
-        parts.append(bar(WING, root, 0.45 * tip + 0.55 * root, 1.2 * chord, 0.04))
-        parts.append(bar(WING, 0.35 * tip + 0.65 * root, tip, 0.8 * chord, 0.033))
+        yield bar(WING, root, 0.45 * tip + 0.55 * root, 1.2 * chord, 0.04)
+        yield bar(WING, 0.35 * tip + 0.65 * root, tip, 0.8 * chord, 0.033)
         for place in {"two": (0.35,), "four": (0.3, 0.6), "tail": ()}[kind]:
             x, y, z = (1 - place) * root + place * tip
             y -= size + 0.05
-            parts.append(rod(ENGINE, (x - 0.1, y, z), (x + 0.3, y, z), 0.85 * size, size))
-            parts.append(box(ENGINE, (x + 0.05, y + size, z), (0.12, 0.06, 0.03)))
+            yield rod(ENGINE, (x - 0.1, y, z), (x + 0.3, y, z), 0.85 * size, size)
+            yield box(ENGINE, (x + 0.05, y + size, z), (0.12, 0.06, 0.03))
         if kind == "tail":
             z = side * (radius + 0.6 * size)
-            parts.append(rod(ENGINE, (-0.8, 0.05, z), (-0.35, 0.05, z), 0.85 * size, size))
+            yield rod(ENGINE, (-0.8, 0.05, z), (-0.35, 0.05, z), 0.85 * size, size)
     rise = rng.uniform(0.38, 0.5)
-    parts.append(bar(TAIL, (-1.0, 0.05, 0), (-1.2, rise, 0), 0.035, 0.15))
+    yield bar(TAIL, (-1.0, 0.05, 0), (-1.2, rise, 0), 0.035, 0.15)
     level = rise if kind == "tail" else 0.1
     back = -1.2 if kind == "tail" else -1.08
     reach = rng.uniform(0.36, 0.45)
     for side in (-1, 1):
-        parts.append(bar(TAIL, (back, level, 0), (back - 0.15, level, side * reach), 0.12, 0.033))
-    return parts
+        yield bar(TAIL, (back, level, 0), (back - 0.15, level, side * reach), 0.12, 0.033)
 
 
-def rocket(rng: np.random.Generator) -> list[Primitive]:
+def rocket(rng: np.random.Generator) -> Iterator[Primitive]:
     """Upright: a hull with a pointed nose and three or four fins, boosters between them or none."""
     radius = rng.uniform(0.2, 0.32)
     nose = rng.uniform(0.45, 0.7)
-    parts = [
-        rod(HULL, (0, 0, 0), (0, 1.75, 0), radius, radius * rng.uniform(0.85, 1.0)),
-        rod(HULL, (0, -0.15, 0), (0, 0.05, 0), 0.75 * radius, 0.5 * radius),
-        rod(NOSE, (0, 1.72, 0), (0, 1.75 + nose, 0), 0.85 * radius, 0.15 * radius, rounding=0.02),
-    ]
+    yield rod(HULL, (0, 0, 0), (0, 1.75, 0), radius, radius * rng.uniform(0.85, 1.0))
+    yield rod(HULL, (0, -0.15, 0), (0, 0.05, 0), 0.75 * radius, 0.5 * radius)
+    yield rod(NOSE, (0, 1.72, 0), (0, 1.75 + nose, 0), 0.85 * radius, 0.15 * radius, rounding=0.02)
     count = int(rng.integers(3, 5))
     reach, boosters, turn = radius + rng.uniform(0.25, 0.45), rng.random() < 0.4, rng.uniform(0, 2 * np.pi)
     height = rng.uniform(0.2, 0.3)
     for angle in turn + 2 * np.pi * np.arange(count) / count:
         turned = rotation_about((0, 1, 0), angle)
         root, tip = turned @ [0.5 * radius, 0.35, 0], turned @ [reach, 0.05, 0]
-        parts.append(bar(FIN, root, tip, 0.035, height))
+        yield bar(FIN, root, tip, 0.035, height)
         if boosters:
             x, _, z = rotation_about((0, 1, 0), angle + np.pi / count) @ [radius + 0.09, 0, 0]
-            parts.append(rod(HULL, (x, 0.0, z), (x, 0.9, z), 0.12, 0.08))
-    return parts
+            yield rod(HULL, (x, 0.0, z), (x, 0.9, z), 0.12, 0.08)
 
 
-def motorbike(rng: np.random.Generator) -> list[Primitive]:
+def motorbike(rng: np.random.Generator) -> Iterator[Primitive]:
     """Two wheels, a fork, an engine with exhaust, a tank, a seat, handles, a head light and perhaps a tail light."""
     radius, base, tyre = rng.uniform(0.38, 0.44), rng.uniform(0.74, 0.82), rng.uniform(0.08, 0.11)
     rear, front = np.array([-base, 0.0, 0.0]), np.array([base, 0.0, 0.0])
-    parts = []
     for hub in (rear, front):
-        parts.append(ring(WHEEL, hub, (0, 0, 1), radius - tyre, tyre, tyre, 0.8 * tyre))
-        parts.append(rod(WHEEL, shifted(hub, z=-0.035), shifted(hub, z=0.035), radius - tyre))
+        yield ring(WHEEL, hub, (0, 0, 1), radius - tyre, tyre, tyre, 0.8 * tyre)
+        yield rod(WHEEL, shifted(hub, z=-0.035), shifted(hub, z=0.035), radius - tyre)
     # The steering head stands behind and above the front wheel by the fork's rake.
     head = shifted(front, -rng.uniform(0.28, 0.4), rng.uniform(0.78, 0.86))
     apart = tyre + 0.05
     for joint in (rear, front, head):
-        parts.append(rod(FRAME, shifted(joint, z=-apart), shifted(joint, z=apart), 0.04))
+        yield rod(FRAME, shifted(joint, z=-apart), shifted(joint, z=apart), 0.04)
     for side in (-1, 1):
-        parts.append(rod(FRAME, shifted(front, z=side * apart), shifted(head, z=side * apart), 0.04))
-        parts.append(rod(FRAME, shifted(rear, z=side * apart), (-0.1, 0.1, side * apart), 0.04))
-    parts.append(box(FRAME, (0.0, 0.12, 0), (0.3, 0.2, 0.15), 0.08))
-    parts.append(box(FRAME, (0.05, 0.36, 0), (0.16, 0.12, 0.11), 0.04, ((0, 0, 1), rng.uniform(-0.3, 0.3))))
-    parts.append(bar(FRAME, (-0.5, 0.42, 0), shifted(head, y=-0.05), 0.06, 0.06))
+        yield rod(FRAME, shifted(front, z=side * apart), shifted(head, z=side * apart), 0.04)
+        yield rod(FRAME, shifted(rear, z=side * apart), (-0.1, 0.1, side * apart), 0.04)
+    yield box(FRAME, (0.0, 0.12, 0), (0.3, 0.2, 0.15), 0.08)
+    yield box(FRAME, (0.05, 0.36, 0), (0.16, 0.12, 0.11), 0.04, ((0, 0, 1), rng.uniform(-0.3, 0.3)))
+    yield bar(FRAME, (-0.5, 0.42, 0), shifted(head, y=-0.05), 0.06, 0.06)
     side = rng.choice([-1, 1])
     exhaust = rng.uniform(0.05, 0.25)
-    parts.append(rod(FRAME, (0.1, 0.0, side * 0.2), (-base - 0.15, exhaust, side * 0.2), 0.05, 0.08))
-    parts.append(box(TANK, (0.17, 0.62, 0), (rng.uniform(0.26, 0.32), 0.14, 0.15), 0.12, ((0, 0, 1), 0.15)))
-    parts.append(box(SEAT, (-0.36, 0.54, 0), (0.28, 0.08, 0.14), 0.06))
+    yield rod(FRAME, (0.1, 0.0, side * 0.2), (-base - 0.15, exhaust, side * 0.2), 0.05, 0.08)
+    yield box(TANK, (0.17, 0.62, 0), (rng.uniform(0.26, 0.32), 0.14, 0.15), 0.12, ((0, 0, 1), 0.15))
+    yield box(SEAT, (-0.36, 0.54, 0), (0.28, 0.08, 0.14), 0.06)
     end = np.array([-0.95, rng.uniform(0.62, 0.75), 0])
-    parts.append(bar(SEAT, (-0.55, 0.56, 0), end, 0.12, 0.07, 0.06))
+    yield bar(SEAT, (-0.55, 0.56, 0), end, 0.12, 0.07, 0.06)
     grip = shifted(head, -rng.uniform(0.05, 0.25), rng.uniform(0.12, 0.3))
     reach = rng.uniform(0.4, 0.46)
     for across in (-1, 1):
         points = [head, shifted(grip, 0.05, 0.0, 0.2 * across), shifted(grip, -0.1, -0.02, reach * across)]
-        parts += path(HANDLE, points, 0.04)
+        yield from path(HANDLE, points, 0.04)
     lamp = rng.uniform(0.12, 0.15)
-    parts.append(rod(LIGHT, shifted(head, y=0.02), shifted(head, 0.22, 0.02), 0.75 * lamp, lamp, 0.04))
+    yield rod(LIGHT, shifted(head, y=0.02), shifted(head, 0.22, 0.02), 0.75 * lamp, lamp, 0.04)
     if rng.random() < 0.6:
-        parts.append(ball(LIGHT, shifted(end, -0.02, -0.03), rng.uniform(0.08, 0.1)))
-    return parts
+        yield ball(LIGHT, shifted(end, -0.02, -0.03), rng.uniform(0.08, 0.1))
 
 
-def skateboard(rng: np.random.Generator) -> list[Primitive]:
+def skateboard(rng: np.random.Generator) -> Iterator[Primitive]:
     """A deck with raised or flat ends, on two trucks with two wheels each."""
     half_width, flat = rng.uniform(0.3, 0.4), rng.uniform(0.7, 0.9)
     rise, end, thick = rng.choice([0.0, rng.uniform(0.1, 0.3)]), rng.uniform(0.3, 0.4), rng.uniform(0.035, 0.05)
-    parts = [box(DECK, (0, 0, 0), (flat, thick, half_width), 0.03)]
+    yield box(DECK, (0, 0, 0), (flat, thick, half_width), 0.03)
     base, track = 0.75 * flat, 0.8 * half_width
     radius, width, drop = rng.uniform(0.1, 0.15), rng.uniform(0.06, 0.09), rng.uniform(0.18, 0.24)
     for side in (-1, 1):
-        parts.append(
-            bar(DECK, (side * (flat - 0.03), 0, 0), (side * (flat + end), rise, 0), 0.9 * half_width, thick, 0.03)
-        )
+        yield bar(DECK, (side * (flat - 0.03), 0, 0), (side * (flat + end), rise, 0), 0.9 * half_width, thick, 0.03)
         x = side * base
-        parts.append(box(TRUCK, (x, -0.5 * drop, 0), (0.13, 0.5 * drop, 0.12)))
-        parts.append(rod(TRUCK, (x, -drop, -track), (x, -drop, track), 0.05))
+        yield box(TRUCK, (x, -0.5 * drop, 0), (0.13, 0.5 * drop, 0.12))
+        yield rod(TRUCK, (x, -drop, -track), (x, -drop, track), 0.05)
         for end_side in (-1, 1):
             z = end_side * track
-            parts.append(rod(SKATE_WHEEL, (x, -drop, z - width), (x, -drop, z + width), radius, rounding=0.03))
-    return parts
+            yield rod(SKATE_WHEEL, (x, -drop, z - width), (x, -drop, z + width), radius, rounding=0.03)
