@@ -22,7 +22,7 @@ from jaxnbv.geometry.tensor_grid import on_tensor_grid
 from jaxnbv.geometry.volume import Box, ray_interval
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Evidence, Grid, GridSurface, SDFSurface, Surface, TriangleMesh, scan
-from jaxnbv.studies.engine.diagnostics import rank_correlation
+from jaxnbv.studies.classification.measures import rank_correlation
 
 BINS = 10
 _scan = eqx.filter_jit(scan)

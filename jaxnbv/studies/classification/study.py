@@ -23,8 +23,7 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SensorNoise, scan
 from jaxnbv.search import CandidateSearch, Problem, Proposal, Search, TieBreakSearch
 from jaxnbv.search.base import Scores, best_unvisited
-from jaxnbv.studies.classification.measures import CUE_PIXELS, MEASURES
-from jaxnbv.studies.engine.diagnostics import rank_correlation, roughness
+from jaxnbv.studies.classification.measures import CUE_PIXELS, MEASURES, rank_correlation, roughness
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.searches import RULES
 from jaxnbv.studies.engine.study import Scene, Study
