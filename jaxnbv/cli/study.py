@@ -123,7 +123,7 @@ def report(
 
 def _about(name: str, entry: Entry) -> str:
     taken = ", ".join([f"{entry.scenes} scenes, {entry.views} views", *map(flag, entry.options)])
-    return f"**{name}** ({taken}): {entry.question} {entry.settings}"
+    return f"**{name}** ({taken}): {entry.question}"
 
 
 study.__doc__ = "\n\n".join(

@@ -102,7 +102,7 @@ def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypa
         settings = {"views": 2, "model": "paper", "quick": False, "workers": 1, "out": tmp_path / out}
         run_study("toy", **none | settings | {"scenes": scenes})
 
-    monkeypatch.setitem(STUDIES, "toy", Entry("toy:ToyStudy", "", "", 3, 2))
+    monkeypatch.setitem(STUDIES, "toy", Entry("toy:ToyStudy", "", 3, 2))
     monkeypatch.setattr(ToyStudy, "run_scene", run_scene)
     with pytest.raises(
         InputError, match=r"^1 of 3 scenes failed.*first scene 1 \(RuntimeError: lost\).*/some has scene_\*\.failed"
