@@ -13,7 +13,6 @@ from jaxnbv.checks import InputError
 from jaxnbv.imagination import Imagination
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.studies.engine.pictures import write_pictures
-from jaxnbv.studies.engine.results import results
 from jaxnbv.studies.heat import HeatStudy, Truth, heat_problem
 from jaxnbv.studies.readers.class_meshes import mesh_files
 from jaxnbv.studies.scenes import heat_scene
@@ -139,48 +138,21 @@ def test_a_folder_of_meshes_gives_the_scenes(tmp_path):
         study.scene(2)
 
 
-def made_run(distances, temperatures, values=(0.5, 0.0)):
-    """Estimates among warmed points are a tenth nearer, and as warm."""
-    estimates = {
-        name: {"distances": [distance - less for distance in distances], "temperatures": list(temperatures)}
-        for name, less in (("all", 0.0), ("reached", 0.1))
-    }
-    steps = [{"value": value, "seconds": 10.0 + 2.0 * index} for index, value in enumerate(values)]
-    return {"steps": steps, "estimates": estimates}
-
-
-def made_record(scene, **methods):
-    return {"scene": scene, "truth": {"temperature": 0.1}, "methods": methods}
-
-
-RECORDS = [
-    made_record(
-        0,
-        heat=made_run((1.0, 0.4, 0.2), (0.9, 0.2, 0.0)),
-        random=made_run((1.0, 0.8, 0.6), (0.9, 0.3, 0.2), (0.7, 0.2)),
-    ),
-    made_record(
-        1,
-        heat=made_run((1.4, 0.6, 0.4), (0.7, 0.4, 0.1), (0.3, 0.1)),
-        random=made_run((1.4, 1.0, 0.6), (0.7, 0.3, 0.2), (0.7, 0.2)),
-    ),
-]
-
-
 def test_measures_are_of_the_estimates():
-    rows = results(RECORDS, HeatStudy).set_index(["quantity", "method", "at"]).sort_index()
-    row = rows.loc["distance, all", "heat", 2]
-    # Of 0.4 and 0.6: a standard deviation of 0.1414, over the root of two.
-    assert (row["mean"], row["standard_error"], row["scenes"]) == (pytest.approx(0.5), pytest.approx(0.1), 2)
-    assert rows.loc[("distance, reached", "heat", 2), "mean"] == pytest.approx(0.4)
-    # Temperatures of 0 and 0.1 in place of 0.1: an error is an error above or below.
-    assert rows.loc[("error, all", "heat", 3), "mean"] == pytest.approx(0.05)
-    assert rows.loc[("error, all", "random", 1), "mean"] == pytest.approx(0.7)
-    # Both scenes differ by -0.4, so any resample does; at the third view by -0.4 and -0.2.
-    lead = ["lead", "lead_low", "lead_high"]
-    assert [*rows.loc[("distance, all", "random", 2), lead]] == pytest.approx([-0.4] * 3)
-    assert [*rows.loc[("distance, reached", "random", 3), lead]] == pytest.approx([-0.3, -0.4, -0.2])
+    """Those among warmed points are a tenth nearer, and as warm."""
+    run = {
+        "steps": [{"value": 0.5, "seconds": 10.0}, {"value": 0.0, "seconds": 12.0}],
+        "estimates": {
+            name: {"distances": [1.0 - less, 0.4 - less], "temperatures": [0.9, 0.0]}
+            for name, less in (("all", 0.0), ("reached", 0.1))
+        },
+    }
+    record = {"truth": {"temperature": 0.1}, "methods": {"heat": run, "random": run}}
+    of = {measure.name: measure.of for measure in HeatStudy.measures}
+    assert of["distance, all"](record, "heat") == [1.0, 0.4]
+    assert of["distance, reached"](record, "heat") == pytest.approx([0.9, 0.3])
+    # An error is an error above or below.
+    assert of["error, all"](record, "random") == pytest.approx([0.8, 0.1])
     # Steps without a view of any value are counted where cold is sought.
-    assert [*rows.loc["saturated"].index] == [("heat", 2), ("heat", 3)]
-    assert [*rows.loc["saturated"]["mean"]] == [0.0, 0.5]
-    assert rows.loc[("seconds", "heat", "median"), "mean"] == 12.0
+    assert (of["saturated"](record, "heat"), of["saturated"](record, "random")) == ({2: 0.0, 3: 1.0}, {})
+    assert of["seconds"](record, "heat") == {"median": 12.0}

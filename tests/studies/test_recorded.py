@@ -105,62 +105,46 @@ def test_a_world_is_turned_upright(sequence, tmp_path):
     assert frames.matrices[0, :3, :3].T @ frames.matrices[0, :3, :3] == pytest.approx(np.eye(3), abs=1e-6)
 
 
-def broken(folder, depths, matrices, name):
-    """A recording with one thing wrong."""
-    if name == "empty":
-        return
-    if name.startswith("tum"):
-        tum(folder, depths, matrices)
-        if name == "tum: other times":
-            (folder / "depth.txt").write_text("17.0 depth/0.png")
-        elif name == "tum: no times":
-            (folder / "depth.txt").write_text("depth/0.png")
-        else:
-            (folder / "depth" / "1.png").unlink()
-        return
-    if name.startswith("json"):
-        plain(folder, depths, matrices)
-        said = json.loads((folder / "frames.json").read_text())
-        if name == "json: no scale":
-            del said["depth_scale"]
-        elif name == "json: no frames":
-            said["frames"] = []
-        elif name == "json: a pose of three rows":
-            said["frames"][0]["pose"] = np.eye(3).tolist()
-        text = json.dumps(said)
-        (folder / "frames.json").write_text(text[:-9] if name == "json: cut" else text)
-        return
-    seven_scenes(folder, depths, matrices)
-    if name == "a pose is missing":
-        (folder / "frame-000003.pose.txt").unlink()
-    elif name == "a pose is no pose":
-        np.savetxt(folder / "frame-000003.pose.txt", np.full((4, 4), 0.5))
-    elif name == "an image is cut":
-        whole = (folder / "frame-000000.depth.png").read_bytes()
-        (folder / "frame-000000.depth.png").write_bytes(whole[:60])
-    elif name == "an image of colours":
-        Image.new("RGB", (48, 36)).save(folder / "frame-000000.depth.png")
+def rewritten(file, change):
+    """Another text in place of a file's."""
+    return lambda folder: (folder / file).write_text(change((folder / file).read_text()))
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("empty", "holds no recorded sequence"),
-        ("tum: other times", "no image has a pose within"),
-        ("tum: no times", "could not convert string to float"),
-        ("tum: an image is missing", r"1 of the 9 files .*1\.png"),
-        ("json: no scale", "KeyError: 'depth_scale'"),
-        ("json: no frames", "need at least one array"),
-        ("json: a pose of three rows", "must have the same shape"),
-        ("json: cut", "JSONDecodeError"),
-        ("a pose is missing", r"is not whole .*000003\.pose"),
-        ("a pose is no pose", "last row of a pose"),
-        ("an image is cut", "cannot read the depth image"),
-        ("an image of colours", "one channel of 16 bit"),
-    ],
-)
-def test_what_is_broken_is_named(name, message, sequence, tmp_path):
-    broken(tmp_path, *sequence, name)
+def said(change):
+    """Another object in place of that of frames.json."""
+    return rewritten("frames.json", lambda text: json.dumps(json.loads(text) | change))
+
+
+def cut(folder):
+    image = folder / "frame-000000.depth.png"
+    image.write_bytes(image.read_bytes()[:60])
+
+
+def coloured(folder):
+    Image.new("RGB", (48, 36)).save(folder / "frame-000000.depth.png")
+
+
+# A layout, what is done to it, and what is said of that.
+BROKEN = {
+    "empty": (lambda *_: None, lambda folder: None, "holds no recorded sequence"),
+    "other times": (tum, rewritten("depth.txt", lambda _: "17.0 depth/0.png"), "no image has a pose within"),
+    "no times": (tum, rewritten("depth.txt", lambda _: "depth/0.png"), "could not convert string to float"),
+    "no image": (tum, lambda folder: (folder / "depth" / "1.png").unlink(), r"1 of the 9 files .*1\.png"),
+    "no scale": (plain, said({"depth_scale": None}), "TypeError"),
+    "no frames": (plain, said({"frames": []}), "need at least one array"),
+    "half a text": (plain, rewritten("frames.json", lambda text: text[:-9]), "JSONDecodeError"),
+    "no pose": (seven_scenes, lambda f: (f / "frame-000003.pose.txt").unlink(), r"is not whole .*000003\.pose"),
+    "a wrong pose": (seven_scenes, lambda f: np.savetxt(f / "frame-000003.pose.txt", np.ones((4, 4))), "of a pose"),
+    "half an image": (seven_scenes, cut, "cannot read the depth image"),
+    "an image of colours": (seven_scenes, coloured, "one channel of 16 bit"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_what_is_broken_is_named(name, sequence, tmp_path):
+    layout, harm, message = BROKEN[name]
+    layout(tmp_path, *sequence)
+    harm(tmp_path)
     with pytest.raises(ValueError, match=message):
         nbv.RecordedFrames(tmp_path)
 

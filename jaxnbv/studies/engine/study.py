@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import time
-import traceback
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -299,8 +298,7 @@ class Study(eqx.Module):
         try:
             planner = make(self, scene)
         except Exception as error:
-            where = traceback.extract_tb(error.__traceback__)[-1]
-            problem = f"{type(error).__name__}: {error}, {where.filename}:{where.lineno}"
+            problem = f"{type(error).__name__}: {error}"
             raise InputError(f"the method {name} fails on scene {scene.index} ({problem})") from error
         check_type(planner, Planner, f"what the method {name} makes")
         require(

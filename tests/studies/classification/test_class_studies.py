@@ -1,20 +1,17 @@
 """The studies of trucks, household objects and scans on a small scale: what they record beside the pyramids'."""
 
 import dataclasses
-import functools
 import json
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from test_pyramid_study import small_study
 
 from jaxnbv.checks import InputError
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.imagination import Imagination
 from jaxnbv.networks import InvariantClassifier, save_checkpoint
 from jaxnbv.studies.classification.objects import ModelNet10Study, OmniObject3DStudy, PyramidStudy, TruckStudy
 from jaxnbv.studies.engine.chart import chart
@@ -22,40 +19,14 @@ from jaxnbv.studies.engine.pictures import write_pictures
 from jaxnbv.studies.engine.results import results, summary
 from jaxnbv.studies.readers import class_meshes
 from jaxnbv.studies.scenes import HOUSEHOLD, FirstView
-from jaxnbv.surfaces import GeometricSPSR
 
-SCENE, CANDIDATES = 4, 12
-CAMERA = Camera(height=24, width=24)
-
-
-class Linear(eqx.Module):
-    """An opinion from the means of points and normals."""
-
-    count: int = eqx.field(static=True)
-
-    def __call__(self, cloud):
-        rows = jnp.concatenate([cloud.points, cloud.normals], axis=-1)
-        mean = jnp.sum(jnp.where(cloud.mask[:, None], rows, 0.0), axis=0) / jnp.maximum(cloud.count, 1)
-        weight = jnp.asarray(np.random.default_rng(1).normal(size=(self.count, 6)), mean.dtype)
-        return jax.nn.log_softmax(2.0 * weight @ mean)
-
-
-def small(kind, **settings):
-    few = {"num_candidates": CANDIDATES, "num_samples": 2, "grid_resolution": 20, "capacity": 250, "num_points": 100}
-    model = GeometricSPSR(lengthscale=0.05, truncation=8)
-    classifier = Linear(len(kind.objects.classes))
-    return kind(classifier=classifier, imagination=Imagination(model), views=3, camera=CAMERA, **few, **settings)
-
-
-@functools.cache
-def record(kind):
-    return json.loads(json.dumps(small(kind).run_scene(SCENE), allow_nan=False))
+SCENE = 4
 
 
 @pytest.mark.parametrize("kind", [ModelNet10Study, PyramidStudy])
 def test_the_first_view_can_be_one_after_which_the_classifier_is_wrong(kind):
     """Of all such views the first in the order in which any view is drawn; of a pyramid none that shows the pattern."""
-    study = small(kind, first=FirstView.MISCLASSIFIED)
+    study = small_study(kind=kind, first=FirstView.MISCLASSIFIED)
     for index in range(3):
         scene = study.scene(index)
         first = study.first_view(scene)
@@ -68,7 +39,7 @@ def test_the_first_view_can_be_one_after_which_the_classifier_is_wrong(kind):
 
 
 def test_first_views_of_trucks_are_random_and_told_apart_by_what_they_show():
-    study = small(TruckStudy)
+    study = small_study(kind=TruckStudy)
     firsts = [study.first_view(study.scene(index)) for index in range(12)]
     assert len({*firsts}) > 5
     for pixels, group in ((0, "first view without cargo"), (3, "first view with cargo")):
@@ -78,7 +49,7 @@ def test_first_views_of_trucks_are_random_and_told_apart_by_what_they_show():
 @pytest.mark.parametrize("kind", [ModelNet10Study, pytest.param(TruckStudy, marks=pytest.mark.slow)])
 def test_records_tables_charts_and_pictures(kind, tmp_path):
     """Where all of the object tells its class no pixels are counted."""
-    found = record(kind)
+    found = json.loads(json.dumps(small_study(kind=kind).run_scene(SCENE), allow_nan=False))
     assert list(found["methods"]) == list(kind.methods)
     assert found["label"] == SCENE % len(kind.objects.classes)
     for held in found["methods"].values():
@@ -88,7 +59,7 @@ def test_records_tables_charts_and_pictures(kind, tmp_path):
     assert ("seen" in {*table["quantity"]}) == bool(kind.cue)
     assert kind.title in summary(table, kind)
     assert chart(table, kind)[:4] == b"\x89PNG"
-    (picture,) = write_pictures([found], small(kind), tmp_path, pixels=24)
+    (picture,) = write_pictures([found], small_study(kind=kind), tmp_path, pixels=24)
     with Image.open(picture) as image:
         assert np.asarray(image.convert("L")).std() > 5
 
@@ -102,7 +73,7 @@ def box_files(folder, *names):
 
 def test_meshes_in_place_of_procedural_objects(tmp_path):
     box_files(tmp_path, "chair/a.off", "desk/b.obj")
-    study = small(ModelNet10Study, meshes=class_meshes(tmp_path, HOUSEHOLD))
+    study = small_study(kind=ModelNet10Study, meshes=class_meshes(tmp_path, HOUSEHOLD))
     assert study.num_scenes == 2
     found = study.run_scene(1, ("farthest", "coverage"))
     assert (found["label"], found["name"]) == (HOUSEHOLD.index("desk"), "desk b")

@@ -4,17 +4,12 @@ import functools
 import json
 import math
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_pyramid_study import Linear, small_study
 
-from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
-from jaxnbv.imagination import Imagination
 from jaxnbv.studies.classification.objects import PyramidStudy
-from jaxnbv.surfaces import GeometricSPSR
 
 SCENE, VIEWS = 3, 3
 SEARCHES = ("cross-entropy", *PyramidStudy.further)
@@ -22,21 +17,10 @@ SEARCHES = ("cross-entropy", *PyramidStudy.further)
 pytestmark = pytest.mark.slow
 
 
-class Linear(eqx.Module):
-    """An opinion on five classes from the means of points and normals."""
-
-    def __call__(self, cloud):
-        rows = jnp.concatenate([cloud.points, cloud.normals], axis=-1)
-        mean = jnp.sum(jnp.where(cloud.mask[:, None], rows, 0.0), axis=0) / jnp.maximum(cloud.count, 1)
-        return jax.nn.log_softmax(jnp.asarray(np.random.default_rng(1).normal(size=(5, 6)), mean.dtype) @ mean)
-
-
 @functools.cache
 def study():
-    small = {"num_candidates": 14, "num_samples": 4, "grid_resolution": 20, "capacity": 250, "num_points": 100}
-    model, camera = GeometricSPSR(lengthscale=0.05, truncation=8), Camera(height=12, width=12)
-    steps = {"num_starts": 2, "iterations": 2, "views": VIEWS}
-    return PyramidStudy(classifier=Linear(), camera=camera, imagination=Imagination(model), **steps, **small)
+    few = {"num_samples": 4, "num_starts": 2, "iterations": 2, "camera": Camera(height=12, width=12)}
+    return small_study(**few)
 
 
 @functools.cache
@@ -75,8 +59,3 @@ def test_what_is_recorded_is_what_the_classifier_says_of_the_views():
     scene, held = study().scene(SCENE), record()["methods"]["gradient-2dof"]
     clouds = [evidence.cloud for _, evidence in study().seen(scene, held)]
     np.testing.assert_allclose(held["log_p"][0], [Linear()(cloud) for cloud in clouds], atol=1e-4)
-
-
-def test_free_poses_are_no_method():
-    with pytest.raises(InputError, match="gradient-6dof"):
-        study().run_scene(SCENE, ("gradient-6dof",))

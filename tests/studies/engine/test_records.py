@@ -1,7 +1,5 @@
 """Records of a study on disk."""
 
-import json
-
 import pytest
 
 from jaxnbv.checks import InputError
@@ -79,12 +77,6 @@ def test_records_that_are_not_what_they_were_are_refused(tmp_path):
         (tmp_path / "study.json").write_text(changed)
         with pytest.raises(InputError, match=r"study\.json is no study record .*choose another"):
             collect()
-
-
-def test_a_record_that_does_not_say_its_format_is_refused(tmp_path):
-    (tmp_path / "scene_0000.json").write_text(json.dumps({"scene": 0, "x": 1.5}))
-    with pytest.raises(InputError, match=r"scene_0000\.json is of format None"):
-        RecordFolder(tmp_path, {"views": 3}).collect(range(1), lambda index: {}, progress=False)
 
 
 def test_keys_that_are_numbers_are_read_as_text(tmp_path):

@@ -92,7 +92,7 @@ def test_a_method_of_ones_own_that_makes_no_planner_is_refused_before_anything_i
 
     for make, problem in (
         (lambda study, scene: None, "what the method mine makes is None; give Planner"),
-        (lambda study, scene: 1 / 0, r"the method mine fails on scene 0 \(ZeroDivisionError: .*test_study\.py:\d+\)"),
+        (lambda study, scene: 1 / 0, r"the method mine fails on scene 0 \(ZeroDivisionError"),
         (lambda: None, "the method mine fails on scene 0 .*takes 0 positional arguments"),
         (few, rf"a planner of 1 views, but the study has {study.views}: give Planner\(max_views={study.views}\)"),
     ):

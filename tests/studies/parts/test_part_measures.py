@@ -4,7 +4,6 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxnbv.studies.engine.results import results
 from jaxnbv.studies.parts.discovery import TARGETS, discovery_time
 from jaxnbv.studies.parts.study import PartStudy
 
@@ -25,26 +24,10 @@ RECORDS = [
 TIMES = {"discrete": [[1, 2, 2, 3, 3], [1, 1, 1, 1, 1]], "farthest": [[2, 3, 4, 4, 4], [3, 3, 3, 3, 4]]}
 
 
-def rows_of(quantity, method):
-    found = results(RECORDS, PartStudy)
-    return found[(found["quantity"] == quantity) & (found["method"] == method)].set_index("at")
-
-
 def test_discovery_times_by_hand():
     for method, times in TIMES.items():
         for record, expected in zip(RECORDS, times, strict=True):
             assert TIME.of(record, method) == dict(zip(TARGETS, expected, strict=True))
-
-
-def test_rows_by_hand():
-    ours, theirs = (rows_of("time", method) for method in TIMES)
-    assert [*ours["mean"], *theirs["mean"]] == [1.0, 1.5, 1.5, 2.0, 2.0, 2.5, 3.0, 3.5, 3.5, 4.0]
-    # Of two numbers it is half their difference.
-    np.testing.assert_allclose(
-        [*ours["standard_error"], *theirs["standard_error"]], [0, 0.5, 0.5, 1, 1, 0.5, 0, 0.5, 0.5, 0]
-    )
-    assert [*rows_of("found", "farthest")["mean"]] == [1.0, 1.0, 0.5, 0.5, 0.0]
-    assert [*theirs["lead"]] == [-1.5, -1.5, -2.0, -1.5, -2.0]
 
 
 def test_the_share_by_view_is_of_the_middle_target():

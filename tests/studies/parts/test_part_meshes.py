@@ -89,7 +89,7 @@ def test_points_belong_to_the_nearest_box(folder):
 
 
 @pytest.mark.slow
-def test_it_asks_for_the_parts_that_can_be_seen_and_counts_their_points(folder):
+def test_it_asks_for_the_parts_that_can_be_seen_and_counts_their_points(folder, tmp_path):
     study = small_study(folder)
     assert study.num_scenes == 2
     record = study.run_scene(0, ("discrete", "farthest"))
@@ -107,6 +107,8 @@ def test_it_asks_for_the_parts_that_can_be_seen_and_counts_their_points(folder):
             slab = (points[:, 1] > 0.25).sum()
             assert abs(counts[1] - slab) <= 0.03 * len(points)
             assert sum(counts) == len(points)
+    (path,) = write_pictures([record], study, tmp_path / "out", pixels=24)
+    assert path.read_bytes()[:4] == b"\x89PNG"
     with pytest.raises(InputError, match="there is no scene 2"):
         study.scene(2)
 
@@ -116,10 +118,3 @@ def test_the_command_takes_a_folder(folder, tmp_path):
     assert isinstance(study, MeshPartStudy)
     assert study.room == 3
     assert study.num_candidates == PartStudy.quick["num_candidates"]
-
-
-@pytest.mark.slow
-def test_its_pictures(folder, tmp_path):
-    study = small_study(folder)
-    (path,) = write_pictures([study.run_scene(0, ("farthest",))], study, tmp_path / "out", pixels=24)
-    assert path.read_bytes()[:4] == b"\x89PNG"
