@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from matplotlib.axes import Axes
 
 from jaxnbv.acquisition import Acquisition, Quantity
@@ -73,22 +73,17 @@ class _Unknown(Surface):
         raise InputError("the true surface of a recording is not known: ask the study's sensor")
 
 
-class EvenlySpaced(Rule):
-    """The frames that divide the recording evenly, from the first view on and round its end.
+class InTurn(Rule):
+    """Candidates in an order that is known before.
 
-    - `views`: into how many parts.
+    - `turns`: the candidate of each view, the first one included.
     """
 
-    views: int = eqx.field(static=True, kw_only=True)
+    turns: Int[Array, " views"] = eqx.field(kw_only=True)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Values are 1 for the frame whose turn it is; the key is not used."""
-        start = problem.evidence.poses
-        apart = [candidates.position - start.position[0], candidates.forward - start.forward[0]]
-        first = jnp.argmin(jnp.linalg.norm(jnp.concatenate(apart, axis=-1), axis=-1))
-        parts = jnp.round(problem.evidence.num_views * candidates.position.shape[0] / self.views).astype(int)
-        turn = (first + parts) % candidates.position.shape[0]
-        chosen = jnp.arange(candidates.position.shape[0]) == turn
+        """Values are 1 for the candidate whose turn it is; the key is not used."""
+        chosen = jnp.arange(candidates.position.shape[0]) == self.turns[problem.evidence.num_views]
         return chosen.astype(candidates.position.dtype)
 
 
@@ -216,7 +211,10 @@ class RecordedStudy(Study):
 
     def search(self, method: str, scene: Scene) -> Search:
         if method == EVEN:
-            return EvenlySpaced(self.candidates, views=self.views)
+            # They divide the recording evenly, from the first view on and round its end.
+            apart = np.round(np.arange(self.views) * self.num_candidates / self.views).astype(int)
+            turns = (self.first_view(scene) + apart) % self.num_candidates
+            return InTurn(self.candidates, turns=jnp.asarray(turns))
         if method == ORACLE:
             return MostNewVoxels(self.candidates, shown=jnp.asarray(self.recording.shown))
         return super().search(method, scene)

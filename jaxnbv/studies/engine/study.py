@@ -159,7 +159,8 @@ class Study(eqx.Module):
 
         **Raises:** `ValueError` for an unknown method.
         """
-        again = tuple(f"{name}{UNKNOWING}" for name in cls.unknowing) if model == KNOWN else ()
+        twice = [name for name in cls.unknowing if name in cls.methods] if model == KNOWN else []
+        again = tuple(f"{name}{UNKNOWING}" for name in twice)
         known = (*cls.methods, *again, *cls.further)
         if names is None:
             return (*cls.methods, *again)
