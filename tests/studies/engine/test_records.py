@@ -28,22 +28,17 @@ def test_records_are_kept_and_the_missing_ones_made(tmp_path):
     assert asked[5:] == [1]
 
 
-def test_folders_of_another_study_and_damaged_records_are_refused(tmp_path):
-    RecordFolder(tmp_path, {"views": 3, "framing": "whole"}).collect(
-        range(1), lambda index: {"scene": index}, progress=False
-    )
+def test_folders_of_another_study_are_refused(tmp_path):
+    config = {"views": 3, "framing": "whole"}
+    RecordFolder(tmp_path, config).collect(range(1), lambda index: {"scene": index}, progress=False)
     with pytest.raises(InputError, match="another study; it differs in views: 3 there, 4 now"):
-        RecordFolder(tmp_path, {"views": 4, "framing": "whole"})
-    for damaged in (b'{"scene": ', b"", b"\xff\xfe\x00"):
-        (tmp_path / "scene_0000.json").write_bytes(damaged)
-        with pytest.raises(InputError, match=r"scene_0000\.json is damaged"):
-            RecordFolder(tmp_path, {"views": 3, "framing": "whole"}).collect(range(1), lambda index: {}, progress=False)
+        RecordFolder(tmp_path, config | {"views": 4})
     (tmp_path / "study.json").write_bytes(b"[")
     with pytest.raises(InputError, match=r"study\.json is no study record"):
-        RecordFolder(tmp_path, {"views": 3, "framing": "whole"})
+        RecordFolder(tmp_path, config)
     (tmp_path / "file").write_text("here")
     with pytest.raises(InputError, match="cannot make the output folder"):
-        RecordFolder(tmp_path / "file", {"views": 3})
+        RecordFolder(tmp_path / "file", config)
 
 
 def test_records_that_are_not_what_they_were_are_refused(tmp_path):
@@ -59,8 +54,8 @@ def test_records_that_are_not_what_they_were_are_refused(tmp_path):
     for changed, problem in (
         (whole.replace("0.25", "0.26"), "checksum"),
         ((tmp_path / "scene_0000.json").read_text(), "it is scene 0"),
+        ("", "Expecting value"),
         ("[]", "it holds a list"),
-        ("null", "it holds a NoneType"),
         ("[" * 100_000, "recursion"),
         ('{"format": 2, "index": 1, "record": [], "sha256": ""}', "checksum"),
     ):

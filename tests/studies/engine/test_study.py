@@ -11,7 +11,6 @@ from toy import ToyStudy
 
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import limit_capacity
 from jaxnbv.geometry.pose import look_at
 from jaxnbv.imagination import Imagination
 from jaxnbv.planning.planner import Planner
@@ -148,11 +147,3 @@ def test_planners_have_the_studys_settings():
     assert isinstance(small().scene(0).surface, SDFSurface)
     keys = [small().key(*of) for of in ((0, "first"), (1, "first"), (0, "episode"))]
     assert len({tuple(jax.random.key_data(key).tolist()) for key in keys}) == 3
-
-
-def test_clouds_are_thinned_to_the_capacity():
-    study = small(capacity=100)
-    run = study.run_scene(0, ["random"])["methods"]["random"]
-    assert run["points"] == [100, 100, 100]
-    scan, evidence = study.seen(study.scene(0), run)[0]
-    np.testing.assert_array_equal(evidence.cloud.points, limit_capacity(scan, 100).points)
