@@ -2,7 +2,7 @@
 
     python benchmarks/kills.py --kills 1000 --out runs/kills
 
-Commands are a run, two of it at once in one folder, its figures, a study by one process and by two, and a session that
+Commands are a run, two of it at once in one folder, its report, a study by one process and by two, and a session that
 takes images where it says and reports, all at small settings. Each is killed (SIGKILL) at moments that are spread over
 the time that it takes, and started again until it has been killed so often. Then it is let through. Not part of the
 tests: about five seconds a kill.
@@ -28,7 +28,7 @@ STUDY = ("study", "pyramid", "--quick", "--scenes", "2", "--views", "2", "--meth
 COMMANDS = {
     "run": (*RUN, "--no-report"),
     "two runs in one folder": (*RUN, "--no-report"),
-    "figures": RUN,
+    "report": RUN,
     "study": STUDY,
     "study by two processes": (*STUDY, "--workers", "2"),
     "session": (),

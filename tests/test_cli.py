@@ -17,12 +17,11 @@ def finished(tmp_path_factory):
     return folder, result
 
 
-def test_demo_leaves_an_episode_a_report_and_figures(finished):
+def test_demo_leaves_an_episode_and_a_report(finished):
     folder, result = finished
     out = folder / "runs" / "truck-cross-entropy-halving-seed0"
     names = {path.name for path in out.iterdir()}
     assert {"episode.json", "view_00.npz", "view_01.npz", "cloud.ply", "report.html"} <= names
-    assert list(out.rglob("*.png"))
     assert "view 2" in result.stdout
     # Probabilities before and after: the likeliest three in a line after each view.
     lines = [line for line in result.stdout.splitlines() if line.count(" %") == 3]

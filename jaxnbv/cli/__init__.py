@@ -17,8 +17,7 @@ app = typer.Typer(
 
     jaxnbv scans an object from a first view, imagines what it may look like where it was not seen, and picks the view
     that is expected to tell the most; then it scans from there and asks again. Each run leaves a folder with the
-    episode (poses, scans, the values of all candidates), its point cloud as PLY, figures, and a report.html that opens
-    offline.
+    episode (poses, scans, the values of all candidates), its point cloud as PLY, and a report.html that opens offline.
 
     Try `jaxnbv demo`, then `jaxnbv run MESH --views 5 --out runs/mine`.
     """,

@@ -72,7 +72,7 @@ class Asked(NamedTuple):
         Path | None, running(metavar="DIR", help="Output folder.", show_default="runs/NAME-TASK-SEARCH[-MODEL]-seedN")
     ] = None
     quick: Annotated[bool, running("--quick", help="Small settings, for a first look; not the paper's.")] = False
-    report: Annotated[bool, running("--report/--no-report", help="Write report.html and the figures.")] = True
+    report: Annotated[bool, running("--report/--no-report", help="Write report.html.")] = True
 
 
 def with_options(**defaults: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:

@@ -74,9 +74,8 @@ def read_record(folder: Path, kind: str, remedy: str) -> dict[str, Any]:
 
 
 @contextmanager
-def writing_in(path: Path, *inside: str) -> Iterator[None]:
-    """While this process writes in a folder; what a process that was killed has left of a file is removed first, there
-    and in folders inside.
+def writing_in(path: Path) -> Iterator[None]:
+    """While this process writes in a folder; what a process that was killed has left of a file is removed first.
 
     **Raises:** `ValueError` if another process writes there, or it cannot be written.
     """
@@ -91,9 +90,8 @@ def writing_in(path: Path, *inside: str) -> Iterator[None]:
     except (OSError, NotImplementedError) as error:
         raise InputError(f"cannot write in {path} ({error}): make room or choose another place") from error
     try:
-        for folder in (path, *(path / name for name in inside)):
-            for left in folder.glob(PARTS):
-                left.unlink()
+        for left in path.glob(PARTS):
+            left.unlink()
         yield
     finally:
         lock.release()

@@ -1,28 +1,19 @@
-"""The pictures of an episode as PNG files, for papers and READMEs."""
+"""All views of an episode in one picture, and the style of figures."""
 
-from collections.abc import Callable
-from functools import partial
-from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import NullLocator
-from PIL import Image
 
 from jaxnbv.geometry.camera import Camera
-from jaxnbv.progress import progress_bar
-from jaxnbv.storage.files import make_folder, write_whole
-from jaxnbv.viz.choice_figures import draw_acquisition, draw_choice
+from jaxnbv.viz.choice_figures import draw_acquisition
 from jaxnbv.viz.data import ReportData
-from jaxnbv.viz.imagined import imagined_figure
-from jaxnbv.viz.layout import fitted, flow, pixels_of
+from jaxnbv.viz.layout import fitted, flow
 from jaxnbv.viz.render import Still, draw_scene
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, NEW, bar_ticks, middle_range
-from jaxnbv.viz.task_figures import chart_figure, progress_charts, task_charts
 
 STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
@@ -54,7 +45,7 @@ def deviation_range(data: ReportData) -> tuple[float, float]:
 
 
 class Stills:
-    """The painted surfaces, once they are asked for: the page, the figures and the strip share them."""
+    """The painted surfaces, once they are asked for."""
 
     def __init__(self, data: ReportData):
         self._data = data
@@ -66,63 +57,6 @@ class Stills:
             still = self._stills[index] = Still(stage.eye, surface, _STILL, stage.extent)
             still.paint(LogNorm(*deviation_range(self._data)))
         return self._stills[index]
-
-
-def figures_of(data: ReportData, camera: Camera, stills: Stills) -> dict[str, Callable[[], Figure]]:
-    """What draws each figure of an episode, by its name: `view_01`, ... scene and acquisition of each view;
-    `view_02_imagined`, ... what was imagined before it; `task` and `coverage`, the charts; `overview`, all views in a
-    strip."""
-    drawings: dict[str, Callable[[], Figure]] = {}
-    for index, view in enumerate(data.views):
-        drawings[f"view_{view.number:02d}"] = partial(_view, data, index, camera, stills)
-        if view.imagined is not None:
-            drawings[f"view_{view.number:02d}_imagined"] = partial(imagined_figure, view.imagined, view.number)
-    drawings["task"] = partial(chart_figure, task_charts(data))
-    drawings["coverage"] = partial(chart_figure, progress_charts(data))
-    drawings["overview"] = partial(overview_figure, data, camera, stills)
-    return drawings
-
-
-def write_figures(
-    data: ReportData, camera: Camera, folder: str | Path, progress: bool = True, stills: Stills | None = None
-) -> list[Path]:
-    """Write the figures of an episode (see `figures_of`) as PNG files into a folder, and return their paths.
-
-    `stills`: painted surfaces, where they are at hand.
-    """
-    folder = make_folder(folder)
-    drawings = figures_of(data, camera, Stills(data) if stills is None else stills)
-    with mpl.rc_context(STYLE):
-        for name, draw in progress_bar(drawings.items(), progress, desc="drawing figures"):
-            small = name == "overview"
-            _save(draw(), folder / f"{name}.png", dpi=120 if small else 200, few_colours=small)
-    return [folder / f"{name}.png" for name in drawings]
-
-
-def _save(figure: Figure, path: Path, dpi: int, few_colours: bool = False) -> None:
-    image = Image.fromarray(pixels_of(figure, dpi)).convert("RGB")
-    if few_colours:
-        # A third of the size; dithered, so that the colour bars stay smooth.
-        image = image.quantize(palette=image.quantize(256), dither=Image.Dither.FLOYDSTEINBERG)
-        colours = np.asarray(image.getpalette()).reshape(-1, 3)
-        # The background is the commonest colour; the mean of it and its neighbours is not quite white.
-        colours[np.bincount(np.asarray(image).ravel()).argmax()] = 255
-        image.putpalette(colours.ravel().tolist())
-    write_whole(path, lambda file: image.save(file, "png", dpi=(dpi, dpi)))
-
-
-def _view(data: ReportData, index: int, camera: Camera, stills: Stills) -> Figure:
-    view, norm, quantity = data.views[index], LogNorm(*deviation_range(data)), data.quantity
-    figure = Figure(figsize=(8.4, 4.3))
-    draw_scene(figure.add_axes((0.0, 0.16, 0.5, 0.78)), data, index, stills[index], camera)
-    figure.text(0.015, 0.955, f"View {view.number}", fontsize=11, fontweight="bold", va="center")
-    flow(figure, _POINTS, 0.125, 0.955, 0.37, 0.045, 8.0)
-    _deviation_bar(figure, (0.08, 0.115, 0.34, 0.022), norm)
-    title = "This view was given" if view.choice is None else f"Why view {view.number}: {quantity.name}"
-    fitted(figure, 0.52, 0.955, title, 0.47, 10.0, va="center")
-    halves = figure.add_gridspec(2, 2, height_ratios=(7, 93), left=0, right=1, bottom=0, top=1, hspace=0, wspace=0)
-    draw_choice(figure.add_subfigure(halves[1, 1]), view.choice, quantity)
-    return figure
 
 
 def _deviation_bar(

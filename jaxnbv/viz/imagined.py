@@ -11,7 +11,6 @@ import matplotlib as mpl
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
 from jaxnbv.geometry.camera import Camera
@@ -24,15 +23,13 @@ from jaxnbv.scanning import Evidence, GridSurface, TriangleMesh, mean_depth, sca
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.surfaces import KnownShapesPosterior, SurfacePosterior
 from jaxnbv.viz.answers import number
-from jaxnbv.viz.layout import fitted, framed
 from jaxnbv.viz.sphere import unit
-from jaxnbv.viz.style import BEFORE, GREY, NEW
+from jaxnbv.viz.style import BEFORE, NEW
 
 SHOWN = 4
 _PIXELS = 96
 # What had been seen before; and what was imagined elsewhere, lighter than the points, so that its shape shows.
 _KNOWN, _UNSEEN = "#c3c9d2", "#5b8fc7"
-_TILE, _GAP = 1.3, 0.12
 # Nearer to the cloud than this, or than so many of its own spacings, a surface was seen before.
 _SEEN, _SPACINGS = 0.05, 3.0
 
@@ -200,20 +197,3 @@ def depth_error(expected: Float[np.ndarray, "h w"], seen: Float[np.ndarray, "i j
     if expected.shape != seen.shape or not np.isfinite(expected - seen).any():
         return None
     return float(np.nanmedian(np.abs(expected - seen)))
-
-
-def imagined_figure(seen: Imagined, view: int) -> Figure:
-    """What was imagined before a view (from 1), in a row of pictures."""
-    (more, scale), tiles = depths(seen), looks(seen)
-    tiles = [*tiles, *more]
-    width, tall = len(tiles) * (_TILE + _GAP) + _GAP, _TILE + 0.85
-    figure = Figure(figsize=(width, tall))
-    head, room = f"What was imagined from the pose of view {view} (grey: seen before). {scale}", 1.0 - 2 * _GAP / width
-    fitted(figure, _GAP / width, 1.0 - 0.25 / tall, head, room, 9.0, va="center")
-    for column, tile in enumerate(tiles):
-        x = (_GAP + column * (_TILE + _GAP)) / width
-        axes = figure.add_axes((x, 0.35 / tall, _TILE / width, _TILE / tall))
-        axes.imshow(tile.picture, interpolation="nearest")
-        framed(axes, GREY, 0.6)
-        fitted(figure, x, 0.17 / tall, tile.name, _TILE / width, 8.0, va="center")
-    return figure

@@ -1,4 +1,4 @@
-"""The report of an episode: one HTML page that opens offline, and the same pictures as PNG files."""
+"""The report of an episode: one HTML page that opens offline."""
 
 import base64
 import gzip
@@ -25,7 +25,7 @@ from jaxnbv.storage.folders import versions, writing_in
 from jaxnbv.viz.answers import capital, label_of, may_be_words, number
 from jaxnbv.viz.choice_figures import draw_choice
 from jaxnbv.viz.data import ReportData, report_data
-from jaxnbv.viz.figures import STYLE, Stills, deviation_range, write_figures
+from jaxnbv.viz.figures import STYLE, Stills, deviation_range
 from jaxnbv.viz.html import render
 from jaxnbv.viz.imagined import depths, looks
 from jaxnbv.viz.layout import pixels_of
@@ -35,7 +35,6 @@ from jaxnbv.viz.space import figures_in_space
 from jaxnbv.viz.style import DEVIATION, bar_ticks, gradient
 from jaxnbv.viz.task_figures import chart_figure, other_charts, task_charts
 
-_FIGURES = "figures"
 _SCENE, _SCENE_DPI = (6.8, 5.9), 100
 _CHART, _SMALL_CHART = (4.4, 2.6), (3.1, 2.6)
 _WHY, _WHY_DPI = (5.2, 4.6), 150
@@ -52,8 +51,8 @@ def write_report(
     rival: Episode | None = None,
     sketches: Sketches | None = None,
 ) -> Path:
-    """Write `report.html` and `figures/*.png` into a folder, which is made where it is missing, and return the page's
-    path. Files of an earlier report are replaced.
+    """Write `report.html` into a folder, which is made where it is missing, and return its path. An earlier report is
+    replaced.
 
     - `truth`: points of the true surface in scene coordinates, for the chart of coverage; by default sampled from the
       scene, where it can be. Without truth the chart is of the area that the scans have shown.
@@ -65,19 +64,14 @@ def write_report(
     """
     path = make_folder(folder) / "report.html"
     data = report_data(episode, truth, progress, rival=rival, sketches=sketches)
-    stills = Stills(data)
-    with writing_in(path.parent, _FIGURES):
-        write_figures(data, episode.planner.camera, path.parent / _FIGURES, progress, stills)
-        write_text(path, report_html(episode, data, title, stills))
+    with writing_in(path.parent):
+        write_text(path, report_html(episode, data, title))
     return path
 
 
-def report_html(episode: Episode, data: ReportData, title: str, stills: Stills | None = None) -> str:
-    """The page as text: a template with the data, the pictures and plotly's own code put in.
-
-    `stills`: painted surfaces, where they are at hand.
-    """
-    stills, camera = Stills(data) if stills is None else stills, episode.planner.camera
+def report_html(episode: Episode, data: ReportData, title: str) -> str:
+    """The page as text: a template with the data, the pictures and plotly's own code put in."""
+    stills, camera = Stills(data), episode.planner.camera
     with mpl.rc_context(STYLE):
         scenes = [_scene(data, index, stills, camera) for index in range(len(data.views))]
         whys = [_why(data, index) for index in range(len(data.views))]
@@ -152,8 +146,8 @@ def _why(data: ReportData, index: int) -> str:
 def _chart(chart: tuple, size: tuple[float, float]) -> tuple[str, bytes, str]:
     """A chart's name, its drawing, and where its first view begins and how wide each is, in the page's style, which
     marks one."""
-    title, _ = chart
-    figure, file = chart_figure([chart], *size, titled=False), io.BytesIO()
+    title, draw = chart
+    figure, file = chart_figure(draw, size), io.BytesIO()
     with mpl.rc_context({"svg.hashsalt": "jaxnbv"}):
         figure.savefig(file, format="svg", metadata={"Date": None}, transparent=True)
     place, (left, right) = figure.axes[0].get_position(), figure.axes[0].get_xlim()

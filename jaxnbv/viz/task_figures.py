@@ -2,6 +2,7 @@
 
 import itertools
 import textwrap
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -13,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from matplotlib.transforms import ScaledTranslation
 
-from jaxnbv.viz.answers import Panel, capital, label_of, number
+from jaxnbv.viz.answers import Panel, label_of, number
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.style import BEFORE, GREY, INK, LINE, NEW, SERIES
 
@@ -169,11 +170,8 @@ def other_charts(data: ReportData) -> list[tuple[str, Any]]:
     return charts
 
 
-def chart_figure(charts: list[tuple[str, Any]], width: float = 3.6, height: float = 2.9, titled: bool = True) -> Figure:
-    """Charts side by side."""
-    figure = Figure(figsize=(width * len(charts), height), layout="constrained")
-    for axes, (title, draw) in zip(np.atleast_1d(figure.subplots(1, len(charts))), charts, strict=True):
-        draw(axes)
-        if titled:
-            axes.set_title("\n".join(textwrap.wrap(capital(title), int(12 * width))[:3]), fontsize=9)
+def chart_figure(draw: Callable[[Axes], object], size: tuple[float, float]) -> Figure:
+    """A chart, by what draws it."""
+    figure = Figure(figsize=size, layout="constrained")
+    draw(figure.subplots())
     return figure

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from matplotlib.text import Text
 from small_run import CAMERA, small_run
 
@@ -17,12 +18,14 @@ import jaxnbv as nbv
 from jaxnbv.acquisition import Answer, Quantity
 from jaxnbv.viz import report_data
 from jaxnbv.viz.answers import CoverageAnswer, Panel
-from jaxnbv.viz.figures import STYLE, Stills, figures_of
+from jaxnbv.viz.choice_figures import draw_choice
+from jaxnbv.viz.figures import STYLE, overview_figure
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.space import clustered, figures_in_space
 from jaxnbv.viz.stage import stage_of
 from jaxnbv.viz.style import bar_ticks
 from jaxnbv.viz.task import Rival, Task
+from jaxnbv.viz.task_figures import chart_figure, other_charts, task_charts
 
 
 @pytest.fixture(scope="module")
@@ -91,43 +94,45 @@ LONG = Quantity(
 )
 
 
+def why(data, index):
+    """Why a view was chosen, as the page draws it."""
+    figure = Figure(figsize=(5.2, 4.6))
+    draw_choice(figure, data.views[index].choice, data.quantity)
+    return figure
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 7])
 @pytest.mark.parametrize("quantity", [None, LONG])
 def test_letters_neither_collide_nor_are_cut(data, count, quantity):
     shown = of_views(data, count)
     shown = shown if quantity is None else dataclasses.replace(shown, quantity=quantity)
-    # A view's own figures do not depend on later ones: those of all but the last are drawn with three views.
-    last = f"view_{count:02d}"
     with mpl.rc_context(STYLE):
-        for name, draw in figures_of(shown, CAMERA, Stills(shown)).items():
-            if count == 3 or name.startswith(last) or not name.startswith("view"):
-                check_letters(draw())
+        check_letters(overview_figure(shown, CAMERA))
+        for _, draw in (*task_charts(shown), *other_charts(shown)):
+            check_letters(chart_figure(draw, (4.4, 2.6)))
+        if count <= 3:
+            check_letters(why(shown, count - 1))
 
 
 @pytest.mark.parametrize("low", [1e-4, 2e-3, 0.04])
 def test_the_ticks_of_any_range_have_room(data, low, monkeypatch):
     monkeypatch.setattr("jaxnbv.viz.figures.deviation_range", lambda data: (low, 1.0))
-    for count, names in ((2, ("view_02", "overview")), (3, ("overview",))):
-        shown = of_views(data, count)
-        with mpl.rc_context(STYLE):
-            drawings = figures_of(shown, CAMERA, Stills(shown))
-            for name in names:
-                check_letters(drawings[name]())
+    with mpl.rc_context(STYLE):
+        for count in (2, 3):
+            check_letters(overview_figure(of_views(data, count), CAMERA))
 
 
 @pytest.mark.parametrize("names", [("one",), tuple("abcde"), tuple(f"a part of a name of {k}" for k in range(12))])
 @pytest.mark.parametrize("one_true", [True, False])
 def test_legends_of_the_task_have_room(data, names, one_true):
     values = np.linspace(0.0, 1.0, len(names))
-    panels = Panel(
-        "a quantity with a rather long name, and its unit (units)", names, values, values[::-1], one_true, 0.9
-    )
+    panels = Panel("a quantity (units)", names, values, values[::-1], one_true, 0.9)
     answer = Answer(names, values)
-    rival = Rival("farthest view", "", ((panels, panels),) * 7, (CoverageAnswer.of_share(0.5),) * 7)
-    task = Task((answer,) * 3, None, ((panels, panels),) * 3, "", "", "", rival)
-    shown = dataclasses.replace(data, task=task)
+    rival = Rival("farthest view", "", ((panels,),) * 7, (CoverageAnswer.of_share(0.5),) * 7)
+    task = Task((answer,) * 3, None, ((panels,),) * 3, "", "", "", rival)
+    ((_, draw),) = task_charts(dataclasses.replace(data, task=task))
     with mpl.rc_context(STYLE):
-        check_letters(figures_of(shown, CAMERA, Stills(shown))["task"]())
+        check_letters(chart_figure(draw, (4.4, 2.6)))
 
 
 def test_ticks_are_powers_of_ten_or_both_ends():
@@ -221,5 +226,5 @@ def test_a_record_without_standard_errors_gives_a_page_too(episode):
         patch.setattr("jaxnbv.viz.sketches.mean_surface", lambda *arguments: None)
         old = report_data(dataclasses.replace(episode, views=views), progress=False, imagine=False)
     with mpl.rc_context(STYLE):
-        for draw in figures_of(old, CAMERA, Stills(old)).values():
-            check_letters(draw())
+        check_letters(overview_figure(old, CAMERA))
+        check_letters(why(old, 2))

@@ -233,8 +233,8 @@ def test_a_rival_is_told_of_and_drawn(plain):
     truth = nbv.metrics.truth_points(scene, jax.random.key(0))
     np.testing.assert_allclose([answer.values[0] for answer in rival.seen], nbv.metrics.coverage(other.views, truth))
     assert rival.words in report_html(episode, data, "thing")
-    (figure,) = (chart_figure(task_charts(data)),)
-    (axes,) = figure.axes
+    ((_, draw),) = task_charts(data)
+    (axes,) = chart_figure(draw, (4.4, 2.6)).axes
     drawn = [line.get_ydata() for line in axes.lines]
     assert any(
         len(values) == 3 and np.allclose(values, [panel[0].values[1] for panel in rival.panels]) for values in drawn
