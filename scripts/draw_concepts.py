@@ -16,8 +16,7 @@ import jaxnbv as nbv
 from jaxnbv.geometry.neighbours import nearest_squared_distance
 from jaxnbv.studies.scenes import demo_object, hidden_view
 from jaxnbv.surfaces.known_shapes import kind_of
-from jaxnbv.viz.choice import choice_of
-from jaxnbv.viz.choice_figures import draw_acquisition
+from jaxnbv.viz.choice import draw_acquisition
 from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.imagined import look, look_picture
 from jaxnbv.viz.render import Still, beside, draw_items, frame
@@ -127,7 +126,7 @@ def draw_search(found: dict[str, nbv.Proposal], quantities: dict[str, nbv.Quanti
     figure = Figure(figsize=(9.6, 2.3))
     for index, (name, proposal) in enumerate(found.items()):
         axes = figure.add_axes((0.005 + 0.333 * index, 0.02, 0.323, 0.76))
-        draw_acquisition(axes, choice_of(proposal), quantities[name])
+        draw_acquisition(axes, proposal, quantities[name])
         axes.set_title(f"{name}: {quantities[name].name}", loc="center", fontsize=8)
     return figure
 

@@ -15,12 +15,12 @@ from PIL import Image
 import jaxnbv as nbv
 from jaxnbv.cli.play import DEMO, imagined, planner_of, rule
 from jaxnbv.cli.tasks import COMMAND_TASKS
+from jaxnbv.viz.charts import over_views
 from jaxnbv.viz.data import ReportData, report_data
-from jaxnbv.viz.figures import STYLE, Stills
+from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.imagined import Tile, look_picture, looks
-from jaxnbv.viz.render import draw_scene
+from jaxnbv.viz.render import draw_scene, painted
 from jaxnbv.viz.style import GREY, NEW
-from jaxnbv.viz.task_figures import over_views
 
 SIZE, DPI, COLOURS = (9.2, 3.5), 120, 128
 MOST_VIEWS, RACE_VIEWS = 5, 10
@@ -40,8 +40,8 @@ def demo_episode(seed: int, search: str, views: int) -> nbv.Episode:
 class Film:
     """Frames of one size, each shown for a time."""
 
-    def __init__(self, data: ReportData, camera: nbv.Camera):
-        self.data, self.camera, self.stills = data, camera, Stills(data)
+    def __init__(self, data: ReportData):
+        self.data, self.stills = data, [painted(data, index) for index in range(len(data.views))]
         self.frames: list[Image.Image] = []
         self.times: list[int] = []
 
@@ -50,7 +50,7 @@ class Film:
         figure = Figure(figsize=SIZE)
         figure.text(0.19, 0.95, f"after view {view}: what is known", ha="center", fontsize=10)
         known = figure.add_axes((0.0, 0.0, 0.38, 0.93))
-        draw_scene(known, self.data, view - 1, self.stills[view - 1], self.camera, inset=False)
+        draw_scene(known, self.data, view - 1, self.stills[view - 1], inset=False)
         figure.text(0.52, 0.95, head, ha="center", fontsize=10)
         axes = figure.add_axes((0.395, 0.12, 0.25, 0.25 * SIZE[0] / SIZE[1]))
         axes.imshow(tile.picture, interpolation="bilinear")
@@ -63,20 +63,20 @@ class Film:
 
     @property
     def _true_name(self) -> str:
-        (panel,) = self.data.task.panels[0]
-        return panel.names[int(np.argmax(panel.true))]
+        (chart,) = self.data.task.charts
+        return chart.names[int(np.argmax(chart.true))]
 
     def _answers(self, axes: Axes, drawn: int, rival: int) -> None:
         task = self.data.task
         assert task.rival is not None
-        lines = (task.rival.panels[:rival], GREY, "s--", task.rival.name), (task.panels[:drawn], NEW, "o-", "jaxnbv")
-        for panels, colour, marks, name in lines:
-            values = [panel.values[int(np.argmax(panel.true))] for (panel,) in panels]
-            axes.plot(range(1, len(values) + 1), values, marks, color=colour, lw=1.8, ms=5, label=name)
-        (panel,) = task.panels[0]
-        axes.axhline(panel.goal, color=GREY, lw=0.8, ls=":")
+        (chart,), (other,) = task.charts, task.rival.charts
+        true = int(np.argmax(chart.true))
+        lines = (other.values[:rival], GREY, "s--", task.rival.name), (chart.values[:drawn], NEW, "o-", "jaxnbv")
+        for values, colour, marks, name in lines:
+            axes.plot(range(1, len(values) + 1), values[:, true], marks, color=colour, lw=1.8, ms=5, label=name)
+        axes.axhline(chart.goal, color=GREY, lw=0.8, ls=":")
         axes.set(ylim=(0.0, 1.06))
-        over_views(axes, max(len(task.panels), len(task.rival.panels)))
+        over_views(axes, max(len(chart.values), len(other.values)))
         axes.legend(loc="lower right", frameon=False, fontsize=9)
 
     def save(self, path: Path) -> None:
@@ -99,18 +99,18 @@ def main() -> None:
     out: Path = parser.parse_args().out
     episode, rival = demo_episode(0, "halving", MOST_VIEWS), demo_episode(0, "farthest", RACE_VIEWS)
     data = report_data(episode, progress=False, rival=rival)
-    views, film = data.views, Film(data, episode.planner.camera)
+    views, film = data.views, Film(data)
     with mpl.rc_context(STYLE):
-        for view in views:
+        for number, view in enumerate(views, start=1):
             assert view.look is not None
             if view.imagined is not None:
                 for tile in looks(view.imagined)[:4]:
                     guess = Tile(tile.name.rstrip(" 0123456789") + "?", tile.picture)
-                    film.add(view.number - 1, guess, f"imagined from view {view.number}", GUESS)
+                    film.add(number - 1, guess, f"imagined from view {number}", GUESS)
             seen = Tile("scanned", look_picture(view.look, plain=True))
-            film.add(view.number, seen, f"seen from view {view.number}", ANSWER)
+            film.add(number, seen, f"seen from view {number}", ANSWER)
         assert data.task.rival is not None
-        film.add(len(views), seen, f"seen from view {len(views)}", END, len(data.task.rival.panels))
+        film.add(len(views), seen, f"seen from view {len(views)}", END, len(data.task.rival.charts[0].values))
     film.save(out / "demo.gif")
 
 

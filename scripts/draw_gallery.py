@@ -19,12 +19,11 @@ from jaxnbv.scanning.metrics import truth_points
 from jaxnbv.scanning.sensors import USUAL_SETTING, fitted
 from jaxnbv.search import SphereCandidates
 from jaxnbv.studies.scenes import Split, demo_object, household_scene, part_scene, truck_scene
-from jaxnbv.viz.choice_figures import draw_acquisition
+from jaxnbv.viz.choice import draw_acquisition
 from jaxnbv.viz.data import ReportData, report_data
-from jaxnbv.viz.figures import STYLE, Stills
+from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.imagined import looks
-from jaxnbv.viz.layout import fitted as words
-from jaxnbv.viz.render import draw_scene
+from jaxnbv.viz.render import draw_scene, painted
 from jaxnbv.viz.style import GREY
 
 VIEWS, RAYS, CANDIDATES = 4, 48, 60
@@ -69,7 +68,7 @@ def draw_gallery(figure: Figure, columns: int = 4) -> None:
         row, column = divmod(index, columns)
         bottom = 1.0 - (row + 1) / rows
         axes = figure.add_axes((column / columns, bottom + 0.08 / rows, 1.0 / columns, 0.92 / rows))
-        draw_scene(axes, data, VIEWS - 1, Stills(data)[VIEWS - 1], episode.planner.camera, weight=0.8, inset=False)
+        draw_scene(axes, data, VIEWS - 1, painted(data, VIEWS - 1), weight=0.8, inset=False)
         text = f"{name}, {data.views[-1].seen.amount} covered"
         figure.text((column + 0.5) / columns, bottom + 0.04 / rows, text, ha="center", va="center", fontsize=9)
 
@@ -78,11 +77,8 @@ def draw_hero(figure: Figure) -> None:
     """One step: what is known, what is imagined, which view is worth most, what it shows, and the answer."""
     episode = demo_episode(SEED, "halving", 2)
     data: ReportData = report_data(episode, progress=False)
-    stills, camera = Stills(data), episode.planner.camera
-    seen = data.views[1].imagined
-    choice = data.views[1].choice
+    seen, proposal = data.views[1].imagined, data.views[1].proposal
     assert seen is not None
-    assert choice is not None
     heads = (
         ("a truck: what does it carry?", "pale is known, dark is guessed"),
         ("what may be there", "four guesses; blue: not seen yet"),
@@ -94,17 +90,17 @@ def draw_hero(figure: Figure) -> None:
     for place, ((head, below), width) in enumerate(zip(heads, widths, strict=True)):
         x, w = left / total, width / total
         figure.text(x + 0.5 * w, 0.96, head, ha="center", va="center", fontsize=12)
-        words(figure, x + 0.5 * w, 0.875, below, 0.96 * w, 10.5, ha="center", va="center", color=GREY)
+        figure.text(x + 0.5 * w, 0.875, below, ha="center", va="center", color=GREY, fontsize=10.5)
         if place in (0, 3):
             index = 0 if place == 0 else 1
-            draw_scene(figure.add_axes((x, 0.0, w, 0.86)), data, index, stills[index], camera, inset=False)
+            draw_scene(figure.add_axes((x, 0.0, w, 0.86)), data, index, painted(data, index), inset=False)
         elif place == 1:
             for number, tile in enumerate(looks(seen)[:4]):
                 down, across = divmod(number, 2)
                 box = (x + (0.04 + 0.48 * across) * w, 0.43 - 0.42 * down, 0.44 * w, 0.4)
                 _tile(figure.add_axes(box), tile.picture)
         else:
-            draw_acquisition(figure.add_axes((x + 0.02 * w, 0.2, 0.96 * w, 0.55)), choice, data.quantity)
+            draw_acquisition(figure.add_axes((x + 0.02 * w, 0.2, 0.96 * w, 0.55)), proposal, data.quantity)
         left += width
 
 

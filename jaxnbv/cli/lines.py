@@ -26,7 +26,7 @@ class Lines:
         _print(f"view {self.count:<3} ({position})   {int(view.scan.count):,} points   {_why(self.planner, view)}")
         answer = self.planner.acquisition.answer(view.cloud)
         if answer is not None:
-            _print(f"         {words_of(answer).line(self.before)}")
+            _print(f"         {words_of(answer).said(self.before)}")
         self.before = answer
 
 

@@ -86,8 +86,10 @@ class SoftPartCount(eqx.Module):
         return PartAnswer(names, counts, asked=asked, target=self.target)
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> "PartAnswer":
-        """Of a solid with labels, how many points of its surface belong to each; of others, the answer on all of it."""
-        answer, label = self.answer(cloud), getattr(getattr(scene, "sdf", None), "label", None)
+        """Of a solid with labels, how many points of its surface belong to each; of others, the answer on all of it.
+        One point is enough for a part to be there."""
+        answer = dataclasses.replace(self.answer(cloud), target=1.0)
+        label = getattr(getattr(scene, "sdf", None), "label", None)
         if not callable(label):
             return answer
         counts = np.bincount(np.asarray(label(cloud.points))[np.asarray(cloud.mask)], minlength=len(answer.names))

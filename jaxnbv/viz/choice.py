@@ -1,116 +1,38 @@
-"""What a search looked at when it chose a view, as plain arrays: candidates, ascents, and a map of the sphere."""
+"""Why a view was chosen: candidates and ascents on a map of the sphere, and the candidates by value."""
 
-import equinox as eqx
+import textwrap
+from typing import Any
+
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from jaxnbv.acquisition import Quantity
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.search import Proposal
-from jaxnbv.viz.sphere import unit
+from jaxnbv.search import Proposal, Trajectories
+from jaxnbv.viz import sphere
+from jaxnbv.viz.answers import label_of, number
+from jaxnbv.viz.style import GREY, INK, LINE, NEW, VALUE
 
 # Fewer candidates than this say little about what lies between them.
 _FEWEST_OF_A_MAP = 12
+_LETTERS = 64
 
 
-class Ascents(eqx.Module):
-    """The trajectories of a gradient search, from each of its starts to where it ended.
-
-    - `poses`: with leading axes (starts, steps); `values`: theirs.
-    """
-
-    poses: Pose
-    values: Float[np.ndarray, "starts steps"]
-
-    @property
-    def directions(self) -> Float[np.ndarray, "starts steps 3"]:
-        """Unit vectors from the origin to their positions."""
-        return unit(np.asarray(self.poses.position, dtype=np.float64))
-
-    @property
-    def is_spatial(self) -> bool:
-        """Whether cameras left the sphere that they started from, or looked past its centre."""
-        positions = np.asarray(self.poses.position, dtype=np.float64)
-        past = np.asarray(self.poses.forward, dtype=np.float64) + unit(positions)
-        return bool(np.ptp(np.linalg.norm(positions, axis=-1)) > 1e-3 or np.linalg.norm(past, axis=-1).max() > 1e-3)
+def open_values(proposal: Proposal) -> Float[np.ndarray, " c"]:
+    """The values of a proposal's candidates, NaN where one was excluded as visited."""
+    values = np.asarray(proposal.values, dtype=np.float64)
+    return np.where(np.isfinite(values), values, np.nan)
 
 
-class Choice(eqx.Module):
-    """What the search looked at when it chose a view.
-
-    - `directions`: unit vectors from the origin to the candidates; `values`: theirs, NaN where excluded as visited.
-    - `chosen`, `value`: direction and value of the pose that was taken.
-    - `ascents`: the trajectories of a gradient search, none of which is among the candidates here; else None.
-    - `num_tied`: how many other candidates are tied with the best one; None where it is not known.
-    - `errors`: standard errors of the values, and `error` that of the chosen one; None where they are not known.
-    - `tied`: which candidates are tied with the best one, itself included; None where not known.
-    """
-
-    directions: Float[np.ndarray, "c 3"]
-    values: Float[np.ndarray, " c"]
-    chosen: Float[np.ndarray, "3"]
-    value: float
-    ascents: Ascents | None
-    num_tied: int | None = None
-    errors: Float[np.ndarray, " c"] | None = None
-    error: float | None = None
-    tied: Bool[np.ndarray, " c"] | None = None
-
-    @property
-    def rank(self) -> int:
-        """Of the chosen pose among the candidates: 1 for the best."""
-        return 1 + int(np.sum(self.values > self.value))
-
-    @property
-    def visited(self) -> Bool[np.ndarray, " c"]:
-        return np.isnan(self.values)
-
-    @property
-    def open_values(self) -> Float[np.ndarray, " o"]:
-        """Values of the candidates that were open, best first."""
-        return np.sort(self.values[~self.visited])[::-1]
-
-    @property
-    def range(self) -> tuple[float, float]:
-        """Of the colours of the map and the candidates; not empty."""
-        return colour_range(self.values)
-
-    @property
-    def rings_tied(self) -> bool:
-        """Whether the candidates that are level with the best are marked: they must be known, and not most of all."""
-        return self.tied is not None and 0 < (self.num_tied or 0) <= len(self.values) // 3
-
-    @property
-    def caption(self) -> str:
-        """What the marks on the map are that not every map has."""
-        parts = []
-        if self.num_tied and not self.rings_tied:
-            parts.append(f"The samples cannot tell the best from {self.num_tied} of the others: no rings are drawn.")
-        if self.ascents is not None:
-            parts.append("Lines: gradient ascents, from a ring where they start to a dot where they end.")
-            if self.ascents.is_spatial:
-                parts.append("They change position and rotation; drawn is the direction of the position.")
-        return " ".join(parts)
-
-    def makes_a_map(self, quantity: Quantity) -> bool:
-        """Whether a map between the candidates says something: they must be many, and their values no lots."""
-        return quantity.smooth and len(self.open_values) >= _FEWEST_OF_A_MAP
-
-
-def choice_of(proposal: Proposal) -> Choice:
-    """A proposal's candidates as directions, where the chosen one stands among them, and its trajectories."""
-    values, ways = open_values(proposal), proposal.trajectories
-    return Choice(
-        directions=unit(np.asarray(proposal.candidates.position, dtype=np.float64)),
-        values=values,
-        chosen=unit(np.asarray(proposal.pose.position, dtype=np.float64)),
-        value=float(proposal.value),
-        ascents=None if ways is None else Ascents(ways.poses, np.asarray(ways.values, np.float64)),
-        num_tied=proposal.num_tied,
-        errors=None if proposal.standard_errors is None else np.asarray(proposal.standard_errors, np.float64),
-        error=proposal.standard_error,
-        tied=None if proposal.num_tied is None else np.asarray(proposal.tied_with_best()),
-    )
+def best_first(proposal: Proposal) -> Float[np.ndarray, " o"]:
+    """The values of the candidates that were open."""
+    values = open_values(proposal)
+    return np.sort(values[~np.isnan(values)])[::-1]
 
 
 def colour_range(values: Float[np.ndarray, "*n"]) -> tuple[float, float]:
@@ -122,7 +44,105 @@ def colour_range(values: Float[np.ndarray, "*n"]) -> tuple[float, float]:
     return (low, high) if high > low else (low - 0.5, low + 0.5)
 
 
-def open_values(proposal: Proposal) -> Float[np.ndarray, " c"]:
-    """The values of a proposal's candidates, NaN where one was excluded as visited."""
-    values = np.asarray(proposal.values, dtype=np.float64)
-    return np.where(np.isfinite(values), values, np.nan)
+def has_rings(proposal: Proposal) -> bool:
+    """Whether the candidates that are level with the best are marked: they must be known, and not most of all."""
+    return 0 < (proposal.num_tied or 0) <= len(proposal.values) // 3
+
+
+def marks(*proposals: Proposal) -> list[str]:
+    """The marks on some maps that not every map has."""
+    visited = any(np.isnan(open_values(proposal)).any() for proposal in proposals)
+    found = ["× visited"] * visited + ["◯ level with the best"] * any(map(has_rings, proposals))
+    climbed = any(proposal.trajectories is not None for proposal in proposals)
+    return found + ["○ start, ● end of an ascent"] * climbed
+
+
+def draw_choice(figure: Figure, proposal: Proposal | None, quantity: Quantity) -> None:
+    """Draw the map, and under it the candidates by value over a colour bar; of a given view the map's grid alone."""
+    colours = draw_acquisition(figure.add_axes((0.06, 0.4, 0.88, 0.58)), proposal, quantity)
+    if proposal is None or colours is None:
+        return
+    draw_candidates(figure.add_axes((0.14, 0.19, 0.72, 0.2)), proposal)
+    bar = figure.colorbar(colours, cax=figure.add_axes((0.14, 0.155, 0.72, 0.024)), orientation="horizontal")
+    bar.outline.set_visible(False)
+    bar.locator = MaxNLocator(5)
+    bar.formatter = FuncFormatter(lambda value, _: number(value))
+    errors = "" if proposal.standard_errors is None else "; lines: standard errors"
+    figure.text(0.5, 0.04, textwrap.fill(label_of(quantity) + errors, _LETTERS), ha="center", va="center")
+
+
+def draw_candidates(axes: Axes, proposal: Proposal) -> None:
+    """Draw the values of the open candidates, the best on top, with their standard errors, over a colour bar of the
+    same range."""
+    best = best_first(proposal)
+    order = np.argsort(-open_values(proposal))[: len(best)]
+    rows = -np.arange(len(best))
+    if proposal.standard_errors is not None:
+        errors = np.asarray(proposal.standard_errors, np.float64)[order]
+        axes.hlines(rows, best - errors, best + errors, color=GREY, lw=0.6, zorder=1)
+    axes.scatter(best, rows, s=4, color=INK, linewidths=0, zorder=2)
+    axes.plot(float(proposal.value), 1.0, "*", color=NEW, ms=8, markeredgecolor="white", zorder=3, clip_on=False)
+    axes.set(xlim=colour_range(best), ylim=(-len(best), 3.0 + 0.05 * len(best)))
+    axes.axis("off")
+
+
+def draw_acquisition(
+    axes: Axes, proposal: Proposal | None, quantity: Quantity, weight: float = 1.0
+) -> ScalarMappable | None:
+    """Draw the candidates' values as a map of the sphere; returns what a colour bar needs, None for a given view.
+
+    Between the candidates it is coloured where these are many, and their values no lots.
+    """
+    axes.axis("off")
+    globe: Any = axes.inset_axes((0.0, 0.0, 1.0, 1.0), projection="mollweide")
+    globe.set_longitude_grid(60)
+    globe.set_latitude_grid(30)
+    globe.set_longitude_grid_ends(90)
+    globe.grid(color=LINE, lw=0.5 * weight, alpha=0.6)
+    globe.tick_params(labelbottom=False, labelleft=False)
+    globe.spines["geo"].set(color=GREY, linewidth=0.8 * weight)
+    if proposal is None:
+        globe.text(0.0, 0.0, "given", ha="center", va="center", color=GREY, fontsize=11 * weight)
+        return None
+    values, directions = open_values(proposal), directions_of(proposal.candidates)
+    colours, is_open = ScalarMappable(Normalize(*colour_range(values)), VALUE), ~np.isnan(values)
+    if quantity.smooth and np.sum(is_open) >= _FEWEST_OF_A_MAP:
+        globe.pcolormesh(*sphere.smooth_map(directions, values), cmap=VALUE, norm=colours.norm)
+    places = sphere.on_map(directions)
+    dots: dict[str, Any] = {"s": 14 * weight, "edgecolors": GREY, "linewidths": 0.6 * weight, "clip_on": False}
+    globe.scatter(*places[is_open].T, c=colours.to_rgba(values[is_open]), **dots, zorder=3)
+    if has_rings(proposal):
+        tied = np.asarray(proposal.tied_with_best()) & is_open
+        rings: dict[str, Any] = {"s": 52 * weight, "facecolors": "none", "edgecolors": INK, "clip_on": False}
+        globe.scatter(*places[tied].T, linewidths=1.0 * weight, **rings, zorder=4)
+    globe.scatter(*places[~is_open].T, marker="x", c=INK, s=26 * weight, linewidths=1.2 * weight, zorder=4)
+    if proposal.trajectories is not None:
+        _draw_ascents(globe, directions_of(proposal.trajectories.poses), weight)
+    size = 14 if proposal.trajectories is None else 11
+    star: dict[str, Any] = {"ms": size * weight**0.5, "color": NEW, "markeredgecolor": "white", "mew": 1.0}
+    globe.plot(*sphere.on_map(directions_of(proposal.pose)[None]).T, "*", **star, zorder=10, clip_on=False)
+    return colours
+
+
+def directions_of(poses: Pose) -> Float[np.ndarray, "*n 3"]:
+    """Unit vectors from the origin to poses."""
+    return sphere.unit(np.asarray(poses.position, dtype=np.float64))
+
+
+def is_spatial(ascents: Trajectories) -> bool:
+    """Whether cameras left the sphere that they started from, or looked past its centre."""
+    positions = np.asarray(ascents.poses.position, dtype=np.float64)
+    past = np.asarray(ascents.poses.forward, dtype=np.float64) + sphere.unit(positions)
+    return bool(np.ptp(np.linalg.norm(positions, axis=-1)) > 1e-3 or np.linalg.norm(past, axis=-1).max() > 1e-3)
+
+
+def _draw_ascents(globe: Any, ascents: Float[np.ndarray, "starts steps 3"], weight: float) -> None:
+    """Draw trajectories on the map, each from a ring to a dot."""
+    for directions in ascents:
+        way = sphere.path(directions).T
+        globe.plot(*way, color="white", lw=2.2 * weight, zorder=6)
+        globe.plot(*way, color=INK, lw=1.1 * weight, zorder=7)
+    mark: dict[str, Any] = {"ls": "none", "marker": "o", "clip_on": False}
+    starts, ends = (sphere.on_map(ascents[:, step]).T for step in (0, -1))
+    globe.plot(*starts, ms=4.6 * weight, mew=1.0 * weight, mfc="white", mec=INK, zorder=8, **mark)
+    globe.plot(*ends, ms=3.4 * weight, mew=0.5 * weight, mfc=INK, mec="white", zorder=9, **mark)

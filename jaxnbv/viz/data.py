@@ -7,58 +7,66 @@ from jaxtyping import Float
 
 from jaxnbv.acquisition import Quantity
 from jaxnbv.checks import AnyArray
+from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.planning.episode import Episode
+from jaxnbv.planning.episode import Episode, View
 from jaxnbv.progress import progress_bar
 from jaxnbv.scanning.metrics import truth_points
-from jaxnbv.viz.answers import CoverageAnswer, words_of
-from jaxnbv.viz.choice import Ascents, Choice, choice_of
+from jaxnbv.search import Proposal, Trajectories
+from jaxnbv.viz.answers import CoverageAnswer, capital, words_of
+from jaxnbv.viz.choice import is_spatial
 from jaxnbv.viz.imagined import Imagined, Look, taken_look
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.sketches import Sketch, Sketches, sketches_of
 from jaxnbv.viz.stage import Stage, stage_of
+from jaxnbv.viz.style import middle_range
 from jaxnbv.viz.task import Task, seen_after, task_of
-from jaxnbv.viz.words import Told, describe_choice, describe_first
+from jaxnbv.viz.words import told
 
 
 class ViewData(eqx.Module):
     """One view, ready to be drawn.
 
-    - `number`: from 1.
-    - `before`: points kept before this view; `new`: points it added. Scene coordinates.
-    - `surface`: of the posterior mean, where it holds points, with a deviation that allows for what was not seen; None
-      where it has none within the grid.
-    - `choice`: None for a view that was given.
+    - `view`: itself.
+    - `before`: points kept before it, in scene coordinates.
+    - `surface`: of the posterior mean after it, where it holds points, with a deviation that allows for what was not
+      seen; None where it has none within the grid.
+    - `guesses`: pieces of the mean's surface that hold no points, if there are some.
     - `seen`: how much of the surface was seen.
-    - `told`: what happened, in words.
+    - `told`: what happened, in words by their headings.
     - `imagined`: what was imagined before it was taken; None for a view that was given.
     - `look`: the scan itself; None where it is no image.
-    - `guesses`: pieces of the mean's surface that hold no points, if there are some.
     """
 
-    number: int
-    pose: Pose
+    view: View
     before: Float[np.ndarray, "n 3"]
-    new: Float[np.ndarray, "m 3"]
     surface: MeanSurface | None
-    choice: Choice | None
+    guesses: MeanSurface | None
     seen: CoverageAnswer
-    told: Told
-    imagined: Imagined | None = None
-    look: Look | None = None
-    guesses: MeanSurface | None = None
+    told: dict[str, str]
+    imagined: Imagined | None
+    look: Look | None
 
     @property
-    def sentence(self) -> str:
-        """What happened, in words."""
-        return self.told.sentence(self.number)
+    def pose(self) -> Pose:
+        return self.view.pose
 
     @property
-    def spatial_ascents(self) -> Ascents | None:
+    def proposal(self) -> Proposal | None:
+        """What the search looked at; None for a view that was given."""
+        return self.view.proposal
+
+    @property
+    def new(self) -> Float[np.ndarray, "m 3"]:
+        """The points that it added, in scene coordinates."""
+        return self.view.scan.to_numpy()[0]
+
+    @property
+    def spatial_ascents(self) -> Trajectories | None:
         """The trajectories that led to this view, where they left the sphere."""
-        ascents = None if self.choice is None else self.choice.ascents
-        return None if ascents is None or not ascents.is_spatial else ascents
+        ascents = None if self.proposal is None else self.proposal.trajectories
+        return ascents if ascents is not None and is_spatial(ascents) else None
 
 
 class ReportData(eqx.Module):
@@ -67,11 +75,23 @@ class ReportData(eqx.Module):
     - `frame`: to the world that the object's file was given in; None where there was none.
     """
 
+    episode: Episode
     views: tuple[ViewData, ...]
     quantity: Quantity
     task: Task
     stage: Stage
     frame: Frame | None
+
+    @property
+    def camera(self) -> Camera:
+        """Which took the views."""
+        return self.episode.planner.camera
+
+    @property
+    def deviations(self) -> tuple[float, float]:
+        """One range of standard deviations for all views."""
+        found = [view.surface.deviation for view in self.views if view.surface is not None]
+        return middle_range(np.concatenate(found)) if found else (1e-3, 1.0)
 
 
 def report_data(
@@ -96,46 +116,23 @@ def report_data(
     seen = seen_after(episode.views, truth, planner.acquisition)
     rival_seen = () if rival is None else seen_after(rival.views, truth, planner.acquisition)
     task = task_of(episode, seen, rival, rival_seen)
-    drawn: list[ViewData] = []
     held = {} if sketches is None else sketches.held
-    following = zip(episode.views, sketches_of(episode, held, imagine), strict=True)
-    leading: Sketch | None = None
-    bar = progress_bar(following, progress, desc="drawing views", total=len(episode.views))
-    for index, (view, next_one) in enumerate(bar):
-        new, _ = view.scan.to_numpy()
-        before = episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), new.dtype)
-        choice = None if view.proposal is None else choice_of(view.proposal)
-        drawn.append(
-            ViewData(
-                number=index + 1,
-                pose=view.pose,
-                before=before,
-                new=new,
-                surface=next_one.surface,
-                choice=choice,
-                seen=seen[index],
-                told=_told(episode, index, choice, task, seen),
-                imagined=None if leading is None else leading.imagined,
-                look=taken_look(view, before),
-                guesses=next_one.guesses,
-            )
-        )
+    following = progress_bar(
+        sketches_of(episode, held, imagine), progress, desc="drawing views", total=len(episode.views)
+    )
+    drawn: list[ViewData] = []
+    leading = Sketch(None, None, None)
+    for index, next_one in enumerate(following):
+        view = episode.views[index]
+        words = told(planner.quantity, episode.views[: index + 1], seen[: index + 1])
+        if not task.is_coverage:
+            answered = words_of(task.answers[index]).said(task.answers[index - 1] if index else None)
+            words["What came"] += f" {capital(answered)}."
+        before = episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), np.float32)
+        look = taken_look(view, before)
+        of_mean = next_one.surface, next_one.guesses
+        drawn.append(ViewData(view, before, *of_mean, seen[index], words, leading.imagined, look))
         leading = next_one
     means = [view.surface.mesh for view in drawn if view.surface is not None]
     frame = getattr(episode.scene, "frame", None)
-    return ReportData(tuple(drawn), planner.quantity, task, stage_of(episode, means), frame)
-
-
-def _told(episode: Episode, index: int, choice: Choice | None, task: Task, seen: list[CoverageAnswer]) -> Told:
-    view = episode.views[index]
-    points = int(view.scan.count)
-    if choice is None or not index:
-        told = describe_first(view.pose, points, seen[index])
-    else:
-        earlier = [other.pose for other in episode.views[:index]]
-        came = points, int(view.cloud.count), (seen[index - 1], seen[index])
-        told = describe_choice(episode.planner.quantity, choice, view.pose, earlier, *came)
-    if not task.is_coverage:
-        answer = words_of(task.answers[index]).sentence(task.answers[index - 1] if index else None)
-        told = told._replace(came=f"{told.came} {answer}")
-    return told
+    return ReportData(episode, tuple(drawn), planner.quantity, task, stage_of(episode, means), frame)

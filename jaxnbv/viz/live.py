@@ -25,7 +25,7 @@ from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
 from jaxnbv.surfaces import KnownShapesPosterior, SurfacePosterior
-from jaxnbv.viz.answers import may_be_words, shown_value, words_of
+from jaxnbv.viz.answers import capital, may_be_words, shown_value, words_of
 from jaxnbv.viz.choice import colour_range, open_values
 from jaxnbv.viz.imagined import depth_picture, depth_range
 from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
@@ -135,7 +135,7 @@ class LiveView:
         seen = seen_after(episode.views, None, acquisition)[-1]
         lines = [f"**{views} view{'s' if views > 1 else ''}**, {seen.amount} of surface seen"]
         answer = acquisition.answer(episode.cloud)
-        lines += [] if answer is None else [words_of(answer).sentence()]
+        lines += [] if answer is None else [f"{capital(words_of(answer).said())}."]
         if isinstance(posterior, KnownShapesPosterior):
             lines.append(may_be_words(tuple(posterior.kinds().items())))
         if proposal is not None:

@@ -26,8 +26,7 @@ from jaxnbv.planning.session import Session
 from jaxnbv.scanning import Evidence
 from jaxnbv.search import Proposal
 from jaxnbv.surfaces import SurfacePosterior
-from jaxnbv.viz.choice import choice_of
-from jaxnbv.viz.choice_figures import draw_acquisition
+from jaxnbv.viz.choice import draw_acquisition
 from jaxnbv.viz.data import report_data
 from jaxnbv.viz.figures import STYLE, overview_figure
 from jaxnbv.viz.render import Still, beside, draw_items, frame
@@ -141,8 +140,7 @@ def _(proposal: Proposal) -> Drawing:
     facts += f", {len(proposal.values)} candidates"
     if proposal.num_tied:
         facts += f", {proposal.num_tied} of them as good as the samples can tell"
-    choice = choice_of(proposal)
-    return Drawing(lambda axes: draw_acquisition(axes, choice, Quantity("value", "", "")), facts)
+    return Drawing(lambda axes: draw_acquisition(axes, proposal, Quantity("value", "", "")), facts)
 
 
 @drawing_of.register
@@ -198,7 +196,7 @@ def show(
     with mpl.rc_context(STYLE):
         if isinstance(episode, Episode):
             data = report_data(episode, progress=progress, imagine=False)
-            return Picture(overview_figure(data, episode.planner.camera), 80)
+            return Picture(overview_figure(data), 80)
         drawing = drawing_of(shown)
         if drawing.draw is None:
             raise InputError(f"this has no picture: {drawing.facts}. Give one thing that holds points")

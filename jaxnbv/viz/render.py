@@ -19,11 +19,10 @@ from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.imagined import lamp, look_picture
-from jaxnbv.viz.layout import framed
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.scene import Cameras, Points, frustum, seen_items
 from jaxnbv.viz.sphere import unit
-from jaxnbv.viz.style import DEVIATION, LINE, NEW
+from jaxnbv.viz.style import DEVIATION, LINE, NEW, framed
 
 _DISTANCE = 11.0
 _SLACK = 0.04  # Noise and the mean's own error must not hide a point behind the surface that it lies on.
@@ -31,6 +30,7 @@ _HIDDEN = 0.18
 # How wide a hollow is darkened, as a share of the picture; how much at most, and how deep a hollow is then.
 _HOLLOW, _DARKEST, _DEEP = 0.05, 0.4, 0.25
 _INSET = 0.24
+_STILL = 640
 
 
 def beside(pose: Pose) -> Float[np.ndarray, "3"]:
@@ -116,26 +116,26 @@ def _occlusion(mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, " hits"])
     return _DARKEST * np.clip((depth - mean) / _DEEP, 0.0, 1.0)
 
 
+def painted(data: ReportData, index: int) -> Still:
+    """The surface after view `index` (from 0), from where all views of an episode are drawn."""
+    still = Still(data.stage.eye, data.views[index].surface, _STILL, data.stage.extent)
+    still.paint(LogNorm(*data.deviations))
+    return still
+
+
 def draw_scene(
-    axes: Axes,
-    data: ReportData,
-    index: int,
-    still: Still,
-    camera: Camera,
-    weight: float = 1.0,
-    inset: bool = True,
-    aspect: float = 1.0,
+    axes: Axes, data: ReportData, index: int, still: Still, weight: float = 1.0, inset: bool = True, aspect: float = 1.0
 ) -> None:
-    """Draw the scene after view `index` (from 0) into an empty axes: surface, points, the cameras so far, of which the
-    last is new, and in the corner where the least stands in any view what that one saw.
+    """Draw the scene after view `index` (from 0) into an empty axes: the painted surface, points, the cameras so far,
+    of which the last is new, and in the corner where the least stands in any view what that one saw.
 
     `weight` scales lines, dots and letters; `aspect` is width over height.
     """
     view, stage = data.views[index], data.stage
     axes.imshow(still.image, interpolation="bilinear", zorder=1)
     poses = [stage.pulled(other.pose) for other in data.views[: index + 1]]
-    draw_items(axes, still, seen_items(view.before, view.new, poses, camera, stage.depth), weight)
-    extent = _extent(data, still, camera)
+    draw_items(axes, still, seen_items(view.before, view.new, poses, data.camera, stage.depth), weight)
+    extent = _extent(data, still)
     frame(axes, still, extent, aspect)
     if inset and view.look is not None:
         across, up = _free_corner(axes, extent)
@@ -157,13 +157,13 @@ def _free_corner(axes: Axes, extent: list[Float[np.ndarray, "_ 2"]]) -> tuple[in
     return min(((0, 0), (0, 1), (1, 0), (1, 1)), key=taken)
 
 
-def _extent(data: ReportData, still: Still, camera: Camera) -> list[Float[np.ndarray, "_ 2"]]:
+def _extent(data: ReportData, still: Still) -> list[Float[np.ndarray, "_ 2"]]:
     """The pixels that anything takes in any view, so that all views are cropped alike."""
     surfaces = [view.surface.vertices for view in data.views if view.surface is not None]
     shown = [still.project(rows)[0] for rows in (*surfaces, *(view.new for view in data.views)) if len(rows)]
     for view in data.views:
         pose = data.stage.pulled(view.pose)
-        shown.append(still.project(frustum(pose, camera, data.stage.depth).reshape(-1, 3))[0])
+        shown.append(still.project(frustum(pose, data.camera, data.stage.depth).reshape(-1, 3))[0])
         shown.append(still.project(1.1 * np.asarray(pose.position, np.float64)[None])[0])
     return [np.clip(pixels, 0, still.size) for pixels in shown]
 

@@ -12,32 +12,30 @@ import equinox as eqx
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float, UInt8
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
 from jaxnbv.checks import AnyArray, checked
-from jaxnbv.geometry.camera import Camera
 from jaxnbv.planning.episode import Episode
 from jaxnbv.storage import describe
 from jaxnbv.storage.files import make_folder, write_text
 from jaxnbv.storage.folders import versions, writing_in
 from jaxnbv.viz.answers import capital, label_of, may_be_words, number
-from jaxnbv.viz.choice_figures import draw_choice
+from jaxnbv.viz.charts import other_charts, task_charts
+from jaxnbv.viz.choice import draw_choice, marks
 from jaxnbv.viz.data import ReportData, report_data
-from jaxnbv.viz.figures import STYLE, Stills, deviation_range
+from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.html import render
 from jaxnbv.viz.imagined import depths, looks
-from jaxnbv.viz.layout import pixels_of
-from jaxnbv.viz.render import draw_scene
+from jaxnbv.viz.render import draw_scene, painted
 from jaxnbv.viz.sketches import Sketches
 from jaxnbv.viz.space import figures_in_space
 from jaxnbv.viz.style import DEVIATION, bar_ticks, gradient
-from jaxnbv.viz.task_figures import chart_figure, other_charts, task_charts
 
 _SCENE, _SCENE_DPI = (6.8, 5.9), 100
-_CHART, _SMALL_CHART = (4.4, 2.6), (3.1, 2.6)
-_WHY, _WHY_DPI = (5.2, 4.6), 150
+_WHY, _WHY_DPI = (5.2, 4.3), 150
 _QUALITY = 82
 
 
@@ -65,41 +63,33 @@ def write_report(
     path = make_folder(folder) / "report.html"
     data = report_data(episode, truth, progress, rival=rival, sketches=sketches)
     with writing_in(path.parent):
-        write_text(path, report_html(episode, data, title))
+        write_text(path, report_html(data, title))
     return path
 
 
-def report_html(episode: Episode, data: ReportData, title: str) -> str:
+def report_html(data: ReportData, title: str) -> str:
     """The page as text: a template with the data, the pictures and plotly's own code put in."""
-    stills, camera = Stills(data), episode.planner.camera
     with mpl.rc_context(STYLE):
-        scenes = [_scene(data, index, stills, camera) for index in range(len(data.views))]
-        whys = [_why(data, index) for index in range(len(data.views))]
-        own = task_charts(data)
-        size = _CHART if len(own) == 1 else _SMALL_CHART
-        charts = [_chart(chart, size) for chart in own], [_chart(chart, _CHART) for chart in other_charts(data)]
+        pictures = [(_scene(data, index), _why(data, index)) for index in range(len(data.views))]
+        charts = [[_chart(*chart) for chart in drawn(data)] for drawn in (task_charts, other_charts)]
     return render(
         Path(__file__).with_name("report.html"),
         title=title,
-        task=data.task,
-        quantity=data.quantity,
+        data=data,
         label=capital(label_of(data.quantity)),
-        views=data.views,
-        scenes=scenes,
-        whys=whys,
+        pictures=pictures,
         task_charts=charts[0],
         other_charts=charts[1],
-        tables=list(zip(*data.task.panels, strict=True)),
-        settings=_settings(episode, title),
+        settings=_settings(data.episode, title),
         units="scene units" if data.frame is None else "the units of the object's file",
         gradient=gradient(DEVIATION),
         ticks=_deviation_ticks(data),
         # Plotly writes a figure with its numbers packed.
-        space=_zipped(f"[{','.join(str(figure.to_json()) for figure in figures_in_space(data, camera))}]"),
+        space=_zipped(f"[{','.join(str(figure.to_json()) for figure in figures_in_space(data))}]"),
         plotly=_zipped(get_plotlyjs()),
-        **{said.__name__: said for said in (capital, number, may_be_words, looks, depths)},
         address=picture_address,
         poses=[_matrix(data, index) for index in range(len(data.views))],
+        **{said.__name__: said for said in (capital, number, may_be_words, looks, depths, marks)},
     )
 
 
@@ -119,7 +109,7 @@ def _matrix(data: ReportData, index: int) -> str:
 
 def _deviation_ticks(data: ReportData) -> list[tuple[float, str]]:
     """The numbers under the bar of deviations, and where they stand, in percent of its width."""
-    low, high = deviation_range(data)
+    low, high = data.deviations
     return [(round(100.0 * math.log(tick / low, high / low), 2), f"{tick:g}") for tick in bar_ticks(low, high)]
 
 
@@ -127,27 +117,33 @@ def _zipped(text: str) -> bytes:
     return gzip.compress(text.encode(), mtime=0)
 
 
-def _scene(data: ReportData, index: int, stills: Stills, camera: Camera) -> str:
+def _scene(data: ReportData, index: int) -> str:
     """The picture of one view's scene."""
     figure = Figure(figsize=_SCENE, facecolor="none")
     # The frame in the corner is not cut.
     axes = figure.add_axes((0.002, 0.002, 0.996, 0.996))
-    draw_scene(axes, data, index, stills[index], camera, weight=1.2, aspect=_SCENE[0] / _SCENE[1])
-    return picture_address(pixels_of(figure, _SCENE_DPI))
+    draw_scene(axes, data, index, painted(data, index), weight=1.2, aspect=_SCENE[0] / _SCENE[1])
+    return picture_address(_pixels(figure, _SCENE_DPI))
 
 
 def _why(data: ReportData, index: int) -> str:
     """Why a view was chosen."""
     figure = Figure(figsize=_WHY, facecolor="none")
-    draw_choice(figure, data.views[index].choice, data.quantity)
-    return picture_address(pixels_of(figure, _WHY_DPI))
+    draw_choice(figure, data.views[index].proposal, data.quantity)
+    return picture_address(_pixels(figure, _WHY_DPI))
 
 
-def _chart(chart: tuple, size: tuple[float, float]) -> tuple[str, bytes, str]:
+def _pixels(figure: Figure, dpi: int) -> UInt8[np.ndarray, "h w 4"]:
+    canvas = FigureCanvasAgg(figure)
+    figure.set_dpi(dpi)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())
+
+
+def _chart(title: str, figure: Figure) -> tuple[str, bytes, str]:
     """A chart's name, its drawing, and where its first view begins and how wide each is, in the page's style, which
     marks one."""
-    title, draw = chart
-    figure, file = chart_figure(draw, size), io.BytesIO()
+    file = io.BytesIO()
     with mpl.rc_context({"svg.hashsalt": "jaxnbv"}):
         figure.savefig(file, format="svg", metadata={"Date": None}, transparent=True)
     place, (left, right) = figure.axes[0].get_position(), figure.axes[0].get_xlim()

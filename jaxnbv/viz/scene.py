@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.viz.choice import Ascents
+from jaxnbv.search import Trajectories
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.style import BEFORE, GREY, NEW
 
@@ -48,7 +48,7 @@ class Ways(NamedTuple):
     """The ascents of a gradient search, coloured by value."""
 
     name: str
-    ascents: Ascents
+    ascents: Trajectories
 
 
 Item = Points | Cameras | Solid | Ways

@@ -6,11 +6,10 @@ import numpy as np
 import plotly.graph_objects as go
 from jaxtyping import Float, Int
 
-from jaxnbv.geometry.camera import Camera
+from jaxnbv.search import Trajectories
 from jaxnbv.viz.answers import number
-from jaxnbv.viz.choice import Ascents, colour_range
+from jaxnbv.viz.choice import colour_range
 from jaxnbv.viz.data import ReportData
-from jaxnbv.viz.figures import deviation_range
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.scene import Cameras, Item, Points, Solid, Ways, frustum, seen_items, surface_items
 from jaxnbv.viz.style import DEVIATION, INK, VALUE_LINES, colour_scale
@@ -23,17 +22,17 @@ _GRAIN = 1 / 256
 _LIGHT = {"ambient": 0.72, "diffuse": 0.45, "specular": 0.04, "roughness": 0.9}
 
 
-def figures_in_space(data: ReportData, camera: Camera) -> list[go.Figure]:
+def figures_in_space(data: ReportData) -> list[go.Figure]:
     """One figure a view. Its legend switches what is shown, which stays from one view to the next."""
     stage, count = data.stage, len(data.views)
     points = min(_MAX_POINTS // count, _MOST_POINTS)
     vertices = min(max(_MAX_VERTICES // count, _FEWEST_VERTICES), _MOST_VERTICES)
-    grades = np.log10(deviation_range(data))
+    grades = np.log10(data.deviations)
     figures = []
     for index, view in enumerate(data.views):
         poses = [stage.pulled(other.pose) for other in data.views[: index + 1]]
         items: list[Item] = [*surface_items(view.surface, view.guesses)]
-        items += seen_items(view.before, view.new, poses, camera, stage.depth)
+        items += seen_items(view.before, view.new, poses, data.camera, stage.depth)
         if view.spatial_ascents is not None:
             items.append(Ways("gradient ascents", view.spatial_ascents))
         drawn = [trace for item in items for trace in _traces(item, points, vertices, grades, stage.pull)]
@@ -97,14 +96,15 @@ def _lines(segments: Float[np.ndarray, "n k 3"], line: dict[str, Any]) -> dict[s
     return {"type": "scatter3d", "mode": "lines", "line": line, **_placed(gapped.reshape(-1, 3))}
 
 
-def _ascents(ascents: Ascents, pull: float) -> list[dict[str, Any]]:
+def _ascents(ascents: Trajectories, pull: float) -> list[dict[str, Any]]:
     """Ways, drawn as near as the cameras, in the colours of their values; the values at their ends."""
     positions = pull * np.asarray(ascents.poses.position, np.float64)
-    low, high = colour_range(ascents.values)
+    looks = np.asarray(ascents.values, np.float64)
+    low, high = colour_range(looks)
     colours = {"colorscale": colour_scale(VALUE_LINES), "cmin": low, "cmax": high, "width": 5}
-    ways = _lines(positions, {"color": np.pad(ascents.values, ((0, 0), (0, 1)), mode="edge").ravel(), **colours})
+    ways = _lines(positions, {"color": np.pad(looks, ((0, 0), (0, 1)), mode="edge").ravel(), **colours})
     marker = {"size": 3, "color": INK, "symbol": ["circle-open", "circle"] * len(positions)}
-    values = [number(value) for value in ascents.values[:, [0, -1]].ravel().tolist()]
+    values = [number(value) for value in looks[:, [0, -1]].ravel().tolist()]
     ends = {"type": "scatter3d", "mode": "markers", "marker": marker, "text": values, "hoverinfo": "text"}
     return [ways, ends | _placed(positions[:, [0, -1]].reshape(-1, 3)) | {"showlegend": False}]
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
 
@@ -56,6 +57,12 @@ def bar_ticks(low: float, high: float) -> list[float]:
     one at most."""
     decades = [tick for tick in log_ticks(low, high).tolist() if round(np.log10(tick), 9).is_integer()]
     return decades[:: -(-len(decades) // 5)] if len(decades) > 1 else [low, high]
+
+
+def framed(axes: Axes, colour: str, width: float) -> None:
+    """A picture without ticks, in a frame."""
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set(visible=True, color=colour, linewidth=width)
 
 
 def save_figure(figure: Figure, path: Path) -> None:

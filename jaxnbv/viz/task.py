@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,43 +20,37 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Surface
 from jaxnbv.scanning.metrics import coverage, true_mesh
 from jaxnbv.tasks.coverage import NewSurface, visible_area
-from jaxnbv.viz.answers import CoverageAnswer, Panel, capital, words_of
+from jaxnbv.viz.answers import Chart, CoverageAnswer, capital, words_of
 
 
-class Rival(eqx.Module):
-    """Another search from the same first view.
-
-    - `name`: of the search, in words; `words`: how it fared, in a sentence.
-    - `panels`: view by view the charts of its answer; `seen`: how much of the surface it had seen.
-    """
+class Rival(NamedTuple):
+    """Another search from the same first view: its name and how it fared, in words; its charts, as of a `Task`."""
 
     name: str
     words: str
-    panels: tuple[tuple[Panel, ...], ...]
-    seen: tuple[CoverageAnswer, ...]
+    charts: tuple[Chart, ...]
+    seen: Chart
 
 
-class Task(eqx.Module):
+class Task(NamedTuple):
     """What the views were for.
 
     - `answers`: after each view; `truth`: what they should come to, None where that is not known.
-    - `panels`: view by view the charts of the answer.
-    - `asked`, `found`, `sure`: how it was asked, what was found and since when, for the head of the report.
+    - `charts`: of the answers; `seen`: of how much of the surface was seen.
+    - `question`, `asked`, `found`, `sure`: what was asked and how, what was found and since when, for the head of the
+      report.
     - `rival`: how another search fared; None without one.
     """
 
-    answers: tuple[Answer, ...]
+    answers: Sequence[Answer]
     truth: Answer | None
-    panels: tuple[tuple[Panel, ...], ...]
+    charts: tuple[Chart, ...]
+    seen: Chart
+    question: str
     asked: str
     found: str
     sure: str
     rival: Rival | None = None
-
-    @property
-    def question(self) -> str:
-        """What was asked."""
-        return words_of(self.answers[-1]).question
 
     @property
     def is_coverage(self) -> bool:
@@ -74,18 +69,30 @@ def task_of(
     - `seen`, `rival_seen`: how much of the surface was seen after each view.
     - `rival`: an episode of another search from the same first view.
     """
-    acquisition = episode.planner.acquisition
-    answers, truth = _answers(acquisition, episode.views, seen), None
+    planner = episode.planner
+    answers, truth = _answers(planner.acquisition, episode.views, seen), None
     if episode.scene is not None and not isinstance(answers[-1], CoverageAnswer):
-        cloud = true_cloud(episode.scene, episode.planner.capacity)
-        truth = None if cloud is None else acquisition.true_answer(episode.scene, cloud)
-    panels = tuple(words_of(answer).panels(truth) for answer in answers)
+        cloud = true_cloud(episode.scene, planner.capacity)
+        truth = None if cloud is None else planner.acquisition.true_answer(episode.scene, cloud)
     beside = None
     if rival is not None:
-        others = tuple(words_of(answer).panels(truth) for answer in _answers(acquisition, rival.views, rival_seen))
-        beside = Rival(search_name(rival), race_words(rival, episode), others, tuple(rival_seen))
-    head = _asked(episode.planner), _found(answers, truth), _sure(answers, episode.stopped)
-    return Task(tuple(answers), truth, panels, *head, beside)
+        others = _charts(_answers(planner.acquisition, rival.views, rival_seen), truth)
+        beside = Rival(search_name(rival), race_words(rival, episode), others, _charts(rival_seen, None)[0])
+    return Task(
+        answers,
+        truth,
+        _charts(answers, truth),
+        _charts(seen, None)[0],
+        words_of(answers[-1]).question,
+        _asked(planner),
+        _found(answers, truth),
+        _sure(answers, episode.stopped),
+        beside,
+    )
+
+
+def _charts(answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
+    return words_of(answers[-1]).charts(answers, truth)
 
 
 def _answers(acquisition: Acquisition, views: Sequence[View], seen: Sequence[CoverageAnswer]) -> Sequence[Answer]:
@@ -102,14 +109,15 @@ def seen_after(
     coordinates; else the area that each scan shows and none before it has shown, summed up, by the acquisition where it
     is a `NewSurface`, so that it is what was promised, and by the default one where not."""
     if truth is not None:
-        return [CoverageAnswer.of_share(float(share)) for share in coverage(views, truth)]
+        shares = [100.0 * float(share) for share in coverage(views, truth)]
+        return [CoverageAnswer(("of the surface seen",), np.array([share])) for share in shares]
     of = acquisition if isinstance(acquisition, NewSurface) else NewSurface()
     clouds = [None, *(view.cloud for view in views[:-1])]
     new = [
         float(_new_area(of, cloud, view.scan, view.camera, view.pose))
         for cloud, view in zip(clouds, views, strict=True)
     ]
-    return [CoverageAnswer.of_area(float(area)) for area in np.cumsum(new)]
+    return [CoverageAnswer(("of surface seen",), np.array([area]), unit="scene units²") for area in np.cumsum(new)]
 
 
 @eqx.filter_jit
@@ -176,7 +184,7 @@ def _asked(planner: Planner) -> str:
 
 def _found(answers: Sequence[Answer], truth: Answer | None) -> str:
     text = capital(words_of(answers[-1]).found)
-    return text if truth is None else f"{text}. In truth: {words_of(truth).truly}"
+    return text if truth is None else f"{text}. In truth: {words_of(truth).found}"
 
 
 def _sure(answers: Sequence[Answer], stopped: str | None) -> str:

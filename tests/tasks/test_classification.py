@@ -182,12 +182,10 @@ def test_answers_name_the_classes_where_the_classifier_does():
     answer = nbv.CrossEntropy(Named()).answer(data)
     assert answer.names == ("cup", "bowl")
     np.testing.assert_allclose(answer.values, [0.3, 0.7], atol=1e-6)
-    assert words_of(answer).line() == "bowl 70 %   cup 30 %"
+    assert words_of(answer).said() == "bowl 70 %, cup 30 %"
     before = eqx.tree_at(lambda a: a.values, answer, np.array([0.9, 0.1]))
-    assert words_of(answer).line(before) == "bowl 10 -> 70 %   cup 90 -> 30 %"
-    assert words_of(answer).sentence(before) == (
-        "The classifier says bowl with probability 0.70 (was 0.10, behind cup with 0.90)."
-    )
+    assert words_of(answer).said(before) == "bowl 70 % (was 10 %), cup 30 % (was 90 %)"
+    assert words_of(answer).found == "bowl, probability 0.70"
     answer = nbv.CrossEntropy(linear, num_points=12).answer(data)
     assert answer.names[:2] == ("class 0", "class 1")
     thinned = linear_in_numpy(*nbv.farthest_point_subsample(data, 12).to_numpy())

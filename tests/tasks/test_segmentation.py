@@ -104,7 +104,5 @@ def test_the_answer_counts_the_points_of_each_part():
     assert plain.asked == words_of(plain).shown == tuple(np.flatnonzero(counts))
     np.testing.assert_array_equal(plain.values, counts)
     named = nbv.ExpectedUtilityImprovement(nbv.SoftPartCount(Named(weight)), num_points=5).answer(cloud)
-    words = words_of(named)
-    assert words.line() == f"seat {counts[1]}   leg {counts[3]}"
-    assert words.line(plain) == words.line()
-    assert words.sentence(plain) == f"Points predicted of each part: seat {counts[1]}, leg {counts[3]}."
+    said = words_of(named).said(plain)
+    assert said == f"points predicted of seat {counts[1]} (was {counts[1]}), leg {counts[3]} (was {counts[3]})"

@@ -40,9 +40,8 @@ def test_a_function_has_its_name_and_value():
     acquisition = nbv.ExpectedUtilityImprovement(greatest_height)
     assert label_of(acquisition.quantity) == "expected improvement of greatest height"
     answer, before = acquisition.answer(CLOUD), acquisition.answer(_first())
-    assert words_of(answer).line(before) == "greatest height 0.3 -> 0.8"
-    assert words_of(answer).sentence(before) == "Greatest height 0.8 (was 0.3)."
-    assert words_of(answer).sentence() == "Greatest height 0.8."
+    assert words_of(answer).said(before) == "greatest height 0.8 (was 0.3)"
+    assert words_of(answer).said() == words_of(answer).found == "greatest height 0.8"
     assert nbv.ExpectedUtilityImprovement(lambda cloud: 1.0).quantity.name == "expected utility improvement"
 
 
@@ -54,7 +53,7 @@ def test_a_utility_says_what_it_likes():
     acquisition = nbv.ExpectedUtilityImprovement(Metres(), num_points=1)
     assert label_of(acquisition.quantity) == "expected growth (metres)"
     # Of all of D, however few points the acquisition looks at.
-    assert words_of(acquisition.answer(CLOUD)).line() == "height 1.6   points 3.0"
+    assert words_of(acquisition.answer(CLOUD)).said() == "height 1.6, points 3.0"
     assert nbv.DiscreteSearch().quantity(acquisition) == acquisition.quantity
 
 

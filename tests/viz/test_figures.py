@@ -12,20 +12,21 @@ import trimesh
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from small_run import CAMERA, small_run
+from small_run import small_run
 
 import jaxnbv as nbv
-from jaxnbv.acquisition import Answer, Quantity
+from jaxnbv.acquisition import Quantity
 from jaxnbv.viz import report_data
-from jaxnbv.viz.answers import CoverageAnswer, Panel
-from jaxnbv.viz.choice_figures import draw_choice
+from jaxnbv.viz.answers import Chart
+from jaxnbv.viz.charts import other_charts, task_charts
+from jaxnbv.viz.choice import draw_choice
+from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.figures import STYLE, overview_figure
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.space import clustered, figures_in_space
 from jaxnbv.viz.stage import stage_of
 from jaxnbv.viz.style import bar_ticks
-from jaxnbv.viz.task import Rival, Task
-from jaxnbv.viz.task_figures import chart_figure, other_charts, task_charts
+from jaxnbv.viz.task import Rival
 
 
 @pytest.fixture(scope="module")
@@ -44,12 +45,9 @@ def data(episode):
 
 def of_views(data, count):
     """The data of an episode of so many views, the same ones again and again."""
-    views = [
-        dataclasses.replace(view, number=number)
-        for number, view in zip(range(1, count + 1), itertools.cycle(data.views), strict=False)
-    ]
-    panels = tuple(itertools.islice(itertools.cycle(data.task.panels), count))
-    return dataclasses.replace(data, views=tuple(views), task=dataclasses.replace(data.task, panels=panels))
+    views = tuple(itertools.islice(itertools.cycle(data.views), count))
+    charts = tuple(chart._replace(values=np.resize(chart.values, (count, 1))) for chart in data.task.charts)
+    return dataclasses.replace(data, views=views, task=data.task._replace(charts=charts, seen=charts[0]))
 
 
 def texts(figure):
@@ -96,8 +94,8 @@ LONG = Quantity(
 
 def why(data, index):
     """Why a view was chosen, as the page draws it."""
-    figure = Figure(figsize=(5.2, 4.6))
-    draw_choice(figure, data.views[index].choice, data.quantity)
+    figure = Figure(figsize=(5.2, 4.3))
+    draw_choice(figure, data.views[index].proposal, data.quantity)
     return figure
 
 
@@ -107,32 +105,30 @@ def test_letters_neither_collide_nor_are_cut(data, count, quantity):
     shown = of_views(data, count)
     shown = shown if quantity is None else dataclasses.replace(shown, quantity=quantity)
     with mpl.rc_context(STYLE):
-        check_letters(overview_figure(shown, CAMERA))
-        for _, draw in (*task_charts(shown), *other_charts(shown)):
-            check_letters(chart_figure(draw, (4.4, 2.6)))
+        check_letters(overview_figure(shown))
+        for _, figure in (*task_charts(shown), *other_charts(shown)):
+            check_letters(figure)
         if count <= 3:
             check_letters(why(shown, count - 1))
 
 
 @pytest.mark.parametrize("low", [1e-4, 2e-3, 0.04])
 def test_the_ticks_of_any_range_have_room(data, low, monkeypatch):
-    monkeypatch.setattr("jaxnbv.viz.figures.deviation_range", lambda data: (low, 1.0))
+    monkeypatch.setattr(ReportData, "deviations", (low, 1.0))
     with mpl.rc_context(STYLE):
         for count in (2, 3):
-            check_letters(overview_figure(of_views(data, count), CAMERA))
+            check_letters(overview_figure(of_views(data, count)))
 
 
 @pytest.mark.parametrize("names", [("one",), tuple("abcde"), tuple(f"a part of a name of {k}" for k in range(12))])
 @pytest.mark.parametrize("one_true", [True, False])
 def test_legends_of_the_task_have_room(data, names, one_true):
     values = np.linspace(0.0, 1.0, len(names))
-    panels = Panel("a quantity (units)", names, values, values[::-1], one_true, 0.9)
-    answer = Answer(names, values)
-    rival = Rival("farthest view", "", ((panels,),) * 7, (CoverageAnswer.of_share(0.5),) * 7)
-    task = Task((answer,) * 3, None, ((panels,),) * 3, "", "", "", rival)
-    ((_, draw),) = task_charts(dataclasses.replace(data, task=task))
+    chart = Chart("a quantity (units)", names, np.tile(values, (3, 1)), values[::-1], one_true, 0.9)
+    rival = Rival("farthest view", "", (chart._replace(values=np.tile(values, (7, 1))),), data.task.seen)
     with mpl.rc_context(STYLE):
-        check_letters(chart_figure(draw, (4.4, 2.6)))
+        ((_, figure),) = task_charts(dataclasses.replace(data, task=data.task._replace(charts=(chart,), rival=rival)))
+        check_letters(figure)
 
 
 def test_ticks_are_powers_of_ten_or_both_ends():
@@ -174,7 +170,7 @@ def test_ten_views_of_fine_surfaces_make_a_small_page(data):
     """Plotly takes 2 MB, packed, and the pictures of a view less than 0.1 MB."""
     shown = of_views(data, 10)
     views = tuple(dataclasses.replace(view, surface=ball()) for view in shown.views)
-    figures = figures_in_space(dataclasses.replace(shown, views=views), CAMERA)
+    figures = figures_in_space(dataclasses.replace(shown, views=views))
     assert sum(len(gzip.compress(figure.to_json().encode())) for figure in figures) < 5e5
     mesh = figures[9].data[0]
     # Plotly's z is our y.
@@ -226,5 +222,5 @@ def test_a_record_without_standard_errors_gives_a_page_too(episode):
         patch.setattr("jaxnbv.viz.sketches.mean_surface", lambda *arguments: None)
         old = report_data(dataclasses.replace(episode, views=views), progress=False, imagine=False)
     with mpl.rc_context(STYLE):
-        check_letters(overview_figure(old, CAMERA))
+        check_letters(overview_figure(old))
         check_letters(why(old, 2))

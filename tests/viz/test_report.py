@@ -18,7 +18,7 @@ import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.viz import report_data, write_report
 from jaxnbv.viz.answers import label_of, number
-from jaxnbv.viz.choice import choice_of
+from jaxnbv.viz.choice import best_first, marks, open_values
 from jaxnbv.viz.mean_surface import mean_surface
 from jaxnbv.viz.report import report_html
 from jaxnbv.viz.scene import frustum
@@ -90,7 +90,7 @@ def test_the_page_holds_every_view_and_escapes_its_title(report, episode, data):
     spatial = scene_in_space(text)
     assert len(spatial) == len(episode.views) == 3
     for matrix, shown, view, told in zip(poses_of(text), spatial, episode.views, data.views, strict=True):
-        assert all(part in html.unescape(text) for part in told.told)
+        assert all(part in html.unescape(text) for part in told.told.values())
         np.testing.assert_allclose(matrix, view.pose.to_matrix(), atol=1e-5)
         (points,) = (trace for trace in shown["data"] if trace["name"] == "new points")
         assert points["x"]["dtype"] == "f4"
@@ -100,7 +100,7 @@ def test_the_page_holds_every_view_and_escapes_its_title(report, episode, data):
 
 def test_what_is_drawn_in_space_stands_where_it_is(episode, data):
     """Plotly's z is our y; coordinates are rounded to 1 / 256."""
-    shown = figures_in_space(data, CAMERA)[2]
+    shown = figures_in_space(data)[2]
     traces = {trace.name: trace for trace in reversed(shown.data)}
     names = ["surface of the mean", "points before", "new points", "cameras", "new camera"]
     assert [name for name in names if name in traces] == names
@@ -114,7 +114,7 @@ def test_poses_are_in_the_units_of_the_objects_file(episode, data):
     """That of a mesh which lies elsewhere and is larger; without a file they are in scene units."""
     assert data.frame is None
     frame = nbv.Frame(0.5, (1.0, 2.0, 3.0), "z")
-    matrix = np.array(poses_of(report_html(episode, dataclasses.replace(data, frame=frame), "mug"))[1])
+    matrix = np.array(poses_of(report_html(dataclasses.replace(data, frame=frame), "mug"))[1])
     pose = np.asarray(episode.views[1].pose.to_matrix(), np.float64)
     np.testing.assert_allclose(matrix[:3, 3], frame.rotation.T @ pose[:3, 3] / 0.5 + [1.0, 2.0, 3.0], atol=1e-5)
     np.testing.assert_allclose(matrix[:3, :3], frame.rotation.T @ pose[:3, :3], atol=1e-6)
@@ -135,8 +135,8 @@ def test_poses_are_in_the_units_of_the_objects_file(episode, data):
 def test_baselines_are_labelled_in_their_own_units(search, label, words):
     data = report_data(small_run(search, views=2), progress=False)
     assert label_of(data.quantity) == label
-    assert words in data.views[1].sentence
-    assert "coverage gain" not in data.views[1].sentence
+    assert words in data.views[1].told["What it promised"]
+    assert "coverage gain" not in " ".join(data.views[1].told.values())
 
 
 def test_other_scores_keep_their_name():
@@ -145,17 +145,15 @@ def test_other_scores_keep_their_name():
 
 
 def test_the_sentence_tells_the_numbers_of_the_step(episode, data):
-    view, shown = episode.views[1], data.views[1]
+    view, said = episode.views[1], data.views[1].told
     values = np.sort(np.asarray(view.proposal.values, np.float64))[::-1]
     values = values[np.isfinite(values)]
-    assert f"the highest of {len(values)} open candidates" in shown.sentence
-    assert f"best other {number(values[1])}, median {number(np.median(values))}" in shown.sentence
-    assert f"added {int(view.scan.count):,} points" in shown.sentence
-    before, after = (data.views[i].seen.scaled for i in (0, 1))
-    assert f"coverage went from {before:.0f} to {after:.0f} %" in shown.sentence
-    assert shown.choice.rank == 1
-    assert shown.choice.num_tied == view.proposal.num_tied
-    assert "two standard errors" in shown.sentence
+    assert f"the highest of {len(values)} open candidates" in said["What it promised"]
+    assert f"Best other {number(values[1])}, median {number(np.median(values))}" in said["Beside the others"]
+    assert "two standard errors" in said["Beside the others"]
+    assert f"added {int(view.scan.count):,} points" in said["What came"]
+    before, after = (data.views[i].seen.values[0] for i in (0, 1))
+    assert f"coverage went from {before:.0f} % to {after:.0f} %" in said["What came"]
 
 
 def test_of_a_scene_without_truth_the_area_that_was_seen_is_told(tmp_path, episode):
@@ -169,18 +167,18 @@ def test_of_a_scene_without_truth_the_area_that_was_seen_is_told(tmp_path, episo
     path = write_report(lone, tmp_path, progress=False)
     page = path.read_text(encoding="utf-8")
     assert "<h2>Surface seen (scene units²)</h2>" in page
-    area = report_data(lone, progress=False, imagine=False).views[0].seen.scaled
+    area = report_data(lone, progress=False, imagine=False).views[0].seen.values[0]
     assert area == pytest.approx(2.0 * np.pi * (1.0 - 1.0 / 2.5), rel=0.15)
     assert f"<td>{number(area)}</td>" in page
     # Seen again it adds nothing, from the other side as much again.
     behind = nbv.look_at((0.0, 0.0, -2.5))
     other = nbv.scan(nbv.SDFSurface(nbv.sdf.Sphere(1.0)), camera, behind)
     views = *lone.views, *lone.views, nbv.View(behind, other, other, None, camera)
-    once, again, both = (seen.scaled for seen in seen_after(views, None, nbv.Coverage()))
+    once, again, both = (seen.values[0] for seen in seen_after(views, None, nbv.Coverage()))
     assert once == pytest.approx(again) == pytest.approx(area)
     assert both == pytest.approx(2.0 * area, rel=0.02)
     truth = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-    assert report_data(lone, truth, progress=False).views[0].seen.scaled in (0.0, 50.0, 100.0)
+    assert report_data(lone, truth, progress=False).views[0].seen.values[0] in (0.0, 50.0, 100.0)
 
 
 class NoisySphere(nbv.Fields):
@@ -233,7 +231,7 @@ def test_a_mean_without_a_surface_is_drawn_without_one(episode, data):
     far = nbv.Imagination(SphereModel(), nbv.Grid(40, 0.2), carving=None)
     assert surface_of(far, episode.evidence_after(1)) is None
     bare = eqx.tree_at(lambda d: [v.surface for v in d.views], data, [None] * 3, is_leaf=lambda x: x is None)
-    assert "What is known after this view" in report_html(episode, bare, "mug")
+    assert "What is known after this view" in report_html(bare, "mug")
 
 
 def test_what_was_seen_is_known_better_than_what_was_not():
@@ -248,11 +246,10 @@ def test_what_was_seen_is_known_better_than_what_was_not():
 def test_excluded_candidates_have_no_value():
     poses = nbv.look_at(nbv.fibonacci_sphere(5, 2.5))
     values = jnp.array([3.0, -jnp.inf, 5.0, 1.0, 4.0])
-    choice = choice_of(nbv.Proposal(poses[0], values[0], poses, values))
-    np.testing.assert_array_equal(choice.visited, [False, True, False, False, False])
-    np.testing.assert_array_equal(choice.open_values, [5.0, 4.0, 3.0, 1.0])
-    assert choice.rank == 3
-    np.testing.assert_allclose(choice.directions, np.asarray(poses.position) / 2.5, atol=1e-6)
+    proposal = nbv.Proposal(poses[0], values[0], poses, values)
+    np.testing.assert_array_equal(open_values(proposal), [3.0, np.nan, 5.0, 1.0, 4.0])
+    np.testing.assert_array_equal(best_first(proposal), [5.0, 4.0, 3.0, 1.0])
+    assert marks(proposal) == ["× visited"]
 
 
 def test_the_map_keeps_values():

@@ -20,10 +20,10 @@ from jaxnbv.tasks.classification import ClassAnswer
 from jaxnbv.tasks.heat import Coldest
 from jaxnbv.tasks.segmentation import PartAnswer
 from jaxnbv.viz.answers import number, words_of
+from jaxnbv.viz.charts import task_charts
 from jaxnbv.viz.data import report_data
 from jaxnbv.viz.report import report_html
 from jaxnbv.viz.task import lost_again, race_words, since, true_cloud
-from jaxnbv.viz.task_figures import chart_figure, task_charts
 
 NAMES = ("left", "right", "up")
 
@@ -82,7 +82,7 @@ class Tables(HTMLParser):
 
 def page_of(episode):
     data = report_data(episode, progress=False, imagine=False)
-    return data, report_html(episode, data, "thing")
+    return data, report_html(data, "thing")
 
 
 def head(text):
@@ -131,7 +131,7 @@ def test_coverage_by_view_is_the_share_of_the_truth_that_was_seen(plain):
     episode = run(nbv.Coverage(), nbv.SDFSurface(Sphere(0.9)))
     truth = 0.9 * np.asarray(nbv.fibonacci_sphere(500), np.float64)
     data = report_data(episode, truth, progress=False, imagine=False)
-    _, *rows = Tables(report_html(episode, data, "ball")).found["Surface seen (%)"]
+    _, *rows = Tables(report_html(data, "ball")).found["Surface seen (%)"]
     assert [row[1] for row in rows] == [number(100.0 * share) for share in nbv.metrics.coverage(episode.views, truth)]
 
 
@@ -162,22 +162,24 @@ def test_a_class_is_not_known_of_a_scene_without_one():
 def test_heat_is_charted_by_temperature_and_distance():
     found = Coldest(("coldest",), np.array([0.4]), point=np.array([1.0, 0.0, 2.0]))
     truth = Coldest(("coldest",), np.array([0.1]), point=np.array([1.0, 3.0, -2.0]))
-    temperature, distance = words_of(found).panels(truth)
-    assert (temperature.values[0], temperature.true[0]) == (0.4, 0.1)
-    assert distance.values[0] == 5.0
-    (alone,) = words_of(found).panels(None)
+    temperature, distance = words_of(found).charts([truth, found], truth)
+    np.testing.assert_array_equal(temperature.values, [[0.1], [0.4]])
+    assert temperature.true == [0.1]
+    np.testing.assert_array_equal(distance.values, [[0.0], [5.0]])
+    (alone,) = words_of(found).charts([found], None)
     assert alone.true is None
 
 
 def test_parts_are_found_by_their_points():
     found = PartAnswer(("a", "b", "c", "d"), np.array([70.0, 59.0, 60.0, 500.0]), asked=(0, 1, 2))
-    truth = PartAnswer(("a", "b", "c", "d"), np.array([4.0, 9.0, 0.0, 0.0]), asked=(0, 1, 2))
-    count, points = words_of(found).panels(truth)
-    assert (count.values[0], count.true[0]) == (2.0, 2.0)
-    np.testing.assert_array_equal(points.values, [70.0, 59.0, 60.0])
+    truth = PartAnswer(("a", "b", "c", "d"), np.array([4.0, 9.0, 0.0, 0.0]), asked=(0, 1, 2), target=1.0)
+    count, points = words_of(found).charts([truth, found], truth)
+    np.testing.assert_array_equal(count.values, [[0.0], [2.0]])
+    assert count.true == [2.0]
+    np.testing.assert_array_equal(points.values, [[4.0, 9.0, 0.0], [70.0, 59.0, 60.0]])
     assert words_of(found).found == "a, c"
     # However few points a part has of the whole surface, the object has it.
-    assert words_of(truth).truly == "a, b"
+    assert words_of(truth).found == "a, b"
     assert not words_of(found).settled(None)
     assert words_of(PartAnswer(("a",), np.array([60.0]), asked=(0,))).settled(None)
 
@@ -229,16 +231,14 @@ def test_a_rival_is_told_of_and_drawn(plain):
         "Farthest view needed 3 views"
     )
     assert report_data(ended, progress=False, imagine=False).task.sure.endswith("It ended by its rule: sure of it.")
-    np.testing.assert_allclose(rival.panels[2][0].values, p, atol=1e-6)
+    np.testing.assert_allclose(rival.charts[0].values[2], p, atol=1e-6)
     truth = nbv.metrics.truth_points(scene, jax.random.key(0))
-    np.testing.assert_allclose([answer.values[0] for answer in rival.seen], nbv.metrics.coverage(other.views, truth))
-    assert rival.words in report_html(episode, data, "thing")
-    ((_, draw),) = task_charts(data)
-    (axes,) = chart_figure(draw, (4.4, 2.6)).axes
+    np.testing.assert_allclose(rival.seen.values[:, 0], 100.0 * np.array(nbv.metrics.coverage(other.views, truth)))
+    assert rival.words in report_html(data, "thing")
+    ((_, figure),) = task_charts(data)
+    (axes,) = figure.axes
     drawn = [line.get_ydata() for line in axes.lines]
-    assert any(
-        len(values) == 3 and np.allclose(values, [panel[0].values[1] for panel in rival.panels]) for values in drawn
-    )
+    assert any(len(values) == 3 and np.allclose(values, rival.charts[0].values[:, 1]) for values in drawn)
     assert axes.get_xlim() == (0.5, 3.5)
 
 
@@ -246,11 +246,11 @@ def test_a_rival_is_asked_what_the_episode_is_asked(plain):
     """Though it would answer something else itself; without an answer it is told how many views it took."""
     scene, score = nbv.SDFSurface(pyramid_scene(Split.TEST, 1)), nbv.CrossEntropy(Leaning(), 512)
     other = small_run(nbv.FarthestView(8), 2, scene, nbv.Coverage(), nbv.SensorNoise(0.0, 0.0))
-    (panel,) = report_data(run(score, scene, 2), progress=False, imagine=False, rival=other).task.rival.panels[1]
-    assert panel.names == NAMES
-    task = report_data(other, progress=False, imagine=False, rival=run(score, scene, 1)).task
-    assert task.rival.words == "Random view took 1 view from the same start."
-    assert task.rival.panels[0][0].label == "surface seen (%)"
+    (chart,) = report_data(run(score, scene, 2), progress=False, imagine=False, rival=other).task.rival.charts
+    assert chart.names == NAMES
+    rival = report_data(other, progress=False, imagine=False, rival=run(score, scene, 1)).task.rival
+    assert rival.words == "Random view took 1 view from the same start."
+    assert rival.charts[0].label == "surface seen (%)"
 
 
 def test_the_page_opens_with_the_answer_and_folds_the_settings_away(plain):

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.collections import QuadMesh
+from matplotlib.figure import Figure
 from small_run import CAMERA, small_run
 
 import jaxnbv as nbv
@@ -18,10 +20,10 @@ from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.search.rotations import rotation_from_6d
 from jaxnbv.viz import report_data, sphere
 from jaxnbv.viz.answers import CoverageAnswer, number
-from jaxnbv.viz.choice import Ascents, Choice, choice_of
+from jaxnbv.viz.choice import draw_acquisition, is_spatial
 from jaxnbv.viz.report import report_html
 from jaxnbv.viz.space import figures_in_space
-from jaxnbv.viz.words import describe_choice
+from jaxnbv.viz.words import told
 
 COVERAGE = nbv.DiscreteSearch().quantity(nbv.Coverage())
 
@@ -51,7 +53,7 @@ class Walks(Search):
 def coarse():
     """Surfaces are traced at a quarter of their pixels a side, which is most of what a picture takes."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jaxnbv.viz.figures._STILL", 160)
+        patch.setattr("jaxnbv.viz.render._STILL", 160)
         yield
 
 
@@ -93,81 +95,68 @@ def trajectories(values) -> Trajectories:
     return Trajectories(look_at(positions), jnp.asarray(values))
 
 
-def proposal(candidate_values, way_values) -> nbv.Proposal:
-    ways = trajectories(way_values)
-    candidates = look_at(nbv.fibonacci_sphere(len(candidate_values), 2.5))
-    values = jnp.asarray(candidate_values, dtype=jnp.float32)
-    poses, looks = joined((candidates, values), ways.flat)
-    best = jnp.argmax(looks)
-    return nbv.Proposal(poses[best], looks[best], candidates, values, ways)
-
-
-def test_a_choice_tells_candidates_from_trajectories():
-    choice = choice_of(proposal([3.0, -jnp.inf, 5.0, 1.0, 4.0], [[4.0, 6.0, 7.0], [3.0, 2.0, 2.5]]))
-    np.testing.assert_array_equal(choice.open_values, [5.0, 4.0, 3.0, 1.0])
-    np.testing.assert_array_equal(choice.visited, [False, True, False, False, False])
-    assert choice.directions.shape == (5, 3)
-    assert (choice.rank, choice.value) == (1, 7.0)
-    np.testing.assert_array_equal(choice.ascents.values, [[4.0, 6.0, 7.0], [3.0, 2.0, 2.5]])
-    np.testing.assert_allclose(choice.ascents.directions[1, 0], [1.0, 0.0, 0.0], atol=1e-6)
-    np.testing.assert_allclose(choice.chosen, choice.ascents.directions[0, 2], atol=1e-6)
-    assert not choice.ascents.is_spatial
+def test_ascents_that_leave_the_sphere_or_look_past_its_centre_are_told_apart():
+    assert not is_spatial(trajectories([[4.0, 6.0, 7.0], [3.0, 2.0, 2.5]]))
     turned = rotation_from_6d(jnp.array([1.0, 0.0, 0.02, 0.0, 1.0, 0.0]))
     for moved in (nbv.Pose(turned, np.array([0.0, 0.0, -2.5])), look_at((0.0, 0.0, -2.4))):
-        # A camera looks past the origin, or has left the sphere.
         poses = jax.tree.map(lambda rows, row: rows.at[0, 0].set(row), trajectories([[1.0, 2.0]]).poses, moved)
-        far = nbv.Proposal(poses[0, 0], jnp.ones(()), poses[0], jnp.ones(2), Trajectories(poses, jnp.ones((1, 2))))
-        assert choice_of(far).ascents.is_spatial
+        assert is_spatial(Trajectories(poses, jnp.ones((1, 2))))
 
 
-def test_a_map_is_made_of_enough_candidates_alone(spatial_data, few_data):
-    quantity = spatial_data.quantity
-    assert spatial_data.views[1].choice.makes_a_map(quantity)
-    assert not few_data.views[1].choice.makes_a_map(quantity)
+@pytest.mark.parametrize(("count", "lots", "has_map"), [(48, False, True), (11, False, False), (48, True, False)])
+def test_a_map_is_made_of_enough_candidates_and_of_no_lots(count, lots, has_map):
+    candidates = sphere_candidates(count)
+    seen = nbv.Proposal(candidates[0], jnp.ones(()), candidates, candidates.position[:, 0])
+    axes = Figure().add_axes((0, 0, 1, 1))
+    draw_acquisition(axes, seen, nbv.Quantity("", "", "", smooth=not lots))
+    (globe,) = axes.child_axes
+    assert any(isinstance(drawn, QuadMesh) for drawn in globe.collections) == has_map
 
 
-def said_of(value, others, starts=0, num_tied=None, pose=None):
+def said_of(value, others, starts=0, pose=None, standard_error=None):
     """What is said of a second view with such a value, beside candidates with others, and ascents from some starts."""
-    values, directions = np.array(others), np.zeros((len(others), 3))
-    ascents = Ascents(trajectories(np.zeros((starts, 2))).poses, np.zeros((starts, 2))) if starts else None
-    choice = Choice(directions, values, np.zeros(3), value, ascents, num_tied)
-    pose = look_at((0.0, 0.0, 2.5)) if pose is None else pose
-    seen = CoverageAnswer.of_area(0.2), CoverageAnswer.of_area(0.3)
-    return describe_choice(COVERAGE, choice, pose, [look_at((2.5, 0.0, 0.0))], 5, 10, seen).sentence(2)
+    pose, first = look_at((0.0, 0.0, 2.5)) if pose is None else pose, look_at((2.5, 0.0, 0.0))
+    ways = trajectories(np.zeros((starts, 2))) if starts else None
+    errors = None if standard_error is None else jnp.full(len(others), standard_error)
+    candidates = look_at(nbv.fibonacci_sphere(max(len(others), 1), 2.5))[: len(others)]
+    looked = nbv.Proposal(pose, jnp.asarray(value), candidates, jnp.asarray(others), ways, errors, errors)
+    scan = nbv.PointCloud.from_arrays(np.eye(3), np.eye(3))
+    views = [nbv.View(first, scan, scan, None, CAMERA), nbv.View(pose, scan, scan, looked, CAMERA)]
+    seen = [CoverageAnswer(("of surface seen",), np.array([area]), unit="scene units²") for area in (0.2, 0.3)]
+    return " ".join(told(COVERAGE, views, seen).values())
 
 
 @pytest.mark.parametrize(
-    ("value", "others", "starts", "level", "words"),
+    ("value", "others", "starts", "error", "words"),
     [
         (4570.0, (4040.0, 2000.0, 1000.0), 6, None, "4,570 scene units², was found by gradient ascent from 6 starts"),
-        (9.0, (3.0, 2.0), 2, None, "from 2 starts: best candidate 3, median 2.5."),
-        (2.0, (1.0,), 1, None, "from 1 start: best candidate 1, median 1."),
+        (9.0, (3.0, 2.0), 2, None, "from 2 starts. Best candidate 3, median 2.5."),
         (2.0, (), 1, None, "was found by gradient ascent from 1 start. It"),
-        (3.0, (3.0, 2.0, 1.0), 6, None, "was the highest of 3 open candidates: best other 2, median 2. It"),
-        (3.0, (3.0, 2.0, 1.0), 0, 0, "best other 2, median 2; no other is within two standard errors of the best. It"),
-        (3.0, (3.0, 2.0, 1.0), 0, 1, "median 2; 1 other is within two standard errors of the best. It added"),
-        (3.0, (3.0, 2.0, 1.0), 0, 3, "median 2; 3 others are within two standard errors of the best. It added"),
-        (2.0, (3.0, 2.0, 1.0), 0, 1, "was rank 2 of 3 open candidates: best other 3, median 2; 1 other is within"),
+        (3.0, (3.0, 2.0, 1.0), 6, None, "was the highest of 3 open candidates. Best other 2, median 2. It"),
+        (3.0, (3.0, 2.0, 1.0), 0, 0.4, "Best other 2, median 2; no others within two standard errors. It"),
+        (3.0, (3.0, 2.0, 1.0), 0, 0.6, "median 2; 1 other within two standard errors. It added 3 points"),
+        (2.0, (3.0, 2.0, 1.0), 0, 1.1, "was rank 2 of 3 open candidates. Best other 3, median 2; 2 others within"),
     ],
 )
-def test_words_say_how_a_view_stands_among_the_others(value, others, starts, level, words):
-    said = said_of(value, others, starts, level)
+def test_words_say_how_a_view_stands_among_the_others(value, others, starts, error, words):
+    said = said_of(value, others, starts, standard_error=error)
     assert words in said
-    assert said.startswith(
-        "View 2 looks from (0.00, 0.00, 2.50), 0° above the horizon, 90° from the nearest earlier view. Its"
-    )
+    where = "It looks from (0.00, 0.00, 2.50), 0° above the horizon, 90° from the nearest earlier view. Its"
+    assert said.startswith(where)
+    assert said.endswith("surface seen went from 0.2 scene units² to 0.3 scene units².")
 
 
 def test_words_say_where_a_camera_looks_past_the_centre():
     pose = look_at((0.0, 0.0, 2.0), target=(2.0 * np.tan(np.radians(7.0)), 0.0, 0.0))
-    assert "the horizon, 2.00 from the centre and aimed 7° off it, 90° from" in said_of(2.0, (1.0,), 1, pose=pose)
+    assert "the horizon, 2.00 from the centre and aimed 7° off it, 90° from" in said_of(2.0, (1.0,), 1, pose)
 
 
 def test_the_sentence_and_the_summary_tell_the_numbers_of_the_step(few, few_data, capsys):
-    view = few_data.views[1]
+    said = few_data.views[1].told
     seen = few.views[1].proposal
     best = float(np.max(seen.values))
-    assert f"was found by gradient ascent from 4 starts: best candidate {number(best)}, median" in view.sentence
+    assert said["What it promised"].endswith("was found by gradient ascent from 4 starts.")
+    assert said["Beside the others"].startswith(f"Best candidate {number(best)}, median")
     lines = Lines(few.planner)
     for one in few.views:
         lines(one)
@@ -177,7 +166,7 @@ def test_the_sentence_and_the_summary_tell_the_numbers_of_the_step(few, few_data
 
 
 def test_ascents_are_drawn_in_space_where_they_left_the_sphere(spatial, spatial_data, few_data):
-    first, second = figures_in_space(spatial_data, CAMERA)
+    first, second = figures_in_space(spatial_data)
     assert not [trace for trace in first.data if trace.name == "gradient ascents"]
     ways, ends = (trace for trace in second.data if trace.name == "gradient ascents")
     stage, seen = spatial_data.stage, spatial.views[1].proposal.trajectories
@@ -189,16 +178,14 @@ def test_ascents_are_drawn_in_space_where_they_left_the_sphere(spatial, spatial_
     assert list(ends.text) == [number(float(value)) for value in np.ravel(seen.values[:, [0, -1]])]
     farthest = np.linalg.norm(seen.poses.position, axis=-1).max()
     assert stage.extent >= 1.09 * stage.pull * farthest
-    assert not [trace for figure in figures_in_space(few_data, CAMERA) for trace in figure.data if "asc" in trace.name]
+    assert not [trace for figure in figures_in_space(few_data) for trace in figure.data if "asc" in trace.name]
 
 
 @pytest.mark.parametrize("kind", ["spatial", "few"])
 def test_a_page_of_a_search_by_gradient(kind, request):
-    episode, data = request.getfixturevalue(kind), request.getfixturevalue(f"{kind}_data")
-    text = report_html(episode, data, "mug")
-    assert "Lines: gradient ascents, from a ring where they start to a dot where they end." in text
-    for said in ("drawn is the direction of the position", "In 3-D: gradient ascents"):
-        assert (said in text) == (kind == "spatial")
+    text = report_html(request.getfixturevalue(f"{kind}_data"), "mug")
+    assert "<span>○ start, ● end of an ascent</span>" in text
+    assert ("In 3-D: gradient ascents" in text) == (kind == "spatial")
 
 
 def test_a_path_over_the_rim_is_cut_there():

@@ -33,8 +33,7 @@ from jaxnbv.studies.scenes import ClassObject, ClassSet, FirstView, Framing, Spl
 from jaxnbv.studies.scenes.class_object import ClassMesh, scan_cue, surface_of
 from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, MixedEntropy
 from jaxnbv.tasks.classification import ClassAcquisition, Classifier
-from jaxnbv.viz.layout import framed
-from jaxnbv.viz.style import NEW
+from jaxnbv.viz.style import NEW, framed
 
 # Of random search, in each scene.
 _RUNS = 8

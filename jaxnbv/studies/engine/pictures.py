@@ -13,8 +13,7 @@ from jaxnbv.studies.engine.measures import Record
 from jaxnbv.studies.engine.study import Study
 from jaxnbv.studies.engine.tiles import Tiles
 from jaxnbv.viz.figures import STYLE
-from jaxnbv.viz.layout import framed
-from jaxnbv.viz.style import LINE, save_figure
+from jaxnbv.viz.style import LINE, framed, save_figure
 
 # Inches of a tile, and of what stands beside and above all of them.
 _TILE, _BESIDE, _ABOVE = (1.75, 1.95), 0.35, 0.75

@@ -1,0 +1,116 @@
+"""The charts of an episode: its task by view, how much was seen, what the chosen views were worth."""
+
+import textwrap
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+from jaxnbv.viz.answers import Chart, label_of, number
+from jaxnbv.viz.choice import best_first
+from jaxnbv.viz.data import ReportData
+from jaxnbv.viz.style import GREY, INK, LINE, NEW, SERIES
+
+_MOST_NAMES, _LONGEST_NAME, _MOST_NUMBERS = 6, 22, 10
+_LARGE, _SMALL = (4.4, 2.6), (3.1, 2.6)
+_BELOW: dict[str, Any] = {"loc": "outside lower center", "frameon": False, "fontsize": 8, "handlelength": 1.4}
+
+
+def shown_names(chart: Chart) -> list[int]:
+    """Which numbers of a chart are drawn: all if they are few, else those that are ever the largest, or true."""
+    reached = chart.values.max(axis=0)
+    reached = reached if chart.true is None else np.maximum(reached, chart.true)
+    return sorted(np.argsort(-reached, kind="stable")[:_MOST_NAMES].tolist())
+
+
+def draw_chart(axes: Axes, chart: Chart, rival: Chart | None = None, rival_name: str = "") -> list[Line2D]:
+    """Draw the numbers as lines over the views, with what is true; of a rival the number that the chart is about, where
+    it is about one. Returns what a legend needs."""
+    views, is_one = np.arange(1, len(chart.values) + 1), len(chart.names) == 1
+    marked = None if chart.true is None or not chart.one_true else int(np.argmax(chart.true))
+    others, handles = iter(SERIES * 2), list[Line2D]()
+    for index in shown_names(chart):
+        name = textwrap.shorten(chart.names[index], _LONGEST_NAME, placeholder="…")
+        colour, label = (NEW, f"{name} (true)") if index == marked else (next(others), name)
+        style: dict[str, Any] = {"color": colour, "lw": 1.6, "marker": "o", "ms": 5, "markeredgecolor": "white"}
+        lines = axes.plot(views, chart.values[:, index], label=label, zorder=3, **style)
+        handles += [] if is_one else lines
+        if chart.true is not None and not chart.one_true:
+            axes.axhline(chart.true[index], color=colour, lw=1.2, ls="--", zorder=1)
+    if chart.true is not None and not chart.one_true:
+        handles.append(Line2D([], [], color=GREY, lw=1.2, ls="--", label="in truth"))
+    if is_one and len(views) <= _MOST_NUMBERS:
+        for view, value in zip(views.tolist(), chart.values[:, 0].tolist(), strict=True):
+            axes.annotate(number(value), (view, value), (0, 6), textcoords="offset points", ha="center", fontsize=8)
+    about = 0 if is_one else marked
+    if rival is not None and about is not None:
+        style = {"color": GREY, "lw": 1.4, "ls": (0, (4, 2)), "marker": "s", "ms": 3.5}
+        count = np.arange(1, len(rival.values) + 1)
+        handles += axes.plot(count, rival.values[:, about], label=rival_name, zorder=2, **style)
+    if chart.goal is not None:
+        axes.axhline(chart.goal, color=GREY, lw=1.0, ls=":", zorder=1)
+    low, high = axes.get_ylim()
+    axes.set_ylim(min(low, 0.0) if chart.values.min() >= 0 else low, high + 0.1 * (high - low))
+    over_views(axes, len(chart.values) if rival is None else max(len(chart.values), len(rival.values)))
+    return handles
+
+
+def over_views(axes: Axes, count: int) -> None:
+    """An axis of views, from half a view before the first to half a view behind the last."""
+    axes.set(xlabel="view", xlim=(0.5, count + 0.5))
+    axes.xaxis.set_major_locator(MaxNLocator(min(count, 10), integer=True, min_n_ticks=1))
+    axes.yaxis.set_major_locator(MaxNLocator(5))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
+
+
+def draw_values(axes: Axes, data: ReportData) -> list[Line2D]:
+    """Draw the value of each chosen view, with its standard error, over that of the median candidate."""
+    for view, shown in enumerate(data.views, start=1):
+        if shown.proposal is None:
+            axes.annotate("given", (view, 0), (0, 4), textcoords="offset points", ha="center", color=GREY, fontsize=8)
+            continue
+        value, error = float(shown.proposal.value), shown.proposal.standard_error
+        axes.vlines(view, 0.0, value, color=LINE, lw=1.5, zorder=1)
+        if error is not None and np.isfinite(error):
+            axes.errorbar(view, value, error, color=INK, lw=1.2, capsize=3, zorder=2)
+        axes.plot(view, value, "*", color=NEW, ms=11, markeredgecolor="white", zorder=3)
+        if len(others := best_first(shown.proposal)):
+            axes.plot(view, np.median(others), "_", color=INK, ms=11, mew=1.4, zorder=2)
+    low, high = axes.get_ylim()
+    axes.set_ylim(min(low, 0.0), high * 1.12)
+    over_views(axes, len(data.views))
+    star = Line2D([], [], ls="none", marker="*", color=NEW, ms=9, label="chosen view, its standard error")
+    return [star, Line2D([], [], ls="none", marker="_", color=INK, ms=9, mew=1.4, label="median candidate")]
+
+
+def task_charts(data: ReportData) -> list[tuple[str, Figure]]:
+    """The charts of the task, with their titles."""
+    task, size = data.task, _LARGE if len(data.task.charts) == 1 else _SMALL
+    others = [None] * len(task.charts) if task.rival is None else task.rival.charts
+    return [_drawn(data, chart, other, size) for chart, other in zip(task.charts, others, strict=True)]
+
+
+def other_charts(data: ReportData) -> list[tuple[str, Figure]]:
+    """Those that say more: how much was seen, where that is not the task, and the values, where views were chosen."""
+    task, charts = data.task, []
+    if not task.is_coverage:
+        charts.append(_drawn(data, task.seen, None if task.rival is None else task.rival.seen, _LARGE))
+    if any(view.proposal is not None for view in data.views):
+        figure = Figure(figsize=_LARGE, layout="constrained")
+        figure.legend(handles=draw_values(figure.subplots(), data), ncols=2, **_BELOW)
+        charts.append((label_of(data.quantity), figure))
+    return charts
+
+
+def _drawn(data: ReportData, chart: Chart, rival: Chart | None, size: tuple[float, float]) -> tuple[str, Figure]:
+    figure = Figure(figsize=size, layout="constrained")
+    handles = draw_chart(figure.subplots(), chart, rival, "" if data.task.rival is None else data.task.rival.name)
+    if handles:
+        # Thirteen letters take an inch, and so do a mark and the gap by it six of them.
+        longest = max(len(str(handle.get_label())) for handle in handles) + 6
+        columns = max(1, min(len(handles), int(13 * size[0]) // longest))
+        figure.legend(handles=handles, ncols=columns, columnspacing=1.2, **_BELOW)
+    return chart.label, figure
