@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from jaxnbv.acquisition import Quantity
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.search import Proposal, Trajectories
+from jaxnbv.search import Proposal
 from jaxnbv.viz import sphere
 from jaxnbv.viz.answers import label_of, number
 from jaxnbv.viz.style import GREY, INK, LINE, NEW, VALUE
@@ -127,13 +127,6 @@ def draw_acquisition(
 def directions_of(poses: Pose) -> Float[np.ndarray, "*n 3"]:
     """Unit vectors from the origin to poses."""
     return sphere.unit(np.asarray(poses.position, dtype=np.float64))
-
-
-def is_spatial(ascents: Trajectories) -> bool:
-    """Whether cameras left the sphere that they started from, or looked past its centre."""
-    positions = np.asarray(ascents.poses.position, dtype=np.float64)
-    past = np.asarray(ascents.poses.forward, dtype=np.float64) + sphere.unit(positions)
-    return bool(np.ptp(np.linalg.norm(positions, axis=-1)) > 1e-3 or np.linalg.norm(past, axis=-1).max() > 1e-3)
 
 
 def _draw_ascents(globe: Any, ascents: Float[np.ndarray, "starts steps 3"], weight: float) -> None:

@@ -13,9 +13,8 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.episode import Episode, View
 from jaxnbv.progress import progress_bar
 from jaxnbv.scanning.metrics import truth_points
-from jaxnbv.search import Proposal, Trajectories
+from jaxnbv.search import Proposal
 from jaxnbv.viz.answers import CoverageAnswer, capital, words_of
-from jaxnbv.viz.choice import is_spatial
 from jaxnbv.viz.imagined import Imagined, Look, taken_look
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.sketches import Sketch, Sketches, sketches_of
@@ -61,12 +60,6 @@ class ViewData(eqx.Module):
     def new(self) -> Float[np.ndarray, "m 3"]:
         """The points that it added, in scene coordinates."""
         return self.view.scan.to_numpy()[0]
-
-    @property
-    def spatial_ascents(self) -> Trajectories | None:
-        """The trajectories that led to this view, where they left the sphere."""
-        ascents = None if self.proposal is None else self.proposal.trajectories
-        return ascents if ascents is not None and is_spatial(ascents) else None
 
 
 class ReportData(eqx.Module):

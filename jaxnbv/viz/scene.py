@@ -8,7 +8,6 @@ from jaxtyping import Float
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.search import Trajectories
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.style import BEFORE, GREY, NEW
 
@@ -44,14 +43,7 @@ class Solid(NamedTuple):
     is_guess: bool = False
 
 
-class Ways(NamedTuple):
-    """The ascents of a gradient search, coloured by value."""
-
-    name: str
-    ascents: Trajectories
-
-
-Item = Points | Cameras | Solid | Ways
+Item = Points | Cameras | Solid
 
 
 def seen_items(

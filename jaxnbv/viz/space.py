@@ -6,13 +6,10 @@ import numpy as np
 import plotly.graph_objects as go
 from jaxtyping import Float, Int
 
-from jaxnbv.search import Trajectories
-from jaxnbv.viz.answers import number
-from jaxnbv.viz.choice import colour_range
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.mean_surface import MeanSurface
-from jaxnbv.viz.scene import Cameras, Item, Points, Solid, Ways, frustum, seen_items, surface_items
-from jaxnbv.viz.style import DEVIATION, INK, VALUE_LINES, colour_scale
+from jaxnbv.viz.scene import Cameras, Item, Points, Solid, frustum, seen_items, surface_items
+from jaxnbv.viz.style import DEVIATION, INK, colour_scale
 
 # Of all views together, so that a long episode stays a small page.
 _MAX_POINTS, _MAX_VERTICES = 18_000, 24_000
@@ -33,9 +30,7 @@ def figures_in_space(data: ReportData) -> list[go.Figure]:
         poses = [stage.pulled(other.pose) for other in data.views[: index + 1]]
         items: list[Item] = [*surface_items(view.surface, view.guesses)]
         items += seen_items(view.before, view.new, poses, data.camera, stage.depth)
-        if view.spatial_ascents is not None:
-            items.append(Ways("gradient ascents", view.spatial_ascents))
-        drawn = [trace for item in items for trace in _traces(item, points, vertices, grades, stage.pull)]
+        drawn = [trace for item in items for trace in _traces(item, points, vertices, grades)]
         figures.append(go.Figure(drawn, _layout(stage.eye, stage.extent)))
     return figures
 
@@ -62,9 +57,7 @@ def _placed(places: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
     return {"x": z, "y": x, "z": y}
 
 
-def _traces(
-    item: Item, points: int, vertices: int, grades: Float[np.ndarray, "2"], pull: float
-) -> list[dict[str, Any]]:
+def _traces(item: Item, points: int, vertices: int, grades: Float[np.ndarray, "2"]) -> list[dict[str, Any]]:
     named = {"name": item.name, "legendgroup": item.name, "hoverinfo": "skip", "showlegend": True}
     match item:
         case Points():
@@ -86,27 +79,12 @@ def _traces(
             shown = {"opacity": 0.35, "visible": "legendonly"} if item.is_guess else {}
             limit = _FEWEST_VERTICES if item.is_guess else vertices
             return [_mesh(item.surface, limit, grades) | named | shown]
-        case Ways():
-            return [named | trace for trace in _ascents(item.ascents, pull)]
 
 
 def _lines(segments: Float[np.ndarray, "n k 3"], line: dict[str, Any]) -> dict[str, Any]:
     """Broken lines, with a gap behind each."""
     gapped = np.pad(np.asarray(segments, np.float64), ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
     return {"type": "scatter3d", "mode": "lines", "line": line, **_placed(gapped.reshape(-1, 3))}
-
-
-def _ascents(ascents: Trajectories, pull: float) -> list[dict[str, Any]]:
-    """Ways, drawn as near as the cameras, in the colours of their values; the values at their ends."""
-    positions = pull * np.asarray(ascents.poses.position, np.float64)
-    looks = np.asarray(ascents.values, np.float64)
-    low, high = colour_range(looks)
-    colours = {"colorscale": colour_scale(VALUE_LINES), "cmin": low, "cmax": high, "width": 5}
-    ways = _lines(positions, {"color": np.pad(looks, ((0, 0), (0, 1)), mode="edge").ravel(), **colours})
-    marker = {"size": 3, "color": INK, "symbol": ["circle-open", "circle"] * len(positions)}
-    values = [number(value) for value in looks[:, [0, -1]].ravel().tolist()]
-    ends = {"type": "scatter3d", "mode": "markers", "marker": marker, "text": values, "hoverinfo": "text"}
-    return [ways, ends | _placed(positions[:, [0, -1]].reshape(-1, 3)) | {"showlegend": False}]
 
 
 def _mesh(surface: MeanSurface, limit: int, grades: Float[np.ndarray, "2"]) -> dict[str, Any]:

@@ -25,14 +25,12 @@ class Stage(eqx.Module):
 
     - `eye`: unit vector from the origin to the reader.
     - `radius`: of the object about the origin, in scene units; `outline`: points of it.
-    - `pull`: what the positions along ascents are multiplied by, so that they stand near the object.
     - `depth`: of the fields of view that are drawn, in scene units.
     """
 
     eye: Float[np.ndarray, "3"]
     radius: float
     outline: Float[np.ndarray, "n 3"]
-    pull: float
     depth: float
 
     @property
@@ -60,18 +58,12 @@ def stage_of(episode: Episode, surfaces: list[trimesh.Trimesh]) -> Stage:
     radius = max(float(np.percentile(far, _SPREAD)) for far in distances)
     outline = np.concatenate([rows[far <= radius] for rows, far in zip(known, distances, strict=True)])
     cameras = np.stack([np.asarray(view.pose.position, np.float64) for view in episode.views])
-    proposals = [view.proposal for view in episode.views if view.proposal is not None]
-    ways = [proposal.trajectories.poses.position for proposal in proposals if proposal.trajectories is not None]
-    positions = np.concatenate([cameras, *(np.asarray(way, np.float64).reshape(-1, 3) for way in ways)])
-    farthest = float(np.linalg.norm(positions, axis=1).max())
-    depth = _DEPTH * radius
-    pull = min(1.0, (_STAND * radius + depth) / max(farthest, 1e-9))
     eyes = np.asarray(fibonacci_sphere(_DIRECTIONS), np.float64)
     eyes = eyes[np.abs(eyes[:, 1]) < _HIGHEST]
     shown = _shown(episode, surfaces[-1] if surfaces else None, eyes, _CLEAR * radius)
     # Cameras should not stand between the eye and the object.
     in_front = np.mean(unit(cameras) @ eyes.T > _IN_FRONT, axis=0)
-    return Stage(eyes[int(np.argmax(shown - in_front))], radius, outline, pull, depth)
+    return Stage(eyes[int(np.argmax(shown - in_front))], radius, outline, _DEPTH * radius)
 
 
 def _shown(

@@ -19,8 +19,6 @@ SERIES = ["#0072b2", "#56b4e9", "#009e73", "#e69f00", "#cc79a7", "#7a8494", "#26
 DEVIATION = LinearSegmentedColormap.from_list("deviation", mpl.colormaps["YlGnBu"](np.linspace(0.04, 0.92, 256)))
 # Another hue for the other scale, and no colour of the marks that lie on it.
 VALUE = LinearSegmentedColormap.from_list("value", mpl.colormaps["BuPu"](np.linspace(0.03, 0.95, 256)))
-# The same, for lines on white paper: without its palest colours.
-VALUE_LINES = LinearSegmentedColormap.from_list("value lines", mpl.colormaps["BuPu"](np.linspace(0.35, 1.0, 256)))
 
 
 def colour_scale(colours: Colormap) -> list[list]:

@@ -1,8 +1,7 @@
-"""Gradient searches in pictures and words: trajectories beside candidates, on the map and in space."""
+"""Gradient searches in pictures and words: trajectories beside candidates."""
 
 from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,12 +16,10 @@ from jaxnbv.geometry.pose import look_at
 from jaxnbv.search import Search, Trajectories
 from jaxnbv.search.base import best_unvisited
 from jaxnbv.search.candidates import sphere_candidates
-from jaxnbv.search.rotations import rotation_from_6d
 from jaxnbv.viz import report_data, sphere
 from jaxnbv.viz.answers import CoverageAnswer, number
-from jaxnbv.viz.choice import draw_acquisition, is_spatial
+from jaxnbv.viz.choice import draw_acquisition
 from jaxnbv.viz.report import report_html
-from jaxnbv.viz.space import figures_in_space
 from jaxnbv.viz.words import told
 
 COVERAGE = nbv.DiscreteSearch().quantity(nbv.Coverage())
@@ -68,24 +65,6 @@ def few_data(few):
     return report_data(few, progress=False)
 
 
-@pytest.fixture(scope="module")
-def spatial(few):
-    """Off the sphere, from two of enough candidates; of made-up values."""
-    candidates, inwards = sphere_candidates(48), jnp.linspace(1.0, 0.8, 7)[:, None]
-    poses = look_at(candidates.position[:2, None] * inwards)
-    ways = Trajectories(poses, 3.0 + jnp.arange(14.0).reshape(2, 7))
-    seen = nbv.Proposal(poses[1, 6], ways.values[1, 6], candidates, 2.0 - candidates.position[:, 2], ways)
-    # Its points alone, which are no image from the made-up pose.
-    scan = nbv.PointCloud(few.views[1].scan.points, few.views[1].scan.normals, few.views[1].scan.mask)
-    changed = lambda e: (e.views[1].proposal, e.views[1].pose, e.views[1].scan)  # noqa: E731
-    return eqx.tree_at(changed, few, (seen, seen.pose, scan))
-
-
-@pytest.fixture(scope="module")
-def spatial_data(spatial):
-    return report_data(spatial, progress=False)
-
-
 def trajectories(values) -> Trajectories:
     """Ways round the equator, one start every 90 degrees."""
     values = np.asarray(values, dtype=np.float32)
@@ -93,14 +72,6 @@ def trajectories(values) -> Trajectories:
     angle = np.radians(90 * np.arange(starts)[:, None] + np.arange(steps))
     positions = 2.5 * np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=-1)
     return Trajectories(look_at(positions), jnp.asarray(values))
-
-
-def test_ascents_that_leave_the_sphere_or_look_past_its_centre_are_told_apart():
-    assert not is_spatial(trajectories([[4.0, 6.0, 7.0], [3.0, 2.0, 2.5]]))
-    turned = rotation_from_6d(jnp.array([1.0, 0.0, 0.02, 0.0, 1.0, 0.0]))
-    for moved in (nbv.Pose(turned, np.array([0.0, 0.0, -2.5])), look_at((0.0, 0.0, -2.4))):
-        poses = jax.tree.map(lambda rows, row: rows.at[0, 0].set(row), trajectories([[1.0, 2.0]]).poses, moved)
-        assert is_spatial(Trajectories(poses, jnp.ones((1, 2))))
 
 
 @pytest.mark.parametrize(("count", "lots", "has_map"), [(48, False, True), (11, False, False), (48, True, False)])
@@ -165,27 +136,8 @@ def test_the_sentence_and_the_summary_tell_the_numbers_of_the_step(few, few_data
     assert second.endswith(f"points   {number(float(seen.value))}, by ascent from {number(best)}")
 
 
-def test_ascents_are_drawn_in_space_where_they_left_the_sphere(spatial, spatial_data, few_data):
-    first, second = figures_in_space(spatial_data)
-    assert not [trace for trace in first.data if trace.name == "gradient ascents"]
-    ways, ends = (trace for trace in second.data if trace.name == "gradient ascents")
-    stage, seen = spatial_data.stage, spatial.views[1].proposal.trajectories
-    # Cameras are drawn nearer than they stood, with a gap behind each way; plotly's z is our y.
-    drawn = np.stack([ways.y, ways.z, ways.x], axis=1).reshape(2, 8, 3)
-    np.testing.assert_allclose(drawn[:, :7], stage.pull * np.asarray(seen.poses.position), atol=1 / 256)
-    assert np.isnan(drawn[:, 7]).all()
-    np.testing.assert_allclose(np.reshape(ways.line.color, (2, 8))[:, :7], seen.values, rtol=1e-6)
-    assert list(ends.text) == [number(float(value)) for value in np.ravel(seen.values[:, [0, -1]])]
-    farthest = np.linalg.norm(seen.poses.position, axis=-1).max()
-    assert stage.extent >= 1.09 * stage.pull * farthest
-    assert not [trace for figure in figures_in_space(few_data) for trace in figure.data if "asc" in trace.name]
-
-
-@pytest.mark.parametrize("kind", ["spatial", "few"])
-def test_a_page_of_a_search_by_gradient(kind, request):
-    text = report_html(request.getfixturevalue(f"{kind}_data"), "mug")
-    assert "<span>○ start, ● end of an ascent</span>" in text
-    assert ("In 3-D: gradient ascents" in text) == (kind == "spatial")
+def test_a_page_of_a_search_by_gradient(few_data):
+    assert "<span>○ start, ● end of an ascent</span>" in report_html(few_data, "mug")
 
 
 def test_a_path_over_the_rim_is_cut_there():
