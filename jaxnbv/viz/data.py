@@ -31,7 +31,6 @@ class ViewData(eqx.Module):
     - `before`: points kept before it, in scene coordinates.
     - `surface`: of the posterior mean after it, where it holds points, with a deviation that allows for what was not
       seen; None where it has none within the grid.
-    - `guesses`: pieces of the mean's surface that hold no points, if there are some.
     - `seen`: how much of the surface was seen.
     - `told`: what happened, in words by their headings.
     - `imagined`: what was imagined before it was taken; None for a view that was given.
@@ -41,7 +40,6 @@ class ViewData(eqx.Module):
     view: View
     before: Float[np.ndarray, "n 3"]
     surface: MeanSurface | None
-    guesses: MeanSurface | None
     seen: CoverageAnswer
     told: dict[str, str]
     imagined: Imagined | None
@@ -114,7 +112,7 @@ def report_data(
         sketches_of(episode, held, imagine), progress, desc="drawing views", total=len(episode.views)
     )
     drawn: list[ViewData] = []
-    leading = Sketch(None, None, None)
+    leading = Sketch(None, None)
     for index, next_one in enumerate(following):
         view = episode.views[index]
         words = told(planner.quantity, episode.views[: index + 1], seen[: index + 1])
@@ -123,8 +121,7 @@ def report_data(
             words["What came"] += f" {capital(answered)}."
         before = episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), np.float32)
         look = taken_look(view, before)
-        of_mean = next_one.surface, next_one.guesses
-        drawn.append(ViewData(view, before, *of_mean, seen[index], words, leading.imagined, look))
+        drawn.append(ViewData(view, before, next_one.surface, seen[index], words, leading.imagined, look))
         leading = next_one
     means = [view.surface.mesh for view in drawn if view.surface is not None]
     frame = getattr(episode.scene, "frame", None)

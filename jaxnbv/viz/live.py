@@ -29,7 +29,7 @@ from jaxnbv.viz.answers import capital, may_be_words, shown_value, words_of
 from jaxnbv.viz.choice import colour_range, open_values
 from jaxnbv.viz.imagined import depth_picture, depth_range
 from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
-from jaxnbv.viz.scene import Cameras, Item, Points, Solid, seen_items, surface_items
+from jaxnbv.viz.scene import Cameras, Item, Points, Solid, seen_items
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, VALUE, gradient, middle_range
 from jaxnbv.viz.task import seen_after
 
@@ -43,8 +43,8 @@ class LiveView:
     """A page that shows an episode, or a session, and changes with it. All in scene coordinates, y up.
 
     Switched on in its scene tree: points, cameras, the surface of the posterior's mean coloured by how uncertain it is,
-    candidates coloured by value, the next view with the depth that is expected of it; to be switched on: pieces of the
-    mean that hold no points, and some imagined surfaces. A slider goes back to earlier views.
+    candidates coloured by value, the next view with the depth that is expected of it; to be switched on: some
+    imagined surfaces. A slider goes back to earlier views.
 
     - `port`, `host`: where the page is served, by default for this machine alone.
 
@@ -108,11 +108,11 @@ class LiveView:
             evidence = episode.evidence_after(len(episode.views)) if evidence is None else evidence
             key, *_ = view_keys(episode.key, len(episode.views))
             posterior = imagination.posterior(evidence)
-            surface, guesses = as_shown(mean_surface(imagination, evidence, posterior), evidence.cloud)
+            surface = as_shown(mean_surface(imagination, evidence, posterior), evidence.cloud)
             picture = None if expected is None else depth_picture(expected, *depth_range([expected]))
             with self._server.atomic():
                 self._drawn += [
-                    *_drawn(scene, surface_items(surface, guesses)),
+                    *_drawn(scene, [] if surface is None else [Solid("surface of the mean", surface)]),
                     *_imagined(scene, imagination, evidence, posterior, key),
                     *([] if proposal is None else _choice(scene, episode.planner.camera, proposal, picture)),
                 ]
@@ -166,9 +166,6 @@ def _drawn(scene: Any, items: Iterable[Item]) -> list[Any]:
                     found.append(_frustum(scene, f"/cameras/view {number}", item.camera, pose, item.colour))
                     # It goes with its camera.
                     scene.add_label(f"/cameras/view {number}/number", str(number))
-            case Solid(name, surface, is_guess=True):
-                settings = {"color": to_rgb(GREY), "opacity": 0.35, "visible": False}
-                found.append(scene.add_mesh_simple(f"/{name}", surface.vertices, surface.faces, **settings))
             case Solid(name, surface):
                 colours = DEVIATION(LogNorm(*middle_range(surface.deviation))(surface.deviation), bytes=True)
                 mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=colours, process=False)

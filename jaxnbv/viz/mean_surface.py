@@ -1,13 +1,11 @@
 """The surface of a posterior's mean as triangles, with how sure it is of each place."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
@@ -90,30 +88,24 @@ def _mean_of_samples(values: Float[np.ndarray, "s g g g"], grid: Grid) -> MeanSu
     return MeanSurface(vertices, faces, normals, spread / np.maximum(slope, 1e-6))
 
 
-def as_shown(surface: MeanSurface | None, cloud: PointCloud) -> tuple[MeanSurface | None, MeanSurface | None]:
-    """The pieces of the surface that hold points of the cloud, and those that hold none, which are guesses; None where
-    there are none. Both with the deviation sqrt(sd^2 + (r / 4)^2), r the distance to the nearest point of the cloud.
+def as_shown(surface: MeanSurface | None, cloud: PointCloud) -> MeanSurface | None:
+    """The pieces of the surface that hold points of the cloud, for others are guesses; with the deviation
+    sqrt(sd^2 + (r / 4)^2), r the distance to the nearest point of the cloud. None where there are none.
 
     The posterior is too sure of what no ray has met, beside the image's border or behind the object: it takes its own
     continuation of what was seen for known. An end that was not seen is to be shown as such.
     """
     if surface is None:
-        return None, None
+        return None
     away, _ = cKDTree(cloud.to_numpy()[0]).query(surface.vertices)
-    surface = dataclasses.replace(surface, deviation=np.hypot(surface.deviation, _UNSEEN * away))
     edges = np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]])
     piece = trimesh.graph.connected_component_labels(edges, len(surface.vertices))
-    held = np.isin(piece, piece[away < _HELD])
-    return _part(surface, held), _part(surface, ~held)
-
-
-def _part(surface: MeanSurface, kept: Bool[np.ndarray, " v"]) -> MeanSurface | None:
-    """Some vertices and the faces between them."""
+    kept = np.isin(piece, piece[away < _HELD])
     faces = surface.faces[kept[surface.faces[:, 0]]]
     if len(faces) == 0:
         return None
-    number = np.cumsum(kept) - 1
-    return MeanSurface(surface.vertices[kept], number[faces], surface.normals[kept], surface.deviation[kept])
+    number, deviation = np.cumsum(kept) - 1, np.hypot(surface.deviation, _UNSEEN * away)
+    return MeanSurface(surface.vertices[kept], number[faces], surface.normals[kept], deviation[kept])
 
 
 def _spread(features: np.ndarray, count: int) -> np.ndarray:

@@ -36,11 +36,10 @@ class Cameras(NamedTuple):
 
 
 class Solid(NamedTuple):
-    """A surface: coloured by its deviation, or of one pale colour where it is a guess, which is offered, not shown."""
+    """A surface, coloured by its deviation."""
 
     name: str
     surface: MeanSurface
-    is_guess: bool = False
 
 
 Item = Points | Cameras | Solid
@@ -60,12 +59,6 @@ def seen_items(
         Cameras("cameras", poses[:-1], camera, GREY, 1, 0.9, depth),
         Cameras("new camera", poses[-1:], camera, NEW, len(poses), 1.5, depth),
     )
-
-
-def surface_items(surface: MeanSurface | None, guesses: MeanSurface | None) -> tuple[Solid, ...]:
-    """The surface of the mean, and its pieces that hold no points."""
-    mean = () if surface is None else (Solid("surface of the mean", surface),)
-    return mean if guesses is None else (*mean, Solid("guesses apart from it", guesses, is_guess=True))
 
 
 def frustum(pose: Pose, camera: Camera, depth: float = FRUSTUM_DEPTH) -> Float[np.ndarray, "lines 2 3"]:

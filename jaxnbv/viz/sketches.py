@@ -14,13 +14,12 @@ from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
 class Sketch(NamedTuple):
     """What a step knew before its view was taken.
 
-    - `surface`: of the posterior mean, where it holds points, and `guesses`, its other pieces, with a deviation that
-      allows for what was not seen; None where it has none.
+    - `surface`: of the posterior mean, where it holds points, with a deviation that allows for what was not seen; None
+      where it has none.
     - `imagined`: None for a view that was not chosen, or not taken.
     """
 
     surface: MeanSurface | None
-    guesses: MeanSurface | None
     imagined: Imagined | None
 
 
@@ -71,4 +70,4 @@ def _sketch(
     seen = None
     if imagine and surfaces is not None and index < len(episode.views):
         seen = imagined(episode, index, evidence, posterior, surfaces)
-    return Sketch(*as_shown(mean, evidence.cloud), seen)
+    return Sketch(as_shown(mean, evidence.cloud), seen)

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.mean_surface import MeanSurface
-from jaxnbv.viz.scene import Cameras, Item, Points, Solid, frustum, seen_items, surface_items
+from jaxnbv.viz.scene import Cameras, Item, Points, Solid, frustum, seen_items
 from jaxnbv.viz.style import DEVIATION, INK, colour_scale
 
 # Of all views together, so that a long episode stays a small page.
@@ -28,7 +28,7 @@ def figures_in_space(data: ReportData) -> list[go.Figure]:
     figures = []
     for index, view in enumerate(data.views):
         poses = [stage.pulled(other.pose) for other in data.views[: index + 1]]
-        items: list[Item] = [*surface_items(view.surface, view.guesses)]
+        items: list[Item] = [] if view.surface is None else [Solid("surface of the mean", view.surface)]
         items += seen_items(view.before, view.new, poses, data.camera, stage.depth)
         drawn = [trace for item in items for trace in _traces(item, points, vertices, grades)]
         figures.append(go.Figure(drawn, _layout(stage.eye, stage.extent)))
@@ -76,9 +76,7 @@ def _traces(item: Item, points: int, vertices: int, grades: Float[np.ndarray, "2
             }
             return [wires | named, {"type": "scatter3d", "mode": "text", **numbers, **named, "showlegend": False}]
         case Solid():
-            shown = {"opacity": 0.35, "visible": "legendonly"} if item.is_guess else {}
-            limit = _FEWEST_VERTICES if item.is_guess else vertices
-            return [_mesh(item.surface, limit, grades) | named | shown]
+            return [_mesh(item.surface, vertices, grades) | named]
 
 
 def _lines(segments: Float[np.ndarray, "n k 3"], line: dict[str, Any]) -> dict[str, Any]:

@@ -16,16 +16,14 @@ def test_the_deviation_allows_for_a_quarter_of_the_distance_to_the_nearest_point
     surface = MeanSurface(vertices, ConvexHull(vertices).simplices, vertices, np.full(200, 0.03))
     # Rows that hold nothing lie at the origin, and are no points.
     cloud = nbv.PointCloud.from_arrays(vertices[:1], vertices[:1], capacity=4)
-    shown, guesses = as_shown(surface, cloud)
-    assert shown is not None
-    assert guesses is None
+    shown = as_shown(surface, cloud)
     chord = 2 * np.sin(0.5 * np.arccos(np.clip(vertices @ vertices[0], -1, 1)))
     np.testing.assert_allclose(shown.deviation, np.sqrt(0.03**2 + (chord / 4) ** 2), rtol=1e-5)
     np.testing.assert_array_equal(shown.vertices, vertices)
-    assert as_shown(None, cloud) == (None, None)
+    assert as_shown(None, cloud) is None
 
 
-def test_pieces_that_hold_no_points_are_guesses():
+def test_pieces_that_hold_no_points_are_not_shown():
     """Of two unit spheres one point of the first was seen."""
     ball = np.asarray(nbv.fibonacci_sphere(200), np.float64)
     faces = ConvexHull(ball).simplices
@@ -33,11 +31,10 @@ def test_pieces_that_hold_no_points_are_guesses():
     both = np.concatenate([ball, other])
     surface = MeanSurface(both, np.concatenate([faces, faces + 200]), np.concatenate([ball, ball]), np.full(400, 0.03))
     cloud = nbv.PointCloud.from_arrays(ball[:1], ball[:1])
-    held, guesses = as_shown(surface, cloud)
+    held = as_shown(surface, cloud)
     np.testing.assert_array_equal(held.vertices, ball)
     np.testing.assert_array_equal(held.faces, faces)
-    np.testing.assert_array_equal(guesses.vertices, other)
-    np.testing.assert_array_equal(guesses.faces, faces)
+    assert as_shown(surface, nbv.PointCloud.from_arrays([[1.5, 9.0, 0.0]], [[0.0, 1.0, 0.0]])) is None
 
 
 def test_an_end_beyond_the_images_border_is_never_shown_as_certain():
