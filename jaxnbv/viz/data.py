@@ -20,7 +20,7 @@ from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.sketches import Sketch, Sketches, sketches_of
 from jaxnbv.viz.stage import Stage, stage_of
 from jaxnbv.viz.style import middle_range
-from jaxnbv.viz.task import Task, seen_after, task_of
+from jaxnbv.viz.task import Task, task_of
 from jaxnbv.viz.words import told
 
 
@@ -104,9 +104,7 @@ def report_data(
     planner = episode.planner
     if truth is None and episode.scene is not None:
         truth = truth_points(episode.scene, jax.random.key(0))
-    seen = seen_after(episode.views, truth, planner.acquisition)
-    rival_seen = () if rival is None else seen_after(rival.views, truth, planner.acquisition)
-    task = task_of(episode, seen, rival, rival_seen)
+    task = task_of(episode, truth, rival)
     held = {} if sketches is None else sketches.held
     following = progress_bar(
         sketches_of(episode, held, imagine), progress, desc="drawing views", total=len(episode.views)
@@ -115,13 +113,13 @@ def report_data(
     leading = Sketch(None, None)
     for index, next_one in enumerate(following):
         view = episode.views[index]
-        words = told(planner.quantity, episode.views[: index + 1], seen[: index + 1])
+        words = told(planner.quantity, episode.views[: index + 1], task.amounts[: index + 1])
         if not task.is_coverage:
             answered = words_of(task.answers[index]).said(task.answers[index - 1] if index else None)
             words["What came"] += f" {capital(answered)}."
         before = episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), np.float32)
         look = taken_look(view, before)
-        drawn.append(ViewData(view, before, next_one.surface, seen[index], words, leading.imagined, look))
+        drawn.append(ViewData(view, before, next_one.surface, task.amounts[index], words, leading.imagined, look))
         leading = next_one
     means = [view.surface.mesh for view in drawn if view.surface is not None]
     frame = getattr(episode.scene, "frame", None)

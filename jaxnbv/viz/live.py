@@ -1,8 +1,6 @@
 """A live view in the browser, by viser: what has been seen, what is imagined, and where to look next."""
 
-import dataclasses
-import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +15,9 @@ from jaxnbv.checks import checked
 from jaxnbv.errors import optional
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import Episode, view_keys
 from jaxnbv.planning.session import Session
-from jaxnbv.scanning import Evidence
+from jaxnbv.scanning import Evidence, Grid, GridSurface
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
@@ -29,7 +26,7 @@ from jaxnbv.viz.answers import capital, may_be_words, shown_value, words_of
 from jaxnbv.viz.choice import colour_range, open_values
 from jaxnbv.viz.imagined import depth_picture, depth_range
 from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
-from jaxnbv.viz.scene import Cameras, Item, Points, Solid, seen_items
+from jaxnbv.viz.scene import Cameras, Points, seen_items
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, VALUE, gradient, middle_range
 from jaxnbv.viz.task import seen_after
 
@@ -43,8 +40,8 @@ class LiveView:
     """A page that shows an episode, or a session, and changes with it. All in scene coordinates, y up.
 
     Switched on in its scene tree: points, cameras, the surface of the posterior's mean coloured by how uncertain it is,
-    candidates coloured by value, the next view with the depth that is expected of it; to be switched on: some
-    imagined surfaces. A slider goes back to earlier views.
+    candidates coloured by value, the next view with the depth that is expected of it; to be switched on: some imagined
+    surfaces.
 
     - `port`, `host`: where the page is served, by default for this machine alone.
 
@@ -59,65 +56,59 @@ class LiveView:
         self._server.gui.configure_theme(control_width="medium")
         self._text = self._server.gui.add_markdown("nothing has been seen yet")
         self._legend = self._server.gui.add_html("")
-        self._image: Any = None
-        self._slider: Any = None
         self._drawn: list[Any] = []
-        # A reader may move the slider while the next view comes.
-        self._drawing = threading.RLock()
 
     @property
     def address(self) -> str:
         """Of the page."""
         return f"http://{self._server.get_host()}:{self._server.get_port()}"
 
-    def update(self, shown: Episode | Session) -> None:
-        """Show an episode as it is now, or a session and where it asks for the next image."""
-        episode = shown.episode if isinstance(shown, Session) else shown
-        asked, evidence = (shown.next_view, shown.evidence) if isinstance(shown, Session) else (None, None)
-        proposal, expected = (None, None) if asked is None else (asked.proposal, asked.expected_depth)
-        views = episode.views
-
-        def show(count: int) -> None:
-            if count == len(views):
-                self._show(episode, proposal, expected, evidence)
-            else:
-                self._show(dataclasses.replace(episode, views=views[:count]), views[count].proposal)
-
-        with self._drawing:
-            if self._slider is not None:
-                self._slider.remove()
-                self._slider = None
-            if len(views) > 1:
-                self._slider = self._server.gui.add_slider("after view", 1, len(views), 1, len(views))
-                self._slider.on_update(lambda event: show(event.target.value))
-            show(len(views))
-
-    def _show(
+    def update(
         self,
         episode: Episode,
-        proposal: Proposal | None,
+        proposal: Proposal | None = None,
         expected: Float[np.ndarray, "h w"] | None = None,
         evidence: Evidence | None = None,
     ) -> None:
-        scene, imagination = self._server.scene, episode.planner.imagination
-        with self._drawing:
-            with self._server.atomic():
-                for handle in self._drawn:
-                    handle.remove()
-                self._drawn = _drawn(scene, _seen(episode))
-            evidence = episode.evidence_after(len(episode.views)) if evidence is None else evidence
-            key, *_ = view_keys(episode.key, len(episode.views))
-            posterior = imagination.posterior(evidence)
-            surface = as_shown(mean_surface(imagination, evidence, posterior), evidence.cloud)
-            picture = None if expected is None else depth_picture(expected, *depth_range([expected]))
-            with self._server.atomic():
-                self._drawn += [
-                    *_drawn(scene, [] if surface is None else [Solid("surface of the mean", surface)]),
-                    *_imagined(scene, imagination, evidence, posterior, key),
-                    *([] if proposal is None else _choice(scene, episode.planner.camera, proposal, picture)),
-                ]
-            self._tell(episode, posterior, proposal, picture)
-            self._legend.content = _legend(surface, proposal, episode.planner.quantity)
+        """Show an episode as it is now.
+
+        - `proposal`: for the view after its last; `expected`: the depth image expected there.
+        - `evidence`: after its last view, where that is at hand; made again from the scans otherwise.
+        """
+        views, planner, imagination = episode.views, episode.planner, episode.planner.imagination
+        evidence = episode.evidence_after(len(views)) if evidence is None else evidence
+        key, *_ = view_keys(episode.key, len(views))
+        posterior = imagination.posterior(evidence)
+        samples = imagination.sample(evidence, key, posterior)
+        surface = as_shown(mean_surface(imagination, evidence, posterior, samples), evidence.cloud)
+        new, _ = views[-1].scan.to_numpy()
+        before = views[-2].cloud.to_numpy()[0] if len(views) > 1 else new[:0]
+        items = seen_items(before, new, [view.pose for view in views], views[-1].camera)
+        picture = None if expected is None else depth_picture(expected, *depth_range([expected]))
+        shapes = [""] * _SAMPLES
+        if isinstance(posterior, KnownShapesPosterior):
+            shapes = [f" {name}" for name in posterior.names_of_samples(key, imagination.num_samples)]
+        scene = self._server.scene
+        with self._server.atomic():
+            for handle in self._drawn:
+                handle.remove()
+            self._drawn = [*_drawn(scene, items, surface), *_imagined(scene, samples, imagination.grid, shapes)]
+            if proposal is not None:
+                self._drawn += _choice(scene, planner.camera, proposal, picture)
+            if picture is not None:
+                self._drawn.append(self._server.gui.add_image(picture, label="depth expected there"))
+            self._text.content = _told(episode, posterior, proposal)
+            self._legend.content = _legend(surface, proposal, planner.quantity)
+
+    def follow(self, session: Session) -> None:
+        """Show a session from now on, with every image and proposal."""
+
+        def show(session: Session) -> None:
+            asked = session.next_view
+            proposal, expected = (None, None) if asked is None else (asked.proposal, asked.expected_depth)
+            self.update(session.episode, proposal, expected, session.evidence)
+
+        session.follow(show)
 
     def save(self, path: str | Path) -> Path:
         """Write the scene as it is now as one HTML file, which opens offline."""
@@ -128,62 +119,46 @@ class LiveView:
         """Serve it no more."""
         self._server.stop()
 
-    def _tell(
-        self, episode: Episode, posterior: SurfacePosterior, proposal: Proposal | None, picture: np.ndarray | None
-    ) -> None:
-        views, sought, acquisition = len(episode.views), episode.planner.quantity, episode.planner.acquisition
-        seen = seen_after(episode.views, None, acquisition)[-1]
-        lines = [f"**{views} view{'s' if views > 1 else ''}**, {seen.amount} of surface seen"]
-        answer = acquisition.answer(episode.cloud)
-        lines += [] if answer is None else [f"{capital(words_of(answer).said())}."]
-        if isinstance(posterior, KnownShapesPosterior):
-            lines.append(may_be_words(tuple(posterior.kinds().items())))
-        if proposal is not None:
-            error = proposal.standard_error
-            about = "" if error is None else f" ± {error:.2g}"
-            lines.append(f"The next view has a {sought.name} of {shown_value(sought, float(proposal.value))}{about}.")
-        self._text.content = "\n\n".join(lines)
-        if self._image is not None:
-            self._image.remove()
-        self._image = None if picture is None else self._server.gui.add_image(picture, label="depth expected there")
+
+def _told(episode: Episode, posterior: SurfacePosterior, proposal: Proposal | None) -> str:
+    """What is known, and what is asked, as Markdown."""
+    views, sought, acquisition = len(episode.views), episode.planner.quantity, episode.planner.acquisition
+    seen = seen_after(episode.views, None, acquisition)[-1]
+    lines = [f"**{views} view{'s' if views > 1 else ''}**, {seen.amount} of surface seen"]
+    answer = acquisition.answer(episode.cloud)
+    lines += [] if answer is None else [f"{capital(words_of(answer).said())}."]
+    if isinstance(posterior, KnownShapesPosterior):
+        lines.append(may_be_words(tuple(posterior.kinds().items())))
+    if proposal is not None:
+        about = "" if proposal.standard_error is None else f" ± {proposal.standard_error:.2g}"
+        lines.append(f"The next view has a {sought.name} of {shown_value(sought, float(proposal.value))}{about}.")
+    return "\n\n".join(lines)
 
 
-def _seen(episode: Episode) -> tuple[Item, ...]:
-    new, _ = episode.views[-1].scan.to_numpy()
-    before = episode.views[-2].cloud.to_numpy()[0] if len(episode.views) > 1 else new[:0]
-    return seen_items(before, new, [view.pose for view in episode.views], episode.views[-1].camera)
-
-
-def _drawn(scene: Any, items: Iterable[Item]) -> list[Any]:
+def _drawn(scene: Any, items: Iterable[Points | Cameras], surface: MeanSurface | None) -> list[Any]:
     found = []
     for item in items:
-        match item:
-            case Points() if len(item.places):
-                settings: dict[str, Any] = {"point_size": _POINT, "point_shape": "circle"}
-                found.append(scene.add_point_cloud(f"/{item.name}", item.places, to_rgb(item.colour), **settings))
-            case Cameras():
-                for number, pose in enumerate(item.poses, start=item.first):
-                    found.append(_frustum(scene, f"/cameras/view {number}", item.camera, pose, item.colour))
-                    # It goes with its camera.
-                    scene.add_label(f"/cameras/view {number}/number", str(number))
-            case Solid(name, surface):
-                colours = DEVIATION(LogNorm(*middle_range(surface.deviation))(surface.deviation), bytes=True)
-                mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=colours, process=False)
-                found.append(scene.add_mesh_trimesh(f"/{name}", mesh))
+        if isinstance(item, Cameras):
+            for number, pose in enumerate(item.poses, start=item.first):
+                found.append(_frustum(scene, f"/cameras/view {number}", item.camera, pose, item.colour))
+                # It goes with its camera.
+                scene.add_label(f"/cameras/view {number}/number", str(number))
+        elif len(item.places):
+            settings: dict[str, Any] = {"point_size": _POINT, "point_shape": "circle"}
+            found.append(scene.add_point_cloud(f"/{item.name}", item.places, to_rgb(item.colour), **settings))
+    if surface is not None:
+        colours = DEVIATION(LogNorm(*middle_range(surface.deviation))(surface.deviation), bytes=True)
+        mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=colours, process=False)
+        found.append(scene.add_mesh_trimesh("/surface of the mean", mesh))
     return found
 
 
-def _imagined(
-    scene: Any, imagination: Imagination, evidence: Evidence, posterior: SurfacePosterior, key: Any
-) -> list[Any]:
-    shapes = [""] * _SAMPLES
-    if isinstance(posterior, KnownShapesPosterior):
-        shapes = [f" {name}" for name in posterior.names_of_samples(key, imagination.num_samples)]
-    # Marching cubes asks for an array that it could write to.
-    values = np.array(imagination.sample(evidence, key, posterior).values[:_SAMPLES])
+def _imagined(scene: Any, samples: GridSurface, grid: Grid, shapes: Sequence[str]) -> list[Any]:
+    """Some sampled surfaces, by the shapes that they are about."""
     found = []
-    for number, (one, shape) in enumerate(zip(values, shapes, strict=False), start=1):
-        if (triangles := level_triangles(one, imagination.grid)) is not None:
+    # Marching cubes asks for an array that it could write to.
+    for number, (values, shape) in enumerate(zip(np.array(samples.values[:_SAMPLES]), shapes, strict=False), start=1):
+        if (triangles := level_triangles(values, grid)) is not None:
             settings: dict[str, Any] = {"color": to_rgb("#8fb8d8"), "opacity": 0.9, "visible": False}
             found.append(scene.add_mesh_simple(f"/imagined/{number}{shape}", *triangles[:2], **settings))
     return found

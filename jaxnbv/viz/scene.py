@@ -8,7 +8,6 @@ from jaxtyping import Float
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.style import BEFORE, GREY, NEW
 
 FRUSTUM_DEPTH = 0.45
@@ -33,16 +32,6 @@ class Cameras(NamedTuple):
     first: int
     weight: float
     depth: float = FRUSTUM_DEPTH
-
-
-class Solid(NamedTuple):
-    """A surface, coloured by its deviation."""
-
-    name: str
-    surface: MeanSurface
-
-
-Item = Points | Cameras | Solid
 
 
 def seen_items(

@@ -8,12 +8,11 @@ from jaxtyping import Float, Int
 
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.mean_surface import MeanSurface
-from jaxnbv.viz.scene import Cameras, Item, Points, Solid, frustum, seen_items
+from jaxnbv.viz.scene import Cameras, Points, frustum, seen_items
 from jaxnbv.viz.style import DEVIATION, INK, colour_scale
 
 # Of all views together, so that a long episode stays a small page.
-_MAX_POINTS, _MAX_VERTICES = 18_000, 24_000
-_MOST_POINTS, _MOST_VERTICES, _FEWEST_VERTICES = 3000, 4000, 1500
+_POINTS, _VERTICES, _FEWEST_VERTICES = 18_000, 24_000, 1500
 # Coordinates are rounded to this, in scene units: a power of two, whose multiples pack well.
 _GRAIN = 1 / 256
 _LIGHT = {"ambient": 0.72, "diffuse": 0.45, "specular": 0.04, "roughness": 0.9}
@@ -21,16 +20,14 @@ _LIGHT = {"ambient": 0.72, "diffuse": 0.45, "specular": 0.04, "roughness": 0.9}
 
 def figures_in_space(data: ReportData) -> list[go.Figure]:
     """One figure a view. Its legend switches what is shown, which stays from one view to the next."""
-    stage, count = data.stage, len(data.views)
-    points = min(_MAX_POINTS // count, _MOST_POINTS)
-    vertices = min(max(_MAX_VERTICES // count, _FEWEST_VERTICES), _MOST_VERTICES)
+    stage, count, figures = data.stage, max(len(data.views), 6), []
+    points, vertices = _POINTS // count, max(_VERTICES // count, _FEWEST_VERTICES)
     grades = np.log10(data.deviations)
-    figures = []
     for index, view in enumerate(data.views):
         poses = [stage.pulled(other.pose) for other in data.views[: index + 1]]
-        items: list[Item] = [] if view.surface is None else [Solid("surface of the mean", view.surface)]
-        items += seen_items(view.before, view.new, poses, data.camera, stage.depth)
-        drawn = [trace for item in items for trace in _traces(item, points, vertices, grades)]
+        drawn = [] if view.surface is None else [_mesh(view.surface, vertices, grades)]
+        for item in seen_items(view.before, view.new, poses, data.camera, stage.depth):
+            drawn += _points(item, points) if isinstance(item, Points) else _cameras(item)
         figures.append(go.Figure(drawn, _layout(stage.eye, stage.extent)))
     return figures
 
@@ -57,32 +54,31 @@ def _placed(places: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
     return {"x": z, "y": x, "z": y}
 
 
-def _traces(item: Item, points: int, vertices: int, grades: Float[np.ndarray, "2"]) -> list[dict[str, Any]]:
-    named = {"name": item.name, "legendgroup": item.name, "hoverinfo": "skip", "showlegend": True}
-    match item:
-        case Points():
-            rows = np.linspace(0, len(item.places) - 1, min(points, len(item.places))).astype(int)
-            marker = {"color": item.colour, "size": 1.0 + item.weight}
-            return [{"type": "scatter3d", "mode": "markers", "marker": marker, **_placed(item.places[rows]), **named}]
-        case Cameras():
-            if not item.poses:
-                return []
-            edges = np.concatenate([frustum(pose, item.camera, item.depth) for pose in item.poses])
-            wires = _lines(edges, {"color": item.colour, "width": 3.0 * item.weight})
-            numbers = {
-                **_placed(1.09 * np.stack([np.asarray(pose.position, np.float64) for pose in item.poses])),
-                "text": [f"<b>{item.first + i}</b>" for i in range(len(item.poses))],
-                "textfont": {"color": item.colour, "size": 14},
-            }
-            return [wires | named, {"type": "scatter3d", "mode": "text", **numbers, **named, "showlegend": False}]
-        case Solid():
-            return [_mesh(item.surface, vertices, grades) | named]
+def _named(name: str) -> dict[str, Any]:
+    return {"name": name, "legendgroup": name, "hoverinfo": "skip", "showlegend": True}
 
 
-def _lines(segments: Float[np.ndarray, "n k 3"], line: dict[str, Any]) -> dict[str, Any]:
-    """Broken lines, with a gap behind each."""
-    gapped = np.pad(np.asarray(segments, np.float64), ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
-    return {"type": "scatter3d", "mode": "lines", "line": line, **_placed(gapped.reshape(-1, 3))}
+def _points(item: Points, most: int) -> list[dict[str, Any]]:
+    rows = np.linspace(0, len(item.places) - 1, min(most, len(item.places))).astype(int)
+    marker = {"color": item.colour, "size": 1.0 + item.weight}
+    places = _placed(item.places[rows])
+    return [{"type": "scatter3d", "mode": "markers", "marker": marker, **places, **_named(item.name)}]
+
+
+def _cameras(item: Cameras) -> list[dict[str, Any]]:
+    """Their edges, with a gap behind each, and their numbers."""
+    if not item.poses:
+        return []
+    edges = np.concatenate([frustum(pose, item.camera, item.depth) for pose in item.poses])
+    gapped = np.pad(edges, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 3)
+    line = {"color": item.colour, "width": 3.0 * item.weight}
+    numbers = {
+        **_placed(1.09 * np.stack([np.asarray(pose.position, np.float64) for pose in item.poses])),
+        "text": [f"<b>{item.first + i}</b>" for i in range(len(item.poses))],
+        "textfont": {"color": item.colour, "size": 14},
+    }
+    wires = {"type": "scatter3d", "mode": "lines", "line": line, **_placed(gapped), **_named(item.name)}
+    return [wires, {"type": "scatter3d", "mode": "text", **numbers, **_named(item.name), "showlegend": False}]
 
 
 def _mesh(surface: MeanSurface, limit: int, grades: Float[np.ndarray, "2"]) -> dict[str, Any]:
@@ -93,6 +89,7 @@ def _mesh(surface: MeanSurface, limit: int, grades: Float[np.ndarray, "2"]) -> d
     deviation = np.bincount(own, np.log10(surface.deviation)) / count
     return {
         "type": "mesh3d",
+        **_named("surface of the mean"),
         **_placed(vertices),
         **dict(zip("ijk", faces.T.astype(np.uint16), strict=True)),
         "intensity": np.round(deviation, 2).astype(np.float32),

@@ -38,16 +38,12 @@ class Stage(eqx.Module):
         """Radius of what is drawn, numbers of cameras included."""
         return 1.1 * (_STAND * self.radius + self.depth)
 
-    def pull_of(self, pose: Pose) -> float:
-        """What a camera's position is multiplied by: it stands just beyond the object's extent in its direction."""
+    def pulled(self, pose: Pose) -> Pose:
+        """Where a camera is drawn: just beyond the object's extent in its direction."""
         position = np.asarray(pose.position, np.float64)
         distance = max(float(np.linalg.norm(position)), 1e-9)
         extent = max(float((self.outline @ position).max()) / distance, _CLOSEST * self.radius)
-        return min(1.0, (_STAND * extent + self.depth) / distance)
-
-    def pulled(self, pose: Pose) -> Pose:
-        """Where a camera is drawn."""
-        return Pose(pose.rotation, self.pull_of(pose) * pose.position)
+        return Pose(pose.rotation, min(1.0, (_STAND * extent + self.depth) / distance) * pose.position)
 
 
 def stage_of(episode: Episode, surfaces: list[trimesh.Trimesh]) -> Stage:

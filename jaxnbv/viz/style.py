@@ -33,12 +33,8 @@ def gradient(colours: Colormap) -> str:
 
 
 def middle_range(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """The range of some positive values in round numbers; it leaves out a fiftieth of them at either end."""
-    return round_range(*np.percentile(values, [2.0, 98.0]).tolist())
-
-
-def round_range(low: float, high: float) -> tuple[float, float]:
-    """The range in steps of 1, 2, 5 that holds [low, high], for an axis of logarithms."""
+    """The range of some positive values in steps of 1, 2, 5; it leaves out a fiftieth of them at either end."""
+    low, high = np.percentile(values, [2.0, 98.0])
     ticks = log_ticks(low / 10.0, high * 10.0)
     return float(ticks[ticks <= low * 1.0001].max()), float(ticks[ticks >= high * 0.9999].min())
 

@@ -35,59 +35,56 @@ class Rival(NamedTuple):
 class Task(NamedTuple):
     """What the views were for.
 
-    - `answers`: after each view; `truth`: what they should come to, None where that is not known.
-    - `charts`: of the answers; `seen`: of how much of the surface was seen.
+    - `amounts`: how much of the surface was seen after each view, and `seen`, the chart of it.
+    - `answers`: after each view, and their `charts`; they are the amounts, where nothing else is asked.
     - `question`, `asked`, `found`, `sure`: what was asked and how, what was found and since when, for the head of the
       report.
     - `rival`: how another search fared; None without one.
     """
 
-    answers: Sequence[Answer]
-    truth: Answer | None
-    charts: tuple[Chart, ...]
+    amounts: Sequence[CoverageAnswer]
     seen: Chart
+    answers: Sequence[Answer]
+    charts: tuple[Chart, ...]
     question: str
     asked: str
     found: str
     sure: str
-    rival: Rival | None = None
+    rival: Rival | None
 
     @property
     def is_coverage(self) -> bool:
-        """Whether its answer is how much was seen."""
-        return isinstance(self.answers[-1], CoverageAnswer)
+        """Whether nothing else is asked than how much was seen."""
+        return self.answers is self.amounts
 
 
-def task_of(
-    episode: Episode,
-    seen: Sequence[CoverageAnswer],
-    rival: Episode | None = None,
-    rival_seen: Sequence[CoverageAnswer] = (),
-) -> Task:
+def task_of(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, rival: Episode | None = None) -> Task:
     """The task of an episode's acquisition; that of seeing all of the surface, where it answers nothing.
 
-    - `seen`, `rival_seen`: how much of the surface was seen after each view.
+    - `truth`: points of the true surface, in scene coordinates.
     - `rival`: an episode of another search from the same first view.
     """
     planner = episode.planner
-    answers, truth = _answers(planner.acquisition, episode.views, seen), None
-    if episode.scene is not None and not isinstance(answers[-1], CoverageAnswer):
+    seen, true = seen_after(episode.views, truth, planner.acquisition), None
+    answers = _answers(planner.acquisition, episode.views) or seen
+    if episode.scene is not None and answers is not seen:
         cloud = true_cloud(episode.scene, planner.capacity)
-        truth = None if cloud is None else planner.acquisition.true_answer(episode.scene, cloud)
+        true = None if cloud is None else planner.acquisition.true_answer(episode.scene, cloud)
     beside = None
     if rival is not None:
-        others = _charts(_answers(planner.acquisition, rival.views, rival_seen), truth)
-        beside = Rival(search_name(rival), race_words(rival, episode), others, _charts(rival_seen, None)[0])
+        rival_seen = seen_after(rival.views, truth, planner.acquisition)
+        charts = _charts(_answers(planner.acquisition, rival.views) or rival_seen, true)
+        beside = Rival(search_name(rival), race_words(rival, episode), charts, _charts(rival_seen, None)[0])
     return Task(
-        answers,
-        truth,
-        _charts(answers, truth),
-        _charts(seen, None)[0],
-        words_of(answers[-1]).question,
-        _asked(planner),
-        _found(answers, truth),
-        _sure(answers, episode.stopped),
-        beside,
+        amounts=seen,
+        seen=_charts(seen, None)[0],
+        answers=answers,
+        charts=_charts(answers, true),
+        question=words_of(answers[-1]).question,
+        asked=_asked(planner),
+        found=capital(words_of(answers[-1]).found) + ("" if true is None else f". In truth: {words_of(true).found}"),
+        sure=_sure(answers, episode.stopped),
+        rival=beside,
     )
 
 
@@ -95,11 +92,11 @@ def _charts(answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...
     return words_of(answers[-1]).charts(answers, truth)
 
 
-def _answers(acquisition: Acquisition, views: Sequence[View], seen: Sequence[CoverageAnswer]) -> Sequence[Answer]:
-    """After each view; how much was seen, where the acquisition answers nothing."""
+def _answers(acquisition: Acquisition, views: Sequence[View]) -> Sequence[Answer]:
+    """After each view; none, where the acquisition answers nothing."""
     given = [acquisition.answer(view.cloud) for view in views]
     answers = [answer for answer in given if answer is not None]
-    return answers if len(answers) == len(given) else seen
+    return answers if len(answers) == len(given) else []
 
 
 def seen_after(
@@ -159,7 +156,7 @@ def race_words(rival: Episode, episode: Episode) -> str:
     """How many views another search took, from the same first view; of an acquisition that answers, whether it ended by
     the rule that ended the episode, what was found, and since when its answers can be relied on."""
     name, count = search_name(rival).capitalize(), len(rival.views)
-    answers = _answers(episode.planner.acquisition, rival.views, ())
+    answers = _answers(episode.planner.acquisition, rival.views)
     needed = "needed" if rival.stopped else "did not end by that rule in" if episode.stopped else "took"
     text = f"{name} {needed} {count} view{'s' * (count > 1)} from the same start"
     if not answers:
@@ -173,11 +170,6 @@ def _asked(planner: Planner) -> str:
     if not planner.search.uses_samples:
         return f"Each view is where the {name} is highest."
     return f"Each view is where the {name} is highest, over {planner.imagination.num_samples} imagined surfaces."
-
-
-def _found(answers: Sequence[Answer], truth: Answer | None) -> str:
-    text = capital(words_of(answers[-1]).found)
-    return text if truth is None else f"{text}. In truth: {words_of(truth).found}"
 
 
 def _sure(answers: Sequence[Answer], stopped: str | None) -> str:

@@ -24,7 +24,7 @@ from jaxnbv.viz.report import report_html
 from jaxnbv.viz.scene import frustum
 from jaxnbv.viz.space import figures_in_space
 from jaxnbv.viz.sphere import on_map, smooth_map
-from jaxnbv.viz.style import log_ticks, round_range
+from jaxnbv.viz.style import log_ticks, middle_range
 from jaxnbv.viz.task import seen_after
 
 
@@ -280,6 +280,6 @@ def test_a_frustum_is_what_the_camera_sees():
 
 
 def test_ranges_and_ticks_are_round():
-    assert round_range(0.0013, 0.088) == pytest.approx((0.001, 0.1))
+    assert middle_range(np.linspace(0.0, 0.09, 1001)[14:]) == pytest.approx((0.002, 0.1))
     np.testing.assert_allclose(log_ticks(0.001, 0.1), [0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1])
     assert [number(value) for value in (0.001234, 186.59, 1234.5, -2.0)] == ["0.00123", "187", "1,234", "−2"]
