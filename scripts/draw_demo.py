@@ -104,7 +104,7 @@ def main() -> None:
         for number, view in enumerate(views, start=1):
             assert view.look is not None
             if view.imagined is not None:
-                for tile in looks(view.imagined)[:4]:
+                for tile in looks(view.imagined, None):
                     guess = Tile(tile.name.rstrip(" 0123456789") + "?", tile.picture)
                     film.add(number - 1, guess, f"imagined from view {number}", GUESS)
             seen = Tile("scanned", look_picture(view.look, plain=True))

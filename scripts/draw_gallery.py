@@ -95,7 +95,7 @@ def draw_hero(figure: Figure) -> None:
             index = 0 if place == 0 else 1
             draw_scene(figure.add_axes((x, 0.0, w, 0.86)), data, index, painted(data, index), inset=False)
         elif place == 1:
-            for number, tile in enumerate(looks(seen)[:4]):
+            for number, tile in enumerate(looks(seen, None)):
                 down, across = divmod(number, 2)
                 box = (x + (0.04 + 0.48 * across) * w, 0.43 - 0.42 * down, 0.44 * w, 0.4)
                 _tile(figure.add_axes(box), tile.picture)

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 import trimesh
 from jaxtyping import Float, UInt8
@@ -24,7 +25,6 @@ from jaxnbv.storage.files import write_text
 from jaxnbv.surfaces import KnownShapesPosterior, SurfacePosterior
 from jaxnbv.viz.answers import capital, may_be_words, shown_value, words_of
 from jaxnbv.viz.choice import colour_range, open_values
-from jaxnbv.viz.imagined import depth_picture, depth_range
 from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
 from jaxnbv.viz.scene import Cameras, Points, seen_items
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, VALUE, gradient, middle_range
@@ -84,7 +84,7 @@ class LiveView:
         new, _ = views[-1].scan.to_numpy()
         before = views[-2].cloud.to_numpy()[0] if len(views) > 1 else new[:0]
         items = seen_items(before, new, [view.pose for view in views], views[-1].camera)
-        picture = None if expected is None else depth_picture(expected, *depth_range([expected]))
+        picture = None if expected is None else _depth_picture(expected)
         shapes = [""] * _SAMPLES
         if isinstance(posterior, KnownShapesPosterior):
             shapes = [f" {name}" for name in posterior.names_of_samples(key, imagination.num_samples)]
@@ -162,6 +162,12 @@ def _imagined(scene: Any, samples: GridSurface, grid: Grid, shapes: Sequence[str
             settings: dict[str, Any] = {"color": to_rgb("#8fb8d8"), "opacity": 0.9, "visible": False}
             found.append(scene.add_mesh_simple(f"/imagined/{number}{shape}", *triangles[:2], **settings))
     return found
+
+
+def _depth_picture(depth: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Near is bright, far dark; white where nothing is expected."""
+    colours = mpl.colormaps["viridis_r"].with_extremes(bad="white")
+    return colours(Normalize(*colour_range(depth))(depth), bytes=True)[..., :3]
 
 
 def _choice(scene: Any, camera: Camera, proposal: Proposal, picture: np.ndarray | None) -> list[Any]:

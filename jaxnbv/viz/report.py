@@ -28,7 +28,7 @@ from jaxnbv.viz.choice import draw_choice, marks
 from jaxnbv.viz.data import ReportData, report_data
 from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.html import render
-from jaxnbv.viz.imagined import depths, looks
+from jaxnbv.viz.imagined import looks
 from jaxnbv.viz.render import draw_scene, painted
 from jaxnbv.viz.sketches import Sketches
 from jaxnbv.viz.space import figures_in_space
@@ -89,7 +89,7 @@ def report_html(data: ReportData, title: str) -> str:
         plotly=_zipped(get_plotlyjs()),
         address=picture_address,
         poses=[_matrix(data, index) for index in range(len(data.views))],
-        **{said.__name__: said for said in (capital, number, may_be_words, looks, depths, marks)},
+        **{said.__name__: said for said in (capital, number, may_be_words, looks, marks)},
     )
 
 
