@@ -4,6 +4,7 @@ import base64
 import gzip
 import json
 import re
+from html.parser import HTMLParser
 
 import jax
 
@@ -33,3 +34,37 @@ def scene_in_space(page: str) -> dict:
     """What a report holds packed, for a reader who turns the object."""
     packed = re.search('id="inspace">([^<]*)<', page)
     return json.loads(gzip.decompress(base64.b64decode(packed[1])))
+
+
+class Page(HTMLParser):
+    """The elements of a page: tag, attributes and the text that follows it."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.elements = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append([tag, dict(attributes), ""])
+
+    def handle_data(self, text):
+        if self.elements:
+            self.elements[-1][2] += text
+
+    def of(self, *tags):
+        """The attributes of the elements of some kinds."""
+        return [attributes for tag, attributes, _ in self.elements if tag in tags]
+
+    @property
+    def tables(self):
+        """By their captions, a row's cells by its name."""
+        found = {}
+        for tag, _, raw in self.elements:
+            text = raw.strip()
+            if tag == "caption":
+                rows = found[text] = []
+            elif tag == "tr":
+                rows.append([])
+            elif tag == "th" or (tag == "td" and text.strip()):
+                rows[-1].append(text)
+        return found

@@ -3,14 +3,13 @@
 import dataclasses
 import html
 import re
-from html.parser import HTMLParser
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_run import small_run
+from small_run import Page, small_run
 
 import jaxnbv as nbv
 from jaxnbv.acquisition import Answer
@@ -55,31 +54,6 @@ def plain(request):
     patch.undo()
 
 
-class Tables(HTMLParser):
-    """The tables of a page: by their captions, a row's cells by its name."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.found, self._tag, self._row = {}, None, None
-        self.feed(text)
-
-    def handle_starttag(self, tag, attributes):
-        self._tag = tag
-        if tag == "tr":
-            self._row = []
-
-    def handle_endtag(self, tag):
-        self._tag = None
-        if tag == "tr" and self._row is not None:
-            self._table.append(self._row)
-
-    def handle_data(self, text):
-        if self._tag == "caption":
-            self._table = self.found[text] = []
-        elif self._tag in ("th", "td") and self._row is not None:
-            self._row.append(text)
-
-
 def page_of(episode):
     data = report_data(episode, progress=False, imagine=False)
     return data, report_html(data, "thing")
@@ -94,7 +68,7 @@ def test_probabilities_by_view_are_those_of_the_classifier(plain):
     scene = pyramid_scene(Split.TEST, 1)
     episode = run(nbv.CrossEntropy(Leaning(), 512), nbv.SDFSurface(scene))
     _, text = page_of(episode)
-    header, *rows, true = Tables(text).found["Probability"]
+    header, *rows, true = Page(text).tables["Probability"]
     assert header == list(NAMES)
     expected = []
     for view in episode.views:
@@ -116,7 +90,7 @@ def test_a_utility_of_ones_own_has_its_chart_and_its_truth(plain):
     """The true height of a ball is its radius."""
     episode = run(nbv.ExpectedUtilityImprovement(greatest_height), nbv.SDFSurface(Sphere(0.9)))
     _data, text = page_of(episode)
-    header, *rows, true = Tables(text).found["Greatest height"]
+    header, *rows, true = Page(text).tables["Greatest height"]
     assert header == ["greatest height"]
     heights = [float(view.cloud.to_numpy()[0][:, 1].max()) for view in episode.views]
     assert [row[1] for row in rows] == [number(height) for height in heights]
@@ -130,7 +104,7 @@ def test_coverage_by_view_is_the_share_of_the_truth_that_was_seen(plain):
     episode = run(nbv.Coverage(), nbv.SDFSurface(Sphere(0.9)))
     truth = 0.9 * np.asarray(nbv.fibonacci_sphere(500), np.float64)
     data = report_data(episode, truth, progress=False, imagine=False)
-    _, *rows = Tables(report_html(data, "ball")).found["Surface seen (%)"]
+    _, *rows = Page(report_html(data, "ball")).tables["Surface seen (%)"]
     assert [row[1] for row in rows] == [number(100.0 * share) for share in nbv.metrics.coverage(episode.views, truth)]
 
 
@@ -257,28 +231,15 @@ def test_the_page_opens_with_the_answer_and_folds_the_settings_away(plain):
         assert setting not in body[:folded]
 
 
-class Attributes(HTMLParser):
-    def __init__(self, text):
-        super().__init__()
-        self.elements = []
-        self.feed(text)
-
-    def handle_starttag(self, tag, attributes):
-        self.elements.append((tag, dict(attributes)))
-
-
 def test_the_page_can_be_read_and_used_without_a_mouse_or_eyes(plain):
     episode = run(nbv.ExpectedUtilityImprovement(greatest_height), nbv.SDFSurface(Sphere(0.9)), views=2)
-    elements = Attributes(page_of(episode)[1]).elements
-    ids = [attributes["id"] for _, attributes in elements if "id" in attributes]
+    page = Page(page_of(episode)[1])
+    ids = [attributes["id"] for _, attributes, _ in page.elements if "id" in attributes]
     assert len(ids) == len(set(ids))
-    (slider,) = (attributes for tag, attributes in elements if tag == "input")
+    (slider,) = page.of("input")
     assert (slider["type"], slider["min"], slider["max"], slider["aria-label"]) == ("range", "1", "2", "View")
-    assert slider["aria-describedby"] in ids
-    (spoken,) = (attributes for _, attributes in elements if attributes.get("aria-live") == "polite")
+    (spoken,) = (made for _, made, _ in page.elements if made.get("aria-live") == "polite")
     assert spoken["id"] == slider["aria-describedby"]
-    images = [attributes for tag, attributes in elements if tag == "img"]
-    assert len(images) >= 4
-    assert all(len(attributes["alt"]) > 5 for attributes in images)
-    buttons = [attributes for tag, attributes in elements if tag == "button"]
-    assert {"Previous view", "Next view"} <= {attributes.get("aria-label") for attributes in buttons}
+    assert len(page.of("img")) >= 4
+    assert all(len(attributes["alt"]) > 5 for attributes in page.of("img"))
+    assert {"Previous view", "Next view"} <= {attributes.get("aria-label") for attributes in page.of("button")}

@@ -22,7 +22,7 @@ from jaxnbv.viz.choice import draw_acquisition
 from jaxnbv.viz.report import report_html
 from jaxnbv.viz.words import told
 
-COVERAGE = nbv.DiscreteSearch().quantity(nbv.Coverage())
+COVERAGE, LOTS = (search.quantity(nbv.Coverage()) for search in (nbv.DiscreteSearch(), nbv.RandomView()))
 
 
 def joined(first, second):
@@ -84,7 +84,7 @@ def test_a_map_is_made_of_enough_candidates_and_of_no_lots(count, lots, has_map)
     assert any(isinstance(drawn, QuadMesh) for drawn in globe.collections) == has_map
 
 
-def said_of(value, others, starts=0, pose=None, standard_error=None):
+def said_of(value, others, starts=0, pose=None, standard_error=None, quantity=COVERAGE):
     """What is said of a second view with such a value, beside candidates with others, and ascents from some starts."""
     pose, first = look_at((0.0, 0.0, 2.5)) if pose is None else pose, look_at((2.5, 0.0, 0.0))
     ways = trajectories(np.zeros((starts, 2))) if starts else None
@@ -94,7 +94,7 @@ def said_of(value, others, starts=0, pose=None, standard_error=None):
     scan = nbv.PointCloud.from_arrays(np.eye(3), np.eye(3))
     views = [nbv.View(first, scan, scan, None, CAMERA), nbv.View(pose, scan, scan, looked, CAMERA)]
     seen = [CoverageAnswer(("of surface seen",), np.array([area]), unit="scene units²") for area in (0.2, 0.3)]
-    return " ".join(told(COVERAGE, views, seen).values())
+    return " ".join(told(quantity, views, seen).values())
 
 
 @pytest.mark.parametrize(
@@ -115,6 +115,10 @@ def test_words_say_how_a_view_stands_among_the_others(value, others, starts, err
     where = "It looks from (0.00, 0.00, 2.50), 0° above the horizon, 90° from the nearest earlier view. Its"
     assert said.startswith(where)
     assert said.endswith("surface seen went from 0.2 scene units² to 0.3 scene units².")
+
+
+def test_of_a_lot_no_value_is_told():
+    assert "It was drawn at random from 2 open candidates. It added" in said_of(0.9, (0.9, 0.5), quantity=LOTS)
 
 
 def test_words_say_where_a_camera_looks_past_the_centre():
