@@ -15,7 +15,7 @@ def planner_of(
     num_samples=3,
     cost=None,
     model=MODEL,
-    grid=nbv.Grid(24),
+    grid=nbv.Grid(24),  # noqa: B008
     **changes,
 ):
     imagination = nbv.Imagination(model, grid, num_samples)

@@ -82,7 +82,9 @@ def draw_values(axes: Axes, data: ReportData) -> list[Line2D]:
     low, high = axes.get_ylim()
     axes.set_ylim(min(low, 0.0), high * 1.12)
     over_views(axes, len(data.views))
-    star = Line2D([], [], ls="none", marker="*", color=NEW, ms=9, label="chosen view, its standard error")
+    has_errors = any(shown.proposal.standard_error is not None for shown in data.views if shown.proposal is not None)
+    label = "chosen view" + " ± standard error" * has_errors
+    star = Line2D([], [], ls="none", marker="*", color=NEW, ms=9, label=label)
     return [star, Line2D([], [], ls="none", marker="_", color=INK, ms=9, mew=1.4, label="median candidate")]
 
 

@@ -1,5 +1,7 @@
 """A live view in the browser, by viser: what has been seen, what is imagined, and where to look next."""
 
+import dataclasses
+import threading
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.episode import Episode, view_keys
 from jaxnbv.planning.session import Session
-from jaxnbv.scanning import Evidence, Grid, GridSurface
+from jaxnbv.scanning import Grid, GridSurface
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
@@ -41,7 +43,7 @@ class LiveView:
 
     Switched on in its scene tree: points, cameras, the surface of the posterior's mean coloured by how uncertain it is,
     candidates coloured by value, the next view with the depth that is expected of it; to be switched on: some imagined
-    surfaces.
+    surfaces. A slider goes back to earlier views.
 
     - `port`, `host`: where the page is served, by default for this machine alone.
 
@@ -56,59 +58,67 @@ class LiveView:
         self._server.gui.configure_theme(control_width="medium")
         self._text = self._server.gui.add_markdown("nothing has been seen yet")
         self._legend = self._server.gui.add_html("")
+        self._image: Any = None
+        self._slider: Any = None
         self._drawn: list[Any] = []
+        # A reader may move the slider while the next view comes.
+        self._drawing = threading.RLock()
 
     @property
     def address(self) -> str:
         """Of the page."""
         return f"http://{self._server.get_host()}:{self._server.get_port()}"
 
-    def update(
-        self,
-        episode: Episode,
-        proposal: Proposal | None = None,
-        expected: Float[np.ndarray, "h w"] | None = None,
-        evidence: Evidence | None = None,
-    ) -> None:
-        """Show an episode as it is now.
+    def update(self, shown: Episode | Session) -> None:
+        """Show an episode as it is now, or a session and where it asks for the next image."""
+        count = len(shown.views)
+        with self._drawing:
+            if self._slider is not None:
+                self._slider.remove()
+                self._slider = None
+            if count > 1:
+                self._slider = self._server.gui.add_slider("after view", 1, count, 1, count)
+                self._slider.on_update(lambda event: self._show(shown, event.target.value))
+            self._show(shown, count)
 
-        - `proposal`: for the view after its last; `expected`: the depth image expected there.
-        - `evidence`: after its last view, where that is at hand; made again from the scans otherwise.
-        """
-        views, planner, imagination = episode.views, episode.planner, episode.planner.imagination
-        evidence = episode.evidence_after(len(views)) if evidence is None else evidence
-        key, *_ = view_keys(episode.key, len(views))
-        posterior = imagination.posterior(evidence)
-        samples = imagination.sample(evidence, key, posterior)
-        surface = as_shown(mean_surface(imagination, evidence, posterior, samples), evidence.cloud)
+    def _show(self, shown: Episode | Session, count: int) -> None:
+        """What was known after so many views, and the next view: of a session's last, where it asks for one."""
+        episode, evidence, proposal, expected = shown, None, None, None
+        if isinstance(shown, Session):
+            episode = shown.episode
+            if count == len(episode.views):
+                evidence, asked = shown.evidence, shown.next_view
+                proposal, expected = (None, None) if asked is None else (asked.proposal, asked.expected_depth)
+        if count < len(episode.views):
+            proposal = episode.views[count].proposal
+        views, planner, imagination = episode.views[:count], episode.planner, episode.planner.imagination
         new, _ = views[-1].scan.to_numpy()
-        before = views[-2].cloud.to_numpy()[0] if len(views) > 1 else new[:0]
-        items = seen_items(before, new, [view.pose for view in views], views[-1].camera)
-        picture = None if expected is None else _depth_picture(expected)
-        shapes = [""] * _SAMPLES
-        if isinstance(posterior, KnownShapesPosterior):
-            shapes = [f" {name}" for name in posterior.names_of_samples(key, imagination.num_samples)]
-        scene = self._server.scene
-        with self._server.atomic():
-            for handle in self._drawn:
-                handle.remove()
-            self._drawn = [*_drawn(scene, items, surface), *_imagined(scene, samples, imagination.grid, shapes)]
-            if proposal is not None:
-                self._drawn += _choice(scene, planner.camera, proposal, picture)
-            if picture is not None:
-                self._drawn.append(self._server.gui.add_image(picture, label="depth expected there"))
-            self._text.content = _told(episode, posterior, proposal)
-            self._legend.content = _legend(surface, proposal, planner.quantity)
-
-    def follow(self, session: Session) -> None:
-        """Show a session from now on, with every image and proposal."""
-
-        def show(session: Session) -> None:
-            asked = session.next_view
-            proposal, expected = (None, None) if asked is None else (asked.proposal, asked.expected_depth)
-            self.update(session.episode, proposal, expected, session.evidence)
-
-        session.follow(show)
+        before = views[-2].cloud.to_numpy()[0] if count > 1 else new[:0]
+        scene, picture = self._server.scene, None if expected is None else _depth_picture(expected)
+        with self._drawing:
+            # What was seen is there at once.
+            with self._server.atomic():
+                for handle in self._drawn:
+                    handle.remove()
+                self._drawn = _drawn(scene, seen_items(before, new, [view.pose for view in views], views[-1].camera))
+            evidence = episode.evidence_after(count) if evidence is None else evidence
+            key, *_ = view_keys(episode.key, count)
+            posterior = imagination.posterior(evidence)
+            samples = imagination.sample(evidence, key, posterior)
+            surface = as_shown(mean_surface(imagination, evidence, posterior, samples), evidence.cloud)
+            shapes = [""] * _SAMPLES
+            if isinstance(posterior, KnownShapesPosterior):
+                shapes = [f" {name}" for name in posterior.names_of_samples(key, imagination.num_samples)]
+            with self._server.atomic():
+                self._drawn += [*_surface(scene, surface), *_imagined(scene, samples, imagination.grid, shapes)]
+                if proposal is not None:
+                    self._drawn += _choice(scene, planner.camera, proposal, picture)
+                if self._image is not None:
+                    self._image.remove()
+                label = "depth expected there"
+                self._image = None if picture is None else self._server.gui.add_image(picture, label=label)
+                self._text.content = _told(dataclasses.replace(episode, views=views), posterior, proposal)
+                self._legend.content = _legend(surface, proposal, planner.quantity)
 
     def save(self, path: str | Path) -> Path:
         """Write the scene as it is now as one HTML file, which opens offline."""
@@ -135,7 +145,7 @@ def _told(episode: Episode, posterior: SurfacePosterior, proposal: Proposal | No
     return "\n\n".join(lines)
 
 
-def _drawn(scene: Any, items: Iterable[Points | Cameras], surface: MeanSurface | None) -> list[Any]:
+def _drawn(scene: Any, items: Iterable[Points | Cameras]) -> list[Any]:
     found = []
     for item in items:
         if isinstance(item, Cameras):
@@ -146,11 +156,15 @@ def _drawn(scene: Any, items: Iterable[Points | Cameras], surface: MeanSurface |
         elif len(item.places):
             settings: dict[str, Any] = {"point_size": _POINT, "point_shape": "circle"}
             found.append(scene.add_point_cloud(f"/{item.name}", item.places, to_rgb(item.colour), **settings))
-    if surface is not None:
-        colours = DEVIATION(LogNorm(*middle_range(surface.deviation))(surface.deviation), bytes=True)
-        mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=colours, process=False)
-        found.append(scene.add_mesh_trimesh("/surface of the mean", mesh))
     return found
+
+
+def _surface(scene: Any, surface: MeanSurface | None) -> list[Any]:
+    if surface is None:
+        return []
+    colours = DEVIATION(LogNorm(*middle_range(surface.deviation))(surface.deviation), bytes=True)
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=colours, process=False)
+    return [scene.add_mesh_trimesh("/surface of the mean", mesh)]
 
 
 def _imagined(scene: Any, samples: GridSurface, grid: Grid, shapes: Sequence[str]) -> list[Any]:

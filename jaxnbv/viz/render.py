@@ -42,23 +42,27 @@ def beside(pose: Pose) -> Float[np.ndarray, "3"]:
 
 
 class Still:
-    """A perspective picture from one place, `size` pixels a side, in which all cameras of the scene have room."""
+    """A perspective picture of a surface from one place, `size` pixels a side, in which all cameras of the scene have
+    room: coloured by its standard deviation, or plain without a range of it, lit from beside the eye, darker in
+    hollows, clear where there is no surface.
+    """
 
-    def __init__(self, eye: Float[np.ndarray, "3"], surface: MeanSurface | None, size: int, extent: float):
+    def __init__(
+        self,
+        eye: Float[np.ndarray, "3"],
+        surface: MeanSurface | None,
+        size: int,
+        extent: float,
+        deviation: LogNorm | None = None,
+    ):
         self.size = size
         self.camera = Camera(2.0 * math.atan(1.08 * extent / _DISTANCE), size, size)
         self.pose = look_at(_DISTANCE * eye / np.linalg.norm(eye))
-        self.image = np.zeros((size, size, 4))
-        self.depth = np.full((size, size), np.inf)
-        self._surface = surface
+        self.image, self.depth = np.zeros((size, size, 4)), np.full((size, size), np.inf)
+        if surface is not None:
+            self._paint(surface, deviation)
 
-    def paint(self, deviation: LogNorm | None) -> None:
-        """Trace the surface, coloured by its standard deviation, lit from beside the eye and darker in hollows; four
-        rays a pixel. Without a range of deviations it is plain.
-        """
-        surface = self._surface
-        if surface is None:
-            return
+    def _paint(self, surface: MeanSurface, deviation: LogNorm | None) -> None:
         mesh = TriangleMesh(surface.vertices.astype(np.float64), surface.faces.astype(np.int64), Frame())
         # Not by the camera's compiled rays: of millions of pixels, XLA takes seconds over the constants.
         directions = np.asarray(self.fine_camera.pixel_directions()) @ np.asarray(self.pose.rotation).T
@@ -118,9 +122,8 @@ def _occlusion(mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, " hits"])
 
 def painted(data: ReportData, index: int) -> Still:
     """The surface after view `index` (from 0), from where all views of an episode are drawn."""
-    still = Still(data.stage.eye, data.views[index].surface, _STILL, data.stage.extent)
-    still.paint(LogNorm(*data.deviations))
-    return still
+    stage, norm = data.stage, LogNorm(*data.deviations)
+    return Still(stage.eye, data.views[index].surface, _STILL, stage.extent, norm)
 
 
 def draw_scene(

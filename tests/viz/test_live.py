@@ -71,6 +71,7 @@ def test_it_says_what_is_asked_and_what_the_colours_mean(watched):
     _, session, page = watched
     assert "2 views" in page._text.content
     assert "expected coverage gain" in page._text.content
+    assert page._image is not None
     values = np.asarray(session.next().proposal.values)
     for words in ("next view", "the surface is known to", f"{values[np.isfinite(values)].max():.3g}"[:3]):
         assert words in page._legend.content

@@ -68,9 +68,7 @@ def still_of(
     fine = trimesh.Trimesh(vertices, faces)
     values = np.ones(len(fine.vertices)) if value is None else np.maximum(value(fine.vertices), 1e-6)
     surface = MeanSurface(np.asarray(fine.vertices), np.asarray(fine.faces), np.asarray(fine.vertex_normals), values)
-    still = Still(eye, surface, size, _REACH)
-    still.paint(norm)
-    return still
+    return Still(eye, surface, size, _REACH, norm)
 
 
 def draw_on(
