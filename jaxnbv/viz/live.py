@@ -20,7 +20,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.episode import Episode, view_keys
 from jaxnbv.planning.session import Session
-from jaxnbv.scanning import Grid, GridSurface
+from jaxnbv.scanning import Evidence, Grid, GridSurface
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
@@ -71,29 +71,36 @@ class LiveView:
 
     def update(self, shown: Episode | Session) -> None:
         """Show an episode as it is now, or a session and where it asks for the next image."""
-        count = len(shown.views)
+        episode = shown.episode if isinstance(shown, Session) else shown
+        asked, evidence = (shown.next_view, shown.evidence) if isinstance(shown, Session) else (None, None)
+        proposal, expected = (None, None) if asked is None else (asked.proposal, asked.expected_depth)
+        views = episode.views
+
+        def show(count: int) -> None:
+            if count == len(views):
+                self._show(episode, proposal, expected, evidence)
+            else:
+                self._show(dataclasses.replace(episode, views=views[:count]), views[count].proposal)
+
         with self._drawing:
             if self._slider is not None:
                 self._slider.remove()
                 self._slider = None
-            if count > 1:
-                self._slider = self._server.gui.add_slider("after view", 1, count, 1, count)
-                self._slider.on_update(lambda event: self._show(shown, event.target.value))
-            self._show(shown, count)
+            if len(views) > 1:
+                self._slider = self._server.gui.add_slider("after view", 1, len(views), 1, len(views))
+                self._slider.on_update(lambda event: show(event.target.value))
+            show(len(views))
 
-    def _show(self, shown: Episode | Session, count: int) -> None:
-        """What was known after so many views, and the next view: of a session's last, where it asks for one."""
-        episode, evidence, proposal, expected = shown, None, None, None
-        if isinstance(shown, Session):
-            episode = shown.episode
-            if count == len(episode.views):
-                evidence, asked = shown.evidence, shown.next_view
-                proposal, expected = (None, None) if asked is None else (asked.proposal, asked.expected_depth)
-        if count < len(episode.views):
-            proposal = episode.views[count].proposal
-        views, planner, imagination = episode.views[:count], episode.planner, episode.planner.imagination
+    def _show(
+        self,
+        episode: Episode,
+        proposal: Proposal | None,
+        expected: Float[np.ndarray, "h w"] | None = None,
+        evidence: Evidence | None = None,
+    ) -> None:
+        views, planner, imagination = episode.views, episode.planner, episode.planner.imagination
         new, _ = views[-1].scan.to_numpy()
-        before = views[-2].cloud.to_numpy()[0] if count > 1 else new[:0]
+        before = views[-2].cloud.to_numpy()[0] if len(views) > 1 else new[:0]
         scene, picture = self._server.scene, None if expected is None else _depth_picture(expected)
         with self._drawing:
             # What was seen is there at once.
@@ -101,8 +108,8 @@ class LiveView:
                 for handle in self._drawn:
                     handle.remove()
                 self._drawn = _drawn(scene, seen_items(before, new, [view.pose for view in views], views[-1].camera))
-            evidence = episode.evidence_after(count) if evidence is None else evidence
-            key, *_ = view_keys(episode.key, count)
+            evidence = episode.evidence_after(len(views)) if evidence is None else evidence
+            key, *_ = view_keys(episode.key, len(views))
             posterior = imagination.posterior(evidence)
             samples = imagination.sample(evidence, key, posterior)
             surface = as_shown(mean_surface(imagination, evidence, posterior, samples), evidence.cloud)
@@ -117,7 +124,7 @@ class LiveView:
                     self._image.remove()
                 label = "depth expected there"
                 self._image = None if picture is None else self._server.gui.add_image(picture, label=label)
-                self._text.content = _told(dataclasses.replace(episode, views=views), posterior, proposal)
+                self._text.content = _told(episode, posterior, proposal)
                 self._legend.content = _legend(surface, proposal, planner.quantity)
 
     def save(self, path: str | Path) -> Path:
