@@ -11,12 +11,22 @@ from jaxnbv.cli.registry import TASKS
 from jaxnbv.errors import InputError
 
 
-@options.with_options(task="cross-entropy", search="halving")
 def demo(
-    asked: options.Asked,
+    task: options.TaskOption = "cross-entropy",
+    views: options.ViewsOption = 5,
+    until: options.UntilOption = None,
     scene: Annotated[
         int, options.asking(metavar="N", min=0, max=2**31 - 1, help="Which object: the number of a scene.")
     ] = 0,
+    first: options.FirstOption = None,
+    noise: options.NoiseOption = 0.01,
+    model: options.ModelOption = "screened",
+    known: options.KnownOption = None,
+    search: options.SearchOption = "halving",
+    seed: options.SeedOption = 0,
+    out: options.OutOption = None,
+    quick: options.QuickOption = False,
+    report: options.ReportOption = True,
 ) -> None:
     """Find out what a truck carries, which the first view does not show: no file, no network.
 
@@ -27,19 +37,21 @@ def demo(
     from jaxnbv.cli.play import DEMO, first_pose, play
     from jaxnbv.cli.tasks import COMMAND_TASKS
 
-    made = COMMAND_TASKS[asked.task]
-    shown = made.demo(scene, asked.seed)
-    if asked.first is not None:
-        shown = shown._replace(first=first_pose(asked.first, shown.surface))
+    made = COMMAND_TASKS[task]
+    shown = made.demo(scene, seed)
+    if first is not None:
+        shown = shown._replace(first=first_pose(first, shown.surface))
+    asked = options.Asked(task, views, until, first, noise, model, known, search, seed, out, quick, report)
     play(asked, shown, made.setting, DEMO)
 
 
-@options.with_options()
 def run(
-    asked: options.Asked,
     mesh: Annotated[
         Path, typer.Argument(metavar="MESH", help="Any mesh that trimesh reads: OBJ, PLY, STL, OFF, glTF, ...")
     ],
+    task: options.TaskOption = "coverage",
+    views: options.ViewsOption = 5,
+    until: options.UntilOption = None,
     network: Annotated[
         Path | None,
         options.asking(
@@ -62,33 +74,43 @@ def run(
             show_default="the middle of the first view",
         ),
     ] = None,
+    first: options.FirstOption = None,
     paper: Annotated[
         bool, options.seeing("--paper", help="The paper's close-up: 30 degrees from 2.5 (parts: 2, heat: 3).")
     ] = False,
+    noise: options.NoiseOption = 0.01,
+    model: options.ModelOption = "screened",
+    known: options.KnownOption = None,
+    search: options.SearchOption = "discrete",
+    seed: options.SeedOption = 0,
+    out: options.OutOption = None,
+    quick: options.QuickOption = False,
+    report: options.ReportOption = True,
 ) -> None:
     """Choose views of a mesh, scanned by a simulated depth camera.
 
     The mesh may be open, a soup of triangles or inconsistently wound. It is scaled and centred so that its longest side
     is 2.5 scene units; cameras stand as far from its centre as it takes to see all of it.
     """
-    task, given = TASKS[asked.task], {"network": network, "category": category, "source": source}
+    of_task, given = TASKS[task], {"network": network, "category": category, "source": source}
     for option, value in given.items():
-        if value is not None and option not in task.requires + task.options:
+        if value is not None and option not in of_task.requires + of_task.options:
             takers = ", ".join(name for name, entry in TASKS.items() if option in entry.requires + entry.options)
-            raise InputError(f"--task {asked.task} takes no --{option}: it is for {takers}")
-        if value is None and option in task.requires:
-            raise InputError(f"--task {asked.task} needs --{option}")
+            raise InputError(f"--task {task} takes no --{option}: it is for {takers}")
+        if value is None and option in of_task.requires:
+            raise InputError(f"--task {task} needs --{option}")
 
     from jaxnbv.cli.play import USUAL, first_pose, play
     from jaxnbv.cli.tasks import COMMAND_TASKS, Given, Shown, usual_first
     from jaxnbv.scanning import load_mesh
     from jaxnbv.scanning.sensors import fitted
 
-    surface, made = load_mesh(mesh), COMMAND_TASKS[asked.task]
+    surface, made = load_mesh(mesh), COMMAND_TASKS[task]
     setting = made.setting if paper else fitted(made.setting, surface.bounding_radius)
     usual = usual_first(None if paper else setting.radius)
-    start = usual if asked.first is None else first_pose(asked.first, surface)
+    start = usual if first is None else first_pose(first, surface)
     acquisition = made.acquisition(Given(surface, setting.camera, start, network, category, source))
+    asked = options.Asked(task, views, until, first, noise, model, known, search, seed, out, quick, report)
     play(asked, Shown(mesh.stem, surface, acquisition, start), setting, USUAL)
 
 
