@@ -67,7 +67,7 @@ def start(name: str, out: Path, inputs: Path) -> list[subprocess.Popen]:
         command = [sys.executable, __file__, "--session", str(out)]
     else:
         out.mkdir(parents=True, exist_ok=True)
-        command = [sys.executable, "-m", "jaxnbv.cli", *words, "--out", str(out)]
+        command = [sys.executable, "-m", "jaxnbv", *words, "--out", str(out)]
     return [
         subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
         for _ in range(2 if name == "two runs in one folder" else 1)

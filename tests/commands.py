@@ -13,7 +13,7 @@ TERMINAL = {"COLUMNS": "200", "NO_COLOR": "1"}
 
 
 def run_process(*arguments: str, cwd) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "jaxnbv.cli", *arguments]
+    command = [sys.executable, "-m", "jaxnbv", *arguments]
     environment = {**os.environ, **TERMINAL}
     return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=600)
 

@@ -113,6 +113,7 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
         (("demo", "--task", "coverage", "--out", "occupied"), ("occupied", "other files")),
         (("run", "ball.obj", "--task", "parts"), ("--category",)),
         (("run", "ball.obj", "--task", "parts", "--category", "teapot"), ("teapot", "mug")),
+        (("run", "ball.obj", "--task", "parts", "--category", "knife"), ("knife", "--network")),
         (("run", "ball.obj", "--task", "heat", "--search", "gradient-2dof"), ("ColdestPoint", "DiscreteSearch")),
         (("run", "ball.obj", "--source", "1", "0", "0"), ("--source", "heat")),
         (("run", "ball.obj", "--task", "cross-entropy"), ("cross-entropy", "--network")),

@@ -74,6 +74,9 @@ def run(
             show_default="the middle of the first view",
         ),
     ] = None,
+    up: Annotated[
+        str, options.seeing(metavar="AXIS", help="The mesh's axis that is upward: x, y or z, or one of these with a -.")
+    ] = "y",
     first: options.FirstOption = None,
     paper: Annotated[
         bool, options.seeing("--paper", help="The paper's close-up: 30 degrees from 2.5 (parts: 2, heat: 3).")
@@ -105,7 +108,7 @@ def run(
     from jaxnbv.scanning import load_mesh
     from jaxnbv.scanning.sensors import fitted
 
-    surface, made = load_mesh(mesh), COMMAND_TASKS[task]
+    surface, made = load_mesh(mesh, up), COMMAND_TASKS[task]
     setting = made.setting if paper else fitted(made.setting, surface.bounding_radius)
     usual = usual_first(None if paper else setting.radius)
     start = usual if first is None else first_pose(first, surface)

@@ -48,6 +48,8 @@ from jaxnbv.tasks import (
 
 # Points of a cloud that the demo's classifier is fed.
 _FED = 512
+# Categories that none of the objects have that the shipped segmenter was trained on.
+_UNKNOWN_TO_SEGMENTER = ("cap", "car", "knife")
 
 
 class Given(NamedTuple):
@@ -122,6 +124,10 @@ def _class_task(of: Callable[[Classifier], Acquisition]) -> CommandTask:
 def _of_parts(given: Given) -> Acquisition:
     assert given.category is not None
     if given.network is None:
+        require(
+            given.category not in _UNKNOWN_TO_SEGMENTER,
+            f"--category {given.category}: the segmenter that ships was not trained on it: give --network FILE",
+        )
         return _counting(part_segmenter(given.category))
     network = load_checkpoint(given.network)
     return _counting(CloudSegmenter(network, given.category, scale=network_scale(network)))

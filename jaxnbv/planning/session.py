@@ -113,6 +113,12 @@ class Session:
                 image = self._folder.read("image", index)
                 self._take(*self._looked(image["depth"], image["matrix"], float(image["depth_scale"])))
 
+    def __repr__(self) -> str:
+        images = f"{self.views} image{'s' * (self.views != 1)}"
+        kept = f", {int(self.evidence.cloud.count):,} points" if self.views else ""
+        asked = ", the next view proposed" if self.next_view else ""
+        return f"Session({self.planner.quantity.name}: {images}{kept}{asked})"
+
     @property
     def views(self) -> int:
         """How many images there are so far."""

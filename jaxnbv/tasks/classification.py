@@ -203,8 +203,8 @@ class Sure(Stop):
             least = min(least, float(half.values[best]))
         if least < self.probability:
             return None
-        halves = f", {least:.2f} at least given a half of the points" if self.num_resamplings else ""
-        return f"sure of {answer.names[best]}: {float(answer.values[best]):.2f}{halves}"
+        halves = f", and at least {100 * least:.0f} % given half of the points" if self.num_resamplings else ""
+        return f"sure of {answer.names[best]} ({100 * float(answer.values[best]):.0f} %{halves})"
 
 
 def _of_classes(acquisition: Acquisition) -> ClassAcquisition:

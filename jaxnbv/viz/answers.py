@@ -253,7 +253,7 @@ def number(value: float) -> str:
 
 
 def may_be_words(kinds: Sequence[tuple[str, float]]) -> str:
-    """What the known shapes say that the object may be, the likeliest first."""
-    shown = [f"{name} {weight:.2f}" for name, weight in kinds[:_KINDS_SAID]]
+    """What the known shapes say that the object may be, of which the surfaces are imagined; the likeliest first."""
+    shown = [f"{name} {100 * weight:.0f} %" for name, weight in kinds[:_KINDS_SAID]]
     rest = sum(weight for _, weight in kinds[_KINDS_SAID:])
-    return f"By the shapes that fit, it may be: {', '.join(shown)}{f', others {rest:.2f}' if rest else ''}."
+    return f"Imagined, as known shapes fit: {', '.join(shown)}{f', others {100 * rest:.0f} %' if rest else ''}."

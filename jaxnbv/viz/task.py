@@ -153,16 +153,15 @@ def search_name(episode: Episode) -> str:
 
 
 def race_words(rival: Episode, episode: Episode) -> str:
-    """How many views another search took, from the same first view; of an acquisition that answers, whether it ended by
-    the rule that ended the episode, what was found, and since when its answers can be relied on."""
+    """How many views another search took, from the same first view, or that they were not enough for the rule that
+    ended the episode; of an acquisition that answers, what was found."""
     name, count = search_name(rival).capitalize(), len(rival.views)
     answers = _answers(episode.planner.acquisition, rival.views)
-    needed = "needed" if rival.stopped else "did not end by that rule in" if episode.stopped else "took"
-    text = f"{name} {needed} {count} view{'s' * (count > 1)} from the same start"
-    if not answers:
-        return f"{text}."
-    first = None if rival.stopped else since(answers)
-    return f"{text} ({words_of(answers[-1]).found}{f'; sure from view {first} on' if first else ''})."
+    views = f"{count} view{'s' * (count > 1)}"
+    text = f"{name} {'needed' if rival.stopped else 'took'} {views} from the same start"
+    if episode.stopped and not rival.stopped:
+        text = f"{name} was not done after {views} from the same start"
+    return f"{text} ({words_of(answers[-1]).found})." if answers else f"{text}."
 
 
 def _asked(planner: Planner) -> str:

@@ -64,7 +64,7 @@ def test_sure_asks_all_of_the_cloud_and_halves_of_it(score, enough, resamplings,
     reason = Sure(0.95, resamplings).after(after(planner, cloud_of(200)))
     assert (reason is not None) == stops
     if stops:
-        assert reason.startswith("sure of class 0: 0.99")
+        assert reason.startswith("sure of class 0 (99 %")
 
 
 def test_sure_wants_the_same_class_of_every_half():

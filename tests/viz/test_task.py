@@ -190,9 +190,7 @@ def test_a_rival_is_told_of_and_drawn(plain):
     found = f"{NAMES[int(np.argmax(p))]}, probability {p.max():.2f}"
     assert rival.words == f"Farthest view took 3 views from the same start ({found})."
     ended = dataclasses.replace(episode, stopped="sure of it")
-    assert (
-        race_words(other, ended) == f"Farthest view did not end by that rule in 3 views from the same start ({found})."
-    )
+    assert race_words(other, ended) == f"Farthest view was not done after 3 views from the same start ({found})."
     assert race_words(dataclasses.replace(other, stopped="sure of it"), ended).startswith(
         "Farthest view needed 3 views"
     )

@@ -1,4 +1,4 @@
-"""`python -m jaxnbv.cli`."""
+"""`python -m jaxnbv`."""
 
 from jaxnbv.cli import main
 
