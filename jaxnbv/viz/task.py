@@ -138,13 +138,20 @@ def true_cloud(scene: Surface, count: int) -> PointCloud | None:
 
 def since(answers: Sequence[Answer]) -> int | None:
     """The first view (from 1) from which on all answers can be relied on; None if not even the last can."""
-    first = None
-    for view, (answer, before) in enumerate(zip(answers, [None, *answers], strict=False), start=1):
-        if not words_of(answer).settled(before):
-            first = None
-        elif first is None:
-            first = view
-    return first
+    relied = _relied(answers)
+    return None if not relied[-1] else len(relied) - int(np.argmin([*relied[::-1], False]) - 1)
+
+
+def lost_again(answers: Sequence[Answer]) -> int | None:
+    """The first view (from 1) whose answer could be relied on, if one after it could not; None otherwise."""
+    relied = _relied(answers)
+    first = int(np.argmax(relied))
+    return first + 1 if relied[first] and not all(relied[first:]) else None
+
+
+def _relied(answers: Sequence[Answer]) -> list[bool]:
+    befores = [None, *answers[:-1]]
+    return [words_of(answer).settled(before) for answer, before in zip(answers, befores, strict=True)]
 
 
 def search_name(episode: Episode) -> str:
@@ -172,7 +179,8 @@ def _asked(planner: Planner) -> str:
 
 
 def _sure(answers: Sequence[Answer], stopped: str | None) -> str:
-    first, count = since(answers), len(answers)
+    first, count, lost = since(answers), len(answers), lost_again(answers)
     text = f"From view {first} on" if first else f"Not yet after {count} view{'s' * (count > 1)}"
+    again = f" At view {lost} it was sure already, but then not." if lost else ""
     ended = "" if stopped is None else f" It ended by its rule: {stopped}."
-    return f"{text}. Sure means {words_of(answers[-1]).settled_means}.{ended}"
+    return f"{text}.{again} Sure means {words_of(answers[-1]).settled_means}.{ended}"

@@ -22,7 +22,7 @@ from jaxnbv.viz.answers import number, words_of
 from jaxnbv.viz.charts import task_charts
 from jaxnbv.viz.data import report_data
 from jaxnbv.viz.report import report_html
-from jaxnbv.viz.task import race_words, since, true_cloud
+from jaxnbv.viz.task import lost_again, race_words, since, true_cloud
 
 NAMES = ("left", "right", "up")
 
@@ -178,6 +178,13 @@ def classes(*rows):
 )
 def test_since_when_an_answer_can_be_relied_on(answers, view):
     assert since(answers) == view
+
+
+@pytest.mark.parametrize(
+    ("answers", "view"), [(classes(0.5, 0.96, 0.97), None), (classes(0.96, 0.9, 0.97), 1), (classes(0.5, 0.6), None)]
+)
+def test_an_answer_that_was_lost_again_is_told(answers, view):
+    assert lost_again(answers) == view
 
 
 def test_a_rival_is_told_of_and_drawn(plain):
