@@ -24,6 +24,8 @@ def knowing_those(imagination: Imagination, wanted: Callable[[str], bool]) -> Im
     if not isinstance(model, KnownShapes):
         return imagination
     rows = [row for row, name in enumerate(model.bank.names) if wanted(name)]
+    if len(rows) == len(model.bank):
+        return imagination
     return dataclasses.replace(imagination, model=dataclasses.replace(model, bank=model.bank.chosen(rows)))
 
 
