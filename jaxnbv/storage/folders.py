@@ -57,7 +57,8 @@ def read_json(file: Path, problem: str, remedy: str) -> dict[str, Any]:
     try:
         content = json.loads(file.read_bytes())
     except (ValueError, OSError, RecursionError) as error:
-        raise InputError(f"{file} {problem} ({error}): {remedy}") from error
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{file} {problem} ({reason}): {remedy}") from error
     require(isinstance(content, dict), f"{file} {problem} (it holds a {type(content).__name__}): {remedy}")
     return content
 

@@ -87,7 +87,7 @@ def test_meshes_in_place_of_procedural_objects(tmp_path):
     with pytest.raises(InputError, match="no scene 2: the study has 2 meshes"):
         study.run_scene(2)
     with pytest.raises(InputError, match="2 meshes of cargo and 0 of trucks: give both, or none"):
-        small(TruckStudy, meshes=class_meshes(tmp_path, HOUSEHOLD))
+        small_study(kind=TruckStudy, meshes=class_meshes(tmp_path, HOUSEHOLD))
 
 
 def test_a_network_of_ones_own_takes_the_place_of_the_shipped_one(tmp_path):
