@@ -153,7 +153,9 @@ class Imagination(eqx.Module):
 
         **Raises:** `ValueError` for evidence of another grid.
         """
-        return _observe(self.carving, self.surroundings, self.known(evidence), pose, scan, camera)
+        known = self.known(evidence)
+        known = dataclasses.replace(known, cloud=_joined(known.cloud, scan))
+        return _record(self.carving, self.surroundings, known, pose, scan, camera)
 
     def record(self, evidence: Evidence, pose: Pose, scan: PointCloud, camera: Camera) -> Evidence:
         """The evidence after a view whose points it holds already.
@@ -302,16 +304,8 @@ class Imagination(eqx.Module):
 
 
 @eqx.filter_jit
-def _observe(
-    carving: Carving | None,
-    surroundings: Surroundings | None,
-    evidence: Evidence,
-    pose: Pose,
-    scan: PointCloud,
-    camera: Camera,
-) -> Evidence:
-    cloud = limit_capacity(concatenate(evidence.cloud, scan), evidence.cloud.capacity)
-    return _record(carving, surroundings, dataclasses.replace(evidence, cloud=cloud), pose, scan, camera)
+def _joined(cloud: PointCloud, scan: PointCloud) -> PointCloud:
+    return limit_capacity(concatenate(cloud, scan), cloud.capacity)
 
 
 @eqx.filter_jit

@@ -8,7 +8,7 @@ import jax
 import matplotlib as mpl
 import numpy as np
 from draw_concepts import save
-from draw_demo import demo_episode
+from draw_demo import SEED, demo_episode
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from tqdm import tqdm
@@ -27,8 +27,6 @@ from jaxnbv.viz.render import draw_scene, painted
 from jaxnbv.viz.style import GREY
 
 VIEWS, RAYS, CANDIDATES = 4, 48, 60
-# Of the demo that the hero shows.
-SEED = 5
 FIRST = nbv.look_at((0.8, 0.9, 2.2))
 
 
@@ -83,7 +81,7 @@ def draw_hero(figure: Figure) -> None:
         ("a truck: what does it carry?", "pale is known, dark is guessed"),
         ("what may be there", "four guesses; blue: not seen yet"),
         ("what each view is worth", "purple: may change the answer"),
-        ("the next view, and the answer", data.task.found),
+        ("the next view, and the answer", data.task.found.partition(". ")[0]),
     )
     widths = (3.0, 2.6, 2.6, 3.0)
     total, left = sum(widths), 0.0

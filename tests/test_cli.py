@@ -19,7 +19,7 @@ def finished(tmp_path_factory):
 
 def test_demo_leaves_an_episode_and_a_report(finished):
     folder, result = finished
-    out = folder / "runs" / "truck-cross-entropy-halving-seed0"
+    out = folder / "runs" / "truck-cross-entropy-halving-seed2"
     names = {path.name for path in out.iterdir()}
     assert {"episode.json", "view_00.npz", "view_01.npz", "cloud.ply", "report.html"} <= names
     assert "view 2" in result.stdout
@@ -36,7 +36,7 @@ def test_demo_leaves_an_episode_and_a_report(finished):
 @pytest.mark.slow
 def test_the_same_command_continues_with_more_views(finished):
     folder, _ = finished
-    out = folder / "runs" / "truck-cross-entropy-halving-seed0"
+    out = folder / "runs" / "truck-cross-entropy-halving-seed2"
     before = {path.name: path.read_bytes() for path in out.glob("view_*.npz")}
     asked = ("--quick", "--known", "none", "--views", "3", "--until", "never", "--no-report")
     result = run_command("demo", *asked, cwd=folder)

@@ -23,7 +23,7 @@ def demo(
     model: options.ModelOption = "screened",
     known: options.KnownOption = None,
     search: options.SearchOption = "halving",
-    seed: options.SeedOption = 0,
+    seed: options.SeedOption = 2,
     out: options.OutOption = None,
     quick: options.QuickOption = False,
     report: options.ReportOption = True,

@@ -155,21 +155,19 @@ def play(asked: Asked, shown: Shown, setting: Setting, sizes: Sizes) -> None:
     lines = Lines(planner)
     sketches = viz.Sketches(Episode(planner, shown.surface, noise, shown.first, key, ())) if asked.report else None
     race: Future[Episode] | None = None
-    jobs: list[Future[None]] = []
+    drawn: list[Future[None]] = []
 
     def tell(step: Step) -> None:
         nonlocal race
         lines(step.view)
-        if asked.views > 1 and not jobs:
-            jobs.append(beside.submit(planner.compile, step.evidence))
         if sketches is not None:
-            jobs.append(beside.submit(sketches.add, step))
+            drawn.append(beside.submit(sketches.add, step))
         # Not before the first view: both would compile what that needs.
         if race is None and races:
             of_rival = (shown.surface, shown.first, _RACE_VIEWS, key, noise, folder / "farthest")
             race = beside.submit(simulate, rival, *of_rival, progress=False, until=enough)
 
-    # While the next view is planned, its search is compiled, the last one is drawn and the rival runs.
+    # While the next view is planned, the last one is drawn and the rival runs.
     with ThreadPoolExecutor(1) as beside:
         try:
             of_planner = (shown.surface, shown.first, asked.views, key, noise, folder)
@@ -178,8 +176,8 @@ def play(asked: Asked, shown: Shown, setting: Setting, sizes: Sizes) -> None:
             beside.shutdown(wait=False, cancel_futures=True)
             raise
     raced = None if race is None else race.result()
-    for job in jobs:
-        job.result()
+    for one in drawn:
+        one.result()
     if episode.stopped is not None:
         views, saved = len(episode.views), asked.views - len(episode.views)
         typer.echo(f"enough   after view {views}: {episode.stopped}. Views saved: {saved} of {asked.views}")

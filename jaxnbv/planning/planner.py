@@ -115,14 +115,6 @@ class Planner(eqx.Module):
             proposal = _propose(self.search, self._problem(evidence, surfaces), key)
         return _checked_proposal(proposal, surfaces)
 
-    def compile(self, evidence: Evidence) -> None:
-        """Compile `choose` for evidence of these shapes and run nothing: in a thread, while surfaces are sampled."""
-        surfaces, grid, count = None, self.imagination.grid, self.imagination.num_samples
-        if self.search.uses_samples:
-            nodes, cells = (count, *3 * [grid.resolution]), (count, *3 * [grid.resolution - 1])
-            surfaces = GridSurface(jnp.zeros(nodes), jnp.zeros(cells, jnp.int8), grid)
-        _propose.lower(self.search, self._problem(evidence, surfaces), jax.random.key(0)).compile()  # type: ignore[attr-defined]
-
     def observe(
         self, evidence: Evidence | PointCloud, pose: Pose, scan: PointCloud, camera: Camera | None = None
     ) -> Evidence:
