@@ -1,5 +1,6 @@
 """`jaxnbv demo` and `jaxnbv run MESH`: one episode. `jaxnbv view RUN`: a look at one."""
 
+import dataclasses
 import time
 from pathlib import Path
 from typing import Annotated
@@ -122,16 +123,21 @@ def view(
     html: Annotated[
         Path | None, typer.Option(help="Write the scene into one HTML file, which opens offline, and end.")
     ] = None,
+    known: options.KnownOption = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Where the page is served.")] = 8080,
 ) -> None:
     """Look at a run in the browser: points, cameras, the surface, what is imagined, where to look next.
 
-    Surfaces are those of the usual model, given what was seen.
+    Surfaces are those of the usual model given what was seen, by one who knows shapes with --known.
     """
+    from jaxnbv.cli.play import imagined
     from jaxnbv.planning.episode import Episode
     from jaxnbv.viz import LiveView
 
     episode, page = Episode.load(folder), LiveView(port)
+    if known is not None:
+        planner = dataclasses.replace(episode.planner, imagination=imagined("screened", False, known))
+        episode = dataclasses.replace(episode, planner=planner)
     try:
         page.update(episode)
         if html is not None:

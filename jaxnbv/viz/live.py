@@ -1,6 +1,7 @@
 """A live view in the browser, by viser: what has been seen, what is imagined, and where to look next."""
 
 import dataclasses
+import html
 import threading
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -36,6 +37,7 @@ _SAMPLES = 4
 _NEXT = "#009e73"
 _EYE = (2.6, 1.7, 2.6)
 _POINT, _CANDIDATE, _FRUSTUM = 0.012, 0.05, 0.22
+_ASIDE = "position:fixed;left:0;bottom:0;max-width:22em;padding:0 1em;background:#fffd;color:#1f2733;font:15px sans-serif"
 
 
 class LiveView:
@@ -128,8 +130,10 @@ class LiveView:
                 self._legend.content = _legend(surface, proposal, planner.quantity)
 
     def save(self, path: str | Path) -> Path:
-        """Write the scene as it is now as one HTML file, which opens offline."""
-        write_text(Path(path), self._server.get_scene_serializer().as_html())
+        """Write the scene as it is now, with its text and legend, as one HTML file, which opens offline."""
+        page, end, rest = self._server.get_scene_serializer().as_html().rpartition("</body>")
+        said = "".join(f"<p>{html.escape(line.replace('**', ''))}</p>" for line in self._text.content.split("\n\n"))
+        write_text(Path(path), f'{page}<aside style="{_ASIDE}">{said}{self._legend.content}</aside>{end}{rest}')
         return Path(path)
 
     def stop(self) -> None:

@@ -93,6 +93,8 @@ def test_the_slider_goes_back_to_an_earlier_view(watched):
 def test_one_file_holds_the_scene(watched, tmp_path):
     _, _, page = watched
     path = page.save(tmp_path / "scene.html")
+    for words in ("<p>2 views, ", "the surface is known to"):
+        assert words in path.read_text()
     text = path.read_text()
     assert "<html" in text
     assert not re.findall(r'<(?:script|link|img)[^>]*(?:src|href)="https?:', text)
