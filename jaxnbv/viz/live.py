@@ -37,7 +37,7 @@ _SAMPLES = 4
 _NEXT = "#009e73"
 _EYE = (2.6, 1.7, 2.6)
 _POINT, _CANDIDATE, _FRUSTUM = 0.012, 0.05, 0.22
-_ASIDE = "position:fixed;left:0;bottom:0;max-width:22em;padding:0 1em;background:#fffd;color:#1f2733;font:15px sans-serif"
+_ASIDE = "position:fixed;left:0;bottom:0;max-width:22em;padding:0 1em;background:#fffd;color:#222;font:15px sans-serif"
 
 
 class LiveView:
