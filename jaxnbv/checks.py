@@ -20,6 +20,7 @@ import numpy as np
 from jax import Array
 
 from jaxnbv.errors import InputError as InputError
+from jaxnbv.errors import install
 
 AnyArray = Array | np.ndarray
 _F = TypeVar("_F", bound=Callable[..., Any])
@@ -33,6 +34,18 @@ _NUMBERS = {tuple[float, float]: "two", tuple[float, float, float]: "three"}
 _REAL = (jnp.bool_, jnp.integer, jnp.floating)
 # Of 32 bits. What is larger is infinite there.
 _LARGEST = float(np.finfo(np.float32).max)
+
+
+def check_device() -> None:
+    """**Raises:** `ValueError` if JAX finds no device of the kind that JAX_PLATFORMS asks for."""
+    try:
+        jax.devices()
+    # With a plugin or without, they are of several kinds.
+    except Exception as error:
+        raise InputError(
+            f"JAX_PLATFORMS is {os.environ.get('JAX_PLATFORMS', '')!r}, but JAX finds no such device here: leave it "
+            f"out, or see to the device's driver and {install('cuda')}"
+        ) from error
 
 
 def require(condition: bool | np.bool_, message: str) -> None:

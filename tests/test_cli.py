@@ -139,6 +139,13 @@ def test_bad_input_is_one_line_that_names_the_value_and_the_remedy(arguments, wo
     assert all(word in result.stderr for word in words), result.stderr
 
 
+def test_a_device_that_is_not_there_is_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_PLATFORMS", "rocm")
+    result = run_process("demo", cwd=tmp_path)
+    assert result.returncode == 2
+    assert result.stderr.startswith("error: JAX_PLATFORMS is 'rocm', but JAX finds no such device here")
+
+
 @pytest.mark.slow
 def test_a_published_checkpoint_classifies_a_mesh(tmp_path, shared):
     trimesh.creation.torus(1.0, 0.4).export(tmp_path / "ring.ply")

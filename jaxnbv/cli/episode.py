@@ -35,6 +35,9 @@ def demo(
     procedural one of thirteen categories, with --task heat one of four kinds that is heated at one place, and with
     --task coverage a mug, to be seen all round.
     """
+    from jaxnbv.checks import check_device
+
+    check_device()
     from jaxnbv.cli.play import DEMO, first_pose, play
     from jaxnbv.cli.tasks import COMMAND_TASKS
 
@@ -104,6 +107,9 @@ def run(
         if value is None and option in of_task.requires:
             raise InputError(f"--task {task} needs --{option}")
 
+    from jaxnbv.checks import check_device
+
+    check_device()
     from jaxnbv.cli.play import USUAL, first_pose, play
     from jaxnbv.cli.tasks import COMMAND_TASKS, Given, Shown, usual_first
     from jaxnbv.scanning import load_mesh
@@ -130,6 +136,9 @@ def view(
 
     Surfaces are those of the usual model given what was seen, by one who knows shapes with --known.
     """
+    from jaxnbv.checks import check_device
+
+    check_device()
     from jaxnbv.cli.play import imagined
     from jaxnbv.planning.episode import Episode
     from jaxnbv.viz import LiveView

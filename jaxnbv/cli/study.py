@@ -104,6 +104,9 @@ def study(
     ] = 1,
 ) -> None:
     asked = dict(locals())
+    from jaxnbv.checks import check_device
+
+    check_device()
     from jaxnbv.cli.run_study import run_study
 
     run_study(**asked)
