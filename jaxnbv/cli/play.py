@@ -146,7 +146,6 @@ def play(asked: Asked, shown: Shown, setting: Setting, sizes: Sizes) -> None:
     usual = "none" if asked.model == "paper" else shown.bank
     imagination = dataclasses.replace(imagined(asked.model, asked.quick, asked.known or usual), grid=shown.grid)
     planner = planner_of(setting, shown.acquisition, asked.search, imagination, sizes)
-    rival = planner_of(setting, shown.acquisition, "farthest", imagination, sizes)
     parts = shown.name, asked.task, asked.search, *(() if asked.model == "screened" else (asked.model,))
     folder = asked.out or Path("runs") / re.sub(r"[^A-Za-z0-9_.-]", "_", f"{'-'.join(parts)}-seed{asked.seed}")
     enough = rule(asked.until or shown.until)
@@ -164,6 +163,7 @@ def play(asked: Asked, shown: Shown, setting: Setting, sizes: Sizes) -> None:
             drawn.append(beside.submit(sketches.add, step))
         # Not before the first view: both would compile what that needs.
         if race is None and races:
+            rival = planner_of(setting, shown.acquisition, "farthest", imagination, sizes)
             of_rival = (shown.surface, shown.first, _RACE_VIEWS, key, noise, folder / "farthest")
             race = beside.submit(simulate, rival, *of_rival, progress=False, until=enough)
 
