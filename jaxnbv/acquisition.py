@@ -297,10 +297,12 @@ def scores(
     """The score of each of a batch of scans, one from each of a batch of poses, `batch_size` of them at a time; fewer
     where several samples are scored together.
     """
+    together = acquisition.batch_size // samples
+    # A batch of one would run its gathers as those of a batch, which takes half as long again.
     return jax.lax.map(
         lambda taken: acquisition.score(context, taken[0], camera, taken[1]),
         (scans, poses),
-        batch_size=max(1, acquisition.batch_size // samples),
+        batch_size=together if together > 1 else None,
     )
 
 
