@@ -15,7 +15,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_solve, solve_triangular
 from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -32,6 +31,7 @@ from jaxnbv.surfaces.covariance import (
     mode_variance,
     normal_covariance,
 )
+from jaxnbv.surfaces.factor import CholeskyFactor
 from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, filled
 from jaxnbv.surfaces.trigonometric import NonuniformTransform, solve_poisson
 
@@ -43,18 +43,18 @@ _ALWAYS_WHOLE = 2048
 _MOST_PRODUCTS = 2000
 
 
-def factorise(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Float[Array, "n n"]:
-    """C, the lower Cholesky factor of A."""
+def factorise(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> CholeskyFactor:
+    """C."""
     capacity = cloud.capacity
 
     def leading(size: int):
         points, mask = cloud.points[:size], cloud.mask[:size]
         kernel = jnp.where(mask[:, None] & mask, normal_covariance(points, points, spectrum), 0.0)
         block = kernel + jnp.diag(jnp.where(mask, noise**2, 1.0))
-        factor = jnp.linalg.cholesky(block, symmetrize_input=False)
-        return jnp.eye(capacity, dtype=factor.dtype).at[:size, :size].set(factor)
+        lower = CholeskyFactor.of(block).lower
+        return jnp.eye(capacity, dtype=lower.dtype).at[:size, :size].set(lower)
 
-    return _on_filled_rows(cloud, leading)
+    return CholeskyFactor(_on_filled_rows(cloud, leading))
 
 
 def _on_filled_rows(cloud: PointCloud, leading: Callable[[int], Float[Array, "*of"]]) -> Float[Array, "*of"]:
@@ -115,7 +115,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
     weights: Float[Array, "n 3"]
     spectrum: Spectra
     noise: Scalar
-    cholesky: Float[Array, "n n"] | None
+    cholesky: CholeskyFactor | None
 
     @property
     def truncation(self) -> int:
@@ -151,8 +151,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         """log p(n_1, ..., n_N | x_1, ..., x_N), summed over the three components."""
         count = self.cloud.count
         fit = jnp.sum(self.cloud.normals * self.weights)
-        log_determinant = 2.0 * jnp.sum(jnp.log(jnp.diag(self.factor)))
-        return -0.5 * (fit + 3.0 * log_determinant + 3.0 * count * jnp.log(2.0 * jnp.pi))
+        return -0.5 * (fit + 3.0 * self.factor.log_determinant + 3.0 * count * jnp.log(2.0 * jnp.pi))
 
     def whitened(self, x: Float[Array, "n 3"]) -> Float[Array, "3 capacity n"]:
         """C^-1 cov(v_d(X), f(x)): the sum of its squares is the variance that the data explain."""
@@ -161,8 +160,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         def leading(size: int):
             cross = function_normal_covariance(x, self.cloud.points[:size], self.spectrum)
             cross = jnp.where(self.cloud.mask[:size], cross, 0.0)
-            factor = self.factor[:size, :size]
-            solved = jax.vmap(lambda c: solve_triangular(factor, c.T, lower=True))(cross)
+            solved = _of_columns(self.factor.leading(size).whiten, jnp.swapaxes(cross, 1, 2))
             return jnp.pad(solved, ((0, 0), (0, capacity - size), (0, 0)))
 
         return _on_filled_rows(self.cloud, leading)
@@ -203,13 +201,13 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
 
     def whitened_residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
         """C^-1 (n - grad m - v(X) - eps), zero in rows that are not filled."""
-        return self._solve_triangular(self._residual(draws, means), transpose=False)
+        return _of_columns(self.factor.whiten, self._residual(draws, means))
 
     def updated(
         self, coefficients: Float[Array, "s 3 a a a"], whitened: Float[Array, "s n 3"]
     ) -> Float[Array, "s a a a"]:
         """Coefficients of Poisson(v + k(., X) C^-T z) for each v and each whitened residual z."""
-        return self._reconstructed(coefficients, self._solve_triangular(whitened, transpose=True))
+        return self._reconstructed(coefficients, _of_columns(self.factor.unwhiten, whitened))
 
     def _reconstructed(
         self, coefficients: Float[Array, "s 3 a a a"], weights: Float[Array, "s n 3"]
@@ -226,10 +224,10 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         """A^-1 applied to the columns of each block."""
         if self.cholesky is None:
             return by_conjugate_gradients(rows, self.cloud, self.spectrum, self.noise)
-        return self._solve_triangular(self._solve_triangular(rows, transpose=False), transpose=True)
+        return _of_columns(self.cholesky.solve, rows)
 
     @property
-    def factor(self) -> Float[Array, "n n"]:
+    def factor(self) -> CholeskyFactor:
         """C.
 
         **Raises:** `ValueError` of more points than are factorised.
@@ -238,10 +236,11 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
             raise InputError(f"the factor of more than {MOST_FACTORISED} points is not made: keep fewer")
         return self.cholesky
 
-    def _solve_triangular(self, rows: Float[Array, "s n 3"], transpose: bool) -> Float[Array, "s n 3"]:
-        columns = jnp.moveaxis(rows, 0, 1)
-        solved = solve_triangular(self.factor, columns.reshape(len(columns), -1), lower=True, trans=int(transpose))
-        return jnp.moveaxis(solved.reshape(columns.shape), 1, 0)
+
+def _of_columns(solve: Callable[[Array], Array], blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
+    """A solve of the columns of all blocks together."""
+    columns = jnp.moveaxis(blocks, 0, 1)
+    return jnp.moveaxis(solve(columns.reshape(len(columns), -1)).reshape(columns.shape), 1, 0)
 
 
 @eqx.filter_jit
@@ -254,7 +253,7 @@ def given_normals(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Geomet
         weights = by_conjugate_gradients(cloud.normals[None], cloud, spectrum, noise)[0]
     else:
         cholesky = factorise(cloud, spectrum, noise)
-        weights = cho_solve((cholesky, True), cloud.normals)
+        weights = cholesky.solve(cloud.normals)
     transform = NonuniformTransform(cloud.points, spectrum.shape[-1] - 1)
     mean = reconstruct(transform, weights, spectrum)
     level = mean_at_data(transform, mean, cloud)

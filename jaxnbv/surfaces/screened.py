@@ -18,7 +18,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, check_fields, is_traced, require, shown
@@ -27,6 +26,7 @@ from jaxnbv.scanning.evidence import Evidence
 from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import SurfaceModel, on_torus
 from jaxnbv.surfaces.covariance import function_covariance, function_variance, mode_variance
+from jaxnbv.surfaces.factor import CholeskyFactor
 from jaxnbv.surfaces.given_normals import MOST_FACTORISED, GeometricSPSRPosterior, NormalDraws
 from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, filled
 from jaxnbv.surfaces.spsr import GeometricSPSR
@@ -106,7 +106,7 @@ def _condition(model: ScreenedSPSR, base: GeometricSPSRPosterior, evidence: Evid
     covariance = function_covariance(rows.points, rows.points, spectrum) - explained + level_variance
     block = jnp.where(rows.mask[:, None] & rows.mask, covariance, 0.0)
     # A row that is not filled is one of the identity, and its weight is zero.
-    factor = jnp.linalg.cholesky(block + jnp.diag(jnp.where(rows.mask, (half_jump * rows.noise) ** 2, 1.0)))
+    factor = CholeskyFactor.of(block + jnp.diag(jnp.where(rows.mask, (half_jump * rows.noise) ** 2, 1.0)))
 
     # Given the normals alone, until the weights of the values are known.
     level, nothing = jnp.zeros_like(base.level), jnp.zeros_like(rows.values)
@@ -117,7 +117,7 @@ def _condition(model: ScreenedSPSR, base: GeometricSPSRPosterior, evidence: Evid
     at_rows = transform.evaluate(base.mean_coefficients[None])[:, 0]
     weights = posterior.solve(half_jump * rows.values - at_rows)
     no_draw = jnp.zeros((1, 3, *base.mean_coefficients.shape), at_rows.dtype)
-    normals = solve_triangular(base.factor, base.cloud.normals, lower=True)
+    normals = base.factor.whiten(base.cloud.normals)
     mean = posterior._updated(no_draw, normals[None], jnp.zeros(1, at_rows.dtype), weights[None])[0]
     return eqx.tree_at(lambda p: (p.weights, p.mean_coefficients), posterior, (weights, mean))
 
@@ -147,7 +147,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
     - `base`: p(f | normals).
     - `rows`: the values; `half_jump`: their unit h.
     - `whitened`: C^-1 K_df with A = C C^T.
-    - `factor`: lower Cholesky factor of S.
+    - `factor`: Cholesky factor of S.
     - `weights`: w of the mean.
     """
 
@@ -158,7 +158,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
     rows: ValueRows
     half_jump: Float[Array, ""]
     whitened: Float[Array, "3 n m"]
-    factor: Float[Array, "m m"]
+    factor: CholeskyFactor
     weights: Float[Array, " m"]
 
     @on_torus
@@ -173,7 +173,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
             normals = self.base.whitened(point[None])
             cross = function_covariance(self.rows.points, point[None], spectrum) + self.model.level_deviation**2
             cross = cross - jnp.einsum("dnm,dnx->mx", self.whitened, normals, precision="highest")
-            values = solve_triangular(self.factor, jnp.where(self.rows.mask[:, None], cross, 0.0), lower=True)
+            values = self.factor.whiten(jnp.where(self.rows.mask[:, None], cross, 0.0))
             return jnp.maximum(prior - jnp.sum(normals**2) - jnp.sum(values**2), 0.0)
 
         chunk = max(1, min(x.shape[0], _CHUNK_VALUES // self.base.cloud.capacity))
@@ -209,7 +209,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
 
     def solve(self, residual: Float[Array, " m"]) -> Float[Array, " m"]:
         """w = S^-1 r; zero in rows that are not filled."""
-        return cho_solve((self.factor, True), jnp.where(self.rows.mask, residual, 0.0))
+        return self.factor.solve(jnp.where(self.rows.mask, residual, 0.0))
 
     def _updated(
         self,
