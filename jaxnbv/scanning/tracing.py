@@ -17,10 +17,10 @@ from jaxnbv.geometry.volume import ray_interval
 from jaxnbv.scanning.cubic import CORNERS, cubic, first_bracket, first_root
 from jaxnbv.scanning.scanner import implicit_depth
 
-# A march goes on with an eighth of its rays once no more are under way; batches smaller than this stay together. Each
-# size is compiled: a quarter takes as long to run and a quarter longer to compile.
-_SHRINK = 8
-_SMALLEST = 8192
+# A march goes on with a fifth of its rays once no more are under way; batches smaller than this stay together. Each
+# size is compiled: with a quarter a march takes as long to run and a third longer to compile.
+_SHRINK = 5
+_SMALLEST = 4096
 
 # A ray grazes where the slope of f along it is below this fraction of the spread of f over the cell's corners.
 _GRAZING = 0.03
