@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 from scipy.special import i0
 
 from jaxnbv.checks import AnyArray
-from jaxnbv.sharding import shared_map
+from jaxnbv.sharding import on_cpu, shared_map
 from jaxnbv.surfaces.base import HALF_WIDTH, Fields, on_grid_of_torus, on_torus
 
 _CHUNK_VALUES = 2**24
@@ -140,19 +140,34 @@ class NonuniformTransform(eqx.Module):
     def adjoint(self, values: Float[Array, "n k"]) -> Float[Array, "k a a a"]:
         """sum_j values_j phi_a(x_j1) phi_b(x_j2) phi_c(x_j3): the transpose of `evaluate`."""
         basis = self._node_basis(values.dtype)
-        nodes = basis.shape[0]
-        grid = jax.ShapeDtypeStruct((nodes, nodes, nodes, values.shape[1]), values.dtype)
-        (spread,) = jax.linear_transpose(self._interpolate, grid)(values)
+        spread = self._spread(values, basis.shape[0])
         return evaluate_on_grid(jnp.moveaxis(spread, -1, 0), basis.T)
 
     def _interpolate(self, grid: Float[Array, "g g g k"]) -> Float[Array, "n k"]:
-        window, k = self.weights.shape[-1], grid.shape[-1]
+        def at_point(taken):
+            start, weights = taken
+            return jnp.einsum("uvwk,u,v,w->k", self._window_of(grid, start), *weights, precision="highest")
 
-        def at_point(start, weights):
-            block = jax.lax.dynamic_slice(grid, (*start, jnp.int32(0)), (window, window, window, k))
-            return jnp.einsum("uvwk,u,v,w->k", block, *weights, precision="highest")
+        # On a CPU as many points at once as leave their windows in its cache.
+        return jax.lax.map(at_point, (self.start, self.weights), batch_size=128 if on_cpu() else len(self.start))
 
-        return jax.vmap(at_point)(self.start, self.weights)
+    def _spread(self, values: Float[Array, "n k"], nodes: int) -> Float[Array, "nodes nodes nodes k"]:
+        """The transpose of `_interpolate`."""
+        grid = jnp.zeros((nodes, nodes, nodes, values.shape[1]), values.dtype)
+        if not on_cpu():
+            return jax.linear_transpose(self._interpolate, grid)(values)[0]
+
+        def add(row, grid):
+            start, (x, y, z) = self.start[row], self.weights[row]
+            block = x[:, None, None, None] * y[:, None, None] * z[:, None] * values[row]
+            return jax.lax.dynamic_update_slice(grid, self._window_of(grid, start) + block, (*start, jnp.int32(0)))
+
+        # On a CPU point by point, six times as fast as XLA's scatter.
+        return jax.lax.fori_loop(0, len(values), add, grid)
+
+    def _window_of(self, grid: Float[Array, "g g g k"], start: Int[Array, "3"]) -> Float[Array, "w w w k"]:
+        window = self.weights.shape[-1]
+        return jax.lax.dynamic_slice(grid, (*start, jnp.int32(0)), (window, window, window, grid.shape[-1]))
 
     def _node_basis(self, dtype) -> Float[Array, "g a"]:
         """The basis at the grid's nodes, each frequency divided by the window's Fourier transform there."""
