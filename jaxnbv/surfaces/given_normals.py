@@ -51,8 +51,8 @@ def factorise(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> CholeskyFa
         points, mask = cloud.points[:size], cloud.mask[:size]
         kernel = jnp.where(mask[:, None] & mask, normal_covariance(points, points, spectrum), 0.0)
         block = kernel + jnp.diag(jnp.where(mask, noise**2, 1.0))
-        lower = CholeskyFactor.of(block).lower
-        return jnp.eye(capacity, dtype=lower.dtype).at[:size, :size].set(lower)
+        upper = CholeskyFactor.of(block).upper
+        return jnp.eye(capacity, dtype=upper.dtype).at[:size, :size].set(upper)
 
     return CholeskyFactor(_on_filled_rows(cloud, leading))
 
