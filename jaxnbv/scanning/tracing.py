@@ -17,10 +17,10 @@ from jaxnbv.geometry.volume import ray_interval
 from jaxnbv.scanning.cubic import CORNERS, cubic, first_bracket, first_root
 from jaxnbv.scanning.scanner import implicit_depth
 
-# A march goes on with a fifth of its rays once no more are under way; batches smaller than this stay together. Each
+# A march goes on with a fifth of its rays once no more are under way; batches smaller than an image stay together. Each
 # size is compiled: with a quarter a march takes as long to run and a third longer to compile.
 _SHRINK = 5
-_SMALLEST = 4096
+_SMALLEST = 2500
 
 # A ray grazes where the slope of f along it is below this fraction of the spread of f over the cell's corners.
 _GRAZING = 0.03
