@@ -281,11 +281,11 @@ def _level_slope(posterior: GeometricSPSRPosterior) -> Float[Array, "n 3"]:
     cloud, spectrum = posterior.cloud, posterior.spectrum
     transform = NonuniformTransform(cloud.points, posterior.truncation)
 
-    def reconstruct(fields):
+    def damped(fields):
         return solve_poisson(mode_variance(spectrum) * fields)
 
-    # Transposes of transforms by name, which are faster than those that JAX derives.
+    # The transforms are each other's transposes, faster than those that JAX derives.
     at_data = transform.adjoint(cloud.mask[:, None] / jnp.sum(cloud.mask))[0]
     fields = jax.ShapeDtypeStruct((3, *at_data.shape), at_data.dtype)
-    slope = transform.evaluate(jax.linear_transpose(reconstruct, fields)(at_data)[0])
+    slope = transform.evaluate(jax.linear_transpose(damped, fields)(at_data)[0])
     return posterior.solve(jnp.where(cloud.mask[:, None], slope, 0.0)[None])[0]

@@ -111,6 +111,14 @@ def test_transform_and_adjoint_equal_direct_sums(truncation, dtype, tolerance):
     assert abs(left - right) < (1e-13 if dtype == np.float64 else 1e-6) * scale
 
 
+def test_a_gpu_spreads_as_a_cpu_does(monkeypatch):
+    points, values = jnp.asarray(points_with_borders(60)), jnp.asarray(RNG.standard_normal((60, 2)))
+    transform = NonuniformTransform(points, 4)
+    on_cpu = transform.adjoint(values)
+    monkeypatch.setattr("jaxnbv.surfaces.trigonometric.on_cpu", lambda: False)
+    assert relative(np.asarray(transform.adjoint(values)), np.asarray(on_cpu)) < 1e-6
+
+
 def test_gradients_on_nodes_and_borders_are_those_of_the_function():
     """A point on a node has a window that ends exactly on its last node, where the square root starts."""
     nodes = -np.pi / 2 + np.pi / 12 * np.arange(13)
