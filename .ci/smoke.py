@@ -19,7 +19,7 @@ from jaxnbv.studies.scenes import demo_object
 CAMERA = nbv.Camera(height=16, width=16)
 FIRST = nbv.look_at((0.0, 0.0, 2.5))
 MODEL = nbv.ScreenedSPSR(nbv.GeometricSPSR(0.02, 0.2, 12))
-IMAGINATION = nbv.Imagination(MODEL, grid=nbv.Grid(24), num_samples=2)
+SAMPLER = nbv.SurfaceSampler(MODEL, grid=nbv.Grid(24), num_samples=2)
 
 
 def command(*arguments: str) -> str:
@@ -39,7 +39,7 @@ def planning() -> None:
     scene = demo_object()
     with tempfile.TemporaryDirectory() as folder:
         for number, search in enumerate(searches):
-            planner = nbv.Planner(nbv.Coverage(), search, CAMERA, IMAGINATION, capacity=512)
+            planner = nbv.Planner(nbv.Coverage(), search, CAMERA, SAMPLER, capacity=512)
             out = Path(folder) / str(number)
             assert len(nbv.simulate(planner, scene, FIRST, 2, jax.random.key(0), folder=out, progress=False).views) == 2
         box = nbv.Box((-1.5,) * 3, (1.5,) * 3)
@@ -66,7 +66,7 @@ def everything() -> None:
             solid.export(path)
             mesh = nbv.load_mesh(path)
         heat = nbv.ExpectedUtilityImprovement(nbv.ColdestPoint(mesh.vertices[0], workers=2), num_points=256)
-        planner = nbv.Planner(heat, nbv.DiscreteSearch(4), CAMERA, IMAGINATION, capacity=512)
+        planner = nbv.Planner(heat, nbv.DiscreteSearch(4), CAMERA, SAMPLER, capacity=512)
         episode = nbv.simulate(planner, mesh, FIRST, 2, jax.random.key(0), progress=False)
         assert nbv.write_report(episode, Path(folder) / "report", progress=False).exists()
 

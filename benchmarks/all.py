@@ -51,13 +51,13 @@ class Bench:
         print(f"{stage}: {seconds:.3g} s", flush=True)
         return seconds
 
-    def evidence(self, planner: nbv.Planner, views: int = 1) -> nbv.Evidence:
+    def observations(self, planner: nbv.Planner, views: int = 1) -> nbv.Observations:
         """After a first view, and others from around the object."""
-        evidence, around = None, map(nbv.look_at, nbv.fibonacci_sphere(views, 2.5))
+        observations, around = None, map(nbv.look_at, nbv.fibonacci_sphere(views, 2.5))
         for index, pose in enumerate([self.first, *around][:views]):
             seen = observe_scene(self.scene, planner.camera, pose, nbv.SensorNoise(), jax.random.key(index))
-            evidence = planner.observe(evidence, pose, seen) if evidence else planner.init(pose, seen)
-        return evidence
+            observations = planner.observe(observations, pose, seen) if observations else planner.init(pose, seen)
+        return observations
 
 
 def rival_scan(surfaces: nbv.GridSurface, camera: nbv.Camera, poses: nbv.Pose) -> float:
@@ -75,13 +75,13 @@ def rival_scan(surfaces: nbv.GridSurface, camera: nbv.Camera, poses: nbv.Pose) -
 def coverage(bench: Bench) -> None:
     """The paper's acquisition by the full search, after one view and with its 8,192 points full."""
     planner = nbv.Planner(nbv.Coverage())
-    evidence = bench.evidence(planner)
+    observations = bench.observations(planner)
     start = time.perf_counter()
-    jax.block_until_ready(planner.propose(evidence, bench.key))
+    jax.block_until_ready(planner.propose(observations, bench.key))
     bench.note("coverage: first step, compilation included", time.perf_counter() - start)
-    step = bench.take("coverage: a step", lambda: planner.propose(evidence, bench.key))
-    bench.take("coverage: samples on the grid", lambda: planner.imagination.sample(evidence, bench.key), step=step)
-    surfaces = planner.imagination.sample(evidence, bench.key)
+    step = bench.take("coverage: a step", lambda: planner.propose(observations, bench.key))
+    bench.take("coverage: samples on the grid", lambda: planner.sampler.sample(observations, bench.key), step=step)
+    surfaces = planner.sampler.sample(observations, bench.key)
     rival = min(rival_scan(surfaces, planner.camera, bench.candidates) for _ in range(2))
     bench.note("the same scans by marching cubes and Embree", rival)
     # Coverage reads no normals, and its step computes none.
@@ -96,10 +96,10 @@ def coverage(bench: Bench) -> None:
         return jnp.mean(jax.lax.map(score, seen, batch_size=samples_at_once(planner.camera, bench.candidates)), axis=0)
 
     # What is timed must be what a step does.
-    expected = nbv.expected_value(planner.acquisition, evidence.cloud, surfaces, planner.camera, bench.candidates)
-    np.testing.assert_allclose(values(evidence.cloud, seen), expected, rtol=1e-3)
-    bench.take("coverage: values of the 1,920 scans", lambda: values(evidence.cloud, seen), step=step)
-    full = bench.evidence(planner, 13)
+    expected = nbv.expected_value(planner.acquisition, observations.cloud, surfaces, planner.camera, bench.candidates)
+    np.testing.assert_allclose(values(observations.cloud, seen), expected, rtol=1e-3)
+    bench.take("coverage: values of the 1,920 scans", lambda: values(observations.cloud, seen), step=step)
+    full = bench.observations(planner, 13)
     bench.take(
         f"coverage: a step at {int(full.cloud.count):,} points", lambda: planner.propose(full, bench.key), step=step
     )
@@ -108,9 +108,9 @@ def coverage(bench: Bench) -> None:
 def sessions(bench: Bench) -> None:
     """What sessions plan by: new surface by halving, 2,000 points kept."""
     planner = nbv.Planner(nbv.NewSurface(), nbv.HalvingSearch(), capacity=2000)
-    second = bench.evidence(planner, 2)
+    second = bench.observations(planner, 2)
     step = bench.take("new surface, halving, 2,000 points: the second step", lambda: planner.propose(second, bench.key))
-    tenth = bench.evidence(planner, 10)
+    tenth = bench.observations(planner, 10)
     bench.take("new surface, halving, 2,000 points: the tenth", lambda: planner.propose(tenth, bench.key), second=step)
 
 
@@ -118,20 +118,20 @@ def cross_entropy(bench: Bench) -> None:
     """The shipped classifier of pyramids on 1,920 clouds of 1,024 points, and by halving; the paper's surfaces."""
     pyramid = pyramid_scene(Split.TEST, 0, Framing.CLOSE_UP)
     classifier = pretrained_classifier("pyramid", Framing.CLOSE_UP.longest_side)
-    imagination = nbv.Imagination.preset("paper")
-    planner = nbv.Planner(nbv.CrossEntropy(classifier), imagination=imagination)
+    sampler = nbv.SurfaceSampler.preset("paper")
+    planner = nbv.Planner(nbv.CrossEntropy(classifier), sampler=sampler)
     first = hidden_view(pyramid, bench.key)
     seen = observe_scene(nbv.SDFSurface(pyramid), planner.camera, first, nbv.SensorNoise(), bench.key)
-    evidence = planner.init(first, seen)
-    step = bench.take("cross-entropy: a step", lambda: planner.propose(evidence, bench.key))
-    halving = nbv.Planner(planner.acquisition, nbv.HalvingSearch(), imagination=imagination)
-    bench.take("cross-entropy: a step by halving", lambda: halving.propose(evidence, bench.key), step=step)
-    bench.take("cross-entropy: samples on the grid", lambda: planner.imagination.sample(evidence, bench.key), step=step)
-    surfaces = planner.imagination.sample(evidence, bench.key)
+    observations = planner.init(first, seen)
+    step = bench.take("cross-entropy: a step", lambda: planner.propose(observations, bench.key))
+    halving = nbv.Planner(planner.acquisition, nbv.HalvingSearch(), sampler=sampler)
+    bench.take("cross-entropy: a step by halving", lambda: halving.propose(observations, bench.key), step=step)
+    bench.take("cross-entropy: samples on the grid", lambda: planner.sampler.sample(observations, bench.key), step=step)
+    surfaces = planner.sampler.sample(observations, bench.key)
     scans = lambda: nbv.scan_samples(surfaces, planner.camera, bench.candidates)  # noqa: E731
     bench.take("cross-entropy: 16 samples scanned from 120 candidates", scans, step=step)
     seen = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), scans())
-    known = planner.acquisition.context(evidence.cloud)[0]
+    known = planner.acquisition.context(observations.cloud)[0]
 
     @jax.jit
     def thinned(seen):
@@ -147,9 +147,9 @@ def cross_entropy(bench: Bench) -> None:
 def gradient(bench: Bench) -> None:
     """Searches on the same samples, as ratios to the discrete one."""
     planner = nbv.Planner(nbv.Coverage())
-    evidence = bench.evidence(planner)
-    surfaces = planner.imagination.sample(evidence, bench.key)
-    discrete = bench.take("search: discrete, 120 candidates", lambda: planner.choose(evidence, surfaces, bench.key))
+    observations = bench.observations(planner)
+    surfaces = planner.sampler.sample(observations, bench.key)
+    discrete = bench.take("search: discrete, 120 candidates", lambda: planner.choose(observations, surfaces, bench.key))
     searches = {
         "halving, 120 candidates": nbv.HalvingSearch(),
         "gradient, six starts": nbv.GradientSearch(dof=2, num_candidates=6),
@@ -159,7 +159,7 @@ def gradient(bench: Bench) -> None:
     for name, search in searches.items():
         other = nbv.Planner(planner.acquisition, search)
         bench.take(
-            f"search: {name}", lambda other=other: other.choose(evidence, surfaces, bench.key), discrete=discrete
+            f"search: {name}", lambda other=other: other.choose(observations, surfaces, bench.key), discrete=discrete
         )
 
 
@@ -179,8 +179,8 @@ def networks(bench: Bench) -> None:
 def devices(bench: Bench) -> None:
     """A step by the full search on one device and shared among all."""
     planner, count = nbv.Planner(nbv.NewSurface(), nbv.DiscreteSearch()), len(jax.devices())
-    evidence = bench.evidence(planner)
-    step = lambda: planner.propose(evidence, bench.key)  # noqa: E731
+    observations = bench.observations(planner)
+    step = lambda: planner.propose(observations, bench.key)  # noqa: E731
     alone = bench.take("new surface: a step on one device", step)
     if count > 1:
         with jax.set_mesh(jax.sharding.Mesh(jax.devices(), "devices")):

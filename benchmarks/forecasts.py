@@ -20,8 +20,9 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
 from jaxnbv.geometry.volume import Box, ray_interval
+from jaxnbv.observations import Observations
 from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Evidence, Grid, GridSurface, SDFSurface, Surface, TriangleMesh, scan
+from jaxnbv.scanning import Grid, GridSurface, SDFSurface, Surface, TriangleMesh, scan
 from jaxnbv.studies.classification.measures import rank_correlation
 
 BINS = 10
@@ -52,7 +53,7 @@ class Truth(eqx.Module):
 
         **Raises:** `ValueError` for a kind of surface whose inside is not known.
         """
-        inside = _inside(scene, planner.imagination.grid)
+        inside = _inside(scene, planner.sampler.grid)
         look = _scan if scene.in_jit else scan
         seen = look(scene, camera, candidates)
         depths = ray_depths(seen, camera, candidates, volume)[0]
@@ -96,23 +97,27 @@ class Judgement(NamedTuple):
 
 
 def judge(
-    planner: Planner, evidence: Evidence, surfaces: GridSurface, truth: Truth, seen_empty: Bool[AnyArray, "g g g"]
+    planner: Planner,
+    observations: Observations,
+    surfaces: GridSurface,
+    truth: Truth,
+    seen_empty: Bool[AnyArray, "g g g"],
 ) -> Judgement:
-    """How good `surfaces`, the planner's samples given the evidence, are.
+    """How good `surfaces`, the planner's samples given the observations, are.
 
     - `seen_empty`: the nodes that the scans have shown to be empty, whether the planner carves by them or not:
       all planners are judged on the same nodes, those inside the volume that are not seen empty.
 
     **Raises:** `ValueError` if the truth is on another grid, or there are fewer than two samples.
     """
-    shape = (planner.imagination.grid.resolution,) * 3
+    shape = (planner.sampler.grid.resolution,) * 3
     require(
         truth.inside.shape == seen_empty.shape == shape,
         f"the truth is on {truth.inside.shape} nodes and the seen space on {seen_empty.shape}, but the planner's grid "
         f"has {shape}: make both with the planner's grid",
     )
     seen_empty = jnp.asarray(seen_empty)
-    judged = _judge(surfaces, evidence.cloud, truth, seen_empty, planner.camera, planner.acquisition)
+    judged = _judge(surfaces, observations.cloud, truth, seen_empty, planner.camera, planner.acquisition)
     crps_depth, in_empty, inside, expected, true_values = (np.asarray(leaf) for leaf in judged)
     record = Judgement(
         crps=float(crps_depth),
@@ -122,7 +127,7 @@ def judge(
     )
     if not bool(truth.inside.any()):
         return record
-    unseen = np.asarray((_over_nodes(truth.volume, planner.imagination.grid) <= 0) & ~seen_empty)
+    unseen = np.asarray((_over_nodes(truth.volume, planner.sampler.grid) <= 0) & ~seen_empty)
     forecast, happened = inside[unseen], np.asarray(truth.inside)[unseen]
     plain = brier(forecast, happened)
     return record._replace(

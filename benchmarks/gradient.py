@@ -55,17 +55,17 @@ def scene_and_first(task: str, mesh: str | None, seed: int, key: jax.Array) -> t
 
 
 @eqx.filter_jit
-def value(planner: nbv.Planner, evidence: nbv.Evidence, surfaces: nbv.GridSurface, parameters):
+def value(planner: nbv.Planner, observations: nbv.Observations, surfaces: nbv.GridSurface, parameters):
     """The acquisition at six poses of the sphere, moved by parameters."""
     starts = sphere_candidates(6)
     poses = jax.vmap(nbv.SpherePoses().retract)(starts, parameters)
-    return nbv.expected_value(planner.acquisition, evidence.cloud, surfaces, planner.camera, poses)
+    return nbv.expected_value(planner.acquisition, observations.cloud, surfaces, planner.camera, poses)
 
 
 @eqx.filter_jit
-def gradient(planner: nbv.Planner, evidence: nbv.Evidence, surfaces: nbv.GridSurface, parameters):
+def gradient(planner: nbv.Planner, observations: nbv.Observations, surfaces: nbv.GridSurface, parameters):
     """Its gradient, and its value with it."""
-    return jax.value_and_grad(lambda moved: value(planner, evidence, surfaces, moved).sum())(parameters)
+    return jax.value_and_grad(lambda moved: value(planner, observations, surfaces, moved).sum())(parameters)
 
 
 def run_seed(planners: dict[str, nbv.Planner], task: str, mesh: str | None, seed: int, compiled: bool) -> dict:
@@ -74,19 +74,19 @@ def run_seed(planners: dict[str, nbv.Planner], task: str, mesh: str | None, seed
     scene, first = scene_and_first(task, mesh, seed, first_key)
     planner = planners["discrete"]
     seen = observe_scene(scene, planner.camera, first, nbv.SensorNoise(), noise_key)
-    evidence = planner.init(first, seen)
-    surfaces = planner.imagination.sample(evidence, sample_key)
+    observations = planner.init(first, seen)
+    surfaces = planner.sampler.sample(observations, sample_key)
     parameters = jnp.zeros((6, 3))
     row = {
-        "samples": least_time(lambda: planner.imagination.sample(evidence, sample_key), 1),
-        "six values": least_time(lambda: value(planner, evidence, surfaces, parameters)),
-        "six gradients": least_time(lambda: gradient(planner, evidence, surfaces, parameters)),
+        "samples": least_time(lambda: planner.sampler.sample(observations, sample_key), 1),
+        "six values": least_time(lambda: value(planner, observations, surfaces, parameters)),
+        "six gradients": least_time(lambda: gradient(planner, observations, surfaces, parameters)),
     }
     for name, asked in planners.items():
         if not compiled:
-            jax.block_until_ready(asked.choose(evidence, surfaces, search_key))
+            jax.block_until_ready(asked.choose(observations, surfaces, search_key))
         start = time.perf_counter()
-        proposal = jax.block_until_ready(asked.choose(evidence, surfaces, search_key))
+        proposal = jax.block_until_ready(asked.choose(observations, surfaces, search_key))
         row[name] = {"value": float(proposal.value), "seconds": time.perf_counter() - start}
     return row
 
@@ -130,7 +130,7 @@ def main() -> None:
     names = [name for name in SEARCHES if arguments.task == "coverage" or name not in COVERAGE_ONLY]
     names = ["discrete", arguments.only] if arguments.only else names
     planners = {
-        name: nbv.Planner(acquisition, SEARCHES[name], imagination=nbv.Imagination(nbv.GeometricSPSR()))
+        name: nbv.Planner(acquisition, SEARCHES[name], sampler=nbv.SurfaceSampler(nbv.GeometricSPSR()))
         for name in names
     }
     label = Path(arguments.mesh).stem if arguments.mesh else arguments.task

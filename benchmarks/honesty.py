@@ -10,7 +10,7 @@ All choose by cross-entropy. The other kind is trucks, and pyramids for trucks.
 
 import dataclasses
 
-from jaxnbv import Imagination, KnownShapes, Planner
+from jaxnbv import KnownShapes, Planner, SurfaceSampler
 from jaxnbv.studies.classification.study import ClassificationStudy
 from jaxnbv.studies.engine.study import Scene
 from jaxnbv.studies.scenes.banks import bank_poses, shape_bank
@@ -19,23 +19,23 @@ from jaxnbv.surfaces.known_shapes import kind_of
 
 def without_the_class(study: ClassificationStudy, scene: Scene) -> Planner:
     """Who has seen the study's objects of all classes but the scene's."""
-    imagination = study.imagination
-    assert isinstance(imagination.model, KnownShapes), "run the study by --model known"
-    bank, own = imagination.model.bank, study.objects.classes[scene.task.label]
+    sampler = study.sampler
+    assert isinstance(sampler.model, KnownShapes), "run the study by --model known"
+    bank, own = sampler.model.bank, study.objects.classes[scene.task.label]
     others = [row for row, name in enumerate(bank.names) if kind_of(name) != own]
-    return _planner(study, scene, imagination.unknowing.knowing(bank.chosen(others), imagination.model.poses))
+    return _planner(study, scene, sampler.without_bank.with_bank(bank.chosen(others), sampler.model.poses))
 
 
 def another_kind(study: ClassificationStudy, scene: Scene) -> Planner:
     """Who has seen objects of another kind alone."""
     other = "pyramid" if study.bank == "truck" else "truck"
-    return _planner(study, scene, study.imagination.unknowing.knowing(shape_bank(other), bank_poses(other)))
+    return _planner(study, scene, study.sampler.without_bank.with_bank(shape_bank(other), bank_poses(other)))
 
 
 def no_shapes(study: ClassificationStudy, scene: Scene) -> Planner:
     """Who has seen none."""
-    return _planner(study, scene, study.imagination.unknowing)
+    return _planner(study, scene, study.sampler.without_bank)
 
 
-def _planner(study: ClassificationStudy, scene: Scene, imagination: Imagination) -> Planner:
-    return dataclasses.replace(study, imagination=imagination).planner("cross-entropy", scene)
+def _planner(study: ClassificationStudy, scene: Scene, sampler: SurfaceSampler) -> Planner:
+    return dataclasses.replace(study, sampler=sampler).planner("cross-entropy", scene)

@@ -73,8 +73,8 @@ COLUMNS = (
 def planner_of(variant: Variant) -> nbv.Planner:
     """The planner whose samples are judged; its search is never asked."""
     model, carving = variant(GRID)
-    imagination = nbv.Imagination(model, GRID, 8, carving)
-    return nbv.Planner(nbv.Coverage(), imagination=imagination, capacity=4096, max_views=VIEWS)
+    sampler = nbv.SurfaceSampler(model, GRID, 8, carving)
+    return nbv.Planner(nbv.Coverage(), sampler=sampler, capacity=4096, max_views=VIEWS)
 
 
 def objects_of(arguments: argparse.Namespace) -> dict[str, Callable[[], nbv.Surface]]:
@@ -95,11 +95,11 @@ def objects_of(arguments: argparse.Namespace) -> dict[str, Callable[[], nbv.Surf
     return found
 
 
-def knowing(planner: nbv.Planner, bank: nbv.ShapeBank, name: str) -> nbv.Planner:
+def with_bank(planner: nbv.Planner, bank: nbv.ShapeBank, name: str) -> nbv.Planner:
     """One that has seen the shapes of a bank, but for the object of this name."""
     others = [row for row, known in enumerate(bank.names) if known != name]
-    imagination = planner.imagination.knowing(bank.chosen(others), nbv.Upright(by_axis=True))
-    return dataclasses.replace(planner, imagination=imagination)
+    sampler = planner.sampler.with_bank(bank.chosen(others), nbv.Upright(by_axis=True))
+    return dataclasses.replace(planner, sampler=sampler)
 
 
 def random_views(scene: nbv.Surface, key: jax.Array) -> list[tuple[nbv.Pose, nbv.PointCloud]]:
@@ -124,19 +124,19 @@ def seen_space(scan: nbv.PointCloud, pose: nbv.Pose) -> jax.Array:
 
 def run(planner: nbv.Planner, views: list, truth: Truth, key: jax.Array, compiled: bool) -> list[dict]:
     """One record for each number of views; seconds are of a run that compiles nothing."""
-    records, evidence, empty = [], None, jnp.zeros((GRID.resolution,) * 3, bool)
+    records, observations, empty = [], None, jnp.zeros((GRID.resolution,) * 3, bool)
     for index, (pose, scan) in enumerate(views):
-        evidence = planner.init(pose, scan) if evidence is None else planner.observe(evidence, pose, scan)
+        observations = planner.init(pose, scan) if observations is None else planner.observe(observations, pose, scan)
         empty = empty | seen_space(scan, pose)
-        sample = functools.partial(planner.imagination.sample, evidence, jax.random.fold_in(key, index))
+        sample = functools.partial(planner.sampler.sample, observations, jax.random.fold_in(key, index))
         if index == 0 and not compiled:
             jax.block_until_ready(sample())
         start = time.perf_counter()
         surfaces = jax.block_until_ready(sample())
         seconds = time.perf_counter() - start
-        record = judge(planner, evidence, surfaces, truth, empty)._asdict()
+        record = judge(planner, observations, surfaces, truth, empty)._asdict()
         record["reliability"] = record["reliability"] and record["reliability"]._asdict()
-        records.append(record | {"views": index + 1, "points": int(evidence.cloud.count), "seconds": seconds})
+        records.append(record | {"views": index + 1, "points": int(observations.cloud.count), "seconds": seconds})
     return records
 
 
@@ -214,7 +214,7 @@ def main() -> None:
             for seed in arguments.seeds:
                 base, views = jax.random.fold_in(jax.random.key(seed), zlib.crc32(name.encode())), None
                 for model, plain in planners.items():
-                    planner = knowing(plain, bank, name) if bank is not None and model == "known" else plain
+                    planner = with_bank(plain, bank, name) if bank is not None and model == "known" else plain
                     asked = describe([scene, planner, arguments.candidates, RAYS, VOLUME, LEAST_HITS])
                     label = f"{name}, seed {seed}, {model}"
                     bar.set_description(label)

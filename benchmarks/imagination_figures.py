@@ -1,4 +1,4 @@
-"""Pictures for `imagination.py`: imagined surfaces beside the true one, and reliability diagrams."""
+"""Pictures for `sampler.py`: imagined surfaces beside the true one, and reliability diagrams."""
 
 import math
 from pathlib import Path
@@ -51,7 +51,7 @@ def draw_samples(path: Path, scene: nbv.Surface, view: tuple, named: dict[str, n
     eye = nbv.look_at(11.0 * (math.cos(1.15) * away + math.sin(1.15) * across + 0.25 * up))
     images = [picture(scene, eye, scan)]
     for planner in named.values():
-        surfaces = planner.imagination.sample(planner.init(pose, scan), key)
+        surfaces = planner.sampler.sample(planner.init(pose, scan), key)
         images += [picture(jax.tree.map(lambda leaf, i=i: leaf[i], surfaces), eye, scan) for i in range(4)]
     rows, columns = crop(images)
     # Inches: a small picture, the gap below a heading, and the true surface at both rows' height.

@@ -46,7 +46,7 @@ def take_session(folder: Path) -> None:
         nbv.Coverage(),
         nbv.DiscreteSearch(20),
         nbv.Camera(height=12, width=16),
-        nbv.Imagination(nbv.GeometricSPSR(0.05, truncation=12), nbv.Grid(32), num_samples=2),
+        nbv.SurfaceSampler(nbv.GeometricSPSR(0.05, truncation=12), nbv.Grid(32), num_samples=2),
         capacity=256,
     )
     session = nbv.Session(camera, ((-0.12, -0.12, -0.12), (0.12, 0.12, 0.12)), planner, folder=folder)

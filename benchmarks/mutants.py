@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-PARTS = ("surfaces", "scanning", "imagination.py", "search", "planning", "storage")
+PARTS = ("surfaces", "scanning", "sampler.py", "search", "planning", "storage")
 SECONDS = 120.0
 
 

@@ -88,19 +88,19 @@ def planned(trial: Trial, search: nbv.Search, rays: int, first: int, seed: int) 
         nbv.NewSurface(),
         search,
         camera,
-        nbv.Imagination(num_samples=SAMPLES),
+        nbv.SurfaceSampler(num_samples=SAMPLES),
         capacity=CAPACITY,
         max_views=trial.protocol.views,
     )
     key, places = jax.random.key(seed), np.asarray(trial.poses.position, np.float64)
     pose, taken, seconds = trial.poses[first], [first], []
-    evidence = planner.init(pose, nbv.scan(trial.mesh, camera, pose))
+    observations = planner.init(pose, nbv.scan(trial.mesh, camera, pose))
     while len(taken) < trial.protocol.views:
         start = time.perf_counter()
-        pose = jax.block_until_ready(planner.propose(evidence, jax.random.fold_in(key, len(taken)))).pose
+        pose = jax.block_until_ready(planner.propose(observations, jax.random.fold_in(key, len(taken)))).pose
         seconds.append(time.perf_counter() - start)
         taken.append(int(np.argmin(np.linalg.norm(places - np.asarray(pose.position), axis=1))))
-        evidence = planner.observe(evidence, pose, nbv.scan(trial.mesh, camera, pose))
+        observations = planner.observe(observations, pose, nbv.scan(trial.mesh, camera, pose))
     return taken, seconds[2:]
 
 

@@ -37,20 +37,22 @@ STAGES = {"samples": "posterior and samples", "search": "search"}
 def measured(points: int, samples: int, candidates: int, rays: int) -> dict[str, float]:
     """Seconds by stage."""
     side, key = round(rays**0.5), jax.random.key(0)
-    imagination = dataclasses.replace(nbv.Imagination(), num_samples=samples)
+    sampler = dataclasses.replace(nbv.SurfaceSampler(), num_samples=samples)
     camera, search = nbv.Camera(height=side, width=side), nbv.DiscreteSearch(candidates)
-    planner = nbv.Planner(nbv.NewSurface(), search, camera, imagination, capacity=points)
+    planner = nbv.Planner(nbv.NewSurface(), search, camera, sampler, capacity=points)
     # The sensor's own rays are more than those that are imagined: D is full at any size.
-    sensor, scene, evidence = nbv.Camera(height=150, width=150), demo_object(), None
+    sensor, scene, observations = nbv.Camera(height=150, width=150), demo_object(), None
     for position in ((0.8, 0.9, 2.2), (-1.4, 0.6, -1.9)):
         pose = nbv.look_at(position)
         seen = observe_scene(scene, sensor, pose, nbv.SensorNoise(), key)
-        evidence = planner.observe(evidence, pose, seen, sensor) if evidence else planner.init(pose, seen, sensor)
-    assert int(evidence.cloud.count) == points
-    surfaces = planner.sample(evidence, key)
+        observations = (
+            planner.observe(observations, pose, seen, sensor) if observations else planner.init(pose, seen, sensor)
+        )
+    assert int(observations.cloud.count) == points
+    surfaces = planner.sample(observations, key)
     return {
-        "samples": least_time(lambda: planner.sample(evidence, key)),
-        "search": least_time(lambda: planner.choose(evidence, surfaces, key)),
+        "samples": least_time(lambda: planner.sample(observations, key)),
+        "search": least_time(lambda: planner.choose(observations, surfaces, key)),
     }
 
 

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from jaxnbv.planning.episode import view_keys
 from jaxnbv.storage.files import write_whole
-from jaxnbv.studies.classification.objects import ModelNet10Study, PyramidStudy, TruckStudy
+from jaxnbv.studies.classification.objects import HouseholdStudy, PyramidStudy, TruckStudy
 from jaxnbv.studies.classification.study import ClassificationStudy
 from jaxnbv.studies.engine.measures import KNOWN
 from jaxnbv.studies.scenes import Framing, Split
@@ -29,7 +29,7 @@ VIEWS = 3
 KINDS: dict[str, type[ClassificationStudy]] = {
     "pyramid": PyramidStudy,
     "truck": TruckStudy,
-    "household": ModelNet10Study,
+    "household": HouseholdStudy,
 }
 
 
@@ -47,12 +47,12 @@ def weights(study: ClassificationStudy, index: int) -> dict:
     planner, sensor, poses = study.planner("coverage", scene), study.sensor(scene), study.candidates.poses()
     first = study.first_view(scene)
     order = jax.random.permutation(study.key(index, "measure"), study.num_candidates).tolist()
-    evidence, found = None, []
+    observations, found = None, []
     for view, candidate in enumerate([first, *(one for one in order if one != first)][:VIEWS]):
         pose = poses[candidate]
         scan = sensor(pose, view_keys(study.key(index, "episode"), view)[2])
-        evidence = planner.init(pose, scan) if evidence is None else planner.observe(evidence, pose, scan)
-        posterior = planner.imagination.posterior(evidence)
+        observations = planner.init(pose, scan) if observations is None else planner.observe(observations, pose, scan)
+        posterior = planner.sampler.posterior(observations)
         assert isinstance(posterior, KnownShapesPosterior)
         kinds = posterior.kinds()
         found.append([kinds.get(name, 0.0) for name in (*study.objects.classes, NONE)])

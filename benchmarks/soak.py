@@ -20,24 +20,24 @@ import psutil
 import jaxnbv as nbv
 
 CAMERA, BALL = nbv.Camera(height=12, width=16), nbv.SDFSurface(nbv.sdf.Sphere(1.0))
-IMAGINATION = nbv.Imagination(nbv.GeometricSPSR(0.05, truncation=8), nbv.Grid(24), num_samples=2)
+SAMPLER = nbv.SurfaceSampler(nbv.GeometricSPSR(0.05, truncation=8), nbv.Grid(24), num_samples=2)
 VIEWS = 8
 
 
 def planner(max_views: int, candidates: int) -> nbv.Planner:
     search = nbv.DiscreteSearch(candidates)
-    return nbv.Planner(nbv.Coverage(), search, CAMERA, IMAGINATION, capacity=512, max_views=max_views)
+    return nbv.Planner(nbv.Coverage(), search, CAMERA, SAMPLER, capacity=512, max_views=max_views)
 
 
 def planning(steps: int) -> Iterator[None]:
     asked, first = planner(VIEWS, 20), nbv.look_at((0.0, 0.0, 2.5))
-    evidence = None
+    observations = None
     for step in range(steps):
         if step % VIEWS == 0:
-            evidence = asked.init(first, nbv.scan(BALL, CAMERA, first))
-        pose = asked.propose(evidence, jax.random.key(step)).pose
+            observations = asked.init(first, nbv.scan(BALL, CAMERA, first))
+        pose = asked.propose(observations, jax.random.key(step)).pose
         if step % VIEWS < VIEWS - 1:
-            evidence = asked.observe(evidence, pose, nbv.scan(BALL, CAMERA, pose))
+            observations = asked.observe(observations, pose, nbv.scan(BALL, CAMERA, pose))
         yield
 
 

@@ -26,7 +26,7 @@ import jaxnbv as nbv
 from jaxnbv.networks import part_segmenter, pretrained_classifier
 from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.planning.episode import view_keys
-from jaxnbv.planning.stopping import so_far
+from jaxnbv.planning.stopping import context
 from jaxnbv.storage.files import write_text
 from jaxnbv.studies.engine.results import interval
 from jaxnbv.studies.scenes import Framing, Split, hidden_view, part_scene, pyramid_scene
@@ -46,10 +46,10 @@ VIEWS = {"class": 6, "parts": 6, "coverage": 14}
 
 
 def planner_of(acquisition: nbv.Acquisition, radius: float, side: float = 2.5, solid: bool = False) -> nbv.Planner:
-    imagination = nbv.Imagination.preset("screened", side, solid=solid)
-    imagination = dataclasses.replace(imagination, grid=nbv.Grid(64, 0.7 * side), num_samples=8)
+    sampler = nbv.SurfaceSampler.preset("screened", side, solid=solid)
+    sampler = dataclasses.replace(sampler, grid=nbv.Grid(64, 0.7 * side), num_samples=8)
     search = nbv.DiscreteSearch(nbv.SphereCandidates(48, radius))
-    return nbv.Planner(acquisition, search, imagination=imagination, capacity=4096)
+    return nbv.Planner(acquisition, search, sampler=sampler, capacity=4096)
 
 
 @functools.cache
@@ -75,17 +75,17 @@ def measured(task: str, index: int) -> dict:
     planner = planner_for(task, category)
     episode = nbv.simulate(planner, surface, first, VIEWS[task], key, progress=False)
     right, ends = [], {name: VIEWS[task] for name in RULES[task]}
-    for count, evidence in enumerate(episode.evidence(), start=1):
+    for count, observations in enumerate(episode.observations(), start=1):
         if task == "class":
-            values = planner.acquisition.answer(evidence.cloud).values
+            values = planner.acquisition.answer(observations.cloud).values
             right.append(float(int(np.argmax(values)) == int(pyramid.label)))
         elif task == "parts":
-            counts = planner.acquisition.answer(evidence.cloud).values
+            counts = planner.acquisition.answer(observations.cloud).values
             right.append(float((counts[np.asarray(thing.parts)] >= 60).all()))
         else:
-            right.append(_seen(surface, planner.camera, planner.search.candidates.poses(), evidence.cloud))
+            right.append(_seen(surface, planner.camera, planner.search.candidates.poses(), observations.cloud))
         poses = tuple(view.pose for view in episode.views[:count])
-        known = so_far(planner, evidence, poses, view_keys(key, count)[0])
+        known = context(planner, observations, poses, view_keys(key, count)[0])
         for name, rule in RULES[task].items():
             if ends[name] == VIEWS[task] and rule.after(known) is not None:
                 ends[name] = count

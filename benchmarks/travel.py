@@ -38,14 +38,14 @@ def episode(planner: nbv.Planner, mesh: nbv.TriangleMesh, truth: np.ndarray, vie
     """Coverage, and length of the way so far, after each view."""
     direction = jax.random.normal(jax.random.fold_in(key, 99), (3,))
     pose = nbv.look_at(2.5 * direction / jnp.linalg.norm(direction))
-    evidence, taken, scans, found = None, [], [], {"way": []}
+    observations, taken, scans, found = None, [], [], {"way": []}
     for index in range(views):
-        if evidence is not None:
-            pose = planner.propose(evidence, view_keys(key, index)[0]).pose
+        if observations is not None:
+            pose = planner.propose(observations, view_keys(key, index)[0]).pose
         seen = observe_scene(mesh, planner.camera, pose, nbv.SensorNoise(), view_keys(key, index)[2])
-        evidence = planner.init(pose, seen) if evidence is None else planner.observe(evidence, pose, seen)
+        observations = planner.init(pose, seen) if observations is None else planner.observe(observations, pose, seen)
         taken.append(pose)
-        scans.append(nbv.View(pose, seen, evidence.cloud, None, planner.camera))
+        scans.append(nbv.View(pose, seen, observations.cloud, None, planner.camera))
         found["way"].append(total_cost(taken))
     found["coverage"] = coverage(scans, truth)
     return found
@@ -88,8 +88,8 @@ def main() -> None:
         truth = truth_points(mesh, jax.random.key(0))
         found = {}
         for name, (search, cost) in METHODS.items():
-            imagination = nbv.Imagination(grid=nbv.Grid(64), num_samples=8)
-            planner = nbv.Planner(nbv.Coverage(), search, imagination=imagination, cost=cost, capacity=4096)
+            sampler = nbv.SurfaceSampler(grid=nbv.Grid(64), num_samples=8)
+            planner = nbv.Planner(nbv.Coverage(), search, sampler=sampler, cost=cost, capacity=4096)
             key = jax.random.fold_in(jax.random.key(4), sum(map(ord, file.stem)))
             found[name] = episode(planner, mesh, truth, asked.views, key)
         records[file.stem] = found

@@ -20,7 +20,7 @@ _SHOWN = {
     "jaxnbv.planning.episode": "Episode",
     "jaxnbv.planning.planner": "Planner",
     "jaxnbv.planning.session": "Session",
-    "jaxnbv.scanning.evidence": "Evidence",
+    "jaxnbv.observations": "Observations",
     "jaxnbv.search.proposal": "Proposal",
     "jaxnbv.surfaces.base": "SurfacePosterior",
 }

@@ -31,14 +31,14 @@ class Quantity(eqx.Module):
     - `name`, `unit`: in words; the unit is empty where there is none.
     - `meaning`: the rest of a caption that begins with "Value:".
     - `smooth`: whether values between two candidates mean anything.
-    - `power`: of length that it is, 2 for an area; a session says it in world units.
+    - `length_power`: of length that it is, 2 for an area; a session says it in world units.
     """
 
     name: str
     unit: str
     meaning: str
     smooth: bool = True
-    power: int = 0
+    length_power: int = 0
 
 
 class Answer(eqx.Module):
@@ -188,7 +188,7 @@ def as_acquisition(value: Any) -> Acquisition:
     return ExpectedUtilityImprovement(value)
 
 
-class Several(Acquisition):
+class AcquisitionList(Acquisition):
     """Several acquisitions of the same scans: compared on the same samples, at the cost of one scan.
 
     Its value is a vector, the members' values in their order (a member whose value is a vector itself takes as many
@@ -280,7 +280,7 @@ def expected_value(
     """The acquisition at each of a batch of poses: mean over the sampled surfaces of the score of what they would show.
 
     `surfaces` carries the samples along its leading axis; `barrier` is as of `scan`. The members of
-    `Several` have an axis of their own.
+    `AcquisitionList` have an axis of their own.
 
     **Raises:** `ValueError` as the acquisition's `check` does, and for a function of the user's that JAX cannot trace.
     """

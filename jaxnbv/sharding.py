@@ -1,7 +1,7 @@
 """Samples and candidates shared among devices.
 
     with jax.set_mesh(jax.sharding.Mesh(jax.devices(), "devices")):
-        proposal = planner.propose(evidence, key)
+        proposal = planner.propose(observations, key)
 
 What is computed for each sample is computed for an equal share of them on each device; so is what is computed for each
 candidate where samples are fewer than devices. Values are those of one device but for the order of sums. Axes that JAX

@@ -41,22 +41,22 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def draw_posterior(
-    planner: nbv.Planner, evidence: nbv.Evidence, surfaces: nbv.GridSurface, scene: nbv.SDFSurface
+    planner: nbv.Planner, observations: nbv.Observations, surfaces: nbv.GridSurface, scene: nbv.SDFSurface
 ) -> Figure:
     """What one view saw; outlines of samples on the plane x = 0, and the probability of being inside there."""
-    axis = np.asarray(planner.imagination.grid.axis)
+    axis = np.asarray(planner.sampler.grid.axis)
     middle = len(axis) // 2
     # Variances take long: every second node.
     y, z = np.meshgrid(axis[::2], axis[::2], indexing="ij")
     plane = jnp.asarray(np.stack([np.full(y.size, axis[middle]), y.ravel(), z.ravel()], axis=1))
-    posterior = planner.imagination.posterior(evidence)
+    posterior = planner.sampler.posterior(observations)
     inside = np.asarray(posterior.probability_inside(plane)).reshape(y.shape)
     truth = np.asarray(scene.sdf(plane)).reshape(y.shape)
     figure = Figure(figsize=(9.6, 3.5))
     first, second, third = (figure.add_axes((left, 0.02, 0.32, 0.86)) for left in (0.0, 0.34, 0.67))
-    pose = evidence.poses[0]
+    pose = observations.poses[0]
     still = Still(beside(pose), None, 500, 2.5)
-    points, _ = evidence.cloud.to_numpy()
+    points, _ = observations.cloud.to_numpy()
     frame(first, still, draw_items(first, still, seen_items(points[:0], points, [pose], planner.camera)))
     first.axis("off")
     for sample in np.asarray(surfaces.values[:SHOWN, middle]):
@@ -76,7 +76,7 @@ def draw_posterior(
 
 
 def draw_utility(
-    planner: nbv.Planner, evidence: nbv.Evidence, surfaces: nbv.GridSurface, proposal: nbv.Proposal
+    planner: nbv.Planner, observations: nbv.Observations, surfaces: nbv.GridSurface, proposal: nbv.Proposal
 ) -> Figure:
     """Imagined scans of the best candidate and of one of the worst tenth, coloured by what each point is worth."""
     order = np.argsort(np.asarray(proposal.values))
@@ -90,14 +90,14 @@ def draw_utility(
     squares = np.zeros((2, SHOWN, PIXELS**2))
     for row in range(2):
         for column in range(SHOWN):
-            squares[row, column] = nearest_squared_distance(fine.points[column, row], evidence.cloud)
+            squares[row, column] = nearest_squared_distance(fine.points[column, row], observations.cloud)
             highest = max(highest, float(np.quantile(squares[row, column][np.asarray(fine.mask[column, row])], 0.98)))
     for row, name in enumerate(("the chosen view", "a poor view")):
         expected = float(proposal.values[chosen[row]])
         figure.text(
             0.012,
             0.955 - 0.49 * row,
-            f"{name}: {expected:.0f} expected, of {planner.imagination.num_samples} samples",
+            f"{name}: {expected:.0f} expected, of {planner.sampler.num_samples} samples",
             color=INK,
             fontsize=10,
         )
@@ -113,7 +113,7 @@ def draw_utility(
             axes.imshow(np.clip(colours, 0, 1).reshape(PIXELS, PIXELS, 3), interpolation="bilinear")
             axes.set(xticks=[], yticks=[])
             own = jax.tree.map(lambda rows, i=(column, row): rows[i], coarse)
-            worth = float(planner.acquisition(planner.acquisition.context(evidence.cloud), own))
+            worth = float(planner.acquisition(planner.acquisition.context(observations.cloud), own))
             axes.set_xlabel(f"worth {worth:.0f}", labelpad=2)
     bar = figure.add_axes((0.91, 0.2, 0.014, 0.55))
     scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(0.0, highest), VALUE)
@@ -135,21 +135,21 @@ def draw_known() -> Figure:
     """Bases that were imagined after a view that shows none of the base: by the model alone, and with known shapes."""
     pyramid = nbv.scenes.pyramid_scene(nbv.scenes.Split.VALIDATION, 2)
     first = hidden_view(pyramid, jax.random.key(0))
-    plain = dataclasses.replace(nbv.Imagination.preset("screened", solid=True), grid=nbv.Grid(100), num_samples=16)
-    knowing = plain.knowing(nbv.shape_bank("pyramid"), nbv.FreeRotation())
-    planner = nbv.Planner(nbv.Coverage(), imagination=plain)
+    plain = dataclasses.replace(nbv.SurfaceSampler.preset("screened", solid=True), grid=nbv.Grid(100), num_samples=16)
+    with_bank = plain.with_bank(nbv.shape_bank("pyramid"), nbv.FreeRotation())
+    planner = nbv.Planner(nbv.Coverage(), sampler=plain)
     scan = nbv.scan(nbv.SDFSurface(pyramid), planner.camera, first)
-    evidence = planner.init(first, nbv.SensorNoise()(scan, jax.random.key(0)))
+    observations = planner.init(first, nbv.SensorNoise()(scan, jax.random.key(0)))
     below = nbv.look_at(np.asarray(pyramid.rotation) @ (1.6, 1.0, -5.0))
     camera = nbv.Camera(height=PIXELS, width=PIXELS)
-    posterior, key = knowing.posterior(evidence), jax.random.key(0)
-    names = [kind_of(name) for name in posterior.names_of_samples(key, knowing.num_samples)]
+    posterior, key = with_bank.posterior(observations), jax.random.key(0)
+    names = [kind_of(name) for name in posterior.names_of_samples(key, with_bank.num_samples)]
     other = [names.index(name) for name in dict.fromkeys(names)][:SHOWN]
     rows = (
-        ("by the Gaussian process", plain.sample(evidence, key), range(SHOWN), [""] * SHOWN),
-        ("with known shapes", knowing.sample(evidence, key, posterior), other, [names[index] for index in other]),
+        ("by the Gaussian process", plain.sample(observations, key), range(SHOWN), [""] * SHOWN),
+        ("with known shapes", with_bank.sample(observations, key, posterior), other, [names[index] for index in other]),
     )
-    cloud = evidence.cloud.to_numpy()[0]
+    cloud = observations.cloud.to_numpy()[0]
     figure = Figure(figsize=(9.6, 4.6))
     for row, (head, surfaces, chosen, labels) in enumerate(rows):
         figure.text(0.012, 0.955 - 0.49 * row, head, color=INK, fontsize=10)
@@ -175,19 +175,19 @@ def main() -> None:
     scene = demo_object()
     model = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=16))
     camera = nbv.Camera(height=32, width=32)
-    imagination = nbv.Imagination(model, grid=nbv.Grid(72), num_samples=8)
-    planner = nbv.Planner(nbv.Coverage(), camera=camera, imagination=imagination, capacity=1024)
+    sampler = nbv.SurfaceSampler(model, grid=nbv.Grid(72), num_samples=8)
+    planner = nbv.Planner(nbv.Coverage(), camera=camera, sampler=sampler, capacity=1024)
     first, noise = nbv.look_at((0.8, 0.9, 2.2)), nbv.SensorNoise()
     scan_key, sample_key, search_key = jax.random.split(jax.random.key(0), 3)
-    evidence = planner.init(first, noise(nbv.scan(scene, planner.camera, first), scan_key))
-    surfaces = planner.imagination.sample(evidence, sample_key)
-    proposal = planner.choose(evidence, surfaces, search_key)
+    observations = planner.init(first, noise(nbv.scan(scene, planner.camera, first), scan_key))
+    surfaces = planner.sampler.sample(observations, sample_key)
+    proposal = planner.choose(observations, surfaces, search_key)
     with mpl.rc_context(STYLE):
-        save(draw_posterior(planner, evidence, surfaces, scene), folder / "concepts_posterior.png")
-        save(draw_utility(planner, evidence, surfaces, proposal), folder / "concepts_utility.png")
+        save(draw_posterior(planner, observations, surfaces, scene), folder / "concepts_posterior.png")
+        save(draw_utility(planner, observations, surfaces, proposal), folder / "concepts_utility.png")
         searches = (nbv.DiscreteSearch(), nbv.UncertaintyView(), nbv.FarthestView())
         planners = {type(search).__name__: dataclasses.replace(planner, search=search) for search in searches}
-        found = {name: one.choose(evidence, surfaces, search_key) for name, one in planners.items()}
+        found = {name: one.choose(observations, surfaces, search_key) for name, one in planners.items()}
         quantities = {name: one.quantity for name, one in planners.items()}
         save(draw_search(found, quantities), folder / "concepts_search.png")
         save(draw_known(), folder / "concepts_known.png")

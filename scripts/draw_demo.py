@@ -34,8 +34,8 @@ def demo_episode(seed: int, search: str, views: int) -> nbv.Episode:
     """The demo of a seed, by a search of the command line, until its own rule or so many views end it."""
     made = COMMAND_TASKS["cross-entropy"]
     shown = made.demo(0, seed)
-    imagination = dataclasses.replace(imagined("screened", False, shown.bank), grid=shown.grid)
-    planner = planner_of(made.setting, shown.acquisition, search, imagination, DEMO)
+    sampler = dataclasses.replace(imagined("screened", False, shown.bank), grid=shown.grid)
+    planner = planner_of(made.setting, shown.acquisition, search, sampler, DEMO)
     return nbv.simulate(planner, shown.surface, shown.first, views, jax.random.key(seed), until=rule(shown.until))
 
 

@@ -50,8 +50,8 @@ def episode_of(surface: Surface, views: int) -> nbv.Episode:
     setting = fitted(USUAL_SETTING, float(np.linalg.norm(points, axis=1).max()))
     camera = setting.camera.resized(RAYS, RAYS)
     search = nbv.DiscreteSearch(SphereCandidates(CANDIDATES, setting.radius))
-    imagination = nbv.Imagination(grid=nbv.Grid(72), num_samples=8)
-    planner = nbv.Planner(nbv.Coverage(), search, camera, imagination, capacity=4096)
+    sampler = nbv.SurfaceSampler(grid=nbv.Grid(72), num_samples=8)
+    planner = nbv.Planner(nbv.Coverage(), search, camera, sampler, capacity=4096)
     first = nbv.look_at(setting.radius * FIRST.position / np.linalg.norm(FIRST.position))
     return nbv.simulate(planner, surface, first, views=views, key=jax.random.key(0))
 

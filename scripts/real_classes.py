@@ -2,7 +2,7 @@
 
     python scripts/real_classes.py FOLDER [--few 2] [--steps 300] [--out results.json]
 
-FOLDER holds a folder of meshes for each class, as `jaxnbv study modelnet10 --meshes` takes it. The first objects of
+FOLDER holds a folder of meshes for each class, as `jaxnbv study household --meshes` takes it. The first objects of
 each class, `few` of them where the class has more, tune the network, together with stand-ins so that it does not
 forget; the others test it. A cloud is of five random views with the sensor's noise, ten clouds an object; objects count
 alike, and their standard error is that over objects.
@@ -86,11 +86,11 @@ def main() -> None:
         tuned = train(network, clouds, labels, jax.random.key(1), arguments.steps, learning_rate=3e-4)
         results["tuned"] = told(tuned, rest, names)
     print(f"tuned on: {', '.join(results['tuned_on']) or 'none'}")
-    for evidence in ("as it is", "tuned"):
-        if evidence in results:
-            found = results[evidence]
+    for observations in ("as it is", "tuned"):
+        if observations in results:
+            found = results[observations]
             error = "" if found["error"] is None else f" ± {found['error']:.0%}"
-            print(f"{evidence}: {found['right']:.0%}{error} right of {found['objects']} objects")
+            print(f"{observations}: {found['right']:.0%}{error} right of {found['objects']} objects")
             for name, share in found["by_object"].items():
                 print(f"    {share:4.0%}  {name}")
     if arguments.out:

@@ -21,9 +21,9 @@ from training import calibrate, expected_calibration_error, fit, log_probabiliti
 from training_clouds import LabelledClouds, Source, concatenated
 
 from jaxnbv import Coverage, Grid, Planner, PointCloud
-from jaxnbv.imagination import Imagination
 from jaxnbv.networks import Focus, InvariantClassifier, save_checkpoint
 from jaxnbv.networks.pretrained import TRAINED_POINTS, TRAINED_SIDE
+from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.studies.scenes import (
     HOUSEHOLD,
     PATTERNS,
@@ -44,7 +44,7 @@ class Recipe(NamedTuple):
 
     - `objects`: the scenes and their classes.
     - `framings`: how large the objects stand.
-    - `solid`: whether they are nowhere thin, see `Imagination.preset`.
+    - `solid`: whether they are nowhere thin, see `SurfaceSampler.preset`.
     - `scenes`: of which there are true scans, in each framing; of 100 there are imagined ones, 16 each.
     - `groups`: of the network.
     - `focus`: steps of learning which points tell the class, where these are few; the classifier sees them alone.
@@ -69,9 +69,9 @@ RECIPES = {
 
 def source(name: str, framing: Framing, folder: Path) -> Source:
     """The clouds of a set's objects in a framing."""
-    preset = Imagination.preset("screened", framing.longest_side, solid=RECIPES[name].solid)
-    imagination = dataclasses.replace(preset, grid=Grid(64, 0.7 * framing.longest_side), num_samples=4)
-    planner = Planner(Coverage(), imagination=imagination, capacity=2500)
+    preset = SurfaceSampler.preset("screened", framing.longest_side, solid=RECIPES[name].solid)
+    sampler = dataclasses.replace(preset, grid=Grid(64, 0.7 * framing.longest_side), num_samples=4)
+    planner = Planner(Coverage(), sampler=sampler, capacity=2500)
     scene = functools.partial(RECIPES[name].objects.scene, framing=framing)
     return Source(folder / framing, scene, planner, TRAINED_POINTS[name], scale=TRAINED_SIDE / framing.longest_side)
 

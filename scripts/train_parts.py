@@ -17,9 +17,9 @@ from training import fit
 from training_clouds import LabelledClouds, Source, concatenated
 
 from jaxnbv import Coverage, Grid, Planner
-from jaxnbv.imagination import Imagination
 from jaxnbv.networks import CATEGORIES, CompactPartSegmenter, part_mask, save_checkpoint
 from jaxnbv.networks.pretrained import TRAINED_SIDE
+from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning.sensors import PART_SETTING
 from jaxnbv.studies.scenes import Split, part_scene
 
@@ -76,8 +76,8 @@ def main() -> None:
     parser.add_argument("--weights", type=Path, default=WEIGHTS)
     arguments = parser.parse_args()
     folder: Path = arguments.out
-    imagination = dataclasses.replace(Imagination.preset(), grid=Grid(64), num_samples=4)
-    planner = Planner(Coverage(), camera=PART_SETTING.camera, imagination=imagination, capacity=2500)
+    sampler = dataclasses.replace(SurfaceSampler.preset(), grid=Grid(64), num_samples=4)
+    planner = Planner(Coverage(), camera=PART_SETTING.camera, sampler=sampler, capacity=2500)
     source = Source(folder, part_scene, planner, setting=PART_SETTING, scale=2.0 / TRAINED_SIDE)
 
     clouds = concatenated(source.scanned(Split.TRAIN, 6000), source.imagined(Split.TRAIN, 130))

@@ -156,8 +156,8 @@ def _scanned(things: Thing, keys: Key[Array, " scenes"], num_points: int, settin
 def _imagined(thing: Thing, key: PRNGKeyArray, planner: Planner, num_points: int, setting: Setting) -> LabelledClouds:
     key, sample_key, pose_key = jax.random.split(key, 3)
     views, poses, count, pixels = _partial_views(thing, key, MOST_VIEWS - 1, setting)
-    *_, evidence = planner.replay((poses[i], views[i], setting.camera) for i in range(MOST_VIEWS - 1))
-    surfaces = planner.imagination.sample(evidence, sample_key)
+    *_, observations = planner.replay((poses[i], views[i], setting.camera) for i in range(MOST_VIEWS - 1))
+    surfaces = planner.sampler.sample(observations, sample_key)
     seen = limit_capacity(joined_views(views), num_points)
 
     def of_sample(surface_and_key):
@@ -165,7 +165,7 @@ def _imagined(thing: Thing, key: PRNGKeyArray, planner: Planner, num_points: int
         scans = scan(surface, setting.camera, random_poses(pose_key, _POSES, setting.radius))
         return jax.lax.map(lambda one: farthest_point_subsample(concatenate(seen, one), num_points), scans)
 
-    keys = jax.random.split(pose_key, planner.imagination.num_samples)
+    keys = jax.random.split(pose_key, planner.sampler.num_samples)
     clouds = jax.lax.map(of_sample, (surfaces, keys))
     clouds = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), clouds)
     label, count, pixels, imagined = (

@@ -61,8 +61,8 @@ def chosen_of_bank(indices):
     return BANK.chosen(indices)
 
 
-def knowing(bank, poses):
-    return nbv.Imagination().knowing(bank, poses)
+def with_bank(bank, poses):
+    return nbv.SurfaceSampler().with_bank(bank, poses)
 
 
 # What is called, and arguments that work; each is replaced in turn.
@@ -96,14 +96,14 @@ CALLS = {
     | {"initial": 0.0},
     nbv.HostClassifier: {"function": number_of_points, "num_classes": 3},
     nbv.HostSegmenter: {"function": number_of_points, "num_parts": 3},
-    nbv.Imagination: {"model": MODEL, "grid": nbv.Grid(8), "num_samples": 2, "carving": nbv.Carving()}
-    | {"surroundings": None},
-    nbv.Imagination.preset: {"name": "paper", "longest_side": 2.5, "quick": True, "volume": None, "solid": False},
+    nbv.SurfaceSampler: {"model": MODEL, "grid": nbv.Grid(8), "num_samples": 2, "carving": nbv.Carving()}
+    | {"obstacles": None},
+    nbv.SurfaceSampler.preset: {"name": "paper", "longest_side": 2.5, "quick": True, "volume": None, "solid": False},
     nbv.MixedEntropy: {"classifier": number_of_points, "threshold": 0.5, "num_points": 16},
     nbv.OnSurface: {"num_points": 10, "noise": 0.1},
     nbv.OutsideBoundary: {"volume": nbv.Box(), "num_points": 10, "value": 1.0, "noise": 0.5},
     nbv.Planner: {"acquisition": nbv.Coverage(), "search": nbv.DiscreteSearch(6), "camera": SMALL}
-    | {"imagination": nbv.Imagination(MODEL, nbv.Grid(8), 2), "cost": None, "capacity": 32, "max_views": 3},
+    | {"sampler": nbv.SurfaceSampler(MODEL, nbv.Grid(8), 2), "cost": None, "capacity": 32, "max_views": 3},
     nbv.PointCloud.from_arrays: {"points": DIRECTIONS, "normals": DIRECTIONS, "capacity": 32},
     nbv.PointCloud.from_depth: {"depth": np.ones((4, 4)), "camera": SMALL, "pose": POSE}
     | {"depth_scale": 1.0, "stride": 2, "box": nbv.Box()},
@@ -114,7 +114,7 @@ CALLS = {
     nbv.ScreenedSPSR: {"base": MODEL, "values": (nbv.OnSurface(),), "level_deviation": 0.5, "offset": 0.1},
     nbv.SeenEmpty: {"num_points": 10, "value": 2.0, "noise": 1.0},
     nbv.SensorNoise: {"points": 0.01, "normals": 0.01},
-    nbv.Several: {"members": (nbv.Coverage(),)},
+    nbv.AcquisitionList: {"members": (nbv.Coverage(),)},
     nbv.SoftPartCount: {"segmenter": number_of_points, "target": 60.0},
     nbv.TieBreakSearch: {"candidates": 6, "second": nbv.Coverage()},
     nbv.SphereCandidates: {"count": 6, "radius": 2.5, "min_elevation": 0.0, "up": (0.0, 1.0, 0.0)},
@@ -125,9 +125,9 @@ CALLS = {
     chosen_of_bank: {"indices": [0]},
     nbv.AsGiven: {"scale": (0.9, 1.1), "by_axis": False},
     nbv.FreeRotation: {"scale": (0.9, 1.1), "by_axis": False},
-    knowing: {"bank": BANK, "poses": nbv.Upright()},
+    with_bank: {"bank": BANK, "poses": nbv.Upright()},
     nbv.KnownShapes: {"bank": BANK, "residual": RESIDUAL, "poses": nbv.Upright(), "box": nbv.Box(), "unknown": MODEL}
-    | {"num_starts": 8, "noise_scale": 0.1, "sharpness": 20.0, "unknown_misfit": 0.6},
+    | {"num_starts": 8, "noise_scale": 0.1, "inverse_temperature": 20.0, "misfit_of_none": 0.6},
     nbv.ShapeBank.from_meshes: {"meshes": [MESH], "resolution": 8, "sheet": 0.05, "names": ["a"], "progress": False},
     nbv.ShapeBank.of: {"solids": [BALL], "names": ["ball"]},
     nbv.Upright: {"axis": (0.0, 1.0, 0.0), "within": 1.0, "scale": (0.9, 1.1), "by_axis": False},

@@ -53,12 +53,12 @@ SEGMENTER, CLASSIFIER = (load_checkpoint(WEIGHTS / f"{name}.safetensors") for na
 
 
 def planner(acquisition=nbv.Coverage(), grid=nbv.Grid(12), max_views=4):  # noqa: B008
-    imagination = nbv.Imagination(MODEL, grid, num_samples=2)
-    return nbv.Planner(acquisition, nbv.DiscreteSearch(6), SMALL, imagination, capacity=64, max_views=max_views)
+    sampler = nbv.SurfaceSampler(MODEL, grid, num_samples=2)
+    return nbv.Planner(acquisition, nbv.DiscreteSearch(6), SMALL, sampler, capacity=64, max_views=max_views)
 
 
 P = planner()
-EVIDENCE = P.init(POSE, SCAN)
+OBSERVATIONS = P.init(POSE, SCAN)
 FULL = planner(max_views=1).init(POSE, SCAN)
 
 
@@ -90,7 +90,7 @@ class Deciding(nbv.Acquisition):
 
 def expected(acquisition):
     acquisition = nbv.Planner(acquisition).acquisition
-    surfaces = P.imagination.sample(CLOUD, KEY)
+    surfaces = P.sampler.sample(CLOUD, KEY)
     return nbv.expected_value(acquisition, CLOUD, surfaces, SMALL, POSES)
 
 
@@ -176,20 +176,20 @@ def nested(depth):
 
 
 BOAST = "OFF\n3 10000000 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
-NEVER = nbv.Imagination(MODEL, nbv.Grid(12), 2, nbv.Carving(lambda x: jnp.full(x.shape[:1], jnp.nan)))
+NEVER = nbv.SurfaceSampler(MODEL, nbv.Grid(12), 2, nbv.Carving(lambda x: jnp.full(x.shape[:1], jnp.nan)))
 
 # What is done, and some of what must be said.
 REFUSED = {
     "index beyond a batch": (lambda: POSES[6], "no index 6"),
     "iteration of a single pose": (lambda: list(POSE), "a single one"),
-    "evidence without room": (lambda: P.observe(FULL, POSE, SCAN), "max_views"),
-    "evidence of another grid's extent": (
-        lambda: planner(grid=nbv.Grid(12, 1.5)).propose(EVIDENCE, KEY),
+    "observations without room": (lambda: P.observe(FULL, POSE, SCAN), "max_views"),
+    "observations of another grid's extent": (
+        lambda: planner(grid=nbv.Grid(12, 1.5)).propose(OBSERVATIONS, KEY),
         "carved on Grid(resolution=12, half_extent=1.5)",
     ),
     "a map's coordinates": (lambda: nbv.Frame.fit(MAP).to_scene(nbv.PointCloud.from_arrays(MAP, D)), "rounded"),
     "points of the plane": (lambda: POSTERIOR.variance(D[:, :2]), "(60, 2)"),
-    "a grid beyond the torus": (lambda: nbv.Imagination(MODEL, nbv.Grid(12, 9.4)).mean_mesh(CLOUD), "9.4"),
+    "a grid beyond the torus": (lambda: nbv.SurfaceSampler(MODEL, nbv.Grid(12, 9.4)).mean_mesh(CLOUD), "9.4"),
     "a number as a mesh of a bank": (lambda: nbv.ShapeBank.from_meshes(["a.ply", 5]), "a mesh is 5"),
     "points beyond the torus": (lambda: POSTERIOR.probability_inside(10.0 * D), "9.978"),
     "nodes that are not finite": (lambda: POSTERIOR.sample(KEY, 2).on_grid(np.array([np.nan, 1.0])), "nan"),
@@ -202,12 +202,12 @@ REFUSED = {
     "a ragged image": (lambda: nbv.PointCloud.from_depth([[2.0] * 6] * 5 + [[1]], SMALL, POSE), "numbers"),
     "a batch of scans": (lambda: P.init(None, SCANS), "batch"),
     "a batch of poses": (lambda: P.init(POSES, SCAN), "batch"),
-    "no pose": (lambda: P.observe(EVIDENCE, None, SCAN), "None"),
-    "no evidence": (lambda: P.propose(None, KEY), "the evidence is None"),
-    "a cloud as what was chosen from": (lambda: P.choose(SCAN, None, KEY), "the evidence is a PointCloud"),
+    "no pose": (lambda: P.observe(OBSERVATIONS, None, SCAN), "None"),
+    "no observations": (lambda: P.propose(None, KEY), "the observations is None"),
+    "a cloud as what was chosen from": (lambda: P.choose(SCAN, None, KEY), "the observations is a PointCloud"),
     "a class as an acquisition": (lambda: planner(nbv.Coverage), "Coverage"),
-    "a number as a key": (lambda: P.propose(EVIDENCE, 0), "jax.random.key"),
-    "values of another grid": (lambda: P.imagination.carve(EVIDENCE, jnp.zeros((3, 3, 3))), "(3, 3, 3)"),
+    "a number as a key": (lambda: P.propose(OBSERVATIONS, 0), "jax.random.key"),
+    "values of another grid": (lambda: P.sampler.carve(OBSERVATIONS, jnp.zeros((3, 3, 3))), "(3, 3, 3)"),
     "a batch of first poses": (lambda: nbv.simulate(P, BALL, POSES, 1, KEY), "batch"),
     "rows that differ in number": (
         lambda: nbv.PointCloud(jnp.zeros((3, 3)), jnp.zeros((2, 3)), jnp.ones(3, bool)),
@@ -263,7 +263,7 @@ REFUSED = {
         lambda: session().add(np.full((6, 6), 9.0), SHOT[1]),
         "the first image shows nothing of the box",
     ),
-    "one score as several": (lambda: nbv.Several(nbv.Coverage()), "a tuple"),
+    "one score as several": (lambda: nbv.AcquisitionList(nbv.Coverage()), "a tuple"),
     "intrinsics of four rows": (lambda: nbv.Camera.from_intrinsics(np.eye(4), 6, 6), "(4, 4)"),
     "a rotation as a pose": (lambda: nbv.Pose.from_matrix(np.eye(3)), "(3, 3)"),
     "a target nowhere": (lambda: nbv.look_at((0, 0, 2), (np.nan, 0, 0)), "got target"),
@@ -291,7 +291,7 @@ REFUSED = {
         "intrinsic matrix",
     ),
     "a volume of no numbers": (
-        lambda: dataclasses.replace(P, imagination=NEVER).init(POSE, SCAN),
+        lambda: dataclasses.replace(P, sampler=NEVER).init(POSE, SCAN),
         "outside the volume",
     ),
     "a volume of one number": (lambda: nbv.Carving(lambda x: jnp.sum(x)), "one number a point"),

@@ -18,5 +18,5 @@ def planner_of(
     grid=nbv.Grid(24),  # noqa: B008
     **changes,
 ):
-    imagination = nbv.Imagination(model, grid, num_samples)
-    return nbv.Planner(score, search, CAMERA, imagination, cost, **{"capacity": 128, "max_views": 6, **changes})
+    sampler = nbv.SurfaceSampler(model, grid, num_samples)
+    return nbv.Planner(score, search, CAMERA, sampler, cost, **{"capacity": 128, "max_views": 6, **changes})

@@ -4,10 +4,10 @@ import numpy as np
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose, look_at
-from jaxnbv.imagination import Imagination
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.session import Session
-from jaxnbv.scanning import Grid, SDFSurface, Surroundings, scan
+from jaxnbv.sampler import SurfaceSampler
+from jaxnbv.scanning import Grid, Obstacles, SDFSurface, scan
 from jaxnbv.scanning.sdf import Cuboid, Sphere
 from jaxnbv.search import DiscreteSearch
 from jaxnbv.surfaces import GeometricSPSR
@@ -38,11 +38,11 @@ def shot(matrix, unit=1000.0):
 
 
 def planner_of(search=DiscreteSearch(), num_samples=3, capacity=400):  # noqa: B008
-    imagination = Imagination(GeometricSPSR(0.2, truncation=8), Grid(28), num_samples)
-    return Planner(Coverage(), search, Camera(height=12, width=16), imagination, capacity=capacity, max_views=8)
+    sampler = SurfaceSampler(GeometricSPSR(0.2, truncation=8), Grid(28), num_samples)
+    return Planner(Coverage(), search, Camera(height=12, width=16), sampler, capacity=capacity, max_views=8)
 
 
 def session_of(folder=None, **changes):
-    told = {"surroundings": Surroundings(), "poses": POSES, "folder": folder}
+    told = {"obstacles": Obstacles(), "poses": POSES, "folder": folder}
     settings = {"camera": CAMERA, "box": BOX, "up": "z", **told, **changes}
     return Session(**{"planner": planner_of(), **settings})

@@ -114,13 +114,15 @@ class Vector(Toy):
 
 def test_several_acquisitions_of_the_same_scans_are_each_that_of_its_own(surfaces, cloud):
     acquisitions = (Toy(), Vector(), nbv.ExpectedUtilityImprovement(height))
-    found = nbv.expected_value(nbv.Several(acquisitions), cloud, surfaces, CAMERA, POSES)
+    found = nbv.expected_value(nbv.AcquisitionList(acquisitions), cloud, surfaces, CAMERA, POSES)
     toy, improvement = (nbv.expected_value(acquisitions[i], cloud, surfaces, CAMERA, POSES) for i in (0, 2))
     np.testing.assert_allclose(found, jnp.stack([toy, toy, -toy, improvement], axis=1), rtol=1e-6)
     assert float(jnp.ptp(toy)) > 0 < float(jnp.ptp(improvement))
-    assert nbv.Several(acquisitions).batch_size == min(acquisition.batch_size for acquisition in acquisitions)
+    assert nbv.AcquisitionList(acquisitions).batch_size == min(acquisition.batch_size for acquisition in acquisitions)
     with pytest.raises(nbv.InputError, match="it must be finite"):
-        nbv.Several((Toy(), nbv.ExpectedUtilityImprovement(lambda cloud: jnp.nan * cloud.points.sum()))).check(cloud)
+        nbv.AcquisitionList((Toy(), nbv.ExpectedUtilityImprovement(lambda cloud: jnp.nan * cloud.points.sum()))).check(
+            cloud
+        )
 
 
 class Highest(eqx.Module):
@@ -198,10 +200,10 @@ def test_all_products_have_full_precision(model, search):
     def step(angle, key):
         solid = Sphere(0.5).translate((0.1, 0.0, 0.0)).rotate((1.0, 2.0, 3.0), angle)
         planner = nbv.Planner(
-            ACQUISITIONS["classes"], search, CAMERA, nbv.Imagination(model, nbv.Grid(16), 2), capacity=64
+            ACQUISITIONS["classes"], search, CAMERA, nbv.SurfaceSampler(model, nbv.Grid(16), 2), capacity=64
         )
-        evidence = planner.init(first, scan(nbv.SDFSurface(solid), CAMERA, first))
-        return planner.propose(planner.observe(evidence, first, scan(nbv.SDFSurface(solid), CAMERA, first)), key)
+        observations = planner.init(first, scan(nbv.SDFSurface(solid), CAMERA, first))
+        return planner.propose(planner.observe(observations, first, scan(nbv.SDFSurface(solid), CAMERA, first)), key)
 
     program = str(jax.make_jaxpr(step)(0.3, jax.random.key(0)))
     assert program.count("dot_general[") == program.count("precision=(Precision.HIGHEST, Precision.HIGHEST)") > 20

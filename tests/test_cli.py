@@ -75,9 +75,9 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
     result = run_command(*arguments, *named, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     config = json.loads((tmp_path / "mine" / "episode.json").read_text())["config"]
-    imagination = config["planner"]["imagination"]
-    assert imagination["model"]["type"] == {"screened": "ScreenedSPSR", "paper": "GeometricSPSR"}[model]
-    assert (imagination["carving"] is None) == (model == "paper")
+    sampler = config["planner"]["sampler"]
+    assert sampler["model"]["type"] == {"screened": "ScreenedSPSR", "paper": "GeometricSPSR"}[model]
+    assert (sampler["carving"] is None) == (model == "paper")
     with np.load(tmp_path / "mine" / "view_01.npz") as view:
         positions, values = view["proposal.candidates.position"], view["proposal.values"]
         if "proposal.trajectories.values" in view:

@@ -28,7 +28,7 @@ SMALL = {
 scenes = 3
 settings = {
     "views": 2,
-    "imagination": nbv.Imagination(nbv.GeometricSPSR(0.05, truncation=8)),
+    "sampler": nbv.SurfaceSampler(nbv.GeometricSPSR(0.05, truncation=8)),
     "num_samples": 2,
     "num_candidates": 8,
     "grid_resolution": 24,

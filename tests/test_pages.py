@@ -38,14 +38,14 @@ def smaller(planner_of=nbv.Planner):
 
     def make(*given, **named):
         planner = planner_of(*given, **named)
-        model = planner.imagination.model
+        model = planner.sampler.model
         if isinstance(model, nbv.ScreenedSPSR):
             model = dataclasses.replace(model, base=SMALL)
         elif isinstance(model, nbv.GeometricSPSR):
             model = SMALL
-        imagination = dataclasses.replace(planner.imagination, model=model, grid=nbv.Grid(24), num_samples=2)
+        sampler = dataclasses.replace(planner.sampler, model=model, grid=nbv.Grid(24), num_samples=2)
         camera = nbv.Camera(height=12, width=12)
-        return dataclasses.replace(planner, imagination=imagination, capacity=512, camera=camera)
+        return dataclasses.replace(planner, sampler=sampler, capacity=512, camera=camera)
 
     return make
 
@@ -137,7 +137,7 @@ def test_the_script_of_the_readme_runs(tmp_path, monkeypatch):
     exec(compile(script, "README.md", "exec"), given)
     assert len(given["episode"].views) == 2
     assert given["fields"](given["x"]).shape == (16, 5)
-    assert int(given["evidence"].num_views) == 2
+    assert int(given["observations"].num_views) == 2
     assert (tmp_path / "runs" / "spot" / "cloud.ply").exists()
 
 
@@ -172,7 +172,7 @@ def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
         nbv.NewSurface(),
         search,
         nbv.Camera(height=18, width=24),
-        nbv.Imagination(model, grid=nbv.Grid(40), num_samples=2),
+        nbv.SurfaceSampler(model, grid=nbv.Grid(40), num_samples=2),
         capacity=2048,
     )
     monkeypatch.setattr("jaxnbv.planning.session.usual_planner", lambda: planner)
@@ -208,8 +208,8 @@ def test_the_block_for_a_recording_runs(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_the_block_for_a_depth_camera_runs(monkeypatch):
     pose = nbv.look_at((0.6, -0.6, 0.4), (0.0, 0.0, 0.1), up=(0.0, 0.0, 1.0))
-    imagination = nbv.Imagination(nbv.GeometricSPSR(0.05, 0.2, 8), grid=nbv.Grid(24), num_samples=2)
-    small = nbv.Planner(nbv.NewSurface(), nbv.DiscreteSearch(12), nbv.Camera(height=12, width=12), imagination)
+    sampler = nbv.SurfaceSampler(nbv.GeometricSPSR(0.05, 0.2, 8), grid=nbv.Grid(24), num_samples=2)
+    small = nbv.Planner(nbv.NewSurface(), nbv.DiscreteSearch(12), nbv.Camera(height=12, width=12), sampler)
     monkeypatch.setattr(nbv, "Planner", lambda *_: small)
     given = {
         "nbv": nbv,

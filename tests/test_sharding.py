@@ -43,15 +43,15 @@ PROGRAM = """
     camera, first, key = nbv.Camera(height=12, width=12), nbv.look_at((0.3, 1.0, 2.3)), jax.random.key(1)
     # Few values, since each device solves for all of them.
     model = nbv.ScreenedSPSR(nbv.GeometricSPSR(0.05, truncation=8), (nbv.OutsideBoundary(num_points=40),))
-    imagination = nbv.Imagination(model, nbv.Grid(24), num_samples=9)
-    planner = nbv.Planner(nbv.NewSurface(), nbv.DiscreteSearch(20), camera, imagination, capacity=64)
+    sampler = nbv.SurfaceSampler(model, nbv.Grid(24), num_samples=9)
+    planner = nbv.Planner(nbv.NewSurface(), nbv.DiscreteSearch(20), camera, sampler, capacity=64)
     halving = dataclasses.replace(planner, search=nbv.HalvingSearch(20))
-    evidence = planner.init(first, nbv.scan(nbv.SDFSurface(nbv.sdf.Sphere(0.8)), camera, first))
+    observations = planner.init(first, nbv.scan(nbv.SDFSurface(nbv.sdf.Sphere(0.8)), camera, first))
     found = []
     for devices in (1, 8):
         with on(devices):
-            surfaces = planner.sample(evidence, key)
-            found.append([one.choose(evidence, surfaces, key) for one in (planner, halving)])
+            surfaces = planner.sample(observations, key)
+            found.append([one.choose(observations, surfaces, key) for one in (planner, halving)])
     for alone, together in zip(*found, strict=True):
         assert len(together.value.sharding.device_set) == 8
         np.testing.assert_allclose(together.values, alone.values, rtol=1e-5)

@@ -145,7 +145,7 @@ def view(
 
     episode, page = Episode.load(folder), LiveView(port)
     if known is not None:
-        planner = dataclasses.replace(episode.planner, imagination=imagined("screened", False, known))
+        planner = dataclasses.replace(episode.planner, sampler=imagined("screened", False, known))
         episode = dataclasses.replace(episode, planner=planner)
     try:
         page.update(episode)

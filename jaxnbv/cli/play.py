@@ -25,17 +25,17 @@ from jaxnbv.cli.options import Asked, Position
 from jaxnbv.cli.registry import STOPS
 from jaxnbv.cli.tasks import Shown
 from jaxnbv.geometry.pose import Pose, look_at
-from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import Episode, Step, simulate
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Budget, ValueBelow
+from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, Surface, TriangleMesh
 from jaxnbv.scanning.sensors import Setting
 from jaxnbv.search import Search, SphereCandidates, TieBreakSearch
 from jaxnbv.studies.engine import searches
 from jaxnbv.studies.scenes.banks import KINDS, bank_poses, shape_bank
 from jaxnbv.surfaces import ShapeBank, Upright
-from jaxnbv.tasks import Coverage, Covered, Found, Stop, Sure
+from jaxnbv.tasks import Coverage, Covered, Found, StopRule, Sure
 from jaxnbv.viz.task import race_words
 
 
@@ -54,7 +54,7 @@ USUAL, QUICK = Sizes(16, None, 8192), Sizes(4, 40, 1024, Grid(56), 24)
 DEMO = Sizes(16, 60, 2048)
 # Views of the baseline that races the demo, at most.
 _RACE_VIEWS = 10
-RULES: dict[str, Callable[[float], Stop]] = {
+RULES: dict[str, Callable[[float], StopRule]] = {
     "sure": Sure,
     "found": lambda points: Found(int(points)),
     "covered": Covered,
@@ -65,7 +65,7 @@ RULES: dict[str, Callable[[float], Stop]] = {
 """What the rules of `--until` stand for."""
 
 
-def rule(texts: Sequence[str]) -> Stop | None:
+def rule(texts: Sequence[str]) -> StopRule | None:
     """The rule that some options make together, "sure=0.95" say; None for none, or "never".
 
     **Raises:** `ValueError` for a name that is not known, or what is no number.
@@ -91,32 +91,32 @@ def search_of(name: str, radius: float, count: int) -> Search:
     return searches.search_of(name, candidates, count, radius, num_starts=6, iterations=20)
 
 
-def imagined(model: str, quick: bool, known: str | None) -> Imagination:
+def imagined(model: str, quick: bool, known: str | None) -> SurfaceSampler:
     """The surfaces of a model's name, by one who knows the shapes of a bank that ships, or upright ones of a folder of
     meshes; none of None or "none".
 
     **Raises:** `ValueError` if there is no such bank or folder, or no mesh in it that can be used.
     """
-    imagination = Imagination.preset(model, quick=quick)
+    sampler = SurfaceSampler.preset(model, quick=quick)
     if known in (None, "none"):
-        return imagination
+        return sampler
     if known in KINDS:
-        return imagination.knowing(shape_bank(known), bank_poses(known))
+        return sampler.with_bank(shape_bank(known), bank_poses(known))
     require(
         os.path.isdir(known), f"--known {known}: there is no such folder of meshes; or give {', '.join(KINDS)}, none"
     )
-    return imagination.knowing(ShapeBank.from_meshes(known), Upright(by_axis=True))
+    return sampler.with_bank(ShapeBank.from_meshes(known), Upright(by_axis=True))
 
 
 def planner_of(
-    setting: Setting, acquisition: Acquisition, search: str, imagination: Imagination, sizes: Sizes
+    setting: Setting, acquisition: Acquisition, search: str, sampler: SurfaceSampler, sizes: Sizes
 ) -> Planner:
     """A planner of a task."""
-    grid = sizes.grid or imagination.grid
-    imagination = dataclasses.replace(imagination, grid=grid, num_samples=sizes.samples)
+    grid = sizes.grid or sampler.grid
+    sampler = dataclasses.replace(sampler, grid=grid, num_samples=sizes.samples)
     found = search_of(search, setting.radius, sizes.candidates or setting.num_candidates)
     camera = setting.camera if sizes.rays is None else setting.camera.resized(sizes.rays, sizes.rays)
-    return Planner(acquisition, found, camera, imagination, capacity=sizes.capacity)
+    return Planner(acquisition, found, camera, sampler, capacity=sizes.capacity)
 
 
 def first_pose(place: Position, surface: Surface) -> Pose:
@@ -144,8 +144,8 @@ def play(asked: Asked, shown: Shown, setting: Setting, sizes: Sizes) -> None:
         typer.echo(shown.note)
     # The paper's model knows no shapes.
     usual = "none" if asked.model == "paper" else shown.bank
-    imagination = dataclasses.replace(imagined(asked.model, asked.quick, asked.known or usual), grid=shown.grid)
-    planner = planner_of(setting, shown.acquisition, asked.search, imagination, sizes)
+    sampler = dataclasses.replace(imagined(asked.model, asked.quick, asked.known or usual), grid=shown.grid)
+    planner = planner_of(setting, shown.acquisition, asked.search, sampler, sizes)
     parts = shown.name, asked.task, asked.search, *(() if asked.model == "screened" else (asked.model,))
     folder = asked.out or Path("runs") / re.sub(r"[^A-Za-z0-9_.-]", "_", f"{'-'.join(parts)}-seed{asked.seed}")
     enough = rule(asked.until or shown.until)
@@ -163,7 +163,7 @@ def play(asked: Asked, shown: Shown, setting: Setting, sizes: Sizes) -> None:
             drawn.append(beside.submit(sketches.add, step))
         # Not before the first view: both would compile what that needs.
         if race is None and races:
-            rival = planner_of(setting, shown.acquisition, "farthest", imagination, sizes)
+            rival = planner_of(setting, shown.acquisition, "farthest", sampler, sizes)
             of_rival = (shown.surface, shown.first, _RACE_VIEWS, key, noise, folder / "farthest")
             race = beside.submit(simulate, rival, *of_rival, progress=False, until=enough)
 

@@ -15,16 +15,17 @@ from jaxnbv.checks import check_key, check_type, checked, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.observations import Observations
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Watch
 from jaxnbv.progress import progress_bar
-from jaxnbv.scanning import Evidence, GridSurface, Noise, SensorNoise, Surface, Surroundings, as_surface, scan
+from jaxnbv.scanning import GridSurface, Noise, Obstacles, SensorNoise, Surface, as_surface, scan
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.search import Proposal
 from jaxnbv.storage import RunFolder, describe
 from jaxnbv.storage.folders import read_record
 from jaxnbv.surfaces import SurfacePosterior
-from jaxnbv.tasks import Coverage, Stop
+from jaxnbv.tasks import Coverage, StopRule
 
 
 class View(eqx.Module):
@@ -64,18 +65,18 @@ class Episode(eqx.Module):
         """D after the last view, in scene coordinates."""
         return self.views[-1].cloud
 
-    def evidence(self) -> Iterator[Evidence]:
+    def observations(self) -> Iterator[Observations]:
         """What the planner knows after each view, made again from the scans."""
         return self.planner.replay((view.pose, view.scan, view.camera) for view in self.views)
 
-    def evidence_after(self, views: int) -> Evidence:
+    def observations_after(self, views: int) -> Observations:
         """What the planner knows after so many of the views.
 
         **Raises:** `ValueError` unless there are so many, and at least one.
         """
         check_type(views, int, "the number of views")
         require(1 <= views <= len(self.views), f"asked for {views} of {len(self.views)} views; ask for one at least")
-        return next(itertools.islice(self.evidence(), views - 1, None))
+        return next(itertools.islice(self.observations(), views - 1, None))
 
     @classmethod
     def load(cls, path: str | Path) -> "Episode":
@@ -91,8 +92,8 @@ class Episode(eqx.Module):
         planner = Planner(Coverage(), camera=Camera(**camera | {"center": tuple(camera["center"])}))
         after = planner.replay((pose, scan) for pose, scan, _ in views)
         shown = tuple(
-            View(pose, scan, evidence.cloud, proposal, planner.camera)
-            for (pose, scan, proposal), evidence in zip(views, after, strict=True)
+            View(pose, scan, observations.cloud, proposal, planner.camera)
+            for (pose, scan, proposal), observations in zip(views, after, strict=True)
         )
         return cls(planner, None, None, views[0][0], jax.random.key(0), shown)
 
@@ -138,7 +139,7 @@ def simulate(
     noise: Noise = SensorNoise(),
     folder: str | Path | None = None,
     progress: bool = True,
-    until: Stop | None = None,
+    until: StopRule | None = None,
     each: Callable[["Step"], None] | None = None,
 ) -> Episode:
     """Scan a known surface, or solid, from `first`, then from the views that the planner asks for: `views` in all, or
@@ -177,7 +178,7 @@ def simulate(
                 bar.update(index * len(STAGES) + STAGES.index(stage) - bar.n)
 
             def sensor(pose: Pose, key: PRNGKeyArray) -> PointCloud:
-                return observe_scene(scene, planner.camera, pose, noise, key, planner.imagination.surroundings)
+                return observe_scene(scene, planner.camera, pose, noise, key, planner.sampler.obstacles)
 
             watch = None if until is None else Watch(until, planner.acquisition)
             episode = steps(planner, sensor, first, key, done=done, begin=begin, watch=watch)
@@ -203,18 +204,18 @@ STAGES = ("sampling surfaces", "searching", "scanning")
 
 
 class Basis(NamedTuple):
-    """What a view was chosen by: the evidence before it, the posterior given that, and the step's samples."""
+    """What a view was chosen by: the observations before it, the posterior given that, and the step's samples."""
 
-    evidence: Evidence
+    observations: Observations
     posterior: SurfacePosterior
     surfaces: GridSurface
 
     @classmethod
-    def of(cls, planner: Planner, evidence: Evidence, key: PRNGKeyArray) -> "Basis":
+    def of(cls, planner: Planner, observations: Observations, key: PRNGKeyArray) -> "Basis":
         """Of the next step, once it is computed."""
-        posterior = planner.imagination.posterior(evidence)
-        surfaces = planner.imagination.sample(evidence, key, posterior)
-        return cls(evidence, posterior, jax.block_until_ready(surfaces))
+        posterior = planner.sampler.posterior(observations)
+        surfaces = planner.sampler.sample(observations, key, posterior)
+        return cls(observations, posterior, jax.block_until_ready(surfaces))
 
 
 class Step(NamedTuple):
@@ -225,7 +226,7 @@ class Step(NamedTuple):
     """
 
     view: View
-    evidence: Evidence
+    observations: Observations
     basis: Basis | None
     seconds: float
 
@@ -253,7 +254,7 @@ def steps(
     **Raises:** `ValueError` as `Planner.init`, `propose` and `observe` do; among others when every candidate has been
     visited.
     """
-    known, evidence = iter(done), None
+    known, observations = iter(done), None
     poses: list[Pose] = []
     for index in range(planner.max_views):
         sample_key, search_key, noise_key = view_keys(key, index)
@@ -262,27 +263,29 @@ def steps(
             pose, seen, proposal = taken
         else:
             pose, proposal = first, None
-            if evidence is not None:
-                if watch and watch.ends(planner, evidence, poses, sample_key):
+            if observations is not None:
+                if watch and watch.ends(planner, observations, poses, sample_key):
                     return
                 if planner.search.uses_samples:
                     begin(index, STAGES[0])
-                    basis = Basis.of(planner, evidence, sample_key)
+                    basis = Basis.of(planner, observations, sample_key)
                 begin(index, STAGES[1])
                 start = time.perf_counter()
                 sampled = None if basis is None else basis.surfaces
-                proposal = jax.block_until_ready(planner.choose(evidence, sampled, search_key))
+                proposal = jax.block_until_ready(planner.choose(observations, sampled, search_key))
                 pose, seconds = proposal.pose, time.perf_counter() - start
-                if watch and watch.ends(planner, evidence, poses, sample_key, proposal):
+                if watch and watch.ends(planner, observations, poses, sample_key, proposal):
                     return
             begin(index, STAGES[2])
             seen = sensor(pose, noise_key)
-        if evidence is None:
-            evidence = planner.init(pose, seen, camera)
+        if observations is None:
+            observations = planner.init(pose, seen, camera)
         else:
-            evidence = planner.observe(evidence, pose, seen, camera)
+            observations = planner.observe(observations, pose, seen, camera)
         poses.append(pose)
-        yield Step(View(pose, seen, evidence.cloud, proposal, camera or planner.camera), evidence, basis, seconds)
+        yield Step(
+            View(pose, seen, observations.cloud, proposal, camera or planner.camera), observations, basis, seconds
+        )
 
 
 def view_keys(key: PRNGKeyArray, index: int) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:
@@ -298,10 +301,10 @@ def observe_scene(
     pose: Pose,
     noise: Noise,
     key: PRNGKeyArray,
-    surroundings: Surroundings | None = None,
+    obstacles: Obstacles | None = None,
 ) -> PointCloud:
     """A noisy scan of the true surface, past what stands around it; compiled where the surface allows it."""
-    barrier = None if surroundings is None else _barrier(surroundings, camera, pose)
+    barrier = None if obstacles is None else _barrier(obstacles, camera, pose)
     observe = _noisy_scan_in_jit if scene.in_jit else _noisy_scan
     return observe(scene, camera, pose, barrier, noise, key)
 
@@ -317,4 +320,4 @@ def _noisy_scan(
     return noise(scan(scene, camera, pose, barrier), key, camera, pose)
 
 
-_noisy_scan_in_jit, _barrier = eqx.filter_jit(_noisy_scan), eqx.filter_jit(Surroundings.barrier)
+_noisy_scan_in_jit, _barrier = eqx.filter_jit(_noisy_scan), eqx.filter_jit(Obstacles.barrier)

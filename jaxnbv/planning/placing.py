@@ -12,7 +12,7 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Surroundings
+from jaxnbv.scanning import Obstacles
 from jaxnbv.scanning.sdf import HalfSpace
 from jaxnbv.search import CandidateSearch, GivenPoses, HalvingSearch, SphereCandidates
 from jaxnbv.tasks import NewSurface
@@ -39,18 +39,16 @@ def stride_of(camera: Camera) -> int:
     return math.ceil(math.sqrt(camera.num_rays / _MOST_RAYS))
 
 
-def placed(
-    planner: Planner, camera: Camera, box: Box, poses: Pose | None, surroundings: Surroundings | None
-) -> Planner:
+def placed(planner: Planner, camera: Camera, box: Box, poses: Pose | None, obstacles: Obstacles | None) -> Planner:
     """A planner at a sensor, all in scene coordinates: see `Session`.
 
     - `poses`: where the search may look from, or None for its own candidates.
 
     **Raises:** `ValueError` if the search does not choose among poses.
     """
-    imagination, search = planner.imagination.within(box), planner.search
-    if surroundings is not None:
-        imagination = dataclasses.replace(imagination, surroundings=surroundings)
+    sampler, search = planner.sampler.within(box), planner.search
+    if obstacles is not None:
+        sampler = dataclasses.replace(sampler, obstacles=obstacles)
     if poses is not None:
         if not isinstance(search, CandidateSearch):
             raise InputError(
@@ -61,18 +59,18 @@ def placed(
     elif isinstance(search, CandidateSearch) and isinstance(search.candidates, SphereCandidates):
         search = dataclasses.replace(search, candidates=search.candidates.upper_half)
     camera = camera.resized(planner.camera.height, planner.camera.width)
-    return dataclasses.replace(planner, camera=camera, search=search, imagination=imagination)
+    return dataclasses.replace(planner, camera=camera, search=search, sampler=sampler)
 
 
 def on_support(planner: Planner, plane: HalfSpace | None, frame: Frame) -> Planner:
-    """The planner with the plane that the object stands on among its surroundings, told of by a warning in world units;
-    with surroundings that hold nothing but the points that were seen, if there is none."""
+    """The planner with the plane that the object stands on among its obstacles, told of by a warning in world units;
+    with obstacles that hold nothing but the points that were seen, if there is none."""
     if plane is not None:
         place = np.round(frame.to_world(np.asarray(plane.point, np.float64)), 4).tolist()
         warnings.warn(
             f"the object stands on a plane through {place}, which goes on beyond the box: it is taken for a table and "
-            "left out. Give surroundings=Surroundings() to keep it",
+            "left out. Give obstacles=Obstacles() to keep it",
             stacklevel=5,
         )
-    around = Surroundings(() if plane is None else (plane,))
-    return dataclasses.replace(planner, imagination=dataclasses.replace(planner.imagination, surroundings=around))
+    around = Obstacles(() if plane is None else (plane,))
+    return dataclasses.replace(planner, sampler=dataclasses.replace(planner.sampler, obstacles=around))

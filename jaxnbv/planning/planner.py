@@ -13,9 +13,10 @@ from jaxnbv.checks import check_fields, check_key, check_type, functions_of_user
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.imagination import Imagination
+from jaxnbv.observations import Observations
 from jaxnbv.planning.travel import ValuePerCost
-from jaxnbv.scanning import Evidence, GridSurface, mean_depth
+from jaxnbv.sampler import SurfaceSampler
+from jaxnbv.scanning import GridSurface, mean_depth
 from jaxnbv.search import DiscreteSearch, Problem, Proposal, Search
 
 # Functions are converted on the way in, which mypy cannot see.
@@ -26,18 +27,18 @@ else:
 
 
 class Planner(eqx.Module):
-    """Bayesian next-best-view selection (the paper's Algorithm 1) as ask/tell over immutable evidence.
+    """Bayesian next-best-view selection (the paper's Algorithm 1) as ask/tell over immutable observations.
 
     - `acquisition`: what a view is worth. A plain function of a cloud is taken as a utility to improve.
     - `search`: how the pose that is expected to be worth most is found.
     - `camera`: the sensor whose scans are imagined.
-    - `imagination`: the surfaces that are held possible given the evidence.
+    - `sampler`: the surfaces that are held possible given the observations.
     - `cost`: of going from the last view to the next; None where it does not count.
     - `capacity`: points of D that are kept, by farthest point sampling beyond it.
-    - `max_views`: views for which evidence has room.
+    - `max_views`: views for which observations have room.
 
     All methods are pure and run under `jit`. A planner compiles at its first two views, and nothing after them.
-    A cloud alone, of no known pose, is evidence too.
+    A cloud alone, of no known pose, is observations too.
 
     **Raises:** `ValueError` for numbers below one, and if the search cannot work with the acquisition or the camera: a
     gradient search with an acquisition that JAX cannot differentiate, say.
@@ -46,7 +47,7 @@ class Planner(eqx.Module):
     acquisition: AnyAcquisition = eqx.field(converter=as_acquisition)
     search: Search = DiscreteSearch()
     camera: Camera = Camera()
-    imagination: Imagination = eqx.field(default_factory=Imagination)
+    sampler: SurfaceSampler = eqx.field(default_factory=SurfaceSampler)
     cost: ValuePerCost | None = None
     capacity: int = eqx.field(static=True, default=8192)
     max_views: int = eqx.field(static=True, default=32)
@@ -58,7 +59,7 @@ class Planner(eqx.Module):
             require(value >= 1, f"{name} is {value}; it must be at least 1")
         self.search.check(self.acquisition, self.camera, self.capacity)
         require(
-            self.cost is None or self.search.weighs_cost,
+            self.cost is None or self.search.uses_cost,
             f"{type(self.search).__name__} does not look at the value of a view, so its cost cannot count: leave cost "
             "out, or use another search",
         )
@@ -69,8 +70,8 @@ class Planner(eqx.Module):
         value = self.search.quantity(self.acquisition)
         return value if self.cost is None else self.cost.quantity(value)
 
-    def init(self, pose: Pose | None, scan: PointCloud, camera: Camera | None = None) -> Evidence:
-        """The evidence after a first scan, in scene coordinates, taken from `pose` (None where it is not known).
+    def init(self, pose: Pose | None, scan: PointCloud, camera: Camera | None = None) -> Observations:
+        """The observations after a first scan, in scene coordinates, taken from `pose` (None where it is not known).
 
         `camera`: the one that took the scan, by default the planner's.
 
@@ -82,89 +83,91 @@ class Planner(eqx.Module):
         another camera; and as the acquisition's `check` does.
         """
         camera = camera or self.camera
-        self.imagination.check(pose, scan, camera, first=True)
-        evidence = self.imagination.begin(scan, self.capacity, self.max_views)
-        if self.search.uses_samples and not is_traced(evidence):
-            self.acquisition.check(evidence.cloud)
-            self.imagination.model.check(evidence.cloud)
-        return evidence if pose is None else self.imagination.record(evidence, pose, scan, camera)
+        self.sampler.check(pose, scan, camera, first=True)
+        observations = self.sampler.begin(scan, self.capacity, self.max_views)
+        if self.search.uses_samples and not is_traced(observations):
+            self.acquisition.check(observations.cloud)
+            self.sampler.model.check(observations.cloud)
+        return observations if pose is None else self.sampler.record(observations, pose, scan, camera)
 
-    def propose(self, evidence: Evidence | PointCloud, key: PRNGKeyArray) -> Proposal:
+    def propose(self, observations: Observations | PointCloud, key: PRNGKeyArray) -> Proposal:
         """Ask: the pose to take next, and what the search looked at.
 
         **Raises:** `ValueError` if every candidate has been visited, and for a cloud as `init` does.
         """
         check_key(key)
-        evidence = self._known(evidence)
+        observations = self._known(observations)
         sample_key, search_key = jax.random.split(key)
-        return self.choose(evidence, self.sample(evidence, sample_key), search_key)
+        return self.choose(observations, self.sample(observations, sample_key), search_key)
 
-    def sample(self, evidence: Evidence, key: PRNGKeyArray) -> GridSurface | None:
+    def sample(self, observations: Observations, key: PRNGKeyArray) -> GridSurface | None:
         """The first half of `propose`: the step's samples; None for a search that asks for none."""
-        return self.imagination.sample(evidence, key) if self.search.uses_samples else None
+        return self.sampler.sample(observations, key) if self.search.uses_samples else None
 
-    def choose(self, evidence: Evidence, surfaces: GridSurface | None, key: PRNGKeyArray) -> Proposal:
+    def choose(self, observations: Observations, surfaces: GridSurface | None, key: PRNGKeyArray) -> Proposal:
         """The second half of `propose`: the search, given the step's samples (any that a model of your own drew).
 
         **Raises:** `ValueError` if every candidate has been visited, or a score is not finite.
         """
         check_key(key)
-        check_type(evidence, Evidence, "the evidence")
+        check_type(observations, Observations, "the observations")
         check_type(surfaces, GridSurface | None, "the surfaces")
         with functions_of_users():
-            proposal = _propose(self.search, self._problem(evidence, surfaces), key)
+            proposal = _propose(self.search, self._problem(observations, surfaces), key)
         return _checked_proposal(proposal, surfaces)
 
     def observe(
-        self, evidence: Evidence | PointCloud, pose: Pose, scan: PointCloud, camera: Camera | None = None
-    ) -> Evidence:
-        """Tell: the evidence after a scan (scene coordinates) from a pose. A scan that saw nothing adds no points.
+        self, observations: Observations | PointCloud, pose: Pose, scan: PointCloud, camera: Camera | None = None
+    ) -> Observations:
+        """Tell: the observations after a scan (scene coordinates) from a pose. A scan that saw nothing adds no points.
 
         `camera`: the one that took the scan, by default the planner's. Scans of one capacity and camera share one
         compilation.
 
-        **Raises:** `ValueError` for a scan as `init` does, for evidence of another grid, or if it has no room for
+        **Raises:** `ValueError` for a scan as `init` does, for observations of another grid, or if it has no room for
         another view.
         """
-        camera, evidence = camera or self.camera, self._known(evidence)
+        camera, observations = camera or self.camera, self._known(observations)
         check_type(pose, Pose, "the pose")
-        self.imagination.check(pose, scan, camera, first=False)
-        if not is_traced(evidence.num_views):
-            views, room = int(evidence.num_views), evidence.max_views
+        self.sampler.check(pose, scan, camera, first=False)
+        if not is_traced(observations.num_views):
+            views, room = int(observations.num_views), observations.max_views
             require(
                 views < room,
-                f"the evidence holds {views} views and has room for no more: make it with a planner of "
+                f"the observations hold {views} views and have room for no more: make it with a planner of "
                 f"Planner(max_views=...) greater than {room}",
             )
-        after = self.imagination.observe(evidence, pose, scan, camera)
+        after = self.sampler.observe(observations, pose, scan, camera)
         if self.search.uses_samples and not is_traced(after):
-            self.imagination.grid.check(after.cloud)
+            self.sampler.grid.check(after.cloud)
         return after
 
     def replay(
         self, views: Iterable[tuple[Pose, PointCloud] | tuple[Pose, PointCloud, Camera | None]]
-    ) -> Iterator[Evidence]:
-        """The evidence after each of some views, poses and scans: `init` with the first, then `observe`, and raises as
-        these do. A third says which camera took a scan."""
-        evidence = None
+    ) -> Iterator[Observations]:
+        """The observations after each of some views, poses and scans: `init` with the first, then `observe`, and
+        raises as these do. A third says which camera took a scan."""
+        observations = None
         for view in views:
-            evidence = self.init(*view) if evidence is None else self.observe(evidence, *view)
-            yield evidence
+            observations = self.init(*view) if observations is None else self.observe(observations, *view)
+            yield observations
 
     @eqx.filter_jit
     def expected_depth(self, surfaces: GridSurface, pose: Pose) -> Float[Array, "h w"]:
         """The depth image that is expected from a pose: `mean_depth` over the samples, by the planner's camera."""
-        scans = self.imagination.scan(surfaces, self.camera, pose[None])
+        scans = self.sampler.scan(surfaces, self.camera, pose[None])
         depth = mean_depth(jax.tree.map(lambda rows: rows[:, 0], scans), pose)
         return depth.reshape(self.camera.height, self.camera.width)
 
-    def _problem(self, evidence: Evidence, surfaces: GridSurface | None) -> Problem:
+    def _problem(self, observations: Observations, surfaces: GridSurface | None) -> Problem:
         """What the search is asked. The acquisition's context is a program of its own, which `init` has compiled."""
-        around = self.imagination.surroundings
-        return Problem(evidence, self.camera, self.acquisition, surfaces, around, self.cost).prepared()
+        around = self.sampler.obstacles
+        return Problem(observations, self.camera, self.acquisition, surfaces, around, self.cost).prepared()
 
-    def _known(self, evidence: Evidence | PointCloud) -> Evidence:
-        return self.init(None, evidence) if isinstance(evidence, PointCloud) else self.imagination.known(evidence)
+    def _known(self, observations: Observations | PointCloud) -> Observations:
+        return (
+            self.init(None, observations) if isinstance(observations, PointCloud) else self.sampler.known(observations)
+        )
 
 
 @eqx.filter_jit

@@ -18,15 +18,16 @@ from jaxnbv.geometry.depth_image import NothingInside
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
+from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import STAGES, Episode, View, view_keys
 from jaxnbv.planning.placing import box_of, on_support, placed, stride_of, usual_planner
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Watch
 from jaxnbv.progress import progress_bar
-from jaxnbv.scanning import Evidence, Surroundings, plane_under
+from jaxnbv.scanning import Obstacles, plane_under
 from jaxnbv.search import Proposal
 from jaxnbv.storage import RunFolder, describe
-from jaxnbv.tasks import Stop
+from jaxnbv.tasks import StopRule
 
 _NO_IMAGE = "the session has no image yet: add one first, session.add(depth, matrix)"
 
@@ -59,9 +60,9 @@ class Session:
       replaced by the sensor's with the planner's number of pixels, and what it holds for the default volume, `Box()`,
       by the box. By default it looks for `NewSurface`, by a `HalvingSearch` with 24 x 32 rays, and keeps 2,000 points.
     - `up`: the world's axis that is upward, "y" or "z" say.
-    - `surroundings`: what stands around the object, in world units: `Surroundings((table,), margin=0.005)`, say. By
+    - `obstacles`: what stands around the object, in world units: `Obstacles((table,), margin=0.005)`, say. By
       default the plane that the object stands on is looked for in the first image, told of by a warning, and taken for
-      a table: left out of the cloud, and no place for a camera. `Surroundings()` says that there is none.
+      a table: left out of the cloud, and no place for a camera. `Obstacles()` says that there is none.
     - `poses`: (n, 4, 4), where the sensor can be held; by default the candidates of the planner's search, in scene
       units about the box's centre, and of a whole sphere the upper half: what is below may be the table.
     - `folder`: where images and proposals are kept before they are acted on; a session that was killed goes on from it.
@@ -85,8 +86,8 @@ class Session:
         folder: str | Path | None = None,
         convention: str = "opencv",
         key: PRNGKeyArray | None = None,
-        until: Stop | None = None,
-        surroundings: Surroundings | None = None,
+        until: StopRule | None = None,
+        obstacles: Obstacles | None = None,
         progress: bool = True,
     ):
         self.camera, self.convention = camera, convention
@@ -97,14 +98,14 @@ class Session:
         check_key(self.key)
         allowed = None if poses is None else self.frame.to_scene(Pose.from_matrix(poses, convention))
         sensor, volume = self.frame.to_scene(camera), self.frame.to_scene(self.box)
-        around = None if surroundings is None else surroundings.in_scene(self.frame)
+        around = None if obstacles is None else obstacles.in_scene(self.frame)
         self.planner = placed(usual_planner() if planner is None else planner, sensor, volume, allowed, around)
         self._rays = self.frame.to_scene(camera.strided(self.stride))
         self._watch, self._asked_at = None if until is None else Watch(until, self.planner.acquisition), 0
         self._views: list[View] = []
         self._proposals: dict[int, Proposal] = {}
         self._next: NextView | None = None
-        self._evidence: Evidence | None = None
+        self._evidence: Observations | None = None
         self._folder = None if folder is None else RunFolder(folder, "session", self._config())
         if self._folder is not None:
             for index in range(self._folder.count("image")):
@@ -115,7 +116,7 @@ class Session:
 
     def __repr__(self) -> str:
         images = f"{self.views} image{'s' * (self.views != 1)}"
-        kept = f", {int(self.evidence.cloud.count):,} points" if self.views else ""
+        kept = f", {int(self.observations.cloud.count):,} points" if self.views else ""
         asked = ", the next view proposed" if self.next_view else ""
         return f"Session({self.planner.quantity.name}: {images}{kept}{asked})"
 
@@ -125,7 +126,7 @@ class Session:
         return len(self._views)
 
     @property
-    def evidence(self) -> Evidence:
+    def observations(self) -> Observations:
         """What the planner knows, in scene coordinates.
 
         **Raises:** `ValueError` before the first image.
@@ -140,7 +141,7 @@ class Session:
 
         **Raises:** `ValueError` before the first image.
         """
-        return self.frame.to_world(self.evidence.cloud)
+        return self.frame.to_world(self.observations.cloud)
 
     @property
     def episode(self) -> Episode:
@@ -162,8 +163,8 @@ class Session:
         if self._asked_at < self.views:
             key, *_ = view_keys(self.key, self.views)
             poses = [view.pose for view in self._views]
-            known = self.planner, self.evidence, poses, key
-            if not self._watch.ends(*known) and self._watch.rule.plans:
+            known = self.planner, self.observations, poses, key
+            if not self._watch.ends(*known) and self._watch.rule.needs_proposal:
                 self._watch.ends(*known, self.next().proposal)
             self._asked_at = self.views
         return self._watch.reason
@@ -212,7 +213,7 @@ class Session:
                         folder.write("proposal", index, **found)
             self._proposals[index] = proposal = found["proposal"]
             matrix = np.asarray(self.frame.to_world(proposal.pose).to_matrix(self.convention), np.float64)
-            unit, error = self.frame.scale**self.planner.quantity.power, proposal.standard_error
+            unit, error = self.frame.scale**self.planner.quantity.length_power, proposal.standard_error
             value, error = float(proposal.value) / unit, None if error is None else error / unit
             self._next = NextView(matrix, value, error, found.get("expected_depth"), proposal)
         return self._next
@@ -228,7 +229,7 @@ class Session:
 
     def _looked(
         self, depth: Real[np.ndarray, "h w"], matrix: Float[np.ndarray, "4 4"], depth_scale: float
-    ) -> tuple[Planner, View, Evidence]:
+    ) -> tuple[Planner, View, Observations]:
         """An image as a view, and what is known after it; nothing of the session is changed. The first may show what
         the object stands on, by which the planner is another."""
         pose, planner, rays = Pose.from_matrix(matrix, self.convention), self.planner, self._rays
@@ -240,18 +241,18 @@ class Session:
                 cloud = PointCloud.from_depth(*shown, self.box)
             except NothingInside as problem:
                 raise InputError(f"the first image shows nothing of the box: {problem}") from problem
-        if not self._views and planner.imagination.surroundings is None:
+        if not self._views and planner.sampler.obstacles is None:
             whole = self.frame.to_scene(PointCloud.from_depth(*shown))
             planner = on_support(planner, plane_under(whole, self.frame.to_scene(self.box)), self.frame)
         scan = self.frame.to_scene(cloud)
-        if (around := planner.imagination.surroundings) is not None:
-            scan = around.without_obstacles(scan)
+        if (around := planner.sampler.obstacles) is not None:
+            scan = around.remove_points(scan)
         told = self.frame.to_scene(pose), scan, rays
-        evidence = planner.init(*told) if self._evidence is None else planner.observe(self._evidence, *told)
-        return planner, View(told[0], scan, evidence.cloud, self._proposals.get(self.views), rays), evidence
+        observations = planner.init(*told) if self._evidence is None else planner.observe(self._evidence, *told)
+        return planner, View(told[0], scan, observations.cloud, self._proposals.get(self.views), rays), observations
 
-    def _take(self, planner: Planner, view: View, evidence: Evidence) -> None:
-        self.planner, self._evidence = planner, evidence
+    def _take(self, planner: Planner, view: View, observations: Observations) -> None:
+        self.planner, self._evidence = planner, observations
         self._views.append(view)
         self._next = None
 
@@ -262,10 +263,10 @@ class Session:
         expected = None
         with progress_bar(total=2, wanted=self.progress) as bar:
             bar.set_description(f"view {self.views + 1}, {STAGES[0]}")
-            surfaces = jax.block_until_ready(self.planner.sample(self.evidence, sample_key))
+            surfaces = jax.block_until_ready(self.planner.sample(self.observations, sample_key))
             bar.update()
             bar.set_description(f"view {self.views + 1}, {STAGES[1]}")
-            proposal = self.planner.choose(self.evidence.with_visited(proposed), surfaces, search_key)
+            proposal = self.planner.choose(self.observations.with_visited(proposed), surfaces, search_key)
             if surfaces is not None:
                 expected = np.asarray(self.planner.expected_depth(surfaces, proposal.pose)) / self.frame.scale
             bar.update()

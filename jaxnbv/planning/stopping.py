@@ -9,14 +9,14 @@ from jaxtyping import PRNGKeyArray
 from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import check_fields, require
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.observations import Observations
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.travel import CostFunction, arc_length, total_cost
-from jaxnbv.scanning import Evidence
 from jaxnbv.search import CandidateSearch, Proposal, SphereCandidates
-from jaxnbv.tasks.stopping import SoFar, Stop
+from jaxnbv.tasks.stopping import StopContext, StopRule
 
 
-class ValueBelow(Stop):
+class ValueBelow(StopRule):
     """Stop once the best view's value is less than this, in the units of what the search maximises."""
 
     value: float = eqx.field(static=True)
@@ -24,11 +24,11 @@ class ValueBelow(Stop):
     def __check_init__(self):
         check_fields(self)
 
-    def before(self, so_far: SoFar, pose: Pose, value: float) -> str | None:
+    def before(self, context: StopContext, pose: Pose, value: float) -> str | None:
         return f"the best view has a value of {value:.3g}, less than {self.value:.3g}" if value < self.value else None
 
 
-class Budget(Stop):
+class Budget(StopRule):
     """Stop when time is up, or when the next view would cost more than is left.
 
     - `seconds`: of this process, since its first view; the view that is under way is finished.
@@ -48,19 +48,19 @@ class Budget(Stop):
         require(all(limit > 0 for limit in given), f"the budget is {given}; it must be positive")
 
     @property
-    def plans(self) -> bool:
+    def needs_proposal(self) -> bool:
         return self.cost is not None
 
-    def after(self, so_far: SoFar) -> str | None:
-        if self.seconds is None or so_far.seconds < self.seconds:
+    def after(self, context: StopContext) -> str | None:
+        if self.seconds is None or context.seconds < self.seconds:
             return None
-        return f"{so_far.seconds:.0f} of {self.seconds:g} seconds are spent"
+        return f"{context.seconds:.0f} of {self.seconds:g} seconds are spent"
 
-    def before(self, so_far: SoFar, pose: Pose, value: float) -> str | None:
+    def before(self, context: StopContext, pose: Pose, value: float) -> str | None:
         if self.cost is None:
             return None
-        left = self.cost - total_cost(so_far.poses, self.of)
-        asked = total_cost((so_far.poses[-1], pose), self.of)
+        left = self.cost - total_cost(context.poses, self.of)
+        asked = total_cost((context.poses[-1], pose), self.of)
         return (
             f"the next view would cost {asked:.3g}, but {left:.3g} of {self.cost:g} are left" if asked > left else None
         )
@@ -72,7 +72,7 @@ class Watch:
     **Raises:** `ValueError` if the rule cannot hold of what views are for.
     """
 
-    def __init__(self, rule: Stop, acquisition: Acquisition):
+    def __init__(self, rule: StopRule, acquisition: Acquisition):
         rule.check(acquisition)
         self.rule, self.began = rule, time.monotonic()
         self.reason: str | None = None
@@ -80,13 +80,13 @@ class Watch:
     def ends(
         self,
         planner: Planner,
-        evidence: Evidence,
+        observations: Observations,
         poses: Sequence[Pose],
         key: PRNGKeyArray,
         proposal: Proposal | None = None,
     ) -> bool:
         """Whether the views so far are enough or, once the next is proposed, it is not to be taken."""
-        known = so_far(planner, evidence, poses, key, time.monotonic() - self.began)
+        known = context(planner, observations, poses, key, time.monotonic() - self.began)
         if proposal is None:
             self.reason = self.rule.after(known)
         else:
@@ -94,11 +94,11 @@ class Watch:
         return self.reason is not None
 
 
-def so_far(
-    planner: Planner, evidence: Evidence, poses: Sequence[Pose], key: PRNGKeyArray, seconds: float = 0.0
-) -> SoFar:
+def context(
+    planner: Planner, observations: Observations, poses: Sequence[Pose], key: PRNGKeyArray, seconds: float = 0.0
+) -> StopContext:
     """What a rule is asked about."""
     search = planner.search
     candidates = search.candidates if isinstance(search, CandidateSearch) else SphereCandidates()
-    known = planner.acquisition, planner.camera, planner.imagination, candidates.poses()
-    return SoFar(*known, evidence, tuple(poses), seconds, key)
+    known = planner.acquisition, planner.camera, planner.sampler, candidates.poses()
+    return StopContext(*known, observations, tuple(poses), seconds, key)

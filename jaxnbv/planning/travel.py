@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jaxnbv.acquisition import Quantity
 from jaxnbv.checks import as_numbers, check_fields, checked, require, shown
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.scanning import Evidence
+from jaxnbv.observations import Observations
 
 CostFunction: TypeAlias = Callable[[Pose, Pose], Float[Array, ""]]
 """What it costs to go from one pose to another, in units of the user's: not negative, made of JAX operations."""
@@ -53,15 +53,15 @@ class ValuePerCost(eqx.Module):
         require(self.fixed > 0, f"the fixed cost of a view is {self.fixed}; it must be positive")
 
     def __call__(
-        self, values: Float[Array, "*samples poses"], evidence: Evidence, poses: Pose
+        self, values: Float[Array, "*samples poses"], observations: Observations, poses: Pose
     ) -> Float[Array, "*samples poses"]:
         """The values of poses, given the cost of going there from the last view, if there is one."""
-        cost = jax.vmap(lambda pose: self.of(evidence.last_pose, pose))(poses)
+        cost = jax.vmap(lambda pose: self.of(observations.last_pose, pose))(poses)
         real = isinstance(cost, Array) and not jnp.iscomplexobj(cost) and cost.shape == (len(poses.position),)
         require(real, f"the cost of going from one pose to another is {shown(cost)}: make it one number a pose")
         # A view is not chosen because its cost is wrong: the planner refuses what is not a number.
         cost = jnp.where((cost >= 0) & (cost < jnp.inf), cost, jnp.nan)
-        return values / (self.fixed + jnp.where(evidence.num_views > 0, cost, 0.0))
+        return values / (self.fixed + jnp.where(observations.num_views > 0, cost, 0.0))
 
     def quantity(self, value: Quantity) -> Quantity:
         """What the weighed value is, where the value is this."""

@@ -1,8 +1,6 @@
 """Surfaces that rays can hit, and the scanner."""
 
 from jaxnbv.scanning import metrics as metrics
-from jaxnbv.scanning.evidence import EmptyPoints as EmptyPoints
-from jaxnbv.scanning.evidence import Evidence as Evidence
 from jaxnbv.scanning.free_space import Carving as Carving
 from jaxnbv.scanning.free_space import carve as carve
 from jaxnbv.scanning.grid import Grid as Grid
@@ -14,6 +12,8 @@ from jaxnbv.scanning.mesh import mesh_from_sdf as mesh_from_sdf
 from jaxnbv.scanning.mesh_files import MeshParts as MeshParts
 from jaxnbv.scanning.mesh_files import load_mesh as load_mesh
 from jaxnbv.scanning.mesh_files import load_parts as load_parts
+from jaxnbv.scanning.obstacles import Obstacles as Obstacles
+from jaxnbv.scanning.obstacles import plane_under as plane_under
 from jaxnbv.scanning.scanner import DepthNoise as DepthNoise
 from jaxnbv.scanning.scanner import Hits as Hits
 from jaxnbv.scanning.scanner import Noise as Noise
@@ -22,5 +22,3 @@ from jaxnbv.scanning.scanner import Surface as Surface
 from jaxnbv.scanning.scanner import scan as scan
 from jaxnbv.scanning.sphere_tracing import SDFSurface as SDFSurface
 from jaxnbv.scanning.sphere_tracing import as_surface as as_surface
-from jaxnbv.scanning.surroundings import Surroundings as Surroundings
-from jaxnbv.scanning.surroundings import plane_under as plane_under

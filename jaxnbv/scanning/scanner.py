@@ -156,7 +156,7 @@ def scan(
     """What the camera sees of the surface from a pose: one row a pixel, missed where its ray hits nothing in its range,
     invalid where it hits what is too near, or too aslant.
 
-    - `barrier`: how far along each ray something else stands (`Surroundings.barrier`); what is behind is missed.
+    - `barrier`: how far along each ray something else stands (`Obstacles.barrier`); what is behind is missed.
 
     Poses with leading axes give clouds with the same leading axes. Points are in scene coordinates; normals are unit
     and turned to the sensor. No noise: apply a `SensorNoise` to the result. Runs under `jit` where `surface.in_jit`.

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxnbv.acquisition import Acquisition, Quantity, Several
+from jaxnbv.acquisition import Acquisition, AcquisitionList, Quantity
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.search.candidates import Candidates, SphereCandidates, as_candidates
@@ -28,11 +28,11 @@ _TIE = 1e-5
 
 
 class Search(eqx.Module):
-    """How a pose is found. `uses_samples` says whether posterior samples must be drawn for it, `weighs_cost` whether
+    """How a pose is found. `uses_samples` says whether posterior samples must be drawn for it, `uses_cost` whether
     the cost of going there can count."""
 
     uses_samples: eqx.AbstractClassVar[bool]
-    weighs_cost: ClassVar[bool] = True
+    uses_cost: ClassVar[bool] = True
 
     def check(self, acquisition: Acquisition, camera: Camera, capacity: int) -> None:
         """Raise `ValueError` if the search cannot work with an acquisition, a camera and a cloud of so many rows."""
@@ -69,7 +69,7 @@ class CandidateSearch(Search):
             return jnp.zeros((0, 0, self.candidates.count))
         if len(asked) == 1:
             return problem.scores(candidates)[None]
-        return problem.about(Several(asked)).scores(candidates)
+        return problem.about(AcquisitionList(asked)).scores(candidates)
 
     @abstractmethod
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
@@ -81,11 +81,11 @@ class CandidateSearch(Search):
         return self.pick(problem, candidates, self.score(problem, candidates), key)
 
 
-class Rule(CandidateSearch):
+class Baseline(CandidateSearch):
     """A search that values candidates by itself, whatever the acquisition."""
 
     uses_samples: ClassVar[bool] = False
-    weighs_cost: ClassVar[bool] = False
+    uses_cost: ClassVar[bool] = False
 
     def asks(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
         """None."""
@@ -112,7 +112,7 @@ def best_unvisited(
     `tie`: the relative difference within which they do, by default what sums in another order differ by. `scores`:
     those whose means the values are, for their standard errors.
     """
-    values = jnp.where(problem.is_closed(candidates), -jnp.inf, values)
+    values = jnp.where(problem.is_excluded(candidates), -jnp.inf, values)
     index = first_best(values, tie)
     found = Proposal(candidates[index], values[index], candidates, values)
     if scores is None:

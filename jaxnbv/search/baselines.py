@@ -9,11 +9,11 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxnbv.acquisition import Acquisition, Quantity
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.search.base import Rule
+from jaxnbv.search.base import Baseline
 from jaxnbv.search.problem import Problem
 
 
-class FarthestView(Rule):
+class FarthestView(Baseline):
     """Farthest point sampling of views: the candidate whose nearest visited camera is farthest away."""
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
@@ -25,7 +25,7 @@ class FarthestView(Rule):
         return problem.distance_to_visited(candidates)
 
 
-class RandomView(Rule):
+class RandomView(Baseline):
     """A candidate drawn uniformly from those not visited yet."""
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
@@ -37,7 +37,7 @@ class RandomView(Rule):
         return jax.random.uniform(key, (self.candidates.count,))
 
 
-class UncertaintyView(Rule):
+class UncertaintyView(Baseline):
     """The candidate whose principal ray is the least certain about where it ends (Holalkere et al. 2025).
 
     With the transmittance T(t), the share of the samples whose surface the ray has not entered before t, the value is
@@ -45,7 +45,7 @@ class UncertaintyView(Rule):
     """
 
     uses_samples: ClassVar[bool] = True
-    weighs_cost: ClassVar[bool] = True
+    uses_cost: ClassVar[bool] = True
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
         meaning = "length of the principal ray along which the posterior samples disagree whether it has hit."
@@ -53,7 +53,7 @@ class UncertaintyView(Rule):
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
         """Values are lengths in scene units; the key is not used."""
-        return problem.weigh(uncertain_length(problem, candidates), candidates)
+        return problem.apply_cost(uncertain_length(problem, candidates), candidates)
 
 
 def uncertain_length(problem: Problem, poses: Pose) -> Float[Array, " poses"]:

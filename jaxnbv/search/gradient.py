@@ -113,7 +113,7 @@ class GradientSearch(Search):
             candidates = self.candidates.poses()
         scores = problem.scores(candidates)
         values = jnp.mean(scores, axis=0)
-        order = jnp.argsort(jnp.where(problem.is_closed(candidates), -jnp.inf, values), descending=True)
+        order = jnp.argsort(jnp.where(problem.is_excluded(candidates), -jnp.inf, values), descending=True)
         # Solvers that search along a line expect differences of order one.
         scale = jnp.max(values) - jnp.min(values)
         scale = jnp.where(scale > 0, scale, 1.0)

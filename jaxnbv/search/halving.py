@@ -53,13 +53,13 @@ class HalvingSearch(CandidateSearch):
         return self._halved(problem, candidates, lambda left, sample: scores[0, sample][left])
 
     def _halved(self, problem: Problem, candidates: Pose, score: Callable) -> Proposal:
-        count, is_closed = self.candidates.count, problem.is_closed(candidates)
+        count, is_excluded = self.candidates.count, problem.is_excluded(candidates)
         nothing = jnp.zeros(count, candidates.position.dtype)
 
         def ranked(state, left):
             """Candidates by their means so far, those that have left last; and the means."""
             order, totals, scored = state
-            values = jnp.where(is_closed, -jnp.inf, totals / jnp.maximum(scored, 1))
+            values = jnp.where(is_excluded, -jnp.inf, totals / jnp.maximum(scored, 1))
             among = jnp.where(jnp.arange(count) < left, values[order], -jnp.inf)
             return order[jnp.argsort(-among, stable=True)], values
 

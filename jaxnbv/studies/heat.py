@@ -186,7 +186,7 @@ class HeatStudy(Study):
         lists = ("points", "temperatures", "distances")
         estimates: dict[str, dict[str, list]] = {name: {key: [] for key in lists} for name in ESTIMATES}
         for step in episode:
-            points, temperature = body_temperature(step.evidence.cloud, heat)
+            points, temperature = body_temperature(step.observations.cloud, heat)
             shares.append(float(temperature.reached.mean()))
             for name, into in estimates.items():
                 coldest = temperature.coldest(name == "reached" and bool(temperature.reached.any()))

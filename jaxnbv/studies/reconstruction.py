@@ -14,11 +14,12 @@ from scipy.spatial import cKDTree
 from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError
 from jaxnbv.errors import install
-from jaxnbv.imagination import Imagination
 from jaxnbv.networks.categories import CATEGORIES
+from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Step
 from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Evidence, SDFSurface, TriangleMesh
+from jaxnbv.sampler import SurfaceSampler
+from jaxnbv.scanning import SDFSurface, TriangleMesh
 from jaxnbv.scanning.metrics import SURFACE_POINTS, coverage, surface_distance, true_mesh, truth_points
 from jaxnbv.scanning.screened_poisson import has_poisson, screened_poisson
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
@@ -59,7 +60,7 @@ class ReconstructionStudy(Study):
         "largest of both. A reconstruction that no scene has (pip install pymeshlab for Poisson) is left out."
     )
     bank: ClassVar[str] = "parts"
-    unknowing: ClassVar[tuple[str, ...]] = ("coverage", "new-surface", "uncertainty")
+    without_bank: ClassVar[tuple[str, ...]] = ("coverage", "new-surface", "uncertainty")
     methods: ClassVar[tuple[str, ...]] = ("coverage", "new-surface", *RULES)
     reference: ClassVar[str] = "coverage"
     measures: ClassVar[tuple[Measure, ...]] = (
@@ -113,13 +114,13 @@ class ReconstructionStudy(Study):
         reconstructions from the last cloud; that by Poisson reconstruction is None without `pymeshlab`."""
         views = [view for view, *_ in episode]
         mesher = self.mesher(scene)
-        *_, evidence = mesher.replay((view.pose, view.scan, self.camera) for view in views)
+        *_, observations = mesher.replay((view.pose, view.scan, self.camera) for view in views)
         found = {
-            name: self._distances(reconstruct(mesher.imagination, evidence, name), truth, scene.index)
+            name: self._distances(reconstruct(mesher.sampler, observations, name), truth, scene.index)
             for name in RECONSTRUCTIONS
         }
         covered = coverage(views, truth)
-        return {"coverage": covered, "points": int(evidence.cloud.count), "reconstructions": found}
+        return {"coverage": covered, "points": int(observations.cloud.count), "reconstructions": found}
 
     def _distances(self, mesh: TriangleMesh | None, truth: Float[np.ndarray, "n 3"], index: int) -> Record | None:
         if mesh is None:
@@ -132,13 +133,13 @@ class ReconstructionStudy(Study):
         scene, held = self.scene(record["scene"]), record["methods"]
         truth = cast(TriangleMesh, true_mesh(scene.surface))
         tree = cKDTree(truth.sample_points(jax.random.key(0), _DENSE))
-        eye, imagination = across(record), self.mesher(scene).imagination
+        eye, sampler = across(record), self.mesher(scene).sampler
         known = {method: self.seen(scene, held[method])[-1][1] for method in methods}
         made = {method: held[method]["reconstructions"] for method in methods}
         names = tuple(name for name in RECONSTRUCTIONS if all(found[name] is not None for found in made.values()))
 
         def tile(axes: Axes, method: str, column: int) -> None:
-            mesh = reconstruct(imagination, known[method], names[column])
+            mesh = reconstruct(sampler, known[method], names[column])
             if mesh is None:
                 raise InputError(f"the records hold {names[column]}: to draw it again, {install('poisson')}")
             still = still_of(mesh, eye, pixels, lambda points: tree.query(points)[0], _ERRORS)
@@ -150,9 +151,9 @@ class ReconstructionStudy(Study):
         return Tiles("", tile, lambda axes: axes.imshow(still_of(truth, eye, pixels).image), names, scale=scale)
 
 
-def reconstruct(imagination: Imagination, evidence: Evidence, name: str) -> TriangleMesh | None:
+def reconstruct(sampler: SurfaceSampler, observations: Observations, name: str) -> TriangleMesh | None:
     """One of `RECONSTRUCTIONS` from what is known; None for Poisson reconstruction where `pymeshlab` cannot be
     imported."""
     if name == MEAN:
-        return imagination.mean_mesh(evidence)
-    return screened_poisson(evidence.cloud) if has_poisson() else None
+        return sampler.mean_mesh(observations)
+    return screened_poisson(observations.cloud) if has_poisson() else None

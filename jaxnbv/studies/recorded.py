@@ -19,15 +19,15 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
-from jaxnbv.imagination import MODELS, Imagination
 from jaxnbv.planning.episode import Sensor, Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.session import stride_of
 from jaxnbv.progress import progress_bar
+from jaxnbv.sampler import MODELS, SurfaceSampler
 from jaxnbv.scanning import Surface
 from jaxnbv.scanning.scanner import Hits
 from jaxnbv.search import GivenPoses, Problem, Search
-from jaxnbv.search.base import Rule
+from jaxnbv.search.base import Baseline
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.searches import RULES
 from jaxnbv.studies.engine.study import Scene, Study
@@ -73,7 +73,7 @@ class _Unknown(Surface):
         raise InputError("the true surface of a recording is not known: ask the study's sensor")
 
 
-class InTurn(Rule):
+class InTurn(Baseline):
     """Candidates in an order that is known before.
 
     - `turns`: the candidate of each view, the first one included.
@@ -83,11 +83,11 @@ class InTurn(Rule):
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
         """Values are 1 for the candidate whose turn it is; the key is not used."""
-        chosen = jnp.arange(candidates.position.shape[0]) == self.turns[problem.evidence.num_views]
+        chosen = jnp.arange(candidates.position.shape[0]) == self.turns[problem.observations.num_views]
         return chosen.astype(candidates.position.dtype)
 
 
-class MostNewVoxels(Rule):
+class MostNewVoxels(Baseline):
     """The greedy oracle: the frame that truly shows the most voxels that no frame so far has shown.
 
     - `shown`: which voxels each candidate shows.
@@ -170,7 +170,7 @@ class RecordedStudy(Study):
         study = cls(
             views=views,
             num_candidates=len(frames),
-            imagination=Imagination.preset(model, quick=quick, volume=_frame(box).to_scene(box)),
+            sampler=SurfaceSampler.preset(model, quick=quick, volume=_frame(box).to_scene(box)),
             camera=_frame(box).to_scene(frames.camera.strided(stride_of(frames.camera))),
             folder=folder,
             box=box,

@@ -43,8 +43,8 @@ STUDIES = {
         views=5,
         options=("meshes", "classifier", "first"),
     ),
-    "modelnet10": Entry(
-        "jaxnbv.studies.classification.objects:ModelNet10Study",
+    "household": Entry(
+        "jaxnbv.studies.classification.objects:HouseholdStudy",
         "Do all methods tell classes alike that differ in global shape? The paper's ModelNet10, on procedural objects, "
         "or on meshes in folders of the classes' names.",
         scenes=100,

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxnbv.checks import AnyArray, as_numbers, check_key, check_type, is_traced, require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
-from jaxnbv.scanning.evidence import Evidence
+from jaxnbv.observations import Observations
 
 HALF_WIDTH = 0.5 * math.pi
 """Scattered points must lie in [-HALF_WIDTH, HALF_WIDTH]^3, the cube that the paper scales a scene into."""
@@ -52,7 +52,7 @@ on_torus = _on_torus(lambda x: x.ndim == 2 and x.shape[1] == 3, "points (n, 3)")
 on_grid_of_torus = _on_torus(lambda axis: axis.ndim == 1, "the nodes along one axis of a grid (g,)")
 
 
-def sampler(method: Callable[..., Any]) -> Callable[..., Any]:
+def sampling_method(method: Callable[..., Any]) -> Callable[..., Any]:
     """A method of a key and a number of samples, at least one."""
 
     @functools.wraps(method)
@@ -136,9 +136,9 @@ class SurfaceModel(eqx.Module):
     """p(f): a prior over implicit surfaces that can be conditioned on what was seen."""
 
     @abstractmethod
-    def condition(self, evidence: Evidence | PointCloud) -> SurfacePosterior:
-        """p(f | evidence): the filled rows of its cloud and, where the model can make use of it, the space that was
-        seen empty. A cloud alone is evidence too; `Evidence.of` makes it so."""
+    def condition(self, observations: Observations | PointCloud) -> SurfacePosterior:
+        """p(f | observations): the filled rows of its cloud and, where the model can make use of it, the space that was
+        seen empty. A cloud alone is observations too; `Observations.of` makes it so."""
 
     def check(self, cloud: PointCloud) -> None:
         """Warn where a cloud, whose values are known, is not one that the model makes much of."""

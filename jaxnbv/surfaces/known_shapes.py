@@ -22,10 +22,10 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from jaxnbv.checks import AnyArray, check_fields, require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.volume import Box
-from jaxnbv.scanning.evidence import Evidence
+from jaxnbv.observations import Observations
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.sharding import shared_map
-from jaxnbv.surfaces.base import Fields, SurfaceModel, SurfacePosterior, sampler
+from jaxnbv.surfaces.base import Fields, SurfaceModel, SurfacePosterior, sampling_method
 from jaxnbv.surfaces.placement import FreeRotation, Placement, ShapePoses
 from jaxnbv.surfaces.registration import Hypotheses, Prior, Seen, register
 from jaxnbv.surfaces.screened import ScreenedSPSR, ScreenedSPSRPosterior
@@ -59,7 +59,7 @@ class KnownShapes(SurfaceModel):
     - `num_starts`: placements that are tried, over all shapes.
     - `noise_scale`: rho, of the residual's deviation where nothing was seen; one as large as the prior's breaks thin
       parts and lets pieces float about them.
-    - `sharpness`: beta; `unknown_misfit`: E_0, the misfit at which a shape is as likely as none.
+    - `inverse_temperature`: beta; `misfit_of_none`: E_0, the misfit at which a shape is as likely as none.
 
     With an empty bank it is `unknown`.
 
@@ -73,38 +73,38 @@ class KnownShapes(SurfaceModel):
     unknown: SurfaceModel = eqx.field(default_factory=ScreenedSPSR)
     num_starts: int = eqx.field(static=True, default=4096)
     noise_scale: float = eqx.field(static=True, default=0.1)
-    sharpness: float = eqx.field(static=True, default=20.0)
-    unknown_misfit: float = eqx.field(static=True, default=0.6)
+    inverse_temperature: float = eqx.field(static=True, default=20.0)
+    misfit_of_none: float = eqx.field(static=True, default=0.6)
 
     def __check_init__(self):
         check_fields(self)
         require(self.num_starts >= 1, f"the number of starts is {self.num_starts}; it must be at least 1")
-        for name, value in (("sharpness", self.sharpness), ("noise scale", self.noise_scale)):
+        for name, value in (("inverse_temperature", self.inverse_temperature), ("noise scale", self.noise_scale)):
             require(0 <= value < math.inf, f"the {name} is {value}; it must be finite and not negative")
 
     def check(self, cloud: PointCloud) -> None:
         self.unknown.check(cloud)
 
-    def condition(self, evidence: Evidence | PointCloud) -> SurfacePosterior:
-        """p(f | evidence), the shapes registered to its cloud and to the space that was seen empty.
+    def condition(self, observations: Observations | PointCloud) -> SurfacePosterior:
+        """p(f | observations), the shapes registered to its cloud and to the space that was seen empty.
 
         **Raises:** `ValueError` as the `condition` of `residual` and `unknown` does.
         """
-        evidence = Evidence.of(evidence)
-        unknown = self.unknown.condition(evidence)
+        observations = Observations.of(observations)
+        unknown = self.unknown.condition(observations)
         if self.bank.solids is None:
             return unknown
-        found = register(self.bank, Prior(self.poses, self.box), Seen.of(evidence), self.num_starts)
-        weights = _weights(found, self.sharpness, self.unknown_misfit)
+        found = register(self.bank, Prior(self.poses, self.box), Seen.of(observations), self.num_starts)
+        weights = _weights(found, self.inverse_temperature, self.misfit_of_none)
         return KnownShapesPosterior(
-            jnp.zeros_like(unknown.level), self, found, weights, self.residual.condition(evidence), unknown
+            jnp.zeros_like(unknown.level), self, found, weights, self.residual.condition(observations), unknown
         )
 
 
 @eqx.filter_jit
-def _weights(found: Hypotheses, sharpness: float, unknown_misfit: float) -> Float[Array, " h_and_none"]:
-    misfit = jnp.append(found.misfit, unknown_misfit)
-    return jax.nn.softmax(-sharpness * misfit, where=jnp.append(found.is_mode, True))
+def _weights(found: Hypotheses, inverse_temperature: float, misfit_of_none: float) -> Float[Array, " h_and_none"]:
+    misfit = jnp.append(found.misfit, misfit_of_none)
+    return jax.nn.softmax(-inverse_temperature * misfit, where=jnp.append(found.is_mode, True))
 
 
 class Hypothesis(NamedTuple):
@@ -147,7 +147,7 @@ class KnownShapesPosterior(SurfacePosterior):
             )
             for row in np.flatnonzero(found.is_mode)
         ]
-        none = Hypothesis(NONE, float(weights[-1]), self.model.unknown_misfit, None)
+        none = Hypothesis(NONE, float(weights[-1]), self.model.misfit_of_none, None)
         return sorted([*known, none], key=lambda one: -one.weight)
 
     def kinds(self) -> dict[str, float]:
@@ -164,7 +164,7 @@ class KnownShapesPosterior(SurfacePosterior):
         names = [*(of_bank[index] for index in np.asarray(self.found.shape)), NONE]
         return [names[index] for index in np.asarray(_drawn(self, key, num_samples))]
 
-    @sampler
+    @sampling_method
     def sample(self, key: PRNGKeyArray, num_samples: int) -> "MixtureFields":
         """`num_samples` samples of f; which shapes they are about is drawn jointly, by systematic resampling."""
         return _sample(self, key, num_samples)

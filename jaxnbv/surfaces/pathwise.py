@@ -22,7 +22,7 @@ from jax.scipy.stats import norm
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, as_floats, check_key, checked, is_traced, require
-from jaxnbv.surfaces.base import Fields, SurfacePosterior, on_grid_of_torus, on_torus, sampler
+from jaxnbv.surfaces.base import Fields, SurfacePosterior, on_grid_of_torus, on_torus, sampling_method
 from jaxnbv.surfaces.trigonometric import TrigonometricFields
 
 
@@ -95,7 +95,7 @@ class TrigonometricPosterior(SurfacePosterior):
         deviation = jnp.sqrt(jnp.maximum(variance, jnp.finfo(variance.dtype).tiny))
         return norm.cdf((self.level - self.mean(x)) / deviation)
 
-    @sampler
+    @sampling_method
     def sample(self, key: PRNGKeyArray, num_samples: int) -> TrigonometricFields:
         """`num_samples` joint samples of f by pathwise conditioning: functions, to be evaluated anywhere."""
         about_zero = _at_data(_Zeros(num_samples), self.data_points())

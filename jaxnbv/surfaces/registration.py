@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.geometry.cloud import farthest_point_subsample
 from jaxnbv.geometry.volume import Box
-from jaxnbv.scanning.evidence import Evidence
+from jaxnbv.observations import Observations
 from jaxnbv.surfaces.placement import Placement, ShapePoses
 from jaxnbv.surfaces.shape_bank import Shape, ShapeBank, values_and_gradients
 
@@ -51,10 +51,10 @@ class Seen(NamedTuple):
     is_empty: Bool[Array, " m"]
 
     @classmethod
-    def of(cls, evidence: Evidence) -> "Seen":
+    def of(cls, observations: Observations) -> "Seen":
         """Some of the cloud, by farthest point sampling, and some of the nodes seen empty, at random."""
-        cloud = farthest_point_subsample(evidence.cloud, _NUM_POINTS)
-        empty, is_empty = _some_empty(evidence)
+        cloud = farthest_point_subsample(observations.cloud, _NUM_POINTS)
+        empty, is_empty = _some_empty(observations)
         return cls(cloud.points, cloud.normals, cloud.mask, empty.astype(cloud.points.dtype), is_empty)
 
     def first(self, count: int) -> "Seen":
@@ -62,12 +62,12 @@ class Seen(NamedTuple):
         return Seen(*(rows[:count] for rows in self))
 
 
-def _some_empty(evidence: Evidence) -> tuple[Float[Array, "m 3"], Bool[Array, " m"]]:
-    if evidence.seen_empty is None or evidence.grid is None:
+def _some_empty(observations: Observations) -> tuple[Float[Array, "m 3"], Bool[Array, " m"]]:
+    if observations.seen_empty is None or observations.grid is None:
         return jnp.zeros((_NUM_EMPTY, 3)), jnp.zeros(_NUM_EMPTY, bool)
-    order = np.random.default_rng(0).permutation(evidence.seen_empty.size)
-    node, is_empty = _first_seen(evidence.seen_empty, order)
-    return jnp.asarray(evidence.grid.axis)[node], is_empty
+    order = np.random.default_rng(0).permutation(observations.seen_empty.size)
+    node, is_empty = _first_seen(observations.seen_empty, order)
+    return jnp.asarray(observations.grid.axis)[node], is_empty
 
 
 @jax.jit

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, check_fields, is_traced, require, shown
 from jaxnbv.geometry.cloud import PointCloud, some_rows
-from jaxnbv.scanning.evidence import Evidence
+from jaxnbv.observations import Observations
 from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import SurfaceModel, on_torus
 from jaxnbv.surfaces.covariance import function_covariance, function_variance, mode_variance
@@ -71,20 +71,20 @@ class ScreenedSPSR(SurfaceModel):
     def check(self, cloud: PointCloud) -> None:
         self.base.check(cloud)
 
-    def condition(self, evidence: Evidence | PointCloud) -> "ScreenedSPSRPosterior":
+    def condition(self, observations: Observations | PointCloud) -> "ScreenedSPSRPosterior":
         """p(g | D, what was seen empty). The cost is that of the base, and of M triangular solves with its factor.
 
         **Raises:** `ValueError` as `GeometricSPSR.condition` does, for a capacity above 16,384, and if S is singular in
         the precision at hand.
         """
-        evidence = Evidence.of(evidence)
-        capacity = evidence.cloud.capacity
+        observations = Observations.of(observations)
+        capacity = observations.cloud.capacity
         require(
             capacity <= MOST_FACTORISED,
             f"the cloud has room for {capacity} points, and this model takes {MOST_FACTORISED} at most: lower the "
             "planner's capacity, or use GeometricSPSR, which takes more",
         )
-        posterior = _condition(self, self.base.condition(evidence), evidence)
+        posterior = _condition(self, self.base.condition(observations), observations)
         if not is_traced(posterior.weights):
             require(
                 bool(jnp.isfinite(posterior.weights).all()),
@@ -95,10 +95,12 @@ class ScreenedSPSR(SurfaceModel):
 
 
 @eqx.filter_jit
-def _condition(model: ScreenedSPSR, base: GeometricSPSRPosterior, evidence: Evidence) -> "ScreenedSPSRPosterior":
+def _condition(
+    model: ScreenedSPSR, base: GeometricSPSRPosterior, observations: Observations
+) -> "ScreenedSPSRPosterior":
     # What stands in rows that are not filled must not reach the products.
-    evidence = eqx.tree_at(lambda e: e.cloud, evidence, base.cloud)
-    spectrum, rows = model.base.spectrum, joined(model.values, evidence)
+    observations = eqx.tree_at(lambda e: e.cloud, observations, base.cloud)
+    spectrum, rows = model.base.spectrum, joined(model.values, observations)
     half_jump = _half_jump(base, model.offset)
     whitened = jnp.where(rows.mask, base.whitened(rows.points), 0.0)
     explained = jnp.einsum("dnk,dnl->kl", whitened, whitened, precision="highest")

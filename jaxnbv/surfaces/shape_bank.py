@@ -1,4 +1,4 @@
-"""A bank of known shapes: what an imagination remembers."""
+"""A bank of known shapes: the shapes that a model remembers."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path

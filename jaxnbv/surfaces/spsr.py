@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 
 from jaxnbv.checks import as_floats, check_type, is_traced, require
 from jaxnbv.geometry.cloud import PointCloud, check_oriented
-from jaxnbv.scanning.evidence import Evidence
+from jaxnbv.observations import Observations
 from jaxnbv.surfaces.base import HALF_WIDTH, SurfaceModel
 from jaxnbv.surfaces.covariance import Scalar, Spectra, circle_spectrum
 from jaxnbv.surfaces.given_normals import GeometricSPSRPosterior, given_normals
@@ -121,15 +121,15 @@ class GeometricSPSR(SurfaceModel):
                 stacklevel=2,
             )
 
-    def condition(self, evidence: Evidence | PointCloud) -> GeometricSPSRPosterior:
-        """p(f | D): of the evidence it takes the cloud alone. The cost is that of a Cholesky factorisation of the
+    def condition(self, observations: Observations | PointCloud) -> GeometricSPSRPosterior:
+        """p(f | D): of the observations it takes the cloud alone. The cost is that of a Cholesky factorisation of the
         cloud's capacity; beyond a capacity of 16,384, of some hundred transforms a solve.
 
         **Raises:** `ValueError` if the cloud is empty, has entries that are not finite, a normal longer than 10 or
         points outside [-pi/2, pi/2]^3 (scene coordinates), or if A is singular in the precision at hand; under `jit`
         values are not known and are not checked.
         """
-        cloud = Evidence.of(evidence).cloud
+        cloud = Observations.of(observations).cloud
         if not is_traced(cloud):
             check_oriented(cloud, "the cloud", HALF_WIDTH, unit=False)
         posterior = given_normals(cloud, self.spectrum, self.noise)

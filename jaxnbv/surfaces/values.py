@@ -16,7 +16,7 @@ from jaxnbv.checks import InputError, check_fields, is_traced, require, shown
 from jaxnbv.geometry.cloud import farthest_point_subsample
 from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.geometry.volume import Box, Volume, boundary_points
-from jaxnbv.scanning.evidence import Evidence
+from jaxnbv.observations import Observations
 from jaxnbv.surfaces.base import HALF_WIDTH
 
 
@@ -36,8 +36,8 @@ class ValueSource(eqx.Module):
     """A kind of knowledge about values of f."""
 
     @abstractmethod
-    def rows(self, evidence: Evidence) -> ValueRows:
-        """The rows that it adds, as many for all evidence of one capacity; run under `jit`."""
+    def rows(self, observations: Observations) -> ValueRows:
+        """The rows that it adds, as many for all observations of one capacity; run under `jit`."""
 
 
 class OutsideBoundary(ValueSource):
@@ -78,8 +78,8 @@ class OutsideBoundary(ValueSource):
             "[-pi/2, pi/2]^3",
         )
 
-    def rows(self, evidence: Evidence) -> ValueRows:
-        points = boundary_points(self.volume, self.num_points).astype(evidence.cloud.points.dtype)
+    def rows(self, observations: Observations) -> ValueRows:
+        points = boundary_points(self.volume, self.num_points).astype(observations.cloud.points.dtype)
         return _rows(points, self.value, self.noise, jnp.ones(self.num_points, bool))
 
 
@@ -99,8 +99,8 @@ class OnSurface(ValueSource):
         check_fields(self)
         _check(self.num_points, self.noise)
 
-    def rows(self, evidence: Evidence) -> ValueRows:
-        chosen = farthest_point_subsample(evidence.cloud, self.num_points)
+    def rows(self, observations: Observations) -> ValueRows:
+        chosen = farthest_point_subsample(observations.cloud, self.num_points)
         return _rows(chosen.points, 0.0, self.noise, chosen.mask)
 
 
@@ -123,18 +123,18 @@ class SeenEmpty(ValueSource):
         check_fields(self)
         _check(self.num_points, self.noise)
 
-    def rows(self, evidence: Evidence) -> ValueRows:
-        empty, seen = evidence.empty_points
+    def rows(self, observations: Observations) -> ValueRows:
+        empty, seen = observations.empty_points
         mask = seen & jnp.all(jnp.abs(empty) <= HALF_WIDTH, axis=1)
         index = farthest_point_indices(empty, mask, self.num_points)
         kept = jnp.arange(self.num_points) < jnp.sum(mask)
-        points = jnp.where(kept[:, None], empty[index], 0.0).astype(evidence.cloud.points.dtype)
+        points = jnp.where(kept[:, None], empty[index], 0.0).astype(observations.cloud.points.dtype)
         return _rows(points, self.value, self.noise, kept)
 
 
-def joined(sources: tuple[ValueSource, ...], evidence: Evidence) -> ValueRows:
+def joined(sources: tuple[ValueSource, ...], observations: Observations) -> ValueRows:
     """The rows of all sources, one behind the other."""
-    parts = [source.rows(evidence) for source in sources]
+    parts = [source.rows(observations) for source in sources]
     return ValueRows(
         *(jnp.concatenate([getattr(part, name) for part in parts]) for name in ("points", "values", "noise", "mask"))
     )

@@ -18,5 +18,5 @@ from jaxnbv.tasks.segmentation import Found as Found
 from jaxnbv.tasks.segmentation import Segmenter as Segmenter
 from jaxnbv.tasks.segmentation import SoftPartCount as SoftPartCount
 from jaxnbv.tasks.segmentation import part_counts as part_counts
-from jaxnbv.tasks.stopping import SoFar as SoFar
-from jaxnbv.tasks.stopping import Stop as Stop
+from jaxnbv.tasks.stopping import StopContext as StopContext
+from jaxnbv.tasks.stopping import StopRule as StopRule

@@ -18,7 +18,7 @@ from jaxnbv.acquisition import Acquisition, Answer, Quantity, context_of, prefer
 from jaxnbv.checks import InputError, check_fields, require
 from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.scanning import Surface
-from jaxnbv.tasks.stopping import SoFar, Stop
+from jaxnbv.tasks.stopping import StopContext, StopRule
 
 Classifier: TypeAlias = Callable[[PointCloud], Float[Array, " classes"]]
 # Their shape is checked by `Acquisition.check`.
@@ -168,7 +168,7 @@ class ClassAnswer(Answer):
     form: str = "{:.2f}"
 
 
-class Sure(Stop):
+class Sure(StopRule):
     """Stop once the class is known: it has this probability given D, and given each of several random halves of D too,
     since a single answer may be sure by chance.
 
@@ -191,15 +191,15 @@ class Sure(Stop):
     def check(self, acquisition: Acquisition) -> None:
         _of_classes(acquisition)
 
-    def after(self, so_far: SoFar) -> str | None:
-        acquisition, cloud = _of_classes(so_far.acquisition), so_far.evidence.cloud
+    def after(self, context: StopContext) -> str | None:
+        acquisition, cloud = _of_classes(context.acquisition), context.observations.cloud
         answer = acquisition.answer(cloud)
         best = int(np.argmax(answer.values))
         least = float(answer.values[best])
         for index in range(self.num_resamplings):
             if least < self.probability:
                 return None
-            half = acquisition.answer(half_of(cloud, jax.random.fold_in(so_far.key, index)))
+            half = acquisition.answer(half_of(cloud, jax.random.fold_in(context.key, index)))
             least = min(least, float(half.values[best]))
         if least < self.probability:
             return None

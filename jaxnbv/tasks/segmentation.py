@@ -20,7 +20,7 @@ from jaxnbv.acquisition import Acquisition, Answer, Quantity, preferred_batch_si
 from jaxnbv.checks import InputError, check_fields, require, shown
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.scanning import Surface
-from jaxnbv.tasks.stopping import SoFar, Stop
+from jaxnbv.tasks.stopping import StopContext, StopRule
 
 # Of probabilities in 32 bits, or less.
 _SLACK = 1e-2
@@ -104,7 +104,7 @@ class PartAnswer(Answer):
     target: float = 60.0
 
 
-class Found(Stop):
+class Found(StopRule):
     """Stop once all parts are found.
 
     - `points`: a part is found once so many points are predicted to be of it.
@@ -140,8 +140,8 @@ class Found(Stop):
         unknown = [name for name in self.parts or () if names and name not in names]
         require(not unknown, f"the segmenter knows no part {unknown[:1]}: give some of {', '.join(names)}")
 
-    def after(self, so_far: SoFar) -> str | None:
-        answer = so_far.acquisition.answer(so_far.evidence.cloud)
+    def after(self, context: StopContext) -> str | None:
+        answer = context.acquisition.answer(context.observations.cloud)
         if not isinstance(answer, PartAnswer):
             raise InputError("the acquisition's answer tells no parts")
         found = dict(zip(answer.names, answer.values.tolist(), strict=True))

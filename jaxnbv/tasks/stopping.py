@@ -10,72 +10,72 @@ from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import check_type
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.imagination import Imagination
-from jaxnbv.scanning import Evidence
+from jaxnbv.observations import Observations
+from jaxnbv.sampler import SurfaceSampler
 
 
-class SoFar(NamedTuple):
+class StopContext(NamedTuple):
     """An episode between two views.
 
-    - `acquisition`, `camera`, `imagination`: the planner's.
+    - `acquisition`, `camera`, `sampler`: the planner's.
     - `candidates`: poses that its search chooses among, or others all about the object.
-    - `evidence`: what is known after the views so far; `poses`: theirs.
+    - `observations`: what is known after the views so far; `poses`: theirs.
     - `seconds`: since this process began to take views.
     - `key`: that of the next step's samples.
     """
 
     acquisition: Acquisition
     camera: Camera
-    imagination: Imagination
+    sampler: SurfaceSampler
     candidates: Pose
-    evidence: Evidence
+    observations: Observations
     poses: tuple[Pose, ...]
     seconds: float
     key: PRNGKeyArray
 
 
-class Stop(eqx.Module):
+class StopRule(eqx.Module):
     """A rule that says when no more views are needed: after a view, or when the next is planned but not yet taken.
 
-    `plans`: whether it is asked about the planned view too.
+    `needs_proposal`: whether it is asked about the planned view too.
     """
 
     @property
-    def plans(self) -> bool:
-        return type(self).before is not Stop.before
+    def needs_proposal(self) -> bool:
+        return type(self).before is not StopRule.before
 
     def check(self, acquisition: Acquisition) -> None:
         """Raise `ValueError` if the rule cannot hold of what views are for."""
         return
 
-    def after(self, so_far: SoFar) -> str | None:
+    def after(self, context: StopContext) -> str | None:
         """Why the views so far are enough, in words; None to go on."""
         return None
 
-    def before(self, so_far: SoFar, pose: Pose, value: float) -> str | None:
+    def before(self, context: StopContext, pose: Pose, value: float) -> str | None:
         """Why the view that is proposed next, of this value, is not to be taken; None to go on."""
         return None
 
-    def __or__(self, other: "Stop") -> "Stop":
-        check_type(other, Stop, "a rule of stopping")
+    def __or__(self, other: "StopRule") -> "StopRule":
+        check_type(other, StopRule, "a rule of stopping")
         return AnyOf((self, other))
 
 
-class AnyOf(Stop):
+class AnyOf(StopRule):
     """The first of some rules that holds."""
 
-    rules: tuple[Stop, ...]
+    rules: tuple[StopRule, ...]
 
     @property
-    def plans(self) -> bool:
-        return any(rule.plans for rule in self.rules)
+    def needs_proposal(self) -> bool:
+        return any(rule.needs_proposal for rule in self.rules)
 
     def check(self, acquisition: Acquisition) -> None:
         for rule in self.rules:
             rule.check(acquisition)
 
-    def after(self, so_far: SoFar) -> str | None:
-        return next(filter(None, (rule.after(so_far) for rule in self.rules)), None)
+    def after(self, context: StopContext) -> str | None:
+        return next(filter(None, (rule.after(context) for rule in self.rules)), None)
 
-    def before(self, so_far: SoFar, pose: Pose, value: float) -> str | None:
-        return next(filter(None, (rule.before(so_far, pose, value) for rule in self.rules)), None)
+    def before(self, context: StopContext, pose: Pose, value: float) -> str | None:
+        return next(filter(None, (rule.before(context, pose, value) for rule in self.rules)), None)

@@ -13,8 +13,9 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Episode, View, view_keys
-from jaxnbv.scanning import Evidence, GridSurface, TriangleMesh, scan
+from jaxnbv.scanning import GridSurface, TriangleMesh, scan
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.surfaces import KnownShapesPosterior, SurfacePosterior
 from jaxnbv.viz.sphere import unit
@@ -53,20 +54,20 @@ class Imagined(eqx.Module):
 
 
 def imagined(
-    episode: Episode, index: int, evidence: Evidence, posterior: SurfacePosterior, surfaces: GridSurface
+    episode: Episode, index: int, observations: Observations, posterior: SurfacePosterior, surfaces: GridSurface
 ) -> Imagined | None:
     """What was imagined before view `index` (from 0) was taken; None for one that was not chosen.
 
-    `evidence`: what was known before it; `posterior`: given that; `surfaces`: the step's samples.
+    `observations`: what was known before it; `posterior`: given that; `surfaces`: the step's samples.
     """
-    imagination, view = episode.planner.imagination, episode.views[index]
+    sampler, view = episode.planner.sampler, episode.views[index]
     if view.proposal is None:
         return None
-    camera, cloud = _finer(episode.planner.camera), evidence.cloud.to_numpy()[0]
-    barrier, samples = imagination.barrier(camera, view.pose), list[Look]()
+    camera, cloud = _finer(episode.planner.camera), observations.cloud.to_numpy()[0]
+    barrier, samples = sampler.barrier(camera, view.pose), list[Look]()
     for values in np.array(surfaces.values[:SHOWN]):
         # Of triangles: a picture is no reason to compile a scan of so many pixels.
-        found = level_triangles(values, imagination.grid)
+        found = level_triangles(values, sampler.grid)
         if found is None:
             nothing = np.zeros((camera.height, camera.width))
             samples.append(Look(nothing > 0, nothing, nothing > 0))
@@ -76,7 +77,7 @@ def imagined(
     names, kinds = [f"imagined {number}" for number in range(1, len(samples) + 1)], dict[str, float]()
     if isinstance(posterior, KnownShapesPosterior):
         sample_key, *_ = view_keys(episode.key, index)
-        names = posterior.names_of_samples(sample_key, imagination.num_samples)[: len(samples)]
+        names = posterior.names_of_samples(sample_key, sampler.num_samples)[: len(samples)]
         kinds = posterior.kinds()
     return Imagined(tuple(samples), tuple(names), tuple(kinds.items()))
 

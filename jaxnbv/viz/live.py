@@ -19,9 +19,10 @@ from jaxnbv.checks import checked
 from jaxnbv.errors import optional
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Episode, view_keys
 from jaxnbv.planning.session import Session
-from jaxnbv.scanning import Evidence, Grid, GridSurface
+from jaxnbv.scanning import Grid, GridSurface
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
@@ -74,13 +75,13 @@ class LiveView:
     def update(self, shown: Episode | Session) -> None:
         """Show an episode as it is now, or a session and where it asks for the next image."""
         episode = shown.episode if isinstance(shown, Session) else shown
-        asked, evidence = (shown.next_view, shown.evidence) if isinstance(shown, Session) else (None, None)
+        asked, observations = (shown.next_view, shown.observations) if isinstance(shown, Session) else (None, None)
         proposal, expected = (None, None) if asked is None else (asked.proposal, asked.expected_depth)
         views = episode.views
 
         def show(count: int) -> None:
             if count == len(views):
-                self._show(episode, proposal, expected, evidence)
+                self._show(episode, proposal, expected, observations)
             else:
                 self._show(dataclasses.replace(episode, views=views[:count]), views[count].proposal)
 
@@ -98,9 +99,9 @@ class LiveView:
         episode: Episode,
         proposal: Proposal | None,
         expected: Float[np.ndarray, "h w"] | None = None,
-        evidence: Evidence | None = None,
+        observations: Observations | None = None,
     ) -> None:
-        views, planner, imagination = episode.views, episode.planner, episode.planner.imagination
+        views, planner, sampler = episode.views, episode.planner, episode.planner.sampler
         new, _ = views[-1].scan.to_numpy()
         before = views[-2].cloud.to_numpy()[0] if len(views) > 1 else new[:0]
         scene, picture = self._server.scene, None if expected is None else _depth_picture(expected)
@@ -110,16 +111,16 @@ class LiveView:
                 for handle in self._drawn:
                     handle.remove()
                 self._drawn = _drawn(scene, seen_items(before, new, [view.pose for view in views], views[-1].camera))
-            evidence = episode.evidence_after(len(views)) if evidence is None else evidence
+            observations = episode.observations_after(len(views)) if observations is None else observations
             key, *_ = view_keys(episode.key, len(views))
-            posterior = imagination.posterior(evidence)
-            samples = imagination.sample(evidence, key, posterior)
-            surface = as_shown(mean_surface(imagination, evidence, posterior, samples), evidence.cloud)
+            posterior = sampler.posterior(observations)
+            samples = sampler.sample(observations, key, posterior)
+            surface = as_shown(mean_surface(sampler, observations, posterior, samples), observations.cloud)
             shapes = [""] * _SAMPLES
             if isinstance(posterior, KnownShapesPosterior):
-                shapes = [f" {name}" for name in posterior.names_of_samples(key, imagination.num_samples)]
+                shapes = [f" {name}" for name in posterior.names_of_samples(key, sampler.num_samples)]
             with self._server.atomic():
-                self._drawn += [*_surface(scene, surface), *_imagined(scene, samples, imagination.grid, shapes)]
+                self._drawn += [*_surface(scene, surface), *_imagined(scene, samples, sampler.grid, shapes)]
                 if proposal is not None:
                     self._drawn += _choice(scene, planner.camera, proposal, picture)
                 if self._image is not None:

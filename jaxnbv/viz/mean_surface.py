@@ -11,8 +11,9 @@ from scipy.spatial import cKDTree
 
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.farthest_points import farthest_point_indices
-from jaxnbv.imagination import Imagination
-from jaxnbv.scanning import Evidence, Grid, GridSurface
+from jaxnbv.observations import Observations
+from jaxnbv.sampler import SurfaceSampler
+from jaxnbv.scanning import Grid, GridSurface
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.surfaces import SurfacePosterior
 
@@ -48,17 +49,20 @@ class MeanSurface(eqx.Module):
 
 
 def mean_surface(
-    imagination: Imagination, evidence: Evidence, posterior: SurfacePosterior, surfaces: GridSurface | None = None
+    sampler: SurfaceSampler,
+    observations: Observations,
+    posterior: SurfacePosterior,
+    surfaces: GridSurface | None = None,
 ) -> MeanSurface | None:
-    """The surface of the mean of the posterior given the evidence, carved as the samples are, with its standard
+    """The surface of the mean of the posterior given the observations, carved as the samples are, with its standard
     deviation; None if the grid holds none.
 
     - `surfaces`: samples of it, by which a posterior without closed forms is drawn; by default under a fixed key.
     """
     if not posterior.has_closed_forms:
-        surfaces = imagination.sample(evidence, jax.random.key(0), posterior) if surfaces is None else surfaces
-        return _mean_of_samples(np.asarray(surfaces.values, np.float64), imagination.grid)
-    found = level_triangles(np.array(imagination.mean(evidence, posterior)), imagination.grid)
+        surfaces = sampler.sample(observations, jax.random.key(0), posterior) if surfaces is None else surfaces
+        return _mean_of_samples(np.asarray(surfaces.values, np.float64), sampler.grid)
+    found = level_triangles(np.array(sampler.mean(observations, posterior)), sampler.grid)
     if found is None:
         return None
     vertices, faces, normals = found
@@ -66,7 +70,7 @@ def mean_surface(
     features = np.concatenate([vertices, 0.1 * normals], axis=1)
     anchors = _spread(features, _SLOPE_ANCHORS)
     few = anchors[:_DEVIATION_ANCHORS]
-    dtype = evidence.cloud.points.dtype
+    dtype = observations.cloud.points.dtype
     variance = np.asarray(posterior.variance(vertices[few].astype(dtype)))
     step = _SLOPE_STEP * normals[anchors]
     ahead, behind = (np.asarray(posterior.mean((vertices[anchors] + s).astype(dtype))) for s in (step, -step))

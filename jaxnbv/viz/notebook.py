@@ -20,10 +20,10 @@ from jaxnbv.checks import checked
 from jaxnbv.errors import InputError
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import look_at
+from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.session import Session
-from jaxnbv.scanning import Evidence
 from jaxnbv.search import Proposal
 from jaxnbv.surfaces import SurfacePosterior
 from jaxnbv.viz.choice import draw_acquisition
@@ -161,9 +161,13 @@ def _draw_views(episode: Episode, axes: Axes) -> None:
 
 
 @drawing_of.register
-def _(evidence: Evidence) -> Drawing:
-    views, cloud = int(evidence.num_views), drawing_of(evidence.cloud)
-    empty = "" if evidence.seen_empty is None else f", {float(np.mean(evidence.seen_empty)):.0%} of the grid seen empty"
+def _(observations: Observations) -> Drawing:
+    views, cloud = int(observations.num_views), drawing_of(observations.cloud)
+    empty = (
+        ""
+        if observations.seen_empty is None
+        else f", {float(np.mean(observations.seen_empty)):.0%} of the grid seen empty"
+    )
     return Drawing(cloud.draw, f"{views} view{'s' * (views != 1)}{empty}; {cloud.facts}")
 
 
@@ -178,14 +182,14 @@ def _(session: Session) -> Drawing:
 
 @drawing_of.register
 def _(planner: Planner) -> Drawing:
-    imagination, search = planner.imagination, type(planner.search).__name__
-    by = f" over {imagination.num_samples} samples of {type(imagination.model).__name__}" * planner.search.uses_samples
+    sampler, search = planner.sampler, type(planner.search).__name__
+    by = f" over {sampler.num_samples} samples of {type(sampler.model).__name__}" * planner.search.uses_samples
     return Drawing(None, f"{search} by {planner.quantity.name}{by}; at most {planner.capacity:,} points are kept")
 
 
 @checked
 def show(
-    shown: PointCloud | Evidence | SurfacePosterior | Proposal | Episode | Session | Planner, progress: bool = True
+    shown: PointCloud | Observations | SurfacePosterior | Proposal | Episode | Session | Planner, progress: bool = True
 ) -> Picture:
     """A picture that a notebook shows: of an episode or a session all views in a strip, the surface as it became known
     and what the search looked at; of others what a notebook draws small, large.

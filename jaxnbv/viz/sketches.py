@@ -4,8 +4,9 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
+from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Episode, Step, view_keys
-from jaxnbv.scanning import Evidence, GridSurface
+from jaxnbv.scanning import GridSurface
 from jaxnbv.surfaces import SurfacePosterior
 from jaxnbv.viz.imagined import Imagined, imagined
 from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
@@ -46,28 +47,28 @@ def sketches_of(episode: Episode, held: Mapping[int, Sketch], imagine: bool) -> 
 
     `held`: those that there are; `imagine`: whether the others show what was imagined.
     """
-    for index, evidence in enumerate(episode.evidence(), start=1):
+    for index, observations in enumerate(episode.observations(), start=1):
         if index in held:
             yield held[index]
             continue
-        posterior, surfaces = episode.planner.imagination.posterior(evidence), None
+        posterior, surfaces = episode.planner.sampler.posterior(observations), None
         # With the key of the step: what it imagined, and moments where the posterior has no closed ones.
         if (imagine and index < len(episode.views)) or not posterior.has_closed_forms:
             sample_key, *_ = view_keys(episode.key, index)
-            surfaces = episode.planner.imagination.sample(evidence, sample_key, posterior)
-        yield _sketch(episode, index, evidence, posterior, surfaces, imagine)
+            surfaces = episode.planner.sampler.sample(observations, sample_key, posterior)
+        yield _sketch(episode, index, observations, posterior, surfaces, imagine)
 
 
 def _sketch(
     episode: Episode,
     index: int,
-    evidence: Evidence,
+    observations: Observations,
     posterior: SurfacePosterior,
     surfaces: GridSurface | None,
     imagine: bool = True,
 ) -> Sketch:
-    mean = mean_surface(episode.planner.imagination, evidence, posterior, surfaces)
+    mean = mean_surface(episode.planner.sampler, observations, posterior, surfaces)
     seen = None
     if imagine and surfaces is not None and index < len(episode.views):
-        seen = imagined(episode, index, evidence, posterior, surfaces)
-    return Sketch(as_shown(mean, evidence.cloud), seen)
+        seen = imagined(episode, index, observations, posterior, surfaces)
+    return Sketch(as_shown(mean, observations.cloud), seen)

@@ -175,7 +175,7 @@ def _asked(planner: Planner) -> str:
     name = planner.quantity.name
     if not planner.search.uses_samples:
         return f"Each view is where the {name} is highest."
-    return f"Each view is where the {name} is highest, over {planner.imagination.num_samples} imagined surfaces."
+    return f"Each view is where the {name} is highest, over {planner.sampler.num_samples} imagined surfaces."
 
 
 def _sure(answers: Sequence[Answer], stopped: str | None) -> str:

@@ -80,7 +80,7 @@ def planner():
     return nbv.Planner(
         nbv.Coverage(),
         camera=camera,
-        imagination=nbv.Imagination(model, grid=GRID, num_samples=2, carving=None),
+        sampler=nbv.SurfaceSampler(model, grid=GRID, num_samples=2, carving=None),
         capacity=16,
     )
 

@@ -29,24 +29,24 @@ def episode():
 
 def test_simulate_is_the_loop_of_ask_and_tell(episode):
     """View i draws from fold_in(key, i): one half to choose it, one for the sensor's noise."""
-    pose, evidence = FIRST, None
+    pose, observations = FIRST, None
     for index in range(4):
         choose_key, noise_key = jax.random.split(jax.random.fold_in(KEY, index))
         proposal = None
-        if evidence is not None:
-            proposal = PLANNER.propose(evidence, choose_key)
+        if observations is not None:
+            proposal = PLANNER.propose(observations, choose_key)
             pose = proposal.pose
         seen = observe_scene(SCENE, PLANNER.camera, pose, SensorNoise(), noise_key)
-        evidence = PLANNER.init(pose, seen) if evidence is None else PLANNER.observe(evidence, pose, seen)
+        observations = PLANNER.init(pose, seen) if observations is None else PLANNER.observe(observations, pose, seen)
         view = episode.views[index]
-        assert_same_bits((view.pose, view.scan, view.cloud), (pose, seen, evidence.cloud))
+        assert_same_bits((view.pose, view.scan, view.cloud), (pose, seen, observations.cloud))
         assert_same_bits(view.proposal, proposal)
-        assert_same_bits(episode.evidence_after(index + 1), evidence)
-    assert_same_bits(episode.cloud, evidence.cloud)
+        assert_same_bits(episode.observations_after(index + 1), observations)
+    assert_same_bits(episode.cloud, observations.cloud)
     assert len(episode.views) == 4
     for wrong in (0, 5):
         with pytest.raises(ValueError, match=f"asked for {wrong} of 4 views"):
-            episode.evidence_after(wrong)
+            episode.observations_after(wrong)
 
 
 def test_a_solid_is_simulated_as_its_surface_is():
@@ -105,26 +105,28 @@ def test_a_whole_episode_as_one_jitted_function(episode):
             return jax.random.split(jax.random.fold_in(key, index))
 
         seen = noise(scan(SCENE, PLANNER.camera, first), keys(0)[1])
-        evidence = PLANNER.init(first, seen)
+        observations = PLANNER.init(first, seen)
 
-        def step(evidence, index):
+        def step(observations, index):
             choose_key, noise_key = keys(index)
-            proposal = PLANNER.propose(evidence, choose_key)
+            proposal = PLANNER.propose(observations, choose_key)
             seen = noise(scan(SCENE, PLANNER.camera, proposal.pose), noise_key)
-            return PLANNER.observe(evidence, proposal.pose, seen), (proposal.pose, proposal.values)
+            return PLANNER.observe(observations, proposal.pose, seen), (proposal.pose, proposal.values)
 
-        return jax.lax.scan(step, evidence, jnp.arange(1, 4))
+        return jax.lax.scan(step, observations, jnp.arange(1, 4))
 
-    evidence, (poses, values) = run(KEY, FIRST.position)
-    assert int(evidence.num_views) == 4
+    observations, (poses, values) = run(KEY, FIRST.position)
+    assert int(observations.num_views) == 4
     for index in range(3):
         view = episode.views[index + 1]
         np.testing.assert_allclose(poses.position[index], view.pose.position, atol=1e-5)
         np.testing.assert_allclose(values[index], view.proposal.values, rtol=0.02, atol=0.02)
-    np.testing.assert_array_equal(evidence.cloud.mask, episode.cloud.mask)
-    assert int(evidence.cloud.count) == 128, "farthest points were taken"
+    np.testing.assert_array_equal(observations.cloud.mask, episode.cloud.mask)
+    assert int(observations.cloud.count) == 128, "farthest points were taken"
     # Where two points tie to rounding, farthest point sampling may swap them: compare as sets.
-    distance = np.linalg.norm(np.asarray(evidence.cloud.points)[:, None] - np.asarray(episode.cloud.points), axis=-1)
+    distance = np.linalg.norm(
+        np.asarray(observations.cloud.points)[:, None] - np.asarray(episode.cloud.points), axis=-1
+    )
     assert (distance.min(axis=1) < 1e-4).mean() > 0.95
 
 

@@ -11,9 +11,9 @@ from small_planner import CAMERA, FIRST, SCENE, planner_of
 
 from jaxnbv.geometry.cloud import PointCloud, concatenate, farthest_point_subsample
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
-from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import simulate
 from jaxnbv.planning.planner import Planner
+from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Grid, SensorNoise, scan
 from jaxnbv.search import DiscreteSearch, FarthestView, RandomView, UncertaintyView
 from jaxnbv.surfaces import GeometricSPSR
@@ -28,20 +28,20 @@ def planner():
 
 
 @pytest.fixture(scope="module")
-def evidence(planner):
+def observations(planner):
     return planner.init(FIRST, scan(SCENE, planner.camera, FIRST))
 
 
 @pytest.mark.parametrize("name", ["DiscreteSearch", "FarthestView"])
 def test_nothing_recompiles_after_the_second_view(name, compilations):
     planner, noise, key = planner_of(SEARCHES[name]), SensorNoise(), jax.random.key(3)
-    after, evidence, pose = [], None, FIRST
+    after, observations, pose = [], None, FIRST
     observe_scene = eqx.filter_jit(lambda pose, key: noise(scan(SCENE, planner.camera, pose), key))
     for view in range(5):
-        if evidence is not None:
-            pose = planner.propose(evidence, jax.random.fold_in(key, view)).pose
+        if observations is not None:
+            pose = planner.propose(observations, jax.random.fold_in(key, view)).pose
         seen = observe_scene(pose, jax.random.fold_in(key, view))
-        evidence = planner.init(pose, seen) if evidence is None else planner.observe(evidence, pose, seen)
+        observations = planner.init(pose, seen) if observations is None else planner.observe(observations, pose, seen)
         after.append(len(compilations))
     assert after[0] > 0, "the counter counts nothing"
     assert after[1:] == [after[1]] * 4, f"compilations after each view: {after}"
@@ -58,36 +58,36 @@ def test_simulated_episodes_do_not_recompile_either(planner, compilations):
     assert len(compilations) == before
 
 
-def test_asking_and_telling_leave_the_evidence_as_it_was(planner, evidence):
-    before = jax.tree.map(np.array, evidence)
-    proposal = planner.propose(evidence, jax.random.key(1))
+def test_asking_and_telling_leave_the_evidence_as_it_was(planner, observations):
+    before = jax.tree.map(np.array, observations)
+    proposal = planner.propose(observations, jax.random.key(1))
     seen = scan(SCENE, planner.camera, proposal.pose)
-    after = planner.observe(evidence, proposal.pose, seen)
-    jax.tree.map(np.testing.assert_array_equal, before, jax.tree.map(np.array, evidence))
-    assert int(evidence.num_views) == 1
+    after = planner.observe(observations, proposal.pose, seen)
+    jax.tree.map(np.testing.assert_array_equal, before, jax.tree.map(np.array, observations))
+    assert int(observations.num_views) == 1
     assert int(after.num_views) == 2
     np.testing.assert_array_equal(after.poses.position[:2], jnp.stack([FIRST.position, proposal.pose.position]))
-    assert int(after.cloud.count) == int(evidence.cloud.count + seen.count) <= 128
+    assert int(after.cloud.count) == int(observations.cloud.count + seen.count) <= 128
     with pytest.raises(AttributeError):
-        evidence.num_views = 3
-    again = planner.propose(evidence, jax.random.key(1))
+        observations.num_views = 3
+    again = planner.propose(observations, jax.random.key(1))
     jax.tree.map(np.testing.assert_array_equal, jax.tree.map(np.array, proposal), jax.tree.map(np.array, again))
 
 
 def test_a_first_scan_from_an_unknown_pose_excludes_nothing():
     planner = planner_of(SEARCHES["FarthestView"])
-    evidence = planner.init(None, scan(SCENE, planner.camera, FIRST))
-    assert int(evidence.num_views) == 0
-    assert not np.isneginf(planner.propose(evidence, jax.random.key(0)).values).any()
+    observations = planner.init(None, scan(SCENE, planner.camera, FIRST))
+    assert int(observations.num_views) == 0
+    assert not np.isneginf(planner.propose(observations, jax.random.key(0)).values).any()
 
 
 def test_a_cloud_alone_is_evidence(planner):
     cloud, key = scan(SCENE, planner.camera, FIRST), jax.random.key(4)
-    known, alone = (planner.propose(evidence, key) for evidence in (planner.init(None, cloud), cloud))
+    known, alone = (planner.propose(observations, key) for observations in (planner.init(None, cloud), cloud))
     jax.tree.map(np.testing.assert_array_equal, jax.tree.map(np.array, known), jax.tree.map(np.array, alone))
 
 
-def test_beyond_its_capacity_the_cloud_is_thinned_by_farthest_points(planner, evidence):
+def test_beyond_its_capacity_the_cloud_is_thinned_by_farthest_points(planner, observations):
     proposal_pose = look_at((-0.8, 0.9, 2.2))
     seen = scan(SCENE, planner.camera, proposal_pose)
     small = planner_of(SEARCHES["DiscreteSearch"], capacity=40)
@@ -103,12 +103,12 @@ def test_beyond_its_capacity_the_cloud_is_thinned_by_farthest_points(planner, ev
     assert bool(after.cloud.mask.all())
 
 
-def test_a_scan_that_saw_nothing_only_records_its_pose(planner, evidence):
+def test_a_scan_that_saw_nothing_only_records_its_pose(planner, observations):
     away = Pose(np.eye(3, dtype=np.float32), np.array([0.0, 0.0, 2.5], np.float32))
     seen = scan(SCENE, planner.camera, away)
     assert int(seen.count) == 0
-    after = planner.observe(evidence, away, seen)
-    np.testing.assert_array_equal(after.cloud.points, evidence.cloud.points)
+    after = planner.observe(observations, away, seen)
+    np.testing.assert_array_equal(after.cloud.points, observations.cloud.points)
     assert int(after.num_views) == 2
 
 
@@ -117,24 +117,24 @@ def cloud_at(*points):
 
 
 @pytest.mark.parametrize("field", ["points", "normals"])
-def test_a_scan_with_nan_is_refused(planner, evidence, field):
+def test_a_scan_with_nan_is_refused(planner, observations, field):
     bad = eqx.tree_at(lambda c: getattr(c, field), cloud_at([0.0, 0.0, 0.1]), jnp.full((4, 3), jnp.nan))
-    for tell in (lambda: planner.init(FIRST, bad), lambda: planner.observe(evidence, FIRST, bad)):
+    for tell in (lambda: planner.init(FIRST, bad), lambda: planner.observe(observations, FIRST, bad)):
         with pytest.raises(ValueError, match=r"not finite.*mask these rows"):
             tell()
 
 
-def test_nan_in_a_masked_row_does_no_harm(planner, evidence):
+def test_nan_in_a_masked_row_does_no_harm(planner, observations):
     cloud = cloud_at([0.0, 0.0, 0.1])
     bad = eqx.tree_at(lambda c: c.points, cloud, cloud.points.at[2].set(jnp.nan))
-    after = planner.observe(evidence, FIRST, bad)
+    after = planner.observe(observations, FIRST, bad)
     assert np.isfinite(after.cloud.points).all()
-    assert int(after.cloud.count) == int(evidence.cloud.count) + 1
+    assert int(after.cloud.count) == int(observations.cloud.count) + 1
 
 
-def test_a_scan_outside_the_scene_is_refused(planner, evidence):
+def test_a_scan_outside_the_scene_is_refused(planner, observations):
     outside = cloud_at([0.0, 0.1, 0.0], [0.0, -40.0, 0.0])
-    for tell in (lambda: planner.init(FIRST, outside), lambda: planner.observe(evidence, FIRST, outside)):
+    for tell in (lambda: planner.init(FIRST, outside), lambda: planner.observe(observations, FIRST, outside)):
         with pytest.raises(ValueError, match=r"coordinate of 40.*Frame\.to_scene"):
             tell()
 
@@ -151,8 +151,8 @@ def test_a_singular_covariance_is_named():
     cloud = PointCloud.from_arrays(points, np.tile([0.0, 0.0, 1.0], (64, 1)))
     with pytest.raises(ValueError, match=r"64 normals with noise=1e-05 is singular .* raise the noise"):
         model.condition(cloud)
-    imagination = Imagination(model, Grid(12), num_samples=2)
-    planner = Planner(Coverage(), DiscreteSearch(4), imagination=imagination, capacity=64)
+    sampler = SurfaceSampler(model, Grid(12), num_samples=2)
+    planner = Planner(Coverage(), DiscreteSearch(4), sampler=sampler, capacity=64)
     with pytest.raises(ValueError, match=r"64 normals with noise=1e-05 is singular .* raise the noise"):
         planner.propose(planner.init(None, cloud), jax.random.key(0))
 
@@ -163,8 +163,8 @@ def test_points_far_apart_are_told_of_with_the_remedy():
     cloud = PointCloud.from_arrays(points, points)
 
     def init(lengthscale, variance):
-        imagination = Imagination(GeometricSPSR(lengthscale, variance, 10), Grid(16), num_samples=2)
-        Planner(Coverage(), DiscreteSearch(6), CAMERA, imagination).init(None, cloud)
+        sampler = SurfaceSampler(GeometricSPSR(lengthscale, variance, 10), Grid(16), num_samples=2)
+        Planner(Coverage(), DiscreteSearch(6), CAMERA, sampler).init(None, cloud)
 
     with pytest.warns(UserWarning, match=r"points are 0\.4\d apart, 2\.\d times .*Scan more densely, or raise"):
         init(0.025, 0.2)
@@ -182,8 +182,8 @@ def test_parts_thinner_than_a_cell_are_told_of_with_the_remedy():
     first, second = PointCloud.from_arrays(above, up), PointCloud.from_arrays(below, -up)
 
     def observe(resolution):
-        imagination = Imagination(GeometricSPSR(0.05, 0.2, 10), Grid(resolution), num_samples=2)
-        planner = Planner(Coverage(), DiscreteSearch(6), CAMERA, imagination, capacity=400)
+        sampler = SurfaceSampler(GeometricSPSR(0.05, 0.2, 10), Grid(resolution), num_samples=2)
+        planner = Planner(Coverage(), DiscreteSearch(6), CAMERA, sampler, capacity=400)
         planner.observe(planner.init(None, first), look_at((0.0, 0.0, -2.5)), second)
 
     with pytest.warns(UserWarning, match=r"288 of 288 points lie on parts thinner than a cell .*0\.0972.*Raise Grid"):
@@ -193,11 +193,11 @@ def test_parts_thinner_than_a_cell_are_told_of_with_the_remedy():
         observe(60)
 
 
-def test_what_is_constant_under_jit_is_checked_too(planner, evidence):
+def test_what_is_constant_under_jit_is_checked_too(planner, observations):
     seen = scan(SCENE, planner.camera, FIRST)
     begun = jax.jit(lambda: planner.init(FIRST, seen))()
-    np.testing.assert_array_equal(begun.cloud.points, evidence.cloud.points)
-    assert int(jax.jit(lambda evidence: planner.observe(evidence, FIRST, seen).num_views)(evidence)) == 2
+    np.testing.assert_array_equal(begun.cloud.points, observations.cloud.points)
+    assert int(jax.jit(lambda observations: planner.observe(observations, FIRST, seen).num_views)(observations)) == 2
     long = eqx.tree_at(lambda c: c.normals, seen, 2 * seen.normals)
     with pytest.raises(ValueError, match="not of unit length"):
         jax.jit(lambda: planner.init(FIRST, long))()

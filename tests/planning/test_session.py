@@ -13,11 +13,11 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
-from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Budget, ValueBelow
-from jaxnbv.scanning import Carving, Grid, Surroundings, scan
+from jaxnbv.sampler import SurfaceSampler
+from jaxnbv.scanning import Carving, Grid, Obstacles, scan
 from jaxnbv.search import DiscreteSearch, FarthestView, GradientSearch, SphereCandidates
 from jaxnbv.surfaces import GeometricSPSR, OutsideBoundary, ScreenedSPSR
 from jaxnbv.tasks import Coverage
@@ -41,21 +41,21 @@ def test_it_asks_and_tells_as_a_planner_in_the_scene_does(finished):
     box = Box(*BOX)
     search = DiscreteSearch(frame.to_scene(Pose.from_matrix(POSES)))
     imagined = frame.to_scene(CAMERA).resized(12, 16)
-    imagination = Imagination(GeometricSPSR(0.2, truncation=8), Grid(28), 3, Carving(frame.to_scene(box)))
-    planner = Planner(Coverage(), search, imagined, imagination, capacity=400, max_views=8)
-    evidence, matrix = None, FIRST
+    sampler = SurfaceSampler(GeometricSPSR(0.2, truncation=8), Grid(28), 3, Carving(frame.to_scene(box)))
+    planner = Planner(Coverage(), search, imagined, sampler, capacity=400, max_views=8)
+    observations, matrix = None, FIRST
     for index in range(3):
         pose = Pose.from_matrix(matrix)
         cloud = PointCloud.from_depth(shot(matrix), CAMERA, pose, depth_scale=1e-3, box=box)
         told = (frame.to_scene(pose), frame.to_scene(cloud), frame.to_scene(CAMERA))
-        evidence = planner.init(*told) if evidence is None else planner.observe(evidence, *told)
+        observations = planner.init(*told) if observations is None else planner.observe(observations, *told)
         sample_key, search_key, _ = view_keys(jax.random.key(0), index + 1)
-        proposal = planner.choose(evidence, planner.imagination.sample(evidence, sample_key), search_key)
+        proposal = planner.choose(observations, planner.sampler.sample(observations, sample_key), search_key)
         matrix = np.asarray(frame.to_world(proposal.pose).matrix)
         expected = finished.episode.views[index + 1].proposal if index < 2 else finished.next().proposal
         np.testing.assert_allclose(proposal.values, expected.values, rtol=1e-4, atol=1e-4)
         np.testing.assert_allclose(proposal.pose.position, expected.pose.position, atol=1e-5)
-    np.testing.assert_allclose(finished.evidence.cloud.points, evidence.cloud.points, atol=1e-5)
+    np.testing.assert_allclose(finished.observations.cloud.points, observations.cloud.points, atol=1e-5)
 
 
 def test_its_matrices_are_those_that_were_given(finished):
@@ -186,7 +186,7 @@ def test_an_image_beside_the_box_is_warned_of():
     [
         (lambda: session_of().next(), "no image yet: add one first"),
         (lambda: session_of().cloud, "no image yet: add one first"),
-        (lambda: session_of().evidence, "no image yet: add one first"),
+        (lambda: session_of().observations, "no image yet: add one first"),
         (lambda: session_of().episode, "no image yet: add one first"),
         (lambda: session_of(box=((0.0, 0.0), (1.0, 1.0))), "give two corners"),
         (lambda: session_of(box=((0.0, 0.0, 0.0), (1.0, 1.0, -1.0))), "has no inside"),
@@ -202,14 +202,12 @@ def test_bad_input_is_named(make, message):
 def test_the_box_is_the_volume_of_the_model_and_of_the_carving():
     """What was given another volume keeps it."""
     own = Box.cube(2.0)
-    imagination = Imagination(ScreenedSPSR(values=(OutsideBoundary(), OutsideBoundary(own))))
-    fitted = session_of(
-        planner=Planner(Coverage(), camera=Camera(height=12, width=16), imagination=imagination)
-    ).planner
+    sampler = SurfaceSampler(ScreenedSPSR(values=(OutsideBoundary(), OutsideBoundary(own))))
+    fitted = session_of(planner=Planner(Coverage(), camera=Camera(height=12, width=16), sampler=sampler)).planner
     scene = Frame.fit(np.array(BOX), up="z").to_scene(Box(*BOX))
-    assert fitted.imagination.carving.volume == scene
-    assert fitted.imagination.model.values[0].volume == scene
-    assert fitted.imagination.model.values[1].volume == own
+    assert fitted.sampler.carving.volume == scene
+    assert fitted.sampler.model.values[0].volume == scene
+    assert fitted.sampler.model.values[1].volume == own
     assert max(scene.high) == pytest.approx(1.25)
     assert fitted.camera.fov == pytest.approx(CAMERA.fov)
 
@@ -237,8 +235,8 @@ BELOW = np.array([[around(angle, -0.4), around(angle, 0.6)] for angle in (0.5, 2
 
 def test_the_table_is_found_told_of_and_kept_clear_of():
     """The box reaches two centimetres into it; half of the poses are below it."""
-    session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), poses=BELOW, surroundings=None)
-    with pytest.warns(UserWarning, match=r"stands on a plane through \[.*, -0\.00.*Surroundings\(\) to keep it"):
+    session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), poses=BELOW, obstacles=None)
+    with pytest.warns(UserWarning, match=r"stands on a plane through \[.*, -0\.00.*Obstacles\(\) to keep it"):
         session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     points, _ = session.cloud.to_numpy()
     # What is left of the table is nearer to the ball than the margin.
@@ -248,7 +246,7 @@ def test_the_table_is_found_told_of_and_kept_clear_of():
 
 
 def test_a_table_is_kept_where_that_is_asked_for():
-    session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), poses=BELOW, surroundings=Surroundings())
+    session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), poses=BELOW, obstacles=Obstacles())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         session.add(shot(FIRST), FIRST, depth_scale=1e-3)

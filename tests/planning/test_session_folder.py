@@ -29,7 +29,7 @@ def test_a_session_goes_on_from_its_folder(tmp_path):
     again.add(shot(matrix), matrix, depth_scale=1e-3)
     last = session_of(tmp_path)
     np.testing.assert_array_equal(last.next().proposal.values, record(None).episode.views[2].proposal.values)
-    np.testing.assert_array_equal(last.evidence.cloud.points, again.evidence.cloud.points)
+    np.testing.assert_array_equal(last.observations.cloud.points, again.observations.cloud.points)
 
 
 def test_images_keep_their_pixels(tmp_path):

@@ -13,8 +13,8 @@ from small_planner import CAMERA, FIRST, SCENE, planner_of
 from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
-from jaxnbv.imagination import Imagination
 from jaxnbv.planning.episode import observe_scene, simulate, steps
+from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import SensorNoise
 from jaxnbv.search import DiscreteSearch, FarthestView, RandomView, UncertaintyView
 from jaxnbv.search.candidates import sphere_candidates
@@ -87,33 +87,33 @@ def test_a_step_holds_the_samples_and_the_evidence_that_the_next_view_is_chosen_
     own = planner(DiscreteSearch(CANDIDATES), 3)
     first, second, third = steps(own, sensor_of(), FIRST, KEY)
     assert (first.basis, first.seconds) == (None, 0.0)
-    again = own.choose(second.evidence, third.basis.surfaces, jax.random.key(0))
+    again = own.choose(second.observations, third.basis.surfaces, jax.random.key(0))
     assert_same(again, third.view.proposal)
     assert third.seconds > 0.0
 
 
 def test_an_episode_lets_a_posterior_go_before_it_makes_the_next(monkeypatch):
     """At thousands of points each holds hundreds of megabytes."""
-    made, posterior = [], Imagination.posterior
+    made, posterior = [], SurfaceSampler.posterior
 
-    def told(imagination, evidence):
+    def told(sampler, observations):
         gc.collect()
         assert all(earlier() is None for earlier in made)
-        found = posterior(imagination, evidence)
+        found = posterior(sampler, observations)
         made.append(weakref.ref(found))
         return found
 
-    monkeypatch.setattr(Imagination, "posterior", told)
+    monkeypatch.setattr(SurfaceSampler, "posterior", told)
     simulate(planner(DiscreteSearch(CANDIDATES), 4), SCENE, FIRST, 4, KEY, progress=False)
     assert len(made) == 3
 
 
 def test_another_acquisition_or_search_does_not_compile_the_sampler_again(compilations):
     own = planner(DiscreteSearch(CANDIDATES))
-    evidence = own.init(FIRST, next(views_of(own)).scan)
-    surfaces = own.imagination.sample(evidence, KEY)
+    observations = own.init(FIRST, next(views_of(own)).scan)
+    surfaces = own.sampler.sample(observations, KEY)
     jax.block_until_ready(surfaces.values)
     del compilations[:]
     other = eqx.tree_at(lambda p: p.acquisition, planner(UncertaintyView(CANDIDATES)), FirstRow())
-    assert_same(other.imagination.sample(evidence, KEY), surfaces)
+    assert_same(other.sampler.sample(observations, KEY), surfaces)
     assert not compilations

@@ -13,11 +13,12 @@ from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
-from jaxnbv.imagination import Imagination
+from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import simulate
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.stopping import Budget, ValueBelow, so_far
-from jaxnbv.scanning import Evidence, Grid, SDFSurface, SensorNoise
+from jaxnbv.planning.stopping import Budget, ValueBelow, context
+from jaxnbv.sampler import SurfaceSampler
+from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.search import DiscreteSearch, FarthestView
 from jaxnbv.surfaces import GeometricSPSR
@@ -30,8 +31,8 @@ SEARCH = DiscreteSearch(10)
 
 
 def planner_of(acquisition, search=SEARCH):
-    imagination = Imagination(GeometricSPSR(0.2, truncation=6), GRID, num_samples=2)
-    return Planner(acquisition, search, CAMERA, imagination, capacity=256, max_views=8)
+    sampler = SurfaceSampler(GeometricSPSR(0.2, truncation=6), GRID, num_samples=2)
+    return Planner(acquisition, search, CAMERA, sampler, capacity=256, max_views=8)
 
 
 def cloud_of(count, capacity=256):
@@ -40,7 +41,7 @@ def cloud_of(count, capacity=256):
 
 
 def after(planner, cloud, poses=(FIRST,), seconds=0.0):
-    return so_far(planner, Evidence.before_views(cloud, 4, GRID), poses, KEY, seconds)
+    return context(planner, Observations.before_views(cloud, 4, GRID), poses, KEY, seconds)
 
 
 def of_count(cloud, enough):
@@ -105,7 +106,7 @@ def test_expected_coverage_is_that_of_the_samples(points, size, monkeypatch):
     """Of a posterior that holds one ball alone, whose rays and points are found anew in float64."""
     ball = balls(Grid(64), [0.8])
     planner = planner_of(Coverage())
-    monkeypatch.setattr(Imagination, "sample", lambda self, evidence, key: ball)
+    monkeypatch.setattr(SurfaceSampler, "sample", lambda self, observations, key: ball)
     upper = np.asarray(fibonacci_sphere(points))
     upper = upper[upper[:, 1] > 0]
     cloud = PointCloud.from_arrays(0.8 * upper, upper, 256)
@@ -146,8 +147,8 @@ def test_value_below_and_budgets_on_scripted_proposals():
     way = after(planner, cloud_of(50), (east, top), seconds=30.0)
     assert Budget(cost=2.01 * quarter).before(way, west, 1.0) is None
     assert "would cost 3.93, but 1.96 of" in Budget(cost=1.5 * quarter).before(way, west, 1.0)
-    assert Budget(cost=1.0).plans
-    assert not Budget(seconds=1.0).plans
+    assert Budget(cost=1.0).needs_proposal
+    assert not Budget(seconds=1.0).needs_proposal
     assert Budget(seconds=30.5).after(way) is None
     assert Budget(seconds=30.0).after(way) == "30 of 30 seconds are spent"
 

@@ -12,8 +12,9 @@ from small_planner import FIRST, SCENE, planner_of
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose, look_at
+from jaxnbv.observations import Observations
 from jaxnbv.planning.travel import ValuePerCost, arc_length, total_cost
-from jaxnbv.scanning import Evidence, scan
+from jaxnbv.scanning import scan
 from jaxnbv.search import (
     DiscreteSearch,
     FarthestView,
@@ -75,7 +76,7 @@ def test_a_cost_that_breaks_its_contract_makes_a_value_of_nothing():
     costs = jnp.array([-1.0, 0.0, jnp.inf, jnp.nan, 2.0])
     poses = Pose(jnp.broadcast_to(jnp.eye(3), (5, 3, 3)), jnp.zeros((5, 3)).at[:, 1].set(jnp.arange(5.0)))
     cloud = PointCloud.from_arrays(np.eye(3), np.eye(3))
-    seen = Evidence.before_views(cloud, 1, None)
+    seen = Observations.before_views(cloud, 1, None)
     weighed = ValuePerCost(lambda start, end: costs[end.position[1].astype(int)], fixed=0.5)
     np.testing.assert_array_equal(weighed(jnp.ones(5), seen, poses), 2.0)
     seen = dataclasses.replace(seen, num_views=seen.num_views + 1)
@@ -100,10 +101,10 @@ PER_COST = ValuePerCost(arc_length, fixed=0.5), lambda value, cost: value / (0.5
 )
 def test_values_are_weighed_against_the_way_from_the_last_view(cost, worth, search):
     plain, weighed = planner_of(search), planner_of(search, cost=cost)
-    evidence = evidence_of(plain)
-    second = plain.propose(evidence, KEY).pose
-    evidence = plain.observe(evidence, second, scan(SCENE, plain.camera, second))
-    values, found = (np.asarray(planner.propose(evidence, KEY).values) for planner in (plain, weighed))
+    observations = evidence_of(plain)
+    second = plain.propose(observations, KEY).pose
+    observations = plain.observe(observations, second, scan(SCENE, plain.camera, second))
+    values, found = (np.asarray(planner.propose(observations, KEY).values) for planner in (plain, weighed))
     places = np.asarray(plain.search.candidates.poses().position, np.float64)
     here = np.asarray(second.position, np.float64)
     angle = np.arccos(np.clip(places @ here / np.linalg.norm(places, axis=1) / np.linalg.norm(here), -1.0, 1.0))
@@ -115,8 +116,8 @@ def test_values_are_weighed_against_the_way_from_the_last_view(cost, worth, sear
 
 def test_standard_errors_are_of_what_is_weighed():
     plain, weighed = planner_of(), planner_of(cost=ValuePerCost(arc_length))
-    evidence = evidence_of(plain)
-    errors = [np.asarray(planner.propose(evidence, KEY).standard_errors) for planner in (plain, weighed)]
+    observations = evidence_of(plain)
+    errors = [np.asarray(planner.propose(observations, KEY).standard_errors) for planner in (plain, weighed)]
     way = np.array([float(arc_length(FIRST, pose)) for pose in plain.search.candidates.poses()])
     np.testing.assert_allclose(errors[1], errors[0] / (1.0 + way), rtol=1e-3)
 
@@ -126,10 +127,10 @@ def test_a_search_by_gradient_weighs_the_way_too():
     """All along its ascents a value is that without cost, by the same samples, over the cost of the way."""
     search = GradientSearch(dof=2, num_starts=2, iterations=6, learning_rate=0.05, num_candidates=6)
     planner = planner_of(search, cost=ValuePerCost(arc_length, fixed=1.0))
-    evidence = evidence_of(planner)
-    ways = planner.propose(evidence, KEY).trajectories
+    observations = evidence_of(planner)
+    ways = planner.propose(observations, KEY).trajectories
     poses = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), ways.poses)
-    plain = planner_of(DiscreteSearch(GivenPoses(poses))).propose(evidence, KEY)
+    plain = planner_of(DiscreteSearch(GivenPoses(poses))).propose(observations, KEY)
     costs = [1.0 + float(arc_length(FIRST, poses[index])) for index in range(ways.values.size)]
     np.testing.assert_allclose(np.ravel(ways.values), np.asarray(plain.values) / costs, rtol=1e-3)
     assert planner.quantity.name == "expected coverage gain per cost"
@@ -137,9 +138,9 @@ def test_a_search_by_gradient_weighs_the_way_too():
 
 def test_without_a_last_view_nothing_is_spent():
     planner = planner_of(cost=ValuePerCost(arc_length))
-    evidence = planner.init(None, scan(SCENE, planner.camera, FIRST))
-    plain = planner_of().propose(evidence, KEY)
-    np.testing.assert_allclose(planner.propose(evidence, KEY).values, plain.values, rtol=1e-5)
+    observations = planner.init(None, scan(SCENE, planner.camera, FIRST))
+    plain = planner_of().propose(observations, KEY)
+    np.testing.assert_allclose(planner.propose(observations, KEY).values, plain.values, rtol=1e-5)
 
 
 @pytest.mark.parametrize("search", [FarthestView(12), RandomView(12)])

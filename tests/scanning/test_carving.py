@@ -1,4 +1,4 @@
-"""The planner and what was seen to be empty: carved samples, what the model is told, refused scans and evidence."""
+"""The planner and what was seen to be empty: carved samples, what the model is told, refused scans and observations."""
 
 import dataclasses
 
@@ -42,7 +42,7 @@ class WavesPosterior(nbv.SurfacePosterior):
 
 
 class WavesModel(nbv.SurfaceModel):
-    def condition(self, evidence):
+    def condition(self, observations):
         return WavesPosterior(level=jnp.asarray(0.1))
 
 
@@ -50,30 +50,30 @@ CARVING, WAVES = nbv.Carving(), WavesModel()
 
 
 def planner_of(carving=CARVING, model=WAVES):
-    imagination = nbv.Imagination(model, SMALL_GRID, 3, carving)
+    sampler = nbv.SurfaceSampler(model, SMALL_GRID, 3, carving)
     return nbv.Planner(
-        nbv.Coverage(), nbv.FarthestView(12), nbv.Camera(height=40, width=40), imagination, capacity=400, max_views=4
+        nbv.Coverage(), nbv.FarthestView(12), nbv.Camera(height=40, width=40), sampler, capacity=400, max_views=4
     )
 
 
 def after_both_sides(planner, surface, poses=POSES):
-    evidence = planner.init(poses[0], nbv.scan(surface, planner.camera, poses[0]))
-    return planner.observe(evidence, poses[1], nbv.scan(surface, planner.camera, poses[1]))
+    observations = planner.init(poses[0], nbv.scan(surface, planner.camera, poses[0]))
+    return planner.observe(observations, poses[1], nbv.scan(surface, planner.camera, poses[1]))
 
 
 def test_no_sample_is_inside_what_was_seen_empty_nor_outside_the_volume():
     planner, raw = planner_of(), planner_of(carving=None)
-    evidence, raw_evidence = (after_both_sides(one, SOLIDS["ball"]) for one in (planner, raw))
+    observations, raw_evidence = (after_both_sides(one, SOLIDS["ball"]) for one in (planner, raw))
     assert raw_evidence.seen_empty is None
     expected = np.zeros((30,) * 3, bool)
     for pose in POSES:
         seen = SEE(CARVING, SMALL_GRID, pose, nbv.scan(SOLIDS["ball"], planner.camera, pose), planner.camera)
         assert seen.sum() > 200
         expected |= np.asarray(seen)
-    np.testing.assert_array_equal(evidence.seen_empty, expected)
+    np.testing.assert_array_equal(observations.seen_empty, expected)
 
-    carved = np.asarray(planner.imagination.sample(evidence, jax.random.key(1)).values)
-    values = np.asarray(raw.imagination.sample(raw_evidence, jax.random.key(1)).values)
+    carved = np.asarray(planner.sampler.sample(observations, jax.random.key(1)).values)
+    values = np.asarray(raw.sampler.sample(raw_evidence, jax.random.key(1)).values)
     outside = (np.linalg.norm(np.maximum(np.abs(nodes_of(SMALL_GRID)) - 1.25, 0.0), axis=-1)) > 2 * SMALL_GRID.spacing
     nowhere = expected | outside
     assert (outside & ~expected).any()
@@ -88,26 +88,26 @@ def test_no_sample_is_inside_what_was_seen_empty_nor_outside_the_volume():
 class Told(WavesModel):
     """Is told of space seen empty: its level says of how many points, and how far the farthest is out of the volume."""
 
-    def condition(self, evidence):
-        empty = nbv.Evidence.of(evidence).empty_points
+    def condition(self, observations):
+        empty = nbv.Observations.of(observations).empty_points
         outermost = jnp.max(jnp.where(empty.mask, jnp.max(jnp.abs(empty.points), axis=1), 0.0))
         return WavesPosterior(level=1000.0 * jnp.sum(empty.mask) + outermost)
 
 
 def test_the_model_is_told_of_what_was_seen_empty_within_the_volume():
     told, waves = planner_of(model=Told()), planner_of(carving=None)
-    evidence = after_both_sides(told, SOLIDS["ball"])
-    within = evidence.seen_empty & CARVING.inside(SMALL_GRID)
-    empty = dataclasses.replace(evidence, seen_empty=within).empty_points
+    observations = after_both_sides(told, SOLIDS["ball"])
+    within = observations.seen_empty & CARVING.inside(SMALL_GRID)
+    empty = dataclasses.replace(observations, seen_empty=within).empty_points
     points = np.asarray(empty.points)[np.asarray(empty.mask)]
     assert 50 < len(points) <= 20**3
     index = np.rint((points + SMALL_GRID.half_extent) / SMALL_GRID.spacing).astype(int)
-    assert np.asarray(evidence.seen_empty)[tuple(index.T)].all()
+    assert np.asarray(observations.seen_empty)[tuple(index.T)].all()
     assert np.abs(points).max() < 1.25
     key = jax.random.key(0)
-    raw = waves.imagination.model.condition(evidence.cloud).sample(key, 3).on_grid(SMALL_GRID.axis)
-    untouched = ~np.asarray(evidence.seen_empty | CARVING.outside(SMALL_GRID))
-    level = float((np.asarray(raw) - np.asarray(told.imagination.sample(evidence, key).values))[:, untouched].mean())
+    raw = waves.sampler.model.condition(observations.cloud).sample(key, 3).on_grid(SMALL_GRID.axis)
+    untouched = ~np.asarray(observations.seen_empty | CARVING.outside(SMALL_GRID))
+    level = float((np.asarray(raw) - np.asarray(told.sampler.sample(observations, key).values))[:, untouched].mean())
     np.testing.assert_allclose(level, 1000.0 * len(points) + np.abs(points).max(), rtol=1e-4)
 
 
@@ -119,9 +119,9 @@ def test_carved_samples_keep_a_thin_sheet_that_was_seen_from_both_sides():
     model = nbv.GeometricSPSR(truncation=12, lengthscale=0.1)
     planner, raw = (planner_of(carving, model=model) for carving in (nbv.Carving(), None))
     sheet = nbv.SDFSurface(Cuboid([0.6, 0.6, 0.04]))
-    evidence = after_both_sides(planner, sheet, ABOVE_AND_BELOW)
-    values = raw.imagination.sample(evidence, jax.random.key(1)).values
-    carved = carve(values, evidence.seen_empty | planner.imagination.carving.outside(SMALL_GRID))
+    observations = after_both_sides(planner, sheet, ABOVE_AND_BELOW)
+    values = raw.sampler.sample(observations, jax.random.key(1)).values
+    carved = carve(values, observations.seen_empty | planner.sampler.carving.outside(SMALL_GRID))
     narrow, poses = (
         nbv.Camera(height=10, width=10, fov=0.35),
         nbv.look_at(jnp.asarray([[0.0, 0.0, 2.5], [0.0, 0.0, -2.5]])),
@@ -143,10 +143,10 @@ def test_a_scan_of_another_camera_needs_that_camera():
     assert np.ptp(column) > 25
     assert np.ptp(row) > 10
     np.testing.assert_array_equal(planner.init(pose, seen, camera=other).seen_empty, expected)
-    evidence = planner.init(POSES[0], nbv.scan(SOLIDS["ball"], planner.camera, POSES[0]))
-    after = planner.observe(evidence, pose, seen, camera=other)
-    np.testing.assert_array_equal(after.seen_empty, expected | np.asarray(evidence.seen_empty))
-    for tell in (lambda: planner.init(pose, seen), lambda: planner.observe(evidence, pose, seen)):
+    observations = planner.init(POSES[0], nbv.scan(SOLIDS["ball"], planner.camera, POSES[0]))
+    after = planner.observe(observations, pose, seen, camera=other)
+    np.testing.assert_array_equal(after.seen_empty, expected | np.asarray(observations.seen_empty))
+    for tell in (lambda: planner.init(pose, seen), lambda: planner.observe(observations, pose, seen)):
         with pytest.raises(ValueError, match=r"scan has 720 rays but the camera 40 x 40: give the camera that took it"):
             tell()
 
@@ -156,9 +156,9 @@ def test_a_cloud_that_is_no_image_carves_nothing():
     points = nbv.scan(SOLIDS["ball"], nbv.Camera(height=9, width=9), POSES[0])
     cloud = nbv.PointCloud.from_arrays(*points.to_numpy())
     assert cloud.missed is None
-    evidence = planner.init(POSES[0], cloud)
-    assert not evidence.seen_empty.any()
-    assert not planner.observe(evidence, POSES[1], cloud).seen_empty.any()
+    observations = planner.init(POSES[0], cloud)
+    assert not observations.seen_empty.any()
+    assert not planner.observe(observations, POSES[1], cloud).seen_empty.any()
     unknown = planner.init(None, nbv.scan(SOLIDS["ball"], planner.camera, POSES[0]))
     assert not unknown.seen_empty.any(), "nothing is known of a scan from an unknown pose"
 

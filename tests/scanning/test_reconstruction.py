@@ -17,7 +17,7 @@ MODEL = nbv.GeometricSPSR(lengthscale=0.05, truncation=10)
 
 
 def mean_mesh(model, cloud, grid):
-    return nbv.Imagination(model, grid, carving=None).mean_mesh(cloud)
+    return nbv.SurfaceSampler(model, grid, carving=None).mean_mesh(cloud)
 
 
 def sphere_cloud(count=600, capacity=700):
@@ -59,7 +59,7 @@ def test_vertices_lie_where_the_posterior_mean_equals_its_level():
 class Balls(nbv.SurfaceModel):
     """A model of its own, with a mean in closed form: whatever the cloud, two balls, of which one holds no data."""
 
-    def condition(self, evidence):
+    def condition(self, observations):
         return BallsPosterior()
 
 
@@ -91,9 +91,9 @@ def test_what_was_seen_empty_is_not_meshed():
     camera, pose = nbv.Camera(fov=1.3, height=60, width=60), nbv.look_at((0.0, 0.0, 2.5))
 
     def mesh(carving):
-        imagination = nbv.Imagination(Balls(), nbv.Grid(30), num_samples=1, carving=carving)
-        planner = nbv.Planner(nbv.Coverage(), nbv.FarthestView(8), camera, imagination, capacity=4000)
-        return imagination.mean_mesh(planner.init(pose, nbv.scan(seen, camera, pose)))
+        sampler = nbv.SurfaceSampler(Balls(), nbv.Grid(30), num_samples=1, carving=carving)
+        planner = nbv.Planner(nbv.Coverage(), nbv.FarthestView(8), camera, sampler, capacity=4000)
+        return sampler.mean_mesh(planner.init(pose, nbv.scan(seen, camera, pose)))
 
     (ball,) = mesh(nbv.Carving()).to_trimesh().split()
     np.testing.assert_allclose(np.linalg.norm(ball.vertices - [-0.6, 0.0, 0.0], axis=1), 0.5, atol=0.03)

@@ -13,9 +13,7 @@ from jaxnbv.studies.scenes import PATTERNS, Split, part_scene, pyramid_scene
 
 COUNT, POINTS = 24, 200
 MODEL = nbv.GeometricSPSR(lengthscale=0.05, truncation=8)
-PLANNER = nbv.Planner(
-    nbv.Coverage(), imagination=nbv.Imagination(MODEL, grid=nbv.Grid(20), num_samples=2), capacity=150
-)
+PLANNER = nbv.Planner(nbv.Coverage(), sampler=nbv.SurfaceSampler(MODEL, grid=nbv.Grid(20), num_samples=2), capacity=150)
 # A motorbike and a skateboard. Compilation takes nearly all the time of the rest.
 PARTS, SETTING = (7, 11), PART_SETTING._replace(camera=nbv.Camera(height=24, width=24))
 

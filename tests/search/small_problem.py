@@ -20,7 +20,7 @@ def problem_of(surfaces, acquisition=nbv.Coverage(), camera=CAMERA):  # noqa: B0
     cloud = nbv.PointCloud.from_arrays(rng.uniform(-1, 1, (30, 3)), np.tile([0.0, 1.0, 0.0], (30, 1)), 32)
     dtype = jnp.result_type(float)
     views = nbv.Pose(np.tile(np.eye(3, dtype=dtype), (6, 1, 1)), np.zeros((6, 3), dtype))
-    return nbv.Problem(nbv.Evidence(cloud, views, jnp.asarray(0)), camera, acquisition, surfaces).prepared()
+    return nbv.Problem(nbv.Observations(cloud, views, jnp.asarray(0)), camera, acquisition, surfaces).prepared()
 
 
 @functools.cache
@@ -34,9 +34,9 @@ def visit(problem, *poses):
     if not poses:
         return problem
     rows = jax.tree.map(lambda *leaves: jnp.stack(leaves), *poses)
-    taken = jax.tree.map(lambda all_rows, new: all_rows.at[: len(poses)].set(new), problem.evidence.poses, rows)
-    evidence = dataclasses.replace(problem.evidence, poses=taken, num_views=jnp.asarray(len(poses)))
-    return dataclasses.replace(problem, evidence=evidence)
+    taken = jax.tree.map(lambda all_rows, new: all_rows.at[: len(poses)].set(new), problem.observations.poses, rows)
+    observations = dataclasses.replace(problem.observations, poses=taken, num_views=jnp.asarray(len(poses)))
+    return dataclasses.replace(problem, observations=observations)
 
 
 @eqx.filter_jit
@@ -52,7 +52,7 @@ def sample_by_sample(problem, acquisition=nbv.Coverage(), poses=POSES):  # noqa:
     """Scores (samples, candidates), each sample by itself."""
     value = eqx.filter_jit(nbv.expected_value)
     of = [
-        value(acquisition, problem.evidence.cloud, with_samples(problem, slice(s, s + 1)).surfaces, CAMERA, poses)
+        value(acquisition, problem.observations.cloud, with_samples(problem, slice(s, s + 1)).surfaces, CAMERA, poses)
         for s in range(problem.num_samples)
     ]
     return np.array(of, np.float64)

@@ -19,8 +19,8 @@ def problem(visited, surfaces=None):
     """Five rows for views, the first of them filled; the rest hold poses that must not count."""
     positions = np.concatenate([visited, np.tile(CANDIDATES[5], (5, 1))])[:5]
     cloud = nbv.PointCloud.from_arrays([[0.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    evidence = nbv.Evidence(cloud, nbv.look_at(positions), jnp.asarray(len(visited)))
-    return nbv.Problem(evidence, nbv.Camera(height=4, width=4), nbv.Coverage(), surfaces).prepared()
+    observations = nbv.Observations(cloud, nbv.look_at(positions), jnp.asarray(len(visited)))
+    return nbv.Problem(observations, nbv.Camera(height=4, width=4), nbv.Coverage(), surfaces).prepared()
 
 
 def index_of(proposal):

@@ -46,7 +46,7 @@ def test_only_the_same_place_and_direction_counts_as_visited():
         again = propose(SEARCH, visit(PROBLEM, pose))
         assert bool((again.pose.position != best.position).any()) == is_visited
     # Rows beyond the views that were taken hold nothing.
-    stale = eqx.tree_at(lambda p: p.evidence.num_views, visit(PROBLEM, best), jnp.asarray(0))
+    stale = eqx.tree_at(lambda p: p.observations.num_views, visit(PROBLEM, best), jnp.asarray(0))
     np.testing.assert_array_equal(propose(SEARCH, stale).pose.position, best.position)
 
 

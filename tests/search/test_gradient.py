@@ -198,7 +198,7 @@ def test_a_view_of_nothing_is_worth_nothing_and_not_chosen():
     def slopes(pose):
         def scores(parameters):
             seen = scan(surface, CAMERA, nbv.FreePoses().retract(pose, parameters))
-            each = jnp.stack([one(one.context(problem.evidence.cloud), seen) for one in ACQUISITIONS.values()])
+            each = jnp.stack([one(one.context(problem.observations.cloud), seen) for one in ACQUISITIONS.values()])
             return each, (each, seen.count)
 
         return jax.jacrev(scores, has_aux=True)(jnp.zeros(9))

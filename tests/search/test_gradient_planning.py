@@ -18,8 +18,8 @@ SMALL = {"num_starts": 2, "iterations": 3, "num_candidates": 4}
 
 
 def planner_of(search, acquisition=nbv.Coverage()):  # noqa: B008
-    imagination = nbv.Imagination(nbv.GeometricSPSR(truncation=6, lengthscale=0.05), nbv.Grid(20), num_samples=2)
-    return nbv.Planner(acquisition, search, nbv.Camera(height=6, width=6), imagination, capacity=64, max_views=6)
+    sampler = nbv.SurfaceSampler(nbv.GeometricSPSR(truncation=6, lengthscale=0.05), nbv.Grid(20), num_samples=2)
+    return nbv.Planner(acquisition, search, nbv.Camera(height=6, width=6), sampler, capacity=64, max_views=6)
 
 
 PLANNER = planner_of(nbv.GradientSearch(dof=2, **SMALL))
@@ -116,6 +116,6 @@ def test_a_derivative_that_is_not_a_number_is_reported(space):
     """The square root's value at zero is finite, its slope is not."""
     score = nbv.ExpectedUtilityImprovement(lambda cloud: jnp.sqrt(0.0 * jnp.sum(cloud.points**2)) + 1.0 * cloud.count)
     planner = planner_of(nbv.GradientSearch(space=space, **SMALL), score)
-    evidence = planner.init(FIRST, nbv.scan(SCENE, planner.camera, FIRST))
+    observations = planner.init(FIRST, nbv.scan(SCENE, planner.camera, FIRST))
     with pytest.raises(ValueError, match=r"not a number.*derivatives"):
-        planner.propose(evidence, KEY)
+        planner.propose(observations, KEY)

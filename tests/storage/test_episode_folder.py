@@ -50,7 +50,7 @@ def test_a_scan_that_is_no_image_reads_as_one(finished, tmp_path):
 def test_the_record_says_what_made_it(finished):
     record = json.loads((finished[1] / "episode.json").read_text())
     assert set(record["config"]) == {"planner", "scene", "noise", "first", "key"}
-    assert record["config"]["planner"]["imagination"]["num_samples"] == 3
+    assert record["config"]["planner"]["sampler"]["num_samples"] == 3
     assert record["versions"]["jax"] == jax.__version__
     np.testing.assert_allclose(record["config"]["first"]["position"], [0.8, 0.9, 2.2], atol=1e-6)
 
@@ -78,7 +78,7 @@ def test_three_views_continued_to_five_equal_five(finished, tmp_path):
     assert len(contents(tmp_path / "run")) == 5
     episode = run(tmp_path / "run", views=5)
     assert contents(tmp_path / "run") == contents(folder)
-    ends = [(each.views, each.evidence_after(5)) for each in (episode, finished[0])]
+    ends = [(each.views, each.observations_after(5)) for each in (episode, finished[0])]
     for a, b in zip(*map(jax.tree.leaves, ends), strict=True):
         np.testing.assert_array_equal(a, b)
     assert ends[0][1].seen_empty.shape == (24, 24, 24)
@@ -97,7 +97,7 @@ def test_a_finished_run_is_read_not_computed(finished, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"planner": planner_of(num_samples=4)}, r"planner\.imagination\.num_samples: 3 there, 4 now"),
+        ({"planner": planner_of(num_samples=4)}, r"planner\.sampler\.num_samples: 3 there, 4 now"),
         ({"planner": planner_of(FarthestView(12))}, r"planner\.search\.type: DiscreteSearch there"),
         ({"noise": SensorNoise(0.03)}, r"noise\.points: 0\.01 there, 0\.03 now"),
         ({"key": jax.random.key(9)}, r"key\.data: \[0, 0\] there, \[0, 9\] now"),

@@ -10,7 +10,7 @@ from PIL import Image
 
 import jaxnbv as nbv
 from jaxnbv.checks import InputError
-from jaxnbv.imagination import Imagination
+from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.studies.engine.pictures import write_pictures
 from jaxnbv.studies.heat import HeatStudy, Truth, heat_problem
@@ -30,7 +30,7 @@ def small_study(**settings):
         "views": VIEWS,
         "num_candidates": CANDIDATES,
         "num_samples": 3,
-        "imagination": Imagination(model),
+        "sampler": SurfaceSampler(model),
         "grid_resolution": 20,
     }
     few = {"capacity": 900, "num_points": 200, "imagined_rays": 6, "true_grid": nbv.Grid(48)}
@@ -79,9 +79,9 @@ def test_estimates_are_those_of_the_clouds(record):
     assert record["truth"] == {"point": truth.coldest.tolist(), "temperature": low, "hottest": high}
     assert coldest_point(truth.mesh, heat).temperature == low
     run = record["methods"]["heat"]
-    for view, (_, evidence) in enumerate(study.seen(scene, run)):
+    for view, (_, observations) in enumerate(study.seen(scene, run)):
         for name, found in run["estimates"].items():
-            expected = coldest_point(evidence.cloud, heat, reached_only=name == "reached")
+            expected = coldest_point(observations.cloud, heat, reached_only=name == "reached")
             assert found["points"][view] == expected.point.tolist()
             assert found["temperatures"][view] == expected.temperature
             distance = np.linalg.norm(near - expected.point, axis=1).min()
@@ -98,7 +98,7 @@ def test_the_coldest_points_are_those_within_a_hundredth_of_the_range():
 
 
 def test_halving_finds_the_second_view_of_the_full_search(record):
-    """Both start from the same view, so that it is chosen from the same evidence and samples."""
+    """Both start from the same view, so that it is chosen from the same observations and samples."""
     second = [np.round(record["methods"][method]["views"][1]["position"], 4).tolist() for method in RUN[:2]]
     assert second[0] == second[1]
 

@@ -10,7 +10,7 @@ from PIL import Image
 
 import jaxnbv as nbv
 from jaxnbv.checks import InputError
-from jaxnbv.imagination import Imagination
+from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import scan
 from jaxnbv.scanning.metrics import coverage, surface_distance, truth_points
 from jaxnbv.scanning.screened_poisson import has_poisson
@@ -44,7 +44,7 @@ def small_study(folder=None, views=3, **settings):
     small = {
         "num_candidates": CANDIDATES,
         "num_samples": 2,
-        "imagination": Imagination(model),
+        "sampler": SurfaceSampler(model),
         "grid_resolution": 20,
         "capacity": 250,
     }
@@ -106,11 +106,11 @@ def test_distances_are_those_of_the_reconstruction_from_the_last_cloud(record, m
     study = small_study(meshes)
     scene = study.scene(1)
     truth = scene.surface.sample_points(jax.random.key(5), 20_000)
-    imagination, method = study.mesher(scene).imagination, record["methods"]["farthest"]
-    evidence = study.seen(scene, method)[-1][1]
+    sampler, method = study.mesher(scene).sampler, record["methods"]["farthest"]
+    observations = study.seen(scene, method)[-1][1]
     for name, found in method["reconstructions"].items():
         if found is not None:
-            points = reconstruct(imagination, evidence, name).sample_points(jax.random.key(6), 20_000)
+            points = reconstruct(sampler, observations, name).sample_points(jax.random.key(6), 20_000)
             expected = surface_distance(points, truth)
             assert found["chamfer"] == pytest.approx(expected.chamfer, rel=0.05)
             assert found["hausdorff"] == pytest.approx(expected.hausdorff, rel=0.1)

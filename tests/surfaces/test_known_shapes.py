@@ -67,14 +67,14 @@ def model(bank=BANK, **changed):
 
 def evidence_of(surface, positions, noise=0.005):
     planner = nbv.Planner(
-        nbv.Coverage(), camera=CAMERA, imagination=nbv.Imagination(grid=GRID), capacity=512, max_views=4
+        nbv.Coverage(), camera=CAMERA, sampler=nbv.SurfaceSampler(grid=GRID), capacity=512, max_views=4
     )
-    evidence = None
+    observations = None
     for index, position in enumerate(positions):
         pose = nbv.look_at(position)
         scan = nbv.SensorNoise(noise, noise)(nbv.scan(surface, CAMERA, pose), jax.random.key(index))
-        evidence = planner.init(pose, scan) if evidence is None else planner.observe(evidence, pose, scan)
-    return evidence
+        observations = planner.init(pose, scan) if observations is None else planner.observe(observations, pose, scan)
+    return observations
 
 
 AROUND = ((0.5, 1.0, 3.2), (2.8, 1.2, -1.2), (-2.5, -1.5, -1.5))
@@ -127,13 +127,13 @@ def test_a_symmetric_shape_stands_in_all_the_ways_that_look_alike():
 
 
 def test_what_was_seen_empty_is_among_what_shapes_are_fitted_to():
-    evidence = evidence_of(nbv.SDFSurface(Cuboid([0.5, 0.3, 0.4])), AROUND)
-    seen = Seen.of(evidence)
+    observations = evidence_of(nbv.SDFSurface(Cuboid([0.5, 0.3, 0.4])), AROUND)
+    seen = Seen.of(observations)
     assert bool(seen.is_empty.all())
     node = (np.asarray(seen.empty, np.float64) + GRID.half_extent) / GRID.spacing
     np.testing.assert_allclose(node, np.rint(node), atol=1e-4)
-    assert np.asarray(evidence.seen_empty)[tuple(np.rint(node).astype(int).T)].all()
-    nothing = dataclasses.replace(evidence, seen_empty=None, grid=None)
+    assert np.asarray(observations.seen_empty)[tuple(np.rint(node).astype(int).T)].all()
+    nothing = dataclasses.replace(observations, seen_empty=None, grid=None)
     assert not bool(Seen.of(nothing).is_empty.any())
 
 
@@ -143,22 +143,24 @@ def test_shapes_of_a_kind_differ_by_their_number():
 
 
 def test_where_no_shape_fits_none_is_the_answer():
-    evidence = evidence_of(nbv.SDFSurface(Sphere(1.2)), AROUND)
-    posterior = model().condition(evidence)
+    observations = evidence_of(nbv.SDFSurface(Sphere(1.2)), AROUND)
+    posterior = model().condition(observations)
     assert posterior.hypotheses[0].name == "none of these"
     assert posterior.hypotheses[0].weight > 0.95
     surfaces = posterior.sample(jax.random.key(0), 4)
-    plain = QUICK.condition(evidence)
+    plain = QUICK.condition(observations)
     x = jnp.asarray(np.random.default_rng(0).uniform(-1.2, 1.2, (64, 3)), jnp.float32)
     *_, unknown_key = jax.random.split(jax.random.key(0), 3)
     np.testing.assert_allclose(surfaces(x), plain.sample(unknown_key, 4)(x) - plain.level, atol=1e-6)
 
 
 def test_without_shapes_the_model_is_the_unknown_one_to_the_bit():
-    evidence = evidence_of(nbv.SDFSurface(Sphere(1.2)), AROUND[:1])
-    empty = model(nbv.ShapeBank.of([])).condition(evidence)
-    assert eqx.tree_equal(empty, QUICK.condition(evidence))
-    assert eqx.tree_equal(empty.sample(jax.random.key(3), 2), QUICK.condition(evidence).sample(jax.random.key(3), 2))
+    observations = evidence_of(nbv.SDFSurface(Sphere(1.2)), AROUND[:1])
+    empty = model(nbv.ShapeBank.of([])).condition(observations)
+    assert eqx.tree_equal(empty, QUICK.condition(observations))
+    assert eqx.tree_equal(
+        empty.sample(jax.random.key(3), 2), QUICK.condition(observations).sample(jax.random.key(3), 2)
+    )
 
 
 def test_of_one_exact_shape_samples_are_that_shape_to_the_noise():
@@ -181,8 +183,8 @@ def test_of_one_exact_shape_samples_are_that_shape_to_the_noise():
 
 
 def test_weights_are_tempered_fits():
-    evidence = evidence_of(filling(0.5, UPRIGHT)[0], AROUND[:1])
-    posterior = model(sharpness=7.0, unknown_misfit=0.4).condition(evidence)
+    observations = evidence_of(filling(0.5, UPRIGHT)[0], AROUND[:1])
+    posterior = model(inverse_temperature=7.0, misfit_of_none=0.4).condition(observations)
     found = posterior.found
     energy = np.append(np.where(found.is_mode, np.exp(-7.0 * np.asarray(found.misfit, np.float64)), 0.0), np.exp(-2.8))
     np.testing.assert_allclose(posterior.weights, energy / energy.sum(), rtol=1e-4, atol=1e-7)
@@ -205,13 +207,11 @@ def test_systematic_resampling_draws_each_as_often_as_its_weight_says(weights, s
 @pytest.mark.slow
 def test_the_same_evidence_has_the_same_hypotheses_and_nothing_is_compiled_twice(compilations):
     surface, _, _ = filling(0.5, UPRIGHT)
-    imagination = dataclasses.replace(nbv.Imagination(QUICK, GRID, 3).knowing(BANK, nbv.AsGiven()))
-    imagination = dataclasses.replace(
-        imagination, model=dataclasses.replace(imagination.model, residual=RESIDUAL, num_starts=64)
-    )
+    sampler = dataclasses.replace(nbv.SurfaceSampler(QUICK, GRID, 3).with_bank(BANK, nbv.AsGiven()))
+    sampler = dataclasses.replace(sampler, model=dataclasses.replace(sampler.model, residual=RESIDUAL, num_starts=64))
     first, second = evidence_of(surface, AROUND[:1]), evidence_of(surface, AROUND[:2])
-    assert eqx.tree_equal(imagination.posterior(first).found, imagination.posterior(first).found)
-    imagination.sample(first, jax.random.key(0))
+    assert eqx.tree_equal(sampler.posterior(first).found, sampler.posterior(first).found)
+    sampler.sample(first, jax.random.key(0))
     compilations.clear()
-    imagination.sample(second, jax.random.key(1))
+    sampler.sample(second, jax.random.key(1))
     assert not compilations

@@ -54,8 +54,8 @@ def exact(s, x):
 class Given(nbv.ValueSource):
     """Values at the points of the tests; the last row is not filled."""
 
-    def rows(self, evidence):
-        arrays = (jnp.asarray(a, evidence.cloud.points.dtype) for a in (AT, VALUES, VALUE_NOISE))
+    def rows(self, observations):
+        arrays = (jnp.asarray(a, observations.cloud.points.dtype) for a in (AT, VALUES, VALUE_NOISE))
         return ValueRows(*arrays, jnp.arange(13) < 12)
 
 

@@ -29,8 +29,8 @@ class SpherePosterior(nbv.SurfacePosterior):
 
 
 class RandomSpheres(nbv.SurfaceModel):
-    def condition(self, evidence):
-        return SpherePosterior(jnp.asarray(0.0), nbv.Evidence.of(evidence).cloud)
+    def condition(self, observations):
+        return SpherePosterior(jnp.asarray(0.0), nbv.Observations.of(observations).cloud)
 
 
 CAMERA = nbv.Camera(height=16, width=16)
@@ -38,8 +38,8 @@ BALL, BOX = nbv.SDFSurface(Sphere(0.7)), nbv.SDFSurface(Cuboid([0.5, 0.6, 0.4]))
 
 
 def planner():
-    imagination = nbv.Imagination(RandomSpheres(), grid=nbv.Grid(40), num_samples=3)
-    return nbv.Planner(nbv.Coverage(), nbv.DiscreteSearch(12), CAMERA, imagination, capacity=512, max_views=4)
+    sampler = nbv.SurfaceSampler(RandomSpheres(), grid=nbv.Grid(40), num_samples=3)
+    return nbv.Planner(nbv.Coverage(), nbv.DiscreteSearch(12), CAMERA, sampler, capacity=512, max_views=4)
 
 
 @pytest.mark.slow
@@ -48,10 +48,10 @@ def test_proposed_view_is_the_best_by_chamfer_distance_to_exact_scans_of_the_sam
     plan, key = planner(), jax.random.key(1)
     first = nbv.look_at((0.8, 0.9, 2.2))
     cloud = nbv.scan(BALL, CAMERA, first)
-    evidence = plan.init(first, cloud)
-    proposal = plan.propose(evidence, key)
+    observations = plan.init(first, cloud)
+    proposal = plan.propose(observations, key)
     sample_key, _ = jax.random.split(key)
-    fields = RandomSpheres().condition(evidence).sample(sample_key, 3)
+    fields = RandomSpheres().condition(observations).sample(sample_key, 3)
     known, _ = cloud.to_numpy()
     values = np.zeros(12)
     for i, pose in enumerate(nbv.look_at(nbv.fibonacci_sphere(12, 2.5))[j] for j in range(12)):

@@ -24,7 +24,7 @@ class Given(nbv.ValueSource):
     values: jax.Array
     noise: jax.Array
 
-    def rows(self, evidence):
+    def rows(self, observations):
         return ValueRows(self.points, self.values, self.noise, jnp.arange(len(self.values)) < len(self.values) - 1)
 
 
@@ -85,29 +85,29 @@ def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
         nbv.GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8),
         (nbv.OutsideBoundary(num_points=60), nbv.SeenEmpty(30)),
     )
-    nothing = nbv.Evidence.before_views(data, 1, grid)
+    nothing = nbv.Observations.before_views(data, 1, grid)
     seen = eqx.tree_at(lambda e: e.seen_empty, nothing, jnp.asarray(is_beside | beyond))
-    without, knowing = (model.condition(evidence) for evidence in (nothing, seen))
+    without, with_bank = (model.condition(observations) for observations in (nothing, seen))
     beside = nodes[is_beside]
     near, far = beside + np.array([0.0, 0.0, 0.1]), beside * np.array([1.0, -1.0, 1.0])
 
     def inside(posterior, x):
         return float((posterior.sample(jax.random.key(0), 64)(x) < 0).mean())
 
-    assert inside(knowing, beside) < 0.3 * inside(without, beside)
-    assert inside(knowing, near) < 0.5 * inside(without, near)
-    assert abs(inside(knowing, far) - inside(without, far)) < 0.1
+    assert inside(with_bank, beside) < 0.3 * inside(without, beside)
+    assert inside(with_bank, near) < 0.5 * inside(without, near)
+    assert abs(inside(with_bank, far) - inside(without, far)) < 0.1
     rows = nbv.SeenEmpty(30).rows(seen)
     assert np.asarray(rows.mask).all()
     assert len(np.unique(np.asarray(rows.points), axis=0)) == 30
     assert {tuple(p) for p in np.asarray(rows.points)} <= {tuple(p) for p in np.float32(beside)}
-    for evidence in (nothing, nbv.Evidence.of(data)):
-        assert not np.asarray(nbv.SeenEmpty(30).rows(evidence).mask).any()
+    for observations in (nothing, nbv.Observations.of(data)):
+        assert not np.asarray(nbv.SeenEmpty(30).rows(observations).mask).any()
 
 
 def test_rows_beyond_the_data_are_not_filled():
     data = ball(RNG, 20)
-    rows = nbv.OnSurface(30).rows(nbv.Evidence.of(data))
+    rows = nbv.OnSurface(30).rows(nbv.Observations.of(data))
     assert np.asarray(rows.mask).sum() == 20
     assert len(np.unique(np.asarray(rows.points)[:20], axis=0)) == 20
 

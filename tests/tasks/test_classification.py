@@ -204,8 +204,8 @@ def test_answers_name_the_classes_where_the_classifier_does():
 def test_what_is_no_log_probability_is_named_at_the_first_scan(classifier, message):
     data = random_cloud(50, 60)
     camera = nbv.Camera(height=8, width=8)
-    imagination = nbv.Imagination(nbv.GeometricSPSR(lengthscale=0.05, truncation=8), carving=None)
+    sampler = nbv.SurfaceSampler(nbv.GeometricSPSR(lengthscale=0.05, truncation=8), carving=None)
     with pytest.raises(nbv.InputError, match=message):
-        nbv.Planner(nbv.CrossEntropy(classifier), nbv.DiscreteSearch(7), camera, imagination).init(None, data)
+        nbv.Planner(nbv.CrossEntropy(classifier), nbv.DiscreteSearch(7), camera, sampler).init(None, data)
     # Asked for nothing, it says nothing.
-    nbv.Planner(nbv.CrossEntropy(classifier), nbv.FarthestView(7), camera, imagination).init(None, data)
+    nbv.Planner(nbv.CrossEntropy(classifier), nbv.FarthestView(7), camera, sampler).init(None, data)

@@ -18,9 +18,9 @@ SCENE = nbv.SDFSurface(Sphere(0.7) | Sphere(0.35).translate([0.8, 0.3, 0.0]))
 
 def small_planner(search, acquisition=None, **changes) -> nbv.Planner:
     imagined = {"model": nbv.GeometricSPSR(0.05, 0.2, 8), "num_samples": 2, "grid": nbv.Grid(24)}
-    imagined |= {name: changes.pop(name) for name in ("carving", "surroundings", *imagined) if name in changes}
+    imagined |= {name: changes.pop(name) for name in ("carving", "obstacles", *imagined) if name in changes}
     acquisition = nbv.Coverage() if acquisition is None else acquisition
-    options = {"camera": CAMERA, "capacity": 512, "imagination": nbv.Imagination(**imagined)}
+    options = {"camera": CAMERA, "capacity": 512, "sampler": nbv.SurfaceSampler(**imagined)}
     return nbv.Planner(acquisition, search, **(options | changes))
 
 

@@ -85,7 +85,7 @@ def test_an_impossible_utility_is_named_at_the_first_scan(utility, message):
     planner = nbv.Planner(
         acquisition,
         nbv.DiscreteSearch(4),
-        imagination=nbv.Imagination(nbv.GeometricSPSR(0.05, truncation=8)),
+        sampler=nbv.SurfaceSampler(nbv.GeometricSPSR(0.05, truncation=8)),
         capacity=5,
     )
     with pytest.raises(nbv.InputError, match=message):
@@ -96,6 +96,6 @@ def test_under_jit_nothing_is_asked():
     acquisition = nbv.ExpectedUtilityImprovement(lambda cloud: jnp.nan * jnp.sum(cloud.mask))
     model = nbv.GeometricSPSR(0.05, truncation=8)
     planner = nbv.Planner(
-        acquisition, nbv.DiscreteSearch(4), imagination=nbv.Imagination(model, carving=None), capacity=5
+        acquisition, nbv.DiscreteSearch(4), sampler=nbv.SurfaceSampler(model, carving=None), capacity=5
     )
     assert jax.eval_shape(lambda cloud: planner.init(None, cloud), CLOUD).cloud.capacity == 5

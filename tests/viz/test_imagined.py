@@ -41,7 +41,7 @@ def episode():
         nbv.Coverage(),
         nbv.DiscreteSearch(12),
         CAMERA,
-        nbv.Imagination(BallModel(), grid=nbv.Grid(64), num_samples=5, carving=None),
+        nbv.SurfaceSampler(BallModel(), grid=nbv.Grid(64), num_samples=5, carving=None),
         capacity=1000,
     )
     first, none = nbv.look_at((0.0, 0.0, 2.5)), nbv.SensorNoise(0.0, 0.0)

@@ -1,4 +1,4 @@
-"""The live view: what is in its scene, against the evidence; and one HTML file of it."""
+"""The live view: what is in its scene, against the observations; and one HTML file of it."""
 
 import re
 import sys

@@ -51,7 +51,7 @@ def test_each_is_a_small_picture_and_a_line(episode):
         (scan, f"{int(scan.count)} points of 144 rays, {144 - int(scan.count)} met nothing; box "),
         (proposal, f"value {float(proposal.value):.4g}"),
         (episode, f"2 views by expected coverage gain, {count:,} points"),
-        (episode.planner.imagination.model.condition(episode.cloud), "level "),
+        (episode.planner.sampler.model.condition(episode.cloud), "level "),
     )
     for shown, expected in facts:
         size, caption = parts(shown)
@@ -73,7 +73,7 @@ def test_a_cloud_is_seen_from_where_its_normals_look(episode):
 
 
 def test_the_slice_of_a_posterior_is_inside_the_ball(episode):
-    posterior = episode.planner.imagination.model.condition(episode.cloud)
+    posterior = episode.planner.sampler.model.condition(episode.cloud)
     (image,) = drawn(posterior).images
     inside = np.asarray(image.get_array())
     assert inside.shape == (48, 48)
@@ -109,8 +109,8 @@ def test_an_episode_is_shown_in_a_strip(episode, monkeypatch):
 
 
 def test_others_are_shown_large(episode):
-    posterior = episode.planner.imagination.model.condition(episode.cloud)
-    for shown in (episode.cloud, episode.evidence_after(2), episode.views[1].proposal, posterior):
+    posterior = episode.planner.sampler.model.condition(episode.cloud)
+    for shown in (episode.cloud, episode.observations_after(2), episode.views[1].proposal, posterior):
         assert Image.open(io.BytesIO(nbv.show(shown)._repr_png_())).size == (528, 528)
     with pytest.raises(nbv.InputError, match="no picture: DiscreteSearch by expected coverage gain over"):
         nbv.show(episode.planner)
@@ -135,8 +135,8 @@ def test_ipython_is_told_how_they_are_shown(monkeypatch, episode):
     shell = SimpleNamespace(display_formatter=SimpleNamespace(formatters={"text/html": formatter}))
     monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
     importlib.reload(nbv)
-    posterior = episode.planner.imagination.model.condition(episode.cloud)
-    evidence, proposal = episode.evidence_after(2), episode.views[1].proposal
-    for shown in (episode, episode.cloud, evidence, proposal, posterior, episode.planner):
+    posterior = episode.planner.sampler.model.condition(episode.cloud)
+    observations, proposal = episode.observations_after(2), episode.views[1].proposal
+    for shown in (episode, episode.cloud, observations, proposal, posterior, episode.planner):
         assert formatter(shown) == html_of(shown)
     assert formatter(episode.planner.camera) is None

@@ -157,16 +157,16 @@ class SphereModel(nbv.SurfaceModel):
         return SpherePosterior(jnp.asarray(0.0))
 
 
-def surface_of(imagination, evidence):
-    imagination = dataclasses.replace(imagination, num_samples=64)
-    return mean_surface(imagination, evidence, imagination.posterior(evidence))
+def surface_of(sampler, observations):
+    sampler = dataclasses.replace(sampler, num_samples=64)
+    return mean_surface(sampler, observations, sampler.posterior(observations))
 
 
 def test_any_posterior_has_a_surface_with_a_standard_deviation():
     # f = |x| - r with r ~ N(0.9, 0.03^2): the surface is a sphere known to 0.03 all over, estimated from 64 samples.
     planner = small_planner(nbv.RandomView(), model=SphereModel(), grid=nbv.Grid(40))
     cloud = nbv.PointCloud.from_arrays([[0.9, 0.0, 0.0]], [[1.0, 0.0, 0.0]])
-    surface = surface_of(planner.imagination, planner.init(None, cloud))
+    surface = surface_of(planner.sampler, planner.init(None, cloud))
     radius = np.linalg.norm(surface.vertices, axis=1)
     np.testing.assert_allclose(radius, 0.9, atol=4 * 0.03 / 8 + 0.005)
     np.testing.assert_allclose(surface.deviation, 0.03, rtol=4 / np.sqrt(2 * 64))
@@ -175,18 +175,18 @@ def test_any_posterior_has_a_surface_with_a_standard_deviation():
 
 def test_the_surface_of_the_mean_is_carved():
     planner = small_planner(nbv.RandomView(), model=SphereModel(), grid=nbv.Grid(40))
-    evidence = planner.init(None, nbv.PointCloud.from_arrays([[0.9, 0.0, 0.0]], [[1.0, 0.0, 0.0]]))
-    empty = jnp.broadcast_to((planner.imagination.grid.axis > 0.3)[:, None, None], evidence.seen_empty.shape)
-    vertices = surface_of(planner.imagination, eqx.tree_at(lambda s: s.seen_empty, evidence, empty)).vertices
-    assert vertices[:, 0].max() < 0.3 + planner.imagination.grid.spacing
+    observations = planner.init(None, nbv.PointCloud.from_arrays([[0.9, 0.0, 0.0]], [[1.0, 0.0, 0.0]]))
+    empty = jnp.broadcast_to((planner.sampler.grid.axis > 0.3)[:, None, None], observations.seen_empty.shape)
+    vertices = surface_of(planner.sampler, eqx.tree_at(lambda s: s.seen_empty, observations, empty)).vertices
+    assert vertices[:, 0].max() < 0.3 + planner.sampler.grid.spacing
     # The other side is as it was.
-    left = vertices[vertices[:, 0] < 0.3 - planner.imagination.grid.spacing]
+    left = vertices[vertices[:, 0] < 0.3 - planner.sampler.grid.spacing]
     np.testing.assert_allclose(np.linalg.norm(left, axis=1).max(), 0.9, atol=0.02)
 
 
 def test_a_mean_without_a_surface_is_drawn_without_one(episode, data):
-    far = nbv.Imagination(SphereModel(), nbv.Grid(40, 0.2), carving=None)
-    assert surface_of(far, episode.evidence_after(1)) is None
+    far = nbv.SurfaceSampler(SphereModel(), nbv.Grid(40, 0.2), carving=None)
+    assert surface_of(far, episode.observations_after(1)) is None
     bare = eqx.tree_at(lambda d: [v.surface for v in d.views], data, [None] * 3, is_leaf=lambda x: x is None)
     assert "What is known after this view" in report_html(bare, "mug")
 
@@ -195,7 +195,7 @@ def test_what_was_seen_is_known_better_than_what_was_not():
     scene = nbv.SDFSurface(Sphere(0.9))
     model, camera = nbv.GeometricSPSR(truncation=16, lengthscale=0.02), nbv.Camera(height=24, width=24)
     view = small_run(nbv.RandomView(12), views=1, scene=scene, model=model, camera=camera)
-    surface = surface_of(view.planner.imagination, view.evidence_after(1))
+    surface = surface_of(view.planner.sampler, view.observations_after(1))
     distance = np.linalg.norm(surface.vertices[:, None] - view.cloud.to_numpy()[0][None, ::4], axis=-1).min(axis=1)
     assert np.median(surface.deviation[distance < 0.1]) < 0.3 * np.median(surface.deviation[distance > 0.6])
 

@@ -45,7 +45,7 @@ def test_an_end_beyond_the_images_border_is_never_shown_as_certain():
         nbv.Coverage(),
         nbv.RandomView(30),
         camera,
-        nbv.Imagination(model, grid=nbv.Grid(40), num_samples=2),
+        nbv.SurfaceSampler(model, grid=nbv.Grid(40), num_samples=2),
         capacity=1024,
     )
     first = nbv.look_at((-0.6, 0.0, 1.8), (-0.6, 0.0, 0.0))

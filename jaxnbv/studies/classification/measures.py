@@ -11,8 +11,9 @@ from jaxtyping import Bool, Float, Real
 from scipy.stats import spearmanr
 
 from jaxnbv.checks import AnyArray
-from jaxnbv.imagination import Imagination
-from jaxnbv.scanning import Evidence, GridSurface
+from jaxnbv.observations import Observations
+from jaxnbv.sampler import SurfaceSampler
+from jaxnbv.scanning import GridSurface
 from jaxnbv.studies.engine.measures import SECONDS, Measure, Record
 from jaxnbv.surfaces import SurfacePosterior
 
@@ -54,7 +55,7 @@ def _value(record: Record, method: str) -> dict[int, float]:
 
 
 def roughness(
-    imagination: Imagination, evidence: Evidence, posterior: SurfacePosterior, surfaces: GridSurface
+    sampler: SurfaceSampler, observations: Observations, posterior: SurfacePosterior, surfaces: GridSurface
 ) -> float:
     """Cells of the grid that a sample's surface crosses, mean over samples, per cell that the mean's surface crosses,
     carved as the samples are. Of a posterior without closed forms the mean is that of these samples.
@@ -63,7 +64,7 @@ def roughness(
     an acquisition says little about the value of a view.
     """
     values = np.asarray(surfaces.values)
-    mean = np.asarray(imagination.mean(evidence, posterior)) if posterior.has_closed_forms else values.mean(axis=0)
+    mean = np.asarray(sampler.mean(observations, posterior)) if posterior.has_closed_forms else values.mean(axis=0)
     samples = [crossed_cells(one) for one in values]
     return float(np.mean(samples)) / max(crossed_cells(mean), 1)
 

@@ -110,7 +110,7 @@ class TruckStudy(ClassificationStudy):
         return loaded_truck(truck, file.read(), file.label, scene_key(self.seed, self.split, index))
 
 
-class ModelNet10Study(ClassificationStudy):
+class HouseholdStudy(ClassificationStudy):
     """The class of a household object, one of ten that are told by their global shape, for which any views will do;
     from a random first view. Settings as of `ClassificationStudy`."""
 

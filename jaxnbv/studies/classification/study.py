@@ -69,7 +69,7 @@ class OracleView(CandidateSearch):
 
     def score(self, problem: Problem, candidates: Pose) -> Float[Array, "1 1 candidates"]:
         """The values of the true scans."""
-        context = problem.acquisition.context(problem.evidence.cloud)
+        context = problem.acquisition.context(problem.observations.cloud)
         return scores(problem.acquisition, context, self.scans, problem.camera, candidates)[None, None]
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
@@ -93,7 +93,7 @@ class ClassificationStudy(Study):
     - `objects`: the scenes; `cue`: the part of them that differs by class, "" for all of the object.
     - `network`: the name of the shipped classifier; `fed`: the points that it is fed of what was seen, and of that and
       an imagined scan.
-    - `framings`: each a study of its own; `solid`: whether the objects are nowhere thin, see `imagination`.
+    - `framings`: each a study of its own; `solid`: whether the objects are nowhere thin, see `sampler`.
     """
 
     methods: ClassVar[tuple[str, ...]] = ("cross-entropy", "entropy", "mixed", "tie-break", *BASELINES, "oracle")
@@ -153,10 +153,10 @@ class ClassificationStudy(Study):
         studies: dict[str, Study] = {}
         for one in (options["framing"],) if "framing" in options else cls.framings:
             classifier, imagining = (cls._classifier(file, one.longest_side, fed) for fed in cls.fed)
-            imagination = cls.imagined(model, one.longest_side, quick, cls.solid)
+            sampler = cls.imagined(model, one.longest_side, quick, cls.solid)
             settings: dict[str, Any] = {"classifier": classifier, "imagining": imagining, "framing": one} | options
             name = one.value if len(cls.framings) > 1 else ""
-            studies[name] = cls(views=views, imagination=imagination, **settings | (dict(cls.quick) if quick else {}))
+            studies[name] = cls(views=views, sampler=sampler, **settings | (dict(cls.quick) if quick else {}))
         return studies
 
     @classmethod
@@ -270,7 +270,7 @@ class ClassificationStudy(Study):
                 values = np.asarray(view.proposal.values)
                 rank = rank_correlation(values, truth.pixels, np.isfinite(values))
             if basis is not None:
-                rough = roughness(planner.imagination, basis.evidence, basis.posterior, basis.surfaces)
+                rough = roughness(planner.sampler, basis.observations, basis.posterior, basis.surfaces)
             found["rank_correlation"].append(rank)
             found["roughness"].append(rough)
         return found | {"log_p": [found["log_p"]], "pixels": [found["pixels"]] if self.cue else []}

@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxnbv.studies.engine.measures import UNKNOWING, Measure
+from jaxnbv.studies.engine.measures import WITHOUT_BANK, Measure
 from jaxnbv.studies.engine.results import groups_of
 from jaxnbv.studies.engine.study import Study
 from jaxnbv.viz.figures import STYLE
@@ -40,8 +40,8 @@ LOOKS = {
     "coverage": ("#009e73", "-", "D"),
     "farthest": ("#0072b2", "-", "s"),
     "uncertainty": ("#56b4e9", "-", "P"),
-    f"coverage{UNKNOWING}": ("#009e73", ":", "d"),
-    f"uncertainty{UNKNOWING}": ("#56b4e9", ":", "p"),
+    f"coverage{WITHOUT_BANK}": ("#009e73", ":", "d"),
+    f"uncertainty{WITHOUT_BANK}": ("#56b4e9", ":", "p"),
     "random": (GREY, "--", "X"),
     "oracle": (INK, ":", "*"),
 }

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 
-from jaxnbv.imagination import Imagination
+from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.studies.readers.class_meshes import MeshFile
 from jaxnbv.surfaces import KnownShapes, ShapeBank, Upright
 
@@ -11,27 +11,27 @@ from jaxnbv.surfaces import KnownShapes, ShapeBank, Upright
 _LONGEST = 50
 
 
-def knowing_meshes(imagination: Imagination, files: Sequence[MeshFile]) -> Imagination:
+def knowing_meshes(sampler: SurfaceSampler, files: Sequence[MeshFile]) -> SurfaceSampler:
     """One that knows the meshes of a study, upright and of any proportions."""
     names = [_name(files, index) for index in range(len(files))]
     bank = ShapeBank.from_meshes([file.path for file in files], names=names)
-    return imagination.knowing(bank, Upright(by_axis=True))
+    return sampler.with_bank(bank, Upright(by_axis=True))
 
 
-def knowing_those(imagination: Imagination, wanted: Callable[[str], bool]) -> Imagination:
+def knowing_those(sampler: SurfaceSampler, wanted: Callable[[str], bool]) -> SurfaceSampler:
     """One that knows shapes, of these alone those whose names are wanted; any other as it is."""
-    model = imagination.model
+    model = sampler.model
     if not isinstance(model, KnownShapes):
-        return imagination
+        return sampler
     rows = [row for row, name in enumerate(model.bank.names) if wanted(name)]
     if len(rows) == len(model.bank):
-        return imagination
-    return dataclasses.replace(imagination, model=dataclasses.replace(model, bank=model.bank.chosen(rows)))
+        return sampler
+    return dataclasses.replace(sampler, model=dataclasses.replace(model, bank=model.bank.chosen(rows)))
 
 
-def knowing_others(imagination: Imagination, files: Sequence[MeshFile], index: int) -> Imagination:
+def knowing_others(sampler: SurfaceSampler, files: Sequence[MeshFile], index: int) -> SurfaceSampler:
     """One of `knowing_meshes` but for the mesh of a scene; any other as it is."""
-    return knowing_those(imagination, lambda name: name != _name(files, index))
+    return knowing_those(sampler, lambda name: name != _name(files, index))
 
 
 def _name(files: Sequence[MeshFile], index: int) -> str:

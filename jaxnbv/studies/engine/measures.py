@@ -9,7 +9,7 @@ from jaxtyping import Float
 # What is stored of one scene with every method.
 Record = dict[str, Any]
 # The model of studies that know shapes, and the end of the name of a method that is run once more without them.
-KNOWN, UNKNOWING = "known", "-screened"
+KNOWN, WITHOUT_BANK = "known", "-screened"
 
 
 class Measure(NamedTuple):

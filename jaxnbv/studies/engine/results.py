@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.stats import bootstrap
 
 from jaxnbv.checks import require
-from jaxnbv.studies.engine.measures import UNKNOWING, Measure, Record
+from jaxnbv.studies.engine.measures import WITHOUT_BANK, Measure, Record
 from jaxnbv.studies.engine.study import Study
 
 LEVEL = 0.90
@@ -150,7 +150,7 @@ def verdicts(found: pd.DataFrame, study: type[Study]) -> list[Verdict]:
     for claim in study.claims:
         (measure,) = (one for one in study.measures if one.name == claim.measure)
         at = found[(found["group"] == _ALL) & (found["quantity"] == claim.measure) & (found["at"] == claim.at)]
-        rows = at[at["method"].str.removesuffix(UNKNOWING).isin(claim.than)].dropna(subset="lead")
+        rows = at[at["method"].str.removesuffix(WITHOUT_BANK).isin(claim.than)].dropna(subset="lead")
         told: dict[str, list[str]] = {where: [] for where in _WHERE}
         for row, text in zip(rows.itertuples(), _leads(rows, measure), strict=True):
             level = row.lead_low <= 0 <= row.lead_high

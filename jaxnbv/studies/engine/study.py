@@ -18,14 +18,15 @@ from jaxnbv.checks import InputError, check_type, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.imagination import Imagination
+from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Sensor, Step, observe_scene, steps, view_keys
 from jaxnbv.planning.planner import Planner
-from jaxnbv.scanning import Evidence, Grid, SensorNoise, Surface
+from jaxnbv.sampler import SurfaceSampler
+from jaxnbv.scanning import Grid, SensorNoise, Surface
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.search import Candidates, Search, SphereCandidates
 from jaxnbv.studies.engine.known import knowing_meshes, knowing_others
-from jaxnbv.studies.engine.measures import KNOWN, UNKNOWING, Claim, Measure, Record
+from jaxnbv.studies.engine.measures import KNOWN, WITHOUT_BANK, Claim, Measure, Record
 from jaxnbv.studies.engine.searches import search_of
 from jaxnbv.studies.engine.tiles import Tiles
 from jaxnbv.studies.readers.class_meshes import MeshFile, mesh_files
@@ -56,7 +57,7 @@ class Study(eqx.Module):
 
     - `views`: in all, the first included.
     - `num_candidates`: on the sphere of `radius`, at which every search but those by gradient looks.
-    - `imagination`, `num_samples`, `grid_resolution`, `capacity`: of the planner; the imagination has as many samples
+    - `sampler`, `num_samples`, `grid_resolution`, `capacity`: of the planner; the sampler has as many samples
       on a grid of this resolution.
     - `camera`: the sensor; a planner may imagine fewer rays, see `imagined_camera`.
     - `num_starts`, `iterations`: of searches by gradient, which look at half the candidates first.
@@ -71,7 +72,7 @@ class Study(eqx.Module):
     - `quick`: settings for a first look, on `quick_scenes` scenes.
     - `seed`: of its first views, noise and samples.
     - `bank`: of the shapes that are known, see `shape_bank`; "" for none.
-    - `unknowing`: those of the methods that are run once more by one who knows none, as "METHOD-screened".
+    - `without_bank`: those of the methods that are run once more by one who knows none, as "METHOD-screened".
 
     **Raises:** `ValueError` for fewer than two views, or fewer candidates than views.
     """
@@ -95,12 +96,12 @@ class Study(eqx.Module):
     }
     quick_scenes: ClassVar[int] = 4
     bank: ClassVar[str] = ""
-    unknowing: ClassVar[tuple[str, ...]] = ("coverage", "uncertainty")
+    without_bank: ClassVar[tuple[str, ...]] = ("coverage", "uncertainty")
 
     views: int = eqx.field(static=True, default=5)
     num_candidates: int = eqx.field(static=True, default=48)
     num_samples: int = eqx.field(static=True, default=16)
-    imagination: Imagination = eqx.field(default_factory=Imagination)
+    sampler: SurfaceSampler = eqx.field(default_factory=SurfaceSampler)
     grid_resolution: int = eqx.field(static=True, default=64)
     capacity: int = eqx.field(static=True, default=4096)
     camera: Camera = Camera()
@@ -126,10 +127,10 @@ class Study(eqx.Module):
         """
         files = cls.files_in(options.pop("meshes")) if "meshes" in options else ()
         if files and model == KNOWN:
-            imagination = knowing_meshes(cls.imagined("screened", quick=quick), files)
+            sampler = knowing_meshes(cls.imagined("screened", quick=quick), files)
         else:
-            imagination = cls.imagined(model, quick=quick)
-        settings = {"imagination": imagination, "meshes": files} | (dict(cls.quick) if quick else {})
+            sampler = cls.imagined(model, quick=quick)
+        settings = {"sampler": sampler, "meshes": files} | (dict(cls.quick) if quick else {})
         return {"": cls(views=views, **settings | options)}
 
     @classmethod
@@ -141,26 +142,28 @@ class Study(eqx.Module):
         return mesh_files(folder)
 
     @classmethod
-    def imagined(cls, model: str, longest_side: float = 2.5, quick: bool = False, solid: bool = False) -> Imagination:
-        """As `Imagination.preset`, or for the model `known` the screened one that knows the shapes of `bank`.
+    def imagined(
+        cls, model: str, longest_side: float = 2.5, quick: bool = False, solid: bool = False
+    ) -> SurfaceSampler:
+        """As `SurfaceSampler.preset`, or for the model `known` the screened one that knows the shapes of `bank`.
 
         **Raises:** `ValueError` for another model, or `known` where there is no bank.
         """
         if model != KNOWN:
-            return Imagination.preset(model, longest_side, quick, solid=solid)
+            return SurfaceSampler.preset(model, longest_side, quick, solid=solid)
         require(bool(cls.bank), f"there are no known shapes for {cls.title.lower()}: give another model")
-        plain = Imagination.preset("screened", longest_side, quick, solid=solid)
-        return plain.knowing(shape_bank(cls.bank), bank_poses(cls.bank))
+        plain = SurfaceSampler.preset("screened", longest_side, quick, solid=solid)
+        return plain.with_bank(shape_bank(cls.bank), bank_poses(cls.bank))
 
     @classmethod
     def chosen(cls, names: Sequence[str] | None, model: str) -> tuple[str, ...]:
         """The methods of these names, in order; by default `methods`, and where shapes are known those of
-        `unknowing`.
+        `without_bank`.
 
         **Raises:** `ValueError` for an unknown method.
         """
-        twice = [name for name in cls.unknowing if name in cls.methods] if model == KNOWN else []
-        again = tuple(f"{name}{UNKNOWING}" for name in twice)
+        twice = [name for name in cls.without_bank if name in cls.methods] if model == KNOWN else []
+        again = tuple(f"{name}{WITHOUT_BANK}" for name in twice)
         known = (*cls.methods, *again, *cls.further)
         if names is None:
             return (*cls.methods, *again)
@@ -203,11 +206,11 @@ class Study(eqx.Module):
 
     def planner(self, method: str, scene: Scene) -> Planner:
         """The planner of a method, of one that knows no shapes too."""
-        known = method.removesuffix(UNKNOWING)
+        known = method.removesuffix(WITHOUT_BANK)
         planner = self.planner_of(self.acquisition(known, scene), self.search(known, scene), scene)
         if known == method:
             return planner
-        return dataclasses.replace(planner, imagination=planner.imagination.unknowing)
+        return dataclasses.replace(planner, sampler=planner.sampler.without_bank)
 
     def truth(self, scene: Scene) -> Any:
         """What is measured against, computed once a scene: by default its task."""
@@ -253,15 +256,15 @@ class Study(eqx.Module):
         """By which planners imagine scans."""
         return self.camera
 
-    def imagination_of(self, scene: Scene) -> Imagination:
+    def sampler_of(self, scene: Scene) -> SurfaceSampler:
         """What is known of such a scene: of meshes all but its own, where these are known."""
-        return knowing_others(self.imagination, self.meshes, scene.index) if self.meshes else self.imagination
+        return knowing_others(self.sampler, self.meshes, scene.index) if self.meshes else self.sampler
 
     def planner_of(self, acquisition: Acquisition, search: Search, scene: Scene) -> Planner:
         """A planner with the study's settings, and what is known of such a scene."""
-        known = self.imagination_of(scene)
-        imagination = dataclasses.replace(known, grid=self.grid, num_samples=self.num_samples)
-        planned = acquisition, search, self.imagined_camera, imagination
+        known = self.sampler_of(scene)
+        sampler = dataclasses.replace(known, grid=self.grid, num_samples=self.num_samples)
+        planned = acquisition, search, self.imagined_camera, sampler
         return Planner(*planned, capacity=self.capacity, max_views=self.views)
 
     def key(self, index: int, purpose: str) -> PRNGKeyArray:
@@ -341,14 +344,14 @@ class Study(eqx.Module):
                 return candidate
         raise InputError(f"none of {self.num_candidates} candidates shows enough of {scene.name}: ask for more")
 
-    def seen(self, scene: Scene, run: Record) -> list[tuple[PointCloud, Evidence]]:
-        """Each scan of a method, and the evidence after it, made again from the poses of its record."""
+    def seen(self, scene: Scene, run: Record) -> list[tuple[PointCloud, Observations]]:
+        """Each scan of a method, and the observations after it, made again from the poses of its record."""
         key, sensor = self.key(scene.index, "episode"), self.sensor(scene)
         poses = enumerate(self.poses_of(run))
         views = [(pose, sensor(pose, view_keys(key, index)[2]), self.camera) for index, pose in poses]
         # It depends on the planner through its capacity and what it carves alone.
         known = self.planner(self.methods[0], scene).replay(views)
-        return [(scan, evidence) for (_, scan, _), evidence in zip(views, known, strict=True)]
+        return [(scan, observations) for (_, scan, _), observations in zip(views, known, strict=True)]
 
     def poses_of(self, run: Record) -> list[Pose]:
         """Where a method's views were taken."""

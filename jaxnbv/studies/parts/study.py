@@ -12,8 +12,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxnbv.checks import require
 from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.imagination import Imagination
 from jaxnbv.networks import CATEGORIES, CloudSegmenter, part_segmenter
+from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Grid, MeshParts, SDFSurface, load_parts, scan
 from jaxnbv.scanning.mesh_files import read_nodes
 from jaxnbv.studies.engine.known import knowing_those
@@ -135,9 +135,9 @@ class PartStudy(PartDiscoveryStudy):
         given = self.segmenter
         return CloudSegmenter(given.network, scene.task.category, num_points or given.num_points, given.scale)
 
-    def imagination_of(self, scene: Scene) -> Imagination:
+    def sampler_of(self, scene: Scene) -> SurfaceSampler:
         """As the network's, with the shapes of the object's category."""
-        return knowing_those(self.imagination, lambda name: kind_of(name) == scene.name)
+        return knowing_those(self.sampler, lambda name: kind_of(name) == scene.name)
 
     def true_parts(self, scene: Scene, points: Float[Array, "n 3"]) -> Int[Array, " n"]:
         return scene.task.solid.label(points)

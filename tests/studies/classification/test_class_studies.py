@@ -13,7 +13,7 @@ from test_pyramid_study import small_study
 
 from jaxnbv.checks import InputError
 from jaxnbv.networks import InvariantClassifier, save_checkpoint
-from jaxnbv.studies.classification.objects import ModelNet10Study, OmniObject3DStudy, PyramidStudy, TruckStudy
+from jaxnbv.studies.classification.objects import HouseholdStudy, OmniObject3DStudy, PyramidStudy, TruckStudy
 from jaxnbv.studies.engine.chart import chart
 from jaxnbv.studies.engine.pictures import write_pictures
 from jaxnbv.studies.engine.results import results, summary
@@ -23,7 +23,7 @@ from jaxnbv.studies.scenes import HOUSEHOLD, FirstView
 SCENE = 4
 
 
-@pytest.mark.parametrize("kind", [ModelNet10Study, PyramidStudy])
+@pytest.mark.parametrize("kind", [HouseholdStudy, PyramidStudy])
 def test_the_first_view_can_be_one_after_which_the_classifier_is_wrong(kind):
     """Of all such views the first in the order in which any view is drawn; of a pyramid none that shows the pattern."""
     study = small_study(kind=kind, first=FirstView.MISCLASSIFIED)
@@ -46,7 +46,7 @@ def test_first_views_of_trucks_are_random_and_told_apart_by_what_they_show():
         assert TruckStudy.group({"methods": {"farthest": {"pixels": [[pixels, 400]]}}}) == group
 
 
-@pytest.mark.parametrize("kind", [ModelNet10Study, pytest.param(TruckStudy, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", [HouseholdStudy, pytest.param(TruckStudy, marks=pytest.mark.slow)])
 def test_records_tables_charts_and_pictures(kind, tmp_path):
     """Where all of the object tells its class no pixels are counted."""
     found = json.loads(json.dumps(small_study(kind=kind).run_scene(SCENE), allow_nan=False))
@@ -73,7 +73,7 @@ def box_files(folder, *names):
 
 def test_meshes_in_place_of_procedural_objects(tmp_path):
     box_files(tmp_path, "chair/a.off", "desk/b.obj")
-    study = small_study(kind=ModelNet10Study, meshes=class_meshes(tmp_path, HOUSEHOLD))
+    study = small_study(kind=HouseholdStudy, meshes=class_meshes(tmp_path, HOUSEHOLD))
     assert study.num_scenes == 2
     found = study.run_scene(1, ("farthest", "coverage"))
     assert (found["label"], found["name"]) == (HOUSEHOLD.index("desk"), "desk b")
@@ -100,7 +100,7 @@ def test_a_network_of_ones_own_takes_the_place_of_the_shipped_one(tmp_path):
     assert (study.classifier.num_points, study.imagining.num_points) == OmniObject3DStudy.fed
     np.testing.assert_array_equal(study.classifier.network.head[1].bias, network.head[1].bias)
     with pytest.raises(InputError, match=r"knows 5 classes; the study has 10: bathtub, bed"):
-        ModelNet10Study.configured("screened", 2, True, classifier=tmp_path / "mine.safetensors")
+        HouseholdStudy.configured("screened", 2, True, classifier=tmp_path / "mine.safetensors")
     for name, word in (("meshes", "--classifier FILE"), ("classifier", "--meshes FOLDER.* lemon, mango")):
         with pytest.raises(InputError, match=f"nothing ships for the study omniobject3d: give {word}"):
             OmniObject3DStudy.configured("screened", 2, True, **{name: given[name]})

@@ -10,7 +10,7 @@ from test_pyramid_study import CAMERA, SCENE, chosen, evidence_of, small_study, 
 
 import jaxnbv as nbv
 from jaxnbv.cli.registry import STUDY_MODELS, resolve
-from jaxnbv.imagination import MODELS
+from jaxnbv.sampler import MODELS
 from jaxnbv.studies.classification.objects import PyramidStudy
 from jaxnbv.studies.engine.measures import KNOWN
 from jaxnbv.studies.heat import HeatStudy
@@ -27,8 +27,8 @@ def knowing_study():
     plain = small_study()
     bank = nbv.ShapeBank.of([pyramid_scene(Split.TRAIN, index, turned=False) for index in range(5)])
     residual = ScreenedSPSR(GeometricSPSR(0.05, truncation=8), (OnSurface(),))
-    model = KnownShapes(bank, residual, unknown=plain.imagination.model, num_starts=60)
-    return dataclasses.replace(plain, imagination=dataclasses.replace(plain.imagination, model=model))
+    model = KnownShapes(bank, residual, unknown=plain.sampler.model, num_starts=60)
+    return dataclasses.replace(plain, sampler=dataclasses.replace(plain.sampler, model=model))
 
 
 @pytest.fixture(scope="module")
@@ -52,8 +52,8 @@ def test_a_choice_is_that_of_the_planner_with_the_same_key(record, method, view)
     study = knowing_study()
     scene, poses = study.scene(SCENE), np.asarray(study.candidates.poses().position)
     planner, candidates = study.planner(method, scene), chosen(study, record["methods"][method])
-    evidence = evidence_of(study, planner, scene, candidates[:view])
-    proposed = planner.propose(evidence, step_key(study, view)).pose.position
+    observations = evidence_of(study, planner, scene, candidates[:view])
+    proposed = planner.propose(observations, step_key(study, view)).pose.position
     np.testing.assert_allclose(poses[candidates[view]], proposed, atol=1e-5)
 
 
@@ -82,7 +82,7 @@ def test_a_study_without_a_bank_refuses_to_know_shapes():
 def test_parts_are_planned_with_the_shapes_of_their_category():
     (study,) = PartStudy.configured(KNOWN, 2, quick=True).values()
     scene = study.scene(2)
-    names = study.planner("discrete", scene).imagination.model.bank.names
+    names = study.planner("discrete", scene).sampler.model.bank.names
     assert {name.rsplit(" ", 1)[0] for name in names} == {scene.name}
     assert len(names) == 40
 
@@ -92,16 +92,16 @@ def test_of_meshes_each_is_planned_by_who_has_seen_the_others(tmp_path, monkeypa
     for index in range(3):
         trimesh.creation.box((1.0, 0.5 + 0.1 * index, 0.4)).export(tmp_path / f"box{index}.ply")
     (study,) = HeatStudy.configured(KNOWN, 2, quick=True, meshes=tmp_path).values()
-    assert study.imagination.model.bank.names == ("box0 0", "box1 1", "box2 2")
-    assert study.planner("coverage", study.scene(1)).imagination.model.bank.names == ("box0 0", "box2 2")
+    assert study.sampler.model.bank.names == ("box0 0", "box1 1", "box2 2")
+    assert study.planner("coverage", study.scene(1)).sampler.model.bank.names == ("box0 0", "box2 2")
     (plain,) = HeatStudy.configured("paper", 2, quick=True, meshes=tmp_path).values()
-    assert plain.imagination_of(plain.scene(1)) == plain.imagination
+    assert plain.sampler_of(plain.scene(1)) == plain.sampler
 
 
 def test_one_who_knows_no_shapes_any_more_is_as_before():
-    plain = nbv.Imagination.preset("screened", 1.25)
-    knowing = plain.knowing(nbv.ShapeBank.of([nbv.sdf.Sphere(1.0)]), nbv.AsGiven())
-    assert knowing.model.box == nbv.Box.cube(1.25)
-    assert float(knowing.model.residual.base.lengthscale) == pytest.approx(0.005)
-    assert jax.tree.structure(knowing.unknowing) == jax.tree.structure(plain)
+    plain = nbv.SurfaceSampler.preset("screened", 1.25)
+    with_bank = plain.with_bank(nbv.ShapeBank.of([nbv.sdf.Sphere(1.0)]), nbv.AsGiven())
+    assert with_bank.model.box == nbv.Box.cube(1.25)
+    assert float(with_bank.model.residual.base.lengthscale) == pytest.approx(0.005)
+    assert jax.tree.structure(with_bank.without_bank) == jax.tree.structure(plain)
     assert CAMERA.num_rays == 24 * 24

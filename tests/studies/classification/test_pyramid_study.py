@@ -12,7 +12,7 @@ from PIL import Image
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import concatenate, limit_capacity
-from jaxnbv.imagination import Imagination
+from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.search import FarthestView, SphereCandidates
 from jaxnbv.studies.classification.objects import PyramidStudy
 from jaxnbv.studies.engine.pictures import write_pictures
@@ -41,7 +41,7 @@ def small_study(classifier=None, kind=PyramidStudy, **settings):
     small = {"num_candidates": CANDIDATES, "num_samples": 2, "grid_resolution": 20, "capacity": 250, "num_points": 100}
     fixed = {"classifier": classifier or Linear(len(kind.objects.classes)), "views": 3, "camera": CAMERA}
     model = GeometricSPSR(lengthscale=0.05, truncation=8)
-    return kind(**({"imagination": Imagination(model)} | fixed | small | settings))
+    return kind(**({"sampler": SurfaceSampler(model)} | fixed | small | settings))
 
 
 @functools.cache
@@ -52,8 +52,8 @@ def whole_record():
 def evidence_of(study, planner, scene, candidates):
     """What a planner knows after the true scans from some candidates."""
     poses, scans = study.candidates.poses(), scene.task.scans
-    *_, evidence = planner.replay((poses[index], scans[index]) for index in candidates)
-    return evidence
+    *_, observations = planner.replay((poses[index], scans[index]) for index in candidates)
+    return observations
 
 
 def step_key(study, view, run=None):
@@ -128,8 +128,10 @@ def test_every_choice_is_the_one_that_the_planner_proposes_with_the_same_key():
     for method, held in record["methods"].items():
         planner, taken = study.planner(method, scene), chosen(study, held)
         for view in (1, 2):
-            evidence = evidence_of(study, planner, scene, taken[:view])
-            proposed = planner.propose(evidence, step_key(study, view, 0 if method == "random" else None)).pose.position
+            observations = evidence_of(study, planner, scene, taken[:view])
+            proposed = planner.propose(
+                observations, step_key(study, view, 0 if method == "random" else None)
+            ).pose.position
             np.testing.assert_allclose(places[taken[view]], proposed, atol=1e-6, err_msg=method)
 
 
@@ -137,9 +139,9 @@ def test_the_oracle_values_true_scans():
     study = small_study()
     scene, visited = study.scene(SCENE), [2, 7]
     planner = study.planner("oracle", scene)
-    evidence = evidence_of(study, planner, scene, visited)
-    values = planner.propose(evidence, jax.random.key(3)).values
-    thinned = limit_capacity(evidence.cloud, 100)
+    observations = evidence_of(study, planner, scene, visited)
+    values = planner.propose(observations, jax.random.key(3)).values
+    thinned = limit_capacity(observations.cloud, 100)
     p = np.exp(np.asarray(study.classifier(thinned), np.float64))
     for candidate in (0, 5):
         q = np.asarray(study.classifier(concatenate(thinned, scene.task.scans[candidate])), np.float64)
@@ -151,8 +153,8 @@ def test_answers_are_the_classifiers_of_all_that_was_seen():
     scene, taken = study.scene(SCENE), chosen(small_study(), whole_record()["methods"]["coverage"])
     planner = study.planner("coverage", scene)
     for count in (1, 2, 3):
-        evidence = evidence_of(study, planner, scene, taken[:count])
-        np.testing.assert_allclose(method["log_p"][0][count - 1], study.classifier(evidence.cloud), atol=1e-5)
+        observations = evidence_of(study, planner, scene, taken[:count])
+        np.testing.assert_allclose(method["log_p"][0][count - 1], study.classifier(observations.cloud), atol=1e-5)
 
 
 def test_a_method_of_ones_own_sees_what_others_see_from_a_candidate(tmp_path):

@@ -57,5 +57,5 @@ def test_each_search_keeps_to_its_poses():
 
 def test_what_is_recorded_is_what_the_classifier_says_of_the_views():
     scene, held = study().scene(SCENE), record()["methods"]["gradient-2dof"]
-    clouds = [evidence.cloud for _, evidence in study().seen(scene, held)]
+    clouds = [observations.cloud for _, observations in study().seen(scene, held)]
     np.testing.assert_allclose(held["log_p"][0], [Linear()(cloud) for cloud in clouds], atol=1e-4)

@@ -12,18 +12,18 @@ from toy import ToyStudy
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import look_at
-from jaxnbv.imagination import Imagination
 from jaxnbv.planning.planner import Planner
+from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import SDFSurface
 from jaxnbv.search import GivenPoses, RandomView
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
 
-IMAGINATION = Imagination(GeometricSPSR(0.05, truncation=4))
+SAMPLER = SurfaceSampler(GeometricSPSR(0.05, truncation=4))
 
 
 def small(kind=ToyStudy, **settings):
-    few = {"views": 3, "num_candidates": 8, "num_samples": 2, "imagination": IMAGINATION}
+    few = {"views": 3, "num_candidates": 8, "num_samples": 2, "sampler": SAMPLER}
     fine = {"grid_resolution": 16, "camera": Camera(height=12, width=12), "capacity": 500}
     return kind(**(few | fine | settings))
 
@@ -58,7 +58,7 @@ def test_the_same_views_are_scanned_again_from_a_record():
     study = small()
     scene, run = study.scene(0), study.run_scene(0)["methods"]["farthest"]
     seen = study.seen(scene, run)
-    assert [int(evidence.cloud.count) for _, evidence in seen] == run["points"]
+    assert [int(observations.cloud.count) for _, observations in seen] == run["points"]
     scans = [scan for scan, _ in seen]
     assert int(scans[0].count) + int(scans[1].count) == run["points"][1]
     # The noise is there.
@@ -87,7 +87,7 @@ def test_a_method_of_ones_own_that_makes_no_planner_is_refused_before_anything_i
     monkeypatch.setattr(ToyStudy, "run", lambda *_: pytest.fail("a method was run"))
 
     def few(study, scene):
-        return Planner(Coverage(), RandomView(3), study.camera, study.imagination, max_views=1)
+        return Planner(Coverage(), RandomView(3), study.camera, study.sampler, max_views=1)
 
     for make, problem in (
         (lambda study, scene: None, "what the method mine makes is None; give Planner"),
@@ -127,23 +127,23 @@ def test_unknown_methods_and_bad_numbers_are_refused():
 def test_a_command_configures_it():
     (name, study), *others = ToyStudy.configured("paper", 4, quick=True).items()
     assert (name, others) == ("", [])
-    assert (study.views, study.num_samples, study.imagination.carving) == (4, 4, None)
-    assert isinstance(study.imagination.model, GeometricSPSR)
+    assert (study.views, study.num_samples, study.sampler.carving) == (4, 4, None)
+    assert isinstance(study.sampler.model, GeometricSPSR)
     (study,) = ToyStudy.configured("screened", 5, quick=False, num_candidates=20).values()
     assert (study.num_samples, study.num_candidates) == (16, 20)
-    assert study.imagination.carving is not None
+    assert study.sampler.carving is not None
 
 
 def test_planners_have_the_studys_settings():
-    study = small(imagination=dataclasses.replace(IMAGINATION, carving=None))
+    study = small(sampler=dataclasses.replace(SAMPLER, carving=None))
     planner = study.planner("random", study.scene(0))
     assert (
-        planner.imagination.num_samples,
-        planner.imagination.grid.resolution,
+        planner.sampler.num_samples,
+        planner.sampler.grid.resolution,
         planner.capacity,
         planner.max_views,
     ) == (2, 16, 500, 3)
-    assert planner.imagination.carving is None
+    assert planner.sampler.carving is None
     assert isinstance(small().scene(0).surface, SDFSurface)
     keys = [small().key(*of) for of in ((0, "first"), (1, "first"), (0, "episode"))]
     assert len({tuple(jax.random.key_data(key).tolist()) for key in keys}) == 3

@@ -9,7 +9,7 @@ import trimesh
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.imagination import Imagination
+from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Grid, load_parts
 from jaxnbv.studies.engine.pictures import write_pictures
 from jaxnbv.studies.parts.discovery import NearestPart
@@ -48,7 +48,7 @@ def small_study(folder, **settings):
         "views": 3,
         "num_candidates": 12,
         "num_samples": 2,
-        "imagination": Imagination(model),
+        "sampler": SurfaceSampler(model),
         "grid_resolution": 20,
     }
     limits = {"capacity": 1500, "camera": Camera(height=32, width=32), "imagined_rays": 12, "num_points": 100}
@@ -101,8 +101,8 @@ def test_it_asks_for_the_parts_that_can_be_seen_and_counts_their_points(folder, 
     )
     scene = study.scene(0)
     for run in record["methods"].values():
-        for counts, (_, evidence) in zip(run["counts"], study.seen(scene, run), strict=True):
-            points, _ = evidence.cloud.to_numpy()
+        for counts, (_, observations) in zip(run["counts"], study.seen(scene, run), strict=True):
+            points, _ = observations.cloud.to_numpy()
             # The slab is all that lies above 0.3; noise is 0.01.
             slab = (points[:, 1] > 0.25).sum()
             assert abs(counts[1] - slab) <= 0.03 * len(points)

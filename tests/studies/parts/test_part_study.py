@@ -12,8 +12,8 @@ import pytest
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import concatenate, limit_capacity
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.imagination import Imagination
 from jaxnbv.networks import CATEGORIES, CloudSegmenter
+from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import SDFSurface, SensorNoise, scan
 from jaxnbv.search import (
     DiscreteSearch,
@@ -52,7 +52,7 @@ def small_study(enough=10**6, **settings):
     small = {"views": VIEWS, "num_candidates": CANDIDATES, "num_samples": 2, "grid_resolution": 20}
     limits = {"capacity": 600, "imagined_rays": 12, "num_points": 100, "num_starts": 1, "iterations": 2}
     segmenter = CloudSegmenter(Pointwise(jnp.asarray(enough)), 0, 500, scale=0.8)
-    return PartStudy(segmenter=segmenter, camera=CAMERA, imagination=Imagination(model), **(small | limits | settings))
+    return PartStudy(segmenter=segmenter, camera=CAMERA, sampler=SurfaceSampler(model), **(small | limits | settings))
 
 
 @functools.cache
@@ -106,13 +106,13 @@ def test_every_choice_is_the_one_that_the_planner_proposes_with_the_same_key(met
     record, study = whole_record(), small_study()
     planner = study.planner(method, study.scene(SCENE))
     views = [pose_of(view) for view in record["methods"][method]["views"]]
-    evidence = None
+    observations = None
     for index, (pose, seen) in enumerate(zip(views, scans(record, method), strict=True)):
-        if evidence is not None:
+        if observations is not None:
             key = jax.random.split(jax.random.fold_in(study.key(SCENE, "episode"), index))[0]
-            np.testing.assert_allclose(planner.propose(evidence, key).pose.position, pose.position, atol=1e-6)
+            np.testing.assert_allclose(planner.propose(observations, key).pose.position, pose.position, atol=1e-6)
         told = pose, seen, study.camera
-        evidence = planner.init(*told) if evidence is None else planner.observe(evidence, *told)
+        observations = planner.init(*told) if observations is None else planner.observe(observations, *told)
 
 
 def test_each_method_has_its_search_and_score():
@@ -133,8 +133,8 @@ def test_counts_are_those_of_the_segmenter_on_all_that_was_seen():
     again = study.seen(study.scene(SCENE), run)
     assert len(again) == len(run["counts"])
     labels = np.flatnonzero(np.asarray(scene.parts))
-    for counts, cloud, (_, evidence) in zip(run["counts"], clouds(record, "discrete"), again, strict=True):
-        np.testing.assert_allclose(evidence.cloud.points, cloud.points, atol=1e-5)
+    for counts, cloud, (_, observations) in zip(run["counts"], clouds(record, "discrete"), again, strict=True):
+        np.testing.assert_allclose(observations.cloud.points, cloud.points, atol=1e-5)
         fed, said = segmenter.predict(cloud)
         points, normals = np.asarray(fed.points, np.float64), np.asarray(fed.normals, np.float64)
         weight = np.random.default_rng(1).normal(size=(6, 50))
@@ -160,12 +160,14 @@ def test_a_run_stops_once_every_part_has_the_largest_target():
 
 def test_planners_of_all_categories_share_their_compilations(compilations):
     study, first = small_study(), pose_of(whole_record()["methods"]["discrete"]["views"][0])
-    evidence = study.planner("discrete", study.scene(0)).init(first, next(scans(whole_record(), "discrete")), CAMERA)
+    observations = study.planner("discrete", study.scene(0)).init(
+        first, next(scans(whole_record(), "discrete")), CAMERA
+    )
     values = []
     for index in (1, 4):
         planner = study.planner("discrete", study.scene(index))
         del compilations[:]
-        values.append(np.asarray(planner.propose(evidence, jax.random.key(1)).values))
+        values.append(np.asarray(planner.propose(observations, jax.random.key(1)).values))
     assert not compilations
     assert (values[0] != values[1]).any()
 

@@ -1,7 +1,7 @@
 """What is imagined: the surfaces that are held possible given what has been seen.
 
-An `Imagination` is all that a sampled surface depends on but the evidence: the model, the grid on which samples are
-evaluated, how many are drawn, what cuts them, and what stands around the object.
+A `SurfaceSampler` is all that a sampled surface depends on but the observations: the model, the grid on which samples
+are evaluated, how many are drawn, what cuts them, and what stands around the object.
 """
 
 import dataclasses
@@ -18,12 +18,12 @@ from jaxnbv.geometry.cloud import PointCloud, check_oriented, check_single, conc
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box, Volume, bounding_box
+from jaxnbv.observations import Observations
 from jaxnbv.scanning import (
     Carving,
-    Evidence,
     Grid,
     GridSurface,
-    Surroundings,
+    Obstacles,
     TriangleMesh,
     carve,
     scan_samples,
@@ -45,10 +45,10 @@ from jaxnbv.surfaces.base import HALF_WIDTH
 from jaxnbv.surfaces.known_shapes import short_ranged
 
 MODELS = ("screened", "paper")
-"""The names of `Imagination.preset`."""
+"""The names of `SurfaceSampler.preset`."""
 
 
-class Imagination(eqx.Module):
+class SurfaceSampler(eqx.Module):
     """A distribution over surfaces, as a planner imagines them.
 
     - `model`: the prior over surfaces.
@@ -56,9 +56,9 @@ class Imagination(eqx.Module):
     - `num_samples`: S, posterior samples a step.
     - `carving`: what samples are cut by: space seen empty, on which the model is conditioned too where it can be, and
       the outside of a volume. None leaves samples as the model draws them from D, which is the paper's own behaviour.
-    - `surroundings`: what stands around the object, hides it, and keeps cameras out; None for nothing.
+    - `obstacles`: what stands around the object, hides it, and keeps cameras out; None for nothing.
 
-    Evidence is an `Evidence` of the same grid, or a cloud alone.
+    Observations is an `Observations` of the same grid, or a cloud alone.
 
     **Raises:** `ValueError` for no samples, or a grid beyond the torus [-pi, pi]^3.
     """
@@ -67,7 +67,7 @@ class Imagination(eqx.Module):
     grid: Grid = Grid()
     num_samples: int = eqx.field(static=True, default=16)
     carving: Carving | None = Carving()
-    surroundings: Surroundings | None = None
+    obstacles: Obstacles | None = None
 
     def __check_init__(self):
         check_fields(self)
@@ -86,7 +86,7 @@ class Imagination(eqx.Module):
         quick: bool = False,
         volume: Volume | None = None,
         solid: bool = False,
-    ) -> "Imagination":
+    ) -> "SurfaceSampler":
         """The surfaces of a name, for an object whose box has this longest side, in scene units.
 
         - `screened`: the default `ScreenedSPSR`, whose lengths are taken in proportion to the longest side and for
@@ -113,7 +113,7 @@ class Imagination(eqx.Module):
         values = (OutsideBoundary(volume), OnSurface(), *(() if solid else (SeenEmpty(),)))
         return cls(ScreenedSPSR(base, values, offset=scale * usual.offset), carving=Carving(volume))
 
-    def knowing(self, bank: ShapeBank, poses: ShapePoses) -> "Imagination":
+    def with_bank(self, bank: ShapeBank, poses: ShapePoses) -> "SurfaceSampler":
         """The same of one who has seen these shapes before: `KnownShapes`, registered within the volume, with this
         model as the answer to "none of these".
 
@@ -127,11 +127,11 @@ class Imagination(eqx.Module):
         )
 
     @property
-    def unknowing(self) -> "Imagination":
+    def without_bank(self) -> "SurfaceSampler":
         """The same without its known shapes, if it has any."""
         return dataclasses.replace(self, model=self.model.unknown) if isinstance(self.model, KnownShapes) else self
 
-    def within(self, volume: Box) -> "Imagination":
+    def within(self, volume: Box) -> "SurfaceSampler":
         """The same for an object in another box: what holds for the default one, `Box()`, holds for this."""
 
         def placed(leaf):
@@ -139,107 +139,111 @@ class Imagination(eqx.Module):
 
         return jax.tree.map(placed, self, is_leaf=lambda leaf: isinstance(leaf, Box))
 
-    def begin(self, cloud: PointCloud, capacity: int, max_views: int) -> Evidence:
-        """A cloud as evidence, before any pose is known.
+    def begin(self, cloud: PointCloud, capacity: int, max_views: int) -> Observations:
+        """A cloud as observations, before any pose is known.
 
         - `capacity`: points of it that are kept, by farthest point sampling beyond it.
         - `max_views`: for how many views there is room.
         """
         kept = limit_capacity(cloud, capacity)
-        return Evidence.before_views(kept, max_views, None if self.carving is None else self.grid)
+        return Observations.before_views(kept, max_views, None if self.carving is None else self.grid)
 
-    def observe(self, evidence: Evidence, pose: Pose, scan: PointCloud, camera: Camera) -> Evidence:
-        """The evidence after a scan from a pose: its points, where it was taken, and what it shows to be empty.
+    def observe(self, observations: Observations, pose: Pose, scan: PointCloud, camera: Camera) -> Observations:
+        """The observations after a scan from a pose: its points, where it was taken, and what it shows to be empty.
 
-        **Raises:** `ValueError` for evidence of another grid.
+        **Raises:** `ValueError` for observations of another grid.
         """
-        known = self.known(evidence)
+        known = self.known(observations)
         known = dataclasses.replace(known, cloud=_joined(known.cloud, scan))
-        return _record(self.carving, self.surroundings, known, pose, scan, camera)
+        return _record(self.carving, self.obstacles, known, pose, scan, camera)
 
-    def record(self, evidence: Evidence, pose: Pose, scan: PointCloud, camera: Camera) -> Evidence:
-        """The evidence after a view whose points it holds already.
+    def record(self, observations: Observations, pose: Pose, scan: PointCloud, camera: Camera) -> Observations:
+        """The observations after a view whose points it holds already.
 
-        **Raises:** `ValueError` for evidence of another grid.
+        **Raises:** `ValueError` for observations of another grid.
         """
-        return _record(self.carving, self.surroundings, self.known(evidence), pose, scan, camera)
+        return _record(self.carving, self.obstacles, self.known(observations), pose, scan, camera)
 
-    def posterior(self, evidence: Evidence | PointCloud) -> SurfacePosterior:
-        """p(f | evidence), of which `sample` draws before it carves. Space is known to be empty within the volume.
+    def posterior(self, observations: Observations | PointCloud) -> SurfacePosterior:
+        """p(f | observations), of which `sample` draws before it carves. Space is known to be empty within the volume.
 
-        **Raises:** `ValueError` as the model's `condition` does, and for evidence of another grid.
+        **Raises:** `ValueError` as the model's `condition` does, and for observations of another grid.
         """
-        evidence = self.known(evidence)
-        if self.carving is None or evidence.seen_empty is None:
-            return self.model.condition(evidence)
-        inside = evidence.seen_empty & self.carving.inside(self.grid)
-        return self.model.condition(dataclasses.replace(evidence, seen_empty=inside))
+        observations = self.known(observations)
+        if self.carving is None or observations.seen_empty is None:
+            return self.model.condition(observations)
+        inside = observations.seen_empty & self.carving.inside(self.grid)
+        return self.model.condition(dataclasses.replace(observations, seen_empty=inside))
 
     def sample(
-        self, evidence: Evidence | PointCloud, key: PRNGKeyArray, posterior: SurfacePosterior | None = None
+        self, observations: Observations | PointCloud, key: PRNGKeyArray, posterior: SurfacePosterior | None = None
     ) -> GridSurface:
-        """S samples of the surface given the evidence, carved, on the grid, along a leading axis.
+        """S samples of the surface given the observations, carved, on the grid, along a leading axis.
 
-        - `posterior`: that of the evidence, where it is at hand already.
+        - `posterior`: that of the observations, where it is at hand already.
 
         **Raises:** `ValueError` as `posterior` does, and if the model gives values that are not finite.
         """
         check_key(key)
         check_type(posterior, SurfacePosterior | None, "the posterior")
-        evidence = self.known(evidence)
+        observations = self.known(observations)
         # On its own, so that whoever asks for the posterior too compiles it once.
-        posterior = self.posterior(evidence) if posterior is None else posterior
-        surfaces = _sample(self, evidence, key, posterior)
+        posterior = self.posterior(observations) if posterior is None else posterior
+        surfaces = _sample(self, observations, key, posterior)
         if not is_traced(surfaces):
             require(
                 bool(jnp.isfinite(surfaces.values).all()),
-                f"the samples of the surface given {int(evidence.cloud.count)} points are not finite: raise the "
+                f"the samples of the surface given {int(observations.cloud.count)} points are not finite: raise the "
                 "model's noise, or enable jax_enable_x64",
             )
         return surfaces
 
-    def carve(self, evidence: Evidence | PointCloud, values: Float[Array, "*s g g g"]) -> Float[Array, "*s g g g"]:
+    def carve(
+        self, observations: Observations | PointCloud, values: Float[Array, "*s g g g"]
+    ) -> Float[Array, "*s g g g"]:
         """Values of f minus its level at the grid's nodes, made positive where the object cannot be: in space that was
         seen empty, outside its volume, and within obstacles.
 
-        **Raises:** `ValueError` if the values or the evidence are of another grid.
+        **Raises:** `ValueError` if the values or the observations are of another grid.
         """
-        evidence, nodes = self.known(evidence), (self.grid.resolution,) * 3
+        observations, nodes = self.known(observations), (self.grid.resolution,) * 3
         require(jnp.shape(values)[-3:] == nodes, f"the values are {shown(values)}, but the grid has {nodes} nodes")
-        if self.carving is None or evidence.seen_empty is None:
+        if self.carving is None or observations.seen_empty is None:
             return values
-        elsewhere = evidence.seen_empty | self.carving.outside(self.grid)
-        around = self.surroundings
+        elsewhere = observations.seen_empty | self.carving.outside(self.grid)
+        around = self.obstacles
         return carve(values, elsewhere if around is None else elsewhere | around.within(self.grid))
 
-    def mean(self, evidence: Evidence | PointCloud, posterior: SurfacePosterior | None = None) -> Float[Array, "g g g"]:
+    def mean(
+        self, observations: Observations | PointCloud, posterior: SurfacePosterior | None = None
+    ) -> Float[Array, "g g g"]:
         """E f minus the level at the grid's nodes, carved as the samples are.
 
         **Raises:** `ValueError` as `posterior` does.
         """
-        posterior = self.posterior(evidence) if posterior is None else posterior
+        posterior = self.posterior(observations) if posterior is None else posterior
         values = posterior.mean_on_grid(self.grid.axis.astype(posterior.level.dtype)) - posterior.level
-        return self.carve(evidence, values)
+        return self.carve(observations, values)
 
-    def probability_inside(self, evidence: Evidence | PointCloud) -> Float[Array, "g g g"]:
-        """P(f < level | evidence) at the grid's nodes: the share of S samples under a fixed key, carved, so that any
-        model will do.
+    def probability_inside(self, observations: Observations | PointCloud) -> Float[Array, "g g g"]:
+        """P(f < level | observations) at the grid's nodes: the share of S samples under a fixed key, carved, so that
+        any model will do.
 
         **Raises:** `ValueError` as `sample` does.
         """
-        return jnp.mean(self.sample(evidence, jax.random.key(0)).values < 0, axis=0)
+        return jnp.mean(self.sample(observations, jax.random.key(0)).values < 0, axis=0)
 
-    def mean_mesh(self, evidence: Evidence | PointCloud) -> TriangleMesh:
+    def mean_mesh(self, observations: Observations | PointCloud) -> TriangleMesh:
         """The surface where the posterior mean equals its level, by marching cubes on the grid, carved as the samples.
 
         The mesh is in scene coordinates (its frame is the identity), its faces wound outward. Where nothing was scanned
         it is the model's guess. All of it is kept, pieces that hold no point of the cloud included: some continue the
-        object behind what was seen, others are not there, and the evidence does not tell which. It is open where it
+        object behind what was seen, others are not there, and the observations do not tell which. It is open where it
         leaves the grid.
 
         **Raises:** `ValueError` if the mean does not cross its level within the grid, and as `posterior` does.
         """
-        values = np.array(self.mean(evidence))
+        values = np.array(self.mean(observations))
         found = level_triangles(values, self.grid)
         if found is None:
             half = self.grid.half_extent
@@ -252,7 +256,7 @@ class Imagination(eqx.Module):
 
     def barrier(self, camera: Camera, poses: Pose) -> Float[Array, "*batch rays"] | None:
         """How far along a camera's rays from a pose or a batch of them obstacles stand; None without any."""
-        return None if self.surroundings is None else self.surroundings.barrier(camera, poses)
+        return None if self.obstacles is None else self.obstacles.barrier(camera, poses)
 
     @eqx.filter_jit
     def scan(self, surfaces: GridSurface, camera: Camera, poses: Pose) -> PointCloud:
@@ -260,23 +264,23 @@ class Imagination(eqx.Module):
         axes (s, p)."""
         return scan_samples(surfaces, camera, poses, self.barrier(camera, poses))
 
-    def known(self, evidence: Evidence | PointCloud) -> Evidence:
-        """The evidence with what is known of its empty space: none of a cloud alone.
+    def known(self, observations: Observations | PointCloud) -> Observations:
+        """The observations with what is known of its empty space: none of a cloud alone.
 
-        **Raises:** `ValueError` for evidence of another grid, or without empty space where samples are carved.
+        **Raises:** `ValueError` for observations of another grid, or without empty space where samples are carved.
         """
-        if isinstance(evidence, PointCloud):
-            check_single(evidence)
-            return Evidence.before_views(evidence, 0, None if self.carving is None else self.grid)
-        check_type(evidence, Evidence, "the evidence")
+        if isinstance(observations, PointCloud):
+            check_single(observations)
+            return Observations.before_views(observations, 0, None if self.carving is None else self.grid)
+        check_type(observations, Observations, "the observations")
         if self.carving is None:
-            return dataclasses.replace(evidence, seen_empty=None, grid=None)
+            return dataclasses.replace(observations, seen_empty=None, grid=None)
         require(
-            bool(evidence.grid == self.grid),
-            f"the evidence knows empty space on {evidence.grid}, but surfaces are carved on {self.grid}: make it with "
-            "the init of the planner that it is given to",
+            bool(observations.grid == self.grid),
+            f"the observations keep empty space on {observations.grid}, but surfaces are carved on {self.grid}: make "
+            "them with the init of the planner that they are given to",
         )
-        return evidence
+        return observations
 
     def check(self, pose: Pose | None, scan: PointCloud, camera: Camera, first: bool) -> None:
         """**Raises:** `ValueError` for a scan that `Planner.init` refuses, or `Planner.observe` if it is not the
@@ -311,24 +315,24 @@ def _joined(cloud: PointCloud, scan: PointCloud) -> PointCloud:
 @eqx.filter_jit
 def _record(
     carving: Carving | None,
-    surroundings: Surroundings | None,
-    evidence: Evidence,
+    obstacles: Obstacles | None,
+    observations: Observations,
     pose: Pose,
     scan: PointCloud,
     camera: Camera,
-) -> Evidence:
-    poses = jax.tree.map(lambda rows, row: rows.at[evidence.num_views].set(row), evidence.poses, pose)
-    empty: Bool[Array, "g g g"] | None = evidence.seen_empty
-    if carving is not None and empty is not None and evidence.grid is not None:
-        barrier = None if surroundings is None else surroundings.barrier(camera, pose)
-        empty = empty | carving.seen_empty(evidence.grid, pose, scan, camera, barrier)
-    return dataclasses.replace(evidence, poses=poses, num_views=evidence.num_views + 1, seen_empty=empty)
+) -> Observations:
+    poses = jax.tree.map(lambda rows, row: rows.at[observations.num_views].set(row), observations.poses, pose)
+    empty: Bool[Array, "g g g"] | None = observations.seen_empty
+    if carving is not None and empty is not None and observations.grid is not None:
+        barrier = None if obstacles is None else obstacles.barrier(camera, pose)
+        empty = empty | carving.seen_empty(observations.grid, pose, scan, camera, barrier)
+    return dataclasses.replace(observations, poses=poses, num_views=observations.num_views + 1, seen_empty=empty)
 
 
 @eqx.filter_jit
 def _sample(
-    imagination: Imagination, evidence: Evidence, key: PRNGKeyArray, posterior: SurfacePosterior
+    sampler: SurfaceSampler, observations: Observations, key: PRNGKeyArray, posterior: SurfacePosterior
 ) -> GridSurface:
-    fields = posterior.sample(key, imagination.num_samples)
-    values = fields.on_grid(imagination.grid.axis) - posterior.level
-    return GridSurface.from_values(imagination.carve(evidence, values), 0.0, imagination.grid)
+    fields = posterior.sample(key, sampler.num_samples)
+    values = fields.on_grid(sampler.grid.axis) - posterior.level
+    return GridSurface.from_values(sampler.carve(observations, values), 0.0, sampler.grid)

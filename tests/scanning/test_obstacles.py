@@ -9,8 +9,8 @@ from free_scenes import SEE
 from scipy.spatial.transform import Rotation
 
 import jaxnbv as nbv
+from jaxnbv.scanning.obstacles import plane_under
 from jaxnbv.scanning.sdf import Capsule, Cuboid, HalfSpace, Sphere, solid_of_mesh
-from jaxnbv.scanning.surroundings import plane_under
 
 CAMERA, BALL = nbv.Camera(height=24, width=24), nbv.SDFSurface(Sphere(0.8))
 TABLE = HalfSpace([0.0, -0.5, 0.0], [0.0, 1.0, 0.0])
@@ -41,7 +41,7 @@ def first_hits(vertices, faces, pose):
 
 @pytest.mark.parametrize("index", range(3))
 def test_a_table_is_met_where_its_plane_is(index):
-    found = np.asarray(nbv.Surroundings((TABLE,)).barrier(CAMERA, POSES[index]), np.float64)
+    found = np.asarray(nbv.Obstacles((TABLE,)).barrier(CAMERA, POSES[index]), np.float64)
     origin, directions = rays_of(POSES[index])
     if origin[1] < -0.5:
         # From within: the way out.
@@ -61,7 +61,7 @@ def test_what_a_wall_hides_is_what_embree_says(as_mesh, index):
     mesh = box_mesh(low, high)
     wall = solid_of_mesh(*mesh, resolution=60) if as_mesh else WALL
     pose = POSES[index]
-    barrier = nbv.Surroundings((wall,)).barrier(CAMERA, pose)
+    barrier = nbv.Obstacles((wall,)).barrier(CAMERA, pose)
     expected = first_hits(*mesh, pose)
     found = np.asarray(barrier)
     # Beside the edges a cell of the sampled distances counts.
@@ -94,7 +94,7 @@ def test_points_of_obstacles_are_not_the_objects():
     normals = np.tile([0.0, 1.0, 0.0], (3, 1))
     cloud = nbv.PointCloud.from_arrays(points, normals, 4)
     scanned = nbv.PointCloud(cloud.points, cloud.normals, cloud.mask, jnp.array([False, False, False, True]))
-    kept = nbv.Surroundings((TABLE,), margin=0.05).without_obstacles(scanned)
+    kept = nbv.Obstacles((TABLE,), margin=0.05).remove_points(scanned)
     np.testing.assert_array_equal(kept.mask, [False, True, True, False])
     np.testing.assert_array_equal(kept.missed, [True, False, False, True])
     np.testing.assert_array_equal(kept.points[0], 0.0)
@@ -104,7 +104,7 @@ def test_space_is_seen_empty_up_to_an_obstacle():
     """Every ray misses the ball's place; nodes before the wall are empty, those behind it are not known."""
     grid, pose = nbv.Grid(40), nbv.look_at((-2.4, 0.0, 0.0))
     nothing = nbv.scan(nbv.SDFSurface(Sphere(0.01).translate([0.0, 5.0, 0.0])), CAMERA, pose)
-    wall = nbv.Surroundings((Cuboid([0.1, 2.0, 2.0]).translate([0.5, 0.0, 0.0]),))
+    wall = nbv.Obstacles((Cuboid([0.1, 2.0, 2.0]).translate([0.5, 0.0, 0.0]),))
     barrier = wall.barrier(CAMERA, pose)
     free, known = (np.asarray(SEE(nbv.Carving(), grid, pose, nothing, CAMERA, b)) for b in (None, barrier))
     x = np.asarray(grid.axis)
@@ -114,14 +114,12 @@ def test_space_is_seen_empty_up_to_an_obstacle():
     np.testing.assert_array_equal(known[x < 0.4 - 2.5 * grid.spacing], free[x < 0.4 - 2.5 * grid.spacing])
 
 
-def planner_of(search, surroundings=None, capacity=256):
-    imagination = nbv.Imagination(nbv.GeometricSPSR(0.1, truncation=8), nbv.Grid(28), 3, surroundings=surroundings)
-    return nbv.Planner(
-        nbv.Coverage(), search, nbv.Camera(height=12, width=12), imagination, capacity=capacity, max_views=6
-    )
+def planner_of(search, obstacles=None, capacity=256):
+    sampler = nbv.SurfaceSampler(nbv.GeometricSPSR(0.1, truncation=8), nbv.Grid(28), 3, obstacles=obstacles)
+    return nbv.Planner(nbv.Coverage(), search, nbv.Camera(height=12, width=12), sampler, capacity=capacity, max_views=6)
 
 
-TABLED = planner_of(nbv.DiscreteSearch(40), nbv.Surroundings((TABLE,), clearance=0.3))
+TABLED = planner_of(nbv.DiscreteSearch(40), nbv.Obstacles((TABLE,), clearance=0.3))
 
 
 def test_an_episode_stands_and_sees_above_the_table():
@@ -142,7 +140,7 @@ def test_a_search_by_gradient_stays_out_of_obstacles():
     starts = nbv.look_at(2.3 * np.array([[np.cos(a), -0.05, np.sin(a)] for a in (0.3, 1.9, 3.5, 5.1)]))
     search = nbv.GradientSearch(dof=2, num_starts=4, iterations=12, learning_rate=0.05, candidates=starts)
     table = HalfSpace([0.0, -0.2, 0.0], [0.0, 1.0, 0.0])
-    planner = planner_of(search, nbv.Surroundings((table,), clearance=0.4))
+    planner = planner_of(search, nbv.Obstacles((table,), clearance=0.4))
     proposal = planner.propose(planner.init(POSES[2], nbv.scan(BALL, planner.camera, POSES[2])), KEY)
     assert float(proposal.pose.position[1]) >= 0.2 - 1e-5
     assert np.isneginf(np.asarray(proposal.values)).all()
@@ -154,7 +152,7 @@ def test_from_the_world_to_the_scene():
     """Distances in the world times the scale are those in the scene."""
     frame = nbv.Frame.fit(np.array([[0.1, 0.2, 0.0], [0.4, 0.5, 0.25]]), up="z")
     table, block = HalfSpace([0.0, 0.0, 0.01], [0.0, 0.0, 1.0]), Cuboid([0.05, 0.1, 0.2]).translate([0.6, 0.0, 0.2])
-    world = nbv.Surroundings((table, block), margin=0.01, clearance=0.05)
+    world = nbv.Obstacles((table, block), margin=0.01, clearance=0.05)
     scene = world.in_scene(frame)
     x = np.random.default_rng(0).uniform(-0.5, 1.0, (100, 3))
     places = jnp.asarray(frame.to_scene(x), jnp.float32)
@@ -218,9 +216,9 @@ def test_no_proposal_is_inside_or_under_what_is_known():
     def chosen(solids, cloud, key):
         (point, normal), (half, block), (start, end) = solids
         arm = Capsule(start, end, 0.1)
-        around = nbv.Surroundings((HalfSpace(point, normal), Cuboid(half).translate(block), arm), clearance=clearance)
-        evidence = nbv.Evidence.before_views(cloud, 2, None)
-        proposal = search.propose(nbv.Problem(evidence, camera, nbv.Coverage(), None, around), key)
+        around = nbv.Obstacles((HalfSpace(point, normal), Cuboid(half).translate(block), arm), clearance=clearance)
+        observations = nbv.Observations.before_views(cloud, 2, None)
+        proposal = search.propose(nbv.Problem(observations, camera, nbv.Coverage(), None, around), key)
         return proposal.pose.position, proposal.value
 
     rng, looked, x = np.random.default_rng(0), 0, np.asarray(poses.position, np.float64)

@@ -1,4 +1,4 @@
-"""The surfaces that are held possible: the presets, and what is made of evidence, against closed forms."""
+"""The surfaces that are held possible: the presets, and what is made of observations, against closed forms."""
 
 import dataclasses
 
@@ -10,9 +10,9 @@ import pytest
 from jaxtyping import Array, Float
 
 import jaxnbv as nbv
-from jaxnbv.imagination import MODELS
+from jaxnbv.sampler import MODELS
 
-preset = nbv.Imagination.preset
+preset = nbv.SurfaceSampler.preset
 
 
 def test_the_papers_model_has_its_published_values_and_is_not_carved():
@@ -52,7 +52,7 @@ def test_quick_surfaces_have_fewer_frequencies():
 
 
 def test_the_preset_is_the_default_and_another_name_is_refused():
-    assert eqx.tree_equal(preset(), nbv.Imagination())
+    assert eqx.tree_equal(preset(), nbv.SurfaceSampler())
     for message, wrong in {
         r"no model 'mine': choose from screened, paper": ("mine",),
         r"-1\.0": ("screened", -1.0),
@@ -89,23 +89,23 @@ class BallsPosterior(nbv.SurfacePosterior):
 
 
 class BallsModel(nbv.SurfaceModel):
-    def condition(self, evidence):
+    def condition(self, observations):
         return BallsPosterior(jnp.asarray(0.3))
 
 
-def balls(carving=nbv.Carving(), surroundings=None):  # noqa: B008
-    return nbv.Imagination(BallsModel(), GRID, len(RADII), carving, surroundings)
+def balls(carving=nbv.Carving(), obstacles=None):  # noqa: B008
+    return nbv.SurfaceSampler(BallsModel(), GRID, len(RADII), carving, obstacles)
 
 
-def seen(imagination):
-    """The evidence after both scans."""
-    evidence = imagination.record(imagination.begin(SCANS[0], 200, 4), POSES[0], SCANS[0], CAMERA)
-    return imagination.observe(evidence, POSES[1], SCANS[1], CAMERA)
+def seen(sampler):
+    """The observations after both scans."""
+    observations = sampler.record(sampler.begin(SCANS[0], 200, 4), POSES[0], SCANS[0], CAMERA)
+    return sampler.observe(observations, POSES[1], SCANS[1], CAMERA)
 
 
 def test_the_probability_is_the_share_of_the_samples_that_hold_a_node():
-    for evidence in (SCANS[0], seen(balls(None))):
-        np.testing.assert_allclose(balls(None).probability_inside(evidence), SHARE, atol=1e-6)
+    for observations in (SCANS[0], seen(balls(None))):
+        np.testing.assert_allclose(balls(None).probability_inside(observations), SHARE, atol=1e-6)
     assert len(np.unique(SHARE)) == 9
     # Of a cloud alone nothing is known to be empty, but the volume is.
     small = balls(nbv.Carving(nbv.Box.cube(0.8)))
@@ -114,17 +114,15 @@ def test_the_probability_is_the_share_of_the_samples_that_hold_a_node():
     )
 
 
-@pytest.mark.parametrize(
-    "surroundings", [None, nbv.Surroundings((nbv.sdf.HalfSpace([0.0, -0.3, 0.0], [0.0, 1.0, 0.0]),))]
-)
-def test_nothing_is_imagined_where_the_object_cannot_be(surroundings):
-    imagination = balls(surroundings=surroundings)
-    evidence = seen(imagination)
-    below = np.asarray(GRID.axis)[None, :, None] < (-np.inf if surroundings is None else -0.3)
-    nowhere = np.asarray(evidence.seen_empty) | np.asarray(imagination.carving.outside(GRID)) | below
+@pytest.mark.parametrize("obstacles", [None, nbv.Obstacles((nbv.sdf.HalfSpace([0.0, -0.3, 0.0], [0.0, 1.0, 0.0]),))])
+def test_nothing_is_imagined_where_the_object_cannot_be(obstacles):
+    sampler = balls(obstacles=obstacles)
+    observations = seen(sampler)
+    below = np.asarray(GRID.axis)[None, :, None] < (-np.inf if obstacles is None else -0.3)
+    nowhere = np.asarray(observations.seen_empty) | np.asarray(sampler.carving.outside(GRID)) | below
     assert (nowhere & (SHARE > 0)).sum() > 50
-    np.testing.assert_allclose(imagination.probability_inside(evidence), np.where(nowhere, 0.0, SHARE), atol=1e-6)
-    values, mean = np.asarray(imagination.sample(evidence, KEY).values), np.asarray(imagination.mean(evidence))
+    np.testing.assert_allclose(sampler.probability_inside(observations), np.where(nowhere, 0.0, SHARE), atol=1e-6)
+    values, mean = np.asarray(sampler.sample(observations, KEY).values), np.asarray(sampler.mean(observations))
     assert (values[:, nowhere] > 0).all()
     assert (mean[nowhere] > 0).all()
     np.testing.assert_allclose(mean[~nowhere], (AWAY - RADII.mean())[~nowhere], atol=1e-5)
@@ -132,20 +130,20 @@ def test_nothing_is_imagined_where_the_object_cannot_be(surroundings):
 
 
 def test_a_posterior_at_hand_is_not_asked_for_again():
-    imagination, evidence = nbv.Imagination(nbv.GeometricSPSR(0.1, truncation=6), GRID, 3), SCANS[0]
-    posterior = imagination.posterior(evidence)
+    sampler, observations = nbv.SurfaceSampler(nbv.GeometricSPSR(0.1, truncation=6), GRID, 3), SCANS[0]
+    posterior = sampler.posterior(observations)
     np.testing.assert_array_equal(
-        imagination.sample(evidence, KEY, posterior).values, imagination.sample(evidence, KEY).values
+        sampler.sample(observations, KEY, posterior).values, sampler.sample(observations, KEY).values
     )
     other = BallsPosterior(jnp.asarray(0.3))
-    np.testing.assert_allclose(imagination.mean(evidence, other), balls().mean(evidence), atol=1e-6)
+    np.testing.assert_allclose(sampler.mean(observations, other), balls().mean(observations), atol=1e-6)
 
 
 def test_scans_of_samples_end_at_the_surroundings():
-    wall = nbv.Surroundings((nbv.sdf.Cuboid([0.1, 1.0, 1.0]).translate([1.4, 0.0, -0.5]),))
-    imagination = balls(surroundings=wall)
-    surfaces = imagination.sample(SCANS[0], KEY)
-    found = imagination.scan(surfaces, CAMERA, POSES)
+    wall = nbv.Obstacles((nbv.sdf.Cuboid([0.1, 1.0, 1.0]).translate([1.4, 0.0, -0.5]),))
+    sampler = balls(obstacles=wall)
+    surfaces = sampler.sample(SCANS[0], KEY)
+    found = sampler.scan(surfaces, CAMERA, POSES)
     free, expected = (nbv.scan_samples(surfaces, CAMERA, POSES, b) for b in (None, wall.barrier(CAMERA, POSES)))
     np.testing.assert_array_equal(found.mask, expected.mask)
     np.testing.assert_allclose(found.points, expected.points, atol=1e-5)
@@ -159,7 +157,7 @@ def test_another_box_takes_the_place_of_the_default_one_alone():
     model = nbv.ScreenedSPSR(
         values=(nbv.OutsideBoundary(), nbv.OutsideBoundary(own, 77), nbv.OutsideBoundary(value=2.0))
     )
-    before = nbv.Imagination(model, GRID, 5, nbv.Carving(margin_voxels=1.5))
+    before = nbv.SurfaceSampler(model, GRID, 5, nbv.Carving(margin_voxels=1.5))
     after = before.within(box)
     assert [source.volume for source in after.model.values] == [box, own, box]
     assert after.carving == nbv.Carving(box, 1.5)
@@ -168,7 +166,7 @@ def test_another_box_takes_the_place_of_the_default_one_alone():
     values = (back[0], after.model.values[1], back[1])
     model = dataclasses.replace(after.model, values=values)
     assert eqx.tree_equal(dataclasses.replace(after, model=model, carving=before.carving), before)
-    kept = nbv.Imagination(carving=nbv.Carving(own)).within(box)
+    kept = nbv.SurfaceSampler(carving=nbv.Carving(own)).within(box)
     assert kept.carving.volume == own
     assert eqx.tree_equal(preset("screened", 1.25).within(box), preset("screened", 1.25))
     assert eqx.tree_equal(preset("screened").within(box).carving, nbv.Carving(box))
@@ -176,20 +174,20 @@ def test_another_box_takes_the_place_of_the_default_one_alone():
 
 @pytest.mark.parametrize("made_by", [balls(None), dataclasses.replace(balls(), grid=nbv.Grid(26, 1.5))])
 def test_evidence_of_another_grid_is_refused(made_by):
-    own, evidence, fits = balls(), seen(made_by), seen(balls())
+    own, observations, fits = balls(), seen(made_by), seen(balls())
     for use in (
         own.known,
         own.posterior,
-        lambda evidence: own.sample(evidence, KEY),
-        lambda evidence: own.carve(evidence, jnp.zeros((26,) * 3)),
+        lambda observations: own.sample(observations, KEY),
+        lambda observations: own.carve(observations, jnp.zeros((26,) * 3)),
         own.mean,
         own.probability_inside,
         own.mean_mesh,
-        lambda evidence: own.observe(evidence, POSES[1], SCANS[1], CAMERA),
-        lambda evidence: own.record(evidence, POSES[1], SCANS[1], CAMERA),
+        lambda observations: own.observe(observations, POSES[1], SCANS[1], CAMERA),
+        lambda observations: own.record(observations, POSES[1], SCANS[1], CAMERA),
     ):
         with pytest.raises(nbv.InputError, match=r"surfaces are carved on Grid\(resolution=26, half_extent=1\.6\)"):
-            use(evidence)
+            use(observations)
         use(fits)
 
 
@@ -201,16 +199,16 @@ def test_where_nothing_is_carved_evidence_of_any_grid_will_do():
 
 @pytest.mark.parametrize("carving", [None, nbv.Carving()])
 def test_evidence_is_that_of_a_planner(carving):
-    imagination = balls(carving)
-    planner = nbv.Planner(nbv.Coverage(), nbv.FarthestView(6), CAMERA, imagination, capacity=200, max_views=4)
-    evidence = planner.observe(planner.init(POSES[0], SCANS[0]), POSES[1], SCANS[1])
-    found = seen(imagination)
-    assert eqx.tree_equal(found, evidence)
+    sampler = balls(carving)
+    planner = nbv.Planner(nbv.Coverage(), nbv.FarthestView(6), CAMERA, sampler, capacity=200, max_views=4)
+    observations = planner.observe(planner.init(POSES[0], SCANS[0]), POSES[1], SCANS[1])
+    found = seen(sampler)
+    assert eqx.tree_equal(found, observations)
     assert int(found.num_views) == 2
     assert int(found.cloud.count) == 200
-    begun = imagination.begin(SCANS[0], 200, 4)
+    begun = sampler.begin(SCANS[0], 200, 4)
     assert eqx.tree_equal(begun, planner.init(None, SCANS[0]))
-    assert eqx.tree_equal(imagination.known(SCANS[0]), nbv.Evidence.before_views(SCANS[0], 0, carving and GRID))
+    assert eqx.tree_equal(sampler.known(SCANS[0]), nbv.Observations.before_views(SCANS[0], 0, carving and GRID))
 
 
 def test_values_of_another_grid_are_refused():

@@ -26,7 +26,7 @@ class EmptyPoints(NamedTuple):
     mask: Bool[Array, " m"]
 
 
-class Evidence(eqx.Module):
+class Observations(eqx.Module):
     """What has been seen, in scene coordinates. Immutable and of fixed shapes, so that nothing recompiles as it grows.
 
     - `cloud`: D, the points that are kept.
@@ -41,16 +41,16 @@ class Evidence(eqx.Module):
     grid: Grid | None = None
 
     @classmethod
-    def of(cls, seen: "Evidence | PointCloud") -> "Evidence":
-        """Evidence as it is; a cloud alone as evidence of no known pose.
+    def of(cls, seen: "Observations | PointCloud") -> "Observations":
+        """Observations as it is; a cloud alone as observations of no known pose.
 
         **Raises:** `ValueError` for anything else.
         """
-        check_type(seen, Evidence | PointCloud, "the evidence")
-        return seen if isinstance(seen, Evidence) else cls.before_views(seen, 0, None)
+        check_type(seen, Observations | PointCloud, "the observations")
+        return seen if isinstance(seen, Observations) else cls.before_views(seen, 0, None)
 
     @classmethod
-    def before_views(cls, cloud: PointCloud, max_views: int, grid: Grid | None) -> "Evidence":
+    def before_views(cls, cloud: PointCloud, max_views: int, grid: Grid | None) -> "Observations":
         """D before any pose is known, with room for so many views.
 
         - `grid`: on whose nodes empty space is kept; None where it is not.
@@ -80,7 +80,7 @@ class Evidence(eqx.Module):
         nodes = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
         return EmptyPoints(nodes, self.seen_empty[::stride, ::stride, ::stride].reshape(-1))
 
-    def with_visited(self, poses: Sequence[Pose]) -> "Evidence":
+    def with_visited(self, poses: Sequence[Pose]) -> "Observations":
         """The same, with these poses taken for visited too. It has room for twice as many, so that its shapes do not
         depend on how many they are."""
         room, count = jax.tree.map(lambda rows: jnp.concatenate([rows, rows]), self.poses), self.num_views

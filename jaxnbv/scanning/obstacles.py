@@ -16,7 +16,6 @@ from jaxnbv.geometry.neighbours import nearest_squared_distance
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
 from jaxnbv.geometry.volume import Box
-from jaxnbv.scanning.evidence import Evidence
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.sdf import HalfSpace, Rotated, SignedDistance
 from jaxnbv.scanning.sphere_tracing import SDFSurface
@@ -35,56 +34,56 @@ _DRAWS, _COUNTED = 500, 5000
 _FEWEST = 0.05
 
 
-class Surroundings(eqx.Module):
-    """Known obstacles, and how near a camera may come to things; in scene units within a `Planner`.
+class Obstacles(eqx.Module):
+    """Known solids, and how near a camera may come to things; in scene units within a `Planner`.
 
     An obstacle hides what is behind it, from the sensor and from imagined scans; it is never counted as the object, and
     no imagined surface is within it.
 
-    - `obstacles`: solids of `jaxnbv.scanning.sdf`: a table is a `HalfSpace`, a mesh is made one by `solid_of_mesh`.
+    - `solids`: solids of `jaxnbv.scanning.sdf`: a table is a `HalfSpace`, a mesh is made one by `solid_of_mesh`.
     - `margin`: points nearer than this to an obstacle are taken for its own.
     - `clearance`: no camera comes nearer than this to an obstacle, nor to a point that was seen.
 
-    **Raises:** `ValueError` for obstacles that are not solids, or a negative length.
+    **Raises:** `ValueError` for solids that are not solids, or a negative length.
     """
 
-    obstacles: tuple[SignedDistance, ...] = ()
+    solids: tuple[SignedDistance, ...] = ()
     margin: float = eqx.field(static=True, default=0.03)
     clearance: float = eqx.field(static=True, default=0.1)
 
     def __check_init__(self):
         check_fields(self)
-        require(isinstance(self.obstacles, tuple), f"the obstacles are {shown(self.obstacles)}; give a tuple of solids")
-        for obstacle in self.obstacles:
+        require(isinstance(self.solids, tuple), f"the solids are {shown(self.solids)}; give a tuple of solids")
+        for obstacle in self.solids:
             check_type(obstacle, SignedDistance, "an obstacle")
         for name in ("margin", "clearance"):
             value = getattr(self, name)
             require(value >= 0, f"the {name} is {value}; it must not be negative")
 
-    def in_scene(self, frame: Frame) -> "Surroundings":
+    def in_scene(self, frame: Frame) -> "Obstacles":
         """From world units to those of the scene."""
-        moved = (obstacle.translate(-np.asarray(frame.center)) for obstacle in self.obstacles)
+        moved = (obstacle.translate(-np.asarray(frame.center)) for obstacle in self.solids)
         solids = tuple(Rotated(solid, frame.rotation).scale(frame.scale) for solid in moved)
-        return Surroundings(solids, frame.scale * self.margin, frame.scale * self.clearance)
+        return Obstacles(solids, frame.scale * self.margin, frame.scale * self.clearance)
 
     def distance(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         """Signed distance to the nearest obstacle, infinite where there is none."""
-        if not self.obstacles:
+        if not self.solids:
             return jnp.full(jnp.shape(x)[:-1], jnp.inf, jnp.result_type(float))
-        return functools.reduce(operator.or_, self.obstacles)(x)
+        return functools.reduce(operator.or_, self.solids)(x)
 
     def barrier(self, camera: Camera, poses: Pose) -> Float[Array, "*batch rays"] | None:
         """How far along each ray of a camera the first obstacle stands; infinite where none does, None without any."""
-        if not self.obstacles:
+        if not self.solids:
             return None
         origins, directions = camera.rays(poses)
-        surface = SDFSurface(functools.reduce(operator.or_, self.obstacles), bounding_radius=_FAR)
+        surface = SDFSurface(functools.reduce(operator.or_, self.solids), bounding_radius=_FAR)
         hits = surface.trace(origins.reshape(-1, 3), directions.reshape(-1, 3))
         along = jnp.linalg.norm(hits.points - origins.reshape(-1, 3), axis=-1)
         return jnp.where(hits.mask, along, jnp.inf).reshape(origins.shape[:-1])
 
-    def without_obstacles(self, scan: PointCloud) -> PointCloud:
-        """A scan less the points of obstacles; of an image, their rays met nothing of the object."""
+    def remove_points(self, scan: PointCloud) -> PointCloud:
+        """A scan less the points of solids; of an image, their rays met nothing of the object."""
         own = scan.mask & (self.distance(scan.points) < self.margin)
         points, normals = (jnp.where(own[..., None], 0.0, rows) for rows in (scan.points, scan.normals))
         missed = None if scan.missed is None else scan.missed | own
@@ -95,9 +94,9 @@ class Surroundings(eqx.Module):
         axis = jnp.asarray(grid.axis, jnp.result_type(float))
         return on_tensor_grid(lambda x: self.distance(x) < 0, axis)
 
-    def is_closed(self, poses: Pose, evidence: Evidence) -> Bool[Array, " poses"]:
-        """Whether a camera may not stand at each of a batch of poses, given what was seen."""
-        return self.violation(poses, evidence.cloud) > 0
+    def is_excluded(self, poses: Pose, cloud: PointCloud) -> Bool[Array, " poses"]:
+        """Whether a camera may not stand at each of a batch of poses, given the points D."""
+        return self.violation(poses, cloud) > 0
 
     def violation(self, poses: Pose, cloud: PointCloud) -> Float[Array, " poses"]:
         """By how much each of a batch of cameras is too near to an obstacle or to D, in scene units; zero where it is
