@@ -48,6 +48,19 @@ MODELS = ("screened", "paper")
 """The names of `SurfaceSampler.preset`."""
 
 
+class StepInputs(eqx.Module):
+    """What one step looks at, computed once.
+
+    - `observations`: what has been seen.
+    - `posterior`: p(f | observations); None where nothing asks for it.
+    - `surfaces`: S samples of it along a leading axis; None where nothing asks for them.
+    """
+
+    observations: Observations
+    posterior: SurfacePosterior | None = None
+    surfaces: GridSurface | None = None
+
+
 class SurfaceSampler(eqx.Module):
     """A distribution over surfaces, as a planner imagines them.
 
