@@ -26,7 +26,7 @@ from timing import least_time
 
 import jaxnbv as nbv
 from jaxnbv.networks import pretrained_classifier
-from jaxnbv.planning.episode import observe_scene
+from jaxnbv.planning.simulate import observe_scene
 from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.storage.folders import versions

@@ -101,23 +101,23 @@ def judge(
     observations: Observations,
     surfaces: GridSurface,
     truth: Truth,
-    seen_empty: Bool[AnyArray, "g g g"],
+    empty_nodes: Bool[AnyArray, "g g g"],
 ) -> Judgement:
     """How good `surfaces`, the planner's samples given the observations, are.
 
-    - `seen_empty`: the nodes that the scans have shown to be empty, whether the planner carves by them or not:
+    - `empty_nodes`: the nodes that the scans have shown to be empty, whether the planner carves by them or not:
       all planners are judged on the same nodes, those inside the volume that are not seen empty.
 
     **Raises:** `ValueError` if the truth is on another grid, or there are fewer than two samples.
     """
     shape = (planner.sampler.grid.resolution,) * 3
     require(
-        truth.inside.shape == seen_empty.shape == shape,
-        f"the truth is on {truth.inside.shape} nodes and the seen space on {seen_empty.shape}, but the planner's grid "
+        truth.inside.shape == empty_nodes.shape == shape,
+        f"the truth is on {truth.inside.shape} nodes and the seen space on {empty_nodes.shape}, but the planner's grid "
         f"has {shape}: make both with the planner's grid",
     )
-    seen_empty = jnp.asarray(seen_empty)
-    judged = _judge(surfaces, observations.cloud, truth, seen_empty, planner.camera, planner.acquisition)
+    empty_nodes = jnp.asarray(empty_nodes)
+    judged = _judge(surfaces, observations.cloud, truth, empty_nodes, planner.camera, planner.acquisition)
     crps_depth, in_empty, inside, expected, true_values = (np.asarray(leaf) for leaf in judged)
     record = Judgement(
         crps=float(crps_depth),
@@ -127,7 +127,7 @@ def judge(
     )
     if not bool(truth.inside.any()):
         return record
-    unseen = np.asarray((_over_nodes(truth.volume, planner.sampler.grid) <= 0) & ~seen_empty)
+    unseen = np.asarray((_over_nodes(truth.volume, planner.sampler.grid) <= 0) & ~empty_nodes)
     forecast, happened = inside[unseen], np.asarray(truth.inside)[unseen]
     plain = brier(forecast, happened)
     return record._replace(

@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 import jaxnbv as nbv
 from jaxnbv.networks import pretrained_classifier
-from jaxnbv.planning.episode import observe_scene
+from jaxnbv.planning.simulate import observe_scene
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.storage import describe
 from jaxnbv.storage.folders import versions

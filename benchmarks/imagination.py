@@ -35,7 +35,7 @@ from tqdm import tqdm
 
 import jaxnbv as nbv
 from jaxnbv import surfaces as models
-from jaxnbv.planning.episode import observe_scene
+from jaxnbv.planning.simulate import observe_scene
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.storage import describe
 from jaxnbv.storage.files import write_whole
@@ -119,7 +119,7 @@ def random_views(scene: nbv.Surface, key: jax.Array) -> list[tuple[nbv.Pose, nbv
 @eqx.filter_jit
 def seen_space(scan: nbv.PointCloud, pose: nbv.Pose) -> jax.Array:
     """What one scan shows to be empty, by the default carving, for all models alike."""
-    return nbv.Carving().seen_empty(GRID, pose, scan, nbv.Camera())
+    return nbv.Carving().empty_nodes(GRID, pose, scan, nbv.Camera())
 
 
 def run(planner: nbv.Planner, views: list, truth: Truth, key: jax.Array, compiled: bool) -> list[dict]:

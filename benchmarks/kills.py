@@ -51,7 +51,7 @@ def take_session(folder: Path) -> None:
     )
     session = nbv.Session(camera, ((-0.12, -0.12, -0.12), (0.12, 0.12, 0.12)), planner, folder=folder)
     first = nbv.look_at((0.0, 0.1, 0.3))
-    while session.views < 4:
+    while len(session.views) < 4:
         matrix = np.asarray(session.next().matrix if session.views else first.matrix)
         pose = nbv.Pose.from_matrix(matrix)
         seen = nbv.scan(ball, camera, pose)

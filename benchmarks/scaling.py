@@ -19,7 +19,7 @@ import matplotlib.pyplot as plt
 from timing import least_time
 
 import jaxnbv as nbv
-from jaxnbv.planning.episode import observe_scene
+from jaxnbv.planning.simulate import observe_scene
 from jaxnbv.storage.files import write_text
 from jaxnbv.studies.scenes import demo_object
 

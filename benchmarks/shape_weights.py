@@ -16,7 +16,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from jaxnbv.planning.episode import view_keys
+from jaxnbv.planning.loop import view_keys
 from jaxnbv.storage.files import write_whole
 from jaxnbv.studies.classification.objects import HouseholdStudy, PyramidStudy, TruckStudy
 from jaxnbv.studies.classification.study import ClassificationStudy

@@ -25,12 +25,11 @@ from tqdm import tqdm
 import jaxnbv as nbv
 from jaxnbv.networks import part_segmenter, pretrained_classifier
 from jaxnbv.networks.categories import CATEGORIES
-from jaxnbv.planning.episode import view_keys
-from jaxnbv.planning.stopping import context
+from jaxnbv.planning.loop import view_keys
+from jaxnbv.planning.stopping import Covered, Found, Sure, context
 from jaxnbv.storage.files import write_text
 from jaxnbv.studies.engine.results import interval
 from jaxnbv.studies.scenes import Framing, Split, hidden_view, part_scene, pyramid_scene
-from jaxnbv.tasks import Covered, Found, Sure
 from jaxnbv.tasks.coverage import NewSurface, ShownArea
 
 SIDE = Framing.WHOLE.longest_side

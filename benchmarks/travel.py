@@ -18,7 +18,8 @@ import numpy as np
 from tqdm import tqdm
 
 import jaxnbv as nbv
-from jaxnbv.planning.episode import observe_scene, view_keys
+from jaxnbv.planning.loop import view_keys
+from jaxnbv.planning.simulate import observe_scene
 from jaxnbv.planning.travel import arc_length, total_cost
 from jaxnbv.scanning.metrics import coverage, truth_points
 from jaxnbv.storage.files import write_text

@@ -38,13 +38,13 @@ def main(folder: str = "live", views: int = 10) -> None:
     session = nbv.Session(camera, BOX, planner, up="z", folder=folder, until=nbv.Covered(0.9))
     first = np.asarray(nbv.look_at((0.0, -0.4, 0.4), (0.0, 0.0, 0.15), up=(0.0, 0.0, 1.0)).matrix)
     try:
-        while session.views < views and not session.done:
-            matrix = go_to(first if session.views == 0 else session.next().matrix)
+        while len(session.views) < views and not session.done():
+            matrix = go_to(first if len(session.views) == 0 else session.next().matrix)
             depth = np.asanyarray(pipeline.wait_for_frames().get_depth_frame().get_data())
             session.add(depth, matrix, depth_scale=scale)
     finally:
         pipeline.stop()
-    print(session.done or f"{views} images are taken", nbv.write_report(session.episode, folder))
+    print(session.done() or f"{views} images are taken", nbv.write_report(session.episode, folder))
 
 
 if __name__ == "__main__":

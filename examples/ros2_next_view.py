@@ -75,10 +75,10 @@ class Bridge:
             return "there is no image yet"
         depth, scale = image_of(self.latest)
         self.session.add(depth, matrix_of(self.lookup(self.latest.header.stamp)), depth_scale=scale)
-        if self.session.done:
-            return f"done: {self.session.done}"
+        if self.session.done():
+            return f"done: {self.session.done()}"
         self.publish(self.session.next().matrix)
-        return f"{self.session.views} images"
+        return f"{self.len(session.views)} images"
 
 
 def main() -> None:

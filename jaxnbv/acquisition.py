@@ -19,19 +19,22 @@ from jaxtyping import Array, Float
 from jaxnbv.checks import InputError, check_fields, checked, functions_of_users, is_traced, require, shown
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import GridSurface, Surface, scan
 from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.sharding import batched_map, on_cpu, share_of, shared, shared_map
 
+_POWERS = {1: "", 2: "²", 3: "³"}
+
 
 class Quantity(eqx.Module):
     """The name, unit and meaning of what is maximised, for tables and captions.
 
-    - `name`, `unit`: in words; the unit is empty where there is none.
+    - `name`, `unit`: in words; the unit is empty where there is none, and leaves out the power of length.
     - `meaning`: the rest of a caption that begins with "Value:".
     - `smooth`: whether values between two candidates mean anything.
-    - `length_power`: of length that it is, 2 for an area; a session says it in world units.
+    - `length_power`: power of length in the unit (2 for an area).
     """
 
     name: str
@@ -39,6 +42,11 @@ class Quantity(eqx.Module):
     meaning: str
     smooth: bool = True
     length_power: int = 0
+
+    def unit_in(self, frame: Frame) -> str:
+        """The whole unit in words, lengths in the units of a frame's world."""
+        length = f"{frame.unit}{_POWERS.get(self.length_power, f'^{self.length_power}')}" if self.length_power else ""
+        return f"{length} {self.unit}".strip()
 
 
 class Answer(eqx.Module):

@@ -1,19 +1,18 @@
-"""What has been seen: the points that are kept, where they were seen from, and the space that was seen empty."""
+"""What has been observed: the points that are kept, the poses that were taken, and which space is empty."""
 
 import dataclasses
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.checks import check_type
-from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud, check_single, concatenate, limit_capacity
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.scanning.grid import Grid
+from jaxnbv.geometry.pose_list import PoseList
+from jaxnbv.scanning import Carving, Grid, Obstacles
 
 # A model takes a hundred or two of the empty points, and the time to choose them grows with how many there are.
 _POINTS_ALONG_AXIS = 20
@@ -27,63 +26,93 @@ class EmptyPoints(NamedTuple):
 
 
 class Observations(eqx.Module):
-    """What has been seen, in scene coordinates. Immutable and of fixed shapes, so that nothing recompiles as it grows.
+    """What has been observed, in scene coordinates. Immutable and of fixed shapes, so that nothing recompiles.
 
     - `cloud`: D, the points that are kept.
-    - `poses`: the views taken in the first `num_views` rows; the others hold the identity.
-    - `seen_empty`: the nodes of `grid` that a scan has shown to be empty; both are None where that is not kept.
+    - `poses`: the poses that views were taken from.
+    - `grid`: of the two below; None where neither is kept.
+    - `empty_nodes`: the nodes that a scan has shown to be empty.
+    - `obstacle_nodes`: the nodes within known obstacles, where the object cannot be.
     """
 
     cloud: PointCloud
-    poses: Pose
-    num_views: Int[Array, ""]
-    seen_empty: Bool[Array, "g g g"] | None = None
+    poses: PoseList
     grid: Grid | None = None
+    empty_nodes: Bool[Array, "g g g"] | None = None
+    obstacle_nodes: Bool[Array, "g g g"] | None = None
 
     @classmethod
-    def of(cls, seen: "Observations | PointCloud") -> "Observations":
-        """Observations as it is; a cloud alone as observations of no known pose.
-
-        **Raises:** `ValueError` for anything else.
-        """
-        check_type(seen, Observations | PointCloud, "the observations")
-        return seen if isinstance(seen, Observations) else cls.before_views(seen, 0, None)
-
-    @classmethod
-    def before_views(cls, cloud: PointCloud, max_views: int, grid: Grid | None) -> "Observations":
-        """D before any pose is known, with room for so many views.
-
-        - `grid`: on whose nodes empty space is kept; None where it is not.
-        """
-        dtype = jnp.result_type(float)
-        poses = Pose(np.tile(np.eye(3, dtype=dtype), (max_views, 1, 1)), np.zeros((max_views, 3), dtype))
+    def start(
+        cls,
+        cloud: PointCloud,
+        max_views: int = 0,
+        grid: Grid | None = None,
+        obstacle_nodes: Bool[Array, "g g g"] | None = None,
+    ) -> "Observations":
+        """A cloud before any pose is added, with room for `max_views` poses. No node of the grid is empty yet."""
         empty = None if grid is None else jnp.zeros((grid.resolution,) * 3, bool)
-        return cls(cloud, poses, jnp.asarray(0, jnp.int32), empty, grid)
+        return cls(cloud, PoseList.empty(max_views), grid, empty, obstacle_nodes)
 
     @property
-    def max_views(self) -> int:
-        """How many views there is room for."""
-        return self.poses.position.shape[0]
-
-    @property
-    def last_pose(self) -> Pose:
-        """The pose of the last view; the identity where there is none."""
-        return jax.tree.map(lambda rows: rows[self.num_views - 1], self.poses)
+    def num_views(self) -> Int[Array, ""]:
+        """How many poses were taken."""
+        return self.poses.count
 
     @property
     def empty_points(self) -> EmptyPoints:
-        """The nodes seen empty, of every few along each axis, for a model to condition on."""
-        if self.seen_empty is None or self.grid is None:
+        """The empty nodes, of every few along each axis, for a model to condition on."""
+        if self.empty_nodes is None or self.grid is None:
             return EmptyPoints(jnp.zeros((1, 3), self.cloud.points.dtype), jnp.zeros(1, bool))
         stride = -(-self.grid.resolution // _POINTS_ALONG_AXIS)
         axis = jnp.asarray(self.grid.axis, jnp.result_type(float))[::stride]
         nodes = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-        return EmptyPoints(nodes, self.seen_empty[::stride, ::stride, ::stride].reshape(-1))
+        return EmptyPoints(nodes, self.empty_nodes[::stride, ::stride, ::stride].reshape(-1))
 
-    def with_visited(self, poses: Sequence[Pose]) -> "Observations":
-        """The same, with these poses taken for visited too. It has room for twice as many, so that its shapes do not
-        depend on how many they are."""
-        room, count = jax.tree.map(lambda rows: jnp.concatenate([rows, rows]), self.poses), self.num_views
-        for pose in poses:
-            room, count = jax.tree.map(lambda rows, row, at=count: rows.at[at].set(row), room, pose), count + 1
-        return dataclasses.replace(self, poses=room, num_views=count)
+    def add_points(self, scan: PointCloud) -> "Observations":
+        """The observations with a scan's points in D, which is thinned to its capacity by farthest point sampling."""
+        return dataclasses.replace(self, cloud=_joined(self.cloud, scan))
+
+    def add_view(
+        self, pose: Pose, scan: PointCloud, camera: Camera, carving: Carving | None, obstacles: Obstacles | None
+    ) -> "Observations":
+        """The observations with a pose, and the nodes that the scan from there shows to be empty.
+
+        - `carving`: how far from its rays a scan shows a node to be empty; None keeps `empty_nodes` as they are.
+        - `obstacles`: what stands before the object; beyond it a ray shows nothing.
+        """
+        poses, empty = _with_view(self.poses, self.empty_nodes, self.grid, pose, scan, camera, carving, obstacles)
+        return dataclasses.replace(self, poses=poses, empty_nodes=empty)
+
+
+def as_observations(value: Observations | PointCloud) -> Observations:
+    """Observations as they are; a cloud alone as observations from no pose.
+
+    **Raises:** `ValueError` for anything else, and for a batch of clouds.
+    """
+    check_type(value, Observations | PointCloud, "the observations")
+    if isinstance(value, Observations):
+        return value
+    check_single(value)
+    return Observations.start(value)
+
+
+@eqx.filter_jit
+def _joined(cloud: PointCloud, scan: PointCloud) -> PointCloud:
+    return limit_capacity(concatenate(cloud, scan), cloud.capacity)
+
+
+@eqx.filter_jit
+def _with_view(
+    poses: PoseList,
+    empty: Bool[Array, "g g g"] | None,
+    grid: Grid | None,
+    pose: Pose,
+    scan: PointCloud,
+    camera: Camera,
+    carving: Carving | None,
+    obstacles: Obstacles | None,
+) -> tuple[PoseList, Bool[Array, "g g g"] | None]:
+    if carving is not None and empty is not None and grid is not None:
+        barrier = None if obstacles is None else obstacles.barrier(camera, pose)
+        empty = empty | carving.empty_nodes(grid, pose, scan, camera, barrier)
+    return poses.append(pose), empty

@@ -1,8 +1,4 @@
-"""What is imagined: the surfaces that are held possible given what has been seen.
-
-A `SurfaceSampler` is all that a sampled surface depends on but the observations: the model, the grid on which samples
-are evaluated, how many are drawn, what cuts them, and what stands around the object.
-"""
+"""The surfaces that are possible given the observations: p(f | D), and samples of it on a grid."""
 
 import dataclasses
 
@@ -10,24 +6,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.checks import InputError, check_fields, check_key, check_type, checked, is_traced, require, shown
-from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud, check_oriented, check_single, concatenate, limit_capacity
+from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
-from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box, Volume, bounding_box
-from jaxnbv.observations import Observations
-from jaxnbv.scanning import (
-    Carving,
-    Grid,
-    GridSurface,
-    Obstacles,
-    TriangleMesh,
-    carve,
-    scan_samples,
-)
+from jaxnbv.observations import Observations, as_observations
+from jaxnbv.scanning import Carving, Grid, GridSurface, TriangleMesh, carve
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.surfaces import (
     GeometricSPSR,
@@ -41,7 +27,6 @@ from jaxnbv.surfaces import (
     SurfaceModel,
     SurfacePosterior,
 )
-from jaxnbv.surfaces.base import HALF_WIDTH
 from jaxnbv.surfaces.known_shapes import short_ranged
 
 MODELS = ("screened", "paper")
@@ -62,16 +47,16 @@ class StepInputs(eqx.Module):
 
 
 class SurfaceSampler(eqx.Module):
-    """A distribution over surfaces, as a planner imagines them.
+    """A distribution over surfaces, and how it is sampled.
 
     - `model`: the prior over surfaces.
-    - `grid`: where samples are evaluated and scanned; empty space is known at its nodes.
+    - `grid`: where samples are evaluated and scanned; empty space is kept at its nodes.
     - `num_samples`: S, posterior samples a step.
-    - `carving`: what samples are cut by: space seen empty, on which the model is conditioned too where it can be, and
-      the outside of a volume. None leaves samples as the model draws them from D, which is the paper's own behaviour.
-    - `obstacles`: what stands around the object, hides it, and keeps cameras out; None for nothing.
+    - `carving`: what samples are cut by: empty space, on which the model is conditioned too where it can be, and the
+      outside of a volume. None leaves samples as the model draws them from D, which is the paper's own behaviour.
 
-    Observations is an `Observations` of the same grid, or a cloud alone.
+    No sample is inside a known obstacle, with carving or without. Observations are `Observations` of the same grid, or
+    a cloud alone.
 
     **Raises:** `ValueError` for no samples, or a grid beyond the torus [-pi, pi]^3.
     """
@@ -80,7 +65,6 @@ class SurfaceSampler(eqx.Module):
     grid: Grid = Grid()
     num_samples: int = eqx.field(static=True, default=16)
     carving: Carving | None = Carving()
-    obstacles: Obstacles | None = None
 
     def __check_init__(self):
         check_fields(self)
@@ -127,8 +111,8 @@ class SurfaceSampler(eqx.Module):
         return cls(ScreenedSPSR(base, values, offset=scale * usual.offset), carving=Carving(volume))
 
     def with_bank(self, bank: ShapeBank, poses: ShapePoses) -> "SurfaceSampler":
-        """The same of one who has seen these shapes before: `KnownShapes`, registered within the volume, with this
-        model as the answer to "none of these".
+        """A copy whose prior is a mixture over a bank: `KnownShapes`, registered within the volume. The present model
+        is its "none of these".
 
         - `poses`: how the shapes can stand in the scene.
         """
@@ -141,52 +125,27 @@ class SurfaceSampler(eqx.Module):
 
     @property
     def without_bank(self) -> "SurfaceSampler":
-        """The same without its known shapes, if it has any."""
+        """A copy whose prior has no bank."""
         return dataclasses.replace(self, model=self.model.unknown) if isinstance(self.model, KnownShapes) else self
 
     def within(self, volume: Box) -> "SurfaceSampler":
-        """The same for an object in another box: what holds for the default one, `Box()`, holds for this."""
+        """A copy for an object in another box, which takes the place of the default one, `Box()`."""
 
         def placed(leaf):
             return volume if isinstance(leaf, Box) and leaf == Box() else leaf
 
         return jax.tree.map(placed, self, is_leaf=lambda leaf: isinstance(leaf, Box))
 
-    def begin(self, cloud: PointCloud, capacity: int, max_views: int) -> Observations:
-        """A cloud as observations, before any pose is known.
-
-        - `capacity`: points of it that are kept, by farthest point sampling beyond it.
-        - `max_views`: for how many views there is room.
-        """
-        kept = limit_capacity(cloud, capacity)
-        return Observations.before_views(kept, max_views, None if self.carving is None else self.grid)
-
-    def observe(self, observations: Observations, pose: Pose, scan: PointCloud, camera: Camera) -> Observations:
-        """The observations after a scan from a pose: its points, where it was taken, and what it shows to be empty.
-
-        **Raises:** `ValueError` for observations of another grid.
-        """
-        known = self.known(observations)
-        known = dataclasses.replace(known, cloud=_joined(known.cloud, scan))
-        return _record(self.carving, self.obstacles, known, pose, scan, camera)
-
-    def record(self, observations: Observations, pose: Pose, scan: PointCloud, camera: Camera) -> Observations:
-        """The observations after a view whose points it holds already.
-
-        **Raises:** `ValueError` for observations of another grid.
-        """
-        return _record(self.carving, self.obstacles, self.known(observations), pose, scan, camera)
-
     def posterior(self, observations: Observations | PointCloud) -> SurfacePosterior:
-        """p(f | observations), of which `sample` draws before it carves. Space is known to be empty within the volume.
+        """p(f | observations), of which `sample` draws before it carves. Empty nodes count within the volume alone.
 
         **Raises:** `ValueError` as the model's `condition` does, and for observations of another grid.
         """
-        observations = self.known(observations)
-        if self.carving is None or observations.seen_empty is None:
+        observations = self.adapt(observations)
+        if self.carving is None or observations.empty_nodes is None:
             return self.model.condition(observations)
-        inside = observations.seen_empty & self.carving.inside(self.grid)
-        return self.model.condition(dataclasses.replace(observations, seen_empty=inside))
+        inside = observations.empty_nodes & self.carving.inside(self.grid)
+        return self.model.condition(dataclasses.replace(observations, empty_nodes=inside))
 
     def sample(
         self, observations: Observations | PointCloud, key: PRNGKeyArray, posterior: SurfacePosterior | None = None
@@ -199,7 +158,7 @@ class SurfaceSampler(eqx.Module):
         """
         check_key(key)
         check_type(posterior, SurfacePosterior | None, "the posterior")
-        observations = self.known(observations)
+        observations = self.adapt(observations)
         # On its own, so that whoever asks for the posterior too compiles it once.
         posterior = self.posterior(observations) if posterior is None else posterior
         surfaces = _sample(self, observations, key, posterior)
@@ -211,21 +170,30 @@ class SurfaceSampler(eqx.Module):
             )
         return surfaces
 
+    def step_inputs(self, observations: Observations | PointCloud, key: PRNGKeyArray) -> StepInputs:
+        """The observations, their posterior and S samples of it.
+
+        **Raises:** `ValueError` as `sample` does.
+        """
+        observations = self.adapt(observations)
+        posterior = self.posterior(observations)
+        return StepInputs(observations, posterior, self.sample(observations, key, posterior))
+
     def carve(
         self, observations: Observations | PointCloud, values: Float[Array, "*s g g g"]
     ) -> Float[Array, "*s g g g"]:
-        """Values of f minus its level at the grid's nodes, made positive where the object cannot be: in space that was
-        seen empty, outside its volume, and within obstacles.
+        """Values of f minus its level at the grid's nodes, made positive where the object cannot be: at empty nodes,
+        outside its volume, and within obstacles.
 
         **Raises:** `ValueError` if the values or the observations are of another grid.
         """
-        observations, nodes = self.known(observations), (self.grid.resolution,) * 3
+        observations, nodes = self.adapt(observations), (self.grid.resolution,) * 3
         require(jnp.shape(values)[-3:] == nodes, f"the values are {shown(values)}, but the grid has {nodes} nodes")
-        if self.carving is None or observations.seen_empty is None:
-            return values
-        elsewhere = observations.seen_empty | self.carving.outside(self.grid)
-        around = self.obstacles
-        return carve(values, elsewhere if around is None else elsewhere | around.within(self.grid))
+        excluded = observations.obstacle_nodes
+        if self.carving is not None and observations.empty_nodes is not None:
+            elsewhere = observations.empty_nodes | self.carving.outside(self.grid)
+            excluded = elsewhere if excluded is None else elsewhere | excluded
+        return values if excluded is None else carve(values, excluded)
 
     def mean(
         self, observations: Observations | PointCloud, posterior: SurfacePosterior | None = None
@@ -267,79 +235,26 @@ class SurfaceSampler(eqx.Module):
             )
         return TriangleMesh(found[0], found[1], Frame())
 
-    def barrier(self, camera: Camera, poses: Pose) -> Float[Array, "*batch rays"] | None:
-        """How far along a camera's rays from a pose or a batch of them obstacles stand; None without any."""
-        return None if self.obstacles is None else self.obstacles.barrier(camera, poses)
+    def adapt(self, observations: Observations | PointCloud) -> Observations:
+        """The observations as this sampler uses them: without empty nodes where it does not carve; a cloud alone with
+        no node empty.
 
-    @eqx.filter_jit
-    def scan(self, surfaces: GridSurface, camera: Camera, poses: Pose) -> PointCloud:
-        """What the camera sees of each of s samples from each of p poses, past what stands around: clouds with leading
-        axes (s, p)."""
-        return scan_samples(surfaces, camera, poses, self.barrier(camera, poses))
-
-    def known(self, observations: Observations | PointCloud) -> Observations:
-        """The observations with what is known of its empty space: none of a cloud alone.
-
-        **Raises:** `ValueError` for observations of another grid, or without empty space where samples are carved.
+        **Raises:** `ValueError` for observations of another grid, or without a grid where samples are carved.
         """
+        grid = None if self.carving is None else self.grid
         if isinstance(observations, PointCloud):
-            check_single(observations)
-            return Observations.before_views(observations, 0, None if self.carving is None else self.grid)
-        check_type(observations, Observations, "the observations")
-        if self.carving is None:
-            return dataclasses.replace(observations, seen_empty=None, grid=None)
+            return Observations.start(as_observations(observations).cloud, grid=grid)
+        observations = as_observations(observations)
+        if observations.obstacle_nodes is not None:
+            grid = self.grid
+        elif grid is None:
+            observations = dataclasses.replace(observations, grid=None)
         require(
-            bool(observations.grid == self.grid),
+            bool(observations.grid == grid),
             f"the observations keep empty space on {observations.grid}, but surfaces are carved on {self.grid}: make "
             "them with the init of the planner that they are given to",
         )
-        return observations
-
-    def check(self, pose: Pose | None, scan: PointCloud, camera: Camera, first: bool) -> None:
-        """**Raises:** `ValueError` for a scan that `Planner.init` refuses, or `Planner.observe` if it is not the
-        first."""
-        for value, hint, name in ((scan, PointCloud, "scan"), (pose, Pose | None, "pose"), (camera, Camera, "camera")):
-            check_type(value, hint, f"the {name}")
-        check_single(scan, "the scan")
-        require(pose is None or pose.position.ndim == 1, "the pose is a batch of poses: give one, poses[0] say")
-        if is_traced(scan, pose):
-            return
-        # Within jit too, values of what is not traced are known.
-        with jax.ensure_compile_time_eval():
-            if first or bool(scan.mask.any()):
-                check_oriented(scan, "the first scan" if first else "the scan", min(self.grid.half_extent, HALF_WIDTH))
-            require(
-                pose is None or scan.missed is None or scan.capacity == camera.num_rays,
-                f"the scan has {scan.capacity} rays but the camera {camera.height} x {camera.width}: give the camera "
-                "that took it, as observe(state, pose, scan, camera), and the pose that it was taken from",
-            )
-            if self.carving is not None:
-                self.carving.check_inside(scan, self.grid)
-
-
-# What is compiled takes what it uses: another model does not compile these again.
-
-
-@eqx.filter_jit
-def _joined(cloud: PointCloud, scan: PointCloud) -> PointCloud:
-    return limit_capacity(concatenate(cloud, scan), cloud.capacity)
-
-
-@eqx.filter_jit
-def _record(
-    carving: Carving | None,
-    obstacles: Obstacles | None,
-    observations: Observations,
-    pose: Pose,
-    scan: PointCloud,
-    camera: Camera,
-) -> Observations:
-    poses = jax.tree.map(lambda rows, row: rows.at[observations.num_views].set(row), observations.poses, pose)
-    empty: Bool[Array, "g g g"] | None = observations.seen_empty
-    if carving is not None and empty is not None and observations.grid is not None:
-        barrier = None if obstacles is None else obstacles.barrier(camera, pose)
-        empty = empty | carving.seen_empty(observations.grid, pose, scan, camera, barrier)
-    return dataclasses.replace(observations, poses=poses, num_views=observations.num_views + 1, seen_empty=empty)
+        return observations if self.carving is not None else dataclasses.replace(observations, empty_nodes=None)
 
 
 @eqx.filter_jit

@@ -93,14 +93,19 @@ class BallsModel(nbv.SurfaceModel):
         return BallsPosterior(jnp.asarray(0.3))
 
 
-def balls(carving=nbv.Carving(), obstacles=None):  # noqa: B008
-    return nbv.SurfaceSampler(BallsModel(), GRID, len(RADII), carving, obstacles)
+def balls(carving=nbv.Carving()):  # noqa: B008
+    return nbv.SurfaceSampler(BallsModel(), GRID, len(RADII), carving)
 
 
-def seen(sampler):
+def planner_of(sampler, obstacles=None):
+    search = nbv.FarthestView(6)
+    return nbv.Planner(nbv.Coverage(), search, CAMERA, sampler, obstacles=obstacles, capacity=200, max_views=4)
+
+
+def seen(sampler, obstacles=None):
     """The observations after both scans."""
-    observations = sampler.record(sampler.begin(SCANS[0], 200, 4), POSES[0], SCANS[0], CAMERA)
-    return sampler.observe(observations, POSES[1], SCANS[1], CAMERA)
+    planner = planner_of(sampler, obstacles)
+    return planner.observe(planner.init(POSES[0], SCANS[0]), POSES[1], SCANS[1])
 
 
 def test_the_probability_is_the_share_of_the_samples_that_hold_a_node():
@@ -114,12 +119,18 @@ def test_the_probability_is_the_share_of_the_samples_that_hold_a_node():
     )
 
 
-@pytest.mark.parametrize("obstacles", [None, nbv.Obstacles((nbv.sdf.HalfSpace([0.0, -0.3, 0.0], [0.0, 1.0, 0.0]),))])
-def test_nothing_is_imagined_where_the_object_cannot_be(obstacles):
-    sampler = balls(obstacles=obstacles)
-    observations = seen(sampler)
-    below = np.asarray(GRID.axis)[None, :, None] < (-np.inf if obstacles is None else -0.3)
-    nowhere = np.asarray(observations.seen_empty) | np.asarray(sampler.carving.outside(GRID)) | below
+TABLE = nbv.Obstacles((nbv.sdf.HalfSpace([0.0, -0.3, 0.0], [0.0, 1.0, 0.0]),))
+
+
+@pytest.mark.parametrize(("obstacles", "carving"), [(None, nbv.Carving()), (TABLE, nbv.Carving()), (TABLE, None)])
+def test_nothing_is_imagined_where_the_object_cannot_be(obstacles, carving):
+    """Within obstacles, with carving or without."""
+    sampler = balls(carving)
+    observations = seen(sampler, obstacles)
+    nowhere = np.asarray(GRID.axis)[None, :, None] < (-np.inf if obstacles is None else -0.3)
+    if carving is not None:
+        nowhere = nowhere | np.asarray(observations.empty_nodes) | np.asarray(carving.outside(GRID))
+    nowhere = np.broadcast_to(nowhere, SHARE.shape)
     assert (nowhere & (SHARE > 0)).sum() > 50
     np.testing.assert_allclose(sampler.probability_inside(observations), np.where(nowhere, 0.0, SHARE), atol=1e-6)
     values, mean = np.asarray(sampler.sample(observations, KEY).values), np.asarray(sampler.mean(observations))
@@ -141,15 +152,14 @@ def test_a_posterior_at_hand_is_not_asked_for_again():
 
 def test_scans_of_samples_end_at_the_surroundings():
     wall = nbv.Obstacles((nbv.sdf.Cuboid([0.1, 1.0, 1.0]).translate([1.4, 0.0, -0.5]),))
-    sampler = balls(obstacles=wall)
-    surfaces = sampler.sample(SCANS[0], KEY)
-    found = sampler.scan(surfaces, CAMERA, POSES)
-    free, expected = (nbv.scan_samples(surfaces, CAMERA, POSES, b) for b in (None, wall.barrier(CAMERA, POSES)))
-    np.testing.assert_array_equal(found.mask, expected.mask)
-    np.testing.assert_allclose(found.points, expected.points, atol=1e-5)
-    assert found.mask[:, 0].any()
+    surfaces = balls().sample(SCANS[0], KEY)
+    free, ended = (nbv.scan_samples(surfaces, CAMERA, POSES, b) for b in (None, wall.barrier(CAMERA, POSES)))
+    assert ended.mask[:, 0].any()
     assert free.mask[:, 1].any()
-    assert not found.mask[:, 1].any()
+    assert not ended.mask[:, 1].any()
+    depth = [planner_of(balls(), around).expected_depth(surfaces, POSES[1]) for around in (None, wall)]
+    assert np.isfinite(depth[0]).any()
+    assert not np.isfinite(depth[1]).any()
 
 
 def test_another_box_takes_the_place_of_the_default_one_alone():
@@ -176,15 +186,14 @@ def test_another_box_takes_the_place_of_the_default_one_alone():
 def test_evidence_of_another_grid_is_refused(made_by):
     own, observations, fits = balls(), seen(made_by), seen(balls())
     for use in (
-        own.known,
+        own.adapt,
         own.posterior,
         lambda observations: own.sample(observations, KEY),
         lambda observations: own.carve(observations, jnp.zeros((26,) * 3)),
         own.mean,
         own.probability_inside,
         own.mean_mesh,
-        lambda observations: own.observe(observations, POSES[1], SCANS[1], CAMERA),
-        lambda observations: own.record(observations, POSES[1], SCANS[1], CAMERA),
+        lambda observations: planner_of(own).observe(observations, POSES[1], SCANS[1]),
     ):
         with pytest.raises(nbv.InputError, match=r"surfaces are carved on Grid\(resolution=26, half_extent=1\.6\)"):
             use(observations)
@@ -192,23 +201,17 @@ def test_evidence_of_another_grid_is_refused(made_by):
 
 
 def test_where_nothing_is_carved_evidence_of_any_grid_will_do():
-    known = balls(None).known(seen(balls()))
-    assert known.seen_empty is None
+    known = balls(None).adapt(seen(balls()))
+    assert known.empty_nodes is None
     np.testing.assert_array_equal(known.cloud.points, seen(balls()).cloud.points)
 
 
 @pytest.mark.parametrize("carving", [None, nbv.Carving()])
-def test_evidence_is_that_of_a_planner(carving):
-    sampler = balls(carving)
-    planner = nbv.Planner(nbv.Coverage(), nbv.FarthestView(6), CAMERA, sampler, capacity=200, max_views=4)
-    observations = planner.observe(planner.init(POSES[0], SCANS[0]), POSES[1], SCANS[1])
-    found = seen(sampler)
-    assert eqx.tree_equal(found, observations)
-    assert int(found.num_views) == 2
-    assert int(found.cloud.count) == 200
-    begun = sampler.begin(SCANS[0], 200, 4)
-    assert eqx.tree_equal(begun, planner.init(None, SCANS[0]))
-    assert eqx.tree_equal(sampler.known(SCANS[0]), nbv.Observations.before_views(SCANS[0], 0, carving and GRID))
+def test_a_cloud_alone_is_from_no_pose_and_shows_nothing_to_be_empty(carving):
+    alone = balls(carving).adapt(SCANS[0])
+    assert eqx.tree_equal(alone, nbv.Observations.start(SCANS[0], 0, carving and GRID))
+    assert int(alone.num_views) == 0
+    assert carving is None or not alone.empty_nodes.any()
 
 
 def test_values_of_another_grid_are_refused():

@@ -6,7 +6,7 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxnbv.acquisition import Answer
-from jaxnbv.planning.episode import View
+from jaxnbv.planning.loop import View
 from jaxnbv.planning.planner import Planner
 from jaxnbv.viz.answers import label_of, number, words_of
 

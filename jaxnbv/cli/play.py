@@ -25,9 +25,11 @@ from jaxnbv.cli.options import Asked, Position
 from jaxnbv.cli.registry import STOPS
 from jaxnbv.cli.tasks import Shown
 from jaxnbv.geometry.pose import Pose, look_at
-from jaxnbv.planning.episode import Episode, Step, simulate
+from jaxnbv.planning.episode import Episode
+from jaxnbv.planning.loop import Step
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.stopping import Budget, ValueBelow
+from jaxnbv.planning.simulate import simulate
+from jaxnbv.planning.stopping import Budget, Covered, Found, StopRule, Sure, ValueBelow
 from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, Surface, TriangleMesh
 from jaxnbv.scanning.sensors import Setting
@@ -35,7 +37,7 @@ from jaxnbv.search import Search, SphereCandidates, TieBreakSearch
 from jaxnbv.studies.engine import searches
 from jaxnbv.studies.scenes.banks import KINDS, bank_poses, shape_bank
 from jaxnbv.surfaces import ShapeBank, Upright
-from jaxnbv.tasks import Coverage, Covered, Found, StopRule, Sure
+from jaxnbv.tasks import Coverage
 from jaxnbv.viz.task import race_words
 
 

@@ -64,6 +64,16 @@ class Frame(eqx.Module):
         return cls(longest_side / extent, (x, y, z), up)
 
     @property
+    def unit(self) -> str:
+        """What a length in the world is counted in: scene units, where the world is the scene."""
+        identity = self.scale == 1.0 and self.center == (0.0, 0.0, 0.0) and self.up == "y"
+        return "scene units" if identity else "world units"
+
+    def length_to_world(self, length: Float[AnyArray, "*n"] | float, power: int = 1):
+        """A length, area or volume (by its power of length) from scene units to world units."""
+        return length / self.scale**power
+
+    @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
         """R, from directions of the world to those of the scene."""
         return np.array(_UP[self.up], np.float64)

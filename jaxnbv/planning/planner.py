@@ -11,13 +11,15 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxnbv.acquisition import Acquisition, Quantity, as_acquisition
 from jaxnbv.checks import check_fields, check_key, check_type, functions_of_users, is_traced, require
 from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.cloud import PointCloud, check_oriented, check_single, limit_capacity
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.pose_list import PoseList
 from jaxnbv.observations import Observations
 from jaxnbv.planning.travel import ValuePerCost
-from jaxnbv.sampler import SurfaceSampler
-from jaxnbv.scanning import GridSurface, mean_depth
+from jaxnbv.sampler import StepInputs, SurfaceSampler
+from jaxnbv.scanning import GridSurface, Obstacles, barrier_of, mean_depth, scan_samples
 from jaxnbv.search import DiscreteSearch, Problem, Proposal, Search
+from jaxnbv.surfaces.base import HALF_WIDTH
 
 # Functions are converted on the way in, which mypy cannot see.
 if TYPE_CHECKING:
@@ -32,13 +34,14 @@ class Planner(eqx.Module):
     - `acquisition`: what a view is worth. A plain function of a cloud is taken as a utility to improve.
     - `search`: how the pose that is expected to be worth most is found.
     - `camera`: the sensor whose scans are imagined.
-    - `sampler`: the surfaces that are held possible given the observations.
+    - `sampler`: the surfaces that are possible given the observations.
     - `cost`: of going from the last view to the next; None where it does not count.
+    - `obstacles`: what stands around the object, hides it, and keeps cameras out; None for nothing.
     - `capacity`: points of D that are kept, by farthest point sampling beyond it.
     - `max_views`: views for which observations have room.
 
     All methods are pure and run under `jit`. A planner compiles at its first two views, and nothing after them.
-    A cloud alone, of no known pose, is observations too.
+    A cloud alone, from no pose, counts as observations too.
 
     **Raises:** `ValueError` for numbers below one, and if the search cannot work with the acquisition or the camera: a
     gradient search with an acquisition that JAX cannot differentiate, say.
@@ -49,6 +52,7 @@ class Planner(eqx.Module):
     camera: Camera = Camera()
     sampler: SurfaceSampler = eqx.field(default_factory=SurfaceSampler)
     cost: ValuePerCost | None = None
+    obstacles: Obstacles | None = None
     capacity: int = eqx.field(static=True, default=8192)
     max_views: int = eqx.field(static=True, default=32)
 
@@ -71,7 +75,7 @@ class Planner(eqx.Module):
         return value if self.cost is None else self.cost.quantity(value)
 
     def init(self, pose: Pose | None, scan: PointCloud, camera: Camera | None = None) -> Observations:
-        """The observations after a first scan, in scene coordinates, taken from `pose` (None where it is not known).
+        """The observations after a first scan, in scene coordinates, taken from `pose` (None for a cloud from no pose).
 
         `camera`: the one that took the scan, by default the planner's.
 
@@ -83,91 +87,117 @@ class Planner(eqx.Module):
         another camera; and as the acquisition's `check` does.
         """
         camera = camera or self.camera
-        self.sampler.check(pose, scan, camera, first=True)
-        observations = self.sampler.begin(scan, self.capacity, self.max_views)
+        self._check(pose, scan, camera, first=True)
+        grid = self.sampler.grid
+        within = None if self.obstacles is None else self.obstacles.within(grid)
+        kept = None if within is None and self.sampler.carving is None else grid
+        observations = Observations.start(limit_capacity(scan, self.capacity), self.max_views, kept, within)
         if self.search.uses_samples and not is_traced(observations):
             self.acquisition.check(observations.cloud)
             self.sampler.model.check(observations.cloud)
-        return observations if pose is None else self.sampler.record(observations, pose, scan, camera)
-
-    def propose(self, observations: Observations | PointCloud, key: PRNGKeyArray) -> Proposal:
-        """Ask: the pose to take next, and what the search looked at.
-
-        **Raises:** `ValueError` if every candidate has been visited, and for a cloud as `init` does.
-        """
-        check_key(key)
-        observations = self._known(observations)
-        sample_key, search_key = jax.random.split(key)
-        return self.choose(observations, self.sample(observations, sample_key), search_key)
-
-    def sample(self, observations: Observations, key: PRNGKeyArray) -> GridSurface | None:
-        """The first half of `propose`: the step's samples; None for a search that asks for none."""
-        return self.sampler.sample(observations, key) if self.search.uses_samples else None
-
-    def choose(self, observations: Observations, surfaces: GridSurface | None, key: PRNGKeyArray) -> Proposal:
-        """The second half of `propose`: the search, given the step's samples (any that a model of your own drew).
-
-        **Raises:** `ValueError` if every candidate has been visited, or a score is not finite.
-        """
-        check_key(key)
-        check_type(observations, Observations, "the observations")
-        check_type(surfaces, GridSurface | None, "the surfaces")
-        with functions_of_users():
-            proposal = _propose(self.search, self._problem(observations, surfaces), key)
-        return _checked_proposal(proposal, surfaces)
+        return observations if pose is None else self._with_view(observations, pose, scan, camera)
 
     def observe(
         self, observations: Observations | PointCloud, pose: Pose, scan: PointCloud, camera: Camera | None = None
     ) -> Observations:
-        """Tell: the observations after a scan (scene coordinates) from a pose. A scan that saw nothing adds no points.
+        """Tell: the observations after a scan (scene coordinates) from a pose. A scan that hit nothing adds no points.
 
         `camera`: the one that took the scan, by default the planner's. Scans of one capacity and camera share one
         compilation.
 
-        **Raises:** `ValueError` for a scan as `init` does, for observations of another grid, or if it has no room for
+        **Raises:** `ValueError` for a scan as `init` does, for observations of another grid, or without room for
         another view.
         """
-        camera, observations = camera or self.camera, self._known(observations)
+        camera, observations = camera or self.camera, self._as_observations(observations)
         check_type(pose, Pose, "the pose")
-        self.sampler.check(pose, scan, camera, first=False)
+        self._check(pose, scan, camera, first=False)
         if not is_traced(observations.num_views):
-            views, room = int(observations.num_views), observations.max_views
+            views, room = int(observations.num_views), observations.poses.room
             require(
                 views < room,
                 f"the observations hold {views} views and have room for no more: make it with a planner of "
                 f"Planner(max_views=...) greater than {room}",
             )
-        after = self.sampler.observe(observations, pose, scan, camera)
+        after = self._with_view(observations.add_points(scan), pose, scan, camera)
         if self.search.uses_samples and not is_traced(after):
             self.sampler.grid.check(after.cloud)
         return after
 
-    def replay(
-        self, views: Iterable[tuple[Pose, PointCloud] | tuple[Pose, PointCloud, Camera | None]]
-    ) -> Iterator[Observations]:
+    def replay(self, views: Iterable[tuple[Pose, PointCloud]], camera: Camera | None = None) -> Iterator[Observations]:
         """The observations after each of some views, poses and scans: `init` with the first, then `observe`, and
-        raises as these do. A third says which camera took a scan."""
+        raises as these do. `camera` took the scans."""
         observations = None
-        for view in views:
-            observations = self.init(*view) if observations is None else self.observe(observations, *view)
+        for pose, scan in views:
+            after = (pose, scan, camera)
+            observations = self.init(*after) if observations is None else self.observe(observations, *after)
             yield observations
+
+    def propose(
+        self, observations: Observations | PointCloud, key: PRNGKeyArray, pending: PoseList | None = None
+    ) -> Proposal:
+        """Ask: the pose to take next, and what the search looked at.
+
+        - `pending`: poses that were proposed before and not taken, which are not proposed again.
+
+        **Raises:** `ValueError` if every candidate has been visited, and for a cloud as `init` does.
+        """
+        check_key(key)
+        sample_key, search_key = jax.random.split(key)
+        return self.choose(self.step_inputs(observations, sample_key), search_key, pending)
+
+    def step_inputs(self, observations: Observations | PointCloud, key: PRNGKeyArray) -> StepInputs:
+        """The first half of `propose`: the posterior and its samples; the observations alone for a search that asks for
+        no samples."""
+        observations = self._as_observations(observations)
+        return self.sampler.step_inputs(observations, key) if self.search.uses_samples else StepInputs(observations)
+
+    def choose(self, inputs: StepInputs, key: PRNGKeyArray, pending: PoseList | None = None) -> Proposal:
+        """The second half of `propose`: the search, given the step's samples (any that a model of your own drew).
+
+        **Raises:** `ValueError` if every candidate has been visited, or a score is not finite.
+        """
+        check_key(key)
+        check_type(inputs, StepInputs, "the inputs of a step")
+        with functions_of_users():
+            problem = Problem(inputs, self.camera, self.acquisition, self.obstacles, self.cost, pending).prepared()
+            proposal = _propose(self.search, problem, key)
+        return _checked_proposal(proposal, inputs.surfaces)
 
     @eqx.filter_jit
     def expected_depth(self, surfaces: GridSurface, pose: Pose) -> Float[Array, "h w"]:
         """The depth image that is expected from a pose: `mean_depth` over the samples, by the planner's camera."""
-        scans = self.sampler.scan(surfaces, self.camera, pose[None])
+        scans = scan_samples(surfaces, self.camera, pose[None], barrier_of(self.obstacles, self.camera, pose[None]))
         depth = mean_depth(jax.tree.map(lambda rows: rows[:, 0], scans), pose)
         return depth.reshape(self.camera.height, self.camera.width)
 
-    def _problem(self, observations: Observations, surfaces: GridSurface | None) -> Problem:
-        """What the search is asked. The acquisition's context is a program of its own, which `init` has compiled."""
-        around = self.sampler.obstacles
-        return Problem(observations, self.camera, self.acquisition, surfaces, around, self.cost).prepared()
+    def _with_view(self, observations: Observations, pose: Pose, scan: PointCloud, camera: Camera) -> Observations:
+        return observations.add_view(pose, scan, camera, self.sampler.carving, self.obstacles)
 
-    def _known(self, observations: Observations | PointCloud) -> Observations:
-        return (
-            self.init(None, observations) if isinstance(observations, PointCloud) else self.sampler.known(observations)
-        )
+    def _as_observations(self, observations: Observations | PointCloud) -> Observations:
+        if isinstance(observations, PointCloud):
+            return self.init(None, observations)
+        return self.sampler.adapt(observations)
+
+    def _check(self, pose: Pose | None, scan: PointCloud, camera: Camera, first: bool) -> None:
+        """**Raises:** `ValueError` for a scan that `init` refuses, or `observe` if it is not the first."""
+        for value, hint, name in ((scan, PointCloud, "scan"), (pose, Pose | None, "pose"), (camera, Camera, "camera")):
+            check_type(value, hint, f"the {name}")
+        check_single(scan, "the scan")
+        require(pose is None or pose.position.ndim == 1, "the pose is a batch of poses: give one, poses[0] say")
+        if is_traced(scan, pose):
+            return
+        # Within jit too, values of what is not traced are known.
+        with jax.ensure_compile_time_eval():
+            if first or bool(scan.mask.any()):
+                name = "the first scan" if first else "the scan"
+                check_oriented(scan, name, min(self.sampler.grid.half_extent, HALF_WIDTH))
+            require(
+                pose is None or scan.missed is None or scan.capacity == camera.num_rays,
+                f"the scan has {scan.capacity} rays but the camera {camera.height} x {camera.width}: give the camera "
+                "that took it, as observe(state, pose, scan, camera), and the pose that it was taken from",
+            )
+            if self.sampler.carving is not None:
+                self.sampler.carving.check_inside(scan, self.sampler.grid)
 
 
 @eqx.filter_jit

@@ -1,17 +1,18 @@
 """A live session: depth images of a real sensor in, where to take the next one out, in the user's own world."""
 
+import dataclasses
+import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray, Real
 
-from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, checked, require
+from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, checked, require, shown
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.depth_image import NothingInside
@@ -19,17 +20,20 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 from jaxnbv.observations import Observations
-from jaxnbv.planning.episode import STAGES, Episode, View, view_keys
-from jaxnbv.planning.placing import box_of, on_support, placed, stride_of, usual_planner
+from jaxnbv.planning.episode import Episode
+from jaxnbv.planning.loop import STAGES, Loop, View
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.stopping import Watch
+from jaxnbv.planning.stopping import StopRule
+from jaxnbv.planning.table import plane_under
 from jaxnbv.progress import progress_bar
-from jaxnbv.scanning import Obstacles, plane_under
-from jaxnbv.search import Proposal
+from jaxnbv.scanning import Obstacles
+from jaxnbv.search import HalvingSearch, Proposal
 from jaxnbv.storage import RunFolder, describe
-from jaxnbv.tasks import StopRule
+from jaxnbv.tasks import NewSurface
 
 _NO_IMAGE = "the session has no image yet: add one first, session.add(depth, matrix)"
+# A cloud holds some thousands of points; more rays than these only take time.
+_MOST_RAYS = 20_000
 
 
 class NextView(eqx.Module):
@@ -37,7 +41,7 @@ class NextView(eqx.Module):
 
     - `matrix`: camera to world, in the convention of the session.
     - `value`: what the search maximises, a length or an area in world units; `standard_error`: of the value, as a mean
-      over the posterior samples; None where it is not known.
+      over the posterior samples; None for a search that draws none.
     - `expected_depth`: what the sensor is expected to see there, in world units and at the planner's resolution: the
       mean depth over the posterior samples, NaN where most of them are missed; None without samples.
     - `proposal`: all that the search looked at, in scene coordinates.
@@ -51,18 +55,19 @@ class NextView(eqx.Module):
 
 
 class Session:
-    """A planner at a real sensor. Matrices are 4 x 4, camera to world, in world units; so is the box. Of an image every
-    so many-th row and column is used, such that 20,000 rays are left or fewer; whole images are kept.
+    """The loop at a real sensor. Matrices are 4 x 4, camera to world, in world units; so is the box. Rules of stopping,
+    costs and values are in world units too. Rows and columns of an image are left out evenly, so that 20,000 rays are
+    left or fewer; whole images are kept.
 
     - `camera`: the sensor, its range in world units.
     - `box`: two corners of a box about the object, without the table.
     - `planner`: in scene coordinates, as for a simulation. The scene is the box, scaled; the planner's camera is
-      replaced by the sensor's with the planner's number of pixels, and what it holds for the default volume, `Box()`,
-      by the box. By default it looks for `NewSurface`, by a `HalvingSearch` with 24 x 32 rays, and keeps 2,000 points.
+      replaced by the sensor's with the planner's number of pixels, and the default volume, `Box()`, by the box. By
+      default it looks for `NewSurface`, by a `HalvingSearch` with 24 x 32 rays, and keeps 2,000 points.
     - `up`: the world's axis that is upward, "y" or "z" say.
-    - `obstacles`: what stands around the object, in world units: `Obstacles((table,), margin=0.005)`, say. By
-      default the plane that the object stands on is looked for in the first image, told of by a warning, and taken for
-      a table: left out of the cloud, and no place for a camera. `Obstacles()` says that there is none.
+    - `obstacles`: what stands around the object, in world units: `Obstacles((table,), margin=0.005)`, say. By default
+      the plane that the object stands on is looked for in the first image, named in a warning, and taken for a table:
+      left out of the cloud, and no place for a camera. `Obstacles()` says that there is none.
     - `poses`: (n, 4, 4), where the sensor can be held; by default the candidates of the planner's search, in scene
       units about the box's centre, and of a whole sphere the upper half: what is below may be the table.
     - `folder`: where images and proposals are kept before they are acted on; a session that was killed goes on from it.
@@ -90,50 +95,48 @@ class Session:
         obstacles: Obstacles | None = None,
         progress: bool = True,
     ):
-        self.camera, self.convention = camera, convention
-        self.box = box_of(box)
-        self.frame = Frame.fit(np.array([self.box.low, self.box.high]), up=up)
-        self.stride, self.progress = stride_of(camera), progress
-        self.key = jax.random.key(0) if key is None else key
+        self.camera, self.box, self.convention = camera, _box_of(box), convention
+        self.key, self.until, self.progress = jax.random.key(0) if key is None else key, until, progress
         check_key(self.key)
-        allowed = None if poses is None else self.frame.to_scene(Pose.from_matrix(poses, convention))
-        sensor, volume = self.frame.to_scene(camera), self.frame.to_scene(self.box)
-        around = None if obstacles is None else obstacles.in_scene(self.frame)
-        self.planner = placed(usual_planner() if planner is None else planner, sensor, volume, allowed, around)
-        self._rays = self.frame.to_scene(camera.strided(self.stride))
-        self._watch, self._asked_at = None if until is None else Watch(until, self.planner.acquisition), 0
-        self._views: list[View] = []
-        self._proposals: dict[int, Proposal] = {}
+        self.frame = Frame.fit(np.array([self.box.low, self.box.high]), up=up)
+        self.stride = stride_of(camera)
+        planner = usual_planner() if planner is None else planner
+        matrices = None if poses is None else as_numbers(poses, "the poses", np.float64)
+        self._bar = progress_bar(total=2, wanted=False)
+        self._loop = self._loop_of(self._placed(planner, matrices, obstacles))
         self._next: NextView | None = None
-        self._evidence: Observations | None = None
-        self._folder = None if folder is None else RunFolder(folder, "session", self._config())
-        if self._folder is not None:
-            for index in range(self._folder.count("image")):
-                if self._folder.file("proposal", index).exists():
-                    self._proposals[index] = self._folder.read("proposal", index)["proposal"]
-                image = self._folder.read("image", index)
-                self._take(*self._looked(image["depth"], image["matrix"], float(image["depth_scale"])))
+        self._folder: RunFolder | None = None
+        if folder is not None:
+            # What a session is made of, as it was given: `load` makes it again from these.
+            config = {"camera": camera, "box": self.box, "planner": planner, "up": up, "poses": matrices}
+            config |= {"convention": convention, "key": self.key, "obstacles": obstacles}
+            self._folder = RunFolder(folder, "session", describe(config))
+            self._read(self._folder)
 
     def __repr__(self) -> str:
-        images = f"{self.views} image{'s' * (self.views != 1)}"
+        images = f"{len(self.views)} image{'s' * (len(self.views) != 1)}"
         kept = f", {int(self.observations.cloud.count):,} points" if self.views else ""
-        asked = ", the next view proposed" if self.next_view else ""
-        return f"Session({self.planner.quantity.name}: {images}{kept}{asked})"
+        proposed = ", the next view proposed" if self.next_view else ""
+        return f"Session({self.planner.quantity.name}: {images}{kept}{proposed})"
 
     @property
-    def views(self) -> int:
-        """How many images there are so far."""
-        return len(self._views)
+    def planner(self) -> Planner:
+        """The planner at this sensor and box, in scene coordinates."""
+        return self._loop.planner
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """The images so far, as views of an episode: in scene coordinates."""
+        return self._loop.views
 
     @property
     def observations(self) -> Observations:
-        """What the planner knows, in scene coordinates.
+        """The planner's observations, in scene coordinates.
 
         **Raises:** `ValueError` before the first image.
         """
-        if self._evidence is None:
-            raise InputError(_NO_IMAGE)
-        return self._evidence
+        require(len(self.views) > 0, _NO_IMAGE)
+        return self._loop.observations
 
     @property
     def cloud(self) -> PointCloud:
@@ -145,29 +148,22 @@ class Session:
 
     @property
     def episode(self) -> Episode:
-        """The session so far, in scene coordinates, as of a simulation.
+        """The session so far, as an episode: in scene coordinates, and with the frame in which it is shown.
 
         **Raises:** `ValueError` before the first image.
         """
-        require(self.views > 0, _NO_IMAGE)
-        return Episode(self.planner, None, None, self._views[0].pose, self.key, tuple(self._views))
+        require(len(self.views) > 0, _NO_IMAGE)
+        loop, first = self._loop, self.views[0].pose
+        return Episode(loop.planner, None, None, first, loop.key, loop.views, None, loop.camera, self.frame)
 
-    @property
     def done(self) -> str | None:
-        """Why no more images are needed, by the rule that was given; None while they are. Asked once an image.
+        """Why no more images are needed, by the rule that was given; None while they are. Asked once an image, and
+        nothing is stored: the samples and the proposal that a rule asks for are those that `next` gives.
 
         **Raises:** `ValueError` as `next` does, if the rule is about what comes next.
         """
-        if self._watch is None or not self._views:
-            return None
-        if self._asked_at < self.views:
-            key, *_ = view_keys(self.key, self.views)
-            poses = [view.pose for view in self._views]
-            known = self.planner, self.observations, poses, key
-            if not self._watch.ends(*known) and self._watch.rule.needs_proposal:
-                self._watch.ends(*known, self.next().proposal)
-            self._asked_at = self.views
-        return self._watch.reason
+        with self._planning():
+            return self._loop.enough()
 
     @checked
     def add(
@@ -188,11 +184,8 @@ class Session:
         """
         pixels = as_numbers(depth, "the depth image", None)
         place = as_numbers(matrix, "the matrix of a pose", np.float64)
-        look = self._looked(pixels, place, depth_scale)
         with self._alone() as folder:
-            if folder is not None:
-                folder.write("image", self.views, depth=pixels, matrix=place, depth_scale=depth_scale)
-        self._take(*look)
+            self._add(pixels, place, depth_scale, folder)
 
     def next(self) -> NextView:
         """Where to take the next image. It is stored, and the same until an image is added; what was proposed once is
@@ -202,20 +195,25 @@ class Session:
         **Raises:** `ValueError` before the first image, as `Planner.propose` does, or if another process has added
         images to the folder.
         """
+        require(len(self.views) > 0, _NO_IMAGE)
         if self._next is None:
-            index = self.views
-            with self._alone() as folder:
+            index = len(self.views)
+            with self._alone() as folder, self._planning():
                 if folder is not None and folder.file("proposal", index).exists():
-                    found = folder.read("proposal", index)
+                    stored = folder.read("proposal", index)
+                    self._loop.resume(stored["proposal"])
+                    self._next = self._next_of(stored["proposal"], stored.get("expected_depth"))
                 else:
-                    found = self._propose()
+                    proposal, expected = self._loop.propose(), None
+                    if (surfaces := self._loop.inputs().surfaces) is not None:
+                        expected = self.frame.length_to_world(
+                            np.asarray(self.planner.expected_depth(surfaces, proposal.pose))
+                        )
+                    next_view = self._next_of(proposal, expected)
+                    _warn_of_little(next_view)
                     if folder is not None:
-                        folder.write("proposal", index, **found)
-            self._proposals[index] = proposal = found["proposal"]
-            matrix = np.asarray(self.frame.to_world(proposal.pose).to_matrix(self.convention), np.float64)
-            unit, error = self.frame.scale**self.planner.quantity.length_power, proposal.standard_error
-            value, error = float(proposal.value) / unit, None if error is None else error / unit
-            self._next = NextView(matrix, value, error, found.get("expected_depth"), proposal)
+                        folder.write("proposal", index, proposal=proposal, expected_depth=expected)
+                    self._next = next_view
         return self._next
 
     @property
@@ -223,55 +221,95 @@ class Session:
         """What `next` gave since the last image; None where it was not asked yet."""
         return self._next
 
-    def _config(self) -> dict:
-        sensor = {"camera": self.camera, "box": self.box, "up": self.frame.up, "convention": self.convention}
-        return describe({**sensor, "key": self.key, "planner": self.planner})
+    def _placed(self, planner: Planner, matrices: np.ndarray | None, obstacles: Obstacles | None) -> Planner:
+        """The planner at this sensor and box, in scene coordinates."""
+        sampler, search = planner.sampler.within(self.frame.to_scene(self.box)), planner.search
+        if matrices is None:
+            search = search.above()
+        else:
+            search = search.among(self.frame.to_scene(Pose.from_matrix(matrices, self.convention)))
+        rows, columns = planner.camera.height, planner.camera.width
+        return dataclasses.replace(
+            planner,
+            search=search,
+            camera=self.frame.to_scene(self.camera).resized(rows, columns),
+            sampler=sampler,
+            cost=None if planner.cost is None else planner.cost.in_world(self.frame),
+            obstacles=planner.obstacles if obstacles is None else obstacles.in_scene(self.frame),
+        )
 
-    def _looked(
-        self, depth: Real[np.ndarray, "h w"], matrix: Float[np.ndarray, "4 4"], depth_scale: float
-    ) -> tuple[Planner, View, Observations]:
-        """An image as a view, and what is known after it; nothing of the session is changed. The first may show what
-        the object stands on, by which the planner is another."""
-        pose, planner, rays = Pose.from_matrix(matrix, self.convention), self.planner, self._rays
-        shown = depth, self.camera, pose, depth_scale, self.stride
+    def _loop_of(self, planner: Planner) -> Loop:
+        rays = self.frame.to_scene(self.camera.strided(self.stride))
+        return Loop(planner, self.key, self.until, self.frame, rays, begin=self._show)
+
+    def _add(self, depth: np.ndarray, matrix: np.ndarray, scale: float, folder: RunFolder | None) -> None:
+        """An image as a view, stored in the folder once the loop accepts it. The first may show what the object stands
+        on, by which the planner is another."""
+        index, pose, loop = len(self.views), Pose.from_matrix(matrix, self.convention), self._loop
+        image = depth, self.camera, pose, scale, self.stride
         with warnings.catch_warnings():
-            if not self._views:
+            if index == 0:
                 warnings.simplefilter("error", NothingInside)
             try:
-                cloud = PointCloud.from_depth(*shown, self.box)
+                cloud = PointCloud.from_depth(*image, self.box)
             except NothingInside as problem:
                 raise InputError(f"the first image shows nothing of the box: {problem}") from problem
-        if not self._views and planner.sampler.obstacles is None:
-            whole = self.frame.to_scene(PointCloud.from_depth(*shown))
-            planner = on_support(planner, plane_under(whole, self.frame.to_scene(self.box)), self.frame)
+        if index == 0 and loop.planner.obstacles is None:
+            loop = self._loop_of(self._on_table(PointCloud.from_depth(*image)))
         scan = self.frame.to_scene(cloud)
-        if (around := planner.sampler.obstacles) is not None:
-            scan = around.remove_points(scan)
-        told = self.frame.to_scene(pose), scan, rays
-        observations = planner.init(*told) if self._evidence is None else planner.observe(self._evidence, *told)
-        return planner, View(told[0], scan, observations.cloud, self._proposals.get(self.views), rays), observations
+        if (obstacles := loop.planner.obstacles) is not None:
+            scan = obstacles.remove_points(scan)
 
-    def _take(self, planner: Planner, view: View, observations: Observations) -> None:
-        self.planner, self._evidence = planner, observations
-        self._views.append(view)
-        self._next = None
+        def store() -> None:
+            if folder is not None:
+                folder.write("image", index, depth=depth, matrix=matrix, depth_scale=scale)
 
-    def _propose(self) -> dict[str, Any]:
-        """The next proposal, and the depth image that is expected there, in world units."""
-        sample_key, search_key, _ = view_keys(self.key, self.views)
-        proposed = [proposal.pose for index, proposal in sorted(self._proposals.items()) if index < self.views]
-        expected = None
-        with progress_bar(total=2, wanted=self.progress) as bar:
-            bar.set_description(f"view {self.views + 1}, {STAGES[0]}")
-            surfaces = jax.block_until_ready(self.planner.sample(self.observations, sample_key))
-            bar.update()
-            bar.set_description(f"view {self.views + 1}, {STAGES[1]}")
-            proposal = self.planner.choose(self.observations.with_visited(proposed), surfaces, search_key)
-            if surfaces is not None:
-                expected = np.asarray(self.planner.expected_depth(surfaces, proposal.pose)) / self.frame.scale
-            bar.update()
-        _warn_of_little(proposal)
-        return {"proposal": proposal, "expected_depth": expected}
+        loop.add(self.frame.to_scene(pose), scan, accepted=store)
+        self._loop, self._next = loop, None
+
+    def _read(self, folder: RunFolder) -> None:
+        """The images and proposals of the folder."""
+        for index in range(folder.count("image")):
+            if index and folder.file("proposal", index).exists():
+                self._loop.resume(folder.read("proposal", index)["proposal"])
+            image = folder.read("image", index)
+            self._add(image["depth"], image["matrix"], float(image["depth_scale"]), None)
+
+    def _on_table(self, cloud: PointCloud) -> Planner:
+        """The planner with the plane that the object stands on among its obstacles, named by a warning; with obstacles
+        that hold nothing but the points of D, if there is no plane.
+
+        - `cloud`: the whole first image, in world units.
+        """
+        plane = plane_under(self.frame.to_scene(cloud), self.frame.to_scene(self.box))
+        if plane is not None:
+            place = np.round(self.frame.to_world(np.asarray(plane.point, np.float64)), 4).tolist()
+            warnings.warn(
+                f"the object stands on a plane through {place}, which goes on beyond the box: it is taken for a table "
+                "and left out. Give obstacles=Obstacles() to keep it",
+                stacklevel=5,
+            )
+        return dataclasses.replace(self.planner, obstacles=Obstacles(() if plane is None else (plane,)))
+
+    def _next_of(self, proposal: Proposal, expected_depth: np.ndarray | None) -> NextView:
+        """A proposal in the user's world."""
+        matrix = np.asarray(self.frame.to_world(proposal.pose).to_matrix(self.convention), np.float64)
+        error = None
+        if proposal.standard_error is not None:
+            error = self._loop.in_world(proposal.standard_error)
+        return NextView(matrix, self._loop.in_world(proposal.value), error, expected_depth, proposal)
+
+    def _show(self, stage: str) -> None:
+        """The stage on the bar."""
+        self._bar.set_description(f"view {len(self.views) + 1}, {stage}")
+        self._bar.update(STAGES.index(stage) - self._bar.n)
+
+    @contextmanager
+    def _planning(self) -> Iterator[None]:
+        """While a bar shows the stages of planning."""
+        with progress_bar(total=2, wanted=self.progress) as self._bar:
+            yield
+            self._bar.update(2 - self._bar.n)
 
     @contextmanager
     def _alone(self) -> Iterator[RunFolder | None]:
@@ -283,18 +321,36 @@ class Session:
             yield None
             return
         with self._folder.writing():
-            found = self._folder.count("image")
+            stored = self._folder.count("image")
             require(
-                found == self.views,
-                f"{self._folder.path} holds {found} images, but this session knows {self.views}: another process has "
-                "added some; make the session again, which reads them",
+                stored == len(self.views),
+                f"{self._folder.path} holds {stored} images, but this session knows {len(self.views)}: another process "
+                "has added some; make the session again, which reads them",
             )
             yield self._folder
 
 
-def _warn_of_little(proposal: Proposal) -> None:
+def usual_planner() -> Planner:
+    """What a session plans by where nothing else is given."""
+    return Planner(NewSurface(), HalvingSearch(), Camera(height=24, width=32), capacity=2000)
+
+
+def stride_of(camera: Camera) -> int:
+    """The stride that leaves as many rays of an image as are worth their time."""
+    return math.ceil(math.sqrt(camera.num_rays / _MOST_RAYS))
+
+
+def _box_of(corners) -> Box:
+    """**Raises:** `ValueError` for what is neither a `Box` nor two corners."""
+    if isinstance(corners, Box):
+        return corners
+    require(np.shape(corners) == (2, 3), f"the box is {shown(corners)}; give two corners, (low, high), or a Box")
+    return Box(*(as_numbers(corner, "a corner of the box", np.float64).tolist() for corner in corners))
+
+
+def _warn_of_little(next_view: NextView) -> None:
     """A best view may be worth nothing: of candidates that look elsewhere, or once all has been seen."""
-    value, error = float(proposal.value), proposal.standard_error
+    value, error = next_view.value, next_view.standard_error
     if value <= (0.0 if error is None else 3.0 * error):
         sure = "" if error is None else f" ± {error:.2g}"
         warnings.warn(

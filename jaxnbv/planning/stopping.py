@@ -1,42 +1,281 @@
-"""When an episode is long enough, whatever it is for: its value, time and cost; and the watch over any rule."""
+"""When an episode is long enough: rules that a loop asks after each view, and about each view that is proposed.
 
-import time
-from collections.abc import Sequence
+Each says its `unit` and whether it `needs_proposal`. Rules are combined by `|`: the first that holds ends the episode.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import ClassVar
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from jaxnbv.acquisition import Acquisition
-from jaxnbv.checks import check_fields, require
+from jaxnbv.acquisition import Acquisition, expected_value
+from jaxnbv.checks import InputError, check_fields, check_type, require, shown
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.observations import Observations
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.travel import CostFunction, arc_length, total_cost
-from jaxnbv.search import CandidateSearch, Proposal, SphereCandidates
-from jaxnbv.tasks.stopping import StopContext, StopRule
+from jaxnbv.planning.travel import CostFunction, WorldCost, arc_length, total_cost
+from jaxnbv.scanning import GridSurface, barrier_of
+from jaxnbv.tasks.classification import ClassAcquisition
+from jaxnbv.tasks.coverage import NewSurface, ShownArea
+from jaxnbv.tasks.segmentation import PartAnswer
+
+
+@dataclasses.dataclass(frozen=True)
+class StopContext:
+    """An episode between two views, as a rule sees it.
+
+    - `planner`, `observations`: as of the next step, in scene coordinates.
+    - `poses`: that were taken, in scene coordinates.
+    - `seconds`: since the first view of this process.
+    - `key`: of the next step's samples; `surfaces` draws them, once for the rule and the search.
+    - `frame`: of the user's world, in whose units a value or a cost is given.
+    """
+
+    planner: Planner
+    observations: Observations
+    poses: tuple[Pose, ...]
+    seconds: float
+    key: PRNGKeyArray
+    surfaces: Callable[[], GridSurface]
+    frame: Frame
+
+    def cost(self, poses: tuple[Pose, ...], of: CostFunction) -> float:
+        """The cost of the way through some poses, by a function of poses in the user's world."""
+        return total_cost(poses, WorldCost(of, self.frame))
+
+
+class StopRule(eqx.Module):
+    """Says when no more views are needed: after a view, or about the next view before it is taken.
+
+    - `unit`: of the number that the rule is given, in words.
+    """
+
+    unit: ClassVar[str] = ""
+
+    @property
+    def needs_proposal(self) -> bool:
+        """Whether the rule is asked about the next view too."""
+        return type(self).before is not StopRule.before
+
+    def check(self, acquisition: Acquisition) -> None:
+        """Raise `ValueError` if the rule does not apply to this acquisition."""
+        return
+
+    def after(self, context: StopContext) -> str | None:
+        """Why the views so far are enough, in words; None to go on."""
+        return None
+
+    def before(self, context: StopContext, pose: Pose, value: float) -> str | None:
+        """Why the next view is not to be taken; None to go on.
+
+        - `pose`: of the proposal, in scene coordinates; `value`: its value in world units.
+        """
+        return None
+
+    def __or__(self, other: "StopRule") -> "StopRule":
+        check_type(other, StopRule, "a rule of stopping")
+        return AnyOf((self, other))
+
+
+class AnyOf(StopRule):
+    """The first of some rules that holds."""
+
+    rules: tuple[StopRule, ...]
+
+    @property
+    def needs_proposal(self) -> bool:
+        return any(rule.needs_proposal for rule in self.rules)
+
+    def check(self, acquisition: Acquisition) -> None:
+        for rule in self.rules:
+            rule.check(acquisition)
+
+    def after(self, context: StopContext) -> str | None:
+        return next(filter(None, (rule.after(context) for rule in self.rules)), None)
+
+    def before(self, context: StopContext, pose: Pose, value: float) -> str | None:
+        return next(filter(None, (rule.before(context, pose, value) for rule in self.rules)), None)
+
+
+class Sure(StopRule):
+    """Stop once the class is known: it has this probability given D, and given each of several random halves of D too,
+    since a single answer may be sure by chance.
+
+    - `probability`: within (0, 1).
+    - `num_resamplings`: how many halves are drawn.
+
+    **Raises:** `ValueError` for another probability or a negative number; of an acquisition without a classifier.
+    """
+
+    unit: ClassVar[str] = "probability"
+    probability: float = eqx.field(static=True, default=0.95)
+    num_resamplings: int = eqx.field(static=True, default=8)
+
+    def __check_init__(self):
+        check_fields(self)
+        require(0 < self.probability < 1, f"the probability is {self.probability}; it must lie within (0, 1)")
+        require(
+            self.num_resamplings >= 0, f"the number of resamplings is {self.num_resamplings}; it must not be negative"
+        )
+
+    def check(self, acquisition: Acquisition) -> None:
+        _of_classes(acquisition)
+
+    def after(self, context: StopContext) -> str | None:
+        acquisition, cloud = _of_classes(context.planner.acquisition), context.observations.cloud
+        answer = acquisition.answer(cloud)
+        best = int(np.argmax(answer.values))
+        least = float(answer.values[best])
+        for index in range(self.num_resamplings):
+            if least < self.probability:
+                return None
+            half = acquisition.answer(half_of(cloud, jax.random.fold_in(context.key, index)))
+            least = min(least, float(half.values[best]))
+        if least < self.probability:
+            return None
+        halves = f", and at least {100 * least:.0f} % given half of the points" if self.num_resamplings else ""
+        return f"sure of {answer.names[best]} ({100 * float(answer.values[best]):.0f} %{halves})"
+
+
+def _of_classes(acquisition: Acquisition) -> ClassAcquisition:
+    if not isinstance(acquisition, ClassAcquisition):
+        raise InputError(
+            f"Sure is about a class, but {type(acquisition).__name__} has no classifier: use CrossEntropy or "
+            "MixedEntropy, or another rule"
+        )
+    return acquisition
+
+
+@jax.jit
+def half_of(cloud: PointCloud, key: PRNGKeyArray) -> PointCloud:
+    """Each of a cloud's points with probability one half."""
+    kept = cloud.mask & jax.random.bernoulli(key, 0.5, cloud.mask.shape)
+    points, normals = (jnp.where(kept[:, None], rows, 0.0) for rows in (cloud.points, cloud.normals))
+    return PointCloud(points, normals, kept)
+
+
+class Found(StopRule):
+    """Stop once all parts are found.
+
+    - `points`: a part is found once so many points are predicted to be of it.
+    - `parts`: names of those to be found; by default all that the segmenter is asked for, of which the object may lack
+      one.
+
+    **Raises:** `ValueError` for a number of points below one; of an acquisition without a segmenter, or whose
+    segmenter does not know a part.
+    """
+
+    unit: ClassVar[str] = "points"
+    points: int = eqx.field(static=True, default=60)
+    parts: tuple[str, ...] | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        check_fields(self)
+        require(self.points >= 1, f"a part is found by {self.points} points; give at least 1")
+        names = isinstance(self.parts, tuple) and all(isinstance(name, str) for name in self.parts)
+        require(self.parts is None or names, f"the parts are {shown(self.parts)}; give a tuple of their names")
+
+    def check(self, acquisition: Acquisition) -> None:
+        segmenter = getattr(getattr(acquisition, "utility", None), "segmenter", None)
+        require(
+            segmenter is not None,
+            f"Found is about parts, but {type(acquisition).__name__} has no segmenter: use the utility "
+            "SoftPartCount, or another rule",
+        )
+        known = getattr(segmenter, "part_names", None)
+        names = () if known is None else tuple(known.values())
+        require(
+            bool(self.parts or names),
+            "the segmenter does not name the parts that it is asked for: give Found(parts=...), 'part 0' and so on",
+        )
+        unknown = [name for name in self.parts or () if names and name not in names]
+        require(not unknown, f"the segmenter knows no part {unknown[:1]}: give some of {', '.join(names)}")
+
+    def after(self, context: StopContext) -> str | None:
+        answer = context.planner.acquisition.answer(context.observations.cloud)
+        if not isinstance(answer, PartAnswer):
+            raise InputError("the acquisition's answer tells no parts")
+        found = dict(zip(answer.names, answer.values.tolist(), strict=True))
+        wanted = self.parts or tuple(answer.names[index] for index in answer.asked)
+        if any(found.get(name, 0) < self.points for name in wanted):
+            return None
+        return f"all of {len(wanted)} parts are found, by {self.points} points or more"
+
+
+class Covered(StopRule):
+    """Stop once this share of what the candidates can show is expected to have been seen: of the area that they would
+    show of the sampled surfaces, the part that is not new to `NewSurface`.
+
+    - `share`: within (0, 1].
+    - `size`: of `NewSurface`, in scene units.
+
+    **Raises:** `ValueError` for another share, or a size that is not positive.
+    """
+
+    unit: ClassVar[str] = "share"
+    share: float = eqx.field(static=True, default=0.98)
+    size: float = eqx.field(static=True, default=0.05)
+
+    def __check_init__(self):
+        check_fields(self)
+        require(0 < self.share <= 1, f"the share is {self.share}; it must lie within (0, 1]")
+        NewSurface(self.size)
+
+    def after(self, context: StopContext) -> str | None:
+        covered = expected_coverage(context, self.size)
+        return f"{100 * covered:.1f} % of what can be seen is expected to be covered" if covered >= self.share else None
+
+
+def expected_coverage(context: StopContext, size: float = 0.05) -> float:
+    """Share of the area that the camera would see of the posterior's surfaces, from all candidates, that is not new.
+
+    - `size`: of `NewSurface`, in scene units.
+    """
+    planner = context.planner
+    poses = planner.search.poses_around()
+    barrier = barrier_of(planner.obstacles, planner.camera, poses)
+    where = context.observations.cloud, context.surfaces(), planner.camera, poses, barrier
+    new, shown = np.asarray(_values(ShownArea(NewSurface(size)), *where)).sum(axis=0)
+    return 1.0 - float(new / shown) if shown else 1.0
+
+
+_values = eqx.filter_jit(expected_value)
 
 
 class ValueBelow(StopRule):
-    """Stop once the best view's value is less than this, in the units of what the search maximises."""
+    """Stop once the best view's value is less than this: in the units of what the search maximises, lengths in world
+    units in a session and in scene units in a simulation."""
 
+    unit: ClassVar[str] = "value"
     value: float = eqx.field(static=True)
 
     def __check_init__(self):
         check_fields(self)
 
     def before(self, context: StopContext, pose: Pose, value: float) -> str | None:
-        return f"the best view has a value of {value:.3g}, less than {self.value:.3g}" if value < self.value else None
+        if value >= self.value:
+            return None
+        unit = context.planner.quantity.unit_in(context.frame)
+        return f"the best view has a value of {value:.3g} {unit}".rstrip() + f", less than {self.value:.3g}"
 
 
 class Budget(StopRule):
     """Stop when time is up, or when the next view would cost more than is left.
 
     - `seconds`: of this process, since its first view; the view that is under way is finished.
-    - `cost`: of the whole way through all views, by the function `of`.
+    - `cost`: of the whole way through all views, by the function `of`: of poses in the world in a session.
 
     **Raises:** `ValueError` for neither, or one that is not positive.
     """
 
+    unit: ClassVar[str] = "seconds, or cost"
     seconds: float | None = eqx.field(static=True, default=None)
     cost: float | None = eqx.field(static=True, default=None)
     of: CostFunction = eqx.field(static=True, default=arc_length)
@@ -59,46 +298,8 @@ class Budget(StopRule):
     def before(self, context: StopContext, pose: Pose, value: float) -> str | None:
         if self.cost is None:
             return None
-        left = self.cost - total_cost(context.poses, self.of)
-        asked = total_cost((context.poses[-1], pose), self.of)
-        return (
-            f"the next view would cost {asked:.3g}, but {left:.3g} of {self.cost:g} are left" if asked > left else None
-        )
-
-
-class Watch:
-    """A rule that is asked as an episode goes on; `reason` is why it ends.
-
-    **Raises:** `ValueError` if the rule cannot hold of what views are for.
-    """
-
-    def __init__(self, rule: StopRule, acquisition: Acquisition):
-        rule.check(acquisition)
-        self.rule, self.began = rule, time.monotonic()
-        self.reason: str | None = None
-
-    def ends(
-        self,
-        planner: Planner,
-        observations: Observations,
-        poses: Sequence[Pose],
-        key: PRNGKeyArray,
-        proposal: Proposal | None = None,
-    ) -> bool:
-        """Whether the views so far are enough or, once the next is proposed, it is not to be taken."""
-        known = context(planner, observations, poses, key, time.monotonic() - self.began)
-        if proposal is None:
-            self.reason = self.rule.after(known)
-        else:
-            self.reason = self.rule.before(known, proposal.pose, float(proposal.value))
-        return self.reason is not None
-
-
-def context(
-    planner: Planner, observations: Observations, poses: Sequence[Pose], key: PRNGKeyArray, seconds: float = 0.0
-) -> StopContext:
-    """What a rule is asked about."""
-    search = planner.search
-    candidates = search.candidates if isinstance(search, CandidateSearch) else SphereCandidates()
-    known = planner.acquisition, planner.camera, planner.sampler, candidates.poses()
-    return StopContext(*known, observations, tuple(poses), seconds, key)
+        left = self.cost - context.cost(context.poses, self.of)
+        next_cost = context.cost((context.poses[-1], pose), self.of)
+        if next_cost <= left:
+            return None
+        return f"the next view would cost {next_cost:.3g}, but {left:.3g} of {self.cost:g} are left"

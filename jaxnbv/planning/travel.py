@@ -1,5 +1,6 @@
 """What it costs to go from one view to the next, and how that counts against the value of a view."""
 
+import dataclasses
 import itertools
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
@@ -12,22 +13,35 @@ from jaxtyping import Array, Float
 
 from jaxnbv.acquisition import Quantity
 from jaxnbv.checks import as_numbers, check_fields, checked, require, shown
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.observations import Observations
 
 CostFunction: TypeAlias = Callable[[Pose, Pose], Float[Array, ""]]
-"""What it costs to go from one pose to another, in units of the user's: not negative, made of JAX operations."""
+"""What it costs to go from one pose to another, in units of the user's: not negative, made of JAX operations. A
+session's poses are in the world, a simulation's in the scene."""
 
 
-@checked
-@jax.jit
-def arc_length(start: Pose, end: Pose) -> Float[Array, ""]:
-    """Length of the way from one camera's place to another's about the origin, in scene units: of the great circle
-    where both are equally far from it, hypot(mean distance x angle, difference of distances) in general."""
-    first, second = start.position, end.position
-    radii = _norm(first), _norm(second)
-    angle = jnp.arctan2(_norm(jnp.cross(first, second)), jnp.sum(first * second))
-    return _norm(jnp.stack([0.5 * (radii[0] + radii[1]) * angle, radii[1] - radii[0]]))
+class ArcLength(eqx.Module):
+    """Length of the way from one camera's place to another's about a centre: of the great circle where both are equally
+    far from it, hypot(mean distance x angle, difference of distances) in general.
+
+    - `center`: by default the origin, where the object of a scene is.
+    """
+
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @checked
+    @jax.jit
+    def __call__(self, start: Pose, end: Pose) -> Float[Array, ""]:
+        """The length, in the units of the poses."""
+        first, second = (pose.position - jnp.asarray(self.center) for pose in (start, end))
+        radii = _norm(first), _norm(second)
+        angle = jnp.arctan2(_norm(jnp.cross(first, second)), jnp.sum(first * second))
+        return _norm(jnp.stack([0.5 * (radii[0] + radii[1]) * angle, radii[1] - radii[0]]))
+
+
+arc_length = ArcLength()
 
 
 def _norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
@@ -36,10 +50,28 @@ def _norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
     return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
 
 
+class WorldCost(eqx.Module):
+    """The cost in the world of going from one pose of the scene to another.
+
+    - `of`: a cost of poses in the world; an `ArcLength` about the scene's centre is one about the same place there.
+    """
+
+    of: CostFunction
+    frame: Frame
+
+    def __call__(self, start: Pose, end: Pose) -> Float[Array, ""]:
+        """The cost, in world units."""
+        of = self.of
+        if isinstance(of, ArcLength):
+            of = dataclasses.replace(of, center=tuple(self.frame.to_world(np.array(of.center)).tolist()))
+        return of(self.frame.to_world(start), self.frame.to_world(end))
+
+
 class ValuePerCost(eqx.Module):
     """How the cost of going to a view counts against its value: value / (fixed + cost).
 
-    - `of`: what it costs to go from one pose to another: `arc_length`, or a function of yours.
+    - `of`: what it costs to go from one pose to another: `arc_length`, or a function of yours. In a session it is given
+      poses in the world.
     - `fixed`: what every view costs wherever it is, such as the time that an image takes, in the units of `of`.
 
     **Raises:** `ValueError` if `fixed` is not positive.
@@ -55,18 +87,23 @@ class ValuePerCost(eqx.Module):
     def __call__(
         self, values: Float[Array, "*samples poses"], observations: Observations, poses: Pose
     ) -> Float[Array, "*samples poses"]:
-        """The values of poses, given the cost of going there from the last view, if there is one."""
-        cost = jax.vmap(lambda pose: self.of(observations.last_pose, pose))(poses)
+        """The values of poses, given the cost of going there from the last pose that was taken, if there is one."""
+        cost = jax.vmap(lambda pose: self.of(observations.poses.last, pose))(poses)
         real = isinstance(cost, Array) and not jnp.iscomplexobj(cost) and cost.shape == (len(poses.position),)
         require(real, f"the cost of going from one pose to another is {shown(cost)}: make it one number a pose")
         # A view is not chosen because its cost is wrong: the planner refuses what is not a number.
         cost = jnp.where((cost >= 0) & (cost < jnp.inf), cost, jnp.nan)
         return values / (self.fixed + jnp.where(observations.num_views > 0, cost, 0.0))
 
+    def in_world(self, frame: Frame) -> "ValuePerCost":
+        """The same for poses of a scene, where `of` is the cost of poses in the world."""
+        return dataclasses.replace(self, of=WorldCost(self.of, frame))
+
     def quantity(self, value: Quantity) -> Quantity:
         """What the weighed value is, where the value is this."""
         meaning = f"{value.meaning.rstrip('.')}, over the cost of going there."
-        return Quantity(f"{value.name} per cost", f"{value.unit or value.name} per unit of cost", meaning, value.smooth)
+        unit = f"{value.unit or ('' if value.length_power else value.name)} per unit of cost".lstrip()
+        return dataclasses.replace(value, name=f"{value.name} per cost", unit=unit, meaning=meaning)
 
 
 @checked

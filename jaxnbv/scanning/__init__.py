@@ -13,7 +13,7 @@ from jaxnbv.scanning.mesh_files import MeshParts as MeshParts
 from jaxnbv.scanning.mesh_files import load_mesh as load_mesh
 from jaxnbv.scanning.mesh_files import load_parts as load_parts
 from jaxnbv.scanning.obstacles import Obstacles as Obstacles
-from jaxnbv.scanning.obstacles import plane_under as plane_under
+from jaxnbv.scanning.obstacles import barrier_of as barrier_of
 from jaxnbv.scanning.scanner import DepthNoise as DepthNoise
 from jaxnbv.scanning.scanner import Hits as Hits
 from jaxnbv.scanning.scanner import Noise as Noise

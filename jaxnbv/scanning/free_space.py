@@ -54,7 +54,7 @@ class Carving(eqx.Module):
             f"the volume says {found} of two points; it must give one number a point",
         )
 
-    def seen_empty(
+    def empty_nodes(
         self,
         grid: Grid,
         pose: Pose,

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxnbv.acquisition import Acquisition, AcquisitionList, Quantity
+from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.search.candidates import Candidates, SphereCandidates, as_candidates
+from jaxnbv.search.candidates import Candidates, GivenPoses, SphereCandidates, as_candidates
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal
 
@@ -42,6 +43,24 @@ class Search(eqx.Module):
         """What the values of its proposals are: by default the acquisition's."""
         return acquisition.quantity
 
+    def poses_around(self) -> Pose:
+        """Poses all about the object, for questions about all that can be seen of it: by default the paper's."""
+        return SphereCandidates().poses()
+
+    def above(self) -> "Search":
+        """The search over the upper half of its poses, where these are the whole sphere."""
+        return self
+
+    def among(self, poses: Pose) -> "Search":
+        """The search over given poses (n,).
+
+        **Raises:** `ValueError` if the search does not choose among poses.
+        """
+        raise InputError(
+            f"poses were given, but {type(self).__name__} is no search over candidates: use DiscreteSearch() or "
+            "HalvingSearch()"
+        )
+
     @abstractmethod
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """The pose to take next; a pure function of its arguments, which runs under `jit`."""
@@ -57,6 +76,16 @@ class CandidateSearch(Search):
     """
 
     candidates: AnyCandidates = eqx.field(converter=as_candidates, default=SphereCandidates())
+
+    def poses_around(self) -> Pose:
+        """Its candidates."""
+        return self.candidates.poses()
+
+    def above(self) -> "CandidateSearch":
+        return dataclasses.replace(self, candidates=self.candidates.above())
+
+    def among(self, poses: Pose) -> "CandidateSearch":
+        return dataclasses.replace(self, candidates=GivenPoses(poses))
 
     def asks(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
         """The acquisitions whose scores it picks by; none for a search that does not look at them."""
@@ -117,8 +146,10 @@ def best_unvisited(
     found = Proposal(candidates[index], values[index], candidates, values)
     if scores is None:
         return found
-    of_differences = standard_error(scores - scores[:, index][:, None])
-    return dataclasses.replace(found, standard_errors=standard_error(scores), difference_errors=of_differences)
+    errors, of_differences = standard_error(scores), standard_error(scores - scores[:, index][:, None])
+    return dataclasses.replace(
+        found, standard_error=errors[index], standard_errors=errors, difference_errors=of_differences
+    )
 
 
 def first_best(values: Float[Array, " candidates"], tie: float = _TIE) -> Int[Array, ""]:
@@ -130,7 +161,7 @@ def first_best(values: Float[Array, " candidates"], tie: float = _TIE) -> Int[Ar
 
 
 def standard_error(scores: Float[Array, "samples *poses"]) -> Float[Array, "*poses"]:
-    """Of the means over the samples; NaN for a single one."""
+    """Standard error of the mean over samples; NaN for one sample."""
     count = scores.shape[0]
     squares = jnp.sum((scores - jnp.mean(scores, axis=0)) ** 2, axis=0)
     return jnp.sqrt(squares / (count - 1) / count) if count > 1 else jnp.full(scores.shape[1:], jnp.nan)

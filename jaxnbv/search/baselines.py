@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.acquisition import Acquisition, Quantity
-from jaxnbv.checks import InputError
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.search.base import Baseline
 from jaxnbv.search.problem import Problem
@@ -18,11 +17,11 @@ class FarthestView(Baseline):
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
         meaning = "distance from a candidate to the nearest camera so far; the surface is not looked at."
-        return Quantity("distance to the nearest camera", "scene units", meaning)
+        return Quantity("distance to the nearest camera", "", meaning, length_power=1)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
         """Values are distances in scene units; the key is not used."""
-        return problem.distance_to_visited(candidates)
+        return problem.observations.poses.distance(candidates)
 
 
 class RandomView(Baseline):
@@ -49,7 +48,7 @@ class UncertaintyView(Baseline):
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
         meaning = "length of the principal ray along which the posterior samples disagree whether it has hit."
-        return Quantity("uncertain length of the principal ray", "scene units", meaning)
+        return Quantity("uncertain length of the principal ray", "", meaning, length_power=1)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
         """Values are lengths in scene units; the key is not used."""
@@ -63,8 +62,6 @@ def uncertain_length(problem: Problem, poses: Pose) -> Float[Array, " poses"]:
     length zero.
     """
     surfaces = problem.surfaces
-    if surfaces is None:
-        raise InputError("the transmittance needs posterior samples: set uses_samples = True on the search")
     grid = surfaces.grid
     step = 0.5 * grid.spacing
     # Long enough to cross the grid from any camera outside it that looks at it, and from any inside.

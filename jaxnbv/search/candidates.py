@@ -31,6 +31,10 @@ class Candidates(eqx.Module):
     def poses(self) -> Pose:
         """The poses (count,), always the same ones."""
 
+    def above(self) -> "Candidates":
+        """The upper half of a whole sphere; any others as they are."""
+        return self
+
     def where(self, allowed: Callable[[Pose], Bool[AnyArray, ""] | bool]) -> "GivenPoses":
         """Those that a predicate of one pose allows: that a robot can reach, say.
 
@@ -72,9 +76,7 @@ class SphereCandidates(Candidates):
             f"the least elevation is {self.min_elevation} rad; it must lie within [-pi/2, pi/2)",
         )
 
-    @property
-    def upper_half(self) -> "SphereCandidates":
-        """Those above the origin, of a whole sphere; one with a least elevation stays as it is."""
+    def above(self) -> "SphereCandidates":
         return dataclasses.replace(self, min_elevation=0.0) if self.min_elevation == -0.5 * math.pi else self
 
     def poses(self) -> Pose:

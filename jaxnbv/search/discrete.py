@@ -59,4 +59,6 @@ class TieBreakSearch(CandidateSearch):
         # What is not a number is told of by the planner, whichever gave it.
         value = jnp.where(jnp.isnan(seconds[index]), jnp.nan, found.values[index])
         value = jnp.where(jnp.isfinite(found.value), value, found.value)
-        return dataclasses.replace(found, pose=candidates[index], value=value)
+        assert found.standard_errors is not None
+        error = found.standard_errors[index]
+        return dataclasses.replace(found, pose=candidates[index], value=value, standard_error=error)

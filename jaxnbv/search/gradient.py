@@ -16,7 +16,7 @@ from jaxnbv.acquisition import Acquisition, check_differentiable
 from jaxnbv.checks import check_fields, checked, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.search.base import Search, best_unvisited
+from jaxnbv.search.base import Search, best_unvisited, first_best, standard_error
 from jaxnbv.search.candidates import Candidates, as_candidates
 from jaxnbv.search.pose_space import FreePoses, PoseSpace, SpherePoses
 from jaxnbv.search.problem import Problem
@@ -117,25 +117,33 @@ class GradientSearch(Search):
         # Solvers that search along a line expect differences of order one.
         scale = jnp.max(values) - jnp.min(values)
         scale = jnp.where(scale > 0, scale, 1.0)
-        trajectories = jax.vmap(partial(self._walk, problem, scale))(candidates[order[: self.num_starts]])
+        starts = candidates[order[: self.num_starts]]
+        trajectories, errors = jax.vmap(partial(self._walk, problem, scale))(starts)
         found = best_unvisited(problem, candidates, values, tie=0.0, scores=scores)
         passed = best_unvisited(problem, *trajectories.flat, tie=0.0)
         # Whatever is not a number comes through, so that the planner can say so.
         better = ~(passed.value <= found.value)
-        pose, value = jax.tree.map(partial(jnp.where, better), *[(p.pose, p.value) for p in (passed, found)])
-        return dataclasses.replace(found, pose=pose, value=value, trajectories=trajectories)
+        # The rows of `passed` are those of the trajectories, turned as `flat` turns them.
+        passed = dataclasses.replace(passed, standard_error=errors.T.reshape(-1)[first_best(passed.values, tie=0.0)])
+        chosen = [(p.pose, p.value, p.standard_error) for p in (passed, found)]
+        pose, value, error = jax.tree.map(partial(jnp.where, better), *chosen)
+        return dataclasses.replace(found, pose=pose, value=value, standard_error=error, trajectories=trajectories)
 
-    def _walk(self, problem: Problem, scale: Float[Array, ""], start: Pose) -> Trajectories:
-        """Where the solver stood: every pose it evaluated or, of one that searches along a line, those it accepted."""
+    def _walk(
+        self, problem: Problem, scale: Float[Array, ""], start: Pose
+    ) -> tuple[Trajectories, Float[Array, " steps"]]:
+        """Where the solver stood (every pose that it evaluated; those that it accepted where it searches along a line),
+        and the standard errors of the values there."""
         solver = self.minimiser
 
         def loss(parameters, _):
             pose = self.space.retract(start, parameters)
-            value = problem.values(pose[None])[0]
+            scores = problem.scores(pose[None])
+            value, error = jnp.mean(scores, axis=0)[0], standard_error(jax.lax.stop_gradient(scores))[0]
             # A pose may hide that the gradient which led to it was not a number.
             value = jnp.where(jnp.isfinite(parameters).all(), value, jnp.nan)
             # A pose where no camera may stand is never chosen; the penalty leads out of there.
-            return _PENALTY * problem.violation(pose[None])[0] - value / scale, (pose, value)
+            return _PENALTY * problem.violation(pose[None])[0] - value / scale, (pose, value, error)
 
         parameters = jnp.zeros(self.space.num_parameters, start.position.dtype)
         struct, aux_struct = jax.eval_shape(loss, parameters, None)
@@ -151,8 +159,8 @@ class GradientSearch(Search):
             return jax.tree.map(partial(jnp.where, done), carry, after), seen
 
         # One step more, for the value of the pose that the last one led to.
-        _, (poses, values) = jax.lax.scan(step, (parameters, state), length=self.iterations + 1)
-        return Trajectories(poses, values)
+        _, (poses, values, errors) = jax.lax.scan(step, (parameters, state), length=self.iterations + 1)
+        return Trajectories(poses, values), errors
 
 
 class HybridSearch(GradientSearch):

@@ -49,7 +49,8 @@ class HalvingSearch(CandidateSearch):
         return self._halved(problem, candidates, score)
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """The best of the last round; the value of a candidate that left earlier is its mean until then."""
+        """The best of the last round; the value of a candidate that left earlier is its mean until then, and so is its
+        standard error."""
         return self._halved(problem, candidates, lambda left, sample: scores[0, sample][left])
 
     def _halved(self, problem: Problem, candidates: Pose, score: Callable) -> Proposal:
@@ -63,18 +64,28 @@ class HalvingSearch(CandidateSearch):
             among = jnp.where(jnp.arange(count) < left, values[order], -jnp.inf)
             return order[jnp.argsort(-among, stable=True)], values
 
-        def advance(state, block):
+        def advance(carry, block):
+            state, squares = carry
             order, totals, scored = state
             order = jax.lax.cond(block.sorts, lambda: ranked(state, block.left)[0], lambda: order)
             taken = order.at[block.ranks].get(mode="fill", fill_value=0)
             rows = jnp.where(block.ranks < count, taken, count)
-            totals = totals.at[rows].add(score(taken, block.sample), mode="drop")
-            return (order, totals, scored.at[rows].add(1, mode="drop")), None
+            scores, before = score(taken, block.sample), scored[taken]
+            # Squared deviations from the mean, one sample more at a time (Welford 1962).
+            deviation = scores - totals[taken] / jnp.maximum(before, 1)
+            squares = squares.at[rows].add(deviation**2 * before / (before + 1), mode="drop")
+            totals = totals.at[rows].add(scores, mode="drop")
+            return ((order, totals, scored.at[rows].add(1, mode="drop")), squares), None
 
         blocks, left = self._blocks(problem.num_samples)
-        state, _ = jax.lax.scan(advance, (jnp.arange(count), nothing, nothing), blocks)
+        start = (jnp.arange(count), nothing, nothing), nothing
+        (state, squares), _ = jax.lax.scan(advance, start, blocks)
         order, values = ranked(state, left)
-        return Proposal(candidates[order[0]], values[order[0]], candidates, values)
+        scored, best = state[2], order[0]
+        errors = jnp.where(scored > 1, jnp.sqrt(squares / (jnp.maximum(scored - 1, 1) * scored)), jnp.nan)
+        return Proposal(
+            candidates[best], values[best], candidates, values, standard_error=errors[best], standard_errors=errors
+        )
 
     def _blocks(self, num_samples: int) -> tuple["_Block", int]:
         """All rounds as blocks of one size, so that what scores them is compiled once; and how many are left in the

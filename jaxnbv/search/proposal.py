@@ -3,7 +3,6 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnbv.geometry.pose import Pose
@@ -28,11 +27,12 @@ class Trajectories(eqx.Module):
 class Proposal(eqx.Module):
     """A search's answer: the pose to take next, and what it looked at.
 
-    - `value`: the chosen pose's value, in the units of what the search maximises.
+    - `value`: the chosen pose's value, in the units of what the search maximises; `standard_error`: of it, as a mean
+      over the posterior samples. NaN for a single sample; None for a search that does not score on samples.
     - `candidates`, `values`: the pool of poses and their values; -inf where one was excluded as visited.
-    - `standard_errors`: of the values, as means over the posterior samples; `difference_errors`: of each value less
-      that of the best candidate, which is known better, since all poses are scored on the same samples. NaN for a
-      single sample; None for a search that does not score all candidates on all samples.
+    - `standard_errors`: of the values, each as a mean over the samples that its candidate was scored on;
+      `difference_errors`: of each value less that of the best candidate, which are smaller, since all poses are scored
+      on the same samples; None for a search that does not score all candidates on all samples.
     - `trajectories`: those of a gradient search, starting from the best candidates; None for other searches.
     """
 
@@ -40,6 +40,7 @@ class Proposal(eqx.Module):
     value: Float[Array, ""]
     candidates: Pose
     values: Float[Array, " candidates"]
+    standard_error: Float[Array, ""] | None = None
     trajectories: Trajectories | None = None
     standard_errors: Float[Array, " candidates"] | None = None
     difference_errors: Float[Array, " candidates"] | None = None
@@ -51,15 +52,6 @@ class Proposal(eqx.Module):
             return None
         best = jnp.max(self.values)
         return (self.values == best) | (best - self.values <= errors * self.difference_errors)
-
-    @property
-    def standard_error(self) -> float | None:
-        """Of the chosen pose's value; None where it is not known, or the pose is none of the candidates."""
-        if self.standard_errors is None:
-            return None
-        same = jax.tree.map(lambda rows, row: rows == row, self.candidates, self.pose)
-        chosen = np.asarray(jnp.all(same.position, axis=1) & jnp.all(same.rotation, axis=(1, 2)))
-        return float(self.standard_errors[chosen.argmax()]) if chosen.any() else None
 
     @property
     def num_tied(self) -> int | None:

@@ -16,7 +16,7 @@ from jaxnbv.checks import InputError
 from jaxnbv.errors import install
 from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.observations import Observations
-from jaxnbv.planning.episode import Step
+from jaxnbv.planning.loop import Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import SDFSurface, TriangleMesh
@@ -114,7 +114,7 @@ class ReconstructionStudy(Study):
         reconstructions from the last cloud; that by Poisson reconstruction is None without `pymeshlab`."""
         views = [view for view, *_ in episode]
         mesher = self.mesher(scene)
-        *_, observations = mesher.replay((view.pose, view.scan, self.camera) for view in views)
+        *_, observations = mesher.replay(((view.pose, view.scan) for view in views), self.camera)
         found = {
             name: self._distances(reconstruct(mesher.sampler, observations, name), truth, scene.index)
             for name in RECONSTRUCTIONS

@@ -19,7 +19,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
-from jaxnbv.planning.episode import Sensor, Step
+from jaxnbv.planning.loop import Sensor, Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.session import stride_of
 from jaxnbv.progress import progress_bar
@@ -100,7 +100,7 @@ class MostNewVoxels(Baseline):
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
         """Values are numbers of voxels; the key is not used."""
-        known = jnp.any(self.shown & problem.is_visited(candidates)[:, None], axis=0)
+        known = jnp.any(self.shown & problem.observations.poses.holds(candidates)[:, None], axis=0)
         gain = jnp.sum(self.shown & ~known, axis=1)
         return gain.astype(candidates.position.dtype)
 

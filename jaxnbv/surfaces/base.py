@@ -138,7 +138,7 @@ class SurfaceModel(eqx.Module):
     @abstractmethod
     def condition(self, observations: Observations | PointCloud) -> SurfacePosterior:
         """p(f | observations): the filled rows of its cloud and, where the model can make use of it, the space that was
-        seen empty. A cloud alone is observations too; `Observations.of` makes it so."""
+        seen empty. A cloud alone is observations too; `as_observations` makes it so."""
 
     def check(self, cloud: PointCloud) -> None:
         """Warn where a cloud, whose values are known, is not one that the model makes much of."""

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from jaxnbv.checks import AnyArray, check_fields, require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.volume import Box
-from jaxnbv.observations import Observations
+from jaxnbv.observations import Observations, as_observations
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import Fields, SurfaceModel, SurfacePosterior, sampling_method
@@ -90,7 +90,7 @@ class KnownShapes(SurfaceModel):
 
         **Raises:** `ValueError` as the `condition` of `residual` and `unknown` does.
         """
-        observations = Observations.of(observations)
+        observations = as_observations(observations)
         unknown = self.unknown.condition(observations)
         if self.bank.solids is None:
             return unknown

@@ -63,22 +63,22 @@ class Seen(NamedTuple):
 
 
 def _some_empty(observations: Observations) -> tuple[Float[Array, "m 3"], Bool[Array, " m"]]:
-    if observations.seen_empty is None or observations.grid is None:
+    if observations.empty_nodes is None or observations.grid is None:
         return jnp.zeros((_NUM_EMPTY, 3)), jnp.zeros(_NUM_EMPTY, bool)
-    order = np.random.default_rng(0).permutation(observations.seen_empty.size)
-    node, is_empty = _first_seen(observations.seen_empty, order)
+    order = np.random.default_rng(0).permutation(observations.empty_nodes.size)
+    node, is_empty = _first_seen(observations.empty_nodes, order)
     return jnp.asarray(observations.grid.axis)[node], is_empty
 
 
 @jax.jit
 def _first_seen(
-    seen_empty: Bool[Array, "g g g"], order: Int[Array, " nodes"]
+    empty_nodes: Bool[Array, "g g g"], order: Int[Array, " nodes"]
 ) -> tuple[Int[Array, "m 3"], Bool[Array, " m"]]:
     """The first nodes in an order of those that were seen empty."""
-    seen = seen_empty.reshape(-1)[order]
+    seen = empty_nodes.reshape(-1)[order]
     place = jnp.where(seen, jnp.cumsum(seen) - 1, _NUM_EMPTY)
     chosen = jnp.zeros(_NUM_EMPTY, jnp.int32).at[place].set(order, mode="drop")
-    return jnp.stack(jnp.unravel_index(chosen, seen_empty.shape), axis=-1), jnp.arange(_NUM_EMPTY) < jnp.sum(seen)
+    return jnp.stack(jnp.unravel_index(chosen, empty_nodes.shape), axis=-1), jnp.arange(_NUM_EMPTY) < jnp.sum(seen)
 
 
 class Hypotheses(eqx.Module):

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, check_fields, is_traced, require, shown
 from jaxnbv.geometry.cloud import PointCloud, some_rows
-from jaxnbv.observations import Observations
+from jaxnbv.observations import Observations, as_observations
 from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import SurfaceModel, on_torus
 from jaxnbv.surfaces.covariance import function_covariance, function_variance, mode_variance
@@ -77,7 +77,7 @@ class ScreenedSPSR(SurfaceModel):
         **Raises:** `ValueError` as `GeometricSPSR.condition` does, for a capacity above 16,384, and if S is singular in
         the precision at hand.
         """
-        observations = Observations.of(observations)
+        observations = as_observations(observations)
         capacity = observations.cloud.capacity
         require(
             capacity <= MOST_FACTORISED,

@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 
 from jaxnbv.checks import as_floats, check_type, is_traced, require
 from jaxnbv.geometry.cloud import PointCloud, check_oriented
-from jaxnbv.observations import Observations
+from jaxnbv.observations import Observations, as_observations
 from jaxnbv.surfaces.base import HALF_WIDTH, SurfaceModel
 from jaxnbv.surfaces.covariance import Scalar, Spectra, circle_spectrum
 from jaxnbv.surfaces.given_normals import GeometricSPSRPosterior, given_normals
@@ -129,7 +129,7 @@ class GeometricSPSR(SurfaceModel):
         points outside [-pi/2, pi/2]^3 (scene coordinates), or if A is singular in the precision at hand; under `jit`
         values are not known and are not checked.
         """
-        cloud = Observations.of(observations).cloud
+        cloud = as_observations(observations).cloud
         if not is_traced(cloud):
             check_oriented(cloud, "the cloud", HALF_WIDTH, unit=False)
         posterior = given_normals(cloud, self.spectrum, self.noise)

@@ -9,16 +9,14 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from jaxnbv.acquisition import Acquisition, Answer, Quantity, context_of, preferred_batch_size, zero_if_empty
-from jaxnbv.checks import InputError, check_fields, require
+from jaxnbv.checks import check_fields, require
 from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.scanning import Surface
-from jaxnbv.tasks.stopping import StopContext, StopRule
 
 Classifier: TypeAlias = Callable[[PointCloud], Float[Array, " classes"]]
 # Their shape is checked by `Acquisition.check`.
@@ -166,59 +164,3 @@ class ClassAnswer(Answer):
     """The probabilities of the classes."""
 
     form: str = "{:.2f}"
-
-
-class Sure(StopRule):
-    """Stop once the class is known: it has this probability given D, and given each of several random halves of D too,
-    since a single answer may be sure by chance.
-
-    - `probability`: within (0, 1).
-    - `num_resamplings`: how many halves are drawn.
-
-    **Raises:** `ValueError` for another probability or a negative number; of an acquisition without a classifier.
-    """
-
-    probability: float = eqx.field(static=True, default=0.95)
-    num_resamplings: int = eqx.field(static=True, default=8)
-
-    def __check_init__(self):
-        check_fields(self)
-        require(0 < self.probability < 1, f"the probability is {self.probability}; it must lie within (0, 1)")
-        require(
-            self.num_resamplings >= 0, f"the number of resamplings is {self.num_resamplings}; it must not be negative"
-        )
-
-    def check(self, acquisition: Acquisition) -> None:
-        _of_classes(acquisition)
-
-    def after(self, context: StopContext) -> str | None:
-        acquisition, cloud = _of_classes(context.acquisition), context.observations.cloud
-        answer = acquisition.answer(cloud)
-        best = int(np.argmax(answer.values))
-        least = float(answer.values[best])
-        for index in range(self.num_resamplings):
-            if least < self.probability:
-                return None
-            half = acquisition.answer(half_of(cloud, jax.random.fold_in(context.key, index)))
-            least = min(least, float(half.values[best]))
-        if least < self.probability:
-            return None
-        halves = f", and at least {100 * least:.0f} % given half of the points" if self.num_resamplings else ""
-        return f"sure of {answer.names[best]} ({100 * float(answer.values[best]):.0f} %{halves})"
-
-
-def _of_classes(acquisition: Acquisition) -> ClassAcquisition:
-    if not isinstance(acquisition, ClassAcquisition):
-        raise InputError(
-            f"Sure is about a class, but {type(acquisition).__name__} has no classifier: use CrossEntropy or "
-            "MixedEntropy, or another rule"
-        )
-    return acquisition
-
-
-@jax.jit
-def half_of(cloud: PointCloud, key: PRNGKeyArray) -> PointCloud:
-    """Each of a cloud's points with probability one half."""
-    kept = cloud.mask & jax.random.bernoulli(key, 0.5, cloud.mask.shape)
-    points, normals = (jnp.where(kept[:, None], rows, 0.0) for rows in (cloud.points, cloud.normals))
-    return PointCloud(points, normals, kept)

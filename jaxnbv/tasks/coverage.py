@@ -5,10 +5,9 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.acquisition import Acquisition, Quantity, expected_value
+from jaxnbv.acquisition import Acquisition, Quantity
 from jaxnbv.checks import check_fields, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
@@ -16,7 +15,6 @@ from jaxnbv.geometry.neighbours import DistanceField, nearest_squared_distance, 
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning.metrics import GRAZING
 from jaxnbv.sharding import on_cpu
-from jaxnbv.tasks.stopping import StopContext, StopRule
 
 
 def _many() -> int:
@@ -38,7 +36,7 @@ class Coverage(Acquisition):
     @property
     def quantity(self) -> Quantity:
         meaning = "squared distances to the cloud, summed over an imagined scan, mean over posterior samples."
-        return Quantity("expected coverage gain", "scene units²", meaning, length_power=2)
+        return Quantity("expected coverage gain", "", meaning, length_power=2)
 
     @property
     def batch_size(self) -> int:
@@ -86,7 +84,7 @@ class NewSurface(Acquisition):
     @property
     def quantity(self) -> Quantity:
         meaning = "area that an imagined scan shows and no scan has shown before, mean over posterior samples."
-        return Quantity("expected new area", "scene units²", meaning, length_power=2)
+        return Quantity("expected new area", "", meaning, length_power=2)
 
     @property
     def batch_size(self) -> int:
@@ -123,41 +121,3 @@ class ShownArea(Acquisition):
     @property
     def batch_size(self) -> int:
         return _many()
-
-
-class Covered(StopRule):
-    """Stop once this share of what the candidates can show is expected to have been seen: of the area that they would
-    show of the sampled surfaces, the part that is not new to `NewSurface`.
-
-    - `share`: within (0, 1].
-    - `size`: of `NewSurface`, in scene units.
-
-    **Raises:** `ValueError` for another share, or a size that is not positive.
-    """
-
-    share: float = eqx.field(static=True, default=0.98)
-    size: float = eqx.field(static=True, default=0.05)
-
-    def __check_init__(self):
-        check_fields(self)
-        require(0 < self.share <= 1, f"the share is {self.share}; it must lie within (0, 1]")
-        NewSurface(self.size)
-
-    def after(self, context: StopContext) -> str | None:
-        covered = expected_coverage(context, self.size)
-        return f"{100 * covered:.1f} % of what can be seen is expected to be covered" if covered >= self.share else None
-
-
-def expected_coverage(context: StopContext, size: float = 0.05) -> float:
-    """Share of the area that the camera would see of the posterior's surfaces, from all candidates, that is not new.
-
-    - `size`: of `NewSurface`, in scene units.
-    """
-    surfaces = context.sampler.sample(context.observations, context.key)
-    barrier = context.sampler.barrier(context.camera, context.candidates)
-    where = context.observations.cloud, surfaces, context.camera, context.candidates, barrier
-    new, shown = np.asarray(_values(ShownArea(NewSurface(size)), *where)).sum(axis=0)
-    return 1.0 - float(new / shown) if shown else 1.0
-
-
-_values = eqx.filter_jit(expected_value)

@@ -16,11 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxnbv.acquisition import Acquisition, Answer, Quantity, preferred_batch_size
-from jaxnbv.checks import InputError, check_fields, require, shown
+from jaxnbv.acquisition import Answer, Quantity, preferred_batch_size
+from jaxnbv.checks import check_fields, require, shown
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.scanning import Surface
-from jaxnbv.tasks.stopping import StopContext, StopRule
 
 # Of probabilities in 32 bits, or less.
 _SLACK = 1e-2
@@ -102,53 +101,6 @@ class PartAnswer(Answer):
     form: str = "{:.0f}"
     asked: tuple[int, ...] = ()
     target: float = 60.0
-
-
-class Found(StopRule):
-    """Stop once all parts are found.
-
-    - `points`: a part is found once so many points are predicted to be of it.
-    - `parts`: names of those to be found; by default all that the segmenter is asked for, of which the object may lack
-      one.
-
-    **Raises:** `ValueError` for a number of points below one; of an acquisition without a segmenter, or whose
-    segmenter does not know a part.
-    """
-
-    points: int = eqx.field(static=True, default=60)
-    parts: tuple[str, ...] | None = eqx.field(static=True, default=None)
-
-    def __check_init__(self):
-        check_fields(self)
-        require(self.points >= 1, f"a part is found by {self.points} points; give at least 1")
-        names = isinstance(self.parts, tuple) and all(isinstance(name, str) for name in self.parts)
-        require(self.parts is None or names, f"the parts are {shown(self.parts)}; give a tuple of their names")
-
-    def check(self, acquisition: Acquisition) -> None:
-        segmenter = getattr(getattr(acquisition, "utility", None), "segmenter", None)
-        require(
-            segmenter is not None,
-            f"Found is about parts, but {type(acquisition).__name__} has no segmenter: use the utility "
-            "SoftPartCount, or another rule",
-        )
-        known = getattr(segmenter, "part_names", None)
-        names = () if known is None else tuple(known.values())
-        require(
-            bool(self.parts or names),
-            "the segmenter does not name the parts that it is asked for: give Found(parts=...), 'part 0' and so on",
-        )
-        unknown = [name for name in self.parts or () if names and name not in names]
-        require(not unknown, f"the segmenter knows no part {unknown[:1]}: give some of {', '.join(names)}")
-
-    def after(self, context: StopContext) -> str | None:
-        answer = context.acquisition.answer(context.observations.cloud)
-        if not isinstance(answer, PartAnswer):
-            raise InputError("the acquisition's answer tells no parts")
-        found = dict(zip(answer.names, answer.values.tolist(), strict=True))
-        wanted = self.parts or tuple(answer.names[index] for index in answer.asked)
-        if any(found.get(name, 0) < self.points for name in wanted):
-            return None
-        return f"all of {len(wanted)} parts are found, by {self.points} points or more"
 
 
 @eqx.filter_jit

@@ -10,7 +10,8 @@ from jaxnbv.checks import AnyArray
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.planning.episode import Episode, View
+from jaxnbv.planning.episode import Episode
+from jaxnbv.planning.loop import View
 from jaxnbv.progress import progress_bar
 from jaxnbv.scanning.metrics import truth_points
 from jaxnbv.search import Proposal
@@ -118,7 +119,7 @@ def report_data(
             answered = words_of(task.answers[index]).said(task.answers[index - 1] if index else None)
             words["What came"] += f" {capital(answered)}."
         before = episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), np.float32)
-        look = taken_look(view, before)
+        look = taken_look(view, episode.sensor, before)
         drawn.append(ViewData(view, before, next_one.surface, task.amounts[index], words, leading.imagined, look))
         leading = next_one
     means = [view.surface.mesh for view in drawn if view.surface is not None]

@@ -13,11 +13,12 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.observations import Observations
-from jaxnbv.planning.episode import Episode, View, view_keys
-from jaxnbv.scanning import GridSurface, TriangleMesh, scan
+from jaxnbv.planning.episode import Episode
+from jaxnbv.planning.loop import View, view_keys
+from jaxnbv.sampler import StepInputs
+from jaxnbv.scanning import TriangleMesh, barrier_of, scan
 from jaxnbv.scanning.mesh import level_triangles
-from jaxnbv.surfaces import KnownShapesPosterior, SurfacePosterior
+from jaxnbv.surfaces import KnownShapesPosterior
 from jaxnbv.viz.sphere import unit
 from jaxnbv.viz.style import BEFORE, NEW
 
@@ -53,19 +54,17 @@ class Imagined(eqx.Module):
     kinds: tuple[tuple[str, float], ...] = eqx.field(static=True)
 
 
-def imagined(
-    episode: Episode, index: int, observations: Observations, posterior: SurfacePosterior, surfaces: GridSurface
-) -> Imagined | None:
+def imagined(episode: Episode, index: int, inputs: StepInputs) -> Imagined | None:
     """What was imagined before view `index` (from 0) was taken; None for one that was not chosen.
 
-    `observations`: what was known before it; `posterior`: given that; `surfaces`: the step's samples.
+    - `inputs`: of the view's step, with its samples.
     """
-    sampler, view = episode.planner.sampler, episode.views[index]
-    if view.proposal is None:
+    planner, sampler, view = episode.planner, episode.planner.sampler, episode.views[index]
+    if view.proposal is None or inputs.surfaces is None:
         return None
-    camera, cloud = _finer(episode.planner.camera), observations.cloud.to_numpy()[0]
-    barrier, samples = sampler.barrier(camera, view.pose), list[Look]()
-    for values in np.array(surfaces.values[:SHOWN]):
+    camera, cloud = _finer(planner.camera), inputs.observations.cloud.to_numpy()[0]
+    barrier, samples = barrier_of(planner.obstacles, camera, view.pose), list[Look]()
+    for values in np.array(inputs.surfaces.values[:SHOWN]):
         # Of triangles: a picture is no reason to compile a scan of so many pixels.
         found = level_triangles(values, sampler.grid)
         if found is None:
@@ -75,17 +74,16 @@ def imagined(
         seen = scan(TriangleMesh(*found[:2], Frame()), camera, view.pose, barrier)
         samples.append(look(seen, camera, view.pose, cloud))
     names, kinds = [f"imagined {number}" for number in range(1, len(samples) + 1)], dict[str, float]()
-    if isinstance(posterior, KnownShapesPosterior):
+    if isinstance(inputs.posterior, KnownShapesPosterior):
         sample_key, *_ = view_keys(episode.key, index)
-        names = posterior.names_of_samples(sample_key, sampler.num_samples)[: len(samples)]
-        kinds = posterior.kinds()
+        names = inputs.posterior.names_of_samples(sample_key, sampler.num_samples)[: len(samples)]
+        kinds = inputs.posterior.kinds()
     return Imagined(tuple(samples), tuple(names), tuple(kinds.items()))
 
 
-def taken_look(view: View, cloud: Float[np.ndarray, "n 3"]) -> Look | None:
-    """What a view saw; None where its scan is no image. `cloud`: what had been seen before it."""
-    is_image = view.scan.capacity == view.camera.num_rays
-    return look(view.scan, view.camera, view.pose, cloud) if is_image else None
+def taken_look(view: View, camera: Camera, cloud: Float[np.ndarray, "n 3"]) -> Look | None:
+    """What a view by a camera saw; None where its scan is no image. `cloud`: what had been seen before it."""
+    return look(view.scan, camera, view.pose, cloud) if view.scan.capacity == camera.num_rays else None
 
 
 def look(seen: PointCloud, camera: Camera, pose: Pose, cloud: Float[np.ndarray, "n 3"]) -> Look:

@@ -20,7 +20,8 @@ from jaxnbv.errors import optional
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.observations import Observations
-from jaxnbv.planning.episode import Episode, view_keys
+from jaxnbv.planning.episode import Episode
+from jaxnbv.planning.loop import view_keys
 from jaxnbv.planning.session import Session
 from jaxnbv.scanning import Grid, GridSurface
 from jaxnbv.scanning.mesh import level_triangles
@@ -110,12 +111,13 @@ class LiveView:
             with self._server.atomic():
                 for handle in self._drawn:
                     handle.remove()
-                self._drawn = _drawn(scene, seen_items(before, new, [view.pose for view in views], views[-1].camera))
+                self._drawn = _drawn(scene, seen_items(before, new, [view.pose for view in views], episode.sensor))
             observations = episode.observations_after(len(views)) if observations is None else observations
             key, *_ = view_keys(episode.key, len(views))
-            posterior = sampler.posterior(observations)
-            samples = sampler.sample(observations, key, posterior)
-            surface = as_shown(mean_surface(sampler, observations, posterior, samples), observations.cloud)
+            inputs = sampler.step_inputs(observations, key)
+            posterior, samples = inputs.posterior, inputs.surfaces
+            assert samples is not None
+            surface = as_shown(mean_surface(sampler, inputs), observations.cloud)
             shapes = [""] * _SAMPLES
             if isinstance(posterior, KnownShapesPosterior):
                 shapes = [f" {name}" for name in posterior.names_of_samples(key, sampler.num_samples)]
@@ -142,10 +144,10 @@ class LiveView:
         self._server.stop()
 
 
-def _told(episode: Episode, posterior: SurfacePosterior, proposal: Proposal | None) -> str:
+def _told(episode: Episode, posterior: SurfacePosterior | None, proposal: Proposal | None) -> str:
     """What is known, and what is asked, as Markdown."""
     views, sought, acquisition = len(episode.views), episode.planner.quantity, episode.planner.acquisition
-    seen = seen_after(episode.views, None, acquisition)[-1]
+    seen = seen_after(episode, None)[-1]
     lines = [f"**{views} view{'s' if views > 1 else ''}**, {seen.amount} of surface seen"]
     answer = acquisition.answer(episode.cloud)
     lines += [] if answer is None else [f"{capital(words_of(answer).said())}."]

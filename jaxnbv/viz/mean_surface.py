@@ -11,11 +11,9 @@ from scipy.spatial import cKDTree
 
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.farthest_points import farthest_point_indices
-from jaxnbv.observations import Observations
-from jaxnbv.sampler import SurfaceSampler
-from jaxnbv.scanning import Grid, GridSurface
+from jaxnbv.sampler import StepInputs, SurfaceSampler
+from jaxnbv.scanning import Grid
 from jaxnbv.scanning.mesh import level_triangles
-from jaxnbv.surfaces import SurfacePosterior
 
 # The variance of one point costs a triangular solve with the whole cloud, the slope two evaluations of the mean.
 _DEVIATION_ANCHORS = 256
@@ -48,17 +46,14 @@ class MeanSurface(eqx.Module):
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
 
-def mean_surface(
-    sampler: SurfaceSampler,
-    observations: Observations,
-    posterior: SurfacePosterior,
-    surfaces: GridSurface | None = None,
-) -> MeanSurface | None:
-    """The surface of the mean of the posterior given the observations, carved as the samples are, with its standard
-    deviation; None if the grid holds none.
+def mean_surface(sampler: SurfaceSampler, inputs: StepInputs) -> MeanSurface | None:
+    """The surface of the posterior's mean, carved as the samples are, with its standard deviation; None if the grid
+    holds none.
 
-    - `surfaces`: samples of it, by which a posterior without closed forms is drawn; by default under a fixed key.
+    - `inputs`: with a posterior; one without closed forms is drawn by the samples, by default under a fixed key.
     """
+    observations, posterior, surfaces = inputs.observations, inputs.posterior, inputs.surfaces
+    assert posterior is not None
     if not posterior.has_closed_forms:
         surfaces = sampler.sample(observations, jax.random.key(0), posterior) if surfaces is None else surfaces
         return _mean_of_samples(np.asarray(surfaces.values, np.float64), sampler.grid)

@@ -165,8 +165,8 @@ def _(observations: Observations) -> Drawing:
     views, cloud = int(observations.num_views), drawing_of(observations.cloud)
     empty = (
         ""
-        if observations.seen_empty is None
-        else f", {float(np.mean(observations.seen_empty)):.0%} of the grid seen empty"
+        if observations.empty_nodes is None
+        else f", {float(np.mean(observations.empty_nodes)):.0%} of the grid seen empty"
     )
     return Drawing(cloud.draw, f"{views} view{'s' * (views != 1)}{empty}; {cloud.facts}")
 

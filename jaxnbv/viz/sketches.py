@@ -4,10 +4,9 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
-from jaxnbv.observations import Observations
-from jaxnbv.planning.episode import Episode, Step, view_keys
-from jaxnbv.scanning import GridSurface
-from jaxnbv.surfaces import SurfacePosterior
+from jaxnbv.planning.episode import Episode
+from jaxnbv.planning.loop import Step, view_keys
+from jaxnbv.sampler import StepInputs
 from jaxnbv.viz.imagined import Imagined, imagined
 from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
 
@@ -37,9 +36,9 @@ class Sketches:
     def add(self, step: Step) -> None:
         """The step to the next view."""
         self.episode = dataclasses.replace(self.episode, views=(*self.episode.views, step.view))
-        if step.basis is not None:
+        if step.inputs is not None:
             index = len(self.episode.views) - 1
-            self.held[index] = _sketch(self.episode, index, *step.basis)
+            self.held[index] = _sketch(self.episode, index, step.inputs)
 
 
 def sketches_of(episode: Episode, held: Mapping[int, Sketch], imagine: bool) -> Iterator[Sketch]:
@@ -51,24 +50,19 @@ def sketches_of(episode: Episode, held: Mapping[int, Sketch], imagine: bool) -> 
         if index in held:
             yield held[index]
             continue
-        posterior, surfaces = episode.planner.sampler.posterior(observations), None
+        posterior = episode.planner.sampler.posterior(observations)
+        inputs = StepInputs(observations, posterior)
         # With the key of the step: what it imagined, and moments where the posterior has no closed ones.
         if (imagine and index < len(episode.views)) or not posterior.has_closed_forms:
             sample_key, *_ = view_keys(episode.key, index)
             surfaces = episode.planner.sampler.sample(observations, sample_key, posterior)
-        yield _sketch(episode, index, observations, posterior, surfaces, imagine)
+            inputs = dataclasses.replace(inputs, surfaces=surfaces)
+        yield _sketch(episode, index, inputs, imagine)
 
 
-def _sketch(
-    episode: Episode,
-    index: int,
-    observations: Observations,
-    posterior: SurfacePosterior,
-    surfaces: GridSurface | None,
-    imagine: bool = True,
-) -> Sketch:
-    mean = mean_surface(episode.planner.sampler, observations, posterior, surfaces)
+def _sketch(episode: Episode, index: int, inputs: StepInputs, imagine: bool = True) -> Sketch:
+    mean = mean_surface(episode.planner.sampler, inputs)
     seen = None
-    if imagine and surfaces is not None and index < len(episode.views):
-        seen = imagined(episode, index, observations, posterior, surfaces)
-    return Sketch(as_shown(mean, observations.cloud), seen)
+    if imagine and inputs.surfaces is not None and index < len(episode.views):
+        seen = imagined(episode, index, inputs)
+    return Sketch(as_shown(mean, inputs.observations.cloud), seen)

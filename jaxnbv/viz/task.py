@@ -15,7 +15,8 @@ from jaxnbv.checks import AnyArray
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.planning.episode import Episode, View
+from jaxnbv.planning.episode import Episode
+from jaxnbv.planning.loop import View
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Surface
 from jaxnbv.scanning.metrics import coverage, true_mesh
@@ -65,14 +66,14 @@ def task_of(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, rival
     - `rival`: an episode of another search from the same first view.
     """
     planner = episode.planner
-    seen, true = seen_after(episode.views, truth, planner.acquisition), None
+    seen, true = seen_after(episode, truth), None
     answers = _answers(planner.acquisition, episode.views) or seen
     if episode.scene is not None and answers is not seen:
         cloud = true_cloud(episode.scene, planner.capacity)
         true = None if cloud is None else planner.acquisition.true_answer(episode.scene, cloud)
     beside = None
     if rival is not None:
-        rival_seen = seen_after(rival.views, truth, planner.acquisition)
+        rival_seen = seen_after(rival, truth)
         charts = _charts(_answers(planner.acquisition, rival.views) or rival_seen, true)
         beside = Rival(search_name(rival), race_words(rival, episode), charts, _charts(rival_seen, None)[0])
     return Task(
@@ -99,22 +100,22 @@ def _answers(acquisition: Acquisition, views: Sequence[View]) -> Sequence[Answer
     return answers if len(answers) == len(given) else []
 
 
-def seen_after(
-    views: Sequence[View], truth: Float[AnyArray, "n 3"] | None, acquisition: Acquisition
-) -> list[CoverageAnswer]:
+def seen_after(episode: Episode, truth: Float[AnyArray, "n 3"] | None) -> list[CoverageAnswer]:
     """How much of the surface was seen after each view: the share of the true one, of which points are given in scene
     coordinates; else the area that each scan shows and none before it has shown, summed up, by the acquisition where it
-    is a `NewSurface`, so that it is what was promised, and by the default one where not."""
+    is a `NewSurface`, so that it is what was promised, and by the default one where not. Areas are in world units."""
+    views, acquisition = episode.views, episode.planner.acquisition
     if truth is not None:
         shares = [100.0 * float(share) for share in coverage(views, truth)]
         return [CoverageAnswer(("of the surface seen",), np.array([share])) for share in shares]
     of = acquisition if isinstance(acquisition, NewSurface) else NewSurface()
     clouds = [None, *(view.cloud for view in views[:-1])]
     new = [
-        float(_new_area(of, cloud, view.scan, view.camera, view.pose))
+        float(_new_area(of, cloud, view.scan, episode.sensor, view.pose))
         for cloud, view in zip(clouds, views, strict=True)
     ]
-    return [CoverageAnswer(("of surface seen",), np.array([area]), unit="scene units²") for area in np.cumsum(new)]
+    areas, unit = episode.frame.length_to_world(np.cumsum(new), 2), f"{episode.frame.unit}²"
+    return [CoverageAnswer(("of surface seen",), np.array([area]), unit=unit) for area in areas]
 
 
 @eqx.filter_jit

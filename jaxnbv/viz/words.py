@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxnbv.acquisition import Quantity
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.planning.episode import View
+from jaxnbv.planning.loop import View
 from jaxnbv.search import Proposal
 from jaxnbv.viz.answers import CoverageAnswer, coordinates, number, shown_value
 from jaxnbv.viz.choice import best_first, directions_of

@@ -100,7 +100,7 @@ def test_a_scan_tells_what_lies_in_range_and_is_not_aslant():
 
 
 def test_what_a_limited_sensor_missed_is_empty_as_far_as_it_reaches():
-    grid, pose, see = nbv.Grid(24), nbv.look_at((0.0, 0.0, 2.5)), eqx.filter_jit(nbv.Carving.seen_empty)
+    grid, pose, see = nbv.Grid(24), nbv.look_at((0.0, 0.0, 2.5)), eqx.filter_jit(nbv.Carving.empty_nodes)
     nothing = nbv.SDFSurface(Sphere(0.01).translate([0.0, 1.4, 0.0]))
     seen = {
         farthest: np.asarray(see(nbv.Carving(), grid, pose, nbv.scan(nothing, camera, pose), camera))

@@ -8,7 +8,8 @@ import pytest
 from small_planner import FIRST, SCENE, SOLID, planner_of
 
 from jaxnbv.geometry.pose import look_at
-from jaxnbv.planning.episode import Episode, observe_scene, simulate
+from jaxnbv.planning.episode import Episode
+from jaxnbv.planning.simulate import observe_scene, simulate
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, mesh_from_sdf, scan
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.search import RandomView

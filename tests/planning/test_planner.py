@@ -11,8 +11,8 @@ from small_planner import CAMERA, FIRST, SCENE, planner_of
 
 from jaxnbv.geometry.cloud import PointCloud, concatenate, farthest_point_subsample
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
-from jaxnbv.planning.episode import simulate
 from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.simulate import simulate
 from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Grid, SensorNoise, scan
 from jaxnbv.search import DiscreteSearch, FarthestView, RandomView, UncertaintyView

@@ -1,27 +1,34 @@
 """A live session at a simulated sensor."""
 
+import dataclasses
 import warnings
 
 import jax
 import numpy as np
 import pytest
+import trimesh
 from small_session import BOX, CAMERA, FIRST, POSES, WORLD, around, planner_of, session_of, shot
 
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
-from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.geometry.volume import Box
-from jaxnbv.planning.episode import view_keys
+from jaxnbv.planning.loop import view_keys
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.stopping import Budget, ValueBelow
-from jaxnbv.sampler import SurfaceSampler
-from jaxnbv.scanning import Carving, Grid, Obstacles, scan
-from jaxnbv.search import DiscreteSearch, FarthestView, GradientSearch, SphereCandidates
+from jaxnbv.planning.simulate import simulate
+from jaxnbv.planning.stopping import Budget, Covered, ValueBelow
+from jaxnbv.planning.travel import ValuePerCost
+from jaxnbv.sampler import StepInputs, SurfaceSampler
+from jaxnbv.scanning import Carving, Grid, Obstacles, SDFSurface, scan
+from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.search import DiscreteSearch, FarthestView, GradientSearch, HalvingSearch, SphereCandidates
 from jaxnbv.surfaces import GeometricSPSR, OutsideBoundary, ScreenedSPSR
 from jaxnbv.tasks import Coverage
 from jaxnbv.viz import write_report
+
+CENTER_OF_BOX = np.mean(BOX, axis=0)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +57,8 @@ def test_it_asks_and_tells_as_a_planner_in_the_scene_does(finished):
         told = (frame.to_scene(pose), frame.to_scene(cloud), frame.to_scene(CAMERA))
         observations = planner.init(*told) if observations is None else planner.observe(observations, *told)
         sample_key, search_key, _ = view_keys(jax.random.key(0), index + 1)
-        proposal = planner.choose(observations, planner.sampler.sample(observations, sample_key), search_key)
+        surfaces = planner.sampler.sample(observations, sample_key)
+        proposal = planner.choose(StepInputs(observations, None, surfaces), search_key)
         matrix = np.asarray(frame.to_world(proposal.pose).matrix)
         expected = finished.episode.views[index + 1].proposal if index < 2 else finished.next().proposal
         np.testing.assert_allclose(proposal.values, expected.values, rtol=1e-4, atol=1e-4)
@@ -69,7 +77,7 @@ def test_its_matrices_are_those_that_were_given(finished):
     assert proposed.value * unit == pytest.approx(float(proposed.proposal.values[index]))
     assert proposed.standard_error * unit == pytest.approx(float(proposed.proposal.standard_errors[index]))
     assert finished.next() is proposed
-    assert finished.views == 3
+    assert len(finished.views) == 3
 
 
 def test_its_cloud_lies_on_the_object_in_the_world(finished):
@@ -163,10 +171,10 @@ def test_a_wrong_image_is_named_and_changes_nothing(given, message, tmp_path):
     right = {"depth": shot(FIRST), "matrix": FIRST, "depth_scale": 1e-3}
     with pytest.raises(InputError, match=message):
         session.add(**right | given)
-    assert session.views == 0
+    assert len(session.views) == 0
     assert not list(tmp_path.glob("*.npz"))
     session.add(**right)
-    assert session.views == 1
+    assert len(session.views) == 1
 
 
 def test_an_image_beside_the_box_is_warned_of():
@@ -212,15 +220,102 @@ def test_the_box_is_the_volume_of_the_model_and_of_the_carving():
     assert fitted.camera.fov == pytest.approx(CAMERA.fov)
 
 
-def test_it_is_done_by_its_rule(finished):
-    assert finished.done is None
-    session = session_of(until=ValueBelow(1e9))
-    assert session.done is None
+def test_travel_counts_from_where_the_camera_was(finished):
+    """Not from where it was to be; in metres about the middle of the box."""
+    plain, priced = session_of(), session_of(planner=dataclasses.replace(planner_of(), cost=ValuePerCost(fixed=0.5)))
+    taken = around(3.0, 0.7)
+    for session in (plain, priced):
+        session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+        proposed = session.next().matrix
+        assert np.abs(proposed - taken).max() > 0.1
+        session.add(shot(taken), taken, depth_scale=1e-3)
+    start, end = taken[:3, 3] - CENTER_OF_BOX, POSES[:, :3, 3] - CENTER_OF_BOX
+    radii = np.linalg.norm(start), np.linalg.norm(end, axis=1)
+    angle = np.arccos(end @ start / radii[0] / radii[1])
+    cost = np.hypot(0.5 * (radii[0] + radii[1]) * angle, radii[1] - radii[0])
+    values, weighed = (np.asarray(session.next().proposal.values) for session in (plain, priced))
+    open_ = np.isfinite(weighed)
+    np.testing.assert_allclose(weighed[open_] * (0.5 + cost[open_]), values[open_], rtol=1e-3)
+    assert priced.next().value == pytest.approx(float(weighed.max()) / priced.frame.scale**2)
+
+
+def test_distances_are_metres_to_cameras_that_were_there():
+    """The proposal that was not followed is not proposed again, but no camera stood there."""
+    session = session_of(planner=planner_of(FarthestView()))
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    assert "less than" in session.done
+    refused, taken = session.next().matrix, around(3.3, 0.4)
+    session.add(shot(taken), taken, depth_scale=1e-3)
+    places = np.array([FIRST[:3, 3], taken[:3, 3]])
+    distance = np.linalg.norm(POSES[:, None, :3, 3] - places, axis=-1).min(axis=1)
+    is_refused = np.abs(POSES - refused).max(axis=(1, 2)) < 1e-5
+    assert is_refused.sum() == 1
+    assert session.next().value == pytest.approx(distance[~is_refused].max(), rel=1e-4)
+
+
+def test_a_rule_sees_the_value_that_the_user_sees():
+    value = (session := session_of(until=ValueBelow(0.0))).add(shot(FIRST), FIRST, depth_scale=1e-3)
+    assert session.done() is None
+    value = session.next().value
+    for limit, ends in ((1.001 * value, True), (0.999 * value, False)):
+        session = session_of(until=ValueBelow(limit))
+        session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+        assert (session.done() is not None) == ends
+
+
+def test_done_and_next_share_their_samples(monkeypatch, tmp_path):
+    drawn, sample = [], SurfaceSampler.sample
+    monkeypatch.setattr(SurfaceSampler, "sample", lambda *args: drawn.append(1) or sample(*args))
+    session = session_of(tmp_path, until=ValueBelow(0.0) | Covered(1.0))
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    assert session.done() is None
+    assert not list(tmp_path.glob("proposal*")), "what is only asked about is not stored"
+    session.next()
+    assert session.done() is None
+    assert len(drawn) == 1
+
+
+def test_the_default_search_says_when_nothing_is_left():
+    """Halving has standard errors too."""
+    away = POSES @ np.diag([-1.0, 1.0, -1.0, 1.0])
+    session = session_of(poses=away, planner=planner_of(HalvingSearch()))
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    with pytest.warns(UserWarning, match=r"the best view is worth 0 ± 0: none is sure"):
+        session.next()
+
+
+def test_its_episode_is_stored_in_the_world(finished, tmp_path):
+    finished.episode.save(tmp_path)
+    stored = trimesh.load(tmp_path / "cloud.ply")
+    np.testing.assert_allclose(stored.vertices, finished.cloud.to_numpy()[0], atol=1e-6)
+
+
+def test_a_session_proposes_as_a_simulation_does(monkeypatch):
+    """The same scans, where the world is the scene: the same poses bit for bit."""
+    search = DiscreteSearch(SphereCandidates(12, min_elevation=-1.0))
+    planner = dataclasses.replace(planner_of(search), obstacles=Obstacles())
+    scene, first, key = SDFSurface(Sphere(0.9)), look_at((0.8, 0.9, 2.2)), jax.random.key(4)
+    episode = simulate(planner, scene, first, 4, key, progress=False)
+    scans = iter(view.scan for view in episode.views)
+    monkeypatch.setattr(PointCloud, "from_depth", lambda *args: next(scans))
+    session = session_of(camera=planner.camera, box=Box(), planner=planner, up="y", poses=None, obstacles=None, key=key)
+    pose = first
+    for view in episode.views:
+        np.testing.assert_array_equal(pose.position, view.pose.position)
+        np.testing.assert_array_equal(pose.rotation, view.pose.rotation)
+        session.add(np.zeros((12, 16)), np.asarray(pose.matrix, np.float64))
+        pose = session.next().proposal.pose
+    np.testing.assert_array_equal(session.cloud.points, episode.cloud.points)
+
+
+def test_it_is_done_by_its_rule(finished):
+    assert finished.done() is None
+    session = session_of(until=ValueBelow(1e9))
+    assert session.done() is None
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    assert "less than" in session.done()
     session = session_of(until=Budget(seconds=1e9))
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    assert session.done is None
+    assert session.done() is None
 
 
 @pytest.mark.slow

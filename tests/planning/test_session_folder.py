@@ -19,7 +19,7 @@ def test_a_session_goes_on_from_its_folder(tmp_path):
     session = session_of(tmp_path)
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     session = session_of(tmp_path)
-    assert session.views == 1
+    assert len(session.views) == 1
     matrix = session.next().matrix
     again = session_of(tmp_path)
     files = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.npz")}
@@ -57,7 +57,7 @@ def test_two_sessions_in_one_folder_do_not_overwrite_each_other(tmp_path):
     with pytest.raises(InputError, match=r"holds 1 images, but this session knows 0"):
         second.add(shot(POSES[0]), POSES[0], depth_scale=1e-3)
     assert (tmp_path / "image_00.npz").read_bytes() == held
-    assert second.views == 0
+    assert len(second.views) == 0
 
 
 def test_a_damaged_image_is_named(tmp_path):
@@ -79,8 +79,8 @@ record(sys.argv[1])
 def record(folder):
     """Three images, where they were asked for, and the next question."""
     session = session_of(folder)
-    while session.views < 3:
-        matrix = FIRST if session.views == 0 else session.next().matrix
+    while len(session.views) < 3:
+        matrix = FIRST if len(session.views) == 0 else session.next().matrix
         session.add(shot(matrix), matrix, depth_scale=1e-3)
     session.next()
     return session

@@ -13,7 +13,8 @@ from small_planner import CAMERA, FIRST, SCENE, planner_of
 from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
-from jaxnbv.planning.episode import observe_scene, simulate, steps
+from jaxnbv.planning.loop import Loop
+from jaxnbv.planning.simulate import observe_scene, simulate
 from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import SensorNoise
 from jaxnbv.search import DiscreteSearch, FarthestView, RandomView, UncertaintyView
@@ -39,8 +40,8 @@ def planner(search, views=4):
 
 
 def views_of(planner, key=KEY, noise=SensorNoise(), camera=CAMERA, first=FIRST):
-    for view, *_ in steps(planner, sensor_of(camera, noise), first, key, camera):
-        yield view
+    for step in Loop(planner, key, camera=camera).steps(sensor_of(camera, noise), first):
+        yield step.view
 
 
 def assert_same(a, b):
@@ -78,16 +79,17 @@ def test_views_that_are_known_are_told_and_not_asked_for():
         return sensor_of()(pose, key)
 
     done = [(view.pose, view.scan, view.proposal) for view in whole[:2]]
-    for step, expected in zip(steps(own, sensor, FIRST, KEY, done=done), whole, strict=True):
+    for step, expected in zip(Loop(own, KEY).steps(sensor, FIRST, done), whole, strict=True):
         assert_same(step.view, expected)
     assert len(asked) == 2
 
 
 def test_a_step_holds_the_samples_and_the_evidence_that_the_next_view_is_chosen_from():
     own = planner(DiscreteSearch(CANDIDATES), 3)
-    first, second, third = steps(own, sensor_of(), FIRST, KEY)
-    assert (first.basis, first.seconds) == (None, 0.0)
-    again = own.choose(second.observations, third.basis.surfaces, jax.random.key(0))
+    first, second, third = Loop(own, KEY).steps(sensor_of(), FIRST)
+    assert (first.inputs, first.seconds) == (None, 0.0)
+    assert_same(third.inputs.observations, second.observations)
+    again = own.choose(third.inputs, jax.random.key(0))
     assert_same(again, third.view.proposal)
     assert third.seconds > 0.0
 

@@ -12,18 +12,18 @@ from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.observations import Observations
-from jaxnbv.planning.episode import simulate
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.stopping import Budget, ValueBelow, context
+from jaxnbv.planning.simulate import simulate
+from jaxnbv.planning.stopping import Budget, Covered, Found, StopContext, Sure, ValueBelow, expected_coverage
 from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.search import DiscreteSearch, FarthestView
 from jaxnbv.surfaces import GeometricSPSR
-from jaxnbv.tasks import Coverage, Covered, CrossEntropy, EntropyReduction, Found, SoftPartCount, Sure
-from jaxnbv.tasks.coverage import expected_coverage
+from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, SoftPartCount
 
 SCENE, FIRST, KEY = SDFSurface(Sphere(0.8)), look_at((0.0, 0.0, 2.5)), jax.random.key(3)
 CAMERA, GRID = Camera(height=12, width=12), Grid(24)
@@ -40,8 +40,9 @@ def cloud_of(count, capacity=256):
     return PointCloud.from_arrays(0.8 * directions, directions, capacity)
 
 
-def after(planner, cloud, poses=(FIRST,), seconds=0.0):
-    return context(planner, Observations.before_views(cloud, 4, GRID), poses, KEY, seconds)
+def after(planner, cloud, poses=(FIRST,), seconds=0.0, frame=Frame(), surfaces=None):  # noqa: B008
+    observations = Observations.start(cloud, 4, GRID)
+    return StopContext(planner, observations, poses, seconds, KEY, lambda: surfaces, frame)
 
 
 def of_count(cloud, enough):
@@ -102,11 +103,10 @@ def test_found_counts_the_points_of_the_parts_that_are_asked_for(parts, points, 
 
 
 @pytest.mark.parametrize(("points", "size"), [(80, 0.1), (300, 0.05), (80, 0.4)])
-def test_expected_coverage_is_that_of_the_samples(points, size, monkeypatch):
+def test_expected_coverage_is_that_of_the_samples(points, size):
     """Of a posterior that holds one ball alone, whose rays and points are found anew in float64."""
     ball = balls(Grid(64), [0.8])
     planner = planner_of(Coverage())
-    monkeypatch.setattr(SurfaceSampler, "sample", lambda self, observations, key: ball)
     upper = np.asarray(fibonacci_sphere(points))
     upper = upper[upper[:, 1] > 0]
     cloud = PointCloud.from_arrays(0.8 * upper, upper, 256)
@@ -131,7 +131,7 @@ def test_expected_coverage_is_that_of_the_samples(points, size, monkeypatch):
         seen_area += area @ np.clip(2.0 - nearest / apart, 0.0, 1.0)
     share = float(seen_area / all_area)
     assert 0.05 < share < 0.97
-    known = after(planner, cloud)
+    known = after(planner, cloud, surfaces=ball)
     assert expected_coverage(known, size) == pytest.approx(share, abs=0.02)
     assert Covered(share - 0.03, size).after(known) is not None
     assert Covered(min(share + 0.03, 1.0), size).after(known) is None
@@ -140,7 +140,7 @@ def test_expected_coverage_is_that_of_the_samples(points, size, monkeypatch):
 def test_value_below_and_budgets_on_scripted_proposals():
     planner = planner_of(Coverage())
     asked = after(planner, cloud_of(50))
-    assert "a value of 0.3, less than 0.5" in ValueBelow(0.5).before(asked, FIRST, 0.3)
+    assert "a value of 0.3 scene units², less than 0.5" in ValueBelow(0.5).before(asked, FIRST, 0.3)
     assert ValueBelow(0.5).before(asked, FIRST, 0.5) is None
     east, top, west = (look_at(place) for place in ((2.5, 0.0, 0.0), (0.0, 2.5, 0.0), (-2.5, 0.0, 0.0)))
     quarter = 2.5 * np.pi / 2.0
@@ -151,6 +151,21 @@ def test_value_below_and_budgets_on_scripted_proposals():
     assert not Budget(seconds=1.0).needs_proposal
     assert Budget(seconds=30.5).after(way) is None
     assert Budget(seconds=30.0).after(way) == "30 of 30 seconds are spent"
+
+
+def test_lengths_are_those_of_the_world():
+    """A world in millimetres, 100 a scene unit: poses are of the scene, costs and values of the world."""
+    frame = Frame(0.01, (30.0, -40.0, 50.0), "z")
+    planner = planner_of(Coverage())
+    east, top, west = (look_at(place) for place in ((2.5, 0.0, 0.0), (0.0, 2.5, 0.0), (-2.5, 0.0, 0.0)))
+    way = after(planner, cloud_of(50), (east, top), frame=frame)
+    quarter = 250.0 * np.pi / 2.0
+    assert Budget(cost=2.01 * quarter).before(way, west, 1.0) is None
+    assert "would cost 393, but 196 of" in Budget(cost=1.5 * quarter).before(way, west, 1.0)
+    # A cost of one's own is asked about poses in the world, where z is up: by how much the camera is raised.
+    climb = Budget(cost=260.0, of=lambda start, end: jnp.abs(end.position[2] - start.position[2]))
+    assert "would cost 250, but 10 of 260" in climb.before(way, west, 1.0)
+    assert "0.3 world units², less than 0.5" in ValueBelow(0.5).before(way, west, 0.3)
 
 
 def test_the_first_rule_that_holds_ends_it():

@@ -76,7 +76,7 @@ def test_a_cost_that_breaks_its_contract_makes_a_value_of_nothing():
     costs = jnp.array([-1.0, 0.0, jnp.inf, jnp.nan, 2.0])
     poses = Pose(jnp.broadcast_to(jnp.eye(3), (5, 3, 3)), jnp.zeros((5, 3)).at[:, 1].set(jnp.arange(5.0)))
     cloud = PointCloud.from_arrays(np.eye(3), np.eye(3))
-    seen = Observations.before_views(cloud, 1, None)
+    seen = Observations.start(cloud, 1, None)
     weighed = ValuePerCost(lambda start, end: costs[end.position[1].astype(int)], fixed=0.5)
     np.testing.assert_array_equal(weighed(jnp.ones(5), seen, poses), 2.0)
     seen = dataclasses.replace(seen, num_views=seen.num_views + 1)

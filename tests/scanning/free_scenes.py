@@ -20,7 +20,7 @@ SOLIDS = {
     "ball": nbv.SDFSurface(Sphere(RADIUS).translate(CENTRE)),
     "box": nbv.SDFSurface(Cuboid(HALF).translate(CENTRE)),
 }
-SEE = eqx.filter_jit(nbv.Carving.seen_empty)
+SEE = eqx.filter_jit(nbv.Carving.empty_nodes)
 
 
 def nodes_of(grid):

@@ -64,13 +64,13 @@ def after_both_sides(planner, surface, poses=POSES):
 def test_no_sample_is_inside_what_was_seen_empty_nor_outside_the_volume():
     planner, raw = planner_of(), planner_of(carving=None)
     observations, raw_evidence = (after_both_sides(one, SOLIDS["ball"]) for one in (planner, raw))
-    assert raw_evidence.seen_empty is None
+    assert raw_evidence.empty_nodes is None
     expected = np.zeros((30,) * 3, bool)
     for pose in POSES:
         seen = SEE(CARVING, SMALL_GRID, pose, nbv.scan(SOLIDS["ball"], planner.camera, pose), planner.camera)
         assert seen.sum() > 200
         expected |= np.asarray(seen)
-    np.testing.assert_array_equal(observations.seen_empty, expected)
+    np.testing.assert_array_equal(observations.empty_nodes, expected)
 
     carved = np.asarray(planner.sampler.sample(observations, jax.random.key(1)).values)
     values = np.asarray(raw.sampler.sample(raw_evidence, jax.random.key(1)).values)
@@ -89,7 +89,7 @@ class Told(WavesModel):
     """Is told of space seen empty: its level says of how many points, and how far the farthest is out of the volume."""
 
     def condition(self, observations):
-        empty = nbv.Observations.of(observations).empty_points
+        empty = nbv.as_observations(observations).empty_points
         outermost = jnp.max(jnp.where(empty.mask, jnp.max(jnp.abs(empty.points), axis=1), 0.0))
         return WavesPosterior(level=1000.0 * jnp.sum(empty.mask) + outermost)
 
@@ -97,16 +97,16 @@ class Told(WavesModel):
 def test_the_model_is_told_of_what_was_seen_empty_within_the_volume():
     told, waves = planner_of(model=Told()), planner_of(carving=None)
     observations = after_both_sides(told, SOLIDS["ball"])
-    within = observations.seen_empty & CARVING.inside(SMALL_GRID)
-    empty = dataclasses.replace(observations, seen_empty=within).empty_points
+    within = observations.empty_nodes & CARVING.inside(SMALL_GRID)
+    empty = dataclasses.replace(observations, empty_nodes=within).empty_points
     points = np.asarray(empty.points)[np.asarray(empty.mask)]
     assert 50 < len(points) <= 20**3
     index = np.rint((points + SMALL_GRID.half_extent) / SMALL_GRID.spacing).astype(int)
-    assert np.asarray(observations.seen_empty)[tuple(index.T)].all()
+    assert np.asarray(observations.empty_nodes)[tuple(index.T)].all()
     assert np.abs(points).max() < 1.25
     key = jax.random.key(0)
     raw = waves.sampler.model.condition(observations.cloud).sample(key, 3).on_grid(SMALL_GRID.axis)
-    untouched = ~np.asarray(observations.seen_empty | CARVING.outside(SMALL_GRID))
+    untouched = ~np.asarray(observations.empty_nodes | CARVING.outside(SMALL_GRID))
     level = float((np.asarray(raw) - np.asarray(told.sampler.sample(observations, key).values))[:, untouched].mean())
     np.testing.assert_allclose(level, 1000.0 * len(points) + np.abs(points).max(), rtol=1e-4)
 
@@ -121,7 +121,7 @@ def test_carved_samples_keep_a_thin_sheet_that_was_seen_from_both_sides():
     sheet = nbv.SDFSurface(Cuboid([0.6, 0.6, 0.04]))
     observations = after_both_sides(planner, sheet, ABOVE_AND_BELOW)
     values = raw.sampler.sample(observations, jax.random.key(1)).values
-    carved = carve(values, observations.seen_empty | planner.sampler.carving.outside(SMALL_GRID))
+    carved = carve(values, observations.empty_nodes | planner.sampler.carving.outside(SMALL_GRID))
     narrow, poses = (
         nbv.Camera(height=10, width=10, fov=0.35),
         nbv.look_at(jnp.asarray([[0.0, 0.0, 2.5], [0.0, 0.0, -2.5]])),
@@ -142,10 +142,10 @@ def test_a_scan_of_another_camera_needs_that_camera():
     # Wider than the planner's own image.
     assert np.ptp(column) > 25
     assert np.ptp(row) > 10
-    np.testing.assert_array_equal(planner.init(pose, seen, camera=other).seen_empty, expected)
+    np.testing.assert_array_equal(planner.init(pose, seen, camera=other).empty_nodes, expected)
     observations = planner.init(POSES[0], nbv.scan(SOLIDS["ball"], planner.camera, POSES[0]))
     after = planner.observe(observations, pose, seen, camera=other)
-    np.testing.assert_array_equal(after.seen_empty, expected | np.asarray(observations.seen_empty))
+    np.testing.assert_array_equal(after.empty_nodes, expected | np.asarray(observations.empty_nodes))
     for tell in (lambda: planner.init(pose, seen), lambda: planner.observe(observations, pose, seen)):
         with pytest.raises(ValueError, match=r"scan has 720 rays but the camera 40 x 40: give the camera that took it"):
             tell()
@@ -157,10 +157,10 @@ def test_a_cloud_that_is_no_image_carves_nothing():
     cloud = nbv.PointCloud.from_arrays(*points.to_numpy())
     assert cloud.missed is None
     observations = planner.init(POSES[0], cloud)
-    assert not observations.seen_empty.any()
-    assert not planner.observe(observations, POSES[1], cloud).seen_empty.any()
+    assert not observations.empty_nodes.any()
+    assert not planner.observe(observations, POSES[1], cloud).empty_nodes.any()
     unknown = planner.init(None, nbv.scan(SOLIDS["ball"], planner.camera, POSES[0]))
-    assert not unknown.seen_empty.any(), "nothing is known of a scan from an unknown pose"
+    assert not unknown.empty_nodes.any(), "nothing is known of a scan from an unknown pose"
 
 
 def test_an_object_larger_than_its_volume_is_refused_and_one_that_fits_is_not():

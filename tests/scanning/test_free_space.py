@@ -83,7 +83,7 @@ def test_a_node_is_marked_only_if_all_rays_near_it_and_their_neighbours_went_on_
     points = np.asarray(pose.to_scene(jnp.asarray(np.where(hit, depth.ravel(), 0.0)[:, None] * rays, jnp.float32)))
     points = jnp.where(hit[:, None], points, 0.0)
     cloud = nbv.PointCloud(points, jnp.zeros_like(points), jnp.asarray(hit), jnp.asarray(np.isinf(depth.ravel())))
-    marked = np.asarray(nbv.Carving(margin_voxels=margin / grid.spacing).seen_empty(grid, pose, cloud, camera)).ravel()
+    marked = np.asarray(nbv.Carving(margin_voxels=margin / grid.spacing).empty_nodes(grid, pose, cloud, camera)).ravel()
 
     local = in_camera(nodes_of(grid).reshape(-1, 3), pose)
     unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
@@ -108,7 +108,7 @@ def marked_and_inside(centre, radius, half, axis, angle, start, end, direction, 
     solid = Cuboid(half).rotate(axis, angle).translate(centre) | Capsule(start, end, radius)
     pose = nbv.look_at(target + distance * direction, target)
     seen = nbv.SensorNoise()(nbv.scan(nbv.SDFSurface(solid), PLAIN, pose), key)
-    empty, inside = nbv.Carving().seen_empty(FINE, pose, seen, PLAIN), solid(FINE_NODES) < 0
+    empty, inside = nbv.Carving().empty_nodes(FINE, pose, seen, PLAIN), solid(FINE_NODES) < 0
     return jnp.sum(empty), jnp.sum(inside), jnp.sum(empty & inside)
 
 

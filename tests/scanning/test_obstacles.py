@@ -217,7 +217,7 @@ def test_no_proposal_is_inside_or_under_what_is_known():
         (point, normal), (half, block), (start, end) = solids
         arm = Capsule(start, end, 0.1)
         around = nbv.Obstacles((HalfSpace(point, normal), Cuboid(half).translate(block), arm), clearance=clearance)
-        observations = nbv.Observations.before_views(cloud, 2, None)
+        observations = nbv.Observations.start(cloud, 2, None)
         proposal = search.propose(nbv.Problem(observations, camera, nbv.Coverage(), None, around), key)
         return proposal.pose.position, proposal.value
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import jax
 from small_planner import FIRST, SCENE, planner_of
 
-from jaxnbv.planning.episode import simulate
+from jaxnbv.planning.simulate import simulate
 from jaxnbv.scanning import SensorNoise
 
 KEY = jax.random.key(0)

@@ -81,7 +81,7 @@ def test_three_views_continued_to_five_equal_five(finished, tmp_path):
     ends = [(each.views, each.observations_after(5)) for each in (episode, finished[0])]
     for a, b in zip(*map(jax.tree.leaves, ends), strict=True):
         np.testing.assert_array_equal(a, b)
-    assert ends[0][1].seen_empty.shape == (24, 24, 24)
+    assert ends[0][1].empty_nodes.shape == (24, 24, 24)
 
 
 def test_a_finished_run_is_read_not_computed(finished, monkeypatch):

@@ -132,8 +132,8 @@ def test_what_was_seen_empty_is_among_what_shapes_are_fitted_to():
     assert bool(seen.is_empty.all())
     node = (np.asarray(seen.empty, np.float64) + GRID.half_extent) / GRID.spacing
     np.testing.assert_allclose(node, np.rint(node), atol=1e-4)
-    assert np.asarray(observations.seen_empty)[tuple(np.rint(node).astype(int).T)].all()
-    nothing = dataclasses.replace(observations, seen_empty=None, grid=None)
+    assert np.asarray(observations.empty_nodes)[tuple(np.rint(node).astype(int).T)].all()
+    nothing = dataclasses.replace(observations, empty_nodes=None, grid=None)
     assert not bool(Seen.of(nothing).is_empty.any())
 
 

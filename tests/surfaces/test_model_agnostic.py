@@ -30,7 +30,7 @@ class SpherePosterior(nbv.SurfacePosterior):
 
 class RandomSpheres(nbv.SurfaceModel):
     def condition(self, observations):
-        return SpherePosterior(jnp.asarray(0.0), nbv.Observations.of(observations).cloud)
+        return SpherePosterior(jnp.asarray(0.0), nbv.as_observations(observations).cloud)
 
 
 CAMERA = nbv.Camera(height=16, width=16)

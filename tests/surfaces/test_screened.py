@@ -85,8 +85,8 @@ def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
         nbv.GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8),
         (nbv.OutsideBoundary(num_points=60), nbv.SeenEmpty(30)),
     )
-    nothing = nbv.Observations.before_views(data, 1, grid)
-    seen = eqx.tree_at(lambda e: e.seen_empty, nothing, jnp.asarray(is_beside | beyond))
+    nothing = nbv.Observations.start(data, 1, grid)
+    seen = eqx.tree_at(lambda e: e.empty_nodes, nothing, jnp.asarray(is_beside | beyond))
     without, with_bank = (model.condition(observations) for observations in (nothing, seen))
     beside = nodes[is_beside]
     near, far = beside + np.array([0.0, 0.0, 0.1]), beside * np.array([1.0, -1.0, 1.0])
@@ -101,13 +101,13 @@ def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
     assert np.asarray(rows.mask).all()
     assert len(np.unique(np.asarray(rows.points), axis=0)) == 30
     assert {tuple(p) for p in np.asarray(rows.points)} <= {tuple(p) for p in np.float32(beside)}
-    for observations in (nothing, nbv.Observations.of(data)):
+    for observations in (nothing, nbv.as_observations(data)):
         assert not np.asarray(nbv.SeenEmpty(30).rows(observations).mask).any()
 
 
 def test_rows_beyond_the_data_are_not_filled():
     data = ball(RNG, 20)
-    rows = nbv.OnSurface(30).rows(nbv.Observations.of(data))
+    rows = nbv.OnSurface(30).rows(nbv.as_observations(data))
     assert np.asarray(rows.mask).sum() == 20
     assert len(np.unique(np.asarray(rows.points)[:20], axis=0)) == 20
 

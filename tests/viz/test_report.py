@@ -176,8 +176,8 @@ def test_any_posterior_has_a_surface_with_a_standard_deviation():
 def test_the_surface_of_the_mean_is_carved():
     planner = small_planner(nbv.RandomView(), model=SphereModel(), grid=nbv.Grid(40))
     observations = planner.init(None, nbv.PointCloud.from_arrays([[0.9, 0.0, 0.0]], [[1.0, 0.0, 0.0]]))
-    empty = jnp.broadcast_to((planner.sampler.grid.axis > 0.3)[:, None, None], observations.seen_empty.shape)
-    vertices = surface_of(planner.sampler, eqx.tree_at(lambda s: s.seen_empty, observations, empty)).vertices
+    empty = jnp.broadcast_to((planner.sampler.grid.axis > 0.3)[:, None, None], observations.empty_nodes.shape)
+    vertices = surface_of(planner.sampler, eqx.tree_at(lambda s: s.empty_nodes, observations, empty)).vertices
     assert vertices[:, 0].max() < 0.3 + planner.sampler.grid.spacing
     # The other side is as it was.
     left = vertices[vertices[:, 0] < 0.3 - planner.sampler.grid.spacing]

@@ -11,11 +11,8 @@ from jaxtyping import Bool, Float, Real
 from scipy.stats import spearmanr
 
 from jaxnbv.checks import AnyArray
-from jaxnbv.observations import Observations
-from jaxnbv.sampler import SurfaceSampler
-from jaxnbv.scanning import GridSurface
+from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.studies.engine.measures import SECONDS, Measure, Record
-from jaxnbv.surfaces import SurfacePosterior
 
 # What the studies call having seen it: rays of one scan that hit the cue of the class.
 CUE_PIXELS = 150
@@ -54,17 +51,18 @@ def _value(record: Record, method: str) -> dict[int, float]:
     return {view: step["value"] for view, step in enumerate(steps, start=2)}
 
 
-def roughness(
-    sampler: SurfaceSampler, observations: Observations, posterior: SurfacePosterior, surfaces: GridSurface
-) -> float:
+def roughness(sampler: SurfaceSampler, inputs: StepInputs) -> float:
     """Cells of the grid that a sample's surface crosses, mean over samples, per cell that the mean's surface crosses,
     carved as the samples are. Of a posterior without closed forms the mean is that of these samples.
 
     About 1 for samples as smooth as the mean. It rises when the spacing of the data exceeds the kernel's width; near 5
     an acquisition says little about the value of a view.
     """
-    values = np.asarray(surfaces.values)
-    mean = np.asarray(sampler.mean(observations, posterior)) if posterior.has_closed_forms else values.mean(axis=0)
+    posterior, surfaces = inputs.posterior, inputs.surfaces
+    assert posterior is not None
+    assert surfaces is not None
+    values, closed = np.asarray(surfaces.values), posterior.has_closed_forms
+    mean = np.asarray(sampler.mean(inputs.observations, posterior)) if closed else values.mean(axis=0)
     samples = [crossed_cells(one) for one in values]
     return float(np.mean(samples)) / max(crossed_cells(mean), 1)
 

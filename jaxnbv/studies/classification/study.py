@@ -18,7 +18,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale, pretrained_classifier
-from jaxnbv.planning.episode import Sensor, Step
+from jaxnbv.planning.loop import Sensor, Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SensorNoise, scan
 from jaxnbv.search import CandidateSearch, Problem, Proposal, Search, TieBreakSearch
@@ -261,7 +261,7 @@ class ClassificationStudy(Study):
         and by the view being chosen how well values agreed with what the candidates would truly show, and how rough
         the samples were."""
         found: dict[str, list] = {name: [] for name in ("log_p", "pixels", "rank_correlation", "roughness")}
-        for view, _, basis, _ in episode:
+        for view, _, inputs, _ in episode:
             found["log_p"].append(np.asarray(_classify(self.classifier, view.cloud)).tolist())
             pose = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], view.pose)
             found["pixels"].append(int(scan_cue(truth.thing, self.camera, pose)[0][0]))
@@ -269,8 +269,8 @@ class ClassificationStudy(Study):
             if self.cue and view.proposal is not None and len(view.proposal.values) == self.num_candidates:
                 values = np.asarray(view.proposal.values)
                 rank = rank_correlation(values, truth.pixels, np.isfinite(values))
-            if basis is not None:
-                rough = roughness(planner.sampler, basis.observations, basis.posterior, basis.surfaces)
+            if inputs is not None:
+                rough = roughness(planner.sampler, inputs)
             found["rank_correlation"].append(rank)
             found["roughness"].append(rough)
         return found | {"log_p": [found["log_p"]], "pixels": [found["pixels"]] if self.cue else []}

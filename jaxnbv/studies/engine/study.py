@@ -19,8 +19,9 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.observations import Observations
-from jaxnbv.planning.episode import Sensor, Step, observe_scene, steps, view_keys
+from jaxnbv.planning.loop import Loop, Sensor, Step, view_keys
 from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.simulate import observe_scene
 from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Grid, SensorNoise, Surface
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
@@ -323,7 +324,7 @@ class Study(eqx.Module):
         views: list[dict[str, list]] = []
         taken: list[dict[str, float]] = []
         key = self.key(scene.index, "episode") if key is None else key
-        episode = steps(planner, self.sensor(scene), self.candidates.poses()[first], key, self.camera)
+        episode = Loop(planner, key, camera=self.camera).steps(self.sensor(scene), self.candidates.poses()[first])
 
         def noted() -> Iterator[Step]:
             for step in itertools.islice(episode, self.views):
@@ -348,10 +349,10 @@ class Study(eqx.Module):
         """Each scan of a method, and the observations after it, made again from the poses of its record."""
         key, sensor = self.key(scene.index, "episode"), self.sensor(scene)
         poses = enumerate(self.poses_of(run))
-        views = [(pose, sensor(pose, view_keys(key, index)[2]), self.camera) for index, pose in poses]
+        views = [(pose, sensor(pose, view_keys(key, index)[2])) for index, pose in poses]
         # It depends on the planner through its capacity and what it carves alone.
-        known = self.planner(self.methods[0], scene).replay(views)
-        return [(scan, observations) for (_, scan, _), observations in zip(views, known, strict=True)]
+        known = self.planner(self.methods[0], scene).replay(views, self.camera)
+        return [(scan, observations) for (_, scan), observations in zip(views, known, strict=True)]
 
     def poses_of(self, run: Record) -> list[Pose]:
         """Where a method's views were taken."""

@@ -17,7 +17,7 @@ from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, farthest_point_subsample
 from jaxnbv.networks import CloudSegmenter
-from jaxnbv.planning.episode import Step
+from jaxnbv.planning.loop import Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, MeshParts, TriangleMesh
 from jaxnbv.scanning.metrics import true_mesh

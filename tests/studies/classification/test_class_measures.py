@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv import GeometricSPSR, Grid, GridSurface, Observations, PointCloud
-from jaxnbv.sampler import SurfaceSampler
+from jaxnbv import GeometricSPSR, Grid, GridSurface, PointCloud, as_observations
+from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.studies.classification.measures import crossed_cells, first_hits, rank_correlation, roughness, stable_hits
 from jaxnbv.studies.classification.objects import PyramidStudy
 
@@ -83,17 +83,17 @@ def test_roughness_counts_the_samples_cells_per_cell_of_the_mean():
     directions = np.random.default_rng(0).normal(size=(200, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     cloud = PointCloud.from_arrays(directions, directions)
-    sampler, observations = SurfaceSampler(model, grid=grid, carving=None), Observations.of(cloud)
+    sampler, observations = SurfaceSampler(model, grid=grid, carving=None), as_observations(cloud)
     posterior = model.condition(cloud)
     mean = np.asarray(posterior.mean_field.on_grid(grid.axis))
     once = GridSurface.from_values(jnp.asarray(mean), posterior.level, grid)
-    assert roughness(sampler, observations, posterior, once) == pytest.approx(1.0)
+    assert roughness(sampler, StepInputs(observations, posterior, once)) == pytest.approx(1.0)
     # A second sample, far inside, that crosses as many cells as one node has around it.
     speck = np.full_like(mean[0], 1.0)
     speck[5, 5, 5] = -1.0
     both = GridSurface.from_values(jnp.stack([mean[0] - posterior.level, jnp.asarray(speck)]), 0.0, grid)
     cells = crossed_cells(mean[0] - float(posterior.level))
-    assert roughness(sampler, observations, posterior, both) == pytest.approx(0.5 * (1.0 + 8.0 / cells))
+    assert roughness(sampler, StepInputs(observations, posterior, both)) == pytest.approx(0.5 * (1.0 + 8.0 / cells))
     samples = posterior.sample(jax.random.key(0), 2).on_grid(grid.axis)
     assert roughness(sampler, observations, posterior, GridSurface.from_values(samples, posterior.level, grid)) > 0.8
 

@@ -1,0 +1,58 @@
+"""A list of poses of fixed room, so that nothing recompiles as it grows."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnbv.geometry.pose import Pose
+
+# Poses nearer than this in position (scene units) and in viewing direction are the same.
+_SAME = 1e-3
+
+
+class PoseList(eqx.Module):
+    """The first `count` rows of `rows`, in scene coordinates; the other rows are the identity."""
+
+    rows: Pose
+    count: Int[Array, ""]
+
+    @classmethod
+    def empty(cls, room: int) -> "PoseList":
+        """A list without poses, with room for `room` of them."""
+        dtype = jnp.result_type(float)
+        rows = Pose(np.tile(np.eye(3, dtype=dtype), (room, 1, 1)), np.zeros((room, 3), dtype))
+        return cls(rows, jnp.asarray(0, jnp.int32))
+
+    @property
+    def room(self) -> int:
+        """How many poses fit."""
+        return self.rows.position.shape[0]
+
+    @property
+    def last(self) -> Pose:
+        """The pose that was appended last; the identity of an empty list."""
+        return jax.tree.map(lambda rows: rows[self.count - 1], self.rows)
+
+    def append(self, pose: Pose) -> "PoseList":
+        """A list with one more pose; a full list stays as it is."""
+        rows = jax.tree.map(lambda rows, row: rows.at[self.count].set(row), self.rows, pose)
+        return dataclasses.replace(self, rows=rows, count=jnp.minimum(self.count + 1, self.room))
+
+    def holds(self, poses: Pose) -> Bool[Array, " poses"]:
+        """Whether each of a batch of poses equals one of the list, to 1e-3 in position and viewing direction."""
+        near = jnp.linalg.norm(poses.position[:, None] - self.rows.position[None], axis=-1) < _SAME
+        aligned = jnp.linalg.norm(poses.forward[:, None] - self.rows.forward[None], axis=-1) < _SAME
+        return jnp.any(near & aligned & self._is_filled, axis=1)
+
+    def distance(self, poses: Pose) -> Float[Array, " poses"]:
+        """Distance from each of a batch of positions to the nearest of the list; infinite if it is empty."""
+        distance = jnp.linalg.norm(poses.position[:, None] - self.rows.position[None], axis=-1)
+        return jnp.min(jnp.where(self._is_filled, distance, jnp.inf), axis=1)
+
+    @property
+    def _is_filled(self) -> Bool[Array, " room"]:
+        return jnp.arange(self.room) < self.count
