@@ -54,7 +54,7 @@ def draw_posterior(
     truth = np.asarray(scene.sdf(plane)).reshape(y.shape)
     figure = Figure(figsize=(9.6, 3.5))
     first, second, third = (figure.add_axes((left, 0.02, 0.32, 0.86)) for left in (0.0, 0.34, 0.67))
-    pose = observations.poses[0]
+    pose = observations.poses.rows[0]
     still = Still(beside(pose), None, 500, 2.5)
     points, _ = observations.cloud.to_numpy()
     frame(first, still, draw_items(first, still, seen_items(points[:0], points, [pose], planner.camera)))

@@ -149,16 +149,16 @@ class Loop:
 
         **Raises:** `ValueError` as `propose` and `add` do.
         """
-        pose, inputs, proposal = first, None, None
+        pose, inputs, seconds = first, None, 0.0
         if self.views:
             if self.enough() is not None:
                 return None
-            proposal, inputs = self.propose(), self._next.inputs if self.planner.search.uses_samples else None
-            pose = proposal.pose
+            pose, seconds = self.propose().pose, self._next.seconds
+            inputs = self._next.inputs if self.planner.search.uses_samples else None
         self._begin(STAGES[2])
         *_, noise_key = view_keys(self.key, len(self.views))
         view = self.add(pose, sensor(pose, noise_key))
-        return Step(view, self.observations, inputs, 0.0 if proposal is None else self._next.seconds)
+        return Step(view, self.observations, inputs, seconds)
 
     def steps(
         self, sensor: Sensor, first: Pose, stored: Iterable[tuple[Pose, PointCloud, Proposal | None]] = ()

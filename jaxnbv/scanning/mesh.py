@@ -60,6 +60,10 @@ class TriangleMesh(Surface):
         self.frame = frame
         self._tree = _Tree()
 
+    @property
+    def world(self) -> Frame:
+        return self.frame
+
     @classmethod
     def from_arrays(
         cls, vertices: Float[AnyArray, "v 3"] | list, faces: Int[AnyArray, "f 3"] | list, up: str = "y"

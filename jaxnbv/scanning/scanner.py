@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from jaxnbv.checks import AnyArray, check_fields, checked, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 
 
@@ -37,6 +38,11 @@ class Surface(eqx.Module):
     """
 
     in_jit: eqx.AbstractClassVar[bool]
+
+    @property
+    def world(self) -> Frame | None:
+        """The frame of the world that the surface was given in; None where that is the scene."""
+        return None
 
     @abstractmethod
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:

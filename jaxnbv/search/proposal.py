@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 
 
@@ -44,6 +45,24 @@ class Proposal(eqx.Module):
     trajectories: Trajectories | None = None
     standard_errors: Float[Array, " candidates"] | None = None
     difference_errors: Float[Array, " candidates"] | None = None
+
+    def in_world(self, frame: Frame, length_power: int) -> "Proposal":
+        """The proposal with its values, a power of length, and their errors in world units; poses stay in the scene."""
+
+        def convert(values):
+            return None if values is None else frame.length_to_world(values, length_power)
+
+        ways = self.trajectories
+        return Proposal(
+            self.pose,
+            convert(self.value),
+            self.candidates,
+            convert(self.values),
+            convert(self.standard_error),
+            None if ways is None else Trajectories(ways.poses, convert(ways.values)),
+            convert(self.standard_errors),
+            convert(self.difference_errors),
+        )
 
     def tied_with_best(self, errors: float = 2.0) -> Bool[Array, " candidates"] | None:
         """Which candidates the samples cannot tell from the best one, itself included: those whose value is within so

@@ -7,6 +7,7 @@
 """
 
 import functools
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnbv.acquisition import Answer, Quantity
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.tasks.classification import ClassAnswer
 from jaxnbv.tasks.heat import Coldest
 from jaxnbv.tasks.segmentation import PartAnswer
@@ -225,19 +227,22 @@ class _CoverageWords(Words):
         return (Chart(f"surface seen ({self.answer.unit})", self.answer.names, _rows(answers)),)
 
 
-def label_of(quantity: Quantity) -> str:
-    """A quantity's name with its unit."""
-    return f"{quantity.name} ({quantity.unit})" if quantity.unit else quantity.name
+def label_of(quantity: Quantity, frame: Frame = Frame()) -> str:  # noqa: B008
+    """A quantity's name with its unit, lengths in the units of a frame's world."""
+    unit = quantity.unit_in(frame)
+    return f"{quantity.name} ({unit})" if unit else quantity.name
 
 
-def shown_value(quantity: Quantity, value: float) -> str:
-    """A value with its unit, where the unit is a length or an area."""
-    return f"{number(value)} {quantity.unit}" if quantity.unit.startswith("scene units") else number(value)
+def shown_value(quantity: Quantity, value: float, frame: Frame) -> str:
+    """A value in the world of a frame, with its unit where that is a length or an area."""
+    return f"{number(value)} {quantity.unit_in(frame)}" if quantity.length_power else number(value)
 
 
-def coordinates(point: Float[np.ndarray, "3"]) -> str:
-    """A point in scene units."""
-    x, y, z = (f"{coordinate:.2f}".replace("-", "−") for coordinate in point)
+def coordinates(point: Float[np.ndarray, "3"], frame: Frame = Frame()) -> str:  # noqa: B008
+    """A point of the scene, in the world of a frame: two digits of a scene unit after the point, or as fine in the
+    world."""
+    digits = max(0, 2 + math.ceil(math.log10(frame.scale)))
+    x, y, z = (f"{coordinate:.{digits}f}".replace("-", "−") for coordinate in frame.to_world(np.asarray(point)))
     return f"({x}, {y}, {z})"
 
 

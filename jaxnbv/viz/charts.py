@@ -103,7 +103,7 @@ def other_charts(data: ReportData) -> list[tuple[str, Figure]]:
     if any(view.proposal is not None for view in data.views):
         figure = Figure(figsize=_LARGE, layout="constrained")
         figure.legend(handles=draw_values(figure.subplots(), data), ncols=2, **_BELOW)
-        charts.append((label_of(data.quantity), figure))
+        charts.append((label_of(data.quantity, data.episode.frame), figure))
     return charts
 
 

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from jaxnbv.acquisition import Quantity
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.search import Proposal
 from jaxnbv.viz import sphere
@@ -57,8 +58,11 @@ def marks(*proposals: Proposal) -> list[str]:
     return found + ["○ start, ● end of an ascent"] * climbed
 
 
-def draw_choice(figure: Figure, proposal: Proposal | None, quantity: Quantity) -> None:
-    """Draw the map, and under it the candidates by value over a colour bar; of a given view the map's grid alone."""
+def draw_choice(figure: Figure, proposal: Proposal | None, quantity: Quantity, frame: Frame) -> None:
+    """Draw the map, and under it the candidates by value over a colour bar; of a given view the map's grid alone.
+
+    - `frame`: of the world in whose units the values are.
+    """
     colours = draw_acquisition(figure.add_axes((0.06, 0.4, 0.88, 0.58)), proposal, quantity)
     if proposal is None or colours is None:
         return
@@ -68,7 +72,7 @@ def draw_choice(figure: Figure, proposal: Proposal | None, quantity: Quantity) -
     bar.locator = MaxNLocator(5)
     bar.formatter = FuncFormatter(lambda value, _: number(value))
     errors = "" if proposal.standard_errors is None else "; lines: standard errors"
-    figure.text(0.5, 0.04, textwrap.fill(label_of(quantity) + errors, _LETTERS), ha="center", va="center")
+    figure.text(0.5, 0.04, textwrap.fill(label_of(quantity, frame) + errors, _LETTERS), ha="center", va="center")
 
 
 def draw_candidates(axes: Axes, proposal: Proposal) -> None:

@@ -1,5 +1,7 @@
 """What the pictures of an episode show, as plain arrays: computed once a view, drawn by `report` and `figures`."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -8,7 +10,6 @@ from jaxtyping import Float
 from jaxnbv.acquisition import Quantity
 from jaxnbv.checks import AnyArray
 from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import View
@@ -28,10 +29,10 @@ from jaxnbv.viz.words import told
 class ViewData(eqx.Module):
     """One view, ready to be drawn.
 
-    - `view`: itself.
+    - `view`: itself, the values of its proposal in world units.
     - `before`: points kept before it, in scene coordinates.
     - `surface`: of the posterior mean after it, where it holds points, with a deviation that allows for what was not
-      seen; None where it has none within the grid.
+      seen, in world units; None where it has none within the grid.
     - `seen`: how much of the surface was seen.
     - `told`: what happened, in words by their headings.
     - `imagined`: what was imagined before it was taken; None for a view that was given.
@@ -62,22 +63,18 @@ class ViewData(eqx.Module):
 
 
 class ReportData(eqx.Module):
-    """All views of an episode, what the values of its search mean, what the views were for, whence they are drawn.
-
-    - `frame`: to the world that the object's file was given in; None where there was none.
-    """
+    """All views of an episode, what the values of its search mean, what the views were for, whence they are drawn."""
 
     episode: Episode
     views: tuple[ViewData, ...]
     quantity: Quantity
     task: Task
     stage: Stage
-    frame: Frame | None
 
     @property
     def camera(self) -> Camera:
         """Which took the views."""
-        return self.episode.planner.camera
+        return self.episode.sensor
 
     @property
     def deviations(self) -> tuple[float, float]:
@@ -102,7 +99,7 @@ def report_data(
     - `sketches`: what was drawn while the episode was under way. For a step that is not among them the model is
       conditioned and sampled again.
     """
-    planner = episode.planner
+    planner, frame = episode.planner, episode.frame
     if truth is None and episode.scene is not None:
         truth = truth_points(episode.scene, jax.random.key(0))
     task = task_of(episode, truth, rival)
@@ -110,18 +107,24 @@ def report_data(
     following = progress_bar(
         sketches_of(episode, held, imagine), progress, desc="drawing views", total=len(episode.views)
     )
-    drawn: list[ViewData] = []
+    power, drawn = planner.quantity.length_power, list[ViewData]()
+    views = [
+        view if view.proposal is None else dataclasses.replace(view, proposal=view.proposal.in_world(frame, power))
+        for view in episode.views
+    ]
     leading = Sketch(None, None)
     for index, next_one in enumerate(following):
-        view = episode.views[index]
-        words = told(planner.quantity, episode.views[: index + 1], task.amounts[: index + 1])
+        view = views[index]
+        words = told(planner.quantity, views[: index + 1], task.amounts[: index + 1], frame)
         if not task.is_coverage:
             answered = words_of(task.answers[index]).said(task.answers[index - 1] if index else None)
             words["What came"] += f" {capital(answered)}."
         before = episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), np.float32)
         look = taken_look(view, episode.sensor, before)
-        drawn.append(ViewData(view, before, next_one.surface, task.amounts[index], words, leading.imagined, look))
+        surface = next_one.surface
+        if surface is not None:
+            surface = dataclasses.replace(surface, deviation=frame.length_to_world(surface.deviation))
+        drawn.append(ViewData(view, before, surface, task.amounts[index], words, leading.imagined, look))
         leading = next_one
     means = [view.surface.mesh for view in drawn if view.surface is not None]
-    frame = getattr(episode.scene, "frame", None)
-    return ReportData(episode, tuple(drawn), planner.quantity, task, stage_of(episode, means), frame)
+    return ReportData(episode, tuple(drawn), planner.quantity, task, stage_of(episode, means))

@@ -30,7 +30,6 @@ STYLE: dict[Any, Any] = {
     "figure.facecolor": "white",
 }
 _ROW, _LINE = 5.0, 0.26
-_DEVIATION_LABEL = "standard deviation of the surface (scene units)"
 
 
 def overview_figure(data: ReportData) -> Figure:
@@ -73,4 +72,4 @@ def _draw_deviations(axes: Any, data: ReportData) -> None:
     bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
     bar.ax.xaxis.set_minor_locator(NullLocator())
     bar.ax.tick_params(labelsize=12)
-    bar.set_label(_DEVIATION_LABEL, fontsize=12)
+    bar.set_label(f"standard deviation of the surface ({data.episode.frame.unit})", fontsize=12)

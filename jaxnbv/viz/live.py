@@ -18,6 +18,7 @@ from jaxnbv.acquisition import Quantity
 from jaxnbv.checks import checked
 from jaxnbv.errors import optional
 from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Episode
@@ -103,6 +104,8 @@ class LiveView:
         observations: Observations | None = None,
     ) -> None:
         views, planner, sampler = episode.views, episode.planner, episode.planner.sampler
+        if proposal is not None:
+            proposal = proposal.in_world(episode.frame, planner.quantity.length_power)
         new, _ = views[-1].scan.to_numpy()
         before = views[-2].cloud.to_numpy()[0] if len(views) > 1 else new[:0]
         scene, picture = self._server.scene, None if expected is None else _depth_picture(expected)
@@ -130,7 +133,7 @@ class LiveView:
                 label = "depth expected there"
                 self._image = None if picture is None else self._server.gui.add_image(picture, label=label)
                 self._text.content = _told(episode, posterior, proposal)
-                self._legend.content = _legend(surface, proposal, planner.quantity)
+                self._legend.content = _legend(surface, proposal, planner.quantity, episode.frame)
 
     def save(self, path: str | Path) -> Path:
         """Write the scene as it is now, with its text and legend, as one HTML file, which opens offline."""
@@ -154,8 +157,11 @@ def _told(episode: Episode, posterior: SurfacePosterior | None, proposal: Propos
     if isinstance(posterior, KnownShapesPosterior):
         lines.append(may_be_words(tuple(posterior.kinds().items())))
     if proposal is not None:
-        about = "" if proposal.standard_error is None else f" ± {proposal.standard_error:.2g}"
-        lines.append(f"The next view has a {sought.name} of {shown_value(sought, float(proposal.value))}{about}.")
+        frame, error = episode.frame, proposal.standard_error
+        about = "" if error is None else f" ± {float(error):.2g}"
+        lines.append(
+            f"The next view has a {sought.name} of {shown_value(sought, float(proposal.value), frame)}{about}."
+        )
     return "\n\n".join(lines)
 
 
@@ -208,16 +214,16 @@ def _choice(scene: Any, camera: Camera, proposal: Proposal, picture: np.ndarray 
     return [*found, _frustum(scene, "/next view", camera, proposal.pose, _NEXT, picture)]
 
 
-def _legend(surface: MeanSurface | None, proposal: Proposal | None, sought: Quantity) -> str:
+def _legend(surface: MeanSurface | None, proposal: Proposal | None, sought: Quantity, frame: Frame) -> str:
     """What the colours mean, as HTML."""
     marks = [("points before", BEFORE), ("new points, last camera", NEW), ("earlier cameras", GREY)]
     marks += [] if proposal is None else [("next view", _NEXT)]
     rows = [f'<div><b style="color:{colour}">&#9679;</b> {name}</div>' for name, colour in marks]
     if surface is not None:
-        low, high = middle_range(surface.deviation)
-        rows.append(_bar("the surface is known to, in scene units", DEVIATION, f"{low:g}", f"{high:g}"))
+        low, high = middle_range(frame.length_to_world(surface.deviation))
+        rows.append(_bar(f"the surface is known to, in {frame.unit}", DEVIATION, f"{low:g}", f"{high:g}"))
     if proposal is not None and np.isfinite(proposal.values).any():
-        ends = (shown_value(sought, value) for value in colour_range(open_values(proposal)))
+        ends = (shown_value(sought, value, frame) for value in colour_range(open_values(proposal)))
         rows.append(_bar(f"candidates: {sought.name}", VALUE, *ends))
     return f'<div style="padding:0 1em 1em;font-size:.85em">{"".join(rows)}</div>'
 

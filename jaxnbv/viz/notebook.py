@@ -173,7 +173,7 @@ def _(observations: Observations) -> Drawing:
 
 @drawing_of.register
 def _(session: Session) -> Drawing:
-    if session.views == 0:
+    if not session.views:
         return Drawing(None, "no image yet")
     shown, next_view = drawing_of(session.episode), session.next_view
     value = "" if next_view is None else f"; the next view is worth {next_view.value:.4g}"

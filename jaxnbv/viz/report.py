@@ -18,6 +18,7 @@ from PIL import Image
 from plotly.offline import get_plotlyjs
 
 from jaxnbv.checks import AnyArray, checked
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.planning.episode import Episode
 from jaxnbv.storage import describe
 from jaxnbv.storage.files import make_folder, write_text
@@ -76,12 +77,13 @@ def report_html(data: ReportData, title: str) -> str:
         Path(__file__).with_name("report.html"),
         title=title,
         data=data,
-        label=capital(label_of(data.quantity)),
+        label=capital(label_of(data.quantity, data.episode.frame)),
         pictures=pictures,
         task_charts=charts[0],
         other_charts=charts[1],
         settings=_settings(data.episode, title),
-        units="scene units" if data.frame is None else "the units of the object's file",
+        units=_world_of(data.episode)[1],
+        length=data.episode.frame.unit,
         gradient=gradient(DEVIATION),
         ticks=_deviation_ticks(data),
         # Plotly writes a figure with its numbers packed.
@@ -101,10 +103,17 @@ def picture_address(picture: UInt8[np.ndarray, "h w _"]) -> str:
 
 
 def _matrix(data: ReportData, index: int) -> str:
-    """Camera to the world of the object's file, or to the scene where there is none, by OpenCV's axes; as JSON."""
-    pose = data.views[index].pose
-    placed = pose if data.frame is None else data.frame.to_world(pose)
+    """Camera to world, by OpenCV's axes; as JSON."""
+    placed = _world_of(data.episode)[0].to_world(data.views[index].pose)
     return json.dumps(np.asarray(placed.to_matrix(), np.float64).round(6).tolist())
+
+
+def _world_of(episode: Episode) -> tuple[Frame, str]:
+    """The frame of the world in which poses are copied, and its units: the session's, that of the object's file, or
+    the scene."""
+    if episode.scene is not None and (own := episode.scene.world) is not None:
+        return own, "the units of the object's file"
+    return episode.frame, episode.frame.unit
 
 
 def _deviation_ticks(data: ReportData) -> list[tuple[float, str]]:
@@ -129,7 +138,7 @@ def _scene(data: ReportData, index: int) -> str:
 def _why(data: ReportData, index: int) -> str:
     """Why a view was chosen."""
     figure = Figure(figsize=_WHY, facecolor="none")
-    draw_choice(figure, data.views[index].proposal, data.quantity)
+    draw_choice(figure, data.views[index].proposal, data.quantity, data.episode.frame)
     return picture_address(_pixels(figure, _WHY_DPI))
 
 

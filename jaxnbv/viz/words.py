@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxnbv.acquisition import Quantity
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.loop import View
 from jaxnbv.search import Proposal
@@ -13,31 +14,32 @@ from jaxnbv.viz.choice import best_first, directions_of
 from jaxnbv.viz.sphere import unit
 
 
-def told(quantity: Quantity, views: Sequence[View], seen: Sequence[CoverageAnswer]) -> dict[str, str]:
+def told(quantity: Quantity, views: Sequence[View], seen: Sequence[CoverageAnswer], frame: Frame) -> dict[str, str]:
     """What happened at the last of some views: where it looks from, what was expected of it, how that stands beside the
     other candidates, what came; each by its heading, and left out where there is none.
 
-    `seen`: how much was seen after each view.
+    - `views`: with the values of their proposals in world units; `frame`: of that world.
+    - `seen`: how much was seen after each view.
     """
     *earlier, view = views
     points, amount = int(view.scan.count), seen[-1].amount
     if view.proposal is None or not earlier:
         of = "the true surface" if seen[-1].unit == "%" else "surface"
         found = f"It found {points:,} points, {amount} of {of}."
-        return {"Where": f"It was given. It looks from {place(view.pose)}.", "What came": found}
+        return {"Where": f"It was given. It looks from {place(view.pose, frame)}.", "What came": found}
     here, there = directions_of(view.pose), np.stack([directions_of(other.pose) for other in earlier])
     nearest = np.degrees(np.arccos(np.clip((there @ here).max(), -1.0, 1.0)))
     added = f"It added {points:,} points ({int(view.cloud.count):,} are kept)" if points else "It saw nothing"
     before = seen[-2].amount
     grown = f"stayed at {amount}" if before == amount else f"went from {before} to {amount}"
     return {
-        "Where": f"It looks from {place(view.pose)}, {nearest:.0f}° from the nearest earlier view.",
-        **_reason(quantity, view.proposal),
+        "Where": f"It looks from {place(view.pose, frame)}, {nearest:.0f}° from the nearest earlier view.",
+        **_reason(quantity, view.proposal, frame),
         "What came": f"{added}; {'coverage' if seen[-1].unit == '%' else 'surface seen'} {grown}.",
     }
 
 
-def _reason(quantity: Quantity, proposal: Proposal) -> dict[str, str]:
+def _reason(quantity: Quantity, proposal: Proposal, frame: Frame) -> dict[str, str]:
     """What was expected of a view, and how that stands beside the other candidates."""
     value, others, tied = float(proposal.value), best_first(proposal).tolist(), proposal.num_tied
     if not quantity.smooth:
@@ -48,7 +50,7 @@ def _reason(quantity: Quantity, proposal: Proposal) -> dict[str, str]:
     if climbed and proposal.trajectories is not None:
         starts = len(proposal.trajectories.values)
         how = f"found by gradient ascent from {starts} start{'s' * (starts > 1)}"
-    said = {"What it promised": f"Its {quantity.name}, {shown_value(quantity, value)}, was {how}."}
+    said = {"What it promised": f"Its {quantity.name}, {shown_value(quantity, value, frame)}, was {how}."}
     rest = others if climbed or rank > 1 else others[1:]
     if rest:
         many = "" if tied is None else f"; {tied or 'no'} other{'s' * (tied != 1)} within two standard errors"
@@ -57,12 +59,13 @@ def _reason(quantity: Quantity, proposal: Proposal) -> dict[str, str]:
     return said
 
 
-def place(pose: Pose) -> str:
-    """A camera's position and its elevation over the scene's horizon (y is up); by how much it looks past the origin,
-    where it does."""
+def place(pose: Pose, frame: Frame) -> str:
+    """A camera's position in the world of a frame, and its elevation over the horizon; by how much it looks past the
+    scene's origin, where it does."""
     position, forward = (np.asarray(vector, dtype=np.float64) for vector in (pose.position, pose.forward))
     elevation = np.degrees(np.arcsin(unit(position)[1]))
     side = "above" if elevation >= 0 else "below"
     off = np.degrees(np.arccos(np.clip(-unit(position) @ forward, -1.0, 1.0)))
-    aim = "" if off < 0.5 else f", {np.linalg.norm(position):.2f} from the centre and aimed {off:.0f}° off it"
-    return f"{coordinates(position)}, {abs(elevation):.0f}° {side} the horizon{aim}"
+    away = number(float(frame.length_to_world(float(np.linalg.norm(position)))))
+    aim = "" if off < 0.5 else f", {away} from the centre and aimed {off:.0f}° off it"
+    return f"{coordinates(position, frame)}, {abs(elevation):.0f}° {side} the horizon{aim}"

@@ -66,7 +66,7 @@ def test_asking_and_telling_leave_the_evidence_as_it_was(planner, observations):
     jax.tree.map(np.testing.assert_array_equal, before, jax.tree.map(np.array, observations))
     assert int(observations.num_views) == 1
     assert int(after.num_views) == 2
-    np.testing.assert_array_equal(after.poses.position[:2], jnp.stack([FIRST.position, proposal.pose.position]))
+    np.testing.assert_array_equal(after.poses.rows.position[:2], jnp.stack([FIRST.position, proposal.pose.position]))
     assert int(after.cloud.count) == int(observations.cloud.count + seen.count) <= 128
     with pytest.raises(AttributeError):
         observations.num_views = 3

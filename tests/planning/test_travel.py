@@ -79,7 +79,7 @@ def test_a_cost_that_breaks_its_contract_makes_a_value_of_nothing():
     seen = Observations.start(cloud, 1, None)
     weighed = ValuePerCost(lambda start, end: costs[end.position[1].astype(int)], fixed=0.5)
     np.testing.assert_array_equal(weighed(jnp.ones(5), seen, poses), 2.0)
-    seen = dataclasses.replace(seen, num_views=seen.num_views + 1)
+    seen = dataclasses.replace(seen, poses=seen.poses.append(poses[0]))
     np.testing.assert_allclose(weighed(jnp.ones(5), seen, poses), [np.nan, 2.0, np.nan, np.nan, 0.4])
 
 

@@ -9,7 +9,8 @@ from free_scenes import SEE
 from scipy.spatial.transform import Rotation
 
 import jaxnbv as nbv
-from jaxnbv.scanning.obstacles import plane_under
+from jaxnbv.planning.table import plane_under
+from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning.sdf import Capsule, Cuboid, HalfSpace, Sphere, solid_of_mesh
 
 CAMERA, BALL = nbv.Camera(height=24, width=24), nbv.SDFSurface(Sphere(0.8))
@@ -218,7 +219,7 @@ def test_no_proposal_is_inside_or_under_what_is_known():
         arm = Capsule(start, end, 0.1)
         around = nbv.Obstacles((HalfSpace(point, normal), Cuboid(half).translate(block), arm), clearance=clearance)
         observations = nbv.Observations.start(cloud, 2, None)
-        proposal = search.propose(nbv.Problem(observations, camera, nbv.Coverage(), None, around), key)
+        proposal = search.propose(nbv.Problem(StepInputs(observations), camera, nbv.Coverage(), around), key)
         return proposal.pose.position, proposal.value
 
     rng, looked, x = np.random.default_rng(0), 0, np.asarray(poses.position, np.float64)

@@ -1,6 +1,5 @@
 """One step's question, small: three balls as samples, a few points seen, twelve candidates; and its scores by loops."""
 
-import dataclasses
 import functools
 
 import equinox as eqx
@@ -10,6 +9,8 @@ import numpy as np
 from on_grid import balls
 
 import jaxnbv as nbv
+from jaxnbv.geometry.pose_list import PoseList
+from jaxnbv.sampler import StepInputs
 
 CAMERA, POSES, KEY = nbv.Camera(height=8, width=8), nbv.SphereCandidates(12).poses(), jax.random.key(5)
 
@@ -18,9 +19,8 @@ def problem_of(surfaces, acquisition=nbv.Coverage(), camera=CAMERA):  # noqa: B0
     """Room for six views, none of them taken."""
     rng = np.random.default_rng(0)
     cloud = nbv.PointCloud.from_arrays(rng.uniform(-1, 1, (30, 3)), np.tile([0.0, 1.0, 0.0], (30, 1)), 32)
-    dtype = jnp.result_type(float)
-    views = nbv.Pose(np.tile(np.eye(3, dtype=dtype), (6, 1, 1)), np.zeros((6, 3), dtype))
-    return nbv.Problem(nbv.Observations(cloud, views, jnp.asarray(0)), camera, acquisition, surfaces).prepared()
+    inputs = StepInputs(nbv.Observations.start(cloud, 6), None, surfaces)
+    return nbv.Problem(inputs, camera, acquisition).prepared()
 
 
 @functools.cache
@@ -33,10 +33,10 @@ def visit(problem, *poses):
     """The same after views from these poses, and no others."""
     if not poses:
         return problem
-    rows = jax.tree.map(lambda *leaves: jnp.stack(leaves), *poses)
-    taken = jax.tree.map(lambda all_rows, new: all_rows.at[: len(poses)].set(new), problem.observations.poses, rows)
-    observations = dataclasses.replace(problem.observations, poses=taken, num_views=jnp.asarray(len(poses)))
-    return dataclasses.replace(problem, observations=observations)
+    taken = PoseList.empty(6)
+    for pose in poses:
+        taken = taken.append(pose)
+    return eqx.tree_at(lambda p: p.inputs.observations.poses, problem, taken)
 
 
 @eqx.filter_jit
@@ -45,7 +45,7 @@ def propose(search, problem, key=KEY):
 
 
 def with_samples(problem, rows):
-    return eqx.tree_at(lambda p: p.surfaces, problem, jax.tree.map(lambda leaf: leaf[rows], problem.surfaces))
+    return eqx.tree_at(lambda p: p.inputs.surfaces, problem, jax.tree.map(lambda leaf: leaf[rows], problem.surfaces))
 
 
 def sample_by_sample(problem, acquisition=nbv.Coverage(), poses=POSES):  # noqa: B008

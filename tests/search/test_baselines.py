@@ -9,6 +9,8 @@ from on_grid import balls
 from scipy.stats import chi2
 
 import jaxnbv as nbv
+from jaxnbv.geometry.pose_list import PoseList
+from jaxnbv.sampler import StepInputs
 from jaxnbv.search.baselines import uncertain_length
 
 GRID = nbv.Grid(24)
@@ -19,8 +21,9 @@ def problem(visited, surfaces=None):
     """Five rows for views, the first of them filled; the rest hold poses that must not count."""
     positions = np.concatenate([visited, np.tile(CANDIDATES[5], (5, 1))])[:5]
     cloud = nbv.PointCloud.from_arrays([[0.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    observations = nbv.Observations(cloud, nbv.look_at(positions), jnp.asarray(len(visited)))
-    return nbv.Problem(observations, nbv.Camera(height=4, width=4), nbv.Coverage(), surfaces).prepared()
+    observations = nbv.Observations(cloud, PoseList(nbv.look_at(positions), jnp.asarray(len(visited))))
+    inputs = StepInputs(observations, None, surfaces)
+    return nbv.Problem(inputs, nbv.Camera(height=4, width=4), nbv.Coverage()).prepared()
 
 
 def index_of(proposal):

@@ -38,7 +38,7 @@ class Walks(Search):
         candidates = sphere_candidates(4)
         values = problem.values(candidates)
         t = jnp.linspace(0.0, 0.7, 6)[:, None]
-        away = (1.0 - t) * candidates.position[:, None] - t * problem.observations.poses.position[0]
+        away = (1.0 - t) * candidates.position[:, None] - t * problem.observations.poses.rows.position[0]
         poses = look_at(2.5 * away / jnp.linalg.norm(away, axis=-1, keepdims=True))
         flat = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), poses)
         ways = Trajectories(poses, problem.values(flat).reshape(4, 6))
