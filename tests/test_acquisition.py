@@ -9,7 +9,7 @@ from on_grid import balls
 from opinions import linear, linear_of_batch
 
 import jaxnbv as nbv
-from jaxnbv.acquisition import preferred_batch_size
+from jaxnbv.acquisition import default_batch_size
 from jaxnbv.networks import pretrained_classifier
 from jaxnbv.scanning import scan
 from jaxnbv.scanning.grid import samples_at_once
@@ -46,11 +46,12 @@ def height_in_numpy(points, normals):
 class Toy(nbv.Acquisition):
     """Counts the rows and weighs them by the context, the highest point of D."""
 
-    def context(self, cloud):
+    def context(self, step):
+        cloud = step.observations.cloud
         return jnp.max(jnp.where(cloud.mask, cloud.points[:, 1], -jnp.inf))
 
-    def __call__(self, context, scan):
-        return jnp.sum(jnp.where(scan.mask, jnp.abs(scan.points[:, 1] - context), 0.0))
+    def score(self, context, view):
+        return jnp.sum(jnp.where(view.scan.mask, jnp.abs(view.scan.points[:, 1] - context), 0.0))
 
 
 def double_loop(surfaces, score):
@@ -107,8 +108,8 @@ def test_the_context_is_computed_once_a_step(surfaces, cloud):
 class Vector(Toy):
     """An acquisition that is a vector itself."""
 
-    def __call__(self, context, scan):
-        value = super().__call__(context, scan)
+    def score(self, context, view):
+        value = super().score(context, view)
         return jnp.stack([value, -value])
 
 
@@ -182,11 +183,11 @@ def test_samples_that_a_gpu_takes_together_have_the_same_scores(surfaces, cloud,
 
 def test_a_device_that_is_set_counts_and_not_the_one_that_was_found(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert preferred_batch_size(height) == 128
+    assert default_batch_size() == 128
     with jax.default_device(jax.devices("cpu")[0]):
-        assert preferred_batch_size(height) == 1
+        assert default_batch_size() == 1
     with jax.default_device("cpu"):
-        assert preferred_batch_size(height) == 1
+        assert default_batch_size() == 1
 
 
 @pytest.mark.parametrize(

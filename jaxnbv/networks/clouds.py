@@ -12,9 +12,11 @@ from jaxnbv.geometry.cloud import PointCloud, farthest_point_subsample
 from jaxnbv.networks.categories import CATEGORIES, NUM_PARTS, category_index, part_mask
 from jaxnbv.networks.invariant import InvariantClassifier
 from jaxnbv.networks.pointnet2 import CompactPartSegmenter, PointNet2Classifier, PointNet2PartSegmenter
+from jaxnbv.tasks.classification import Classifier
+from jaxnbv.tasks.segmentation import Segmenter
 
 
-class CloudClassifier(eqx.Module):
+class CloudClassifier(Classifier):
     """A network as a function from a `PointCloud` to log-probabilities.
 
     - `network`: called as `network(points, normals, mask)`.
@@ -28,7 +30,7 @@ class CloudClassifier(eqx.Module):
     network: Callable[..., Float[Array, " classes"]]
     num_points: int = eqx.field(static=True, default=1024)
     scale: float = eqx.field(static=True, default=1.0)
-    classes: tuple[str, ...] | None = eqx.field(static=True, default=None)
+    classes: tuple[str, ...] | None = eqx.field(static=True, default=None)  # type: ignore[misc]
 
     def __post_init__(self):
         if self.classes is None:
@@ -50,7 +52,7 @@ class CloudClassifier(eqx.Module):
         return self.network(self.scale * fed.points, fed.normals, fed.mask)
 
 
-class CloudSegmenter(eqx.Module):
+class CloudSegmenter(Segmenter):
     """A network as a function from a `PointCloud` to the probabilities of the parts of a known category, row by row.
 
     Category and scale are arrays, so objects that differ in them share one compilation.
