@@ -161,7 +161,8 @@ class FunctionUtility(Utility):
 
     function: Callable[[PointCloud], Float[Array, ""]]
 
-    def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
+    # What it returns is checked by `Acquisition.check`, which names it.
+    def __call__(self, cloud: PointCloud) -> Any:
         return self.function(cloud)
 
     @property

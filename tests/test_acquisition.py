@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from on_grid import balls
-from opinions import linear, linear_of_batch
+from opinions import WEIGHTS, Linear, linear, linear_of_batch
 
 import jaxnbv as nbv
 from jaxnbv.acquisition import default_batch_size
@@ -149,6 +149,72 @@ ACQUISITIONS = {
     "classes": nbv.CrossEntropy(pretrained_classifier("pyramid"), num_points=64),
     "heat": nbv.ExpectedUtilityImprovement(nbv.ColdestPoint((0.0, 0.0, 1.0))),
 }
+
+
+ALL = {
+    "coverage": nbv.Coverage(),
+    "new surface": nbv.NewSurface(0.3),
+    "cross-entropy": nbv.CrossEntropy(linear, num_points=8),
+    "reduction": nbv.EntropyReduction(linear, num_points=8),
+    "mixed": nbv.MixedEntropy(linear, num_points=8),
+    "parts": nbv.ExpectedUtilityImprovement(nbv.SoftPartCount(Linear(jnp.asarray(WEIGHTS.T[:, :3], jnp.float32)), 9.0)),
+    "utility": nbv.ExpectedUtilityImprovement(height, num_points=8),
+    "heat": ACQUISITIONS["heat"],
+}
+
+
+def value_of(acquisition, surfaces, cloud):
+    """The expected value at one pose, a function of where it is and of the points of the cloud."""
+
+    def value(x, points=cloud.points):
+        seen = nbv.PointCloud(points, cloud.normals, cloud.mask)
+        pose = nbv.look_at(jnp.stack([x, jnp.full_like(x, 0.4), jnp.full_like(x, 2.4)]))
+        return nbv.expected_value(acquisition, seen, surfaces, nbv.Camera(height=3, width=3), pose[None])[0]
+
+    return value
+
+
+@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("wrap", [lambda f: f, jax.vmap], ids=["one", "vmap"])
+def test_every_acquisition_has_a_gradient_under_jit_and_vmap_but_heat_says_that_it_has_none(
+    surfaces, cloud, name, wrap
+):
+    """In the pose, with the cloud known, and in both."""
+    value = value_of(ALL[name], surfaces, cloud)
+    x = jnp.asarray(0.5) if wrap is not jax.vmap else jnp.asarray([0.5, 0.2])
+    points = jnp.broadcast_to(cloud.points, (*x.shape, *cloud.points.shape))
+    for slope, at in ((jax.grad(value), (x,)), (jax.grad(value, (0, 1)), (x, points))):
+        trace = lambda slope=slope, at=at: jax.make_jaxpr(wrap(slope))(*at)  # noqa: E731
+        if name == "heat":
+            with pytest.raises(nbv.InputError, match="ColdestPoint has no derivative"):
+                trace()
+        else:
+            trace()
+    jax.make_jaxpr(wrap(value))(x, points)
+
+
+def test_values_and_gradients_are_the_same_under_jit_and_vmap(surfaces, cloud):
+    value = value_of(nbv.AcquisitionList(tuple(ALL[name] for name in ALL if name != "heat")), surfaces, cloud)
+    along = jnp.asarray(np.random.default_rng(1).normal(size=cloud.points.shape), jnp.float32) * cloud.mask[:, None]
+    ends = jnp.stack([cloud.points + step * along for step in (0.0, 3e-3, -3e-3)])
+    both = lambda x, points: (value(x, points), *jax.jacrev(value, (0, 1))(x, points))  # noqa: E731
+    x = jnp.full(3, 0.5)
+    of_pair = jax.jit(jax.vmap(both))(x, ends)
+    alone = jax.jit(both)(x[0], ends[0])
+    for batched, single in zip(of_pair, alone, strict=True):
+        np.testing.assert_allclose(batched[0], single, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(alone[0], value(x[0], ends[0]), rtol=1e-4, atol=1e-5)
+    values, _, slopes = of_pair
+    assert bool(jnp.isfinite(slopes).all() & jnp.isfinite(alone[1]).all())
+    assert float(jnp.abs(alone[1]).min()) > 0
+    np.testing.assert_allclose(
+        jnp.sum(slopes[0] * along, axis=(1, 2)), (values[1] - values[2]) / 6e-3, rtol=0.03, atol=2e-3
+    )
+
+
+def test_heat_is_valued_under_vmap(surfaces, cloud):
+    value, x = value_of(ALL["heat"], surfaces, cloud), jnp.asarray([0.5, -0.4])
+    np.testing.assert_array_equal(jax.vmap(value)(x), jnp.stack([value(one) for one in x]))
 
 
 @pytest.mark.parametrize("name", ACQUISITIONS)

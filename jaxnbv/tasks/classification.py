@@ -6,7 +6,7 @@ network of `jaxnbv.networks`, one of your own, or a `HostClassifier`. A `Classif
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -41,11 +41,13 @@ class Classifier(eqx.Module):
     `classes`: their names; None where they have none.
     """
 
-    classes: ClassVar[tuple[str, ...] | None] = None
-
     @abstractmethod
     def __call__(self, cloud: PointCloud) -> Float[Array, " classes"]:
         """log p of one cloud (rows, masked)."""
+
+    @property
+    def classes(self) -> tuple[str, ...] | None:
+        return None
 
     @property
     def batch_size(self) -> int:
@@ -58,7 +60,8 @@ class FunctionClassifier(Classifier):
 
     function: Callable[[PointCloud], Float[Array, " classes"]]
 
-    def __call__(self, cloud: PointCloud) -> Float[Array, " classes"]:
+    # What it returns is checked by `Acquisition.check`, which names it.
+    def __call__(self, cloud: PointCloud) -> Any:
         return self.function(cloud)
 
 

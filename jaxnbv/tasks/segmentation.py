@@ -52,7 +52,8 @@ class FunctionSegmenter(Segmenter):
 
     function: Callable[[PointCloud], Float[Array, "points parts"]]
 
-    def __call__(self, cloud: PointCloud) -> Float[Array, "points parts"]:
+    # What it returns is checked by `SoftPartCount.check`, which names it.
+    def __call__(self, cloud: PointCloud) -> Any:
         return self.function(cloud)
 
 

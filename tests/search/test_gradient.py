@@ -7,6 +7,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 from on_grid import balls, nodes
+from opinions import context_of, score_of
 from scipy.ndimage import gaussian_filter
 from small_problem import problem_of as any_problem_of
 from small_problem import propose, visit

@@ -1,5 +1,7 @@
 """Acquisitions of classification against their formulas in float64 NumPy."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,7 @@ import pytest
 from opinions import context_of, drawn_cloud, linear, linear_in_numpy, nothing, score_of
 
 import jaxnbv as nbv
-from jaxnbv.tasks.classification import cross_entropy, entropy
+from jaxnbv.tasks.classification import Classifier, cross_entropy, entropy
 from jaxnbv.viz.answers import words_of
 
 RNG = np.random.default_rng(0)

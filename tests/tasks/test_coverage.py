@@ -11,6 +11,7 @@ from opinions import context_of, drawn_cloud, nothing, score_of
 from scipy.integrate import quad
 
 import jaxnbv as nbv
+from jaxnbv.acquisition import ImaginedView
 from jaxnbv.scanning.sdf import Cuboid, Sphere
 from jaxnbv.tasks.coverage import visible_area
 
@@ -47,7 +48,7 @@ def test_the_area_of_a_slanted_face_does_not_depend_on_the_rays_or_the_distance(
     face = nbv.SDFSurface(Cuboid((0.5, 0.4, 1e-3)))
     for pixels, away in ((120, 1.0), (200, 1.0), (200, 1.6)):
         camera, pose = nbv.Camera(height=pixels, width=pixels, fov=1.0), nbv.look_at((away, 0.3 * away, 1.5 * away))
-        area = float(jnp.sum(visible_area(nbv.scan(face, camera, pose), camera, pose)))
+        area = float(jnp.sum(visible_area(ImaginedView(nbv.scan(face, camera, pose), camera, pose))))
         # Its border is known to a pixel: a share of 2 / 120 * (1 / 1.0 + 1 / 0.8) of the face, most of it by chance.
         assert area == pytest.approx(1.0 * 0.8, rel=0.03)
 
