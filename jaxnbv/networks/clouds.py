@@ -30,7 +30,7 @@ class CloudClassifier(Classifier):
     network: Callable[..., Float[Array, " classes"]]
     num_points: int = eqx.field(static=True, default=1024)
     scale: float = eqx.field(static=True, default=1.0)
-    classes: tuple[str, ...] | None = eqx.field(static=True, default=None)  # type: ignore[misc]
+    classes: tuple[str, ...] | None = eqx.field(static=True, default=None)
 
     def __post_init__(self):
         if self.classes is None:
