@@ -25,6 +25,7 @@ from skimage.measure import marching_cubes
 from timing import least_time
 
 import jaxnbv as nbv
+from jaxnbv.acquisition import inputs_of, scores
 from jaxnbv.networks import pretrained_classifier
 from jaxnbv.planning.simulate import observe_scene
 from jaxnbv.scanning.grid import samples_at_once
@@ -91,8 +92,8 @@ def coverage(bench: Bench) -> None:
 
     @jax.jit
     def values(cloud, seen):
-        context = planner.acquisition.context(cloud)
-        score = lambda of: nbv.acquisition.scores(planner.acquisition, context, of, planner.camera, bench.candidates)  # noqa: E731
+        context = planner.acquisition.context(inputs_of(cloud))
+        score = lambda of: scores(planner.acquisition, context, of, planner.camera, bench.candidates)  # noqa: E731
         return jnp.mean(jax.lax.map(score, seen, batch_size=samples_at_once(planner.camera, bench.candidates)), axis=0)
 
     # What is timed must be what a step does.
@@ -131,7 +132,7 @@ def cross_entropy(bench: Bench) -> None:
     scans = lambda: nbv.scan_samples(surfaces, planner.camera, bench.candidates)  # noqa: E731
     bench.take("cross-entropy: 16 samples scanned from 120 candidates", scans, step=step)
     seen = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), scans())
-    known = planner.acquisition.context(observations.cloud)[0]
+    known = planner.acquisition.context(inputs_of(observations))[0]
 
     @jax.jit
     def thinned(seen):

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnbv.acquisition import Acquisition, expected_value, scores
+from jaxnbv.acquisition import Acquisition, expected_value, inputs_of, scores
 from jaxnbv.checks import AnyArray, InputError, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
@@ -240,7 +240,7 @@ def _judge(
     share = empty_share(seen.points, seen.mask, empty, surfaces.grid)
     inside = jnp.mean(surfaces.values < 0, axis=0)
     expected = expected_value(acquisition, cloud, surfaces, camera, truth.candidates)
-    context = acquisition.context(cloud)
+    context = acquisition.context(inputs_of(cloud))
     true_values = scores(acquisition, context, truth.scans, camera, truth.candidates)
     return error, share, inside, expected, true_values
 

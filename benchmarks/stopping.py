@@ -23,6 +23,7 @@ import numpy as np
 from tqdm import tqdm
 
 import jaxnbv as nbv
+from jaxnbv.acquisition import inputs_of, scores
 from jaxnbv.networks import part_segmenter, pretrained_classifier
 from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.planning.loop import view_keys
@@ -101,7 +102,7 @@ def _seen(surface: nbv.SDFSurface, camera: nbv.Camera, poses: nbv.Pose, cloud: n
 def _areas(surface: nbv.SDFSurface, camera: nbv.Camera, poses: nbv.Pose, cloud: nbv.PointCloud):
     shown = ShownArea(NewSurface())
     scans = nbv.scan(surface, camera, poses)
-    return jnp.sum(nbv.acquisition.scores(shown, shown.context(cloud), scans, camera, poses), axis=0)
+    return jnp.sum(scores(shown, shown.context(inputs_of(cloud)), scans, camera, poses), axis=0)
 
 
 def table(task: str, records: list[dict]) -> str:

@@ -9,6 +9,7 @@ from .acquisition import AcquisitionList as AcquisitionList
 from .acquisition import Answer as Answer
 from .acquisition import ExpectedUtilityImprovement as ExpectedUtilityImprovement
 from .acquisition import Quantity as Quantity
+from .acquisition import Utility as Utility
 from .acquisition import expected_value as expected_value
 from .errors import InputError as InputError
 from .geometry.camera import Camera as Camera

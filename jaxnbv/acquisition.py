@@ -2,13 +2,13 @@
 
     alpha(theta) = E alpha(D, scan(theta; f | D)),   estimated by the mean over the step's samples f_1, ..., f_S,
 
-the same samples for all poses (common random numbers). An acquisition sees the context that was computed once from D,
-and one imagined scan; what it gives of it is that scan's *score*.
+the same samples for all poses (common random numbers). An acquisition computes its context once from what has been
+seen, and from that the *score* of each imagined view.
 """
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
 import equinox as eqx
 import jax
@@ -21,6 +21,8 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.observations import Observations, as_observations
+from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import GridSurface, Surface, scan
 from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.sharding import batched_map, on_cpu, share_of, shared, shared_map
@@ -61,30 +63,38 @@ class Answer(eqx.Module):
     form: str = "{:.4g}"
 
 
+class ImaginedView(eqx.Module):
+    """One imagined scan (rows, masked, in scene coordinates), the camera that takes it, and from which pose."""
+
+    scan: PointCloud
+    camera: Camera
+    pose: Pose
+
+
 class Acquisition(eqx.Module):
-    """What one imagined scan is worth, given what has been seen. A search maximises the mean over the posterior."""
+    """What one imagined scan is worth, given what has been seen. A search maximises the mean over the posterior.
+
+    `needs_posterior`: whether `context` looks at the posterior, which a planner then puts into the step.
+    """
+
+    needs_posterior: ClassVar[bool] = False
 
     @abstractmethod
-    def context(self, cloud: PointCloud) -> Any:
-        """Whatever depends on D alone; computed once a step."""
+    def context(self, step: StepInputs) -> Any:
+        """Whatever depends on what has been seen alone; computed once a step."""
 
-    def __call__(self, context: Any, scan: PointCloud) -> Float[Array, ""]:
-        """The score of one scan (rows, masked). Finite; for a scan that sees nothing, no more than for any other.
+    @abstractmethod
+    def score(self, context: Any, view: ImaginedView) -> Float[Array, "*values"]:
+        """The score of one view. Finite; for a scan that sees nothing, no more than for any other."""
 
-        **Raises:** `ValueError` for an acquisition that has only a `score`.
-        """
-        name = type(self).__name__
-        raise InputError(f"{name} scores no scan alone: call its score(context, scan, camera, pose)")
-
-    def score(self, context: Any, scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, "*values"]:
-        """The score of one scan that a camera takes from a pose: by default that of the scan alone. Define it in place
-        of `__call__` where it matters how far away, or at which angle, a point was seen."""
-        return self(context, scan)
+    def inputs(self, step: StepInputs) -> StepInputs:
+        """The part of a step that `context` looks at. Steps whose parts have equal shapes share one compilation."""
+        return StepInputs(step.observations, step.posterior if self.needs_posterior else None)
 
     @property
     def batch_size(self) -> int:
         """How many scans are scored together."""
-        return preferred_batch_size(None)
+        return default_batch_size()
 
     @property
     def quantity(self) -> Quantity:
@@ -108,92 +118,162 @@ class Acquisition(eqx.Module):
         return
 
 
-def preferred_batch_size(function: Any) -> int:
-    """How many calls of a function to batch: its attribute `batch_size`, where it has one.
+def default_batch_size() -> int:
+    """How many calls of a function of clouds to batch.
 
-    Otherwise a CPU takes them one by one, lest a network's layers leave its cache, and a GPU many at once.
+    A CPU takes them one by one, lest a network's layers leave its cache, and a GPU many at once.
     """
-    return getattr(function, "batch_size", 1 if on_cpu() else 128)
+    return 1 if on_cpu() else 128
+
+
+class Utility(eqx.Module):
+    """u(D): one number that says what a cloud is worth. Only `__call__` must be given.
+
+    `name` is in words. `improvement` is the `Quantity` that is expected of a view.
+    """
+
+    @abstractmethod
+    def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
+        """u(D) of a cloud (rows, masked), made of JAX operations."""
+
+    @property
+    def name(self) -> str:
+        return "utility"
+
+    @property
+    def improvement(self) -> Quantity:
+        meaning = "how much an imagined scan raises the utility of the cloud, mean over posterior samples."
+        name = "utility improvement" if self.name == "utility" else f"improvement of {self.name}"
+        return Quantity(f"expected {name}", "", meaning)
+
+    @property
+    def batch_size(self) -> int:
+        """How many clouds are valued together."""
+        return default_batch_size()
+
+    def answer(self, cloud: PointCloud) -> Answer | None:
+        """What D answers; None for u(D) itself."""
+        return None
+
+    def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
+        """What `answer` should come to, see `Acquisition.true_answer`; None for `answer` on all of the surface."""
+        return None
+
+    def check(self, cloud: PointCloud) -> None:
+        """Raise `ValueError` if what the utility is made of gives something impossible on a first D."""
+        return
+
+
+class FunctionUtility(Utility):
+    """A plain function of a cloud as a utility, which has the function's name."""
+
+    function: Callable[[PointCloud], Float[Array, ""]]
+
+    # What it returns is checked by `Acquisition.check`, which names it.
+    def __call__(self, cloud: PointCloud) -> Any:
+        return self.function(cloud)
+
+    @property
+    def name(self) -> str:
+        # Only functions have a name of their own; a callable object does not.
+        name = getattr(self.function, "__name__", "").strip("_").replace("_", " ")
+        return name if name and name != "<lambda>" else "utility"
+
+
+def plain_function(value: Any, name: str, example: str = "") -> Callable[..., Any]:
+    """A function of a cloud as it is.
+
+    **Raises:** `ValueError` for anything else, a class included.
+    """
+    proper = callable(value) and not isinstance(value, type)
+    require(proper, f"{name} is {shown(value)}: give one{example}, or a function of a cloud")
+    return value
+
+
+def as_utility(value: Any) -> Utility:
+    """A utility as it is; a plain function as one.
+
+    **Raises:** `ValueError` for anything else.
+    """
+    return value if isinstance(value, Utility) else FunctionUtility(plain_function(value, "the utility"))
+
+
+# Functions are converted on the way in, which mypy cannot see.
+if TYPE_CHECKING:
+    AnyUtility: TypeAlias = Any
+else:
+    AnyUtility = Utility
 
 
 class ExpectedUtilityImprovement(Acquisition):
     """max(0, u(D u scan) - u(D)) for any utility u(cloud): the paper's alpha^(u), once averaged over samples.
 
-    - `utility`: a function from a `PointCloud` (rows, masked) to a scalar, made of JAX operations.
+    - `utility`: a `Utility`, or a function from a `PointCloud` (rows, masked) to a scalar, made of JAX operations.
     - `num_points`: where given, D is thinned to so many by farthest point sampling, once a step, before scans are
       added to it: for a utility that looks at so many points anyway, and would sample D again for every scan.
-
-    A utility may say more of itself by attributes: `improvement`, the `Quantity` of what is expected; `answer(cloud)`,
-    `true_answer(scene, cloud)` and `check(cloud)`, as of an `Acquisition`; `batch_size`. A plain function has its name.
     """
 
-    utility: Callable[[PointCloud], Float[Array, ""]]
+    utility: AnyUtility = eqx.field(converter=as_utility)
     num_points: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
         check_fields(self)
         require(self.num_points is None or self.num_points >= 1, f"num_points is {self.num_points}; give at least 1")
 
-    def context(self, cloud: PointCloud) -> tuple[PointCloud, Array]:
+    def context(self, step: StepInputs) -> tuple[PointCloud, Array]:
         """D, thinned, and u(D)."""
+        cloud = step.observations.cloud
         cloud = cloud if self.num_points is None else limit_capacity(cloud, self.num_points)
         return cloud, self.utility(cloud)
 
-    def __call__(self, context: tuple[PointCloud, Float[Array, ""]], scan: PointCloud) -> Float[Array, ""]:
+    def score(self, context: tuple[PointCloud, Float[Array, ""]], view: ImaginedView) -> Float[Array, ""]:
         """max(0, u(D u scan) - u(D))."""
         cloud, utility = context
-        return zero_if_empty(scan, jnp.maximum(0.0, self.utility(concatenate(cloud, scan)) - utility))
+        return zero_if_empty(view.scan, jnp.maximum(0.0, self.utility(concatenate(cloud, view.scan)) - utility))
+
+    def inputs(self, step: StepInputs) -> StepInputs:
+        """D alone."""
+        return inputs_of(step.observations.cloud)
 
     @property
     def batch_size(self) -> int:
         """As the utility prefers."""
-        return preferred_batch_size(self.utility)
+        return self.utility.batch_size
 
     @property
     def quantity(self) -> Quantity:
-        """The utility's `improvement`, or one that is made of its name."""
-        meaning = "how much an imagined scan raises the utility of the cloud, mean over posterior samples."
-        name = "utility improvement" if self._name == "utility" else f"improvement of {self._name}"
-        return getattr(self.utility, "improvement", Quantity(f"expected {name}", "", meaning))
+        """The utility's `improvement`."""
+        return self.utility.improvement
 
-    def answer(self, cloud: PointCloud) -> Answer | None:
+    def answer(self, cloud: PointCloud) -> Answer:
         """The utility's own answer, or its value."""
-        own = getattr(self.utility, "answer", None)
-        return Answer((self._name,), np.array([float(context_of(self, cloud)[1])])) if own is None else own(cloud)
+        own = self.utility.answer(cloud)
+        return Answer((self.utility.name,), np.array([float(context_of(self, cloud)[1])])) if own is None else own
 
-    def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
+    def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer:
         """The utility's own, or its answer on all of the surface."""
-        own = getattr(self.utility, "true_answer", None)
-        return self.answer(cloud) if own is None else own(scene, cloud)
+        own = self.utility.true_answer(scene, cloud)
+        return self.answer(cloud) if own is None else own
 
     def check(self, cloud: PointCloud) -> None:
         """**Raises:** `ValueError` as the utility's own `check` does, or if u(D) is not a finite number."""
-        if (own := getattr(self.utility, "check", None)) is not None:
-            own(cloud)
-        _, value = context_of(self, cloud)
+        self.utility.check(cloud)
+        (_, value), name = context_of(self, cloud), self.utility.name
         require(
             jnp.shape(value) == (),
-            f"the {self._name} of the cloud has shape {jnp.shape(value)}: a utility is one number",
+            f"the {name} of the cloud has shape {jnp.shape(value)}: a utility is one number",
         )
-        require(bool(jnp.isfinite(value)), f"the {self._name} of the first cloud is {value}: it must be finite")
-
-    @property
-    def _name(self) -> str:
-        """In words; functions without a name of their own are "utility"."""
-        name = getattr(self.utility, "__name__", "").strip("_").replace("_", " ")
-        return name if name and name != "<lambda>" else "utility"
+        require(bool(jnp.isfinite(value)), f"the {name} of the first cloud is {value}: it must be finite")
 
 
 def as_acquisition(value: Any) -> Acquisition:
-    """An acquisition as it is; of a function of a cloud, which is a utility, the expected improvement.
+    """An acquisition as it is; the expected improvement of a utility, or of a plain function as one.
 
     **Raises:** `ValueError` for anything else.
     """
     if isinstance(value, Acquisition):
         return value
-    function = callable(value) and not isinstance(value, type)
-    require(function, f"the acquisition is {shown(value)}: give one, such as Coverage(), or a function of a cloud")
-    return ExpectedUtilityImprovement(value)
+    return ExpectedUtilityImprovement(plain_function(value, "the acquisition", ", such as Coverage()"))
 
 
 class AcquisitionList(Acquisition):
@@ -209,14 +289,19 @@ class AcquisitionList(Acquisition):
         known = isinstance(self.members, tuple) and all(isinstance(member, Acquisition) for member in self.members)
         require(known and len(self.members) > 0, f"the members are {shown(self.members)}; give a tuple of some")
 
-    def context(self, cloud: PointCloud) -> tuple[Any, ...]:
-        """That of each."""
-        return tuple(member.context(cloud) for member in self.members)
+    @property
+    def needs_posterior(self) -> bool:  # type: ignore[override]
+        """Whether one of them does."""
+        return any(member.needs_posterior for member in self.members)
 
-    def score(self, context: tuple[Any, ...], scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, " values"]:
-        """The scores of one scan."""
-        found = [member.score(own, scan, camera, pose) for member, own in zip(self.members, context, strict=True)]
-        return jnp.concatenate([jnp.atleast_1d(value) for value in found])
+    def context(self, step: StepInputs) -> tuple[Any, ...]:
+        """That of each."""
+        return tuple(member.context(member.inputs(step)) for member in self.members)
+
+    def score(self, context: tuple[Any, ...], view: ImaginedView) -> Float[Array, " values"]:
+        """The scores of one view."""
+        values = [member.score(own, view) for member, own in zip(self.members, context, strict=True)]
+        return jnp.concatenate([jnp.atleast_1d(value) for value in values])
 
     @property
     def batch_size(self) -> int:
@@ -229,18 +314,34 @@ class AcquisitionList(Acquisition):
             member.check(cloud)
 
 
-def context_of(acquisition: Acquisition, cloud: PointCloud) -> Any:
-    """What an acquisition makes of D, compiled.
+def inputs_of(seen: StepInputs | Observations | PointCloud) -> StepInputs:
+    """A step's inputs as they are; observations, or a cloud alone, as inputs without posterior and samples."""
+    return seen if isinstance(seen, StepInputs) else StepInputs(as_observations(seen))
 
-    **Raises:** `ValueError` for a function of the user's that JAX cannot trace.
+
+def context_of(acquisition: Acquisition, seen: StepInputs | Observations | PointCloud) -> Any:
+    """The acquisition's context, compiled.
+
+    **Raises:** `ValueError` for a function of the user's that JAX cannot trace, and if the acquisition needs a
+    posterior and there is none.
     """
+    inputs = _inputs(acquisition, seen)
     with functions_of_users():
-        return _context_of(acquisition, cloud)
+        return _context_of(acquisition, inputs)
+
+
+def _inputs(acquisition: Acquisition, seen: StepInputs | Observations | PointCloud) -> StepInputs:
+    step = inputs_of(seen)
+    require(
+        step.posterior is not None or not acquisition.needs_posterior,
+        f"{type(acquisition).__name__} needs the posterior: give StepInputs(observations, posterior)",
+    )
+    return acquisition.inputs(step)
 
 
 @eqx.filter_jit
-def _context_of(acquisition: Acquisition, cloud: PointCloud) -> Any:
-    return acquisition.context(cloud)
+def _context_of(acquisition: Acquisition, inputs: StepInputs) -> Any:
+    return acquisition.context(inputs)
 
 
 def zero_if_empty(scan: PointCloud, value: Float[Array, "*values"]) -> Float[Array, "*values"]:
@@ -255,6 +356,9 @@ def check_differentiable(acquisition: Acquisition, capacity: int, camera: Camera
 
     **Raises:** `ValueError` if it cannot, as for anything that calls back to host code.
     """
+    if acquisition.needs_posterior:
+        # There is none yet.
+        return
 
     def cloud(rows: int) -> PointCloud:
         return PointCloud(jnp.zeros((rows, 3)), jnp.ones((rows, 3)), jnp.ones(rows, bool))
@@ -262,7 +366,7 @@ def check_differentiable(acquisition: Acquisition, capacity: int, camera: Camera
     def value(rows):
         points, normals = rows
         scan, pose = PointCloud(points, normals, cloud(camera.num_rays).mask), Pose(jnp.eye(3), jnp.zeros(3))
-        return acquisition.score(acquisition.context(cloud(capacity)), scan, camera, pose)
+        return acquisition.score(acquisition.context(inputs_of(cloud(capacity))), ImaginedView(scan, camera, pose))
 
     rows = cloud(camera.num_rays).points, cloud(camera.num_rays).normals
     # One that fails by itself says so itself.
@@ -279,7 +383,7 @@ def check_differentiable(acquisition: Acquisition, capacity: int, camera: Camera
 @checked
 def expected_value(
     acquisition: Acquisition,
-    cloud: PointCloud,
+    seen: StepInputs | Observations | PointCloud,
     surfaces: GridSurface,
     camera: Camera,
     poses: Pose,
@@ -287,15 +391,24 @@ def expected_value(
 ) -> Float[Array, "poses *scores"]:
     """The acquisition at each of a batch of poses: mean over the sampled surfaces of the score of what they would show.
 
-    `surfaces` carries the samples along its leading axis; `barrier` is as of `scan`. The members of
-    `AcquisitionList` have an axis of their own.
+    Runs under `jit`, `grad` and `vmap`, in the poses and in what has been seen.
 
-    **Raises:** `ValueError` as the acquisition's `check` does, and for a function of the user's that JAX cannot trace.
+    - `seen`: a cloud D suffices for all acquisitions but those that need the posterior, which `StepInputs` holds.
+    - `surfaces`: the samples along a leading axis.
+    - `barrier`: see `scan`.
+
+    The members of `AcquisitionList` have an axis of their own.
+
+    **Raises:** `ValueError` as the acquisition's `check` does, where values are known, and for a function of the user's
+    that JAX cannot trace.
     """
-    if not is_traced(acquisition, cloud):
-        acquisition.check(cloud)
+    inputs = _inputs(acquisition, seen)
     with functions_of_users():
-        context = acquisition.context(cloud)
+        context = acquisition.context(inputs)
+        # Within a transformation even what follows from known values may be traced.
+        if not is_traced(acquisition, inputs, context):
+            with jax.ensure_compile_time_eval():
+                acquisition.check(inputs.observations.cloud)
         return jnp.mean(sample_scores(acquisition, context, surfaces, camera, poses, barrier), axis=0)
 
 
@@ -306,7 +419,7 @@ def scores(
     where several samples are scored together.
     """
     return batched_map(
-        lambda taken: acquisition.score(context, taken[0], camera, taken[1]),
+        lambda rows: acquisition.score(context, ImaginedView(rows[0], camera, rows[1])),
         (scans, poses),
         acquisition.batch_size // samples,
     )

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import jaxnbv as nbv
+from jaxnbv.acquisition import ImaginedView, context_of
 from jaxnbv.geometry.neighbours import nearest_squared_distance
 from jaxnbv.studies.scenes import demo_object, hidden_view
 from jaxnbv.surfaces.known_shapes import kind_of
@@ -85,6 +86,7 @@ def draw_utility(
     camera = dataclasses.replace(planner.camera, height=PIXELS, width=PIXELS)
     few = jax.tree.map(lambda rows: rows[:SHOWN], surfaces)
     fine, coarse = (nbv.scan_samples(few, one, poses) for one in (camera, planner.camera))
+    context = context_of(planner.acquisition, observations)
     figure = Figure(figsize=(9.6, 5.2))
     highest = 0.0
     squares = np.zeros((2, SHOWN, PIXELS**2))
@@ -113,7 +115,7 @@ def draw_utility(
             axes.imshow(np.clip(colours, 0, 1).reshape(PIXELS, PIXELS, 3), interpolation="bilinear")
             axes.set(xticks=[], yticks=[])
             own = jax.tree.map(lambda rows, i=(column, row): rows[i], coarse)
-            worth = float(planner.acquisition(planner.acquisition.context(observations.cloud), own))
+            worth = float(planner.acquisition.score(context, ImaginedView(own, planner.camera, poses[row])))
             axes.set_xlabel(f"worth {worth:.0f}", labelpad=2)
     bar = figure.add_axes((0.91, 0.2, 0.014, 0.55))
     scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(0.0, highest), VALUE)

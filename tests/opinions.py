@@ -1,11 +1,12 @@
 """Opinions on classes, in JAX and in NumPy, and on parts, and clouds to have them of."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxnbv as nbv
+from jaxnbv.acquisition import ImaginedView, inputs_of
+from jaxnbv.tasks import Segmenter
 
 WEIGHTS = np.random.default_rng(7).normal(size=(4, 6)) * 3.0
 
@@ -38,7 +39,17 @@ def nothing(capacity):
     return nbv.PointCloud(jnp.zeros((capacity, 3)), jnp.zeros((capacity, 3)), jnp.zeros(capacity, bool))
 
 
-class Linear(eqx.Module):
+def context_of(acquisition, cloud):
+    """The acquisition's context of a cloud, not compiled."""
+    return acquisition.context(inputs_of(cloud))
+
+
+def score_of(acquisition, context, scan):
+    """The score of a scan by an acquisition that does not look at where it was taken from."""
+    return acquisition.score(context, ImaginedView(scan, nbv.Camera(height=2, width=2), nbv.look_at((0.0, 0.0, 2.5))))
+
+
+class Linear(Segmenter):
     """Probabilities of parts that follow from where a point is and how it faces."""
 
     weight: jax.Array

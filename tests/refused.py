@@ -81,11 +81,11 @@ def first_if_positive(cloud):
 class Deciding(nbv.Acquisition):
     """Scores a scan by a value that JAX traces."""
 
-    def context(self, cloud):
-        return cloud
+    def context(self, step):
+        return None
 
-    def __call__(self, context, scan):
-        return jnp.ones(()) if scan.points[0, 0] > 0 else jnp.zeros(())
+    def score(self, context, view):
+        return jnp.ones(()) if view.scan.points[0, 0] > 0 else jnp.zeros(())
 
 
 def expected(acquisition):

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from on_grid import balls
-from opinions import linear, linear_of_batch
+from opinions import WEIGHTS, Linear, linear, linear_of_batch
 
 import jaxnbv as nbv
-from jaxnbv.acquisition import preferred_batch_size
+from jaxnbv.acquisition import default_batch_size
 from jaxnbv.networks import pretrained_classifier
 from jaxnbv.scanning import scan
 from jaxnbv.scanning.grid import samples_at_once
@@ -46,11 +46,12 @@ def height_in_numpy(points, normals):
 class Toy(nbv.Acquisition):
     """Counts the rows and weighs them by the context, the highest point of D."""
 
-    def context(self, cloud):
+    def context(self, step):
+        cloud = step.observations.cloud
         return jnp.max(jnp.where(cloud.mask, cloud.points[:, 1], -jnp.inf))
 
-    def __call__(self, context, scan):
-        return jnp.sum(jnp.where(scan.mask, jnp.abs(scan.points[:, 1] - context), 0.0))
+    def score(self, context, view):
+        return jnp.sum(jnp.where(view.scan.mask, jnp.abs(view.scan.points[:, 1] - context), 0.0))
 
 
 def double_loop(surfaces, score):
@@ -107,8 +108,8 @@ def test_the_context_is_computed_once_a_step(surfaces, cloud):
 class Vector(Toy):
     """An acquisition that is a vector itself."""
 
-    def __call__(self, context, scan):
-        value = super().__call__(context, scan)
+    def score(self, context, view):
+        value = super().score(context, view)
         return jnp.stack([value, -value])
 
 
@@ -150,6 +151,75 @@ ACQUISITIONS = {
 }
 
 
+ALL = {
+    "coverage": nbv.Coverage(),
+    "new surface": nbv.NewSurface(0.3),
+    "cross-entropy": nbv.CrossEntropy(linear, num_points=8),
+    "reduction": nbv.EntropyReduction(linear, num_points=8),
+    "mixed": nbv.MixedEntropy(linear, num_points=8),
+    "parts": nbv.ExpectedUtilityImprovement(nbv.SoftPartCount(Linear(jnp.asarray(WEIGHTS.T[:, :3], jnp.float32)), 9.0)),
+    "utility": nbv.ExpectedUtilityImprovement(height, num_points=8),
+    "heat": ACQUISITIONS["heat"],
+}
+
+
+def value_of(acquisition, surfaces, cloud):
+    """The expected value at one pose, a function of where it is and of the points of the cloud."""
+
+    def value(x, points=cloud.points):
+        seen = nbv.PointCloud(points, cloud.normals, cloud.mask)
+        pose = nbv.look_at(jnp.stack([x, jnp.full_like(x, 0.4), jnp.full_like(x, 2.4)]))
+        return nbv.expected_value(acquisition, seen, surfaces, nbv.Camera(height=3, width=3), pose[None])[0]
+
+    return value
+
+
+@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("wrap", [lambda f: f, jax.vmap], ids=["one", "vmap"])
+def test_every_acquisition_has_a_gradient_under_jit_and_vmap_but_heat_says_that_it_has_none(
+    surfaces, cloud, name, wrap
+):
+    """In the pose, with the cloud known, and in both."""
+    value = value_of(ALL[name], surfaces, cloud)
+    x = jnp.asarray(0.5) if wrap is not jax.vmap else jnp.asarray([0.5, 0.2])
+    points = jnp.broadcast_to(cloud.points, (*x.shape, *cloud.points.shape))
+    for slope, at in ((jax.grad(value), (x,)), (jax.grad(value, (0, 1)), (x, points))):
+        trace = lambda slope=slope, at=at: jax.make_jaxpr(wrap(slope))(*at)  # noqa: E731
+        if name == "heat":
+            with pytest.raises(nbv.InputError, match="ColdestPoint has no derivative"):
+                trace()
+        else:
+            trace()
+    jax.make_jaxpr(wrap(value))(x, points)
+
+
+@pytest.mark.slow
+def test_values_and_gradients_are_the_same_under_jit_and_vmap(surfaces, cloud):
+    value = value_of(nbv.AcquisitionList(tuple(ALL[name] for name in ALL if name != "heat")), surfaces, cloud)
+    along = jnp.asarray(np.random.default_rng(1).normal(size=cloud.points.shape), jnp.float32) * cloud.mask[:, None]
+    ends = jnp.stack([cloud.points + step * along for step in (0.0, 3e-3, -3e-3)])
+    both = lambda x, points: (value(x, points), *jax.jacrev(value, (0, 1))(x, points))  # noqa: E731
+    x = jnp.full(3, 0.5)
+    of_pair = jax.jit(jax.vmap(both))(x, ends)
+    alone = jax.jit(both)(x[0], ends[0])
+    for batched, single in zip(of_pair, alone, strict=True):
+        np.testing.assert_allclose(batched[0], single, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(alone[0], value(x[0], ends[0]), rtol=1e-4, atol=1e-5)
+    values, _, slopes = of_pair
+    assert bool(jnp.isfinite(slopes).all() & jnp.isfinite(alone[1]).all())
+    assert float(jnp.abs(alone[1]).min()) > 0
+    np.testing.assert_allclose(
+        jnp.sum(slopes[0] * along, axis=(1, 2)), (values[1] - values[2]) / 6e-3, rtol=0.1, atol=2e-3
+    )
+
+
+@pytest.mark.slow
+def test_heat_is_valued_under_vmap(surfaces, cloud):
+    heat = nbv.ExpectedUtilityImprovement(nbv.ColdestPoint((0.0, 0.0, 1.0), workers=1))
+    value, x = jax.jit(value_of(heat, surfaces, cloud)), jnp.asarray([0.5, -0.4])
+    np.testing.assert_allclose(jax.vmap(value)(x), jnp.stack([value(one) for one in x]), rtol=1e-5)
+
+
 @pytest.mark.parametrize("name", ACQUISITIONS)
 def test_only_heat_is_computed_by_the_host(surfaces, cloud, name):
     """Its Laplacian has no JAX; all else stays on the device."""
@@ -182,11 +252,11 @@ def test_samples_that_a_gpu_takes_together_have_the_same_scores(surfaces, cloud,
 
 def test_a_device_that_is_set_counts_and_not_the_one_that_was_found(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert preferred_batch_size(height) == 128
+    assert default_batch_size() == 128
     with jax.default_device(jax.devices("cpu")[0]):
-        assert preferred_batch_size(height) == 1
+        assert default_batch_size() == 1
     with jax.default_device("cpu"):
-        assert preferred_batch_size(height) == 1
+        assert default_batch_size() == 1
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,11 @@ from jaxnbv.geometry.cloud import PointCloud, farthest_point_subsample
 from jaxnbv.networks.categories import CATEGORIES, NUM_PARTS, category_index, part_mask
 from jaxnbv.networks.invariant import InvariantClassifier
 from jaxnbv.networks.pointnet2 import CompactPartSegmenter, PointNet2Classifier, PointNet2PartSegmenter
+from jaxnbv.tasks.classification import Classifier
+from jaxnbv.tasks.segmentation import Segmenter
 
 
-class CloudClassifier(eqx.Module):
+class CloudClassifier(Classifier):
     """A network as a function from a `PointCloud` to log-probabilities.
 
     - `network`: called as `network(points, normals, mask)`.
@@ -50,7 +52,7 @@ class CloudClassifier(eqx.Module):
         return self.network(self.scale * fed.points, fed.normals, fed.mask)
 
 
-class CloudSegmenter(eqx.Module):
+class CloudSegmenter(Segmenter):
     """A network as a function from a `PointCloud` to the probabilities of the parts of a known category, row by row.
 
     Category and scale are arrays, so objects that differ in them share one compilation.

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from jaxnbv.acquisition import Acquisition, expected_value
+from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement, expected_value
 from jaxnbv.checks import InputError, check_fields, check_type, require, shown
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
@@ -24,7 +24,7 @@ from jaxnbv.planning.travel import CostFunction, WorldCost, arc_length, total_co
 from jaxnbv.scanning import GridSurface, barrier_of
 from jaxnbv.tasks.classification import ClassAcquisition
 from jaxnbv.tasks.coverage import NewSurface, ShownArea
-from jaxnbv.tasks.segmentation import PartAnswer
+from jaxnbv.tasks.segmentation import PartAnswer, SoftPartCount
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,14 +129,18 @@ class Sure(StopRule):
         _of_classes(acquisition)
 
     def after(self, context: StopContext) -> str | None:
-        acquisition, cloud = _of_classes(context.planner.acquisition), context.observations.cloud
+        return self.reason(context.planner.acquisition, context.observations.cloud, context.key)
+
+    def reason(self, acquisition: Acquisition, cloud: PointCloud, key: PRNGKeyArray) -> str | None:
+        """Why the class is known given D, in words; None if it is not. `key`: of the random halves."""
+        acquisition = _of_classes(acquisition)
         answer = acquisition.answer(cloud)
         best = int(np.argmax(answer.values))
         least = float(answer.values[best])
         for index in range(self.num_resamplings):
             if least < self.probability:
                 return None
-            half = acquisition.answer(half_of(cloud, jax.random.fold_in(context.key, index)))
+            half = acquisition.answer(half_of(cloud, jax.random.fold_in(key, index)))
             least = min(least, float(half.values[best]))
         if least < self.probability:
             return None
@@ -183,14 +187,13 @@ class Found(StopRule):
         require(self.parts is None or names, f"the parts are {shown(self.parts)}; give a tuple of their names")
 
     def check(self, acquisition: Acquisition) -> None:
-        segmenter = getattr(getattr(acquisition, "utility", None), "segmenter", None)
-        require(
-            segmenter is not None,
-            f"Found is about parts, but {type(acquisition).__name__} has no segmenter: use the utility "
-            "SoftPartCount, or another rule",
-        )
-        known = getattr(segmenter, "part_names", None)
-        names = () if known is None else tuple(known.values())
+        utility = acquisition.utility if isinstance(acquisition, ExpectedUtilityImprovement) else None
+        if not isinstance(utility, SoftPartCount):
+            raise InputError(
+                f"Found is about parts, but {type(acquisition).__name__} has no segmenter: use the utility "
+                "SoftPartCount, or another rule"
+            )
+        names = tuple((utility.segmenter.part_names or {}).values())
         require(
             bool(self.parts or names),
             "the segmenter does not name the parts that it is asked for: give Found(parts=...), 'part 0' and so on",

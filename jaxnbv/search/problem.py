@@ -49,7 +49,7 @@ class Problem(eqx.Module):
 
     def prepared(self) -> "Problem":
         """The same with the acquisition's context, as searches ask for it; nothing to prepare without samples."""
-        context = None if self.inputs.surfaces is None else context_of(self.acquisition, self.observations.cloud)
+        context = None if self.inputs.surfaces is None else context_of(self.acquisition, self.inputs)
         return dataclasses.replace(self, context=context)
 
     def about(self, acquisition: Acquisition) -> "Problem":

@@ -1,26 +1,81 @@
 """Classification: which class is the object of?
 
 A classifier is any function from a `PointCloud` (rows, masked) to log-probabilities, log p = classifier(cloud): a
-network of `jaxnbv.networks`, one of your own, or a `HostClassifier`. In an attribute `classes` it may say their names.
+network of `jaxnbv.networks`, one of your own, or a `HostClassifier`. A `Classifier` may also name its classes.
 """
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.acquisition import Acquisition, Answer, Quantity, context_of, preferred_batch_size, zero_if_empty
+from jaxnbv.acquisition import (
+    Acquisition,
+    Answer,
+    ImaginedView,
+    Quantity,
+    context_of,
+    default_batch_size,
+    inputs_of,
+    plain_function,
+    zero_if_empty,
+)
 from jaxnbv.checks import check_fields, require
 from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
+from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import Surface
 
-Classifier: TypeAlias = Callable[[PointCloud], Float[Array, " classes"]]
 # Their shape is checked by `Acquisition.check`.
 Context: TypeAlias = tuple[PointCloud, Array]
+
+
+class Classifier(eqx.Module):
+    """Log-probabilities of the classes of a cloud. Only `__call__` must be given.
+
+    `classes`: their names; None where they have none.
+    """
+
+    @abstractmethod
+    def __call__(self, cloud: PointCloud) -> Float[Array, " classes"]:
+        """log p of one cloud (rows, masked)."""
+
+    @property
+    def classes(self) -> tuple[str, ...] | None:
+        return None
+
+    @property
+    def batch_size(self) -> int:
+        """How many clouds are classified together."""
+        return default_batch_size()
+
+
+class FunctionClassifier(Classifier):
+    """A plain function of a cloud as a classifier."""
+
+    function: Callable[[PointCloud], Float[Array, " classes"]]
+
+    # What it returns is checked by `Acquisition.check`, which names it.
+    def __call__(self, cloud: PointCloud) -> Any:
+        return self.function(cloud)
+
+
+def as_classifier(value: Any) -> Classifier:
+    """A classifier as it is; a plain function as one.
+
+    **Raises:** `ValueError` for anything else.
+    """
+    return value if isinstance(value, Classifier) else FunctionClassifier(plain_function(value, "the classifier"))
+
+
+# Functions are converted on the way in, which mypy cannot see.
+if TYPE_CHECKING:
+    AnyClassifier: TypeAlias = Any
+else:
+    AnyClassifier = Classifier
 
 
 def entropy(log_p: Float[Array, "*batch classes"]) -> Float[Array, "*batch"]:
@@ -39,36 +94,40 @@ def cross_entropy(
 class ClassAcquisition(Acquisition):
     """An acquisition that compares what a classifier says of D and of D u scan.
 
-    - `classifier`: a function from a cloud to log-probabilities.
+    - `classifier`: a `Classifier`, or a function from a cloud to log-probabilities.
     - `num_points`: D is thinned to so many by farthest point sampling, once a step, before scans are added to it.
     """
 
-    classifier: Classifier
+    classifier: AnyClassifier = eqx.field(converter=as_classifier)
     num_points: int = eqx.field(static=True, default=1024)
 
-    def context(self, cloud: PointCloud) -> Context:
+    def context(self, step: StepInputs) -> Context:
         """D, thinned, and log p^(t)."""
-        thinned = limit_capacity(cloud, self.num_points)
+        thinned = limit_capacity(step.observations.cloud, self.num_points)
         return thinned, self.classifier(thinned)
 
     @abstractmethod
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, "*values"]:
         """The value, in nats, of a scan that takes the classifier's answer from log p^(t) to log p^(t+1)."""
 
-    def __call__(self, context: Context, scan: PointCloud) -> Float[Array, "*values"]:
+    def score(self, context: Context, view: ImaginedView) -> Float[Array, "*values"]:
         """`compare`; zero for a scan that sees nothing."""
         cloud, log_p = context
-        return zero_if_empty(scan, self.compare(log_p, self.classifier(concatenate(cloud, scan))))
+        return zero_if_empty(view.scan, self.compare(log_p, self.classifier(concatenate(cloud, view.scan))))
+
+    def inputs(self, step: StepInputs) -> StepInputs:
+        """D alone."""
+        return inputs_of(step.observations.cloud)
 
     @property
     def batch_size(self) -> int:
         """As the classifier prefers."""
-        return preferred_batch_size(self.classifier)
+        return self.classifier.batch_size
 
     def answer(self, cloud: PointCloud) -> "ClassAnswer":
         """The probabilities of the classes given D."""
         p = np.exp(np.asarray(context_of(self, cloud)[1], np.float64))
-        names = getattr(self.classifier, "classes", None) or tuple(f"class {index}" for index in range(len(p)))
+        names = self.classifier.classes or tuple(f"class {index}" for index in range(len(p)))
         return ClassAnswer(tuple(names), p)
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> "ClassAnswer | None":
@@ -94,7 +153,7 @@ class ClassAcquisition(Acquisition):
             f"the classifier's answers are not log-probabilities: their exponentials sum to {total:.4g}; give "
             "log_softmax of its logits, or the logarithms of probabilities",
         )
-        names = getattr(self.classifier, "classes", None)
+        names = self.classifier.classes
         require(
             names is None or len(names) == len(log_p),
             f"the classifier names {len(names or ())} classes but gives {len(log_p)} probabilities: give as many names",

@@ -1,18 +1,16 @@
 """Coverage: how much of the surface has been seen, and how much more a view would show."""
 
 import dataclasses
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnbv.acquisition import Acquisition, Quantity
+from jaxnbv.acquisition import Acquisition, ImaginedView, Quantity
 from jaxnbv.checks import check_fields, require
-from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.neighbours import DistanceField, nearest_squared_distance, spacing
-from jaxnbv.geometry.pose import Pose
+from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning.metrics import GRAZING
 from jaxnbv.sharding import on_cpu
 
@@ -25,13 +23,13 @@ def _many() -> int:
 class Coverage(Acquisition):
     """The paper's alpha^(CD): sum over the points x of the scan of min_{y in D} |x - y|^2, in squared scene units."""
 
-    def context(self, cloud: PointCloud) -> PointCloud:
+    def context(self, step: StepInputs) -> PointCloud:
         """D itself."""
-        return cloud
+        return step.observations.cloud
 
-    def __call__(self, context: PointCloud, scan: PointCloud) -> Float[Array, ""]:
+    def score(self, context: PointCloud, view: ImaginedView) -> Float[Array, ""]:
         """Unidirectional Chamfer distance from the scan to D; zero for a scan that sees nothing."""
-        return jnp.sum(jnp.where(scan.mask, nearest_squared_distance(scan.points, context), 0.0))
+        return jnp.sum(jnp.where(view.scan.mask, nearest_squared_distance(view.scan.points, context), 0.0))
 
     @property
     def quantity(self) -> Quantity:
@@ -67,15 +65,16 @@ class NewSurface(Acquisition):
         check_fields(self)
         require(self.size > 0, f"the size is {self.size}; it must be positive, in scene units")
 
-    def context(self, cloud: PointCloud) -> DistanceField:
+    def context(self, step: StepInputs) -> DistanceField:
         """How far it is to D, in units of s, on a grid about it."""
+        cloud = step.observations.cloud
         size = jnp.maximum(self.size, spacing(cloud))
         distance = DistanceField.of(cloud, 2.0 * size)
         return dataclasses.replace(distance, values=distance.values / size)
 
-    def score(self, context: DistanceField, scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, ""]:
+    def score(self, context: DistanceField, view: ImaginedView) -> Float[Array, ""]:
         """The new area of one scan; zero for a scan that sees nothing."""
-        return jnp.sum(visible_area(scan, camera, pose) * self.newness(context, scan.points))
+        return jnp.sum(visible_area(view) * self.newness(context, view.scan.points))
 
     def newness(self, distance: DistanceField, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
         """From 0 beside D to 1 at 2 s."""
@@ -92,16 +91,17 @@ class NewSurface(Acquisition):
         return _many()
 
 
-def visible_area(scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, " rays"]:
+def visible_area(view: ImaginedView) -> Float[Array, " rays"]:
     """The area of each pixel on the surface that it shows, in squared scene units; zero where it shows none.
 
     A pixel of focal lengths fx and fy at depth z and distance r has r^2 omega = z^3 / (r fx fy).
     """
+    scan, pose = view.scan, view.pose
     offset = jnp.where(scan.mask[:, None], scan.points - pose.position, pose.forward)
     depth = jnp.matmul(offset, pose.forward, precision="highest")
     distance = jnp.linalg.norm(offset, axis=-1)
     cosine = jnp.abs(jnp.sum(offset * scan.normals, axis=-1)) / distance
-    across, down = camera.focal_lengths
+    across, down = view.camera.focal_lengths
     facing = depth**3 / (distance * across * down)
     return jnp.where(scan.mask, facing / jnp.maximum(cosine, GRAZING), 0.0)
 
@@ -111,12 +111,12 @@ class ShownArea(Acquisition):
 
     of: NewSurface
 
-    def context(self, cloud: PointCloud) -> DistanceField:
-        return self.of.context(cloud)
+    def context(self, step: StepInputs) -> DistanceField:
+        return self.of.context(step)
 
-    def score(self, context: Any, scan: PointCloud, camera: Camera, pose: Pose) -> Float[Array, "2"]:
-        area = visible_area(scan, camera, pose)
-        return jnp.stack([jnp.sum(area * self.of.newness(context, scan.points)), jnp.sum(area)])
+    def score(self, context: DistanceField, view: ImaginedView) -> Float[Array, "2"]:
+        area = visible_area(view)
+        return jnp.stack([jnp.sum(area * self.of.newness(context, view.scan.points)), jnp.sum(area)])
 
     @property
     def batch_size(self) -> int:

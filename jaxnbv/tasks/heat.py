@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.acquisition import Answer, Quantity
+from jaxnbv.acquisition import Answer, Quantity, Utility
 from jaxnbv.checks import AnyArray, InputError, checked, require
 from jaxnbv.errors import optional
 from jaxnbv.geometry.cloud import PointCloud
@@ -28,7 +28,7 @@ _IDLE_SECONDS = 120
 _WORKER_ENVIRONMENT = {"JAX_PLATFORMS": "cpu", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
-class ColdestPoint(eqx.Module):
+class ColdestPoint(Utility):
     """The paper's u_H(D) = -min u^(T), a utility for `ExpectedUtilityImprovement`.
 
     Its Laplacian runs on the host, so it has no gradient: search over candidates, as in the paper. Values are equal to

@@ -12,9 +12,11 @@ from jaxtyping import Array, Float, Shaped
 
 from jaxnbv.checks import InputError, check_fields, require
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.tasks.classification import Classifier
+from jaxnbv.tasks.segmentation import Segmenter
 
 
-class HostClassifier(eqx.Module):
+class HostClassifier(Classifier):
     """A classifier that runs outside JAX, a PyTorch model say: for search over candidates only.
 
     - `function`: from points (b, n, 3), unit normals (b, n, 3) and mask (b, n), as NumPy arrays, to log-probabilities
@@ -38,7 +40,7 @@ class HostClassifier(eqx.Module):
         return _of_cloud(self.function, (self.num_classes,), "HostClassifier", cloud)
 
 
-class HostSegmenter(eqx.Module):
+class HostSegmenter(Segmenter):
     """A segmenter that runs outside JAX, a PyTorch model say: for search over candidates only.
 
     - `function`: as of `HostClassifier`, to probabilities of the parts (b, n, num_parts); rows that the mask leaves out

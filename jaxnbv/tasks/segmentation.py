@@ -3,12 +3,13 @@
 A segmenter is any function from a `PointCloud` (rows, masked) to the probabilities p_ic that point i belongs to part c,
 with rows of zeros for points that are not there: p = segmenter(cloud), (points, parts). The points may be fewer than
 the cloud's, where the segmenter thins it; `jaxnbv.networks.CloudSegmenter` makes one of a network, `HostSegmenter` of a
-function outside JAX. In an attribute `part_names`, by their index, it may say which parts it is asked for.
+function outside JAX. A `Segmenter` may also name the parts that it is asked for.
 """
 
 import dataclasses
+from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from typing import TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxnbv.acquisition import Answer, Quantity, preferred_batch_size
+from jaxnbv.acquisition import Answer, Quantity, Utility, default_batch_size, plain_function
 from jaxnbv.checks import check_fields, require, shown
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.scanning import Surface
@@ -24,20 +25,63 @@ from jaxnbv.scanning import Surface
 # Of probabilities in 32 bits, or less.
 _SLACK = 1e-2
 
-Segmenter: TypeAlias = Callable[[PointCloud], Float[Array, "points parts"]]
+
+class Segmenter(eqx.Module):
+    """Probabilities of the parts of an object, point by point. Only `__call__` must be given.
+
+    `part_names`: the parts that it is asked for, by their index; None where they have no names.
+    """
+
+    @abstractmethod
+    def __call__(self, cloud: PointCloud) -> Float[Array, "points parts"]:
+        """p of one cloud (rows, masked); zeros in rows without a point."""
+
+    @property
+    def part_names(self) -> Mapping[int, str] | None:
+        return None
+
+    @property
+    def batch_size(self) -> int:
+        """How many clouds are segmented together."""
+        return default_batch_size()
 
 
-class SoftPartCount(eqx.Module):
+class FunctionSegmenter(Segmenter):
+    """A plain function of a cloud as a segmenter."""
+
+    function: Callable[[PointCloud], Float[Array, "points parts"]]
+
+    # What it returns is checked by `SoftPartCount.check`, which names it.
+    def __call__(self, cloud: PointCloud) -> Any:
+        return self.function(cloud)
+
+
+def as_segmenter(value: Any) -> Segmenter:
+    """A segmenter as it is; a plain function as one.
+
+    **Raises:** `ValueError` for anything else.
+    """
+    return value if isinstance(value, Segmenter) else FunctionSegmenter(plain_function(value, "the segmenter"))
+
+
+# Functions are converted on the way in, which mypy cannot see.
+if TYPE_CHECKING:
+    AnySegmenter: TypeAlias = Any
+else:
+    AnySegmenter = Segmenter
+
+
+class SoftPartCount(Utility):
     """The paper's u_S(D) = sum_c tanh(sum_i p_ic / N_target), a utility for `ExpectedUtilityImprovement`.
 
     A part of which far more than N_target points are seen adds nothing any more, so the value of a view is what it
     shows of parts not found yet.
 
-    - `segmenter`: a function from a cloud to the probabilities of the parts, point by point.
+    - `segmenter`: a `Segmenter`, or a function from a cloud to the probabilities of the parts, point by point.
     - `target`: N_target, in points that the segmenter looks at; the default is the authors'.
     """
 
-    segmenter: Segmenter
+    segmenter: AnySegmenter = eqx.field(converter=as_segmenter)
     target: float = eqx.field(static=True, default=60.0)
 
     def __check_init__(self):
@@ -68,7 +112,7 @@ class SoftPartCount(eqx.Module):
     @property
     def batch_size(self) -> int:
         """As the segmenter prefers."""
-        return preferred_batch_size(self.segmenter)
+        return self.segmenter.batch_size
 
     @property
     def improvement(self) -> Quantity:
@@ -79,7 +123,7 @@ class SoftPartCount(eqx.Module):
     def answer(self, cloud: PointCloud) -> "PartAnswer":
         """How many points are predicted of each part: of those that the segmenter names, or of those that it finds."""
         counts = np.asarray(_counts(self.segmenter, cloud), np.float64)
-        known: Mapping[int, str] | None = getattr(self.segmenter, "part_names", None)
+        known = self.segmenter.part_names
         names = tuple((known or {}).get(index, f"part {index}") for index in range(len(counts)))
         asked = tuple(np.flatnonzero(counts > 0).tolist() if known is None else known)
         return PartAnswer(names, counts, asked=asked, target=self.target)

@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Array, Float
 
-from jaxnbv.acquisition import Acquisition, Answer
+from jaxnbv.acquisition import Acquisition, Answer, ImaginedView, inputs_of
 from jaxnbv.checks import AnyArray
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
@@ -122,9 +122,8 @@ def seen_after(episode: Episode, truth: Float[AnyArray, "n 3"] | None) -> list[C
 def _new_area(
     of: NewSurface, cloud: PointCloud | None, scan: PointCloud, camera: Camera, pose: Pose
 ) -> Float[Array, ""]:
-    if cloud is None:
-        return jnp.sum(visible_area(scan, camera, pose))
-    return of.score(of.context(cloud), scan, camera, pose)
+    view = ImaginedView(scan, camera, pose)
+    return jnp.sum(visible_area(view)) if cloud is None else of.score(of.context(inputs_of(cloud)), view)
 
 
 def true_cloud(scene: Surface, count: int) -> PointCloud | None:

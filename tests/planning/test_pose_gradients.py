@@ -61,11 +61,11 @@ class OneOf(Acquisition):
     members: list[Acquisition]
     weights: jax.Array
 
-    def context(self, cloud):
-        return [member.context(cloud) for member in self.members]
+    def context(self, step):
+        return [member.context(step) for member in self.members]
 
-    def __call__(self, context, scan):
-        values = [member(c, scan) for member, c in zip(self.members, context, strict=True)]
+    def score(self, context, view):
+        values = [member.score(c, view) for member, c in zip(self.members, context, strict=True)]
         return jnp.stack(values) @ self.weights
 
 

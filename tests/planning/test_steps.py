@@ -24,11 +24,11 @@ CANDIDATES, KEY = 12, jax.random.key(3)
 
 
 class FirstRow(Acquisition):
-    def context(self, cloud):
+    def context(self, step):
         return None
 
-    def __call__(self, context, scan):
-        return scan.points[0, 0]
+    def score(self, context, view):
+        return view.scan.points[0, 0]
 
 
 def sensor_of(camera=CAMERA, noise=SensorNoise()):

@@ -63,10 +63,11 @@ class Height(nbv.Acquisition):
 
     factor: float = 1.0
 
-    def context(self, cloud):
+    def context(self, step):
         return None
 
-    def __call__(self, context, scan):
+    def score(self, context, view):
+        scan = view.scan
         return self.factor * jnp.sum(jnp.where(scan.mask, scan.points[:, 1], 0.0)) / jnp.maximum(scan.count, 1)
 
 
@@ -75,8 +76,8 @@ class Constant(nbv.Acquisition):
 
     value: float
 
-    def context(self, cloud):
+    def context(self, step):
         return None
 
-    def __call__(self, context, scan):
+    def score(self, context, view):
         return jnp.asarray(self.value)

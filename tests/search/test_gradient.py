@@ -7,6 +7,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 from on_grid import balls, nodes
+from opinions import context_of, score_of
 from scipy.ndimage import gaussian_filter
 from small_problem import problem_of as any_problem_of
 from small_problem import propose, visit
@@ -23,10 +24,11 @@ class Nearness(nbv.Acquisition):
 
     target: jax.Array
 
-    def context(self, cloud):
+    def context(self, step):
         return None
 
-    def __call__(self, context, scan):
+    def score(self, context, view):
+        scan = view.scan
         mean = jnp.sum(jnp.where(scan.mask[:, None], scan.points, 0.0), axis=0) / jnp.maximum(scan.count, 1)
         return jnp.where(scan.count > 0, 4.0 - jnp.sum((mean - self.target) ** 2), 0.0)
 
@@ -198,7 +200,9 @@ def test_a_view_of_nothing_is_worth_nothing_and_not_chosen():
     def slopes(pose):
         def scores(parameters):
             seen = scan(surface, CAMERA, nbv.FreePoses().retract(pose, parameters))
-            each = jnp.stack([one(one.context(problem.observations.cloud), seen) for one in ACQUISITIONS.values()])
+            each = jnp.stack(
+                [score_of(one, context_of(one, problem.observations), seen) for one in ACQUISITIONS.values()]
+            )
             return each, (each, seen.count)
 
         return jax.jacrev(scores, has_aux=True)(jnp.zeros(9))

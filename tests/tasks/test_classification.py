@@ -1,14 +1,16 @@
 """Acquisitions of classification against their formulas in float64 NumPy."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from opinions import drawn_cloud, linear, linear_in_numpy, nothing
+from opinions import context_of, drawn_cloud, linear, linear_in_numpy, nothing, score_of
 
 import jaxnbv as nbv
-from jaxnbv.tasks.classification import cross_entropy, entropy
+from jaxnbv.tasks.classification import Classifier, cross_entropy, entropy
 from jaxnbv.viz.answers import words_of
 
 RNG = np.random.default_rng(0)
@@ -78,7 +80,7 @@ def test_scores_of_chosen_probabilities(x64, p, q):
         nbv.EntropyReduction(first_point): reduction,
     }
     for score, expected in scores.items():
-        assert float(score(score.context(seen), scanned)) == pytest.approx(expected, rel=1e-12, abs=1e-15)
+        assert float(score_of(score, context_of(score, seen), scanned)) == pytest.approx(expected, rel=1e-12, abs=1e-15)
 
 
 def test_the_switch_is_at_the_threshold_and_not_above_it(x64):
@@ -86,7 +88,9 @@ def test_the_switch_is_at_the_threshold_and_not_above_it(x64):
     exactly = float(entropy(first_point(one_point(p))))
     for threshold, expected in ((exactly, exactly - entropy_in_numpy(q)), (exactly - 1e-9, entropy_in_numpy(p, q))):
         score = nbv.MixedEntropy(first_point, threshold=threshold)
-        assert float(score(score.context(one_point(p)), one_point(q))) == pytest.approx(expected, rel=1e-12)
+        assert float(score_of(score, context_of(score, one_point(p)), one_point(q))) == pytest.approx(
+            expected, rel=1e-12
+        )
     with pytest.raises(nbv.InputError, match=r"threshold is -0\.1"):
         nbv.MixedEntropy(first_point, threshold=-0.1)
 
@@ -100,13 +104,15 @@ def test_a_scan_that_sees_nothing(x64):
         nbv.EntropyReduction(linear),
     ]
     for score in scores:
-        assert float(score(score.context(data), nothing(6))) == 0.0
+        assert float(score_of(score, context_of(score, data), nothing(6))) == 0.0
         gradient = jax.grad(_of_points(score, data, nothing(6)))(nothing(6).points)
         assert not np.asarray(gradient).any()
 
 
 def _of_points(score, data, scanned):
-    return lambda points: score(score.context(data), nbv.PointCloud(points, scanned.normals, scanned.mask))
+    return lambda points: score_of(
+        score, context_of(score, data), nbv.PointCloud(points, scanned.normals, scanned.mask)
+    )
 
 
 def test_thinning_is_that_by_hand_and_happens_once_before_scans_are_added(x64):
@@ -122,10 +128,10 @@ def test_thinning_is_that_by_hand_and_happens_once_before_scans_are_added(x64):
         nbv.EntropyReduction(linear, num_points=16): reduction,
     }
     for score, expected in scores.items():
-        context = score.context(data)
+        context = context_of(score, data)
         for found, wanted in zip(jax.tree.leaves(context[0]), jax.tree.leaves(by_hand), strict=True):
             np.testing.assert_array_equal(found, wanted)
-        assert float(score(context, scanned)) == pytest.approx(expected, rel=1e-10, abs=1e-14)
+        assert float(score_of(score, context, scanned)) == pytest.approx(expected, rel=1e-10, abs=1e-14)
     assert not np.allclose(p, linear_in_numpy(*data.to_numpy()), atol=1e-3)
 
 
@@ -138,8 +144,8 @@ def test_thinning_to_what_the_utility_looks_at_leaves_its_value(x64):
         return jnp.sum(jnp.where(fed.mask, fed.points[:, 0] * jnp.arange(16), 0.0))
 
     whole, thinned = nbv.ExpectedUtilityImprovement(utility), nbv.ExpectedUtilityImprovement(utility, num_points=16)
-    assert float(thinned.context(data)[1]) == float(whole.context(data)[1]) == float(utility(data))
-    assert whole.context(data)[0] is data
+    assert float(context_of(thinned, data)[1]) == float(context_of(whole, data)[1]) == float(utility(data))
+    assert context_of(whole, data)[0] is data
 
 
 @pytest.mark.parametrize(
@@ -157,7 +163,7 @@ def test_gradient_in_the_scan_against_central_differences(x64, score):
     for name in ("points", "normals"):
 
         def value(rows, name=name):
-            return score(score.context(data), eqx.tree_at(lambda c: getattr(c, name), scanned, rows))
+            return score_of(score, context_of(score, data), eqx.tree_at(lambda c: getattr(c, name), scanned, rows))
 
         rows = getattr(scanned, name)
         gradient = np.asarray(jax.grad(value)(rows))
@@ -170,8 +176,8 @@ def test_gradient_in_the_scan_against_central_differences(x64, score):
             assert float(np.sum(gradient * along)) == pytest.approx(float(difference), rel=1e-6)
 
 
-class Named(eqx.Module):
-    classes: tuple[str, ...] = eqx.field(static=True, default=("cup", "bowl"))
+class Named(Classifier):
+    classes: ClassVar = ("cup", "bowl")
 
     def __call__(self, cloud):
         return jnp.log(jnp.array([0.3, 0.7]))

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from opinions import Linear, drawn_cloud, linear, linear_of_batch
+from opinions import Linear, context_of, drawn_cloud, linear, linear_of_batch, score_of
 
 import jaxnbv as nbv
 
@@ -66,9 +66,11 @@ def test_a_host_classifier_that_returns_another_shape_says_so(wrap):
 def test_a_host_classifier_has_no_gradient():
     score, data, scanned = nbv.CrossEntropy(nbv.HostClassifier(Host(), 4)), random_cloud(5, 5), random_cloud(4, 6)
     with pytest.raises(nbv.InputError, match="use DiscreteSearch"):
-        jax.grad(lambda points: score(score.context(data), nbv.PointCloud(points, scanned.normals, scanned.mask)))(
-            scanned.points
-        )
+        jax.grad(
+            lambda points: score_of(
+                score, context_of(score, data), nbv.PointCloud(points, scanned.normals, scanned.mask)
+            )
+        )(scanned.points)
     with pytest.raises(nbv.InputError, match="num_classes is 1"):
         nbv.HostClassifier(Host(), 1)
 
@@ -91,9 +93,11 @@ def test_a_segmenter_on_the_host_is_one_in_jax():
     np.testing.assert_allclose(host(cloud), own(cloud), atol=1e-6)
     scores = [nbv.ExpectedUtilityImprovement(nbv.SoftPartCount(segmenter, 3.0)) for segmenter in (own, host)]
     scans = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[random_cloud(4, 6) for _ in range(5)])
-    contexts = [score.context(cloud) for score in scores]
+    contexts = [context_of(score, cloud) for score in scores]
     del calls[:]
-    values = [jax.vmap(lambda seen, s=s, c=c: s(c, seen))(scans) for s, c in zip(scores, contexts, strict=True)]
+    values = [
+        jax.vmap(lambda seen, s=s, c=c: score_of(s, c, seen))(scans) for s, c in zip(scores, contexts, strict=True)
+    ]
     np.testing.assert_allclose(values[1], values[0], atol=1e-5)
     assert calls == [5], "all candidates in one call"
     assert scores[1].batch_size == 128

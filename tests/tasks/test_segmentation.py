@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from opinions import Linear, drawn_cloud, nothing
+from opinions import Linear, context_of, drawn_cloud, nothing, score_of
 
 import jaxnbv as nbv
 from jaxnbv.tasks import part_counts
@@ -70,7 +70,7 @@ def certain(part):
 def test_it_saturates_for_a_part_that_is_found():
     def gain(seen):
         score = nbv.ExpectedUtilityImprovement(nbv.SoftPartCount(certain(2), 60.0))
-        return float(score(score.context(make_cloud(seen, 1000)), make_cloud(30, 30)))
+        return float(score_of(score, context_of(score, make_cloud(seen, 1000)), make_cloud(30, 30)))
 
     gains = [gain(seen) for seen in (1, 60, 200, 600)]
     assert gains[0] > gains[1] > gains[2] > gains[3]

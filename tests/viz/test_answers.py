@@ -16,7 +16,7 @@ def greatest_height(cloud):
     return jnp.max(jnp.where(cloud.mask, cloud.points[:, 1], -jnp.inf))
 
 
-class Metres:
+class Metres(nbv.Utility):
     """A utility that says more of itself."""
 
     improvement = nbv.Quantity("expected growth", "metres", "how much higher.")
@@ -29,11 +29,11 @@ class Metres:
 
 
 class Unnamed(nbv.Acquisition):
-    def context(self, cloud):
+    def context(self, step):
         return None
 
-    def __call__(self, context, scan):
-        return jnp.sum(scan.mask)
+    def score(self, context, view):
+        return jnp.sum(view.scan.mask)
 
 
 def test_a_function_has_its_name_and_value():

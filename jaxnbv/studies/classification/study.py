@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 from matplotlib.axes import Axes
 
-from jaxnbv.acquisition import Acquisition, scores
+from jaxnbv.acquisition import Acquisition, inputs_of, scores
 from jaxnbv.checks import require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
@@ -32,7 +32,7 @@ from jaxnbv.studies.readers import MeshFile, class_meshes
 from jaxnbv.studies.scenes import ClassObject, ClassSet, FirstView, Framing, Split
 from jaxnbv.studies.scenes.class_object import ClassMesh, scan_cue, surface_of
 from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, MixedEntropy
-from jaxnbv.tasks.classification import ClassAcquisition, Classifier
+from jaxnbv.tasks.classification import AnyClassifier, ClassAcquisition, Classifier, as_classifier
 from jaxnbv.viz.style import NEW, framed
 
 # Of random search, in each scene.
@@ -69,7 +69,7 @@ class OracleView(CandidateSearch):
 
     def score(self, problem: Problem, candidates: Pose) -> Float[Array, "1 1 candidates"]:
         """The values of the true scans."""
-        context = problem.acquisition.context(problem.observations.cloud)
+        context = problem.acquisition.context(inputs_of(problem.observations))
         return scores(problem.acquisition, context, self.scans, problem.camera, candidates)[None, None]
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
@@ -132,7 +132,7 @@ class ClassificationStudy(Study):
     framings: ClassVar[tuple[Framing, ...]] = (Framing.CLOSE_UP,)
     solid: ClassVar[bool] = False
 
-    classifier: Classifier = eqx.field(kw_only=True)
+    classifier: AnyClassifier = eqx.field(kw_only=True, converter=as_classifier)
     imagining: Classifier | None = None
     framing: Framing = eqx.field(static=True, default=Framing.CLOSE_UP)
     split: Split = eqx.field(static=True, default=Split.TEST)

@@ -26,7 +26,7 @@ from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.searches import RULES
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.engine.tiles import Tiles, across, draw_on, say, still_of
-from jaxnbv.tasks import Coverage, SoftPartCount, part_counts
+from jaxnbv.tasks import Coverage, Segmenter, SoftPartCount, part_counts
 from jaxnbv.viz.style import GREY, SERIES
 
 # The paper's N_target of its Table 1, and the authors' value for the utility, in points of the 2,048 that the network
@@ -43,7 +43,7 @@ _NOWHERE = 100.0
 _DENSE = 8000
 
 
-class NearestPart(eqx.Module):
+class NearestPart(Segmenter):
     """An oracle in place of a network that segments: it separates what planning does from what the network does.
 
     The parts of an object that is known: p_ic in proportion to exp(-d_ic^2 / 2 w^2), w = 0.02 scene units, with the
