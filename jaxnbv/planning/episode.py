@@ -22,8 +22,7 @@ from jaxnbv.progress import progress_bar
 from jaxnbv.scanning import GridSurface, Noise, Obstacles, SensorNoise, Surface, as_surface, scan
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.search import Proposal
-from jaxnbv.storage import RunFolder, describe
-from jaxnbv.storage.folders import read_record
+from jaxnbv.storage import RunFolder
 from jaxnbv.surfaces import SurfacePosterior
 from jaxnbv.tasks import Coverage, StopRule
 
@@ -85,11 +84,10 @@ class Episode(eqx.Module):
 
         **Raises:** `ValueError` if the folder holds no episode, or one without a view.
         """
-        config = read_record(Path(path), "episode", "give the folder of a run")["config"]
+        config = RunFolder.config_of(path, "episode")
         views = read_views(RunFolder(path, "episode", config))
         require(len(views) > 0, f"{path} holds no view yet")
-        camera = {name: value for name, value in config["planner"]["camera"].items() if name != "type"}
-        planner = Planner(Coverage(), camera=Camera(**camera | {"center": tuple(camera["center"])}))
+        planner = Planner(Coverage(), camera=config["planner"].camera)
         after = planner.replay((pose, scan) for pose, scan, _ in views)
         shown = tuple(
             View(pose, scan, observations.cloud, proposal, planner.camera)
@@ -126,7 +124,7 @@ def read_views(folder: RunFolder) -> list[tuple[Pose, PointCloud, Proposal | Non
 
 
 def _config(planner: Planner, scene: Surface | None, noise: Noise | None, first: Pose, key: PRNGKeyArray) -> dict:
-    return describe({"planner": planner, "scene": scene, "noise": noise, "first": first, "key": key})
+    return {"planner": planner, "scene": scene, "noise": noise, "first": first, "key": key}
 
 
 @checked

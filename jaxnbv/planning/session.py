@@ -26,7 +26,7 @@ from jaxnbv.planning.stopping import Watch
 from jaxnbv.progress import progress_bar
 from jaxnbv.scanning import Obstacles, plane_under
 from jaxnbv.search import Proposal
-from jaxnbv.storage import RunFolder, describe
+from jaxnbv.storage import RunFolder
 from jaxnbv.tasks import StopRule
 
 _NO_IMAGE = "the session has no image yet: add one first, session.add(depth, matrix)"
@@ -225,7 +225,7 @@ class Session:
 
     def _config(self) -> dict:
         sensor = {"camera": self.camera, "box": self.box, "up": self.frame.up, "convention": self.convention}
-        return describe({**sensor, "key": self.key, "planner": self.planner})
+        return {**sensor, "key": self.key, "planner": self.planner}
 
     def _looked(
         self, depth: Real[np.ndarray, "h w"], matrix: Float[np.ndarray, "4 4"], depth_scale: float

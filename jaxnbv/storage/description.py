@@ -1,49 +1,30 @@
-"""A description of any configuration in JSON: two that differ are told apart, and `jaxnbv.storage.rebuilding` reads it."""
+"""A JSON description of any configuration; `jaxnbv.storage.rebuilding` is the inverse."""
 
-import contextlib
 import dataclasses
-import dis
 import enum
 import functools
 import hashlib
-import importlib.util
-import inspect
 import itertools
 import json
 import math
-import sys
-import sysconfig
-import textwrap
-from collections.abc import Iterator, Sequence
-from pathlib import Path, PurePath
-from types import CodeType, FunctionType, GetSetDescriptorType, MemberDescriptorType, ModuleType
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from pathlib import PurePath
+from types import FunctionType, ModuleType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxnbv.errors import InputError
+from jaxnbv.storage.code import closure, is_installed, is_plain, is_written, lookup, name_of, reads_of, source_of
 
 _LARGEST_LISTED = 16
-_STANDARD = sysconfig.get_path("stdlib")
 # Classes whose objects are the functions that they wrap, with the derivatives that JAX is given of them.
 _WRAPPERS = {"PjitFunction", "custom_jvp", "custom_vjp", "_JitWrapper", "_lru_cache_wrapper"} | {
-    "cached_property",
-    "classmethod",
-    "property",
-    "staticmethod",
+    kind.__name__ for kind in (functools.cached_property, classmethod, property, staticmethod)
 }
 _FUNCTIONS = ("__func__", "fget", "func", "fun", "jvp", "fwd", "bwd", "__wrapped__")
-
-
-# Methods that Python writes for dataclasses and named tuples.
-_GENERATED = {f"__{name}__" for name in "init repr eq lt le gt ge hash setattr delattr new replace".split()}
-_SLOTS = MemberDescriptorType | GetSetDescriptorType | type(NamedTuple("_", [("a", int)]).a)  # type: ignore[attr-defined]
-
-
-class _WithoutOwnMemory:
-    """Objects of its size keep all that they know in their `__dict__`: none of it lies in memory of a C library."""
 
 
 def describe(thing: Any, arrays: dict[str, np.ndarray] | None = None, way: str = "") -> Any:
@@ -61,50 +42,6 @@ def describe(thing: Any, arrays: dict[str, np.ndarray] | None = None, way: str =
     function whose source cannot be read, unless it has a `version`.
     """
     return _Describer({} if arrays is None else arrays).describe(thing, way)
-
-
-def lookup(name: str) -> Any:
-    """What a module that is imported already defines by this name, "module:qualified.name"; None if nothing."""
-    module, _, path = name.partition(":")
-    value: Any = sys.modules.get(module)
-    for part in path.split("."):
-        # Not by getattr, which may run code.
-        value = getattr(value, "__dict__", {}).get(part)
-        value = value.__func__ if isinstance(value, classmethod | staticmethod) else value
-    return value
-
-
-def name_of(thing: Any) -> str:
-    """Module and qualified name of a class or function, by which `lookup` finds it if it can; empty for anything else."""
-    own = getattr(thing, "__qualname__", None) or getattr(thing, "__name__", None)
-    module = getattr(thing, "__module__", None) or getattr(getattr(thing, "__objclass__", None), "__module__", None)
-    if not isinstance(own, str) or not isinstance(module, str):
-        return ""
-    if lookup(f"{module}:{own}") is not thing:
-        # A lambda, or what a function returned, has the name of a global that holds it.
-        names = vars(sys.modules.get(module, object))
-        own = next((name for name in list(names) if names[name] is thing), own)
-    return f"{module}:{own}"
-
-
-def is_installed(module: str | None) -> bool:
-    """Whether a module is of jaxnbv, Python or an installed package, whose code changes with its version alone."""
-    package = str(module).partition(".")[0]
-    if package == "jaxnbv":
-        return True
-    try:
-        spec = importlib.util.find_spec(package)
-    # What is no file, such as __main__.
-    except (ValueError, ImportError):
-        return False
-    places = [] if spec is None else [spec.origin, *(spec.submodule_search_locations or ())]
-    return any(
-        place in ("built-in", "frozen")
-        or {"site-packages", "dist-packages"} & {*Path(place).parts}
-        or Path(place).is_relative_to(_STANDARD)
-        for place in places
-        if place
-    )
 
 
 def is_record(kind: type) -> bool:
@@ -181,7 +118,7 @@ class _Describer:
         if is_installed(name.partition(":")[0]) and lookup(name) is thing:
             return {"type": "class" if isinstance(thing, type) else "function", "name": name}
         if isinstance(thing, type):
-            parts = {"members": {key: value for key, value in vars(thing).items() if _is_code(key, value)}}
+            parts = {"members": {key: value for key, value in vars(thing).items() if is_written(key, value)}}
             return {"type": "class", "name": name, **self._beside({**parts, "bases": thing.__bases__}, way)}
         if isinstance(thing, functools.partial):
             return {"type": "partial", **self._named({"function": thing.func, "arguments": thing.args}, way)} | {
@@ -196,7 +133,7 @@ class _Describer:
         if wraps:
             functions = {part: value for part in _FUNCTIONS if callable(value := getattr(thing, part, None))}
             return {"type": "wrapped", "by": name_of(kind), "name": name, **self._named(functions, way)}
-        if is_installed(kind.__module__) and kind.__basicsize__ <= _WithoutOwnMemory.__basicsize__:
+        if is_installed(kind.__module__) and is_plain(thing):
             return {"type": name_of(kind), **self._beside({"state": getattr(thing, "__dict__", {})}, way)}
         raise InputError(
             f"{way or 'this'} is a {kind.__name__}, which nothing here can tell from another {kind.__name__}: give it "
@@ -224,11 +161,11 @@ class _Describer:
     def _function(self, function: FunctionType, way: str) -> dict[str, Any]:
         """Everything on which the result of a function depends, but for what installed packages define."""
         own = not is_installed(function.__globals__.get("__name__"))
-        parts = {"defaults": (function.__defaults__, function.__kwdefaults__), "closure": _closure(function)}
+        parts = {"defaults": (function.__defaults__, function.__kwdefaults__), "closure": closure(function)}
         if own:
-            reads = dict(_reads(function.__code__, function.__globals__, way))
+            reads = dict(reads_of(function.__code__, function.__globals__, way))
             parts["globals"] = {name: reads[name] for name in sorted(reads)}
-        source = {"source": _source(function, way)} if own or function.__name__ == "<lambda>" else {}
+        source = {"source": source_of(function, way)} if own or function.__name__ == "<lambda>" else {}
         return source | self._beside(parts, way)
 
     def _beside(self, parts: dict[str, Any], way: str) -> dict[str, Any]:
@@ -238,66 +175,3 @@ class _Describer:
             return self._named(parts, way)
         finally:
             self.arrays = arrays
-
-
-def _closure(function: FunctionType) -> dict[str, Any]:
-    """Variables of the enclosing functions that have a value."""
-    values = {}
-    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
-        with contextlib.suppress(ValueError):
-            values[name] = cell.cell_contents
-    return values
-
-
-def _reads(code: CodeType, names: dict[str, Any], way: str) -> Iterator[tuple[str, Any]]:
-    """Globals that code reads; of a user's module the attributes.
-
-    **Raises:** `ValueError` for code that imports a user's module.
-    """
-    steps = [step for step in dis.get_instructions(code) if step.opname != "EXTENDED_ARG"]
-    for index, step in enumerate(steps):
-        if step.opname == "IMPORT_NAME" and not is_installed(step.argval):
-            raise InputError(f"{way} imports {step.argval or 'a module'} while it runs: import it at the top of the file")
-        if step.opname in ("LOAD_GLOBAL", "LOAD_NAME") and step.argval in names:
-            name, value = step.argval, names[step.argval]
-            for after in steps[index + 1 :]:
-                own = isinstance(value, ModuleType) and not is_installed(value.__name__)
-                if not own or after.opname not in ("LOAD_ATTR", "LOAD_METHOD") or not hasattr(value, after.argval):
-                    break
-                name, value = f"{name}.{after.argval}", getattr(value, after.argval)
-            yield name, value
-    for constant in code.co_consts:
-        if isinstance(constant, CodeType):
-            yield from _reads(constant, names, way)
-
-
-def _is_code(name: str, member: Any) -> bool:
-    """Whether a member of a class is its author's, not Python's."""
-    if isinstance(member, FunctionType):
-        return member.__code__.co_filename != "<string>" or name not in _GENERATED
-    return not (name.startswith("__") or name == "_abc_impl" or isinstance(member, _SLOTS))
-
-
-def _source(function: FunctionType, way: str) -> str:
-    """The text of a function; of a lambda its body alone, for a line may hold several.
-
-    **Raises:** `ValueError` if it cannot be read.
-    """
-    code = function.__code__
-    try:
-        text = textwrap.dedent(inspect.getsource(code))
-    except (OSError, TypeError) as error:
-        raise InputError(
-            f"{way or 'this'} is the function {function.__qualname__}, whose source cannot be read: define it in a file, "
-            f'or give it a version that you change whenever it changes, {function.__name__}.version = "1"'
-        ) from error
-    if function.__name__ != "<lambda>":
-        return text
-    lines, _ = inspect.findsource(code)
-    # An instruction without width is of no expression.
-    spans = [(a, b, c, d) for a, b, c, d in code.co_positions() if a and b and c is not None and d]
-    (first, start), (last, end) = min((a, c) for a, _, c, _ in spans), max((b, d) for _, b, _, d in spans)
-    body = [line.encode() for line in lines[first - 1 : last]]
-    body[-1] = body[-1][:end]
-    body[0] = body[0][start:]
-    return b"".join(body).decode()

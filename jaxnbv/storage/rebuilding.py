@@ -3,7 +3,6 @@
 import dataclasses
 import enum
 import functools
-import hashlib
 import importlib
 import sys
 from collections.abc import Callable, Mapping
@@ -19,8 +18,7 @@ from jaxnbv.checks import InputError, require
 from jaxnbv.storage.description import describe, fields_of, is_installed, is_record, lookup, name_of
 from jaxnbv.storage.folders import differences
 
-# Modules of installed packages whose functions compute and nothing else. Of another, what a file names might do anything
-# once it is called.
+# Modules of installed packages whose functions compute and nothing else. Those of others might do anything when called.
 _HARMLESS = ("jaxnbv", "jax.nn", "jax._src.nn", "jax.lax", "equinox.nn", "optimistix", "math")
 _WEAK = {"b": bool, "i": int, "f": float}
 _TEXTS: dict[str, Callable[[Any], Any]] = {
@@ -82,21 +80,27 @@ class _Rebuilder:
             require(alike, f"{way} is a {told.get('by')} of {told['name']} that has no name of its own: {self.remedy}")
             return thing
         if kind == "partial":
-            function, arguments, keywords = (self.rebuild(told[part], way) for part in ("function", "arguments", "keywords"))
+            function, arguments, keywords = (
+                self.rebuild(told[part], way) for part in ("function", "arguments", "keywords")
+            )
             return functools.partial(function, *arguments, **keywords)
         if kind == "method":
             return MethodType(self.rebuild(told["function"], way), self.rebuild(told["self"], way))
         require(" " in kind, f"{way} is a {told.get('name', kind)}, of which its {kind} alone is kept: {self.remedy}")
         origin, dtype = kind.split(" ")
         if origin == "key":
-            return jax.random.wrap_key_data(np.array(told["data"], np.uint32), impl=dtype)
-        return self._array(origin, np.dtype(dtype), told)
+            return jax.random.wrap_key_data(jnp.array(told["data"], jnp.uint32), impl=dtype)
+        return self._array(origin, np.dtype(dtype), told, way)
 
-    def _array(self, origin: str, dtype: np.dtype, told: dict[str, Any]) -> Any:
+    def _array(self, origin: str, dtype: np.dtype, told: dict[str, Any], way: str) -> Any:
         if "values" in told:
             array = np.array(told["values"], dtype)
         else:
-            array = np.frombuffer(self.arrays[told["sha256"]].tobytes(), dtype).reshape(told["shape"]).copy()
+            digest = told["sha256"]
+            require(
+                digest in self.arrays, f"{way} is the array {digest}, which the folder does not hold: {self.remedy}"
+            )
+            array = np.frombuffer(self.arrays[digest].tobytes(), dtype).reshape(told["shape"]).copy()
         if origin == "weak":
             return jax.lax.convert_element_type(array, _WEAK[array.dtype.kind])
         return jnp.asarray(array) if origin == "jax" else array[()] if origin == "scalar" else array
@@ -111,7 +115,7 @@ class _Rebuilder:
         values = {field: self.rebuild(told[field], f"{way}.{field}") for field in fields_of(kind)}
         if not dataclasses.is_dataclass(kind):
             return tuple.__new__(kind, values.values())
-        thing = object.__new__(kind)
+        thing: Any = object.__new__(kind)  # type: ignore[arg-type]
         for field, value in values.items():
             object.__setattr__(thing, field, value)
         return thing
@@ -137,6 +141,8 @@ class _Rebuilder:
             importlib.import_module(module)
         thing = lookup(name)
         if thing is None:
-            missing = "is not imported" if module not in sys.modules else "has none of that name that could be looked up"
+            missing = (
+                "is not imported" if module not in sys.modules else "has none of that name that could be looked up"
+            )
             raise InputError(f"{way} is {name}, but {module or name} {missing}: {self.remedy}")
         return thing
