@@ -97,9 +97,7 @@ class _Rebuilder:
             array = np.array(told["values"], dtype)
         else:
             digest = told["sha256"]
-            require(
-                digest in self.arrays, f"{way} is the array {digest}, which the folder does not hold: {self.remedy}"
-            )
+            require(digest in self.arrays, f"{way} is an array that the folder does not hold: {self.remedy}")
             array = np.frombuffer(self.arrays[digest].tobytes(), dtype).reshape(told["shape"]).copy()
         if origin == "weak":
             return jax.lax.convert_element_type(array, _WEAK[array.dtype.kind])
