@@ -115,8 +115,10 @@ def reads_of(code: CodeType, names: dict[str, Any], way: str) -> Iterator[tuple[
 
 def is_written(name: str, member: Any) -> bool:
     """Whether a member of a class is its author's, not Python's."""
-    if isinstance(member, FunctionType):
-        return member.__code__.co_filename != "<string>" or name not in _GENERATED
+    function = getattr(member, "__func__", member)
+    if isinstance(function, FunctionType):
+        by_python = name in _GENERATED and function.__code__.co_filename == "<string>"
+        return not by_python and function.__globals__.get("__name__") != "collections"
     return not (name.startswith("__") or name == "_abc_impl" or isinstance(member, _SLOTS))
 
 

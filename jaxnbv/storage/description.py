@@ -21,7 +21,7 @@ from jaxnbv.storage.code import closure, is_installed, is_plain, is_written, loo
 
 _LARGEST_LISTED = 16
 # Classes whose objects are the functions that they wrap, with the derivatives that JAX is given of them.
-_WRAPPERS = {"PjitFunction", "custom_jvp", "custom_vjp", "_JitWrapper", "_lru_cache_wrapper"} | {
+_WRAPPERS = {"PjitFunction", "custom_jvp", "custom_vjp", "_JitWrapper", "BoundMethod", "_lru_cache_wrapper"} | {
     kind.__name__ for kind in (functools.cached_property, classmethod, property, staticmethod)
 }
 _FUNCTIONS = ("__func__", "fget", "func", "fun", "jvp", "fwd", "bwd", "__wrapped__")
@@ -148,7 +148,8 @@ class _Describer:
         array = np.ascontiguousarray(thing).reshape(np.shape(thing))
         if array.dtype.hasobject:
             raise InputError(f"{way or 'this'} is an array of Python objects: give numbers")
-        kind = f"{'weak' if getattr(thing, 'weak_type', False) else origin} {array.dtype}"
+        # Of a Python number, by which no type is promoted.
+        kind = f"{'weak' if array.ndim == 0 and getattr(thing, 'weak_type', False) else origin} {array.dtype}"
         if 0 < array.size <= _LARGEST_LISTED and array.dtype.kind in "biuf" and np.isfinite(array).all():
             return {"type": kind, "values": array.tolist()}
         digest = hashlib.sha256(array.tobytes()).hexdigest()

@@ -7,7 +7,6 @@ import importlib
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import MethodType
 from typing import Any
 
 import jax
@@ -20,7 +19,6 @@ from jaxnbv.storage.folders import differences
 
 # Modules of installed packages whose functions compute and nothing else. Those of others might do anything when called.
 _HARMLESS = ("jaxnbv", "jax.nn", "jax._src.nn", "jax.lax", "equinox.nn", "optimistix", "math")
-_WEAK = {"b": bool, "i": int, "f": float}
 _TEXTS: dict[str, Callable[[Any], Any]] = {
     "float": float,
     "complex": complex,
@@ -85,7 +83,10 @@ class _Rebuilder:
             )
             return functools.partial(function, *arguments, **keywords)
         if kind == "method":
-            return MethodType(self.rebuild(told["function"], way), self.rebuild(told["self"], way))
+            function, bound = self.rebuild(told["function"], way), self.rebuild(told["self"], way)
+            own = any(member is function for base in type(bound).__mro__ for member in vars(base).values())
+            require(own, f"{way} is a method that {type(bound).__name__} does not have: {self.remedy}")
+            return getattr(bound, function.__name__)
         require(" " in kind, f"{way} is a {told.get('name', kind)}, of which its {kind} alone is kept: {self.remedy}")
         origin, dtype = kind.split(" ")
         if origin == "key":
@@ -100,7 +101,7 @@ class _Rebuilder:
             require(digest in self.arrays, f"{way} is an array that the folder does not hold: {self.remedy}")
             array = np.frombuffer(self.arrays[digest].tobytes(), dtype).reshape(told["shape"]).copy()
         if origin == "weak":
-            return jax.lax.convert_element_type(array, _WEAK[array.dtype.kind])
+            return jnp.asarray(array.item())
         return jnp.asarray(array) if origin == "jax" else array[()] if origin == "scalar" else array
 
     def _record(self, name: str, told: dict[str, Any], way: str) -> Any:
@@ -116,6 +117,10 @@ class _Rebuilder:
         thing: Any = object.__new__(kind)  # type: ignore[arg-type]
         for field, value in values.items():
             object.__setattr__(thing, field, value)
+        # Equinox's wrappers have the names of the functions that they wrap.
+        if is_installed(kind.__module__) and (wrapped := getattr(thing, "__wrapped__", None)) is not None:
+            for attribute in functools.WRAPPER_ASSIGNMENTS:
+                object.__setattr__(thing, attribute, getattr(wrapped, attribute))
         return thing
 
     def _code(self, name: str, way: str) -> Any:
@@ -139,8 +144,6 @@ class _Rebuilder:
             importlib.import_module(module)
         thing = lookup(name)
         if thing is None:
-            missing = (
-                "is not imported" if module not in sys.modules else "has none of that name that could be looked up"
-            )
-            raise InputError(f"{way} is {name}, but {module or name} {missing}: {self.remedy}")
+            missing = "has nothing of that name" if module in sys.modules else "is not imported"
+            raise InputError(f"{way} is {name}, but {module} {missing}: {self.remedy}")
         return thing

@@ -174,10 +174,10 @@ def test_whatever_a_function_reads_tells_it_apart(tmp_path, monkeypatch):
 
 def test_a_users_class_is_told_apart_by_its_methods():
     def acquisition(number):
-        class Mine(nbv.Acquisition):
+        class Mine(eqx.Module):
             weight: float = 1.0
 
-            def score(self, context, scan, camera, pose):
+            def score(self, scan):
                 return self.weight * number
 
         return Mine()
