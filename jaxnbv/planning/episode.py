@@ -1,11 +1,12 @@
 """An episode: views that were chosen of an object, and all that they depend on."""
 
+import dataclasses
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
 
 import equinox as eqx
-import jax
+import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from jaxnbv.checks import check_type, require
@@ -18,9 +19,7 @@ from jaxnbv.planning.loop import View
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Noise, Surface
 from jaxnbv.search import Proposal
-from jaxnbv.storage import RunFolder, describe
-from jaxnbv.storage.folders import read_record
-from jaxnbv.tasks import Coverage
+from jaxnbv.storage import RunFolder
 
 
 class Episode(eqx.Module):
@@ -66,23 +65,27 @@ class Episode(eqx.Module):
         return next(itertools.islice(self.observations(), views - 1, None))
 
     @classmethod
-    def load(cls, path: str | Path) -> "Episode":
-        """The episode of a folder, which says what camera was planned for but not how: its planner has this camera and
-        the usual surfaces, for what is to be drawn.
+    def load(cls, path: str | Path, planner: Planner | None = None, scene: Surface | None = None) -> "Episode":
+        """The episode of a folder, as it was saved or as far as `simulate` has come.
 
-        **Raises:** `ValueError` if the folder holds no episode, or one without a view.
+        - `planner`, `scene`: in place of the stored ones, where these hold a function or a network that cannot be made
+          again from its description; they must have the same description.
+
+        **Raises:** `ValueError` if the folder holds no episode, or no view, or if its planner or scene cannot be made
+        again.
         """
-        config = read_record(Path(path), "episode", "give the folder of a run")["config"]
-        views = read_views(RunFolder(path, "episode", config))
-        require(len(views) > 0, f"{path} holds no view yet")
-        camera = {name: value for name, value in config["planner"]["camera"].items() if name != "type"}
-        planner = Planner(Coverage(), camera=Camera(**camera | {"center": tuple(camera["center"])}))
-        after = planner.replay((pose, scan) for pose, scan, _ in views)
-        shown = tuple(
+        given = {name: value for name, value in (("planner", planner), ("scene", scene)) if value is not None}
+        config = RunFolder.config_of(path, "episode", **given)
+        folder = RunFolder(path, "episode", config)
+        stored = read_views(folder)
+        require(len(stored) > 0, f"{path} holds no view yet")
+        episode = cls(**config)
+        after = episode.planner.replay(((pose, scan) for pose, scan, _ in stored), episode.camera)
+        views = tuple(
             View(pose, scan, observations.cloud, proposal)
-            for (pose, scan, proposal), observations in zip(views, after, strict=True)
+            for (pose, scan, proposal), observations in zip(stored, after, strict=True)
         )
-        return cls(planner, None, None, views[0][0], jax.random.key(0), shown)
+        return dataclasses.replace(episode, views=views, stopped=_read_end(folder, len(views)))
 
     def save(self, path: str | Path) -> None:
         """Write the episode to a folder (see `jaxnbv.storage` for its files); `simulate` can continue from it.
@@ -100,7 +103,13 @@ class Episode(eqx.Module):
             )
             for index, view in enumerate(self.views):
                 folder.write("view", index, pose=view.pose, scan=view.scan, proposal=view.proposal)
-            folder.write_cloud(self.frame.to_world(self.cloud))
+            self.write_end(folder)
+
+    def write_end(self, folder: RunFolder) -> None:
+        """Write why the episode ended, and its cloud in world units."""
+        if self.stopped is not None:
+            folder.write("end", 0, reason=np.array(self.stopped), views=np.array(len(self.views)))
+        folder.write_cloud(self.frame.to_world(self.cloud))
 
     def open(self, path: str | Path) -> RunFolder:
         """The folder of this episode's configuration, for its views.
@@ -108,7 +117,7 @@ class Episode(eqx.Module):
         **Raises:** `ValueError` as `RunFolder` does.
         """
         names = ("planner", "scene", "noise", "first", "key", "camera", "frame")
-        return RunFolder(path, "episode", describe({name: getattr(self, name) for name in names}))
+        return RunFolder(path, "episode", {name: getattr(self, name) for name in names})
 
 
 def read_views(folder: RunFolder) -> list[tuple[Pose, PointCloud, Proposal | None]]:
@@ -118,3 +127,11 @@ def read_views(folder: RunFolder) -> list[tuple[Pose, PointCloud, Proposal | Non
     """
     views = (folder.read("view", index) for index in range(folder.count("view")))
     return [(view["pose"], view["scan"], view.get("proposal")) for view in views]
+
+
+def _read_end(folder: RunFolder, views: int) -> str | None:
+    """Why an episode of as many views ended; None if it went on since, or was not ended by a rule."""
+    if not folder.file("end", 0).exists():
+        return None
+    end = folder.read("end", 0)
+    return str(end["reason"]) if int(end["views"]) == views else None

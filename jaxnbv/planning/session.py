@@ -28,7 +28,7 @@ from jaxnbv.planning.table import plane_under
 from jaxnbv.progress import progress_bar
 from jaxnbv.scanning import Obstacles
 from jaxnbv.search import HalvingSearch, Proposal
-from jaxnbv.storage import RunFolder, describe
+from jaxnbv.storage import RunFolder
 from jaxnbv.tasks import NewSurface
 
 _NO_IMAGE = "the session has no image yet: add one first, session.add(depth, matrix)"
@@ -110,8 +110,24 @@ class Session:
             # What a session is made of, as it was given: `load` makes it again from these.
             config = {"camera": camera, "box": self.box, "planner": planner, "up": up, "poses": matrices}
             config |= {"convention": convention, "key": self.key, "obstacles": obstacles}
-            self._folder = RunFolder(folder, "session", describe(config))
+            self._folder = RunFolder(folder, "session", config)
             self._read(self._folder)
+
+    @classmethod
+    def load(
+        cls, path: str | Path, planner: Planner | None = None, until: StopRule | None = None, progress: bool = True
+    ) -> "Session":
+        """The session of a folder, which goes on from its last image.
+
+        - `planner`: in place of the stored one, where that holds a function or a network that cannot be made again from
+          its description; it must have the same description.
+        - `until`, `progress`: as of a new session; they are not stored.
+
+        **Raises:** `ValueError` if the folder holds no session, or its planner cannot be made again.
+        """
+        given = {} if planner is None else {"planner": planner}
+        config = RunFolder.config_of(path, "session", **given)
+        return cls(**config, folder=path, until=until, progress=progress)
 
     def __repr__(self) -> str:
         images = f"{len(self.views)} image{'s' * (len(self.views) != 1)}"

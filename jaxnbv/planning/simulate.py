@@ -87,7 +87,7 @@ def simulate(
         stopped = loop.enough() if len(loop.views) < views else None
         episode = dataclasses.replace(episode, views=loop.views, stopped=stopped)
         if store:
-            store.write_cloud(episode.cloud)
+            episode.write_end(store)
     return episode
 
 

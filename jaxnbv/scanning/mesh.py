@@ -1,5 +1,6 @@
 """TriangleMesh: real objects as they come, soups and open sheets included, met by rays through Embree on the host."""
 
+import dataclasses
 import warnings
 from typing import ClassVar
 
@@ -22,11 +23,14 @@ from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.scanning.sdf.sampled import checked_triangles, winding_number
 
 
+@dataclasses.dataclass(eq=False)
 class _Tree:
-    """Embree's tree of the triangles it was last asked for: it is no array, so it stays out of the pytree's leaves."""
+    """Embree's tree of the triangles it was last asked for: it is no array, so it stays out of the pytree's leaves.
 
-    def __init__(self):
-        self._vertices = self._faces = self._scene = None
+    It has no fields, for it follows from the triangles: any two are described alike.
+    """
+
+    _vertices = _faces = _scene = None
 
     def of(self, vertices: np.ndarray, faces: np.ndarray) -> EmbreeScene:
         if self._vertices is not vertices or self._faces is not faces:

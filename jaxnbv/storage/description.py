@@ -1,82 +1,178 @@
-"""A description of any configuration that JSON can say."""
+"""A JSON description of any configuration; `jaxnbv.storage.rebuilding` is the inverse."""
 
 import dataclasses
+import enum
 import functools
 import hashlib
-import inspect
-import textwrap
-import warnings
-from types import FunctionType
+import itertools
+import json
+import math
+from collections.abc import Sequence
+from pathlib import PurePath
+from types import FunctionType, ModuleType
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxnbv.errors import InputError
+from jaxnbv.storage.code import closure, is_installed, is_plain, is_written, lookup, name_of, reads_of, source_of
+
 _LARGEST_LISTED = 16
+# Classes whose objects are the functions that they wrap, with the derivatives that JAX is given of them.
+_WRAPPERS = {"PjitFunction", "custom_jvp", "custom_vjp", "_JitWrapper", "BoundMethod", "_lru_cache_wrapper"} | {
+    kind.__name__ for kind in (functools.cached_property, classmethod, property, staticmethod)
+}
+_FUNCTIONS = ("__func__", "fget", "func", "fun", "jvp", "fwd", "bwd", "__wrapped__")
 
 
-def describe(thing: Any) -> Any:
-    """A JSON description by which two configurations can be told apart.
+def describe(thing: Any, arrays: dict[str, np.ndarray] | None = None, way: str = "") -> Any:
+    """A JSON description by which two configurations can be told apart, and from which `rebuild` makes them again.
 
-    Modules and dataclasses become their fields, small arrays their values, large ones a hash of their bytes, functions
-    their names, source, defaults and closures, other objects their types' names. Where the source of a function cannot
-    be read, a `UserWarning` says so, and its name must do.
+    Modules, dataclasses and named tuples become their classes and fields, small arrays their values, large ones a hash
+    of their bytes. A function becomes its source, defaults and closure and every global that its code reads; so do the
+    methods of a user's class. What an installed package defines is described by its name. An object with a `version`, a
+    text or a number, is described by its class and version.
+
+    - `arrays`: is filled with the contents of the large arrays, by their hashes.
+    - `way`: what the errors call `thing`.
+
+    **Raises:** `ValueError` that names the way to an object that cannot be told from others of its class, or to a
+    function whose source cannot be read, unless it has a `version`.
     """
-    if dataclasses.is_dataclass(thing) and not isinstance(thing, type):
-        fields = {field.name: describe(getattr(thing, field.name, None)) for field in dataclasses.fields(thing)}
-        return {"type": type(thing).__qualname__, **fields}
-    if isinstance(thing, jax.Array) and jnp.issubdtype(thing.dtype, jax.dtypes.prng_key):
-        return {"type": str(jax.random.key_impl(thing)), "data": jax.random.key_data(thing).tolist()}
-    if isinstance(thing, jax.Array | np.ndarray | np.generic):
-        array = np.asarray(thing)
-        if array.size <= _LARGEST_LISTED:
-            return array.tolist()
-        digest = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
-        return {"shape": list(array.shape), "dtype": str(array.dtype), "sha256": digest}
-    if isinstance(thing, dict):
-        return {str(key): describe(value) for key, value in thing.items()}
-    if isinstance(thing, list | tuple):
-        return [describe(value) for value in thing]
-    if thing is None or isinstance(thing, bool | int | float | str):
-        return thing
-    if isinstance(thing, functools.partial):
-        return {"partial": describe(thing.func), "arguments": describe([thing.args, thing.keywords])}
-    if isinstance(thing, FunctionType):
-        cells = [cell.cell_contents for cell in thing.__closure__ or ()]
-        parts = {
-            "source": _source(thing),
-            "defaults": [thing.__defaults__, thing.__kwdefaults__],
-            "closure": [cell for cell in cells if cell is not thing],
-        }
-        return {"function": thing.__qualname__, **describe(parts)}
-    if isinstance(thing, set | frozenset):
-        return sorted(map(repr, thing))
-    if isinstance(thing, bytes | complex):
-        return repr(thing)
-    if hasattr(thing, "__wrapped__"):
-        return describe(thing.__wrapped__)
-    return getattr(thing, "__qualname__", type(thing).__qualname__)
+    return _Describer({} if arrays is None else arrays).describe(thing, way)
 
 
-def _source(function: FunctionType) -> str | None:
-    """The text of a function; of a lambda its body alone, for a line may hold several."""
-    try:
-        text = textwrap.dedent(inspect.getsource(function))
-    except (OSError, TypeError):
-        warnings.warn(
-            f"the source of the function {function.__qualname__} cannot be read: its name alone says whether a stored "
-            "run is of the same function. Define it in a file",
-            stacklevel=2,
+def is_record(kind: type) -> bool:
+    """Whether a class is a dataclass, which a module is too, or a named tuple."""
+    return dataclasses.is_dataclass(kind) or (issubclass(kind, tuple) and hasattr(kind, "_fields"))
+
+
+def fields_of(kind: type) -> Sequence[str]:
+    """Names of the fields of a dataclass or a named tuple."""
+    return [field.name for field in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else kind._fields  # type: ignore[attr-defined]
+
+
+class _Describer:
+    """One description under way. What it has visited is described once, so that it ends on what refers to itself."""
+
+    def __init__(self, arrays: dict[str, np.ndarray]):
+        self.arrays = arrays
+        self.visited: dict[int, tuple[int, Any]] = {}
+        self.numbers = itertools.count()
+
+    def describe(self, thing: Any, way: str) -> Any:
+        kind = type(thing)
+        if thing is None or kind in (bool, int, str) or (kind is float and math.isfinite(thing)):
+            return thing
+        if kind in (float, complex):
+            return {"type": kind.__name__, "value": repr(thing)}
+        if kind is bytes:
+            return {"type": "bytes", "value": thing.hex()}
+        if isinstance(thing, enum.Enum):
+            return {"type": name_of(kind), "member": thing.name, "value": self.describe(thing.value, way)}
+        if isinstance(thing, PurePath):
+            return {"type": "path", "value": str(thing)}
+        if isinstance(thing, np.dtype):
+            return {"type": "dtype", "value": str(thing)}
+        if isinstance(thing, jax.Array | np.generic) or kind is np.ndarray:
+            return self._array(thing, way)
+        if id(thing) in self.visited:
+            return {"type": "again", "name": name_of(thing), "index": self.visited[id(thing)][0]}
+        self.visited[id(thing)] = next(self.numbers), thing
+        try:
+            return self._object(thing, kind, way)
+        finally:
+            # Code alone is described once: two equal containers are alike, whether or not they are one.
+            if not isinstance(thing, FunctionType | type):
+                del self.visited[id(thing)]
+
+    def _object(self, thing: Any, kind: type, way: str) -> Any:
+        version = None if isinstance(thing, ModuleType) else getattr(thing, "version", None)
+        versioned = isinstance(version, str | int | float)
+        wraps = kind.__name__ in _WRAPPERS and is_installed(kind.__module__)
+        if is_record(kind) and not wraps:
+            code = {} if is_installed(kind.__module__) else {"class": self.describe(kind, f"{way}.class")}
+            values = {name: getattr(thing, name) for name in fields_of(kind)}
+            # The version stands for what is called.
+            kept = {name: value for name, value in values.items() if not (versioned and callable(value))}
+            return {"type": name_of(kind), **code, **self._named(kept, way)}
+        if versioned:
+            return {"type": "versioned", "name": name_of(thing) or name_of(kind), "version": version}
+        if kind is dict:
+            if all(type(key) is str for key in thing) and "type" not in thing:
+                return self._named(thing, way)
+            return {"type": "dict", "items": self.describe(tuple(thing.items()), way)}
+        if kind is tuple:
+            return [self.describe(value, f"{way}[{index}]") for index, value in enumerate(thing)]
+        if kind is list:
+            return {"type": "list", "items": self.describe(tuple(thing), way)}
+        if kind in (set, frozenset):
+            items = [self.describe(value, way) for value in thing]
+            return {"type": kind.__name__, "items": sorted(items, key=lambda item: json.dumps(item, sort_keys=True))}
+        if isinstance(thing, ModuleType):
+            own = {} if is_installed(thing.__name__) else {"version": getattr(thing, "__version__", None)}
+            return {"type": "module", "name": thing.__name__, **own}
+        name = name_of(thing)
+        if is_installed(name.partition(":")[0]) and lookup(name) is thing:
+            return {"type": "class" if isinstance(thing, type) else "function", "name": name}
+        if isinstance(thing, type):
+            parts = {"members": {key: value for key, value in vars(thing).items() if is_written(key, value)}}
+            return {"type": "class", "name": name, **self._beside({**parts, "bases": thing.__bases__}, way)}
+        if isinstance(thing, functools.partial):
+            return {"type": "partial", **self._named({"function": thing.func, "arguments": thing.args}, way)} | {
+                "keywords": self.describe(thing.keywords, way)
+            }
+        bound = getattr(thing, "__self__", None)
+        if bound is not None and not isinstance(bound, ModuleType):
+            function = getattr(thing, "__func__", None) or getattr(type(bound), thing.__name__)
+            return {"type": "method", **self._named({"function": function, "self": bound}, way)}
+        if isinstance(thing, FunctionType):
+            return {"type": "function", "name": name, **self._function(thing, way)}
+        if wraps:
+            functions = {part: value for part in _FUNCTIONS if callable(value := getattr(thing, part, None))}
+            return {"type": "wrapped", "by": name_of(kind), "name": name, **self._named(functions, way)}
+        if is_installed(kind.__module__) and is_plain(thing):
+            return {"type": name_of(kind), **self._beside({"state": getattr(thing, "__dict__", {})}, way)}
+        raise InputError(
+            f"{way or 'this'} is a {kind.__name__}, which nothing here can tell from another {kind.__name__}: give it "
+            "an attribute version, a text or a number that you change whenever it changes; of a network that is not of "
+            'JAX say HostClassifier(..., version="2026-11")'
         )
-        return None
-    if function.__name__ != "<lambda>":
-        return text
-    lines, _ = inspect.findsource(function)
-    # An instruction without width is of no expression.
-    spans = [(a, b, c, d) for a, b, c, d in function.__code__.co_positions() if a and b and c is not None and d]
-    (first, start), (last, end) = min((a, c) for a, _, c, _ in spans), max((b, d) for _, b, _, d in spans)
-    body = [line.encode() for line in lines[first - 1 : last]]
-    body[-1] = body[-1][:end]
-    body[0] = body[0][start:]
-    return b"".join(body).decode()
+
+    def _array(self, thing: Any, way: str) -> Any:
+        if isinstance(thing, jax.Array) and jnp.issubdtype(thing.dtype, jax.dtypes.prng_key):
+            return {"type": f"key {jax.random.key_impl(thing)}", "data": jax.random.key_data(thing).tolist()}
+        origin = "jax" if isinstance(thing, jax.Array) else "numpy" if isinstance(thing, np.ndarray) else "scalar"
+        array = np.ascontiguousarray(thing).reshape(np.shape(thing))
+        if array.dtype.hasobject:
+            raise InputError(f"{way or 'this'} is an array of Python objects: give numbers")
+        # Of a Python number, by which no type is promoted.
+        kind = f"{'weak' if array.ndim == 0 and getattr(thing, 'weak_type', False) else origin} {array.dtype}"
+        if 0 < array.size <= _LARGEST_LISTED and array.dtype.kind in "biuf" and np.isfinite(array).all():
+            return {"type": kind, "values": array.tolist()}
+        digest = hashlib.sha256(array.tobytes()).hexdigest()
+        self.arrays[digest] = array
+        return {"type": kind, "shape": list(array.shape), "sha256": digest}
+
+    def _named(self, values: dict[str, Any], way: str) -> dict[str, Any]:
+        return {name: self.describe(value, f"{way}.{name}".lstrip(".")) for name, value in values.items()}
+
+    def _function(self, function: FunctionType, way: str) -> dict[str, Any]:
+        """Everything on which the result of a function depends, but for what installed packages define."""
+        own = not is_installed(function.__globals__.get("__name__"))
+        parts = {"defaults": (function.__defaults__, function.__kwdefaults__), "closure": closure(function)}
+        if own:
+            reads = dict(reads_of(function.__code__, function.__globals__, way))
+            parts["globals"] = {name: reads[name] for name in sorted(reads)}
+        source = {"source": source_of(function, way)} if own or function.__name__ == "<lambda>" else {}
+        return source | self._beside(parts, way)
+
+    def _beside(self, parts: dict[str, Any], way: str) -> dict[str, Any]:
+        """Descriptions of what is looked up and not rebuilt, so that its arrays need not be kept."""
+        arrays, self.arrays = self.arrays, {}
+        try:
+            return self._named(parts, way)
+        finally:
+            self.arrays = arrays

@@ -4,18 +4,25 @@ import importlib.metadata
 import json
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import filelock
 import jax
+import numpy as np
 
 from jaxnbv.checks import InputError, require
-from jaxnbv.storage.files import PARTS, make_folder, write_text
+from jaxnbv.storage.files import PARTS, make_folder, write_text, write_whole
 
 _LOCK = ".lock"
+# What belongs to the record, beside it.
+ARRAYS = "arrays.npz"
+# In bytes, unpacked: sixteen million rays, far more than a camera has.
+LARGEST = 2**29
+_LONGEST_SHOWN = 60
 
 
 def software() -> dict[str, str]:
@@ -35,7 +42,13 @@ def differences(found: Any, asked: Any, name: str = "") -> list[str]:
         keys = list(dict.fromkeys([*found, *asked]))
         nested = (differences(found.get(key), asked.get(key), f"{name}.{key}".lstrip(".")) for key in keys)
         return [difference for group in nested for difference in group]
-    return [] if found == asked else [f"{name}: {found} there, {asked} now"]
+    return [] if found == asked else [f"{name}: {_short(found)} there, {_short(asked)} now"]
+
+
+def _short(value: Any) -> str:
+    """The beginning of what may be the source of a function."""
+    text = str(value)
+    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
 
 
 def check_format(found: Any, known: int, file: Path) -> None:
@@ -61,6 +74,39 @@ def read_json(file: Path, problem: str, remedy: str) -> dict[str, Any]:
         raise InputError(f"{file} {problem} ({reason}): {remedy}") from error
     require(isinstance(content, dict), f"{file} {problem} (it holds a {type(content).__name__}): {remedy}")
     return content
+
+
+def write_arrays(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays to a .npz file, all or nothing.
+
+    **Raises:** `ValueError` as `write_whole` does, or if they are larger than `read_arrays` reads.
+    """
+    size = sum(array.nbytes for array in arrays.values())
+    require(size <= LARGEST, f"cannot write {file}: its arrays have {size} bytes, more than {LARGEST}")
+    write_whole(file, lambda opened: np.savez_compressed(opened, **arrays))  # type: ignore[arg-type]
+
+
+def read_arrays(file: Path, remedy: str, check: Callable[[dict[str, np.ndarray]], None]) -> dict[str, np.ndarray]:
+    """The arrays of a .npz file.
+
+    - `check`: raises any error if they are not what was written.
+
+    **Raises:** `ValueError` that tells `remedy` if the file is damaged.
+    """
+    try:
+        if not file.is_file():
+            raise ValueError("there is no file")
+        with np.load(file, allow_pickle=False) as saved:
+            held = sum(member.file_size for member in saved.zip.infolist())
+            # Headers are small, but count.
+            if held > LARGEST + 2**20:
+                raise ValueError(f"it unpacks to {held} bytes")
+            arrays = {key: saved[key] for key in saved.files}
+        check(arrays)
+        return arrays
+    # Whatever NumPy and zipfile raise on bits that were turned: some twenty kinds of error.
+    except Exception as error:
+        raise InputError(f"{file} is damaged ({error}): {remedy}") from error
 
 
 def read_record(folder: Path, kind: str, remedy: str) -> dict[str, Any]:
@@ -103,6 +149,7 @@ class ResultFolder:
 
     - `config`: what JSON can say, see `jaxnbv.storage.describe`.
     - `cores`: how many share a sum, by default all.
+    - `arrays`: contents of its large arrays by their hashes, kept in arrays.npz.
 
     A subclass says of what `kind` its results are, after which the record is named, the `pattern` of their names, and
     the number of their `format`.
@@ -114,8 +161,15 @@ class ResultFolder:
     pattern: str
     format: int
 
-    def __init__(self, path: str | Path, config: dict[str, Any], cores: int | None = None):
+    def __init__(
+        self,
+        path: str | Path,
+        config: dict[str, Any],
+        cores: int | None = None,
+        arrays: Mapping[str, np.ndarray] = MappingProxyType({}),
+    ):
         self.path, self.config, self.cores = make_folder(path), json.loads(json.dumps(config)), cores
+        self.arrays = arrays
         self.bound = False
         self._check()
 
@@ -131,10 +185,13 @@ class ResultFolder:
             yield
 
     def bind(self) -> None:
-        """Write the record, if it is not there, before the first result is."""
+        """Write the record and its arrays, if they are not there, before the first result is."""
         if not self.bound:
             record = {"format": self.format, "config": self.config, "versions": versions(self.cores)}
+            # The record first: arrays alone would be of nobody.
             write_text(self.path / f"{self.kind}.json", json.dumps(record, indent=2))
+            if self.arrays:
+                write_arrays(self.path / ARRAYS, self.arrays)
             self.bound = True
 
     def _check(self) -> None:

@@ -1,9 +1,12 @@
 """An episode or a session on disk, written step by step.
 
 episode.json      the configuration (planner, scene, noise, first pose, seed) and the versions that made it
+arrays.npz        the configuration's large arrays (weights of networks, meshes) by the SHA-256 of their bytes; none if
+                  it has none
 view_00.npz       pose and scan of the first view; view_01.npz and so on also hold what the search proposed: candidates,
                   their values, and the trajectories of a gradient search
-cloud.ply         the points that were kept, once the episode is complete
+end_00.npz        why a rule ended the episode, and after how many views
+cloud.ply         the points that were kept, in world units, once the episode is complete
 
 session.json      the configuration (planner, sensor, box, what is up) and the versions that made it
 image_00.npz      the first depth image as the sensor gave it, its pose and scale; image_01.npz and so on
@@ -21,15 +24,15 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 
-from jaxnbv.checks import InputError, require
+from jaxnbv.checks import require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.search import Proposal, Trajectories
+from jaxnbv.storage.description import describe
 from jaxnbv.storage.files import write_whole
-from jaxnbv.storage.folders import ResultFolder
+from jaxnbv.storage.folders import ARRAYS, ResultFolder, check_format, read_arrays, read_record, write_arrays
+from jaxnbv.storage.rebuilding import rebuild
 
-# In bytes, unpacked: sixteen million rays, far more than a camera has.
-_LARGEST = 2**29
 # What is stored as several arrays.
 _MODULES = {
     "pose": Pose,
@@ -45,14 +48,37 @@ class RunFolder(ResultFolder):
     """The folder of an "episode" or a "session", open for one configuration: numbered files of arrays, which are
     checked when they are read.
 
+    - `config`: parts of the configuration by their names, as they are: `RunFolder` describes them.
+
     **Raises:** `ValueError` if the folder holds results of another configuration, or other files.
     """
 
-    pattern, format = "*.npz", 3
+    # Not arrays.npz, which belongs to the record.
+    pattern, format = "*_*.npz", 4
 
     def __init__(self, path: str | Path, kind: str, config: dict[str, Any]):
         self.kind = kind
-        super().__init__(path, config)
+        arrays: dict[str, np.ndarray] = {}
+        described = {name: describe(part, arrays, name) for name, part in config.items()}
+        super().__init__(path, described, arrays=arrays)
+
+    @classmethod
+    def config_of(cls, path: str | Path, kind: str, **given: Any) -> dict[str, Any]:
+        """The configuration of an existing folder, made again from its record.
+
+        - `given`: parts that are taken instead of being made again, `planner` say. Opening the folder for them checks
+          that they are those of the record.
+
+        **Raises:** `ValueError` if the folder holds no record, or one that is damaged, or has a part that cannot be
+        made again and is not given.
+        """
+        folder = Path(path)
+        record = read_record(folder, kind, "give the folder of a run")
+        check_format(record.get("format"), cls.format, folder / f"{kind}.json")
+        parts = {name: told for name, told in record["config"].items() if name not in given}
+        file = folder / ARRAYS
+        arrays = read_arrays(file, "restore it", _check_hashes) if file.exists() else {}
+        return given | {name: rebuild(told, arrays, name) for name, told in parts.items()}
 
     def count(self, name: str) -> int:
         """How many files of a name there are, of "view" say: view_00.npz, view_01.npz and so on.
@@ -86,31 +112,22 @@ class RunFolder(ResultFolder):
         arrays = {jax.tree_util.keystr(way, simple=True, separator="."): np.asarray(leaf) for way, leaf in leaves}
         arrays["index"] = np.asarray(index)
         sealed: dict[str, Any] = arrays | {"sha256": np.asarray(_checksum(arrays))}
-        write_whole(self.file(name, index), lambda opened: np.savez_compressed(opened, **sealed))
+        write_arrays(self.file(name, index), sealed)
 
     def read(self, name: str, index: int) -> dict[str, Any]:
         """The parts that were written; without those that were None.
 
         **Raises:** `ValueError` if the file is damaged, or not that of the index.
         """
-        file, remedy = self.file(name, index), "restore it, or delete it and those after it"
-        try:
-            if not file.is_file():
-                raise ValueError("there is no file")
-            with np.load(file, allow_pickle=False) as saved:
-                held = sum(member.file_size for member in saved.zip.infolist())
-                require(held <= _LARGEST, f"{file} is damaged (it unpacks to {held} bytes): {remedy}")
-                arrays = {key: saved[key] for key in saved.files}
+
+        def check(arrays: dict[str, np.ndarray]) -> None:
             checksum = str(arrays.pop("sha256"))
             if int(arrays["index"]) != index:
                 raise ValueError(f"it is {name} {int(arrays['index'])}")
             if checksum != _checksum(arrays):
                 raise ValueError("its checksum is not that of its arrays")
-        except InputError:
-            raise
-        # Whatever NumPy and zipfile raise on bits that were turned: some twenty kinds of error.
-        except Exception as error:
-            raise InputError(f"{file} is damaged ({error}): {remedy}") from error
+
+        arrays = read_arrays(self.file(name, index), "restore it, or delete it and those after it", check)
         del arrays["index"]
         return _parts(arrays)
 
@@ -121,6 +138,12 @@ class RunFolder(ResultFolder):
         bare = trimesh.Trimesh(points, vertex_normals=normals, process=False)
         content = trimesh.exchange.ply.export_ply(bare, vertex_normal=True)
         write_whole(self.path / "cloud.ply", lambda file: file.write(content))
+
+
+def _check_hashes(arrays: dict[str, np.ndarray]) -> None:
+    for name, array in arrays.items():
+        if hashlib.sha256(array.tobytes()).hexdigest() != name:
+            raise ValueError(f"the array {name} is another")
 
 
 def _checksum(arrays: dict[str, np.ndarray]) -> str:

@@ -22,6 +22,8 @@ class HostClassifier(Classifier):
     - `function`: from points (b, n, 3), unit normals (b, n, 3) and mask (b, n), as NumPy arrays, to log-probabilities
       (b, num_classes). It is called with up to 128 scans at once.
     - `num_classes`: how many classes it tells apart.
+    - `version`: a text or number that you change whenever the function changes, "2026-11" say. A run that is stored
+      needs it unless the function's source and all that it reads can be described, which weights of PyTorch cannot.
 
     **Raises:** `ValueError` when a gradient is asked for. A function that returns another shape, or fails, fails within
     JAX, which raises its own `RuntimeError` with the message in its text.
@@ -29,6 +31,7 @@ class HostClassifier(Classifier):
 
     function: Callable = eqx.field(static=True)
     num_classes: int = eqx.field(static=True)
+    version: str | int | float | None = eqx.field(static=True, default=None, kw_only=True)
     batch_size: ClassVar[int] = 128
 
     def __check_init__(self):
@@ -46,12 +49,14 @@ class HostSegmenter(Segmenter):
     - `function`: as of `HostClassifier`, to probabilities of the parts (b, n, num_parts); rows that the mask leaves out
       count for nothing, whatever it says of them.
     - `num_parts`: how many parts it tells apart.
+    - `version`: as of `HostClassifier`.
 
     **Raises:** as `HostClassifier`.
     """
 
     function: Callable = eqx.field(static=True)
     num_parts: int = eqx.field(static=True)
+    version: str | int | float | None = eqx.field(static=True, default=None, kw_only=True)
     batch_size: ClassVar[int] = 128
 
     def __check_init__(self):

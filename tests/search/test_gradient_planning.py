@@ -41,7 +41,7 @@ def contents(folder):
 
 def test_trajectories_come_back_from_disk_with_the_same_bits(tmp_path):
     episode = nbv.simulate(PLANNER, SCENE, FIRST, 4, KEY, folder=tmp_path / "whole", progress=False)
-    config = describe({"planner": PLANNER, "scene": SCENE, "noise": nbv.SensorNoise(), "first": FIRST, "key": KEY})
+    config = {"planner": PLANNER, "scene": SCENE, "noise": nbv.SensorNoise(), "first": FIRST, "key": KEY}
     views = read_views(RunFolder(tmp_path / "whole", "episode", config))
     assert views[0][2] is None
     for (_, _, read), view in zip(views[1:], episode.views[1:], strict=True):

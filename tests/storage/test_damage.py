@@ -10,7 +10,7 @@ from small_episode import BASE, run
 
 from jaxnbv.checks import InputError
 from jaxnbv.planning.episode import read_views
-from jaxnbv.storage import RunFolder, describe
+from jaxnbv.storage import RunFolder
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "7", '{"versions": {}}', "\x80\xff"])
@@ -55,7 +55,7 @@ def test_a_view_that_is_not_what_it_was_is_refused(finished, tmp_path):
 
 
 def config_of(episode):
-    return describe(BASE | {"planner": episode.planner})
+    return BASE | {"planner": episode.planner}
 
 
 @pytest.mark.slow
@@ -86,6 +86,6 @@ def test_no_turned_bit_of_a_view_passes(finished, tmp_path):
 def test_an_episode_of_a_later_format_is_refused(finished, tmp_path):
     folder = shutil.copytree(finished[1], tmp_path / "copy")
     record = json.loads((folder / "episode.json").read_text())
-    (folder / "episode.json").write_text(json.dumps(record | {"format": 4}))
-    with pytest.raises(InputError, match=r"episode\.json is of format 4; .* install a newer one"):
+    (folder / "episode.json").write_text(json.dumps(record | {"format": 5}))
+    with pytest.raises(InputError, match=r"episode\.json is of format 5; .* install a newer one"):
         run(folder, views=5)

@@ -1,11 +1,14 @@
 """What a record says of the settings: the same for the same, another for any other."""
 
 import functools
+import importlib
 import json
+import linecache
 import os
 import subprocess
 import sys
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +16,8 @@ import pytest
 from small_episode import BASE
 from small_planner import planner_of
 
+import jaxnbv as nbv
+from jaxnbv.checks import InputError
 from jaxnbv.geometry.pose import look_at
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
 from jaxnbv.scanning.sdf import Capsule, Sphere
@@ -78,10 +83,148 @@ def test_a_description_of_a_function_is_the_same_in_every_process(tmp_path):
     assert b"return x in" in outputs.pop()
 
 
-def test_a_function_without_source_is_known_by_its_name_and_says_so():
+def write_module(folder, monkeypatch, name, text):
+    """A module of the user's, imported."""
+    (folder / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    sys.modules.pop(name, None)
+    linecache.clearcache()
+    return importlib.import_module(name)
+
+
+class Net:
+    """Weights that nothing here can see, as of a network of another library."""
+
+    def __init__(self, weight):
+        self.weight = weight
+
+    def __call__(self, points, normals, mask):
+        return np.log([[self.weight, 1.0 - self.weight]] * len(points))
+
+
+def planner_with(classifier):
+    return {"planner": planner_of(score=nbv.CrossEntropy(classifier, num_points=16))}
+
+
+def test_a_network_of_another_library_needs_a_version():
+    with pytest.raises(InputError, match=r"^planner\.acquisition\.classifier\.function is a Net, .*version"):
+        describe(planner_with(nbv.HostClassifier(Net(0.2), 2)))
+    first, same, other = (
+        describe(planner_with(nbv.HostClassifier(Net(weight), 2, version=version)))
+        for weight, version in ((0.2, "2026-11"), (0.3, "2026-11"), (0.2, "2026-12"))
+    )
+    assert first == same != other
+    assert other != describe(planner_with(nbv.HostClassifier(Net(0.2), 3, version="2026-12")))
+    assert describe(nbv.HostSegmenter(len, 2, version="a")) != describe(nbv.HostSegmenter(len, 2, version="b"))
+    first, other = Net(0.2), Net(0.3)
+    first.version, other.version = 1, 2
+    assert describe(nbv.HostClassifier(first, 2)) != describe(nbv.HostClassifier(other, 2))
+
+
+def test_bound_methods_of_different_objects_are_told_apart():
+    one, other = (nbv.SphereCandidates(6, radius) for radius in (2.5, 2.6))
+    assert describe(one.poses) == describe(one.poses) != describe(other.poses)
+    with pytest.raises(InputError, match="a Net"):
+        describe(Net(0.1).__call__)
+
+
+HELPER = """
+WEIGHTS = [1.0, {weight}]
+
+class Scorer:
+    bias = {bias}
+
+    def score(self, x):
+        return x + self.bias
+"""
+MINE = """
+import numpy as np
+import helper
+
+def inner(x):
+    return inner(x - 1) if x > 3 else [WEIGHT * y for y in helper.WEIGHTS]
+
+WEIGHT = np.arange(40.0)
+
+def utility(x):
+    return inner(x) or helper.Scorer().score(x)
+"""
+
+
+def test_whatever_a_function_reads_tells_it_apart(tmp_path, monkeypatch):
+    def described(weight=2.0, bias=0.5, replaced=("", "")):
+        write_module(tmp_path, monkeypatch, "helper", HELPER.format(weight=weight, bias=bias))
+        return describe(write_module(tmp_path, monkeypatch, "mine", MINE.replace(*replaced)).utility)
+
+    usual = described()
+    assert json.loads(json.dumps(usual)) == described()
+    others = [
+        described(weight=3.0),
+        described(bias=0.25),
+        described(replaced=("arange(40.0)", "arange(41.0)")),
+        described(replaced=("x > 3", "x > 4")),
+    ]
+    assert len({json.dumps(other) for other in [usual, *others]}) == 5
+    mine = sys.modules["mine"]
+    before = describe(mine.utility)
+    mine.WEIGHT[17] = 0.0
+    assert describe(mine.utility) != before
+
+
+def test_a_users_class_is_told_apart_by_its_methods():
+    def acquisition(number):
+        class Mine(eqx.Module):
+            weight: float = 1.0
+
+            def score(self, scan):
+                return self.weight * number
+
+        return Mine()
+
+    assert describe(acquisition(1)) == describe(acquisition(1)) != describe(acquisition(2))
+
+
+def test_what_refers_to_itself_ends():
+    loops = []
+    for number in (1.0, 2.0):
+        loop = [number]
+        loop.append(loop)
+        loops.append(loop)
+    assert describe(loops[0]) != describe(loops[1])
+
+    def even(x):
+        return x == 0 or odd(x - 1)
+
+    def odd(x):
+        return x != 0 and even(x - 1)
+
+    assert describe(even) != describe(odd)
+
+
+def test_a_function_whose_source_cannot_be_read_needs_a_version():
     namespace = {}
     exec("def utility(x):\n    return x", namespace)
-    with pytest.warns(UserWarning, match=r"source of the function utility cannot be read.*Define it in a file"):
-        told = describe(namespace["utility"])
-    assert told["function"] == "utility"
-    assert told["source"] is None
+    utility = namespace["utility"]
+    with pytest.raises(InputError, match=r"^planner\.score is the function utility, whose source cannot .*: define"):
+        describe({"planner": {"score": utility}})
+    utility.version = 1
+    first = describe(utility)
+    utility.version = 2
+    assert first != describe(utility)
+
+
+def test_a_function_that_imports_a_users_module_is_refused(tmp_path, monkeypatch):
+    write_module(tmp_path, monkeypatch, "weights_of_mine", "VALUE = 1")
+    text = "def utility(x):\n    import weights_of_mine\n    return weights_of_mine.VALUE\n"
+    mine = write_module(tmp_path, monkeypatch, "mine", text)
+    with pytest.raises(InputError, match="imports weights_of_mine while it runs: import it at the top"):
+        describe(mine.utility)
+
+
+@pytest.mark.parametrize(
+    "transform", [jax.jit, eqx.filter_jit, jax.vmap, eqx.filter_vmap, jax.grad, eqx.filter_grad, functools.lru_cache]
+)
+def test_transformed_functions_are_told_apart(transform):
+    one, same, other = (transform(lambda x, y=y: x + y) for y in (1.0, 1.0, 2.0))
+    assert describe(one) == describe(same) != describe(other)

@@ -67,6 +67,7 @@ def chapters(folder: str | Path) -> list[Chapter]:
             written = read_record(file.parent, "study", _REMEDY)
             study = written["config"].get("study")
             name = study.get("type") if isinstance(study, dict) else study
+            name = name.rpartition(":")[2] if isinstance(name, str) else name
             if not isinstance(name, str) or name not in kinds:
                 raise InputError(f"{file} is of a study {name!r}, which this version does not know: {_REMEDY}")
             chapter = _chapter(file.parent, file.parent.relative_to(folder), written, kinds[name])

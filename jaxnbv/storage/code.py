@@ -1,0 +1,147 @@
+"""Code as data: what a function is called, its text, and what it reads."""
+
+import contextlib
+import dis
+import importlib.util
+import inspect
+import sys
+import sysconfig
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from types import CodeType, FunctionType, GetSetDescriptorType, MemberDescriptorType, ModuleType
+from typing import Any, NamedTuple
+
+from jaxnbv.errors import InputError
+
+_STANDARD = sysconfig.get_path("stdlib")
+# Methods that Python writes for dataclasses and named tuples.
+_GENERATED = {"__init__", "__repr__", "__eq__", "__lt__", "__le__", "__gt__", "__ge__", "__hash__", "__new__"} | {
+    f"__{name}__" for name in ("setattr", "delattr", "replace")
+}
+# Of a class's `__flags__`: it was made by a class statement, or by a C library that makes classes as Python does.
+_HEAP_TYPE = 1 << 9
+_SLOTS = MemberDescriptorType | GetSetDescriptorType | type(NamedTuple("_", [("a", int)]).a)  # type: ignore[attr-defined]
+
+
+def lookup(name: str) -> Any:
+    """What a module that is imported already defines by this name, "module:qualified.name"; None if nothing."""
+    module, _, path = name.partition(":")
+    value: Any = sys.modules.get(module)
+    for part in path.split("."):
+        # Not by getattr, which may run code.
+        value = getattr(value, "__dict__", {}).get(part)
+        value = value.__func__ if isinstance(value, classmethod | staticmethod) else value
+    return value
+
+
+def name_of(thing: Any) -> str:
+    """Module and qualified name of a class or function, by which `lookup` finds it if it can; empty for others."""
+    own = getattr(thing, "__qualname__", None) or getattr(thing, "__name__", None)
+    module = getattr(thing, "__module__", None) or getattr(getattr(thing, "__objclass__", None), "__module__", None)
+    if not isinstance(own, str) or not isinstance(module, str):
+        return ""
+    if lookup(f"{module}:{own}") is not thing:
+        # A lambda, or what a function returned, has the name of a global that holds it.
+        names = vars(sys.modules.get(module, object))
+        own = next((name for name in list(names) if names[name] is thing), own)
+    return f"{module}:{own}"
+
+
+def is_installed(module: str | None) -> bool:
+    """Whether a module is of jaxnbv, Python or an installed package, whose code changes with its version alone."""
+    package = str(module).partition(".")[0]
+    if package == "jaxnbv":
+        return True
+    try:
+        spec = importlib.util.find_spec(package)
+    # What is no file, such as __main__.
+    except (ValueError, ImportError):
+        return False
+    places = [] if spec is None else [spec.origin, *(spec.submodule_search_locations or ())]
+    return any(
+        place in ("built-in", "frozen")
+        or {"site-packages", "dist-packages"} & {*Path(place).parts}
+        or Path(place).is_relative_to(_STANDARD)
+        for place in places
+        if place
+    )
+
+
+class _Plain:
+    pass
+
+
+def is_plain(thing: Any) -> bool:
+    """Whether an object keeps all that it knows in its `__dict__`, and nothing in slots or in memory of a C library."""
+    kind = type(thing)
+    slots = any(isinstance(member, MemberDescriptorType) for base in kind.__mro__ for member in vars(base).values())
+    made_by_python = bool(kind.__flags__ & _HEAP_TYPE) and kind.__basicsize__ == _Plain.__basicsize__
+    return kind is object or (made_by_python and not slots)
+
+
+def closure(function: FunctionType) -> dict[str, Any]:
+    """Variables of the enclosing functions that have a value."""
+    values = {}
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
+        with contextlib.suppress(ValueError):
+            values[name] = cell.cell_contents
+    return values
+
+
+def reads_of(code: CodeType, names: dict[str, Any], way: str) -> Iterator[tuple[str, Any]]:
+    """Globals that code reads; of a user's module the attributes.
+
+    **Raises:** `ValueError` for code that imports a user's module.
+    """
+    steps = [step for step in dis.get_instructions(code) if step.opname != "EXTENDED_ARG"]
+    for index, step in enumerate(steps):
+        if step.opname == "IMPORT_NAME" and not is_installed(step.argval):
+            raise InputError(
+                f"{way} imports {step.argval or 'a module'} while it runs: import it at the top of the file"
+            )
+        if step.opname in ("LOAD_GLOBAL", "LOAD_NAME") and step.argval in names:
+            name, value = step.argval, names[step.argval]
+            for after in steps[index + 1 :]:
+                own = isinstance(value, ModuleType) and not is_installed(value.__name__)
+                if not own or after.opname not in ("LOAD_ATTR", "LOAD_METHOD") or not hasattr(value, after.argval):
+                    break
+                name, value = f"{name}.{after.argval}", getattr(value, after.argval)
+            yield name, value
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from reads_of(constant, names, way)
+
+
+def is_written(name: str, member: Any) -> bool:
+    """Whether a member of a class is its author's, not Python's."""
+    function = getattr(member, "__func__", member)
+    if isinstance(function, FunctionType):
+        by_python = name in _GENERATED and function.__code__.co_filename == "<string>"
+        return not by_python and function.__globals__.get("__name__") != "collections"
+    return not (name.startswith("__") or name == "_abc_impl" or isinstance(member, _SLOTS))
+
+
+def source_of(function: FunctionType, way: str) -> str:
+    """The text of a function; of a lambda its body alone, for a line may hold several.
+
+    **Raises:** `ValueError` if it cannot be read.
+    """
+    code = function.__code__
+    try:
+        text = textwrap.dedent(inspect.getsource(code))
+    except (OSError, TypeError) as error:
+        raise InputError(
+            f"{way or 'this'} is the function {function.__qualname__}, whose source cannot be read: define it in a "
+            f'file, or give it a version that you change whenever it changes, {function.__name__}.version = "1"'
+        ) from error
+    if function.__name__ != "<lambda>":
+        return text
+    lines, _ = inspect.findsource(code)
+    # An instruction without width is of no expression.
+    spans = [(a, b, c, d) for a, b, c, d in code.co_positions() if a and b and c is not None and d]
+    (first, start), (last, end) = min((a, c) for a, _, c, _ in spans), max((b, d) for _, b, _, d in spans)
+    body = [line.encode() for line in lines[first - 1 : last]]
+    body[-1] = body[-1][:end]
+    body[0] = body[0][start:]
+    return b"".join(body).decode()

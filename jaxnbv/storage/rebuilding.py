@@ -1,0 +1,149 @@
+"""Configurations made again from their descriptions, without running what is not of jaxnbv or imported already."""
+
+import dataclasses
+import enum
+import functools
+import importlib
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnbv.checks import InputError, require
+from jaxnbv.storage.description import describe, fields_of, is_installed, is_record, lookup, name_of
+from jaxnbv.storage.folders import differences
+
+# Modules of installed packages whose functions compute and nothing else. Those of others might do anything when called.
+_HARMLESS = ("jaxnbv", "jax.nn", "jax._src.nn", "jax.lax", "equinox.nn", "optimistix", "math")
+_TEXTS: dict[str, Callable[[Any], Any]] = {
+    "float": float,
+    "complex": complex,
+    "bytes": bytes.fromhex,
+    "path": Path,
+    "dtype": np.dtype,
+}
+
+
+def rebuild(description: Any, arrays: Mapping[str, np.ndarray], way: str) -> Any:
+    """The configuration that `describe` described.
+
+    Classes and functions are looked up in jaxnbv and in modules that are imported already; none of them is called, not
+    even a constructor.
+
+    - `arrays`: contents of the large arrays by their hashes, as `describe` gives them.
+    - `way`: what the errors call it; its first name is the argument by which it can be given instead.
+
+    **Raises:** `ValueError` that names the way to what cannot be made again, or is another now.
+    """
+    remedy = f"import its module first, or give it again: load(..., {way.partition('.')[0] or 'planner'}=...)"
+    try:
+        thing = _Rebuilder(arrays, remedy).rebuild(description, way)
+    except InputError:
+        raise
+    # A description that was changed by hand may be anything.
+    except Exception as error:
+        raise InputError(f"{way} cannot be made again from its description ({error}): {remedy}") from error
+    changed = differences(description, describe(thing, way=way), way)
+    require(not changed, f"{'; '.join(changed[:3])}: what it was made of has changed; {remedy}")
+    return thing
+
+
+class _Rebuilder:
+    def __init__(self, arrays: Mapping[str, np.ndarray], remedy: str):
+        self.arrays, self.remedy = arrays, remedy
+
+    def rebuild(self, told: Any, way: str) -> Any:
+        if isinstance(told, list):
+            return tuple(self.rebuild(value, f"{way}[{index}]") for index, value in enumerate(told))
+        if not isinstance(told, dict):
+            return told
+        if "type" not in told:
+            return {name: self.rebuild(value, f"{way}.{name}") for name, value in told.items()}
+        kind = told["type"]
+        if ":" in kind:
+            return self._record(kind, told, way)
+        if kind in _TEXTS:
+            return _TEXTS[kind](told["value"])
+        if kind in ("list", "set", "frozenset", "dict"):
+            return {"list": list, "set": set, "frozenset": frozenset, "dict": dict}[kind](
+                self.rebuild(told["items"], way)
+            )
+        if kind in ("function", "class", "again", "wrapped"):
+            thing = self._code(told["name"], way)
+            alike = kind != "wrapped" or name_of(type(thing)) == told["by"]
+            require(alike, f"{way} is a {told.get('by')} of {told['name']} that has no name of its own: {self.remedy}")
+            return thing
+        if kind == "partial":
+            function, arguments, keywords = (
+                self.rebuild(told[part], way) for part in ("function", "arguments", "keywords")
+            )
+            return functools.partial(function, *arguments, **keywords)
+        if kind == "method":
+            function, bound = self.rebuild(told["function"], way), self.rebuild(told["self"], way)
+            own = any(member is function for base in type(bound).__mro__ for member in vars(base).values())
+            require(own, f"{way} is a method that {type(bound).__name__} does not have: {self.remedy}")
+            return getattr(bound, function.__name__)
+        require(" " in kind, f"{way} is a {told.get('name', kind)}, of which its {kind} alone is kept: {self.remedy}")
+        origin, dtype = kind.split(" ")
+        if origin == "key":
+            return jax.random.wrap_key_data(jnp.array(told["data"], jnp.uint32), impl=dtype)
+        return self._array(origin, np.dtype(dtype), told, way)
+
+    def _array(self, origin: str, dtype: np.dtype, told: dict[str, Any], way: str) -> Any:
+        if "values" in told:
+            array = np.array(told["values"], dtype)
+        else:
+            digest = told["sha256"]
+            require(digest in self.arrays, f"{way} is an array that the folder does not hold: {self.remedy}")
+            array = np.frombuffer(self.arrays[digest].tobytes(), dtype).reshape(told["shape"]).copy()
+        if origin == "weak":
+            return jnp.asarray(array.item())
+        return jnp.asarray(array) if origin == "jax" else array[()] if origin == "scalar" else array
+
+    def _record(self, name: str, told: dict[str, Any], way: str) -> Any:
+        kind = self._lookup(name, way)
+        if isinstance(kind, enum.EnumType):
+            return kind[told["member"]]
+        require(isinstance(kind, type) and is_record(kind), f"{way} is a {name}, which is no dataclass: {self.remedy}")
+        absent = [field for field in fields_of(kind) if field not in told]
+        require(not absent, f"{way} is a {name} that was stored without its {', '.join(absent)}: {self.remedy}")
+        values = {field: self.rebuild(told[field], f"{way}.{field}") for field in fields_of(kind)}
+        if not dataclasses.is_dataclass(kind):
+            return tuple.__new__(kind, values.values())
+        thing: Any = object.__new__(kind)  # type: ignore[arg-type]
+        for field, value in values.items():
+            object.__setattr__(thing, field, value)
+        # Equinox's wrappers have the names of the functions that they wrap.
+        if is_installed(kind.__module__) and (wrapped := getattr(thing, "__wrapped__", None)) is not None:
+            for attribute in functools.WRAPPER_ASSIGNMENTS:
+                object.__setattr__(thing, attribute, getattr(wrapped, attribute))
+        return thing
+
+    def _code(self, name: str, way: str) -> Any:
+        """A function, or the class of a record."""
+        thing = self._lookup(name, way)
+        module = name.partition(":")[0]
+        harmless = (
+            is_record(thing) or issubclass(thing, np.generic)
+            if isinstance(thing, type)
+            else not is_installed(module)
+            or any(module == own or module.startswith(f"{own}.") for own in _HARMLESS)
+            # The functions of jax.numpy that are ufuncs of NumPy, and these.
+            or (module in ("numpy", "jax.numpy") and isinstance(getattr(np, name.partition(":")[2], None), np.ufunc))
+        )
+        require(harmless, f"{way} is {name}, which no configuration that is read from a file may call: {self.remedy}")
+        return thing
+
+    def _lookup(self, name: str, way: str) -> Any:
+        module = name.partition(":")[0]
+        if module.startswith("jaxnbv.") and not module.endswith("__main__"):
+            importlib.import_module(module)
+        thing = lookup(name)
+        if thing is None:
+            missing = "has nothing of that name" if module in sys.modules else "is not imported"
+            raise InputError(f"{way} is {name}, but {module} {missing}: {self.remedy}")
+        return thing
