@@ -74,8 +74,9 @@ class ScreenedSPSR(SurfaceModel):
     def condition(self, observations: Observations | PointCloud) -> "ScreenedSPSRPosterior":
         """p(g | D, what was seen empty). The cost is that of the base, and of M triangular solves with its factor.
 
-        **Raises:** `ValueError` as `GeometricSPSR.condition` does, for a capacity above 16,384, and if S is singular in
-        the precision at hand.
+        **Raises:** `ValueError` as `GeometricSPSR.condition` does, for a capacity above 16,384, for values at points
+        outside [-pi/2, pi/2]^3 or that are not finite, and if S is singular in the precision at hand; under `jit`
+        numbers cannot be checked, and the posterior is NaN instead.
         """
         observations = Observations.of(observations)
         capacity = observations.cloud.capacity
@@ -85,6 +86,7 @@ class ScreenedSPSR(SurfaceModel):
             "planner's capacity, or use GeometricSPSR, which takes more",
         )
         posterior = _condition(self, self.base.condition(observations), observations)
+        posterior.rows.check()
         if not is_traced(posterior.weights):
             require(
                 bool(jnp.isfinite(posterior.weights).all()),

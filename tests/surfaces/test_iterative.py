@@ -48,6 +48,16 @@ def test_all_that_is_offered_equals_the_factorisation_and_weight_space(x64, few)
     np.testing.assert_allclose(conditioned(posterior, draws), conditioned(factorised, same), atol=1e-8)
 
 
+@pytest.mark.parametrize("capacity", [35, 46], ids=("factorised", "by conjugate gradients"))
+def test_a_traced_point_outside_the_scene_gives_no_number(few, capacity):
+    """With its value known it is refused."""
+    outside = eqx.tree_at(lambda c: c.points, cloud(capacity), cloud(capacity).points.at[3, 1].set(2.2))
+    model = nbv.GeometricSPSR(**SETTINGS)
+    with pytest.raises(ValueError, match=r"coordinate of 2\.2, outside the scene's cube"):
+        model.condition(outside)
+    assert np.isnan(eqx.filter_jit(lambda cloud: model.condition(cloud).mean(QUERIES))(outside)).all()
+
+
 def test_float32_is_exact_to_a_ten_thousandth(monkeypatch):
     """500 points of a sphere, as dense as 2,000 of one of radius 1, at the default noise, against float64."""
     points = RNG.standard_normal((500, 3))
