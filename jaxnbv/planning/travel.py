@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from jaxnbv.acquisition import Quantity
 from jaxnbv.checks import as_numbers, check_fields, checked, require, shown
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.rotations import safe_norm
 from jaxnbv.observations import Observations
 
 CostFunction: TypeAlias = Callable[[Pose, Pose], Float[Array, ""]]
@@ -25,15 +26,9 @@ def arc_length(start: Pose, end: Pose) -> Float[Array, ""]:
     """Length of the way from one camera's place to another's about the origin, in scene units: of the great circle
     where both are equally far from it, hypot(mean distance x angle, difference of distances) in general."""
     first, second = start.position, end.position
-    radii = _norm(first), _norm(second)
-    angle = jnp.arctan2(_norm(jnp.cross(first, second)), jnp.sum(first * second))
-    return _norm(jnp.stack([0.5 * (radii[0] + radii[1]) * angle, radii[1] - radii[0]]))
-
-
-def _norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
-    """Whose derivative at zero is zero."""
-    squared = jnp.sum(vector**2)
-    return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
+    radii = safe_norm(*first), safe_norm(*second)
+    angle = jnp.arctan2(safe_norm(*jnp.cross(first, second)), jnp.sum(first * second))
+    return safe_norm(0.5 * (radii[0] + radii[1]) * angle, radii[1] - radii[0])
 
 
 class ValuePerCost(eqx.Module):
