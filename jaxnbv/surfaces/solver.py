@@ -44,14 +44,21 @@ class Solver(eqx.Module):
 
     - `cloud`: D, with zeros in the rows that are not filled.
     - `spectrum`, `noise`: of the prior and of the normals.
-    - `factor`: C. Reading it raises `ValueError` where A is not factorised, and so does what needs it: `whiten`,
-      `unwhiten` and `whitened_cross`.
+
+    `whiten`, `unwhiten` and `whitened_cross` need the factor, and raise as `factor` does where there is none.
     """
 
     cloud: eqx.AbstractVar[PointCloud]
     spectrum: eqx.AbstractVar[Spectra]
     noise: eqx.AbstractVar[Scalar]
-    factor: eqx.AbstractVar[CholeskyFactor]
+
+    @property
+    @abstractmethod
+    def factor(self) -> CholeskyFactor:
+        """C.
+
+        **Raises:** `ValueError` where A is not factorised.
+        """
 
     @abstractmethod
     def solve(self, blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
@@ -88,7 +95,7 @@ class DenseSolver(Solver):
     cloud: PointCloud
     spectrum: Spectra
     noise: Scalar
-    factor: CholeskyFactor
+    cholesky: CholeskyFactor
 
     @classmethod
     def of(cls, cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> "DenseSolver":
@@ -104,8 +111,12 @@ class DenseSolver(Solver):
 
         return cls(cloud, spectrum, noise, CholeskyFactor(_on_filled_rows(cloud, leading)))
 
+    @property
+    def factor(self) -> CholeskyFactor:
+        return self.cholesky
+
     def solve(self, blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        return _of_columns(self.factor.solve, blocks)
+        return _of_columns(self.cholesky.solve, blocks)
 
     def explained_variance(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
         """As `Solver` says. The cost grows with (number of points) x (capacity)^2."""
@@ -128,10 +139,6 @@ class ConjugateGradientSolver(Solver):
 
     @property
     def factor(self) -> CholeskyFactor:
-        """None is made.
-
-        **Raises:** `ValueError`, always.
-        """
         raise InputError(
             f"the factor of more than {MOST_FACTORISED} points is not made, and covariances and likelihoods need it: "
             "keep fewer points"

@@ -70,7 +70,7 @@ def test_rows_of_a_source_of_ones_own_are_checked(where, number, message):
     with pytest.raises(ValueError, match=message):
         model.condition(cloud(POINTS, NORMALS, 27))
     if where == "points":
-        traced = eqx.filter_jit(lambda model, cloud: model.condition(cloud).mean(QUERIES))
+        traced = eqx.filter_jit(lambda model, cloud: model.condition(cloud).mean(QUERIES.astype(np.float32)))
         assert np.isnan(traced(model, cloud(POINTS, NORMALS, 27))).all()
 
 
