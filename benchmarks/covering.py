@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 import jaxnbv as nbv
 
@@ -129,10 +130,8 @@ def boundary_views(
     axes = np.cross(out, up)
     turns = TURNS[np.arange(len(chosen)) % len(TURNS)][:, None] * np.linalg.norm(axes, axis=1, keepdims=True)
     along = unit(axes)
-    # Rodrigues' rotation of the normal about the boundary.
-    turned = up * np.cos(turns) + np.cross(along, up) * np.sin(turns)
-    turned += along * np.sum(along * up, axis=1, keepdims=True) * (1.0 - np.cos(turns))
-    return targets, unit(turned)
+    # The normals turned about the boundary.
+    return targets, unit(Rotation.from_rotvec(turns * along).apply(up))
 
 
 def is_boundary(points, normals, apart, near) -> Bool[np.ndarray, " n"]:

@@ -296,6 +296,10 @@ REFUSED = {
     ),
     "a volume of one number": (lambda: nbv.Carving(lambda x: jnp.sum(x)), "one number a point"),
     "a volume of NumPy": (lambda: nbv.Carving(lambda x: np.linalg.norm(x, axis=1)), "jax.numpy"),
+    "two points of three values": (
+        lambda: nbv.surfaces.ValueRows(jnp.zeros((2, 3)), jnp.zeros(3), jnp.ones(3), jnp.ones(3, bool)),
+        "give (m, 3)",
+    ),
     "what is allowed three times": (lambda: nbv.SphereCandidates(6).where(lambda p: p.position > 0), "True or False"),
     "a list in lists": (lambda: nbv.PointCloud.from_arrays(nested(5000), D), "nested too deep"),
     "up without measure": (lambda: nbv.look_at((0, 0, 2), (0, 0, 0), (0, 1e30, 0)), "up direction"),

@@ -15,6 +15,7 @@ from jaxnbv.acquisition import Quantity
 from jaxnbv.checks import as_numbers, check_fields, checked, require, shown
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.rotations import safe_norm
 from jaxnbv.observations import Observations
 
 CostFunction: TypeAlias = Callable[[Pose, Pose], Float[Array, ""]]
@@ -36,18 +37,12 @@ class ArcLength(eqx.Module):
     def __call__(self, start: Pose, end: Pose) -> Float[Array, ""]:
         """The length, in the units of the poses."""
         first, second = (pose.position - jnp.asarray(self.center) for pose in (start, end))
-        radii = _norm(first), _norm(second)
-        angle = jnp.arctan2(_norm(jnp.cross(first, second)), jnp.sum(first * second))
-        return _norm(jnp.stack([0.5 * (radii[0] + radii[1]) * angle, radii[1] - radii[0]]))
+        radii = safe_norm(*first), safe_norm(*second)
+        angle = jnp.arctan2(safe_norm(*jnp.cross(first, second)), jnp.sum(first * second))
+        return safe_norm(0.5 * (radii[0] + radii[1]) * angle, radii[1] - radii[0])
 
 
 arc_length = ArcLength()
-
-
-def _norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
-    """Whose derivative at zero is zero."""
-    squared = jnp.sum(vector**2)
-    return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
 
 
 class WorldCost(eqx.Module):

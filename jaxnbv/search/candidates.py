@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxnbv.checks import AnyArray, InputError, check_fields, require, shown
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
+from jaxnbv.geometry.rotations import rotation_between
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
-from jaxnbv.search.rotations import rotation_between
 
 # The real root of x^3 = x + 1.
 _PLASTIC = 1.324717957244746

@@ -16,8 +16,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxnbv.checks import check_fields, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
+from jaxnbv.geometry.rotations import normalise, rotation_between, rotation_from_6d, rotation_to_6d
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
-from jaxnbv.search.rotations import normalise, rotation_between, rotation_from_6d, rotation_to_6d
 
 
 class PoseSpace(eqx.Module):

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from jaxnbv.checks import check_fields, require
+from jaxnbv.geometry.rotations import rotation_from_vector
 from jaxnbv.scanning.sdf import SignedDistance
 
 _GOLDEN = 1.0 / 1.533751168755204288118041
@@ -48,22 +49,10 @@ class Placement(eqx.Module):
         """Turned by the rotation vector of the first three numbers about t, shifted by the next three, and scaled by
         the exponentials of the last."""
         return Placement(
-            jnp.matmul(_exponential(step[:3]), self.rotation, precision="highest"),
+            jnp.matmul(rotation_from_vector(step[:3]), self.rotation, precision="highest"),
             self.shift + step[3:6],
             self.scale * jnp.exp(step[6:]),
         )
-
-
-def _exponential(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """The rotation about a vector by its length in radians (Rodrigues' formula)."""
-    square = jnp.sum(vector**2)
-    small = square < 1e-12
-    angle = jnp.sqrt(jnp.where(small, 1.0, square))
-    sine = jnp.where(small, 1.0 - square / 6.0, jnp.sin(angle) / angle)
-    versine = jnp.where(small, 0.5 - square / 24.0, (1.0 - jnp.cos(angle)) / angle**2)
-    x, y, z = vector
-    cross = jnp.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return jnp.eye(3) + sine * cross + versine * jnp.matmul(cross, cross, precision="highest")
 
 
 class ShapePoses(eqx.Module):

@@ -27,13 +27,13 @@ from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import SurfaceModel, on_torus
 from jaxnbv.surfaces.covariance import function_covariance, function_variance, mode_variance
 from jaxnbv.surfaces.factor import CholeskyFactor
-from jaxnbv.surfaces.given_normals import MOST_FACTORISED, GeometricSPSRPosterior, NormalDraws
+from jaxnbv.surfaces.given_normals import GeometricSPSRPosterior, NormalDraws
 from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, filled
+from jaxnbv.surfaces.solver import MOST_FACTORISED, points_at_once
 from jaxnbv.surfaces.spsr import GeometricSPSR
 from jaxnbv.surfaces.trigonometric import NonuniformTransform, inverse_laplacian, solve_poisson
 from jaxnbv.surfaces.values import OnSurface, OutsideBoundary, SeenEmpty, ValueRows, ValueSource, joined
 
-_CHUNK_VALUES = 2**24
 _JUMP_POINTS = 256
 
 
@@ -74,8 +74,9 @@ class ScreenedSPSR(SurfaceModel):
     def condition(self, observations: Observations | PointCloud) -> "ScreenedSPSRPosterior":
         """p(g | D, what was seen empty). The cost is that of the base, and of M triangular solves with its factor.
 
-        **Raises:** `ValueError` as `GeometricSPSR.condition` does, for a capacity above 16,384, and if S is singular in
-        the precision at hand.
+        **Raises:** `ValueError` as `GeometricSPSR.condition` does, for a capacity above 16,384, for values at points
+        outside [-pi/2, pi/2]^3 or that are not finite, and if S is singular in the precision at hand; under `jit`
+        numbers cannot be checked, and the posterior is NaN instead.
         """
         observations = as_observations(observations)
         capacity = observations.cloud.capacity
@@ -85,6 +86,7 @@ class ScreenedSPSR(SurfaceModel):
             "planner's capacity, or use GeometricSPSR, which takes more",
         )
         posterior = _condition(self, self.base.condition(observations), observations)
+        posterior.rows.check()
         if not is_traced(posterior.weights):
             require(
                 bool(jnp.isfinite(posterior.weights).all()),
@@ -102,7 +104,7 @@ def _condition(
     observations = eqx.tree_at(lambda e: e.cloud, observations, base.cloud)
     spectrum, rows = model.base.spectrum, joined(model.values, observations)
     half_jump = _half_jump(base, model.offset)
-    whitened = jnp.where(rows.mask, base.whitened(rows.points), 0.0)
+    whitened = jnp.where(rows.mask, base.solver.whitened_cross(rows.points), 0.0)
     explained = jnp.einsum("dnk,dnl->kl", whitened, whitened, precision="highest")
     level_variance = model.level_deviation**2
     covariance = function_covariance(rows.points, rows.points, spectrum) - explained + level_variance
@@ -119,8 +121,8 @@ def _condition(
     at_rows = transform.evaluate(base.mean_coefficients[None])[:, 0]
     weights = posterior.solve(half_jump * rows.values - at_rows)
     no_draw = jnp.zeros((1, 3, *base.mean_coefficients.shape), at_rows.dtype)
-    normals = base.factor.whiten(base.cloud.normals)
-    mean = posterior._updated(no_draw, normals[None], jnp.zeros(1, at_rows.dtype), weights[None])[0]
+    normals = base.solver.whiten(base.cloud.normals[None])
+    mean = posterior._updated(no_draw, normals, jnp.zeros(1, at_rows.dtype), weights[None])[0]
     return eqx.tree_at(lambda p: (p.weights, p.mean_coefficients), posterior, (weights, mean))
 
 
@@ -172,14 +174,13 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
 
         def at_point(point):
             # Whitened covariances of g with the normals, and with what the values say beyond them.
-            normals = self.base.whitened(point[None])
+            normals = self.base.solver.whitened_cross(point[None])
             cross = function_covariance(self.rows.points, point[None], spectrum) + self.model.level_deviation**2
             cross = cross - jnp.einsum("dnm,dnx->mx", self.whitened, normals, precision="highest")
             values = self.factor.whiten(jnp.where(self.rows.mask[:, None], cross, 0.0))
             return jnp.maximum(prior - jnp.sum(normals**2) - jnp.sum(values**2), 0.0)
 
-        chunk = max(1, min(x.shape[0], _CHUNK_VALUES // self.base.cloud.capacity))
-        return jax.lax.map(at_point, x, batch_size=chunk)
+        return jax.lax.map(at_point, x, batch_size=points_at_once(len(x), self.base.cloud.capacity))
 
     def data_points(self) -> DataPoints:
         """The cloud's for gradients, and those of the values."""

@@ -127,7 +127,7 @@ class GeometricSPSR(SurfaceModel):
 
         **Raises:** `ValueError` if the cloud is empty, has entries that are not finite, a normal longer than 10 or
         points outside [-pi/2, pi/2]^3 (scene coordinates), or if A is singular in the precision at hand; under `jit`
-        values are not known and are not checked.
+        numbers cannot be checked, and the posterior of points outside is NaN.
         """
         cloud = as_observations(observations).cloud
         if not is_traced(cloud):

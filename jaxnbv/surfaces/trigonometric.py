@@ -129,7 +129,10 @@ class NonuniformTransform(eqx.Module):
         offset = position[..., None] - first[..., None] - jnp.arange(window)
         radicand = jnp.maximum(1.0 - (2.0 * offset / window) ** 2, jnp.finfo(points.dtype).eps ** 2)
         self.start = (first + window // 2).astype(jnp.int32)
-        self.weights = jnp.i0(beta * jnp.sqrt(radicand)) / float(i0(beta))
+        weights = jnp.i0(beta * jnp.sqrt(radicand)) / float(i0(beta))
+        # A slice that starts beyond its array is clamped, and would be of other nodes.
+        in_grid = (self.start >= 0) & (self.start <= 2 * truncation + 1)
+        self.weights = jnp.where(in_grid[..., None], weights, jnp.nan)
         self.truncation = truncation
 
     def evaluate(self, coefficients: Float[Array, "k a a a"]) -> Float[Array, "n k"]:

@@ -10,9 +10,10 @@ from abc import abstractmethod
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnbv.checks import InputError, check_fields, is_traced, require, shown
+from jaxnbv.checks import InputError, check_fields, check_type, is_traced, require, shown
 from jaxnbv.geometry.cloud import farthest_point_subsample
 from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.geometry.volume import Box, Volume, boundary_points
@@ -23,7 +24,9 @@ from jaxnbv.surfaces.base import HALF_WIDTH
 class ValueRows(eqx.Module):
     """f(y_k) - c = value_k + e_k with e_k ~ N(0, noise_k^2), in units of h. Rows whose mask is False hold nothing.
 
-    - `points`: in scene coordinates.
+    - `points`: in scene coordinates, within [-pi/2, pi/2]^3.
+
+    **Raises:** `ValueError` for arrays of other shapes.
     """
 
     points: Float[Array, "m 3"]
@@ -31,13 +34,48 @@ class ValueRows(eqx.Module):
     noise: Float[Array, " m"]
     mask: Bool[Array, " m"]
 
+    def __check_init__(self):
+        shapes = tuple(jnp.shape(leaf) for leaf in (self.points, self.values, self.noise, self.mask))
+        rows = shapes[1]
+        require(
+            len(rows) == 1 and shapes == ((*rows, 3), rows, rows, rows),
+            f"rows of values have points, values, noise and mask of shapes {shapes}: give (m, 3), (m,), (m,) and (m,)",
+        )
+
+    def check(self) -> None:
+        """Check the filled rows, where their numbers are known.
+
+        **Raises:** `ValueError` for numbers that are not finite, negative noise, or a point outside [-pi/2, pi/2]^3.
+        """
+        if is_traced(self):
+            return
+        mask = np.asarray(self.mask)
+        points, values, noise = (np.asarray(leaf)[mask] for leaf in (self.points, self.values, self.noise))
+        for name, numbers in (("points", points), ("values", values), ("noise", noise)):
+            require(
+                bool(np.isfinite(numbers).all()), f"rows of values have {name} that are not finite: mask these rows"
+            )
+        require(
+            bool((noise >= 0).all()), f"a value has a noise of {noise.min(initial=0.0):.4g}; it must not be negative"
+        )
+        furthest = float(np.abs(points).max(initial=0.0))
+        require(
+            furthest <= float(points.dtype.type(HALF_WIDTH)),
+            f"a value is given at a point with a coordinate of {furthest:.4g}, outside the scene, [-pi/2, pi/2]^3: "
+            "mask the row, or bring the point there with Frame.to_scene",
+        )
+
 
 class ValueSource(eqx.Module):
     """A kind of knowledge about values of f."""
 
     @abstractmethod
     def rows(self, observations: Observations) -> ValueRows:
-        """The rows that it adds, as many for all observations of one capacity; run under `jit`."""
+        """The rows that it adds, as many for all observations of one capacity; run under `jit`.
+
+        A filled row outside [-pi/2, pi/2]^3 is refused when the model is conditioned; where that runs under `jit` too,
+        its numbers cannot be checked, and the posterior is NaN.
+        """
 
 
 class OutsideBoundary(ValueSource):
@@ -133,11 +171,18 @@ class SeenEmpty(ValueSource):
 
 
 def joined(sources: tuple[ValueSource, ...], observations: Observations) -> ValueRows:
-    """The rows of all sources, one behind the other."""
+    """The rows of all sources, one behind the other, with zeros in those that are not filled.
+
+    **Raises:** `ValueError` for a source that gives no rows of values.
+    """
     parts = [source.rows(observations) for source in sources]
-    return ValueRows(
-        *(jnp.concatenate([getattr(part, name) for part in parts]) for name in ("points", "values", "noise", "mask"))
-    )
+    for source, part in zip(sources, parts, strict=True):
+        check_type(part, ValueRows, f"what {type(source).__name__}.rows gives")
+    rows = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+    # Whatever stands in the others, NaN included, must not reach the products.
+    points = jnp.where(rows.mask[:, None], rows.points, 0.0)
+    values, noise = (jnp.where(rows.mask, leaf, 0.0) for leaf in (rows.values, rows.noise))
+    return ValueRows(points, values, noise, rows.mask)
 
 
 def _rows(points, value: float, noise: float, mask) -> ValueRows:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import jaxnbv as nbv
-from jaxnbv.search.rotations import rotation_to_6d
+from jaxnbv.geometry.rotations import rotation_to_6d
 
 RNG = np.random.default_rng(0)
 LOOK_AT = jax.jit(nbv.look_at)

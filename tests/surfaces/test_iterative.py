@@ -8,7 +8,7 @@ import pytest
 from weight_space import WeightSpace
 
 import jaxnbv as nbv
-from jaxnbv.surfaces import given_normals
+from jaxnbv.surfaces import solver
 from jaxnbv.surfaces.pathwise import MeansAtData
 
 SETTINGS = {"lengthscale": 0.1, "variance": 0.8, "noise": 0.2, "nu": 1.5, "truncation": 4}
@@ -25,27 +25,38 @@ def cloud(capacity: int) -> nbv.PointCloud:
 @pytest.fixture
 def few(monkeypatch):
     """Capacities above 36 are not factorised; those here are the file's own, since what is compiled is kept."""
-    monkeypatch.setattr(given_normals, "MOST_FACTORISED", 36)
+    monkeypatch.setattr(solver, "MOST_FACTORISED", 36)
 
 
 def test_all_that_is_offered_equals_the_factorisation_and_weight_space(x64, few):
     model, key = nbv.GeometricSPSR(**SETTINGS), jax.random.key(0)
     posterior, factorised = model.condition(cloud(47)), model.condition(cloud(36))
-    assert posterior.cholesky is None
-    assert factorised.cholesky is not None
+    assert isinstance(posterior.solver, solver.ConjugateGradientSolver)
+    assert isinstance(factorised.solver, solver.DenseSolver)
     mean, covariance = WeightSpace(**SETTINGS).posterior(POINTS, NORMALS, QUERIES)
     np.testing.assert_allclose(posterior.mean(QUERIES), mean, atol=1e-8 * np.abs(mean).max())
     np.testing.assert_allclose(posterior.variance(QUERIES), np.diag(covariance), atol=1e-8 * covariance.max())
     np.testing.assert_allclose(posterior.level, factorised.level, atol=1e-8)
     # The same rows in both, since capacities differ.
     rows = posterior.cloud.normals[None]
-    solve = eqx.filter_jit(lambda posterior, rows: posterior.solve(rows))
+    solve = eqx.filter_jit(lambda posterior, rows: posterior.solver.solve(rows))
     np.testing.assert_allclose(solve(posterior, rows)[:, :36], solve(factorised, rows[:, :36]), atol=1e-8)
     draws = eqx.filter_jit(posterior.prior_draws)(key, 2)
     same = draws._replace(at_data=draws.at_data[:, :36])
     none = MeansAtData(jnp.zeros(()), jnp.zeros(()))
     conditioned = eqx.filter_jit(lambda posterior, draws: posterior.conditioned(draws, none))
     np.testing.assert_allclose(conditioned(posterior, draws), conditioned(factorised, same), atol=1e-8)
+
+
+@pytest.mark.parametrize("capacity", [35, 46], ids=("factorised", "by conjugate gradients"))
+def test_a_traced_point_outside_the_scene_gives_no_number(few, capacity):
+    """With its value known it is refused."""
+    outside = eqx.tree_at(lambda c: c.points, cloud(capacity), cloud(capacity).points.at[3, 1].set(2.2))
+    model = nbv.GeometricSPSR(**SETTINGS)
+    with pytest.raises(ValueError, match=r"coordinate of 2\.2, outside the scene's cube"):
+        model.condition(outside)
+    traced = eqx.filter_jit(lambda cloud: model.condition(cloud).mean(QUERIES.astype(np.float32)))
+    assert np.isnan(traced(outside)).all()
 
 
 def test_float32_is_exact_to_a_ten_thousandth(monkeypatch):
@@ -56,14 +67,14 @@ def test_float32_is_exact_to_a_ten_thousandth(monkeypatch):
     model = nbv.GeometricSPSR(lengthscale=0.03, truncation=12)
     with jax.enable_x64(True):
         expected = model.condition(nbv.PointCloud.from_arrays(0.5 * points, points)).mean(queries)
-    monkeypatch.setattr(given_normals, "MOST_FACTORISED", 499)
+    monkeypatch.setattr(solver, "MOST_FACTORISED", 499)
     found = model.condition(nbv.PointCloud.from_arrays(0.5 * points, points)).mean(queries)
     np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
 
 
 def test_what_does_not_converge_is_refused(few, monkeypatch):
     """Two steps for thirty points; of a capacity of its own, so that it is compiled so."""
-    monkeypatch.setattr(given_normals, "_MOST_PRODUCTS", 2)
+    monkeypatch.setattr(solver, "_MOST_PRODUCTS", 2)
     with pytest.raises(ValueError, match=r"singular in float32: raise the noise"):
         nbv.GeometricSPSR(0.1, 0.8, 4, noise=0.01).condition(cloud(41))
 
@@ -72,6 +83,8 @@ def test_what_needs_the_factor_is_refused(few, monkeypatch):
     model = nbv.GeometricSPSR(**SETTINGS)
     with pytest.raises(ValueError, match=r"more than 36 points is not made"):
         model.condition(cloud(42)).log_marginal_likelihood()
+    with pytest.raises(ValueError, match=r"more than 36 points is not made"):
+        model.condition(cloud(42)).covariance(QUERIES, QUERIES)
     monkeypatch.setattr("jaxnbv.surfaces.screened.MOST_FACTORISED", 36)
     with pytest.raises(ValueError, match=r"room for 39 points.*36 at most: lower the planner's capacity"):
         nbv.ScreenedSPSR(model).condition(cloud(39))

@@ -18,7 +18,7 @@ ONE = {"lengthscale": 0.1, "variance": 0.8}
 
 
 class Given(nbv.ValueSource):
-    """Values at points of the test's choice; the last row is not filled."""
+    """Values at points of the test's choice; the last row is not filled, whatever stands there."""
 
     points: jax.Array
     values: jax.Array
@@ -31,6 +31,7 @@ class Given(nbv.ValueSource):
 def problem(hyperparameters, capacity=27):
     at = RNG.uniform(-1.2, 1.2, (13, 3))
     values, noise = RNG.standard_normal(13), RNG.uniform(0.1, 1.0, 13)
+    at[-1], values[-1], noise[-1] = 2.4, np.nan, -1.0
     source = Given(*(jnp.asarray(a) for a in (at, values, noise)))
     base = nbv.GeometricSPSR(truncation=3, noise=0.2, **hyperparameters)
     posterior = nbv.ScreenedSPSR(base, (source,), level_deviation=0.7).condition(cloud(POINTS, NORMALS, capacity))
@@ -46,6 +47,31 @@ def test_posterior_equals_one_regression_of_normals_and_values(x64, hyperparamet
     posterior, (mean, covariance) = problem(hyperparameters)
     np.testing.assert_allclose(posterior.mean(QUERIES), mean, atol=1e-9 * np.abs(mean).max())
     np.testing.assert_allclose(posterior.variance(QUERIES), np.diag(covariance), atol=1e-9 * covariance.max())
+
+
+@pytest.mark.parametrize(
+    ("where", "number", "message"),
+    [
+        ("points", -2.4, r"coordinate of 2\.4, outside the scene.*mask the row, or bring the point there"),
+        ("points", np.nan, "points that are not finite: mask"),
+        ("values", np.inf, "values that are not finite: mask"),
+        ("noise", -0.5, r"noise of -0\.5; it must not be negative"),
+    ],
+)
+def test_rows_of_a_source_of_ones_own_are_checked(where, number, message):
+    """The first of two filled rows; where it cannot be checked, no number comes of a point outside."""
+    rows = {
+        "points": np.full((3, 3), 0.9, np.float32),
+        "values": np.ones(3, np.float32),
+        "noise": np.ones(3, np.float32),
+    }
+    rows[where][0] = number
+    model = nbv.ScreenedSPSR(nbv.GeometricSPSR(0.1, truncation=3), (Given(*map(jnp.asarray, rows.values())),))
+    with pytest.raises(ValueError, match=message):
+        model.condition(cloud(POINTS, NORMALS, 27))
+    if where == "points":
+        traced = eqx.filter_jit(lambda model, cloud: model.condition(cloud).mean(QUERIES.astype(np.float32)))
+        assert np.isnan(traced(model, cloud(POINTS, NORMALS, 27))).all()
 
 
 def test_the_unit_of_values_is_half_the_rise_of_the_mean_across_the_data():

@@ -111,6 +111,21 @@ def test_transform_and_adjoint_equal_direct_sums(truncation, dtype, tolerance):
     assert abs(left - right) < (1e-13 if dtype == np.float64 else 1e-6) * scale
 
 
+def test_the_transform_beyond_the_scene_is_exact_or_nan(x64):
+    """One grid step beyond pi/2, 0.39 here, windows still lie within the grid."""
+    places = np.array([-3.1, -2.4, -1.6, -1.5, 0.3, 1.5, 1.7, 2.2, 3.1, np.nan, np.inf])
+    points = np.stack([places, np.full(11, 0.2), np.full(11, -0.4)], axis=1)
+    points = np.concatenate([np.roll(points, axis, axis=1) for axis in range(3)])
+    transform = NonuniformTransform(jnp.asarray(points), L)
+    actual = np.asarray(transform.evaluate(jnp.asarray(COEFFICIENTS[0]))).T
+    furthest = np.abs(points).max(axis=1)
+    with np.errstate(invalid="ignore"):
+        exact = direct(COEFFICIENTS[0], points)
+    np.testing.assert_array_equal(np.isnan(actual).all(axis=0), ~(furthest < 2.0))
+    np.testing.assert_allclose(actual[:, furthest < 2.0], exact[:, furthest < 2.0], atol=1e-10)
+    assert np.isnan(transform.adjoint(jnp.ones((33, 1)))).all()
+
+
 def test_a_gpu_spreads_as_a_cpu_does(monkeypatch):
     points, values = jnp.asarray(points_with_borders(60)), jnp.asarray(RNG.standard_normal((60, 2)))
     transform = NonuniformTransform(points, 4)

@@ -14,7 +14,6 @@ from jaxnbv.scanning.sdf.base import Vector as Vector
 from jaxnbv.scanning.sdf.base import corner_distance as corner_distance
 from jaxnbv.scanning.sdf.base import least_of_last as least_of_last
 from jaxnbv.scanning.sdf.base import nonnegative as nonnegative
-from jaxnbv.scanning.sdf.base import norm as norm
 from jaxnbv.scanning.sdf.base import parameter as parameter
 from jaxnbv.scanning.sdf.sampled import Sampled as Sampled
 from jaxnbv.scanning.sdf.sampled import solid_of_mesh as solid_of_mesh

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from jaxnbv.checks import AnyArray, InputError, as_floats, check_type, is_traced, require
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.rotations import rotation_about, safe_norm
 
 # Numbers and lists are converted on the way in, which mypy cannot see.
 if TYPE_CHECKING:
@@ -40,19 +41,6 @@ def parameter(**kwargs):
 def nonnegative(**kwargs):
     """A parameter that must not be negative."""
     return parameter(metadata={"length": True}, **kwargs)
-
-
-@jax.custom_jvp
-def norm(*components):
-    """Euclidean length of the vectors with these components, with derivative zero at zero."""
-    return jnp.sqrt(sum(c * c for c in components))
-
-
-@norm.defjvp
-def _norm_jvp(components, tangents):
-    length = norm(*components)
-    inverse = 1.0 / jnp.where(length > 0, length, 1.0)
-    return length, sum(inverse * c * dc for c, dc in zip(components, tangents, strict=True))
 
 
 def split(x):
@@ -85,18 +73,9 @@ def _least_of_last_jvp(values, tangents):
     return least_of_last(values), jnp.sum(jnp.where(is_least, tangents, 0.0), axis=-1)
 
 
-@jax.jit
-def _rotation_about(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Rodrigues' formula, cos I + sin [k]_x + (1 - cos) k k^T about the unit axis k."""
-    x, y, z = unit = axis / norm(*axis)
-    zero = jnp.zeros_like(x)
-    cross = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-    return jnp.cos(angle) * jnp.eye(3) + jnp.sin(angle) * cross + (1.0 - jnp.cos(angle)) * unit[:, None] * unit
-
-
 def corner_distance(*q):
     """Signed distance to the corner, edge or face where all q <= 0, given the signed distances q to its faces."""
-    outside = norm(*(greatest(c, 0.0) for c in q))
+    outside = safe_norm(*(greatest(c, 0.0) for c in q))
     return outside + least(functools.reduce(greatest, q), 0.0)
 
 
@@ -151,7 +130,7 @@ class SignedDistance(eqx.Module):
             # As a float of JAX, which takes what is below the least normal number for zero.
             longer = bool(np.sum(np.square(np.asarray(axis))) >= jnp.finfo(axis.dtype).tiny)
             require(longer, f"the axis of rotation is {axis}: give a direction that is not zero")
-        return Rotated(self, _rotation_about(axis, angle))
+        return Rotated(self, rotation_about(axis, angle))
 
     def scale(self, factor) -> "Scaled":
         """The solid scaled about the origin by a positive factor."""

@@ -9,7 +9,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.checks import AnyArray, as_numbers, checked, require
 from jaxnbv.errors import optional
-from jaxnbv.scanning.sdf.base import Scalar, SignedDistance, Vector, nonnegative, norm, parameter, split
+from jaxnbv.geometry.rotations import safe_norm
+from jaxnbv.scanning.sdf.base import Scalar, SignedDistance, Vector, nonnegative, parameter, split
 
 # Of the longest side, on all sides.
 _PADDING = 0.1
@@ -33,7 +34,7 @@ class Sampled(SignedDistance):
         nearest = jnp.clip(x, self.low, high)
         places = jnp.moveaxis((nearest - self.low) / self.spacing, -1, 0)
         found = jax.scipy.ndimage.map_coordinates(self.values, list(places), order=1, mode="nearest")
-        beyond = norm(*split(x - nearest))
+        beyond = safe_norm(*split(x - nearest))
         return jnp.where(beyond > 0, beyond + self.padding, found)
 
 

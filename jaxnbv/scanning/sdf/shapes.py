@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxnbv.checks import AnyArray, is_traced, require
+from jaxnbv.geometry.rotations import safe_norm
 from jaxnbv.scanning.sdf.base import (
     Scalar,
     SignedDistance,
@@ -11,7 +12,6 @@ from jaxnbv.scanning.sdf.base import (
     corner_distance,
     greatest,
     nonnegative,
-    norm,
     parameter,
     split,
 )
@@ -23,7 +23,7 @@ class Sphere(SignedDistance):
     radius: Scalar = nonnegative()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        return norm(*split(x)) - self.radius
+        return safe_norm(*split(x)) - self.radius
 
 
 class Cuboid(SignedDistance):
@@ -54,7 +54,7 @@ class Cylinder(SignedDistance):
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         x, y, z = split(x)
-        return corner_distance(norm(x, z) - self.radius, jnp.abs(y) - self.half_height)
+        return corner_distance(safe_norm(x, z) - self.radius, jnp.abs(y) - self.half_height)
 
 
 class Cone(SignedDistance):
@@ -67,15 +67,15 @@ class Cone(SignedDistance):
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         # The profile in the half plane (r, y): two caps, a slanted edge from the bottom's corner to the top's.
         x, y, z = split(x)
-        r = norm(x, z)
+        r = safe_norm(x, z)
         widening, rise = self.top_radius - self.bottom_radius, 2.0 * self.half_height
-        slant = norm(widening, rise)
+        slant = safe_norm(widening, rise)
         out, up = r - self.bottom_radius, y + self.half_height
         side = (rise * out - widening * up) / slant
         along = (widening * out + rise * up) / slant
         cap = jnp.abs(y) - self.half_height
         inside = greatest(side, cap)
-        bottom, top = norm(out, up), norm(r - self.top_radius, y - self.half_height)
+        bottom, top = safe_norm(out, up), safe_norm(r - self.top_radius, y - self.half_height)
         outside = jnp.where(along < 0, bottom, jnp.where(along > slant, top, inside))
         over_cap = (cap > 0) & (r < jnp.where(y > 0, self.top_radius, self.bottom_radius))
         return jnp.where(over_cap, cap, jnp.where(inside > 0, outside, inside))
@@ -89,7 +89,7 @@ class Torus(SignedDistance):
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         x, y, z = split(x)
-        return norm(norm(x, z) - self.major_radius, y) - self.minor_radius
+        return safe_norm(safe_norm(x, z) - self.major_radius, y) - self.minor_radius
 
 
 class Capsule(SignedDistance):
@@ -105,7 +105,7 @@ class Capsule(SignedDistance):
         offset = split(x - self.start)
         along = sum(c * d for c, d in zip(offset, segment, strict=True)) / jnp.where(squared > 0, squared, 1.0)
         nearest = jnp.clip(along, 0.0, 1.0)
-        return norm(*(c - nearest * d for c, d in zip(offset, segment, strict=True))) - self.radius
+        return safe_norm(*(c - nearest * d for c, d in zip(offset, segment, strict=True))) - self.radius
 
 
 class HalfSpace(SignedDistance):
@@ -119,8 +119,8 @@ class HalfSpace(SignedDistance):
 
     def __check_init__(self):
         if not is_traced(self.normal):
-            require(bool(norm(*self.normal) > 0), f"the plane's normal is {self.normal}: give a direction")
+            require(bool(safe_norm(*self.normal) > 0), f"the plane's normal is {self.normal}: give a direction")
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        unit = self.normal / norm(*self.normal)
+        unit = self.normal / safe_norm(*self.normal)
         return sum(c * d for c, d in zip(split(x - self.point), unit, strict=True))

@@ -6,15 +6,16 @@ rounded rectangle that is turned about an axis: a ring, a wheel, a rod, a cone, 
 
 import dataclasses
 import itertools
-import math
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial.transform import Rotation
 
 from jaxnbv.checks import AnyArray, require
-from jaxnbv.scanning.sdf import SignedDistance, corner_distance, least_of_last, nonnegative, norm, parameter
+from jaxnbv.geometry.rotations import safe_norm
+from jaxnbv.scanning.sdf import SignedDistance, corner_distance, least_of_last, nonnegative, parameter
 
 # How many primitives a solid has room for, or a multiple of it.
 CAPACITY = 24
@@ -60,7 +61,7 @@ class LabelledSolid(SignedDistance):
         u, v, w = (
             a * self.rotation[:, 0, i] + b * self.rotation[:, 1, i] + c * self.rotation[:, 2, i] for i in range(3)
         )
-        u = jnp.where(self.revolved, norm(u, w) - self.radius - self.slant * v, u)
+        u = jnp.where(self.revolved, safe_norm(u, w) - self.radius - self.slant * v, u)
         w = jnp.where(self.revolved, 0.0, w)
         half = self.half_size - self.rounding[:, None]
         distance = (
@@ -164,9 +165,7 @@ def shifted(point, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Float[np.n
 
 def rotation_about(axis, angle: float) -> Float[np.ndarray, "3 3"]:
     """The right-handed rotation about an axis by an angle in radians."""
-    x, y, z = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
+    return Rotation.from_rotvec(angle * np.asarray(axis, dtype=float) / np.linalg.norm(axis)).as_matrix()
 
 
 def _upright(axis):

@@ -1,10 +1,50 @@
-"""Rotations as parameters of an optimiser: smooth, without angles."""
+"""Rotations, and norms and directions of vectors whose derivatives are finite at zero."""
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxnbv.checks import AnyArray
+
+
+@jax.custom_jvp
+def safe_norm(*components: Float[AnyArray, "*#n"]) -> Float[Array, "*n"]:
+    """Euclidean length of the vectors with these components, with derivative zero at zero."""
+    return jnp.sqrt(sum(c * c for c in components))
+
+
+@safe_norm.defjvp
+def _safe_norm_jvp(components, tangents):
+    length = safe_norm(*components)
+    inverse = 1.0 / jnp.where(length > 0, length, 1.0)
+    return length, sum(inverse * c * dc for c, dc in zip(components, tangents, strict=True))
+
+
+@jax.jit
+def rotation_about(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """The right-handed rotation about a direction by an angle in radians: cos I + sin [k]_x + (1 - cos) k k^T about the
+    unit axis k (Rodrigues' formula). NaN about an axis of zero."""
+    unit = axis / safe_norm(*axis)
+    return jnp.cos(angle) * jnp.eye(3) + jnp.sin(angle) * _cross(unit) + (1.0 - jnp.cos(angle)) * unit[:, None] * unit
+
+
+def rotation_from_vector(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """The rotation about a vector by its length in radians: the same formula in w = angle k, which has derivatives at
+    zero too."""
+    square = jnp.sum(vector**2)
+    small = square < 1e-12
+    angle = jnp.sqrt(jnp.where(small, 1.0, square))
+    sine = jnp.where(small, 1.0 - square / 6.0, jnp.sin(angle) / angle)
+    versine = jnp.where(small, 0.5 - square / 24.0, (1.0 - jnp.cos(angle)) / angle**2)
+    cross = _cross(vector)
+    return jnp.eye(3) + sine * cross + versine * jnp.matmul(cross, cross, precision="highest")
+
+
+def _cross(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """[v]_x, with [v]_x u = v x u."""
+    x, y, z = vector
+    zero = jnp.zeros_like(x)
+    return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
 
 
 @jax.jit

@@ -1,4 +1,4 @@
-"""Rotations as parameters: the 6-D map against a float64 Gram-Schmidt and SciPy, the least rotation by its angle."""
+"""Rotations: turns against SciPy, the 6-D map against a float64 Gram-Schmidt, the least rotation by its angle."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jaxnbv.search.rotations import rotation_between, rotation_from_6d, rotation_to_6d
+from jaxnbv.geometry.rotations import (
+    rotation_about,
+    rotation_between,
+    rotation_from_6d,
+    rotation_from_vector,
+    rotation_to_6d,
+    safe_norm,
+)
 
 RNG = np.random.default_rng(0)
 FROM_6D, BETWEEN = jax.jit(rotation_from_6d), jax.jit(rotation_between)
@@ -46,6 +53,32 @@ def gram_schmidt(columns):
     across = np.cross(first, b)
     third = across / np.linalg.norm(across, axis=-1, keepdims=True)
     return np.stack([first, np.cross(third, first), third], axis=-1)
+
+
+@pytest.mark.parametrize("angle", [-4.0, -1.0, 0.0, 1e-9, 1e-5, 0.3, np.pi, 9.0])
+def test_turns_are_those_of_scipy_with_their_derivatives(x64, angle):
+    axis = 3.0 * units(1)[0]
+    vector = angle * axis / 3.0
+    expected = Rotation.from_rotvec(vector).as_matrix()
+    np.testing.assert_allclose(rotation_about(jnp.asarray(axis), jnp.asarray(angle)), expected, atol=1e-12)
+    np.testing.assert_allclose(rotation_from_vector(jnp.asarray(vector)), expected, atol=1e-12)
+    h = 1e-5
+    about = [Rotation.from_rotvec((angle + s) * axis / 3.0).as_matrix() for s in (h, -h)]
+    slope = jax.jacfwd(rotation_about, argnums=1)(jnp.asarray(axis), jnp.asarray(angle))
+    np.testing.assert_allclose(slope, (about[0] - about[1]) / (2 * h), atol=1e-8)
+    along = [[Rotation.from_rotvec(vector + s * e).as_matrix() for s in (h, -h)] for e in np.eye(3)]
+    central = np.stack([(up - down) / (2 * h) for up, down in along], axis=-1)
+    for jacobian in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(jacobian(rotation_from_vector)(jnp.asarray(vector)), central, atol=1e-5)
+
+
+def test_at_zero_a_turn_has_the_cross_product_as_its_derivative():
+    """In float32, where nothing may be 0 / 0: d R u = d w x u. Nor has a length a slope there."""
+    slope = jax.jit(jax.jacrev(rotation_from_vector))(jnp.zeros(3))
+    expected = np.stack([np.cross(e, np.eye(3)).T for e in np.eye(3)], axis=-1)
+    np.testing.assert_array_equal(slope, expected)
+    np.testing.assert_array_equal(jax.grad(lambda v: safe_norm(*v))(jnp.zeros(3)), np.zeros(3))
+    np.testing.assert_allclose(jax.grad(lambda v: safe_norm(*v))(jnp.asarray([3.0, 0.0, 4.0])), [0.6, 0.0, 0.8])
 
 
 def test_rotations_come_back():
