@@ -1,6 +1,12 @@
 """The command line: one call of each kind as a user makes it, in a process of its own, the others in this process."""
 
+import gc
 import json
+import os
+import subprocess
+import sys
+import threading
+import weakref
 
 import numpy as np
 import pytest
@@ -144,6 +150,58 @@ def test_a_device_that_is_not_there_is_named(tmp_path, monkeypatch):
     result = run_process("demo", cwd=tmp_path)
     assert result.returncode == 2
     assert result.stderr.startswith("error: JAX_PLATFORMS is 'rocm', but JAX finds no such device here")
+
+
+def test_a_command_of_another_package_stands_beside_ours(tmp_path, monkeypatch):
+    """One that cannot be imported, or has a name of ours, takes nothing from the others."""
+    (tmp_path / "toy.py").write_text('def greet(who: str = "you") -> None:\n    """Greets."""\n    print("hello", who)\n')
+    (tmp_path / "toy_broken.py").write_text("1 / 0")
+    folder = tmp_path / "toy-1.0.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: toy\nVersion: 1.0\n")
+    points = "greet = toy:greet\nview = toy:greet\nbreak = toy_broken:it\n"
+    (folder / "entry_points.txt").write_text(f"[jaxnbv.commands]\n{points}")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    shown = run_process("--help", cwd=tmp_path)
+    assert shown.returncode == 0, shown.stderr
+    assert "Greets." in shown.stdout
+    assert "Look at a run in the browser" in shown.stdout
+    (line,) = shown.stderr.splitlines()
+    assert line.startswith("warning: toy has no command break (ZeroDivisionError")
+    assert run_process("greet", "--who", "me", cwd=tmp_path).stdout == "hello me\n"
+
+
+RACE = """
+import sys, threading
+from jaxnbv.cli import main, play
+
+racing = threading.Event()
+
+def simulate(planner, scene, first, views, key, noise, folder, each=None, **settings):
+    if each is None:
+        racing.set()
+        threading.Event().wait()
+    each(next(steps(planner, sensor_of(planner, scene, noise), first, key)))
+    assert racing.wait(120)
+    raise KeyboardInterrupt
+
+from jaxnbv.planning.episode import observe_scene, steps
+
+def sensor_of(planner, scene, noise):
+    return lambda pose, key: observe_scene(scene, planner.camera, pose, noise, key)
+
+play.simulate = simulate
+sys.argv = ["jaxnbv", "demo", "--quick", "--known", "none"]
+main()
+"""
+
+
+def test_an_interrupt_ends_the_process_while_a_rival_still_runs(tmp_path):
+    """A rival that would never end; the process is given two minutes."""
+    script = [sys.executable, "-c", RACE]
+    result = subprocess.run(script, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert result.returncode == 130, result.stderr
+    assert "view 1   (" in result.stdout
 
 
 @pytest.mark.slow

@@ -133,6 +133,10 @@ class TriangleMesh(Surface):
         """Distance from the scene's origin to the farthest corner."""
         return float(np.linalg.norm(self.vertices, axis=1).max())
 
+    @property
+    def world_frame(self) -> Frame:
+        return self.frame
+
     @checked
     def contains(self, points: Float[AnyArray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Which points (scene coordinates) lie inside: where the winding number is above 1/2 in magnitude, so that a

@@ -9,11 +9,13 @@ from typing import TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, check_fields, checked, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 
 
@@ -45,6 +47,15 @@ class Surface(eqx.Module):
         A sensor sees only what faces it: an origin inside the surface sees the surface from within, its normals turned
         to the origin like all others.
         """
+
+    def contains(self, points: Float[AnyArray, "n 3"]) -> Bool[AnyArray, " n"]:
+        """Which points (scene coordinates) lie inside; none of a surface that encloses nothing."""
+        return np.zeros(len(points), bool)
+
+    @property
+    def world_frame(self) -> Frame | None:
+        """From the world that the surface was given in to the scene; None where it was given in the scene."""
+        return None
 
 
 class SensorNoise(eqx.Module):

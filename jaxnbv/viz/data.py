@@ -122,5 +122,5 @@ def report_data(
         drawn.append(ViewData(view, before, next_one.surface, task.amounts[index], words, leading.imagined, look))
         leading = next_one
     means = [view.surface.mesh for view in drawn if view.surface is not None]
-    frame = getattr(episode.scene, "frame", None)
+    frame = None if episode.scene is None else episode.scene.world_frame
     return ReportData(episode, tuple(drawn), planner.quantity, task, stage_of(episode, means), frame)

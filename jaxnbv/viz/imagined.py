@@ -17,7 +17,7 @@ from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Episode, View, view_keys
 from jaxnbv.scanning import GridSurface, TriangleMesh, scan
 from jaxnbv.scanning.mesh import level_triangles
-from jaxnbv.surfaces import KnownShapesPosterior, SurfacePosterior
+from jaxnbv.surfaces import SurfacePosterior
 from jaxnbv.viz.sphere import unit
 from jaxnbv.viz.style import BEFORE, NEW
 
@@ -74,12 +74,10 @@ def imagined(
             continue
         seen = scan(TriangleMesh(*found[:2], Frame()), camera, view.pose, barrier)
         samples.append(look(seen, camera, view.pose, cloud))
-    names, kinds = [f"imagined {number}" for number in range(1, len(samples) + 1)], dict[str, float]()
-    if isinstance(posterior, KnownShapesPosterior):
-        sample_key, *_ = view_keys(episode.key, index)
-        names = posterior.names_of_samples(sample_key, sampler.num_samples)[: len(samples)]
-        kinds = posterior.kinds()
-    return Imagined(tuple(samples), tuple(names), tuple(kinds.items()))
+    sample_key, *_ = view_keys(episode.key, index)
+    shapes = posterior.names_of_samples(sample_key, sampler.num_samples)[: len(samples)]
+    names = [shape or f"imagined {number}" for number, shape in enumerate(shapes, start=1)]
+    return Imagined(tuple(samples), tuple(names), tuple(posterior.kinds().items()))
 
 
 def taken_look(view: View, cloud: Float[np.ndarray, "n 3"]) -> Look | None:
