@@ -192,14 +192,18 @@ class Sure(StopRule):
         _of_classes(acquisition)
 
     def after(self, context: StopContext) -> str | None:
-        acquisition, cloud = _of_classes(context.acquisition), context.observations.cloud
+        return self.reason(context.acquisition, context.observations.cloud, context.key)
+
+    def reason(self, acquisition: Acquisition, cloud: PointCloud, key: PRNGKeyArray) -> str | None:
+        """Why the class is known given D, in words; None if it is not. `key`: of the random halves."""
+        acquisition = _of_classes(acquisition)
         answer = acquisition.answer(cloud)
         best = int(np.argmax(answer.values))
         least = float(answer.values[best])
         for index in range(self.num_resamplings):
             if least < self.probability:
                 return None
-            half = acquisition.answer(half_of(cloud, jax.random.fold_in(context.key, index)))
+            half = acquisition.answer(half_of(cloud, jax.random.fold_in(key, index)))
             least = min(least, float(half.values[best]))
         if least < self.probability:
             return None

@@ -24,6 +24,7 @@ from jaxnbv.viz.data import report_data
 from jaxnbv.viz.report import report_html
 from jaxnbv.viz.task import lost_again, race_words, since, true_cloud
 
+KEY = jax.random.key(0)
 NAMES = ("left", "right", "up")
 
 
@@ -153,12 +154,18 @@ def test_parts_are_found_by_their_points():
     assert words_of(found).found == "a, c"
     # However few points a part has of the whole surface, the object has it.
     assert words_of(truth).found == "a, b"
-    assert not words_of(found).settled(None)
-    assert words_of(PartAnswer(("a",), np.array([60.0]), asked=(0,))).settled(None)
+    assert words_of(found).settled([truth, found], None) == [False, False]
+    last = PartAnswer(("a",), np.array([60.0]), asked=(0,))
+    assert words_of(last).settled([last], None) == [True]
 
 
 def classes(*rows):
     return [ClassAnswer(("a", "b"), np.array([p, 1.0 - p])) for p in rows]
+
+
+def settled(answers):
+    """By a rule that asks nothing but the probability."""
+    return words_of(answers[-1]).settled(answers, lambda rule, index: answers[index].values.max() >= rule.probability)
 
 
 @pytest.mark.parametrize(
@@ -177,14 +184,31 @@ def classes(*rows):
     ],
 )
 def test_since_when_an_answer_can_be_relied_on(answers, view):
-    assert since(answers) == view
+    assert since(settled(answers)) == view
 
 
 @pytest.mark.parametrize(
     ("answers", "view"), [(classes(0.5, 0.96, 0.97), None), (classes(0.96, 0.9, 0.97), 1), (classes(0.5, 0.6), None)]
 )
 def test_an_answer_that_was_lost_again_is_told(answers, view):
-    assert lost_again(answers) == view
+    assert lost_again(settled(answers)) == view
+
+
+def test_a_class_that_halves_of_the_points_do_not_tell_is_sure_nowhere(plain):
+    """Certain of one class given all points, of the other given some halves of them."""
+
+    def by_count(cloud):
+        return jnp.log(jnp.where(cloud.count >= 40, jnp.array([0.99, 0.01]), jnp.array([0.01, 0.99])))
+
+    planner, sure = nbv.Planner(nbv.CrossEntropy(by_count), nbv.RandomView(8), capacity=50), nbv.Sure(0.95)
+    episode = nbv.simulate(planner, Sphere(0.9), nbv.look_at((0.0, 0.0, 2.5)), 2, KEY, until=sure)
+    assert [view.cloud.count for view in episode.views] == [50, 50]
+    assert episode.stopped is None
+    task = report_data(episode, progress=False, imagine=False).task
+    assert task.answers[-1].values.max() > 0.95
+    assert task.sure.startswith("Not yet after 2 views")
+    # With no halves to ask, the first view is enough.
+    assert nbv.Sure(0.95, 0).reason(planner.acquisition, episode.cloud, KEY) is not None
 
 
 def test_a_rival_is_told_of_and_drawn(plain):
