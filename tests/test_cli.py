@@ -229,7 +229,7 @@ def test_no_posterior_waits_for_a_rival_or_for_an_earlier_drawing(tmp_path, monk
             assert Drawings.may_end.wait(300)
             return episode
         for view in (1, 2, 3):
-            step = mock.Mock(spec=Step, view=view, posterior=types.SimpleNamespace())
+            step = mock.Mock(spec=Step, view=view, posterior={1, 2, 3})
             held.append(weakref.ref(step.posterior))
             each(step)
             del step

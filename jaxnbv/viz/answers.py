@@ -135,7 +135,8 @@ class _ClassWords(Words):
         """Sure, and not of another class than the view before was sure of."""
         sure = [holds(self.rule, index) for index in range(len(answers))]
         best = [int(np.argmax(answer.values)) for answer in answers]
-        return [is_sure and not (i and sure[i - 1] and best[i - 1] != best[i]) for i, is_sure in enumerate(sure)]
+        contradicted = [False, *(was and a != b for was, (a, b) in zip(sure, pairwise(best), strict=False))]
+        return [now and not other for now, other in zip(sure, contradicted, strict=True)]
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
         """The probabilities of all classes; of the truth, 1 and 0."""
