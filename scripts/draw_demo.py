@@ -14,7 +14,7 @@ from PIL import Image
 
 import jaxnbv as nbv
 from jaxnbv.cli.play import DEMO, imagined, planner_of, rule
-from jaxnbv.cli.tasks import COMMAND_TASKS
+from jaxnbv.cli.tasks import TASKS
 from jaxnbv.viz.charts import over_views
 from jaxnbv.viz.data import ReportData, report_data
 from jaxnbv.viz.figures import STYLE
@@ -32,11 +32,11 @@ GUESS, ANSWER, END = 700, 1800, 5000
 
 def demo_episode(seed: int, search: str, views: int) -> nbv.Episode:
     """The demo of a seed, by a search of the command line, until its own rule or so many views end it."""
-    made = COMMAND_TASKS["cross-entropy"]
-    shown = made.demo(0, seed)
-    sampler = dataclasses.replace(imagined("screened", False, shown.bank), grid=shown.grid)
-    planner = planner_of(made.setting, shown.acquisition, search, sampler, DEMO)
-    return nbv.simulate(planner, shown.surface, shown.first, views, jax.random.key(seed), until=rule(shown.until))
+    task = TASKS["cross-entropy"]
+    subject, enough = task.demo(0, seed), rule(task.until)
+    sampler = dataclasses.replace(imagined("screened", False, subject.bank), grid=subject.grid)
+    planner = planner_of(task.setting(), subject.acquisition, search, sampler, DEMO)
+    return nbv.simulate(planner, subject.surface, subject.first, views, jax.random.key(seed), until=enough)
 
 
 class Film:

@@ -1,11 +1,25 @@
 """The command line: one call of each kind as a user makes it, in a process of its own, the others in this process."""
 
+import gc
 import json
+import os
+import subprocess
+import sys
+import threading
+import time
+import types
+import weakref
+from unittest import mock
 
 import numpy as np
 import pytest
 import trimesh
 from commands import run_command, run_process
+
+from jaxnbv.cli import play
+from jaxnbv.cli.tasks import TASKS
+from jaxnbv.planning.loop import Step
+from jaxnbv.viz import Sketches
 
 
 @pytest.fixture(scope="module")
@@ -144,6 +158,99 @@ def test_a_device_that_is_not_there_is_named(tmp_path, monkeypatch):
     result = run_process("demo", cwd=tmp_path)
     assert result.returncode == 2
     assert result.stderr.startswith("error: JAX_PLATFORMS is 'rocm', but JAX finds no such device here")
+
+
+def test_a_command_of_another_package_stands_beside_ours(tmp_path, monkeypatch):
+    """One that cannot be imported, or has a name of ours, takes nothing from the others."""
+    (tmp_path / "toy.py").write_text(
+        'def greet(who: str = "you") -> None:\n    """Greets."""\n    print("hello", who)\n'
+    )
+    (tmp_path / "toy_broken.py").write_text("1 / 0")
+    folder = tmp_path / "toy-1.0.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: toy\nVersion: 1.0\n")
+    points = "greet = toy:greet\nview = toy:greet\nbreak = toy_broken:it\n"
+    (folder / "entry_points.txt").write_text(f"[jaxnbv.commands]\n{points}")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    shown = run_process("--help", cwd=tmp_path)
+    assert shown.returncode == 0, shown.stderr
+    assert "Greets." in shown.stdout
+    assert "Look at a run in the browser" in shown.stdout
+    (line,) = shown.stderr.splitlines()
+    assert line.startswith("warning: toy has no command break (ZeroDivisionError")
+    assert run_process("greet", "--who", "me", cwd=tmp_path).stdout == "hello me\n"
+
+
+RACE = """
+import sys, threading, types
+from jaxnbv.cli import main, play
+from jaxnbv.cli.tasks import TASKS
+
+racing = threading.Event()
+
+def simulate(*arguments, each=None, **settings):
+    if each is None:
+        racing.set()
+        threading.Event().wait()
+    each(types.SimpleNamespace(view="view 1"))
+    assert racing.wait(300)
+    raise KeyboardInterrupt
+
+play.simulate, play.Lines = simulate, lambda planner: print
+TASKS["coverage"].until = ("seconds=1e6",)
+sys.argv = ["jaxnbv", "demo", "--task", "coverage", "--no-report"]
+main()
+"""
+
+
+def test_an_interrupt_ends_the_process_while_a_rival_still_runs(tmp_path):
+    """The rival would never end."""
+    script = [sys.executable, "-c", RACE]
+    result = subprocess.run(script, cwd=tmp_path, capture_output=True, text=True, timeout=600)
+    assert result.returncode == 130, result.stderr
+    assert "view 1" in result.stdout
+
+
+class Drawings(Sketches):
+    """The last one waits."""
+
+    may_end = threading.Event()
+
+    def add(self, step):
+        assert step.view < 3 or self.may_end.wait(300)
+
+
+def test_no_posterior_waits_for_a_rival_or_for_an_earlier_drawing(tmp_path, monkeypatch):
+    held = []
+
+    def simulate(*arguments, each=None, **settings):
+        episode = types.SimpleNamespace(stopped=None, views=())
+        if each is None:
+            assert Drawings.may_end.wait(300)
+            return episode
+        for view in (1, 2, 3):
+            step = mock.Mock(spec=Step, view=view, posterior={1, 2, 3})
+            held.append(weakref.ref(step.posterior))
+            each(step)
+            del step
+        # The thread of a drawing ends after its result is there.
+        until = time.monotonic() + 60
+        while any(one() for one in held[:2]) and time.monotonic() < until:
+            gc.collect()
+            time.sleep(0.01)
+        held[:] = [one() is not None for one in held]
+        Drawings.may_end.set()
+        return episode
+
+    monkeypatch.setattr(TASKS["coverage"], "until", ("seconds=1e6",))
+    changes = {"simulate": simulate, "Lines": lambda planner: print, "race_words": lambda *episodes: "a race"}
+    monkeypatch.setattr(play.viz, "Sketches", Drawings)
+    monkeypatch.setattr(play.viz, "write_report", lambda *arguments, **settings: "report.html")
+    with mock.patch.multiple(play, **changes):
+        result = run_command("demo", "--task", "coverage", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "a race" in result.stdout
+    assert held == [False, False, True]
 
 
 @pytest.mark.slow

@@ -1,15 +1,15 @@
-"""The command line: `jaxnbv demo`, `jaxnbv run MESH`, `jaxnbv view RUN`, `jaxnbv study NAME`, `jaxnbv report DIR`."""
+"""The command line. Commands are entry points of the group `jaxnbv.commands`, functions for typer by their names."""
 
 import os
 import sys
+from importlib.metadata import EntryPoint, entry_points
 from typing import Annotated
 
 import platformdirs
 import typer
 
 import jaxnbv
-from jaxnbv.cli.episode import demo, run, view
-from jaxnbv.cli.study import report, study
+from jaxnbv.cli.background import end_process, is_working
 from jaxnbv.errors import InputError, explained_imports
 
 app = typer.Typer(
@@ -45,8 +45,24 @@ def _options(
     """What is asked of `jaxnbv` itself."""
 
 
-for _command in (demo, run, view, report, study):
-    app.command()(_command)
+def _is_own(point: EntryPoint) -> bool:
+    return point.module.split(".")[0] == "jaxnbv"
+
+
+def _add_commands() -> None:
+    """Add the commands of this package, then those of others under names that are free."""
+    named = {point.name: point for point in sorted(entry_points(group="jaxnbv.commands"), key=_is_own)}
+    for point in sorted(named.values(), key=lambda point: (not _is_own(point), point.name)):
+        try:
+            app.command(point.name)(point.load())
+        # Whatever a module of somebody else does as it is imported.
+        except (Exception, SystemExit) as error:
+            package = point.dist.name if point.dist else point.module
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            typer.echo(f"warning: {package} has no command {point.name} ({reason}): mend it or uninstall it", err=True)
+
+
+_add_commands()
 
 
 def keep_programs() -> None:
@@ -56,8 +72,11 @@ def keep_programs() -> None:
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 
 
-def main() -> None:
-    """Entry point: errors that the user can mend are one line, without a traceback."""
+def answer() -> None:
+    """Answer the words of this process: errors that the user can mend are one line, without a traceback.
+
+    **Raises:** `SystemExit` with the code.
+    """
     keep_programs()
     try:
         with explained_imports():
@@ -65,3 +84,13 @@ def main() -> None:
     except InputError as error:
         typer.echo(f"error: {error}", err=True)
         sys.exit(2)
+
+
+def main() -> None:
+    """Entry point: answer, then end the process, whatever still runs beside."""
+    try:
+        answer()
+    except SystemExit as leaving:
+        if is_working():
+            end_process(leaving.code if isinstance(leaving.code, int) else 0)
+        raise

@@ -1,161 +1,84 @@
-"""`jaxnbv demo` and `jaxnbv run MESH`: one episode. `jaxnbv view RUN`: a look at one."""
+"""What `jaxnbv demo` and `jaxnbv run` are both asked."""
 
-import dataclasses
-import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias, TypeVar
 
-import typer
+from jaxnbv.cli.options import Position, asking, finding, imagining, listed, running, seeing
+from jaxnbv.cli.registry import BANKS, MODELS, SEARCHES, STOPS
+from jaxnbv.cli.tasks import TASKS
+from jaxnbv.cli.tasks.base import Task
 
-from jaxnbv.cli import options
-from jaxnbv.cli.registry import TASKS
-from jaxnbv.errors import InputError
+T = TypeVar("T")
 
+# One of some names, which type checkers do not read.
+if TYPE_CHECKING:
+    TaskName: TypeAlias = str
+    SearchName: TypeAlias = str
+    ModelName: TypeAlias = str
+else:
+    TaskName, SearchName, ModelName = (Literal[tuple(names)] for names in (TASKS, SEARCHES, MODELS))
 
-def demo(
-    task: options.TaskOption = "cross-entropy",
-    views: options.ViewsOption = 5,
-    until: options.UntilOption = None,
-    scene: Annotated[
-        int, options.asking(metavar="N", min=0, max=2**31 - 1, help="Which object: the number of a scene.")
-    ] = 0,
-    first: options.FirstOption = None,
-    noise: options.NoiseOption = 0.01,
-    model: options.ModelOption = "screened",
-    known: options.KnownOption = None,
-    search: options.SearchOption = "halving",
-    seed: options.SeedOption = 2,
-    out: options.OutOption = None,
-    quick: options.QuickOption = False,
-    report: options.ReportOption = True,
-) -> None:
-    """Find out what a truck carries, which the first view does not show: no file, no network.
-
-    Farthest view, which knows nothing of the task, then starts from the same view. With --task parts the object is a
-    procedural one of thirteen categories, with --task heat one of four kinds that is heated at one place, and with
-    --task coverage a mug, to be seen all round.
-    """
-    from jaxnbv.checks import check_device
-
-    check_device()
-    from jaxnbv.cli.play import DEMO, first_pose, play
-    from jaxnbv.cli.tasks import COMMAND_TASKS
-
-    made = COMMAND_TASKS[task]
-    shown = made.demo(scene, seed)
-    if first is not None:
-        shown = shown._replace(first=first_pose(first, shown.surface))
-    asked = options.Asked(task, views, until, first, noise, model, known, search, seed, out, quick, report)
-    play(asked, shown, made.setting, DEMO)
+TaskOption = Annotated[
+    TaskName, asking(metavar="TASK", help=listed((name, task.about) for name, task in TASKS.items()))
+]
+SearchOption = Annotated[SearchName, finding(metavar="SEARCH", help=listed(SEARCHES.items()))]
+SeedOption = Annotated[
+    int, running(metavar="N", min=0, max=2**63 - 1, help="Seed of the sensor's noise and of the samples.")
+]
+KnownOption = Annotated[
+    str | None,
+    imagining(
+        metavar="BANK",
+        help=f"Shapes known before: a folder of upright meshes, or one of {', '.join(BANKS)}; or none.",
+        show_default="none; demo, but for --model paper: others of the kind",
+    ),
+]
 
 
-def run(
-    mesh: Annotated[
-        Path, typer.Argument(metavar="MESH", help="Any mesh that trimesh reads: OBJ, PLY, STL, OFF, glTF, ...")
-    ],
-    task: options.TaskOption = "coverage",
-    views: options.ViewsOption = 5,
-    until: options.UntilOption = None,
-    network: Annotated[
-        Path | None,
-        options.asking(
-            metavar="FILE",
-            help="A classifier, .pth or .safetensors, which tasks about the class need; for parts a segmenter.",
+def by_task(of: Callable[[type[Task]], T]) -> dict[T, str]:
+    """What tasks say, each with the names of those that say it."""
+    names: dict[T, list[str]] = {}
+    for name, task in TASKS.items():
+        names.setdefault(of(task), []).append(name)
+    return {said: "/".join(tasks) for said, tasks in names.items()}
+
+
+_ENOUGH = [f"{' '.join(until)} for {names}" for until, names in by_task(lambda task: task.until).items() if until]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeOptions:
+    """Options of a command that plays an episode."""
+
+    task: TaskOption
+    views: Annotated[int, asking(metavar="N", help="Views in all, the first one included.")] = 5
+    until: Annotated[
+        list[str] | None,
+        asking(
+            metavar="RULE=N",
+            help="End once a rule holds; can be given several times. "
+            + listed((name, stop.about) for name, stop in STOPS.items())
+            + " Or never.",
+            show_default=f"never; demo: {', '.join(_ENOUGH)}",
         ),
-    ] = None,
-    category: Annotated[
-        str | None,
-        options.asking(
-            metavar="NAME",
-            help="For parts: what the object is, one of ShapeNet-part's categories; upright along y, facing x.",
-        ),
-    ] = None,
-    source: Annotated[
-        options.Position | None,
-        options.asking(
+    ] = None
+    first: Annotated[
+        Position | None,
+        seeing(
             metavar="X Y Z",
-            help="For heat: the object is heated at its point nearest to this, in scene units.",
-            show_default="the middle of the first view",
+            help="Where the first camera stands, in scene units; it looks at the origin.",
+            show_default="from 0.8 0.9 2.2, as far as the others; demo: where the answer hides",
         ),
-    ] = None,
-    up: Annotated[
-        str, options.seeing(metavar="AXIS", help="The mesh's axis that is upward: x, y or z, or one of these with a -.")
-    ] = "y",
-    first: options.FirstOption = None,
-    paper: Annotated[
-        bool, options.seeing("--paper", help="The paper's close-up: 30 degrees from 2.5 (parts: 2, heat: 3).")
-    ] = False,
-    noise: options.NoiseOption = 0.01,
-    model: options.ModelOption = "screened",
-    known: options.KnownOption = None,
-    search: options.SearchOption = "discrete",
-    seed: options.SeedOption = 0,
-    out: options.OutOption = None,
-    quick: options.QuickOption = False,
-    report: options.ReportOption = True,
-) -> None:
-    """Choose views of a mesh, scanned by a simulated depth camera.
-
-    The mesh may be open, a soup of triangles or inconsistently wound. It is scaled and centred so that its longest side
-    is 2.5 scene units; cameras stand as far from its centre as it takes to see all of it.
-    """
-    of_task, given = TASKS[task], {"network": network, "category": category, "source": source}
-    for option, value in given.items():
-        if value is not None and option not in of_task.requires + of_task.options:
-            takers = ", ".join(name for name, entry in TASKS.items() if option in entry.requires + entry.options)
-            raise InputError(f"--task {task} takes no --{option}: it is for {takers}")
-        if value is None and option in of_task.requires:
-            raise InputError(f"--task {task} needs --{option}")
-
-    from jaxnbv.checks import check_device
-
-    check_device()
-    from jaxnbv.cli.play import USUAL, first_pose, play
-    from jaxnbv.cli.tasks import COMMAND_TASKS, Given, Shown, usual_first
-    from jaxnbv.scanning import load_mesh
-    from jaxnbv.scanning.sensors import fitted
-
-    surface, made = load_mesh(mesh, up), COMMAND_TASKS[task]
-    setting = made.setting if paper else fitted(made.setting, surface.bounding_radius)
-    usual = usual_first(None if paper else setting.radius)
-    start = usual if first is None else first_pose(first, surface)
-    acquisition = made.acquisition(Given(surface, setting.camera, start, network, category, source))
-    asked = options.Asked(task, views, until, first, noise, model, known, search, seed, out, quick, report)
-    play(asked, Shown(mesh.stem, surface, acquisition, start), setting, USUAL)
-
-
-def view(
-    folder: Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run.")],
-    html: Annotated[
-        Path | None, typer.Option(help="Write the scene into one HTML file, which opens offline, and end.")
-    ] = None,
-    known: options.KnownOption = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Where the page is served.")] = 8080,
-) -> None:
-    """Look at a run in the browser: points, cameras, the surface, what is imagined, where to look next.
-
-    Surfaces are those of the usual model given what was seen, by one who knows shapes with --known.
-    """
-    from jaxnbv.checks import check_device
-
-    check_device()
-    from jaxnbv.cli.play import imagined
-    from jaxnbv.planning.episode import Episode
-    from jaxnbv.viz import LiveView
-
-    episode, page = Episode.load(folder), LiveView(port)
-    if known is not None:
-        planner = dataclasses.replace(episode.planner, sampler=imagined("screened", False, known))
-        episode = dataclasses.replace(episode, planner=planner)
-    try:
-        page.update(episode)
-        if html is not None:
-            typer.echo(f"page     {page.save(html)}")
-            return
-        typer.echo(f"look at {page.address}; end with Ctrl-C")
-        while True:
-            time.sleep(3600.0)
-    except KeyboardInterrupt:
-        typer.echo("ended")
-    finally:
-        page.stop()
+    ] = None
+    noise: Annotated[float, seeing(metavar="X", help="Standard deviation of points and normals.")] = 0.01
+    model: Annotated[ModelName, imagining(metavar="MODEL", help=listed(MODELS.items()))] = "screened"
+    known: KnownOption = None
+    search: SearchOption
+    seed: SeedOption = 0
+    out: Annotated[
+        Path | None, running(metavar="DIR", help="Output folder.", show_default="runs/NAME-TASK-SEARCH[-MODEL]-seedN")
+    ] = None
+    quick: Annotated[bool, running("--quick", help="Small settings, for a first look; not the paper's.")] = False
+    report: Annotated[bool, running("--report/--no-report", help="Write report.html.")] = True

@@ -7,31 +7,32 @@ import os
 import re
 import textwrap
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import typer
 
 from jaxnbv import viz
 from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError, require
+from jaxnbv.cli.background import in_background
+from jaxnbv.cli.episode import EpisodeOptions
 from jaxnbv.cli.lines import Lines
-from jaxnbv.cli.options import Asked, Position
+from jaxnbv.cli.options import Position
 from jaxnbv.cli.registry import STOPS
-from jaxnbv.cli.tasks import Shown
+from jaxnbv.cli.tasks.base import Subject
 from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.simulate import simulate
-from jaxnbv.planning.stopping import Budget, Covered, Found, StopRule, Sure, ValueBelow
+from jaxnbv.planning.stopping import StopRule
 from jaxnbv.sampler import SurfaceSampler
-from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, Surface, TriangleMesh
+from jaxnbv.scanning import Grid, SensorNoise, Surface
 from jaxnbv.scanning.sensors import Setting
 from jaxnbv.search import Search, SphereCandidates, TieBreakSearch
 from jaxnbv.studies.engine import searches
@@ -56,15 +57,6 @@ USUAL, QUICK = Sizes(16, None, 8192), Sizes(4, 40, 1024, Grid(56), 24)
 DEMO = Sizes(16, 60, 2048)
 # Views of the baseline that races the demo, at most.
 _RACE_VIEWS = 10
-RULES: dict[str, Callable[[float], StopRule]] = {
-    "sure": Sure,
-    "found": lambda points: Found(int(points)),
-    "covered": Covered,
-    "value-below": ValueBelow,
-    "seconds": lambda seconds: Budget(seconds=seconds),
-    "travel": lambda length: Budget(cost=length),
-}
-"""What the rules of `--until` stand for."""
 
 
 def rule(texts: Sequence[str]) -> StopRule | None:
@@ -77,9 +69,9 @@ def rule(texts: Sequence[str]) -> StopRule | None:
     rules = []
     for text in texts:
         name, _, value = text.partition("=")
-        require(name in RULES, f"--until is {text!r}: give never or one of {', '.join(STOPS)}, such as sure=0.95")
+        require(name in STOPS, f"--until is {text!r}: give never or one of {', '.join(STOPS)}, such as sure=0.95")
         try:
-            rules.append(RULES[name](float(value)))
+            rules.append(STOPS[name].rule(float(value)))
         except (ValueError, OverflowError) as error:
             raise InputError(f"--until is {text!r} ({error}): give a number, such as {name}=0.95") from error
     return functools.reduce(operator.or_, rules)
@@ -126,67 +118,71 @@ def first_pose(place: Position, surface: Surface) -> Pose:
 
     **Raises:** `ValueError` for a position inside the object.
     """
-    pose, inside = look_at(place), False
-    if isinstance(surface, TriangleMesh):
-        inside = bool(surface.contains(np.array([place]))[0])
-    elif isinstance(surface, SDFSurface):
-        inside = bool(surface.sdf(jnp.array([place]))[0] < 0)
-    require(not inside, f"--first is {place}, inside the object: give a place outside")
+    pose = look_at(place)
+    require(not surface.contains(np.array([place]))[0], f"--first is {place}, inside the object: give a place outside")
     return pose
 
 
-def play(asked: Asked, shown: Shown, setting: Setting, sizes: Sizes) -> None:
-    """Simulate an episode into a folder, tell of each view as it is done, and report; where the object says what is
-    enough, farthest view races it from the same first view."""
+def play(options: EpisodeOptions, subject: Subject, setting: Setting, sizes: Sizes, until: Sequence[str] = ()) -> None:
+    """Simulate an episode into a folder, tell of each view as it is done, and report.
+
+    - `until`: what is enough by default, as in `--until`; where it is given, farthest view races the episode from the
+      same first view.
+    """
     began = time.perf_counter()
-    if asked.quick:
+    if options.quick:
         typer.echo("--quick: small settings; leave it out for the usual ones.")
         sizes = QUICK
-    if shown.note:
-        typer.echo(shown.note)
+    if subject.note:
+        typer.echo(subject.note)
     # The paper's model knows no shapes.
-    usual = "none" if asked.model == "paper" else shown.bank
-    sampler = dataclasses.replace(imagined(asked.model, asked.quick, asked.known or usual), grid=shown.grid)
-    planner = planner_of(setting, shown.acquisition, asked.search, sampler, sizes)
-    parts = shown.name, asked.task, asked.search, *(() if asked.model == "screened" else (asked.model,))
-    folder = asked.out or Path("runs") / re.sub(r"[^A-Za-z0-9_.-]", "_", f"{'-'.join(parts)}-seed{asked.seed}")
-    enough = rule(asked.until or shown.until)
-    key, noise = jax.random.key(asked.seed), SensorNoise(asked.noise, asked.noise)
-    races = bool(shown.until) and enough is not None and asked.search != "farthest"
+    bank = options.known or ("none" if options.model == "paper" else subject.bank)
+    sampler = dataclasses.replace(imagined(options.model, options.quick, bank), grid=subject.grid or Grid())
+    planner, rival = (
+        planner_of(setting, subject.acquisition, search, sampler, sizes) for search in (options.search, "farthest")
+    )
+    folder, enough = options.out or Path("runs") / _folder_name(options, subject), rule(options.until or until)
+    races = bool(until) and enough is not None and options.search != "farthest"
+    key, noise = jax.random.key(options.seed), SensorNoise(options.noise, options.noise)
     lines = Lines(planner)
-    sketches = viz.Sketches(Episode(planner, shown.surface, noise, shown.first, key, ())) if asked.report else None
+    sketches = (
+        viz.Sketches(Episode(planner, subject.surface, noise, subject.first, key, ())) if options.report else None
+    )
     race: Future[Episode] | None = None
-    drawn: list[Future[None]] = []
-
-    def tell(step: Step) -> None:
-        nonlocal race
-        lines(step.view)
-        if sketches is not None:
-            drawn.append(beside.submit(sketches.add, step))
-        # Not before the first view: both would compile what that needs.
-        if race is None and races:
-            rival = planner_of(setting, shown.acquisition, "farthest", sampler, sizes)
-            of_rival = (shown.surface, shown.first, _RACE_VIEWS, key, noise, folder / "farthest")
-            race = beside.submit(simulate, rival, *of_rival, progress=False, until=enough)
+    drawing: Future[None] | None = None
 
     # While the next view is planned, the last one is drawn and the rival runs.
-    with ThreadPoolExecutor(1) as beside:
-        try:
-            of_planner = (shown.surface, shown.first, asked.views, key, noise, folder)
-            episode = simulate(planner, *of_planner, until=enough, each=tell)
-        except BaseException:
-            beside.shutdown(wait=False, cancel_futures=True)
-            raise
+    def tell(step: Step) -> None:
+        nonlocal race, drawing
+        lines(step.view)
+        if sketches is not None:
+            # One at a time: a step that waited would keep its posterior.
+            if drawing is not None:
+                drawing.result()
+            drawing = in_background(sketches.add, step)
+        # Not before the first view: both would compile what that needs.
+        if race is None and races:
+            start = subject.surface, subject.first, _RACE_VIEWS, key, noise, folder / "farthest"
+            race = in_background(simulate, rival, *start, progress=False, until=enough)
+
+    start = subject.surface, subject.first, options.views, key, noise, folder
+    episode = simulate(planner, *start, until=enough, each=tell)
     raced = None if race is None else race.result()
-    for one in drawn:
-        one.result()
+    if drawing is not None:
+        drawing.result()
     if episode.stopped is not None:
-        views, saved = len(episode.views), asked.views - len(episode.views)
-        typer.echo(f"enough   after view {views}: {episode.stopped}. Views saved: {saved} of {asked.views}")
+        views, saved = len(episode.views), options.views - len(episode.views)
+        typer.echo(f"enough   after view {views}: {episode.stopped}. Views saved: {saved} of {options.views}")
     if raced is not None:
-        told_of = race_words(raced, episode)
-        typer.echo(textwrap.fill(told_of, 100, initial_indent="race     ", subsequent_indent="         "))
-    if asked.report:
-        page = viz.write_report(episode, folder, title=shown.name, rival=raced, sketches=sketches)
+        words = race_words(raced, episode)
+        typer.echo(textwrap.fill(words, 100, initial_indent="race     ", subsequent_indent="         "))
+    if options.report:
+        page = viz.write_report(episode, folder, title=subject.name, rival=raced, sketches=sketches)
         typer.echo(f"report   {page}")
     typer.echo(f"episode  {folder}   ({time.perf_counter() - began:.0f} s)")
+
+
+def _folder_name(options: EpisodeOptions, subject: Subject) -> str:
+    model = () if options.model == "screened" else (options.model,)
+    parts = subject.name, options.task, options.search, *model, f"seed{options.seed}"
+    return re.sub(r"[^A-Za-z0-9_.-]", "_", "-".join(parts))

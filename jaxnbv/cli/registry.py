@@ -1,32 +1,15 @@
-"""What the command line must know before anything heavy is imported: tasks, models, searches, rules.
-
-A new task, search or rule is a name here and what it stands for, in `tasks.py` or `play.py`.
-"""
+"""The names of models, searches and rules on the command line, known before anything heavy is imported."""
 
 import importlib
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+# Its names load what they stand for once they are used.
+import jaxnbv as nbv
 
-class TaskEntry(NamedTuple):
-    """What the views are for.
+if TYPE_CHECKING:
+    from jaxnbv.planning.stopping import StopRule
 
-    - `about`: a clause for the help.
-    - `requires`: options of `run` without which it does not go; `options`: others that it takes.
-    """
-
-    about: str
-    requires: tuple[str, ...] = ()
-    options: tuple[str, ...] = ()
-
-
-TASKS = {
-    "cross-entropy": TaskEntry("the object's class", ("network",)),
-    "entropy": TaskEntry("its class, by the entropy that a view removes", ("network",)),
-    "mixed": TaskEntry("its class, by one and then the other", ("network",)),
-    "coverage": TaskEntry("its shape"),
-    "parts": TaskEntry("its parts", ("category",), ("network",)),
-    "heat": TaskEntry("its coldest point when it is heated", options=("source",)),
-}
 
 MODELS = {
     "screened": "knows what was seen to be empty too",
@@ -50,13 +33,21 @@ SEARCHES = {
     "uncertainty": "a baseline, where the surface is least known",
 }
 
+
+class Stop(NamedTuple):
+    """A rule of `--until`: what its number is, and the rule of a number."""
+
+    about: str
+    rule: "Callable[[float], StopRule]"
+
+
 STOPS = {
-    "sure": "probability of the class",
-    "found": "points of every part",
-    "covered": "share seen of what can be seen",
-    "value-below": "value of the best view",
-    "seconds": "passed",
-    "travel": "length of the way",
+    "sure": Stop("probability of the class", lambda probability: nbv.Sure(probability)),
+    "found": Stop("points of every part", lambda points: nbv.Found(int(points))),
+    "covered": Stop("share seen of what can be seen", lambda share: nbv.Covered(share)),
+    "value-below": Stop("value of the best view", lambda value: nbv.ValueBelow(value)),
+    "seconds": Stop("passed", lambda seconds: nbv.Budget(seconds=seconds)),
+    "travel": Stop("length of the way", lambda length: nbv.Budget(cost=length)),
 }
 
 

@@ -64,10 +64,6 @@ class TriangleMesh(Surface):
         self.frame = frame
         self._tree = _Tree()
 
-    @property
-    def world(self) -> Frame:
-        return self.frame
-
     @classmethod
     def from_arrays(
         cls, vertices: Float[AnyArray, "v 3"] | list, faces: Int[AnyArray, "f 3"] | list, up: str = "y"
@@ -140,6 +136,10 @@ class TriangleMesh(Surface):
     def bounding_radius(self) -> float:
         """Distance from the scene's origin to the farthest corner."""
         return float(np.linalg.norm(self.vertices, axis=1).max())
+
+    @property
+    def world_frame(self) -> Frame:
+        return self.frame
 
     @checked
     def contains(self, points: Float[AnyArray, "n 3"]) -> Bool[np.ndarray, " n"]:

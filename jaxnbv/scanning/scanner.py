@@ -9,6 +9,7 @@ from typing import TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, check_fields, checked, require
@@ -39,11 +40,6 @@ class Surface(eqx.Module):
 
     in_jit: eqx.AbstractClassVar[bool]
 
-    @property
-    def world(self) -> Frame | None:
-        """The frame of the world that the surface was given in; None where that is the scene."""
-        return None
-
     @abstractmethod
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
         """First hits of the rays origin + t direction, t >= 0, with unit directions; of either side of the surface.
@@ -51,6 +47,15 @@ class Surface(eqx.Module):
         A sensor sees only what faces it: an origin inside the surface sees the surface from within, its normals turned
         to the origin like all others.
         """
+
+    def contains(self, points: Float[AnyArray, "n 3"]) -> Bool[AnyArray, " n"]:
+        """Which points (scene coordinates) lie inside; none of a surface that encloses nothing."""
+        return np.zeros(len(points), bool)
+
+    @property
+    def world_frame(self) -> Frame | None:
+        """From the world that the surface was given in to the scene; None where it was given in the scene."""
+        return None
 
 
 class SensorNoise(eqx.Module):

@@ -50,6 +50,9 @@ class SDFSurface(Surface):
         check_fields(self)
         require(self.bounding_radius > 0, f"the bounding radius is {self.bounding_radius}; it must be positive")
 
+    def contains(self, points: Float[AnyArray, "n 3"]) -> Bool[Array, " n"]:
+        return self.sdf(jnp.asarray(points)) < 0
+
     @eqx.filter_jit
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
         origins, directions = jnp.asarray(origins), jnp.asarray(directions)

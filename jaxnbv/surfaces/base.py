@@ -108,6 +108,14 @@ class SurfacePosterior(eqx.Module):
         """Whether it has its own `mean`; else moments are estimated from samples."""
         return type(self).mean is not SurfacePosterior.mean
 
+    def kinds(self) -> dict[str, float]:
+        """How likely the object is of each kind of known shape, most likely first; empty where no shapes are known."""
+        return {}
+
+    def names_of_samples(self, key: PRNGKeyArray, num_samples: int) -> list[str]:
+        """The known shape that each of the samples of `sample` is about; empty names where no shapes are known."""
+        return [""] * num_samples
+
     def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
         """E f(x), here the mean of samples, of standard error sqrt(Var f / S)."""
         return jnp.mean(self._kept()(x), axis=0)

@@ -8,23 +8,26 @@
 
 import functools
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxnbv.acquisition import Answer, Quantity
 from jaxnbv.geometry.frame import Frame
+from jaxnbv.planning.stopping import Sure
 from jaxnbv.tasks.classification import ClassAnswer
 from jaxnbv.tasks.heat import Coldest
 from jaxnbv.tasks.segmentation import PartAnswer
 
 # An answer that changes by less than this share from one view to the next has settled.
 _SETTLED = 0.05
-# The probability at which a reader may rely on a class.
-_SURE = 0.95
 _CLASSES_SAID, _KINDS_SAID = 3, 4
+
+# Whether a rule held after the view of an index, from 0.
+Holds: TypeAlias = Callable[[Sure, int], bool]
 
 
 class Chart(NamedTuple):
@@ -84,9 +87,12 @@ class Words:
         """What `settled` asks."""
         return f"within {100 * _SETTLED:.0f} % of the view before"
 
-    def settled(self, before: Answer | None) -> bool:
-        """Whether the answer can be relied on, given that of the view before."""
-        return before is not None and np.allclose(self.answer.values, before.values, rtol=_SETTLED)
+    def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
+        """Whether each of the answers of all views, of which this is the last, can be relied on.
+
+        `holds`: whether a rule held after the view of an index.
+        """
+        return [False, *(np.allclose(now.values, was.values, rtol=_SETTLED) for was, now in pairwise(answers))]
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
         """Those of the answers of all views, of which this is the last.
@@ -112,7 +118,8 @@ class _ClassWords(Words):
     """The likeliest three are said, in percent."""
 
     question = "Which class is it?"
-    settled_means = f"probability {_SURE} or more"
+    rule = Sure()
+    settled_means = f"probability {rule.probability} or more, given half of the points too"
 
     @property
     def shown(self) -> Sequence[int]:
@@ -127,18 +134,19 @@ class _ClassWords(Words):
         name, p = self.answer.names[best], self.answer.values[best]
         return name if p == 1.0 else f"{name}, probability {p:.2f}"
 
-    def settled(self, before: Answer | None) -> bool:
+    def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
         """Sure, and not of another class than the view before was sure of."""
-        values = self.answer.values
-        contradicted = (
-            before is not None and before.values.max() >= _SURE and np.argmax(before.values) != np.argmax(values)
-        )
-        return bool(values.max() >= _SURE) and not contradicted
+        sure = [holds(self.rule, index) for index in range(len(answers))]
+        best = [int(np.argmax(answer.values)) for answer in answers]
+        contradicted = [False, *(was and a != b for was, (a, b) in zip(sure, pairwise(best), strict=False))]
+        return [now and not other for now, other in zip(sure, contradicted, strict=True)]
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
         """The probabilities of all classes; of the truth, 1 and 0."""
         true = None if truth is None else truth.values
-        return (Chart("probability", self.answer.names, _rows(answers), true, one_true=True, goal=_SURE),)
+        return (
+            Chart("probability", self.answer.names, _rows(answers), true, one_true=True, goal=self.rule.probability),
+        )
 
 
 @words_of.register(PartAnswer)
@@ -164,8 +172,10 @@ class _PartWords(Words):
     def settled_means(self) -> str:
         return f"{self.answer.target:g} points or more of every part"
 
-    def settled(self, before: Answer | None) -> bool:
-        return all(self.answer.values[index] >= self.answer.target for index in self.shown)
+    def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
+        return [
+            all(answer.values[index] >= self.answer.target for index in words_of(answer).shown) for answer in answers
+        ]
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
         """How many parts have N_target points, and the points of each."""

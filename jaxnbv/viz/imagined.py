@@ -18,7 +18,6 @@ from jaxnbv.planning.loop import View, view_keys
 from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import TriangleMesh, barrier_of, scan
 from jaxnbv.scanning.mesh import level_triangles
-from jaxnbv.surfaces import KnownShapesPosterior
 from jaxnbv.viz.sphere import unit
 from jaxnbv.viz.style import BEFORE, NEW
 
@@ -73,12 +72,12 @@ def imagined(episode: Episode, index: int, inputs: StepInputs) -> Imagined | Non
             continue
         seen = scan(TriangleMesh(*found[:2], Frame()), camera, view.pose, barrier)
         samples.append(look(seen, camera, view.pose, cloud))
-    names, kinds = [f"imagined {number}" for number in range(1, len(samples) + 1)], dict[str, float]()
-    if isinstance(inputs.posterior, KnownShapesPosterior):
-        sample_key, *_ = view_keys(episode.key, index)
-        names = inputs.posterior.names_of_samples(sample_key, sampler.num_samples)[: len(samples)]
-        kinds = inputs.posterior.kinds()
-    return Imagined(tuple(samples), tuple(names), tuple(kinds.items()))
+    posterior = inputs.posterior
+    sample_key, *_ = view_keys(episode.key, index)
+    assert posterior is not None
+    shapes = posterior.names_of_samples(sample_key, sampler.num_samples)[: len(samples)]
+    names = [shape or f"imagined {number}" for number, shape in enumerate(shapes, start=1)]
+    return Imagined(tuple(samples), tuple(names), tuple(posterior.kinds().items()))
 
 
 def taken_look(view: View, camera: Camera, cloud: Float[np.ndarray, "n 3"]) -> Look | None:

@@ -28,7 +28,7 @@ from jaxnbv.scanning import Grid, GridSurface
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
-from jaxnbv.surfaces import KnownShapesPosterior, SurfacePosterior
+from jaxnbv.surfaces import SurfacePosterior
 from jaxnbv.viz.answers import capital, may_be_words, shown_value, words_of
 from jaxnbv.viz.choice import colour_range, open_values
 from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
@@ -119,11 +119,10 @@ class LiveView:
             key, *_ = view_keys(episode.key, len(views))
             inputs = sampler.step_inputs(observations, key)
             posterior, samples = inputs.posterior, inputs.surfaces
+            assert posterior is not None
             assert samples is not None
             surface = as_shown(mean_surface(sampler, inputs), observations.cloud)
-            shapes = [""] * _SAMPLES
-            if isinstance(posterior, KnownShapesPosterior):
-                shapes = [f" {name}" for name in posterior.names_of_samples(key, sampler.num_samples)]
+            shapes = posterior.names_of_samples(key, sampler.num_samples)
             with self._server.atomic():
                 self._drawn += [*_surface(scene, surface), *_imagined(scene, samples, sampler.grid, shapes)]
                 if proposal is not None:
@@ -147,15 +146,15 @@ class LiveView:
         self._server.stop()
 
 
-def _told(episode: Episode, posterior: SurfacePosterior | None, proposal: Proposal | None) -> str:
+def _told(episode: Episode, posterior: SurfacePosterior, proposal: Proposal | None) -> str:
     """What is known, and what is asked, as Markdown."""
     views, sought, acquisition = len(episode.views), episode.planner.quantity, episode.planner.acquisition
     seen = seen_after(episode, None)[-1]
     lines = [f"**{views} view{'s' if views > 1 else ''}**, {seen.amount} of surface seen"]
     answer = acquisition.answer(episode.cloud)
     lines += [] if answer is None else [f"{capital(words_of(answer).said())}."]
-    if isinstance(posterior, KnownShapesPosterior):
-        lines.append(may_be_words(tuple(posterior.kinds().items())))
+    kinds = tuple(posterior.kinds().items())
+    lines += [may_be_words(kinds)] if kinds else []
     if proposal is not None:
         frame, error = episode.frame, proposal.standard_error
         about = "" if error is None else f" ± {float(error):.2g}"
@@ -194,7 +193,7 @@ def _imagined(scene: Any, samples: GridSurface, grid: Grid, shapes: Sequence[str
     for number, (values, shape) in enumerate(zip(np.array(samples.values[:_SAMPLES]), shapes, strict=False), start=1):
         if (triangles := level_triangles(values, grid)) is not None:
             settings: dict[str, Any] = {"color": to_rgb("#8fb8d8"), "opacity": 0.9, "visible": False}
-            found.append(scene.add_mesh_simple(f"/imagined/{number}{shape}", *triangles[:2], **settings))
+            found.append(scene.add_mesh_simple(f"/imagined/{number} {shape}".rstrip(), *triangles[:2], **settings))
     return found
 
 

@@ -111,7 +111,7 @@ def _matrix(data: ReportData, index: int) -> str:
 def _world_of(episode: Episode) -> tuple[Frame, str]:
     """The frame of the world in which poses are copied, and its units: the session's, that of the object's file, or
     the scene."""
-    if episode.scene is not None and (own := episode.scene.world) is not None:
+    if episode.scene is not None and (own := episode.scene.world_frame) is not None:
         return own, "the units of the object's file"
     return episode.frame, episode.frame.unit
 

@@ -16,8 +16,9 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.episode import Episode
-from jaxnbv.planning.loop import View
+from jaxnbv.planning.loop import View, view_keys
 from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.stopping import Sure
 from jaxnbv.scanning import Surface
 from jaxnbv.scanning.metrics import coverage, true_mesh
 from jaxnbv.tasks.coverage import NewSurface, visible_area
@@ -84,7 +85,7 @@ def task_of(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, rival
         question=words_of(answers[-1]).question,
         asked=_asked(planner),
         found=capital(words_of(answers[-1]).found) + ("" if true is None else f". In truth: {words_of(true).found}"),
-        sure=_sure(answers, episode.stopped),
+        sure=_sure(episode, answers),
         rival=beside,
     )
 
@@ -136,22 +137,25 @@ def true_cloud(scene: Surface, count: int) -> PointCloud | None:
     return PointCloud.from_arrays(np.asarray(points, np.float32), np.asarray(own.face_normals[faces], np.float32))
 
 
-def since(answers: Sequence[Answer]) -> int | None:
+def settled_after(episode: Episode, answers: Sequence[Answer]) -> list[bool]:
+    """Whether the answer after each view can be relied on. A rule is asked as the episode would ask it."""
+
+    def holds(rule: Sure, index: int) -> bool:
+        key, *_ = view_keys(episode.key, index + 1)
+        return rule.reason(episode.planner.acquisition, episode.views[index].cloud, key) is not None
+
+    return words_of(answers[-1]).settled(answers, holds)
+
+
+def since(settled: Sequence[bool]) -> int | None:
     """The first view (from 1) from which on all answers can be relied on; None if not even the last can."""
-    relied = _relied(answers)
-    return None if not relied[-1] else len(relied) - int(np.argmin([*relied[::-1], False]) - 1)
+    return len(settled) - int(np.argmin([*settled[::-1], False]) - 1) if settled[-1] else None
 
 
-def lost_again(answers: Sequence[Answer]) -> int | None:
+def lost_again(settled: Sequence[bool]) -> int | None:
     """The first view (from 1) whose answer could be relied on, if one after it could not; None otherwise."""
-    relied = _relied(answers)
-    first = int(np.argmax(relied))
-    return first + 1 if relied[first] and not all(relied[first:]) else None
-
-
-def _relied(answers: Sequence[Answer]) -> list[bool]:
-    befores = [None, *answers[:-1]]
-    return [words_of(answer).settled(before) for answer, before in zip(answers, befores, strict=True)]
+    first = int(np.argmax(settled))
+    return first + 1 if settled[first] and not all(settled[first:]) else None
 
 
 def search_name(episode: Episode) -> str:
@@ -178,9 +182,10 @@ def _asked(planner: Planner) -> str:
     return f"Each view is where the {name} is highest, over {planner.sampler.num_samples} imagined surfaces."
 
 
-def _sure(answers: Sequence[Answer], stopped: str | None) -> str:
-    first, count, lost = since(answers), len(answers), lost_again(answers)
+def _sure(episode: Episode, answers: Sequence[Answer]) -> str:
+    settled, count = settled_after(episode, answers), len(answers)
+    first, lost = since(settled), lost_again(settled)
     text = f"From view {first} on" if first else f"Not yet after {count} view{'s' * (count > 1)}"
     again = f" At view {lost} it was sure already, but then not." if lost else ""
-    ended = "" if stopped is None else f" It ended by its rule: {stopped}."
+    ended = "" if episode.stopped is None else f" It ended by its rule: {episode.stopped}."
     return f"{text}.{again} Sure means {words_of(answers[-1]).settled_means}.{ended}"

@@ -11,7 +11,7 @@ from small_session import FIRST, session_of, shot
 
 import jaxnbv as nbv
 from jaxnbv.checks import InputError
-from jaxnbv.cli import episode as commands
+from jaxnbv.cli import view as command
 from jaxnbv.viz.live import LiveView
 
 viser = pytest.importorskip("viser", reason="viser is not installed")
@@ -119,7 +119,7 @@ def test_the_command_shows_a_run(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr("jaxnbv.viz.LiveView", Page)
     small_run(nbv.RandomView(8), views=2).save(tmp_path)
-    commands.view(tmp_path, tmp_path / "scene.html", port=7)
+    command.view(folder=tmp_path, html=tmp_path / "scene.html", port=7)
     assert told == [7, 2, "stopped"]
     assert "scene.html" in capsys.readouterr().out
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_run import Page, small_run
+from small_run import FIRST, Page, small_planner, small_run
 
 import jaxnbv as nbv
 from jaxnbv.acquisition import Answer
@@ -22,7 +22,14 @@ from jaxnbv.viz.answers import number, words_of
 from jaxnbv.viz.charts import task_charts
 from jaxnbv.viz.data import report_data
 from jaxnbv.viz.report import report_html
-from jaxnbv.viz.task import lost_again, race_words, since, true_cloud
+from jaxnbv.viz.task import lost_again, race_words, since, task_of, true_cloud
+
+KEY = jax.random.key(0)
+
+
+def never(rule, index):
+    return False
+
 
 NAMES = ("left", "right", "up")
 
@@ -153,12 +160,20 @@ def test_parts_are_found_by_their_points():
     assert words_of(found).found == "a, c"
     # However few points a part has of the whole surface, the object has it.
     assert words_of(truth).found == "a, b"
-    assert not words_of(found).settled(None)
-    assert words_of(PartAnswer(("a",), np.array([60.0]), asked=(0,))).settled(None)
+    assert words_of(found).settled([truth, found], never) == [False, False]
+    last = PartAnswer(("a",), np.array([60.0]), asked=(0,))
+    assert words_of(last).settled([last], never) == [True]
 
 
 def classes(*rows):
     return [ClassAnswer(("a", "b"), np.array([p, 1.0 - p])) for p in rows]
+
+
+def settled(answers):
+    """By a rule that asks nothing but the probability."""
+    return words_of(answers[-1]).settled(
+        answers, lambda rule, index: bool(answers[index].values.max() >= rule.probability)
+    )
 
 
 @pytest.mark.parametrize(
@@ -177,14 +192,31 @@ def classes(*rows):
     ],
 )
 def test_since_when_an_answer_can_be_relied_on(answers, view):
-    assert since(answers) == view
+    assert since(settled(answers)) == view
 
 
 @pytest.mark.parametrize(
     ("answers", "view"), [(classes(0.5, 0.96, 0.97), None), (classes(0.96, 0.9, 0.97), 1), (classes(0.5, 0.6), None)]
 )
 def test_an_answer_that_was_lost_again_is_told(answers, view):
-    assert lost_again(answers) == view
+    assert lost_again(settled(answers)) == view
+
+
+def test_a_class_that_halves_of_the_points_do_not_tell_is_sure_nowhere():
+    """Certain of one class given all points, of the other given some halves of them."""
+
+    def by_count(cloud):
+        return jnp.log(jnp.where(cloud.count >= 40, jnp.array([0.99, 0.01]), jnp.array([0.01, 0.99])))
+
+    planner = small_planner(nbv.RandomView(8), nbv.CrossEntropy(by_count), capacity=50)
+    episode = nbv.simulate(planner, Sphere(0.9), FIRST, 2, KEY, progress=False, until=nbv.Sure(0.95))
+    assert [view.cloud.count for view in episode.views] == [50, 50]
+    assert episode.stopped is None
+    task = task_of(episode)
+    assert task.answers[-1].values.max() > 0.95
+    assert task.sure.startswith("Not yet after 2 views")
+    # With no halves to ask, the first view is enough.
+    assert nbv.Sure(0.95, 0).reason(planner.acquisition, episode.cloud, KEY) is not None
 
 
 def test_a_rival_is_told_of_and_drawn(plain):

@@ -1,0 +1,40 @@
+"""`jaxnbv demo`: an episode on an object that ships."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from jaxnbv.cli.episode import EpisodeOptions, SearchOption, SeedOption, TaskOption, by_task
+from jaxnbv.cli.options import asking, command, listed
+from jaxnbv.cli.tasks import TASKS
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions(EpisodeOptions):
+    task: TaskOption = "cross-entropy"
+    search: SearchOption = "halving"
+    seed: SeedOption = 2
+    scene: Annotated[int, asking(metavar="N", min=0, max=2**31 - 1, help="Which object: the number of a scene.")] = 0
+
+
+@command(DemoOptions)
+def demo(options: DemoOptions) -> None:
+    from jaxnbv.checks import check_device
+
+    check_device()
+    from jaxnbv.cli.play import DEMO, first_pose, play
+
+    task = TASKS[options.task]
+    subject = task.demo(options.scene, options.seed)
+    if options.first is not None:
+        subject = subject._replace(first=first_pose(options.first, subject.surface))
+    play(options, subject, task.setting(), DEMO, task.until)
+
+
+demo.__doc__ = "\n\n".join(
+    [
+        "Find out what a truck carries, which the first view does not show: no file, no network.",
+        "Farthest view, which knows nothing of the task, then starts from the same view.",
+        "The object by --task: "
+        + listed((names, example) for example, names in by_task(lambda task: task.example).items()),
+    ]
+)

@@ -1,0 +1,78 @@
+"""`jaxnbv run MESH`: an episode on a user's mesh."""
+
+from dataclasses import MISSING, dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+import typer
+
+from jaxnbv.cli.episode import EpisodeOptions, SearchOption, TaskOption
+from jaxnbv.cli.options import command, seeing
+from jaxnbv.cli.tasks import TASKS
+from jaxnbv.cli.tasks.base import Task, usual_first
+from jaxnbv.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(EpisodeOptions):
+    mesh: Annotated[
+        Path, typer.Argument(metavar="MESH", help="Any mesh that trimesh reads: OBJ, PLY, STL, OFF, glTF, ...")
+    ]
+    task: TaskOption = "coverage"
+    search: SearchOption = "discrete"
+    up: Annotated[
+        str, seeing(metavar="AXIS", help="The mesh's axis that is upward: x, y or z, or one of these with a -.")
+    ] = "y"
+    paper: Annotated[
+        bool, seeing("--paper", help="The paper's close-up: 30 degrees, from 2 to 3 scene units by the task.")
+    ] = False
+
+
+_OF_TASKS = {
+    name: hint
+    for task in TASKS.values()
+    for name, hint in get_type_hints(task, include_extras=True).items()
+    if name in {field.name for field in fields(task)}
+}
+"""Annotations of the options that tasks declare."""
+
+
+@command(RunOptions, _OF_TASKS)
+def run(options: RunOptions, **of_tasks: Any) -> None:
+    """Choose views of a mesh, scanned by a simulated depth camera.
+
+    The mesh may be open, a soup of triangles or inconsistently wound. It is scaled and centred so that its longest side
+    is 2.5 scene units; cameras stand as far from its centre as it takes to see all of it.
+    """
+    task = _task(options.task, {name: value for name, value in of_tasks.items() if value is not None})
+
+    from jaxnbv.checks import check_device
+
+    check_device()
+    from jaxnbv.cli.play import USUAL, first_pose, play
+    from jaxnbv.cli.tasks.base import Subject
+    from jaxnbv.scanning import load_mesh
+    from jaxnbv.scanning.sensors import fitted
+
+    surface, setting = load_mesh(options.mesh, options.up), task.setting()
+    if not options.paper:
+        setting = fitted(setting, surface.bounding_radius)
+    usual = usual_first(None if options.paper else setting.radius)
+    first = usual if options.first is None else first_pose(options.first, surface)
+    acquisition = task.acquisition(surface, setting.camera, first)
+    play(options, Subject(options.mesh.stem, surface, acquisition, first), setting, USUAL)
+
+
+def _task(name: str, given: dict[str, Any]) -> Task:
+    """The task of a name with its own options.
+
+    **Raises:** `ValueError` for an option that is not the task's, or one that it requires and that is not given.
+    """
+    declared = {field.name: field for field in fields(TASKS[name])}
+    for option in given.keys() - declared.keys():
+        takers = ", ".join(other for other, task in TASKS.items() if option in {field.name for field in fields(task)})
+        raise InputError(f"--task {name} takes no --{option}: it is for {takers}")
+    for option in declared.keys() - given.keys():
+        if declared[option].default is MISSING:
+            raise InputError(f"--task {name} needs --{option}")
+    return TASKS[name](**given)

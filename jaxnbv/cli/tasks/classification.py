@@ -1,0 +1,91 @@
+"""The object's class."""
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from jaxnbv.cli.tasks.base import Subject, Task, network_option
+
+if TYPE_CHECKING:
+    from jaxnbv.acquisition import Acquisition
+    from jaxnbv.geometry.camera import Camera
+    from jaxnbv.geometry.pose import Pose
+    from jaxnbv.scanning import TriangleMesh
+    from jaxnbv.tasks.classification import Classifier
+
+# Points of a cloud that the demo's classifier is fed.
+_NUM_POINTS = 512
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClassTask(Task):
+    """A task whose acquisition compares the answers of a classifier."""
+
+    example = "a truck, whose cargo the first view does not show"
+    until = ("sure=0.95",)
+    network: Annotated[Path, network_option]
+
+    @classmethod
+    @abstractmethod
+    def compared(cls, classifier: "Classifier") -> "Acquisition":
+        """The acquisition that compares a classifier's answers."""
+
+    def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
+        from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale
+
+        network = load_checkpoint(self.network)
+        return self.compared(CloudClassifier(network, scale=network_scale(network)))
+
+    @classmethod
+    def demo(cls, scene: int, seed: int) -> Subject:
+        """A truck; only what it carries tells the class, and the first view, from above the ground, does not show it.
+        The grid is that of the surfaces that the classifier was trained on."""
+        import jax
+        import numpy as np
+
+        from jaxnbv.networks import pretrained_classifier
+        from jaxnbv.scanning import Grid, SDFSurface
+        from jaxnbv.search.candidates import sphere_candidates
+        from jaxnbv.studies.scenes import HOUSEHOLD, Framing, Split, hidden_view, truck_scene
+
+        truck = truck_scene(Split.TEST, scene, turned=False)
+        around = sphere_candidates(120)
+        first = hidden_view(truck, jax.random.key(seed), poses=around[np.asarray(around.position[:, 1]) > 0])
+        side = Framing.CLOSE_UP.longest_side
+        acquisition = cls.compared(pretrained_classifier("truck", side, num_points=_NUM_POINTS))
+        note = f"the truck carries a {HOUSEHOLD[int(truck.label)]}, which the first view does not show"
+        return Subject("truck", SDFSurface(truck), acquisition, first, "truck", Grid(64, 0.7 * side), note)
+
+
+class CrossEntropyTask(ClassTask):
+    name = "cross-entropy"
+    about = "the object's class"
+
+    @classmethod
+    def compared(cls, classifier: "Classifier") -> "Acquisition":
+        from jaxnbv.tasks import CrossEntropy
+
+        return CrossEntropy(classifier)
+
+
+class EntropyTask(ClassTask):
+    name = "entropy"
+    about = "its class, by the entropy that a view removes"
+
+    @classmethod
+    def compared(cls, classifier: "Classifier") -> "Acquisition":
+        from jaxnbv.tasks import EntropyReduction
+
+        return EntropyReduction(classifier)
+
+
+class MixedTask(ClassTask):
+    name = "mixed"
+    about = "its class, by one and then the other"
+
+    @classmethod
+    def compared(cls, classifier: "Classifier") -> "Acquisition":
+        from jaxnbv.tasks import MixedEntropy
+
+        return MixedEntropy(classifier)

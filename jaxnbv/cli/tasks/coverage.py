@@ -1,0 +1,30 @@
+"""The object's shape."""
+
+from typing import TYPE_CHECKING
+
+from jaxnbv.cli.tasks.base import Subject, Task, usual_first
+
+if TYPE_CHECKING:
+    from jaxnbv.acquisition import Acquisition
+    from jaxnbv.geometry.camera import Camera
+    from jaxnbv.geometry.pose import Pose
+    from jaxnbv.scanning import TriangleMesh
+
+
+class CoverageTask(Task):
+    name = "coverage"
+    about = "its shape"
+    example = "a mug, to be seen all round"
+
+    def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
+        from jaxnbv.tasks import NewSurface
+
+        return NewSurface()
+
+    @classmethod
+    def demo(cls, scene: int, seed: int) -> Subject:
+        """A mug, the only one."""
+        from jaxnbv.studies.scenes import demo_object
+        from jaxnbv.tasks import NewSurface
+
+        return Subject("mug", demo_object(), NewSurface(), usual_first())

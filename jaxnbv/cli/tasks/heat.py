@@ -1,0 +1,79 @@
+"""The coldest point of an object that is heated at one place."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
+
+from jaxnbv.cli.options import Position, asking
+from jaxnbv.cli.tasks.base import Subject, Task
+
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float
+
+    from jaxnbv.acquisition import Acquisition
+    from jaxnbv.geometry.camera import Camera
+    from jaxnbv.geometry.pose import Pose
+    from jaxnbv.scanning import TriangleMesh
+    from jaxnbv.scanning.sensors import Setting
+
+_NUM_POINTS = 2048
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeatTask(Task):
+    name = "heat"
+    about = "its coldest point when it is heated"
+    example = "a procedural one of four kinds, heated at one place"
+    source: Annotated[
+        Position | None,
+        asking(
+            metavar="X Y Z",
+            help="For heat: the object is heated at its point nearest to this, in scene units.",
+            show_default="the middle of the first view",
+        ),
+    ] = None
+
+    @classmethod
+    def setting(cls) -> "Setting":
+        from jaxnbv.scanning.sensors import HEAT_SETTING
+
+        return HEAT_SETTING
+
+    def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
+        return _heated_at(_source(self.source, mesh, camera, first))
+
+    @classmethod
+    def demo(cls, scene: int, seed: int) -> Subject:
+        import jax
+        import numpy as np
+
+        from jaxnbv.studies.scenes import heat_scene, source_view
+
+        heated = heat_scene(scene)
+        first = source_view(heated, jax.random.key(seed))
+        return Subject(heated.name, heated.surface, _heated_at(np.asarray(heated.source)), first, bank="heat")
+
+
+def _heated_at(source: "Float[np.ndarray, '3']") -> "Acquisition":
+    from jaxnbv.acquisition import ExpectedUtilityImprovement
+    from jaxnbv.tasks import ColdestPoint
+
+    return ExpectedUtilityImprovement(ColdestPoint(source), _NUM_POINTS)
+
+
+def _source(place: Position | None, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Float[np.ndarray, '3']":
+    """The object's point nearest to a place, by default the one in the middle of the first view."""
+    import jax
+    import numpy as np
+
+    from jaxnbv.checks import require
+    from jaxnbv.scanning import scan
+
+    if place is not None:
+        points = mesh.sample_points(jax.random.key(0), 20_000)
+        return points[np.linalg.norm(points - place, axis=1).argmin()]
+    points, _ = scan(mesh, camera, first).to_numpy()
+    require(len(points) > 0, "the first view does not see the object: give another --first, or a --source")
+    away, forward = points - np.asarray(first.position), np.asarray(first.forward)
+    beside = np.linalg.norm(away - (away @ forward)[:, None] * forward, axis=1)
+    return points[beside.argmin()]

@@ -1,0 +1,72 @@
+"""The object's parts."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from jaxnbv.cli.options import asking
+from jaxnbv.cli.tasks.base import Subject, Task, network_option, usual_first
+
+if TYPE_CHECKING:
+    from jaxnbv.acquisition import Acquisition
+    from jaxnbv.geometry.camera import Camera
+    from jaxnbv.geometry.pose import Pose
+    from jaxnbv.networks import CloudSegmenter
+    from jaxnbv.scanning import TriangleMesh
+    from jaxnbv.scanning.sensors import Setting
+
+# Categories of no object that the shipped segmenter was trained on.
+_UNKNOWN_TO_SEGMENTER = ("cap", "car", "knife")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartTask(Task):
+    name = "parts"
+    about = "its parts"
+    example = "a procedural one of thirteen categories"
+    until = ("found=60",)
+    category: Annotated[
+        str,
+        asking(
+            metavar="NAME",
+            help="For parts: what the object is, one of ShapeNet-part's categories; upright along y, facing x.",
+        ),
+    ]
+    network: Annotated[Path | None, network_option] = None
+
+    @classmethod
+    def setting(cls) -> "Setting":
+        from jaxnbv.scanning.sensors import PART_SETTING
+
+        return PART_SETTING
+
+    def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
+        from jaxnbv.checks import require
+        from jaxnbv.networks import CloudSegmenter, load_checkpoint, network_scale, part_segmenter
+
+        if self.network is not None:
+            network = load_checkpoint(self.network)
+            return _counting(CloudSegmenter(network, self.category, scale=network_scale(network)))
+        require(
+            self.category not in _UNKNOWN_TO_SEGMENTER,
+            f"--category {self.category}: the segmenter that ships was not trained on it: give --network FILE",
+        )
+        return _counting(part_segmenter(self.category))
+
+    @classmethod
+    def demo(cls, scene: int, seed: int) -> Subject:
+        from jaxnbv.networks import CATEGORIES, part_segmenter
+        from jaxnbv.scanning import SDFSurface
+        from jaxnbv.studies.scenes import Split, part_scene
+
+        thing = part_scene(Split.TEST, scene)
+        category = CATEGORIES[int(thing.category)].name
+        acquisition = _counting(part_segmenter(category))
+        return Subject(category, SDFSurface(thing.solid), acquisition, usual_first(), bank="parts")
+
+
+def _counting(segmenter: "CloudSegmenter") -> "Acquisition":
+    from jaxnbv.acquisition import ExpectedUtilityImprovement
+    from jaxnbv.tasks import SoftPartCount
+
+    return ExpectedUtilityImprovement(SoftPartCount(segmenter), segmenter.num_points)
