@@ -70,10 +70,10 @@ from .search import SpherePoses as SpherePoses
 from .search import TieBreakSearch as TieBreakSearch
 from .search import Trajectories as Trajectories
 from .search import UncertaintyView as UncertaintyView
-from .studies import readers as readers
+from . import readers as readers
 from .studies import scenes as scenes
-from .studies.readers.recorded import RecordedFrames as RecordedFrames
-from .studies.scenes.banks import shape_bank as shape_bank
+from .readers.recorded import RecordedFrames as RecordedFrames
+from .surfaces import shape_bank as shape_bank
 from .surfaces import AsGiven as AsGiven
 from .surfaces import Fields as Fields
 from .surfaces import FieldsAbout as FieldsAbout

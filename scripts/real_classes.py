@@ -25,7 +25,7 @@ from jaxnbv.networks.pretrained import TRAINED_POINTS
 from jaxnbv.scanning import SensorNoise, scan
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.storage.folders import versions
-from jaxnbv.studies.readers import MeshFile, class_meshes
+from jaxnbv.readers import MeshFile, class_meshes
 from jaxnbv.studies.scenes import HOUSEHOLD, Split, household_scene
 
 CLOUDS, VIEWS, STAND_INS = 10, 5, 200

@@ -32,7 +32,7 @@ from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.searches import RULES
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.engine.tiles import Tiles, say
-from jaxnbv.studies.readers.recorded import RecordedFrames
+from jaxnbv.readers.recorded import RecordedFrames
 from jaxnbv.tasks import Coverage, NewSurface
 from jaxnbv.viz.style import GREY, INK, LINE, NEW
 

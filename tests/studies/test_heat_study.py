@@ -14,7 +14,7 @@ from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.studies.engine.pictures import write_pictures
 from jaxnbv.studies.heat import HeatStudy, Truth, heat_problem
-from jaxnbv.studies.readers.class_meshes import mesh_files
+from jaxnbv.readers.class_meshes import mesh_files
 from jaxnbv.studies.scenes import heat_scene
 from jaxnbv.tasks import coldest_point
 from jaxnbv.tasks import heat as heat_task

@@ -19,7 +19,7 @@ from jaxnbv.storage import describe
 from jaxnbv.studies import reconstruction
 from jaxnbv.studies.engine.pictures import write_pictures
 from jaxnbv.studies.engine.results import results, summary
-from jaxnbv.studies.readers.class_meshes import mesh_files
+from jaxnbv.readers.class_meshes import mesh_files
 from jaxnbv.studies.reconstruction import MEAN, POISSON, ReconstructionStudy, reconstruct
 
 # Those that draw no samples compile in a fraction of the time; all planners are of the same make.

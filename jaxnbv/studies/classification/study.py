@@ -28,7 +28,7 @@ from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.searches import RULES
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.engine.tiles import Tiles, say
-from jaxnbv.studies.readers import MeshFile, class_meshes
+from jaxnbv.readers import MeshFile, class_meshes
 from jaxnbv.studies.scenes import ClassObject, ClassSet, FirstView, Framing, Split
 from jaxnbv.studies.scenes.class_object import ClassMesh, scan_cue, surface_of
 from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, MixedEntropy

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 from jaxnbv.sampler import SurfaceSampler
-from jaxnbv.studies.readers.class_meshes import MeshFile
+from jaxnbv.readers.class_meshes import MeshFile
 from jaxnbv.surfaces import KnownShapes, ShapeBank, Upright
 
 # So that a number fits into a shape's name too.

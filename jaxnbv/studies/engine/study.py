@@ -29,8 +29,8 @@ from jaxnbv.studies.engine.known import knowing_meshes, knowing_others
 from jaxnbv.studies.engine.measures import KNOWN, WITHOUT_BANK, Claim, Measure, Record
 from jaxnbv.studies.engine.searches import search_of
 from jaxnbv.studies.engine.tiles import Tiles
-from jaxnbv.studies.readers.class_meshes import MeshFile, mesh_files
-from jaxnbv.studies.scenes.banks import bank_poses, shape_bank
+from jaxnbv.readers.class_meshes import MeshFile, mesh_files
+from jaxnbv.surfaces.shipped_banks import bank_poses, shape_bank
 
 # The file of a study's chart.
 CHART = "chart.png"

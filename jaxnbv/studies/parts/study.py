@@ -20,7 +20,7 @@ from jaxnbv.studies.engine.known import knowing_those
 from jaxnbv.studies.engine.measures import Record
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.parts.discovery import NETWORK_POINTS, TARGETS, NearestPart, PartDiscoveryStudy
-from jaxnbv.studies.readers.class_meshes import MeshFile, mesh_files, taking_turns
+from jaxnbv.readers.class_meshes import MeshFile, mesh_files, taking_turns
 from jaxnbv.studies.scenes import Split, part_scene
 from jaxnbv.surfaces.known_shapes import kind_of
 from jaxnbv.tasks import part_counts

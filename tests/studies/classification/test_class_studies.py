@@ -17,7 +17,7 @@ from jaxnbv.studies.classification.objects import HouseholdStudy, OmniObject3DSt
 from jaxnbv.studies.engine.chart import chart
 from jaxnbv.studies.engine.pictures import write_pictures
 from jaxnbv.studies.engine.results import results, summary
-from jaxnbv.studies.readers import class_meshes
+from jaxnbv.readers import class_meshes
 from jaxnbv.studies.scenes import HOUSEHOLD, FirstView
 
 SCENE = 4

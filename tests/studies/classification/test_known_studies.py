@@ -17,7 +17,7 @@ from jaxnbv.studies.heat import HeatStudy
 from jaxnbv.studies.parts.study import PartStudy
 from jaxnbv.studies.registry import STUDIES
 from jaxnbv.studies.scenes import Split, pyramid_scene
-from jaxnbv.studies.scenes.banks import KINDS
+from jaxnbv.surfaces.shipped_banks import SHIPPED_BANKS
 from jaxnbv.surfaces import GeometricSPSR, KnownShapes, OnSurface, ScreenedSPSR, mesh_shapes
 
 METHODS = ("cross-entropy", "coverage", "uncertainty", "coverage-screened", "uncertainty-screened")
@@ -71,7 +71,7 @@ def test_the_models_of_studies_are_known_and_those_of_the_library():
 
 @pytest.mark.parametrize("name", [name for name, entry in STUDIES.items() if entry.model == KNOWN])
 def test_a_study_whose_usual_model_is_known_has_a_bank(name):
-    assert resolve(STUDIES[name].study).bank in KINDS
+    assert resolve(STUDIES[name].study).bank in SHIPPED_BANKS
 
 
 def test_a_study_without_a_bank_refuses_to_know_shapes():

@@ -106,7 +106,7 @@ def test_the_first_view_is_that_of_all_methods_and_shows_no_pattern_but_somethin
     assert pixels[record["first"]] == 0 < int(seen.count[record["first"]])
     for method in record["methods"].values():
         np.testing.assert_allclose(method["pixels"][0], pixels[chosen(small_study(), method)], atol=1)
-    outward = -np.asarray(pyramid.rotation)[:, 2]
+    outward = -np.asarray(pyramid.solid.rotation)[:, 2]
     angle = np.degrees(np.arccos(np.asarray(poses.position[record["first"]]) @ outward / 2.5))
     assert record["angle"] == pytest.approx(angle, abs=0.05)
 
