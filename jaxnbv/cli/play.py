@@ -103,7 +103,8 @@ def imagined(model: str, quick: bool, known: str | None) -> SurfaceSampler:
     if known in SHIPPED_BANKS:
         return sampler.with_bank(shape_bank(known), bank_poses(known))
     require(
-        os.path.isdir(known), f"--known {known}: there is no such folder of meshes; or give {', '.join(SHIPPED_BANKS)}, none"
+        os.path.isdir(known),
+        f"--known {known}: there is no such folder of meshes; or give {', '.join(SHIPPED_BANKS)}, none",
     )
     return sampler.with_bank(ShapeBank.from_meshes(known), Upright(by_axis=True))
 

@@ -11,11 +11,11 @@ import equinox as eqx
 import numpy as np
 
 from jaxnbv.checks import require
+from jaxnbv.readers import MeshFile
+from jaxnbv.readers.class_meshes import mesh_files
 from jaxnbv.studies.classification.study import BASELINES, ClassificationStudy, Truth
 from jaxnbv.studies.engine.measures import Claim, Record
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.readers import MeshFile
-from jaxnbv.readers.class_meshes import mesh_files
 from jaxnbv.studies.scenes import (
     HOUSEHOLD,
     PATTERNS,

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 from jaxnbv.checks import InputError, require
 from jaxnbv.storage.files import make_folder, write_text
 from jaxnbv.storage.folders import read_record
-from jaxnbv.studies.engine.chart import chart
+from jaxnbv.studies.engine.chart import CHART, chart
 from jaxnbv.studies.engine.records import read_records
 from jaxnbv.studies.engine.results import Verdict, count_of, explained, groups_of, results, tables, verdicts
-from jaxnbv.studies.engine.study import CHART, Study
+from jaxnbv.studies.engine.study import Study
 from jaxnbv.studies.registry import STUDIES
 from jaxnbv.version import __version__
 from jaxnbv.viz.html import render

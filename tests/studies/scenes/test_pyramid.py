@@ -10,9 +10,9 @@ from matplotlib.path import Path as Polygon
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.scanning import Grid, SDFSurface, mesh_from_sdf, scan
-from jaxnbv.search.candidates import sphere_candidates
-from jaxnbv.studies.scenes import PATTERNS, Framing, Pyramid, Split, hidden_view, pyramid_scene
 from jaxnbv.scanning.sdf.imprinted import ImprintedPyramid, pattern_distance
+from jaxnbv.search.candidates import sphere_candidates
+from jaxnbv.studies.scenes import PATTERNS, Framing, Split, hidden_view, pyramid_scene
 
 RNG = np.random.default_rng(0)
 CAMERA = Camera(height=24, width=24)
@@ -240,7 +240,9 @@ def test_a_hidden_view_does_not_show_the_pattern():
         assert len({*np.argmin(away, axis=1)}) > 2
         for pose in drawn:
             seen = scan(SDFSurface(pyramid), CAMERA, pose).to_numpy()[0]
-            offset, rotation, scale = map(np.asarray, (pyramid.solid.offset, pyramid.solid.rotation, pyramid.solid.scale))
+            offset, rotation, scale = map(
+                np.asarray, (pyramid.solid.offset, pyramid.solid.rotation, pyramid.solid.scale)
+            )
             own = (seen - offset) @ rotation / scale
             assert len(own) > 100
             # Only base or sides: whatever is seen above the base lies on a slanted plane.
@@ -258,7 +260,9 @@ def test_bad_input_is_refused():
     across = np.cross(outward, np.roll(outward, 1))
     across /= np.linalg.norm(across)
     rotation = np.stack([across, np.cross(-outward, across), -outward], axis=-1)
-    facing = eqx.tree_at(lambda p: (p.solid.rotation, p.solid.offset), pyramid, (jnp.asarray(rotation), jnp.asarray(0.6 * outward)))
+    facing = eqx.tree_at(
+        lambda p: (p.solid.rotation, p.solid.offset), pyramid, (jnp.asarray(rotation), jnp.asarray(0.6 * outward))
+    )
     with pytest.raises(InputError, match="shows from all 1 candidates"):
         hidden_view(facing, jax.random.key(0), CAMERA, sphere_candidates(1))
     with pytest.raises(InputError, match="must not be negative"):
