@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from jaxnbv.cli.play import RULES, search_of
-from jaxnbv.cli.registry import SEARCHES, STOPS, TASKS, resolve
+from jaxnbv.cli.registry import SEARCHES, STOPS, TASKS
 from jaxnbv.cli.tasks import COMMAND_TASKS
 from jaxnbv.search import Search
 from jaxnbv.studies.engine.study import Study
-from jaxnbv.studies.registry import STUDIES
+from jaxnbv.studies.registry import studies
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -39,10 +39,10 @@ def test_a_search_stands_at_the_sensors_distance_with_as_many_candidates(name):
     assert distance.mean() == pytest.approx(2.2, abs=0.1)
 
 
-@pytest.mark.parametrize("name", STUDIES)
+@pytest.mark.parametrize("name", studies())
 def test_a_study_is_declared_in_full(name):
-    entry = STUDIES[name]
-    study = resolve(entry.study)
+    entry = studies()[name]
+    study = entry.load()
     assert issubclass(study, Study)
     assert study.reference in study.methods
     names = [measure.name for measure in study.measures]
@@ -51,5 +51,5 @@ def test_a_study_is_declared_in_full(name):
     taken = {*inspect.signature(study).parameters, *inspect.signature(study.configured).parameters}
     assert {*entry.options} <= taken - {"model", "views", "quick", "options"}
     assert {*study.quick} <= {*inspect.signature(study).parameters}
-    seeds = [resolve(other.study).seed for other in STUDIES.values()]
+    seeds = [other.load().seed for other in studies().values()]
     assert len({*seeds}) == len(seeds)

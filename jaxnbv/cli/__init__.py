@@ -9,7 +9,8 @@ import typer
 
 import jaxnbv
 from jaxnbv.cli.episode import demo, run, view
-from jaxnbv.cli.study import report, study
+from jaxnbv.cli.report import report
+from jaxnbv.cli.study import study
 from jaxnbv.errors import InputError, explained_imports
 
 app = typer.Typer(

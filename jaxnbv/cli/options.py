@@ -1,9 +1,11 @@
 """What `jaxnbv demo` and `jaxnbv run` are both asked, declared once."""
 
-from collections.abc import Iterable
+import dataclasses
+import inspect
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeAlias, TypeVar, get_type_hints
 
 import typer
 
@@ -18,6 +20,7 @@ else:
     Task, Search, Model = (Literal[tuple(names)] for names in (TASKS, SEARCHES, MODELS))
 
 Position = tuple[float, float, float]
+T = TypeVar("T")
 
 # An option in each group of the help.
 asking = partial(typer.Option, rich_help_panel="What to find out")
@@ -85,3 +88,34 @@ class Asked(NamedTuple):
     out: Path | None
     quick: bool
     report: bool
+
+
+def command(options: type[T], more: Mapping[str, Any] = {}) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Decorator: a command for typer of a function that takes a dataclass of options.
+
+    - `more`: annotations of further options by name, passed by keyword; None where they are not given.
+    """
+
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        def call(**values: Any) -> None:
+            further = {name: values.pop(name) for name in more}
+            function(options(**values), **further)
+
+        hints, fields = get_type_hints(options, include_extras=True), dataclasses.fields(options)  # type: ignore[arg-type]
+        parameters = [
+            _parameter(one.name, hints[one.name], _EMPTY if one.default is dataclasses.MISSING else one.default)
+            for one in fields
+        ]
+        parameters += [_parameter(name, hint, None) for name, hint in more.items()]
+        call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        call.__name__, call.__doc__ = function.__name__, function.__doc__
+        return call
+
+    return decorate
+
+
+_EMPTY = inspect.Parameter.empty
+
+
+def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)

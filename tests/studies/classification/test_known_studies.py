@@ -9,14 +9,13 @@ import trimesh
 from test_pyramid_study import CAMERA, SCENE, chosen, evidence_of, small_study, step_key, without_time
 
 import jaxnbv as nbv
-from jaxnbv.cli.registry import STUDY_MODELS, resolve
+from jaxnbv.cli.registry import STUDY_MODELS
 from jaxnbv.sampler import MODELS
 from jaxnbv.studies.classification.objects import PyramidStudy
 from jaxnbv.studies.engine.measures import KNOWN
 from jaxnbv.studies.engine.run import methods_of, run_scene
 from jaxnbv.studies.heat import HeatStudy
 from jaxnbv.studies.parts.study import PartStudy
-from jaxnbv.studies.registry import STUDIES
 from jaxnbv.studies.scenes import Split, pyramid_scene
 from jaxnbv.surfaces import GeometricSPSR, KnownShapes, OnSurface, ScreenedSPSR, mesh_shapes
 from jaxnbv.surfaces.shipped_banks import SHIPPED_BANKS
@@ -70,9 +69,9 @@ def test_the_models_of_studies_are_known_and_those_of_the_library():
     assert methods_of(PyramidStudy, None, KNOWN)[-2:] == ("coverage-screened", "uncertainty-screened")
 
 
-@pytest.mark.parametrize("name", [name for name, entry in STUDIES.items() if entry.model == KNOWN])
+@pytest.mark.parametrize("name", [name for name, entry in studies().items() if entry.model == KNOWN])
 def test_a_study_whose_usual_model_is_known_has_a_bank(name):
-    assert resolve(STUDIES[name].study).bank in SHIPPED_BANKS
+    assert studies()[name].load().bank in SHIPPED_BANKS
 
 
 def test_a_study_without_a_bank_refuses_to_know_shapes():
