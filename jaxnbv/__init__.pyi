@@ -72,7 +72,6 @@ from .search import SpherePoses as SpherePoses
 from .search import TieBreakSearch as TieBreakSearch
 from .search import Trajectories as Trajectories
 from .search import UncertaintyView as UncertaintyView
-from .studies import scenes as scenes
 from .surfaces import AsGiven as AsGiven
 from .surfaces import Fields as Fields
 from .surfaces import FieldsAbout as FieldsAbout

@@ -23,7 +23,7 @@ from jaxnbv.networks import (
     pretrained_classifier,
 )
 from jaxnbv.scanning import Grid, SDFSurface, Surface, TriangleMesh, scan
-from jaxnbv.scanning.sensors import HEAT_SETTING, PART_SETTING, USUAL_SETTING, Setting
+from jaxnbv.scanning.sensors import USUAL_SETTING, Setting
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.studies.scenes import (
     HOUSEHOLD,
@@ -36,6 +36,7 @@ from jaxnbv.studies.scenes import (
     source_view,
     truck_scene,
 )
+from jaxnbv.studies.sensors import HEAT_SETTING, PART_SETTING
 from jaxnbv.tasks import (
     Classifier,
     ColdestPoint,

@@ -21,7 +21,6 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.planning.episode import Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, TriangleMesh, mesh_from_sdf
-from jaxnbv.scanning.sensors import HEAT_SETTING
 from jaxnbv.search import Search
 from jaxnbv.studies.engine.measures import SECONDS, Claim, Measure, Record
 from jaxnbv.studies.engine.run import replay
@@ -29,6 +28,7 @@ from jaxnbv.studies.engine.searches import RULES
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.engine.tiles import Tiles, across, draw_on, say, still_of
 from jaxnbv.studies.scenes import heat_scene
+from jaxnbv.studies.sensors import HEAT_SETTING
 from jaxnbv.tasks import ColdestPoint, Coverage, body_temperature
 from jaxnbv.tasks.diffusion import HeatProblem
 from jaxnbv.viz.render import Still

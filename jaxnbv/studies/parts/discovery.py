@@ -21,12 +21,12 @@ from jaxnbv.planning.episode import Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, MeshParts, TriangleMesh
 from jaxnbv.scanning.metrics import true_mesh
-from jaxnbv.scanning.sensors import PART_SETTING
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.run import replay
 from jaxnbv.studies.engine.searches import RULES
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.engine.tiles import Tiles, across, draw_on, say, still_of
+from jaxnbv.studies.sensors import PART_SETTING
 from jaxnbv.tasks import Coverage, SoftPartCount, part_counts
 from jaxnbv.viz.style import GREY, SERIES
 

@@ -16,6 +16,7 @@ from jaxnbv.studies.engine.measures import KNOWN
 from jaxnbv.studies.engine.run import methods_of, run_scene
 from jaxnbv.studies.heat import HeatStudy
 from jaxnbv.studies.parts.study import PartStudy
+from jaxnbv.studies.registry import studies
 from jaxnbv.studies.scenes import Split, pyramid_scene
 from jaxnbv.surfaces import GeometricSPSR, KnownShapes, OnSurface, ScreenedSPSR, mesh_shapes
 from jaxnbv.surfaces.shipped_banks import SHIPPED_BANKS

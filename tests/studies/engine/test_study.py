@@ -85,7 +85,7 @@ def test_a_method_of_ones_own_stands_in_the_same_record():
 
 def test_a_method_of_ones_own_that_makes_no_planner_is_refused_before_anything_is_run(monkeypatch):
     study = small()
-    monkeypatch.setattr(ToyStudy, "run", lambda *_: pytest.fail("a method was run"))
+    monkeypatch.setattr(ToyStudy, "follow", lambda *_: pytest.fail("a method was run"))
 
     def few(study, scene):
         return Planner(Coverage(), RandomView(3), study.camera, study.sampler, max_views=1)
