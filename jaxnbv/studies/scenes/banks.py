@@ -16,19 +16,19 @@ from jaxnbv.surfaces import ShapeBank
 class BankRecipe(NamedTuple):
     """Of what a bank is made.
 
-    - `count`: number of objects.
+    - `number`: of objects.
     - `kinds`: their kinds, which take turns.
     - `shape`: the object of a number, not turned.
     """
 
-    count: int
+    number: int
     kinds: tuple[str, ...]
     shape: Callable[[int], SignedDistance]
 
     def make(self) -> ShapeBank:
         """The bank; each shape is named by its kind and number."""
-        names = [f"{self.kinds[index % len(self.kinds)]} {index}" for index in range(self.count)]
-        return ShapeBank.of([self.shape(index) for index in range(self.count)], names)
+        names = [f"{self.kinds[index % len(self.kinds)]} {index}" for index in range(self.number)]
+        return ShapeBank.of([self.shape(index) for index in range(self.number)], names)
 
 
 def _heated(index: int) -> SignedDistance:

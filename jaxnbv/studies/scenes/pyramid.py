@@ -17,14 +17,11 @@ class Pyramid(ClassObject):
     """A pyramid whose pattern is its class.
 
     - `solid`: where it stands in the scene.
+    - `label`: the class, an index of `PATTERNS`.
     """
 
     solid: ImprintedPyramid
-
-    @property
-    def label(self) -> Int[Array, ""]:
-        """The class, an index of `PATTERNS`."""
-        return self.solid.pattern
+    label: Int[Array, ""]
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         return self.solid(x)
@@ -72,4 +69,4 @@ def _pyramid(key: PRNGKeyArray, label: Int[Array, ""], longest_side: Float[Array
     low, high = jnp.min(corners, axis=0), jnp.max(corners, axis=0)
     scale = longest_side / jnp.max(high - low)
     offset = -0.5 * scale * (low + high)
-    return Pyramid(ImprintedPyramid(label, height, size, place, turn, depth, rotation, scale, offset))
+    return Pyramid(ImprintedPyramid(label, height, size, place, turn, depth, rotation, scale, offset), label)
