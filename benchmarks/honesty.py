@@ -13,8 +13,8 @@ import dataclasses
 from jaxnbv import KnownShapes, Planner, SurfaceSampler
 from jaxnbv.studies.classification.study import ClassificationStudy
 from jaxnbv.studies.engine.study import Scene
-from jaxnbv.studies.scenes.banks import bank_poses, shape_bank
 from jaxnbv.surfaces.known_shapes import kind_of
+from jaxnbv.surfaces.shipped_banks import bank_poses, shape_bank
 
 
 def without_the_class(study: ClassificationStudy, scene: Scene) -> Planner:

@@ -1,4 +1,5 @@
 from . import networks as networks
+from . import readers as readers
 from . import scanning as scanning
 from . import search as search
 from . import surfaces as surfaces
@@ -38,6 +39,7 @@ from .planning.stopping import Sure as Sure
 from .planning.stopping import ValueBelow as ValueBelow
 from .planning.travel import ValuePerCost as ValuePerCost
 from .planning.travel import arc_length as arc_length
+from .readers.recorded import RecordedFrames as RecordedFrames
 from .sampler import SurfaceSampler as SurfaceSampler
 from .scanning import Carving as Carving
 from .scanning import DepthNoise as DepthNoise
@@ -76,10 +78,6 @@ from .search import SpherePoses as SpherePoses
 from .search import TieBreakSearch as TieBreakSearch
 from .search import Trajectories as Trajectories
 from .search import UncertaintyView as UncertaintyView
-from .studies import readers as readers
-from .studies import scenes as scenes
-from .studies.readers.recorded import RecordedFrames as RecordedFrames
-from .studies.scenes.banks import shape_bank as shape_bank
 from .surfaces import AsGiven as AsGiven
 from .surfaces import Fields as Fields
 from .surfaces import FieldsAbout as FieldsAbout
@@ -96,6 +94,7 @@ from .surfaces import SurfaceModel as SurfaceModel
 from .surfaces import SurfacePosterior as SurfacePosterior
 from .surfaces import Upright as Upright
 from .surfaces import ValueSource as ValueSource
+from .surfaces import shape_bank as shape_bank
 from .tasks import ColdestPoint as ColdestPoint
 from .tasks import Coverage as Coverage
 from .tasks import CrossEntropy as CrossEntropy

@@ -15,7 +15,7 @@ from PIL import Image
 import jaxnbv as nbv
 from jaxnbv.acquisition import ImaginedView, context_of
 from jaxnbv.geometry.neighbours import nearest_squared_distance
-from jaxnbv.studies.scenes import demo_object, hidden_view
+from jaxnbv.studies.scenes import Split, demo_object, hidden_view, pyramid_scene
 from jaxnbv.surfaces.known_shapes import kind_of
 from jaxnbv.viz.choice import draw_acquisition
 from jaxnbv.viz.figures import STYLE
@@ -135,7 +135,7 @@ def draw_search(found: dict[str, nbv.Proposal], quantities: dict[str, nbv.Quanti
 
 def draw_known() -> Figure:
     """Bases that were imagined after a view that shows none of the base: by the model alone, and with known shapes."""
-    pyramid = nbv.scenes.pyramid_scene(nbv.scenes.Split.VALIDATION, 2)
+    pyramid = pyramid_scene(Split.VALIDATION, 2)
     first = hidden_view(pyramid, jax.random.key(0))
     plain = dataclasses.replace(nbv.SurfaceSampler.preset("screened", solid=True), grid=nbv.Grid(100), num_samples=16)
     with_bank = plain.with_bank(nbv.shape_bank("pyramid"), nbv.FreeRotation())

@@ -11,26 +11,11 @@ import jax
 import numpy as np
 
 from jaxnbv.scanning.sdf import Sampled
-from jaxnbv.studies.scenes import HEAT_OBJECTS, HOUSEHOLD, PART_CATEGORIES, PATTERNS
-from jaxnbv.studies.scenes.banks import KINDS, QUANTUM
+from jaxnbv.studies.scenes.banks import RECIPES
 from jaxnbv.surfaces import ShapeBank
+from jaxnbv.surfaces.shipped_banks import QUANTUM
 
-BANKS = Path(__file__).parents[1] / "jaxnbv" / "studies" / "scenes" / "shapes"
-# How many, and the kinds of object, which take turns.
-NUMBERS = {
-    "pyramid": (1024, PATTERNS),
-    "truck": (512, HOUSEHOLD),
-    "household": (512, HOUSEHOLD),
-    "parts": (520, PART_CATEGORIES),
-    "heat": (256, HEAT_OBJECTS),
-}
-
-
-def made_bank(name: str) -> ShapeBank:
-    """A bank of procedural objects."""
-    count, kinds = NUMBERS[name]
-    names = [f"{kinds[index % len(kinds)]} {index}" for index in range(count)]
-    return ShapeBank.of([KINDS[name].shape(index) for index in range(count)], names)
+BANKS = Path(__file__).parents[1] / "jaxnbv" / "surfaces" / "shapes"
 
 
 def write_bank(path: Path, bank: ShapeBank) -> None:
@@ -48,12 +33,12 @@ def write_bank(path: Path, bank: ShapeBank) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("names", nargs="*", default=list(NUMBERS), help="which")
+    parser.add_argument("names", nargs="*", default=list(RECIPES), help="which")
     parser.add_argument("--household", type=Path, help="folder of real meshes, class/cc-0_name.glb")
     arguments = parser.parse_args()
     BANKS.mkdir(exist_ok=True)
     for name in arguments.names:
-        write_bank(BANKS / f"{name}.npz", made_bank(name))
+        write_bank(BANKS / f"{name}.npz", RECIPES[name].make())
     if arguments.household is not None:
         files = sorted(arguments.household.glob("*/cc-0_*.glb"))
         names = [f"{file.parent.name.replace('_', ' ')} {file.stem.removeprefix('cc-0_')}" for file in files]

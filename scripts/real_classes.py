@@ -22,10 +22,10 @@ from jaxnbv import Camera, PointCloud
 from jaxnbv.geometry.cloud import farthest_point_subsample
 from jaxnbv.networks import pretrained_classifier
 from jaxnbv.networks.pretrained import TRAINED_POINTS
+from jaxnbv.readers import MeshFile, class_meshes
 from jaxnbv.scanning import SensorNoise, scan
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.storage.folders import versions
-from jaxnbv.studies.readers import MeshFile, class_meshes
 from jaxnbv.studies.scenes import HOUSEHOLD, Split, household_scene
 
 CLOUDS, VIEWS, STAND_INS = 10, 5, 200

@@ -20,8 +20,8 @@ from jaxnbv import Coverage, Grid, Planner
 from jaxnbv.networks import CATEGORIES, CompactPartSegmenter, part_mask, save_checkpoint
 from jaxnbv.networks.pretrained import TRAINED_SIDE
 from jaxnbv.sampler import SurfaceSampler
-from jaxnbv.scanning.sensors import PART_SETTING
 from jaxnbv.studies.scenes import Split, part_scene
+from jaxnbv.studies.sensors import PART_SETTING
 
 WEIGHTS = Path(__file__).parents[1] / "jaxnbv" / "networks" / "weights" / "parts.safetensors"
 

@@ -149,8 +149,7 @@ def documented() -> dict[str, list[str]]:
     return names
 
 
-STUDIES = ("studies.readers", "studies.scenes")
-PACKAGES = ("networks", "scanning", "search", "surfaces", "tasks", "viz", *STUDIES)
+PACKAGES = ("networks", "readers", "scanning", "search", "studies.scenes", "surfaces", "tasks", "viz")
 
 
 @pytest.mark.parametrize("package", ["jaxnbv", *(f"jaxnbv.{name}" for name in PACKAGES)])

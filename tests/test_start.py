@@ -12,8 +12,9 @@ import pytest
 import jaxnbv
 import jaxnbv as nbv
 from jaxnbv.errors import EXTRAS
+from jaxnbv.studies import scenes
 
-PACKAGES = [jaxnbv, nbv.readers, nbv.scenes, nbv.viz]
+PACKAGES = [jaxnbv, nbv.readers, nbv.viz, scenes]
 LAZY = pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.__name__)
 
 

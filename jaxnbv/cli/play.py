@@ -36,8 +36,8 @@ from jaxnbv.scanning import Grid, SensorNoise, Surface
 from jaxnbv.scanning.sensors import Setting
 from jaxnbv.search import Search, SphereCandidates, TieBreakSearch
 from jaxnbv.studies.engine import searches
-from jaxnbv.studies.scenes.banks import KINDS, bank_poses, shape_bank
 from jaxnbv.surfaces import ShapeBank, Upright
+from jaxnbv.surfaces.shipped_banks import SHIPPED_BANKS, bank_poses, shape_bank
 from jaxnbv.tasks import Coverage
 from jaxnbv.viz.task import race_words
 
@@ -94,10 +94,11 @@ def imagined(model: str, quick: bool, known: str | None) -> SurfaceSampler:
     sampler = SurfaceSampler.preset(model, quick=quick)
     if known in (None, "none"):
         return sampler
-    if known in KINDS:
+    if known in SHIPPED_BANKS:
         return sampler.with_bank(shape_bank(known), bank_poses(known))
     require(
-        os.path.isdir(known), f"--known {known}: there is no such folder of meshes; or give {', '.join(KINDS)}, none"
+        os.path.isdir(known),
+        f"--known {known}: there is no such folder of meshes; or give {', '.join(SHIPPED_BANKS)}, none",
     )
     return sampler.with_bank(ShapeBank.from_meshes(known), Upright(by_axis=True))
 

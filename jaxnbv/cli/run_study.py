@@ -1,4 +1,4 @@
-"""Run a study of the registry: its scenes, tables, charts and pictures."""
+"""Run a study by its command: its scenes, tables, chart and pictures."""
 
 import functools
 import os
@@ -12,79 +12,75 @@ import typer
 
 from jaxnbv.checks import InputError, require
 from jaxnbv.cli.registry import resolve
+from jaxnbv.cli.study_options import StudyOptions
 from jaxnbv.storage import describe
 from jaxnbv.storage.files import write_bytes, write_text
-from jaxnbv.studies.engine.chart import chart
+from jaxnbv.studies.engine.chart import CHART, chart
 from jaxnbv.studies.engine.pictures import write_pictures
 from jaxnbv.studies.engine.records import RecordFolder
 from jaxnbv.studies.engine.results import results, summary
-from jaxnbv.studies.engine.study import CHART, Factory, Study
-from jaxnbv.studies.registry import STUDIES, flag
+from jaxnbv.studies.engine.run import Factory, methods_of, run_scene
+from jaxnbv.studies.engine.study import Study
+from jaxnbv.studies.registry import Entry, studies
 
 
-def run_study(
-    name: str,
-    scenes: str | None,
-    views: int | None,
-    methods: str | None,
-    own: Sequence[str] | None,
-    model: str | None,
-    out: Path | None,
-    quick: bool,
-    workers: int,
-    **options: Any,
-) -> None:
-    """Run a study, or each of those that it consists of, and write what it found.
+def run_study(options: StudyOptions, **of_studies: Any) -> None:
+    """Run a study, or each of those that it consists of, and write its results.
 
-    - `scenes`, `views`, `model`: None for the study's own; `options`: those of single studies, None where not given.
+    - `of_studies`: options of single studies; None where they are not given.
 
     **Raises:** `ValueError` for no scenes, unknown methods, an option that the study does not take, or a method of
-    one's own that cannot be found; and, once all is written, if scenes failed.
+    one's own that cannot be imported; and, once all is written, if scenes failed.
     """
-    entry = STUDIES[name]
-    given = {option: value for option, value in options.items() if value is not None}
-    for option in given:
-        takers = ", ".join(other for other, one in STUDIES.items() if option in one.options)
-        require(option in entry.options, f"the study {name} takes no {flag(option)}: it is for {takers}")
-    require(
-        "folder" not in entry.options or "folder" in given,
-        f"the study {name} needs a folder: jaxnbv study {name} FOLDER",
-    )
-    kind: type[Study] = resolve(entry.study)
-    model = model or entry.model
-    named = None if methods is None else [name.strip() for name in methods.split(",")]
-    chosen, added = kind.chosen(named, model), {text: _own(text) for text in own or ()}
-    wanted = _scenes(str(entry.scenes) if scenes is None else scenes)
-    failed: dict[str, str] = {}
-    asked = 0
+    entry = studies()[options.name]
+    given = _given(options.name, entry, of_studies)
+    kind: type[Study] = entry.load()
+    model = options.model or entry.model
+    names = None if options.methods is None else [name.strip() for name in options.methods.split(",")]
+    methods, own = methods_of(kind, names, model), {text: _own(text) for text in options.own or ()}
+    scenes = _scenes(str(entry.scenes) if options.scenes is None else options.scenes)
     of_model = "" if model == entry.model else f"-{model}"
-    folder = out or Path("runs") / f"study-{name}{of_model}{'-quick' if quick else ''}"
-    if quick:
+    folder = options.out or Path("runs") / f"study-{options.name}{of_model}{'-quick' if options.quick else ''}"
+    if options.quick:
         typer.echo("--quick: small settings and few scenes. This is not the full study; leave it out for that.")
-        wanted = wanted[: kind.quick_scenes]
-    for part, settings in kind.configured(model, views or entry.views, quick, **given).items():
-        config = {"study": describe(settings), "methods": sorted(chosen)}
-        config |= {"own": {text: describe(make) for text, make in added.items()}} if added else {}
-        there = wanted if settings.num_scenes is None else [index for index in wanted if index < settings.num_scenes]
-        run = functools.partial(settings.run_scene, methods=chosen, own=added)
-        held = RecordFolder(folder / part, config, workers)
-        records, failures = held.collect(there, run), held.failures(there)
-        failed |= {f"{part} scene {index}".strip(): error for index, error in failures.items()}
-        asked += len(there)
-        if not records:
-            continue
-        table = results(records, type(settings))
-        write_text(folder / part / "results.csv", table.round(6).to_csv(index=False))
-        write_bytes(folder / part / CHART, chart(table, type(settings)))
-        write_pictures(records, settings, folder / part)
-        typer.echo(f"\n{f'{part}. ' if part else ''}{summary(table, type(settings))}")
-        typer.echo(f"All tables as CSV, chart and pictures: {folder / part}\n")
-    if failed:
-        where, error = next(iter(failed.items()))
+        scenes = scenes[: kind.quick_scenes]
+    failures: dict[str, str] = {}
+    count = 0
+    for part, study in kind.configured(model, options.views or entry.views, options.quick, **given).items():
+        config = {"study": describe(study), "methods": sorted(methods)}
+        config |= {"own": {text: describe(make) for text, make in own.items()}} if own else {}
+        there = scenes if study.num_scenes is None else [index for index in scenes if index < study.num_scenes]
+        run = functools.partial(run_scene, study, methods=methods, own=own)
+        held = RecordFolder(folder / part, config, options.workers)
+        records = held.collect(there, run)
+        failures |= {f"{part} scene {index}".strip(): error for index, error in held.failures(there).items()}
+        count += len(there)
+        if records:
+            table = results(records, type(study))
+            write_text(folder / part / "results.csv", table.round(6).to_csv(index=False))
+            write_bytes(folder / part / CHART, chart(table, type(study)))
+            write_pictures(records, study, folder / part)
+            typer.echo(f"\n{f'{part}. ' if part else ''}{summary(table, type(study))}")
+            typer.echo(f"All tables as CSV, chart and pictures: {folder / part}\n")
+    if failures:
+        where, error = next(iter(failures.items()))
         raise InputError(
-            f"{len(failed)} of {asked} scenes failed, the first {where} ({error}): {folder} has scene_*.failed that "
+            f"{len(failures)} of {count} scenes failed, the first {where} ({error}): {folder} has scene_*.failed that "
             "tell how, and the same command tries them again"
         )
+
+
+def _given(name: str, entry: Entry, of_studies: dict[str, Any]) -> dict[str, Any]:
+    """The options that a study is given, all of which it takes."""
+    given = {option: value for option, value in of_studies.items() if value is not None}
+    for option in given:
+        takers = {other: one for other, one in studies().items() if option in one.options}
+        flag = next(iter(takers.values())).flag(option)
+        require(option in entry.options, f"the study {name} takes no {flag}: it is for {', '.join(takers)}")
+    for option in entry.arguments:
+        flag = entry.flag(option)
+        require(option in given, f"the study {name} needs a {option}: jaxnbv study {name} {flag}")
+    return given
 
 
 def _scenes(asked: str) -> Sequence[int]:

@@ -32,7 +32,7 @@ def pretrained_classifier(
 
 
 def part_segmenter(category: str | int, num_points: int = 2048, longest_side: float = TRAINED_SIDE) -> CloudSegmenter:
-    """The shipped segmenter of the objects of `jaxnbv.studies.scenes.part_scene`, for one of their categories.
+    """The shipped segmenter of procedural objects, for one of their categories.
 
     It was trained on objects whose box has the longest side 2.5, upright and facing one way, seen by parts; on none of
     the categories cap, car and knife, of which it says nothing that can be relied on.

@@ -1,4 +1,4 @@
-"""The authors' sensors: which camera each task has and how far away it stands; and the same where an object fits in."""
+"""The authors' usual sensor: its camera and how far away it stands; and a sensor so far away that an object fits in."""
 
 import math
 from typing import NamedTuple
@@ -18,8 +18,6 @@ class Setting(NamedTuple):
 
 
 USUAL_SETTING = Setting(Camera(), 2.5, 120)
-PART_SETTING = Setting(Camera(height=64, width=64), 2.0, 120)
-HEAT_SETTING = Setting(Camera(), 3.0, 100)
 SENSOR_RADIUS = USUAL_SETTING.radius
 
 

@@ -21,13 +21,14 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.planning.loop import Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, SDFSurface, TriangleMesh, mesh_from_sdf
-from jaxnbv.scanning.sensors import HEAT_SETTING
 from jaxnbv.search import Search
 from jaxnbv.studies.engine.measures import SECONDS, Claim, Measure, Record
+from jaxnbv.studies.engine.run import replay
 from jaxnbv.studies.engine.searches import RULES
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.engine.tiles import Tiles, across, draw_on, say, still_of
 from jaxnbv.studies.scenes import heat_scene
+from jaxnbv.studies.sensors import HEAT_SETTING
 from jaxnbv.tasks import ColdestPoint, Coverage, body_temperature
 from jaxnbv.tasks.diffusion import HeatProblem
 from jaxnbv.viz.render import Still
@@ -202,7 +203,7 @@ class HeatStudy(Study):
         truth, heat = self.truth(scene), heat_problem(scene)
         still = still_of(truth.mesh, across(record), pixels)
         colours = ScalarMappable(Normalize(0.0, float(truth.temperatures.max())), _HEAT)
-        seen = {method: self.seen(scene, held[method]) for method in methods}
+        clouds = {method: [after.cloud for _, after in replay(self, scene, held[method])] for method in methods}
 
         def draw_truth(axes: Axes) -> None:
             draw_on(axes, still, truth.points, colours.to_rgba(truth.temperatures))
@@ -210,7 +211,7 @@ class HeatStudy(Study):
             _mark(axes, still, truth.coldest, "coldest point of the object")
 
         def tile(axes: Axes, method: str, view: int) -> None:
-            points, temperature = body_temperature(seen[method][view][1].cloud, heat)
+            points, temperature = body_temperature(clouds[method][view], heat)
             draw_on(axes, still, points, colours.to_rgba(temperature.values))
             estimate = held[method]["estimates"]["all"]
             _mark(axes, still, truth.coldest, "coldest point of the object")

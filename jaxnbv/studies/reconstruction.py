@@ -23,6 +23,7 @@ from jaxnbv.scanning import SDFSurface, TriangleMesh
 from jaxnbv.scanning.metrics import SURFACE_POINTS, coverage, surface_distance, true_mesh, truth_points
 from jaxnbv.scanning.screened_poisson import has_poisson, screened_poisson
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
+from jaxnbv.studies.engine.run import replay
 from jaxnbv.studies.engine.searches import RULES
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.engine.tiles import Tiles, across, say, still_of
@@ -134,7 +135,7 @@ class ReconstructionStudy(Study):
         truth = cast(TriangleMesh, true_mesh(scene.surface))
         tree = cKDTree(truth.sample_points(jax.random.key(0), _DENSE))
         eye, sampler = across(record), self.mesher(scene).sampler
-        known = {method: self.seen(scene, held[method])[-1][1] for method in methods}
+        known = {method: replay(self, scene, held[method])[-1][1] for method in methods}
         made = {method: held[method]["reconstructions"] for method in methods}
         names = tuple(name for name in RECONSTRUCTIONS if all(found[name] is not None for found in made.values()))
 

@@ -23,6 +23,7 @@ from jaxnbv.planning.loop import Sensor, Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.session import stride_of
 from jaxnbv.progress import progress_bar
+from jaxnbv.readers.recorded import RecordedFrames
 from jaxnbv.sampler import MODELS, SurfaceSampler
 from jaxnbv.scanning import Surface
 from jaxnbv.scanning.scanner import Hits
@@ -32,7 +33,6 @@ from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.searches import RULES
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.engine.tiles import Tiles, say
-from jaxnbv.studies.readers.recorded import RecordedFrames
 from jaxnbv.tasks import Coverage, NewSurface
 from jaxnbv.viz.style import GREY, INK, LINE, NEW
 

@@ -15,6 +15,8 @@ from jaxnbv.surfaces.placement import ShapePoses as ShapePoses
 from jaxnbv.surfaces.placement import Upright as Upright
 from jaxnbv.surfaces.screened import ScreenedSPSR as ScreenedSPSR
 from jaxnbv.surfaces.shape_bank import ShapeBank as ShapeBank
+from jaxnbv.surfaces.shipped_banks import bank_poses as bank_poses
+from jaxnbv.surfaces.shipped_banks import shape_bank as shape_bank
 from jaxnbv.surfaces.spsr import GeometricSPSR as GeometricSPSR
 from jaxnbv.surfaces.trigonometric import TrigonometricFields as TrigonometricFields
 from jaxnbv.surfaces.values import OnSurface as OnSurface

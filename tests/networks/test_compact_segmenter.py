@@ -8,8 +8,8 @@ import pytest
 from training_clouds import scanned_clouds
 
 from jaxnbv.networks import CATEGORIES, CompactPartSegmenter, part_segmenter
-from jaxnbv.scanning.sensors import PART_SETTING
 from jaxnbv.studies.scenes import Split, part_scene
+from jaxnbv.studies.sensors import PART_SETTING
 
 RNG = np.random.default_rng(0)
 COUNT = 300

@@ -11,7 +11,8 @@ import trimesh
 
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
-from jaxnbv.scanning.sensors import HEAT_SETTING, PART_SETTING, USUAL_SETTING, fitted
+from jaxnbv.scanning.sensors import USUAL_SETTING, fitted
+from jaxnbv.studies.sensors import HEAT_SETTING, PART_SETTING
 
 ICOSPHERE = trimesh.creation.icosphere(4)
 SURFACES = {

@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 from training_clouds import MOST_VIEWS, Source, imagined_clouds, scanned_clouds
 
 import jaxnbv as nbv
-from jaxnbv.scanning.sensors import PART_SETTING
 from jaxnbv.studies.scenes import PATTERNS, Split, part_scene, pyramid_scene
+from jaxnbv.studies.sensors import PART_SETTING
 
 COUNT, POINTS = 24, 200
 MODEL = nbv.GeometricSPSR(lengthscale=0.05, truncation=8)

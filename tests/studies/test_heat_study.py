@@ -10,11 +10,12 @@ from PIL import Image
 
 import jaxnbv as nbv
 from jaxnbv.checks import InputError
+from jaxnbv.readers.class_meshes import mesh_files
 from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.studies.engine.pictures import write_pictures
+from jaxnbv.studies.engine.run import replay, run_scene
 from jaxnbv.studies.heat import HeatStudy, Truth, heat_problem
-from jaxnbv.studies.readers.class_meshes import mesh_files
 from jaxnbv.studies.scenes import heat_scene
 from jaxnbv.tasks import coldest_point
 from jaxnbv.tasks import heat as heat_task
@@ -46,7 +47,7 @@ def coarse_truth(monkeypatch):
 
 @functools.cache
 def desk():
-    return small_study().run_scene(0, RUN)
+    return run_scene(small_study(), 0, RUN)
 
 
 @pytest.fixture
@@ -66,7 +67,7 @@ def test_a_record_is_json_and_holds_every_method(record):
 def test_the_first_view_sees_the_heat_source(record):
     study = small_study()
     for method in RUN:
-        points, _ = study.seen(study.scene(0), record["methods"][method])[0][1].cloud.to_numpy()
+        points, _ = replay(study, study.scene(0), record["methods"][method])[0][1].cloud.to_numpy()
         assert np.linalg.norm(points - np.asarray(heat_scene(0).source), axis=1).min() <= 0.1
 
 
@@ -79,7 +80,7 @@ def test_estimates_are_those_of_the_clouds(record):
     assert record["truth"] == {"point": truth.coldest.tolist(), "temperature": low, "hottest": high}
     assert coldest_point(truth.mesh, heat).temperature == low
     run = record["methods"]["heat"]
-    for view, (_, observations) in enumerate(study.seen(scene, run)):
+    for view, (_, observations) in enumerate(replay(study, scene, run)):
         for name, found in run["estimates"].items():
             expected = coldest_point(observations.cloud, heat, reached_only=name == "reached")
             assert found["points"][view] == expected.point.tolist()

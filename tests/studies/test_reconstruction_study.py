@@ -10,6 +10,7 @@ from PIL import Image
 
 import jaxnbv as nbv
 from jaxnbv.checks import InputError
+from jaxnbv.readers.class_meshes import mesh_files
 from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import scan
 from jaxnbv.scanning.metrics import coverage, surface_distance, truth_points
@@ -19,7 +20,7 @@ from jaxnbv.storage import describe
 from jaxnbv.studies import reconstruction
 from jaxnbv.studies.engine.pictures import write_pictures
 from jaxnbv.studies.engine.results import results, summary
-from jaxnbv.studies.readers.class_meshes import mesh_files
+from jaxnbv.studies.engine.run import replay, run_scene
 from jaxnbv.studies.reconstruction import MEAN, POISSON, ReconstructionStudy, reconstruct
 
 # Those that draw no samples compile in a fraction of the time; all planners are of the same make.
@@ -54,7 +55,7 @@ def small_study(folder=None, views=3, **settings):
 
 @pytest.fixture(scope="module")
 def record(meshes):
-    return small_study(meshes).run_scene(1, RUN)
+    return run_scene(small_study(meshes), 1, RUN)
 
 
 def test_a_record_is_json_and_holds_every_method(record):
@@ -98,7 +99,7 @@ def test_views_are_those_of_an_episode_from_the_shared_first_view(record, meshes
         assert method["coverage"] == coverage(episode.views, truth)
         for view, taken in zip(episode.views, method["views"], strict=True):
             np.testing.assert_array_equal(view.pose.position, np.float32(taken["position"]))
-        cloud = study.seen(scene, method)[-1][1].cloud
+        cloud = replay(study, scene, method)[-1][1].cloud
         np.testing.assert_array_equal(cloud.points, episode.cloud.points)
 
 
@@ -107,7 +108,7 @@ def test_distances_are_those_of_the_reconstruction_from_the_last_cloud(record, m
     scene = study.scene(1)
     truth = scene.surface.sample_points(jax.random.key(5), 20_000)
     sampler, method = study.mesher(scene).sampler, record["methods"]["farthest"]
-    observations = study.seen(scene, method)[-1][1]
+    observations = replay(study, scene, method)[-1][1]
     for name, found in method["reconstructions"].items():
         if found is not None:
             points = reconstruct(sampler, observations, name).sample_points(jax.random.key(6), 20_000)
@@ -118,7 +119,7 @@ def test_distances_are_those_of_the_reconstruction_from_the_last_cloud(record, m
 
 def test_without_pymeshlab_the_mean_alone_is_measured(monkeypatch, meshes):
     monkeypatch.setattr(reconstruction, "has_poisson", lambda: False)
-    found = small_study(meshes).run_scene(1, ("farthest",))["methods"]["farthest"]["reconstructions"]
+    found = run_scene(small_study(meshes), 1, ("farthest",))["methods"]["farthest"]["reconstructions"]
     assert found[POISSON] is None
     assert found[MEAN]["chamfer"] > 0
 
@@ -144,7 +145,7 @@ def test_mesh_files_are_sorted_and_what_cannot_be_read_is_named(meshes, tmp_path
         mesh_files(tmp_path / "missing")
     (tmp_path / "broken.ply").write_bytes(b"not a mesh")
     with pytest.raises(InputError, match=r"cannot read .*broken\.ply"):
-        small_study(tmp_path).run_scene(0)
+        run_scene(small_study(tmp_path), 0)
 
 
 def test_the_pictures_show_something(record, meshes, tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxnbv as nbv
 from jaxnbv.studies.engine.pictures import write_pictures
+from jaxnbv.studies.engine.run import run_scene
 from jaxnbv.studies.recorded import EVEN, NEW_AREA, ORACLE, RecordedStudy
 
 UNIT = 1000.0
@@ -191,7 +192,7 @@ def test_its_voxels_are_those_that_three_frames_have_seen(study, sequence):
 
 
 def test_every_method_is_measured_by_what_its_frames_show(study):
-    record = study.run_scene(1)
+    record = run_scene(study, 1)
     first, shown = record["first"], study.recording.shown
     for name, method in record["methods"].items():
         frames = method["frames"]
@@ -210,7 +211,7 @@ def test_every_method_is_measured_by_what_its_frames_show(study):
 
 
 def test_its_pictures_show_every_method(study, tmp_path):
-    record = study.run_scene(0, methods=(EVEN, ORACLE))
+    record = run_scene(study, 0, methods=(EVEN, ORACLE))
     (path,) = write_pictures([record], study, tmp_path)
     assert path.name == "scene_0000.png"
     pixels = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
@@ -229,7 +230,7 @@ def test_what_the_study_cannot_use_is_named(study, sequence, tmp_path):
         RecordedStudy.configured("known", VIEWS, quick=True, folder=tmp_path)
     away = RecordedStudy.configured("screened", VIEWS, quick=True, folder=tmp_path, box=(9, 9, 9, 10, 10, 10))[""]
     with pytest.raises(ValueError, match="no voxel"):
-        away.run_scene(0)
+        run_scene(away, 0)
 
 
 def test_a_frame_that_looks_away_shows_nothing(sequence, tmp_path):

@@ -35,7 +35,7 @@ class HeatTask(Task):
 
     @classmethod
     def setting(cls) -> "Setting":
-        from jaxnbv.scanning.sensors import HEAT_SETTING
+        from jaxnbv.studies.sensors import HEAT_SETTING
 
         return HEAT_SETTING
 

@@ -36,7 +36,7 @@ class PartTask(Task):
 
     @classmethod
     def setting(cls) -> "Setting":
-        from jaxnbv.scanning.sensors import PART_SETTING
+        from jaxnbv.studies.sensors import PART_SETTING
 
         return PART_SETTING
 

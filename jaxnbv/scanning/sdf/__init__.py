@@ -15,6 +15,10 @@ from jaxnbv.scanning.sdf.base import corner_distance as corner_distance
 from jaxnbv.scanning.sdf.base import least_of_last as least_of_last
 from jaxnbv.scanning.sdf.base import nonnegative as nonnegative
 from jaxnbv.scanning.sdf.base import parameter as parameter
+from jaxnbv.scanning.sdf.imprinted import PATTERNS as PATTERNS
+from jaxnbv.scanning.sdf.imprinted import ImprintedPyramid as ImprintedPyramid
+from jaxnbv.scanning.sdf.labelled import UNUSED as UNUSED
+from jaxnbv.scanning.sdf.labelled import LabelledSolid as LabelledSolid
 from jaxnbv.scanning.sdf.sampled import Sampled as Sampled
 from jaxnbv.scanning.sdf.sampled import solid_of_mesh as solid_of_mesh
 from jaxnbv.scanning.sdf.shapes import Capsule as Capsule

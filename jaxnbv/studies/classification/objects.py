@@ -11,11 +11,11 @@ import equinox as eqx
 import numpy as np
 
 from jaxnbv.checks import require
+from jaxnbv.readers import MeshFile
+from jaxnbv.readers.class_meshes import mesh_files
 from jaxnbv.studies.classification.study import BASELINES, ClassificationStudy, Truth
 from jaxnbv.studies.engine.measures import Claim, Record
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.readers import MeshFile
-from jaxnbv.studies.readers.class_meshes import mesh_files
 from jaxnbv.studies.scenes import (
     HOUSEHOLD,
     PATTERNS,
@@ -58,7 +58,7 @@ class PyramidStudy(ClassificationStudy):
         direction = np.asarray(self.candidates.poses().position[first])
         # The base looks along -z of the pyramid's own frame.
         assert isinstance(truth.thing, Pyramid)
-        outward = -np.asarray(truth.thing.rotation)[:, 2]
+        outward = -np.asarray(truth.thing.solid.rotation)[:, 2]
         cosine = np.clip(direction @ outward / np.linalg.norm(direction), -1.0, 1.0)
         return super().facts(scene, truth, first) | {"angle": float(np.degrees(np.arccos(cosine)))}
 

@@ -20,15 +20,17 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale, pretrained_classifier
 from jaxnbv.planning.loop import Sensor, Step
 from jaxnbv.planning.planner import Planner
+from jaxnbv.readers import MeshFile, class_meshes
 from jaxnbv.scanning import Grid, SensorNoise, scan
 from jaxnbv.search import CandidateSearch, Problem, Proposal, Search, TieBreakSearch
 from jaxnbv.search.base import Scores, best_unvisited
 from jaxnbv.studies.classification.measures import CUE_PIXELS, MEASURES, rank_correlation, roughness
+from jaxnbv.studies.engine.episodes import poses_of
+from jaxnbv.studies.engine.known import study_sampler
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.searches import RULES
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.engine.tiles import Tiles, say
-from jaxnbv.studies.readers import MeshFile, class_meshes
 from jaxnbv.studies.scenes import ClassObject, ClassSet, FirstView, Framing, Split
 from jaxnbv.studies.scenes.class_object import ClassMesh, scan_cue, surface_of
 from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, MixedEntropy
@@ -153,7 +155,7 @@ class ClassificationStudy(Study):
         studies: dict[str, Study] = {}
         for one in (options["framing"],) if "framing" in options else cls.framings:
             classifier, imagining = (cls._classifier(file, one.longest_side, fed) for fed in cls.fed)
-            sampler = cls.imagined(model, one.longest_side, quick, cls.solid)
+            sampler = study_sampler(model, cls.bank, (), one.longest_side, quick, cls.solid)
             settings: dict[str, Any] = {"classifier": classifier, "imagining": imagining, "framing": one} | options
             name = one.value if len(cls.framings) > 1 else ""
             studies[name] = cls(views=views, sampler=sampler, **settings | (dict(cls.quick) if quick else {}))
@@ -245,15 +247,13 @@ class ClassificationStudy(Study):
 
         return look
 
-    def run(
-        self, scene: Scene, truth: Truth, first: int, method: str, planner: Planner, key: PRNGKeyArray | None = None
-    ) -> Record:
-        """Of random search several runs in one."""
-        if method != "random":
-            return super().run(scene, truth, first, method, planner, key)
-        episode = self.key(scene.index, "episode")
-        keys = [jax.random.fold_in(episode, run) for run in range(_RUNS)]
-        runs = [super(ClassificationStudy, self).run(scene, truth, first, method, planner, key) for key in keys]
+    def episode_keys(self, method: str, scene: Scene) -> list[PRNGKeyArray]:
+        """Several of random search."""
+        keys = super().episode_keys(method, scene)
+        return [jax.random.fold_in(keys[0], run) for run in range(_RUNS)] if method == "random" else keys
+
+    def joined(self, runs: Sequence[Record]) -> Record:
+        """What the classifier says and what was seen in each run, the rest of the first."""
         return runs[0] | {name: [row for run in runs for row in run[name]] for name in ("log_p", "pixels")}
 
     def follow(self, scene: Scene, truth: Truth, planner: Planner, episode: Iterator[Step]) -> Record:
@@ -279,7 +279,7 @@ class ClassificationStudy(Study):
         """The true surface in the sensor's field of view, its cue tinted; beneath it the predicted class with its
         probability once this view is known."""
         held, scene, names = record["methods"], self.scene(record["scene"]), self.objects.classes
-        poses = {method: self.poses_of(held[method]) for method in methods}
+        poses = {method: poses_of(held[method]) for method in methods}
         camera = Camera(height=pixels, width=pixels)
 
         def tile(axes: Axes, method: str, view: int) -> None:

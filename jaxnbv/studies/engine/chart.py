@@ -15,6 +15,8 @@ from jaxnbv.studies.engine.study import Study
 from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.style import GREY, INK, LINE
 
+# Its file in the folder of a study.
+CHART = "chart.png"
 # Methods side by side, so that equal values do not hide one another: of the distance between two columns.
 _DODGE = 0.06
 _PANELS_A_ROW = 3

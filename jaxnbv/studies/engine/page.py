@@ -2,7 +2,6 @@
 
 import json
 import os
-import pkgutil
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,11 +9,11 @@ from typing import Any, NamedTuple
 from jaxnbv.checks import InputError, require
 from jaxnbv.storage.files import make_folder, write_text
 from jaxnbv.storage.folders import read_record
-from jaxnbv.studies.engine.chart import chart
+from jaxnbv.studies.engine.chart import CHART, chart
 from jaxnbv.studies.engine.records import read_records
 from jaxnbv.studies.engine.results import Verdict, count_of, explained, groups_of, results, tables, verdicts
-from jaxnbv.studies.engine.study import CHART, Study
-from jaxnbv.studies.registry import STUDIES
+from jaxnbv.studies.engine.study import Study
+from jaxnbv.studies.registry import studies
 from jaxnbv.version import __version__
 from jaxnbv.viz.html import render
 
@@ -78,7 +77,7 @@ def chapters(folder: str | Path) -> list[Chapter]:
 
 def _kinds() -> dict[str, type[Study]]:
     """The studies by the names of their classes, those of the registry first."""
-    named = {kind.__qualname__: kind for kind in (pkgutil.resolve_name(entry.study) for entry in STUDIES.values())}
+    named = {kind.__qualname__: kind for kind in (entry.load() for entry in studies().values())}
     todo = [Study]
     while todo:
         for kind in todo.pop().__subclasses__():

@@ -14,7 +14,7 @@ from jaxnbv.progress import progress_bar
 from jaxnbv.storage.files import write_text
 from jaxnbv.storage.folders import ResultFolder, check_format, read_json
 from jaxnbv.studies.engine.measures import Record
-from jaxnbv.studies.engine.trials import Failure, Outcome, Trial, cores_of, outcomes
+from jaxnbv.studies.engine.trials import Failure, Trial, cores_of, outcomes
 
 _FAILED = ".failed"
 _FORMAT = 2
@@ -48,9 +48,10 @@ class RecordFolder(ResultFolder):
             bar = progress_bar(None, progress, True, total=len(scenes), initial=len(records), desc=self.path.name)
             with bar, closing(outcomes(run, missing, self.workers)) as ended:
                 for index, outcome in ended:
-                    self._write(index, outcome)
-                    if not isinstance(outcome, Failure):
-                        records[index] = _read(self._file(index), index)
+                    if isinstance(outcome, Failure):
+                        self._write_failure(index, outcome)
+                    else:
+                        records[index] = self._write(index, outcome)
                     bar.update()
                     if progress and bar.disable:
                         print(f"{self.path.name}: scene {index} is done", file=sys.stderr, flush=True)
@@ -64,17 +65,18 @@ class RecordFolder(ResultFolder):
     def _file(self, index: int) -> Path:
         return self.path / f"scene_{index:04d}.json"
 
-    def _write(self, index: int, outcome: Outcome) -> None:
-        failed = self._file(index).with_suffix(_FAILED)
-        if isinstance(outcome, Failure):
-            write_text(failed, f"{outcome.error}\n\n{outcome.traceback}")
-            return
-        # As it will be read: JSON turns keys that are numbers into text, and the checksum sorts them.
-        record = json.loads(json.dumps(outcome))
+    def _write_failure(self, index: int, failure: Failure) -> None:
+        write_text(self._file(index).with_suffix(_FAILED), f"{failure.error}\n\n{failure.traceback}")
+
+    def _write(self, index: int, record: Record) -> Record:
+        """Write a record, and return it as it will be read."""
+        # JSON turns keys that are numbers into text, and the checksum sorts them.
+        record = json.loads(json.dumps(record))
         self.bind()
         sealed = {"format": _FORMAT, "index": index, "sha256": _checksum(index, record), "record": record}
         write_text(self._file(index), json.dumps(sealed))
-        failed.unlink(missing_ok=True)
+        self._file(index).with_suffix(_FAILED).unlink(missing_ok=True)
+        return record
 
 
 def read_records(folder: str | Path) -> list[Record]:

@@ -1,40 +1,32 @@
-"""What a study is, and the engine that runs one scene of it with every method."""
+"""What a study is: its scenes, its methods, what is measured of them, and its settings."""
 
 import dataclasses
-import itertools
-import time
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
-import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from jaxnbv.acquisition import Acquisition
-from jaxnbv.checks import InputError, check_type, require
+from jaxnbv.checks import InputError, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.pose import Pose
-from jaxnbv.observations import Observations
-from jaxnbv.planning.loop import Loop, Sensor, Step, view_keys
+from jaxnbv.planning.loop import Sensor, Step
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.simulate import observe_scene
+from jaxnbv.readers.class_meshes import MeshFile, mesh_files
 from jaxnbv.sampler import SurfaceSampler
-from jaxnbv.scanning import Grid, SensorNoise, Surface
+from jaxnbv.scanning import Grid, Surface
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.search import Candidates, Search, SphereCandidates
-from jaxnbv.studies.engine.known import knowing_meshes, knowing_others
-from jaxnbv.studies.engine.measures import KNOWN, WITHOUT_BANK, Claim, Measure, Record
+from jaxnbv.studies.engine.episodes import first_showing, sensor_before
+from jaxnbv.studies.engine.known import knowing_others, study_sampler
+from jaxnbv.studies.engine.measures import WITHOUT_BANK, Claim, Measure, Record
 from jaxnbv.studies.engine.searches import search_of
 from jaxnbv.studies.engine.tiles import Tiles
-from jaxnbv.studies.readers.class_meshes import MeshFile, mesh_files
-from jaxnbv.studies.scenes.banks import bank_poses, shape_bank
 
-# The file of a study's chart.
-CHART = "chart.png"
 _PURPOSES = ("first", "episode", "scene", "measure")
 
 
@@ -124,15 +116,11 @@ class Study(eqx.Module):
         - `options`: settings of its own. `meshes` is a folder, see `files_in`; by the model `known` each of its objects
           is planned by who has seen all others.
 
-        **Raises:** `ValueError` as `files_in` and `imagined` do.
+        **Raises:** `ValueError` as `files_in` and `study_sampler` do.
         """
         files = cls.files_in(options.pop("meshes")) if "meshes" in options else ()
-        if files and model == KNOWN:
-            sampler = knowing_meshes(cls.imagined("screened", quick=quick), files)
-        else:
-            sampler = cls.imagined(model, quick=quick)
-        settings = {"sampler": sampler, "meshes": files} | (dict(cls.quick) if quick else {})
-        return {"": cls(views=views, **settings | options)}
+        settings = {"sampler": study_sampler(model, cls.bank, files, quick=quick), "meshes": files}
+        return {"": cls(views=views, **settings | (dict(cls.quick) if quick else {}) | options)}
 
     @classmethod
     def files_in(cls, folder: str | Path) -> tuple[MeshFile, ...]:
@@ -141,36 +129,6 @@ class Study(eqx.Module):
         **Raises:** `ValueError` if there is none.
         """
         return mesh_files(folder)
-
-    @classmethod
-    def imagined(
-        cls, model: str, longest_side: float = 2.5, quick: bool = False, solid: bool = False
-    ) -> SurfaceSampler:
-        """As `SurfaceSampler.preset`, or for the model `known` the screened one that knows the shapes of `bank`.
-
-        **Raises:** `ValueError` for another model, or `known` where there is no bank.
-        """
-        if model != KNOWN:
-            return SurfaceSampler.preset(model, longest_side, quick, solid=solid)
-        require(bool(cls.bank), f"there are no known shapes for {cls.title.lower()}: give another model")
-        plain = SurfaceSampler.preset("screened", longest_side, quick, solid=solid)
-        return plain.with_bank(shape_bank(cls.bank), bank_poses(cls.bank))
-
-    @classmethod
-    def chosen(cls, names: Sequence[str] | None, model: str) -> tuple[str, ...]:
-        """The methods of these names, in order; by default `methods`, and where shapes are known those of
-        `without_bank`.
-
-        **Raises:** `ValueError` for an unknown method.
-        """
-        twice = [name for name in cls.without_bank if name in cls.methods] if model == KNOWN else []
-        again = tuple(f"{name}{WITHOUT_BANK}" for name in twice)
-        known = (*cls.methods, *again, *cls.further)
-        if names is None:
-            return (*cls.methods, *again)
-        unknown = sorted({*names} - {*known})
-        require(not unknown, f"unknown methods: {', '.join(unknown)}; choose from {', '.join(known)}")
-        return tuple(name for name in known if name in names)
 
     @property
     def num_scenes(self) -> int | None:
@@ -231,7 +189,7 @@ class Study(eqx.Module):
 
     def sensor(self, scene: Scene) -> Sensor:
         """What the camera sees of a scene."""
-        return lambda pose, key: observe_scene(scene.surface, self.camera, pose, SensorNoise(), key)
+        return sensor_before(scene.surface, self.camera)
 
     def shows_enough(self, scene: Scene, seen: PointCloud) -> bool:
         """Whether a scan can be the first one."""
@@ -273,92 +231,22 @@ class Study(eqx.Module):
         of_scene = jax.random.fold_in(jax.random.key(self.seed), index)
         return jax.random.fold_in(of_scene, _PURPOSES.index(purpose))
 
-    def run_scene(
-        self, index: int, methods: Sequence[str] | None = None, own: "Mapping[str, Factory] | None" = None
-    ) -> Record:
-        """One scene with every method: the record that tables and figures are made of.
+    def episode_keys(self, method: str, scene: Scene) -> list[PRNGKeyArray]:
+        """The key of a method's episode, which all methods share; several for several episodes, see `joined`."""
+        return [self.key(scene.index, "episode")]
 
-        All methods share the first view, a random one of the candidates that show enough, the sensor's noise and the
-        prior's samples at each view.
-
-        - `methods`: some of the study's, by default all; `own`: further ones, and what makes their planners.
-
-        **Raises:** `ValueError` for an unknown method, as `scene` does, if no candidate shows enough, or if one of
-        `own` makes no planner of so many views.
-        """
-        methods = self.methods if methods is None else self.chosen(methods, KNOWN)
-        start = time.perf_counter()
-        scene = self.scene(index)
-        planners = {name: self._made(name, make, scene) for name, make in (own or {}).items()}
-        first, truth = self.first_view(scene), self.truth(scene)
-        record = {"scene": index, **self.facts(scene, truth, first), "first": first, "study_views": self.views}
-        planned = {name: self.planner(name, scene) for name in methods}
-        record["methods"] = {
-            name: self.run(scene, truth, first, name, planner) for name, planner in (planned | planners).items()
-        }
-        return record | {"seconds": time.perf_counter() - start}
-
-    def _made(self, name: str, make: "Factory", scene: Scene) -> Planner:
-        """The planner of a method of one's own."""
-        try:
-            planner = make(self, scene)
-        except Exception as error:
-            problem = f"{type(error).__name__}: {error}"
-            raise InputError(f"the method {name} fails on scene {scene.index} ({problem})") from error
-        check_type(planner, Planner, f"what the method {name} makes")
-        require(
-            planner.max_views >= self.views,
-            f"the method {name} makes a planner of {planner.max_views} views, but the study has {self.views}: give "
-            f"Planner(max_views={self.views})",
-        )
-        return planner
-
-    def run(
-        self, scene: Scene, truth: Any, first: int, method: str, planner: Planner, key: PRNGKeyArray | None = None
-    ) -> Record:
-        """The record of one method: its views' poses, of each step the value of the view that was chosen and the
-        seconds of the search, and what `follow` makes of the episode.
-
-        - `key`: of the episode, by default the one that all methods share.
-        """
-        views: list[dict[str, list]] = []
-        taken: list[dict[str, float]] = []
-        key = self.key(scene.index, "episode") if key is None else key
-        episode = Loop(planner, key, camera=self.camera).steps(self.sensor(scene), self.candidates.poses()[first])
-
-        def noted() -> Iterator[Step]:
-            for step in itertools.islice(episode, self.views):
-                pose, proposal = step.view.pose, step.view.proposal
-                views.append({"position": pose.position.tolist(), "rotation": pose.rotation.tolist()})
-                if proposal is not None:
-                    taken.append({"value": float(proposal.value), "seconds": step.seconds})
-                yield step
-
-        return {"views": views, "steps": taken, **self.follow(scene, truth, planner, noted())}
+    def joined(self, runs: Sequence[Record]) -> Record:
+        """The record of a method that is made of those of its episodes."""
+        return runs[0]
 
     def first_view(self, scene: Scene) -> int:
         """A random one of the candidates from which the object shows enough."""
-        poses, sensor = self.candidates.poses(), self.sensor(scene)
-        *_, noise_key = view_keys(self.key(scene.index, "episode"), 0)
-        for candidate in jax.random.permutation(self.key(scene.index, "first"), self.num_candidates).tolist():
-            if self.shows_enough(scene, sensor(poses[candidate], noise_key)):
-                return candidate
-        raise InputError(f"none of {self.num_candidates} candidates shows enough of {scene.name}: ask for more")
 
-    def seen(self, scene: Scene, run: Record) -> list[tuple[PointCloud, Observations]]:
-        """Each scan of a method, and the observations after it, made again from the poses of its record."""
-        key, sensor = self.key(scene.index, "episode"), self.sensor(scene)
-        poses = enumerate(self.poses_of(run))
-        views = [(pose, sensor(pose, view_keys(key, index)[2])) for index, pose in poses]
-        # It depends on the planner through its capacity and what it carves alone.
-        known = self.planner(self.methods[0], scene).replay(views, self.camera)
-        return [(scan, observations) for (_, scan), observations in zip(views, known, strict=True)]
+        def enough(seen: PointCloud) -> bool:
+            return self.shows_enough(scene, seen)
 
-    def poses_of(self, run: Record) -> list[Pose]:
-        """Where a method's views were taken."""
-        arrays = [[np.asarray(view[name], np.float32) for name in ("rotation", "position")] for view in run["views"]]
-        return [Pose(rotation, position) for rotation, position in arrays]
-
-
-# A method of one's own: the planner of a scene.
-Factory: TypeAlias = Callable[[Study, Scene], Planner]
+        keys = self.key(scene.index, "first"), self.key(scene.index, "episode")
+        first = first_showing(enough, self.candidates.poses(), self.sensor(scene), *keys)
+        if first is None:
+            raise InputError(f"none of {self.num_candidates} candidates shows enough of {scene.name}: ask for more")
+        return first

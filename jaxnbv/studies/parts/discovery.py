@@ -21,11 +21,12 @@ from jaxnbv.planning.loop import Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Grid, MeshParts, TriangleMesh
 from jaxnbv.scanning.metrics import true_mesh
-from jaxnbv.scanning.sensors import PART_SETTING
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
+from jaxnbv.studies.engine.run import replay
 from jaxnbv.studies.engine.searches import RULES
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.engine.tiles import Tiles, across, draw_on, say, still_of
+from jaxnbv.studies.sensors import PART_SETTING
 from jaxnbv.tasks import Coverage, Segmenter, SoftPartCount, part_counts
 from jaxnbv.viz.style import GREY, SERIES
 
@@ -193,7 +194,7 @@ class PartDiscoveryStudy(Study):
         points = mesh.sample_points(jax.random.key(0), _DENSE)
         of = np.asarray(self.true_parts(scene, jnp.asarray(points, jnp.float32)))
         still = still_of(mesh, across(record), pixels)
-        known = {method: self.seen(scene, held[method]) for method in methods}
+        known = {method: replay(self, scene, held[method]) for method in methods}
 
         def tile(axes: Axes, method: str, view: int) -> None:
             fed, predicted = segmenter.predict(known[method][view][1].cloud)

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 from jaxnbv.checks import require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.networks import CATEGORIES, CloudSegmenter, part_segmenter
+from jaxnbv.readers.class_meshes import MeshFile, mesh_files, taking_turns
 from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Grid, MeshParts, SDFSurface, load_parts, scan
 from jaxnbv.scanning.mesh_files import read_nodes
@@ -20,7 +21,6 @@ from jaxnbv.studies.engine.known import knowing_those
 from jaxnbv.studies.engine.measures import Record
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.parts.discovery import NETWORK_POINTS, TARGETS, NearestPart, PartDiscoveryStudy
-from jaxnbv.studies.readers.class_meshes import MeshFile, mesh_files, taking_turns
 from jaxnbv.studies.scenes import Split, part_scene
 from jaxnbv.surfaces.known_shapes import kind_of
 from jaxnbv.tasks import part_counts

@@ -13,11 +13,12 @@ from test_pyramid_study import small_study
 
 from jaxnbv.checks import InputError
 from jaxnbv.networks import InvariantClassifier, save_checkpoint
+from jaxnbv.readers import class_meshes
 from jaxnbv.studies.classification.objects import HouseholdStudy, OmniObject3DStudy, PyramidStudy, TruckStudy
 from jaxnbv.studies.engine.chart import chart
 from jaxnbv.studies.engine.pictures import write_pictures
 from jaxnbv.studies.engine.results import results, summary
-from jaxnbv.studies.readers import class_meshes
+from jaxnbv.studies.engine.run import run_scene
 from jaxnbv.studies.scenes import HOUSEHOLD, FirstView
 
 SCENE = 4
@@ -49,7 +50,7 @@ def test_first_views_of_trucks_are_random_and_told_apart_by_what_they_show():
 @pytest.mark.parametrize("kind", [HouseholdStudy, pytest.param(TruckStudy, marks=pytest.mark.slow)])
 def test_records_tables_charts_and_pictures(kind, tmp_path):
     """Where all of the object tells its class no pixels are counted."""
-    found = json.loads(json.dumps(small_study(kind=kind).run_scene(SCENE), allow_nan=False))
+    found = json.loads(json.dumps(run_scene(small_study(kind=kind), SCENE), allow_nan=False))
     assert list(found["methods"]) == list(kind.methods)
     assert found["label"] == SCENE % len(kind.objects.classes)
     for held in found["methods"].values():
@@ -75,7 +76,7 @@ def test_meshes_in_place_of_procedural_objects(tmp_path):
     box_files(tmp_path, "chair/a.off", "desk/b.obj")
     study = small_study(kind=HouseholdStudy, meshes=class_meshes(tmp_path, HOUSEHOLD))
     assert study.num_scenes == 2
-    found = study.run_scene(1, ("farthest", "coverage"))
+    found = run_scene(study, 1, ("farthest", "coverage"))
     assert (found["label"], found["name"]) == (HOUSEHOLD.index("desk"), "desk b")
     assert len({tuple(view["position"]) for view in found["methods"]["coverage"]["views"]}) == 3
     seen = study.scene(1).task.scans[found["first"]].to_numpy()[0]
@@ -85,7 +86,7 @@ def test_meshes_in_place_of_procedural_objects(tmp_path):
     (picture,) = write_pictures([found], study, tmp_path, pixels=24)
     assert picture.exists()
     with pytest.raises(InputError, match="no scene 2: the study has 2 meshes"):
-        study.run_scene(2)
+        run_scene(study, 2)
     with pytest.raises(InputError, match="2 meshes of cargo and 0 of trucks: give both, or none"):
         small_study(kind=TruckStudy, meshes=class_meshes(tmp_path, HOUSEHOLD))
 

@@ -9,16 +9,17 @@ import trimesh
 from test_pyramid_study import CAMERA, SCENE, chosen, evidence_of, small_study, step_key, without_time
 
 import jaxnbv as nbv
-from jaxnbv.cli.registry import STUDY_MODELS, resolve
+from jaxnbv.cli.registry import STUDY_MODELS
 from jaxnbv.sampler import MODELS
 from jaxnbv.studies.classification.objects import PyramidStudy
 from jaxnbv.studies.engine.measures import KNOWN
+from jaxnbv.studies.engine.run import methods_of, run_scene
 from jaxnbv.studies.heat import HeatStudy
 from jaxnbv.studies.parts.study import PartStudy
-from jaxnbv.studies.registry import STUDIES
+from jaxnbv.studies.registry import studies
 from jaxnbv.studies.scenes import Split, pyramid_scene
-from jaxnbv.studies.scenes.banks import KINDS
 from jaxnbv.surfaces import GeometricSPSR, KnownShapes, OnSurface, ScreenedSPSR, mesh_shapes
+from jaxnbv.surfaces.shipped_banks import SHIPPED_BANKS
 
 METHODS = ("cross-entropy", "coverage", "uncertainty", "coverage-screened", "uncertainty-screened")
 
@@ -33,7 +34,7 @@ def knowing_study():
 
 @pytest.fixture(scope="module")
 def record():
-    return knowing_study().run_scene(SCENE, METHODS)
+    return run_scene(knowing_study(), SCENE, METHODS)
 
 
 def choices(*methods):
@@ -58,25 +59,25 @@ def test_a_choice_is_that_of_the_planner_with_the_same_key(record, method, view)
 
 
 def test_the_methods_that_know_no_shapes_are_those_of_a_study_without(record):
-    plain = small_study().run_scene(SCENE, ("coverage", "uncertainty"))
+    plain = run_scene(small_study(), SCENE, ("coverage", "uncertainty"))
     for method in ("coverage", "uncertainty"):
         assert without_time(record["methods"][f"{method}-screened"]) == without_time(plain["methods"][method])
 
 
 def test_the_models_of_studies_are_known_and_those_of_the_library():
     assert tuple(STUDY_MODELS) == (KNOWN, *MODELS)
-    assert PyramidStudy.chosen(None, "screened") == PyramidStudy.methods
-    assert PyramidStudy.chosen(None, KNOWN)[-2:] == ("coverage-screened", "uncertainty-screened")
+    assert methods_of(PyramidStudy, None, "screened") == PyramidStudy.methods
+    assert methods_of(PyramidStudy, None, KNOWN)[-2:] == ("coverage-screened", "uncertainty-screened")
 
 
-@pytest.mark.parametrize("name", [name for name, entry in STUDIES.items() if entry.model == KNOWN])
+@pytest.mark.parametrize("name", [name for name, entry in studies().items() if entry.model == KNOWN])
 def test_a_study_whose_usual_model_is_known_has_a_bank(name):
-    assert resolve(STUDIES[name].study).bank in KINDS
+    assert studies()[name].load().bank in SHIPPED_BANKS
 
 
 def test_a_study_without_a_bank_refuses_to_know_shapes():
     with pytest.raises(nbv.InputError, match="no known shapes for"):
-        type("Own", (HeatStudy,), {"bank": ""}).imagined(KNOWN)
+        type("Own", (HeatStudy,), {"bank": ""}).configured(KNOWN, 2, quick=True)
 
 
 def test_parts_are_planned_with_the_shapes_of_their_category():

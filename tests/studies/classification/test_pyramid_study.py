@@ -16,6 +16,7 @@ from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.search import FarthestView, SphereCandidates
 from jaxnbv.studies.classification.objects import PyramidStudy
 from jaxnbv.studies.engine.pictures import write_pictures
+from jaxnbv.studies.engine.run import run_scene
 from jaxnbv.studies.scenes import Split, pyramid_scene
 from jaxnbv.studies.scenes.class_object import scan_cue
 from jaxnbv.surfaces import GeometricSPSR
@@ -46,7 +47,7 @@ def small_study(classifier=None, kind=PyramidStudy, **settings):
 
 @functools.cache
 def whole_record():
-    return small_study().run_scene(SCENE)
+    return run_scene(small_study(), SCENE)
 
 
 def evidence_of(study, planner, scene, candidates):
@@ -106,7 +107,7 @@ def test_the_first_view_is_that_of_all_methods_and_shows_no_pattern_but_somethin
     assert pixels[record["first"]] == 0 < int(seen.count[record["first"]])
     for method in record["methods"].values():
         np.testing.assert_allclose(method["pixels"][0], pixels[chosen(small_study(), method)], atol=1)
-    outward = -np.asarray(pyramid.rotation)[:, 2]
+    outward = -np.asarray(pyramid.solid.rotation)[:, 2]
     angle = np.degrees(np.arccos(np.asarray(poses.position[record["first"]]) @ outward / 2.5))
     assert record["angle"] == pytest.approx(angle, abs=0.05)
 
@@ -163,7 +164,7 @@ def test_a_method_of_ones_own_sees_what_others_see_from_a_candidate(tmp_path):
     def own(study, scene):
         return study.planner_of(Coverage(), FarthestView(study.candidates), scene)
 
-    record = study.run_scene(SCENE, ("random",), {"mine:own": own})
+    record = run_scene(study, SCENE, ("random",), {"mine:own": own})
     ours, farthest = record["methods"]["mine:own"], whole_record()["methods"]["farthest"]
     np.testing.assert_allclose(ours["log_p"], farthest["log_p"], atol=1e-5)
     assert ours["pixels"] == farthest["pixels"]

@@ -10,6 +10,8 @@ from test_pyramid_study import Linear, small_study
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.studies.classification.objects import PyramidStudy
+from jaxnbv.studies.engine.episodes import poses_of
+from jaxnbv.studies.engine.run import replay, run_scene
 
 SCENE, VIEWS = 3, 3
 SEARCHES = ("cross-entropy", *PyramidStudy.further)
@@ -25,7 +27,7 @@ def study():
 
 @functools.cache
 def record():
-    return json.loads(json.dumps(study().run_scene(SCENE, SEARCHES)))
+    return json.loads(json.dumps(run_scene(study(), SCENE, SEARCHES)))
 
 
 def test_a_search_that_climbs_from_the_candidates_finds_no_less_and_one_with_fewer_samples_no_more():
@@ -37,7 +39,7 @@ def test_a_search_that_climbs_from_the_candidates_finds_no_less_and_one_with_few
 
 
 def test_each_search_keeps_to_its_poses():
-    poses = {method: study().poses_of(held)[1:] for method, held in record()["methods"].items()}
+    poses = {method: poses_of(held)[1:] for method, held in record()["methods"].items()}
     assert all(len(views) == VIEWS - 1 for views in poses.values())
     candidates = np.asarray(study().candidates.poses().position)
     for method in ("cross-entropy", "halving"):
@@ -57,5 +59,5 @@ def test_each_search_keeps_to_its_poses():
 
 def test_what_is_recorded_is_what_the_classifier_says_of_the_views():
     scene, held = study().scene(SCENE), record()["methods"]["gradient-2dof"]
-    clouds = [observations.cloud for _, observations in study().seen(scene, held)]
+    clouds = [observations.cloud for _, observations in replay(study(), scene, held)]
     np.testing.assert_allclose(held["log_p"][0], [Linear()(cloud) for cloud in clouds], atol=1e-4)

@@ -9,11 +9,10 @@ from PIL import Image
 from toy import ToyStudy
 
 from jaxnbv.checks import InputError
-from jaxnbv.cli.registry import resolve
 from jaxnbv.studies.engine.chart import chart
 from jaxnbv.studies.engine.measures import Claim, Measure
 from jaxnbv.studies.engine.results import results, summary, tables, verdicts
-from jaxnbv.studies.registry import STUDIES
+from jaxnbv.studies.registry import studies
 
 POINTS, MANY, ODD = ToyStudy.measures
 
@@ -145,9 +144,9 @@ def test_a_claim_holds_where_the_interval_lies_on_its_side():
     assert "behind c-screened (+2.0 [+1.0, +3.0])" in away.sentence
 
 
-@pytest.mark.parametrize("name", STUDIES)
+@pytest.mark.parametrize("name", studies())
 def test_the_claims_of_a_study_name_what_it_has(name):
-    study = resolve(STUDIES[name].study)
+    study = studies()[name].load()
     assert study.claims
     for claim in study.claims:
         assert claim.measure in {measure.name for measure in study.measures}

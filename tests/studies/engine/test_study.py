@@ -16,6 +16,7 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import SDFSurface
 from jaxnbv.search import GivenPoses, RandomView
+from jaxnbv.studies.engine.run import replay, run_scene
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
 
@@ -39,7 +40,7 @@ def without_time(record):
 
 def test_a_record_is_json_and_methods_share_the_first_view():
     study = small()
-    record = study.run_scene(3)
+    record = run_scene(study, 3)
     assert json.loads(json.dumps(record, allow_nan=False)) == record
     assert (record["scene"], record["name"], record["study_views"]) == (3, "ball 3", 3)
     assert list(record["methods"]) == ["farthest", "random"]
@@ -49,15 +50,15 @@ def test_a_record_is_json_and_methods_share_the_first_view():
     assert runs[0]["points"][0] == runs[1]["points"][0]
     first = study.candidates.poses()[record["first"]]
     assert runs[0]["views"][0]["position"] == first.position.tolist()
-    assert without_time(study.run_scene(3)) == without_time(record)
-    assert without_time(study.run_scene(3, ["random"])["methods"]) == without_time({"random": runs[1]})
-    assert study.run_scene(4)["first"] != record["first"] or study.run_scene(5)["first"] != record["first"]
+    assert without_time(run_scene(study, 3)) == without_time(record)
+    assert without_time(run_scene(study, 3, ["random"])["methods"]) == without_time({"random": runs[1]})
+    assert run_scene(study, 4)["first"] != record["first"] or run_scene(study, 5)["first"] != record["first"]
 
 
 def test_the_same_views_are_scanned_again_from_a_record():
     study = small()
-    scene, run = study.scene(0), study.run_scene(0)["methods"]["farthest"]
-    seen = study.seen(scene, run)
+    scene, run = study.scene(0), run_scene(study, 0)["methods"]["farthest"]
+    seen = replay(study, scene, run)
     assert [int(observations.cloud.count) for _, observations in seen] == run["points"]
     scans = [scan for scan, _ in seen]
     assert int(scans[0].count) + int(scans[1].count) == run["points"][1]
@@ -74,7 +75,7 @@ def test_a_method_of_ones_own_stands_in_the_same_record():
         poses = look_at(jnp.array([[0.0, 2.5, 0.1], [0.0, -2.5, 0.1], [0.1, 2.5, 0.0]]))
         return study.planner_of(Coverage(), RandomView(GivenPoses(poses)), scene)
 
-    record = study.run_scene(2, ["random"], {"mine:above": above})
+    record = run_scene(study, 2, ["random"], {"mine:above": above})
     assert asked == [2]
     assert list(record["methods"]) == ["random", "mine:above"]
     own = record["methods"]["mine:above"]
@@ -84,7 +85,7 @@ def test_a_method_of_ones_own_stands_in_the_same_record():
 
 def test_a_method_of_ones_own_that_makes_no_planner_is_refused_before_anything_is_run(monkeypatch):
     study = small()
-    monkeypatch.setattr(ToyStudy, "run", lambda *_: pytest.fail("a method was run"))
+    monkeypatch.setattr(ToyStudy, "follow", lambda *_: pytest.fail("a method was run"))
 
     def few(study, scene):
         return Planner(Coverage(), RandomView(3), study.camera, study.sampler, max_views=1)
@@ -96,7 +97,7 @@ def test_a_method_of_ones_own_that_makes_no_planner_is_refused_before_anything_i
         (few, rf"a planner of 1 views, but the study has {study.views}: give Planner\(max_views={study.views}\)"),
     ):
         with pytest.raises(InputError, match=problem):
-            study.run_scene(0, ["random"], {"mine": make})
+            run_scene(study, 0, ["random"], {"mine": make})
 
 
 def test_the_first_view_shows_enough():
@@ -106,9 +107,9 @@ def test_the_first_view_shows_enough():
 
     study = small(Picky)
     for index in range(4):
-        assert float(study.candidates.poses().position[study.run_scene(index, ["random"])["first"]][1]) > 0.5
+        assert float(study.candidates.poses().position[run_scene(study, index, ["random"])["first"]][1]) > 0.5
     with pytest.raises(InputError, match="none of 3 candidates shows enough of ball 0"):
-        small(Never, views=2, num_candidates=3).run_scene(0)
+        run_scene(small(Never, views=2, num_candidates=3), 0)
 
 
 class Never(ToyStudy):
@@ -118,7 +119,7 @@ class Never(ToyStudy):
 
 def test_unknown_methods_and_bad_numbers_are_refused():
     with pytest.raises(InputError, match="unknown methods: best; choose from farthest, random"):
-        small().run_scene(0, ["best", "random"])
+        run_scene(small(), 0, ["best", "random"])
     for settings in ({"views": 1}, {"views": 9}):
         with pytest.raises(InputError, match="at least two views"):
             small(**settings)

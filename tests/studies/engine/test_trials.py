@@ -1,5 +1,6 @@
 """Where trials are run."""
 
+import functools
 import os
 import signal
 import subprocess
@@ -12,13 +13,14 @@ import psutil
 import pytest
 from deadly import Trial
 from test_study import small, without_time
-from toy import ToyStudy
 
 from jaxnbv.checks import InputError
-from jaxnbv.cli.run_study import run_study
+from jaxnbv.cli import run_study as command
+from jaxnbv.cli.study_options import StudyOptions
 from jaxnbv.studies.engine.records import RecordFolder
+from jaxnbv.studies.engine.run import run_scene
 from jaxnbv.studies.engine.trials import _pool, cores_of
-from jaxnbv.studies.registry import STUDIES, Entry
+from jaxnbv.studies.registry import Entry, studies
 
 
 def squares(*indices):
@@ -77,8 +79,9 @@ def is_running(process):
 @pytest.mark.slow
 def test_a_study_in_processes_finds_what_it_finds_here(tmp_path):
     balls = small(num_candidates=4, views=2)
+    trial = functools.partial(run_scene, balls)
     here, processes = (
-        RecordFolder(tmp_path / str(workers), {}, workers).collect(range(2), balls.run_scene, progress=False)
+        RecordFolder(tmp_path / str(workers), {}, workers).collect(range(2), trial, progress=False)
         for workers in (1, 2)
     )
     assert list(map(without_time, here)) == list(map(without_time, processes))
@@ -92,32 +95,31 @@ def test_processes_share_the_cores():
 
 
 def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypatch):
-    def run_scene(self, index, methods, own):
+    def fake(study, index, methods, own):
         if index == 1:
             raise RuntimeError("lost")
         return {"scene": index, "methods": {name: {"points": [1000, 4000], "views": [0, 1]} for name in methods}}
 
-    def run(out, scenes):
-        none = dict.fromkeys(("methods", "own", "out"))
-        settings = {"views": 2, "model": "paper", "quick": False, "workers": 1, "out": tmp_path / out}
-        run_study("toy", **none | settings | {"scenes": scenes})
+    def run(out, scenes, **of_studies):
+        options = StudyOptions(name="toy", scenes=scenes, views=2, model="paper", out=tmp_path / out)
+        command.run_study(options, **of_studies)
 
-    monkeypatch.setitem(STUDIES, "toy", Entry("toy:ToyStudy", "", 3, 2))
-    monkeypatch.setattr(ToyStudy, "run_scene", run_scene)
+    monkeypatch.setitem(studies(), "toy", Entry("toy:ToyStudy", "", 3, 2))
+    monkeypatch.setattr(command, "run_scene", fake)
     with pytest.raises(
         InputError, match=r"^1 of 3 scenes failed.*first scene 1 \(RuntimeError: lost\).*/some has scene_\*\.failed"
     ):
         run("some", "3")
     assert "points" in (tmp_path / "some" / "results.csv").read_text()
-    monkeypatch.setattr(ToyStudy, "run_scene", lambda self, index, **_: run_scene(self, 1, (), {}))
+    monkeypatch.setattr(command, "run_scene", lambda study, index, **_: fake(study, 1, (), {}))
     with pytest.raises(InputError, match=r"^2 of 2 scenes failed"):
         run("all", "2")
     assert not (tmp_path / "all" / "results.csv").exists()
-    monkeypatch.setattr(ToyStudy, "run_scene", lambda self, index, **given: run_scene(self, index + 1, **given))
+    monkeypatch.setattr(command, "run_scene", lambda study, index, **given: fake(study, index + 1, **given))
     run("range", "7:9")
     assert sorted(file.name for file in (tmp_path / "range").glob("scene_*")) == ["scene_0007.json", "scene_0008.json"]
     for wrong in ("0", "3:3", "9:7", "-2", "all"):
         with pytest.raises(InputError, match=f"--scenes {wrong} names no scenes"):
             run("wrong", wrong)
     with pytest.raises(InputError, match="the study toy takes no --meshes: it is for truck"):
-        run_study("toy", "2", 2, None, None, "paper", None, False, 1, meshes=tmp_path)
+        run("wrong", "2", meshes=tmp_path)

@@ -22,6 +22,7 @@ from jaxnbv.search import (
     SpherePoses,
 )
 from jaxnbv.studies.engine.pictures import write_pictures
+from jaxnbv.studies.engine.run import replay, run_scene
 from jaxnbv.studies.parts.study import PartStudy
 from jaxnbv.studies.scenes import Split, part_scene
 from jaxnbv.surfaces import GeometricSPSR
@@ -57,7 +58,7 @@ def small_study(enough=10**6, **settings):
 
 @functools.cache
 def whole_record():
-    return small_study().run_scene(SCENE, RUN)
+    return run_scene(small_study(), SCENE, RUN)
 
 
 def pose_of(view):
@@ -130,7 +131,7 @@ def test_counts_are_those_of_the_segmenter_on_all_that_was_seen():
     record, study, scene = whole_record(), small_study(), part_scene(Split.TEST, SCENE)
     segmenter = CloudSegmenter(study.segmenter.network, scene.category, 500, scale=0.8)
     run = record["methods"]["discrete"]
-    again = study.seen(study.scene(SCENE), run)
+    again = replay(study, study.scene(SCENE), run)
     assert len(again) == len(run["counts"])
     labels = np.flatnonzero(np.asarray(scene.parts))
     for counts, cloud, (_, observations) in zip(run["counts"], clouds(record, "discrete"), again, strict=True):
@@ -150,7 +151,7 @@ def test_a_run_stops_once_every_part_has_the_largest_target():
     first = int(next(scans(whole_record(), "farthest")).count)
     study = small_study(first + 1, capacity=4096)
     study = eqx.tree_at(lambda s: s.segmenter, study, CloudSegmenter(study.segmenter.network, 0, 2048, scale=0.8))
-    record = study.run_scene(SCENE, ("farthest",))
+    record = run_scene(study, SCENE, ("farthest",))
     run = record["methods"]["farthest"]
     assert min(run["counts"][0]) < 100 <= min(run["counts"][-1])
     assert [min(counts) >= 100 for counts in run["counts"]] == [False] * (len(run["counts"]) - 1) + [True]

@@ -10,9 +10,9 @@ from matplotlib.path import Path as Polygon
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.scanning import Grid, SDFSurface, mesh_from_sdf, scan
+from jaxnbv.scanning.sdf.imprinted import ImprintedPyramid, pattern_distance
 from jaxnbv.search.candidates import sphere_candidates
-from jaxnbv.studies.scenes import PATTERNS, Framing, Pyramid, Split, hidden_view, pyramid_scene
-from jaxnbv.studies.scenes.pyramid import pattern_distance
+from jaxnbv.studies.scenes import PATTERNS, Framing, Split, hidden_view, pyramid_scene
 
 RNG = np.random.default_rng(0)
 CAMERA = Camera(height=24, width=24)
@@ -88,15 +88,15 @@ def test_patterns_against_polygons(x64, name):
 
 
 def to_scene(pyramid, own):
-    rotation = np.asarray(pyramid.rotation, np.float64)
-    return float(pyramid.scale) * np.asarray(own) @ rotation.T + np.asarray(pyramid.offset, np.float64)
+    rotation = np.asarray(pyramid.solid.rotation, np.float64)
+    return float(pyramid.solid.scale) * np.asarray(own) @ rotation.T + np.asarray(pyramid.solid.offset, np.float64)
 
 
 def of_pattern(pyramid, flat):
     """From the pattern's plane to the base's."""
-    turn, size = float(pyramid.turn), float(pyramid.size)
+    turn, size = float(pyramid.solid.turn), float(pyramid.solid.size)
     c, s = np.cos(turn), np.sin(turn)
-    return size * flat @ np.array([[c, s], [-s, c]]) + np.asarray(pyramid.place, np.float64)
+    return size * flat @ np.array([[c, s], [-s, c]]) + np.asarray(pyramid.solid.place, np.float64)
 
 
 def name_of(pyramid):
@@ -107,15 +107,15 @@ def test_the_mesh_lies_on_the_surface_and_holds_the_pyramid_less_its_imprint():
     for index in range(5):
         framing = list(Framing)[index % 2]
         pyramid = pyramid_scene(Split.VALIDATION, index, framing)
-        plain = eqx.tree_at(lambda p: p.depth, pyramid, jnp.asarray(0.0))
+        plain = eqx.tree_at(lambda p: p.solid.depth, pyramid, jnp.asarray(0.0))
         grid = Grid(100, 0.52 * framing.longest_side)
         mesh, whole = (mesh_from_sdf(sdf, grid).to_trimesh() for sdf in (pyramid, plain))
         assert np.abs(np.asarray(values(pyramid, mesh.vertices))).max() < 0.6 * grid.spacing
         assert np.median(np.abs(np.asarray(values(pyramid, mesh.vertices)))) < 1e-2 * grid.spacing
-        scale, height, size = (float(v) for v in (pyramid.scale, pyramid.height, pyramid.size))
+        scale, height, size = (float(v) for v in (pyramid.solid.scale, pyramid.solid.height, pyramid.solid.size))
         assert mesh.is_watertight
         assert whole.volume == pytest.approx(scale**3 * 4 * height / 3, rel=3e-3)
-        imprint = scale**3 * AREAS[name_of(pyramid)] * size**2 * float(pyramid.depth)
+        imprint = scale**3 * AREAS[name_of(pyramid)] * size**2 * float(pyramid.solid.depth)
         assert whole.volume - mesh.volume == pytest.approx(imprint, rel=0.03)
 
 
@@ -123,7 +123,7 @@ def test_the_mesh_lies_on_the_surface_and_holds_the_pyramid_less_its_imprint():
 def test_the_longest_side_of_the_box_is_as_asked_and_the_box_is_centred(framing):
     for index in range(8):
         pyramid = pyramid_scene(Split.TRAIN, index, framing)
-        corners = [[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [0, 0, float(pyramid.height)]]
+        corners = [[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [0, 0, float(pyramid.solid.height)]]
         corners = to_scene(pyramid, corners)
         np.testing.assert_allclose(np.asarray(values(pyramid, corners)), 0.0, atol=2e-6)
         low, high = corners.min(axis=0), corners.max(axis=0)
@@ -151,11 +151,11 @@ def test_no_pattern_breaks_through_a_side_and_none_reaches_the_apex():
     pyramids = scenes(Split.TRAIN, 2000)
     for index in range(2000):
         pyramid = jax.tree.map(lambda leaf, index=index: np.asarray(leaf)[index], pyramids)
-        corners = np.concatenate(OUTLINES[PATTERNS[pyramid.label]])
+        corners = np.concatenate(OUTLINES[PATTERNS[int(pyramid.solid.pattern)]])
         reach = np.abs(of_pattern(pyramid, corners)).max()
         assert reach < 0.9 + 1e-6
-        assert 1.0 - pyramid.depth / pyramid.height - reach > 0.01
-        assert 0 < 3 * pyramid.depth < pyramid.height
+        assert 1.0 - pyramid.solid.depth / pyramid.solid.height - reach > 0.01
+        assert 0 < 3 * pyramid.solid.depth < pyramid.solid.height
 
 
 def clear_of_outline(name, local, count, points=None):
@@ -166,16 +166,16 @@ def clear_of_outline(name, local, count, points=None):
 
 def faces(pyramid, count=400):
     """Points in the pyramid's own frame on floor, wall, base and sides, none of them within 0.01 of an edge."""
-    name, height, depth = name_of(pyramid), float(pyramid.height), float(pyramid.depth)
+    name, height, depth = name_of(pyramid), float(pyramid.solid.height), float(pyramid.solid.depth)
     flat = RNG.uniform(-1, 1, (20 * count, 2))
     floor = clear_of_outline(name, flat[is_inside(name, flat)], count)
     floor = np.insert(of_pattern(pyramid, floor), 2, depth, axis=1)
     wall = of_pattern(pyramid, on_outline(name, count))
     wall = np.insert(wall, 2, RNG.uniform(0.012, depth, count), axis=1)
     base = RNG.uniform(-0.99, 0.99, (20 * count, 2))
-    turn, size = float(pyramid.turn), float(pyramid.size)
+    turn, size = float(pyramid.solid.turn), float(pyramid.solid.size)
     c, s = np.cos(turn), np.sin(turn)
-    local = (base - np.asarray(pyramid.place, np.float64)) @ np.array([[c, -s], [s, c]]) / size
+    local = (base - np.asarray(pyramid.solid.place, np.float64)) @ np.array([[c, -s], [s, c]]) / size
     outside = ~is_inside(name, local)
     base = np.insert(clear_of_outline(name, local[outside], count, base[outside]), 2, 0.0, axis=1)
     w = RNG.uniform(0.012, height, count)
@@ -201,15 +201,15 @@ def test_points_of_the_faces_are_told_apart(framing):
 def test_scenes_spread_over_their_ranges_and_orientations():
     pyramids = scenes(Split.TRAIN, 1500)
     for leaf, low, high in (
-        (pyramids.height, 1.2, 1.6),
-        (pyramids.size, 0.7, 0.85),
-        (pyramids.turn, 0.0, 2 * np.pi),
-        (pyramids.depth, 0.07, 0.1),
+        (pyramids.solid.height, 1.2, 1.6),
+        (pyramids.solid.size, 0.7, 0.85),
+        (pyramids.solid.turn, 0.0, 2 * np.pi),
+        (pyramids.solid.depth, 0.07, 0.1),
     ):
         share = (np.asarray(leaf) - low) / (high - low)
         assert 0 <= share.min() < 0.01
         assert 0.99 < share.max() <= 1
-    rotation = np.asarray(pyramids.rotation, np.float64)
+    rotation = np.asarray(pyramids.solid.rotation, np.float64)
     np.testing.assert_allclose(rotation @ rotation.transpose(0, 2, 1), np.tile(np.eye(3), (1500, 1, 1)), atol=1e-5)
     np.testing.assert_allclose(np.linalg.det(rotation), 1.0, atol=1e-5)
     # The mean of 1500 random directions has components of standard deviation 1 / sqrt(3 * 1500).
@@ -218,7 +218,7 @@ def test_scenes_spread_over_their_ranges_and_orientations():
 
 def test_classes_take_turns_and_a_scene_is_the_same_however_it_is_built():
     together = scenes(Split.TEST, 12, Framing.WHOLE)
-    assert [int(label) for label in together.label] == [index % 5 for index in range(12)]
+    assert [int(label) for label in together.solid.pattern] == [index % 5 for index in range(12)]
     x = RNG.uniform(-0.7, 0.7, (200, 3))
     expected = np.asarray(jax.jit(jax.vmap(lambda pyramid: pyramid(x)))(together))
     for index in (0, 4, 11):
@@ -240,12 +240,14 @@ def test_a_hidden_view_does_not_show_the_pattern():
         assert len({*np.argmin(away, axis=1)}) > 2
         for pose in drawn:
             seen = scan(SDFSurface(pyramid), CAMERA, pose).to_numpy()[0]
-            offset, rotation, scale = map(np.asarray, (pyramid.offset, pyramid.rotation, pyramid.scale))
+            offset, rotation, scale = map(
+                np.asarray, (pyramid.solid.offset, pyramid.solid.rotation, pyramid.solid.scale)
+            )
             own = (seen - offset) @ rotation / scale
             assert len(own) > 100
             # Only base or sides: whatever is seen above the base lies on a slanted plane.
             above = own[own[:, 2] > 5e-3]
-            side = (np.abs(above[:, :2]).max(axis=1) - 1) * float(pyramid.height) + above[:, 2]
+            side = (np.abs(above[:, :2]).max(axis=1) - 1) * float(pyramid.solid.height) + above[:, 2]
             assert np.abs(side).max(initial=0.0) < 2e-2
 
 
@@ -258,8 +260,10 @@ def test_bad_input_is_refused():
     across = np.cross(outward, np.roll(outward, 1))
     across /= np.linalg.norm(across)
     rotation = np.stack([across, np.cross(-outward, across), -outward], axis=-1)
-    facing = eqx.tree_at(lambda p: (p.rotation, p.offset), pyramid, (jnp.asarray(rotation), jnp.asarray(0.6 * outward)))
+    facing = eqx.tree_at(
+        lambda p: (p.solid.rotation, p.solid.offset), pyramid, (jnp.asarray(rotation), jnp.asarray(0.6 * outward))
+    )
     with pytest.raises(InputError, match="shows from all 1 candidates"):
         hidden_view(facing, jax.random.key(0), CAMERA, sphere_candidates(1))
     with pytest.raises(InputError, match="must not be negative"):
-        Pyramid(*jax.tree.leaves(eqx.tree_at(lambda p: p.depth, pyramid, jnp.asarray(-0.1))))
+        ImprintedPyramid(*jax.tree.leaves(eqx.tree_at(lambda p: p.depth, pyramid.solid, jnp.asarray(-0.1))))

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from jaxnbv.checks import InputError
-from jaxnbv.studies.readers import class_meshes
+from jaxnbv.readers import class_meshes
 from jaxnbv.studies.scenes import HOUSEHOLD
 
 

@@ -1,4 +1,4 @@
-"""Readers of local copies of data sets."""
+"""Readers of local copies of data sets: recorded sequences, meshes by class."""
 
 import lazy_loader
 

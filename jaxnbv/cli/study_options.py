@@ -1,0 +1,66 @@
+"""What `jaxnbv study` is asked of any study."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+
+import typer
+
+from jaxnbv.cli.options import listed, running
+from jaxnbv.cli.registry import STUDY_MODELS
+from jaxnbv.studies.registry import studies
+
+if TYPE_CHECKING:
+    StudyName: TypeAlias = str
+    StudyModel: TypeAlias = str
+else:
+    StudyName, StudyModel = Literal[tuple(studies())], Literal[tuple(STUDY_MODELS)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyOptions:
+    name: Annotated[
+        StudyName, typer.Argument(metavar="NAME", help=f"Which: {', '.join(studies())}.", show_default=False)
+    ]
+    scenes: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N|A:B",
+            help="Scenes of the test split: the first N, or from A up to but without B.",
+            show_default="as many as the study has by default",
+        ),
+    ] = None
+    views: Annotated[
+        int | None, typer.Option(min=2, help="Views in all, the first one included.", show_default="the study's")
+    ] = None
+    methods: Annotated[
+        str | None, typer.Option(help="Which methods, separated by commas.", show_default="those of the table")
+    ] = None
+    own: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--method",
+            help="A method of your own in the same table, module:function. The function makes a Planner from the study "
+            "and a scene of it; the module is looked for in the current folder too. Can be given several times.",
+            show_default=False,
+        ),
+    ] = None
+    model: Annotated[
+        StudyModel | None,
+        typer.Option(
+            metavar="MODEL",
+            help="By what surfaces are imagined. " + listed(STUDY_MODELS.items()),
+            show_default="known, where there are known shapes",
+        ),
+    ] = None
+    out: Annotated[
+        Path | None,
+        running(
+            help="Output folder; the scenes already in it are not run again.",
+            show_default="runs/study-NAME[-MODEL][-quick]",
+        ),
+    ] = None
+    quick: Annotated[
+        bool, running("--quick", help="Small settings and few scenes: minutes, and not the full study.")
+    ] = False
+    workers: Annotated[int, running(min=1, help="Scenes at a time, in as many processes, which share the cores.")] = 1

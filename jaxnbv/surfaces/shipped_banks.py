@@ -1,0 +1,93 @@
+"""Banks of known shapes that ship: procedural objects of the training scenes, and a few real ones."""
+
+from collections.abc import Callable
+from importlib import resources
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnbv.checks import check_type, require
+from jaxnbv.scanning.sdf import UNUSED, ImprintedPyramid, LabelledSolid, Sampled, SignedDistance
+from jaxnbv.surfaces.placement import FreeRotation, ShapePoses, Upright
+from jaxnbv.surfaces.shape_bank import ShapeBank, encoded
+
+# One unit of the stored distances of a mesh, which are clipped to 127 of them.
+QUANTUM = 0.008
+# Upright, of any proportions.
+_FURNITURE = Upright(by_axis=True)
+
+
+class ShippedBank(NamedTuple):
+    """A bank that ships.
+
+    - `form`: makes any solid of its kind.
+    - `poses`: how such objects stand in a scene.
+    """
+
+    form: Callable[[], SignedDistance]
+    poses: ShapePoses
+
+
+def _labelled() -> LabelledSolid:
+    points, numbers = jnp.zeros((1, 3)), jnp.zeros(1)
+    shape = points, jnp.eye(3)[None], points, numbers, numbers, numbers
+    return LabelledSolid(jnp.full(1, UNUSED), jnp.zeros(1, bool), *shape)
+
+
+def _pyramid() -> ImprintedPyramid:
+    one, place = jnp.ones(()), jnp.zeros(2)
+    return ImprintedPyramid(jnp.asarray(0), one, one, place, one, one, jnp.eye(3), one, jnp.zeros(3))
+
+
+def _sampled() -> Sampled:
+    return Sampled(jnp.zeros((2, 2, 2)), jnp.zeros(3), 1.0, 1.0)
+
+
+SHIPPED_BANKS = {
+    "pyramid": ShippedBank(_pyramid, FreeRotation()),
+    "truck": ShippedBank(_labelled, FreeRotation()),
+    "household": ShippedBank(_labelled, _FURNITURE),
+    "parts": ShippedBank(_labelled, Upright(within=0.35, by_axis=True)),
+    "heat": ShippedBank(_labelled, _FURNITURE),
+    "household-real": ShippedBank(_sampled, _FURNITURE),
+}
+"""The banks that ship, by name."""
+
+
+def shape_bank(name: str) -> ShapeBank:
+    """A bank that ships.
+
+    - `name`: "pyramid", "truck", "household", "parts" or "heat", procedural objects of the training split; or
+      "household-real", pieces of furniture that were modelled by people, credited in `docs/how_to/known_shapes.md`.
+
+    **Raises:** `ValueError` for another name.
+    """
+    check_type(name, str, "the bank's name")
+    there = ", ".join(SHIPPED_BANKS)
+    require(name in SHIPPED_BANKS, f"there is no bank of shapes {name!r}: choose from {there}, or make one")
+    with resources.as_file(resources.files("jaxnbv.surfaces") / "shapes" / f"{name}.npz") as path:
+        return read_bank(path, SHIPPED_BANKS[name].form())
+
+
+def bank_poses(name: str) -> ShapePoses:
+    """How the shapes of a bank that ships stand in a scene."""
+    return SHIPPED_BANKS[name].poses
+
+
+def read_bank(path: Path, like: SignedDistance) -> ShapeBank:
+    """The bank that `scripts/make_banks.py` wrote of solids of this form.
+
+    Stored are numbers in sixteen bits, and in eight bits integers and distances on grids, these as differences of
+    neighbours in units of `QUANTUM`.
+    """
+    wide = {"f": np.float32, "i": np.int32, "b": np.bool_}
+    with np.load(path) as stored:
+        names = [str(one) for one in stored["names"]]
+        *leaves, extremes = (stored[key] for key in sorted(stored.files) if key != "names")
+    if isinstance(like, Sampled):
+        leaves[0] = QUANTUM * np.cumsum(leaves[0], axis=-1, dtype=np.int8).astype(np.float32)
+    arrays = [jnp.asarray(leaf.astype(wide[leaf.dtype.kind])) for leaf in (*leaves, extremes)]
+    return ShapeBank(jax.tree.unflatten(jax.tree.structure(like), arrays[:-1]), arrays[-1], encoded(names))
