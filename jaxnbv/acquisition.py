@@ -403,12 +403,11 @@ def expected_value(
     that JAX cannot trace.
     """
     inputs = _inputs(acquisition, seen)
+    # Under jit even what follows from known values is traced, so there is nothing that a check could look at.
+    if not is_traced(acquisition, inputs, jnp.zeros(())):
+        acquisition.check(inputs.observations.cloud)
     with functions_of_users():
         context = acquisition.context(inputs)
-        # Within a transformation even what follows from known values may be traced.
-        if not is_traced(acquisition, inputs, context):
-            with jax.ensure_compile_time_eval():
-                acquisition.check(inputs.observations.cloud)
         return jnp.mean(sample_scores(acquisition, context, surfaces, camera, poses, barrier), axis=0)
 
 
