@@ -54,14 +54,14 @@ class Bench:
 
     def observations(self, planner: nbv.Planner, views: int = 1) -> nbv.Observations:
         """After a first view, and others from around the object."""
-        observations, around = None, map(nbv.look_at, nbv.fibonacci_sphere(views, 2.5))
+        observations, around = None, map(nbv.look_at, nbv.geometry.fibonacci_sphere(views, 2.5))
         for index, pose in enumerate([self.first, *around][:views]):
             seen = observe_scene(self.scene, planner.camera, pose, nbv.SensorNoise(), jax.random.key(index))
             observations = planner.observe(observations, pose, seen) if observations else planner.init(pose, seen)
         return observations
 
 
-def rival_scan(surfaces: nbv.GridSurface, camera: nbv.Camera, poses: nbv.Pose) -> float:
+def rival_scan(surfaces: nbv.scanning.GridSurface, camera: nbv.Camera, poses: nbv.Pose) -> float:
     """Seconds that marching cubes and Embree take for the scans of all samples from all poses."""
     values, spacing = np.array(surfaces.values), surfaces.grid.spacing
     origins, directions = (np.asarray(rays).reshape(-1, 3) for rays in camera.rays(poses))
@@ -86,9 +86,9 @@ def coverage(bench: Bench) -> None:
     rival = min(rival_scan(surfaces, planner.camera, bench.candidates) for _ in range(2))
     bench.note("the same scans by marching cubes and Embree", rival)
     # Coverage reads no normals, and its step computes none.
-    points = jax.jit(lambda surfaces: nbv.scan_samples(surfaces, planner.camera, bench.candidates).points)
+    points = jax.jit(lambda surfaces: nbv.scanning.scan_samples(surfaces, planner.camera, bench.candidates).points)
     bench.take("coverage: 16 samples scanned from 120 candidates", lambda: points(surfaces), step=step, rival=rival)
-    seen = nbv.scan_samples(surfaces, planner.camera, bench.candidates)
+    seen = nbv.scanning.scan_samples(surfaces, planner.camera, bench.candidates)
 
     @jax.jit
     def values(cloud, seen):
@@ -129,14 +129,16 @@ def cross_entropy(bench: Bench) -> None:
     bench.take("cross-entropy: a step by halving", lambda: halving.propose(observations, bench.key), step=step)
     bench.take("cross-entropy: samples on the grid", lambda: planner.sampler.sample(observations, bench.key), step=step)
     surfaces = planner.sampler.sample(observations, bench.key)
-    scans = lambda: nbv.scan_samples(surfaces, planner.camera, bench.candidates)  # noqa: E731
+    scans = lambda: nbv.scanning.scan_samples(surfaces, planner.camera, bench.candidates)  # noqa: E731
     bench.take("cross-entropy: 16 samples scanned from 120 candidates", scans, step=step)
     seen = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), scans())
     known = planner.acquisition.context(inputs_of(observations))[0]
 
     @jax.jit
     def thinned(seen):
-        join = lambda scan: nbv.farthest_point_subsample(nbv.concatenate(known, scan), classifier.num_points)  # noqa: E731
+        join = lambda scan: nbv.geometry.farthest_point_subsample(
+            nbv.geometry.concatenate(known, scan), classifier.num_points
+        )  # noqa: E731
         return jax.lax.map(join, seen)
 
     bench.take("cross-entropy: farthest points of 1,920 clouds", lambda: thinned(seen), step=step)
@@ -155,7 +157,7 @@ def gradient(bench: Bench) -> None:
         "halving, 120 candidates": nbv.HalvingSearch(),
         "gradient, six starts": nbv.GradientSearch(dof=2, num_candidates=6),
         "gradient, 100 candidates": nbv.GradientSearch(dof=2),
-        "hybrid": nbv.HybridSearch(),
+        "hybrid": nbv.search.HybridSearch(),
     }
     for name, search in searches.items():
         other = nbv.Planner(planner.acquisition, search)

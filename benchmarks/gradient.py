@@ -37,14 +37,14 @@ SEARCHES = {
     "2-DOF, six starts, rate 5e-3": nbv.GradientSearch(dof=2, num_candidates=6, learning_rate=5e-3),
     "2-DOF, six starts, rate 1e-4": nbv.GradientSearch(dof=2, num_candidates=6, learning_rate=1e-4),
     "6-DOF": nbv.GradientSearch(dof=6),
-    "6-DOF, constrained": nbv.GradientSearch(space=nbv.ConstrainedPoses()),
-    "hybrid": nbv.HybridSearch(),
+    "6-DOF, constrained": nbv.GradientSearch(space=nbv.search.ConstrainedPoses()),
+    "hybrid": nbv.search.HybridSearch(),
 }
 # The paper leaves cross-entropy out of free 6-DOF poses.
 COVERAGE_ONLY = ("6-DOF",)
 
 
-def scene_and_first(task: str, mesh: str | None, seed: int, key: jax.Array) -> tuple[nbv.Surface, nbv.Pose]:
+def scene_and_first(task: str, mesh: str | None, seed: int, key: jax.Array) -> tuple[nbv.scanning.Surface, nbv.Pose]:
     """The object, and a random first view of it; of a pyramid one that does not show the pattern."""
     if task == "cross-entropy":
         pyramid = pyramid_scene(Split.TEST, seed, Framing.CLOSE_UP)
@@ -55,15 +55,15 @@ def scene_and_first(task: str, mesh: str | None, seed: int, key: jax.Array) -> t
 
 
 @eqx.filter_jit
-def value(planner: nbv.Planner, observations: nbv.Observations, surfaces: nbv.GridSurface, parameters):
+def value(planner: nbv.Planner, observations: nbv.Observations, surfaces: nbv.scanning.GridSurface, parameters):
     """The acquisition at six poses of the sphere, moved by parameters."""
     starts = sphere_candidates(6)
-    poses = jax.vmap(nbv.SpherePoses().retract)(starts, parameters)
+    poses = jax.vmap(nbv.search.SpherePoses().retract)(starts, parameters)
     return nbv.expected_value(planner.acquisition, observations.cloud, surfaces, planner.camera, poses)
 
 
 @eqx.filter_jit
-def gradient(planner: nbv.Planner, observations: nbv.Observations, surfaces: nbv.GridSurface, parameters):
+def gradient(planner: nbv.Planner, observations: nbv.Observations, surfaces: nbv.scanning.GridSurface, parameters):
     """Its gradient, and its value with it."""
     return jax.value_and_grad(lambda moved: value(planner, observations, surfaces, moved).sum())(parameters)
 

@@ -10,9 +10,10 @@ All choose by cross-entropy. The other kind is trucks, and pyramids for trucks.
 
 import dataclasses
 
-from jaxnbv import KnownShapes, Planner, SurfaceSampler
+from jaxnbv import Planner, SurfaceSampler
 from jaxnbv.studies.classification.study import ClassificationStudy
 from jaxnbv.studies.engine.study import Scene
+from jaxnbv.surfaces import KnownShapes
 from jaxnbv.surfaces.known_shapes import kind_of
 from jaxnbv.surfaces.shipped_banks import bank_poses, shape_bank
 

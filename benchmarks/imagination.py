@@ -52,9 +52,12 @@ TWO_SCALES = nbv.ScreenedSPSR().base
 VARIANTS: dict[str, Variant] = {
     "paper": lambda grid: (nbv.GeometricSPSR(), None),
     "+ carving": lambda grid: (nbv.GeometricSPSR(), nbv.Carving()),
-    "+ volume": lambda grid: (nbv.ScreenedSPSR(nbv.GeometricSPSR(), (nbv.OutsideBoundary(),)), nbv.Carving()),
-    "+ two scales": lambda grid: (nbv.ScreenedSPSR(TWO_SCALES, (nbv.OutsideBoundary(),)), nbv.Carving()),
-    "+ on surface": lambda grid: (nbv.ScreenedSPSR(values=(nbv.OutsideBoundary(), nbv.OnSurface())), nbv.Carving()),
+    "+ volume": lambda grid: (nbv.ScreenedSPSR(nbv.GeometricSPSR(), (nbv.surfaces.OutsideBoundary(),)), nbv.Carving()),
+    "+ two scales": lambda grid: (nbv.ScreenedSPSR(TWO_SCALES, (nbv.surfaces.OutsideBoundary(),)), nbv.Carving()),
+    "+ on surface": lambda grid: (
+        nbv.ScreenedSPSR(values=(nbv.surfaces.OutsideBoundary(), nbv.surfaces.OnSurface())),
+        nbv.Carving(),
+    ),
     "default": lambda grid: (nbv.ScreenedSPSR(), nbv.Carving()),
 }
 # What the table shows: heading, key of the record, digits.
@@ -77,12 +80,12 @@ def planner_of(variant: Variant) -> nbv.Planner:
     return nbv.Planner(nbv.Coverage(), sampler=sampler, capacity=4096, max_views=VIEWS)
 
 
-def objects_of(arguments: argparse.Namespace) -> dict[str, Callable[[], nbv.Surface]]:
+def objects_of(arguments: argparse.Namespace) -> dict[str, Callable[[], nbv.scanning.Surface]]:
     """How to make each object, by the name "class/object"."""
     alone = not arguments.mesh
     scenes = (2 if alone else 0) if arguments.scenes is None else arguments.scenes
     parts = (["chair", "mug", "motorbike"] if alone else []) if arguments.parts is None else arguments.parts
-    found: dict[str, Callable[[], nbv.Surface]] = {}
+    found: dict[str, Callable[[], nbv.scanning.Surface]] = {}
     for index in range(scenes):
         found[f"pyramid/{index}"] = lambda i=index: nbv.SDFSurface(pyramid_scene(Split.VALIDATION, i))
     for name in parts:
@@ -98,11 +101,11 @@ def objects_of(arguments: argparse.Namespace) -> dict[str, Callable[[], nbv.Surf
 def with_bank(planner: nbv.Planner, bank: nbv.ShapeBank, name: str) -> nbv.Planner:
     """One that has seen the shapes of a bank, but for the object of this name."""
     others = [row for row, known in enumerate(bank.names) if known != name]
-    sampler = planner.sampler.with_bank(bank.chosen(others), nbv.Upright(by_axis=True))
+    sampler = planner.sampler.with_bank(bank.chosen(others), nbv.surfaces.Upright(by_axis=True))
     return dataclasses.replace(planner, sampler=sampler)
 
 
-def random_views(scene: nbv.Surface, key: jax.Array) -> list[tuple[nbv.Pose, nbv.PointCloud]]:
+def random_views(scene: nbv.scanning.Surface, key: jax.Array) -> list[tuple[nbv.Pose, nbv.PointCloud]]:
     """Views from random directions, each of which sees something of the object."""
     views = []
     for index in range(100):

@@ -18,7 +18,7 @@ from jaxnbv.viz.style import BEFORE, GREY, INK, LINE, NEW
 TINT = "#f0a45c"
 
 
-def picture(surface: nbv.Surface, eye: nbv.Pose, seen: nbv.PointCloud, pixels: int = 440) -> np.ndarray:
+def picture(surface: nbv.scanning.Surface, eye: nbv.Pose, seen: nbv.PointCloud, pixels: int = 440) -> np.ndarray:
     """The surface lit from beside the eye, tinted where it lies at scanned points; four rays a pixel, RGBA."""
     camera = nbv.Camera(2.0 * math.atan(1.9 / 11.0), 2 * pixels, 2 * pixels)
     view = nbv.scan(surface, camera, eye)
@@ -43,7 +43,9 @@ def crop(images: list[np.ndarray]) -> tuple[slice, slice]:
     return spans[0], spans[1]
 
 
-def draw_samples(path: Path, scene: nbv.Surface, view: tuple, named: dict[str, nbv.Planner], key: jax.Array) -> None:
+def draw_samples(
+    path: Path, scene: nbv.scanning.Surface, view: tuple, named: dict[str, nbv.Planner], key: jax.Array
+) -> None:
     """The true surface, and four surfaces that each of two models imagines after one view, seen from its side."""
     pose, scan = view
     away, up = np.asarray(pose.position) / 2.5, np.array([0.0, 1.0, 0.0])

@@ -77,7 +77,7 @@ METHODS = {
 }
 
 
-def planned(trial: Trial, search: nbv.Search, rays: int, first: int, seed: int) -> tuple[list[int], list[float]]:
+def planned(trial: Trial, search: nbv.search.Search, rays: int, first: int, seed: int) -> tuple[list[int], list[float]]:
     """The candidates that a planner takes, and seconds for each choice after those that compile."""
     distance = float(np.linalg.norm(trial.poses.position[0]))
     needed = 2.0 * math.asin(min(1.05 * trial.mesh.bounding_radius / distance, 1.0))
@@ -117,7 +117,9 @@ def greedy(trial: Trial, first: int) -> list[int]:
 def uniform(trial: Trial, first: int) -> list[int]:
     """The candidates nearest to a lattice of as many places."""
     places = np.asarray(trial.poses.position, np.float64)
-    lattice = np.array(nbv.fibonacci_sphere(trial.protocol.views, float(np.linalg.norm(places[0]))), np.float64)
+    lattice = np.array(
+        nbv.geometry.fibonacci_sphere(trial.protocol.views, float(np.linalg.norm(places[0]))), np.float64
+    )
     if trial.half:
         lattice[:, 1] = np.abs(lattice[:, 1])
     nearest = np.argmin(np.linalg.norm(places[None] - lattice[:, None], axis=2), axis=1)

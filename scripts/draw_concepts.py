@@ -42,7 +42,7 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def draw_posterior(
-    planner: nbv.Planner, observations: nbv.Observations, surfaces: nbv.GridSurface, scene: nbv.SDFSurface
+    planner: nbv.Planner, observations: nbv.Observations, surfaces: nbv.scanning.GridSurface, scene: nbv.SDFSurface
 ) -> Figure:
     """What one view saw; outlines of samples on the plane x = 0, and the probability of being inside there."""
     axis = np.asarray(planner.sampler.grid.axis)
@@ -77,7 +77,10 @@ def draw_posterior(
 
 
 def draw_utility(
-    planner: nbv.Planner, observations: nbv.Observations, surfaces: nbv.GridSurface, proposal: nbv.Proposal
+    planner: nbv.Planner,
+    observations: nbv.Observations,
+    surfaces: nbv.scanning.GridSurface,
+    proposal: nbv.search.Proposal,
 ) -> Figure:
     """Imagined scans of the best candidate and of one of the worst tenth, coloured by what each point is worth."""
     order = np.argsort(np.asarray(proposal.values))
@@ -85,7 +88,7 @@ def draw_utility(
     poses = proposal.candidates[jnp.asarray(chosen)]
     camera = dataclasses.replace(planner.camera, height=PIXELS, width=PIXELS)
     few = jax.tree.map(lambda rows: rows[:SHOWN], surfaces)
-    fine, coarse = (nbv.scan_samples(few, one, poses) for one in (camera, planner.camera))
+    fine, coarse = (nbv.scanning.scan_samples(few, one, poses) for one in (camera, planner.camera))
     context = context_of(planner.acquisition, observations)
     figure = Figure(figsize=(9.6, 5.2))
     highest = 0.0
@@ -123,7 +126,7 @@ def draw_utility(
     return figure
 
 
-def draw_search(found: dict[str, nbv.Proposal], quantities: dict[str, nbv.Quantity]) -> Figure:
+def draw_search(found: dict[str, nbv.search.Proposal], quantities: dict[str, nbv.Quantity]) -> Figure:
     """Maps of the sphere of directions, by one search each."""
     figure = Figure(figsize=(9.6, 2.3))
     for index, (name, proposal) in enumerate(found.items()):
@@ -138,7 +141,7 @@ def draw_known() -> Figure:
     pyramid = pyramid_scene(Split.VALIDATION, 2)
     first = hidden_view(pyramid, jax.random.key(0))
     plain = dataclasses.replace(nbv.SurfaceSampler.preset("screened", solid=True), grid=nbv.Grid(100), num_samples=16)
-    with_bank = plain.with_bank(nbv.shape_bank("pyramid"), nbv.FreeRotation())
+    with_bank = plain.with_bank(nbv.shape_bank("pyramid"), nbv.surfaces.FreeRotation())
     planner = nbv.Planner(nbv.Coverage(), sampler=plain)
     scan = nbv.scan(nbv.SDFSurface(pyramid), planner.camera, first)
     observations = planner.init(first, nbv.SensorNoise()(scan, jax.random.key(0)))
@@ -155,7 +158,7 @@ def draw_known() -> Figure:
     figure = Figure(figsize=(9.6, 4.6))
     for row, (head, surfaces, chosen, labels) in enumerate(rows):
         figure.text(0.012, 0.955 - 0.49 * row, head, color=INK, fontsize=10)
-        scans = nbv.scan_samples(surfaces, camera, below[None])
+        scans = nbv.scanning.scan_samples(surfaces, camera, below[None])
         for column, (index, label) in enumerate(zip(chosen, labels, strict=True)):
             axes = figure.add_axes((0.01 + 0.2 * column, 0.55 - 0.49 * row, 0.19, 0.385))
             image = look(jax.tree.map(lambda leaf, i=index: leaf[i, 0], scans), camera, below, cloud)
@@ -187,7 +190,7 @@ def main() -> None:
     with mpl.rc_context(STYLE):
         save(draw_posterior(planner, observations, surfaces, scene), folder / "concepts_posterior.png")
         save(draw_utility(planner, observations, surfaces, proposal), folder / "concepts_utility.png")
-        searches = (nbv.DiscreteSearch(), nbv.UncertaintyView(), nbv.FarthestView())
+        searches = (nbv.DiscreteSearch(), nbv.search.UncertaintyView(), nbv.FarthestView())
         planners = {type(search).__name__: dataclasses.replace(planner, search=search) for search in searches}
         found = {name: one.choose(observations, surfaces, search_key) for name, one in planners.items()}
         quantities = {name: one.quantity for name, one in planners.items()}

@@ -28,7 +28,7 @@ POSES = nbv.SphereCandidates(6).poses()
 SMALL = nbv.Camera(height=4, width=4)
 BALL = nbv.sdf.Sphere(1.0)
 MODEL = nbv.GeometricSPSR(0.05, 0.2, 6)
-RESIDUAL = nbv.ScreenedSPSR(MODEL, (nbv.OnSurface(),))
+RESIDUAL = nbv.ScreenedSPSR(MODEL, (nbv.surfaces.OnSurface(),))
 BANK = nbv.ShapeBank.of([BALL])
 # Until the program ends.
 _HELD = tempfile.TemporaryDirectory()
@@ -77,31 +77,31 @@ CALLS = {
     SMALL.strided: {"stride": 2},
     nbv.Carving: {"volume": nbv.Box(), "margin_voxels": 1.0},
     nbv.ColdestPoint: {"heat": (0.0, 1.0, 0.0), "reached_only": False, "workers": 1},
-    nbv.ConstrainedPoses: {"nearest": 2.0, "farthest": 3.0, "off_axis": 0.1},
+    nbv.search.ConstrainedPoses: {"nearest": 2.0, "farthest": 3.0, "off_axis": 0.1},
     nbv.CrossEntropy: {"classifier": number_of_points, "num_points": 16},
     nbv.DiscreteSearch: {"candidates": 6},
-    nbv.EntropyReduction: {"classifier": number_of_points, "num_points": 16},
+    nbv.tasks.EntropyReduction: {"classifier": number_of_points, "num_points": 16},
     nbv.ExpectedUtilityImprovement: {"utility": number_of_points, "num_points": 16},
     nbv.FarthestView: {"candidates": 6},
     nbv.Frame: {"scale": 1.0, "center": (0.0, 0.0, 0.0)},
     nbv.Frame.fit: {"points": DIRECTIONS, "longest_side": 2.5},
-    nbv.FreePoses: {"radius": 2.5},
+    nbv.search.FreePoses: {"radius": 2.5},
     nbv.GeometricSPSR: {"lengthscale": 0.05, "variance": 0.2, "truncation": 6, "noise": 0.01, "nu": 1.5},
     nbv.GivenPoses: {"given": POSES},
     nbv.GradientSearch: {"dof": 2, "space": None, "num_starts": 2, "iterations": 2, "learning_rate": 0.01}
     | {"num_candidates": 6, "solver": None, "candidates": None},
     nbv.Grid: {"resolution": 8, "half_extent": 1.5},
     nbv.HalvingSearch: {"candidates": 6, "num_first_samples": 2},
-    nbv.HeatProblem: {"source": (0.0, 1.0, 0.0), "radius": 0.1, "power": 10.0, "duration": 5.0, "steps": 2}
+    nbv.tasks.HeatProblem: {"source": (0.0, 1.0, 0.0), "radius": 0.1, "power": 10.0, "duration": 5.0, "steps": 2}
     | {"initial": 0.0},
     nbv.HostClassifier: {"function": number_of_points, "num_classes": 3},
     nbv.HostSegmenter: {"function": number_of_points, "num_parts": 3},
     nbv.SurfaceSampler: {"model": MODEL, "grid": nbv.Grid(8), "num_samples": 2, "carving": nbv.Carving()}
     | {"obstacles": None},
     nbv.SurfaceSampler.preset: {"name": "paper", "longest_side": 2.5, "quick": True, "volume": None, "solid": False},
-    nbv.MixedEntropy: {"classifier": number_of_points, "threshold": 0.5, "num_points": 16},
-    nbv.OnSurface: {"num_points": 10, "noise": 0.1},
-    nbv.OutsideBoundary: {"volume": nbv.Box(), "num_points": 10, "value": 1.0, "noise": 0.5},
+    nbv.tasks.MixedEntropy: {"classifier": number_of_points, "threshold": 0.5, "num_points": 16},
+    nbv.surfaces.OnSurface: {"num_points": 10, "noise": 0.1},
+    nbv.surfaces.OutsideBoundary: {"volume": nbv.Box(), "num_points": 10, "value": 1.0, "noise": 0.5},
     nbv.Planner: {"acquisition": nbv.Coverage(), "search": nbv.DiscreteSearch(6), "camera": SMALL}
     | {"sampler": nbv.SurfaceSampler(MODEL, nbv.Grid(8), 2), "cost": None, "capacity": 32, "max_views": 3},
     nbv.PointCloud.from_arrays: {"points": DIRECTIONS, "normals": DIRECTIONS, "capacity": 32},
@@ -111,31 +111,37 @@ CALLS = {
     nbv.Pose: {"rotation": np.eye(3), "position": np.zeros(3)},
     nbv.RandomView: {"candidates": 6},
     nbv.SDFSurface: {"sdf": BALL, "bounding_radius": 2.0},
-    nbv.ScreenedSPSR: {"base": MODEL, "values": (nbv.OnSurface(),), "level_deviation": 0.5, "offset": 0.1},
-    nbv.SeenEmpty: {"num_points": 10, "value": 2.0, "noise": 1.0},
+    nbv.ScreenedSPSR: {"base": MODEL, "values": (nbv.surfaces.OnSurface(),), "level_deviation": 0.5, "offset": 0.1},
+    nbv.surfaces.SeenEmpty: {"num_points": 10, "value": 2.0, "noise": 1.0},
     nbv.SensorNoise: {"points": 0.01, "normals": 0.01},
     nbv.AcquisitionList: {"members": (nbv.Coverage(),)},
     nbv.SoftPartCount: {"segmenter": number_of_points, "target": 60.0},
-    nbv.TieBreakSearch: {"candidates": 6, "second": nbv.Coverage()},
+    nbv.search.TieBreakSearch: {"candidates": 6, "second": nbv.Coverage()},
     nbv.SphereCandidates: {"count": 6, "radius": 2.5, "min_elevation": 0.0, "up": (0.0, 1.0, 0.0)},
-    nbv.SpherePoses: {"radius": 2.5},
+    nbv.search.SpherePoses: {"radius": 2.5},
     nbv.TriangleMesh.from_arrays: {"vertices": np.eye(3), "faces": [[0, 1, 2]]},
-    nbv.UncertaintyView: {"candidates": 6},
+    nbv.search.UncertaintyView: {"candidates": 6},
     readers.class_meshes: {"folder": COPY, "classes": ["bed"]},
     chosen_of_bank: {"indices": [0]},
-    nbv.AsGiven: {"scale": (0.9, 1.1), "by_axis": False},
-    nbv.FreeRotation: {"scale": (0.9, 1.1), "by_axis": False},
-    with_bank: {"bank": BANK, "poses": nbv.Upright()},
-    nbv.KnownShapes: {"bank": BANK, "residual": RESIDUAL, "poses": nbv.Upright(), "box": nbv.Box(), "unknown": MODEL}
+    nbv.surfaces.AsGiven: {"scale": (0.9, 1.1), "by_axis": False},
+    nbv.surfaces.FreeRotation: {"scale": (0.9, 1.1), "by_axis": False},
+    with_bank: {"bank": BANK, "poses": nbv.surfaces.Upright()},
+    nbv.surfaces.KnownShapes: {
+        "bank": BANK,
+        "residual": RESIDUAL,
+        "poses": nbv.surfaces.Upright(),
+        "box": nbv.Box(),
+        "unknown": MODEL,
+    }
     | {"num_starts": 8, "noise_scale": 0.1, "inverse_temperature": 20.0, "misfit_of_none": 0.6},
     nbv.ShapeBank.from_meshes: {"meshes": [MESH], "resolution": 8, "sheet": 0.05, "names": ["a"], "progress": False},
     nbv.ShapeBank.of: {"solids": [BALL], "names": ["ball"]},
-    nbv.Upright: {"axis": (0.0, 1.0, 0.0), "within": 1.0, "scale": (0.9, 1.1), "by_axis": False},
+    nbv.surfaces.Upright: {"axis": (0.0, 1.0, 0.0), "within": 1.0, "scale": (0.9, 1.1), "by_axis": False},
     nbv.shape_bank: {"name": "heat"},
     nbv.ValueBelow: {"value": 0.1},
-    nbv.concatenate: {"first": CLOUD, "second": CLOUD},
-    nbv.farthest_point_subsample: {"cloud": CLOUD, "count": 3},
-    nbv.fibonacci_sphere: {"count": 6, "radius": 1.0, "min_elevation": 0.0},
+    nbv.geometry.concatenate: {"first": CLOUD, "second": CLOUD},
+    nbv.geometry.farthest_point_subsample: {"cloud": CLOUD, "count": 3},
+    nbv.geometry.fibonacci_sphere: {"count": 6, "radius": 1.0, "min_elevation": 0.0},
     nbv.load_mesh: {"path": "nowhere.obj"},
     nbv.look_at: {"position": (0.0, 0.0, 2.5), "target": (0.0, 0.0, 0.0), "up": (0.0, 1.0, 0.0)},
     nbv.mesh_from_sdf: {"sdf": BALL, "grid": nbv.Grid(8)},

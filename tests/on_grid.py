@@ -14,4 +14,4 @@ def balls(grid, radii, centres=None):
     """One ball a sample, about the origin unless centres are given."""
     centres = np.zeros((len(radii), 3)) if centres is None else centres
     away = [np.linalg.norm(nodes(grid.axis) - centre, axis=-1) for centre in centres]
-    return nbv.GridSurface.from_values(np.stack(away) - np.reshape(radii, (-1, 1, 1, 1)), 0.0, grid)
+    return nbv.scanning.GridSurface.from_values(np.stack(away) - np.reshape(radii, (-1, 1, 1, 1)), 0.0, grid)

@@ -216,17 +216,17 @@ REFUSED = {
     "rays that differ in number": (lambda: nbv.PointCloud(SCAN.points, SCAN.normals, SCAN.mask, SCAN.mask[:5]), "(5,)"),
     "a mask of numbers": (lambda: nbv.PointCloud(CLOUD.points, CLOUD.normals, jnp.ones(60)), "truths"),
     "a batch to measure": (
-        lambda: nbv.metrics.coverage([nbv.View(POSE, SCANS, CLOUD, None, SMALL)], D),
+        lambda: nbv.scanning.metrics.coverage([nbv.View(POSE, SCANS, CLOUD, None, SMALL)], D),
         "rows of shape",
     ),
     "text as a cloud": (lambda: nbv.ScreenedSPSR(MODEL).condition("x"), "'x'"),
     "complex coordinates": (lambda: nbv.PointCloud.from_arrays(D + 1j, D), "real numbers"),
     "text for a frame": (lambda: nbv.Frame().to_scene("x"), "real numbers"),
     "a masked truth": (
-        lambda: nbv.metrics.coverage([VIEW], np.ma.masked_array(D, D > 0)),
+        lambda: nbv.scanning.metrics.coverage([VIEW], np.ma.masked_array(D, D > 0)),
         "masked",
     ),
-    "normals of points of the plane": (lambda: nbv.estimate_normals(D[:, :2], (0.0, 0.0, 5.0)), "(60, 2)"),
+    "normals of points of the plane": (lambda: nbv.geometry.estimate_normals(D[:, :2], (0.0, 0.0, 5.0)), "(60, 2)"),
     "text as a radius": (lambda: nbv.sdf.Sphere("x"), "'x'"),
     "a turn about the plane": (lambda: nbv.sdf.Sphere(1.0).rotate([0.0, 1.0], 1.0), "(2,)"),
     "united with a number": (lambda: nbv.sdf.Union(nbv.sdf.Sphere(1.0), 3), "is 3"),
@@ -274,7 +274,10 @@ REFUSED = {
         "'sure'",
     ),
     "parts that are no names": (lambda: nbv.Found(parts=3), "3"),
-    "a boundary of text": (lambda: nbv.OutsideBoundary(lambda x: "far"), "gives no signed distances of points"),
+    "a boundary of text": (
+        lambda: nbv.surfaces.OutsideBoundary(lambda x: "far"),
+        "gives no signed distances of points",
+    ),
     "a gap among images": (lambda: reopened("gap", lambda f: (f / "image_01.npz").unlink()), "not image_01.npz"),
     "a link to no image": (lambda: reopened("link", dangling), "image_01.npz is damaged"),
     "a pipe as an image": (lambda: reopened("pipe", piped), "image_01.npz is damaged"),
@@ -311,28 +314,34 @@ REFUSED = {
     ),
     "a ball of no size around a solid": (lambda: nbv.SDFSurface(nbv.sdf.Sphere(1.0), 0.0), "must be positive"),
     "values of another size": (
-        lambda: nbv.GridSurface.from_values(np.zeros((9, 9, 9)), 0.0, nbv.Grid(12)),
+        lambda: nbv.scanning.GridSurface.from_values(np.zeros((9, 9, 9)), 0.0, nbv.Grid(12)),
         "do not fit a grid of 12",
     ),
     "values that are not finite": (
-        lambda: nbv.GridSurface.from_values(np.full((12, 12, 12), np.nan), 0.0, nbv.Grid(12)),
+        lambda: nbv.scanning.GridSurface.from_values(np.full((12, 12, 12), np.nan), 0.0, nbv.Grid(12)),
         "not finite",
     ),
     "a batch of grids as one": (
-        lambda: nbv.GridSurface.from_values(np.ones((2, 12, 12, 12)), 0.0, nbv.Grid(12)).trace(D, D),
+        lambda: nbv.scanning.GridSurface.from_values(np.ones((2, 12, 12, 12)), 0.0, nbv.Grid(12)).trace(D, D),
         "scan_samples",
     ),
     "a grid turned inside out": (lambda: nbv.Grid(half_extent=-1.0), "half extent is -1"),
     **{
         f"no candidates for {kind.__name__}": (lambda kind=kind: kind(0), "0 candidates")
-        for kind in (nbv.DiscreteSearch, nbv.HalvingSearch, nbv.FarthestView, nbv.RandomView, nbv.UncertaintyView)
+        for kind in (
+            nbv.DiscreteSearch,
+            nbv.HalvingSearch,
+            nbv.FarthestView,
+            nbv.RandomView,
+            nbv.search.UncertaintyView,
+        )
     },
     "no first samples": (lambda: nbv.HalvingSearch(9, 0), "num_first_samples is 0"),
     "an object out of the image": (
-        lambda: nbv.Planner(nbv.Coverage(), nbv.GradientSearch(space=nbv.ConstrainedPoses(off_axis=0.3))),
+        lambda: nbv.Planner(nbv.Coverage(), nbv.GradientSearch(space=nbv.search.ConstrainedPoses(off_axis=0.3))),
         "off_axis is 0.3 rad but the image ends 0.262 rad",
     ),
-    "a utility as a second question": (lambda: nbv.TieBreakSearch(12, second=lambda cloud: 0.0), "second"),
+    "a utility as a second question": (lambda: nbv.search.TieBreakSearch(12, second=lambda cloud: 0.0), "second"),
     "no samples of a posterior": (lambda: POSTERIOR.sample(KEY, 0), "asked for 0 samples"),
     "a target of no points": (lambda: nbv.SoftPartCount(lambda cloud: None, 0.0), "N_target is"),
     "no points for a classifier": (lambda: CloudClassifier(CLASSIFIER, num_points=0), "num_points is 0"),

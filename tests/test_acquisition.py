@@ -18,7 +18,7 @@ from jaxnbv.scanning.sdf import Sphere
 CAMERA = nbv.Camera(height=6, width=7)
 GRID = nbv.Grid(20)
 # The last looks away from the object and sees nothing.
-POSES = nbv.look_at(jnp.concatenate([nbv.fibonacci_sphere(6, 2.5), jnp.array([[0.0, 3.0, 0.0]])]))
+POSES = nbv.look_at(jnp.concatenate([nbv.geometry.fibonacci_sphere(6, 2.5), jnp.array([[0.0, 3.0, 0.0]])]))
 POSES = eqx.tree_at(lambda pose: pose.rotation, POSES, POSES.rotation.at[-1].set(jnp.eye(3)))
 
 
@@ -155,8 +155,8 @@ ALL = {
     "coverage": nbv.Coverage(),
     "new surface": nbv.NewSurface(0.3),
     "cross-entropy": nbv.CrossEntropy(linear, num_points=8),
-    "reduction": nbv.EntropyReduction(linear, num_points=8),
-    "mixed": nbv.MixedEntropy(linear, num_points=8),
+    "reduction": nbv.tasks.EntropyReduction(linear, num_points=8),
+    "mixed": nbv.tasks.MixedEntropy(linear, num_points=8),
     "parts": nbv.ExpectedUtilityImprovement(nbv.SoftPartCount(Linear(jnp.asarray(WEIGHTS.T[:, :3], jnp.float32)), 9.0)),
     "utility": nbv.ExpectedUtilityImprovement(height, num_points=8),
     "heat": ACQUISITIONS["heat"],

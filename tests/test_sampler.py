@@ -70,12 +70,12 @@ AWAY = np.linalg.norm(np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axi
 SHARE = (AWAY[..., None] < RADII).mean(axis=-1)
 
 
-class Balls(nbv.Fields):
+class Balls(nbv.surfaces.Fields):
     def __call__(self, x):
         return 0.3 + jnp.linalg.norm(x, axis=-1) - jnp.asarray(RADII, x.dtype)[:, None]
 
 
-class BallsPosterior(nbv.SurfacePosterior):
+class BallsPosterior(nbv.surfaces.SurfacePosterior):
     """Whatever was seen, balls of eight radii, of the level 0.3."""
 
     level: Float[Array, ""]
@@ -153,7 +153,7 @@ def test_a_posterior_at_hand_is_not_asked_for_again():
 def test_scans_of_samples_end_at_the_surroundings():
     wall = nbv.Obstacles((nbv.sdf.Cuboid([0.1, 1.0, 1.0]).translate([1.4, 0.0, -0.5]),))
     surfaces = balls().sample(SCANS[0], KEY)
-    free, ended = (nbv.scan_samples(surfaces, CAMERA, POSES, b) for b in (None, wall.barrier(CAMERA, POSES)))
+    free, ended = (nbv.scanning.scan_samples(surfaces, CAMERA, POSES, b) for b in (None, wall.barrier(CAMERA, POSES)))
     assert ended.mask[:, 0].any()
     assert free.mask[:, 1].any()
     assert not ended.mask[:, 1].any()
@@ -165,7 +165,11 @@ def test_scans_of_samples_end_at_the_surroundings():
 def test_another_box_takes_the_place_of_the_default_one_alone():
     box, own = nbv.Box.cube(1.4), nbv.Box.cube(2.0)
     model = nbv.ScreenedSPSR(
-        values=(nbv.OutsideBoundary(), nbv.OutsideBoundary(own, 77), nbv.OutsideBoundary(value=2.0))
+        values=(
+            nbv.surfaces.OutsideBoundary(),
+            nbv.surfaces.OutsideBoundary(own, 77),
+            nbv.surfaces.OutsideBoundary(value=2.0),
+        )
     )
     before = nbv.SurfaceSampler(model, GRID, 5, nbv.Carving(margin_voxels=1.5))
     after = before.within(box)

@@ -42,7 +42,7 @@ PROGRAM = """
 
     camera, first, key = nbv.Camera(height=12, width=12), nbv.look_at((0.3, 1.0, 2.3)), jax.random.key(1)
     # Few values, since each device solves for all of them.
-    model = nbv.ScreenedSPSR(nbv.GeometricSPSR(0.05, truncation=8), (nbv.OutsideBoundary(num_points=40),))
+    model = nbv.ScreenedSPSR(nbv.GeometricSPSR(0.05, truncation=8), (nbv.surfaces.OutsideBoundary(num_points=40),))
     sampler = nbv.SurfaceSampler(model, nbv.Grid(24), num_samples=9)
     planner = nbv.Planner(nbv.NewSurface(), nbv.DiscreteSearch(20), camera, sampler, capacity=64)
     halving = dataclasses.replace(planner, search=nbv.HalvingSearch(20))

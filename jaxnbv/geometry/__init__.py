@@ -1,1 +1,12 @@
 """Poses, cameras, clouds, and the frame that they are in."""
+
+from jaxnbv.geometry.camera import Camera as Camera
+from jaxnbv.geometry.cloud import PointCloud as PointCloud
+from jaxnbv.geometry.cloud import concatenate as concatenate
+from jaxnbv.geometry.cloud import farthest_point_subsample as farthest_point_subsample
+from jaxnbv.geometry.frame import Frame as Frame
+from jaxnbv.geometry.normals import estimate_normals as estimate_normals
+from jaxnbv.geometry.pose import Pose as Pose
+from jaxnbv.geometry.pose import fibonacci_sphere as fibonacci_sphere
+from jaxnbv.geometry.pose import look_at as look_at
+from jaxnbv.geometry.volume import Box as Box

@@ -20,5 +20,6 @@ from jaxnbv.scanning.scanner import Noise as Noise
 from jaxnbv.scanning.scanner import SensorNoise as SensorNoise
 from jaxnbv.scanning.scanner import Surface as Surface
 from jaxnbv.scanning.scanner import scan as scan
+from jaxnbv.scanning.screened_poisson import screened_poisson as screened_poisson
 from jaxnbv.scanning.sphere_tracing import SDFSurface as SDFSurface
 from jaxnbv.scanning.sphere_tracing import as_surface as as_surface

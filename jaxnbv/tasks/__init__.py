@@ -6,6 +6,7 @@ from jaxnbv.tasks.classification import EntropyReduction as EntropyReduction
 from jaxnbv.tasks.classification import MixedEntropy as MixedEntropy
 from jaxnbv.tasks.coverage import Coverage as Coverage
 from jaxnbv.tasks.coverage import NewSurface as NewSurface
+from jaxnbv.tasks.diffusion import HeatProblem as HeatProblem
 from jaxnbv.tasks.heat import Coldest as Coldest
 from jaxnbv.tasks.heat import ColdestPoint as ColdestPoint
 from jaxnbv.tasks.heat import body_temperature as body_temperature

@@ -95,7 +95,9 @@ def _balls(*radii):
     """Samples that are balls."""
     x, y, z = np.meshgrid(GRID.axis, GRID.axis, GRID.axis, indexing="ij")
     distance = np.sqrt(x**2 + y**2 + z**2)
-    return nbv.GridSurface.from_values(jnp.stack([jnp.asarray(distance - r, jnp.float32) for r in radii]), 0.0, GRID)
+    return nbv.scanning.GridSurface.from_values(
+        jnp.stack([jnp.asarray(distance - r, jnp.float32) for r in radii]), 0.0, GRID
+    )
 
 
 def _state(planner):

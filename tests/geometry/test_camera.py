@@ -186,7 +186,7 @@ def test_look_at_and_rays_run_under_jit_and_are_differentiable():
 @pytest.mark.parametrize("count", [12, 120, 1000])
 def test_fibonacci_sphere_is_even(count):
     """Nearest neighbours against Fejes Toth's bound, which no set of n points on the sphere can exceed."""
-    points = np.asarray(nbv.fibonacci_sphere(count, 2.5), dtype=np.float64)
+    points = np.asarray(nbv.geometry.fibonacci_sphere(count, 2.5), dtype=np.float64)
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), 2.5, atol=1e-5)
     unit = points / 2.5
     distance = np.linalg.norm(unit[:, None] - unit[None], axis=-1) + 9 * np.eye(count)
@@ -200,7 +200,7 @@ def test_fibonacci_sphere_is_even(count):
 
 
 def test_a_batch_of_poses_is_iterated_once():
-    poses = nbv.look_at(nbv.fibonacci_sphere(3, 2.5))
+    poses = nbv.look_at(nbv.geometry.fibonacci_sphere(3, 2.5))
     for pose, again in zip(poses, [poses[0], poses[1], poses[-1]], strict=True):
         np.testing.assert_array_equal(pose.position, again.position)
     assert [len(list(row)) for row in nbv.look_at(np.ones((2, 3, 3)))] == [3, 3]

@@ -153,7 +153,7 @@ def tagged(points, mask):
     return nbv.PointCloud(jnp.asarray(points), jnp.asarray(tags), jnp.asarray(mask))
 
 
-subsample = jax.jit(nbv.farthest_point_subsample, static_argnums=1)
+subsample = jax.jit(nbv.geometry.farthest_point_subsample, static_argnums=1)
 
 
 @settings(max_examples=60, deadline=None)

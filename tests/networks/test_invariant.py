@@ -148,7 +148,7 @@ def test_a_cloud_classifier_is_sampling_and_the_network_in_its_units(x64):
     points, normals = oriented(200, 2.0)
     cloud = nbv.PointCloud.from_arrays(points, normals, 230)
     for num_points, scale in ((64, 0.5), (300, 1.0)):
-        fed = nbv.farthest_point_subsample(cloud, num_points)
+        fed = nbv.geometry.farthest_point_subsample(cloud, num_points)
         expected = answer(net, scale * np.asarray(fed.points), fed.normals, fed.mask)
         np.testing.assert_allclose(CloudClassifier(net, num_points, scale)(cloud), expected, atol=1e-12)
     halved = nbv.PointCloud.from_arrays(0.5 * points, normals, 230)

@@ -34,12 +34,12 @@ def some_bumps(rng):
 
 
 def grid_surface(field, grid):
-    return nbv.GridSurface.from_values(field(jnp.asarray(nodes(grid.axis))), 0.0, grid)
+    return nbv.scanning.GridSurface.from_values(field(jnp.asarray(nodes(grid.axis))), 0.0, grid)
 
 
 def small_surfaces(rng, count):
     values = np.stack([some_bumps(rng)(nodes(SMALL.axis)) for _ in range(count)])
-    return nbv.GridSurface.from_values(values, 0.0, SMALL)
+    return nbv.scanning.GridSurface.from_values(values, 0.0, SMALL)
 
 
 def rough_values(grid, seed, amplitude):

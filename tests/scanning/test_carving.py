@@ -18,7 +18,7 @@ SMALL_GRID = nbv.Grid(30, 1.6)
 POSES = [nbv.look_at((0.0, 0.3, 2.5)), nbv.look_at((0.0, 0.3, -2.5))]
 
 
-class Waves(nbv.Fields):
+class Waves(nbv.surfaces.Fields):
     """A ball under random waves, whatever was scanned: dents and islands all over the scene."""
 
     phases: Float[Array, "s 3"]
@@ -28,7 +28,7 @@ class Waves(nbv.Fields):
         return jnp.linalg.norm(x, axis=-1) - 0.6 + waves
 
 
-class WavesPosterior(nbv.SurfacePosterior):
+class WavesPosterior(nbv.surfaces.SurfacePosterior):
     level: Float[Array, ""]
 
     def sample(self, key, num_samples):
@@ -126,8 +126,8 @@ def test_carved_samples_keep_a_thin_sheet_that_was_seen_from_both_sides():
         nbv.Camera(height=10, width=10, fov=0.35),
         nbv.look_at(jnp.asarray([[0.0, 0.0, 2.5], [0.0, 0.0, -2.5]])),
     )
-    surfaces = nbv.GridSurface.from_values(jnp.concatenate([values, carved]), 0.0, SMALL_GRID)
-    clouds = nbv.scan_samples(surfaces, narrow, poses)
+    surfaces = nbv.scanning.GridSurface.from_values(jnp.concatenate([values, carved]), 0.0, SMALL_GRID)
+    clouds = nbv.scanning.scan_samples(surfaces, narrow, poses)
     on_sheet = np.asarray(clouds.mask) & (np.abs(np.asarray(clouds.points)[..., 2]) < 2.0 * SMALL_GRID.spacing)
     before, after = on_sheet.reshape(2, 3, 2, -1).mean(axis=-1)
     assert (before > 0.5).all(), "the model does not see the sheet"

@@ -32,7 +32,7 @@ def segment_meets(name, x, pose):
 def wholly_free(name, node, radius, camera, pose, in_image=True):
     """Whether the whole ball about each node is in front of the camera, before the solid and in the image; or all of
     it that is in the image."""
-    shell = np.asarray(nbv.fibonacci_sphere(80), np.float64)
+    shell = np.asarray(nbv.geometry.fibonacci_sphere(80), np.float64)
     ball = node[:, None] + radius[:, None, None] * np.concatenate([np.zeros((1, 3)), shell])
     column, row, ahead = image(ball, camera, pose)
     seen = (ahead > 0) & (column > 0) & (column < camera.width) & (row > 0) & (row < camera.height)

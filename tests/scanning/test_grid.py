@@ -18,7 +18,7 @@ CAMERA = nbv.Camera(height=40, width=40)
 
 
 def sphere(grid=GRID, radius=1.0):
-    return nbv.GridSurface.from_values(np.linalg.norm(nodes(grid.axis), axis=-1), radius, grid)
+    return nbv.scanning.GridSurface.from_values(np.linalg.norm(nodes(grid.axis), axis=-1), radius, grid)
 
 
 def interpolate(values, points, grid):
@@ -65,7 +65,7 @@ def test_box_closed_form():
     q = np.abs(nodes(GRID.axis)) - half
     outside = np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0)
     origins, directions = random_rays(1, 4000, spread=0.6)
-    hits = nbv.GridSurface.from_values(outside, 0.0, GRID).trace(origins, directions)
+    hits = nbv.scanning.GridSurface.from_values(outside, 0.0, GRID).trace(origins, directions)
     t, normal = box_hit(origins, directions, half)
     expected = origins + t[:, None] * directions.astype(np.float64)
     assert np.asarray(hits.mask).all()
@@ -102,7 +102,7 @@ def brute_force(values, origins, directions, grid, step):
 def test_brute_force_march(amplitude):
     grid = nbv.Grid(32, 1.5)
     values = rough_values(grid, 3, amplitude).astype(np.float32)
-    surface = nbv.GridSurface.from_values(values, 0.0, grid)
+    surface = nbv.scanning.GridSurface.from_values(values, 0.0, grid)
     outside, inside = random_rays(4, 200), random_rays(5, 100, radius=0.6)
     origins, directions = (np.concatenate(pair) for pair in zip(outside, inside, strict=True))
     hits = surface.trace(origins, directions)
@@ -131,7 +131,7 @@ def test_no_tunnelling_through_a_two_voxel_sheet(normal, direction, shift, slide
     side = -np.sign(d @ n)
     # A flatter ray enters the box within the sheet.
     assume(abs(d @ n) > 0.15)
-    surface = nbv.GridSurface.from_values(np.abs(nodes(grid.axis) @ n - shift) - h, 0.0, grid)
+    surface = nbv.scanning.GridSurface.from_values(np.abs(nodes(grid.axis) @ n - shift) - h, 0.0, grid)
     across = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
     targets = shift * n + np.linspace(-0.5, 0.5, 64)[:, None] * across + slide * np.cross(n, across)
     hits = surface.trace((targets - 4 * d).astype(np.float32), np.broadcast_to(d, (64, 3)).astype(np.float32))
@@ -145,7 +145,7 @@ def test_no_tunnelling_through_a_two_voxel_sheet(normal, direction, shift, slide
 def test_axis_parallel_rays_through_nodes_and_edges():
     grid = nbv.Grid(33, 1.6)
     values = rough_values(grid, 7, 0.1).astype(np.float32)
-    surface = nbv.GridSurface.from_values(values, 0.0, grid)
+    surface = nbv.scanning.GridSurface.from_values(values, 0.0, grid)
     a, b = np.meshgrid(grid.axis[1:-1], grid.axis[1:-1] + 0.25 * grid.spacing * (np.arange(31) % 3))
     a, b = a.ravel(), b.ravel()
     for axis in range(3):
@@ -172,9 +172,9 @@ def test_far_origins_and_rays_on_the_border_of_the_box():
 
 def test_samples_in_a_batch_equal_single_ones():
     values = np.stack([rough_values(GRID, seed, 0.1) for seed in range(3)]).astype(np.float32)
-    surfaces = nbv.GridSurface.from_values(values, 0.05, GRID)
-    poses = nbv.look_at(nbv.fibonacci_sphere(6, 2.5))
-    clouds = nbv.scan_samples(surfaces, CAMERA, poses)
+    surfaces = nbv.scanning.GridSurface.from_values(values, 0.05, GRID)
+    poses = nbv.look_at(nbv.geometry.fibonacci_sphere(6, 2.5))
+    clouds = nbv.scanning.scan_samples(surfaces, CAMERA, poses)
     assert clouds.points.shape == (3, 6, 1600, 3)
     assert clouds.mask.shape == (3, 6, 1600)
     origins, directions = camera_rays(poses)
@@ -185,7 +185,7 @@ def test_samples_in_a_batch_equal_single_ones():
         return np.abs(np.asarray(a) - np.asarray(b)).max(axis=-1) > 1e-5
 
     for i in range(3):
-        single = nbv.GridSurface.from_values(values[i], 0.05, GRID)
+        single = nbv.scanning.GridSurface.from_values(values[i], 0.05, GRID)
         np.testing.assert_array_equal(single.distance, surfaces.distance[i])
         for j in range(6):
             expected = nbv.scan(single, CAMERA, poses[j])
@@ -197,7 +197,7 @@ def test_samples_in_a_batch_equal_single_ones():
 
 def test_normals_are_interpolated_central_differences():
     values = rough_values(GRID, 14, 0.1).astype(np.float32)
-    hits = nbv.GridSurface.from_values(values, 0.0, GRID).trace(*random_rays(15, 4000))
+    hits = nbv.scanning.GridSurface.from_values(values, 0.0, GRID).trace(*random_rays(15, 4000))
     points = np.asarray(hits.points, np.float64)[np.asarray(hits.mask)]
     gradient = np.stack([interpolate(g, points, GRID) for g in np.gradient(values.astype(np.float64))], axis=1)
     gradient /= np.linalg.norm(gradient, axis=1, keepdims=True)

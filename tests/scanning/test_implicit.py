@@ -76,7 +76,7 @@ def test_gradients_of_depths_equal_those_of_optimistix(name, x64):
         if name == "solid":
             traced = nbv.SDFSurface(along.function)
         else:
-            traced = nbv.GridSurface(along.function.values, surface.distance, GRID)
+            traced = nbv.scanning.GridSurface(along.function.values, surface.distance, GRID)
         points = traced.trace(along.origins, along.directions).points
         offset, square = points - along.origins, jnp.sum(along.directions**2, axis=1)
         return weights @ (jnp.sum(offset * along.directions, axis=1) / square)
@@ -125,7 +125,7 @@ def hessian_and_gradient(run):
 
 def test_second_derivatives_of_depths_of_a_ball_in_closed_form(x64):
     """t = -b - sqrt(b^2 - c), b = o . d, c = o . o - r^2."""
-    start, space = nbv.look_at((0.4, 2.4, 0.5)), nbv.FreePoses()
+    start, space = nbv.look_at((0.4, 2.4, 0.5)), nbv.search.FreePoses()
     parameters = jnp.asarray(0.02 * RNG.normal(size=9))
 
     def closed(parameters):

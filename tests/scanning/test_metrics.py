@@ -18,7 +18,7 @@ from jaxnbv.scanning.sdf import Sphere
 RADIUS, AWAY = 0.8, 2.5
 BALL = nbv.SDFSurface(Sphere(RADIUS))
 # Uniform by area: the share of them in any part of the ball has a standard error of 0.0035 at most.
-POINTS = RADIUS * np.asarray(nbv.fibonacci_sphere(20_000), np.float64)
+POINTS = RADIUS * np.asarray(nbv.geometry.fibonacci_sphere(20_000), np.float64)
 SIDES = nbv.look_at(AWAY * jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))
 
 

@@ -219,7 +219,7 @@ def test_no_proposal_is_inside_or_under_what_is_known():
         arm = Capsule(start, end, 0.1)
         around = nbv.Obstacles((HalfSpace(point, normal), Cuboid(half).translate(block), arm), clearance=clearance)
         observations = nbv.Observations.start(cloud, 2, None)
-        proposal = search.propose(nbv.Problem(StepInputs(observations), camera, nbv.Coverage(), around), key)
+        proposal = search.propose(nbv.search.Problem(StepInputs(observations), camera, nbv.Coverage(), around), key)
         return proposal.pose.position, proposal.value
 
     rng, looked, x = np.random.default_rng(0), 0, np.asarray(poses.position, np.float64)

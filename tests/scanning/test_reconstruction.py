@@ -22,7 +22,7 @@ def mean_mesh(model, cloud, grid):
 
 def sphere_cloud(count=600, capacity=700):
     """Points all over a sphere about (0.2, 0, 0), in a cloud with rows to spare."""
-    normals = np.asarray(nbv.fibonacci_sphere(count, 1.0))
+    normals = np.asarray(nbv.geometry.fibonacci_sphere(count, 1.0))
     return nbv.PointCloud.from_arrays(RADIUS * normals + [0.2, 0.0, 0.0], normals, capacity)
 
 
@@ -63,7 +63,7 @@ class Balls(nbv.SurfaceModel):
         return BallsPosterior()
 
 
-class BallsPosterior(nbv.SurfacePosterior):
+class BallsPosterior(nbv.surfaces.SurfacePosterior):
     level: Float[Array, ""] = 0.25
 
     def __init__(self):
@@ -104,21 +104,21 @@ def test_what_was_seen_empty_is_not_meshed():
 @pytest.mark.skipif(not has_poisson(), reason="pymeshlab, or the system's OpenGL library, is not installed")
 def test_poisson_reconstruction_of_a_whole_scan_is_the_surface():
     cloud = sphere_cloud()
-    mesh = nbv.screened_poisson(cloud, depth=6)
+    mesh = nbv.scanning.screened_poisson(cloud, depth=6)
     check_sphere(mesh, 0.03)
-    again = nbv.screened_poisson(cloud, depth=6)
+    again = nbv.scanning.screened_poisson(cloud, depth=6)
     np.testing.assert_array_equal(mesh.vertices, again.vertices)
-    assert len(nbv.screened_poisson(cloud, depth=3).faces) < 0.5 * len(mesh.faces)
+    assert len(nbv.scanning.screened_poisson(cloud, depth=3).faces) < 0.5 * len(mesh.faces)
 
 
 def test_poisson_reconstruction_names_what_is_wrong(monkeypatch):
     cloud = sphere_cloud(20)
     with pytest.raises(nbv.InputError, match="depth is 0"):
-        nbv.screened_poisson(cloud, depth=0)
+        nbv.scanning.screened_poisson(cloud, depth=0)
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "pymeshlab", None)
         with pytest.raises(nbv.InputError, match=r'pip install "\.\[poisson\]"'):
-            nbv.screened_poisson(cloud)
+            nbv.scanning.screened_poisson(cloud)
     if not has_poisson():
         pytest.skip("pymeshlab, or the system's OpenGL library, is not installed")
     few = jax.tree.map(lambda leaf: leaf[:3], cloud)
@@ -126,4 +126,4 @@ def test_poisson_reconstruction_names_what_is_wrong(monkeypatch):
     broken = nbv.PointCloud(cloud.points.at[0, 0].set(jnp.nan), cloud.normals, cloud.mask)
     for wrong, message in ((few, "3 points, and"), (together, "no surface through 20"), (broken, "not finite")):
         with pytest.raises(nbv.InputError, match=message):
-            nbv.screened_poisson(wrong)
+            nbv.scanning.screened_poisson(wrong)

@@ -19,7 +19,7 @@ from jaxnbv.scanning.sdf import Sphere
 
 RNG = np.random.default_rng(0)
 CAMERA = nbv.Camera(height=24, width=24)
-SPACE = nbv.FreePoses()
+SPACE = nbv.search.FreePoses()
 
 
 def is_grazing(surface, points, normals, directions):
@@ -68,7 +68,7 @@ def test_scans_as_functions_of_a_pose_against_central_differences(name, x64):
         surface = nbv.SDFSurface(solid())
     else:
         surface = grid_surface(some_bumps(RNG) if name == "field" else solid(), GRID)
-    starts, count, h = nbv.look_at(nbv.fibonacci_sphere(6, 2.5)), SPACE.num_parameters, 1e-6
+    starts, count, h = nbv.look_at(nbv.geometry.fibonacci_sphere(6, 2.5)), SPACE.num_parameters, 1e-6
     at, step = 0.1 * RNG.normal(size=(6, count)), RNG.normal(size=(6, count))
     values, slopes, (masks, rays) = looks(surface, *moves(starts, at, step, jnp.asarray([0.0, h, -h])))
     points, normals = (np.asarray(value) for value in values)
@@ -128,7 +128,7 @@ def test_grazing_and_missed_rays(name):
 @jax.jit
 def traced(weights, surface, origins, directions):
     def total(values, origins, directions):
-        hits = nbv.GridSurface(values, surface.distance, SMALL).trace(origins, directions)
+        hits = nbv.scanning.GridSurface(values, surface.distance, SMALL).trace(origins, directions)
         return jnp.sum(weights[0] * hits.points) + jnp.sum(weights[1] * hits.normals), hits.mask
 
     return jax.value_and_grad(total, argnums=(0, 1, 2), has_aux=True)(surface.values, origins, directions)

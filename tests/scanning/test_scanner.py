@@ -23,7 +23,7 @@ SURFACES = {
 
 @pytest.mark.parametrize("name", SURFACES)
 def test_batched_poses_equal_single_ones(name):
-    camera, poses = nbv.Camera(height=12, width=17), nbv.look_at(nbv.fibonacci_sphere(6, 2.5))
+    camera, poses = nbv.Camera(height=12, width=17), nbv.look_at(nbv.geometry.fibonacci_sphere(6, 2.5))
     batch = nbv.scan(SURFACES[name], camera, poses)
     assert batch.points.shape == (6, 12 * 17, 3)
     for i in range(6):

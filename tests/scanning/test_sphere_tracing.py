@@ -77,7 +77,7 @@ def test_vmapped_scenes_equal_single_scenes():
         box = Cuboid(jnp.stack([size[0], 0.4 * jnp.ones(()), size[1]]), 0.05)
         return box | Sphere(size[1]).translate(jnp.stack([size[0], size[0], 0.0 * size[0]]))
 
-    camera, poses = nbv.Camera(height=20, width=20, fov=0.7), nbv.look_at(nbv.fibonacci_sphere(5, 2.5))
+    camera, poses = nbv.Camera(height=20, width=20, fov=0.7), nbv.look_at(nbv.geometry.fibonacci_sphere(5, 2.5))
     together = jax.jit(jax.vmap(lambda size, pose: nbv.scan(nbv.SDFSurface(build(size)), camera, pose)))(sizes, poses)
     batch = jax.vmap(lambda size: nbv.SDFSurface(build(size)))(sizes)
     again = jax.jit(jax.vmap(lambda surface, pose: nbv.scan(surface, camera, pose)))(batch, poses)
@@ -93,7 +93,7 @@ def test_normals_on_flat_faces_survive_compilation():
     """On a face the slopes of a box come from one of two cases; rounding must not lose both (nor the unit length)."""
     surface = nbv.SDFSurface(Sphere(0.7) | Cuboid([0.4, 0.3, 0.8]).translate([0.3, 0.2, 0.0]))
     seen = jax.jit(lambda pose: nbv.scan(surface, nbv.Camera(height=16, width=16), pose))(
-        nbv.look_at(nbv.fibonacci_sphere(12, 2.5))
+        nbv.look_at(nbv.geometry.fibonacci_sphere(12, 2.5))
     )
     assert int(seen.count.sum()) > 2000
     lengths = np.linalg.norm(np.asarray(seen.normals)[np.asarray(seen.mask)], axis=1)

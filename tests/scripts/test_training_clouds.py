@@ -123,7 +123,7 @@ def surface_points(solid):
     """Noiseless hits from many sides, by another camera than the clouds', with their labels."""
     camera = nbv.Camera(fov=1.0, height=64, width=64)
     hits = jax.lax.map(
-        lambda pose: nbv.scan(nbv.SDFSurface(solid), camera, pose), nbv.look_at(nbv.fibonacci_sphere(16, 2.7))
+        lambda pose: nbv.scan(nbv.SDFSurface(solid), camera, pose), nbv.look_at(nbv.geometry.fibonacci_sphere(16, 2.7))
     )
     return hits.points.reshape(-1, 3), solid.label(hits.points).reshape(-1), hits.mask.reshape(-1)
 

@@ -20,7 +20,7 @@ def problem_of(surfaces, acquisition=nbv.Coverage(), camera=CAMERA):  # noqa: B0
     rng = np.random.default_rng(0)
     cloud = nbv.PointCloud.from_arrays(rng.uniform(-1, 1, (30, 3)), np.tile([0.0, 1.0, 0.0], (30, 1)), 32)
     inputs = StepInputs(nbv.Observations.start(cloud, 6), None, surfaces)
-    return nbv.Problem(inputs, camera, acquisition).prepared()
+    return nbv.search.Problem(inputs, camera, acquisition).prepared()
 
 
 @functools.cache

@@ -11,7 +11,7 @@ from small_problem import problem_of, propose, visit
 import jaxnbv as nbv
 
 
-class Known(nbv.Problem):
+class Known(nbv.search.Problem):
     """5 - |position - place|^2 - |forward - gaze|^2: an acquisition in closed form, without surfaces."""
 
     place: jax.Array
@@ -46,7 +46,7 @@ def test_a_pose_in_space_is_found(solver):
 
 
 def test_it_starts_from_the_poses_it_is_given():
-    given = nbv.look_at(nbv.fibonacci_sphere(3, 2.2))
+    given = nbv.look_at(nbv.geometry.fibonacci_sphere(3, 2.2))
     found = propose(nbv.GradientSearch(num_starts=1, iterations=1, candidates=given), known(), jax.random.key(0))
     np.testing.assert_array_equal(found.candidates.position, given.position)
 
@@ -67,7 +67,7 @@ def test_where_values_tie_the_first_candidate_wins():
     jax.tree.map(np.testing.assert_array_equal, again.pose, found.candidates[1])
 
 
-@pytest.mark.parametrize("space", [nbv.SpherePoses(), nbv.FreePoses(), nbv.ConstrainedPoses()])
+@pytest.mark.parametrize("space", [nbv.search.SpherePoses(), nbv.search.FreePoses(), nbv.search.ConstrainedPoses()])
 def test_adam_is_optax_in_a_plain_loop(space, x64):
     problem, start = known(), nbv.look_at(jnp.asarray([[1.2, 1.0, 1.9]]))
     steps = {"num_starts": 1, "iterations": 30, "learning_rate": 0.02}
@@ -92,7 +92,7 @@ def test_adam_is_optax_in_a_plain_loop(space, x64):
     assert float(jnp.abs(ways.poses.position[0, -1] - start.position[0]).max()) > 0.1
 
 
-@pytest.mark.parametrize("space", [nbv.SpherePoses(), nbv.ConstrainedPoses(), nbv.FreePoses()])
+@pytest.mark.parametrize("space", [nbv.search.SpherePoses(), nbv.search.ConstrainedPoses(), nbv.search.FreePoses()])
 def test_a_start_at_the_origin_gives_numbers(space):
     start = nbv.Pose(np.eye(3, dtype=np.float32), np.zeros(3, np.float32))
     parameters = jnp.zeros(space.num_parameters)

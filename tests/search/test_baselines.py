@@ -14,7 +14,7 @@ from jaxnbv.sampler import StepInputs
 from jaxnbv.search.baselines import uncertain_length
 
 GRID = nbv.Grid(24)
-CANDIDATES = np.asarray(nbv.fibonacci_sphere(12, 2.5), dtype=np.float64)
+CANDIDATES = np.asarray(nbv.geometry.fibonacci_sphere(12, 2.5), dtype=np.float64)
 
 
 def problem(visited, surfaces=None):
@@ -23,7 +23,7 @@ def problem(visited, surfaces=None):
     cloud = nbv.PointCloud.from_arrays([[0.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     observations = nbv.Observations(cloud, PoseList(nbv.look_at(positions), jnp.asarray(len(visited))))
     inputs = StepInputs(observations, None, surfaces)
-    return nbv.Problem(inputs, nbv.Camera(height=4, width=4), nbv.Coverage()).prepared()
+    return nbv.search.Problem(inputs, nbv.Camera(height=4, width=4), nbv.Coverage()).prepared()
 
 
 def index_of(proposal):
@@ -84,7 +84,7 @@ def test_uncertainty_against_its_definition():
     """The slow version walks at an eighth of the library's step, which finds the first end late and the last early."""
     rng = np.random.default_rng(0)
     surfaces = balls(GRID, [0.9, 0.6, 0.7, 0.3], rng.uniform(-0.5, 0.5, (4, 3)))
-    search, values = nbv.UncertaintyView(12), np.asarray(surfaces.values, dtype=np.float64)
+    search, values = nbv.search.UncertaintyView(12), np.asarray(surfaces.values, dtype=np.float64)
     asked = problem(CANDIDATES[:1], surfaces)
     step = 0.5 * GRID.spacing
     expected = np.array([slow_uncertain_length(values, c, step / 8) for c in CANDIDATES])
@@ -114,7 +114,7 @@ def test_a_ray_that_meets_a_look_on_the_boxes_face_is_still_open():
     grid = nbv.Grid(5, 1.0)
     values = np.broadcast_to(grid.axis + 0.5, (2, 5, 5, 5)).astype(np.float32)
     values = np.stack([values[0], values[1] - 0.75])
-    surfaces = nbv.GridSurface.from_values(values, 0.0, grid)
+    surfaces = nbv.scanning.GridSurface.from_values(values, 0.0, grid)
     # Surfaces at z = -0.5 and z = 0.25, seen from z = 1.5; looks every quarter, at 1.5, 1.25, 1.0, ...
     value = uncertain_length(problem(np.zeros((0, 3)), surfaces), nbv.look_at(jnp.array([[0.0, 0.0, 1.5]])))
     np.testing.assert_allclose(value, 0.75, atol=0.26)

@@ -21,7 +21,7 @@ def positions(candidates):
 
 def test_the_whole_sphere_is_the_papers_lattice():
     poses = nbv.SphereCandidates(30, 2.5).poses()
-    np.testing.assert_array_equal(poses.position, nbv.fibonacci_sphere(30, 2.5))
+    np.testing.assert_array_equal(poses.position, nbv.geometry.fibonacci_sphere(30, 2.5))
     np.testing.assert_allclose(poses.forward, -poses.position / 2.5, atol=1e-6)
     np.testing.assert_array_equal(sphere_candidates(30).position, poses.position)
     assert nbv.SphereCandidates().count == len(positions(nbv.SphereCandidates())) == 120

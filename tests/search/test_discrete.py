@@ -21,7 +21,7 @@ def test_the_argmax_of_values_recomputed_one_by_one():
     np.testing.assert_allclose(proposal.values, values, rtol=1e-5)
     best = int(np.argmax(values))
     assert np.sort(values)[-1] > 1.01 * np.sort(values)[-2]
-    np.testing.assert_allclose(proposal.candidates.position, nbv.fibonacci_sphere(12, 2.5), atol=1e-6)
+    np.testing.assert_allclose(proposal.candidates.position, nbv.geometry.fibonacci_sphere(12, 2.5), atol=1e-6)
     np.testing.assert_allclose(proposal.pose.position, POSES.position[best], atol=1e-6)
     np.testing.assert_allclose(proposal.pose.rotation, POSES.rotation[best], atol=1e-6)
     assert float(proposal.value) == pytest.approx(float(values[best]), rel=1e-5)
@@ -112,10 +112,10 @@ def test_rounds_of_halving_recomputed(num_visited, first):
 SEARCHES = {
     "discrete": SEARCH,
     "halving": nbv.HalvingSearch(12, num_first_samples=1),
-    "tie-break": nbv.TieBreakSearch(12, second=Height()),
+    "tie-break": nbv.search.TieBreakSearch(12, second=Height()),
     "farthest": nbv.FarthestView(12),
     "random": nbv.RandomView(12),
-    "uncertainty": nbv.UncertaintyView(12),
+    "uncertainty": nbv.search.UncertaintyView(12),
 }
 ASKED = {"discrete": (nbv.Coverage(),), "halving": (nbv.Coverage(),), "tie-break": (nbv.Coverage(), Height())}
 
@@ -160,7 +160,9 @@ def test_scores_are_those_of_each_sample_by_each_acquisition_that_is_asked(name)
 
 @pytest.mark.parametrize("name", [name for name, search in SEARCHES.items() if search.uses_samples])
 def test_without_samples_it_says_so(name):
-    bare = eqx.tree_at(lambda p: p.surfaces, PROBLEM, None, is_leaf=lambda leaf: isinstance(leaf, nbv.GridSurface))
+    bare = eqx.tree_at(
+        lambda p: p.surfaces, PROBLEM, None, is_leaf=lambda leaf: isinstance(leaf, nbv.scanning.GridSurface)
+    )
     with pytest.raises(ValueError, match="uses_samples"):
         SEARCHES[name].propose(bare, KEY)
 
@@ -169,7 +171,7 @@ PROBLEM = three_balls()
 
 
 def tie_break(problem, second):
-    return propose(nbv.TieBreakSearch(12, second=second), problem)
+    return propose(nbv.search.TieBreakSearch(12, second=second), problem)
 
 
 @pytest.mark.parametrize("factor", [1.0, -1.0])

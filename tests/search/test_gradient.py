@@ -44,9 +44,9 @@ def classifier(cloud):
 ACQUISITIONS = {
     "coverage": nbv.Coverage(),
     "cross-entropy": nbv.CrossEntropy(classifier),
-    "mixed, open": nbv.MixedEntropy(classifier, threshold=0.0),
-    "mixed, settled": nbv.MixedEntropy(classifier, threshold=9.0),
-    "improvement": nbv.EntropyReduction(classifier),
+    "mixed, open": nbv.tasks.MixedEntropy(classifier, threshold=0.0),
+    "mixed, settled": nbv.tasks.MixedEntropy(classifier, threshold=9.0),
+    "improvement": nbv.tasks.EntropyReduction(classifier),
 }
 
 
@@ -59,7 +59,7 @@ def rough(seed):
     rng = np.random.default_rng(seed)
     noise = gaussian_filter(rng.normal(size=(2, *NODES.shape[:3])), (0, 2, 2, 2))
     away = [np.linalg.norm(NODES - rng.uniform(-0.2, 0.2, 3), axis=-1) for _ in range(2)]
-    return nbv.GridSurface.from_values(np.stack(away) - 0.7 + 4.0 * noise, 0.0, GRID)
+    return nbv.scanning.GridSurface.from_values(np.stack(away) - 0.7 + 4.0 * noise, 0.0, GRID)
 
 
 def run(name, problem, seed=0):
@@ -89,9 +89,9 @@ FEW, LINE = {**COMMON, "num_candidates": 6}, {"rtol": 1e-4, "atol": 1e-4}
 SEARCHES = {
     "2-DOF": nbv.GradientSearch(dof=2, **FEW),
     "BFGS": nbv.GradientSearch(dof=2, **FEW, solver=optx.BFGS(**LINE)),
-    "hybrid": nbv.HybridSearch(dof=2, **COMMON, num_candidates=20),
+    "hybrid": nbv.search.HybridSearch(dof=2, **COMMON, num_candidates=20),
     "6-DOF": nbv.GradientSearch(dof=6, **FEW),
-    "constrained": nbv.GradientSearch(space=nbv.ConstrainedPoses(2.0, 3.0), **{**FEW, "learning_rate": 0.1}),
+    "constrained": nbv.GradientSearch(space=nbv.search.ConstrainedPoses(2.0, 3.0), **{**FEW, "learning_rate": 0.1}),
 }
 
 
@@ -199,7 +199,7 @@ def test_a_view_of_nothing_is_worth_nothing_and_not_chosen():
     @jax.jit
     def slopes(pose):
         def scores(parameters):
-            seen = scan(surface, CAMERA, nbv.FreePoses().retract(pose, parameters))
+            seen = scan(surface, CAMERA, nbv.search.FreePoses().retract(pose, parameters))
             each = jnp.stack(
                 [score_of(one, context_of(one, problem.observations), seen) for one in ACQUISITIONS.values()]
             )

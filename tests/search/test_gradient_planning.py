@@ -65,7 +65,7 @@ def sgd(rate):
 @pytest.mark.parametrize(
     ("one", "other"),
     [
-        (nbv.GradientSearch(dof=6), nbv.GradientSearch(space=nbv.FreePoses(radius=2.4))),
+        (nbv.GradientSearch(dof=6), nbv.GradientSearch(space=nbv.search.FreePoses(radius=2.4))),
         (nbv.GradientSearch(solver=sgd(0.1)), nbv.GradientSearch(solver=sgd(0.2))),
     ],
 )
@@ -108,8 +108,11 @@ def test_a_score_without_gradient_is_refused_at_once(score):
 @pytest.mark.parametrize(
     "space",
     [
-        nbv.SpherePoses(),
-        *(pytest.param(space, marks=pytest.mark.slow) for space in (nbv.FreePoses(), nbv.ConstrainedPoses())),
+        nbv.search.SpherePoses(),
+        *(
+            pytest.param(space, marks=pytest.mark.slow)
+            for space in (nbv.search.FreePoses(), nbv.search.ConstrainedPoses())
+        ),
     ],
 )
 def test_a_derivative_that_is_not_a_number_is_reported(space):

@@ -18,7 +18,7 @@ from jaxnbv.geometry.rotations import rotation_to_6d
 
 RNG = np.random.default_rng(0)
 LOOK_AT = jax.jit(nbv.look_at)
-SPHERE, FREE, CONSTRAINED = nbv.SpherePoses(), nbv.FreePoses(), nbv.ConstrainedPoses(2.0, 3.0)
+SPHERE, FREE, CONSTRAINED = nbv.search.SpherePoses(), nbv.search.FreePoses(), nbv.search.ConstrainedPoses(2.0, 3.0)
 SPACES = {"sphere": SPHERE, "free": FREE, "constrained": CONSTRAINED}
 RETRACT = {name: jax.jit(space.retract) for name, space in SPACES.items()}
 RETRACT_MANY = {name: jax.jit(jax.vmap(space.retract)) for name, space in SPACES.items()}
@@ -191,7 +191,7 @@ def test_starts_that_look_straight_away_are_turned_to_the_origin():
 
 def test_constrained_poses_fill_their_range():
     """Distances from end to end, and the origin anywhere in the cone, reach all that is allowed and no more."""
-    space = nbv.ConstrainedPoses(1.5, 4.0, math.radians(25.0))
+    space = nbv.search.ConstrainedPoses(1.5, 4.0, math.radians(25.0))
     start = nbv.look_at((0.0, 0.0, 2.0))
     parameters = np.zeros((2, 8))
     parameters[:, 3], parameters[:, 4] = (-30.0, 30.0), (-30.0, 30.0)

@@ -54,8 +54,8 @@ def utility(cloud):
 by_name = lambda cloud: jnp.sum(cloud.normals)  # noqa: E731
 KEY = jax.random.key(3)
 MLP = eqx.nn.MLP(3, 2, 8, 1, key=KEY)
-WITH_BANK = nbv.SurfaceSampler(nbv.ScreenedSPSR(MODEL, (nbv.OnSurface(20),)), GRID, 2).with_bank(
-    nbv.ShapeBank.of([nbv.sdf.Sphere(0.5), nbv.sdf.Sphere(0.6)]), nbv.Upright()
+WITH_BANK = nbv.SurfaceSampler(nbv.ScreenedSPSR(MODEL, (nbv.surfaces.OnSurface(20),)), GRID, 2).with_bank(
+    nbv.ShapeBank.of([nbv.sdf.Sphere(0.5), nbv.sdf.Sphere(0.6)]), nbv.surfaces.Upright()
 )
 OBSTACLES = nbv.SurfaceSampler(MODEL, nbv.Grid(9, half_extent=1.6), 2, obstacles=nbv.Obstacles((nbv.sdf.Sphere(0.1),)))
 
@@ -83,7 +83,9 @@ CONFIGURATIONS = {
     "networks": lambda: (MLP, eqx.nn.Sequential([eqx.nn.Linear(3, 3, key=KEY), eqx.nn.Lambda(jax.nn.relu)])),
     "gradient": lambda: nbv.GradientSearch(dof=6, num_starts=2, solver=optx.BFGS(1e-3, 1e-3)),
     "solids": lambda: (SOLID, nbv.SDFSurface(SOLID), nbv.sdf.solid_of_mesh(SPHERE.vertices, SPHERE.faces)),
-    "sampled grid": lambda: nbv.GridSurface.from_values(jnp.linspace(-1.0, 1.0, 512).reshape(8, 8, 8), 0.0, GRID),
+    "sampled grid": lambda: nbv.scanning.GridSurface.from_values(
+        jnp.linspace(-1.0, 1.0, 512).reshape(8, 8, 8), 0.0, GRID
+    ),
     "own": lambda: Mine(MLP, Pair(Kind.SMALL, Path("a"))),
     "arrays": lambda: (
         [np.zeros((0, 3)), np.arange(60.0), np.float32(0.1), np.array(7, np.int8), True, 1, 1.0, None, "a"],

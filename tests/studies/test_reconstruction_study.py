@@ -77,7 +77,7 @@ def test_a_record_is_json_and_holds_every_method(record):
 def test_planners_differ_in_what_they_seek_and_their_search_alone():
     study = small_study()
     scene = study.scene(0)
-    searches = (nbv.DiscreteSearch, nbv.DiscreteSearch, nbv.FarthestView, nbv.UncertaintyView, nbv.RandomView)
+    searches = (nbv.DiscreteSearch, nbv.DiscreteSearch, nbv.FarthestView, nbv.search.UncertaintyView, nbv.RandomView)
     own: dict = {"search": None, "acquisition": None}
     for method, search in zip(study.methods, searches, strict=True):
         planner = study.planner(method, scene)

@@ -82,7 +82,7 @@ def plain(folder, depths, matrices):
 def test_layouts_of_one_recording_are_read_alike(layout, sequence, tmp_path):
     depths, matrices = sequence
     layout(tmp_path, depths, matrices)
-    frames = nbv.RecordedFrames(tmp_path)
+    frames = nbv.readers.RecordedFrames(tmp_path)
     assert len(frames) == COUNT
     np.testing.assert_allclose(frames.matrices, matrices, atol=1e-6)
     for index in (0, COUNT - 1):
@@ -98,7 +98,7 @@ def test_a_world_is_turned_upright(sequence, tmp_path):
     turned = matrices.copy()
     turned[:, :3, :] = tilt @ matrices[:, :3, :]
     plain(tmp_path, depths, turned)
-    frames = nbv.RecordedFrames(tmp_path, up=tuple((3.0 * tilt[:, 2]).tolist()))
+    frames = nbv.readers.RecordedFrames(tmp_path, up=tuple((3.0 * tilt[:, 2]).tolist()))
     # Heights are those before the world was tilted, and so are all distances.
     np.testing.assert_allclose(frames.matrices[:, 2, 3], matrices[:, 2, 3], atol=1e-9)
     steps = [np.diff(m[:, :3, 3], axis=0) for m in (frames.matrices, matrices)]
@@ -147,15 +147,15 @@ def test_what_is_broken_is_named(name, sequence, tmp_path):
     layout(tmp_path, *sequence)
     harm(tmp_path)
     with pytest.raises(ValueError, match=message):
-        nbv.RecordedFrames(tmp_path)
+        nbv.readers.RecordedFrames(tmp_path)
 
 
 def test_a_frame_that_is_not_there_and_an_up_that_is_none_are_named(sequence, tmp_path):
     plain(tmp_path, *sequence)
     with pytest.raises(ValueError, match="no frame 9"):
-        nbv.RecordedFrames(tmp_path).depth(COUNT)
+        nbv.readers.RecordedFrames(tmp_path).depth(COUNT)
     with pytest.raises(ValueError, match="give a direction"):
-        nbv.RecordedFrames(tmp_path, up=(0.0, 0.0, 0.0))
+        nbv.readers.RecordedFrames(tmp_path, up=(0.0, 0.0, 0.0))
 
 
 LOW, HIGH = (0.6, 1.6, 0.3), (1.4, 2.4, 0.9)

@@ -19,7 +19,7 @@ from jaxnbv.surfaces.registration import Prior, Seen, register
 
 CAMERA = nbv.Camera(height=40, width=40, fov=1.0)
 QUICK = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=8))
-RESIDUAL = nbv.ScreenedSPSR(nbv.GeometricSPSR(0.02, truncation=12), (nbv.OnSurface(),))
+RESIDUAL = nbv.ScreenedSPSR(nbv.GeometricSPSR(0.02, truncation=12), (nbv.surfaces.OnSurface(),))
 GRID = nbv.Grid(40)
 
 
@@ -62,7 +62,7 @@ UPRIGHT = Rotation.from_rotvec([0.0, 1e-6, 0.0])
 
 def model(bank=BANK, **changed):
     """Alike in most tests, which then share what was compiled."""
-    return nbv.KnownShapes(bank, RESIDUAL, unknown=QUICK, num_starts=2048, **changed)
+    return nbv.surfaces.KnownShapes(bank, RESIDUAL, unknown=QUICK, num_starts=2048, **changed)
 
 
 def evidence_of(surface, positions, noise=0.005):
@@ -88,7 +88,9 @@ def planted():
         rotation, index = Rotation.random(random_state=seed), seed % len(ARMS)
         surface, _, shift = filling(ARMS[index], rotation)
         seen = Seen.of(evidence_of(surface, AROUND))
-        found.append((index, rotation, shift, register(BANK, Prior(nbv.FreeRotation(), nbv.Box()), seen, 2048)))
+        found.append(
+            (index, rotation, shift, register(BANK, Prior(nbv.surfaces.FreeRotation(), nbv.Box()), seen, 2048))
+        )
     return found
 
 
@@ -118,7 +120,7 @@ def test_a_symmetric_shape_stands_in_all_the_ways_that_look_alike():
     """A bar that was seen from above: it may be turned by half a turn."""
     bank = nbv.ShapeBank.of([Cuboid([1.2, 0.3, 0.4])])
     seen = Seen.of(evidence_of(nbv.SDFSurface(Cuboid([1.25, 0.31, 0.42])), ((0.5, 3.0, 1.5),)))
-    found = register(bank, Prior(nbv.Upright(), nbv.Box()), seen, 512)
+    found = register(bank, Prior(nbv.surfaces.Upright(), nbv.Box()), seen, 512)
     angles = np.degrees(
         np.arctan2(np.asarray(found.placement.rotation)[:, 0, 2], np.asarray(found.placement.rotation)[:, 0, 0])
     )
@@ -207,7 +209,7 @@ def test_systematic_resampling_draws_each_as_often_as_its_weight_says(weights, s
 @pytest.mark.slow
 def test_the_same_evidence_has_the_same_hypotheses_and_nothing_is_compiled_twice(compilations):
     surface, _, _ = filling(0.5, UPRIGHT)
-    sampler = dataclasses.replace(nbv.SurfaceSampler(QUICK, GRID, 3).with_bank(BANK, nbv.AsGiven()))
+    sampler = dataclasses.replace(nbv.SurfaceSampler(QUICK, GRID, 3).with_bank(BANK, nbv.surfaces.AsGiven()))
     sampler = dataclasses.replace(sampler, model=dataclasses.replace(sampler.model, residual=RESIDUAL, num_starts=64))
     first, second = evidence_of(surface, AROUND[:1]), evidence_of(surface, AROUND[:2])
     assert eqx.tree_equal(sampler.posterior(first).found, sampler.posterior(first).found)

@@ -26,7 +26,7 @@ WIDTH = 0.5
 SCALES = {"one scale": ((0.1,), (0.8,)), "two scales": ((0.1, 0.3), (0.8, 0.6))}
 
 
-class Bumps(nbv.Fields):
+class Bumps(nbv.surfaces.Fields):
     """sum_k a_sk exp(-|x - c_sk|^2 / 2 w^2) + x^T Q_s x / 2."""
 
     centres: Float[Array, "s k 3"]
@@ -51,7 +51,7 @@ def exact(s, x):
     return value, -np.sum(each[..., None] * apart, axis=1) / WIDTH**2 + x @ QUADRATICS[s]
 
 
-class Given(nbv.ValueSource):
+class Given(nbv.surfaces.ValueSource):
     """Values at the points of the tests; the last row is not filled."""
 
     def rows(self, observations):
@@ -128,7 +128,7 @@ def test_no_noise_gives_the_means_whatever_the_key(x64, kind):
     assert float(jnp.abs(mixed[1] - mean[1]).min()) > 1e-6
 
 
-class Zeros(nbv.Fields):
+class Zeros(nbv.surfaces.Fields):
     count: int = eqx.field(static=True)
 
     def __call__(self, x):
@@ -158,7 +158,7 @@ def test_gradients_and_grids_of_samples_about_functions_are_those_of_their_value
     np.testing.assert_allclose(fields.on_grid(axis).reshape(3, -1), fields(nodes), atol=1e-12)
 
 
-class Balls(nbv.Fields):
+class Balls(nbv.surfaces.Fields):
     """Distances to spheres about the origin, where they have no gradient."""
 
     radii: Float[Array, " s"]
@@ -190,7 +190,7 @@ def flat(x):
     return jnp.zeros((1, len(x)))
 
 
-class OneValue(nbv.Fields):
+class OneValue(nbv.surfaces.Fields):
     def __call__(self, x):
         return jnp.sum(x, axis=1)
 

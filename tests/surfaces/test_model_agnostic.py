@@ -10,7 +10,7 @@ import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Cuboid, Sphere
 
 
-class SphereFields(nbv.Fields):
+class SphereFields(nbv.surfaces.Fields):
     centres: Float[Array, "s 3"]
     radii: Float[Array, " s"]
 
@@ -18,7 +18,7 @@ class SphereFields(nbv.Fields):
         return jnp.linalg.norm(x[None] - self.centres[:, None], axis=-1) - self.radii[:, None]
 
 
-class SpherePosterior(nbv.SurfacePosterior):
+class SpherePosterior(nbv.surfaces.SurfacePosterior):
     level: Float[Array, ""]
     cloud: nbv.PointCloud
 
@@ -54,7 +54,7 @@ def test_proposed_view_is_the_best_by_chamfer_distance_to_exact_scans_of_the_sam
     fields = RandomSpheres().condition(observations).sample(sample_key, 3)
     known, _ = cloud.to_numpy()
     values = np.zeros(12)
-    for i, pose in enumerate(nbv.look_at(nbv.fibonacci_sphere(12, 2.5))[j] for j in range(12)):
+    for i, pose in enumerate(nbv.look_at(nbv.geometry.fibonacci_sphere(12, 2.5))[j] for j in range(12)):
         origins, directions = (np.asarray(a, np.float64) for a in CAMERA.rays(pose))
         for centre, radius in zip(np.asarray(fields.centres), np.asarray(fields.radii), strict=True):
             along = np.sum(directions * (centre - origins), axis=1)
@@ -64,7 +64,9 @@ def test_proposed_view_is_the_best_by_chamfer_distance_to_exact_scans_of_the_sam
             values[i] += np.min(np.sum((hits[:, None] - known) ** 2, axis=-1), axis=1).sum() / 3
     np.testing.assert_allclose(proposal.values, values, rtol=0.03, atol=0.03 * values.max())
     assert int(np.argmax(proposal.values)) == int(np.argmax(values))
-    np.testing.assert_allclose(proposal.pose.position, nbv.fibonacci_sphere(12, 2.5)[np.argmax(values)], atol=1e-6)
+    np.testing.assert_allclose(
+        proposal.pose.position, nbv.geometry.fibonacci_sphere(12, 2.5)[np.argmax(values)], atol=1e-6
+    )
 
 
 def test_a_simulated_episode_sees_a_box_by_spheres():

@@ -18,7 +18,7 @@ AXIS = np.linspace(-1.0, 1.2, 5, dtype=np.float32)
 
 def test_the_probability_of_being_inside_is_the_share_of_the_samples_that_are():
     """1,500 samples at 40 points, within 4.5 standard errors and the rounding of a share."""
-    values = nbv.OutsideBoundary(num_points=40), nbv.OnSurface(20)
+    values = nbv.surfaces.OutsideBoundary(num_points=40), nbv.surfaces.OnSurface(20)
     posterior = nbv.ScreenedSPSR(nbv.GeometricSPSR(0.05, truncation=4, noise=0.1), values).condition(ball(RNG, 40))
     assert posterior.has_closed_forms
     count, probability = 1500, np.asarray(posterior.probability_inside(X), np.float64)
@@ -41,7 +41,7 @@ def test_the_probability_of_being_inside_is_that_of_weight_space(x64):
         posterior.probability_inside(np.full((1, 3), 3.2))
 
 
-class Shifted(nbv.Fields):
+class Shifted(nbv.surfaces.Fields):
     """a_s x + b_s."""
 
     slopes: Float[Array, " s"]
@@ -51,7 +51,7 @@ class Shifted(nbv.Fields):
         return self.slopes[:, None] * jnp.asarray(x)[:, 0] + self.offsets[:, None]
 
 
-class Lines(nbv.SurfacePosterior):
+class Lines(nbv.surfaces.SurfacePosterior):
     """Lines of random slope and offset."""
 
     level: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(0.4))

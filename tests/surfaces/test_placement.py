@@ -54,7 +54,7 @@ def test_a_step_has_derivatives_where_nothing_is_turned():
 
 def test_free_rotations_leave_no_gap():
     """Uniform rotations of as many numbers would leave holes; the spiral's nearest one is within 15 degrees."""
-    rotations = nbv.FreeRotation().rotations(4096)
+    rotations = nbv.surfaces.FreeRotation().rotations(4096)
     np.testing.assert_allclose(
         rotations @ np.swapaxes(rotations, 1, 2), np.broadcast_to(np.eye(3), (4096, 3, 3)), atol=1e-12
     )
@@ -66,7 +66,7 @@ def test_free_rotations_leave_no_gap():
 
 
 def test_upright_rotations_turn_about_the_vertical_within_their_range():
-    rotations = nbv.Upright((0.0, 0.0, 2.0), within=0.5).rotations(1000)
+    rotations = nbv.surfaces.Upright((0.0, 0.0, 2.0), within=0.5).rotations(1000)
     np.testing.assert_allclose(rotations[:, :, 2], np.broadcast_to([0, 0, 1], (len(rotations), 3)), atol=1e-12)
     angles = np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])
     assert abs(angles).max() < 0.5
@@ -77,11 +77,11 @@ def test_upright_rotations_turn_about_the_vertical_within_their_range():
 @pytest.mark.parametrize(
     ("poses", "count"),
     [
-        (nbv.FreeRotation(), 7),
-        (nbv.Upright(), 5),
-        (nbv.AsGiven(), 4),
-        (nbv.AsGiven(scale=(1.0, 1.0)), 3),
-        (nbv.Upright(by_axis=True), 7),
+        (nbv.surfaces.FreeRotation(), 7),
+        (nbv.surfaces.Upright(), 5),
+        (nbv.surfaces.AsGiven(), 4),
+        (nbv.surfaces.AsGiven(scale=(1.0, 1.0)), 3),
+        (nbv.surfaces.Upright(by_axis=True), 7),
     ],
 )
 def test_steps_are_independent_and_of_unit_length(poses, count):

@@ -17,7 +17,7 @@ SCALES = {"lengthscale": (0.1, 0.3), "variance": (0.8, 0.6)}
 ONE = {"lengthscale": 0.1, "variance": 0.8}
 
 
-class Given(nbv.ValueSource):
+class Given(nbv.surfaces.ValueSource):
     """Values at points of the test's choice; the last row is not filled, whatever stands there."""
 
     points: jax.Array
@@ -87,7 +87,7 @@ def test_values_are_reached_where_they_are_said_to_be():
     data = ball(RNG, 80)
     posterior = nbv.ScreenedSPSR(
         nbv.GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8),
-        (nbv.OutsideBoundary(num_points=60, noise=0.02), nbv.OnSurface(30, noise=0.02)),
+        (nbv.surfaces.OutsideBoundary(num_points=60, noise=0.02), nbv.surfaces.OnSurface(30, noise=0.02)),
     ).condition(data)
     h, rows = float(posterior.half_jump), posterior.rows
     assert h > 0
@@ -109,7 +109,7 @@ def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
     assert beyond.sum() == 8
     model = nbv.ScreenedSPSR(
         nbv.GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8),
-        (nbv.OutsideBoundary(num_points=60), nbv.SeenEmpty(30)),
+        (nbv.surfaces.OutsideBoundary(num_points=60), nbv.surfaces.SeenEmpty(30)),
     )
     nothing = nbv.Observations.start(data, 1, grid)
     seen = eqx.tree_at(lambda e: e.empty_nodes, nothing, jnp.asarray(is_beside | beyond))
@@ -123,17 +123,17 @@ def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
     assert inside(with_bank, beside) < 0.3 * inside(without, beside)
     assert inside(with_bank, near) < 0.5 * inside(without, near)
     assert abs(inside(with_bank, far) - inside(without, far)) < 0.1
-    rows = nbv.SeenEmpty(30).rows(seen)
+    rows = nbv.surfaces.SeenEmpty(30).rows(seen)
     assert np.asarray(rows.mask).all()
     assert len(np.unique(np.asarray(rows.points), axis=0)) == 30
     assert {tuple(p) for p in np.asarray(rows.points)} <= {tuple(p) for p in np.float32(beside)}
     for observations in (nothing, nbv.as_observations(data)):
-        assert not np.asarray(nbv.SeenEmpty(30).rows(observations).mask).any()
+        assert not np.asarray(nbv.surfaces.SeenEmpty(30).rows(observations).mask).any()
 
 
 def test_rows_beyond_the_data_are_not_filled():
     data = ball(RNG, 20)
-    rows = nbv.OnSurface(30).rows(nbv.as_observations(data))
+    rows = nbv.surfaces.OnSurface(30).rows(nbv.as_observations(data))
     assert np.asarray(rows.mask).sum() == 20
     assert len(np.unique(np.asarray(rows.points)[:20], axis=0)) == 20
 
@@ -141,7 +141,7 @@ def test_rows_beyond_the_data_are_not_filled():
 def test_the_posterior_is_differentiable_in_the_data(x64):
     data, model = (
         ball(RNG, 20),
-        nbv.ScreenedSPSR(nbv.GeometricSPSR(0.1, truncation=3), (nbv.OutsideBoundary(num_points=20),)),
+        nbv.ScreenedSPSR(nbv.GeometricSPSR(0.1, truncation=3), (nbv.surfaces.OutsideBoundary(num_points=20),)),
     )
 
     def mean(shift):

@@ -34,14 +34,14 @@ def test_grid_point_and_default_slab_evaluation_agree(x64):
     nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     expected = direct(COEFFICIENTS[0], nodes).reshape(3, 7, 7, 7)
     np.testing.assert_allclose(fields.on_grid(axis), expected, atol=1e-11)
-    np.testing.assert_allclose(nbv.Fields.on_grid(fields, axis), expected, atol=1e-11)
+    np.testing.assert_allclose(nbv.surfaces.Fields.on_grid(fields, axis), expected, atol=1e-11)
 
 
 def test_ways_to_the_gradient_agree(x64):
     fields = TrigonometricFields(jnp.asarray(COEFFICIENTS[0]))
     automatic = jax.vmap(jax.jacobian(lambda x: fields(x[None])[:, 0]))(jnp.asarray(POINTS))
     np.testing.assert_allclose(fields.gradient(POINTS), automatic.transpose(1, 0, 2), atol=1e-10)
-    np.testing.assert_allclose(nbv.Fields.gradient(fields, POINTS), automatic.transpose(1, 0, 2), atol=1e-10)
+    np.testing.assert_allclose(nbv.surfaces.Fields.gradient(fields, POINTS), automatic.transpose(1, 0, 2), atol=1e-10)
     for axis in range(3):
         derivative = TrigonometricFields(differentiate(fields.coefficients, axis))(POINTS)
         np.testing.assert_allclose(derivative, automatic[..., axis].T, atol=1e-10)

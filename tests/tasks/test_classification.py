@@ -74,10 +74,10 @@ def test_scores_of_chosen_probabilities(x64, p, q):
     seen, scanned = one_point(p), one_point(q)
     scores = {
         nbv.CrossEntropy(first_point): crossed,
-        nbv.MixedEntropy(first_point): crossed if before > 0.75 else reduction,
-        nbv.MixedEntropy(first_point, threshold=2.0): reduction,
-        nbv.MixedEntropy(first_point, threshold=0.0): crossed if before > 0 else reduction,
-        nbv.EntropyReduction(first_point): reduction,
+        nbv.tasks.MixedEntropy(first_point): crossed if before > 0.75 else reduction,
+        nbv.tasks.MixedEntropy(first_point, threshold=2.0): reduction,
+        nbv.tasks.MixedEntropy(first_point, threshold=0.0): crossed if before > 0 else reduction,
+        nbv.tasks.EntropyReduction(first_point): reduction,
     }
     for score, expected in scores.items():
         assert float(score_of(score, context_of(score, seen), scanned)) == pytest.approx(expected, rel=1e-12, abs=1e-15)
@@ -87,21 +87,21 @@ def test_the_switch_is_at_the_threshold_and_not_above_it(x64):
     p, q = [0.2, 0.3, 0.5], [0.1, 0.1, 0.8]
     exactly = float(entropy(first_point(one_point(p))))
     for threshold, expected in ((exactly, exactly - entropy_in_numpy(q)), (exactly - 1e-9, entropy_in_numpy(p, q))):
-        score = nbv.MixedEntropy(first_point, threshold=threshold)
+        score = nbv.tasks.MixedEntropy(first_point, threshold=threshold)
         assert float(score_of(score, context_of(score, one_point(p)), one_point(q))) == pytest.approx(
             expected, rel=1e-12
         )
     with pytest.raises(nbv.InputError, match=r"threshold is -0\.1"):
-        nbv.MixedEntropy(first_point, threshold=-0.1)
+        nbv.tasks.MixedEntropy(first_point, threshold=-0.1)
 
 
 def test_a_scan_that_sees_nothing(x64):
     data = random_cloud(20, 25)
     scores = [
         nbv.CrossEntropy(linear),
-        nbv.MixedEntropy(linear, threshold=0.0),
-        nbv.MixedEntropy(linear, threshold=2.0),
-        nbv.EntropyReduction(linear),
+        nbv.tasks.MixedEntropy(linear, threshold=0.0),
+        nbv.tasks.MixedEntropy(linear, threshold=2.0),
+        nbv.tasks.EntropyReduction(linear),
     ]
     for score in scores:
         assert float(score_of(score, context_of(score, data), nothing(6))) == 0.0
@@ -117,15 +117,15 @@ def _of_points(score, data, scanned):
 
 def test_thinning_is_that_by_hand_and_happens_once_before_scans_are_added(x64):
     data, scanned = random_cloud(60, 80), random_cloud(15, 18, (0.3, 0.0, 0.0))
-    by_hand = nbv.farthest_point_subsample(data, 16)
+    by_hand = nbv.geometry.farthest_point_subsample(data, 16)
     p = linear_in_numpy(*by_hand.to_numpy())
-    q = linear_in_numpy(*nbv.concatenate(by_hand, scanned).to_numpy())
+    q = linear_in_numpy(*nbv.geometry.concatenate(by_hand, scanned).to_numpy())
     reduction = max(0.0, entropy_in_numpy(p) - entropy_in_numpy(q))
     scores = {
         nbv.CrossEntropy(linear, num_points=16): entropy_in_numpy(p, q),
-        nbv.MixedEntropy(linear, threshold=0.0, num_points=16): entropy_in_numpy(p, q),
-        nbv.MixedEntropy(linear, threshold=2.0, num_points=16): reduction,
-        nbv.EntropyReduction(linear, num_points=16): reduction,
+        nbv.tasks.MixedEntropy(linear, threshold=0.0, num_points=16): entropy_in_numpy(p, q),
+        nbv.tasks.MixedEntropy(linear, threshold=2.0, num_points=16): reduction,
+        nbv.tasks.EntropyReduction(linear, num_points=16): reduction,
     }
     for score, expected in scores.items():
         context = context_of(score, data)
@@ -140,7 +140,7 @@ def test_thinning_to_what_the_utility_looks_at_leaves_its_value(x64):
     data = random_cloud(60, 80)
 
     def utility(cloud):
-        fed = nbv.farthest_point_subsample(cloud, 16)
+        fed = nbv.geometry.farthest_point_subsample(cloud, 16)
         return jnp.sum(jnp.where(fed.mask, fed.points[:, 0] * jnp.arange(16), 0.0))
 
     whole, thinned = nbv.ExpectedUtilityImprovement(utility), nbv.ExpectedUtilityImprovement(utility, num_points=16)
@@ -152,9 +152,9 @@ def test_thinning_to_what_the_utility_looks_at_leaves_its_value(x64):
     "score",
     [
         nbv.CrossEntropy(linear, num_points=20),
-        nbv.MixedEntropy(linear, threshold=0.0, num_points=20),
-        nbv.MixedEntropy(linear, threshold=2.0, num_points=20),
-        nbv.EntropyReduction(linear, num_points=20),
+        nbv.tasks.MixedEntropy(linear, threshold=0.0, num_points=20),
+        nbv.tasks.MixedEntropy(linear, threshold=2.0, num_points=20),
+        nbv.tasks.EntropyReduction(linear, num_points=20),
     ],
 )
 def test_gradient_in_the_scan_against_central_differences(x64, score):
@@ -194,7 +194,7 @@ def test_answers_name_the_classes_where_the_classifier_does():
     assert words_of(answer).found == "bowl, probability 0.70"
     answer = nbv.CrossEntropy(linear, num_points=12).answer(data)
     assert answer.names[:2] == ("class 0", "class 1")
-    thinned = linear_in_numpy(*nbv.farthest_point_subsample(data, 12).to_numpy())
+    thinned = linear_in_numpy(*nbv.geometry.farthest_point_subsample(data, 12).to_numpy())
     np.testing.assert_allclose(answer.values, thinned, atol=1e-5)
 
 

@@ -79,7 +79,7 @@ def test_the_score_is_the_area_weighed_by_how_far_it_is_to_d():
 def test_between_the_points_of_a_sparse_cloud_nothing_is_new():
     """As many points as are 0.1 apart, all over the ball that is looked at: by the size alone half of it were new."""
     seen, camera = looked_at()
-    cloud = cloud_of(RADIUS * np.asarray(nbv.fibonacci_sphere(300)))
+    cloud = cloud_of(RADIUS * np.asarray(nbv.geometry.fibonacci_sphere(300)))
     acquisition = nbv.NewSurface(0.02)
     score = float(acquisition.score(context_of(acquisition, cloud), ImaginedView(seen, camera, POSE)))
     assert score < 0.02 * float(jnp.sum(visible_area(ImaginedView(seen, camera, POSE))))
@@ -125,7 +125,7 @@ def test_a_scan_that_sees_nothing_or_nothing_new_is_worth_nothing(score):
 def test_the_acquisition_against_brute_force_over_all_scans():
     rng = np.random.default_rng(2)
     surfaces = balls(nbv.Grid(20), (0.8, 0.6, 0.9), rng.uniform(-0.3, 0.3, (3, 3)))
-    data, poses = drawn_cloud(rng, 60, 64), nbv.look_at(nbv.fibonacci_sphere(5, 2.5))
+    data, poses = drawn_cloud(rng, 60, 64), nbv.look_at(nbv.geometry.fibonacci_sphere(5, 2.5))
     expected = np.zeros((3, 5))
     for s, p in np.ndindex(3, 5):
         surface = jax.tree.map(lambda leaf, s=s: leaf[s], surfaces)

@@ -16,7 +16,7 @@ NOWHERE = np.array([9.0, 9.0, 9.0])
 
 
 def sphere_points(count, radius=1.0):
-    return radius * np.asarray(nbv.fibonacci_sphere(count, 1.0), np.float64)
+    return radius * np.asarray(nbv.geometry.fibonacci_sphere(count, 1.0), np.float64)
 
 
 def plate(across, along, width=1.0, height=0.5):
@@ -52,7 +52,7 @@ def test_a_heated_sphere_against_its_series():
     """u_T = sum_l f_l sum_k h (1 + h l(l+1))^-k P_l, f_l = power (P_{l-1} - P_{l+1})(cos a) / 2 on a cap of angle a."""
     ball = trimesh.creation.icosphere(5)
     top, radius, steps, duration = np.array([0.0, 0.0, 1.0]), 0.4, 5, 2.0
-    heat = nbv.HeatProblem(top, radius, power=3.0, duration=duration, steps=steps, initial=1.0)
+    heat = nbv.tasks.HeatProblem(top, radius, power=3.0, duration=duration, steps=steps, initial=1.0)
     edge, degrees = 1 - radius**2 / 2, np.arange(1, 200)
     cap = 1.5 * (eval_legendre(degrees - 1, edge) - eval_legendre(degrees + 1, edge))
     powers = (1 + duration / steps * degrees * (degrees + 1)) ** -np.arange(1.0, steps + 1)[:, None]
@@ -110,7 +110,7 @@ def test_halving_the_time_step_halves_the_error():
 def test_only_the_piece_with_the_source_gets_warm():
     ball = sphere_points(200, 0.5)
     points = np.concatenate([ball, ball + np.array([5.0, 0.0, 0.0])])
-    heat = nbv.HeatProblem(ball[7], initial=3.0)
+    heat = nbv.tasks.HeatProblem(ball[7], initial=3.0)
     values, reached = cloud_temperature(points, heat)
     np.testing.assert_array_equal(reached, np.arange(400) < 200)
     np.testing.assert_array_equal(values[200:], 3.0)
@@ -123,7 +123,10 @@ def test_only_the_piece_with_the_source_gets_warm():
 
 
 def test_a_source_that_nothing_is_near():
-    for heat in (nbv.HeatProblem(NOWHERE, initial=-2.0), nbv.HeatProblem(np.zeros(3), power=0.0, initial=-2.0)):
+    for heat in (
+        nbv.tasks.HeatProblem(NOWHERE, initial=-2.0),
+        nbv.tasks.HeatProblem(np.zeros(3), power=0.0, initial=-2.0),
+    ):
         values, reached = cloud_temperature(np.concatenate([np.zeros((1, 3)), sphere_points(50)]), heat)
         np.testing.assert_array_equal(values, -2.0)
         assert not reached.any()
@@ -131,7 +134,7 @@ def test_a_source_that_nothing_is_near():
 
 def test_the_source_warms_the_share_of_a_disc_within_its_radius():
     distances = np.array([0.0, 0.15, 0.2, 0.225, 0.25, 0.3])
-    heat = nbv.HeatProblem(np.array([0.1, -0.4, 2.0]), radius=0.2, power=4.0)
+    heat = nbv.tasks.HeatProblem(np.array([0.1, -0.4, 2.0]), radius=0.2, power=4.0)
     points = heat.source + distances[:, None] * np.array([0.6, 0.0, 0.8])
     small, large = np.pi * 0.05**2, np.pi * 0.2**2
     shares = heat.heating(points, np.full(6, small)) / 4.0
@@ -144,7 +147,7 @@ def test_the_source_warms_the_share_of_a_disc_within_its_radius():
 def test_points_without_triangles_keep_what_they_get():
     """Lines, pairs and single points conduct nothing: u0 + T power where the source is, u0 elsewhere."""
     line = np.linspace(0.0, 1.0, 40)[:, None] * np.array([1.0, 2.0, -1.0])
-    heat = nbv.HeatProblem(line[0], radius=1e-3, power=2.0, duration=3.0, initial=1.0)
+    heat = nbv.tasks.HeatProblem(line[0], radius=1e-3, power=2.0, duration=3.0, initial=1.0)
     for points in (line, line[:1], line[:2], np.tile(line[:1], (35, 1)), np.concatenate([line, line + 7.0])):
         distinct, place = np.unique(points, axis=0, return_inverse=True)
         gained = 3.0 * heat.heating(distinct, cloud_laplacian(distinct).mass)[place.reshape(-1)]
@@ -168,7 +171,7 @@ def test_any_cloud_has_a_temperature(seed, count, copies, flatness):
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(count, 3)) * [1.0, flatness, flatness]
     order = np.concatenate([np.arange(count), rng.integers(0, count, copies)])
-    heat = nbv.HeatProblem(points[0], radius=0.3, initial=1.0)
+    heat = nbv.tasks.HeatProblem(points[0], radius=0.3, initial=1.0)
     once = cloud_temperature(points, heat)
     again = cloud_temperature(points[order], heat)
     np.testing.assert_array_equal(again.values, once.values[order])
@@ -181,7 +184,7 @@ def test_any_cloud_has_a_temperature(seed, count, copies, flatness):
 
 def test_heat_crosses_the_seams_of_a_soup():
     ball = trimesh.creation.icosphere(2)
-    heat = nbv.HeatProblem(np.asarray(ball.vertices[0]), radius=0.4)
+    heat = nbv.tasks.HeatProblem(np.asarray(ball.vertices[0]), radius=0.4)
     whole = mesh_temperature(np.asarray(ball.vertices), np.asarray(ball.faces), heat)
     soup = np.asarray(ball.vertices)[ball.faces].reshape(-1, 3)
     # With a triangle that is a point, and a vertex that no triangle uses.
@@ -210,7 +213,7 @@ def test_refinement_halves_edges_and_tears_nothing(longest):
 
 
 def test_bad_input_is_told():
-    heat, bad = nbv.HeatProblem(np.zeros(3)), sphere_points(40)
+    heat, bad = nbv.tasks.HeatProblem(np.zeros(3)), sphere_points(40)
     bad[5, 1] = np.nan
     for solve in (lambda: cloud_temperature(bad, heat), lambda: mesh_temperature(bad, np.array([[0, 1, 2]]), heat)):
         with pytest.raises(nbv.InputError, match="1 points are not finite"):
@@ -226,7 +229,7 @@ def test_bad_input_is_told():
         "heat source is": {"source": np.array([0.0, np.nan, 0.0])},
     }.items():
         with pytest.raises(nbv.InputError, match=message):
-            nbv.HeatProblem(**{"source": np.zeros(3), **wrong})
+            nbv.tasks.HeatProblem(**{"source": np.zeros(3), **wrong})
 
 
 def test_three_points_are_a_triangle():

@@ -17,7 +17,7 @@ from jaxnbv.tasks.heat import body_temperature
 RNG = np.random.default_rng(0)
 CAMERA, GRID = nbv.Camera(height=8, width=8), nbv.Grid(24)
 POLE = np.array([0.0, 0.0, 1.0])
-HEAT = nbv.HeatProblem(POLE, radius=0.4, power=8.0, duration=1.0, steps=6, initial=0.5)
+HEAT = nbv.tasks.HeatProblem(POLE, radius=0.4, power=8.0, duration=1.0, steps=6, initial=0.5)
 
 
 def sphere(count):
@@ -120,14 +120,14 @@ def test_the_coldest_point_of_a_mesh_and_of_a_scan_of_it():
     """A bar that is heated at one end is coldest at the other."""
     bar = trimesh.creation.box((2.5, 0.15, 0.15))
     mesh = nbv.TriangleMesh.from_arrays(np.asarray(bar.vertices), np.asarray(bar.faces))
-    heat = nbv.HeatProblem([-1.25, 0.0, 0.0], radius=0.2)
+    heat = nbv.tasks.HeatProblem([-1.25, 0.0, 0.0], radius=0.2)
     points, temperature = body_temperature(mesh, heat)
-    truth = nbv.coldest_point(mesh, heat)
+    truth = nbv.tasks.coldest_point(mesh, heat)
     assert truth.point[0] == pytest.approx(1.25)
     assert truth.temperature == temperature.values.min() > 0
     assert len(points) > 100 * len(mesh.vertices)
     cloud = cloud_of(mesh.sample_points(jax.random.key(0), 2000), 2100)
-    estimate = nbv.coldest_point(cloud, heat)
+    estimate = nbv.tasks.coldest_point(cloud, heat)
     assert estimate.point[0] > 1.2
     assert estimate.temperature == pytest.approx(truth.temperature, rel=0.2)
     assert float(utility_of(heat, workers=1)(cloud)) == pytest.approx(-estimate.temperature, rel=1e-5)
@@ -136,13 +136,13 @@ def test_the_coldest_point_of_a_mesh_and_of_a_scan_of_it():
 def test_the_coldest_point_that_heat_reaches():
     near, far = sphere(60), sphere(60) + np.array([9.0, 0.0, 0.0])
     both = cloud_of(np.concatenate([near, far]))
-    assert nbv.coldest_point(both, HEAT).temperature == 0.5
-    reached = nbv.coldest_point(both, HEAT, reached_only=True)
+    assert nbv.tasks.coldest_point(both, HEAT).temperature == 0.5
+    reached = nbv.tasks.coldest_point(both, HEAT, reached_only=True)
     assert np.abs(reached.point).max() < 1.1
     assert reached.temperature > 0.55
     for body, why in ((cloud_of(far), "none of its 60 points"), (nothing(4), "it is empty")):
         with pytest.raises(nbv.InputError, match=why):
-            nbv.coldest_point(body, HEAT, reached_only=True)
+            nbv.tasks.coldest_point(body, HEAT, reached_only=True)
 
 
 def test_points_that_are_not_finite_and_wrong_numbers_of_workers_are_told():

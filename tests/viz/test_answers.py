@@ -65,7 +65,11 @@ def test_an_acquisition_without_words_has_its_type():
 
 
 def test_a_search_that_does_not_ask_the_score_says_so():
-    units = {nbv.FarthestView: "scene units", nbv.RandomView: "uniform on [0, 1)", nbv.UncertaintyView: "scene units"}
+    units = {
+        nbv.FarthestView: "scene units",
+        nbv.RandomView: "uniform on [0, 1)",
+        nbv.search.UncertaintyView: "scene units",
+    }
     for kind, unit in units.items():
         assert kind().quantity(nbv.Coverage()).unit == unit
         assert kind().quantity(Unnamed()) == kind().quantity(nbv.Coverage())

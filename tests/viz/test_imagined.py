@@ -14,14 +14,14 @@ CAMERA = nbv.Camera(1.0, 32, 32)
 TRUE_RADIUS = 1.0
 
 
-class Balls(nbv.Fields):
+class Balls(nbv.surfaces.Fields):
     radii: jax.Array
 
     def __call__(self, x):
         return (jnp.linalg.norm(x, axis=-1) - self.radii[:, None]).astype(x.dtype)
 
 
-class BallPosterior(nbv.SurfacePosterior):
+class BallPosterior(nbv.surfaces.SurfacePosterior):
     level: jax.Array
 
     def sample(self, key, num_samples):
@@ -71,7 +71,7 @@ def test_the_samples_are_those_of_the_step(episode):
 
 def test_what_was_seen_before_is_told_from_what_was_not(episode):
     """Half of a ball was seen from +z: from +x its near half in z is known, the other is not."""
-    cloud = 1.0 * np.asarray(nbv.fibonacci_sphere(4000), np.float64)
+    cloud = 1.0 * np.asarray(nbv.geometry.fibonacci_sphere(4000), np.float64)
     pose = nbv.look_at((2.5, 0.0, 0.0))
     scan = nbv.scan(nbv.SDFSurface(Sphere(1.0)), CAMERA, pose)
     image = look(scan, CAMERA, pose, cloud[cloud[:, 2] > 0])

@@ -117,7 +117,7 @@ def test_of_a_scene_without_truth_the_area_that_was_seen_is_told(tmp_path, episo
     """Of a ball of radius 1 a first view sees the cap before its horizon, 2 pi (1 - 1 / r)."""
     grid = nbv.Grid(24)
     distance = np.linalg.norm(np.stack(np.meshgrid(*[grid.axis] * 3, indexing="ij")), axis=0) - 1.0
-    scene = nbv.GridSurface.from_values(distance, 0.0, grid)
+    scene = nbv.scanning.GridSurface.from_values(distance, 0.0, grid)
     camera, pose = nbv.Camera(1.0, 40, 40), nbv.look_at((0.0, 0.0, 2.5))
     seen = nbv.scan(nbv.SDFSurface(nbv.sdf.Sphere(1.0)), camera, pose)
     lone = dataclasses.replace(episode, scene=scene, views=(nbv.View(pose, seen, seen, None, camera),))
@@ -138,14 +138,14 @@ def test_of_a_scene_without_truth_the_area_that_was_seen_is_told(tmp_path, episo
     assert report_data(lone, truth, progress=False).views[0].seen.values[0] in (0.0, 50.0, 100.0)
 
 
-class NoisySphere(nbv.Fields):
+class NoisySphere(nbv.surfaces.Fields):
     radii: jax.Array
 
     def __call__(self, x):
         return (jnp.linalg.norm(x, axis=-1) - self.radii[:, None]).astype(x.dtype)
 
 
-class SpherePosterior(nbv.SurfacePosterior):
+class SpherePosterior(nbv.surfaces.SurfacePosterior):
     level: jax.Array
 
     def sample(self, key, num_samples):
@@ -201,16 +201,16 @@ def test_what_was_seen_is_known_better_than_what_was_not():
 
 
 def test_excluded_candidates_have_no_value():
-    poses = nbv.look_at(nbv.fibonacci_sphere(5, 2.5))
+    poses = nbv.look_at(nbv.geometry.fibonacci_sphere(5, 2.5))
     values = jnp.array([3.0, -jnp.inf, 5.0, 1.0, 4.0])
-    proposal = nbv.Proposal(poses[0], values[0], poses, values)
+    proposal = nbv.search.Proposal(poses[0], values[0], poses, values)
     np.testing.assert_array_equal(open_values(proposal), [3.0, np.nan, 5.0, 1.0, 4.0])
     np.testing.assert_array_equal(best_first(proposal), [5.0, 4.0, 3.0, 1.0])
     assert marks(proposal) == ["× visited"]
 
 
 def test_the_map_keeps_values():
-    some = np.asarray(nbv.fibonacci_sphere(100), dtype=np.float64)
+    some = np.asarray(nbv.geometry.fibonacci_sphere(100), dtype=np.float64)
     np.testing.assert_allclose(on_map(np.eye(3)), [[np.pi / 2, 0.0], [0.0, np.pi / 2], [0.0, 0.0]], atol=1e-12)
     values = some[:, 1] + some[:, 0] * some[:, 2]
     values[3] = np.nan

@@ -109,10 +109,12 @@ def test_a_utility_of_ones_own_has_its_chart_and_its_truth(plain):
 
 def test_coverage_by_view_is_the_share_of_the_truth_that_was_seen(plain):
     episode = run(nbv.Coverage(), nbv.SDFSurface(Sphere(0.9)))
-    truth = 0.9 * np.asarray(nbv.fibonacci_sphere(500), np.float64)
+    truth = 0.9 * np.asarray(nbv.geometry.fibonacci_sphere(500), np.float64)
     data = report_data(episode, truth, progress=False, imagine=False)
     _, *rows = Page(report_html(data, "ball")).tables["Surface seen (%)"]
-    assert [row[1] for row in rows] == [number(100.0 * share) for share in nbv.metrics.coverage(episode.views, truth)]
+    assert [row[1] for row in rows] == [
+        number(100.0 * share) for share in nbv.scanning.metrics.coverage(episode.views, truth)
+    ]
 
 
 def test_truth_of_a_scene_is_all_over_it():
@@ -123,7 +125,8 @@ def test_truth_of_a_scene_is_all_over_it():
     assert np.abs(points.mean(axis=0)).max() < 5 * 0.9 / np.sqrt(3 * len(points))
     assert (
         true_cloud(
-            nbv.GridSurface.from_values(jnp.ones((24, 24, 24)).at[12, 12, 12].set(-1.0), 0.0, nbv.Grid(24)), 8192
+            nbv.scanning.GridSurface.from_values(jnp.ones((24, 24, 24)).at[12, 12, 12].set(-1.0), 0.0, nbv.Grid(24)),
+            8192,
         )
         is None
     )
@@ -131,7 +134,7 @@ def test_truth_of_a_scene_is_all_over_it():
 
 def test_a_class_is_not_known_of_a_scene_without_one():
     ball, cloud = nbv.SDFSurface(Sphere(0.9)), nbv.PointCloud.from_arrays([[0.0, 0.9, 0.0]], [[0.0, 1.0, 0.0]])
-    for score in (nbv.CrossEntropy(Leaning()), nbv.EntropyReduction(Leaning())):
+    for score in (nbv.CrossEntropy(Leaning()), nbv.tasks.EntropyReduction(Leaning())):
         assert score.true_answer(ball, cloud) is None
         known = score.true_answer(nbv.SDFSurface(pyramid_scene(Split.TEST, 2)), cloud)
         np.testing.assert_array_equal(known.values, [0.0, 0.0, 1.0])
@@ -235,8 +238,10 @@ def test_a_rival_is_told_of_and_drawn(plain):
     )
     assert report_data(ended, progress=False, imagine=False).task.sure.endswith("It ended by its rule: sure of it.")
     np.testing.assert_allclose(rival.charts[0].values[2], p, atol=1e-6)
-    truth = nbv.metrics.truth_points(scene, jax.random.key(0))
-    np.testing.assert_allclose(rival.seen.values[:, 0], 100.0 * np.array(nbv.metrics.coverage(other.views, truth)))
+    truth = nbv.scanning.metrics.truth_points(scene, jax.random.key(0))
+    np.testing.assert_allclose(
+        rival.seen.values[:, 0], 100.0 * np.array(nbv.scanning.metrics.coverage(other.views, truth))
+    )
     assert rival.words in report_html(data, "thing")
     ((_, figure),) = task_charts(data)
     (axes,) = figure.axes

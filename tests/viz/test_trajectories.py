@@ -43,7 +43,7 @@ class Walks(Search):
         flat = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), poses)
         ways = Trajectories(poses, problem.values(flat).reshape(4, 6))
         found = best_unvisited(problem, *joined((candidates, values), ways.flat))
-        return nbv.Proposal(found.pose, found.value, candidates, found.values[:4], ways)
+        return nbv.search.Proposal(found.pose, found.value, candidates, found.values[:4], ways)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -77,7 +77,7 @@ def trajectories(values) -> Trajectories:
 @pytest.mark.parametrize(("count", "lots", "has_map"), [(48, False, True), (11, False, False), (48, True, False)])
 def test_a_map_is_made_of_enough_candidates_and_of_no_lots(count, lots, has_map):
     candidates = sphere_candidates(count)
-    seen = nbv.Proposal(candidates[0], jnp.ones(()), candidates, candidates.position[:, 0])
+    seen = nbv.search.Proposal(candidates[0], jnp.ones(()), candidates, candidates.position[:, 0])
     axes = Figure().add_axes((0, 0, 1, 1))
     draw_acquisition(axes, seen, nbv.Quantity("", "", "", smooth=not lots))
     (globe,) = axes.child_axes
@@ -89,8 +89,8 @@ def said_of(value, others, starts=0, pose=None, standard_error=None, quantity=CO
     pose, first = look_at((0.0, 0.0, 2.5)) if pose is None else pose, look_at((2.5, 0.0, 0.0))
     ways = trajectories(np.zeros((starts, 2))) if starts else None
     errors = None if standard_error is None else jnp.full(len(others), standard_error)
-    candidates = look_at(nbv.fibonacci_sphere(max(len(others), 1), 2.5))[: len(others)]
-    looked = nbv.Proposal(pose, jnp.asarray(value), candidates, jnp.asarray(others), ways, errors, errors)
+    candidates = look_at(nbv.geometry.fibonacci_sphere(max(len(others), 1), 2.5))[: len(others)]
+    looked = nbv.search.Proposal(pose, jnp.asarray(value), candidates, jnp.asarray(others), ways, errors, errors)
     scan = nbv.PointCloud.from_arrays(np.eye(3), np.eye(3))
     views = [nbv.View(first, scan, scan, None, CAMERA), nbv.View(pose, scan, scan, looked, CAMERA)]
     seen = [CoverageAnswer(("of surface seen",), np.array([area]), unit="scene units²") for area in (0.2, 0.3)]

@@ -12,7 +12,7 @@ from jaxnbv.viz.mean_surface import MeanSurface, as_shown
 
 def test_the_deviation_allows_for_a_quarter_of_the_distance_to_the_nearest_point():
     """On a unit sphere of which one point was seen, and is held to be known to 0.03 all over."""
-    vertices = np.asarray(nbv.fibonacci_sphere(200), np.float64)
+    vertices = np.asarray(nbv.geometry.fibonacci_sphere(200), np.float64)
     surface = MeanSurface(vertices, ConvexHull(vertices).simplices, vertices, np.full(200, 0.03))
     # Rows that hold nothing lie at the origin, and are no points.
     cloud = nbv.PointCloud.from_arrays(vertices[:1], vertices[:1], capacity=4)
@@ -25,7 +25,7 @@ def test_the_deviation_allows_for_a_quarter_of_the_distance_to_the_nearest_point
 
 def test_pieces_that_hold_no_points_are_not_shown():
     """Of two unit spheres one point of the first was seen."""
-    ball = np.asarray(nbv.fibonacci_sphere(200), np.float64)
+    ball = np.asarray(nbv.geometry.fibonacci_sphere(200), np.float64)
     faces = ConvexHull(ball).simplices
     other = ball + np.array([3.0, 0.0, 0.0])
     both = np.concatenate([ball, other])

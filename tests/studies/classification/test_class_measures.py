@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnbv import GeometricSPSR, Grid, GridSurface, PointCloud, as_observations
+from jaxnbv import GeometricSPSR, Grid, PointCloud, as_observations
 from jaxnbv.sampler import StepInputs, SurfaceSampler
+from jaxnbv.scanning import GridSurface
 from jaxnbv.studies.classification.measures import crossed_cells, first_hits, rank_correlation, roughness, stable_hits
 from jaxnbv.studies.classification.objects import PyramidStudy
 

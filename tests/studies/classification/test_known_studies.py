@@ -101,7 +101,7 @@ def test_of_meshes_each_is_planned_by_who_has_seen_the_others(tmp_path, monkeypa
 
 def test_one_who_knows_no_shapes_any_more_is_as_before():
     plain = nbv.SurfaceSampler.preset("screened", 1.25)
-    with_bank = plain.with_bank(nbv.ShapeBank.of([nbv.sdf.Sphere(1.0)]), nbv.AsGiven())
+    with_bank = plain.with_bank(nbv.ShapeBank.of([nbv.sdf.Sphere(1.0)]), nbv.surfaces.AsGiven())
     assert with_bank.model.box == nbv.Box.cube(1.25)
     assert float(with_bank.model.residual.base.lengthscale) == pytest.approx(0.005)
     assert jax.tree.structure(with_bank.without_bank) == jax.tree.structure(plain)

@@ -48,7 +48,7 @@ def test_extremes_lie_on_the_shapes_and_bound_them(name):
 def test_real_shapes_are_named_by_their_class_and_stand_upright():
     bank = shape_bank("household-real")
     assert {"chair", "table", "sofa"} <= {name.split()[0] for name in bank.names}
-    assert isinstance(bank_poses("household-real"), nbv.Upright)
+    assert isinstance(bank_poses("household-real"), nbv.surfaces.Upright)
     longest = np.ptp(np.asarray(bank.extremes), axis=1).max(axis=1)
     np.testing.assert_allclose(longest, 2.5, atol=0.01)
 
