@@ -136,9 +136,9 @@ def cross_entropy(bench: Bench) -> None:
 
     @jax.jit
     def thinned(seen):
-        join = lambda scan: nbv.geometry.farthest_point_subsample(
-            nbv.geometry.concatenate(known, scan), classifier.num_points
-        )  # noqa: E731
+        def join(scan):
+            return nbv.geometry.farthest_point_subsample(nbv.geometry.concatenate(known, scan), classifier.num_points)
+
         return jax.lax.map(join, seen)
 
     bench.take("cross-entropy: farthest points of 1,920 clouds", lambda: thinned(seen), step=step)
