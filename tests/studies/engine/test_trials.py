@@ -101,10 +101,10 @@ def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypa
         return {"scene": index, "methods": {name: {"points": [1000, 4000], "views": [0, 1]} for name in methods}}
 
     def run(out, scenes, **of_studies):
-        options = StudyOptions(name="toy", scenes=scenes, views=2, model="paper", out=tmp_path / out)
+        options = StudyOptions(name="pyramid", scenes=scenes, views=2, model="paper", out=tmp_path / out)
         command.run_study(options, **of_studies)
 
-    monkeypatch.setitem(studies(), "toy", Entry("toy:ToyStudy", "", 3, 2))
+    monkeypatch.setitem(studies(), "pyramid", Entry("toy:ToyStudy", "", 3, 2))
     monkeypatch.setattr(command, "run_scene", fake)
     with pytest.raises(
         InputError, match=r"^1 of 3 scenes failed.*first scene 1 \(RuntimeError: lost\).*/some has scene_\*\.failed"
@@ -121,5 +121,5 @@ def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypa
     for wrong in ("0", "3:3", "9:7", "-2", "all"):
         with pytest.raises(InputError, match=f"--scenes {wrong} names no scenes"):
             run("wrong", wrong)
-    with pytest.raises(InputError, match="the study toy takes no --meshes: it is for truck"):
+    with pytest.raises(InputError, match="the study pyramid takes no --meshes: it is for truck"):
         run("wrong", "2", meshes=tmp_path)
