@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import typer
 
 from jaxnbv.checks import InputError, require
@@ -47,11 +48,12 @@ def run_study(options: StudyOptions, **of_studies: Any) -> None:
     failures: dict[str, str] = {}
     count = 0
     for part, study in kind.configured(model, options.views or entry.views, options.quick, **given).items():
-        config = {"study": describe(study), "methods": sorted(methods)}
+        arrays: dict[str, np.ndarray] = {}
+        config = {"study": describe(study, arrays, "study"), "methods": sorted(methods)}
         config |= {"own": {text: describe(make) for text, make in own.items()}} if own else {}
         there = scenes if study.num_scenes is None else [index for index in scenes if index < study.num_scenes]
         run = functools.partial(run_scene, study, methods=methods, own=own)
-        held = RecordFolder(folder / part, config, options.workers)
+        held = RecordFolder(folder / part, config, options.workers, arrays)
         records = held.collect(there, run)
         failures |= {f"{part} scene {index}".strip(): error for index, error in held.failures(there).items()}
         count += len(there)

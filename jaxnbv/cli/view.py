@@ -1,6 +1,5 @@
 """`jaxnbv view RUN`: a look at an episode."""
 
-import dataclasses
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,38 +7,32 @@ from typing import Annotated
 
 import typer
 
-from jaxnbv.cli.episode import KnownOption
 from jaxnbv.cli.options import command
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions:
-    folder: Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run.")]
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run or a session.")]
     html: Annotated[
         Path | None, typer.Option(help="Write the scene into one HTML file, which opens offline, and end.")
     ] = None
-    known: KnownOption = None
     port: Annotated[int, typer.Option(min=0, max=65535, help="Where the page is served.")] = 8080
 
 
 @command(ViewOptions)
 def view(options: ViewOptions) -> None:
-    """Look at a run in the browser: points, cameras, the surface, what is imagined, where to look next.
-
-    Surfaces are those of the usual model given what was seen, by one who knows shapes with --known.
-    """
+    """Look at a run or a session in the browser: points, cameras, the surface, what is imagined, where to look next."""
     from jaxnbv.checks import check_device
 
     check_device()
-    from jaxnbv.cli.play import imagined
     from jaxnbv.planning.episode import Episode
+    from jaxnbv.planning.session import Session
     from jaxnbv.viz import LiveView
 
-    episode, page = Episode.load(options.folder), LiveView(options.port)
+    is_session = (options.folder / "session.json").exists()
+    episode = Session.load(options.folder).episode if is_session else Episode.load(options.folder)
+    page = LiveView(options.port)
     try:
-        if options.known is not None:
-            planner = dataclasses.replace(episode.planner, sampler=imagined("screened", False, options.known))
-            episode = dataclasses.replace(episode, planner=planner)
         page.update(episode)
         if options.html is not None:
             typer.echo(f"page     {page.save(options.html)}")

@@ -3,6 +3,7 @@
 import dataclasses
 import enum
 import functools
+import hashlib
 import importlib
 import sys
 from collections.abc import Callable, Mapping
@@ -15,7 +16,7 @@ import numpy as np
 
 from jaxnbv.checks import InputError, require
 from jaxnbv.storage.description import describe, fields_of, is_installed, is_record, lookup, name_of
-from jaxnbv.storage.folders import differences
+from jaxnbv.storage.folders import ARRAYS, check_format, differences, read_arrays, read_record
 
 # Modules of installed packages whose functions compute and nothing else. Those of others might do anything when called.
 _HARMLESS = ("jaxnbv", "jax.nn", "jax._src.nn", "jax.lax", "equinox.nn", "optimistix", "math")
@@ -50,6 +51,31 @@ def rebuild(description: Any, arrays: Mapping[str, np.ndarray], way: str) -> Any
     changed = differences(description, describe(thing, way=way), way)
     require(not changed, f"{'; '.join(changed[:3])}: what it was made of has changed; {remedy}")
     return thing
+
+
+def read_config(path: str | Path, kind: str, format: int, given: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration of an existing folder, made again from its record.
+
+    - `kind`: of the folder, "episode" say; `format`: the number of the format of its record.
+    - `given`: parts by their names that are not made again. Opening the folder for them checks that they are those of
+      the record.
+
+    **Raises:** `ValueError` if the folder holds no record, or one that is damaged, or has a part that cannot be made
+    again and is not given.
+    """
+    folder, remedy = Path(path), "give the folder of a run"
+    record = read_record(folder, kind, remedy)
+    check_format(record.get("format"), format, folder / f"{kind}.json")
+    parts = {name: part for name, part in record["config"].items() if name not in given}
+    file = folder / ARRAYS
+    arrays = read_arrays(file, "restore it", _check_hashes) if file.exists() else {}
+    return dict(given) | {name: rebuild(part, arrays, name) for name, part in parts.items()}
+
+
+def _check_hashes(arrays: dict[str, np.ndarray]) -> None:
+    for name, array in arrays.items():
+        if hashlib.sha256(array.tobytes()).hexdigest() != name:
+            raise ValueError(f"the array {name} is another")
 
 
 class _Rebuilder:

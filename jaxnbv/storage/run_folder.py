@@ -30,8 +30,8 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.search import Proposal, Trajectories
 from jaxnbv.storage.description import describe
 from jaxnbv.storage.files import write_whole
-from jaxnbv.storage.folders import ARRAYS, ResultFolder, check_format, read_arrays, read_record, write_arrays
-from jaxnbv.storage.rebuilding import rebuild
+from jaxnbv.storage.folders import ResultFolder, read_arrays, write_arrays
+from jaxnbv.storage.rebuilding import read_config
 
 # What is stored as several arrays.
 _MODULES = {
@@ -64,21 +64,8 @@ class RunFolder(ResultFolder):
 
     @classmethod
     def config_of(cls, path: str | Path, kind: str, **given: Any) -> dict[str, Any]:
-        """The configuration of an existing folder, made again from its record.
-
-        - `given`: parts that are taken instead of being made again, `planner` say. Opening the folder for them checks
-          that they are those of the record.
-
-        **Raises:** `ValueError` if the folder holds no record, or one that is damaged, or has a part that cannot be
-        made again and is not given.
-        """
-        folder = Path(path)
-        record = read_record(folder, kind, "give the folder of a run")
-        check_format(record.get("format"), cls.format, folder / f"{kind}.json")
-        parts = {name: told for name, told in record["config"].items() if name not in given}
-        file = folder / ARRAYS
-        arrays = read_arrays(file, "restore it", _check_hashes) if file.exists() else {}
-        return given | {name: rebuild(told, arrays, name) for name, told in parts.items()}
+        """The configuration of an existing folder, see `read_config`."""
+        return read_config(path, kind, cls.format, given)
 
     def count(self, name: str) -> int:
         """How many files of a name there are, of "view" say: view_00.npz, view_01.npz and so on.
@@ -132,18 +119,12 @@ class RunFolder(ResultFolder):
         return _parts(arrays)
 
     def write_cloud(self, cloud: PointCloud) -> None:
-        """Write points and normals as a binary PLY file, in scene coordinates."""
+        """Write points and normals as a binary PLY file, in the coordinates that they have."""
         points, normals = cloud.to_numpy()
         # A mesh without faces: clouds of trimesh have no normals.
         bare = trimesh.Trimesh(points, vertex_normals=normals, process=False)
         content = trimesh.exchange.ply.export_ply(bare, vertex_normal=True)
         write_whole(self.path / "cloud.ply", lambda file: file.write(content))
-
-
-def _check_hashes(arrays: dict[str, np.ndarray]) -> None:
-    for name, array in arrays.items():
-        if hashlib.sha256(array.tobytes()).hexdigest() != name:
-            raise ValueError(f"the array {name} is another")
 
 
 def _checksum(arrays: dict[str, np.ndarray]) -> str:

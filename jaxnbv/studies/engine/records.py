@@ -4,10 +4,13 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
+
+import numpy as np
 
 from jaxnbv.checks import InputError, require
 from jaxnbv.progress import progress_bar
@@ -18,21 +21,25 @@ from jaxnbv.studies.engine.trials import Failure, Trial, cores_of, outcomes
 
 _FAILED = ".failed"
 _FORMAT = 2
+_NONE: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
 class RecordFolder(ResultFolder):
     """A folder of records that belong to one configuration, kept beside them in study.json.
 
     - `workers`: how many missing ones are made at a time.
+    - `arrays`: the large arrays of the configuration, see `describe`.
 
     **Raises:** `ValueError` if the folder cannot be made or holds records of another configuration.
     """
 
     kind, pattern, format = "study", "scene_*.json", _FORMAT
 
-    def __init__(self, path: str | Path, config: dict[str, Any], workers: int = 1):
+    def __init__(
+        self, path: str | Path, config: dict[str, Any], workers: int = 1, arrays: Mapping[str, np.ndarray] = _NONE
+    ):
         self.workers = workers
-        super().__init__(path, config, cores_of(workers))
+        super().__init__(path, config, cores_of(workers), arrays)
 
     def collect(self, scenes: Sequence[int], run: Trial, progress: bool = True) -> list[Record]:
         """The records of these scenes, in order: those on disk as they are, the others from `run`, each written once it

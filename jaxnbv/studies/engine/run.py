@@ -3,14 +3,17 @@
 import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TypeAlias
 
 from jaxnbv.checks import InputError, check_type, require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.observations import Observations
 from jaxnbv.planning.planner import Planner
+from jaxnbv.storage.rebuilding import read_config
 from jaxnbv.studies.engine.episodes import episode_record, poses_of, seen_again
 from jaxnbv.studies.engine.measures import KNOWN, WITHOUT_BANK, Record
+from jaxnbv.studies.engine.records import RecordFolder, read_records
 from jaxnbv.studies.engine.study import Scene, Study
 
 # A method of one's own: the planner of a scene.
@@ -44,6 +47,16 @@ def run_scene(
         runs = [episode_record(planner, sensor, pose, key, study.camera, study.views, follow) for key in keys]
         record["methods"][method] = study.joined(runs)
     return record | {"seconds": time.perf_counter() - start}
+
+
+def load_study(folder: str | Path) -> tuple[Study, list[Record]]:
+    """The study of a folder with its settings, and its records.
+
+    **Raises:** `ValueError` if there is none, or if it or a record is damaged.
+    """
+    # Which methods were run, and those of a user, are no part of the study.
+    config = read_config(folder, "study", RecordFolder.format, {"methods": None, "own": None})
+    return config["study"], read_records(folder)
 
 
 def methods_of(study: type[Study], names: Sequence[str] | None, model: str) -> tuple[str, ...]:

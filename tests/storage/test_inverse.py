@@ -1,0 +1,124 @@
+"""What is loaded is what was saved: episodes, sessions and studies."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_session import FIRST, session_of, shot
+
+import jaxnbv as nbv
+from jaxnbv.planning.loop import View
+from jaxnbv.storage import describe
+from jaxnbv.studies.engine.records import RecordFolder
+from jaxnbv.studies.engine.run import load_study
+from jaxnbv.studies.heat import HeatStudy
+from jaxnbv.surfaces import KnownShapes, Upright
+
+SPHERE = np.asarray(nbv.geometry.fibonacci_sphere(64))
+BANK = nbv.ShapeBank.of([nbv.sdf.Sphere(0.9), nbv.sdf.Sphere(0.7)])
+
+
+def height(cloud):
+    return jnp.max(jnp.where(cloud.mask, cloud.points[:, 1], 0.0))
+
+
+def halves(cloud):
+    return jnp.log(jnp.array([0.5, 0.5])) + 0.0 * cloud.points.sum()
+
+
+SAMPLERS = {
+    "usual": nbv.SurfaceSampler(num_samples=3),
+    "paper": nbv.SurfaceSampler.preset("paper"),
+    "fine": nbv.SurfaceSampler(grid=nbv.Grid(30, 1.6), carving=nbv.Carving(nbv.Box.cube(2.9))),
+    "bank": nbv.SurfaceSampler().with_bank(BANK, Upright()),
+}
+PLANNERS = st.builds(
+    nbv.Planner,
+    acquisition=st.sampled_from(
+        [nbv.Coverage(), nbv.NewSurface(0.07), nbv.ExpectedUtilityImprovement(height, 32), nbv.CrossEntropy(halves)]
+    ),
+    search=st.sampled_from([nbv.FarthestView(9), nbv.HalvingSearch(8), nbv.RandomView(nbv.Reach(7))]),
+    camera=st.just(nbv.Camera(height=8, width=8, farthest=9.0)),
+    sampler=st.sampled_from(list(SAMPLERS.values())),
+    obstacles=st.sampled_from([None, nbv.Obstacles((nbv.sdf.HalfSpace([0, -1.2, 0], [0, 1, 0]),), margin=0.01)]),
+    capacity=st.sampled_from([40, 64]),
+    max_views=st.sampled_from([3, 40]),
+)
+
+
+def scan_of(shift):
+    """A cloud of the image's size, of which some rays met nothing."""
+    there = SPHERE[:, 2] > shift
+    rows = [jnp.asarray(np.where(there[:, None], part, 0.0), jnp.float32) for part in (0.9 * SPHERE, SPHERE)]
+    return nbv.PointCloud(*rows, jnp.asarray(there), jnp.asarray(~there))
+
+
+def assert_same(loaded, saved):
+    assert eqx.tree_equal(loaded, saved), f"{loaded} is not {saved}"
+
+
+@given(planner=PLANNERS, stopped=st.sampled_from([None, "enough"]), in_world=st.booleans())
+@settings(max_examples=6, deadline=None)
+def test_an_episode_is_loaded_as_it_was_saved(tmp_path_factory, planner, stopped, in_world):
+    candidates = nbv.SphereCandidates(5).poses()
+    poses, scans = [candidates[index] for index in range(3)], [scan_of(shift) for shift in (-0.5, 0.0, 0.5)]
+    values = jnp.arange(5.0)
+    proposal = nbv.search.Proposal(candidates[1], values[1], candidates, values, standard_error=jnp.asarray(0.5))
+    frame = nbv.Frame(3.0, (1.0, 2.0, 3.0), "z") if in_world else nbv.Frame()
+    episode = nbv.Episode(planner, None, nbv.SensorNoise(0.02), poses[0], jax.random.key(7), frame=frame)
+    views = [
+        View(pose, scan, after.cloud, None if index == 0 else proposal)
+        for index, (pose, scan, after) in enumerate(
+            zip(poses, scans, planner.replay(zip(poses, scans, strict=True)), strict=True)
+        )
+    ]
+    episode = dataclasses.replace(episode, views=tuple(views), stopped=stopped)
+    folder = tmp_path_factory.mktemp("episode")
+    episode.save(folder)
+    assert_same(nbv.Episode.load(folder), episode)
+    # It can be saved again, and a view more makes the end another.
+    nbv.Episode.load(folder).save(folder)
+
+
+def test_what_cannot_be_made_again_is_given(tmp_path):
+    """A utility without a name: the folder says that it is the same, not what it is."""
+    planner = nbv.Planner(lambda cloud: cloud.count * 1.0, nbv.FarthestView(9), nbv.Camera(height=8, width=8))
+    episode = nbv.simulate(planner, nbv.sdf.Sphere(0.9), nbv.look_at((0.0, 0.0, 2.5)), 2, jax.random.key(0))
+    episode.save(tmp_path)
+    with pytest.raises(nbv.InputError, match=r"planner\.acquisition.*load\(\.\.\., planner=\.\.\.\)"):
+        nbv.Episode.load(tmp_path)
+    assert_same(nbv.Episode.load(tmp_path, planner=planner), episode)
+    other = nbv.Planner(lambda cloud: cloud.count * 2.0, nbv.FarthestView(9), nbv.Camera(height=8, width=8))
+    with pytest.raises(nbv.InputError, match="belongs to another episode"):
+        nbv.Episode.load(tmp_path, planner=other)
+
+
+def test_a_session_and_its_episode_are_loaded_as_they_were_saved(tmp_path):
+    session = session_of(tmp_path / "session")
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    matrix = session.next().matrix
+    session.add(shot(matrix), matrix, depth_scale=1e-3)
+    session.next()
+    loaded = nbv.Session.load(tmp_path / "session", progress=False)
+    assert_same(loaded.episode, session.episode)
+    np.testing.assert_array_equal(loaded.next().matrix, session.next().matrix)
+    assert loaded.next().value == session.next().value
+    session.episode.save(tmp_path / "episode")
+    assert_same(nbv.Episode.load(tmp_path / "episode"), session.episode)
+
+
+def test_a_study_is_loaded_as_it_was_run(tmp_path):
+    (study,) = HeatStudy.configured("screened", 3, True).values()
+    study = dataclasses.replace(study, sampler=study.sampler.with_bank(BANK, Upright()))
+    arrays = {}
+    folder = RecordFolder(tmp_path, {"study": describe(study, arrays, "study"), "methods": []}, arrays=arrays)
+    records = folder.collect(range(2), lambda index: {"scene": index, "methods": {}}, progress=False)
+    loaded, read = load_study(tmp_path)
+    assert isinstance(loaded.sampler.model, KnownShapes)
+    assert_same(loaded, study)
+    assert read == records
