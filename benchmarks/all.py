@@ -151,8 +151,8 @@ def gradient(bench: Bench) -> None:
     """Searches on the same samples, as ratios to the discrete one."""
     planner = nbv.Planner(nbv.Coverage())
     observations = bench.observations(planner)
-    surfaces = planner.sampler.sample(observations, bench.key)
-    discrete = bench.take("search: discrete, 120 candidates", lambda: planner.choose(observations, surfaces, bench.key))
+    inputs = planner.step_inputs(observations, bench.key)
+    discrete = bench.take("search: discrete, 120 candidates", lambda: planner.choose(inputs, bench.key))
     searches = {
         "halving, 120 candidates": nbv.HalvingSearch(),
         "gradient, six starts": nbv.GradientSearch(dof=2, num_candidates=6),
@@ -161,9 +161,7 @@ def gradient(bench: Bench) -> None:
     }
     for name, search in searches.items():
         other = nbv.Planner(planner.acquisition, search)
-        bench.take(
-            f"search: {name}", lambda other=other: other.choose(observations, surfaces, bench.key), discrete=discrete
-        )
+        bench.take(f"search: {name}", lambda other=other: other.choose(inputs, bench.key), discrete=discrete)
 
 
 def networks(bench: Bench) -> None:

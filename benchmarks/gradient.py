@@ -75,7 +75,8 @@ def run_seed(planners: dict[str, nbv.Planner], task: str, mesh: str | None, seed
     planner = planners["discrete"]
     seen = observe_scene(scene, planner.camera, first, nbv.SensorNoise(), noise_key)
     observations = planner.init(first, seen)
-    surfaces = planner.sampler.sample(observations, sample_key)
+    inputs = planner.step_inputs(observations, sample_key)
+    surfaces = inputs.surfaces
     parameters = jnp.zeros((6, 3))
     row = {
         "samples": least_time(lambda: planner.sampler.sample(observations, sample_key), 1),
@@ -84,9 +85,9 @@ def run_seed(planners: dict[str, nbv.Planner], task: str, mesh: str | None, seed
     }
     for name, asked in planners.items():
         if not compiled:
-            jax.block_until_ready(asked.choose(observations, surfaces, search_key))
+            jax.block_until_ready(asked.choose(inputs, search_key))
         start = time.perf_counter()
-        proposal = jax.block_until_ready(asked.choose(observations, surfaces, search_key))
+        proposal = jax.block_until_ready(asked.choose(inputs, search_key))
         row[name] = {"value": float(proposal.value), "seconds": time.perf_counter() - start}
     return row
 

@@ -49,10 +49,10 @@ def measured(points: int, samples: int, candidates: int, rays: int) -> dict[str,
             planner.observe(observations, pose, seen, sensor) if observations else planner.init(pose, seen, sensor)
         )
     assert int(observations.cloud.count) == points
-    surfaces = planner.sample(observations, key)
+    inputs = planner.step_inputs(observations, key)
     return {
-        "samples": least_time(lambda: planner.sample(observations, key)),
-        "search": least_time(lambda: planner.choose(observations, surfaces, key)),
+        "samples": least_time(lambda: planner.step_inputs(observations, key)),
+        "search": least_time(lambda: planner.choose(inputs, key)),
     }
 
 

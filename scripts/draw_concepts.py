@@ -185,14 +185,14 @@ def main() -> None:
     first, noise = nbv.look_at((0.8, 0.9, 2.2)), nbv.SensorNoise()
     scan_key, sample_key, search_key = jax.random.split(jax.random.key(0), 3)
     observations = planner.init(first, noise(nbv.scan(scene, planner.camera, first), scan_key))
-    surfaces = planner.sampler.sample(observations, sample_key)
-    proposal = planner.choose(observations, surfaces, search_key)
+    inputs = planner.step_inputs(observations, sample_key)
+    surfaces, proposal = inputs.surfaces, planner.choose(inputs, search_key)
     with mpl.rc_context(STYLE):
         save(draw_posterior(planner, observations, surfaces, scene), folder / "concepts_posterior.png")
         save(draw_utility(planner, observations, surfaces, proposal), folder / "concepts_utility.png")
         searches = (nbv.DiscreteSearch(), nbv.search.UncertaintyView(), nbv.FarthestView())
         planners = {type(search).__name__: dataclasses.replace(planner, search=search) for search in searches}
-        found = {name: one.choose(observations, surfaces, search_key) for name, one in planners.items()}
+        found = {name: one.choose(inputs, search_key) for name, one in planners.items()}
         quantities = {name: one.quantity for name, one in planners.items()}
         save(draw_search(found, quantities), folder / "concepts_search.png")
         save(draw_known(), folder / "concepts_known.png")

@@ -156,7 +156,7 @@ def _scanned(things: Thing, keys: Key[Array, " scenes"], num_points: int, settin
 def _imagined(thing: Thing, key: PRNGKeyArray, planner: Planner, num_points: int, setting: Setting) -> LabelledClouds:
     key, sample_key, pose_key = jax.random.split(key, 3)
     views, poses, count, pixels = _partial_views(thing, key, MOST_VIEWS - 1, setting)
-    *_, observations = planner.replay((poses[i], views[i], setting.camera) for i in range(MOST_VIEWS - 1))
+    *_, observations = planner.replay(((poses[i], views[i]) for i in range(MOST_VIEWS - 1)), setting.camera)
     surfaces = planner.sampler.sample(observations, sample_key)
     seen = limit_capacity(joined_views(views), num_points)
 

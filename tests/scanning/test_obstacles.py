@@ -116,8 +116,11 @@ def test_space_is_seen_empty_up_to_an_obstacle():
 
 
 def planner_of(search, obstacles=None, capacity=256):
-    sampler = nbv.SurfaceSampler(nbv.GeometricSPSR(0.1, truncation=8), nbv.Grid(28), 3, obstacles=obstacles)
-    return nbv.Planner(nbv.Coverage(), search, nbv.Camera(height=12, width=12), sampler, capacity=capacity, max_views=6)
+    sampler, camera = (
+        nbv.SurfaceSampler(nbv.GeometricSPSR(0.1, truncation=8), nbv.Grid(28), 3),
+        nbv.Camera(height=12, width=12),
+    )
+    return nbv.Planner(nbv.Coverage(), search, camera, sampler, obstacles=obstacles, capacity=capacity, max_views=6)
 
 
 TABLED = planner_of(nbv.DiscreteSearch(40), nbv.Obstacles((TABLE,), clearance=0.3))

@@ -57,11 +57,13 @@ MLP = eqx.nn.MLP(3, 2, 8, 1, key=KEY)
 WITH_BANK = nbv.SurfaceSampler(nbv.ScreenedSPSR(MODEL, (nbv.surfaces.OnSurface(20),)), GRID, 2).with_bank(
     nbv.ShapeBank.of([nbv.sdf.Sphere(0.5), nbv.sdf.Sphere(0.6)]), nbv.surfaces.Upright()
 )
-OBSTACLES = nbv.SurfaceSampler(MODEL, nbv.Grid(9, half_extent=1.6), 2, obstacles=nbv.Obstacles((nbv.sdf.Sphere(0.1),)))
+COARSE = nbv.SurfaceSampler(MODEL, nbv.Grid(9, half_extent=1.6), 2)
+OBSTACLES = nbv.Obstacles((nbv.sdf.Sphere(0.1),))
 
 
-def planned(acquisition, search=nbv.DiscreteSearch(6), sampler=OBSTACLES, **changes):  # noqa: B008
-    return nbv.Planner(acquisition, search, nbv.Camera(height=4, width=5), sampler, **changes)
+def planned(acquisition, search=nbv.DiscreteSearch(6), sampler=COARSE, **changes):  # noqa: B008
+    camera = nbv.Camera(height=4, width=5)
+    return nbv.Planner(acquisition, search, camera, sampler, obstacles=OBSTACLES, **changes)
 
 
 def improvement(function):
