@@ -50,8 +50,8 @@ PROGRAM = """
     found = []
     for devices in (1, 8):
         with on(devices):
-            surfaces = planner.sample(observations, key)
-            found.append([one.choose(observations, surfaces, key) for one in (planner, halving)])
+            inputs = planner.step_inputs(observations, key)
+            found.append([one.choose(inputs, key) for one in (planner, halving)])
     for alone, together in zip(*found, strict=True):
         assert len(together.value.sharding.device_set) == 8
         np.testing.assert_allclose(together.values, alone.values, rtol=1e-5)

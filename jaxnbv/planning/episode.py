@@ -27,7 +27,6 @@ class Episode(eqx.Module):
 
     - `scene`, `noise`: None where a real sensor took the views.
     - `stopped`: why there are not as many views as were asked for; None where there are.
-    - `camera`: the sensor's, in scene units; None for the planner's.
     - `frame`: of the user's world, in which the episode is shown and its cloud is written.
     """
 
@@ -38,13 +37,12 @@ class Episode(eqx.Module):
     key: PRNGKeyArray
     views: tuple[View, ...] = ()
     stopped: str | None = None
-    camera: Camera | None = None
     frame: Frame = Frame()
 
     @property
     def sensor(self) -> Camera:
-        """The camera that took the views, in scene units."""
-        return self.planner.camera if self.camera is None else self.camera
+        """The camera that takes the views, in scene units."""
+        return self.views[0].camera if self.views else self.planner.camera
 
     @property
     def cloud(self) -> PointCloud:
@@ -53,7 +51,7 @@ class Episode(eqx.Module):
 
     def observations(self) -> Iterator[Observations]:
         """The planner's observations after each view, made again from the scans."""
-        return self.planner.replay(((view.pose, view.scan) for view in self.views), self.camera)
+        return self.planner.replay(((view.pose, view.scan) for view in self.views), self.sensor)
 
     def observations_after(self, views: int) -> Observations:
         """The planner's observations after the first `views` views.
@@ -79,10 +77,11 @@ class Episode(eqx.Module):
         folder = RunFolder(path, "episode", config)
         stored = read_views(folder)
         require(len(stored) > 0, f"{path} holds no view yet")
+        camera = config.pop("camera")
         episode = cls(**config)
-        after = episode.planner.replay(((pose, scan) for pose, scan, _ in stored), episode.camera)
+        after = episode.planner.replay(((pose, scan) for pose, scan, _ in stored), camera)
         views = tuple(
-            View(pose, scan, observations.cloud, proposal)
+            View(pose, scan, observations.cloud, proposal, camera)
             for (pose, scan, proposal), observations in zip(stored, after, strict=True)
         )
         return dataclasses.replace(episode, views=views, stopped=_read_end(folder, len(views)))
@@ -116,8 +115,9 @@ class Episode(eqx.Module):
 
         **Raises:** `ValueError` as `RunFolder` does.
         """
-        names = ("planner", "scene", "noise", "first", "key", "camera", "frame")
-        return RunFolder(path, "episode", {name: getattr(self, name) for name in names})
+        names = ("planner", "scene", "noise", "first", "key", "frame")
+        config = {name: getattr(self, name) for name in names}
+        return RunFolder(path, "episode", config | {"camera": self.sensor})
 
 
 def read_views(folder: RunFolder) -> list[tuple[Pose, PointCloud, Proposal | None]]:

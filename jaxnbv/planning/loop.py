@@ -39,12 +39,14 @@ class View(eqx.Module):
     - `scan`: what it saw, noise included; one row a pixel.
     - `cloud`: D after this view.
     - `proposal`: what the search looked at; None for the first view, which was given.
+    - `camera`: the one that took it, in scene units.
     """
 
     pose: Pose
     scan: PointCloud
     cloud: PointCloud
     proposal: Proposal | None
+    camera: Camera
 
 
 class Step(NamedTuple):
@@ -136,7 +138,7 @@ class Loop:
             self._first_view_at = time.monotonic()
         if proposal is not None:
             self._pending = self._pending.append(proposal.pose)
-        view = View(pose, scan, observations.cloud, proposal)
+        view = View(pose, scan, observations.cloud, proposal, self.camera)
         self._observations, self.views = observations, (*self.views, view)
         self._next = _NextView()
         return view

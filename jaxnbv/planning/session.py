@@ -170,7 +170,7 @@ class Session:
         """
         require(len(self.views) > 0, _NO_IMAGE)
         loop, first = self._loop, self.views[0].pose
-        return Episode(loop.planner, None, None, first, loop.key, loop.views, None, loop.camera, self.frame)
+        return Episode(loop.planner, None, None, first, loop.key, loop.views, None, self.frame)
 
     def done(self) -> str | None:
         """Why no more images are needed, by the rule that was given; None while they are. Asked once an image, and

@@ -120,7 +120,7 @@ def report_data(
             answered = words_of(task.answers[index]).said(task.answers[index - 1] if index else None)
             words["What came"] += f" {capital(answered)}."
         before = episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), np.float32)
-        look = taken_look(view, episode.sensor, before)
+        look = taken_look(view, before)
         surface = next_one.surface
         if surface is not None:
             surface = dataclasses.replace(surface, deviation=frame.length_to_world(surface.deviation))

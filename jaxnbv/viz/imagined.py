@@ -80,9 +80,10 @@ def imagined(episode: Episode, index: int, inputs: StepInputs) -> Imagined | Non
     return Imagined(tuple(samples), tuple(names), tuple(posterior.kinds().items()))
 
 
-def taken_look(view: View, camera: Camera, cloud: Float[np.ndarray, "n 3"]) -> Look | None:
-    """What a view by a camera saw; None where its scan is no image. `cloud`: what had been seen before it."""
-    return look(view.scan, camera, view.pose, cloud) if view.scan.capacity == camera.num_rays else None
+def taken_look(view: View, cloud: Float[np.ndarray, "n 3"]) -> Look | None:
+    """What a view saw; None where its scan is no image. `cloud`: what had been seen before it."""
+    is_image = view.scan.capacity == view.camera.num_rays
+    return look(view.scan, view.camera, view.pose, cloud) if is_image else None
 
 
 def look(seen: PointCloud, camera: Camera, pose: Pose, cloud: Float[np.ndarray, "n 3"]) -> Look:

@@ -112,7 +112,7 @@ def seen_after(episode: Episode, truth: Float[AnyArray, "n 3"] | None) -> list[C
     of = acquisition if isinstance(acquisition, NewSurface) else NewSurface()
     clouds = [None, *(view.cloud for view in views[:-1])]
     new = [
-        float(_new_area(of, cloud, view.scan, episode.sensor, view.pose))
+        float(_new_area(of, cloud, view.scan, view.camera, view.pose))
         for cloud, view in zip(clouds, views, strict=True)
     ]
     areas, unit = episode.frame.length_to_world(np.cumsum(new), 2), f"{episode.frame.unit}²"

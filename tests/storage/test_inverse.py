@@ -72,7 +72,7 @@ def test_an_episode_is_loaded_as_it_was_saved(tmp_path_factory, planner, stopped
     frame = nbv.Frame(3.0, (1.0, 2.0, 3.0), "z") if in_world else nbv.Frame()
     episode = nbv.Episode(planner, None, nbv.SensorNoise(0.02), poses[0], jax.random.key(7), frame=frame)
     views = [
-        View(pose, scan, after.cloud, None if index == 0 else proposal)
+        View(pose, scan, after.cloud, None if index == 0 else proposal, planner.camera)
         for index, (pose, scan, after) in enumerate(
             zip(poses, scans, planner.replay(zip(poses, scans, strict=True)), strict=True)
         )
