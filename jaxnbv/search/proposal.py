@@ -41,10 +41,10 @@ class Proposal(eqx.Module):
     value: Float[Array, ""]
     candidates: Pose
     values: Float[Array, " candidates"]
-    standard_error: Float[Array, ""] | None = None
     trajectories: Trajectories | None = None
     standard_errors: Float[Array, " candidates"] | None = None
     difference_errors: Float[Array, " candidates"] | None = None
+    standard_error: Float[Array, ""] | None = None
 
     def in_world(self, frame: Frame, length_power: int) -> "Proposal":
         """The proposal with its values, a power of length, and their errors in world units; poses stay in the scene."""
@@ -58,10 +58,10 @@ class Proposal(eqx.Module):
             convert(self.value),
             self.candidates,
             convert(self.values),
-            convert(self.standard_error),
             None if ways is None else Trajectories(ways.poses, convert(ways.values)),
             convert(self.standard_errors),
             convert(self.difference_errors),
+            convert(self.standard_error),
         )
 
     def tied_with_best(self, errors: float = 2.0) -> Bool[Array, " candidates"] | None:

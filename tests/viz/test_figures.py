@@ -95,7 +95,7 @@ LONG = Quantity(
 def why(data, index):
     """Why a view was chosen, as the page draws it."""
     figure = Figure(figsize=(5.2, 4.3))
-    draw_choice(figure, data.views[index].proposal, data.quantity)
+    draw_choice(figure, data.views[index].proposal, data.quantity, nbv.Frame())
     return figure
 
 

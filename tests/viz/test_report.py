@@ -14,6 +14,7 @@ import pytest
 from small_run import Page, scene_in_space, small_planner, small_run
 
 import jaxnbv as nbv
+from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.viz import report_data, write_report
 from jaxnbv.viz.answers import number
@@ -131,7 +132,7 @@ def test_of_a_scene_without_truth_the_area_that_was_seen_is_told(tmp_path, episo
     behind = nbv.look_at((0.0, 0.0, -2.5))
     other = nbv.scan(nbv.SDFSurface(nbv.sdf.Sphere(1.0)), camera, behind)
     views = *lone.views, *lone.views, nbv.View(behind, other, other, None, camera)
-    once, again, both = (seen.values[0] for seen in seen_after(views, None, nbv.Coverage()))
+    once, again, both = (seen.values[0] for seen in seen_after(dataclasses.replace(lone, views=views), None))
     assert once == pytest.approx(again) == pytest.approx(area)
     assert both == pytest.approx(2.0 * area, rel=0.02)
     truth = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
@@ -159,7 +160,7 @@ class SphereModel(nbv.SurfaceModel):
 
 def surface_of(sampler, observations):
     sampler = dataclasses.replace(sampler, num_samples=64)
-    return mean_surface(sampler, observations, sampler.posterior(observations))
+    return mean_surface(sampler, StepInputs(observations, sampler.posterior(observations)))
 
 
 def test_any_posterior_has_a_surface_with_a_standard_deviation():

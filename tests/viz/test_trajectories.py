@@ -94,7 +94,7 @@ def said_of(value, others, starts=0, pose=None, standard_error=None, quantity=CO
     scan = nbv.PointCloud.from_arrays(np.eye(3), np.eye(3))
     views = [nbv.View(first, scan, scan, None, CAMERA), nbv.View(pose, scan, scan, looked, CAMERA)]
     seen = [CoverageAnswer(("of surface seen",), np.array([area]), unit="scene units²") for area in (0.2, 0.3)]
-    return " ".join(told(quantity, views, seen).values())
+    return " ".join(told(quantity, views, seen, nbv.Frame()).values())
 
 
 @pytest.mark.parametrize(
