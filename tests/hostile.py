@@ -17,7 +17,7 @@ import numpy as np
 from hypothesis import HealthCheck, Phase, given, settings
 
 import jaxnbv as nbv
-from jaxnbv.studies import readers
+from jaxnbv import readers
 
 RNG = np.random.default_rng(0)
 DIRECTIONS = RNG.normal(size=(20, 3))

@@ -21,10 +21,10 @@ from small_episode import BASE
 from small_planner import MODEL, SOLID, planner_of
 
 import jaxnbv as nbv
+from jaxnbv import readers
 from jaxnbv.checks import InputError
 from jaxnbv.networks.pretrained import part_segmenter, pretrained_classifier
 from jaxnbv.storage import RunFolder, describe, rebuild
-from jaxnbv.studies import readers
 
 SPHERE = nbv.mesh_from_sdf(nbv.sdf.Sphere(0.7), nbv.Grid(16))
 GRID = nbv.Grid(8)
