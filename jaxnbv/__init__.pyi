@@ -8,10 +8,7 @@ from . import tasks as tasks
 from . import viz as viz
 from .acquisition import Acquisition as Acquisition
 from .acquisition import AcquisitionList as AcquisitionList
-from .acquisition import Answer as Answer
 from .acquisition import ExpectedUtilityImprovement as ExpectedUtilityImprovement
-from .acquisition import Quantity as Quantity
-from .acquisition import Utility as Utility
 from .acquisition import expected_value as expected_value
 from .errors import InputError as InputError
 from .geometry.camera import Camera as Camera
@@ -69,6 +66,9 @@ from .tasks import HostClassifier as HostClassifier
 from .tasks import HostSegmenter as HostSegmenter
 from .tasks import NewSurface as NewSurface
 from .tasks import SoftPartCount as SoftPartCount
+from .utility import Answer as Answer
+from .utility import Quantity as Quantity
+from .utility import Utility as Utility
 from .version import __version__ as __version__
 from .viz import LiveView as LiveView
 from .viz import show as show

@@ -9,11 +9,11 @@ from on_grid import balls
 from opinions import WEIGHTS, Linear, linear, linear_of_batch
 
 import jaxnbv as nbv
-from jaxnbv.acquisition import default_batch_size
 from jaxnbv.networks import pretrained_classifier
 from jaxnbv.scanning import scan
 from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.utility import default_batch_size
 
 CAMERA = nbv.Camera(height=6, width=7)
 GRID = nbv.Grid(20)

@@ -20,6 +20,7 @@ ORDER = (
     "observations",
     "surfaces",
     "sampler",
+    "utility",
     "acquisition",
     "tasks",
     "search",

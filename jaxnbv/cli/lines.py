@@ -5,9 +5,9 @@ import sys
 import numpy as np
 from tqdm import tqdm
 
-from jaxnbv.acquisition import Answer
 from jaxnbv.planning.loop import View
 from jaxnbv.planning.planner import Planner
+from jaxnbv.utility import Answer
 from jaxnbv.viz.answers import label_of, number, words_of
 
 

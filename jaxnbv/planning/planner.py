@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.acquisition import Acquisition, Quantity, as_acquisition
+from jaxnbv.acquisition import Acquisition, as_acquisition
 from jaxnbv.checks import check_fields, check_key, check_type, functions_of_users, is_traced, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, check_oriented, check_single, limit_capacity
@@ -20,6 +20,7 @@ from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.scanning import GridSurface, Obstacles, barrier_of, mean_depth, scan_samples
 from jaxnbv.search import DiscreteSearch, Problem, Proposal, Search
 from jaxnbv.surfaces.base import HALF_WIDTH
+from jaxnbv.utility import Quantity
 
 # Functions are converted on the way in, which mypy cannot see.
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ class Planner(eqx.Module):
     - `max_views`: views for which observations have room.
 
     All methods are pure and run under `jit`. A planner compiles at its first two views, and nothing after them.
-    A cloud alone, from no pose, counts as observations too.
+    Observations of a cloud from no pose are `planner.init(None, cloud)`.
 
     **Raises:** `ValueError` for numbers below one, and if the search cannot work with the acquisition or the camera: a
     gradient search with an acquisition that JAX cannot differentiate, say.
@@ -98,7 +99,7 @@ class Planner(eqx.Module):
         return observations if pose is None else self._with_view(observations, pose, scan, camera)
 
     def observe(
-        self, observations: Observations | PointCloud, pose: Pose, scan: PointCloud, camera: Camera | None = None
+        self, observations: Observations, pose: Pose, scan: PointCloud, camera: Camera | None = None
     ) -> Observations:
         """Tell: the observations after a scan (scene coordinates) from a pose. A scan that hit nothing adds no points.
 
@@ -108,7 +109,8 @@ class Planner(eqx.Module):
         **Raises:** `ValueError` for a scan as `init` does, for observations of another grid, or without room for
         another view.
         """
-        camera, observations = camera or self.camera, self._as_observations(observations)
+        camera = camera or self.camera
+        check_type(observations, Observations, "the observations")
         check_type(pose, Pose, "the pose")
         self._check(pose, scan, camera, first=False)
         if not is_traced(observations.num_views):
@@ -118,7 +120,7 @@ class Planner(eqx.Module):
                 f"the observations hold {views} views and have room for no more: make it with a planner of "
                 f"Planner(max_views=...) greater than {room}",
             )
-        after = self._with_view(observations.add_points(scan), pose, scan, camera)
+        after = self._with_view(self.sampler.adapt(observations).add_points(scan), pose, scan, camera)
         if self.search.uses_samples and not is_traced(after):
             self.sampler.grid.check(after.cloud)
         return after
@@ -132,23 +134,21 @@ class Planner(eqx.Module):
             observations = self.init(*after) if observations is None else self.observe(observations, *after)
             yield observations
 
-    def propose(
-        self, observations: Observations | PointCloud, key: PRNGKeyArray, pending: PoseList | None = None
-    ) -> Proposal:
+    def propose(self, observations: Observations, key: PRNGKeyArray, pending: PoseList | None = None) -> Proposal:
         """Ask: the pose to take next, and what the search looked at.
 
         - `pending`: poses that were proposed before and not taken, which are not proposed again.
 
-        **Raises:** `ValueError` if every candidate has been visited, and for a cloud as `init` does.
+        **Raises:** `ValueError` if every candidate has been visited, and for observations of another grid.
         """
         check_key(key)
         sample_key, search_key = jax.random.split(key)
         return self.choose(self.step_inputs(observations, sample_key), search_key, pending)
 
-    def step_inputs(self, observations: Observations | PointCloud, key: PRNGKeyArray) -> StepInputs:
+    def step_inputs(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
         """The first half of `propose`: the posterior and its samples; the observations alone for a search that asks for
         no samples."""
-        observations = self._as_observations(observations)
+        check_type(observations, Observations, "the observations")
         return self.sampler.step_inputs(observations, key) if self.search.uses_samples else StepInputs(observations)
 
     def choose(self, inputs: StepInputs, key: PRNGKeyArray, pending: PoseList | None = None) -> Proposal:
@@ -172,11 +172,6 @@ class Planner(eqx.Module):
 
     def _with_view(self, observations: Observations, pose: Pose, scan: PointCloud, camera: Camera) -> Observations:
         return observations.add_view(pose, scan, camera, self.sampler.carving, self.obstacles)
-
-    def _as_observations(self, observations: Observations | PointCloud) -> Observations:
-        if isinstance(observations, PointCloud):
-            return self.init(None, observations)
-        return self.sampler.adapt(observations)
 
     def _check(self, pose: Pose | None, scan: PointCloud, camera: Camera, first: bool) -> None:
         """**Raises:** `ValueError` for a scan that `init` refuses, or `observe` if it is not the first."""

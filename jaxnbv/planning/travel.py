@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.acquisition import Quantity
 from jaxnbv.checks import as_numbers, check_fields, checked, require, shown
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.rotations import safe_norm
 from jaxnbv.observations import Observations
+from jaxnbv.utility import Quantity
 
 CostFunction: TypeAlias = Callable[[Pose, Pose], Float[Array, ""]]
 """What it costs to go from one pose to another, in units of the user's: not negative, made of JAX operations. A

@@ -8,13 +8,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxnbv.acquisition import Acquisition, AcquisitionList, Quantity
+from jaxnbv.acquisition import Acquisition, AcquisitionList
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.search.candidates import Candidates, GivenPoses, SphereCandidates, as_candidates
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal
+from jaxnbv.utility import Quantity
 
 # Numbers and poses are converted on the way in, which mypy cannot see.
 if TYPE_CHECKING:

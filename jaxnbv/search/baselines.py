@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.acquisition import Acquisition, Quantity
+from jaxnbv.acquisition import Acquisition
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.search.base import Baseline
 from jaxnbv.search.problem import Problem
+from jaxnbv.utility import Quantity
 
 
 class FarthestView(Baseline):

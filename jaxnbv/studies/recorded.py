@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from matplotlib.axes import Axes
 
-from jaxnbv.acquisition import Acquisition, Quantity
+from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
@@ -34,6 +34,7 @@ from jaxnbv.studies.engine.searches import RULES
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.engine.tiles import Tiles, say
 from jaxnbv.tasks import Coverage, NewSurface
+from jaxnbv.utility import Quantity
 from jaxnbv.viz.style import GREY, INK, LINE, NEW
 
 NEW_AREA, COVERAGE, EVEN, ORACLE = "new surface", "coverage", "evenly spaced", "oracle"

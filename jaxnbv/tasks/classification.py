@@ -13,21 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.acquisition import (
-    Acquisition,
-    Answer,
-    ImaginedView,
-    Quantity,
-    context_of,
-    default_batch_size,
-    inputs_of,
-    plain_function,
-    zero_if_empty,
-)
+from jaxnbv.acquisition import Acquisition, ImaginedView, context_of, inputs_of, zero_if_empty
 from jaxnbv.checks import check_fields, require
 from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import Surface
+from jaxnbv.utility import Answer, Quantity, default_batch_size, plain_function
 
 # Their shape is checked by `Acquisition.check`.
 Context: TypeAlias = tuple[PointCloud, Array]

@@ -6,13 +6,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnbv.acquisition import Acquisition, ImaginedView, Quantity
+from jaxnbv.acquisition import Acquisition, ImaginedView
 from jaxnbv.checks import check_fields, require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.neighbours import DistanceField, nearest_squared_distance, spacing
 from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning.metrics import GRAZING
 from jaxnbv.sharding import on_cpu
+from jaxnbv.utility import Quantity
 
 
 def _many() -> int:

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.acquisition import Answer, Quantity, Utility
 from jaxnbv.checks import AnyArray, InputError, checked, require
 from jaxnbv.errors import optional
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.tasks.diffusion import HeatProblem, Temperature, cloud_temperature, mesh_temperature, refine
 from jaxnbv.tasks.host import call_on_host
+from jaxnbv.utility import Answer, Quantity, Utility
 
 # Longest edge, in scene units, of the triangles on which the true temperature is computed: within 2 % of that on ever
 # finer ones at the default radius, in seconds.

@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxnbv.acquisition import Answer, Quantity, Utility, default_batch_size, plain_function
 from jaxnbv.checks import check_fields, require, shown
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.scanning import Surface
+from jaxnbv.utility import Answer, Quantity, Utility, default_batch_size, plain_function
 
 # Of probabilities in 32 bits, or less.
 _SLACK = 1e-2

@@ -15,12 +15,12 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from jaxnbv.acquisition import Answer, Quantity
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.planning.stopping import Sure
 from jaxnbv.tasks.classification import ClassAnswer
 from jaxnbv.tasks.heat import Coldest
 from jaxnbv.tasks.segmentation import PartAnswer
+from jaxnbv.utility import Answer, Quantity
 
 # An answer that changes by less than this share from one view to the next has settled.
 _SETTLED = 0.05

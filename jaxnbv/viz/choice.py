@@ -11,10 +11,10 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from jaxnbv.acquisition import Quantity
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.search import Proposal
+from jaxnbv.utility import Quantity
 from jaxnbv.viz import sphere
 from jaxnbv.viz.answers import label_of, number
 from jaxnbv.viz.style import GREY, INK, LINE, NEW, VALUE

@@ -7,7 +7,6 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxnbv.acquisition import Quantity
 from jaxnbv.checks import AnyArray
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
@@ -16,6 +15,7 @@ from jaxnbv.planning.loop import View
 from jaxnbv.progress import progress_bar
 from jaxnbv.scanning.metrics import truth_points
 from jaxnbv.search import Proposal
+from jaxnbv.utility import Quantity
 from jaxnbv.viz.answers import CoverageAnswer, capital, words_of
 from jaxnbv.viz.imagined import Imagined, Look, taken_look
 from jaxnbv.viz.mean_surface import MeanSurface

@@ -14,7 +14,6 @@ from jaxtyping import Float, UInt8
 from matplotlib.colors import Colormap, LogNorm, Normalize, to_rgb
 from scipy.spatial.transform import Rotation
 
-from jaxnbv.acquisition import Quantity
 from jaxnbv.checks import checked
 from jaxnbv.errors import optional
 from jaxnbv.geometry.camera import Camera
@@ -29,6 +28,7 @@ from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
 from jaxnbv.surfaces import SurfacePosterior
+from jaxnbv.utility import Quantity
 from jaxnbv.viz.answers import capital, may_be_words, shown_value, words_of
 from jaxnbv.viz.choice import colour_range, open_values
 from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface

@@ -15,7 +15,6 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxnbv.acquisition import Quantity
 from jaxnbv.checks import checked
 from jaxnbv.errors import InputError
 from jaxnbv.geometry.cloud import PointCloud
@@ -26,6 +25,7 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.session import Session
 from jaxnbv.search import Proposal
 from jaxnbv.surfaces import SurfacePosterior
+from jaxnbv.utility import Quantity
 from jaxnbv.viz.choice import draw_acquisition
 from jaxnbv.viz.data import report_data
 from jaxnbv.viz.figures import STYLE, overview_figure

@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Array, Float
 
-from jaxnbv.acquisition import Acquisition, Answer, ImaginedView, inputs_of
+from jaxnbv.acquisition import Acquisition, ImaginedView, inputs_of
 from jaxnbv.checks import AnyArray
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
@@ -22,6 +22,7 @@ from jaxnbv.planning.stopping import Sure
 from jaxnbv.scanning import Surface
 from jaxnbv.scanning.metrics import coverage, true_mesh
 from jaxnbv.tasks.coverage import NewSurface, visible_area
+from jaxnbv.utility import Answer
 from jaxnbv.viz.answers import Chart, CoverageAnswer, capital, words_of
 
 

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxnbv.acquisition import Quantity
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.loop import View
 from jaxnbv.search import Proposal
+from jaxnbv.utility import Quantity
 from jaxnbv.viz.answers import CoverageAnswer, coordinates, number, shown_value
 from jaxnbv.viz.choice import best_first, directions_of
 from jaxnbv.viz.sphere import unit

@@ -15,7 +15,7 @@ from matplotlib.text import Text
 from small_run import small_run
 
 import jaxnbv as nbv
-from jaxnbv.acquisition import Quantity
+from jaxnbv.utility import Quantity
 from jaxnbv.viz import report_data
 from jaxnbv.viz.answers import Chart
 from jaxnbv.viz.charts import other_charts, task_charts

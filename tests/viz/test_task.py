@@ -12,12 +12,12 @@ import pytest
 from small_run import FIRST, Page, small_planner, small_run
 
 import jaxnbv as nbv
-from jaxnbv.acquisition import Answer
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.studies.scenes import Split, pyramid_scene
 from jaxnbv.tasks.classification import ClassAnswer
 from jaxnbv.tasks.heat import Coldest
 from jaxnbv.tasks.segmentation import PartAnswer
+from jaxnbv.utility import Answer
 from jaxnbv.viz.answers import number, words_of
 from jaxnbv.viz.charts import task_charts
 from jaxnbv.viz.data import report_data
