@@ -110,7 +110,7 @@ class Planner(eqx.Module):
         another view.
         """
         camera = camera or self.camera
-        check_type(observations, Observations, "the observations")
+        check_type(observations, Observations, "observations")
         check_type(pose, Pose, "the pose")
         self._check(pose, scan, camera, first=False)
         if not is_traced(observations.num_views):
@@ -148,7 +148,7 @@ class Planner(eqx.Module):
     def step_inputs(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
         """The first half of `propose`: the posterior and its samples; the observations alone for a search that asks for
         no samples."""
-        check_type(observations, Observations, "the observations")
+        check_type(observations, Observations, "observations")
         return self.sampler.step_inputs(observations, key) if self.search.uses_samples else StepInputs(observations)
 
     def choose(self, inputs: StepInputs, key: PRNGKeyArray, pending: PoseList | None = None) -> Proposal:
