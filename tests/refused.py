@@ -111,7 +111,7 @@ def large_view():
     """A view whose arrays are zeros, of which a megabyte holds gigabytes."""
     folder = FOLDER / "episode"
     nbv.simulate(P, BALL, POSE, 1, KEY, folder=folder, progress=False)
-    np.savez_compressed(folder / "view_00.npz", points=np.zeros(2**26 + 2**10))
+    np.savez_compressed(folder / "view_00.npz", points=np.zeros(2**26 + 2**18))
     nbv.simulate(P, BALL, POSE, 1, KEY, folder=folder, progress=False)
 
 

@@ -49,7 +49,7 @@ def test_the_papers_close_up_is_there_when_asked(ring):
     config = json.loads((out / "episode.json").read_text())["config"]
     assert config["planner"]["camera"]["fov"] == pytest.approx(np.radians(30))
     assert config["planner"]["search"]["candidates"]["radius"] == 2.5
-    np.testing.assert_allclose(config["first"]["position"], [0.8, 0.9, 2.2])
+    np.testing.assert_allclose(config["first"]["position"]["values"], [0.8, 0.9, 2.2])
 
 
 def test_a_view_is_told_when_it_is_done(ring):

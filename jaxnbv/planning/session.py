@@ -211,10 +211,10 @@ class Session:
         **Raises:** `ValueError` before the first image, as `Planner.propose` does, or if another process has added
         images to the folder.
         """
-        require(len(self.views) > 0, _NO_IMAGE)
         if self._next is None:
             index = len(self.views)
             with self._alone() as folder, self._planning():
+                require(index > 0, _NO_IMAGE)
                 if folder is not None and folder.file("proposal", index).exists():
                     stored = folder.read("proposal", index)
                     self._loop.resume(stored["proposal"])

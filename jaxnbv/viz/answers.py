@@ -249,11 +249,14 @@ def shown_value(quantity: Quantity, value: float, frame: Frame) -> str:
 
 
 def coordinates(point: Float[np.ndarray, "3"], frame: Frame = Frame()) -> str:  # noqa: B008
-    """A point of the scene, in the world of a frame: two digits of a scene unit after the point, or as fine in the
-    world."""
-    digits = max(0, 2 + math.ceil(math.log10(frame.scale)))
-    x, y, z = (f"{coordinate:.{digits}f}".replace("-", "−") for coordinate in frame.to_world(np.asarray(point)))
+    """A point of the scene, in the world of a frame."""
+    x, y, z = (fixed(coordinate, frame) for coordinate in frame.to_world(np.asarray(point)))
     return f"({x}, {y}, {z})"
+
+
+def fixed(length: float, frame: Frame) -> str:
+    """A length in world units, to a hundredth of a scene unit or finer."""
+    return f"{length:.{max(0, 2 + math.ceil(math.log10(frame.scale)))}f}".replace("-", "−")
 
 
 def capital(text: str) -> str:

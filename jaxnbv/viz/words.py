@@ -9,7 +9,7 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.loop import View
 from jaxnbv.search import Proposal
 from jaxnbv.utility import Quantity
-from jaxnbv.viz.answers import CoverageAnswer, coordinates, number, shown_value
+from jaxnbv.viz.answers import CoverageAnswer, coordinates, fixed, number, shown_value
 from jaxnbv.viz.choice import best_first, directions_of
 from jaxnbv.viz.sphere import unit
 
@@ -66,6 +66,6 @@ def place(pose: Pose, frame: Frame) -> str:
     elevation = np.degrees(np.arcsin(unit(position)[1]))
     side = "above" if elevation >= 0 else "below"
     off = np.degrees(np.arccos(np.clip(-unit(position) @ forward, -1.0, 1.0)))
-    away = number(float(frame.length_to_world(float(np.linalg.norm(position)))))
+    away = fixed(frame.length_to_world(float(np.linalg.norm(position))), frame)
     aim = "" if off < 0.5 else f", {away} from the centre and aimed {off:.0f}° off it"
     return f"{coordinates(position, frame)}, {abs(elevation):.0f}° {side} the horizon{aim}"

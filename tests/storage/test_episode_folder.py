@@ -24,7 +24,7 @@ from jaxnbv.storage import RunFolder
 
 def test_views_come_back_with_the_same_bits(finished):
     episode, folder = finished
-    views = read_views(RunFolder(folder, "episode", BASE))
+    views = read_views(episode.open(folder))
     assert len(views) == 5
     assert views[0][2] is None
     assert all(0 < np.asarray(scan.missed).sum() < 64 for _, scan, _ in views)
@@ -48,7 +48,7 @@ def test_a_scan_that_is_no_image_reads_as_one(finished, tmp_path):
 
 def test_the_record_says_what_made_it(finished):
     record = json.loads((finished[1] / "episode.json").read_text())
-    assert set(record["config"]) == {"planner", "scene", "noise", "first", "key"}
+    assert set(record["config"]) == {"planner", "scene", "noise", "first", "key", "frame", "camera"}
     assert record["config"]["planner"]["sampler"]["num_samples"] == 3
     assert record["versions"]["jax"] == jax.__version__
     np.testing.assert_allclose(record["config"]["first"]["position"]["values"], [0.8, 0.9, 2.2], atol=1e-6)
@@ -87,7 +87,7 @@ def test_a_finished_run_is_read_not_computed(finished, monkeypatch):
     before = contents(finished[1])
     monkeypatch.setattr(Planner, "choose", lambda *_: pytest.fail("a finished view was chosen again"))
     monkeypatch.setattr(
-        "jaxnbv.planning.episode.observe_scene", lambda *_: pytest.fail("a finished view was scanned again")
+        "jaxnbv.planning.simulate.observe_scene", lambda *_: pytest.fail("a finished view was scanned again")
     )
     run(finished[1], views=5)
     assert contents(finished[1]) == before

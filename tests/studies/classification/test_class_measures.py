@@ -96,7 +96,8 @@ def test_roughness_counts_the_samples_cells_per_cell_of_the_mean():
     cells = crossed_cells(mean[0] - float(posterior.level))
     assert roughness(sampler, StepInputs(observations, posterior, both)) == pytest.approx(0.5 * (1.0 + 8.0 / cells))
     samples = posterior.sample(jax.random.key(0), 2).on_grid(grid.axis)
-    assert roughness(sampler, observations, posterior, GridSurface.from_values(samples, posterior.level, grid)) > 0.8
+    drawn = GridSurface.from_values(samples, posterior.level, grid)
+    assert roughness(sampler, StepInputs(observations, posterior, drawn)) > 0.8
 
 
 def test_rank_correlation_is_of_the_candidates_compared():

@@ -13,9 +13,10 @@ from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import look_at
 from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.simulate import simulate
 from jaxnbv.sampler import SurfaceSampler
-from jaxnbv.scanning import SDFSurface
-from jaxnbv.search import GivenPoses, RandomView
+from jaxnbv.scanning import SDFSurface, SensorNoise
+from jaxnbv.search import DiscreteSearch, GivenPoses, RandomView
 from jaxnbv.studies.engine.run import replay, run_scene
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
@@ -65,6 +66,23 @@ def test_the_same_views_are_scanned_again_from_a_record():
     # The noise is there.
     distance = np.abs(np.linalg.norm(scans[0].to_numpy()[0], axis=1) - 1.0)
     assert 1e-4 < distance.mean() < 0.05
+
+
+def test_a_study_takes_the_views_of_a_simulation():
+    """Bit for bit, as a session does (`test_a_session_proposes_as_a_simulation_does`): there is one loop."""
+    study = small()
+
+    def discrete(study, scene) -> Planner:
+        return study.planner_of(Coverage(), DiscreteSearch(study.candidates), scene)
+
+    record = run_scene(study, 1, methods=[], own={"discrete": discrete})
+    scene, first = study.scene(1), study.candidates.poses()[record["first"]]
+    key, noise = study.key(1, "episode"), SensorNoise()
+    episode = simulate(discrete(study, scene), scene.surface, first, 3, key, noise, progress=False)
+    for view, recorded in zip(episode.views, record["methods"]["discrete"]["views"], strict=True):
+        assert view.pose.position.tolist() == recorded["position"]
+        assert view.pose.rotation.tolist() == recorded["rotation"]
+    assert [int(view.cloud.count) for view in episode.views] == record["methods"]["discrete"]["points"]
 
 
 def test_a_method_of_ones_own_stands_in_the_same_record():
