@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from plyfile import PlyData
-from small_episode import BASE, contents, run
+from small_episode import contents, run
 from small_planner import planner_of
 
 from jaxnbv.checks import InputError
