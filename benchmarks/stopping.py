@@ -27,7 +27,7 @@ from jaxnbv.acquisition import inputs_of, scores
 from jaxnbv.networks import part_segmenter, pretrained_classifier
 from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.planning.loop import view_keys
-from jaxnbv.planning.stopping import Covered, Found, Sure, context
+from jaxnbv.planning.stopping import Covered, Found, StopContext, Sure
 from jaxnbv.storage.files import write_text
 from jaxnbv.studies.engine.results import interval
 from jaxnbv.studies.scenes import Framing, Split, hidden_view, part_scene, pyramid_scene
@@ -85,7 +85,9 @@ def measured(task: str, index: int) -> dict:
         else:
             right.append(_seen(surface, planner.camera, planner.search.candidates.poses(), observations.cloud))
         poses = tuple(view.pose for view in episode.views[:count])
-        known = context(planner, observations, poses, view_keys(key, count)[0])
+        sample_key, *_ = view_keys(key, count)
+        surfaces = functools.cache(functools.partial(planner.sampler.sample, observations, sample_key))
+        known = StopContext(planner, observations, poses, 0.0, sample_key, surfaces, nbv.Frame())
         for name, rule in RULES[task].items():
             if ends[name] == VIEWS[task] and rule.after(known) is not None:
                 ends[name] = count

@@ -78,7 +78,7 @@ class Bridge:
         if self.session.done():
             return f"done: {self.session.done()}"
         self.publish(self.session.next().matrix)
-        return f"{self.len(session.views)} images"
+        return f"{len(self.session.views)} images"
 
 
 def main() -> None:

@@ -49,6 +49,10 @@ class Answer(eqx.Module):
     values: Float[np.ndarray, " n"]
     form: str = "{:.4g}"
 
+    def in_world(self, frame: Frame) -> "Answer":
+        """The answer, to be said in the world of a frame: the same, unless it has points or lengths."""
+        return self
+
 
 def default_batch_size() -> int:
     """How many calls of a function of clouds to batch.

@@ -30,10 +30,10 @@ def view(options: ViewOptions) -> None:
     from jaxnbv.viz import LiveView
 
     is_session = (options.folder / "session.json").exists()
-    episode = Session.load(options.folder).episode if is_session else Episode.load(options.folder)
+    shown = Session.load(options.folder) if is_session else Episode.load(options.folder)
     page = LiveView(options.port)
     try:
-        page.update(episode)
+        page.update(shown)
         if options.html is not None:
             typer.echo(f"page     {page.save(options.html)}")
             return

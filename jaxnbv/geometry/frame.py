@@ -13,7 +13,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 
-# Of the sensor's noise a hundredth.
+# 1 % of the sensor's noise.
 _ROUNDING = 1e-4
 # Rotations whose second row, the scene's up, is an axis of the world.
 _UP = {

@@ -106,8 +106,8 @@ class Episode(eqx.Module):
 
     def write_end(self, folder: RunFolder) -> None:
         """Write why the episode ended, and its cloud in world units."""
-        if self.stopped is not None:
-            folder.write("end", 0, reason=np.array(self.stopped), views=np.array(len(self.views)))
+        reason = None if self.stopped is None else np.array(self.stopped)
+        folder.write("end", 0, reason=reason, views=np.array(len(self.views)))
         folder.write_cloud(self.frame.to_world(self.cloud))
 
     def open(self, path: str | Path) -> RunFolder:
@@ -134,4 +134,4 @@ def _read_end(folder: RunFolder, views: int) -> str | None:
     if not folder.file("end", 0).exists():
         return None
     end = folder.read("end", 0)
-    return str(end["reason"]) if int(end["views"]) == views else None
+    return str(end["reason"]) if "reason" in end and int(end["views"]) == views else None

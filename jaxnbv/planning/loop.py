@@ -53,7 +53,8 @@ class Step(NamedTuple):
     """How an episode came to a view.
 
     - `observations`: after the view.
-    - `inputs`: what the view was chosen by; None for a view that was given or stored.
+    - `inputs`: the samples that the view was chosen by; None where there are none, and for a view that was given or
+      stored.
     - `seconds`: of the search; zero for a view that was given or stored.
     """
 
@@ -64,17 +65,19 @@ class Step(NamedTuple):
 
 
 @dataclasses.dataclass
-class _NextView:
+class _StepState:
     """What was computed for the next view so far.
 
-    - `stop`: why it is not needed, once the rule `was_asked`.
+    - `is_proposed`: whether the proposal was handed out, and not computed for the rule alone.
+    - `stop`: why the view is not needed, once the rule `is_asked`.
     """
 
     inputs: StepInputs | None = None
     proposal: Proposal | None = None
+    is_proposed: bool = False
     seconds: float = 0.0
     stop: str | None = None
-    was_asked: bool = False
+    is_asked: bool = False
 
 
 class Loop:
@@ -108,7 +111,7 @@ class Loop:
         self._observations: Observations | None = None
         self._pending = PoseList.empty(planner.max_views)
         self._first_view_at = time.monotonic()
-        self._next = _NextView()
+        self._next = _StepState()
 
     @property
     def observations(self) -> Observations:
@@ -133,14 +136,14 @@ class Loop:
         else:
             observations = self.planner.observe(self._observations, pose, scan, self.camera)
         accepted()
-        proposal = self._next.proposal
+        proposal = self._next.proposal if self._next.is_proposed else None
         if not self.views:
             self._first_view_at = time.monotonic()
         if proposal is not None:
             self._pending = self._pending.append(proposal.pose)
         view = View(pose, scan, observations.cloud, proposal, self.camera)
         self._observations, self.views = observations, (*self.views, view)
-        self._next = _NextView()
+        self._next = _StepState()
         return view
 
     def take(self, sensor: Sensor, first: Pose) -> Step | None:
@@ -185,6 +188,10 @@ class Loop:
 
         **Raises:** `ValueError` before the first view, and as `Planner.propose` does.
         """
+        self._next.is_proposed = True
+        return self._chosen()
+
+    def _chosen(self) -> Proposal:
         if self._next.proposal is None:
             inputs = self.inputs()
             self._begin(STAGES[1])
@@ -196,7 +203,7 @@ class Loop:
 
     def resume(self, proposal: Proposal) -> None:
         """Take a stored proposal for that of the next view."""
-        self._next.proposal, self._next.seconds = proposal, 0.0
+        self._next = _StepState(proposal=proposal, is_proposed=True)
 
     def inputs(self) -> StepInputs:
         """What the search of the next view looks at, computed once."""
@@ -212,17 +219,21 @@ class Loop:
         """
         if self.until is None or not self.views:
             return None
-        if not self._next.was_asked:
+        if not self._next.is_asked:
             key, *_ = view_keys(self.key, len(self.views))
             poses = tuple(view.pose for view in self.views)
             seconds = time.monotonic() - self._first_view_at
-            told = self.planner, self.observations, poses, seconds, key, self._surfaces, self.frame
-            context = StopContext(*told)
+            context = StopContext(self.planner, self.observations, poses, seconds, key, self._surfaces, self.frame)
             self._next.stop = self.until.after(context)
             if self._next.stop is None and self.until.needs_proposal:
-                proposal = self.propose()
+                proposal = self._chosen()
                 self._next.stop = self.until.before(context, proposal.pose, self.in_world(proposal.value))
-            self._next.was_asked = True
+            self._next.is_asked = True
+        return self._next.stop
+
+    @property
+    def stopped(self) -> str | None:
+        """Why no more views are needed, as far as the rule was asked."""
         return self._next.stop
 
     def in_world(self, value: Float[Array, ""]) -> float:

@@ -117,7 +117,7 @@ class Planner(eqx.Module):
             views, room = int(observations.num_views), observations.poses.room
             require(
                 views < room,
-                f"the observations hold {views} views and have room for no more: make it with a planner of "
+                f"the observations hold {views} views and have room for no more: make them with a planner of "
                 f"Planner(max_views=...) greater than {room}",
             )
         after = self._with_view(self.sampler.adapt(observations).add_points(scan), pose, scan, camera)
@@ -189,7 +189,7 @@ class Planner(eqx.Module):
             require(
                 pose is None or scan.missed is None or scan.capacity == camera.num_rays,
                 f"the scan has {scan.capacity} rays but the camera {camera.height} x {camera.width}: give the camera "
-                "that took it, as observe(state, pose, scan, camera), and the pose that it was taken from",
+                "that took it, as observe(observations, pose, scan, camera), and the pose that it was taken from",
             )
             if self.sampler.carving is not None:
                 self.sampler.carving.check_inside(scan, self.sampler.grid)

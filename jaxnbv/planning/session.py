@@ -6,11 +6,13 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray, Real
+from tqdm import tqdm
 
 from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, checked, require, shown
 from jaxnbv.geometry.camera import Camera
@@ -41,7 +43,7 @@ class NextView(eqx.Module):
 
     - `matrix`: camera to world, in the convention of the session.
     - `value`: what the search maximises, a length or an area in world units; `standard_error`: of the value, as a mean
-      over the posterior samples; None for a search that draws none.
+      over the posterior samples; None for a search that draws fewer than two.
     - `expected_depth`: what the sensor is expected to see there, in world units and at the planner's resolution: the
       mean depth over the posterior samples, NaN where most of them are missed; None without samples.
     - `proposal`: all that the search looked at, in scene coordinates.
@@ -102,7 +104,7 @@ class Session:
         self.stride = stride_of(camera)
         planner = usual_planner() if planner is None else planner
         matrices = None if poses is None else as_numbers(poses, "the poses", np.float64)
-        self._bar = progress_bar(total=2, wanted=False)
+        self._bar: tqdm[Any] | None = None
         self._loop = self._loop_of(self._placed(planner, matrices, obstacles))
         self._next: NextView | None = None
         self._folder: RunFolder | None = None
@@ -170,7 +172,7 @@ class Session:
         """
         require(len(self.views) > 0, _NO_IMAGE)
         loop, first = self._loop, self.views[0].pose
-        return Episode(loop.planner, None, None, first, loop.key, loop.views, None, self.frame)
+        return Episode(loop.planner, None, None, first, loop.key, loop.views, loop.stopped, self.frame)
 
     def done(self) -> str | None:
         """Why no more images are needed, by the rule that was given; None while they are. Asked once an image, and
@@ -212,24 +214,16 @@ class Session:
         images to the folder.
         """
         if self._next is None:
-            index = len(self.views)
             with self._alone() as folder, self._planning():
-                require(index > 0, _NO_IMAGE)
-                if folder is not None and folder.file("proposal", index).exists():
-                    stored = folder.read("proposal", index)
-                    self._loop.resume(stored["proposal"])
-                    self._next = self._next_of(stored["proposal"], stored.get("expected_depth"))
-                else:
-                    proposal, expected = self._loop.propose(), None
-                    if (surfaces := self._loop.inputs().surfaces) is not None:
-                        expected = self.frame.length_to_world(
-                            np.asarray(self.planner.expected_depth(surfaces, proposal.pose))
-                        )
-                    next_view = self._next_of(proposal, expected)
-                    _warn_of_little(next_view)
-                    if folder is not None:
-                        folder.write("proposal", index, proposal=proposal, expected_depth=expected)
-                    self._next = next_view
+                require(len(self.views) > 0, _NO_IMAGE)
+                proposal, depth = self._loop.propose(), None
+                if (surfaces := self._loop.inputs().surfaces) is not None:
+                    depth = self.frame.length_to_world(np.asarray(self.planner.expected_depth(surfaces, proposal.pose)))
+                next_view = self._next_of(proposal, depth)
+                _warn_of_little(next_view)
+                if folder is not None:
+                    folder.write("proposal", len(self.views), proposal=proposal, expected_depth=depth)
+                self._next = next_view
         return self._next
 
     @property
@@ -278,18 +272,24 @@ class Session:
 
         def store() -> None:
             if folder is not None:
+                # Planned from images that were deleted since.
+                folder.file("proposal", index + 1).unlink(missing_ok=True)
                 folder.write("image", index, depth=depth, matrix=matrix, depth_scale=scale)
 
         loop.add(self.frame.to_scene(pose), scan, accepted=store)
         self._loop, self._next = loop, None
 
     def _read(self, folder: RunFolder) -> None:
-        """The images and proposals of the folder."""
-        for index in range(folder.count("image")):
+        """The images of the folder and the proposals that they followed; the proposal after the last one."""
+        count = folder.count("image")
+        for index in range(count + 1):
             if index and folder.file("proposal", index).exists():
-                self._loop.resume(folder.read("proposal", index)["proposal"])
-            image = folder.read("image", index)
-            self._add(image["depth"], image["matrix"], float(image["depth_scale"]), None)
+                stored = folder.read("proposal", index)
+                self._loop.resume(stored["proposal"])
+                self._next = self._next_of(stored["proposal"], stored.get("expected_depth"))
+            if index < count:
+                image = folder.read("image", index)
+                self._add(image["depth"], image["matrix"], float(image["depth_scale"]), None)
 
     def _on_table(self, cloud: PointCloud) -> Planner:
         """The planner with the plane that the object stands on among its obstacles, named by a warning; with obstacles
@@ -310,22 +310,26 @@ class Session:
     def _next_of(self, proposal: Proposal, expected_depth: np.ndarray | None) -> NextView:
         """A proposal in the user's world."""
         matrix = np.asarray(self.frame.to_world(proposal.pose).to_matrix(self.convention), np.float64)
-        error = None
-        if proposal.standard_error is not None:
-            error = self._loop.in_world(proposal.standard_error)
+        error = None if proposal.standard_error is None else self._loop.in_world(proposal.standard_error)
+        error = error if error is not None and math.isfinite(error) else None
         return NextView(matrix, self._loop.in_world(proposal.value), error, expected_depth, proposal)
 
     def _show(self, stage: str) -> None:
-        """The stage on the bar."""
+        """The stage on the bar, which begins with the first one."""
+        if self._bar is None:
+            self._bar = progress_bar(total=2, wanted=self.progress)
         self._bar.set_description(f"view {len(self.views) + 1}, {stage}")
         self._bar.update(STAGES.index(stage) - self._bar.n)
 
     @contextmanager
     def _planning(self) -> Iterator[None]:
-        """While a bar shows the stages of planning."""
-        with progress_bar(total=2, wanted=self.progress) as self._bar:
+        """While a bar shows the stages of planning, if there are any."""
+        try:
             yield
-            self._bar.update(2 - self._bar.n)
+        finally:
+            if self._bar is not None:
+                self._bar.close()
+            self._bar = None
 
     @contextmanager
     def _alone(self) -> Iterator[RunFolder | None]:
@@ -372,5 +376,5 @@ def _warn_of_little(next_view: NextView) -> None:
         warnings.warn(
             f"the best view is worth {value:.3g}{sure}: none is sure to show anything new. Stop, or give poses that "
             "look at the box from elsewhere",
-            stacklevel=4,
+            stacklevel=3,
         )

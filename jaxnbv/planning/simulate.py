@@ -84,7 +84,7 @@ def simulate(
                 # Its posterior may be large, and is not to be held beside that of the next step.
                 del step
             bar.update(bar.total - bar.n)
-        stopped = loop.enough() if len(loop.views) < views else None
+        stopped = loop.stopped if len(loop.views) < views else None
         episode = dataclasses.replace(episode, views=loop.views, stopped=stopped)
         if store:
             episode.write_end(store)

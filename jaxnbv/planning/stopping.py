@@ -1,11 +1,17 @@
 """When an episode is long enough: rules that a loop asks after each view, and about each view that is proposed.
 
-Each says its `unit` and whether it `needs_proposal`. Rules are combined by `|`: the first that holds ends the episode.
+    rule         its number is                                            asked about the next view too
+    Sure         a probability                                            no
+    Found        points of each part                                      no
+    Covered      a share of the area that can be seen                     no
+    ValueBelow   a value of the search, lengths in world units            yes
+    Budget       seconds; or a cost, of poses in the world                for a cost
+
+Rules are combined by `|`: the first that holds ends the episode. In a simulation the world is the scene.
 """
 
 import dataclasses
 from collections.abc import Callable
-from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -23,7 +29,7 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.travel import CostFunction, WorldCost, arc_length, total_cost
 from jaxnbv.scanning import GridSurface, barrier_of
 from jaxnbv.tasks.classification import ClassAcquisition
-from jaxnbv.tasks.coverage import NewSurface, ShownArea
+from jaxnbv.tasks.coverage import NewSurface, ShownArea, newness_of
 from jaxnbv.tasks.segmentation import PartAnswer, SoftPartCount
 
 
@@ -52,12 +58,7 @@ class StopContext:
 
 
 class StopRule(eqx.Module):
-    """Says when no more views are needed: after a view, or about the next view before it is taken.
-
-    - `unit`: of the number that the rule is given, in words.
-    """
-
-    unit: ClassVar[str] = ""
+    """Says when no more views are needed: after a view, or about the next view before it is taken."""
 
     @property
     def needs_proposal(self) -> bool:
@@ -114,7 +115,6 @@ class Sure(StopRule):
     **Raises:** `ValueError` for another probability or a negative number; of an acquisition without a classifier.
     """
 
-    unit: ClassVar[str] = "probability"
     probability: float = eqx.field(static=True, default=0.95)
     num_resamplings: int = eqx.field(static=True, default=8)
 
@@ -176,7 +176,6 @@ class Found(StopRule):
     segmenter does not know a part.
     """
 
-    unit: ClassVar[str] = "points"
     points: int = eqx.field(static=True, default=60)
     parts: tuple[str, ...] | None = eqx.field(static=True, default=None)
 
@@ -217,36 +216,39 @@ class Covered(StopRule):
     show of the sampled surfaces, the part that is not new to `NewSurface`.
 
     - `share`: within (0, 1].
-    - `size`: of `NewSurface`, in scene units.
+    - `size`: of `NewSurface`, in world units in a session; by default that of the acquisition, or 0.05 scene units.
 
     **Raises:** `ValueError` for another share, or a size that is not positive.
     """
 
-    unit: ClassVar[str] = "share"
     share: float = eqx.field(static=True, default=0.98)
-    size: float = eqx.field(static=True, default=0.05)
+    size: float | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
         check_fields(self)
         require(0 < self.share <= 1, f"the share is {self.share}; it must lie within (0, 1]")
-        NewSurface(self.size)
+        if self.size is not None:
+            NewSurface(self.size)
 
     def after(self, context: StopContext) -> str | None:
-        covered = expected_coverage(context, self.size)
+        new = newness_of(context.planner.acquisition)
+        if self.size is not None:
+            new = NewSurface(self.size * context.frame.scale)
+        covered = expected_coverage(context, new)
         return f"{100 * covered:.1f} % of what can be seen is expected to be covered" if covered >= self.share else None
 
 
-def expected_coverage(context: StopContext, size: float = 0.05) -> float:
+def expected_coverage(context: StopContext, new: NewSurface) -> float:
     """Share of the area that the camera would see of the posterior's surfaces, from all candidates, that is not new.
 
-    - `size`: of `NewSurface`, in scene units.
+    - `new`: what is new.
     """
     planner = context.planner
     poses = planner.search.poses_around()
     barrier = barrier_of(planner.obstacles, planner.camera, poses)
     where = context.observations.cloud, context.surfaces(), planner.camera, poses, barrier
-    new, shown = np.asarray(_values(ShownArea(NewSurface(size)), *where)).sum(axis=0)
-    return 1.0 - float(new / shown) if shown else 1.0
+    fresh, area = np.asarray(_values(ShownArea(new), *where)).sum(axis=0)
+    return 1.0 - float(fresh / area) if area else 1.0
 
 
 _values = eqx.filter_jit(expected_value)
@@ -256,7 +258,6 @@ class ValueBelow(StopRule):
     """Stop once the best view's value is less than this: in the units of what the search maximises, lengths in world
     units in a session and in scene units in a simulation."""
 
-    unit: ClassVar[str] = "value"
     value: float = eqx.field(static=True)
 
     def __check_init__(self):
@@ -278,7 +279,6 @@ class Budget(StopRule):
     **Raises:** `ValueError` for neither, or one that is not positive.
     """
 
-    unit: ClassVar[str] = "seconds, or cost"
     seconds: float | None = eqx.field(static=True, default=None)
     cost: float | None = eqx.field(static=True, default=None)
     of: CostFunction = eqx.field(static=True, default=arc_length)

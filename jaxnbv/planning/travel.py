@@ -27,16 +27,17 @@ class ArcLength(eqx.Module):
     """Length of the way from one camera's place to another's about a centre: of the great circle where both are equally
     far from it, hypot(mean distance x angle, difference of distances) in general.
 
-    - `center`: by default the origin, where the object of a scene is.
+    - `center`: by default the middle of the scene, in a session that of the box.
     """
 
-    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    center: tuple[float, float, float] | None = None
 
     @checked
     @jax.jit
     def __call__(self, start: Pose, end: Pose) -> Float[Array, ""]:
         """The length, in the units of the poses."""
-        first, second = (pose.position - jnp.asarray(self.center) for pose in (start, end))
+        center = jnp.zeros(3) if self.center is None else jnp.asarray(self.center)
+        first, second = (pose.position - center for pose in (start, end))
         radii = safe_norm(*first), safe_norm(*second)
         angle = jnp.arctan2(safe_norm(*jnp.cross(first, second)), jnp.sum(first * second))
         return safe_norm(0.5 * (radii[0] + radii[1]) * angle, radii[1] - radii[0])
@@ -48,7 +49,7 @@ arc_length = ArcLength()
 class WorldCost(eqx.Module):
     """The cost in the world of going from one pose of the scene to another.
 
-    - `of`: a cost of poses in the world; an `ArcLength` about the scene's centre is one about the same place there.
+    - `of`: a cost of poses in the world; an `ArcLength` without a centre is one about the middle of the scene.
     """
 
     of: CostFunction
@@ -57,8 +58,8 @@ class WorldCost(eqx.Module):
     def __call__(self, start: Pose, end: Pose) -> Float[Array, ""]:
         """The cost, in world units."""
         of = self.of
-        if isinstance(of, ArcLength):
-            of = dataclasses.replace(of, center=tuple(self.frame.to_world(np.array(of.center)).tolist()))
+        if isinstance(of, ArcLength) and of.center is None:
+            of = ArcLength(self.frame.center)
         return of(self.frame.to_world(start), self.frame.to_world(end))
 
 
@@ -92,10 +93,11 @@ class ValuePerCost(eqx.Module):
 
     def in_world(self, frame: Frame) -> "ValuePerCost":
         """The same for poses of a scene, where `of` is the cost of poses in the world."""
-        return dataclasses.replace(self, of=WorldCost(self.of, frame))
+        of = self.of.of if isinstance(self.of, WorldCost) else self.of
+        return dataclasses.replace(self, of=WorldCost(of, frame))
 
     def quantity(self, value: Quantity) -> Quantity:
-        """What the weighed value is, where the value is this."""
+        """What a value over its cost is, for a value of this quantity."""
         meaning = f"{value.meaning.rstrip('.')}, over the cost of going there."
         unit = f"{value.unit or ('' if value.length_power else value.name)} per unit of cost".lstrip()
         return dataclasses.replace(value, name=f"{value.name} per cost", unit=unit, meaning=meaning)

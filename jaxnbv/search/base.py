@@ -90,7 +90,7 @@ class CandidateSearch(Search):
 
     def asks(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
         """The acquisitions whose scores it picks by; none for a search that does not look at them."""
-        return (acquisition,) if self.uses_samples else ()
+        return (acquisition,)
 
     def score(self, problem: Problem, candidates: Pose) -> Scores:
         """The first half: the scores of the candidates, sample by sample, by each acquisition that it asks."""
@@ -156,7 +156,7 @@ def best_unvisited(
 def first_best(values: Float[Array, " candidates"], tie: float = _TIE) -> Int[Array, ""]:
     """Index of the highest value, ties as of `best_unvisited`."""
     best = jnp.max(values)
-    # Nothing ties with an infinite value, and NaN is told of by the planner.
+    # Nothing ties with an infinite value, and the planner reports NaN.
     tied = values >= best - jnp.where(jnp.isfinite(best), tie * jnp.abs(best), 0.0)
     return jnp.where(jnp.isfinite(best), jnp.argmax(tied), jnp.argmax(values))
 

@@ -56,7 +56,7 @@ class TieBreakSearch(CandidateSearch):
         assert tied is not None
         seconds = jnp.where(tied & (found.values > -jnp.inf), jnp.mean(second, axis=0), -jnp.inf)
         index = first_best(seconds)
-        # What is not a number is told of by the planner, whichever gave it.
+        # NaN from either acquisition propagates; the planner reports it.
         value = jnp.where(jnp.isnan(seconds[index]), jnp.nan, found.values[index])
         value = jnp.where(jnp.isfinite(found.value), value, found.value)
         assert found.standard_errors is not None

@@ -99,6 +99,14 @@ class GradientSearch(Search):
         # No tolerance is ever met: as many steps as were asked for.
         return optx.OptaxMinimiser(optax.adam(self.learning_rate), rtol=0.0, atol=0.0)
 
+    def poses_around(self) -> Pose:
+        return super().poses_around() if self.candidates is None else self.candidates.poses()
+
+    def above(self) -> "GradientSearch":
+        if self.candidates is None:
+            return self
+        return eqx.tree_at(lambda search: search.candidates, self, self.candidates.above())
+
     def check(self, acquisition: Acquisition, camera: Camera, capacity: int) -> None:
         """Raise `ValueError` if the acquisition has no gradient, or the space makes no sense for the camera."""
         self.space.check_camera(camera)

@@ -96,7 +96,7 @@ class Problem(eqx.Module):
         excluded = self.observations.poses.holds(poses)
         if self.pending is not None:
             excluded |= self.pending.holds(poses)
-        return excluded if self.obstacles is None else excluded | (self.violation(poses) > 0)
+        return excluded | (self.violation(poses) > 0)
 
     def violation(self, poses: Pose) -> Float[Array, " poses"]:
         """By how much each of a batch of cameras is too near to things, see `Obstacles.violation`."""

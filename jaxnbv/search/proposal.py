@@ -49,20 +49,10 @@ class Proposal(eqx.Module):
     def in_world(self, frame: Frame, length_power: int) -> "Proposal":
         """The proposal with its values, a power of length, and their errors in world units; poses stay in the scene."""
 
-        def convert(values):
-            return None if values is None else frame.length_to_world(values, length_power)
+        def convert(leaf):
+            return leaf if isinstance(leaf, Pose) else frame.length_to_world(leaf, length_power)
 
-        ways = self.trajectories
-        return Proposal(
-            self.pose,
-            convert(self.value),
-            self.candidates,
-            convert(self.values),
-            None if ways is None else Trajectories(ways.poses, convert(ways.values)),
-            convert(self.standard_errors),
-            convert(self.difference_errors),
-            convert(self.standard_error),
-        )
+        return jax.tree.map(convert, self, is_leaf=lambda leaf: isinstance(leaf, Pose))
 
     def tied_with_best(self, errors: float = 2.0) -> Bool[Array, " candidates"] | None:
         """Which candidates the samples cannot tell from the best one, itself included: those whose value is within so

@@ -107,6 +107,11 @@ def visible_area(view: ImaginedView) -> Float[Array, " rays"]:
     return jnp.where(scan.mask, facing / jnp.maximum(cosine, GRAZING), 0.0)
 
 
+def newness_of(acquisition: Acquisition) -> NewSurface:
+    """What counts as new to an acquisition: itself, if it looks for new surface, or the default."""
+    return acquisition if isinstance(acquisition, NewSurface) else NewSurface()
+
+
 class ShownArea(Acquisition):
     """New area and all area of a scan: for `expected_value`, not for a search."""
 

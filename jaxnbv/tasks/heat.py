@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from jaxnbv.checks import AnyArray, InputError, checked, require
 from jaxnbv.errors import optional
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.tasks.diffusion import HeatProblem, Temperature, cloud_temperature, mesh_temperature, refine
 from jaxnbv.tasks.host import call_on_host
@@ -122,9 +123,16 @@ def body_temperature(
 
 
 class Coldest(Answer):
-    """The coldest point (scene coordinates), and its temperature in degrees, which is the answer's one value."""
+    """The coldest point (scene coordinates), and its temperature in degrees, which is the answer's one value.
+
+    - `frame`: of the world in which the point is said.
+    """
 
     point: Float[np.ndarray, "3"] = eqx.field(default_factory=lambda: np.zeros(3))
+    frame: Frame = Frame()
+
+    def in_world(self, frame: Frame) -> "Coldest":
+        return replace(self, frame=frame)
 
     @property
     def temperature(self) -> float:

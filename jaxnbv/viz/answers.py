@@ -200,7 +200,8 @@ class _ColdestWords(Words):
 
     def said(self, before: Answer | None = None) -> str:
         was = "" if before is None else f" (was {number(float(before.values[0]))})"
-        return f"coldest at {coordinates(self.answer.point)}, {number(float(self.answer.values[0]))} degrees{was}"
+        place = coordinates(self.answer.point, self.answer.frame)
+        return f"coldest at {place}, {number(float(self.answer.values[0]))} degrees{was}"
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
         """The temperature of the coldest point and, where the truth is known, its distance to the true one."""
@@ -208,8 +209,10 @@ class _ColdestWords(Words):
         temperature = Chart("lowest temperature (degrees)", ("coldest",), _rows(answers), true)
         if not isinstance(truth, Coldest):
             return (temperature,)
-        away = [np.linalg.norm(answer.point - truth.point) for answer in answers if isinstance(answer, Coldest)]
-        label = "distance to the true coldest point (scene units)"
+        frame = self.answer.frame
+        points = np.stack([answer.point for answer in answers if isinstance(answer, Coldest)])
+        away = frame.length_to_world(np.linalg.norm(points - truth.point, axis=1))
+        label = f"distance to the true coldest point ({frame.unit})"
         return temperature, Chart(label, ("distance",), np.array(away)[:, None], goal=0.0)
 
 

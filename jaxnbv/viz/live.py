@@ -152,7 +152,7 @@ def _told(episode: Episode, posterior: SurfacePosterior, proposal: Proposal | No
     seen = seen_after(episode, None)[-1]
     lines = [f"**{views} view{'s' if views > 1 else ''}**, {seen.amount} of surface seen"]
     answer = acquisition.answer(episode.cloud)
-    lines += [] if answer is None else [f"{capital(words_of(answer).said())}."]
+    lines += [] if answer is None else [f"{capital(words_of(answer.in_world(episode.frame)).said())}."]
     kinds = tuple(posterior.kinds().items())
     lines += [may_be_words(kinds)] if kinds else []
     if proposal is not None:

@@ -17,6 +17,7 @@ from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.geometry.volume import Box
 from jaxnbv.planning.loop import view_keys
 from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.session import Session
 from jaxnbv.planning.simulate import simulate
 from jaxnbv.planning.stopping import Budget, Covered, ValueBelow
 from jaxnbv.planning.travel import ValuePerCost
@@ -274,6 +275,31 @@ def test_done_and_next_share_their_samples(monkeypatch, tmp_path):
     assert len(drawn) == 1
 
 
+def test_what_a_rule_looked_at_was_not_proposed(tmp_path):
+    """An image that the user takes after asking `done` alone follows no proposal, live and read again."""
+    session = session_of(tmp_path, until=ValueBelow(0.0))
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    assert session.done() is None
+    taken = around(3.0, 0.7)
+    session.add(shot(taken), taken, depth_scale=1e-3)
+    again = Session.load(tmp_path, progress=False)
+    assert session.views[1].proposal is again.views[1].proposal is None
+    np.testing.assert_array_equal(session.next().proposal.values, again.next().proposal.values)
+    # What was proposed is there when the folder is read again.
+    resumed = Session.load(tmp_path, progress=False)
+    np.testing.assert_array_equal(resumed.next_view.matrix, session.next().matrix)
+    assert resumed.next_view.value == session.next().value
+
+
+def test_a_single_sample_has_no_error_and_warns_of_nothing_left():
+    away = POSES @ np.diag([-1.0, 1.0, -1.0, 1.0])
+    session = session_of(poses=away, planner=planner_of(num_samples=1))
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    with pytest.warns(UserWarning, match=r"the best view is worth 0: none is sure"):
+        session.next()
+    assert session.next().standard_error is None
+
+
 def test_the_default_search_says_when_nothing_is_left():
     """Halving has standard errors too."""
     away = POSES @ np.diag([-1.0, 1.0, -1.0, 1.0])
@@ -313,6 +339,7 @@ def test_it_is_done_by_its_rule(finished):
     assert session.done() is None
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     assert "less than" in session.done()
+    assert session.episode.stopped == session.done()
     session = session_of(until=Budget(seconds=1e9))
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     assert session.done() is None

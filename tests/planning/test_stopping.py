@@ -23,7 +23,7 @@ from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.search import DiscreteSearch, FarthestView
 from jaxnbv.surfaces import GeometricSPSR
-from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, SoftPartCount
+from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, NewSurface, SoftPartCount
 
 SCENE, FIRST, KEY = SDFSurface(Sphere(0.8)), look_at((0.0, 0.0, 2.5)), jax.random.key(3)
 CAMERA, GRID = Camera(height=12, width=12), Grid(24)
@@ -132,9 +132,12 @@ def test_expected_coverage_is_that_of_the_samples(points, size):
     share = float(seen_area / all_area)
     assert 0.05 < share < 0.97
     known = after(planner, cloud, surfaces=ball)
-    assert expected_coverage(known, size) == pytest.approx(share, abs=0.02)
+    assert expected_coverage(known, NewSurface(size)) == pytest.approx(share, abs=0.02)
     assert Covered(share - 0.03, size).after(known) is not None
     assert Covered(min(share + 0.03, 1.0), size).after(known) is None
+    # The size is a length of the world.
+    small = after(planner, cloud, surfaces=ball, frame=Frame(10.0))
+    assert Covered(share - 0.03, 0.1 * size).after(small) == Covered(share - 0.03, size).after(known)
 
 
 def test_value_below_and_budgets_on_scripted_proposals():

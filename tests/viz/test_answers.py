@@ -61,7 +61,7 @@ def test_an_acquisition_without_words_has_its_type():
     assert Unnamed().quantity.name == "acquisition, Unnamed"
     assert Unnamed().answer(CLOUD) is None
     assert nbv.Coverage().answer(CLOUD) is None
-    assert nbv.Coverage().quantity.unit == "scene units²"
+    assert nbv.Coverage().quantity.unit_in(nbv.Frame()) == "scene units²"
 
 
 def test_a_search_that_does_not_ask_the_score_says_so():
@@ -71,7 +71,7 @@ def test_a_search_that_does_not_ask_the_score_says_so():
         nbv.search.UncertaintyView: "scene units",
     }
     for kind, unit in units.items():
-        assert kind().quantity(nbv.Coverage()).unit == unit
+        assert kind().quantity(nbv.Coverage()).unit_in(nbv.Frame()) == unit
         assert kind().quantity(Unnamed()) == kind().quantity(nbv.Coverage())
     assert not nbv.RandomView().quantity(Unnamed()).smooth
 
