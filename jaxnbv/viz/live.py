@@ -158,9 +158,8 @@ def _told(episode: Episode, posterior: SurfacePosterior, proposal: Proposal | No
     if proposal is not None:
         frame, error = episode.frame, proposal.standard_error
         about = "" if error is None else f" ± {float(error):.2g}"
-        lines.append(
-            f"The next view has a {sought.name} of {shown_value(sought, float(proposal.value), frame)}{about}."
-        )
+        value = shown_value(sought, float(proposal.value), frame)
+        lines.append(f"The next view: {sought.name} {value}{about}.")
     return "\n\n".join(lines)
 
 

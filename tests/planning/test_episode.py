@@ -58,20 +58,6 @@ def test_a_solid_is_simulated_as_its_surface_is():
     assert int(solid.views[1].scan.count) > 5
 
 
-def test_a_folder_gives_the_views_back_with_a_planner_of_its_camera(episode, tmp_path):
-    episode.save(tmp_path)
-    found = Episode.load(tmp_path)
-    assert found.planner.camera == PLANNER.camera
-    assert found.scene is None
-    assert found.noise is None
-    assert len(found.views) == 4
-    for view, expected in zip(found.views, episode.views, strict=True):
-        assert_same_bits((view.pose, view.scan, view.proposal), (expected.pose, expected.scan, expected.proposal))
-    # It does not know how many points were kept, and keeps more of them.
-    seen = np.concatenate([view.scan.to_numpy()[0] for view in episode.views])
-    np.testing.assert_array_equal(found.cloud.to_numpy()[0], seen)
-
-
 def test_a_folder_without_an_episode_is_named(tmp_path):
     with pytest.raises(ValueError, match=str(tmp_path)):
         Episode.load(tmp_path)

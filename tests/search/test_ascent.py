@@ -29,7 +29,7 @@ def known(kind=Known, *poses):
     """The problem, with poses that have been visited."""
     problem = problem_of(None)
     place, gaze = jnp.asarray((0.9, -1.1, 1.4)), jnp.asarray((-0.6, 0.0, -0.8))
-    return kind(visit(problem, *poses).observations, nbv.Camera(), nbv.Coverage(), None, place, gaze)
+    return kind(visit(problem, *poses).inputs, nbv.Camera(), nbv.Coverage(), place, gaze)
 
 
 SOLVERS = {"Adam": None, "BFGS": optx.BFGS(rtol=1e-4, atol=1e-4), "NonlinearCG": optx.NonlinearCG(rtol=1e-4, atol=1e-4)}

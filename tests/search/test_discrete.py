@@ -10,6 +10,7 @@ import pytest
 from small_problem import KEY, POSES, Constant, Height, propose, sample_by_sample, three_balls, visit, with_samples
 
 import jaxnbv as nbv
+from jaxnbv.sampler import StepInputs
 from jaxnbv.search.base import best_unvisited
 
 SEARCH, PROBLEM = nbv.DiscreteSearch(12), three_balls()
@@ -46,7 +47,7 @@ def test_only_the_same_place_and_direction_counts_as_visited():
         again = propose(SEARCH, visit(PROBLEM, pose))
         assert bool((again.pose.position != best.position).any()) == is_visited
     # Rows beyond the views that were taken hold nothing.
-    stale = eqx.tree_at(lambda p: p.observations.num_views, visit(PROBLEM, best), jnp.asarray(0))
+    stale = eqx.tree_at(lambda p: p.inputs.observations.poses.count, visit(PROBLEM, best), jnp.asarray(0))
     np.testing.assert_array_equal(propose(SEARCH, stale).pose.position, best.position)
 
 
@@ -160,9 +161,7 @@ def test_scores_are_those_of_each_sample_by_each_acquisition_that_is_asked(name)
 
 @pytest.mark.parametrize("name", [name for name, search in SEARCHES.items() if search.uses_samples])
 def test_without_samples_it_says_so(name):
-    bare = eqx.tree_at(
-        lambda p: p.surfaces, PROBLEM, None, is_leaf=lambda leaf: isinstance(leaf, nbv.scanning.GridSurface)
-    )
+    bare = dataclasses.replace(PROBLEM, inputs=StepInputs(PROBLEM.observations))
     with pytest.raises(ValueError, match="uses_samples"):
         SEARCHES[name].propose(bare, KEY)
 

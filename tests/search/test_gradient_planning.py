@@ -10,7 +10,7 @@ from small_planner import FIRST, SCENE
 
 import jaxnbv as nbv
 from jaxnbv.planning.episode import read_views
-from jaxnbv.storage import RunFolder, describe
+from jaxnbv.storage import describe
 
 ELSEWHERE, KEY = nbv.look_at((-0.8, 0.9, 2.2)), jax.random.key(0)
 OTHER_KEY = jax.random.key(1)
@@ -41,8 +41,7 @@ def contents(folder):
 
 def test_trajectories_come_back_from_disk_with_the_same_bits(tmp_path):
     episode = nbv.simulate(PLANNER, SCENE, FIRST, 4, KEY, folder=tmp_path / "whole", progress=False)
-    config = {"planner": PLANNER, "scene": SCENE, "noise": nbv.SensorNoise(), "first": FIRST, "key": KEY}
-    views = read_views(RunFolder(tmp_path / "whole", "episode", config))
+    views = read_views(episode.open(tmp_path / "whole"))
     assert views[0][2] is None
     for (_, _, read), view in zip(views[1:], episode.views[1:], strict=True):
         assert read.trajectories.values.shape == (2, 4)

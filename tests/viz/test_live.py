@@ -72,8 +72,8 @@ def test_it_says_what_is_asked_and_what_the_colours_mean(watched):
     assert "2 views" in page._text.content
     assert "expected coverage gain" in page._text.content
     assert page._image is not None
-    values = np.asarray(session.next().proposal.values)
-    for words in ("next view", "the surface is known to", f"{values[np.isfinite(values)].max():.3g}"[:3]):
+    values = session.frame.length_to_world(np.asarray(session.next().proposal.values), 2)
+    for words in ("next view", "the surface is known to, in world units", f"{values[np.isfinite(values)].max():.3g}"):
         assert words in page._legend.content
 
 
@@ -85,7 +85,7 @@ def test_the_slider_goes_back_to_an_earlier_view(watched):
     np.testing.assert_allclose(shown["/new points"].points, first, atol=2e-3)
     assert "/cameras/view 2" not in shown
     np.testing.assert_allclose(shown["/next view"].position, session.episode.views[1].proposal.pose.position, atol=1e-5)
-    assert re.search(r"^\*\*1 view\*\*, [\d.]+ scene units² of surface seen$", page._text.content, re.MULTILINE)
+    assert re.search(r"^\*\*1 view\*\*, [\d.]+ world units² of surface seen$", page._text.content, re.MULTILINE)
     page._slider.value = 2
     assert "/cameras/view 2" in handles(page)
 

@@ -94,9 +94,9 @@ def test_what_is_drawn_in_space_stands_where_it_is(episode, data):
 
 def test_poses_are_in_the_units_of_the_objects_file(episode, data):
     """That of a mesh which lies elsewhere and is larger; without a file they are in scene units."""
-    assert data.frame is None
     frame = nbv.Frame(0.5, (1.0, 2.0, 3.0), "z")
-    matrix = np.array(poses_of(report_html(dataclasses.replace(data, frame=frame), "mug"))[1])
+    elsewhere = dataclasses.replace(data, episode=dataclasses.replace(episode, frame=frame))
+    matrix = np.array(poses_of(report_html(elsewhere, "mug"))[1])
     pose = np.asarray(episode.views[1].pose.to_matrix(), np.float64)
     np.testing.assert_allclose(matrix[:3, 3], frame.rotation.T @ pose[:3, 3] / 0.5 + [1.0, 2.0, 3.0], atol=1e-5)
     np.testing.assert_allclose(matrix[:3, :3], frame.rotation.T @ pose[:3, :3], atol=1e-6)

@@ -4,7 +4,6 @@ import dataclasses
 import html
 import re
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +13,7 @@ from small_run import FIRST, Page, small_planner, small_run
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.studies.scenes import Split, pyramid_scene
-from jaxnbv.tasks.classification import ClassAnswer
+from jaxnbv.tasks.classification import ClassAnswer, Classifier
 from jaxnbv.tasks.heat import Coldest
 from jaxnbv.tasks.segmentation import PartAnswer
 from jaxnbv.utility import Answer
@@ -34,10 +33,12 @@ def never(rule, index):
 NAMES = ("left", "right", "up")
 
 
-class Leaning(eqx.Module):
+class Leaning(Classifier):
     """A classifier that looks at where the points are."""
 
-    classes: tuple[str, ...] = NAMES
+    @property
+    def classes(self):
+        return NAMES
 
     def __call__(self, cloud):
         mean = jnp.sum(jnp.where(cloud.mask[:, None], cloud.points, 0.0), axis=0) / jnp.maximum(cloud.count, 1)
