@@ -150,7 +150,7 @@ def test_a_posterior_at_hand_is_not_asked_for_again():
     np.testing.assert_allclose(sampler.mean(observations, other), balls().mean(observations), atol=1e-6)
 
 
-def test_scans_of_samples_end_at_the_surroundings():
+def test_scans_of_samples_end_at_the_obstacles():
     wall = nbv.Obstacles((nbv.sdf.Cuboid([0.1, 1.0, 1.0]).translate([1.4, 0.0, -0.5]),))
     surfaces = balls().sample(SCANS[0], KEY)
     free, ended = (nbv.scanning.scan_samples(surfaces, CAMERA, POSES, b) for b in (None, wall.barrier(CAMERA, POSES)))
@@ -187,7 +187,7 @@ def test_another_box_takes_the_place_of_the_default_one_alone():
 
 
 @pytest.mark.parametrize("made_by", [balls(None), dataclasses.replace(balls(), grid=nbv.Grid(26, 1.5))])
-def test_evidence_of_another_grid_is_refused(made_by):
+def test_observations_of_another_grid_are_refused(made_by):
     own, observations, fits = balls(), seen(made_by), seen(balls())
     for use in (
         own.adapt,
@@ -204,7 +204,7 @@ def test_evidence_of_another_grid_is_refused(made_by):
         use(fits)
 
 
-def test_where_nothing_is_carved_evidence_of_any_grid_will_do():
+def test_where_nothing_is_carved_observations_of_any_grid_will_do():
     known = balls(None).adapt(seen(balls()))
     assert known.empty_nodes is None
     np.testing.assert_array_equal(known.cloud.points, seen(balls()).cloud.points)

@@ -58,7 +58,7 @@ def test_simulated_episodes_do_not_recompile_either(planner, compilations):
     assert len(compilations) == before
 
 
-def test_asking_and_telling_leave_the_evidence_as_it_was(planner, observations):
+def test_asking_and_telling_leave_the_observations_as_they_were(planner, observations):
     before = jax.tree.map(np.array, observations)
     proposal = planner.propose(observations, jax.random.key(1))
     seen = scan(SCENE, planner.camera, proposal.pose)
@@ -81,9 +81,12 @@ def test_a_first_scan_from_an_unknown_pose_excludes_nothing():
     assert not np.isneginf(planner.propose(observations, jax.random.key(0)).values).any()
 
 
-def test_a_cloud_alone_is_evidence(planner):
+def test_a_cloud_alone_makes_observations(planner):
     cloud, key = scan(SCENE, planner.camera, FIRST), jax.random.key(4)
-    known, alone = (planner.propose(observations, key) for observations in (planner.init(None, cloud), cloud))
+    sample_key, search_key = jax.random.split(key)
+    observations = planner.init(None, cloud)
+    known = planner.propose(observations, key)
+    alone = planner.choose(planner.sampler.step_inputs(observations.cloud, sample_key), search_key)
     jax.tree.map(np.testing.assert_array_equal, jax.tree.map(np.array, known), jax.tree.map(np.array, alone))
 
 

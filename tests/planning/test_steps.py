@@ -84,7 +84,7 @@ def test_views_that_are_known_are_told_and_not_asked_for():
     assert len(asked) == 2
 
 
-def test_a_step_holds_the_samples_and_the_evidence_that_the_next_view_is_chosen_from():
+def test_a_step_holds_the_samples_and_the_observations_that_the_next_view_is_chosen_from():
     own = planner(DiscreteSearch(CANDIDATES), 3)
     first, second, third = Loop(own, KEY).steps(sensor_of(), FIRST)
     assert (first.inputs, first.seconds) == (None, 0.0)

@@ -28,7 +28,7 @@ from jaxnbv.search import (
 RNG, KEY = np.random.default_rng(0), jax.random.key(3)
 
 
-def evidence_of(planner):
+def observations_of(planner):
     return planner.init(FIRST, scan(SCENE, planner.camera, FIRST))
 
 
@@ -101,7 +101,7 @@ PER_COST = ValuePerCost(arc_length, fixed=0.5), lambda value, cost: value / (0.5
 )
 def test_values_are_weighed_against_the_way_from_the_last_view(cost, worth, search):
     plain, weighed = planner_of(search), planner_of(search, cost=cost)
-    observations = evidence_of(plain)
+    observations = observations_of(plain)
     second = plain.propose(observations, KEY).pose
     observations = plain.observe(observations, second, scan(SCENE, plain.camera, second))
     values, found = (np.asarray(planner.propose(observations, KEY).values) for planner in (plain, weighed))
@@ -116,7 +116,7 @@ def test_values_are_weighed_against_the_way_from_the_last_view(cost, worth, sear
 
 def test_standard_errors_are_of_what_is_weighed():
     plain, weighed = planner_of(), planner_of(cost=ValuePerCost(arc_length))
-    observations = evidence_of(plain)
+    observations = observations_of(plain)
     errors = [np.asarray(planner.propose(observations, KEY).standard_errors) for planner in (plain, weighed)]
     way = np.array([float(arc_length(FIRST, pose)) for pose in plain.search.candidates.poses()])
     np.testing.assert_allclose(errors[1], errors[0] / (1.0 + way), rtol=1e-3)
@@ -127,7 +127,7 @@ def test_a_search_by_gradient_weighs_the_way_too():
     """All along its ascents a value is that without cost, by the same samples, over the cost of the way."""
     search = GradientSearch(dof=2, num_starts=2, iterations=6, learning_rate=0.05, num_candidates=6)
     planner = planner_of(search, cost=ValuePerCost(arc_length, fixed=1.0))
-    observations = evidence_of(planner)
+    observations = observations_of(planner)
     ways = planner.propose(observations, KEY).trajectories
     poses = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), ways.poses)
     plain = planner_of(DiscreteSearch(GivenPoses(poses))).propose(observations, KEY)

@@ -63,8 +63,8 @@ def after_both_sides(planner, surface, poses=POSES):
 
 def test_no_sample_is_inside_what_was_seen_empty_nor_outside_the_volume():
     planner, raw = planner_of(), planner_of(carving=None)
-    observations, raw_evidence = (after_both_sides(one, SOLIDS["ball"]) for one in (planner, raw))
-    assert raw_evidence.empty_nodes is None
+    observations, raw_observations = (after_both_sides(one, SOLIDS["ball"]) for one in (planner, raw))
+    assert raw_observations.empty_nodes is None
     expected = np.zeros((30,) * 3, bool)
     for pose in POSES:
         seen = SEE(CARVING, SMALL_GRID, pose, nbv.scan(SOLIDS["ball"], planner.camera, pose), planner.camera)
@@ -73,7 +73,7 @@ def test_no_sample_is_inside_what_was_seen_empty_nor_outside_the_volume():
     np.testing.assert_array_equal(observations.empty_nodes, expected)
 
     carved = np.asarray(planner.sampler.sample(observations, jax.random.key(1)).values)
-    values = np.asarray(raw.sampler.sample(raw_evidence, jax.random.key(1)).values)
+    values = np.asarray(raw.sampler.sample(raw_observations, jax.random.key(1)).values)
     outside = (np.linalg.norm(np.maximum(np.abs(nodes_of(SMALL_GRID)) - 1.25, 0.0), axis=-1)) > 2 * SMALL_GRID.spacing
     nowhere = expected | outside
     assert (outside & ~expected).any()

@@ -65,7 +65,7 @@ def model(bank=BANK, **changed):
     return nbv.surfaces.KnownShapes(bank, RESIDUAL, unknown=QUICK, num_starts=2048, **changed)
 
 
-def evidence_of(surface, positions, noise=0.005):
+def observations_of(surface, positions, noise=0.005):
     planner = nbv.Planner(
         nbv.Coverage(), camera=CAMERA, sampler=nbv.SurfaceSampler(grid=GRID), capacity=512, max_views=4
     )
@@ -87,7 +87,7 @@ def planted():
     for seed in range(8):
         rotation, index = Rotation.random(random_state=seed), seed % len(ARMS)
         surface, _, shift = filling(ARMS[index], rotation)
-        seen = Seen.of(evidence_of(surface, AROUND))
+        seen = Seen.of(observations_of(surface, AROUND))
         found.append(
             (index, rotation, shift, register(BANK, Prior(nbv.surfaces.FreeRotation(), nbv.Box()), seen, 2048))
         )
@@ -119,7 +119,7 @@ def test_modes_of_one_shape_are_far_apart(planted):
 def test_a_symmetric_shape_stands_in_all_the_ways_that_look_alike():
     """A bar that was seen from above: it may be turned by half a turn."""
     bank = nbv.ShapeBank.of([Cuboid([1.2, 0.3, 0.4])])
-    seen = Seen.of(evidence_of(nbv.SDFSurface(Cuboid([1.25, 0.31, 0.42])), ((0.5, 3.0, 1.5),)))
+    seen = Seen.of(observations_of(nbv.SDFSurface(Cuboid([1.25, 0.31, 0.42])), ((0.5, 3.0, 1.5),)))
     found = register(bank, Prior(nbv.surfaces.Upright(), nbv.Box()), seen, 512)
     angles = np.degrees(
         np.arctan2(np.asarray(found.placement.rotation)[:, 0, 2], np.asarray(found.placement.rotation)[:, 0, 0])
@@ -129,7 +129,7 @@ def test_a_symmetric_shape_stands_in_all_the_ways_that_look_alike():
 
 
 def test_what_was_seen_empty_is_among_what_shapes_are_fitted_to():
-    observations = evidence_of(nbv.SDFSurface(Cuboid([0.5, 0.3, 0.4])), AROUND)
+    observations = observations_of(nbv.SDFSurface(Cuboid([0.5, 0.3, 0.4])), AROUND)
     seen = Seen.of(observations)
     assert bool(seen.is_empty.all())
     node = (np.asarray(seen.empty, np.float64) + GRID.half_extent) / GRID.spacing
@@ -145,7 +145,7 @@ def test_shapes_of_a_kind_differ_by_their_number():
 
 
 def test_where_no_shape_fits_none_is_the_answer():
-    observations = evidence_of(nbv.SDFSurface(Sphere(1.2)), AROUND)
+    observations = observations_of(nbv.SDFSurface(Sphere(1.2)), AROUND)
     posterior = model().condition(observations)
     assert posterior.hypotheses[0].name == "none of these"
     assert posterior.hypotheses[0].weight > 0.95
@@ -157,7 +157,7 @@ def test_where_no_shape_fits_none_is_the_answer():
 
 
 def test_without_shapes_the_model_is_the_unknown_one_to_the_bit():
-    observations = evidence_of(nbv.SDFSurface(Sphere(1.2)), AROUND[:1])
+    observations = observations_of(nbv.SDFSurface(Sphere(1.2)), AROUND[:1])
     empty = model(nbv.ShapeBank.of([])).condition(observations)
     assert eqx.tree_equal(empty, QUICK.condition(observations))
     assert eqx.tree_equal(
@@ -170,7 +170,7 @@ def test_of_one_exact_shape_samples_are_that_shape_to_the_noise():
     surface, _, _ = filling(0.65, UPRIGHT)
     truth = nbv.mesh_from_sdf(surface.sdf, nbv.Grid(100, 1.4))
     points = jnp.asarray(truth.frame.to_world(truth.sample_points(jax.random.key(1), 400)), jnp.float32)
-    posterior = model().condition(evidence_of(surface, AROUND[:2]))
+    posterior = model().condition(observations_of(surface, AROUND[:2]))
     # Held for certain, in the best of the ways that it was found to stand.
     best = int(np.flatnonzero(np.asarray(posterior.found.shape) == 2)[0])
     certain = jnp.zeros_like(posterior.weights).at[best].set(1.0)
@@ -185,7 +185,7 @@ def test_of_one_exact_shape_samples_are_that_shape_to_the_noise():
 
 
 def test_weights_are_tempered_fits():
-    observations = evidence_of(filling(0.5, UPRIGHT)[0], AROUND[:1])
+    observations = observations_of(filling(0.5, UPRIGHT)[0], AROUND[:1])
     posterior = model(inverse_temperature=7.0, misfit_of_none=0.4).condition(observations)
     found = posterior.found
     energy = np.append(np.where(found.is_mode, np.exp(-7.0 * np.asarray(found.misfit, np.float64)), 0.0), np.exp(-2.8))
@@ -207,11 +207,11 @@ def test_systematic_resampling_draws_each_as_often_as_its_weight_says(weights, s
 
 
 @pytest.mark.slow
-def test_the_same_evidence_has_the_same_hypotheses_and_nothing_is_compiled_twice(compilations):
+def test_the_same_observations_have_the_same_hypotheses_and_nothing_is_compiled_twice(compilations):
     surface, _, _ = filling(0.5, UPRIGHT)
     sampler = dataclasses.replace(nbv.SurfaceSampler(QUICK, GRID, 3).with_bank(BANK, nbv.surfaces.AsGiven()))
     sampler = dataclasses.replace(sampler, model=dataclasses.replace(sampler.model, residual=RESIDUAL, num_starts=64))
-    first, second = evidence_of(surface, AROUND[:1]), evidence_of(surface, AROUND[:2])
+    first, second = observations_of(surface, AROUND[:1]), observations_of(surface, AROUND[:2])
     assert eqx.tree_equal(sampler.posterior(first).found, sampler.posterior(first).found)
     sampler.sample(first, jax.random.key(0))
     compilations.clear()

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 import trimesh
-from test_pyramid_study import CAMERA, SCENE, chosen, evidence_of, small_study, step_key, without_time
+from test_pyramid_study import CAMERA, SCENE, chosen, observations_of, small_study, step_key, without_time
 
 import jaxnbv as nbv
 from jaxnbv.cli.registry import STUDY_MODELS
@@ -53,7 +53,7 @@ def test_a_choice_is_that_of_the_planner_with_the_same_key(record, method, view)
     study = knowing_study()
     scene, poses = study.scene(SCENE), np.asarray(study.candidates.poses().position)
     planner, candidates = study.planner(method, scene), chosen(study, record["methods"][method])
-    observations = evidence_of(study, planner, scene, candidates[:view])
+    observations = observations_of(study, planner, scene, candidates[:view])
     proposed = planner.propose(observations, step_key(study, view)).pose.position
     np.testing.assert_allclose(poses[candidates[view]], proposed, atol=1e-5)
 

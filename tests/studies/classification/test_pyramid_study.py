@@ -50,7 +50,7 @@ def whole_record():
     return run_scene(small_study(), SCENE)
 
 
-def evidence_of(study, planner, scene, candidates):
+def observations_of(study, planner, scene, candidates):
     """What a planner knows after the true scans from some candidates."""
     poses, scans = study.candidates.poses(), scene.task.scans
     *_, observations = planner.replay((poses[index], scans[index]) for index in candidates)
@@ -129,7 +129,7 @@ def test_every_choice_is_the_one_that_the_planner_proposes_with_the_same_key():
     for method, held in record["methods"].items():
         planner, taken = study.planner(method, scene), chosen(study, held)
         for view in (1, 2):
-            observations = evidence_of(study, planner, scene, taken[:view])
+            observations = observations_of(study, planner, scene, taken[:view])
             proposed = planner.propose(
                 observations, step_key(study, view, 0 if method == "random" else None)
             ).pose.position
@@ -140,7 +140,7 @@ def test_the_oracle_values_true_scans():
     study = small_study()
     scene, visited = study.scene(SCENE), [2, 7]
     planner = study.planner("oracle", scene)
-    observations = evidence_of(study, planner, scene, visited)
+    observations = observations_of(study, planner, scene, visited)
     values = planner.propose(observations, jax.random.key(3)).values
     thinned = limit_capacity(observations.cloud, 100)
     p = np.exp(np.asarray(study.classifier(thinned), np.float64))
@@ -154,7 +154,7 @@ def test_answers_are_the_classifiers_of_all_that_was_seen():
     scene, taken = study.scene(SCENE), chosen(small_study(), whole_record()["methods"]["coverage"])
     planner = study.planner("coverage", scene)
     for count in (1, 2, 3):
-        observations = evidence_of(study, planner, scene, taken[:count])
+        observations = observations_of(study, planner, scene, taken[:count])
         np.testing.assert_allclose(method["log_p"][0][count - 1], study.classifier(observations.cloud), atol=1e-5)
 
 
