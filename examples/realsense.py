@@ -39,7 +39,7 @@ def main(folder: str = "live", views: int = 10) -> None:
     first = np.asarray(nbv.look_at((0.0, -0.4, 0.4), (0.0, 0.0, 0.15), up=(0.0, 0.0, 1.0)).matrix)
     try:
         while len(session.views) < views and not session.done():
-            matrix = go_to(first if len(session.views) == 0 else session.next().matrix)
+            matrix = go_to(session.next().matrix if session.views else first)
             depth = np.asanyarray(pipeline.wait_for_frames().get_depth_frame().get_data())
             session.add(depth, matrix, depth_scale=scale)
     finally:

@@ -75,8 +75,8 @@ class Bridge:
             return "there is no image yet"
         depth, scale = image_of(self.latest)
         self.session.add(depth, matrix_of(self.lookup(self.latest.header.stamp)), depth_scale=scale)
-        if self.session.done():
-            return f"done: {self.session.done()}"
+        if (reason := self.session.done()) is not None:
+            return f"done: {reason}"
         self.publish(self.session.next().matrix)
         return f"{len(self.session.views)} images"
 
