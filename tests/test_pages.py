@@ -177,7 +177,7 @@ def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
     )
     monkeypatch.setattr("jaxnbv.planning.session.usual_planner", lambda: planner)
     given = {"K": INTRINSICS, **CORNERS, "reachable": poses, "first": poses[0], "take_image": image_of_a_ball}
-    (block,) = (block for block in blocks("how_to/depth_camera.md") if "until=" in block)
+    (block,) = (block for block in blocks("how_to/depth_camera.md") if "take_image" in block)
     exec(block, given)
     session = given["session"]
     assert 2 <= len(session.views) < 10
@@ -187,6 +187,12 @@ def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
     assert np.abs(np.linalg.norm(points - [0.0, 0.0, 0.1], axis=1) - 0.1).max() < 0.01
     assert points[:, 0].min() < -0.08
     assert points[:, 0].max() > 0.08
+    # Loaded again, it is the same session.
+    (block,) = (block for block in blocks("how_to/depth_camera.md") if "Session.load" in block)
+    exec(block, given)
+    assert given["session"] is not session
+    assert len(given["session"].views) == len(session.views)
+    assert given["session"].done() == session.done()
 
 
 @pytest.mark.slow
@@ -231,4 +237,4 @@ def test_the_block_for_a_depth_camera_runs(monkeypatch):
 
 
 def test_no_block_of_the_depth_camera_is_left_out():
-    assert len(blocks("how_to/depth_camera.md")) == 3
+    assert len(blocks("how_to/depth_camera.md")) == 4

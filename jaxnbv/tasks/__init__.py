@@ -1,4 +1,4 @@
-"""One file a task: its utility or its acquisition, its rule of stopping, what it answers."""
+"""One file a task: its utility or its acquisition, and what it answers."""
 
 from jaxnbv.tasks.classification import Classifier as Classifier
 from jaxnbv.tasks.classification import CrossEntropy as CrossEntropy
