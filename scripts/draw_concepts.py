@@ -145,7 +145,7 @@ def draw_known() -> Figure:
     planner = nbv.Planner(nbv.Coverage(), sampler=plain)
     scan = nbv.scan(nbv.SDFSurface(pyramid), planner.camera, first)
     observations = planner.init(first, nbv.SensorNoise()(scan, jax.random.key(0)))
-    below = nbv.look_at(np.asarray(pyramid.rotation) @ (1.6, 1.0, -5.0))
+    below = nbv.look_at(np.asarray(pyramid.solid.rotation) @ (1.6, 1.0, -5.0))
     camera = nbv.Camera(height=PIXELS, width=PIXELS)
     posterior, key = with_bank.posterior(observations), jax.random.key(0)
     names = [kind_of(name) for name in posterior.names_of_samples(key, with_bank.num_samples)]

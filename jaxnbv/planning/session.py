@@ -29,6 +29,7 @@ from jaxnbv.planning.stopping import StopRule
 from jaxnbv.planning.table import plane_under
 from jaxnbv.progress import progress_bar
 from jaxnbv.scanning import Obstacles
+from jaxnbv.scanning.sdf import HalfSpace
 from jaxnbv.search import HalvingSearch, Proposal
 from jaxnbv.storage import RunFolder
 from jaxnbv.tasks import NewSurface
@@ -106,6 +107,7 @@ class Session:
         matrices = None if poses is None else as_numbers(poses, "the poses", np.float64)
         self._bar: tqdm[Any] | None = None
         self._loop = self._loop_of(self._placed(planner, matrices, obstacles))
+        self._table: HalfSpace | None = None
         self._next: NextView | None = None
         self._folder: RunFolder | None = None
         if folder is not None:
@@ -204,6 +206,13 @@ class Session:
         place = as_numbers(matrix, "the matrix of a pose", np.float64)
         with self._alone() as folder:
             self._add(pixels, place, depth_scale, folder)
+        if len(self.views) == 1 and self._table is not None:
+            point = np.round(self.frame.to_world(np.asarray(self._table.point, np.float64)), 4).tolist()
+            warnings.warn(
+                f"the object stands on a plane through {point}, which goes on beyond the box: it is taken for a table "
+                "and left out. Give obstacles=Obstacles() to keep it",
+                stacklevel=3,
+            )
 
     def next(self) -> NextView:
         """Where to take the next image. It is stored, and the same until an image is added; what was proposed once is
@@ -265,7 +274,11 @@ class Session:
             except NothingInside as problem:
                 raise InputError(f"the first image shows nothing of the box: {problem}") from problem
         if index == 0 and loop.planner.obstacles is None:
-            loop = self._loop_of(self._on_table(PointCloud.from_depth(*image)))
+            whole = self.frame.to_scene(PointCloud.from_depth(*image))
+            self._table = plane_under(whole, self.frame.to_scene(self.box))
+            # Without a table there still are the points of D, which cameras keep clear of.
+            around = Obstacles(() if self._table is None else (self._table,))
+            loop = self._loop_of(dataclasses.replace(loop.planner, obstacles=around))
         scan = self.frame.to_scene(cloud)
         if (obstacles := loop.planner.obstacles) is not None:
             scan = obstacles.remove_points(scan)
@@ -290,22 +303,6 @@ class Session:
             if index < count:
                 image = folder.read("image", index)
                 self._add(image["depth"], image["matrix"], float(image["depth_scale"]), None)
-
-    def _on_table(self, cloud: PointCloud) -> Planner:
-        """The planner with the plane that the object stands on among its obstacles, named by a warning; with obstacles
-        that hold nothing but the points of D, if there is no plane.
-
-        - `cloud`: the whole first image, in world units.
-        """
-        plane = plane_under(self.frame.to_scene(cloud), self.frame.to_scene(self.box))
-        if plane is not None:
-            place = np.round(self.frame.to_world(np.asarray(plane.point, np.float64)), 4).tolist()
-            warnings.warn(
-                f"the object stands on a plane through {place}, which goes on beyond the box: it is taken for a table "
-                "and left out. Give obstacles=Obstacles() to keep it",
-                stacklevel=5,
-            )
-        return dataclasses.replace(self.planner, obstacles=Obstacles(() if plane is None else (plane,)))
 
     def _next_of(self, proposal: Proposal, expected_depth: np.ndarray | None) -> NextView:
         """A proposal in the user's world."""

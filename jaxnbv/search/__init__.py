@@ -1,5 +1,6 @@
 """How the next pose is found: among candidates, by gradient, by both, and by the paper's baselines."""
 
+from jaxnbv.search.base import Baseline as Baseline
 from jaxnbv.search.base import CandidateSearch as CandidateSearch
 from jaxnbv.search.base import Search as Search
 from jaxnbv.search.baselines import FarthestView as FarthestView

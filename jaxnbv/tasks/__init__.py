@@ -1,5 +1,6 @@
 """One file a task: its utility or its acquisition, and what it answers."""
 
+from jaxnbv.tasks.classification import ClassAcquisition as ClassAcquisition
 from jaxnbv.tasks.classification import Classifier as Classifier
 from jaxnbv.tasks.classification import CrossEntropy as CrossEntropy
 from jaxnbv.tasks.classification import EntropyReduction as EntropyReduction

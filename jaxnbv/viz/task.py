@@ -16,7 +16,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.episode import Episode
-from jaxnbv.planning.loop import view_keys
+from jaxnbv.planning.loop import View, view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Sure
 from jaxnbv.scanning import Surface
@@ -69,14 +69,14 @@ def task_of(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, rival
     """
     planner = episode.planner
     seen, true = seen_after(episode, truth), None
-    answers = _answers(episode) or seen
+    answers = _answers(episode, episode.views) or seen
     if episode.scene is not None and answers is not seen:
         cloud = true_cloud(episode.scene, planner.capacity)
         true = None if cloud is None else planner.acquisition.true_answer(episode.scene, cloud)
     beside = None
     if rival is not None:
         rival_seen = seen_after(rival, truth)
-        charts = _charts(_answers(rival) or rival_seen, true)
+        charts = _charts(_answers(episode, rival.views) or rival_seen, true)
         beside = Rival(search_name(rival), race_words(rival, episode), charts, _charts(rival_seen, None)[0])
     return Task(
         amounts=seen,
@@ -95,11 +95,11 @@ def _charts(answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...
     return words_of(answers[-1]).charts(answers, truth)
 
 
-def _answers(episode: Episode) -> Sequence[Answer]:
-    """The acquisition's answers after each view, in the world of the episode; none, where it answers nothing."""
-    given = [episode.planner.acquisition.answer(view.cloud) for view in episode.views]
-    answers = [answer.in_world(episode.frame) for answer in given if answer is not None]
-    return answers if len(answers) == len(given) else []
+def _answers(episode: Episode, views: Sequence[View]) -> Sequence[Answer]:
+    """The answers of the episode's acquisition after each of some views, in its world; none, where it has none."""
+    answers = [episode.planner.acquisition.answer(view.cloud) for view in views]
+    said = [answer.in_world(episode.frame) for answer in answers if answer is not None]
+    return said if len(said) == len(answers) else []
 
 
 def seen_after(episode: Episode, truth: Float[AnyArray, "n 3"] | None) -> list[CoverageAnswer]:
@@ -168,7 +168,7 @@ def race_words(rival: Episode, episode: Episode) -> str:
     """How many views another search took, from the same first view, or that they were not enough for the rule that
     ended the episode; of an acquisition that answers, what was found."""
     name, count = search_name(rival).capitalize(), len(rival.views)
-    answers = _answers(rival)
+    answers = _answers(episode, rival.views)
     views = f"{count} view{'s' * (count > 1)}"
     text = f"{name} {'needed' if rival.stopped else 'took'} {views} from the same start"
     if episode.stopped and not rival.stopped:

@@ -35,7 +35,7 @@ def distances(solid, x):
 
 def own_frame(pyramid, points):
     """Points in the frame of the pyramid."""
-    offset, rotation, scale = map(np.asarray, (pyramid.offset, pyramid.rotation, pyramid.scale))
+    offset, rotation, scale = map(np.asarray, (pyramid.solid.offset, pyramid.solid.rotation, pyramid.solid.scale))
     return (points - offset) @ rotation / scale
 
 
@@ -63,10 +63,10 @@ def test_points_that_tell_the_class_lie_in_the_pattern_where_a_view_shows_it(sca
     for row, pixels in enumerate(np.asarray(scanned.cue_pixels)):
         pyramid = pyramid_scene(Split.TRAIN, 5 + row)
         own = own_frame(pyramid, np.asarray(scanned.clouds.points[row]))
-        assert (own[tells[row], 2] * float(pyramid.scale) > 0.03 - 1e-4).all()
-        assert (own[tells[row], 2] < float(pyramid.depth) + 0.04).all()
-        side = (np.abs(own[:, :2]).max(axis=1) - 1) * float(pyramid.height) + own[:, 2]
-        inner = mask[row] & (own[:, 2] > 0.5 * float(pyramid.depth)) & (side < -0.12)
+        assert (own[tells[row], 2] * float(pyramid.solid.scale) > 0.03 - 1e-4).all()
+        assert (own[tells[row], 2] < float(pyramid.solid.depth) + 0.04).all()
+        side = (np.abs(own[:, :2]).max(axis=1) - 1) * float(pyramid.solid.height) + own[:, 2]
+        inner = mask[row] & (own[:, 2] > 0.5 * float(pyramid.solid.depth)) & (side < -0.12)
         if pixels == 0 or pixels > 500:
             shares[bool(pixels)].append((inner.sum() / mask[row].sum(), tells[row].sum()))
     unseen, seen = (np.array(shares[key]) for key in (False, True))

@@ -121,5 +121,5 @@ def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypa
     for wrong in ("0", "3:3", "9:7", "-2", "all"):
         with pytest.raises(InputError, match=f"--scenes {wrong} names no scenes"):
             run("wrong", wrong)
-    with pytest.raises(InputError, match="the study pyramid takes no --meshes: it is for truck"):
+    with pytest.raises(InputError, match="the study pyramid takes no --meshes: it is for heat"):
         run("wrong", "2", meshes=tmp_path)
