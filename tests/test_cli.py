@@ -175,7 +175,7 @@ def test_a_command_of_another_package_stands_beside_ours(tmp_path, monkeypatch):
     shown = run_process("--help", cwd=tmp_path)
     assert shown.returncode == 0, shown.stderr
     assert "Greets." in shown.stdout
-    assert "Look at a run in the browser" in shown.stdout
+    assert "Look at a run or a session in the browser" in shown.stdout
     (line,) = shown.stderr.splitlines()
     assert line.startswith("warning: toy has no command break (ZeroDivisionError")
     assert run_process("greet", "--who", "me", cwd=tmp_path).stdout == "hello me\n"
