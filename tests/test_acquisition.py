@@ -242,7 +242,7 @@ def test_only_heat_is_computed_by_the_host(surfaces, cloud, name):
 )
 def test_samples_that_a_gpu_takes_together_have_the_same_scores(surfaces, cloud, acquisition, monkeypatch):
     alone = nbv.expected_value(acquisition, cloud, surfaces, CAMERA, POSES)
-    for module in ("acquisition", "scanning.grid", "tasks.coverage"):
+    for module in ("utility", "scanning.grid", "tasks.coverage"):
         monkeypatch.setattr(f"jaxnbv.{module}.on_cpu", lambda: False)
     assert samples_at_once(CAMERA, POSES) > 3
     together = nbv.expected_value(acquisition, cloud, surfaces, CAMERA, POSES)
