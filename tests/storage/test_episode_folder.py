@@ -68,13 +68,13 @@ def test_saving_afterwards_writes_what_a_run_into_the_folder_writes(finished, tm
     episode, folder = finished
     episode.save(tmp_path / "saved")
     assert contents(tmp_path / "saved") == contents(folder)
-    assert set(contents(folder)) == {"episode.json", "cloud.ply", *(f"view_0{i}.npz" for i in range(5))}
+    assert set(contents(folder)) == {"episode.json", "cloud.ply", "end_00.npz", *(f"view_0{i}.npz" for i in range(5))}
 
 
 def test_three_views_continued_to_five_equal_five(finished, tmp_path):
     _, folder = finished
     run(tmp_path / "run", views=3)
-    assert len(contents(tmp_path / "run")) == 5
+    assert len(contents(tmp_path / "run")) == 6
     episode = run(tmp_path / "run", views=5)
     assert contents(tmp_path / "run") == contents(folder)
     ends = [(each.views, each.observations_after(5)) for each in (episode, finished[0])]
@@ -162,8 +162,8 @@ def test_a_first_view_that_fails_does_not_bind_its_folder(tmp_path, finished):
 def test_a_record_without_views_binds_nobody(tmp_path, finished):
     """A run that was killed between the two files."""
     run(tmp_path, views=1, key=jax.random.key(9))
-    (tmp_path / "view_00.npz").unlink()
-    (tmp_path / "cloud.ply").unlink()
+    for name in ("view_00.npz", "end_00.npz", "cloud.ply"):
+        (tmp_path / name).unlink()
     run(tmp_path, views=5)
     assert contents(tmp_path) == contents(finished[1])
 
