@@ -199,5 +199,5 @@ def _label(thing: Thing) -> Int[Array, ""]:
 
 def _point_labels(thing: Thing, cloud: PointCloud) -> Any:
     if isinstance(thing, PartScene):
-        return thing.solid.label(cloud.points)
+        return thing.solid.part_labels(cloud.points)
     return thing.on_cue(cloud.points, _NOISE) & cloud.mask

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, check_fields, checked, require
 from jaxnbv.geometry.camera import Camera
@@ -51,6 +51,15 @@ class Surface(eqx.Module):
     def contains(self, points: Float[AnyArray, "n 3"]) -> Bool[AnyArray, " n"]:
         """Which points (scene coordinates) lie inside; none of a surface that encloses nothing."""
         return np.zeros(len(points), bool)
+
+    @property
+    def class_label(self) -> Int[AnyArray, ""] | None:
+        """Index of the object's class; None where it has none."""
+        return None
+
+    def part_labels(self, points: Float[Array, "n 3"]) -> Int[Array, " n"] | None:
+        """Index of the part that each point of the surface belongs to; None for an object without parts."""
+        return None
 
     @property
     def world_frame(self) -> Frame | None:

@@ -6,7 +6,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.checks import AnyArray, check_fields, require
 from jaxnbv.scanning.scanner import Hits, Surface, implicit_depth
@@ -52,6 +52,13 @@ class SDFSurface(Surface):
 
     def contains(self, points: Float[AnyArray, "n 3"]) -> Bool[Array, " n"]:
         return self.sdf(jnp.asarray(points)) < 0
+
+    @property
+    def class_label(self) -> Int[AnyArray, ""] | None:
+        return self.sdf.class_label
+
+    def part_labels(self, points: Float[Array, "n 3"]) -> Int[Array, " n"] | None:
+        return self.sdf.part_labels(points)
 
     @eqx.filter_jit
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:

@@ -123,8 +123,8 @@ class ClassAcquisition(Acquisition):
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> "ClassAnswer | None":
         """The object's own class, where it says one that the classifier knows."""
-        label = getattr(getattr(scene, "sdf", None), "label", None)
-        if not isinstance(label, Array) or label.ndim > 0:
+        label = scene.class_label
+        if label is None:
             return None
         names = self.answer(cloud).names
         return ClassAnswer(names, np.eye(len(names))[int(label)]) if 0 <= int(label) < len(names) else None

@@ -132,10 +132,10 @@ class SoftPartCount(Utility):
         """Of a solid with labels, how many points of its surface belong to each; of others, the answer on all of it.
         One point is enough for a part to be there."""
         answer = dataclasses.replace(self.answer(cloud), target=1.0)
-        label = getattr(getattr(scene, "sdf", None), "label", None)
-        if not callable(label):
+        labels = scene.part_labels(cloud.points)
+        if labels is None:
             return answer
-        counts = np.bincount(np.asarray(label(cloud.points))[np.asarray(cloud.mask)], minlength=len(answer.names))
+        counts = np.bincount(np.asarray(labels)[np.asarray(cloud.mask)], minlength=len(answer.names))
         return dataclasses.replace(answer, values=counts[: len(answer.names)].astype(np.float64))
 
 

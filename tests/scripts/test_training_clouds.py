@@ -125,7 +125,7 @@ def surface_points(solid):
     hits = jax.lax.map(
         lambda pose: nbv.scan(nbv.SDFSurface(solid), camera, pose), nbv.look_at(nbv.geometry.fibonacci_sphere(16, 2.7))
     )
-    return hits.points.reshape(-1, 3), solid.label(hits.points).reshape(-1), hits.mask.reshape(-1)
+    return hits.points.reshape(-1, 3), solid.part_labels(hits.points).reshape(-1), hits.mask.reshape(-1)
 
 
 @pytest.mark.slow

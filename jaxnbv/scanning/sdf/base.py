@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxnbv.checks import AnyArray, InputError, as_floats, check_type, is_traced, require
 from jaxnbv.geometry.pose import Pose
@@ -91,6 +91,15 @@ class SignedDistance(eqx.Module):
     @abstractmethod
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         """The signed distance at the points x."""
+
+    @property
+    def class_label(self) -> Int[AnyArray, ""] | None:
+        """See `Surface.class_label`."""
+        return None
+
+    def part_labels(self, x: Float[AnyArray, "*n 3"]) -> Int[Array, "*n"] | None:
+        """See `Surface.part_labels`."""
+        return None
 
     def __check_init__(self):
         for field in fields(self):

@@ -57,6 +57,6 @@ class LabelledSolid(SignedDistance):
         steepest = 0.5 * (jnp.abs(self.slant) + jnp.sqrt(self.slant**2 + 4.0))
         return jnp.where(self.labels > UNUSED, distance / steepest, jnp.inf)
 
-    def label(self, x: Float[AnyArray, "*n 3"]) -> Int[Array, "*n"]:
+    def part_labels(self, x: Float[AnyArray, "*n 3"]) -> Int[Array, "*n"]:
         """The label of the primitive whose surface is nearest: exact for points of the solid's surface."""
         return self.labels[jnp.argmin(jnp.abs(self.distances(x)), axis=-1)]

@@ -140,7 +140,7 @@ class PartStudy(PartDiscoveryStudy):
         return knowing_those(self.sampler, lambda name: kind_of(name) == scene.name)
 
     def true_parts(self, scene: Scene, points: Float[Array, "n 3"]) -> Int[Array, " n"]:
-        return scene.task.solid.label(points)
+        return scene.task.solid.part_labels(points)
 
     def truth(self, scene: Scene) -> list[int]:
         """The labels of the parts that the object has."""

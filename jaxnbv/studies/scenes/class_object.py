@@ -28,6 +28,10 @@ class ClassObject(SignedDistance):
 
     label: eqx.AbstractVar[Int[Array, ""]]
 
+    @property
+    def class_label(self) -> Int[Array, ""]:
+        return self.label
+
     def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
         """Which points of the surface tell the class: here all.
 

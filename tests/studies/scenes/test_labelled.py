@@ -29,7 +29,7 @@ RNG = np.random.default_rng(0)
 FIELDS = ("centre", "rotation", "half_size", "rounding", "radius", "slant", "revolved", "labels")
 
 
-evaluate = eqx.filter_jit(lambda solid, x: (solid.distances(x), solid(x), solid.label(x)))
+evaluate = eqx.filter_jit(lambda solid, x: (solid.distances(x), solid(x), solid.part_labels(x)))
 slopes_of = eqx.filter_jit(lambda solid, x: jax.vmap(jax.grad(solid))(x))
 
 
@@ -143,7 +143,7 @@ def test_one_program_scans_any_solid(compilations):
     @eqx.filter_jit
     def look(solid):
         hits = scan(SDFSurface(solid), camera, pose)
-        return hits, solid.label(hits.points)
+        return hits, solid.part_labels(hits.points)
 
     solids = [random_solid(count, 0.6) for count in (3, 11, CAPACITY)]
     seen = [look(solids[0])]

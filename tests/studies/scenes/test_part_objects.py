@@ -17,7 +17,7 @@ COMPUTES = True
 
 @eqx.filter_jit
 def labels_at(solid, x):
-    return solid.label(x)
+    return solid.part_labels(x)
 
 
 def part_object(category, turn):
