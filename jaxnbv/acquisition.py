@@ -38,10 +38,12 @@ class ImaginedView(eqx.Module):
 class Acquisition(eqx.Module):
     """What one imagined scan is worth, given what has been seen. A search maximises the mean over the posterior.
 
-    `needs_posterior`: whether `context` looks at the posterior, which a planner then puts into the step.
+    - `needs_posterior`: whether `context` looks at the posterior, which a planner then puts into the step.
+    - `measurable_only`: whether surface that a view looked at in vain is left out of the samples, see `Looks`.
     """
 
     needs_posterior: ClassVar[bool] = False
+    measurable_only: ClassVar[bool] = False
 
     @abstractmethod
     def context(self, step: StepInputs) -> Any:

@@ -12,7 +12,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, check_single, concatenate, limit_capacity
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.pose_list import PoseList
-from jaxnbv.scanning import Carving, Grid, Obstacles
+from jaxnbv.scanning import Carving, Grid, Looks, Obstacles, barrier_of
 
 # A model takes a hundred or two of the empty points, and the time to choose them grows with how many there are.
 _POINTS_ALONG_AXIS = 20
@@ -30,7 +30,8 @@ class Observations(eqx.Module):
 
     - `cloud`: D, the points that are kept.
     - `poses`: the poses that views were taken from.
-    - `grid`: of the two below; None where neither is kept.
+    - `grid`: of what follows; None where none of it is kept.
+    - `looks`: what has been measured, and how far each view saw.
     - `empty_nodes`: the nodes that a scan has shown to be empty.
     - `obstacle_nodes`: the nodes within known obstacles, where the object cannot be.
     """
@@ -38,6 +39,7 @@ class Observations(eqx.Module):
     cloud: PointCloud
     poses: PoseList
     grid: Grid | None = None
+    looks: Looks | None = None
     empty_nodes: Bool[Array, "g g g"] | None = None
     obstacle_nodes: Bool[Array, "g g g"] | None = None
 
@@ -48,10 +50,15 @@ class Observations(eqx.Module):
         max_views: int = 0,
         grid: Grid | None = None,
         obstacle_nodes: Bool[Array, "g g g"] | None = None,
+        camera: Camera = Camera(),
     ) -> "Observations":
-        """A cloud before any pose is added, with room for `max_views` poses. No node of the grid is empty yet."""
+        """A cloud before any pose is added, with room for `max_views` poses. No node of the grid is empty yet.
+
+        - `camera`: by whose rays looks are kept.
+        """
         empty = None if grid is None else jnp.zeros((grid.resolution,) * 3, bool)
-        return cls(cloud, PoseList.empty(max_views), grid, empty, obstacle_nodes)
+        looks = None if grid is None else _measured(Looks.none(grid, camera, max_views), cloud)
+        return cls(cloud, PoseList.empty(max_views), grid, looks, empty, obstacle_nodes)
 
     @property
     def num_views(self) -> Int[Array, ""]:
@@ -75,13 +82,15 @@ class Observations(eqx.Module):
     def add_view(
         self, pose: Pose, scan: PointCloud, camera: Camera, carving: Carving | None, obstacles: Obstacles | None
     ) -> "Observations":
-        """The observations with a pose, and the nodes that the scan from there shows to be empty.
+        """The observations with a pose, what the scan from there has measured, and the nodes that it shows to be empty.
 
         - `carving`: how far from its rays a scan shows a node to be empty; None keeps `empty_nodes` as they are.
         - `obstacles`: what stands before the object; beyond it a ray shows nothing.
         """
-        poses, empty = _with_view(self.poses, self.empty_nodes, self.grid, pose, scan, camera, carving, obstacles)
-        return dataclasses.replace(self, poses=poses, empty_nodes=empty)
+        # Without D, whose capacity need not compile this again.
+        seen = self.poses, self.looks, self.empty_nodes
+        poses, looks, empty = _with_view(*seen, pose, scan, camera, carving, obstacles)
+        return dataclasses.replace(self, poses=poses, looks=looks, empty_nodes=empty)
 
 
 def as_observations(value: Observations | PointCloud) -> Observations:
@@ -102,17 +111,24 @@ def _joined(cloud: PointCloud, scan: PointCloud) -> PointCloud:
 
 
 @eqx.filter_jit
+def _measured(looks: Looks, cloud: PointCloud) -> Looks:
+    return looks.with_points(cloud)
+
+
+@eqx.filter_jit
 def _with_view(
     poses: PoseList,
+    looks: Looks | None,
     empty: Bool[Array, "g g g"] | None,
-    grid: Grid | None,
     pose: Pose,
     scan: PointCloud,
     camera: Camera,
     carving: Carving | None,
     obstacles: Obstacles | None,
-) -> tuple[PoseList, Bool[Array, "g g g"] | None]:
-    if carving is not None and empty is not None and grid is not None:
-        barrier = None if obstacles is None else obstacles.barrier(camera, pose)
-        empty = empty | carving.empty_nodes(grid, pose, scan, camera, barrier)
-    return poses.append(pose), empty
+) -> tuple[PoseList, Looks | None, Bool[Array, "g g g"] | None]:
+    if looks is not None and empty is not None:
+        barrier = barrier_of(obstacles, camera, pose)
+        if carving is not None:
+            empty = empty | carving.empty_nodes(looks.grid, pose, scan, camera, barrier)
+        looks = looks.with_view(poses.count, pose, scan, camera, barrier)
+    return poses.append(pose), looks, empty

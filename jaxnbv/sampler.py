@@ -14,6 +14,7 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.volume import Box, Volume, bounding_box
 from jaxnbv.observations import Observations, as_observations
 from jaxnbv.scanning import Carving, Grid, GridSurface, TriangleMesh, carve
+from jaxnbv.scanning.grid import touched_cells
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.surfaces import (
     GeometricSPSR,
@@ -28,6 +29,9 @@ from jaxnbv.surfaces import (
     SurfacePosterior,
 )
 from jaxnbv.surfaces.known_shapes import short_ranged
+
+# How far beyond the faces of a box that may cut the object this may go on, in scene units: 8 % of the longest side.
+_ROOM = 0.2
 
 MODELS = ("screened", "paper")
 """The names of `SurfaceSampler.preset`."""
@@ -91,7 +95,7 @@ class SurfaceSampler(eqx.Module):
           space, nor outside the volume.
         - `paper`: the published model at its published values, which conditions on normals alone; not carved.
         - `quick`: with fewer frequencies.
-        - `volume`: by default the cube of the longest side about the origin.
+        - `volume`: by default the cube of the longest side about the origin. One that is given may cut the object.
         - `solid`: for a body that is nowhere thin, such as the pyramid: its hidden side is as large as the one that was
           seen, so that nothing follows for the space beside what was seen empty (`SeenEmpty`).
 
@@ -101,13 +105,13 @@ class SurfaceSampler(eqx.Module):
         require(name in MODELS, f"there is no model {name!r}: choose from {', '.join(MODELS)}")
         if name == "paper":
             return cls(GeometricSPSR(0.015, truncation=20) if quick else GeometricSPSR(), carving=None)
-        volume = Box.cube(longest_side) if volume is None else volume
         scale, usual = longest_side / 2.5, ScreenedSPSR()
+        room, volume = (0.0, Box.cube(longest_side)) if volume is None else (scale * _ROOM, volume)
         lengthscales = scale * (usual.base.lengthscale + (jnp.array([0.005, 0.0]) if quick else 0.0))
         # Shorter scales need more frequencies, but time and memory grow with their cube.
         truncation = min(round((20 if quick else usual.base.truncation) / scale), 30 if quick else 48)
         base = GeometricSPSR(lengthscales, usual.base.variance, truncation)
-        values = (OutsideBoundary(volume), OnSurface(), *(() if solid else (SeenEmpty(),)))
+        values = (OutsideBoundary(volume, room=room), OnSurface(), *(() if solid else (SeenEmpty(),)))
         return cls(ScreenedSPSR(base, values, offset=scale * usual.offset), carving=Carving(volume))
 
     def with_bank(self, bank: ShapeBank, poses: ShapePoses) -> "SurfaceSampler":
@@ -129,12 +133,14 @@ class SurfaceSampler(eqx.Module):
         return dataclasses.replace(self, model=self.model.unknown) if isinstance(self.model, KnownShapes) else self
 
     def within(self, volume: Box) -> "SurfaceSampler":
-        """A copy for an object in another box, which takes the place of the default one, `Box()`."""
+        """A copy for an object in another box, which takes the place of the default one, `Box()`, and may cut it."""
 
         def placed(leaf):
+            if isinstance(leaf, OutsideBoundary):
+                return dataclasses.replace(leaf, volume=volume, room=_ROOM) if placed(leaf.volume) is volume else leaf
             return volume if isinstance(leaf, Box) and leaf == Box() else leaf
 
-        return jax.tree.map(placed, self, is_leaf=lambda leaf: isinstance(leaf, Box))
+        return jax.tree.map(placed, self, is_leaf=lambda leaf: isinstance(leaf, Box | OutsideBoundary))
 
     def posterior(self, observations: Observations | PointCloud) -> SurfacePosterior:
         """p(f | observations), of which `sample` draws before it carves. Empty nodes count within the volume alone.
@@ -248,7 +254,7 @@ class SurfaceSampler(eqx.Module):
         if observations.obstacle_nodes is not None:
             grid = self.grid
         elif grid is None:
-            observations = dataclasses.replace(observations, grid=None)
+            observations = dataclasses.replace(observations, grid=None, looks=None)
         require(
             bool(observations.grid == grid),
             f"the observations keep empty space on {observations.grid}, but surfaces are carved on {self.grid}: make "
@@ -263,4 +269,8 @@ def _sample(
 ) -> GridSurface:
     fields = posterior.sample(key, sampler.num_samples)
     values = fields.on_grid(sampler.grid.axis) - posterior.level
-    return GridSurface.from_values(sampler.carve(observations, values), 0.0, sampler.grid)
+    surfaces = GridSurface.from_values(sampler.carve(observations, values), 0.0, sampler.grid)
+    if sampler.carving is None:
+        return surfaces
+    # A volume cuts through the inside of what goes on beyond it.
+    return surfaces.void(touched_cells((values <= 0) & sampler.carving.outside(sampler.grid)))

@@ -140,6 +140,31 @@ def test_nothing_is_imagined_where_the_object_cannot_be(obstacles, carving):
     np.testing.assert_allclose(values[:, ~nowhere], (AWAY - RADII[:, None, None, None])[:, ~nowhere], atol=1e-5)
 
 
+def test_what_a_volume_cuts_is_no_surface():
+    """Balls within a slab that cuts them above: from above a ray meets the cut, and has met nothing; from the side it
+    meets the ball."""
+    slab = nbv.Carving(nbv.Box((-1.25, -1.25, -1.25), (1.25, 0.1, 1.25)))
+    surfaces = balls(slab).sample(SCANS[0], KEY)
+    poses = nbv.look_at(jnp.array([[0.0, 2.5, 0.1], [0.0, 0.0, 2.5]]))
+    above, beside = nbv.scanning.scan_samples(surfaces, CAMERA, poses).mask.sum(-1).T
+    largest = np.argmax(RADII)
+    assert int(above[largest]) < 0.1 * int(beside[largest])
+    whole = balls().sample(SCANS[0], KEY)
+    # The smallest ball reaches two spacings beyond the slab at most, so nothing of it is cut.
+    small = [nbv.scanning.scan_samples(one, CAMERA, POSES[1:]).mask[0].sum() for one in (surfaces, whole)]
+    assert int(small[0]) == int(small[1]) > 0
+
+
+@pytest.mark.parametrize("room", [0.0, 0.2])
+def test_a_box_that_is_given_does_not_close_the_object_at_its_faces(room):
+    box = nbv.Box((-1.0, -0.5, -0.8), (1.0, 0.9, 0.7))
+    rows = nbv.surfaces.OutsideBoundary(box, 200, room=room).rows(nbv.Observations.start(SCANS[0]))
+    np.testing.assert_allclose(box(rows.points), room, atol=1e-4)
+    given = preset(volume=box).model.values[0], nbv.SurfaceSampler().within(box).model.values[0]
+    assert all(one.room == 0.2 and one.volume == box for one in given)
+    assert preset().model.values[0].room == 0.0
+
+
 def test_a_posterior_at_hand_is_not_asked_for_again():
     sampler, observations = nbv.SurfaceSampler(nbv.GeometricSPSR(0.1, truncation=6), GRID, 3), SCANS[0]
     posterior = sampler.posterior(observations)
@@ -175,8 +200,10 @@ def test_another_box_takes_the_place_of_the_default_one_alone():
     after = before.within(box)
     assert [source.volume for source in after.model.values] == [box, own, box]
     assert after.carving == nbv.Carving(box, 1.5)
+    assert [source.room for source in after.model.values] == [0.2, 0.0, 0.2]
     # The rest is as it was.
-    back = [dataclasses.replace(one, volume=nbv.Box()) for one in (after.model.values[0], after.model.values[2])]
+    default = {"volume": nbv.Box(), "room": 0.0}
+    back = [dataclasses.replace(one, **default) for one in (after.model.values[0], after.model.values[2])]
     values = (back[0], after.model.values[1], back[1])
     model = dataclasses.replace(after.model, values=values)
     assert eqx.tree_equal(dataclasses.replace(after, model=model, carving=before.carving), before)

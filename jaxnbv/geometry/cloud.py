@@ -40,16 +40,20 @@ class PointCloud(eqx.Module):
     - `points`: positions, in scene units unless said otherwise.
     - `normals`: unit outward normals.
     - `missed`: of a sensor's scan, whose rows are its pixels: where the ray met nothing, so that all of it is empty. A
-      row that is neither filled nor missed is invalid and says nothing. None for a cloud that is no sensor's image.
+      row that is neither filled nor missed is invalid. None for a cloud that is no sensor's image.
+    - `sight`: how far each ray of a scan saw, in units of the points: to what it met, though that be no point of the
+      cloud, and without end where nothing came back. None where this is not known.
     """
 
     points: Float[Array, "*batch n 3"]
     normals: Float[Array, "*batch n 3"]
     mask: Bool[Array, "*batch n"]
     missed: Bool[Array, "*batch n"] | None = None
+    sight: Float[Array, "*batch n"] | None = None
 
     def __check_init__(self):
-        shapes = [jnp.shape(leaf) for leaf in (self.points, self.normals, self.mask, self.missed) if leaf is not None]
+        leaves = self.points, self.normals, self.mask, self.missed, self.sight
+        shapes = [jnp.shape(leaf) for leaf in leaves if leaf is not None]
         rows = shapes[0][:-1]
         require(
             len(rows) > 0 and shapes[0] == shapes[1] == (*rows, 3) and all(shape == rows for shape in shapes[2:]),

@@ -14,7 +14,7 @@ from jaxnbv.geometry.plane_fit import fitted_planes
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box, ray_interval
 
-Rows = tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"]]
+Rows = tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"], Float[Array, " n"]]
 # Depths that are so many times what they should be are in other units, not of another object.
 _OTHER_UNITS = 20.0
 
@@ -26,7 +26,7 @@ class NothingInside(UserWarning):
 def points_of_depth(
     depth: Real[AnyArray, "height width"], camera: Camera, pose: Pose, scale: float, stride: int, box: Box | None
 ) -> Rows:
-    """Points, normals, which rows are filled and which rays met nothing: `PointCloud.from_depth`."""
+    """Points, normals, which rows are filled, which rays met nothing, and how far each saw: `PointCloud.from_depth`."""
     shape = (camera.height, camera.width)
     # Before large numbers are rounded to infinity.
     numbers = depth if is_traced(depth) else as_numbers(depth, "the depth image", None)
@@ -45,12 +45,15 @@ def points_of_depth(
     if not is_traced(depth, pose):
         known = np.asarray(depth)
         _check_meaning(known[np.isfinite(known) & (known > 0)], camera, pose, box)
+    some = depth[stride // 2 :: stride, stride // 2 :: stride].reshape(-1)
+    lengths = jnp.linalg.norm(camera.strided(stride).pixel_directions(), axis=-1)
+    sight = jnp.where(some > 0, some * lengths, jnp.inf)
     points, normals, mask, missed, inside = _oriented(depth, jnp.asarray(missed), camera, pose, stride, rounding, box)
     if box is not None and not is_traced(points):
         _warn_of_nothing_inside(np.asarray(points)[np.asarray(mask)], np.asarray(inside)[np.asarray(mask)], box)
     mask = mask & inside
     points, normals = (jnp.where(mask[:, None], vectors, 0.0) for vectors in (points, normals))
-    return points, normals, mask, missed
+    return points, normals, mask, missed, sight
 
 
 @eqx.filter_jit

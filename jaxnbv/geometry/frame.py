@@ -116,8 +116,9 @@ class Frame(eqx.Module):
 def _apply(thing, place, turn, scale: float):
     """A thing whose points are placed, whose directions are turned, and whose lengths are scaled."""
     if isinstance(thing, PointCloud):
-        points = jnp.where(thing.mask[..., None], place(thing.points), 0.0)
-        return PointCloud(points.astype(thing.points.dtype), turn(thing.normals), thing.mask, thing.missed)
+        points = jnp.where(thing.mask[..., None], place(thing.points), 0.0).astype(thing.points.dtype)
+        sight = None if thing.sight is None else scale * thing.sight
+        return dataclasses.replace(thing, points=points, normals=turn(thing.normals), sight=sight)
     if isinstance(thing, Pose):
         rotation = jnp.swapaxes(turn(jnp.swapaxes(thing.rotation, -1, -2)), -1, -2)
         return Pose(rotation, place(thing.position).astype(thing.position.dtype))

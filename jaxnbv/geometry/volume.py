@@ -44,6 +44,11 @@ class Box(eqx.Module):
             f"a box from {self.low} to {self.high} has no inside: each of three sides must be positive and finite",
         )
 
+    def widened(self, by: float) -> "Box":
+        """The box with its faces moved outward, but for the lower one (y is up): what the object stands on is below."""
+        (x, y, z), high = self.low, tuple(high + by for high in self.high)
+        return Box((x - by, y, z - by), high)
+
     @classmethod
     def cube(cls, side: float) -> "Box":
         """The cube of this side about the origin."""
@@ -79,17 +84,19 @@ def ray_interval(
 
 
 @eqx.filter_jit
-def boundary_points(volume: Volume, count: int) -> Float[Array, "count 3"]:
+def boundary_points(volume: Volume, count: int, beyond: float = 0.0) -> Float[Array, "count 3"]:
     """Where `count` evenly spread rays from the origin cross the volume's boundary: found by bisection between the
     origin and a sphere beyond the scene. A ray of a volume that is not star-shaped about the origin has several
     crossings, of which this is any one.
+
+    - `beyond`: how far outside the boundary the points lie instead, in scene units.
     """
     directions = fibonacci_sphere(count)
 
     def halve(_, interval):
         near, far = interval
         middle = 0.5 * (near + far)
-        inside = volume(middle[:, None] * directions) < 0
+        inside = volume(middle[:, None] * directions) < beyond
         return jnp.where(inside, middle, near), jnp.where(inside, far, middle)
 
     ends = jnp.zeros(count, directions.dtype), jnp.full(count, _FAR, directions.dtype)

@@ -249,7 +249,7 @@ class Loop:
         if self._next.inputs is None:
             self._begin(STAGES[0])
             sample_key, *_ = view_keys(self.key, len(self.views))
-            self._next.inputs = jax.block_until_ready(self.planner.sampler.step_inputs(self.observations, sample_key))
+            self._next.inputs = jax.block_until_ready(self.planner.sampled(self.observations, sample_key))
         return self._next.inputs
 
 

@@ -1,5 +1,6 @@
 """The planner: ask for the next view, tell what it showed. A simulated episode and a real scanner call the same two."""
 
+import dataclasses
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -92,7 +93,9 @@ class Planner(eqx.Module):
         grid = self.sampler.grid
         within = None if self.obstacles is None else self.obstacles.within(grid)
         kept = None if within is None and self.sampler.carving is None else grid
-        observations = Observations.start(limit_capacity(scan, self.capacity), self.max_views, kept, within)
+        observations = Observations.start(
+            limit_capacity(scan, self.capacity), self.max_views, kept, within, self.camera
+        )
         if self.search.uses_samples and not is_traced(observations):
             self.acquisition.check(observations.cloud)
             self.sampler.model.check(observations.cloud)
@@ -149,7 +152,15 @@ class Planner(eqx.Module):
         """The first half of `propose`: the posterior and its samples; the observations alone for a search that asks for
         no samples."""
         check_type(observations, Observations, "observations")
-        return self.sampler.step_inputs(observations, key) if self.search.uses_samples else StepInputs(observations)
+        return self.sampled(observations, key) if self.search.uses_samples else StepInputs(observations)
+
+    def sampled(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
+        """The posterior and its samples, less what the sensor cannot measure if the acquisition asks for that alone."""
+        inputs = self.sampler.step_inputs(observations, key)
+        looks, surfaces = inputs.observations.looks, inputs.surfaces
+        if looks is None or surfaces is None or not self.acquisition.measurable_only:
+            return inputs
+        return dataclasses.replace(inputs, surfaces=looks.measurable(surfaces, inputs.observations.poses))
 
     def choose(self, inputs: StepInputs, key: PRNGKeyArray, pending: PoseList | None = None) -> Proposal:
         """The second half of `propose`: the search, given the step's samples (any that a model of your own drew).
@@ -159,8 +170,8 @@ class Planner(eqx.Module):
         check_key(key)
         check_type(inputs, StepInputs, "the inputs of a step")
         with functions_of_users():
-            problem = Problem(inputs, self.camera, self.acquisition, self.obstacles, self.cost, pending).prepared()
-            proposal = _propose(self.search, problem, key)
+            problem = Problem(inputs, self.camera, self.acquisition, self.obstacles, self.cost, pending)
+            proposal = _propose(self.search, problem.prepared(), key)
         return _checked_proposal(proposal, inputs.surfaces)
 
     @eqx.filter_jit

@@ -10,6 +10,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray, Real
 from tqdm import tqdm
@@ -160,11 +161,14 @@ class Session:
 
     @property
     def cloud(self) -> PointCloud:
-        """The points that are kept, in world units.
+        """The points in the box that are kept, in world units.
 
         **Raises:** `ValueError` before the first image.
         """
-        return self.frame.to_world(self.observations.cloud)
+        cloud = self.frame.to_world(self.observations.cloud)
+        mask = cloud.mask & (self.box(cloud.points) <= 0)
+        points, normals = (jnp.where(mask[:, None], rows, 0.0) for rows in (cloud.points, cloud.normals))
+        return PointCloud(points, normals, mask)
 
     @property
     def episode(self) -> Episode:
@@ -265,12 +269,14 @@ class Session:
         """An image as a view, stored in the folder once the loop accepts it. The first may show what the object stands
         on, by which the planner is another."""
         index, pose, loop = len(self.views), Pose.from_matrix(matrix, self.convention), self._loop
-        image = depth, self.camera, pose, scale, self.stride
+        image, kept = (depth, self.camera, pose, scale, self.stride), self.box
+        if (carving := loop.planner.sampler.carving) is not None:
+            kept = carving.with_room(kept, loop.planner.sampler.grid, self.frame)
         with warnings.catch_warnings():
             if index == 0:
                 warnings.simplefilter("error", NothingInside)
             try:
-                cloud = PointCloud.from_depth(*image, self.box)
+                cloud = PointCloud.from_depth(*image, kept)
             except NothingInside as problem:
                 raise InputError(f"the first image shows nothing of the box: {problem}") from problem
         if index == 0 and loop.planner.obstacles is None:

@@ -7,6 +7,7 @@ from jaxnbv.scanning.grid import Grid as Grid
 from jaxnbv.scanning.grid import GridSurface as GridSurface
 from jaxnbv.scanning.grid import mean_depth as mean_depth
 from jaxnbv.scanning.grid import scan_samples as scan_samples
+from jaxnbv.scanning.looks import Looks as Looks
 from jaxnbv.scanning.mesh import TriangleMesh as TriangleMesh
 from jaxnbv.scanning.mesh import mesh_from_sdf as mesh_from_sdf
 from jaxnbv.scanning.mesh_files import MeshParts as MeshParts

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnbv.checks import check_fields, functions_of_users, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
 from jaxnbv.geometry.volume import Box, Volume
@@ -81,6 +82,11 @@ class Carving(eqx.Module):
         """The nodes outside the volume, by two margins."""
         axis = jnp.asarray(grid.axis, jnp.result_type(float))
         return on_tensor_grid(self.volume, axis) > self._beyond_volume(grid)
+
+    def with_room(self, box: Box, grid: Grid, frame: Frame) -> Box:
+        """A box of the world with room for points that are still taken for the object's: a scan that is cropped to it
+        shows that the surface goes on where the box cuts it."""
+        return frame.to_world(frame.to_scene(box).widened(self._beyond_volume(grid) / math.sqrt(3.0)))
 
     def _beyond_volume(self, grid: Grid) -> float:
         return 2.0 * self.margin_voxels * grid.spacing

@@ -1,5 +1,6 @@
 """GridSurface: the level set of a function sampled on the regular grid that posterior samples are traced on."""
 
+import dataclasses
 import warnings
 from typing import ClassVar
 
@@ -66,6 +67,8 @@ class GridSurface(Surface):
 
     - `values`: f minus its level at the nodes; positive outside.
     - `distance`: how far each cell is from one with a change of sign (`tracing.free_distance`).
+    - `is_void`: the cells whose change of sign is no surface that a sensor sees: a ray that meets one has met nothing.
+      None where there are none.
 
     Nothing is hit outside the grid's box, which a ray enters where it meets it.
     """
@@ -75,6 +78,7 @@ class GridSurface(Surface):
     values: Float[Array, "*s g g g"]
     distance: Int8[Array, "*s m m m"]
     grid: Grid
+    is_void: Bool[Array, "*s m m m"] | None = None
 
     @classmethod
     def from_values(
@@ -94,6 +98,10 @@ class GridSurface(Surface):
         if not is_traced(finite):
             require(bool(finite), "the values on the grid, or the level, are not finite")
         return cls(relative, distances, grid)
+
+    def void(self, cells: Bool[Array, "*s m m m"]) -> "GridSurface":
+        """The surface less what lies in some of its cells."""
+        return dataclasses.replace(self, is_void=cells if self.is_void is None else self.is_void | cells)
 
     @eqx.filter_jit
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
@@ -117,6 +125,9 @@ class GridSurface(Surface):
         field = tracing.Field(self.values.reshape(-1), self.distance.reshape(-1), self.grid.resolution)
         o, d = list(jnp.asarray(origins).T), list(jnp.asarray(directions).T)
         t, mask = tracing.first_zero(field, [(x + half) / h for x in o], [x / h for x in d])
+        if self.is_void is not None:
+            places = [jnp.floor((x + t * dx + half) / h).astype(jnp.int32) for x, dx in zip(o, d, strict=True)]
+            mask = mask & ~self.is_void[tuple(jnp.clip(cell, 0, self.grid.resolution - 2) for cell in places)]
         hits = [jnp.where(mask, x + t * dx, 0.0) for x, dx in zip(o, d, strict=True)]
 
         normals = tracing.smooth_gradient(field, [(x + half) / h for x in hits])
@@ -164,3 +175,9 @@ def _prepared(
     values = values - level
     distances = shared_map(tracing.free_distance, values.reshape(-1, *values.shape[-3:]))
     return values, jnp.isfinite(values).all(), distances.reshape(*values.shape[:-3], *distances.shape[1:])
+
+
+def touched_cells(nodes: Bool[Array, "*s g g g"]) -> Bool[Array, "*s m m m"]:
+    """The cells of a grid that have one of some nodes as a corner."""
+    windows = (1,) * (nodes.ndim - 3) + (2,) * 3, (1,) * nodes.ndim
+    return jax.lax.reduce_window(nodes, False, jax.lax.bitwise_or, *windows, "VALID")

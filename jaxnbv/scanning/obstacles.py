@@ -76,7 +76,7 @@ class Obstacles(eqx.Module):
         own = scan.mask & (self.distance(scan.points) < self.margin)
         points, normals = (jnp.where(own[..., None], 0.0, rows) for rows in (scan.points, scan.normals))
         missed = None if scan.missed is None else scan.missed | own
-        return PointCloud(points, normals, scan.mask & ~own, missed)
+        return PointCloud(points, normals, scan.mask & ~own, missed, scan.sight)
 
     def within(self, grid: Grid) -> Bool[Array, "g g g"]:
         """The nodes of a grid that lie within an obstacle."""

@@ -96,7 +96,8 @@ class SensorNoise(eqx.Module):
         normals = cloud.normals + self.normals * jax.random.normal(normal_key, cloud.normals.shape, cloud.points.dtype)
         normals = normals / jnp.linalg.norm(normals, axis=-1, keepdims=True)
         mask = cloud.mask[..., None]
-        return PointCloud(jnp.where(mask, points, 0.0), jnp.where(mask, normals, 0.0), cloud.mask, cloud.missed)
+        points, normals = jnp.where(mask, points, 0.0), jnp.where(mask, normals, 0.0)
+        return PointCloud(points, normals, cloud.mask, cloud.missed, cloud.sight)
 
 
 class DepthNoise(eqx.Module):
@@ -203,13 +204,19 @@ def _returns(
         mask = mask & (jnp.linalg.norm(points - origins, axis=-1) < barrier)
         points, normals = (jnp.where(mask[..., None], rows, 0.0) for rows in (points, normals))
     if not camera.limited:
-        return PointCloud(points, normals, mask, ~mask)
+        return PointCloud(points, normals, mask, ~mask, _sight(points, origins, mask))
     depth = jnp.einsum("...rd,...d->...r", points - origins, pose.forward, precision="highest")
     beyond = jnp.zeros_like(mask) if camera.farthest is None else depth > camera.farthest
     cosine = -jnp.sum(normals * directions, axis=-1)
     returns = mask & ~beyond & (depth >= camera.nearest) & (cosine >= math.cos(camera.max_incidence))
     points, normals = (jnp.where(returns[..., None], rows, 0.0) for rows in (points, normals))
-    return PointCloud(points, normals, returns, ~mask | beyond)
+    return PointCloud(points, normals, returns, ~mask | beyond, _sight(points, origins, returns))
+
+
+def _sight(
+    points: Float[Array, "*batch rays 3"], origins: Float[Array, "*batch rays 3"], returns: Bool[Array, "*batch rays"]
+) -> Float[Array, "*batch rays"]:
+    return jnp.where(returns, jnp.linalg.norm(points - origins, axis=-1), jnp.inf)
 
 
 @eqx.filter_custom_jvp

@@ -184,7 +184,9 @@ class RecordedStudy(Study):
     @property
     def recording(self) -> Recording:
         """The sequence, read once a process."""
-        return _recording(self.folder, self.up, self.box, self.voxel)
+        carving, frame = self.sampler.carving, _frame(self.box)
+        kept = self.box if carving is None else carving.with_room(self.box, self.grid, frame)
+        return _recording(self.folder, self.up, self.box, self.voxel, kept)
 
     @property
     def candidates(self) -> GivenPoses:
@@ -284,7 +286,8 @@ def _frame(box: Box) -> Frame:
 
 
 @functools.cache
-def _recording(folder: str, up: tuple[float, float, float] | None, box: Box, voxel: float) -> Recording:
+def _recording(folder: str, up: tuple[float, float, float] | None, box: Box, voxel: float, kept: Box) -> Recording:
+    """`kept`: the box to which scans are cropped."""
     frames, frame = RecordedFrames(folder, up), _frame(box)
     poses, stride = Pose.from_matrix(frames.matrices), stride_of(frames.camera)
     count = frames.camera.strided(stride).num_rays
@@ -292,12 +295,14 @@ def _recording(folder: str, up: tuple[float, float, float] | None, box: Box, vox
     scans, seen = [], []
     for index in progress_bar(range(len(frames)), desc="reading frames"):
         # One that shows nothing of the box says nothing of it.
-        scan = PointCloud(nowhere, nowhere, none, none)
+        scan = PointCloud(nowhere, nowhere, none, none, jnp.zeros(count))
         if np.any(np.asarray(box(_points(frames, index, stride))) < 0):
             depth = frames.depth(index)
-            scan = PointCloud.from_depth(depth, frames.camera, poses[index], frames.depth_scale, stride, box)
+            image = depth, frames.camera, poses[index], frames.depth_scale, stride
+            scan = PointCloud.from_depth(*image, kept)
         scans.append(frame.to_scene(scan))
-        seen.append(np.unique(np.floor(scan.to_numpy()[0] / voxel).astype(int), axis=0))
+        points = scan.to_numpy()[0]
+        seen.append(np.unique(np.floor(points[np.asarray(box(points)) <= 0] / voxel).astype(int), axis=0))
     found, which, counts = np.unique(np.concatenate(seen), axis=0, return_inverse=True, return_counts=True)
     shown = np.zeros((len(frames), len(counts)), bool)
     shown[np.repeat(np.arange(len(frames)), [len(rows) for rows in seen]), which] = True

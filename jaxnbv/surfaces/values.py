@@ -85,18 +85,22 @@ class OutsideBoundary(ValueSource):
     - `volume`: see `jaxnbv.geometry.volume`; by default the box that scenes are scaled to.
     - `num_points`: points, spread evenly as seen from the origin.
     - `value`, `noise`: mean and standard deviation, in units of h.
+    - `room`: how far outside the boundary the points lie, in scene units, as far as the scene goes: for a volume that
+      may cut the object, which then does not close at the cut.
 
-    **Raises:** `ValueError` for a count below one, noise that is not positive, or a boundary that leaves the scene,
-    [-pi/2, pi/2]^3, or does not enclose the origin.
+    **Raises:** `ValueError` for a count below one, noise that is not positive, negative room, or a boundary that leaves
+    the scene, [-pi/2, pi/2]^3, or does not enclose the origin.
     """
 
     volume: Volume = Box()
     num_points: int = eqx.field(static=True, default=150)
     value: float = eqx.field(static=True, default=1.0)
     noise: float = eqx.field(static=True, default=0.5)
+    room: float = eqx.field(static=True, default=0.0)
 
     def __check_init__(self):
         check_fields(self)
+        require(0 <= self.room < math.inf, f"the room is {self.room}; it must be finite and not negative")
         _check(self.num_points, self.noise)
         if is_traced(self.volume):
             return
@@ -117,7 +121,9 @@ class OutsideBoundary(ValueSource):
         )
 
     def rows(self, observations: Observations) -> ValueRows:
-        points = boundary_points(self.volume, self.num_points).astype(observations.cloud.points.dtype)
+        points = boundary_points(self.volume, self.num_points, self.room).astype(observations.cloud.points.dtype)
+        # The scene's own border, as a number of this type rounds it.
+        points = jnp.clip(points, -HALF_WIDTH, HALF_WIDTH)
         return _rows(points, self.value, self.noise, jnp.ones(self.num_points, bool))
 
 

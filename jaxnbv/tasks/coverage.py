@@ -1,6 +1,6 @@
 """Coverage: how much of the surface has been seen, and how much more a view would show."""
 
-import dataclasses
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,9 +11,16 @@ from jaxnbv.checks import check_fields, require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.neighbours import DistanceField, nearest_squared_distance, spacing
 from jaxnbv.sampler import StepInputs
+from jaxnbv.scanning import Looks
 from jaxnbv.scanning.metrics import GRAZING
 from jaxnbv.sharding import on_cpu
 from jaxnbv.utility import Quantity
+
+# The cosine of incidence below which a pixel counts for less than the area that it covers: sensors measure little that
+# is steeper, and imagined slopes are uncertain.
+_STEEP = 0.5
+# Scene units: s without looks.
+_SIZE = 0.05
 
 
 def _many() -> int:
@@ -43,43 +50,59 @@ class Coverage(Acquisition):
         return _many()
 
 
+class Unseen(eqx.Module):
+    """Where surface would be new, given what has been observed.
+
+    - `seen`: distances to all that was measured, or to D where looks are not kept; `size`: see `NewSurface`.
+    """
+
+    seen: Looks | DistanceField
+    size: Float[Array, ""]
+
+    def __call__(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """How new surface at some points is, from 0 to 1."""
+        distance = self.seen(points) if isinstance(self.seen, DistanceField) else self.seen.distance_at(points)
+        return jnp.clip(distance / self.size - 1.0, 0.0, 1.0)
+
+
 class NewSurface(Acquisition):
-    """Expected new area: how much surface an imagined scan shows that is not near D, in squared scene units.
+    """Expected new area: how much surface an imagined scan shows that was not measured yet, in squared scene units.
 
-        alpha(D, scan) = sum_x a(x) clip(d(x, D) / s - 1, 0, 1),   s = max(size, spacing of D),
+        alpha(D, scan) = sum_x a(x) clip(d(x) / s - 1, 0, 1)
 
-    over the hits x of the scan, where d is the distance to the nearest point of D, the spacing the median of how far
-    its points are from their nearest neighbours, and a(x) = r^2 omega / cos the area of the pixel on the surface: omega
-    its solid angle, r the distance, cos that of the angle of incidence, at least 0.2. The rays of one scan do not
-    overlap, so no part of the surface counts twice; and neither near surfaces, which fill more pixels, nor a single
-    point far from all others outweighs the rest, as in the paper's `Coverage`. It is differentiable in the pose
-    wherever `Coverage` is.
+    over the hits x of the scan, where d is the distance to the nearest hit of any view so far (`Looks`), and
+    a(x) = r^2 omega / cos the area of the pixel on the surface: omega its solid angle, r the distance, cos that of the
+    angle of incidence, at least 0.5. The rays of one scan do not overlap, so no part of the surface counts twice; and
+    neither near surfaces, which fill more pixels, nor a single point far from all others outweighs the rest, as in the
+    paper's `Coverage`. It is differentiable in the pose wherever `Coverage` is.
 
-    - `size`: what lies within this distance of D has been seen; what is twice as far is new. In scene units.
+    - `size`: s, what lies within this distance of a hit has been seen; what is twice as far is new. In scene units, in
+      a session too; by default, and at least, the spacing of the grid on which looks are kept.
+
+    Observations that keep no looks, such as a cloud alone, have D in place of all hits; then s is 0.05 by default, and
+    at least the median of how far points of D are from their nearest neighbours.
 
     **Raises:** `ValueError` if the size is not positive.
     """
 
-    size: float = eqx.field(static=True, default=0.05)
+    size: float | None = eqx.field(static=True, default=None)
+    measurable_only: ClassVar[bool] = True
 
     def __check_init__(self):
         check_fields(self)
-        require(self.size > 0, f"the size is {self.size}; it must be positive, in scene units")
+        require(self.size is None or self.size > 0, f"the size is {self.size}; it must be positive, in scene units")
 
-    def context(self, step: StepInputs) -> DistanceField:
-        """How far it is to D, in units of s, on a grid about it."""
-        cloud = step.observations.cloud
-        size = jnp.maximum(self.size, spacing(cloud))
-        distance = DistanceField.of(cloud, 2.0 * size)
-        return dataclasses.replace(distance, values=distance.values / size)
+    def context(self, step: StepInputs) -> Unseen:
+        """What has been seen."""
+        cloud, looks = step.observations.cloud, step.observations.looks
+        if looks is not None and 2.0 * (self.size or 0.0) <= looks.reach:
+            return Unseen(looks, jnp.asarray(max(looks.grid.spacing, self.size or 0.0), cloud.points.dtype))
+        size = jnp.maximum(_SIZE if self.size is None else self.size, spacing(cloud))
+        return Unseen(DistanceField.of(cloud, 2.0 * size), size)
 
-    def score(self, context: DistanceField, view: ImaginedView) -> Float[Array, ""]:
+    def score(self, context: Unseen, view: ImaginedView) -> Float[Array, ""]:
         """The new area of one scan; zero for a scan that sees nothing."""
-        return jnp.sum(visible_area(view) * self.newness(context, view.scan.points))
-
-    def newness(self, distance: DistanceField, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """From 0 beside D to 1 at 2 s."""
-        return jnp.clip(distance(points) - 1.0, 0.0, 1.0)
+        return jnp.sum(visible_area(view, _STEEP) * context(view.scan.points))
 
     @property
     def quantity(self) -> Quantity:
@@ -92,10 +115,12 @@ class NewSurface(Acquisition):
         return _many()
 
 
-def visible_area(view: ImaginedView) -> Float[Array, " rays"]:
+def visible_area(view: ImaginedView, steepest: float = GRAZING) -> Float[Array, " rays"]:
     """The area of each pixel on the surface that it shows, in squared scene units; zero where it shows none.
 
     A pixel of focal lengths fx and fy at depth z and distance r has r^2 omega = z^3 / (r fx fy).
+
+    - `steepest`: the least cosine of incidence at which a pixel counts for all of its area.
     """
     scan, pose = view.scan, view.pose
     offset = jnp.where(scan.mask[:, None], scan.points - pose.position, pose.forward)
@@ -104,7 +129,7 @@ def visible_area(view: ImaginedView) -> Float[Array, " rays"]:
     cosine = jnp.abs(jnp.sum(offset * scan.normals, axis=-1)) / distance
     across, down = view.camera.focal_lengths
     facing = depth**3 / (distance * across * down)
-    return jnp.where(scan.mask, facing / jnp.maximum(cosine, GRAZING), 0.0)
+    return jnp.where(scan.mask, facing / jnp.maximum(cosine, steepest), 0.0)
 
 
 def newness_of(acquisition: Acquisition) -> NewSurface:
@@ -117,12 +142,12 @@ class ShownArea(Acquisition):
 
     of: NewSurface
 
-    def context(self, step: StepInputs) -> DistanceField:
+    def context(self, step: StepInputs) -> Unseen:
         return self.of.context(step)
 
-    def score(self, context: DistanceField, view: ImaginedView) -> Float[Array, "2"]:
-        area = visible_area(view)
-        return jnp.stack([jnp.sum(area * self.of.newness(context, view.scan.points)), jnp.sum(area)])
+    def score(self, context: Unseen, view: ImaginedView) -> Float[Array, "2"]:
+        area = visible_area(view, _STEEP)
+        return jnp.stack([jnp.sum(area * context(view.scan.points)), jnp.sum(area)])
 
     @property
     def batch_size(self) -> int:

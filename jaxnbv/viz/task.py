@@ -1,5 +1,6 @@
 """The task by view: what was asked, what was found, when it was sure, and the numbers for its charts."""
 
+import itertools
 import re
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,9 +13,8 @@ from jaxtyping import Array, Float
 
 from jaxnbv.acquisition import ImaginedView, inputs_of
 from jaxnbv.checks import AnyArray
-from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.pose import Pose
+from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import View, view_keys
 from jaxnbv.planning.planner import Planner
@@ -111,21 +111,19 @@ def seen_after(episode: Episode, truth: Float[AnyArray, "n 3"] | None) -> list[C
         shares = [100.0 * float(share) for share in coverage(views, truth)]
         return [CoverageAnswer(("of the surface seen",), np.array([share])) for share in shares]
     of = newness_of(acquisition)
-    clouds = [None, *(view.cloud for view in views[:-1])]
+    before = itertools.chain([None], episode.observations())
     new = [
-        float(_new_area(of, cloud, view.scan, view.camera, view.pose))
-        for cloud, view in zip(clouds, views, strict=True)
+        float(_new_area(of, seen, ImaginedView(view.scan, view.camera, view.pose)))
+        for seen, view in zip(before, views, strict=False)
     ]
     areas, unit = episode.frame.length_to_world(np.cumsum(new), 2), f"{episode.frame.unit}²"
     return [CoverageAnswer(("of surface seen",), np.array([area]), unit=unit) for area in areas]
 
 
 @eqx.filter_jit
-def _new_area(
-    of: NewSurface, cloud: PointCloud | None, scan: PointCloud, camera: Camera, pose: Pose
-) -> Float[Array, ""]:
-    view = ImaginedView(scan, camera, pose)
-    return jnp.sum(visible_area(view)) if cloud is None else of.score(of.context(inputs_of(cloud)), view)
+def _new_area(of: NewSurface, before: Observations | None, view: ImaginedView) -> Float[Array, ""]:
+    area = visible_area(view)
+    return jnp.sum(area if before is None else area * of.context(inputs_of(before))(view.scan.points))
 
 
 def true_cloud(scene: Surface, count: int) -> PointCloud | None:

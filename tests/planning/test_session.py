@@ -221,6 +221,16 @@ def test_the_box_is_the_volume_of_the_model_and_of_the_carving():
     assert fitted.camera.fov == pytest.approx(CAMERA.fov)
 
 
+def test_a_rim_about_the_box_is_modelled_and_not_given(finished):
+    """Beside and above it, but not below, where the table is."""
+    box, world = Box(*BOX), finished.frame.to_world(finished.observations.cloud)
+    beyond = np.asarray(world.points)[np.asarray(world.mask)]
+    assert (beyond[:, 2] >= BOX[0][2] - 1e-6).all()
+    points, _ = finished.cloud.to_numpy()
+    assert len(points) > 0
+    assert np.asarray(box(points)).max() <= 0
+
+
 def test_travel_counts_from_where_the_camera_was(finished):
     """Not from where it was to be; in metres about the middle of the box."""
     plain, priced = session_of(), session_of(planner=dataclasses.replace(planner_of(), cost=ValuePerCost(fixed=0.5)))

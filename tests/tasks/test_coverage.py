@@ -12,6 +12,7 @@ from scipy.integrate import quad
 
 import jaxnbv as nbv
 from jaxnbv.acquisition import ImaginedView
+from jaxnbv.geometry.cloud import limit_capacity
 from jaxnbv.scanning.sdf import Cuboid, Sphere
 from jaxnbv.tasks.coverage import visible_area
 
@@ -40,8 +41,10 @@ def ball_area(sharpest: float) -> float:
 @pytest.mark.parametrize(("height", "width"), [(240, 240), (120, 240)])
 def test_the_area_of_a_ball_is_its_integral(height, width):
     seen, camera = looked_at(height, width)
-    # A pixel of the limb is seen or not: a share of about one in a hundred of the area.
-    assert float(jnp.sum(visible_area(ImaginedView(seen, camera, POSE)))) == pytest.approx(ball_area(0.2), rel=0.02)
+    for steepest in (0.2, 0.5):
+        area = float(jnp.sum(visible_area(ImaginedView(seen, camera, POSE), steepest)))
+        # A pixel of the limb is seen or not: a share of about one in a hundred of the area.
+        assert area == pytest.approx(ball_area(steepest), rel=0.02)
 
 
 def test_the_area_of_a_slanted_face_does_not_depend_on_the_rays_or_the_distance():
@@ -69,7 +72,8 @@ def test_the_score_is_the_area_weighed_by_how_far_it_is_to_d():
 
     points, mask = np.asarray(seen.points, np.float64), np.asarray(seen.mask)
     distance = np.linalg.norm(points[:, None] - data[None], axis=-1).min(axis=1)
-    area = np.asarray(visible_area(ImaginedView(seen, camera, POSE)), np.float64)
+    # Where a pixel is steeper than 60 degrees it counts for less.
+    area = np.asarray(visible_area(ImaginedView(seen, camera, POSE), 0.5), np.float64)
     expected = float(np.sum(area[mask] * np.clip(distance[mask] / 0.15 - 1.0, 0.0, 1.0)))
     assert 0.1 * area.sum() < expected < 0.9 * area.sum()
     # Between nodes a distance is wrong by a small part of their spacing, here 0.026, and to both sides.
@@ -83,6 +87,34 @@ def test_between_the_points_of_a_sparse_cloud_nothing_is_new():
     acquisition = nbv.NewSurface(0.02)
     score = float(acquisition.score(context_of(acquisition, cloud), ImaginedView(seen, camera, POSE)))
     assert score < 0.02 * float(jnp.sum(visible_area(ImaginedView(seen, camera, POSE))))
+
+
+def observed(points, capacity):
+    """Observations after one view of some points, of which few are kept."""
+    camera, pose = nbv.Camera(height=80, width=80), nbv.look_at((0.0, 0.0, 2.5))
+    own = cloud_of(points, camera.num_rays)
+    scan = nbv.PointCloud(own.points, own.normals, own.mask, jnp.zeros(6400, bool), jnp.zeros(6400))
+    start = nbv.Observations.start(limit_capacity(own, capacity), 2, nbv.Grid(40, 1.2))
+    return start.add_view(pose, scan, camera, nbv.Carving(), None)
+
+
+def test_what_is_new_does_not_depend_on_the_points_that_are_kept():
+    """Hits all over the ball that is looked at, but for a hole: its area is new, though D is too sparse to tell."""
+    seen, camera = looked_at(120, 120)
+    view = ImaginedView(seen, camera, POSE)
+    everywhere = np.asarray(nbv.geometry.fibonacci_sphere(6000), np.float64)
+    toward = np.asarray(POSE.position, np.float64) / AWAY
+    radius = 0.4
+    hits = RADIUS * everywhere[everywhere @ toward < math.cos(radius)]
+    observations = observed(hits, 60)
+    new, by_d = (
+        float(nbv.NewSurface().score(context_of(nbv.NewSurface(), one), view))
+        for one in (observations, observations.cloud)
+    )
+    # What lies between one and two spacings of the grid, 0.062, from a hit counts in part, on average a half.
+    whole, rim = (2 * math.pi * RADIUS**2 * (1 - math.cos(radius - margin / RADIUS)) for margin in (0.062, 0.123))
+    assert rim < new < whole
+    assert by_d < 0.1 * new
 
 
 @pytest.mark.slow

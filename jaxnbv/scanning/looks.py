@@ -1,0 +1,120 @@
+"""Which surface the views so far have measured, and how far each of them saw.
+
+D is thinned to its capacity, so what lies between its points may have been measured all the same. The hits of all rays
+say what has been, at the resolution of the sensor. A sampled surface that a view must have seen and has not measured is
+none that the sensor can measure: it is not there, or too dark, or too shiny.
+"""
+
+import dataclasses
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.pose_list import PoseList
+from jaxnbv.scanning.grid import Grid, GridSurface
+from jaxnbv.scanning.scanner import scan
+from jaxnbv.sharding import shared_map
+
+# In spacings of the grid: up to here distances to hits are kept.
+_REACH = 3
+# The least cosine of incidence at which a look is one: sensors measure little that is steeper.
+_STEEPEST = 0.5
+
+
+class Looks(eqx.Module):
+    """What the rays of all views came back with. Immutable and of fixed shapes.
+
+    - `distance`: from each node of the grid to the nearest hit, in scene units, at most `reach`.
+    - `sight`: how far each view saw along the rays of `camera`, see `PointCloud`; zero beside its image.
+    """
+
+    distance: Float[Array, "g g g"]
+    sight: Float[Array, "views rays"]
+    camera: Camera
+    grid: Grid
+
+    @classmethod
+    def none(cls, grid: Grid, camera: Camera, max_views: int) -> "Looks":
+        """Before the first look."""
+        far = jnp.full((grid.resolution,) * 3, _REACH * grid.spacing, jnp.result_type(float))
+        return cls(far, jnp.zeros((max_views, camera.num_rays), far.dtype), camera, grid)
+
+    @property
+    def reach(self) -> float:
+        """The largest distance that is kept, in scene units."""
+        return _REACH * self.grid.spacing
+
+    def with_points(self, cloud: PointCloud) -> "Looks":
+        """The looks with a cloud's points as hits."""
+        place = (cloud.points + self.grid.half_extent) / self.grid.spacing
+        low, distance = jnp.floor(place).astype(jnp.int32), self.distance
+        for offset in itertools.product(range(1 - _REACH, _REACH + 1), repeat=3):
+            node = low + jnp.array(offset)
+            away = self.grid.spacing * jnp.linalg.norm(node - place, axis=-1)
+            # A negative index would count from the other end.
+            there = cloud.mask & jnp.all(node >= 0, axis=-1)
+            index = jnp.where(there[:, None], node, self.grid.resolution)
+            distance = distance.at[tuple(index.T)].min(away, mode="drop")
+        return dataclasses.replace(self, distance=distance)
+
+    def with_view(
+        self,
+        index: Array,
+        pose: Pose,
+        scan: PointCloud,
+        camera: Camera,
+        barrier: Float[Array, " rays"] | None = None,
+    ) -> "Looks":
+        """The looks with those of one view.
+
+        - `index`: of the view, from 0; `camera`: the one that took it.
+        - `barrier`: how far along each of its rays an obstacle stands; what is behind it was not looked at.
+        """
+        looks = self.with_points(scan)
+        if scan.sight is None:
+            return looks
+        far = scan.sight if barrier is None else jnp.minimum(scan.sight, barrier)
+        column, row = jnp.floor(camera.to_pixels(self.camera.pixel_directions()[:, :2])).astype(jnp.int32).T
+        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        sight = jnp.where(inside, far[jnp.where(inside, row * camera.width + column, 0)], 0.0)
+        return dataclasses.replace(looks, sight=looks.sight.at[index].set(sight.astype(looks.sight.dtype)))
+
+    def distance_at(self, x: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
+        """Distance of points to the nearest hit, at most `reach`: linear between nodes, so that at a hit itself it is
+        up to half a spacing. Differentiable in x."""
+        places = list(jnp.moveaxis((x + self.grid.half_extent) / self.grid.spacing, -1, 0))
+        return jax.scipy.ndimage.map_coordinates(self.distance, places, order=1, mode="nearest")
+
+    @eqx.filter_jit
+    def measurable(self, surfaces: GridSurface, poses: PoseList) -> GridSurface:
+        """Sampled surfaces, along a leading axis, less what a view looked at and has not measured, and what lies within
+        a cell of it: the view saw as far as the surface, which faces it, but no hit lies within a spacing.
+
+        - `poses`: of the views.
+        """
+        return surfaces.void(shared_map(_looked_at_in_vain, surfaces, self, poses))
+
+
+def _looked_at_in_vain(surface: GridSurface, looks: Looks, poses: PoseList) -> Bool[Array, "m m m"]:
+    spacing = looks.grid.spacing
+
+    def look(index, found):
+        pose = jax.tree.map(lambda rows: rows[index], poses.rows)
+        seen = scan(surface, looks.camera, pose)
+        offset = seen.points - pose.position
+        away = jnp.linalg.norm(offset, axis=-1)
+        faces = -jnp.sum(offset * seen.normals, axis=-1) >= _STEEPEST * away
+        in_vain = seen.mask & faces & (away <= looks.sight[index] + spacing)
+        in_vain &= looks.distance_at(seen.points) > spacing
+        cell = jnp.floor((seen.points + looks.grid.half_extent) / spacing).astype(jnp.int32)
+        return found.at[tuple(jnp.where(in_vain[:, None], cell, looks.grid.resolution).T)].set(True, mode="drop")
+
+    found = jax.lax.fori_loop(0, poses.count, look, jnp.zeros(surface.distance.shape, bool))
+    # Rays are farther apart than cells.
+    return jax.lax.reduce_window(found, False, jax.lax.bitwise_or, (3, 3, 3), (1, 1, 1), "SAME")
