@@ -57,7 +57,7 @@ class Observations(eqx.Module):
         - `camera`: by whose rays looks are kept.
         """
         empty = None if grid is None else jnp.zeros((grid.resolution,) * 3, bool)
-        looks = None if grid is None else _measured(Looks.none(grid, camera, max_views), cloud)
+        looks = None if grid is None else Looks.none(grid, camera, max_views).with_points(cloud)
         return cls(cloud, PoseList.empty(max_views), grid, looks, empty, obstacle_nodes)
 
     @property
@@ -108,11 +108,6 @@ def as_observations(value: Observations | PointCloud) -> Observations:
 @eqx.filter_jit
 def _joined(cloud: PointCloud, scan: PointCloud) -> PointCloud:
     return limit_capacity(concatenate(cloud, scan), cloud.capacity)
-
-
-@eqx.filter_jit
-def _measured(looks: Looks, cloud: PointCloud) -> Looks:
-    return looks.with_points(cloud)
 
 
 @eqx.filter_jit

@@ -170,8 +170,8 @@ class Planner(eqx.Module):
         check_key(key)
         check_type(inputs, StepInputs, "the inputs of a step")
         with functions_of_users():
-            problem = Problem(inputs, self.camera, self.acquisition, self.obstacles, self.cost, pending)
-            proposal = _propose(self.search, problem.prepared(), key)
+            problem = Problem(inputs, self.camera, self.acquisition, self.obstacles, self.cost, pending).prepared()
+            proposal = _propose(self.search, problem, key)
         return _checked_proposal(proposal, inputs.surfaces)
 
     @eqx.filter_jit

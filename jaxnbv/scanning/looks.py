@@ -11,7 +11,7 @@ import itertools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
@@ -50,6 +50,7 @@ class Looks(eqx.Module):
         """The largest distance that is kept, in scene units."""
         return _REACH * self.grid.spacing
 
+    @eqx.filter_jit
     def with_points(self, cloud: PointCloud) -> "Looks":
         """The looks with a cloud's points as hits."""
         place = (cloud.points + self.grid.half_extent) / self.grid.spacing
@@ -65,7 +66,7 @@ class Looks(eqx.Module):
 
     def with_view(
         self,
-        index: Array,
+        index: Int[Array, ""],
         pose: Pose,
         scan: PointCloud,
         camera: Camera,
@@ -85,7 +86,7 @@ class Looks(eqx.Module):
         sight = jnp.where(inside, far[jnp.where(inside, row * camera.width + column, 0)], 0.0)
         return dataclasses.replace(looks, sight=looks.sight.at[index].set(sight.astype(looks.sight.dtype)))
 
-    def distance_at(self, x: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
+    def __call__(self, x: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
         """Distance of points to the nearest hit, at most `reach`: linear between nodes, so that at a hit itself it is
         up to half a spacing. Differentiable in x."""
         places = list(jnp.moveaxis((x + self.grid.half_extent) / self.grid.spacing, -1, 0))
@@ -111,7 +112,7 @@ def _looked_at_in_vain(surface: GridSurface, looks: Looks, poses: PoseList) -> B
         away = jnp.linalg.norm(offset, axis=-1)
         faces = -jnp.sum(offset * seen.normals, axis=-1) >= _STEEPEST * away
         in_vain = seen.mask & faces & (away <= looks.sight[index] + spacing)
-        in_vain &= looks.distance_at(seen.points) > spacing
+        in_vain &= looks(seen.points) > spacing
         cell = jnp.floor((seen.points + looks.grid.half_extent) / spacing).astype(jnp.int32)
         return found.at[tuple(jnp.where(in_vain[:, None], cell, looks.grid.resolution).T)].set(True, mode="drop")
 

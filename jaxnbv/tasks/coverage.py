@@ -61,8 +61,7 @@ class Unseen(eqx.Module):
 
     def __call__(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
         """How new surface at some points is, from 0 to 1."""
-        distance = self.seen(points) if isinstance(self.seen, DistanceField) else self.seen.distance_at(points)
-        return jnp.clip(distance / self.size - 1.0, 0.0, 1.0)
+        return jnp.clip(self.seen(points) / self.size - 1.0, 0.0, 1.0)
 
 
 class NewSurface(Acquisition):

@@ -45,7 +45,7 @@ def test_between_nodes_distances_are_linear():
     looks = nothing().with_points(cloud_of(RNG.uniform(-1.0, 1.0, (30, 3)), 30))
     a, b = NODES[5, 6, 7], NODES[5, 6, 8]
     x = jnp.asarray(np.stack([a, 0.25 * a + 0.75 * b, b]), jnp.float32)
-    first, middle, last = np.asarray(looks.distance_at(x))
+    first, middle, last = np.asarray(looks(x))
     assert middle == pytest.approx(0.25 * first + 0.75 * last, abs=1e-5)
 
 
