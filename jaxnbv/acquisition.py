@@ -40,10 +40,14 @@ class Acquisition(eqx.Module):
 
     - `needs_posterior`: whether `context` looks at the posterior, which a planner then puts into the step.
     - `measurable_only`: whether surface that a view looked at in vain is left out of the samples, see `Looks`.
+    - `gains_once`: whether a pose that was taken has nothing more to give, so that what is expected there is expected
+      in vain. A search over candidates then takes the farthest from the cameras so far among those that are level with
+      the best, see `Proposal.tied_with_best`.
     """
 
     needs_posterior: ClassVar[bool] = False
     measurable_only: ClassVar[bool] = False
+    gains_once: ClassVar[bool] = False
 
     @abstractmethod
     def context(self, step: StepInputs) -> Any:

@@ -167,6 +167,12 @@ class PointCloud(eqx.Module):
         mask = np.asarray(self.mask)
         return np.asarray(self.points)[mask], np.asarray(self.normals)[mask]
 
+    def only(self, kept: Bool[Array, "*batch n"]) -> "PointCloud":
+        """The cloud with those of its rows that are kept; as an image it says what it said, `missed` and `sight`."""
+        mask = self.mask & kept
+        points, normals = (jnp.where(mask[..., None], rows, 0.0) for rows in (self.points, self.normals))
+        return PointCloud(points, normals, mask, self.missed, self.sight)
+
     def __getitem__(self, index) -> "PointCloud":
         """The cloud, or clouds, at an index of the leading axes.
 

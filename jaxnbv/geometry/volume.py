@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnbv.checks import AnyArray, InputError, require, shown
@@ -48,6 +49,14 @@ class Box(eqx.Module):
         """The box with its faces moved outward, but for the lower one (y is up): what the object stands on is below."""
         (x, y, z), high = self.low, tuple(high + by for high in self.high)
         return Box((x - by, y, z - by), high)
+
+    def passed(self, points: Float[np.ndarray, "n 3"], by: float) -> dict[str, float]:
+        """The share of some points that lies beyond each face, "+x" say, by more than a length."""
+        if len(points) == 0:
+            return {}
+        beyond = {"-": points < np.array(self.low) - by, "+": points > np.array(self.high) + by}
+        shares = {sign: rows.mean(axis=0) for sign, rows in beyond.items()}
+        return {f"{sign}{axis}": float(shares[sign][index]) for index, axis in enumerate("xyz") for sign in shares}
 
     @classmethod
     def cube(cls, side: float) -> "Box":

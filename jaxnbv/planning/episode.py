@@ -4,11 +4,13 @@ import dataclasses
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
+from jaxnbv.acquisition import Acquisition, ImaginedView, context_of
 from jaxnbv.checks import check_type, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
@@ -20,6 +22,11 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Noise, Surface
 from jaxnbv.search import Proposal
 from jaxnbv.storage import RunFolder
+
+
+@eqx.filter_jit
+def _score(acquisition: Acquisition, context: Any, view: ImaginedView) -> Float[Array, ""]:
+    return acquisition.score(context, view)
 
 
 class Episode(eqx.Module):
@@ -61,6 +68,15 @@ class Episode(eqx.Module):
         check_type(views, int, "the number of views")
         require(1 <= views <= len(self.views), f"asked for {views} of {len(self.views)} views; ask for one at least")
         return next(itertools.islice(self.observations(), views - 1, None))
+
+    def found(self) -> Iterator[float | None]:
+        """What each view added of what the planner's acquisition is about: the score of its scan given the observations
+        before it, beside the value that its proposal promised. None for the first view; in scene units."""
+        yield None
+        acquisition = self.planner.acquisition
+        for before, view in zip(self.observations(), self.views[1:], strict=False):
+            context = context_of(acquisition, before)
+            yield float(_score(acquisition, context, ImaginedView(view.scan, view.camera, view.pose)))
 
     @classmethod
     def load(cls, path: str | Path, planner: Planner | None = None, scene: Surface | None = None) -> "Episode":

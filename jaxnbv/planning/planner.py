@@ -93,9 +93,7 @@ class Planner(eqx.Module):
         grid = self.sampler.grid
         within = None if self.obstacles is None else self.obstacles.within(grid)
         kept = None if within is None and self.sampler.carving is None else grid
-        observations = Observations.start(
-            limit_capacity(scan, self.capacity), self.max_views, kept, within, self.camera
-        )
+        observations = Observations.start(limit_capacity(scan, self.capacity), self.max_views, kept, within, camera)
         if self.search.uses_samples and not is_traced(observations):
             self.acquisition.check(observations.cloud)
             self.sampler.model.check(observations.cloud)

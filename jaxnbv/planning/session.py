@@ -10,7 +10,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray, Real
 from tqdm import tqdm
@@ -26,18 +25,22 @@ from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import STAGES, Loop, View
 from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.session_warnings import warn_of_cut, warn_of_little, warn_of_table
 from jaxnbv.planning.stopping import StopRule
 from jaxnbv.planning.table import plane_under
 from jaxnbv.progress import progress_bar
+from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Obstacles
 from jaxnbv.scanning.sdf import HalfSpace
-from jaxnbv.search import HalvingSearch, Proposal
+from jaxnbv.search import DiscreteSearch, Proposal
 from jaxnbv.storage import RunFolder
 from jaxnbv.tasks import NewSurface
 
 _NO_IMAGE = "the session has no image yet: add one first, session.add(depth, matrix)"
 # A cloud holds some thousands of points; more rays than these only take time.
 _MOST_RAYS = 20_000
+# On recordings twice as many showed no more.
+_SAMPLES = 8
 
 
 class NextView(eqx.Module):
@@ -67,7 +70,8 @@ class Session:
     - `box`: two corners of a box about the object, without the table.
     - `planner`: in scene coordinates, as for a simulation. The scene is the box, scaled; the planner's camera is
       replaced by the sensor's with the planner's number of pixels, and the default volume, `Box()`, by the box. By
-      default it looks for `NewSurface`, by a `HalvingSearch` with 24 x 32 rays, and keeps 2,000 points.
+      default it looks for `NewSurface`, by a `DiscreteSearch` over eight samples with 24 x 32 rays, and keeps 2,000
+      points.
     - `up`: the world's axis that is upward, "y" or "z" say.
     - `obstacles`: what stands around the object, in world units: `Obstacles((table,), margin=0.005)`, say. By default
       the plane that the object stands on is looked for in the first image, named in a warning, and taken for a table:
@@ -109,6 +113,7 @@ class Session:
         self._bar: tqdm[Any] | None = None
         self._loop = self._loop_of(self._placed(planner, matrices, obstacles))
         self._table: HalfSpace | None = None
+        self._cut: frozenset[str] = frozenset()
         self._next: NextView | None = None
         self._folder: RunFolder | None = None
         if folder is not None:
@@ -166,9 +171,7 @@ class Session:
         **Raises:** `ValueError` before the first image.
         """
         cloud = self.frame.to_world(self.observations.cloud)
-        mask = cloud.mask & (self.box(cloud.points) <= 0)
-        points, normals = (jnp.where(mask[:, None], rows, 0.0) for rows in (cloud.points, cloud.normals))
-        return PointCloud(points, normals, mask)
+        return cloud.only(self.box(cloud.points) <= 0)
 
     @property
     def episode(self) -> Episode:
@@ -211,12 +214,10 @@ class Session:
         with self._alone() as folder:
             self._add(pixels, place, depth_scale, folder)
         if len(self.views) == 1 and self._table is not None:
-            point = np.round(self.frame.to_world(np.asarray(self._table.point, np.float64)), 4).tolist()
-            warnings.warn(
-                f"the object stands on a plane through {point}, which goes on beyond the box: it is taken for a table "
-                "and left out. Give obstacles=Obstacles() to keep it",
-                stacklevel=3,
-            )
+            warn_of_table(self.frame.to_world(np.asarray(self._table.point, np.float64)))
+        voxel = self.frame.length_to_world(self.planner.sampler.grid.spacing)
+        points, _ = self.frame.to_world(self.observations.cloud).to_numpy()
+        self._cut = warn_of_cut(self.box, points, voxel, self._cut)
 
     def next(self) -> NextView:
         """Where to take the next image. It is stored, and the same until an image is added; what was proposed once is
@@ -233,7 +234,7 @@ class Session:
                 if (surfaces := self._loop.inputs().surfaces) is not None:
                     depth = self.frame.length_to_world(np.asarray(self.planner.expected_depth(surfaces, proposal.pose)))
                 next_view = self._next_of(proposal, depth)
-                _warn_of_little(next_view)
+                warn_of_little(next_view.value, next_view.standard_error, self._in_vain(proposal))
                 if folder is not None:
                     folder.write("proposal", len(self.views), proposal=proposal, expected_depth=depth)
                 self._next = next_view
@@ -317,6 +318,9 @@ class Session:
         error = error if error is not None and math.isfinite(error) else None
         return NextView(matrix, self._loop.in_world(proposal.value), error, expected_depth, proposal)
 
+    def _in_vain(self, proposal: Proposal) -> float:
+        return 0.0 if proposal.in_vain is None else self._loop.in_world(proposal.in_vain)
+
     def _show(self, stage: str) -> None:
         """The stage on the bar, which begins with the first one."""
         if self._bar is None:
@@ -355,7 +359,9 @@ class Session:
 
 def usual_planner() -> Planner:
     """What a session plans by where nothing else is given."""
-    return Planner(NewSurface(), HalvingSearch(), Camera(height=24, width=32), capacity=2000)
+    return Planner(
+        NewSurface(), DiscreteSearch(), Camera(height=24, width=32), SurfaceSampler(num_samples=_SAMPLES), capacity=2000
+    )
 
 
 def stride_of(camera: Camera) -> int:
@@ -369,15 +375,3 @@ def _box_of(corners) -> Box:
         return corners
     require(np.shape(corners) == (2, 3), f"the box is {shown(corners)}; give two corners, (low, high), or a Box")
     return Box(*(as_numbers(corner, "a corner of the box", np.float64).tolist() for corner in corners))
-
-
-def _warn_of_little(next_view: NextView) -> None:
-    """A best view may be worth nothing: of candidates that look elsewhere, or once all has been seen."""
-    value, error = next_view.value, next_view.standard_error
-    if value <= (0.0 if error is None else 3.0 * error):
-        sure = "" if error is None else f" ± {error:.2g}"
-        warnings.warn(
-            f"the best view is worth {value:.3g}{sure}: none is sure to show anything new. Stop, or give poses that "
-            "look at the box from elsewhere",
-            stacklevel=3,
-        )

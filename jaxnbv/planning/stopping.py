@@ -15,11 +15,10 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement, expected_value
+from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement, context_of
 from jaxnbv.checks import InputError, check_fields, check_type, require, shown
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
@@ -29,7 +28,7 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.travel import CostFunction, WorldCost, arc_length, total_cost
 from jaxnbv.scanning import GridSurface, barrier_of
 from jaxnbv.tasks.classification import ClassAcquisition
-from jaxnbv.tasks.coverage import NewSurface, ShownArea, newness_of
+from jaxnbv.tasks.coverage import NewSurface, newness_of, seen_share
 from jaxnbv.tasks.segmentation import PartAnswer, SoftPartCount
 
 
@@ -160,9 +159,7 @@ def _of_classes(acquisition: Acquisition) -> ClassAcquisition:
 @jax.jit
 def half_of(cloud: PointCloud, key: PRNGKeyArray) -> PointCloud:
     """Each of a cloud's points with probability one half."""
-    kept = cloud.mask & jax.random.bernoulli(key, 0.5, cloud.mask.shape)
-    points, normals = (jnp.where(kept[:, None], rows, 0.0) for rows in (cloud.points, cloud.normals))
-    return PointCloud(points, normals, kept)
+    return cloud.only(jax.random.bernoulli(key, 0.5, cloud.mask.shape))
 
 
 class Found(StopRule):
@@ -212,11 +209,11 @@ class Found(StopRule):
 
 
 class Covered(StopRule):
-    """Stop once this share of what the candidates can show is expected to have been seen: of the area that they would
-    show of the sampled surfaces, the part that is not new to `NewSurface`.
+    """Stop once this share of what the candidates can show is expected to have been seen: of the cells of the grid in
+    which they would show the sampled surfaces, those in which nothing is new to `NewSurface`.
 
     - `share`: within (0, 1].
-    - `size`: of `NewSurface`, in world units in a session; by default that of the acquisition, or 0.05 scene units.
+    - `size`: of `NewSurface`, in world units in a session; by default that of the acquisition, or of `NewSurface()`.
 
     **Raises:** `ValueError` for another share, or a size that is not positive.
     """
@@ -239,19 +236,16 @@ class Covered(StopRule):
 
 
 def expected_coverage(context: StopContext, new: NewSurface) -> float:
-    """Share of the area that the camera would see of the posterior's surfaces, from all candidates, that is not new.
+    """`seen_share` of the posterior's surfaces from all candidates, less what no sensor can measure.
 
     - `new`: what is new.
     """
-    planner = context.planner
+    planner, observations, surfaces = context.planner, context.observations, context.surfaces()
+    if observations.looks is not None and not planner.acquisition.measurable_only:
+        surfaces = observations.looks.measurable(surfaces, observations.poses)
     poses = planner.search.poses_around()
     barrier = barrier_of(planner.obstacles, planner.camera, poses)
-    where = context.observations.cloud, context.surfaces(), planner.camera, poses, barrier
-    fresh, area = np.asarray(_values(ShownArea(new), *where)).sum(axis=0)
-    return 1.0 - float(fresh / area) if area else 1.0
-
-
-_values = eqx.filter_jit(expected_value)
+    return float(seen_share(context_of(new, observations), surfaces, planner.camera, poses, barrier))
 
 
 class ValueBelow(StopRule):

@@ -7,6 +7,7 @@ none that the sensor can measure: it is not there, or too dark, or too shiny.
 
 import dataclasses
 import itertools
+import math
 
 import equinox as eqx
 import jax
@@ -23,8 +24,12 @@ from jaxnbv.sharding import shared_map
 
 # In spacings of the grid: up to here distances to hits are kept.
 _REACH = 3
-# The least cosine of incidence at which a look is one: sensors measure little that is steeper.
-_STEEPEST = 0.5
+STEEP = 0.5
+"""The cosine of incidence below which little is expected: sensors measure little that is steeper, so that no look at it
+is in vain, and imagined slopes are uncertain."""
+
+# Of a view, at most: with more, imagining what it would have shown takes longer.
+_RAYS = 5_000
 
 
 class Looks(eqx.Module):
@@ -41,7 +46,8 @@ class Looks(eqx.Module):
 
     @classmethod
     def none(cls, grid: Grid, camera: Camera, max_views: int) -> "Looks":
-        """Before the first look."""
+        """Before the first look. `camera`: the sensor, of whose rays those of every few rows and columns are kept."""
+        camera = camera.strided(math.ceil(math.sqrt(camera.num_rays / _RAYS)))
         far = jnp.full((grid.resolution,) * 3, _REACH * grid.spacing, jnp.result_type(float))
         return cls(far, jnp.zeros((max_views, camera.num_rays), far.dtype), camera, grid)
 
@@ -110,12 +116,17 @@ def _looked_at_in_vain(surface: GridSurface, looks: Looks, poses: PoseList) -> B
         seen = scan(surface, looks.camera, pose)
         offset = seen.points - pose.position
         away = jnp.linalg.norm(offset, axis=-1)
-        faces = -jnp.sum(offset * seen.normals, axis=-1) >= _STEEPEST * away
-        in_vain = seen.mask & faces & (away <= looks.sight[index] + spacing)
+        cosine, sight = -jnp.sum(offset * seen.normals, axis=-1) / away, looks.sight[index]
+        # Steep ones need not return; but a ray that was met by something deeper has passed.
+        passed = jnp.isfinite(sight) & ((sight - away) * cosine > spacing)
+        in_vain = seen.mask & (passed | (cosine >= STEEP) & (away <= sight + spacing))
         in_vain &= looks(seen.points) > spacing
         cell = jnp.floor((seen.points + looks.grid.half_extent) / spacing).astype(jnp.int32)
         return found.at[tuple(jnp.where(in_vain[:, None], cell, looks.grid.resolution).T)].set(True, mode="drop")
 
     found = jax.lax.fori_loop(0, poses.count, look, jnp.zeros(surface.distance.shape, bool))
     # Rays are farther apart than cells.
-    return jax.lax.reduce_window(found, False, jax.lax.bitwise_or, (3, 3, 3), (1, 1, 1), "SAME")
+    for axis in range(3):
+        window = tuple(3 if own == axis else 1 for own in range(3))
+        found = jax.lax.reduce_window(found, False, jax.lax.bitwise_or, window, (1, 1, 1), "SAME")
+    return found

@@ -1,5 +1,6 @@
 """Known obstacles: what they hide, and where a camera may not stand because of them."""
 
+import dataclasses
 import functools
 import operator
 
@@ -74,9 +75,8 @@ class Obstacles(eqx.Module):
     def remove_points(self, scan: PointCloud) -> PointCloud:
         """A scan less the points of solids; of an image, their rays met nothing of the object."""
         own = scan.mask & (self.distance(scan.points) < self.margin)
-        points, normals = (jnp.where(own[..., None], 0.0, rows) for rows in (scan.points, scan.normals))
         missed = None if scan.missed is None else scan.missed | own
-        return PointCloud(points, normals, scan.mask & ~own, missed, scan.sight)
+        return dataclasses.replace(scan.only(~own), missed=missed)
 
     def within(self, grid: Grid) -> Bool[Array, "g g g"]:
         """The nodes of a grid that lie within an obstacle."""

@@ -153,6 +153,33 @@ def best_unvisited(
     )
 
 
+def best_or_farthest(
+    problem: Problem, candidates: Pose, scores: Float[Array, "samples candidates"], tie: float = _TIE
+) -> Proposal:
+    """`best_unvisited`; of an acquisition that `gains_once`, the farthest from the cameras so far among the candidates
+    that are level with it, unless a cost counts, which would speak against it."""
+    found = best_unvisited(problem, candidates, jnp.mean(scores, axis=0), tie, scores)
+    if not problem.acquisition.gains_once or problem.cost is not None:
+        return found
+    found = dataclasses.replace(found, in_vain=problem.expected_in_vain())
+    taken = problem.observations.poses
+    # From no pose, all are equally far.
+    return preferred(found, jnp.where(taken.count > 0, taken.distance(candidates), found.values))
+
+
+def preferred(found: Proposal, preference: Float[Array, " candidates"]) -> Proposal:
+    """A proposal with the candidate of the highest preference among those that are level with its best and open."""
+    tied, errors = found.tied_with_best(), found.standard_errors
+    assert tied is not None
+    assert errors is not None
+    preference = jnp.where(tied & (found.values > -jnp.inf), preference, -jnp.inf)
+    index = first_best(preference)
+    # NaN in either propagates; the planner reports it.
+    value = jnp.where(jnp.isnan(preference[index]), jnp.nan, found.values[index])
+    value = jnp.where(jnp.isfinite(found.value), value, found.value)
+    return dataclasses.replace(found, pose=found.candidates[index], value=value, standard_error=errors[index])
+
+
 def first_best(values: Float[Array, " candidates"], tie: float = _TIE) -> Int[Array, ""]:
     """Index of the highest value, ties as of `best_unvisited`."""
     best = jnp.max(values)

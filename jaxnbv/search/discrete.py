@@ -1,6 +1,5 @@
 """Discrete candidate search: the paper's Algorithm 1, and a second question where samples cannot answer the first."""
 
-import dataclasses
 from typing import ClassVar
 
 import equinox as eqx
@@ -10,19 +9,24 @@ from jaxtyping import PRNGKeyArray
 from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import check_fields
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.search.base import CandidateSearch, Scores, best_unvisited, first_best
+from jaxnbv.search.base import CandidateSearch, Scores, best_or_farthest, best_unvisited, preferred
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal
 
 
 class DiscreteSearch(CandidateSearch):
-    """The candidate of the highest acquisition."""
+    """The candidate of the highest acquisition.
+
+    Where a pose that was taken has nothing more to give (`NewSurface`), it is the farthest from the cameras so far
+    among the candidates that are level with the highest: within two standard errors of the difference, and what is
+    expected, on average, of the poses that were taken. There it is expected in vain, and so it may be elsewhere.
+    """
 
     uses_samples: ClassVar[bool] = True
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """The argmax of the acquisition over the candidates not visited yet; the key is not used."""
-        return best_unvisited(problem, candidates, jnp.mean(scores[0], axis=0), scores=scores[0])
+        """One of the candidates not visited yet; the key is not used."""
+        return best_or_farthest(problem, candidates, scores[0])
 
 
 class TieBreakSearch(CandidateSearch):
@@ -52,13 +56,4 @@ class TieBreakSearch(CandidateSearch):
         """The argmax of the second acquisition over the tied candidates not visited yet; the key is not used."""
         first, second = scores
         found = best_unvisited(problem, candidates, jnp.mean(first, axis=0), scores=first)
-        tied = found.tied_with_best()
-        assert tied is not None
-        seconds = jnp.where(tied & (found.values > -jnp.inf), jnp.mean(second, axis=0), -jnp.inf)
-        index = first_best(seconds)
-        # NaN from either acquisition propagates; the planner reports it.
-        value = jnp.where(jnp.isnan(seconds[index]), jnp.nan, found.values[index])
-        value = jnp.where(jnp.isfinite(found.value), value, found.value)
-        assert found.standard_errors is not None
-        error = found.standard_errors[index]
-        return dataclasses.replace(found, pose=candidates[index], value=value, standard_error=error)
+        return preferred(found, jnp.mean(second, axis=0))

@@ -76,6 +76,24 @@ class Problem(eqx.Module):
         """Values of poses, given the cost of going there from the last pose that was taken."""
         return values if self.cost is None else self.cost(values, self.observations, poses)
 
+    def expected_in_vain(self) -> Float[Array, ""]:
+        """What the acquisition expects of the poses that were taken, on average, where these have nothing more to give:
+        by so much it may be wrong elsewhere. Zero before there are two, and for an acquisition that may gain twice.
+
+        The first view alone tells little: what it shows at a slant is steep to it, and not in vain.
+        """
+        taken = self.observations.poses
+        if not self.acquisition.gains_once:
+            return jnp.zeros((), taken.rows.position.dtype)
+        uncosted = dataclasses.replace(self, cost=None)
+
+        def add(index, total):
+            pose = jax.tree.map(lambda rows: rows[index][None], taken.rows)
+            return total + uncosted.values(pose)[0]
+
+        total = jax.lax.fori_loop(0, taken.count, add, jnp.zeros((), taken.rows.position.dtype))
+        return jnp.where(taken.count > 1, total / jnp.maximum(taken.count, 1), 0.0)
+
     @property
     def num_samples(self) -> int:
         """How many posterior samples there are."""

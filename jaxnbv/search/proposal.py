@@ -35,6 +35,8 @@ class Proposal(eqx.Module):
       `difference_errors`: of each value less that of the best candidate, which are smaller, since all poses are scored
       on the same samples; None for a search that does not score all candidates on all samples.
     - `trajectories`: those of a gradient search, starting from the best candidates; None for other searches.
+    - `in_vain`: what the acquisition expects, on average, of poses that were taken, see `Problem.expected_in_vain`;
+      None for an acquisition that may gain twice.
     """
 
     pose: Pose
@@ -45,6 +47,7 @@ class Proposal(eqx.Module):
     standard_errors: Float[Array, " candidates"] | None = None
     difference_errors: Float[Array, " candidates"] | None = None
     standard_error: Float[Array, ""] | None = None
+    in_vain: Float[Array, ""] | None = None
 
     def in_world(self, frame: Frame, length_power: int) -> "Proposal":
         """The proposal with its values, a power of length, and their errors in world units; poses stay in the scene."""
@@ -55,12 +58,12 @@ class Proposal(eqx.Module):
         return jax.tree.map(convert, self, is_leaf=lambda leaf: isinstance(leaf, Pose))
 
     def tied_with_best(self, errors: float = 2.0) -> Bool[Array, " candidates"] | None:
-        """Which candidates the samples cannot tell from the best one, itself included: those whose value is within so
-        many standard errors of the difference. None where these are not known."""
+        """Which candidates cannot be told from the best one, itself included: those whose value is within so many
+        standard errors of the difference, and what is expected in vain. None where the errors are not known."""
         if self.difference_errors is None:
             return None
-        best = jnp.max(self.values)
-        return (self.values == best) | (best - self.values <= errors * self.difference_errors)
+        best, in_vain = jnp.max(self.values), 0.0 if self.in_vain is None else self.in_vain
+        return (self.values == best) | (best - self.values <= errors * self.difference_errors + in_vain)
 
     @property
     def num_tied(self) -> int | None:

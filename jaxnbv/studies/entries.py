@@ -41,7 +41,7 @@ RECORDING = {
         typer.Option(
             metavar="LOW HIGH",
             help="What is to be seen of a recording: two corners of a box, six numbers in its units.",
-            show_default="about nearly all that was seen",
+            show_default="about nearly all that was seen, with room",
         ),
     ],
     "up": Annotated[

@@ -45,16 +45,16 @@ _VOXELS_ALONG_BOX = 80
 _ENOUGH = 0.05
 # Rays by which views are imagined, rows and columns.
 _RAYS = (24, 32)
-# The stride by which the box is looked for.
-_COARSE = 16
+# The stride by which the box is looked for, and its room about nearly all that was seen: of its longest side.
+_COARSE, _ROOM = 16, 0.05
 
 
 class Recording(NamedTuple):
     """A sequence as a study sees it.
 
     - `poses`: of the frames; `scans`: what each showed of the box; both in scene units.
-    - `shown`: which of the voxels that three frames or more have seen each frame shows; `voxels`: their centres, and
-      `places`: of the camera, both in the recording's units.
+    - `shown`: which of the voxels that three frames or more have seen each frame shows, by all of its pixels; `voxels`:
+      their centres, and `places`: of the camera, both in the recording's units.
     """
 
     poses: Pose
@@ -158,8 +158,9 @@ class RecordedStudy(Study):
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
         """
-        - `folder`, `up`: those of the study; `box`: its corners, six numbers, by default about nearly all that was
-          seen. The voxels are an eightieth of its longest side.
+        - `folder`, `up`: those of the study; `box`: its corners, six numbers, by default about all but a hundredth of
+          what was seen, to either side of each axis, with room of a twentieth of its longest side. The voxels are an
+          eightieth of its longest side.
         """
         require(model in MODELS, f"nothing is known of what was recorded: give a model of {', '.join(MODELS)}")
         folder, up = str(Path(options["folder"]).resolve()), options.get("up")
@@ -171,8 +172,8 @@ class RecordedStudy(Study):
         study = cls(
             views=views,
             num_candidates=len(frames),
-            sampler=SurfaceSampler.preset(model, quick=quick, volume=_frame(box).to_scene(box)),
-            camera=_frame(box).to_scene(frames.camera.strided(stride_of(frames.camera))),
+            sampler=SurfaceSampler.preset(model, quick=quick, volume=frame_of_box(box).to_scene(box)),
+            camera=frame_of_box(box).to_scene(frames.camera.strided(stride_of(frames.camera))),
             folder=folder,
             box=box,
             voxel=longest / _VOXELS_ALONG_BOX,
@@ -184,7 +185,7 @@ class RecordedStudy(Study):
     @property
     def recording(self) -> Recording:
         """The sequence, read once a process."""
-        carving, frame = self.sampler.carving, _frame(self.box)
+        carving, frame = self.sampler.carving, frame_of_box(self.box)
         kept = self.box if carving is None else carving.with_room(self.box, self.grid, frame)
         return _recording(self.folder, self.up, self.box, self.voxel, kept)
 
@@ -196,7 +197,7 @@ class RecordedStudy(Study):
         return Scene(index, f"{Path(self.folder).name}, start {index}", _Unknown())
 
     def sensor(self, scene: Scene) -> Sensor:
-        return lambda pose, key: self.recording.scans[self._frame_of(pose)]
+        return lambda pose, key: self.recording.scans[self.frame_of(pose)]
 
     def first_view(self, scene: Scene) -> int:
         """Another one in each scene, as long as there are others that show enough."""
@@ -233,7 +234,7 @@ class RecordedStudy(Study):
         episode: Iterator[Step],
     ) -> Record:
         """The frames that were chosen, and the share of the voxels that they have shown after each."""
-        frames = [self._frame_of(step.view.pose) for step in episode]
+        frames = [self.frame_of(step.view.pose) for step in episode]
         seen = np.logical_or.accumulate(truth[frames], axis=0)
         return {"frames": frames, "covered": seen.mean(axis=1).tolist()}
 
@@ -258,7 +259,7 @@ class RecordedStudy(Study):
 
         return Tiles("Coloured: voxels that the frames show. Numbers: where they were taken, in their order.", tile)
 
-    def _frame_of(self, pose: Pose) -> int:
+    def frame_of(self, pose: Pose) -> int:
         """The frame that was taken from a pose."""
         poses = self.recording.poses
         off = jnp.abs(poses.position - pose.position).sum(-1) + jnp.abs(poses.rotation - pose.rotation).sum((-1, -2))
@@ -275,34 +276,38 @@ def _points(frames: RecordedFrames, index: int, stride: int) -> Float[np.ndarray
 
 
 def _bounds(frames: RecordedFrames) -> list[float]:
-    """Two corners of a box that holds all but a hundredth of what was seen along each axis, to either side."""
+    """Two corners of a box about all but a hundredth of what was seen along each axis, to either side, with room."""
     found = np.concatenate([_points(frames, index, _COARSE) for index in range(len(frames))])
     require(len(found) > 0, f"no frame of {frames.folder} has measured anything")
-    return np.percentile(found, [1, 99], axis=0).reshape(-1).tolist()
+    low, high = np.percentile(found, [1, 99], axis=0)
+    room = _ROOM * float((high - low).max())
+    return [*(low - room).tolist(), *(high + room).tolist()]
 
 
-def _frame(box: Box) -> Frame:
+def frame_of_box(box: Box) -> Frame:
+    """From the recording to the scene."""
     return Frame.fit(np.array([box.low, box.high]), up="z")
 
 
 @functools.cache
 def _recording(folder: str, up: tuple[float, float, float] | None, box: Box, voxel: float, kept: Box) -> Recording:
     """`kept`: the box to which scans are cropped."""
-    frames, frame = RecordedFrames(folder, up), _frame(box)
+    frames, frame = RecordedFrames(folder, up), frame_of_box(box)
     poses, stride = Pose.from_matrix(frames.matrices), stride_of(frames.camera)
     count = frames.camera.strided(stride).num_rays
     nowhere, none = jnp.zeros((count, 3)), jnp.zeros(count, bool)
     scans, seen = [], []
     for index in progress_bar(range(len(frames)), desc="reading frames"):
+        # By all pixels: rays that are left out for the planner's sake would leave voxels out that the frame shows.
+        points = _points(frames, index, 1)
+        points = points[np.all((points >= box.low) & (points <= box.high), axis=1)]
         # One that shows nothing of the box says nothing of it.
         scan = PointCloud(nowhere, nowhere, none, none, jnp.zeros(count))
-        if np.any(np.asarray(box(_points(frames, index, stride))) < 0):
-            depth = frames.depth(index)
-            image = depth, frames.camera, poses[index], frames.depth_scale, stride
+        if len(points) > 0:
+            image = frames.depth(index), frames.camera, poses[index], frames.depth_scale, stride
             scan = PointCloud.from_depth(*image, kept)
         scans.append(frame.to_scene(scan))
-        points = scan.to_numpy()[0]
-        seen.append(np.unique(np.floor(points[np.asarray(box(points)) <= 0] / voxel).astype(int), axis=0))
+        seen.append(np.unique(np.floor(points / voxel).astype(int), axis=0))
     found, which, counts = np.unique(np.concatenate(seen), axis=0, return_inverse=True, return_counts=True)
     shown = np.zeros((len(frames), len(counts)), bool)
     shown[np.repeat(np.arange(len(frames)), [len(rows) for rows in seen]), which] = True

@@ -4,21 +4,21 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxnbv.acquisition import Acquisition, ImaginedView
 from jaxnbv.checks import check_fields, require
+from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.neighbours import DistanceField, nearest_squared_distance, spacing
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.sampler import StepInputs
-from jaxnbv.scanning import Looks
+from jaxnbv.scanning import Grid, GridSurface, Looks, Surface, scan
+from jaxnbv.scanning.looks import STEEP
 from jaxnbv.scanning.metrics import GRAZING
-from jaxnbv.sharding import on_cpu
+from jaxnbv.sharding import on_cpu, shared_map
 from jaxnbv.utility import Quantity
 
-# The cosine of incidence below which a pixel counts for less than the area that it covers: sensors measure little that
-# is steeper, and imagined slopes are uncertain.
-_STEEP = 0.5
 # Scene units: s without looks.
 _SIZE = 0.05
 
@@ -86,6 +86,7 @@ class NewSurface(Acquisition):
 
     size: float | None = eqx.field(static=True, default=None)
     measurable_only: ClassVar[bool] = True
+    gains_once: ClassVar[bool] = True
 
     def __check_init__(self):
         check_fields(self)
@@ -101,7 +102,7 @@ class NewSurface(Acquisition):
 
     def score(self, context: Unseen, view: ImaginedView) -> Float[Array, ""]:
         """The new area of one scan; zero for a scan that sees nothing."""
-        return jnp.sum(visible_area(view, _STEEP) * context(view.scan.points))
+        return jnp.sum(visible_area(view, STEEP) * context(view.scan.points))
 
     @property
     def quantity(self) -> Quantity:
@@ -136,18 +137,43 @@ def newness_of(acquisition: Acquisition) -> NewSurface:
     return acquisition if isinstance(acquisition, NewSurface) else NewSurface()
 
 
-class ShownArea(Acquisition):
-    """New area and all area of a scan: for `expected_value`, not for a search."""
+@eqx.filter_jit
+def seen_share(
+    unseen: Unseen,
+    surfaces: GridSurface,
+    camera: Camera,
+    poses: Pose,
+    barrier: Float[Array, "poses rays"] | None = None,
+) -> Float[Array, ""]:
+    """The share of what a camera can see of the sampled surfaces from some poses together that is not new: of the cells
+    of their grid, each of which counts once, however many poses see it.
 
-    of: NewSurface
+    - `barrier`: see `scan`.
+    """
+    counts = shared_map(cells_shown, surfaces, unseen, surfaces.grid, camera, poses, barrier)
+    new, shown = jnp.sum(counts, axis=0)
+    return 1.0 - new / jnp.maximum(shown, 1)
 
-    def context(self, step: StepInputs) -> Unseen:
-        return self.of.context(step)
 
-    def score(self, context: Unseen, view: ImaginedView) -> Float[Array, "2"]:
-        area = visible_area(view, _STEEP)
-        return jnp.stack([jnp.sum(area * context(view.scan.points)), jnp.sum(area)])
+def cells_shown(
+    surface: Surface,
+    unseen: Unseen,
+    grid: Grid,
+    camera: Camera,
+    poses: Pose,
+    barrier: Float[Array, "poses rays"] | None = None,
+) -> Int[Array, "2"]:
+    """How many cells of a grid hold surface that some poses show and that is new; and how many hold any that they show,
+    but at a grazing angle."""
+    scans = scan(surface, camera, poses, barrier)
+    offset = scans.points - poses.position[:, None]
+    cosine = jnp.abs(jnp.sum(offset * scans.normals, axis=-1)) / jnp.linalg.norm(offset, axis=-1)
+    points, measured = scans.points.reshape(-1, 3), (scans.mask & (cosine >= GRAZING)).reshape(-1)
 
-    @property
-    def batch_size(self) -> int:
-        return _many()
+    def number(kept):
+        cell = jnp.floor((points + grid.half_extent) / grid.spacing).astype(jnp.int32)
+        cell = jnp.where(kept[:, None], cell, grid.resolution)
+        found = jnp.zeros((grid.resolution,) * 3, bool).at[tuple(cell.T)].set(True, mode="drop")
+        return jnp.sum(found)
+
+    return jnp.stack([number(measured & (unseen(points) > 0)), number(measured)])

@@ -1,6 +1,7 @@
 """What the pictures of an episode show, as plain arrays: computed once a view, drawn by `report` and `figures`."""
 
 import dataclasses
+import itertools
 
 import equinox as eqx
 import jax
@@ -113,9 +114,11 @@ def report_data(
         for view in episode.views
     ]
     leading = Sketch(None, None)
-    for index, next_one in enumerate(following):
-        view = views[index]
-        words = told(planner.quantity, views[: index + 1], task.amounts[: index + 1], frame)
+    # Only then is what was promised what one view can give.
+    found = episode.found() if planner.acquisition.gains_once else itertools.repeat(None)
+    for index, (next_one, gain) in enumerate(zip(following, found, strict=False)):
+        view, gain = views[index], None if gain is None else float(frame.length_to_world(gain, power))
+        words = told(planner.quantity, views[: index + 1], task.amounts[: index + 1], frame, gain)
         if not task.is_coverage:
             answered = words_of(task.answers[index]).said(task.answers[index - 1] if index else None)
             words["What came"] += f" {capital(answered)}."

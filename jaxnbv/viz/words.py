@@ -14,12 +14,19 @@ from jaxnbv.viz.choice import best_first, directions_of
 from jaxnbv.viz.sphere import unit
 
 
-def told(quantity: Quantity, views: Sequence[View], seen: Sequence[CoverageAnswer], frame: Frame) -> dict[str, str]:
+def told(
+    quantity: Quantity,
+    views: Sequence[View],
+    seen: Sequence[CoverageAnswer],
+    frame: Frame,
+    gain: float | None = None,
+) -> dict[str, str]:
     """What happened at the last of some views: where it looks from, what was expected of it, how that stands beside the
     other candidates, what came; each by its heading, and left out where there is none.
 
     - `views`: with the values of their proposals in world units; `frame`: of that world.
-    - `seen`: how much was seen after each view.
+    - `seen`: how much was seen after each view; `gain`: what the last one truly gave of what it promised, in world
+      units, where that is known.
     """
     *earlier, view = views
     points, amount = int(view.scan.count), seen[-1].amount
@@ -30,6 +37,8 @@ def told(quantity: Quantity, views: Sequence[View], seen: Sequence[CoverageAnswe
     here, there = directions_of(view.pose), np.stack([directions_of(other.pose) for other in earlier])
     nearest = np.degrees(np.arccos(np.clip((there @ here).max(), -1.0, 1.0)))
     added = f"It added {points:,} points ({int(view.cloud.count):,} are kept)" if points else "It saw nothing"
+    if gain is not None:
+        added += f", and {shown_value(quantity, gain, frame)} of what it promised"
     before = seen[-2].amount
     grown = f"stayed at {amount}" if before == amount else f"went from {before} to {amount}"
     return {
@@ -47,13 +56,17 @@ def _reason(quantity: Quantity, proposal: Proposal, frame: Frame) -> dict[str, s
     climbed = proposal.trajectories is not None and (not others or value > others[0])
     rank = 1 + sum(other > value for other in others)
     how = f"{'the highest' if rank == 1 else f'rank {rank}'} of {len(others)} open candidates"
+    if rank > 1 and proposal.in_vain is not None:
+        how += ", and of those level with the best the farthest from the cameras so far"
     if climbed and proposal.trajectories is not None:
         starts = len(proposal.trajectories.values)
         how = f"found by gradient ascent from {starts} start{'s' * (starts > 1)}"
     said = {"What it promised": f"Its {quantity.name}, {shown_value(quantity, value, frame)}, was {how}."}
     rest = others if climbed or rank > 1 else others[1:]
     if rest:
-        many = "" if tied is None else f"; {tied or 'no'} other{'s' * (tied != 1)} within two standard errors"
+        vain = 0.0 if proposal.in_vain is None else float(proposal.in_vain)
+        level = "two standard errors" + (f" and {number(vain)}, expected where cameras were" if vain > 0 else "")
+        many = "" if tied is None else f"; {tied or 'no'} other{'s' * (tied != 1)} within {level}"
         other, median = "candidate" if climbed else "other", number(float(np.median(others)))
         said["Beside the others"] = f"Best {other} {number(rest[0])}, median {median}{many}."
     return said

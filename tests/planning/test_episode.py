@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from small_planner import FIRST, SCENE, SOLID, planner_of
 
+import jaxnbv as nbv
 from jaxnbv.geometry.pose import look_at
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.simulate import observe_scene, simulate
@@ -125,3 +126,20 @@ def test_an_episode_over_a_mesh_runs_outside_jit():
     clean = scan(mesh, planner.camera, episode.views[1].pose)
     assert int(clean.count) > 5
     np.testing.assert_array_equal(episode.views[1].scan.mask, clean.mask)
+
+
+def test_what_views_found_of_a_ball():
+    """From the other side nearly all of the cap that a sensor sees there, 2 pi r^2 (1 - r / d), of which what is
+    steeper than 60 degrees counts for less; from beside the first pose nearly nothing."""
+    radius, away = 0.8, 4.0
+    poses = nbv.look_at([(0.0, 0.0, away), (0.0, 0.0, -away), (0.05, 0.0, away)])
+    camera = nbv.Camera(height=40, width=40)
+    sampler = nbv.SurfaceSampler(nbv.GeometricSPSR(0.2, truncation=6), nbv.Grid(40), num_samples=2)
+    planner = nbv.Planner(nbv.NewSurface(), nbv.DiscreteSearch(poses), camera, sampler, capacity=400, max_views=4)
+    scans = [scan(SDFSurface(Sphere(radius)), camera, pose) for pose in poses]
+    views = tuple(nbv.View(pose, seen, seen, None, camera) for pose, seen in zip(poses, scans, strict=True))
+    first, other_side, again = Episode(planner, None, None, poses[0], KEY, views).found()
+    cap = 2.0 * np.pi * radius**2 * (1.0 - radius / away)
+    assert first is None
+    assert 0.7 * cap < other_side < cap
+    assert again < 0.05 * cap

@@ -231,6 +231,17 @@ def test_a_rim_about_the_box_is_modelled_and_not_given(finished):
     assert np.asarray(box(points)).max() <= 0
 
 
+def test_a_box_that_cuts_the_object_is_told_once_a_face():
+    """Two centimetres of the ball are beyond it at +x, and nothing anywhere else."""
+    session = session_of(box=(BOX[0], (0.38, 0.32, 0.24)))
+    with pytest.warns(UserWarning, match=r"go on beyond the box at \+x: \d+ % of the points .* larger box") as told:
+        session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    assert len(told) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        session.add(shot(POSES[0]), POSES[0], depth_scale=1e-3)
+
+
 def test_travel_counts_from_where_the_camera_was(finished):
     """Not from where it was to be; in metres about the middle of the box."""
     plain, priced = session_of(), session_of(planner=dataclasses.replace(planner_of(), cost=ValuePerCost(fixed=0.5)))
@@ -379,9 +390,9 @@ def test_the_table_is_found_told_of_and_kept_clear_of():
 
 def test_a_table_is_kept_where_that_is_asked_for():
     session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), poses=BELOW, obstacles=Obstacles())
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with pytest.warns(UserWarning, match="go on beyond the box") as told:
         session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    assert not any("stands on a plane" in str(one.message) for one in told)
     points, _ = session.cloud.to_numpy()
     assert (points[:, 2] < 0.001).mean() > 0.1
     assert np.isfinite(np.asarray(session.next().proposal.values)).all()

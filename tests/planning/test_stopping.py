@@ -1,5 +1,6 @@
 """When an episode ends: rules on scripted answers, and expected coverage against a count of its own."""
 
+import dataclasses
 import functools
 
 import jax
@@ -19,7 +20,7 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.simulate import simulate
 from jaxnbv.planning.stopping import Budget, Covered, Found, StopContext, Sure, ValueBelow, expected_coverage
 from jaxnbv.sampler import SurfaceSampler
-from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
+from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, scan
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.search import DiscreteSearch, FarthestView
 from jaxnbv.surfaces import GeometricSPSR
@@ -103,41 +104,57 @@ def test_found_counts_the_points_of_the_parts_that_are_asked_for(parts, points, 
 
 
 @pytest.mark.parametrize(("points", "size"), [(80, 0.1), (300, 0.05), (80, 0.4)])
-def test_expected_coverage_is_that_of_the_samples(points, size):
-    """Of a posterior that holds one ball alone, whose rays and points are found anew in float64."""
-    ball = balls(Grid(64), [0.8])
-    planner = planner_of(Coverage())
+def test_expected_coverage_is_that_of_the_cells_of_the_samples(points, size):
+    """Of a posterior that holds one ball alone, whose rays and cells are found anew in float64."""
+    grid = Grid(64)
+    ball, planner = balls(grid, [0.8]), planner_of(Coverage())
     upper = np.asarray(fibonacci_sphere(points))
     upper = upper[upper[:, 1] > 0]
     cloud = PointCloud.from_arrays(0.8 * upper, upper, 256)
     # What is as far as neighbouring points are apart was seen too.
     apart = np.linalg.norm(0.8 * (upper[:, None] - upper), axis=-1)
     apart = max(size, np.median(np.sort(apart, axis=1)[:, 1]))
-    seen_area, all_area = 0.0, 0.0
+    shown, new = set(), set()
     for pose in DiscreteSearch(10).candidates.poses():
         origin = np.asarray(pose.position, np.float64)
         rays = np.asarray(CAMERA.pixel_directions(), np.float64) @ np.asarray(pose.rotation, np.float64).T
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         along = -rays @ origin
         inside = 0.8**2 - (origin @ origin - along**2)
-        seen = inside > 0
-        along = along[seen] - np.sqrt(inside[seen])
-        hits = origin + along[:, None] * rays[seen]
-        cosine = np.maximum(-np.sum(rays[seen] * hits, axis=1) / 0.8, 0.2)
-        focal = CAMERA.focal_lengths[0]
-        area = along**2 * (rays[seen] @ np.asarray(pose.forward, np.float64)) ** 3 / focal**2 / cosine
+        along, rays = (along - np.sqrt(np.maximum(inside, 0.0)))[inside > 0], rays[inside > 0]
+        hits = origin + along[:, None] * rays
+        hits = hits[-np.sum(rays * hits, axis=1) / 0.8 >= 0.2]
         nearest = np.linalg.norm(hits[:, None] - cloud.to_numpy()[0][None], axis=-1).min(axis=1)
-        all_area += area.sum()
-        seen_area += area @ np.clip(2.0 - nearest / apart, 0.0, 1.0)
-    share = float(seen_area / all_area)
+        cells = [tuple(cell) for cell in np.floor((hits + grid.half_extent) / grid.spacing).astype(int)]
+        shown.update(cells)
+        new.update(cell for cell, distance in zip(cells, nearest, strict=True) if distance > apart)
+    share = 1.0 - len(new) / len(shown)
     assert 0.05 < share < 0.97
-    known = after(planner, cloud, surfaces=ball)
+    known = dataclasses.replace(after(planner, cloud, surfaces=ball), observations=Observations.start(cloud, 4))
     assert expected_coverage(known, NewSurface(size)) == pytest.approx(share, abs=0.02)
     assert Covered(share - 0.03, size).after(known) is not None
     assert Covered(min(share + 0.03, 1.0), size).after(known) is None
     # The size is a length of the world.
-    small = after(planner, cloud, surfaces=ball, frame=Frame(10.0))
+    small = dataclasses.replace(known, frame=Frame(10.0))
     assert Covered(share - 0.03, 0.1 * size).after(small) == Covered(share - 0.03, size).after(known)
+
+
+def test_what_no_sensor_can_measure_need_not_be_covered():
+    """Of two samples, the ball that was measured and a larger one that every view looked through."""
+    camera, poses = Camera(height=50, width=50), look_at([(0.0, 0.0, 5.0), (5.0, 0.0, 0.0)])
+    planner, fine = planner_of(NewSurface(), DiscreteSearch(poses)), Grid(64)
+    planner = dataclasses.replace(planner, camera=camera, sampler=dataclasses.replace(planner.sampler, grid=fine))
+    *_, observations = planner.replay((pose, scan(SCENE, camera, pose)) for pose in poses)
+    surfaces = balls(fine, [0.8, 1.1])
+    known = dataclasses.replace(after(planner, observations.cloud, surfaces=surfaces), observations=observations)
+    assert expected_coverage(known, NewSurface()) < 0.45
+    measurable = observations.looks.measurable(surfaces, observations.poses)
+    covered = expected_coverage(dataclasses.replace(known, surfaces=lambda: measurable), NewSurface())
+    # What is steep to both views may still be there.
+    assert covered > 0.75
+    # Whatever the planner looks for, the rule leaves out what is not there.
+    other = dataclasses.replace(planner, acquisition=Coverage())
+    assert expected_coverage(dataclasses.replace(known, planner=other), NewSurface()) == pytest.approx(covered)
 
 
 def test_value_below_and_budgets_on_scripted_proposals():

@@ -92,6 +92,22 @@ def test_only_as_far_as_a_view_saw_it_looked(sight, share):
     assert count == shown(surfaces, POSE) if share == 1.0 else count < share * shown(surfaces, POSE)
 
 
+def test_a_ray_that_met_something_deeper_has_passed_however_steep_the_surface():
+    """Of the rays that meet the ball, what came back from a wall behind it leaves those at the very limb; what did not
+    come back leaves all that are steeper than 60 degrees."""
+    surfaces, left = sampled(0.6), []
+    for sight in (np.inf, 4.0):
+        looks, poses = after(POSE, dataclasses.replace(EMPTY, sight=jnp.full(600, sight)))
+        left.append(shown(looks.measurable(surfaces, poses), POSE))
+    assert left[1] < 0.5 * left[0]
+
+
+def test_of_a_sensor_of_many_rays_every_few_are_kept():
+    looks = Looks.none(GRID, nbv.Camera(height=480, width=640), 2)
+    assert 2_000 < looks.camera.num_rays <= 5_000
+    assert looks.sight.shape == (2, looks.camera.num_rays)
+
+
 def test_behind_an_obstacle_nothing_was_looked_at():
     surfaces = sampled(0.6)
     silent = dataclasses.replace(EMPTY, sight=jnp.full(600, jnp.inf))

@@ -16,6 +16,12 @@ from jaxnbv.search.base import best_unvisited
 SEARCH, PROBLEM = nbv.DiscreteSearch(12), three_balls()
 
 
+class Once(nbv.Coverage):
+    """Coverage of which nothing is left at a pose that was taken."""
+
+    gains_once = True
+
+
 def test_the_argmax_of_values_recomputed_one_by_one():
     proposal = propose(SEARCH, PROBLEM)
     values = [sample_by_sample(PROBLEM, poses=pose[None]).mean() for pose in POSES]
@@ -83,6 +89,44 @@ def test_standard_errors_are_those_of_the_scores_sample_by_sample():
     assert 0 < proposal.num_tied < 11
     again = propose(SEARCH, visit(PROBLEM, proposal.pose))
     assert not again.tied_with_best()[np.argmax(proposal.values)]
+
+
+@pytest.mark.parametrize("taken", [(), (3,), (3, 8), (0, 3, 8)])
+def test_of_what_is_gained_once_the_farthest_of_those_that_are_level(taken):
+    """Level is within two standard errors and, from the second view on, the mean of what is expected where cameras
+    were."""
+    problem = visit(PROBLEM.about(Once()), *[POSES[index] for index in taken])
+    scores, is_open = sample_by_sample(PROBLEM), ~np.isin(np.arange(12), taken)
+    values = np.where(is_open, scores.mean(axis=0), -np.inf)
+    differences = scores[:, [values.argmax()]] - scores
+    in_vain = scores.mean(axis=0)[list(taken)].mean() if len(taken) > 1 else 0.0
+    level = differences.mean(axis=0) <= 2.0 * differences.std(axis=0, ddof=1) / np.sqrt(3) + in_vain
+    places = np.asarray(POSES.position)
+    away = np.linalg.norm(places[:, None] - places[list(taken)], axis=-1).min(axis=1, initial=np.inf)
+    expected = np.argmax(np.where(level & is_open, away, -np.inf)) if taken else values.argmax()
+    assert (level & is_open).sum() > 1
+    found = propose(SEARCH, problem)
+    assert float(found.in_vain) == pytest.approx(in_vain, rel=1e-4)
+    np.testing.assert_array_equal(found.tied_with_best()[is_open], level[is_open])
+    np.testing.assert_array_equal(found.pose.position, found.candidates.position[expected])
+    assert float(found.value) == pytest.approx(values[expected], rel=1e-5)
+    assert float(found.standard_error) == pytest.approx(float(found.standard_errors[expected]))
+
+
+def test_of_what_is_gained_once_the_way_there_counts_for_more():
+    here, cost = nbv.look_at(jnp.array([0.0, 0.0, 2.5])), nbv.ValuePerCost(nbv.arc_length, fixed=1e-3)
+    problem = dataclasses.replace(visit(PROBLEM.about(Once()), here), cost=cost)
+    found = propose(SEARCH, problem)
+    assert float(found.value) == float(found.values.max())
+    assert found.in_vain is None
+
+
+def test_what_is_gained_once_and_is_no_number_is_told_of():
+    class Broken(Once):
+        def score(self, context, view):
+            return jnp.nan * view.scan.points[0, 0]
+
+    assert np.isnan(float(propose(SEARCH, PROBLEM.about(Broken())).value))
 
 
 def test_of_one_sample_no_errors_are_known():

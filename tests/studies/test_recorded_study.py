@@ -181,13 +181,13 @@ def voxels_of(study, depth, matrix):
 
 
 def test_its_voxels_are_those_that_three_frames_have_seen(study, sequence):
-    """Points are smoothed by a plane before they are counted, so a few lie in the next voxel."""
+    """By all pixels; a few lie in the next voxel by rounding."""
     seen = [voxels_of(study, *frame) for frame in zip(*sequence, strict=True)]
     often = {place for place in set().union(*seen) if sum(place in one for one in seen) >= 3}
     shown = study.recording.shown
-    assert shown.shape[1] == pytest.approx(len(often), rel=0.1)
+    assert shown.shape[1] == pytest.approx(len(often), rel=0.01)
     expected = [len(one & often) / len(often) for one in seen]
-    np.testing.assert_allclose(shown.mean(axis=1), expected, atol=0.05)
+    np.testing.assert_allclose(shown.mean(axis=1), expected, atol=0.01)
     assert (shown.sum(axis=0) >= 3).all()
 
 
@@ -243,9 +243,10 @@ def test_a_frame_that_looks_away_shows_nothing(sequence, tmp_path):
     assert (shown[:-1] > 0).all()
 
 
-def test_a_box_is_found_about_what_was_seen(sequence, tmp_path):
+def test_a_box_with_room_is_found_about_what_was_seen(sequence, tmp_path):
     plain(tmp_path, *sequence)
     box = RecordedStudy.configured("screened", VIEWS, quick=True, folder=tmp_path)[""].box
     # All of the ball but what faces away from all cameras.
-    np.testing.assert_allclose(box.high, [1.3, 2.3, 0.8], atol=0.06)
-    np.testing.assert_allclose(box.low[:2], [0.7, 1.95], atol=0.15)
+    np.testing.assert_allclose(box.high, [1.33, 2.33, 0.83], atol=0.03)
+    np.testing.assert_allclose(box.low[:2], [0.67, 1.92], atol=0.15)
+    assert (np.array(box.high) > [1.299, 2.299, 0.799]).all()
