@@ -27,6 +27,7 @@ from timing import least_time
 import jaxnbv as nbv
 from jaxnbv.acquisition import inputs_of, scores
 from jaxnbv.networks import pretrained_classifier
+from jaxnbv.planning.session import usual_planner
 from jaxnbv.planning.simulate import observe_scene
 from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.search.candidates import sphere_candidates
@@ -107,12 +108,12 @@ def coverage(bench: Bench) -> None:
 
 
 def sessions(bench: Bench) -> None:
-    """What sessions plan by: new surface by halving, 2,000 points kept."""
-    planner = nbv.Planner(nbv.NewSurface(), nbv.HalvingSearch(), capacity=2000)
+    """What sessions plan by."""
+    planner = usual_planner()
     second = bench.observations(planner, 2)
-    step = bench.take("new surface, halving, 2,000 points: the second step", lambda: planner.propose(second, bench.key))
+    step = bench.take("new surface, as sessions plan: the second step", lambda: planner.propose(second, bench.key))
     tenth = bench.observations(planner, 10)
-    bench.take("new surface, halving, 2,000 points: the tenth", lambda: planner.propose(tenth, bench.key), second=step)
+    bench.take("new surface, as sessions plan: the tenth", lambda: planner.propose(tenth, bench.key), second=step)
 
 
 def cross_entropy(bench: Bench) -> None:

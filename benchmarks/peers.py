@@ -185,7 +185,7 @@ def run(trial: Trial, methods: tuple[str, ...], rays: int, seed: int) -> dict:
         "boundary oracle": lambda: beyond_boundary(trial, first, seed, best=True),
     }
     searches = {
-        "new surface": nbv.HalvingSearch(trial.poses[spread(trial.poses)]),
+        "new surface": nbv.DiscreteSearch(trial.poses[spread(trial.poses)]),
         "farthest view": nbv.FarthestView(trial.poses),
     }
     for method in methods:

@@ -18,12 +18,11 @@ from pathlib import Path
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
 import jaxnbv as nbv
-from jaxnbv.acquisition import inputs_of, scores
+from jaxnbv.acquisition import inputs_of
 from jaxnbv.networks import part_segmenter, pretrained_classifier
 from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.planning.loop import view_keys
@@ -31,7 +30,7 @@ from jaxnbv.planning.stopping import Covered, Found, StopContext, Sure
 from jaxnbv.storage.files import write_text
 from jaxnbv.studies.engine.results import interval
 from jaxnbv.studies.scenes import Framing, Split, hidden_view, part_scene, pyramid_scene
-from jaxnbv.tasks.coverage import NewSurface, ShownArea
+from jaxnbv.tasks.coverage import cells_shown
 
 SIDE = Framing.WHOLE.longest_side
 FIRST = nbv.look_at((0.8, 0.9, 2.2))
@@ -83,7 +82,9 @@ def measured(task: str, index: int) -> dict:
             counts = planner.acquisition.answer(observations.cloud).values
             right.append(float((counts[np.asarray(thing.parts)] >= 60).all()))
         else:
-            right.append(_seen(surface, planner.camera, planner.search.candidates.poses(), observations.cloud))
+            unseen = planner.acquisition.context(inputs_of(observations))
+            new, shown = _cells(surface, unseen, planner.sampler.grid, planner.camera, planner.search.poses_around())
+            right.append(1.0 - float(new / shown))
         poses = tuple(view.pose for view in episode.views[:count])
         sample_key, *_ = view_keys(key, count)
         surfaces = functools.cache(functools.partial(planner.sampler.sample, observations, sample_key))
@@ -94,17 +95,7 @@ def measured(task: str, index: int) -> dict:
     return {"right": right, "ends": ends}
 
 
-def _seen(surface: nbv.SDFSurface, camera: nbv.Camera, poses: nbv.Pose, cloud: nbv.PointCloud) -> float:
-    """Share of the area that the camera would truly see, from all candidates, that is not new."""
-    new, shown = np.asarray(_areas(surface, camera, poses, cloud))
-    return 1.0 - float(new / shown)
-
-
-@eqx.filter_jit
-def _areas(surface: nbv.SDFSurface, camera: nbv.Camera, poses: nbv.Pose, cloud: nbv.PointCloud):
-    shown = ShownArea(NewSurface())
-    scans = nbv.scan(surface, camera, poses)
-    return jnp.sum(scores(shown, shown.context(inputs_of(cloud)), scans, camera, poses), axis=0)
+_cells = eqx.filter_jit(cells_shown)
 
 
 def table(task: str, records: list[dict]) -> str:

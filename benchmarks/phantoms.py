@@ -1,0 +1,173 @@
+"""How much of the new surface that is expected is there: ranks, phantoms and where they lie, promised against found.
+
+    python benchmarks/phantoms.py --recorded FOLDER ... [--box ...] [--up ...] [--starts 6] [--views 6]
+    python benchmarks/phantoms.py --mesh FILE ... [--above] [--bunny FILE] --work FOLDER
+
+Meshes are recorded first, into the folder that is given, by a camera with noise: whole in view, from all around, or
+with --above on a table from the upper half. A *phantom* is surface that the samples show, count as new, and that lies
+more than two voxels from anything that any frame of the recording shows. Each lies at the first of these that is true:
+
+    cut     within a voxel of a face of the box, or beyond it
+    empty   where a ray of a view that was taken went past, by a voxel
+    silent  along a ray of a view that was taken which came back with nothing
+    unseen  elsewhere
+
+Rows are means over the starts, after each view: *rank* correlation of the expected with the true gain over frames that
+were not taken; *chosen*, the true gain of the best of them by expectation, of the largest there is; *phantom*, share of
+the expected area; the kinds, as shares of it; *covered*, the share that `Covered` expects to be seen, beside what is
+*seen*; *promised* and *found*, the area that was expected of the frame that was taken and that its image added, in
+squared scene units.
+"""
+
+import argparse
+import itertools
+from collections.abc import Iterable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from recordings import Recorded, of_bunny, of_mesh, study_of
+from scipy.spatial import cKDTree
+from scipy.stats import spearmanr
+
+from jaxnbv.acquisition import ImaginedView
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.planning.loop import Loop, Step
+from jaxnbv.scanning import scan
+from jaxnbv.scanning.looks import STEEP
+from jaxnbv.studies.recorded import NEW_AREA, RecordedStudy, frame_of_box
+from jaxnbv.tasks.coverage import Unseen, seen_share, visible_area
+
+KINDS = ("cut", "empty", "silent", "unseen")
+COLUMNS = ("rank", "chosen", "phantom", *KINDS, "covered", "promised", "found", "seen")
+
+
+class Case:
+    """A recording as a study, and what all of its frames show, in scene units."""
+
+    def __init__(self, recorded: Recorded, views: int):
+        self.study = study_of(recorded, views)
+        self.recording = self.study.recording
+        frame = frame_of_box(self.study.box)
+        self.voxel = frame.scale * self.study.voxel
+        self.shown = cKDTree(np.asarray(frame.to_scene(jnp.asarray(self.recording.voxels))))
+
+    def rows(self, start: int) -> Iterable[list[float]]:
+        """The columns after each view of an episode of the study's own."""
+        study, scene = self.study, self.study.scene(start)
+        planner, recording = study.planner(NEW_AREA, scene), self.recording
+        loop = Loop(planner, study.key(start, "episode"), camera=study.camera)
+        taken: list[int] = []
+        first = recording.poses[study.first_view(scene)]
+        before: tuple[float, Unseen] | None = None
+        for step in itertools.islice(loop.steps(study.sensor(scene), first), study.views):
+            taken.append(study.frame_of(step.view.pose))
+            row = [np.nan] * len(COLUMNS)
+            row[-1] = float(recording.shown[taken].any(axis=0).mean())
+            if before is not None:
+                row[-3:-1] = before[0], float(_new_area(step.view.scan, step.view.pose, study, before[1]))
+            if len(taken) < study.views:
+                inputs = loop.inputs()
+                unseen = planner.acquisition.context(inputs)
+                before = float(loop.propose().value), unseen
+                row[:-3] = self._judge(inputs.surfaces, unseen, step, taken)
+            yield row
+
+    def _judge(self, surfaces, unseen: Unseen, step: Step, taken: list[int]) -> list[float]:
+        recording, camera = self.recording, self.study.imagined_camera
+        areas, points = _expected(surfaces, unseen, camera, recording.poses)
+        expected = np.asarray(areas.sum(axis=-1).mean(axis=0))
+        known = recording.shown[taken].any(axis=0)
+        gain = (recording.shown & ~known).sum(axis=1)
+        left = ~np.isin(np.arange(len(gain)), taken)
+        varies = np.ptp(expected[left]) > 0 and np.ptp(gain[left]) > 0
+        rank = float(spearmanr(expected[left], gain[left])[0]) if varies else np.nan
+        chosen = gain[left][expected[left].argmax()] / max(1, gain[left].max())
+        weights, places = np.asarray(areas).reshape(-1), np.asarray(points).reshape(-1, 3)
+        weights, places = weights[weights > 0], places[weights > 0]
+        phantom = self.shown.query(places)[0] > 2.0 * self.voxel
+        kinds = self._kinds(places[phantom], taken)
+        share = weights[phantom].sum() / max(weights.sum(), 1e-9)
+        of_kind = [weights[phantom][kinds == kind].sum() / max(weights[phantom].sum(), 1e-9) for kind in range(4)]
+        covered = float(seen_share(unseen, surfaces, camera, recording.poses))
+        return [rank, chosen, share, *of_kind, covered]
+
+    def _kinds(self, places: np.ndarray, taken: list[int]) -> np.ndarray:
+        study, recording = self.study, self.recording
+        volume = study.sampler.carving.volume
+        cut = np.asarray(volume(jnp.asarray(places))) > -self.voxel
+        empty, silent = np.zeros(len(places), bool), np.zeros(len(places), bool)
+        camera = study.camera
+        for index in taken:
+            pose, seen = recording.poses[index], recording.scans[index]
+            local = (places - np.asarray(pose.position)) @ np.asarray(pose.rotation)
+            ahead = local[:, 2] > 0
+            pixel = np.asarray(camera.to_pixels(jnp.asarray(local[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None])))
+            column, row = np.floor(pixel).astype(int).T
+            inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+            ray = np.where(inside, row * camera.width + column, 0)
+            sight = np.asarray(seen.sight)[ray]
+            returned = np.isfinite(sight)
+            empty |= inside & returned & (sight > np.linalg.norm(local, axis=1) + self.voxel)
+            silent |= inside & ~returned
+        return np.select([cut, empty, silent], [0, 1, 2], 3)
+
+
+@jax.jit
+def _expected(surfaces, unseen: Unseen, camera, poses: Pose):
+    def of_sample(surface):
+        def of_pose(pose):
+            seen = scan(surface, camera, pose)
+            return visible_area(ImaginedView(seen, camera, pose), STEEP) * unseen(seen.points), seen.points
+
+        return jax.lax.map(of_pose, poses, batch_size=32)
+
+    return jax.lax.map(of_sample, surfaces)
+
+
+def _new_area(seen: PointCloud, pose: Pose, study: RecordedStudy, unseen: Unseen):
+    return jnp.sum(visible_area(ImaginedView(seen, study.camera, pose), STEEP) * unseen(seen.points))
+
+
+def measured(case: Case, starts: int) -> np.ndarray:
+    """(views, columns), the mean over starts."""
+    return np.mean([list(case.rows(start)) for start in range(starts)], axis=0)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--recorded", type=Path, nargs="*", default=[])
+    parser.add_argument("--box", type=float, nargs=6)
+    parser.add_argument("--up", type=float, nargs=3)
+    parser.add_argument("--mesh", type=Path, nargs="*", default=[])
+    parser.add_argument("--above", action="store_true")
+    parser.add_argument("--bunny", type=Path)
+    parser.add_argument("--work", type=Path, help="where recordings are made")
+    parser.add_argument("--starts", type=int, default=6)
+    parser.add_argument("--views", type=int, default=6)
+    args = parser.parse_args()
+    cases = [Recorded(folder.name, folder, args.box, args.up) for folder in args.recorded]
+    for file in args.mesh:
+        cases.append(of_mesh(file, args.work / f"{file.stem}-{'above' if args.above else 'around'}", args.above))
+    if args.bunny is not None:
+        cases.append(of_bunny(args.bunny, args.work / "bunny"))
+    tables = []
+    for recorded in cases:
+        # Each has a box of its own, and so programs of its own: those of twenty do not fit in memory's map.
+        jax.clear_caches()
+        tables.append(measured(Case(recorded, args.views), args.starts))
+        _show(recorded.name, tables[-1])
+    if len(tables) > 1:
+        _show(f"mean of {len(tables)}", np.mean(tables, axis=0))
+
+
+def _show(name: str, table: np.ndarray) -> None:
+    print(f"\n{name}\nview " + " ".join(f"{column:>8}" for column in COLUMNS))
+    for view, row in enumerate(table, start=1):
+        print(f"{view:4d} " + " ".join(f"{'':>8}" if np.isnan(value) else f"{value:8.2f}" for value in row), flush=True)
+
+
+if __name__ == "__main__":
+    main()

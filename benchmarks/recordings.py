@@ -1,0 +1,173 @@
+"""Recordings of known objects, as folders that `RecordedFrames` reads: what a noisy depth camera sees of a mesh on a
+table, and the range scans of the Stanford bunny. And how much of them views by new surface show.
+
+    python benchmarks/recordings.py --mesh FILE ... --work FOLDER [--above] [--starts 2] [--views 6]
+
+Each object is a study of a recording (`jaxnbv study recorded`), with other first views for each start. The table has
+the share of the voxels seen after views 2 and on, mean over objects; then new surface less each other, with paired 90 %
+intervals over objects, and at last the mean over the views.
+"""
+
+import argparse
+import itertools
+import json
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from PIL import Image
+
+import jaxnbv as nbv
+from jaxnbv.geometry.pose import fibonacci_sphere
+from jaxnbv.planning.loop import Loop
+from jaxnbv.scanning import TriangleMesh
+from jaxnbv.scanning.sensors import Setting, fitted
+from jaxnbv.studies.engine.results import interval
+from jaxnbv.studies.recorded import NEW_AREA, ORACLE, RecordedStudy
+
+# 640 x 480 pixels, f = 600; nothing steeper than 75 degrees returns.
+_INTRINSICS = np.array([[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]])
+_CAMERA = nbv.Camera(2.0 * math.atan(0.4), 480, 640, max_incidence=math.radians(75.0))
+# The longest side of an object in metres; the noise at a metre, and a unit of the images.
+_SIDE, _NOISE, _UNIT = 0.5, 1e-3, 1e-4
+# Poses on the whole sphere, and on its upper half.
+_AROUND, _ABOVE = 60, 40
+_HALF_TABLE = 20.0
+# How far from the bunny its range scans are drawn from, in metres: the sensor's rays were nearly parallel.
+_FAR, _BUNNY_PIXELS = 1.0, 600.0
+
+
+class Recorded(NamedTuple):
+    """A recording: its name, its folder, and the box that a study is to look at, with what is upward in its world."""
+
+    name: str
+    folder: Path
+    box: tuple[float, ...] | None = None
+    up: tuple[float, float, float] | None = None
+
+
+def of_mesh(file: Path, folder: Path, above: bool) -> Recorded:
+    """A mesh seen whole from all around, or with `above` on a table from the upper half. Written once."""
+    mesh = nbv.load_mesh(file)
+    extents = np.ptp(mesh.vertices, axis=0)
+    size = _SIDE / extents.max() * np.array([extents[0], extents[2], extents[1]])
+    corners = np.array([[-0.5 * size[0], -0.5 * size[1], 0.0], [0.5 * size[0], 0.5 * size[1], size[2]]])
+    frame = nbv.Frame.fit(corners, up="z")
+    # The table's noise stays below the box.
+    room = np.array([[-0.03, -0.03, 0.02 if above else -0.03], [0.03, 0.03, 0.03]])
+    box = tuple((corners + _SIDE * room).reshape(-1).tolist())
+    recorded = Recorded(f"{file.stem}, {'above' if above else 'around'}", folder, box)
+    if (folder / "frames.json").exists():
+        return recorded
+    if above:
+        mesh = _on_table(mesh, -0.5 * extents[1])
+    radius = fitted(Setting(_CAMERA, 1.0, 1), float(np.linalg.norm(extents)) / 2.0).radius
+    count, lowest = (_ABOVE, math.radians(10.0)) if above else (_AROUND, -math.pi / 2)
+    poses = nbv.look_at(fibonacci_sphere(count, radius, lowest))
+    noise = nbv.DepthNoise(_NOISE, scale=frame.scale)
+    images = []
+    for index, pose in enumerate(poses):
+        seen = nbv.scan(mesh, _CAMERA, pose)
+        depth = np.where(seen.mask, (seen.points - pose.position) @ pose.forward, 0.0)
+        measured = noise.measured(depth, jax.random.key(index))
+        images.append(np.asarray(measured, np.float64).reshape(_CAMERA.height, _CAMERA.width) / frame.scale)
+    matrices = np.asarray(frame.to_world(poses).to_matrix(), np.float64)
+    _write(folder, images, matrices, _INTRINSICS)
+    return recorded
+
+
+def of_bunny(file: Path, folder: Path) -> Recorded:
+    """The ten range scans of the Stanford bunny, drawn from a metre away each."""
+    recorded = Recorded("bunny", folder)
+    if (folder / "frames.json").exists():
+        return recorded
+    data = np.load(file)
+    ends = np.cumsum(data["count"])
+    images, matrices = [], []
+    for points, rotation, shift in zip(np.split(data["points_10um"], ends[:-1]), data["R"], data["t"], strict=True):
+        own = points * 1e-5
+        middle = own.mean(axis=0)
+        # The sensor looks along -z of its own coordinates, y up; the camera along its z, y down.
+        local = (own - middle) * (1.0, -1.0, -1.0) + np.array([0.0, 0.0, _FAR])
+        column, row = np.round(_BUNNY_PIXELS * local[:, :2] / local[:, 2:] + 120.0).astype(int).T
+        image = np.full((240, 240), np.inf)
+        np.minimum.at(image, (row, column), local[:, 2])
+        images.append(np.where(np.isfinite(image), image, 0.0))
+        matrix = np.eye(4)
+        matrix[:3, :3] = rotation @ np.diag([1.0, -1.0, -1.0])
+        matrix[:3, 3] = rotation @ (middle + np.array([0.0, 0.0, _FAR])) + shift
+        matrices.append(matrix)
+    _write(
+        folder, images, np.stack(matrices), np.array([[_BUNNY_PIXELS, 0, 120.5], [0, _BUNNY_PIXELS, 120.5], [0, 0, 1]])
+    )
+    return recorded
+
+
+def _on_table(mesh: TriangleMesh, height: float) -> TriangleMesh:
+    far = _HALF_TABLE
+    corners = [[-far, height, -far], [far, height, -far], [far, height, far], [-far, height, far]]
+    vertices = np.concatenate([mesh.vertices, corners])
+    faces = np.concatenate([mesh.faces, len(mesh.vertices) + np.array([[0, 2, 1], [0, 3, 2]])])
+    return TriangleMesh(vertices, faces, mesh.frame)
+
+
+def _write(folder: Path, images: list[np.ndarray], matrices: np.ndarray, intrinsics: np.ndarray) -> None:
+    """Images in metres."""
+    folder.mkdir(parents=True, exist_ok=True)
+    frames = []
+    for index, (image, matrix) in enumerate(zip(images, matrices, strict=True)):
+        name = f"depth-{index:03}.png"
+        Image.fromarray(np.clip(np.round(image / _UNIT), 0, 65534).astype(np.uint16)).save(folder / name)
+        frames.append({"depth": name, "pose": matrix.tolist()})
+    said = {"intrinsics": intrinsics.tolist(), "depth_scale": _UNIT, "frames": frames}
+    (folder / "frames.json").write_text(json.dumps(said))
+
+
+def study_of(recorded: Recorded, views: int) -> RecordedStudy:
+    options = {"folder": recorded.folder, "box": recorded.box, "up": recorded.up}
+    return RecordedStudy.configured("screened", views, False, **options)[""]
+
+
+def covered(study: RecordedStudy, method: str, start: int) -> np.ndarray:
+    """Share of the voxels that the views of a method have shown, after each."""
+    scene = study.scene(start)
+    first = study.recording.poses[study.first_view(scene)]
+    loop = Loop(study.planner(method, scene), study.key(start, "episode"), camera=study.camera)
+    steps = itertools.islice(loop.steps(study.sensor(scene), first), study.views)
+    frames = [study.frame_of(step.view.pose) for step in steps]
+    return np.logical_or.accumulate(study.recording.shown[frames]).mean(axis=1)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--mesh", type=Path, nargs="+", required=True)
+    parser.add_argument("--work", type=Path, required=True, help="where recordings are made")
+    parser.add_argument("--above", action="store_true")
+    parser.add_argument("--starts", type=int, default=2)
+    parser.add_argument("--views", type=int, default=6)
+    args = parser.parse_args()
+    seen: dict[str, list[np.ndarray]] = {method: [] for method in (NEW_AREA, "farthest", "random", ORACLE)}
+    for file in args.mesh:
+        # Each has a box of its own, and so programs of its own: those of twenty do not fit in memory's map.
+        jax.clear_caches()
+        folder = args.work / f"{file.stem}-{'above' if args.above else 'around'}"
+        study = study_of(of_mesh(file, folder, args.above), args.views)
+        for method, rows in seen.items():
+            rows.append(np.mean([covered(study, method, start) for start in range(args.starts)], axis=0)[1:])
+        print(file.stem, *(f"{method} {np.round(100 * rows[-1], 1)}" for method, rows in seen.items()), flush=True)
+    own = np.array(seen[NEW_AREA])
+    for method, rows in seen.items():
+        print(f"{method:12}", np.round(100 * np.mean(rows, axis=0), 1))
+    for method in ("farthest", "random"):
+        less = 100 * (own - np.array(seen[method]))
+        less = np.concatenate([less, less.mean(axis=1, keepdims=True)], axis=1)
+        shown = [
+            f"{mean:.1f} [{low:.1f}, {high:.1f}]" for mean, low, high in zip(less.mean(0), *interval(less), strict=True)
+        ]
+        print(f"less {method:8}", "  ".join(shown))
+
+
+if __name__ == "__main__":
+    main()
