@@ -222,7 +222,7 @@ class Session:
     def next(self) -> NextView:
         """Where to take the next image. It is stored, and the same until an image is added; what was proposed once is
         not proposed again, for where the sensor could not be held it need not be tried twice. Warns where the best view
-        is worth no more than three standard errors.
+        is worth no more than three standard errors and what is expected in vain.
 
         **Raises:** `ValueError` before the first image, as `Planner.propose` does, or if another process has added
         images to the folder.

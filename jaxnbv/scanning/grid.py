@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int8
+from jaxtyping import Array, Bool, Float, Int, Int8
 from scipy.spatial import cKDTree
 
 from jaxnbv.checks import AnyArray, as_floats, check_fields, is_traced, require
@@ -42,6 +42,10 @@ class Grid(eqx.Module):
     def spacing(self) -> float:
         """Distance between neighbouring nodes, in scene units."""
         return 2.0 * self.half_extent / (self.resolution - 1)
+
+    def cell_of(self, points: Float[Array, "*n 3"]) -> Int[Array, "*n 3"]:
+        """The cell that each of some points (scene units) lies in; outside the grid below 0 or beyond its cells."""
+        return jnp.floor((points + self.half_extent) / self.spacing).astype(jnp.int32)
 
     def check(self, cloud: PointCloud) -> None:
         """Warn of parts that are thinner than a cell: points within one that look in opposite directions."""

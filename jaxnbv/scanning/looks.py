@@ -121,8 +121,8 @@ def _looked_at_in_vain(surface: GridSurface, looks: Looks, poses: PoseList) -> B
         passed = jnp.isfinite(sight) & ((sight - away) * cosine > spacing)
         in_vain = seen.mask & (passed | (cosine >= STEEP) & (away <= sight + spacing))
         in_vain &= looks(seen.points) > spacing
-        cell = jnp.floor((seen.points + looks.grid.half_extent) / spacing).astype(jnp.int32)
-        return found.at[tuple(jnp.where(in_vain[:, None], cell, looks.grid.resolution).T)].set(True, mode="drop")
+        cell = jnp.where(in_vain[:, None], looks.grid.cell_of(seen.points), looks.grid.resolution)
+        return found.at[tuple(cell.T)].set(True, mode="drop")
 
     found = jax.lax.fori_loop(0, poses.count, look, jnp.zeros(surface.distance.shape, bool))
     # Rays are farther apart than cells.

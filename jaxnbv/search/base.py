@@ -153,12 +153,10 @@ def best_unvisited(
     )
 
 
-def best_or_farthest(
-    problem: Problem, candidates: Pose, scores: Float[Array, "samples candidates"], tie: float = _TIE
-) -> Proposal:
+def best_or_farthest(problem: Problem, candidates: Pose, scores: Float[Array, "samples candidates"]) -> Proposal:
     """`best_unvisited`; of an acquisition that `gains_once`, the farthest from the cameras so far among the candidates
     that are level with it, unless a cost counts, which would speak against it."""
-    found = best_unvisited(problem, candidates, jnp.mean(scores, axis=0), tie, scores)
+    found = best_unvisited(problem, candidates, jnp.mean(scores, axis=0), scores=scores)
     if not problem.acquisition.gains_once or problem.cost is not None:
         return found
     found = dataclasses.replace(found, in_vain=problem.expected_in_vain())

@@ -77,14 +77,12 @@ class Problem(eqx.Module):
         return values if self.cost is None else self.cost(values, self.observations, poses)
 
     def expected_in_vain(self) -> Float[Array, ""]:
-        """What the acquisition expects of the poses that were taken, on average, where these have nothing more to give:
-        by so much it may be wrong elsewhere. Zero before there are two, and for an acquisition that may gain twice.
+        """What the acquisition expects of the poses that were taken, on average, in its own units and without cost.
+        Where these have nothing more to give, it may be wrong by so much elsewhere. Zero before there are two.
 
         The first view alone tells little: what it shows at a slant is steep to it, and not in vain.
         """
         taken = self.observations.poses
-        if not self.acquisition.gains_once:
-            return jnp.zeros((), taken.rows.position.dtype)
         uncosted = dataclasses.replace(self, cost=None)
 
         def add(index, total):

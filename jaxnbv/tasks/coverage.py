@@ -171,8 +171,7 @@ def cells_shown(
     points, measured = scans.points.reshape(-1, 3), (scans.mask & (cosine >= GRAZING)).reshape(-1)
 
     def number(kept):
-        cell = jnp.floor((points + grid.half_extent) / grid.spacing).astype(jnp.int32)
-        cell = jnp.where(kept[:, None], cell, grid.resolution)
+        cell = jnp.where(kept[:, None], grid.cell_of(points), grid.resolution)
         found = jnp.zeros((grid.resolution,) * 3, bool).at[tuple(cell.T)].set(True, mode="drop")
         return jnp.sum(found)
 

@@ -104,8 +104,9 @@ def _answers(episode: Episode, views: Sequence[View]) -> Sequence[Answer]:
 
 def seen_after(episode: Episode, truth: Float[AnyArray, "n 3"] | None) -> list[CoverageAnswer]:
     """How much of the surface was seen after each view: the share of the true one, of which points are given in scene
-    coordinates; else the area that each scan shows and none before it has shown, summed up, by the acquisition where it
-    is a `NewSurface`, so that it is what was promised, and by the default one where not. Areas are in world units."""
+    coordinates; else the area that each scan shows and none before it has shown, summed up: what is new to the
+    acquisition where it is a `NewSurface`, and to the default one where not. What was measured at a slant counts for
+    all of its area here, and for less where it is promised. Areas are in world units."""
     views, acquisition = episode.views, episode.planner.acquisition
     if truth is not None:
         shares = [100.0 * float(share) for share in coverage(views, truth)]
