@@ -19,7 +19,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.pose_list import PoseList
 from jaxnbv.scanning.grid import Grid, GridSurface
-from jaxnbv.scanning.scanner import scan
+from jaxnbv.scanning.scanner import Surface, scan
 from jaxnbv.sharding import shared_map
 
 # In spacings of the grid: up to here distances to hits are kept.
@@ -107,22 +107,28 @@ class Looks(eqx.Module):
         """
         return surfaces.void(shared_map(_looked_at_in_vain, surfaces, self, poses))
 
+    def cells_in_vain(self, surface: Surface, index: Int[Array, ""] | int, pose: Pose) -> Int[Array, "rays 3"]:
+        """The cells of the grid that hold what one view looked at of a surface and has not measured, see `measurable`;
+        beyond the grid's cells for a ray that shows none.
 
-def _looked_at_in_vain(surface: GridSurface, looks: Looks, poses: PoseList) -> Bool[Array, "m m m"]:
-    spacing = looks.grid.spacing
-
-    def look(index, found):
-        pose = jax.tree.map(lambda rows: rows[index], poses.rows)
-        seen = scan(surface, looks.camera, pose)
+        - `index`: of the view, from 0; `pose`: its own.
+        """
+        spacing = self.grid.spacing
+        seen = scan(surface, self.camera, pose)
         offset = seen.points - pose.position
         away = jnp.linalg.norm(offset, axis=-1)
-        cosine, sight = -jnp.sum(offset * seen.normals, axis=-1) / away, looks.sight[index]
+        cosine, sight = -jnp.sum(offset * seen.normals, axis=-1) / away, self.sight[index]
         # Steep ones need not return; but a ray that was met by something deeper has passed.
         passed = jnp.isfinite(sight) & ((sight - away) * cosine > spacing)
         in_vain = seen.mask & (passed | (cosine >= STEEP) & (away <= sight + spacing))
-        in_vain &= looks(seen.points) > spacing
-        cell = jnp.where(in_vain[:, None], looks.grid.cell_of(seen.points), looks.grid.resolution)
-        return found.at[tuple(cell.T)].set(True, mode="drop")
+        in_vain &= self(seen.points) > spacing
+        return jnp.where(in_vain[:, None], self.grid.cell_of(seen.points), self.grid.resolution)
+
+
+def _looked_at_in_vain(surface: GridSurface, looks: Looks, poses: PoseList) -> Bool[Array, "m m m"]:
+    def look(index, found):
+        cells = looks.cells_in_vain(surface, index, jax.tree.map(lambda rows: rows[index], poses.rows))
+        return found.at[tuple(cells.T)].set(True, mode="drop")
 
     found = jax.lax.fori_loop(0, poses.count, look, jnp.zeros(surface.distance.shape, bool))
     # Rays are farther apart than cells.

@@ -24,6 +24,7 @@ from jaxnbv.viz.sketches import Sketch, Sketches, sketches_of
 from jaxnbv.viz.stage import Stage, stage_of
 from jaxnbv.viz.style import middle_range
 from jaxnbv.viz.task import Task, task_of
+from jaxnbv.viz.unmeasured import unmeasured_words
 from jaxnbv.viz.words import told
 
 
@@ -123,6 +124,8 @@ def report_data(
             answered = words_of(task.answers[index]).said(task.answers[index - 1] if index else None)
             words["What came"] += f" {capital(answered)}."
         before = episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), np.float32)
+        if next_one.unmeasured:
+            words["Never measured"] = unmeasured_words(next_one.unmeasured, frame)
         look = taken_look(view, before)
         surface = next_one.surface
         if surface is not None:

@@ -1,7 +1,7 @@
 """What costs most of an episode's pictures, drawn step by step while what a step imagined is at hand."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from jaxnbv.planning.episode import Episode
@@ -9,6 +9,7 @@ from jaxnbv.planning.loop import Step, view_keys
 from jaxnbv.sampler import StepInputs
 from jaxnbv.viz.imagined import Imagined, imagined
 from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
+from jaxnbv.viz.unmeasured import Patch, unmeasured
 
 
 class Sketch(NamedTuple):
@@ -17,10 +18,12 @@ class Sketch(NamedTuple):
     - `surface`: of the posterior mean, where it holds points, with a deviation that allows for what was not seen; None
       where it has none.
     - `imagined`: None for a view that was not chosen, or not taken.
+    - `unmeasured`: patches of that surface that views looked at and did not measure.
     """
 
     surface: MeanSurface | None
     imagined: Imagined | None
+    unmeasured: Sequence[Patch] = ()
 
 
 class Sketches:
@@ -61,8 +64,10 @@ def sketches_of(episode: Episode, held: Mapping[int, Sketch], imagine: bool) -> 
 
 
 def _sketch(episode: Episode, index: int, inputs: StepInputs, imagine: bool = True) -> Sketch:
-    mean = mean_surface(episode.planner.sampler, inputs)
+    sampler, observations = episode.planner.sampler, inputs.observations
+    surface = as_shown(mean_surface(sampler, inputs), observations.cloud)
+    patches = [] if surface is None else unmeasured(surface.mesh, observations, sampler.carving)
     seen = None
     if imagine and inputs.surfaces is not None and index < len(episode.views):
         seen = imagined(episode, index, inputs)
-    return Sketch(as_shown(mean, inputs.observations.cloud), seen)
+    return Sketch(surface, seen, patches)

@@ -1,0 +1,75 @@
+"""Surface that views looked at and did not measure: it is too dark or too shiny, or it is not there."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from scipy.ndimage import binary_dilation
+
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.observations import Observations
+from jaxnbv.scanning import Carving, TriangleMesh
+from jaxnbv.viz.answers import coordinates, number
+
+# Once may be chance. Smaller patches than this share of the surface are not worth a sentence.
+_LOOKS, _SHARE, _PATCHES = 2, 0.005, 3
+
+
+class Patch(NamedTuple):
+    """One piece of surface that was not measured, in scene units: its area, its middle, how many views looked at it."""
+
+    area: float
+    middle: Float[np.ndarray, "3"]
+    looks: int
+
+
+def unmeasured(surface: trimesh.Trimesh, observations: Observations, carving: Carving | None) -> list[Patch]:
+    """The largest patches of a surface (scene coordinates) that at least two views looked at and did not measure, the
+    largest first. What the carving volume cuts is none.
+
+    - `surface`: what the observations say of the object, such as the posterior's mean.
+    """
+    looks = observations.looks
+    if looks is None or len(surface.faces) == 0:
+        return []
+    mesh, count = TriangleMesh(surface.vertices, surface.faces, Frame()), int(observations.num_views)
+    cells = np.asarray(looks.grid.cell_of(jnp.asarray(surface.triangles_center)))
+    times = np.zeros((looks.grid.resolution + 2,) * 3, int)
+    for index in range(count):
+        in_vain = np.zeros(times.shape, bool)
+        seen = np.asarray(looks.cells_in_vain(mesh, index, observations.poses.rows[index]))
+        in_vain[tuple(seen[(seen < looks.grid.resolution).all(axis=1)].T + 1)] = True
+        # Rays are farther apart than cells.
+        times += binary_dilation(in_vain, np.ones((3, 3, 3)))
+    of_face = times[tuple(np.clip(cells, -1, looks.grid.resolution).T + 1)]
+    chosen = of_face >= _LOOKS
+    if carving is not None:
+        chosen &= np.asarray(carving.volume(jnp.asarray(surface.triangles_center))) < -looks.grid.spacing
+    pieces = trimesh.graph.connected_components(
+        surface.face_adjacency[chosen[surface.face_adjacency].all(axis=1)], nodes=np.nonzero(chosen)[0]
+    )
+    patches = [_patch(surface, faces, of_face) for faces in pieces]
+    patches = [patch for patch in patches if patch.area > _SHARE * surface.area]
+    return sorted(patches, key=lambda patch: -patch.area)[:_PATCHES]
+
+
+def unmeasured_words(patches: Sequence[Patch], frame: Frame) -> str:
+    """What was looked at and not measured, in a sentence, in the world of a frame."""
+    said = [
+        f"{number(float(frame.length_to_world(patch.area, 2)))} {frame.unit}² about {coordinates(patch.middle, frame)} "
+        f"({patch.looks} looks)"
+        for patch in patches
+    ]
+    return (
+        f"Views looked at {', '.join(said)} and measured nothing there: the surface is too dark or too shiny for the "
+        "sensor, or it is not there."
+    )
+
+
+def _patch(surface: trimesh.Trimesh, faces: np.ndarray, times: np.ndarray) -> Patch:
+    areas = surface.area_faces[faces]
+    middle = np.average(surface.triangles_center[faces], axis=0, weights=areas)
+    return Patch(float(areas.sum()), middle, int(np.median(times[faces])))
