@@ -31,14 +31,13 @@ from recordings import Recorded, of_bunny, of_mesh, study_of
 from scipy.spatial import cKDTree
 from scipy.stats import spearmanr
 
-from jaxnbv.acquisition import ImaginedView
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.loop import Loop, Step
-from jaxnbv.scanning import scan
+from jaxnbv.scanning import pixel_area, scan
 from jaxnbv.scanning.looks import STEEP
 from jaxnbv.studies.recorded import NEW_AREA, RecordedStudy, frame_of_box
-from jaxnbv.tasks.coverage import Unseen, seen_share, visible_area
+from jaxnbv.tasks.coverage import Unseen, seen_share
 
 KINDS = ("cut", "empty", "silent", "unseen")
 COLUMNS = ("rank", "chosen", "phantom", *KINDS, "covered", "promised", "found", "seen")
@@ -120,7 +119,7 @@ def _expected(surfaces, unseen: Unseen, camera, poses: Pose):
     def of_sample(surface):
         def of_pose(pose):
             seen = scan(surface, camera, pose)
-            return visible_area(ImaginedView(seen, camera, pose), STEEP) * unseen(seen.points), seen.points
+            return pixel_area(seen, camera, pose, STEEP) * unseen(seen.points), seen.points
 
         return jax.lax.map(of_pose, poses, batch_size=32)
 
@@ -128,7 +127,7 @@ def _expected(surfaces, unseen: Unseen, camera, poses: Pose):
 
 
 def _new_area(seen: PointCloud, pose: Pose, study: RecordedStudy, unseen: Unseen):
-    return jnp.sum(visible_area(ImaginedView(seen, study.camera, pose), STEEP) * unseen(seen.points))
+    return jnp.sum(pixel_area(seen, study.camera, pose, STEEP) * unseen(seen.points))
 
 
 def measured(case: Case, starts: int) -> np.ndarray:

@@ -20,6 +20,7 @@ from jaxnbv.scanning.scanner import Hits as Hits
 from jaxnbv.scanning.scanner import Noise as Noise
 from jaxnbv.scanning.scanner import SensorNoise as SensorNoise
 from jaxnbv.scanning.scanner import Surface as Surface
+from jaxnbv.scanning.scanner import pixel_area as pixel_area
 from jaxnbv.scanning.scanner import scan as scan
 from jaxnbv.scanning.screened_poisson import screened_poisson as screened_poisson
 from jaxnbv.scanning.sphere_tracing import SDFSurface as SDFSurface

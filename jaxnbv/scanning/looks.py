@@ -19,7 +19,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.pose_list import PoseList
 from jaxnbv.scanning.grid import Grid, GridSurface
-from jaxnbv.scanning.scanner import Surface, scan
+from jaxnbv.scanning.scanner import Surface, pixel_area, scan
 from jaxnbv.sharding import shared_map
 
 # In spacings of the grid: up to here distances to hits are kept.
@@ -35,7 +35,7 @@ _RAYS = 5_000
 class Looks(eqx.Module):
     """What the rays of all views came back with. Immutable and of fixed shapes.
 
-    - `distance`: from each node of the grid to the nearest hit, in scene units, at most `reach`.
+    - `distance`: from each node of the grid to the nearest pixel on the surface, in scene units, at most `reach`.
     - `sight`: how far each view saw along the rays of `camera`, see `PointCloud`; zero beside its image.
     """
 
@@ -57,13 +57,17 @@ class Looks(eqx.Module):
         return _REACH * self.grid.spacing
 
     @eqx.filter_jit
-    def with_points(self, cloud: PointCloud) -> "Looks":
-        """The looks with a cloud's points as hits."""
+    def with_points(self, cloud: PointCloud, radii: Float[Array, " n"] | float = 0.0) -> "Looks":
+        """The looks with a cloud's points as hits.
+
+        - `radii`: how far each of them reaches, in scene units; a spacing of the grid at most counts.
+        """
+        radii = jnp.minimum(radii, self.grid.spacing)
         place = (cloud.points + self.grid.half_extent) / self.grid.spacing
         low, distance = jnp.floor(place).astype(jnp.int32), self.distance
         for offset in itertools.product(range(1 - _REACH, _REACH + 1), repeat=3):
             node = low + jnp.array(offset)
-            away = self.grid.spacing * jnp.linalg.norm(node - place, axis=-1)
+            away = jnp.maximum(self.grid.spacing * jnp.linalg.norm(node - place, axis=-1) - radii, 0.0)
             # A negative index would count from the other end.
             there = cloud.mask & jnp.all(node >= 0, axis=-1)
             index = jnp.where(there[:, None], node, self.grid.resolution)
@@ -83,7 +87,8 @@ class Looks(eqx.Module):
         - `index`: of the view, from 0; `camera`: the one that took it.
         - `barrier`: how far along each of its rays an obstacle stands; what is behind it was not looked at.
         """
-        looks = self.with_points(scan)
+        # Half the diagonal of a pixel on the surface: what lies between the rays of few pixels is not new.
+        looks = self.with_points(scan, jnp.sqrt(jnp.maximum(0.5 * pixel_area(scan, camera, pose, STEEP), 0.0)))
         if scan.sight is None:
             return looks
         far = scan.sight if barrier is None else jnp.minimum(scan.sight, barrier)

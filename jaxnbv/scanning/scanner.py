@@ -248,3 +248,20 @@ def _implicit_depth_jvp(primals, tangents):
     slope = jnp.where(jnp.abs(slope) < grazing, jnp.where(slope < 0, -grazing, grazing), slope)
     _, change = eqx.filter_jvp(lambda field: field(depth), (along,), (tangents[0],))
     return depth, jnp.where(mask, -change / jnp.where(slope == 0, 1.0, slope), 0.0)
+
+
+def pixel_area(scan: PointCloud, camera: Camera, pose: Pose, steepest: float) -> Float[Array, " rays"]:
+    """The area of each pixel on the surface that it shows, in squared scene units; zero where it shows none.
+
+    A pixel of focal lengths fx and fy at depth z and distance r has r^2 omega / cos = z^3 / (r fx fy cos).
+
+    - `scan`: of the camera's rays from the pose. `steepest`: the least cosine of incidence at which a pixel counts for
+      all of its area.
+    """
+    offset = jnp.where(scan.mask[:, None], scan.points - pose.position, pose.forward)
+    depth = jnp.matmul(offset, pose.forward, precision="highest")
+    distance = jnp.linalg.norm(offset, axis=-1)
+    cosine = jnp.abs(jnp.sum(offset * scan.normals, axis=-1)) / distance
+    across, down = camera.focal_lengths
+    facing = depth**3 / (distance * across * down)
+    return jnp.where(scan.mask, facing / jnp.maximum(cosine, steepest), 0.0)

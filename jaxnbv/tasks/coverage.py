@@ -13,7 +13,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.neighbours import DistanceField, nearest_squared_distance, spacing
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.sampler import StepInputs
-from jaxnbv.scanning import Grid, GridSurface, Looks, Surface, scan
+from jaxnbv.scanning import Grid, GridSurface, Looks, Surface, pixel_area, scan
 from jaxnbv.scanning.looks import STEEP
 from jaxnbv.scanning.metrics import GRAZING
 from jaxnbv.sharding import on_cpu, shared_map
@@ -102,7 +102,7 @@ class NewSurface(Acquisition):
 
     def score(self, context: Unseen, view: ImaginedView) -> Float[Array, ""]:
         """The new area of one scan; zero for a scan that sees nothing."""
-        return jnp.sum(visible_area(view, STEEP) * context(view.scan.points))
+        return jnp.sum(pixel_area(view.scan, view.camera, view.pose, STEEP) * context(view.scan.points))
 
     @property
     def quantity(self) -> Quantity:
@@ -113,23 +113,6 @@ class NewSurface(Acquisition):
     def batch_size(self) -> int:
         """Many scans at once."""
         return _many()
-
-
-def visible_area(view: ImaginedView, steepest: float = GRAZING) -> Float[Array, " rays"]:
-    """The area of each pixel on the surface that it shows, in squared scene units; zero where it shows none.
-
-    A pixel of focal lengths fx and fy at depth z and distance r has r^2 omega = z^3 / (r fx fy).
-
-    - `steepest`: the least cosine of incidence at which a pixel counts for all of its area.
-    """
-    scan, pose = view.scan, view.pose
-    offset = jnp.where(scan.mask[:, None], scan.points - pose.position, pose.forward)
-    depth = jnp.matmul(offset, pose.forward, precision="highest")
-    distance = jnp.linalg.norm(offset, axis=-1)
-    cosine = jnp.abs(jnp.sum(offset * scan.normals, axis=-1)) / distance
-    across, down = view.camera.focal_lengths
-    facing = depth**3 / (distance * across * down)
-    return jnp.where(scan.mask, facing / jnp.maximum(cosine, steepest), 0.0)
 
 
 def newness_of(acquisition: Acquisition) -> NewSurface:

@@ -19,9 +19,9 @@ from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import View, view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Sure
-from jaxnbv.scanning import Surface
-from jaxnbv.scanning.metrics import coverage, true_mesh
-from jaxnbv.tasks.coverage import NewSurface, newness_of, visible_area
+from jaxnbv.scanning import Surface, pixel_area
+from jaxnbv.scanning.metrics import GRAZING, coverage, true_mesh
+from jaxnbv.tasks.coverage import NewSurface, newness_of
 from jaxnbv.utility import Answer
 from jaxnbv.viz.answers import Chart, CoverageAnswer, capital, words_of
 
@@ -123,7 +123,7 @@ def seen_after(episode: Episode, truth: Float[AnyArray, "n 3"] | None) -> list[C
 
 @eqx.filter_jit
 def _new_area(of: NewSurface, before: Observations | None, view: ImaginedView) -> Float[Array, ""]:
-    area = visible_area(view)
+    area = pixel_area(view.scan, view.camera, view.pose, GRAZING)
     return jnp.sum(area if before is None else area * of.context(inputs_of(before))(view.scan.points))
 
 

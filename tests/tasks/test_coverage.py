@@ -1,5 +1,6 @@
 """Coverage and expected new area against integrals over known surfaces and brute force in float64."""
 
+import dataclasses
 import math
 
 import jax
@@ -13,8 +14,8 @@ from scipy.integrate import quad
 import jaxnbv as nbv
 from jaxnbv.acquisition import ImaginedView
 from jaxnbv.geometry.cloud import limit_capacity
+from jaxnbv.scanning import pixel_area
 from jaxnbv.scanning.sdf import Cuboid, Sphere
-from jaxnbv.tasks.coverage import visible_area
 
 SMALL, POSE = nbv.Camera(height=8, width=8), nbv.look_at((0.4, 1.1, 2.2))
 RADIUS, AWAY = 0.5, math.dist((0, 0, 0), (0.4, 1.1, 2.2))
@@ -42,7 +43,7 @@ def ball_area(sharpest: float) -> float:
 def test_the_area_of_a_ball_is_its_integral(height, width):
     seen, camera = looked_at(height, width)
     for steepest in (0.2, 0.5):
-        area = float(jnp.sum(visible_area(ImaginedView(seen, camera, POSE), steepest)))
+        area = float(jnp.sum(pixel_area(seen, camera, POSE, steepest)))
         # A pixel of the limb is seen or not: a share of about one in a hundred of the area.
         assert area == pytest.approx(ball_area(steepest), rel=0.02)
 
@@ -51,7 +52,7 @@ def test_the_area_of_a_slanted_face_does_not_depend_on_the_rays_or_the_distance(
     face = nbv.SDFSurface(Cuboid((0.5, 0.4, 1e-3)))
     for pixels, away in ((120, 1.0), (200, 1.0), (200, 1.6)):
         camera, pose = nbv.Camera(height=pixels, width=pixels, fov=1.0), nbv.look_at((away, 0.3 * away, 1.5 * away))
-        area = float(jnp.sum(visible_area(ImaginedView(nbv.scan(face, camera, pose), camera, pose))))
+        area = float(jnp.sum(pixel_area(nbv.scan(face, camera, pose), camera, pose, 0.2)))
         # Its border is known to a pixel: a share of 2 / 120 * (1 / 1.0 + 1 / 0.8) of the face, most of it by chance.
         assert area == pytest.approx(1.0 * 0.8, rel=0.03)
 
@@ -73,7 +74,7 @@ def test_the_score_is_the_area_weighed_by_how_far_it_is_to_d():
     points, mask = np.asarray(seen.points, np.float64), np.asarray(seen.mask)
     distance = np.linalg.norm(points[:, None] - data[None], axis=-1).min(axis=1)
     # Where a pixel is steeper than 60 degrees it counts for less.
-    area = np.asarray(visible_area(ImaginedView(seen, camera, POSE), 0.5), np.float64)
+    area = np.asarray(pixel_area(seen, camera, POSE, 0.5), np.float64)
     expected = float(np.sum(area[mask] * np.clip(distance[mask] / 0.15 - 1.0, 0.0, 1.0)))
     assert 0.1 * area.sum() < expected < 0.9 * area.sum()
     # Between nodes a distance is wrong by a small part of their spacing, here 0.026, and to both sides.
@@ -86,12 +87,17 @@ def test_between_the_points_of_a_sparse_cloud_nothing_is_new():
     cloud = cloud_of(RADIUS * np.asarray(nbv.geometry.fibonacci_sphere(300)))
     acquisition = nbv.NewSurface(0.02)
     score = float(acquisition.score(context_of(acquisition, cloud), ImaginedView(seen, camera, POSE)))
-    assert score < 0.02 * float(jnp.sum(visible_area(ImaginedView(seen, camera, POSE))))
+    assert score < 0.02 * float(jnp.sum(pixel_area(seen, camera, POSE, 0.2)))
+
+
+def score_new(observations, view):
+    return nbv.NewSurface().score(context_of(nbv.NewSurface(), observations), view)
 
 
 def observed(points, capacity):
     """Observations after one view of some points, of which few are kept."""
-    camera, pose = nbv.Camera(height=80, width=80), nbv.look_at((0.0, 0.0, 2.5))
+    # Of pixels so small that hits are points.
+    camera, pose = nbv.Camera(fov=0.1, height=80, width=80), nbv.look_at((0.0, 0.0, 2.5))
     own = cloud_of(points, camera.num_rays)
     scan = nbv.PointCloud(own.points, own.normals, own.mask, jnp.zeros(6400, bool), jnp.zeros(6400))
     start = nbv.Observations.start(limit_capacity(own, capacity), 2, nbv.Grid(40, 1.2))
@@ -107,14 +113,25 @@ def test_what_is_new_does_not_depend_on_the_points_that_are_kept():
     radius = 0.4
     hits = RADIUS * everywhere[everywhere @ toward < math.cos(radius)]
     observations = observed(hits, 60)
-    new, by_d = (
-        float(nbv.NewSurface().score(context_of(nbv.NewSurface(), one), view))
-        for one in (observations, observations.cloud)
-    )
+    new, by_d = (float(score_new(one, view)) for one in (observations, observations.cloud))
     # What lies between one and two spacings of the grid, 0.062, from a hit counts in part, on average a half.
     whole, rim = (2 * math.pi * RADIUS**2 * (1 - math.cos(radius - margin / RADIUS)) for margin in (0.062, 0.123))
     assert rim < new < whole
     assert by_d < 0.1 * new
+
+
+def test_between_the_rays_of_a_coarse_sensor_nothing_is_new():
+    """A ball that 14 x 14 pixels saw, looked at again from there by six times as many a side. Hits by themselves are
+    almost two spacings of the grid apart, which leaves a twelfth of the area new."""
+    seen, camera = looked_at(14, 14)
+    start = nbv.Observations.start(limit_capacity(seen, 60), 2, nbv.Grid(40, 1.2))
+    observations = start.add_view(POSE, seen, camera, nbv.Carving(), None)
+    fine, sharp = looked_at(80, 80)
+    new = float(score_new(observations, ImaginedView(fine, sharp, POSE)))
+    points = dataclasses.replace(start, looks=start.looks.with_points(seen))
+    by_points = float(score_new(points, ImaginedView(fine, sharp, POSE)))
+    assert new < 0.03 * ball_area(0.5)
+    assert by_points > 0.08 * ball_area(0.5)
 
 
 @pytest.mark.slow
