@@ -133,6 +133,19 @@ def test_poses_to_matrices_and_back_in_both_conventions(given):
     assert batch.matrix.shape == (2, 4, 4)
 
 
+def test_a_matrix_to_three_digits_is_made_a_rotation():
+    matrices = np.tile(np.eye(4), (50, 1, 1))
+    matrices[:, :3, :3] = Rotation.random(50, rng=np.random.default_rng(0)).as_matrix()
+    poses = nbv.Pose.from_matrix(np.round(matrices, 3))
+    rotation = np.asarray(poses.rotation, np.float64)
+    np.testing.assert_allclose(rotation, matrices[:, :3, :3], atol=1e-3)
+    off = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
+    given = np.round(matrices[:, :3, :3], 3)
+    was_off = np.abs(given @ given.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2)) > 1e-3
+    assert 5 < was_off.sum() < 50
+    assert off[was_off].max() < 1e-6
+
+
 def test_a_pose_s_matrix_moves_points_as_the_pose_does():
     pose = nbv.look_at((0.8, 0.9, 2.2), (0.1, 0.2, 0.3))
     points = np.random.default_rng(0).normal(size=(5, 3))
