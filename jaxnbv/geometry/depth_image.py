@@ -12,11 +12,16 @@ from jaxnbv.checks import AnyArray, as_floats, as_numbers, is_traced, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.plane_fit import fitted_planes
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.sentinels import sentinel_pixels
 from jaxnbv.geometry.volume import Box, ray_interval
 
 Rows = tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"], Float[Array, " n"]]
 # Depths that are so many times what they should be are in other units, not of another object.
 _OTHER_UNITS = 20.0
+# What an object stands on is near the end of its box; a value beyond this factor of its depth may be a sentinel.
+_BEHIND = 1.1
+# The share of depths that shows their units.
+_SOME = 1e-3
 
 
 class NothingInside(UserWarning):
@@ -32,7 +37,7 @@ def points_of_depth(
     numbers = depth if is_traced(depth) else as_numbers(depth, "the depth image", None)
     missed = numbers == np.inf
     rounding = scale / math.sqrt(12.0) if np.issubdtype(numbers.dtype, np.integer) else 0.0
-    depth = scale * as_floats(depth, "the depth image")
+    depth = scale * as_floats(numbers, "the depth image")
     require(
         depth.shape == shape,
         f"the depth image is {depth.shape} but the camera has {shape} pixels: give Camera(height=..., width=...) of "
@@ -43,8 +48,10 @@ def points_of_depth(
     # Before any work is done for a stride that is none.
     camera.strided(stride)
     if not is_traced(depth, pose):
-        known = np.asarray(depth)
-        _check_meaning(known[np.isfinite(known) & (known > 0)], camera, pose, box)
+        ahead = None if box is None else _depths_of(box, pose)
+        known = np.where(_is_sentinel(numbers, camera, scale, ahead), 0.0, depth)
+        depth = jnp.asarray(known)
+        _check_meaning(known[np.isfinite(known) & (known > 0)], camera, ahead)
     some = depth[stride // 2 :: stride, stride // 2 :: stride].reshape(-1)
     lengths = jnp.linalg.norm(camera.strided(stride).pixel_directions(), axis=-1)
     sight = jnp.where(some > 0, some * lengths, jnp.inf)
@@ -94,31 +101,64 @@ def _depth_behind(box: Box, camera: Camera, pose: Pose) -> Float[Array, " n"]:
     return jnp.where(leave > jnp.maximum(enter, 0.0), leave, -jnp.inf)
 
 
-def _check_meaning(depth: Float[np.ndarray, " valid"], camera: Camera, pose: Pose, box: Box | None) -> None:
-    """**Raises:** `ValueError` for depths and a pose that cannot be meant."""
-    if not len(depth):
-        return
-    low, middle, high = (float(value) for value in (depth.min(), np.median(depth), depth.max()))
-    farthest = np.inf if camera.farthest is None else camera.farthest
-    require(
-        high >= camera.nearest and low <= farthest,
-        f"all depths, from {low:.4g} to {high:.4g}, are out of the camera's range of {camera.nearest:.4g} to "
-        f"{farthest:.4g}: give the depth's scale, 0.001 for millimetres and a pose in metres, or another range",
-    )
-    if box is None:
-        return
+def without_sentinels(
+    depth: Real[np.ndarray, "height width"], camera: Camera, pose: Pose, scale: float, box: Box
+) -> Real[np.ndarray, "height width"]:
+    """The image with zeros where its value stands for "not measured", as `points_of_depth` finds them with the box.
+
+    **Raises:** `ValueError` if the box lies behind the camera.
+    """
+    return np.where(_is_sentinel(depth, camera, scale, _depths_of(box, pose)), 0, depth)
+
+
+def _is_sentinel(
+    depth: Real[np.ndarray, "h w"], camera: Camera, scale: float, ahead: tuple[float, float] | None
+) -> Bool[np.ndarray, "h w"]:
+    ends = np.inf if camera.farthest is None else camera.farthest, np.inf if ahead is None else _BEHIND * ahead[1]
+    return sentinel_pixels(depth, min(ends) / scale)
+
+
+def _depths_of(box: Box, pose: Pose) -> tuple[float, float]:
+    """Between which depths a box lies, the first one positive.
+
+    **Raises:** `ValueError` if it lies behind the camera.
+    """
     corners = np.stack(np.meshgrid(*zip(box.low, box.high, strict=True)), axis=-1).reshape(-1, 3)
     ahead = (corners - np.asarray(pose.position)) @ np.asarray(pose.forward)
+    farthest = float(ahead.max())
     require(
-        float(ahead.max()) > 0,
+        farthest > 0,
         f"the box from {box.low} to {box.high} lies behind the camera at {np.asarray(pose.position)}: give the pose "
         'from camera to world, not its inverse, and its convention, Pose.from_matrix(matrix, "opengl")',
     )
-    nearest = max(float(ahead.min()), 1e-3 * float(ahead.max()))
+    return max(float(ahead.min()), 1e-3 * farthest), farthest
+
+
+def _check_meaning(depth: Float[np.ndarray, " valid"], camera: Camera, ahead: tuple[float, float] | None) -> None:
+    """Check the units of the depths that were measured: one in a thousand of those in the camera's range is of the
+    order of the box's. What else there is may be a far background, or glare.
+
+    - `ahead`: between which depths the box lies.
+
+    **Raises:** `ValueError` for depths that cannot be meant.
+    """
+    if not len(depth):
+        return
+    farthest = np.inf if camera.farthest is None else camera.farthest
     require(
-        middle < _OTHER_UNITS * float(ahead.max()) and middle > nearest / _OTHER_UNITS,
-        f"the depths have a median of {middle:.4g}, but the box is {nearest:.4g} to {float(ahead.max()):.4g} away: "
-        "give the depth's scale, 0.001 for millimetres and a pose in metres",
+        depth.max() >= camera.nearest and depth.min() <= farthest,
+        f"all depths, from {depth.min():.4g} to {depth.max():.4g}, are out of the camera's range of "
+        f"{camera.nearest:.4g} to {farthest:.4g}: give the depth's scale, 0.001 for millimetres and a pose in metres, "
+        "or another range",
+    )
+    depth = depth[(depth >= camera.nearest) & (depth <= farthest)]
+    if ahead is None or not len(depth):
+        return
+    near, far = ahead
+    require(
+        bool(((depth > near / _OTHER_UNITS) & (depth < _OTHER_UNITS * far)).mean() >= _SOME),
+        f"the depths have a median of {np.median(depth):.4g}, but the box is {near:.4g} to {far:.4g} away: give the "
+        "depth's scale, 0.001 for millimetres and a pose in metres",
     )
 
 

@@ -91,6 +91,67 @@ def test_beyond_its_range_a_sensor_met_nothing_and_before_it_says_nothing():
     assert int(cloud.count) > 200
 
 
+def image_with(mark, background, dtype, camera=CAMERA):
+    """The ball before a background, millimetres or metres; the left half of it is marked as not measured."""
+    depth = depth_of(BALL, camera=camera)
+    ball = np.isfinite(depth)
+    shown = np.where(ball, 1000.0 * depth, background)
+    shown[:, : camera.width // 2][ball[:, : camera.width // 2]] = mark
+    return np.round(shown).astype(dtype) / (1.0 if dtype == np.uint16 else 1000.0), ball
+
+
+WALL = 2500.0 + 5.0 * np.random.default_rng(0).normal(size=(48, 64))
+
+
+@pytest.mark.parametrize("farthest", [None, 2.0])
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+@pytest.mark.parametrize("alone", [True, False])
+@pytest.mark.parametrize("mark", [65535, 32767, 10000, 8191, 4095, 2047])
+@pytest.mark.filterwarnings("ignore:the depth image has the value")
+def test_a_mark_says_no_more_than_zero(mark, alone, dtype, farthest):
+    """Row by row the same cloud, and no node within the ball is known to be empty."""
+    camera = nbv.Camera.from_intrinsics(CAMERA.intrinsics, 48, 64, farthest=farthest)
+    scale = 1e-3 if dtype == np.uint16 else 1.0
+    clouds = []
+    for value in (mark, 0):
+        image, ball = image_with(value, value if alone else WALL, dtype)
+        clouds.append(nbv.PointCloud.from_depth(image.astype(dtype), camera, POSE, depth_scale=scale, box=BOX))
+    for name in ("points", "mask", "missed", "sight"):
+        np.testing.assert_array_equal(getattr(clouds[0], name), getattr(clouds[1], name))
+    assert not np.asarray(clouds[0].missed).reshape(48, 64)[ball].any()
+    assert int(clouds[0].count) > 100
+    grid, frame = nbv.Grid(40), nbv.Frame.fit(np.array([BOX.low, BOX.high]), up="z")
+    scene = (frame.to_scene(one) for one in (POSE, clouds[0], camera))
+    empty = np.asarray(nbv.Carving().empty_nodes(grid, *scene))
+    nodes = np.stack(np.meshgrid(*[grid.axis] * 3, indexing="ij"), axis=-1)
+    center = np.asarray(frame.to_scene(np.array([[0.0, 0.0, 0.1]])))[0]
+    assert not empty[np.linalg.norm(nodes - center, axis=-1) < 0.095 * frame.scale].any()
+
+
+def test_a_mark_is_warned_of_and_a_wall_and_a_floor_are_not(recwarn):
+    image, _ = image_with(10000, WALL, np.uint16)
+    with pytest.warns(UserWarning, match=r"value 10000 in \d+ pixels.*not measured.*Give infinity"):
+        nbv.PointCloud.from_depth(image, CAMERA, POSE, depth_scale=1e-3, box=BOX)
+    recwarn.clear()
+    for other in (image_with(0, WALL, np.uint16)[0], np.round(1000 * depth_of(BALL, TABLE)), np.full((48, 64), 9e3)):
+        cloud = nbv.PointCloud.from_depth(np.where(np.isfinite(other), other, 0), CAMERA, POSE, depth_scale=1e-3)
+        assert int(cloud.count) > 100
+    assert len(recwarn) == 0
+
+
+@pytest.mark.filterwarnings("ignore:the depth image has the value")
+@pytest.mark.parametrize("farthest", [None, 3.0])
+@pytest.mark.parametrize("rest", [1e10, 65504.0, 100.0, 20.0, 0.01, "a wall"])
+def test_a_far_background_and_glare_are_no_other_units(rest, farthest):
+    depth = depth_of(BALL)
+    camera = nbv.Camera.from_intrinsics(CAMERA.intrinsics, 48, 64, nearest=0.1, farthest=farthest)
+    background = 20.0 + 0.01 * np.arange(64) if rest == "a wall" else rest
+    image = np.where(np.isfinite(depth), depth, background)
+    cloud, alone = (nbv.PointCloud.from_depth(one, camera, POSE, box=BOX) for one in (image, depth))
+    np.testing.assert_array_equal(cloud.mask, alone.mask)
+    np.testing.assert_allclose(cloud.points, alone.points, atol=1e-5)
+
+
 def test_what_cannot_be_meant_is_named():
     depth = depth_of(BALL, TABLE)
     ranged = nbv.Camera.from_intrinsics(CAMERA.intrinsics, 48, 64, nearest=0.1, farthest=3.0)
