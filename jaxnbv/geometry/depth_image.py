@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Real
 
 from jaxnbv.checks import AnyArray, as_floats, as_numbers, is_traced, require
 from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.distortion import undistorted
 from jaxnbv.geometry.plane_fit import fitted_planes
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.sentinels import sentinel_pixels
@@ -49,9 +50,13 @@ def points_of_depth(
     camera.strided(stride)
     if not is_traced(depth, pose):
         ahead = None if box is None else _depths_of(box, pose)
-        known = np.where(_is_sentinel(numbers, camera, scale, ahead), 0.0, depth)
+        known = np.where(_is_sentinel(np.asarray(numbers), camera, scale, ahead), 0.0, depth)
         depth = jnp.asarray(known)
         _check_meaning(known[np.isfinite(known) & (known > 0)], camera, ahead)
+    if camera.distortion:
+        place = camera.pixel_directions().reshape(*shape, 3)[..., :2]
+        matrix = jnp.asarray(camera.intrinsics, depth.dtype)
+        depth, missed = undistorted(depth, jnp.asarray(missed), place, matrix, camera.distortion)
     some = depth[stride // 2 :: stride, stride // 2 :: stride].reshape(-1)
     lengths = jnp.linalg.norm(camera.strided(stride).pixel_directions(), axis=-1)
     sight = jnp.where(some > 0, some * lengths, jnp.inf)

@@ -280,7 +280,7 @@ class Session:
         """An image as a view, stored in the folder once the loop accepts it. The first may show what the object stands
         on, by which the planner is another."""
         index, pose, loop = len(self.views), Pose.from_matrix(matrix, self.convention), self._loop
-        digest = hashlib.sha256(np.ascontiguousarray(depth)).digest()
+        digest = hashlib.sha256(depth.tobytes()).digest()
         _check_moved(self._taken.get(digest), matrix, depth)
         pixels = without_sentinels(depth, self.camera, pose, scale, self.box)
         image, kept = (pixels, self.camera, pose, scale, self.stride), self.box
@@ -392,8 +392,8 @@ def _check_moved(earlier: tuple[int, np.ndarray] | None, matrix: np.ndarray, dep
     index, before = earlier
     require(
         bool(np.abs(before - matrix).max() <= _SAME_PLACE),
-        f"the image is bit for bit image {index + 1}, which was taken from another pose: it is of an earlier moment than "
-        "its pose. Discard the frames that the driver still holds after a move",
+        f"the image is bit for bit image {index + 1}, which was taken from another pose: it is of an earlier moment "
+        "than its pose. Discard the frames that the driver still holds after a move",
     )
 
 
@@ -401,10 +401,8 @@ def _is_blank(depth: np.ndarray, cloud: PointCloud) -> bool:
     """Whether an image measured nothing: no pixel is valid, or all of them have one value and show no surface."""
     if bool(cloud.mask.any()):
         return False
-    known = depth[depth > 0]
-    return not bool(cloud.missed.any()) or (
-        len(known) > 0 and np.isfinite(known[0]) and bool((known == known[0]).all())
-    )
+    values = np.unique(depth[depth > 0])
+    return not bool(np.any(cloud.missed)) or (len(values) == 1 and bool(np.isfinite(values[0])))
 
 
 def _box_of(corners) -> Box:

@@ -42,8 +42,8 @@ def warn_of_table(point: Float[np.ndarray, "3"]) -> None:
 def warn_of_blank() -> None:
     """Warn of an image that measured nothing."""
     warnings.warn(
-        "the image measured nothing (all pixels are invalid, or of one value beyond the object) and is left out: take it "
-        "again, from farther away or with another exposure",
+        "the image measured nothing (all pixels are invalid, or of one value beyond the object) and is left out: take "
+        "it again, from farther away or with another exposure",
         stacklevel=_CALLER_OF_ADD,
     )
 

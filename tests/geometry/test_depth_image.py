@@ -149,7 +149,7 @@ def test_a_far_background_and_glare_are_no_other_units(rest, farthest):
     image = np.where(np.isfinite(depth), depth, background)
     cloud, alone = (nbv.PointCloud.from_depth(one, camera, POSE, box=BOX) for one in (image, depth))
     np.testing.assert_array_equal(cloud.mask, alone.mask)
-    np.testing.assert_allclose(cloud.points, alone.points, atol=1e-5)
+    np.testing.assert_allclose(cloud.points, alone.points, atol=1e-3)
 
 
 def test_what_cannot_be_meant_is_named():
