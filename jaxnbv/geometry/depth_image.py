@@ -4,6 +4,7 @@ import math
 import warnings
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Real
@@ -11,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Real
 from jaxnbv.checks import AnyArray, as_floats, as_numbers, is_traced, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.distortion import undistorted
+from jaxnbv.geometry.gaps import block_samples, gap_of
 from jaxnbv.geometry.plane_fit import fitted_planes
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.sentinels import sentinel_pixels
@@ -57,10 +59,9 @@ def points_of_depth(
         place = camera.pixel_directions().reshape(*shape, 3)[..., :2]
         matrix = jnp.asarray(camera.intrinsics, depth.dtype)
         depth, missed = undistorted(depth, jnp.asarray(missed), place, matrix, camera.distortion)
-    some = depth[stride // 2 :: stride, stride // 2 :: stride].reshape(-1)
-    lengths = jnp.linalg.norm(camera.strided(stride).pixel_directions(), axis=-1)
-    sight = jnp.where(some > 0, some * lengths, jnp.inf)
-    points, normals, mask, missed, inside = _oriented(depth, jnp.asarray(missed), camera, pose, stride, rounding, box)
+    gap = 1 if is_traced(depth) else gap_of(np.isfinite(depth) & (np.asarray(depth) > 0))
+    image = depth, jnp.asarray(missed), camera, pose, stride, rounding, box, gap
+    points, normals, mask, missed, inside, sight = _oriented(*image)
     if box is not None and not is_traced(points):
         _warn_of_nothing_inside(np.asarray(points)[np.asarray(mask)], np.asarray(inside)[np.asarray(mask)], box)
     mask = mask & inside
@@ -77,15 +78,27 @@ def _oriented(
     stride: int,
     rounding: float,
     box: Box | None,
-) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"], Bool[Array, " n"]]:
-    """Points, normals, which of them are valid, which rays met nothing in the box, and which points lie in it."""
+    gap: int,
+) -> tuple[
+    Float[Array, "n 3"],
+    Float[Array, "n 3"],
+    Bool[Array, " n"],
+    Bool[Array, " n"],
+    Bool[Array, " n"],
+    Float[Array, " n"],
+]:
+    """Points, normals, which of them are valid, which rays met nothing in the box, which points lie in it, and how far
+    each ray saw."""
+    rows, strided = slice(stride // 2, None, stride), camera.strided(stride)
+    seen = _rows_of(depth, jnp.isfinite(depth) & (depth > 0), stride, gap)[0]
+    sight = jnp.where(seen > 0, seen, jnp.inf).reshape(-1) * jnp.linalg.norm(strided.pixel_directions(), axis=-1)
     valid = jnp.isfinite(depth) & (depth > 0)
     if camera.farthest is not None:
         missed = missed | (valid & (depth > camera.farthest))
     valid = valid & ~missed & (depth >= camera.nearest)
-    smooth, normals, has_normal = fitted_planes(jnp.where(valid, depth, 0.0), valid, camera, stride, rounding)
-    rows, camera = slice(stride // 2, None, stride), camera.strided(stride)
-    depth, valid, missed = depth[rows, rows], valid[rows, rows], missed[rows, rows]
+    smooth, normals, has_normal = fitted_planes(jnp.where(valid, depth, 0.0), valid, camera, stride, rounding, gap)
+    (depth, valid, nearest), camera = _rows_of(jnp.where(valid, depth, 0.0), valid, stride, gap), strided
+    missed = missed[rows, rows]
     mask = (valid & has_normal).reshape(-1)
     local = jnp.where(valid, jnp.where(has_normal, smooth, depth), 0.0).reshape(-1, 1) * camera.pixel_directions()
     points = pose.to_scene(local)
@@ -93,10 +106,24 @@ def _oriented(
 
     missed, inside = missed.reshape(-1), jnp.ones_like(mask)
     if box is not None:
-        crossed = valid.reshape(-1) & (depth.reshape(-1) >= _depth_behind(box, camera, pose))
+        crossed = valid.reshape(-1) & (nearest.reshape(-1) >= _depth_behind(box, camera, pose))
         inside = box(points) <= 0
         missed = missed | (crossed & ~inside)
-    return points, normals, mask, missed, inside
+    return points, normals, mask, missed, inside, sight
+
+
+def _rows_of(
+    depth: Float[Array, "h w"], valid: Bool[Array, "h w"], stride: int, gap: int
+) -> tuple[Float[Array, "k l"], Bool[Array, "k l"], Float[Array, "k l"]]:
+    """Depths of every `stride`-th row and column, which are valid, and the least depth that a ray there may have met:
+    of the samples of their blocks, and with gaps of the blocks beside them."""
+    samples, is_sample, _ = block_samples(depth, valid, gap)
+    nearest = jnp.where(is_sample, samples, jnp.inf)
+    if gap > 1:
+        nearest = jax.lax.reduce_window(nearest, jnp.inf, jax.lax.min, (3, 3), (1, 1), "SAME")
+    rows, columns = (jnp.arange(stride // 2, size, stride) // gap for size in depth.shape)
+    at = rows[:, None], columns[None]
+    return samples[at], is_sample[at], nearest[at]
 
 
 def _depth_behind(box: Box, camera: Camera, pose: Pose) -> Float[Array, " n"]:

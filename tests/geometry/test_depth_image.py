@@ -152,6 +152,55 @@ def test_a_far_background_and_glare_are_no_other_units(rest, farthest):
     np.testing.assert_allclose(cloud.points, alone.points, atol=1e-3)
 
 
+FINE = nbv.Camera.from_intrinsics([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]], width=640, height=480)
+SPARSE = {
+    "every 8th row": lambda v, u: v % 8 == 0,
+    "every 8th row, others": lambda v, u: v % 8 == 3,
+    "every 4th column": lambda v, u: u % 4 == 1,
+    "every 2nd column": lambda v, u: u % 2 == 1,
+    "every 4th pixel": lambda v, u: (v % 4 == 1) & (u % 4 == 3),
+    "a lidar": lambda v, u: (v % 6 == 5) & (u % 2 == 0),
+    "5 % at random": lambda v, u: np.random.default_rng(0).random(v.shape) < 0.05,
+    "20 % at random": lambda v, u: np.random.default_rng(0).random(v.shape) < 0.2,
+}
+
+
+@pytest.mark.parametrize("stride", [4, 8])
+@pytest.mark.parametrize("name", SPARSE)
+def test_an_image_with_gaps_shows_the_object(name, stride):
+    """As many rows as of the whole image but for the rim, on their rays, near the ball and with its normals."""
+    depth = depth_of(BALL, TABLE, camera=FINE)
+    image = np.where(np.isfinite(depth) & SPARSE[name](*np.mgrid[:480, :640]), np.round(1e4 * depth), 0.0)
+    whole = nbv.PointCloud.from_depth(np.where(np.isfinite(depth), depth, 0.0), FINE, POSE, 1.0, stride, BOX)
+    cloud = nbv.PointCloud.from_depth(image.astype(np.uint16), FINE, POSE, 1e-4, stride, BOX)
+    points, normals = (np.asarray(rows, np.float64) for rows in cloud.to_numpy())
+    assert 0.6 * int(whole.count) < len(points) < 1.4 * int(whole.count)
+    outward = points - [0.0, 0.0, 0.1]
+    distance = np.linalg.norm(outward, axis=1)
+    assert np.median(np.abs(distance - 0.1)) < 4e-3
+    assert np.median(np.sum(outward * normals, axis=1) / distance) > np.cos(np.radians(10.0))
+    rays = np.asarray(FINE.strided(stride).pixel_directions(), np.float64)[np.asarray(cloud.mask)]
+    local = (points - np.asarray(POSE.position, np.float64)) @ np.asarray(POSE.rotation, np.float64)
+    np.testing.assert_allclose(local / local[:, 2:], rays, atol=1e-5)
+    # What lies between samples is not seen through.
+    assert not np.asarray(cloud.missed & whole.mask).any()
+    both = np.asarray(cloud.mask & whole.mask)
+    assert np.median(np.abs(np.asarray(cloud.sight) / np.asarray(whole.sight) - 1.0)[both]) < 0.03
+
+
+def test_planes_are_seen_exactly_between_samples():
+    """Linear in inverse depth: the pattern and the phase of the gaps do not matter."""
+    depth = depth_of(Cuboid([3.0, 3.0, 0.02]).translate([0.0, 0.0, -0.02]), camera=FINE)
+    for keep in SPARSE.values():
+        image = np.where(np.isfinite(depth) & keep(*np.mgrid[:480, :640]), depth, 0.0)
+        points, normals = nbv.PointCloud.from_depth(image, FINE, POSE, stride=5).to_numpy()
+        # Farther away it is seen aslant by more than planes are fitted to.
+        points, normals = points[points[:, 1] < 0.0], normals[points[:, 1] < 0.0]
+        assert len(points) > 2000
+        assert np.percentile(np.abs(points[:, 2]), 99) < 1e-4
+        assert np.percentile(normals[:, 2], 1) > np.cos(np.radians(0.1))
+
+
 def test_what_cannot_be_meant_is_named():
     depth = depth_of(BALL, TABLE)
     ranged = nbv.Camera.from_intrinsics(CAMERA.intrinsics, 48, 64, nearest=0.1, farthest=3.0)
