@@ -1,7 +1,8 @@
 """A thin ROS 2 node about a session: depth images in, the next pose of the camera out.
 
-Topics: `depth/image` (sensor_msgs/Image, 16UC1 in millimetres or 32FC1 in metres), `depth/camera_info`
-(sensor_msgs/CameraInfo), `next_view` (geometry_msgs/PoseStamped). The camera's pose is that of `camera_frame` in
+Topics: `depth/image` (sensor_msgs/Image, 16UC1 or mono16 in millimetres, 32FC1 in metres), `depth/camera_info`
+(sensor_msgs/CameraInfo, with its distortion, region of interest and binning; a rectified stream has no distortion),
+`next_view` (geometry_msgs/PoseStamped). The camera's pose is that of `camera_frame` in
 `world_frame`, by tf at the image's time; camera frames of ROS look along z with y down, which is OpenCV's convention.
 An image is taken in when the service `take` (std_srvs/Trigger) is called, since most of a stream shows nothing new.
 
@@ -15,11 +16,18 @@ import numpy as np
 
 import jaxnbv as nbv
 
-_DTYPES = {"16UC1": (np.uint16, 1e-3), "32FC1": (np.float32, 1.0)}
+_DTYPES = {"16UC1": (np.uint16, 1e-3), "mono16": (np.uint16, 1e-3), "32FC1": (np.float32, 1.0)}
+# Models of sensor_msgs/CameraInfo that are OpenCV's; none where there is no distortion.
+_MODELS = ("plumb_bob", "rational_polynomial", "")
 
 
 def image_of(message: Any) -> tuple[np.ndarray, float]:
-    """The depth image of a message, and metres per unit."""
+    """The depth image of a message, and metres per unit.
+
+    **Raises:** `ValueError` for another encoding.
+    """
+    if message.encoding not in _DTYPES:
+        raise ValueError(f"the image's encoding is {message.encoding!r}: publish depth as one of {', '.join(_DTYPES)}")
     dtype, scale = _DTYPES[message.encoding]
     rows = np.frombuffer(bytes(message.data), np.dtype(dtype).newbyteorder(">" if message.is_bigendian else "<"))
     image = rows.reshape(message.height, message.step // np.dtype(dtype).itemsize)[:, : message.width]
@@ -27,8 +35,22 @@ def image_of(message: Any) -> tuple[np.ndarray, float]:
 
 
 def camera_of(message: Any) -> nbv.Camera:
-    """The camera of an undistorted stream."""
-    return nbv.Camera.from_intrinsics(np.reshape(message.k, (3, 3)), message.height, message.width)
+    """The camera of a stream. The matrix and size of a message are those of the full image, of which the stream shows
+    the region of interest, in full pixels, binned.
+
+    **Raises:** `ValueError` for a distortion that is not OpenCV's, or a matrix of zeros, which means uncalibrated.
+    """
+    coefficients = tuple(message.d) if np.any(message.d) else ()
+    if coefficients and message.distortion_model not in _MODELS:
+        raise ValueError(f"the distortion is {message.distortion_model!r}: rectify the stream first (image_proc)")
+    roi, matrix = message.roi, np.array(message.k, float).reshape(3, 3)
+    binning = max(message.binning_x, 1), max(message.binning_y, 1)
+    width, height = (roi.width or message.width) // binning[0], (roi.height or message.height) // binning[1]
+    for row, (offset, factor) in enumerate(zip((roi.x_offset, roi.y_offset), binning, strict=True)):
+        matrix[row] /= factor
+        # The centre of the first binned pixel is in the middle of those that it stands for.
+        matrix[row, 2] -= (offset + 0.5 * (factor - 1)) / factor
+    return nbv.Camera.from_intrinsics(matrix, height, width, distortion=coefficients)
 
 
 def matrix_of(transform: Any) -> np.ndarray:
@@ -73,8 +95,9 @@ class Bridge:
         """Take in the latest image and publish where to go next; says what was done."""
         if self.session is None or self.latest is None:
             return "there is no image yet"
-        depth, scale = image_of(self.latest)
-        self.session.add(depth, matrix_of(self.lookup(self.latest.header.stamp)), depth_scale=scale)
+        image, self.latest = self.latest, None
+        depth, scale = image_of(image)
+        self.session.add(depth, matrix_of(self.lookup(image.header.stamp)), depth_scale=scale)
         if (reason := self.session.done()) is not None:
             return f"done: {reason}"
         self.publish(self.session.next().matrix)

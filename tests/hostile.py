@@ -72,7 +72,7 @@ CALLS = {
     nbv.Camera: {"fov": 0.5, "height": 4, "width": 4, "aspect": 1.0, "center": (0.5, 0.5), "nearest": 0.1}
     | {"farthest": 3.0, "max_incidence": 1.0},
     nbv.Camera.from_intrinsics: {"matrix": np.eye(3), "height": 4, "width": 4, "nearest": 0.1, "farthest": 3.0}
-    | {"max_incidence": 1.0},
+    | {"max_incidence": 1.0, "distortion": (0.1, 0.0, 0.0, 0.0)},
     SMALL.resized: {"height": 2, "width": 3},
     SMALL.strided: {"stride": 2},
     nbv.Carving: {"volume": nbv.Box(), "margin_voxels": 1.0},

@@ -99,6 +99,12 @@ def session(**changes):
     return nbv.Session(**(settings | changes))
 
 
+def stale_frame():
+    started = session()
+    started.add(*SHOT)
+    started.add(SHOT[0], nbv.look_at((2.5, 0.0, 0.0)).matrix)
+
+
 def stored(name, changes):
     file = WEIGHTS / "pyramid.safetensors"
     with safe_open(file, "numpy") as opened:
@@ -290,6 +296,17 @@ REFUSED = {
     "a cost of three numbers": (lambda: costing(lambda a, b: b.position), "one number a pose"),
     "a cost of NumPy": (lambda: costing(lambda a, b: np.linalg.norm(b.position)), "jax.numpy"),
     "a rule or text": (lambda: nbv.Sure(0.9) | "x", "'x'"),
+    "a matrix of the whole image for half of it": (
+        lambda: nbv.Camera.from_intrinsics([[600.0, 0, 318], [0, 600, 238], [0, 0, 1]], 240, 320),
+        "divide its first two rows by 2",
+    ),
+    "a fisheye's four numbers and more": (
+        lambda: nbv.Camera.from_intrinsics(
+            [[600.0, 0, 320], [0, 600, 240], [0, 0, 1]], 480, 640, distortion=(0.1,) * 6
+        ),
+        "k1, k2, p1, p2",
+    ),
+    "a frame of before the move": (stale_frame, "bit for bit image 1"),
     "an inverse of intrinsics": (
         lambda: nbv.Camera.from_intrinsics(np.linalg.inv([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]]), 480, 640),
         "intrinsic matrix",

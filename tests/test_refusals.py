@@ -25,6 +25,12 @@ def intrinsics(matrix):
     return nbv.Camera.from_intrinsics(np.array(matrix), 40, 60)
 
 
+def camera_of_lens(*coefficients):
+    return nbv.Camera.from_intrinsics(
+        [[500.0, 0, 320.0], [0, 500.0, 240.0], [0, 0, 1.0]], 480, 640, distortion=coefficients
+    )
+
+
 def pose_of(rotation):
     return nbv.Pose(rotation, np.zeros(rotation.shape[:-1]))
 
@@ -42,6 +48,8 @@ GEOMETRY = [
     (lambda: nbv.Camera(nearest=-1.0), "from -1.0"),
     (lambda: nbv.Camera(max_incidence=2.0), "angle of incidence is 2.0"),
     (lambda: nbv.Camera(aspect=0.0), "aspect of the pixels is 0.0"),
+    *((lambda wrong=wrong: camera_of_lens(*wrong), "k1, k2, p1, p2") for wrong in ((0.1,), (0.1,) * 14, (np.nan,) * 5)),
+    (lambda: camera_of_lens(-9.0, 0.0, 0.0, 0.0), "folds the image"),
     (lambda: nbv.Camera(fov=0.0), "field of view is 0.0"),
     (lambda: nbv.Camera(fov=math.pi), "field of view is 3.14"),
     (lambda: nbv.Camera(fov=math.nan), "fov is nan; it must be a finite number"),

@@ -5,6 +5,7 @@ OpenCV convention: in the camera's own frame x points right, y down and z forwar
 
 import dataclasses
 import math
+import warnings
 from typing import TypeVar
 
 import equinox as eqx
@@ -13,11 +14,19 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnbv.checks import AnyArray, as_numbers, check_fields, checked, require
+from jaxnbv.geometry.distortion import check_distortion
 from jaxnbv.geometry.pose import Pose
 
 _Places = TypeVar("_Places", Float[Array, "*n 2"], Float[np.ndarray, "*n 2"])
 # Of the focal length: what a calibration without skew is written down to.
 _SKEW = 1e-6
+
+
+# Rays of a window farther off the axis (70 degrees) are no depth camera's; how far, as a share, a principal point is
+# off an image's centre.
+_WIDEST, _OFF_CENTER = math.tan(math.radians(70.0)), 0.2
+# Where both shares of the principal point are this large, the image is a part of what the matrix is for.
+_SURELY = 0.96
 
 
 class Camera(eqx.Module):
@@ -30,6 +39,8 @@ class Camera(eqx.Module):
     - `nearest`, `farthest`: depths along the viewing direction between which the sensor measures, in scene units; None
       is no limit. A hit before `nearest` is invalid; a ray without a hit before `farthest` met nothing up to there.
     - `max_incidence`: largest angle in radians, within (0, pi/2], between a ray and the normal at which a hit returns.
+    - `distortion`: of the lens, see `from_intrinsics`. All rays are those of the pinhole; `PointCloud.from_depth`
+      undoes the distortion of an image first.
 
     The defaults are the paper's: 30 degrees, 50 x 50, no limits.
 
@@ -44,6 +55,7 @@ class Camera(eqx.Module):
     nearest: float = eqx.field(static=True, default=0.0)
     farthest: float | None = eqx.field(static=True, default=None)
     max_incidence: float = eqx.field(static=True, default=0.5 * math.pi)
+    distortion: tuple[float, ...] = eqx.field(static=True, default=())
 
     def __check_init__(self):
         check_fields(self)
@@ -59,6 +71,9 @@ class Camera(eqx.Module):
             0 < self.max_incidence <= 0.5 * math.pi,
             f"the largest angle of incidence is {self.max_incidence} rad; it must lie within (0, pi/2]",
         )
+        if self.distortion != ():
+            left, top, right, bottom = map(abs, self.edges)
+            check_distortion(self.distortion, math.hypot(max(left, right), max(top, bottom)))
 
     @classmethod
     @checked
@@ -70,11 +85,17 @@ class Camera(eqx.Module):
         nearest: float = 0.0,
         farthest: float | None = None,
         max_incidence: float = 0.5 * math.pi,
+        distortion: Float[AnyArray, " k"] | list | tuple = (),
     ) -> "Camera":
         """The camera of an intrinsic matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, as OpenCV and the makers
-        of depth cameras give it: the centre of the first pixel is at (0, 0). The limits are those of the camera.
+        of depth cameras give it: the centre of the first pixel is at (0, 0). The limits are those of the camera. The
+        principal point may lie outside the image, which may be a window of a larger one. A `UserWarning` says where the
+        matrix is likely that of another image size.
 
-        **Raises:** `ValueError` for another matrix, such as one with skew or of another image size.
+        - `distortion`: OpenCV's coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]].
+
+        **Raises:** `ValueError` for another matrix, such as one with skew or surely of another image size; for other
+        numbers of coefficients, or ones that fold the image.
         """
         found = as_numbers(matrix, "the intrinsic matrix", np.float64)
         require(found.shape == (3, 3), f"the intrinsic matrix has shape {found.shape}: give one of (3, 3)")
@@ -89,14 +110,11 @@ class Camera(eqx.Module):
             f"the intrinsic matrix has a focal length of {fy:.4g} for {height} rows: give it in pixels, and no inverse",
         )
         require(abs(skew) <= _SKEW * fx, f"the intrinsic matrix has a skew of {skew}: undistort the image first")
-        require(
-            -0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5,
-            f"the principal point ({cx}, {cy}) lies outside the image of {width} x {height}: give the matrix that is "
-            "of this image size",
-        )
         fov = 2.0 * math.atan(0.5 * height / fy)
         center = ((cx + 0.5) / width, (cy + 0.5) / height)
-        return cls(fov, height, width, fx / fy, center, nearest, farthest, max_incidence)
+        _check_image_size(found, height, width, center)
+        coefficients = tuple(as_numbers(distortion, "the distortion", np.float64).reshape(-1).tolist())
+        return cls(fov, height, width, fx / fy, center, nearest, farthest, max_incidence, coefficients)
 
     @property
     def intrinsics(self) -> Float[np.ndarray, "3 3"]:
@@ -169,3 +187,30 @@ class Camera(eqx.Module):
         directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
         directions = jnp.einsum("...ij,rj->...ri", pose.rotation, directions, precision="highest")
         return jnp.broadcast_to(pose.position[..., None, :], directions.shape), directions
+
+
+def _check_image_size(matrix: np.ndarray, height: int, width: int, center: tuple[float, float]) -> None:
+    """Warn of a principal point that is the centre of an image of another size.
+
+    **Raises:** `ValueError` if it is the corner of this image or beyond, or a window ends beyond 70 degrees.
+    """
+    (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
+    across, down = (
+        max(share, 1.0 - share) * side / f for share, side, f in zip(center, (width, height), (fx, fy), strict=True)
+    )
+    require(
+        all(0 <= share <= 1 for share in center) or max(across, down) < _WIDEST,
+        f"the principal point ({cx}, {cy}) lies outside the image of {width} x {height}, which would end "
+        f"{math.degrees(math.atan(max(across, down))):.0f} degrees off the axis: give the matrix that is of this image "
+        "size",
+    )
+    for ratio in (0.5, 2.0, 3.0, 4.0):
+        if not all(abs(2.0 * share / ratio - 1.0) <= _OFF_CENTER for share in center):
+            continue
+        problem = (
+            f"the principal point ({cx:.5g}, {cy:.5g}) is the centre of an image of {2 * cx + 1:.0f} x "
+            f"{2 * cy + 1:.0f}, but this one is {width} x {height}: if it was binned, decimated or resized, the matrix "
+            f"is that of the other size, divide its first two rows by {ratio:g}. If it is a window of a larger image"
+        )
+        require(min(center) < _SURELY, f"{problem}, make it Camera(fov, height, width, aspect, center)")
+        warnings.warn(f"{problem}, all is well", stacklevel=4)

@@ -4,19 +4,27 @@ import math
 import warnings
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Real
 
 from jaxnbv.checks import AnyArray, as_floats, as_numbers, is_traced, require
 from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.distortion import undistorted
+from jaxnbv.geometry.gaps import block_samples, gap_of
 from jaxnbv.geometry.plane_fit import fitted_planes
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.sentinels import sentinel_pixels
 from jaxnbv.geometry.volume import Box, ray_interval
 
 Rows = tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"], Float[Array, " n"]]
 # Depths that are so many times what they should be are in other units, not of another object.
 _OTHER_UNITS = 20.0
+# What an object stands on is near the end of its box; a value beyond this factor of its depth may be a sentinel.
+_BEHIND = 1.1
+# The share of depths that shows their units.
+_SOME = 1e-3
 
 
 class NothingInside(UserWarning):
@@ -32,7 +40,7 @@ def points_of_depth(
     numbers = depth if is_traced(depth) else as_numbers(depth, "the depth image", None)
     missed = numbers == np.inf
     rounding = scale / math.sqrt(12.0) if np.issubdtype(numbers.dtype, np.integer) else 0.0
-    depth = scale * as_floats(depth, "the depth image")
+    depth = scale * as_floats(numbers, "the depth image")
     require(
         depth.shape == shape,
         f"the depth image is {depth.shape} but the camera has {shape} pixels: give Camera(height=..., width=...) of "
@@ -43,12 +51,17 @@ def points_of_depth(
     # Before any work is done for a stride that is none.
     camera.strided(stride)
     if not is_traced(depth, pose):
-        known = np.asarray(depth)
-        _check_meaning(known[np.isfinite(known) & (known > 0)], camera, pose, box)
-    some = depth[stride // 2 :: stride, stride // 2 :: stride].reshape(-1)
-    lengths = jnp.linalg.norm(camera.strided(stride).pixel_directions(), axis=-1)
-    sight = jnp.where(some > 0, some * lengths, jnp.inf)
-    points, normals, mask, missed, inside = _oriented(depth, jnp.asarray(missed), camera, pose, stride, rounding, box)
+        ahead = None if box is None else _depths_of(box, pose)
+        known = np.where(_is_sentinel(np.asarray(numbers), camera, scale, ahead), 0.0, depth)
+        depth = jnp.asarray(known)
+        _check_meaning(known[np.isfinite(known) & (known > 0)], camera, ahead)
+    if camera.distortion:
+        place = camera.pixel_directions().reshape(*shape, 3)[..., :2]
+        matrix = jnp.asarray(camera.intrinsics, depth.dtype)
+        depth, missed = undistorted(depth, jnp.asarray(missed), place, matrix, camera.distortion)
+    gap = 1 if is_traced(depth) else gap_of(np.isfinite(depth) & (np.asarray(depth) > 0))
+    image = depth, jnp.asarray(missed), camera, pose, stride, rounding, box, gap
+    points, normals, mask, missed, inside, sight = _oriented(*image)
     if box is not None and not is_traced(points):
         _warn_of_nothing_inside(np.asarray(points)[np.asarray(mask)], np.asarray(inside)[np.asarray(mask)], box)
     mask = mask & inside
@@ -65,15 +78,27 @@ def _oriented(
     stride: int,
     rounding: float,
     box: Box | None,
-) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"], Bool[Array, " n"]]:
-    """Points, normals, which of them are valid, which rays met nothing in the box, and which points lie in it."""
+    gap: int,
+) -> tuple[
+    Float[Array, "n 3"],
+    Float[Array, "n 3"],
+    Bool[Array, " n"],
+    Bool[Array, " n"],
+    Bool[Array, " n"],
+    Float[Array, " n"],
+]:
+    """Points, normals, which of them are valid, which rays met nothing in the box, which points lie in it, and how far
+    each ray saw."""
+    rows, strided = slice(stride // 2, None, stride), camera.strided(stride)
+    seen = _rows_of(depth, jnp.isfinite(depth) & (depth > 0), stride, gap)[0]
+    sight = jnp.where(seen > 0, seen, jnp.inf).reshape(-1) * jnp.linalg.norm(strided.pixel_directions(), axis=-1)
     valid = jnp.isfinite(depth) & (depth > 0)
     if camera.farthest is not None:
         missed = missed | (valid & (depth > camera.farthest))
     valid = valid & ~missed & (depth >= camera.nearest)
-    smooth, normals, has_normal = fitted_planes(jnp.where(valid, depth, 0.0), valid, camera, stride, rounding)
-    rows, camera = slice(stride // 2, None, stride), camera.strided(stride)
-    depth, valid, missed = depth[rows, rows], valid[rows, rows], missed[rows, rows]
+    smooth, normals, has_normal = fitted_planes(jnp.where(valid, depth, 0.0), valid, camera, stride, rounding, gap)
+    (depth, valid, nearest), camera = _rows_of(jnp.where(valid, depth, 0.0), valid, stride, gap), strided
+    missed = missed[rows, rows]
     mask = (valid & has_normal).reshape(-1)
     local = jnp.where(valid, jnp.where(has_normal, smooth, depth), 0.0).reshape(-1, 1) * camera.pixel_directions()
     points = pose.to_scene(local)
@@ -81,10 +106,24 @@ def _oriented(
 
     missed, inside = missed.reshape(-1), jnp.ones_like(mask)
     if box is not None:
-        crossed = valid.reshape(-1) & (depth.reshape(-1) >= _depth_behind(box, camera, pose))
+        crossed = valid.reshape(-1) & (nearest.reshape(-1) >= _depth_behind(box, camera, pose))
         inside = box(points) <= 0
         missed = missed | (crossed & ~inside)
-    return points, normals, mask, missed, inside
+    return points, normals, mask, missed, inside, sight
+
+
+def _rows_of(
+    depth: Float[Array, "h w"], valid: Bool[Array, "h w"], stride: int, gap: int
+) -> tuple[Float[Array, "k l"], Bool[Array, "k l"], Float[Array, "k l"]]:
+    """Depths of every `stride`-th row and column, which are valid, and the least depth that a ray there may have met:
+    of the samples of their blocks, and with gaps of the blocks beside them."""
+    samples, is_sample, _ = block_samples(depth, valid, gap)
+    nearest = jnp.where(is_sample, samples, jnp.inf)
+    if gap > 1:
+        nearest = jax.lax.reduce_window(nearest, jnp.inf, jax.lax.min, (3, 3), (1, 1), "SAME")
+    rows, columns = (jnp.arange(stride // 2, size, stride) // gap for size in depth.shape)
+    at = rows[:, None], columns[None]
+    return samples[at], is_sample[at], nearest[at]
 
 
 def _depth_behind(box: Box, camera: Camera, pose: Pose) -> Float[Array, " n"]:
@@ -94,31 +133,64 @@ def _depth_behind(box: Box, camera: Camera, pose: Pose) -> Float[Array, " n"]:
     return jnp.where(leave > jnp.maximum(enter, 0.0), leave, -jnp.inf)
 
 
-def _check_meaning(depth: Float[np.ndarray, " valid"], camera: Camera, pose: Pose, box: Box | None) -> None:
-    """**Raises:** `ValueError` for depths and a pose that cannot be meant."""
-    if not len(depth):
-        return
-    low, middle, high = (float(value) for value in (depth.min(), np.median(depth), depth.max()))
-    farthest = np.inf if camera.farthest is None else camera.farthest
-    require(
-        high >= camera.nearest and low <= farthest,
-        f"all depths, from {low:.4g} to {high:.4g}, are out of the camera's range of {camera.nearest:.4g} to "
-        f"{farthest:.4g}: give the depth's scale, 0.001 for millimetres and a pose in metres, or another range",
-    )
-    if box is None:
-        return
+def without_sentinels(
+    depth: Real[np.ndarray, "height width"], camera: Camera, pose: Pose, scale: float, box: Box
+) -> Real[np.ndarray, "height width"]:
+    """The image with zeros where its value stands for "not measured", as `points_of_depth` finds them with the box.
+
+    **Raises:** `ValueError` if the box lies behind the camera.
+    """
+    return np.where(_is_sentinel(depth, camera, scale, _depths_of(box, pose)), 0, depth)
+
+
+def _is_sentinel(
+    depth: Real[np.ndarray, "h w"], camera: Camera, scale: float, ahead: tuple[float, float] | None
+) -> Bool[np.ndarray, "h w"]:
+    ends = np.inf if camera.farthest is None else camera.farthest, np.inf if ahead is None else _BEHIND * ahead[1]
+    return sentinel_pixels(depth, min(ends) / scale)
+
+
+def _depths_of(box: Box, pose: Pose) -> tuple[float, float]:
+    """Between which depths a box lies, the first one positive.
+
+    **Raises:** `ValueError` if it lies behind the camera.
+    """
     corners = np.stack(np.meshgrid(*zip(box.low, box.high, strict=True)), axis=-1).reshape(-1, 3)
     ahead = (corners - np.asarray(pose.position)) @ np.asarray(pose.forward)
+    farthest = float(ahead.max())
     require(
-        float(ahead.max()) > 0,
+        farthest > 0,
         f"the box from {box.low} to {box.high} lies behind the camera at {np.asarray(pose.position)}: give the pose "
         'from camera to world, not its inverse, and its convention, Pose.from_matrix(matrix, "opengl")',
     )
-    nearest = max(float(ahead.min()), 1e-3 * float(ahead.max()))
+    return max(float(ahead.min()), 1e-3 * farthest), farthest
+
+
+def _check_meaning(depth: Float[np.ndarray, " valid"], camera: Camera, ahead: tuple[float, float] | None) -> None:
+    """Check the units of the depths that were measured: one in a thousand of those in the camera's range is of the
+    order of the box's. What else there is may be a far background, or glare.
+
+    - `ahead`: between which depths the box lies.
+
+    **Raises:** `ValueError` for depths that cannot be meant.
+    """
+    if not len(depth):
+        return
+    farthest = np.inf if camera.farthest is None else camera.farthest
     require(
-        middle < _OTHER_UNITS * float(ahead.max()) and middle > nearest / _OTHER_UNITS,
-        f"the depths have a median of {middle:.4g}, but the box is {nearest:.4g} to {float(ahead.max()):.4g} away: "
-        "give the depth's scale, 0.001 for millimetres and a pose in metres",
+        depth.max() >= camera.nearest and depth.min() <= farthest,
+        f"all depths, from {depth.min():.4g} to {depth.max():.4g}, are out of the camera's range of "
+        f"{camera.nearest:.4g} to {farthest:.4g}: give the depth's scale, 0.001 for millimetres and a pose in metres, "
+        "or another range",
+    )
+    depth = depth[(depth >= camera.nearest) & (depth <= farthest)]
+    if ahead is None or not len(depth):
+        return
+    near, far = ahead
+    require(
+        bool(((depth > near / _OTHER_UNITS) & (depth < _OTHER_UNITS * far)).mean() >= _SOME),
+        f"the depths have a median of {np.median(depth):.4g}, but the box is {near:.4g} to {far:.4g} away: give the "
+        "depth's scale, 0.001 for millimetres and a pose in metres",
     )
 
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.gaps import block_samples
 
 _LARGEST_RADIUS = 10
 _SLOPE_ERROR = math.radians(2.5)
@@ -42,7 +43,7 @@ def depth_noise(depth: Float[Array, "h w"], valid: Bool[Array, "h w"]) -> Float[
 
 
 def fitted_planes(
-    depth: Float[Array, "h w"], valid: Bool[Array, "h w"], camera: Camera, stride: int, least_noise: float
+    depth: Float[Array, "h w"], valid: Bool[Array, "h w"], camera: Camera, stride: int, least_noise: float, gap: int = 1
 ) -> tuple[Float[Array, "k l"], Float[Array, "k l 3"], Bool[Array, "k l"]]:
     """Depths and normals of every so many-th row and column, in the camera's frame, and which have a plane.
 
@@ -50,26 +51,37 @@ def fitted_planes(
 
     - `depth`: positive and finite where it is `valid`. `camera`: of the whole image.
     - `least_noise`: a standard deviation that is known, that of rounding say.
+    - `gap`: the side of the blocks of pixels of which one is fitted to, see `gaps`; windows are of so many blocks.
     """
     sigma = jnp.maximum(depth_noise(depth, valid), least_noise)
     focal = jnp.asarray(camera.focal_lengths, depth.dtype)
     strided = slice(stride // 2, None, stride)
     place = camera.pixel_directions().reshape(*depth.shape, 3)[strided, strided, :2].astype(depth.dtype)
-    middle, has_middle = jnp.where(valid, depth, 1.0)[strided, strided], valid[strided, strided]
+    pixels = [jnp.arange(stride // 2, size, stride) for size in depth.shape]
+    rows, columns = (_LARGEST_RADIUS + pixel // gap for pixel in pixels)
+    samples, is_sample, offset = block_samples(depth, valid, gap)
+    padded = jnp.pad(jnp.where(is_sample, samples, 0.0), _LARGEST_RADIUS)
+    # How far each sample lies from the pixel of a row, in pixels: the column, then the row.
+    offset = jnp.pad(offset, ((_LARGEST_RADIUS, _LARGEST_RADIUS), (_LARGEST_RADIUS, _LARGEST_RADIUS), (0, 0)))
+    inside = jnp.stack(jnp.meshgrid(pixels[1] % gap, pixels[0] % gap), axis=-1)
+    own = offset[rows[:, None], columns[None]] - inside
+    middle, has_middle = padded[rows[:, None], columns[None]], padded[rows[:, None], columns[None]] > 0
+    middle = jnp.where(has_middle, middle, 1.0)
     spacing = middle[..., None] / focal
-    radius = _radius(jnp.min(spacing, axis=-1), sigma)
+    radius = _radius(gap * jnp.min(spacing, axis=-1), sigma)
+    window = (gap * radius)[..., None]
     width = 2 * jnp.max(jnp.where(has_middle, radius, 1)) + 1
-    padded = jnp.pad(jnp.where(valid, depth, 0.0), _LARGEST_RADIUS)
-    rows, columns = (_LARGEST_RADIUS + jnp.arange(stride // 2, size, stride) for size in depth.shape)
 
     def add(index, sums):
         """A neighbour of each pixel, where it can be of the same surface, its place in units of the window."""
         down, right = index // width - width // 2, index % width - width // 2
         near = padded[(rows + down)[:, None], (columns + right)[None]]
-        away = jnp.linalg.norm(spacing * jnp.stack([right, down]), axis=-1)
+        place = gap * jnp.stack([right, down]) - inside
+        place = place + offset[(rows + down)[:, None], (columns + right)[None]]
+        away = jnp.linalg.norm(spacing * (place - own), axis=-1)
         alike = jnp.abs(near - middle) <= _STEEPEST * away + _SPREAD * sigma
         used = has_middle & (near > 0) & alike & (jnp.maximum(jnp.abs(down), jnp.abs(right)) <= radius)
-        row = jnp.stack(jnp.broadcast_arrays(1.0, right / radius, down / radius), axis=-1)
+        row = jnp.stack(jnp.broadcast_arrays(1.0, *jnp.moveaxis(place / window, -1, 0)), axis=-1)
         row = jnp.where(used[..., None], row.astype(depth.dtype), 0.0)
         ratio = middle / jnp.where(used, near, 1.0)
         return sums[0] + row[..., :, None] * row[..., None, :], sums[1] + ratio[..., None] * row
@@ -82,10 +94,11 @@ def fitted_planes(
     plane = jnp.linalg.solve(regular, right_hand[..., None])[..., 0]
     has_plane = has_plane & (plane[..., 0] > 0)
     # From a slope a unit of the window to one a unit of (u, v).
-    slope = plane[..., 1:] * focal / radius[..., None]
+    slope = plane[..., 1:] * focal / window
     towards = jnp.concatenate([slope, plane[..., :1] - jnp.sum(slope * place, axis=-1, keepdims=True)], axis=-1)
     length = jnp.linalg.norm(towards, axis=-1, keepdims=True)
-    smooth = jnp.clip(middle / jnp.where(has_plane, plane[..., 0], 1.0), middle - 3.0 * sigma, middle + 3.0 * sigma)
+    reach = 3.0 * sigma + _STEEPEST * jnp.linalg.norm(spacing * own, axis=-1)
+    smooth = jnp.clip(middle / jnp.where(has_plane, plane[..., 0], 1.0), middle - reach, middle + reach)
     return smooth, -towards / jnp.where(length > 0, length, 1.0), has_plane & (length[..., 0] > 0)
 
 

@@ -11,10 +11,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxnbv.checks import AnyArray, as_floats, check_batch, check_index, checked, is_traced, require
 
+# |R R^T - I| of a matrix that is taken for a rotation; of one written to three digits, which is made one.
+_ORTHONORMAL, _ROUNDED = 1e-3, 5e-3
 # Signs of the camera's axes, given as right, down and forward.
 _CONVENTIONS = {"opencv": (1.0, 1.0, 1.0), "opengl": (1.0, -1.0, -1.0)}
 
@@ -51,6 +53,8 @@ class Pose(eqx.Module):
         - `convention`: "opencv" for cameras that look along +z with y down, "opengl" (also Blender's and NeRF's) for
           cameras that look along -z with y up.
 
+        A matrix written to three digits is made orthonormal.
+
         **Raises:** `ValueError` for another convention, a last row other than (0, 0, 0, 1), or as `Pose` does.
         """
         axes = _axes(convention)
@@ -63,6 +67,12 @@ class Pose(eqx.Module):
                 f"the last row of a pose's matrix is {last}, not (0, 0, 0, 1): give camera-to-world, not its transpose "
                 "or a projection",
             )
+            rotation = np.asarray(found)[..., :3, :3]
+            rounded = ((error := _off_rotation(rotation)) > _ORTHONORMAL) & (error <= _ROUNDED)
+            if rounded.any():
+                found = found.at[..., :3, :3].set(
+                    np.where(rounded[..., None, None], _nearest_rotation(rotation), rotation)
+                )
         return cls(found[..., :3, :3] * axes.astype(found.dtype), found[..., :3, 3])
 
     @property
@@ -107,15 +117,39 @@ def _axes(convention: str) -> np.ndarray:
     return np.array(_CONVENTIONS[convention])
 
 
+def rigid_matrices(
+    matrices: Float[np.ndarray, "n 4 4"],
+) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"]]:
+    """Matrices [[R, t], [0, 1]] with R made orthonormal, and which of them are rigid motions, if written to three
+    digits; the others are as they were."""
+    is_rigid = np.isfinite(matrices).all(axis=(1, 2)) & (_off_rotation(matrices[:, :3, :3]) <= _ROUNDED)
+    is_rigid &= (np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]) < 1e-6).all(axis=1)
+    rigid = np.array(matrices)
+    rigid[is_rigid, :3, :3] = _nearest_rotation(matrices[is_rigid, :3, :3])
+    return rigid, is_rigid
+
+
+def _off_rotation(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
+    """The largest entry of |R R^T - I|; infinite for a reflection and for what is not finite."""
+    known = np.where(np.isfinite(rotation).all(axis=(-1, -2), keepdims=True), rotation, 0.0)
+    error = np.abs(known @ np.swapaxes(known, -1, -2) - np.eye(3)).max(axis=(-1, -2))
+    return np.where(np.linalg.det(known) > 0, error, np.inf)
+
+
+def _nearest_rotation(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """The nearest rotation in the Frobenius norm (orthogonal Procrustes)."""
+    left, _, right = np.linalg.svd(rotation)
+    return left @ right
+
+
 def _check_rigid(rotation: np.ndarray, position: np.ndarray) -> None:
     finite = np.isfinite(rotation).all() and np.isfinite(position).all()
     require(finite, f"the pose has entries that are not finite: rotation {rotation}, position {position}; give numbers")
     error = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max(initial=0.0)
-    determinant = np.linalg.det(rotation)
     require(
-        error < 1e-3 and bool((determinant > 0).all()),
-        f"the pose's 3 x 3 matrix is not a rotation: |R R^T - I| is {error:.3g} and det R is {determinant}; "
-        "build it with look_at, or orthonormalise it first",
+        bool((_off_rotation(rotation) < _ORTHONORMAL).all()),
+        f"the pose's 3 x 3 matrix is not a rotation: |R R^T - I| is {error:.3g} and det R is {np.linalg.det(rotation)}"
+        "; build it with look_at, or orthonormalise it first",
     )
 
 

@@ -1,6 +1,7 @@
 """A live session: depth images of a real sensor in, where to take the next one out, in the user's own world."""
 
 import dataclasses
+import hashlib
 import math
 import warnings
 from collections.abc import Iterator
@@ -17,7 +18,7 @@ from tqdm import tqdm
 from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, checked, require, shown
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.depth_image import NothingInside
+from jaxnbv.geometry.depth_image import NothingInside, without_sentinels
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
@@ -25,7 +26,7 @@ from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import STAGES, Loop, View
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.session_warnings import warn_of_cut, warn_of_little, warn_of_table
+from jaxnbv.planning.session_warnings import warn_of_blank, warn_of_cut, warn_of_little, warn_of_table
 from jaxnbv.planning.stopping import StopRule
 from jaxnbv.planning.table import plane_under
 from jaxnbv.progress import progress_bar
@@ -39,6 +40,8 @@ from jaxnbv.tasks import NewSurface
 _NO_IMAGE = "the session has no image yet: add one first, session.add(depth, matrix)"
 # A cloud holds some thousands of points; more rays than these only take time.
 _MOST_RAYS = 20_000
+# Entries of two matrices of one pose differ by less, as stored in 32 bits.
+_SAME_PLACE = 1e-5
 # On recordings twice as many showed no more.
 _SAMPLES = 8
 
@@ -115,6 +118,8 @@ class Session:
         self._table: HalfSpace | None = None
         self._cut: frozenset[str] = frozenset()
         self._next: NextView | None = None
+        # The images so far by their digests: which they were, and from where.
+        self._taken: dict[bytes, tuple[int, np.ndarray]] = {}
         self._folder: RunFolder | None = None
         if folder is not None:
             # What a session is made of, as it was given: `load` makes it again from these.
@@ -199,20 +204,25 @@ class Session:
         matrix: Float[AnyArray, "4 4"] | list,
         depth_scale: float = 1.0,
     ) -> None:
-        """Take in an image, which is stored first.
+        """Take in an image, which is stored first. A later image that measured nothing is left out with a
+        `UserWarning`.
 
         - `depth`: see `PointCloud.from_depth`; `depth_scale` times it is in world units: 0.001 for millimetres where
           the world is in metres.
         - `matrix`: where the camera truly was, which need not be what was proposed.
 
         **Raises:** `ValueError` as `PointCloud.from_depth`, `Pose.from_matrix`, `Planner.init` and `observe` do, if the
-        first image shows nothing of the box, or if another process has added images to the folder. Nothing is changed
-        then.
+        first image shows nothing of the box, an earlier image is the same bit for bit though its pose is another, or
+        another process has added images to the folder. Nothing is changed then.
         """
         pixels = as_numbers(depth, "the depth image", None)
         place = as_numbers(matrix, "the matrix of a pose", np.float64)
+        count = len(self.views)
         with self._alone() as folder:
             self._add(pixels, place, depth_scale, folder)
+        if len(self.views) == count:
+            warn_of_blank()
+            return
         if len(self.views) == 1 and self._table is not None:
             warn_of_table(self.frame.to_world(np.asarray(self._table.point, np.float64)))
         voxel = self.frame.length_to_world(self.planner.sampler.grid.spacing)
@@ -270,7 +280,10 @@ class Session:
         """An image as a view, stored in the folder once the loop accepts it. The first may show what the object stands
         on, by which the planner is another."""
         index, pose, loop = len(self.views), Pose.from_matrix(matrix, self.convention), self._loop
-        image, kept = (depth, self.camera, pose, scale, self.stride), self.box
+        digest = hashlib.sha256(depth.tobytes()).digest()
+        _check_moved(self._taken.get(digest), matrix, depth)
+        pixels = without_sentinels(depth, self.camera, pose, scale, self.box)
+        image, kept = (pixels, self.camera, pose, scale, self.stride), self.box
         if (carving := loop.planner.sampler.carving) is not None:
             kept = carving.with_room(kept, loop.planner.sampler.grid, self.frame)
         with warnings.catch_warnings():
@@ -280,6 +293,8 @@ class Session:
                 cloud = PointCloud.from_depth(*image, kept)
             except NothingInside as problem:
                 raise InputError(f"the first image shows nothing of the box: {problem}") from problem
+        if index > 0 and _is_blank(depth, cloud):
+            return
         if index == 0 and loop.planner.obstacles is None:
             whole = self.frame.to_scene(PointCloud.from_depth(*image))
             self._table = plane_under(whole, self.frame.to_scene(self.box))
@@ -298,6 +313,7 @@ class Session:
 
         loop.add(self.frame.to_scene(pose), scan, accepted=store)
         self._loop, self._next = loop, None
+        self._taken[digest] = index, matrix
 
     def _read(self, folder: RunFolder) -> None:
         """The images of the folder and the proposals that they followed; the proposal after the last one."""
@@ -367,6 +383,26 @@ def usual_planner() -> Planner:
 def stride_of(camera: Camera) -> int:
     """The stride that leaves as many rays of an image as are worth their time."""
     return math.ceil(math.sqrt(camera.num_rays / _MOST_RAYS))
+
+
+def _check_moved(earlier: tuple[int, np.ndarray] | None, matrix: np.ndarray, depth: np.ndarray) -> None:
+    """**Raises:** `ValueError` if an image that measured something was added before from another pose."""
+    if earlier is None or not (depth > 0).any():
+        return
+    index, before = earlier
+    require(
+        bool(np.abs(before - matrix).max() <= _SAME_PLACE),
+        f"the image is bit for bit image {index + 1}, which was taken from another pose: it is of an earlier moment "
+        "than its pose. Discard the frames that the driver still holds after a move",
+    )
+
+
+def _is_blank(depth: np.ndarray, cloud: PointCloud) -> bool:
+    """Whether an image measured nothing: no pixel is valid, or all of them have one value and show no surface."""
+    if bool(cloud.mask.any()):
+        return False
+    values = np.unique(depth[depth > 0])
+    return not bool(np.any(cloud.missed)) or (len(values) == 1 and bool(np.isfinite(values[0])))
 
 
 def _box_of(corners) -> Box:

@@ -39,6 +39,15 @@ def warn_of_table(point: Float[np.ndarray, "3"]) -> None:
     )
 
 
+def warn_of_blank() -> None:
+    """Warn of an image that measured nothing."""
+    warnings.warn(
+        "the image measured nothing (all pixels are invalid, or of one value beyond the object) and is left out: take "
+        "it again, from farther away or with another exposure",
+        stacklevel=_CALLER_OF_ADD,
+    )
+
+
 def warn_of_little(value: float, error: float | None, in_vain: float) -> None:
     """Warn of a best view that may be worth nothing: of candidates that look elsewhere, or once all has been seen.
 

@@ -3,52 +3,80 @@
 import json
 import math
 import os
+import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt16
+from jaxtyping import Bool, Float, UInt16
 from scipy.spatial.transform import Rotation
 
-from jaxnbv.checks import InputError, as_numbers, require, shown
+from jaxnbv.checks import AnyArray, InputError, as_numbers, require, shown
 from jaxnbv.errors import optional
 from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.pose import rigid_matrices
+from jaxnbv.readers.depth_unit import depth_unit
+from jaxnbv.readers.intrinsics import intrinsic_matrix, stored_intrinsics
+from jaxnbv.readers.text_files import read_rows, read_table, read_text
 
 # In seconds: an image and a pose of a TUM sequence that lie farther apart are not of one moment.
 _APART = 0.02
 # 7-Scenes marks what was not measured by the largest number there is.
 _NOT_MEASURED = np.iinfo(np.uint16).max
-# Published with the data sets, of TUM RGB-D for its first two sensors.
-_INTRINSICS_7_SCENES = np.array([[585.0, 0.0, 320.0], [0.0, 585.0, 240.0], [0.0, 0.0, 1.0]])
-_INTRINSICS_TUM = np.array([[525.0, 0.0, 319.5], [0.0, 525.0, 239.5], [0.0, 0.0, 1.0]])
+_ASK_INTRINSICS = (
+    "give intrinsics=(fx, fy, cx, cy) in pixels (on the command line --intrinsics FX FY CX CY), or put a "
+    "camera-intrinsics.txt into it. As published: 585, 585, 320, 240 for 7-Scenes; 517.3, 516.5, 318.6, 255.3 for "
+    "freiburg1 of TUM RGB-D, 520.9, 521.0, 325.1, 249.7 for freiburg2, 535.4, 539.2, 320.1, 247.6 for freiburg3; "
+    "481.2, 480, 319.5, 239.5 for ICL-NUIM"
+)
+_ASK_UNIT = (
+    "give depth_scale= (on the command line --depth-scale): 1/1000 for millimetres (7-Scenes, 3DMatch), 1/5000 for TUM "
+    "RGB-D and ICL-NUIM, 1/10000 for tenths of a millimetre"
+)
 
 
-# Files, matrices from camera to world, intrinsics in pixels, and how long a unit of the depth images is.
-_Layout: TypeAlias = tuple[list[Path], Float[np.ndarray, "n 4 4"], Float[np.ndarray, "3 3"], float]
+class _Layout(NamedTuple):
+    """Files and their matrices, camera to world; intrinsics and the length of a unit where the layout says them."""
+
+    files: list[Path]
+    matrices: Float[np.ndarray, "n 4 4"]
+    intrinsics: Float[np.ndarray, "3 3"] | None = None
+    depth_scale: float | None = None
 
 
 class RecordedFrames:
     """The frames of a recorded sequence: depth images, each read when it is asked for, and where they were taken.
 
     - `folder`: as one of these data sets is unpacked,
-        - 7-Scenes: `frame-000000.depth.png` (16 bit, mm) and `frame-000000.pose.txt` (4 x 4, camera to world, metres);
-          `camera-intrinsics.txt` (3 x 3) where it is not the data set's own;
-        - TUM RGB-D: `depth.txt` (time, file) and `groundtruth.txt` (time, position, quaternion); images of 5,000 a
-          metre. An image without a pose within 20 ms is left out;
+        - 7-Scenes: `frame-000000.depth.png` (16 bit) and `frame-000000.pose.txt` (4 x 4, camera to world);
+        - TUM RGB-D: `depth.txt` (time, file) and `groundtruth.txt` (time, position, quaternion). An image without a
+          pose within 20 ms is left out;
         - `frames.json`: `{"intrinsics": 3 x 3, "depth_scale": 0.001, "frames": [{"depth": FILE, "pose": 4 x 4}, ...]}`,
-          files relative to it, camera to world in OpenCV's axes.
+          files relative to it, camera to world in OpenCV's axes; the first two may be left out.
     - `up`: where given, the direction that is upward in the world, which is then turned so that this becomes z, and x
       stays in its plane.
+    - `intrinsics`: of the depth camera, in pixels: 3 x 3, or fx, fy, cx, cy. By default those of `frames.json`, or of a
+      file in the folder or its parent: `camera-intrinsics.txt` (3 x 3) or another of the kind that 3DMatch, ScanNet,
+      ETH3D, BundleFusion and Open3D write. No layout has intrinsics of its own.
+    - `depth_scale`: the length of a unit of the images in the poses' units, 1/5000 say. By default that of
+      `frames.json`, or the usual one (1/1000, 1/5000, 1/10000...) with which frames of the same place agree.
 
     `camera` is the sensor and `matrices` (n, 4, 4) its poses, OpenCV axes, in world units; `depth_scale` times an image
     is in these. Add frame i to a session by `session.add(frames.depth(i), frames.matrices[i], frames.depth_scale)`.
+    A frame whose pose was lost (not finite, zeros, or no rotation) is left out with a `UserWarning`.
 
-    **Raises:** `ValueError` if the folder holds none of these, or what is missing or damaged in it.
+    **Raises:** `ValueError` if the folder holds none of these, or what is missing or damaged in it; if the intrinsics
+    are not there, or the frames cannot tell the unit; if most poses are none.
     """
 
-    def __init__(self, folder: str | Path, up: tuple[float, float, float] | None = None):
+    def __init__(
+        self,
+        folder: str | Path,
+        up: tuple[float, float, float] | None = None,
+        intrinsics: Float[AnyArray, "..."] | list | tuple | None = None,
+        depth_scale: float | None = None,
+    ):
         folder, turn = Path(folder), np.eye(4) if up is None else _upward(up)
         require(os.path.isdir(folder), f"there is no folder {folder}: give the place of the unpacked data set")
         read = next((reader for sign, reader in _READERS.items() if any(folder.glob(sign))), None)
@@ -58,21 +86,30 @@ class RecordedFrames:
                 "TUM RGB-D (depth.txt and groundtruth.txt), or one with frames.json"
             )
         try:
-            files, matrices, intrinsics, depth_scale = read(folder)
-            matrices = turn @ matrices
-            Pose.from_matrix(matrices)
+            layout = read(folder)
+            rigid, is_rigid = rigid_matrices(layout.matrices)
         except (OSError, ValueError, LookupError, TypeError) as error:
             problem = f"the recording in {folder} is not whole ({type(error).__name__}: {error})"
             raise InputError(f"{problem}: unpack the data set again") from error
+        files = _with_pose(layout.files, is_rigid, folder)
         absent = [file for file in files if not os.path.isfile(file)]
         require(
             not absent,
             f"{len(absent)} of the {len(files)} files that {folder} names are not there, the first "
             f"{absent[:1]}: unpack the data set again",
         )
-        self.folder, self.files, self.matrices, self.depth_scale = folder, tuple(files), matrices, depth_scale
-        height, width = self.depth(0).shape
-        self.camera = Camera.from_intrinsics(intrinsics, height, width)
+        self.folder, self.files, self.matrices = folder, tuple(files), turn @ rigid[is_rigid]
+        matrix = layout.intrinsics if intrinsics is None else intrinsic_matrix(intrinsics, "the intrinsics")
+        matrix = stored_intrinsics(folder) if matrix is None else matrix
+        if matrix is None:
+            raise InputError(f"nothing in {folder} says the intrinsics of its depth camera: {_ASK_INTRINSICS}")
+        self.camera = Camera.from_intrinsics(matrix, *self.depth(0).shape)
+        scale = layout.depth_scale if depth_scale is None else depth_scale
+        scale = depth_unit(self.depth, self.matrices, self.camera) if scale is None else scale
+        if scale is None:
+            raise InputError(f"the frames of {folder} cannot tell the unit of their depths: {_ASK_UNIT}")
+        require(0 < scale < 100, f"the depth scale is {shown(scale)}, which is no length of a unit: {_ASK_UNIT}")
+        self.depth_scale = float(scale)
 
     def __len__(self) -> int:
         return len(self.files)
@@ -95,32 +132,36 @@ class RecordedFrames:
 
 def _seven_scenes(folder: Path) -> _Layout:
     files = sorted(folder.glob("*.depth.png"))
-    poses = [_table(file.with_name(file.name.replace(".depth.png", ".pose.txt"))) for file in files]
-    own = folder / "camera-intrinsics.txt"
-    intrinsics = _table(own) if os.path.isfile(own) else _INTRINSICS_7_SCENES
-    return files, np.stack(poses), intrinsics, 1e-3
+    poses = [read_table(file.with_name(file.name.replace(".depth.png", ".pose.txt"))) for file in files]
+    return _Layout(files, np.stack(poses))
 
 
 def _tum(folder: Path) -> _Layout:
-    lines = (folder / "depth.txt").read_text().splitlines()
-    images = np.array([line.split() for line in lines if line and not line.startswith("#")])
-    times, track = images[:, 0].astype(float), _table(folder / "groundtruth.txt")
+    images = np.array([row[:2] for row in read_rows(folder / "depth.txt")])
+    times, track = images[:, 0].astype(float), read_table(folder / "groundtruth.txt")
     nearest = np.abs(times[:, None] - track[None, :, 0]).argmin(axis=1)
     kept = np.flatnonzero(np.abs(times - track[nearest, 0]) <= _APART)
     require(len(kept) > 0, f"no image has a pose within {_APART} s")
-    found = track[nearest[kept]]
-    matrices = np.tile(np.eye(4), (len(kept), 1, 1))
-    matrices[:, :3, :3], matrices[:, :3, 3] = Rotation.from_quat(found[:, 4:]).as_matrix(), found[:, 1:4]
-    return [folder / images[index, 1] for index in kept], matrices, _INTRINSICS_TUM, 1.0 / 5000.0
+    poses = track[nearest[kept], 1:8]
+    length = np.linalg.norm(poses[:, 3:], axis=1)
+    is_rotation = np.isfinite(length) & (length > 0)
+    matrices = np.full((len(kept), 4, 4), np.nan)
+    matrices[:, :3, 3], matrices[:, 3] = poses[:, :3], (0.0, 0.0, 0.0, 1.0)
+    matrices[is_rotation, :3, :3] = Rotation.from_quat(poses[is_rotation, 3:]).as_matrix()
+    return _Layout([folder / images[index, 1] for index in kept], matrices)
 
 
 def _plain(folder: Path) -> _Layout:
-    said = json.loads((folder / "frames.json").read_text())
-    files = [folder / frame["depth"] for frame in said["frames"]]
-    matrices = np.stack([np.array(frame["pose"], float) for frame in said["frames"]])
-    scale = float(said["depth_scale"])
-    require(0 < scale < math.inf, f"the depth_scale is {scale}; it must be positive and finite")
-    return files, matrices, np.array(said["intrinsics"], float), scale
+    content = json.loads(read_text(folder / "frames.json"))
+    files = [folder / frame["depth"] for frame in content["frames"]]
+    matrices = np.stack([np.array(frame["pose"], float) for frame in content["frames"]])
+    intrinsics, scale = content.get("intrinsics"), content.get("depth_scale")
+    return _Layout(
+        files,
+        matrices,
+        None if intrinsics is None else intrinsic_matrix(intrinsics, "intrinsics"),
+        None if scale is None else float(scale),
+    )
 
 
 # By a file that tells it.
@@ -131,12 +172,20 @@ _READERS: dict[str, Callable[[Path], _Layout]] = {
 }
 
 
-def _table(path: Path) -> Float[np.ndarray, "rows columns"]:
-    """The numbers in a text file."""
-    try:
-        return np.loadtxt(path, ndmin=2)
-    except ValueError as error:
-        raise InputError(f"{path} is no table: {error}") from error
+def _with_pose(files: list[Path], has_pose: Bool[np.ndarray, " n"], folder: Path) -> list[Path]:
+    """The files whose frames have a pose, with a `UserWarning` if others have none.
+
+    **Raises:** `ValueError` if most have none.
+    """
+    lost = [file.name for file, kept in zip(files, has_pose, strict=True) if not kept]
+    problem = f"{len(lost)} of the {len(files)} poses in {folder} are no rigid motion, the first that of {lost[:1]}"
+    require(
+        2 * len(lost) <= len(files),
+        f"{problem}: give 4 x 4 matrices from camera to world, [[R, t], [0, 1]] with R R^T = I",
+    )
+    if lost:
+        warnings.warn(f"{problem}: these frames are left out", stacklevel=3)
+    return [file for file, kept in zip(files, has_pose, strict=True) if kept]
 
 
 def _upward(up: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:

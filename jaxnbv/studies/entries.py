@@ -52,6 +52,21 @@ RECORDING = {
             show_default="as recorded",
         ),
     ],
+    "intrinsics": Annotated[
+        tuple[float, float, float, float] | None,
+        typer.Option(
+            metavar="FX FY CX CY",
+            help="Intrinsics of a recording's depth camera, in pixels.",
+            show_default="those in its folder or the parent",
+        ),
+    ],
+    "depth_scale": Annotated[
+        float | None,
+        typer.Option(
+            help="The length of a unit of a recording's images in the units of its poses, 0.0002 for TUM RGB-D.",
+            show_default="the usual one with which frames agree",
+        ),
+    ],
 }
 
 PYRAMID = Entry(

@@ -119,7 +119,7 @@ class RecordedStudy(Study):
     """Which frames of a recording show the most of a box? Settings as of `Study`, but that candidates are the recorded
     poses, and a scene is a first view: one of the frames that show a twentieth of the box, at random.
 
-    - `folder`: of `RecordedFrames`; `up`: as it takes it.
+    - `folder`: of `RecordedFrames`; `up`, `intrinsics` (fx, fy, cx, cy) and `depth_scale`: as it takes them.
     - `box`: low and high corner of what is to be seen, in the recording's units.
     - `voxel`: side of the voxels that are counted, in the recording's units.
 
@@ -154,17 +154,20 @@ class RecordedStudy(Study):
     box: Box = eqx.field(static=True, kw_only=True)
     voxel: float = eqx.field(static=True, kw_only=True)
     up: tuple[float, float, float] | None = eqx.field(static=True, default=None)
+    intrinsics: tuple[float, float, float, float] | None = eqx.field(static=True, default=None)
+    depth_scale: float | None = eqx.field(static=True, default=None)
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
         """
-        - `folder`, `up`: those of the study; `box`: its corners, six numbers, by default about all but a hundredth of
-          what was seen, to either side of each axis, with room of a twentieth of its longest side. The voxels are an
-          eightieth of its longest side.
+        - `folder`, `up`, `intrinsics`, `depth_scale`: those of the study.
+        - `box`: its corners, six numbers, by default about all but a hundredth of what was seen, to either side of each
+          axis, with room of a twentieth of its longest side. The voxels are an eightieth of its longest side.
         """
         require(model in MODELS, f"nothing is known of what was recorded: give a model of {', '.join(MODELS)}")
-        folder, up = str(Path(options["folder"]).resolve()), options.get("up")
-        frames = RecordedFrames(folder, up)
+        folder = str(Path(options["folder"]).resolve())
+        sensor: dict[str, Any] = {name: options.get(name) for name in ("up", "intrinsics", "depth_scale")}
+        frames = RecordedFrames(folder, **sensor)
         corners = options.get("box") or _bounds(frames)
         box = Box(tuple(corners[:3]), tuple(corners[3:]))
         longest = max(high - low for low, high in zip(box.low, box.high, strict=True))
@@ -177,7 +180,7 @@ class RecordedStudy(Study):
             folder=folder,
             box=box,
             voxel=longest / _VOXELS_ALONG_BOX,
-            up=up,
+            **sensor,
             **settings,
         )
         return {"": study}
@@ -187,7 +190,8 @@ class RecordedStudy(Study):
         """The sequence, read once a process."""
         carving, frame = self.sampler.carving, frame_of_box(self.box)
         kept = self.box if carving is None else carving.with_room(self.box, self.grid, frame)
-        return _recording(self.folder, self.up, self.box, self.voxel, kept)
+        sensor = self.up, self.intrinsics, self.depth_scale
+        return _recording((self.folder, *sensor), self.box, self.voxel, kept)
 
     @property
     def candidates(self) -> GivenPoses:
@@ -290,9 +294,9 @@ def frame_of_box(box: Box) -> Frame:
 
 
 @functools.cache
-def _recording(folder: str, up: tuple[float, float, float] | None, box: Box, voxel: float, kept: Box) -> Recording:
-    """`kept`: the box to which scans are cropped."""
-    frames, frame = RecordedFrames(folder, up), frame_of_box(box)
+def _recording(source: tuple[Any, ...], box: Box, voxel: float, kept: Box) -> Recording:
+    """`source`: the arguments of `RecordedFrames`. `kept`: the box to which scans are cropped."""
+    frames, frame = RecordedFrames(*source), frame_of_box(box)
     poses, stride = Pose.from_matrix(frames.matrices), stride_of(frames.camera)
     count = frames.camera.strided(stride).num_rays
     nowhere, none = jnp.zeros((count, 3)), jnp.zeros(count, bool)
@@ -312,6 +316,6 @@ def _recording(folder: str, up: tuple[float, float, float] | None, box: Box, vox
     shown = np.zeros((len(frames), len(counts)), bool)
     shown[np.repeat(np.arange(len(frames)), [len(rows) for rows in seen]), which] = True
     often = counts >= _SEEN_BY
-    require(bool(often.any()), f"no voxel of {box} is seen by {_SEEN_BY} frames of {folder}: give another box")
+    require(bool(often.any()), f"no voxel of {box} is seen by {_SEEN_BY} frames of {frames.folder}: give another box")
     voxels, places = voxel * (found[often] + 0.5), frames.matrices[:, :3, 3]
     return Recording(frame.to_scene(poses), tuple(scans), shown[:, often], voxels, places)

@@ -45,7 +45,7 @@ class Entry(NamedTuple):
 
     def flag(self, option: str) -> str:
         """How an option is given on the command line."""
-        return option.upper() if option in self.arguments else f"--{option}"
+        return option.upper() if option in self.arguments else f"--{option.replace('_', '-')}"
 
 
 @functools.cache

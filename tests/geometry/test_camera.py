@@ -78,6 +78,105 @@ def test_a_resized_camera_sees_the_same_and_the_frustum_is_its_border(values, he
     np.testing.assert_allclose(corners[2], [2 * expected[2], 2 * expected[3], 2.0], rtol=1e-5, atol=1e-6)
 
 
+FULL = np.array([[600.0, 0.0, 318.6], [0.0, 605.0, 242.3], [0.0, 0.0, 1.0]])
+# Principal points of depth cameras on the market, as shares of width and height.
+CENTERS = [
+    (0.4978, 0.5318),
+    (0.4980, 0.4835),
+    (0.5004, 0.5063),
+    (0.5, 0.5),
+    (0.4863, 0.4961),
+    (0.516, 0.49),
+    (0.505, 0.52),
+]
+
+
+@pytest.mark.parametrize(("left", "top"), [(320, 240), (600, 0), (-300, 100), (0, 400), (100, -200)])
+def test_the_rays_of_a_window_are_those_of_the_whole_image(left, top):
+    """Wherever its principal point lies, as of structured light too."""
+    matrix, whole = FULL - np.array([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]]), np.array(FULL)
+    camera = nbv.Camera.from_intrinsics(matrix, 120, 160)
+    directions = np.asarray(camera.pixel_directions(), np.float64).reshape(120, 160, 3)
+    seen = directions @ whole.T
+    np.testing.assert_allclose(seen[0, 0, :2], [left, top], atol=1e-3)
+    np.testing.assert_allclose(seen[-1, -1, :2], [left + 159, top + 119], atol=1e-3)
+
+
+@pytest.mark.parametrize("binning", [2, 3, 4])
+@pytest.mark.parametrize("center", CENTERS)
+def test_a_matrix_of_another_image_size_is_named(center, binning, recwarn):
+    height, width = 480, 640
+    matrix = FULL + np.array(
+        [[0, 0, center[0] * width - 0.5 - 318.6], [0, 0, center[1] * height - 0.5 - 242.3], [0] * 3]
+    )
+    nbv.Camera.from_intrinsics(matrix, height, width)
+    assert len(recwarn) == 0
+    named = r"centre of an image of 6\d\d x [45]\d\d, but this one is .* binned.* divide its first two rows by"
+    with pytest.raises(nbv.InputError, match=f"{named} {binning}"):
+        nbv.Camera.from_intrinsics(matrix, height // binning, width // binning)
+    if binning == 2:
+        with pytest.warns(UserWarning, match=r"centre of an image .* divide its first two rows by 0\.5"):
+            nbv.Camera.from_intrinsics(matrix, height * 2, width * 2)
+    right = np.array(matrix)
+    right[:2] /= binning
+    nbv.Camera.from_intrinsics(right, height // binning, width // binning)
+
+
+LENSES = [
+    (-0.3, 0.1, 0.001, -0.002),
+    (0.1, -0.2, 0.0005, 0.0005, 0.1),
+    (8.1, 4.5, 1e-4, -2e-5, 0.2, 8.4, 6.5, 1.2),
+]
+
+
+def through_lens(x, y, k1, k2, p1, p2, k3=0.0, k4=0.0, k5=0.0, k6=0.0):
+    """OpenCV's formula, in float64."""
+    r2 = x * x + y * y
+    radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
+    return x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_distortion_is_undone_once_an_image(lens):
+    """A ball before a slanted wall through a lens: analytic depths on rays found by iteration from the forward model.
+    What met nothing stays so."""
+    matrix = np.array([[250.0, 0.0, 160.5], [0.0, 252.0, 118.0], [0.0, 0.0, 1.0]])
+    v, u = np.mgrid[:240, :320].astype(float)
+    seen = (u - 160.5) / 250.0, (v - 118.0) / 252.0
+    x, y = np.array(seen)
+    for _ in range(100):
+        now = through_lens(x, y, *lens)
+        x, y = x + seen[0] - now[0], y + seen[1] - now[1]
+    np.testing.assert_allclose(through_lens(x, y, *lens), seen, atol=1e-9)
+    center, radius = np.array([0.05, -0.02, 0.55]), 0.15
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+    a, b, c = (rays**2).sum(axis=-1), rays @ center, center @ center - radius**2
+    root = b * b - a * c
+    ball = np.where(root > 0, (b - np.sqrt(np.maximum(root, 0.0))) / a, np.inf)
+    depth = np.where(x > 0.3, np.inf, np.minimum(ball, 0.8 / (1.0 - 0.1 * x)))
+    camera = nbv.Camera.from_intrinsics(matrix, 240, 320, distortion=lens)
+    pose = nbv.Pose(np.eye(3), np.zeros(3))
+    off = []
+    for one in (camera, nbv.Camera.from_intrinsics(matrix, 240, 320)):
+        cloud = nbv.PointCloud.from_depth(depth, one, pose)
+        points = np.asarray(cloud.to_numpy()[0], np.float64)
+        from_ball = np.linalg.norm(points - center, axis=1) - radius
+        from_wall = (points[:, 2] - 0.1 * points[:, 0] - 0.8) / math.hypot(1.0, 0.1)
+        off.append(np.minimum(np.abs(from_ball), np.abs(from_wall)))
+    assert np.median(off[0]) < 5e-5
+    assert np.percentile(off[0], 99) < 1e-3
+    assert np.median(off[1]) > 4 * np.percentile(off[0], 90)
+    cloud = nbv.PointCloud.from_depth(depth, camera, pose)
+    missed, met = np.asarray(cloud.missed), np.asarray(cloud.mask)
+    across = np.asarray(camera.pixel_directions())[:, 0]
+    assert not missed[across < 0.295].any()
+    assert not met[across > 0.305].any()
+    assert missed[across > 0.305].mean() > 0.6
+    on_ball = np.abs(np.linalg.norm(np.asarray(cloud.points) - center, axis=1) - radius) < 1e-4
+    outward = (np.asarray(cloud.points)[met & on_ball] - center) / radius
+    assert np.median(np.sum(outward * np.asarray(cloud.normals)[met & on_ball], axis=1)) > math.cos(math.radians(2.0))
+
+
 def test_a_scan_tells_what_lies_in_range_and_is_not_aslant():
     """A ball before a wall: analytic depths and angles, ray by ray."""
     surface = nbv.SDFSurface(Sphere(0.5) | Cuboid([1.2, 1.2, 0.1]).translate([0.0, 0.0, -1.0]))
@@ -131,6 +230,19 @@ def test_poses_to_matrices_and_back_in_both_conventions(given):
     np.testing.assert_allclose(turned.rotation[:, 0], rotation[:, 0], atol=1e-6)
     batch = nbv.Pose.from_matrix(np.stack([matrix, np.eye(4)]))
     assert batch.matrix.shape == (2, 4, 4)
+
+
+def test_a_matrix_to_three_digits_is_made_a_rotation():
+    matrices = np.tile(np.eye(4), (50, 1, 1))
+    matrices[:, :3, :3] = Rotation.random(50, rng=np.random.default_rng(0)).as_matrix()
+    poses = nbv.Pose.from_matrix(np.round(matrices, 3))
+    rotation = np.asarray(poses.rotation, np.float64)
+    np.testing.assert_allclose(rotation, matrices[:, :3, :3], atol=1e-3)
+    off = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
+    given = np.round(matrices[:, :3, :3], 3)
+    was_off = np.abs(given @ given.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2)) > 1e-3
+    assert 5 < was_off.sum() < 50
+    assert off[was_off].max() < 1e-6
 
 
 def test_a_pose_s_matrix_moves_points_as_the_pose_does():

@@ -91,6 +91,116 @@ def test_beyond_its_range_a_sensor_met_nothing_and_before_it_says_nothing():
     assert int(cloud.count) > 200
 
 
+def image_with(mark, background, dtype, camera=CAMERA):
+    """The ball before a background, millimetres or metres; the left half of it is marked as not measured."""
+    depth = depth_of(BALL, camera=camera)
+    ball = np.isfinite(depth)
+    shown = np.where(ball, 1000.0 * depth, background)
+    shown[:, : camera.width // 2][ball[:, : camera.width // 2]] = mark
+    return np.round(shown).astype(dtype) / (1.0 if dtype == np.uint16 else 1000.0), ball
+
+
+WALL = 2500.0 + 5.0 * np.random.default_rng(0).normal(size=(48, 64))
+
+
+@pytest.mark.parametrize("farthest", [None, 2.0])
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+@pytest.mark.parametrize("alone", [True, False])
+@pytest.mark.parametrize("mark", [65535, 32767, 10000, 8191, 4095, 2047])
+@pytest.mark.filterwarnings("ignore:the depth image has the value")
+def test_a_mark_says_no_more_than_zero(mark, alone, dtype, farthest):
+    """Row by row the same cloud, and no node within the ball is known to be empty."""
+    camera = nbv.Camera.from_intrinsics(CAMERA.intrinsics, 48, 64, farthest=farthest)
+    scale = 1e-3 if dtype == np.uint16 else 1.0
+    clouds = []
+    for value in (mark, 0):
+        image, ball = image_with(value, value if alone else WALL, dtype)
+        clouds.append(nbv.PointCloud.from_depth(image.astype(dtype), camera, POSE, depth_scale=scale, box=BOX))
+    for name in ("points", "mask", "missed", "sight"):
+        np.testing.assert_array_equal(getattr(clouds[0], name), getattr(clouds[1], name))
+    assert not np.asarray(clouds[0].missed).reshape(48, 64)[ball].any()
+    assert int(clouds[0].count) > 100
+    grid, frame = nbv.Grid(40), nbv.Frame.fit(np.array([BOX.low, BOX.high]), up="z")
+    scene = (frame.to_scene(one) for one in (POSE, clouds[0], camera))
+    empty = np.asarray(nbv.Carving().empty_nodes(grid, *scene))
+    nodes = np.stack(np.meshgrid(*[grid.axis] * 3, indexing="ij"), axis=-1)
+    center = np.asarray(frame.to_scene(np.array([[0.0, 0.0, 0.1]])))[0]
+    assert not empty[np.linalg.norm(nodes - center, axis=-1) < 0.095 * frame.scale].any()
+
+
+def test_a_mark_is_warned_of_and_a_wall_and_a_floor_are_not(recwarn):
+    image, _ = image_with(10000, WALL, np.uint16)
+    with pytest.warns(UserWarning, match=r"value 10000 in \d+ pixels.*not measured.*Give infinity"):
+        nbv.PointCloud.from_depth(image, CAMERA, POSE, depth_scale=1e-3, box=BOX)
+    recwarn.clear()
+    for other in (image_with(0, WALL, np.uint16)[0], np.round(1000 * depth_of(BALL, TABLE)), np.full((48, 64), 9e3)):
+        cloud = nbv.PointCloud.from_depth(np.where(np.isfinite(other), other, 0), CAMERA, POSE, depth_scale=1e-3)
+        assert int(cloud.count) > 100
+    assert len(recwarn) == 0
+
+
+@pytest.mark.filterwarnings("ignore:the depth image has the value")
+@pytest.mark.parametrize("farthest", [None, 3.0])
+@pytest.mark.parametrize("rest", [1e10, 65504.0, 100.0, 20.0, 0.01, "a wall"])
+def test_a_far_background_and_glare_are_no_other_units(rest, farthest):
+    depth = depth_of(BALL)
+    camera = nbv.Camera.from_intrinsics(CAMERA.intrinsics, 48, 64, nearest=0.1, farthest=farthest)
+    background = 20.0 + 0.01 * np.arange(64) if rest == "a wall" else rest
+    image = np.where(np.isfinite(depth), depth, background)
+    cloud, alone = (nbv.PointCloud.from_depth(one, camera, POSE, box=BOX) for one in (image, depth))
+    np.testing.assert_array_equal(cloud.mask, alone.mask)
+    np.testing.assert_allclose(cloud.points, alone.points, atol=1e-3)
+
+
+FINE = nbv.Camera.from_intrinsics([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]], width=640, height=480)
+SPARSE = {
+    "every 8th row": lambda v, u: v % 8 == 0,
+    "every 8th row, others": lambda v, u: v % 8 == 3,
+    "every 4th column": lambda v, u: u % 4 == 1,
+    "every 2nd column": lambda v, u: u % 2 == 1,
+    "every 4th pixel": lambda v, u: (v % 4 == 1) & (u % 4 == 3),
+    "a lidar": lambda v, u: (v % 6 == 5) & (u % 2 == 0),
+    "5 % at random": lambda v, u: np.random.default_rng(0).random(v.shape) < 0.05,
+    "20 % at random": lambda v, u: np.random.default_rng(0).random(v.shape) < 0.2,
+}
+
+
+@pytest.mark.parametrize("stride", [4, 8])
+@pytest.mark.parametrize("name", SPARSE)
+def test_an_image_with_gaps_shows_the_object(name, stride):
+    """As many rows as of the whole image but for the rim, on their rays, near the ball and with its normals."""
+    depth = depth_of(BALL, TABLE, camera=FINE)
+    image = np.where(np.isfinite(depth) & SPARSE[name](*np.mgrid[:480, :640]), np.round(1e4 * depth), 0.0)
+    whole = nbv.PointCloud.from_depth(np.where(np.isfinite(depth), depth, 0.0), FINE, POSE, 1.0, stride, BOX)
+    cloud = nbv.PointCloud.from_depth(image.astype(np.uint16), FINE, POSE, 1e-4, stride, BOX)
+    points, normals = (np.asarray(rows, np.float64) for rows in cloud.to_numpy())
+    assert 0.6 * int(whole.count) < len(points) < 1.4 * int(whole.count)
+    outward = points - [0.0, 0.0, 0.1]
+    distance = np.linalg.norm(outward, axis=1)
+    assert np.median(np.abs(distance - 0.1)) < 4e-3
+    assert np.median(np.sum(outward * normals, axis=1) / distance) > np.cos(np.radians(10.0))
+    rays = np.asarray(FINE.strided(stride).pixel_directions(), np.float64)[np.asarray(cloud.mask)]
+    local = (points - np.asarray(POSE.position, np.float64)) @ np.asarray(POSE.rotation, np.float64)
+    np.testing.assert_allclose(local / local[:, 2:], rays, atol=1e-5)
+    # What lies between samples is not seen through.
+    assert not np.asarray(cloud.missed & whole.mask).any()
+    both = np.asarray(cloud.mask & whole.mask)
+    assert np.median(np.abs(np.asarray(cloud.sight) / np.asarray(whole.sight) - 1.0)[both]) < 0.03
+
+
+def test_planes_are_seen_exactly_between_samples():
+    """Linear in inverse depth: the pattern and the phase of the gaps do not matter."""
+    depth = depth_of(Cuboid([3.0, 3.0, 0.02]).translate([0.0, 0.0, -0.02]), camera=FINE)
+    for keep in SPARSE.values():
+        image = np.where(np.isfinite(depth) & keep(*np.mgrid[:480, :640]), depth, 0.0)
+        points, normals = nbv.PointCloud.from_depth(image, FINE, POSE, stride=5).to_numpy()
+        # Farther away it is seen aslant by more than planes are fitted to.
+        points, normals = points[points[:, 1] < 0.0], normals[points[:, 1] < 0.0]
+        assert len(points) > 2000
+        assert np.percentile(np.abs(points[:, 2]), 99) < 1e-4
+        assert np.percentile(normals[:, 2], 1) > np.cos(np.radians(0.1))
+
+
 def test_what_cannot_be_meant_is_named():
     depth = depth_of(BALL, TABLE)
     ranged = nbv.Camera.from_intrinsics(CAMERA.intrinsics, 48, 64, nearest=0.1, farthest=3.0)

@@ -187,7 +187,48 @@ def test_an_image_beside_the_box_is_warned_of():
         session.add(shot(FIRST), inverse, depth_scale=1e-3)
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     with pytest.warns(UserWarning, match=problem):
-        session.add(shot(FIRST), inverse, depth_scale=1e-3)
+        session.add(shot(POSES[0]), inverse, depth_scale=1e-3)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+def test_an_image_of_an_earlier_moment_than_its_pose_is_refused(unit, tmp_path):
+    """Also by a session that was read from its folder; from the same pose it may be added again."""
+    stale = shot(FIRST, unit)
+    session_of(tmp_path).add(stale, FIRST, depth_scale=1.0 / unit)
+    session = session_of(tmp_path)
+    with pytest.raises(InputError, match=r"bit for bit image 1, which was taken from another pose.*Discard the frames"):
+        session.add(stale.copy(), POSES[0], depth_scale=1.0 / unit)
+    session.add(stale, FIRST.astype(np.float32), depth_scale=1.0 / unit)
+    stale[20, 20] += 1
+    session.add(stale, POSES[0], depth_scale=1.0 / unit)
+    assert len(session.views) == len(list(tmp_path.glob("image_*"))) == 3
+
+
+BLANK = {
+    "zeros": np.zeros((48, 64), np.uint16),
+    "65535": np.full((48, 64), 65535, np.uint16),
+    "10000": np.full((48, 64), 10000, np.uint16),
+    "nan": np.full((48, 64), np.nan),
+}
+
+
+@pytest.mark.parametrize("name", BLANK)
+def test_a_later_image_that_measured_nothing_is_no_view(name, tmp_path):
+    session = session_of(tmp_path)
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    before = session.observations
+    for matrix in POSES[:2]:
+        with pytest.warns(UserWarning, match="measured nothing .* left out: take it again"):
+            session.add(BLANK[name], matrix, depth_scale=1e-3)
+    assert len(session.views) == len(list(tmp_path.glob("image_*"))) == 1
+    assert session.observations is before
+
+
+def test_an_image_past_the_object_is_a_view():
+    session = session_of()
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    session.add(np.full((48, 64), np.inf), POSES[0], depth_scale=1e-3)
+    assert len(session.views) == 2
 
 
 @pytest.mark.parametrize(

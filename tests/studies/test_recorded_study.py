@@ -48,7 +48,6 @@ def seven_scenes(folder, depths, matrices):
         hole[depth == 0] = 65535
         save(folder / f"frame-{index:06d}.depth.png", hole)
         np.savetxt(folder / f"frame-{index:06d}.pose.txt", matrix, delimiter="\t")
-    np.savetxt(folder / "camera-intrinsics.txt", INTRINSICS)
 
 
 def tum(folder, depths, matrices):
@@ -56,10 +55,7 @@ def tum(folder, depths, matrices):
     images, track = ["# time file"], ["# time tx ty tz qx qy qz qw"]
     for index, (depth, matrix) in enumerate(zip(depths, matrices, strict=True)):
         time = 1305031102.16 + 0.03 * index
-        # The data set's calibration is for images of this size.
-        whole = np.zeros((480, 640), np.uint16)
-        whole[:36, :48] = 5 * depth
-        save(folder / "depth" / f"{index}.png", whole)
+        save(folder / "depth" / f"{index}.png", 5 * depth)
         images.append(f"{time:.6f} depth/{index}.png")
         quaternion = Rotation.from_matrix(matrix[:3, :3]).as_quat()
         track.append(" ".join(f"{x:.9f}" for x in [time + 0.004, *matrix[:3, 3], *quaternion]))
@@ -74,22 +70,177 @@ def plain(folder, depths, matrices):
     for index, (depth, matrix) in enumerate(zip(depths, matrices, strict=True)):
         save(folder / f"{index}.png", depth)
         frames.append({"depth": f"{index}.png", "pose": matrix.tolist()})
-    said = {"intrinsics": INTRINSICS.tolist(), "depth_scale": 0.001, "frames": frames}
-    (folder / "frames.json").write_text(json.dumps(said))
+    (folder / "frames.json").write_text(json.dumps({"frames": frames}))
 
 
-@pytest.mark.parametrize("layout", [seven_scenes, tum, plain])
-def test_layouts_of_one_recording_are_read_alike(layout, sequence, tmp_path):
-    depths, matrices = sequence
-    layout(tmp_path, depths, matrices)
-    frames = nbv.readers.RecordedFrames(tmp_path)
+LAYOUTS = (seven_scenes, tum, plain)
+
+
+def known_sensor(layout, folder, sequence):
+    """A folder that says its intrinsics."""
+    layout(folder, *sequence)
+    np.savetxt(folder / "camera-intrinsics.txt", INTRINSICS)
+
+
+FOUR = "40 40 23.5 17.5"
+OPEN3D = {"width": 48, "height": 36, "intrinsic_matrix": INTRINSICS.T.reshape(-1).tolist()}
+# Where a folder, or its parent, says the intrinsics; in the parent those of other sensors, which do not count.
+STORED = {
+    "3DMatch, in the parent": lambda folder: np.savetxt(folder.parent / "camera-intrinsics.txt", INTRINSICS),
+    "in the folder before the parent": lambda folder: [
+        np.savetxt(folder / "camera-intrinsics.txt", INTRINSICS),
+        np.savetxt(folder.parent / "camera-intrinsics.txt", 2.0 * INTRINSICS),
+    ],
+    "ScanNet, depth beside colour": lambda folder: [
+        np.savetxt(folder / "intrinsic_depth.txt", np.block([[INTRINSICS, np.zeros((3, 1))], [0, 0, 0, 1]])),
+        np.savetxt(folder / "intrinsic_color.txt", np.eye(4)),
+    ],
+    "ETH3D": lambda folder: (folder / "calibration.txt").write_text(FOUR + "\n"),
+    "BundleFusion": lambda folder: (folder / "info.txt").write_text(
+        "m_versionNumber = 4\nm_calibrationDepthIntrinsic = 40 0 23.5 0 0 40 17.5 0 0 0 1 0 0 0 0 1\n"
+    ),
+    "Open3D": lambda folder: (folder / "camera_intrinsic.json").write_text(json.dumps(OPEN3D)),
+    "by name": lambda folder: (folder / "intrinsics.json").write_text(
+        json.dumps({"fx": 40, "fy": 40, "cx": 23.5, "cy": 17.5})
+    ),
+    "UTF-16": lambda folder: (folder / "camera-intrinsics.txt").write_text(FOUR + "\r\n \r\n", encoding="utf-16"),
+}
+
+
+def check_points(frames, sequence):
+    """Every frame's points lie on the ball, by a pinhole of our own."""
+    for index, depth in enumerate(sequence[0]):
+        z = frames.depth_scale * frames.depth(index)
+        np.testing.assert_allclose(z, depth / UNIT, atol=1e-9)
+        row, column = np.nonzero(z)
+        (fx, _, cx), (_, fy, cy), _ = frames.camera.intrinsics
+        local = np.stack([(column - cx) / fx, (row - cy) / fy, np.ones(len(row))], axis=-1) * z[row, column, None]
+        points = local @ frames.matrices[index, :3, :3].T + frames.matrices[index, :3, 3]
+        off = np.abs(np.linalg.norm(points - [1.0, 2.0, 0.5], axis=1) - 0.3)
+        assert np.median(off) < 0.5e-3
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("place", STORED)
+def test_each_layout_takes_the_intrinsics_that_lie_there_and_the_unit_that_fits(layout, place, sequence, tmp_path):
+    folder = tmp_path / "sequence" / "seq-01"
+    folder.mkdir(parents=True)
+    layout(folder, *sequence)
+    STORED[place](folder)
+    frames = nbv.readers.RecordedFrames(folder)
     assert len(frames) == COUNT
-    np.testing.assert_allclose(frames.matrices, matrices, atol=1e-6)
-    for index in (0, COUNT - 1):
-        depth = frames.depth_scale * frames.depth(index)
-        np.testing.assert_allclose(depth[:36, :48], depths[index] / UNIT, atol=1e-9)
-    expected = [[525.0, 0.0, 319.5], [0.0, 525.0, 239.5], [0.0, 0.0, 1.0]] if layout is tum else INTRINSICS
-    np.testing.assert_allclose(frames.camera.intrinsics, expected)
+    np.testing.assert_allclose(frames.matrices, sequence[1], atol=1e-6)
+    np.testing.assert_allclose(frames.camera.intrinsics, INTRINSICS)
+    check_points(frames, sequence)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("given", [INTRINSICS, INTRINSICS.tolist(), (40.0, 40.0, 23.5, 17.5)])
+def test_what_is_given_comes_before_what_is_stored(layout, given, sequence, tmp_path):
+    layout(tmp_path, *sequence)
+    np.savetxt(tmp_path / "camera-intrinsics.txt", 2.0 * INTRINSICS)
+    scale = 1 / 5000 if layout is tum else 1e-3
+    check_points(nbv.readers.RecordedFrames(tmp_path, intrinsics=given, depth_scale=scale), sequence)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_no_layout_has_intrinsics_of_its_own(layout, sequence, tmp_path):
+    folder = tmp_path / "sequence"
+    folder.mkdir()
+    layout(folder, *sequence)
+    with pytest.raises(ValueError, match=r"give intrinsics=\(fx, fy, cx, cy\).*--intrinsics.*585.*535\.4.*481\.2"):
+        nbv.readers.RecordedFrames(folder)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("units", [1, 4, 5, 10])
+def test_the_unit_is_the_one_with_which_frames_agree(layout, units, sequence, tmp_path):
+    """Thousands a metre, and in the layout of TUM, which the helper writes at 5,000, a fifth of them more."""
+    depths, matrices = sequence
+    layout(tmp_path, depths // 5 * units if layout is tum else depths * units, matrices)
+    frames = nbv.readers.RecordedFrames(tmp_path, intrinsics=INTRINSICS)
+    assert 1.0 / frames.depth_scale == pytest.approx(1000 * units)
+
+
+def test_a_unit_that_nothing_tells_is_asked_for(sequence, tmp_path):
+    """One frame, and a camera that stays where it is, agree with themselves in any unit."""
+    depths, matrices = sequence
+    for name, still in (("one", slice(0, 1)), ("still", [0, 0, 0])):
+        (tmp_path / name).mkdir()
+        known_sensor(seven_scenes, tmp_path / name, (depths[still], matrices[still]))
+        with pytest.raises(ValueError, match=r"give depth_scale=.*1/1000.*1/5000.*1/10000"):
+            nbv.readers.RecordedFrames(tmp_path / name)
+        frames = nbv.readers.RecordedFrames(tmp_path / name, depth_scale=1e-3)
+        assert frames.depth_scale == pytest.approx(1e-3)
+
+
+LOST = {
+    "-inf": np.full((4, 4), -np.inf),
+    "nan": np.full((4, 4), np.nan),
+    "zeros": np.zeros((4, 4)),
+    "no rotation": np.diag([0.0, 0.0, 0.0, 1.0]),
+    "ones": np.ones((4, 4)),
+    "a reflection": np.diag([1.0, 1.0, -1.0, 1.0]),
+}
+
+
+@pytest.mark.parametrize("layout", [seven_scenes, plain])
+@pytest.mark.parametrize("name", LOST)
+def test_a_frame_whose_pose_was_lost_is_left_out(layout, name, sequence, tmp_path):
+    depths, matrices = sequence
+    poses = matrices.copy()
+    poses[3] = LOST[name]
+    known_sensor(layout, tmp_path, (depths, poses))
+    with pytest.warns(UserWarning, match=r"1 of the 9 poses .*3.*left out") as warned:
+        frames = nbv.readers.RecordedFrames(tmp_path)
+    assert len(warned) == 1
+    kept = np.arange(COUNT) != 3
+    np.testing.assert_allclose(frames.matrices, matrices[kept], atol=1e-6)
+    check_points(frames, (depths[kept], None))
+
+
+@pytest.mark.parametrize(
+    "lost", ["nan nan nan nan nan nan nan", "0 0 0 0 0 0 0", "-1.#IND 0 0 0 0 0 1", "0 0 0 0 0 0 inf"]
+)
+def test_a_lost_row_of_a_track_is_left_out(lost, sequence, tmp_path):
+    known_sensor(tum, tmp_path, sequence)
+    lines = (tmp_path / "groundtruth.txt").read_text().splitlines()
+    lines[4] = f"{lines[4].split()[0]} {lost}"
+    (tmp_path / "groundtruth.txt").write_text("\n".join(lines))
+    with pytest.warns(UserWarning, match=r"1 of the 9 poses .*3\.png.*left out"):
+        frames = nbv.readers.RecordedFrames(tmp_path)
+    check_points(frames, (np.delete(sequence[0], 3, axis=0), None))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_poses_to_three_digits_are_rotations(layout, sequence, tmp_path):
+    """To within what is lost by rounding; exactly orthonormal."""
+    depths, matrices = sequence
+    known_sensor(layout, tmp_path, (depths, np.round(matrices, 3)))
+    frames = nbv.readers.RecordedFrames(tmp_path)
+    rotations = frames.matrices[:, :3, :3]
+    np.testing.assert_allclose(rotations @ rotations.swapaxes(1, 2), np.tile(np.eye(3), (COUNT, 1, 1)), atol=1e-6)
+    np.testing.assert_allclose(frames.matrices, matrices, atol=1e-3)
+    nbv.Pose.from_matrix(frames.matrices)
+
+
+ENCODED = {
+    "BOM": lambda text: text.encode("utf-8-sig"),
+    "UTF-16": lambda text: text.encode("utf-16"),
+    "UTF-16 without BOM": lambda text: text.encode("utf-16-le"),
+    "Windows, blank lines": lambda text: ("\r\n".join(["", *text.splitlines(), "  ", "\t", ""])).encode(),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("encoding", ENCODED)
+def test_text_of_any_editor_is_read(layout, encoding, sequence, tmp_path):
+    known_sensor(layout, tmp_path, sequence)
+    for file in (*tmp_path.glob("*.txt"), *tmp_path.glob("*.json")):
+        file.write_bytes(ENCODED[encoding](file.read_text()))
+    frames = nbv.readers.RecordedFrames(tmp_path)
+    np.testing.assert_allclose(frames.matrices, sequence[1], atol=1e-6)
+    check_points(frames, sequence)
 
 
 def test_a_world_is_turned_upright(sequence, tmp_path):
@@ -97,7 +248,7 @@ def test_a_world_is_turned_upright(sequence, tmp_path):
     tilt = Rotation.from_euler("xyz", [0.4, -0.7, 1.1]).as_matrix()
     turned = matrices.copy()
     turned[:, :3, :] = tilt @ matrices[:, :3, :]
-    plain(tmp_path, depths, turned)
+    known_sensor(plain, tmp_path, (depths, turned))
     frames = nbv.readers.RecordedFrames(tmp_path, up=tuple((3.0 * tilt[:, 2]).tolist()))
     # Heights are those before the world was tilted, and so are all distances.
     np.testing.assert_allclose(frames.matrices[:, 2, 3], matrices[:, 2, 3], atol=1e-9)
@@ -125,17 +276,28 @@ def coloured(folder):
     Image.new("RGB", (48, 36)).save(folder / "frame-000000.depth.png")
 
 
+def doubled(folder):
+    """Matrices of a similarity."""
+    content = json.loads((folder / "frames.json").read_text())
+    for frame in content["frames"]:
+        frame["pose"] = (np.diag([2.0, 2.0, 2.0, 1.0]) @ frame["pose"]).tolist()
+    (folder / "frames.json").write_text(json.dumps(content))
+
+
 # A layout, what is done to it, and what is said of that.
 BROKEN = {
     "empty": (lambda *_: None, lambda folder: None, "holds no recorded sequence"),
     "other times": (tum, rewritten("depth.txt", lambda _: "17.0 depth/0.png"), "no image has a pose within"),
     "no times": (tum, rewritten("depth.txt", lambda _: "depth/0.png"), "could not convert string to float"),
     "no image": (tum, lambda folder: (folder / "depth" / "1.png").unlink(), r"1 of the 9 files .*1\.png"),
-    "no scale": (plain, said({"depth_scale": None}), "TypeError"),
+    "no scale": (plain, said({"depth_scale": -1.0}), r"depth scale is -1\.0"),
+    "units a metre": (plain, said({"depth_scale": 5000}), "5000.0, which is no length of a unit: .*1/5000"),
     "no frames": (plain, said({"frames": []}), "need at least one array"),
     "half a text": (plain, rewritten("frames.json", lambda text: text[:-9]), "JSONDecodeError"),
     "no pose": (seven_scenes, lambda f: (f / "frame-000003.pose.txt").unlink(), r"is not whole .*000003\.pose"),
-    "a wrong pose": (seven_scenes, lambda f: np.savetxt(f / "frame-000003.pose.txt", np.ones((4, 4))), "of a pose"),
+    "inverse scale of poses": (plain, doubled, "9 of the 9 poses .* no rigid motion"),
+    "other intrinsics": (plain, said({"intrinsics": [1, 2]}), r"intrinsics is \[1, 2\]: give a 3 x 3 matrix"),
+    "intrinsics of text": (plain, lambda f: (f / "camera-intrinsics.txt").write_text("fx 40"), "no table of numbers"),
     "half an image": (seven_scenes, cut, "cannot read the depth image"),
     "an image of colours": (seven_scenes, coloured, "one channel of 16 bit"),
 }
@@ -144,14 +306,14 @@ BROKEN = {
 @pytest.mark.parametrize("name", BROKEN)
 def test_what_is_broken_is_named(name, sequence, tmp_path):
     layout, harm, message = BROKEN[name]
-    layout(tmp_path, *sequence)
+    known_sensor(layout, tmp_path, sequence)
     harm(tmp_path)
     with pytest.raises(ValueError, match=message):
         nbv.readers.RecordedFrames(tmp_path)
 
 
 def test_a_frame_that_is_not_there_and_an_up_that_is_none_are_named(sequence, tmp_path):
-    plain(tmp_path, *sequence)
+    known_sensor(plain, tmp_path, sequence)
     with pytest.raises(ValueError, match="no frame 9"):
         nbv.readers.RecordedFrames(tmp_path).depth(COUNT)
     with pytest.raises(ValueError, match="give a direction"):
@@ -165,7 +327,7 @@ VIEWS = 3
 @pytest.fixture(scope="module")
 def study(sequence, tmp_path_factory):
     folder = tmp_path_factory.mktemp("recording")
-    plain(folder, *sequence)
+    known_sensor(plain, folder, sequence)
     return RecordedStudy.configured("screened", VIEWS, quick=True, folder=folder, box=(*LOW, *HIGH))[""]
 
 
@@ -189,6 +351,15 @@ def test_its_voxels_are_those_that_three_frames_have_seen(study, sequence):
     expected = [len(one & often) / len(often) for one in seen]
     np.testing.assert_allclose(shown.mean(axis=1), expected, atol=0.01)
     assert (shown.sum(axis=0) >= 3).all()
+
+
+def test_a_study_takes_intrinsics_and_unit(study, sequence, tmp_path):
+    folder = tmp_path / "sequence"
+    folder.mkdir()
+    tum(folder, *sequence)
+    given = {"folder": folder, "box": (*LOW, *HIGH), "intrinsics": (40.0, 40.0, 23.5, 17.5), "depth_scale": 1 / 5000}
+    told = RecordedStudy.configured("screened", VIEWS, quick=True, **given)[""]
+    np.testing.assert_array_equal(told.recording.shown, study.recording.shown)
 
 
 def test_every_method_is_measured_by_what_its_frames_show(study):
@@ -225,7 +396,7 @@ def test_first_views_differ_and_show_enough(study):
 
 
 def test_what_the_study_cannot_use_is_named(study, sequence, tmp_path):
-    plain(tmp_path, *sequence)
+    known_sensor(plain, tmp_path, sequence)
     with pytest.raises(ValueError, match="give a model of screened, paper"):
         RecordedStudy.configured("known", VIEWS, quick=True, folder=tmp_path)
     away = RecordedStudy.configured("screened", VIEWS, quick=True, folder=tmp_path, box=(9, 9, 9, 10, 10, 10))[""]
@@ -236,7 +407,8 @@ def test_what_the_study_cannot_use_is_named(study, sequence, tmp_path):
 def test_a_frame_that_looks_away_shows_nothing(sequence, tmp_path):
     depths, matrices = sequence
     back = np.diag([-1.0, 1.0, -1.0, 1.0])
-    plain(tmp_path, np.concatenate([depths, depths[:1]]), np.concatenate([matrices, matrices[:1] @ back]))
+    looks = np.concatenate([depths, depths[:1]]), np.concatenate([matrices, matrices[:1] @ back])
+    known_sensor(plain, tmp_path, looks)
     study = RecordedStudy.configured("screened", VIEWS, quick=True, folder=tmp_path, box=(*LOW, *HIGH))[""]
     shown = study.recording.shown.sum(axis=1)
     assert shown[-1] == 0
@@ -244,7 +416,7 @@ def test_a_frame_that_looks_away_shows_nothing(sequence, tmp_path):
 
 
 def test_a_box_with_room_is_found_about_what_was_seen(sequence, tmp_path):
-    plain(tmp_path, *sequence)
+    known_sensor(plain, tmp_path, sequence)
     box = RecordedStudy.configured("screened", VIEWS, quick=True, folder=tmp_path)[""].box
     # All of the ball but what faces away from all cameras.
     np.testing.assert_allclose(box.high, [1.33, 2.33, 0.83], atol=0.03)

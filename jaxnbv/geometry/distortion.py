@@ -1,0 +1,81 @@
+"""Lens distortion by OpenCV's model of five or eight coefficients (Brown 1971), undone in depth images.
+
+With (x, y) = (X / Z, Y / Z) and r^2 = x^2 + y^2 a point appears at
+
+    x' = x g + 2 p1 x y + p2 (r^2 + 2 x^2),    y' = y g + p1 (r^2 + 2 y^2) + 2 p2 x y,
+    g = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxnbv.checks import AnyArray, as_numbers, require
+
+_SHAPES = ((4,), (5,), (8,))
+# Depths of neighbouring pixels that differ by more, as a share and by pixels of the focal length, are not averaged.
+_ALIKE, _STEEPEST = 0.01, 4.0
+
+
+def distorted(
+    x: Float[AnyArray, "*n"], y: Float[AnyArray, "*n"], coefficients: tuple[float, ...]
+) -> tuple[Float[AnyArray, "*n"], Float[AnyArray, "*n"]]:
+    """Where places (x, y) of the plane Z = 1 appear in it through the lens."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *[0.0] * (8 - len(coefficients)))
+    r2 = x**2 + y**2
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
+    down = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+    return across, down
+
+
+def check_distortion(coefficients: tuple[float, ...], radius: float) -> None:
+    """Check coefficients of a lens for an image that ends at a distance from the axis, in the plane Z = 1.
+
+    **Raises:** `ValueError` for another number of them, or a radius that grows no longer on the way to the border.
+    """
+    array = as_numbers(coefficients, "the distortion", np.float64)
+    require(
+        isinstance(coefficients, tuple) and array.shape in _SHAPES and bool(np.isfinite(array).all()),
+        f"the distortion is {coefficients}: give OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]], or () for none",
+    )
+    radial = (*coefficients[:2], 0.0, 0.0, *coefficients[4:])
+    moved, _ = distorted(np.linspace(0.0, radius, 100), np.zeros(100), radial)
+    require(
+        bool((np.diff(np.asarray(moved)) > 0).all()),
+        f"the distortion {coefficients} folds the image: give OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]] in this "
+        "order, of this camera",
+    )
+
+
+@eqx.filter_jit
+def undistorted(
+    depth: Float[Array, "h w"],
+    missed: Bool[Array, "h w"],
+    place: Float[Array, "h w 2"],
+    matrix: Float[Array, "3 3"],
+    coefficients: tuple[float, ...],
+) -> tuple[Float[Array, "h w"], Bool[Array, "h w"]]:
+    """The depth image that a pinhole would have taken, and which of its rays met nothing. Linear in inverse depth among
+    four pixels of one surface, else that of the nearest pixel; 0 beyond the image.
+
+    - `depth`: through the lens; what is valid of it is positive and finite.
+    - `place`: of the pinhole's pixels in the plane Z = 1; `matrix`: intrinsics, of the pinhole and of the lens.
+    """
+    focal, center = jnp.diagonal(matrix)[:2], matrix[:2, 2]
+    across, down = distorted(place[..., 0], place[..., 1], coefficients)
+    column, row = across * focal[0] + center[0], down * focal[1] + center[1]
+    height, width = depth.shape
+    within = (column > -0.5) & (column < width - 0.5) & (row > -0.5) & (row < height - 0.5)
+    nearest = jnp.round(row).astype(int).clip(0, height - 1), jnp.round(column).astype(int).clip(0, width - 1)
+
+    top, left = jnp.floor(row).astype(int).clip(0, height - 2), jnp.floor(column).astype(int).clip(0, width - 2)
+    known = jnp.where(jnp.isfinite(depth) & (depth > 0), depth, 0.0)
+    four = jnp.stack([known[top + i, left + j] for i in (0, 1) for j in (0, 1)])
+    low, high = jnp.min(four, axis=0), jnp.max(four, axis=0)
+    is_alike = (low > 0) & (high <= low * (1.0 + jnp.maximum(_ALIKE, _STEEPEST / jnp.min(focal))))
+    below, right = row - top, column - left
+    weights = jnp.stack([(1 - below) * (1 - right), (1 - below) * right, below * (1 - right), below * right])
+    smooth = 1.0 / jnp.sum(weights / jnp.where(is_alike, four, 1.0), axis=0)
+    return jnp.where(within, jnp.where(is_alike, smooth, depth[nearest]), 0.0), within & missed[nearest]

@@ -1,0 +1,44 @@
+"""Depth images with gaps between pixels: one sample a block, as lidars and images aligned to a finer camera need."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+# Sides of blocks. What share of the blocks of four times the side must be filled: less of pixels, since a window of
+# nine holds a plane though four of them are holes.
+_SIDES, _FILLED, _PIXELS = (1, 2, 3, 4, 6, 8, 12, 16, 24), 0.7, 0.55
+
+
+def gap_of(valid: Bool[np.ndarray, "h w"]) -> int:
+    """The least side of blocks that are filled about as often as blocks of four times the side: 1 for an image whose
+    pixels lie side by side, whatever holes it has, and 8 for one of every eighth row."""
+
+    def filled(side: int) -> float:
+        height, width = (side * (size // side) for size in valid.shape)
+        blocks = valid[:height, :width].reshape(height // side, side, width // side, side)
+        return float(blocks.any(axis=(1, 3)).mean()) if blocks.size else 0.0
+
+    return next(
+        (side for side in _SIDES if filled(side) >= (_PIXELS if side == 1 else _FILLED) * filled(4 * side)), _SIDES[-1]
+    )
+
+
+def block_samples(
+    depth: Float[Array, "h w"], valid: Bool[Array, "h w"], side: int
+) -> tuple[Float[Array, "k l"], Bool[Array, "k l"], Int[Array, "k l 2"]]:
+    """The valid pixel of each block that is nearest to the block's middle: its depth, whether there is one, and its
+    column and row in the block."""
+    if side == 1:
+        return depth, valid, jnp.zeros((*depth.shape, 2), int)
+
+    def blocks(image):
+        image = jnp.pad(image, [(0, -size % side) for size in image.shape])
+        height, width = (size // side for size in image.shape)
+        return image.reshape(height, side, width, side).swapaxes(1, 2).reshape(height, width, side * side)
+
+    row, column = np.divmod(np.arange(side * side), side)
+    off = (row - 0.5 * (side - 1)) ** 2 + (column - 0.5 * (side - 1)) ** 2
+    chosen = jnp.argmin(jnp.where(blocks(valid), off, jnp.inf), axis=-1)
+    place = jnp.stack([jnp.asarray(column)[chosen], jnp.asarray(row)[chosen]], axis=-1)
+    samples = jnp.take_along_axis(blocks(depth), chosen[..., None], axis=-1)[..., 0]
+    return samples, blocks(valid).any(axis=-1), place

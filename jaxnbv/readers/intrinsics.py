@@ -1,0 +1,62 @@
+"""The intrinsics of a recording's depth camera, as people store or give them."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxnbv.checks import AnyArray, InputError, as_numbers, require, shown
+from jaxnbv.readers.text_files import read_rows, read_table, read_text
+
+# Read in this order, so that those of a depth camera come before those of the colour camera beside it.
+_FILES = ("*depth*intrinsic*", "*intrinsic*depth*", "*camera*intrinsic*", "*intrinsic*", "calibration.txt", "info.txt")
+_BUNDLE_FUSION = "m_calibrationDepthIntrinsic"
+
+
+def intrinsic_matrix(values: Float[AnyArray, "..."] | list | tuple, name: str) -> Float[np.ndarray, "3 3"]:
+    """The 3 x 3 matrix, in pixels, of a matrix of 3 x 3 or 4 x 4 or of fx, fy, cx, cy.
+
+    **Raises:** `ValueError` for another shape.
+    """
+    array = np.squeeze(as_numbers(values, name, np.float64))
+    if array.shape == (4,):
+        fx, fy, cx, cy = array
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    require(array.shape in ((3, 3), (4, 4)), f"{name} is {shown(values)}: give a 3 x 3 matrix, or fx, fy, cx, cy")
+    return array[:3, :3]
+
+
+def stored_intrinsics(folder: Path) -> Float[np.ndarray, "3 3"] | None:
+    """The matrix of a file of intrinsics, .txt or .json, in a folder or else in its parent; None where there is none.
+
+    A text file holds a matrix of 3 x 3 or 4 x 4, or fx, fy, cx, cy, or is BundleFusion's `info.txt`; a JSON file what
+    Open3D writes, the four numbers by name, or the matrix alone.
+
+    **Raises:** `ValueError` if the file holds something else.
+    """
+    for place in (folder, folder.resolve().parent):
+        for pattern in _FILES:
+            for file in sorted(place.glob(pattern)):
+                if file.suffix.lower() in (".txt", ".json") and file.is_file():
+                    return _of_file(file)
+    return None
+
+
+def _of_file(file: Path) -> Float[np.ndarray, "3 3"]:
+    if file.name == "info.txt":
+        fields = {row[0]: row[2:] for row in read_rows(file)}
+        require(_BUNDLE_FUSION in fields, f"{file} names no {_BUNDLE_FUSION}: give intrinsics=(fx, fy, cx, cy)")
+        return intrinsic_matrix(np.reshape([float(word) for word in fields[_BUNDLE_FUSION]], (4, 4)), str(file))
+    if file.suffix.lower() == ".txt":
+        return intrinsic_matrix(read_table(file), str(file))
+    try:
+        content = json.loads(read_text(file))
+    except ValueError as error:
+        raise InputError(f"{file} is no JSON file: {error}") from error
+    if not isinstance(content, dict):
+        return intrinsic_matrix(content, str(file))
+    if "intrinsic_matrix" in content:
+        # Open3D writes it column by column.
+        return intrinsic_matrix(np.reshape(content["intrinsic_matrix"], (3, 3), "F"), str(file))
+    return intrinsic_matrix([content.get(name) for name in ("fx", "fy", "cx", "cy")], str(file))

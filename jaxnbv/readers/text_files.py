@@ -1,0 +1,47 @@
+"""Text files as other programs leave them: with a byte order mark, in UTF-16, with blank lines."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxnbv.checks import InputError
+
+# How Microsoft's C runtime prints infinities and NaN.
+_NOT_FINITE = re.compile(r"[+-]?1\.#[A-Z]+\d*")
+
+
+def read_text(path: Path) -> str:
+    """The text of a file in UTF-8, UTF-16 or UTF-32, without its byte order mark.
+
+    **Raises:** `OSError` if it cannot be read.
+    """
+    content = path.read_bytes()
+    return content.decode(json.detect_encoding(content), "surrogateescape")
+
+
+def read_rows(path: Path) -> list[list[str]]:
+    """The words of each line of a file, without blank lines and those that begin with #.
+
+    **Raises:** `OSError` if it cannot be read.
+    """
+    rows = (line.split() for line in read_text(path).splitlines())
+    return [row for row in rows if row and not row[0].startswith("#")]
+
+
+def read_table(path: Path) -> Float[np.ndarray, "rows columns"]:
+    """The numbers in a text file.
+
+    **Raises:** `ValueError` if it holds something else, nothing, or rows of different lengths; `OSError` if it cannot
+    be read.
+    """
+    try:
+        rows = [[float(_NOT_FINITE.sub("nan", word)) for word in row] for row in read_rows(path)]
+        table = np.array(rows)
+    except ValueError as error:
+        raise InputError(f"{path} is no table of numbers: {error}") from error
+    if table.ndim != 2:
+        raise InputError(f"{path} is no table of numbers: it is empty")
+    return table
