@@ -1,7 +1,7 @@
 """Meshes, and their parts, from files of any format that trimesh reads."""
 
 import os
-import re
+from io import BytesIO
 from pathlib import Path
 
 import equinox as eqx
@@ -11,12 +11,12 @@ import trimesh
 from jaxtyping import Array, Float
 
 from jaxnbv.checks import InputError, checked, require, shown
+from jaxnbv.scanning.gltf import read_gltf
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.mesh import TriangleMesh
+from jaxnbv.scanning.mesh_rows import read_obj, read_off, without_mark
+from jaxnbv.scanning.ply_rows import read_ply
 from jaxnbv.scanning.sdf.sampled import distance_to_triangles
-
-# Of a PLY or OFF file: bytes that its header is shorter than.
-_HEADER = 2**16
 
 
 @checked
@@ -82,37 +82,34 @@ def joined_nodes(path: str | Path, meshes: list[trimesh.Trimesh], up: str) -> Tr
 def read_nodes(path: str | Path) -> list[tuple[str, trimesh.Trimesh]]:
     """The nodes of a file that have faces, by name, where its scene places them, in the file's coordinates.
 
-    **Raises:** `ValueError` if the file is missing, cannot be read, or has no faces.
+    **Raises:** `ValueError` if the file is missing, cannot be read, has no faces, or holds what its reader passes over.
     """
     path = Path(path)
     require(os.path.isfile(path), f"no mesh file at {shown(str(path))}: check the path")
     try:
-        parts = trimesh.load_scene(path, path.suffix[1:].lower(), process=False).dump()
+        meshes = _read(path)
+    except InputError as error:
+        raise InputError(f"cannot read {path}: it {error}") from error
     except Exception as error:  # Each of trimesh's readers fails in its own way.
         formats = ", ".join(sorted(trimesh.available_formats()))
         raise InputError(
             f"cannot read {path} as a mesh ({type(error).__name__}: {error}): it is damaged, or none of {formats}, "
             "some of which need a package of their own"
         ) from error
-    meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    meshes = [(name, mesh) for name, mesh in meshes if len(mesh.faces)]
     require(len(meshes) > 0, f"{path} has no faces: it is a point cloud, empty, or an STL that was cut short")
-    found = sum(len(mesh.vertices) for mesh in meshes), sum(len(mesh.faces) for mesh in meshes)
-    for what, count, declared in zip(("vertices", "faces"), found, _declared(path), strict=True):
-        message = f"{path} has {count} of the {declared} {what} that its header declares: fetch it again"
-        require(count >= declared, message)
-    return [(str(mesh.metadata.get("node", index)), mesh) for index, mesh in enumerate(meshes)]
+    return meshes
 
 
-def _declared(path: Path) -> tuple[int, int]:
-    """How many vertices and faces the header of a PLY or OFF file declares; trimesh takes one that ends early."""
-    with path.open("rb") as file:
-        head = file.read(_HEADER).decode("latin1")
-    if path.suffix.lower() == ".off":
-        found = re.match(r"\s*[A-Z]*OFF\s*(\d+)\s+(\d+)", re.sub(r"#.*", "", head))
-        counts = [int(count) for count in found.groups()] if found else []
-    elif path.suffix.lower() == ".ply":
-        elements = dict(re.findall(r"(?m)^element (\w+) (\d+)\s*$", head.partition("end_header")[0]))
-        counts = [int(elements.get(name, 0)) for name in ("vertex", "face")]
+def _read(path: Path) -> list[tuple[str, trimesh.Trimesh]]:
+    kind, content = path.suffix[1:].lower(), without_mark(path.read_bytes())
+    if kind in ("obj", "off", "ply"):
+        rows = read_obj(content) if kind == "obj" else {"mesh": (read_off if kind == "off" else read_ply)(content)}
+        return [(name, trimesh.Trimesh(vertices, faces, process=False)) for name, (vertices, faces) in rows.items()]
+    resolver = trimesh.resolvers.FilePathResolver(str(path))
+    if kind in ("glb", "gltf"):
+        meshes = read_gltf(content, kind, resolver)
     else:
-        counts = []
-    return (counts[0], counts[1]) if len(counts) == 2 else (0, 0)
+        parts = trimesh.load_scene(BytesIO(content), kind, resolver, process=False).dump()
+        meshes = [part for part in parts if isinstance(part, trimesh.Trimesh)]
+    return [(str(mesh.metadata.get("node", index)), mesh) for index, mesh in enumerate(meshes)]

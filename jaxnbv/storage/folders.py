@@ -170,7 +170,7 @@ class ResultFolder:
         arrays: Mapping[str, np.ndarray] = MappingProxyType({}),
     ):
         self.path, self.config, self.cores = make_folder(path), json.loads(json.dumps(config)), cores
-        self.arrays = arrays
+        self.arrays = dict(arrays)
         self.bound = False
         self._check()
 
