@@ -24,7 +24,7 @@ from jaxnbv.scanning.mesh_files import load_mesh
 from jaxnbv.scanning.sdf import Sampled, solid_of_mesh
 
 # What is kept is made anew where what makes it has changed.
-_VERSION = 1
+_VERSION = 2
 _T = TypeVar("_T")
 
 
