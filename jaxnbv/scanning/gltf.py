@@ -24,8 +24,8 @@ _ROUNDING = 1e-3
 _REMEDY = "export it again without, from Blender say"
 
 
-def read_gltf(content: bytes, kind: str, resolver: Resolver) -> list[trimesh.Trimesh]:
-    """The meshes of the scene where its nodes place them.
+def read_gltf(content: bytes, kind: str, resolver: Resolver) -> trimesh.Scene:
+    """The scene of a file.
 
     - `kind`: "gltf" or "glb"; `resolver`: of the files that it names.
 
@@ -57,8 +57,7 @@ def read_gltf(content: bytes, kind: str, resolver: Resolver) -> list[trimesh.Tri
             )
         boxes.setdefault(index, []).append(trimesh.bounds.corners(bounds))
     expected = [trimesh.transform_points(box, to) for index, to in _placed(header) for box in boxes.get(index, [])]
-    meshes = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
-    placed = [mesh.bounds for mesh in meshes]
+    placed = [part.bounds for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
     require(len(placed) == len(expected), f"places {len(expected)} meshes, but trimesh reads {len(placed)}: {_REMEDY}")
     if placed:
         low, high = np.min(expected, axis=(0, 1)), np.max(expected, axis=(0, 1))
@@ -69,7 +68,7 @@ def read_gltf(content: bytes, kind: str, resolver: Resolver) -> list[trimesh.Tri
             f"places its meshes within {low.tolist()} to {high.tolist()}, but trimesh in {found[0].tolist()} to "
             f"{found[1].tolist()}: apply the nodes' transforms and export it again",
         )
-    return meshes
+    return scene
 
 
 def _unread(header: dict[str, Any]) -> Iterator[str]:

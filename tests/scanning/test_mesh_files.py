@@ -3,6 +3,7 @@
 import json
 import struct
 
+import jax
 import numpy as np
 import pytest
 import trimesh
@@ -226,3 +227,27 @@ def test_what_cannot_be_read_is_named(tmp_path, name):
     with pytest.raises(nbv.InputError, match=message) as caught:
         nbv.load_mesh(tmp_path / name)
     assert name in str(caught.value)
+
+
+def test_meshes_and_scenes_of_trimesh(tmp_path):
+    scene = trimesh.Scene([BOX, BOX.copy().apply_translation((3.0, 0.0, 0.0))])
+    check_boxes(nbv.load_mesh(BOX), 1)
+    check_boxes(nbv.load_mesh(scene))
+    assert nbv.load_mesh(BOX, up="z").frame.up == "z"
+    assert len(nbv.scanning.load_parts(scene).parts) == 2
+    with pytest.raises(nbv.InputError, match="no faces"):
+        nbv.load_mesh(trimesh.Trimesh(CORNERS))
+    with pytest.raises(nbv.InputError, match="give str or Path or Trimesh or Scene"):
+        nbv.load_mesh(trimesh.PointCloud(CORNERS))
+
+
+def test_what_takes_a_mesh_takes_that_of_trimesh():
+    bank = nbv.ShapeBank.from_meshes([BOX, trimesh.creation.icosphere(2)], resolution=16, progress=False)
+    places = np.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.0], [0.0, 0.0, 1.1]])
+    solids = [jax.tree.map(lambda rows, row=row: rows[row], bank.solids) for row in range(2)]
+    inside = [np.asarray(solid(places)) < 0 for solid in solids]
+    # The box is 0.83 x 1.67 x 2.5, the ball's radius 1.25.
+    np.testing.assert_array_equal(inside, [[True, False, True], [True, True, True]])
+    assert bank.names == ("0", "1")
+    ray = np.array([[0.0, 0.0, 3.0]]), np.array([[0.0, 0.0, -1.0]])
+    np.testing.assert_allclose(nbv.scanning.as_surface(BOX).trace(*ray).points, [[0.0, 0.0, 1.25]], atol=1e-6)
