@@ -129,6 +129,24 @@ def check_key(key: Any) -> None:
     require(known, f"the key is {shown(key)}: make one with jax.random.key(seed)")
 
 
+def native(value: Any) -> Any:
+    """An array of NumPy's in the byte order and precision that JAX has; anything else as it is. Under `jit` JAX reads
+    the bytes of another order as if they were in its own."""
+    if isinstance(value, np.ndarray) and (value.dtype.char == "g" or not value.dtype.isnative):
+        return value.astype(np.float64 if value.dtype.char == "g" else value.dtype.newbyteorder("="))
+    return value
+
+
+def takes_native(function: _F) -> _F:
+    """A function whose arguments pass through `native`."""
+
+    @functools.wraps(function)
+    def call(*arguments: Any, **named: Any) -> Any:
+        return function(*map(native, arguments), **{name: native(value) for name, value in named.items()})
+
+    return call  # type: ignore[return-value]
+
+
 def as_floats(value: Any, name: str) -> Array:
     """The numbers as an array of JAX's default floating-point type.
 
@@ -147,7 +165,7 @@ def as_numbers(value: Any, name: str, dtype: Any = float) -> np.ndarray:
     masked = isinstance(value, np.ma.MaskedArray) and bool(np.ma.getmaskarray(value).any())
     require(not masked, f"{name} is a masked array: give what is valid of it as a plain one")
     try:
-        found = np.asarray(value)
+        found = native(np.asarray(value))
         # Of text, dates, complex numbers and None NumPy would make numbers.
         real = found.dtype.kind in "biuf" or jnp.issubdtype(found.dtype, jnp.floating)
         real = real or (found.dtype.kind == "O" and all(isinstance(item, numbers.Real) for item in found.flat))

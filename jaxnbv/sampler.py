@@ -8,7 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.checks import InputError, check_fields, check_key, check_type, checked, is_traced, require, shown
+from jaxnbv.checks import (
+    InputError,
+    check_fields,
+    check_key,
+    check_type,
+    checked,
+    is_traced,
+    require,
+    shown,
+    takes_native,
+)
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.volume import Box, Volume, bounding_box
@@ -185,6 +195,7 @@ class SurfaceSampler(eqx.Module):
         posterior = self.posterior(observations)
         return StepInputs(observations, posterior, self.sample(observations, key, posterior))
 
+    @takes_native
     def carve(
         self, observations: Observations | PointCloud, values: Float[Array, "*s g g g"]
     ) -> Float[Array, "*s g g g"]:

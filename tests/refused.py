@@ -181,6 +181,7 @@ def nested(depth):
     return value
 
 
+COMMAS = "v 0,5 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 BOAST = "OFF\n3 10000000 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 NEVER = nbv.SurfaceSampler(MODEL, nbv.Grid(12), 2, nbv.Carving(lambda x: jnp.full(x.shape[:1], jnp.nan)))
 
@@ -291,6 +292,8 @@ REFUSED = {
     "an older session that asks": (older_session_asks, "another process has added some"),
     "a scene without a number": (lambda: records("unnumbered"), "scene_x.json is no record"),
     "a PLY that ends early": (lambda: cut("early.ply", 0.6), "its header declares"),
+    "decimal commas": (lambda: cut("commas.obj", 1.0, COMMAS), "decimal points in place of commas"),
+    "a mesh that is no file": (lambda: nbv.load_mesh(D), "give str or Path or Trimesh or Scene"),
     "a face of ten million": (lambda: cut("boast.off", 1.0, BOAST), "of the 10000000 faces"),
     "a negative cost": (lambda: costing(lambda a, b: -jnp.sum(b.position**2)), "zero or more"),
     "a cost of three numbers": (lambda: costing(lambda a, b: b.position), "one number a pose"),

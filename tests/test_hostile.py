@@ -20,3 +20,7 @@ def test_any_argument_works_or_is_refused_by_name():
 
 def test_what_once_passed_or_failed_within_is_refused_by_name():
     run("refused.py")
+
+
+def test_the_byte_order_of_arrays_does_not_matter():
+    run("byte_order.py")

@@ -17,6 +17,7 @@ from jaxnbv.checks import (
     check_index,
     check_type,
     checked,
+    native,
     require,
     shown,
 )
@@ -45,11 +46,11 @@ class PointCloud(eqx.Module):
       cloud, and without end where nothing came back. None where this is not known.
     """
 
-    points: Float[Array, "*batch n 3"]
-    normals: Float[Array, "*batch n 3"]
+    points: Float[Array, "*batch n 3"] = eqx.field(converter=native)
+    normals: Float[Array, "*batch n 3"] = eqx.field(converter=native)
     mask: Bool[Array, "*batch n"]
     missed: Bool[Array, "*batch n"] | None = None
-    sight: Float[Array, "*batch n"] | None = None
+    sight: Float[Array, "*batch n"] | None = eqx.field(converter=native, default=None)
 
     def __check_init__(self):
         leaves = self.points, self.normals, self.mask, self.missed, self.sight

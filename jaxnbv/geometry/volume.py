@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import AnyArray, InputError, require, shown
+from jaxnbv.checks import AnyArray, InputError, require, shown, takes_native
 from jaxnbv.geometry.pose import fibonacci_sphere
 
 Volume = Callable[[Float[Array, "n 3"]], Float[Array, " n"]]
@@ -63,6 +63,7 @@ class Box(eqx.Module):
         """The cube of this side about the origin."""
         return cls((-0.5 * side,) * 3, (0.5 * side,) * 3)
 
+    @takes_native
     @eqx.filter_jit
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         """The signed distance at the points x; exact."""

@@ -6,6 +6,8 @@ imported. Two layouts are read: the zip archive written since PyTorch 1.6 (`data
 older stream of pickles followed by the arrays.
 """
 
+import functools
+import mmap
 import os
 import pickle
 import struct
@@ -20,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnbv.checks import InputError, require
+from jaxnbv.networks.pickle_bounds import skip_pickle
 
 # Names, not types: what a pickle is given it may change, unless it is text.
 _TYPES = {
@@ -54,7 +57,8 @@ def read_torch_tensors(path: str | Path) -> dict[str, np.ndarray]:
         with path.open("rb") as file:
             archive = file.read(2) == b"PK"
             file.seek(0)
-            return _state_dictionary(_read_archive(file) if archive else _read_stream(file))
+            size = os.fstat(file.fileno()).st_size
+            return _state_dictionary((_read_archive if archive else _read_stream)(file, size))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:  # a damaged pickle can raise nearly anything
@@ -75,9 +79,11 @@ def _state_dictionary(content: Any) -> dict[str, np.ndarray]:
     return {name.removeprefix(shared): tensor for name, tensor in content.items()}
 
 
-def _read_archive(file: BufferedIOBase) -> Any:
+def _read_archive(file: BufferedIOBase, size: int) -> Any:
     """The zip archive: one folder that holds data.pkl, the arrays as data/<key>, and the byte order."""
     with zipfile.ZipFile(file) as archive:
+        unpacked = sum(entry.file_size for entry in archive.infolist())
+        require(unpacked <= size, f"unpacks to {unpacked} bytes from {size}, which torch.save does not: save it again")
         roots = [name.removesuffix("data.pkl") for name in archive.namelist() if name.endswith("/data.pkl")]
         require(len(roots) == 1, "is a zip file, but not one made by torch.save: it has no data.pkl")
         order = f"{roots[0]}byteorder"
@@ -85,14 +91,12 @@ def _read_archive(file: BufferedIOBase) -> Any:
             order not in archive.namelist() or archive.read(order).strip() == b"little",
             "was written by a big-endian machine: load it with PyTorch and torch.save it again",
         )
-
-        def load(key: str, kind: str, count: int) -> np.ndarray:
-            return np.frombuffer(archive.read(f"{roots[0]}data/{key}"), kind, count)
-
-        return _Tensors(BytesIO(archive.read(f"{roots[0]}data.pkl")), load).load()
+        contents = functools.cache(lambda key: archive.read(f"{roots[0]}data/{key}"))
+        pickled = archive.read(f"{roots[0]}data.pkl")
+        return _unpickled(BytesIO(pickled), len(pickled), lambda key, *form: np.frombuffer(contents(key), *form))
 
 
-def _read_stream(file: BufferedIOBase) -> Any:
+def _read_stream(file: BufferedIOBase, size: int) -> Any:
     """The layout before PyTorch 1.6: magic number, protocol, system, content, keys; then each array's count and bytes.
 
     The arrays come last, so the tensors are made as views of arrays that are filled afterwards.
@@ -100,9 +104,15 @@ def _read_stream(file: BufferedIOBase) -> Any:
     storages: dict[str, np.ndarray] = {}
 
     def load(key: str, kind: str, count: int) -> np.ndarray:
-        return storages.setdefault(key, np.zeros(count, kind))
+        if key not in storages:
+            held = sum(storage.nbytes for storage in storages.values()) + count * np.dtype(kind).itemsize
+            require(held <= size, f"declares arrays of {held} bytes, more than it has: fetch the file again")
+            storages[key] = np.zeros(count, kind)
+        return storages[key]
 
-    magic, _, _, content, keys = (_Tensors(file, load).load() for _ in range(5))
+    with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
+        magic, _, _, content, keys = (_unpickled(mapped, size, load) for _ in range(5))
+        file.seek(mapped.tell())
     require(magic == _STREAM_MAGIC, "is neither a zip archive nor an older PyTorch file: torch.save the model anew")
     require(sorted(keys) == sorted(storages), "lists other storages than its tensors need: the file is damaged")
     for key in keys:
@@ -115,23 +125,48 @@ def _read_stream(file: BufferedIOBase) -> Any:
     return content
 
 
+def _unpickled(file: BytesIO | mmap.mmap, size: int, load: _Load) -> Any:
+    """What the next pickle of a file describes."""
+    start = file.tell()
+    skip_pickle(file, size)
+    end = file.tell()
+    file.seek(start)
+    return _Tensors(BytesIO(file.read(end - start)), load).load()
+
+
 class _Tensors(pickle.Unpickler):
     """Python's own reader of pickles, of which a file gets no name but those of tensors and dictionaries."""
 
-    def __init__(self, file: BufferedIOBase, load: _Load):
+    def __init__(self, file: BytesIO, load: _Load):
         super().__init__(file)
         self._storage = load
+        self._items = len(file.getbuffer())
 
     def find_class(self, module: str, name: str) -> Any:
         """What stands for a name."""
         if module in ("torch", "torch.cuda") and name in _TYPES:
             return _TYPES[name]
+        if (module, name) == ("collections", "OrderedDict"):
+            return self._dictionary
         return _KNOWN.get((module, name), _Nothing)
 
     def persistent_load(self, identifier: Any) -> np.ndarray:
         """The storage that ('storage', type, key, device, count) names; older files add a view, always None."""
         _, kind, key, _, count, *_ = identifier
         return self._storage(key, kind, count)
+
+    def _dictionary(self, items: Any = ()) -> "_Dictionary":
+        """A copy of these items; a file that copies more than it has bytes is refused."""
+        self._items -= len(items)
+        require(self._items >= 0, "copies the same dictionary over and over: it is damaged")
+        return _Dictionary(items)
+
+
+class _Dictionary(OrderedDict):
+    """A dictionary that does not take what a model says of itself beside its tensors."""
+
+    def __setstate__(self, _: Any) -> None:
+        pass
 
 
 class _Nothing:
@@ -150,11 +185,12 @@ class _Nothing:
 def _tensor(storage: np.ndarray, offset: int, shape: tuple[int, ...], strides: tuple[int, ...], *_: Any) -> np.ndarray:
     """A view of a storage; NumPy refuses one that leaves it."""
     size = storage.itemsize
-    return np.ndarray(shape, storage.dtype, storage, offset * size, tuple(stride * size for stride in strides))
+    tensor = np.ndarray(shape, storage.dtype, storage, offset * size, tuple(stride * size for stride in strides))
+    require(tensor.size <= storage.size, f"stretches {storage.size} numbers to a tensor of shape {shape}: save a copy")
+    return tensor
 
 
 _KNOWN: dict[tuple[str, str], Any] = {
-    ("collections", "OrderedDict"): OrderedDict,
     ("torch._utils", "_rebuild_tensor_v2"): _tensor,
     ("torch._utils", "_rebuild_parameter"): lambda tensor, *_: tensor,
 }

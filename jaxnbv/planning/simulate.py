@@ -7,6 +7,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import equinox as eqx
+import trimesh
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.checks import check_key, checked, require
@@ -25,7 +26,7 @@ from jaxnbv.scanning.sdf import SignedDistance
 @checked
 def simulate(
     planner: Planner,
-    scene: Surface | SignedDistance,
+    scene: Surface | SignedDistance | trimesh.Trimesh | trimesh.Scene,
     first: Pose,
     views: int,
     key: PRNGKeyArray,
@@ -35,8 +36,8 @@ def simulate(
     until: StopRule | None = None,
     each: Callable[[Step], None] | None = None,
 ) -> Episode:
-    """Scan a known surface, or solid, from `first`, then from the views that the planner asks for: `views` in all, or
-    as many as it takes `until` a rule of stopping ends it, `Sure(0.95) | Budget(seconds=60)` say.
+    """Scan a known surface, solid or mesh of trimesh's from `first`, then from the views that the planner asks for:
+    `views` in all, or as many as it takes `until` a rule of stopping ends it, `Sure(0.95) | Budget(seconds=60)` say.
 
     View i depends on the key and i alone, not on how many follow. With `folder`, every finished view is written there;
     a run that was interrupted goes on after the last of them and, on a CPU with the same versions, ends with the same

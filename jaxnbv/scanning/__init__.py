@@ -11,6 +11,7 @@ from jaxnbv.scanning.looks import Looks as Looks
 from jaxnbv.scanning.mesh import TriangleMesh as TriangleMesh
 from jaxnbv.scanning.mesh import mesh_from_sdf as mesh_from_sdf
 from jaxnbv.scanning.mesh_files import MeshParts as MeshParts
+from jaxnbv.scanning.mesh_files import as_surface as as_surface
 from jaxnbv.scanning.mesh_files import load_mesh as load_mesh
 from jaxnbv.scanning.mesh_files import load_parts as load_parts
 from jaxnbv.scanning.obstacles import Obstacles as Obstacles
@@ -24,4 +25,3 @@ from jaxnbv.scanning.scanner import pixel_area as pixel_area
 from jaxnbv.scanning.scanner import scan as scan
 from jaxnbv.scanning.screened_poisson import screened_poisson as screened_poisson
 from jaxnbv.scanning.sphere_tracing import SDFSurface as SDFSurface
-from jaxnbv.scanning.sphere_tracing import as_surface as as_surface

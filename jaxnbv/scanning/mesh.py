@@ -1,4 +1,4 @@
-"""TriangleMesh: real objects as they come, soups and open sheets included, met by rays through Embree on the host."""
+"""TriangleMesh: real objects as they come, soups and open sheets included, whose rays are traced on the host."""
 
 import dataclasses
 import warnings
@@ -9,8 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
-from embreex.mesh_construction import TriangleMesh as EmbreeTriangles
-from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, InputError, check_key, check_type, checked, is_traced, require
@@ -21,23 +19,26 @@ from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.scanner import Hits, Surface
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.scanning.sdf.sampled import checked_triangles, winding_number
+from jaxnbv.scanning.triangle_rays import FirstFaces, first_faces
 
 
-@dataclasses.dataclass(eq=False)
+@dataclasses.dataclass(unsafe_hash=True)
 class _Tree:
-    """Embree's tree of the triangles it was last asked for: it is no array, so it stays out of the pytree's leaves.
+    """The tree of the triangles it was last asked for: it is no array, so it stays out of the pytree's leaves.
 
-    It has no fields, for it follows from the triangles: any two are described alike.
+    It has no fields, for it follows from the triangles: any two are equal, are described alike, and a copy is empty.
     """
 
-    _vertices = _faces = _scene = None
+    _built = None
 
-    def of(self, vertices: np.ndarray, faces: np.ndarray) -> EmbreeScene:
-        if self._vertices is not vertices or self._faces is not faces:
-            self._scene = EmbreeScene(robust=True)
-            EmbreeTriangles(self._scene, vertices.astype(np.float32), faces.astype(np.int32))
-            self._vertices, self._faces = vertices, faces
-        return self._scene
+    def of(self, vertices: np.ndarray, faces: np.ndarray) -> FirstFaces:
+        built = self._built
+        if built is None or built[0] is not vertices or built[1] is not faces:
+            built = self._built = vertices, faces, first_faces(vertices, faces)
+        return built[2]
+
+    def __reduce__(self) -> tuple[type["_Tree"], tuple[()]]:
+        return _Tree, ()
 
 
 class TriangleMesh(Surface):
@@ -100,19 +101,18 @@ class TriangleMesh(Surface):
             "or trace SDFSurface(sdf.solid_of_mesh(mesh.vertices, mesh.faces)) instead, which runs inside",
         )
         origins, directions = (np.asarray(a, dtype=np.float64) for a in (origins, directions))
-        scene = self._tree.of(self.vertices, self.faces)
-        found = scene.run(origins.astype(np.float32), directions.astype(np.float32), output=1)
-        (hit,) = np.nonzero(found["primID"] >= 0)
-        origins, directions, near = origins[hit], directions[hit], found["tfar"][hit]
-        a, b, c = np.moveaxis(self.vertices[self.faces[found["primID"][hit]]], 1, 0)
+        rows, distances = self._tree.of(self.vertices, self.faces)(origins, directions)
+        (hit,) = np.nonzero(rows >= 0)
+        origins, directions, near = origins[hit], directions[hit], distances[hit]
+        a, b, c = np.moveaxis(self.vertices[self.faces[rows[hit]]], 1, 0)
         normals = np.cross(b - a, c - a)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         cosine = np.sum(normals * directions, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = np.sum(normals * (a - origins), axis=1) / cosine
-        # A triangle seen edge-on has no well-defined place on its plane; Embree's float32 depth stays in the triangle.
+        # A triangle seen edge-on has no well-defined place on its plane; the tracer's distance stays in the triangle.
         depth = np.where(np.abs(depth - near) < 1e-3, depth, near)
-        mask = np.zeros(len(found["primID"]), dtype=bool)
+        mask = np.zeros(len(rows), dtype=bool)
         mask[hit] = True
         points, outward = np.zeros((2, len(mask), 3))
         points[hit] = origins + depth[:, None] * directions

@@ -1,7 +1,7 @@
 """Meshes, and their parts, from files of any format that trimesh reads."""
 
 import os
-import re
+from io import BytesIO
 from pathlib import Path
 
 import equinox as eqx
@@ -11,23 +11,38 @@ import trimesh
 from jaxtyping import Array, Float
 
 from jaxnbv.checks import InputError, checked, require, shown
+from jaxnbv.scanning.gltf import read_gltf
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.mesh import TriangleMesh
+from jaxnbv.scanning.mesh_rows import read_obj, read_off, without_mark
+from jaxnbv.scanning.ply_rows import read_ply
+from jaxnbv.scanning.scanner import Surface
+from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.scanning.sdf.sampled import distance_to_triangles
-
-# Of a PLY or OFF file: bytes that its header is shorter than.
-_HEADER = 2**16
+from jaxnbv.scanning.sphere_tracing import SDFSurface
 
 
 @checked
-def load_mesh(path: str | Path, up: str = "y") -> TriangleMesh:
-    """The mesh in a file of any format that trimesh reads; a scene's geometries are joined where it places them.
+def load_mesh(path: str | Path | trimesh.Trimesh | trimesh.Scene, up: str = "y") -> TriangleMesh:
+    """The mesh in a file of any format that trimesh reads, or a mesh or scene of trimesh's; the geometries of a scene
+    are joined where it places them.
 
     - `up`: the file's axis that is upward, see `Frame`.
 
-    **Raises:** `ValueError` if the file is missing or cannot be read, and as `TriangleMesh.from_arrays` does.
+    **Raises:** `ValueError` if the file is missing, cannot be read, or holds what is not read of it (a skeleton or
+    sparse accessors of glTF, say), and as `TriangleMesh.from_arrays` does.
     """
     return joined_nodes(path, [mesh for _, mesh in read_nodes(path)], up)
+
+
+def as_surface(scene: Surface | SignedDistance | trimesh.Trimesh | trimesh.Scene) -> Surface:
+    """A surface as it is; of a solid its boundary; of trimesh's meshes what `load_mesh` makes, with y upward.
+
+    **Raises:** `ValueError` as `load_mesh` does.
+    """
+    if isinstance(scene, trimesh.Trimesh | trimesh.Scene):
+        return load_mesh(scene)
+    return SDFSurface(scene) if isinstance(scene, SignedDistance) else scene
 
 
 class MeshParts(eqx.Module):
@@ -49,8 +64,9 @@ class MeshParts(eqx.Module):
         return jnp.asarray(np.stack(found).reshape(shape), jnp.result_type(float))
 
 
-def load_parts(path: str | Path, up: str = "y") -> MeshParts:
-    """The mesh in a file and its parts, one for each node that has a face of positive area, in the order of names.
+def load_parts(path: str | Path | trimesh.Scene, up: str = "y") -> MeshParts:
+    """The mesh in a file, or a scene of trimesh's, and its parts, one for each node that has a face of positive area,
+    in the order of names.
 
     - `up`: the file's axis that is upward, see `Frame`.
 
@@ -65,7 +81,7 @@ def load_parts(path: str | Path, up: str = "y") -> MeshParts:
     return MeshParts(mesh, parts, tuple(name for name, *_ in whole))
 
 
-def joined_nodes(path: str | Path, meshes: list[trimesh.Trimesh], up: str) -> TriangleMesh:
+def joined_nodes(path: str | Path | trimesh.Geometry, meshes: list[trimesh.Trimesh], up: str) -> TriangleMesh:
     """The mesh that the nodes of a file make together.
 
     **Raises:** `ValueError` as `TriangleMesh.from_arrays` does, for the file.
@@ -79,40 +95,44 @@ def joined_nodes(path: str | Path, meshes: list[trimesh.Trimesh], up: str) -> Tr
         raise InputError(f"{path}: {error}") from error
 
 
-def read_nodes(path: str | Path) -> list[tuple[str, trimesh.Trimesh]]:
-    """The nodes of a file that have faces, by name, where its scene places them, in the file's coordinates.
+def read_nodes(path: str | Path | trimesh.Geometry) -> list[tuple[str, trimesh.Trimesh]]:
+    """The nodes of a file or scene that have faces, by name, where they are placed, in the file's coordinates.
 
-    **Raises:** `ValueError` if the file is missing, cannot be read, or has no faces.
+    **Raises:** `ValueError` if the file is missing, cannot be read, has no faces, or holds what its reader passes over.
     """
-    path = Path(path)
+    meshes = _read_file(Path(path)) if isinstance(path, str | Path) else _placed(path)
+    meshes = [(name, mesh) for name, mesh in meshes if len(mesh.faces)]
+    require(len(meshes) > 0, f"{path} has no faces: it is a point cloud, empty, or an STL that was cut short")
+    return meshes
+
+
+def _read_file(path: Path) -> list[tuple[str, trimesh.Trimesh]]:
     require(os.path.isfile(path), f"no mesh file at {shown(str(path))}: check the path")
     try:
-        parts = trimesh.load_scene(path, path.suffix[1:].lower(), process=False).dump()
+        return _read(path)
+    except InputError as error:
+        raise InputError(f"cannot read {path}: it {error}") from error
     except Exception as error:  # Each of trimesh's readers fails in its own way.
         formats = ", ".join(sorted(trimesh.available_formats()))
         raise InputError(
             f"cannot read {path} as a mesh ({type(error).__name__}: {error}): it is damaged, or none of {formats}, "
             "some of which need a package of their own"
         ) from error
-    meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-    require(len(meshes) > 0, f"{path} has no faces: it is a point cloud, empty, or an STL that was cut short")
-    found = sum(len(mesh.vertices) for mesh in meshes), sum(len(mesh.faces) for mesh in meshes)
-    for what, count, declared in zip(("vertices", "faces"), found, _declared(path), strict=True):
-        message = f"{path} has {count} of the {declared} {what} that its header declares: fetch it again"
-        require(count >= declared, message)
+
+
+def _read(path: Path) -> list[tuple[str, trimesh.Trimesh]]:
+    kind, content = path.suffix[1:].lower(), without_mark(path.read_bytes())
+    if kind in ("obj", "off", "ply"):
+        rows = read_obj(content) if kind == "obj" else {"mesh": (read_off if kind == "off" else read_ply)(content)}
+        return [(name, trimesh.Trimesh(vertices, faces, process=False)) for name, (vertices, faces) in rows.items()]
+    resolver = trimesh.resolvers.FilePathResolver(str(path))
+    if kind in ("glb", "gltf"):
+        return _placed(read_gltf(content, kind, resolver))
+    return _placed(trimesh.load_scene(BytesIO(content), kind, resolver, process=False))
+
+
+def _placed(thing: trimesh.Geometry) -> list[tuple[str, trimesh.Trimesh]]:
+    """The meshes of a scene by their nodes' names, or a mesh alone."""
+    parts = thing.dump() if isinstance(thing, trimesh.Scene) else [thing]
+    meshes = [part for part in parts if isinstance(part, trimesh.Trimesh)]
     return [(str(mesh.metadata.get("node", index)), mesh) for index, mesh in enumerate(meshes)]
-
-
-def _declared(path: Path) -> tuple[int, int]:
-    """How many vertices and faces the header of a PLY or OFF file declares; trimesh takes one that ends early."""
-    with path.open("rb") as file:
-        head = file.read(_HEADER).decode("latin1")
-    if path.suffix.lower() == ".off":
-        found = re.match(r"\s*[A-Z]*OFF\s*(\d+)\s+(\d+)", re.sub(r"#.*", "", head))
-        counts = [int(count) for count in found.groups()] if found else []
-    elif path.suffix.lower() == ".ply":
-        elements = dict(re.findall(r"(?m)^element (\w+) (\d+)\s*$", head.partition("end_header")[0]))
-        counts = [int(elements.get(name, 0)) for name in ("vertex", "face")]
-    else:
-        counts = []
-    return (counts[0], counts[1]) if len(counts) == 2 else (0, 0)

@@ -4,7 +4,7 @@ noise; and how a hit moves with the ray and the surface."""
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from jaxnbv.checks import AnyArray, check_fields, checked, require
+from jaxnbv.checks import AnyArray, check_fields, checked, require, takes_native
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
@@ -39,6 +39,11 @@ class Surface(eqx.Module):
     """
 
     in_jit: eqx.AbstractClassVar[bool]
+
+    def __init_subclass__(cls, **settings: Any):
+        super().__init_subclass__(**settings)
+        for name in {"trace", "contains"} & vars(cls).keys():
+            setattr(cls, name, takes_native(vars(cls)[name]))
 
     @abstractmethod
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:

@@ -80,11 +80,6 @@ class SDFSurface(Surface):
         return Hits(jnp.where(mask[:, None], points, 0.0), jnp.where(mask[:, None], normals, 0.0), mask)
 
 
-def as_surface(scene: Surface | SignedDistance) -> Surface:
-    """A surface as it is; of a solid its boundary."""
-    return SDFSurface(scene) if isinstance(scene, SignedDistance) else scene
-
-
 class _Along(eqx.Module):
     """A solid's distance along rays."""
 

@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from jaxnbv.checks import InputError, require
+from jaxnbv.scanning.triangle_rays import tracer
 from jaxnbv.storage.files import PARTS, make_folder, write_text, write_whole
 
 _LOCK = ".lock"
@@ -27,7 +28,7 @@ _LONGEST_SHOWN = 60
 
 def software() -> dict[str, str]:
     """Versions of what the numbers depend on."""
-    names = ("jaxnbv", "jax", "jaxlib", "equinox", "optax", "optimistix", "numpy", "trimesh", "embreex")
+    names = ("jaxnbv", "jax", "jaxlib", "equinox", "optax", "optimistix", "numpy", "trimesh", tracer())
     return {name: importlib.metadata.version(name) for name in names}
 
 
@@ -169,7 +170,7 @@ class ResultFolder:
         arrays: Mapping[str, np.ndarray] = MappingProxyType({}),
     ):
         self.path, self.config, self.cores = make_folder(path), json.loads(json.dumps(config)), cores
-        self.arrays = arrays
+        self.arrays = dict(arrays)
         self.bound = False
         self._check()
 

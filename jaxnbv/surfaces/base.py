@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.checks import AnyArray, as_numbers, check_key, check_type, is_traced, require
+from jaxnbv.checks import AnyArray, as_numbers, check_key, check_type, is_traced, native, require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
 from jaxnbv.observations import Observations
@@ -30,6 +30,7 @@ def _on_torus(is_given: Callable[[Any], bool], wanted: str) -> Callable[..., Any
     def checking(method: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(method)
         def call(self: Any, *arrays: Any) -> Any:
+            arrays = tuple(map(native, arrays))
             for array in arrays:
                 found = array if is_traced(array) else as_numbers(array, "the coordinates", None)
                 require(is_given(found), f"the coordinates have shape {found.shape}: give {wanted}")

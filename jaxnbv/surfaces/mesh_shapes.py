@@ -24,7 +24,7 @@ from jaxnbv.scanning.mesh_files import load_mesh
 from jaxnbv.scanning.sdf import Sampled, solid_of_mesh
 
 # What is kept is made anew where what makes it has changed.
-_VERSION = 1
+_VERSION = 2
 _T = TypeVar("_T")
 
 
@@ -36,9 +36,9 @@ def listed(values: Sequence[_T], name: str) -> tuple[_T, ...]:
         raise InputError(f"{name} are {shown(values)}; give a list") from error
 
 
-def mesh_paths(meshes: str | Path | Sequence[str | Path]) -> list[Path]:
-    """The files that are named, or all meshes in a folder and those within it: files whose names end as a format that
-    trimesh reads.
+def mesh_paths(meshes: str | Path | Sequence[str | Path | trimesh.Trimesh]) -> list[Path | trimesh.Trimesh]:
+    """The files and meshes that are named, or all meshes in a folder and those within it: files whose names end as a
+    format that trimesh reads.
 
     **Raises:** `ValueError` for a folder that is not there or holds no mesh, or for no files.
     """
@@ -52,12 +52,12 @@ def mesh_paths(meshes: str | Path | Sequence[str | Path]) -> list[Path]:
     named = listed(meshes, "the meshes")
     require(len(named) > 0, "no meshes are named: give their files, or a folder")
     for path in named:
-        check_type(path, str | Path, "a mesh")
-    return [Path(path) for path in named]
+        check_type(path, str | Path | trimesh.Trimesh, "a mesh")
+    return [path if isinstance(path, trimesh.Trimesh) else Path(path) for path in named]
 
 
 def shapes_of_meshes(
-    paths: Sequence[Path], resolution: int, sheet: float, num_extremes: int, progress: bool
+    paths: Sequence[Path | trimesh.Trimesh], resolution: int, sheet: float, num_extremes: int, progress: bool
 ) -> tuple[list[Sampled], Float[np.ndarray, "k p 3"], list[int]]:
     """The solids of the meshes that can be used, points that are extreme on each, and which they are.
 
@@ -68,7 +68,7 @@ def shapes_of_meshes(
     solids, extremes, used = [], [], []
     for index, path in enumerate(progress_bar(paths, progress, desc="meshes read")):
         try:
-            solid, points = _kept(path, resolution, sheet, num_extremes)
+            solid, points = _shape(path, resolution, sheet, num_extremes)
         except InputError as error:
             warnings.warn(f"{path} is left out of the bank: {error}", stacklevel=3)
             continue
@@ -79,7 +79,15 @@ def shapes_of_meshes(
     return solids, np.stack(extremes), used
 
 
-def _kept(path: Path, resolution: int, sheet: float, num_extremes: int) -> tuple[Sampled, Float[np.ndarray, "p 3"]]:
+def _shape(
+    mesh: Path | trimesh.Trimesh, resolution: int, sheet: float, num_extremes: int
+) -> tuple[Sampled, Float[np.ndarray, "p 3"]]:
+    settings = resolution, sheet, num_extremes
+    found = _kept(mesh, *settings) if isinstance(mesh, Path) else _sampled(load_mesh(mesh), *settings)
+    return Sampled(*(jnp.asarray(found[name]) for name in ("values", "low", "spacing", "padding"))), found["extremes"]
+
+
+def _kept(path: Path, resolution: int, sheet: float, num_extremes: int) -> dict[str, np.ndarray]:
     require(os.path.isfile(path), f"cannot read {path}: there is no file")
     try:
         content = path.read_bytes()
@@ -91,7 +99,7 @@ def _kept(path: Path, resolution: int, sheet: float, num_extremes: int) -> tuple
     if found is None:
         found = _sampled(load_mesh(path), resolution, sheet, num_extremes)
         _keep(file, found)
-    return Sampled(*(jnp.asarray(found[name]) for name in ("values", "low", "spacing", "padding"))), found["extremes"]
+    return found
 
 
 def _sampled(mesh: TriangleMesh, resolution: int, sheet: float, num_extremes: int) -> dict[str, np.ndarray]:

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import trimesh
 from jaxtyping import Array, Float, Int, UInt8
 
 from jaxnbv.checks import check_type, checked, require
@@ -80,7 +81,7 @@ class ShapeBank(eqx.Module):
     @checked
     def from_meshes(
         cls,
-        meshes: str | Path | Sequence[str | Path],
+        meshes: str | Path | Sequence[str | Path | trimesh.Trimesh],
         resolution: int = 64,
         sheet: float = 0.05,
         names: Sequence[str] | None = None,
@@ -89,10 +90,10 @@ class ShapeBank(eqx.Module):
         """A bank of meshes, centred, their longest sides 2.5: their signed distances on grids, which are kept in the
         user's cache. Soups and open meshes will do.
 
-        - `meshes`: files, or a folder of which all are taken, also in folders within.
+        - `meshes`: files and meshes of trimesh's, or a folder of which all are taken, also in folders within.
         - `resolution`: nodes along the longest side.
         - `sheet`: how thick faces are, in scene units, that have the outside on both sides.
-        - `names`: by default the names of the files, of a folder's with their place in it.
+        - `names`: by default the names of the files, of a folder's with their place in it, and numbers.
 
         A `UserWarning` names each mesh that cannot be used and is left out.
 
@@ -103,7 +104,10 @@ class ShapeBank(eqx.Module):
         paths = mesh_paths(meshes)
         if names is None:
             folder = Path(meshes) if isinstance(meshes, str | Path) else None
-            names = [path.stem if folder is None else str(path.relative_to(folder).with_suffix("")) for path in paths]
+            files = [
+                Path(str(index)) if isinstance(path, trimesh.Trimesh) else path for index, path in enumerate(paths)
+            ]
+            names = [path.stem if folder is None else str(path.relative_to(folder).with_suffix("")) for path in files]
         names = _as_names(names)
         require(len(names) == len(paths), f"there are {len(names)} names for {len(paths)} meshes: give one for each")
         solids, extremes, used = shapes_of_meshes(paths, resolution, sheet, NUM_EXTREMES, progress)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnbv.checks import InputError, check_fields, check_type, is_traced, require, shown
+from jaxnbv.checks import InputError, check_fields, check_type, is_traced, native, require, shown
 from jaxnbv.geometry.cloud import farthest_point_subsample
 from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.geometry.volume import Box, Volume, boundary_points
@@ -29,9 +29,9 @@ class ValueRows(eqx.Module):
     **Raises:** `ValueError` for arrays of other shapes.
     """
 
-    points: Float[Array, "m 3"]
-    values: Float[Array, " m"]
-    noise: Float[Array, " m"]
+    points: Float[Array, "m 3"] = eqx.field(converter=native)
+    values: Float[Array, " m"] = eqx.field(converter=native)
+    noise: Float[Array, " m"] = eqx.field(converter=native)
     mask: Bool[Array, " m"]
 
     def __check_init__(self):

@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere
 from jaxnbv.planning.episode import Episode
+from jaxnbv.scanning.triangle_rays import first_faces
 from jaxnbv.viz.sphere import unit
 
 # Fields of view are drawn so deep, in radii of the object, and end at so many of its extents in their direction, which
@@ -74,5 +75,6 @@ def _shown(
     if surface is not None and len(few):
         rays = np.repeat(eyes[None], len(few), axis=0)
         origins = points[few, None] + clear * rays
-        facing &= ~surface.ray.intersects_any(origins.reshape(-1, 3), rays.reshape(-1, 3)).reshape(facing.shape)
+        rows, _ = first_faces(surface.vertices, surface.faces)(origins.reshape(-1, 3), rays.reshape(-1, 3))
+        facing &= (rows < 0).reshape(facing.shape)
     return np.sum(facing, axis=0) / max(len(few), 1)

@@ -1,7 +1,10 @@
 """PyTorch files written by hand: read as they are meant, or refused; nothing in them is run."""
 
 import pickle
+import resource
 import struct
+import tracemalloc
+import zipfile
 
 import numpy as np
 import pytest
@@ -13,6 +16,7 @@ from torch_files import (
     checkpoint,
     dumps,
     named,
+    program,
     storage,
     tensors_and_bytes,
     view,
@@ -169,3 +173,97 @@ def test_storages_that_an_older_file_does_not_fill_are_refused(tmp_path, state):
     file = write_stream(tmp_path / "net.pth", content, first, [next(iter(state.values())).size])
     with pytest.raises(nbv.InputError, match="lists other storages than its tensors need"):
         read_torch_tensors(file)
+
+
+def copies(count, step):
+    """Many dictionaries of the same entries: memo 1 makes one, 2 has the pairs, 3 has them as a dictionary."""
+    pairs = [(f"k{index:05d}", 1) for index in range(count)]
+    head = b"\x80\x02ccollections\nOrderedDict\nq\x01" + program([list(pair) for pair in pairs]) + b"q\x02"
+    return head + program(dict(pairs)) + b"q\x03" + b"(" + step * count + b"l."
+
+
+LONG = struct.pack("<I", 2**31 - 1)
+BOMBS = {
+    "memo of 67 million": b"\x80\x02]r\x00\x00\x00\x04.",
+    "memo in text": b"]p67108864\n.",
+    "later memo": b"\x80\x02](NNNNr\x00\x00\x00\x01e.",
+    "text of 2 GB": b"\x80\x02X" + LONG + b".",
+    "bytes of 2 GB": b"\x80\x03B" + LONG + b".",
+    "text of 16 EB": b"\x80\x04\x8d" + b"\xff" * 8 + b".",
+    "buffer of 4 TB": b"\x80\x05\x96" + struct.pack("<Q", 2**42) + b".",
+    "number of 2 GB": b"\x80\x02\x8b" + LONG + b".",
+    "frame of 2 GB": b"\x80\x04\x95" + struct.pack("<Q", 2**31) + b"N.",
+    "frame of 4 TB": b"\x80\x04\x95" + struct.pack("<Q", 2**42) + b"N.",
+    "tuples in tuples": b"\x80\x02}N" + b"\x85" * 1_000_000 + b"Ns.",
+    "tuples in tuples, remembered": b"\x80\x02}N" + b"\x85q\x00h\x00\x86" * 200_000 + b"Ns.",
+    "one array of 8 TB": dumps({"a": view(storage("0", "DoubleStorage", 2**40), 0, (1,), (1,))}),
+    "many arrays": dumps({str(i): view(storage(str(i), "DoubleStorage", 400), 0, (1,), (1,)) for i in range(40)}),
+    "copies": copies(2000, b"h\x01h\x02\x85R"),
+    "copies beside": copies(2000, b"h\x01)Rh\x03b"),
+    "nothing taken": b"\x80\x02\x85.",
+    "a mark that is none": b"\x80\x02t.",
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+@pytest.mark.parametrize("layout", ["alone", "stream", "archive"])
+def test_memory_is_bounded_by_the_size_of_the_file(tmp_path, name, layout):
+    file = tmp_path / "net.pth"
+    if layout == "archive":
+        with zipfile.ZipFile(file, "w") as archive:
+            archive.writestr("net/data.pkl", BOMBS[name])
+    else:
+        head = [0x1950A86A20F9469CFC6C, 1001, {"little_endian": True}] if layout == "stream" else []
+        file.write_bytes(b"".join(map(dumps, head)) + BOMBS[name])
+    tracemalloc.start()
+    with pytest.raises(nbv.InputError, match=r"net\.pth"):
+        read_torch_tensors(file)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 2**20 + 200 * file.stat().st_size
+
+
+def test_a_file_of_ten_bytes_takes_no_gigabyte(tmp_path):
+    """Python's own reader would: memory that NumPy and Python do not trace counts too."""
+    file = tmp_path / "net.pth"
+    file.write_bytes(b"\x80\x02]r\x00\x00\x00\x04.")
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(nbv.InputError, match="asks for room for 67108864 things"):
+        read_torch_tensors(file)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
+
+
+def test_compressed_and_stretched_arrays_are_refused(tmp_path):
+    content = {"a": view(storage("0", "DoubleStorage", 2**20), 0, (1,), (1,))}
+    file = write_archive(tmp_path / "net.pth", content, {"0": bytes(2**23)})
+    assert read_torch_tensors(file)["a"].shape == (1,)
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("net/data.pkl", dumps(content))
+        archive.writestr("net/data/0", bytes(2**23))
+    with pytest.raises(nbv.InputError, match="unpacks to"):
+        read_torch_tensors(file)
+    content = {"a": view(storage("0", "DoubleStorage", 1), 0, (2**40,), (0,))}
+    with pytest.raises(nbv.InputError, match="to a tensor of shape"):
+        read_torch_tensors(write_archive(file, content, {"0": bytes(8)}))
+
+
+def test_a_storage_that_many_tensors_share_is_read_once(tmp_path):
+    shared = storage("0", "DoubleStorage", 2**17)
+    content = {str(row): view(shared, row, (1,), (1,)) for row in range(100)}
+    file = write_archive(tmp_path / "net.pth", content, {"0": np.arange(2.0**17).tobytes()})
+    tracemalloc.start()
+    tensors = read_torch_tensors(file)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert [float(tensors[str(row)][0]) for row in range(100)] == list(range(100))
+    assert peak < 6 * 2**20
+
+
+def test_long_lists_and_deep_settings_are_read(tmp_path, state):
+    """As older protocols write them, one item at a time; deep, but not too deep."""
+    deep = ()
+    for _ in range(300):
+        deep = (deep,)
+    items = Op(b"".join(b"K\x01a" for _ in range(3000)), [])
+    found = read_torch_tensors(checkpoint(tmp_path / "net.pth", state, losses=items, settings=deep))
+    assert set(found) == set(state)

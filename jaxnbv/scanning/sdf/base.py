@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxnbv.checks import AnyArray, InputError, as_floats, check_type, is_traced, require
+from jaxnbv.checks import AnyArray, InputError, as_floats, check_type, is_traced, require, takes_native
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.rotations import rotation_about, safe_norm
 
@@ -87,6 +87,11 @@ class SignedDistance(eqx.Module):
 
     **Raises:** `ValueError` if a parameter is not finite, has the wrong shape, or is a negative length.
     """
+
+    def __init_subclass__(cls, **settings: Any):
+        super().__init_subclass__(**settings)
+        for name in {"__call__", "part_labels"} & vars(cls).keys():
+            setattr(cls, name, takes_native(vars(cls)[name]))
 
     @abstractmethod
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:

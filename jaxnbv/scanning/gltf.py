@@ -1,0 +1,118 @@
+"""glTF files by trimesh: what it passes over is refused by name, and what it has read is what the file declares."""
+
+import importlib.util
+import json
+import re
+import struct
+from collections.abc import Iterator
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from trimesh.resolvers import Resolver
+
+from jaxnbv.checks import require
+
+# What normalised integers are divided by, by the type of their accessor.
+_LARGEST = {5120: 127.0, 5121: 255.0, 5122: 32767.0, 5123: 65535.0}
+_KEPT, _TRIANGLES, _FANS = (0, 1, 4, 5), (4, 5), 6
+# A file may require these: they change no shape, or trimesh reads them.
+_HARMLESS = re.compile("material|texture|light|mesh_quantization|xmp|KHR_draco_mesh_compression")
+_ROUNDING = 1e-3
+_REMEDY = "export it again without, from Blender say"
+
+
+def read_gltf(content: bytes, kind: str, resolver: Resolver) -> trimesh.Scene:
+    """The scene of a file.
+
+    - `kind`: "gltf" or "glb"; `resolver`: of the files that it names.
+
+    **Raises:** `ValueError` for what trimesh does not read, and for counts or bounds that are not the declared ones.
+    """
+    text = content[20 : 20 + struct.unpack("<I", content[12:16])[0]] if kind == "glb" else content
+    header = json.loads(text)
+    unread = sorted(set(_unread(header)))
+    require(not unread, f"has {', '.join(unread)}, which trimesh does not read: {_REMEDY}")
+    scene = trimesh.load_scene(BytesIO(content), kind, resolver, process=False)
+    # trimesh keeps primitives in their order.
+    kept = [(index, part) for index, part in _primitives(header) if part.get("mode", 4) in _KEPT]
+    require(len(kept) == len(scene.geometry), f"has {len(kept)} primitives, but trimesh reads {len(scene.geometry)}")
+    boxes: dict[int, list[Float[np.ndarray, "8 3"]]] = {}
+    for (index, part), geometry in zip(kept, scene.geometry.values(), strict=True):
+        if part.get("mode", 4) not in _TRIANGLES:
+            continue
+        accessor = header["accessors"][part["attributes"]["POSITION"]]
+        if accessor.get("normalized"):
+            geometry.vertices = geometry.vertices / _LARGEST[accessor["componentType"]]
+        bounds = np.array([geometry.vertices.min(axis=0), geometry.vertices.max(axis=0)])
+        if "min" in accessor and "max" in accessor:
+            largest = _LARGEST[accessor["componentType"]] if accessor.get("normalized") else 1.0
+            stated = np.array([accessor["min"], accessor["max"]]) / largest
+            require(
+                np.allclose(bounds, stated, rtol=0.0, atol=_ROUNDING * np.abs(stated).max()),
+                f"declares that mesh {index} spans {stated.tolist()}, but trimesh reads {bounds.tolist()}: "
+                "it is damaged, or stored in a way that trimesh does not read; export it again",
+            )
+        boxes.setdefault(index, []).append(trimesh.bounds.corners(bounds))
+    expected = [trimesh.transform_points(box, to) for index, to in _placed(header) for box in boxes.get(index, [])]
+    placed = [part.bounds for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
+    require(len(placed) == len(expected), f"places {len(expected)} meshes, but trimesh reads {len(placed)}: {_REMEDY}")
+    if placed:
+        low, high = np.min(expected, axis=(0, 1)), np.max(expected, axis=(0, 1))
+        slack = _ROUNDING * np.abs([low, high]).max()
+        found = np.min(placed, axis=0)[0], np.max(placed, axis=0)[1]
+        require(
+            bool((found[0] >= low - slack).all() and (found[1] <= high + slack).all()),
+            f"places its meshes within {low.tolist()} to {high.tolist()}, but trimesh in {found[0].tolist()} to "
+            f"{found[1].tolist()}: apply the nodes' transforms and export it again",
+        )
+    return scene
+
+
+def _unread(header: dict[str, Any]) -> Iterator[str]:
+    """Names of what is in a file and changes its shape, but is passed over."""
+    yield from (name for name in header.get("extensionsRequired", []) if not _HARMLESS.search(name))
+    for node in header.get("nodes", []):
+        if "mesh" in node and "skin" in node:
+            yield "a skeleton (apply the armature)"
+        below = [header["nodes"][child] for child in node.get("children", [])]
+        if "camera" in node and any("mesh" in one for one in [node, *below]):
+            yield "a mesh below a camera (clear its parent)"
+        if "EXT_mesh_gpu_instancing" in node.get("extensions", {}):
+            yield "EXT_mesh_gpu_instancing"
+    weights = [thing.get("weights", []) for name in ("nodes", "meshes") for thing in header.get(name, [])]
+    if any(weight for row in weights for weight in row):
+        yield "shape keys (apply them)"
+    no_draco = importlib.util.find_spec("DracoPy") is None
+    for _, part in _primitives(header):
+        used = part["attributes"].get("POSITION"), part.get("indices")
+        if any("sparse" in header["accessors"][index] for index in used if index is not None):
+            yield "sparse accessors"
+        if no_draco and "KHR_draco_mesh_compression" in part.get("extensions", {}):
+            yield "Draco compression (pip install DracoPy)"
+        if part.get("mode", 4) == _FANS:
+            yield "fans of triangles"
+
+
+def _primitives(header: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
+    return [(index, part) for index, mesh in enumerate(header.get("meshes", [])) for part in mesh["primitives"]]
+
+
+def _placed(header: dict[str, Any]) -> Iterator[tuple[int, Float[np.ndarray, "4 4"]]]:
+    """The meshes of the scene, and where its nodes place each."""
+    scenes = header.get("scenes", [])
+    roots = scenes[header.get("scene", 0)].get("nodes", []) if scenes else []
+    waiting = [(root, np.eye(4)) for root in roots]
+    while waiting:
+        index, matrix = waiting.pop()
+        node = header["nodes"][index]
+        own = np.array(node.get("matrix", np.eye(4).ravel()), np.float64).reshape(4, 4).T
+        x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
+        turn = trimesh.transformations.quaternion_matrix((w, x, y, z))
+        move = trimesh.transformations.translation_matrix(node.get("translation", (0.0, 0.0, 0.0)))
+        matrix = matrix @ own @ move @ turn @ np.diag([*node.get("scale", (1.0, 1.0, 1.0)), 1.0])
+        if "mesh" in node:
+            yield node["mesh"], matrix
+        waiting += [(child, matrix) for child in node.get("children", [])]

@@ -1,0 +1,118 @@
+"""Vertices and faces of PLY files, of any encoding."""
+
+import re
+from collections.abc import Iterable
+from typing import Any, TypeAlias
+
+import numpy as np
+from jaxtyping import Int
+
+from jaxnbv.checks import require
+from jaxnbv.scanning.mesh_rows import Triangles, cut_short, numbers_of, triangles_of
+
+_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
+_TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
+_TYPES |= {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
+# Text is read as if its numbers had been stored in 64 bits.
+_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+# Its name, its type, and for a list the type of its length.
+_Property: TypeAlias = tuple[str, np.dtype, np.dtype | None]
+
+
+def read_ply(content: bytes) -> Triangles:
+    """The triangles of a PLY file: its faces, cut into fans, and its strips of triangles.
+
+    **Raises:** `ValueError` for a header that is none, and rows that are missing or no numbers.
+    """
+    head = re.match(rb"ply\s.*?[\r\n]end_header[ \t]*(\r\n|\n|\r)", content, re.DOTALL)
+    encoding, elements = _header(head.group().decode("latin1") if head else "")
+    body = content[head.end() if head else 0 :]
+    if encoding == "ascii":
+        body = numbers_of([body.decode("latin1").split()]).astype("<f8").tobytes()
+    columns: dict[str, dict[str, Any]] = {}
+    start = 0
+    for name, (count, properties) in elements.items():
+        columns[name], start = _element(body, start, name, count, properties)
+    points, faces, strips = (columns.get(name, {}) for name in ("vertex", "face", "tristrips"))
+    require({"x", "y", "z"} <= set(points), "has no vertices with x, y and z")
+    corners = [rows for name, rows in faces.items() if name in ("vertex_indices", "vertex_index")]
+    pieces = [triangles_of(rows) for rows in corners] + [_of_strips(rows) for rows in strips.values()]
+    vertices = np.stack([np.asarray(points[axis], np.float64).ravel() for axis in "xyz"], axis=1)
+    return vertices, np.concatenate([np.zeros((0, 3), np.int64), *pieces])
+
+
+def _header(text: str) -> tuple[str, dict[str, tuple[int, list[_Property]]]]:
+    """The encoding, and the number and the properties of each element."""
+    encoding, elements = "", dict[str, tuple[int, list[_Property]]]()
+
+    def kind_of(word: str) -> np.dtype:
+        require(word in _TYPES, f"has values of a type {word!r}, which PLY does not have: save it again")
+        return np.dtype("<f8" if encoding == "ascii" else _ORDERS[encoding] + _TYPES[word])
+
+    for line in re.split("[\\r\\n]+", text):
+        words = line.split()
+        if words[:1] == ["format"]:
+            encoding = words[1]
+            require(encoding in _ORDERS, f"is a PLY file of an encoding {encoding!r}: save it as binary or ASCII")
+        elif words[:1] == ["element"]:
+            elements[words[1]] = int(words[2]), []
+        elif words[:1] == ["property"]:
+            length = kind_of(words[2]) if words[1] == "list" else None
+            elements[next(reversed(elements))][1].append((words[-1], kind_of(words[-2]), length))
+    require(encoding != "", "has no header of a PLY file")
+    return encoding, elements
+
+
+def _element(
+    body: bytes, start: int, element: str, count: int, properties: list[_Property]
+) -> tuple[dict[str, Any], int]:
+    """The columns of an element by name, of a list one array a row, and where it ends."""
+    if count == 0:
+        return {name: [] for name, *_ in properties}, start
+    what = f"{element!r} elements"
+    first, end = _row(body, start, properties, cut_short(0, count, what))
+    fields: list[Any] = []
+    for (name, kind, length), values in zip(properties, first, strict=True):
+        fields += [(name, kind)] if length is None else [(f"length of {name}", length), (name, kind, (len(values),))]
+    alike = np.dtype(fields)
+    if start + count * alike.itemsize <= len(body):
+        rows = np.frombuffer(body, alike, count, start)
+        sizes = [(rows[f"length of {name}"], rows[name].shape[1]) for name, _, length in properties if length]
+        if all((lengths == size).all() for lengths, size in sizes):
+            return {name: rows[name] for name, *_ in properties}, start + rows.nbytes
+    columns = [[values] for values in first]
+    for index in range(1, count):
+        row, end = _row(body, end, properties, cut_short(index, count, what))
+        for column, values in zip(columns, row, strict=True):
+            column.append(values)
+    return {name: column for (name, *_), column in zip(properties, columns, strict=True)}, end
+
+
+def _row(body: bytes, start: int, properties: list[_Property], message: str) -> tuple[list[np.ndarray], int]:
+    """The values of a row, and where it ends.
+
+    **Raises:** `ValueError` with this message where the file ends before.
+    """
+    row: list[np.ndarray] = []
+    for _, kind, length in properties:
+        parts = [(kind, 1)] if length is None else [(length, 1), (kind, -1)]
+        for part, size in parts:
+            size = int(row.pop()[0]) if size < 0 else size
+            end = start + size * part.itemsize
+            require(start <= end <= len(body), message)
+            row.append(np.frombuffer(body, part, size, start) if size else np.zeros(0, part))
+            start = end
+    return row, start
+
+
+def _of_strips(strips: Iterable[np.ndarray]) -> Int[np.ndarray, "f 3"]:
+    """Strips that -1 ends; every second triangle of one is wound the other way."""
+    faces = [np.zeros((0, 3), np.int64)]
+    for strip in strips:
+        whole = np.asarray(strip, np.int64)
+        for piece in np.split(whole, np.flatnonzero(whole < 0)):
+            corners = piece[piece >= 0]
+            rows = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+            rows[1::2] = rows[1::2, ::-1]
+            faces.append(rows)
+    return np.concatenate(faces)

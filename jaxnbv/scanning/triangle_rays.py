@@ -1,0 +1,68 @@
+"""The first triangle that each ray meets, on the host: by Embree, or by libigl where Embree has no wheel."""
+
+import importlib
+import weakref
+from collections.abc import Callable
+from typing import TypeAlias
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxnbv.errors import optional
+
+# libigl counts a ray as parallel to a triangle where twice the area times the cosine is below 1e-6, and loses rays that
+# run exactly through an edge. So it gets a unit that is small beside any triangle, and rays that are shifted by 1e-9 in
+# a direction that edges are unlikely to have.
+_SCALE = 2.0**20
+_SHIFT = 1e-10 * np.array([3.1, 7.7, 5.5])
+
+FirstFaces: TypeAlias = Callable[
+    [Float[np.ndarray, "rays 3"], Float[np.ndarray, "rays 3"]],
+    tuple[Int[np.ndarray, " rays"], Float[np.ndarray, " rays"]],
+]
+"""From origins and unit directions to the row of the face that each ray meets first, -1 for none, and the distance."""
+
+
+def first_faces(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> FirstFaces:
+    """A tree of these triangles, in a scene's coordinates.
+
+    **Raises:** `ValueError` where neither Embree nor libigl is installed.
+    """
+    return (_by_embree if tracer() == "embreex" else _by_libigl)(vertices, faces)
+
+
+def tracer() -> str:
+    """The package that traces here, `embreex` or `libigl`."""
+    try:
+        importlib.import_module("embreex.rtcore_scene")
+    except ImportError:
+        return "libigl"
+    return "embreex"
+
+
+def _by_embree(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> FirstFaces:
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    scene = EmbreeScene(robust=True)
+    TriangleMesh(scene, vertices.astype(np.float32), faces.astype(np.int32))
+
+    def first(origins, directions):
+        hits = scene.run(origins.astype(np.float32), directions.astype(np.float32), output=1)
+        return hits["primID"], hits["tfar"]
+
+    return first
+
+
+def _by_libigl(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> FirstFaces:
+    corners, rows = _SCALE * np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
+    held = [optional("igl").AABB()]
+    held[0].init(corners, rows)
+
+    def first(origins, directions):
+        found, distances, _ = held[0].intersect_ray_first(corners, rows, _SCALE * (origins + _SHIFT), directions)
+        return found, distances / _SCALE
+
+    # A tree that outlives Python is reported as a leak, on standard error.
+    weakref.finalize(first, held.clear)
+    return first
