@@ -70,11 +70,11 @@ class NewSurface(Acquisition):
         alpha(D, scan) = sum_x a(x) clip(d(x) / s - 1, 0, 1)
 
     over the hits x of the scan, where d is the distance to the nearest pixel of any view so far, as large as it is on
-    the surface (`Looks`), and a(x) = r^2 omega / cos the area of the pixel on the surface: omega its solid angle, r the distance, cos that of the
-    angle of incidence, at least 0.5. The rays of one scan do not overlap, so no part of the surface counts twice; and
-    neither near surfaces, which fill more pixels, nor a single point far from all others outweighs the rest, as in the
-    paper's `Coverage`. It is differentiable in the pose wherever `Coverage` is, but its derivative lacks the jumps that
-    make most of a gain: search over candidates.
+    the surface (`Looks`), and a(x) = r^2 omega / cos the area of the pixel on the surface: omega its solid angle, r the
+    distance, cos that of the angle of incidence, at least 0.5. The rays of one scan do not overlap, so no part of the
+    surface counts twice; and neither near surfaces, which fill more pixels, nor a single point far from all others
+    outweighs the rest, as in the paper's `Coverage`. It is differentiable in the pose wherever `Coverage` is, but its
+    derivative lacks the jumps that make most of a gain: search over candidates.
 
     - `size`: s, what lies within this distance of a hit has been seen; what is twice as far is new. In scene units, in
       a session too; by default, and at least, the spacing of the grid on which looks are kept.
