@@ -95,7 +95,7 @@ def expected(acquisition):
 
 
 def session(**changes):
-    settings = {"planner": P, "camera": SMALL, "box": ((-1.2, -1.2, -1.2), (1.2, 1.2, 1.2))}
+    settings = {"planner": P, "camera": SMALL, "box": ((-1.2, -1.2, -1.2), (1.2, 1.2, 1.2)), "up": "y"}
     return nbv.Session(**(settings | changes))
 
 
@@ -269,6 +269,7 @@ REFUSED = {
     "a rotation as a pose": (lambda: nbv.Pose.from_matrix(np.eye(3)), "(3, 3)"),
     "a target nowhere": (lambda: nbv.look_at((0, 0, 2), (np.nan, 0, 0)), "got target"),
     "poses of a session that are one": (lambda: session(poses=np.eye(4)), "give a batch"),
+    "a session without up": (lambda: session(up=None), 'up="z"'),
     "a depth image of text": (lambda: session().add("image", np.eye(4)), "'image'"),
     "a rule of an episode that is none": (
         lambda: nbv.simulate(P, BALL, POSE, 2, KEY, progress=False, until="sure"),

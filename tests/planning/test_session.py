@@ -388,6 +388,31 @@ def test_the_table_is_found_told_of_and_kept_clear_of():
     assert session.next().matrix[2, 3] > 0.1
 
 
+@pytest.mark.parametrize("up", ["y", "-y", "x", "-x", "-z"])
+def test_a_wrong_up_is_told_by_the_table(up):
+    """Once, with the axis that is right."""
+    session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), obstacles=None, up=up)
+    with pytest.warns(UserWarning, match="no table is found") as told:
+        session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    message = f'no table is found with up="{up}", but a plane would be one with up="z": give that'
+    assert [message in str(one.message) for one in told].count(True) == 1
+
+
+def test_no_table_is_told_and_obstacles_say_that_there_is_none():
+    image = np.where(
+        shot(FIRST) * 1e-3 * np.linalg.norm(CAMERA.pixel_directions(), axis=1).reshape(48, 64) < 0.6, shot(FIRST), 0
+    )
+    session = session_of(obstacles=None)
+    with pytest.warns(
+        UserWarning, match=r'no table is found under the box with up="z".*Obstacles\(\) if there is none'
+    ):
+        session.add(image, FIRST, depth_scale=1e-3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        session.add(image, FIRST, depth_scale=1e-3)
+        session_of(obstacles=Obstacles()).add(image, FIRST, depth_scale=1e-3)
+
+
 def test_a_table_is_kept_where_that_is_asked_for():
     session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), poses=BELOW, obstacles=Obstacles())
     with pytest.warns(UserWarning, match="go on beyond the box") as told:
