@@ -25,7 +25,13 @@ from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import STAGES, Loop, View
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.session_warnings import warn_of_cut, warn_of_little, warn_of_no_table, warn_of_table
+from jaxnbv.planning.session_warnings import (
+    warn_of_cut,
+    warn_of_inside,
+    warn_of_little,
+    warn_of_no_table,
+    warn_of_table,
+)
 from jaxnbv.planning.stopping import StopRule
 from jaxnbv.planning.table import other_ups, table_under
 from jaxnbv.progress import progress_bar
@@ -78,7 +84,8 @@ class Session:
       left out of the cloud, and no place for a camera. If there is none a warning says so, and whether there would be
       one by another `up`. `Obstacles()` says that there is none.
     - `poses`: (n, 4, 4), where the sensor can be held; by default the candidates of the planner's search, in scene
-      units about the box's centre, and of a whole sphere the upper half: what is below may be the table.
+      units about the box's centre, and of a whole sphere the upper half: what is below may be the table. In a room that
+      is scanned from inside they must be given: the default ones stand outside the box.
     - `folder`: where images and proposals are kept before they are acted on; a session that was killed goes on from it.
     - `convention`: of the matrices' axes, see `Pose.from_matrix`.
     - `key`: of the posterior samples.
@@ -222,6 +229,9 @@ class Session:
             warn_of_table(self._table, self.frame)
         elif looks_for_table:
             warn_of_no_table(self.frame.up, self._other_ups)
+        cameras = np.stack([np.asarray(self.frame.to_world(view.pose).position) for view in self.views])
+        candidates = self.frame.to_world(self.planner.search.poses_around()).position
+        warn_of_inside(self.box, cameras, np.asarray(candidates))
         voxel = self.frame.length_to_world(self.planner.sampler.grid.spacing)
         points, _ = self.frame.to_world(self.observations.cloud).to_numpy()
         self._cut = warn_of_cut(self.box, points, voxel, self._cut)

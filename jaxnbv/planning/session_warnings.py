@@ -60,6 +60,18 @@ def warn_of_no_table(up: str, others: tuple[str, ...]) -> None:
     )
 
 
+def warn_of_inside(box: Box, cameras: Float[np.ndarray, "n 3"], candidates: Float[np.ndarray, "m 3"]) -> None:
+    """Warn, of the first camera that stands in the box, if no candidate does. All in world units."""
+    is_inside = np.asarray(box(cameras)) <= 0
+    if is_inside[-1] and is_inside.sum() == 1 and not (np.asarray(box(candidates)) <= 0).any():
+        warnings.warn(
+            f"the camera at {np.round(cameras[-1], 3).tolist()} stands inside the box, but all {len(candidates)} "
+            "candidates stand outside it. To look around inside, as in a room, give poses=nbv.look_at(places, "
+            "targets).matrix with places in the box; to look at an object, give a box about the object alone",
+            stacklevel=_CALLER_OF_ADD,
+        )
+
+
 def warn_of_little(value: float, error: float | None, in_vain: float) -> None:
     """Warn of a best view that may be worth nothing: of candidates that look elsewhere, or once all has been seen.
 
