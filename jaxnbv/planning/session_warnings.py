@@ -66,8 +66,8 @@ def warn_of_inside(box: Box, cameras: Float[np.ndarray, "n 3"], candidates: Floa
     if is_inside[-1] and is_inside.sum() == 1 and not (np.asarray(box(candidates)) <= 0).any():
         warnings.warn(
             f"the camera at {np.round(cameras[-1], 3).tolist()} stands inside the box, but all {len(candidates)} "
-            "candidates stand outside it. To look around inside, as in a room, give poses=nbv.look_at(places, "
-            "targets).matrix with places in the box; to look at an object, give a box about the object alone",
+            "candidates stand outside it. To look around inside, as in a room, give poses=..., (n, 4, 4), of places in "
+            "the box; to look at an object, give a box about the object alone",
             stacklevel=_CALLER_OF_ADD,
         )
 
