@@ -79,7 +79,7 @@ def test_a_search_that_does_not_ask_the_score_says_so():
 @pytest.mark.parametrize(
     ("utility", "message"),
     [
-        (lambda cloud: cloud.points[:, 1], r"shape \(5,\): a utility is one number"),
+        (lambda cloud: cloud.points[:, 1], r"shape \(5,\) and type float32: a utility is one number"),
         (lambda cloud: jnp.log(-1.0 - jnp.sum(cloud.mask)), "a cloud of 3 points is nan: it must be finite"),
         (lambda cloud: 1.0 / jnp.sum(~cloud.mask[:3]), "must be finite"),
     ],
