@@ -49,7 +49,7 @@ def take_session(folder: Path) -> None:
         nbv.SurfaceSampler(nbv.GeometricSPSR(0.05, truncation=12), nbv.Grid(32), num_samples=2),
         capacity=256,
     )
-    session = nbv.Session(camera, ((-0.12, -0.12, -0.12), (0.12, 0.12, 0.12)), planner, folder=folder)
+    session = nbv.Session(camera, ((-0.12, -0.12, -0.12), (0.12, 0.12, 0.12)), planner, up="y", folder=folder)
     first = nbv.look_at((0.0, 0.1, 0.3))
     while len(session.views) < 4:
         matrix = np.asarray(session.next().matrix if session.views else first.matrix)

@@ -47,7 +47,7 @@ def session(steps: int) -> Iterator[None]:
     with tempfile.TemporaryDirectory() as folder:
         # A session asks for no pose twice.
         asked = planner(steps, 20 + steps // 10)
-        taken = nbv.Session(CAMERA, ((-1.2,) * 3, (1.2,) * 3), asked, folder=folder, progress=False)
+        taken = nbv.Session(CAMERA, ((-1.2,) * 3, (1.2,) * 3), asked, up="y", folder=folder, progress=False)
         for step in range(steps):
             pose = poses[step]
             seen = nbv.scan(BALL, CAMERA, pose)

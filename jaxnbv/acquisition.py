@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import InputError, check_fields, checked, functions_of_users, is_traced, require, shown
+from jaxnbv.checks import InputError, check_fields, checked, functions_of_users, is_traced, require, returned, shown
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.geometry.pose import Pose
@@ -39,6 +39,7 @@ class Acquisition(eqx.Module):
     """What one imagined scan is worth, given what has been seen. A search maximises the mean over the posterior.
 
     - `needs_posterior`: whether `context` looks at the posterior, which a planner then puts into the step.
+    - `cloud_only`: whether `context` looks at D alone, so that a planner can try it before there are observations.
     - `measurable_only`: whether surface that a view looked at in vain is left out of the samples, see `Looks`.
     - `gains_once`: whether a pose that was taken has nothing more to give, so that what is expected there is expected
       in vain. A search over candidates then takes the farthest from the cameras so far among those that are level with
@@ -46,6 +47,7 @@ class Acquisition(eqx.Module):
     """
 
     needs_posterior: ClassVar[bool] = False
+    cloud_only: ClassVar[bool] = False
     measurable_only: ClassVar[bool] = False
     gains_once: ClassVar[bool] = False
 
@@ -59,6 +61,8 @@ class Acquisition(eqx.Module):
 
     def inputs(self, step: StepInputs) -> StepInputs:
         """The part of a step that `context` looks at. Steps whose parts have equal shapes share one compilation."""
+        if self.cloud_only:
+            return inputs_of(step.observations.cloud)
         return StepInputs(step.observations, step.posterior if self.needs_posterior else None)
 
     @property
@@ -84,7 +88,8 @@ class Acquisition(eqx.Module):
         return self.answer(cloud)
 
     def check(self, cloud: PointCloud) -> None:
-        """Raise `ValueError` if what the acquisition is made of gives something impossible on a first D."""
+        """Raise `ValueError` if what the acquisition is made of gives something impossible on a cloud: the first D, and
+        D with a scan whose score is no finite number."""
         return
 
 
@@ -96,6 +101,7 @@ class ExpectedUtilityImprovement(Acquisition):
       added to it: for a utility that looks at so many points anyway, and would sample D again for every scan.
     """
 
+    cloud_only: ClassVar[bool] = True
     utility: AnyUtility = eqx.field(converter=as_utility)
     num_points: int | None = eqx.field(static=True, default=None)
 
@@ -107,16 +113,15 @@ class ExpectedUtilityImprovement(Acquisition):
         """D, thinned, and u(D)."""
         cloud = step.observations.cloud
         cloud = cloud if self.num_points is None else limit_capacity(cloud, self.num_points)
-        return cloud, self.utility(cloud)
+        return cloud, self._value(cloud)
+
+    def _value(self, cloud: PointCloud) -> Any:
+        return returned(self.utility(cloud), f"the {self.utility.name} of a cloud", 0, "a utility is one number")
 
     def score(self, context: tuple[PointCloud, Float[Array, ""]], view: ImaginedView) -> Float[Array, ""]:
         """max(0, u(D u scan) - u(D))."""
         cloud, utility = context
-        return zero_if_empty(view.scan, jnp.maximum(0.0, self.utility(concatenate(cloud, view.scan)) - utility))
-
-    def inputs(self, step: StepInputs) -> StepInputs:
-        """D alone."""
-        return inputs_of(step.observations.cloud)
+        return zero_if_empty(view.scan, jnp.maximum(0.0, self._value(concatenate(cloud, view.scan)) - utility))
 
     @property
     def batch_size(self) -> int:
@@ -141,12 +146,9 @@ class ExpectedUtilityImprovement(Acquisition):
     def check(self, cloud: PointCloud) -> None:
         """**Raises:** `ValueError` as the utility's own `check` does, or if u(D) is not a finite number."""
         self.utility.check(cloud)
-        (_, value), name = context_of(self, cloud), self.utility.name
-        require(
-            jnp.shape(value) == (),
-            f"the {name} of the cloud has shape {jnp.shape(value)}: a utility is one number",
-        )
-        require(bool(jnp.isfinite(value)), f"the {name} of the first cloud is {value}: it must be finite")
+        _, value = context_of(self, cloud)
+        name, count = self.utility.name, int(cloud.count)
+        require(bool(jnp.isfinite(value)), f"the {name} of a cloud of {count} points is {value}: it must be finite")
 
 
 def as_acquisition(value: Any) -> Acquisition:
@@ -232,12 +234,16 @@ def zero_if_empty(scan: PointCloud, value: Float[Array, "*values"]) -> Float[Arr
     return jnp.where(jnp.any(scan.mask), value, 0.0)
 
 
-def check_differentiable(acquisition: Acquisition, capacity: int, camera: Camera) -> None:
-    """Check that JAX can differentiate an acquisition in the points and normals of a scan, without computing anything.
+def check_traceable(
+    acquisition: Acquisition, seen: Observations | int, camera: Camera, differentiable: bool = False
+) -> None:
+    """Check that JAX can trace an acquisition, by shapes alone: nothing is computed.
 
-    - `capacity`: rows of the cloud.
+    - `seen`: observations, or the capacity of a cloud D.
+    - `camera`: whose scans it scores.
+    - `differentiable`: whether it must have derivatives in the points and normals of a scan.
 
-    **Raises:** `ValueError` if it cannot, as for anything that calls back to host code.
+    **Raises:** `ValueError` if it cannot, as for a utility of NumPy, or derivatives of what calls back to host code.
     """
     if acquisition.needs_posterior:
         # There is none yet.
@@ -249,11 +255,14 @@ def check_differentiable(acquisition: Acquisition, capacity: int, camera: Camera
     def value(rows):
         points, normals = rows
         scan, pose = PointCloud(points, normals, cloud(camera.num_rays).mask), Pose(jnp.eye(3), jnp.zeros(3))
-        return acquisition.score(acquisition.context(inputs_of(cloud(capacity))), ImaginedView(scan, camera, pose))
+        step = inputs_of(cloud(seen) if isinstance(seen, int) else seen)
+        return acquisition.score(acquisition.context(acquisition.inputs(step)), ImaginedView(scan, camera, pose))
 
     rows = cloud(camera.num_rays).points, cloud(camera.num_rays).normals
-    # One that fails by itself says so itself.
-    jax.eval_shape(value, rows)
+    with functions_of_users():
+        jax.eval_shape(value, rows)
+    if not differentiable:
+        return
     try:
         jax.eval_shape(jax.grad(value), rows)
     except ValueError as error:

@@ -32,6 +32,22 @@ _OWN = tuple(
 )
 _NUMBERS = {tuple[float, float]: "two", tuple[float, float, float]: "three"}
 _REAL = (jnp.bool_, jnp.integer, jnp.floating)
+# What a function does that JAX cannot trace, by JAX's errors, and what to do instead.
+_UNTRACEABLE: dict[type[Exception], tuple[str, str]] = {
+    jax.errors.TracerArrayConversionError: ("calls NumPy or other code outside JAX", "write it with jax.numpy"),
+    jax.errors.NonConcreteBooleanIndexError: (
+        "picks rows by a mask, of which JAX cannot know how many there are",
+        "keep all rows and leave out by jnp.where(cloud.mask, ..., 0.0), or jnp.mean(..., where=cloud.mask)",
+    ),
+    jax.errors.TracerIntegerConversionError: (
+        "counts or indexes in Python by a value that JAX traces",
+        "write it with jax.numpy, or jax.lax.fori_loop",
+    ),
+    jax.errors.ConcretizationTypeError: (
+        "decides in Python by a value that JAX traces",
+        "write it with jnp.where, or jax.lax.cond",
+    ),
+}
 # Of 32 bits. What is larger is infinite there.
 _LARGEST = float(np.finfo(np.float32).max)
 
@@ -182,22 +198,33 @@ def as_numbers(value: Any, name: str, dtype: Any = float) -> np.ndarray:
 def functions_of_users() -> Iterator[None]:
     """Where functions of the user's run under JAX: what they do that it cannot trace is one error with its remedy.
 
-    **Raises:** `ValueError` for a function that calls NumPy, or decides in Python by a value.
+    **Raises:** `ValueError` for a function that calls NumPy, picks rows by a mask, or decides in Python by a value.
     """
     try:
         yield
-    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
+    except tuple(_UNTRACEABLE) as error:
         theirs = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(_OWN)]
         if not theirs:
             raise
-        host = isinstance(error, jax.errors.TracerArrayConversionError)
         at = f"{theirs[-1].filename}:{theirs[-1].lineno}"
-        problem = "calls NumPy or other code outside JAX" if host else "decides in Python by a value that JAX traces"
-        remedy = "write it with jax.numpy" if host else "write it with jnp.where, or jax.lax.cond"
+        problem, remedy = next(words for kind, words in _UNTRACEABLE.items() if isinstance(error, kind))
         raise InputError(
             f"{theirs[-1].name} {problem} ({at}): {remedy}, or wrap a network that is not of JAX in HostClassifier or "
             "HostSegmenter"
         ) from error
+
+
+def returned(value: Any, name: str, axes: int, wanted: str) -> Any:
+    """What a function of the user's gave, as it is.
+
+    - `name`: of what it gave, and `wanted`: what it should give, for the error.
+
+    **Raises:** `ValueError` unless it is an array of real numbers with so many axes, or a number for none.
+    """
+    dtype = getattr(value, "dtype", None)
+    real = isinstance(value, numbers.Real) if dtype is None else any(jnp.issubdtype(dtype, kind) for kind in _REAL)
+    require(real and np.ndim(value) == axes, f"{name} is {shown(value)}: {wanted}")
+    return value
 
 
 def shown(value: Any) -> str:

@@ -96,7 +96,7 @@ class Utility(eqx.Module):
         return None
 
     def check(self, cloud: PointCloud) -> None:
-        """Raise `ValueError` if what the utility is made of gives something impossible on a first D."""
+        """Raise `ValueError` if what the utility is made of gives something impossible on a cloud."""
         return
 
 

@@ -4,6 +4,8 @@ A program of its own: in the tests annotations are checked by beartype before an
 """
 
 import dataclasses
+import functools
+import operator
 import os
 import sys
 import tempfile
@@ -11,6 +13,7 @@ import traceback
 import warnings
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -95,7 +98,7 @@ def expected(acquisition):
 
 
 def session(**changes):
-    settings = {"planner": P, "camera": SMALL, "box": ((-1.2, -1.2, -1.2), (1.2, 1.2, 1.2))}
+    settings = {"planner": P, "camera": SMALL, "box": ((-1.2, -1.2, -1.2), (1.2, 1.2, 1.2)), "up": "y"}
     return nbv.Session(**(settings | changes))
 
 
@@ -174,6 +177,41 @@ def costing(cost):
     return priced.propose(priced.init(POSE, SCAN), KEY)
 
 
+def nan_if(condition, bad=jnp.nan):
+    """A utility that is `bad` of clouds with so many points, and zero of others."""
+
+    def lacking(cloud):
+        return jnp.where(condition(jnp.sum(cloud.mask)), bad, 0.0)
+
+    return lacking
+
+
+class NaNView(nbv.search.Baseline):
+    """A baseline whose values are not numbers."""
+
+    def values(self, problem, candidates, key):
+        return jnp.full(self.candidates.count, jnp.nan)
+
+
+def nan_baseline():
+    asks = nbv.Planner(nbv.Coverage(), NaNView(6), SMALL, P.sampler, capacity=64)
+    return asks.propose(asks.init(POSE, SCAN), KEY)
+
+
+class Saying(nbv.StopRule):
+    """A rule that says what it was given."""
+
+    reason: object = eqx.field(static=True)
+
+    def after(self, context):
+        return self.reason
+
+
+def stopping(reason, *others):
+    until = functools.reduce(operator.or_, (Saying(reason), *others))
+    return nbv.simulate(P, BALL, POSE, 3, KEY, progress=False, until=until)
+
+
 def nested(depth):
     value = []
     for _ in range(depth):
@@ -202,7 +240,7 @@ REFUSED = {
     "nodes that are not finite": (lambda: POSTERIOR.sample(KEY, 2).on_grid(np.array([np.nan, 1.0])), "nan"),
     "an infinite score": (
         lambda: proposed(nbv.ExpectedUtilityImprovement(lambda c: jnp.where(c.points.shape[0] > 64, jnp.inf, 1.0))),
-        "infinite",
+        "points is inf",
     ),
     "parts without points": (lambda: parts_of(jnp.ones(16)), "(16,)"),
     "logits of parts": (lambda: parts_of(jnp.full((16, 3), 4.0)), "softmax"),
@@ -276,6 +314,7 @@ REFUSED = {
     "a rotation as a pose": (lambda: nbv.Pose.from_matrix(np.eye(3)), "(3, 3)"),
     "a target nowhere": (lambda: nbv.look_at((0, 0, 2), (np.nan, 0, 0)), "got target"),
     "poses of a session that are one": (lambda: session(poses=np.eye(4)), "give a batch"),
+    "a session without up": (lambda: session(up=None), 'up="z"'),
     "a depth image of text": (lambda: session().add("image", np.eye(4)), "'image'"),
     "a rule of an episode that is none": (
         lambda: nbv.simulate(P, BALL, POSE, 2, KEY, progress=False, until="sure"),
@@ -296,6 +335,52 @@ REFUSED = {
     "a mesh that is no file": (lambda: nbv.load_mesh(D), "give str or Path or Trimesh or Scene"),
     "a face of ten million": (lambda: cut("boast.off", 1.0, BOAST), "of the 10000000 faces"),
     "a negative cost": (lambda: costing(lambda a, b: -jnp.sum(b.position**2)), "zero or more"),
+    "a cost that is not a number": (lambda: costing(lambda a, b: jnp.nan * b.position[0]), "the cost of going"),
+    "a cost of -1": (lambda: costing(lambda a, b: -1.0), "from one pose to another is -1.0"),
+    "a cost without end": (lambda: costing(lambda a, b: jnp.inf), "the cost of going from one pose to another is inf"),
+    "a cost of text": (lambda: costing(lambda a, b: "far"), "'far'"),
+    "a utility that is NaN later": (lambda: proposed(nan_if(lambda c: c > 36)), "the lacking of a cloud of"),
+    "a utility that is infinite later": (lambda: proposed(nan_if(lambda c: c > 36, jnp.inf)), "must be finite"),
+    "a utility of nothing": (lambda: planner(lambda cloud: None), "the utility of a cloud is None"),
+    "a utility of two": (lambda: planner(lambda cloud: (1.0, 2.0)), "a utility is one number"),
+    "a utility of complex numbers": (
+        lambda: planner(lambda cloud: jnp.sum(cloud.points) * 1j),
+        "a utility is one number",
+    ),
+    "a classifier that is NaN later": (
+        lambda: proposed(nbv.CrossEntropy(lambda c: nan_if(lambda n: n > 36)(c) + jnp.log(jnp.full(2, 0.5)), 64)),
+        "the classifier's answers are not log-probabilities",
+    ),
+    "a classifier of one number": (lambda: planner(nbv.CrossEntropy(lambda c: jnp.zeros(()), 16)), "the classifier"),
+    "a segmenter that is NaN later": (
+        lambda: proposed(nbv.SoftPartCount(lambda c: nan_if(lambda n: n > 36)(c) + jnp.full((c.capacity, 2), 0.5))),
+        "the segmenter gives values",
+    ),
+    "a segmenter of rows": (lambda: planner(nbv.SoftPartCount(lambda c: c.mask)), "the segmenter's answer"),
+    "a baseline of NaN": (lambda: nan_baseline(), "the value of NaNView is not a number"),
+    "a rule that says True": (lambda: stopping(True), "the rule of stopping Saying says True"),
+    "a rule that says nothing": (lambda: stopping(""), "None to go on"),
+    "a rule of a number in two": (lambda: stopping(0.5, nbv.Budget(seconds=1e9)), "Saying says 0.5"),
+    "a utility by a mask": (
+        lambda: planner(lambda cloud: jnp.max(cloud.points[cloud.mask][:, 1])),
+        "jnp.where(cloud.mask",
+    ),
+    "a utility that counts": (lambda: planner(lambda cloud: float(len(range(cloud.mask.sum())))), "jax.numpy"),
+    "a utility that looks for rows": (lambda: planner(lambda cloud: jnp.nonzero(cloud.mask)[0][0]), "jnp.where"),
+    "a classifier of NumPy": (
+        lambda: planner(nbv.CrossEntropy(lambda c: np.log(np.array(c.points[:2, 0])), 16)),
+        "jax.numpy",
+    ),
+    "an acquisition that decides, first": (lambda: planner(Deciding()).init(POSE, SCAN), "jnp.where"),
+    "a mesh without a frame": (lambda: nbv.TriangleMesh(np.eye(3), np.array([[0, 1, 2]])), "from_arrays"),
+    "a camera in millimetres": (
+        lambda: nbv.simulate(P, BALL, nbv.look_at((0.0, 0.0, 2500.0)), 1, KEY, progress=False),
+        "2500 scene units",
+    ),
+    "a second camera in millimetres": (
+        lambda: P.observe(OBSERVATIONS, nbv.look_at((0.0, 0.0, 2500.0)), SCAN),
+        "Frame.to_scene",
+    ),
     "a cost of three numbers": (lambda: costing(lambda a, b: b.position), "one number a pose"),
     "a cost of NumPy": (lambda: costing(lambda a, b: np.linalg.norm(b.position)), "jax.numpy"),
     "a rule or text": (lambda: nbv.Sure(0.9) | "x", "'x'"),

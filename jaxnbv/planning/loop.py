@@ -21,7 +21,7 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.pose_list import PoseList
 from jaxnbv.observations import Observations
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.stopping import StopContext, StopRule
+from jaxnbv.planning.stopping import StopContext, StopRule, checked_reason
 from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import GridSurface
 from jaxnbv.search import Proposal
@@ -224,10 +224,11 @@ class Loop:
             poses = tuple(view.pose for view in self.views)
             seconds = time.monotonic() - self._first_view_at
             context = StopContext(self.planner, self.observations, poses, seconds, key, self._surfaces, self.frame)
-            self._next.stop = self.until.after(context)
+            self._next.stop = checked_reason(self.until, self.until.after(context))
             if self._next.stop is None and self.until.needs_proposal:
                 proposal = self._chosen()
-                self._next.stop = self.until.before(context, proposal.pose, self.in_world(proposal.value))
+                reason = self.until.before(context, proposal.pose, self.in_world(proposal.value))
+                self._next.stop = checked_reason(self.until, reason)
             self._next.is_asked = True
         return self._next.stop
 

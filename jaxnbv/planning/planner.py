@@ -7,18 +7,20 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.acquisition import Acquisition, as_acquisition
-from jaxnbv.checks import check_fields, check_key, check_type, functions_of_users, is_traced, require
+from jaxnbv.acquisition import Acquisition, as_acquisition, check_traceable
+from jaxnbv.checks import InputError, check_fields, check_key, check_type, functions_of_users, is_traced, require
 from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud, check_oriented, check_single, limit_capacity
+from jaxnbv.geometry.cloud import PointCloud, check_oriented, check_single, concatenate, limit_capacity
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.pose_list import PoseList
 from jaxnbv.observations import Observations
-from jaxnbv.planning.travel import ValuePerCost
+from jaxnbv.planning.travel import ValuePerCost, total_cost
 from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.scanning import GridSurface, Obstacles, barrier_of, mean_depth, scan_samples
+from jaxnbv.scanning.scanner import far_from_scene
 from jaxnbv.search import DiscreteSearch, Problem, Proposal, Search
 from jaxnbv.surfaces.base import HALF_WIDTH
 from jaxnbv.utility import Quantity
@@ -46,7 +48,8 @@ class Planner(eqx.Module):
     Observations of a cloud from no pose are `planner.init(None, cloud)`.
 
     **Raises:** `ValueError` for numbers below one, and if the search cannot work with the acquisition or the camera: a
-    gradient search with an acquisition that JAX cannot differentiate, say.
+    gradient search with an acquisition that JAX cannot differentiate, say; for a utility, classifier or segmenter that
+    JAX cannot trace, or that gives an array of another shape.
     """
 
     acquisition: AnyAcquisition = eqx.field(converter=as_acquisition)
@@ -64,6 +67,9 @@ class Planner(eqx.Module):
             value = getattr(self, name)
             require(value >= 1, f"{name} is {value}; it must be at least 1")
         self.search.check(self.acquisition, self.camera, self.capacity)
+        # Before anything is computed for a function that JAX cannot trace.
+        if self.search.uses_samples and self.acquisition.cloud_only:
+            check_traceable(self.acquisition, self.capacity, self.camera)
         require(
             self.cost is None or self.search.uses_cost,
             f"{type(self.search).__name__} does not look at the value of a view, so its cost cannot count: leave cost "
@@ -95,6 +101,8 @@ class Planner(eqx.Module):
         kept = None if within is None and self.sampler.carving is None else grid
         observations = Observations.start(limit_capacity(scan, self.capacity), self.max_views, kept, within, camera)
         if self.search.uses_samples and not is_traced(observations):
+            if not self.acquisition.cloud_only:
+                check_traceable(self.acquisition, observations, self.camera)
             self.acquisition.check(observations.cloud)
             self.sampler.model.check(observations.cloud)
         return observations if pose is None else self._with_view(observations, pose, scan, camera)
@@ -170,7 +178,7 @@ class Planner(eqx.Module):
         with functions_of_users():
             problem = Problem(inputs, self.camera, self.acquisition, self.obstacles, self.cost, pending).prepared()
             proposal = _propose(self.search, problem, key)
-        return _checked_proposal(proposal, inputs.surfaces)
+        return _checked_proposal(self, problem, proposal)
 
     @eqx.filter_jit
     def expected_depth(self, surfaces: GridSurface, pose: Pose) -> Float[Array, "h w"]:
@@ -192,6 +200,8 @@ class Planner(eqx.Module):
             return
         # Within jit too, values of what is not traced are known.
         with jax.ensure_compile_time_eval():
+            problem = None if pose is None else far_from_scene(pose)
+            require(problem is None, f"the pose is not of the scene: {problem}")
             if first or bool(scan.mask.any()):
                 name = "the first scan" if first else "the scan"
                 check_oriented(scan, name, min(self.sampler.grid.half_extent, HALF_WIDTH))
@@ -209,24 +219,45 @@ def _propose(search: Search, problem: Problem, key: PRNGKeyArray) -> Proposal:
     return search.propose(problem, key)
 
 
-def _checked_proposal(proposal: Proposal, surfaces: GridSurface | None) -> Proposal:
+def _checked_proposal(planner: Planner, problem: Problem, proposal: Proposal) -> Proposal:
     """A proposal as it is.
 
-    **Raises:** `ValueError` if its value is not finite, or every candidate has been visited.
+    **Raises:** `ValueError` if its value is not finite, naming what of the user's gave that, or if every candidate has
+    been visited.
     """
     if is_traced(proposal):
         return proposal
-    value = proposal.value
+    value, search = proposal.value, planner.search
     known = not bool(jnp.isnan(value))
-    require(
-        known and (surfaces is None or bool(value < jnp.inf)),
-        f"the acquisition is {'infinite' if known else 'not a number (NaN)'} for a candidate: it must be finite for "
-        "every scan, one that sees nothing included, for a gradient search so must its derivatives, and the cost of "
-        "going there, if it counts, one finite number, zero or more",
-    )
+    if not known or (search.uses_samples and bool(value == jnp.inf)):
+        _check_parts(planner, problem, proposal)
+        kind = f"acquisition {type(problem.acquisition).__name__}" if search.uses_samples else type(search).__name__
+        raise InputError(
+            f"the value of {kind} is {'infinite' if known else 'not a number (NaN)'} for a candidate: it must be "
+            "finite for every scan, one that sees nothing included, and for a gradient search so must its derivatives"
+        )
     require(
         bool(value > -jnp.inf),
         f"all {proposal.values.shape[0]} candidates have been visited, or no camera may stand there: give the search "
         "more candidates",
     )
     return proposal
+
+
+def _check_parts(planner: Planner, problem: Problem, proposal: Proposal) -> None:
+    """**Raises:** `ValueError` that names the cost, or the part of the acquisition, that gives no finite number at the
+    first candidate whose value is none."""
+    values = proposal.values
+    wrong = jnp.isnan(values) | (values == jnp.inf)
+    pose = proposal.candidates[int(jnp.argmax(wrong))] if bool(wrong.any()) else proposal.pose
+    observations = problem.observations
+    if planner.cost is not None and int(observations.num_views) > 0:
+        total_cost((observations.poses.last, pose), planner.cost.of)
+    if problem.inputs.surfaces is None:
+        return
+    scans = scan_samples(
+        problem.surfaces, problem.camera, pose[None], barrier_of(problem.obstacles, problem.camera, pose[None])
+    )
+    scores = dataclasses.replace(problem, cost=None).scores(pose[None])
+    for sample in np.flatnonzero(~np.isfinite(np.asarray(scores)[..., 0])):
+        problem.acquisition.check(concatenate(observations.cloud, scans[int(sample)][0]))

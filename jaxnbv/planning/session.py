@@ -19,24 +19,31 @@ from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, checked, 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.depth_image import NothingInside, without_sentinels
-from jaxnbv.geometry.frame import Frame
+from jaxnbv.geometry.frame import AXES, Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import STAGES, Loop, View
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.session_warnings import warn_of_blank, warn_of_cut, warn_of_little, warn_of_table
+from jaxnbv.planning.session_warnings import (
+    warn_of_blank,
+    warn_of_cut,
+    warn_of_inside,
+    warn_of_little,
+    warn_of_no_table,
+    warn_of_table,
+)
 from jaxnbv.planning.stopping import StopRule
-from jaxnbv.planning.table import plane_under
+from jaxnbv.planning.table import other_ups, table_under
 from jaxnbv.progress import progress_bar
 from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Obstacles
-from jaxnbv.scanning.sdf import HalfSpace
 from jaxnbv.search import DiscreteSearch, Proposal
 from jaxnbv.storage import RunFolder
 from jaxnbv.tasks import NewSurface
 
+_NO_UP = 'say which axis of the world is upward, up="z" for most robots: one of'
 _NO_IMAGE = "the session has no image yet: add one first, session.add(depth, matrix)"
 # A cloud holds some thousands of points; more rays than these only take time.
 _MOST_RAYS = 20_000
@@ -75,20 +82,22 @@ class Session:
       replaced by the sensor's with the planner's number of pixels, and the default volume, `Box()`, by the box. By
       default it looks for `NewSurface`, by a `DiscreteSearch` over eight samples with 24 x 32 rays, and keeps 2,000
       points.
-    - `up`: the world's axis that is upward, "y" or "z" say.
+    - `up`: the world's axis that is upward, "y" or "z" say. It must be given, since no default is right for all.
     - `obstacles`: what stands around the object, in world units: `Obstacles((table,), margin=0.005)`, say. By default
       the plane that the object stands on is looked for in the first image, named in a warning, and taken for a table:
-      left out of the cloud, and no place for a camera. `Obstacles()` says that there is none.
+      left out of the cloud, and no place for a camera. If there is none a warning says so, and whether there would be
+      one by another `up`. `Obstacles()` says that there is none.
     - `poses`: (n, 4, 4), where the sensor can be held; by default the candidates of the planner's search, in scene
-      units about the box's centre, and of a whole sphere the upper half: what is below may be the table.
+      units about the box's centre, and of a whole sphere the upper half: what is below may be the table. In a room that
+      is scanned from inside they must be given: the default ones stand outside the box.
     - `folder`: where images and proposals are kept before they are acted on; a session that was killed goes on from it.
     - `convention`: of the matrices' axes, see `Pose.from_matrix`.
     - `key`: of the posterior samples.
     - `until`: when it is done, such as `Sure(0.95) | Budget(seconds=600)`; see `jaxnbv.planning.stopping`.
     - `progress`: whether a bar shows what it is at while it plans.
 
-    **Raises:** `ValueError` for a box without inside, poses that the search has no use for, or a folder of another
-    session.
+    **Raises:** `ValueError` for a box without inside, no `up`, poses that the search has no use for, or a folder of
+    another session.
     """
 
     @checked
@@ -97,7 +106,7 @@ class Session:
         camera: Camera,
         box: tuple | list | Box | AnyArray,
         planner: Planner | None = None,
-        up: str = "y",
+        up: str | None = None,
         poses: Float[AnyArray, "n 4 4"] | None = None,
         folder: str | Path | None = None,
         convention: str = "opencv",
@@ -109,13 +118,16 @@ class Session:
         self.camera, self.box, self.convention = camera, _box_of(box), convention
         self.key, self.until, self.progress = jax.random.key(0) if key is None else key, until, progress
         check_key(self.key)
+        if up is None:
+            raise InputError(f"{_NO_UP} {', '.join(AXES)}")
         self.frame = Frame.fit(np.array([self.box.low, self.box.high]), up=up)
         self.stride = stride_of(camera)
         planner = usual_planner() if planner is None else planner
         matrices = None if poses is None else as_numbers(poses, "the poses", np.float64)
         self._bar: tqdm[Any] | None = None
         self._loop = self._loop_of(self._placed(planner, matrices, obstacles))
-        self._table: HalfSpace | None = None
+        self._table: Obstacles | None = None
+        self._other_ups: tuple[str, ...] = ()
         self._cut: frozenset[str] = frozenset()
         self._next: NextView | None = None
         # The images so far by their digests: which they were, and from where.
@@ -219,12 +231,18 @@ class Session:
         place = as_numbers(matrix, "the matrix of a pose", np.float64)
         count = len(self.views)
         with self._alone() as folder:
+            looks_for_table = len(self.views) == 0 and self.planner.obstacles is None
             self._add(pixels, place, depth_scale, folder)
         if len(self.views) == count:
             warn_of_blank()
             return
-        if len(self.views) == 1 and self._table is not None:
-            warn_of_table(self.frame.to_world(np.asarray(self._table.point, np.float64)))
+        if looks_for_table and self._table is not None:
+            warn_of_table(self._table, self.frame)
+        elif looks_for_table:
+            warn_of_no_table(self.frame.up, self._other_ups)
+        cameras = np.stack([np.asarray(self.frame.to_world(view.pose).position) for view in self.views])
+        candidates = self.frame.to_world(self.planner.search.poses_around()).position
+        warn_of_inside(self.box, cameras, np.asarray(candidates))
         voxel = self.frame.length_to_world(self.planner.sampler.grid.spacing)
         points, _ = self.frame.to_world(self.observations.cloud).to_numpy()
         self._cut = warn_of_cut(self.box, points, voxel, self._cut)
@@ -296,11 +314,12 @@ class Session:
         if index > 0 and _is_blank(depth, cloud):
             return
         if index == 0 and loop.planner.obstacles is None:
-            whole = self.frame.to_scene(PointCloud.from_depth(*image))
-            self._table = plane_under(whole, self.frame.to_scene(self.box))
+            whole = PointCloud.from_depth(*image)
+            self._table = table_under(self.frame.to_scene(whole), self.frame.to_scene(self.box))
+            if self._table is None:
+                self._other_ups = other_ups(whole, self.box, self.frame.up)
             # Without a table there still are the points of D, which cameras keep clear of.
-            around = Obstacles(() if self._table is None else (self._table,))
-            loop = self._loop_of(dataclasses.replace(loop.planner, obstacles=around))
+            loop = self._loop_of(dataclasses.replace(loop.planner, obstacles=self._table or Obstacles()))
         scan = self.frame.to_scene(cloud)
         if (obstacles := loop.planner.obstacles) is not None:
             scan = obstacles.remove_points(scan)

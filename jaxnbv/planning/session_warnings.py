@@ -6,7 +6,10 @@ import warnings
 import numpy as np
 from jaxtyping import Float
 
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.volume import Box
+from jaxnbv.scanning import Obstacles
+from jaxnbv.scanning.sdf import HalfSpace
 
 # Of the points, as for a volume that holds the object: fewer may be stray.
 _STRAY = 0.01
@@ -30,11 +33,15 @@ def warn_of_cut(box: Box, points: Float[np.ndarray, "n 3"], voxel: float, told: 
     return told.union(shares)
 
 
-def warn_of_table(point: Float[np.ndarray, "3"]) -> None:
-    """Warn of a plane that was taken for a table. `point`: on it, in world units."""
+def warn_of_table(table: Obstacles, frame: Frame) -> None:
+    """Warn of a plane that was taken for a table. `table`: one half space, in scene coordinates."""
+    (plane,) = table.solids
+    assert isinstance(plane, HalfSpace)
+    point = frame.to_world(np.asarray(plane.point, np.float64))
+    normal = frame.rotation.T @ np.asarray(plane.normal, np.float64)
     warnings.warn(
-        f"the object stands on a plane through {np.round(point, 4).tolist()}, which goes on beyond the box: it is "
-        "taken for a table and left out. Give obstacles=Obstacles() to keep it",
+        f"the object stands on a plane through {np.round(point, 4).tolist()} with the normal "
+        f"{np.round(normal, 3).tolist()}: it is taken for a table and left out. Give obstacles=Obstacles() to keep it",
         stacklevel=_CALLER_OF_ADD,
     )
 
@@ -46,6 +53,33 @@ def warn_of_blank() -> None:
         "it again, from farther away or with another exposure",
         stacklevel=_CALLER_OF_ADD,
     )
+
+
+def warn_of_no_table(up: str, others: tuple[str, ...]) -> None:
+    """Warn that no table was found under the object. `others`: the axes, if one were up, under which there is one."""
+    if others:
+        axes = " or ".join(f'up="{axis}"' for axis in others)
+        problem = f'no table is found with up="{up}", but a plane would be one with {axes}: give that if it is upward'
+    else:
+        problem = f'no table is found under the box with up="{up}", so points of one may be taken for the object\'s'
+    warnings.warn(
+        f"{problem}. Give the table as obstacles=Obstacles((sdf.HalfSpace(point, normal),)) in world units, or "
+        "obstacles=Obstacles() if there is none",
+        stacklevel=_CALLER_OF_ADD,
+    )
+
+
+def warn_of_inside(box: Box, cameras: Float[np.ndarray, "n 3"], candidates: Float[np.ndarray, "m 3"]) -> None:
+    """Warn, of the first camera that stands in the box, if no candidate does. All in world units."""
+    low, high = np.array(box.low), np.array(box.high)
+    is_inside, any_inside = (np.all((x > low) & (x < high), axis=1) for x in (cameras, candidates))
+    if is_inside[-1] and is_inside.sum() == 1 and not any_inside.any():
+        warnings.warn(
+            f"the camera at {np.round(cameras[-1], 3).tolist()} stands inside the box, but all {len(candidates)} "
+            "candidates stand outside it. To look around inside, as in a room, give poses=..., (n, 4, 4), of places in "
+            "the box; to look at an object, give a box about the object alone",
+            stacklevel=_CALLER_OF_ADD,
+        )
 
 
 def warn_of_little(value: float, error: float | None, in_vain: float) -> None:

@@ -98,10 +98,22 @@ class AnyOf(StopRule):
             rule.check(acquisition)
 
     def after(self, context: StopContext) -> str | None:
-        return next(filter(None, (rule.after(context) for rule in self.rules)), None)
+        return next(filter(None, (checked_reason(rule, rule.after(context)) for rule in self.rules)), None)
 
     def before(self, context: StopContext, pose: Pose, value: float) -> str | None:
-        return next(filter(None, (rule.before(context, pose, value) for rule in self.rules)), None)
+        reasons = (checked_reason(rule, rule.before(context, pose, value)) for rule in self.rules)
+        return next(filter(None, reasons), None)
+
+
+def checked_reason(rule: StopRule, reason: str | None) -> str | None:
+    """What a rule says, as it is.
+
+    **Raises:** `ValueError` unless it is a reason in words, or None.
+    """
+    proper = reason is None or (isinstance(reason, str) and bool(reason))
+    name = type(rule).__name__
+    require(proper, f"the rule of stopping {name} says {shown(reason)}: it must say why, in words, or None to go on")
+    return reason
 
 
 class Sure(StopRule):

@@ -1,71 +1,144 @@
 """The plane that an object stands on."""
 
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import AXES, Frame
 from jaxnbv.geometry.volume import Box
+from jaxnbv.scanning import Obstacles
 from jaxnbv.scanning.sdf import HalfSpace
 
-# A table goes on beside the box, by so much of the box's longest side at least, and may lie so little below it. Of the
-# points beside the box most are on it, of those in the box none is below it, and so many of all are on it.
-_BESIDE, _BELOW = 0.2, 0.05
-_MOST, _NONE, _SOME = 0.5, 0.02, 50
-_LEVEL = np.cos(np.radians(15.0))
+# A table is level to 30 degrees. The normals of its points are noisy and agree with its own to 40.
+_LEVEL, _AGREES = np.cos(np.radians(30.0)), np.cos(np.radians(40.0))
+# Shares of the box's longest side: how far below the box a table may lie, and how far beside it is looked at.
+_BELOW, _BESIDE = 0.25, 0.2
+# The share of the points in the box that may lie below a table, and how many beside the box must lie on it.
+_STRAY, _FEWEST = 0.02, 50
+# How far from a plane its points lie, in scene units.
 _TOLERANCE = 0.03
 # Planes that are tried, and points that each is tried on.
-_DRAWS, _COUNTED = 500, 5000
-# The share of the points that a plane has at least.
-_FEWEST = 0.05
+_DRAWS, _COUNTED = 1000, 3000
 
 
-def plane_under(cloud: PointCloud, box: Box) -> HalfSpace | None:
-    """The plane that an object in a box stands on, and all below it; None where a cloud shows none. In scene
-    coordinates, with y up.
+class _Points(NamedTuple):
+    """Points of an image from the middle of a box, with their normals. `inside`: in the box; `around`: in, under, over
+    or close beside it. The weight falls with the horizontal distance."""
 
-    It is the plane of most points in the box and beside it, and level to 15 degrees. It goes on beside the box, which
-    the top of a table that *is* the object does not, and no more than 2 % of the points in the box are below it.
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    inside: Bool[np.ndarray, " n"]
+    around: Bool[np.ndarray, " n"]
+    weights: Float[np.ndarray, " n"]
+
+    def at(self, rows: np.ndarray) -> "_Points":
+        return _Points(*(values[rows] for values in self))
+
+
+def table_under(cloud: PointCloud, box: Box) -> Obstacles | None:
+    """The plane that an object in a box stands on, and all below it; None where an image shows none. In scene
+    coordinates, with y up. Its margin is three standard deviations of its points, or the default if that is larger.
+
+    Planes are drawn by RANSAC (Fischler and Bolles 1981). The one of most points outside the box is taken, where near
+    points count for more, among those that can be a table:
+
+    - level to 30 degrees, so no wall;
+    - under the middle of the box no higher than its top, and no deeper below it than a quarter of its longest side;
+    - with at most 2 % of the points in the box below it, so not the top of an object;
+    - under the box and close beside it with no more points below it than on it, so no edges of things in the air.
+
+    `cloud` is the whole image, not only what lies in the box.
     """
-    points, _ = cloud.to_numpy()
     low, high = np.array(box.low), np.array(box.high)
-    side = float((high - low).max())
-    beside, below = side * _BESIDE * np.array([1.0, 0.0, 1.0]), side * _BELOW * np.array([0.0, 1.0, 0.0])
-    near = points[((points > low - beside - below) & (points < high + beside)).all(axis=1)].astype(np.float64)
-    inside = ((near > low - below) & (near < high)).all(axis=1)
-    if min(inside.sum(), (~inside).sum()) < _SOME:
-        return None
-    plane = _plane_of_most(near)
+    side, middle = float((high - low).max()), 0.5 * (low + high)
+    image = _points_about(cloud, low, high, side)
+    plane = _plane_of_most(image, low[1] - middle[1] - _BELOW * side, high[1] - middle[1])
     if plane is None:
         return None
-    point, normal = plane
-    normal = np.sign(normal[1]) * normal
-    height = (near - point) @ normal
-    on = np.abs(height) <= _TOLERANCE
-    found = (
-        normal[1] >= _LEVEL
-        and on[~inside].sum() >= _SOME
-        and on[~inside].mean() >= _MOST
-        and (height[inside] < -_TOLERANCE).mean() <= _NONE
-    )
-    return HalfSpace(point, normal) if found else None
+    normal, offset = plane
+    height = np.abs(image.points @ normal - offset)
+    own = image.around & (height <= 4.0 * _TOLERANCE) & (image.normals @ normal >= _AGREES)
+    # The deviation of normal noise, from the median of its sizes.
+    deviation = 1.4826 * float(np.median(height[own]))
+    table = Obstacles((HalfSpace(middle + offset * normal, normal),), max(Obstacles().margin, 3.0 * deviation))
+    return table if deviation <= _TOLERANCE else None
 
 
-def _plane_of_most(
-    points: Float[np.ndarray, "n 3"],
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None:
-    """A point and the normal of it, by RANSAC (Fischler and Bolles 1981): of planes through three points drawn at
-    random the one that most points are near, then the best fit to these. None where all lie on a line, or fewer than a
-    twentieth are near."""
+def other_ups(cloud: PointCloud, box: Box, up: str) -> tuple[str, ...]:
+    """The other axes by which there is a table under a box, if one of them were upward. Cloud and box are in world
+    units."""
+    frames = [Frame.fit(np.array([box.low, box.high]), up=axis) for axis in AXES if axis != up]
+    found = [table_under(frame.to_scene(cloud), frame.to_scene(box)) for frame in frames]
+    return tuple(frame.up for frame, table in zip(frames, found, strict=True) if table is not None)
+
+
+def _points_about(cloud: PointCloud, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], side: float) -> _Points:
+    """The points of an image, from the middle of a box."""
+    points, normals = (rows.astype(np.float64) for rows in cloud.to_numpy())
+    inside = np.all((points > low) & (points < high), axis=1)
+    room = np.array([_BESIDE * side, np.inf, _BESIDE * side])
+    around = np.all((points > low - room) & (points < high + room), axis=1)
+    points = points - 0.5 * (low + high)
+    weights = 1.0 / (1.0 + (points[:, 0] ** 2 + points[:, 2] ** 2) / side**2)
+    return _Points(points, normals, inside, around, weights)
+
+
+def _plane_of_most(image: _Points, lowest: float, highest: float) -> tuple[Float[np.ndarray, "3"], float] | None:
+    """The normal n and offset d of the plane n . x = d that most points are on, of those that can be a table and have
+    such heights at the middle."""
     draw = np.random.default_rng(0)
-    a, b, c = np.moveaxis(points[draw.integers(0, len(points), (_DRAWS, 3))], 1, 0)
-    normals = np.cross(b - a, c - a)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
-    few = draw.choice(points, min(len(points), _COUNTED), replace=False)
-    near = np.abs(few @ normals.T - np.sum(a * normals, axis=1)) <= _TOLERANCE
-    # Three points on a line have no normal.
-    best = np.argmax(np.where(normals.any(axis=1), near.sum(axis=0), -1))
-    on = points[np.abs((points - a[best]) @ normals[best]) <= _TOLERANCE]
-    if not normals[best].any() or len(on) < max(3, _FEWEST * len(points)):
+    # What a table within these heights can reach to, seen from above.
+    reach = np.hypot(image.points[:, 0], image.points[:, 2]) * np.sqrt(1.0 / _LEVEL**2 - 1.0)
+    up = image.points[:, 1]
+    rows = np.flatnonzero(~image.inside & (image.normals[:, 1] > 0.5) & (up > lowest - reach) & (up < highest + reach))
+    if len(rows) < _FEWEST:
         return None
-    middle = on.mean(axis=0)
-    return middle, np.linalg.eigh((on - middle).T @ (on - middle))[1][:, 0]
+    # As many points as are counted, drawn by weight, stand for all.
+    share = image.weights / image.weights.sum()
+    few = image.at(draw.choice(len(share), min(len(share), _COUNTED), replace=False, p=share))
+    drawn = draw.choice(rows, (_DRAWS, 3), p=share[rows] / share[rows].sum())
+    a, b, c = np.moveaxis(image.points[drawn], 1, 0)
+    normals = np.cross(b - a, c - a)
+    normals *= np.sign(normals[:, 1:2]) / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    offsets = np.sum(normals * a, axis=1)
+    can = (normals[:, 1] >= _LEVEL) & (offsets >= lowest * normals[:, 1]) & (offsets <= highest * normals[:, 1])
+    normals, offsets = normals[can], offsets[can]
+    if not can.any():
+        return None
+    on, below = _on_and_below(few, normals, offsets)
+    count = np.where(_is_table(few, on, below), (on & ~few.inside[:, None]).sum(axis=0), 0)
+    best = int(np.argmax(count))
+    normal, offset = normals[best], float(offsets[best])
+    for _ in range(3):
+        on, below = _on_and_below(image, normal[None], np.array([offset]))
+        if not _is_table(image, on, below)[0] or on[~image.inside].sum() < _FEWEST:
+            return None
+        normal, offset = _fitted(image.at(on[:, 0]))
+    can = normal[1] >= _LEVEL and lowest <= offset / normal[1] <= highest
+    return (normal, offset) if can else None
+
+
+def _on_and_below(
+    image: _Points, normals: Float[np.ndarray, "k 3"], offsets: Float[np.ndarray, " k"]
+) -> tuple[Bool[np.ndarray, "n k"], Bool[np.ndarray, "n k"]]:
+    """Which points lie on each of some planes, and which below it."""
+    height = image.points @ normals.T - offsets
+    return (np.abs(height) <= _TOLERANCE) & (image.normals @ normals.T >= _AGREES), height < -_TOLERANCE
+
+
+def _is_table(image: _Points, on: Bool[np.ndarray, "n k"], below: Bool[np.ndarray, "n k"]) -> Bool[np.ndarray, " k"]:
+    """Whether an object can stand on each of some planes, by the points in the box and close beside it."""
+    free = below[image.inside].sum(axis=0) <= _STRAY * image.inside.sum()
+    return free & (on[image.around].sum(axis=0) >= below[image.around].sum(axis=0))
+
+
+def _fitted(points: _Points) -> tuple[Float[np.ndarray, "3"], float]:
+    """The plane y = h + a x + b z that fits points best, by weighted least squares, as its normal and offset."""
+    root = np.sqrt(points.weights)
+    columns = np.stack([np.ones(len(root)), points.points[:, 0], points.points[:, 2]], axis=1)
+    height, across, along = np.linalg.lstsq(root[:, None] * columns, root * points.points[:, 1])[0]
+    normal = np.array([-across, 1.0, -along])
+    length = float(np.linalg.norm(normal))
+    return normal / length, height / length

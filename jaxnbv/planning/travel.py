@@ -2,16 +2,16 @@
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import as_numbers, check_fields, checked, require, shown
+from jaxnbv.checks import check_fields, checked, require, returned
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.rotations import safe_norm
@@ -21,6 +21,9 @@ from jaxnbv.utility import Quantity
 CostFunction: TypeAlias = Callable[[Pose, Pose], Float[Array, ""]]
 """What it costs to go from one pose to another, in units of the user's: not negative, made of JAX operations. A
 session's poses are in the world, a simulation's in the scene."""
+
+
+_COST, _ONE_NUMBER = "the cost of going from one pose to another", "make it one number a pose, finite and zero or more"
 
 
 class ArcLength(eqx.Module):
@@ -84,10 +87,8 @@ class ValuePerCost(eqx.Module):
         self, values: Float[Array, "*samples poses"], observations: Observations, poses: Pose
     ) -> Float[Array, "*samples poses"]:
         """The values of poses, given the cost of going there from the last pose that was taken, if there is one."""
-        cost = jax.vmap(lambda pose: self.of(observations.poses.last, pose))(poses)
-        real = isinstance(cost, Array) and not jnp.iscomplexobj(cost) and cost.shape == (len(poses.position),)
-        require(real, f"the cost of going from one pose to another is {shown(cost)}: make it one number a pose")
-        # A view is not chosen because its cost is wrong: the planner refuses what is not a number.
+        cost = jax.vmap(lambda pose: returned(self.of(observations.poses.last, pose), _COST, 0, _ONE_NUMBER))(poses)
+        # A view is not chosen because its cost is wrong: the planner refuses it, see `total_cost`.
         cost = jnp.where((cost >= 0) & (cost < jnp.inf), cost, jnp.nan)
         return values / (self.fixed + jnp.where(observations.num_views > 0, cost, 0.0))
 
@@ -109,10 +110,9 @@ def total_cost(poses: Sequence[Pose], cost: CostFunction = arc_length) -> float:
 
     **Raises:** `ValueError` for a cost that is not one finite number, zero or more.
     """
-    name, way = "the cost of going from one pose to another", 0.0
+    way = 0.0
     for start, end in itertools.pairwise(poses):
-        found = as_numbers(cost(start, end), name, np.float64)
-        proper = found.shape == () and bool(0 <= found < np.inf)
-        require(proper, f"{name} is {shown(found)}: make it one finite number, zero or more")
-        way += float(found)
+        found = float(returned(cost(start, end), _COST, 0, _ONE_NUMBER))
+        require(0 <= found < math.inf, f"{_COST} is {found}: make it one finite number, zero or more")
+        way += found
     return way

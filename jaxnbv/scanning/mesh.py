@@ -59,7 +59,11 @@ class TriangleMesh(Surface):
     _tree: _Tree = eqx.field(static=True)
     in_jit: ClassVar[bool] = False
 
-    def __init__(self, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], frame: Frame):
+    def __init__(self, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], frame: Frame | None = None):
+        if frame is None:
+            raise InputError(
+                "a TriangleMesh needs the frame of its vertices: use TriangleMesh.from_arrays(vertices, faces)"
+            )
         self.vertices = np.asarray(vertices, dtype=np.float64)
         self.faces = np.asarray(faces, dtype=np.int64)
         self.frame = frame

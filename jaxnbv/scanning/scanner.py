@@ -2,6 +2,7 @@
 noise; and how a hit moves with the ray and the surface."""
 
 import math
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, TypeAlias
@@ -12,11 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from jaxnbv.checks import AnyArray, check_fields, checked, require, takes_native
+from jaxnbv.checks import AnyArray, check_fields, checked, is_traced, require, takes_native
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
+
+# Forty times the longest side of an object.
+_FAR_OFF = 100.0
 
 
 class Hits(eqx.Module):
@@ -175,6 +179,17 @@ Noise: TypeAlias = SensorNoise | DepthNoise
 """What a sensor makes of a scan without noise: a function of the scan, a key, the camera and the pose."""
 
 
+def far_from_scene(pose: Pose) -> str | None:
+    """What is wrong with known poses that stand too far from the scene to be meant; None if nothing is."""
+    away = float(np.linalg.norm(np.asarray(pose.position), axis=-1).max(initial=0.0))
+    if away <= _FAR_OFF:
+        return None
+    return (
+        f"a camera stands {away:.4g} scene units from the middle of the scene, where an object's longest side is 2.5. "
+        "Is its pose in millimetres or metres? Bring it to the scene with Frame.to_scene(pose), or use a Session"
+    )
+
+
 @checked
 def scan(
     surface: Surface, camera: Camera, pose: Pose, barrier: Float[Array, "*batch rays"] | None = None
@@ -186,10 +201,14 @@ def scan(
 
     Poses with leading axes give clouds with the same leading axes. Points are in scene coordinates; normals are unit
     and turned to the sensor. No noise: apply a `SensorNoise` to the result. Runs under `jit` where `surface.in_jit`.
+    Warns if a camera so far off that its pose must be in other units sees nothing.
     """
     origins, directions = camera.rays(pose)
     hits = surface.trace(origins.reshape(-1, 3), directions.reshape(-1, 3))
-    return _returns(hits, origins, directions, camera, pose, barrier)
+    found = _returns(hits, origins, directions, camera, pose, barrier)
+    if not is_traced(pose, found) and (problem := far_from_scene(pose)) and not bool(found.mask.any()):
+        warnings.warn(f"the scan sees nothing: {problem}", stacklevel=3)
+    return found
 
 
 @eqx.filter_jit

@@ -12,7 +12,7 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.acquisition import Acquisition, check_differentiable
+from jaxnbv.acquisition import Acquisition, check_traceable
 from jaxnbv.checks import check_fields, checked, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
@@ -110,7 +110,7 @@ class GradientSearch(Search):
     def check(self, acquisition: Acquisition, camera: Camera, capacity: int) -> None:
         """Raise `ValueError` if the acquisition has no gradient, or the space makes no sense for the camera."""
         self.space.check_camera(camera)
-        check_differentiable(acquisition, capacity, camera)
+        check_traceable(acquisition, capacity, camera, differentiable=True)
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """The best pose on the ways from the best candidates, or the best candidate if none is better; the key turns

@@ -6,20 +6,21 @@ network of `jaxnbv.networks`, one of your own, or a `HostClassifier`. A `Classif
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.acquisition import Acquisition, ImaginedView, context_of, inputs_of, zero_if_empty
-from jaxnbv.checks import check_fields, require
+from jaxnbv.acquisition import Acquisition, ImaginedView, context_of, zero_if_empty
+from jaxnbv.checks import check_fields, require, returned
 from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import Surface
 from jaxnbv.utility import Answer, Quantity, default_batch_size, plain_function
 
+_LOG_P = "give log-probabilities, one for each of two classes or more"
 # Their shape is checked by `Acquisition.check`.
 Context: TypeAlias = tuple[PointCloud, Array]
 
@@ -89,13 +90,17 @@ class ClassAcquisition(Acquisition):
     - `num_points`: D is thinned to so many by farthest point sampling, once a step, before scans are added to it.
     """
 
+    cloud_only: ClassVar[bool] = True
     classifier: AnyClassifier = eqx.field(converter=as_classifier)
     num_points: int = eqx.field(static=True, default=1024)
 
     def context(self, step: StepInputs) -> Context:
         """D, thinned, and log p^(t)."""
         thinned = limit_capacity(step.observations.cloud, self.num_points)
-        return thinned, self.classifier(thinned)
+        return thinned, self._log_p(thinned)
+
+    def _log_p(self, cloud: PointCloud) -> Any:
+        return returned(self.classifier(cloud), "the classifier's answer", 1, _LOG_P)
 
     @abstractmethod
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, "*values"]:
@@ -104,11 +109,7 @@ class ClassAcquisition(Acquisition):
     def score(self, context: Context, view: ImaginedView) -> Float[Array, "*values"]:
         """`compare`; zero for a scan that sees nothing."""
         cloud, log_p = context
-        return zero_if_empty(view.scan, self.compare(log_p, self.classifier(concatenate(cloud, view.scan))))
-
-    def inputs(self, step: StepInputs) -> StepInputs:
-        """D alone."""
-        return inputs_of(step.observations.cloud)
+        return zero_if_empty(view.scan, self.compare(log_p, self._log_p(concatenate(cloud, view.scan))))
 
     @property
     def batch_size(self) -> int:
@@ -133,11 +134,7 @@ class ClassAcquisition(Acquisition):
         """**Raises:** `ValueError` if the classifier's answer on D is not a vector of log-probabilities, one for each
         of the classes that it names."""
         log_p = context_of(self, cloud)[1]
-        require(
-            jnp.ndim(log_p) == 1 and jnp.size(log_p) >= 2,
-            f"the classifier's answer has shape {jnp.shape(log_p)}: give log-probabilities, one for each of two "
-            "classes or more",
-        )
+        require(len(log_p) >= 2, f"the classifier's answer has shape {jnp.shape(log_p)}: {_LOG_P}")
         total = float(jnp.sum(jnp.exp(log_p)))
         require(
             abs(total - 1.0) < 1e-3,

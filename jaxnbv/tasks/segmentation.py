@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxnbv.checks import check_fields, require, shown
+from jaxnbv.checks import check_fields, functions_of_users, require, returned
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.scanning import Surface
 from jaxnbv.utility import Answer, Quantity, Utility, default_batch_size, plain_function
@@ -90,15 +90,12 @@ class SoftPartCount(Utility):
 
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
         """u_S, between zero and the number of parts."""
-        return jnp.sum(jnp.tanh(jnp.sum(self.segmenter(cloud), axis=0) / self.target))
+        return jnp.sum(jnp.tanh(jnp.sum(_probabilities(self.segmenter, cloud), axis=0) / self.target))
 
     def check(self, cloud: PointCloud) -> None:
         """**Raises:** `ValueError` if what the segmenter gives of the cloud are not probabilities, a row a point."""
-        p = _probabilities(self.segmenter, cloud)
-        require(
-            isinstance(p, Array) and p.ndim == 2,
-            f"the segmenter gives {shown(p)}; it should give probabilities (points, parts)",
-        )
+        with functions_of_users():
+            p = _probabilities(self.segmenter, cloud)
         total = jnp.sum(p, axis=1)
         # Rows of points that are not there hold zeros.
         proper = jnp.all(p >= -_SLACK) & jnp.all((jnp.abs(total - 1.0) < _SLACK) | (jnp.abs(total) < _SLACK))
@@ -148,13 +145,13 @@ class PartAnswer(Answer):
 
 
 @eqx.filter_jit
-def _probabilities(segmenter: Segmenter, cloud: PointCloud):
-    return segmenter(cloud)
+def _probabilities(segmenter: Segmenter, cloud: PointCloud) -> Any:
+    return returned(segmenter(cloud), "the segmenter's answer", 2, "give probabilities (points, parts)")
 
 
 @eqx.filter_jit
 def _counts(segmenter: Segmenter, cloud: PointCloud) -> Int[Array, " parts"]:
-    return part_counts(segmenter(cloud))
+    return part_counts(_probabilities(segmenter, cloud))
 
 
 def part_counts(p: Float[Array, "points parts"]) -> Int[Array, " parts"]:

@@ -429,6 +429,52 @@ def test_the_table_is_found_told_of_and_kept_clear_of():
     assert session.next().matrix[2, 3] > 0.1
 
 
+def test_a_room_scanned_from_inside_needs_poses_inside():
+    """It says so at the first image from inside, and no more."""
+    half, place = np.array([2.0, 1.5, 1.2]), np.array([0.3, -0.2, 0.1])
+    images = []
+    for target in ((2.0, 0.5, 0.0), (-2.0, 0.5, 0.0)):
+        pose = look_at(place, target, up=(0.0, 0.0, 1.0))
+        directions = np.asarray(CAMERA.pixel_directions(), np.float64) @ np.asarray(pose.rotation, np.float64).T
+        depth = np.min((np.sign(directions) * half - place) / directions, axis=1).reshape(48, 64)
+        images.append((depth, np.asarray(pose.matrix, np.float64)))
+    room = (tuple(-half - 0.05), tuple(half + 0.05))
+    session = session_of(box=room, poses=None)
+    with pytest.warns(UserWarning, match=r"stands inside the box, but all \d+ candidates stand outside .*poses="):
+        session.add(*images[0])
+    inside = session_of(box=room, poses=np.stack([matrix for _, matrix in images]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        session.add(*images[1])
+        inside.add(*images[0])
+    assert np.asarray(Box(*room)(inside.next().matrix[:3, 3])) < 0
+
+
+@pytest.mark.parametrize("up", ["y", "-y", "x", "-x", "-z"])
+def test_a_wrong_up_is_told_by_the_table(up):
+    """Once, with the axis that is right."""
+    session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), obstacles=None, up=up)
+    with pytest.warns(UserWarning, match="no table is found") as told:
+        session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    message = f'no table is found with up="{up}", but a plane would be one with up="z": give that'
+    assert [message in str(one.message) for one in told].count(True) == 1
+
+
+def test_no_table_is_told_and_obstacles_say_that_there_is_none():
+    image = np.where(
+        shot(FIRST) * 1e-3 * np.linalg.norm(CAMERA.pixel_directions(), axis=1).reshape(48, 64) < 0.6, shot(FIRST), 0
+    )
+    session = session_of(obstacles=None)
+    with pytest.warns(
+        UserWarning, match=r'no table is found under the box with up="z".*Obstacles\(\) if there is none'
+    ):
+        session.add(image, FIRST, depth_scale=1e-3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        session.add(image, FIRST, depth_scale=1e-3)
+        session_of(obstacles=Obstacles()).add(image, FIRST, depth_scale=1e-3)
+
+
 def test_a_table_is_kept_where_that_is_asked_for():
     session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), poses=BELOW, obstacles=Obstacles())
     with pytest.warns(UserWarning, match="go on beyond the box") as told:

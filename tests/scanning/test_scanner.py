@@ -2,6 +2,7 @@
 stands so that an object fits."""
 
 import math
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +32,18 @@ def test_batched_poses_equal_single_ones(name):
         assert bool((alone.mask == batch.mask[i]).all())
         np.testing.assert_allclose(alone.points, batch.points[i], atol=1e-5)
         np.testing.assert_allclose(alone.normals, batch.normals[i], atol=1e-4)
+
+
+def test_a_camera_in_other_units_is_told():
+    """Where it sees nothing; a large world of its own is scanned as before."""
+    camera = nbv.Camera(height=4, width=4)
+    far = nbv.look_at([[0.0, 0.0, 2500.0], [0.0, 0.0, 2.5]])
+    with pytest.warns(UserWarning, match="sees nothing: a camera stands 2500 scene units .* Frame.to_scene"):
+        nbv.scan(nbv.SDFSurface(Sphere(0.6)), camera, far[0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        nbv.scan(nbv.SDFSurface(Sphere(0.6)), camera, far)
+        assert nbv.scan(nbv.SDFSurface(Sphere(600.0), 700.0), camera, far[0]).mask.any()
 
 
 def test_rows_are_pixels_row_by_row_and_misses_are_masked():

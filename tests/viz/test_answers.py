@@ -79,21 +79,15 @@ def test_a_search_that_does_not_ask_the_score_says_so():
 @pytest.mark.parametrize(
     ("utility", "message"),
     [
-        (lambda cloud: cloud.points[:, 1], r"shape \(5,\): a utility is one number"),
-        (lambda cloud: jnp.log(-1.0 - jnp.sum(cloud.mask)), "first cloud is nan: it must be finite"),
+        (lambda cloud: cloud.points[:, 1], r"shape \(5,\) and type float32: a utility is one number"),
+        (lambda cloud: jnp.log(-1.0 - jnp.sum(cloud.mask)), "a cloud of 3 points is nan: it must be finite"),
         (lambda cloud: 1.0 / jnp.sum(~cloud.mask[:3]), "must be finite"),
     ],
 )
 def test_an_impossible_utility_is_named_at_the_first_scan(utility, message):
-    acquisition = nbv.ExpectedUtilityImprovement(utility)
-    planner = nbv.Planner(
-        acquisition,
-        nbv.DiscreteSearch(4),
-        sampler=nbv.SurfaceSampler(nbv.GeometricSPSR(0.05, truncation=8)),
-        capacity=5,
-    )
+    sampler = nbv.SurfaceSampler(nbv.GeometricSPSR(0.05, truncation=8))
     with pytest.raises(nbv.InputError, match=message):
-        planner.init(None, CLOUD)
+        nbv.Planner(utility, nbv.DiscreteSearch(4), sampler=sampler, capacity=5).init(None, CLOUD)
 
 
 def test_under_jit_nothing_is_asked():

@@ -118,7 +118,7 @@ def test_others_are_shown_large(episode):
 
 def test_a_session_tells_its_images_and_the_next_view():
     camera = nbv.Camera(height=12, width=12)
-    session = nbv.Session(camera, ((-1.2,) * 3, (1.2,) * 3), small_planner(nbv.DiscreteSearch(8)))
+    session = nbv.Session(camera, ((-1.2,) * 3, (1.2,) * 3), small_planner(nbv.DiscreteSearch(8)), up="y")
     assert html_of(session) == "<div>no image yet</div>"
     pose = nbv.look_at((0.0, 0.0, 2.5))
     scan = nbv.scan(nbv.SDFSurface(Sphere(1.0)), camera, pose)
