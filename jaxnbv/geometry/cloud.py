@@ -133,7 +133,7 @@ class PointCloud(eqx.Module):
         A pixel of +infinity met nothing within the sensor's reach, which is taken to be the whole scene; one that is
         zero, negative or NaN is invalid and says nothing. Out of the camera's range a pixel is invalid where it is too
         near, and met nothing so far where it is too far. Points and normals are those of planes fitted to what lies
-        around a pixel on the same surface, in a window that grows with the image's noise (`geometry/plane_fit.py`);
+        around a pixel on the same surface, in a window that grows with the noise there (`geometry/plane_fit.py`);
         normals are turned to the camera. A pixel whose neighbours have no plane is invalid.
 
         - `depth`: along the camera's forward axis; `depth_scale` times it is in units of the pose: 0.001 where the

@@ -10,35 +10,19 @@ held below 2.5 degrees where windows of at most 21 pixels can.
 """
 
 import math
-from statistics import NormalDist
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.depth_noise import depth_noise
 
 _LARGEST_RADIUS = 10
 _SLOPE_ERROR = math.radians(2.5)
 # A neighbour on the same surface is no steeper away than this (76 degrees), noise of the pair aside.
 _STEEPEST, _SPREAD = 4.0, 6.0
 _FEWEST = 4
-# Of third differences the share that edges leave alone, and the mean of that share of a standard normal's least sizes.
-_SHARE = 0.5
-_NORMAL = NormalDist()
-_MEAN_SIZE = 2.0 * (_NORMAL.pdf(0.0) - _NORMAL.pdf(_NORMAL.inv_cdf(0.5 + 0.5 * _SHARE))) / _SHARE
-
-
-def depth_noise(depth: Float[Array, "h w"], valid: Bool[Array, "h w"]) -> Float[Array, ""]:
-    """The standard deviation of a depth image's noise, rounding included, in its units: from the third differences
-    along its rows, which are little but noise where the surface is smooth, the larger half left out. Zero where there
-    are no four pixels in a row."""
-    size = jnp.abs(jnp.diff(depth, n=3)).reshape(-1)
-    known = (valid[:, :-3] & valid[:, 1:-2] & valid[:, 2:-1] & valid[:, 3:]).reshape(-1)
-    ordered = jnp.sort(jnp.where(known, size, jnp.inf))
-    count = jnp.ceil(_SHARE * jnp.sum(known))
-    used = jnp.arange(len(ordered)) < count
-    return jnp.sum(jnp.where(used, ordered, 0.0)) / jnp.maximum(count, 1.0) / (_MEAN_SIZE * math.sqrt(20.0))
 
 
 def fitted_planes(
@@ -51,9 +35,9 @@ def fitted_planes(
     - `depth`: positive and finite where it is `valid`. `camera`: of the whole image.
     - `least_noise`: a standard deviation that is known, that of rounding say.
     """
-    sigma = jnp.maximum(depth_noise(depth, valid), least_noise)
     focal = jnp.asarray(camera.focal_lengths, depth.dtype)
     strided = slice(stride // 2, None, stride)
+    sigma = depth_noise(depth, valid, least_noise)[strided, strided]
     place = camera.pixel_directions().reshape(*depth.shape, 3)[strided, strided, :2].astype(depth.dtype)
     middle, has_middle = jnp.where(valid, depth, 1.0)[strided, strided], valid[strided, strided]
     spacing = middle[..., None] / focal
@@ -89,10 +73,10 @@ def fitted_planes(
     return smooth, -towards / jnp.where(length > 0, length, 1.0), has_plane & (length[..., 0] > 0)
 
 
-def _radius(spacing: Float[Array, "k l"], sigma: Float[Array, ""]) -> Int[Array, "k l"]:
+def _radius(spacing: Float[Array, "k l"], sigma: Float[Array, "k l"]) -> Int[Array, "k l"]:
     """The least window, by its radius in pixels, whose slopes are sure enough."""
     radii = jnp.arange(1, _LARGEST_RADIUS + 1)
-    error = math.sqrt(3.0) * sigma / (spacing[..., None] * radii * (2 * radii + 1))
+    error = math.sqrt(3.0) * sigma[..., None] / (spacing[..., None] * radii * (2 * radii + 1))
     return jnp.minimum(1 + jnp.sum(error > _SLOPE_ERROR, axis=-1), _LARGEST_RADIUS)
 
 
