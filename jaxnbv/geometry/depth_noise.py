@@ -38,14 +38,18 @@ def depth_noise(depth: Float[Array, "h w"], valid: Bool[Array, "h w"], least: fl
         # Every second pixel: sensors smooth their images, so that neighbours err alike.
         a, b, c, d = (_every_second(depth, axis, index) for index in range(4))
         known = functools.reduce(operator.and_, (_every_second(valid, axis, index) for index in range(4)))
+        # Not what is mixed of a near and a far surface, beside an edge.
+        known &= functools.reduce(operator.and_, (jnp.abs(other - a) <= _DEPTH_STEP * a for other in (b, c, d)))
         size = jnp.abs(d - 3.0 * c + 3.0 * b - a) / jnp.where(known, a, 1.0)
         level = 1 + jnp.floor(jnp.log2(jnp.maximum(size / _LEAST_DIFFERENCE, 0.5))).astype(jnp.int32)
         place = (_every_second(index, axis, 0) for index in cell)
         counts = counts.at[*place, jnp.where(known, level, _LEVELS)].add(1.0, mode="drop")
     counts = counts + jnp.roll(counts, 1, axis=2) + jnp.roll(counts, -1, axis=2)
     near = jax.lax.reduce_window(counts, 0.0, jax.lax.add, (3, 3, 1, 1), (1, 1, 1, 1), "SAME")
-    few = jnp.sum(near, axis=-1, keepdims=True) < _ENOUGH
-    median = _median(jnp.where(few, jnp.sum(counts, axis=(0, 1), keepdims=True), near))
+    for axes in ((0, 1), (0, 1, 2)):
+        few = jnp.sum(near, axis=-1, keepdims=True) < _ENOUGH
+        near = jnp.where(few, jnp.sum(counts, axis=axes, keepdims=True), near)
+    median = _median(near)
     return jnp.maximum(depth * median[*cell] / _MEDIAN_SIZE, least)
 
 

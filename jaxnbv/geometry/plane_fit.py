@@ -23,6 +23,9 @@ _SLOPE_ERROR = math.radians(2.5)
 # A neighbour on the same surface is no steeper away than this (76 degrees), noise of the pair aside.
 _STEEPEST, _SPREAD = 4.0, 6.0
 _FEWEST = 4
+# The difference of two pixels of one surface, in standard deviations of one, is mostly less than this. A pixel of which
+# so many of the eight beside it measured something else is one that mixes a near and a far surface.
+_DIFFERENCE, _MOST_UNLIKE = 3.0 * math.sqrt(2.0), 5
 
 
 def fitted_planes(
@@ -51,17 +54,18 @@ def fitted_planes(
         down, right = index // width - width // 2, index % width - width // 2
         near = padded[(rows + down)[:, None], (columns + right)[None]]
         away = jnp.linalg.norm(spacing * jnp.stack([right, down]), axis=-1)
-        alike = jnp.abs(near - middle) <= _STEEPEST * away + _SPREAD * sigma
-        used = has_middle & (near > 0) & alike & (jnp.maximum(jnp.abs(down), jnp.abs(right)) <= radius)
+        beyond, distance = jnp.abs(near - middle) - _STEEPEST * away, jnp.maximum(jnp.abs(down), jnp.abs(right))
+        used = has_middle & (near > 0) & (beyond <= _SPREAD * sigma) & (distance <= radius)
+        unlike = (near > 0) & (beyond > _DIFFERENCE * sigma) & (distance == 1)
         row = jnp.stack(jnp.broadcast_arrays(1.0, right / radius, down / radius), axis=-1)
         row = jnp.where(used[..., None], row.astype(depth.dtype), 0.0)
         ratio = middle / jnp.where(used, near, 1.0)
-        return sums[0] + row[..., :, None] * row[..., None, :], sums[1] + ratio[..., None] * row
+        return sums[0] + row[..., :, None] * row[..., None, :], sums[1] + ratio[..., None] * row, sums[2] + unlike
 
-    zeros = jnp.zeros((*middle.shape, 3, 3), depth.dtype), jnp.zeros((*middle.shape, 3), depth.dtype)
-    normal, right_hand = jax.lax.fori_loop(0, width * width, add, zeros)
+    zeros = *(jnp.zeros(middle.shape + shape, depth.dtype) for shape in ((3, 3), (3,))), jnp.zeros(middle.shape, int)
+    normal, right_hand, num_unlike = jax.lax.fori_loop(0, width * width, add, zeros)
     # What lies along a line has no plane.
-    has_plane = (normal[..., 0, 0] >= _FEWEST) & (_breadth(normal) > 1e-3)
+    has_plane = (normal[..., 0, 0] >= _FEWEST) & (_breadth(normal) > 1e-3) & (num_unlike <= _MOST_UNLIKE)
     regular = jnp.where(has_plane[..., None, None], normal, jnp.eye(3, dtype=depth.dtype))
     plane = jnp.linalg.solve(regular, right_hand[..., None])[..., 0]
     has_plane = has_plane & (plane[..., 0] > 0)
