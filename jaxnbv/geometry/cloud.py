@@ -134,7 +134,8 @@ class PointCloud(eqx.Module):
         zero, negative or NaN is invalid and says nothing. Out of the camera's range a pixel is invalid where it is too
         near, and met nothing so far where it is too far. Points and normals are those of planes fitted to what lies
         around a pixel on the same surface, in a window that grows with the noise there (`geometry/plane_fit.py`);
-        normals are turned to the camera. A pixel whose neighbours have no plane is invalid.
+        normals are turned to the camera. A pixel whose neighbours have no plane is invalid, and so is one that
+        six of the eight beside it disagree with: at an edge sensors mix the depths of two surfaces.
 
         - `depth`: along the camera's forward axis; `depth_scale` times it is in units of the pose: 0.001 where the
           image is in millimetres and the pose in metres. The range of the camera, and the box, are in these units too.

@@ -23,8 +23,9 @@ def depth_noise(depth: Float[Array, "h w"], valid: Bool[Array, "h w"], least: fl
     """The standard deviation of each pixel's noise, rounding included, in units of the depth; at least `least`.
 
     From the median of third differences along rows and columns, which are little but noise where the surface is smooth:
-    those near the pixel and at its depth, or where these are few those of the whole image at its depth. Where most are
-    zero, the depth is in steps, whose size the others tell.
+    those near the pixel and at its depth. Where these are few, those of the whole image at its depth are taken, and
+    where these are few too, those at all depths. If half of them are zero and a quarter is not, the depth is in steps,
+    whose size that quarter tells.
     """
     tile = max(-(-max(depth.shape) // _TILES), _SMALLEST_TILE)
     tiles = tuple(-(-size // tile) for size in depth.shape)
@@ -60,10 +61,10 @@ def _every_second(image: Shaped[Array, "h w"], axis: int, index: int) -> Shaped[
 
 
 def _median(counts: Float[Array, "*n levels"]) -> Float[Array, "*n"]:
-    """The median of numbers that are counted by powers of two, of those above the first level where this holds most of
-    them: linear within a level; zero where there are none."""
-    total = jnp.sum(counts, axis=-1)
-    counts = counts.at[..., 0].multiply(2.0 * counts[..., 0] < total)
+    """The median of numbers that are counted by powers of two, linear within one; zero where there are none. Numbers at
+    the first level are left out where they are more than a half and less than three quarters."""
+    zeros = counts[..., 0] / jnp.maximum(jnp.sum(counts, axis=-1), 1.0)
+    counts = counts.at[..., 0].multiply((zeros < 0.5) | (zeros > 0.75))
     below = jnp.cumsum(counts, axis=-1)
     half = 0.5 * below[..., -1:]
     level = jnp.argmax(below >= half, axis=-1, keepdims=True)
