@@ -4,6 +4,7 @@ import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -16,6 +17,7 @@ from jaxnbv.scanning import Carving, Grid, Looks, Obstacles, barrier_of
 
 # A model takes a hundred or two of the empty points, and the time to choose them grows with how many there are.
 _POINTS_ALONG_AXIS = 20
+_ROWS_AT_ONCE = 64
 
 
 class EmptyPoints(NamedTuple):
@@ -76,8 +78,9 @@ class Observations(eqx.Module):
         return EmptyPoints(nodes, self.empty_nodes[::stride, ::stride, ::stride].reshape(-1))
 
     def add_points(self, scan: PointCloud) -> "Observations":
-        """The observations with a scan's points in D, which is thinned to its capacity by farthest point sampling."""
-        return dataclasses.replace(self, cloud=_joined(self.cloud, scan))
+        """The observations with a scan's points in D, which is thinned to its capacity by farthest point sampling and
+        loses stray points: those that lie alone where a view has looked through."""
+        return dataclasses.replace(self, cloud=_joined(self.cloud, scan, self.empty_nodes, self.grid))
 
     def add_view(
         self, pose: Pose, scan: PointCloud, camera: Camera, carving: Carving | None, obstacles: Obstacles | None
@@ -106,8 +109,28 @@ def as_observations(value: Observations | PointCloud) -> Observations:
 
 
 @eqx.filter_jit
-def _joined(cloud: PointCloud, scan: PointCloud) -> PointCloud:
-    return limit_capacity(concatenate(cloud, scan), cloud.capacity)
+def _joined(cloud: PointCloud, scan: PointCloud, empty: Bool[Array, "g g g"] | None, grid: Grid | None) -> PointCloud:
+    joined = limit_capacity(concatenate(cloud, scan), cloud.capacity)
+    return joined if empty is None or grid is None else joined.only(~_is_stray(joined, empty, grid))
+
+
+def _is_stray(cloud: PointCloud, empty: Bool[Array, "g g g"], grid: Grid) -> Bool[Array, " n"]:
+    """Which points lie in a cell that some view has seen to be empty, and alone.
+
+    A thin part that a view has missed does not lie alone, nor does a surface whose images' poses are a little off:
+    thinned, what is connected has a neighbour within twice the spacing.
+    """
+    rows = jnp.arange(cloud.capacity)
+
+    def nearest_other(row):
+        away = jnp.linalg.norm(cloud.points - cloud.points[row], axis=-1)
+        return jnp.min(jnp.where(cloud.mask & (rows != row), away, jnp.inf))
+
+    nearest = jax.lax.map(nearest_other, rows, batch_size=_ROWS_AT_ONCE)
+    usual = jnp.sort(jnp.where(cloud.mask, nearest, jnp.inf))[cloud.count // 2]
+    crossed = jax.lax.reduce_window(empty, True, jax.lax.bitwise_and, (2, 2, 2), (1, 1, 1), "VALID")
+    cell = tuple(grid.cell_of(cloud.points).T)
+    return cloud.mask & crossed.at[cell].get(mode="fill", fill_value=False) & (nearest > 2.0 * usual)
 
 
 @eqx.filter_jit

@@ -1,6 +1,7 @@
 """The surfaces that are possible given the observations: p(f | D), and samples of it on a grid."""
 
 import dataclasses
+import warnings
 
 import equinox as eqx
 import jax
@@ -25,7 +26,7 @@ from jaxnbv.geometry.volume import Box, Volume, bounding_box
 from jaxnbv.observations import Observations, as_observations
 from jaxnbv.scanning import Carving, Grid, GridSurface, TriangleMesh, carve
 from jaxnbv.scanning.grid import touched_cells
-from jaxnbv.scanning.mesh import level_triangles
+from jaxnbv.scanning.mesh import held_pieces, level_triangles
 from jaxnbv.surfaces import (
     GeometricSPSR,
     KnownShapes,
@@ -235,9 +236,8 @@ class SurfaceSampler(eqx.Module):
         """The surface where the posterior mean equals its level, by marching cubes on the grid, carved as the samples.
 
         The mesh is in scene coordinates (its frame is the identity), its faces wound outward. Where nothing was scanned
-        it is the model's guess. All of it is kept, pieces that hold no point of the cloud included: some continue the
-        object behind what was seen, others are not there, and the observations do not tell which. It is open where it
-        leaves the grid.
+        it is the model's guess. Pieces on which fewer than four points of the cloud lie are left out, and a warning
+        says how many. It is open where it leaves the grid.
 
         **Raises:** `ValueError` if the mean does not cross its level within the grid, and as `posterior` does.
         """
@@ -250,7 +250,15 @@ class SurfaceSampler(eqx.Module):
                 f"no surface lies within [-{half}, {half}]^3: give a finer Grid, or one whose half extent holds the "
                 "cloud"
             )
-        return TriangleMesh(found[0], found[1], Frame())
+        points, _ = self.adapt(observations).cloud.to_numpy()
+        vertices, faces, dropped = held_pieces(*found[:2], points, self.grid.spacing)
+        if dropped:
+            warnings.warn(
+                f"{dropped} piece{'s' * (dropped > 1)} of the mesh with hardly a point of the cloud on "
+                f"{'them' if dropped > 1 else 'it'} {'were' if dropped > 1 else 'was'} left out",
+                stacklevel=2,
+            )
+        return TriangleMesh(vertices, faces, Frame())
 
     def adapt(self, observations: Observations | PointCloud) -> Observations:
         """The observations as this sampler uses them: without empty nodes where it does not carve; a cloud alone with

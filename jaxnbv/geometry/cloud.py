@@ -134,10 +134,11 @@ class PointCloud(eqx.Module):
         A pixel of +infinity met nothing within the sensor's reach, which is taken to be the whole scene; one that is
         zero, negative or NaN is invalid and says nothing. Out of the camera's range a pixel is invalid where it is too
         near, and met nothing so far where it is too far. Points and normals are those of planes fitted to what lies
-        around a pixel on the same surface, in a window that grows with the image's noise (`geometry/plane_fit.py`);
-        normals are turned to the camera. A pixel whose neighbours have no plane is invalid. Of an image with gaps
-        between its pixels, a lidar's say, each block of the gap's size gives a sample, and planes are evaluated on the
-        rays of the rows. Distortion is undone first (`Camera.from_intrinsics`). A value beyond the range, or beyond
+        around a pixel on the same surface, in a window that grows with the noise there (`geometry/plane_fit.py`);
+        normals are turned to the camera. A pixel whose neighbours have no plane is invalid, and so is one that
+        six of the eight beside it disagree with: at an edge sensors mix the depths of two surfaces. Of an image with
+        gaps between its pixels, a lidar's say, each block of the gap's size gives a sample, and planes are evaluated on
+        the rays of the rows. Distortion is undone first (`Camera.from_intrinsics`). A value beyond the range, or beyond
         what lies about the box, that fills far more pixels than any other near it stands for "not measured" and is
         invalid, with a `UserWarning`; so is the largest value of an integer type.
 

@@ -10,13 +10,13 @@ held below 2.5 degrees where windows of at most 21 pixels can.
 """
 
 import math
-from statistics import NormalDist
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.depth_noise import depth_noise
 from jaxnbv.geometry.gaps import block_samples
 
 _LARGEST_RADIUS = 10
@@ -24,22 +24,9 @@ _SLOPE_ERROR = math.radians(2.5)
 # A neighbour on the same surface is no steeper away than this (76 degrees), noise of the pair aside.
 _STEEPEST, _SPREAD = 4.0, 6.0
 _FEWEST = 4
-# Of third differences the share that edges leave alone, and the mean of that share of a standard normal's least sizes.
-_SHARE = 0.5
-_NORMAL = NormalDist()
-_MEAN_SIZE = 2.0 * (_NORMAL.pdf(0.0) - _NORMAL.pdf(_NORMAL.inv_cdf(0.5 + 0.5 * _SHARE))) / _SHARE
-
-
-def depth_noise(depth: Float[Array, "h w"], valid: Bool[Array, "h w"]) -> Float[Array, ""]:
-    """The standard deviation of a depth image's noise, rounding included, in its units: from the third differences
-    along its rows, which are little but noise where the surface is smooth, the larger half left out. Zero where there
-    are no four pixels in a row."""
-    size = jnp.abs(jnp.diff(depth, n=3)).reshape(-1)
-    known = (valid[:, :-3] & valid[:, 1:-2] & valid[:, 2:-1] & valid[:, 3:]).reshape(-1)
-    ordered = jnp.sort(jnp.where(known, size, jnp.inf))
-    count = jnp.ceil(_SHARE * jnp.sum(known))
-    used = jnp.arange(len(ordered)) < count
-    return jnp.sum(jnp.where(used, ordered, 0.0)) / jnp.maximum(count, 1.0) / (_MEAN_SIZE * math.sqrt(20.0))
+# The difference of two pixels of one surface, in standard deviations of one, is mostly less than this. A pixel of which
+# so many of the eight beside it measured something else is one that mixes a near and a far surface.
+_DIFFERENCE, _MOST_UNLIKE = 3.0 * math.sqrt(2.0), 5
 
 
 def fitted_planes(
@@ -53,13 +40,13 @@ def fitted_planes(
     - `least_noise`: a standard deviation that is known, that of rounding say.
     - `gap`: the side of the blocks of pixels of which one is fitted to, see `gaps`; windows are of so many blocks.
     """
-    sigma = jnp.maximum(depth_noise(depth, valid), least_noise)
     focal = jnp.asarray(camera.focal_lengths, depth.dtype)
     strided = slice(stride // 2, None, stride)
     place = camera.pixel_directions().reshape(*depth.shape, 3)[strided, strided, :2].astype(depth.dtype)
     pixels = [jnp.arange(stride // 2, size, stride) for size in depth.shape]
     rows, columns = (_LARGEST_RADIUS + pixel // gap for pixel in pixels)
     samples, is_sample, offset = block_samples(depth, valid, gap)
+    sigma = depth_noise(samples, is_sample, least_noise)[(pixels[0] // gap)[:, None], pixels[1] // gap]
     padded = jnp.pad(jnp.where(is_sample, samples, 0.0), _LARGEST_RADIUS)
     # How far each sample lies from the pixel of a row, in pixels: the column, then the row.
     offset = jnp.pad(offset, ((_LARGEST_RADIUS, _LARGEST_RADIUS), (_LARGEST_RADIUS, _LARGEST_RADIUS), (0, 0)))
@@ -79,17 +66,18 @@ def fitted_planes(
         place = gap * jnp.stack([right, down]) - inside
         place = place + offset[(rows + down)[:, None], (columns + right)[None]]
         away = jnp.linalg.norm(spacing * (place - own), axis=-1)
-        alike = jnp.abs(near - middle) <= _STEEPEST * away + _SPREAD * sigma
-        used = has_middle & (near > 0) & alike & (jnp.maximum(jnp.abs(down), jnp.abs(right)) <= radius)
+        beyond, distance = jnp.abs(near - middle) - _STEEPEST * away, jnp.maximum(jnp.abs(down), jnp.abs(right))
+        used = has_middle & (near > 0) & (beyond <= _SPREAD * sigma) & (distance <= radius)
+        unlike = (near > 0) & (beyond > _DIFFERENCE * sigma) & (distance == 1)
         row = jnp.stack(jnp.broadcast_arrays(1.0, *jnp.moveaxis(place / window, -1, 0)), axis=-1)
         row = jnp.where(used[..., None], row.astype(depth.dtype), 0.0)
         ratio = middle / jnp.where(used, near, 1.0)
-        return sums[0] + row[..., :, None] * row[..., None, :], sums[1] + ratio[..., None] * row
+        return sums[0] + row[..., :, None] * row[..., None, :], sums[1] + ratio[..., None] * row, sums[2] + unlike
 
-    zeros = jnp.zeros((*middle.shape, 3, 3), depth.dtype), jnp.zeros((*middle.shape, 3), depth.dtype)
-    normal, right_hand = jax.lax.fori_loop(0, width * width, add, zeros)
+    zeros = *(jnp.zeros(middle.shape + shape, depth.dtype) for shape in ((3, 3), (3,))), jnp.zeros(middle.shape, int)
+    normal, right_hand, num_unlike = jax.lax.fori_loop(0, width * width, add, zeros)
     # What lies along a line has no plane.
-    has_plane = (normal[..., 0, 0] >= _FEWEST) & (_breadth(normal) > 1e-3)
+    has_plane = (normal[..., 0, 0] >= _FEWEST) & (_breadth(normal) > 1e-3) & (num_unlike <= _MOST_UNLIKE)
     regular = jnp.where(has_plane[..., None, None], normal, jnp.eye(3, dtype=depth.dtype))
     plane = jnp.linalg.solve(regular, right_hand[..., None])[..., 0]
     has_plane = has_plane & (plane[..., 0] > 0)
@@ -102,10 +90,10 @@ def fitted_planes(
     return smooth, -towards / jnp.where(length > 0, length, 1.0), has_plane & (length[..., 0] > 0)
 
 
-def _radius(spacing: Float[Array, "k l"], sigma: Float[Array, ""]) -> Int[Array, "k l"]:
+def _radius(spacing: Float[Array, "k l"], sigma: Float[Array, "k l"]) -> Int[Array, "k l"]:
     """The least window, by its radius in pixels, whose slopes are sure enough."""
     radii = jnp.arange(1, _LARGEST_RADIUS + 1)
-    error = math.sqrt(3.0) * sigma / (spacing[..., None] * radii * (2 * radii + 1))
+    error = math.sqrt(3.0) * sigma[..., None] / (spacing[..., None] * radii * (2 * radii + 1))
     return jnp.minimum(1 + jnp.sum(error > _SLOPE_ERROR, axis=-1), _LARGEST_RADIUS)
 
 

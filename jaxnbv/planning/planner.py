@@ -129,7 +129,7 @@ class Planner(eqx.Module):
                 f"the observations hold {views} views and have room for no more: make them with a planner of "
                 f"Planner(max_views=...) greater than {room}",
             )
-        after = self._with_view(self.sampler.adapt(observations).add_points(scan), pose, scan, camera)
+        after = self._with_view(self.sampler.adapt(observations), pose, scan, camera).add_points(scan)
         if self.search.uses_samples and not is_traced(after):
             self.sampler.grid.check(after.cloud)
         return after

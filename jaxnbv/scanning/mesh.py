@@ -10,6 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from jaxnbv.checks import AnyArray, InputError, check_key, check_type, checked, is_traced, require
 from jaxnbv.errors import optional
@@ -20,6 +23,9 @@ from jaxnbv.scanning.scanner import Hits, Surface
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.scanning.sdf.sampled import checked_triangles, winding_number
 from jaxnbv.scanning.triangle_rays import FirstFaces, first_faces
+
+# A piece of a mesh with fewer may stand on stray points alone.
+_FEWEST_POINTS = 4
 
 
 @dataclasses.dataclass(unsafe_hash=True)
@@ -168,6 +174,24 @@ def level_triangles(
     vertices, faces, normals, _ = marching_cubes(values, 0.0, spacing=spacing, gradient_direction="descent")
     lengths = np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return vertices - grid.half_extent, faces, -normals / lengths
+
+
+def held_pieces(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], points: Float[np.ndarray, "n 3"], size: float
+) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "k 3"], int]:
+    """Vertices and faces of the connected pieces on which four points lie or more, and how many other pieces there are.
+    If no piece has four, those that have the most.
+
+    - `size`: how far from a vertex a point of its piece may be.
+    """
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    graph = coo_array((np.ones(len(edges), bool), edges.T), (len(vertices), len(vertices)))
+    count, piece = connected_components(graph, directed=False)
+    distance, nearest = cKDTree(vertices).query(points)
+    held = np.bincount(piece[nearest[distance <= size]], minlength=count)
+    kept = held >= min(_FEWEST_POINTS, held.max())
+    used, rows = np.unique(faces[kept[piece[faces[:, 0]]]], return_inverse=True)
+    return vertices[used], rows.reshape(-1, 3), int(np.sum(~kept))
 
 
 @checked

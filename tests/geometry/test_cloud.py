@@ -97,7 +97,8 @@ def test_depth_of_a_sphere_gives_normals_within_a_pixel(x64):
     cosine = -np.sum(points * (points - origin), axis=1) / np.linalg.norm(points - origin, axis=1)
     step = 0.3 / 60 * np.linalg.norm(points - origin, axis=1) / cosine
     np.testing.assert_array_less(np.abs(np.linalg.norm(points, axis=1) - 1.0), step**2)
-    error = np.arccos(np.clip(np.sum(points * normals, axis=1), -1, 1))
+    radii = points / np.linalg.norm(points, axis=1, keepdims=True)
+    error = np.arccos(np.clip(np.sum(radii * normals, axis=1), -1, 1))
     assert len(points) > 3000
     assert (error[cosine > 0.5] < step[cosine > 0.5]).all()
     assert np.median(error) < 0.2 * np.median(step)

@@ -1,6 +1,7 @@
 """Depth images as a sensor gives them: units, strides, a box, range; and what cannot be meant."""
 
 import functools
+import itertools
 import operator
 
 import numpy as np
@@ -229,3 +230,25 @@ def test_depths_beyond_the_type_say_nothing_and_only_infinity_says_nothing_is_th
         cloud = nbv.PointCloud.from_depth(np.full((4, 4), depth), camera, pose)
         assert int(cloud.count) == 0
         assert int(cloud.missed.sum()) == missed
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_pixels_that_mix_a_near_and_a_far_surface_are_left_out_and_thin_parts_stay(share, noise):
+    """A ball and a leg three pixels wide, 0.8 m away before a wall; in some of the pixels beside an edge the depth is
+    anywhere between."""
+    camera = CAMERA.resized(192, 256)
+    leg = Cuboid([0.0035, 0.0035, 0.1]).translate([0.14, 0.0, 0.1])
+    near = np.minimum(depth_of(BALL, leg, camera=camera), 1.6)
+    far = near
+    for axis, shift in itertools.product((0, 1), (-1, 1)):
+        far = np.maximum(far, np.roll(near, shift, axis))
+    rng = np.random.default_rng(0)
+    mixed = (far - near > 0.1) & (rng.uniform(size=near.shape) < share)
+    depth = np.where(mixed, near + rng.uniform(size=near.shape) * (far - near), near)
+    points, _ = nbv.PointCloud.from_depth(depth + noise * rng.normal(size=near.shape), camera, POSE).to_numpy()
+    object_points = points[points[:, 1] < 0.3]
+    away = np.minimum(*(np.abs(np.asarray(solid(object_points))) for solid in (BALL, leg)))
+    assert away.max() < 0.012
+    assert len(object_points) > 0.95 * np.sum((near < 1.6) & ~mixed)
+    assert np.sum(np.abs(object_points[:, 0] - 0.14) < 0.01) > (280 if share == 0 else 80)

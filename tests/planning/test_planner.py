@@ -1,5 +1,6 @@
 """The planner: ask and tell, compilation, overflow, bad input."""
 
+import dataclasses
 import warnings
 
 import equinox as eqx
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from small_planner import CAMERA, FIRST, SCENE, planner_of
 
+from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate, farthest_point_subsample
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
 from jaxnbv.planning.planner import Planner
@@ -104,6 +106,32 @@ def test_beyond_its_capacity_the_cloud_is_thinned_by_farthest_points(planner, ob
     np.testing.assert_array_equal(after.cloud.points, expected.points)
     np.testing.assert_array_equal(after.cloud.normals, expected.normals)
     assert bool(after.cloud.mask.all())
+
+
+@pytest.mark.parametrize(("partners", "kept"), [(0, 0), (1, 2)])
+def test_a_point_that_lies_alone_where_another_view_looked_through_goes(partners, kept):
+    """It is what thinning would take first. With a neighbour it stays: it may be a thin part that the view missed."""
+    camera, stray = Camera(fov=1.3, height=48, width=48), np.array([0.0, 1.0, -1.0])
+    planner = dataclasses.replace(planner_of(capacity=400), camera=camera)
+    first = scan(SCENE, camera, FIRST)
+    row = np.flatnonzero(first.missed)[: 1 + partners]
+    points = stray + 0.1 * np.arange(1 + partners)[:, None] * [1.0, 0.0, 0.0]
+    first = dataclasses.replace(
+        first,
+        points=first.points.at[row].set(points),
+        normals=first.normals.at[row].set([0.0, 0.0, 1.0]),
+        mask=first.mask.at[row].set(True),
+    )
+
+    def near(observations):
+        cloud, _ = observations.cloud.to_numpy()
+        return int(np.sum(np.linalg.norm(cloud - stray, axis=1) < 0.2))
+
+    observations = planner.init(FIRST, first)
+    assert near(observations) == 1 + partners
+    beside = look_at((2.4, 0.6, -0.4))
+    after = planner.observe(observations, beside, scan(SCENE, camera, beside))
+    assert near(after) == kept
 
 
 def test_a_scan_that_saw_nothing_only_records_its_pose(planner, observations):

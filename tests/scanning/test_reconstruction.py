@@ -1,6 +1,7 @@
 """Surfaces from clouds: against the sphere they were scanned from, and against the posterior mean itself."""
 
 import sys
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from jaxnbv.scanning.screened_poisson import has_poisson
 from jaxnbv.scanning.sdf import Sphere
 
 RADIUS = 0.9
+CENTRES = np.asarray(nbv.geometry.fibonacci_sphere(200, 1.0), np.float64)
 MODEL = nbv.GeometricSPSR(lengthscale=0.05, truncation=10)
 
 
@@ -77,12 +79,25 @@ class BallsPosterior(nbv.surfaces.SurfacePosterior):
         return jnp.minimum(away, jnp.linalg.norm(x - jnp.array([0.6, 0.3, 0.0]), axis=-1) - 0.3) + 0.25
 
 
-def test_other_models_are_meshed_too_and_pieces_without_data_are_kept():
-    mesh = mean_mesh(Balls(), sphere_cloud(), nbv.Grid(30))
-    parts = sorted(mesh.to_trimesh().split(), key=lambda part: part.volume)
-    assert len(parts) == 2
-    for part, centre, radius in zip(parts, ([0.6, 0.3, 0.0], [-0.6, 0.0, 0.0]), (0.3, 0.5), strict=True):
-        np.testing.assert_allclose(np.linalg.norm(part.vertices - centre, axis=1), radius, atol=0.02)
+def test_other_models_are_meshed_too_less_pieces_on_which_no_points_lie():
+    """The cloud's sphere cuts the ball at the left, and passes the other one by."""
+    with pytest.warns(UserWarning, match="1 piece of the mesh .* was left out"):
+        mesh = mean_mesh(Balls(), sphere_cloud(), nbv.Grid(30))
+    (part,) = mesh.to_trimesh().split()
+    np.testing.assert_allclose(np.linalg.norm(part.vertices - [-0.6, 0.0, 0.0], axis=1), 0.5, atol=0.02)
+
+
+@pytest.mark.parametrize(("points", "kept"), [(3, 1), (4, 2)])
+def test_a_piece_stays_with_four_points_on_it(points, kept):
+    """All points on one ball, and few on the other."""
+    left = 0.5 * CENTRES + [-0.6, 0.0, 0.0]
+    right = 0.3 * CENTRES[:: len(CENTRES) // points][:points] + [0.6, 0.3, 0.0]
+    cloud = nbv.PointCloud.from_arrays(np.concatenate([left, right]), np.ones((len(left) + points, 3)) / np.sqrt(3))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        mesh = mean_mesh(Balls(), cloud, nbv.Grid(30))
+    assert len(mesh.to_trimesh().split()) == kept
+    assert len(told) == 2 - kept
 
 
 def test_what_was_seen_empty_is_not_meshed():
@@ -95,10 +110,11 @@ def test_what_was_seen_empty_is_not_meshed():
         planner = nbv.Planner(nbv.Coverage(), nbv.FarthestView(8), camera, sampler, capacity=4000)
         return sampler.mean_mesh(planner.init(pose, nbv.scan(seen, camera, pose)))
 
+    with pytest.warns(UserWarning, match="1 piece"):
+        whole, plain = mesh(None), mean_mesh(Balls(), sphere_cloud(), nbv.Grid(30))
+    np.testing.assert_array_equal(whole.vertices, plain.vertices)
     (ball,) = mesh(nbv.Carving()).to_trimesh().split()
     np.testing.assert_allclose(np.linalg.norm(ball.vertices - [-0.6, 0.0, 0.0], axis=1), 0.5, atol=0.03)
-    whole, plain = mesh(None), mean_mesh(Balls(), sphere_cloud(), nbv.Grid(30))
-    np.testing.assert_array_equal(whole.vertices, plain.vertices)
 
 
 @pytest.mark.skipif(not has_poisson(), reason="pymeshlab, or the system's OpenGL library, is not installed")
