@@ -8,8 +8,8 @@ import pytest
 
 from jaxnbv.version import check_jax
 
-# Programs as users compile them, and with what NumPy makes of them in double precision. jax issue 39103 is a matrix by a
-# vector under vmap, then a reduction: rows after the 32,768th came out wrong in single precision, after the 16,384th in
+# Compiled as users compile them, and compared with NumPy in double precision. jax issue 39103 is a matrix by a vector
+# under vmap, then a reduction: rows after the 32,768th came out wrong in single precision, after the 16,384th in
 # double. Issues 39257 and 40412 end the process: sums over arrays of rank 8 and 7.
 PROGRAMS = """
 import jax
