@@ -8,7 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.checks import InputError, check_fields, check_key, check_type, checked, is_traced, require, shown
+from jaxnbv.checks import (
+    InputError,
+    check_fields,
+    check_key,
+    check_type,
+    checked,
+    is_traced,
+    own_settings,
+    require,
+    shown,
+)
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.volume import Box, Volume, bounding_box
@@ -114,6 +124,7 @@ class SurfaceSampler(eqx.Module):
         values = (OutsideBoundary(volume, room=room), OnSurface(), *(() if solid else (SeenEmpty(),)))
         return cls(ScreenedSPSR(base, values, offset=scale * usual.offset), carving=Carving(volume))
 
+    @own_settings()
     def with_bank(self, bank: ShapeBank, poses: ShapePoses) -> "SurfaceSampler":
         """A copy whose prior is a mixture over a bank: `KnownShapes`, registered within the volume. The present model
         is its "none of these".
@@ -132,6 +143,7 @@ class SurfaceSampler(eqx.Module):
         """A copy whose prior has no bank."""
         return dataclasses.replace(self, model=self.model.unknown) if isinstance(self.model, KnownShapes) else self
 
+    @own_settings()
     def within(self, volume: Box) -> "SurfaceSampler":
         """A copy for an object in another box, which takes the place of the default one, `Box()`, and may cut it."""
 
@@ -142,6 +154,7 @@ class SurfaceSampler(eqx.Module):
 
         return jax.tree.map(placed, self, is_leaf=lambda leaf: isinstance(leaf, Box | OutsideBoundary))
 
+    @own_settings()
     def posterior(self, observations: Observations | PointCloud) -> SurfacePosterior:
         """p(f | observations), of which `sample` draws before it carves. Empty nodes count within the volume alone.
 
@@ -153,6 +166,7 @@ class SurfaceSampler(eqx.Module):
         inside = observations.empty_nodes & self.carving.inside(self.grid)
         return self.model.condition(dataclasses.replace(observations, empty_nodes=inside))
 
+    @own_settings()
     def sample(
         self, observations: Observations | PointCloud, key: PRNGKeyArray, posterior: SurfacePosterior | None = None
     ) -> GridSurface:
@@ -176,6 +190,7 @@ class SurfaceSampler(eqx.Module):
             )
         return surfaces
 
+    @own_settings()
     def step_inputs(self, observations: Observations | PointCloud, key: PRNGKeyArray) -> StepInputs:
         """The observations, their posterior and S samples of it.
 
@@ -185,6 +200,7 @@ class SurfaceSampler(eqx.Module):
         posterior = self.posterior(observations)
         return StepInputs(observations, posterior, self.sample(observations, key, posterior))
 
+    @own_settings()
     def carve(
         self, observations: Observations | PointCloud, values: Float[Array, "*s g g g"]
     ) -> Float[Array, "*s g g g"]:
@@ -201,6 +217,7 @@ class SurfaceSampler(eqx.Module):
             excluded = elsewhere if excluded is None else elsewhere | excluded
         return values if excluded is None else carve(values, excluded)
 
+    @own_settings()
     def mean(
         self, observations: Observations | PointCloud, posterior: SurfacePosterior | None = None
     ) -> Float[Array, "g g g"]:
@@ -212,6 +229,7 @@ class SurfaceSampler(eqx.Module):
         values = posterior.mean_on_grid(self.grid.axis.astype(posterior.level.dtype)) - posterior.level
         return self.carve(observations, values)
 
+    @own_settings()
     def probability_inside(self, observations: Observations | PointCloud) -> Float[Array, "g g g"]:
         """P(f < level | observations) at the grid's nodes: the share of S samples under a fixed key, carved, so that
         any model will do.
@@ -220,6 +238,7 @@ class SurfaceSampler(eqx.Module):
         """
         return jnp.mean(self.sample(observations, jax.random.key(0)).values < 0, axis=0)
 
+    @own_settings()
     def mean_mesh(self, observations: Observations | PointCloud) -> TriangleMesh:
         """The surface where the posterior mean equals its level, by marching cubes on the grid, carved as the samples.
 

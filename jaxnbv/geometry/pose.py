@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import AnyArray, as_floats, check_batch, check_index, checked, is_traced, require
+from jaxnbv.checks import AnyArray, as_floats, check_batch, check_index, checked, is_traced, own_settings, require
 
 # Signs of the camera's axes, given as right, down and forward.
 _CONVENTIONS = {"opencv": (1.0, 1.0, 1.0), "opengl": (1.0, -1.0, -1.0)}
@@ -70,6 +70,7 @@ class Pose(eqx.Module):
         """The camera-to-scene matrix [[R, t], [0, 1]] in OpenCV's convention."""
         return self.to_matrix()
 
+    @own_settings()
     def to_matrix(self, convention: str = "opencv") -> Float[Array, "*batch 4 4"]:
         """The camera-to-scene matrix that `from_matrix` takes.
 
@@ -80,14 +81,17 @@ class Pose(eqx.Module):
         return jnp.concatenate([jnp.concatenate([rotation, self.position[..., None]], axis=-1), last], axis=-2)
 
     @property
+    @own_settings()
     def forward(self) -> Float[Array, "*batch 3"]:
         """Unit viewing direction in the scene."""
         return self.rotation[..., :, 2]
 
+    @own_settings()
     def to_scene(self, points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
         """Points of the camera's frame in scene coordinates (a single pose)."""
         return jnp.matmul(points, self.rotation.T, precision="highest") + self.position
 
+    @own_settings()
     def __getitem__(self, index) -> "Pose":
         """The pose, or poses, at an index of the leading axes.
 
@@ -119,6 +123,7 @@ def _check_rigid(rotation: np.ndarray, position: np.ndarray) -> None:
     )
 
 
+@own_settings()
 def look_at(
     position,
     target=(0.0, 0.0, 0.0),
