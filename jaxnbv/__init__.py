@@ -3,12 +3,16 @@
 The public names are those of `__init__.pyi`. Each is imported when it is first used, for JAX takes seconds to import.
 """
 
+import importlib.metadata
 import sys
 from typing import Any
 
 import lazy_loader
 
 from jaxnbv.errors import explained_imports
+from jaxnbv.version import check_jax
+
+check_jax(importlib.metadata.version("jaxlib"))
 
 _named, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 __getattr__ = explained_imports()(_named)

@@ -87,8 +87,19 @@ def check_fields(module: Any) -> None:
         check_type(getattr(module, field.name, None), hints[field.name], f"{type(module).__name__}'s {field.name}")
 
 
+@contextmanager
+def own_settings() -> Iterator[None]:
+    """Where JAX promotes ranks and types and moves arrays as this package expects, whatever `jax.config` says. Also a
+    decorator of a function.
+
+    A user's strict settings are for code of the user's. `jax_debug_nans` stays as it is.
+    """
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"), jax.transfer_guard("allow"):
+        yield
+
+
 def checked(function: _F) -> _F:
-    """A function whose arguments are checked as the fields of a module are; nothing else is changed."""
+    """A function whose arguments are checked as the fields of a module are, and which has JAX's `own_settings`."""
     signature = inspect.signature(function)
 
     @functools.wraps(function)
@@ -99,7 +110,8 @@ def checked(function: _F) -> _F:
             if name in hints:
                 owner = type(arguments[0]).__name__ if function.__name__ == "__init__" else function.__name__
                 check_type(value, hints[name], f"{owner}'s {name}")
-        return function(*arguments, **named)
+        with own_settings():
+            return function(*arguments, **named)
 
     return call  # type: ignore[return-value]
 
@@ -163,6 +175,7 @@ def takes_native(function: _F) -> _F:
     return call  # type: ignore[return-value]
 
 
+@own_settings()
 def as_floats(value: Any, name: str) -> Array:
     """The numbers as an array of JAX's default floating-point type.
 

@@ -16,6 +16,7 @@ from jaxnbv.checks import (
     check_type,
     checked,
     is_traced,
+    own_settings,
     require,
     shown,
     takes_native,
@@ -125,6 +126,7 @@ class SurfaceSampler(eqx.Module):
         values = (OutsideBoundary(volume, room=room), OnSurface(), *(() if solid else (SeenEmpty(),)))
         return cls(ScreenedSPSR(base, values, offset=scale * usual.offset), carving=Carving(volume))
 
+    @own_settings()
     def with_bank(self, bank: ShapeBank, poses: ShapePoses) -> "SurfaceSampler":
         """A copy whose prior is a mixture over a bank: `KnownShapes`, registered within the volume. The present model
         is its "none of these".
@@ -143,6 +145,7 @@ class SurfaceSampler(eqx.Module):
         """A copy whose prior has no bank."""
         return dataclasses.replace(self, model=self.model.unknown) if isinstance(self.model, KnownShapes) else self
 
+    @own_settings()
     def within(self, volume: Box) -> "SurfaceSampler":
         """A copy for an object in another box, which takes the place of the default one, `Box()`, and may cut it."""
 
@@ -153,6 +156,7 @@ class SurfaceSampler(eqx.Module):
 
         return jax.tree.map(placed, self, is_leaf=lambda leaf: isinstance(leaf, Box | OutsideBoundary))
 
+    @own_settings()
     def posterior(self, observations: Observations | PointCloud) -> SurfacePosterior:
         """p(f | observations), of which `sample` draws before it carves. Empty nodes count within the volume alone.
 
@@ -164,6 +168,7 @@ class SurfaceSampler(eqx.Module):
         inside = observations.empty_nodes & self.carving.inside(self.grid)
         return self.model.condition(dataclasses.replace(observations, empty_nodes=inside))
 
+    @own_settings()
     def sample(
         self, observations: Observations | PointCloud, key: PRNGKeyArray, posterior: SurfacePosterior | None = None
     ) -> GridSurface:
@@ -187,6 +192,7 @@ class SurfaceSampler(eqx.Module):
             )
         return surfaces
 
+    @own_settings()
     def step_inputs(self, observations: Observations | PointCloud, key: PRNGKeyArray) -> StepInputs:
         """The observations, their posterior and S samples of it.
 
@@ -196,6 +202,7 @@ class SurfaceSampler(eqx.Module):
         posterior = self.posterior(observations)
         return StepInputs(observations, posterior, self.sample(observations, key, posterior))
 
+    @own_settings()
     @takes_native
     def carve(
         self, observations: Observations | PointCloud, values: Float[Array, "*s g g g"]
@@ -213,6 +220,7 @@ class SurfaceSampler(eqx.Module):
             excluded = elsewhere if excluded is None else elsewhere | excluded
         return values if excluded is None else carve(values, excluded)
 
+    @own_settings()
     def mean(
         self, observations: Observations | PointCloud, posterior: SurfacePosterior | None = None
     ) -> Float[Array, "g g g"]:
@@ -224,6 +232,7 @@ class SurfaceSampler(eqx.Module):
         values = posterior.mean_on_grid(self.grid.axis.astype(posterior.level.dtype)) - posterior.level
         return self.carve(observations, values)
 
+    @own_settings()
     def probability_inside(self, observations: Observations | PointCloud) -> Float[Array, "g g g"]:
         """P(f < level | observations) at the grid's nodes: the share of S samples under a fixed key, carved, so that
         any model will do.
@@ -232,6 +241,7 @@ class SurfaceSampler(eqx.Module):
         """
         return jnp.mean(self.sample(observations, jax.random.key(0)).values < 0, axis=0)
 
+    @own_settings()
     def mean_mesh(self, observations: Observations | PointCloud) -> TriangleMesh:
         """The surface where the posterior mean equals its level, by marching cubes on the grid, carved as the samples.
 

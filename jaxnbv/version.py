@@ -1,5 +1,23 @@
-"""The version of the installed distribution."""
+"""The version of the installed distribution, and the versions of JAX that it accepts."""
 
 import importlib.metadata
 
+from packaging.requirements import Requirement
+
 __version__ = importlib.metadata.version("jaxnbv")
+
+
+def check_jax(installed: str) -> None:
+    """Refuse a version of jaxlib that the distribution leaves out, since it computes wrong values on CPUs.
+
+    `pip` keeps such versions away, but not those that it installs after jaxnbv.
+
+    **Raises:** `ImportError` that says which versions will do.
+    """
+    needed = map(Requirement, importlib.metadata.requires("jaxnbv") or ())
+    accepted = next(need.specifier for need in needed if need.name == "jax")
+    if not accepted.contains(installed, prereleases=True):
+        raise ImportError(
+            f"jaxlib {installed} is installed, which is too old, computes wrong values on CPUs or crashes there "
+            f"(jax issues 39103 and 39257): pip install -U 'jax{accepted}'"
+        )

@@ -10,6 +10,7 @@ import typer
 
 import jaxnbv
 from jaxnbv.cli.background import end_process, is_working
+from jaxnbv.cli.streams import write_readable
 from jaxnbv.errors import InputError, explained_imports
 
 app = typer.Typer(
@@ -77,6 +78,7 @@ def answer() -> None:
 
     **Raises:** `SystemExit` with the code.
     """
+    write_readable()
     keep_programs()
     try:
         with explained_imports():

@@ -18,6 +18,7 @@ from jaxnbv.checks import (
     check_type,
     checked,
     native,
+    own_settings,
     require,
     shown,
 )
@@ -65,6 +66,7 @@ class PointCloud(eqx.Module):
             require(leaf is None or leaf.dtype == bool, f"a cloud's {name} is {shown(leaf)}: give an array of truths")
 
     @classmethod
+    @own_settings()
     def from_arrays(
         cls,
         points: Float[AnyArray, "n 3"] | list,
@@ -160,10 +162,12 @@ class PointCloud(eqx.Module):
         return self.points.shape[-2]
 
     @property
+    @own_settings()
     def count(self) -> Int[Array, "*batch"]:
         """The number of filled rows."""
         return jnp.sum(self.mask, axis=-1)
 
+    @own_settings()
     def to_numpy(self) -> tuple[Float[np.ndarray, "count 3"], Float[np.ndarray, "count 3"]]:
         """Points and normals of the filled rows of a single cloud.
 
@@ -173,12 +177,14 @@ class PointCloud(eqx.Module):
         mask = np.asarray(self.mask)
         return np.asarray(self.points)[mask], np.asarray(self.normals)[mask]
 
+    @own_settings()
     def only(self, kept: Bool[Array, "*batch n"]) -> "PointCloud":
         """The cloud with those of its rows that are kept; as an image it says what it said, `missed` and `sight`."""
         mask = self.mask & kept
         points, normals = (jnp.where(mask[..., None], rows, 0.0) for rows in (self.points, self.normals))
         return PointCloud(points, normals, mask, self.missed, self.sight)
 
+    @own_settings()
     def __getitem__(self, index) -> "PointCloud":
         """The cloud, or clouds, at an index of the leading axes.
 
@@ -266,6 +272,7 @@ def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
     return _take(cloud, chosen, kept)
 
 
+@own_settings()
 @functools.partial(jax.jit, static_argnames="capacity")
 def limit_capacity(cloud: PointCloud, capacity: int) -> PointCloud:
     """The cloud in `capacity` rows, the filled ones first: all its points where they fit, else farthest point samples.

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import AnyArray, as_numbers, check_fields, checked, is_traced, require, shown
+from jaxnbv.checks import AnyArray, as_numbers, check_fields, checked, is_traced, own_settings, require, shown
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
@@ -70,6 +70,7 @@ class Frame(eqx.Module):
         identity = self.scale == 1.0 and self.center == (0.0, 0.0, 0.0) and self.up == "y"
         return "scene units" if identity else "world units"
 
+    @own_settings()
     def length_to_world(self, length: Float[AnyArray, "*n"] | float, power: int = 1):
         """A length, area or volume (by its power of length) from scene units to world units."""
         return length / self.scale**power
@@ -79,6 +80,7 @@ class Frame(eqx.Module):
         """R, from directions of the world to those of the scene."""
         return np.array(_UP[self.up], np.float64)
 
+    @own_settings()
     def to_scene(self, thing):
         """World to scene: an array of points (..., 3), a `PointCloud`, a `Pose`, a `Box`, or the range of a `Camera`.
 
@@ -92,6 +94,7 @@ class Frame(eqx.Module):
         center = np.asarray(self.center)
         return _apply(thing, lambda points: self._turned(points - center) * self.scale, self._turned, self.scale)
 
+    @own_settings()
     def to_world(self, thing):
         """Scene to world, for what `to_scene` takes."""
         center = np.asarray(self.center)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnbv.checks import AnyArray, as_floats, check_batch, check_index, checked, is_traced, require
+from jaxnbv.checks import AnyArray, as_floats, check_batch, check_index, checked, is_traced, own_settings, require
 
 # |R R^T - I| of a matrix that is taken for a rotation; of one written to three digits, which is made one.
 _ORTHONORMAL, _ROUNDED = 1e-3, 5e-3
@@ -80,6 +80,7 @@ class Pose(eqx.Module):
         """The camera-to-scene matrix [[R, t], [0, 1]] in OpenCV's convention."""
         return self.to_matrix()
 
+    @own_settings()
     def to_matrix(self, convention: str = "opencv") -> Float[Array, "*batch 4 4"]:
         """The camera-to-scene matrix that `from_matrix` takes.
 
@@ -90,14 +91,17 @@ class Pose(eqx.Module):
         return jnp.concatenate([jnp.concatenate([rotation, self.position[..., None]], axis=-1), last], axis=-2)
 
     @property
+    @own_settings()
     def forward(self) -> Float[Array, "*batch 3"]:
         """Unit viewing direction in the scene."""
         return self.rotation[..., :, 2]
 
+    @own_settings()
     def to_scene(self, points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
         """Points of the camera's frame in scene coordinates (a single pose)."""
         return jnp.matmul(points, self.rotation.T, precision="highest") + self.position
 
+    @own_settings()
     def __getitem__(self, index) -> "Pose":
         """The pose, or poses, at an index of the leading axes.
 
@@ -153,6 +157,7 @@ def _check_rigid(rotation: np.ndarray, position: np.ndarray) -> None:
     )
 
 
+@own_settings()
 def look_at(
     position,
     target=(0.0, 0.0, 0.0),

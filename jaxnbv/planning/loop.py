@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.checks import InputError
+from jaxnbv.checks import InputError, own_settings
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
@@ -94,6 +94,7 @@ class Loop:
     **Raises:** `ValueError` if the rule does not apply to the planner's acquisition.
     """
 
+    @own_settings()
     def __init__(
         self,
         planner: Planner,
@@ -123,6 +124,7 @@ class Loop:
             raise InputError("there is no view yet: add one first")
         return self._observations
 
+    @own_settings()
     def add(self, pose: Pose, scan: PointCloud, accepted: Callable[[], None] = lambda: None) -> View:
         """Add a view that was taken, wherever that was; its proposal is what `propose` gave since the last view, if it
         was asked.
@@ -146,6 +148,7 @@ class Loop:
         self._next = _StepState()
         return view
 
+    @own_settings()
     def take(self, sensor: Sensor, first: Pose) -> Step | None:
         """Take the next view by a sensor, from where the planner asks for it, and add it; None once the views are
         enough.
@@ -183,6 +186,7 @@ class Loop:
             # The posterior of a step may be large, and is not to be held beside that of the next.
             del step
 
+    @own_settings()
     def propose(self) -> Proposal:
         """The next pose and what the search looked at: the same until a view is added.
 
@@ -211,6 +215,7 @@ class Loop:
             return StepInputs(self.observations)
         return self._sampled()
 
+    @own_settings()
     def enough(self) -> str | None:
         """Why no more views are needed, by the rule; None while they are. Costs what the rule looks at, once a view:
         the samples and the proposal that it asks for are those of `propose`.

@@ -11,7 +11,16 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.acquisition import Acquisition, as_acquisition, check_traceable
-from jaxnbv.checks import InputError, check_fields, check_key, check_type, functions_of_users, is_traced, require
+from jaxnbv.checks import (
+    InputError,
+    check_fields,
+    check_key,
+    check_type,
+    functions_of_users,
+    is_traced,
+    own_settings,
+    require,
+)
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, check_oriented, check_single, concatenate, limit_capacity
 from jaxnbv.geometry.pose import Pose
@@ -61,6 +70,7 @@ class Planner(eqx.Module):
     capacity: int = eqx.field(static=True, default=8192)
     max_views: int = eqx.field(static=True, default=32)
 
+    @own_settings()
     def __check_init__(self):
         check_fields(self)
         for name in ("capacity", "max_views"):
@@ -82,6 +92,7 @@ class Planner(eqx.Module):
         value = self.search.quantity(self.acquisition)
         return value if self.cost is None else self.cost.quantity(value)
 
+    @own_settings()
     def init(self, pose: Pose | None, scan: PointCloud, camera: Camera | None = None) -> Observations:
         """The observations after a first scan, in scene coordinates, taken from `pose` (None for a cloud from no pose).
 
@@ -107,6 +118,7 @@ class Planner(eqx.Module):
             self.sampler.model.check(observations.cloud)
         return observations if pose is None else self._with_view(observations, pose, scan, camera)
 
+    @own_settings()
     def observe(
         self, observations: Observations, pose: Pose, scan: PointCloud, camera: Camera | None = None
     ) -> Observations:
@@ -143,6 +155,7 @@ class Planner(eqx.Module):
             observations = self.init(*after) if observations is None else self.observe(observations, *after)
             yield observations
 
+    @own_settings()
     def propose(self, observations: Observations, key: PRNGKeyArray, pending: PoseList | None = None) -> Proposal:
         """Ask: the pose to take next, and what the search looked at.
 
@@ -154,12 +167,14 @@ class Planner(eqx.Module):
         sample_key, search_key = jax.random.split(key)
         return self.choose(self.step_inputs(observations, sample_key), search_key, pending)
 
+    @own_settings()
     def step_inputs(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
         """The first half of `propose`: the posterior and its samples; the observations alone for a search that asks for
         no samples."""
         check_type(observations, Observations, "observations")
         return self.sampled(observations, key) if self.search.uses_samples else StepInputs(observations)
 
+    @own_settings()
     def sampled(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
         """The posterior and its samples, less what the sensor cannot measure if the acquisition asks for that alone."""
         inputs = self.sampler.step_inputs(observations, key)
@@ -168,6 +183,7 @@ class Planner(eqx.Module):
             return inputs
         return dataclasses.replace(inputs, surfaces=looks.measurable(surfaces, inputs.observations.poses))
 
+    @own_settings()
     def choose(self, inputs: StepInputs, key: PRNGKeyArray, pending: PoseList | None = None) -> Proposal:
         """The second half of `propose`: the search, given the step's samples (any that a model of your own drew).
 
@@ -175,11 +191,14 @@ class Planner(eqx.Module):
         """
         check_key(key)
         check_type(inputs, StepInputs, "the inputs of a step")
-        with functions_of_users():
+        # NaN is a value here: the standard error of a single sample. That of an acquisition is reported below.
+        with functions_of_users(), jax.debug_nans(False):
             problem = Problem(inputs, self.camera, self.acquisition, self.obstacles, self.cost, pending).prepared()
             proposal = _propose(self.search, problem, key)
         return _checked_proposal(self, problem, proposal)
 
+    @own_settings()
+    @jax.debug_nans(False)
     @eqx.filter_jit
     def expected_depth(self, surfaces: GridSurface, pose: Pose) -> Float[Array, "h w"]:
         """The depth image that is expected from a pose: `mean_depth` over the samples, by the planner's camera."""

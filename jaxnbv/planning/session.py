@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray, Real
 from tqdm import tqdm
 
-from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, checked, require, shown
+from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, checked, own_settings, require, shown
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.depth_image import NothingInside, without_sentinels
@@ -182,6 +182,7 @@ class Session:
         return self._loop.observations
 
     @property
+    @own_settings()
     def cloud(self) -> PointCloud:
         """The points in the box that are kept, in world units.
 
@@ -200,6 +201,7 @@ class Session:
         loop, first = self._loop, self.views[0].pose
         return Episode(loop.planner, None, None, first, loop.key, loop.views, loop.stopped, self.frame)
 
+    @own_settings()
     def done(self) -> str | None:
         """Why no more images are needed, by the rule that was given; None while they are. Asked once an image, and
         nothing is stored: the samples and the proposal that a rule asks for are those that `next` gives.
@@ -247,6 +249,7 @@ class Session:
         points, _ = self.frame.to_world(self.observations.cloud).to_numpy()
         self._cut = warn_of_cut(self.box, points, voxel, self._cut)
 
+    @own_settings()
     def next(self) -> NextView:
         """Where to take the next image. It is stored, and the same until an image is added; what was proposed once is
         not proposed again, for where the sensor could not be held it need not be tried twice. Warns where the best view

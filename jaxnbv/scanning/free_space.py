@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnbv.checks import check_fields, functions_of_users, require
+from jaxnbv.checks import check_fields, functions_of_users, own_settings, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
@@ -42,6 +42,7 @@ class Carving(eqx.Module):
     volume: Volume = Box()
     margin_voxels: float = eqx.field(static=True, default=1.0)
 
+    @own_settings()
     def __check_init__(self):
         check_fields(self)
         require(

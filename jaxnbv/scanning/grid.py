@@ -159,6 +159,7 @@ def samples_at_once(camera: Camera, poses: Pose) -> int:
     return 1 if on_cpu() else max(1, 2**23 // (poses.position.shape[0] * camera.num_rays))
 
 
+@jax.debug_nans(False)
 @eqx.filter_jit
 def mean_depth(scans: PointCloud, pose: Pose) -> Float[Array, " rays"]:
     """Mean depth along the camera's axis (scene units) over the samples that a ray hits; NaN where it misses most.

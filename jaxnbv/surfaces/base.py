@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.checks import AnyArray, as_numbers, check_key, check_type, is_traced, native, require
+from jaxnbv.checks import AnyArray, as_numbers, check_key, check_type, is_traced, native, own_settings, require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
 from jaxnbv.observations import Observations
@@ -42,7 +42,8 @@ def _on_torus(is_given: Callable[[Any], bool], wanted: str) -> Callable[..., Any
                     f"a point has a coordinate of {furthest:.4g}, outside [-pi, pi]^3, where surfaces only repeat; the "
                     "scene is [-pi/2, pi/2]^3: bring the points there with Frame.to_scene",
                 )
-            return method(self, *arrays)
+            with own_settings():
+                return method(self, *arrays)
 
         return call
 
@@ -61,7 +62,8 @@ def sampling_method(method: Callable[..., Any]) -> Callable[..., Any]:
         check_key(key)
         check_type(num_samples, int, "the number of samples")
         require(num_samples >= 1, f"asked for {num_samples} samples; ask for at least one")
-        return method(self, key, int(num_samples))
+        with own_settings():
+            return method(self, key, int(num_samples))
 
     return call
 

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
-from jaxnbv.checks import as_floats, check_type, is_traced, require
+from jaxnbv.checks import as_floats, check_type, is_traced, own_settings, require
 from jaxnbv.geometry.cloud import PointCloud, check_oriented
 from jaxnbv.observations import Observations, as_observations
 from jaxnbv.surfaces.base import HALF_WIDTH, SurfaceModel
@@ -67,6 +67,7 @@ class GeometricSPSR(SurfaceModel):
     noise: Scalar = eqx.field(converter=_to_float, default=0.01)
     nu: float = eqx.field(static=True, default=1.5)
 
+    @own_settings()
     def __check_init__(self):
         check_type(self.nu, float, "nu")
         require(self.nu in (0.5, 1.5, 2.5), f"nu is {self.nu}; it must be 0.5, 1.5 or 2.5")

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnbv.checks import InputError, check_fields, check_type, is_traced, native, require, shown
+from jaxnbv.checks import InputError, check_fields, check_type, is_traced, native, own_settings, require, shown
 from jaxnbv.geometry.cloud import farthest_point_subsample
 from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.geometry.volume import Box, Volume, boundary_points
@@ -98,6 +98,7 @@ class OutsideBoundary(ValueSource):
     noise: float = eqx.field(static=True, default=0.5)
     room: float = eqx.field(static=True, default=0.0)
 
+    @own_settings()
     def __check_init__(self):
         check_fields(self)
         require(0 <= self.room < math.inf, f"the room is {self.room}; it must be finite and not negative")

@@ -226,7 +226,7 @@ class Rotated(SignedDistance):
     rotation: Matrix = parameter()
 
     def __check_init__(self):
-        Pose(self.rotation, jnp.zeros(3))
+        Pose(self.rotation, np.zeros(3))
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         # R^T x written as a sum, which XLA fuses with its neighbours where it would not a matrix product.
