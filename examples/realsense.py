@@ -30,6 +30,7 @@ def depth_camera(profile) -> tuple[nbv.Camera, float]:
 
 
 def main(folder: str = "live", views: int = 10) -> None:
+    nbv.keep_compiled()
     pipeline = rs.pipeline()
     camera, scale = depth_camera(pipeline.start())
     planner = nbv.Planner(
