@@ -21,7 +21,7 @@ import trimesh
 from tqdm import tqdm
 
 import jaxnbv as nbv
-from jaxnbv.cli import keep_programs
+from jaxnbv.compiled import keep_compiled
 
 RUN = ("run", "BOX.PLY", "--quick", "--views", "4")
 STUDY = ("study", "pyramid", "--quick", "--scenes", "2", "--views", "2", "--methods", "coverage,farthest")
@@ -40,7 +40,7 @@ UNLIKE = {"report.html", ".lock"}
 
 def take_session(folder: Path) -> None:
     """Four images of a ball by a simulated sensor, from where the planner asks for them, and the report."""
-    keep_programs()
+    keep_compiled()
     camera, ball = nbv.Camera(height=48, width=64), nbv.SDFSurface(nbv.sdf.Sphere(0.1))
     planner = nbv.Planner(
         nbv.Coverage(),

@@ -58,6 +58,7 @@ def depth_frame(pipeline, since: float):
 
 
 def main(folder: str = "live", views: int = 10) -> None:
+    nbv.keep_compiled()
     pipeline = rs.pipeline()
     camera, scale = depth_camera(pipeline.start())
     planner = nbv.Planner(

@@ -10,6 +10,7 @@ from .acquisition import Acquisition as Acquisition
 from .acquisition import AcquisitionList as AcquisitionList
 from .acquisition import ExpectedUtilityImprovement as ExpectedUtilityImprovement
 from .acquisition import expected_value as expected_value
+from .compiled import keep_compiled as keep_compiled
 from .errors import InputError as InputError
 from .geometry.camera import Camera as Camera
 from .geometry.cloud import PointCloud as PointCloud

@@ -12,6 +12,7 @@ ROOT = Path(jaxnbv.__file__).parent
 ORDER = (
     "version",
     "errors",
+    "compiled",
     "progress",
     "checks",
     "sharding",

@@ -1,16 +1,15 @@
 """The command line. Commands are entry points of the group `jaxnbv.commands`, functions for typer by their names."""
 
-import os
 import sys
 from importlib.metadata import EntryPoint, entry_points
 from typing import Annotated
 
-import platformdirs
 import typer
 
 import jaxnbv
 from jaxnbv.cli.background import end_process, is_working
 from jaxnbv.cli.streams import write_readable
+from jaxnbv.compiled import keep_compiled
 from jaxnbv.errors import InputError, explained_imports
 
 app = typer.Typer(
@@ -44,6 +43,10 @@ def _options(
     ] = False,
 ) -> None:
     """What is asked of `jaxnbv` itself."""
+    try:
+        keep_compiled()
+    except InputError as error:
+        typer.echo(f"warning: {error}", err=True)
 
 
 def _is_own(point: EntryPoint) -> bool:
@@ -66,20 +69,12 @@ def _add_commands() -> None:
 _add_commands()
 
 
-def keep_programs() -> None:
-    """Keep what JAX compiles, once it is imported, for later runs and for processes that this one starts."""
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(platformdirs.user_cache_path("jaxnbv") / "xla")
-        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
-
-
 def answer() -> None:
     """Answer the words of this process: errors that the user can mend are one line, without a traceback.
 
     **Raises:** `SystemExit` with the code.
     """
     write_readable()
-    keep_programs()
     try:
         with explained_imports():
             app()
