@@ -77,7 +77,7 @@ class Cone(SignedDistance):
         inside = greatest(side, cap)
         bottom, top = safe_norm(out, up), safe_norm(r - self.top_radius, y - self.half_height)
         outside = jnp.where(along < 0, bottom, jnp.where(along > slant, top, inside))
-        over_cap = (cap > 0) & (r < jnp.where(y > 0, self.top_radius, self.bottom_radius))
+        over_cap = (cap > 0) & (jnp.where(y > 0, r - self.top_radius, out) < 0)
         return jnp.where(over_cap, cap, jnp.where(inside > 0, outside, inside))
 
 
