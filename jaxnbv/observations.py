@@ -11,13 +11,15 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnbv.checks import check_type
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, check_single, concatenate, limit_capacity
+from jaxnbv.geometry.neighbours import distance_to_others, spacing
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.pose_list import PoseList
 from jaxnbv.scanning import Carving, Grid, Looks, Obstacles, barrier_of
 
 # A model takes a hundred or two of the empty points, and the time to choose them grows with how many there are.
 _POINTS_ALONG_AXIS = 20
-_ROWS_AT_ONCE = 64
+# Of one scan, so that the time does not grow with the square of the capacity; more go with the next.
+_MOST_STRAY = 512
 
 
 class EmptyPoints(NamedTuple):
@@ -120,17 +122,12 @@ def _is_stray(cloud: PointCloud, empty: Bool[Array, "g g g"], grid: Grid) -> Boo
     A thin part that a view has missed does not lie alone, nor does a surface whose images' poses are a little off:
     thinned, what is connected has a neighbour within twice the spacing.
     """
-    rows = jnp.arange(cloud.capacity)
-
-    def nearest_other(row):
-        away = jnp.linalg.norm(cloud.points - cloud.points[row], axis=-1)
-        return jnp.min(jnp.where(cloud.mask & (rows != row), away, jnp.inf))
-
-    nearest = jax.lax.map(nearest_other, rows, batch_size=_ROWS_AT_ONCE)
-    usual = jnp.sort(jnp.where(cloud.mask, nearest, jnp.inf))[cloud.count // 2]
     crossed = jax.lax.reduce_window(empty, True, jax.lax.bitwise_and, (2, 2, 2), (1, 1, 1), "VALID")
     cell = tuple(grid.cell_of(cloud.points).T)
-    return cloud.mask & crossed.at[cell].get(mode="fill", fill_value=False) & (nearest > 2.0 * usual)
+    inside = cloud.mask & crossed.at[cell].get(mode="fill", fill_value=False)
+    (rows,) = jnp.nonzero(inside, size=min(_MOST_STRAY, cloud.capacity), fill_value=cloud.capacity)
+    is_alone = distance_to_others(cloud, rows) > 2.0 * spacing(cloud)
+    return jnp.zeros(cloud.capacity, bool).at[rows].set(is_alone, mode="drop")
 
 
 @eqx.filter_jit

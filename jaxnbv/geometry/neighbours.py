@@ -25,11 +25,16 @@ def nearest_squared_distance(x: Float[Array, "n 3"], cloud: PointCloud) -> Float
 def spacing(cloud: PointCloud) -> Float[Array, ""]:
     """How far a point of a cloud is from its nearest neighbour, in the cloud's units: the median over some of its
     points, spread over its rows; zero for fewer than two points."""
-    rows = some_rows(cloud, _ASKED)
+    nearest = distance_to_others(cloud, some_rows(cloud, _ASKED))
+    return jnp.where(cloud.count > 1, jnp.median(nearest), 0.0)
+
+
+def distance_to_others(cloud: PointCloud, rows: Int[Array, " r"]) -> Float[Array, " r"]:
+    """How far the points of some rows of a cloud are from their nearest neighbours in it; infinite where they have
+    none."""
     offsets = cloud.points[rows, None] - cloud.points
     other = cloud.mask & (jnp.arange(cloud.capacity) != rows[:, None])
-    nearest = jnp.min(jnp.where(other, jnp.sum(offsets**2, axis=-1), jnp.inf), axis=1)
-    return jnp.where(cloud.count > 1, jnp.sqrt(jnp.median(nearest)), 0.0)
+    return jnp.sqrt(jnp.min(jnp.where(other, jnp.sum(offsets**2, axis=-1), jnp.inf), axis=1))
 
 
 class DistanceField(eqx.Module):
