@@ -96,14 +96,14 @@ CALLS = {
     | {"initial": 0.0},
     nbv.HostClassifier: {"function": number_of_points, "num_classes": 3},
     nbv.HostSegmenter: {"function": number_of_points, "num_parts": 3},
-    nbv.SurfaceSampler: {"model": MODEL, "grid": nbv.Grid(8), "num_samples": 2, "carving": nbv.Carving()}
-    | {"obstacles": None},
+    nbv.SurfaceSampler: {"model": MODEL, "grid": nbv.Grid(8), "num_samples": 2, "carving": nbv.Carving()},
     nbv.SurfaceSampler.preset: {"name": "paper", "longest_side": 2.5, "quick": True, "volume": None, "solid": False},
     nbv.tasks.MixedEntropy: {"classifier": number_of_points, "threshold": 0.5, "num_points": 16},
     nbv.surfaces.OnSurface: {"num_points": 10, "noise": 0.1},
     nbv.surfaces.OutsideBoundary: {"volume": nbv.Box(), "num_points": 10, "value": 1.0, "noise": 0.5, "room": 0.1},
     nbv.Planner: {"acquisition": nbv.Coverage(), "search": nbv.DiscreteSearch(6), "camera": SMALL}
-    | {"sampler": nbv.SurfaceSampler(MODEL, nbv.Grid(8), 2), "cost": None, "capacity": 32, "max_views": 3},
+    | {"sampler": nbv.SurfaceSampler(MODEL, nbv.Grid(8), 2), "cost": None, "capacity": 32, "max_views": 3}
+    | {"obstacles": None},
     nbv.PointCloud.from_arrays: {"points": DIRECTIONS, "normals": DIRECTIONS, "capacity": 32},
     nbv.PointCloud.from_depth: {"depth": np.ones((4, 4)), "camera": SMALL, "pose": POSE}
     | {"depth_scale": 1.0, "stride": 2, "box": nbv.Box()},

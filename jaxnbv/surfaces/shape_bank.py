@@ -137,7 +137,8 @@ class ShapeBank(eqx.Module):
 
         **Raises:** `ValueError` for an index that it does not have.
         """
-        for index in listed(indices, "the indices"):
+        indices = listed(indices, "the indices")
+        for index in indices:
             check_type(index, int, "an index of the bank")
             require(0 <= index < len(self), f"the bank has {len(self)} shapes; there is no number {index}")
         rows = np.asarray(indices, int)

@@ -147,12 +147,13 @@ class NonuniformTransform(eqx.Module):
         return evaluate_on_grid(jnp.moveaxis(spread, -1, 0), basis.T)
 
     def _interpolate(self, grid: Float[Array, "g g g k"]) -> Float[Array, "n k"]:
-        def at_point(taken):
-            start, weights = taken
+        def at_point(start, weights):
             return jnp.einsum("uvwk,u,v,w->k", self._window_of(grid, start), *weights, precision="highest")
 
-        # On a CPU as many points at once as leave their windows in its cache.
-        return jax.lax.map(at_point, (self.start, self.weights), batch_size=128 if on_cpu() else len(self.start))
+        if not on_cpu():
+            return jax.vmap(at_point)(self.start, self.weights)
+        # As many points at once as leave their windows in the cache.
+        return jax.lax.map(lambda point: at_point(*point), (self.start, self.weights), batch_size=128)
 
     def _spread(self, values: Float[Array, "n k"], nodes: int) -> Float[Array, "nodes nodes nodes k"]:
         """The transpose of `_interpolate`."""
