@@ -3,24 +3,27 @@
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.ndimage import correlate
 
-# Sides of blocks. What share of the blocks of four times the side must be filled: less of pixels, since a window of
-# nine holds a plane though four of them are holes.
-_SIDES, _FILLED, _PIXELS = (1, 2, 3, 4, 6, 8, 12, 16, 24), 0.7, 0.55
+# Sides of blocks, and what share of the blocks of four times the side must be filled.
+_SIDES, _FILLED = (2, 3, 4, 6, 8, 12, 16, 24), 0.7
+# Of the pixels the share that has neighbours enough for a plane, four of nine, where there are no gaps.
+_WITH_PLANE, _FEWEST = 0.8, 4
 
 
 def gap_of(valid: Bool[np.ndarray, "h w"]) -> int:
-    """The least side of blocks that are filled about as often as blocks of four times the side: 1 for an image whose
-    pixels lie side by side, whatever holes it has, and 8 for one of every eighth row."""
+    """1 for an image in which most pixels have neighbours enough for a plane, whatever holes it has; else the least
+    side of blocks that are filled about as often as blocks of four times the side: 8 for one of every eighth row."""
+    around = correlate(valid.astype(np.uint8), np.ones((3, 3), np.uint8), mode="constant")
+    if not valid.any() or np.mean(around[valid] >= _FEWEST) >= _WITH_PLANE:
+        return 1
 
     def filled(side: int) -> float:
         height, width = (side * (size // side) for size in valid.shape)
         blocks = valid[:height, :width].reshape(height // side, side, width // side, side)
         return float(blocks.any(axis=(1, 3)).mean()) if blocks.size else 0.0
 
-    return next(
-        (side for side in _SIDES if filled(side) >= (_PIXELS if side == 1 else _FILLED) * filled(4 * side)), _SIDES[-1]
-    )
+    return next((side for side in _SIDES if filled(side) >= _FILLED * filled(4 * side)), _SIDES[-1])
 
 
 def block_samples(

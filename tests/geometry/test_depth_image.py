@@ -6,8 +6,10 @@ import operator
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 import jaxnbv as nbv
+from jaxnbv.geometry.gaps import gap_of
 from jaxnbv.scanning.sdf import Cuboid, Sphere
 
 # In metres, z up: a ball on a table, 0.8 m from the camera, and a pillar between them at the left.
@@ -187,6 +189,16 @@ def test_an_image_with_gaps_shows_the_object(name, stride):
     assert not np.asarray(cloud.missed & whole.mask).any()
     both = np.asarray(cloud.mask & whole.mask)
     assert np.median(np.abs(np.asarray(cloud.sight) / np.asarray(whole.sight) - 1.0)[both]) < 0.03
+
+
+def test_holes_are_no_gaps():
+    """A quarter of the pixels, in clumps as a sensor returns them: each has neighbours, so that none stands for others.
+    Of as many at random few have."""
+    noise = gaussian_filter(np.random.default_rng(0).normal(size=(240, 320)), 1.5)
+    clumps = noise > np.quantile(noise, 0.75)
+    assert gap_of(clumps) == 1
+    assert gap_of(np.random.default_rng(1).permutation(clumps.ravel()).reshape(clumps.shape)) > 1
+    assert gap_of(np.zeros((8, 8), bool)) == 1
 
 
 def test_planes_are_seen_exactly_between_samples():
