@@ -44,8 +44,10 @@ class Grid(eqx.Module):
         return 2.0 * self.half_extent / (self.resolution - 1)
 
     def cell_of(self, points: Float[Array, "*n 3"]) -> Int[Array, "*n 3"]:
-        """The cell that each of some points (scene units) lies in; outside the grid below 0 or beyond its cells."""
-        return jnp.floor((points + self.half_extent) / self.spacing).astype(jnp.int32)
+        """The cell that each of some points (scene units) lies in; `resolution - 1` or more along an axis on which it
+        is outside the grid: no cell, and no negative index, which would count from the other end."""
+        cell = jnp.floor((points + self.half_extent) / self.spacing).astype(jnp.int32)
+        return jnp.where(cell < 0, self.resolution, cell)
 
     def check(self, cloud: PointCloud) -> None:
         """Warn of parts that are thinner than a cell: points within one that look in opposite directions."""

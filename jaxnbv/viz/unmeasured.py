@@ -37,14 +37,14 @@ def unmeasured(surface: trimesh.Trimesh, observations: Observations, carving: Ca
         return []
     mesh, count = TriangleMesh(surface.vertices, surface.faces, Frame()), int(observations.num_views)
     cells = np.asarray(looks.grid.cell_of(jnp.asarray(surface.triangles_center)))
-    times = np.zeros((looks.grid.resolution + 2,) * 3, int)
+    times = np.zeros((looks.grid.resolution + 1,) * 3, int)
     for index in range(count):
         in_vain = np.zeros(times.shape, bool)
         seen = np.asarray(looks.cells_in_vain(mesh, index, observations.poses.rows[index]))
-        in_vain[tuple(seen[(seen < looks.grid.resolution).all(axis=1)].T + 1)] = True
+        in_vain[tuple(seen[(seen < looks.grid.resolution).all(axis=1)].T)] = True
         # Rays are farther apart than cells.
         times += binary_dilation(in_vain, np.ones((3, 3, 3)))
-    of_face = times[tuple(np.clip(cells, -1, looks.grid.resolution).T + 1)]
+    of_face = times[tuple(np.minimum(cells, looks.grid.resolution).T)]
     chosen = of_face >= _LOOKS
     if carving is not None:
         chosen &= np.asarray(carving.volume(jnp.asarray(surface.triangles_center))) < -looks.grid.spacing

@@ -240,3 +240,11 @@ def test_free_distance_against_a_distance_transform():
     levels = np.array([0, 1, 2, 3, 5, 9, 17])
     np.testing.assert_array_equal(np.abs(distance), levels[np.searchsorted(levels, exact, side="right") - 1])
     np.testing.assert_array_equal(np.sign(distance), np.where(crossed, 0, np.where(corners[0], 1, -1)))
+
+
+def test_outside_a_grid_there_is_no_cell():
+    """Nor is it one that counts from the other end."""
+    grid = nbv.Grid(11, 1.0)
+    cells = np.asarray(grid.cell_of(jnp.array([[-0.99, 0.01, 0.99], [-1.01, -3.0, 1.01]])))
+    np.testing.assert_array_equal(cells[0], [0, 5, 9])
+    assert (cells[1] >= 10).all()
