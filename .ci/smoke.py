@@ -43,7 +43,7 @@ def planning() -> None:
             out = Path(folder) / str(number)
             assert len(nbv.simulate(planner, scene, FIRST, 2, jax.random.key(0), folder=out, progress=False).views) == 2
         box = nbv.Box((-1.5,) * 3, (1.5,) * 3)
-        session = nbv.Session(CAMERA, box, planner, folder=Path(folder) / "session", progress=False)
+        session = nbv.Session(CAMERA, box, planner, up="y", folder=Path(folder) / "session", progress=False)
         scan = nbv.scan(scene, CAMERA, FIRST)
         depth = np.where(scan.mask, (np.asarray(scan.points) - FIRST.position) @ FIRST.forward, 0.0)
         session.add(depth.reshape(16, 16), FIRST.matrix)
