@@ -8,7 +8,7 @@ import zipfile
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +24,8 @@ from jaxnbv.scanning.mesh_files import load_mesh
 from jaxnbv.scanning.sdf import Sampled, solid_of_mesh
 
 # What is kept is made anew where what makes it has changed.
-_VERSION = 2
+_VERSION = 3
+_ARRAYS = ("values", "low", "spacing", "padding", "extremes", "from_mesh")
 _T = TypeVar("_T")
 
 
@@ -56,48 +57,58 @@ def mesh_paths(meshes: str | Path | Sequence[str | Path | trimesh.Trimesh]) -> l
     return [path if isinstance(path, trimesh.Trimesh) else Path(path) for path in named]
 
 
+class MeshShape(NamedTuple):
+    """A mesh as a shape of a bank.
+
+    - `solid`: its signed distance, where its longest side is 2.5; `extremes`: points that are extreme on it.
+    - `from_mesh`: the similarity from the coordinates of the mesh.
+    """
+
+    solid: Sampled
+    extremes: Float[np.ndarray, "p 3"]
+    from_mesh: Float[np.ndarray, "4 4"]
+
+
 def shapes_of_meshes(
-    paths: Sequence[Path | trimesh.Trimesh], resolution: int, sheet: float, num_extremes: int, progress: bool
-) -> tuple[list[Sampled], Float[np.ndarray, "k p 3"], list[int]]:
-    """The solids of the meshes that can be used, points that are extreme on each, and which they are.
+    paths: Sequence[Path | trimesh.Trimesh], resolution: int, sheet: float, num_extremes: int, up: str, progress: bool
+) -> tuple[list[MeshShape], list[int]]:
+    """The shapes of the meshes that can be used, and which these are.
 
     A `UserWarning` names each mesh that cannot be used, and why.
 
     **Raises:** `ValueError` if none can.
     """
-    solids, extremes, used = [], [], []
+    shapes, used = [], []
     for index, path in enumerate(progress_bar(paths, progress, desc="meshes read")):
         try:
-            solid, points = _shape(path, resolution, sheet, num_extremes)
+            shape = _shape(path, resolution, sheet, num_extremes, up)
         except InputError as error:
             warnings.warn(f"{path} is left out of the bank: {error}", stacklevel=3)
             continue
-        solids.append(solid)
-        extremes.append(points)
+        shapes.append(shape)
         used.append(index)
     require(len(used) > 0, f"none of the {len(paths)} meshes can be used, the first of them {paths[0]}")
-    return solids, np.stack(extremes), used
+    return shapes, used
 
 
-def _shape(
-    mesh: Path | trimesh.Trimesh, resolution: int, sheet: float, num_extremes: int
-) -> tuple[Sampled, Float[np.ndarray, "p 3"]]:
+def _shape(mesh: Path | trimesh.Trimesh, resolution: int, sheet: float, num_extremes: int, up: str) -> MeshShape:
     settings = resolution, sheet, num_extremes
-    found = _kept(mesh, *settings) if isinstance(mesh, Path) else _sampled(load_mesh(mesh), *settings)
-    return Sampled(*(jnp.asarray(found[name]) for name in ("values", "low", "spacing", "padding"))), found["extremes"]
+    arrays = _kept(mesh, *settings, up) if isinstance(mesh, Path) else _sampled(load_mesh(mesh, up), *settings)
+    solid = Sampled(*(jnp.asarray(arrays[name]) for name in ("values", "low", "spacing", "padding")))
+    return MeshShape(solid, arrays["extremes"], arrays["from_mesh"])
 
 
-def _kept(path: Path, resolution: int, sheet: float, num_extremes: int) -> dict[str, np.ndarray]:
+def _kept(path: Path, resolution: int, sheet: float, num_extremes: int, up: str) -> dict[str, np.ndarray]:
     require(os.path.isfile(path), f"cannot read {path}: there is no file")
     try:
         content = path.read_bytes()
     except OSError as error:
         raise InputError(f"cannot read {path} ({error.strerror or error})") from error
-    settings = f"{_VERSION} {path.suffix} {resolution} {sheet} {num_extremes} ".encode()
+    settings = f"{_VERSION} {path.suffix} {resolution} {sheet} {num_extremes} {up} ".encode()
     file = platformdirs.user_cache_path("jaxnbv") / "shapes" / f"{hashlib.sha256(settings + content).hexdigest()}.npz"
     found = _read(file)
     if found is None:
-        found = _sampled(load_mesh(path), resolution, sheet, num_extremes)
+        found = _sampled(load_mesh(path, up), resolution, sheet, num_extremes)
         _keep(file, found)
     return found
 
@@ -109,15 +120,19 @@ def _sampled(mesh: TriangleMesh, resolution: int, sheet: float, num_extremes: in
     )
     directions = np.asarray(fibonacci_sphere(num_extremes))
     extremes = mesh.vertices[np.argmax(mesh.vertices @ directions.T, axis=0)]
-    arrays: dict[str, Any] = {name: getattr(solid, name) for name in ("values", "low", "spacing", "padding")}
-    return {name: np.asarray(array, np.float32) for name, array in (arrays | {"extremes": extremes}).items()}
+    from_mesh = np.eye(4)
+    from_mesh[:3, :3] = mesh.frame.scale * mesh.frame.rotation
+    from_mesh[:3, 3] = -from_mesh[:3, :3] @ mesh.frame.center
+    arrays: dict[str, Any] = {name: getattr(solid, name) for name in _ARRAYS[:4]}
+    arrays |= {"extremes": extremes, "from_mesh": from_mesh}
+    return {name: np.asarray(array, np.float32) for name, array in arrays.items()}
 
 
 def _read(file: Path) -> dict[str, np.ndarray] | None:
     """What was kept; None where nothing was, or what was is damaged."""
     try:
         with np.load(file) as stored:
-            return {name: stored[name] for name in ("values", "low", "spacing", "padding", "extremes")}
+            return {name: stored[name] for name in _ARRAYS}
     except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error):
         return None
 

@@ -6,6 +6,7 @@ from abc import abstractmethod
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
@@ -82,16 +83,20 @@ class ShapePoses(eqx.Module):
         """The axes about which a placement can be turned, one a column."""
 
     @property
+    def moves(self) -> Float[np.ndarray, "9 k"]:
+        """The independent steps of `Placement.moved` without a change of scale, one a column."""
+        return scipy.linalg.block_diag(self.turns(), np.eye(3), np.zeros((3, 0)))
+
+    @property
     def steps(self) -> Float[np.ndarray, "9 k"]:
         """The independent steps of `Placement.moved`, one a column."""
-        turns = self.turns()
         least, most = self.scale
         scales = np.zeros((3, 0)) if least == most else np.eye(3) if self.by_axis else np.full((3, 1), 3**-0.5)
-        blocks, row = np.zeros((9, turns.shape[1] + 3 + scales.shape[1])), 0
-        for place, block in zip((0, 3, 6), (turns, np.eye(3), scales), strict=True):
-            blocks[place : place + 3, row : row + block.shape[1]] = block
-            row += block.shape[1]
-        return blocks
+        return scipy.linalg.block_diag(self.turns(), np.eye(3), scales)
+
+    def rotations_of(self, num_shapes: int, count: int) -> Float[np.ndarray, "k m 3 3"]:
+        """At most `count` rotations of each of some shapes; a first axis of one where they are those of all."""
+        return self.rotations(count)[None]
 
 
 class FreeRotation(ShapePoses):

@@ -52,7 +52,8 @@ class Seen(NamedTuple):
 
     @classmethod
     def of(cls, observations: Observations) -> "Seen":
-        """Some of the cloud, by farthest point sampling, and some of the nodes seen empty, at random."""
+        """Some of the cloud, by farthest point sampling, and some of the nodes seen empty, or within obstacles, at
+        random."""
         cloud = farthest_point_subsample(observations.cloud, _NUM_POINTS)
         empty, is_empty = _some_empty(observations)
         return cls(cloud.points, cloud.normals, cloud.mask, empty.astype(cloud.points.dtype), is_empty)
@@ -65,8 +66,11 @@ class Seen(NamedTuple):
 def _some_empty(observations: Observations) -> tuple[Float[Array, "m 3"], Bool[Array, " m"]]:
     if observations.empty_nodes is None or observations.grid is None:
         return jnp.zeros((_NUM_EMPTY, 3)), jnp.zeros(_NUM_EMPTY, bool)
-    order = np.random.default_rng(0).permutation(observations.empty_nodes.size)
-    node, is_empty = _first_seen(observations.empty_nodes, order)
+    empty = observations.empty_nodes
+    if observations.obstacle_nodes is not None:
+        empty = empty | observations.obstacle_nodes
+    order = np.random.default_rng(0).permutation(empty.size)
+    node, is_empty = _first_seen(empty, order)
     return jnp.asarray(observations.grid.axis)[node], is_empty
 
 
@@ -105,10 +109,17 @@ class Prior(NamedTuple):
     """What is known of placements before anything was seen.
 
     - `poses`: which are possible. `box`: what holds the object, which fills it more or less.
+    - `is_true_size`: whether shapes are as large as they are, and need not fill the box.
     """
 
     poses: ShapePoses
     box: Box
+    is_true_size: bool = False
+
+    @property
+    def steps(self) -> Float[np.ndarray, "9 k"]:
+        """The independent steps of `Placement.moved`, one a column."""
+        return self.poses.moves if self.is_true_size else self.poses.steps
 
     def filling(self, shape: Shape, rotation: Float[Array, "3 3"]) -> Placement:
         """A shape turned so, as large as the box has room for, in its middle."""
@@ -120,12 +131,16 @@ class Prior(NamedTuple):
 
     def deviation(self, shape: Shape, placement: Placement) -> Float[Array, "9"]:
         """By how much a placement departs from what fills the box: no turn, the shift, the logarithms of the scale."""
+        if self.is_true_size:
+            return jnp.zeros(9, placement.shift.dtype)
         usual = self.filling(shape, placement.rotation)
         shift, stretch = placement.shift - usual.shift, jnp.log(placement.scale / usual.scale)
         return jnp.concatenate([jnp.zeros_like(shift), shift, stretch])
 
     def within(self, shape: Shape, placement: Placement) -> Placement:
         """The placement with its scale clipped to what is possible."""
+        if self.is_true_size:
+            return placement
         usual = self.filling(shape, placement.rotation).scale
         least, most = self.poses.scale
         return eqx.tree_at(lambda p: p.scale, placement, jnp.clip(placement.scale, least * usual, most * usual))
@@ -142,16 +157,12 @@ def register(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Hypo
     """
     few, some = seen.first(_COARSE[1]), seen.first(_FINE[1])
     turned = _turned(bank, prior, few, num_starts)
-    coarse = _refined(bank, prior, turned.best(_COARSE[0]), few, _COARSE)
-    fine = _refined(bank, prior, coarse.best(_FINE[0]), some, _FINE)
+    coarse = refined(bank, prior, turned.best(_COARSE[0]), few, _COARSE[2])
+    fine = refined(bank, prior, coarse.best(_FINE[0]), some, _FINE[2])
     others = _exchanged(bank, prior, fine, few).best(_LAST[0])
     both = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), fine, others)
-    last = _refined(bank, prior, both.best(_LAST[0]), some, _LAST)
-
-    def judge(start):
-        return _misfit(bank.shape(start.shape), prior, start.placement, seen, _LAST_TAU)
-
-    found = dataclasses.replace(last, misfit=jax.lax.map(judge, last, batch_size=_AT_ONCE)).best(_LAST[0])
+    last = refined(bank, prior, both.best(_LAST[0]), some, _LAST[2])
+    found = judged(bank, prior, last, seen).best(_LAST[0])
     return dataclasses.replace(found, is_mode=_modes(found.shape, found.placement.rotation))
 
 
@@ -167,7 +178,7 @@ def _turned(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Hypot
         return jax.vmap(lambda one: prior.filling(shape, one))(rotations)
 
     starts = jax.vmap(of_shape)(bank.shapes, all_of_them[places.astype(int)])
-    return _tried(bank, prior, starts, seen)
+    return tried(bank, prior, starts, seen)
 
 
 def _exchanged(bank: ShapeBank, prior: Prior, first: Hypotheses, seen: Seen) -> Hypotheses:
@@ -181,10 +192,10 @@ def _exchanged(bank: ShapeBank, prior: Prior, first: Hypotheses, seen: Seen) -> 
     def of_shape(shape):
         return jax.vmap(lambda one, step: prior.filling(shape, one.rotation).moved(step))(where, step)
 
-    return _tried(bank, prior, jax.vmap(of_shape)(bank.shapes), seen)
+    return tried(bank, prior, jax.vmap(of_shape)(bank.shapes), seen)
 
 
-def _tried(bank: ShapeBank, prior: Prior, placements: Placement, seen: Seen) -> Hypotheses:
+def tried(bank: ShapeBank, prior: Prior, placements: Placement, seen: Seen) -> Hypotheses:
     """The misfits of each shape at its own placements, along a second axis."""
     num_shapes, count = placements.scale.shape[:2]
 
@@ -198,10 +209,10 @@ def _tried(bank: ShapeBank, prior: Prior, placements: Placement, seen: Seen) -> 
     return Hypotheses(shape, flat, misfit.reshape(-1), jnp.ones(len(shape), bool))
 
 
-def _refined(bank: ShapeBank, prior: Prior, starts: Hypotheses, seen: Seen, stage: tuple[int, int, int]) -> Hypotheses:
+def refined(bank: ShapeBank, prior: Prior, starts: Hypotheses, seen: Seen, num_steps: int) -> Hypotheses:
     """The best along Gauss-Newton steps, by E at the last tau, while the tau of the steps falls."""
-    taus = jnp.append(jnp.geomspace(_FIRST_TAU, _LAST_TAU, stage[2]), _LAST_TAU)
-    basis = jnp.asarray(prior.poses.steps, seen.points.dtype)
+    taus = jnp.append(jnp.geomspace(_FIRST_TAU, _LAST_TAU, num_steps), _LAST_TAU)
+    basis = jnp.asarray(prior.steps, seen.points.dtype)
 
     def refine(start):
         shape = bank.shape(start.shape)
@@ -218,6 +229,15 @@ def _refined(bank: ShapeBank, prior: Prior, starts: Hypotheses, seen: Seen, stag
         return Hypotheses(start.shape, best, least, start.is_mode)
 
     return jax.lax.map(refine, starts, batch_size=_AT_ONCE)
+
+
+def judged(bank: ShapeBank, prior: Prior, hypotheses: Hypotheses, seen: Seen) -> Hypotheses:
+    """The hypotheses with their E by all that was seen, at the last tau."""
+
+    def judge(one):
+        return _misfit(bank.shape(one.shape), prior, one.placement, seen, _LAST_TAU)
+
+    return dataclasses.replace(hypotheses, misfit=jax.lax.map(judge, hypotheses, batch_size=_AT_ONCE))
 
 
 def _mean(values: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, ""]:

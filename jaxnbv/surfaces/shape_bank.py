@@ -1,5 +1,6 @@
 """A bank of known shapes: the shapes that a model remembers."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -11,13 +12,16 @@ import numpy as np
 import trimesh
 from jaxtyping import Array, Float, Int, UInt8
 
-from jaxnbv.checks import check_type, checked, require
+from jaxnbv.checks import InputError, check_type, checked, require, shown
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import fibonacci_sphere
-from jaxnbv.scanning.sdf import SignedDistance
+from jaxnbv.scanning.sdf import Scaled, SignedDistance
 from jaxnbv.surfaces.mesh_shapes import listed, mesh_paths, shapes_of_meshes
 
 NUM_EXTREMES, _FAR, _STRIDES, _ARRIVED = 128, 4.0, 40, 0.01
 _LONGEST_NAME = 64
+# Lengths of the units in which parts are drawn, in metres.
+_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 
 
 class Shape(NamedTuple):
@@ -37,6 +41,10 @@ class ShapeBank(eqx.Module):
     - `solids`: all of them as one, whose arrays have a leading axis of shapes; None for a bank of none.
     - `extremes`: of each, as of a `Shape`.
     - `codes`: their names in UTF-8. No program that is compiled depends on them.
+    - `from_mesh`: (k, 4, 4) matrices from the coordinates of each mesh to those of its shape, similarities; None where
+      the shapes come from no meshes.
+    - `is_true_size`: whether the shapes are as large as the objects that they stand for, so that no placement scales
+      them.
 
     **Raises:** `ValueError` for another number of names than of shapes.
     """
@@ -44,20 +52,27 @@ class ShapeBank(eqx.Module):
     solids: SignedDistance | None
     extremes: Float[Array, "k p 3"]
     codes: UInt8[Array, "k c"]
+    from_mesh: Float[Array, "k 4 4"] | None = None
+    is_true_size: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
         check_type(self.solids, SignedDistance | None, "the bank's solids")
-        rows = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves((self.solids, self.extremes, self.codes))}
+        rows = {
+            jnp.shape(leaf)[:1] for leaf in jax.tree.leaves((self.solids, self.extremes, self.codes, self.from_mesh))
+        }
         require(
             len(rows) == 1,
             f"the arrays of the bank have {sorted(rows)} rows: make it with ShapeBank.of or ShapeBank.from_meshes",
         )
 
     @classmethod
-    def of(cls, solids: Sequence[SignedDistance], names: Sequence[str] | None = None) -> "ShapeBank":
+    def of(
+        cls, solids: Sequence[SignedDistance], names: Sequence[str] | None = None, is_true_size: bool = False
+    ) -> "ShapeBank":
         """A bank of solids of one kind, as exact as they are: one compiled program evaluates any of them.
 
         - `names`: by default their numbers.
+        - `is_true_size`: whether they are as large as the objects that they stand for, see `from_meshes`.
 
         **Raises:** `ValueError` for what is no solid, solids of several kinds, or another number of names.
         """
@@ -75,7 +90,7 @@ class ShapeBank(eqx.Module):
             "of one kind, or meshes of them (nbv.mesh_from_sdf) to ShapeBank.from_meshes",
         )
         joined = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *solids)
-        return cls(joined, _extremes(joined), encoded(names))
+        return cls(joined, _extremes(joined), encoded(names), is_true_size=is_true_size)
 
     @classmethod
     @checked
@@ -86,19 +101,27 @@ class ShapeBank(eqx.Module):
         sheet: float = 0.05,
         names: Sequence[str] | None = None,
         progress: bool = True,
+        scale: float | str | None = None,
+        up: str = "y",
     ) -> "ShapeBank":
-        """A bank of meshes, centred, their longest sides 2.5: their signed distances on grids, which are kept in the
-        user's cache. Soups and open meshes will do.
+        """A bank of meshes, centred: their signed distances on grids, which are kept in the user's cache. Soups and
+        open meshes will do.
 
         - `meshes`: files and meshes of trimesh's, or a folder of which all are taken, also in folders within.
         - `resolution`: nodes along the longest side.
-        - `sheet`: how thick faces are, in scene units, that have the outside on both sides.
+        - `sheet`: how thick faces are that have the outside on both sides, where the longest side of a mesh is 2.5.
         - `names`: by default the names of the files, of a folder's with their place in it, and numbers.
+        - `scale`: the length of the meshes' unit in the world, for parts at their true size: a number, or "m", "cm",
+          "mm", "in" or "ft" for a world in metres. None for examples of categories, whose sizes do not matter: their
+          longest sides are 2.5.
+        - `up`: the meshes' axis that is upward, see `Frame`.
 
         A `UserWarning` names each mesh that cannot be used and is left out.
 
-        **Raises:** `ValueError` if none can be used, for another number of names, or numbers out of their ranges.
+        **Raises:** `ValueError` if none can be used, for another number of names, for numbers out of their ranges, or
+        another unit.
         """
+        factor = None if scale is None else _metres(scale)
         require(resolution >= 8, f"the resolution is {resolution}; it must be at least 8")
         require(0 < sheet < 1, f"sheets are {sheet} thick; give scene units, above 0 and below 1")
         paths = mesh_paths(meshes)
@@ -110,9 +133,32 @@ class ShapeBank(eqx.Module):
             names = [path.stem if folder is None else str(path.relative_to(folder).with_suffix("")) for path in files]
         names = _as_names(names)
         require(len(names) == len(paths), f"there are {len(names)} names for {len(paths)} meshes: give one for each")
-        solids, extremes, used = shapes_of_meshes(paths, resolution, sheet, NUM_EXTREMES, progress)
-        joined = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *solids)
-        return cls(joined, jnp.asarray(extremes), encoded([names[index] for index in used]))
+        shapes, used = shapes_of_meshes(paths, resolution, sheet, NUM_EXTREMES, up, progress)
+        joined, extremes, from_mesh = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *shapes)
+        bank = cls(joined, extremes, encoded([names[index] for index in used]), from_mesh)
+        if factor is None:
+            return bank
+        sizes = factor / jnp.cbrt(jnp.linalg.det(from_mesh[:, :3, :3]))
+        return dataclasses.replace(bank, is_true_size=True)._resized(sizes)
+
+    def in_scene(self, frame: Frame) -> "ShapeBank":
+        """The bank at the size that it has in the scene of a frame; as it is, if sizes do not matter."""
+        return self._resized(jnp.full(len(self), frame.scale)) if self.is_true_size else self
+
+    def _resized(self, factors: Float[Array, " k"]) -> "ShapeBank":
+        """The bank with each shape as many times as large."""
+        if self.solids is None:
+            return self
+        if isinstance(self.solids, Scaled):
+            larger = eqx.tree_at(lambda solids: solids.factor, self.solids, factors * self.solids.factor)
+        else:
+            larger = jax.vmap(Scaled)(self.solids, factors)
+        from_mesh = None
+        if self.from_mesh is not None:
+            from_mesh = self.from_mesh.at[:, :3].multiply(factors[:, None, None])
+        return dataclasses.replace(
+            self, solids=larger, extremes=factors[:, None, None] * self.extremes, from_mesh=from_mesh
+        )
 
     @property
     def shapes(self) -> Shape:
@@ -143,7 +189,20 @@ class ShapeBank(eqx.Module):
             require(0 <= index < len(self), f"the bank has {len(self)} shapes; there is no number {index}")
         rows = np.asarray(indices, int)
         solids = jax.tree.map(lambda leaf: leaf[rows], self.solids) if len(rows) else None
-        return ShapeBank(solids, self.extremes[rows], self.codes[rows])
+        from_mesh = None if self.from_mesh is None else self.from_mesh[rows]
+        return ShapeBank(solids, self.extremes[rows], self.codes[rows], from_mesh, self.is_true_size)
+
+
+def _metres(scale: float | str) -> float:
+    """**Raises:** `ValueError` for a unit that is not known, or a length that is not positive."""
+    if isinstance(scale, str):
+        require(
+            scale in _METRES, f"the unit is {scale!r}: give one of {', '.join(_METRES)}, or its length in the world"
+        )
+        return _METRES[scale]
+    if not (0 < scale < np.inf):
+        raise InputError(f"the scale is {shown(scale)}: give the length of the meshes' unit in the world, above 0")
+    return float(scale)
 
 
 def _as_names(names: Sequence[str]) -> tuple[str, ...]:

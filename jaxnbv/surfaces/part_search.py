@@ -1,0 +1,139 @@
+"""Which parts of known size fit what was seen, and how they lie: a search in which no part crowds out another.
+
+Every part is tried in many placements; its best few are refined by Gauss-Newton steps on the misfit E of
+`registration`, and the best of these again, on more points, together with the hypotheses of the view before. So a part
+never loses its place to look-alikes, and time grows linearly with the number of parts.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxnbv.geometry.volume import Box
+from jaxnbv.surfaces.placement import Placement, ShapePoses
+from jaxnbv.surfaces.registration import Hypotheses, Prior, Seen, judged, refined, tried
+from jaxnbv.surfaces.shape_bank import ShapeBank
+
+NUM_HYPOTHESES = 32
+# Each rotation is tried in so many places.
+_PLACES = 4
+# How many of each part are refined, by how many points and steps: of all tried, and of the best of these.
+_COARSE, _FINE = (10, 48, 5), (4, 128, 10)
+# How far a part may reach beyond the box, and how far two placed parts may differ that count as one: scene units.
+_ROOM, SAME = 0.2, 0.03
+_NUM_PROBES = 4096
+
+
+@eqx.filter_jit
+def search_parts(
+    bank: ShapeBank, poses: ShapePoses, box: Box, seen: Seen, before: Hypotheses | None, num_starts: int
+) -> Hypotheses:
+    """The 32 placed parts of least misfit, best first. Those whose surfaces are equal, by symmetry say, count once.
+
+    - `bank`: parts at true size, in scene units; `box`: what holds the object.
+    - `before`: the hypotheses of the view before, which are refined and kept for as long as they fit.
+    - `num_starts`: placements that are tried with each part.
+    """
+    prior = Prior(poses, box, is_true_size=True)
+    few, some = seen.first(_COARSE[1]), seen.first(_FINE[1])
+    starts = tried(bank, prior, _starts(bank, prior, seen, num_starts), few)
+    coarse = refined(bank, prior, _best_of_each(starts, len(bank), _COARSE[0]), few, _COARSE[2])
+    fine = _best_of_each(coarse, len(bank), _FINE[0])
+    if before is not None:
+        fine = jax.tree.map(lambda *rows: jnp.concatenate(rows), fine, before)
+    last = judged(bank, prior, refined(bank, prior, fine, some, _FINE[2]), seen)
+    return _distinct(bank, box, last.best(2 * NUM_HYPOTHESES)).best(NUM_HYPOTHESES)
+
+
+def _best_of_each(tried: Hypotheses, num_shapes: int, count: int) -> Hypotheses:
+    """The best few of each shape, in whose order the hypotheses are."""
+    misfits = tried.misfit.reshape(num_shapes, -1)
+    _, best = jax.lax.top_k(-misfits, min(count, misfits.shape[1]))
+    rows = (best + misfits.shape[1] * jnp.arange(num_shapes)[:, None]).reshape(-1)
+    return jax.tree.map(lambda leaf: leaf[rows], tried)
+
+
+def _starts(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Placement:
+    """Placements of each shape, along a second axis: rotations, each in a few places where the shape would hold what
+    was seen.
+
+    Where the whole of the object was in view, there is one such place across the line of sight, and along it the one
+    whose front is what was seen. Where a view shows a patch, places are spread over all that hold it.
+    """
+    dtype = seen.points.dtype
+    rotations = jnp.asarray(prior.poses.rotations_of(len(bank), max(1, num_starts // _PLACES)), dtype)
+    count = rotations.shape[1]
+    # A sequence of low discrepancy (Roberts 2018); the first place is the middle, in front.
+    steps = np.array([0.8191725134, 0.6710436067, 0.5497004779])
+    spread = (0.5 + np.arange(1, count * (_PLACES - 1) + 1)[:, None] * steps) % 1.0
+    middle = np.tile([[[0.5, 0.5, 1.0]]], (1, count, 1))
+    shares = jnp.asarray(np.concatenate([middle, spread.reshape(_PLACES - 1, count, 3)]), dtype)
+
+    axes = _axes_of_sight(seen)
+    along = jnp.matmul(seen.points, axes.T, precision="highest")
+    least = jnp.min(jnp.where(seen.mask[:, None], along, jnp.inf), axis=0)
+    most = jnp.max(jnp.where(seen.mask[:, None], along, -jnp.inf), axis=0)
+    low, high = jnp.asarray(prior.box.low, dtype) - _ROOM, jnp.asarray(prior.box.high, dtype) + _ROOM
+
+    def place(shape, rotation, share):
+        turned = jnp.matmul(shape.extremes, rotation.T, precision="highest")
+        own = jnp.matmul(turned, axes.T, precision="highest")
+        first, last = most - jnp.max(own, axis=0), least - jnp.min(own, axis=0)
+        # A shape that is smaller than what was seen stands in its middle; its front is what was seen all the same.
+        first, last = jnp.minimum(first, last), jnp.maximum(first, last)
+        shift = jnp.matmul(last + share * (first - last), axes, precision="highest")
+        inside = jnp.clip(shift, low - jnp.min(turned, axis=0), high - jnp.max(turned, axis=0))
+        return Placement(rotation, inside, jnp.ones(3, dtype))
+
+    def of_shape(shape, own_rotations):
+        of_share = jax.vmap(place, (None, 0, 0))
+        places = jax.vmap(of_share, (None, None, 0))(shape, own_rotations, shares)
+        return jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), places)
+
+    each = jnp.broadcast_to(rotations, (len(bank), *rotations.shape[1:]))
+    return jax.vmap(of_shape)(bank.shapes, each)
+
+
+def _axes_of_sight(seen: Seen) -> Float[Array, "3 3"]:
+    """Two directions across the line of sight, and last the one to the sensor: the mean of the normals."""
+    mean = jnp.sum(jnp.where(seen.mask[:, None], seen.normals, 0.0), axis=0)
+    length = jnp.linalg.norm(mean)
+    ahead = jnp.where(length > 0, mean / jnp.where(length > 0, length, 1.0), jnp.eye(3, dtype=mean.dtype)[2])
+    aside = jnp.cross(ahead, jnp.eye(3, dtype=mean.dtype)[jnp.argmin(jnp.abs(ahead))])
+    aside = aside / jnp.linalg.norm(aside)
+    return jnp.stack([aside, jnp.cross(ahead, aside), ahead])
+
+
+def _distinct(bank: ShapeBank, box: Box, hypotheses: Hypotheses) -> Hypotheses:
+    """The hypotheses with `is_mode` false, and no misfit that could be best, for all whose surface is that of a better
+    one."""
+    dtype = hypotheses.misfit.dtype
+    low, high = np.asarray(box.low) - _ROOM, np.asarray(box.high) + _ROOM
+    probes = jnp.asarray(low + (high - low) * np.random.default_rng(0).random((_NUM_PROBES, 3)), dtype)
+
+    def distances(one):
+        return one.placement.distance(bank.shape(one.shape).solid, probes)
+
+    values = jax.lax.map(distances, hypotheses, batch_size=8)
+
+    def off(row):
+        return jnp.max(jnp.abs(values - row), axis=1)
+
+    is_same = (jax.lax.map(off, values, batch_size=4) < SAME) & (hypotheses.shape[:, None] == hypotheses.shape)
+    modes = first_of_each(is_same)
+    return dataclasses.replace(hypotheses, is_mode=modes, misfit=jnp.where(modes, hypotheses.misfit, jnp.inf))
+
+
+def first_of_each(is_same: Bool[Array, "h h"]) -> Bool[Array, " h"]:
+    """Which rows are not the same as an earlier one of these."""
+    order = jnp.arange(is_same.shape[0])
+
+    def keep(modes, index):
+        covered = jnp.any(is_same[index] & modes & (order < index))
+        return modes.at[index].set(~covered), None
+
+    return jax.lax.scan(keep, jnp.zeros(len(order), bool), order)[0]
