@@ -29,6 +29,8 @@ from .planning.simulate import simulate as simulate
 from .planning.stopping import Budget as Budget
 from .planning.stopping import Covered as Covered
 from .planning.stopping import Found as Found
+from .planning.stopping import Identified as Identified
+from .planning.stopping import Placed as Placed
 from .planning.stopping import StopRule as StopRule
 from .planning.stopping import Sure as Sure
 from .planning.stopping import ValueBelow as ValueBelow
@@ -65,6 +67,7 @@ from .tasks import Coverage as Coverage
 from .tasks import CrossEntropy as CrossEntropy
 from .tasks import HostClassifier as HostClassifier
 from .tasks import HostSegmenter as HostSegmenter
+from .tasks import Identify as Identify
 from .tasks import NewSurface as NewSurface
 from .tasks import SoftPartCount as SoftPartCount
 from .utility import Answer as Answer

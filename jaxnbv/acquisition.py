@@ -41,6 +41,8 @@ class Acquisition(eqx.Module):
     - `needs_posterior`: whether `context` looks at the posterior, which a planner then puts into the step.
     - `cloud_only`: whether `context` looks at D alone, so that a planner can try it before there are observations.
     - `measurable_only`: whether surface that a view looked at in vain is left out of the samples, see `Looks`.
+    - `needs_hypotheses`: whether it is about the hypotheses that a model of known parts carries, and looks at no
+      posterior; the step's only sample is then the likeliest part.
     - `gains_once`: whether a pose that was taken has nothing more to give, so that what is expected there is expected
       in vain. A search over candidates then takes the farthest from the cameras so far among those that are level with
       the best, see `Proposal.tied_with_best`.
@@ -50,6 +52,7 @@ class Acquisition(eqx.Module):
     cloud_only: ClassVar[bool] = False
     measurable_only: ClassVar[bool] = False
     gains_once: ClassVar[bool] = False
+    needs_hypotheses: ClassVar[bool] = False
 
     @abstractmethod
     def context(self, step: StepInputs) -> Any:
@@ -58,6 +61,27 @@ class Acquisition(eqx.Module):
     @abstractmethod
     def score(self, context: Any, view: ImaginedView) -> Float[Array, "*values"]:
         """The score of one view. Finite; for a scan that sees nothing, no more than for any other."""
+
+    def sample_scores(
+        self,
+        context: Any,
+        surfaces: GridSurface,
+        camera: Camera,
+        poses: Pose,
+        barrier: Float[Array, "poses rays"] | None = None,
+    ) -> Float[Array, "samples poses *scores"]:
+        """The score of what each of the sampled surfaces would show from each of a batch of poses. One row will do for
+        an acquisition that is no mean over samples.
+
+        All poses are scanned at once, of one sample or of `samples_at_once`, so memory is that of these scans; they are
+        scored `batch_size` of them at a time. Samples are shared among devices, or the poses are where samples are too
+        few.
+
+        - `barrier`: see `scan`.
+        """
+        together = min(samples_at_once(camera, poses), share_of(surfaces.values.shape[0]))
+        views = poses, barrier
+        return shared_map(_of_sample, surfaces, context, views, self, camera, together, at_once=together)
 
     def inputs(self, step: StepInputs) -> StepInputs:
         """The part of a step that `context` looks at. Steps whose parts have equal shapes share one compilation."""
@@ -245,8 +269,8 @@ def check_traceable(
 
     **Raises:** `ValueError` if it cannot, as for a utility of NumPy, or derivatives of what calls back to host code.
     """
-    if acquisition.needs_posterior:
-        # There is none yet.
+    if acquisition.needs_posterior or acquisition.needs_hypotheses:
+        # There are none yet.
         return
 
     def cloud(rows: int) -> PointCloud:
@@ -300,7 +324,7 @@ def expected_value(
         acquisition.check(inputs.observations.cloud)
     with functions_of_users():
         context = acquisition.context(inputs)
-        return jnp.mean(sample_scores(acquisition, context, surfaces, camera, poses, barrier), axis=0)
+        return jnp.mean(acquisition.sample_scores(context, surfaces, camera, poses, barrier), axis=0)
 
 
 def scores(
@@ -314,26 +338,6 @@ def scores(
         (scans, poses),
         acquisition.batch_size // samples,
     )
-
-
-def sample_scores(
-    acquisition: Acquisition,
-    context: Any,
-    surfaces: GridSurface,
-    camera: Camera,
-    poses: Pose,
-    barrier: Float[Array, "poses rays"] | None = None,
-) -> Float[Array, "samples poses *scores"]:
-    """The score of what each of the sampled surfaces would show from each of a batch of poses.
-
-    All poses are scanned at once, of one sample or of `samples_at_once`, so memory is that of these scans; they are
-    scored `batch_size` of them at a time. Samples are shared among devices, or the poses are where samples are too few.
-
-    - `barrier`: see `scan`.
-    """
-    together = min(samples_at_once(camera, poses), share_of(surfaces.values.shape[0]))
-    views = poses, barrier
-    return shared_map(_of_sample, surfaces, context, views, acquisition, camera, together, at_once=together)
 
 
 # Poses, and how far along the rays from each obstacles stand.

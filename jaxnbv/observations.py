@@ -38,6 +38,7 @@ class Observations(eqx.Module):
     - `looks`: what has been measured, and how far each view saw.
     - `empty_nodes`: the nodes that a scan has shown to be empty.
     - `obstacle_nodes`: the nodes within known obstacles, where the object cannot be.
+    - `hypotheses`: what a model carries from view to view, see `SurfaceModel.observed`; None for nothing.
     """
 
     cloud: PointCloud
@@ -46,6 +47,7 @@ class Observations(eqx.Module):
     looks: Looks | None = None
     empty_nodes: Bool[Array, "g g g"] | None = None
     obstacle_nodes: Bool[Array, "g g g"] | None = None
+    hypotheses: eqx.Module | None = None
 
     @classmethod
     def start(

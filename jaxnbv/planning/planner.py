@@ -28,11 +28,17 @@ from jaxnbv.geometry.pose_list import PoseList
 from jaxnbv.observations import Observations
 from jaxnbv.planning.travel import ValuePerCost, total_cost
 from jaxnbv.sampler import StepInputs, SurfaceSampler
-from jaxnbv.scanning import GridSurface, Obstacles, barrier_of, mean_depth, scan_samples
+from jaxnbv.scanning import Grid, GridSurface, Obstacles, barrier_of, mean_depth, scan_samples
 from jaxnbv.scanning.scanner import far_from_scene
 from jaxnbv.search import DiscreteSearch, Problem, Proposal, Search
+from jaxnbv.surfaces import FreeRotation, ShapeBank, ShapePoses
 from jaxnbv.surfaces.base import HALF_WIDTH
+from jaxnbv.surfaces.part_hypotheses import PartHypotheses
+from jaxnbv.tasks import Identify
 from jaxnbv.utility import Quantity
+
+_PARTS_GRID = 64
+_NO_HYPOTHESES = "the observations hold no hypotheses: make them with the init of the planner that they are given to"
 
 # Functions are converted on the way in, which mypy cannot see.
 if TYPE_CHECKING:
@@ -78,6 +84,11 @@ class Planner(eqx.Module):
             require(value >= 1, f"{name} is {value}; it must be at least 1")
         self.search.check(self.acquisition, self.camera, self.capacity)
         # Before anything is computed for a function that JAX cannot trace.
+        require(
+            self.sampler.model.hypothesises or not self.acquisition.needs_hypotheses,
+            f"{type(self.acquisition).__name__} is about known parts, and the sampler knows none: give it a bank at "
+            "true size, sampler.with_bank(ShapeBank.from_meshes(folder, scale='m'), FreeRotation())",
+        )
         if self.search.uses_samples and self.acquisition.cloud_only:
             check_traceable(self.acquisition, self.capacity, self.camera)
         require(
@@ -85,6 +96,19 @@ class Planner(eqx.Module):
             f"{type(self.search).__name__} does not look at the value of a view, so its cost cannot count: leave cost "
             "out, or use another search",
         )
+
+    @classmethod
+    def for_parts(cls, bank: ShapeBank, poses: ShapePoses = FreeRotation(), acquisition: Any = Identify()) -> "Planner":  # noqa: B008
+        """A planner that asks which part of a bank the object is and how it lies.
+
+        - `bank`: at true size, `ShapeBank.from_meshes(folder, scale="m")`. In a session it is in world units, in a
+          simulation in scene units.
+        - `poses`: how parts can lie, in any rotation by default; `acquisition`: what views are chosen by.
+
+        **Raises:** `ValueError` for a bank without parts, or not at true size.
+        """
+        sampler = SurfaceSampler(grid=Grid(_PARTS_GRID), num_samples=8).with_bank(bank, poses)
+        return cls(acquisition, DiscreteSearch(), Camera(height=24, width=32), sampler, capacity=2000)
 
     @property
     def quantity(self) -> Quantity:
@@ -116,7 +140,9 @@ class Planner(eqx.Module):
                 check_traceable(self.acquisition, observations, self.camera)
             self.acquisition.check(observations.cloud)
             self.sampler.model.check(observations.cloud)
-        return observations if pose is None else self._with_view(observations, pose, scan, camera)
+        if pose is not None:
+            observations = self._with_view(observations, pose, scan, camera)
+        return self.sampler.model.observed(observations)
 
     @own_settings()
     def observe(
@@ -144,7 +170,7 @@ class Planner(eqx.Module):
         after = self._with_view(self.sampler.adapt(observations), pose, scan, camera).add_points(scan)
         if self.search.uses_samples and not is_traced(after):
             self.sampler.grid.check(after.cloud)
-        return after
+        return self.sampler.model.observed(after)
 
     def replay(self, views: Iterable[tuple[Pose, PointCloud]], camera: Camera | None = None) -> Iterator[Observations]:
         """The observations after each of some views, poses and scans: `init` with the first, then `observe`, and
@@ -176,7 +202,12 @@ class Planner(eqx.Module):
 
     @own_settings()
     def sampled(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
-        """The posterior and its samples, less what the sensor cannot measure if the acquisition asks for that alone."""
+        """The posterior and its samples, less what the sensor cannot measure if the acquisition asks for that alone;
+        the likeliest part in place of the samples for an acquisition about hypotheses."""
+        if self.acquisition.needs_hypotheses:
+            hypotheses = observations.hypotheses
+            require(isinstance(hypotheses, PartHypotheses), _NO_HYPOTHESES)
+            return StepInputs(observations, None, hypotheses.surfaces(self.sampler.grid, 1))
         inputs = self.sampler.step_inputs(observations, key)
         looks, surfaces = inputs.observations.looks, inputs.surfaces
         if looks is None or surfaces is None or not self.acquisition.measurable_only:

@@ -41,6 +41,8 @@ from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Obstacles
 from jaxnbv.search import DiscreteSearch, Proposal
 from jaxnbv.storage import RunFolder
+from jaxnbv.surfaces.part_hypotheses import PartHypotheses
+from jaxnbv.surfaces.part_pose import ObjectPose, object_pose
 from jaxnbv.tasks import NewSurface
 
 _NO_UP = 'say which axis of the world is upward, up="z" for most robots: one of'
@@ -192,6 +194,29 @@ class Session:
         return cloud.only(self.box(cloud.points) <= 0)
 
     @property
+    def identity(self) -> dict[str, float]:
+        """How likely the object is each of the parts that the planner knows, most likely first, and "none of these".
+
+        **Raises:** `ValueError` before the first image, or if the planner knows no parts.
+        """
+        return self._hypotheses().names()
+
+    @property
+    @own_settings()
+    def object_pose(self) -> ObjectPose:
+        """Where the likeliest part lies in the world.
+
+        **Raises:** `ValueError` as `identity` does.
+        """
+        return object_pose(self._hypotheses(), self.observations, self.frame)
+
+    def _hypotheses(self) -> PartHypotheses:
+        hypotheses = self.observations.hypotheses
+        if not isinstance(hypotheses, PartHypotheses):
+            raise InputError("the planner knows no parts: give the session Planner.for_parts(bank)")
+        return hypotheses
+
+    @property
     def episode(self) -> Episode:
         """The session so far, as an episode: in scene coordinates, and with the frame in which it is shown.
 
@@ -279,6 +304,7 @@ class Session:
     def _placed(self, planner: Planner, matrices: np.ndarray | None, obstacles: Obstacles | None) -> Planner:
         """The planner at this sensor and box, in scene coordinates."""
         sampler, search = planner.sampler.within(self.frame.to_scene(self.box)), planner.search
+        sampler = dataclasses.replace(sampler, model=sampler.model.in_scene(self.frame))
         if matrices is None:
             search = search.above()
         else:

@@ -3,6 +3,8 @@
     rule         its number is                                            asked about the next view too
     Sure         a probability                                            no
     Found        points of each part                                      no
+    Identified   a probability                                            no
+    Placed       a length                                                 no
     Covered      a share of the area that can be seen                     no
     ValueBelow   a value of the search, lengths in world units            yes
     Budget       seconds; or a cost, of poses in the world                for a cost
@@ -27,6 +29,8 @@ from jaxnbv.observations import Observations
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.travel import CostFunction, WorldCost, arc_length, total_cost
 from jaxnbv.scanning import GridSurface, barrier_of
+from jaxnbv.surfaces.part_hypotheses import PartHypotheses
+from jaxnbv.surfaces.part_pose import surface_error
 from jaxnbv.tasks.classification import ClassAcquisition
 from jaxnbv.tasks.coverage import NewSurface, newness_of, seen_share
 from jaxnbv.tasks.segmentation import PartAnswer, SoftPartCount
@@ -258,6 +262,52 @@ def expected_coverage(context: StopContext, new: NewSurface) -> float:
     poses = planner.search.poses_around()
     barrier = barrier_of(planner.obstacles, planner.camera, poses)
     return float(seen_share(context_of(new, observations), surfaces, planner.camera, poses, barrier))
+
+
+class Identified(StopRule):
+    """Stop once it is known which part the object is: one of them, or none of these, has this probability.
+
+    - `probability`: within (0, 1).
+
+    **Raises:** `ValueError` for another probability; for a planner that knows no parts.
+    """
+
+    probability: float = eqx.field(static=True, default=0.95)
+
+    def __check_init__(self):
+        check_fields(self)
+        require(0 < self.probability < 1, f"the probability is {self.probability}; it must lie within (0, 1)")
+
+    def after(self, context: StopContext) -> str | None:
+        name, probability = next(iter(_parts(context).names().items()))
+        return f"it is {name} ({100 * probability:.0f} %)" if probability >= self.probability else None
+
+
+class Placed(StopRule):
+    """Stop once it is known where the object lies: the surface of the likeliest part to this length, the root mean
+    square over its surface and over the hypotheses.
+
+    - `length`: in world units in a session, scene units in a simulation.
+
+    **Raises:** `ValueError` for a length that is not positive; for a planner that knows no parts.
+    """
+
+    length: float = eqx.field(static=True)
+
+    def __check_init__(self):
+        check_fields(self)
+        require(self.length > 0, f"the length is {self.length}; it must be positive")
+
+    def after(self, context: StopContext) -> str | None:
+        error = float(context.frame.length_to_world(surface_error(_parts(context), context.observations)))
+        return f"its surface is known to {error:.2g}" if error <= self.length else None
+
+
+def _parts(context: StopContext) -> PartHypotheses:
+    hypotheses = context.observations.hypotheses
+    if not isinstance(hypotheses, PartHypotheses):
+        raise InputError("the planner knows no parts: use Planner.for_parts(bank), or another rule")
+    return hypotheses
 
 
 class ValueBelow(StopRule):

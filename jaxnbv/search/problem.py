@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnbv.acquisition import Acquisition, context_of, sample_scores
+from jaxnbv.acquisition import Acquisition, context_of
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
@@ -69,7 +69,7 @@ class Problem(eqx.Module):
         """
         some = jax.tree.map(lambda leaf: leaf[samples], self.surfaces)
         barrier = barrier_of(self.obstacles, self.camera, poses)
-        values = sample_scores(self.acquisition, self.context, some, self.camera, poses, barrier)
+        values = self.acquisition.sample_scores(self.context, some, self.camera, poses, barrier)
         return self.apply_cost(jnp.moveaxis(values, (0, 1), (-2, -1)), poses)
 
     def apply_cost(self, values: Float[Array, "*samples poses"], poses: Pose) -> Float[Array, "*samples poses"]:

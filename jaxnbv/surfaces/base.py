@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, as_numbers, check_key, check_type, is_traced, native, own_settings, require
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
 from jaxnbv.observations import Observations
 
@@ -150,6 +151,19 @@ class SurfaceModel(eqx.Module):
     def condition(self, observations: Observations | PointCloud) -> SurfacePosterior:
         """p(f | observations): the filled rows of its cloud and, where the model can make use of it, the space that was
         seen empty. A cloud alone is observations too; `as_observations` makes it so."""
+
+    def observed(self, observations: Observations) -> Observations:
+        """The observations with what the model carries from view to view; asked after each view."""
+        return observations
+
+    def in_scene(self, frame: Frame) -> "SurfaceModel":
+        """The model, given in the world of a frame as far as it knows true sizes, in the scene."""
+        return self
+
+    @property
+    def hypothesises(self) -> bool:
+        """Whether `observed` keeps hypotheses about which known part the object is, see `PartHypotheses`."""
+        return False
 
     def check(self, cloud: PointCloud) -> None:
         """Warn where a cloud, whose values are known, is not one that the model makes much of."""

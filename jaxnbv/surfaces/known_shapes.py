@@ -10,6 +10,7 @@ The weights are tempered: the likelihood of thousands of normals, which are not 
 See `surfaces/registration.py` for E.
 """
 
+import dataclasses
 import math
 from typing import Any, NamedTuple
 
@@ -21,19 +22,19 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, check_fields, require
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.volume import Box
 from jaxnbv.observations import Observations, as_observations
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import Fields, SurfaceModel, SurfacePosterior, sampling_method
+from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses, identify
 from jaxnbv.surfaces.placement import FreeRotation, Placement, ShapePoses
 from jaxnbv.surfaces.registration import Hypotheses, Prior, Seen, register
 from jaxnbv.surfaces.screened import ScreenedSPSR, ScreenedSPSRPosterior
 from jaxnbv.surfaces.shape_bank import ShapeBank
 from jaxnbv.surfaces.spsr import GeometricSPSR
 from jaxnbv.surfaces.values import OnSurface
-
-NONE = "none of these"
 
 
 def short_ranged(longest_side: float = 2.5, truncation: int = 32) -> ScreenedSPSR:
@@ -85,6 +86,24 @@ class KnownShapes(SurfaceModel):
     def check(self, cloud: PointCloud) -> None:
         self.unknown.check(cloud)
 
+    @property
+    def hypothesises(self) -> bool:
+        """For parts at true size."""
+        return self.bank.is_true_size and self.bank.solids is not None
+
+    def in_scene(self, frame: Frame) -> "KnownShapes":
+        return dataclasses.replace(self, bank=self.bank.in_scene(frame))
+
+    def observed(self, observations: Observations) -> Observations:
+        """The observations with the `PartHypotheses` of parts at true size."""
+        if not self.hypothesises:
+            return observations
+        before = observations.hypotheses
+        assert before is None or isinstance(before, PartHypotheses)
+        return dataclasses.replace(
+            observations, hypotheses=identify(self.bank, self.poses, self.box, observations, before)
+        )
+
     def condition(self, observations: Observations | PointCloud) -> SurfacePosterior:
         """p(f | observations), the shapes registered to its cloud and to the space that was seen empty.
 
@@ -94,8 +113,15 @@ class KnownShapes(SurfaceModel):
         unknown = self.unknown.condition(observations)
         if self.bank.solids is None:
             return unknown
-        found = register(self.bank, Prior(self.poses, self.box), Seen.of(observations), self.num_starts)
-        weights = _weights(found, self.inverse_temperature, self.misfit_of_none)
+        if self.hypothesises:
+            hypotheses = (
+                self.observed(observations).hypotheses if observations.hypotheses is None else observations.hypotheses
+            )
+            assert isinstance(hypotheses, PartHypotheses)
+            found, weights = hypotheses.placed, hypotheses.weights
+        else:
+            found = register(self.bank, Prior(self.poses, self.box), Seen.of(observations), self.num_starts)
+            weights = _weights(found, self.inverse_temperature, self.misfit_of_none)
         return KnownShapesPosterior(
             jnp.zeros_like(unknown.level), self, found, weights, self.residual.condition(observations), unknown
         )

@@ -6,6 +6,7 @@ never loses its place to look-alikes, and time grows linearly with the number of
 """
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnbv.geometry.volume import Box
+from jaxnbv.surfaces.part_evidence import Rays, evidence
 from jaxnbv.surfaces.placement import Placement, ShapePoses
 from jaxnbv.surfaces.registration import Hypotheses, Prior, Seen, judged, refined, tried
 from jaxnbv.surfaces.shape_bank import ShapeBank
@@ -25,14 +27,22 @@ _PLACES = 4
 _COARSE, _FINE = (10, 48, 5), (4, 128, 10)
 # How far a part may reach beyond the box, and how far two placed parts may differ that count as one: scene units.
 _ROOM, SAME = 0.2, 0.03
-_NUM_PROBES = 4096
+_NUM_PROBES, _FEW_RAYS = 4096, 1024
+
+
+def nothing_before(dtype: Any) -> Hypotheses:
+    """Hypotheses before the first view: the first part as it is, which one start more does no harm."""
+    still = Placement(jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype), jnp.ones(3, dtype))
+    one = Hypotheses(jnp.zeros((), int), still, jnp.asarray(jnp.inf, dtype), jnp.asarray(False))
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (NUM_HYPOTHESES, *leaf.shape)), one)
 
 
 @eqx.filter_jit
 def search_parts(
-    bank: ShapeBank, poses: ShapePoses, box: Box, seen: Seen, before: Hypotheses | None, num_starts: int
+    bank: ShapeBank, poses: ShapePoses, box: Box, seen: Seen, rays: Rays | None, before: Hypotheses, num_starts: int
 ) -> Hypotheses:
-    """The 32 placed parts of least misfit, best first. Those whose surfaces are equal, by symmetry say, count once.
+    """The 32 placed parts of least misfit, best first, by rays or by E where there are none. Those whose surfaces are
+    equal, by symmetry say, count once.
 
     - `bank`: parts at true size, in scene units; `box`: what holds the object.
     - `before`: the hypotheses of the view before, which are refined and kept for as long as they fit.
@@ -43,9 +53,12 @@ def search_parts(
     starts = tried(bank, prior, _starts(bank, prior, seen, num_starts), few)
     coarse = refined(bank, prior, _best_of_each(starts, len(bank), _COARSE[0]), few, _COARSE[2])
     fine = _best_of_each(coarse, len(bank), _FINE[0])
-    if before is not None:
-        fine = jax.tree.map(lambda *rows: jnp.concatenate(rows), fine, before)
-    last = judged(bank, prior, refined(bank, prior, fine, some, _FINE[2]), seen)
+    fine = jax.tree.map(lambda *rows: jnp.concatenate(rows), fine, before)
+    last = refined(bank, prior, fine, some, _FINE[2])
+    if rays is None:
+        last = judged(bank, prior, last, seen)
+    else:
+        last = dataclasses.replace(last, misfit=evidence(bank, last, rays.first(_FEW_RAYS)))
     return _distinct(bank, box, last.best(2 * NUM_HYPOTHESES)).best(NUM_HYPOTHESES)
 
 

@@ -90,7 +90,8 @@ class ShapeBank(eqx.Module):
             "of one kind, or meshes of them (nbv.mesh_from_sdf) to ShapeBank.from_meshes",
         )
         joined = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *solids)
-        return cls(joined, _extremes(joined), encoded(names), is_true_size=is_true_size)
+        from_mesh = jnp.tile(jnp.eye(4), (len(solids), 1, 1)) if is_true_size else None
+        return cls(joined, _extremes(joined), encoded(names), from_mesh, is_true_size)
 
     @classmethod
     @checked

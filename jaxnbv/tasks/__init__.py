@@ -14,6 +14,7 @@ from jaxnbv.tasks.heat import body_temperature as body_temperature
 from jaxnbv.tasks.heat import coldest_point as coldest_point
 from jaxnbv.tasks.host import HostClassifier as HostClassifier
 from jaxnbv.tasks.host import HostSegmenter as HostSegmenter
+from jaxnbv.tasks.identification import Identify as Identify
 from jaxnbv.tasks.segmentation import Segmenter as Segmenter
 from jaxnbv.tasks.segmentation import SoftPartCount as SoftPartCount
 from jaxnbv.tasks.segmentation import part_counts as part_counts

@@ -1,0 +1,138 @@
+"""Where the likeliest part lies: its pose in the world, how sure that is, and the poses that are equally right."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.spatial.transform import Rotation
+
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.observations import Observations
+from jaxnbv.surfaces.part_hypotheses import PartHypotheses
+from jaxnbv.surfaces.part_search import SAME
+from jaxnbv.surfaces.placement import Placement
+from jaxnbv.surfaces.registration import Seen
+from jaxnbv.surfaces.shape_bank import Shape, values_and_gradients
+
+_NUM_PROBES = 4096
+# Turns about each axis of a part that may be symmetries.
+_STEP = np.radians(5.0)
+# Standard deviations of what the points say nothing of: a turn in radians, a shift in scene units.
+_UNKNOWN_TURN, _UNKNOWN_SHIFT = np.pi / np.sqrt(3.0), 1.0
+# Scene units: the part's surface is known no better on its grid. And the standard deviation of a normal distribution
+# in medians of its absolute value.
+_LEAST_ERROR, _BY_MEDIAN = 0.005, 1.4826
+
+
+class ObjectPose(eqx.Module):
+    """Where a part lies in the world.
+
+    - `name`: the part's.
+    - `matrix`: from the coordinates of the part's mesh, in world units, to the world; a rigid motion.
+    - `covariance`: of a turn (rotation vector about the part's centre, radians, the world's axes) and of the position
+      of the centre (world units): how well the points say so, if the part is right.
+    - `alternatives`: the matrices that are equally right since the part is symmetric, `matrix` first. A part that is
+      round about an axis has 72 of them, five degrees apart.
+    """
+
+    name: str
+    matrix: Float[np.ndarray, "4 4"]
+    covariance: Float[np.ndarray, "6 6"]
+    alternatives: Float[np.ndarray, "n 4 4"]
+
+
+def object_pose(hypotheses: PartHypotheses, observations: Observations, frame: Frame) -> ObjectPose:
+    """The pose of the likeliest part in the world of a frame."""
+    part, placement = hypotheses.likeliest
+    bank = hypotheses.bank
+    shape = bank.shape(jnp.asarray(part))
+    from_mesh = np.eye(4) if bank.from_mesh is None else np.asarray(bank.from_mesh[part], np.float64)
+    to_scene = _matrix(np.asarray(placement.rotation), np.asarray(placement.shift))
+    to_world = np.linalg.inv(_matrix(frame.scale * frame.rotation, -frame.scale * frame.rotation @ frame.center))
+    turns = symmetries(shape)
+    matrices = np.stack([_rigid(to_world @ to_scene @ _matrix(turn, np.zeros(3)) @ from_mesh) for turn in turns])
+    covariance = _covariance(shape, placement, Seen.of(observations))
+    back = np.kron(np.eye(2), frame.rotation.T) * np.repeat([1.0, 1.0 / frame.scale], 3)[:, None]
+    return ObjectPose(bank.names[part], matrices[0], back @ covariance @ back.T, matrices)
+
+
+def surface_error(hypotheses: PartHypotheses, observations: Observations) -> float:
+    """By how much the surface of the likeliest part may be off, in scene units: the root mean square over its surface,
+    by the errors of the points and by the other hypotheses."""
+    part, placement = hypotheses.likeliest
+    shape = hypotheses.bank.shape(jnp.asarray(part))
+    covariance = _covariance(shape, placement, Seen.of(observations))
+    points = np.asarray(placement.rotation) @ np.asarray(shape.extremes).T + np.asarray(placement.shift)[:, None]
+    off, gradient = (
+        np.asarray(rows, np.float64) for rows in _distances(hypotheses, jnp.asarray(points.T, jnp.float32))
+    )
+    # What moves along the surface does not move it.
+    rows = np.concatenate([np.cross(gradient[0], points.T - np.asarray(placement.shift)), -gradient[0]], axis=1)
+    by_points = float(np.mean(np.einsum("ni,ij,nj->n", rows, covariance, rows)))
+    by_others = float(np.asarray(hypotheses.weights, np.float64)[:-1] @ np.mean(off**2, axis=1))
+    return float(np.sqrt(by_points + by_others))
+
+
+@eqx.filter_jit
+def _distances(
+    hypotheses: PartHypotheses, points: Float[Array, "p 3"]
+) -> tuple[Float[Array, "h p"], Float[Array, "h p 3"]]:
+    """The distances of points to each hypothesis, and their gradients."""
+    solids = hypotheses.bank.shape(hypotheses.placed.shape).solid
+
+    def of_part(placed):
+        solid, placement = placed
+        return values_and_gradients(lambda x: placement.distance(solid, x), points)
+
+    return jax.lax.map(of_part, (solids, hypotheses.placed.placement))
+
+
+def symmetries(shape: Shape) -> Float[np.ndarray, "n 3 3"]:
+    """The turns about a shape's own axes, through its centre, that leave it as it is; none first. Tried are turns by
+    multiples of five degrees about each axis, and those of a cube."""
+    axes = [Rotation.from_rotvec(angle * axis) for axis in np.eye(3) for angle in np.arange(0.0, 2.0 * np.pi, _STEP)]
+    turns = np.concatenate([[one.as_matrix() for one in axes], Rotation.create_group("O").as_matrix()])
+    _, first = np.unique(np.round(turns, 6).reshape(-1, 9), axis=0, return_index=True)
+    turns = turns[np.sort(first)]
+    reach = 1.1 * float(jnp.max(jnp.linalg.norm(shape.extremes, axis=-1)))
+    probes = reach * (2.0 * np.random.default_rng(0).random((_NUM_PROBES, 3)) - 1.0)
+    is_same = _largest_change(
+        shape, jnp.asarray(turns, shape.extremes.dtype), jnp.asarray(probes, shape.extremes.dtype)
+    )
+    return turns[np.asarray(is_same) < SAME]
+
+
+@eqx.filter_jit
+def _largest_change(shape: Shape, turns: Float[Array, "n 3 3"], probes: Float[Array, "p 3"]) -> Float[Array, " n"]:
+    before = shape.solid(probes)
+
+    def change(turn):
+        return jnp.max(jnp.abs(shape.solid(jnp.matmul(probes, turn.T, precision="highest")) - before))
+
+    return jax.lax.map(change, turns)
+
+
+def _covariance(shape: Shape, placement: Placement, seen: Seen) -> Float[np.ndarray, "6 6"]:
+    """Of a turn about the part's centre and its shift, in the scene: the inverse of J^T J / s^2, J how the distances of
+    the points change, s their error."""
+    distance, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), seen.points)
+    mask = np.asarray(seen.mask)
+    distance, gradient = np.asarray(distance, np.float64)[mask], np.asarray(gradient, np.float64)[mask]
+    away = np.asarray(seen.points, np.float64)[mask] - np.asarray(placement.shift, np.float64)
+    rows = np.concatenate([np.cross(gradient, away), -gradient], axis=1)
+    error = max(_LEAST_ERROR, _BY_MEDIAN * float(np.median(np.abs(distance)))) if len(distance) else 1.0
+    unknown = np.repeat([_UNKNOWN_TURN**-2, _UNKNOWN_SHIFT**-2], 3)
+    return np.linalg.inv(rows.T @ rows / error**2 + np.diag(unknown))
+
+
+def _matrix(linear: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = linear, shift
+    return matrix
+
+
+def _rigid(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """The matrix with the rotation nearest to its linear part, which rounding has left a little off."""
+    left, _, right = np.linalg.svd(matrix[:3, :3])
+    return _matrix(left @ right, matrix[:3, 3])
