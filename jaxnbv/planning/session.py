@@ -11,8 +11,9 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray, Real
+from jaxtyping import Bool, Float, PRNGKeyArray, Real
 from tqdm import tqdm
 
 from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, checked, own_settings, require, shown
@@ -242,6 +243,7 @@ class Session:
         depth: Real[AnyArray, "height width"],
         matrix: Float[AnyArray, "4 4"] | list,
         depth_scale: float = 1.0,
+        mask: Bool[AnyArray, "height width"] | None = None,
     ) -> None:
         """Take in an image, which is stored first. A later image that measured nothing is left out with a
         `UserWarning`.
@@ -249,17 +251,25 @@ class Session:
         - `depth`: see `PointCloud.from_depth`; `depth_scale` times it is in world units: 0.001 for millimetres where
           the world is in metres.
         - `matrix`: where the camera truly was, which need not be what was proposed.
+        - `mask`: which pixels show the object, where other things are in the box too, which may hide it; by default
+          all that lie in the box.
 
         **Raises:** `ValueError` as `PointCloud.from_depth`, `Pose.from_matrix`, `Planner.init` and `observe` do, if the
         first image shows nothing of the box, an earlier image is the same bit for bit though its pose is another, or
         another process has added images to the folder. Nothing is changed then.
         """
         pixels = as_numbers(depth, "the depth image", None)
+        shows = None if mask is None else np.asarray(mask)
+        if shows is not None:
+            proper = shows.dtype == bool and shows.shape == pixels.shape
+            require(
+                proper, f"the mask is {shown(mask)}: give truths, one for each of the image's {pixels.shape} pixels"
+            )
         place = as_numbers(matrix, "the matrix of a pose", np.float64)
         count = len(self.views)
         with self._alone() as folder:
             looks_for_table = len(self.views) == 0 and self.planner.obstacles is None
-            self._add(pixels, place, depth_scale, folder)
+            self._add(pixels, place, depth_scale, folder, shows)
         if len(self.views) == count:
             warn_of_blank()
             return
@@ -323,7 +333,14 @@ class Session:
         rays = self.frame.to_scene(self.camera.strided(self.stride))
         return Loop(planner, self.key, self.until, self.frame, rays, begin=self._show)
 
-    def _add(self, depth: np.ndarray, matrix: np.ndarray, scale: float, folder: RunFolder | None) -> None:
+    def _add(
+        self,
+        depth: np.ndarray,
+        matrix: np.ndarray,
+        scale: float,
+        folder: RunFolder | None,
+        mask: Bool[np.ndarray, "height width"] | None,
+    ) -> None:
         """An image as a view, stored in the folder once the loop accepts it. The first may show what the object stands
         on, by which the planner is another."""
         index, pose, loop = len(self.views), Pose.from_matrix(matrix, self.convention), self._loop
@@ -349,6 +366,11 @@ class Session:
                 self._other_ups = other_ups(whole, self.box, self.frame.up)
             # Without a table there still are the points of D, which cameras keep clear of.
             loop = self._loop_of(dataclasses.replace(loop.planner, obstacles=self._table or Obstacles()))
+        if mask is not None:
+            rows = slice(self.stride // 2, None, self.stride)
+            cloud = cloud.only(jnp.asarray(mask[rows, rows].reshape(-1)))
+            shows_any = index > 0 or bool(cloud.mask.any())
+            require(shows_any, "the first image shows nothing of the box at the pixels of the mask")
         scan = self.frame.to_scene(cloud)
         if (obstacles := loop.planner.obstacles) is not None:
             scan = obstacles.remove_points(scan)
@@ -357,7 +379,8 @@ class Session:
             if folder is not None:
                 # Planned from images that were deleted since.
                 folder.file("proposal", index + 1).unlink(missing_ok=True)
-                folder.write("image", index, depth=depth, matrix=matrix, depth_scale=scale)
+                masked = {} if mask is None else {"mask": mask}
+                folder.write("image", index, depth=depth, matrix=matrix, depth_scale=scale, **masked)
 
         loop.add(self.frame.to_scene(pose), scan, accepted=store)
         self._loop, self._next = loop, None
@@ -373,7 +396,7 @@ class Session:
                 self._next = self._next_of(stored["proposal"], stored.get("expected_depth"))
             if index < count:
                 image = folder.read("image", index)
-                self._add(image["depth"], image["matrix"], float(image["depth_scale"]), None)
+                self._add(image["depth"], image["matrix"], float(image["depth_scale"]), None, image.get("mask"))
 
     def _next_of(self, proposal: Proposal, expected_depth: np.ndarray | None) -> NextView:
         """A proposal in the user's world."""

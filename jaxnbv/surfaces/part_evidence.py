@@ -3,13 +3,17 @@
 A ray that met the object at x, and came there through space that is empty, speaks of a placed part of signed distance d
 by how far x is from its surface, and how deep the ray went through it:
 
-    L = sum over views and rays of  l(d(x)) + l(min over the ray of min(d, 0)),   l(r) = log(1 + r^2 / 2 tau^2)
+    L = sum over rays of  l(d(x)) + l(min over the ray of min(d, 0)),   l(r) = log(1 + r^2 / 2 tau^2)
 
-without the first term for a ray that did not meet the object. No term is more than C = l(0.3): what is far off says no
-more than what is off; and none of a ray without a return is more than C_0 = -log 0.3, since dark surfaces return
-nothing. A sum lets evidence add up, where a mean would not; but rays side by side err together, so it is tempered,
+without the first term for a ray that did not meet the object. No term is more than C = l(0.12): what is far off says no
+more than what is off. A ray from which nothing came back counts where it went through a part in space that was seen to
+be empty: a sensor may miss a surface. Misfits add up, so that weights sharpen with evidence; but rays side by side err
+together, so the sum is tempered,
 
-    w_h proportional to exp(-kappa L_h),   w_0 (none of these) to exp(-kappa N e_0),   N the rays that met the object.
+    w_h proportional to exp(-kappa L_h),   w_0 (none of these) to exp(-kappa L_0),   L_0 = sum over rays of e_0 + o,
+
+over the rays that met the object, o what the best of all hypotheses leaves of l(d(x)) beyond e_0: a point that none
+explains is none of the object's, of a fifth of the points at most.
 """
 
 import math
@@ -22,21 +26,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.volume import Box, ray_interval
 from jaxnbv.observations import Observations
+from jaxnbv.scanning import Grid
 from jaxnbv.surfaces.registration import Hypotheses
 from jaxnbv.surfaces.shape_bank import ShapeBank
 
 # Scene units.
-_TAU, _FAR = 0.03, 0.3
+_TAU, _FAR = 0.03, 0.12
 MOST = math.log1p(_FAR**2 / (2.0 * _TAU**2))
-# A surface that faces a ray returns it with a probability of 0.7 or more.
-_NO_RETURN = -math.log(0.3)
 # The least stride along a ray, and how many are taken.
 _STRIDE, _NUM_STRIDES = 0.04, 40
-# All views together speak by so many rays, at most, and each as if it had a thousand.
-_NUM_RAYS, RAYS_OF_VIEW = 4096, 1000.0
-KAPPA, NONE_MISFIT = 0.08, 0.17
+# All views together speak by so many rays, at most.
+_NUM_RAYS = 4096
+# Rays that are closer together on the object err together: scene units.
+_APART = 0.12
+KAPPA, _NONE_MISFIT = 0.15, 0.17
+# The share of the points that met something else, at most.
+_STRAY = 0.2
 
 
 class Rays(NamedTuple):
@@ -44,53 +52,67 @@ class Rays(NamedTuple):
 
     - `sight`: how far each went, without end where nothing came back; zero for a row that holds none.
     - `is_object`: whether it met the object there.
-    - `weight`: how many rays of a view of a thousand each stands for.
+    - `weight`: what each counts: one, or less where rays are closer together than the errors of a surface, and more
+      where it stands for others.
+    - `empty_nodes`: of `grid`, those that were seen empty.
     """
 
     origins: Float[Array, "n 3"]
     directions: Float[Array, "n 3"]
     sight: Float[Array, " n"]
     is_object: Bool[Array, " n"]
-    weight: Float[Array, ""]
+    weight: Float[Array, " n"]
+    empty_nodes: Bool[Array, "g g g"]
+    grid: Grid
 
     @classmethod
     @eqx.filter_jit
     def of(cls, observations: Observations, box: Box) -> "Rays | None":
         """Those that enter a box; None where the observations keep no looks."""
         looks, poses = observations.looks, observations.poses
-        if looks is None:
+        if looks is None or observations.empty_nodes is None:
             return None
-        views, rays = looks.sight.shape
         origins, directions = (rows.reshape(-1, 3) for rows in looks.camera.rays(poses.rows))
-        sight = looks.sight.reshape(-1)
+        count, sight = len(origins), looks.sight.reshape(-1)
+        returned = jnp.isfinite(sight) & (sight > 0)
+        points = origins + jnp.where(returned, sight, 0.0)[:, None] * directions
+        is_object = returned & (looks(points) <= looks.grid.spacing)
+        away = jnp.sum(jnp.where(is_object, sight, 0.0)) / jnp.maximum(jnp.sum(is_object), 1)
+
         enter, leave = ray_interval(list(origins.T), list(directions.T), box.low, box.high)
         is_known = (sight > 0) & (leave > jnp.maximum(enter, 0.0))
-        order = jnp.asarray(np.random.default_rng(0).permutation(views * rays))
-        (rows,) = jnp.nonzero(is_known[order], size=_NUM_RAYS, fill_value=views * rays)
-        chosen = order.at[rows].get(mode="fill", fill_value=0)
-        sight = jnp.where(rows < views * rays, sight[chosen], 0.0)
-        origins, directions = origins[chosen], directions[chosen]
-        met = jnp.isfinite(sight) & (sight > 0)
-        points = origins + jnp.where(met, sight, 0.0)[:, None] * directions
-        is_object = met & (looks(points) <= looks.grid.spacing)
-        share = jnp.maximum(jnp.sum(is_known) / _NUM_RAYS, 1.0)
-        return cls(origins, directions, sight, is_object, share * RAYS_OF_VIEW / rays)
+        order = jnp.asarray(np.random.default_rng(0).permutation(count))
+        chosen, weight = [], []
+        for kind in (is_known & is_object, is_known & ~is_object):
+            (rows,) = jnp.nonzero(kind[order], size=_NUM_RAYS // 2, fill_value=count)
+            chosen.append(order.at[rows].get(mode="fill", fill_value=count))
+            share = jnp.maximum(2.0 * jnp.sum(kind) / _NUM_RAYS, 1.0)
+            weight.append(jnp.broadcast_to(share * jnp.minimum(weight_of(away, looks.camera), 1.0), rows.shape))
+        # One of each kind in turn, so that the first few are of both.
+        rows, weight = (jnp.stack(parts, axis=1).reshape(-1) for parts in (chosen, weight))
+        at = jnp.minimum(rows, count - 1)
+        return cls(
+            origins[at],
+            directions[at],
+            jnp.where(rows < count, sight[at], 0.0),
+            is_object[at] & (rows < count),
+            weight,
+            observations.empty_nodes,
+            looks.grid,
+        )
 
     def first(self, count: int) -> "Rays":
         """The first few, each of which stands for more."""
-        rows = (leaf[:count] for leaf in self[:4])
-        share = jnp.sum(self.sight > 0) / jnp.maximum(jnp.sum(self.sight[:count] > 0), 1)
-        return Rays(*rows, self.weight * share)
-
-    @property
-    def num_met(self) -> Float[Array, ""]:
-        """N."""
-        return self.weight * jnp.sum(self.is_object)
+        rows = [leaf[:count] for leaf in self[:5]]
+        for kind in (self.is_object, ~self.is_object):
+            share = jnp.sum(kind & (self.sight > 0)) / jnp.maximum(jnp.sum((kind & (self.sight > 0))[:count]), 1)
+            rows[4] = jnp.where(kind[:count], share * rows[4], rows[4])
+        return Rays(*rows, self.empty_nodes, self.grid)
 
 
 @eqx.filter_jit
-def evidence(bank: ShapeBank, hypotheses: Hypotheses, rays: Rays) -> Float[Array, " h"]:
-    """L of each hypothesis."""
+def evidence(bank: ShapeBank, hypotheses: Hypotheses, rays: Rays) -> tuple[Float[Array, " h"], Float[Array, ""]]:
+    """L of each hypothesis, and L_0."""
     points = rays.origins + jnp.where(rays.is_object, rays.sight, 0.0)[:, None] * rays.directions
 
     def of_part(one):
@@ -100,11 +122,21 @@ def evidence(bank: ShapeBank, hypotheses: Hypotheses, rays: Rays) -> Float[Array
             return one.placement.distance(solid, x)
 
         off = jnp.where(rays.is_object, misfit_of(distance(points)), 0.0)
-        through = misfit_of(_deepest(distance, rays))
-        through = jnp.where(jnp.isfinite(rays.sight), through, jnp.minimum(through, _NO_RETURN))
-        return rays.weight * jnp.sum(jnp.where(rays.sight > 0, off + through, 0.0))
+        through, counts = _deepest(distance, rays)
+        through = jnp.where(counts, misfit_of(through), 0.0)
+        return jnp.sum(rays.weight * jnp.where(rays.sight > 0, off + through, 0.0)), off
 
-    return jax.lax.map(of_part, hypotheses, batch_size=8)
+    misfits, off = jax.lax.map(of_part, hypotheses, batch_size=8)
+    met = jnp.where(rays.is_object, rays.weight, 0.0)
+    stray = jnp.sum(met * jnp.maximum(jnp.min(off, axis=0) - _NONE_MISFIT, 0.0))
+    return misfits, _NONE_MISFIT * jnp.sum(met) + jnp.minimum(stray, _STRAY * MOST * jnp.sum(met))
+
+
+def weight_of(away: Float[Array, ""], camera: Camera) -> Float[Array, ""]:
+    """How many independent rays a camera's ray stands for, so far from an object: its area there by that within which
+    rays err together."""
+    across, down = camera.focal_lengths
+    return away**2 / (across * down * _APART**2)
 
 
 def misfit_of(distance: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -112,14 +144,23 @@ def misfit_of(distance: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return jnp.minimum(jnp.log1p(distance**2 / (2.0 * _TAU**2)), MOST)
 
 
-def _deepest(distance: Callable[[Float[Array, "n 3"]], Float[Array, " n"]], rays: Rays) -> Float[Array, " n"]:
-    """The least signed distance along each ray, short of what it met; zero where the ray passes beside the solid."""
+def _deepest(
+    distance: Callable[[Float[Array, "n 3"]], Float[Array, " n"]], rays: Rays
+) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
+    """The least signed distance along each ray, short of what it met, zero where the ray passes beside the solid; and
+    whether the ray is known to have gone there."""
 
     def stride(state, _):
-        along, deepest = state
+        along, deepest, place = state
         here = distance(rays.origins + along[:, None] * rays.directions)
-        deepest = jnp.minimum(deepest, jnp.where(along < rays.sight - _TAU, here, 0.0))
-        return (along + jnp.maximum(jnp.abs(here), _STRIDE), deepest), None
+        is_deeper = (along < rays.sight - _TAU) & (here < deepest)
+        deepest, place = jnp.where(is_deeper, here, deepest), jnp.where(is_deeper, along, place)
+        return (along + jnp.maximum(jnp.abs(here), _STRIDE), deepest, place), None
 
-    start = jnp.zeros_like(rays.sight), jnp.zeros_like(rays.sight)
-    return jax.lax.scan(stride, start, length=_NUM_STRIDES)[0][1]
+    zero = jnp.zeros_like(rays.sight)
+    (_, deepest, place), _ = jax.lax.scan(stride, (zero, zero, zero), length=_NUM_STRIDES)
+    points = rays.origins + place[:, None] * rays.directions
+    node = jnp.round((points + rays.grid.half_extent) / rays.grid.spacing).astype(jnp.int32)
+    node = jnp.where(jnp.all(node >= 0, axis=-1, keepdims=True), node, rays.grid.resolution)
+    was_empty = rays.empty_nodes.at[tuple(node.T)].get(mode="fill", fill_value=False)
+    return deepest, jnp.isfinite(rays.sight) | was_empty

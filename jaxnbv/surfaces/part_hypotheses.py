@@ -9,15 +9,17 @@ from jaxtyping import Array, Float
 from jaxnbv.geometry.volume import Box
 from jaxnbv.observations import Observations
 from jaxnbv.scanning import Grid, GridSurface
-from jaxnbv.surfaces.part_evidence import KAPPA, NONE_MISFIT, RAYS_OF_VIEW, Rays, evidence
+from jaxnbv.surfaces.part_evidence import KAPPA, Rays, evidence
 from jaxnbv.surfaces.part_search import nothing_before, search_parts
 from jaxnbv.surfaces.placement import Placement, ShapePoses
-from jaxnbv.surfaces.registration import Hypotheses, Seen
+from jaxnbv.surfaces.registration import NUM_POINTS, Hypotheses, Seen
 from jaxnbv.surfaces.shape_bank import ShapeBank
 
 NONE = "none of these"
 # Placements that are tried with each part.
 _NUM_STARTS = 1024
+# E at which a part is as likely as none, where there is a cloud alone.
+_NONE_MISFIT = 0.6
 
 
 class PartHypotheses(eqx.Module):
@@ -75,12 +77,12 @@ def identify(
 @eqx.filter_jit
 def _weighted(bank: ShapeBank, placed: Hypotheses, rays: Rays | None) -> PartHypotheses:
     if rays is None:
-        # A cloud alone: as many rays as it has points to compare, all of which met the object.
-        misfit, count = RAYS_OF_VIEW * placed.misfit, RAYS_OF_VIEW
+        # A cloud alone: as if each of the points that were compared were a ray.
+        misfit, misfit_of_none = NUM_POINTS * placed.misfit, NUM_POINTS * _NONE_MISFIT
     else:
-        misfit, count = evidence(bank, placed, rays), rays.num_met
+        misfit, misfit_of_none = evidence(bank, placed, rays)
     misfit = jnp.where(placed.is_mode, misfit, jnp.inf)
-    weights = jax.nn.softmax(-KAPPA * jnp.append(misfit, NONE_MISFIT * count))
+    weights = jax.nn.softmax(-KAPPA * jnp.append(misfit, misfit_of_none))
     order = jnp.argsort(misfit, stable=True)
     placed = jax.tree.map(lambda rows: rows[order], placed)
     return PartHypotheses(bank, placed, jnp.append(weights[:-1][order], weights[-1]))

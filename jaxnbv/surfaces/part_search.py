@@ -58,7 +58,7 @@ def search_parts(
     if rays is None:
         last = judged(bank, prior, last, seen)
     else:
-        last = dataclasses.replace(last, misfit=evidence(bank, last, rays.first(_FEW_RAYS)))
+        last = dataclasses.replace(last, misfit=evidence(bank, last, rays.first(_FEW_RAYS))[0])
     return _distinct(bank, box, last.best(2 * NUM_HYPOTHESES)).best(NUM_HYPOTHESES)
 
 

@@ -26,7 +26,7 @@ from jaxnbv.observations import Observations
 from jaxnbv.surfaces.placement import Placement, ShapePoses
 from jaxnbv.surfaces.shape_bank import Shape, ShapeBank, values_and_gradients
 
-_NUM_POINTS, _NUM_EMPTY = 256, 512
+NUM_POINTS, _NUM_EMPTY = 256, 512
 _MARGIN = 0.05
 _FIRST_TAU, _LAST_TAU = 0.12, 0.03
 # Standard deviations of shift (scene units) and of the logarithm of the scale about what fills the box, and what this
@@ -54,7 +54,7 @@ class Seen(NamedTuple):
     def of(cls, observations: Observations) -> "Seen":
         """Some of the cloud, by farthest point sampling, and some of the nodes seen empty, or within obstacles, at
         random."""
-        cloud = farthest_point_subsample(observations.cloud, _NUM_POINTS)
+        cloud = farthest_point_subsample(observations.cloud, NUM_POINTS)
         empty, is_empty = _some_empty(observations)
         return cls(cloud.points, cloud.normals, cloud.mask, empty.astype(cloud.points.dtype), is_empty)
 

@@ -17,7 +17,7 @@ from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import Grid, GridSurface, scan
 from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.sharding import shared_map
-from jaxnbv.surfaces.part_evidence import KAPPA, MOST, RAYS_OF_VIEW, misfit_of
+from jaxnbv.surfaces.part_evidence import KAPPA, MOST, misfit_of
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.utility import Quantity
 
@@ -100,7 +100,7 @@ class Identify(Acquisition):
         at_once = samples_at_once(camera, poses)
         images = shared_map(_image, context.surfaces, camera, poses, barrier, at_once=at_once)
         by_pose = jax.tree.map(lambda rows: jnp.moveaxis(rows, 1, 0), images)
-        return shared_map(_information, by_pose, context.weights, context.classes)[None]
+        return shared_map(_information, by_pose, context.weights, context.classes, camera)[None]
 
     @property
     def quantity(self) -> Quantity:
@@ -117,11 +117,16 @@ def _image(surface: GridSurface, camera: Camera, poses: Pose, barrier: Float[Arr
     return away, cosine, scans.mask
 
 
-def _information(images: _Image, weights: Float[Array, " h"], classes: Float[Array, "h c"]) -> Float[Array, ""]:
+def _information(
+    images: _Image, weights: Float[Array, " h"], classes: Float[Array, "h c"], camera: Camera
+) -> Float[Array, ""]:
     """The information of one pose, given the images of all hypotheses from there."""
 
+    reach, _, hits = images
+    weight = weight_of(jnp.sum(jnp.where(hits, reach, 0.0)) / jnp.maximum(jnp.sum(hits), 1), camera)
+
     def after(image):
-        misfit = RAYS_OF_VIEW * jnp.mean(_misfits(image, images), axis=-1)
+        misfit = weight * jnp.sum(_misfits(image, images), axis=-1)
         return jax.nn.softmax(jnp.log(weights) - KAPPA * misfit)
 
     left = entropy(jnp.matmul(jax.lax.map(after, images), classes, precision="highest"))
