@@ -17,14 +17,14 @@ from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import Grid, GridSurface, scan
 from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.sharding import shared_map
-from jaxnbv.surfaces.part_evidence import KAPPA, MOST, misfit_of
+from jaxnbv.surfaces.part_evidence import KAPPA, MOST, misfit_of, weight_of
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.utility import Quantity
 
 # Hypotheses that are imagined, and the nodes along an axis of their surfaces.
 _NUM_IMAGINED, _RESOLUTION = 24, 64
 # How far each ray goes to a part, the cosine of its incidence, and whether it meets the part.
-_Image: TypeAlias = tuple[Float[Array, "*batch rays"], Float[Array, "*batch rays"], Bool[Array, "*batch rays"]]
+_Image: TypeAlias = tuple[Float[Array, "..."], Float[Array, "..."], Bool[Array, "..."]]
 
 
 class ImaginedParts(eqx.Module):

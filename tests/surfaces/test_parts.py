@@ -1,0 +1,210 @@
+"""Parts at true size: their bank, how well they explain rays, which of them it is, and where it lies."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+import jaxnbv as nbv
+from jaxnbv.scanning.sdf import Cuboid, Cylinder, Sphere, Translated, Union
+from jaxnbv.surfaces.part_evidence import Rays, evidence
+from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses, identify
+from jaxnbv.surfaces.part_pose import object_pose, surface_error, symmetries
+from jaxnbv.surfaces.placement import Placement
+from jaxnbv.surfaces.registration import Hypotheses
+from jaxnbv.surfaces.shape_bank import Shape
+
+CAMERA = nbv.Camera(height=40, width=40, fov=1.0)
+GRID = nbv.Grid(48)
+
+
+def lamp(arm):
+    """Two boxes and a ball, without any symmetry."""
+    boxes = Union(
+        Cuboid(np.array([0.9, 0.3, 0.4])), Translated(Cuboid(np.array([0.2, arm, 0.25])), np.array([0.6, 0.5, 0.1]))
+    )
+    return Union(boxes, Translated(Sphere(0.3), np.array([-0.6, 0.2, 0.3])))
+
+
+ARMS = (0.4, 0.65, 0.9)
+BANK = nbv.ShapeBank.of([lamp(arm) for arm in ARMS], [f"arm {arm}" for arm in ARMS], is_true_size=True)
+TURN, SHIFT = Rotation.from_rotvec([0.4, -1.1, 0.7]), np.array([0.1, -0.15, 0.05])
+
+
+def observations_of(surface, positions, sampler=None, noise=0.005):
+    sampler = sampler or nbv.SurfaceSampler(grid=GRID)
+    planner = nbv.Planner(nbv.Coverage(), camera=CAMERA, sampler=sampler, capacity=512, max_views=4)
+    observations = None
+    for index, position in enumerate(positions):
+        pose = nbv.look_at(position)
+        scan = nbv.SensorNoise(noise, noise)(nbv.scan(surface, CAMERA, pose), jax.random.key(index))
+        observations = planner.init(pose, scan) if observations is None else planner.observe(observations, pose, scan)
+    return observations
+
+
+def placed(indices, placements, misfits=None):
+    misfits = jnp.zeros(len(indices)) if misfits is None else jnp.asarray(misfits)
+    rows = jax.tree.map(lambda *leaves: jnp.stack(leaves), *placements)
+    return Hypotheses(jnp.asarray(indices), rows, misfits, jnp.ones(len(indices), bool))
+
+
+def still(shift=(0.0, 0.0, 0.0)):
+    return Placement(jnp.eye(3), jnp.asarray(shift, jnp.float32), jnp.ones(3))
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("parts")
+    trimesh.creation.box((40.0, 60.0, 100.0)).apply_translation((5.0, -20.0, 300.0)).export(folder / "box.stl")
+    trimesh.creation.icosphere(2, 25.0).export(folder / "ball.ply")
+    return folder
+
+
+def test_a_bank_keeps_true_sizes(meshes):
+    """Vertices of a mesh in millimetres lie on its shape, in metres, and in a scene at the scene's scale."""
+    bank = nbv.ShapeBank.from_meshes(meshes, resolution=24, progress=False, scale="mm")
+    assert bank.names == ("ball", "box")
+    assert bank.is_true_size
+    assert np.asarray(bank.extremes[1]).max(axis=0) == pytest.approx([0.02, 0.03, 0.05], abs=1e-6)
+    for scaled, factor in ((bank, 1.0), (bank.in_scene(nbv.Frame(scale=8.0)), 8.0)):
+        mesh = trimesh.load(meshes / "box.stl")
+        on_faces = mesh.triangles_center * 1.0
+        own = np.asarray(scaled.from_mesh[1]) @ np.c_[on_faces, np.ones(len(on_faces))].T
+        assert own[:3].max(axis=1) == pytest.approx(factor * np.array([0.02, 0.03, 0.05]), rel=1e-5)
+        assert np.asarray(scaled.shape(jnp.asarray(1)).solid(jnp.asarray(own[:3].T))) == pytest.approx(
+            0.0, abs=2e-3 * factor
+        )
+    assert bank.chosen([1]).is_true_size
+    without = nbv.ShapeBank.from_meshes(meshes, resolution=24, progress=False)
+    assert not without.is_true_size
+    assert without.in_scene(nbv.Frame(scale=8.0)) is without
+
+
+@pytest.mark.parametrize("scale", ["yard", 0.0, -1.0, float("nan")])
+def test_other_units_are_refused(meshes, scale):
+    with pytest.raises(nbv.InputError, match="unit"):
+        nbv.ShapeBank.from_meshes(meshes, resolution=24, progress=False, scale=scale)
+
+
+def test_misfit_of_rays_to_a_ball():
+    """Hits of a ball lie 0.04 from the surface of a larger one, and pass through it by as much: a closed form."""
+    observations = observations_of(nbv.SDFSurface(Sphere(0.8)), [(0.0, 0.0, 3.0)], noise=0.0)
+    rays = Rays.of(observations, nbv.Box())
+    bank = nbv.ShapeBank.of([Sphere(0.8), Sphere(0.84), Sphere(0.76)], is_true_size=True)
+    misfits, none = evidence(bank, placed([0, 1, 2], [still()] * 3), rays)
+    met = float(jnp.sum(rays.weight * rays.is_object))
+    each = float(np.log1p(0.04**2 / (2 * 0.03**2)))
+    assert met > 20
+    assert float(misfits[0]) == pytest.approx(0.0, abs=1e-3 * met)
+    # The smaller ball is only missed; the larger is gone through as well, up to tau before the hit.
+    assert float(misfits[2]) == pytest.approx(each * met, rel=0.02)
+    assert each * met < float(misfits[1]) < 2.0 * each * met + 0.1 * met
+    assert float(none) == pytest.approx(0.17 * met, rel=0.01)
+
+
+def test_silence_is_no_evidence_against_a_part():
+    """Rays without a return cost nothing where no view has seen space to be empty."""
+    observations = observations_of(nbv.SDFSurface(Sphere(0.8)), [(0.0, 0.0, 3.0)], noise=0.0)
+    beside = nbv.ShapeBank.of([Translated(Sphere(0.3), np.array([0.0, 1.0, 0.0]))], is_true_size=True)
+    unknown = dataclasses.replace(observations, empty_nodes=jnp.zeros_like(observations.empty_nodes))
+    (silent,), _ = evidence(beside, placed([0], [still()]), Rays.of(unknown, nbv.Box()))
+    (seen,), _ = evidence(beside, placed([0], [still()]), Rays.of(observations, nbv.Box()))
+    rays = Rays.of(observations, nbv.Box())
+    assert float(silent) < float(seen)
+    assert float(seen) - float(silent) > 5.0 * float(rays.weight.min())
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """The second lamp from two sides, and what is thought of it after each view."""
+    turned = lamp(ARMS[1]).rotate(TURN.as_rotvec(), float(np.linalg.norm(TURN.as_rotvec()))).translate(SHIFT)
+    sampler = nbv.SurfaceSampler(grid=GRID).with_bank(BANK, nbv.surfaces.FreeRotation())
+    surface = nbv.SDFSurface(turned)
+    return [
+        observations_of(surface, positions, sampler)
+        for positions in ([(0.5, 1.0, 3.4)], [(0.5, 1.0, 3.4), (-2.2, 1.5, -2.2)])
+    ]
+
+
+def test_a_part_is_named_and_placed(seen):
+    for observations in seen:
+        hypotheses = observations.hypotheses
+        names = hypotheses.names()
+        assert next(iter(names)) == "arm 0.65"
+        assert sum(names.values()) == pytest.approx(1.0, abs=1e-5)
+    assert names["arm 0.65"] > 0.95
+    pose = object_pose(hypotheses, seen[1], nbv.Frame())
+    assert pose.name == "arm 0.65"
+    off = Rotation.from_matrix(pose.matrix[:3, :3] @ TURN.as_matrix().T).magnitude()
+    assert np.degrees(off) < 2.0
+    assert pose.matrix[:3, 3] == pytest.approx(SHIFT, abs=0.02)
+    assert len(pose.alternatives) == 1
+    # What it says of its errors is of the size of its errors.
+    assert 0.0005 < np.sqrt(np.diag(pose.covariance)).min() < np.sqrt(np.diag(pose.covariance)).max() < 0.05
+    assert surface_error(hypotheses, seen[1]) < 0.03
+
+
+def test_the_pose_is_of_the_world_and_of_the_mesh(seen):
+    """In a world that is turned, shifted and scaled, the same matrix follows by composition."""
+    frame = nbv.Frame(scale=5.0, center=(1.0, 2.0, 3.0), up="z")
+    in_scene = object_pose(seen[1].hypotheses, seen[1], nbv.Frame())
+    in_world = object_pose(seen[1].hypotheses, seen[1], frame)
+    corner = np.array([0.9, 0.3, 0.4])
+    point = in_scene.matrix[:3, :3] @ corner + in_scene.matrix[:3, 3]
+    assert in_world.matrix[:3, :3] @ (corner / 5.0) + in_world.matrix[:3, 3] == pytest.approx(
+        np.asarray(frame.to_world(point)), abs=0.2
+    )
+    assert np.linalg.det(in_world.matrix[:3, :3]) == pytest.approx(1.0)
+    error = np.sqrt(np.trace(in_world.covariance[3:, 3:])) * 5.0
+    assert error == pytest.approx(np.sqrt(np.trace(in_scene.covariance[3:, 3:])), rel=1e-4)
+
+
+def test_hypotheses_are_kept_and_the_same_by_the_same_views(seen):
+    again = identify(BANK, nbv.surfaces.FreeRotation(), nbv.Box(), seen[0], None)
+    assert eqx.tree_equal(again.placed.shape, seen[0].hypotheses.placed.shape)
+    carried = identify(BANK, nbv.surfaces.FreeRotation(), nbv.Box(), seen[0], again)
+    best = float(carried.placed.misfit.min())
+    assert best <= float(again.placed.misfit.min()) * 1.1 + 1.0
+
+
+def test_none_of_these():
+    """A ball is no lamp."""
+    sampler = nbv.SurfaceSampler(grid=GRID).with_bank(BANK, nbv.surfaces.FreeRotation())
+    ball = nbv.SDFSurface(Sphere(1.1))
+    observations = observations_of(ball, [(0.5, 1.0, 3.4), (-2.2, 1.5, -2.2)], sampler)
+    assert observations.hypotheses.names()[NONE] > 0.95
+
+
+@pytest.mark.parametrize(
+    ("solid", "number"),
+    [
+        (Cuboid(np.ones(3)), 24),
+        (Cuboid(np.array([1.0, 0.8, 0.6])), 4),
+        (Cuboid(np.array([1.0, 0.6, 0.6])), 8),
+        (Cylinder(0.5, 1.0), 144),
+        (lamp(0.5), 1),
+    ],
+    ids=["cube", "brick", "square bar", "cylinder", "lamp"],
+)
+def test_symmetries(solid, number):
+    """The rotation groups of these solids; a cylinder's at steps of five degrees, either way up."""
+    directions = np.asarray(Rotation.random(64, random_state=0).as_matrix())[:, :, 0]
+    turns = symmetries(Shape(solid, jnp.asarray(1.5 * directions)))
+    assert len(turns) == number
+    assert turns[0] == pytest.approx(np.eye(3))
+
+
+def test_covariance_of_a_ball():
+    """Nothing says how a ball is turned; its place is known as by so many points, each along its normal."""
+    observations = observations_of(nbv.SDFSurface(Sphere(0.8)), [(0.0, 0.0, 3.0), (0.0, 0.0, -3.0)], noise=0.02)
+    bank = nbv.ShapeBank.of([Sphere(0.8)], is_true_size=True)
+    hypotheses = PartHypotheses(bank, placed([0], [still()]), jnp.array([1.0, 0.0]))
+    covariance = object_pose(hypotheses, observations, nbv.Frame()).covariance
+    assert np.diag(covariance)[:3] == pytest.approx(np.pi**2 / 3.0, rel=1e-3)
+    # 256 points all around: the variance of each coordinate is about 3 / 256 of that of a point.
+    assert np.diag(covariance)[3:] == pytest.approx(3.0 * 0.02**2 / 256, rel=0.6)

@@ -1,0 +1,115 @@
+"""Information about which part it is: of views that tell, and of views that do not."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxnbv as nbv
+from jaxnbv.observations import Observations
+from jaxnbv.sampler import StepInputs
+from jaxnbv.scanning.sdf import Cuboid, Translated, Union
+from jaxnbv.surfaces.part_hypotheses import PartHypotheses
+from jaxnbv.surfaces.placement import Placement
+from jaxnbv.surfaces.registration import Hypotheses
+from jaxnbv.tasks.identification import entropy
+
+CAMERA = nbv.Camera(height=24, width=24, fov=1.0)
+GRID = nbv.Grid(48)
+
+
+def block(height, side):
+    """A block with a boss on top, to either side."""
+    boss = Translated(Cuboid(np.array([0.25, height, 0.25])), np.array([side, 0.4 + height, 0.0]))
+    return Union(Cuboid(np.array([1.0, 0.4, 0.8])), boss)
+
+
+BANK = nbv.ShapeBank.of(
+    [block(0.05, 0.4), block(0.3, 0.4), block(0.05, -0.4)], ["low", "high", "other"], is_true_size=True
+)
+ABOVE, BELOW = nbv.look_at((0.3, 3.2, 0.4)), nbv.look_at((0.0, -3.2, 0.3))
+
+
+def step(weights, shapes=(0, 1, 2), turns=None):
+    count = len(shapes)
+    turns = np.tile(np.eye(3), (count, 1, 1)) if turns is None else turns
+    placement = Placement(jnp.asarray(turns, jnp.float32), jnp.zeros((count, 3)), jnp.ones((count, 3)))
+    placed = Hypotheses(jnp.asarray(shapes), placement, jnp.zeros(count), jnp.ones(count, bool))
+    cloud = nbv.PointCloud(jnp.zeros((4, 3)), jnp.ones((4, 3)), jnp.ones(4, bool))
+    hypotheses = PartHypotheses(BANK, placed, jnp.asarray([*weights, 0.0]))
+    observations = Observations.start(cloud, 2, GRID, camera=CAMERA)
+    observations = Observations(
+        *(getattr(observations, name) for name in ("cloud", "poses", "grid", "looks", "empty_nodes", "obstacle_nodes")),
+        hypotheses,
+    )
+    return StepInputs(observations, None, hypotheses.surfaces(GRID, 1))
+
+
+def information(acquisition, weights, poses, **changed):
+    inputs = step(weights, **changed)
+    batch = jax.tree.map(lambda *rows: jnp.stack(rows), *poses)
+    return np.asarray(nbv.expected_value(acquisition, inputs, inputs.surfaces, CAMERA, batch))
+
+
+def test_a_view_is_worth_what_it_tells():
+    """From below the blocks are equal; from above a view tells them apart: all of the entropy, in nats."""
+    above, below = information(nbv.Identify(), (0.5, 0.5, 0.0), (ABOVE, BELOW))
+    assert above == pytest.approx(np.log(2.0), rel=0.02)
+    assert below == pytest.approx(0.0, abs=1e-3)
+    above, below = information(nbv.Identify(), (0.25, 0.25, 0.5), (ABOVE, BELOW))
+    assert above == pytest.approx(1.5 * np.log(2.0), rel=0.02)
+    assert below == pytest.approx(0.0, abs=1e-3)
+
+
+def test_names_poses_and_groups():
+    """A block that may be turned end to end is the other one for its name, not for its pose."""
+    half_turn = np.array([np.eye(3), np.diag([-1.0, 1.0, -1.0]), np.eye(3)])
+    weights, shapes = (0.4, 0.4, 0.2), (0, 0, 1)
+    by_pose, by_name, by_group = (
+        information(acquisition, weights, (ABOVE,), shapes=shapes, turns=half_turn)[0]
+        for acquisition in (
+            nbv.Identify(),
+            nbv.Identify(pose=False),
+            nbv.Identify(group=["block", "block", "other"]),
+        )
+    )
+    names = float(entropy(jnp.array([0.8, 0.2])))
+    assert by_pose == pytest.approx(float(entropy(jnp.array(weights))), rel=0.02)
+    assert by_name == pytest.approx(names, rel=0.02)
+    assert by_group == pytest.approx(0.0, abs=1e-3)
+
+
+def test_derivative_in_the_pose():
+    """Information changes smoothly where a boss comes into sight, as finite differences say."""
+    inputs = step((0.5, 0.5, 0.0))
+    context = nbv.Identify().context(inputs)
+
+    def value(angle):
+        pose = nbv.look_at(3.2 * jnp.stack([jnp.sin(angle), jnp.cos(angle), 0.1]))
+        return nbv.Identify().sample_scores(context, inputs.surfaces, CAMERA, pose[None])[0, 0]
+
+    slope = jax.grad(value)(jnp.asarray(1.2))
+    assert np.isfinite(float(slope))
+
+
+def test_what_it_needs():
+    with pytest.raises(nbv.InputError, match="knows none"):
+        nbv.Planner(nbv.Identify())
+    with pytest.raises(nbv.InputError, match="2 names for 3 parts"):
+        information(nbv.Identify(group=["a", "b"]), (0.5, 0.5, 0.0), (ABOVE,))
+    with pytest.raises(nbv.InputError, match="no hypotheses"):
+        nbv.Identify().context(StepInputs(Observations.start(step((1.0, 0.0, 0.0)).observations.cloud)))
+
+
+def test_an_episode_ends_once_the_part_is_known():
+    """The planner, its proposal, and the rules, in a simulation."""
+    planner = nbv.Planner.for_parts(BANK)
+    scene = nbv.SDFSurface(block(0.3, 0.4))
+    until = nbv.Identified(0.9) | nbv.Placed(0.001)
+    episode = nbv.simulate(
+        planner, scene, BELOW, 3, jax.random.key(0), nbv.SensorNoise(0.005, 0.005), progress=False, until=until
+    )
+    assert episode.stopped is not None
+    assert "high" in episode.stopped
+    assert len(episode.views) <= 3
+    assert float(episode.views[1].proposal.value) > 0.2
