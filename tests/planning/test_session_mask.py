@@ -1,0 +1,57 @@
+"""Images of which some pixels show the object, and others things beside it."""
+
+import numpy as np
+import pytest
+
+import jaxnbv as nbv
+from small_session import FIRST, POSES, session_of, shot
+
+
+def left_half(image):
+    mask = np.zeros(image.shape, bool)
+    mask[:, :34] = True
+    return mask
+
+
+def test_points_are_those_of_the_mask(tmp_path):
+    """The cloud of a mask is that of the whole image where the mask is true; a stored session is the same."""
+    whole, masked = session_of(), session_of(tmp_path)
+    image = shot(FIRST)
+    whole.add(image, FIRST, 1e-3)
+    masked.add(image, FIRST, 1e-3, left_half(image))
+    pose, camera = np.linalg.inv(FIRST), whole.camera
+    points = np.asarray(whole.cloud.to_numpy()[0], np.float64)
+    column = camera.to_pixels(
+        (points @ pose[:3, :3].T + pose[:3, 3])[:, :2] / (points @ pose[:3, :3].T + pose[:3, 3])[:, 2:]
+    )[:, 0]
+    kept = np.asarray(masked.cloud.to_numpy()[0], np.float64)
+    # Points are fitted planes' and may cross the middle by less than a pixel.
+    expected = int(np.sum(np.asarray(column) < 34.0))
+    assert len(kept) == pytest.approx(expected, abs=4)
+    assert 0 < len(kept) < len(points)
+    # Where others are, the rays have ended all the same.
+    assert np.array_equal(np.asarray(masked.observations.looks.sight), np.asarray(whole.observations.looks.sight))
+    again = nbv.Session.load(tmp_path, progress=False)
+    assert np.array_equal(again.cloud.to_numpy()[0], masked.cloud.to_numpy()[0])
+
+
+@pytest.mark.parametrize("mask", [np.ones((4, 4), bool), np.ones((48, 64))], ids=["another size", "numbers"])
+def test_what_is_no_mask_is_refused(mask):
+    with pytest.raises(nbv.InputError, match="the mask is"):
+        session_of().add(shot(FIRST), FIRST, 1e-3, mask)
+
+
+def test_a_first_mask_of_nothing_is_refused():
+    session, image = session_of(), shot(FIRST)
+    with pytest.raises(nbv.InputError, match="at the pixels of the mask"):
+        session.add(image, FIRST, 1e-3, np.zeros(image.shape, bool))
+    assert len(session.views) == 0
+    session.add(image, FIRST, 1e-3)
+    session.add(shot(POSES[1]), POSES[1], 1e-3, np.zeros(image.shape, bool))
+
+
+def test_a_planner_without_parts_names_none():
+    session = session_of()
+    session.add(shot(FIRST), FIRST, 1e-3)
+    with pytest.raises(nbv.InputError, match="knows no parts"):
+        session.identity  # noqa: B018
