@@ -243,7 +243,7 @@ class Session:
         depth: Real[AnyArray, "height width"],
         matrix: Float[AnyArray, "4 4"] | list,
         depth_scale: float = 1.0,
-        mask: Bool[AnyArray, "height width"] | None = None,
+        mask: AnyArray | None = None,
     ) -> None:
         """Take in an image, which is stored first. A later image that measured nothing is left out with a
         `UserWarning`.

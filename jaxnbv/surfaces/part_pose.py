@@ -33,7 +33,7 @@ class ObjectPose(eqx.Module):
     - `covariance`: of a turn (rotation vector about the part's centre, radians, the world's axes) and of the position
       of the centre (world units): how well the points say so, if the part is right.
     - `alternatives`: the matrices that are equally right since the part is symmetric, `matrix` first. A part that is
-      round about an axis has 72 of them, five degrees apart.
+      round about an axis has 72 of them, five degrees apart, or 144 if its ends are equal.
     """
 
     name: str
@@ -90,17 +90,19 @@ def _distances(
 
 def symmetries(shape: Shape) -> Float[np.ndarray, "n 3 3"]:
     """The turns about a shape's own axes, through its centre, that leave it as it is; none first. Tried are turns by
-    multiples of five degrees about each axis, and those of a cube."""
-    axes = [Rotation.from_rotvec(angle * axis) for axis in np.eye(3) for angle in np.arange(0.0, 2.0 * np.pi, _STEP)]
-    turns = np.concatenate([[one.as_matrix() for one in axes], Rotation.create_group("O").as_matrix()])
-    _, first = np.unique(np.round(turns, 6).reshape(-1, 9), axis=0, return_index=True)
-    turns = turns[np.sort(first)]
+    multiples of five degrees about each axis, those of a cube, and both in turn."""
+    vectors = [angle * axis for axis in np.eye(3) for angle in np.arange(0.0, 2.0 * np.pi, _STEP)]
+    about_axes, of_cube = Rotation.from_rotvec(vectors).as_matrix(), Rotation.create_group("O").as_matrix()
+    turns = np.concatenate([about_axes, of_cube])
     reach = 1.1 * float(jnp.max(jnp.linalg.norm(shape.extremes, axis=-1)))
     probes = reach * (2.0 * np.random.default_rng(0).random((_NUM_PROBES, 3)) - 1.0)
-    is_same = _largest_change(
-        shape, jnp.asarray(turns, shape.extremes.dtype), jnp.asarray(probes, shape.extremes.dtype)
-    )
-    return turns[np.asarray(is_same) < SAME]
+    change = _largest_change(shape, jnp.asarray(turns, shape.extremes.dtype), jnp.asarray(probes, shape.extremes.dtype))
+    is_symmetry = np.asarray(change) < SAME
+    left, right = about_axes[is_symmetry[: len(about_axes)]], of_cube[is_symmetry[len(about_axes) :]]
+    # One after another they are symmetries too.
+    both = np.einsum("aij,bjk->abik", left, right).reshape(-1, 3, 3)
+    _, first = np.unique(np.round(both, 6).reshape(-1, 9) + 0.0, axis=0, return_index=True)
+    return both[np.sort(first)]
 
 
 @eqx.filter_jit

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from small_session import FIRST, POSES, session_of, shot
 
 import jaxnbv as nbv
-from small_session import FIRST, POSES, session_of, shot
 
 
 def left_half(image):
