@@ -1,5 +1,6 @@
 """Recorded sequences of depth images with poses: 7-Scenes, TUM RGB-D, and a plain JSON file."""
 
+import functools
 import json
 import math
 import os
@@ -18,6 +19,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import rigid_matrices
 from jaxnbv.readers.depth_unit import depth_unit
 from jaxnbv.readers.intrinsics import intrinsic_matrix, stored_intrinsics
+from jaxnbv.readers.own_parts import own_parts
 from jaxnbv.readers.text_files import read_rows, read_table, read_text
 
 # In seconds: an image and a pose of a TUM sequence that lie farther apart are not of one moment.
@@ -64,7 +66,8 @@ class RecordedFrames:
 
     `camera` is the sensor and `matrices` (n, 4, 4) its poses, OpenCV axes, in world units; `depth_scale` times an image
     is in these. Add frame i to a session by `session.add(frames.depth(i), frames.matrices[i], frames.depth_scale)`.
-    A frame whose pose was lost (not finite, zeros, or no rotation) is left out with a `UserWarning`.
+    A frame whose pose was lost (not finite, zeros, or no rotation) is left out with a `UserWarning`, and so is what the
+    camera sees of its own mount: a gripper is at the same place of all images.
 
     **Raises:** `ValueError` if the folder holds none of these, or what is missing or damaged in it; if the intrinsics
     are not there, or the frames cannot tell the unit; if most poses are none.
@@ -103,9 +106,9 @@ class RecordedFrames:
         matrix = stored_intrinsics(folder) if matrix is None else matrix
         if matrix is None:
             raise InputError(f"nothing in {folder} says the intrinsics of its depth camera: {_ASK_INTRINSICS}")
-        self.camera = Camera.from_intrinsics(matrix, *self.depth(0).shape)
+        self.camera = Camera.from_intrinsics(matrix, *self._stored(0).shape)
         scale = layout.depth_scale if depth_scale is None else depth_scale
-        scale = depth_unit(self.depth, self.matrices, self.camera) if scale is None else scale
+        scale = depth_unit(self._stored, self.matrices, self.camera) if scale is None else scale
         if scale is None:
             raise InputError(f"the frames of {folder} cannot tell the unit of their depths: {_ASK_UNIT}")
         require(0 < scale < 100, f"the depth scale is {shown(scale)}, which is no length of a unit: {_ASK_UNIT}")
@@ -115,10 +118,29 @@ class RecordedFrames:
         return len(self.files)
 
     def depth(self, index: int) -> UInt16[np.ndarray, "height width"]:
-        """A depth image, in its own units; 0 where nothing was measured.
+        """A depth image, in its own units; 0 where nothing of the scene was measured.
 
         **Raises:** `ValueError` for no frame, or an image that cannot be read or is no image of depths.
         """
+        pixels = self._stored(index)
+        # One of another size is refused where it is used.
+        is_own = pixels <= self._own_parts if pixels.shape == self._own_parts.shape else False
+        return np.where(is_own, 0, pixels).astype(np.uint16)
+
+    @functools.cached_property
+    def _own_parts(self) -> Float[np.ndarray, "height width"]:
+        parts = own_parts(self._stored, self.matrices, self.camera, self.depth_scale)
+        if parts.any():
+            warnings.warn(
+                f"{np.mean(parts > 0):.0%} of the image show the same in the frames of {self.folder} wherever the "
+                f"camera is, up to {self.depth_scale * parts.max():.3g} from it: parts of the camera's mount, which "
+                "are left out",
+                stacklevel=4,
+            )
+        return parts
+
+    def _stored(self, index: int) -> UInt16[np.ndarray, "height width"]:
+        """A depth image as it is in its file, 0 where nothing was measured."""
         require(0 <= index < len(self), f"there is no frame {index}: {self.folder} has {len(self)}, counted from 0")
         file = self.files[index]
         try:

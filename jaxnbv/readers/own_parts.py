@@ -1,0 +1,121 @@
+"""What a recording's camera sees of its own mount, such as a gripper: it moves with the camera, and is in no scene."""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt16
+from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from jaxnbv.geometry.camera import Camera
+
+# Frames that are compared, and blocks along the longer side of an image.
+_FRAMES, _FEWEST, _BLOCKS = 16, 4, 80
+# Depths that differ by less, as a share of them, are equal; of a part's own blocks, and of two frames' surfaces.
+_EQUAL, _ALIKE = 0.02, 0.05
+# What is near a block of a part in the image, and no farther than by this factor, is of the same part.
+_OF_PART = 1.1
+# How many times as often a part was looked through as found again where it was.
+_CLEAR = 4
+
+
+def own_parts(
+    image: Callable[[int], UInt16[np.ndarray, "h w"]],
+    matrices: Float[np.ndarray, "n 4 4"],
+    camera: Camera,
+    scale: float,
+) -> Float[np.ndarray, "h w"]:
+    """Depths, in units of the images, up to which a pixel shows a part of the camera's mount; zero where it shows none.
+
+    A part is what most frames show at the same place of the image and at the same depth, though the camera has moved:
+    where one frame shows it in the world, others see something deeper. A vase in the middle of an orbit has equal
+    depths too, but the other frames see it at the same place of the world.
+
+    - `image`: the depth image of a frame, 0 where nothing was measured. `scale`: the length of a unit.
+    - `matrices`: of the frames, camera to world, OpenCV's axes.
+    """
+    asked = np.unique(np.linspace(0, len(matrices) - 1, _FRAMES).astype(int))
+    side = -(-max(camera.height, camera.width) // _BLOCKS)
+    images = {int(frame): image(int(frame)) for frame in asked}
+    frames = [frame for frame, depth in images.items() if depth.shape == (camera.height, camera.width)]
+    depths = np.stack([_nearest_of_blocks(images[frame], side) for frame in frames])
+    measured = depths > 0
+    often = (2 * measured.sum(axis=0) >= len(frames)) & (measured.sum(axis=0) >= _FEWEST)
+    rows = np.where(measured & often, depths, np.nan)[:, often]
+    part = np.zeros(depths.shape[1:])
+    if rows.size:
+        low, middle, high = np.nanpercentile(rows, [10, 50, 90], axis=0)
+        part[often] = np.where(high - low < _EQUAL * middle, middle, 0.0)
+    if part.any():
+        part = np.where(_is_looked_through(scale * part, scale * depths, matrices[frames], camera, side), part, 0.0)
+    reach = _OF_PART * maximum_filter(part, 3)
+    return np.kron(reach, np.ones((side, side)))[: camera.height, : camera.width]
+
+
+def _nearest_of_blocks(image: UInt16[np.ndarray, "h w"], side: int) -> Float[np.ndarray, "k l"]:
+    """The least depth in each block of `side` pixels; zero where there is none."""
+    image = np.pad(image, [(0, -size % side) for size in image.shape]).astype(float)
+    blocks = np.where(image > 0, image, np.inf).reshape(image.shape[0] // side, side, image.shape[1] // side, side)
+    least = blocks.min(axis=(1, 3))
+    return np.where(np.isfinite(least), least, 0.0)
+
+
+def _is_looked_through(
+    part: Float[np.ndarray, "k l"],
+    depths: Float[np.ndarray, "n k l"],
+    matrices: Float[np.ndarray, "n 4 4"],
+    camera: Camera,
+    side: int,
+) -> Bool[np.ndarray, "k l"]:
+    """Which connected pieces of a part, whose depth is positive, other frames look through where one frame shows them.
+
+    - `depths`: of the blocks of all frames; all depths in the world's unit.
+    """
+    row, column = np.nonzero(part)
+    own, count = _pieces(part)
+    (fx, skew, cx), (_, fy, cy), _ = np.asarray(camera.intrinsics, float)
+    down = (side * (row + 0.5) - cy) / fy
+    rays = np.stack([(side * (column + 0.5) - cx - skew * down) / fx, down, np.ones(len(row))], axis=-1)
+    points = part[row, column, None] * rays
+    deeper, alike = np.zeros(count), np.zeros(count)
+    # Between these the depths about a block lie: it is seen at a slant, and the point is anywhere in it.
+    window = (1, 3, 3)
+    least = minimum_filter(np.where(depths > 0, depths, np.inf), window)
+    most = maximum_filter(depths, window)
+    for first, matrix in enumerate(matrices):
+        shown = np.abs(depths[first, row, column] - part[row, column]) < _EQUAL * part[row, column]
+        for second, other in enumerate(matrices):
+            move = np.linalg.inv(other) @ matrix
+            moved = points @ move[:3, :3].T + move[:3, 3]
+            kept = shown & (moved[:, 2] > 0) & (first != second)
+            across, along = (moved[:, :2] / np.where(kept, moved[:, 2], 1.0)[:, None]).T
+            at = np.floor(np.stack([fy * along + cy, fx * across + skew * along + cx]) / side)
+            kept &= np.all((at >= 0) & (at < np.array(part.shape)[:, None]), axis=0)
+            block = second, *np.where(kept, at, 0).astype(int)
+            kept &= depths[block] > 0
+            is_deeper = least[block] > (1.0 + _ALIKE) * moved[:, 2]
+            is_before = most[block] < (1.0 - _ALIKE) * moved[:, 2]
+            np.add.at(deeper, own[kept & is_deeper], 1)
+            np.add.at(alike, own[kept & ~is_deeper & ~is_before], 1)
+    found = np.zeros(part.shape, bool)
+    found[row, column] = (deeper > _CLEAR * alike)[own]
+    return found
+
+
+def _pieces(part: Float[np.ndarray, "k l"]) -> tuple[Int[np.ndarray, " blocks"], int]:
+    """The piece that each block of positive depth belongs to, and how many there are: neighbours in the image at about
+    the same depth are of one piece."""
+    padded = np.pad(part, 1)
+    number = np.zeros(padded.shape, int)
+    number[padded > 0] = np.arange(np.count_nonzero(part))
+    pairs = []
+    for down, right in ((0, 1), (1, -1), (1, 0), (1, 1)):
+        other = np.roll(padded, (-down, -right), axis=(0, 1))
+        near, far = np.minimum(padded, other), np.maximum(padded, other)
+        joined = (near > 0) & (far <= _OF_PART * near)
+        pairs.append(np.stack([number[joined], np.roll(number, (-down, -right), axis=(0, 1))[joined]]))
+    first, second = np.concatenate(pairs, axis=1)
+    graph = coo_array((np.ones(len(first)), (first, second)), shape=(np.count_nonzero(part),) * 2)
+    count, own = connected_components(graph, directed=False)
+    return own, count
