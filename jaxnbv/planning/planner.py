@@ -206,7 +206,8 @@ class Planner(eqx.Module):
         the likeliest part in place of the samples for an acquisition about hypotheses."""
         if self.acquisition.needs_hypotheses:
             hypotheses = observations.hypotheses
-            require(isinstance(hypotheses, PartHypotheses), _NO_HYPOTHESES)
+            if not isinstance(hypotheses, PartHypotheses):
+                raise InputError(_NO_HYPOTHESES)
             return StepInputs(observations, None, hypotheses.surfaces(self.sampler.grid, 1))
         inputs = self.sampler.step_inputs(observations, key)
         looks, surfaces = inputs.observations.looks, inputs.surfaces

@@ -82,20 +82,20 @@ class Rays(NamedTuple):
         enter, leave = ray_interval(list(origins.T), list(directions.T), box.low, box.high)
         is_known = (sight > 0) & (leave > jnp.maximum(enter, 0.0))
         order = jnp.asarray(np.random.default_rng(0).permutation(count))
-        chosen, weight = [], []
+        chosen, weights = [], []
         for kind in (is_known & is_object, is_known & ~is_object):
             (rows,) = jnp.nonzero(kind[order], size=_NUM_RAYS // 2, fill_value=count)
             chosen.append(order.at[rows].get(mode="fill", fill_value=count))
             share = jnp.maximum(2.0 * jnp.sum(kind) / _NUM_RAYS, 1.0)
-            weight.append(jnp.broadcast_to(share * jnp.minimum(weight_of(away, looks.camera), 1.0), rows.shape))
+            weights.append(jnp.broadcast_to(share * jnp.minimum(weight_of(away, looks.camera), 1.0), rows.shape))
         # One of each kind in turn, so that the first few are of both.
-        rows, weight = (jnp.stack(parts, axis=1).reshape(-1) for parts in (chosen, weight))
-        at = jnp.minimum(rows, count - 1)
+        picked, weight = (jnp.stack(parts, axis=1).reshape(-1) for parts in (chosen, weights))
+        at = jnp.minimum(picked, count - 1)
         return cls(
             origins[at],
             directions[at],
-            jnp.where(rows < count, sight[at], 0.0),
-            is_object[at] & (rows < count),
+            jnp.where(picked < count, sight[at], 0.0),
+            is_object[at] & (picked < count),
             weight,
             observations.empty_nodes,
             looks.grid,
@@ -103,11 +103,12 @@ class Rays(NamedTuple):
 
     def first(self, count: int) -> "Rays":
         """The first few, each of which stands for more."""
-        rows = [leaf[:count] for leaf in self[:5]]
-        for kind in (self.is_object, ~self.is_object):
-            share = jnp.sum(kind & (self.sight > 0)) / jnp.maximum(jnp.sum((kind & (self.sight > 0))[:count]), 1)
-            rows[4] = jnp.where(kind[:count], share * rows[4], rows[4])
-        return Rays(*rows, self.empty_nodes, self.grid)
+        weight, holds = self.weight[:count], self.sight > 0
+        for kind in (self.is_object & holds, ~self.is_object & holds):
+            share = jnp.sum(kind) / jnp.maximum(jnp.sum(kind[:count]), 1)
+            weight = jnp.where(kind[:count], share * weight, weight)
+        origins, directions, sight, is_object = (leaf[:count] for leaf in self[:4])
+        return Rays(origins, directions, sight, is_object, weight, self.empty_nodes, self.grid)
 
 
 @eqx.filter_jit

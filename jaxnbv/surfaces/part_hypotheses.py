@@ -78,7 +78,7 @@ def identify(
 def _weighted(bank: ShapeBank, placed: Hypotheses, rays: Rays | None) -> PartHypotheses:
     if rays is None:
         # A cloud alone: as if each of the points that were compared were a ray.
-        misfit, misfit_of_none = NUM_POINTS * placed.misfit, NUM_POINTS * _NONE_MISFIT
+        misfit, misfit_of_none = NUM_POINTS * placed.misfit, jnp.asarray(NUM_POINTS * _NONE_MISFIT)
     else:
         misfit, misfit_of_none = evidence(bank, placed, rays)
     misfit = jnp.where(placed.is_mode, misfit, jnp.inf)

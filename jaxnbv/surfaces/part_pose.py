@@ -100,7 +100,7 @@ def symmetries(shape: Shape) -> Float[np.ndarray, "n 3 3"]:
     is_symmetry = np.asarray(change) < SAME
     left, right = about_axes[is_symmetry[: len(about_axes)]], of_cube[is_symmetry[len(about_axes) :]]
     # One after another they are symmetries too.
-    both = np.einsum("aij,bjk->abik", left, right).reshape(-1, 3, 3)
+    both = np.concatenate([np.eye(3)[None], np.einsum("aij,bjk->abik", left, right).reshape(-1, 3, 3)])
     _, first = np.unique(np.round(both, 6).reshape(-1, 9) + 0.0, axis=0, return_index=True)
     return both[np.sort(first)]
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from small_session import FIRST, POSES, session_of, shot
+from small_session import FIRST, POSES, planner_of, session_of, shot
 
 import jaxnbv as nbv
 
@@ -15,7 +15,8 @@ def left_half(image):
 
 def test_points_are_those_of_the_mask(tmp_path):
     """The cloud of a mask is that of the whole image where the mask is true; a stored session is the same."""
-    whole, masked = session_of(), session_of(tmp_path)
+    planner = planner_of(capacity=4000)
+    whole, masked = session_of(planner=planner), session_of(tmp_path, planner=planner)
     image = shot(FIRST)
     whole.add(image, FIRST, 1e-3)
     masked.add(image, FIRST, 1e-3, left_half(image))
