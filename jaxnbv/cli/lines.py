@@ -24,7 +24,7 @@ class Lines:
         self.count += 1
         position = ", ".join(f"{value:+.2f}" for value in np.asarray(view.pose.position))
         _print(f"view {self.count:<3} ({position})   {int(view.scan.count):,} points   {_why(self.planner, view)}")
-        answer = self.planner.acquisition.answer(view.cloud)
+        answer = view.answer(self.planner.acquisition)
         if answer is not None:
             _print(f"         {words_of(answer).said(self.before)}")
         self.before = answer

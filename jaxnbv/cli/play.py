@@ -36,7 +36,7 @@ from jaxnbv.scanning import Grid, SensorNoise, Surface
 from jaxnbv.scanning.sensors import Setting
 from jaxnbv.search import Search, SphereCandidates, TieBreakSearch
 from jaxnbv.studies.engine import searches
-from jaxnbv.surfaces import ShapeBank, Upright
+from jaxnbv.surfaces import FreeRotation, ShapeBank, Upright
 from jaxnbv.surfaces.shipped_banks import SHIPPED_BANKS, bank_poses, shape_bank
 from jaxnbv.tasks import Coverage
 from jaxnbv.viz.task import race_words
@@ -85,15 +85,17 @@ def search_of(name: str, radius: float, count: int) -> Search:
     return searches.search_of(name, candidates, count, radius, num_starts=6, iterations=20)
 
 
-def imagined(model: str, quick: bool, known: str | None) -> SurfaceSampler:
+def imagined(model: str, quick: bool, known: str | ShapeBank | None) -> SurfaceSampler:
     """The surfaces of a model's name, by one who knows the shapes of a bank that ships, or upright ones of a folder of
-    meshes; none of None or "none".
+    meshes, or parts that lie anyhow; none of None or "none".
 
     **Raises:** `ValueError` if there is no such bank or folder, or no mesh in it that can be used.
     """
     sampler = SurfaceSampler.preset(model, quick=quick)
-    if known in (None, "none"):
+    if known is None or known == "none":
         return sampler
+    if isinstance(known, ShapeBank):
+        return sampler.with_bank(known, FreeRotation())
     if known in SHIPPED_BANKS:
         return sampler.with_bank(shape_bank(known), bank_poses(known))
     require(

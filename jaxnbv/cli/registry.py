@@ -45,6 +45,8 @@ STOPS = {
     "sure": Stop("probability of the class", lambda probability: nbv.Sure(probability)),
     "found": Stop("points of every part", lambda points: nbv.Found(int(points))),
     "covered": Stop("share seen of what can be seen", lambda share: nbv.Covered(share)),
+    "identified": Stop("probability of the part", lambda probability: nbv.Identified(probability)),
+    "placed": Stop("how far its surface may be off", lambda length: nbv.Placed(length)),
     "value-below": Stop("value of the best view", lambda value: nbv.ValueBelow(value)),
     "seconds": Stop("passed", lambda seconds: nbv.Budget(seconds=seconds)),
     "travel": Stop("length of the way", lambda length: nbv.Budget(cost=length)),

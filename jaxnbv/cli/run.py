@@ -60,7 +60,7 @@ def run(options: RunOptions, **of_tasks: Any) -> None:
     usual = usual_first(None if options.paper else setting.radius)
     first = usual if options.first is None else first_pose(options.first, surface)
     acquisition = task.acquisition(surface, setting.camera, first)
-    play(options, Subject(options.mesh.stem, surface, acquisition, first), setting, USUAL)
+    play(options, Subject(options.mesh.stem, surface, acquisition, first, task.bank(surface)), setting, USUAL)
 
 
 def _task(name: str, given: dict[str, Any]) -> Task:

@@ -97,7 +97,7 @@ class Episode(eqx.Module):
         episode = cls(**config)
         after = episode.planner.replay(((pose, scan) for pose, scan, _ in stored), camera)
         views = tuple(
-            View(pose, scan, observations.cloud, proposal, camera)
+            View(pose, scan, observations.cloud, proposal, camera, observations.hypotheses)
             for (pose, scan, proposal), observations in zip(stored, after, strict=True)
         )
         return dataclasses.replace(episode, views=views, stopped=_read_end(folder, len(views)))

@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError, own_settings
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
@@ -25,6 +26,9 @@ from jaxnbv.planning.stopping import StopContext, StopRule, checked_reason
 from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import GridSurface
 from jaxnbv.search import Proposal
+from jaxnbv.surfaces.part_hypotheses import PartHypotheses
+from jaxnbv.tasks.identification import identity_answer
+from jaxnbv.utility import Answer
 
 Sensor: TypeAlias = Callable[[Pose, PRNGKeyArray], PointCloud]
 """What a sensor sees from a pose; the key is of its noise, for which a real sensor has no use."""
@@ -40,6 +44,7 @@ class View(eqx.Module):
     - `cloud`: D after this view.
     - `proposal`: what the search looked at; None for the first view, which was given.
     - `camera`: the one that took it, in scene units.
+    - `hypotheses`: what the model carries after this view, see `Observations`.
     """
 
     pose: Pose
@@ -47,6 +52,15 @@ class View(eqx.Module):
     cloud: PointCloud
     proposal: Proposal | None
     camera: Camera
+    hypotheses: eqx.Module | None = None
+
+    def answer(self, acquisition: Acquisition) -> Answer | None:
+        """What the views so far answer to what an acquisition asks; which part the object is, where it has no answer of
+        its own and parts are known."""
+        answer = acquisition.answer(self.cloud)
+        if answer is None and isinstance(self.hypotheses, PartHypotheses):
+            return identity_answer(self.hypotheses, acquisition)
+        return answer
 
 
 class Step(NamedTuple):
@@ -143,7 +157,7 @@ class Loop:
             self._first_view_at = time.monotonic()
         if proposal is not None:
             self._pending = self._pending.append(proposal.pose)
-        view = View(pose, scan, observations.cloud, proposal, self.camera)
+        view = View(pose, scan, observations.cloud, proposal, self.camera, observations.hypotheses)
         self._observations, self.views = observations, (*self.views, view)
         self._next = _StepState()
         return view

@@ -168,7 +168,7 @@ class RecordedStudy(Study):
         folder = str(Path(options["folder"]).resolve())
         sensor: dict[str, Any] = {name: options.get(name) for name in ("up", "intrinsics", "depth_scale")}
         frames = RecordedFrames(folder, **sensor)
-        corners = options.get("box") or _bounds(frames)
+        corners = options.get("box") or bounds_of(frames)
         box = Box(tuple(corners[:3]), tuple(corners[3:]))
         longest = max(high - low for low, high in zip(box.low, box.high, strict=True))
         settings = dict(cls.quick) if quick else {"num_samples": 8, "grid_resolution": 100, "capacity": 2000}
@@ -279,7 +279,7 @@ def _points(frames: RecordedFrames, index: int, stride: int) -> Float[np.ndarray
     return local @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def _bounds(frames: RecordedFrames) -> list[float]:
+def bounds_of(frames: RecordedFrames) -> list[float]:
     """Two corners of a box about all but a hundredth of what was seen along each axis, to either side, with room."""
     found = np.concatenate([_points(frames, index, _COARSE) for index in range(len(frames))])
     require(len(found) > 0, f"no frame of {frames.folder} has measured anything")

@@ -18,8 +18,8 @@ from jaxnbv.scanning import Grid, GridSurface, scan
 from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.part_evidence import KAPPA, MOST, misfit_of, weight_of
-from jaxnbv.surfaces.part_hypotheses import PartHypotheses
-from jaxnbv.utility import Quantity
+from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses
+from jaxnbv.utility import Answer, Quantity
 
 # Hypotheses that are imagined, and the nodes along an axis of their surfaces.
 _NUM_IMAGINED, _RESOLUTION = 24, 64
@@ -106,6 +106,20 @@ class Identify(Acquisition):
     def quantity(self) -> Quantity:
         meaning = "information about which part it is and how it lies that a view is expected to give."
         return Quantity("expected information", "nats", meaning)
+
+
+class IdentityAnswer(Answer):
+    """The probability of each part of a bank by its name, or of each group of parts, and last of "none of these"."""
+
+    form: str = "{:.2f}"
+
+
+def identity_answer(hypotheses: PartHypotheses, acquisition: Acquisition) -> IdentityAnswer:
+    """Which part the object is; which group of parts, for `Identify(group=...)`."""
+    group = acquisition.group if isinstance(acquisition, Identify) else None
+    names, numbers = np.unique(hypotheses.bank.names if group is None else group, return_inverse=True)
+    weights = np.bincount(numbers, np.asarray(hypotheses.shape_weights, np.float64), len(names))
+    return IdentityAnswer((*names.tolist(), NONE), np.append(weights, float(hypotheses.weights[-1])))
 
 
 def _image(surface: GridSurface, camera: Camera, poses: Pose, barrier: Float[Array, "poses rays"] | None) -> _Image:

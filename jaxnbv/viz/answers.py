@@ -16,15 +16,18 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnbv.geometry.frame import Frame
-from jaxnbv.planning.stopping import Sure
+from jaxnbv.planning.stopping import Identified, Sure
 from jaxnbv.tasks.classification import ClassAnswer
 from jaxnbv.tasks.heat import Coldest
+from jaxnbv.tasks.identification import IdentityAnswer
 from jaxnbv.tasks.segmentation import PartAnswer
 from jaxnbv.utility import Answer, Quantity
 
 # An answer that changes by less than this share from one view to the next has settled.
 _SETTLED = 0.05
 _CLASSES_SAID, _KINDS_SAID = 3, 4
+# Lines of a chart, rows of its table.
+_PARTS_SHOWN = 6
 
 # Whether a rule held after the view of an index, from 0.
 Holds: TypeAlias = Callable[[Sure, int], bool]
@@ -147,6 +150,26 @@ class _ClassWords(Words):
         return (
             Chart("probability", self.answer.names, _rows(answers), true, one_true=True, goal=self.rule.probability),
         )
+
+
+@words_of.register(IdentityAnswer)
+class _IdentityWords(_ClassWords):
+    """The likeliest three parts are said, "none of these" among them."""
+
+    question = "Which part is it?"
+    least = Identified().probability
+    settled_means = f"probability {least} or more"
+
+    def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
+        """As of a class, by the probability alone."""
+        return super().settled(answers, lambda _, index: bool(answers[index].values.max() >= self.least))
+
+    def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
+        """The probabilities of the parts that were likely after any view."""
+        values = _rows(answers)
+        kept = np.sort(np.argsort(-values.max(axis=0), kind="stable")[:_PARTS_SHOWN])
+        names = tuple(self.answer.names[index] for index in kept)
+        return (Chart("probability", names, values[:, kept], goal=self.least),)
 
 
 @words_of.register(PartAnswer)

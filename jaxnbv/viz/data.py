@@ -16,6 +16,7 @@ from jaxnbv.planning.loop import View
 from jaxnbv.progress import progress_bar
 from jaxnbv.scanning.metrics import truth_points
 from jaxnbv.search import Proposal
+from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.utility import Quantity
 from jaxnbv.viz.answers import CoverageAnswer, capital, words_of
 from jaxnbv.viz.imagined import Imagined, Look, taken_look
@@ -33,8 +34,8 @@ class ViewData(eqx.Module):
 
     - `view`: itself, the values of its proposal in world units.
     - `before`: points kept before it, in scene coordinates.
-    - `surface`: of the posterior mean after it, where it holds points, with a deviation that allows for what was not
-      seen, in world units; None where it has none within the grid.
+    - `surface`: of the likeliest part after it, or else of the posterior mean, where it holds points, with a deviation
+      that allows for what was not seen, in world units; None where there is none within the grid.
     - `seen`: how much of the surface was seen.
     - `told`: what happened, in words by their headings.
     - `imagined`: what was imagined before it was taken; None for a view that was given.
@@ -81,8 +82,13 @@ class ReportData(eqx.Module):
     @property
     def deviations(self) -> tuple[float, float]:
         """One range of standard deviations for all views."""
-        found = [view.surface.deviation for view in self.views if view.surface is not None]
+        found = [view.surface.deviation for view in self.views if view.surface is not None and self.has_deviations]
         return middle_range(np.concatenate(found)) if found else (1e-3, 1.0)
+
+    @property
+    def has_deviations(self) -> bool:
+        """Whether surfaces are coloured by their deviations; known parts are not."""
+        return not isinstance(self.episode.views[0].hypotheses, PartHypotheses)
 
 
 def report_data(

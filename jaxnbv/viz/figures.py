@@ -10,7 +10,7 @@ from matplotlib.ticker import NullLocator
 from jaxnbv.viz.choice import draw_acquisition, marks
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.render import draw_scene, painted
-from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, NEW, bar_ticks
+from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, NEW, PART, bar_ticks
 
 STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
@@ -37,7 +37,8 @@ def overview_figure(data: ReportData) -> Figure:
     columns = min(len(data.views), 5)
     rows, width = -(-len(data.views) // columns), max(3.0 * columns, 6.0)
     chosen = [view.proposal for view in data.views if view.proposal is not None]
-    legend = [("● points before", BEFORE), ("● new points and camera", NEW), ("★ chosen view", NEW)]
+    legend = [] if data.has_deviations else [("■ likeliest part", PART)]
+    legend += [("● points before", BEFORE), ("● new points and camera", NEW), ("★ chosen view", NEW)]
     legend += [(mark, INK) for mark in marks(*chosen)]
     beside = int(width // 3)
     foot = 1.3 + _LINE * -(-len(legend) // beside)
@@ -52,7 +53,8 @@ def overview_figure(data: ReportData) -> Figure:
         part.text(0.96, 0.95, seen, fontsize=14, ha="right", va="center")
         draw_acquisition(part.add_axes((0.03, 0.01, 0.94, 0.3)), view.proposal, data.quantity, weight=1.2)
     below = figure.add_subfigure(grid[rows, :])
-    _draw_deviations(below.add_axes((0.15, 1.0 - 0.25 / foot, 0.7, 0.13 / foot)), data)
+    if data.has_deviations:
+        _draw_deviations(below.add_axes((0.15, 1.0 - 0.25 / foot, 0.7, 0.13 / foot)), data)
     maps = f"Maps: {data.quantity.name}; dark is high"
     # Ten letters of this size take an inch.
     below.text(0.04, 1.0 - 1.0 / foot, maps, fontsize=12.0 * min(1.0, 9.0 * width / len(maps)), va="center")

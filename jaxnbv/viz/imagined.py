@@ -18,6 +18,8 @@ from jaxnbv.planning.loop import View, view_keys
 from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import TriangleMesh, barrier_of, scan
 from jaxnbv.scanning.mesh import level_triangles
+from jaxnbv.surfaces.part_hypotheses import PartHypotheses
+from jaxnbv.viz.placed_part import placed_parts
 from jaxnbv.viz.sphere import unit
 from jaxnbv.viz.style import BEFORE, NEW
 
@@ -44,7 +46,8 @@ class Look(eqx.Module):
 class Imagined(eqx.Module):
     """What a step knew of its view before it was taken.
 
-    - `samples`: some of its sampled surfaces, from the chosen pose; `names`: what each is about.
+    - `samples`: some of its sampled surfaces, or the likeliest parts, from the chosen pose; `names`: what each is
+      about.
     - `kinds`: what the object may be, and how likely that is; empty where no shapes are known.
     """
 
@@ -59,25 +62,32 @@ def imagined(episode: Episode, index: int, inputs: StepInputs) -> Imagined | Non
     - `inputs`: of the view's step, with its samples.
     """
     planner, sampler, view = episode.planner, episode.planner.sampler, episode.views[index]
-    if view.proposal is None or inputs.surfaces is None:
+    parts = inputs.observations.hypotheses if planner.acquisition.needs_hypotheses else None
+    if view.proposal is None or (inputs.surfaces is None and parts is None):
         return None
     camera, cloud = _finer(planner.camera), inputs.observations.cloud.to_numpy()[0]
     barrier, samples = barrier_of(planner.obstacles, camera, view.pose), list[Look]()
-    for values in np.array(inputs.surfaces.values[:SHOWN]):
-        # Of triangles: a picture is no reason to compile a scan of so many pixels.
-        found = level_triangles(values, sampler.grid)
-        if found is None:
+    # Of triangles: a picture is no reason to compile a scan of so many pixels.
+    if isinstance(parts, PartHypotheses):
+        likely = placed_parts(parts, SHOWN)
+        names, kinds = [part.name for part in likely], parts.names()
+        meshes: list[TriangleMesh | None] = [TriangleMesh(part.vertices, part.faces, Frame()) for part in likely]
+    else:
+        assert inputs.surfaces is not None
+        assert inputs.posterior is not None
+        found = [level_triangles(values, sampler.grid) for values in np.array(inputs.surfaces.values[:SHOWN])]
+        meshes = [None if triangles is None else TriangleMesh(*triangles[:2], Frame()) for triangles in found]
+        sample_key, *_ = view_keys(episode.key, index)
+        shapes = inputs.posterior.names_of_samples(sample_key, sampler.num_samples)[: len(meshes)]
+        names = [shape or f"imagined {number}" for number, shape in enumerate(shapes, start=1)]
+        kinds = inputs.posterior.kinds()
+    for mesh in meshes:
+        if mesh is None:
             nothing = np.zeros((camera.height, camera.width))
             samples.append(Look(nothing > 0, nothing, nothing > 0))
             continue
-        seen = scan(TriangleMesh(*found[:2], Frame()), camera, view.pose, barrier)
-        samples.append(look(seen, camera, view.pose, cloud))
-    posterior = inputs.posterior
-    sample_key, *_ = view_keys(episode.key, index)
-    assert posterior is not None
-    shapes = posterior.names_of_samples(sample_key, sampler.num_samples)[: len(samples)]
-    names = [shape or f"imagined {number}" for number, shape in enumerate(shapes, start=1)]
-    return Imagined(tuple(samples), tuple(names), tuple(posterior.kinds().items()))
+        samples.append(look(scan(mesh, camera, view.pose, barrier), camera, view.pose, cloud))
+    return Imagined(tuple(samples), tuple(names), tuple(kinds.items()))
 
 
 def taken_look(view: View, cloud: Float[np.ndarray, "n 3"]) -> Look | None:

@@ -3,14 +3,14 @@
 import dataclasses
 import html
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import matplotlib as mpl
 import numpy as np
 import trimesh
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, PRNGKeyArray, UInt8
 from matplotlib.colors import Colormap, LogNorm, Normalize, to_rgb
 from scipy.spatial.transform import Rotation
 
@@ -23,18 +23,23 @@ from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import view_keys
 from jaxnbv.planning.session import Session
-from jaxnbv.scanning import Grid, GridSurface
+from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
-from jaxnbv.surfaces import SurfacePosterior
+from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.utility import Quantity
 from jaxnbv.viz.answers import capital, may_be_words, shown_value, words_of
 from jaxnbv.viz.choice import colour_range, open_values
 from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
+from jaxnbv.viz.placed_part import PlacedPart, likeliest_part, placed_parts
 from jaxnbv.viz.scene import Cameras, Points, seen_items
-from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, VALUE, gradient, middle_range
+from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, PART, VALUE, gradient, middle_range
 from jaxnbv.viz.task import seen_after
+
+# Vertices and faces; what the object may be, and how likely that is.
+Triangles: TypeAlias = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
+Kinds: TypeAlias = tuple[tuple[str, float], ...]
 
 _SAMPLES = 4
 _NEXT = "#009e73"
@@ -117,21 +122,16 @@ class LiveView:
                 self._drawn = _drawn(scene, seen_items(before, new, [view.pose for view in views], episode.sensor))
             observations = episode.observations_after(len(views)) if observations is None else observations
             key, *_ = view_keys(episode.key, len(views))
-            inputs = sampler.step_inputs(observations, key)
-            posterior, samples = inputs.posterior, inputs.surfaces
-            assert posterior is not None
-            assert samples is not None
-            surface = as_shown(mean_surface(sampler, inputs), observations.cloud)
-            shapes = posterior.names_of_samples(key, sampler.num_samples)
+            surface, imagined, kinds = _surfaces(sampler, observations, key)
             with self._server.atomic():
-                self._drawn += [*_surface(scene, surface), *_imagined(scene, samples, sampler.grid, shapes)]
+                self._drawn += [*_surface(scene, surface), *_imagined(scene, imagined)]
                 if proposal is not None:
                     self._drawn += _choice(scene, planner.camera, proposal, picture)
                 if self._image is not None:
                     self._image.remove()
                 label = "depth expected there"
                 self._image = None if picture is None else self._server.gui.add_image(picture, label=label)
-                self._text.content = _told(episode, posterior, proposal)
+                self._text.content = _told(episode, kinds, proposal)
                 self._legend.content = _legend(surface, proposal, planner.quantity, episode.frame)
 
     def save(self, path: str | Path) -> Path:
@@ -146,14 +146,33 @@ class LiveView:
         self._server.stop()
 
 
-def _told(episode: Episode, posterior: SurfacePosterior, proposal: Proposal | None) -> str:
+def _surfaces(
+    sampler: SurfaceSampler, observations: Observations, key: PRNGKeyArray
+) -> tuple[MeanSurface | None, list[tuple[str, Triangles]], Kinds]:
+    """The likeliest surface, some that are imagined, by their names, and what known shapes say that the object may be.
+    Where parts are known, these are the likeliest part and the others."""
+    if isinstance(observations.hypotheses, PartHypotheses):
+        parts = placed_parts(observations.hypotheses, _SAMPLES)
+        return likeliest_part(observations.hypotheses), [(p.name, (p.vertices, p.faces)) for p in parts], ()
+    inputs = sampler.step_inputs(observations, key)
+    posterior, samples = inputs.posterior, inputs.surfaces
+    assert posterior is not None
+    assert samples is not None
+    surface = as_shown(mean_surface(sampler, inputs), observations.cloud)
+    # Marching cubes asks for an array that it could write to.
+    found = [level_triangles(values, sampler.grid) for values in np.array(samples.values[:_SAMPLES])]
+    names = posterior.names_of_samples(key, sampler.num_samples)
+    imagined = [(name, triangles[:2]) for name, triangles in zip(names, found, strict=False) if triangles is not None]
+    return surface, imagined, tuple(posterior.kinds().items())
+
+
+def _told(episode: Episode, kinds: Kinds, proposal: Proposal | None) -> str:
     """What is known, and what is asked, as Markdown."""
     views, sought, acquisition = len(episode.views), episode.planner.quantity, episode.planner.acquisition
     seen = seen_after(episode, None)[-1]
     lines = [f"**{views} view{'s' if views > 1 else ''}**, {seen.amount} of surface seen"]
-    answer = acquisition.answer(episode.cloud)
+    answer = episode.views[-1].answer(acquisition)
     lines += [] if answer is None else [f"{capital(words_of(answer.in_world(episode.frame)).said())}."]
-    kinds = tuple(posterior.kinds().items())
     lines += [may_be_words(kinds)] if kinds else []
     if proposal is not None:
         frame, error = episode.frame, proposal.standard_error
@@ -180,20 +199,21 @@ def _drawn(scene: Any, items: Iterable[Points | Cameras]) -> list[Any]:
 def _surface(scene: Any, surface: MeanSurface | None) -> list[Any]:
     if surface is None:
         return []
+    if isinstance(surface, PlacedPart):
+        place, colour = f"/likeliest part, {surface.caption}", to_rgb(PART)
+        return [scene.add_mesh_simple(place, surface.vertices, surface.faces, color=colour)]
     colours = DEVIATION(LogNorm(*middle_range(surface.deviation))(surface.deviation), bytes=True)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=colours, process=False)
     return [scene.add_mesh_trimesh("/surface of the mean", mesh)]
 
 
-def _imagined(scene: Any, samples: GridSurface, grid: Grid, shapes: Sequence[str]) -> list[Any]:
-    """Some sampled surfaces, by the shapes that they are about."""
-    found = []
-    # Marching cubes asks for an array that it could write to.
-    for number, (values, shape) in enumerate(zip(np.array(samples.values[:_SAMPLES]), shapes, strict=False), start=1):
-        if (triangles := level_triangles(values, grid)) is not None:
-            settings: dict[str, Any] = {"color": to_rgb("#8fb8d8"), "opacity": 0.9, "visible": False}
-            found.append(scene.add_mesh_simple(f"/imagined/{number} {shape}".rstrip(), *triangles[:2], **settings))
-    return found
+def _imagined(scene: Any, surfaces: Iterable[tuple[str, Triangles]]) -> list[Any]:
+    """Some surfaces, by the shapes that they are about."""
+    settings: dict[str, Any] = {"color": to_rgb("#8fb8d8"), "opacity": 0.9, "visible": False}
+    return [
+        scene.add_mesh_simple(f"/imagined/{number} {shape}".rstrip(), *triangles, **settings)
+        for number, (shape, triangles) in enumerate(surfaces, start=1)
+    ]
 
 
 def _depth_picture(depth: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -216,8 +236,10 @@ def _legend(surface: MeanSurface | None, proposal: Proposal | None, sought: Quan
     """What the colours mean, as HTML."""
     marks = [("points before", BEFORE), ("new points, last camera", NEW), ("earlier cameras", GREY)]
     marks += [] if proposal is None else [("next view", _NEXT)]
+    if isinstance(surface, PlacedPart):
+        marks.insert(0, (f"likeliest part: {html.escape(surface.caption)}", PART))
     rows = [f'<div><b style="color:{colour}">&#9679;</b> {name}</div>' for name, colour in marks]
-    if surface is not None:
+    if surface is not None and not isinstance(surface, PlacedPart):
         low, high = middle_range(frame.length_to_world(surface.deviation))
         rows.append(_bar(f"the surface is known to, in {frame.unit}", DEVIATION, f"{low:g}", f"{high:g}"))
     if proposal is not None and np.isfinite(proposal.values).any():

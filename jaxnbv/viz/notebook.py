@@ -25,10 +25,12 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.session import Session
 from jaxnbv.search import Proposal
 from jaxnbv.surfaces import SurfacePosterior
+from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.utility import Quantity
 from jaxnbv.viz.choice import draw_acquisition
 from jaxnbv.viz.data import report_data
 from jaxnbv.viz.figures import STYLE, overview_figure
+from jaxnbv.viz.placed_part import PlacedPart, likeliest_part
 from jaxnbv.viz.render import Still, beside, draw_items, frame
 from jaxnbv.viz.scene import seen_items
 from jaxnbv.viz.style import BEFORE, VALUE
@@ -147,14 +149,18 @@ def _(proposal: Proposal) -> Drawing:
 def _(episode: Episode) -> Drawing:
     count = len(episode.views)
     facts = f"{count} view{'s' * (count != 1)} by {episode.planner.quantity.name}, {int(episode.cloud.count):,} points"
-    return Drawing(functools.partial(_draw_views, episode), facts + (f"; {episode.stopped}" if episode.stopped else ""))
+    hypotheses = episode.views[-1].hypotheses if count else None
+    part = likeliest_part(hypotheses) if isinstance(hypotheses, PartHypotheses) else None
+    facts += "" if part is None else f"; {part.caption}"
+    drawn = functools.partial(_draw_views, episode, part)
+    return Drawing(drawn, facts + (f"; {episode.stopped}" if episode.stopped else ""))
 
 
-def _draw_views(episode: Episode, axes: Axes) -> None:
-    """The points, those of the last view told apart, and where the cameras stood."""
+def _draw_views(episode: Episode, part: PlacedPart | None, axes: Axes) -> None:
+    """The points, those of the last view told apart, the likeliest part, and where the cameras stood."""
     poses = [view.pose for view in episode.views]
     extent = max(1.8, *(float(np.linalg.norm(pose.position)) for pose in poses))
-    still = Still(beside(poses[-1]), None, 400, extent)
+    still = Still(beside(poses[-1]), part, 400, extent)
     points, new = episode.cloud.to_numpy()[0], episode.views[-1].scan.to_numpy()[0]
     shown = draw_items(axes, still, seen_items(points, new, poses, episode.planner.camera), 0.8)
     frame(axes, still, shown)

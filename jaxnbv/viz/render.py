@@ -20,9 +20,10 @@ from jaxnbv.scanning import TriangleMesh
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.imagined import lamp, look_picture
 from jaxnbv.viz.mean_surface import MeanSurface
+from jaxnbv.viz.placed_part import PlacedPart
 from jaxnbv.viz.scene import Cameras, Points, frustum, seen_items
 from jaxnbv.viz.sphere import unit
-from jaxnbv.viz.style import DEVIATION, LINE, NEW, framed
+from jaxnbv.viz.style import DEVIATION, LINE, NEW, PART, framed
 
 _DISTANCE = 11.0
 _SLACK = 0.04  # Noise and the mean's own error must not hide a point behind the surface that it lies on.
@@ -75,7 +76,9 @@ class Still:
         normals = unit(np.sum(weight[..., None] * surface.normals[near], axis=1))
         lit = 0.72 + 0.34 * np.clip(normals @ lamp(self.pose), -0.4, 1.0)
         colours = np.tile(mpl.colors.to_rgba(LINE), (len(points), 1))
-        if deviation is not None:
+        if isinstance(surface, PlacedPart):
+            colours[:, :3] = mpl.colors.to_rgb(PART)
+        elif deviation is not None:
             colours = DEVIATION(deviation(np.exp(np.sum(weight * np.log(surface.deviation)[near], axis=1))))
         depth = (points - np.asarray(self.pose.position)) @ np.asarray(self.pose.forward)
         shaded = lit * (1.0 - _occlusion(mask.reshape(2 * self.size, -1), depth))
@@ -130,16 +133,24 @@ def draw_scene(
     axes: Axes, data: ReportData, index: int, still: Still, weight: float = 1.0, inset: bool = True, aspect: float = 1.0
 ) -> None:
     """Draw the scene after view `index` (from 0) into an empty axes: the painted surface, points, the cameras so far,
-    of which the last is new, and in the corner where the least stands in any view what that one saw.
+    of which the last is new, and in the corner where the least stands in any view what that one saw. The likeliest part
+    is named below.
 
     `weight` scales lines, dots and letters; `aspect` is width over height.
     """
     view, stage = data.views[index], data.stage
     axes.imshow(still.image, interpolation="bilinear", zorder=1)
     poses = [stage.pulled(other.pose) for other in data.views[: index + 1]]
-    draw_items(axes, still, seen_items(view.before, view.new, poses, data.camera, stage.depth), weight)
+    items = seen_items(view.before, view.new, poses, data.camera, stage.depth)
+    if isinstance(view.surface, PlacedPart):
+        # What is scanned is to be seen on what is not.
+        items = tuple(item._replace(weight=3.0 * item.weight) if isinstance(item, Points) else item for item in items)
+    draw_items(axes, still, items, weight)
     extent = _extent(data, still)
     frame(axes, still, extent, aspect)
+    if isinstance(view.surface, PlacedPart):
+        style: dict[str, Any] = {"ha": "center", "va": "bottom", "fontsize": 10 * weight, "fontweight": "bold"}
+        axes.text(0.5, 0.01, view.surface.caption, transform=axes.transAxes, zorder=5, **style)
     if inset and view.look is not None:
         across, up = _free_corner(axes, extent)
         wide, tall = _INSET / aspect, _INSET

@@ -33,7 +33,7 @@ from jaxnbv.viz.imagined import looks
 from jaxnbv.viz.render import draw_scene, painted
 from jaxnbv.viz.sketches import Sketches
 from jaxnbv.viz.space import figures_in_space
-from jaxnbv.viz.style import DEVIATION, bar_ticks, gradient
+from jaxnbv.viz.style import DEVIATION, PART, bar_ticks, gradient
 
 _SCENE, _SCENE_DPI = (6.8, 5.9), 100
 _WHY, _WHY_DPI = (5.2, 4.3), 150
@@ -85,6 +85,7 @@ def report_html(data: ReportData, title: str) -> str:
         units=_world_of(data.episode)[1],
         length=data.episode.frame.unit,
         gradient=gradient(DEVIATION),
+        part=PART,
         ticks=_deviation_ticks(data),
         # Plotly writes a figure with its numbers packed.
         space=_zipped(f"[{','.join(str(figure.to_json()) for figure in figures_in_space(data))}]"),

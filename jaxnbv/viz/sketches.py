@@ -7,16 +7,18 @@ from typing import NamedTuple
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import Step, view_keys
 from jaxnbv.sampler import StepInputs
+from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.viz.imagined import Imagined, imagined
 from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
+from jaxnbv.viz.placed_part import likeliest_part
 from jaxnbv.viz.unmeasured import Patch, unmeasured
 
 
 class Sketch(NamedTuple):
     """What a step knew before its view was taken.
 
-    - `surface`: of the posterior mean, where it holds points, with a deviation that allows for what was not seen; None
-      where it has none.
+    - `surface`: of the likeliest part, where parts are known; else of the posterior mean, where it holds points, with a
+      deviation that allows for what was not seen. None where there is none.
     - `imagined`: None for a view that was not chosen, or not taken.
     - `unmeasured`: patches of that surface that views looked at and did not measure.
     """
@@ -53,6 +55,9 @@ def sketches_of(episode: Episode, held: Mapping[int, Sketch], imagine: bool) -> 
         if index in held:
             yield held[index]
             continue
+        if episode.planner.acquisition.needs_hypotheses:
+            yield _sketch(episode, index, StepInputs(observations), imagine)
+            continue
         posterior = episode.planner.sampler.posterior(observations)
         inputs = StepInputs(observations, posterior)
         # With the key of the step: what it imagined, and moments where the posterior has no closed ones.
@@ -65,9 +70,13 @@ def sketches_of(episode: Episode, held: Mapping[int, Sketch], imagine: bool) -> 
 
 def _sketch(episode: Episode, index: int, inputs: StepInputs, imagine: bool = True) -> Sketch:
     sampler, observations = episode.planner.sampler, inputs.observations
-    surface = as_shown(mean_surface(sampler, inputs), observations.cloud)
+    surface: MeanSurface | None
+    if isinstance(observations.hypotheses, PartHypotheses):
+        surface = likeliest_part(observations.hypotheses)
+    else:
+        surface = as_shown(mean_surface(sampler, inputs), observations.cloud)
     patches = [] if surface is None else unmeasured(surface.mesh, observations, sampler.carving)
     seen = None
-    if imagine and inputs.surfaces is not None and index < len(episode.views):
+    if imagine and index < len(episode.views):
         seen = imagined(episode, index, inputs)
     return Sketch(surface, seen, patches)

@@ -8,8 +8,9 @@ from jaxtyping import Float, Int
 
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.mean_surface import MeanSurface
+from jaxnbv.viz.placed_part import PlacedPart
 from jaxnbv.viz.scene import Cameras, Points, frustum, seen_items
-from jaxnbv.viz.style import DEVIATION, INK, colour_scale
+from jaxnbv.viz.style import DEVIATION, INK, PART, colour_scale
 
 # Of all views together, so that a long episode stays a small page.
 _POINTS, _VERTICES, _FEWEST_VERTICES = 18_000, 24_000, 1500
@@ -82,21 +83,26 @@ def _cameras(item: Cameras) -> list[dict[str, Any]]:
 
 
 def _mesh(surface: MeanSurface, limit: int, grades: Float[np.ndarray, "2"]) -> dict[str, Any]:
-    """A coarser mesh, coloured by the logarithm of its deviation."""
+    """A coarser mesh, coloured by the logarithm of its deviation; a known part plain."""
     own, faces = clustered(surface.vertices, surface.faces, limit)
     count = np.bincount(own)
     vertices = np.stack([np.bincount(own, column) / count for column in surface.vertices.T], axis=1)
-    deviation = np.bincount(own, np.log10(surface.deviation)) / count
+    looks: dict[str, Any] = {**_named("likeliest part"), "color": PART}
+    if not isinstance(surface, PlacedPart):
+        deviation = np.bincount(own, np.log10(surface.deviation)) / count
+        looks = {
+            **_named("surface of the mean"),
+            "intensity": np.round(deviation, 2).astype(np.float32),
+            "cmin": grades[0],
+            "cmax": grades[1],
+            "colorscale": colour_scale(DEVIATION),
+            "showscale": False,
+        }
     return {
         "type": "mesh3d",
-        **_named("surface of the mean"),
+        **looks,
         **_placed(vertices),
         **dict(zip("ijk", faces.T.astype(np.uint16), strict=True)),
-        "intensity": np.round(deviation, 2).astype(np.float32),
-        "cmin": grades[0],
-        "cmax": grades[1],
-        "colorscale": colour_scale(DEVIATION),
-        "showscale": False,
         "lighting": _LIGHT,
         "lightposition": {"x": 4000, "y": 3000, "z": 8000},
     }

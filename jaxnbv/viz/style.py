@@ -13,6 +13,8 @@ from jaxnbv.storage.files import write_whole
 
 INK, GREY, LINE = "#1f2733", "#7a8494", "#d9dee6"
 BEFORE, NEW = "#26344d", "#d55e00"
+# A known part, where it is taken to lie.
+PART = "#8fd6bd"
 # For several numbers in one chart (Okabe and Ito), apart from NEW, which marks the true one.
 SERIES = ["#0072b2", "#56b4e9", "#009e73", "#e69f00", "#cc79a7", "#7a8494", "#26344d", "#b8b04a"]
 # Pale where the surface is known, dark where it is not: the scanned points stand out on what is known.

@@ -97,7 +97,7 @@ def _charts(answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...
 
 def _answers(episode: Episode, views: Sequence[View]) -> Sequence[Answer]:
     """The answers of the episode's acquisition after each of some views, in its world; none, where it has none."""
-    answers = [episode.planner.acquisition.answer(view.cloud) for view in views]
+    answers = [view.answer(episode.planner.acquisition) for view in views]
     said = [answer.in_world(episode.frame) for answer in answers if answer is not None]
     return said if len(said) == len(answers) else []
 
@@ -179,6 +179,8 @@ def _asked(planner: Planner) -> str:
     name = planner.quantity.name
     if not planner.search.uses_samples:
         return f"Each view is where the {name} is highest."
+    if planner.acquisition.needs_hypotheses:
+        return f"Each view is where the {name} is highest, over the likeliest parts and how they may lie."
     return f"Each view is where the {name} is highest, over {planner.sampler.num_samples} imagined surfaces."
 
 

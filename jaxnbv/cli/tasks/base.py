@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from jaxnbv.geometry.pose import Pose
     from jaxnbv.scanning import Grid, Surface, TriangleMesh
     from jaxnbv.scanning.sensors import Setting
+    from jaxnbv.surfaces import ShapeBank
 
 network_option = asking(
     metavar="FILE", help="A classifier, .pth or .safetensors, which tasks about the class need; for parts a segmenter."
@@ -22,7 +23,7 @@ network_option = asking(
 class Subject(NamedTuple):
     """An object that an episode is played on.
 
-    - `bank`: the shapes that are known of it, as in `--known`.
+    - `bank`: the shapes that are known of it, as in `--known`; or parts at the size that they have in the scene.
     - `grid`: of the imagined surfaces; None for the usual one.
     - `note`: what is said of it before the first view.
     """
@@ -31,7 +32,7 @@ class Subject(NamedTuple):
     surface: "Surface"
     acquisition: "Acquisition"
     first: "Pose"
-    bank: str = "none"
+    bank: "str | ShapeBank" = "none"
     grid: "Grid | None" = None
     note: str = ""
 
@@ -60,6 +61,10 @@ class Task(ABC):
     @abstractmethod
     def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
         """What views of a user's mesh are chosen by; `first`: where the first view is taken."""
+
+    def bank(self, mesh: "TriangleMesh") -> "str | ShapeBank":
+        """The shapes that are known of a user's mesh, as of a `Subject`."""
+        return "none"
 
     @classmethod
     @abstractmethod

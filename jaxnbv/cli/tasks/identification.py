@@ -1,0 +1,134 @@
+"""Which of some known parts the object is."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from jaxnbv.cli.options import asking
+from jaxnbv.cli.tasks.base import Subject, Task
+
+if TYPE_CHECKING:
+    from jaxnbv.acquisition import Acquisition
+    from jaxnbv.geometry.camera import Camera
+    from jaxnbv.geometry.pose import Pose
+    from jaxnbv.scanning import TriangleMesh
+    from jaxnbv.scanning.sdf import SignedDistance
+    from jaxnbv.scanning.sensors import Setting
+    from jaxnbv.surfaces import ShapeBank
+
+# Parts so many times smaller or larger than the object are of another unit.
+_OTHER_UNIT = 20.0
+# Nearly all of a housing is seen from so far away, in scene units; the first view is from this side of it.
+_RADIUS, _FIRST = 5.5, (-0.75, -0.42, 0.5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class IdentifyTask(Task):
+    name = "identify"
+    about = "which of some known parts it is, and how it lies"
+    example = "one of five housings that differ at the bottom of a pocket"
+    until = ("identified=0.95",)
+    parts: Annotated[
+        Path,
+        asking(metavar="FOLDER", help="For identify: a folder with a mesh of each part that the object may be."),
+    ]
+    parts_scale: Annotated[
+        str,
+        asking(
+            metavar="UNIT",
+            help="For identify: the parts' unit in that of MESH, a number; or mm, cm, m, in, ft for a MESH in metres.",
+            show_default="1",
+        ),
+    ] = "1"
+
+    @classmethod
+    def setting(cls) -> "Setting":
+        from jaxnbv.scanning.sensors import USUAL_SETTING
+
+        return USUAL_SETTING._replace(radius=_RADIUS)
+
+    def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
+        from jaxnbv.tasks import Identify
+
+        return Identify()
+
+    def bank(self, mesh: "TriangleMesh") -> "ShapeBank":
+        """The parts of the folder."""
+        import numpy as np
+
+        frame = mesh.world_frame
+        return bank_of(self.parts, self.parts_scale, np.ptp(mesh.vertices, axis=0).max() / frame.scale).in_scene(frame)
+
+    @classmethod
+    def demo(cls, scene: int, seed: int) -> Subject:
+        """One of the housings in a random rotation, from a side that does not show what tells them apart."""
+        import numpy as np
+        from scipy.spatial.transform import Rotation
+
+        from jaxnbv.geometry.frame import Frame
+        from jaxnbv.geometry.pose import look_at
+        from jaxnbv.scanning import Grid, SDFSurface, mesh_from_sdf
+        from jaxnbv.surfaces import ShapeBank
+        from jaxnbv.tasks import Identify
+
+        housings = _housings()
+        meshes = [mesh_from_sdf(solid, Grid(96, 1.4)).to_trimesh() for solid in housings.values()]
+        bank = ShapeBank.from_meshes(meshes, names=tuple(housings), scale=1.0, progress=False)
+        index = scene % len(housings)
+        name, solid = list(housings.items())[index]
+        turn = Rotation.random(random_state=scene)
+        frame = Frame(2.5 / float(np.ptp(turn.apply(bank.extremes[index]), axis=0).max()))
+        surface = SDFSurface(solid.rotate(turn.as_rotvec(), turn.magnitude()).scale(frame.scale))
+        first = look_at(_RADIUS * turn.apply(_FIRST) / np.linalg.norm(_FIRST))
+        note = f"the object is the housing with {name}; the first view does not look into its pocket"
+        return Subject("housing", surface, Identify(), first, bank.in_scene(frame), note=note)
+
+
+def bank_of(folder: Path, scale: str, size: float, up: str = "y") -> "ShapeBank":
+    """The parts of a folder, in units of a world.
+
+    - `scale`: the parts' unit, as in `--parts-scale`; `size`: of the object in the world, about; `up`: the parts' axis
+      that is upward.
+
+    **Raises:** `ValueError` as `ShapeBank.from_meshes` does, and if no part is about as large as the object.
+    """
+    import numpy as np
+
+    from jaxnbv.checks import require
+    from jaxnbv.surfaces import ShapeBank
+
+    bank = ShapeBank.from_meshes(folder, scale=as_unit(scale), up=up)
+    sides = np.ptp(np.asarray(bank.extremes), axis=1).max(axis=1)
+    require(
+        bool(((sides > size / _OTHER_UNIT) & (sides < size * _OTHER_UNIT)).any()),
+        f"the parts of {folder} are {sides.min():.3g} to {sides.max():.3g} long, the object about {size:.3g}: give the "
+        "parts' unit, --parts-scale mm say",
+    )
+    return bank
+
+
+def as_unit(text: str) -> float | str:
+    """A number, or the name of a unit."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _housings() -> "dict[str, SignedDistance]":
+    """Housings whose longest side is 2.5, by what stands at the bottom of their pocket, which opens upward."""
+    from jaxnbv.scanning.sdf import Cuboid, Cylinder
+
+    body = Cuboid([1.0, 1.25, 0.9], 0.05) - Cuboid([0.8, 0.6, 0.7]).translate([0.0, 0.85, 0.0])
+    body = body - Cuboid([0.3, 0.3, 1.0]).translate([1.0, -1.25, 0.0])
+
+    def boss(x: float, height: float = 0.6) -> "SignedDistance":
+        return Cylinder(0.22, 0.5 * height).translate([x, 0.5 * height + 0.23, 0.0])
+
+    return {
+        "no boss": body,
+        "a boss on the left": body | boss(-0.4),
+        "a boss on the right": body | boss(0.4),
+        "a tall boss": body | boss(-0.4, 0.95),
+        "two bosses": body | boss(-0.4) | boss(0.4),
+    }

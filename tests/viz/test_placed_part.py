@@ -1,0 +1,122 @@
+"""Which part it is, in words and pictures, against hypotheses that are given."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_run import Page, scene_in_space, small_run
+
+import jaxnbv as nbv
+from jaxnbv.geometry.rotations import rotation_about
+from jaxnbv.scanning.sdf import Cuboid
+from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses
+from jaxnbv.surfaces.placement import Placement
+from jaxnbv.surfaces.registration import Hypotheses
+from jaxnbv.tasks.identification import identity_answer
+from jaxnbv.viz.answers import words_of
+from jaxnbv.viz.data import report_data
+from jaxnbv.viz.notebook import html_of
+from jaxnbv.viz.placed_part import likeliest_part, placed_parts
+from jaxnbv.viz.report import report_html
+from jaxnbv.viz.task import task_of
+
+SIDES = {"cube left": (0.7, 0.7, 0.7), "slab": (0.9, 0.3, 0.5), "cube right": (0.6, 0.6, 0.6)}
+BANK = nbv.ShapeBank.of([Cuboid(list(half)) for half in SIDES.values()], tuple(SIDES), is_true_size=True)
+TURN = np.asarray(rotation_about(np.array([0.0, 1.0, 0.0]), 0.4))
+
+
+def hypotheses(*weights):
+    """The slab in two places, then the left cube."""
+    shapes, shifts = jnp.array([1, 1, 0]), jnp.array([[0.2, 0.1, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    places = Placement(jnp.tile(jnp.asarray(TURN), (3, 1, 1)), shifts, jnp.ones((3, 3)))
+    return PartHypotheses(BANK, Hypotheses(shapes, places, jnp.arange(3.0), jnp.ones(3, bool)), jnp.array(weights))
+
+
+SLAB = hypotheses(0.5, 0.25, 0.2, 0.05)
+
+
+class Told(nbv.SurfaceModel):
+    """Knows the hypotheses, whatever was observed."""
+
+    hypotheses: PartHypotheses
+    hypothesises = True
+
+    def observed(self, observations):
+        return dataclasses.replace(observations, hypotheses=self.hypotheses)
+
+    def condition(self, observations):
+        raise AssertionError("no posterior is needed")
+
+
+def test_a_part_is_drawn_where_it_lies():
+    first, second = placed_parts(SLAB, 4)
+    assert (first.name, second.name) == ("slab", "cube left")
+    assert first.probability == pytest.approx(0.75)
+    assert first.caption == "slab  75 %"
+    own = (first.vertices - [0.2, 0.1, 0.0]) @ TURN
+    np.testing.assert_allclose(np.abs(own).max(axis=0), SIDES["slab"], atol=0.01)
+    on_top = (own[:, 1] > 0.29) & (np.abs(own[:, [0, 2]]) < [0.8, 0.4]).all(axis=1)
+    np.testing.assert_allclose(first.normals[on_top][:, 1], 1.0, atol=0.01)
+
+
+def test_nothing_is_drawn_of_what_is_none_of_these():
+    assert likeliest_part(hypotheses(0.3, 0.1, 0.1, 0.5)) is None
+    assert likeliest_part(hypotheses(0.3, 0.2, 0.1, 0.4)).name == "slab"
+
+
+def test_words_name_the_likeliest_and_none_of_these():
+    answer = identity_answer(SLAB, nbv.Identify())
+    assert answer.names == (*sorted(SIDES), NONE)
+    np.testing.assert_allclose(answer.values, [0.2, 0.0, 0.75, 0.05], atol=1e-6)
+    before = identity_answer(hypotheses(0.1, 0.1, 0.5, 0.3), nbv.Coverage())
+    words = words_of(answer)
+    assert words.said(before) == "slab 75 % (was 20 %), cube left 20 % (was 50 %), none of these 5 % (was 30 %)"
+    assert words.found == "slab, probability 0.75"
+    sure = identity_answer(hypotheses(0.97, 0.01, 0.01, 0.01), nbv.Identify())
+    assert words_of(sure).settled([before, answer, sure], lambda rule, index: True) == [False, False, True]
+    (chart,) = words.charts([before, answer], None)
+    assert chart.names == answer.names
+    assert chart.goal == 0.95
+
+
+def test_a_group_is_told_in_place_of_its_parts():
+    acquisition = nbv.Identify(group=[name.split()[0] for name in SIDES])
+    answer = identity_answer(hypotheses(0.2, 0.1, 0.6, 0.1), acquisition)
+    assert answer.names == ("cube", "slab", NONE)
+    np.testing.assert_allclose(answer.values, [0.6, 0.3, 0.1], atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def episode():
+    return small_run(nbv.DiscreteSearch(8), 2, acquisition=nbv.Identify(), model=Told(SLAB))
+
+
+def test_a_report_shows_the_part_over_the_scan(episode):
+    data = report_data(episode, progress=False)
+    assert [view.surface.caption for view in data.views] == ["slab  75 %", "slab  75 %"]
+    assert data.views[1].imagined.names == ("slab", "cube left")
+    assert task_of(episode).asked.endswith("over the likeliest parts and how they may lie.")
+    page = report_html(data, "thing")
+    assert Page(page).tables["Probability"][1][0] == "view 1"
+    for words in ("Which part is it?", "Slab, probability 0.75", "The likeliest part where it is taken to lie"):
+        assert words in page
+    assert "What the colour measures" not in page
+    assert "likeliest part" in {drawn["name"] for drawn in scene_in_space(page)[1]["data"]}
+    assert nbv.show(episode, progress=False).png.startswith(b"\x89PNG")
+    assert "; slab  75 %" in html_of(episode)
+
+
+def test_the_live_view_holds_the_part(episode):
+    pytest.importorskip("viser", reason="viser is not installed")
+    page = nbv.viz.LiveView(port=0)
+    try:
+        page.update(episode)
+        shown = {handle.name: handle for handle in page._drawn}
+        part = shown["/likeliest part, slab  75 %"]
+        np.testing.assert_allclose(part.vertices, likeliest_part(SLAB).vertices, atol=1e-5)
+        assert not shown["/imagined/2 cube left"].visible
+        assert "slab 75 %" in page._text.content.lower()
+        assert "likeliest part: slab" in page._legend.content
+    finally:
+        page.stop()
