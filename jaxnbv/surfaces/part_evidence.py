@@ -42,7 +42,7 @@ _STRIDE, _NUM_STRIDES = 0.04, 40
 _NUM_RAYS = 4096
 # Rays that are closer together on the object err together: scene units.
 _APART = 0.12
-KAPPA, _NONE_MISFIT = 0.15, 0.2
+KAPPA, _NONE_MISFIT = 0.3, 0.2
 # The share of the points that met something else, at most.
 _STRAY = 0.2
 
