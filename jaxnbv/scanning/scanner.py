@@ -99,14 +99,21 @@ class SensorNoise(eqx.Module):
     def __call__(
         self, cloud: PointCloud, key: PRNGKeyArray, camera: Camera | None = None, pose: Pose | None = None
     ) -> PointCloud:
-        """The cloud with noise on its filled rows, whatever took it."""
+        """The cloud with noise on its filled rows, whatever took it.
+
+        Where the pose is given, `sight` is the distance to the noisy points: a noisy scan holds no exact range.
+        """
         point_key, normal_key = jax.random.split(key)
         points = cloud.points + self.points * jax.random.normal(point_key, cloud.points.shape, cloud.points.dtype)
         normals = cloud.normals + self.normals * jax.random.normal(normal_key, cloud.normals.shape, cloud.points.dtype)
         normals = normals / jnp.linalg.norm(normals, axis=-1, keepdims=True)
         mask = cloud.mask[..., None]
         points, normals = jnp.where(mask, points, 0.0), jnp.where(mask, normals, 0.0)
-        return PointCloud(points, normals, cloud.mask, cloud.missed, cloud.sight)
+        sight = cloud.sight
+        if sight is not None and pose is not None:
+            ranges = jnp.linalg.norm(points - pose.position[..., None, :], axis=-1)
+            sight = jnp.where(cloud.mask, ranges, sight)
+        return PointCloud(points, normals, cloud.mask, cloud.missed, sight)
 
 
 class DepthNoise(eqx.Module):

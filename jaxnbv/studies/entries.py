@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from jaxnbv.studies.registry import Entry
-from jaxnbv.studies.scenes.framing import FirstView, Framing
+from jaxnbv.studies.scenes.framing import FirstView, Framing, Setup
 
 MESHES = {
     "meshes": Annotated[
@@ -65,6 +65,19 @@ RECORDING = {
         typer.Option(
             help="The length of a unit of a recording's images in the units of its poses, 0.0002 for TUM RGB-D.",
             show_default="the usual one with which frames agree",
+        ),
+    ],
+}
+KNOWN_PARTS = {
+    "parts": Annotated[
+        Path | None,
+        typer.Option(help="A folder of the parts' meshes, at true size.", show_default="sets of parts that look alike"),
+    ],
+    "setup": Annotated[
+        Setup | None,
+        typer.Option(
+            help="How a part is scanned: all of it in view, a patch of it, on a table, or beside a box.",
+            show_default="each",
         ),
     ],
 }
@@ -135,4 +148,12 @@ RECORDED = Entry(
     scenes=6,
     views=6,
     options=RECORDING,
+)
+IDENTIFICATION = Entry(
+    "jaxnbv.studies.identification:IdentificationStudy",
+    "Which of some known parts is it, and how does it lie? On your own parts, or on sets of parts that look alike.",
+    scenes=40,
+    views=4,
+    model="known",
+    options=KNOWN_PARTS,
 )

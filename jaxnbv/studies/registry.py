@@ -22,7 +22,8 @@ class Entry(NamedTuple):
     - `study`: its class, "module:class", imported once it is run.
     - `question`: for the help.
     - `scenes`, `views`: numbers by default.
-    - `model`: by which surfaces are imagined by default; "known" for a study that has a `bank`.
+    - `model`: by which surfaces are imagined by default; "known" for a study that has a `bank`, or is
+      about known parts.
     - `options`: annotations for typer of its own options, by the names of its settings; None is their default. One that
       is a `typer.Argument` must be given.
     """

@@ -1,6 +1,7 @@
 """The scanner: rows, batches of poses, noise of sensors by its law and by statistics, depth images; where a camera
 stands so that an object fits."""
 
+import dataclasses
 import math
 import warnings
 
@@ -90,6 +91,26 @@ def test_normals_of_a_batch_of_noisy_scans_are_unit():
     scans = nbv.scan(SURFACES["sdf"], nbv.Camera(height=6, width=6), nbv.look_at([[0.0, 0.0, 2.5], [2.5, 0.0, 0.0]]))
     noisy = nbv.SensorNoise()(scans, jax.random.key(0))
     np.testing.assert_allclose(np.linalg.norm(noisy.normals, axis=-1), np.asarray(scans.mask), atol=1e-5)
+
+
+@pytest.mark.parametrize("batch", [False, True])
+def test_the_ranges_of_a_noisy_scan_are_those_of_its_points(batch):
+    """Else an observer would read off exact ranges."""
+    pose = nbv.look_at([[0.0, 0.0, 2.5], [2.5, 0.0, 0.0]] if batch else [0.0, 0.3, 2.5])
+    camera = nbv.Camera(height=12, width=12)
+    clean = nbv.scan(SURFACES["sdf"], camera, pose)
+    noisy = nbv.SensorNoise(0.02)(clean, jax.random.key(0), camera, pose)
+    mask = np.asarray(clean.mask)
+    assert 10 < mask.sum() < mask.size
+    away = np.linalg.norm(np.asarray(noisy.points) - np.asarray(pose.position)[..., None, :], axis=-1)
+    np.testing.assert_allclose(np.asarray(noisy.sight)[mask], away[mask], rtol=1e-6)
+    error = (np.asarray(noisy.sight) - np.asarray(clean.sight))[mask]
+    assert 0.01 < error.std() < 0.03
+    assert np.isinf(np.asarray(noisy.sight)[~mask]).all()
+    # A ray that ended at what is no point of the cloud saw as far as it did.
+    ended = dataclasses.replace(clean, mask=clean.mask & False)
+    again = nbv.SensorNoise(0.02)(ended, jax.random.key(0), camera, pose)
+    np.testing.assert_array_equal(again.sight, clean.sight)
 
 
 def seen_share(setting, reach):

@@ -1,4 +1,7 @@
-"""How large an object stands, and from where it is seen first. Commands offer both: nothing heavy is imported."""
+"""How large an object stands, where, and from where it is seen first.
+
+Commands offer these: nothing heavy is imported.
+"""
 
 from enum import StrEnum
 
@@ -20,3 +23,23 @@ class FirstView(StrEnum):
 
     ANY = "any"
     MISCLASSIFIED = "misclassified"
+
+
+class Setup(StrEnum):
+    """How a known part is scanned: nearly all of its near side in view, a patch of it, resting on a table, or there
+    beside a box that hides half of it."""
+
+    WHOLE = "whole"
+    CLOSE_UP = "close-up"
+    TABLE = "table"
+    HIDDEN = "hidden"
+
+    @property
+    def radius(self) -> float:
+        """Distance of the cameras from the part's centre, in scene units, where its longest side is 2.5."""
+        return 2.2 if self is Setup.CLOSE_UP else 5.0
+
+    @property
+    def is_resting(self) -> bool:
+        """Whether the part lies on a table."""
+        return self in (Setup.TABLE, Setup.HIDDEN)

@@ -1,0 +1,261 @@
+"""The study of identification: which of some known parts is it, how does it lie, and by which views is that told?"""
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import pdist
+
+from jaxnbv.acquisition import Acquisition
+from jaxnbv.checks import require
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.planning.loop import Sensor, Step
+from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.simulate import observe_scene
+from jaxnbv.sampler import SurfaceSampler
+from jaxnbv.scanning import SensorNoise
+from jaxnbv.scanning.sdf import SignedDistance
+from jaxnbv.search import Search, SphereCandidates
+from jaxnbv.studies.engine.measures import KNOWN, SECONDS, Claim, Measure, Record
+from jaxnbv.studies.engine.study import Scene, Study
+from jaxnbv.studies.engine.tiles import Tiles, across, say, still_of
+from jaxnbv.studies.scenes.framing import Setup
+from jaxnbv.studies.scenes.placed_parts import PlacedPart, confusable_parts, parts_in, place_part
+from jaxnbv.surfaces import FreeRotation
+from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses
+from jaxnbv.surfaces.placement import Placement
+from jaxnbv.tasks import Identify, NewSurface
+from jaxnbv.viz.style import DEVIATION
+
+IDENTIFY, BY_NAME = "identify", "identify-name"
+_SIZE = 2.5
+# The sensor's noise: 0.6 % of the size for each coordinate of a point, six degrees for a normal.
+_NOISE = SensorNoise(0.006 * _SIZE, 0.1)
+# Cameras about a table stand at least this far above it.
+_ELEVATION = math.radians(10.0)
+# A first view shows the part by so many of its pixels, at least.
+_ENOUGH = 0.01
+# Rays by which views are imagined, rows and columns.
+_RAYS = (28, 28)
+# Points of the true surface that are measured, and of the placed one that they are compared with.
+_POINTS, _DENSE = 500, 20_000
+# Share of the size by which a pose that counts as right is off at most.
+_RIGHT = 0.01
+# Names whose weights are as near to the largest, as shares of it, are level.
+_LEVEL = 0.99
+# Distances to the true part that pictures tell apart, in scene units.
+_ERRORS = LogNorm(0.01, 0.5)
+_Truth = tuple[PlacedPart, Float[np.ndarray, "n 3"], float]
+
+
+def _by_view(name: str) -> Any:
+    return lambda record, method: [float(value) for value in record["methods"][method][name]]
+
+
+def _below(share: float) -> Any:
+    return lambda record, method: [float(value < share) for value in record["methods"][method]["add_s"]]
+
+
+class IdentificationStudy(Study):
+    """Which of some known parts an object is, and how it lies. Settings as of `Study`, and
+
+    - `setup`: how the part is scanned.
+    - `meshes`: files of the parts, at true size. Without any, parts are sets of eight that look alike.
+
+    All methods hold the same bank and weigh the same hypotheses, so that they differ in their views alone.
+    """
+
+    title: ClassVar[str] = "Which part it is, and how it lies"
+    explanation: ClassVar[str] = (
+        "Name right: the likeliest name is the true one; 'none of these' counts as wrong, one of n that are level as\n"
+        "1/n. Pose right: so is the name, and the true part's surface lies within 1 % of its size of the placed part,\n"
+        "on average. ADD-S: the mean distance from the true part's points to the nearest ones of the placed part, in\n"
+        "shares of the diameter.\n"
+        "There is no oracle: to score each candidate by its true scan takes a search of the bank for each."
+    )
+    methods: ClassVar[tuple[str, ...]] = (IDENTIFY, BY_NAME, "farthest", "random")
+    further: ClassVar[tuple[str, ...]] = ("new-surface", "uncertainty")
+    pictured: ClassVar[tuple[str, ...]] = (IDENTIFY, "farthest", "random")
+    reference: ClassVar[str] = IDENTIFY
+    measures: ClassVar[tuple[Measure, ...]] = (
+        Measure("right", "Name right", _by_view("right"), unit="%"),
+        Measure("probability", "Probability of the true name", _by_view("p_true"), digits=2),
+        Measure("placed", "Pose right", _by_view("placed"), unit="%"),
+        Measure("add5", "ADD-S below 5 % of the diameter", _below(0.05), unit="%"),
+        Measure("add10", "ADD-S below 10 % of the diameter", _below(0.1), unit="%"),
+        SECONDS,
+    )
+    claims: ClassVar[tuple[Claim, ...]] = (
+        Claim(
+            "Views by what they tell about the hypotheses name the part sooner than views that know no hypotheses.",
+            "right",
+            2,
+            ("farthest", "random"),
+        ),
+    )
+    without_bank: ClassVar[tuple[str, ...]] = ()
+    seed: ClassVar[int] = 19
+    quick: ClassVar[Mapping[str, Any]] = {
+        "num_candidates": 24,
+        "num_samples": 4,
+        "grid_resolution": 48,
+        "capacity": 1000,
+    }
+
+    num_candidates: int = eqx.field(static=True, default=60)
+    num_samples: int = eqx.field(static=True, default=8)
+    capacity: int = eqx.field(static=True, default=2000)
+    setup: Setup = eqx.field(static=True, default=Setup.WHOLE)
+
+    @classmethod
+    def configured(
+        cls,
+        model: str,
+        views: int,
+        quick: bool,
+        parts: str | Path | None = None,
+        setup: Setup | None = None,
+        **options: Any,
+    ) -> dict[str, Study]:
+        """One for each setup, if none is given.
+
+        - `parts`: a folder of meshes at true size; by default parts that look alike.
+
+        **Raises:** `ValueError` for a model that knows no parts, or a folder without meshes.
+        """
+        require(model == KNOWN, f"the study is about known parts: give the model {KNOWN}, or none")
+        settings: dict[str, Any] = {
+            "sampler": SurfaceSampler.preset("screened", quick=quick),
+            "meshes": () if parts is None else cls.files_in(parts),
+        }
+        settings |= (dict(cls.quick) if quick else {}) | options
+        return {one.value: cls(views=views, setup=one, **settings) for one in ((setup,) if setup else Setup)}
+
+    @property
+    def num_scenes(self) -> int | None:
+        """As many as are asked for: a part returns in another pose."""
+        return None
+
+    @property
+    def candidates(self) -> SphereCandidates:
+        lowest = _ELEVATION if self.setup.is_resting else -0.5 * math.pi
+        return SphereCandidates(self.num_candidates, self.setup.radius, lowest)
+
+    @property
+    def imagined_camera(self) -> Camera:
+        return self.camera.resized(*_RAYS)
+
+    def scene(self, index: int) -> Scene:
+        """A part that lies somehow; its task is the `PlacedPart`."""
+        require(index >= 0, f"there is no scene {index}: they are counted from 0")
+        if self.meshes:
+            parts = parts_in(self.meshes)
+            part = parts.choose(index)
+        else:
+            _, parts, part = confusable_parts(index)
+        placed = place_part(parts, part, self.setup, self.key(index, "scene"))
+        return Scene(index, parts.bank.names[part], placed.mesh, placed)
+
+    def sensor(self, scene: Scene) -> Sensor:
+        """A camera whose points are noisy, and their ranges too; what stands around the part hides it."""
+        obstacles = scene.task.obstacles
+
+        def observe(pose: Pose, key: PRNGKeyArray) -> PointCloud:
+            seen = observe_scene(scene.surface, self.camera, pose, _NOISE, key, obstacles)
+            return seen if obstacles is None else obstacles.remove_points(seen)
+
+        return observe
+
+    def shows_enough(self, scene: Scene, seen: PointCloud) -> bool:
+        return int(seen.count) >= _ENOUGH * self.camera.num_rays
+
+    def sampler_of(self, scene: Scene) -> SurfaceSampler:
+        """With the bank at the scale of the scene."""
+        return self.sampler.with_bank(scene.task.bank, FreeRotation())
+
+    def planner_of(self, acquisition: Acquisition, search: Search, scene: Scene) -> Planner:
+        planner = super().planner_of(acquisition, search, scene)
+        return dataclasses.replace(planner, obstacles=scene.task.obstacles)
+
+    def acquisition(self, method: str, scene: Scene) -> Acquisition:
+        if method in ("new-surface", "uncertainty"):
+            return NewSurface()
+        return Identify(pose=method != BY_NAME)
+
+    def truth(self, scene: Scene) -> _Truth:
+        """The placed part, points of its surface, and its diameter."""
+        mesh = scene.task.mesh
+        corners = mesh.to_trimesh().convex_hull.vertices
+        return scene.task, mesh.sample_points(self.key(scene.index, "measure"), _POINTS), float(pdist(corners).max())
+
+    def facts(self, scene: Scene, truth: _Truth, first: int) -> Record:
+        alike = "" if self.meshes else scene.name.rpartition(" ")[0]
+        return {"name": scene.name, "setup": self.setup.value, "set": alike, "part": truth[0].part}
+
+    @classmethod
+    def group(cls, record: Record) -> str:
+        """By the set of parts that look alike."""
+        return record["set"]
+
+    def follow(self, scene: Scene, truth: _Truth, planner: Planner, episode: Iterator[Step]) -> Record:
+        """After each view: the likeliest name, how far it is right, how likely the true one is, and how far off the
+        likeliest placement is."""
+        views = [self._told(truth, step.observations.hypotheses) for step in episode]
+        return {name: [view[name] for view in views] for name in views[0]}
+
+    def _told(self, truth: _Truth, hypotheses: Any) -> Record:
+        assert isinstance(hypotheses, PartHypotheses)
+        (task, points, diameter), bank = truth, hypotheses.bank
+        weights = np.append(np.asarray(hypotheses.shape_weights), hypotheses.weights[-1])
+        named, (part, placement) = int(np.argmax(weights)), hypotheses.likeliest
+        # Parts that nothing seen so far tells apart are level, whatever their order in the bank.
+        level = weights >= _LEVEL * weights.max()
+        right = float(level[task.part] / level.sum())
+        rotation, shift = np.asarray(placement.rotation, np.float64), np.asarray(placement.shift, np.float64)
+        off = _distances(placement, bank.shape(jnp.asarray(part)).solid, jnp.asarray(points, jnp.float32))
+        fit = float(np.mean(np.abs(np.asarray(off)))) / _SIZE
+        dense = task.placed(part, rotation, shift).sample_points(jax.random.key(0), _DENSE)
+        return {
+            "named": NONE if named == len(bank) else bank.names[named],
+            "right": right,
+            "p_true": float(weights[task.part]),
+            "fit": fit,
+            "placed": right if fit < _RIGHT else 0.0,
+            "add_s": float(np.mean(cKDTree(dense).query(points)[0])) / diameter,
+            "likeliest": {"part": part, "rotation": rotation.tolist(), "shift": shift.tolist()},
+        }
+
+    def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
+        """The likeliest part where it is placed after each view, coloured by the distance to the true one."""
+        task, held, eye = self.scene(record["scene"]).task, record["methods"], across(record)
+        true = task.mesh
+        tree = cKDTree(true.sample_points(jax.random.key(0), 10 * _DENSE))
+
+        def tile(axes: Axes, method: str, view: int) -> None:
+            run = held[method]
+            at = run["likeliest"][view]
+            mesh = task.placed(at["part"], np.asarray(at["rotation"]), np.asarray(at["shift"]))
+            axes.imshow(still_of(mesh, eye, pixels, lambda points: tree.query(points)[0], _ERRORS).image)
+            say(axes, f"{run['named'][view]}, {run['p_true'][view]:.2f}", right=run["right"][view] == 1)
+
+        scale = ScalarMappable(_ERRORS, DEVIATION), "distance to the true part\n(scene units)"
+        caption = "The likeliest part as it is placed, its name, and how likely the true name is."
+        return Tiles(caption, tile, lambda axes: axes.imshow(still_of(true, eye, pixels).image), scale=scale)
+
+
+@eqx.filter_jit
+def _distances(placement: Placement, solid: SignedDistance, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    return placement.distance(solid, points)

@@ -1,0 +1,213 @@
+"""Sets of parts that look alike: the same housing, and one feature that differs, which few views show.
+
+Lengths are scene units. No part reaches beyond 1.35 from the origin along an axis.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.scanning import Grid, TriangleMesh
+from jaxnbv.scanning.mesh import level_triangles
+from jaxnbv.scanning.sdf import Cuboid, Cylinder, Difference, Sampled, SignedDistance, Translated, Union
+from jaxnbv.surfaces import ShapeBank
+
+PARTS_OF_SET = 8
+# Two spacings of the bank's grid are less than the smallest feature, 0.12 across; the meshes are finer.
+_BANK_GRID, _MESH_GRID = Grid(64, 1.5), Grid(100, 1.4)
+# No part comes nearer to the faces of the bank's grid.
+_PADDING = 0.15
+# The pocket of the housing: its centre across, its floor, and one that holes in it are seen in.
+_ACROSS, _FLOOR, _SHALLOW = 0.15, 0.05, 0.45
+
+
+def _box(half_size: Sequence[float], center: Sequence[float]) -> SignedDistance:
+    return Translated(Cuboid(np.asarray(half_size)), np.asarray(center))
+
+
+def _pin(radius: float, half_height: float, center: Sequence[float]) -> SignedDistance:
+    return Translated(Cylinder(radius, half_height), np.asarray(center))
+
+
+def _housing(side: float = 1.0, floor: float = _FLOOR) -> SignedDistance:
+    """A block with a deep pocket, open above, and a notch at one corner by which its sides are told apart.
+
+    - `side`: 1, or -1 for its mirror image; `floor`: of the pocket.
+    """
+    block = Cuboid(np.array([0.75, 1.25, 0.55]))
+    pocket = _box([0.42, 0.7, 0.3], [side * _ACROSS, floor + 0.7, 0.0])
+    return Difference(Difference(block, pocket), _box([0.2, 0.2, 0.2], [side * 0.75, -1.25, 0.55]))
+
+
+def _bosses() -> list[SignedDistance]:
+    """A boss on the floor of the pocket: its place, radius and height."""
+    variants = [
+        (-0.25, 0.0, 0.12, 0.25),
+        (0.25, 0.0, 0.12, 0.25),
+        (0.0, 0.15, 0.12, 0.25),
+        (0.0, -0.15, 0.12, 0.25),
+        (0.0, 0.0, 0.12, 0.25),
+        (0.0, 0.0, 0.12, 0.45),
+        (0.0, 0.0, 0.22, 0.25),
+        (-0.25, 0.15, 0.1, 0.4),
+    ]
+    return [Union(_housing(), _pin(r, h, [_ACROSS + x, _FLOOR + h - 0.05, z])) for x, z, r, h in variants]
+
+
+def _bores() -> list[SignedDistance]:
+    """A blind hole in the floor of the pocket: its place and radius."""
+    places = [(-0.25, 0.0), (0.25, 0.0), (0.0, 0.15), (0.0, -0.15), (0.0, 0.0), (0.0, 0.0), (-0.25, 0.15), (0.25, 0.15)]
+    radii = [0.12, 0.12, 0.12, 0.12, 0.12, 0.22, 0.12, 0.12]
+    return [
+        Difference(_housing(floor=_SHALLOW), _pin(r, 0.35, [_ACROSS + x, _SHALLOW - 0.25, z]))
+        for (x, z), r in zip(places, radii, strict=True)
+    ]
+
+
+def _ribs() -> list[SignedDistance]:
+    """A rib across the floor of the pocket: its place and direction."""
+    along = [(-0.28, 0.0, 90.0), (0.0, 0.0, 90.0), (0.28, 0.0, 90.0)]
+    across = [(0.0, -0.2, 0.0), (0.0, 0.0, 0.0), (0.0, 0.2, 0.0)]
+    aslant = [(0.0, 0.0, 45.0), (0.0, 0.0, -45.0)]
+    rib = Cuboid(np.array([0.28, 0.15, 0.06]))
+    up = np.array([0.0, 1.0, 0.0])
+    return [
+        Union(_housing(), Translated(rib.rotate(up, np.radians(angle)), np.array([_ACROSS + x, _FLOOR + 0.1, z])))
+        for x, z, angle in (*along, *across, *aslant)
+    ]
+
+
+def _connectors() -> list[SignedDistance]:
+    """A connector on the floor of the pocket: its sides and place."""
+    variants = [
+        (0.3, 0.1, 0.0, 0.0),
+        (0.1, 0.22, 0.0, 0.0),
+        (0.2, 0.2, 0.0, 0.0),
+        (0.12, 0.12, 0.0, 0.0),
+        (0.16, 0.1, -0.22, 0.15),
+        (0.16, 0.1, 0.22, 0.15),
+        (0.16, 0.1, -0.22, -0.15),
+        (0.16, 0.1, 0.22, -0.15),
+    ]
+    return [
+        Union(_housing(), _box([half, 0.2, deep], [_ACROSS + x, _FLOOR + 0.15, z])) for half, deep, x, z in variants
+    ]
+
+
+def _pins() -> list[SignedDistance]:
+    """Four places for pins on the floor of the pocket, some of which hold one."""
+    places = [(-0.24, -0.15), (-0.24, 0.15), (0.24, -0.15), (0.24, 0.15)]
+    held = ["1111", "0111", "1011", "1101", "1110", "1001", "0110", "1010"]
+
+    def part(which: str) -> SignedDistance:
+        # A pin that is not there lies within the block, so that all parts are made alike.
+        heights = [_FLOOR + (0.2 if one == "1" else -0.6) for one in which]
+        pins = [_pin(0.1, 0.25, [_ACROSS + x, y, z]) for (x, z), y in zip(places, heights, strict=True)]
+        return functools.reduce(Union, pins, _housing())
+
+    return [part(which) for which in held]
+
+
+def _channels() -> list[SignedDistance]:
+    """A boss in a channel through a block: how far in, and on which of two walls."""
+    block = Difference(Cuboid(np.array([0.7, 0.6, 1.25])), _box([0.28, 0.28, 1.5], [0.0, 0.1, 0.0]))
+    block = Difference(block, _box([0.2, 0.2, 0.2], [0.7, -0.6, 1.25]))
+    places = [(wall, z) for wall in (-0.24, 0.24) for z in (-0.6, -0.2, 0.2, 0.6)]
+    return [Union(block, _box([0.12, 0.12, 0.12], [x, 0.0, z])) for x, z in places]
+
+
+def _cup(floor: float, size: float = 1.0) -> SignedDistance:
+    wall, high = 0.12 * size, 1.25 * size
+    top = 1.5
+    inside = _pin(0.7 * size - wall, 0.5 * (top - floor), [0.0, 0.5 * (top + floor), 0.0])
+    return Difference(Cylinder(0.7 * size, high), inside)
+
+
+def _cups() -> list[SignedDistance]:
+    """A cup: how far up its floor is, which the outside does not show."""
+    return [_cup(floor) for floor in np.linspace(-1.1, -0.05, PARTS_OF_SET)]
+
+
+def _sizes() -> list[SignedDistance]:
+    """A cup in sizes that differ by 4 %."""
+    return [_cup(-1.1 * size, size) for size in 1.04 ** -np.arange(PARTS_OF_SET)]
+
+
+def _mugs() -> list[SignedDistance]:
+    """A mug whose handle, which hides behind it, differs in place and length."""
+    variants = [(y, half) for half in (0.2, 0.4) for y in (-0.6, -0.2, 0.2, 0.6)]
+
+    def part(y: float, half: float) -> SignedDistance:
+        grip = Difference(_box([0.22, half, 0.1], [0.86, y, 0.0]), _box([0.12, half - 0.1, 0.2], [0.82, y, 0.0]))
+        # The grip ends at the wall: it must not show inside.
+        mug = Union(_cup(-1.1), Difference(grip, Cylinder(0.65, 1.5)))
+        return Translated(mug, np.array([-0.19, 0.0, 0.0]))
+
+    return [part(*variant) for variant in variants]
+
+
+def _mirrored() -> list[SignedDistance]:
+    """Four housings with a boss, and the mirror image of each."""
+    places = [(-0.25, 0.0), (0.25, 0.0), (0.0, 0.15), (0.0, -0.15)]
+    return [
+        Union(_housing(side), _pin(0.12, 0.25, [side * (_ACROSS + x), _FLOOR + 0.2, z]))
+        for side in (1.0, -1.0)
+        for x, z in places
+    ]
+
+
+_SETS: dict[str, Callable[[], list[SignedDistance]]] = {
+    "boss": _bosses,
+    "bore": _bores,
+    "rib": _ribs,
+    "connector": _connectors,
+    "pins": _pins,
+    "channel": _channels,
+    "cup": _cups,
+    "mug": _mugs,
+    "mirror": _mirrored,
+    "size": _sizes,
+}
+CONFUSABLE_SETS = tuple(_SETS)
+"""Names of the sets."""
+HIDDEN_CUES = ("boss", "bore", "rib", "connector", "pins", "channel", "cup")
+"""The sets whose parts look the same from at least two directions in three."""
+
+
+def confusable_solids(name: str) -> list[SignedDistance]:
+    """The parts of a set as solids, all made of the same operations."""
+    return _SETS[name]()
+
+
+@functools.cache
+def confusable_meshes(name: str) -> tuple[TriangleMesh, ...]:
+    """The parts of a set as meshes, whose edges are rounded to 0.03."""
+    values = [np.array(_values(solid, _nodes(_MESH_GRID))) for solid in confusable_solids(name)]
+    triangles = [level_triangles(rows, _MESH_GRID) for rows in values]
+    return tuple(TriangleMesh(found[0], found[1], Frame()) for found in triangles if found is not None)
+
+
+@functools.cache
+def confusable_bank(name: str) -> ShapeBank:
+    """The parts of a set as a bank at true size, by their signed distances on a grid: a tree of operations would take
+    minutes to compile within a search."""
+    nodes = _nodes(_BANK_GRID)
+    low, spacing = np.full(3, -_BANK_GRID.half_extent), _BANK_GRID.spacing
+    solids = [Sampled(_values(solid, nodes), low, spacing, _PADDING) for solid in confusable_solids(name)]
+    return ShapeBank.of(solids, [f"{name} {index}" for index in range(len(solids))], is_true_size=True)
+
+
+def _nodes(grid: Grid) -> Float[Array, "g g g 3"]:
+    axis = jnp.asarray(grid.axis, jnp.result_type(float))
+    return jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+
+
+# Solids of one set share a compilation.
+@eqx.filter_jit
+def _values(solid: SignedDistance, nodes: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
+    return solid(nodes)
