@@ -34,7 +34,6 @@ from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.engine.tiles import Tiles, across, say, still_of
 from jaxnbv.studies.scenes.framing import Setup
 from jaxnbv.studies.scenes.placed_parts import PlacedPart, confusable_parts, parts_in, place_part
-from jaxnbv.surfaces import FreeRotation
 from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses
 from jaxnbv.surfaces.placement import Placement
 from jaxnbv.tasks import Identify, NewSurface
@@ -183,8 +182,8 @@ class IdentificationStudy(Study):
         return int(seen.count) >= _ENOUGH * self.camera.num_rays
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
-        """With the bank at the scale of the scene."""
-        return self.sampler.with_bank(scene.task.bank, FreeRotation())
+        """With the bank at the scale of the scene; its parts rest on the table, where there is one."""
+        return self.sampler.with_bank(scene.task.bank, scene.task.poses)
 
     def planner_of(self, acquisition: Acquisition, search: Search, scene: Scene) -> Planner:
         planner = super().planner_of(acquisition, search, scene)

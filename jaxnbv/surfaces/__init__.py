@@ -15,6 +15,7 @@ from jaxnbv.surfaces.placement import FreeRotation as FreeRotation
 from jaxnbv.surfaces.placement import Placement as Placement
 from jaxnbv.surfaces.placement import ShapePoses as ShapePoses
 from jaxnbv.surfaces.placement import Upright as Upright
+from jaxnbv.surfaces.resting import Resting as Resting
 from jaxnbv.surfaces.screened import ScreenedSPSR as ScreenedSPSR
 from jaxnbv.surfaces.shape_bank import ShapeBank as ShapeBank
 from jaxnbv.surfaces.shipped_banks import bank_poses as bank_poses

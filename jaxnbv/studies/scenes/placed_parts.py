@@ -1,7 +1,7 @@
 """Known parts as they lie before a sensor: turned at random or resting on a table, a box beside them or not."""
 
+import dataclasses
 import functools
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ from jaxnbv.scanning import Obstacles, TriangleMesh
 from jaxnbv.scanning.sdf import Cuboid, HalfSpace
 from jaxnbv.studies.scenes.confusable import CONFUSABLE_SETS, PARTS_OF_SET, confusable_bank, confusable_meshes
 from jaxnbv.studies.scenes.framing import Setup
-from jaxnbv.surfaces import ShapeBank
+from jaxnbv.surfaces import FreeRotation, Resting, ShapeBank, ShapePoses
 
 _LONGEST_SIDE = 2.5
 # The box beside a part: how far away, half its thickness, and how far it goes beyond the part, in scene units.
@@ -26,11 +26,17 @@ _GAP, _THIN, _BEYOND = 0.3, 0.15, 0.2
 _ORDER = 123
 
 
-class Parts(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Parts:
     """A bank at true size, and the meshes of its parts, in the coordinates of its shapes and at true size."""
 
     bank: ShapeBank
     meshes: tuple[TriangleMesh, ...]
+
+    @functools.cached_property
+    def resting(self) -> Resting:
+        """How they can lie on a table."""
+        return Resting.of(self.bank)
 
     def choose(self, index: int) -> int:
         """The part of a scene. Scenes of even and of odd numbers share none, and each part comes before any returns."""
@@ -86,6 +92,11 @@ class PlacedPart(eqx.Module):
     def bank(self) -> ShapeBank:
         """In scene units."""
         return self.parts.bank.in_scene(Frame(scale=self.scale))
+
+    @property
+    def poses(self) -> ShapePoses:
+        """How the parts can lie: on a table, where there is one."""
+        return FreeRotation() if self.obstacles is None else self.parts.resting
 
     @property
     def mesh(self) -> TriangleMesh:

@@ -1,0 +1,76 @@
+"""How parts can lie on a table: turned about the vertical in the poses in which they do not topple."""
+
+from typing import cast
+
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jaxtyping import Array, Float
+from scipy.spatial.transform import Rotation
+
+from jaxnbv.checks import require
+from jaxnbv.surfaces.placement import ShapePoses
+from jaxnbv.surfaces.shape_bank import ShapeBank
+
+# Stable poses of a part that are tried, at most; those whose upward directions are nearer count as one, in radians.
+_MOST, _NEAR = 8, np.radians(10.0)
+_NODES = 32
+# From z, which is upward to trimesh, to y.
+_UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+class Resting(ShapePoses):
+    """Parts that rest on a table, y upward: any turn about the vertical, in one of a part's stable poses.
+
+    A search starts from these; refined hypotheses may tilt.
+
+    - `stable`: (k, p, 3, 3) rotations of each part of a bank, likeliest first.
+    """
+
+    stable: Float[Array, "k p 3 3"]
+
+    @classmethod
+    def of(cls, bank: ShapeBank) -> "Resting":
+        """The stable poses of a bank's parts, by their convex hulls and centres of mass, as if they were solid.
+
+        **Raises:** `ValueError` for an empty bank.
+        """
+        require(len(bank) > 0, "the bank is empty: give one with parts")
+        each = [_stable_poses(bank, index) for index in range(len(bank))]
+        most = max(len(poses) for poses in each)
+        # Parts with fewer repeat theirs.
+        rows = [poses[np.arange(most) % len(poses)] for poses in each]
+        return cls(jnp.asarray(np.stack(rows), jnp.result_type(float)))
+
+    def rotations(self, count: int) -> Float[np.ndarray, "m 3 3"]:
+        """Those of the first part."""
+        return self.rotations_of(1, count)[0]
+
+    def rotations_of(self, num_shapes: int, count: int) -> Float[np.ndarray, "k m 3 3"]:
+        """Evenly spaced turns of each stable pose."""
+        stable = np.asarray(self.stable, np.float64)[:num_shapes]
+        num_turns = max(1, count // stable.shape[1])
+        angles = 2.0 * np.pi * np.arange(num_turns) / num_turns
+        turns = Rotation.from_rotvec(angles[:, None] * np.array([0.0, 1.0, 0.0])).as_matrix()
+        return np.einsum("tij,kpjl->kptil", turns, stable).reshape(len(stable), -1, 3, 3)
+
+    def turns(self) -> Float[np.ndarray, "3 k"]:
+        return np.eye(3)
+
+
+def _stable_poses(bank: ShapeBank, index: int) -> Float[np.ndarray, "p 3 3"]:
+    shape = bank.shape(jnp.asarray(index))
+    points = np.asarray(shape.extremes, np.float64)
+    axes = [np.linspace(low, high, _NODES) for low, high in zip(points.min(axis=0), points.max(axis=0), strict=True)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    inside = nodes[np.asarray(shape.solid(jnp.asarray(nodes, shape.extremes.dtype))) < 0]
+    center = inside.mean(axis=0) if len(inside) else points.mean(axis=0)
+    hull = cast(trimesh.Trimesh, trimesh.convex.convex_hull(points))
+    transforms, probabilities = trimesh.poses.compute_stable_poses(hull, center_mass=center)
+    chosen: list[np.ndarray] = []
+    for transform in transforms[np.argsort(-probabilities)]:
+        rotation = _UPRIGHT @ transform[:3, :3]
+        # A turn about the vertical leaves what is upward in the part as it is.
+        if all(rotation[1] @ other[1] < np.cos(_NEAR) for other in chosen):
+            chosen.append(rotation)
+    return np.stack(chosen[:_MOST]) if chosen else np.eye(3)[None]
