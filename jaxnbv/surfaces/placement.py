@@ -10,7 +10,7 @@ import scipy.linalg
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
-from jaxnbv.checks import check_fields, require
+from jaxnbv.checks import AnyArray, check_fields, require
 from jaxnbv.geometry.rotations import rotation_from_vector
 from jaxnbv.scanning.sdf import SignedDistance
 
@@ -75,7 +75,7 @@ class ShapePoses(eqx.Module):
         require(0 < least <= most, f"the scales are {self.scale}; give the least, positive, and the greatest")
 
     @abstractmethod
-    def rotations(self, count: int) -> Float[np.ndarray, "m 3 3"]:
+    def rotations(self, count: int) -> Float[AnyArray, "m 3 3"]:
         """At most `count` rotations, spread evenly over those that are possible: where a search starts."""
 
     @abstractmethod
@@ -94,7 +94,7 @@ class ShapePoses(eqx.Module):
         scales = np.zeros((3, 0)) if least == most else np.eye(3) if self.by_axis else np.full((3, 1), 3**-0.5)
         return scipy.linalg.block_diag(self.turns(), np.eye(3), scales)
 
-    def rotations_of(self, num_shapes: int, count: int) -> Float[np.ndarray, "k m 3 3"]:
+    def rotations_of(self, num_shapes: int, count: int) -> Float[AnyArray, "k m 3 3"]:
         """At most `count` rotations of each of some shapes; a first axis of one where they are those of all."""
         return self.rotations(count)[None]
 

@@ -8,7 +8,7 @@ import trimesh
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
-from jaxnbv.checks import require
+from jaxnbv.checks import AnyArray, require
 from jaxnbv.surfaces.placement import ShapePoses
 from jaxnbv.surfaces.shape_bank import ShapeBank
 
@@ -42,17 +42,18 @@ class Resting(ShapePoses):
         rows = [poses[np.arange(most) % len(poses)] for poses in each]
         return cls(jnp.asarray(np.stack(rows), jnp.result_type(float)))
 
-    def rotations(self, count: int) -> Float[np.ndarray, "m 3 3"]:
+    def rotations(self, count: int) -> Float[AnyArray, "m 3 3"]:
         """Those of the first part."""
         return self.rotations_of(1, count)[0]
 
-    def rotations_of(self, num_shapes: int, count: int) -> Float[np.ndarray, "k m 3 3"]:
+    def rotations_of(self, num_shapes: int, count: int) -> Float[AnyArray, "k m 3 3"]:
         """Evenly spaced turns of each stable pose."""
-        stable = np.asarray(self.stable, np.float64)[:num_shapes]
+        stable = self.stable[:num_shapes]
         num_turns = max(1, count // stable.shape[1])
         angles = 2.0 * np.pi * np.arange(num_turns) / num_turns
         turns = Rotation.from_rotvec(angles[:, None] * np.array([0.0, 1.0, 0.0])).as_matrix()
-        return np.einsum("tij,kpjl->kptil", turns, stable).reshape(len(stable), -1, 3, 3)
+        starts = jnp.einsum("tij,kpjl->kptil", jnp.asarray(turns, stable.dtype), stable, precision="highest")
+        return starts.reshape(len(stable), -1, 3, 3)
 
     def turns(self) -> Float[np.ndarray, "3 k"]:
         return np.eye(3)

@@ -29,7 +29,7 @@ def test_turns_are_about_the_vertical():
     """All starts of a part keep one of its stable poses' directions upward, evenly turned."""
     bank = nbv.ShapeBank.of([Cuboid(np.array([1.0, 0.6, 0.3]))], is_true_size=True)
     poses = Resting.of(bank)
-    starts = poses.rotations_of(1, 60)[0]
+    starts = np.asarray(poses.rotations_of(1, 60)[0])
     assert len(starts) == 60
     upward = np.unique(starts[:, 1].round(4) + 0.0, axis=0)
     assert len(upward) == 6
