@@ -85,7 +85,7 @@ class Planner(eqx.Module):
         self.search.check(self.acquisition, self.camera, self.capacity)
         # Before anything is computed for a function that JAX cannot trace.
         require(
-            self.sampler.model.hypothesises or not self.acquisition.needs_hypotheses,
+            self.sampler.model.carries_hypotheses or not self.acquisition.needs_hypotheses,
             f"{type(self.acquisition).__name__} is about known parts, and the sampler knows none: give it a bank at "
             "true size, sampler.with_bank(ShapeBank.from_meshes(folder, scale='m'), FreeRotation())",
         )

@@ -161,7 +161,7 @@ class SurfaceModel(eqx.Module):
         return self
 
     @property
-    def hypothesises(self) -> bool:
+    def carries_hypotheses(self) -> bool:
         """Whether `observed` keeps hypotheses about which known part the object is, see `PartHypotheses`."""
         return False
 

@@ -87,7 +87,7 @@ class KnownShapes(SurfaceModel):
         self.unknown.check(cloud)
 
     @property
-    def hypothesises(self) -> bool:
+    def carries_hypotheses(self) -> bool:
         """For parts at true size."""
         return self.bank.is_true_size and self.bank.solids is not None
 
@@ -96,7 +96,7 @@ class KnownShapes(SurfaceModel):
 
     def observed(self, observations: Observations) -> Observations:
         """The observations with the `PartHypotheses` of parts at true size."""
-        if not self.hypothesises:
+        if not self.carries_hypotheses:
             return observations
         before = observations.hypotheses
         assert before is None or isinstance(before, PartHypotheses)
@@ -113,7 +113,7 @@ class KnownShapes(SurfaceModel):
         unknown = self.unknown.condition(observations)
         if self.bank.solids is None:
             return unknown
-        if self.hypothesises:
+        if self.carries_hypotheses:
             hypotheses = (
                 self.observed(observations).hypotheses if observations.hypotheses is None else observations.hypotheses
             )

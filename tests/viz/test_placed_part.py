@@ -40,7 +40,7 @@ class Told(nbv.SurfaceModel):
     """Knows the hypotheses, whatever was observed."""
 
     hypotheses: PartHypotheses
-    hypothesises = True
+    carries_hypotheses = True
 
     def observed(self, observations):
         return dataclasses.replace(observations, hypotheses=self.hypotheses)
