@@ -33,12 +33,11 @@ from jaxnbv.scanning.scanner import far_from_scene
 from jaxnbv.search import DiscreteSearch, Problem, Proposal, Search
 from jaxnbv.surfaces import FreeRotation, ShapeBank, ShapePoses
 from jaxnbv.surfaces.base import HALF_WIDTH
-from jaxnbv.surfaces.part_hypotheses import PartHypotheses
+from jaxnbv.surfaces.part_hypotheses import hypotheses_of
 from jaxnbv.tasks import Identify
 from jaxnbv.utility import Quantity
 
 _PARTS_GRID = 64
-_NO_HYPOTHESES = "the observations hold no hypotheses: make them with the init of the planner that they are given to"
 
 # Functions are converted on the way in, which mypy cannot see.
 if TYPE_CHECKING:
@@ -205,10 +204,7 @@ class Planner(eqx.Module):
         """The posterior and its samples, less what the sensor cannot measure if the acquisition asks for that alone;
         the likeliest part in place of the samples for an acquisition about hypotheses."""
         if self.acquisition.needs_hypotheses:
-            hypotheses = observations.hypotheses
-            if not isinstance(hypotheses, PartHypotheses):
-                raise InputError(_NO_HYPOTHESES)
-            return StepInputs(observations, None, hypotheses.surfaces(self.sampler.grid, 1))
+            return StepInputs(observations, None, hypotheses_of(observations).surfaces(self.sampler.grid, 1))
         inputs = self.sampler.step_inputs(observations, key)
         looks, surfaces = inputs.observations.looks, inputs.surfaces
         if looks is None or surfaces is None or not self.acquisition.measurable_only:

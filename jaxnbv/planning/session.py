@@ -42,7 +42,7 @@ from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Obstacles
 from jaxnbv.search import DiscreteSearch, Proposal
 from jaxnbv.storage import RunFolder
-from jaxnbv.surfaces.part_hypotheses import PartHypotheses
+from jaxnbv.surfaces.part_hypotheses import hypotheses_of
 from jaxnbv.surfaces.part_pose import ObjectPose, object_pose
 from jaxnbv.tasks import NewSurface
 
@@ -200,7 +200,7 @@ class Session:
 
         **Raises:** `ValueError` before the first image, or if the planner knows no parts.
         """
-        return self._hypotheses().names()
+        return hypotheses_of(self.observations).names()
 
     @property
     @own_settings()
@@ -209,13 +209,7 @@ class Session:
 
         **Raises:** `ValueError` as `identity` does.
         """
-        return object_pose(self._hypotheses(), self.observations, self.frame)
-
-    def _hypotheses(self) -> PartHypotheses:
-        hypotheses = self.observations.hypotheses
-        if not isinstance(hypotheses, PartHypotheses):
-            raise InputError("the planner knows no parts: give the session Planner.for_parts(bank)")
-        return hypotheses
+        return object_pose(hypotheses_of(self.observations), self.observations, self.frame)
 
     @property
     def episode(self) -> Episode:

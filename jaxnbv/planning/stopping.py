@@ -29,7 +29,7 @@ from jaxnbv.observations import Observations
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.travel import CostFunction, WorldCost, arc_length, total_cost
 from jaxnbv.scanning import GridSurface, barrier_of
-from jaxnbv.surfaces.part_hypotheses import PartHypotheses
+from jaxnbv.surfaces.part_hypotheses import hypotheses_of
 from jaxnbv.surfaces.part_pose import surface_error
 from jaxnbv.tasks.classification import ClassAcquisition
 from jaxnbv.tasks.coverage import NewSurface, newness_of, seen_share
@@ -279,7 +279,7 @@ class Identified(StopRule):
         require(0 < self.probability < 1, f"the probability is {self.probability}; it must lie within (0, 1)")
 
     def after(self, context: StopContext) -> str | None:
-        name, probability = next(iter(_parts(context).names().items()))
+        name, probability = next(iter(hypotheses_of(context.observations).names().items()))
         return f"it is {name} ({100 * probability:.0f} %)" if probability >= self.probability else None
 
 
@@ -299,15 +299,10 @@ class Placed(StopRule):
         require(self.length > 0, f"the length is {self.length}; it must be positive")
 
     def after(self, context: StopContext) -> str | None:
-        error = float(context.frame.length_to_world(surface_error(_parts(context), context.observations)))
+        error = float(
+            context.frame.length_to_world(surface_error(hypotheses_of(context.observations), context.observations))
+        )
         return f"its surface is known to {error:.2g}" if error <= self.length else None
-
-
-def _parts(context: StopContext) -> PartHypotheses:
-    hypotheses = context.observations.hypotheses
-    if not isinstance(hypotheses, PartHypotheses):
-        raise InputError("the planner knows no parts: use Planner.for_parts(bank), or another rule")
-    return hypotheses
 
 
 class ValueBelow(StopRule):

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxnbv.checks import InputError
 from jaxnbv.geometry.volume import Box
 from jaxnbv.observations import Observations
 from jaxnbv.scanning import Grid, GridSurface
@@ -58,6 +59,16 @@ class PartHypotheses(eqx.Module):
         part = int(np.argmax(np.bincount(shapes, weights, len(self.bank))))
         row = int(np.argmax(np.where(shapes == part, weights, -1.0)))
         return part, jax.tree.map(lambda rows: rows[row], self.placed.placement)
+
+
+def hypotheses_of(observations: Observations) -> PartHypotheses:
+    """What the observations hold of known parts.
+
+    **Raises:** `ValueError` if that is nothing.
+    """
+    if not isinstance(observations.hypotheses, PartHypotheses):
+        raise InputError("there are no hypotheses: the planner knows no parts; use Planner.for_parts(bank)")
+    return observations.hypotheses
 
 
 def identify(

@@ -12,12 +12,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxnbv.geometry.volume import Box
 from jaxnbv.surfaces.part_evidence import Rays, evidence
 from jaxnbv.surfaces.placement import Placement, ShapePoses
-from jaxnbv.surfaces.registration import Hypotheses, Prior, Seen, judged, refined, tried
+from jaxnbv.surfaces.registration import Hypotheses, Prior, Seen, first_of_each, judged, refined, tried
 from jaxnbv.surfaces.shape_bank import ShapeBank
 
 NUM_HYPOTHESES = 32
@@ -139,14 +139,3 @@ def _distinct(bank: ShapeBank, box: Box, hypotheses: Hypotheses) -> Hypotheses:
     is_same = (jax.lax.map(off, values, batch_size=4) < SAME) & (hypotheses.shape[:, None] == hypotheses.shape)
     modes = first_of_each(is_same)
     return dataclasses.replace(hypotheses, is_mode=modes, misfit=jnp.where(modes, hypotheses.misfit, jnp.inf))
-
-
-def first_of_each(is_same: Bool[Array, "h h"]) -> Bool[Array, " h"]:
-    """Which rows are not the same as an earlier one of these."""
-    order = jnp.arange(is_same.shape[0])
-
-    def keep(modes, index):
-        covered = jnp.any(is_same[index] & modes & (order < index))
-        return modes.at[index].set(~covered), None
-
-    return jax.lax.scan(keep, jnp.zeros(len(order), bool), order)[0]

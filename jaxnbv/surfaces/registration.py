@@ -321,9 +321,15 @@ def _modes(shape: Int[Array, " h"], rotation: Float[Array, "h 3 3"]) -> Bool[Arr
     """Which of the hypotheses, best first, are farther than 15 degrees from all better modes of their shape."""
     trace = jnp.einsum("aij,bij->ab", rotation, rotation, precision="highest")
     near = (0.5 * (trace - 1.0) > np.cos(np.radians(15.0))) & (shape[:, None] == shape)
+    return first_of_each(near)
+
+
+def first_of_each(is_same: Bool[Array, "h h"]) -> Bool[Array, " h"]:
+    """Which rows are not the same as an earlier one of these."""
+    order = jnp.arange(is_same.shape[0])
 
     def keep(modes, index):
-        covered = jnp.any(near[index] & modes & (jnp.arange(len(shape)) < index))
+        covered = jnp.any(is_same[index] & modes & (order < index))
         return modes.at[index].set(~covered), None
 
-    return jax.lax.scan(keep, jnp.zeros(len(shape), bool), jnp.arange(len(shape)))[0]
+    return jax.lax.scan(keep, jnp.zeros(len(order), bool), order)[0]

@@ -18,7 +18,7 @@ from jaxnbv.scanning import Grid, GridSurface, scan
 from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.part_evidence import KAPPA, MOST, misfit_of, weight_of
-from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses
+from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses, hypotheses_of
 from jaxnbv.utility import Answer, Quantity
 
 # Hypotheses that are imagined, and the nodes along an axis of their surfaces.
@@ -64,9 +64,7 @@ class Identify(Acquisition):
 
     def context(self, step: StepInputs) -> ImaginedParts:
         """The likeliest hypotheses as surfaces."""
-        hypotheses, observations = step.observations.hypotheses, step.observations
-        if not isinstance(hypotheses, PartHypotheses):
-            raise InputError("there are no hypotheses: Identify asks observations of a planner with a bank of parts")
+        observations, hypotheses = step.observations, hypotheses_of(step.observations)
         grid = Grid() if observations.grid is None else observations.grid
         grid = Grid(min(_RESOLUTION, grid.resolution), grid.half_extent)
         shapes = hypotheses.placed.shape[:_NUM_IMAGINED]
